@@ -46,7 +46,7 @@ from robotid.robot.examples import example_urdf
 from robotid.robot.families import wanted_families
 from robotid.robot.model import RobotModel
 from robotid.simulation.motions import random_fourier
-from robotid.variation.covariates import with_effects
+from robotid.variation.covariates import effects_of, model_of, with_effects
 from robotid.variation.draws import scores_to_values
 from robotid.variation.groups import Covariate, Group, RunsOf, runs_of
 from robotid.variation.mixed_effects import MixedEffects, Runs, Slope, covariance_of
@@ -412,14 +412,16 @@ def fleets(count, units=20):
     )
 
 
-def estimates(rng, x, unit, covariates=()):
+def estimates(rng, x, unit, covariates=(), similar=1.0):
     """Return the information of runs on three drives with four terms, whose values are x (k, 12).
 
-    Errors are 2 % of a term and correlated; the plausible spread is 10 %.
+    Errors are 2 % of a term and correlated; the plausible spread is 10 %. The torque of the second
+    term of a drive is that of the first one, but for a share ``similar``.
     """
     found = []
     for j in range(3):
         A = 0.3 * rng.normal(size=(len(x), 4, 4)) + np.eye(4)
+        A[:, :, 1] = np.sqrt(1.0 - similar**2) * A[:, :, 0] + similar * A[:, :, 1]
         H = np.einsum("kij,kil->kjl", A, A) / 0.02**2
         error = np.linalg.solve(
             np.linalg.cholesky(H).swapaxes(1, 2), rng.normal(size=(len(x), 4, 1))
@@ -478,41 +480,72 @@ def samples(count):
 def temperatures(count):
     """Print how effects of the temperature on friction are found, and the coverage of slopes.
 
-    Two of 12 terms depend on it, by -2 and -1.5 % per degC; its standard deviation is 8 degC, that
-    of terms between logs 8 %. The time of the logs has no effect.
+    The standard deviation of the temperature is 8 degC, that of terms between logs 8 %, and between
+    robots BETWEEN. The time of the logs has no effect. Terms that are hardly distinguishable: the
+    torques of viscous and Coulomb friction correlate by 0.99.
     """
-    true = {0: -0.02, 9: -0.015}
-    print(
-        "| logs | found | another effect (sets) | slope within 95 % | next log at a temperature |"
-    )
-    print("|---|---|---|---|---|")
-    for logs in (6, 10, 16):
-        hits = others = inside = ahead = 0
-        for k in range(count):
-            rng = np.random.default_rng([2, k, logs])
-            warm = 20.0 + 8.0 * rng.normal(size=logs)
-            c, x = warm - warm.mean(), 0.08 * rng.normal(size=(logs, 12))
-            for p, slope in true.items():
-                x[:, p] += slope * c
-            about = (Covariate("temperature", "degC", warm),
-                     Covariate("time", "h", rng.uniform(0.0, 50.0, logs)))  # fmt: skip
-            found = estimates(rng, x, [0] * logs, about)
-            used = [(4 * j + s.parameter, np.array_equal(s.covariate, c))
-                    for j, group in enumerate(with_effects(found))
-                    for s in group.runs.slopes]  # fmt: skip
-            right = sum(is_warm and p in true for p, is_warm in used)
-            hits, others = hits + right, others + (len(used) > right)
-            for p, slope in true.items():
-                runs = found[p // 4].runs.with_slopes([Slope(p % 4, c, 0.1 / c.std())])
-                shift = np.eye(5)[4] * slope  # about the true slope
-                about_true = replace(runs, h=runs.h - runs.H @ shift)
-                inside += MixedEffects(about_true).slope(0)[2] > 0.05
-                at = rng.choice([-12.0, 0.0, 12.0, 18.0])
-                low, high = MixedEffects(runs).predict(at=[at])[p % 4].ends
-                ahead += low < slope * at + 0.08 * rng.normal() < high
-        total = 2 * count
-        shares = f"{100 * inside / total:.0f} % | {100 * ahead / total:.0f} %"
-        print(f"| {logs} | {hits} of {total} | {others} of {count} | {shares} |", flush=True)
+    apart, both = {0: -0.02, 9: -0.015}, {0: -0.02, 1: -0.02}
+    print("| logs | effects | found | another effect (sets) | slope found, over the true one | "
+          "slope within 95 % | of those found | next log at a temperature |\n"
+          "|---|---|---|---|---|---|---|---|")  # fmt: skip
+    for robots, logs, true, similar in (
+        (1, 6, apart, 1.0), (1, 10, apart, 1.0), (1, 16, apart, 1.0),
+        (4, 4, apart, 1.0), (8, 2, apart, 1.0), (8, 4, apart, 1.0),
+        (1, 10, both, 0.15), (1, 16, both, 0.15), (4, 4, both, 0.15),
+        (1, 10, {0: -0.02}, 0.15), (1, 16, {0: -0.02}, 0.15), (4, 4, {0: -0.02}, 0.15),
+    ):  # fmt: skip
+        tally(count, robots, logs, true, similar)
+
+
+def tally(count, robots, logs, true, similar):
+    """Print the line of sets with one number of robots, logs of each, and slopes by term."""
+    hits = others = right = inside = ahead = 0
+    sizes = []
+    for k in range(count):
+        total = robots * logs
+        rng = np.random.default_rng([2, k, total] + ([robots] if robots > 1 else []))
+        unit = np.repeat(np.arange(robots), logs)
+        warm = 20.0 + 8.0 * rng.normal(size=total)
+        c, x = warm - warm.mean(), 0.08 * rng.normal(size=(total, 12))
+        if robots > 1:
+            x += BETWEEN * rng.normal(size=(robots, 12))[unit]
+        for p, slope in true.items():
+            x[:, p] += slope * c
+        about = (Covariate("temperature", "degC", warm),
+                 Covariate("time", "h", rng.uniform(0.0, 50.0, total)))  # fmt: skip
+        found = estimates(rng, x, unit, about, similar)
+        chosen = with_effects(found)
+        used = {}
+        for j, group in enumerate(chosen):
+            for place, each in enumerate(group.runs.slopes):
+                if np.array_equal(each.covariate, c):
+                    model = model_of(group, MixedEffects(group.runs), each.parameter)
+                    used[4 * j + each.parameter] = model.slope(place)
+        own = [p for p in used if p in true]
+        hits += len(own)
+        others += sum(len(group.runs.slopes) for group in chosen) > len(own)
+        sizes += [used[p][0] / true[p] for p in own]
+        right += sum(abs(used[p][0] - true[p]) < 1.96 * used[p][1] for p in own)
+        for p, slope in true.items():
+            group, q = found[p // 4], p % 4
+            moved = group.runs.h - slope * c[:, None] * group.runs.H[:, :, q]
+            shifted = replace(  # about the true slope
+                group, runs=replace(group.runs, h=moved), covariates=about[:1]
+            )
+            inside += effects_of(shifted, MixedEffects(shifted.runs), q)[0].probability > 0.05
+            runs = group.runs.with_slopes([Slope(q, c, 0.1 / c.std())])
+            model = model_of(replace(group, runs=runs), MixedEffects(runs), q)
+            at = rng.choice([-12.0, 0.0, 12.0, 18.0])
+            covariates = [at, *np.zeros(len(model.runs.slopes) - 1)]
+            low, high = model.predict(at=covariates)[q].ends
+            spread = np.hypot(0.08, BETWEEN * (robots > 1))
+            ahead += low < slope * at + spread * rng.normal() < high
+    total = len(true) * count
+    words = "two drives" if 9 in true else "two of a drive" if 1 in true else "one"
+    words += ", hardly distinguishable" if similar < 1.0 else ""
+    print(f"| {robots} x {logs} | {words} | {hits} of {total} | {others} of {count} | "
+          f"{np.median(sizes or [np.nan]):.2f} | {100 * inside / total:.0f} % | {right} of {hits} "
+          f"| {100 * ahead / total:.0f} % |", flush=True)  # fmt: skip
 
 
 def warm_up(honest, count):

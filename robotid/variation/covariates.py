@@ -1,4 +1,10 @@
-"""Effects of temperature and time on drive parameters, taken by their evidence."""
+"""Effects of temperature and time on drive parameters, taken by their evidence.
+
+Errors of the terms of a drive correlate: an effect on viscous friction that is left out, for its
+own evidence is too weak, looks like one on Coulomb friction. A parameter with an effect therefore
+has its own model, in which the covariate has effects of any plausible size on the other terms of
+the drive; their error is part of that of the effect.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -10,14 +16,16 @@ import numpy as np
 from robotid._typing import Array
 from robotid.exceptions import DataError
 from robotid.variation.groups import Covariate, RunsOf
-from robotid.variation.mixed_effects import MixedEffects, Slope
+from robotid.variation.mixed_effects import MixedEffects, Runs, Slope
+from robotid.variation.restricted_likelihood import UNKNOWN
 
-__all__ = ["Effect", "at_temperature", "effects_of", "with_effects"]
+__all__ = ["Effect", "at_temperature", "effects_of", "model_of", "with_effects"]
 
 _FALSE_EFFECTS = 0.02  # probability that one of all effects is taken where there is none
 _FEWEST = 4  # runs: a mean, a slope, and a spread
 _POINTS = 9  # covariates at which the interval of the next run is stated
 _BEYOND = 0.5  # of their range, beyond each end of it
+_OTHERS = 3.0  # standard deviation of an effect on another term of a drive, in plausible sizes
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,27 +96,38 @@ def with_effects(groups: Sequence[RunsOf]) -> list[RunsOf]:
             for group in groups]  # fmt: skip
 
 
+def model_of(group: RunsOf, model: MixedEffects, p: int) -> MixedEffects:
+    """Return the model of a parameter: that of its group, or one of its own if it has an effect.
+
+    Args:
+        group: The group of the parameter, as of ``with_effects``.
+        model: Its model, with the effects that are used.
+        p: Index of the parameter.
+    """
+    slopes = group.runs.slopes
+    if all(slope.parameter != p for slope in slopes):
+        return model
+    return MixedEffects(_beside(group, slopes, p), model.deviation)
+
+
 def effects_of(group: RunsOf, model: MixedEffects, p: int) -> tuple[Effect, ...]:
     """Return the effects on a parameter, used or not.
 
     Args:
         group: The group of the parameter, as of ``with_effects``.
-        model: Its model.
+        model: The model of the parameter, see ``model_of``.
         p: Index of the parameter.
     """
-    runs, found = group.runs, []
+    used, found = group.runs.slopes, []
     for covariate, slope in _candidates(group):
         if slope.parameter != p:
             continue
-        places = [
-            s for s, used in enumerate(runs.slopes)
-            if used.parameter == p and np.array_equal(used.covariate, slope.covariate)
-        ]  # fmt: skip
+        places = [s for s, each in enumerate(used) if _is_same(each, slope)]
         if places:
             values = model.slope(places[0])
             intervals = _intervals(model, places[0], covariate, float(group.centre[p]))
         else:
-            values = MixedEffects(runs.with_slopes([*runs.slopes, slope])).slope(len(runs.slopes))
+            values = MixedEffects(_beside(group, [*used, slope], p)).slope(len(used))
             intervals = np.zeros((3, 0))
         found.append(Effect(covariate, *values, bool(places), intervals))
     return tuple(found)
@@ -189,16 +208,40 @@ def _with_effects(group: RunsOf, level: float) -> RunsOf:
     """Return a group with the effects whose p-value is below the level."""
     runs, left = group.runs, [slope for _, slope in _candidates(group)]
     while left:
-        tried = [runs.with_slopes([*runs.slopes, slope]) for slope in left]
-        p_values = [MixedEffects(each).slope(len(runs.slopes))[2] for each in tried]
+        used = runs.slopes
+        tried = [_beside(group, [*used, slope], slope.parameter) for slope in left]
+        p_values = [MixedEffects(each).slope(len(used))[2] for each in tried]
         best = int(np.argmin(p_values))
         if p_values[best] >= level:
             break
-        runs = tried[best]
-        del left[best]
+        runs = runs.with_slopes([*used, left.pop(best)])
     model = MixedEffects(runs)
     sizes = [model.slope(s)[0] for s in range(len(runs.slopes))]
     return replace(group, runs=runs, slopes=tuple(sizes))
+
+
+def _beside(group: RunsOf, slopes: Sequence[Slope], p: int) -> Runs:
+    """Return the runs of a group with slopes, and those that a parameter is estimated beside.
+
+    Each covariate of the parameter's slopes has slopes of plausible size on the other parameters.
+
+    Args:
+        group: The group.
+        slopes: The first slopes, without a prior.
+        p: Index of the parameter.
+    """
+    own = [slope.covariate for slope in slopes if slope.parameter == p]
+    others = [
+        replace(slope, scale=_OTHERS * slope.scale / UNKNOWN) for _, slope in _candidates(group)
+        if slope.parameter != p and any(np.array_equal(slope.covariate, c) for c in own)
+        and not any(_is_same(slope, each) for each in slopes)
+    ]  # fmt: skip
+    return group.runs.with_slopes([*slopes, *others])
+
+
+def _is_same(one: Slope, other: Slope) -> bool:
+    """Return whether two slopes are those of one covariate on one parameter."""
+    return one.parameter == other.parameter and np.array_equal(one.covariate, other.covariate)
 
 
 def _intervals(model: MixedEffects, s: int, covariate: Covariate, centre: float) -> Array:

@@ -13,7 +13,7 @@ of the prediction interval.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -50,7 +50,8 @@ class Slope:
     Attributes:
         parameter: Index of the parameter.
         covariate: The covariate of each run, shape (k,).
-        scale: Plausible size of the slope, positive.
+        scale: Plausible size of the slope, positive. Before the data, the slope is normal about 0
+            with 100 times this standard deviation, as a mean is.
     """
 
     parameter: int
@@ -371,15 +372,24 @@ class MixedEffects:
             is_unit: Whether they are units.
         """
         unit = self.runs.unit
-        found: list[tuple[Array, tuple[Array, ...]]] = []
         own = which[:, None] == (unit if is_unit else np.arange(len(unit)))  # (m, k)
-        if self.runs.slopes and len(which) > 1:  # each has covariates of its own
-            each = [self.against_others(one[None], is_unit=is_unit) for one in which]
-            return Compared(*(np.concatenate([getattr(x, key.name) for x in each])
-                              for key in fields(Compared)))  # fmt: skip
-        if self.runs.slopes and any(at := self.runs.means_of(own[0])):
-            moved = MixedEffects(self.runs.seen_from(at), self.deviation)
-            return moved.against_others(which, is_unit=is_unit)
+        if not self.runs.slopes:
+            return Compared(*self._against(own, is_unit=is_unit))
+        each = []
+        for one in own:  # has covariates of its own
+            runs = self.runs.seen_from(self.runs.means_of(one))
+            each.append(MixedEffects(runs, self.deviation)._against(one[None], is_unit=is_unit))
+        return Compared(*map(np.concatenate, zip(*each, strict=True)))
+
+    def _against(self, own: Array, *, is_unit: bool) -> list[Array]:
+        """Return the arrays of ``Compared`` for m runs or units, parameters at the covariates 0.
+
+        Args:
+            own: Whether a run is left out, shape (m, k).
+            is_unit: Whether they are units.
+        """
+        unit = self.runs.unit
+        found: list[tuple[Array, tuple[Array, ...]]] = []
         several = np.array([len(np.unique(unit[~each])) > 1 for each in own])
         most = max(1, _ELEMENTS // (len(GRID) * len(unit)))
         for levels in (1, 2):
@@ -388,7 +398,7 @@ class MixedEffects:
                 found.append((some, self._compared(own[some], levels, is_unit=is_unit)))
         order = np.argsort(np.concatenate([some for some, _ in found]))
         parts = zip(*(part for _, part in found), strict=True)
-        return Compared(*(np.concatenate(each)[order] for each in parts))
+        return [np.concatenate(each)[order] for each in parts]
 
     def _compared(
         self, own: Array, levels: int, *, is_unit: bool

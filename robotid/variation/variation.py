@@ -9,7 +9,7 @@ import numpy as np
 
 from robotid._typing import Array
 from robotid.variation.causes import evidence_by_group
-from robotid.variation.covariates import Effect, effects_of, with_effects
+from robotid.variation.covariates import Effect, effects_of, model_of, with_effects
 from robotid.variation.groups import FEWEST_RUNS, RunsOf
 from robotid.variation.mixed_effects import MixedEffects, Prediction, covariance_of
 
@@ -269,6 +269,8 @@ def shrunk_correlation(values: Array) -> Array:
     r*_ij = a_i a_j r_ij with a_i^2 = 1 - sum Var(r_ij) / sum r_ij^2 over j != i, within [0, 1]: a
     parameter that hardly varies, and correlates by noise alone, leaves the others as they are. The
     matrix is positive definite, as a product of positive semidefinite matrices by elements (Schur).
+    Var(r) is that of normal values, (1 - r^2)^2 / (k - 1), times (k^2 - 1) / (k^2 - 2 k): its mean
+    is then 1 / (k - 1), as it is, for independent parameters. Two runs determine no correlation.
 
     Args:
         values: Values in k runs, shape (k, m).
@@ -279,34 +281,38 @@ def shrunk_correlation(values: Array) -> Array:
     References:
         Schaefer, Strimmer (2005), A shrinkage approach to large-scale covariance matrix
         estimation, doi:10.2202/1544-6115.1175, section 2.4 (target D), there with one factor for
-        all parameters.
+        all parameters. Hotelling (1953), New light on the correlation coefficient and its
+        transforms (variance of r).
     """
     k, m = values.shape
+    if k < FEWEST_RUNS:
+        return np.eye(m)
     centred = values - values.mean(axis=0)
     std = np.sqrt((centred**2).sum(axis=0) / (k - 1))
     z = centred / np.where(std > 0.0, std, 1.0)
-    products = z[:, :, None] * z[:, None, :]
-    mean = products.mean(axis=0)
-    r = k / (k - 1) * mean
-    variance = k / (k - 1) ** 3 * ((products - mean) ** 2).sum(axis=0)
+    r = z.T @ z / (k - 1)
     off = ~np.eye(m, dtype=bool)
-    size = (r**2 * off).sum(axis=1)
-    share = (variance * off).sum(axis=1) / np.where(size > 0.0, size, 1.0)
+    others = off & (std > 0.0)
+    size = (r**2 * others).sum(axis=1)
+    variance = (1.0 - r**2) ** 2 * (k + 1) / (k * (k - 2))
+    share = (variance * others).sum(axis=1) / np.where(size > 0.0, size, 1.0)
     left = np.sqrt(1.0 - np.clip(np.where(size > 0.0, share, 1.0), _LEAST_SHRUNK, 1.0))
     return np.where(off, left[:, None] * r * left, 1.0)
 
 
-def _parameters(group: RunsOf, model: MixedEffects) -> Iterator[VaryingParameter]:
+def _parameters(group: RunsOf, every: MixedEffects) -> Iterator[VaryingParameter]:
     """Yield the parameters of a group on which the runs have information."""
-    values, errors = model.values
+    of_every = every.with_one_more()
     known = np.einsum("kpp->p", group.runs.H) > 0.0
-    for p, prediction in enumerate(model.with_one_more()):
+    for p in range(len(of_every)):
         if known[p]:
-            centre = float(group.centre[p])
+            centre, model = float(group.centre[p]), model_of(group, every, p)
+            predictions = of_every if model is every else model.with_one_more()
+            values, errors = model.values
             yield VaryingParameter(
                 group.group.parameters[p],
                 group.group.units[p],
-                prediction.shifted(centre),
+                predictions[p].shifted(centre),
                 centre + values[:, p],
                 errors[:, p],
                 float(model.deviation[0, p]) if model.n_levels == 2 else None,

@@ -1,10 +1,12 @@
 """Effects of temperature and time on parameters of runs, against generalised least squares."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from robotid.exceptions import DataError
-from robotid.variation.covariates import at_temperature, effects_of, with_effects
+from robotid.variation.covariates import at_temperature, effects_of, model_of, with_effects
 from robotid.variation.groups import Covariate, Group, RunsOf
 from robotid.variation.mixed_effects import MixedEffects, Runs, Slope
 from robotid.variation.restricted_likelihood import evidence
@@ -307,3 +309,70 @@ def test_runs_and_robots_are_compared_with_others_at_their_own_covariates():
     assert found.values[0] == pytest.approx(wanted[:2], rel=5e-3)
     assert np.sqrt(np.diag(found.covariance[0])) == pytest.approx(np.sqrt(np.diag(P))[:2], rel=5e-3)
     assert found.mean[0] == pytest.approx([each.mean for each in others.predict()], rel=1e-6)
+
+
+def test_an_effect_is_estimated_beside_plausible_ones_on_the_other_terms():
+    """Generalised least squares with a normal prior of slopes: 3 plausible sizes."""
+    rng = np.random.default_rng(12)
+    x, C, runs = drawn_runs(rng, q=3, unit=np.zeros(9, int))
+    c, hours = (rng.permutation(np.arange(-4.0, 5.0)) for _ in range(2))  # means of exactly 0
+    about = [Covariate("temperature", "degC", c), Covariate("time", "h", hours)]
+    one = group(x, 1.0, about, scale=0.5)
+    own = Slope(2, c, 0.5 / np.std(c))
+    one = replace(one, runs=runs.with_slopes([own]))
+    every = MixedEffects(one.runs)
+    assert model_of(one, every, 0) is every
+    model = model_of(one, every, 2)
+    assert [slope.parameter for slope in model.runs.slopes] == [2, 0, 1]
+    variance = np.concatenate([model.deviation[0, :3], np.zeros(3)])[None, :, None] ** 2
+    found = evidence(*model._members, model.runs.scale, variance)
+    wanted, P = least_squares(x, C, model.runs.slopes, model.deviation[:, :3], np.zeros(9, int))
+    prior = np.diag([0.0, 0.0, 0.0, 0.0, *np.full(2, (1.5 / np.std(c)) ** -2.0)])
+    C = np.linalg.inv(np.linalg.inv(P) + prior)
+    assert found.mean[0] == pytest.approx(C @ np.linalg.solve(P, wanted), rel=5e-3, abs=1e-4)
+    errors = np.sqrt(np.diag(C))
+    assert np.sqrt(np.diag(found.covariance[0])) == pytest.approx(errors, rel=2e-3)
+    # an effect of the other covariate is taken for itself, and one that is taken has no prior
+    two = replace(one, runs=runs.with_slopes([own, Slope(0, c, own.scale)]))
+    slopes = model_of(two, MixedEffects(two.runs), 2).runs.slopes
+    assert [(each.parameter, each.scale) for each in slopes[:2]] == [(2, own.scale), (0, own.scale)]
+    assert [(each.parameter, each.scale) for each in slopes[2:]] == [(1, 0.03 * own.scale)]
+
+
+def test_an_effect_is_not_biased_by_one_of_a_term_that_is_hardly_distinguishable():
+    """Both terms fall by 2 % per degC; the evidence of viscous friction is weak."""
+    inside, sizes = 0, []
+    A = np.array([[1.0, 0.99], [0.0, 0.14]]) / 0.03  # torques of both correlate by 0.99
+    H = np.tile(A.T @ A, (12, 1, 1))
+    for seed in range(10):
+        rng = np.random.default_rng([13, seed])
+        warm = 25.0 + 8.0 * rng.normal(size=12)
+        own = Covariate("temperature", "degC", warm)
+        noise = 0.05 * rng.normal(size=(12, 2)) + np.linalg.solve(A, rng.normal(size=(2, 12))).T
+        for sign in (-1.0, 1.0):
+            x = sign * noise - 0.02 * (warm - warm.mean())[:, None]
+            one = group(x, 1.0, [own])
+            one = replace(one, runs=replace(one.runs, H=H, h=np.einsum("kij,kj->ki", H, x)))
+            (effect,) = effects_of(one, MixedEffects(one.runs), 1)
+            sizes.append(effect.slope)
+            inside += abs(effect.slope + 0.02) < 1.96 * effect.std_error
+    assert np.mean(sizes) == pytest.approx(-0.02, abs=0.002)
+    assert 17 <= inside <= 20
+
+
+def test_units_are_compared_whose_mean_covariate_rounds():
+    """The mean of c - mean(c) is 1e-16, not 0, for one of these robots."""
+    rng = np.random.default_rng(14)
+    unit, c = np.repeat(np.arange(5), 3), np.round(8.0 * rng.normal(size=15), 1)
+    x, C, runs = drawn_runs(rng, unit=unit)
+    own = c[3:6] - c[3:6].mean()
+    assert own.mean() != 0.0
+    model = MixedEffects(runs.with_slopes([Slope(1, c, 0.1)]))
+    found = model.against_others(np.arange(5), is_unit=True)
+    moved = model.runs.seen_from([c[3:6].mean()])
+    others = MixedEffects(moved.without_unit(1), model.deviation)
+    slopes, first = [Slope(1, own, 0.1)], others.deviation[:1, :2]
+    wanted, P = least_squares(x[3:6], C[3:6], slopes, first, np.zeros(3, int))
+    assert found.values[1] == pytest.approx(wanted[:2], rel=1e-2)
+    assert np.sqrt(np.diag(found.covariance[1])) == pytest.approx(np.sqrt(np.diag(P))[:2], rel=1e-2)
+    assert found.mean[1] == pytest.approx([each.mean for each in others.predict()], rel=1e-6)

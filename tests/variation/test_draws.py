@@ -75,9 +75,9 @@ def test_correlation_is_shrunk_by_its_uncertainty():
         above = below = 0.0
         for j in range(3):
             if i != j:
-                w = z[:, i] * z[:, j]
-                above += 6 / 5**3 * ((w - w.mean()) ** 2).sum()
-                below += (6 / 5 * w.mean()) ** 2
+                r = z[:, i] @ z[:, j] / 5
+                above += (1 - r**2) ** 2 / 5 * 35 / 24  # 35 / 24: k = 6
+                below += r**2
         left.append(np.sqrt(1 - min(above / below, 1.0)))
     assert len({round(a, 3) for a in left}) == 3  # a factor for each parameter
     wanted = np.outer(left, left) * np.corrcoef(x.T)
@@ -91,3 +91,22 @@ def test_correlation_is_shrunk_by_its_uncertainty():
     off = [np.abs(R[~np.eye(8, dtype=bool)]).mean() for R in few]
     assert np.mean(off) < 0.2  # 0.45 without shrinkage
     assert min(np.linalg.eigvalsh(R).min() for R in few) > 0
+    # a constant parameter has no correlation, and leaves those of the others
+    x[:, 1] = 2.0
+    wanted = np.insert(np.insert(shrunk_correlation(x[:, [0, 2]]), 1, 0.0, 0), 1, 0.0, 1)
+    wanted[1, 1] = 1.0
+    assert shrunk_correlation(x) == pytest.approx(wanted)
+    assert shrunk_correlation(x[:2]) == pytest.approx(np.eye(3))  # r is 1 or -1 for any two runs
+
+
+def test_variance_of_a_correlation_has_the_mean_of_independent_parameters():
+    """E (1 - r^2)^2 is k (k - 2) / (k^2 - 1) of independent normal values, Var(r) 1 / (k - 1)."""
+    x = np.random.default_rng(5).normal(size=(20_000, 5, 2))
+    z = x - x.mean(axis=1, keepdims=True)
+    r = (z[..., 0] * z[..., 1]).sum(axis=1) / np.sqrt((z**2).sum(axis=1).prod(axis=1))
+    assert np.mean((1 - r**2) ** 2) == pytest.approx(5 * 3 / 24, rel=0.01)
+    assert np.mean(r**2) == pytest.approx(1 / 4, rel=0.03)
+    shares = [(1 - r[k] ** 2) ** 2 * 6 / 15 / r[k] ** 2 for k in range(3)]
+    for k in range(3):
+        off = shrunk_correlation(x[k])[0, 1]
+        assert off == pytest.approx(r[k] * (1 - min(max(shares[k], 1e-3), 1.0)))
