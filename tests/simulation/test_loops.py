@@ -38,7 +38,7 @@ from robotid.robot.model import RobotModel
 from robotid.robot.parameters import Coupling
 from robotid.simulation.course_lanes import divide_rows
 from robotid.simulation.failures import why_no_solution
-from robotid.simulation.loops import ClosedLoopRobot, Loops, Window, cut_windows
+from robotid.simulation.loops import ClosedLoopRobot, Loops, Window, _Grid, cut_windows
 
 RATE = 500.0  # [Hz]
 LEGS = (*LEG, *(name.replace("FL", "FR") for name in LEG))
@@ -637,3 +637,12 @@ def test_ticks_between_rows_take_the_commands_of_their_own_half_row(planar):
         replace(loops, delay=np.zeros(2)), cut_windows(fine, np.inf, 0.0)
     )
     np.testing.assert_allclose(late.q, same.q[::2], atol=1e-12)
+
+
+def test_the_command_of_the_last_tick_is_averaged_to_the_next_one():
+    """Two ticks in each row of 1 s, and some after the last row."""
+    grid = _Grid(np.arange(5.0, 9.0), np.arange(5.5, 9.1, 0.5), 1.0)
+    ticks = np.arange(5.0, 8.0, 0.5)
+    np.testing.assert_allclose(
+        grid.sampled(ticks).reshape(-1, 2), np.column_stack([ticks, ticks + 0.5])
+    )
