@@ -8,7 +8,7 @@ import pinocchio as pin
 import pytest
 from helpers.paths import URDF
 
-from robotid.closed_loop import fit
+from robotid.closed_loop import fit, second_order
 from robotid.closed_loop.fit import stated_loops
 from robotid.closed_loop.initial_values import (
     first_loops,
@@ -318,3 +318,22 @@ def test_whitening_and_free_gains_are_those_of_all_logs(planar, monkeypatch, spe
     assert max(lengths) == 0.5
     assert {id(w.log) for w in given[1]} == {id(w.log) for w in found.simulator.windows}
     assert len({id(w.log) for w in given[1]}) == 2
+
+
+def test_tried_loops_have_a_damping_to_which_the_stated_gain_contributes(planar, monkeypatch):
+    kp, kd, torque = np.array([100.0, 40.0]), np.array([2.0, 30.0]), np.array([3.0, 0.5])
+    bare = stated_loops(planar, LoopSettings())
+    bare = replace(bare, kp=kp, kd=kd, delay=np.array([0.01, 0.02]))
+    tried = []
+    monkeypatch.setattr(
+        second_order, "_better",
+        lambda robot, windows, trial, best, found: tried.append(trial) or (np.zeros(2), trial),
+    )  # fmt: skip
+    second_order._coarse(None, (), bare, torque, False)
+    wanted = iter([(w, z, f) for w in _FREQUENCIES for z in (0.5, 1.5) for f in (0.05, 0.5)])
+    for trial, (w, z, f) in zip(tried, wanted, strict=True):
+        viscous, coulomb, offset = trial.values.reshape(2, 3).T
+        np.testing.assert_allclose(trial.armature * w**2, kp)
+        np.testing.assert_allclose(kd + viscous, np.maximum(2 * z * kp / w, kd))
+        np.testing.assert_allclose(coulomb, f * torque)
+        np.testing.assert_array_equal([offset, trial.delay], [[0.0, 0.0], bare.delay])

@@ -183,6 +183,8 @@ def test_gains_of_joints_with_equal_limits_that_differ_are_a_note(found):
     assert "kp from 6 to 75" in note.message
     assert 'groups = { NAME = ["rail", "turn"] } in [controller]' in note.message
     assert said([25.0, 75.0]) == []
+    [note] = said([75.0, 6.0])  # in any order
+    assert note.evidence == {"lowest": 6.0, "highest": 75.0}
     assert said([6.0, 75.0], effort=8.0) == []
     assert said([6.0, 75.0], velocity=3.0) == []
 
@@ -287,6 +289,14 @@ def test_the_usual_speed_of_a_joint_is_the_root_of_its_mean_square():
     seldom = Log(t[::2], q[::2], 0 * q[::2], ("a", "b"), q_ref=q[::2], has_torque=False)
     both = [*windows, *cut_windows(seldom, 0.5, 0.0)]  # each log has a rate of its own
     np.testing.assert_allclose(_speed(both), [rms, 0.5 * rms], rtol=0.02)
+
+
+def test_a_result_is_consistent_if_every_body_is(found):
+    assert found.is_consistent
+    for body in range(found.model.layout.n_inertial // 10):
+        standard = found.standard.copy()
+        standard[10 * body] *= -1.0  # its mass
+        assert not replace(found, standard=standard).is_consistent
 
 
 def test_a_result_of_wrong_logs_has_no_urdf(found):

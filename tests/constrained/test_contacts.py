@@ -1,6 +1,7 @@
 """Findings on the motion of a floating base and on contacts."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pinocchio as pin
@@ -9,6 +10,7 @@ from scipy.special import stdtrit
 
 from robotid.constrained.contacts import (
     _contact_jacobian,
+    _flags,
     _loaded,
     _of_pairs,
     _radius,
@@ -280,6 +282,21 @@ def test_a_foot_of_measured_force_is_on_the_ground_above_a_tenth_of_its_largest_
     log = Log(t, np.zeros((4, 1)), np.zeros((4, 1)), ("a",), wrenches=forces)
     times = np.array([3.3, 3.25, 3.1, 3.0])
     assert _loaded(contact, log, times).tolist() == [True, False, True, True]
+
+
+def test_flags_are_of_measured_forces_always_or_those_found():
+    t = 3.0 + np.arange(5.0)
+    kinds = {"is_measured": False, "always": False}
+    feet = [SimpleNamespace(frame=name, measured=("fz",), **kinds | own) for name, own in (
+        ("held", {"always": True}), ("pressed", {"is_measured": True}), ("found", {}), ("no", {}),
+    )]  # fmt: skip
+    zeros = np.zeros((5, 1))
+    log = Log(t, zeros, zeros, ("a",), wrenches={"fz pressed": np.r_[0.0, 9.0, 1.0, 0.5, -5.0]})
+    whole = replace(log, contacts={"found": np.r_[True, True, False, False, True]})
+    flags = _flags(SimpleNamespace(contacts=feet), log, whole, t)
+    assert flags.T.astype(int).tolist() == [
+        [1, 1, 1, 1, 1], [0, 1, 1, 0, 1], [1, 1, 0, 0, 1], [1, 1, 1, 1, 1],
+    ]  # fmt: skip
 
 
 def slipping(cutoff, speed):

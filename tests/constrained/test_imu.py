@@ -114,14 +114,16 @@ def test_the_axes_of_a_turned_imu_are_named(robot, sway):
 
 
 def test_gravity_that_was_subtracted_is_named(robot, sway):
-    def subtracted(values):
+    def subtracted(values, share=1.0):
         up = in_base(sway.base.pose[:, 3:], -G) @ TURN
-        return np.hstack([values[:, :3], values[:, 3:] - up])
+        return np.hstack([values[:, :3], values[:, 3:] - share * up])
 
     (found,) = check_base(robot, measured(sway, subtracted), RAW)
     assert found.code == "imu_gravity"
     assert "gravity was subtracted" in found.message
     assert found.evidence["size"] < 0.5
+    (found,) = check_base(robot, measured(sway, lambda x: subtracted(x, 0.6)), RAW)
+    assert "gravity was subtracted" in found.message  # what is left is below half of it
 
 
 def test_axes_of_imu_and_orientation_that_are_turned_alike_are_found_by_the_legs(robot, sway):

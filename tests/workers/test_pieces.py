@@ -15,7 +15,7 @@ from robotid.exceptions import (
     RankDeficientError,
 )
 from robotid.regressor.torque import joint_torque_regressor
-from robotid.workers.pieces import reduce_piece, run_task
+from robotid.workers.pieces import Outcome, reduce_piece, run_task
 
 
 def say(piece, threads):
@@ -39,6 +39,13 @@ def test_a_task_runs_with_one_thread_and_brings_home_what_was_logged(tmp_path, c
         caplog.clear()
         outcome.log()
     assert caplog.record_tuples == [expected]
+
+
+def test_messages_of_a_worker_keep_their_level(caplog):
+    said = (("robotid.one", 30, "a % b"), ("robotid.two", 10, "c"))
+    with caplog.at_level(10, logger="robotid"):
+        Outcome(None, said).log()
+    assert tuple(caplog.record_tuples) == said
 
 
 def test_a_piece_is_reduced_with_the_threads_that_it_is_given(tmp_path):

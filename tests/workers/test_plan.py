@@ -113,3 +113,15 @@ def test_other_inputs_are_named_up_to_five_and_the_rest_is_counted(tmp_path):
     # what was kept is as it was
     stated = json.loads((tmp_path / ".robotid-checkpoint" / "inputs.json").read_text())
     assert stated == {**inputs, "pieces": [f"piece {k}" for k in range(3)]}
+
+
+def test_a_plan_hands_on_all_that_is_stated(monkeypatch):
+    given = []
+    monkeypatch.setattr(module, "map_pieces", lambda *args, **how: given.append((args, how)) or [7])
+    stated = {"checkpoint": object(), "counted": "draws", "lost": object()}
+    progress, pieces = object(), [SimpleNamespace(samples=1)]
+    assert list(WorkPlan(progress=progress).map("work", pieces, "doing", **stated)) == [7]
+    ((args, how),) = given
+    assert args == ("work", pieces, "doing")
+    assert isinstance(how.pop("backend"), SerialBackend)
+    assert how == {"progress": progress, **stated}
