@@ -1,3 +1,4 @@
+import gc
 import os
 from pathlib import Path
 
@@ -18,6 +19,11 @@ from robotid.logs.data import Log
 from robotid.logs.settings import SignalSettings
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
+
+
+def pytest_collection_finish():
+    """Exempt what was imported from the searches of the garbage collector."""
+    gc.freeze()
 
 
 @pytest.fixture
