@@ -28,7 +28,7 @@ _FINEST = 1000  # largest number of points of the uniform grid per row of the lo
 _ALL = slice(None)
 _KEPT = 20_000  # rows of a log up to which its motions are kept as long as the log
 _KNOWN: WeakKeyDictionary[Log, dict[object, Trajectory]] = WeakKeyDictionary()
-_SPREAD = 4.0  # [time constants] from a force at which the filter leaves 0.5 % of it
+_SPREAD = 3.6  # [time constants] from a force at which less than 1 % of it is left
 _JUMPS = 14.0  # [time constants] after which it has forgotten a jump: 1e-6
 _BESIDE = 16  # rows after which splines and differences have
 

@@ -291,7 +291,7 @@ def test_a_filter_leaves_no_force_where_a_contact_is_none(order, cutoff):
     own = Log(t, still, still, ("a",), contacts={"foot": flags}, wrenches=force)
     smooth = process(own, SignalSettings(order=order, cutoff=cutoff, velocity="differentiated"))
     touching, f = smooth.contacts[:, 0], np.abs(smooth.wrenches[:, 0])
-    assert 0.5 < f[~touching].max() < 0.0055 * 300.0
+    assert 0.5 < f[~touching].max() < 0.009 * 300.0
     rows = np.searchsorted(t, smooth.t)
     assert np.mean(touching) - np.mean(flags[rows]) < 4.0 / cutoff
 
@@ -309,10 +309,10 @@ def test_a_contact_is_extended_by_the_reach_of_the_filter(log):
     assert np.flatnonzero(raw.switching).tolist() == [39, 40, 49, 50, 52, 53]
     smooth = process(log, SignalSettings(cutoff=40.0, trim=0.1, velocity="differentiated"))
     a, b, c = (smooth.t[own] for own in smooth.contacts.T)
-    # 17 rows: 4 time constants, which are long for a cutoff near half the rate
-    np.testing.assert_allclose(a, np.arange(2.32, 2.705, 0.01))
-    np.testing.assert_allclose([b[0], b[-1]], [2.22, smooth.t[-1]])
-    np.testing.assert_allclose([c[0], c[-1]], [smooth.t[0], 2.57])
+    # 15 rows: 3.6 time constants, which are long for a cutoff near half the rate
+    np.testing.assert_allclose(a, np.arange(2.34, 2.685, 0.01))
+    np.testing.assert_allclose([b[0], b[-1]], [2.24, smooth.t[-1]])
+    np.testing.assert_allclose([c[0], c[-1]], [smooth.t[0], 2.55])
     assert not smooth.switching.any()
     np.testing.assert_allclose(smooth.wrenches[:, 0], np.sin(smooth.t), atol=2e-3)
     assert smooth.q.shape == (79, 9)
