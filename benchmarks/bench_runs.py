@@ -81,7 +81,7 @@ def main():
         servos()
     print()
     fleets(1, 8) if options.quick else fleets(5)
-    samples(1 if options.quick else 12)
+    samples(1 if options.quick else 100)
     temperatures(5 if options.quick else 60)
     warm_up(3, 3) if options.quick else warm_up(110, 25)
     unlike(1 if options.quick else 20)
@@ -195,10 +195,10 @@ def drawn(variation, count, rng):
 
 
 def mahalanobis_rank(draws, x):
-    """Return the share of draws that are nearer to the mean than x."""
+    """Return the share of draws that are nearer to the mean than x (m,), or each of x (k, m)."""
     mean, P = draws.mean(axis=0), np.linalg.inv(np.cov(draws.T))
-    distance = np.einsum("ki,ij,kj->k", draws - mean, P, draws - mean)
-    return np.mean(distance < (x - mean) @ P @ (x - mean))
+    own, of_draws = (np.einsum("...i,ij,...j->...", y - mean, P, y - mean) for y in (x, draws))
+    return np.searchsorted(np.sort(of_draws), own) / len(draws)
 
 
 def servos():
@@ -443,9 +443,10 @@ def parameters_of(groups):
 
 
 def samples(count):
-    """Print how many robots left out are in the 95 % and 50 % regions of samples.
+    """Print how many of 200 robots left out of each fleet are in the 95 % and 50 % regions.
 
-    Friction differs by BETWEEN between robots, other terms by 1 %; logs as WITHIN.
+    The standard error is that of fleets: robots of one fleet have the samples in common. Friction
+    differs by BETWEEN between robots, other terms by 1 %; logs as WITHIN.
     """
     varies = np.tile([True, True, False, False], 3)
     blocks = np.arange(12) // 4
@@ -467,13 +468,16 @@ def samples(count):
                 x = (rng.normal(size=(robots, 12)) @ L.T)[unit]
                 x = x + within * rng.normal(size=x.shape)
                 found = parameters_of(estimates(rng, x, unit))
-                new = 1.0 + rng.normal(size=(60, 12)) @ L.T + within * rng.normal(size=(60, 12))
-                draws = drawn(found, 3000, rng)
+                new = 1.0 + rng.normal(size=(200, 12)) @ L.T + within * rng.normal(size=(200, 12))
+                draws = drawn(found, 2000, rng)
                 for rank, own in zip(ranks, (slice(None), varies), strict=True):
-                    rank += [mahalanobis_rank(draws[:, own], each[own]) for each in new]
-            inside = [(100 * np.mean(np.array(r) < 0.95), 100 * np.mean(np.array(r) < 0.5))
-                      for r in ranks]  # fmt: skip
-            cells = " | ".join(f"{most:.0f} % ({half:.0f} %)" for most, half in inside)
+                    rank.append(mahalanobis_rank(draws[:, own], new[:, own]))
+            most = [100 * (np.array(r) < 0.95).mean(axis=1) for r in ranks]  # of each fleet
+            half = [100 * np.mean(np.array(r) < 0.5) for r in ranks]
+            cells = " | ".join(
+                f"{x.mean():.0f} +- {x.std() / np.sqrt(count):.1f} % ({y:.0f} %)"
+                for x, y in zip(most, half, strict=True)
+            )
             print(f"| {words} | {robots} | {cells} |", flush=True)
 
 
