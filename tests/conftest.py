@@ -6,6 +6,7 @@ from pathlib import Path
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 # programs that tests start compile the package once, not each of them
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+gc.disable()  # until the tests begin: nothing that is imported is garbage
 
 import numpy as np
 import pytest
@@ -24,6 +25,7 @@ from robotid.robot.model import RobotModel
 def pytest_collection_finish():
     """Exempt what was imported from the searches of the garbage collector."""
     gc.freeze()
+    gc.enable()
 
 
 @pytest.fixture
