@@ -204,6 +204,32 @@ def test_the_speed_of_feet_is_the_mean_of_the_slower_one(robot, log):
     assert f"move at {high} (mean) below the base, else at {low} below it" in found.message
 
 
+def test_of_readings_that_are_almost_as_slow_the_one_with_fewer_changes_is_named(
+    robot, log, monkeypatch
+):
+    from robotid.constrained import base_pose
+
+    as_logged = []
+
+    def speed(feet, pose, body, world):
+        as_logged.append(pose[0])  # the first one is asked first
+        if (pose[0] == as_logged[0]).all():
+            return 0.2
+        return 0.020 if (body == np.eye(3)).all() and (world == np.eye(3)).all() else 0.019
+
+    another = {"inverse": log.base.pose[:1, 3:] * [-1.0, -1.0, -1.0, 1.0]}
+    monkeypatch.setattr(
+        base_pose,
+        "orientation_readings",
+        lambda q: {words: np.tile(one, (len(q), 1)) for words, one in another.items()},
+    )
+    monkeypatch.setattr(base_pose._Feet, "speed", speed)
+    monkeypatch.setattr(base_pose._Feet, "upwards", lambda feet, R: np.array([0.0, 0.0, 1.0]))
+    (found,) = (x for x in check_base(robot, log, SLOW) if x.code == "base_orientation")
+    assert found.evidence["best"] == 0.020
+    assert found.message.endswith("below it: inverse")
+
+
 def test_inverted_flags_are_no_error_of_the_pose(robot, log):
     inverted = replace(log, contacts={foot: ~x for foot, x in log.contacts.items()})
     assert "base_orientation" not in {x.code for x in check_base(robot, inverted, SLOW)}
