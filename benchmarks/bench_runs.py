@@ -82,7 +82,7 @@ def main():
     print()
     fleets(1, 8) if options.quick else fleets(5)
     samples(1 if options.quick else 100)
-    temperatures(5 if options.quick else 60)
+    temperatures(1 if options.quick else 60)
     warm_up(3, 3) if options.quick else warm_up(110, 25)
     unlike(1 if options.quick else 20)
     print("| arms in MuJoCo | sets | named | another | none |\n|---|---|---|---|---|")
