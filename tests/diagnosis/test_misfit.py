@@ -41,7 +41,7 @@ from robotid.judgement.verdict import warnings_of
 from robotid.log_files.read import write_log
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.base_parameters import structural_mapping
-from robotid.robot.drives import Harmonic
+from robotid.robot.drives import Harmonic, Viscous
 from robotid.robot.families import AUTO, drive_line
 from robotid.robot.model import RobotModel
 from robotid.simulation.closed_loop import another_robot
@@ -319,10 +319,10 @@ def test_a_mass_that_is_too_large_is_named_beside_a_spring(ur5):
     assert found.evidence["factor"] == pytest.approx(wanted, abs=0.06)
     assert f"the URDF's mass of upper_arm_link, {pi[k]:.3g} kg, is too large" in found.message
     assert counterbalanced([found], ["run0.csv"]) == {LIFT: "harmonics1"}
-    term = Harmonic(order=1.0)
+    terms = (Viscous(), Harmonic(order=1.0))
     fit = SimpleNamespace(
-        model=SimpleNamespace(layout=SimpleNamespace(own={LIFT: (term,)})),
-        drives=[SimpleNamespace(joint=LIFT, terms=(term,))],
+        model=SimpleNamespace(layout=SimpleNamespace(own={LIFT: terms})),
+        drives=[SimpleNamespace(joint=LIFT, terms=terms)],
     )
     assert with_known_springs([found], fit, {LIFT: None}) == [found]
     (note,) = with_known_springs([found], fit, {LIFT: ("harmonics1",)})
