@@ -86,7 +86,7 @@ def main():
     warm_up(3, 3) if options.quick else warm_up(110, 25)
     unlike(1 if options.quick else 20)
     print("| arms in MuJoCo | sets | named | another | none |\n|---|---|---|---|---|")
-    alike_logs(6 if options.quick else 150)
+    alike_logs(7 if options.quick else 150)
     alike_fleets(6 if options.quick else 150)
     if not options.quick:
         odd_fleets(20)
@@ -637,8 +637,9 @@ class Plants:
     def chosen(self, found, logs, unit):
         """Return the variation of some logs of a pool, about the fit to all."""
         own = [
-            replace(group, runs=replace(group.runs, H=group.runs.H[logs], h=group.runs.h[logs],
-                                        unit=np.array(unit)))
+            replace(group, across=group.across[logs],
+                    runs=replace(group.runs, H=group.runs.H[logs], h=group.runs.h[logs],
+                                 unit=np.array(unit)))
             for group in found
         ]  # fmt: skip
         return vary([str(k) for k in range(len(logs))], own)
