@@ -12,6 +12,7 @@ from robotid.fitting.recordings import Recordings
 from robotid.fitting.survey import hold_log
 from robotid.identification import pipeline, repeated_errors
 from robotid.identification.repeated_errors import (
+    _shift,
     _shift_of_motion,
     _slopes,
     _slopes_of_bias,
@@ -384,3 +385,9 @@ def test_errors_of_the_acceleration_of_the_base_shift_the_score_by_their_square(
     found = with_repeated_errors(Recordings(model, mapping, [hold_log(model, log, RAW)])).repeated
     assert found.root.shape == (len(theta), 1)
     assert found.described == "errors of the motion of the base that would cause the residual"
+    held = hold_log(model, log, RAW)
+    some = replace(rows, trajectory=rows.trajectory.every(3), mask=rows.mask[::3])
+    of_some = _shift_of_motion(model, mapping, some, theta)  # a third of one of two logs
+    two = _shift(Recordings(model, mapping, [held, held]), theta, 3)
+    np.testing.assert_allclose(two[:, 0], 2 * 3 * of_some, rtol=1e-9)
+    assert np.abs(of_some).max() > 0.0
