@@ -1,12 +1,16 @@
 """robotid validate: compute a result's prediction error on other logs."""
 
 import argparse
-from typing import Any
+from functools import partial
+from typing import TYPE_CHECKING, Any
 
 from robotid._text import terminal_width
 from robotid.cli.flags import add_json
 from robotid.cli.printing import echo, print_verdict
 from robotid.cli.running import show_found
+
+if TYPE_CHECKING:
+    from robotid.commands.job import LogEntry
 
 __all__ = ["SUMMARY", "add_flags", "run"]
 
@@ -22,6 +26,14 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("result", metavar="RESULT.json")
     add("logs", nargs="+", metavar="LOG")
+    words = "name of the robot of the logs, if the fitted logs are of several"
+    add("--unit", metavar="NAME", help=words)
+    words = "mean temperature of the drives in the logs; default: their columns temperature"
+    add("--temperature", type=float, metavar="DEGC", help=words)
+    words = "time of the logs, as the fitted logs state it: a date with a time, or hours"
+    add("--time", metavar="TIME", help=words)
+    words = "add the logs to the variation between logs in RESULT.json"
+    add("--update", action="store_true", help=words)
     add_json(parser)
 
 
@@ -33,11 +45,24 @@ def run(options: argparse.Namespace) -> None:
     """
     from robotid.commands.validate import validate_result
 
-    show_found(validate_result(options.result, options.logs), options, _show)
+    entries = [_entry(log, options) for log in options.logs]
+    found = validate_result(options.result, entries, update=options.update)
+    show_found(found, options, partial(_show, is_update=options.update))
 
 
-def _show(found: dict[str, Any]) -> None:
-    from robotid.identification.summary import error_lines
+def _entry(log: str, options: argparse.Namespace) -> "LogEntry":
+    """Return a log with what the flags state of it, checked as in a job file."""
+    from robotid.commands.job import LogEntry
+
+    time = options.time
+    if time is not None and time.replace(".", "", 1).isdigit():
+        time = float(time)
+    stated = {"unit": options.unit, "temperature": options.temperature, "time": time}
+    return LogEntry.from_dict({"log": log, **{k: x for k, x in stated.items() if x is not None}})
+
+
+def _show(found: dict[str, Any], *, is_update: bool = False) -> None:
+    from robotid.identification.summary import error_lines, variation_lines
 
     echo(f"predicted with {found['predicted_with']}")
     for recording in found["validation"]:
@@ -53,4 +78,10 @@ def _show(found: dict[str, Any]) -> None:
             echo(
                 f"expected rmse by the {source} (share of rows within 95 %): {', '.join(own)}", "  "
             )
+    for finding in found.get("findings", ()):
+        echo(f"\n{finding['message']}")
     print_verdict(found["verdict"])
+    if is_update:
+        echo(f"the variation between logs in {found['result']} counts these logs now:")
+        for line in variation_lines(found["variation"]):
+            echo(line, "  ")

@@ -37,6 +37,7 @@ __all__ = [
     "checkpoint_inputs",
     "examine",
     "examine_logs",
+    "hours_of",
     "identity_of",
     "job_of_result",
     "locked_as_logged",
@@ -85,7 +86,7 @@ def survey_logs(
     def survey(entries: Sequence[LogEntry]) -> tuple[SurveyedLog, ...]:
         logs = []
         units_of_logs(entries)
-        hours = dict(zip(entries, _hours_of(entries), strict=True))
+        hours = dict(zip(entries, hours_of(entries), strict=True))
         for entry in entries:
             try:
                 found = opened[entry.path]
@@ -124,8 +125,11 @@ def units_of_logs(entries: Sequence[LogEntry]) -> list[str]:
     return [entry.unit or "" for entry in entries]
 
 
-def _hours_of(entries: Sequence[LogEntry]) -> list[float | None]:
+def hours_of(entries: Sequence[LogEntry]) -> list[float | None]:
     """Return the time of each log [h], from any origin; None if none is stated.
+
+    Args:
+        entries: The logs.
 
     Raises:
         SettingsError: If only some logs state time or temperature, or their times are of two kinds.

@@ -1,7 +1,7 @@
 """Validation of a written result on other logs, with a verdict."""
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from itertools import compress
 from pathlib import Path
 from typing import Any
@@ -10,6 +10,7 @@ import numpy as np
 
 from robotid._files import file_sha256, finite, log_exists
 from robotid.closed_loop.evaluation import OpenLoop, position_metrics
+from robotid.commands.added_logs import add_logs, check_update
 from robotid.commands.job import Job, LogEntry, job_from_settings
 from robotid.commands.logs import log_of_commands, survey_logs
 from robotid.doctor.diagnosis import diagnose
@@ -45,21 +46,28 @@ from robotid.robot.model import RobotModel
 __all__ = ["validate_result"]
 
 
-def validate_result(path: str | Path, logs: Sequence[str | Path]) -> dict[str, Any]:
+def validate_result(
+    path: str | Path, logs: Sequence[LogEntry | str | Path], *, update: bool = False
+) -> dict[str, Any]:
     """Compute the prediction error of a written result on other logs.
 
     If the result has a URDF, the prediction uses that file and its sidecar, as a user does. The
-    doctor examines the logs. Logs that contain fitted rows do not count as validation.
+    doctor examines the logs. Logs that contain fitted rows do not count as validation. If three or
+    more logs were fitted, the drives in the new logs are compared with those in the fitted ones.
 
     Args:
         path: A result.json.
-        logs: Logs of the same robot.
+        logs: Logs of the same robot; as entries with their unit, temperature and time.
+        update: Whether the logs are added to the variation between logs in the result.json. The
+            fitted logs are not read for it; links and drives of the result stay as they are.
 
     Returns:
-        {"result", "predicted_with", "validation": [...], "verdict": {...}}, as in result.json.
+        {"result", "predicted_with", "validation": [...], "verdict": {...}}, as in result.json,
+        "findings" about logs that differ from the fitted ones, and "variation" with the new logs,
+        if three or more were fitted.
 
     Raises:
-        DataError: If the result or a log is not usable.
+        DataError: If the result or a log is not usable, or a log is to be added twice.
         ModelError: If the URDF is missing or was changed.
         SettingsError: If the settings in the result are not usable.
     """
@@ -67,8 +75,11 @@ def validate_result(path: str | Path, logs: Sequence[str | Path]) -> dict[str, A
     result = loaded.content
     settings = {key: value for key, value in result["settings"].items() if value != {}}
     job = job_from_settings(settings, Path(path).name, Path())
+    entries = [log if isinstance(log, LogEntry) else LogEntry(Path(log)) for log in logs]
+    if update:
+        check_update(loaded, job, entries)
     if "simulation" in result:
-        return _validate_commands(loaded, job, [LogEntry(Path(log)) for log in logs])
+        return _validate_commands(loaded, job, entries)
     source = stated_model(result, job.model())
     if loaded.has_urdf:
         model, pi = loaded.identified
@@ -76,11 +87,15 @@ def validate_result(path: str | Path, logs: Sequence[str | Path]) -> dict[str, A
     else:
         model, pi = source, stated_parameters(result, source)
     prior = source.standard_parameters()
-    entries, parameters = [LogEntry(Path(log)) for log in logs], {"estimate": pi}
     (surveyed,) = survey_logs(job, model, entries)
     driven = stated_urdf_with_drives(result, source)
-    _, evaluations = evaluate_logs((), surveyed, parameters, prior, driven)
-    verdict = _verdict(job, source, result, evaluations, surveyed)
+    _, evaluations = evaluate_logs((), surveyed, {"estimate": pi}, prior, driven)
+    own = [log.with_model(source) for log in surveyed]
+    added = add_logs(loaded, source, job, own, is_update=update)
+    unlike = () if added is None else added.findings
+    verdict = _verdict(job, source, result, evaluations, surveyed, unlike)
+    if update and added is not None:
+        added.write(loaded)
     return {
         "result": str(path),
         "predicted_with": result["outputs"].get("urdf", "base parameters of result.json"),
@@ -88,6 +103,8 @@ def validate_result(path: str | Path, logs: Sequence[str | Path]) -> dict[str, A
             recording_metrics(e, "estimate") | _expected(result, model, e) for e in evaluations
         ],
         "verdict": verdict.to_dict(),
+        **({} if added is None else {"variation": added.shown}),
+        "findings": [asdict(finding) for finding in unlike],
     }
 
 
@@ -170,8 +187,9 @@ def _verdict(
     result: Mapping[str, Any],
     evaluations: Sequence[Evaluation],
     logs: Sequence[SurveyedLog],
+    unlike: Sequence[Finding],
 ) -> Verdict:
-    """Return the verdict on logs, which may be fitted, faulty, or repeat a fitted motion."""
+    """Return the verdict on logs, which may be fitted, faulty, unlike, or fitted motions."""
     hashes = {i["sha256"] for i in result["inputs"] if i["role"] == "identification"}
     fitted, missing = _fitted_logs(job, model, hashes)
     again = [
@@ -186,6 +204,7 @@ def _verdict(
         for finding in diagnose(model, fitted, looks, job.signals)
         if finding.where.split(": ")[0] in names and finding.code not in job.ignore
     ]
+    found += [each for each in unlike if each.code not in job.ignore]
     log_errors = blocking(found, job.ignore, is_robust=job.estimator.is_robust)
     stated = result["verdict"]
     predictions = Predictions(

@@ -122,11 +122,26 @@ def _torque_entries(found: Identification, settings: Mapping[str, Any]) -> dict[
 
 
 def _variation(found: Identification) -> dict[str, Any]:
-    """Return the variation between three or more logs, with the torque error of the next log."""
-    if found.variation is None:
+    """Return the variation between three or more logs, with the torque error of the next log.
+
+    Sums over the rows of each log are those to which the next logs are added.
+    """
+    if found.variation is None or found.sums is None:
         return {}
     rows = zip(found.model.row_names, next_errors(found).tolist(), strict=True)
-    return {"variation": found.variation.to_dict() | {"next_torque_rmse": dict(rows)}}
+    content = found.variation.to_dict() | {"next_torque_rmse": dict(rows)}
+    noise = found.regressor_noise
+    sums = found.sums.to_dict() | {
+        "unit": [found.variation.unit_names[k] for k in found.variation.of_runs],
+        "covariates": {
+            group.group.name: [each.to_dict() for each in group.covariates]
+            for group in found.runs
+            if group.covariates
+        },
+    }
+    if noise is not None and noise.is_corrected:
+        sums["shift"] = noise.shift.tolist()
+    return {"variation": content | {"sums": sums}}
 
 
 def build_preview(preview: "Preview") -> dict[str, Any]:

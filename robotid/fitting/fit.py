@@ -33,9 +33,16 @@ from robotid.fitting.standard_errors import (
 from robotid.regressor.factors import Factors, Reduction, join
 from robotid.regressor.memory import is_loaded
 from robotid.robot.prior import prior_spread
-from robotid.variation.groups import FEWEST_RUNS, Covariate, RunsOf, runs_of
+from robotid.variation.groups import FEWEST_RUNS, Covariate, RunSums, runs_of, sums_of
 
-__all__ = ["Solved", "fit_recordings", "rough_choice", "solve_recordings"]
+__all__ = [
+    "Solved",
+    "covariates_of",
+    "fit_recordings",
+    "rough_choice",
+    "solve_recordings",
+    "sums_of_logs",
+]
 
 _MOST_LOADS = 20  # largest number of fits until the joint load torque has converged
 _DAMPED = 3  # number of fits after which only half of each change is applied
@@ -164,20 +171,20 @@ class Solved:
             factors=ground.factors,
             determination=ground.determination,
             regressor_noise=ground.noise,
-            runs=self._runs(),
         )
+        found = self._with_runs(found)
         hidden = (mapping.K[:, ~found.at_bound] == 0).all(axis=1)  # sums of terms at bounds only
         return replace(found, base_error=np.where(hidden, np.inf, base_error))
 
-    def _runs(self) -> tuple[RunsOf, ...]:
-        """Return the information of each log on parameters that may vary between logs."""
-        logs, ground = self.ground.logs, self.ground
+    def _with_runs(self, fit: Fit) -> Fit:
+        """Return the fit with the information of each log on parameters that may vary."""
+        logs, own, mapping = self.ground.logs, self.recordings, self.recordings.mapping
         if len(logs) < FEWEST_RUNS:
-            return ()
-        own, sigma = self.recordings, ground.rough.sigma
+            return fit
+        sums = sums_of(own.model, mapping, logs, self.standard, self.ground.rough.sigma)
         _, unit = np.unique([log.unit for log in own.fitted], return_inverse=True)
-        covariates = _covariates(own)
-        return runs_of(own.model, own.mapping, logs, self.standard, sigma, unit, covariates)
+        runs = runs_of(own.model, mapping, self.standard, sums, unit, covariates_of(own))
+        return replace(fit, sums=sums, runs=runs)
 
     def _measured(self) -> tuple[Estimate, Estimate, StandardErrors]:
         """Return the estimate and that of WLS with standard errors, and how these were found."""
@@ -211,8 +218,12 @@ class Solved:
         return estimate, wls, errors
 
 
-def _covariates(recordings: Recordings) -> dict[str, list[Covariate]]:
-    """Return temperature and time of the logs by drive, where every log has them."""
+def covariates_of(recordings: Recordings) -> dict[str, list[Covariate]]:
+    """Return temperature and time of the logs to fit by drive, where every log has them.
+
+    Args:
+        recordings: The recordings.
+    """
     found: dict[str, list[Covariate]] = {}
     for drive in recordings.model.layout.drives:
         warm = [
@@ -226,6 +237,32 @@ def _covariates(recordings: Recordings) -> dict[str, list[Covariate]]:
         if len(times) == len(warm):
             own.append(Covariate("time", "h", np.array(times)))
     return found
+
+
+def sums_of_logs(
+    recordings: Recordings, choice: EstimatorSettings, standard: Array, sigma: Array, shift: Array
+) -> RunSums:
+    """Return the sums of logs that are not fitted, about the parameters of a fit to others.
+
+    Args:
+        recordings: The logs, in the place of fitted ones, of the robot of the fit.
+        choice: Settings of the estimator.
+        standard: Standard parameters of the fit, shape (p,).
+        sigma: Its noise level per joint, shape (n,) [N m or N].
+        shift: Bias of the base parameters that it corrects, shape (b,).
+
+    Raises:
+        DataError: If a row of a log cannot be used.
+        NotConvergedError, SettingsError: As of ``reweigh``.
+    """
+    model, mapping = recordings.model, recordings.mapping
+    if choice.is_robust:
+        recordings, _ = reweigh(recordings, choice.loss, model.standard_parameters())
+    logs = [
+        [part.factors.without(shift) for part in parts if part.factors.rows.any()]
+        for parts in recordings.reduce_logs()
+    ]
+    return sums_of(model, mapping, logs, standard, sigma)
 
 
 def _under_own_load(recordings: Recordings, choice: EstimatorSettings) -> Recordings:

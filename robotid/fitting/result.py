@@ -36,7 +36,7 @@ from robotid.robot.bodies import held_parameters
 from robotid.robot.mass_matrix import MassMatrixCheck, check_mass_matrix
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
-from robotid.variation.groups import RunsOf
+from robotid.variation.groups import RunsOf, RunSums
 from robotid.variation.variation import Variation, between_covariance
 
 __all__ = ["Fit", "Solution"]
@@ -88,6 +88,7 @@ class Fit(Identified, Solution):
         open_terms: Uncertainties of the drive models; ``standard_covariance`` includes them.
         regressor_noise: Effect of position quantisation on least squares; None: negligible.
         runs: Information of each of three or more fitted logs on parameters that may vary.
+        sums: Sums over their rows from which it is computed.
         variation: Variation of the drives' parameters between these logs.
     """
 
@@ -101,6 +102,7 @@ class Fit(Identified, Solution):
     open_terms: tuple[OpenTerm, ...] = ()
     regressor_noise: RegressorNoise | None = None
     runs: tuple[RunsOf, ...] = ()
+    sums: RunSums | None = None
     variation: Variation | None = None
     _checked: list[tuple[Array, MassMatrixCheck]] = field(default_factory=list, repr=False)
 

@@ -8,8 +8,9 @@ at theta.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
@@ -19,7 +20,16 @@ from robotid.regressor.factors import Factors
 from robotid.robot.model import RobotModel
 from robotid.variation.mixed_effects import Runs
 
-__all__ = ["FEWEST_RUNS", "Covariate", "Group", "RunsOf", "inflation_of", "runs_of"]
+__all__ = [
+    "FEWEST_RUNS",
+    "Covariate",
+    "Group",
+    "RunSums",
+    "RunsOf",
+    "inflation_of",
+    "runs_of",
+    "sums_of",
+]
 
 #: Smallest number of runs whose scatter is estimated.
 FEWEST_RUNS = 3
@@ -69,6 +79,10 @@ class Covariate:
     unit: str
     values: Array
 
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain values, as result.json has them."""
+        return {"name": self.name, "unit": self.unit, "by_log": self.values.tolist()}
+
 
 @dataclass(frozen=True, eq=False)
 class RunsOf:
@@ -94,12 +108,89 @@ class RunsOf:
     across: Array | None = None
 
 
-def runs_of(
+@dataclass(frozen=True, eq=False)
+class RunSums:
+    """Sums over the rows of k runs; those of new runs are added without the rows of the others.
+
+    The rows are A = W B of the Q parameters of all groups, in their order, and the residuals
+    r = tau - W theta, over the noise level of their joint.
+
+    Attributes:
+        H: A^T A of each run, shape (k, Q, Q). A pair of groups counts the joints of both.
+        h: A^T r of each run, shape (k, Q), each group over its own joints.
+        scatter: Of each group, the scatter of the scores of segments about each run's estimate,
+            and that of independent rows, shape (g, 2); see ``inflation_of``.
+        sigma: Noise level per joint, shape (n,) [N m or N].
+    """
+
+    H: Array
+    h: Array
+    scatter: Array
+    sigma: Array
+
+    def joined(self, new: "RunSums") -> "RunSums":
+        """Return the sums of these runs and of new ones.
+
+        Args:
+            new: Sums of the new runs, of the same groups, theta and noise levels.
+        """
+        H, h = np.concatenate([self.H, new.H]), np.concatenate([self.h, new.h])
+        return RunSums(H, h, self.scatter + new.scatter, self.sigma)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain values, as result.json has them: of H, the upper triangle, row by row."""
+        upper = np.triu_indices(self.H.shape[1])
+        return {
+            "H": self.H[:, *upper].tolist(),
+            "h": self.h.tolist(),
+            "scatter": self.scatter.tolist(),
+            "sigma": self.sigma.tolist(),
+        }
+
+    @classmethod
+    def from_dict(cls, stated: Mapping[str, Any]) -> "RunSums":
+        """Return the sums from plain values; see ``to_dict``.
+
+        Args:
+            stated: The values.
+        """
+        h = np.array(stated["h"])
+        H = np.zeros((*h.shape, h.shape[1]))
+        rows, columns = np.triu_indices(h.shape[1])
+        H[:, rows, columns] = H[:, columns, rows] = stated["H"]
+        return cls(H, h, np.array(stated["scatter"]), np.array(stated["sigma"]))
+
+
+def sums_of(
     model: RobotModel,
     mapping: BaseMapping,
     segments: Sequence[Sequence[Factors]],
     standard: Array,
     sigma: Array,
+) -> RunSums:
+    """Return the sums of runs over all groups of parameters.
+
+    Args:
+        model: The robot.
+        mapping: Standard to base parameters.
+        segments: Factors of the segments of each run, base parameters; k items.
+        standard: Standard parameters of the residual, shape (p,).
+        sigma: Noise level per joint, shape (n,) [N m or N].
+    """
+    theta, groups = mapping.to_base(standard), [g for g, _ in _groups(model, mapping, standard)]
+    products = [_products(run, groups, theta, sigma) for run in segments]
+    scatter = [
+        _scatter([(H[:, own, own], g[:, own]) for H, g in products]) for own in _places(groups)
+    ]
+    H, h = (np.array([each[k].sum(axis=0) for each in products]) for k in (0, 1))
+    return RunSums(H, h, np.array(scatter), sigma)
+
+
+def runs_of(
+    model: RobotModel,
+    mapping: BaseMapping,
+    standard: Array,
+    sums: RunSums,
     unit: Array,
     covariates: Mapping[str, Sequence[Covariate]] = _NO_COVARIATES,
 ) -> tuple[RunsOf, ...]:
@@ -108,28 +199,31 @@ def runs_of(
     Args:
         model: The robot.
         mapping: Standard to base parameters.
-        segments: Factors of the segments of each run, base parameters; k items.
-        standard: Standard parameters fitted to all runs, shape (p,).
-        sigma: Noise level per joint, shape (n,) [N m or N].
+        standard: As of ``sums_of``.
+        sums: The sums of k runs.
         unit: Index of the robot of each run, shape (k,), int, from 0.
         covariates: Quantities of the runs by drive.
     """
-    theta = mapping.to_base(standard)
+    every = _groups(model, mapping, standard)
+    places = _places([group for group, _ in every])
+    kept = [k for k, own in enumerate(places) if sums.H[:, own, own].any()]  # some run has effects
+    columns = np.concatenate([np.r_[places[k]] for k in kept]) if kept else np.empty(0, dtype=int)
     found = []
-    for group, centre in _groups(model, mapping, standard):
-        own = [_products(run, group, theta, sigma) for run in segments]
-        H, h = (np.array([each[k].sum(axis=0) for each in own]) for k in (0, 1))
-        if not H.any():  # no run has any effect of these parameters
-            continue
-        scale, inflation = _scale(group, centre, H.sum(axis=0), model, standard), inflation_of(own)
-        runs = Runs(H / inflation, h / inflation, unit, scale)
+    for k in kept:
+        (group, centre), own = every[k], places[k]
+        H, inflation = sums.H[:, own, own], _ratio(*sums.scatter[k])
+        scale = _scale(group, centre, H.sum(axis=0), model, standard)
+        runs = Runs(H / inflation, sums.h[:, own] / inflation, unit, scale)
         of_drive = covariates.get(group.name, ()) if group.kind == "drive" else ()
-        found.append(RunsOf(group, centre, runs, inflation, tuple(of_drive)))
-    across, end = _across(segments, [each.group for each in found], sigma), 0
-    for k, each in enumerate(found):
-        start, end = end, end + len(each.centre)
-        found[k] = replace(each, across=across[:, start:end])
+        across = sums.H[:, own][:, :, columns]
+        found.append(RunsOf(group, centre, runs, inflation, tuple(of_drive), across=across))
     return tuple(found)
+
+
+def _places(groups: Sequence[Group]) -> list[slice]:
+    """Return the places of the parameters of each group among those of all."""
+    ends = np.cumsum([group.columns.shape[1] for group in groups]).tolist()
+    return [slice(end - g.columns.shape[1], end) for g, end in zip(groups, ends, strict=True)]
 
 
 def _groups(model: RobotModel, mapping: BaseMapping, standard: Array) -> list[tuple[Group, Array]]:
@@ -161,38 +255,24 @@ def _groups(model: RobotModel, mapping: BaseMapping, standard: Array) -> list[tu
 
 
 def _products(
-    segments: Sequence[Factors], group: Group, theta: Array, sigma: Array
+    segments: Sequence[Factors], groups: Sequence[Group], theta: Array, sigma: Array
 ) -> tuple[Array, Array]:
-    """Return A^T A (s, q, q) and A^T r (s, q) of each segment with A = W B, r = tau - W theta.
+    """Return A^T A (s, Q, Q) and A^T r (s, Q) of each segment with A = W B, r = tau - W theta.
 
-    Rows are divided by the noise level of their joint.
+    A of a group is 0 in rows of joints that it does not act on. Rows are divided by the noise level
+    of their joint.
     """
-    q = group.columns.shape[1]
-    H, g = np.zeros((len(segments), q, q)), np.zeros((len(segments), q))
+    B = np.hstack([group.columns for group in groups])
+    acts = np.array([[j in g.rows for g in groups] for j in range(len(sigma))])
+    acts = np.repeat(acts, [group.columns.shape[1] for group in groups], axis=1)
+    H, g = np.zeros((len(segments), B.shape[1], B.shape[1])), np.zeros((len(segments), B.shape[1]))
     for k, segment in enumerate(segments):
-        for j in group.rows:
-            R, own = segment.triangles[j] / sigma[j], segment.columns[j]
-            A = R[:, :-1] @ group.columns[own]
+        for j, level in enumerate(sigma):
+            R, own = segment.triangles[j] / level, segment.columns[j]
+            A = R[:, :-1] @ (B[own] * acts[j])
             H[k] += A.T @ A
             g[k] += A.T @ (R[:, -1] - R[:, :-1] @ theta[own])
     return H, g
-
-
-def _across(segments: Sequence[Sequence[Factors]], groups: Sequence[Group], sigma: Array) -> Array:
-    """Return A^T A of each run with A = W B of the Q parameters of all groups, (k, Q, Q)."""
-    B = np.hstack([group.columns for group in groups]) if groups else np.zeros((0, 0))
-    acts = np.array([j in g.rows for j in range(len(sigma)) for g in groups]).reshape(
-        len(sigma), -1
-    )
-    acts = np.repeat(acts, [group.columns.shape[1] for group in groups], axis=1)
-    found = np.zeros((len(segments), B.shape[1], B.shape[1]))
-    for k, run in enumerate(segments):
-        for segment in run:
-            for j in range(len(sigma)):
-                own = segment.columns[j]
-                A = segment.triangles[j][:, :-1] @ (B[own] * acts[j]) / sigma[j]
-                found[k] += A.T @ A
-    return found
 
 
 def inflation_of(runs: Sequence[tuple[Array, Array]]) -> float:
@@ -204,6 +284,11 @@ def inflation_of(runs: Sequence[tuple[Array, Array]]) -> float:
     Args:
         runs: Of each run, A^T A (s, q, q) and A^T r (s, q) of its s segments.
     """
+    return _ratio(*_scatter(runs))
+
+
+def _scatter(runs: Sequence[tuple[Array, Array]]) -> tuple[float, float]:
+    """Return the scatter of the scores of segments, and the one of independent rows."""
     scatter, expected = 0.0, 0.0
     for H, g in runs:
         bread = np.linalg.pinv(H.sum(axis=0), rcond=_RANK, hermitian=True)
@@ -211,6 +296,11 @@ def inflation_of(runs: Sequence[tuple[Array, Array]]) -> float:
         scatter += float(np.einsum("si,ij,sj->", scores, bread, scores))
         leverage = H @ bread
         expected += float(np.einsum("sii->", leverage) - np.einsum("sij,sji->", leverage, leverage))
+    return scatter, expected
+
+
+def _ratio(scatter: float, expected: float) -> float:
+    """Return the inflation of two sums of ``_scatter``; 1 if there is one segment per run."""
     return max(scatter / expected, _LEAST) if expected > _LEAST else 1.0
 
 

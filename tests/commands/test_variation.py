@@ -2,7 +2,9 @@
 
 import json
 import re
+import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,21 +12,24 @@ import yaml
 from helpers.driven import JOINTS, arm, driven_log
 from helpers.synthetic import truth
 
+from robotid.cli import main
 from robotid.cli.identify import show_result
 from robotid.cli.validate import _show as show_validation
 from robotid.commands.export import export_result
 from robotid.commands.identify import run_job
-from robotid.commands.job import job_from_settings
+from robotid.commands.job import LogEntry, job_from_settings
 from robotid.commands.logs import survey_logs
 from robotid.commands.preview import preview_job
 from robotid.commands.validate import validate_result
 from robotid.exceptions import DataError, SettingsError
 from robotid.export.ranges import parameter_ranges, stated_ranges
+from robotid.fitting.recordings import Recordings
 from robotid.identification.summary import variation_lines
 from robotid.log_files.read import write_log
 from robotid.regressor.torque import joint_torque_regressor
 from robotid.robot.examples import example_urdf
-from robotid.variation.variation import SCORES
+from robotid.variation.groups import runs_of, sums_of
+from robotid.variation.variation import SCORES, vary
 
 COULOMB = "shoulder_lift_joint.coulomb"
 
@@ -227,6 +232,194 @@ def test_robots_are_stated_by_unit(folder):
     part = job_from_settings(settings(folder, ("a", "a", "b")), "job.toml", folder)
     with pytest.raises(SettingsError, match=r"run_3.csv has no unit, but run_0.csv has unit = 'a'"):
         run_job(part, folder / "part")
+
+
+def changed_log(found, seed, **factors):
+    """Return a log of a robot with changed drive parameters, in place of __ a point."""
+    pi = truth(found.model)
+    for name, factor in factors.items():
+        pi[found.model.layout.names.index(name.replace("__", "."))] *= factor
+    return driven_log(found.model, pi, seed, duration=6.0)
+
+
+@pytest.fixture
+def written(result, folder, tmp_path):
+    """A copy of the result, two new logs, and the fitted ones out of reach."""
+    found, _ = result
+    for file in (folder / "out").glob("*.*"):
+        if file.suffix in (".urdf", ".json"):
+            shutil.copy(file, tmp_path)
+    write_log(changed_log(found, 11, elbow_joint__coulomb=1.1), tmp_path / "more_0.csv")
+    write_log(changed_log(found, 12, shoulder_lift_joint__coulomb=0.9), tmp_path / "more_1.csv")
+    return tmp_path
+
+
+def joined(found, names, folder, shift):
+    """Return the variation of fitted and added logs about the fit, of one pass over each part."""
+    job, sums = job_from_settings(settings(folder), "job.toml", folder), []
+    for k, own in enumerate(names):
+        (logs,) = survey_logs(job, found.model, [LogEntry(path) for path in own])
+        cut = Recordings(found.model, found.mapping, logs).reduce_logs()
+        segments = [[part.factors.without(shift * (k > 0)) for part in parts] for parts in cut]
+        sums.append(sums_of(found.model, found.mapping, segments, found.standard, found.sums.sigma))
+    H, h = (np.concatenate([getattr(each, key) for each in sums]) for key in "Hh")
+    total = replace(sums[0], H=H, h=h, scatter=sum(each.scatter for each in sums))
+    unit = np.zeros(len(h), int)
+    groups = runs_of(found.model, found.mapping, found.standard, total, unit)
+    return vary([path.name for some in names for path in some], groups).to_dict()
+
+
+def test_logs_are_added_to_the_variation_without_the_others(result, folder, written):
+    found, content = result
+    names = [
+        [folder / f"run_{k}.csv" for k in range(4)],
+        *([written / f"more_{k}.csv"] for k in range(2)),
+    ]
+    assert "shift" not in content["variation"]["sums"]  # no positions are quantised
+    shift = 0.01 * np.abs(found.base)
+    wanted = joined(found, names, folder, shift)
+    file, hidden = written / "result.json", folder / "hidden"
+    before = json.loads(file.read_text())
+    before["variation"]["sums"]["shift"] = shift.tolist()
+    file.write_text(json.dumps(before))
+    (folder / "run_2.csv").rename(hidden)
+    try:
+        for k in range(2):  # one after the other
+            done = validate_result(file, [written / f"more_{k}.csv"], update=True)
+    finally:
+        hidden.rename(folder / "run_2.csv")
+    after = json.loads(file.read_text())
+    variation = after["variation"]
+    assert variation["logs"] == [path.name for some in names for path in some] == wanted["logs"]
+    for name, entry in wanted["parameters"].items():
+        own = variation["parameters"][name]
+        for key in ("mean", "std_error", "spread", "next_interval", "by_log", "std_error_by_log"):
+            assert own[key] == pytest.approx(entry[key], rel=1e-6, abs=1e-9), (name, key)
+    assert np.array(variation["correlation"]) == pytest.approx(np.array(wanted["correlation"]))
+    assert done["variation"] == {k: x for k, x in variation.items() if k != "sums"}
+    assert [x["path"] for x in variation["added"]] == [str(path) for (path,) in names[1:]]
+    assert {k: x for k, x in after.items() if k != "variation"} == {
+        k: x for k, x in before.items() if k != "variation"
+    }
+    ranges = stated_ranges(after)["drives"]["shoulder_lift_joint"]["coulomb"]
+    assert ranges["high"] == variation["parameters"][COULOMB]["next_interval"][1]
+    with pytest.raises(DataError, match=r"more_0.csv is .*more_0.csv, which result.json has alre"):
+        validate_result(file, [written / "more_0.csv"], update=True)
+    with pytest.raises(DataError, match=r"run_3.csv, which result.json has already; leave it out"):
+        validate_result(file, [folder / "run_3.csv"], update=True)
+
+
+def test_added_logs_are_those_of_a_fit_to_all(folder, written):
+    logs = [{"log": str(folder / f"run_{k}.csv")} for k in range(4)]
+    logs += [{"log": str(written / f"more_{k}.csv")} for k in range(2)]
+    job = job_from_settings({**settings(folder), "identification": logs}, "job.toml", folder)
+    _, content = run_job(job, written / "all")
+    more = [written / "more_0.csv", written / "more_1.csv"]
+    own = validate_result(written / "result.json", more)["variation"]["parameters"]
+    of_fit = {each["name"]: each["std_error"] for each in content["drive_parameters"]}
+    for name, entry in content["variation"]["parameters"].items():
+        error = 1.5 * np.hypot(of_fit[name], entry["std_error"])  # links are those of four logs
+        assert own[name]["mean"] == pytest.approx(entry["mean"], abs=error), name
+        assert own[name]["by_log"] == pytest.approx(entry["by_log"], abs=1.5 * error), name
+        assert own[name]["spread"] == pytest.approx(entry["spread"], rel=0.3), name
+
+
+def test_a_new_log_that_differs_is_named_with_its_cause(result, folder, written, capsys):
+    found, _ = result
+    log = changed_log(found, 13, shoulder_lift_joint__coulomb=5.0)
+    write_log(log, written / "worn.csv")
+    before = (written / "result.json").read_bytes()
+    done = validate_result(written / "result.json", [written / "worn.csv", written / "more_0.csv"])
+    assert (written / "result.json").read_bytes() == before
+    (finding,) = done["findings"]
+    assert finding["code"] == "unlike_run"
+    assert finding["message"].startswith(f"worn.csv: {COULOMB} is ")
+    assert "; 5 other logs predict " in finding["message"]
+    true = truth(found.model)[found.model.layout.names.index(COULOMB)] * 5.0
+    assert finding["evidence"]["value"] == pytest.approx(true, rel=0.1)
+    assert {
+        "code": "unlike_run",
+        "joint": "",
+        "message": "worn.csv: the log differs from the other logs",
+    } in done["verdict"]["warnings"]
+    show_validation(done)
+    assert f"worn.csv: {COULOMB} is " in " ".join(capsys.readouterr().out.split())
+    done = validate_result(written / "result.json", [written / "more_0.csv"])
+    assert done["findings"] == []
+    content = json.loads(before)
+    content["variation"]["sums"]["unit"] = ["a", "b", "c", "d"]  # of another robot
+    (written / "result.json").write_text(json.dumps(content))
+    done = validate_result(written / "result.json", [written / "worn.csv"])
+    (finding,) = done["findings"]
+    assert finding["message"].startswith(f"unit worn.csv: {COULOMB} is ")
+
+
+def test_robot_temperature_and_time_of_added_logs(written, capsys):
+    file, log = written / "result.json", str(written / "more_0.csv")
+    content = json.loads(file.read_text())
+    sums, degrees = content["variation"]["sums"], [10.0, 15.0, 22.0, 25.0]
+    assert (sums["unit"], sums["covariates"]) == ([""] * 4, {})
+    sums["unit"] = ["a", "a", "b", "b"]
+    for entry, unit in zip(content["settings"]["identification"], sums["unit"], strict=True):
+        entry["unit"] = unit
+    hours = [0.0, 7.0, 3.0, 1.0]
+    for entry, hour in zip(content["settings"]["identification"], hours, strict=True):
+        entry["time"] = hour
+    sums["covariates"] = {
+        joint: [{"name": "temperature", "unit": "degC", "by_log": degrees},
+                {"name": "time", "unit": "h", "by_log": hours}] for joint in JOINTS
+    }  # fmt: skip
+    file.write_text(json.dumps(content))
+    done = validate_result(file, [log])["variation"]  # robot and temperature unknown
+    assert done["units"] == 3
+    assert "effects" not in done["parameters"][COULOMB]
+    with pytest.raises(SettingsError, match=r"more_0.csv has no unit, but run_0.csv has unit = .a"):
+        validate_result(file, [log], update=True)
+    with pytest.raises(DataError, match="have the temperature of shoulder_lift_joint, but not all"):
+        validate_result(file, [LogEntry(Path(log), unit="b", time=5.0)], update=True)
+    with pytest.raises(SettingsError, match=r"more_0.csv has no time, but run_0.csv has time = 0"):
+        validate_result(file, [LogEntry(Path(log), unit="b", temperature=20.0)], update=True)
+    assert json.loads(file.read_text()) == content
+    stated = ["--unit", "b", "--temperature", "31", "--time", "12.5"]
+    assert main(["validate", str(file), log, "--update", *stated]) == 0
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "result.json counts these logs now: spread between 5 logs, by joint: coul" in printed
+    variation = json.loads(file.read_text())["variation"]
+    assert variation["units"] == 2
+    assert variation["sums"]["unit"] == ["a", "a", "b", "b", "b"]
+    effect = variation["parameters"][COULOMB]["effects"]["temperature"]
+    assert effect["by_log"] == variation["sums"]["covariates"]["elbow_joint"][0]["by_log"]
+    assert effect["by_log"] == [*degrees, 31.0]
+    assert variation["parameters"][COULOMB]["effects"]["time"]["by_log"] == [*hours, 12.5]
+    capsys.readouterr()
+    assert main(["validate", str(file), log, "--temperature", "900"]) == 2
+    assert "temperature is 900.0, wanted -100 to 300" in capsys.readouterr().err
+
+
+def test_rows_of_added_logs_are_downweighted_as_those_of_the_fit(result, written):
+    found, _ = result
+    log, rng = changed_log(found, 14), np.random.default_rng(4)
+    wrong = rng.random(log.tau.shape) < 0.02
+    write_log(replace(log, tau=log.tau + 30.0 * wrong), written / "jumps.csv")
+    file, values = written / "result.json", []
+    content = json.loads(file.read_text())
+    for loss in ("none", "tukey"):
+        content["settings"]["estimator"]["robust"] = loss
+        file.write_text(json.dumps(content))
+        own = validate_result(file, [written / "jumps.csv"])["variation"]["parameters"][COULOMB]
+        values.append(own["by_log"][-1])
+    true = truth(found.model)[found.model.layout.names.index(COULOMB)]
+    assert abs(values[1] - true) < 0.3 * abs(values[0] - true)
+
+
+def test_results_without_sums_cannot_be_updated(written):
+    file = written / "result.json"
+    content = json.loads(file.read_text())
+    del content["variation"]["sums"]
+    file.write_text(json.dumps(content))
+    assert "variation" not in validate_result(file, [written / "more_0.csv"])
+    with pytest.raises(DataError, match="wanted a result of three or more logs with torques; id"):
+        validate_result(file, [written / "more_0.csv"], update=True)
 
 
 @pytest.fixture(scope="module")

@@ -14,7 +14,7 @@ from robotid.judgement.unlike_runs import unlike_findings
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.model import RobotModel
 from robotid.variation import variation
-from robotid.variation.groups import Group, RunsOf, _groups, inflation_of, runs_of
+from robotid.variation.groups import Group, RunsOf, _groups, inflation_of, runs_of, sums_of
 from robotid.variation.mixed_effects import MixedEffects, Runs
 from robotid.variation.variation import (
     UnlikeRun,
@@ -59,7 +59,8 @@ def groups_of(model, logs, standard, sigma=1.0, unit=None):
     own = recordings(model, logs)
     segments = [own.segments(k, log.whole.trajectory) for k, log in enumerate(own.fitted)]
     units = np.zeros(len(logs), int) if unit is None else np.asarray(unit)
-    return runs_of(model, own.mapping, segments, standard, np.full(3, sigma), units)
+    sums = sums_of(model, own.mapping, segments, standard, np.full(3, sigma))
+    return runs_of(model, own.mapping, standard, sums, units)
 
 
 @pytest.fixture(scope="module")
@@ -145,7 +146,13 @@ def test_rows_are_divided_by_the_noise_of_their_joint(model):
     own = recordings(model, logs)
     segments = [own.segments(k, log.whole.trajectory) for k, log in enumerate(own.fitted)]
     found = [
-        runs_of(model, own.mapping, segments, base, np.array(sigma), np.zeros(6, int))
+        runs_of(
+            model,
+            own.mapping,
+            base,
+            sums_of(model, own.mapping, segments, base, np.array(sigma)),
+            np.zeros(6, int),
+        )
         for sigma in ([1.0, 1.0, 1.0], [1.0, 2.0, 5.0])
     ]
     for one, other in zip(*found, strict=True):

@@ -1,0 +1,175 @@
+"""Logs compared with those of a result, and added to their variation without reading these."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from robotid._files import read_json, source_entry, write_json
+from robotid._typing import Array
+from robotid.commands.job import Job, LogEntry
+from robotid.commands.logs import hours_of, units_of_logs
+from robotid.exceptions import DataError
+from robotid.export.result import Result, stated_parameters
+from robotid.findings import Finding
+from robotid.fitting.fit import covariates_of, sums_of_logs
+from robotid.fitting.recordings import Recordings
+from robotid.fitting.survey import SurveyedLog
+from robotid.identification.repeated_errors import with_repeated_errors
+from robotid.judgement.unlike_runs import unlike_findings
+from robotid.regressor.base_parameters import structural_mapping
+from robotid.robot.model import RobotModel
+from robotid.variation.groups import Covariate, RunSums, runs_of
+from robotid.variation.variation import vary
+
+__all__ = ["AddedLogs", "add_logs", "check_update"]
+
+_ADVICE = "identify again from all logs"
+
+
+@dataclass(frozen=True)
+class AddedLogs:
+    """The variation between the logs of a result and new ones.
+
+    Attributes:
+        content: As "variation" of result.json, of all these logs.
+        findings: Findings about the new logs that differ, and about their robots.
+    """
+
+    content: dict[str, Any]
+    findings: tuple[Finding, ...]
+
+    @property
+    def shown(self) -> dict[str, Any]:
+        """The content without the sums of the logs."""
+        return {key: x for key, x in self.content.items() if key != "sums"}
+
+    def write(self, result: Result) -> None:
+        """Write the variation to the result.json.
+
+        Args:
+            result: The result.
+        """
+        content = read_json(result.path, "result")  # with the keys as they are in the file
+        write_json({**content, "variation": self.content}, result.path)
+
+
+def check_update(result: Result, job: Job, entries: Sequence[LogEntry]) -> None:
+    """Check that logs can be added to the variation of a result.
+
+    Args:
+        result: The result.
+        job: Its job.
+        entries: The logs.
+
+    Raises:
+        DataError: If the result has no sums, or a log is one of its logs.
+        SettingsError: If the robot, temperature or time of a log is missing, or stated otherwise.
+    """
+    stated = result.content.get("variation", {})
+    if "sums" not in stated:
+        raise DataError(
+            f"{result.path.name} has no variation to which logs can be added, wanted a result of "
+            f"three or more logs with torques; {_ADVICE}"
+        )
+    known = [x for x in result.content["inputs"] if x["role"] == "identification"]
+    of_file = {x["sha256"]: x["path"] for x in (*known, *stated.get("added", ()))}
+    for entry in entries:
+        own = source_entry(str(entry.path))["sha256"]
+        if own in of_file:
+            raise DataError(
+                f"{entry.path} is {of_file[own]}, which {result.path.name} has already; "
+                "leave it out"
+            )
+        of_file[own] = str(entry.path)
+    every = [replace(entry, temperature=None) for entry in (*job.identification, *entries)]
+    units_of_logs(every)
+    hours_of(every)
+
+
+def add_logs(
+    result: Result,
+    model: RobotModel,
+    job: Job,
+    logs: Sequence[SurveyedLog],
+    *,
+    is_update: bool = False,
+) -> AddedLogs | None:
+    """Return the variation between the logs of a result and new ones.
+
+    The sums of the new logs about the parameters of the fit are added to those of the others; the
+    mixed-effects model is that of all. To first order it is the variation of a fit to all logs.
+
+    Args:
+        result: The result.
+        model: Its robot.
+        job: Its job.
+        logs: The new logs, of this robot.
+        is_update: Whether the temperature and time of the others must not be lost.
+
+    Returns:
+        The variation; None if the result has no sums of its logs.
+
+    Raises:
+        DataError: If a row of a log cannot be used, a temperature is missing, or the sums are of
+            another version.
+    """
+    stated = result.content.get("variation", {})
+    if "sums" not in stated:
+        return None
+    mapping, before = structural_mapping(model), stated["sums"]
+    recordings = with_repeated_errors(Recordings(model, mapping, logs))
+    pi, old = stated_parameters(result.content, model), RunSums.from_dict(before)
+    shift = np.array(before.get("shift", np.zeros(len(mapping.base_names))))
+    new = sums_of_logs(recordings, job.estimator, pi, old.sigma, shift)
+    if new.H.shape[1:] != old.H.shape[1:]:
+        raise DataError(
+            f"the variation in {result.path.name} has {old.H.shape[1]} parameters, wanted "
+            f"{new.H.shape[1]}: another version of robotid wrote it; {_ADVICE}"
+        )
+    new_units = [log.unit or any(before["unit"]) * Path(log.path).name for log in logs]
+    units = [*before["unit"], *new_units]
+    covariates = _joined(before["covariates"], recordings, is_update=is_update)
+    unit_names, unit = np.unique(units, return_inverse=True)
+    sums = old.joined(new)
+    groups = runs_of(model, mapping, pi, sums, unit, covariates)
+    names = [*stated["logs"], *(Path(log.path).name for log in logs)]
+    found = vary(names, groups, unit_names.tolist())
+    assert found is not None
+    count = len(stated["logs"])
+    own = replace(
+        found,
+        unlike=tuple(each for each in found.unlike if each.run >= count),
+        unlike_units=tuple(each for each in found.unlike_units if each.run in unit[count:]),
+    )
+    added = [source_entry(log.path) for log in logs]
+    content = found.to_dict() | {
+        "sums": sums.to_dict() | {key: before[key] for key in ("shift",) if key in before}
+        | {"unit": units, "covariates": {
+            name: [each.to_dict() for each in some] for name, some in covariates.items()
+        }},
+        "added": [*stated.get("added", ()), *added],
+    }  # fmt: skip
+    return AddedLogs(content, tuple(unlike_findings(own)))
+
+
+def _joined(
+    before: Mapping[str, Sequence[Mapping[str, Any]]], recordings: Recordings, *, is_update: bool
+) -> dict[str, list[Covariate]]:
+    """Return temperature and time of the logs of a result and of new ones, where all have them."""
+    found: dict[str, list[Covariate]] = {}
+    of_new = covariates_of(recordings)
+    for name, some in before.items():
+        new = {each.name: each.values for each in of_new.get(name, ())}
+        for each in some:
+            if each["name"] in new:
+                values: Array = np.concatenate([each["by_log"], new[each["name"]]])
+                found.setdefault(name, []).append(Covariate(each["name"], each["unit"], values))
+            elif is_update:
+                raise DataError(
+                    f"the logs of the result have the {each['name']} of {name}, but not all new "
+                    f"logs do; state it with --{each['name']}"
+                )
+    return found
