@@ -12,7 +12,7 @@ from robotid.estimators import Consistent
 from robotid.estimators.consistent.penalties import WeightChoice
 from robotid.fitting import estimators
 from robotid.fitting.estimators import Known, consistent_fit
-from robotid.fitting.fit import _covariates, rough_choice
+from robotid.fitting.fit import covariates_of, rough_choice
 from robotid.fitting.settings import ConsistentSettings, EstimatorSettings
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.base_parameters import BaseMapping, structural_mapping
@@ -132,7 +132,7 @@ def test_temperature_and_time_are_effects_only_if_every_log_has_them():
     def found(*logs):
         fitted = [SimpleNamespace(temperature=x, time=t) for x, t in logs]
         layout = SimpleNamespace(drives=drives)
-        own = _covariates(SimpleNamespace(model=SimpleNamespace(layout=layout), fitted=fitted))
+        own = covariates_of(SimpleNamespace(model=SimpleNamespace(layout=layout), fitted=fitted))
         return {d: [(x.name, x.unit, x.values.tolist()) for x in y] for d, y in own.items()}
 
     warm = [{"a": 20.0, "b": 30.0}, {"a": 26.0, "b": 24.0}]
