@@ -32,6 +32,8 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     words = "address of a Dask cluster, as tcp://host:8786"
     group.add_argument("--scheduler", metavar="ADDRESS", help=words)
     add("--resume", action="store_true", help="continue an interrupted run in --out")
+    words = "take units whose inputs have not changed from the results in --out"
+    add("--update", action="store_true", help=words)
     add_json(parser)
     add_progress(parser)
 
@@ -50,7 +52,7 @@ def run(options: argparse.Namespace) -> int:
         units = read_fleet(options.table, options.urdf, options.job)
         workers = available_cores() if options.workers is None else options.workers
         plan = WorkPlan(workers, options.scheduler, options.resume, progress)
-        content = run_fleet(units, options.out, plan=plan)
+        content = run_fleet(units, options.out, plan=plan, update=options.update)
     show_found(content, options, _show, ["fleet.parquet", "fleet.html", "fleet.json"])
     return 0 if content["done"] else 1
 

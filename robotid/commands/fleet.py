@@ -2,14 +2,16 @@
 
 import hashlib
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import groupby
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from robotid._files import check_folder, folder_beside, write_json, write_text
+from robotid._files import check_folder, folder_beside, read_json, write_json, write_text
 from robotid._typing import Array
 from robotid.commands.identify import identify_job
 from robotid.commands.job import Job, LogEntry, PayloadEntry, read_job, stated_path
@@ -17,7 +19,7 @@ from robotid.commands.logs import identity_of
 from robotid.exceptions import DataError, SettingsError
 from robotid.export.entries import build_result
 from robotid.fitting.settings import SimulationSettings
-from robotid.log_files.text_tables import parquet_rows, read_text_table
+from robotid.log_files.text_tables import parquet_rows, parquet_values, read_text_table
 from robotid.logs.data import suggestion
 from robotid.report.fleet import fleet_page
 from robotid.variation.groups import FEWEST_RUNS
@@ -42,6 +44,7 @@ _FILES = ("fleet.parquet", "fleet.json", "fleet.html")
 _RESULTS: Mapping[str, type] = {
     "unit": str, "log": str, "status": str, "verdict": str, "reasons": str, "parameter": str,
     "value": float, "std_error": float, "spread": float, "parameter_unit": str, "error": str,
+    "robot": str, "expression": str,
 }  # fmt: skip
 
 
@@ -99,18 +102,14 @@ class UnitResult:
     """The result of a unit.
 
     Attributes:
-        rows: Its rows of the table of results.
-        robot: Name of the robot in the URDF; "" if it is not identified.
-        expressions: Expression of each base parameter.
+        rows: Its rows of the table of results; a missing value has no key.
     """
 
     rows: list[dict[str, Any]]
-    robot: str
-    expressions: dict[str, str]
 
     def to_arrays(self) -> dict[str, Array]:
         """Return the result as arrays by name, for a checkpoint."""
-        content = json.dumps([self.rows, self.robot, self.expressions], allow_nan=False)
+        content = json.dumps(self.rows, allow_nan=False)
         return {"content": np.frombuffer(content.encode(), dtype=np.uint8)}
 
     @classmethod
@@ -120,7 +119,7 @@ class UnitResult:
         Args:
             arrays: The arrays by name.
         """
-        return cls(*json.loads(arrays["content"].tobytes()))
+        return cls(json.loads(arrays["content"].tobytes()))
 
 
 def read_fleet(
@@ -253,14 +252,13 @@ def identify_unit(unit: FleetUnit, threads: int | None) -> UnitResult:
         result = build_result(found, job.to_dict(), outputs={})
         used = [e.path for e in job.identification if e.path not in refused]
         rows += _rows(unit.unit, used, result)
-        about = result["robot"], {e["name"]: e["expression"] for e in result["base_parameters"]}
     except Exception as error:  # the fleet goes on: the error is in the table, with its type
-        rows, about = [_failure(unit, error)], ("", {})
+        rows = [_failure(unit, error)]
     rows += [
         {"unit": unit.unit, "log": str(path), "status": "failed", "error": error}
         for path, error in refused.items()
     ]
-    return UnitResult(rows, *about)
+    return UnitResult(rows)
 
 
 def _failure(unit: FleetUnit, error: Exception) -> dict[str, Any]:
@@ -281,7 +279,7 @@ def _rows(unit: str, logs: Sequence[Path], result: Mapping[str, Any]) -> Iterato
         plain = {"value": entry["value"], "std_error": entry["std_error"]}
         yield {
             **common, **of_unit, "parameter": entry["name"], "parameter_unit": entry["unit"],
-            **(mean or plain),
+            **(mean or plain), "robot": result["robot"], "expression": entry["expression"],
         }  # fmt: skip
     for k, path in enumerate(logs if between["parameters"] else ()):
         for name, own in between["parameters"].items():
@@ -292,7 +290,11 @@ def _rows(unit: str, logs: Sequence[Path], result: Mapping[str, Any]) -> Iterato
 
 
 def run_fleet(
-    units: Sequence[FleetUnit], folder: str | Path, *, plan: WorkPlan | None = None
+    units: Sequence[FleetUnit],
+    folder: str | Path,
+    *,
+    plan: WorkPlan | None = None,
+    update: bool = False,
 ) -> dict[str, Any]:
     """Identify all units; write fleet.parquet, fleet.json and fleet.html.
 
@@ -304,25 +306,30 @@ def run_fleet(
         units: The units.
         folder: Folder of the results; created if it is missing.
         plan: The workers; this process if None.
+        update: Whether units whose inputs are those of the results in the folder are taken from
+            these; units with a failure are identified again.
 
     Returns:
         The content of fleet.json: "units" (how many), "logs", "done", "verdicts" (how many of
-        each), "failures", "parameters" (variation between units) and "unlike".
+        each), "failures", "parameters" (variation between units), "unlike" and "inputs" (versions,
+        and a hash of the inputs of each unit).
 
     Raises:
-        DataError: If the checkpoint to resume has other inputs.
+        DataError: If the checkpoint to resume has other inputs, or results to update are missing
+            or of other versions.
         SettingsError: If the folder is not writable.
         WorkerError: If a cluster cannot be used.
     """
-    chosen, target = plan or WorkPlan(1), Path(folder)
+    chosen, target, inputs = plan or WorkPlan(1), Path(folder), _inputs(units)
     check_folder(target, _FILES)
-    checkpoint = Checkpoint.open(
-        target, _inputs(units), units, resume=chosen.resume, kind=UnitResult
-    )
+    known = _known(target, inputs) if update else frozenset()
+    checkpoint = Checkpoint.open(target, inputs, units, resume=chosen.resume, kind=UnitResult)
     with chosen, released_on_error(checkpoint):
+        if known:
+            _keep(target / "fleet.parquet", known, units, checkpoint)
         for _ in chosen.map(
             identify_unit, units, "identifying", checkpoint=checkpoint, counted="logs",
-            lost=lambda unit, error: UnitResult([_failure(unit, error)], "", {}),
+            lost=lambda unit, error: UnitResult([_failure(unit, error)]),
         ):  # fmt: skip
             pass
         with folder_beside(target) as partial:
@@ -332,7 +339,7 @@ def run_fleet(
                     result = checkpoint.load(k)
                     table.add(result.rows)
                     gathered.add(result)
-            content = gathered.content(units)
+            content = gathered.content(units) | {"inputs": inputs}
             write_json(content, partial / "fleet.json")
             write_text(fleet_page(content), partial / "fleet.html")
     checkpoint.remove()
@@ -349,6 +356,35 @@ def _inputs(units: Sequence[FleetUnit]) -> dict[str, Any]:
         return hashlib.sha256(text.encode()).hexdigest()
 
     return {"versions": code_versions(), "units": {unit.unit: digest(unit) for unit in units}}
+
+
+def _known(folder: Path, inputs: Mapping[str, Any]) -> frozenset[str]:
+    """Return the units of the results in a folder that have the same inputs.
+
+    Raises:
+        DataError: If there are no results, or they are of other versions.
+    """
+    stated = read_json(folder / "fleet.json", "fleet to update").get("inputs", {})
+    if stated.get("versions") != inputs["versions"]:
+        raise DataError(
+            f"the results in {folder} are of other versions of robotid or its packages; run "
+            "without --update"
+        )
+    own = inputs["units"].items()
+    return frozenset(name for name, key in own if stated["units"].get(name) == key)
+
+
+def _keep(
+    table: Path, known: Collection[str], units: Sequence[FleetUnit], checkpoint: Checkpoint
+) -> None:
+    """Store the results of units in a table as finished, if nothing failed."""
+    places, finished = {unit.unit: k for k, unit in enumerate(units)}, checkpoint.finished()
+    for name, rows in groupby(parquet_values(table), key=itemgetter("unit")):
+        own = list(rows)
+        is_new = name in known and places[name] not in finished
+        if is_new and all(row["status"] == "done" for row in own):
+            unit = units[places[name]]
+            checkpoint.save(places[name], unit.name, UnitResult(own))
 
 
 class _Gathered:
@@ -369,9 +405,8 @@ class _Gathered:
             if row["status"] == "failed":
                 shown = {"unit": row["unit"], "log": row.get("log", ""), "error": row["error"]}
                 self._failures.append(shown)
-            elif "log" not in row and row["std_error"]:
-                name = row["parameter"]
-                key = result.robot, name, result.expressions[name], row["parameter_unit"]
+            elif "log" not in row and row.get("std_error"):
+                key = row["robot"], row["parameter"], row["expression"], row["parameter_unit"]
                 own = row["unit"], row["value"], row["std_error"]
                 self._values.setdefault(key, []).append(own)
         verdict = next((row["verdict"] for row in result.rows if row.get("verdict")), None)

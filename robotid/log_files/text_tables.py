@@ -11,7 +11,7 @@ from robotid.exceptions import DataError
 from robotid.log_files.parquet_files import load_pyarrow
 from robotid.log_files.table import parsing
 
-__all__ = ["ParquetRows", "parquet_rows", "read_text_table"]
+__all__ = ["ParquetRows", "parquet_rows", "parquet_values", "read_text_table"]
 
 _GROUP = 10_000  # rows of a row group, which are in memory before it is written
 
@@ -124,3 +124,20 @@ def parquet_rows(path: Path, columns: Mapping[str, type]) -> Iterator[ParquetRow
         rows = ParquetRows(writer, schema)
         yield rows
         rows.close()
+
+
+def parquet_values(path: Path) -> Iterator[dict[str, Any]]:
+    """Yield the rows of a Parquet file, without their nulls; a row group of them is in memory.
+
+    Args:
+        path: The file.
+
+    Raises:
+        DataError: If it cannot be read.
+        MissingDependencyError: If pyarrow is not installed.
+    """
+    pa = load_pyarrow("reading Parquet")
+    with parsing(path, "Parquet"), pa.parquet.ParquetFile(path) as file:
+        for batch in file.iter_batches(_GROUP):
+            for row in batch.to_pylist():
+                yield {name: value for name, value in row.items() if value is not None}

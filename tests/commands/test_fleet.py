@@ -1,6 +1,7 @@
 """A fleet: the table, results of units, failures, resumed runs with the same bits, the page."""
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -222,6 +223,40 @@ def test_another_table_does_not_resume(table, tmp_path, monkeypatch):
         run_fleet(other, tmp_path, plan=WorkPlan(1, resume=True))
 
 
+def test_units_with_the_same_inputs_are_kept_and_new_logs_added(
+    table, done, tmp_path, monkeypatch, capsys
+):
+    units, first, repeated = read_fleet(table), fleet.identify_unit, []
+    monkeypatch.setattr(
+        fleet, "identify_unit", lambda unit, threads: repeated.append(unit.unit) or first(unit, 1)
+    )
+    shutil.copytree(done[0], tmp_path / "own")
+    same = run_fleet(units, tmp_path / "own", update=True)
+    assert same == done[1]
+    assert repeated == ["a", "d"]  # with a failure
+    for name in FILES:
+        assert (tmp_path / "own" / name).read_bytes() == (done[0] / name).read_bytes()
+    repeated.clear()
+    extra = replace(units[2], logs=(*units[2].logs, units[1].logs[0]))
+    changed = [units[1], extra]
+    found = run_fleet(changed, tmp_path / "own", update=True)
+    assert repeated == ["c"]
+    assert found["logs"] == 3
+    run_fleet(changed, tmp_path / "whole")
+    for name in FILES:
+        own = (tmp_path / "own" / name).read_bytes()
+        assert own == (tmp_path / "whole" / name).read_bytes()
+    stated = json.loads((tmp_path / "own" / "fleet.json").read_text())
+    stated["inputs"]["versions"]["numpy"] = "0.1"
+    (tmp_path / "own" / "fleet.json").write_text(json.dumps(stated))
+    with pytest.raises(DataError, match="are of other versions of robotid or its packages; run w"):
+        run_fleet(changed, tmp_path / "own", update=True)
+    words = ["fleet", str(table), "--out", str(tmp_path / "none"), "--update"]
+    assert main(words) == 1
+    assert "fleet.json" in capsys.readouterr().err
+    assert not (tmp_path / "none").exists()
+
+
 def test_a_unit_is_another_one_with_another_payload_job_or_file(table, tmp_path):
     units = read_fleet(table)
     first, *others = units[0].logs
@@ -297,17 +332,19 @@ def test_units_are_compared_by_parameter_robot_and_expression():
         rows = [
             {"unit": f"u{k}", "status": "done", "verdict": "good" if k % 2 else "usable",
              "parameter": name, "parameter_unit": unit, "value": x[k, p],
-             "std_error": None if (k, p) == (0, 1) else errors[k, p]}
+             "std_error": None if (k, p) == (0, 1) else errors[k, p], "robot": "arm",
+             "expression": name if p == 0 else "b.m + 2 c.m"}
             for p, (name, unit) in enumerate((("a.coulomb", "N m"), ("b.m", "kg")))
         ]  # fmt: skip
         rows.append(rows[0] | {"log": "x.csv", "value": 99.0})  # of one log: not compared
         rows.append({"unit": f"u{k}", "status": "failed", "log": f"{k}.csv", "error": "lost"})
-        gathered.add(UnitResult(rows, "arm", {"a.coulomb": "a.coulomb", "b.m": "b.m + 2 c.m"}))
+        gathered.add(UnitResult(rows))
     for k in (5, 6):
         row = {"unit": f"u{k}", "status": "done", "verdict": "good", "parameter": "b.m",
-               "parameter_unit": "kg", "value": 1.0, "std_error": 0.1}  # fmt: skip
-        gathered.add(UnitResult([row], "leg", {"b.m": "b.m"}))
-    gathered.add(UnitResult([{"unit": "u7", "status": "failed", "error": "bad"}], "", {}))
+               "parameter_unit": "kg", "value": 1.0, "std_error": 0.1, "robot": "leg",
+               "expression": "b.m"}  # fmt: skip
+        gathered.add(UnitResult([row]))
+    gathered.add(UnitResult([{"unit": "u7", "status": "failed", "error": "bad"}]))
     found = gathered.content(units)
     assert (found["units"], found["logs"], found["done"]) == (8, 36, 7)
     assert found["verdicts"] == {"usable": 3, "good": 4}
@@ -362,18 +399,20 @@ def test_a_distribution_is_of_the_values_with_the_interval_of_the_next_unit():
 def test_every_flag_reaches_the_units_and_their_workers(monkeypatch, capsys):
     heard = {}
 
-    def run(units, folder, *, plan):
-        heard.update(units=units, folder=folder, plan=plan)
+    def run(units, folder, *, plan, update):
+        heard.update(units=units, folder=folder, plan=plan, update=update)
         return {"done": 1}
 
     monkeypatch.setattr(fleet, "read_fleet", lambda *words: words)
     monkeypatch.setattr(fleet, "run_fleet", run)
     words = "fleet t.csv --urdf arm.urdf --job all.toml --out there --resume --json --workers 3"
+    words += " --update"
     assert main(words.split()) == 0
     assert heard["units"] == ("t.csv", "arm.urdf", "all.toml")
     assert heard["folder"] == "there"
-    assert (heard["plan"].workers, heard["plan"].resume) == (3, True)
+    assert (heard["plan"].workers, heard["plan"].resume, heard["update"]) == (3, True, True)
     assert main(["fleet", "t.csv", "--scheduler", "tcp://host:8786", "--json"]) == 0
     assert heard["units"] == ("t.csv", None, None)
     assert heard["plan"].scheduler == "tcp://host:8786"
+    assert (heard["plan"].resume, heard["update"]) == (False, False)
     assert capsys.readouterr().out == '{"done": 1}\n' * 2
