@@ -63,8 +63,9 @@ SERVOS = {
 }  # fmt: skip
 JOINTS = ("shoulder_lift_joint", "elbow_joint", "wrist_1_joint")
 WITHIN, BETWEEN = 0.05, 0.15  # spread of friction between runs, between robots
+SLIP = 0.05  # [rad] of the encoder of a joint in one log
 COMMON = 0.7  # correlation of frictions between robots
-KINDS = ("friction", "gain", "payload")
+KINDS = ("friction", "gain", "payload", "zero")
 
 
 def main():
@@ -278,11 +279,12 @@ def simulated(model, pi, rng, *, seconds=12.0, rate=60.0):
     return Log(t=t, q=q, v=v, a=a, tau=tau, joints=model.joints)
 
 
-def recorded(model, pi, rng, *, seconds=6.0, rate=200.0, gain=1.0, load=0.0):
+def recorded(model, pi, rng, *, seconds=6.0, rate=200.0, gain=1.0, load=0.0, slip=0.0):
     """Return the log of an arm that MuJoCo simulates at 0.1 ms, under a controller at 1 kHz.
 
     The controller reads encoders of 18 bits and holds its torque; the log has the encoders and the
-    torque with noise of 2 %, by ``gain`` too large at the elbow. The last link has a load [kg].
+    torque with noise of 2 %, by ``gain`` too large at the elbow. The last link has a load [kg]. In
+    the log, not in the controller, the encoder of the elbow has slipped [rad].
     """
     hold, step = 1e-3, 1e-4
     period = round(1.0 / (rate * hold))
@@ -306,7 +308,8 @@ def recorded(model, pi, rng, *, seconds=6.0, rate=200.0, gain=1.0, load=0.0):
         mujoco.mj_step(plant, state, steps)
     t, q, tau = map(np.array, zip(*rows, strict=True))
     tau = tau + 0.02 * np.std(tau, axis=0) * rng.standard_normal(tau.shape)
-    return Log(t=t, q=q, tau=tau * np.array([1.0, gain, 1.0]), joints=model.joints)
+    q, tau = q + np.array([0.0, slip, 0.0]), tau * np.array([1.0, gain, 1.0])
+    return Log(t=t, q=q, tau=tau, joints=model.joints)
 
 
 def quantised(q):
@@ -623,6 +626,8 @@ def unlike(count):
                 log = simulated(model, own, rng)
                 if run == 2 and kind == "gain":
                     log = replace(log, tau=log.tau * np.array([1.0, 1.15, 1.0]))
+                if run == 2 and kind == "zero":
+                    log = replace(log, q=log.q + np.array([0.0, SLIP, 0.0]))
                 logs.append(log)
             found = vary([str(k) for k in range(6)], groups(model, logs, ["a"] * 6)).unlike
             cause = {"friction": "drive"}.get(kind, kind)
@@ -704,7 +709,8 @@ def odd_fleets(count):
         right = wrong = none = 0
         for _ in range(count):
             own = plants.robot()
-            changed = {"gain": {"gain": 1.15}, "payload": {"load": 1.0}}.get(kind, {})
+            odd = {"gain": {"gain": 1.15}, "payload": {"load": 1.0}, "zero": {"slip": SLIP}}
+            changed = odd.get(kind, {})
             if kind == "friction":
                 own[plants.model.layout.names.index(f"{joint}.coulomb")] *= 3.0
             others = plants.rng.choice(len(pool), 4, replace=False)

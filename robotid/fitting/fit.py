@@ -30,6 +30,7 @@ from robotid.fitting.standard_errors import (
     standard_of,
     with_wls_errors,
 )
+from robotid.fitting.zeros import sums_with_zeros
 from robotid.regressor.factors import Factors, Reduction, join
 from robotid.regressor.memory import is_loaded
 from robotid.robot.prior import prior_spread
@@ -182,6 +183,9 @@ class Solved:
         if len(logs) < FEWEST_RUNS:
             return fit
         sums = sums_of(own.model, mapping, logs, self.standard, self.ground.rough.sigma)
+        noise, none = self.ground.noise, np.zeros(len(mapping.base_names))
+        shift = noise.shift if noise is not None and noise.is_corrected else none
+        sums = sums_with_zeros(sums, own, self.standard, shift)
         _, unit = np.unique([log.unit for log in own.fitted], return_inverse=True)
         runs = runs_of(own.model, mapping, self.standard, sums, unit, covariates_of(own))
         return replace(fit, sums=sums, runs=runs)
@@ -262,7 +266,8 @@ def sums_of_logs(
         [part.factors.without(shift) for part in parts if part.factors.rows.any()]
         for parts in recordings.reduce_logs()
     ]
-    return sums_of(model, mapping, logs, standard, sigma)
+    sums = sums_of(model, mapping, logs, standard, sigma)
+    return sums_with_zeros(sums, recordings, standard, shift)
 
 
 def _under_own_load(recordings: Recordings, choice: EstimatorSettings) -> Recordings:

@@ -163,7 +163,7 @@ class Recordings:
         """
         if self.is_in_memory:
             motions = [log.whole.trajectory for log in self.fitted]
-            return concatenate([self._problem(k, x, with_mass) for k, x in enumerate(motions)])
+            return concatenate([self.problem_of(k, x, with_mass) for k, x in enumerate(motions)])
 
         def problems() -> Iterator[Problem]:
             for piece in (piece for log in self.fitted for piece in log.pieces):
@@ -200,16 +200,26 @@ class Recordings:
                 rows used and their weights are those of the log.
             joined: Number of segments that are joined into one.
         """
-        return compress_segments(self._problem(k, motion), joined * self._length(k))
+        return compress_segments(self.problem_of(k, motion), joined * self.segment_length(k))
 
-    def _problem(self, k: int, motion: Trajectory, with_mass: bool = False) -> Problem:
-        """Return the weighted rows of a log in memory for a motion of the same length."""
+    def problem_of(self, k: int, motion: Trajectory, with_mass: bool = False) -> Problem:
+        """Return the weighted rows of a log in memory for a motion of the same length.
+
+        Args:
+            k: Index of the log in ``fitted``.
+            motion: Its motion, or another one of the same length.
+            with_mass: As of ``problem``.
+        """
         mask = self.fitted[k].whole.mask
         weight = mask if self.weights is None else mask * self.weights[k]
         return base_problem(self.model, self.mapping, motion, weight, with_mass=with_mass)
 
-    def _length(self, k: int) -> int:
-        """Return the samples of each segment of a log in memory."""
+    def segment_length(self, k: int) -> int:
+        """Return the samples of each segment of a log in memory.
+
+        Args:
+            k: Index of the log in ``fitted``.
+        """
         samples, count = len(self.fitted[k].whole.trajectory.t), -(-_SEGMENTS // len(self.fitted))
         shortest = round(_CORRELATIONS / independent_share(self.fitted[k].signals))
         if self.model.is_static:  # means of segments, not filtered
@@ -218,7 +228,7 @@ class Recordings:
 
     def _segments(self, k: int) -> Iterator[Reduction]:
         """Yield the reduction of each segment of a log in memory."""
-        motion, length = self.fitted[k].whole.trajectory, self._length(k)
+        motion, length = self.fitted[k].whole.trajectory, self.segment_length(k)
         for i, factors in enumerate(self.segments(k, motion)):
             part = motion.part(i * length, (i + 1) * length)
             yield Reduction(factors, part.squares, len(part.t))
@@ -226,4 +236,4 @@ class Recordings:
     def _whole(self, k: int) -> Iterator[Reduction]:
         """Yield the reduction of a log in memory."""
         motion = self.fitted[k].whole.trajectory
-        yield Reduction.of(self._problem(k, motion), motion)
+        yield Reduction.of(self.problem_of(k, motion), motion)

@@ -98,6 +98,8 @@ _REMEDY = {
     "out, or correct its torque",
     "drive": "Temperature, lubrication or the zero of a sensor may have changed: leave the log "
     "out, or use the interval of the next log",
+    "zero": "The encoder may have slipped, or been calibrated again: correct the positions of the "
+    "log, or leave it out",
 }
 
 _UNIT_REMEDY = {
@@ -107,14 +109,20 @@ _UNIT_REMEDY = {
     "alone",
     "drive": "Its drive may be worn, cold, or of another version: identify this robot alone, or "
     "use the interval of the next robot",
+    "zero": "Its encoder is calibrated otherwise: correct the positions of its logs, or identify "
+    "this robot alone",
 }
 
 
 def _words(found: UnlikeRun, others: str) -> str:
     """Return what differs in the log or unit, as text."""
     size = f"{found.value:.3g} +- {found.std_error:.2g}"
+    those = others.split(" ", 1)[1]
     if found.kind == "payload":
-        return f"{found.name} is {size} {found.unit} more than in the {others.split(' ', 1)[1]}"
+        return f"{found.name} is {size} {found.unit} more than in the {those}"
+    if found.kind == "zero":
+        sized = f"{found.value:+.3g} +- {found.std_error:.2g} {found.unit}"
+        return f"the positions of {found.where} differ by {sized} from those in the {those}"
     if found.kind == "gain":
         change = f"{100 * (found.value - 1):+.3g} +- {100 * found.std_error:.2g} %"
         return f"the torque of {found.where} differs from that of the fit by {change}"

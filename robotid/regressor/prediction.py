@@ -1,6 +1,7 @@
 """Torques predicted from parameter vectors, without the whole regressor in memory."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import TypeVar
 
 import numpy as np
 import pinocchio as pin
@@ -16,7 +17,9 @@ from robotid.regressor.constraints import without_forces
 from robotid.regressor.rows import BLOCK, COMPILED, InertialRows, TrajectoryRows, trajectory_rows
 from robotid.regressor.torque import joint_torque_regressor
 from robotid.robot.model import RobotModel
-from robotid.robot.torque_slopes import TorqueSlopes, torque_slopes
+from robotid.robot.torque_slopes import TorqueSlopes, position_slopes, torque_slopes
+
+SlopesT = TypeVar("SlopesT", Array, TorqueSlopes)
 
 __all__ = [
     "body_slopes",
@@ -246,10 +249,28 @@ def body_slopes(model: RobotModel, pi: Array, trajectory: Trajectory) -> TorqueS
         pi: Standard parameters, shape (p,), consistent or not.
         trajectory: N samples of q, v and a.
     """
+    return _of_consistent(torque_slopes, model, pi, trajectory)
+
+
+def body_slopes_by_position(model: RobotModel, pi: Array, trajectory: Trajectory) -> Array:
+    """Return the derivatives of the bodies' torque by the positions, shape (N, n, n).
+
+    Args:
+        model: As of ``body_slopes``.
+        pi: Likewise.
+        trajectory: Likewise.
+    """
+    return _of_consistent(position_slopes, model, pi, trajectory)
+
+
+def _of_consistent(
+    slopes: Callable[..., SlopesT], model: RobotModel, pi: Array, trajectory: Trajectory
+) -> SlopesT:
+    """Return derivatives for consistent bodies, or the difference of those of two sets of these."""
     added = _consistent_addition(model, pi)
     state = trajectory.q, trajectory.v, trajectory.a
-    slopes = torque_slopes(model, pi + added, *state)
-    return slopes - torque_slopes(model, added, *state) if added.any() else slopes
+    found = slopes(model, pi + added, *state)
+    return found - slopes(model, added, *state) if added.any() else found
 
 
 def _consistent_addition(model: RobotModel, pi: Array) -> Array:

@@ -3,8 +3,8 @@
 The drive terms of each drive, the gain of each joint's torque signal, and a payload on the last
 link are three kinds of groups with the same form: columns B in base parameters, and the rows that
 they act on. The torque of a run is W (theta + B x) with theta of the fit to all runs and x of the
-group in this run. One group is estimated with the others
-at theta.
+group in this run. The zero of each joint's position has no columns: its rows are the derivatives of
+the torque by the position. One group is estimated with the others at theta.
 """
 
 from collections.abc import Mapping, Sequence
@@ -26,9 +26,12 @@ __all__ = [
     "Group",
     "RunSums",
     "RunsOf",
+    "columns_of",
+    "groups_at",
     "inflation_of",
     "runs_of",
     "sums_of",
+    "with_zeros",
 ]
 
 #: Smallest number of runs whose scatter is estimated.
@@ -37,6 +40,7 @@ _DRIVE = 0.1  # plausible standard deviation of a drive term, over the drive's t
 _GAIN = 0.02  # ... of a gain
 _MASS = 0.01  # ... of the mass on the last link, over the mass of the robot
 _REACH = 0.1  # [m] ... of its centre of mass
+_ZERO = {"rad": 0.005, "m": 0.001}  # ... of the zero of a position
 _PAYLOAD = ("m", "mcx", "mcy", "mcz")
 _SMALLEST = 0.01  # torque of a drive over that of its largest term below which this share counts
 _RANK = 1e-9  # eigenvalue over the largest below which a run does not determine a direction
@@ -49,11 +53,11 @@ class Group:
     """Parameters that vary together.
 
     Attributes:
-        kind: "drive", "gain" or "payload".
+        kind: "drive", "gain", "payload" or "zero".
         name: Name of the drive, joint or link.
         parameters: Their names, q items.
         units: Their units, q items.
-        columns: B, shape (b, q).
+        columns: B, shape (b, q); 0 for a zero.
         rows: The joints whose torque they change, indices.
     """
 
@@ -113,7 +117,7 @@ class RunSums:
     """Sums over the rows of k runs; those of new runs are added without the rows of the others.
 
     The rows are A = W B of the Q parameters of all groups, in their order, and the residuals
-    r = tau - W theta, over the noise level of their joint.
+    r = tau - W theta, over the noise level of their joint. Zeros are last: see ``with_zeros``.
 
     Attributes:
         H: A^T A of each run, shape (k, Q, Q). A pair of groups counts the joints of both.
@@ -177,13 +181,39 @@ def sums_of(
         standard: Standard parameters of the residual, shape (p,).
         sigma: Noise level per joint, shape (n,) [N m or N].
     """
-    theta, groups = mapping.to_base(standard), [g for g, _ in _groups(model, mapping, standard)]
+    theta, groups = mapping.to_base(standard), [g for g, _ in groups_at(model, mapping, standard)]
     products = [_products(run, groups, theta, sigma) for run in segments]
     scatter = [
         _scatter([(H[:, own, own], g[:, own]) for H, g in products]) for own in _places(groups)
     ]
     H, h = (np.array([each[k].sum(axis=0) for each in products]) for k in (0, 1))
     return RunSums(H, h, np.array(scatter), sigma)
+
+
+def with_zeros(
+    sums: RunSums, groups: Sequence[Group], rows: Sequence[Sequence[tuple[Array, Array, Array]]]
+) -> RunSums:
+    """Return sums with those over the rows of the zeros of the positions.
+
+    Args:
+        sums: The sums of k runs, in which they are 0.
+        groups: All groups, as of ``groups_at``, those of the zeros last.
+        rows: Of each run and segment, over N samples with n rows each, divided by the noise level:
+            A of the other groups, shape (N n, Q - z), that of the z zeros, (N n, z), and r, (N n,).
+    """
+    H, h, scatter = sums.H.copy(), sums.h.copy(), sums.scatter.copy()
+    z = sum(group.kind == "zero" for group in groups)
+    own, others = slice(H.shape[1] - z, None), slice(0, H.shape[1] - z)
+    parts = [[(D.T @ D, D.T @ r) for _, D, r in run] for run in rows]
+    for k, run in enumerate(rows):
+        H[k, own, own] = sum(D_D for D_D, _ in parts[k])
+        h[k, own] = sum(D_r for _, D_r in parts[k])
+        H[k, others, own] = sum(A.T @ D for A, D, _ in run)
+    H[:, own, others] = H[:, others, own].transpose(0, 2, 1)
+    for j in range(z):
+        each = [np.array([(D_D[j, j], D_r[j]) for D_D, D_r in run]) for run in parts]
+        scatter[len(groups) - z + j] = _scatter([(x[:, :1, None], x[:, 1:]) for x in each])
+    return RunSums(H, h, scatter, sums.sigma)
 
 
 def runs_of(
@@ -204,7 +234,7 @@ def runs_of(
         unit: Index of the robot of each run, shape (k,), int, from 0.
         covariates: Quantities of the runs by drive.
     """
-    every = _groups(model, mapping, standard)
+    every = groups_at(model, mapping, standard)
     places = _places([group for group, _ in every])
     kept = [k for k, own in enumerate(places) if sums.H[:, own, own].any()]  # some run has effects
     columns = np.concatenate([np.r_[places[k]] for k in kept]) if kept else np.empty(0, dtype=int)
@@ -226,8 +256,16 @@ def _places(groups: Sequence[Group]) -> list[slice]:
     return [slice(end - g.columns.shape[1], end) for g, end in zip(groups, ends, strict=True)]
 
 
-def _groups(model: RobotModel, mapping: BaseMapping, standard: Array) -> list[tuple[Group, Array]]:
-    """Return the groups and their values in the fit."""
+def groups_at(
+    model: RobotModel, mapping: BaseMapping, standard: Array
+) -> list[tuple[Group, Array]]:
+    """Return the groups and their values in the fit.
+
+    Args:
+        model: The robot.
+        mapping: Standard to base parameters.
+        standard: Standard parameters of the fit, shape (p,).
+    """
     layout, base = model.layout, mapping.base_names
     rows = tuple(range(model.n_rows))
     eye, found = np.eye(len(base)), []
@@ -251,7 +289,13 @@ def _groups(model: RobotModel, mapping: BaseMapping, standard: Array) -> list[tu
     names = tuple(f"{link}.{term}" for term in _PAYLOAD)
     columns = mapping.K[:, [places[name] for name in names]]
     payload = Group("payload", link, names, tuple(units[n] for n in names), columns, rows)
-    return [*found, (payload, np.zeros(len(names)))]
+    found.append((payload, np.zeros(len(names))))
+    if not (model.constraints or model.free_flyer):
+        for joint in layout.joints:
+            unit, none = "m" if joint in layout.prismatic else "rad", np.zeros((len(base), 1))
+            zero = Group("zero", joint, (f"{joint}.zero",), (unit,), none, rows)
+            found.append((zero, np.zeros(1)))
+    return found
 
 
 def _products(
@@ -262,9 +306,7 @@ def _products(
     A of a group is 0 in rows of joints that it does not act on. Rows are divided by the noise level
     of their joint.
     """
-    B = np.hstack([group.columns for group in groups])
-    acts = np.array([[j in g.rows for g in groups] for j in range(len(sigma))])
-    acts = np.repeat(acts, [group.columns.shape[1] for group in groups], axis=1)
+    B, acts = columns_of(groups, len(sigma))
     H, g = np.zeros((len(segments), B.shape[1], B.shape[1])), np.zeros((len(segments), B.shape[1]))
     for k, segment in enumerate(segments):
         for j, level in enumerate(sigma):
@@ -273,6 +315,18 @@ def _products(
             H[k] += A.T @ A
             g[k] += A.T @ (R[:, -1] - R[:, :-1] @ theta[own])
     return H, g
+
+
+def columns_of(groups: Sequence[Group], n_rows: int) -> tuple[Array, Array]:
+    """Return B of all groups, shape (b, Q), and in which of a sample's rows each acts, (n_rows, Q).
+
+    Args:
+        groups: The groups.
+        n_rows: Number of rows of a sample.
+    """
+    sizes = [group.columns.shape[1] for group in groups]
+    acts = np.array([[j in group.rows for group in groups] for j in range(n_rows)])
+    return np.hstack([group.columns for group in groups]), np.repeat(acts, sizes, axis=1)
 
 
 def inflation_of(runs: Sequence[tuple[Array, Array]]) -> float:
@@ -311,6 +365,8 @@ def _scale(group: Group, centre: Array, H: Array, model: RobotModel, standard: A
     """
     if group.kind == "gain":
         return np.array([_GAIN])
+    if group.kind == "zero":
+        return np.array([_ZERO[group.units[0]]])
     if group.kind == "payload":
         mass = _MASS * float(standard[: model.layout.n_inertial : 10].sum())
         return mass * np.array([1.0, _REACH, _REACH, _REACH])

@@ -100,11 +100,11 @@ class UnlikeRun:
 
     Attributes:
         run: Index of the run, or of the unit.
-        kind: "drive", "gain" or "payload".
+        kind: "drive", "gain", "payload" or "zero".
         where: Drive, joint or link.
         name: The parameter that differs most.
         unit: Its unit.
-        value: Its value in this run; of a payload, more than in the other runs.
+        value: Its value in this run; of a payload and a zero, more than in the other runs.
         std_error: Its standard error.
         ends: 95 % prediction interval from the other runs, shape (2,).
         probability: Probability of such a deviation, before the number of tests is counted.
@@ -350,7 +350,7 @@ def _unlike(
         expected = others[best].predict(variance, x, is_unit=is_unit)
         p, group = int(np.argmin([each.probability for each in expected])), groups[best]
         centre = float(group.centre[p])
-        if group.group.kind == "payload":  # relative to the other runs
+        if group.group.kind in ("payload", "zero"):  # relative to the other runs
             centre = -expected[p].mean
         unlike.append(UnlikeRun(
             at, group.group.kind, group.group.name, group.group.parameters[p],

@@ -8,7 +8,12 @@ from robotid.exceptions import DataError
 from robotid.regressor import prediction
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.columns import friction_speeds
-from robotid.regressor.prediction import body_slopes, predict, predict_instants
+from robotid.regressor.prediction import (
+    body_slopes,
+    body_slopes_by_position,
+    predict,
+    predict_instants,
+)
 from robotid.regressor.torque import joint_torque_regressor
 from robotid.robot.drives import Lag, LoadFriction, Presliding, Stribeck
 from robotid.robot.examples import example_urdf
@@ -79,6 +84,7 @@ def test_slopes_of_bodies_that_are_none_are_those_of_differences(ur5, rng):
     pi = ur5.standard_parameters()
     pi[10:20] = [-0.5, 0.3, -0.2, 0.5, 0.1, 0.0, 0.2, 0.0, 0.0, 0.1]
     found = body_slopes(ur5, pi, m)
+    np.testing.assert_allclose(body_slopes_by_position(ur5, pi, m), found.by_q, atol=1e-9)
     state = (m.q, m.v, m.a)
     for k, slope in enumerate((found.by_q, found.by_v, found.by_a)):
         for j in range(n):

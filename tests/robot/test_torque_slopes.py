@@ -7,7 +7,7 @@ from helpers.synthetic import truth
 
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
-from robotid.robot.torque_slopes import torque_slopes
+from robotid.robot.torque_slopes import position_slopes, torque_slopes
 
 ROBOTS = {
     "in another order": (
@@ -48,6 +48,7 @@ def test_slopes_are_those_of_differences_by_motion_and_gravity(case):
     model, pi, q, v, a = case
     found = torque_slopes(model, pi, q, v, a)
     n = len(model.joints)
+    np.testing.assert_allclose(position_slopes(model, pi, q, v, a), found.by_q, atol=1e-10)
     assert [x.shape for x in found.arrays] == [(4, n, n)] * 3 + [(4, n, 3), (4, n, n, 3)]
 
     def close(slope, up, down):

@@ -10,11 +10,20 @@ from helpers.synthetic import truth
 from robotid.fitting.fit import solve_recordings
 from robotid.fitting.recordings import Recordings
 from robotid.fitting.survey import hold_log
+from robotid.fitting.zeros import sums_with_zeros
 from robotid.judgement.unlike_runs import unlike_findings
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.model import RobotModel
 from robotid.variation import variation
-from robotid.variation.groups import Group, RunsOf, _groups, inflation_of, runs_of, sums_of
+from robotid.variation.groups import (
+    Group,
+    RunsOf,
+    columns_of,
+    groups_at,
+    inflation_of,
+    runs_of,
+    sums_of,
+)
 from robotid.variation.mixed_effects import MixedEffects, Runs
 from robotid.variation.variation import (
     UnlikeRun,
@@ -72,6 +81,65 @@ def scaled(log, joint, factor):
     tau = log.tau.copy()
     tau[:, joint] *= factor
     return type(log)(**{**vars(log), "tau": tau})
+
+
+def slipped(log, joint, size):
+    """Return a log whose encoder has slipped."""
+    q = log.q.copy()
+    q[:, joint] += size
+    return type(log)(**{**vars(log), "q": q})
+
+
+def test_rows_of_zeros_are_differences_of_the_torque(model):
+    """Two logs with noise levels by joint, rows that are left out, weights and a shift."""
+    logs, base = segments_of(model, noise=0.02, seed=4)
+    own = recordings(model, [logs[0], logs[1]])
+    own.fitted[0].whole.mask[::3, 1] = False
+    weights = [1.0 + np.arange(log.whole.mask.size).reshape(log.whole.mask.shape) % 3
+               for log in own.fitted]  # fmt: skip
+    own, sigma = replace(own, weights=tuple(weights)), np.array([1.0, 2.0, 5.0])
+    shift = 0.01 * own.mapping.to_base(base)
+    segments = [
+        [part.without(shift) for part in own.segments(k, log.whole.trajectory)]
+        for k, log in enumerate(own.fitted)
+    ]
+    plain = sums_of(model, own.mapping, segments, base, sigma)
+    found = sums_with_zeros(plain, own, base, shift)
+    groups = [group for group, _ in groups_at(model, own.mapping, base)]
+    assert [(g.name, g.units) for g in groups[-3:]] == [(j, ("rad",)) for j in model.joints]
+    B, acts = (x[:, :-3] for x in columns_of(groups, 3))
+    h, parts = 1e-6, [[] for _ in model.joints]
+    for k, log in enumerate(own.fitted):
+        motion, w = log.whole.trajectory, (log.whole.mask * weights[k] / sigma**2).ravel()
+        W = regressor_rows(own, motion)
+        D = np.stack([
+            (regressor_rows(own, replace(motion, q=motion.q - h * e))
+             - regressor_rows(own, replace(motion, q=motion.q + h * e))) / (2 * h)
+            @ own.mapping.to_base(base) for e in np.eye(3)
+        ], 1)  # fmt: skip
+        r = motion.tau.ravel() - W @ (own.mapping.to_base(base) + shift)
+        A = (W @ B) * np.tile(acts, (len(motion.t), 1))
+        cuts = np.arange(own.segment_length(k) * 3, len(r), own.segment_length(k) * 3)
+        for j, part in enumerate(parts):
+            x = [(w * D[:, j] * y) for y in (D[:, j], r)]
+            H, g = ([each.sum() for each in np.split(y, cuts)] for y in x)
+            part.append((np.array(H)[:, None, None], np.array(g)[:, None]))
+        near = {"rtol": 1e-5, "atol": 1e-5 * np.abs(found.H[k]).max()}
+        np.testing.assert_allclose(found.H[k, -3:, -3:], D.T @ (w[:, None] * D), **near)
+        np.testing.assert_allclose(found.H[k, :-3, -3:], A.T @ (w[:, None] * D), **near)
+        np.testing.assert_allclose(found.H[k], found.H[k].T, rtol=1e-12)
+        np.testing.assert_allclose(found.h[k, -3:], D.T @ (w * r), rtol=1e-4)
+        np.testing.assert_allclose(found.H[k, :-3, :-3], plain.H[k, :-3, :-3], rtol=0)
+        np.testing.assert_allclose(found.h[k, :-3], plain.h[k, :-3], rtol=0)
+    np.testing.assert_allclose(found.scatter[:-3], plain.scatter[:-3], rtol=0)
+    for j in range(3):
+        wanted = inflation_of(parts[j])
+        assert found.scatter[j - 3, 0] / found.scatter[j - 3, 1] == pytest.approx(wanted, rel=1e-4)
+
+
+def regressor_rows(own, motion):
+    problem = own.problem_of(0, motion)
+    return np.vstack([W for W, _, _ in problem.blocks()])
 
 
 def test_each_run_tells_its_own_drives_gain_and_payload(model):
@@ -166,6 +234,7 @@ def test_rows_are_divided_by_the_noise_of_their_joint(model):
     ("drive", LIFT, f"{LIFT}.coulomb", 7.0),
     ("gain", ELBOW, f"{ELBOW}.gain", 1.12),
     ("payload", "wrist_1_link", "wrist_1_link.m", 0.8),
+    ("zero", ELBOW, f"{ELBOW}.zero", 0.06),
     ("none", "", "", 0.0),
 ])  # fmt: skip
 def test_the_run_that_differs_is_named_with_its_cause(model, kind, where, name, value):
@@ -175,6 +244,8 @@ def test_the_run_that_differs_is_named_with_its_cause(model, kind, where, name, 
     logs, _ = segments_of(model, {3: change}, seed=1)
     if kind == "gain":
         logs[3] = scaled(logs[3], 1, value)
+    if kind == "zero":
+        logs[3] = slipped(logs[3], 1, value)
     fit = solve_recordings(recordings(model, logs), FIT).with_errors()
     variation = vary(NAMES, fit.runs)
     assert variation.runs == tuple(NAMES)
@@ -189,6 +260,13 @@ def test_the_run_that_differs_is_named_with_its_cause(model, kind, where, name, 
     if kind == "payload":
         assert found.name == name
         assert found.value == pytest.approx(value, abs=0.1)
+    if kind == "zero":
+        assert (found.name, found.unit) == (name, "rad")
+        assert found.value == pytest.approx(value, abs=0.006)
+        (finding,) = unlike_findings(variation)
+        said = f"differ by {value:+.1g}"[:-1]
+        assert f"run_3.csv: the positions of {ELBOW} {said}" in finding.message
+        assert "rad from those in the other logs; 5 other logs predict -0.0" in finding.message
     assert not found.ends[0] < found.value < found.ends[1]
     assert found.probability < 0.02 / 100
 
@@ -288,7 +366,7 @@ def test_spreads_are_stated_between_units_and_within_them():
 
 def test_gains_are_of_the_rows_of_joints_behind_those_of_a_floating_base():
     free = RobotModel.from_urdf(arm().tree.path, joints=(LIFT, ELBOW), free_flyer=True)
-    groups = _groups(free, structural_mapping(free), free.standard_parameters())
+    groups = groups_at(free, structural_mapping(free), free.standard_parameters())
     gains = {group.name: group.rows for group, _ in groups if group.kind == "gain"}
     assert gains == {LIFT: (6,), ELBOW: (7,)}
     assert gains == {joint: (free.row_names.index(joint),) for joint in (LIFT, ELBOW)}
