@@ -1,4 +1,4 @@
-"""Rows of the zeros of the positions: what a log tells about a joint whose encoder has slipped."""
+"""Rows of the zeros of the positions: the information of a log about an encoder that slips."""
 
 import numpy as np
 
@@ -35,8 +35,8 @@ def sums_with_zeros(
         motion = log.whole.trajectory
         slopes = body_slopes_by_position(model, standard, motion).reshape(-1, z)
         parts, size = [], recordings.segment_length(k) * model.n_rows
-        A, r, scale = np.empty((len(slopes), B.shape[1])), *np.empty((2, len(slopes)))
-        start = 0
+        A, start = np.empty((len(slopes), B.shape[1])), 0
+        r, scale = np.empty((2, len(slopes)))
         for W, tau, weight in recordings.problem_of(k, motion).blocks():
             rows = slice(start, start + len(tau))
             scale[rows] = np.sqrt(weight) / np.resize(sums.sigma, len(tau))
