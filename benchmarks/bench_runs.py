@@ -63,7 +63,7 @@ SERVOS = {
 }  # fmt: skip
 JOINTS = ("shoulder_lift_joint", "elbow_joint", "wrist_1_joint")
 WITHIN, BETWEEN = 0.05, 0.15  # spread of friction between runs, between robots
-SLIP = 0.05  # [rad] of the encoder of a joint in one log
+SLIP = 0.1  # [rad] of the encoder of a joint in one log, or of one robot
 COMMON = 0.7  # correlation of frictions between robots
 KINDS = ("friction", "gain", "payload", "zero")
 

@@ -41,6 +41,7 @@ _GAIN = 0.02  # ... of a gain
 _MASS = 0.01  # ... of the mass on the last link, over the mass of the robot
 _REACH = 0.1  # [m] ... of its centre of mass
 _ZERO = {"rad": 0.005, "m": 0.001}  # ... of the zero of a position
+_LEVER = 0.005  # ... and its torque over that of its joint, at least
 _PAYLOAD = ("m", "mcx", "mcy", "mcz")
 _SMALLEST = 0.01  # torque of a drive over that of its largest term below which this share counts
 _RANK = 1e-9  # eigenvalue over the largest below which a run does not determine a direction
@@ -238,11 +239,18 @@ def runs_of(
     places = _places([group for group, _ in every])
     kept = [k for k, own in enumerate(places) if sums.H[:, own, own].any()]  # some run has effects
     columns = np.concatenate([np.r_[places[k]] for k in kept]) if kept else np.empty(0, dtype=int)
+    squares = np.einsum("kqq->q", sums.H)
+    of_gains = {group.name: squares[own].item()
+                for (group, _), own in zip(every, places, strict=True) if group.kind == "gain"}  # fmt: skip
     found = []
     for k in kept:
         (group, centre), own = every[k], places[k]
         H, inflation = sums.H[:, own, own], _ratio(*sums.scatter[k])
-        scale = _scale(group, centre, H.sum(axis=0), model, standard)
+        if group.kind == "zero":
+            like_gain = np.sqrt(of_gains[group.name] / squares[own])
+            scale = np.maximum(_ZERO[group.units[0]], _LEVER * like_gain)
+        else:
+            scale = _scale(group, centre, H.sum(axis=0), model, standard)
         runs = Runs(H / inflation, sums.h[:, own] / inflation, unit, scale)
         of_drive = covariates.get(group.name, ()) if group.kind == "drive" else ()
         across = sums.H[:, own][:, :, columns]
@@ -365,8 +373,6 @@ def _scale(group: Group, centre: Array, H: Array, model: RobotModel, standard: A
     """
     if group.kind == "gain":
         return np.array([_GAIN])
-    if group.kind == "zero":
-        return np.array([_ZERO[group.units[0]]])
     if group.kind == "payload":
         mass = _MASS * float(standard[: model.layout.n_inertial : 10].sum())
         return mass * np.array([1.0, _REACH, _REACH, _REACH])

@@ -137,6 +137,30 @@ def test_rows_of_zeros_are_differences_of_the_torque(model):
         assert found.scatter[j - 3, 0] / found.scatter[j - 3, 1] == pytest.approx(wanted, rel=1e-4)
 
 
+@pytest.mark.parametrize("light", [1.0, 1e-3])
+def test_a_plausible_zero_changes_the_torque_of_its_joint_by_half_a_percent(model, light):
+    logs, base = segments_of(model, noise=0.02, spread=0.0, seed=5)
+    own = recordings(model, logs[:3])
+    segments = [own.segments(k, log.whole.trajectory) for k, log in enumerate(own.fitted)]
+    sums = sums_of(model, own.mapping, segments, base, np.ones(3))
+    sums = sums_with_zeros(sums, own, base, np.zeros(len(own.mapping.base_names)))
+    H = sums.H.copy()
+    H[:, -1] /= light
+    H[:, :, -1] /= light
+    found = {
+        (g.group.kind, g.group.name): g
+        for g in runs_of(model, own.mapping, base, replace(sums, H=H), np.zeros(3, int))
+    }
+    for joint in model.joints:
+        of_gain, of_zero = (
+            (found[kind, joint].runs.H * found[kind, joint].inflation).sum()
+            for kind in ("gain", "zero")
+        )
+        wanted = max(0.005, 0.005 * np.sqrt(of_gain / of_zero))
+        assert found["zero", joint].runs.scale == pytest.approx([wanted])
+    assert (found["zero", model.joints[2]].runs.scale.item() == 0.005) == (light < 1)
+
+
 def regressor_rows(own, motion):
     problem = own.problem_of(0, motion)
     return np.vstack([W for W, _, _ in problem.blocks()])
@@ -180,6 +204,8 @@ def test_scales_are_a_tenth_of_the_drive_and_a_hundredth_of_the_robot(model):
     assert drive.runs.scale == pytest.approx(0.1 * torque / np.sqrt(np.diag(H)))
     assert found["gain", ELBOW].runs.scale == pytest.approx([0.02])
     mass = 0.01 * sum(base[at(model, f"{body}.m")] for body in model.layout.bodies)
+    # zeros: none are computed here
+    assert not any(kind == "zero" for kind, _ in found)
     payload = found["payload", "wrist_1_link"].runs.scale
     assert payload == pytest.approx([mass, 0.1 * mass, 0.1 * mass, 0.1 * mass])
 
