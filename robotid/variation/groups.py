@@ -241,7 +241,8 @@ def runs_of(
     columns = np.concatenate([np.r_[places[k]] for k in kept]) if kept else np.empty(0, dtype=int)
     squares = np.einsum("kqq->q", sums.H)
     of_gains = {group.name: squares[own].item()
-                for (group, _), own in zip(every, places, strict=True) if group.kind == "gain"}  # fmt: skip
+                for (group, _), own in zip(every, places, strict=True)
+                if group.kind == "gain"}  # fmt: skip
     found = []
     for k in kept:
         (group, centre), own = every[k], places[k]
