@@ -22,6 +22,8 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("result", metavar="RESULT.json")
     add("logs", nargs="+", metavar="LOG")
+    words = "temperature of the drives [degC], where it has an effect; default: that in each log"
+    add("--temperature", metavar="DEGC", type=float, help=words)
     add_json(parser)
 
 
@@ -33,7 +35,8 @@ def run(options: argparse.Namespace) -> None:
     """
     from robotid.commands.validate import validate_result
 
-    show_found(validate_result(options.result, options.logs), options, _show)
+    found = validate_result(options.result, options.logs, temperature=options.temperature)
+    show_found(found, options, _show)
 
 
 def _show(found: dict[str, Any]) -> None:
@@ -43,7 +46,10 @@ def _show(found: dict[str, Any]) -> None:
     for recording in found["validation"]:
         echo(f"\n{recording['name']}", "  ")
         print("\n".join(error_lines(recording, width=terminal_width())))
-        if expected := recording.get("expected"):
+        expected = recording.get("expected", {})
+        if "missing" in expected:
+            echo(f"no expected rmse: {expected['missing']}", "  ")
+        elif expected:
             source = "fit and spread between logs" if expected["with_spread"] else "fit"
             own = [
                 f"{joint} {each['rmse']:.3g} ({each['within_95_pct']:.0f} %)"

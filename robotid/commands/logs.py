@@ -44,6 +44,7 @@ __all__ = [
     "needed_of",
     "survey_logs",
     "units_of_logs",
+    "warmed",
 ]
 
 _PIECES = 8  # pieces per rows in memory: the filter of a piece needs memory of its own
@@ -93,9 +94,7 @@ def survey_logs(
                     raise found
                 window = entry.start, entry.end
                 log = survey_log(*found, model, job.signals, window, length=length)
-                if entry.temperature is not None:
-                    log = replace(log, temperature=dict.fromkeys(model.joints, entry.temperature))
-                logs.append(replace(log, unit=entry.unit or "", time=hours[entry]))
+                logs.append(replace(warmed(log, entry), unit=entry.unit or "", time=hours[entry]))
             except DataError as error:
                 if refuse is None:
                     raise
@@ -103,6 +102,18 @@ def survey_logs(
         return tuple(logs)
 
     return tuple(survey(entries) for entries in groups)
+
+
+def warmed(log: SurveyedLog, entry: LogEntry) -> SurveyedLog:
+    """Return a log with the temperature that is stated for all its drives, if any.
+
+    Args:
+        log: The log.
+        entry: What states it.
+    """
+    if entry.temperature is None:
+        return log
+    return replace(log, temperature=dict.fromkeys(log.model.joints, entry.temperature))
 
 
 def units_of_logs(entries: Sequence[LogEntry]) -> list[str]:

@@ -8,13 +8,14 @@ import numpy as np
 
 from robotid._files import file_sha256
 from robotid.commands.job import Job, LogEntry
-from robotid.commands.logs import result_run
-from robotid.exceptions import DataError
+from robotid.commands.logs import result_run, warmed
+from robotid.exceptions import DataError, SettingsError
 from robotid.export.entries import build_preview
 from robotid.export.result import load_result, stated_between
 from robotid.fitting.survey import SurveyedLog, survey_log
 from robotid.identification.previews import preview_logs
 from robotid.robot.model import RobotModel
+from robotid.variation.covariates import at_temperature, drive_temperatures
 
 __all__ = ["preview_job"]
 
@@ -25,6 +26,7 @@ def preview_job(
     *,
     noise: Mapping[str, float] | None = None,
     correlation: float | None = None,
+    temperature: float | None = None,
 ) -> dict[str, Any]:
     """Preview the logs of a job from their positions alone.
 
@@ -36,12 +38,15 @@ def preview_job(
         given: A result.json, or its folder; its settings for reading logs are then used.
         noise: Standard deviation of the torque noise by joint [N m or N].
         correlation: As of ``preview_logs``.
+        temperature: Temperature of the drives in the motions [degC], where it has an effect by the
+            given result; None: that stated for each motion, or the mean of its own columns.
 
     Returns:
         The output of ``robotid preview --json``.
 
     Raises:
-        DataError: If a motion is not usable, or a log of the result is missing.
+        DataError: If a motion is not usable, a log of the result is missing, or the temperature has
+            no effect or is far outside that of these logs.
         ModelError: If the URDF is not usable.
         SettingsError: If a setting is not usable.
     """
@@ -49,16 +54,25 @@ def preview_job(
     if not job.identification:
         raise DataError("no motion is given, wanted at least one to preview")
     if given is None:
+        if temperature is not None:
+            raise SettingsError("the temperature has an effect by a given result; state it, too")
         model = job.model()
         motions = _motions(job, model, job.identification)
         return build_preview(preview_logs(model, motions, job.estimator, **stated))
     job, fitted, model, run = result_run(job, given)
     result = load_result(given).content
+    if temperature is not None:  # raises if it has no effect
+        at_temperature(result.get("variation", {}), temperature)
     hashes = {entry["sha256"] for entry in result["inputs"] if entry["role"] == "identification"}
     if not any(file_sha256(entry.path) in hashes for entry in job.identification):
         motions = _motions(job, model, job.identification)
         found = preview_logs(model, motions, job.estimator, run=run, **stated)
-        return build_preview(replace(found, between=stated_between(result, model)))
+        drives = model.layout.drives
+        warm = [drive_temperatures(drives, log.temperature) for log in motions]
+        if temperature is not None:
+            warm = [dict.fromkeys((drive.name for drive in drives), temperature)] * len(motions)
+        between = [stated_between(result, model, each) for each in warm]
+        return build_preview(replace(found, between=tuple(between)))
     motions = _motions(job, model, fitted)
     alone = preview_logs(model, motions, job.estimator, like=run, **stated)
     return _with_achieved(build_preview(alone), result)
@@ -70,7 +84,8 @@ def _motions(job: Job, model: RobotModel, entries: Sequence[LogEntry]) -> list[S
     for entry in entries:
         layout, table = job.lay_out(entry, model, needs="motion")
         window = entry.start, entry.end
-        found.append(survey_log(layout, table, model, job.signals, window, length=None))
+        log = survey_log(layout, table, model, job.signals, window, length=None)
+        found.append(warmed(log, entry))
     return found
 
 

@@ -13,6 +13,7 @@ from robotid.closed_loop.evaluation import OpenLoop, position_metrics
 from robotid.commands.job import Job, LogEntry, job_from_settings
 from robotid.commands.logs import log_of_commands, survey_logs
 from robotid.doctor.diagnosis import diagnose
+from robotid.exceptions import DataError
 from robotid.export.entries import recording_metrics
 from robotid.export.loops import open_loop_entry
 from robotid.export.result import (
@@ -41,11 +42,14 @@ from robotid.judgement.verdict import Verdict, VerdictWarning, blocking, judge, 
 from robotid.logs.data import Log
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.model import RobotModel
+from robotid.variation.covariates import at_temperature, drive_temperatures
 
 __all__ = ["validate_result"]
 
 
-def validate_result(path: str | Path, logs: Sequence[str | Path]) -> dict[str, Any]:
+def validate_result(
+    path: str | Path, logs: Sequence[str | Path], *, temperature: float | None = None
+) -> dict[str, Any]:
     """Compute the prediction error of a written result on other logs.
 
     If the result has a URDF, the prediction uses that file and its sidecar, as a user does. The
@@ -54,12 +58,16 @@ def validate_result(path: str | Path, logs: Sequence[str | Path]) -> dict[str, A
     Args:
         path: A result.json.
         logs: Logs of the same robot.
+        temperature: Temperature of the drives in the logs [degC], at which the error is expected
+            where it has an effect; None: the mean of each log's own columns, or any temperature of
+            the fitted logs if it has none.
 
     Returns:
         {"result", "predicted_with", "validation": [...], "verdict": {...}}, as in result.json.
 
     Raises:
-        DataError: If the result or a log is not usable.
+        DataError: If the result or a log is not usable, or the stated temperature has no effect or
+            is far outside that of the fitted logs.
         ModelError: If the URDF is missing or was changed.
         SettingsError: If the settings in the result are not usable.
     """
@@ -67,6 +75,8 @@ def validate_result(path: str | Path, logs: Sequence[str | Path]) -> dict[str, A
     result = loaded.content
     settings = {key: value for key, value in result["settings"].items() if value != {}}
     job = job_from_settings(settings, Path(path).name, Path())
+    if temperature is not None:  # raises if it has no effect
+        at_temperature(result.get("variation", {}), temperature)
     if "simulation" in result:
         return _validate_commands(loaded, job, [LogEntry(Path(log)) for log in logs])
     source = stated_model(result, job.model())
@@ -85,24 +95,40 @@ def validate_result(path: str | Path, logs: Sequence[str | Path]) -> dict[str, A
         "result": str(path),
         "predicted_with": result["outputs"].get("urdf", "base parameters of result.json"),
         "validation": [
-            recording_metrics(e, "estimate") | _expected(result, model, e) for e in evaluations
+            recording_metrics(e, "estimate")
+            | _expected(
+                result,
+                model,
+                e,
+                drive_temperatures(model.layout.drives, log.temperature)
+                if temperature is None
+                else temperature,
+            )
+            for e, log in zip(evaluations, surveyed, strict=True)
         ],
         "verdict": verdict.to_dict(),
     }
 
 
 def _expected(
-    result: Mapping[str, Any], model: RobotModel, evaluation: Evaluation
+    result: Mapping[str, Any],
+    model: RobotModel,
+    evaluation: Evaluation,
+    temperature: float | Mapping[str, float],
 ) -> dict[str, Any]:
     """Return the expected torque error of a log by the result, and how often it is within 95 %.
 
     The error has the uncertainty of the parameters, the spread of the drives between logs, if three
-    or more were fitted, and the residual of the fit.
+    or more were fitted, the effect of the temperature, as of ``at_temperature``, and the residual
+    of the fit.
     """
     covariance = stated_covariance(result, model.layout.names)
     if covariance is None:
         return {}
-    between = stated_between(result, model)
+    try:
+        between = stated_between(result, model, temperature)
+    except DataError as error:  # the log's own temperature is far from that of the fitted logs
+        return {"expected": {"missing": str(error)}}
     of_fit = result["identification"]["per_joint"]
     noise = np.array([of_fit.get(row, {}).get("rmse") or 0.0 for row in model.row_names])
     recording, mapping = evaluation.recording, structural_mapping(model)

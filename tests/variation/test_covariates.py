@@ -207,6 +207,34 @@ def test_predictions_of_a_result_are_moved_to_a_temperature():
         at_temperature(plain, 20.0)
 
 
+def test_the_next_log_has_the_known_effects_of_the_temperatures_of_its_drives():
+    rng = np.random.default_rng(3)
+    warm, x = 20.0 + 8.0 * rng.normal(size=(2, 10)), 0.03 * rng.normal(size=(2, 10, 2))
+    slopes, names = (-0.02, 0.03), ("lift.viscous", "elbow.viscous", "elbow.coulomb")
+    x[:, :, 0] += np.array(slopes)[:, None] * (warm - warm.mean(axis=1, keepdims=True))
+    groups = [group(own, 0.01, [Covariate("temperature", "degC", each)], name=name)
+              for own, each, name in zip(x, warm, ("lift", "elbow"), strict=True)]  # fmt: skip
+    plain = vary([str(k) for k in range(10)], groups).to_dict()
+    effects = [plain["parameters"][name]["effects"]["temperature"] for name in names]
+    assert [each["is_used"] for each in effects] == [True, True, False]
+    at = {"lift": 31.0, "elbow": 12.0}
+    away = np.array([31.0, 12.0]) - [each["mean"] for each in effects[:2]]
+    moved = np.append(away * [each["slope"] for each in effects[:2]], 0.0)
+    error = np.append(away * [each["std_error"] for each in effects[:2]], 0.0)
+    order = [list(plain["parameters"]).index(name) for name in names]
+    std = np.array([plain["parameters"][name]["spread"] for name in names])
+    spread = np.array(plain["correlation"])[np.ix_(order, order)] * np.outer(std, std)
+    wanted = spread + np.outer(moved, moved) + np.diag(error**2)
+    assert between_covariance(plain, names, at) == pytest.approx(wanted, rel=1e-9)
+    del at["elbow"]  # has any temperature of the logs
+    found = between_covariance(plain, names, at)
+    assert found[0, 0] == pytest.approx(wanted[0, 0])
+    elbow = effects[1]["slope"] ** 2 * np.var(warm[1], ddof=1)
+    assert found[1, 1] - spread[1, 1] == pytest.approx(elbow)
+    with pytest.raises(DataError, match="temperature is 99 degC, wanted"):
+        between_covariance(plain, names, 99.0)
+
+
 def test_a_cold_log_is_not_unlike_where_the_temperature_explains_it():
     rng = np.random.default_rng(8)
     warm = np.append(20.0 + 3.0 * rng.normal(size=9), -20.0)
