@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.special import ndtr
 
 from robotid.exceptions import DataError
 from robotid.variation.covariates import at_temperature, effects_of, model_of, with_effects
@@ -309,6 +310,37 @@ def test_a_slope_is_averaged_over_the_spread_at_the_level_of_its_covariate(is_wi
     own, other = found if is_within else found[::-1]
     assert (mean, error) == pytest.approx(own, rel=2e-3)
     assert error != pytest.approx(other[1], rel=5e-3)
+
+
+@pytest.mark.parametrize(("q", "unit"), [(1, UNIT), (2, np.zeros(9, int))])
+def test_a_small_p_value_is_that_of_all_spreads(q, unit):
+    """Those of two levels, or of two terms: on a grid of both, by generalised least squares."""
+    rng = np.random.default_rng(17)
+    c = rng.normal(size=9)
+    x, C, runs = drawn_runs(rng, q=q, unit=unit, scale=0.5)
+    x = 0.6 * x + (1.1 if q > 1 else 1.5) * np.outer(c, np.arange(q, 0, -1) == 1)
+    runs = replace(runs, h=np.einsum("kij,kj->ki", runs.H, x))
+    model = MixedEffects(runs.with_slopes([Slope(q - 1, c, 0.4)]))
+    z = np.linspace(-6.0, 5.0, 45)
+    both = np.array(np.meshgrid(z, z)).reshape(2, -1)
+    shape = (1 + int(unit.max() > 0), q + 1, both.shape[1])
+    variance = np.zeros(shape)
+    variance[:, :q] = (0.5 * np.exp(both)).reshape(shape[0], q, -1) ** 2
+    density = evidence(*model._members, model.runs.scale, variance).log_likelihood
+    density += (both - 2.5 * np.log1p(np.exp(2.0 * both) / 4.0)).sum(axis=0)
+    w = np.exp(density - density.max())
+    w /= w.sum()
+    means, errors = np.zeros(w.size), np.ones(w.size)
+    for k in np.flatnonzero(w > 1e-7):
+        found, P = least_squares(x, C, model.runs.slopes, np.sqrt(variance[:, :q, k]), unit)
+        means[k], errors[k] = found[-1], np.sqrt(P[-1, -1])
+    w[w <= 1e-7] = 0.0
+    p_value = 2.0 * w @ ndtr(-means / errors)
+    mean, error, found = model.slope(0)
+    assert 1e-4 < p_value < 5e-3
+    assert found == pytest.approx(p_value, rel=0.1)
+    assert mean == pytest.approx(w @ means, rel=0.01)
+    assert error == pytest.approx(np.sqrt(w @ (errors**2 + (means - w @ means) ** 2)), rel=0.02)
 
 
 def test_runs_and_robots_are_compared_with_others_at_their_own_covariates():
