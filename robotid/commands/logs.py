@@ -1,6 +1,6 @@
 """The logs of a job: opened once, examined, and identified by their inputs."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import cache
@@ -27,6 +27,7 @@ from robotid.log_files.table import Table
 from robotid.logs.data import Log
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.model import RobotModel
+from robotid.variation.covariates import at_temperature, drive_temperatures
 from robotid.versions import code_versions
 
 if TYPE_CHECKING:
@@ -42,6 +43,7 @@ __all__ = [
     "locked_as_logged",
     "log_of_commands",
     "needed_of",
+    "new_temperatures",
     "survey_logs",
     "units_of_logs",
     "warmed",
@@ -114,6 +116,31 @@ def warmed(log: SurveyedLog, entry: LogEntry) -> SurveyedLog:
     if entry.temperature is None:
         return log
     return replace(log, temperature=dict.fromkeys(log.model.joints, entry.temperature))
+
+
+def new_temperatures(
+    result: Mapping[str, Any],
+    model: RobotModel,
+    logs: Sequence[SurveyedLog],
+    stated: float | None,
+) -> list[dict[str, float]]:
+    """Return the temperatures of the drives in new logs, by drive [degC]; none where not known.
+
+    Args:
+        result: Content of the result.json that predicts them.
+        model: The robot.
+        logs: The new logs.
+        stated: Temperature of all drives; None: as each log has it.
+
+    Raises:
+        DataError: If the stated one has no effect by the result, or is far outside that of its
+            logs.
+    """
+    drives = model.layout.drives
+    if stated is None:
+        return [drive_temperatures(drives, log.temperature) for log in logs]
+    at_temperature(result.get("variation", {}), stated)  # raises
+    return [dict.fromkeys((drive.name for drive in drives), stated) for _ in logs]
 
 
 def units_of_logs(entries: Sequence[LogEntry]) -> list[str]:

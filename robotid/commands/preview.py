@@ -8,14 +8,13 @@ import numpy as np
 
 from robotid._files import file_sha256
 from robotid.commands.job import Job, LogEntry
-from robotid.commands.logs import result_run, warmed
+from robotid.commands.logs import new_temperatures, result_run, warmed
 from robotid.exceptions import DataError, SettingsError
 from robotid.export.entries import build_preview
 from robotid.export.result import load_result, stated_between
 from robotid.fitting.survey import SurveyedLog, survey_log
 from robotid.identification.previews import preview_logs
 from robotid.robot.model import RobotModel
-from robotid.variation.covariates import at_temperature, drive_temperatures
 
 __all__ = ["preview_job"]
 
@@ -61,18 +60,17 @@ def preview_job(
         return build_preview(preview_logs(model, motions, job.estimator, **stated))
     job, fitted, model, run = result_run(job, given)
     result = load_result(given).content
-    if temperature is not None:  # raises if it has no effect
-        at_temperature(result.get("variation", {}), temperature)
     hashes = {entry["sha256"] for entry in result["inputs"] if entry["role"] == "identification"}
     if not any(file_sha256(entry.path) in hashes for entry in job.identification):
         motions = _motions(job, model, job.identification)
         found = preview_logs(model, motions, job.estimator, run=run, **stated)
-        drives = model.layout.drives
-        warm = [drive_temperatures(drives, log.temperature) for log in motions]
-        if temperature is not None:
-            warm = [dict.fromkeys((drive.name for drive in drives), temperature)] * len(motions)
+        warm = new_temperatures(result, model, motions, temperature)
         between = [stated_between(result, model, each) for each in warm]
         return build_preview(replace(found, between=tuple(between)))
+    if temperature is not None:
+        raise SettingsError(
+            "these motions are fitted logs, whose temperature is known; leave it out"
+        )
     motions = _motions(job, model, fitted)
     alone = preview_logs(model, motions, job.estimator, like=run, **stated)
     return _with_achieved(build_preview(alone), result)

@@ -11,7 +11,7 @@ import numpy as np
 from robotid._files import file_sha256, finite, log_exists
 from robotid.closed_loop.evaluation import OpenLoop, position_metrics
 from robotid.commands.job import Job, LogEntry, job_from_settings
-from robotid.commands.logs import log_of_commands, survey_logs
+from robotid.commands.logs import log_of_commands, new_temperatures, survey_logs
 from robotid.doctor.diagnosis import diagnose
 from robotid.exceptions import DataError
 from robotid.export.entries import recording_metrics
@@ -42,7 +42,6 @@ from robotid.judgement.verdict import Verdict, VerdictWarning, blocking, judge, 
 from robotid.logs.data import Log
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.model import RobotModel
-from robotid.variation.covariates import at_temperature, drive_temperatures
 
 __all__ = ["validate_result"]
 
@@ -75,9 +74,8 @@ def validate_result(
     result = loaded.content
     settings = {key: value for key, value in result["settings"].items() if value != {}}
     job = job_from_settings(settings, Path(path).name, Path())
-    if temperature is not None:  # raises if it has no effect
-        at_temperature(result.get("variation", {}), temperature)
     if "simulation" in result:
+        new_temperatures(result, loaded.robot, (), temperature)
         return _validate_commands(loaded, job, [LogEntry(Path(log)) for log in logs])
     source = stated_model(result, job.model())
     if loaded.has_urdf:
@@ -88,6 +86,7 @@ def validate_result(
     prior = source.standard_parameters()
     entries, parameters = [LogEntry(Path(log)) for log in logs], {"estimate": pi}
     (surveyed,) = survey_logs(job, model, entries)
+    warm = new_temperatures(result, model, surveyed, temperature)
     driven = stated_urdf_with_drives(result, source)
     _, evaluations = evaluate_logs((), surveyed, parameters, prior, driven)
     verdict = _verdict(job, source, result, evaluations, surveyed)
@@ -95,16 +94,8 @@ def validate_result(
         "result": str(path),
         "predicted_with": result["outputs"].get("urdf", "base parameters of result.json"),
         "validation": [
-            recording_metrics(e, "estimate")
-            | _expected(
-                result,
-                model,
-                e,
-                drive_temperatures(model.layout.drives, log.temperature)
-                if temperature is None
-                else temperature,
-            )
-            for e, log in zip(evaluations, surveyed, strict=True)
+            recording_metrics(e, "estimate") | _expected(result, model, e, each)
+            for e, each in zip(evaluations, warm, strict=True)
         ],
         "verdict": verdict.to_dict(),
     }
@@ -114,7 +105,7 @@ def _expected(
     result: Mapping[str, Any],
     model: RobotModel,
     evaluation: Evaluation,
-    temperature: float | Mapping[str, float],
+    temperature: Mapping[str, float],
 ) -> dict[str, Any]:
     """Return the expected torque error of a log by the result, and how often it is within 95 %.
 
