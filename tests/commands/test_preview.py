@@ -13,6 +13,7 @@ from robotid.commands import preview
 from robotid.commands.identify import run_job
 from robotid.commands.job import LogEntry, job_from_settings
 from robotid.commands.preview import _motions
+from robotid.exceptions import SettingsError
 from robotid.log_files.formats import write_columns
 from robotid.log_files.read import read_log, write_log
 from robotid.robot.examples import example_urdf
