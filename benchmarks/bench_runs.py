@@ -527,13 +527,13 @@ def temperatures(count):
         tally(count, robots, logs, true, similar)
 
 
-def tally(count, robots, logs, true, similar):
+def tally(count, robots, logs, true, similar, seed=2):
     """Print the line of sets with one number of robots, logs of each, and slopes by term."""
     hits = others = right = inside = ahead = 0
     sizes = []
     for k in range(count):
         total = robots * logs
-        rng = np.random.default_rng([2, k, total] + ([robots] if robots > 1 else []))
+        rng = np.random.default_rng([seed, k, total] + ([robots] if robots > 1 else []))
         unit = np.repeat(np.arange(robots), logs)
         warm = 20.0 + 8.0 * rng.normal(size=total)
         c, x = warm - warm.mean(), 0.08 * rng.normal(size=(total, 12))
@@ -570,8 +570,9 @@ def tally(count, robots, logs, true, similar):
             low, high = model.predict(at=covariates)[q].ends
             spread = np.hypot(0.08, BETWEEN * (robots > 1))
             ahead += low < slope * at + spread * rng.normal() < high
-    total = len(true) * count
+    total = len(true) * count or np.nan
     words = "two drives" if 9 in true else "two of a drive" if 1 in true else "one"
+    words = words if true else "none"
     words += ", hardly distinguishable" if similar < 1.0 else ""
     print(f"| {robots} x {logs} | {words} | {hits} of {total} | {others} of {count} | "
           f"{np.median(sizes or [np.nan]):.2f} | {100 * inside / total:.0f} % | {right} of {hits} "

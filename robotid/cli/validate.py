@@ -68,7 +68,10 @@ def _show(found: dict[str, Any], *, is_update: bool = False) -> None:
     for recording in found["validation"]:
         echo(f"\n{recording['name']}", "  ")
         print("\n".join(error_lines(recording, width=terminal_width())))
-        if expected := recording.get("expected"):
+        expected = recording.get("expected", {})
+        if "missing" in expected:
+            echo(f"no expected rmse: {expected['missing']}", "  ")
+        elif expected:
             source = "fit and spread between logs" if expected["with_spread"] else "fit"
             own = [
                 f"{joint} {each['rmse']:.3g} ({each['within_95_pct']:.0f} %)"

@@ -1,6 +1,6 @@
 """The logs of a job: opened once, examined, and identified by their inputs."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import cache
@@ -27,6 +27,7 @@ from robotid.log_files.table import Table
 from robotid.logs.data import Log
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.model import RobotModel
+from robotid.variation.covariates import at_temperature, drive_temperatures
 from robotid.versions import code_versions
 
 if TYPE_CHECKING:
@@ -43,8 +44,10 @@ __all__ = [
     "locked_as_logged",
     "log_of_commands",
     "needed_of",
+    "new_temperatures",
     "survey_logs",
     "units_of_logs",
+    "warmed",
 ]
 
 _PIECES = 8  # pieces per rows in memory: the filter of a piece needs memory of its own
@@ -94,9 +97,7 @@ def survey_logs(
                     raise found
                 window = entry.start, entry.end
                 log = survey_log(*found, model, job.signals, window, length=length)
-                if entry.temperature is not None:
-                    log = replace(log, temperature=dict.fromkeys(model.joints, entry.temperature))
-                logs.append(replace(log, unit=entry.unit or "", time=hours[entry]))
+                logs.append(replace(warmed(log, entry), unit=entry.unit or "", time=hours[entry]))
             except DataError as error:
                 if refuse is None:
                     raise
@@ -104,6 +105,43 @@ def survey_logs(
         return tuple(logs)
 
     return tuple(survey(entries) for entries in groups)
+
+
+def warmed(log: SurveyedLog, entry: LogEntry) -> SurveyedLog:
+    """Return a log with the temperature that is stated for all its drives, if any.
+
+    Args:
+        log: The log.
+        entry: What states it.
+    """
+    if entry.temperature is None:
+        return log
+    return replace(log, temperature=dict.fromkeys(log.model.joints, entry.temperature))
+
+
+def new_temperatures(
+    result: Mapping[str, Any],
+    model: RobotModel,
+    logs: Sequence[SurveyedLog],
+    stated: float | None,
+) -> list[dict[str, float]]:
+    """Return the temperatures of the drives in new logs, by drive [degC]; none where not known.
+
+    Args:
+        result: Content of the result.json that predicts them.
+        model: The robot.
+        logs: The new logs.
+        stated: Temperature of all drives; None: as each log has it.
+
+    Raises:
+        DataError: If the stated one has no effect by the result, or is far outside that of its
+            logs.
+    """
+    drives = model.layout.drives
+    if stated is None:
+        return [drive_temperatures(drives, log.temperature) for log in logs]
+    at_temperature(result.get("variation", {}), stated)  # raises
+    return [dict.fromkeys((drive.name for drive in drives), stated) for _ in logs]
 
 
 def units_of_logs(entries: Sequence[LogEntry]) -> list[str]:

@@ -12,8 +12,9 @@ from robotid._files import file_sha256, finite, log_exists
 from robotid.closed_loop.evaluation import OpenLoop, position_metrics
 from robotid.commands.added_logs import add_logs, check_update
 from robotid.commands.job import Job, LogEntry, job_from_settings
-from robotid.commands.logs import log_of_commands, survey_logs
+from robotid.commands.logs import log_of_commands, new_temperatures, survey_logs
 from robotid.doctor.diagnosis import diagnose
+from robotid.exceptions import DataError
 from robotid.export.entries import recording_metrics
 from robotid.export.loops import open_loop_entry
 from robotid.export.result import (
@@ -88,6 +89,7 @@ def validate_result(
         model, pi = source, stated_parameters(result, source)
     prior = source.standard_parameters()
     (surveyed,) = survey_logs(job, model, entries)
+    warm = new_temperatures(result, model, surveyed, None)
     driven = stated_urdf_with_drives(result, source)
     _, evaluations = evaluate_logs((), surveyed, {"estimate": pi}, prior, driven)
     own = [log.with_model(source) for log in surveyed]
@@ -100,7 +102,8 @@ def validate_result(
         "result": str(path),
         "predicted_with": result["outputs"].get("urdf", "base parameters of result.json"),
         "validation": [
-            recording_metrics(e, "estimate") | _expected(result, model, e) for e in evaluations
+            recording_metrics(e, "estimate") | _expected(result, model, e, each)
+            for e, each in zip(evaluations, warm, strict=True)
         ],
         "verdict": verdict.to_dict(),
         **({} if added is None else {"variation": added.shown}),
@@ -109,17 +112,24 @@ def validate_result(
 
 
 def _expected(
-    result: Mapping[str, Any], model: RobotModel, evaluation: Evaluation
+    result: Mapping[str, Any],
+    model: RobotModel,
+    evaluation: Evaluation,
+    temperature: Mapping[str, float],
 ) -> dict[str, Any]:
     """Return the expected torque error of a log by the result, and how often it is within 95 %.
 
     The error has the uncertainty of the parameters, the spread of the drives between logs, if three
-    or more were fitted, and the residual of the fit.
+    or more were fitted, the effect of the temperature, as of ``at_temperature``, and the residual
+    of the fit.
     """
     covariance = stated_covariance(result, model.layout.names)
     if covariance is None:
         return {}
-    between = stated_between(result, model)
+    try:
+        between = stated_between(result, model, temperature)
+    except DataError as error:  # the log's own temperature is far from that of the fitted logs
+        return {"expected": {"missing": str(error)}}
     of_fit = result["identification"]["per_joint"]
     noise = np.array([of_fit.get(row, {}).get("rmse") or 0.0 for row in model.row_names])
     recording, mapping = evaluation.recording, structural_mapping(model)

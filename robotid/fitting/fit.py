@@ -34,6 +34,7 @@ from robotid.fitting.zeros import sums_with_zeros
 from robotid.regressor.factors import Factors, Reduction, join
 from robotid.regressor.memory import is_loaded
 from robotid.robot.prior import prior_spread
+from robotid.variation.covariates import drive_temperatures
 from robotid.variation.groups import FEWEST_RUNS, Covariate, RunSums, runs_of, sums_of
 
 __all__ = [
@@ -229,16 +230,15 @@ def covariates_of(recordings: Recordings) -> dict[str, list[Covariate]]:
         recordings: The recordings.
     """
     found: dict[str, list[Covariate]] = {}
-    for drive in recordings.model.layout.drives:
-        warm = [
-            [log.temperature[joint] for joint, _ in drive.ratios if joint in log.temperature]
-            for log in recordings.fitted
-        ]
-        times = [log.time for log in recordings.fitted if log.time is not None]
+    drives, logs = recordings.model.layout.drives, recordings.fitted
+    warm = [drive_temperatures(drives, log.temperature) for log in logs]
+    times = [log.time for log in logs if log.time is not None]
+    for drive in drives:
         own = found[drive.name] = list[Covariate]()
-        if all(warm):
-            own.append(Covariate("temperature", "degC", np.array([np.mean(x) for x in warm])))
-        if len(times) == len(warm):
+        if all(drive.name in each for each in warm):
+            values = np.array([each[drive.name] for each in warm])
+            own.append(Covariate("temperature", "degC", values))
+        if len(times) == len(logs):
             own.append(Covariate("time", "h", np.array(times)))
     return found
 

@@ -16,6 +16,7 @@ sum_j (P W)_j^T e_j, and its covariance the sum above, without the base's rows.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import repeat
 from pathlib import Path
 from typing import Any
 
@@ -170,13 +171,13 @@ class Preview:
         noise: The noise of the torque.
         before: Standard errors of the base parameters from the earlier run only, shape (b,), inf
             where it does not determine one; None without an earlier run.
-        between: As of ``Fit.between`` of an earlier result, which widens the bands.
+        between: As of ``Fit.between`` of an earlier result, of each motion, which widens the bands.
     """
 
     expected: Identification
     noise: TorqueNoise
     before: Array | None = None
-    between: Array | None = None
+    between: tuple[Array | None, ...] = ()
 
     def __repr__(self) -> str:
         determined, found = self.expected.determination, self.expected
@@ -213,7 +214,8 @@ class Preview:
     def bands(self) -> tuple[TorqueBand, ...]:
         """Expected band of each motion's predicted torques."""
         found = self.expected
-        return tuple(expected_band(found, e, self.between) for e in found.fitted)
+        between = self.between or (None,) * len(found.fitted)
+        return tuple(map(expected_band, repeat(found), found.fitted, between))
 
     @property
     def words(self) -> str:
@@ -273,7 +275,7 @@ def preview(
     )  # fmt: skip
     in_memory = [hold_log(model, motion, settings) for motion in read]
     found = preview_logs(model, in_memory, choice, noise=noise, run=run)
-    return found if given is None else replace(found, between=given.between)
+    return found if given is None else replace(found, between=(given.between,) * len(in_memory))
 
 
 def preview_logs(

@@ -15,11 +15,19 @@ import numpy as np
 
 from robotid._typing import Array
 from robotid.exceptions import DataError
+from robotid.robot.parameters import Coupling
 from robotid.variation.groups import Covariate, RunsOf
 from robotid.variation.mixed_effects import MixedEffects, Runs, Slope
 from robotid.variation.restricted_likelihood import UNKNOWN
 
-__all__ = ["Effect", "at_temperature", "effects_of", "model_of", "with_effects"]
+__all__ = [
+    "Effect",
+    "at_temperature",
+    "drive_temperatures",
+    "effects_of",
+    "model_of",
+    "with_effects",
+]
 
 _FALSE_EFFECTS = 0.02  # probability that one of all effects is taken where there is none
 _FEWEST = 4  # runs: a mean, a slope, and a spread
@@ -133,31 +141,58 @@ def effects_of(group: RunsOf, model: MixedEffects, p: int) -> tuple[Effect, ...]
     return tuple(found)
 
 
-def at_temperature(variation: Mapping[str, Any], temperature: float) -> dict[str, Any]:
+def drive_temperatures(
+    drives: Sequence[Coupling], temperature: Mapping[str, float]
+) -> dict[str, float]:
+    """Return the temperature of each drive, the mean of its joints [degC]; none if not known.
+
+    Args:
+        drives: The drives.
+        temperature: Temperature of the drives of joints, by joint [degC].
+    """
+    own = {
+        drive.name: [temperature[joint] for joint, _ in drive.ratios if joint in temperature]
+        for drive in drives
+    }
+    return {name: float(np.mean(warm)) for name, warm in own.items() if warm}
+
+
+def at_temperature(
+    variation: Mapping[str, Any], temperature: float | Mapping[str, float]
+) -> dict[str, Any]:
     """Return the variation of a result.json, its predictions at a temperature.
 
     Args:
         variation: As in result.json.
-        temperature: The temperature [degC].
+        temperature: The temperature [degC], of all drives or by drive. Drives that are left out
+            have any temperature of the logs.
 
     Raises:
-        DataError: If temperature has no effect, or it is far outside that of the logs.
+        DataError: If it is far outside that of the logs, or temperature has no effect and one of
+            all drives is stated.
     """
     moved = dict(variation.get("parameters", {}))
     for name, entry in moved.items():
         own = entry.get("effects", {}).get("temperature", {"is_used": False})
         if not own["is_used"]:
             continue
+        if isinstance(temperature, Mapping):
+            there = temperature.get(name.rpartition(".")[0])
+        else:
+            there = temperature
+        if there is None:
+            continue
         table = own["next_interval_at"]
         intervals = np.array([table[key] for key in ("at", "low", "high")])
-        ends = _interval("temperature", own["unit"], intervals, temperature)
+        ends = _interval("temperature", own["unit"], intervals, there)
         at_mean = np.array(entry["next_interval"])
         wider = float(np.ptp(ends) / np.ptp(at_mean))
         quantiles = ends.mean() + wider * (np.array(entry["next_quantiles"]) - at_mean.mean())
-        change = own["slope"] * (temperature - own["mean"])
+        change = own["slope"] * (there - own["mean"])
         others = {key: x for key, x in entry["effects"].items() if key != "temperature"}
         moved[name] = entry | {
             "mean": entry["mean"] + change,
+            "change": [change, own["std_error"] * abs(there - own["mean"])],
             "next_interval": ends.tolist(),
             "next_quantiles": quantiles.tolist(),
             "effects": others,
@@ -165,7 +200,8 @@ def at_temperature(variation: Mapping[str, Any], temperature: float) -> dict[str
         if "seen_interval" in entry:
             room = np.array(entry["seen_interval"]) - _hull(intervals, own["by_log"])
             moved[name]["seen_interval"] = (ends + room).tolist()
-    if all(moved[name] is entry for name, entry in variation.get("parameters", {}).items()):
+    before = variation.get("parameters", {})
+    if not isinstance(temperature, Mapping) and all(moved[n] is x for n, x in before.items()):
         raise DataError(
             "temperature has no effect on a drive parameter of this result; leave it out, or "
             "identify from logs at more temperatures, with temperature in [[identification]]"

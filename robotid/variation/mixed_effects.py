@@ -22,6 +22,7 @@ import scipy.special
 from robotid._typing import Array
 from robotid.variation.restricted_likelihood import (
     GRID,
+    Evidence,
     Grid,
     by_unit,
     evidence,
@@ -29,6 +30,7 @@ from robotid.variation.restricted_likelihood import (
     log_prior,
     most_probable,
     on_grid,
+    over_all,
     prior_of,
 )
 
@@ -40,6 +42,7 @@ _TAIL = 0.025  # probability beyond each end of an interval
 _ENDS = np.array([_TAIL, 1.0 - _TAIL])
 _ELEMENTS = 1_000_000  # of an array that compares runs, at most
 _HALVINGS = 200  # of the range of a quantile, at most
+_FAR = 0.01  # p-value of a slope below which all spreads are integrated
 _CLOSE = 1e-15  # change of a quantile that rounding decides
 
 
@@ -345,7 +348,8 @@ class MixedEffects:
         """Return a slope, its standard error, and the two-sided p-value of a slope of 0.
 
         The standard deviation of its parameter is integrated between runs if its covariate varies
-        most within units, else between units.
+        most within units, else between units. A p-value below 1 % depends on the uncertainty of all
+        others: then all are integrated, see ``over_all``.
 
         Args:
             s: Index of the slope.
@@ -353,14 +357,14 @@ class MixedEffects:
         own, slope, unit = self.runs.n_varying + s, self.runs.slopes[s], self.runs.unit
         means_of = np.bincount(unit, slope.covariate) / np.bincount(unit)
         is_within = float(np.var(slope.covariate - means_of[unit])) > float(np.var(means_of[unit]))
+        level, p, scale = 0 if is_within else self.n_levels - 1, slope.parameter, self.runs.scale
         variance = np.repeat(self.deviation[:, :, None] ** 2, len(GRID), axis=2)
-        p = slope.parameter
-        variance[0 if is_within else -1, p] = (self.runs.scale[p] * np.exp(GRID)) ** 2
-        found = evidence(*self._members, self.runs.scale, variance)
-        weight = _weight(found.log_likelihood + log_prior(GRID))
-        means, variances = found.mean[:, own], found.covariance[:, own, own]
-        mean, error = _moments(weight, means, variances)
-        return mean, error, float(_beyond(np.zeros(()), weight, means, np.sqrt(variances)))
+        variance[level, p] = (scale[p] * np.exp(GRID)) ** 2
+        found = evidence(*self._members, scale, variance)
+        estimate = _slope(found.log_likelihood + log_prior(GRID), found, own)
+        if estimate[2] >= _FAR:
+            return estimate
+        return _slope(*over_all(*self._members, scale, self.deviation, level, p), own)
 
     def against_others(self, which: Array, *, is_unit: bool) -> Compared:
         """Compare runs, or units, each with the prediction of all others.
@@ -521,6 +525,14 @@ def _mixture_quantiles(wanted: Array, weight: Array, means: Array, std: Array) -
             break
         x = tried
     return np.asarray(tried)
+
+
+def _slope(log_density: Array, found: Evidence, own: int) -> tuple[float, float, float]:
+    """Return a slope, its standard error and p-value, from models with their log density, (b,)."""
+    weight = _weight(log_density)
+    means, variances = found.mean[:, own], found.covariance[:, own, own]
+    mean, error = _moments(weight, means, variances)
+    return mean, error, float(_beyond(np.zeros(()), weight, means, np.sqrt(variances)))
 
 
 def _weight(log_density: Array) -> Array:

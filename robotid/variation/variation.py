@@ -9,7 +9,13 @@ import numpy as np
 
 from robotid._typing import Array
 from robotid.variation.causes import evidence_by_group
-from robotid.variation.covariates import Effect, effects_of, model_of, with_effects
+from robotid.variation.covariates import (
+    Effect,
+    at_temperature,
+    effects_of,
+    model_of,
+    with_effects,
+)
 from robotid.variation.groups import FEWEST_RUNS, RunsOf
 from robotid.variation.mixed_effects import MixedEffects, Prediction, covariance_of
 
@@ -214,20 +220,32 @@ def vary(
     )  # fmt: skip
 
 
-def between_covariance(variation: Mapping[str, Any], names: Sequence[str]) -> Array:
+def between_covariance(
+    variation: Mapping[str, Any],
+    names: Sequence[str],
+    temperature: float | Mapping[str, float] | None = None,
+) -> Array:
     """Return the covariance of parameters in the next run that the fit to all runs lacks.
 
     Standard deviations are the medians of the spreads: between runs, or between units and between
-    the runs of a unit. Temperature and time of the next run are as those of the runs.
+    the runs of a unit. Temperature and time of the next run are as those of the runs. At a stated
+    temperature, it is the mean square about the fit: its effect d, known but for the error of the
+    slope, adds d d^T.
 
     Args:
         variation: As of ``Variation.to_dict``.
         names: Names of p parameters.
+        temperature: As of ``at_temperature``; None: any of the runs.
 
     Returns:
         Shape (p, p); 0 for parameters that do not vary.
+
+    Raises:
+        DataError: As ``at_temperature``.
     """
     at = {name: k for k, name in enumerate(names)}
+    if temperature is not None:
+        variation = at_temperature(variation, temperature)
     parameters = variation["parameters"]
     own = [k for k, name in enumerate(parameters) if name in at]
     places = [at[name] for name in parameters if name in at]
@@ -240,6 +258,8 @@ def between_covariance(variation: Mapping[str, Any], names: Sequence[str]) -> Ar
     moved = effects_by_log(entries)
     if len(moved):
         found[np.ix_(places, places)] += np.cov(moved.T).reshape(len(places), len(places))
+    change, error = np.array([e.get("change", (0.0, 0.0)) for e in entries]).reshape(-1, 2).T
+    found[np.ix_(places, places)] += np.outer(change, change) + np.diag(error**2)
     return found
 
 

@@ -11,7 +11,7 @@ import pytest
 from robotid.cli import doctor, identify, main, preview, track
 from robotid.cli.flags import job_from_flags, source_words
 from robotid.cli.parser import CommandParser
-from robotid.commands.job import job_from_settings
+from robotid.commands.job import LogEntry, job_from_settings
 from robotid.exceptions import SettingsError
 from robotid.fitting.settings import ESTIMATORS
 from robotid.logs.settings import LogSource, SignalSettings
@@ -187,7 +187,12 @@ class Heard(Exception):
 JOB_OF_FLAGS = SimpleNamespace(workers=2)
 UNSTATED = dict.fromkeys(("step", "delay", "samples", "seed", "temperature"))
 FORWARDED = {
-    "validate out a.csv b.csv": ("validate.validate_result", ("out", ["a.csv", "b.csv"]), {}),
+    "validate out a.csv b.csv --temperature 12 --time 2.5 --unit x --update": (
+        "validate.validate_result",
+        ("out", [LogEntry(Path(x), temperature=12.0, time=2.5, unit="x")
+                 for x in ("a.csv", "b.csv")]),
+        {"update": True},
+    ),
     "report out --out p.html": ("report.rewrite_report", ("out", "p.html"), {"progress": ANY}),
     "export out --format mjcf --out a.xml --step 0.002 --delay filter": (
         "export.export_result", ("out", "mjcf", "a.xml"),
@@ -201,9 +206,9 @@ FORWARDED = {
         "payload.measure_payload", (JOB_OF_FLAGS, ["c", "d"]),
         {"links": ["x", "y"], "masses": ["x=2"], "find_gains": True, "progress": ANY},
     ),
-    "preview u a.csv --given out --noise a=0.2 --noise b=3 --correlation 0.3": (
+    "preview u a.csv --given out --noise a=0.2 --noise b=3 --correlation 0.3 --temperature 35": (
         "preview.preview_job", (JOB_OF_FLAGS, "out"),
-        {"noise": {"a": 0.2, "b": 3.0}, "correlation": 0.3},
+        {"noise": {"a": 0.2, "b": 3.0}, "correlation": 0.3, "temperature": 35.0},
     ),
     "track u a.csv --out there": ("track.run_track", (JOB_OF_FLAGS, "there"), {}),
     "track u a.csv --out there --serve 8123 --speed 2.5": (

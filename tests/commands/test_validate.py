@@ -252,7 +252,7 @@ def test_the_expected_error_has_the_parts_of_fit_spread_and_residual(arm, rng, m
         }
     }
     for spread in (None, of_logs):
-        monkeypatch.setattr(validate, "stated_between", lambda result, model, own=spread: own)
+        monkeypatch.setattr(validate, "stated_between", lambda *_, own=spread: own)
         C = of_fit if spread is None else of_fit + spread
         total = np.sqrt(np.einsum("kjp,pq,kjq->kj", Y, C, Y) + noise**2)
         z = 1.2 * rng.standard_normal((count, 2))
@@ -263,7 +263,7 @@ def test_the_expected_error_has_the_parts_of_fit_spread_and_residual(arm, rng, m
             recording=SimpleNamespace(trajectory=motion, mask=mask),
             torques={"estimate": tau - z * total},
         )
-        found = validate._expected(result, arm, evaluation)["expected"]
+        found = validate._expected(result, arm, evaluation, {})["expected"]
         assert found["with_spread"] is (spread is not None)
         for j, own in enumerate(found["per_joint"].values()):
             assert own["rmse"] == pytest.approx(np.sqrt(np.mean(total[:, j] ** 2)), rel=1e-9)

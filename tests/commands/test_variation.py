@@ -503,6 +503,64 @@ def test_friction_falls_with_the_temperature_in_the_logs(warm, capsys):
     assert np.std(cold[1]) < 0.3 * spread
     with pytest.raises(DataError, match="temperature is -60 degC, wanted"):
         export_result(where / "out", "ranges", where / "no.yaml", temperature=-60.0)
+    expect_at_temperatures(where, model, effect, capsys)
+
+
+def expect_at_temperatures(where, model, effect, capsys):
+    """Check the expected torque error and the bands of two motions at temperatures of the elbow."""
+    given, files, v = where / "out" / "result.json", [], []
+    degrees = 38.0, 17.0
+    for k, own in enumerate(degrees):
+        log = driven_log(model, truth(model), 80 + k, duration=6.0)
+        files.append(where / f"next_{k}.csv")
+        write_log(log, files[k])
+        rows = files[k].read_text().splitlines()
+        cells = ["temperature_elbow_joint", *[str(own)] * (len(rows) - 1)]
+        files[k].write_text("\n".join(map(",".join, zip(rows, cells, strict=True))) + "\n")
+        v.append(np.sqrt(np.mean(log.v[:, 1] ** 2)))
+    variances = {
+        key: np.array([
+            [each["expected"]["per_joint"][joint]["rmse"] ** 2 for joint in JOINTS[1:]]
+            for each in validate_result(
+                given, [LogEntry(file, temperature=own) for file in files]
+            )["validation"]
+        ])
+        for key, own in {"own": None, "mean": effect["mean"], "cold": 17.0}.items()
+    }  # fmt: skip
+
+    def added(degree):  # by the elbow's viscous friction, nothing by the last joint
+        away = degree - effect["mean"]
+        return away**2 * (effect["slope"] ** 2 + effect["std_error"] ** 2)
+
+    for k, own in enumerate(degrees):
+        for key, degree in (("own", own), ("cold", 17.0)):
+            elbow, wrist = variances[key][k] - variances["mean"][k]
+            assert elbow == pytest.approx(added(degree) * v[k] ** 2, rel=0.06)  # not filtered
+            assert wrist == pytest.approx(0.0, abs=1e-9)
+    hot = variances["own"][0, 0] - variances["mean"][0, 0]
+    cold = variances["cold"][0, 0] - variances["mean"][0, 0]
+    assert hot / cold == pytest.approx(added(38.0) / added(17.0), rel=1e-6)
+    bands = {}
+    for key, stated, option in (("own", {}, {}), ("mean", {}, {"temperature": effect["mean"]}),
+                                ("job", {"temperature": 17.0}, {})):  # fmt: skip
+        entries = [{"log": str(file)} | stated for file in files]
+        job = job_from_settings({**settings(where), "identification": entries}, "j", where)
+        torque = preview_job(job, str(given), **option)["torque"]["elbow_joint"]
+        bands[key] = (torque["half_width"] / 1.96) ** 2
+    own, cold = (np.mean([added(x) * y**2 for x, y in zip(each, v, strict=True)])
+                 for each in (degrees, (17.0, 17.0)))  # fmt: skip
+    assert bands["own"] - bands["mean"] == pytest.approx(own, rel=0.06)
+    assert bands["job"] - bands["mean"] == pytest.approx(cold, rel=0.06)
+    files[0].write_text(files[0].read_text().replace("38.0", "88.0"))
+    done = validate_result(given, files)
+    show_validation(done)
+    assert "no expected rmse: temperature is 88 degC, wanted" in capsys.readouterr().out
+    assert done["validation"][1]["expected"]["per_joint"]
+    done = validate_result(given, [LogEntry(file, temperature=88.0) for file in files])
+    for each in done["validation"]:
+        assert each["expected"]["missing"].startswith("temperature is 88 degC, wanted")
+    with pytest.raises(SettingsError, match="by a given result; state it, too"):
+        preview_job(job, temperature=20.0)
 
 
 def test_stated_temperatures_replace_those_of_the_logs(warm):

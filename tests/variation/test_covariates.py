@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.special import ndtr
 
 from robotid.exceptions import DataError
 from robotid.variation.covariates import at_temperature, effects_of, model_of, with_effects
@@ -207,6 +208,34 @@ def test_predictions_of_a_result_are_moved_to_a_temperature():
         at_temperature(plain, 20.0)
 
 
+def test_the_next_log_has_the_known_effects_of_the_temperatures_of_its_drives():
+    rng = np.random.default_rng(3)
+    warm, x = 20.0 + 8.0 * rng.normal(size=(2, 10)), 0.03 * rng.normal(size=(2, 10, 2))
+    slopes, names = (-0.02, 0.03), ("lift.viscous", "elbow.viscous", "elbow.coulomb")
+    x[:, :, 0] += np.array(slopes)[:, None] * (warm - warm.mean(axis=1, keepdims=True))
+    groups = [group(own, 0.01, [Covariate("temperature", "degC", each)], name=name)
+              for own, each, name in zip(x, warm, ("lift", "elbow"), strict=True)]  # fmt: skip
+    plain = vary([str(k) for k in range(10)], groups).to_dict()
+    effects = [plain["parameters"][name]["effects"]["temperature"] for name in names]
+    assert [each["is_used"] for each in effects] == [True, True, False]
+    at = {"lift": 31.0, "elbow": 12.0}
+    away = np.array([31.0, 12.0]) - [each["mean"] for each in effects[:2]]
+    moved = np.append(away * [each["slope"] for each in effects[:2]], 0.0)
+    error = np.append(away * [each["std_error"] for each in effects[:2]], 0.0)
+    order = [list(plain["parameters"]).index(name) for name in names]
+    std = np.array([plain["parameters"][name]["spread"] for name in names])
+    spread = np.array(plain["correlation"])[np.ix_(order, order)] * np.outer(std, std)
+    wanted = spread + np.outer(moved, moved) + np.diag(error**2)
+    assert between_covariance(plain, names, at) == pytest.approx(wanted, rel=1e-9)
+    del at["elbow"]  # has any temperature of the logs
+    found = between_covariance(plain, names, at)
+    assert found[0, 0] == pytest.approx(wanted[0, 0])
+    elbow = effects[1]["slope"] ** 2 * np.var(warm[1], ddof=1)
+    assert found[1, 1] - spread[1, 1] == pytest.approx(elbow)
+    with pytest.raises(DataError, match="temperature is 99 degC, wanted"):
+        between_covariance(plain, names, 99.0)
+
+
 def test_a_cold_log_is_not_unlike_where_the_temperature_explains_it():
     rng = np.random.default_rng(8)
     warm = np.append(20.0 + 3.0 * rng.normal(size=9), -20.0)
@@ -281,6 +310,37 @@ def test_a_slope_is_averaged_over_the_spread_at_the_level_of_its_covariate(is_wi
     own, other = found if is_within else found[::-1]
     assert (mean, error) == pytest.approx(own, rel=2e-3)
     assert error != pytest.approx(other[1], rel=5e-3)
+
+
+@pytest.mark.parametrize(("q", "unit"), [(1, UNIT), (2, np.zeros(9, int))])
+def test_a_small_p_value_is_that_of_all_spreads(q, unit):
+    """Those of two levels, or of two terms: on a grid of both, by generalised least squares."""
+    rng = np.random.default_rng(17)
+    c = rng.normal(size=9)
+    x, C, runs = drawn_runs(rng, q=q, unit=unit, scale=0.5)
+    x = 0.6 * x + (1.1 if q > 1 else 1.5) * np.outer(c, np.arange(q, 0, -1) == 1)
+    runs = replace(runs, h=np.einsum("kij,kj->ki", runs.H, x))
+    model = MixedEffects(runs.with_slopes([Slope(q - 1, c, 0.4)]))
+    z = np.linspace(-6.0, 5.0, 45)
+    both = np.array(np.meshgrid(z, z)).reshape(2, -1)
+    shape = (1 + int(unit.max() > 0), q + 1, both.shape[1])
+    variance = np.zeros(shape)
+    variance[:, :q] = (0.5 * np.exp(both)).reshape(shape[0], q, -1) ** 2
+    density = evidence(*model._members, model.runs.scale, variance).log_likelihood
+    density += (both - 2.5 * np.log1p(np.exp(2.0 * both) / 4.0)).sum(axis=0)
+    w = np.exp(density - density.max())
+    w /= w.sum()
+    means, errors = np.zeros(w.size), np.ones(w.size)
+    for k in np.flatnonzero(w > 1e-7):
+        found, P = least_squares(x, C, model.runs.slopes, np.sqrt(variance[:, :q, k]), unit)
+        means[k], errors[k] = found[-1], np.sqrt(P[-1, -1])
+    w[w <= 1e-7] = 0.0
+    p_value = 2.0 * w @ ndtr(-means / errors)
+    mean, error, found = model.slope(0)
+    assert 1e-4 < p_value < 5e-3
+    assert found == pytest.approx(p_value, rel=0.1)
+    assert mean == pytest.approx(w @ means, rel=0.01)
+    assert error == pytest.approx(np.sqrt(w @ (errors**2 + (means - w @ means) ** 2)), rel=0.02)
 
 
 def test_runs_and_robots_are_compared_with_others_at_their_own_covariates():
