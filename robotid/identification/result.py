@@ -189,10 +189,24 @@ class Identification(Fit):
         """Whether a URDF may be written: it is consistent, and no fault makes it wrong."""
         return self.is_consistent and not self.log_errors
 
-    @cached_property
+    @property
     def scale_check(self) -> ScaleCheck:
         """Scale check: identified gravity and masses against the URDF's."""
-        return replace(check_scale(self), payloads=self.payload_checks)
+        return replace(self._scale, payloads=self.payload_checks)
+
+    @cached_property
+    def _scale(self) -> ScaleCheck:
+        return check_scale(self)
+
+    def with_conclusion(self, **changes: Any) -> "Identification":
+        """Return the same fit with other fields of ``Identification``, and the same scale check.
+
+        Args:
+            changes: Values of the fields.
+        """
+        same = replace(self, **changes)
+        vars(same)["_scale"] = self._scale
+        return same
 
     @property
     def _uncertain_drives(self) -> list[str]:
