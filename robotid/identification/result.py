@@ -1,6 +1,7 @@
 """An identification: a fit with findings and a verdict."""
 
 from collections.abc import Mapping
+from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -198,14 +199,14 @@ class Identification(Fit):
     def _scale(self) -> ScaleCheck:
         return check_scale(self)
 
-    def with_conclusion(self, **changes: Any) -> "Identification":
-        """Return the same fit with other fields of ``Identification``, and the same scale check.
+    def with_scale_of(self, fit: "Identification") -> "Identification":
+        """Return the result with the scale check of the same fit, which is not computed again.
 
         Args:
-            changes: Values of the fields.
+            fit: A result of the same fit, with other findings or payload checks.
         """
-        same = replace(self, **changes)
-        vars(same)["_scale"] = self._scale
+        same = copy(self)
+        vars(same)["_scale"] = fit._scale
         return same
 
     @property
