@@ -326,7 +326,8 @@ def identify_job(
     asked = replace(concluded.asked, job=job)
     findings = (*placed.notes, *concluded.findings)
     checks = check_payloads(job, concluded.model, fitted)
-    return replace(concluded, asked=asked, findings=findings, payload_checks=checks), checkpoint
+    stated = replace(concluded, asked=asked, findings=findings, payload_checks=checks)
+    return stated.with_scale_of(concluded), checkpoint
 
 
 def _loop_stages() -> Sequence[str]:

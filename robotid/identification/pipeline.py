@@ -202,12 +202,13 @@ def conclude(
     findings += not_written(log_errors, "" if fit.is_consistent else fit.estimator.name)
     counted = not_ignored(findings, ignore)
     names = [Path(e.recording.log.path).name for e in fit.validation if not e.is_refitted]
-    return replace(
+    concluded = replace(
         result,
         findings=tuple(findings),
         log_errors=tuple(finding.message for finding in log_errors),
         warnings=warnings_of(counted, model.joints, names, is_robust=is_robust),
     )
+    return concluded.with_scale_of(result)
 
 
 @contextmanager

@@ -1,6 +1,7 @@
 """An identification: a fit with findings and a verdict."""
 
 from collections.abc import Mapping
+from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -189,10 +190,24 @@ class Identification(Fit):
         """Whether a URDF may be written: it is consistent, and no fault makes it wrong."""
         return self.is_consistent and not self.log_errors
 
-    @cached_property
+    @property
     def scale_check(self) -> ScaleCheck:
         """Scale check: identified gravity and masses against the URDF's."""
-        return replace(check_scale(self), payloads=self.payload_checks)
+        return replace(self._scale, payloads=self.payload_checks)
+
+    @cached_property
+    def _scale(self) -> ScaleCheck:
+        return check_scale(self)
+
+    def with_scale_of(self, fit: "Identification") -> "Identification":
+        """Return the result with the scale check of the same fit, which is not computed again.
+
+        Args:
+            fit: A result of the same fit, with other findings or payload checks.
+        """
+        same = copy(self)
+        vars(same)["_scale"] = fit._scale
+        return same
 
     @property
     def _uncertain_drives(self) -> list[str]:

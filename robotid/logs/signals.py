@@ -7,6 +7,7 @@ be switched off: with ``cutoff=None`` and no ``rate`` the rows are those of the 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import pairwise
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -17,12 +18,13 @@ from robotid.findings import listed
 from robotid.logs.data import Log, Trajectory
 from robotid.logs.measured_velocity import is_trustworthy
 from robotid.logs.settings import SignalSettings
-from robotid.logs.smoothing import Segment, process_segments, too_short
+from robotid.logs.smoothing import KEPT, Segment, process_segments, too_short
 
 __all__ = ["decide", "process", "resolve", "turns_note", "unwrap"]
 
 _SLOWEST = 1e-6  # smallest cut-off over the rate
 _GAP_STEPS = 2.5  # [median steps] a longer step may be a gap
+_UNWRAPPED: WeakKeyDictionary[Log, Log] = WeakKeyDictionary()
 _GAP_CYCLES = 0.25  # [periods of the filter] ... if it is also longer than this
 
 
@@ -159,10 +161,15 @@ def unwrap(log: Log, is_free: Array) -> Log:
         )
     if not has_jump.any():
         return log
+    if log in _UNWRAPPED:
+        return _UNWRAPPED[log]
     q = log.q.copy()
     q[:, has_jump] = np.unwrap(q[:, has_jump], axis=0)
     names = [log.joints[j] for j in np.flatnonzero(has_jump)]
-    return replace(log, q=q, notes=(*log.notes, turns_note(names)))
+    unwrapped = replace(log, q=q, notes=(*log.notes, turns_note(names)))
+    if len(log.t) <= KEPT:  # its motions are kept with it
+        _UNWRAPPED[log] = unwrapped
+    return unwrapped
 
 
 def turns_note(joints: Sequence[str]) -> str:

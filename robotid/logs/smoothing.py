@@ -18,7 +18,7 @@ from robotid.logs.friction_direction import acting_directions
 from robotid.logs.settings import SignalSettings
 from robotid.logs.splines import cubic_spline
 
-__all__ = ["SPLINE", "Segment", "filter_reach", "low_pass", "process_segments", "too_short"]
+__all__ = ["KEPT", "SPLINE", "Segment", "filter_reach", "low_pass", "process_segments", "too_short"]
 
 #: Rows after which the end of a cubic spline has no effect: it decreases by half or more per row.
 SPLINE = 64
@@ -26,7 +26,8 @@ _SETTLED = 42.0  # [time constants] after which a filter's transient is negligib
 _LONGEST = 8.0  # [periods of the filter] longest time of stiction
 _FINEST = 1000  # largest number of points of the uniform grid per row of the log
 _ALL = slice(None)
-_KEPT = 20_000  # rows of a log up to which its motions are kept as long as the log
+#: Rows of a log up to which its motions are kept as long as the log.
+KEPT = 20_000
 _KNOWN: WeakKeyDictionary[Log, dict[object, Trajectory]] = WeakKeyDictionary()
 _SPREAD = 3.6  # [time constants] from a force at which less than 1 % of it is left
 _JUMPS = 14.0  # [time constants] after which it has forgotten a jump: 1e-6
@@ -79,7 +80,7 @@ def process_segments(
     """
     is_sharp = settings.cutoff is None and settings.friction_band == 0
     ratios = np.empty((0, len(log.joints))) if speeds is None or is_sharp else speeds
-    if len(log.t) > _KEPT or first or own.indices(len(log.t)) != (0, len(log.t), 1):
+    if len(log.t) > KEPT or first or own.indices(len(log.t)) != (0, len(log.t), 1):
         return _process(log, segments, settings, first, own, ratios)
     known = _KNOWN.setdefault(log, {})
     key = settings, tuple(segments), ratios.shape, ratios.tobytes()

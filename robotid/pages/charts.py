@@ -4,6 +4,7 @@ import base64
 import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from html import escape
 from typing import Any
 
@@ -247,7 +248,7 @@ class _Axis:
         share = (v - self.low) / (self.high - self.low)
         return np.asarray(self.start + share * (self.stop - self.start))
 
-    @property
+    @cached_property
     def ticks(self) -> list[float]:
         if self.is_log:
             few = self.high - self.low < 1.5
@@ -258,7 +259,7 @@ class _Axis:
         first, last = np.ceil(self.low / step), np.floor(self.high / step)
         return [float(k * step) for k in np.arange(first, last + 1)]
 
-    @property
+    @cached_property
     def step(self) -> float:
         """Distance of the ticks: 1, 2 or 5 times a power of ten."""
         distance = 22.0 if self.stop < self.start else 80.0  # [px] at least
@@ -341,21 +342,23 @@ def _frame(chart: Chart, across: _Axis, up: _Axis) -> str:
             f'<path d="M{left:.1f} {_TOP}H{max(stop, left + 0.5):.1f}V{bottom:.0f}H{left:.1f}z" '
             'fill-opacity="0.09"/>'
         )
-    grid = "".join(f"M{_LEFT} {up(v):.1f}H{right}" for v in up.ticks)
-    columns = list(range(len(chart.x_names))) or across.ticks
-    grid += "".join(f"M{across(v):.1f} {_TOP}V{bottom}" for v in columns)
+    heights = up(np.array(up.ticks)).tolist()
+    columns = across(np.array(range(len(chart.x_names)) or across.ticks, dtype=float)).tolist()
+    grid = "".join(f"M{_LEFT} {y:.1f}H{right}" for y in heights)
+    grid += "".join(f"M{x:.1f} {_TOP}V{bottom}" for x in columns)
     parts.append(f'<path d="{grid}" stroke="currentColor" stroke-opacity="0.15"/>')
     parts += [
-        f'<text x="{_LEFT - 6}" y="{up(v) + 4:.1f}" text-anchor="end">{word}</text>'
-        for v, word in zip(up.ticks, up.words, strict=True)
+        f'<text x="{_LEFT - 6}" y="{y + 4:.1f}" text-anchor="end">{word}</text>'
+        for y, word in zip(heights, up.words, strict=True)
     ]
     slant = _slant(chart.x_names, chart.width)
-    for v, word in zip(columns, chart.x_names or across.words, strict=True):
-        place = f"{across(v):.1f} {bottom + 14:.0f}"
+    for x, word in zip(columns, chart.x_names or across.words, strict=True):
+        place = f"{x:.1f} {bottom + 14:.0f}"
         slanted = f'transform="translate({place}) rotate(-30)" text-anchor="end"'
         upright = f'transform="translate({place})" text-anchor="middle"'
         parts.append(f"<text {slanted if slant else upright}>{escape(word)}</text>")
-    dotted = "".join(f"M{across(v):.1f} {_TOP}V{bottom}" for v in chart.marks)
+    marks = across(np.array(chart.marks, dtype=float)).tolist()
+    dotted = "".join(f"M{x:.1f} {_TOP}V{bottom}" for x in marks)
     if dotted:
         parts.append(f'<path d="{dotted}" stroke="currentColor" stroke-dasharray="1 3"/>')
     middle = (_LEFT + right) / 2

@@ -100,13 +100,9 @@ class Factors:
         folded, everything = [Triangle(len(own) + 1) for own in self.columns], Triangle(c + 1)
         for total, own, level in zip(folded, self.triangles, sigma, strict=True):
             total.fold_triangle(own / level, np.arange(len(own)))
-        for j, k in self._carriers:
-            columns = np.append(self.columns[j], c)
-            if k is None:
-                everything.fold_triangle(folded[j].R, columns)
-            else:
-                places = np.searchsorted(self.columns[k], columns)
-                folded[k].fold_triangle(folded[j].R, places)
+        for j, k, places in self._carriers:
+            carrier = everything if k is None else folded[k]
+            carrier.fold_triangle(folded[j].R, places)
         return everything.R
 
     def residual_squares(self, theta: Array) -> Array:
@@ -187,17 +183,22 @@ class Factors:
         return np.array([np.vdot(A @ C, A) for A, C in pairs])
 
     @cached_property
-    def _carriers(self) -> list[tuple[int, int | None]]:
-        """Pairs of a joint and the one with the fewest columns that has all of its, or None.
+    def _carriers(self) -> list[tuple[int, int | None, Array]]:
+        """Each joint, the one with the fewest columns that has all of its, or None, and the places.
 
-        Joints with few columns come first, so that a joint is complete before it is folded.
+        Joints with few columns come first, so that a joint is complete before it is folded. The
+        places are those of its columns and of the torque in the other factor.
         """
         order = sorted(range(len(self.columns)), key=lambda j: (len(self.columns[j]), -j))
         sets = [set(own.tolist()) for own in self.columns]
-        return [
-            (j, next((k for k in order[position:] if sets[j] <= sets[k]), None))
-            for position, j in enumerate(order, start=1)
-        ]
+        found: list[tuple[int, int | None, Array]] = []
+        for position, j in enumerate(order, start=1):
+            carrier = next((k for k in order[position:] if sets[j] <= sets[k]), None)
+            places = np.append(self.columns[j], len(self.names))
+            if carrier is not None:
+                places = np.searchsorted(self.columns[carrier], places)
+            found.append((j, carrier, places))
+        return found
 
 
 @dataclass(frozen=True, eq=False)

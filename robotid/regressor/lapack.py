@@ -7,7 +7,7 @@ not available, through SciPy's wrapper.
 
 import ctypes
 from collections.abc import Callable
-from functools import cache
+from functools import cache, cached_property
 
 import numpy as np
 import scipy.linalg.cython_lapack
@@ -35,13 +35,10 @@ class Triangle:
         self.R = np.zeros((columns, columns), order="F")
         self._is_empty = True
         self._panel = min(_PANEL if columns < _WIDE else _WIDE_PANEL, columns)
-        self._scratch = np.empty(2 * self._panel * columns)
-        # m, n, l, nb, lda, ldb, ldt, info
-        self._sizes = np.array(
-            [0, columns, 0, self._panel, columns, 0, self._panel, 0], dtype=np.intc
-        )
-        self._address = self.R.ctypes.data
-        self._addresses = self._list_addresses()
+        # 8 sizes of C's int: m, n, l, nb, lda, ldb, ldt, info; then T and work
+        self._scratch = np.empty(4 + 2 * self._panel * columns)
+        self._sizes = self._scratch[:4].view(np.intc)
+        self._sizes[:] = 0, columns, 0, self._panel, columns, 0, self._panel, 0
 
     def fold(self, rows: Array) -> None:
         """Replace R by the triangular factor of [R; rows].
@@ -87,18 +84,18 @@ class Triangle:
         ldb = max(len(rows), rows.strides[1] // rows.itemsize)
         self._sizes[:4] = len(rows), width, triangular, panel
         self._sizes[5] = ldb
-        self._addresses[4] = self._address + first * (len(self.R) + 1) * self.R.itemsize
-        self._addresses[6] = rows.ctypes.data
-        call(*self._addresses)
+        addresses = self._addresses.copy()
+        addresses[4] += first * (len(self.R) + 1) * self.R.itemsize
+        addresses[6] = rows.ctypes.data
+        call(*addresses)
 
-    def _list_addresses(self) -> list[int]:
-        """Return the addresses of m, n, l, nb, A, lda, B, ldb, T, ldt, work and info."""
-        sizes, scratch = self._sizes.ctypes.data, self._scratch.ctypes.data
-        m, n, pentagon, nb, lda, ldb, ldt, info = range(
-            sizes, sizes + self._sizes.nbytes, self._sizes.itemsize
-        )
-        T, work = scratch, scratch + self._scratch.nbytes // 2
-        return [m, n, pentagon, nb, self._address, lda, 0, ldb, T, ldt, work, info]
+    @cached_property
+    def _addresses(self) -> list[int]:
+        """Addresses of m, n, l, nb, A, lda, B, ldb, T, ldt, work and info."""
+        R, sizes = self.R.ctypes.data, self._scratch.ctypes.data
+        T, end = sizes + self._sizes.nbytes, sizes + self._scratch.nbytes
+        m, n, pentagon, nb, lda, ldb, ldt, info = range(sizes, T, self._sizes.itemsize)
+        return [m, n, pentagon, nb, R, lda, 0, ldb, T, ldt, (T + end) // 2, info]
 
 
 @cache

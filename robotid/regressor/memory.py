@@ -59,8 +59,18 @@ def drive_motion_along(
         has_rate: Whether the rate is needed, as for a lag; it is 0 otherwise.
 
     Returns:
-        Arrays of shape (d, N).
+        Arrays of shape (d, N). The last ones are kept with the trajectory.
     """
+    key, known = (model.pin_model, model.layout, has_rate), trajectory.derived.get("drive motion")
+    if known is None or known[0] != key or not np.array_equal(known[1], model.carried_by):
+        found = _drive_motion(model, trajectory, has_rate)
+        trajectory.derived["drive motion"] = known = key, model.carried_by, found
+    motion: DriveMotion = known[2]
+    return motion
+
+
+def _drive_motion(model: RobotModel, trajectory: Trajectory, has_rate: bool) -> DriveMotion:
+    """Return the motion and load of drives as of ``drive_motion_along``."""
     layout, pi = model.layout, model.carried_by
     m = trajectory.with_states(None)  # that of another reference, if it has one
     first = model.n_rows - len(model.joints)

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -181,6 +183,11 @@ def test_full_turns_are_taken_out_of_free_joints_only():
     out = unwrap(log, np.array([True, False]))
     np.testing.assert_allclose(out.q, angle, atol=1e-12)
     assert out.notes == ("full turns removed from the angle of a",)
+    assert unwrap(log, np.array([True, True])) is out, "so that its motions are kept"
+    other = replace(log, q=wrapped + np.array([0.0, 1.0]))
+    np.testing.assert_allclose(
+        unwrap(other, np.array([True, False])).q, angle + np.array([0.0, 1.0])
+    )
     with pytest.raises(DataError, match=r"q_a jumps by a full turn at t = 1.58 s"):
         unwrap(log, np.array([False, False]))
 

@@ -102,3 +102,21 @@ def test_one_drive_that_bears_a_load_is_enough(ur5):
     assert not is_loaded(ur5.with_terms({first: (Presliding(),), second: (Presliding(),)}))
     own = {first: (Presliding(),), second: (Lag(),), third: (Presliding(),)}
     assert is_loaded(ur5.with_terms(own))
+
+
+def test_motions_that_were_kept_are_not_those_of_another_reference(ur5, rng):
+    model = ur5.with_terms({JOINTS[1]: (LoadFriction(), Lag())})
+    m = motion(ur5, rng, samples=40)
+    pi = model.standard_parameters()
+    pi[model.layout.n_inertial :] = 0.5
+    heavier = model.with_reference(
+        np.where(np.arange(len(pi)) < model.layout.n_inertial, 2, 3) * pi
+    )
+    first, again = (drive_motion_along(model.with_reference(pi), m) for _ in range(2))
+    assert first is again
+    other = drive_motion_along(heavier, m)
+    np.testing.assert_allclose(other.load, 2 * first.load)
+    alone = drive_motion_along(heavier, motion(ur5, np.random.default_rng(1), samples=40))
+    assert not np.allclose(alone.load, other.load), "of another trajectory"
+    assert not drive_motion_along(heavier, m, has_rate=False).rate.any()
+    assert drive_motion_along(heavier, m).rate.any()
