@@ -23,7 +23,6 @@ from robotid.logs.settings import SignalSettings
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 
-
 # every second worker of pytest-xdist collects from the end: modules that one has compiled the other
 # finds compiled
 WORKER = os.environ.get("PYTEST_XDIST_WORKER", "")
