@@ -1,11 +1,13 @@
 import gc
 import os
+import sys
 from pathlib import Path
 
 # one thread of BLAS per process, before numpy loads it: the workers of pytest-xdist share the cores
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-# programs that tests start compile the package once, not each of them
+# the package is compiled once, not by each process and each program that tests start
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
 gc.disable()  # until the tests begin: nothing that is imported is garbage
 
 import numpy as np
@@ -20,6 +22,27 @@ from robotid.logs.data import Log
 from robotid.logs.settings import SignalSettings
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
+
+# every second worker of pytest-xdist collects from the end: modules that one has compiled the other
+# finds compiled
+WORKER = os.environ.get("PYTEST_XDIST_WORKER", "")
+FROM_THE_END = WORKER.endswith(("1", "3", "5", "7", "9"))
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_make_collect_report(collector):
+    """Turn round the entries of folders in every second worker."""
+    report = yield
+    if FROM_THE_END and isinstance(collector, pytest.Directory):
+        report.result.reverse()
+    return report
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items):
+    """Give all workers one order of files."""
+    if WORKER:
+        items.sort(key=lambda item: str(item.path))
 
 
 def pytest_collection_finish():

@@ -3,6 +3,7 @@
 import ast
 import re
 import sys
+from functools import cache
 
 import pytest
 from helpers.paths import DOCS, ROOT
@@ -75,18 +76,19 @@ def faults(text):
     ]
 
 
-def strings(source):
+@cache
+def strings(path):
     """Return the docstrings of a module that others use, and the texts that users read."""
-    tree = ast.parse(source)
+    nodes = list(ast.walk(ast.parse(path.read_text())))
     docs, texts, skipped = [], [], set()
-    for node in ast.walk(tree):
+    for node in nodes:
         if isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef)):
             first = node.body[0] if node.body else None
             if isinstance(first, ast.Expr) and isinstance(first.value, ast.Constant):
                 skipped.add(first.value)
                 if not getattr(node, "name", "").startswith("_"):
                     docs.append(str(first.value.value))
-    for node in ast.walk(tree):
+    for node in nodes:
         if isinstance(node, ast.Constant) and isinstance(node.value, str) and node not in skipped:
             texts.append(node.value)
     return docs, [text for text in texts if " " in text.strip()]
@@ -110,7 +112,7 @@ def test_the_package_uses_the_words_of_the_field(part, kind):
     found = [
         f"{path.relative_to(ROOT)}: {fault}"
         for path in modules(part)
-        for text in strings(path.read_text())[which]
+        for text in strings(path)[which]
         for fault in faults(text)
     ]
     assert not found, "\n".join(found)
