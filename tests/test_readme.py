@@ -101,9 +101,9 @@ def test_the_recipes_are_job_files(folder, recipe):
 
 
 def test_each_command_is_one_line_with_venv_and_pip():
-    for marker, option in (("demo command", ""), ("test command", "--upgrade-deps ")):
+    for marker, option in (("demo command", ""), ("test command", " --upgrade-deps")):
         (line,) = block(marker).strip().splitlines()
-        assert line.startswith(f"python3 -m venv {option}.venv && .venv/bin/pip install")
+        assert line.startswith(f"python3 -m venv .venv{option} && .venv/bin/pip install")
 
 
 def test_the_demo_needs_no_extra():
