@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from robotid.advice.loop_steps import loop_steps
-from robotid.advice.next_steps import next_steps
-from robotid.advice.steps import Origin
+from robotid.advice.next_steps import _of_verdict, _once, next_steps
+from robotid.advice.steps import Origin, Step
 from robotid.cli import _parser
 from robotid.commands.job import job_from_settings
 from robotid.diagnosis.candidates import CANDIDATES, couplings, ripples
@@ -19,6 +19,7 @@ from robotid.diagnosis.misfit_findings import misfit_findings, setting_of
 from robotid.findings import Finding
 from robotid.fitting.joint_motion import JointMotion
 from robotid.fitting.settings import ConsistentSettings
+from robotid.judgement.payload_check import PayloadCheck
 from robotid.judgement.verdict import WARNING_CODES
 from robotid.robot.examples import example_urdf
 
@@ -370,6 +371,69 @@ def test_figures_in_steps_are_those_of_all_findings_and_of_the_result(identified
     assert step.blocks[0] == "[estimator.constraints]\ntotal_mass = KG"
 
 
+def test_a_payload_that_contradicts_the_scale_is_the_one_to_identify_gains_from(identified):
+    near = PayloadCheck("wrist", 2.0, 2.02, 0.01, (2.0, 2.04), "near.csv")
+    far = PayloadCheck("tool0", 2.5, 3.25, 0.1, (3.05, 3.45), "far.csv")
+    gains = ("--gain", "two=1.5", "--cutoff", "8", "--gain", "one=-2")
+    origin = Origin(("arm.urdf", "first.csv", *gains), "out")
+
+    def step(*payloads):
+        found = told(identified, warning("scale_unchecked"))
+        found.__dict__["scale_check"] = replace(identified.scale_check, payloads=payloads)
+        return next_steps(found, origin)[0]
+
+    urdf, log = identified.model.tree.path, identified.fitted[0].recording.log.path
+    words = "robotid payload {} {} --reference {} --link {} --mass {} --gains"
+    wrong = step(near, far)
+    assert wrong.words.startswith(f"Correct the torque scale: {far.message}. State the gains ")
+    assert wrong.blocks == (
+        words.format(urdf, "far.csv", log, "tool0", "2.5"),
+        "robotid identify arm.urdf first.csv --cutoff 8 --gain two=GAIN --gain one=GAIN --out out",
+    )
+    right = step(near)
+    assert right.words == f"Verify the torque scale: {near.message}."
+    assert right.blocks[0] == words.format(urdf, "near.csv", log, "wrist", "2")
+    assert "GAIN" not in right.blocks[1]
+
+
+def test_a_flag_is_replaced_with_its_value_and_nothing_else():
+    source = ("a.urdf", "x.csv", "--gain", "one=1", "--gain=two=2", "--rename", "one=1", "--cutoff",
+              "8", "--payload-check", "l.csv=2", "y.csv")  # fmt: skip
+    again = Origin(source).again("--cutoff", "5", "--gain", "one=3")
+    assert again == (
+        "robotid identify a.urdf x.csv --gain=two=2 --rename one=1 --payload-check l.csv=2 y.csv "
+        "--cutoff 5 --gain one=3"
+    )
+    twice = Origin((*source, "--gain", "one=7", "--gain", "one=8"), "o").again("--gain", "one=3")
+    assert twice.count("one=") == 2  # the gain and the name
+    assert twice.endswith("--cutoff 8 --payload-check l.csv=2 y.csv --gain one=3 --out o")
+
+
+def test_a_block_of_several_steps_is_in_the_last_of_them_only():
+    steps = [Step("a", ("x", "y")), Step("b", ("z",)), Step("c", ("x", "w")), Step("d", ("w",))]
+    assert [step.blocks for step in _once(steps)] == [("y",), ("z",), ("x",), ("w",)]
+
+
+def test_a_torque_with_another_gain_is_no_reason_to_keep_the_urdf(identified):
+    (kept,) = identified.validation
+    own = kept.metrics["estimate"]
+    beaten = {j: replace(m, baselines={**m.baselines, "urdf_with_drives": 0.01})
+              for j, m in own.per_joint.items()}  # fmt: skip
+    metrics = {**kept.metrics, "estimate": replace(own, per_joint=beaten)}
+    runs = (replace(kept, metrics=metrics),)
+
+    def named(*findings):
+        causes = {
+            c.code: c.joints for c in _of_verdict(told(identified, *findings, validation=runs))
+        }
+        return causes["beaten"]
+
+    joints = identified.model.joints
+    assert named() == joints
+    assert named(warning("gain_change", f"kept.csv: {joints[2]}")) == (*joints[:2], *joints[3:])
+    assert named(warning("torque_delay", f"kept.csv: {joints[2]}")) == joints
+
+
 def test_joints_that_any_recording_misses_are_looked_at_and_the_first_is_played(identified):
     (kept,) = identified.validation
     metrics = kept.metrics["estimate"]
@@ -435,6 +499,14 @@ def test_a_poor_result_of_commands_is_repaired_and_not_used():
     ]
     assert "position of two is wrong" in steps[-1].words
     assert [block.split()[1] for step in steps for block in step.blocks] == ["replay", "identify"]
+
+
+def test_the_causes_of_poor_joints_come_first_and_three_steps_are_enough():
+    warnings = [loop_warning(f"c{k}", where) for k, where in enumerate(("one", "two", "three"))]
+    steps = loop_steps(loop_content("poor", warnings=warnings), JOB)
+    assert [step.words.split(";")[0] for step in steps[:2]] == ["Two has c1", "One has c0"]
+    assert len(steps) == 3
+    assert steps[-1].words.startswith("Do not use the result")
 
 
 def test_errors_of_a_log_of_commands_are_corrected_first():

@@ -9,6 +9,7 @@ from helpers.mujoco_plant import plant, recorded
 from robotid.closed_loop.free_parameters import FreeParameter, LoopSimulator
 from robotid.closed_loop.runs import loop_runs, units_of
 from robotid.estimators.estimator import Estimate
+from robotid.estimators.output_error import segment_scores
 from robotid.export.commanded import loops_of
 from robotid.robot.drives import Coulomb, Viscous
 from robotid.simulation.loops import ClosedLoopRobot, cut_windows
@@ -67,6 +68,11 @@ def test_each_log_tells_its_own_gains_and_friction(leg):
     assert kp == pytest.approx([0.0, 0.0, 0.03, 0.0], abs=0.006)
     assert np.abs(values(hip)[:, 1]).max() < 3e-4  # [s]
     assert hip.runs.scale == pytest.approx([0.1 * hip.centre[0], 1e-3])
+    own = tuple(w for w in simulator.windows if w.log is simulator.windows[-1].log)
+    each = [segment_scores(replace(simulator, windows=(w,)), estimate) for w in own]
+    H, g = (sum(x[k].sum(axis=0) for x in each) for k in (0, 1))  # of all windows of the last log
+    assert hip.runs.H[3] * hip.inflation == pytest.approx(H[1:, 1:], rel=1e-6)
+    assert hip.runs.h[3] * hip.inflation == pytest.approx(g[1:], rel=1e-6)
     # another noise level: another information, the same inflated one
     louder = loop_runs(robot.model, simulator, replace(estimate, sigma=2.0 * estimate.sigma))
     assert louder[1].inflation == pytest.approx(hip.inflation / 4)

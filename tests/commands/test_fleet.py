@@ -166,7 +166,11 @@ def test_a_page_of_many_failures_and_units_shows_each_kind_and_few_of_them():
     ]  # fmt: skip
     content = {"units": 1000, "logs": 1000, "done": 699, "verdicts": {"usable": 699},
                "failures": failures, "unlike": unlike, "parameters": []}  # fmt: skip
+    unlike[1] |= {"value": -1.25, "std_error": 0.5, "others": [0.75, 4.5]}
     html = fleet_page(content)
+    differ = tables(html)["Units that differ from the others"].rows
+    assert differ[0] == ["u0", "a.coulomb", "1.00", "0.10", "2.00", "3.00", "N m"]
+    assert differ[1] == ["u0", "a.coulomb", "−1.25", "0.50", "0.75", "4.50", "N m"]
     shown = tables(html)["Units and logs that were not identified"].rows
     assert [row[0] for row in shown] == ["u000", "last", *(f"u{k:03d}" for k in range(1, 19))]
     assert [row[2] for row in shown[:3]] == ["300", "1", "300"]

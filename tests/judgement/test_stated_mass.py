@@ -136,6 +136,14 @@ def test_a_wide_range_is_a_bound_and_a_narrow_one_widens_the_interval(crane):
     narrow = checked(model, log, total_mass=[0.98 * total, 1.02 * total]).stated
     exact = checked(model, log, total_mass=total).stated
     assert narrow.half_width == pytest.approx(exact.half_width + 0.02)
+    cart, boom = float(pi[0]), float(pi[10])  # ranges of several masses count by their shares
+    ranged, both = (
+        checked(model, log, mass={"boom": [(1 - x) * boom, (1 + x) * boom],
+                                  "cart": [(1 - y) * cart, (1 + y) * cart]}).stated
+        for x, y in ((0.02, 0.04), (0.0, 0.0))
+    )  # fmt: skip
+    wider = (0.02 * boom + 0.04 * cart) / total
+    assert ranged.half_width - both.half_width == pytest.approx(wider, rel=1e-6)
 
 
 @pytest.mark.parametrize(

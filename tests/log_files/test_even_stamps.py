@@ -7,7 +7,7 @@ import pytest
 from robotid.commands.convert import convert
 from robotid.log_files.even_stamps import with_even_stamps
 from robotid.log_files.read import lay_out, read_log
-from robotid.log_files.table import Table
+from robotid.log_files.table import RowReader, Table
 from robotid.logs.settings import LogSource, LogUnits
 
 EVEN = LogSource(stamp="even")
@@ -62,3 +62,34 @@ def test_one_row_and_other_columns_stay():
     assert even.read(["time", "q"]) == {"time": [3.0], "q": [3.0]}
     assert even.read(["q"]) == {"q": [3.0]}
     assert even.rows is None
+
+
+class Blocks(RowReader):
+    """Rows in blocks of unlike lengths, the first one empty."""
+
+    def __init__(self, t):
+        self.t, self.parts = t, np.split(t, [0, 3, 50, 51])
+
+    def count(self):
+        return len(self.t)
+
+    def scan(self, name):
+        yield from ((part if name == "time" else -part, k) for k, part in enumerate(self.parts))
+
+    def read(self, wanted, first, stop, near):
+        return {name: (1 if name == "time" else -1) * self.t[first:stop] for name in wanted}
+
+
+def test_the_line_is_that_through_all_blocks_of_a_long_file(rng):
+    t = 1.7e9 + 0.004 * np.arange(90) + 0.001 * rng.random(90)
+    even = with_even_stamps(Table(["time", "q"], lambda names: {}, rows=Blocks(t)), "time").rows
+    k = np.arange(90)
+    step, start = np.polyfit(k, t - t[0], 1)
+    wanted = start + step * k
+    blocks = list(even.scan("time"))
+    assert [(len(x), place) for x, place in blocks] == [(0, 0), (3, 1), (47, 2), (1, 3), (39, 4)]
+    np.testing.assert_allclose(np.concatenate([x for x, _ in blocks]) - t[0], wanted, atol=1e-6)
+    np.testing.assert_array_equal(np.concatenate([x for x, _ in even.scan("q")]), -t)
+    part = even.read(["q", "time"], 40, 60, 2)
+    np.testing.assert_allclose(part["time"] - t[0], wanted[40:60], atol=1e-6)
+    np.testing.assert_array_equal(part["q"], -t[40:60])

@@ -11,7 +11,14 @@ from robotid.exceptions import DataError
 from robotid.log_files.read import read_log, write_log
 from robotid.logs.base import BaseColumns, BaseMotion, base_state
 from robotid.logs.data import Log
-from robotid.logs.imu import ImuFrame, ImuMotion, bias_at_rest, motion_of_imu, orientation_of_imu
+from robotid.logs.imu import (
+    ImuFrame,
+    ImuMotion,
+    bias_at_rest,
+    inertial_state,
+    motion_of_imu,
+    orientation_of_imu,
+)
 from robotid.logs.settings import SignalSettings
 from robotid.logs.signals import process
 
@@ -247,3 +254,30 @@ def test_an_imu_needs_no_orientation_unless_horizontal_forces_of_the_world_are_m
     other = replace(frame, gravity=np.array([0.0, -9.81, 0.0]))
     with pytest.raises(DataError, match="no column imu_qx"):
         read_log(path, JOINTS, base=BaseColumns(floats=True, imu=other, wrenches=("fz foot",)))
+
+
+def test_the_acceleration_of_the_base_is_that_of_a_lever_at_uneven_stamps(rng):
+    t = 50.0 + np.cumsum(rng.uniform(0.5e-3, 3e-3, 1500))
+    rate, size, start = np.array([3.0, 2.0, 4.0]), np.array([2.0, -1.5, 1.0]), [0.3, 1.0, 2.0]
+    angle = t[:, None] * rate + start
+    w, alpha = size * np.sin(angle), size * rate * np.cos(angle)
+    r, offset = np.array([0.3, -0.2, 0.5]), np.array([0.4, -0.3, 0.2])
+    f, v = rng.normal(size=(2, len(t), 3))
+    down = np.tile([1.0, -2.0, -9.0], (len(t), 1))
+    at_imu = f + np.cross(alpha, r) + np.cross(w, np.cross(w, r)) + offset
+    frame = ImuFrame(np.array([0, 0, 0, 1.0]), r, np.array([0, 0, -9.81]), np.zeros(3), offset)
+    twist, found = inertial_state(t, v, down, np.hstack([at_imu, w])[:, [3, 4, 5, 0, 1, 2]], frame)
+    np.testing.assert_array_equal(twist, np.hstack([v, w]))
+    wanted = np.hstack([f + down - np.cross(w, v), alpha])
+    np.testing.assert_allclose(found[1:-1], wanted[1:-1], atol=1e-3)
+
+
+def test_the_vertical_is_the_mean_force_within_one_second_to_each_side_taken_twice(rng):
+    t = 100.0 + np.sort(rng.uniform(0.0, 8.0, 4000))
+    x = 0.5 * (t - 104.0) ** 2  # [m/s^2]; its mean over +-1 s is larger by 0.5 / 3
+    force = np.column_stack([x, np.zeros_like(t), np.full_like(t, 9.0)])
+    q = orientation_of_imu(t, np.hstack([0.0 * force, force]), np.array([0.0, 0.0, -9.81]))
+    inner = (t > 102.0) & (t < 106.0)
+    half = np.arctan2(x + 2 * 0.5 / 3, 9.0) / 2
+    wanted = np.column_stack([0 * t, -np.sin(half), 0 * t, np.cos(half)])
+    np.testing.assert_allclose(q[inner], wanted[inner], atol=2e-4)

@@ -425,3 +425,61 @@ def test_charts_below_the_window_are_there_in_a_capture_of_the_page(
         seen.page.emulate_media(media="print")
         assert seen.page.evaluate(hidden) == "block"
         assert seen.errors == []
+
+
+def test_every_number_and_setting_of_a_chart_is_in_its_data():
+    x = np.array([0.1, 1.0, 10.0, 100.0])
+    series = (
+        Series("a", np.array([1.0, 20.0, np.nan, 3e4]), "text", half=np.array([0.0, 0.5, 1.0, 4])),
+        Series("b", np.array([5.0, 6.0, 7.0, 8.0]), "tone-1", "dots", is_weak=True),
+        Series("c", np.array([0.2, 0.4, 0.6, 9.0]), "tone-2", is_hidden=True),
+    )
+    chart = Chart(
+        "<t>", x, series, "x [Hz]", "y [N]", link="run 2", spans=((0.2, 0.5), (2.0, 30.0)),
+        marks=(0.3, 40.0), logarithmic="xy", height=123, x_names=("p", "q"),
+    )  # fmt: skip
+    (found,) = charts(chart_html(chart, ""))
+    np.testing.assert_allclose(found["x"], x, rtol=1e-6)
+    for own, said in zip(series, found["series"], strict=True):
+        np.testing.assert_allclose(said["y"], own.y, rtol=1e-3)
+        keys = {"label": own.label, "tone": own.tone, "kind": own.kind}
+        assert {key: said[key] for key in keys} == keys
+        assert (said["faint"], said["hidden"]) == (own.is_weak, own.is_hidden)
+    np.testing.assert_allclose(found["series"][0]["half"], [0.0, 0.5, 1.0, 4.0], atol=1e-4)
+    assert [said["half"] is None for said in found["series"]] == [False, True, True]
+    assert found["spans"] == [[0.2, 0.5], [2.0, 30.0]]
+    assert found["marks"] == [0.3, 40.0]
+    keys = ("title", "x_label", "y_label", "link", "logarithmic", "height", "x_names")
+    said = [found[key] for key in keys]
+    assert said == ["<t>", "x [Hz]", "y [N]", "run 2", "xy", 123, ["p", "q"]]
+
+
+def test_of_a_thinned_line_every_extreme_and_both_sides_of_a_break_remain():
+    y = np.sin(np.arange(4000) / 7.0) * (1 + np.arange(4000) / 4000)
+    y[[600, 2501]] = 30.0, -40.0
+    y[1000:1100] = y[3333] = np.nan
+    rows = thin(y, 400)
+    assert {0, 600, 999, 1000, 1099, 1100, 2501, 3332, 3333, 3334, 3999} <= set(rows.tolist())
+    assert len(rows) <= 400 + 10
+    for first in range(0, 4000, 20):  # two points of each 20 samples: the largest and the smallest
+        own = y[first : first + 20]
+        if np.isfinite(own).any():
+            kept = y[rows[(rows >= first) & (rows < first + 20)]]
+            assert (np.nanmin(kept), np.nanmax(kept)) == (np.nanmin(own), np.nanmax(own))
+
+
+def test_a_line_is_broken_in_the_middle_of_each_gap():
+    x, y = np.array([10.0, 10.5, 11.0, 14.0, 14.5, 20.5]), np.arange(6.0)
+    times, one, two = broken(np.array([0, 0, 0, 1, 1, 2]), x, y, -y)
+    np.testing.assert_array_equal(times, [10.0, 10.5, 11.0, 12.5, 14.0, 14.5, 17.5, 20.5])
+    np.testing.assert_array_equal(one, [0, 1, 2, np.nan, 3, 4, np.nan, 5])
+    np.testing.assert_array_equal(two, -one)
+
+
+def test_a_cell_of_a_notebook_is_as_high_as_its_charts():
+    def height(*each):
+        own = [Chart("a", np.arange(2.0), (), "x", "y", height=h) for h in each]
+        plot = Plot("two", tuple((chart, "") for chart in own))
+        return int(re.search(r"height:(\d+)px", plot._repr_html_())[1])
+
+    assert (height(100, 150), height(500, 500)) == (100 + 150 + 2 * 112 + 60, 900)

@@ -50,6 +50,16 @@ def test_a_command_breaks_between_arguments_only():
     assert command_html("[locked]\na = 0") == '<pre class="command">[locked]\na = 0</pre>'
 
 
+def test_a_small_error_of_a_plain_number_is_written_in_full():
+    """Powers of ten are for numbers that are small, too, and for errors of 100,000 and more."""
+    for value, error, wanted in (
+        (1.5, 1.2e-5, ("1.500000", "0.000012")), (0.00123, 2e-4, ("0.00123", "0.00020")),
+        (1.5e-4, 0.0012, ("0.0001", "0.0012")), (2e-4, 3e-4, ("2.0e−04", "3.0e−04")),
+        (-1.5e6, 9.94e4, ("−1500000", "99400")), (-1.5e6, 1.2e5, ("−1.50e+06", "1.2e+05")),
+    ):  # fmt: skip
+        assert tuple(cell.html for cell in with_error(value, error)) == wanted
+
+
 def test_a_number_ends_at_the_second_digit_of_its_error(rng):
     sizes = zip(rng.uniform(-6, 6, 300), rng.uniform(-7, 5, 300), strict=True)
     for value, error in ((rng.choice([-1, 1]) * 10.0**a, 10.0**b) for a, b in sizes):

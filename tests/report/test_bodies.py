@@ -122,3 +122,29 @@ def test_intervals_and_values_of_the_urdf_are_on_the_axis_of_their_group(central
                 ends = re.search(r'class="half" x1="([-\d.]+)%" x2="([-\d.]+)%"', mark).groups()
                 wanted = [at(value - half), at(value + half)]
                 assert [float(x) for x in ends] == pytest.approx(wanted, abs=0.3)
+
+
+@pytest.mark.parametrize(("term", "columns"), [("m", [0]), ("cy", [1, 2, 3]), ("Ixz", [7, 8, 9])])
+def test_the_numbers_below_an_axis_are_zero_and_a_round_one_at_their_places(
+    central, picture, term, columns
+):
+    def scaled(x):
+        return np.sign(x) * np.sqrt(np.abs(x)) if term[0] == "I" else np.asarray(x)
+
+    every = np.concatenate(
+        [[0.0], *(x[:, columns].ravel() for x in (central.urdf, central.values))]
+    )
+    low, high = scaled(every).min(), scaled(every).max()
+    low, high = low - 0.06 * (high - low), high + 0.06 * (high - low)  # the ends of the axis
+    end = max(low, high, key=abs)
+    end = np.sign(end) * end**2 if term[0] == "I" else end
+    _, drawn = picture.split(f'aria-label="{term} of each link">')
+    lines = [float(x) for x in re.findall(r'class="tick" x1="([\d.]+)%"', drawn.split("</svg>")[0])]
+    spans = re.findall(r'<span style="(left|right): (\d+)%">(.*?)</span>', drawn.split("</div>")[0])
+    said = [float(words.replace("−", "-")) for _, _, words in spans]
+    digit = 10.0 ** np.floor(np.log10(abs(end)))
+    assert said == [0.0, pytest.approx(np.sign(end) * np.floor(abs(end) / digit) * digit)]
+    at = [100 * (scaled(x) - low) / (high - low) for x in said]
+    assert lines == pytest.approx(at, abs=0.06)
+    places = [float(x) if side == "left" else 100 - float(x) for side, x, _ in spans]
+    assert places == pytest.approx(at, abs=0.51)

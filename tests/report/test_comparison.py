@@ -23,9 +23,10 @@ from robotid.log_files.read import write_log
 from robotid.pages.html import code
 from robotid.report import comparison_page
 from robotid.report.comparison import _friction_curves, compare_results, write_comparison
-from robotid.report.history import history_of
+from robotid.report.history import _message, history_of, history_section
 from robotid.robot.drives import Asymmetric, LoadFriction, Stribeck
 from robotid.robot.model import RobotModel
+from robotid.variation.change_causes import Cause
 
 
 @pytest.fixture(scope="module")
@@ -662,3 +663,61 @@ def test_the_chart_of_a_friction_has_its_units_its_loads_and_no_line_across_stan
     plain = comparison_page._friction_figure(content, entry | {"unit": "N m", "load": 3 * [None]})
     assert charts(plain)[0]["x_label"] == "speed [rad/s]"
     assert "of load" not in plain
+
+
+@pytest.mark.parametrize(
+    ("kind", "size", "error", "wanted"),
+    [
+        ("friction", 0.312, 0.0456, "friction of two is 31 % higher (standard error 4.6 %)"),
+        ("friction", -0.27, 0.0312, "friction of two is 27 % lower (standard error 3.1 %)"),
+        ("gain", -0.054, 0.012, "gain of the torque of two is 5.4 % lower (standard error 1.2 %)"),
+        ("payload", 1.2345, 0.0567, "the load on two has changed: +1.23 kg (standard error "
+         "0.057 kg)"),
+        ("payload", -0.5, 0.02, "the load on two has changed: -0.5 kg (standard error 0.02 kg)"),
+        ("payload", 0.0, 0.0, "the load on two has changed"),
+        ("offset", -2.345, 0.123, "the offset of two has changed by -2.35 (standard error 0.12)"),
+        ("other", 0.0, 0.0, "no single cause explains the change of a.coulomb"),
+    ],
+)  # fmt: skip
+def test_a_cause_states_size_and_standard_error_in_its_unit(kind, size, error, wanted):
+    assert _message(Cause(kind, "two", size, error), ["a.coulomb", "b.m"]) == wanted
+
+
+def test_every_cell_of_a_history_is_that_of_its_change():
+    changes = [
+        {"result": "C", "since": "B", "name": "a.m", "unit": "kg", "value": -1.5, "std_error": 0.25,
+         "compared_from": "A", "predicted": [0.5, 3.25], "probability": 1e-4},
+        {"result": "D", "since": "D", "name": "b.m", "unit": "N m", "value": 8.0, "std_error": 2.0,
+         "compared_from": "B", "predicted": [2.0, 6.0], "probability": 1e-5},
+    ]  # fmt: skip
+    findings = [
+        {"result": "C", "since": "B", "message": "one", "parameters": ["a.m"], "remedy": "weigh"},
+        {"result": "D", "since": "D", "message": "two", "parameters": ["b.m", "c"], "remedy": "go"},
+    ]
+    names = ("a.m", "b.m")
+    base = [{"name": x, "unit": "u", "values": [9, 1, 2, 3], "std_errors": [5, 2, 3, 4]}
+            for x in names]  # fmt: skip
+    content = {"results": [{"label": x} for x in "DBAC"], "order": [2, 1, 3, 0], "by_time": True,
+               "false_alarms": 0.035, "changes": changes, "findings": findings,
+               "base_parameters": base}  # fmt: skip
+    html = history_section(content)
+    assert "logs: A, B, C, D. " in html
+    assert "of at most 3.5 %." in html
+    causes, found = tables(html).values()
+    assert causes.rows == [
+        ["C", "B", "one", "a.m", "weigh"], ["D", "D", "two", "b.m, c", "go"]
+    ]  # fmt: skip
+    assert found.rows == [
+        ["C", "a.m", "−1.50", "0.25", "0.50", "3.25", "kg", "B"],
+        ["D", "b.m", "8.0", "2.0", "2.0", "6.0", "N m", "D"],
+    ]
+    for drawn, name, mark in zip(charts(html), names, (0.5, 2.5), strict=True):
+        assert (drawn["y_label"], drawn["marks"]) == (f"{name} [u]", [mark])
+        before, own = drawn["series"]
+        np.testing.assert_allclose(own["y"], [2, 1, 3, 9], atol=1e-3)  # in order of time
+        np.testing.assert_allclose(own["half"], 1.96 * np.array([3, 2, 4, 5.0]), atol=1e-3)
+        middle, half = ([1.875] * 3 + [np.nan], [1.375] * 3) if name == "a.m" else (
+            [np.nan, 4, 4, 4], [2.0] * 3)  # fmt: skip
+        np.testing.assert_allclose(before["y"], middle, atol=1e-3)
+        known = np.isfinite(middle)
+        np.testing.assert_allclose(before["half"][known], half, atol=1e-3)

@@ -340,3 +340,7 @@ def test_a_missing_folder_is_named(found, tmp_path):
 def test_numbers_that_do_not_exist_are_dashes():
     assert [number(x).html for x in (None, np.inf, np.nan)] == ["–", "–", "–"]
     assert [percent(x).html for x in (0.123, 12.34, 1234.5, None)] == ["0.12", "12.3", "1234", "–"]
+    edges = [0.0, 0.994, 0.996, 9.96, 99.96, 999.9, 1000.0, -2.5, np.inf]
+    assert [percent(x).html for x in edges] == [
+        "0.00", "0.99", "1.0", "10.0", "100.0", "999.9", "1000", "−2.50", "–"
+    ]  # fmt: skip

@@ -436,3 +436,27 @@ def test_units_are_compared_whose_mean_covariate_rounds():
     assert found.values[1] == pytest.approx(wanted[:2], rel=1e-2)
     assert np.sqrt(np.diag(found.covariance[1])) == pytest.approx(np.sqrt(np.diag(P))[:2], rel=1e-2)
     assert found.mean[1] == pytest.approx([each.mean for each in others.predict()], rel=1e-6)
+
+
+@pytest.mark.parametrize("unit", [1e-4, 1e3])
+def test_an_effect_does_not_depend_on_the_unit_and_the_zero_of_its_covariate(unit):
+    groups, _ = two_drives(np.random.default_rng(3))
+    moved = [
+        replace(each, covariates=tuple(
+            replace(own, values=unit * (own.values + 273.15)) for own in each.covariates
+        )) for each in groups
+    ]  # fmt: skip
+    one, other = (
+        [own for each in vary([f"run_{k}" for k in range(10)], own_groups).parameters
+         for own in each.effects]
+        for own_groups in (groups, moved)
+    )  # fmt: skip
+    assert [own.is_used for own in one] == [own.is_used for own in other]
+    assert sum(own.is_used for own in one) == 1
+    for own, same in zip(one, other, strict=True):
+        assert unit * same.slope == pytest.approx(own.slope, rel=1e-5, abs=1e-7)
+        assert unit * same.std_error == pytest.approx(own.std_error, rel=1e-5)
+        assert same.probability == pytest.approx(own.probability, rel=1e-4)
+        at, *ends = own.intervals
+        assert same.intervals[0] == pytest.approx(unit * (at + 273.15), rel=1e-9)
+        assert same.intervals[1:] == pytest.approx(np.array(ends), rel=1e-5)
