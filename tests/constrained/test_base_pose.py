@@ -86,6 +86,17 @@ def test_another_vertical_axis_of_the_world_is_named(robot, log, axis, down):
     assert not list(check_base(stated, other, SLOW))
 
 
+def test_a_base_that_rolls_over_has_no_wrong_axes(robot, log):
+    angle = np.pi * np.clip(log.t - log.t[-1] / 2 + 0.5, 0.0, 1.0)  # the whole world turns in 1 s
+    turns = [pin.Quaternion(pin.exp3(np.array([x, 0.0, 0.0]))) for x in angle]
+    pose = [
+        np.r_[turn * x[:3], (turn * pin.Quaternion(x[3:])).coeffs()]
+        for turn, x in zip(turns, log.base.pose, strict=True)
+    ]
+    rolls = replace(log, base=BaseMotion(np.array(pose)))
+    assert "base_orientation" not in {x.code for x in check_base(robot, rolls, SLOW)}
+
+
 def test_a_position_in_millimetres_is_named(robot, log):
     pose = log.base.pose.copy()
     pose[:, :3] *= 1e3
