@@ -9,6 +9,7 @@ from scipy.special import stdtrit
 
 from robotid._typing import Array
 from robotid.constrained.base_pose import check_order, check_pose, check_twist, check_unit
+from robotid.constrained.closed_log import closed_log
 from robotid.constrained.found_contacts import with_contacts
 from robotid.constrained.imu import check_imu
 from robotid.constrained.slips import check_slip, without_zeros
@@ -59,6 +60,7 @@ def check_base(model: RobotModel, log: Log, signals: SignalSettings) -> Iterator
         return
     still = replace(signals, velocity="differentiated", acceleration="differentiated")
     try:
+        log = closed_log(model, log)
         motion = process(log, still)
         wrong = list(check_order(model, log, motion))
         whole = log if wrong else with_contacts(model, log, signals)
