@@ -323,9 +323,12 @@ def _names(turn: Array) -> list[str]:
 
 
 def _vertical(direction: Array, gravity: Array) -> str | None:
-    """Return the setting of gravity along the axis of a direction upwards; None if it has none."""
+    """Return the setting of gravity along the axis of a direction upwards; None if it has none.
+
+    The mean direction of a base that rolls over is short: it has none.
+    """
     k = int(np.argmax(np.abs(direction)))
-    if np.abs(direction[k]) < _ALONG * np.linalg.norm(direction):
+    if np.abs(direction[k]) < max(_ABOVE, _ALONG * float(np.linalg.norm(direction))):
         return None
     wanted = [0.0, 0.0, 0.0]
     wanted[k] = -float(np.copysign(np.linalg.norm(gravity), direction[k]))
@@ -334,10 +337,10 @@ def _vertical(direction: Array, gravity: Array) -> str | None:
 
 def _check_vertical(log: Log, mean: Array, gravity: Array) -> Iterator[Finding]:
     """Yield a finding if the base is above its feet along another axis of the world."""
-    mean = mean / np.linalg.norm(mean).clip(1e-9)
     remedy = _vertical(mean, gravity)
     if remedy is None:
         return
+    mean = mean / np.linalg.norm(mean)
     k = int(np.argmax(np.abs(mean)))
     axis = ("-" if mean[k] < 0 else "") + "xyz"[k]
     message = (

@@ -9,6 +9,7 @@ from scipy.special import stdtrit
 
 from robotid._typing import Array
 from robotid.constrained.base_pose import check_order, check_pose, check_twist, check_unit
+from robotid.constrained.closed_log import closed_log
 from robotid.constrained.found_contacts import with_contacts
 from robotid.constrained.imu import check_imu
 from robotid.constrained.slips import check_slip, without_zeros
@@ -27,6 +28,7 @@ __all__ = ["check_base", "flag_delay"]
 _LONGEST = 0.15  # [s] delay of contact flags that is searched for
 _NEAR = 0.075  # [s] distance of a change of motion from the delay of most changes
 _STOPS = 1e-3  # of the largest speed: smaller ones are alike
+_SLOWER = 0.5  # median speed in contact over that without, from which no delay can be seen
 _OF_MEDIAN = 1.858  # standard error of a median, times sqrt(n), over the median deviation (normal)
 _CERTAIN = 0.975  # probability that the scatter of a delay is below its bound
 _SLIDES = 0.1  # [m/s] RMS speed of a foot in contact that is reported ...
@@ -58,6 +60,7 @@ def check_base(model: RobotModel, log: Log, signals: SignalSettings) -> Iterator
         return
     still = replace(signals, velocity="differentiated", acceleration="differentiated")
     try:
+        log = closed_log(model, log)
         motion = process(log, still)
         wrong = list(check_order(model, log, motion))
         whole = log if wrong else with_contacts(model, log, signals)
@@ -265,7 +268,7 @@ def flag_delay(t: Array, flags: Array, speed: Array, spread: float) -> tuple[flo
     touch-downs, or differs from step to step, is no delay: a slow lift-off, a slip. So the delay
     is the mean of the two medians, half of their difference is its error, and that of the scatter
     is added, and half the spread of the filter: rows of that time beside a contact have no force
-    anyway.
+    anyway. A link that slides at more than half of its speed in the air shows no delay.
 
     Args:
         t: Time stamps, shape (N,) [s].
@@ -282,7 +285,10 @@ def flag_delay(t: Array, flags: Array, speed: Array, spread: float) -> tuple[flo
     shift = _best_shift(flags, speed, int(_LONGEST / step))
     flags = flags[(np.arange(len(flags)) + shift).clip(0, len(flags) - 1)]
     edges = 1 + np.flatnonzero(np.diff(flags.astype(int)))
-    level = np.sqrt(np.median(speed[flags]) * np.median(speed[~flags]))
+    slow, fast = np.median(speed[flags]), np.median(speed[~flags])
+    if slow > _SLOWER * fast:
+        return None
+    level = np.sqrt(slow * fast)
     is_still, near = speed <= level, int(_NEAR / step)
     delays: tuple[list[float], list[float]] = ([], [])  # at lift-offs, at touch-downs
     for before, i, after in zip([0, *edges], edges, [*edges[1:], len(t)], strict=False):

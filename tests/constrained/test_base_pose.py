@@ -13,10 +13,11 @@ from robotid.logs.base import BaseMotion, base_state, in_base, quaternions_of_an
 from robotid.logs.data import Log
 from robotid.logs.settings import SignalSettings
 from robotid.logs.signals import process
-from robotid.robot.constraints import Contact, link_positions
+from robotid.robot.constraints import Contact, frame_id, link_positions
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 
+UNTURNED = pin.SE3(pin.exp3(np.array([0.0, 0.0, -1.5])), np.zeros(3))
 SLOW = SignalSettings(cutoff=4.0)
 
 
@@ -84,6 +85,31 @@ def test_another_vertical_axis_of_the_world_is_named(robot, log, axis, down):
         gravity=(0.0, down, 0.0),
     )  # fmt: skip
     assert not list(check_base(stated, other, SLOW))
+
+
+def test_the_pose_of_another_link_is_that_of_the_root_first(robot, log):
+    data, head = robot.pin_model.createData(), frame_id(robot.pin_model, "Head")
+    poses = []
+    for q in robot.configurations(np.hstack([log.base.pose, log.q])):
+        pin.framesForwardKinematics(robot.pin_model, data, q)
+        leans = data.oMf[head].act(pin.SE3(pin.exp3(np.array([0.0, 0.0, 1.5])), np.zeros(3)))
+        poses.append(pin.SE3ToXYZQUAT(leans))
+    straight = [pin.SE3ToXYZQUAT(pin.XYZQUATToSE3(x) * UNTURNED) for x in poses]
+    stated = replace(log, base=BaseMotion(np.array(straight), link="Head"))
+    assert not list(check_base(robot, stated, SLOW))
+    other = replace(log, base=BaseMotion(np.array(poses), link="Head"))  # turned about its axis
+    assert [x.code for x in check_base(robot, other, SLOW)] == ["base_orientation"]
+
+
+def test_a_base_that_rolls_over_has_no_wrong_axes(robot, log):
+    angle = np.pi * np.clip(log.t - log.t[-1] / 2 + 0.5, 0.0, 1.0)  # the whole world turns in 1 s
+    turns = [pin.Quaternion(pin.exp3(np.array([x, 0.0, 0.0]))) for x in angle]
+    pose = [
+        np.r_[turn * x[:3], (turn * pin.Quaternion(x[3:])).coeffs()]
+        for turn, x in zip(turns, log.base.pose, strict=True)
+    ]
+    rolls = replace(log, base=BaseMotion(np.array(pose)))
+    assert "base_orientation" not in {x.code for x in check_base(robot, rolls, SLOW)}
 
 
 def test_a_position_in_millimetres_is_named(robot, log):

@@ -113,6 +113,13 @@ def test_what_differs_at_lift_offs_and_touch_downs_is_no_delay():
     assert flag_delay(*steps(0.0, 0.0, slips=2), spread=0.0) is None
 
 
+@pytest.mark.parametrize(("slides", "is_found"), [(0.38, True), (0.42, False)])  # of 0.8 m/s
+def test_a_foot_that_slides_at_half_of_its_speed_in_the_air_shows_no_delay(slides, is_found):
+    t, flags, speed = steps(0.06, 0.06)
+    found = flag_delay(t, flags, speed.clip(slides), spread=0.0)
+    assert (found is not None) == is_found
+
+
 def test_a_vibration_in_contact_is_no_slip_and_the_same_mean_speed_is(robot, walk):
     """Both feet stand always; one of them moves relative to the other."""
     contacts = tuple(Contact(foot, "surface", always=True) for foot in FEET)
