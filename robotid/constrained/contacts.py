@@ -268,7 +268,7 @@ def flag_delay(t: Array, flags: Array, speed: Array, spread: float) -> tuple[flo
     touch-downs, or differs from step to step, is no delay: a slow lift-off, a slip. So the delay
     is the mean of the two medians, half of their difference is its error, and that of the scatter
     is added, and half the spread of the filter: rows of that time beside a contact have no force
-    anyway. A link that slides at more than half of its speed in the air shows no delay.
+    anyway. A link sliding at more than half of its speed in the air shows no delay.
 
     Args:
         t: Time stamps, shape (N,) [s].

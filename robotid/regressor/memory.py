@@ -59,7 +59,7 @@ def drive_motion_along(
         has_rate: Whether the rate is needed, as for a lag; it is 0 otherwise.
 
     Returns:
-        Arrays of shape (d, N). The last ones are kept with the trajectory.
+        Arrays of shape (d, N). The last ones are stored with the trajectory.
     """
     key, known = (model.pin_model, model.layout, has_rate), trajectory.derived.get("drive motion")
     if known is None or known[0] != key or not np.array_equal(known[1], model.carried_by):

@@ -363,7 +363,7 @@ def test_figures_in_steps_are_those_of_all_findings_and_of_the_result(identified
     assert f"({after:.4g} kg stated, {before:.4g} kg" in next_steps(found, JOB)[0].words
     weighed = replace(identified.scale_check, is_total_determined=True)
     found = told(identified, warning("total_mass", "robot"))
-    found.__dict__["scale_check"] = weighed
+    found.__dict__["_scale"] = weighed
     step = next_steps(found, JOB)[0]
     assert "State the measured mass of the moving links" in step.words
     assert step.blocks[0] == "[estimator.constraints]\ntotal_mass = KG"
@@ -378,8 +378,7 @@ def test_a_payload_that_contradicts_the_scale_is_the_one_to_identify_gains_from(
     origin = Origin(("arm.urdf", "first.csv", *gains), "out")
 
     def step(*payloads):
-        found = told(identified, warning("scale_unchecked"))
-        found.__dict__["scale_check"] = replace(identified.scale_check, payloads=payloads)
+        found = replace(told(identified, warning("scale_unchecked")), payload_checks=payloads)
         return next_steps(found, origin)[0]
 
     urdf, log = identified.model.tree.path, identified.fitted[0].recording.log.path
