@@ -251,7 +251,8 @@ def test_the_page_of_result_files_lists_every_key_of_them():
     }
     stored = [json.loads(path.read_text()) for path in (ROOT / "tests/figures").glob("*.json")]
     results = [from_former_keys(run["result.json"]) for run in stored if "result.json" in run]
-    keys = {key for result in results for key in result} | {"robotid", "versions", "variation"}
+    keys = {key for result in results for key in result}
+    keys |= {"robotid", "versions", "variation", "left_out"}
     assert listed["Keys of result.json"] == keys
     parameters = [x for result in results for x in result["drive_parameters"]]
     assert listed["Keys of a parameter"] == {key for x in parameters for key in x}

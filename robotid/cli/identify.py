@@ -130,10 +130,11 @@ def _found(result: Mapping[str, Any]) -> str:
 
 def _drive_lines(result: Mapping[str, Any]) -> list[str]:
     """Return the friction terms, or all parameters of drives and controllers of a simulation."""
-    from robotid.identification.summary import friction_lines, variation_lines
+    from robotid.identification.summary import friction_lines, left_out_lines, variation_lines
 
     if "simulation" not in result:
-        return friction_lines(result["friction"]) + variation_lines(result.get("variation"))
+        lines = friction_lines(result["friction"]) + left_out_lines(result.get("left_out", ()))
+        return lines + variation_lines(result.get("variation"))
     rows = [
         (
             entry["name"],

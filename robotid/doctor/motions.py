@@ -19,6 +19,7 @@ from robotid.robot.model import RobotModel
 from robotid.robot.prior import prior_spread
 
 __all__ = [
+    "alike_motions",
     "check_excitation",
     "check_repeated_motion",
     "excitation_finding",
@@ -29,6 +30,7 @@ _AHEAD = (0.0, 0.25, 0.5, 0.75, 1.0)  # [s] after an instant, positions that are
 _NEAR = 0.02  # of the range of each joint: closer positions are equal
 _SHARE = 0.3  # of the validation motion that is in a fitted log, too
 _INSTANTS = 300
+_FEW = 60  # ... of each of many motions
 _ROWS = 5000  # of a log, from which its excitation is computed
 _ILL_CONDITIONED = 1e3  # condition number of unit columns above which a motion is poor
 _RICHER = "a motion of all joints together, in both directions and as fast as permitted"
@@ -61,6 +63,33 @@ def check_repeated_motion(
         "prediction error is too optimistic; record another motion to validate with"
     )
     yield log_finding(name, "repeated_motion", "warning", message, share=share)
+
+
+def alike_motions(motions: Sequence[Trajectory]) -> list[list[int]]:
+    """Return the motions in groups: one that repeats another one is in its group.
+
+    Args:
+        motions: Smooth motions.
+
+    Returns:
+        Indices of the motions of each group, the groups in the order of their first motions.
+    """
+    from scipy.spatial import cKDTree
+
+    low, high = (np.array([f(x.q, axis=0) for x in motions]) for f in (np.min, np.max))
+    size = np.maximum(high.max(axis=0) - low.min(axis=0), 1e-3)
+    trees = [cKDTree(known) if len(known := _segments(x, size, None)) else None for x in motions]
+    groups: list[list[int]] = []
+    for k, motion in enumerate(motions):
+        own, same = _segments(motion, size, _FEW), list[list[int]]()
+        for group in groups if len(own) else ():
+            others = [tree for j in group if (tree := trees[j]) is not None]
+            far = [x.query(own, p=np.inf, distance_upper_bound=_NEAR)[0] for x in others]
+            if any(np.mean(np.isfinite(distance)) >= _SHARE for distance in far):
+                same.append(group)
+        groups = [group for group in groups if group not in same]
+        groups.append([*(j for group in same for j in group), k])
+    return sorted(sorted(group) for group in groups)
 
 
 def check_excitation(

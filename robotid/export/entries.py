@@ -14,6 +14,7 @@ from robotid.fitting.bands import QUANTILE, next_errors, typical_friction
 from robotid.fitting.drives import DriveChoice
 from robotid.fitting.evaluation import Evaluation
 from robotid.fitting.identified import SOURCES, Identified
+from robotid.fitting.left_out import LEFT_OUT
 from robotid.identification.result import Identification
 from robotid.judgement.parameter_table import parameter_entries
 from robotid.logs.transmission import Transmission
@@ -117,8 +118,16 @@ def _torque_entries(found: Identification, settings: Mapping[str, Any]) -> dict[
             "validation": [recording_metrics(e, "wls") for e in found.validation],
         },
         "scale_check": found.scale_check.to_dict(),
+        **_left_out(found),
         **_variation(found),
     }
+
+
+def _left_out(found: Identification) -> dict[str, Any]:
+    """Return the metrics of each log as a fit to the others predicts it."""
+    logs = [{"log": name.removesuffix(LEFT_OUT), **metrics.to_dict()}
+            for name, metrics in found.left_out.items()]  # fmt: skip
+    return {"left_out": logs} if logs else {}
 
 
 def _variation(found: Identification) -> dict[str, Any]:

@@ -1,5 +1,6 @@
 """Fit of a robot's parameters to recordings: estimate, standard errors, predictions."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import chain
@@ -13,7 +14,9 @@ from robotid.estimators.estimator import Weighing
 from robotid.exceptions import NotConvergedError, RankDeficientError, SettingsError
 from robotid.fitting.baselines import urdf_with_drives
 from robotid.fitting.estimators import Known, consistent_fit, pinned_links
-from robotid.fitting.evaluation import evaluate_logs
+from robotid.fitting.evaluation import Evaluation, evaluate_logs
+from robotid.fitting.left_out import left_out_metrics
+from robotid.fitting.metrics import Metrics
 from robotid.fitting.recordings import Recordings
 from robotid.fitting.regressor_noise import RegressorNoise, find_regressor_noise
 from robotid.fitting.result import Fit, Solution
@@ -175,8 +178,24 @@ class Solved:
             regressor_noise=ground.noise,
         )
         found = self._with_runs(found)
+        found = replace(found, left_out=self._left_out(fitted))
         hidden = (mapping.K[:, ~found.at_bound] == 0).all(axis=1)  # sums of terms at bounds only
         return replace(found, base_error=np.where(hidden, np.inf, base_error))
+
+    def _left_out(self, fitted: Sequence[Evaluation]) -> dict[str, Metrics]:
+        """Return the metrics of each log by a fit to the others, with the same prior weight."""
+        ground, own, mapping = self.ground, self.recordings, self.recordings.mapping
+        before, estimator = ground.before, self.choice.make(ground.before)
+        if own.validation or estimator.reads != "factors":
+            return {}
+        fit_to = estimator if self.in_cone is None else self.in_cone
+
+        def fit(factors: Factors) -> tuple[Array, Array]:
+            standard, _ = standard_of(fit_to.fit(factors), mapping, before.pi, before.spread)
+            sigma, spread = before.sigma, before.spread
+            return standard, urdf_with_drives(own.model, mapping, factors, sigma, spread)
+
+        return left_out_metrics(own.model, ground.logs, fitted, fit)
 
     def _with_runs(self, fit: Fit) -> Fit:
         """Return the fit with the information of each log on parameters that may vary."""

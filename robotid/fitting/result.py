@@ -1,5 +1,6 @@
 """The result of a fit: identified parameters, standard errors, predictions."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -89,6 +90,8 @@ class Fit(Identified, Solution):
         regressor_noise: Effect of position quantisation on least squares; None: negligible.
         runs: Information of each of three or more fitted logs on parameters that may vary.
         sums: Sums over their rows from which it is computed.
+        left_out: Without validation logs, metrics of each fitted log as a fit to the others
+            predicts it, by its name.
         variation: Variation of the drives' parameters between these logs.
     """
 
@@ -103,6 +106,7 @@ class Fit(Identified, Solution):
     regressor_noise: RegressorNoise | None = None
     runs: tuple[RunsOf, ...] = ()
     sums: RunSums | None = None
+    left_out: Mapping[str, Metrics] = field(default_factory=dict)
     variation: Variation | None = None
     _checked: list[tuple[Array, MassMatrixCheck]] = field(default_factory=list, repr=False)
 
@@ -272,7 +276,12 @@ class Fit(Identified, Solution):
 
     @property
     def predictions(self) -> dict[str, Metrics]:
-        """Metrics of each validation recording without fitted rows, by its name."""
+        """Metrics of each validation recording without fitted rows, by its name.
+
+        Without validation recordings, those of the fitted ones that are left out in turn.
+        """
+        if not self.validation:
+            return dict(self.left_out)
         new = (e for e in self.validation if not e.is_refitted)
         return {e.recording.name: e.metrics["estimate"] for e in new}
 

@@ -24,6 +24,7 @@ __all__ = [
     "identification_line",
     "identification_text",
     "joint_reason",
+    "left_out_lines",
     "one_more_gain",
     "variation_lines",
     "verdict_cell",
@@ -122,6 +123,23 @@ def friction_lines(friction: Mapping[str, Any]) -> list[str]:
             gain = f"held-out error {before:.1f} -> {after:.1f} %"
             lines.append(f"  {joint}: {' + '.join(found['families'])} ({gain})")
     return ["friction besides viscous and Coulomb:", *lines] if lines else []
+
+
+def left_out_lines(logs: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return the errors by joint of logs that a fit to the others predicts, as text.
+
+    Args:
+        logs: As "left_out" in result.json; no line if there are none.
+    """
+    errors: dict[str, list[float]] = {}
+    for each in logs:
+        for joint, own in each["per_joint"].items():
+            if own["relative_error_pct"] is not None:
+                errors.setdefault(joint, []).append(own["relative_error_pct"])
+    if not errors:
+        return []
+    words = [f"{joint} {min(x):.1f} to {max(x):.1f} %" for joint, x in errors.items()]
+    return [f"error of each of {len(logs)} logs, by a fit to the others: {', '.join(words)}"]
 
 
 def variation_lines(variation: Mapping[str, Any] | None) -> list[str]:

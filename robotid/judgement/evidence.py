@@ -41,7 +41,7 @@ class Predictions:
 
     Attributes:
         fit: Metrics over the fitted recordings.
-        validation: Metrics of each validation log, by its name.
+        validation: Metrics of each validation log, by its name; or of each log left out in turn.
         joints: The model's joints; one without a sample in any recording is not evaluated.
         refitted: Names of validation logs that are left out because they contain fitted samples.
         hidden: Joints that are not evaluated, as of ``hidden_joints``; their metrics are ignored.

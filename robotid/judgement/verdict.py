@@ -12,6 +12,7 @@ from robotid._settings import require_kind
 from robotid.doctor.diagnosis import CODES
 from robotid.exceptions import SettingsError
 from robotid.findings import Finding, current_code, listed, not_ignored
+from robotid.fitting.left_out import logs_that_test
 from robotid.fitting.metrics import Metrics
 from robotid.judgement.evidence import Determined, Predictions, error_of, is_harmless_cost
 from robotid.judgement.scale_check import ScaleCheck
@@ -216,9 +217,9 @@ def judge(
             error gets this reason, too.
 
     Returns:
-        The verdict. Without a validation log, or with a warning, it is at most "usable". So is the
-        verdict on a joint with a warning, and on all joints if a warning concerns the result. An
-        impossible body concerns the result, but not the torque of its joint.
+        The verdict. Without a log that tests it, or with a warning, it is at most "usable". So is
+        the verdict on a joint with a warning, and on all joints if a warning concerns the result.
+        An impossible body concerns the result, but not the torque of its joint.
     """
     found, hidden = predictions.on_each(), predictions.hidden
     largest = sorted(found.values(), key=lambda of: -max(of[2], default=0.0))
@@ -265,9 +266,9 @@ def judge(
             notes.insert(0, f"{largest_good}: largest error: {cause}")
     worst = max((error for _, _, errors in found.values() for error in errors), default=0.0)
     good = (
-        f"torque prediction error on validation logs: at most {worst:.1f} % at every joint, "
-        "smaller than that of a constant and that of the URDF; all parameters are physically "
-        "consistent"
+        f"torque prediction error on {logs_that_test(predictions.validation)}: at most "
+        f"{worst:.1f} % at every joint, smaller than that of a constant and that of the URDF; all "
+        "parameters are physically consistent"
     )
     verdict = concluded(
         per_joint, poor=poor, warnings=reasons, good=good, notes=notes, log_errors=log_errors
@@ -408,7 +409,7 @@ def rejected(
         elif finding.severity == "error":
             is_rejected = False
         if is_rejected:
-            but = f"; rejected: torque error on validation logs at most {worst:.1f} %"
+            but = f"; rejected: torque error on {logs_that_test(validation)} at most {worst:.1f} %"
             finding = replace(finding, severity="note", message=f"{finding.message}{but}")
         found.append(finding)
     return found

@@ -16,6 +16,7 @@ from robotid.fitting.evaluation import Evaluation
 from robotid.fitting.metrics import Metrics
 from robotid.identification.pictures import torque_charts
 from robotid.identification.result import Identification
+from robotid.identification.summary import left_out_lines
 from robotid.judgement.parameter_table import parameter_entries
 from robotid.logs.settings import SignalSettings
 from robotid.pages.charts import chart_html
@@ -166,9 +167,15 @@ def _method(found: Identification) -> str:
         f"{len(found.base)} base parameters of {len(found.model.joints)} joints were fitted to "
         f"{_names(fitted)} ({samples} samples after filtering, {rows} torque values used) by "
         f"{found.estimator.words} ({found.estimator.name}). "
-        + (f"Validation: {_names(validation)}. " if validation else "There is no validation log. ")
+        + (f"Validation: {_names(validation)}. " if validation else f"{_others(found)}. ")
         + f"Signals: {'; or '.join(chains)}."
     )
+
+
+def _others(found: Identification) -> str:
+    """Return that there is no validation log, and the errors of logs left out, as text."""
+    lines = left_out_lines([metrics.to_dict() for metrics in found.left_out.values()])
+    return "There is no validation log" + "".join(f"; {line}" for line in lines)
 
 
 def _totals(found: Identification) -> str:

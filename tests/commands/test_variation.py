@@ -84,6 +84,10 @@ def test_result_has_the_variation_of_each_drive_parameter(result, folder):
     low, high = np.interp([-1.96, 1.96], SCORES, entry["next_quantiles"])
     assert [low, high] == pytest.approx(entry["next_interval"], rel=0.1)
     assert np.array(variation["correlation"]).shape == (len(own), len(own))
+    assert [each["log"].split(" ")[0] for each in content["left_out"]] == variation["logs"]
+    for each, metrics in zip(content["left_out"], found.left_out.values(), strict=True):
+        measured = metrics.per_joint["elbow_joint"].rmse
+        assert each["per_joint"]["elbow_joint"]["rmse"] == measured
     assert entry["unit"] == "N m"
     assert "spread_within_units" not in entry
 
