@@ -265,10 +265,20 @@ def touching(model: RobotModel, motion: Trajectory) -> Array:
     Args:
         model: The robot.
         motion: Its motion.
+
+    Raises:
+        DataError: If the motion has flags of another number of contacts.
     """
     contacts = np.ones((len(motion.t), len(model.contacts)), dtype=bool)
     if motion.contacts is not None:
-        contacts[:, [not x.always for x in model.contacts]] = motion.contacts
+        flagged = [not x.always for x in model.contacts]
+        if motion.contacts.shape[1] != sum(flagged):
+            raise DataError(
+                f"the log has contact flags of {motion.contacts.shape[1]} contacts, wanted "
+                f"{sum(flagged)}, one for each contact that may be in the air and is not measured "
+                "completely; leave out the others"
+            )
+        contacts[:, flagged] = motion.contacts
     return contacts
 
 

@@ -8,7 +8,7 @@ import pinocchio as pin
 import pytest
 
 from robotid.estimators.consistent.weighting import held_out_errors
-from robotid.exceptions import ModelError, SettingsError
+from robotid.exceptions import DataError, ModelError, SettingsError
 from robotid.logs.base import BaseColumns
 from robotid.logs.data import Trajectory
 from robotid.logs.settings import BaseSource
@@ -133,6 +133,8 @@ def test_unknown_forces_have_no_effect_and_measured_ones_are_subtracted(quadrupe
     )  # fmt: skip
     found, used = constrained(quadruped, motion, np.ones((7, 18), dtype=bool))
     (predicted,) = predict(quadruped, [pi], found)
+    with pytest.raises(DataError, match="has contact flags of 4 contacts, wanted 3, one for each"):
+        constrained(quadruped, replace(motion, contacts=touching), used)
     rest = np.arange(7) != 4
     np.testing.assert_allclose(found.tau[rest], predicted[rest], atol=1e-10)
     assert np.abs(found.tau).max() > 1.0
