@@ -14,7 +14,7 @@ import numpy as np
 import pinocchio as pin
 
 from robotid._typing import Array
-from robotid.exceptions import ModelError
+from robotid.exceptions import DataError, ModelError
 from robotid.findings import listed
 from robotid.logs.base import BaseColumns
 from robotid.logs.data import Trajectory, suggestion
