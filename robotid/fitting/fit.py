@@ -15,7 +15,7 @@ from robotid.exceptions import NotConvergedError, RankDeficientError, SettingsEr
 from robotid.fitting.baselines import urdf_with_drives
 from robotid.fitting.estimators import Known, consistent_fit, pinned_links
 from robotid.fitting.evaluation import Evaluation, evaluate_logs
-from robotid.fitting.left_out import left_out_metrics
+from robotid.fitting.left_out import FEWEST_LEFT_OUT, left_out_metrics
 from robotid.fitting.metrics import Metrics
 from robotid.fitting.recordings import Recordings
 from robotid.fitting.regressor_noise import RegressorNoise, find_regressor_noise
@@ -185,8 +185,10 @@ class Solved:
     def _left_out(self, fitted: Sequence[Evaluation]) -> dict[str, Metrics]:
         """Return the metrics of each log by a fit to the others, with the same prior weight."""
         ground, own, mapping = self.ground, self.recordings, self.recordings.mapping
+        if own.validation or len(ground.logs) < FEWEST_LEFT_OUT:
+            return {}
         before, estimator = ground.before, self.choice.make(ground.before)
-        if own.validation or estimator.reads != "factors":
+        if estimator.reads != "factors":
             return {}
         fit_to = estimator if self.in_cone is None else self.in_cone
 
