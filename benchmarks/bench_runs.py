@@ -63,7 +63,7 @@ SERVOS = {
 }  # fmt: skip
 JOINTS = ("shoulder_lift_joint", "elbow_joint", "wrist_1_joint")
 WITHIN, BETWEEN = 0.05, 0.15  # spread of friction between runs, between robots
-SLIP = 0.1  # [rad] of the encoder of a joint in one log, or of one robot
+SLIP = 0.1, 0.2  # [rad] of the encoder of a joint in one log, of one robot
 COMMON = 0.7  # correlation of frictions between robots
 KINDS = ("friction", "gain", "payload", "zero")
 
@@ -628,7 +628,7 @@ def unlike(count):
                 if run == 2 and kind == "gain":
                     log = replace(log, tau=log.tau * np.array([1.0, 1.15, 1.0]))
                 if run == 2 and kind == "zero":
-                    log = replace(log, q=log.q + np.array([0.0, SLIP, 0.0]))
+                    log = replace(log, q=log.q + np.array([0.0, SLIP[0], 0.0]))
                 logs.append(log)
             found = vary([str(k) for k in range(6)], groups(model, logs, ["a"] * 6)).unlike
             cause = {"friction": "drive"}.get(kind, kind)
@@ -710,7 +710,7 @@ def odd_fleets(count):
         right = wrong = none = 0
         for _ in range(count):
             own = plants.robot()
-            odd = {"gain": {"gain": 1.15}, "payload": {"load": 1.0}, "zero": {"slip": SLIP}}
+            odd = {"gain": {"gain": 1.15}, "payload": {"load": 1.0}, "zero": {"slip": SLIP[1]}}
             changed = odd.get(kind, {})
             if kind == "friction":
                 own[plants.model.layout.names.index(f"{joint}.coulomb")] *= 3.0
