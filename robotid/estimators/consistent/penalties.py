@@ -33,8 +33,7 @@ __all__ = [
 
 METRICS = ("euclidean", "entropic", "riemannian")
 _SINGULAR = 1e-12  # ratio of the axes of a body, squared, below which it is singular
-_WIDENED = 0.01  # smallest eigenvalue, relative to its size, of a pseudo-inertia that is widened
-_THINNEST = 3e-4  # eigenvalue below which it is; links of robots are above it, rods may be below
+_THINNEST = 0.01  # smallest relative thickness of a prior's pseudo-inertia
 
 
 @dataclass(frozen=True)
@@ -199,8 +198,8 @@ def make_penalty(
       Hessian of the entropic one there.
 
     The latter two do not depend on the frame of a body; for the drives they are Euclidean. If the
-    pseudo-inertia of a prior is not physically consistent, or its smallest eigenvalue relative to
-    its size is below 3e-4, its eigenvalues are increased to 1 % first.
+    pseudo-inertia of a prior is not physically consistent or its relative thickness is below 1 %,
+    its eigenvalues are increased to 1 % first.
 
     Args:
         metric: One of ``METRICS``.
@@ -273,13 +272,9 @@ def _whitened(S: Array, L: Array) -> Array:
 
 
 def _widened(J: Array, shrink: Array) -> Array:
-    """Return pseudo-inertias; those of bodies thinner than links have eigenvalues of at least 1 %.
-
-    The slender links of limbs are kept: the smallest eigenvalue of a tube of 0.4 m whose radius is
-    2 cm, about its end, is 1e-3.
-    """
+    """Return pseudo-inertias whose smallest dimensionless eigenvalue is at least 1 %."""
     values, vectors = np.linalg.eigh(shrink @ J @ shrink)
-    floored = (vectors * np.maximum(values, _WIDENED)[:, None]) @ vectors.transpose(0, 2, 1)
+    floored = (vectors * np.maximum(values, _THINNEST)[:, None]) @ vectors.transpose(0, 2, 1)
     grow = np.linalg.inv(shrink)
     changed = values[:, 0] < _THINNEST
     return np.where(changed[:, None, None], grow @ floored @ grow, J)

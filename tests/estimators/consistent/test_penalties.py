@@ -147,20 +147,6 @@ def test_a_prior_without_mass_is_widened_to_a_hundredth_of_its_size(metric, prio
     assert np.isfinite(penalty.hessian(penalty.centre)).all()
 
 
-@pytest.mark.parametrize(("radius", "is_kept"), [(0.02, True), (0.008, False)])
-def test_the_prior_of_a_slender_link_is_its_own(prior, std, radius, is_kept):
-    """A tube of 2 kg and 0.4 m from its end; one with walls at 8 mm is too thin to be known."""
-    m, along, across = 2.0, 0.4**2 / 3, radius**2 / 2  # second moments over the mass [m^2]
-    pi, wide = prior.copy(), std.copy()
-    pi[:10] = m * np.array([1, 0, 0, 0.2, along + across, 0, along + across, 0, 0, 2 * across])
-    size = 0.2 + np.sqrt(along + 2 * across)
-    wide[:10] = m * np.array([1, *[size] * 3, *[size**2] * 6])
-    centre = penalty_of("entropic", pi, wide).centre
-    wanted = 2 * m * (across if is_kept else 0.01 * size**2)
-    assert centre[9] == pytest.approx(wanted, rel=1e-6)
-    np.testing.assert_allclose(centre[10:], pi[10:], rtol=1e-13)
-
-
 def test_the_held_share_of_a_body_is_no_part_of_the_distance(prior, std):
     held = np.zeros(20)
     held[:10] = 0.5 * prior[:10]
