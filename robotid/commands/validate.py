@@ -80,6 +80,8 @@ def validate_result(
     if update:
         check_update(loaded, job, entries)
     if "simulation" in result:
+        for entry in entries:  # a stated temperature has no effect: refused
+            new_temperatures(result, loaded.robot, (), entry.temperature)
         return _validate_commands(loaded, job, entries)
     source = stated_model(result, job.model())
     if loaded.has_urdf:
@@ -199,7 +201,7 @@ def _verdict(
     logs: Sequence[SurveyedLog],
     unlike: Sequence[Finding],
 ) -> Verdict:
-    """Return the verdict on logs, which may be fitted, faulty, unlike, or fitted motions."""
+    """Return the verdict on logs, which may be fitted, faulty, unlike, or of a fitted motion."""
     hashes = {i["sha256"] for i in result["inputs"] if i["role"] == "identification"}
     fitted, missing = _fitted_logs(job, model, hashes)
     again = [

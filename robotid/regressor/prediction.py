@@ -23,6 +23,7 @@ SlopesT = TypeVar("SlopesT", Array, TorqueSlopes)
 
 __all__ = [
     "body_slopes",
+    "body_slopes_by_position",
     "drive_torque",
     "inverse_dynamics",
     "predict",
