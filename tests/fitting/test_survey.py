@@ -9,6 +9,7 @@ import pinocchio as pin
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from helpers.closed_chains import four_bar
 from helpers.synthetic import truth
 
 from robotid.estimators import WLS
@@ -25,6 +26,7 @@ from robotid.logs.settings import LogUnits, SignalSettings
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.factors import join
 from robotid.regressor.torque import joint_torque_regressor
+from robotid.robot.closure import Chains
 from robotid.robot.constraints import Contact
 from robotid.robot.drives import Cubic
 from robotid.robot.examples import example_urdf
@@ -341,6 +343,23 @@ def test_other_drive_terms_keep_the_rows_and_torques_without_contact_forces(rng)
         hold_log(model, turned, settings)
     with pytest.raises(DataError, match="log has no pose of the floating base"):
         hold_log(model, replace(log, base=None), settings)
+
+
+def test_other_drive_terms_keep_the_rows_that_a_closed_chain_leaves(rng, tmp_path):
+    """Crank and coupler in line: the rocker cannot move, and the bars hold all of its torque."""
+    model = four_bar(tmp_path, terms=("viscous",))
+    t = np.arange(41) / 50.0
+    given = np.zeros((41, 3))
+    given[:, model.joints.index("elbow")] = np.sin(2 * (t - t[20]))
+    missing = np.array([joint != "elbow" for joint in model.joints])
+    q = Chains(model).closed(given, missing)
+    log = Log(t, q, rng.standard_normal(q.shape), model.joints)
+    settings = SignalSettings(cutoff=None, trim=0.0, min_velocity=0.0)
+    held = hold_log(model, log, settings)
+    first, pivot = held.whole, model.joints.index("pivot")
+    assert np.argwhere(~first.mask).tolist() == [[20, pivot]]
+    other = held.with_model(model.with_terms({"elbow": (Cubic(),)})).whole
+    np.testing.assert_array_equal(other.mask, first.mask)
 
 
 def test_the_temperature_of_a_joint_is_the_mean_of_the_rows_read():
