@@ -50,10 +50,10 @@ from robotid.exceptions import SettingsError
 from robotid.export.commanded import CommandedDrive, loops_of
 from robotid.fitting.evaluation import evaluate_logs
 from robotid.fitting.settings import SimulationSettings
-from robotid.fitting.survey import hold_log
 from robotid.identification.pipeline import identify
 from robotid.logs.data import Log
 from robotid.logs.settings import SignalSettings
+from robotid.recordings.survey import hold_log
 from robotid.robot.examples import example_urdf
 from robotid.robot.families import AUTO
 from robotid.robot.model import RobotModel

@@ -56,9 +56,9 @@ from robotid.excitation.design import Designer
 from robotid.excitation.limits import MotionLimits
 from robotid.excitation.standing import standing
 from robotid.fitting.settings import ConsistentSettings
-from robotid.fitting.survey import hold_log
 from robotid.identification.pipeline import identify
 from robotid.logs.settings import SignalSettings
+from robotid.recordings.survey import hold_log
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.factors import compress
 from robotid.regressor.used_rows import base_problem

@@ -35,12 +35,12 @@ from robotid.commands.job import LogEntry, job_from_settings, read_job
 from robotid.commands.logs import survey_logs
 from robotid.fitting.bands import expected_band
 from robotid.fitting.fit import solve_recordings
-from robotid.fitting.recordings import Recordings
 from robotid.fitting.settings import EstimatorSettings
-from robotid.fitting.survey import hold_log
 from robotid.identification.pipeline import identify, with_drives
 from robotid.logs.data import Log
 from robotid.logs.settings import SignalSettings
+from robotid.recordings.logs import Recordings
+from robotid.recordings.survey import hold_log
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.examples import example_urdf
 from robotid.robot.families import wanted_families

@@ -23,7 +23,7 @@ from setting import ROBOTS, machine
 
 from robotid.commands.job import Job, LogEntry
 from robotid.commands.logs import survey_logs
-from robotid.fitting.recordings import Recordings
+from robotid.recordings.logs import Recordings
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.factors import join
 from robotid.robot.examples import example_urdf

@@ -23,7 +23,7 @@ LINES = [
     "robot logs",
     "log_files regressor",
     "constrained estimators simulation urdf_audit variation workers",
-    "doctor",
+    "doctor recordings",
     "fitting",
     "diagnosis",
     "judgement",
@@ -141,7 +141,7 @@ def test_importing_the_package_is_light(statement):
 
 def test_logs_and_results_are_handled_without_the_simulator():
     code = (
-        "import sys, robotid.commands.logs, robotid.export.entries, robotid.fitting.survey\n"
+        "import sys, robotid.commands.logs, robotid.export.entries, robotid.recordings.survey\n"
         "slow = ('robotid.closed_loop.fit', 'robotid.simulation.loops', 'scipy.interpolate')\n"
         "print([m for m in slow if m in sys.modules])"
     )

@@ -319,7 +319,7 @@ def test_the_architecture_names_every_package():
     text = (DOCS / "explanation/architecture.md").read_text()
     assert rooms == set(re.findall(r"^\| `(\w+)` \|", text, re.MULTILINE))
     figure = (DOCS / "pictures" / "packages.svg").read_text()
-    assert not [room for room in rooms if f">{room}<" not in figure]
+    assert not [room for room in rooms if figure.count(f">{room}<") != 1]
 
 
 def test_the_job_file_of_the_docs_is_accepted(tmp_path):

@@ -15,10 +15,10 @@ from robotid.exceptions import DataError
 from robotid.export.result import Result, stated_parameters
 from robotid.findings import Finding
 from robotid.fitting.fit import covariates_of, sums_of_logs
-from robotid.fitting.recordings import Recordings
-from robotid.fitting.survey import SurveyedLog
 from robotid.identification.repeated_errors import with_repeated_errors
 from robotid.judgement.unlike_runs import unlike_findings
+from robotid.recordings.logs import Recordings
+from robotid.recordings.survey import SurveyedLog
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.model import RobotModel
 from robotid.variation.groups import Covariate, RunSums, runs_of

@@ -25,11 +25,11 @@ from robotid.excitation.routes import design_stands, design_sweeps
 from robotid.excitation.settings import ROUTES, MotionSettings
 from robotid.excitation.standing import Stand, Standing, standing
 from robotid.findings import toml_text
-from robotid.fitting.survey import hold_log
 from robotid.identification.previews import Preview, Run, preview_logs
 from robotid.log_files.formats import check_suffix
 from robotid.log_files.read import write_log
 from robotid.logs.data import Log
+from robotid.recordings.survey import hold_log
 from robotid.robot.model import RobotModel
 
 if TYPE_CHECKING:

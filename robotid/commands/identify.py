@@ -26,12 +26,12 @@ from robotid.exceptions import DataError
 from robotid.export.entries import build_result
 from robotid.export.urdf import DYNAMICS_TERMS, write_urdf
 from robotid.fitting.evaluation import Evaluation
-from robotid.fitting.recordings import Recordings
 from robotid.fitting.settings import SimulationSettings
 from robotid.identification.pipeline import conclude
 from robotid.identification.result import Identification
 from robotid.judgement.findings import locked_findings
 from robotid.judgement.verdict import check_ignored
+from robotid.recordings.logs import Recordings
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.friction_projection import project_friction
 from robotid.report.document import write_report

@@ -18,13 +18,13 @@ from robotid.doctor.locked_joints import STILL, check_locked, percent_hint
 from robotid.exceptions import DataError, SettingsError
 from robotid.export.result import Result, load_result, stated_model, stated_parameters
 from robotid.findings import Finding, by_severity
-from robotid.fitting.recordings import Recordings
-from robotid.fitting.survey import SurveyedLog, survey_log
 from robotid.judgement.verdict import check_ignored
 from robotid.log_files.columns import Needs
 from robotid.log_files.read import LogLayout
 from robotid.log_files.table import Table
 from robotid.logs.data import Log
+from robotid.recordings.logs import Recordings
+from robotid.recordings.survey import SurveyedLog, survey_log
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.model import RobotModel
 from robotid.variation.covariates import at_temperature, drive_temperatures

@@ -11,10 +11,10 @@ from robotid.commands.job import Job, LogEntry
 from robotid.commands.logs import job_of_result, survey_logs
 from robotid.exceptions import SettingsError
 from robotid.findings import listed
-from robotid.fitting.recordings import Recordings
-from robotid.fitting.survey import SurveyedLog
 from robotid.identification.payload_fit import fit_payloads, mass_checks, own_friction
 from robotid.judgement.payload_check import PayloadCheck
+from robotid.recordings.logs import Recordings
+from robotid.recordings.survey import SurveyedLog
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.bodies import usual_links
 from robotid.robot.drives import DriveTerm

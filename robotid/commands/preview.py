@@ -12,8 +12,8 @@ from robotid.commands.logs import new_temperatures, result_run, warmed
 from robotid.exceptions import DataError, SettingsError
 from robotid.export.entries import build_preview
 from robotid.export.result import load_result, stated_between
-from robotid.fitting.survey import SurveyedLog, survey_log
 from robotid.identification.previews import preview_logs
+from robotid.recordings.survey import SurveyedLog, survey_log
 from robotid.robot.model import RobotModel
 
 __all__ = ["preview_job"]

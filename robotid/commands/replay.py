@@ -20,12 +20,12 @@ from robotid.export.result import Result, load_result, stated_model, stated_urdf
 from robotid.export.shape import FILE, NUMBER, TABLE, TEXT, check_shape
 from robotid.findings import listed
 from robotid.fitting.evaluation import predict
-from robotid.fitting.survey import hold_log
 from robotid.identification.pictures import shown_evaluation
 from robotid.identification.result import Identification
 from robotid.log_files.formats import open_table
 from robotid.logs.data import Log
 from robotid.logs.settings import LogSource
+from robotid.recordings.survey import hold_log
 from robotid.regressor.prediction import predict_instants
 from robotid.robot.model import RobotModel
 from robotid.viewer.replays import Bands, Mark, Replay, Torques, replay

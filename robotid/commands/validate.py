@@ -36,11 +36,11 @@ from robotid.fitting.evaluation import (
     shares_rows,
 )
 from robotid.fitting.metrics import Metrics
-from robotid.fitting.survey import SurveyedLog
 from robotid.judgement.evidence import Determined, Predictions
 from robotid.judgement.positions import judge_positions
 from robotid.judgement.verdict import Verdict, VerdictWarning, blocking, judge, warnings_of
 from robotid.logs.data import Log
+from robotid.recordings.survey import SurveyedLog
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.model import RobotModel
 

@@ -12,10 +12,10 @@ import numpy as np
 from robotid._text import period
 from robotid._typing import Array
 from robotid.fitting.metrics import Metrics, TorqueSums
-from robotid.fitting.survey import PieceTask, SurveyedLog
 from robotid.logs.data import Log, Trajectory
 from robotid.logs.settings import SignalSettings
 from robotid.logs.signals import turns_note
+from robotid.recordings.survey import PieceTask, SurveyedLog
 from robotid.regressor.prediction import predict
 from robotid.robot.model import RobotModel
 from robotid.workers.plan import WorkPlan

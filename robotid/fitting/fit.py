@@ -17,7 +17,6 @@ from robotid.fitting.estimators import Known, consistent_fit, pinned_links
 from robotid.fitting.evaluation import Evaluation, evaluate_logs
 from robotid.fitting.left_out import FEWEST_LEFT_OUT, left_out_metrics
 from robotid.fitting.metrics import Metrics
-from robotid.fitting.recordings import Recordings
 from robotid.fitting.regressor_noise import RegressorNoise, find_regressor_noise
 from robotid.fitting.result import Fit, Solution
 from robotid.fitting.robust import reweigh
@@ -34,6 +33,7 @@ from robotid.fitting.standard_errors import (
     with_wls_errors,
 )
 from robotid.fitting.zeros import sums_with_zeros
+from robotid.recordings.logs import Recordings
 from robotid.regressor.factors import Factors, Reduction, join
 from robotid.regressor.memory import is_loaded
 from robotid.robot.prior import prior_spread

@@ -36,12 +36,12 @@ import numpy as np
 from robotid._typing import Array
 from robotid.estimators.batch import solve_factor
 from robotid.findings import Finding, listed
-from robotid.fitting.recordings import Recordings
-from robotid.fitting.survey import SurveyedLog, hold_log
 from robotid.logs.data import Trajectory
 from robotid.logs.filters import local_polynomial
 from robotid.logs.measured_velocity import quantum
 from robotid.logs.settings import SignalSettings
+from robotid.recordings.logs import Recordings
+from robotid.recordings.survey import SurveyedLog, hold_log
 from robotid.regressor.factors import Factors, Reduction
 
 if TYPE_CHECKING:

@@ -11,8 +11,8 @@ from robotid._typing import Array
 from robotid.estimators import WLS
 from robotid.exceptions import NotConvergedError, SettingsError
 from robotid.fitting.evaluation import Evaluation
-from robotid.fitting.recordings import Recordings
 from robotid.logs.data import Trajectory
+from robotid.recordings.logs import Recordings
 from robotid.regressor.factors import join
 from robotid.regressor.prediction import predict
 from robotid.robot.drives import DriveMotion

@@ -3,7 +3,7 @@
 import numpy as np
 
 from robotid._typing import Array
-from robotid.fitting.recordings import Recordings
+from robotid.recordings.logs import Recordings
 from robotid.regressor.prediction import body_slopes_by_position
 from robotid.variation.groups import RunSums, columns_of, groups_at, with_zeros
 

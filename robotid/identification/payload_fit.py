@@ -13,14 +13,14 @@ from robotid.estimators.segments import quantile
 from robotid.estimators.two_runs import Compared, TwoRuns, payload_runs
 from robotid.exceptions import DataError, NotConvergedError, SettingsError
 from robotid.findings import listed
-from robotid.fitting.recordings import Recordings
 from robotid.fitting.settings import ConsistentSettings
-from robotid.fitting.survey import hold_log
 from robotid.identification.payload import Gain, PayloadFit, payload_of
 from robotid.identification.pipeline import robot_of, with_drives
 from robotid.judgement.payload_check import PayloadCheck
 from robotid.log_files.read import Readable, read_logs
 from robotid.logs.settings import SignalSettings
+from robotid.recordings.logs import Recordings
+from robotid.recordings.survey import hold_log
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.constraints import logged_base
 from robotid.regressor.factors import join

@@ -25,10 +25,8 @@ from robotid.exceptions import (
 from robotid.findings import Finding, not_ignored
 from robotid.fitting.drives import DriveChoice
 from robotid.fitting.fit import fit_recordings, rough_choice, solve_recordings
-from robotid.fitting.recordings import Recordings
 from robotid.fitting.result import Fit, Solution
 from robotid.fitting.settings import EstimatorSettings
-from robotid.fitting.survey import hold_log
 from robotid.identification.repeated_errors import with_repeated_errors
 from robotid.identification.result import Asked, Identification
 from robotid.judgement.findings import fit_findings, log_findings, not_written
@@ -36,6 +34,8 @@ from robotid.judgement.unlike_runs import rescaled_findings, unlike_findings
 from robotid.judgement.verdict import blocking, check_ignored, rejected, warnings_of
 from robotid.log_files.read import Readable, read_logs
 from robotid.logs.settings import SignalSettings
+from robotid.recordings.logs import Recordings
+from robotid.recordings.survey import hold_log
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.constraints import logged_base
 from robotid.robot.families import AUTO, wanted_families

@@ -34,10 +34,8 @@ from robotid.findings import listed
 from robotid.fitting.bands import TorqueBand, expected_band
 from robotid.fitting.estimators import Known, consistent_fit, pinned_links
 from robotid.fitting.evaluation import evaluate_logs
-from robotid.fitting.recordings import Recordings
 from robotid.fitting.settings import ConsistentSettings, EstimatorSettings
 from robotid.fitting.standard_errors import StandardErrors, about_prior, standard_of
-from robotid.fitting.survey import SurveyedLog, hold_log
 from robotid.identification.assumptions import (
     FAINTEST,
     TorqueNoise,
@@ -50,6 +48,8 @@ from robotid.log_files.read import Readable, read_logs
 from robotid.logs.data import Log
 from robotid.logs.settings import SignalSettings
 from robotid.logs.smoothing import low_pass
+from robotid.recordings.logs import Recordings
+from robotid.recordings.survey import SurveyedLog, hold_log
 from robotid.regressor.base_parameters import BaseMapping, structural_mapping
 from robotid.regressor.constraints import logged_base
 from robotid.regressor.factors import Factors, compress, join, merge

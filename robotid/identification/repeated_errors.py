@@ -38,11 +38,11 @@ from scipy.optimize import minimize_scalar
 
 from robotid._typing import Array
 from robotid.estimators import WLS
-from robotid.fitting.recordings import Recordings, RepeatedErrors
-from robotid.fitting.survey import Rows, SurveyedLog
 from robotid.logs.base import in_base
 from robotid.logs.data import Trajectory
 from robotid.logs.imu import ImuFrame
+from robotid.recordings.logs import Recordings, RepeatedErrors
+from robotid.recordings.survey import Rows, SurveyedLog
 from robotid.regressor.base_parameters import BaseMapping
 from robotid.regressor.constraints import constraint_forces, contact_links, without_forces
 from robotid.regressor.factors import join, triangle_of

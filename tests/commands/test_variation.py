@@ -23,9 +23,9 @@ from robotid.commands.preview import preview_job
 from robotid.commands.validate import validate_result
 from robotid.exceptions import DataError, SettingsError
 from robotid.export.ranges import parameter_ranges, stated_ranges
-from robotid.fitting.recordings import Recordings
 from robotid.identification.summary import variation_lines
 from robotid.log_files.read import write_log
+from robotid.recordings.logs import Recordings
 from robotid.regressor.torque import joint_torque_regressor
 from robotid.robot.examples import example_urdf
 from robotid.variation.groups import runs_of, sums_of

@@ -16,12 +16,12 @@ from robotid.diagnosis import discrepancies
 from robotid.diagnosis.discrepancies import _alterations, explain_residual
 from robotid.diagnosis.misfit import find_misfits
 from robotid.diagnosis.sample import Trials, along, take_sample
-from robotid.fitting.recordings import Recordings
 from robotid.fitting.settings import EstimatorSettings
-from robotid.fitting.survey import hold_log
 from robotid.identification.pipeline import with_drives
 from robotid.logs.data import Log
 from robotid.logs.settings import SignalSettings
+from robotid.recordings.logs import Recordings
+from robotid.recordings.survey import hold_log
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.prediction import inverse_dynamics
 from robotid.robot.examples import example_urdf

@@ -28,12 +28,12 @@ from robotid.diagnosis.sample import Normal, Sample, Trials, take_sample
 from robotid.exceptions import NotConvergedError, SettingsError
 from robotid.export.urdf import load_identified, write_urdf
 from robotid.fitting.bands import friction_curve
-from robotid.fitting.recordings import Recordings
 from robotid.fitting.settings import EstimatorSettings
 from robotid.identification.pipeline import identify, with_drives
 from robotid.judgement.parameter_table import parameter_entries
 from robotid.log_files.read import write_log
 from robotid.logs.signals import process
+from robotid.recordings.logs import Recordings
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.memory import drive_motion_along, remember
 from robotid.regressor.prediction import predict

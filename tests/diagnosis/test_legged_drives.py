@@ -10,10 +10,10 @@ from robotid.diagnosis.sample import Trials, take_sample
 from robotid.exceptions import SettingsError
 from robotid.fitting.drives import DriveChoice
 from robotid.fitting.fit import solve_recordings
-from robotid.fitting.recordings import Recordings
 from robotid.fitting.settings import EstimatorSettings
-from robotid.fitting.survey import hold_log
 from robotid.logs.settings import SignalSettings
+from robotid.recordings.logs import Recordings
+from robotid.recordings.survey import hold_log
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.constraints import without_forces
 from robotid.robot.constraints import Contact

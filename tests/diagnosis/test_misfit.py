@@ -32,14 +32,14 @@ from robotid.diagnosis.selection import p_value
 from robotid.doctor.diagnosis import check_logs
 from robotid.findings import Finding
 from robotid.fitting.joint_motion import JointMotion
-from robotid.fitting.recordings import Recordings
 from robotid.fitting.settings import EstimatorSettings
-from robotid.fitting.survey import hold_log
 from robotid.identification.pipeline import conclude, identify
 from robotid.judgement.findings import fit_findings
 from robotid.judgement.verdict import warnings_of
 from robotid.log_files.read import write_log
 from robotid.logs.settings import SignalSettings
+from robotid.recordings.logs import Recordings
+from robotid.recordings.survey import hold_log
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.drives import Harmonic, Viscous
 from robotid.robot.families import AUTO, drive_line

@@ -6,8 +6,8 @@ from helpers.synthetic import exact_log, truth
 
 from robotid.diagnosis.residuals import autocorrelation, friction_split, spectrum
 from robotid.fitting.evaluation import evaluate_logs
-from robotid.fitting.survey import hold_log
 from robotid.logs.settings import SignalSettings
+from robotid.recordings.survey import hold_log
 
 
 def brute_force(x, used, segment, lags):

@@ -117,7 +117,7 @@ def test_a_joint_that_stands_where_it_is_said_to_is_not_named(job):
 
 
 def test_held_joints_are_checked_in_logs_read_in_pieces_too(job, tmp_path, monkeypatch):
-    monkeypatch.setattr("robotid.fitting.survey._WINDOW", 300)
+    monkeypatch.setattr("robotid.recordings.survey._WINDOW", 300)
     short = job(0.5, samples=1000)
     path = tmp_path / "run.parquet"
     write_log(read_log(tmp_path / "run.csv", (*short.model().joints, HELD)), path)

@@ -17,10 +17,10 @@ from robotid.fitting.evaluation import (
     shares_rows,
 )
 from robotid.fitting.metrics import TorqueSums
-from robotid.fitting.survey import hold_log
 from robotid.logs.data import Log, Trajectory
 from robotid.logs.settings import SignalSettings
 from robotid.logs.signals import turns_note
+from robotid.recordings.survey import hold_log
 from robotid.regressor.used_rows import row_mask
 from robotid.robot.parameters import Coupling
 

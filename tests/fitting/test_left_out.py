@@ -11,13 +11,13 @@ from robotid.doctor.motions import alike_motions
 from robotid.fitting import left_out
 from robotid.fitting.fit import solve_recordings
 from robotid.fitting.left_out import LEFT_OUT, logs_that_test
-from robotid.fitting.recordings import Recordings
 from robotid.fitting.settings import EstimatorSettings
-from robotid.fitting.survey import hold_log
 from robotid.identification.pipeline import conclude
 from robotid.identification.summary import left_out_lines
 from robotid.judgement.evidence import Determined, Predictions
 from robotid.judgement.verdict import judge
+from robotid.recordings.logs import Recordings
+from robotid.recordings.survey import hold_log
 from robotid.regressor.base_parameters import structural_mapping
 
 WLS = EstimatorSettings("wls")

@@ -11,7 +11,6 @@ from helpers.synthetic import truth
 from robotid.estimators import OLS, WLS
 from robotid.fitting import regressor_noise, survey
 from robotid.fitting.fit import solve_recordings
-from robotid.fitting.recordings import Recordings
 from robotid.fitting.regressor_noise import (
     acceleration_noise,
     find_regressor_noise,
@@ -21,11 +20,12 @@ from robotid.fitting.regressor_noise import (
 )
 from robotid.fitting.settings import EstimatorSettings
 from robotid.fitting.standard_errors import measured_errors
-from robotid.fitting.survey import hold_log, survey_log
 from robotid.log_files.read import lay_out, write_log
 from robotid.logs.data import Log
 from robotid.logs.settings import SignalSettings
 from robotid.logs.signals import process
+from robotid.recordings.logs import Recordings
+from robotid.recordings.survey import hold_log, survey_log
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.factors import Factors, join
 from robotid.regressor.torque import joint_torque_regressor

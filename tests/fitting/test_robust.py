@@ -11,14 +11,14 @@ from helpers.synthetic import exact_log, truth
 from robotid.estimators import WLS
 from robotid.exceptions import SettingsError
 from robotid.fitting import robust
-from robotid.fitting.recordings import Recordings
 from robotid.fitting.robust import LOSSES, find_outliers, loss_slope, loss_weight
 from robotid.fitting.settings import EstimatorSettings
-from robotid.fitting.survey import hold_log, survey_log
 from robotid.identification.pipeline import conclude
 from robotid.log_files.read import lay_out, write_log
 from robotid.logs.data import Log, Trajectory
 from robotid.logs.settings import SignalSettings
+from robotid.recordings.logs import Recordings
+from robotid.recordings.survey import hold_log, survey_log
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.factors import join
 from robotid.regressor.prediction import predict

@@ -5,11 +5,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from helpers.synthetic import perfect
-from robotid.fitting.recordings import Recordings
 from robotid.fitting.settings import EstimatorSettings
-from robotid.fitting.survey import hold_log
 from robotid.identification.pipeline import identify, with_drives
 from robotid.logs.settings import SignalSettings
+from robotid.recordings.logs import Recordings
+from robotid.recordings.survey import hold_log
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.examples import example_urdf
 from robotid.robot.families import AUTO, wanted_families

@@ -4,11 +4,11 @@
 """
 
 from robotid.fitting.fit import fit_recordings
-from robotid.fitting.recordings import Recordings
 from robotid.fitting.settings import EstimatorSettings
-from robotid.fitting.survey import hold_log
 from robotid.identification import pipeline
 from robotid.logs.settings import SignalSettings
+from robotid.recordings.logs import Recordings
+from robotid.recordings.survey import hold_log
 from robotid.regressor.base_parameters import structural_mapping
 
 PLAIN = {"doctor": False, "friction": "viscous+coulomb"}  # what tests of fits do not read

@@ -12,12 +12,12 @@ import robotid
 from robotid.commands.identify import run_job
 from robotid.commands.job import read_job
 from robotid.estimators import WLS
-from robotid.fitting.recordings import Recordings
 from robotid.fitting.settings import ConsistentSettings
-from robotid.fitting.survey import hold_log
 from robotid.identification.repeated_errors import with_repeated_errors
 from robotid.logs.base import BaseMotion, in_base
 from robotid.logs.settings import BaseSource
+from robotid.recordings.logs import Recordings
+from robotid.recordings.survey import hold_log
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.constraints import Contact
 from robotid.robot.examples import example_urdf

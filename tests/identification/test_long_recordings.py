@@ -177,7 +177,7 @@ def test_a_fitted_recording_is_no_validation_in_pieces_either(noisy_job, tmp_pat
 
 def test_only_stretches_of_a_long_log_are_drawn_and_examined(noisy_job, tmp_path, monkeypatch):
     monkeypatch.setattr("robotid.fitting.evaluation._SHOWN", 100)
-    monkeypatch.setattr("robotid.fitting.survey._WINDOW", 400)
+    monkeypatch.setattr("robotid.recordings.survey._WINDOW", 400)
     job = replace(noisy_job, rows_in_memory=HELD, validation=(), report=True)
     identification, result = run_job(job, tmp_path)
     (evaluation,) = identification.fitted

@@ -15,13 +15,13 @@ from scipy.stats import t as t_of
 from robotid.commands.job import LogEntry, read_job
 from robotid.estimators.segments import quantile
 from robotid.exceptions import DataError, ModelError, SettingsError
-from robotid.fitting.recordings import Recordings
-from robotid.fitting.survey import hold_log
 from robotid.identification import payload_fit
 from robotid.identification.payload import Gain, Payload, PayloadFit, payload_of
 from robotid.identification.payload_fit import _gains, identify_payload
 from robotid.logs.data import Log
 from robotid.logs.settings import SignalSettings
+from robotid.recordings.logs import Recordings
+from robotid.recordings.survey import hold_log
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.torque import joint_torque_regressor
 from robotid.robot.drives import FAMILIES

@@ -11,10 +11,8 @@ from helpers.synthetic import exact_log, truth
 from robotid.estimators import batch
 from robotid.exceptions import DataError, NotConvergedError, RankDeficientError, SettingsError
 from robotid.findings import Finding
-from robotid.fitting.recordings import Recordings
 from robotid.fitting.result import Fit
 from robotid.fitting.settings import EstimatorSettings
-from robotid.fitting.survey import hold_log
 from robotid.identification import pipeline
 from robotid.identification import result as result_module
 from robotid.identification.pipeline import conclude
@@ -22,6 +20,8 @@ from robotid.identification.result import Asked, Identification
 from robotid.judgement.evidence import Determined, Predictions
 from robotid.logs.data import Log
 from robotid.logs.settings import SignalSettings
+from robotid.recordings.logs import Recordings
+from robotid.recordings.survey import hold_log
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.drives import Harmonic, LoadFriction
 from robotid.robot.examples import example_urdf

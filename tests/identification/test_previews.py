@@ -16,9 +16,7 @@ from robotid.estimators.batch import solve_factor
 from robotid.estimators.segments import scatter
 from robotid.exceptions import DataError, SettingsError
 from robotid.export.entries import build_preview
-from robotid.fitting.recordings import Recordings
 from robotid.fitting.settings import EstimatorSettings
-from robotid.fitting.survey import hold_log
 from robotid.identification import previews
 from robotid.identification.assumptions import (
     TorqueNoise,
@@ -38,6 +36,8 @@ from robotid.identification.previews import (
 )
 from robotid.logs.data import Log
 from robotid.logs.settings import SignalSettings
+from robotid.recordings.logs import Recordings
+from robotid.recordings.survey import hold_log
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.factors import Factors, compress
 from robotid.regressor.prediction import predict

@@ -8,8 +8,6 @@ import pinocchio as pin
 import pytest
 
 from robotid.fitting.drives import DriveChoice
-from robotid.fitting.recordings import Recordings
-from robotid.fitting.survey import hold_log
 from robotid.identification import pipeline, repeated_errors
 from robotid.identification.repeated_errors import (
     _shift,
@@ -25,6 +23,8 @@ from robotid.logs.base import BaseMotion
 from robotid.logs.data import Log
 from robotid.logs.imu import ImuFrame, ImuMotion
 from robotid.logs.settings import SignalSettings
+from robotid.recordings.logs import Recordings
+from robotid.recordings.survey import hold_log
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.constraints import constraint_jacobian, touching
 from robotid.regressor.factors import triangle_of

@@ -21,13 +21,13 @@ from helpers.recorders import (
 from robotid._files import file_sha256, log_exists, source_entry
 from robotid.commands.convert import convert
 from robotid.exceptions import DataError, SettingsError
-from robotid.fitting.survey import survey_log
 from robotid.log_files.formats import write_columns
 from robotid.log_files.read import lay_out, read_log, read_logs, write_log
 from robotid.log_files.table import prefixes, quantity_of
 from robotid.logs.data import COLUMNS, Log
 from robotid.logs.settings import LogSource, LogUnits, SignalSettings
 from robotid.logs.transmission import Transmission
+from robotid.recordings.survey import survey_log
 
 JOINTS = ("shoulder", "elbow")
 

@@ -11,13 +11,13 @@ from scipy.signal import butter, sosfiltfilt
 from robotid.estimators import WLS
 from robotid.exceptions import DataError
 from robotid.fitting.bands import torque_band
-from robotid.fitting.recordings import Recordings
-from robotid.fitting.survey import hold_log
 from robotid.logs.data import Log, Trajectory
 from robotid.logs.friction_direction import acting_directions
 from robotid.logs.settings import SignalSettings
 from robotid.logs.signals import process
 from robotid.logs.smoothing import _acting
+from robotid.recordings.logs import Recordings
+from robotid.recordings.survey import hold_log
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.columns import friction_directions, friction_speeds
 from robotid.regressor.factors import join

@@ -4,9 +4,9 @@ import scipy.linalg
 from helpers.synthetic import exact_log, truth
 
 from robotid.exceptions import DataError
-from robotid.fitting.survey import hold_log
 from robotid.logs.data import Trajectory
 from robotid.logs.settings import SignalSettings
+from robotid.recordings.survey import hold_log
 from robotid.regressor import lapack
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.factors import (

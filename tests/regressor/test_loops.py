@@ -10,11 +10,11 @@ import pytest
 from robotid._text import seconds
 from robotid.constrained.closed_log import closed_log
 from robotid.exceptions import DataError, ModelError, SettingsError
-from robotid.fitting.survey import hold_log, survey_log
 from robotid.identification.pipeline import identify
 from robotid.log_files.read import lay_out, read_log, write_log
 from robotid.logs.data import Log
 from robotid.logs.settings import SignalSettings
+from robotid.recordings.survey import hold_log, survey_log
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.constraints import (
     constraint_jacobian,

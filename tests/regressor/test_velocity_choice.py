@@ -8,9 +8,9 @@ import pytest
 from helpers.corruptions import clean_log, robot
 from helpers.driven import arm
 
-from robotid.fitting.survey import hold_log
 from robotid.logs.data import Trajectory
 from robotid.logs.settings import SignalSettings
+from robotid.recordings.survey import hold_log
 from robotid.regressor import velocity_choice
 from robotid.regressor.torque import joint_torque_regressor
 

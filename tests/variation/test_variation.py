@@ -8,10 +8,10 @@ from helpers.driven import EXACT, FIT, arm, driven_log
 from helpers.synthetic import truth
 
 from robotid.fitting.fit import solve_recordings
-from robotid.fitting.recordings import Recordings
-from robotid.fitting.survey import hold_log
 from robotid.fitting.zeros import sums_with_zeros
 from robotid.judgement.unlike_runs import unlike_findings
+from robotid.recordings.logs import Recordings
+from robotid.recordings.survey import hold_log
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.model import RobotModel
 from robotid.variation import variation

@@ -7,8 +7,8 @@ from itertools import chain, islice
 import numpy as np
 
 from robotid._typing import Array
-from robotid.fitting.survey import ReducedPiece, SurveyedLog
 from robotid.logs.data import Trajectory
+from robotid.recordings.survey import ReducedPiece, SurveyedLog
 from robotid.regressor.base_parameters import BaseMapping, structural_mapping
 from robotid.regressor.factors import Factors, Reduction, compress_segments, join_segments
 from robotid.regressor.problem import Block, Problem, concatenate

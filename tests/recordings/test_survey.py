@@ -14,15 +14,15 @@ from helpers.synthetic import truth
 
 from robotid.estimators import WLS
 from robotid.exceptions import DataError
-from robotid.fitting import survey
-from robotid.fitting.recordings import Recordings
-from robotid.fitting.survey import ReducedPiece, _temperatures, hold_log, survey_log
 from robotid.log_files.formats import open_table, write_columns
 from robotid.log_files.read import lay_out, read_log, write_log
 from robotid.logs.base import BaseColumns, BaseMotion
 from robotid.logs.data import Log
 from robotid.logs.imu import ImuFrame
 from robotid.logs.settings import LogUnits, SignalSettings
+from robotid.recordings import survey
+from robotid.recordings.logs import Recordings
+from robotid.recordings.survey import ReducedPiece, _temperatures, hold_log, survey_log
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.factors import join
 from robotid.regressor.torque import joint_torque_regressor

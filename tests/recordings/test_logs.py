@@ -8,10 +8,10 @@ from helpers.driven import arm
 from helpers.synthetic import exact_log, truth
 
 from robotid.exceptions import DataError
-from robotid.fitting import recordings as recordings_module
-from robotid.fitting.recordings import Recordings
-from robotid.fitting.survey import hold_log
 from robotid.logs.settings import SignalSettings
+from robotid.recordings import logs as recordings_module
+from robotid.recordings.logs import Recordings
+from robotid.recordings.survey import hold_log
 from robotid.regressor.base_parameters import structural_mapping
 
 
