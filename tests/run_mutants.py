@@ -4,7 +4,7 @@
 
 Each entry of mutants.toml names a file, a text that occurs in it exactly once, the faulty text to
 put in its place, and the tests that must fail then. ``--rotate`` tries N of them, chosen by the
-seed alone (CI gives the commit). Exit code 1 if a fault is missed or a text no longer occurs once.
+seed alone (CI gives the commit). Exit code 1 if a fault is missed, a text no longer occurs once or a test does not exist.
 """
 
 import argparse
@@ -55,6 +55,10 @@ def stale_text(fault: dict[str, Any]) -> str | None:
     """Return what is wrong with an entry, if anything."""
     path = ROOT / fault["file"]
     count = path.read_text().count(fault["text"]) if path.is_file() else 0
+    tests = [test.split("::")[0] for test in fault["tests"] if test.startswith("tests/")]
+    absent = [test for test in tests if not (ROOT / test).exists()]
+    if absent:
+        return f"{fault['file']}: there is no {absent[0]}, which is to notice {fault['faulty']!r}"
     if count == 1 and fault["text"] != fault["faulty"]:
         return None
     return f"{fault['file']}: the text occurs {count} times, wanted once: {fault['text']!r}"

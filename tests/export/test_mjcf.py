@@ -118,6 +118,12 @@ def test_friction_is_coulombs_at_slow_speeds_too(identified, tmp_path):
     mujoco.mj_inverse(robot, data)
     coulomb = [pi[model.layout.names.index(f"{joint}.coulomb")] for joint in model.joints]
     np.testing.assert_allclose(-data.qfrc_constraint, coulomb, rtol=1e-12)
+    # at rest, with a torque below the friction: one in a thousand of the acceleration remains
+    robot.opt.gravity, data.qvel = 0.0, 0.0
+    k = model.joints.index("elbow_joint")
+    data.qfrc_applied[k] = 0.5 * coulomb[k]
+    mujoco.mj_forward(robot, data)
+    assert abs(data.qacc[k]) < 0.002 * abs(data.qacc_smooth[k])
 
 
 def test_limits_shapes_and_meshes(tmp_path):
