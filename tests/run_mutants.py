@@ -4,7 +4,8 @@
 
 Each entry of mutants.toml names a file, a text that occurs in it exactly once, the faulty text to
 put in its place, and the tests that must fail then. ``--rotate`` tries N of them, chosen by the
-seed alone (CI gives the commit). Exit code 1 if a fault is missed, a text no longer occurs once or a test does not exist.
+seed alone (CI gives the commit). Exit code 1 if a fault is missed, a text no longer occurs once or
+a test does not exist.
 """
 
 import argparse
