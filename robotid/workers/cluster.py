@@ -2,6 +2,7 @@
 
 import logging
 import socket
+import time
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import islice
@@ -14,11 +15,13 @@ from robotid.workers.pieces import Lost, Outcome, Work, Workload, run_task
 from robotid.workers.processes import Backend, named
 
 if TYPE_CHECKING:
-    from distributed import Client, Future
+    from distributed import Client, Future, as_completed
 
 __all__ = ["ClusterBackend"]
 
 _log = logging.getLogger(__name__)
+_POLL = 0.01  # [s] between two looks for a finished piece
+_LOOK = 1.0  # [s] between two looks for workers
 
 
 class ClusterBackend(Backend):
@@ -27,11 +30,13 @@ class ClusterBackend(Backend):
     Every worker must be able to read the logs under the same path. If a worker ends, another one
     repeats its piece; each result is used once, by the index of its piece. At most two pieces per
     thread of the cluster are submitted. It raises ``WorkerError`` without a cluster, with workers
-    of another version of robotid, and if every worker that processes a piece ends.
+    of another version of robotid, if every worker that processes a piece ends, and if no worker is
+    left.
 
     Args:
         address: Address of the scheduler, such as ``tcp://host:8786``.
-        patience: Time to wait for the scheduler and its first worker [s].
+        patience: Time to wait for the scheduler, for its first worker, and for another one when
+            none is left [s].
     """
 
     def __init__(self, address: str, *, patience: float = 30.0) -> None:
@@ -112,7 +117,7 @@ class ClusterBackend(Backend):
                     submit(index, piece)
                 if not running:
                     return
-                future = next(results)
+                future = self._next(client, results)
                 index, piece, _ = running[future.key]
                 try:
                     with named(piece):
@@ -144,6 +149,24 @@ class ClusterBackend(Backend):
         finally:
             if running and client.status == "running":
                 client.cancel([future for _, _, future in running.values()])
+
+    def _next(self, client: "Client", results: "as_completed") -> "Future[Any]":
+        """Wait for a finished piece, and for workers if there are none, no longer than patience."""
+        looked = seen = time.monotonic()
+        while not results.has_ready():
+            time.sleep(_POLL)
+            now = time.monotonic()
+            if now - looked < min(_LOOK, self.patience):
+                continue
+            looked = now
+            if client.nthreads():
+                seen = time.monotonic()
+            elif now - seen > self.patience:
+                raise WorkerError(
+                    f"the cluster {self.address} has had no workers for {self.patience:.3g} s. "
+                    f"Start workers with 'dask worker {self.address}' and repeat the command"
+                )
+        return next(results)
 
 
 def _run(work: Work, piece: Workload, level: int, wanted: str) -> Outcome:

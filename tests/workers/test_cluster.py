@@ -113,6 +113,22 @@ def test_a_piece_that_kills_every_worker_is_given_up_and_its_neighbours_are_done
     assert all(same_bits(own, serial[k]) for k, own in found.items())
 
 
+def test_a_cluster_whose_workers_have_all_ended_is_not_waited_for(tmp_path):
+    with distributed.LocalCluster(
+        n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None
+    ) as alone:
+        backend = ClusterBackend(alone.scheduler_address, patience=0.4)
+        pieces = list(enumerate(pieces_in(tmp_path / "marks", 6)))
+        found = backend.run(reduce_piece, pieces)
+        next(found)
+        alone.scale(0)
+        with pytest.raises(
+            WorkerError, match=r"cluster \S+ has had no workers for 0.4 s. Start workers with"
+        ):
+            list(found)
+    assert backend._client is None
+
+
 def test_no_scheduler_is_said(tmp_path):
     backend = ClusterBackend("tcp://127.0.0.1:9", patience=0.2)
     with pytest.raises(WorkerError, match=r"no Dask scheduler answers at 'tcp://127.0.0.1:9'"):
