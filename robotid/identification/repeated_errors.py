@@ -8,8 +8,11 @@ rows D of the torque per offset along each axis, and offsets x ~ N(0, s^2) of al
     W pi = tau + J^T f + D x,
 
 the score W^T tau has the covariance s^2 W^T D D^T W beside that of its noise. If s is not stated,
-it is the one with the largest evidence. Without torques of joints an offset is like a displaced
-centre of mass: s then is 2 cm, its bound.
+it is the one with the largest evidence, and offsets need not be alike along all axes: feet that are
+balls are off along one. In place of s^2 I all points then have the mean over points of E[x x^T],
+3 by 3, given the rows. Which of them is off to which side is not taken from the rows: what is not
+fixed in a link, as of a foot that rolls, has this size only. Without torques of joints an offset is
+like a displaced centre of mass: s then is 2 cm, its bound.
 
 A bias of the accelerometers acts as a change of gravity with the axes of the base. D then has the
 torque per acceleration of the base. Where the base turns, gravity turns in its axes and the bias
@@ -120,11 +123,16 @@ def with_repeated_errors(recordings: Recordings) -> Recordings:
     L = np.linalg.cholesky((mapping.K * spread**2) @ mapping.K.T)
     fit = estimated_errors(total.R, L, mean, recordings.share, count, sizes, before)
     cross = total.R[:b, :b].T @ total.R[:b, b:-1]  # -W^T D
-    roots = np.diag(np.where(np.isnan(sizes), fit.size, sizes))
+    roots, is_open = np.diag(sizes), np.isnan(sizes)
+    if is_open.any():
+        own = fit.squares.reshape(is_open.sum() // 3, 3, -1, 3)  # of each pair of points
+        V = np.einsum("ijik->jk", own) / len(own)
+        roots[np.ix_(is_open, is_open)] = np.kron(np.eye(len(own)), np.linalg.cholesky(V))
     roots[c:, c:] = np.linalg.cholesky(fit.covariance[c:, c:])
     rest = total.R[b:-1, b:-1] @ roots  # of D, what W cannot explain
     variance = float(np.sum(rest**2)) / count
-    root, largest = np.column_stack([cross @ roots, shift]), float(roots[:c].max(initial=0.0))
+    largest = float(np.where(is_open, fit.size, sizes)[:c].max(initial=0.0))
+    root = np.column_stack([cross @ roots, shift])
     errors = RepeatedErrors(root, variance, largest, has_motion=is_blind)
     if not d:
         return replace(recordings, repeated=errors)
@@ -157,12 +165,13 @@ class EstimatedErrors:
     size: float  # standard deviation s of the offsets whose size is unknown [m]; NaN if none is
     known: Array  # (d,), estimated errors of known size; the prior means of others
     covariance: Array  # (d, d), of errors of known size; 0 for others
+    squares: Array  # (k, k), E[x x^T | rows] of the k offsets x whose size is unknown [m^2]
 
 
 def estimated_errors(
     R: Array, L: Array, mean: Array, share: float, rows: int, sizes: Array, before: Array
 ) -> EstimatedErrors:
-    """Return the size s of offsets with the largest evidence, and errors of known size.
+    """Return the size s of offsets with the largest evidence, their squares, errors of known size.
 
     The evidence is that of a much wider prior: with the stated one, parameters outside it would be
     explained by offsets. With the noise level sigma of the rows, their triangle without parameters
@@ -204,7 +213,8 @@ def estimated_errors(
     inverse = scipy.linalg.solve_triangular(T[b:-1, b:-1], np.eye(len(R) - 1 - b))
     known[some] = found[b:k]
     covariance[np.ix_(some, some)] = inverse[: k - b] @ inverse[: k - b].T
-    return EstimatedErrors(s, known, covariance)
+    squares = inverse[k - b :] @ inverse[k - b :].T + np.outer(found[k:], found[k:])
+    return EstimatedErrors(s, known, covariance, squares)
 
 
 def _largest(z2: Array, u2: Array) -> float:

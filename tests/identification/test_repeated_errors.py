@@ -10,6 +10,7 @@ import pytest
 from robotid.fitting.drives import DriveChoice
 from robotid.identification import pipeline, repeated_errors
 from robotid.identification.repeated_errors import (
+    EstimatedErrors,
     _shift,
     _shift_of_motion,
     _slopes,
@@ -180,6 +181,13 @@ def test_the_size_of_offsets_is_that_of_the_density_of_the_rows(rng):
     )
     assert not found.covariance[2:].any()
     assert not found.known[2:].any()
+    signs = np.where(np.arange(12) < 3, 1.0, -1.0)  # tau is W pi - D x
+    H, about = signs[:, None] * H * signs, np.zeros(12)
+    about[3:5] = before[:2] / sizes[:2] ** 2
+    mean = np.linalg.solve(H, signs * (rows.T @ tau) / sigma**2 + about)[5:]
+    np.testing.assert_allclose(
+        found.squares - np.outer(mean, mean), np.linalg.inv(H)[5:, 5:], rtol=0.05, atol=2e-10
+    )
 
 
 def test_a_drift_is_neither_the_speed_at_the_ends_nor_that_of_a_walk():
@@ -206,6 +214,39 @@ def test_the_covariance_of_the_score_is_that_of_the_stated_uncertainty(log):
     assert once.variance > 0.0
     assert errors(0.0) is None
     assert 0.0 < np.abs(errors(None).root).max() < np.inf
+
+
+@pytest.mark.parametrize("stated", [None, 2e-3])
+def test_points_of_unknown_uncertainty_have_the_mean_square_of_their_offsets(
+    log, monkeypatch, stated
+):
+    """Two offsets of unequal size along three axes; the uncertainty of the first may be stated."""
+    first, *others = (x for x in robot(None).constraints if x.kind == "point")
+    constraints = [replace(first, uncertainty=stated), *others]
+    model = replace(robot(None), constraints=tuple(constraints))
+    mapping = structural_mapping(model)
+    recordings = Recordings(model, mapping, (hold_log(model, log, RAW),))
+    rows = recordings.fitted[0].whole
+    some = base_problem(model, mapping, rows.trajectory, rows.mask)
+    W, weight = (np.concatenate([block[k] for block in some.blocks()]) for k in (0, 2))
+    D = np.random.default_rng(2).standard_normal((len(W), 6))
+    x = 1e-4 * np.array([3.0, 2.0, 0.1, -9.0, 4.0, 0.2][0 if stated is None else 3 :])
+    squares = np.outer(x, x) + np.diag(np.arange(1.0, len(x) + 1.0)) * 1e-9
+    found = EstimatedErrors(5e-4, np.zeros(6), np.zeros((6, 6)), squares)
+    monkeypatch.setattr(repeated_errors, "_slopes", lambda *_: D)
+    monkeypatch.setattr(repeated_errors, "estimated_errors", lambda *_: found)
+    errors = with_repeated_errors(recordings).repeated
+    E = np.zeros((6, 6))
+    if stated is None:
+        E[:3, :3] = E[3:, 3:] = 0.5 * (squares[:3, :3] + squares[3:, 3:])
+    else:
+        E[:3, :3], E[3:, 3:] = stated**2 * np.eye(3), squares
+    score = W.T @ (weight[:, None] * D)
+    wanted = score @ E @ score.T
+    np.testing.assert_allclose(
+        errors.root @ errors.root.T, wanted, atol=1e-9 * np.abs(wanted).max()
+    )
+    assert errors.points == (5e-4 if stated is None else stated)
 
 
 def test_offsets_without_torques_of_joints_are_two_centimetres_if_not_stated(log):
