@@ -128,7 +128,7 @@ def test_an_impossible_inertia_is_named_with_what_it_breaks(tmp_path):
     assert finding["severity"] == "note"
     assert "flat or thin" in finding["message"]
     # a fit is warned of the impossible ones only
-    both = (("izz=\"0.11\"", "izz=\"0.23\""), ("izz=\"0.035\"", "izz=\"0.05\""))
+    both = (('izz="0.11"', 'izz="0.23"'), ('izz="0.035"', 'izz="0.05"'))
     inspected(tmp_path, *both)
     (finding,) = impossible_inertials(RobotModel.from_urdf(tmp_path / "two.urdf"))
     assert (finding.where, finding.severity) == ("link upper", "warning")
