@@ -156,7 +156,7 @@ def coupled_fit(rng, free_flyer=False):
     fitted, base = [], 6 * free_flyer
     for count in (31, 40):
         q, v, a, tau = rng.standard_normal((4, count, 3 + base))
-        q = np.hstack([np.zeros((count, free_flyer)), q])  # a pose has seven numbers
+        q = np.hstack([np.zeros((count, int(free_flyer))), q])  # a pose has seven numbers
         motion = Trajectory(
             np.arange(count) / 50, q, v, a, tau, JOINTS, 50.0, np.zeros(count, dtype=int)
         )
