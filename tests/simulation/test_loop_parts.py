@@ -83,7 +83,7 @@ def test_limits_are_a_share_of_the_urdfs_but_where_stated(panda):
     read = [Actuator.from_dict({"effort": value}) for value in (0.4, False)]
     assert [x.effort for x in read] == [0.4, None]
     assert [x.to_dict()["effort"] for x in read] == [0.4, False]
-    with pytest.raises(SettingsError, match="effort is true, wanted a factor .* or false for no"):
+    with pytest.raises(SettingsError, match=r"effort is true, wanted a factor .* or false for no"):
         Actuator.from_dict({"effort": True})
     free = RobotModel.from_urdf(example_urdf("double_pendulum_continuous.urdf"))
     no_limit = [j.effort <= 0 for j in free.limits]
