@@ -86,6 +86,13 @@ def test_criteria_have_their_values_and_gradients(name, rng):
     assert np.sum(gradient * D) == pytest.approx(slope, rel=1e-6)
 
 
+def test_a_singular_matrix_has_the_determinant_of_rounding_errors():
+    eps = 4.0 * np.finfo(float).eps  # of the largest eigenvalue
+    value, gradient = criterion("D", np.diag([1.0, 0.0, 4.0]))
+    assert value == pytest.approx(-np.log(4.0 * eps) / 3)
+    np.testing.assert_allclose(gradient, np.diag([-1.0, -1.0 / eps, -0.25]) / 3)
+
+
 def test_a_criterion_that_there_is_not_is_refused():
     with pytest.raises(SettingsError, match="criterion is 'F', wanted one of D, A, E, condition"):
         criterion("F", np.eye(2))
