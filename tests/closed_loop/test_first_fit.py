@@ -1,6 +1,6 @@
 """The first fit of a loop, from which the others go on."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -48,6 +48,53 @@ def test_the_first_fit_is_of_drives_alone_with_the_bodies_of_the_urdf(monkeypatc
     first, rounds = caught.value.args
     assert [unknown.name for unknown in first.free_parameters] == ["kp", "coulomb"]
     assert (first.windows, rounds) == (("first", "third"), 1)
+
+
+@dataclass
+class Started(Simulator):
+    starts: int = 0
+    error: str = ""
+    lag = exact = torque = None
+
+    def with_better_start(self, theta):
+        return replace(self, starts=self.starts + 1)
+
+
+@dataclass
+class Recorder:
+    rounds: int
+    fits: list
+
+    def minimise(self, simulator, theta=None):
+        self.fits.append(("steps", self.rounds, len(simulator.windows), simulator.starts))
+        return simulator.prior
+
+    def joint_step(self, simulator, theta):
+        return theta
+
+    def fit(self, simulator, theta, exact):
+        self.fits.append(("fit", self.rounds, len(simulator.windows), simulator.starts))
+        return SimpleNamespace(theta=theta)
+
+
+def test_only_the_last_fit_is_to_all_windows_from_better_starts(monkeypatch):
+    simulator, fits = Started((), tuple(range(96)), np.zeros(0)), []
+    others = dict.fromkeys(("linear", "encoders", "plain", "torque"))
+    initialised = SimpleNamespace(simulator=simulator, estimator=Recorder(9, fits), **others)
+    monkeypatch.setattr(fit, "_initialise_from_commands", lambda *_: initialised)
+    monkeypatch.setattr(fit, "_check_settings", lambda *_: None)
+    monkeypatch.setattr(fit, "refine_steps", lambda simulator, _, estimate: (simulator, estimate))
+    monkeypatch.setattr(fit, "is_stated", lambda *_: np.array([False]))
+    found = fit.fit_loops(None, [], LoopSettings(), SimulationSettings(), chooses=False)
+    few = fits[0][2]
+    assert few < 48
+    assert fits == [
+        ("steps", 1, few, 0),
+        ("steps", 1, 48, 1),
+        ("steps", 1, 48, 2),
+        ("fit", 9, 96, 4),
+    ]
+    assert len(found.simulator.windows) == 96
 
 
 def test_where_a_settling_step_cannot_be_simulated_the_parameters_are_fitted():

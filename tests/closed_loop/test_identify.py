@@ -385,7 +385,8 @@ def test_a_delay_at_its_bound_leaves_the_warning_of_a_slow_command(found):
     evidence = {"frequency": 2.0, "shortest": 0.0, "longest": 0.09}
     slow = Finding("slow_command", "warning", "log", "any delay explains it", evidence)
     delay = next(name for name in found.fit.estimate.names if name.endswith("delay"))
-    details = {**found.estimate.details, "at_bound": (delay,)}
+    other = next(name for name in found.fit.estimate.names if name.endswith("coulomb"))
+    details = {**found.estimate.details, "at_bound": (other, delay)}
     fitted = replace(found.fit, estimate=replace(found.estimate, details=details))
     bound = replace(found, fit=fitted)
     named = {finding.code: finding for finding in loop_findings(bound, [slow])}

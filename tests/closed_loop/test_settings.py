@@ -48,6 +48,12 @@ def test_a_logged_torque_closes_no_loop(name, value):
     assert LoopSettings(kind="pd", **{name: value}).kind == "pd"
 
 
+@pytest.mark.parametrize("name", ["zeros", "kind", "delays"])
+def test_a_word_that_is_none_of_a_setting_is_refused(name):
+    with pytest.raises(SettingsError, match=rf"\[?controller\]?:? {name} is 'fnid', wanted one of"):
+        LoopSettings(**{name: "fnid"})
+
+
 def test_a_late_torque_is_moved_back_by_the_signals():
     with pytest.raises(SettingsError, match=r"\[signals\] torque_delay"):
         LoopSettings(kind="torque", delay=0.01)

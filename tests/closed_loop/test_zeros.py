@@ -55,6 +55,8 @@ def test_a_zero_is_found_to_the_grid_and_then_by_the_fit(moved):
     np.testing.assert_array_equal(first.sign, 1.0)
     assert first.zero[1] == pytest.approx(AWAY, abs=np.deg2rad(15.0))
     assert (first.zero[[0, 2]] == 0.0).all()
+    assert first.next_zero[1] == 0.0  # that of the URDF, so gain and margin are of the same two
+    np.testing.assert_allclose(first.gain, [0.0, 1.0 - 1.0 / (1.0 + first.margin[1]), 0.0])
     drives = robot.drives
     loop = LoopSettings(
         kp={d.joint: d.kp for d in drives}, kd={d.joint: d.kd for d in drives}, zeros="find"

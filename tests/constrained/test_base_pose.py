@@ -7,7 +7,7 @@ import pinocchio as pin
 import pytest
 from helpers.humans import FEET, human_urdf, logged, walk
 
-from robotid.constrained.base_pose import check_pose, check_twist, check_unit
+from robotid.constrained.base_pose import _vertical, check_pose, check_twist, check_unit
 from robotid.constrained.contacts import check_base
 from robotid.logs.base import BaseMotion, base_state, in_base, quaternions_of_angles
 from robotid.logs.data import Log
@@ -65,6 +65,15 @@ def test_another_order_of_the_quaternion_is_named(robot, log, change, words):
     assert (found.code, found.severity) == ("base_orientation", "error")
     assert words in found.message
     assert found.evidence["best"] < 0.1  # [m/s], noise of the markers
+
+
+def test_gravity_is_stated_along_the_one_axis_that_may_be_the_vertical():
+    G = np.array([0.0, 0.0, -3.7])
+    for up, said in (
+        ([0.9, 0.1, -0.3], "[-3.7, 0, 0]"), ([0.2, -0.8, 0.1], "[0, 3.7, 0]"),
+        ([-0.1, 0.0, 0.4], "[0, 0, -3.7]"), ([0.02, 0.05, 0.29], None), ([0.7, 0.6, 0.0], None),
+    ):  # fmt: skip
+        assert _vertical(np.array(up), G) == (said and f"gravity = {said}")
 
 
 @pytest.mark.parametrize(("axis", "down"), [("y", -9.81), ("-y", 9.81)])
@@ -301,7 +310,9 @@ def test_noise_of_the_pose_is_no_error_of_the_twist(free):
     ],
 )  # fmt: skip
 def test_a_wrong_part_of_the_twist_is_named(free, change, words):
-    (found,) = check_twist(changed(flight(free), **change), SignalSettings(cutoff=20.0))
+    # how the identification takes its velocities has no effect
+    signals = SignalSettings(cutoff=20.0, velocity="differentiated")
+    (found,) = check_twist(changed(flight(free), **change), signals)
     assert (found.code, found.severity) == ("base_twist", "error")
     assert all(text in found.message for text in words)
 

@@ -1,6 +1,7 @@
 """Findings on measured forces of the ground: sign, unit, foot, axes, and plates that are missed."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pinocchio as pin
@@ -9,7 +10,7 @@ from helpers.humans import FEET, PARTS, human_urdf, logged, walk, with_other_seg
 
 from robotid.constrained import wrenches
 from robotid.constrained.contacts import check_base
-from robotid.constrained.wrench_times import check_gains, check_level, check_offsets
+from robotid.constrained.wrench_times import check_delay, check_gains, check_level, check_offsets
 from robotid.constrained.wrenches import _Reading, check_wrenches
 from robotid.logs.base import BaseMotion
 from robotid.logs.settings import SignalSettings
@@ -252,6 +253,26 @@ def test_vertical_forces_alone_show_their_sign_and_foot(urdf, log):
     assert not found(model, vertical)
     (finding,) = found(model, scaled(vertical, -1.0))
     assert "their sign is reversed" in finding.message
+
+
+@pytest.mark.parametrize(("noise", "count"), [(2.0, 1), (6.0, 0)])
+def test_a_delay_counts_if_a_tenth_of_the_squared_residual_goes_with_it(noise, count):
+    """Without the delay of 40 ms the residual has the variance of about 1.0 more."""
+    rng = np.random.default_rng(0)
+    t = 3.0 + 0.01 * np.arange(4000)
+    force = np.cumsum(rng.standard_normal((4000, 1)), axis=0) / 2.0
+    late = np.vstack([np.repeat(force[:1], 4, axis=0), force[:-4]])
+    slopes = np.zeros((4000, 1, 6))
+    slopes[:, 0, 2] = 1.0
+    left = np.zeros((4000, 6))
+    left[:, 2] = force[:, 0] + noise * rng.standard_normal(4000)
+    motion = SimpleNamespace(t=t, wrenches=late, segment=None)
+    found = list(check_delay("log", motion, slopes, left, 0.005))
+    assert len(found) == count
+    for finding in found:
+        assert finding.evidence["delay"] == pytest.approx(0.04, abs=0.003)
+        assert "lag the motion by +40 +- " in finding.message
+        assert "state wrench_delay = 0.045 in [signals]" in finding.message
 
 
 def test_the_delay_is_searched_without_the_torques_of_unknown_forces(urdf, log, monkeypatch):

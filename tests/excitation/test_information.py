@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from helpers.robots import ROBOTS, WRIST
 
-from robotid.exceptions import SettingsError
+from robotid.exceptions import DataError, SettingsError
 from robotid.excitation.information import CRITERIA, MotionInformation, criterion
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.columns import friction_speeds
@@ -86,6 +86,13 @@ def test_criteria_have_their_values_and_gradients(name, rng):
     assert np.sum(gradient * D) == pytest.approx(slope, rel=1e-6)
 
 
+def test_a_singular_matrix_has_the_determinant_of_rounding_errors():
+    eps = 4.0 * np.finfo(float).eps  # of the largest eigenvalue
+    value, gradient = criterion("D", np.diag([1.0, 0.0, 4.0]))
+    assert value == pytest.approx(-np.log(4.0 * eps) / 3)
+    np.testing.assert_allclose(gradient, np.diag([-1.0, -1.0 / eps, -0.25]) / 3)
+
+
 def test_a_criterion_that_there_is_not_is_refused():
     with pytest.raises(SettingsError, match="criterion is 'F', wanted one of D, A, E, condition"):
         criterion("F", np.eye(2))
@@ -96,6 +103,8 @@ def test_gravity_at_a_joint_is_shared_by_the_joints_of_its_chain():
     model = RobotModel.from_urdf(example_urdf("tiago_no_hand.urdf"), joints=joints)
     mapping = structural_mapping(model)
     information = MotionInformation(model, mapping, mapping.to_base(model.standard_parameters()))
+    with pytest.raises(DataError, match=rf"beta has shape \(2,\), wanted \({len(mapping.K)},\)"):
+        MotionInformation(model, mapping, np.zeros(2))
     linked = {"torso": "torso arm_1 arm_2 head", "arm_1": "torso arm_1 arm_2"}
     linked |= {"arm_2": "torso arm_1 arm_2", "head": "torso head"}
     short = [joint.replace("_joint", "").replace("_lift", "").replace("head_1", "head")

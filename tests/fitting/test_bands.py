@@ -144,22 +144,27 @@ def test_rows_that_are_not_used_do_not_count():
     assert np.isnan(share[1])
 
 
-def coupled_fit(rng):
+def coupled_fit(rng, free_flyer=False):
     """Return what a fit of a drive of two joints to two logs has, all of it by chance."""
     model = RobotModel.from_urdf(
         example_urdf("ur5_robot.urdf"),
         joints=JOINTS,
         couplings=[Coupling("pair", ((LIFT, 1.0), (WRIST, -2.5)))],
         own_terms={"pair": [PositionCoulomb(centre=0.3)], ELBOW: [LoadFriction()]},
+        free_flyer=free_flyer,
     )
-    fitted = []
+    fitted, base = [], 6 * free_flyer
     for count in (31, 40):
-        q, v, a, tau = rng.standard_normal((4, count, 3))
+        q, v, a, tau = rng.standard_normal((4, count, 3 + base))
+        q = np.hstack([np.zeros((count, int(free_flyer))), q])  # a pose has seven numbers
         motion = Trajectory(
             np.arange(count) / 50, q, v, a, tau, JOINTS, 50.0, np.zeros(count, dtype=int)
         )
-        mask = rng.random((count, 3)) < 0.6
-        mask[:2], v[:2] = [True, False, False], 9.0  # fast only where the other joint is not used
+        mask = rng.random((count, 3 + base)) < 0.6
+        mask[:2, -3:], v[:2] = (
+            [True, False, False],
+            9.0,
+        )  # fast only where the other joint is not used
         motion = replace(motion, v=v)
         fitted.append(SimpleNamespace(recording=SimpleNamespace(trajectory=motion, mask=mask)))
     size = len(model.layout.names)
@@ -171,14 +176,17 @@ def coupled_fit(rng):
     )  # fmt: skip
 
 
-def test_usual_friction_of_a_coupled_drive_is_over_the_rows_that_all_of_its_joints_have(rng):
-    found = coupled_fit(rng)
+@pytest.mark.parametrize("free_flyer", [False, True])
+def test_usual_friction_of_a_coupled_drive_is_over_the_rows_that_all_of_its_joints_have(
+    rng, free_flyer
+):
+    found = coupled_fit(rng, free_flyer)
     ratios = np.array([1.0, 0.0, -2.5])
-    rows = [(e.recording.mask[:, [0, 2]]).all(axis=1) for e in found.fitted]
+    rows = [(e.recording.mask[:, [-3, -1]]).all(axis=1) for e in found.fitted]
     q, v = (
         np.concatenate(
             [
-                getattr(e.recording.trajectory, x)[r] @ ratios
+                getattr(e.recording.trajectory, x)[r, -3:] @ ratios
                 for e, r in zip(found.fitted, rows, strict=True)
             ]
         )
@@ -202,6 +210,7 @@ def test_usual_friction_of_a_coupled_drive_is_over_the_rows_that_all_of_its_join
     X = np.array([[0.7, 1.0, 0.8], [-0.2, -1.0, -0.8]])
     np.testing.assert_allclose(asked.torque, X @ found.standard[k], rtol=1e-12)
     assert asked.load == 3.0
+    assert repr(typical_friction(found, "pair", [])) == "<FrictionCurve: no speeds>"
 
 
 def test_a_term_that_is_open_adds_its_own_torque_to_what_it_moves(rng):

@@ -228,6 +228,7 @@ def test_a_fit_is_said_and_written_with_its_figures():
     at_link = INERTIA + MASS * (COM @ COM * np.eye(3) - np.outer(COM, COM))
     np.testing.assert_allclose(written["inertia_at_link"], at_link)
     assert written["inertia_std_error"] == (INERTIA / 20).tolist()
+    assert [written[key] for key in ("mass", "mass_std_error")] == [2.0, one.mass_std_error]
     assert written["mass_interval"] == [1.75, 2.25]
     assert (other["inertia"], other["inertia_std_error"]) == (None, None)
     assert "inertia_at_link" not in other

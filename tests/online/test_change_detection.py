@@ -131,7 +131,7 @@ def test_the_noise_and_what_the_parameters_leave_open_are_their_recursions(rng):
     for k in range(80):
         used = rng.uniform(size=2) < 0.8
         tau, e, residual = rng.standard_normal((3, 2)) * [[8.0, 2.0]]
-        doubt = rng.uniform(0.0, 0.2, 2) * variance
+        doubt = rng.uniform(0.0, 0.45, 2) * variance
         for j in range(2):
             expected = doubt[j] + variance[j] + model_error**2 * torque[j]
             if used[j] and open_[j] < 0.25:
@@ -148,10 +148,19 @@ def test_the_noise_and_what_the_parameters_leave_open_are_their_recursions(rng):
         np.testing.assert_allclose(monitor.variance, variance)
         np.testing.assert_allclose(monitor.ratio, open_)
         np.testing.assert_allclose(detector.evidence, evidence)
+        assert monitor.is_converged == (open_ < 0.25).all()
     assert evidence.max() > 0.0
     assert monitor.is_converged
     monitor.forget_convergence()
     assert not monitor.is_converged
+
+
+def test_the_noise_has_a_floor_relative_to_the_torque_of_its_row_or_of_the_largest():
+    detector = ChangeDetector(3, 40.0, 4.0)
+    monitor = Innovations(np.array([10.0, 3.0, 1e-5]), 0.01, 0.01, 0.0, detector)
+    for k in range(40):
+        monitor.push(0.01 * k, *np.zeros((4, 3)), np.ones(3, dtype=bool), 1.0)
+    np.testing.assert_allclose(np.sqrt(monitor.variance), [1e-3, 3e-4, 1e-6])
 
 
 def test_a_load_is_the_generalised_least_squares_of_its_change_about_none(rng):

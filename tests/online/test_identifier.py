@@ -1,6 +1,6 @@
 import copy
 from collections import deque
-from dataclasses import replace
+from dataclasses import fields, replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -130,6 +130,8 @@ def test_without_a_change_none_is_flagged_and_it_converges(panda):
     run(identifier, log, 1000)
     late = identifier.reading
     assert identifier.changes == ()
+    assert len(identifier._recent) == 30  # states, one every tenth of a second
+    assert np.diff([t for t, _ in identifier._recent]) == pytest.approx(0.1, abs=0.011)
     assert not early.converged
     assert late.converged
     assert 0.5 < early.excitation < late.excitation <= 1.0
@@ -211,6 +213,12 @@ def test_before_the_robot_has_moved_there_is_no_estimate(ur5):
     assert seen > 80
     with pytest.raises(DataError, match=rf"moved for {seen // 2 / 100:.2f} s, and the warm-up"):
         _ = identifier.compared
+    # the instants of the warm-up are processed as if their own samples had just come
+    steps, identifier._step = [], lambda instant, now: steps.append(now - instant[0])
+    for k in range(140, 300):
+        identifier.update(k / 200.0, np.append(np.zeros(5), k / 200.0), np.ones(6))
+    assert len(steps) > 100
+    np.testing.assert_allclose(steps, identifier.delay, atol=1e-9)
 
 
 def test_settings_out_of_range_are_refused():
@@ -218,3 +226,9 @@ def test_settings_out_of_range_are_refused():
         OnlineSettings(threshold=0)
     with pytest.raises(SettingsError, match="walk is -1, wanted 0 or a positive number"):
         OnlineSettings(walk=-1)
+    may_be_0 = {"walk", "min_velocity", "model_error"}
+    for name in {f.name for f in fields(OnlineSettings)} - {"order"}:  # which the signals check
+        for value in (-1.0,) if name in may_be_0 else (-1.0, 0.0):
+            with pytest.raises(SettingsError, match=f"{name} is {value}, wanted .*positive number"):
+                OnlineSettings(**{name: value})
+    assert OnlineSettings(**dict.fromkeys(may_be_0, 0.0)).walk == 0.0

@@ -89,6 +89,10 @@ def test_a_bad_sample_is_refused_and_leaves_no_trace():
             disturbed.push(t[k], q[k], q[k])
     for ours, theirs in zip(zip(*found, strict=True), expected, strict=True):
         np.testing.assert_array_equal(np.array(ours), theirs)
+    for q, tau in ((np.zeros(2), np.zeros(1)), (np.zeros(1), np.zeros(2))):
+        shapes = rf"q has shape \({len(q)},\) and tau \({len(tau)},\), wanted \(1,\) each"
+        with pytest.raises(DataError, match=shapes):
+            clean.push(9.0, q, tau)
 
 
 def test_settings_that_cannot_be_are_refused():

@@ -6,6 +6,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
+from robotid.exceptions import SettingsError
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import Coupling
@@ -79,6 +80,11 @@ def test_limits_are_a_share_of_the_urdfs_but_where_stated(panda):
     wanted = 0.4 * effort
     wanted[2] = 5.0
     np.testing.assert_allclose(_limits(panda, stated), wanted)
+    read = [Actuator.from_dict({"effort": value}) for value in (0.4, False)]
+    assert [x.effort for x in read] == [0.4, None]
+    assert [x.to_dict()["effort"] for x in read] == [0.4, False]
+    with pytest.raises(SettingsError, match=r"effort is true, wanted a factor .* or false for no"):
+        Actuator.from_dict({"effort": True})
     free = RobotModel.from_urdf(example_urdf("double_pendulum_continuous.urdf"))
     no_limit = [j.effort <= 0 for j in free.limits]
     np.testing.assert_array_equal(np.isinf(_limits(free, Actuator(effort=0.4))), no_limit)

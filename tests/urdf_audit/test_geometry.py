@@ -136,6 +136,7 @@ def test_a_link_without_geometry_is_compared_with_the_distance_of_its_joints(tmp
     assert (finding.code, finding.severity) == ("com_outside", "warning")
     assert finding.evidence == pytest.approx({"outside": 0.05})
     assert slender(tmp_path, 0.3, com=-0.44) == []
+    assert [f.code for f in slender(tmp_path, 2.3, com=-0.5)] == ["com_outside"]  # only the cause
     # the last body ends beyond its joint: a note
     assert [(f.where, f.severity) for f in slender(tmp_path, 0.1, com=0, offset=0)] == [
         ("link fore", "note")
@@ -184,6 +185,11 @@ def test_numbers_of_templates_are_named(tmp_path):
     assert found.code == "default_inertial"
     assert "1 kg and 0.001 kg m^2 about every axis" in found.message
     assert found.evidence == {"mass": 1.0, "moment": 0.001}
+    # a moment may be round by chance: of a stated mass, about a stated centre
+    assert not any(
+        f.code == "default_inertial"
+        for f in audit(tmp_path, **numbers | {"mass": "1.3", "com": "0.2 0 0"})
+    )
 
 
 def test_a_mesh_that_is_not_found_is_one_note(tmp_path):

@@ -12,6 +12,7 @@ from robotid.regressor.torque import random_regressor
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 from robotid.robot.urdf_text import read_with_yourdfpy
+from robotid.urdf_audit.inertials import impossible_inertials
 from robotid.urdf_audit.inspection import inspect_urdf
 from robotid.urdf_audit.rounding import rounded_robot
 
@@ -126,6 +127,12 @@ def test_an_impossible_inertia_is_named_with_what_it_breaks(tmp_path):
     (finding,) = found(inspected(tmp_path, ('izz="0.11"', 'izz="0.22"')), "not_positive_definite")
     assert finding["severity"] == "note"
     assert "flat or thin" in finding["message"]
+    # a fit is warned of the impossible ones only
+    both = (('izz="0.11"', 'izz="0.23"'), ('izz="0.035"', 'izz="0.05"'))
+    inspected(tmp_path, *both)
+    (finding,) = impossible_inertials(RobotModel.from_urdf(tmp_path / "two.urdf"))
+    assert (finding.where, finding.severity) == ("link upper", "warning")
+    assert finding.message.endswith("a consistent fit uses the nearest possible body instead")
 
 
 def test_the_inertia_may_be_stated_in_a_turned_frame(tmp_path):

@@ -53,6 +53,18 @@ def test_a_plan_chooses_who_works():
     assert found.address == "tcp://here:8786"
 
 
+def test_worker_processes_are_kept_from_one_work_of_an_open_plan_to_the_next():
+    plan, used = WorkPlan(2), []
+    with plan:
+        for _ in range(2):
+            with plan._backend(pieces_of(1, 1)) as backend:
+                used.append(backend)
+    with plan._backend(pieces_of(1, 1)) as backend:
+        used.append(backend)
+    assert used[0] is used[1]
+    assert used[2] is not used[0]
+
+
 class Backwards(SerialBackend):
     """Finishes the last piece first."""
 
