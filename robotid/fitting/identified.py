@@ -3,7 +3,6 @@
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -106,7 +105,7 @@ class Identified(ABC):
         half = self.standard_quantile * self.standard_error
         return np.column_stack([self.standard - half, self.standard + half])
 
-    @cached_property
+    @property
     def base_interval(self) -> Array:
         """95 % interval of each base parameter, shape (b, 2).
 
