@@ -2,7 +2,6 @@
 
 import platform
 from functools import cache
-from importlib.metadata import PackageNotFoundError, version
 
 __all__ = ["__version__", "code_versions", "versions"]
 
@@ -44,6 +43,8 @@ def _platform() -> str:
 
 @cache  # each call reads the metadata of a package
 def _installed(package: str) -> str:
+    from importlib.metadata import PackageNotFoundError, version  # only results state versions
+
     try:
         return version(package)
     except PackageNotFoundError:

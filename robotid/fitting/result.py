@@ -136,7 +136,7 @@ class Fit(Identified, Solution):
         """
         return typical_friction(self, joint, v, q=q, load=load)
 
-    @property
+    @cached_property
     def is_consistent(self) -> bool:
         """Whether every body, every drive and the mass matrix are physically consistent.
 
@@ -156,7 +156,7 @@ class Fit(Identified, Solution):
             self._checked.append((self.standard, check_mass_matrix(self.model, self.standard)))
         return self._checked[-1][1]
 
-    @property
+    @cached_property
     def at_bound(self) -> Array:
         """Which drive terms are at their bound of 0, shape (p,), bool.
 
@@ -173,7 +173,7 @@ class Fit(Identified, Solution):
         errors = np.sqrt(np.maximum(np.diag(self.standard_covariance), 0.0))
         return np.where(self.at_bound, np.inf, errors)
 
-    @property
+    @cached_property
     def sources(self) -> tuple[str, ...]:
         """The source of the value of each standard parameter.
 

@@ -1,5 +1,10 @@
 """Checks of the measured velocities of a log against the derivatives of its positions."""
 
+from collections.abc import Callable
+from functools import wraps
+from typing import TypeVar
+from weakref import WeakKeyDictionary
+
 import numpy as np
 
 from robotid._typing import Array
@@ -28,6 +33,21 @@ _GAP = 5  # [median steps] a longer step is a gap
 _SEGMENT = 0.1  # [s] over which the motion is averaged against noise
 _UNLIKE = 0.5  # correlation below which a velocity is not the derivative of its position
 _MOVED, _SPEED = 1e-3, 0.02  # [rad or m], [rad/s or m/s] smaller values: at rest
+
+FoundT = TypeVar("FoundT")
+
+
+def _once(check: Callable[[Log], FoundT]) -> Callable[[Log], FoundT]:
+    """Keep the result of a check with each log: the doctor and the fit both use it."""
+    known: WeakKeyDictionary[Log, FoundT] = WeakKeyDictionary()
+
+    @wraps(check)
+    def found(log: Log) -> FoundT:
+        if log not in known:
+            known[log] = check(log)
+        return known[log]
+
+    return found
 
 
 def is_trustworthy(log: Log, stated: float = 0.0) -> bool:
@@ -64,6 +84,7 @@ def velocity_lag(log: Log) -> float:
     return velocity_lags(log)[0]
 
 
+@_once
 def velocity_lags(log: Log) -> tuple[float, Array]:
     """Return the delays of measured velocities relative to the derivatives of the positions [s].
 
@@ -107,6 +128,7 @@ def velocity_lags(log: Log) -> tuple[float, Array]:
     return delay(total.sum(axis=0)) if v.any() else 0.0, np.array(single)
 
 
+@_once
 def coarse_velocities(log: Log) -> tuple[str, ...]:
     """Return the joints whose measured velocity is coarsely quantised, as from an encoder.
 
@@ -120,6 +142,7 @@ def coarse_velocities(log: Log) -> tuple[str, ...]:
     )
 
 
+@_once
 def unlike_velocities(log: Log) -> dict[str, float]:
     """Return the joints whose measured velocity is not the derivative of their position at any lag.
 

@@ -222,12 +222,10 @@ def independent_factors(W: Array, n_rows: int) -> list[tuple[Array, Array]]:
     Returns:
         For each part its c columns, and their R with R^T R = W^T W, shape (c, c).
     """
-    from scipy.sparse.csgraph import connected_components
-
     samples = W.reshape(-1, n_rows, W.shape[1])
     filled = (samples != 0.0).any(axis=0)  # (n_rows, p)
     linked = filled.astype(float) @ filled.T > 0.0
-    count, label = connected_components(linked, directed=False)
+    count, label = _linked_parts(linked)
     # a column of zeros is assigned to the first equation
     of_column = label[filled.argmax(axis=0)]
     parts = [(np.flatnonzero(label == k), np.flatnonzero(of_column == k)) for k in range(count)]
@@ -236,6 +234,20 @@ def independent_factors(W: Array, n_rows: int) -> list[tuple[Array, Array]]:
         for rows, own in parts
         if len(own)
     ]
+
+
+def _linked_parts(linked: Array) -> tuple[int, Array]:
+    """Return the number of parts of a graph, and the part of each node, int.
+
+    Args:
+        linked: Which nodes are linked, flags, shape (m, m), symmetric.
+    """
+    if linked.all(axis=1).any():  # to one node, as to the first joint of an arm
+        return 1, np.zeros(len(linked), dtype=int)
+    from scipy.sparse.csgraph import connected_components  # takes long to import
+
+    count, label = connected_components(linked, directed=False)
+    return int(count), label
 
 
 def _factor(rows: Array, filled: Array) -> Array:

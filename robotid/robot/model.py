@@ -275,6 +275,10 @@ class RobotModel:
 
         The drive terms are 0, since the URDF's values of them are not used.
         """
+        return self._standard_parameters.copy()
+
+    @cached_property
+    def _standard_parameters(self) -> Array:
         inertial = [inertia.toDynamicParameters() for inertia in self.pin_model.inertias[1:]]
         return np.concatenate([*inertial, np.zeros(len(self.layout.drive_names))])
 

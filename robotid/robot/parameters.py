@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cache, cached_property
 from numbers import Real
 
 import numpy as np
@@ -300,6 +300,7 @@ def to_paper_order(pi: Array) -> Array:
     return _by_body(pi)[:, order].reshape(-1)
 
 
+@cache
 def pseudo_inertia_basis() -> Array:
     """Return the ten symmetric matrices B_k with J(pi) = sum_k pi_k B_k, shape (10, 4, 4).
 
@@ -315,6 +316,7 @@ def pseudo_inertia_basis() -> Array:
         basis[k, axis, axis] = -0.5
     for k, (i, j) in ((5, (0, 1)), (7, (0, 2)), (8, (1, 2))):
         basis[k, i, j] = basis[k, j, i] = -1.0
+    basis.flags.writeable = False
     return basis
 
 
