@@ -616,6 +616,32 @@ def test_results_are_in_the_order_of_the_dates_of_their_logs(folder, tmp_path, c
     assert "false_alarms is 2, wanted a probability" in capsys.readouterr().err
 
 
+def test_each_change_has_its_own_parameters(folder, tmp_path):
+    """Friction of joint 2 that is three times as large from the fifth result on, of joint 1 from
+    the seventh on."""
+    rng, paths = np.random.default_rng(3), []
+    for k in range(7):
+        result = copy.deepcopy(read_result(folder / "a.json"))
+        for entry in result["base_parameters"]:
+            entry["value"] *= 1 + 0.01 * rng.normal()
+            joint, _, term = entry["name"].rpartition(".")
+            if (joint, k >= 4) == ("joint_2", True) and term in ("coulomb", "viscous"):
+                entry["value"] *= 3
+            if (entry["name"], k) == ("joint_1.coulomb", 6):
+                entry["value"] *= 4
+        paths.append(tmp_path / f"{k}.json")
+        write_json(result, paths[-1])
+    found = compare_results(paths)["findings"]
+    keys = ("result", "since", "kind", "where")
+    assert [tuple(each[key] for key in keys) for each in found] == [
+        ("E", "E", "friction", "joint_2"), ("G", "G", "friction", "joint_1"),
+    ]  # fmt: skip
+    assert [set(each["parameters"]) for each in found] == [
+        {"joint_2.coulomb", "joint_2.viscous"}, {"joint_1.coulomb"},
+    ]  # fmt: skip
+    assert found[0]["size"] == pytest.approx(2.0, rel=0.05)
+
+
 def test_time_stamps_from_the_start_of_a_log_are_no_order(folder, tmp_path):
     content = compare_results(history(folder, tmp_path, [3.0, 0.0, 5.0, 1.0, 2.0], 1.0))
     assert (content["order"], content["by_time"]) == ([0, 1, 2, 3, 4], False)

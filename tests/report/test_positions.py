@@ -330,6 +330,12 @@ def test_the_worst_joint_of_the_verdict_is_open(content, followed):
     opened = re.findall(r'<details[^>]*id="joint-(\d)"[^>]* open', page)
     assert opened == ["1"]
     assert next(iter(bars(page))) == LEG[1]
+    known = (model, model.standard_parameters())
+    for logs, wanted in (
+        (([moved], [still]), "not fitted"),
+        (([moved, still], []), "fitted samples, without validation log"),
+    ):
+        assert f"|motion|, {wanted}" in page_with(content, *logs, known)
     assert '<a href="#cause-saturation">saturation</a>' in page.split('id="worst"')[0]
 
 
