@@ -696,6 +696,7 @@ def test_the_chart_of_a_friction_has_its_units_its_loads_and_no_line_across_stan
     [
         ("friction", 0.312, 0.0456, "friction of two is 31 % higher (standard error 4.6 %)"),
         ("friction", -0.27, 0.0312, "friction of two is 27 % lower (standard error 3.1 %)"),
+        ("friction", 2.023, 1.0, "friction of two is 202 % higher (standard error 100 %)"),
         ("gain", -0.054, 0.012, "gain of the torque of two is 5.4 % lower (standard error 1.2 %)"),
         ("payload", 1.2345, 0.0567, "the load on two has changed: +1.23 kg (standard error "
          "0.057 kg)"),
