@@ -159,14 +159,22 @@ def test_a_command_in_degrees_is_told_from_one_that_goes_far_along_a_slider(fact
     """Only a revolute joint has degrees."""
     far = log(q=0.5 * Q, q_ref=0.5 * Q * [1.0, factor], v=None)
     check_units(far, LogUnits(), prismatic=["b"])
-    with pytest.raises(DataError, match=r"qref_b is \S+ times that of q_b: one of them"):
-        check_units(far, LogUnits(), prismatic=["a"])
+    for sign in (1.0, -1.0):  # a command that is reversed as well
+        far = log(q=0.5 * Q, q_ref=0.5 * Q * [1.0, sign * factor], v=None)
+        with pytest.raises(
+            DataError, match=rf"qref_b is {sign * factor:.3g} times that of q_b: one of them"
+        ):
+            check_units(far, LogUnits(), prismatic=["a"])
+    check_units(log(q=Q, q_ref=-Q, v=None), LogUnits())
 
 
 def test_a_command_that_is_not_followed_shows_no_unit():
     """57 times as large as the motion, and at another frequency."""
-    other = np.column_stack([Q[:, 0], 180 / np.pi * 0.1 * np.sin(7.3 * T)])
-    check_units(log(q=0.1 * Q, q_ref=other, v=None), LogUnits())
+    for share in (0.0, 0.85):  # the correlation from which two signals are alike is 0.9
+        y = np.sin(7.3 * T) * np.sqrt(2) * np.std(Q[:, 1])
+        other = share * (Q[:, 1] - Q[:, 1].mean()) + np.sqrt(1 - share**2) * y
+        q_ref = np.column_stack([Q[:, 0], 180 / np.pi * 0.1 * other])
+        check_units(log(q=0.1 * Q, q_ref=q_ref, v=None), LogUnits())
     with pytest.raises(DataError, match=r"qref_b is 57\.3 times that of q_b"):
         check_units(log(q=0.1 * Q, q_ref=0.1 * Q * [1.0, 180 / np.pi], v=None), LogUnits())
 
