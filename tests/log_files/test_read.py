@@ -241,9 +241,10 @@ def test_velocity_of_some_joints_only_is_noted(run):
     assert read_log(run(table), ["elbow"]).v.shape == (300, 1)
 
 
-@pytest.mark.parametrize("joints", [(), "elbow"])
+@pytest.mark.parametrize("joints", [(), "elbow", ("elbow", 3), 5])
 def test_joints_must_be_a_list_of_names(run, joints):
-    with refused(f"joints is {joints!r}, wanted a list of at least one name", SettingsError):
+    shown = "5, a int" if joints == 5 else repr(joints)
+    with refused(f"joints is {shown}, wanted a list of at least one name", SettingsError):
         read_log(run(make_table()), joints)
 
 

@@ -182,10 +182,11 @@ def test_a_command_that_is_not_followed_shows_no_unit():
 @pytest.mark.parametrize(("turn", "unit"), [(2 * np.pi, 1.0), (360.0, 180 / np.pi)])
 def test_speeds_are_compared_beside_gaps_and_full_turns(turn, unit):
     """The factor of dq by d(q)/dt, of a log with jumps of a turn and a gap with a long way."""
-    t = 6.0 + np.where(T < 2.0, T, T + 9.0)
+    t = 6.0 + np.where(T < 2.0, T, T + 9.0) + np.where(np.arange(400) < 250, 0.0, 0.1)
     q = unit * np.column_stack([0.7 * T + 0.02 * np.sin(5 * T), np.cos(3 * T)])
     v = unit * np.column_stack([0.7 + 0.1 * np.cos(5 * T), -3.0 * np.sin(3 * T)])
     q[200:] += [4.0 * unit, -2.0 * unit]  # while nothing was recorded
+    q[250:, 0] += unit  # in a gap of 11 steps
     q[60:, 0] -= turn
     q[300:, 1] += turn
     found = _velocity_factor(log(t=t, q=q, v=[2.0, -0.5] * v))
