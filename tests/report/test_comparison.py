@@ -608,7 +608,8 @@ def test_results_are_in_the_order_of_the_dates_of_their_logs(folder, tmp_path, c
     words = ["compare", *(str(tmp_path / f"{k}.json") for k in range(6))]
     assert main(words) == 0
     printed = " ".join(capsys.readouterr().out.split())
-    assert "finding: C: friction of joint_2 is 3" in printed
+    share = f"{100 * finding['size']:.0f} %"
+    assert f"finding: C: friction of joint_2 is {share} higher (standard error " in printed
     for more in ([], ["--out", str(tmp_path / "few.html")]):
         assert main([*words, "--false-alarms", "1e-9", *more]) == 0
         assert "finding:" not in capsys.readouterr().out
