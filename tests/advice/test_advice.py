@@ -219,7 +219,7 @@ def test_many_locked_joints_are_placed_together(identified):
     assert step.blocks[0] == '[locked]\n"*" = POSITION'
 
 
-def test_a_result_without_trouble_is_measured_used_and_played(identified):
+def test_a_result_without_trouble_is_measured_used_and_played(identified, monkeypatch):
     urdf, first, kept = files_of(identified)
     weigh = ["robotid", "payload", urdf, "LOADED.csv", "--reference", first, "--mass", "KG"]
     looked, scale, used = next_steps(told(identified), JOB)
@@ -250,6 +250,20 @@ def test_a_result_without_trouble_is_measured_used_and_played(identified):
     )
     validated = ("robotid validate out/result.json NEW.csv",)
     assert [step.blocks for step in others] == [looked.blocks, validated]
+    spiky = replace(calm, findings=(warning("spikes", ""),))
+    few = ", ".join(identified.model.joints[:4])
+    assert f"the residual of {few} and 2 more in" in next_steps(spiky, JOB)[0].words
+    (fitted, *_) = identified.fitted
+    unsaved = replace(fitted.recording, log=replace(fitted.recording.log, path=""))
+    arrays = replace(calm, fitted=(replace(fitted, recording=unsaved),))
+    assert next_steps(arrays, JOB)[0].blocks == scale.blocks[:2]
+    with monkeypatch.context() as patched:
+        patched.setattr(type(calm), "is_consistent", False)
+        by_flags, by_job = (next_steps(replace(calm), origin)[0] for origin in (FLAGS, JOB))
+    assert by_flags.words.startswith("Identify with the consistent estimator: the result of con")
+    assert by_flags.blocks == (FLAGS.again("--estimator", "consistent"),)
+    table = '[estimator]\nname = "consistent"'
+    assert by_job.blocks == (table, "robotid identify 'my job.toml' --out out")
     poor = replace(calm, findings=(warning("undetermined", ""),))
     (again,) = (s for s in next_steps(poor, JOB) if s.words.startswith("Record another motion"))
     count = len(poor.determination.undetermined)
