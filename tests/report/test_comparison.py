@@ -598,6 +598,7 @@ def test_results_are_in_the_order_of_the_dates_of_their_logs(folder, tmp_path, c
     assert {chart["title"].split()[0] for chart in named} == set(finding["parameters"])
     assert named[0]["x_names"] == list("BDEAFC")
     assert named[0]["marks"] == [4.5]
+    assert [series["faint"] for series in named[0]["series"]] == [True, False]
     entry = next(x for x in content["base_parameters"] if named[0]["title"].startswith(x["name"]))
     errors = [entry["std_errors"][k] for k in content["order"]]
     np.testing.assert_allclose(named[0]["series"][1]["half"], 1.96 * np.array(errors), rtol=1e-3)

@@ -342,7 +342,9 @@ def test_the_worst_joint_of_the_verdict_is_open(content, followed):
 def test_logs_have_their_role_and_the_worst_second_is_of_those_not_fitted(content, followed):
     fitted = replace(followed, log=replace(followed.log, path="fitted.csv"), q=followed.q + 0.2)
     for validation, wanted in (([followed], "kept.csv"), ([], "fitted.csv")):
-        _, html = shown_positions(content, [fitted], validation, Origin((), "out")).curves
+        shown = shown_positions(content, [fitted], validation, Origin((), "out"))
+        assert shown.title.endswith(": drives from commands")
+        _, html = shown.curves
         roles = set(re.findall(r"(\w+\.csv) 1-5 s, ([a-z ]+): RMSE", html))
         own = {("kept.csv", "not fitted")} if validation else set()
         assert roles == {*own, ("fitted.csv", "fitted")}
