@@ -102,6 +102,11 @@ def test_commanded_positions_are_found_where_they_are_wanted():
     )
 
 
+def test_the_first_column_that_is_missing_is_the_example():
+    found = said([*of("q"), *of("torque_ratio", UR[:3])])
+    assert 'columns = { tau_pan = "NAME" }. Record tau_<joint> or current_<joint>. ' in found
+
+
 @pytest.mark.parametrize("kind", ["temperature", "temp", "voltage", "iq", "tau_ext", "power"])
 def test_another_quantity_is_listed_and_not_proposed(kind):
     found = said([*of("q"), *of(kind)])

@@ -464,6 +464,9 @@ def test_fewer_than_two_rows_are_refused(run):
     path = run({"t": [0.0], "q_a": [0.0], "tau_a": [0.0]})
     with refused(f"{path.name} has 1 rows, wanted at least 2; record longer"):
         read_log(path, ["a"])
+    np.savez(path.with_name("none.npz"), time=np.zeros(0), q_a=np.zeros(0), tau_a=np.zeros(0))
+    with refused("none.npz has columns but no rows; record at least 2"):
+        read_log(path.with_name("none.npz"), ["a"])
 
 
 # --- CSV text -------------------------------------------------------------------------------------
