@@ -509,6 +509,9 @@ def test_a_still_picture_of_bars_has_its_names_slanted_where_they_are_long():
         for k, (y, h) in enumerate(zip(one.y, one.half, strict=True))
     )
     assert f'<path d="{whiskers}" stroke="currentColor" stroke-width="1.2"/>' in parts
+    alone = Series("o", np.ones(1), "tone-1", "bars")  # x from -1 to 1 on 576 px
+    _, parts = still_of(Chart("o", np.zeros(1), (alone,), "joint", "m", x_names=("a",)))
+    assert any(f"h{0.9 * 0.8 * 288:.1f}V" in part for part in parts)
     short = replace(chart, x_names=("n" * 19, "b"))
     assert still_of(short)[0] == f"0 0 300 {180 + 20 + 34}"
 
