@@ -45,7 +45,8 @@ class Encoders:
     Attributes:
         sign: 1, or -1 of an encoder with the opposite sign.
         zero: Position of the URDF where the encoder reads 0 [rad or m].
-        gain: Reduction of the squared position error by a zero and sign other than the URDF's [-].
+        gain: Reduction of the squared position error by a zero and sign other than the URDF's, as
+            share of the error with those of the URDF at all joints [-].
         explained: Share of the joint's own squared position error that gravity explains [-].
         margin: Relative increase of the squared error by the next best zero or sign, outside the
             neighbourhood of the best [-]; 0 of prismatic joints and of joints that hardly move.
@@ -135,7 +136,8 @@ def _descend(
     """
     N, n = motion.q.shape
     sign, zero, gain = np.ones(n), np.zeros(n), np.zeros(n)
-    cost, costs = motion.cost(model, sign, zero), np.full((n, len(_TRIALS)), np.inf)
+    first = cost = motion.cost(model, sign, zero)
+    costs = np.full((n, len(_TRIALS)), np.inf)
     for _ in range(_PASSES):
         moved = False
         for j in revolute:
@@ -145,7 +147,7 @@ def _descend(
                 costs[j, k] = motion.cost(model, trial_sign, trial_zero)
             k = int(np.argmin(costs[j]))
             if j in free and costs[j, k] < cost - np.log1p(CLEAR) * N:
-                gain[j] += 1.0 - np.exp((costs[j, k] - cost) / N)
+                gain[j] += np.exp((cost - first) / N) - np.exp((costs[j, k] - first) / N)
                 (sign[j], zero[j]), cost, moved = _TRIALS[k], float(costs[j, k]), True
         if not moved:
             break

@@ -139,15 +139,16 @@ def _alone(log: Log, kind: str, j: int, others: Array) -> str:
 
 
 def _check_commands(log: Log, is_revolute: Array) -> None:
-    """Reject joints with only one of position and commanded position in degrees."""
+    """Reject joints with only one of position and commanded position in degrees, of any sign."""
     if log.q_ref is None:
         return
     q, wanted = log.q - log.q.mean(axis=0), log.q_ref - log.q_ref.mean(axis=0)
     both = np.einsum("kj,kj->j", q, wanted)
     sizes = np.linalg.norm(q, axis=0), np.linalg.norm(wanted, axis=0)
-    follows = is_revolute & (both > _ALIKE * sizes[0] * sizes[1])
-    factor = sizes[1] / np.where(follows, sizes[0], np.nan)
-    for j in np.flatnonzero(_is_near(factor, _DEGREES) | _is_near(factor, 1 / _DEGREES)):
+    follows = is_revolute & (np.abs(both) > _ALIKE * sizes[0] * sizes[1])
+    factor = np.copysign(sizes[1], both) / np.where(follows, sizes[0], np.nan)
+    ratio = np.abs(factor)
+    for j in np.flatnonzero(_is_near(ratio, _DEGREES) | _is_near(ratio, 1 / _DEGREES)):
         raise DataError(
             f"{log.name}: the motion of qref_{log.joints[j]} is {factor[j]:.3g} times that of "
             f"q_{log.joints[j]}: one of them looks like degrees, the other like radians. Convert "

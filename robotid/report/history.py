@@ -146,13 +146,18 @@ def _findings(
     return findings
 
 
+def _percent(share: float) -> str:
+    """Return a share as text, with two digits or more, never as a power of ten."""
+    return f"{100 * share:.0f} %" if share >= 0.995 else f"{100 * share:.2g} %"
+
+
 def _message(cause: Cause, names: Sequence[str]) -> str:
     """Return the cause as text."""
     size, error = cause.size, cause.std_error
     if cause.kind in ("friction", "gain"):
         what = "friction" if cause.kind == "friction" else "gain of the torque"
         way = "higher" if size > 0 else "lower"
-        share = f"{100 * abs(size):.2g} % {way} (standard error {100 * error:.2g} %)"
+        share = f"{_percent(abs(size))} {way} (standard error {_percent(error)})"
         return f"{what} of {cause.where} is {share}"
     if cause.kind == "payload":
         mass = f": {size:+.3g} kg (standard error {error:.2g} kg)" if error > 0 else ""

@@ -35,6 +35,25 @@ def warning(code, where="elbow_joint", severity="warning", **evidence):
     return Finding(code, severity, where, f"{code} is so; do something", evidence)
 
 
+def files_of(identified):
+    """Return the URDF, the fitted log and the validation log."""
+    logs = (identified.fitted[0].recording.log, identified.validation[0].recording.log)
+    return (str(identified.model.tree.path), *(log.path for log in logs))
+
+
+def predicted(identified, path, errors):
+    """Return the validation recording with another file and other errors of the joints [%]."""
+    (kept,) = identified.validation
+    metrics = kept.metrics["estimate"]
+    per_joint = {
+        joint: replace(m, relative_error_pct=x, baselines={k: 99.0 for k in m.baselines})
+        for (joint, m), x in zip(metrics.per_joint.items(), errors, strict=True)
+    }
+    recording = replace(kept.recording, log=replace(kept.recording.log, path=path))
+    changed = {**kept.metrics, "estimate": replace(metrics, per_joint=per_joint)}
+    return replace(kept, recording=recording, metrics=changed)
+
+
 def words(steps):
     return [step.words.split()[0] for step in steps]
 
@@ -154,6 +173,8 @@ def test_a_named_cause_has_its_step_and_no_guess_beside_it(identified, code, rng
             "spring": ("harmonics2", "spring"),
         }
         assert read(drives).drives == {joint: wanted[code]}
+    if code == "backlash":  # there is no term for it, and the same logs are not repeated
+        assert [step.blocks for step in steps if step.words.startswith(NAMED[code])] == [()]
     if code == "coupling":
         (made,) = read(blocks[0]).couplings
         assert set(dict(made.ratios)) == {joint, "wrist_1_joint"}
@@ -198,12 +219,63 @@ def test_many_locked_joints_are_placed_together(identified):
     assert step.blocks[0] == '[locked]\n"*" = POSITION'
 
 
-def test_a_result_without_trouble_is_measured_used_and_played(identified):
-    calm = told(identified, validation=identified.validation)
-    result = "out/result.json"
-    blocks = [block for step in next_steps(calm, JOB) for block in step.blocks]
-    assert len(next_steps(calm, JOB)) <= 3
-    assert f"robotid export {result} --format mjcf --out ur5.xml" in blocks
+def test_a_result_without_trouble_is_measured_used_and_played(identified, monkeypatch):
+    urdf, first, kept = files_of(identified)
+    weigh = ["robotid", "payload", urdf, "LOADED.csv", "--reference", first, "--mass", "KG"]
+    looked, scale, used = next_steps(told(identified), JOB)
+    assert looked.words.startswith("Examine the residual of shoulder_pan_joint, elbow_joint, ")
+    assert looked.blocks == (shlex.join(["robotid", "replay", urdf, kept, "out"]),)
+    assert scale.words.startswith("Verify the torque scale with a payload of known mass")
+    assert scale.blocks == (
+        '[[payload_check]]\nlog = "LOADED.csv"\nmass = KG',
+        "robotid identify 'my job.toml' --out out",
+        shlex.join([*weigh, "--gains"]),
+    )
+    assert used.words.startswith("Use the result: the identified URDF is written")
+    assert used.blocks == ("robotid export out/result.json --format mjcf --out ur5.xml",)
+    # nothing to examine, and no URDF to export
+    calm = told(identified, validation=(predicted(identified, kept, [1.0] * 6),))
+    assert [step.blocks for step in next_steps(calm, JOB)] == [
+        scale.blocks,
+        used.blocks,
+        looked.blocks,
+    ]
+    without = replace(calm, log_errors=("wrong",))
+    vars(without)["verdict"] = identified.verdict
+    weighed, *others = next_steps(without, FLAGS)
+    assert weighed.words == scale.words
+    assert weighed.blocks == (
+        FLAGS.again("--payload-check", "LOADED.csv=KG"),
+        shlex.join([*weigh, "--gains"]),
+    )
+    validated = ("robotid validate out/result.json NEW.csv",)
+    assert [step.blocks for step in others] == [looked.blocks, validated]
+    spiky = replace(calm, findings=(warning("spikes", ""),))
+    few = ", ".join(identified.model.joints[:4])
+    assert f"the residual of {few} and 2 more in" in next_steps(spiky, JOB)[0].words
+    (fitted, *_) = identified.fitted
+    unsaved = replace(fitted.recording, log=replace(fitted.recording.log, path=""))
+    arrays = replace(calm, fitted=(replace(fitted, recording=unsaved),))
+    assert next_steps(arrays, JOB)[0].blocks == scale.blocks[:2]
+    with monkeypatch.context() as patched:
+        patched.setattr(type(calm), "is_consistent", False)
+        by_flags, by_job = (next_steps(replace(calm), origin)[0] for origin in (FLAGS, JOB))
+    assert by_flags.words.startswith("Identify with the consistent estimator: the result of con")
+    assert by_flags.blocks == (FLAGS.again("--estimator", "consistent"),)
+    table = '[estimator]\nname = "consistent"'
+    assert by_job.blocks == (table, "robotid identify 'my job.toml' --out out")
+    poor = replace(calm, findings=(warning("undetermined", ""),))
+    (again,) = (s for s in next_steps(poor, JOB) if s.words.startswith("Record another motion"))
+    count = len(poor.determination.undetermined)
+    assert again.words.endswith(f"the data do not determine {count} base parameters.")
+    assert again.blocks == (
+        '[[identification]]\nlog = "NEW.csv"',
+        "robotid identify 'my job.toml' --out out",
+    )
+    assert next_steps(poor, FLAGS)[0].blocks == (
+        "robotid identify arm.urdf NEW.csv first.csv --cutoff 8 --out out",
+    )
+    assert next_steps(poor, Origin())[0].blocks == ('[[identification]]\nlog = "NEW.csv"',)
 
 
 def test_a_step_names_no_joint_of_a_note(identified):
@@ -377,8 +449,8 @@ def test_a_payload_that_contradicts_the_scale_is_the_one_to_identify_gains_from(
     gains = ("--gain", "two=1.5", "--cutoff", "8", "--gain", "one=-2")
     origin = Origin(("arm.urdf", "first.csv", *gains), "out")
 
-    def step(*payloads):
-        found = replace(told(identified, warning("scale_unchecked")), payload_checks=payloads)
+    def step(*payloads, findings=()):
+        found = replace(told(identified, *findings), payload_checks=payloads)
         return next_steps(found, origin)[0]
 
     urdf, log = identified.model.tree.path, identified.fitted[0].recording.log.path
@@ -389,7 +461,7 @@ def test_a_payload_that_contradicts_the_scale_is_the_one_to_identify_gains_from(
         words.format(urdf, "far.csv", log, "tool0", "2.5"),
         "robotid identify arm.urdf first.csv --cutoff 8 --gain two=GAIN --gain one=GAIN --out out",
     )
-    right = step(near)
+    right = step(near, findings=(warning("scale_unchecked"),))
     assert right.words == f"Verify the torque scale: {near.message}."
     assert right.blocks[0] == words.format(urdf, "near.csv", log, "wrist", "2")
     assert "GAIN" not in right.blocks[1]
@@ -434,21 +506,9 @@ def test_a_torque_with_another_gain_is_no_reason_to_keep_the_urdf(identified):
 
 
 def test_joints_that_any_recording_misses_are_looked_at_and_the_first_is_played(identified):
-    (kept,) = identified.validation
-    metrics = kept.metrics["estimate"]
-    names = list(metrics.per_joint)
-
-    def other(path, errors):
-        per_joint = {
-            joint: replace(m, relative_error_pct=x, baselines={k: 99.0 for k in m.baselines})
-            for (joint, m), x in zip(metrics.per_joint.items(), errors, strict=True)
-        }
-        log = replace(kept.recording.log, path=path)
-        recording = replace(kept.recording, log=log)
-        changed = {**kept.metrics, "estimate": replace(metrics, per_joint=per_joint)}
-        return replace(kept, recording=recording, metrics=changed)
-
-    runs = (other("x.csv", [35.0, 1, 1, 1, 1, 1]), other("y.csv", [1, 1, 1, 1, 35.0, 1]))
+    names = identified.model.joints
+    errors = ("x.csv", [35.0, 1, 1, 1, 1, 1]), ("y.csv", [1, 1, 1, 1, 35.0, 1])
+    runs = tuple(predicted(identified, *each) for each in errors)
     steps = next_steps(told(identified, validation=runs), JOB)
     (look,) = [step for step in steps if step.words.startswith("Examine the residual of")]
     assert f"the residual of {names[0]}, {names[4]} in" in look.words
@@ -476,9 +536,25 @@ def loop_warning(code, where):
 
 
 def test_a_usable_result_of_commands_is_exported():
-    steps = loop_steps(loop_content("usable"), JOB)
-    assert [step.blocks[0].split()[1] for step in steps] == ["replay", "export", "export", "export"]
-    assert loop_steps(loop_content("usable"), Origin()) == ()
+    content = loop_content("usable")
+    replay, *exports = loop_steps(content, JOB)
+    assert replay == Step(
+        "Compare the commanded, measured and simulated robot in the replay.",
+        ("robotid replay arm.urdf a.csv out/result.json",),
+    )
+    assert [step.blocks[0].split()[3:] for step in exports] == [
+        ["--format", "mjcf", "--out", "arm.xml"],
+        ["--format", "isaac", "--out", "arm_actuators.yaml"],
+        ["--format", "ranges", "--out", "arm_ranges.yaml"],
+    ]
+    assert exports[0].words == "Simulate it in MuJoCo, gains and delays included."
+    assert loop_steps(content, Origin()) == ()
+    content["simulation"]["controller"]["kind"] = "torque"
+    replay, *exports = loop_steps(content | {"robot": ""}, JOB)
+    assert replay.words == "Compare measured and predicted torque in the replay."
+    (export,) = exports
+    assert export.words.startswith("Use the result: the identified URDF is written")
+    assert export.blocks == ("robotid export out/result.json --format mjcf --out robot.xml",)
 
 
 def test_the_replay_of_commands_shows_the_first_validation_log():
@@ -509,7 +585,8 @@ def test_the_causes_of_poor_joints_come_first_and_three_steps_are_enough():
 
 
 def test_errors_of_a_log_of_commands_are_corrected_first():
-    content = loop_content("poor", log_errors=["a.csv: two moves before its command"])
+    content = loop_content("poor", log_errors=["a.csv: two moves before its command", "x"])
+    assert [step.blocks for step in loop_steps(content, Origin())] == [()]
     (step,) = loop_steps(content, JOB)
     assert "Correct the logs, then repeat the identification: a.csv: two moves" in step.words
     assert [block.split()[1] for block in step.blocks] == ["doctor", "identify"]

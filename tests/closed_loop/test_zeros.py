@@ -10,7 +10,7 @@ from robotid.closed_loop.fit import stated_loops
 from robotid.closed_loop.free_parameters import LoopSimulator, free_body_parameters
 from robotid.closed_loop.identify import identify_loops
 from robotid.closed_loop.settings import LoopSettings
-from robotid.closed_loop.zeros import CLEAR, find_encoders, parallel_axes
+from robotid.closed_loop.zeros import CLEAR, _descend, find_encoders, parallel_axes
 from robotid.fitting.settings import SimulationSettings
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
@@ -105,6 +105,23 @@ def test_an_encoder_that_counts_the_other_way_is_turned(leg):
     # a chain with parallel axes is its mirror image: thigh or calf
     assert sorted(sign[1:].tolist()) == [-1.0, 1.0]
     assert sign[0] == 1.0
+
+
+def test_the_gain_of_an_encoder_is_that_of_all_passes():
+    """The squared error is 1 with the URDF's zeros, 0.5 and 0.3 after the first pass, then 0.2."""
+    least = {(0, 0): 1.0, (15, 0): 0.5, (15, 30): 0.3, (45, 30): 0.2, (45, -90): 0.19}
+
+    def cost(model, sign, zero):
+        degrees = tuple(round(float(x)) for x in np.rad2deg(zero))
+        return 7 * np.log(least.get(degrees, 1.0) if (sign == 1.0).all() else 1.0)
+
+    motion = SimpleNamespace(q=np.zeros((7, 2)), cost=cost)
+    sign, zero, gain, left, costs = _descend(None, motion, np.array([0, 1]), [0, 1])
+    np.testing.assert_array_equal(sign, 1.0)
+    np.testing.assert_allclose(np.rad2deg(zero), [45.0, 30.0])
+    np.testing.assert_allclose(gain, [(1.0 - 0.5) + (0.3 - 0.2), 0.5 - 0.3])
+    assert left == pytest.approx(7 * np.log(0.2))
+    assert costs.min(axis=1) == pytest.approx(7 * np.log([0.2, 0.19]))
 
 
 def test_torques_tell_the_gains_that_positions_leave_open():

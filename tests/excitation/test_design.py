@@ -8,7 +8,7 @@ import pytest
 from robotid.exceptions import SettingsError
 from robotid.excitation.basis import BSplineBasis, FourierBasis
 from robotid.excitation.clearance import Box, Clearance
-from robotid.excitation.design import Designer
+from robotid.excitation.design import Designer, State
 from robotid.excitation.limits import LIMITS, MotionLimits
 from robotid.excitation.multipliers import Multipliers
 from robotid.identification.assumptions import TorqueNoise
@@ -179,6 +179,20 @@ def test_a_motion_whose_middle_collides_is_mixed_with_one_that_keeps_the_limits(
     assert margin >= 0.0
     used, margin, _ = near._constraints(mixed + 2e-3 * (C - kept), 1.0)
     assert np.abs(used).max() > 0.995 or margin < 1e-3  # it can hardly go farther
+
+
+def test_a_round_of_the_search_leaves_the_reserve_of_the_limits(designer, monkeypatch):
+    """0.3 % for the motion between samples, also on the way between two motions."""
+    fast, slow = (designer.random(np.random.default_rng(k)) * x for k, x in ((5, 3.0), (6, 0.2)))
+    kept = designer._feasible(slow, 0.2)
+    state = State(kept, -np.inf, kept, Multipliers(0.2))
+    asked = []
+    monkeypatch.setattr(
+        Designer, "_towards", lambda self, start, end, most: asked.append((start, most)) or start
+    )
+    designer._updated(state, fast, 1e-3)
+    assert [most for _, most in asked] == [1.0 - 0.003] * len(asked)
+    assert any(start is kept for start, _ in asked)
 
 
 def test_multipliers_push_as_hard_on_a_finer_grid():

@@ -124,6 +124,10 @@ def test_a_filter_stands_for_the_delay_where_it_is_asked_for(tmp_path):
     while data.time < 0.02 - 1e-9:
         mujoco.mj_step(robot, data)
     np.testing.assert_allclose(data.act, 1 - np.exp(-1.0), rtol=1e-6)
+    prompt = [replace(drive, delay=0.0) for drive in leg.drives]
+    for delay in ("filter", "history"):
+        notes = write_mjcf(leg.model, pi, tmp_path / "b.xml", commanded=prompt, delay=delay)
+        assert not any("delays" in note for note in notes)
     with pytest.raises(SettingsError, match="delay is 'none', wanted one of history, filter"):
         write_mjcf(leg.model, pi, tmp_path / "a.xml", commanded=leg.drives, delay="none")
 

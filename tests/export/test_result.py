@@ -266,6 +266,10 @@ def test_results_that_are_not_whole_are_refused(result, identified, tmp_path):
         DataError, match=r"^result\.json has no entry 'inputs': the file is incomplete"
     ):
         read_result(path)
+    for part, words in (([], r"\[\], wanted a table"), (5, "5, wanted a table")):
+        path.write_text(json.dumps({**result, "verdict": part}))
+        with pytest.raises(DataError, match=rf"^result\.json\.verdict is {words}"):
+            read_result(path)
     short = {**result, "drive_parameters": result["drive_parameters"][1:]}
     with pytest.raises(ModelError, match=r"^the result has no value of shoulder_pan_joint\.arm"):
         stated_parameters(short, identified.model)

@@ -60,6 +60,7 @@ def read(path, gravity):
         inertial = links[name].find("inertial") if name in links else None
         if inertial is not None:
             about, _ = pose(inertial)
+            np.testing.assert_array_equal(about.rotation, np.eye(3))  # moments in the link's axes
             xx, xy, xz, yy, yz, zz = (float(moment.text) for moment in inertial.find("inertia"))
             I = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])  # noqa: E741
             body = pin.Inertia(float(inertial.findtext("mass")), about.translation, I)

@@ -228,6 +228,9 @@ def test_a_bag_is_converted_with_base_and_forces(tmp_path, capsys):
 
 
 def test_one_of_several_topics_is_stated(tmp_path):
+    none = {"/mocap/odom": (ODOMETRY, S[:0], lambda m, t: m.odometry(t, 1.0))}
+    empty = read_log(write(tmp_path / "empty", STATES | ODOM | none), JOINTS, base=BASE)
+    np.testing.assert_allclose(empty.base.pose[:, 0], empty.t, atol=1e-9)
     other = {"/mocap/odom": (ODOMETRY, S, lambda m, t: m.odometry(t, 1.0))}
     path = write(tmp_path / "log", STATES | ODOM | other)
     with pytest.raises(

@@ -92,6 +92,21 @@ def test_commanded_columns_are_no_torques(kind):
     )
 
 
+def test_commanded_positions_are_found_where_they_are_wanted():
+    names = [name.replace("qref_elbow", "qrf_elbow") for name in of("qref")]
+    assert said([*of("q"), *names, *of("current_des")], needs="commands") == (
+        "log has no column 'qref_elbow'; commanded position columns found: qref_pan, qref_lift, "
+        f"qref_wrist_1, qref_wrist_2, qref_wrist_3. Commanded, not measured: {DESIRED}. Did you "
+        "mean 'qrf_elbow'? Rename it, or state it in the job file: columns = { qref_elbow = "
+        '"qrf_elbow" }'
+    )
+
+
+def test_the_first_column_that_is_missing_is_the_example():
+    found = said([*of("q"), *of("torque_ratio", UR[:3])])
+    assert 'columns = { tau_pan = "NAME" }. Record tau_<joint> or current_<joint>. ' in found
+
+
 @pytest.mark.parametrize("kind", ["temperature", "temp", "voltage", "iq", "tau_ext", "power"])
 def test_another_quantity_is_listed_and_not_proposed(kind):
     found = said([*of("q"), *of(kind)])

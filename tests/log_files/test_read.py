@@ -241,9 +241,10 @@ def test_velocity_of_some_joints_only_is_noted(run):
     assert read_log(run(table), ["elbow"]).v.shape == (300, 1)
 
 
-@pytest.mark.parametrize("joints", [(), "elbow"])
+@pytest.mark.parametrize("joints", [(), "elbow", ("elbow", 3), 5])
 def test_joints_must_be_a_list_of_names(run, joints):
-    with refused(f"joints is {joints!r}, wanted a list of at least one name", SettingsError):
+    shown = "5, a int" if joints == 5 else repr(joints)
+    with refused(f"joints is {shown}, wanted a list of at least one name", SettingsError):
         read_log(run(make_table()), joints)
 
 
@@ -463,6 +464,9 @@ def test_fewer_than_two_rows_are_refused(run):
     path = run({"t": [0.0], "q_a": [0.0], "tau_a": [0.0]})
     with refused(f"{path.name} has 1 rows, wanted at least 2; record longer"):
         read_log(path, ["a"])
+    np.savez(path.with_name("none.npz"), time=np.zeros(0), q_a=np.zeros(0), tau_a=np.zeros(0))
+    with refused("none.npz has columns but no rows; record at least 2"):
+        read_log(path.with_name("none.npz"), ["a"])
 
 
 # --- CSV text -------------------------------------------------------------------------------------

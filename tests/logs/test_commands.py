@@ -568,6 +568,7 @@ def test_normalised_positions_are_no_angles(tmp_path):
         (lambda info: info.update(features={"image": {}}), "neither observation.state nor action"),
         (lambda info: info.update(features=None), "features is None, wanted a table of tables"),
         (lambda info: info.update(features={"action": 5}), "wanted a table of tables"),
+        (lambda info: info["features"].update(x=5), "wanted a table of tables"),
         (lambda info: info["features"]["action"].update(names=5), "no names of the motors in ac"),
         (lambda info: info["features"]["action"].update(names={"m": 5}), "no names of the motors"),
         (lambda info: info["features"]["action"].update(names=[["a"], 5]), "no names of the motor"),

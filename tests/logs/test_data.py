@@ -121,6 +121,9 @@ def test_shapes_that_do_not_fit_are_refused():
         "for each of the joints shoulder, elbow"
     ):
         make_log(tau=np.zeros((500, 3)))
+    for kind, values in (("contacts", np.ones((500, 2), bool)), ("wrenches", np.zeros((499,)))):
+        with refused(f"run3.csv: 'fz' of {kind} has shape {values.shape}, wanted (500,)"):
+            make_log(**{kind: {"mx": np.ones(500, bool), "fz": values}})
     with refused("run3.csv: t has shape (500, 1), wanted (N,)"):
         make_log(t=np.arange(500.0)[:, None])
 

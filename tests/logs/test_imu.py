@@ -109,9 +109,13 @@ def test_the_bias_is_estimated_at_rest(rng):
 @pytest.mark.parametrize(("rate", "is_known"), [(8.0, False), (10.0, True)])
 def test_a_window_of_rest_has_five_samples(rate, is_known):
     t = 70.0 + np.arange(30) / rate
-    bias, note = bias_at_rest([(t, np.zeros((30, 1)), np.tile(BIAS, (30, 1)))])
-    np.testing.assert_allclose(bias, is_known * BIAS, atol=1e-15)
+    still, w = np.zeros((30, 1)), np.tile(40 * BIAS, (30, 1))
+    bias, note = bias_at_rest([(t, still, w)])
+    np.testing.assert_allclose(bias, is_known * 40 * BIAS, atol=1e-15)
     assert ("never at rest" in note) != is_known
+    swings = np.sin(6 * t)[:, None]
+    for q, turn in ((still, w + swings * [0, 0, 0.5]), (np.hstack([still, swings]), w)):
+        assert not bias_at_rest([(t, q, turn)])[0].any()
 
 
 def test_an_imu_is_read_with_or_without_an_orientation_of_its_own(motion, tmp_path):

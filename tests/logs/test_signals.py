@@ -188,6 +188,8 @@ def test_full_turns_are_taken_out_of_free_joints_only():
     np.testing.assert_allclose(
         unwrap(other, np.array([True, False])).q, angle + np.array([0.0, 1.0])
     )
+    steady = replace(log, q=0.1 * angle)
+    assert unwrap(steady, np.array([True, True])) is steady
     with pytest.raises(DataError, match=r"q_a jumps by a full turn at t = 1.58 s"):
         unwrap(log, np.array([False, False]))
 

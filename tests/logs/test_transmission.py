@@ -103,6 +103,7 @@ def test_motors_of_several_joints_drive_in_the_place_of_the_joints_without_their
     assert Transmission(**WRIST).shared == {"wrist": (("elbow", 1.0), ("wrist", -30.0 / 32.0))}
     assert Transmission(**WRIST).gears == {"elbow": 45.0, "wrist": 32.0}
     assert Transmission(joints=JOINTS, matrix=(3.0, -4.0, 5.0)).shared == {}
+    assert Transmission(joints=("a", "b"), matrix=(1e6, -1e-6)).gears == {"a": 1e6, "b": -1e-6}
     crossed = Transmission(joints=("a", "b"), motors=("x", "y"), matrix=((0, 7.0), (8.0, 8.0)))
     assert crossed.shared == {"a": (("a", 1.0), ("b", 1.0))}
     assert crossed.gears == {"b": 7.0, "a": 8.0}

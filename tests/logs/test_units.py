@@ -159,14 +159,22 @@ def test_a_command_in_degrees_is_told_from_one_that_goes_far_along_a_slider(fact
     """Only a revolute joint has degrees."""
     far = log(q=0.5 * Q, q_ref=0.5 * Q * [1.0, factor], v=None)
     check_units(far, LogUnits(), prismatic=["b"])
-    with pytest.raises(DataError, match=r"qref_b is \S+ times that of q_b: one of them"):
-        check_units(far, LogUnits(), prismatic=["a"])
+    for sign in (1.0, -1.0):  # a command that is reversed as well
+        far = log(q=0.5 * Q, q_ref=0.5 * Q * [1.0, sign * factor], v=None)
+        with pytest.raises(
+            DataError, match=rf"qref_b is {sign * factor:.3g} times that of q_b: one of them"
+        ):
+            check_units(far, LogUnits(), prismatic=["a"])
+    check_units(log(q=Q, q_ref=-Q, v=None), LogUnits())
 
 
 def test_a_command_that_is_not_followed_shows_no_unit():
     """57 times as large as the motion, and at another frequency."""
-    other = np.column_stack([Q[:, 0], 180 / np.pi * 0.1 * np.sin(7.3 * T)])
-    check_units(log(q=0.1 * Q, q_ref=other, v=None), LogUnits())
+    for share in (0.0, 0.85):  # the correlation from which two signals are alike is 0.9
+        y = np.sin(7.3 * T) * np.sqrt(2) * np.std(Q[:, 1])
+        other = share * (Q[:, 1] - Q[:, 1].mean()) + np.sqrt(1 - share**2) * y
+        q_ref = np.column_stack([Q[:, 0], 180 / np.pi * 0.1 * other])
+        check_units(log(q=0.1 * Q, q_ref=q_ref, v=None), LogUnits())
     with pytest.raises(DataError, match=r"qref_b is 57\.3 times that of q_b"):
         check_units(log(q=0.1 * Q, q_ref=0.1 * Q * [1.0, 180 / np.pi], v=None), LogUnits())
 
@@ -174,10 +182,11 @@ def test_a_command_that_is_not_followed_shows_no_unit():
 @pytest.mark.parametrize(("turn", "unit"), [(2 * np.pi, 1.0), (360.0, 180 / np.pi)])
 def test_speeds_are_compared_beside_gaps_and_full_turns(turn, unit):
     """The factor of dq by d(q)/dt, of a log with jumps of a turn and a gap with a long way."""
-    t = 6.0 + np.where(T < 2.0, T, T + 9.0)
+    t = 6.0 + np.where(T < 2.0, T, T + 9.0) + np.where(np.arange(400) < 250, 0.0, 0.1)
     q = unit * np.column_stack([0.7 * T + 0.02 * np.sin(5 * T), np.cos(3 * T)])
     v = unit * np.column_stack([0.7 + 0.1 * np.cos(5 * T), -3.0 * np.sin(3 * T)])
     q[200:] += [4.0 * unit, -2.0 * unit]  # while nothing was recorded
+    q[250:, 0] += unit  # in a gap of 11 steps
     q[60:, 0] -= turn
     q[300:, 1] += turn
     found = _velocity_factor(log(t=t, q=q, v=[2.0, -0.5] * v))

@@ -1,5 +1,6 @@
 import re
 import xml.etree.ElementTree as ET
+from dataclasses import replace
 from html import unescape
 
 import numpy as np
@@ -389,6 +390,157 @@ def test_labels_of_many_series_stay_inside_the_still_picture():
     assert labels["measured"][1] > labels["gravity"][1]
     few = chart_html(Chart("few", x, series[:2], "time [s]", "torque [N m]"), "")
     assert float(re.search(r'viewBox="([^"]*)"', few)[1].split()[3]) < height
+
+
+def still_of(chart):
+    html = chart_html(chart, "")
+    head, parts = (
+        re.search(r"<svg ([^>]*)>(.*)</svg>", html)[1],
+        re.findall(r"<(?:path|text) .*?(?:/>|</text>)", html),
+    )
+    return re.search(r'viewBox="([^"]*)"', head)[1], parts
+
+
+def outline(*points):
+    """Return a path through points [px]."""
+    return "M" + "L".join(f"{a:.1f} {b:.1f}" for a, b in points)
+
+
+def frame(xs, x_words, ys, y_words, bottom, right, label):
+    """Return the grid and the words of a plot from x = 54 and y = 20; all in [px]."""
+    grid = "".join(f"M54 {y:.1f}H{right}" for y in ys) + "".join(
+        f"M{x:.1f} 20V{bottom}" for x in xs
+    )
+    beside = zip(ys, y_words, strict=True)
+    return [
+        f'<path d="{grid}" stroke="currentColor" stroke-opacity="0.15"/>',
+        *(f'<text x="48" y="{y + 4:.1f}" text-anchor="end">{word}</text>' for y, word in beside),
+        *(
+            f'<text transform="translate({x:.1f} {bottom + 14})" text-anchor="middle">{word}</text>'
+            for x, word in zip(xs, x_words, strict=True)
+        ),
+    ], f'<text x="{(54 + right) / 2:.0f}" y="{bottom + 29}" text-anchor="middle">{label}</text>'
+
+
+def key_of(x, tone, label, opacity="1.0"):
+    return [
+        f'<path d="M{x:.0f} 8h12" stroke="var(--{tone})" stroke-width="4" '
+        f'stroke-opacity="{opacity}"/>',
+        f'<text x="{x + 16:.0f}" y="12">{label}</text>',
+    ]
+
+
+def test_a_still_picture_of_lines_and_dots_is_drawn_to_scale():
+    """x from 10 to 14 on 576 px; y from -3 to 6, with 4 % to each side, on 200 px."""
+    x = np.array([10.0, 11.0, 12.0, 13.0, 14.0])
+    line = Series("l", np.array([1.0, 2, np.nan, 4, 3]), "text", half=np.array([0.5, 1, 1, 1, 2]))
+    dots = Series("dd", np.array([-3.0, 0, 5, np.nan, 6]), "tone-1", "dots", is_weak=True)
+    chart = Chart(
+        "c", x, (line, dots), "x [m]", "y", spans=((9.0, 11.0), (13.0, 13.001)), marks=(12.5,),
+        height=200,
+    )  # fmt: skip
+    place = dict(zip([*x.tolist(), 12.5], 54 + 144 * (np.append(x, 12.5) - 10), strict=True))
+
+    def up(y):
+        return 220 - 200 * (y + 3.36) / 9.72
+
+    ticks = [-2, 0, 2, 4, 6]
+    grid, label = frame(
+        [place[v] for v in x], ["10", "11", "12", "13", "14"],
+        [up(v) for v in ticks], ["−2", "0", "2", "4", "6"], 220, 630, "x [m]",
+    )  # fmt: skip
+    bands = [[(10, 1.5), (11, 3), (11, 1), (10, 0.5)], [(13, 5), (14, 5), (14, 1), (13, 3)]]
+    lines = [[(10, 1), (11, 2)], [(13, 4), (14, 3)]]
+    band, path = (
+        [outline(*((place[a], up(b)) for a, b in each)) for each in every]
+        for every in (bands, lines)
+    )
+    dotted = "".join(
+        f"M{place[a]:.1f} {up(b):.1f}h0" for a, b in ((10, -3), (11, 0), (12, 5), (14, 6))
+    )
+    box, parts = still_of(chart)
+    assert box == "0 0 640 254"
+    assert parts == [
+        '<path d="M54.0 20H198.0V220H54.0z" fill-opacity="0.09"/>',
+        '<path d="M486.0 20H486.5V220H486.0z" fill-opacity="0.09"/>',
+        *grid,
+        '<path d="M414.0 20V220" stroke="currentColor" stroke-dasharray="1 3"/>',
+        label,
+        f'<path d="{band[0]}z{band[1]}z" fill="var(--text)" fill-opacity="0.2"/>',
+        f'<path d="{"".join(path)}" fill="none" stroke="var(--text)" stroke-width="1.2" '
+        'stroke-opacity="1.0"/>',
+        f'<path d="{dotted}" stroke="var(--tone-1)" stroke-width="3" stroke-linecap="round" '
+        'stroke-opacity="0.5"/>',
+        '<text x="4" y="12">y</text>',
+        *key_of(4 + 6.2 * 4, "text", "l"),
+        *key_of(4 + 6.2 * 4 + 16 + 6.2 * 4, "tone-1", "dd", "0.5"),
+    ]
+
+
+def test_a_still_picture_of_bars_has_its_names_slanted_where_they_are_long():
+    """Each bar is 0.9 of half of 0.8 wide; a name of 20 letters is longer than the 118 px of it."""
+    one = Series("one", np.array([3.0, -1.0]), "tone-1", "bars", half=np.array([0.5, 0.2]))
+    two = Series("two", np.array([1.0, 2.0]), "tone-2", "bars")
+    names = ("n" * 20, "b")
+    chart = Chart("b", np.arange(2.0), (one, two), "joint", "m", x_names=names, width=300)
+    box, parts = still_of(chart)
+    assert box == f"0 0 300 {180 + 20 + 34 + 62}"
+
+    def up(y):  # from -1.2 to 3.5, with 4 % to each side, on 180 px
+        return 200 - 180 * (y + 1.2 + 0.188) / (4.7 * 1.08)
+
+    def across(x):  # from -0.5 to 1.5
+        return 54 + 118 * (x + 0.5)
+
+    assert [p for p in parts if "rotate" in p] == [
+        f'<text transform="translate({across(k):.1f} 214) rotate(-30)" text-anchor="end">{n}</text>'
+        for k, n in enumerate(names)
+    ]
+    assert '<text x="172" y="291" text-anchor="middle">joint</text>' in parts
+    wide, zero = 0.9 * 0.4 * 118, up(0)
+    for series, side in ((one, -0.2), (two, 0.2)):
+        bars = "".join(
+            f"M{across(k + side) - wide / 2:.1f} {zero:.1f}h{wide:.1f}V{up(y):.1f}h{-wide:.1f}z"
+            for k, y in enumerate(series.y)
+        )
+        assert f'<path d="{bars}" fill="var(--{series.tone})" fill-opacity="1.0"/>' in parts
+    whiskers = "".join(
+        f"M{across(k - 0.2):.1f} {up(y - h):.1f}V{up(y + h):.1f}"
+        for k, (y, h) in enumerate(zip(one.y, one.half, strict=True))
+    )
+    assert f'<path d="{whiskers}" stroke="currentColor" stroke-width="1.2"/>' in parts
+    alone = Series("o", np.ones(1), "tone-1", "bars")  # x from -1 to 1 on 576 px
+    _, parts = still_of(Chart("o", np.zeros(1), (alone,), "joint", "m", x_names=("a",)))
+    assert any(f"h{0.9 * 0.8 * 288:.1f}V" in part for part in parts)
+    short = replace(chart, x_names=("n" * 19, "b"))
+    assert still_of(short)[0] == f"0 0 300 {180 + 20 + 34}"
+
+
+def test_a_still_picture_of_areas_is_drawn_between_their_edges():
+    x = np.array([5.0, 6.0, 7.0])
+    ys = np.array([1.0, 2, -1]), np.array([2.0, -1, 1])
+    areas = tuple(Series(f"a{k}", y, f"tone-{k}", "area") for k, y in enumerate(ys))
+    _, parts = still_of(Chart("a", x, areas, "x", "y", height=100))
+
+    def path(*points):  # y from -1 to 3
+        places = ((54 + 288 * (a - 5), 120 - 100 * (b + 1.16) / 4.32) for a, b in points)
+        return outline(*places) + "z"
+
+    for k, wanted in enumerate((
+        path((5, 1), (6, 2), (7, 0), (7, 0), (6, 0), (5, 0))
+        + path((6, 0), (7, 0), (7, -1), (6, 0)),
+        path((5, 3), (6, 2), (7, 1), (7, 0), (6, 2), (5, 1))
+        + path((5, 0), (6, 0), (7, -1), (7, -1), (6, -1), (5, 0)),
+    )):  # fmt: skip
+        assert f'<path d="{wanted}" fill="var(--tone-{k})" fill-opacity="0.7"/>' in parts
+    # one point, one value: half a unit to each side of x, 8 % of the value around y
+    _, (*_, label, drawn, _, _, _) = still_of(
+        Chart("p", np.array([5.0]), (Series("p", np.array([2.0]), "text", "dots"),), "t", "y")
+    )
+    assert (label, drawn.split('"')[1]) == (
+        '<text x="342" y="229" text-anchor="middle">t</text>',
+        "M342.0 110.0h0",
+    )
 
 
 @pytest.mark.parametrize("is_idle", [True, False])

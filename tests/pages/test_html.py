@@ -5,7 +5,22 @@ from decimal import Decimal
 import numpy as np
 import pytest
 
-from robotid.pages.html import command_html, facts_html, steps_html, verdict_html, with_error
+from robotid.pages.html import (
+    Section,
+    asset,
+    code,
+    command_html,
+    facts_html,
+    figure,
+    number,
+    page,
+    percent,
+    steps_html,
+    table,
+    text,
+    verdict_html,
+    with_error,
+)
 
 
 def test_a_verdict_shows_three_reasons_and_folds_all_others():
@@ -18,6 +33,9 @@ def test_a_verdict_shows_three_reasons_and_folds_all_others():
     )
     assert "<summary>1 more reason</summary>" in verdict_html("arm", "poor", "abcd")
     assert "<details>" not in verdict_html("arm", "good", "abc")
+    assert verdict_html("arm", "good", [], "a < b").endswith(
+        '<ul></ul><p class="uses">a &lt; b</p></div>\n'
+    )
 
 
 def test_facts_end_with_links_to_the_files():
@@ -74,3 +92,79 @@ def test_a_number_ends_at_the_second_digit_of_its_error(rng):
         assert abs(float(shown) - value) <= 0.5001 * 10.0 ** shown.as_tuple().exponent
     assert [cell.html for cell in with_error(1.234, np.inf)] == ["1.234", "–"]
     assert with_error(0.5, 0.25, sign="+")[0].html == "+0.50"
+
+
+def test_a_cell_has_the_style_of_its_content_and_its_number_in_full():
+    for cell, wanted in (
+        (text("<" * 23), ("&lt;" * 23, "text", None)), (text("a" * 24), ("a" * 24, "", None)),
+        (text("a", flag=True), ("a", "flag", None)),
+        (code("a.b_c/<"), ("a.<wbr>b_<wbr>c/<wbr>&lt;", "code", None)),
+        (number(-12.3456), ("−12.35", "number", -12.3456)), (number(None), ("–", "number", None)),
+        (number(np.nan), ("–", "number", None)), (number(2.0, "+.2f"), ("+2.00", "number", 2.0)),
+        (percent(1000.4), ("1000", "number", 1000.4)),
+        (percent(999.94), ("999.9", "number", 999.94)),
+        (percent(0.995), ("1.0", "number", 0.995)), (percent(0.994), ("0.99", "number", 0.994)),
+        (percent(-0.5), ("−0.50", "number", -0.5)), (percent(None), ("–", "number", None)),
+    ):  # fmt: skip
+        assert (cell.html, cell.kind, cell.value) == wanted
+
+
+def test_a_table_has_heads_by_its_first_row_and_numbers_for_its_scripts():
+    rows = [[text("one"), number(1.5), text("x")], [text("two"), number(None), number(1 / 3)]]
+    box = '<div class="scroll" tabindex="0" role="region" aria-label="&lt;t&gt;">'
+    head = (
+        '<thead><tr><th scope="col" class="text">a</th><th scope="col" class="number">b</th>'
+        '<th scope="col" class="text">&lt;c&gt;</th></tr></thead>'
+    )
+    first = '<tr><th scope="row" class="text">{}</th><td class="number"{}>{}</td><td class="{}"{}>'
+    one = first.format("one", "{}", "1.5", "text", "") + "x</td></tr>\n"
+    two = first.format("two", "", "–", "number", "{}") + "0.3333</td></tr>\n"
+    wanted = (
+        f"{box}<table><caption>&lt;t&gt;</caption>{head}<tbody>{one.format('')}{two.format('')}"
+        f"</tbody><tfoot>{one.format('')}</tfoot></table></div>\n"
+    )
+    assert table("<t>", ("a", "b", "<c>"), rows, rows[0]) == wanted
+    filled = one.format(' data-value="1.5"') + two.format(' data-value="0.3333333333"')
+    wanted = (
+        f'{box}<table class="data"><caption>&lt;t&gt;</caption>{head}<tbody>{filled}</tbody>'
+        "</table></div>\n"
+    )
+    assert table("<t>", ("a", "b", "<c>"), rows, is_data=True) == wanted
+    assert '<th scope="col" class="text">b</th>' in table("none", ("a", "b"), [])
+    assert figure("c", "<svg/>").startswith('<figure tabindex="0"><figcaption>c</figcaption><svg/>')
+    assert figure("c", "<svg/>", single=True).startswith('<figure class="single" tabindex="0">')
+
+
+def test_a_page_links_to_its_sections_and_runs_the_scripts_that_they_need():
+    plain, folds, still = (
+        page("<p>", "<h1>h</h1>", sections)
+        for sections in (
+            {"a": ("A", "text a"), "b": Section("B", "text b")},
+            {
+                "a": Section("A", "text", "in short", is_open=False),
+                "b": Section("B", "x", "", True),
+            },
+            {"a": ("A", '<table class="data">')},
+        )
+    )
+    assert "<title>&lt;p&gt;</title>" in plain
+    assert (
+        '<div><a href="#content">&lt;p&gt;</a> <a href="#a">A</a> <a href="#b">B</a> </div>'
+        in plain
+    )
+    assert (
+        '<header>\n<h1>h</h1></header>\n<section aria-labelledby="a">\n<h2 id="a">A</h2>\n'
+        'text a</section>\n<section aria-labelledby="b">\n<h2 id="b">B</h2>\ntext b</section>\n'
+        "</main>" in plain
+    )
+    assert (
+        '<section aria-labelledby="a">\n<details id="a-fold"><summary><h2 id="a">A</h2>'
+        "<span>in short</span></summary>\ntext</details>\n</section>\n" in folds
+    )
+    assert '<details id="b-fold" open><summary><h2 id="b">B</h2></summary>\nx</details>' in folds
+    for html, names in ((plain, []), (folds, ["page.js"]), (still, ["page.js", "tables.js"])):
+        run = [n for n in ("page.js", "tables.js", "dock.js", "charts.js") if asset(n) in html]
+        assert run == names
+        assert html.count("sha256-") == len(names)
+        assert "frame-src" not in html
+        assert asset("tones.css") in html

@@ -147,5 +147,6 @@ def test_the_numbers_below_an_axis_are_zero_and_a_round_one_at_their_places(
     assert said == [0.0, pytest.approx(np.sign(end) * np.floor(abs(end) / digit) * digit)]
     at = [100 * (scaled(x) - low) / (high - low) for x in said]
     assert lines == pytest.approx(at, abs=0.06)
+    assert [side for side, _, _ in spans] == ["left" if x < 85.0 else "right" for x in at]
     places = [float(x) if side == "left" else 100 - float(x) for side, x, _ in spans]
     assert places == pytest.approx(at, abs=0.51)

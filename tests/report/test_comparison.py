@@ -598,6 +598,7 @@ def test_results_are_in_the_order_of_the_dates_of_their_logs(folder, tmp_path, c
     assert {chart["title"].split()[0] for chart in named} == set(finding["parameters"])
     assert named[0]["x_names"] == list("BDEAFC")
     assert named[0]["marks"] == [4.5]
+    assert [series["faint"] for series in named[0]["series"]] == [True, False]
     entry = next(x for x in content["base_parameters"] if named[0]["title"].startswith(x["name"]))
     errors = [entry["std_errors"][k] for k in content["order"]]
     np.testing.assert_allclose(named[0]["series"][1]["half"], 1.96 * np.array(errors), rtol=1e-3)
@@ -608,12 +609,39 @@ def test_results_are_in_the_order_of_the_dates_of_their_logs(folder, tmp_path, c
     words = ["compare", *(str(tmp_path / f"{k}.json") for k in range(6))]
     assert main(words) == 0
     printed = " ".join(capsys.readouterr().out.split())
-    assert "finding: C: friction of joint_2 is 3" in printed
+    share = f"{100 * finding['size']:.0f} %"
+    assert f"finding: C: friction of joint_2 is {share} higher (standard error " in printed
     for more in ([], ["--out", str(tmp_path / "few.html")]):
         assert main([*words, "--false-alarms", "1e-9", *more]) == 0
         assert "finding:" not in capsys.readouterr().out
     assert main([*words, "--false-alarms", "2"]) == 2
     assert "false_alarms is 2, wanted a probability" in capsys.readouterr().err
+
+
+def test_each_change_has_its_own_parameters(folder, tmp_path):
+    """Friction of joint 2 that is three times as large from the fifth result on, of joint 1 from
+    the seventh on."""
+    rng, paths = np.random.default_rng(3), []
+    for k in range(7):
+        result = copy.deepcopy(read_result(folder / "a.json"))
+        for entry in result["base_parameters"]:
+            entry["value"] *= 1 + 0.01 * rng.normal()
+            joint, _, term = entry["name"].rpartition(".")
+            if (joint, k >= 4) == ("joint_2", True) and term in ("coulomb", "viscous"):
+                entry["value"] *= 3
+            if (entry["name"], k) == ("joint_1.coulomb", 6):
+                entry["value"] *= 4
+        paths.append(tmp_path / f"{k}.json")
+        write_json(result, paths[-1])
+    found = compare_results(paths)["findings"]
+    keys = ("result", "since", "kind", "where")
+    assert [tuple(each[key] for key in keys) for each in found] == [
+        ("E", "E", "friction", "joint_2"), ("G", "G", "friction", "joint_1"),
+    ]  # fmt: skip
+    assert [set(each["parameters"]) for each in found] == [
+        {"joint_2.coulomb", "joint_2.viscous"}, {"joint_1.coulomb"},
+    ]  # fmt: skip
+    assert found[0]["size"] == pytest.approx(2.0, rel=0.05)
 
 
 def test_time_stamps_from_the_start_of_a_log_are_no_order(folder, tmp_path):
@@ -670,6 +698,7 @@ def test_the_chart_of_a_friction_has_its_units_its_loads_and_no_line_across_stan
     [
         ("friction", 0.312, 0.0456, "friction of two is 31 % higher (standard error 4.6 %)"),
         ("friction", -0.27, 0.0312, "friction of two is 27 % lower (standard error 3.1 %)"),
+        ("friction", 2.023, 1.0, "friction of two is 202 % higher (standard error 100 %)"),
         ("gain", -0.054, 0.012, "gain of the torque of two is 5.4 % lower (standard error 1.2 %)"),
         ("payload", 1.2345, 0.0567, "the load on two has changed: +1.23 kg (standard error "
          "0.057 kg)"),

@@ -12,6 +12,7 @@ from robotid.logs.settings import SignalSettings
 from robotid.pages.charts import Chart, Series
 from robotid.report.diagnosis import (
     _choice,
+    _correlation_map,
     _correlations,
     _residual_figures,
     friction_section,
@@ -30,6 +31,17 @@ def test_shares_of_the_data_are_those_of_all_and_of_the_weakest(identified):
         f"{round(100 * share.min())} %,"
     ) in said
     assert share.min() < 0.9 * share.mean()
+
+
+def test_the_map_of_correlations_has_squares_of_11_px_below_the_diagonal():
+    """The longest name has 5 letters: 6 px each, with 4 for its number, and 12 px."""
+    C = np.array([[1.0, 0.9, 0.9], [0.5, 1.0, 0.9], [-1.0, 0.02, 1.0]])
+    html = _correlation_map(C, ["a", "b", "<long"], title="t", key="k")
+    assert 'viewBox="0 0 103 55"' in html
+    assert re.findall(r' d="(.*?)"', html) == ["M66 22h10v10h-10z", "M66 11h10v10h-10z"]
+    labels = re.findall(r'<text x="(\d+)" y="(\d+)"[^>]*>(.*?)</text>', html)
+    assert labels[:2] == [("60", "9", "a 1"), ("68", "9", "1")]
+    assert labels[4:] == [("60", "31", "&lt;long 3"), ("90", "31", "3")]
 
 
 def test_friction_of_more_joints_than_fit_is_folded_but_for_the_worst(identified, monkeypatch):

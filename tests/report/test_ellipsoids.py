@@ -44,7 +44,7 @@ def test_mass_and_lengths_are_those_of_the_link(identified, i):
 
 
 def test_an_outline_has_the_axes_and_the_angle_of_the_ellipsoid():
-    html = _picture("arm", mark(SEMI), mark(SEMI, TURN), np.array([[-0.1, -0.1, 0], [0.3, 0.1, 0]]))
+    html = _picture("arm", mark(SEMI), mark(SEMI, TURN), np.array([[-0.1, -0.1, 0], [0.7, 0.1, 0]]))
     found = re.findall(r'rx="([\d.]+)" ry="([\d.]+)" transform=.*? rotate\(([-\d.]+)\)', html)
     (a, b, angle), (c, d, turned) = (map(float, item) for item in found)
     assert b / a == pytest.approx(1 / 3, abs=0.01)
@@ -54,8 +54,16 @@ def test_an_outline_has_the_axes_and_the_angle_of_the_ellipsoid():
     assert turned % 180 == pytest.approx(120.0, abs=0.1)
     assert "x →, y ↑" in html
     scale = a / 0.3
-    width, height = map(float, re.search(r'<rect.* width="(.*?)" height="(.*?)"', html).groups())
-    assert [width, height] == pytest.approx([0.4 * scale, 0.2 * scale], abs=0.2)
+    # 80 px are high enough for the turned ellipsoid; the middle is x = 0.25 m, at (80, 48) px
+    assert scale == pytest.approx(40.0 / np.hypot(0.3 * 0.75**0.5, 0.05), rel=2e-3)
+    middle = 80.0 - 0.15 * scale
+    placed = np.array(re.findall(r"translate\(([\d.]+) ([\d.]+)\)", html), dtype=float)
+    np.testing.assert_allclose(placed, [[middle, 48.0]] * 2, atol=0.1)
+    dots = np.array(re.findall(r'<circle cx="([\d.]+)" cy="([\d.]+)" r="3.0"', html), dtype=float)
+    np.testing.assert_array_equal(dots, placed)
+    rectangle = re.search(r'<rect x="(.*?)" y="(.*?)" width="(.*?)" height="(.*?)"', html)
+    wanted = [80 - 0.35 * scale, 48 - 0.1 * scale, 0.8 * scale, 0.2 * scale]
+    assert [float(x) for x in rectangle.groups()] == pytest.approx(wanted, abs=0.2)
     ruler, length = re.search(r'h([\d.]+)"/><text.*?>([\d.]+) m;', html).groups()
     assert float(ruler) / float(length) == pytest.approx(scale, rel=0.02)
 

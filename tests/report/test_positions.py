@@ -330,13 +330,21 @@ def test_the_worst_joint_of_the_verdict_is_open(content, followed):
     opened = re.findall(r'<details[^>]*id="joint-(\d)"[^>]* open', page)
     assert opened == ["1"]
     assert next(iter(bars(page))) == LEG[1]
+    known = (model, model.standard_parameters())
+    for logs, wanted in (
+        (([moved], [still]), "not fitted"),
+        (([moved, still], []), "fitted samples, without validation log"),
+    ):
+        assert f"|motion|, {wanted}" in page_with(content, *logs, known)
     assert '<a href="#cause-saturation">saturation</a>' in page.split('id="worst"')[0]
 
 
 def test_logs_have_their_role_and_the_worst_second_is_of_those_not_fitted(content, followed):
     fitted = replace(followed, log=replace(followed.log, path="fitted.csv"), q=followed.q + 0.2)
     for validation, wanted in (([followed], "kept.csv"), ([], "fitted.csv")):
-        _, html = shown_positions(content, [fitted], validation, Origin((), "out")).curves
+        shown = shown_positions(content, [fitted], validation, Origin((), "out"))
+        assert shown.title.endswith(": drives from commands")
+        _, html = shown.curves
         roles = set(re.findall(r"(\w+\.csv) 1-5 s, ([a-z ]+): RMSE", html))
         own = {("kept.csv", "not fitted")} if validation else set()
         assert roles == {*own, ("fitted.csv", "fitted")}

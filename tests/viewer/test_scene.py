@@ -3,7 +3,7 @@ import pinocchio as pin
 import pytest
 
 from robotid.robot.model import RobotModel
-from robotid.viewer.scene import _corners, _ends, _reach, ellipsoids
+from robotid.viewer.scene import _corners, _ends, _reach, ellipsoids, robot_scene
 
 
 def test_the_ellipsoid_of_a_solid_ellipsoid_is_itself(rng):
@@ -56,6 +56,34 @@ def test_the_box_about_a_part_is_where_the_part_is(shape, size, half):
     np.testing.assert_allclose(own.min(axis=0), low, atol=1e-12)
     np.testing.assert_allclose(own.max(axis=0), high, atol=1e-12)
     assert len(np.unique(own.round(9), axis=0)) == 8
+
+
+def test_shapes_are_placed_as_in_the_urdf_and_cylinders_along_its_z(tmp_path):
+    shapes = (
+        '<box size="1 2 3"/>',
+        '<sphere radius="0.2"/>',
+        '<cylinder radius="0.1" length="0.5"/>',
+    )
+    visual = (
+        '<visual><origin xyz="0.1 0.2 0.3" rpy="0.4 -0.5 0.6"/><geometry>{}</geometry></visual>'
+    )
+    (tmp_path / "shapes.urdf").write_text(
+        '<robot name="s"><link name="base"/><link name="a">'
+        f"{''.join(visual.format(shape) for shape in shapes)}</link>"
+        '<joint name="j" type="revolute"><parent link="base"/><child link="a"/>'
+        '<axis xyz="0 0 1"/><limit effort="1" velocity="1"/></joint></robot>'
+    )
+    scene = robot_scene(RobotModel.from_urdf(tmp_path / "shapes.urdf"))
+    parts = {part["shape"]: part for part in scene.content["parts"] if part["node"] == 1}
+    wanted = pin.SE3(pin.rpy.rpyToMatrix(0.4, -0.5, 0.6), np.array([0.1, 0.2, 0.3])).homogeneous
+    found = {name: np.array(part["matrix"]).reshape(4, 4).T for name, part in parts.items()}
+    for name, size in (("box", [1, 2, 3]), ("sphere", [0.2]), ("cylinder", [0.1, 0.5])):
+        assert parts[name]["size"] == size
+        np.testing.assert_allclose(found[name][:, 3], wanted[:, 3])
+    np.testing.assert_allclose(found["box"], wanted, atol=1e-12)
+    np.testing.assert_allclose(found["sphere"], wanted, atol=1e-12)
+    np.testing.assert_allclose(found["cylinder"][:3, 1], wanted[:3, 2], atol=1e-12)
+    assert np.linalg.det(found["cylinder"]) == pytest.approx(1.0)
 
 
 BRANCHED = """<robot name="tree"><link name="base"/><link name="a"/><link name="b"/><link name="c"/>

@@ -49,6 +49,9 @@ def test_the_page_is_served_on_this_machine_alone(live):
     assert live.url.startswith("http://127.0.0.1:")
     _, response = ask(live.url)
     assert (response.status, response.read()) == (200, b"<p>page")
+    names = ("Content-Type", "Content-Length", "Cache-Control")
+    said = [response.headers[name] for name in names]
+    assert said == ["text/html; charset=utf-8", "7", "no-store"]
     assert ask(live.url, "/etc/passwd")[1].status == 404
     # a page of another site whose name was made to point here
     assert ask(live.url, host="evil.example:80")[1].status == 403

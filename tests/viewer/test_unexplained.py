@@ -36,6 +36,16 @@ def test_a_push_is_found_with_its_joint_its_time_and_its_size(torques):
     assert found.residual == pytest.approx(8.0, abs=0.3)
 
 
+@pytest.mark.parametrize(("usual", "limit"), [(1.0, 6.0), (0.1, 0.3 * 8.0)])
+def test_a_push_is_one_above_six_medians_and_0_3_of_the_torque(usual, limit):
+    tau = np.tile([8.0, -8.0], 1000)[:, None]
+    for share in (0.97, 1.03):
+        residual = np.full_like(tau, usual)
+        residual[500:600] = share * limit
+        found = find_unexplained(T, tau, tau - residual, ("a",))
+        assert [x.residual for x in found] == pytest.approx([share * limit] * (share > 1))
+
+
 def test_two_pushes_far_apart_are_two_and_near_ones_are_one(torques):
     tau, predicted = torques
     tau = tau.copy()
