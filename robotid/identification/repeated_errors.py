@@ -123,15 +123,10 @@ def with_repeated_errors(recordings: Recordings) -> Recordings:
     L = np.linalg.cholesky((mapping.K * spread**2) @ mapping.K.T)
     fit = estimated_errors(total.R, L, mean, recordings.share, count, sizes, before)
     cross = total.R[:b, :b].T @ total.R[:b, b:-1]  # -W^T D
-    roots, is_open = np.diag(sizes), np.isnan(sizes)
-    if is_open.any():
-        own = fit.squares.reshape(is_open.sum() // 3, 3, -1, 3)  # of each pair of points
-        V = np.einsum("ijik->jk", own) / len(own)
-        roots[np.ix_(is_open, is_open)] = np.kron(np.eye(len(own)), np.linalg.cholesky(V))
-    roots[c:, c:] = np.linalg.cholesky(fit.covariance[c:, c:])
+    roots = _roots(fit, sizes, c)
     rest = total.R[b:-1, b:-1] @ roots  # of D, what W cannot explain
     variance = float(np.sum(rest**2)) / count
-    largest = float(np.where(is_open, fit.size, sizes)[:c].max(initial=0.0))
+    largest = float(np.where(np.isnan(sizes), fit.size, sizes)[:c].max(initial=0.0))
     root = np.column_stack([cross @ roots, shift])
     errors = RepeatedErrors(root, variance, largest, has_motion=is_blind)
     if not d:
@@ -166,6 +161,26 @@ class EstimatedErrors:
     known: Array  # (d,), estimated errors of known size; the prior means of others
     covariance: Array  # (d, d), of errors of known size; 0 for others
     squares: Array  # (k, k), E[x x^T | rows] of the k offsets x whose size is unknown [m^2]
+
+
+def _roots(fit: EstimatedErrors, sizes: Array, c: int) -> Array:
+    """Return a root of the covariance of all errors, (d, d).
+
+    Offsets of unknown size have the mean square along each axis of their links, pooled over the
+    points.
+
+    Args:
+        fit: The estimated errors.
+        sizes: Known standard deviations, NaN if unknown, shape (d,) [m or m/s^2].
+        c: Number of offsets, the first of the errors.
+    """
+    roots, is_open = np.diag(sizes), np.isnan(sizes)
+    if is_open.any():
+        own = fit.squares.reshape(is_open.sum() // 3, 3, -1, 3)  # of each pair of points
+        V = np.einsum("ijik->jk", own) / len(own)
+        roots[np.ix_(is_open, is_open)] = np.kron(np.eye(len(own)), np.linalg.cholesky(V))
+    roots[c:, c:] = np.linalg.cholesky(fit.covariance[c:, c:])
+    return roots
 
 
 def estimated_errors(
