@@ -121,7 +121,7 @@ class ClusterBackend(Backend):
                 index, piece, _ = running[future.key]
                 try:
                     with named(piece):
-                        outcome: Outcome = future.result()
+                        outcome = self._outcome(client, future)
                 except KilledWorker as error:
                     del running[future.key]
                     future.release()
@@ -162,11 +162,27 @@ class ClusterBackend(Backend):
             if client.nthreads():
                 seen = time.monotonic()
             elif now - seen > self.patience:
-                raise WorkerError(
-                    f"the cluster {self.address} has had no workers for {self.patience:.3g} s. "
-                    f"Start workers with 'dask worker {self.address}' and repeat the command"
-                )
+                raise self._no_workers()
         return next(results)
+
+    def _outcome(self, client: "Client", future: "Future[Any]") -> Outcome:
+        """Return what a finished piece gave; if its worker has ended, another one repeats it."""
+        while True:
+            try:
+                found: Outcome = future.result(timeout=self.patience)
+                return found
+            except TimeoutError as error:
+                if getattr(error, "__notes__", ()):  # of the piece itself
+                    raise
+                if not client.nthreads():
+                    raise self._no_workers() from error
+
+    def _no_workers(self) -> WorkerError:
+        return WorkerError(
+            f"the cluster {self.address} has no workers any more; none has started within "
+            f"{self.patience:.3g} s. Start workers with 'dask worker {self.address}' and repeat "
+            "the command"
+        )
 
 
 def _run(work: Work, piece: Workload, level: int, wanted: str) -> Outcome:
