@@ -9,7 +9,7 @@ from helpers.paths import ROOT
 from helpers.synthetic import truth
 
 from robotid.estimators import OLS, WLS
-from robotid.fitting import regressor_noise, survey
+from robotid.fitting import regressor_noise
 from robotid.fitting.fit import solve_recordings
 from robotid.fitting.regressor_noise import (
     acceleration_noise,
@@ -24,6 +24,7 @@ from robotid.log_files.read import lay_out, write_log
 from robotid.logs.data import Log
 from robotid.logs.settings import SignalSettings
 from robotid.logs.signals import process
+from robotid.recordings import survey
 from robotid.recordings.logs import Recordings
 from robotid.recordings.survey import hold_log, survey_log
 from robotid.regressor.base_parameters import structural_mapping
