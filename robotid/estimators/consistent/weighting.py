@@ -25,6 +25,8 @@ _MOST_JOINT_LOSS = 1.05  # ... and of any one joint
 _MOST_REPEATED = 0.5  # largest share of repeated errors in the squared residual
 _BEYOND = 4.0  # standard errors by which a body must be outside its box
 _CLEAR = 0.02  # relative increase of the mean square error at which an extent is contradicted
+_REESTIMATED = 8  # largest number of steps of the plausible weight
+_EXPECTED = 1.02  # distance from the prior over the expected one at which they end
 _STEP = 0.5  # decades between the best weight and the refined ones
 
 
@@ -104,8 +106,9 @@ def choose_weight(
     smallest = _SMALLEST if fit.penalty.is_quadratic else _SMALLEST_ENTROPIC
     evidence = log_evidence(fit, segments.rows)
     by_evidence = _search(lambda w: (-evidence(w), np.zeros(0)), "evidence", smallest, 0.0)
+    plausible = plausible_weight(fit, segments.rows, by_evidence.plausible)
     if how == "evidence":
-        return by_evidence
+        return replace(by_evidence, plausible=plausible)
 
     starts = None  # the fits at the previous weight
 
@@ -121,7 +124,40 @@ def choose_weight(
 
     # a residual without the repeated error is smaller by this log ratio
     excess = -0.5 * np.log1p(-min(repeated, _MOST_REPEATED))
-    return replace(_search(score, how, smallest, excess), plausible=by_evidence.plausible)
+    return replace(_search(score, how, smallest, excess), plausible=plausible)
+
+
+def plausible_weight(fit: Consistent, rows: Array, weight: float) -> float:
+    """Return the weight at which the distance from the prior is as expected, or the given one.
+
+    The evidence expands the penalty at its centre. At the minimum with a weight w that agrees with
+    the data, w times the penalty is the number of parameters that the data determine, g = d -
+    trace(w H C / 2) of d free ones. If it is more, the prior is less certain than w states: the
+    next weight is g over the penalty. The steps end before a weight at which the fit does not
+    converge.
+
+    Args:
+        fit: The fit; its own weight is not used.
+        rows: Rows of the data, shape (k, b + 1), from ``Consistent.rows``.
+        weight: The weight with the largest ``log_evidence`` [-].
+
+    References:
+        MacKay (1992), Bayesian interpolation, section 4.
+    """
+    programme, solution, found = fit.programme, None, weight
+    for _ in range(_REESTIMATED):
+        try:
+            solution = programme.minimise(rows, weight, is_exact=False, start=solution)
+        except NotConvergedError:  # bodies shrink to points
+            break
+        found = weight
+        H, C = programme.penalty.hessian(solution.x), programme.covariance(weight, rows, solution.x)
+        determined = programme.space.basis.shape[1] - 0.5 * weight * float(np.sum(H * C))
+        distance = weight * programme.penalty.value(solution.x)
+        if distance <= _EXPECTED * determined:
+            break
+        weight *= determined / distance
+    return found
 
 
 def contradicted_extents(fit: Consistent, segments: Segments) -> tuple[str, ...]:

@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import scipy.optimize
 import scipy.stats
 from helpers.estimation import EXACT, NOISE, Case, consistent
 from helpers.fitting import identify
@@ -19,8 +20,9 @@ from robotid.estimators.consistent.weighting import (
     contradicted_extents,
     held_out_errors,
     log_evidence,
+    plausible_weight,
 )
-from robotid.exceptions import DataError, SettingsError
+from robotid.exceptions import DataError, NotConvergedError, SettingsError
 from robotid.fitting.settings import EstimatorSettings
 from robotid.logs.signals import process
 from robotid.regressor.base_parameters import structural_mapping
@@ -85,6 +87,47 @@ def test_the_evidence_finds_the_spread_that_parameters_were_drawn_with(case):
     assert np.mean(found) == pytest.approx(2.0, abs=0.2)
 
 
+def test_the_plausible_weight_of_a_quadratic_prior_is_that_of_the_largest_evidence(case):
+    fit, problem = case
+    fit = replace(fit, metric="euclidean", solver="clarabel")
+    rows = fit.rows(compress(problem), NOISE)
+    best = scipy.optimize.minimize_scalar(
+        lambda decade: -log_evidence(fit, rows)(10.0**decade), bounds=(-4, 2), method="bounded"
+    )
+    assert plausible_weight(fit, rows, 100.0) == pytest.approx(10.0**best.x, rel=0.1)
+    assert 10.0**best.x < 30.0
+    # a smaller weight is not increased
+    assert plausible_weight(fit, rows, 0.1 * 10.0**best.x) == 0.1 * 10.0**best.x
+
+
+def test_at_the_plausible_weight_the_prior_is_as_far_as_expected(case):
+    fit, problem = case
+    fit = replace(fit, metric="entropic")
+    rows = fit.rows(compress(problem), NOISE)
+    weight = plausible_weight(fit, rows, 100.0)
+    pi = fit.programme.minimise(rows, weight).x
+    unit = np.diag(fit.prior_std)
+    A, H = rows[:, :-1] @ fit.K @ unit, unit @ fit.penalty.hessian(pi) @ unit / 2
+    determined = np.trace(np.linalg.solve(A.T @ A + weight * H, A.T @ A))
+    assert weight * fit.penalty.value(pi) == pytest.approx(determined, rel=0.03)
+    assert weight < 50.0
+
+
+def test_no_smaller_weight_is_plausible_if_the_fit_does_not_converge_there(case, monkeypatch):
+    fit, problem = case
+    rows, tried = fit.rows(compress(problem), NOISE), []
+    minimise = type(fit.programme).minimise
+
+    def fails(self, rows, weight, **options):
+        tried.append(weight)
+        if len(tried) == 3:
+            raise NotConvergedError("stopped", "status")
+        return minimise(self, rows, weight, **options)
+
+    monkeypatch.setattr(type(fit.programme), "minimise", fails)
+    assert plausible_weight(fit, rows, 100.0) == tried[1] < tried[0] == 100.0
+
+
 def test_the_held_out_errors_are_those_of_a_loop_by_hand(case):
     fit, problem = case
     segments = cut(problem, 3)
@@ -116,6 +159,20 @@ def test_the_chosen_weight_is_the_best_of_its_curve_and_is_stated(ur5, rng):
         assert (np.diff(weights) > 0).all()
         assert len(weights) >= 5
         assert weights.max() == 100.0
+
+
+@pytest.mark.parametrize("how", ["cv", "evidence"])
+def test_a_choice_has_the_plausible_weight_from_that_of_the_largest_evidence(
+    case, monkeypatch, how
+):
+    fit, problem = case
+    segments, given = Segments.of(fit, cut(problem, 4)), []
+    best = choose_weight(fit, segments, "evidence").weight
+    monkeypatch.setattr(
+        weighting, "plausible_weight", lambda *own: given.append(own) or 0.3 * own[2]
+    )
+    assert choose_weight(fit, segments, how).plausible == 0.3 * best
+    assert given == [(fit, segments.rows, best)]
 
 
 CHANCE = np.array([[0.05], [-0.05], [0.02], [-0.05], [0.05], [-0.02]])  # (segments, 1)
