@@ -133,8 +133,9 @@ def plausible_weight(fit: Consistent, rows: Array, weight: float) -> float:
     The evidence expands the penalty at its centre. At the minimum with a weight w that agrees with
     the data, w times the penalty is the number of parameters that the data determine, g = d -
     trace(w H C / 2) of d free ones. If it is more, the prior is less certain than w states: the
-    next weight is g over the penalty. The steps end before a weight at which the fit does not
-    converge.
+    next weight is g over the penalty. The weight is reduced by half a decade at most, the distance
+    of the weights tried: a larger disagreement is not due to the expansion, but to errors of the
+    model. The steps end before a weight at which the fit does not converge.
 
     Args:
         fit: The fit; its own weight is not used.
@@ -145,6 +146,7 @@ def plausible_weight(fit: Consistent, rows: Array, weight: float) -> float:
         MacKay (1992), Bayesian interpolation, section 4.
     """
     programme, solution, found = fit.programme, None, weight
+    least = weight * 10.0**-_STEP
     for _ in range(_REESTIMATED):
         try:
             solution = programme.minimise(rows, weight, is_exact=False, start=solution)
@@ -154,9 +156,9 @@ def plausible_weight(fit: Consistent, rows: Array, weight: float) -> float:
         H, C = programme.penalty.hessian(solution.x), programme.covariance(weight, rows, solution.x)
         determined = programme.space.basis.shape[1] - 0.5 * weight * float(np.sum(H * C))
         distance = weight * programme.penalty.value(solution.x)
-        if distance <= _EXPECTED * determined:
+        if distance <= _EXPECTED * determined or weight == least:
             break
-        weight *= determined / distance
+        weight = max(least, weight * determined / distance)
     return found
 
 
