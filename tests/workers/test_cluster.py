@@ -118,7 +118,7 @@ def test_a_cluster_whose_workers_have_all_ended_is_not_waited_for(tmp_path):
         n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None
     ) as alone:
         backend = ClusterBackend(alone.scheduler_address, patience=0.4)
-        pieces = list(enumerate(pieces_in(tmp_path / "marks", 6)))
+        pieces = list(enumerate(pieces_in(tmp_path / "marks", 6, pause=0.5)))
         found = backend.run(reduce_piece, pieces)
         next(found)
         alone.scale(0)
