@@ -1,6 +1,7 @@
 """A real Dask cluster with worker processes: the same bits, also when workers are killed."""
 
 import os
+from types import SimpleNamespace
 
 import pytest
 from helpers.piecework import (
@@ -127,6 +128,32 @@ def test_a_cluster_whose_workers_have_all_ended_is_not_waited_for(tmp_path):
         ):
             list(found)
     assert backend._client is None
+
+
+@pytest.mark.parametrize(
+    ("notes", "workers", "wanted"),
+    [(["on a host"], 1, TimeoutError), ([], 0, WorkerError), ([], 1, None)],
+)
+def test_a_timeout_of_a_piece_is_its_error_and_one_of_its_result_is_not(notes, workers, wanted):
+    waited, late = [], TimeoutError("the file server does not answer")
+    for note in notes:
+        late.add_note(note)
+
+    def result(timeout):
+        waited.append(timeout)
+        if len(waited) == 1:
+            raise late
+        return "result"
+
+    client = SimpleNamespace(nthreads=lambda: dict.fromkeys(range(workers), 1))
+    backend, future = ClusterBackend("tcp://host:1", patience=7.5), SimpleNamespace(result=result)
+    if wanted is None:
+        assert backend._outcome(client, future) == "result"
+        assert waited == [7.5, 7.5]
+        return
+    with pytest.raises(wanted):
+        backend._outcome(client, future)
+    assert waited == [7.5]
 
 
 def test_no_scheduler_is_said(tmp_path):
