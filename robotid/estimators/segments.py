@@ -19,17 +19,24 @@ __all__ = ["FEWEST_SEGMENTS", "Scatter", "at_least", "quantile", "sandwich", "sc
 #: Smallest number of segments for an estimate of the scatter.
 FEWEST_SEGMENTS = 12
 _OWN = 0.95  # leverage above which a segment determines a direction alone, without scatter
+_UNSEEN = 1e-12  # leverage of a direction, or share of a variance, that is rounding error
 
 
 @dataclass(frozen=True, eq=False)
 class Scatter:
-    """Scatter of the scores of s segments about 0, for c parameters."""
+    """Scatter of the scores of s segments about 0, for c parameters.
+
+    With W the weighted rows of a segment and L L^T = bread, the leverages of the segment are the
+    eigenvalues of L^T W^T W L = Q diag(leverage) Q^T.
+    """
 
     meat: Array  # (c, c), covariance of the score W^T S^-1 (tau - W theta) of all segments
     bread: Array  # (c, c), covariance of the parameters if rows were independent
     inflation: float  # mean ratio of the scatter to that of independent rows [-]
-    factors: Array  # (s, c, c), of the weighted rows of each segment, along its eigenvectors
-    adjusted: Array  # (s, c, c), the same after the correction for their leverage
+    root: Array  # (c, c), L
+    axes: Array  # (s, c, c), Q of each segment
+    leverage: Array  # (s, c)
+    gain: Array  # (s, c), correction for it
 
     @property
     def covariance(self) -> Array:
@@ -39,18 +46,24 @@ class Scatter:
     def freedom(self) -> Array:
         """Return the degrees of freedom of each parameter's variance, shape (c,), at least 1.
 
+        They are inf for parameters that no segment sees: their variance is that of a prior.
+
         References:
             Bell, McCaffrey (2002), Bias reduction in standard errors for linear regression with
             multi-stage samples, section 4.
         """
-        R, bread = self.factors, self.bread
-        loads = self.adjusted @ bread  # (s, c, c): column l is a_s of parameter l
-        back = np.einsum("sij,sil->lsj", R, loads, optimize=True)  # R_s^T a_s
-        freedom = np.empty(len(bread))
-        for k, Z in enumerate(back):
+        along = self.axes.mT @ self.root.T  # (s, c, c): column l is that of parameter l
+        weight = (self.leverage * self.gain)[..., None]
+        squares = np.sum(weight * self.gain[..., None] * along**2, axis=1)  # (s, c)
+        back = self.axes @ (weight * along)
+        freedom = np.full(len(self.bread), np.inf)
+        for k in np.flatnonzero(squares.sum(axis=0) > _UNSEEN * np.diag(self.bread)):
             # covariances of the segments' contributions to the parameter for independent noise
-            gram = np.diag((loads[:, :, k] ** 2).sum(axis=1)) - Z @ bread @ Z.T
-            freedom[k] = np.trace(gram) ** 2 / max(float((gram**2).sum()), 1e-300)
+            Z = back[:, :, k]
+            gram = np.diag(squares[:, k]) - Z @ Z.T
+            total = float(np.trace(gram))
+            is_rounding = total <= _UNSEEN * float(squares[:, k].sum())  # of one segment alone
+            freedom[k] = 1.0 if is_rounding else total**2 / float((gram**2).sum())
         return np.maximum(freedom, 1.0)
 
 
@@ -80,27 +93,39 @@ def scatter(segments: Sequence[Factors], theta: Array, sigma: Array, bread: Arra
             f"{len(segments)} segments are too few to estimate the scatter of their scores, wanted "
             f"at least {FEWEST_SEGMENTS}; fit longer logs"
         )
-    c = len(theta)
+    s, c = len(segments), len(theta)
     meat, alone, along_squares, expected = np.zeros((c, c)), np.zeros((c, c)), 0.0, 0.0
-    rotated, adjusted = np.empty((2, len(segments), c, c))
+    root, axes, (leverages, gains) = _root(bread), np.empty((s, c, c)), np.empty((2, s, c))
     for k, segment in enumerate(segments):  # one by one: all together are larger than a cache
-        weighted = segment.weighted(sigma)
-        R, u = weighted[:c, :c], weighted[:c, c] - weighted[:c, :c] @ theta
-        leverage, V = np.linalg.eigh(R @ bread @ R.T)
+        W, residual = segment.weighted_rows(theta, sigma)
+        B = W @ root
+        leverage, Q = np.linalg.eigh(B.T @ B)
         share = np.clip(1.0 - leverage, 0.0, 1.0)  # of the noise that is left in the residual
         gain = 1.0 / np.sqrt(np.maximum(share, 1.0 - _OWN))
-        along = gain * (V.T @ u)
-        # the weight of each eigenvector is its leverage
-        along_squares += float(leverage @ along**2)
+        along = Q.T @ (B.T @ residual)
+        # the weight of each direction is its leverage
+        along_squares += float(np.sum((gain * along) ** 2))
         expected += float(leverage @ (gain**2 * share))
-        np.matmul(V.T, R, out=rotated[k])
-        np.multiply(gain[:, None], rotated[k], out=adjusted[k])
-        score = along @ rotated[k]
+        is_seen = leverage > _UNSEEN
+        corrected = along / np.where(is_seen, leverage, 1.0) * np.where(is_seen, gain - 1.0, 0.0)
+        score = W.T @ (residual + B @ (Q @ corrected))
         meat += np.outer(score, score)
-        missing = np.sqrt(np.maximum(1.0 - gain**2 * share, 0.0))[:, None] * rotated[k]
-        alone += missing.T @ missing
+        is_own = gain**2 * share < 1.0 - _UNSEEN
+        missing = np.sqrt((1.0 - gain**2 * share)[is_own] / leverage[is_own]) * Q[:, is_own]
+        missing = W.T @ (B @ missing)
+        alone += missing @ missing.T
+        axes[k], leverages[k], gains[k] = Q, leverage, gain
     inflation = along_squares / expected
-    return Scatter(meat + inflation * alone, bread, inflation, rotated, adjusted)
+    return Scatter(meat + inflation * alone, bread, inflation, root, axes, leverages, gains)
+
+
+def _root(covariance: Array) -> Array:
+    """Return L with L L^T = covariance, shape (c, c); variances may be 0."""
+    deviation = np.sqrt(np.diag(covariance))
+    scale = np.where(deviation > 0.0, deviation, 1.0)
+    variances, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
+    root: Array = scale[:, None] * vectors * np.sqrt(np.maximum(variances, 0.0))
+    return root
 
 
 def sandwich(bread: Array, meat: Array) -> Array:

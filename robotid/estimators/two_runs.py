@@ -324,7 +324,7 @@ class TwoRuns:
         found = scatter(parts, solution, np.abs(gain) * self._noise, own)
         meat = self.share**2 * found.meat
         meat[:size, :size] += self.precision
-        return sandwich(bread, meat), replace(found, bread=own).freedom()
+        return sandwich(bread, meat), found.freedom()
 
 
 def _of_joint(factors: Factors, joint: int) -> Factors:

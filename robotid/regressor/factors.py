@@ -105,6 +105,25 @@ class Factors:
             carrier.fold_triangle(folded[j].R, places)
         return everything.R
 
+    def weighted_rows(self, theta: Array, sigma: Array) -> tuple[Array, Array]:
+        """Return rows W_j / sigma_j and (tau_j - W_j theta) / sigma_j that have these factors.
+
+        Args:
+            theta: Parameters, shape (c,).
+            sigma: Noise level per joint, shape (n,) [N m or N], positive.
+
+        Returns:
+            The rows of all joints, shape (m, c), and their residuals, shape (m,); m is the sum of
+            the sizes of the factors.
+        """
+        ends = np.cumsum([len(R) for R in self.triangles])
+        W, residual = np.zeros((ends[-1], len(self.names))), np.empty(ends[-1])
+        for R, own, level, end in zip(self.triangles, self.columns, sigma, ends, strict=True):
+            rows = slice(end - len(R), end)
+            W[rows, own] = R[:, :-1] / level
+            residual[rows] = R[:, -1] / level - W[rows, own] @ theta[own]
+        return W, residual
+
     def residual_squares(self, theta: Array) -> Array:
         """Return |tau_j - W_j theta|^2 of each joint, shape (n,) [(N m)^2 or N^2].
 
