@@ -2,10 +2,8 @@
 
 import ast
 import json
-import os
 import re
 import runpy
-import subprocess
 import sys
 import textwrap
 import tomllib
@@ -16,7 +14,6 @@ from helpers.corruptions import CASES
 from helpers.paths import DOCS, ROOT
 from helpers.synthetic import exact_log, truth
 
-import robotid
 from robotid.cli import COMMANDS, main
 from robotid.commands.job import Job, LogEntry, job_from_settings
 from robotid.doctor.diagnosis import CODES
@@ -333,24 +330,6 @@ def test_the_job_file_of_the_docs_is_accepted(tmp_path):
         job = job_from_settings(tomllib.loads(version), "job_file.md", tmp_path)
         assert job.signals.min_velocity == 0.02
         assert job.estimator.name == "consistent"
-
-
-def test_the_site_builds_and_documents_the_public_names(tmp_path):
-    command = [sys.executable, "-m", "mkdocs", "build", "-q", "--strict", "-f", ".mkdocs.yml"]
-    environment = os.environ | {"NO_MKDOCS_2_WARNING": "1"}
-    run = subprocess.run(
-        [*command, "-d", str(tmp_path)], cwd=ROOT, env=environment, capture_output=True, text=True
-    )
-    assert run.returncode == 0, run.stderr
-    pages = [page.read_text() for page in (tmp_path / "reference/api").glob("*.html")]
-    shown = [name for page in pages for name in re.findall(r'id="robotid\.(\w+)"', page)]
-    assert set(robotid.__all__) - {"__version__"} <= set(shown)
-    assert len(shown) == len(set(shown)), "a name is documented twice"
-    assert "plot_friction" in (tmp_path / "tutorials/first_steps.html").read_text()
-    links = (tmp_path / "tutorials/first_arm.html").read_text()
-    assert 'href="first_steps.html"' in links, "the page of the notebook, not its file"
-    home = (tmp_path / "index.html").read_text()
-    assert "fonts." not in home, "the site is read without a network"
 
 
 def test_every_drive_parameter_is_in_the_table_of_names():

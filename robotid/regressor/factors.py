@@ -29,6 +29,7 @@ __all__ = [
     "compress",
     "compress_segments",
     "gather",
+    "in_order",
     "join",
     "join_segments",
     "merge",
@@ -331,7 +332,9 @@ def compress_segments(
         places = _places(source, columns)
         starts = range(0, source.samples, part)
         fold = partial(_fold_part, source, part, length)
-        folded = chain.from_iterable(_in_order(fold, starts, source.is_parallel, threads))
+        folded = chain.from_iterable(
+            in_order(fold, starts, is_parallel=source.is_parallel, threads=threads)
+        )
         for start, triangles in zip(range(0, source.samples, length), folded, strict=True):
             _require_finite(triangles)
             rows = source.rows(start, min(start + length, source.samples))
@@ -433,6 +436,29 @@ def available_cores() -> int:
     return os.cpu_count() or 1
 
 
+def in_order(
+    work: Callable[[ItemT], ResultT],
+    items: Sequence[ItemT],
+    *,
+    is_parallel: bool = True,
+    threads: int | None = None,
+) -> Iterator[ResultT]:
+    """Yield the result of work for each item in order, with threads where that is faster.
+
+    Args:
+        work: What is done with an item.
+        items: The items.
+        is_parallel: Whether the work releases the interpreter's lock.
+        threads: Number of threads; None: the number of cores if the work is parallel.
+    """
+    workers = (available_cores() if is_parallel else 1) if threads is None else threads
+    if min(workers, len(items)) <= 1:
+        yield from map(work, items)
+        return
+    with ThreadPoolExecutor(min(workers, len(items))) as pool:
+        yield from pool.map(work, items)
+
+
 def _fold_blocks(
     triangles: Sequence[Triangle], columns: Sequence[Array], problem: Problem
 ) -> Array:
@@ -464,7 +490,9 @@ def _fold_sources(
         places = _places(source, columns)
         starts = range(0, source.samples, _PART)
         fold = partial(_fold_part, source, _PART, _PART)
-        for part in chain.from_iterable(_in_order(fold, starts, source.is_parallel, threads)):
+        for part in chain.from_iterable(
+            in_order(fold, starts, is_parallel=source.is_parallel, threads=threads)
+        ):
             for triangle, place, R_j in zip(triangles, places, part, strict=True):
                 triangle.fold_triangle(R_j, place)
     rows: Array = np.sum([source.rows(0, source.samples) for source in sources], axis=0)
@@ -492,18 +520,6 @@ def _require_finite(triangles: Sequence[Array]) -> None:
     """Refuse factors of rows that are not finite: R is not finite then either."""
     if not all(np.isfinite(R).all() for R in triangles):
         raise DataError("the problem has a row that is not finite; check the trajectory")
-
-
-def _in_order(
-    work: Callable[[ItemT], ResultT], items: Sequence[ItemT], is_parallel: bool, threads: int | None
-) -> Iterator[ResultT]:
-    """Yield the result of work for each item in order, with threads where that is faster."""
-    workers = (available_cores() if is_parallel else 1) if threads is None else threads
-    if min(workers, len(items)) <= 1:
-        yield from map(work, items)
-        return
-    with ThreadPoolExecutor(min(workers, len(items))) as pool:
-        yield from pool.map(work, items)
 
 
 def _fold_part(source: RowSource, length: int, segment: int, start: int) -> list[list[Array]]:

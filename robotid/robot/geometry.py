@@ -1,6 +1,8 @@
 """The extent of each body from the URDF's collision or visual geometry, for bounds on its mass."""
 
-from collections.abc import Iterable, Sequence
+import xml.etree.ElementTree as ET
+from collections.abc import Sequence
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -70,7 +72,7 @@ def body_points(model: RobotModel) -> dict[str, Array]:
     Returns:
         Points by name of the body, shape (k, 3) [m].
     """
-    shapes = _shapes(model)
+    shapes = _shapes(model.tree.robot)
     found: dict[str, list[Array]] = {body: [] for body in model.layout.bodies}
     open_bodies = set()
     for place in link_places(model):
@@ -100,7 +102,7 @@ def link_clouds(model: RobotModel) -> tuple[list[tuple[str, int, Array]], list[s
         Name of the link, its body (-1: it is fixed to the world) and the points, shape (k, 3) [m],
         of each shape; and the links of which a shape cannot be read.
     """
-    shapes, urdf = _shapes(model), Path(model.tree.path)
+    shapes, urdf = _shapes(model.tree.robot), Path(model.tree.path)
     clouds, unread = [], []
     for link in model.tree.links:
         frame = model.pin_model.frames[model.pin_model.getFrameId(link, pin.FrameType.BODY)]
@@ -231,13 +233,13 @@ def _body_frames(model: RobotModel) -> dict[str, list[Array]]:
     return frames
 
 
-def _shapes(model: RobotModel) -> dict[str, list[Shape]]:
+@lru_cache(maxsize=4)
+def _shapes(robot: ET.Element) -> dict[str, list[Shape]]:
     """Return the collision shapes of each link, or its visual ones if it has none."""
-    robot = model.tree.robot
     return _by_link(read_shapes(robot, "visual")) | _by_link(read_shapes(robot, "collision"))
 
 
-def _by_link(shapes: Iterable[Shape]) -> dict[str, list[Shape]]:
+def _by_link(shapes: Sequence[Shape]) -> dict[str, list[Shape]]:
     by_link: dict[str, list[Shape]] = {}
     for shape in shapes:
         by_link.setdefault(shape.link, []).append(shape)
@@ -255,6 +257,7 @@ def _link_points(shapes: Sequence[Shape], urdf: Path) -> Array | None:
     return np.vstack(parts)
 
 
+@lru_cache(maxsize=64)  # shapes of one reading of a URDF: their meshes are read once
 def _shape_points(shape: Shape, urdf: Path) -> Array | None:
     corners: Array = np.array(np.meshgrid(*[[-1.0, 1.0]] * 3)).reshape(3, -1).T
     size: Array = np.array(shape.size)

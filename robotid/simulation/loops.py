@@ -7,11 +7,9 @@ windows in parallel.
 
 import math
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
-from os import cpu_count
 from types import ModuleType
 from typing import TYPE_CHECKING, TypeAlias
 
@@ -21,6 +19,7 @@ from robotid._typing import Array
 from robotid.exceptions import NotConvergedError, SettingsError
 from robotid.logs.data import Log
 from robotid.regressor.compiled import Tree, flatten, why_not
+from robotid.regressor.factors import in_order
 from robotid.robot.drive_term import BRISTLES
 from robotid.robot.drives import Bristles, DriveTerm, MemorylessTerm
 from robotid.robot.model import RobotModel
@@ -315,10 +314,9 @@ class ClosedLoopRobot:
         blocks = [windows[k : k + lanes.LANES] for k in range(0, len(windows), lanes.LANES)]
         pieces = [(part, block) for block in blocks for part in self._parts]
         outputs = 2 if with_speeds else 1
-        with ThreadPoolExecutor(max_workers=min(len(pieces), cpu_count() or 1) or 1) as pool:
-            done = list(
-                pool.map(lambda p: self._block(p[0], p[1], loops, wanted, along, outputs), pieces)
-            )
+        done = list(
+            in_order(lambda p: self._block(p[0], p[1], loops, wanted, along, outputs), pieces)
+        )
         n, each = len(self.model.joints), len(self._parts)
         found = []
         for b, block in enumerate(blocks):
