@@ -142,8 +142,8 @@ def sample(result: "Result", count: int, rng: np.random.Generator) -> tuple[list
             axis=1
         )
         bodies = (drawn[:, : model.layout.n_inertial] - held).reshape(-1)
-        eigenvalues = np.linalg.eigvalsh(pseudo_inertia(bodies)).reshape(len(x), -1)
-        return np.asarray(signs & (eigenvalues > 0.0).all(axis=1))
+        are_bodies = _positive_definite(pseudo_inertia(bodies)).reshape(len(x), -1)
+        return np.asarray(signs & are_bodies.all(axis=1))
 
     x = possible_draws(root, is_possible, count, rng)
     drawn = nominal + x
@@ -166,6 +166,20 @@ def sample(result: "Result", count: int, rng: np.random.Generator) -> tuple[list
             if len(logs):
                 drawn[:, i] = np.maximum(drawn[:, i] + moved[logs, k], least)
     return names, drawn
+
+
+def _positive_definite(J: Array) -> Array:
+    """Return which symmetric matrices, shape (k, n, n), are positive definite, shape (k,).
+
+    They are those whose elimination has positive pivots only.
+    """
+    left = np.array(J.transpose(1, 2, 0), order="C")
+    found = np.ones(len(J), dtype=bool)
+    for k in range(len(left)):
+        found &= left[k, k] > 0.0
+        below = left[k + 1 :, k]
+        left[k + 1 :, k + 1 :] -= below[:, None] * (below / np.where(found, left[k, k], 1.0))
+    return found
 
 
 def _between(content: Mapping[str, Any]) -> dict[str, dict[str, Any]]:

@@ -13,7 +13,7 @@ import robotid
 from robotid.cli import main
 from robotid.exceptions import DataError
 from robotid.export.result import load_result
-from robotid.export.samples import sample, write_samples
+from robotid.export.samples import _positive_definite, sample, write_samples
 from robotid.robot.parameters import pseudo_inertia
 from robotid.variation.variation import SCORES
 
@@ -207,3 +207,12 @@ def test_a_gain_of_the_next_log_has_the_part_of_the_fit_in_its_error(tmp_path, s
     kp, other = values[:, -2:].T
     assert kp.std() == pytest.approx(size, rel=0.1)
     assert np.corrcoef(kp, other)[0, 1] == pytest.approx(0.6 * of_gain, abs=0.08)
+
+
+def test_positive_definite_matrices_have_positive_eigenvalues(rng):
+    A = rng.standard_normal((400, 4, 4))
+    J = A @ A.mT - rng.uniform(0.0, 1.0, 400)[:, None, None] * np.eye(4)
+    wanted = np.linalg.eigvalsh(J)[:, 0] > 0.0
+    assert 50 < wanted.sum() < 350
+    np.testing.assert_array_equal(_positive_definite(J), wanted)
+    assert _positive_definite(np.diag([1.0, 2.0, 3.0, 0.0])[None]).tolist() == [False]
