@@ -16,8 +16,8 @@ from robotid.regressor.compiled import work_per_sample
 from robotid.regressor.constraints import without_forces
 from robotid.regressor.rows import BLOCK, COMPILED, InertialRows, TrajectoryRows, trajectory_rows
 from robotid.regressor.torque import joint_torque_regressor
+from robotid.regressor.torque_slopes import TorqueSlopes, position_slopes, torque_slopes
 from robotid.robot.model import RobotModel
-from robotid.robot.torque_slopes import TorqueSlopes, position_slopes, torque_slopes
 
 SlopesT = TypeVar("SlopesT", Array, TorqueSlopes)
 

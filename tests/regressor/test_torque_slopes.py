@@ -5,9 +5,9 @@ import pinocchio as pin
 import pytest
 from helpers.synthetic import truth
 
+from robotid.regressor.torque_slopes import position_slopes, torque_slopes
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
-from robotid.robot.torque_slopes import position_slopes, torque_slopes
 
 ROBOTS = {
     "in another order": (
