@@ -292,10 +292,17 @@ def test_the_pieces_of_a_log_have_the_bias_of_all_rests_of_its_windows(monkeypat
         np.testing.assert_allclose(values, w[rows] @ turn.T - wanted, atol=1e-6)
         (note,) = [x for x in log.notes if "gyroscopes" in x]
         assert "estimated in 2.5 s at rest" in note
-    pieces = [piece.read().trajectory for piece in found.pieces]
-    at, own = (np.concatenate([getattr(x, name) for x in pieces]) for name in ("t", "v"))
+    offset = np.array([0.3, -0.2, 0.1])
+    changed = found.with_accelerometer_bias(offset)
+    for log in changed.windows:
+        np.testing.assert_array_equal(log.base.imu.frame.offset, offset)
+    pieces, others = ([x.read().trajectory for x in log.pieces] for log in (found, changed))
+    at, own, a = (np.concatenate([getattr(x, name) for x in pieces]) for name in ("t", "v", "a"))
     rows = np.searchsorted(t, at - 1e-6)
     np.testing.assert_allclose(own[:, 3:6], w[rows] @ turn.T - wanted, atol=1e-6)
+    biased = np.concatenate([x.a for x in others])
+    np.testing.assert_allclose(a[:, :3] - biased[:, :3], np.tile(offset, (len(a), 1)), atol=1e-9)
+    np.testing.assert_array_equal(a[:, 3:], biased[:, 3:])
 
 
 def test_windows_of_a_long_log_are_named_by_their_own_rows(monkeypatch):
