@@ -208,3 +208,7 @@ def test_columns_are_scaled_by_the_rows_of_every_block_with_their_weights(rng):
         for W, _, weight in blocks
     )
     np.testing.assert_allclose(column_scale(problem, sigma), [*np.sqrt(squares[:2] / 8), 1.0])
+    # below 1e-9 of the largest, a column has no data
+    small = np.array([[2.0, 2.4e-9, 1.6e-9]])
+    problem.n_joints, problem.blocks = 1, lambda: iter([(small, np.ones(1), np.ones(1))])
+    np.testing.assert_allclose(column_scale(problem, np.ones(1)), [2.0, 2.4e-9, 1.0])
