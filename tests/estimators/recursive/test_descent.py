@@ -76,10 +76,19 @@ def test_prx_says_what_it_lacks_and_refuses_settings(states):
             estimator.update(estimator.init(58), sample)
     with pytest.raises(DataError, match="step is 'wrong', wanted 'exact' or 'printed'"):
         PRX(np.ones(6), step="wrong")
-    with pytest.raises(DataError, match="passes is 0"):
-        PRX(np.ones(6), passes=0)
-    with pytest.raises(DataError, match="step_size is 2"):
-        NormalisedGradient(np.ones(6), step_size=2.0)
+    positive = "wanted a positive number"
+    for method, name, value, words in (
+        (PRX, "metric", "torque", "wanted 'noise', 'mass' or 'rows'"),
+        (PRX, "bounds", 0.0, positive),
+        (PRX, "passes", 0, positive),
+        (PRX, "eps1", 0.0, positive),
+        (PRX, "eps2", -1e-12, positive),
+        (NormalisedGradient, "regularisation", 0.0, positive),
+        (NormalisedGradient, "step_size", 0.0, "wanted above 0 and below 2"),
+        (NormalisedGradient, "step_size", 2.0, "wanted above 0 and below 2"),
+    ):
+        with pytest.raises(DataError, match=rf"^{name} is '?{value}'?, {words}$"):
+            method(np.ones(6), **{name: value})
 
 
 @pytest.mark.parametrize("average", [False, True])
