@@ -372,6 +372,12 @@ def test_a_failure_while_writing_leaves_the_folder_as_it_was(source, tmp_path, r
             ModelError, match=r"new.urdf is not written: in the test reading, its torque"
         ):
             write_urdf(model, pi * 1.01, tmp_path / "new.urdf")
+    other = RobotModel.from_urdf(source, joints=model.joints[:1])
+    with monkeypatch.context() as patch:
+        patch.setattr(urdf, "load_identified", lambda *_: (other, other.standard_parameters()))
+        words = "^new.urdf is not written: in the test reading, it has other bodies or joints$"
+        with pytest.raises(ModelError, match=words):
+            write_urdf(model, pi * 1.01, tmp_path / "new.urdf")
     assert listing(tmp_path) == before
     with monkeypatch.context() as patch:
         patch.setattr(os, "replace", lambda *_: (_ for _ in ()).throw(OSError("disk full")))

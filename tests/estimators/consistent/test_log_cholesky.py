@@ -119,6 +119,28 @@ def test_curvatures_of_any_size_are_settled_in_a_few_steps_of_limited_length(rng
     assert moves.max() < 4.0 + 1e-9
 
 
+def test_multipliers_are_updated_until_they_change_no_more():
+    """Two parameters, one extent; the second round finds the multiplier of the first."""
+    rounds, ends = [], [0.75, 2.0, 2.0, 2.0]
+
+    def settle(rows, z, price, stiffness):
+        rounds.append((z, price.tolist(), stiffness))
+        return np.array([ends[len(rounds) - 1], 5.0]), 3, True
+
+    fit = SimpleNamespace(
+        fit_in_cone=SimpleNamespace(objective=lambda rows, pi: 7.0 + pi[1] - 5.0),
+        _parameters=lambda z: (z, None),
+        _extents=np.array([[1.0, -0.2]]),  # -0.25 after the first round, 1 after the second
+        _settle=settle,
+    )
+    z, value, steps, converged = LogCholesky._descend(fit, "rows", np.array([0.0, 5.0]))
+    assert (value, steps, converged) == (7.0, 9, True)
+    assert z.tolist() == [2.0, 5.0]
+    prices = [price for _, price, _ in rounds]
+    np.testing.assert_allclose(prices, [[0.0], [17.5], [0.0]], rtol=1e-12)  # 70 * 0.25
+    assert {stiffness for *_, stiffness in rounds} == {70.0}
+
+
 def test_at_active_constraints_the_gap_is_stated_and_small(case):
     fit, factors = case
     cone, smooth = fit.fit(factors), LogCholesky(fit, starts=1).fit(factors)
