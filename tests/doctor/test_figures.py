@@ -298,8 +298,8 @@ def test_torques_without_sign_are_those_of_three_joints_that_reach_zero_thrice()
     assert found.message.startswith(
         "run.csv: no torque is ever negative, although the torques of 3 joints reach 0 repeatedly"
     )
-    for changed in (tau[:, [0, 1, 1]] * [1, 1, -1], np.column_stack([tau[:, :2], twice])):
-        other = replace(log, tau=np.column_stack([changed, log.tau[:, 3:]]))
+    for changed in (all_tau * [1, 1, 1, 1, -1], all_tau[:, [0, 1, 3, 3, 4]]):
+        other = replace(log, tau=changed)
         assert "unsigned_torque" not in {f.code for f in check_torque_channels(other)}
 
 

@@ -111,7 +111,7 @@ def test_another_joint_is_refused_by_name(found, loaded):
         found.friction("elbow")
     with pytest.raises(DataError, match="has no friction curve of 'elbow_joint '; joints with"):
         loaded.friction("elbow_joint ")
-    with pytest.raises(SettingsError, match="^joint is 5, a int, wanted the name of a joint"):
+    with pytest.raises(SettingsError, match=r"^joint is 5, a int, wanted the name of a joint"):
         loaded.friction(5)
 
 

@@ -231,6 +231,17 @@ def test_time_must_increase_where_pieces_meet_too(ur5, recording, tmp_path, row)
     assert f"t[{row}]" in str(in_pieces.value)
 
 
+def test_a_log_is_read_in_pieces_of_16384_rows_if_nothing_else_is_said(tmp_path):
+    arm = RobotModel.from_urdf(example_urdf("ur5_robot.urdf"), joints=["elbow_joint"])
+    t = 3.0 + 0.01 * np.arange(16_500)
+    columns = {"t": t, "q_elbow_joint": np.sin(t), "tau_elbow_joint": np.cos(t)}
+    write_columns(columns, tmp_path / "run.parquet")
+    layout, table = lay_out(tmp_path / "run.parquet", arm.joints)
+    found = survey_log(layout, table, arm, SignalSettings(), (4.0, None))
+    assert [(p.first, p.stop) for p in found.pieces] == [(100, 16_484), (16_484, 16_500)]
+    assert found.with_accelerometer_bias(np.ones(3)).windows == found.windows  # it has no IMU
+
+
 def test_samples_have_the_regressor_of_their_mass_matrix(ur5, recording, tmp_path):
     """Of two logs, in memory and in pieces."""
     mapping, signals = structural_mapping(ur5), SignalSettings(cutoff=None, trim=0.0)
