@@ -279,6 +279,15 @@ def test_results_that_are_not_whole_are_refused(result, identified, tmp_path):
     structure = {**result["structure"], "base": -1e100}
     path.write_text(json.dumps({**result, "structure": structure}))
     assert read_result(path)["structure"]["base"] == -1e100
+    *others, last = result["inputs"]
+    assert len(others) == 3
+    for changed, words in (
+        ({**last, "rows_used": "x"}, r"inputs\[3\]\.rows_used is 'x', wanted a number"),
+        ({k: v for k, v in last.items() if k != "end"}, r"inputs\[3\] has no entry 'end': the"),
+    ):
+        path.write_text(json.dumps({**result, "inputs": [*others, changed]}))
+        with pytest.raises(DataError, match=rf"^result\.json\.{words}"):
+            read_result(path)
     short = {**result, "drive_parameters": result["drive_parameters"][1:]}
     with pytest.raises(ModelError, match=r"^the result has no value of shoulder_pan_joint\.arm"):
         stated_parameters(short, identified.model)

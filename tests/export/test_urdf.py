@@ -539,6 +539,25 @@ def test_a_link_that_did_not_change_keeps_its_text_and_rounding_is_0(ur5, tmp_pa
     assert "e-6" not in (tmp_path / "new.urdf").read_text()
 
 
+def test_a_change_is_of_the_link_in_its_line_and_not_of_the_next_line(tmp_path):
+    body = (
+        '<link name="{0}"><inertial><origin xyz="0.1 0 0"/><mass value="2"/><inertia ixx="1" '
+        'iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>'
+    )
+    joint = (
+        '<joint name="{0}" type="continuous"><parent link="{1}"/><child link="{2}"/>'
+        '<axis xyz="0 0 1"/></joint>'
+    )
+    lines = [body.format("base"), body.format("upper"), joint.format("first", "base", "upper"),
+             body.format("lower"), joint.format("second", "upper", "lower")]  # fmt: skip
+    (tmp_path / "r.urdf").write_text("\n".join(["<robot name='r'>", *lines, "</robot>"]))
+    model = RobotModel.from_urdf(tmp_path / "r.urdf", terms=())
+    pi = model.standard_parameters()
+    pi[[0, 10]] = 2.5, 3.5
+    changes = [line for line in urdf_changes(model, pi) if line.startswith("@@")]
+    assert changes == ["@@ -3 +3 @@ upper", "@@ -5 +5 @@ lower"]
+
+
 def test_a_sidecar_states_the_loops(tmp_path):
     model = four_bar(tmp_path)
     sidecar = write_urdf(model, model.standard_parameters(), tmp_path / "written.urdf")
