@@ -596,3 +596,12 @@ def test_a_robot_with_loops_is_refused_before_its_logs_are_read(tmp_path):
         identify_payload(chain, [], [])
     with pytest.raises(DataError, match=words):
         payload_fit.fit_payloads(SimpleNamespace(model=chain), None, links=(), masses={})
+
+
+def test_a_mass_is_undetermined_by_its_share_of_the_payload_s_columns(ur5):
+    """In other units of the base parameters it is the same."""
+    K = structural_mapping(ur5).K
+    columns = payload_fit._payload_columns(ur5, K, ["tool0", "forearm_link"])
+    assert columns.shape == (len(K), 20)
+    small = payload_fit._payload_columns(ur5, 1e-5 * K, ["tool0", "forearm_link"])
+    np.testing.assert_allclose(small, 1e-5 * columns, rtol=1e-12)

@@ -62,6 +62,11 @@ def found(arm, logs, reported):
     return identify(arm, logs[:1], validation=logs[1:], progress=lambda *x: reported.append(x))
 
 
+def test_each_drive_has_its_choice_of_friction_though_none_is_added(found):
+    assert [drive.joint for drive in found.drives] == list(found.model.joints)
+    assert not any(drive.terms for drive in found.drives)
+
+
 def test_the_start_of_each_stage_is_reported(found, reported):
     assert [x for x in reported if x[3] == "stages"] == [
         (name, k, 5, "stages")
