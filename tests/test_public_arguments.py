@@ -99,6 +99,7 @@ CALLS = {
     "path    ": lambda m, log: robotid.inspect_urdf(5),
     "job": lambda m, log: robotid.run_job(5, "x"),
     "model ": lambda m, log: robotid.OnlineIdentifier(5),
+    "settings": lambda m, log: robotid.OnlineIdentifier(m, 5),
     "identification": lambda m, log: robotid.write_report(5, "x.html"),
     "found": lambda m, log: robotid.write_ranges(5, "x.yaml"),
     "pi": lambda m, log: robotid.write_urdf(m, 5, "x.urdf"),
@@ -261,6 +262,9 @@ REFUSED = {
     ),
     "ghost 'x' has 3 arrays, wanted two": lambda m, log: robotid.replay(
         m, log.t, log.q, ghosts=ghosts(log.t, log.q, log.q)
+    ),
+    "log: joints.joint_2 is 5, wanted a name": lambda m, log: robotid.LogSource(
+        joints={"joint_1": "a", "joint_2": 5}
     ),
     "gravity is ": lambda m, log: RobotModel.from_urdf(URDF, gravity=(0, 0, 10**400)),
     "trajectory: rate is 'x', wanted": lambda m, log: robotid.Trajectory(

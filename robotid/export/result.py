@@ -340,9 +340,10 @@ def read_result(path: str | Path) -> dict[str, Any]:
             "written by 'robotid identify'"
         )
     check_shape(result, _SHAPE, name)
-    recordings = [entry for entry in result["inputs"] if entry["role"] != "urdf"]
-    check_shape(recordings, [_RECORDING], f"{name}.inputs")
-    validation = [entry for entry in recordings if entry["role"] == "validation"]
+    for k, entry in enumerate(result["inputs"]):
+        if entry["role"] != "urdf":
+            check_shape(entry, _RECORDING, f"{name}.inputs[{k}]")
+    validation = [entry for entry in result["inputs"] if entry["role"] == "validation"]
     if len(validation) != len(result["validation"]):
         raise DataError(
             f"{name} has {len(validation)} validation recordings among its inputs, but errors of "

@@ -34,11 +34,11 @@ class Triangle:
         """Initialise for rows of so many columns."""
         self.R = np.zeros((columns, columns), order="F")
         self._is_empty = True
-        self._panel = min(_PANEL if columns < _WIDE else _WIDE_PANEL, columns)
+        self._panel = _PANEL if columns < _WIDE else _WIDE_PANEL
         # 8 sizes of C's int: m, n, l, nb, lda, ldb, ldt, info; then T and work
         self._scratch = np.empty(4 + 2 * self._panel * columns)
         self._sizes = self._scratch[:4].view(np.intc)
-        self._sizes[:] = 0, columns, 0, self._panel, columns, 0, self._panel, 0
+        self._sizes[[4, 6]] = columns, self._panel
 
     def fold(self, rows: Array) -> None:
         """Replace R by the triangular factor of [R; rows].

@@ -285,6 +285,24 @@ def test_a_torque_is_clipped_at_either_limit_and_held_by_groups():
     }
 
 
+def test_torques_without_sign_are_those_of_three_joints_that_reach_zero_thrice():
+    """Of five joints the last ones are 0 only twice, and never."""
+    t = 3.0 + np.arange(2000) / 100  # 20 s
+    speeds = 0.75, 0.9, 1.1
+    tau = np.column_stack([4.0 * np.abs(np.cos(w * (t - 3.0))) for w in speeds])
+    twice = 5.0 * np.abs(np.cos(0.3 * (t - 3.0)))
+    q, all_tau = np.cos(np.outer(t, np.arange(1, 6))), np.column_stack([tau, twice, 3.0 + 0 * t])
+    log = Log(t, q, all_tau, tuple("abcde"), path="run.csv")
+    found = one(check_torque_channels(log), "unsigned_torque")
+    assert (found.severity, found.evidence) == ("error", {"joints": 3})
+    assert found.message.startswith(
+        "run.csv: no torque is ever negative, although the torques of 3 joints reach 0 repeatedly"
+    )
+    for changed in (all_tau * [1, 1, 1, 1, -1], all_tau[:, [0, 1, 3, 3, 4]]):
+        other = replace(log, tau=changed)
+        assert "unsigned_torque" not in {f.code for f in check_torque_channels(other)}
+
+
 def test_proportional_commands_are_alike_in_their_changes_too():
     """Of a chain of three the least of the largest correlations; a trend alone is none."""
     t, rng = np.arange(3000) / 100, np.random.default_rng(2)

@@ -94,6 +94,19 @@ def test_excitation_is_that_of_the_weighted_rows_of_all_motions(planar, motions)
     )
 
 
+def test_the_excitation_by_a_joint_at_rest_is_checked_too(planar, motions):
+    """The rows determine fewer sums than there are base parameters."""
+    still = {name: getattr(motions[2], name) * [1.0, 0.0] for name in ("q", "v", "a")}
+    mapping, motion = structural_mapping(planar), replace(motions[2], **still)
+    (found,) = check_excitation(planar, mapping, [motion], EXACT, "one")
+    Y = joint_torque_regressor(planar, motion.q, motion.v, motion.a)[:, mapping.independent]
+    b = len(mapping.K)
+    assert (found.evidence["rank"], found.evidence["base"]) == (np.linalg.matrix_rank(Y), b)
+    assert found.evidence["rank"] < b
+    assert found.severity == "warning"
+    assert found.message.startswith("one: the motion determines 7 of 11 base parameters")
+
+
 def test_of_long_motions_every_nth_row_counts_for_n_in_what_is_independent(
     planar, motions, monkeypatch
 ):

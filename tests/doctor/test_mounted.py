@@ -1,12 +1,14 @@
 """Parts of the URDF that were not mounted, loads that only the validation log has."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from helpers.corruptions import NOISE, clean_log, robot
 from helpers.synthetic import perfect
 
+from robotid.doctor import mounted
 from robotid.doctor.diagnosis import diagnose
 from robotid.doctor.mounted import Segments, check_payload_change
 from robotid.doctor.sample import smooth_motion
@@ -14,6 +16,7 @@ from robotid.logs.settings import SignalSettings
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.bodies import link_places
 from robotid.robot.drives import FAMILIES
+from robotid.robot.prior import payload_spread
 from robotid.simulation.closed_loop import another_robot
 from robotid.simulation.motions import random_fourier
 from robotid.simulation.settings import Sensors
@@ -161,3 +164,33 @@ def test_rows_of_both_logs_are_independent_by_the_band_of_the_filter(ur5, monkey
         list(check_payload_change(fitted, kept, signals, "kept"))
     seconds = sum(float(np.ptp(run.motions[0].t)) for run in (fitted, kept))
     assert found.value.args[0] == pytest.approx(2 * 3.0 * seconds)
+
+
+@pytest.mark.parametrize(
+    ("share", "error", "found"),
+    [(0.0099, 1e-9, False), (0.0101, 1e-9, True), (-0.0101, 1e-9, True), (0.0101, 0.0021, False),
+     (0.0101, 0.002, True), (1.01, 1e-3, False)],
+)  # fmt: skip
+def test_a_change_of_load_is_significant_and_from_a_hundredth_of_the_arms_mass_to_all_of_it(
+    ur5, monkeypatch, share, error, found
+):
+    """Five standard errors with many degrees of freedom; scales leave more than the load."""
+    size = payload_spread(ur5)[0]
+    theta, covariance = np.ones(12), np.eye(12)
+    theta[-10], covariance[-10, -10] = share * size, (error * size) ** 2
+    compared = SimpleNamespace(theta=theta, covariance=covariance, freedom=np.full(12, 1e9))
+    runs = SimpleNamespace(
+        D=np.ones((3, 15)), alike=lambda: (np.full(12, size), 1e-9 * covariance),
+        compare=lambda by_joint: compared, residual_ratios=lambda x: np.array([1.2, 1.4]),
+        residual_ratios_by_scales=lambda count: np.array([1.0 + 0.1 * count, 1.42]),
+    )  # fmt: skip
+    monkeypatch.setattr(mounted, "payload_runs", lambda *_, **__: runs)
+    part = SimpleNamespace(squares=np.ones((3, 6)), samples=10)
+    mapping = structural_mapping(ur5)
+    run = SimpleNamespace(model=ur5, mapping=mapping, reductions=(part,), seconds=1.0)
+    findings = list(check_payload_change(run, run, SignalSettings(), "kept"))
+    assert len(findings) == found
+    for finding in findings:
+        assert finding.evidence == pytest.approx({"mass": share * size, "std_error": error * size})
+        word = "more" if share > 0 else "less"
+        assert f" kg {word} than in the fitted logs" in finding.message

@@ -1,6 +1,7 @@
 """A delay of the torque is found where there is one, and only where moving it back would help."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pinocchio as pin
@@ -373,3 +374,31 @@ def test_the_delay_of_one_joint_that_friction_by_load_explains_better_is_none(sh
     own = _Misfit(squares, np.ones(3), ("a", "b", "c"), loaded).own_delay(1, 0.01)
     assert own.explained == pytest.approx(0.9, abs=1e-4)
     assert own.is_significant is is_late
+
+
+def test_a_motion_is_read_where_it_moves_in_pieces_of_one_segment(ur5, monkeypatch):
+    monkeypatch.setattr(torque_delay, "_ROWS", 40)
+    monkeypatch.setattr(torque_delay, "_WINDOWS", 4)
+    v = np.zeros((200, 6))
+    motion = SimpleNamespace(v=v, segment=np.repeat([0, 1], [70, 130]))
+    assert torque_delay._segments(ur5, motion, 2) == []
+    v[60:75, 4] = 0.021
+    parts = torque_delay._segments(ur5, motion, 2)
+    assert [(part[0], part[-1]) for part in parts] == [(60, 69), (70, 74)]
+    v[160:181, 1] = -0.021  # four pieces of twenty rows from 60 to 180
+    parts = torque_delay._segments(ur5, motion, 2)
+    assert [(part[0], part[-1]) for part in parts] == [
+        (60, 69), (70, 79), (93, 112), (127, 146), (161, 180),
+    ]  # fmt: skip
+    v[:199] = 0.0
+    v[199, 0] = 1.0
+    (part,) = torque_delay._segments(ur5, motion, 2)
+    assert part.tolist() == [199]
+
+
+def test_values_of_one_instant_are_not_interpolated():
+    t, at = np.array([3.0]), np.zeros((81, 5))
+    assert torque_delay._interpolated(t, np.ones((1, 2)), at).shape == (81, 5, 2)
+    t = 3.0 + np.arange(6) / 10
+    found = torque_delay._interpolated(t, np.column_stack([t, 2.0 - t]), np.array([[3.05], [3.41]]))
+    np.testing.assert_allclose(found, [[[3.05, -1.05]], [[3.41, -1.41]]])

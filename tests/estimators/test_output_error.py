@@ -404,6 +404,16 @@ def test_other_residuals_move_an_estimate_by_its_normal_equations(rng):
     wanted = inverse @ (pulls[1] - pulls[0])[:2]
     np.testing.assert_allclose(change, [*wanted, 0.0], rtol=1e-9)
     np.testing.assert_allclose(error, [*np.sqrt(np.diag(inverse)), 0.0], rtol=1e-9)
+    # in units that differ by twelve orders the change is the same
+    H, unit = H[:2, :2], np.array([1e6, 1e-6])
+    fit = SimpleNamespace(
+        weights=lambda *_: None,
+        normal=lambda lag, *_, **__: (H * np.outer(unit, unit), unit * lag.pulls[:2]),
+    )
+    lags = [SimpleNamespace(pulls=x, bounds=UNBOUNDED[:, :2]) for x in pulls]
+    moved = OutputError.moved(fit, *lags, theta[:2])
+    np.testing.assert_allclose(moved[0] * unit, wanted, rtol=1e-9)
+    np.testing.assert_allclose(moved[1] * unit, np.sqrt(np.diag(inverse)), rtol=1e-9)
 
 
 def test_residuals_of_larger_variance_count_less_beside_further_rows(rng):

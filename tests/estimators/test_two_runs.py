@@ -248,3 +248,21 @@ def test_runs_that_differ_by_scales_leave_more_by_a_load_than_by_scales(rng):
             np.testing.assert_allclose(found, left / own.reshape(2, 2).sum(axis=0), rtol=1e-4)
         assert (found < 1.3).all()
         assert runs.residual_ratios(runs.compare().theta).mean() > 2.0
+
+
+def test_the_noise_of_a_joint_is_its_residual_or_its_signal_or_one():
+    """Of joints with many rows, some, few, without noise, without a signal, and without rows."""
+    logged = SimpleNamespace(
+        is_projected=False,
+        rows=np.array([1000, 85, 10, 1000, 1000, 0]),
+        columns=[np.arange(count) for count in (20, 20, 10, 20, 20, 0)],
+        torque_squares=lambda: np.array([80.0, 80.0, 90.0, 4000.0, 0.0, 0.0]),
+    )
+    runs = SimpleNamespace(
+        _logged=logged, _whole=(None, None), share=0.5,
+        _own_squares=np.array([46.0, 34.0, 1e-9, 0.0, 0.0, 0.0]),
+    )  # fmt: skip
+    # two runs' columns over the independent share of the rows: 80 degrees of freedom; a tenth of
+    # the rows are left at least
+    wanted = [np.sqrt(46 / 920), np.sqrt(34 / 8.5), 3.0, 2e-7, 1.0, 1.0]
+    np.testing.assert_allclose(TwoRuns._noise.func(runs), wanted)

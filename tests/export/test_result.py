@@ -270,6 +270,24 @@ def test_results_that_are_not_whole_are_refused(result, identified, tmp_path):
         path.write_text(json.dumps({**result, "verdict": part}))
         with pytest.raises(DataError, match=rf"^result\.json\.verdict is {words}"):
             read_result(path)
+    for value in (-1.01e100, -(10**101)):
+        structure = {**result["structure"], "base": value}
+        path.write_text(json.dumps({**result, "structure": structure}))
+        words = r"^result\.json\.structure\.base is -1.*, wanted a number of at most 1e\+100$"
+        with pytest.raises(DataError, match=words):
+            read_result(path)
+    structure = {**result["structure"], "base": -1e100}
+    path.write_text(json.dumps({**result, "structure": structure}))
+    assert read_result(path)["structure"]["base"] == -1e100
+    *others, last = result["inputs"]
+    assert len(others) == 3
+    for changed, words in (
+        ({**last, "rows_used": "x"}, r"inputs\[3\]\.rows_used is 'x', wanted a number"),
+        ({k: v for k, v in last.items() if k != "end"}, r"inputs\[3\] has no entry 'end': the"),
+    ):
+        path.write_text(json.dumps({**result, "inputs": [*others, changed]}))
+        with pytest.raises(DataError, match=rf"^result\.json\.{words}"):
+            read_result(path)
     short = {**result, "drive_parameters": result["drive_parameters"][1:]}
     with pytest.raises(ModelError, match=r"^the result has no value of shoulder_pan_joint\.arm"):
         stated_parameters(short, identified.model)

@@ -13,7 +13,11 @@ import robotid
 from robotid.cli import main
 from robotid.exceptions import DataError
 from robotid.export.result import load_result
+<<<<<<< HEAD
 from robotid.export.samples import _positive_definite, sample, write_samples
+=======
+from robotid.export.samples import _between, _quantile, sample, write_samples
+>>>>>>> fe
 from robotid.robot.parameters import pseudo_inertia
 from robotid.variation.variation import SCORES
 
@@ -209,6 +213,7 @@ def test_a_gain_of_the_next_log_has_the_part_of_the_fit_in_its_error(tmp_path, s
     assert np.corrcoef(kp, other)[0, 1] == pytest.approx(0.6 * of_gain, abs=0.08)
 
 
+<<<<<<< HEAD
 def test_positive_definite_matrices_have_positive_eigenvalues(rng):
     A = rng.standard_normal((400, 4, 4))
     J = A @ A.mT - rng.uniform(0.0, 1.0, 400)[:, None, None] * np.eye(4)
@@ -216,3 +221,32 @@ def test_positive_definite_matrices_have_positive_eigenvalues(rng):
     assert 50 < wanted.sum() < 350
     np.testing.assert_array_equal(_positive_definite(J), wanted)
     assert _positive_definite(np.diag([1.0, 2.0, 3.0, 0.0])[None]).tolist() == [False]
+=======
+def test_parameters_at_a_bound_have_no_quantiles_of_the_next_log():
+    """A place is that in the stated variation; an interval is 1.96 errors wide on each side."""
+    entries = [{"name": "a.kp"}, {"name": "b.kp", "at_bound": True}, {"name": "c.kd"}]
+    low = np.array([1.0, 2.0, 3.0])
+    parameters = {
+        entry["name"]: {
+            "next_interval": [x, x + 0.98], "std_error": x / 10, "next_quantiles": [x, x + 0.5]
+        }
+        for entry, x in zip(entries, low, strict=True)
+    }  # fmt: skip
+    found = _between({"drive_parameters": entries, "variation": {"parameters": parameters}})
+    assert list(found) == ["a.kp", "c.kd"]
+    for name, place, x in (("a.kp", 0, 1.0), ("c.kd", 2, 3.0)):
+        assert found[name]["at"] == place
+        assert found[name]["errors"] == pytest.approx((x / 10, 0.25), rel=1e-4)
+        np.testing.assert_array_equal(found[name]["quantiles"], [x, x + 0.5])
+    assert _between({"drive_parameters": entries}) == {}
+
+
+def test_the_typical_quantile_is_the_median_of_those_of_uncertain_parameters():
+    standard = [{"quantile": 2.0, "std_error": 1.0}, {"quantile": 9.0, "std_error": 0.0}, {}]
+    drives = [{"quantile": 3.0, "std_error": 0.1}, {"quantile": None, "std_error": 0.1},
+              {"quantile": 2.5, "std_error": 0.2}]  # fmt: skip
+    content = {"standard_parameters": standard, "drive_parameters": drives}
+    assert _quantile(content) == 2.5
+    content["drive_parameters"] = content["standard_parameters"] = standard[1:]
+    assert _quantile(content) == pytest.approx(1.96, abs=1e-3)
+>>>>>>> fe

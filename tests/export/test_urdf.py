@@ -372,6 +372,12 @@ def test_a_failure_while_writing_leaves_the_folder_as_it_was(source, tmp_path, r
             ModelError, match=r"new.urdf is not written: in the test reading, its torque"
         ):
             write_urdf(model, pi * 1.01, tmp_path / "new.urdf")
+    other = RobotModel.from_urdf(source, joints=model.joints[:1])
+    with monkeypatch.context() as patch:
+        patch.setattr(urdf, "load_identified", lambda *_: (other, other.standard_parameters()))
+        words = "^new.urdf is not written: in the test reading, it has other bodies or joints$"
+        with pytest.raises(ModelError, match=words):
+            write_urdf(model, pi * 1.01, tmp_path / "new.urdf")
     assert listing(tmp_path) == before
     with monkeypatch.context() as patch:
         patch.setattr(os, "replace", lambda *_: (_ for _ in ()).throw(OSError("disk full")))
@@ -531,6 +537,25 @@ def test_a_link_that_did_not_change_keeps_its_text_and_rounding_is_0(ur5, tmp_pa
     assert origin.split('xyz="')[1].split('"')[0].split()[2] == "0.0"
     write_urdf(ur5, pi, tmp_path / "new.urdf")
     assert "e-6" not in (tmp_path / "new.urdf").read_text()
+
+
+def test_a_change_is_of_the_link_in_its_line_and_not_of_the_next_line(tmp_path):
+    body = (
+        '<link name="{0}"><inertial><origin xyz="0.1 0 0"/><mass value="2"/><inertia ixx="1" '
+        'iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>'
+    )
+    joint = (
+        '<joint name="{0}" type="continuous"><parent link="{1}"/><child link="{2}"/>'
+        '<axis xyz="0 0 1"/></joint>'
+    )
+    lines = [body.format("base"), body.format("upper"), joint.format("first", "base", "upper"),
+             body.format("lower"), joint.format("second", "upper", "lower")]  # fmt: skip
+    (tmp_path / "r.urdf").write_text("\n".join(["<robot name='r'>", *lines, "</robot>"]))
+    model = RobotModel.from_urdf(tmp_path / "r.urdf", terms=())
+    pi = model.standard_parameters()
+    pi[[0, 10]] = 2.5, 3.5
+    changes = [line for line in urdf_changes(model, pi) if line.startswith("@@")]
+    assert changes == ["@@ -3 +3 @@ upper", "@@ -5 +5 @@ lower"]
 
 
 def test_a_sidecar_states_the_loops(tmp_path):

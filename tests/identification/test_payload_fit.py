@@ -8,6 +8,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 import scipy.signal
+from helpers.closed_chains import four_bar
 from helpers.driven import arm
 from helpers.synthetic import exact_log, truth
 from scipy.stats import t as t_of
@@ -565,3 +566,42 @@ def test_a_payload_of_no_significant_mass_has_nothing_else():
         own = payload_of(model, "tool", np.append(mass, x[1:]), C, np.full(10, np.inf)).reasons
         assert {key: own[key] for key in reasons} == reasons
         assert (why in own.values()) is bool(reasons)
+
+
+def test_the_nearest_possible_payload_is_that_of_the_covariance(monkeypatch):
+    """Of the first of two bodies Izz exceeds Ixx + Iyy; their errors share the excess."""
+
+    def body(mass, xx, zz):
+        return np.array([mass, 0, 0, 0, xx, 0, xx, 0, 0, zz])
+
+    monkeypatch.setattr(payload_fit, "payload_spread", lambda model: np.array([5.0]))
+    model = SimpleNamespace(length=1.5)
+    x = np.concatenate([body(2.0, 0.03, 0.08), body(3.0, 0.05, 0.04)])
+    xx, zz = 0.01**2, 0.02**2  # variances
+    variance = np.tile([0.01, *[4e-4] * 3, xx, 1e-4, xx, 1e-4, 1e-4, zz], 2)
+    share = 0.02 / (2 * xx + zz)
+    wanted = np.concatenate([body(2.0, 0.03 + share * xx, 0.08 - share * zz), x[10:]])
+    for masses in ({}, {"a": 2.0}):
+        C = np.diag(np.where(np.arange(20) == 0, 0.0, variance) if masses else variance)
+        found = payload_fit._possible(model, ["a", "b"], x, C, masses)
+        np.testing.assert_allclose(found, wanted, atol=1e-7)
+    C = np.diag(np.where(np.arange(20) == 10, 0.0, variance))
+    assert payload_fit._possible(model, ["a", "b"], x, C, {"b": 3.0})[10] == pytest.approx(3.0)
+
+
+def test_a_robot_with_loops_is_refused_before_its_logs_are_read(tmp_path):
+    chain = four_bar(tmp_path)
+    words = "four_bar has loops; the identification of a payload needs a robot without loops"
+    with pytest.raises(DataError, match=words):
+        identify_payload(chain, [], [])
+    with pytest.raises(DataError, match=words):
+        payload_fit.fit_payloads(SimpleNamespace(model=chain), None, links=(), masses={})
+
+
+def test_a_mass_is_undetermined_by_its_share_of_the_payload_s_columns(ur5):
+    """In other units of the base parameters it is the same."""
+    K = structural_mapping(ur5).K
+    columns = payload_fit._payload_columns(ur5, K, ["tool0", "forearm_link"])
+    assert columns.shape == (len(K), 20)
+    small = payload_fit._payload_columns(ur5, 1e-5 * K, ["tool0", "forearm_link"])
+    np.testing.assert_allclose(small, 1e-5 * columns, rtol=1e-12)

@@ -10,7 +10,7 @@ from helpers.driven import ELBOW, LIFT, arm, driven, driven_log, found_in
 
 from robotid.commands.export import export_result
 from robotid.commands.identify import save_result
-from robotid.exceptions import DataError
+from robotid.exceptions import DataError, SettingsError
 from robotid.export.ranges import parameter_ranges
 from robotid.export.result import load_result
 from robotid.export.urdf import read_sidecar
@@ -111,6 +111,8 @@ def test_another_joint_is_refused_by_name(found, loaded):
         found.friction("elbow")
     with pytest.raises(DataError, match="has no friction curve of 'elbow_joint '; joints with"):
         loaded.friction("elbow_joint ")
+    with pytest.raises(SettingsError, match=r"^joint is 5, a int, wanted the name of a joint"):
+        loaded.friction(5)
 
 
 def test_pinocchios_model_has_the_nearest_friction_and_says_so(found, loaded):

@@ -18,6 +18,7 @@ from robotid.identification.summary import (
     _errors,
     _tables,
     cell,
+    effect_text,
     error_lines,
     friction_lines,
     joint_reason,
@@ -52,8 +53,27 @@ def logs(arm):
 
 
 @pytest.fixture(scope="module")
-def found(arm, logs):
-    return identify(arm, logs[:1], validation=logs[1:])
+def reported():
+    return []
+
+
+@pytest.fixture(scope="module")
+def found(arm, logs, reported):
+    return identify(arm, logs[:1], validation=logs[1:], progress=lambda *x: reported.append(x))
+
+
+def test_each_drive_has_its_choice_of_friction_though_none_is_added(found):
+    assert [drive.joint for drive in found.drives] == list(found.model.joints)
+    assert not any(drive.terms for drive in found.drives)
+
+
+def test_the_start_of_each_stage_is_reported(found, reported):
+    assert [x for x in reported if x[3] == "stages"] == [
+        (name, k, 5, "stages")
+        for k, name in enumerate(
+            ["reading logs", "checking logs", "fitting", "errors and intervals"]
+        )
+    ]
 
 
 def test_an_identification_is_one_short_line(found):
@@ -236,3 +256,22 @@ def test_a_notebook_shows_each_joint_s_error_before_that_of_the_urdf():
     metrics = Metrics({"a": one, "b": other}, 1.0)
     rows = tables(_errors("log.csv: not fitted", metrics))["log.csv: not fitted"].rows
     assert rows == [["a", "2.5", "0.125", "N m", "41.5"], ["b", "7.5", "3", "N", "–"]]
+
+
+def test_an_effect_has_its_share_of_a_known_mean_or_its_unit():
+    """A share is of more than two standard errors; of a negative mean the absolute value rises."""
+    effects = {
+        "temperature": {"slope": -0.5, "std_error": 0.08, "unit": "degC", "by_log": [31, 25, 40]},
+        "time": {"slope": 0.25, "std_error": 0.02, "unit": "h", "by_log": [3.0, 7.5]},
+    }
+    for mean, error, temperature, time in (
+        (4.0, 1.9, "falls with temperature: by 12 +- 2 %", "rises with time: by 6.2 +- 0.5 %"),
+        (-4.0, 1.9, "rises with temperature: by 12 +- 2 %", "falls with time: by 6.2 +- 0.5 %"),
+        (4.0, 2.1, "falls with temperature: by 0.5 +- 0.08 N m",
+         "rises with time: by 0.25 +- 0.02 N m"),
+    ):  # fmt: skip
+        parameter = {"mean": mean, "std_error": error, "unit": "N m", "effects": effects}
+        assert effect_text("a.b", parameter, "temperature") == (
+            f"a.b {temperature} per degC (logs: 25 to 40 degC)"
+        )
+        assert effect_text("a.b", parameter, "time") == f"a.b {time} per h (logs: 4.5 h)"

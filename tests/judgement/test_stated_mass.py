@@ -171,6 +171,7 @@ def test_a_written_statement_is_read_as_it_was(stated):
     read = stated_scale_check({"scale_check": former})
     assert read.stated == (None if stated is None else StatedMass(()))
     assert not read.agrees
+    assert stated_scale_check({}) is stated_scale_check({"scale_check": None}) is None
 
 
 def test_a_message_names_the_figure_its_limit_and_the_probable_cause():

@@ -10,7 +10,7 @@ from helpers.synthetic import exact_log, truth
 from robotid.exceptions import DataError
 from robotid.logs.settings import SignalSettings
 from robotid.recordings import logs as recordings_module
-from robotid.recordings.logs import Recordings
+from robotid.recordings.logs import Recordings, RepeatedErrors
 from robotid.recordings.survey import hold_log
 from robotid.regressor.base_parameters import structural_mapping
 
@@ -64,3 +64,19 @@ def test_logs_in_files_have_segments_as_many_as_fit_into_the_memory(monkeypatch)
     parts[2].samples = 0
     with pytest.raises(DataError, match="short"):
         recordings.reduce()
+
+
+def test_errors_that_repeat_are_described_with_their_figures():
+    root, bias = np.eye(2), np.array([0.1234, -0.5, 0.0625])
+    none = RepeatedErrors(root, 1.0, 0.0)
+    assert none.described == ""
+    points = RepeatedErrors(root, 1.0, 0.0125)
+    assert points.described == "points of contact uncertain by 0.013 m"
+    both = RepeatedErrors(root, 1.0, 0.0125, bias, 0.025, has_motion=True)
+    assert both.described == (
+        "points of contact uncertain by 0.013 m; bias of the accelerometers, estimated and "
+        "subtracted: +0.123, -0.500, +0.062 m/s^2, uncertain by 0.025 m/s^2; errors of the motion "
+        "of the base that would cause the residual"
+    )
+    alone = RepeatedErrors(root, 1.0, 0.0, has_motion=True)
+    assert alone.described == "errors of the motion of the base that would cause the residual"

@@ -25,7 +25,7 @@ from robotid.recordings.logs import Recordings
 from robotid.recordings.survey import ReducedPiece, _temperatures, hold_log, survey_log
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.factors import join
-from robotid.regressor.torque import joint_torque_regressor
+from robotid.regressor.torque import joint_torque_regressor, mass_regressor
 from robotid.robot.closure import Chains
 from robotid.robot.constraints import Contact
 from robotid.robot.drives import Cubic
@@ -231,6 +231,34 @@ def test_time_must_increase_where_pieces_meet_too(ur5, recording, tmp_path, row)
     assert f"t[{row}]" in str(in_pieces.value)
 
 
+def test_a_log_is_read_in_pieces_of_16384_rows_if_nothing_else_is_said(tmp_path):
+    arm = RobotModel.from_urdf(example_urdf("ur5_robot.urdf"), joints=["elbow_joint"])
+    t = 3.0 + 0.01 * np.arange(16_500)
+    columns = {"t": t, "q_elbow_joint": np.sin(t), "tau_elbow_joint": np.cos(t)}
+    write_columns(columns, tmp_path / "run.parquet")
+    layout, table = lay_out(tmp_path / "run.parquet", arm.joints)
+    found = survey_log(layout, table, arm, SignalSettings(), (4.0, None))
+    assert [(p.first, p.stop) for p in found.pieces] == [(100, 16_484), (16_484, 16_500)]
+    assert found.with_accelerometer_bias(np.ones(3)).windows == found.windows  # it has no IMU
+
+
+def test_samples_have_the_regressor_of_their_mass_matrix(ur5, recording, tmp_path):
+    """Of two logs, in memory and in pieces."""
+    mapping, signals = structural_mapping(ur5), SignalSettings(cutoff=None, trim=0.0)
+    logs = [recording.window(start, start + 0.8) for start in (1.0, 3.0)]
+    held = [hold_log(ur5, log, signals) for log in logs]
+    q = np.concatenate([log.whole.trajectory.q for log in held])
+    wanted = mass_regressor(ur5, q)[..., mapping.independent]
+    for k, log in enumerate(logs):
+        write_log(log, tmp_path / f"{k}.csv")
+    read = [long_log(ur5, tmp_path / f"{k}.csv", signals, length=30) for k in range(2)]
+    for own in (held, read):
+        recordings = Recordings(ur5, mapping, own)
+        found = [sample.mass_regressor for sample in recordings.problem(with_mass=True).samples()]
+        np.testing.assert_allclose(np.array(found), wanted, atol=1e-9)
+        assert next(recordings.problem().samples()).mass_regressor is None
+
+
 def test_pieces_travel_as_they_are(ur5, recording, tmp_path):
     path = tmp_path / "run.parquet"
     write_log(recording, path)
@@ -292,10 +320,17 @@ def test_the_pieces_of_a_log_have_the_bias_of_all_rests_of_its_windows(monkeypat
         np.testing.assert_allclose(values, w[rows] @ turn.T - wanted, atol=1e-6)
         (note,) = [x for x in log.notes if "gyroscopes" in x]
         assert "estimated in 2.5 s at rest" in note
-    pieces = [piece.read().trajectory for piece in found.pieces]
-    at, own = (np.concatenate([getattr(x, name) for x in pieces]) for name in ("t", "v"))
+    offset = np.array([0.3, -0.2, 0.1])
+    changed = found.with_accelerometer_bias(offset)
+    for log in changed.windows:
+        np.testing.assert_array_equal(log.base.imu.frame.offset, offset)
+    pieces, others = ([x.read().trajectory for x in log.pieces] for log in (found, changed))
+    at, own, a = (np.concatenate([getattr(x, name) for x in pieces]) for name in ("t", "v", "a"))
     rows = np.searchsorted(t, at - 1e-6)
     np.testing.assert_allclose(own[:, 3:6], w[rows] @ turn.T - wanted, atol=1e-6)
+    biased = np.concatenate([x.a for x in others])
+    np.testing.assert_allclose(a[:, :3] - biased[:, :3], np.tile(offset, (len(a), 1)), atol=1e-9)
+    np.testing.assert_array_equal(a[:, 3:], biased[:, 3:])
 
 
 def test_windows_of_a_long_log_are_named_by_their_own_rows(monkeypatch):
@@ -316,6 +351,22 @@ def test_windows_of_a_long_log_are_named_by_their_own_rows(monkeypatch):
     short = SimpleNamespace(windows=windows[:1], first=7, stop=300)
     assert survey.SurveyedLog.looks.fget(short) == windows[:1]
     assert survey.SurveyedLog.head.fget(short) is windows[0]
+
+
+def test_a_log_without_a_segment_of_sufficient_length_is_named():
+    for is_static, words in (
+        (False, "none of its 2 segments without gaps is long enough for the filter and a trim of "
+         "0.75 s at each end"),
+        (True, "no segment of 0.25 s is slow enough for dynamics = 'static'"),
+    ):  # fmt: skip
+        for path, name in (("", "log"), ("run.csv", "run.csv")):
+            log = SimpleNamespace(
+                model=SimpleNamespace(is_static=is_static), path=path, segments=("a", "b"),
+                signals=SignalSettings(trim=0.75),
+            )  # fmt: skip
+            error = survey.SurveyedLog.too_short(log)
+            assert str(error).startswith(f"{name}: {words}; record")
+            assert error.code == "too_short"
 
 
 def test_other_drive_terms_keep_the_rows_and_torques_without_contact_forces(rng):

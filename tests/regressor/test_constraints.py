@@ -236,6 +236,7 @@ def test_rows_are_projected_and_counted(quadruped, rng):
     dense *= np.sqrt(used * weight)[..., None]
     factors = compress(problem, threads=1)
     assert factors.is_projected
+    assert all(own.is_projected for own in compress_segments(problem, 25))
     for j, R in enumerate(factors.R):
         rows = dense[:, j]
         np.testing.assert_allclose(R.T @ R, rows.T @ rows, atol=1e-9 * np.abs(rows).max() ** 2)

@@ -114,7 +114,7 @@ def test_both_velocities_are_compared_on_the_rows_that_both_have(monkeypatch):
 
 
 @pytest.mark.parametrize(("last", "wanted"), [(0.84, False), (0.86, True)])
-def test_the_median_joint_of_all_logs_decides(monkeypatch, last, wanted):
+def test_the_median_joint_of_all_logs_decides(monkeypatch, caplog, last, wanted):
     errors = {
         "a": np.array([[1.0, 0.9], [2.0, np.nan]]),
         "b": np.array([[4.0, 3.2], [5.0, 5 * last]]),
@@ -123,7 +123,12 @@ def test_the_median_joint_of_all_logs_decides(monkeypatch, last, wanted):
         monkeypatch.setattr(velocity_choice, name, lambda log: False)
     monkeypatch.setattr(velocity_choice, "_errors", lambda model, log, settings: errors[log.name])
     logs = [SimpleNamespace(name=name) for name in "ab"]
-    assert velocity_choice.prefers_measured(None, logs, SignalSettings()) is wanted
+    with caplog.at_level("INFO", "robotid"):
+        assert velocity_choice.prefers_measured(None, logs, SignalSettings()) is wanted
+    chosen = "measured" if wanted else "differentiated"
+    (said,) = caplog.messages
+    assert said.startswith(f"a: velocity = 'auto' uses {chosen} velocities: the torque prediction")
+    assert f" is {last:.2f} times that with measured velocities" in said
     errors["a"], errors["b"] = np.full((2, 2, 2), np.nan)
     timely = {"a": True, "b": wanted}
     monkeypatch.setattr(velocity_choice, "is_timely", lambda log, delay: timely[log.name])

@@ -3,6 +3,7 @@ import pinocchio as pin
 import pytest
 
 from robotid.robot.bodies import (
+    LinkPlace,
     central_inertial,
     held_parameters,
     least_density,
@@ -44,6 +45,15 @@ def test_links_behind_a_locked_joint_are_held(panda):
     held = held_parameters(panda).reshape(-1, 10)
     assert held[-1, 0] == pytest.approx(2 * fingers)
     assert not held[:-1].any()
+
+
+@pytest.mark.parametrize(
+    ("body", "role", "is_lumped"),
+    [(0, "fixed", True), (3, "fixed", True), (-1, "fixed", False), (0, "moved", False),
+     (3, "held", False)],
+)  # fmt: skip
+def test_the_mass_of_links_fixed_to_moved_ones_is_lumped(body, role, is_lumped):
+    assert LinkPlace("tool", body, role, np.zeros(10)).is_lumped is is_lumped
 
 
 def test_the_least_density_of_a_body_is_that_of_its_ellipsoid():

@@ -67,6 +67,15 @@ def test_a_lever_is_the_derivative_of_its_springs_energy():
     )
 
 
+def test_a_lever_that_is_not_described_hangs_at_the_zero_position():
+    """Arms of 0.1 and 0.5 m, a spring without length at rest: tau = k a b sin q."""
+    z = np.array([-2.0, 0.0, 0.7])
+    term = TERM_CLASSES["Counterbalance"]()
+    y, slope = term.position_law(z, term.arm, term.base, term.angle, term.rest)
+    np.testing.assert_allclose(y, 0.05 * np.sin(z), atol=1e-15)
+    np.testing.assert_allclose(slope, 0.05 * np.cos(z))
+
+
 def test_bristles_keep_what_the_solution_of_their_equation_keeps():
     s_0, w, c = 0.03, 0.4, 0.6
     v = np.array([0.0, 0.1, -0.3, 1.2, -2.0])

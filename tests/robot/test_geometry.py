@@ -152,6 +152,11 @@ def test_the_box_of_a_body_holds_its_geometry_or_its_frames_and_the_urdfs_own_bo
     # frames alone: the flange is 1 m up
     low, high = body_boxes(arm(tmp_path))["one"]
     np.testing.assert_allclose([low, high], [[-0.35, -0.35, -0.35], [0.35, 0.35, 1.35]], atol=1e-9)
+    # a joint at the frame of its body: one metre, the length of the robot, is grown by a tenth
+    text = (tmp_path / "arm.urdf").read_text().replace('type="fixed"', 'type="continuous"')
+    (tmp_path / "two.urdf").write_text(text.replace(".01", ".002"))
+    box = body_boxes(RobotModel.from_urdf(tmp_path / "two.urdf"))["flange"]
+    np.testing.assert_allclose(box, np.outer([-0.1, 0.1], np.ones(3)), atol=1e-9)
     # a heavy flange's own body reaches beyond the sphere that is drawn: 3 sigma^2 about the centre
     small = arm(tmp_path, SPHERE, '<visual><geometry><sphere radius="0.01"/></geometry></visual>')
     (J,) = pseudo_inertia(small.standard_parameters()[:10])

@@ -136,6 +136,12 @@ def test_a_scene_holds_each_mesh_once_and_names_what_is_missing(package):
     (note,) = shown.notes
     assert note.startswith("1 meshes were not found or are not readable")
     assert "lost.stl" in note
+    second = '<visual><geometry><mesh filename="other.stl"/></geometry></visual><visual>'
+    text = URDF.replace("<visual><geometry><sphere", f"{second}<geometry><sphere")
+    (package / "urdf" / "r.urdf").write_text(text)
+    (note,) = robot_scene(RobotModel.from_urdf(package / "urdf" / "r.urdf")).notes
+    lost = "package://my_robot/meshes/lost.stl"
+    assert note == f"2 meshes were not found or are not readable, for example {lost}"
 
 
 def test_a_mesh_is_thinned_once_until_its_file_is_another(package, monkeypatch):

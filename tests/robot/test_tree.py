@@ -124,6 +124,29 @@ def test_pinocchio_gets_the_tree_alone_and_the_whole_file_is_kept(chain):
     assert [i.mass for i in lean.inertias] == [i.mass for i in full.inertias]
 
 
+def test_gear_ratios_are_of_transmissions_with_one_joint_one_actuator_and_one_ratio(tmp_path):
+    gear = "<mechanicalReduction>{}</mechanicalReduction>"
+    gears = (
+        ("first", 1, f"<actuator name='m1'>{gear.format(' -80 ')}</actuator>"),
+        ("none", 1, "<actuator name='m2'/>"),
+        ("wrist", 2, f"<actuator name='m3'>{gear.format(3)}</actuator>"),
+        ("pair", 1, f"<actuator name='m4'/><actuator name='m5'>{gear.format(4)}</actuator>"),
+        ("both", 1, f"<actuator name='m6'>{gear.format(5)}{gear.format(6)}</actuator>"),
+        ("last", 1, f"<actuator name='m7'>{gear.format('0.5')}</actuator>"),
+    )
+    text = "".join(
+        f"<transmission name='t'>{f'<joint name={name!r}/>' * count}{rest}</transmission>"
+        for name, count, rest in gears
+    )
+    path = tmp_path / "r.urdf"
+    path.write_text(f"<robot name='r'><link name='base'/>{text}</robot>")
+    assert read_tree(path).reductions == {"first": -80.0, "last": 0.5}
+    path.write_text(path.read_text().replace("0.5<", "half<"))
+    words = "^r.urdf: the mechanicalReduction of joint 'last' is 'half', wanted a number$"
+    with pytest.raises(ModelError, match=words):
+        _ = read_tree(path).reductions
+
+
 def test_numbers_are_all_finite_or_none():
     assert numbers(" 1 -2.5e0  +.3 ", 3) == (1.0, -2.5, 0.3)
     assert numbers(" 1.E+1", 1) == (10.0,)

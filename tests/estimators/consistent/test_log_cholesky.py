@@ -1,6 +1,7 @@
 """Log-Cholesky against Pinocchio, finite differences and the cone programme."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pinocchio as pin
@@ -91,6 +92,53 @@ def test_it_agrees_with_the_cone_programme_where_no_constraint_binds(ur5, rng, m
     assert np.abs(difference).max() < 1e-6
     assert abs(smooth.details["gaps"][0]) < 1e-9
     assert smooth.converged
+
+
+def test_curvatures_of_any_size_are_settled_in_a_few_steps_of_limited_length(rng):
+    """A parabola of curvatures 1e6 to 1e-4; a step changes no coordinate by more than four."""
+    size = np.array([1e3, 1.0, 1e-2])
+    root = rng.standard_normal((5, 3))
+    H, least = size[:, None] * (root.T @ root) * size, np.array([0.5, -2.0, 9.0])
+    visited = []
+
+    def objective(rows, z, price, stiffness):
+        assert (rows, price, stiffness) == ("rows", "price", "stiffness")
+        visited.append(z)
+        return 3.0 + 0.5 * float((z - least) @ H @ (z - least))
+
+    def derivatives(rows, z, price, stiffness):
+        return H @ (z - least), H
+
+    fit = SimpleNamespace(objective=objective, derivatives=derivatives)
+    z, steps, converged = LogCholesky._settle(fit, "rows", np.zeros(3), "price", "stiffness")
+    np.testing.assert_allclose(z, least, atol=1e-4)
+    assert converged
+    assert 4 <= steps <= 8
+    moves = np.abs(np.diff(visited, axis=0)).max(axis=1)
+    np.testing.assert_allclose(moves[0], 4.0)
+    assert moves.max() < 4.0 + 1e-9
+
+
+def test_multipliers_are_updated_until_they_change_no_more():
+    """Two parameters, one extent; the second round finds the multiplier of the first."""
+    rounds, ends = [], [0.75, 2.0, 2.0, 2.0]
+
+    def settle(rows, z, price, stiffness):
+        rounds.append((z, price.tolist(), stiffness))
+        return np.array([ends[len(rounds) - 1], 5.0]), 3, True
+
+    fit = SimpleNamespace(
+        fit_in_cone=SimpleNamespace(objective=lambda rows, pi: 7.0 + pi[1] - 5.0),
+        _parameters=lambda z: (z, None),
+        _extents=np.array([[1.0, -0.2]]),  # -0.25 after the first round, 1 after the second
+        _settle=settle,
+    )
+    z, value, steps, converged = LogCholesky._descend(fit, "rows", np.array([0.0, 5.0]))
+    assert (value, steps, converged) == (7.0, 9, True)
+    assert z.tolist() == [2.0, 5.0]
+    prices = [price for _, price, _ in rounds]
+    np.testing.assert_allclose(prices, [[0.0], [17.5], [0.0]], rtol=1e-12)  # 70 * 0.25
+    assert {stiffness for *_, stiffness in rounds} == {70.0}
 
 
 def test_at_active_constraints_the_gap_is_stated_and_small(case):

@@ -425,3 +425,23 @@ def test_a_larger_weight_may_leave_an_error_that_repeats_in_all_segments():
     assert not weighting._is_accepted(worse, best, 0.009)
     assert weighting._is_accepted(worse, best, 0.011)
     assert not weighting._is_accepted(best * 1.03**2, best, 0.1)
+
+
+@pytest.mark.parametrize(("repeated", "share"), [(0.0, 0.0), (0.36, 0.36), (0.75, 0.5)])
+def test_an_error_that_repeats_makes_a_residual_larger_by_its_share(
+    case, monkeypatch, repeated, share
+):
+    """Of a squared residual it is at most one half."""
+    fit, problem = case
+    segments, given = Segments.of(fit, cut(problem, 4)), []
+    found = SimpleNamespace(plausible=None)
+
+    def search(score, how, smallest, excess):
+        given.append((how, excess))
+        return found
+
+    monkeypatch.setattr(weighting, "_search", search)
+    monkeypatch.setattr(weighting, "plausible_weight", lambda *_: 0.1)
+    monkeypatch.setattr(weighting, "replace", lambda choice, **_: choice)
+    choose_weight(fit, segments, "cv", repeated)
+    assert given == [("evidence", 0.0), ("cv", pytest.approx(np.log(1 / np.sqrt(1 - share))))]

@@ -76,10 +76,19 @@ def test_prx_says_what_it_lacks_and_refuses_settings(states):
             estimator.update(estimator.init(58), sample)
     with pytest.raises(DataError, match="step is 'wrong', wanted 'exact' or 'printed'"):
         PRX(np.ones(6), step="wrong")
-    with pytest.raises(DataError, match="passes is 0"):
-        PRX(np.ones(6), passes=0)
-    with pytest.raises(DataError, match="step_size is 2"):
-        NormalisedGradient(np.ones(6), step_size=2.0)
+    positive = "wanted a positive number"
+    for method, name, value, words in (
+        (PRX, "metric", "torque", "wanted 'noise', 'mass' or 'rows'"),
+        (PRX, "bounds", 0.0, positive),
+        (PRX, "passes", 0, positive),
+        (PRX, "eps1", 0.0, positive),
+        (PRX, "eps2", -1e-12, positive),
+        (NormalisedGradient, "regularisation", 0.0, positive),
+        (NormalisedGradient, "step_size", 0.0, "wanted above 0 and below 2"),
+        (NormalisedGradient, "step_size", 2.0, "wanted above 0 and below 2"),
+    ):
+        with pytest.raises(DataError, match=rf"^{name} is '?{value}'?, {words}$"):
+            method(np.ones(6), **{name: value})
 
 
 @pytest.mark.parametrize("average", [False, True])
@@ -208,3 +217,7 @@ def test_columns_are_scaled_by_the_rows_of_every_block_with_their_weights(rng):
         for W, _, weight in blocks
     )
     np.testing.assert_allclose(column_scale(problem, sigma), [*np.sqrt(squares[:2] / 8), 1.0])
+    # below 1e-9 of the largest, a column has no data
+    small = np.array([[2.0, 2.4e-9, 1.6e-9]])
+    problem.n_joints, problem.blocks = 1, lambda: iter([(small, np.ones(1), np.ones(1))])
+    np.testing.assert_allclose(column_scale(problem, np.ones(1)), [2.0, 2.4e-9, 1.0])
