@@ -13,11 +13,13 @@ import robotid
 from robotid.cli import main
 from robotid.exceptions import DataError
 from robotid.export.result import load_result
-<<<<<<< HEAD
-from robotid.export.samples import _positive_definite, sample, write_samples
-=======
-from robotid.export.samples import _between, _quantile, sample, write_samples
->>>>>>> fe
+from robotid.export.samples import (
+    _between,
+    _positive_definite,
+    _quantile,
+    sample,
+    write_samples,
+)
 from robotid.robot.parameters import pseudo_inertia
 from robotid.variation.variation import SCORES
 
@@ -213,7 +215,6 @@ def test_a_gain_of_the_next_log_has_the_part_of_the_fit_in_its_error(tmp_path, s
     assert np.corrcoef(kp, other)[0, 1] == pytest.approx(0.6 * of_gain, abs=0.08)
 
 
-<<<<<<< HEAD
 def test_positive_definite_matrices_have_positive_eigenvalues(rng):
     A = rng.standard_normal((400, 4, 4))
     J = A @ A.mT - rng.uniform(0.0, 1.0, 400)[:, None, None] * np.eye(4)
@@ -221,7 +222,8 @@ def test_positive_definite_matrices_have_positive_eigenvalues(rng):
     assert 50 < wanted.sum() < 350
     np.testing.assert_array_equal(_positive_definite(J), wanted)
     assert _positive_definite(np.diag([1.0, 2.0, 3.0, 0.0])[None]).tolist() == [False]
-=======
+
+
 def test_parameters_at_a_bound_have_no_quantiles_of_the_next_log():
     """A place is that in the stated variation; an interval is 1.96 errors wide on each side."""
     entries = [{"name": "a.kp"}, {"name": "b.kp", "at_bound": True}, {"name": "c.kd"}]
@@ -249,4 +251,3 @@ def test_the_typical_quantile_is_the_median_of_those_of_uncertain_parameters():
     assert _quantile(content) == 2.5
     content["drive_parameters"] = content["standard_parameters"] = standard[1:]
     assert _quantile(content) == pytest.approx(1.96, abs=1e-3)
->>>>>>> fe
