@@ -351,8 +351,9 @@ def _regressor(model: RobotModel, motion: Trajectory, samples: Array | None = No
 
 def _in_units(Y: Array, independent: Array, U: Array) -> Array:
     """Return the independent columns of regressors (N, n, p) times U^T, shape (N, n, b)."""
-    rows = Y.reshape(-1, Y.shape[2]).take(independent, axis=1)  # one product, not one per sample
-    return (rows @ U.T).reshape(*Y.shape[:2], len(U))
+    units = np.zeros((Y.shape[2], len(U)))
+    units[independent] = U.T  # one product of all rows, without a copy of these columns
+    return (Y.reshape(-1, len(units)) @ units).reshape(*Y.shape[:2], len(U))
 
 
 def _lengths(basis: Array) -> Array:
