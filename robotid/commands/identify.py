@@ -164,7 +164,9 @@ def _write(
         played = {"replay": replay} if job.replay else {}
         written = {"urdf": name, "sidecar": sidecar} if found.has_urdf else {}
         if job.report:
-            found = replace(found, report=str(target / report))
+            before, found = found, replace(found, report=str(target / report))
+            if isinstance(before, Identification) and isinstance(found, Identification):
+                found = found.with_scale_of(before)
             links = {"result": "result.json", **written, **played}
             origin = Origin(tuple(source), str(target), replay)
             write_report(found, partial / report, files=links, origin=origin)

@@ -289,7 +289,7 @@ def _auto(sample: Sample, drive: _Drive, first: Sequence[str] = ()) -> DriveChoi
             break
         own = found.own
         known = known if set(chosen) <= set(retained[best]) else []
-        weighted = _reweighted(sample, drive, own)
+        weighted = found.weighted
         every, torque = _Options.of(weighted, drive, [*own, *grid]), float(weighted.torque[0])
         chosen = list(range(len(own)))
         before = every.left(chosen)
@@ -320,12 +320,13 @@ def _simplicity(every: _Options, i: int) -> tuple[int, int]:
     return len(every.place[i]), list(FAMILIES).index(every.own[i][0].name)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Refined:
     """A candidate together with those chosen, with shapes refined between the grid's values."""
 
     number: int
     own: list[tuple[Family, list[float]]]  # those chosen and the candidate
+    weighted: Sample  # the samples with weights from the residual with these
     faults: tuple[bool, bool]  # a shape is at its bound, a standard error increases tenfold
 
 
@@ -346,9 +347,9 @@ def _conditioned(
 
     def refined(i: int) -> _Refined:
         own = _refined(sample, drive, [every.own[k] for k in (*retained[i], i)])
-        grown = _grown(_reweighted(sample, drive, own), drive, own)
-        is_grown = max(grown.values(), default=1.0) > TENFOLD
-        return _Refined(i, own, (bool(_at_bound(drive, own).any()), is_grown))
+        weighted = _reweighted(sample, drive, own)
+        is_grown = max(_grown(weighted, drive, own).values(), default=1.0) > TENFOLD
+        return _Refined(i, own, weighted, (bool(_at_bound(drive, own).any()), is_grown))
 
     def left_of(other: _Refined) -> Array:
         return _Options.of(sample, drive, other.own).left(range(len(other.own)))

@@ -277,7 +277,8 @@ def take_sample(fit: Solution, *, for_drives: bool = False) -> Sample | None:
     weight = used * np.sqrt(independent) / np.where(scale > 0, scale, np.inf)
     # C = U^T U: base parameters over their prior spread are of size 1
     U = np.asarray(np.linalg.qr((mapping.K * fit.prior_std).T, mode="r"))
-    W = weight[:, :, None] * (Y[:, :, mapping.independent] @ U.T)
+    W = _in_units(Y, mapping.independent, U)
+    W *= weight[:, :, None]
     r = weight * r
     return Sample(
         joints=model.joints,
@@ -308,9 +309,8 @@ def along(sample: Sample, model: RobotModel, at: Sequence[Trajectory], tau: Arra
         at: The motions, as of ``Sample.at``.
         tau: Torques of the estimate along them, shape (N, n) [N m or N].
     """
-    independent = sample.independent
-    Y = np.concatenate([_regressor(model, motion)[:, :, independent] for motion in at])
-    W = sample.weight[:, :, None] * (Y @ sample.U.T)
+    Y = np.concatenate([_regressor(model, motion) for motion in at])
+    W = sample.weight[:, :, None] * _in_units(Y, sample.independent, sample.U)
     W = np.concatenate([W, sample.W[:, :, W.shape[2] :]], axis=2)
     r = sample.weight * (np.concatenate([motion.tau for motion in at]) - tau)
     normal = Normal.of(W, r, sample.segments, sample.fitted)
@@ -347,6 +347,13 @@ def _regressor(model: RobotModel, motion: Trajectory, samples: Array | None = No
     """Return the regressor of the standard parameters at some samples, shape (N, n, p)."""
     Y = trajectory_regressor(model, motion, samples)
     return Y.reshape(-1, model.n_rows, Y.shape[1])
+
+
+def _in_units(Y: Array, independent: Array, U: Array) -> Array:
+    """Return the independent columns of regressors (N, n, p) times U^T, shape (N, n, b)."""
+    units = np.zeros((Y.shape[2], len(U)))
+    units[independent] = U.T  # one product of all rows, without a copy of these columns
+    return (Y.reshape(-1, len(units)) @ units).reshape(*Y.shape[:2], len(U))
 
 
 def _lengths(basis: Array) -> Array:

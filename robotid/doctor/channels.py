@@ -271,8 +271,11 @@ def _channels(log: Log) -> Iterator[tuple[str, Array]]:
 
 def _jumps(deviation: Array, noise: float, amplitude: float) -> tuple[Array, Array]:
     """Return the rows that differ strongly from their neighbours, and their deviations."""
-    typical = max(1.48 * float(np.median(np.abs(deviation))), noise)
-    rows = np.flatnonzero(np.abs(deviation) > max(_SPIKE * typical, _BEYOND * amplitude))
+    size = np.abs(deviation)
+    rows = np.flatnonzero(size > _BEYOND * amplitude)
+    if len(rows):
+        typical = max(1.48 * float(np.median(size)), noise)
+        rows = rows[size[rows] > _SPIKE * typical]
     return rows, deviation[rows]
 
 

@@ -216,7 +216,7 @@ class Fit(Identified, Solution):
         """Base parameters that the data do not determine by themselves."""
         return self.determination.undetermined
 
-    @property
+    @cached_property
     def moments(self) -> dict[str, DriveMoments]:
         """Moments that project drive friction on simpler terms, from the fitted rows, by drive."""
         return fitted_moments(self)

@@ -4,6 +4,7 @@ They equal ``sosfiltfilt(butter(...))`` and ``savgol_filter`` of scipy.signal to
 import of that package takes longer than the doctor.
 """
 
+from functools import cache
 from math import factorial
 
 import numpy as np
@@ -15,6 +16,7 @@ from robotid._typing import Array
 __all__ = ["butterworth_poles", "local_polynomial", "zero_phase"]
 
 
+@cache  # a log has few filters, each for many channels
 def butterworth_poles(order: int, cutoff: float, rate: float) -> Array:
     """Return the poles of a digital Butterworth low-pass filter, by the bilinear transform.
 
@@ -24,11 +26,13 @@ def butterworth_poles(order: int, cutoff: float, rate: float) -> Array:
         rate: Rows per second.
 
     Returns:
-        The poles with an imaginary part >= 0, shape (ceil(order / 2),), complex.
+        The poles with an imaginary part >= 0, shape (ceil(order / 2),), complex, read-only.
     """
     angles = np.pi * (2 * np.arange((order + 1) // 2) + order + 1) / (2 * order)
     analog = np.tan(np.pi * cutoff / rate) * np.exp(1j * angles)
-    return np.asarray((1 + analog) / (1 - analog))
+    poles = np.asarray((1 + analog) / (1 - analog))
+    poles.flags.writeable = False
+    return poles
 
 
 def zero_phase(x: Array, order: int, cutoff: float, rate: float, pad: int) -> Array:

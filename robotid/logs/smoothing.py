@@ -29,6 +29,8 @@ _ALL = slice(None)
 #: Rows of a log up to which its motions are kept as long as the log.
 KEPT = 20_000
 _KNOWN: WeakKeyDictionary[Log, dict[object, Trajectory]] = WeakKeyDictionary()
+#: Channels on the grid, and after the filter; settings may differ in the source of velocities.
+_CHANNELS: WeakKeyDictionary[Log, dict[object, Array]] = WeakKeyDictionary()
 _SPREAD = 3.6  # [time constants] from a force at which less than 1 % of it is left
 _JUMPS = 14.0  # [time constants] after which it has forgotten a jump: 1e-6
 _BESIDE = 16  # rows after which splines and differences have
@@ -81,11 +83,12 @@ def process_segments(
     is_sharp = settings.cutoff is None and settings.friction_band == 0
     ratios = np.empty((0, len(log.joints))) if speeds is None or is_sharp else speeds
     if len(log.t) > KEPT or first or own.indices(len(log.t)) != (0, len(log.t), 1):
-        return _process(log, segments, settings, first, own, ratios)
+        return _process(log, segments, settings, first, own, ratios, {})
     known = _KNOWN.setdefault(log, {})
     key = settings, tuple(segments), ratios.shape, ratios.tobytes()
     if key not in known:
-        known[key] = _process(log, segments, settings, first, own, ratios)
+        channels = _CHANNELS.setdefault(log, {})
+        known[key] = _process(log, segments, settings, first, own, ratios, channels)
     return known[key].at(slice(None))  # with a cache of its own
 
 
@@ -96,13 +99,17 @@ def _process(
     first: int,
     own: slice,
     ratios: Array,
+    known: dict[object, Array],
 ) -> Trajectory:
-    """Return the motion as of ``process_segments``, for the speeds of Coulomb friction."""
+    """Return the motion as of ``process_segments``, for the speeds of Coulomb friction.
+
+    The ``known`` channels of these rows are used; others are added to them.
+    """
     n, base = len(log.joints), 0 if log.base is None else 6
     parts, counts = [], []
     for segment in segments:
         rows = slice(max(segment.first - first, 0), min(segment.stop - first, len(log.t)))
-        part = _process_part(log, rows, segment, settings, first, own, ratios)
+        part = _process_part(log, rows, segment, settings, first, own, ratios, known)
         counts.append(0 if part is None else len(part[0]))
         parts += [] if part is None else [part]
     empty = np.empty((0, base + n))
@@ -195,6 +202,7 @@ def _process_part(
     first: int,
     own: slice,
     speeds: Array,
+    known: dict[object, Array],
 ) -> tuple[Array, Array, Array, Array, Array, Array, Array] | None:
     """Return t, q, v, a, tau, direction and wrenches of the own rows, None if there are none."""
     t = log.t[rows]
@@ -220,10 +228,16 @@ def _process_part(
         "v": settings.velocity_delay,
         "wrenches": settings.wrench_delay,
     }
-    smooth = {
-        name: low_pass(_resample(t - delay.get(name, 0.0), x[rows], times), grid.rate, settings)
-        for name, x in channels.items()
-    }
+    smooth = {}
+    for name, x in channels.items():
+        late = delay.get(name, 0.0)
+        on_grid = name, segment, grid, late
+        filtered = *on_grid, settings.cutoff, settings.order
+        if on_grid not in known:
+            known[on_grid] = _resample(t - late, x[rows], times)
+        if filtered not in known:
+            known[filtered] = low_pass(known[on_grid], grid.rate, settings)
+        smooth[name] = known[filtered]
     v = smooth["v"] if "v" in smooth else np.gradient(smooth["q"], times, axis=0)
     a = smooth["a"] if "a" in smooth else np.gradient(v, times, axis=0)
     # filtered as the torque, before rows are left out

@@ -69,6 +69,23 @@ def drive_motion_along(
     return motion
 
 
+def _load_torque(model: RobotModel, trajectory: Trajectory) -> Array:
+    """Return the torque of the bodies by the model's reference, shape (N, n_rows) [N m, N].
+
+    The last one is stored with the trajectory: it is that of any terms of the drives.
+    """
+    pi = model.carried_by[: model.layout.n_inertial]
+    known = trajectory.derived.get("load torque")
+    if known is None or known[0] is not model.pin_model or not np.array_equal(known[1], pi):
+        plain = model.with_terms({})
+        bodies = np.zeros(len(plain.layout.names))
+        bodies[: len(pi)] = pi
+        (load,) = predict(plain, [bodies], trajectory)
+        trajectory.derived["load torque"] = known = model.pin_model, pi, load
+    torque: Array = known[2]
+    return torque
+
+
 def _drive_motion(model: RobotModel, trajectory: Trajectory, has_rate: bool) -> DriveMotion:
     """Return the motion and load of drives as of ``drive_motion_along``."""
     layout, pi = model.layout, model.carried_by
@@ -76,10 +93,7 @@ def _drive_motion(model: RobotModel, trajectory: Trajectory, has_rate: bool) -> 
     first = model.n_rows - len(model.joints)
     signs = friction_directions(layout, m.v, m.direction)
     begins = np.diff(m.segment, prepend=m.segment[:1] - 1) != 0
-    plain = model.with_terms({})
-    bodies = np.zeros(len(plain.layout.names))
-    bodies[: layout.n_inertial] = pi[: layout.n_inertial]
-    load = predict(plain, [bodies], m)[0][:, first:]
+    load = _load_torque(model, m)[:, first:]
     motion = drive_motion(layout, m.q, m.v, m.a, signs, load, None, begins)
     if not has_rate:
         return motion

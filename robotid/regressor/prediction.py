@@ -289,11 +289,16 @@ def _consistent_addition(model: RobotModel, pi: Array) -> Array:
 
 def _newton_euler(model: RobotModel, pi: Array, q: Array, v: Array, a: Array) -> Array:
     """Return the torque of the bodies, shape (N, n_rows)."""
-    G, pin_model, rnea = model.velocity_map, model.with_parameters(pi).pin_model, pin.rnea
+    G, pin_model = model.velocity_map, model.with_parameters(pi).pin_model
     data, torque = pin_model.createData(), np.empty((len(v), pin_model.nv))
-    is_plain = np.array_equal(G, np.eye(len(G)))
-    rates, changes = (v, a) if is_plain else (v @ G.T, a @ G.T)
+    is_plain, is_moving = np.array_equal(G, np.eye(len(G))), v.any() or a.any()
     configurations = np.ascontiguousarray(model.configurations(q))
-    for torque_k, *motion_k in zip(torque, configurations, rates, changes, strict=True):
-        torque_k[:] = rnea(pin_model, data, *motion_k)
+    if is_moving:
+        rates, changes = (v, a) if is_plain else (v @ G.T, a @ G.T)
+        instants = zip(torque, configurations, rates, changes, strict=True)
+        for torque_k, q_k, v_k, a_k in instants:
+            torque_k[:] = pin.rnea(pin_model, data, q_k, v_k, a_k)
+    else:
+        for torque_k, q_k in zip(torque, configurations, strict=True):
+            torque_k[:] = pin.computeGeneralizedGravity(pin_model, data, q_k)
     return torque if is_plain else torque @ G  # tau = G^T tau_pinocchio

@@ -100,7 +100,7 @@ class InertialRows:
         """
         rows = zip(self.columns, pairwise(self.first), strict=True)
         for j, (own, (first, stop)) in enumerate(rows):
-            Y[:, j, own] = self.values[first:stop, samples].T
+            Y[:, j, _as_slice(own)] = self.values[first:stop, samples].T
 
     def torque(self, stacked: Array) -> Array:
         """Return the torques of bodies, shape (k, N, n_rows) [N m, N].

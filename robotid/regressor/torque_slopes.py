@@ -101,7 +101,9 @@ def torque_slopes(model: RobotModel, pi: Array, q: Array, v: Array, a: Array) ->
     states = zip(configurations, velocities, accelerations, strict=True)
     for D_q, D_v, D_a, state in zip(*slopes, states, strict=True):
         by_q, by_v, by_a = derive(extended, data, *state)
-        D_q[:], D_v[:], D_a[:] = by_q[own], by_v[own], by_a[own]
+        by_q.take(own, 0, D_q, "clip")  # without bound checks
+        by_v.take(own, 0, D_v, "clip")
+        by_a.take(own, 0, D_a, "clip")
     D: Array = G.T @ slopes  # tau = G^T tau_pinocchio
     by_q, by_v, by_a = D[..., own] @ G
     leaders = np.array([plain.getJointId(name) - 1 for name in model.joints])

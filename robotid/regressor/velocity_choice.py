@@ -97,13 +97,14 @@ def _held_out_error(model: RobotModel, motion: Trajectory, mask: Array, every: i
         even, odd = used & (part == 0), used & (part == 1)
         if min(even.sum(), odd.sum()) < _FEW * W.shape[1] or not tau.any():
             continue  # too few rows, or no torques
-        squares = 0.0
-        for first, second in ((even, odd), (odd, even)):
-            size = np.linalg.norm(W[first], axis=0)
-            X = W / np.where(size > 0, size, 1.0)
-            squared, V = np.linalg.eigh(X[first].T @ X[first])  # of singular values
+        squares, parts = 0.0, [(W[rows_of], tau[rows_of]) for rows_of in (even, odd)]
+        for (A, known), (B, unknown) in (parts, parts[::-1]):
+            size = np.linalg.norm(A, axis=0)
+            size[size == 0] = 1.0
+            X = A / size
+            squared, V = np.linalg.eigh(X.T @ X)  # of singular values
             kept = squared > _DEPENDENT**2 * squared[-1]
-            theta = V[:, kept] @ (V[:, kept].T @ (X[first].T @ tau[first]) / squared[kept])
-            squares += float(np.sum((tau[second] - X[second] @ theta) ** 2))
+            theta = V[:, kept] @ (V[:, kept].T @ (X.T @ known) / squared[kept])
+            squares += float(np.sum((unknown - B @ (theta / size)) ** 2))
         error[j] = np.sqrt(squares) + _EXACT * np.linalg.norm(tau)
     return error

@@ -103,6 +103,20 @@ def test_parts_give_the_motion_of_the_whole(case, rng):
         assert np.abs(found - wanted).max() < bound * np.abs(wanted).max(), name
 
 
+def test_a_log_smoothed_before_with_other_settings_has_the_values_of_a_new_one(rng):
+    log = recording(rng, samples=1500, gaps=(700,))
+    plain = SignalSettings(cutoff=8.0, velocity="differentiated")
+    changes = [
+        {}, {"cutoff": 12.0}, {"order": 2}, {"torque_delay": 0.02}, {"rate": 150.0},
+        {"velocity": "measured"}, {"velocity": "measured", "velocity_delay": 0.03},
+    ]  # fmt: skip
+    for change in changes:
+        settings = replace(plain, **change)
+        found, wanted = (process(x, settings, SPEEDS) for x in (log, replace(log)))
+        for name in ("t", "q", "v", "a", "tau", "direction", "segment"):
+            np.testing.assert_array_equal(getattr(found, name), getattr(wanted, name), name)
+
+
 def test_rows_that_a_part_does_not_own_are_cut_off_behind_the_filter(rng):
     log = recording(rng)
     settings = resolve(log, SignalSettings())
