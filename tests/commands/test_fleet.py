@@ -385,6 +385,13 @@ def test_units_are_compared_by_parameter_robot_and_expression(monkeypatch):
         assert entry["others"] == found["parameters"][p]["next_interval"]
 
 
+def test_rows_of_a_checkpoint_have_no_value_that_is_none():
+    rows = [{"unit": "a", "value": 1.5}, {"unit": "b"}]
+    assert UnitResult.from_arrays(UnitResult(rows).to_arrays()).rows == rows
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        UnitResult([{"unit": "a", "value": np.nan}]).to_arrays()
+
+
 def test_a_distribution_is_of_the_values_with_the_interval_of_the_next_unit():
     values = [1.0, 1.1, 1.15, 1.2, 3.0, 3.1]
     entry = {"name": "a.coulomb", "robot": "arm", "expression": "a.coulomb", "unit": "N m",

@@ -177,7 +177,8 @@ def test_parameters_at_the_end(shown, content):
         ]
 
 
-def test_the_inertial_vector_is_in_the_papers_order(shown, content, folder):
+def test_the_inertial_vector_is_in_the_papers_order(shown, content, folder, html):
+    assert "nearest to the initial values (half of the true ones) that have the four sums" in html
     vector = content["inertial_vector"]
     order = ["Ixx", "Ixy", "Ixz", "Iyy", "Iyz", "Izz", "mcx", "mcy", "mcz", "m"]  # (9)
     assert vector["names"] == [f"{body}.{term}" for body in ("link_1", "link_2") for term in order]
