@@ -361,6 +361,10 @@ def test_between_the_poses_of_a_base_it_turns_the_short_way(tmp_path):
         path.write_text(f"{name},{text}")
         again = _base_poses(job, LogEntry(path), SimpleNamespace(t=at))
         assert (again is not None) == has_pose
+    np.savetxt(path, np.where(np.arange(8) == 4, np.nan, table), delimiter=",", header=header,
+               comments="")  # fmt: skip
+    with pytest.raises(DataError, match="base_qx to base_qw is not a unit quaternion"):
+        _base_poses(job, LogEntry(path), SimpleNamespace(t=at))
     path.write_text(f"time,{text}".replace("base_qw", "other"))
     assert _base_poses(job, LogEntry(path), SimpleNamespace(t=at)) is None
 

@@ -221,6 +221,10 @@ def test_a_fault_of_the_second_of_two_new_logs_is_one_of_the_verdict(here, monke
     assert judged["scale_check"].to_dict() == stated["scale_check"]
     assert predictions.refitted == []
     assert predictions.joints == ("joint_1", "joint_2")
+    del stated["structure"]["poorly_excited"]  # as of an older result
+    (folder / "out" / "older.json").write_text(json.dumps(stated))
+    validate_result(folder / "out" / "older.json", logs)
+    assert judged["determined"].is_poorly_excited is True
 
 
 def test_few_fitted_rows_in_a_long_log_and_a_few_of_it_in_a_long_fitted_one_are_shared(rng):
