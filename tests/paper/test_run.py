@@ -37,6 +37,7 @@ def test_the_json_has_the_schema_of_the_design(written):
     folder, content = written
     found = json.loads((folder / "paper.json").read_text())
     assert found == content
+    assert "clean" not in found, "it is that of the models"
     assert set(found["models"]) == {"printed", "corrected", "physical"}
     for name, model in found["models"].items():
         c = 4 if name == "physical" else 5
