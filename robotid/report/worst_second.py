@@ -71,7 +71,7 @@ def _worst(of: Residual) -> WorstSecond | None:
     squares = np.append(0.0, np.cumsum(np.where(used, of.values, 0.0) ** 2))
     counts = np.append(0, np.cumsum(used))
     step = float(np.median(np.diff(t)))
-    first = np.arange(max(1, int(np.searchsorted(t, t[-1] - _WINDOW + step / 2, side="right"))))
+    first = np.arange(max(1, int(np.searchsorted(t, t[-1] - _WINDOW + 1.5 * step, side="right"))))
     last = np.searchsorted(t, t[first] + _WINDOW - step / 2)  # exclusive
     count = counts[last] - counts[first]
     enough = count >= _USED * min(_WINDOW / step, len(t))

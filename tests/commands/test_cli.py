@@ -7,7 +7,7 @@ import platform
 import re
 import subprocess
 import sys
-from contextlib import redirect_stderr, redirect_stdout
+from contextlib import nullcontext, redirect_stderr, redirect_stdout
 
 import numpy as np
 import pytest
@@ -404,10 +404,13 @@ def test_inspect_of_an_unusable_urdf_says_why(capsys, tmp_path):
     assert "does not give a valid model; see the findings" in printed.err
 
 
-def test_demo_runs_from_nothing_and_finds_the_truth(tmp_path, capsys):
-    out = tmp_path / "demo"
+def test_demo_runs_from_nothing_and_finds_the_truth(tmp_path, capsys, monkeypatch):
+    out, stages = tmp_path / "demo", []
+    shown = nullcontext(lambda *stage: stages.append(stage))
+    monkeypatch.setattr("robotid.cli.demo.terminal_progress", lambda: shown)
     assert main(["demo", "--out", str(out)]) == 0
     printed = capsys.readouterr().out
+    assert stages, "the stages of the identification are shown"
     assert "verdict: good" in printed
     assert "of 58 base parameters lie within 3 standard errors of the truth" in printed
     count = int(printed.split(" of 58 base")[0].split()[-1])

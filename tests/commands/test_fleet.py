@@ -325,7 +325,7 @@ def test_the_command_prints_what_failed_and_takes_a_parquet_table(table, tmp_pat
     assert content["failures"][1]["log"] == str(tmp_path / "none.csv")
 
 
-def test_units_are_compared_by_parameter_robot_and_expression():
+def test_units_are_compared_by_parameter_robot_and_expression(monkeypatch):
     """Five units and a failed one; of one robot only two, and one value without an error."""
     rng, gathered = np.random.default_rng(3), _Gathered()
     x = np.array([4.0, -2.0]) + [0.1, 0.05] * rng.normal(size=(5, 2))
@@ -349,7 +349,13 @@ def test_units_are_compared_by_parameter_robot_and_expression():
                "expression": "b.m"}  # fmt: skip
         gathered.add(UnitResult([row]))
     gathered.add(UnitResult([{"unit": "u7", "status": "failed", "error": "bad"}]))
+    levels = []
+    monkeypatch.setattr(
+        "robotid.commands.fleet.between_units",
+        lambda values, errors, level: levels.append(level) or between_units(values, errors, level),
+    )
     found = gathered.content(units)
+    assert levels == [0.02 / 9] * 2  # of 5 + 4 values tested together
     assert (found["units"], found["logs"], found["done"]) == (8, 36, 7)
     assert found["verdicts"] == {"usable": 3, "good": 4}
     assert found["failures"][0] == {"unit": "u0", "log": "0.csv", "error": "lost"}
@@ -377,6 +383,13 @@ def test_units_are_compared_by_parameter_robot_and_expression():
         assert entry["parameter"] == ("a.coulomb", "b.m")[p]
         assert (entry["value"], entry["std_error"]) == (x[k, p], errors[k, p])
         assert entry["others"] == found["parameters"][p]["next_interval"]
+
+
+def test_rows_of_a_checkpoint_have_no_value_that_is_none():
+    rows = [{"unit": "a", "value": 1.5}, {"unit": "b"}]
+    assert UnitResult.from_arrays(UnitResult(rows).to_arrays()).rows == rows
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        UnitResult([{"unit": "a", "value": np.nan}]).to_arrays()
 
 
 def test_a_distribution_is_of_the_values_with_the_interval_of_the_next_unit():

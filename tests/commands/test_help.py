@@ -1,5 +1,6 @@
 """The command line's help, and its answer to a misspelt word."""
 
+import argparse
 import re
 from importlib import import_module
 
@@ -41,6 +42,12 @@ def test_help_has_no_words_of_python_or_markdown(capsys, command):
     code, said = printed(capsys, command, words)
     assert code == 0
     assert not re.search(r"`|\b(None|True|False|Python|sidecar)\b", said)
+    parser = argparse.ArgumentParser()
+    import_module(f"robotid.cli.{command}").add_flags(parser)
+    unsaid = {action.metavar for action in parser._actions if not (action.help or "").strip()}
+    assert unsaid <= {"JOB.toml | URDF", "URDF", "LOG", "RESULT.json"}  # these say what they are
+    needs_value = [action for action in parser._actions if action.nargs != 0 and not action.choices]
+    assert [action.dest for action in needs_value if action.metavar is None] == []
 
 
 def test_a_word_that_is_near_to_none_is_answered_with_all(capsys):

@@ -1,9 +1,10 @@
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from robotid.commands.job import Job, job_from_settings, read_job
+from robotid.commands.job import Job, _motors, job_from_settings, read_job
 from robotid.exceptions import SettingsError
 from robotid.log_files.read import write_log
 from robotid.logs.data import Log
@@ -232,7 +233,17 @@ def test_a_controller_that_the_estimator_does_not_read_is_refused(tmp_path):
     with pytest.raises(SettingsError, match=r"'wls', wanted 'simulation'; set \[estimator\] name"):
         job_from_settings(table, "job.toml", tmp_path)
     table["estimator"] = {"name": "simulation"}
-    assert job_from_settings(table, "job.toml", tmp_path).controller.kp == 20.0
+    job = job_from_settings(table, "job.toml", tmp_path)
+    assert job.controller.kp == 20.0
+    assert job.to_dict()["controller"]["kp"] == 20.0
+    del table["controller"]
+    assert "controller" not in job_from_settings(table, "job.toml", tmp_path).to_dict()
+
+
+def test_the_motor_of_several_joints_replaces_the_drive_of_the_joint_with_its_name():
+    ratios = (("a", 60.0), ("b", -1.5))
+    gear = SimpleNamespace(shared={"a": ratios})
+    assert _motors(gear) == [Coupling("a", ratios, replaces=True)]
 
 
 def test_a_job_of_a_closed_chain_reads_the_log_of_its_driven_joint(tmp_path):

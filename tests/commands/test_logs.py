@@ -13,11 +13,13 @@ from robotid.commands.job import Job, LogEntry
 from robotid.commands.logs import (
     checkpoint_inputs,
     examine_logs,
+    hours_of,
     locked_as_logged,
     log_of_commands,
     survey_logs,
+    units_of_logs,
 )
-from robotid.exceptions import DataError
+from robotid.exceptions import DataError, SettingsError
 from robotid.fitting.settings import SimulationSettings
 
 HAND = """<robot name="hand"><link name="base"/><link name="a"/><link name="b"/><link name="c"/>
@@ -250,3 +252,19 @@ def test_a_robot_hears_commands_the_gravity_of_its_urdf_or_torques(hand, monkeyp
     job = replace(hand, controller=loop, estimator=SimulationSettings())
     result = SimpleNamespace(robot="the result's")
     assert log_of_commands(job, LogEntry(Path("a.csv")), result) == wanted
+
+
+@pytest.mark.parametrize("at", [0, 1, 2])
+@pytest.mark.parametrize("key", ["unit", "time", "temperature"])
+def test_what_one_log_alone_does_not_state_is_named(key, at):
+    value = {"unit": "left", "time": 2.5, "temperature": 31.0}[key]
+    entries = [LogEntry(Path(f"{name}.csv"), **{key: value}) for name in "abc"]
+    read = units_of_logs if key == "unit" else hours_of
+    assert read(entries) == {"unit": ["left"] * 3, "time": [2.5] * 3}.get(key, [None] * 3)
+    entries[at] = replace(entries[at], **{key: "" if key == "unit" else None})
+    other = "b.csv" if at == 0 else "a.csv"
+    has = "unit = 'left'" if key == "unit" else f"{key} = {value}"
+    with pytest.raises(
+        SettingsError, match=f"^{'abc'[at]}.csv has no {key}, but {other} has {has}; "
+    ):
+        read(entries)

@@ -356,6 +356,17 @@ def test_between_the_poses_of_a_base_it_turns_the_short_way(tmp_path):
     wanted = np.column_stack([0 * at, np.sin(0.4 * (at - 4)), 0 * at, np.cos(0.4 * (at - 4))])
     np.testing.assert_allclose(found[:, 3:], wanted, atol=1e-12)  # half-way, where it is exact
     assert _base_poses(job, LogEntry(path), SimpleNamespace(t=at[:1])).shape == (1, 7)
+    for name, has_pose in (("t", True), ("clock", False)):  # of the time, without which is no pose
+        text = path.read_text().partition(",")[2]
+        path.write_text(f"{name},{text}")
+        again = _base_poses(job, LogEntry(path), SimpleNamespace(t=at))
+        assert (again is not None) == has_pose
+    np.savetxt(path, np.where(np.arange(8) == 4, np.nan, table), delimiter=",", header=header,
+               comments="")  # fmt: skip
+    with pytest.raises(DataError, match="base_qx to base_qw is not a unit quaternion"):
+        _base_poses(job, LogEntry(path), SimpleNamespace(t=at))
+    path.write_text(f"time,{text}".replace("base_qw", "other"))
+    assert _base_poses(job, LogEntry(path), SimpleNamespace(t=at)) is None
 
 
 def test_a_motion_without_torques_plays_and_marks_where_it_uses_the_most_of_limits(folder):

@@ -15,6 +15,7 @@ from robotid.cli import main
 from robotid.commands.job import Job, job_from_settings
 from robotid.commands.schema import job_schema
 from robotid.exceptions import SettingsError
+from robotid.fitting.settings import ESTIMATORS
 
 JOBS = sorted((ROOT / "tests/jobs").rglob("*.toml"))
 LOG = {"log": "run.csv"}
@@ -82,6 +83,7 @@ def test_each_key_says_what_it_is_and_the_robot_is_required(capsys):
         "type": ["number"],
         "description": "start of the window in the log's own time [s]",
     }
+    assert found["estimator"]["properties"]["name"]["enum"] == [*ESTIMATORS]
     weight = found["estimator"]["properties"]["prior_weight"]
     assert weight["anyOf"] == [{"enum": ["auto", "cv", "evidence"]}, {"type": ["number"]}]
 

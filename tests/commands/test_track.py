@@ -11,6 +11,7 @@ from robotid.commands.job import Job, LogEntry
 from robotid.commands.track import run_track, serve_track
 from robotid.log_files.formats import open_table
 from robotid.log_files.read import read_log, write_log
+from robotid.logs.data import Log
 from robotid.logs.settings import LogSource, SignalSettings
 from robotid.online.settings import OnlineSettings
 from robotid.viewer.scene import coordinates
@@ -36,6 +37,24 @@ def test_the_settings_of_the_signals_reach_the_tracker(arm, arm_logs):
     assert identifier.settings.rate == pytest.approx(100.0)  # the log's own
     assert identifier.settings.cutoff == usual.cutoff
     assert identifier.settings.min_velocity == usual.min_velocity
+
+
+def test_the_rate_is_that_of_most_samples(arm, monkeypatch):
+    """Of a log with a gap of 20 s."""
+    t = np.arange(200) / 100.0
+    zero = np.zeros((200, len(arm.joints)))
+    log = Log(np.where(t < 1.0, t, t + 20.0), zero, zero, arm.joints)
+
+    class Reached(Exception):
+        pass
+
+    def reached(model, log, settings, observer):
+        raise Reached(settings.rate)
+
+    monkeypatch.setattr(Job, "read", lambda self, entry, model: log)
+    monkeypatch.setattr(module, "track", reached)
+    with pytest.raises(Reached, match=r"^(100\.0|99\.99)"):
+        tracked(arm, "log.csv")
 
 
 def test_what_is_told_is_what_the_history_ends_with(arm, rng, tmp_path):

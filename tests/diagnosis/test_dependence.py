@@ -1,5 +1,7 @@
 """How a residual follows a quantity, against sums over rows, bins and segments one by one."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -68,6 +70,15 @@ def test_few_stretches_show_means_but_no_share(rows):
     none = follow("speed", "rad/s", x, r, bins, None)
     np.testing.assert_allclose(none.means, follow("speed", "", x, r, bins, segments).means)
     assert np.isnan(none.errors).all()
+    assert (none.share, none.p_value) == (None, 1.0)
+
+
+def test_a_dependence_is_significant_by_its_share_and_its_p_value(rows):
+    found = follow("speed", "rad/s", *rows)
+    for share, p, wanted in (
+        (0.1, 9e-4, True), (0.099, 9e-4, False), (0.1, 1.1e-3, False), (None, 9e-4, False),
+    ):  # fmt: skip
+        assert replace(found, share=share, p_value=p).is_significant == wanted
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])

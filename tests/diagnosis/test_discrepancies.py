@@ -393,3 +393,38 @@ def test_columns_of_terms_are_of_their_joint_and_the_residual_of_fitted_logs(mon
     monkeypatch.setattr(discrepancies, "Trials", trials)
     assert discrepancies._left(sample, Z) == pytest.approx(left[:5].sum())
     assert given == [[0, 1, 2]]
+
+
+@pytest.mark.parametrize(
+    ("share", "p", "confirmed", "size", "error", "is_found"),
+    [
+        (0.11, 2.9e-4, 0.03, 0.11, 0.02, True),
+        (0.11, 3.1e-4, 0.03, 0.11, 0.02, False),
+        (0.11, 2.9e-4, 0.027, 0.11, 0.02, False),  # a quarter of the share
+        (0.11, 2.9e-4, 0.03, 0.09, 0.01, False),  # the size that changes a result is 0.1
+        (0.11, 2.9e-4, 0.03, 0.11, 0.023, False),  # five standard errors
+        (0.11, 2.9e-4, None, 0.11, 0.02, True),
+        (0.09, 9e-6, None, 0.21, 0.02, False),
+        (0.09, 9e-6, 0.095, 0.21, 0.02, True),
+        (0.09, 1.1e-5, 0.095, 0.21, 0.02, False),
+        (0.09, 9e-6, 0.085, 0.21, 0.02, False),
+        (0.09, 9e-6, 0.095, 0.19, 0.02, False),
+        (0.031, 9e-6, 0.095, 0.21, 0.02, True),
+        (0.029, 9e-6, 0.095, 0.21, 0.02, False),
+    ],
+)
+def test_a_difference_is_reported_by_its_share_p_value_validation_and_size(
+    monkeypatch, share, p, confirmed, size, error, is_found
+):
+    before = np.ones(12 if confirmed is None else 16)
+    left = before - np.where(np.arange(len(before)) < 12, share, confirmed or 0.0)
+    held_out = SimpleNamespace(
+        left=lambda which: before, left_each=lambda options: dict.fromkeys(options, left)
+    )
+    whole = SimpleNamespace(estimate=lambda *_: (np.array([size]), np.array([[error**2]])))
+    trials = SimpleNamespace(held_out=held_out, whole=whole)
+    monkeypatch.setattr(discrepancies, "Trials", lambda sample, Z: trials)
+    monkeypatch.setattr(discrepancies.Round, "p_value", lambda self, option: p)
+    one = discrepancies._Alteration("a", "", np.zeros((1, 1, 1)), 0.1, lambda x, e: "")
+    found = discrepancies._found(SimpleNamespace(), SimpleNamespace(fitted=12), [one])
+    assert len(list(found)) == is_found

@@ -28,6 +28,7 @@ from robotid.diagnosis.sample import Normal, Sample, Trials, take_sample
 from robotid.exceptions import NotConvergedError, SettingsError
 from robotid.export.urdf import load_identified, write_urdf
 from robotid.fitting.bands import friction_curve
+from robotid.fitting.drives import DriveChoice
 from robotid.fitting.settings import EstimatorSettings
 from robotid.identification.pipeline import identify, with_drives
 from robotid.judgement.parameter_table import parameter_entries
@@ -305,6 +306,116 @@ def test_segments_are_alike_within_a_slack_or_their_scatter():
     best = np.arange(9.0)
     assert drive_choice._is_alike(best, best + swing + 0.3, 0.0)  # 2.7 of 3
     assert not drive_choice._is_alike(best, best + swing + 0.4, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("faults", "more", "wanted"),
+    [
+        ([(0, 10.0), (1, 1.0), (0, 1.0)], 0.0, 0),  # the best has no fault
+        ([(0, 10.1), (0, 11.0), (0, 1.0)], 0.0, 2),
+        ([(0, 10.1), (0, 11.0), (0, 11.0)], 0.0, 0),  # no better, though simpler
+        ([(0, 10.1), (1, 1.0), (1, 1.0)], 0.0, 0),
+        ([(1, 1.0), (0, 11.0), (1, 11.0)], 0.0, 1),
+        ([(0, 10.1), (0, 1.0), (0, 1.0)], 0.0, 1),  # the simplest
+        ([(0, 10.1), (0, 11.0), (0, 1.0)], 0.019, 2),
+        ([(0, 10.1), (0, 11.0), (0, 1.0)], 0.021, 0),  # of the squared residual
+    ],
+)
+def test_an_equal_family_is_taken_for_its_faults_only(monkeypatch, faults, more, wanted):
+    """Candidates 0, 1 and 2 have two, one and one column; another of the best's family is none."""
+    families = [FAMILIES[name] for name in ("stribeck", "tanh", "power", "stribeck")]
+    faults = [*faults, (0, 1.0)]
+    own = [(family, [float(k)]) for k, family in enumerate(families)]
+    after = np.full(10, 5.0)
+    left = {0: after, 1: after + 10 * more, 2: after + 10 * more, 3: after - 0.01}
+
+    class Options(SimpleNamespace):
+        @classmethod
+        def of(cls, sample, drive, own):
+            return SimpleNamespace(left=lambda which: left[int(own[-1][1][0])])
+
+    every = Options(own=own, place=[[0, 1], [2], [3], [4]])
+    this = drive_choice.Round(np.full(10, 10.0), left, 10, 100.0)
+
+    def place(own):
+        return int(own[-1][1][0])
+
+    for name, function in {
+        "_Options": Options,
+        "_refined": lambda sample, drive, own: own,
+        "_reweighted": lambda sample, drive, own: sample,
+        "_grown": lambda sample, drive, own: {"coulomb": 1.0, "viscous": faults[place(own)][1]},
+        "_at_bound": lambda drive, own: np.array([False, faults[place(own)][0]]),
+    }.items():
+        monkeypatch.setattr(drive_choice, name, function)
+    found = drive_choice._conditioned(None, None, every, this, {k: [] for k in range(4)}, 0)
+    assert found.number == wanted
+    assert found.own == [own[wanted]]
+
+
+@pytest.mark.parametrize(
+    ("share", "p", "torque", "families", "undecided"),
+    [
+        (0.051, 0.0099, 1e4, ("tanh",), 0),
+        (0.049, 0.0099, 1e4, (), 1),
+        (0.051, 0.0101, 1e4, (), 1),
+        (0.051, 0.249, 1e4, (), 1),
+        (0.051, 0.251, 1e4, (), 0),
+        (0.1, 0.0099, 0.99 * 1.0 / 0.006**2, ("tanh",), 0),
+        (0.1, 0.0099, 1.01 * 1.0 / 0.006**2, (), 1),  # the gain is 1.0
+    ],
+)
+def test_a_family_is_selected_by_share_p_value_and_gain(
+    monkeypatch, share, p, torque, families, undecided
+):
+    one = (FAMILIES["tanh"], [0.2])
+    drive = SimpleNamespace(data_range=SEEN)
+    sample = SimpleNamespace(torque=np.array([torque]))
+
+    class Options(SimpleNamespace):
+        @classmethod
+        def of(cls, sample, drive, own):
+            before = np.ones(10)
+            return cls(
+                own=own, place=[[k] for k in range(len(own))], left=lambda chosen: before,
+                left_each=lambda retained: {i: before * (1 - share) for i in retained},
+            )  # fmt: skip
+
+    given = []
+
+    def found(sample, drive, own, tried):
+        given.append((own, tried))
+        return DriveChoice("a", tuple(family.name for family, _ in own), ())
+
+    for name, function in {
+        "_Options": Options,
+        "_candidates": lambda drive, families: [one] if len(families) > 1 else [],
+        "_reweighted": lambda sample, drive, own: sample,
+        "_conditioned": lambda sample, drive, every, this, retained, best: drive_choice._Refined(
+            best, [every.own[best]], (False, False)
+        ),
+        "_found": found,
+    }.items():
+        monkeypatch.setattr(drive_choice, name, function)
+    monkeypatch.setattr(drive_choice.Round, "p_value", lambda self, option: p)
+    choice = drive_choice._auto(sample, drive)
+    assert choice.families == families
+    assert len(choice.undecided) == undecided
+    ((_, tried),) = given
+    assert tried[0] == drive_choice.Tried((), 100 * np.sqrt(10 / torque), 1.0, True)
+    after = 100 * np.sqrt(10 * (1 - share) / torque)
+    assert tried[1] == drive_choice.Tried(("tanh",), pytest.approx(after), p, bool(families))
+
+
+@pytest.mark.parametrize(
+    ("at", "is_near"), [(0.0, True), (0.019, True), (0.021, False), (0.979, False), (0.981, True)]
+)
+def test_a_shape_is_at_a_bound_within_a_fiftieth_of_its_range(at, is_near):
+    drive = SimpleNamespace(data_range=SEEN)
+    low, high = FAMILIES["tanh"].shapes[0].within(SEEN)
+    middle = float(np.sqrt(low * high))
+    own = [(FAMILIES["tanh"], [low * (high / low) ** at]), (FAMILIES["tanh"], [middle])]
+    assert drive_choice._at_bound(drive, own).tolist() == [is_near, False]
 
 
 def test_what_was_seen_is_of_the_rows_that_count_in_all_recordings():

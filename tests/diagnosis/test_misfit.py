@@ -644,6 +644,16 @@ def test_each_term_is_reported_with_what_it_adds_to_those_before(rng, monkeypatc
     np.testing.assert_allclose(second.theta, theta)
     np.testing.assert_allclose(second.shift, -trials.whole.T[:, :2] @ theta)
     assert second.unit == "N rms"
+    # at the limits of p-value, share and size over the torque
+    limits = misfit.MISFIT.share, misfit.MISFIT.p_value, misfit.MISFIT_REPORTED
+    assert limits == (0.1, 3e-4, 0.005)
+    least = np.sqrt(first.share * squares) / 0.005
+    for scale, count in ((0.99, 1), (1.01, 0)):
+        weaker = replace(sample, torque=np.array([900.0, (scale * least) ** 2]))
+        assert len(list(misfit._of_joint(weaker, 1))) == count
+    for p, count in ((2.9e-4, 2), (3.1e-4, 0)):
+        monkeypatch.setattr(misfit.Round, "p_value", lambda self, option, p=p: p)
+        assert len(list(misfit._of_joint(sample, 1))) == count
 
 
 def test_entries_keep_other_families_and_a_term_replaces_all_that_it_explains():

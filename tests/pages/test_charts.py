@@ -230,6 +230,15 @@ def test_areas_are_stacked_up_and_down_from_zero():
         np.testing.assert_allclose(cover[1], [down[k], down[k - 1] if k else 0 * x])
 
 
+def test_what_is_unknown_has_no_width_and_bars_stand_on_zero():
+    y, half = np.array([1.0, -2.0, np.nan]), np.array([0.5, np.nan, 0.5])
+    (line,), (bars,) = _covers(
+        [(Series("a", y, "text", kind), y, half) for kind in ("line", "bars")]
+    )
+    np.testing.assert_allclose(line, [[0.5, -2.0, np.nan], [1.5, -2.0, np.nan]])
+    np.testing.assert_allclose(bars, [[0.0, -2.0, 0.0], [1.5, 0.0, 0.0]])
+
+
 def test_a_plot_in_a_notebook_is_as_high_as_its_charts():
     one, two = (Chart("c", np.arange(2.0), (), "x", "y", height=h) for h in (90, 180))
     for charts_of, height in (((one,), 262), ((one, two), 554), ((one,) * 9, 900)):

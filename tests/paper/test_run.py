@@ -37,6 +37,7 @@ def test_the_json_has_the_schema_of_the_design(written):
     folder, content = written
     found = json.loads((folder / "paper.json").read_text())
     assert found == content
+    assert "clean" not in found, "it is that of the models"
     assert set(found["models"]) == {"printed", "corrected", "physical"}
     for name, model in found["models"].items():
         c = 4 if name == "physical" else 5
@@ -177,7 +178,8 @@ def test_parameters_at_the_end(shown, content):
         ]
 
 
-def test_the_inertial_vector_is_in_the_papers_order(shown, content, folder):
+def test_the_inertial_vector_is_in_the_papers_order(shown, content, folder, html):
+    assert "nearest to the initial values (half of the true ones) that have the four sums" in html
     vector = content["inertial_vector"]
     order = ["Ixx", "Ixy", "Ixz", "Iyy", "Iyz", "Izz", "mcx", "mcy", "mcz", "m"]  # (9)
     assert vector["names"] == [f"{body}.{term}" for body in ("link_1", "link_2") for term in order]

@@ -86,6 +86,10 @@ def test_the_figures_of_each_mark_are_those_of_the_result(identified, central, p
 
 
 def test_marks_lie_on_one_axis_per_group(central, picture):
+    assert re.findall(r'<svg height="(\d+)"', picture) == 10 * ["132"]
+    rows = re.search(r'aria-label="m of each link">(.*?)</svg>', picture)[1]
+    heights = re.findall(r'cy="(\d+)" r="3.5"', rows)
+    assert heights == ["11", "33", "55", "77", "99", "121"]
     column = re.search(r'aria-label="m of each link">(.*?)</svg>', picture)[1]
     places = [float(x) for x in re.findall(r'<circle cx="([\d.]+)%"', column)]
     slope, zero = np.polyfit(central.values[:, 0], places, 1)

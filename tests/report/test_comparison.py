@@ -482,11 +482,24 @@ def test_a_difference_is_far_if_that_to_any_result_is_and_ends_in_a_point_beyond
     half, widest = comparison_page._HALF, comparison_page._WIDEST
     for difference, end, tip in ((2.0, 2.0, 0), (-5.0, -5.0, 0), (9.0, 6.0, 4), (-7.25, -6.0, -4)):
         cell = comparison_page._difference(difference, 1)
+        assert '<svg width="90" height="14"' in cell.html
+        assert 'd="M45 0v14M22 0v14M68 0v14"' in cell.html  # zero and three errors
         assert f'd="M{half} 3h{end * half / widest - tip:.1f}l{tip} 4l{-tip} 4H{half}z"' in (
             cell.html
         )
         assert ("<strong>" in cell.html) == (abs(difference) > 3)
         assert cell.value == difference
+
+
+def test_bars_of_results_stand_below_each_other_over_the_largest():
+    html = comparison_page._bars([2.0, None, 1.0], 4.0).html
+    width, high = comparison_page._BAR, comparison_page._HIGH
+    assert f'width="{width}" height="{3 * high}"' in html
+    assert re.findall(r'd="M0 (.*?)h(.*?)v(.*?)H0z" fill="var\(--(.*?)\)"', html) == [
+        ("1", f"{width / 2:.1f}", str(high - 2), "tone-1"),
+        (str(2 * high + 1), f"{width / 4:.1f}", str(high - 2), "tone-3"),
+    ]
+    assert "h0.0v" in comparison_page._bars([0.0], 0.0).html
 
 
 def test_friction_is_compared_up_to_the_fastest_speed_of_any_result():

@@ -53,6 +53,7 @@ def test_an_outline_has_the_axes_and_the_angle_of_the_ellipsoid():
     assert abs(angle) % 180 == pytest.approx(0.0)
     assert turned % 180 == pytest.approx(120.0, abs=0.1)
     assert "x →, y ↑" in html
+    assert '<svg viewBox="0 0 160 104"' in html
     scale = a / 0.3
     # 80 px are high enough for the turned ellipsoid; the middle is x = 0.25 m, at (80, 48) px
     assert scale == pytest.approx(40.0 / np.hypot(0.3 * 0.75**0.5, 0.05), rel=2e-3)

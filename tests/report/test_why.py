@@ -3,6 +3,7 @@
 import re
 from dataclasses import replace
 from html import unescape
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -105,10 +106,13 @@ def test_the_section_stays_small(section):
     assert len(section) < 6 * 90_000
 
 
-def test_of_many_joints_the_worst_have_all_charts_and_the_others_the_split(identified, monkeypatch):
-    monkeypatch.setattr("robotid.report.why._MOST", 2)
-    counts = [len(charts(part)) for part in why_section(identified).split("<details")[1:]]
-    assert counts == [7, 7, 1, 1, 1, 1]
+def test_of_many_joints_the_worst_twelve_have_all_charts_and_the_others_the_split(identified):
+    many = SimpleNamespace(
+        joint_torques=3 * [*identified.joint_torques], model=identified.model,
+        validation=identified.validation, fitted=identified.fitted,
+    )  # fmt: skip
+    counts = [len(charts(part)) for part in why_section(many).split("<details")[1:]]
+    assert counts == 12 * [7] + 6 * [1]
 
 
 def test_the_residual_against_speed_is_drawn_with_its_mean(section, torques):

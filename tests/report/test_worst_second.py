@@ -47,7 +47,7 @@ def test_a_window_needs_half_of_its_samples(share):
     unused = (T > 101.0) & (T < 104.0) & ~((T >= 102.0) & (102.0 + share - 0.005 > T))
     values[unused] = np.nan
     worst = worst_second([residual(values)])
-    assert (worst.rms > 1.0) == (share > 0.5)
+    assert worst.rms == pytest.approx(5.0 if share > 0.5 else 0.1)
 
 
 def test_a_window_at_a_gap_has_half_of_its_samples_at_least():
@@ -59,9 +59,30 @@ def test_a_window_at_a_gap_has_half_of_its_samples_at_least():
     assert worst.rms == pytest.approx(np.sqrt((10 * 81 + 40 * 0.01) / 50), rel=0.02)
 
 
+EXACT = np.arange(128) / 64  # [s] a clock without rounding
+
+
+def test_the_last_window_ends_at_the_last_sample():
+    worst = worst_second([residual(np.arange(128) == 127, EXACT)])
+    assert (worst.start, worst.end) == (1.0, EXACT[-1])
+    assert worst.rms == pytest.approx(1 / 8)
+
+
+def test_a_window_has_its_number_of_samples_also_with_jitter():
+    early = np.where(np.arange(128) == 64, EXACT - 0.375 / 64, EXACT)
+    worst = worst_second([residual(np.arange(128) % 64 == 0, early)])
+    assert worst.rms == pytest.approx(1 / 8)
+    half = np.where(np.arange(128) % 2, np.nan, 1.0)
+    assert worst_second([residual(half, EXACT)]).rms == pytest.approx(1.0)
+
+
 def test_a_short_recording_is_one_window_and_an_unused_one_none():
-    worst = worst_second([residual(np.ones(50), T[:50])])
-    assert (worst.start, worst.end, worst.ratio) == (100.0, pytest.approx(100.49), 1.0)
+    worst = worst_second([residual(np.arange(30), T[:30])])
+    assert (worst.start, worst.end, worst.ratio) == (100.0, pytest.approx(100.29), 1.0)
+    assert worst_second([residual([3.0, np.nan], T[:2])]).rms == pytest.approx(3.0)
+    assert worst_second([residual(np.zeros(1000))]).ratio == 0.0
+    assert worst_second([residual([1.0], T[:1])]) is None
+    assert worst_second([residual(np.where(np.arange(1000) % 3, np.nan, 1.0))]) is None
     assert worst_second([residual(np.full(1000, np.nan))]) is None
     assert worst_second([]) is None
     assert worst_html(None, "j", "N m", Dock("replay.html")) == ""
@@ -76,7 +97,9 @@ def test_figures_have_their_unit_and_names_are_escaped():
     assert link.path == "my%20%22replay%22.html"
     fragment = {key: value[0] for key, value in parse_qs(link.fragment).items()}
     assert fragment == {"t": "103.500", "joint": "odd & <j>", "log": 'a "&<b>.csv'}
-    assert "href" not in worst_html(worst, "j", "N m", Dock())
+    plain = worst_html(worst, "j", "N m", Dock())
+    assert "href" not in plain
+    assert "RMS 0.002 N m, " in plain
 
 
 def test_each_joint_of_a_report_has_its_own_worst_second(identified):
