@@ -13,6 +13,7 @@ from robotid.closed_loop.fit import stated_loops
 from robotid.closed_loop.initial_values import (
     first_loops,
     free_drive_parameters,
+    free_zeros,
     is_stated,
     likeness,
     typical_sizes,
@@ -20,7 +21,7 @@ from robotid.closed_loop.initial_values import (
 )
 from robotid.closed_loop.second_order import _FREQUENCIES, SecondOrder, _better
 from robotid.closed_loop.settings import LoopSettings
-from robotid.closed_loop.zeros import _Motion
+from robotid.closed_loop.zeros import _Motion, same_encoders
 from robotid.fitting.settings import SimulationSettings
 from robotid.logs.data import Log
 from robotid.regressor.prediction import predict_instants
@@ -234,6 +235,16 @@ def test_a_number_states_all_joints_and_a_table_those_it_names(planar):
     a, b = planar.joints
     for value, wanted in ((3.0, [1, 1]), (None, [0, 0]), ({b: 1.0}, [0, 1]), ({a: 0.0}, [1, 0])):
         assert is_stated(value, planar).tolist() == [bool(x) for x in wanted]
+
+
+def test_zeros_other_than_the_urdfs_are_free_about_their_first_estimates(planar):
+    """With a standard deviation of 0.3 rad; a sign alone has a gain, too."""
+    first = replace(same_encoders(planar), zero=np.array([0.4, -0.2]), gain=np.array([0.0, 0.7]))
+    (found,) = free_zeros(planar, first)
+    assert (found.name, found.what, found.joints) == (f"{planar.joints[1]}.zero", "zero", (1,))
+    assert (found.prior, found.spread, found.lowest) == (-0.2, 0.3, -np.inf)
+    both = free_zeros(planar, replace(first, gain=np.array([0.1, 0.7])))
+    assert [(x.joints, x.prior) for x in both] == [((0,), 0.4), ((1,), -0.2)]
 
 
 def test_a_load_that_would_push_a_loop_the_wrong_way_does_not_count(rng):

@@ -373,6 +373,23 @@ def test_loads_that_do_not_shift_show_no_gain():
     assert not list(check_gains("log", ("a", "b"), loads, left))
 
 
+def test_gains_that_the_loads_hardly_determine_are_those_of_equal_feet():
+    """Loads of two feet shift by 1 %: their gains have rows of equal gains beside the loads."""
+    rng, names = np.random.default_rng(5), ("a", "b")
+    left = np.array([0.0, 0.0, 500.0]) + rng.normal(size=(400, 3))
+    shares = 0.5 + 0.01 * rng.normal(size=400)
+    shared = np.stack([shares, 1.0 - shares], axis=1)[:, None]
+    loads = left[:, :, None] * shared / [1.0, 0.4] + 0.01 * rng.normal(size=(400, 3, 2))
+    A = loads.reshape(-1, 2)
+    equal = np.sqrt(1e-4 * np.sum(A**2) / 2) * np.array([[1.0, -1.0]])
+    solved = np.linalg.lstsq(np.vstack([A, equal]), np.append(left, 0.0), rcond=None)[0]
+    (finding,) = check_gains("log", names, loads, left)
+    k = names.index(finding.message.split("that of ")[1][0])
+    assert finding.evidence["factor"] == pytest.approx(solved[k] / solved[1 - k])
+    alone = np.linalg.lstsq(A, left.ravel(), rcond=None)[0]
+    assert abs(solved[1] - solved[0]) < 0.9 * abs(alone[1] - alone[0])
+
+
 def test_a_mean_horizontal_force_is_an_offset_or_a_tilt():
     rng, down = np.random.default_rng(0), np.array([0.0, -9.81, 0.0])
     excess = rng.normal(size=(400, 3)) * [5.0, 50.0, 5.0] + [6.0, 200.0, -8.0]

@@ -195,6 +195,29 @@ def test_a_round_of_the_search_leaves_the_reserve_of_the_limits(designer, monkey
     assert any(start is kept for start, _ in asked)
 
 
+def test_random_motions_leave_the_reserve_of_limits_and_of_distances(wrist, designer):
+    """0.3 % of the limits, and of a pair its own; the search requires twice that of distances."""
+    motions = [designer.random(np.random.default_rng(seed)) for seed in range(10)]
+    largest = [np.abs(designer._constraints(C)[0]).max() for C in motions]
+    assert 0.996 < max(largest) <= 0.997 + 1e-9
+    asked = []
+
+    def margins(placed, spare, hints):
+        asked.append(spare)
+        return np.outer([0.2, 0.1 - spare], np.ones(43))
+
+    around = SimpleNamespace(
+        pairs=[(0, 1), (1, 2)], required=np.array([0.01, 0.03]), placed=lambda q: q,
+        spare=np.array([[2e-3], [5e-4]]), margins=margins,
+    )  # fmt: skip
+    near = replace(designer, clearance=around)
+    assert near._constraints(motions[0], 0.7)[1] == pytest.approx(0.1 - 0.7)
+    np.testing.assert_allclose(near._wanted, [[0.014], [0.031]])
+    near._feasible(motions[0], 0.5)
+    assert asked[0] == 0.7
+    assert set(asked[1:]) == {1.0}
+
+
 def test_multipliers_push_as_hard_on_a_finer_grid():
     limits = np.random.default_rng(0).uniform(0.0, 0.1, (6, 61, 3))
     distances = np.random.default_rng(1).uniform(0.0, 0.1, (4, 61))

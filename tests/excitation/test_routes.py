@@ -121,6 +121,34 @@ def test_sweeps_are_about_the_posture_whose_worst_joint_has_the_largest_share(mo
     assert speeds == (0.1,)
 
 
+@pytest.mark.parametrize("feasible", [8, 9])
+def test_sweeps_are_shortened_by_a_fifth_seven_times_at_most(monkeypatch, feasible):
+    shares, joints = [], ("a", "b")
+
+    def examined(*_):
+        used = np.full((6, 2), 0.5)
+        used[4, 1] = 0.9 if len(shares) == feasible else 3.5
+        return SimpleNamespace(contact=None, used=used, number=len(shares))
+
+    about = SimpleNamespace(
+        postures=SimpleNamespace(resting=lambda rng, count: np.zeros((30, 2))),
+        limits=SimpleNamespace(sizes=np.array([[2.0, 1.0]])), examined=examined,
+        information=SimpleNamespace(model=SimpleNamespace(joints=joints)),
+    )  # fmt: skip
+    monkeypatch.setattr(routes, "_free_range", lambda *_: np.array([[1.0, 2.0], [0.5, 0.5]]))
+    monkeypatch.setattr(
+        routes, "_sweeps",
+        lambda designer, posture, free, _: shares.append(free[0]) or SimpleNamespace(duration=1.0),
+    )  # fmt: skip
+    if feasible == 8:
+        assert design_sweeps(about, None).number == 8
+    else:
+        wanted = r"about none of 20 random .* can sweep: b needs 350 %; lower"
+        with pytest.raises(SettingsError, match=wanted):
+            design_sweeps(about, None)
+    np.testing.assert_allclose(shares, 0.8 ** np.arange(1, 9)[:, None] * [1.0, 2.0])
+
+
 def test_stands_weigh_torques_by_their_noise_over_two_seconds(monkeypatch):
     """Six of nine postures, one by one: each adds most to log det of the information."""
     rng = np.random.default_rng(3)

@@ -304,7 +304,7 @@ def test_a_coupled_drive_steps_at_each_of_its_joints_by_its_ratio():
     assert robust._friction_step(model, pi) == pytest.approx([1.4, 2.2, 3.5])
 
 
-def test_weights_and_their_loss_are_those_of_the_residuals_of_all_logs_together(model):
+def test_weights_and_their_loss_are_those_of_the_residuals_of_all_logs_together(model, monkeypatch):
     """The scale of a joint is the median of both logs; of the second most rows are not used."""
     rng, pi = np.random.default_rng(8), truth(model)
     signals = SignalSettings(cutoff=None, trim=0.0, min_velocity=0.3)
@@ -334,3 +334,7 @@ def test_weights_and_their_loss_are_those_of_the_residuals_of_all_logs_together(
     mean = np.minimum(1.0, 1.345 / scaled).mean() / np.mean(scaled < 1.345)
     assert understated == pytest.approx(mean, rel=1e-2)
     assert mean > 1.05
+    # residuals beyond the constant of the loss have no slope: a thousandth at least
+    monkeypatch.setattr(robust, "loss_slope", lambda loss, r: np.full(r.shape, 2e-4))
+    weight = np.minimum(1.0, 1.345 / scaled).mean()
+    assert robust.reweigh(own, "huber", prior)[1] == pytest.approx(weight / 1e-3, rel=1e-2)

@@ -79,6 +79,35 @@ def test_workers_with_another_robotid_are_refused(address, tmp_path, monkeypatch
     assert marks(tmp_path / "marks") == {}
 
 
+def test_other_versions_of_libraries_are_named_by_worker_and_host(monkeypatch, caplog):
+    here = {"robotid": "1.0", "numpy": "2.2", "scipy": "1.15"}
+    monkeypatch.setattr(cluster, "code_versions", lambda: here)
+    monkeypatch.setattr(cluster, "__version__", "1.0")
+
+    def compare(*workers):
+        """Workers are (host, versions), or an error; they are named 0, 1 and so on."""
+        caplog.clear()
+        own = [w if isinstance(w, Exception) else {"host": w[0], **w[1]} for w in workers]
+        client = SimpleNamespace(run=lambda *_, on_error: dict(enumerate(own)))
+        cluster._require_same_version("tcp://host:1", client)
+        return [(x.levelname, x.getMessage()) for x in caplog.records]
+
+    caplog.set_level("INFO")
+    assert compare(("b", here), ("a", here), ("b", here)) == [("INFO", "3 workers on ['a', 'b']")]
+    old = {**here, "numpy": "2.1", "scipy": "1.14"}
+    assert compare(("b", here), ("a", old)) == [
+        ("WARNING", "worker 1 on a has numpy 2.1 (here 2.2), scipy 1.14 (here 1.15): results may "
+                    "differ by rounding from a run here"),
+        ("INFO", "2 workers on ['a', 'b']"),
+    ]  # fmt: skip
+    with pytest.raises(
+        WorkerError, match=r"workers must run robotid 1.0, but a \(1\) has 0.9. Ins"
+    ):
+        compare(("a", here), ("a", {**here, "robotid": "0.9"}))
+    with pytest.raises(WorkerError, match=r"worker 1 of tcp://host:1 cannot run robotid 1.0 \(No"):
+        compare(("a", here), ModuleNotFoundError("No module named 'robotid'"))
+
+
 def allow_failures(address, number):
     with distributed.Client(address, set_as_default=False) as client:
         client.run_on_scheduler(

@@ -218,6 +218,15 @@ def test_a_script_needs_no_guard(tmp_path):
     assert marks(tmp_path / "marks") == dict.fromkeys(range(10), 1)
 
 
+def test_memory_that_a_worker_keeps_is_no_reason_to_replace_it():
+    """Pieces limit the memory; loky would replace a worker that grows by 300 MB."""
+    from loky import process_executor
+
+    with ProcessBackend(1) as backend:
+        largest = backend._start().submit(getattr, process_executor, "_MAX_MEMORY_LEAK_SIZE")
+        assert largest.result() == 10**15
+
+
 def test_workers_default_to_the_cores_for_long_work_only(tmp_path):
     short = pieces_in(tmp_path / "marks")
     assert choose_workers(short) == 1
