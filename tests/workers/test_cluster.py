@@ -30,13 +30,16 @@ def address():
         yield cluster.scheduler_address
 
 
-def test_a_cluster_reduces_to_the_same_bits(address, tmp_path):
+def test_a_cluster_reduces_to_the_same_bits(address, tmp_path, caplog):
+    caplog.set_level("INFO", logger="robotid")
     pieces = pieces_in(tmp_path / "marks", 12, pause=0.02)
     calls = []
     with ClusterBackend(address) as backend:
         found = reduce_all(pieces, backend=backend, progress=lambda *call: calls.append(call))
     assert marks(tmp_path / "marks") == dict.fromkeys(range(12), 1)
     assert len(workers_of(tmp_path / "marks") - {os.getpid()}) == 2
+    said = [text for name, _, text in caplog.record_tuples if name == "robotid.piecework"]
+    assert sorted(said) == sorted(f"reduced random rows {k}" for k in range(12))
     serial = reduce_all(pieces)
     assert all(map(same_bits, found, serial))
     assert same_bits(join(found), join(serial))

@@ -61,7 +61,8 @@ def kept(folder):
     return sorted((folder / ".robotid-checkpoint").glob("*.npz"))
 
 
-def test_the_number_of_workers_does_not_show_in_the_bits(tmp_path):
+def test_the_number_of_workers_does_not_show_in_the_bits(tmp_path, caplog):
+    caplog.set_level("INFO", logger="robotid")
     pieces = pieces_in(tmp_path / "marks")
     calls = []
     serial = reduce_all(pieces, progress=lambda *call: calls.append(call))
@@ -71,6 +72,8 @@ def test_the_number_of_workers_does_not_show_in_the_bits(tmp_path):
         assert all(map(same_bits, found, serial))
         assert same_bits(join(found), join(serial))
     assert marks(tmp_path / "marks") == dict.fromkeys(range(10), 3)
+    said = [text for name, _, text in caplog.record_tuples if name == "robotid.piecework"]
+    assert sorted(said) == sorted(f"reduced random rows {k}" for k in 3 * [*range(10)])
     assert os.getpid() in workers_of(tmp_path / "marks")
     total = sum(piece.samples for piece in pieces)
     assert calls[0] == ("reducing", 0, total, "samples")
