@@ -319,6 +319,47 @@ def test_a_better_reading_halves_one_residual_and_keeps_the_other(force, moment,
     assert reading(40.0, 15.0).is_better(stated, (90.0, 16.0)) is True  # a small moment may grow
 
 
+def test_the_reading_with_the_smallest_force_and_moment_is_named(urdf, log, monkeypatch):
+    """Shares of the weight, and of the weight at the distance of the feet; as stated 0.8 and 0.6.
+
+    X exchanges the feet.
+    """
+    model, motion = human(urdf), process(log, SLOW)
+    weight = 9.81 * sum(x.mass for x in model.pin_model.inertias)
+    some = motion.every(max(1, len(motion.t) // 400))
+    feet = link_positions(model.pin_model, model.configurations(some.q), FEET)
+    apart = np.linalg.norm(feet - some.q[:, None, :3], axis=2)
+    lever = np.sqrt(np.mean(apart**2)) + 1e-3
+
+    def reading(name, force, moment, known):
+        own = np.zeros((len(some.t), 6))
+        own[:, 1], own[:, 5] = force * weight, moment * weight * lever
+        return _Reading(tuple(name.split()), FEET * (name == "X"), 1.0, own, known * weight)
+
+    for others, wanted in [
+        ([("a", 0.45, 0.5, 1.0)], None),  # half of neither
+        ([("a", 0.39, 0.5, 1.0), ("b", 0.45, 0.01, 1.0)], "b"),
+        ([("a", 0.001, 0.05, 1.0), ("b", 0.004, 0.03, 1.0)], "b"),  # 0.011 0.06 and 0.014 0.04
+        ([("a c", 0.2, 0.10, 1.0), ("b", 0.2, 0.115, 1.0)], "b"),  # 1.2 for a second change
+        ([("a c", 0.2, 0.08, 1.0), ("b", 0.2, 0.115, 1.0)], "a and c"),
+        ([("a", 0.2, 0.01, 0.49), ("b", 0.3, 0.2, 0.51)], "b"),  # most of the force is unknown
+        ([("X", 0.1, 0.4, 1.0), ("b", 0.3, 0.4, 1.0)], "b"),  # the force does not show the foot
+        ([("X", 0.1, 0.2, 1.0), ("b", 0.3, 0.4, 1.0)], "X"),
+    ]:
+        every = [reading(*own) for own in [("", 0.8, 0.6, 1.0), *others]]
+        monkeypatch.setattr(wrenches, "_readings", lambda *_, every=every: every)
+        finding = next(iter(check_wrenches(model, log, motion)), None)
+        if wanted is None:
+            assert finding is None or "only" not in finding.message
+            continue
+        best = next(x for x in every if " and ".join(x.changes) == wanted)
+        assert f"if {wanted}. Correct the columns" in finding.message
+        assert finding.evidence["force"] == pytest.approx(0.8 * weight)
+        assert finding.evidence["best"] == pytest.approx(best.sizes[0])
+        force, moment = best.sizes
+        assert f"but only {force:.3g} N and {moment:.3g} N m if" in finding.message
+
+
 @pytest.mark.parametrize("foot", FEET)
 def test_the_gain_of_one_foot_is_named_with_its_factor(urdf, long_log, foot):
     wrong = {x: y * (1.3 if x.endswith(foot) else 1.0) for x, y in long_log.wrenches.items()}
