@@ -18,7 +18,7 @@ from robotid.exceptions import DataError, WorkerError
 from robotid.regressor.factors import join
 from robotid.workers import cluster
 from robotid.workers.cluster import ClusterBackend
-from robotid.workers.pieces import reduce_piece
+from robotid.workers.pieces import Outcome, reduce_piece
 
 distributed = pytest.importorskip("distributed")
 
@@ -144,6 +144,85 @@ def test_a_piece_that_kills_every_worker_is_given_up_and_its_neighbours_are_done
     serial = reduce_all(pieces_in(tmp_path / "alone", 5))
     assert sorted(found) == [0, 2, 3, 4]
     assert all(same_bits(own, serial[k]) for k, own in found.items())
+
+
+class Cluster:
+    """A client of a cluster, two threads of which take the pieces in turn; some end all workers."""
+
+    loop, status = None, "running"
+
+    def __init__(self, killers):
+        self.killers, self.running, self.killed = killers, [], []
+        self.submitted, self.released, self.cancelled = [], [], []
+
+    def nthreads(self):
+        return {"one": 1, "two": 1}
+
+    def submit(self, run, work, piece, level, version, *, key, pure):
+        assert (run, work, pure) == (cluster._run, reduce_piece, False)
+        name = key.split("-", 2)[2]
+        self.submitted.append((name, [x.name for x in self.running]))
+        future = SimpleNamespace(key=key, name=name, piece=piece, result=lambda timeout: of(future))
+        future.release = lambda: self.released.append(name)
+        self.running.append(future)
+
+        def of(future):
+            if future in self.killed:
+                raise distributed.KilledWorker("task", None, 0)
+            return Outcome(f"{future.piece.name} reduced", ())
+
+        return future
+
+    def cancel(self, futures):
+        self.cancelled += [x.name for x in futures]
+
+    def as_completed(self, loop):
+        return self
+
+    def add(self, future):
+        assert future is self.running[-1]
+
+    def has_ready(self):
+        return True
+
+    def __next__(self):
+        under_way = self.running[:2]
+        if any(x.piece.name in self.killers and x not in self.killed for x in under_way):
+            self.killed += under_way
+        return self.running.pop(0)
+
+
+def test_pieces_whose_worker_ended_are_repeated_alone(monkeypatch):
+    client, backend = Cluster(killers="b"), ClusterBackend("tcp://host:1")
+    monkeypatch.setattr(distributed, "as_completed", client.as_completed)
+    pieces = [SimpleNamespace(name=x) for x in "abcdefg"]
+    results = backend._collect(client, reduce_piece, list(enumerate(pieces)), lambda *lost: lost)
+    found = dict(results)
+    assert client.submitted == [
+        ("0", []), ("1", ["0"]), ("2", ["0", "1"]), ("3", ["0", "1", "2"]),
+        ("0-alone", []), ("1-alone", []),
+        ("4", []), ("5", ["4"]), ("6", ["4", "5"]),
+    ]  # fmt: skip
+    piece, error = found[1]
+    assert piece is pieces[1]
+    assert str(error).startswith("every worker of the cluster that processed b ended (killed, or")
+    assert list(found) == [2, 3, 0, 1, 4, 5, 6]
+    assert found[4] == "e reduced"
+    assert client.released == ["0", "1", "2", "3", "0-alone", "1-alone", "4", "5", "6"]
+    assert client.cancelled == []
+
+
+@pytest.mark.parametrize(("status", "wanted"), [("running", ["1", "2", "3"]), ("closed", [])])
+def test_pieces_under_way_are_cancelled_if_no_more_results_are_wanted(monkeypatch, status, wanted):
+    client, pieces = Cluster(killers=""), [SimpleNamespace(name=x) for x in "abcdefg"]
+    monkeypatch.setattr(distributed, "as_completed", client.as_completed)
+    results = ClusterBackend("tcp://host:1")._collect(
+        client, reduce_piece, list(enumerate(pieces)), None
+    )
+    assert next(results)[0] == 0
+    client.status = status
+    results.close()
+    assert client.cancelled == wanted
 
 
 def test_a_cluster_whose_workers_have_all_ended_is_not_waited_for(tmp_path):
