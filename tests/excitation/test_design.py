@@ -10,7 +10,7 @@ from robotid.excitation.basis import BSplineBasis, FourierBasis
 from robotid.excitation.clearance import Box, Clearance
 from robotid.excitation.design import Designer, State
 from robotid.excitation.limits import LIMITS, MotionLimits
-from robotid.excitation.multipliers import Multipliers
+from robotid.excitation.multipliers import SOFT, Multipliers
 from robotid.identification.assumptions import TorqueNoise
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.torque import joint_torque_regressor
@@ -193,6 +193,43 @@ def test_a_round_of_the_search_leaves_the_reserve_of_the_limits(designer, monkey
     designer._updated(state, fast, 1e-3)
     assert [most for _, most in asked] == [1.0 - 0.003] * len(asked)
     assert any(start is kept for start, _ in asked)
+
+
+def test_a_search_has_converged_near_its_limits_when_it_gains_no_more(designer, monkeypatch):
+    """Before the round the criterion is 5; 1 is the iterate, 2 it scaled, 3 mixed, 0 that before.
+
+    Per round: use of the limits, margin [m], criterion of 1, 2 and 3; criterion, number and next
+    iterate after it, violation, whether it has converged.
+    """
+    zero = np.zeros((designer.basis.size, 3))
+    before = State(zero, 5.0, zero, Multipliers(0.2))
+    monkeypatch.setattr(Designer, "_feasible", lambda self, C, most: zero + 2.0)
+    monkeypatch.setattr(Designer, "_towards", lambda self, kept, C, most: zero + 3.0)
+    monkeypatch.setattr(Designer, "matrix", lambda self, rows: rows)
+    monkeypatch.setattr(Designer, "_distances", lambda self, rows, multipliers: (None, None))
+    monkeypatch.setattr(Multipliers, "raised", lambda self, *_: self)
+    for used, margin, own, scaled, mixed, *wanted in [
+        (1.005, 0.0, 4.980, 4.990, None, 4.990, 2, 1, 0.008, False),  # gains more
+        (1.005, 0.0, 4.990, 4.999, 5.100, 4.999, 2, 1, 0.008, True),
+        (0.900, 0.0, 4.990, 5.010, 4.999, 4.999, 3, 1, 0.0, True),
+        (1.020, 0.0, 4.990, 4.999, 5.100, 4.999, 2, 2, 0.023, False),  # not near the limits
+        (0.900, -1e-3, 4.99, 4.999, 5.100, 4.999, 2, 2, 1e-3 / SOFT, False),
+        (0.900, -1e-3, 4.94, 4.950, None, 4.950, 2, 1, 1e-3 / SOFT, False),
+        (0.900, 0.0, 4.940, 4.985, None, 4.985, 2, 2, 0.0, False),  # scaling costs too much
+        (0.900, 0.0, 4.940, 4.970, None, 4.970, 2, 1, 0.0, False),
+        (0.900, 0.0, 5.040, 5.100, 5.050, 5.000, 0, 1, 0.0, True),  # worse than before
+        (1.020, 0.0, 5.040, 5.100, 5.050, 5.000, 0, 0, 0.023, False),
+    ]:
+        shares = np.full((6, 4, 3), 0.1)
+        shares[2, 1, 0] = -used
+        monkeypatch.setattr(Designer, "_constraints", lambda *_, x=shares, y=margin: (x, y, "rows"))
+        monkeypatch.setattr(Designer, "judged", lambda *_, x=own: (x, None))
+        values = {2.0: scaled, 3.0: mixed}
+        monkeypatch.setattr(Designer, "_objective", lambda _, C, x=values: x[C[0, 0]])
+        after, violation = designer._updated(before, zero + 1.0, 2e-3)
+        found = [after.objective, after.feasible[0, 0], after.iterate[0, 0], violation]
+        assert found == pytest.approx(wanted[:4], abs=1e-12), (used, margin, own)
+        assert after.is_settled is wanted[4], (used, margin, own)
 
 
 def test_random_motions_leave_the_reserve_of_limits_and_of_distances(wrist, designer):
