@@ -21,7 +21,7 @@ from robotid.exceptions import (
 from robotid.regressor.factors import Reduction, available_cores, join
 from robotid.workers.pieces import reduce_piece
 from robotid.workers.plan import choose_workers
-from robotid.workers.processes import ProcessBackend
+from robotid.workers.processes import ProcessBackend, _interrupts_deferred
 
 SCRIPT = Path(__file__).parents[1] / "helpers" / "piecework.py"
 
@@ -205,6 +205,43 @@ def test_ctrl_c_in_a_terminal_reaches_the_workers_too_and_shows_one_traceback(tm
     assert error.count("Traceback") == 1  # of the script; workers say nothing
     assert "KeyboardInterrupt" in error
     assert error.strip().endswith(".robotid-checkpoint. Continue with --resume")
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_an_interrupt_during_the_pools_own_functions_is_raised_after_them(number):
+    heard, before = [], signal.getsignal(number)
+
+    def handler(number, _):
+        heard.append(number)
+
+    signal.signal(number, handler)
+    try:
+        with _interrupts_deferred():
+            signal.raise_signal(number)
+            time.sleep(0.01)
+            assert heard == []
+        assert heard == [number]
+        assert signal.getsignal(number) is handler
+        assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, [])
+        with _interrupts_deferred():
+            pass
+        assert heard == [number]
+        signal.signal(number, signal.SIG_IGN)  # as nohup does
+        with _interrupts_deferred():
+            signal.raise_signal(number)
+        assert signal.getsignal(number) == signal.SIG_IGN
+        masked = []
+
+        def work():  # only the main thread may have handlers
+            with _interrupts_deferred():
+                masked.append(signal.pthread_sigmask(signal.SIG_BLOCK, []))
+
+        thread = threading.Thread(target=work)
+        thread.start()
+        thread.join()
+        assert masked == [{signal.SIGINT}]
+    finally:
+        signal.signal(number, before)
 
 
 def test_a_script_needs_no_guard(tmp_path):
