@@ -5,9 +5,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from robotid.exceptions import SettingsError
+from robotid.exceptions import NotConvergedError, SettingsError
 from robotid.excitation.basis import BSplineBasis, FourierBasis
-from robotid.excitation.clearance import Box, Clearance
+from robotid.excitation.clearance import Box, Clearance, Contact
 from robotid.excitation.design import Designer, State
 from robotid.excitation.limits import LIMITS, MotionLimits
 from robotid.excitation.multipliers import SOFT, Multipliers
@@ -93,7 +93,13 @@ def test_a_design_keeps_its_limits_between_its_instants(wrist, designer, design)
 
 def test_designs_are_the_same_under_a_seed_and_stop_when_told(designer):
     short = replace(designer, basis=BSplineBasis(4.0, 5))
-    one, other = (short.design(np.random.default_rng(3), starts=1, seconds=0.0) for _ in range(2))
+    told = []
+    one, other = (
+        short.design(np.random.default_rng(3), starts=1, seconds=0.0, progress=progress)
+        for progress in (None, lambda *call: told.append(call))
+    )
+    assert [start for start, _ in told] == [0, 1]  # as it starts, and before the finer grid
+    assert told[0][1] == other.history[0][1]
     np.testing.assert_array_equal(one.motion.coefficients, other.motion.coefficients)
     assert not one.is_converged
     assert one.used.max() <= 1.0
@@ -310,6 +316,65 @@ def test_what_a_joint_needs_to_rest_is_the_least_of_what_postures_need(wrist, de
     postures = replace(designer.postures, limits=replace(designer.limits, sizes=weak))
     words = postures._why_not(*postures._at_rest(q))
     assert "wrist_1_joint needs at least 300 % of its torque limit; state" in words
+
+
+def test_what_most_postures_violate_is_named_if_no_limit_rules_out_all(wrist, designer):
+    """Of eight postures; two pairs of links and two limits."""
+    around = SimpleNamespace(
+        named=[("tool", "floor"), ("arm", "post")], required=np.array([0.02, 0.03]),
+        spare=np.array([[2e-3], [1e-3]]),
+    )  # fmt: skip
+    used, margins = np.full((6, 8, 3), 0.5), np.full((2, 8), 0.1)
+    used[4, :3, 1], used[0, 7, 2], used[4, 3, 1] = 1.4, 1.01, 1.0
+    margins[1, 2:7], margins[0, 0] = -0.004, -0.001
+    postures = replace(designer.postures, clearance=around)
+    assert postures._why_not(used, margins).startswith(
+        "none of 8 random postures is feasible at rest: each violates a limit or a distance, "
+        "wanted one without violations. Most frequent: arm and post are nearer than 31.0 mm in 62 %, "
+        "wrist_2_joint needs more than its torque limit in 38 %, wrist_3_joint needs more than its "
+        "position limit in 12 %"
+    )
+    margins[1] = -0.004
+    margins[1, 5] = -0.0015
+    assert postures._why_not(used, margins).endswith(
+        "rest: the distance of arm and post is 29.5 mm at most, wanted 31.0 mm; lower the "
+        "clearance, or move the floor and the boxes"
+    )
+    used[0], margins[:] = 1.5, 0.1
+    used[0, :, 1] = 1.7
+    weak = replace(
+        designer.postures, limits=replace(designer.limits, sizes=designer.limits.sizes * 1e-3)
+    )
+    with pytest.raises(SettingsError, match=r"^in the first posture \w+ needs at least \d+ % of"):
+        weak.required(np.full(3, 2.0))
+    ok = designer.postures.resting(np.random.default_rng(0))[0]
+    assert designer.postures.required(ok) is ok
+
+
+def test_a_motion_that_collides_between_samples_is_scaled_more_and_more(designer):
+    C = np.arange(1.0, 1.0 + designer.basis.size * 3).reshape(-1, 3)
+    margins, seen = [], []
+
+    def nearest(motion, duration):
+        assert duration == 4.0
+        seen.append(motion.coefficients)
+        return Contact("arm", "post", 0.02 + margins.pop(0), 1.5, 0.02)
+
+    near = replace(designer, clearance=SimpleNamespace(nearest=nearest))
+    margins[:] = [-0.01, -0.005, -0.001, 0.0]
+    found, contact = near._clear(C)
+    for own, share in zip(seen, np.cumprod([1.0, 0.99, 0.98, 0.96]), strict=True):
+        np.testing.assert_allclose(own, np.vstack([C[:1], share * C[1:]]))
+    assert found is seen[-1]
+    assert contact.margin == 0.0
+    margins[:] = [-0.01] * 9 + [-0.0042]
+    with pytest.raises(NotConvergedError) as caught:
+        near._clear(C)
+    words = "of the design arm and post approach to 16 mm at 1.50 s, margin -4.2 mm, wanted 0 or"
+    assert words in str(caught.value)
+    share = np.prod([0.99, 0.98, 0.96, 0.92, 0.84, 0.68, 0.5, 0.5, 0.5])
+    np.testing.assert_allclose(seen[-1][1:], share * C[1:])
+    assert str(Contact("a", "b", -0.003, 2.346)) == "a and b overlap at 2.35 s"
 
 
 def test_postures_are_drawn_from_the_middle_of_wide_ranges(designer):

@@ -327,3 +327,27 @@ def test_the_page_has_limits_course_errors_and_a_search_that_got_better(
     places = [shown.rindex(part) for part in parts]
     assert places == sorted(places)
     assert (">Course of the optimisation<" in shown) == is_shown
+
+
+def test_each_limit_has_a_chart_of_its_joints_and_some_quantities_without_one(monkeypatch):
+    """Position is limited of all joints, torque of two, power of one, the others of none."""
+    sizes = np.full((len(LIMITS), 3), np.inf)
+    sizes[LIMITS.index("position")] = sizes[LIMITS.index("torque"), [0, 2]] = 1.0
+    sizes[LIMITS.index("power"), 1] = 1.0
+    course = SimpleNamespace(limits=SimpleNamespace(sizes=sizes), clearance=None, nearest=None)
+    for word in ("share", "free"):
+        monkeypatch.setattr(
+            motion_page, f"_{word}_chart",
+            lambda model, course, kind, joints, word=word: f"{word} {kind} {joints.tolist()};",
+        )  # fmt: skip
+    monkeypatch.setattr(motion_page, "_distance_chart", lambda *given: f"distance {given[2]}")
+    shown = ["share position [0, 1, 2];", "free acceleration [0, 1, 2];", "share torque [0, 2];",
+             "free torque [1];", "share power [1];"]  # fmt: skip
+    for nearest, clearance, last in (
+        (None, None, ""), (None, "around", ""), ("contact", None, ""),
+        ("contact", "around", "distance around"),
+    ):  # fmt: skip
+        course.nearest, course.clearance = nearest, clearance
+        found = motion_page._over_time("model", {}, course)
+        assert found == f'<div class="plots">\n{"".join(shown)}{last}</div>\n'
+    assert motion_page._ground({"limits": {"torque": {"margin": 0.1}}}) == ""

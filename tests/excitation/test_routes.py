@@ -6,7 +6,7 @@ import pytest
 from robotid.exceptions import SettingsError
 from robotid.excitation import routes
 from robotid.excitation.basis import FourierBasis
-from robotid.excitation.clearance import Clearance
+from robotid.excitation.clearance import Clearance, Contact
 from robotid.excitation.course import Course
 from robotid.excitation.design import Designer
 from robotid.excitation.limits import LIMITS, MotionLimits
@@ -140,6 +140,9 @@ def test_sweeps_are_shortened_by_a_fifth_seven_times_at_most(monkeypatch, feasib
         routes, "_sweeps",
         lambda designer, posture, free, _: shares.append(free[0]) or SimpleNamespace(duration=1.0),
     )  # fmt: skip
+    contact = Contact("arm", "post", -0.01, 2.0)
+    stuck = SimpleNamespace(contact=contact, used=np.zeros((6, 2)))
+    assert routes._why(stuck, about) == "arm and post overlap at 2.00 s"
     if feasible == 8:
         assert design_sweeps(about, None).number == 8
     else:
