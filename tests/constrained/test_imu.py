@@ -10,7 +10,7 @@ from helpers.paths import JOBS
 
 from robotid.commands.job import read_job
 from robotid.constrained.contacts import check_base
-from robotid.constrained.imu import _check_orientation, _named, _turn
+from robotid.constrained.imu import _check_axes, _check_orientation, _named, _turn
 from robotid.logs.base import BaseMotion, base_state, in_base, quaternions_of_angles
 from robotid.logs.data import Log
 from robotid.logs.imu import ImuFrame, ImuMotion
@@ -301,3 +301,22 @@ def test_another_quaternion_explains_gyroscopes_but_for_a_third_of_the_motion(le
         assert finding.evidence == pytest.approx({"speed": off, "best": left * size})
         assert f"differs by {off:.2g} rad/s (RMS)" in finding.message
         assert "it is the orientation of the world in the base" in finding.message
+
+
+@pytest.mark.parametrize(("source", "is_error"), [("from the orientation", True), ("x", False)])
+def test_an_angular_velocity_that_nothing_explains_is_an_error_only_by_the_orientation(
+    source, is_error
+):
+    """Feet in contact may slip; the noise is broadband and has no axes."""
+    w, own = np.random.default_rng(0).standard_normal((2, 300, 3)) * [[[0.5]], [[0.8]]]
+    D = np.tile(np.eye(3), (300, 1, 1))
+    log = SimpleNamespace(name="log")
+    found = list(_check_axes(log, FRAME, w, D, -own, source))
+    assert len(found) == is_error
+    for finding in found:
+        size, off = (np.sqrt(np.mean(np.sum(x**2, axis=1))) for x in (own, w - own))
+        assert finding.evidence["off"] == pytest.approx(off / size)
+        assert 0.5 < finding.evidence["best"] / finding.evidence["off"] < 1.0
+        assert "neither other axes nor degrees explain it. Check the columns" in finding.message
+    slow = 0.09 / np.sqrt(np.mean(np.sum(w**2, axis=1)))  # below 0.1 rad/s
+    assert not list(_check_axes(log, FRAME, slow * w, D, -own, source))

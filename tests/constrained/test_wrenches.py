@@ -275,6 +275,22 @@ def test_a_delay_counts_if_a_tenth_of_the_squared_residual_goes_with_it(noise, c
         assert "state wrench_delay = 0.045 in [signals]" in finding.message
 
 
+@pytest.mark.parametrize(("rows", "count"), [(359, 0), (360, 1)])
+def test_a_delay_is_searched_in_eight_parts_of_twice_its_largest_size(rows, count):
+    """Of 20 rows, which both ends lack; the log has two segments, then the middle lacks 40 more."""
+    rng = np.random.default_rng(1)
+    for gap in (0, 40):
+        t = 3.0 + 0.01 * np.arange(rows + gap)
+        force = np.cumsum(rng.standard_normal((len(t), 1)), axis=0)
+        late = np.vstack([np.repeat(force[:1], 4, axis=0), force[:-4]])
+        slopes, left = np.zeros((len(t), 1, 6)), np.zeros((len(t), 6))
+        slopes[:, 0, 2], left[:, 2] = 1.0, force[:, 0]
+        segment = (np.arange(len(t)) >= 150).astype(int) if gap else None
+        motion = SimpleNamespace(t=t, wrenches=late, segment=segment)
+        found = list(check_delay("log", motion, slopes, left, 0.0))
+        assert [x.evidence["delay"] for x in found] == count * [pytest.approx(0.04, abs=2e-3)]
+
+
 def test_the_delay_is_searched_without_the_torques_of_unknown_forces(urdf, log, monkeypatch):
     contacts = tuple(Contact(foot, "point", ("fz",), always=True) for foot in FEET)
     model, given = replace(human(urdf), constraints=contacts), []
@@ -393,6 +409,10 @@ def test_the_gain_of_a_foot_is_relative_to_the_median_of_the_others():
     assert f"that of c is multiplied by {finding.evidence['factor']:.3g} +-" in finding.message
     assert "relative to a, b, d: the gain" in finding.message
     assert not list(check_gains("log", names[:2], loads[:, :, :2] * 1.1, left))  # not all the load
+    assert not list(check_gains("log", ("c",), loads[:, :, 2:3], left))
+    for rows, count in ((15, 0), (16, 1)):  # two in each of eight parts
+        some = slice(0, 25 * rows, 25)
+        assert len(list(check_gains("log", names, loads[some], 1.2 * left[some]))) == count
     right, same = shifting(np.random.default_rng(1), np.array([1.03, 1.0, 1.0, 0.98]))
     assert not list(check_gains("log", names, right, 1.2 * same))
 
@@ -442,6 +462,8 @@ def test_a_mean_horizontal_force_is_an_offset_or_a_tilt():
     parts = excess.reshape(8, 50, 3)[:, :, [0, 2]].mean(axis=1)
     error = np.sqrt(np.sum(parts.var(axis=0, ddof=1)) / 8)
     assert finding.evidence["std_error"] == pytest.approx(error)
+    assert not list(check_level("log", excess[:15], down, 70.0))
+    assert len(list(check_level("log", excess[:16], down, 70.0))) == 1
     assert not list(check_level("log", excess, down, 1100.0))  # below 1 % of the weight
     assert not list(check_level("log", excess - [6.0, 0.0, -8.0], down, 50.0))
 
