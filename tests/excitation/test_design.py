@@ -331,8 +331,8 @@ def test_what_most_postures_violate_is_named_if_no_limit_rules_out_all(wrist, de
     assert postures._why_not(used, margins).startswith(
         "none of 8 random postures is feasible at rest: each violates a limit or a distance, "
         "wanted one without violations. Most frequent: arm and post are nearer than 31.0 mm in "
-        "62 %, wrist_2_joint needs more than its torque limit in 38 %, wrist_3_joint needs more than its "
-        "position limit in 12 %"
+        "62 %, wrist_2_joint needs more than its torque limit in 38 %, wrist_3_joint needs more "
+        "than its position limit in 12 %"
     )
     margins[1] = -0.004
     margins[1, 5] = -0.0015
