@@ -9,7 +9,7 @@ from helpers.fitting import fit
 from helpers.synthetic import exact_log, truth
 
 from robotid.estimators import WLS
-from robotid.exceptions import SettingsError
+from robotid.exceptions import NotConvergedError, SettingsError
 from robotid.fitting import robust
 from robotid.fitting.robust import LOSSES, find_outliers, loss_slope, loss_weight
 from robotid.fitting.settings import EstimatorSettings
@@ -334,6 +334,10 @@ def test_weights_and_their_loss_are_those_of_the_residuals_of_all_logs_together(
     mean = np.minimum(1.0, 1.345 / scaled).mean() / np.mean(scaled < 1.345)
     assert understated == pytest.approx(mean, rel=1e-2)
     assert mean > 1.05
+    monkeypatch.setattr(robust, "_MAX_ITERATIONS", 1)  # the first fit has none to compare with
+    with pytest.raises(NotConvergedError, match=r"of the huber loss have not converged after 1 p"):
+        robust.reweigh(own, "tukey", prior)
+    monkeypatch.undo()
     # residuals beyond the constant of the loss have no slope: a thousandth at least
     monkeypatch.setattr(robust, "loss_slope", lambda loss, r: np.full(r.shape, 2e-4))
     weight = np.minimum(1.0, 1.345 / scaled).mean()
