@@ -21,6 +21,8 @@ from robotid.workers.cluster import ClusterBackend
 from robotid.workers.pieces import Outcome, reduce_piece
 
 distributed = pytest.importorskip("distributed")
+# a busy disk is no error of a cluster
+pytestmark = pytest.mark.filterwarnings("ignore:Creating scratch directories:UserWarning")
 
 
 @pytest.fixture(scope="module")
