@@ -138,8 +138,16 @@ def test_terms_that_are_not_chosen_are_tried_a_second_time(monkeypatch, chosen, 
     monkeypatch.setattr(fit, "_with", extended)
     monkeypatch.setattr(fit, "refine_steps", lambda simulator, _, estimate: (simulator, estimate))
     monkeypatch.setattr(fit, "is_stated", lambda *_: np.array([False]))
-    found = fit.fit_loops(None, [], LoopSettings(), SimulationSettings())
+    stages = []
+    found = fit.fit_loops(
+        None,
+        [],
+        LoopSettings(),
+        SimulationSettings(),
+        progress=lambda *call: stages.append(call[0]),
+    )
     assert tried == passes
+    assert stages[:2] == ["trying friction terms", "fitting loops"]
     assert [f"{t.name} {t.number} {'yes' if t.is_chosen else 'no'}" for t in found.tried] == last
     assert found.simulator.names == tuple(name for name in chosen if name)
     assert [kind for kind, *_ in fits].count("fit") == max(1, len(found.simulator.names))

@@ -315,7 +315,14 @@ def test_whitening_and_free_gains_are_those_of_all_logs(planar, monkeypatch, spe
     seen = []
     monkeypatch.setattr(fit, "fit_second_order", lambda *x, **how: seen.append((x, how)) or plain)
     loop, asked = LoopSettings(delay=0.01), SimulationSettings(window=0.5, lead=0.1, bodies=0.0)
-    found = fit._initialise_from_commands(planar, logs, loop, asked, None, lambda *_: None)
+    stages = []
+    found = fit._initialise_from_commands(
+        planar, logs, loop, asked, None, lambda *call: stages.append(call)
+    )
+    assert stages == [
+        (name, fit.STAGES.index(name), len(fit.STAGES), "stages")
+        for name in ("trying second-order models", "fitting loops")
+    ]
     most = np.exp(-2.0 * 0.008 / plain.time_constant)
     np.testing.assert_allclose(found.estimator.most, np.tile(most, 3))
     names = found.simulator.names
@@ -329,6 +336,32 @@ def test_whitening_and_free_gains_are_those_of_all_logs(planar, monkeypatch, spe
     assert max(lengths) == 0.5
     assert {id(w.log) for w in given[1]} == {id(w.log) for w in found.simulator.windows}
     assert len({id(w.log) for w in given[1]}) == 2
+
+
+def test_a_fit_by_torques_starts_with_their_rows_and_says_so(planar, monkeypatch):
+    stages, pi = [], planar.standard_parameters()
+    pi[planar.layout.n_inertial :] = 0.25
+    q = np.column_stack([0.5 * np.sin(6 * T), 0.7 * np.cos(4 * T)])
+    log = Log(T, q, 7.0 * q, planar.joints)
+    rows = SimpleNamespace(standard=pi)
+    monkeypatch.setattr(fit, "identified_rows", lambda *_: rows)
+    found = fit._initialise_from_torque(
+        planar, [log], LoopSettings(kind="torque"), SimulationSettings(torques=False, bodies=0.0),
+        None, lambda *call: stages.append(call),
+    )  # fmt: skip
+    assert stages == [
+        (name, fit.STAGES.index(name), len(fit.STAGES), "stages")
+        for name in ("fitting torques", "fitting loops")
+    ]
+    assert found.linear is rows
+    assert found.plain is None
+    np.testing.assert_allclose(
+        found.torque, 7.0 * np.sqrt(np.mean(q[:400] ** 2, axis=0)), rtol=0.02
+    )
+    free = {x.name: x.prior for x in found.simulator.free_parameters}
+    names = {n.rsplit(".", 1)[1] for n in planar.layout.names[planar.layout.n_inertial :]}
+    assert {name.rsplit(".", 1)[1] for name in free} == names
+    assert set(free.values()) == {0.25}
 
 
 @pytest.mark.parametrize(("count", "finds_delay"), [(50, True), (30, False)])
