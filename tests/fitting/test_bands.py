@@ -13,7 +13,9 @@ from robotid.fitting.bands import (
     TorqueBand,
     expected_band,
     friction_curve,
+    next_errors,
     recording_bands,
+    rms_error,
     torque_band,
     typical_friction,
 )
@@ -290,3 +292,14 @@ def test_the_band_of_a_recording_has_each_open_term_with_what_it_moves(rng):
     np.testing.assert_array_equal(band.samples, np.arange(9))
     np.testing.assert_allclose(band.parameters, np.sqrt(variance).reshape(9, 3), rtol=1e-9)
     np.testing.assert_allclose(band.total**2, band.parameters**2 + [9.0, 1.0, 0.25], rtol=1e-12)
+    other = rng.standard_normal((30, len(standard)))  # as much as the next log may differ
+    wide = expected_band(found, SimpleNamespace(recording=recording), other.T @ other)
+    more = np.sum((W @ other.T) ** 2, axis=1).reshape(9, 3)
+    np.testing.assert_allclose(wide.parameters**2, band.parameters**2 + more, rtol=1e-9)
+    short = replace(wide, samples=wide.samples[:4], parameters=wide.parameters[:4])
+    squares = np.vstack([wide.total, short.total]) ** 2
+    np.testing.assert_allclose(rms_error([wide, short]), np.sqrt(squares.mean(axis=0)))
+    after = replace_in(
+        found, between=other.T @ other, fitted=[SimpleNamespace(recording=recording)]
+    )
+    np.testing.assert_allclose(next_errors(after), np.sqrt(np.mean(wide.total**2, axis=0)))
