@@ -110,7 +110,7 @@ class ClusterBackend(Backend):
         try:
             while True:
                 most = 2 * max(1, sum(client.nthreads().values()))
-                is_alone = bool(again) or any(own[0] in suspects for own in running.values())
+                is_alone = bool(again)
                 if again and not running:
                     submit(*again.popleft())
                 for index, piece in islice(waiting, 0 if is_alone else max(0, most - len(running))):

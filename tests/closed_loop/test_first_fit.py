@@ -54,6 +54,7 @@ def test_the_first_fit_is_of_drives_alone_with_the_bodies_of_the_urdf(monkeypatc
 class Started(Simulator):
     starts: int = 0
     error: str = ""
+    names: tuple = ()
     lag = exact = torque = None
 
     def with_better_start(self, theta):
@@ -64,6 +65,7 @@ class Started(Simulator):
 class Recorder:
     rounds: int
     fits: list
+    inflation: float = 3.0
 
     def minimise(self, simulator, theta=None):
         self.fits.append(("steps", self.rounds, len(simulator.windows), simulator.starts))
@@ -95,6 +97,60 @@ def test_only_the_last_fit_is_to_all_windows_from_better_starts(monkeypatch):
         ("fit", 9, 96, 4),
     ]
     assert len(found.simulator.windows) == 96
+
+
+@pytest.mark.parametrize(
+    ("chosen", "passes", "last"),
+    [
+        (["a", "b"], [["a", "b", "c"], ["b", "c"]], ["a 1 yes", "b 2 yes", "c 2 no"]),
+        (["b", ""], [["a", "b", "c"], ["a", "c"]], ["b 1 yes", "a 2 no", "c 2 no"]),
+        (["", ""], [["a", "b", "c"]] * 2, ["a 2 no", "b 2 no", "c 2 no"]),
+    ],
+)
+def test_terms_that_are_not_chosen_are_tried_a_second_time(monkeypatch, chosen, passes, last):
+    """And the loops are fitted with those of each pass; after the first one in any case."""
+    fits, tried = [], []
+    simulator = Started((), tuple(range(3)), np.zeros(0))
+    others = dict.fromkeys(("linear", "encoders", "plain"))
+    initialised = SimpleNamespace(
+        simulator=simulator, estimator=Recorder(9, fits), torque="torque", **others
+    )
+
+    def choose(simulator, theta, offered, estimator):
+        tried.append([set_[0].name for set_ in offered])
+        assert estimator.inflation == 1.0
+        assert simulator.names[-len(offered) :] == tuple(tried[-1])
+        own = chosen[len(tried) - 1]
+        return [
+            SimpleNamespace(name=name, number=len(tried), is_chosen=name == own)
+            for name in tried[-1]
+        ]
+
+    def extended(simulator, theta, sets):
+        names = simulator.names + tuple(set_[0].name for set_ in sets)
+        return replace(simulator, names=names), theta
+
+    every = [(SimpleNamespace(name=name), None) for name in "abc"]
+    monkeypatch.setattr(fit, "_initialise_from_commands", lambda *_: initialised)
+    monkeypatch.setattr(fit, "_check_settings", lambda *_: None)
+    monkeypatch.setattr(fit, "candidates", lambda simulator, torque: every * (torque == "torque"))
+    monkeypatch.setattr(fit, "choose", choose)
+    monkeypatch.setattr(fit, "_with", extended)
+    monkeypatch.setattr(fit, "refine_steps", lambda simulator, _, estimate: (simulator, estimate))
+    monkeypatch.setattr(fit, "is_stated", lambda *_: np.array([False]))
+    stages = []
+    found = fit.fit_loops(
+        None,
+        [],
+        LoopSettings(),
+        SimulationSettings(),
+        progress=lambda *call: stages.append(call[0]),
+    )
+    assert tried == passes
+    assert stages[:2] == ["trying friction terms", "fitting loops"]
+    assert [f"{t.name} {t.number} {'yes' if t.is_chosen else 'no'}" for t in found.tried] == last
+    assert found.simulator.names == tuple(name for name in chosen if name)
+    assert [kind for kind, *_ in fits].count("fit") == max(1, len(found.simulator.names))
 
 
 def test_where_a_settling_step_cannot_be_simulated_the_parameters_are_fitted():

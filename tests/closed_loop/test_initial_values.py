@@ -13,6 +13,7 @@ from robotid.closed_loop.fit import stated_loops
 from robotid.closed_loop.initial_values import (
     first_loops,
     free_drive_parameters,
+    free_zeros,
     is_stated,
     likeness,
     typical_sizes,
@@ -20,12 +21,12 @@ from robotid.closed_loop.initial_values import (
 )
 from robotid.closed_loop.second_order import _FREQUENCIES, SecondOrder, _better
 from robotid.closed_loop.settings import LoopSettings
-from robotid.closed_loop.zeros import _Motion
+from robotid.closed_loop.zeros import _Motion, same_encoders
 from robotid.fitting.settings import SimulationSettings
 from robotid.logs.data import Log
 from robotid.regressor.prediction import predict_instants
 from robotid.robot.model import RobotModel
-from robotid.simulation.loops import cut_windows
+from robotid.simulation.loops import ClosedLoopRobot, cut_windows
 
 T = 3.0 + np.arange(400) / 200.0
 
@@ -236,6 +237,16 @@ def test_a_number_states_all_joints_and_a_table_those_it_names(planar):
         assert is_stated(value, planar).tolist() == [bool(x) for x in wanted]
 
 
+def test_zeros_other_than_the_urdfs_are_free_about_their_first_estimates(planar):
+    """With a standard deviation of 0.3 rad; a sign alone has a gain, too."""
+    first = replace(same_encoders(planar), zero=np.array([0.4, -0.2]), gain=np.array([0.0, 0.7]))
+    (found,) = free_zeros(planar, first)
+    assert (found.name, found.what, found.joints) == (f"{planar.joints[1]}.zero", "zero", (1,))
+    assert (found.prior, found.spread, found.lowest) == (-0.2, 0.3, -np.inf)
+    both = free_zeros(planar, replace(first, gain=np.array([0.1, 0.7])))
+    assert [(x.joints, x.prior) for x in both] == [((0,), 0.4), ((1,), -0.2)]
+
+
 def test_a_load_that_would_push_a_loop_the_wrong_way_does_not_count(rng):
     model = RobotModel.from_urdf(URDF / "planar_2r.urdf", gravity=(0.0, -9.81, 0.0))
     q, v, a = rng.uniform(-1.0, 1.0, (3, 60, 2))
@@ -304,7 +315,14 @@ def test_whitening_and_free_gains_are_those_of_all_logs(planar, monkeypatch, spe
     seen = []
     monkeypatch.setattr(fit, "fit_second_order", lambda *x, **how: seen.append((x, how)) or plain)
     loop, asked = LoopSettings(delay=0.01), SimulationSettings(window=0.5, lead=0.1, bodies=0.0)
-    found = fit._initialise_from_commands(planar, logs, loop, asked, None, lambda *_: None)
+    stages = []
+    found = fit._initialise_from_commands(
+        planar, logs, loop, asked, None, lambda *call: stages.append(call)
+    )
+    assert stages == [
+        (name, fit.STAGES.index(name), len(fit.STAGES), "stages")
+        for name in ("trying second-order models", "fitting loops")
+    ]
     most = np.exp(-2.0 * 0.008 / plain.time_constant)
     np.testing.assert_allclose(found.estimator.most, np.tile(most, 3))
     names = found.simulator.names
@@ -318,6 +336,90 @@ def test_whitening_and_free_gains_are_those_of_all_logs(planar, monkeypatch, spe
     assert max(lengths) == 0.5
     assert {id(w.log) for w in given[1]} == {id(w.log) for w in found.simulator.windows}
     assert len({id(w.log) for w in given[1]}) == 2
+
+
+def test_a_fit_by_torques_starts_with_their_rows_and_says_so(planar, monkeypatch):
+    stages, pi = [], planar.standard_parameters()
+    pi[planar.layout.n_inertial :] = 0.25
+    q = np.column_stack([0.5 * np.sin(6 * T), 0.7 * np.cos(4 * T)])
+    log = Log(T, q, 7.0 * q, planar.joints)
+    rows = SimpleNamespace(standard=pi)
+    monkeypatch.setattr(fit, "identified_rows", lambda *_: rows)
+    found = fit._initialise_from_torque(
+        planar, [log], LoopSettings(kind="torque"), SimulationSettings(torques=False, bodies=0.0),
+        None, lambda *call: stages.append(call),
+    )  # fmt: skip
+    assert stages == [
+        (name, fit.STAGES.index(name), len(fit.STAGES), "stages")
+        for name in ("fitting torques", "fitting loops")
+    ]
+    assert found.linear is rows
+    assert found.plain is None
+    np.testing.assert_allclose(
+        found.torque, 7.0 * np.sqrt(np.mean(q[:400] ** 2, axis=0)), rtol=0.02
+    )
+    free = {x.name: x.prior for x in found.simulator.free_parameters}
+    names = {n.rsplit(".", 1)[1] for n in planar.layout.names[planar.layout.n_inertial :]}
+    assert {name.rsplit(".", 1)[1] for name in free} == names
+    assert set(free.values()) == {0.25}
+
+
+@pytest.mark.parametrize(("count", "finds_delay"), [(50, True), (30, False)])
+def test_a_second_order_model_is_of_some_windows_and_all_position_errors(
+    planar, monkeypatch, rng, count, finds_delay
+):
+    """Eight windows for the coarse search, every third of 50 and all of 30 for the fit."""
+    windows = tuple(
+        SimpleNamespace(log=SimpleNamespace(q=q, q_ref=q_ref), counted=slice(2, 9))
+        for q, q_ref in rng.standard_normal((count, 2, 10, 2))
+    )
+    stated = replace(
+        stated_loops(planar, LoopSettings()), kp=np.array([50.0, 8.0]), kd=np.array([0.3, 0.1]),
+        zero=np.array([0.1, 0.2]), limit=np.array([3.0, 4.0]), delay=np.array([0.01, 0.02]),
+    )  # fmt: skip
+    coarse, fitted = [], []
+    start = replace(
+        plain_model(planar, [0.2, 0.4], [50.0, 8.0]).loops,
+        terms=(second_order._TERMS,) * 2, values=np.arange(6.0),
+    )  # fmt: skip
+
+    class Estimator:
+        def __init__(self, *, whitens, steps):
+            assert (whitens, steps) == (False, 12)
+
+        def fit(self, simulator):
+            fitted.append(simulator)
+            k = len(simulator.free_parameters)
+            return SimpleNamespace(theta=simulator.prior, std_error=np.arange(k) + 1.0)
+
+    monkeypatch.setattr(second_order, "_coarse", lambda *given: coarse.append(given) or start)
+    monkeypatch.setattr(second_order, "OutputError", Estimator)
+    found = second_order.fit_second_order(
+        ClosedLoopRobot(planar), windows, stated, finds_delay=finds_delay
+    )
+    ((_, tried, bare, torque, _),) = coarse
+    assert tried == windows[:8]
+    assert fitted[0].windows == (windows[::3] if count == 50 else windows)
+    error = np.concatenate([(w.log.q_ref - w.log.q)[2:9] for w in windows])
+    np.testing.assert_allclose(torque, [50.0, 8.0] * np.sqrt(np.mean(error**2, axis=0)))
+    np.testing.assert_array_equal(found.torque, torque)
+    for zero in (bare.bodies, bare.zero, bare.values):
+        np.testing.assert_array_equal(zero, 0.0)
+    np.testing.assert_array_equal(bare.limit, np.inf)
+    np.testing.assert_array_equal(
+        [bare.kp, bare.kd, bare.delay], [stated.kp, stated.kd, stated.delay]
+    )
+    a, b = planar.joints
+    wanted = {f"{a}.armature": (0.2, 2.0, 0.2e-6), f"{b}.armature": (0.4, 4.0, 0.4e-6)}
+    for j, joint in enumerate((a, b)):
+        for k, term in enumerate(("viscous", "coulomb", "offset")):
+            spread = 100.0 * torque[j] * (10.0 if k == 0 else 1.0)
+            wanted[f"{joint}.{term}"] = (3.0 * j + k, spread, -np.inf if k == 2 else 0.0)
+        if finds_delay:
+            wanted[f"{joint}.delay"] = (start.delay[j], 0.1, 0.0)
+    free = {x.name: (x.prior, x.spread, x.lowest) for x in fitted[0].free_parameters}
+    assert free == {name: pytest.approx(x) for name, x in wanted.items()}
+    np.testing.assert_array_equal(found.inertia_error, [1.0, 6.0 if finds_delay else 5.0])
 
 
 def test_tried_loops_have_a_damping_to_which_the_stated_gain_contributes(planar, monkeypatch):

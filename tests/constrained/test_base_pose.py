@@ -1,13 +1,21 @@
 """Findings on the pose of a floating base: jumps, and the order of its quaternion."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pinocchio as pin
 import pytest
 from helpers.humans import FEET, human_urdf, logged, walk
 
-from robotid.constrained.base_pose import _vertical, check_pose, check_twist, check_unit
+from robotid.constrained import base_pose
+from robotid.constrained.base_pose import (
+    _check_readings,
+    _vertical,
+    check_pose,
+    check_twist,
+    check_unit,
+)
 from robotid.constrained.contacts import check_base
 from robotid.logs.base import BaseMotion, base_state, in_base, quaternions_of_angles
 from robotid.logs.data import Log
@@ -242,8 +250,6 @@ def test_the_speed_of_feet_is_the_mean_of_the_slower_one(robot, log):
 def test_of_readings_that_are_almost_as_slow_the_one_with_fewer_changes_is_named(
     robot, log, monkeypatch
 ):
-    from robotid.constrained import base_pose
-
     as_logged = []
 
     def speed(feet, pose, body, world):
@@ -263,6 +269,43 @@ def test_of_readings_that_are_almost_as_slow_the_one_with_fewer_changes_is_named
     (found,) = (x for x in check_base(robot, log, SLOW) if x.code == "base_orientation")
     assert found.evidence["best"] == 0.020
     assert found.message.endswith("below it: inverse")
+
+
+@pytest.mark.parametrize(
+    ("logged", "inverse", "both", "wanted"),
+    [
+        (4.9e-3, 1e-3, 1.0, None),  # feet that hardly move are not examined
+        (5.1e-3, 1e-3, 1.0, "inverse"),
+        (0.1, 0.0649, 1.0, "inverse"),  # 0.65 of the speed as logged
+        (0.1, 0.0651, 1.0, None),
+        (0.1, 0.05, 0.0416, "inverse"),  # (0.05 + 0.001) 1.2 = (0.0415 + 0.001) 1.2^2
+        (0.1, 0.05, 0.0414, "inverse; the axes x, y, z of the base"),
+    ],
+)
+def test_a_pose_is_another_one_if_its_feet_are_slower(
+    robot, monkeypatch, logged, inverse, both, wanted
+):
+    """Of the axes of the base, one other order is as slow as stated; ``both``: with the inverse."""
+    order = np.eye(3)[[1, 0, 2]]
+
+    def speed(pose, body, world):
+        if pose[0, 0, 0] == 1.0:
+            return logged if (body == np.eye(3)).all() else 1.0
+        if (world != np.eye(3)).any():
+            return 1.0
+        return {True: inverse}.get((body == np.eye(3)).all(), both if (body == order).all() else 1)
+
+    monkeypatch.setattr(base_pose, "orientation_readings", lambda q: {"inverse": 2.0 * q})
+    feet = SimpleNamespace(
+        turned=lambda q: q[:, 0, None, None] * np.eye(3), speed=speed, dp=0.0,
+        upwards=lambda R: np.array([0.0, 0.0, 1.0]),
+    )  # fmt: skip
+    found = list(_check_readings(robot, SimpleNamespace(name="log"), feet, np.ones((5, 4))))
+    assert len(found) == (wanted is not None)
+    for finding in found:
+        best = inverse if wanted == "inverse" else both
+        assert finding.evidence == pytest.approx({"speed": logged, "best": best})
+        assert f"below it: {wanted}" in finding.message
 
 
 def test_inverted_flags_are_no_error_of_the_pose(robot, log):

@@ -1,6 +1,7 @@
 """Findings on an IMU: turned axes, units, gravity; and feet that slip."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pinocchio as pin
@@ -9,7 +10,7 @@ from helpers.paths import JOBS
 
 from robotid.commands.job import read_job
 from robotid.constrained.contacts import check_base
-from robotid.constrained.imu import _named, _turn
+from robotid.constrained.imu import _check_axes, _check_orientation, _named, _turn
 from robotid.logs.base import BaseMotion, base_state, in_base, quaternions_of_angles
 from robotid.logs.data import Log
 from robotid.logs.imu import ImuFrame, ImuMotion
@@ -279,3 +280,43 @@ def test_another_quaternion_is_named_without_a_position(robot, sway, change, wor
     assert [(x.code, x.severity) for x in found] == [("base_orientation", "error")]
     assert words in found[0].message
     assert found[0].evidence["best"] < 0.02 * found[0].evidence["speed"]
+
+
+@pytest.mark.parametrize(("left", "is_found"), [(0.28, True), (0.32, False)])
+def test_another_quaternion_explains_gyroscopes_but_for_a_third_of_the_motion(left, is_found):
+    """Of 0.25 rad/s; the pose of the log is that of the world in the base, 7 s after the start."""
+    t = 7.0 + 0.02 * np.arange(200)
+    angles = 0.12 * np.column_stack([np.sin(1.6 * t), np.sin(2.3 * t), np.sin(1.1 * t)])
+    right = np.hstack([np.zeros((200, 3)), quaternions_of_angles(angles)])
+    own, w = (base_state(t, right * [1, 1, 1, s, s, s, 1], None, None)[1][:, 3:] for s in (-1, 1))
+    size = np.sqrt(np.mean(np.sum(own**2, axis=1)))
+    assert 0.2 < size < 0.35
+    w = w + left * size / np.sqrt(3)
+    v = np.hstack([np.zeros((200, 3)), w])
+    motion = SimpleNamespace(t=t, q=right * [1, 1, 1, -1, -1, -1, 1], v=v)
+    found = list(_check_orientation(SimpleNamespace(name="log"), motion, own))
+    assert len(found) == is_found
+    for finding in found:
+        off = np.sqrt(np.mean(np.sum((w - own) ** 2, axis=1)))
+        assert finding.evidence == pytest.approx({"speed": off, "best": left * size})
+        assert f"differs by {off:.2g} rad/s (RMS)" in finding.message
+        assert "it is the orientation of the world in the base" in finding.message
+
+
+@pytest.mark.parametrize(("source", "is_error"), [("from the orientation", True), ("x", False)])
+def test_an_angular_velocity_that_nothing_explains_is_an_error_only_by_the_orientation(
+    source, is_error
+):
+    """Feet in contact may slip; the noise is broadband and has no axes."""
+    w, own = np.random.default_rng(0).standard_normal((2, 300, 3)) * [[[0.5]], [[0.8]]]
+    D = np.tile(np.eye(3), (300, 1, 1))
+    log = SimpleNamespace(name="log")
+    found = list(_check_axes(log, FRAME, w, D, -own, source))
+    assert len(found) == is_error
+    for finding in found:
+        size, off = (np.sqrt(np.mean(np.sum(x**2, axis=1))) for x in (own, w - own))
+        assert finding.evidence["off"] == pytest.approx(off / size)
+        assert 0.5 < finding.evidence["best"] / finding.evidence["off"] < 1.0
+        assert "neither other axes nor degrees explain it. Check the columns" in finding.message
+    slow = 0.09 / np.sqrt(np.mean(np.sum(w**2, axis=1)))  # below 0.1 rad/s
+    assert not list(_check_axes(log, FRAME, slow * w, D, -own, source))

@@ -275,6 +275,22 @@ def test_a_delay_counts_if_a_tenth_of_the_squared_residual_goes_with_it(noise, c
         assert "state wrench_delay = 0.045 in [signals]" in finding.message
 
 
+@pytest.mark.parametrize(("rows", "count"), [(359, 0), (360, 1)])
+def test_a_delay_is_searched_in_eight_parts_of_twice_its_largest_size(rows, count):
+    """Of 20 rows, which both ends lack; the log has two segments, then the middle lacks 40 more."""
+    rng = np.random.default_rng(1)
+    for gap in (0, 40):
+        t = 3.0 + 0.01 * np.arange(rows + gap)
+        force = np.cumsum(rng.standard_normal((len(t), 1)), axis=0)
+        late = np.vstack([np.repeat(force[:1], 4, axis=0), force[:-4]])
+        slopes, left = np.zeros((len(t), 1, 6)), np.zeros((len(t), 6))
+        slopes[:, 0, 2], left[:, 2] = 1.0, force[:, 0]
+        segment = (np.arange(len(t)) >= 150).astype(int) if gap else None
+        motion = SimpleNamespace(t=t, wrenches=late, segment=segment)
+        found = list(check_delay("log", motion, slopes, left, 0.0))
+        assert [x.evidence["delay"] for x in found] == count * [pytest.approx(0.04, abs=2e-3)]
+
+
 def test_the_delay_is_searched_without_the_torques_of_unknown_forces(urdf, log, monkeypatch):
     contacts = tuple(Contact(foot, "point", ("fz",), always=True) for foot in FEET)
     model, given = replace(human(urdf), constraints=contacts), []
@@ -319,6 +335,47 @@ def test_a_better_reading_halves_one_residual_and_keeps_the_other(force, moment,
     assert reading(40.0, 15.0).is_better(stated, (90.0, 16.0)) is True  # a small moment may grow
 
 
+def test_the_reading_with_the_smallest_force_and_moment_is_named(urdf, log, monkeypatch):
+    """Shares of the weight, and of the weight at the distance of the feet; as stated 0.8 and 0.6.
+
+    X exchanges the feet.
+    """
+    model, motion = human(urdf), process(log, SLOW)
+    weight = 9.81 * sum(x.mass for x in model.pin_model.inertias)
+    some = motion.every(max(1, len(motion.t) // 400))
+    feet = link_positions(model.pin_model, model.configurations(some.q), FEET)
+    apart = np.linalg.norm(feet - some.q[:, None, :3], axis=2)
+    lever = np.sqrt(np.mean(apart**2)) + 1e-3
+
+    def reading(name, force, moment, known):
+        own = np.zeros((len(some.t), 6))
+        own[:, 1], own[:, 5] = force * weight, moment * weight * lever
+        return _Reading(tuple(name.split()), FEET * (name == "X"), 1.0, own, known * weight)
+
+    for others, wanted in [
+        ([("a", 0.45, 0.5, 1.0)], None),  # half of neither
+        ([("a", 0.39, 0.5, 1.0), ("b", 0.45, 0.01, 1.0)], "b"),
+        ([("a", 0.001, 0.05, 1.0), ("b", 0.004, 0.03, 1.0)], "b"),  # 0.011 0.06 and 0.014 0.04
+        ([("a c", 0.2, 0.10, 1.0), ("b", 0.2, 0.115, 1.0)], "b"),  # 1.2 for a second change
+        ([("a c", 0.2, 0.08, 1.0), ("b", 0.2, 0.115, 1.0)], "a and c"),
+        ([("a", 0.2, 0.01, 0.49), ("b", 0.3, 0.2, 0.51)], "b"),  # most of the force is unknown
+        ([("X", 0.1, 0.4, 1.0), ("b", 0.3, 0.4, 1.0)], "b"),  # the force does not show the foot
+        ([("X", 0.1, 0.2, 1.0), ("b", 0.3, 0.4, 1.0)], "X"),
+    ]:
+        every = [reading(*own) for own in [("", 0.8, 0.6, 1.0), *others]]
+        monkeypatch.setattr(wrenches, "_readings", lambda *_, every=every: every)
+        finding = next(iter(check_wrenches(model, log, motion)), None)
+        if wanted is None:
+            assert finding is None or "only" not in finding.message
+            continue
+        best = next(x for x in every if " and ".join(x.changes) == wanted)
+        assert f"if {wanted}. Correct the columns" in finding.message
+        assert finding.evidence["force"] == pytest.approx(0.8 * weight)
+        assert finding.evidence["best"] == pytest.approx(best.sizes[0])
+        force, moment = best.sizes
+        assert f"but only {force:.3g} N and {moment:.3g} N m if" in finding.message
+
+
 @pytest.mark.parametrize("foot", FEET)
 def test_the_gain_of_one_foot_is_named_with_its_factor(urdf, long_log, foot):
     wrong = {x: y * (1.3 if x.endswith(foot) else 1.0) for x, y in long_log.wrenches.items()}
@@ -352,6 +409,10 @@ def test_the_gain_of_a_foot_is_relative_to_the_median_of_the_others():
     assert f"that of c is multiplied by {finding.evidence['factor']:.3g} +-" in finding.message
     assert "relative to a, b, d: the gain" in finding.message
     assert not list(check_gains("log", names[:2], loads[:, :, :2] * 1.1, left))  # not all the load
+    assert not list(check_gains("log", ("c",), loads[:, :, 2:3], left))
+    for rows, count in ((15, 0), (16, 1)):  # two in each of eight parts
+        some = slice(0, 25 * rows, 25)
+        assert len(list(check_gains("log", names, loads[some], 1.2 * left[some]))) == count
     right, same = shifting(np.random.default_rng(1), np.array([1.03, 1.0, 1.0, 0.98]))
     assert not list(check_gains("log", names, right, 1.2 * same))
 
@@ -373,6 +434,23 @@ def test_loads_that_do_not_shift_show_no_gain():
     assert not list(check_gains("log", ("a", "b"), loads, left))
 
 
+def test_gains_that_the_loads_hardly_determine_are_those_of_equal_feet():
+    """Loads of two feet shift by 1 %: their gains have rows of equal gains beside the loads."""
+    rng, names = np.random.default_rng(5), ("a", "b")
+    left = np.array([0.0, 0.0, 500.0]) + rng.normal(size=(400, 3))
+    shares = 0.5 + 0.01 * rng.normal(size=400)
+    shared = np.stack([shares, 1.0 - shares], axis=1)[:, None]
+    loads = left[:, :, None] * shared / [1.0, 0.4] + 0.01 * rng.normal(size=(400, 3, 2))
+    A = loads.reshape(-1, 2)
+    equal = np.sqrt(1e-4 * np.sum(A**2) / 2) * np.array([[1.0, -1.0]])
+    solved = np.linalg.lstsq(np.vstack([A, equal]), np.append(left, 0.0), rcond=None)[0]
+    (finding,) = check_gains("log", names, loads, left)
+    k = names.index(finding.message.split("that of ")[1][0])
+    assert finding.evidence["factor"] == pytest.approx(solved[k] / solved[1 - k])
+    alone = np.linalg.lstsq(A, left.ravel(), rcond=None)[0]
+    assert abs(solved[1] - solved[0]) < 0.9 * abs(alone[1] - alone[0])
+
+
 def test_a_mean_horizontal_force_is_an_offset_or_a_tilt():
     rng, down = np.random.default_rng(0), np.array([0.0, -9.81, 0.0])
     excess = rng.normal(size=(400, 3)) * [5.0, 50.0, 5.0] + [6.0, 200.0, -8.0]
@@ -384,6 +462,8 @@ def test_a_mean_horizontal_force_is_an_offset_or_a_tilt():
     parts = excess.reshape(8, 50, 3)[:, :, [0, 2]].mean(axis=1)
     error = np.sqrt(np.sum(parts.var(axis=0, ddof=1)) / 8)
     assert finding.evidence["std_error"] == pytest.approx(error)
+    assert not list(check_level("log", excess[:15], down, 70.0))
+    assert len(list(check_level("log", excess[:16], down, 70.0))) == 1
     assert not list(check_level("log", excess, down, 1100.0))  # below 1 % of the weight
     assert not list(check_level("log", excess - [6.0, 0.0, -8.0], down, 50.0))
 

@@ -7,11 +7,12 @@ from robotid.excitation.information import CRITERIA, MotionInformation, criterio
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.columns import friction_speeds
 from robotid.regressor.torque import joint_torque_regressor
-from robotid.robot.drives import LoadFriction, Stribeck
+from robotid.robot.drives import Lag, LoadFriction, Stribeck
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 
-OWN = {"own_terms": {"elbow_joint": [Stribeck(speed=0.3), LoadFriction()]}}
+OWN = {"own_terms": {"elbow_joint": [Stribeck(speed=0.3), LoadFriction(), Lag()],
+                     "wrist_1_joint": [Lag()]}}  # fmt: skip
 CASES = {
     "six turning joints": ROBOTS["six turning joints"],
     "coupled drives": ROBOTS["coupled drives"],

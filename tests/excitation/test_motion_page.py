@@ -7,6 +7,7 @@ import pytest
 from helpers.pages import chart
 
 from robotid.excitation import course as course_of_motions
+from robotid.excitation import motion_page
 from robotid.excitation.basis import FourierBasis
 from robotid.excitation.clearance import Box, Clearance, Contact
 from robotid.excitation.course import Course
@@ -295,3 +296,58 @@ def test_the_head_and_the_course_of_the_optimisation_have_the_figures_of_the_des
     what = chart(_history(content), "criterion of the best motion against the computing time")
     np.testing.assert_allclose(what["x"], [0.5, 1.25, 4.0], atol=1e-3)
     np.testing.assert_allclose(what["series"][0]["y"], [3.25, 2.5, -1.75], atol=1e-3)
+
+
+@pytest.mark.parametrize(("gain", "is_shown"), [(1.1e-3, True), (9e-4, False)])
+def test_the_page_has_limits_course_errors_and_a_search_that_got_better(
+    monkeypatch, tmp_path, gain, is_shown
+):
+    model, course = SimpleNamespace(name="a<b", joints=("one",)), object()
+    content = {
+        "kind": "fourier", "duration": 4.0, "criterion": "D", "condition_number": 7.0,
+        "seconds": 2.0, "starts": 1, "converged": True, "history": [[0.5, 3.0], [1.0, 3.0 - gain]],
+    }  # fmt: skip
+
+    def of_course(words):
+        def shown(*given):
+            assert given == (model, content, course)
+            return f"<p>{words}</p>"
+
+        return shown
+
+    monkeypatch.setattr(motion_page, "_limit_table", of_course("uses"))
+    monkeypatch.setattr(motion_page, "_over_time", of_course("runs"))
+    target = tmp_path / "page.html"
+    found = motion_page.write_motion_page(target, model, content, course, ["b < 3 g"])
+    assert found == target
+    shown = target.read_text()
+    parts = ["a&lt;b: excitation trajectory</title>", "<h1>", ">Smallest margin to each limit<",
+             "<p>uses</p>", ">Course over time<", "<p>runs</p>", ">Expected standard errors<",
+             "b &lt; 3 g"]  # fmt: skip
+    places = [shown.rindex(part) for part in parts]
+    assert places == sorted(places)
+    assert (">Course of the optimisation<" in shown) == is_shown
+
+
+def test_each_limit_has_a_chart_of_its_joints_and_some_quantities_without_one(monkeypatch):
+    """Position is limited of all joints, torque of two, power of one, the others of none."""
+    sizes = np.full((len(LIMITS), 3), np.inf)
+    sizes[LIMITS.index("position")] = sizes[LIMITS.index("torque"), [0, 2]] = 1.0
+    sizes[LIMITS.index("power"), 1] = 1.0
+    course = SimpleNamespace(limits=SimpleNamespace(sizes=sizes), clearance=None, nearest=None)
+    for word in ("share", "free"):
+        monkeypatch.setattr(
+            motion_page, f"_{word}_chart",
+            lambda model, course, kind, joints, word=word: f"{word} {kind} {joints.tolist()};",
+        )  # fmt: skip
+    monkeypatch.setattr(motion_page, "_distance_chart", lambda *given: f"distance {given[2]}")
+    shown = ["share position [0, 1, 2];", "free acceleration [0, 1, 2];", "share torque [0, 2];",
+             "free torque [1];", "share power [1];"]  # fmt: skip
+    for nearest, clearance, last in (
+        (None, None, ""), (None, "around", ""), ("contact", None, ""),
+        ("contact", "around", "distance around"),
+    ):  # fmt: skip
+        course.nearest, course.clearance = nearest, clearance
+        found = motion_page._over_time("model", {}, course)
+        assert found == f'<div class="plots">\n{"".join(shown)}{last}</div>\n'
+    assert motion_page._ground({"limits": {"torque": {"margin": 0.1}}}) == ""

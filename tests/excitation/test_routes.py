@@ -6,7 +6,7 @@ import pytest
 from robotid.exceptions import SettingsError
 from robotid.excitation import routes
 from robotid.excitation.basis import FourierBasis
-from robotid.excitation.clearance import Clearance
+from robotid.excitation.clearance import Clearance, Contact
 from robotid.excitation.course import Course
 from robotid.excitation.design import Designer
 from robotid.excitation.limits import LIMITS, MotionLimits
@@ -119,6 +119,37 @@ def test_sweeps_are_about_the_posture_whose_worst_joint_has_the_largest_share(mo
     np.testing.assert_array_equal(posture, [2.0, 3.0])
     np.testing.assert_allclose(room, 0.8 * free[1])
     assert speeds == (0.1,)
+
+
+@pytest.mark.parametrize("feasible", [8, 9])
+def test_sweeps_are_shortened_by_a_fifth_seven_times_at_most(monkeypatch, feasible):
+    shares, joints = [], ("a", "b")
+
+    def examined(*_):
+        used = np.full((6, 2), 0.5)
+        used[4, 1] = 0.9 if len(shares) == feasible else 3.5
+        return SimpleNamespace(contact=None, used=used, number=len(shares))
+
+    about = SimpleNamespace(
+        postures=SimpleNamespace(resting=lambda rng, count: np.zeros((30, 2))),
+        limits=SimpleNamespace(sizes=np.array([[2.0, 1.0]])), examined=examined,
+        information=SimpleNamespace(model=SimpleNamespace(joints=joints)),
+    )  # fmt: skip
+    monkeypatch.setattr(routes, "_free_range", lambda *_: np.array([[1.0, 2.0], [0.5, 0.5]]))
+    monkeypatch.setattr(
+        routes, "_sweeps",
+        lambda designer, posture, free, _: shares.append(free[0]) or SimpleNamespace(duration=1.0),
+    )  # fmt: skip
+    contact = Contact("arm", "post", -0.01, 2.0)
+    stuck = SimpleNamespace(contact=contact, used=np.zeros((6, 2)))
+    assert routes._why(stuck, about) == "arm and post overlap at 2.00 s"
+    if feasible == 8:
+        assert design_sweeps(about, None).number == 8
+    else:
+        wanted = r"about none of 20 random .* can sweep: b needs 350 %; lower"
+        with pytest.raises(SettingsError, match=wanted):
+            design_sweeps(about, None)
+    np.testing.assert_allclose(shares, 0.8 ** np.arange(1, 9)[:, None] * [1.0, 2.0])
 
 
 def test_stands_weigh_torques_by_their_noise_over_two_seconds(monkeypatch):

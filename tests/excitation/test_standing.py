@@ -43,14 +43,17 @@ def stand():
     return standing(quadruped(), posture=POSTURE, lifted=["FR_foot"], soles={}, friction=0.6)
 
 
-@pytest.fixture(scope="module")
-def biped():
+def two_legs():
     joints = [joint for joint in TALOS.model.joints if joint.startswith(("leg", "torso"))]
-    model = RobotModel.from_urdf(
+    return RobotModel.from_urdf(
         example_urdf(TALOS.urdf), free_flyer=True, joints=joints, terms=("viscous",),
         constraints=[Contact(foot, "surface") for foot in TALOS.feet],
     )  # fmt: skip
-    return standing(model, posture=CROUCH, soles=SOLES, friction=0.7)
+
+
+@pytest.fixture(scope="module")
+def biped():
+    return standing(two_legs(), posture=CROUCH, soles=SOLES, friction=0.7)
 
 
 def moved(stand, rng, count=3):
@@ -334,6 +337,18 @@ def test_what_cannot_stand_is_refused():
     refused("FL_foot is a surface of unknown size", flat)
     soles = {foot: (-0.1, -0.1, 0.1, 0.1, 0.0) for foot in FEET}
     refused("24 conditions, of which the 12 joints of the legs satisfy 12", flat, soles=soles)
+
+
+@pytest.mark.parametrize(("width", "is_refused"), [(9e-4, True), (1.1e-3, False)])
+def test_a_robot_does_not_stand_on_a_line(width, is_refused):
+    own, other = TALOS.feet
+    stated = {"posture": CROUCH, "lifted": [other], "friction": 0.7,
+              "soles": {own: (-0.1, -0.06, 0.12, -0.06 + width, -0.02)}}  # fmt: skip
+    if not is_refused:
+        assert len(standing(two_legs(), **stated).ground.points) == 4
+        return
+    with pytest.raises(SettingsError, match=f"^the points of contact of {own} are on a line, on"):
+        standing(two_legs(), **stated)
 
 
 def test_noise_of_the_joints_is_spread_over_the_rows_of_base_and_joints(stand):

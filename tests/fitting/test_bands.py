@@ -7,12 +7,15 @@ from helpers.driven import ELBOW, JOINTS, LIFT, WRIST
 from helpers.fitting import identify
 from helpers.synthetic import exact_log, truth
 
+from robotid.exceptions import DataError
 from robotid.export.entries import build_result
 from robotid.fitting.bands import (
     TorqueBand,
     expected_band,
     friction_curve,
+    next_errors,
     recording_bands,
+    rms_error,
     torque_band,
     typical_friction,
 )
@@ -213,6 +216,30 @@ def test_usual_friction_of_a_coupled_drive_is_over_the_rows_that_all_of_its_join
     assert repr(typical_friction(found, "pair", [])) == "<FrictionCurve: no speeds>"
 
 
+def test_usual_friction_that_depends_on_the_load_is_that_at_its_rms_over_the_rows_used(rng):
+    found, loads = coupled_fit(rng), []
+    size = found.model.layout.n_inertial
+    for e in found.fitted:
+        m = e.recording.trajectory
+        bodies = joint_torque_regressor(found.model, m.q, m.v, m.a)[:, :size]
+        loads.append((bodies @ found.standard[:size]).reshape(-1, 3)[e.recording.mask[:, 1], 1])
+    curve = typical_friction(found, ELBOW, [0.4])
+    assert curve.load == pytest.approx(np.sqrt(np.mean(np.concatenate(loads) ** 2)))
+    for wrong, words in (
+        ({"load": np.inf}, "load is 'inf', wanted a finite number or None"),
+        ({"q": "up"}, "q is 'up', wanted a finite number or None"),
+        ({"v": [[0.1, 0.2]]}, r"v has shape \(1, 2\), wanted finite speeds, shape \(k,\)"),
+        ({"v": [0.1, np.inf]}, r"v has shape \(2,\), wanted finite speeds"),
+        ({"joint": "elbow"}, r"'elbow' is no drive of .*; drives: .*pair"),
+    ):
+        with pytest.raises(DataError, match=words):
+            typical_friction(found, **{"joint": ELBOW, "v": [0.1], **wrong})
+    for e in found.fitted:
+        e.recording.trajectory = replace(e.recording.trajectory, v=0.0 * e.recording.trajectory.v)
+    with pytest.raises(DataError, match="elbow_joint was at rest in the fitted logs, so the range"):
+        typical_friction(found, ELBOW)
+
+
 def test_a_term_that_is_open_adds_its_own_torque_to_what_it_moves(rng):
     found, v = coupled_fit(rng), np.array([-0.8, 0.3, 1.7])
     layout = found.model.layout
@@ -265,3 +292,14 @@ def test_the_band_of_a_recording_has_each_open_term_with_what_it_moves(rng):
     np.testing.assert_array_equal(band.samples, np.arange(9))
     np.testing.assert_allclose(band.parameters, np.sqrt(variance).reshape(9, 3), rtol=1e-9)
     np.testing.assert_allclose(band.total**2, band.parameters**2 + [9.0, 1.0, 0.25], rtol=1e-12)
+    other = rng.standard_normal((30, len(standard)))  # as much as the next log may differ
+    wide = expected_band(found, SimpleNamespace(recording=recording), other.T @ other)
+    more = np.sum((W @ other.T) ** 2, axis=1).reshape(9, 3)
+    np.testing.assert_allclose(wide.parameters**2, band.parameters**2 + more, rtol=1e-9)
+    short = replace(wide, samples=wide.samples[:4], parameters=wide.parameters[:4])
+    squares = np.vstack([wide.total, short.total]) ** 2
+    np.testing.assert_allclose(rms_error([wide, short]), np.sqrt(squares.mean(axis=0)))
+    after = replace_in(
+        found, between=other.T @ other, fitted=[SimpleNamespace(recording=recording)]
+    )
+    np.testing.assert_allclose(next_errors(after), np.sqrt(np.mean(wide.total**2, axis=0)))

@@ -4,7 +4,9 @@ from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
+import pytest
 
+from robotid.exceptions import SettingsError
 from robotid.fitting import result as result_module
 from robotid.fitting.result import Fit
 from robotid.fitting.settings import EstimatorSettings
@@ -86,3 +88,32 @@ def test_a_band_is_that_of_the_recording_or_of_the_noise_of_the_fit(monkeypatch)
     a, b, c, other = (SimpleNamespace(name=name) for name in "abcd")
     own = SimpleNamespace(fitted=(a, b), validation=(c,), _bands=(1, 2, 3), between=7)
     assert [Fit.band(own, e) for e in (a, b, c, other)] == [1, 2, 3, ("expected", other, 7)]
+
+
+def test_wls_is_overfitted_where_it_predicts_every_unseen_log_by_a_fifth_worse():
+    def log(is_refitted=False, **errors):
+        metrics = {
+            name: SimpleNamespace(
+                per_joint={joint: SimpleNamespace(rmse=x[k]) for joint, x in errors.items()}
+            )
+            for k, name in enumerate(("estimate", "wls"))
+        }
+        return SimpleNamespace(is_refitted=is_refitted, metrics=metrics)
+
+    def overfitted(*logs):
+        return Fit.overfitted.func(SimpleNamespace(validation=logs))
+
+    first = log(a=(1.0, 1.21), b=(2.0, 2.39), c=(3.0, 9.0))
+    second = log(a=(0.5, 0.61), b=(1.0, 9.0), c=(3.0, 3.0))
+    assert overfitted(first, second) == {"a"}
+    assert overfitted(first) == {"a", "c"}
+    seen = log(is_refitted=True, a=(1.0, 1.0), b=(1.0, 2.0), c=(1.0, 1.0))
+    assert overfitted(seen, first) == {"a", "c"}
+    assert overfitted(seen) == overfitted() == frozenset()
+
+
+def test_metrics_are_of_the_estimate_or_of_wls():
+    for name in ("urdf", None, ["wls"]):
+        with pytest.raises(SettingsError, match="wanted 'estimate' or 'wls'") as caught:
+            Fit.metrics(None, name)
+        assert str(caught.value).startswith(f"name is {name!r}, ")

@@ -9,7 +9,7 @@ from helpers.fitting import fit
 from helpers.synthetic import exact_log, truth
 
 from robotid.estimators import WLS
-from robotid.exceptions import SettingsError
+from robotid.exceptions import NotConvergedError, SettingsError
 from robotid.fitting import robust
 from robotid.fitting.robust import LOSSES, find_outliers, loss_slope, loss_weight
 from robotid.fitting.settings import EstimatorSettings
@@ -304,7 +304,7 @@ def test_a_coupled_drive_steps_at_each_of_its_joints_by_its_ratio():
     assert robust._friction_step(model, pi) == pytest.approx([1.4, 2.2, 3.5])
 
 
-def test_weights_and_their_loss_are_those_of_the_residuals_of_all_logs_together(model):
+def test_weights_and_their_loss_are_those_of_the_residuals_of_all_logs_together(model, monkeypatch):
     """The scale of a joint is the median of both logs; of the second most rows are not used."""
     rng, pi = np.random.default_rng(8), truth(model)
     signals = SignalSettings(cutoff=None, trim=0.0, min_velocity=0.3)
@@ -334,3 +334,11 @@ def test_weights_and_their_loss_are_those_of_the_residuals_of_all_logs_together(
     mean = np.minimum(1.0, 1.345 / scaled).mean() / np.mean(scaled < 1.345)
     assert understated == pytest.approx(mean, rel=1e-2)
     assert mean > 1.05
+    monkeypatch.setattr(robust, "_MAX_ITERATIONS", 1)  # the first fit has none to compare with
+    with pytest.raises(NotConvergedError, match=r"of the huber loss have not converged after 1 p"):
+        robust.reweigh(own, "tukey", prior)
+    monkeypatch.undo()
+    # residuals beyond the constant of the loss have no slope: a thousandth at least
+    monkeypatch.setattr(robust, "loss_slope", lambda loss, r: np.full(r.shape, 2e-4))
+    weight = np.minimum(1.0, 1.345 / scaled).mean()
+    assert robust.reweigh(own, "huber", prior)[1] == pytest.approx(weight / 1e-3, rel=1e-2)

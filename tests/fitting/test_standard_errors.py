@@ -222,6 +222,12 @@ def test_few_segments_have_errors_that_repeat_in_every_row(W, rng):
     wanted = np.linalg.solve(H, np.linalg.solve(H, H + share**2 * more).T)
     np.testing.assert_allclose(found.covariance, wanted, rtol=1e-6, atol=1e-12)
     assert np.diag(wanted).max() > 1.5 * np.diag(rough.covariance).max()
+    without = replace(rough, covariance=rough.covariance.copy())  # the third is not identifiable
+    without.covariance[2], without.covariance[:, 2], without.covariance[2, 2] = 0.0, 0.0, np.inf
+    found, _ = measured_errors(without, parts, whole, share, np.eye(4), rough.sigma, more=more)
+    C = np.where(np.isinf(without.covariance), 0.0, without.covariance)
+    wanted = without.covariance + share**2 * C @ more @ C
+    np.testing.assert_allclose(found.covariance, wanted, rtol=1e-9)
     K, L = rng.standard_normal((4, 6)), np.diag(rng.uniform(1.0, 2.0, 6))
     prior = K.T @ H @ K + L  # of standard parameters, with a prior
     own = replace(rough, theta=np.zeros(6), covariance=np.linalg.inv(prior))

@@ -4,6 +4,7 @@ As a script, it reduces ten pieces with a checkpoint: ``piecework.py FOLDER WORK
 "hold" leaves the last five under way for ever: it waits for a signal.
 """
 
+import logging
 import os
 import signal
 import socket
@@ -44,6 +45,7 @@ class RandomPiece(Piece):
     def reduce(self, *, threads=None):
         time.sleep(self.pause)
         mark(self)
+        logging.getLogger("robotid.piecework").info("reduced %s", self.name)
         if self.fault == "data":
             raise DataError("row 7 is not finite", "not_finite")
         if self.fault == "missing":

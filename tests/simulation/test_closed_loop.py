@@ -11,6 +11,7 @@ from robotid.robot.drives import Lag, LoadFriction, Presliding
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
+from robotid.simulation import closed_loop
 from robotid.simulation.closed_loop import Noise, carried, follow, simulate
 from robotid.simulation.motions import FourierTrajectory, random_fourier
 from robotid.simulation.settings import Actuator, Controller, Payload, Simulation, Truth
@@ -233,12 +234,28 @@ def test_gains_beyond_reason_are_told(ur5):
         followed(ur5, truth(ur5), wild)
 
 
-def test_more_steps_than_a_computer_makes_are_refused_before_the_first(ur5):
+def test_more_steps_than_a_computer_makes_are_refused_before_the_first(ur5, monkeypatch):
     motion = random_fourier(ur5, np.random.default_rng(0))
     for rate, duration in ((1e5, 3600.0), (1e3, 1e9)):
         with pytest.raises(SettingsError, match=r"has .* samples of 1 steps each, wanted at most"):
             follow(ur5, ur5.standard_parameters(), motion, rate=rate, duration=duration,
                    settings=Simulation())  # fmt: skip
+    monkeypatch.setattr(closed_loop, "_wanted", None)  # nothing is simulated
+    with pytest.raises(
+        SettingsError, match=r"has 6 samples of \d{6,} steps each, wanted at most 2e"
+    ):
+        followed(ur5, truth(ur5), Simulation(), rate=1e-3, duration=5e3)
+    for samples, steps, is_possible in (
+        (2e7, 1, True), (2.1e7, 1, False), (200, 100_000, True), (201, 100_000, False),
+        (1, 100_001, False),
+    ):  # fmt: skip
+        if is_possible:
+            closed_loop._check_size(samples, steps)
+            continue
+        with pytest.raises(
+            SettingsError, match="wanted at most 2e\\+07 steps in total and 1e\\+05 per"
+        ):
+            closed_loop._check_size(samples, steps)
     with pytest.raises(SettingsError, match=r"rate is 1000000000\.0, wanted 1e-3 to 1e5"):
         Simulation(rate=1e9)
     with pytest.raises(SettingsError, match="inertials is 1000, wanted 0 to 5"):

@@ -11,6 +11,7 @@ from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import Coupling
 from robotid.simulation.closed_loop import _Gear, _limits, _Torque, carried
+from robotid.simulation.loops import _failed_at
 from robotid.simulation.settings import Actuator, Controller, Payload, Truth
 from robotid.simulation.truth import draw_parameters
 
@@ -118,3 +119,23 @@ def test_a_drive_of_several_joints_is_as_small_as_the_weakest(panda):
             weak = 12.0 / 50.0 if drive == "motor" or drive[-1] in "567" else 1.0
             low, high = (weak * x for x in term.typical)
             assert low <= drawn[f"{drive}.{term.name}"] <= high, drive
+
+
+def test_a_failed_roll_out_is_named_by_row_window_and_joint_with_its_positions(rng):
+    """Five rows of three joints in four windows at a time."""
+    q, v = rng.standard_normal((2, 5, 3, 4))
+    for wrong in (2e6, -2e6, np.nan, np.inf):
+        fast = v.copy()
+        fast[3, 1, 2] = fast[4, 0, 3] = wrong
+        row, lane, joint, start = _failed_at(9, None, q, fast)
+        assert (row, lane, joint) == (3, 2, 1)
+        np.testing.assert_array_equal(start, q[0, :, 2])
+    before, change = rng.standard_normal((2, 3, 4))
+    for wrong in (-8.0, np.nan, np.inf):
+        moved = change.copy()
+        moved[2, 1] = wrong
+        row, lane, joint, start = _failed_at(7, (before, moved), q, v)
+        assert (row, lane, joint) == (7, 1, 2)
+        np.testing.assert_array_equal(start, before[:, 1])
+    before[:, 1] = np.nan, -3e6, 0.25
+    np.testing.assert_array_equal(_failed_at(7, (before, moved), q, v)[3], [0.0, -1e6, 0.25])

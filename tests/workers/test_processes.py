@@ -21,7 +21,7 @@ from robotid.exceptions import (
 from robotid.regressor.factors import Reduction, available_cores, join
 from robotid.workers.pieces import reduce_piece
 from robotid.workers.plan import choose_workers
-from robotid.workers.processes import ProcessBackend
+from robotid.workers.processes import ProcessBackend, _interrupts_deferred
 
 SCRIPT = Path(__file__).parents[1] / "helpers" / "piecework.py"
 
@@ -61,7 +61,8 @@ def kept(folder):
     return sorted((folder / ".robotid-checkpoint").glob("*.npz"))
 
 
-def test_the_number_of_workers_does_not_show_in_the_bits(tmp_path):
+def test_the_number_of_workers_does_not_show_in_the_bits(tmp_path, caplog):
+    caplog.set_level("INFO", logger="robotid")
     pieces = pieces_in(tmp_path / "marks")
     calls = []
     serial = reduce_all(pieces, progress=lambda *call: calls.append(call))
@@ -71,6 +72,8 @@ def test_the_number_of_workers_does_not_show_in_the_bits(tmp_path):
         assert all(map(same_bits, found, serial))
         assert same_bits(join(found), join(serial))
     assert marks(tmp_path / "marks") == dict.fromkeys(range(10), 3)
+    said = [text for name, _, text in caplog.record_tuples if name == "robotid.piecework"]
+    assert sorted(said) == sorted(f"reduced random rows {k}" for k in 3 * [*range(10)])
     assert os.getpid() in workers_of(tmp_path / "marks")
     total = sum(piece.samples for piece in pieces)
     assert calls[0] == ("reducing", 0, total, "samples")
@@ -204,6 +207,43 @@ def test_ctrl_c_in_a_terminal_reaches_the_workers_too_and_shows_one_traceback(tm
     assert error.strip().endswith(".robotid-checkpoint. Continue with --resume")
 
 
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_an_interrupt_during_the_pools_own_functions_is_raised_after_them(number):
+    heard, before = [], signal.getsignal(number)
+
+    def handler(number, _):
+        heard.append(number)
+
+    signal.signal(number, handler)
+    try:
+        with _interrupts_deferred():
+            signal.raise_signal(number)
+            time.sleep(0.01)
+            assert heard == []
+        assert heard == [number]
+        assert signal.getsignal(number) is handler
+        assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, [])
+        with _interrupts_deferred():
+            pass
+        assert heard == [number]
+        signal.signal(number, signal.SIG_IGN)  # as nohup does
+        with _interrupts_deferred():
+            signal.raise_signal(number)
+        assert signal.getsignal(number) == signal.SIG_IGN
+        masked = []
+
+        def work():  # only the main thread may have handlers
+            with _interrupts_deferred():
+                masked.append(signal.pthread_sigmask(signal.SIG_BLOCK, []))
+
+        thread = threading.Thread(target=work)
+        thread.start()
+        thread.join()
+        assert masked == [{signal.SIGINT}]
+    finally:
+        signal.signal(number, before)
+
+
 def test_a_script_needs_no_guard(tmp_path):
     script = tmp_path / "script.py"
     script.write_text(
@@ -216,6 +256,15 @@ def test_a_script_needs_no_guard(tmp_path):
     run = subprocess.run([sys.executable, script], cwd=tmp_path, capture_output=True, text=True)
     assert (run.stdout, run.stderr) == ("10\n", "")
     assert marks(tmp_path / "marks") == dict.fromkeys(range(10), 1)
+
+
+def test_memory_that_a_worker_keeps_is_no_reason_to_replace_it():
+    """Pieces limit the memory; loky would replace a worker that grows by 300 MB."""
+    from loky import process_executor
+
+    with ProcessBackend(1) as backend:
+        largest = backend._start().submit(getattr, process_executor, "_MAX_MEMORY_LEAK_SIZE")
+        assert largest.result() == 10**15
 
 
 def test_workers_default_to_the_cores_for_long_work_only(tmp_path):
