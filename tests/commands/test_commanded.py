@@ -93,8 +93,9 @@ def test_drives_of_a_real_leg_are_as_large_as_they_can_be(result):
             "unit": "N m/rad", "source": "stated",
         }  # fmt: skip
         assert values[f"{joint}.kd"]["std_error"] is None
-        assert 0.0 < values[f"{joint}.delay"]["value"] < 0.03
-        assert values[f"{joint}.delay"]["std_error"] < 0.01
+        delay = values[f"{joint}.delay"]  # not known to differ from 0, its bound
+        assert 0.0 <= delay["value"] < 0.01
+        assert 0.0 < delay["std_error"] < 0.003
         assert 1.96 <= values[f"{joint}.delay"]["quantile"] < 2.3
 
 

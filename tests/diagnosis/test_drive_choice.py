@@ -392,7 +392,7 @@ def test_a_family_is_selected_by_share_p_value_and_gain(
         "_candidates": lambda drive, families: [one] if len(families) > 1 else [],
         "_reweighted": lambda sample, drive, own: sample,
         "_conditioned": lambda sample, drive, every, this, retained, best: drive_choice._Refined(
-            best, [every.own[best]], (False, False)
+            best, [every.own[best]], sample, (False, False)
         ),
         "_found": found,
     }.items():
