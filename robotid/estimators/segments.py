@@ -56,7 +56,7 @@ class Scatter:
         weight = (self.leverage * self.gain)[..., None]
         squares = np.sum(weight * self.gain[..., None] * along**2, axis=1)  # (s, c)
         back = self.axes @ (weight * along)
-        freedom = np.full(len(self.bread), np.inf)
+        freedom: Array = np.full(len(self.bread), np.inf)
         for k in np.flatnonzero(squares.sum(axis=0) > _UNSEEN * np.diag(self.bread)):
             # covariances of the segments' contributions to the parameter for independent noise
             Z = back[:, :, k]
@@ -64,7 +64,8 @@ class Scatter:
             total = float(np.trace(gram))
             is_rounding = total <= _UNSEEN * float(squares[:, k].sum())  # of one segment alone
             freedom[k] = 1.0 if is_rounding else total**2 / float((gram**2).sum())
-        return np.maximum(freedom, 1.0)
+        freedom = np.maximum(freedom, 1.0)
+        return freedom
 
 
 def scatter(segments: Sequence[Factors], theta: Array, sigma: Array, bread: Array) -> Scatter:
