@@ -249,7 +249,7 @@ def identify_unit(unit: FleetUnit, threads: int | None) -> UnitResult:
             job, job.model(), WorkPlan(1),
             refuse=lambda entry, error: refused.update({entry.path: str(error)}),
         )  # fmt: skip
-        result = build_result(found, job.to_dict(), outputs={})
+        result = build_result(found, job.to_dict())
         used = [e.path for e in job.identification if e.path not in refused]
         rows += _rows(unit.unit, used, result)
     except Exception as error:  # the fleet goes on: the error is in the table, with its type

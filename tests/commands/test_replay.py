@@ -86,8 +86,11 @@ def test_a_result_predicts_and_shows_masses_before_and_after(folder):
 
 def test_the_page_is_beside_the_first_result_unless_stated(folder, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    log, out = str(folder / "log.csv"), folder / "out"
-    for words, page in (([str(out / "result.json")], out), ([], tmp_path)):
+    log, out, other = str(folder / "log.csv"), folder / "out", tmp_path / "other"
+    other.mkdir()
+    (other / "result.json").write_bytes((out / "result.json").read_bytes())
+    one, both = [str(out / "result.json")], [str(x / "result.json") for x in (other, out)]
+    for words, page in ((one, out), (both, other), ([], tmp_path)):
         assert main(["replay", URDF, log, *words]) == 0
         assert capsys.readouterr().err.startswith("written: ")
         assert (page / "replay.html").is_file()
