@@ -72,19 +72,21 @@ def body_points(model: RobotModel) -> dict[str, Array]:
     Returns:
         Points by name of the body, shape (k, 3) [m].
     """
-    shapes = _shapes(model.tree.robot)
+    clouds = _clouds(model.tree.robot, model.tree.path)
     found: dict[str, list[Array]] = {body: [] for body in model.layout.bodies}
     open_bodies = set()
     for place in link_places(model):
         if place.body < 0:
             continue
         body = model.layout.bodies[place.body]
-        points = _link_points(shapes.get(place.link, ()), Path(model.tree.path))
-        if points is None or (not len(points) and place.parameters.any()):
+        parts = clouds.get(place.link, [])
+        known = [points for points in parts if points is not None]
+        if len(known) < len(parts) or (not known and place.parameters.any()):
             open_bodies.add(body)
-        elif len(points):
+        elif known:
             index = model.pin_model.getFrameId(place.link, pin.FrameType.BODY)
-            found[body].append(_moved(points, model.pin_model.frames[index].placement.homogeneous))
+            placement = model.pin_model.frames[index].placement.homogeneous
+            found[body].append(_moved(np.vstack(known), placement))
     return {
         body: np.vstack(parts) for body, parts in found.items() if parts and body not in open_bodies
     }
@@ -102,16 +104,15 @@ def link_clouds(model: RobotModel) -> tuple[list[tuple[str, int, Array]], list[s
         Name of the link, its body (-1: it is fixed to the world) and the points, shape (k, 3) [m],
         of each shape; and the links of which a shape cannot be read.
     """
-    shapes, urdf = _shapes(model.tree.robot), Path(model.tree.path)
+    shapes = _clouds(model.tree.robot, model.tree.path)
     clouds, unread = [], []
     for link in model.tree.links:
         frame = model.pin_model.frames[model.pin_model.getFrameId(link, pin.FrameType.BODY)]
-        for shape in shapes.get(link, ()):
-            points = _shape_points(shape, urdf)
+        for points in shapes.get(link, []):
             if points is None:
                 unread.append(link)
                 continue
-            points = _moved(_moved(points, shape.placement), frame.placement.homogeneous)
+            points = _moved(points, frame.placement.homogeneous)
             clouds.append((link, frame.parentJoint - 1, points))
     return clouds, list(dict.fromkeys(unread))
 
@@ -233,10 +234,14 @@ def _body_frames(model: RobotModel) -> dict[str, list[Array]]:
     return frames
 
 
-@lru_cache(maxsize=4)
-def _shapes(robot: ET.Element) -> dict[str, list[Shape]]:
-    """Return the collision shapes of each link, or its visual ones if it has none."""
-    return _by_link(read_shapes(robot, "visual")) | _by_link(read_shapes(robot, "collision"))
+@lru_cache(maxsize=2)  # the meshes of a robot are read once
+def _clouds(robot: ET.Element, urdf: str) -> dict[str, list[Array | None]]:
+    """Return the points of each shape of each link, in its frame; None if it cannot be read.
+
+    They are those of the collision shapes of a link, or of its visual ones if it has none.
+    """
+    shapes = _by_link(read_shapes(robot, "visual")) | _by_link(read_shapes(robot, "collision"))
+    return {link: [_cloud(shape, Path(urdf)) for shape in own] for link, own in shapes.items()}
 
 
 def _by_link(shapes: Sequence[Shape]) -> dict[str, list[Shape]]:
@@ -246,18 +251,11 @@ def _by_link(shapes: Sequence[Shape]) -> dict[str, list[Shape]]:
     return by_link
 
 
-def _link_points(shapes: Sequence[Shape], urdf: Path) -> Array | None:
-    """Return points of a link's shapes in its frame; None if one is not known or not found."""
-    parts = [np.zeros((0, 3))]
-    for shape in shapes:
-        points = _shape_points(shape, urdf)
-        if points is None:
-            return None
-        parts.append(_moved(points, shape.placement))
-    return np.vstack(parts)
+def _cloud(shape: Shape, urdf: Path) -> Array | None:
+    points = _shape_points(shape, urdf)
+    return None if points is None else _moved(points, shape.placement)
 
 
-@lru_cache(maxsize=64)  # shapes of one reading of a URDF: their meshes are read once
 def _shape_points(shape: Shape, urdf: Path) -> Array | None:
     corners: Array = np.array(np.meshgrid(*[[-1.0, 1.0]] * 3)).reshape(3, -1).T
     size: Array = np.array(shape.size)

@@ -14,7 +14,9 @@ from robotid.robot.geometry import (
     geometry_half_spaces,
     hull_half_spaces,
     kinematic_lengths,
+    link_clouds,
 )
+from robotid.robot.meshes import Surface
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
 from robotid.urdf_audit.inspection import inspect_urdf
@@ -102,6 +104,26 @@ def test_a_mesh_is_found_beside_the_urdf_and_scaled(tmp_path):
         np.testing.assert_allclose(high[:2], [0.25, 1.0], atol=1e-6)
         np.testing.assert_allclose(low, [-0.25, -1.0, -1.5], atol=1e-6)
     assert body_points(arm(tmp_path, MESH.format("lost.stl"), SPHERE)) == {}
+    assert body_points(arm(tmp_path, BOX + MESH.format("lost.stl"), SPHERE)) == {}
+
+
+def test_the_meshes_of_a_robot_are_read_once_however_many(tmp_path, monkeypatch):
+    corners, read = np.array([[0.0, 0, 0], [1, 0, 0], [0, 2, 0]]), []
+
+    def surfaces(path):
+        read.append(path.name)
+        return (Surface(corners, np.array([[0, 1, 2]]), None),)
+
+    monkeypatch.setattr("robotid.robot.geometry.read_surfaces", surfaces)
+    (tmp_path / "part.stl").touch()
+    one, other = (arm(tmp_path, 70 * MESH.format("part.stl"), BOX) for _ in range(2))
+    for model in (one, one.with_terms({}), one):
+        assert len(body_points(model)["one"]) == 70 * 3 + 8
+        body_boxes(model)
+        assert len(link_clouds(model)[0]) == 71
+    assert len(read) == 70
+    body_points(other)  # the same file, read anew
+    assert len(read) == 140
 
 
 def test_half_spaces_hold_every_point_and_touch_the_hull(rng):
