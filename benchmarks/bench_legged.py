@@ -592,7 +592,7 @@ def main():
             excited(name, 10.0, *((10.0, 1) if options.quick else (options.design, options.runs)))
         return
     runs, seconds = (1, 4.0) if options.quick else (options.runs, options.seconds)
-    for name in ("go1", "g1", "cassie") if options.quick else options.robots:
+    for name in ("go1", "cassie") if options.quick else options.robots:
         if options.faults:
             faults(name, range(options.first, options.first + runs), seconds)
         elif options.flags:

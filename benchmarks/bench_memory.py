@@ -46,7 +46,7 @@ def main():
     if options.write:
         write(Path(options.write[0]), int(options.write[1]))
         return
-    logs = {"csv": 20_000, "parquet": 50_000} if options.quick else {"csv": 10**6, "parquet": 10**7}
+    logs = {"csv": 10_000, "parquet": 20_000} if options.quick else {"csv": 10**6, "parquet": 10**7}
     held = 8192 if options.quick else None
     print("| log | rows | file, MB | peak, MB | s | in memory: peak, MB | s | difference |")
     print("|" + "---|" * 8)

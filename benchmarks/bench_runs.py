@@ -18,6 +18,7 @@ import argparse
 import os
 import sys
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -66,6 +67,13 @@ WITHIN, BETWEEN = 0.05, 0.15  # spread of friction between runs, between robots
 SLIP = 0.1, 0.2  # [rad] of the encoder of a joint in one log, of one robot
 COMMON = 0.7  # correlation of frictions between robots
 KINDS = ("friction", "gain", "payload", "zero")
+APART, BOTH = {0: -0.02, 9: -0.015}, {0: -0.02, 1: -0.02}  # slopes of terms [1/degC]
+SETS = (  # robots, logs of each, slopes by term, share of `estimates`
+    (1, 6, APART, 1.0), (1, 10, APART, 1.0), (1, 16, APART, 1.0),
+    (4, 4, APART, 1.0), (8, 2, APART, 1.0), (8, 4, APART, 1.0),
+    (1, 10, BOTH, 0.15), (1, 16, BOTH, 0.15), (4, 4, BOTH, 0.15),
+    (1, 10, {0: -0.02}, 0.15), (1, 16, {0: -0.02}, 0.15), (4, 4, {0: -0.02}, 0.15),
+)  # fmt: skip
 
 
 def main():
@@ -76,14 +84,14 @@ def main():
         sys.exit("set ROBOTID_DATA to the folder of the recordings")
     print("| recordings | logs | 95 % of the next log | of the mean | parameters | 95 % jointly |")
     print("|---|---|---|---|---|---|")
-    for name, entries in recordings():
+    for name, entries in islice(recordings(), 1 if options.quick else None):
         left_out(name, entries, 1 if options.quick else len(entries))
     if not options.quick:
         servos()
     print()
     fleets(1, 8) if options.quick else fleets(5)
     samples(1 if options.quick else 100)
-    temperatures(1 if options.quick else 60)
+    temperatures(*((1, SETS[3:5]) if options.quick else (60, SETS)))
     warm_up(3, 3) if options.quick else warm_up(110, 25)
     unlike(1 if options.quick else 20)
     print("| arms in MuJoCo | sets | named | another | none |\n|---|---|---|---|---|")
@@ -507,23 +515,17 @@ def samples(count):
             print(f"| {words} | {robots} | {cells} |", flush=True)
 
 
-def temperatures(count):
+def temperatures(count, sets):
     """Print how effects of the temperature on friction are found, and the coverage of slopes.
 
     The standard deviation of the temperature is 8 degC, that of terms between logs 8 %, and between
     robots BETWEEN. The time of the logs has no effect. Terms that are hardly distinguishable: the
     torques of viscous and Coulomb friction correlate by 0.99.
     """
-    apart, both = {0: -0.02, 9: -0.015}, {0: -0.02, 1: -0.02}
     print("| logs | effects | found | another effect (sets) | slope found, over the true one | "
           "slope within 95 % | of those found | next log at a temperature |\n"
           "|---|---|---|---|---|---|---|---|")  # fmt: skip
-    for robots, logs, true, similar in (
-        (1, 6, apart, 1.0), (1, 10, apart, 1.0), (1, 16, apart, 1.0),
-        (4, 4, apart, 1.0), (8, 2, apart, 1.0), (8, 4, apart, 1.0),
-        (1, 10, both, 0.15), (1, 16, both, 0.15), (4, 4, both, 0.15),
-        (1, 10, {0: -0.02}, 0.15), (1, 16, {0: -0.02}, 0.15), (4, 4, {0: -0.02}, 0.15),
-    ):  # fmt: skip
+    for robots, logs, true, similar in sets:
         tally(count, robots, logs, true, similar)
 
 

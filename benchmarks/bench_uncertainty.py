@@ -230,7 +230,7 @@ def main():
             print_encoders(robots, options.friction, options.bits, options.runs)
         return
     robots, runs = (
-        (["UR10"], 4) if options.quick else (options.robots or ["UR10", "panda"], options.runs)
+        (["UR10"], 2) if options.quick else (options.robots or ["UR10", "panda"], options.runs)
     )
     print(setting.machine())
     print(f"{runs} runs each; ratio = reported standard error / root mean square of the error")
