@@ -195,7 +195,10 @@ def codes_of_findings():
     places = {"Finding": 0, "_Alteration": 0, "log_finding": 1, "Candidate": 1}
     codes = {*CODES, *WARNING_CODES, "unusable_log"}
     for path in (ROOT / "robotid").rglob("*.py"):
-        for node in ast.walk(ast.parse(path.read_text())):
+        text = path.read_text()
+        if not re.search(rf"\bcode\b|\b({'|'.join(places)})\(", text):
+            continue
+        for node in ast.walk(ast.parse(text)):
             if isinstance(node, ast.Call):
                 name = getattr(node.func, "id", getattr(node.func, "attr", ""))
                 given = [k.value for k in node.keywords if k.arg == "code"]

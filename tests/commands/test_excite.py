@@ -1,6 +1,8 @@
 import argparse
+import io
 import json
 import re
+from contextlib import redirect_stdout
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -29,14 +31,22 @@ WORDS = [
 ]  # fmt: skip
 
 
-def test_a_motion_is_designed_written_and_told(tmp_path, capsys):
-    target = tmp_path / "motion.parquet"
+@pytest.fixture(scope="module")
+def designed(tmp_path_factory):
+    """What is printed of a motion with limits of its own, its columns and the page about it."""
+    folder, printed = tmp_path_factory.mktemp("designed"), io.StringIO()
     stated = ["--share", "0.5", "--max-acceleration", "wrist_2_joint=3", "--floor", "-2"]
-    assert main([*WORDS, "--out", str(target), "--json", *stated, "--points", "50"]) == 0
-    content = json.loads(capsys.readouterr().out)
-    table = open_table(target, LogSource())
+    stated += ["--points", "50", "--report", str(folder / "motion.html"), "--json"]
+    with redirect_stdout(printed):
+        assert main([*WORDS, "--out", str(folder / "motion.parquet"), *stated]) == 0
+    assert sorted(path.name for path in folder.iterdir()) == ["motion.html", "motion.parquet"]
+    table = open_table(folder / "motion.parquet", LogSource())
     assert table.names[:2] == ["time", "q_wrist_1_joint"]
-    columns = table.read(table.names)
+    return json.loads(printed.getvalue()), table.read(table.names), folder / "motion.html"
+
+
+def test_a_motion_is_designed_written_and_told(designed):
+    content, columns, _ = designed
     np.testing.assert_allclose(columns["time"], np.arange(201) / 50)
     model = RobotModel.from_urdf(example_urdf("ur10_robot.urdf"), joints=WRIST)
     speed = [np.abs(columns[f"dq_{j.name}"]).max() / (0.5 * j.velocity) for j in model.limits]
@@ -106,11 +116,8 @@ def test_bad_flags_are_refused_before_anything_is_written(tmp_path, capsys, word
     assert not list(tmp_path.iterdir())
 
 
-def test_the_page_says_what_is_used_of_each_limit_and_draws_it(tmp_path, capsys):
-    target, page = tmp_path / "motion.csv", tmp_path / "motion.html"
-    stated = ["--max-acceleration", "wrist_2_joint=3", "--floor", "-2", "--report", str(page)]
-    assert main([*WORDS, "--out", str(target), "--json", *stated]) == 0
-    content = json.loads(capsys.readouterr().out)
+def test_the_page_says_what_is_used_of_each_limit_and_draws_it(designed):
+    content, columns, page = designed
     assert content["report"] == str(page)
     html = page.read_text()
     shown = {
@@ -118,8 +125,6 @@ def test_the_page_says_what_is_used_of_each_limit_and_draws_it(tmp_path, capsys)
         for row in re.findall(r"<tr>(.*?)</tr>", html)
         if (cells := re.findall(r"<t[hd][^>]*>(.*?)</t[hd]>", row))
     }
-    table = open_table(target, LogSource())
-    columns = table.read(table.names)
     for name, unit in (("velocity", "rad/s"), ("acceleration", "rad/s²")):
         entry, cells = content["limits"][name], shown[name]
         assert float(cells[0]) == pytest.approx(100 * (1 - entry["margin"]), abs=0.06)
@@ -139,8 +144,7 @@ def test_the_page_says_what_is_used_of_each_limit_and_draws_it(tmp_path, capsys)
     velocity = next(c for c in charts if c["title"].startswith("velocity"))
     assert velocity["link"] == "time"
     assert [velocity["series"][k]["y"]["low"] for k in (0, 1)] == [100.0, -100.0]
-    assert "motion.csv: the motion determines" in html
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["motion.csv", "motion.html"]
+    assert "motion.parquet: the motion determines" in html
 
 
 def test_a_page_that_cannot_be_written_is_refused_before_the_design(tmp_path, capsys):
@@ -193,6 +197,7 @@ def test_a_payload_is_found_by_a_motion_of_the_few_joints_that_show_it(tmp_path,
     logs = [str(tmp_path / name) for name in ("loaded.parquet", "bare.parquet")]
     for log, own in zip(logs, (["--plant", str(plant)], []), strict=True):
         noisy = ["--rate", "200", "--torque-noise", "0.02", "--perturb", "0.1", "--seed", "3"]
+        noisy += ["--controller", "perfect"]
         assert main(["simulate", robot, motion, "--out", log, *noisy, *own, "--json"]) == 0
     capsys.readouterr()
     assert main(["payload", robot, logs[0], "--reference", logs[1], "--json"]) == 0
@@ -227,25 +232,26 @@ def test_flags_of_a_payload_that_do_not_fit_are_refused(tmp_path, capsys, words,
 
 def test_after_a_result_a_motion_is_made_for_what_it_knows_the_least(tmp_path, capsys):
     motion, log, out = (str(tmp_path / name) for name in ("m.parquet", "log.parquet", "out"))
-    assert main([*WORDS, "--out", motion, "--json"]) == 0
+    words = [*WORDS, "--clearance", "none", "--out", motion]
+    assert main([*words, "--json"]) == 0
     robot = [WORDS[1], WORDS[2], WORDS[3]]
     noisy = ["--rate", "100", "--torque-noise", "0.02", "--controller", "perfect"]
     assert main(["simulate", robot[0], motion, *robot[1:], "--out", log, *noisy, "--json"]) == 0
     plain = ["--estimator", "wls", "--friction", "viscous+coulomb", "--json"]
     assert main(["identify", robot[0], log, *robot[1:], "--out", out, *plain]) == 0
     capsys.readouterr()
-    assert main([*WORDS, "--out", motion, "--given", out]) == 0
+    assert main([*words, "--given", out]) == 0
     assert "designed for the parameters with the widest intervals: " in " ".join(
         capsys.readouterr().out.split()
     )
-    assert main([*WORDS, "--out", motion, "--given", out, "--json"]) == 0
+    assert main([*words, "--given", out, "--json"]) == 0
     content = json.loads(capsys.readouterr().out)
     assert content["criterion"] == "widest"
     result = json.loads((tmp_path / "out" / "result.json").read_text())
     names = [entry["name"] for entry in result["base_parameters"]]
     assert len(content["widest"]) == round(len(names) / 4)
     assert set(content["widest"]) < set(names)
-    assert main([*WORDS, "--out", motion, "--given", out, "--criterion", "A", "--json"]) == 0
+    assert main([*words, "--given", out, "--criterion", "A", "--json"]) == 0
     content = json.loads(capsys.readouterr().out)
     assert content["criterion"] == "A"
     assert "widest" not in content
@@ -348,6 +354,7 @@ def test_a_box_is_kept_away_from_and_a_seed_makes_the_same_motion_again(pan_tilt
     def designed(*words):
         out = pan_tilt.with_name("motion.csv")
         quick = ["--duration", "2", "--seconds", "60", "--starts", "1", "--points", "1000"]
+        quick += ["--harmonics", "2"]
         command = ["excite", str(pan_tilt), "--out", str(out), *quick, "--json", *words]
         assert main(command) == 0
         return json.loads(capsys.readouterr().out)["limits"]["collision"], out.read_text()
