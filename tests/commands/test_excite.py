@@ -452,10 +452,10 @@ BENT = [
 ]
 
 
-@pytest.fixture
-def on_feet(tmp_path):
+@pytest.fixture(scope="module")
+def on_feet(tmp_path_factory):
     """Return the words that design a motion of Go1 on its feet."""
-    job = tmp_path / "go1.toml"
+    job = tmp_path_factory.mktemp("go1") / "go1.toml"
     job.write_text(STANDING.format(urdf=json.dumps(str(example_urdf("go1.urdf")))))
     return [
         "excite", str(job), *BENT, "--duration", "4", "--harmonics", "2", "--starts", "1",
@@ -463,41 +463,39 @@ def on_feet(tmp_path):
     ]  # fmt: skip
 
 
-def test_a_motion_on_the_feet_is_written_with_the_job_that_identifies_it(on_feet, tmp_path, capsys):
-    page = tmp_path / "page.html"
-    words = [
-        *ALONE,
-        "--out",
-        str(tmp_path / "squat.csv"),
-        "--lifted",
-        "FR_foot",
-        "--friction-coefficient",
-        "0.4",
-        "--report",
-        str(page),
-    ]
-    assert main([*on_feet, *words, "--json"]) == 0
-    content = json.loads(capsys.readouterr().out)
+@pytest.fixture(scope="module")
+def squat(on_feet, tmp_path_factory):
+    """What is printed of a motion on three feet, and the folder that it is in."""
+    folder, printed = tmp_path_factory.mktemp("squat"), io.StringIO()
+    words = [*ALONE, "--lifted", "FR_foot", "--friction-coefficient", "0.4", "--json"]
+    words += ["--out", str(folder / "squat.csv"), "--report", str(folder / "page.html")]
+    with redirect_stdout(printed):
+        assert main([*on_feet, *words]) == 0
+    return json.loads(printed.getvalue()), folder
+
+
+def test_a_motion_on_the_feet_is_written_with_the_job_that_identifies_it(squat, tmp_path):
+    content, folder = squat
     limits = content["limits"]
     assert set(limits) == {"position", "velocity", "torque", "vertical force", "friction"}
     assert all(0.0 <= entry["margin"] < 1.0 for entry in limits.values())
     assert re.fullmatch(r"0\.\d\d, wanted 0.36 or less", limits["friction"]["words"])
     assert content["feasible"] is True
     assert len(content["joints"]) == 12
-    assert "Forces of the ground" in page.read_text()
+    assert "Forces of the ground" in (folder / "page.html").read_text()
     job = read_job(content["job"])
     assert [(x.frame, x.always) for x in job.contacts] == [
         ("FL_foot", True), ("RL_foot", True), ("RR_foot", True)
     ]  # fmt: skip
     assert job.signals.cutoff == 15.0
-    assert job.identification[0].path == tmp_path / "squat_recorded.csv"
+    assert job.identification[0].path == folder / "squat_recorded.csv"
     model = job.model()
     log = read_log(
-        tmp_path / "squat.csv", joints=model.joints, base=logged_base(model), needs="motion"
+        folder / "squat.csv", joints=model.joints, base=logged_base(model), needs="motion"
     )
     assert np.abs(np.ptp(log.base.pose[:, :3], axis=0)).min() > 1e-3
     # the forces of the written motion by simulate's dynamics, which shares the least norm only
-    where = ["simulate", content["job"], str(tmp_path / "squat.csv"), "--controller", "perfect"]
+    where = ["simulate", content["job"], str(folder / "squat.csv"), "--controller", "perfect"]
     assert main([*where, "--out", str(tmp_path / "squat_recorded.csv"), "--rate", "100"]) == 0
     simulated = read_log(tmp_path / "squat_recorded.csv", joints=model.joints)
     used = np.abs(simulated.tau).max(axis=0) / [joint.effort for joint in model.limits]
@@ -505,12 +503,14 @@ def test_a_motion_on_the_feet_is_written_with_the_job_that_identifies_it(on_feet
     assert used.max() == pytest.approx(wanted, abs=0.06)
 
 
-def test_the_terminal_names_the_margins_of_the_ground(on_feet, tmp_path, capsys):
-    assert main([*on_feet, *ALONE, "--out", str(tmp_path / "squat.csv")]) == 0
+def test_the_terminal_names_the_margins_of_the_ground(on_feet, squat, monkeypatch, capsys):
+    content, folder = squat
+    monkeypatch.setattr("robotid.commands.excite.design_motion", lambda *_, **__: content)
+    assert main([*on_feet, *ALONE, "--out", str(folder / "squat.csv")]) == 0
     said = capsys.readouterr().out
     assert re.search(r"vertical force +\d+\.\d %  R?F?[LR]_foot at \d\.\d\d s: ", said)
     assert re.search(r"friction +\d+\.\d %  ", said)
-    assert str(tmp_path / "squat.identify.toml") in said.replace("\n", "")
+    assert str(folder / "squat.identify.toml") in said.replace("\n", "")
 
 
 @pytest.mark.parametrize(
