@@ -61,7 +61,6 @@ class Workplace:
             "identification": [{"log": str(log)}],
             "validation": [{"log": str(path)} for path in kept],
             "output": {"report": False},
-            "estimator": {"draws": 0},
             **settings,
         }
         job = job_from_settings(table, "job.toml", self.folder)
