@@ -351,9 +351,9 @@ def test_the_table_of_a_motion_on_the_feet_ends_with_the_motion():
 def test_a_box_is_kept_away_from_and_a_seed_makes_the_same_motion_again(pan_tilt, capsys):
     """The tilting link is a cube of 5 cm that turns about its centre: a wall is 6 cm from it."""
 
-    def designed(*words):
+    def designed(*words, seconds="60"):
         out = pan_tilt.with_name("motion.csv")
-        quick = ["--duration", "2", "--seconds", "60", "--starts", "1", "--points", "1000"]
+        quick = ["--duration", "2", "--seconds", seconds, "--starts", "1", "--points", "1000"]
         quick += ["--harmonics", "2"]
         command = ["excite", str(pan_tilt), "--out", str(out), *quick, "--json", *words]
         assert main(command) == 0
@@ -370,8 +370,9 @@ def test_a_box_is_kept_away_from_and_a_seed_makes_the_same_motion_again(pan_tilt
     apart = 0.06 - reach.max()
     assert apart - 0.001 <= near["margin"] + near["kept"] <= apart + 1e-6  # a bound to 1 mm
     assert 0.0 <= near["margin"] < 0.01
-    assert designed(*wall, "--seed", "3")[1] == first
-    assert designed(*wall, "--seed", "4")[1] != first
+    # the first motion of the search
+    made = [designed(*wall, "--seed", x, seconds="0.001")[1] for x in ("3", "3", "4")]
+    assert made[0] == made[1] != made[2]
 
 
 def test_a_motion_too_short_for_its_page_is_not_written_either(tmp_path, capsys):
