@@ -106,6 +106,7 @@ _SHAPE = {
     "simulation?": {"controller": {"kind": TEXT, "rate?": MAYBE}},
     "own_terms?": {...: [TABLE]},
     "covariance?": {"names": [TEXT], "root": [[NUMBER]]},
+    "friction?": {...: {"data_range?": {...: [NUMBER]}}},
     "drive_moments?": {...: {"terms": [TEXT], "products": [[NUMBER]], "torque": NUMBER}},
     "identification": _METRICS,
     "validation": [{"log": TEXT, **_METRICS}],
@@ -343,6 +344,13 @@ def read_result(path: str | Path) -> dict[str, Any]:
     for k, entry in enumerate(result["inputs"]):
         if entry["role"] != "urdf":
             check_shape(entry, _RECORDING, f"{name}.inputs[{k}]")
+    for joint, own in result.get("friction", {}).items():
+        for quantity, ends in own.get("data_range", {}).items():
+            if len(ends) != 2:
+                at = f"{name}.friction.{joint}.data_range.{quantity}"
+                raise DataError(
+                    f"{at} has {len(ends)} numbers, wanted 2: the smallest, the largest"
+                )
     validation = [entry for entry in result["inputs"] if entry["role"] == "validation"]
     if len(validation) != len(result["validation"]):
         raise DataError(

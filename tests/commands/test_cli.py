@@ -8,6 +8,7 @@ import re
 import subprocess
 import sys
 from contextlib import nullcontext, redirect_stderr, redirect_stdout
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,10 +16,12 @@ from helpers.paths import URDF as PLANAR
 from helpers.synthetic import exact_log, truth
 
 from robotid.cli import main
+from robotid.commands.demo import run_demo
 from robotid.export.urdf import load_identified
 from robotid.log_files.read import read_log, write_log
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.torque import joint_torque_regressor
+from robotid.robot.drives import LoadFriction
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 
@@ -124,6 +127,16 @@ def test_the_written_urdf_predicts_what_the_fit_predicts(identified, logs, capsy
         (("base_parameters", 1, "value"), "x", "base_parameters[1].value is 'x', wanted"),
         (("inputs", 2, "path"), 3, "inputs[2].path is 3, wanted"),
         (("verdict", "reasons"), {}, "verdict.reasons is {}, wanted"),
+        (
+            ("friction", "elbow_joint", "data_range", "v"),
+            [0.1, {}],
+            "friction.elbow_joint.data_range.v[1] is {}, wanted",
+        ),
+        (
+            ("friction", "elbow_joint", "data_range", "q"),
+            [0.1],
+            "friction.elbow_joint.data_range.q has 1 numbers, wanted 2",
+        ),
     ],
 )
 def test_a_result_that_was_changed_by_hand_is_refused_by_the_place(
@@ -351,7 +364,7 @@ def test_a_job_file_states_its_logs_itself(arm_logs, tmp_path, capsys):
 def test_rounded_angles_are_named_and_snapped_where_asked(tmp_path, rng, capsys):
     source = tmp_path / "arm.urdf"
     text = example_urdf("xarm7.urdf").read_text().replace("1.5708", "1.57")
-    source.write_text(text)
+    source.write_text(re.sub(r"(?s)<(visual|collision)>.*?</\1>", "", text))
     model = RobotModel.from_urdf(source, snap_angles=True)
     pi = truth(model)
     write_log(exact_log(model, pi, rng, samples=400), tmp_path / "log.csv")
@@ -406,6 +419,9 @@ def test_inspect_of_an_unusable_urdf_says_why(capsys, tmp_path):
 
 def test_demo_runs_from_nothing_and_finds_the_truth(tmp_path, capsys, monkeypatch):
     out, stages = tmp_path / "demo", []
+    monkeypatch.setattr("robotid.commands.demo._PERIOD", 7.0)
+    # what the robot looks like takes seconds to be thinned
+    monkeypatch.setattr("robotid.viewer.scene._thinned", lambda files, _: (None,) * len(files))
     shown = nullcontext(lambda *stage: stages.append(stage))
     monkeypatch.setattr("robotid.cli.demo.terminal_progress", lambda: shown)
     assert main(["demo", "--out", str(out)]) == 0
@@ -420,6 +436,22 @@ def test_demo_runs_from_nothing_and_finds_the_truth(tmp_path, capsys, monkeypatc
     assert len(set(links)) == 4
     assert {name for name in links if (out / name).is_file()} == set(links)
     assert str(out / "report.html") in printed
+
+
+def test_a_term_that_the_demo_finds_and_did_not_simulate_is_truly_0(tmp_path, monkeypatch):
+    """As the friction of a drive that seems to grow with its load."""
+    monkeypatch.setattr("robotid.commands.demo._PERIOD", 0.25)
+    whole = RobotModel.from_urdf(example_urdf("z1.urdf"), locked={"jointGripper": 0.0})
+    bases = []
+    for model in (whole, whole.with_terms({"joint2": (LoadFriction(),)})):
+        found = SimpleNamespace(model=model, mapping=structural_mapping(model))
+        monkeypatch.setattr(
+            "robotid.commands.demo.run_job", lambda *_, found=found, **__: (found, {})
+        )
+        *_, true = run_demo(tmp_path / "demo")
+        bases.append(dict(zip(found.mapping.base_names, true, strict=True)))
+    plain, more = bases
+    assert more == pytest.approx(plain | {"joint2.load": 0.0})
 
 
 def test_nothing_stays_behind_when_a_run_fails_late(arm_logs, tmp_path, monkeypatch):

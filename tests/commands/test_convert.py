@@ -154,27 +154,34 @@ def test_the_command_refuses_by_name_and_leaves_what_was_there(tmp_path, bag, ca
 
 
 FULL_DISK = """
-import resource, sys
+import contextlib, io, json, resource, sys
 sys.dont_write_bytecode = True  # a cut file would be read by the next process
 from robotid.cli import main
 resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))
-sys.exit(main(["convert", *sys.argv[1:]]))
+ends = []
+for target in sys.argv[2:]:
+    with contextlib.redirect_stderr(io.StringIO()) as said:
+        ends.append((main(["convert", sys.argv[1], target]), said.getvalue()))
+print(json.dumps(ends))
 """
 
 
-@pytest.mark.parametrize("suffix", ["csv", "parquet", "npz", "h5", "hdf5", "mat"])
-def test_on_a_full_disk_the_old_file_stays_and_no_part_of_the_new(tmp_path, suffix):
+def test_on_a_full_disk_the_old_file_stays_and_no_part_of_the_new(tmp_path):
     t, q = np.arange(20_000) / 100, np.random.default_rng(0).normal(size=20_000)
     np.savez(tmp_path / "in.npz", time=t, q_a=q)
-    target = tmp_path / f"out.{suffix}"
-    target.write_text("precious")
-    command = [sys.executable, "-c", FULL_DISK, str(tmp_path / "in.npz"), str(target)]
-    run = subprocess.run(command, capture_output=True, text=True)
-    assert run.returncode == 1
-    assert run.stderr.startswith("robotid: [Errno 27] ")
-    assert run.stderr.endswith(f"\n  while writing {str(target)!r}\n")
-    assert target.read_text() == "precious"
-    assert {path.name for path in tmp_path.iterdir()} == {"in.npz", target.name}
+    suffixes = ("csv", "parquet", "npz", "h5", "hdf5", "mat")
+    targets = [tmp_path / f"out.{suffix}" for suffix in suffixes]
+    for target in targets:
+        target.write_text("precious")
+    command = [sys.executable, "-c", FULL_DISK, tmp_path / "in.npz", *targets]
+    run = subprocess.run(command, capture_output=True, text=True, check=True)
+    for target, (code, said) in zip(targets, json.loads(run.stdout), strict=True):
+        assert code == 1
+        assert said.startswith("robotid: [Errno 27] ")
+        assert said.endswith(f"\n  while writing {str(target)!r}\n")
+        assert target.read_text() == "precious"
+    assert run.stderr == ""
+    assert {*tmp_path.iterdir()} == {tmp_path / "in.npz", *targets}
 
 
 def test_a_job_reads_a_bag_and_its_result_validates_on_it(tmp_path, ur5, rng, capsys):

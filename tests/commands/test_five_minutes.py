@@ -33,6 +33,8 @@ def user(files, done, tmp_path, monkeypatch):
     for file in files.iterdir():
         (tmp_path / file.name).write_bytes(file.read_bytes())
     monkeypatch.chdir(tmp_path)
+    # what the robot looks like takes seconds to be thinned
+    monkeypatch.setattr("robotid.viewer.scene._thinned", lambda files, _: (None,) * len(files))
 
     class Quick(User):
         def run(self, words):

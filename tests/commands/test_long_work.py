@@ -144,7 +144,7 @@ def test_a_signal_to_end_is_heard_as_ctrl_c_is(job, tmp_path, number, code, coun
 
 def test_ctrl_c_ends_with_one_line_and_resumes_to_the_same_bits(job, expected, tmp_path):
     out = tmp_path / "out"
-    code, error = cut_off(job, out, signal.SIGINT, "2")
+    code, error = cut_off(job, out, signal.SIGINT, "1")  # of workers: tests/workers
     assert code == 130
     assert error.count("\n") == 1
     assert error.startswith("robotid: interrupted; finished pieces are stored in ")

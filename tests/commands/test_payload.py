@@ -53,6 +53,9 @@ def files(ur5, tmp_path_factory):
     return folder
 
 
+STATED = ("--friction", "viscous+coulomb")  # so that none has to be chosen
+
+
 def asked(capsys, *words, code=0):
     assert main(["payload", ARM, *map(str, words)]) == code
     printed = capsys.readouterr()
@@ -76,7 +79,8 @@ def test_a_log_and_a_result_are_references_alike(files, capsys):
 
 
 def test_a_mass_is_said_to_be_in_the_scale_of_the_torques(files, capsys):
-    said = asked(capsys, files / "loaded.csv", "--reference", files / "bare.csv", "--link", "tool0")
+    words = [files / "loaded.csv", "--reference", files / "bare.csv", "--link", "tool0", *STATED]
+    said = asked(capsys, *words)
     mass, low, high = re.search(
         r"mass ([.\d]+) kg \(95 % interval ([.\d]+) to ([.\d]+)\)\.", said
     ).groups()
@@ -86,7 +90,7 @@ def test_a_mass_is_said_to_be_in_the_scale_of_the_torques(files, capsys):
 
 def test_the_text_says_what_a_controller_asks_for(files, capsys):
     said = asked(capsys, files / "loaded.csv", "--reference", files / "bare.csv", "--link", "tool0",
-                 "--mass", "2")  # fmt: skip
+                 "--mass", "2", *STATED)  # fmt: skip
     assert said.startswith("payload on tool0\n  mass 2 kg, stated\n  scale of the torques: payload")
     check = " ".join(said.split())
     assert re.search(r"of 2 kg on tool0: torque alone determines [12][.\d]* kg \(95 % inter", check)
@@ -190,11 +194,11 @@ def test_gains_come_from_a_known_mass(files, capsys, ur5):
         assert gain["gain"] == pytest.approx(true, abs=4 * gain["std_error"])
         assert gain["std_error"] < 0.05 * true
     assert all(entry["std_error"] > 0 for entry in found["base_parameters"])
-    said = asked(capsys, *words)
+    said = asked(capsys, *words, *STATED)
     assert "verify them with another payload or another log of it" in " ".join(said.split())
     assert "[torque.gains]\nshoulder_pan_joint = 1" in said
     stated = f"{ur5.joints[0]}={GAINS[0]}"
-    some = json.loads(asked(capsys, *words, "--gain", stated, "--json"))
+    some = json.loads(asked(capsys, *words, "--gain", stated, *STATED, "--json"))
     assert list(some["gains"]) == list(ur5.joints[1:])
 
 
@@ -218,7 +222,7 @@ def test_friction_is_chosen_of_torques_in_the_gains_that_were_found(
 
 def test_what_is_missing_is_named(files, capsys):
     loaded, bare = files / "loaded.csv", files / "bare.csv"
-    said = asked(capsys, bare, "--reference", loaded, "--link", "tool0", code=1)
+    said = asked(capsys, bare, "--reference", loaded, "--link", "tool0", *STATED, code=1)
     assert "less than in the reference" in said
     said = asked(capsys, loaded, "--reference", files / "out", "--cutoff", "5", code=2)
     assert "a RESULT states how its logs are read; remove --cutoff" in said

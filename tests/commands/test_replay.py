@@ -30,22 +30,34 @@ from robotid.robot.model import RobotModel
 URDF = str(example_urdf("ur5_robot.urdf"))
 
 
+def of_boxes(urdf, path):
+    """Write a URDF that shows boxes for all meshes but one: they take seconds to be thinned."""
+    text = Path(urdf).read_text()
+    first, *others = re.split(r"(?=<visual>)", text, maxsplit=2)[1:]
+    head = text.partition("<visual>")[0]
+    box = r'\g<1><box size="0.1 0.1 0.1"/>'
+    others = [re.sub(r"(<visual>.*?)<mesh [^>]*/>", box, x, flags=re.DOTALL) for x in others]
+    path.write_text("".join([head, first, *others]))
+    return str(path)
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """A log of a UR5 that its URDF does not describe, and what identify found in it."""
+    """A UR5, a log of one that its URDF does not describe, and what identify found in it."""
     folder = tmp_path_factory.mktemp("replay")
-    model = RobotModel.from_urdf(URDF)
+    urdf = of_boxes(URDF, folder / "ur5.urdf")
+    model = RobotModel.from_urdf(urdf)
     rng = np.random.default_rng(0)
     log = exact_log(model, truth(model), rng, samples=1500, rate=100.0)
     write_log(log, folder / "log.csv")
-    words = ["identify", URDF, str(folder / "log.csv"), "--out", str(folder / "out")]
+    words = ["identify", urdf, str(folder / "log.csv"), "--out", str(folder / "out")]
     assert main([*words, "--estimator", "wls", "--no-report"]) == 0
     return folder
 
 
 def run(folder, *words):
     target = folder / "page.html"
-    code = main(["replay", URDF, *map(str, words), "--html", str(target)])
+    code = main(["replay", str(folder / "ur5.urdf"), *map(str, words), "--html", str(target)])
     return code, shown(target.read_text(encoding="utf-8")) if code == 0 else None
 
 
@@ -91,7 +103,7 @@ def test_the_page_is_beside_the_first_result_unless_stated(folder, tmp_path, mon
     (other / "result.json").write_bytes((out / "result.json").read_bytes())
     one, both = [str(out / "result.json")], [str(x / "result.json") for x in (other, out)]
     for words, page in ((one, out), (both, other), ([], tmp_path)):
-        assert main(["replay", URDF, log, *words]) == 0
+        assert main(["replay", str(folder / "ur5.urdf"), log, *words]) == 0
         assert capsys.readouterr().err.startswith("written: ")
         assert (page / "replay.html").is_file()
         (page / "replay.html").unlink()
@@ -121,7 +133,9 @@ def test_identify_writes_the_replay_that_its_report_links_to(tmp_path, capsys):
     assert 'href="#replay"' in (out / "report.html").read_text()
 
 
-def test_the_urdf_with_drives_is_rnea_and_drive_terms(identified):
+def test_the_urdf_with_drives_is_rnea_and_drive_terms(identified, monkeypatch):
+    # what the robot looks like is not asked for, and takes seconds to be thinned
+    monkeypatch.setattr("robotid.viewer.scene._thinned", lambda files, _: (None,) * len(files))
     data = shown(replay_identified(identified).html)
     torques, (evaluation, *_) = data["torques"], identified.validation
     assert torques["labels"] == ["measured", "identified", "URDF + drives", "URDF"]
@@ -243,7 +257,8 @@ def test_torque_that_the_result_does_not_explain_is_marked(folder):
 def test_a_track_gives_parameters_over_time_and_marks_the_load(panda, tmp_path, capsys):
     log = payload_log(panda, np.random.default_rng(0), duration=12.0, at=10.0)
     write_log(log, tmp_path / "log.csv")
-    urdf, joints = str(panda.tree.path), ",".join(panda.joints)
+    urdf = of_boxes(panda.tree.path, tmp_path / "panda.urdf")
+    joints = ",".join(panda.joints)
     words = [urdf, str(tmp_path / "log.csv")]
     assert main(["track", *words, "--joints", joints, "--out", str(tmp_path / "track")]) == 0
     page = tmp_path / "page.html"
@@ -402,7 +417,7 @@ def test_a_motion_without_torques_plays_and_marks_where_it_uses_the_most_of_limi
 
 
 def test_a_motion_of_a_robot_without_limits_plays_and_says_what_is_not_marked(folder, tmp_path):
-    text = re.sub(r'velocity="[^"]*"', 'velocity="0"', Path(URDF).read_text())
+    text = re.sub(r'velocity="[^"]*"', 'velocity="0"', (folder / "ur5.urdf").read_text())
     (tmp_path / "arm.urdf").write_text(text)
     t = np.arange(50) / 100.0
     write_columns(

@@ -247,8 +247,9 @@ def changed_log(found, seed, **factors):
 
 
 @pytest.fixture
-def written(result, folder, tmp_path):
-    """A copy of the result, two new logs, and the fitted ones out of reach."""
+def written(result, folder, tmp_path, monkeypatch):
+    """A copy of the result, two new logs, and the fitted ones out of reach; no doctor."""
+    monkeypatch.setattr("robotid.commands.validate.diagnose", lambda *_: [])
     found, _ = result
     for file in (folder / "out").glob("*.*"):
         if file.suffix in (".urdf", ".json"):
@@ -316,7 +317,8 @@ def test_logs_are_added_to_the_variation_without_the_others(result, folder, writ
 def test_added_logs_are_those_of_a_fit_to_all(folder, written):
     logs = [{"log": str(folder / f"run_{k}.csv")} for k in range(4)]
     logs += [{"log": str(written / f"more_{k}.csv")} for k in range(2)]
-    job = job_from_settings({**settings(folder), "identification": logs}, "job.toml", folder)
+    all_logs = {"identification": logs, "output": {"report": False}}
+    job = job_from_settings({**settings(folder), **all_logs}, "job.toml", folder)
     _, content = run_job(job, written / "all")
     more = [written / "more_0.csv", written / "more_1.csv"]
     own = validate_result(written / "result.json", more)["variation"]["parameters"]
@@ -508,6 +510,7 @@ def test_friction_falls_with_the_temperature_in_the_logs(warm, capsys, monkeypat
     assert np.std(cold[1]) < 0.3 * spread
     with pytest.raises(DataError, match="temperature is -60 degC, wanted"):
         export_result(where / "out", "ranges", where / "no.yaml", temperature=-60.0)
+    monkeypatch.setattr("robotid.commands.validate.add_logs", lambda *_, **__: None)
     expect_at_temperatures(where, model, effect, capsys)
 
 

@@ -155,7 +155,7 @@ def unknown_joint(here):
 def inactive_joint(here):
     joints = list(here.model.joints[:5])
     path = here.write(here.log)
-    _, result = here.identified(path, joints=joints)
+    _, result = here.identified(path, joints=joints, estimator={"name": "wls"})
     return next(w["message"] for w in result["warnings"] if w["code"] == "locked_at_zero")
 
 
@@ -167,7 +167,9 @@ def continuous_joint(here):
     log = exact_log(model, pi, np.random.default_rng(2), samples=600, rate=100.0)
     turned = log.q + 2 * np.pi * np.array(turning) * (np.arange(600) >= 300)[:, None]
     signals = read_job_signals(here)
-    found = identify(model, [replace(log, q=turned)], signals=signals, estimator="wls")
+    found = identify(
+        model, [replace(log, q=turned)], signals=signals, estimator="wls", doctor=False
+    )
     beta = found.mapping.to_base(pi)
     error = np.abs(found.base - beta).max() / np.abs(beta).max()
     assert error < 1e-8
@@ -191,7 +193,8 @@ def missing_mesh(here):
 
 
 def filter_off(here):
-    found, _ = here.identified(here.write(here.log), signals={"cutoff": False})
+    path = here.write(here.log)
+    found, _ = here.identified(path, signals={"cutoff": False}, estimator={"name": "wls"})
     assert found.fitted[0].recording.signals.cutoff is None
     return "`cutoff = false`, `--cutoff false`"
 
@@ -204,7 +207,7 @@ def outliers(here):
     assert result["verdict"]["status"] == "poor"
     tukey = EstimatorSettings("wls", robust="tukey")
     clean, found = (
-        identify(here.model, [log], estimator=tukey)
+        identify(here.model, [log], estimator=tukey, doctor=False)
         for log in (here.log, replace(here.log, tau=tau))
     )
     assert np.max(np.abs(found.base - clean.base) / clean.base_error) < 1

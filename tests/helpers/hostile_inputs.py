@@ -579,7 +579,7 @@ def run_flags(example, folder):
 def good_result():
     """Return a folder with a result, and the content of its result.json."""
     folder = Path(tempfile.mkdtemp(prefix="robotid-fuzz-"))
-    write_log(good_log(2000), folder / "fit.csv")
+    write_log(good_log(300), folder / "fit.csv")
     assert obey("identify", URDF, folder / "fit.csv", "--out", folder) == 0
     return folder, (folder / "result.json").read_text()
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from helpers.driven import EXACT, FIT, arm, driven_log
 from helpers.synthetic import truth
+from scipy.optimize import brentq
 
 from robotid.fitting.fit import solve_recordings
 from robotid.fitting.zeros import sums_with_zeros
@@ -42,7 +43,7 @@ def at(model, name):
     return model.layout.names.index(name)
 
 
-def segments_of(model, changes=None, *, noise=0.01, seed=0, spread=SPREAD):
+def segments_of(model, changes=None, *, noise=0.01, seed=0, spread=SPREAD, rate=60.0):
     """Return the segments of six logs, whose friction varies, with changes of parameters by run."""
     rng, base, logs = np.random.default_rng(seed), truth(model), []
     friction = [
@@ -53,7 +54,7 @@ def segments_of(model, changes=None, *, noise=0.01, seed=0, spread=SPREAD):
         pi[friction] *= 1 + spread * rng.normal(size=len(friction))
         for name, change in (changes or {}).get(run, {}).items():
             pi[at(model, name)] += change
-        logs.append(driven_log(model, pi, 10 * seed + run, duration=12.0, noise=noise))
+        logs.append(driven_log(model, pi, 10 * seed + run, duration=12.0, rate=rate, noise=noise))
     return logs, base
 
 
@@ -267,7 +268,7 @@ def test_the_run_that_differs_is_named_with_its_cause(model, kind, where, name, 
     before = truth(model)
     change = {"drive": {f"{LIFT}.coulomb": value - before[at(model, f"{LIFT}.coulomb")]},
               "payload": {"wrist_1_link.m": value}}.get(kind, {})  # fmt: skip
-    logs, _ = segments_of(model, {3: change}, seed=1)
+    logs, _ = segments_of(model, {3: change}, seed=1, rate=30.0)
     if kind == "gain":
         logs[3] = scaled(logs[3], 1, value)
     if kind == "zero":
@@ -339,11 +340,12 @@ def test_a_run_is_named_by_the_number_of_all_parameters_in_all_runs():
         (found,) = MixedEffects(runs.without(7)).predict(np.array([0.01]), own[7])
         return found.probability
 
+    def misses(value, p):
+        x[7] = value
+        return np.log(p_value(x) / p)
+
     for p, is_named in ((0.003, False), (0.0015, False), (0.0005, True)):
-        low, high = 0.0, 50.0
-        for _ in range(20):  # the value with this p-value
-            x[7] = 0.5 * (low + high)
-            low, high = (low, x[7, 0]) if p_value(x) < p else (x[7, 0], high)
+        x[7] = brentq(misses, 2.0, 20.0, args=(p,), xtol=1e-3)  # the value with this p-value
         assert p_value(x) == pytest.approx(p, rel=0.01)
         unlike = vary(list("abcdefgh"), (stated("a", x, 0.1), others)).unlike
         assert [each.run for each in unlike] == [7] * is_named
@@ -527,7 +529,7 @@ def test_a_robot_with_a_changed_gain_is_named_though_the_friction_of_robots_diff
         for run in range(2):
             pi = own.copy()
             pi[friction] *= 1 + 0.05 * rng.normal(size=len(friction))
-            log = driven_log(model, pi, 2 * robot + run, duration=12.0, noise=0.01)
+            log = driven_log(model, pi, 2 * robot + run, duration=12.0, rate=30.0, noise=0.01)
             logs.append(scaled(log, 1, 1.15) if robot == 3 else log)
     held = [
         replace(hold_log(model, log, EXACT), unit=f"arm-{k // 2}") for k, log in enumerate(logs)

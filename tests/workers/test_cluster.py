@@ -120,18 +120,6 @@ def allow_failures(address, number):
         )
 
 
-def test_a_piece_that_kills_every_worker_is_named(address, tmp_path):
-    pieces = pieces_in(tmp_path / "marks", 2, faults={1: "kill"}.items())[1:]  # blames no neighbour
-    allow_failures(address, 0)
-    try:
-        with pytest.raises(
-            WorkerError, match="every worker of the cluster that processed random rows 1"
-        ):
-            reduce_all(pieces, backend=ClusterBackend(address))
-    finally:
-        allow_failures(address, 3)
-
-
 def test_a_piece_that_kills_every_worker_is_given_up_and_its_neighbours_are_done(address, tmp_path):
     pieces = pieces_in(tmp_path / "marks", 5, faults={1: "kill"}.items())
     allow_failures(address, 0)  # its neighbours are suspected, too
@@ -212,6 +200,16 @@ def test_pieces_whose_worker_ended_are_repeated_alone(monkeypatch):
     assert found[4] == "e reduced"
     assert client.released == ["0", "1", "2", "3", "0-alone", "1-alone", "4", "5", "6"]
     assert client.cancelled == []
+
+
+def test_a_piece_that_kills_every_worker_is_named(monkeypatch):
+    client, pieces = Cluster(killers="b"), [SimpleNamespace(name=x) for x in "abc"]
+    monkeypatch.setattr(distributed, "as_completed", client.as_completed)
+    results = ClusterBackend("tcp://host:1")._collect(
+        client, reduce_piece, list(enumerate(pieces)), None
+    )
+    with pytest.raises(WorkerError, match="every worker of the cluster that processed b ended"):
+        list(results)
 
 
 @pytest.mark.parametrize(("status", "wanted"), [("running", ["1", "2", "3"]), ("closed", [])])

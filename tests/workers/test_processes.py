@@ -26,6 +26,20 @@ from robotid.workers.processes import ProcessBackend, _interrupts_deferred
 SCRIPT = Path(__file__).parents[1] / "helpers" / "piecework.py"
 
 
+@pytest.fixture(scope="module")
+def one():
+    """One worker process, which waits for the work of the next test."""
+    with ProcessBackend(1) as backend:
+        yield backend
+
+
+@pytest.fixture(scope="module")
+def two():
+    """Two worker processes, which wait for the work of the next test."""
+    with ProcessBackend(2) as backend:
+        yield backend
+
+
 def is_running(pid):
     """Return whether a process lives; one that only waits to be reaped does not."""
     try:
@@ -61,14 +75,13 @@ def kept(folder):
     return sorted((folder / ".robotid-checkpoint").glob("*.npz"))
 
 
-def test_the_number_of_workers_does_not_show_in_the_bits(tmp_path, caplog):
+def test_the_number_of_workers_does_not_show_in_the_bits(one, two, tmp_path, caplog):
     caplog.set_level("INFO", logger="robotid")
     pieces = pieces_in(tmp_path / "marks")
     calls = []
     serial = reduce_all(pieces, progress=lambda *call: calls.append(call))
-    for workers in (1, 2):
-        with ProcessBackend(workers) as backend:
-            found = reduce_all(pieces, backend=backend)
+    for backend in (one, two):
+        found = reduce_all(pieces, backend=backend)
         assert all(map(same_bits, found, serial))
         assert same_bits(join(found), join(serial))
     assert marks(tmp_path / "marks") == dict.fromkeys(range(10), 3)
@@ -81,13 +94,12 @@ def test_the_number_of_workers_does_not_show_in_the_bits(tmp_path, caplog):
     assert len(calls) == 11
 
 
-def test_two_workers_work_at_the_same_time(tmp_path):
+def test_two_workers_work_at_the_same_time(two, tmp_path):
     pieces = pieces_in(tmp_path / "marks", 2, faults={0: "meet", 1: "meet"}.items())
-    with ProcessBackend(2) as backend:
-        reduce_all(pieces, backend=backend)
+    reduce_all(pieces, backend=two)
 
 
-def test_few_pieces_are_under_way_at_a_time(tmp_path):
+def test_few_pieces_are_under_way_at_a_time(one, tmp_path):
     taken = []
 
     def pieces():
@@ -95,9 +107,8 @@ def test_few_pieces_are_under_way_at_a_time(tmp_path):
             taken.append(k)
             yield k, piece
 
-    with ProcessBackend(1) as backend:
-        for done, _ in enumerate(backend.run(reduce_piece, pieces())):
-            assert len(taken) == min(10, done + 2)
+    for done, _ in enumerate(one.run(reduce_piece, pieces())):
+        assert len(taken) == min(10, done + 2)
 
 
 def test_workers_wait_for_more_work_and_end_when_they_are_let_go(tmp_path):
@@ -110,15 +121,14 @@ def test_workers_wait_for_more_work_and_end_when_they_are_let_go(tmp_path):
     assert all(map(same_bits, once, again))
 
 
-def test_reductions_come_back_in_the_order_of_the_pieces(tmp_path):
+def test_reductions_come_back_in_the_order_of_the_pieces(two, tmp_path):
     pieces = pieces_in(tmp_path / "marks", 4)
     late = [type(pieces[0])(0, pieces[0].marks, pause=0.5), *pieces[1:]]
-    with ProcessBackend(2) as backend:
-        found = reduce_all(late, backend=backend)
+    found = reduce_all(late, backend=two)
     assert [r.samples for r in found] == [100, 101, 102, 103]
 
 
-@pytest.mark.parametrize("backend", [None, ProcessBackend(2)])
+@pytest.mark.parametrize("backend", [None, ProcessBackend(1)])
 def test_an_error_of_the_data_keeps_its_type_and_names_the_piece(tmp_path, backend):
     pieces = pieces_in(tmp_path / "marks", faults={3: "data"}.items())
     with pytest.raises(DataError, match="row 7 is not finite") as caught:
@@ -164,8 +174,11 @@ def test_what_stops_the_caller_ends_the_workers(tmp_path):
 
 
 def test_no_thread_of_the_pool_outlives_it(tmp_path, monkeypatch):
+    others = set(threading.enumerate())  # of the pools of other tests
+
     def feeders():
-        return [thread for thread in threading.enumerate() if thread.name == "QueueFeederThread"]
+        own = set(threading.enumerate()) - others
+        return [thread for thread in own if thread.name == "QueueFeederThread"]
 
     class Slow(threading.Thread):  # its end takes longer than what is left of the process
         def run(self):
@@ -180,11 +193,23 @@ def test_no_thread_of_the_pool_outlives_it(tmp_path, monkeypatch):
     assert not feeders()
 
 
-@pytest.mark.parametrize(("number", "workers"), [(signal.SIGKILL, 2), (signal.SIGINT, 1)])
-def test_a_run_that_was_killed_resumes_to_the_same_bits(tmp_path, number, workers):
-    run = start_and_hold(tmp_path, workers)
-    run.send_signal(number)
+def killed(run):
+    run.kill()
     run.communicate(timeout=60)
+
+
+def interrupted_in_a_terminal(run):
+    """Send Ctrl-C, which reaches the workers too; they say nothing."""
+    os.killpg(run.pid, signal.SIGINT)
+    error = run.communicate(timeout=60)[1]
+    assert error.count("Traceback") == 1  # of the script
+    assert "KeyboardInterrupt" in error
+    assert error.strip().endswith(".robotid-checkpoint. Continue with --resume")
+
+
+@pytest.mark.parametrize("end", [killed, interrupted_in_a_terminal])
+def test_a_run_that_was_ended_resumes_to_the_same_bits(tmp_path, end):
+    end(start_and_hold(tmp_path, 2))
     assert eventually(lambda: not any(map(is_running, workers_of(tmp_path / "marks"))))
     assert not (tmp_path / "joined.npz").exists()
     assert {int(path.stem[-6:]) for path in kept(tmp_path)} == set(range(5))
@@ -196,15 +221,6 @@ def test_a_run_that_was_killed_resumes_to_the_same_bits(tmp_path, number, worker
         resumed = Reduction.from_arrays(arrays)
     assert same_bits(resumed, join(reduce_all(pieces_in(tmp_path / "other"))))
     assert not (tmp_path / ".robotid-checkpoint").exists()
-
-
-def test_ctrl_c_in_a_terminal_reaches_the_workers_too_and_shows_one_traceback(tmp_path):
-    run = start_and_hold(tmp_path, 2)
-    os.killpg(run.pid, signal.SIGINT)
-    error = run.communicate(timeout=60)[1]
-    assert error.count("Traceback") == 1  # of the script; workers say nothing
-    assert "KeyboardInterrupt" in error
-    assert error.strip().endswith(".robotid-checkpoint. Continue with --resume")
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
@@ -250,7 +266,7 @@ def test_a_script_needs_no_guard(tmp_path):
         f"import sys\nsys.path.insert(0, {str(SCRIPT.parents[1])!r})\n"
         "from helpers.piecework import pieces_in, reduce_all\n"
         "from robotid.workers.processes import ProcessBackend\n"
-        "with ProcessBackend(2) as backend:\n"
+        "with ProcessBackend(1) as backend:\n"
         "    print(len(reduce_all(pieces_in('marks'), backend=backend)))\n"
     )
     run = subprocess.run([sys.executable, script], cwd=tmp_path, capture_output=True, text=True)
@@ -258,13 +274,13 @@ def test_a_script_needs_no_guard(tmp_path):
     assert marks(tmp_path / "marks") == dict.fromkeys(range(10), 1)
 
 
-def test_memory_that_a_worker_keeps_is_no_reason_to_replace_it():
+def test_memory_that_a_worker_keeps_is_no_reason_to_replace_it(one):
     """Pieces limit the memory; loky would replace a worker that grows by 300 MB."""
     from loky import process_executor
 
-    with ProcessBackend(1) as backend:
-        largest = backend._start().submit(getattr, process_executor, "_MAX_MEMORY_LEAK_SIZE")
-        assert largest.result() == 10**15
+    pool = one._pool or one._start()
+    largest = pool.submit(getattr, process_executor, "_MAX_MEMORY_LEAK_SIZE")
+    assert largest.result() == 10**15
 
 
 def test_workers_default_to_the_cores_for_long_work_only(tmp_path):
