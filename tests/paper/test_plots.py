@@ -95,6 +95,7 @@ def test_iterations_are_counted_and_energies_are_in_percent():
         heights = {k: bar.get_height() for k, bar in enumerate(bars) if bar.get_height()}
         assert heights == count
         assert axes.get_title() == title
+        assert axes.title.get_fontsize() == axes.xaxis.label.get_fontsize() == 8.5
     (axes,) = _energy_figure(drift).axes
     for line, gained in zip(axes.lines, (3.0 * t, -20.0 * t**2), strict=True):
         np.testing.assert_allclose(line.get_xydata(), np.column_stack([t, gained]))
