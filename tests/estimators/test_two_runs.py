@@ -266,3 +266,17 @@ def test_the_noise_of_a_joint_is_its_residual_or_its_signal_or_one():
     # the rows are left at least
     wanted = [np.sqrt(46 / 920), np.sqrt(34 / 8.5), 3.0, 2e-7, 1.0, 1.0]
     np.testing.assert_allclose(TwoRuns._noise.func(runs), wanted)
+
+
+@pytest.mark.parametrize("unknown", [[1], [0, 1]])
+def test_gains_start_at_least_squares_of_both_runs(rng, unknown):
+    """Torques over their gains, of a load that is known: exact ones start at their gains."""
+    W, c = rng.standard_normal((2, 2, 40, 3)), np.array([0.0, 0.7, -0.4])
+    gains = np.ones(2)
+    gains[unknown] = [2.5, 0.3][: len(unknown)]
+    tau = np.stack([W[0] @ BETA, W[1] @ (BETA + c)]) / gains[:, None]
+    runs = TwoRuns(
+        of_rows(W[0], tau[0], 2), of_rows(W[1], tau[1], 2), np.zeros((3, 0)), c, np.zeros(3),
+        1e-9 * np.eye(3), 1.0, np.array(unknown),
+    )  # fmt: skip
+    np.testing.assert_allclose(runs._first_gains(), gains, rtol=1e-6)
