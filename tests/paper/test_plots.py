@@ -100,3 +100,5 @@ def test_iterations_are_counted_and_energies_are_in_percent():
     for line, gained in zip(axes.lines, (3.0 * t, -20.0 * t**2), strict=True):
         np.testing.assert_allclose(line.get_xydata(), np.column_stack([t, gained]))
     assert [line.get_label() for line in axes.lines] == ["one", "other"]
+    frame = axes.spines["left"].get_linewidth()
+    assert all(frame <= 0.5 * line.get_linewidth() for line in axes.lines)
