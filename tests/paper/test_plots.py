@@ -102,3 +102,4 @@ def test_iterations_are_counted_and_energies_are_in_percent():
     assert [line.get_label() for line in axes.lines] == ["one", "other"]
     frame = axes.spines["left"].get_linewidth()
     assert all(frame <= 0.5 * line.get_linewidth() for line in axes.lines)
+    assert axes.figure.get_size_inches().tolist() == [9.3, 2.8]
