@@ -1,6 +1,8 @@
 """The paper's figures: what each line holds."""
 
+import re
 from types import SimpleNamespace
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -8,6 +10,7 @@ import pytest
 from robotid.paper.errata import EnergyDrift, energy_drift
 from robotid.paper.plots import _energy_figure, _trajectories_figure, paper_figures
 from robotid.paper.study import MODELS, PaperSettings, paper_arm, random_runs, study_model
+from robotid.paper.svg import INK, svg_element
 from robotid.simulation.motions import ProgramMotion
 
 
@@ -103,3 +106,21 @@ def test_iterations_are_counted_and_energies_are_in_percent():
     frame = axes.spines["left"].get_linewidth()
     assert all(frame <= 0.5 * line.get_linewidth() for line in axes.lines)
     assert axes.figure.get_size_inches().tolist() == [9.3, 2.8]
+
+
+def test_an_svg_element_is_transparent_and_has_ids_of_its_own():
+    drift = EnergyDrift(np.linspace(0.0, 1.0, 5), {"one": np.linspace(0.0, 0.1, 5)})
+    shown = svg_element(_energy_figure(drift), "one < two", "key")
+    root = ElementTree.fromstring(shown)
+    assert (root.tag, root.get("viewBox")) == ("svg", f"0 0 {9.3 * 72:g} {2.8 * 72:g}")
+    assert root.get("width") is root.get("height") is None
+    assert root.findtext("title") == "one < two"
+    ids = {at.get("id") for at in root.iter() if at.get("id")}
+    assert root.get("aria-labelledby") == "key-title"
+    assert all(name.startswith("key-") for name in ids)
+    used = re.findall(r'href="#([^"]*)"|url\(#([^)]*)\)', shown)
+    assert used
+    assert {a or b for a, b in used} <= ids
+    # text and axes have the colour of the page's text, and nothing is behind them
+    assert "currentColor" in shown
+    assert not re.search(f"{INK}|#ffffff|xmlns|metadata", shown)
