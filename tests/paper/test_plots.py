@@ -124,3 +124,30 @@ def test_an_svg_element_is_transparent_and_has_ids_of_its_own():
     # text and axes have the colour of the page's text, and nothing is behind them
     assert "currentColor" in shown
     assert not re.search(f"{INK}|#ffffff|xmlns|metadata", shown)
+
+
+def test_axes_have_their_unit_lines_their_name_and_figures_their_size(figures):
+    error, last, program = "|P̂ − P| / |P|", "minus the last iteration [N m]", "program control"
+    third = ["position [rad]", "velocity [rad/s]", "acceleration [rad/s²]"]
+    noisy = ["clean", "torque ±10 %", "noise", "noise, ε₂ = 1"]
+    prx = ["largest entry of PRX [N m/s²]", f"{error}; thin: start on program"]
+    estimates = ["estimate [kg m²]; dotted: true", "", ""]
+    fourth = ["torque u2 [N m]", "", "", last, "", ""]
+    for name, xlabel, ylabels, height, names in (
+        ("figure_3b", "time [s]", third, 2.4, None),
+        ("figure_4b", "time [s]", fourth, 4.4, ["iteration 1", "iteration 2", program]),
+        ("figure_5", "iteration", estimates, 3.2, ["p1", "p2", "p3", "p4", "p5"]),
+        ("convergence", "iteration", prx, 3.2, MODELS),
+        ("disturbance", "iteration", [error, "", ""], 3.2, noisy),
+        ("trajectories", "iterations to 10⁻³", ["random motions", "", ""], 2.8, None),
+        ("energy", "time [s]", ["energy gained [%]"], 2.8, MODELS),
+    ):
+        figure, axes = figures[name], figures[name].axes
+        assert [each.get_ylabel() for each in axes] == ylabels
+        assert {each.get_xlabel() for each in axes[-3:]} == {xlabel}
+        assert figure.get_size_inches().tolist() == [9.3, height]
+        legends = [[text.get_text() for text in each.get_texts()] for each in figure.legends]
+        assert legends == ([list(names)] if names else [])
+    for axes in (*figures["convergence"].axes, *figures["disturbance"].axes):
+        assert axes.yaxis.get_major_formatter()(1e-3, 0) == "10⁻³"
+        assert axes.yaxis.get_minor_formatter()(3e-3, 0) == ""
