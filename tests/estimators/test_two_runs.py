@@ -280,3 +280,6 @@ def test_gains_start_at_least_squares_of_both_runs(rng, unknown):
         1e-9 * np.eye(3), 1.0, np.array(unknown),
     )  # fmt: skip
     np.testing.assert_allclose(runs._first_gains(), gains, rtol=1e-6)
+    found = runs.compare()
+    np.testing.assert_allclose(found.gain, gains, rtol=1e-6)
+    np.testing.assert_allclose(found.theta, BETA, rtol=1e-6)

@@ -234,3 +234,11 @@ def test_prx_is_zero_within_two_standard_errors_of_its_moving_average():
     still = replace(prx.init(2), prx=np.array([0.9e-9, 0.0]), prx_square=0.0, steps=1000)
     assert prx._is_zero(still)
     assert not prx._is_zero(replace(still, prx=np.array([1.1e-9, 0.0])))
+
+
+def test_an_indefinite_inertia_is_bounded_by_its_largest_eigenvalue_of_either_sign():
+    turn = np.array([[0.6, -0.8], [0.8, 0.6]])
+    sample = SimpleNamespace(mass_regressor=(turn * [-5.0, 2.0] @ turn.T)[..., None])
+    values, vectors = PRX(np.ones(2))._inertia(np.ones(1), sample)
+    np.testing.assert_allclose(values, [5e-6, 2.0], rtol=1e-12)
+    np.testing.assert_allclose(np.abs(vectors), np.abs(turn), rtol=1e-12)
