@@ -1,5 +1,6 @@
 """Two runs that differ by what loads only one of them."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -283,3 +284,17 @@ def test_gains_start_at_least_squares_of_both_runs(rng, unknown):
     found = runs.compare()
     np.testing.assert_allclose(found.gain, gains, rtol=1e-6)
     np.testing.assert_allclose(found.theta, BETA, rtol=1e-6)
+
+
+def test_rows_without_constraint_forces_have_one_noise_level_in_both_runs(rng):
+    W, tau = rng.standard_normal((2, 40, 3)), rng.standard_normal((2, 40))
+    for is_projected in (True, False):
+        parts = tuple(replace(x, is_projected=is_projected) for x in of_rows(W, tau, 2))
+        runs = TwoRuns(
+            parts, parts, np.zeros((3, 0)), np.zeros(3), np.zeros(3), np.eye(3), 1.0,
+            np.empty(0, dtype=int),
+        )  # fmt: skip
+        levels = runs._both(np.ones(2)).noise_levels(np.zeros(3), np.array([80.0, 80.0]))
+        own = np.sqrt(np.mean(tau**2, axis=1))
+        wanted = np.full(2, np.sqrt(np.mean(own**2))) if is_projected else own
+        np.testing.assert_allclose(levels, wanted, rtol=1e-12)
