@@ -12,6 +12,7 @@ from robotid.commands.logs import new_temperatures, result_run, warmed
 from robotid.exceptions import DataError, SettingsError
 from robotid.export.entries import build_preview
 from robotid.export.result import load_result, stated_between
+from robotid.findings import listed
 from robotid.identification.previews import preview_logs
 from robotid.recordings.survey import SurveyedLog, survey_log
 from robotid.robot.model import RobotModel
@@ -44,8 +45,9 @@ def preview_job(
         The output of ``robotid preview --json``.
 
     Raises:
-        DataError: If a motion is not usable, a log of the result is missing, or the temperature has
-            no effect or is far outside that of these logs.
+        DataError: If a motion is not usable, a log of the result is missing, only some motions are
+            logs of the result, or the temperature has no effect or is far outside that of these
+            logs.
         ModelError: If the URDF is not usable.
         SettingsError: If a setting is not usable.
     """
@@ -61,12 +63,19 @@ def preview_job(
     job, fitted, model, run = result_run(job, given)
     result = load_result(given).content
     hashes = {entry["sha256"] for entry in result["inputs"] if entry["role"] == "identification"}
-    if not any(file_sha256(entry.path) in hashes for entry in job.identification):
+    is_fitted = {entry.path: file_sha256(entry.path) in hashes for entry in job.identification}
+    if not any(is_fitted.values()):
         motions = _motions(job, model, job.identification)
         found = preview_logs(model, motions, job.estimator, run=run, **stated)
         warm = new_temperatures(result, model, motions, temperature)
         between = [stated_between(result, model, each) for each in warm]
         return build_preview(replace(found, between=tuple(between)))
+    if not all(is_fitted.values()):
+        new = listed([path for path, own in is_fitted.items() if not own])
+        raise DataError(
+            f"the given result was fitted to some of these motions, but not to {new}; preview "
+            "fitted logs and new motions separately"
+        )
     if temperature is not None:
         raise SettingsError(
             "these motions are fitted logs, whose temperature is known; leave it out"

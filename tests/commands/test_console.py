@@ -63,6 +63,18 @@ def test_a_stage_stays_above_the_work_it_consists_of(capsys):
         show("fitting", 2, 5, "stages")
         show("reducing", 50, 100, "samples")
     assert re.search(r"3/5 fitting.*\n.*    reducing.*50 %", capsys.readouterr().err)
+    with terminal_progress(force=True) as show:
+        show("fitting", 2, 5, "stages")
+        show("reducing", 50, 100, "samples")
+        show("solving", 1, 4, "fits")
+    shown = capsys.readouterr().err
+    last = shown[shown.rindex("fitting") :]  # only the newest work stays below its stage
+    assert "solving" in last
+    assert "reducing" not in last
+    with terminal_progress(force=True) as show:
+        show("fitting", 2, 5, "stages")
+        show("writing", 4, 5, "stages")
+    assert not re.search(r"fitting.*\n.*writing", capsys.readouterr().err)
 
 
 def on_a_terminal(words, columns, **environment):

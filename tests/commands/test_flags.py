@@ -1,6 +1,7 @@
 """Flags state what the keys of a job file state."""
 
 import argparse
+from contextlib import nullcontext
 from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
@@ -8,7 +9,7 @@ from unittest.mock import ANY
 
 import pytest
 
-from robotid.cli import doctor, identify, main, preview, track
+from robotid.cli import doctor, excite, identify, main, preview, track
 from robotid.cli.flags import job_from_flags, source_words
 from robotid.cli.parser import CommandParser
 from robotid.commands.job import LogEntry, job_from_settings
@@ -247,3 +248,18 @@ def test_every_flag_reaches_the_function_that_does_the_work(words, monkeypatch):
     with pytest.raises(Heard) as caught:
         main(words.split())
     assert caught.value.args == (wanted, options)
+
+
+@pytest.mark.parametrize(
+    ("words", "quiet", "force"), [("--progress", False, True), ("--json", True, False)]
+)
+def test_progress_of_a_design_is_shown_if_asked(words, quiet, force, monkeypatch):
+    def heard(*_, **stated):
+        raise Heard(stated["progress"])
+
+    monkeypatch.setattr("robotid.commands.excite.design_motion", heard)
+    monkeypatch.setattr(excite, "job_from_flags", lambda options, needs_logs: JOB_OF_FLAGS)
+    monkeypatch.setattr(excite, "terminal_progress", lambda **stated: nullcontext(stated))
+    with pytest.raises(Heard) as caught:
+        main(["excite", "u", "--out", "m.csv", words])
+    assert caught.value.args == ({"quiet": quiet, "force": force},)

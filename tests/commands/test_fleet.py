@@ -404,7 +404,7 @@ def test_a_distribution_is_of_the_values_with_the_interval_of_the_next_unit():
     first, second = charts(html)  # the larger relative spread comes first
     assert first["title"] == "Distribution of a.coulomb over units"
     assert second["title"] == "Distribution of b.coulomb over units"
-    assert first["marks"] == [-0.7, 4.25]
+    assert (first["marks"], first["height"]) == ([-0.7, 4.25], 120)
     width = (3.1 - 1.0) / 4
     np.testing.assert_allclose(first["x"], 1.0 + width * (np.arange(4) + 0.5), rtol=1e-3)
     np.testing.assert_allclose(first["series"][0]["y"], [4, 0, 0, 2], atol=1e-3)

@@ -15,6 +15,7 @@ from robotid.robot.families import AUTO
 from robotid.robot.model import GRAVITY
 from robotid.robot.parameters import Coupling
 from tests.helpers.closed_chains import FOUR_BAR, FOUR_BAR_LOOP
+from tests.helpers.paths import ROOT
 
 FULL = """
 urdf = "robot.urdf"
@@ -264,3 +265,31 @@ def test_a_job_of_a_closed_chain_reads_the_log_of_its_driven_joint(tmp_path):
     assert model.layout.drive_names[-1] == "pivot.viscous"
     assert job.read(job.identification[0], model).joints == ("drive",)
     assert job_from_settings(job.to_dict(), "result.json", Path()) == job
+
+
+def test_gear_ratios_of_the_urdf_need_no_matrix_and_shared_motors_are_couplings(tmp_path):
+    gears = "".join(
+        f"<transmission name='{joint}'><joint name='{joint}'/><actuator name='m'>"
+        f"<mechanicalReduction>{ratio}</mechanicalReduction></actuator></transmission>"
+        for joint, ratio in (("joint_1", 80), ("joint_2", -40))
+    )
+    text = (ROOT / "urdf" / "planar_2r.urdf").read_text()
+    (tmp_path / "arm.urdf").write_text(text.replace("</robot>", f"{gears}</robot>"))
+    t = np.linspace(0.0, 1.0, 20)
+    head = ",".join(f"{kind}_joint_{k}" for kind in ("qm", "taum") for k in (1, 2))
+    rows = np.column_stack([t, np.outer(t, [8.0, 4.0, 1.0, 2.0])])
+    np.savetxt(tmp_path / "log.csv", rows, delimiter=",", header=f"time,{head}", comments="")
+    table = {
+        "urdf": "arm.urdf",
+        "transmission": [{"joints": ["joint_1", "joint_2"], "matrix": "urdf"}],
+        "identification": [{"log": "log.csv"}],
+    }
+    job = job_from_settings(table, "job.toml", tmp_path)
+    model = job.model()
+    assert model.layout.couplings == ()
+    log = job.read(job.identification[0], model)
+    np.testing.assert_allclose(log.q, np.outer(t, [0.1, -0.1]), atol=1e-12)
+    np.testing.assert_allclose(log.tau, np.outer(t, [80.0, -80.0]), atol=1e-12)
+    table["transmission"][0]["matrix"] = [[80.0, 0.0], [60.0, -40.0]]
+    (shared,) = job_from_settings(table, "job.toml", tmp_path).model().layout.couplings
+    assert shared == Coupling("joint_2", (("joint_1", 1.0), ("joint_2", -2 / 3)), replaces=True)

@@ -13,7 +13,7 @@ from robotid.commands import preview
 from robotid.commands.identify import run_job
 from robotid.commands.job import LogEntry, job_from_settings
 from robotid.commands.preview import _motions
-from robotid.exceptions import SettingsError
+from robotid.exceptions import DataError, SettingsError
 from robotid.log_files.formats import write_columns
 from robotid.log_files.read import read_log, write_log
 from robotid.robot.examples import example_urdf
@@ -176,6 +176,9 @@ def test_noise_that_is_stated_is_that_of_every_preview(monkeypatch, given, is_ow
     if is_own:
         with pytest.raises(SettingsError, match="whose temperature is known; leave it out"):
             preview.preview_job(job, given, temperature=21.5)
+        job.identification = (LogEntry(Path("a.csv")), entry, LogEntry(Path("b.csv")))
+        with pytest.raises(DataError, match=r"some of these motions, but not to a\.csv, b\.csv;"):
+            preview.preview_job(job, given)
 
 
 def test_the_text_says_what_it_rests_on(files, capsys):

@@ -70,7 +70,9 @@ def test_what_a_job_refuses_is_invalid(check, wrong):
 
 def test_each_key_says_what_it_is_and_the_robot_is_required(capsys):
     assert main(["schema"]) == 0
-    printed = json.loads(capsys.readouterr().out)
+    text = capsys.readouterr().out
+    assert text.startswith('{\n  "')  # a line for each key
+    printed = json.loads(text)
     assert printed == job_schema()
     assert printed["required"] == ["urdf"]
     found = printed["properties"]

@@ -148,3 +148,6 @@ def test_a_live_page_is_told_what_is_known_at_each_moment_in_the_time_of_the_log
             ready += 1
     assert ready > 100
     assert message["theta"] == [entry["value"] for entry in content["base_parameters"]]
+    monkeypatch.setattr(module, "run_track", lambda job, folder, observer: vars(observer))
+    real = serve_track(job, None, port=7, announce=heard.append, linger=False)
+    assert real["_speed"] == 1.0  # in real time

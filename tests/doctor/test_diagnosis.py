@@ -299,8 +299,11 @@ def test_a_log_of_standing_still_is_said_to_be_one(short, tmp_path):
     q = short.q
     still = replace(short, q=np.tile(q[0], (len(q), 1)), v=np.zeros_like(q))
     write_log(still, tmp_path / "still.csv")
-    found = examine(Job(Path(URDF), identification=(LogEntry(tmp_path / "still.csv"),)))
+    job, stages = Job(Path(URDF), identification=(LogEntry(tmp_path / "still.csv"),)), []
+    found = examine(job, progress=lambda *stage: stages.append(stage))
     assert {"no_motion", "static_joint"} <= loud(found)
+    names = "reading logs", "checking logs"
+    assert stages == [(name, k, 2, "stages") for k, name in enumerate(names)]
 
 
 @pytest.mark.parametrize("name", ["finger_edu.urdf", "so101.urdf", "double_pendulum.urdf"])

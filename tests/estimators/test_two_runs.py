@@ -1,5 +1,6 @@
 """Two runs that differ by what loads only one of them."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -266,3 +267,34 @@ def test_the_noise_of_a_joint_is_its_residual_or_its_signal_or_one():
     # the rows are left at least
     wanted = [np.sqrt(46 / 920), np.sqrt(34 / 8.5), 3.0, 2e-7, 1.0, 1.0]
     np.testing.assert_allclose(TwoRuns._noise.func(runs), wanted)
+
+
+@pytest.mark.parametrize("unknown", [[1], [0, 1]])
+def test_gains_start_at_least_squares_of_both_runs(rng, unknown):
+    """Torques over their gains, of a load that is known: exact ones start at their gains."""
+    W, c = rng.standard_normal((2, 2, 40, 3)), np.array([0.0, 0.7, -0.4])
+    gains = np.ones(2)
+    gains[unknown] = [2.5, 0.3][: len(unknown)]
+    tau = np.stack([W[0] @ BETA, W[1] @ (BETA + c)]) / gains[:, None]
+    runs = TwoRuns(
+        of_rows(W[0], tau[0], 2), of_rows(W[1], tau[1], 2), np.zeros((3, 0)), c, np.zeros(3),
+        1e-9 * np.eye(3), 1.0, np.array(unknown),
+    )  # fmt: skip
+    np.testing.assert_allclose(runs._first_gains(), gains, rtol=1e-6)
+    found = runs.compare()
+    np.testing.assert_allclose(found.gain, gains, rtol=1e-6)
+    np.testing.assert_allclose(found.theta, BETA, rtol=1e-6)
+
+
+def test_rows_without_constraint_forces_have_one_noise_level_in_both_runs(rng):
+    W, tau = rng.standard_normal((2, 40, 3)), rng.standard_normal((2, 40))
+    for is_projected in (True, False):
+        parts = tuple(replace(x, is_projected=is_projected) for x in of_rows(W, tau, 2))
+        runs = TwoRuns(
+            parts, parts, np.zeros((3, 0)), np.zeros(3), np.zeros(3), np.eye(3), 1.0,
+            np.empty(0, dtype=int),
+        )  # fmt: skip
+        levels = runs._both(np.ones(2)).noise_levels(np.zeros(3), np.array([80.0, 80.0]))
+        own = np.sqrt(np.mean(tau**2, axis=1))
+        wanted = np.full(2, np.sqrt(np.mean(own**2))) if is_projected else own
+        np.testing.assert_allclose(levels, wanted, rtol=1e-12)

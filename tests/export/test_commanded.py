@@ -237,6 +237,9 @@ def test_impossible_drives_are_refused(result, tmp_path):
             _ = changed.commanded
     none = with_entries(lambda e: None if e["name"].endswith((".kp", ".kd")) else e)
     assert none.commanded == ()
+    rest = (".kd", ".delay", ".zero")  # which are 0 if not stated
+    bare = with_entries(lambda e: None if e["name"].endswith(rest) else e).commanded
+    assert {(drive.kd, drive.delay, drive.zero) for drive in bare} == {(0.0, 0.0, 0.0)}
 
 
 def test_mujoco_rolls_out_what_our_own_roll_out_does():

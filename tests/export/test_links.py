@@ -59,6 +59,8 @@ def test_a_joint_follows_its_leader_by_ratio_and_offset(tmp_path):
     assert mimic.get("joint") == "jb"
     stated = {tag: float(mimic.findtext(tag)) for tag in ("multiplier", "offset", "reference")}
     assert stated == pytest.approx({"multiplier": -1.5, "offset": 0.25, "reference": 0.0})
+    for name, end in (("hand.xml", "</mujoco>\n"), ("hand.sdf", "</sdf>\n")):
+        assert (tmp_path / name).read_text().endswith(end)
 
 
 def test_terms_of_either_sign_that_have_no_place_are_named_and_those_of_none_are_not(tmp_path):

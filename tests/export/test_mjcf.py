@@ -63,6 +63,7 @@ def test_mass_matrix_and_forces_are_pinocchios(name, tmp_path):
         assert robot.nv == len(state.v)
         P, turning = np.zeros((robot.nv, robot.nv)), np.zeros(robot.nv)  # v_mujoco = P v
         if model.free_flyer:  # MuJoCo's base velocity is in the world's axes, its spin in its own
+            assert named(robot, "root_joint") == 0
             R = pin.XYZQUATToSE3(state.q[:7]).rotation
             P[:3, :3], P[3:6, 3:6] = R, np.eye(3)
             turning[:3] = R @ np.cross(state.v[3:6], state.v[:3])

@@ -278,3 +278,7 @@ def test_projected_friction_is_as_wide_as_draws_of_what_it_replaces(ur5):
         width = ranges[term]["high"] - ranges[term]["low"]
         # 500 draws know a standard deviation to 3 %
         assert width == pytest.approx(2 * 2.6 * values.std(), rel=0.1), term
+    covariance *= 1e4  # wider than the values: an offset may be negative, friction may not
+    ranges = projected_ranges(found)["projected_drives"][elbow]
+    assert (ranges["viscous"]["low"], ranges["coulomb"]["low"]) == (0.0, 0.0)
+    assert ranges["offset"]["low"] < -1.0

@@ -18,7 +18,7 @@ from robotid.estimators.segments import quantile
 from robotid.exceptions import DataError, ModelError, SettingsError
 from robotid.identification import payload_fit
 from robotid.identification.payload import Gain, Payload, PayloadFit, payload_of
-from robotid.identification.payload_fit import _gains, identify_payload
+from robotid.identification.payload_fit import _check_gains, _gains, identify_payload
 from robotid.logs.data import Log
 from robotid.logs.settings import SignalSettings
 from robotid.recordings.logs import Recordings
@@ -605,3 +605,16 @@ def test_a_mass_is_undetermined_by_its_share_of_the_payload_s_columns(ur5):
     assert columns.shape == (len(K), 20)
     small = payload_fit._payload_columns(ur5, 1e-5 * K, ["tool0", "forearm_link"])
     np.testing.assert_allclose(small, 1e-5 * columns, rtol=1e-12)
+
+
+@pytest.mark.parametrize(("floats", "constraints"), [(True, ()), (False, ("a loop",))])
+def test_gains_are_refused_of_a_floating_base_and_of_a_fixed_one_with_constraints(
+    floats, constraints
+):
+    def check(unknown, **about):
+        _check_gains(SimpleNamespace(**about), unknown)
+
+    with pytest.raises(SettingsError, match="unknown gains are stated for knee; gains are iden"):
+        check(["knee"], free_flyer=floats, constraints=constraints)
+    check([], free_flyer=floats, constraints=constraints)
+    check(["knee"], free_flyer=False, constraints=())

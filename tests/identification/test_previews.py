@@ -518,3 +518,21 @@ def test_words_of_a_preview_are_of_all_motions_each_named_once(monkeypatch):
     ]
     expected = SimpleNamespace(fitted=fitted, wls="wls", determination="determined")
     assert Preview(expected, white()).words == ("wls", "determined", "a.csv, b.csv")
+
+
+def test_a_joint_that_fits_exactly_has_a_billionth_of_the_largest_noise():
+    """Of two joints with one parameter, which the second determines; and of two that fit exactly.
+
+    R holds the rows of the parameter, 3, and below them the root of the sum of residual squares.
+    """
+
+    def noise(residual):
+        R = np.array([[2.0, 6.0], [0.0, residual]]), np.array([[4.0, 12.0], [0.0, 0.0]])
+        part = Factors(R, (np.array([0]),) * 2, np.array([25, 16]), ("a",))
+        return Run((part,), np.array([3.0]), np.zeros(1), 25, 0.5, 0.01).noise(np.eye(1))
+
+    found, free = noise(10.0), np.array([1.0, 15 / 16])
+    np.testing.assert_allclose(found.std, [2.0, 2e-9] / np.sqrt(free), rtol=1e-12)
+    np.testing.assert_allclose(found.correlation, free * 0.01 / 0.5, rtol=1e-12)
+    free = 1.0 - np.array([2.0, 4.0]) ** 2 / (2.0**2 + 4.0**2) / [25, 16]
+    np.testing.assert_allclose(noise(0.0).std, 1e-18 / np.sqrt(free), rtol=1e-12)

@@ -42,14 +42,14 @@ RAW = SignalSettings(
 )
 
 
-def robot(uncertainty, **measured):
+def robot(uncertainty, terms=(), **measured):
     contacts = [
         Contact(FEET[1], "surface", always=True),
         Contact(FEET[0], uncertainty=uncertainty),
         Contact(FEET[3], uncertainty=uncertainty, always=True, **measured),
     ]
     return RobotModel.from_urdf(
-        example_urdf("solo12.urdf"), free_flyer=True, terms=(), constraints=contacts
+        example_urdf("solo12.urdf"), free_flyer=True, terms=terms, constraints=contacts
     )
 
 
@@ -250,8 +250,8 @@ def test_points_of_unknown_uncertainty_have_the_mean_square_of_their_offsets(
 
 
 def test_offsets_without_torques_of_joints_are_two_centimetres_if_not_stated(log):
-    def size(log, uncertainty, has_torque):
-        model = robot(uncertainty, measured=("fz",))
+    def size(log, uncertainty, has_torque, terms=()):
+        model = robot(uncertainty, terms, measured=("fz",))
         model = replace(model, constraints=model.contacts[1:])
         forces = {f"fz {FEET[3]}": np.full(len(log.t), 5.0)}
         log = replace(log, tau=log.tau * has_torque, wrenches=forces, has_torque=has_torque)
@@ -261,6 +261,9 @@ def test_offsets_without_torques_of_joints_are_two_centimetres_if_not_stated(log
     assert size(log, None, has_torque=False).points == 0.02
     assert size(log, 0.005, has_torque=False).points == 0.005
     assert size(log, None, has_torque=True).points != 0.02
+    still = log.q.copy()
+    still[:, 4] = 0.1  # a joint at rest: with Coulomb friction, its rows are not used
+    assert size(replace(log, q=still), None, has_torque=True, terms=("coulomb",)).points != 0.02
 
 
 def test_contact_errors_follow_the_selected_drive_terms(log, monkeypatch):

@@ -13,7 +13,7 @@ from helpers.synthetic import exact_log, truth
 from robotid.export.result import stated_scale_check
 from robotid.fitting.settings import EstimatorSettings
 from robotid.judgement.scale_check import ScaleCheck, check_scale
-from robotid.judgement.stated_mass import StatedMass, stated_mass
+from robotid.judgement.stated_mass import StatedMass, determines_total_mass, stated_mass
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.model import RobotModel
@@ -192,3 +192,11 @@ def test_a_message_names_the_figure_its_limit_and_the_probable_cause():
     )
     weighed = ScaleCheck(scale=0.9, factor=0.9, masses=(10.0, 9.0, 0.0), is_total_determined=True)
     assert weighed.message.endswith("State the measured mass of the moving links (total_mass)")
+
+
+@pytest.mark.parametrize("mass", [0.0, -0.1])
+def test_a_fit_without_a_total_mass_does_not_determine_it(mass):
+    model = arm()
+    standard = np.ones(len(model.layout.names))  # of other parameters than masses
+    standard[: model.layout.n_inertial : 10] = mass
+    assert not determines_total_mass(SimpleNamespace(model=model, standard=standard))

@@ -158,6 +158,14 @@ def test_an_update_is_left_out_where(change, why, rng):
     np.testing.assert_array_equal(found, P, err_msg=why)
 
 
+@pytest.mark.parametrize(("size", "moves"), [(1.1e-12, True), (0.9e-12, False), (0.0, False)])
+def test_a_sample_is_small_below_a_millionth(size, moves):
+    P, eta, Psi = np.array([2.0, -3.0]), np.array([0.5]), np.array([[0.6, 0.8]]) * size**0.5
+    found = recursive_update(P, Psi, eta, np.array(1.5), np.array(True))
+    wanted = P - 1.5 * Psi[0] * 0.5 / size if moves else P
+    np.testing.assert_allclose(found, wanted, rtol=1e-12)
+
+
 def test_one_shot_finds_the_truth_from_any_guess(rng):
     G, P, P_hat = rng.normal(size=(40, 5)), rng.normal(size=5), rng.normal(size=5)
     # G_* with G P = G_* P^: any matrix, moved along P^ so that the torques agree

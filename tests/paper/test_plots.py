@@ -1,6 +1,8 @@
 """The paper's figures: what each line holds."""
 
+import re
 from types import SimpleNamespace
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -8,6 +10,7 @@ import pytest
 from robotid.paper.errata import EnergyDrift, energy_drift
 from robotid.paper.plots import _energy_figure, _trajectories_figure, paper_figures
 from robotid.paper.study import MODELS, PaperSettings, paper_arm, random_runs, study_model
+from robotid.paper.svg import INK, svg_element
 from robotid.simulation.motions import ProgramMotion
 
 
@@ -95,7 +98,56 @@ def test_iterations_are_counted_and_energies_are_in_percent():
         heights = {k: bar.get_height() for k, bar in enumerate(bars) if bar.get_height()}
         assert heights == count
         assert axes.get_title() == title
+        assert axes.title.get_fontsize() == axes.xaxis.label.get_fontsize() == 8.5
     (axes,) = _energy_figure(drift).axes
     for line, gained in zip(axes.lines, (3.0 * t, -20.0 * t**2), strict=True):
         np.testing.assert_allclose(line.get_xydata(), np.column_stack([t, gained]))
     assert [line.get_label() for line in axes.lines] == ["one", "other"]
+    frame = axes.spines["left"].get_linewidth()
+    assert all(frame <= 0.5 * line.get_linewidth() for line in axes.lines)
+    assert axes.figure.get_size_inches().tolist() == [9.3, 2.8]
+
+
+def test_an_svg_element_is_transparent_and_has_ids_of_its_own():
+    drift = EnergyDrift(np.linspace(0.0, 1.0, 5), {"one": np.linspace(0.0, 0.1, 5)})
+    shown = svg_element(_energy_figure(drift), "one < two", "key")
+    root = ElementTree.fromstring(shown)
+    assert (root.tag, root.get("viewBox")) == ("svg", f"0 0 {9.3 * 72:g} {2.8 * 72:g}")
+    assert root.get("width") is root.get("height") is None
+    assert root.findtext("title") == "one < two"
+    ids = {at.get("id") for at in root.iter() if at.get("id")}
+    assert root.get("aria-labelledby") == "key-title"
+    assert all(name.startswith("key-") for name in ids)
+    used = re.findall(r'href="#([^"]*)"|url\(#([^)]*)\)', shown)
+    assert used
+    assert {a or b for a, b in used} <= ids
+    # text and axes have the colour of the page's text, and nothing is behind them
+    assert "currentColor" in shown
+    assert not re.search(f"{INK}|#ffffff|xmlns|metadata", shown)
+
+
+def test_axes_have_their_unit_lines_their_name_and_figures_their_size(figures):
+    error, last, program = "|P̂ − P| / |P|", "minus the last iteration [N m]", "program control"
+    third = ["position [rad]", "velocity [rad/s]", "acceleration [rad/s²]"]
+    noisy = ["clean", "torque ±10 %", "noise", "noise, ε₂ = 1"]
+    prx = ["largest entry of PRX [N m/s²]", f"{error}; thin: start on program"]
+    estimates = ["estimate [kg m²]; dotted: true", "", ""]
+    fourth = ["torque u2 [N m]", "", "", last, "", ""]
+    for name, xlabel, ylabels, height, names in (
+        ("figure_3b", "time [s]", third, 2.4, None),
+        ("figure_4b", "time [s]", fourth, 4.4, ["iteration 1", "iteration 2", program]),
+        ("figure_5", "iteration", estimates, 3.2, ["p1", "p2", "p3", "p4", "p5"]),
+        ("convergence", "iteration", prx, 3.2, MODELS),
+        ("disturbance", "iteration", [error, "", ""], 3.2, noisy),
+        ("trajectories", "iterations to 10⁻³", ["random motions", "", ""], 2.8, None),
+        ("energy", "time [s]", ["energy gained [%]"], 2.8, MODELS),
+    ):
+        figure, axes = figures[name], figures[name].axes
+        assert [each.get_ylabel() for each in axes] == ylabels
+        assert {each.get_xlabel() for each in axes[-3:]} == {xlabel}
+        assert figure.get_size_inches().tolist() == [9.3, height]
+        legends = [[text.get_text() for text in each.get_texts()] for each in figure.legends]
+        assert legends == ([list(names)] if names else [])
+    for axes in (*figures["convergence"].axes, *figures["disturbance"].axes):
+        assert axes.yaxis.get_major_formatter()(1e-3, 0) == "10⁻³"
+        assert axes.yaxis.get_minor_formatter()(3e-3, 0) == ""

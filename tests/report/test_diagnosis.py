@@ -129,6 +129,7 @@ def test_all_strong_correlations_are_counted_and_the_strongest_listed():
         [names[i], names[j], f"{r[i, j]:.3f}".replace("-", "−")] for i, j in pairs[:15]
     ]
     assert "Correlation of the errors of 8 base parameters; 20 pairs above 0.8" in html
+    assert "full colour at ±1.</figcaption><svg" in html
     weak = _correlations(SimpleNamespace(correlation=0.5 * r), names)
     assert "No two errors are correlated by 0.8 or more." in weak
 

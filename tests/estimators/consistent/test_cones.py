@@ -1,7 +1,15 @@
 import numpy as np
 import pytest
 
-from robotid.estimators.consistent.cones import SOLVERS, Cone, Subspace, least_squares, svec, unsvec
+from robotid.estimators.consistent.cones import (
+    SOLVERS,
+    Cone,
+    Subspace,
+    _described,
+    least_squares,
+    svec,
+    unsvec,
+)
 from robotid.exceptions import NotConvergedError
 from robotid.robot.parameters import pseudo_inertia_basis
 
@@ -129,3 +137,12 @@ def test_a_solver_that_breaks_down_is_a_fit_that_was_not_solved(monkeypatch):
     error = KeyboardInterrupt()
     with pytest.raises(KeyboardInterrupt):
         least_squares(np.eye(10), np.ones(10), psd_cone(), solver="clarabel")
+
+
+def test_the_message_states_each_solution_that_is_less_exact():
+    solved, almost = "Solved", "AlmostSolved"
+    assert _described([solved]) == "Solved"
+    assert _described([solved, solved]) == "Solved, refined once"
+    assert _described([almost, solved, solved]) == "first AlmostSolved, refined 2 times"
+    last = "Solved, refined 2 times, the last one AlmostSolved"
+    assert _described([solved, solved, almost]) == last

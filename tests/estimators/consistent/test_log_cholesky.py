@@ -179,3 +179,9 @@ def test_identify_takes_it_by_name(ur5, rng):
     assert found.is_consistent
     assert len(found.estimate.details["gaps"]) == 3
     np.testing.assert_allclose(found.base, other.base, atol=1e-5 * np.abs(other.base).max())
+
+
+def test_a_fit_that_is_out_of_steps_has_not_converged(monkeypatch):
+    monkeypatch.setattr("robotid.estimators.consistent.log_cholesky._STEPS", 0)
+    flat = SimpleNamespace(objective=lambda *_: 1.0)
+    assert LogCholesky._settle(flat, None, 5.0, None, 1.0) == (5.0, 0, False)

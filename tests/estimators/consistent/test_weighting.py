@@ -445,3 +445,24 @@ def test_an_error_that_repeats_makes_a_residual_larger_by_its_share(
     monkeypatch.setattr(weighting, "replace", lambda choice, **_: choice)
     choose_weight(fit, segments, "cv", repeated)
     assert given == [("evidence", 0.0), ("cv", pytest.approx(np.log(1 / np.sqrt(1 - share))))]
+
+
+def test_the_best_weight_is_one_at_which_the_held_out_fits_converge(case, monkeypatch):
+    """Errors fall with the weight, but fits below a weight of 5 do not converge."""
+    fit, problem = case
+    tried = []
+
+    def errors(fit, segments, w, starts):
+        tried.append(w)
+        if w < 5.0:
+            raise NotConvergedError("stopped", "status")
+        return np.full((6, 2), w) * [1.0, 4.0], []
+
+    monkeypatch.setattr(weighting, "held_out_errors", errors)
+    choice = choose_weight(fit, Segments.of(fit, cut(problem, 6)), "cv")
+    assert min(tried) < 5.0
+    best = min(w for w in tried if w > 5.0)
+    assert choice.weight == pytest.approx(best)
+    # the geometric mean over joints of the root mean squares over six segments
+    wanted = [(w, np.sqrt(6.0 * w) * 2.0**0.5) for w in sorted(tried) if w > 5.0]
+    np.testing.assert_allclose(choice.curve, wanted, rtol=1e-9)

@@ -221,3 +221,24 @@ def test_columns_are_scaled_by_the_rows_of_every_block_with_their_weights(rng):
     small = np.array([[2.0, 2.4e-9, 1.6e-9]])
     problem.n_joints, problem.blocks = 1, lambda: iter([(small, np.ones(1), np.ones(1))])
     np.testing.assert_allclose(column_scale(problem, np.ones(1)), [2.0, 2.4e-9, 1.0])
+
+
+def test_prx_is_zero_within_two_standard_errors_of_its_moving_average():
+    """Averaged over 1000 samples, independent ones have the variance of one over 2000."""
+    prx, limit = PRX(np.ones(1), eps1=1e-9), 2.0 * np.sqrt(5.0 / 2000)
+    for size, steps, is_zero in (
+        (0.99 * limit, 1000, True), (1.01 * limit, 1000, False), (0.99 * limit, 999, False),
+    ):  # fmt: skip
+        state = replace(prx.init(2), prx=size * np.array([0.6, -0.8]), prx_square=5.0, steps=steps)
+        assert prx._is_zero(state) == is_zero
+    still = replace(prx.init(2), prx=np.array([0.9e-9, 0.0]), prx_square=0.0, steps=1000)
+    assert prx._is_zero(still)
+    assert not prx._is_zero(replace(still, prx=np.array([1.1e-9, 0.0])))
+
+
+def test_an_indefinite_inertia_is_bounded_by_its_largest_eigenvalue_of_either_sign():
+    turn = np.array([[0.6, -0.8], [0.8, 0.6]])
+    sample = SimpleNamespace(mass_regressor=(turn * [-5.0, 2.0] @ turn.T)[..., None])
+    values, vectors = PRX(np.ones(2))._inertia(np.ones(1), sample)
+    np.testing.assert_allclose(values, [5e-6, 2.0], rtol=1e-12)
+    np.testing.assert_allclose(np.abs(vectors), np.abs(turn), rtol=1e-12)
