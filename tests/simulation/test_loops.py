@@ -255,6 +255,7 @@ def test_sensitivities_are_those_of_differences(request, name, rate, terms):
         limit=np.full(n, 2.5 * size if name == "legs" else 2.0 * size), rate=rate,
     )  # fmt: skip
     columns, changes = [], []
+    joints = (0, 1, n - 1)
 
     def by(field, j):
         def change(loops, x):
@@ -264,11 +265,13 @@ def test_sensitivities_are_those_of_differences(request, name, rate, terms):
 
         return change
 
-    for j in (0, 1, n - 1):
+    for place, j in enumerate(joints):
         for field in ("armature", "kp", "kd", "limit", "delay", "zero"):
             columns.append((kinds[field], j, 0))
             changes.append(by(field, j))
         for k in range(len(terms)):
+            if terms is TERMS and (k + place) % 3 != (name == "legs"):
+                continue  # each of one joint of either robot
             columns.append((kinds["term"], j, len(terms) * j + k))
             changes.append(by("values", len(terms) * j + k))
     for body, joint in enumerate(robot.joint_of_body):
