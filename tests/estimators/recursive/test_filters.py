@@ -34,7 +34,7 @@ def test_forgetting_does_not_wind_up_where_nothing_moves():
     # one sample over and over: with forgetting 0.8 the rest would be forgotten after ten
     rng, c = np.random.default_rng(0), 12
     prior, std = np.arange(1.0, c + 1), np.full(c, 2.0)
-    estimator = RLS(np.ones(2), 0.8, prior, std)
+    estimator = RLS(np.full(2, 0.1), 0.8, prior, std)
     state = estimator.init(c)
     Y = np.zeros((2, c))
     Y[:, :2] = [[1.0, 0.5], [0.0, 1.0]]
