@@ -44,7 +44,7 @@ def trot(go1):
     rng = np.random.default_rng(3)
     middle, reach = np.array([POSTURE[joint.split("_")[1]] for joint in go1.joints]).T
     log = recorded(
-        go1, FEET, middle, reach, rng, duration=12.0, step=2e-4, kp=100.0, kd=2.0, highest=1.5,
+        go1, FEET, middle, reach, rng, duration=9.5, step=2e-4, kp=100.0, kd=2.0, highest=1.5,
         armature=ARMATURE, damping=DAMPING, torque=TORQUE, imu=IMU,
     )  # fmt: skip
     return log, rng
@@ -57,7 +57,7 @@ def found(go1, trot):
     log = replace(log, base=BaseMotion(log.base.pose))
     other = with_other_bodies(go1, rng)
     result = robotid.identify(
-        other, log.window(end=9.0), validation=log.window(9.0), doctor=False, friction="none",
+        other, log.window(end=7.0), validation=log.window(7.0), doctor=False, friction="none",
         signals=SIGNALS, estimator="wls",
     )  # fmt: skip
     return result, truth_of(go1), other.standard_parameters()
