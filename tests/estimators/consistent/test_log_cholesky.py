@@ -26,7 +26,6 @@ from robotid.robot.geometry import body_boxes
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import inertial_from_pseudo_inertia
 
-
 LEVEL = NOISE[1:4]  # of the joints of the arm [N m]
 
 
