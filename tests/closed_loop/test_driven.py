@@ -74,7 +74,7 @@ def test_what_is_fed_forward_is_the_mean_torque_between_two_rows():
 
 def test_the_true_robot_does_under_its_torque_what_mujocos_does(arm):
     robot, rng = arm[0], np.random.default_rng(8)
-    log = driven_log(robot.model, torque_log(robot, rng, duration=4.0, rate=500.0), SIGNALS)
+    log = driven_log(robot.model, torque_log(robot, rng, duration=2.0, rate=500.0), SIGNALS)
     loops = open_loops(robot.model, true_parameters(robot))
     run = run_open_loop(ClosedLoopRobot(robot.model, step=1e-3), loops, log)
     # its friction is soft over 1e-2 rad/s, ours over 1e-4

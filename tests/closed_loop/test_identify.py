@@ -82,9 +82,10 @@ def test_the_drives_of_a_leg_are_recovered_within_their_errors(leg, found):
 def test_drives_behind_a_slow_clock_are_recovered_once_it_is_stated(rng):
     """At 100 Hz the hold is worth some 5 ms, which damping has to give else."""
     robot = plant("planar", rng, delay=0.0, coulomb=0.0)
-    q_ref = multisine(np.arange(1000) / 500.0, robot.middle, 0.5 * robot.reach, rng, highest=8.0)
+    t = np.arange(800) / 500.0
+    q_ref = multisine(t, robot.middle, 0.5 * robot.reach, rng, highest=8.0)
     q = held(robot, q_ref, 500.0, 100.0) + 1e-4 * rng.standard_normal(q_ref.shape)
-    log = Log(np.arange(1000) / 500.0, q, 0 * q, robot.model.joints, q_ref=q_ref, has_torque=False)
+    log = Log(t, q, 0 * q, robot.model.joints, q_ref=q_ref, has_torque=False)
     worst = {}
     for rate in (100.0, None):
         loop = stated(robot, rate=rate)
@@ -314,7 +315,7 @@ def test_joints_of_a_group_share_their_drive(leg, scaleless):
 def test_of_many_scales_that_suit_the_positions_the_urdfs_is_taken():
     rng = np.random.default_rng(5)
     robot = plant("planar", rng)
-    log, truth = recorded(robot, rng, duration=3.0, rate=250.0, step=2e-4)
+    log, truth = recorded(robot, rng, duration=2.0, rate=250.0, step=2e-4)
     settings, loop = replace(COARSE, bodies=0.1), LoopSettings(delays="group")
     fitted = fit_loops(robot.model, [log], loop, settings, chooses=False)
     gains = [unknown.what == "kp" for unknown in fitted.simulator.free_parameters]

@@ -11,7 +11,7 @@ from robotid.doctor.command_channels import largest_speeds
 from robotid.fitting.settings import SimulationSettings
 from robotid.logs.data import Log
 
-RATE, HELD, RAMP, STEPS = 250.0, 150, 20, 4  # [Hz], rows, of a leg that goes from pose to pose
+RATE, HELD, RAMP, STEPS = 250.0, 110, 20, 4  # [Hz], rows, of a leg that goes from pose to pose
 LIMIT, VISCOUS, KP = 9.0, 4.5, 200.0  # [N m], [N m s/rad], [N m/rad] of the calf
 DELAY = 0.008  # [s] of all drives
 SETTINGS = SimulationSettings(window=2.0, lead=0.2, bodies=0.0, step=4e-3)

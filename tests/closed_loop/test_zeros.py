@@ -135,7 +135,7 @@ def test_torques_tell_the_gains_that_positions_leave_open():
     lighter = [np.log(0.7) / 2 if u.name.endswith("mass") else 0.0 for u in free_parameters]
     # by the URDF's masses positions take the scale, which the torques then have to move
     robot = replace(robot, bodies=simulator.loops(np.array(lighter)).bodies.reshape(-1))
-    log, truth = recorded(robot, rng, duration=3.4, rate=250.0, noise=1e-4, torque=0.5, step=1e-4)
+    log, truth = recorded(robot, rng, duration=2.4, rate=250.0, noise=1e-4, torque=0.5, step=1e-4)
     settings, loop = replace(SETTINGS, bodies=0.1), LoopSettings(delays="group")
     told = identify_loops(robot.model, [log], [], loop, settings, chooses=False)
     for joint in robot.model.joints:

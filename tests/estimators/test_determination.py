@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers.fitting import fit, identify
 from helpers.synthetic import exact_log, truth
 
 from robotid.doctor.motions import check_excitation
@@ -17,7 +18,7 @@ from robotid.estimators.determination import (
 from robotid.exceptions import RankDeficientError
 from robotid.export.entries import build_result
 from robotid.findings import listed
-from robotid.identification.pipeline import identify
+from robotid.fitting.settings import EstimatorSettings
 from robotid.logs.data import Log
 from robotid.logs.settings import SignalSettings
 from robotid.logs.signals import process, resolve
@@ -27,6 +28,7 @@ from robotid.report.tables import open_section
 
 EXACT = SignalSettings(cutoff=None, trim=0.0)
 NOISE = 0.1  # [N m]
+CHOICE = EstimatorSettings(draws=0)  # intervals are not read
 
 
 def moved(model, change, *, samples=600, noise=NOISE):
@@ -51,12 +53,12 @@ def pan_one_way(t, q, v, a):
 
 @pytest.fixture(scope="module")
 def wrist(ur5):
-    return identify(ur5, [moved(ur5, still_wrist)], signals=EXACT)
+    return identify(ur5, [moved(ur5, still_wrist)], signals=EXACT, estimator=CHOICE)
 
 
 @pytest.fixture(scope="module")
 def pan(ur5):
-    return identify(ur5, [moved(ur5, pan_one_way)], signals=EXACT)
+    return identify(ur5, [moved(ur5, pan_one_way)], signals=EXACT, estimator=CHOICE)
 
 
 def test_a_sum_that_alone_is_measured_is_named_as_such():
@@ -234,7 +236,7 @@ def test_doctor_result_report_and_refusal_say_the_same(ur5, case, request):
 
     log = found.fitted[0].recording.log
     with pytest.raises(RankDeficientError) as caught:
-        identify(ur5, [log], signals=EXACT, estimator="wls")
+        fit(ur5, [log], signals=EXACT, estimator="wls")
     assert caught.value.rank == known.rank
     assert caught.value.undetermined == known.undetermined
     assert known.described() in str(caught.value)
@@ -297,7 +299,7 @@ def test_too_few_rows_are_said(ur5):
 def test_a_pinned_link_is_not_listed(ur5, wrist):
     log = wrist.fitted[0].recording.log
     settings = replace(wrist.estimator, constraints={"pinned": ["wrist_3_link"]})
-    found = identify(ur5, [log], signals=EXACT, estimator=settings)
+    found = fit(ur5, [log], signals=EXACT, estimator=settings)
     own = found.mapping.described([f"wrist_3_link.{term}" for term in ("mcx", "Ixy", "Ixz", "Iyz")])
     assert len(own["alone"]) == 4
     assert not set(own["alone"]) & set(found.determination.undetermined)

@@ -4,7 +4,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from helpers.driven import ELBOW, JOINTS, LIFT, WRIST
-from helpers.fitting import identify
+from helpers.fitting import fit, identify
 from helpers.synthetic import exact_log, truth
 
 from robotid.exceptions import DataError
@@ -77,7 +77,7 @@ def test_the_noise_of_a_band_is_what_recordings_of_its_kind_leave(ur5):
         for log in logs[1:]
     ]
     settings = SignalSettings(cutoff=None, trim=0.0)
-    found = identify(ur5, logs[:1], validation=worse, signals=settings, estimator="wls")
+    found = fit(ur5, logs[:1], validation=worse, signals=settings, estimator="wls")
     fitted, *kept = (found.band(e) for e in (*found.fitted, *found.validation))
     np.testing.assert_array_equal(kept[0].noise, kept[1].noise)
     assert fitted.noise[1] == pytest.approx(NOISE[1], rel=0.15)

@@ -5,7 +5,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.driven import arm
 from helpers.fitting import fit
+from helpers.paths import ROOT
 from helpers.synthetic import exact_log, truth
 
 from robotid._settings import setting
@@ -17,10 +19,15 @@ from robotid.estimators import WLS, BatchEstimator
 from robotid.estimators.consistent.cones import SOLVERS
 from robotid.estimators.consistent.penalties import METRICS
 from robotid.exceptions import SettingsError
+from robotid.fitting.fit import fit_recordings
 from robotid.fitting.robust import LOSSES
 from robotid.fitting.settings import ESTIMATORS, EstimatorSettings, RecursiveSettings
 from robotid.log_files.read import write_log
 from robotid.logs.settings import SignalSettings
+from robotid.recordings.logs import Recordings
+from robotid.recordings.survey import hold_log
+from robotid.regressor.base_parameters import structural_mapping
+from robotid.robot.model import RobotModel
 
 JOBS = Path(__file__).parents[1] / "jobs"
 RECURSIVE = [name for name, kind in ESTIMATORS.items() if issubclass(kind, RecursiveSettings)]
@@ -36,19 +43,23 @@ def test_recursive_estimators_predict_real_recordings_as_wls_does(recordings, mo
     monkeypatch.setenv("ROBOTID_DATA", str(recordings))
     job = read_job(JOBS / "panda_inria.toml")
     model = job.model()
-    logs = [job.read(entry, model) for entry in job.identification]
-    kept = [job.read(entry, model) for entry in job.validation]
+    fitted, kept = (
+        [hold_log(model, job.read(entry, model), job.signals) for entry in entries]
+        for entries in (job.identification, job.validation)
+    )
+    recordings = Recordings(model, structural_mapping(model), fitted, kept)
     for name in RECURSIVE:
-        found = fit(model, logs, validation=kept, signals=job.signals, estimator=name)
+        found = fit_recordings(recordings, EstimatorSettings(name))
         ratio = relative_errors(found, "estimate") / relative_errors(found, "wls")
         assert ratio.max() < 1.15, name
 
 
 @pytest.mark.parametrize("name", RECURSIVE)
-def test_standard_errors_of_recursive_estimators_are_honest(ur5, rng, name):
-    pi, noise = truth(ur5), np.array([4.0, 2.0, 1.0, 0.3, 0.2, 0.1])
-    log = exact_log(ur5, pi, rng, samples=2000, noise=noise)
-    found = fit(ur5, [log], signals=EXACT, estimator=name)
+def test_standard_errors_of_recursive_estimators_are_honest(rng, name):
+    model, noise = arm(), np.array([4.0, 2.0, 0.3])
+    pi = truth(model)
+    log = exact_log(model, pi, rng, samples=2000, noise=noise)
+    found = fit(model, [log], signals=EXACT, estimator=name)
     error = np.abs(found.base - found.mapping.to_base(pi)) / found.base_error
     assert np.sqrt(np.mean(error**2)) < 1.3
     assert np.isfinite(found.base_error).all()
@@ -57,22 +68,22 @@ def test_standard_errors_of_recursive_estimators_are_honest(ur5, rng, name):
 
 
 @pytest.mark.parametrize("name", RECURSIVE)
-def test_noise_free_data_do_not_upset_them(ur5, rng, name):
-    pi = truth(ur5)
-    log = exact_log(ur5, pi, rng)
-    found = fit(ur5, [log], validation=[log], signals=EXACT, estimator=name)
+def test_noise_free_data_do_not_upset_them(rng, name):
+    model = arm()
+    log = exact_log(model, truth(model), rng)
+    found = fit(model, [log], validation=[log], signals=EXACT, estimator=name)
     # exact for least squares; a gradient method is still on its way
     assert relative_errors(found, "estimate").max() < (30 if name in ("prx", "gradient") else 1e-3)
 
 
 @pytest.mark.parametrize("name", RECURSIVE)
-def test_a_recursive_estimate_is_made_physical_on_request(ur5, rng, name):
-    noise = 20 * np.array([4.0, 2.0, 1.0, 0.3, 0.2, 0.1])
-    log = exact_log(ur5, truth(ur5), rng, noise=noise)
-    free = fit(ur5, [log], signals=EXACT, estimator=name)
+def test_a_recursive_estimate_is_made_physical_on_request(rng, name):
+    model = arm()
+    log = exact_log(model, truth(model), rng, noise=20 * np.array([4.0, 2.0, 0.3]))
+    free = fit(model, [log], signals=EXACT, estimator=name)
     assert not free.is_consistent
     settings = EstimatorSettings(name, physical=True, draws=0)
-    found = fit(ur5, [log], signals=EXACT, estimator=settings)
+    found = fit(model, [log], signals=EXACT, estimator=settings)
     assert found.is_consistent
     assert "projected onto physically consistent" in found.estimate.message
 
@@ -83,11 +94,12 @@ def test_the_printed_step_asks_for_the_mass_regressor_itself(ur5, rng):
     assert not found.estimate.converged
 
 
-def test_a_job_with_a_recursive_estimator_runs_from_file_to_report(ur5, rng, tmp_path):
-    log = exact_log(ur5, truth(ur5), rng, rate=100.0, noise=np.full(6, 0.1))
+def test_a_job_with_a_recursive_estimator_runs_from_file_to_report(rng, tmp_path):
+    model = RobotModel.from_urdf(ROOT / "urdf" / "planar_2r.urdf")
+    log = exact_log(model, truth(model), rng, rate=100.0, noise=np.full(2, 0.1))
     write_log(log, tmp_path / "log.csv")
     (tmp_path / "job.toml").write_text(
-        f'urdf = "{ur5.tree.path}"\n[signals]\ncutoff = false\n'
+        f'urdf = "{model.tree.path}"\n[signals]\ncutoff = false\n'
         '[estimator]\nname = "kalman"\nwalk = 1e-6\ngate = 0.999999\nphysical = true\n'
         '[[identification]]\nlog = "log.csv"\n'
     )
@@ -171,11 +183,12 @@ class ShrunkSettings(EstimatorSettings):
         return Shrunk(self.factor)
 
 
-def test_a_new_estimator_is_a_module_and_its_settings(ur5, rng, monkeypatch, capsys):
+def test_a_new_estimator_is_a_module_and_its_settings(rng, monkeypatch, capsys):
     monkeypatch.setitem(ESTIMATORS, "shrunk", ShrunkSettings)
-    log = exact_log(ur5, truth(ur5), rng)
+    model = arm()
+    log = exact_log(model, truth(model), rng)
     wls, found = (
-        fit(ur5, [log], signals=EXACT, estimator=EstimatorSettings(name, **own))
+        fit(model, [log], signals=EXACT, estimator=EstimatorSettings(name, **own))
         for name, own in (("wls", {}), ("shrunk", {"factor": 0.25}))
     )
     np.testing.assert_allclose(found.base, 0.25 * wls.base, rtol=1e-9, atol=1e-12)

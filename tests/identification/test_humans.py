@@ -83,7 +83,7 @@ def test_vertical_forces_of_a_walk_weigh_in_spite_of_drift(human):
     """Odometry drifts by 2 cm/s, quaternions change their signs, and feet leave the ground."""
     rng = np.random.default_rng(7)
     true = with_other_segments(human, rng)
-    motion = walk(human, true, rng, duration=12.0, rate=50.0)
+    motion = walk(human, true, rng, duration=8.0, rate=50.0)
     whole = logged(human, motion, rng, plates=[pin.SE3.Identity()] * 2)
     pose = whole.base.pose.copy()
     pose[:, 0] += 0.02 * motion.t

@@ -39,7 +39,7 @@ def runs(robot):
             controller=Controller(kind="perfect"), sensors=sensors, payload=payload
         )
         log = simulate(
-            robot, robot.standard_parameters(), motion, rate=80.0, duration=4.0, rng=rng,
+            robot, robot.standard_parameters(), motion, rate=80.0, duration=3.0, rng=rng,
             settings=settings,
         )  # fmt: skip
         found.append(log)

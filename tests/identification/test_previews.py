@@ -12,7 +12,6 @@ from helpers.driven import arm
 from helpers.fitting import identify
 from helpers.synthetic import truth
 
-from robotid.estimators.batch import solve_factor
 from robotid.estimators.segments import scatter
 from robotid.exceptions import DataError, SettingsError
 from robotid.export.entries import build_preview
@@ -88,12 +87,15 @@ def test_the_errors_expected_are_the_scatter_of_many_recordings(ur5, motion, col
     ahead = preview(ur5, [log], noise=noise, estimator="wls")
     mapping, sigma = ahead.expected.mapping, ahead.expected.estimate.sigma
     rng, thetas = np.random.default_rng(2), []
+    rows = hold_log(ur5, log, SignalSettings()).whole
+    X = trajectory_regressor(ur5, rows.trajectory)[:, mapping.independent]
+    weight = (rows.mask / sigma).ravel()
+    least_squares = np.linalg.pinv(weight[:, None] * X)
     for _ in range(60):
         wild = rng.standard_normal((len(log.t) + 200, 6))
         wild = scipy.signal.lfilter([np.sqrt(1 - colour**2)], [1.0, -colour], wild, axis=0)[200:]
         held = hold_log(ur5, replace(log, tau=STD * wild), SignalSettings())
-        factors = compress(base_problem(ur5, mapping, held.whole.trajectory, held.whole.mask))
-        thetas.append(solve_factor(factors, sigma, np.zeros(len(mapping.K))).theta)
+        thetas.append(least_squares @ (weight * held.whole.trajectory.tau.ravel()))
     scatter = np.sqrt(np.mean(np.square(thetas), axis=0))
     ratio = ahead.base_error / scatter
     # a motion is not quite slow beside noise of 0.2 s, whose density falls from 1 Hz on

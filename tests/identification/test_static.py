@@ -48,7 +48,7 @@ def poses(full, pi, rng, count=60, rows=20):
     return Log(t=t, q=q, tau=tau, joints=full.joints)
 
 
-def sweep(full, pi, rng, legs=12, speed=0.03, rate=20.0):
+def sweep(full, pi, rng, legs=12, speed=0.03, rate=10.0):
     """A log of straight lines between random points, all dynamics but viscous friction in it."""
     via = rng.uniform(*reach(full), (legs, len(full.joints)))
     parts = []

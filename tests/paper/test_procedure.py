@@ -102,28 +102,28 @@ def test_a_ur5_under_gravity_tracks_with_its_true_base_parameters(gentle_ur5):
 
 
 @pytest.mark.parametrize(
-    ("form", "P", "iterations", "left"),
+    ("form", "P", "left"),
     [
-        ("printed", planar_2r.PAPER_PARAMETERS, 40, 2.86e-3),
-        ("corrected_five", planar_2r.PAPER_PARAMETERS, 20, 4.04e-2),
-        ("corrected", P4, 20, 3.57e-2),
+        ("printed", planar_2r.PAPER_PARAMETERS, 0.1011),
+        ("corrected_five", planar_2r.PAPER_PARAMETERS, 0.09915),
+        ("corrected", P4, 0.09864),
     ],
 )
-def test_the_recursion_finds_the_papers_parameters(form, P, iterations, left):
+def test_the_recursion_finds_the_papers_parameters(form, P, left):
     dynamics = PlanarDynamics(form)
-    plant, settings = LinearPlant(dynamics, P), LoopSettings(iterations=iterations)
+    plant, settings = LinearPlant(dynamics, P), LoopSettings(iterations=12)
     history = run_procedure(dynamics, plant, MOTION, P[None] / 2, settings=settings, offset=DEGREE)
     error = history.relative_error(P)[:, 0]
     assert error[0] == 0.5
     assert 0.34 < error[1] < 0.40  # the reading has 0.39, 0.15 and, after 100, 1e-5
     assert 0.10 < error[10] < 0.16
-    assert error[-1] == pytest.approx(left, rel=0.02)
+    assert error[-1] == pytest.approx(left, rel=1e-3)
     assert (np.diff(error) < 0).all()
 
 
 def test_from_the_program_exactly_the_same_procedure_is_slow():
-    error = run(settings=LoopSettings(iterations=15)).relative_error(P4)[:, 0]
-    assert error[15] > 0.18  # 0.21; one degree beside the program it is 0.07
+    error = run(settings=LoopSettings(iterations=10)).relative_error(P4)[:, 0]
+    assert error[10] > 0.22  # 0.25; one degree beside the program it is 0.13
 
 
 def test_the_error_never_grows_while_the_guarantee_holds(rng):
@@ -156,7 +156,7 @@ def test_one_update_never_raises_the_error(rng):
 
 
 def test_prx_falls_as_the_estimate_comes_near():
-    history = run(settings=LoopSettings(iterations=10), offset=DEGREE)
+    history = run(settings=LoopSettings(iterations=7), offset=DEGREE)
     assert (np.diff(history.prx[2:, 0]) < 0).all()
 
 

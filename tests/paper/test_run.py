@@ -4,6 +4,7 @@ import json
 import math
 import re
 import xml.etree.ElementTree as ET
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -12,9 +13,10 @@ from helpers.pages import number, tables
 from matplotlib.figure import Figure
 
 from robotid.cli import main
-from robotid.paper import page
+from robotid.paper import page, study
 from robotid.paper import run as paper
 from robotid.paper.errata import EnergyDrift, energy_drift
+from robotid.paper.procedure import LoopSettings
 from robotid.paper.run import run_paper
 from robotid.paper.study import CASES, MODELS, PROGRAM, PaperSettings, paper_arm
 from robotid.robot.model import RobotModel
@@ -30,6 +32,8 @@ def written(tmp_path_factory):
     folder = tmp_path_factory.mktemp("paper") / "out"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(paper, "energy_drift", lambda: energy_drift(duration=1.0))
+        for module in (paper, study):
+            patch.setattr(module, "LoopSettings", partial(LoopSettings, updates=40))
         return folder, run_paper(folder, settings=FEW)
 
 
@@ -105,6 +109,7 @@ def test_a_failure_leaves_no_half_written_file(tmp_path, monkeypatch):
 
     monkeypatch.setattr(paper, "paper_page", fail)
     monkeypatch.setattr(paper, "energy_drift", lambda: energy_drift(duration=0.1))
+    monkeypatch.setattr(study, "LoopSettings", partial(LoopSettings, updates=20))
     monkeypatch.setattr(paper, "paper_figures", lambda *_: {"figure_3a": ("3", Figure())})
     with pytest.raises(OSError, match="disk full"):
         run_paper(tmp_path, settings=PaperSettings(iterations=1, longest=1, runs=1, patience=1))

@@ -58,7 +58,7 @@ def test_another_robot_is_possible(ur5):
 
 def test_the_log_of_the_plant_obeys_its_own_equation(ur5, rng):
     pi = truth(ur5)
-    log = simulate(ur5, pi, random_fourier(ur5, rng), rate=1000.0, duration=2.0, rng=rng)
+    log = simulate(ur5, pi, random_fourier(ur5, rng), rate=1000.0, duration=1.0, rng=rng)
     a = np.gradient(log.v, log.t, axis=0)
     tau = (joint_torque_regressor(ur5, log.q, log.v, a) @ pi).reshape(log.tau.shape)
     smooth = (np.abs(log.v) > 0.02).all(axis=1)  # the plant's friction is tanh(v / 0.2 mm/s)
@@ -77,7 +77,7 @@ def test_the_controller_tracks_although_it_does_not_know_the_drives(ur5, rng):
 def test_noise_is_of_the_size_asked_for(ur5, rng):
     motion = random_fourier(ur5, rng)
     clean, noisy = (
-        simulate(ur5, truth(ur5), motion, rate=200.0, duration=3.0, noise=noise,
+        simulate(ur5, truth(ur5), motion, rate=200.0, duration=1.5, noise=noise,
                  rng=np.random.default_rng(0))
         for noise in (None, Noise(q=1e-4, v=1e-3, tau=0.05))
     )  # fmt: skip
@@ -118,7 +118,7 @@ def error_of(run):
 def test_computed_torque_with_the_right_bodies_follows_all_but_exactly(ur5):
     pi = ur5.standard_parameters()
     kinds = {
-        kind: error_of(followed(ur5, pi, Simulation(controller=Controller(kind))))
+        kind: error_of(followed(ur5, pi, Simulation(controller=Controller(kind)), duration=1.0))
         for kind in ("pd", "feedforward", "computed_torque", "perfect")
     }
     assert kinds["computed_torque"] < 1e-4
@@ -131,7 +131,7 @@ def test_more_bandwidth_follows_better(ur5):
     pi, errors = truth(ur5), []
     for w in (10.0, 40.0):
         loop = Controller("computed_torque", bandwidth=w)
-        errors.append(error_of(followed(ur5, pi, Simulation(controller=loop))))
+        errors.append(error_of(followed(ur5, pi, Simulation(controller=loop), duration=1.0)))
     assert errors[1] < 0.3 * errors[0]
 
 
@@ -139,10 +139,10 @@ def test_a_perfect_log_is_inverse_dynamics_drives_that_remember_included(ur5):
     own = {"elbow_joint": (LoadFriction(), Presliding(displacement=0.05))}
     model = ur5.with_terms(own)
     pi = truth(model)
-    run = followed(model, pi, Simulation(controller=Controller("perfect")), rate=1000.0)
-    loop = followed(
-        model, pi, Simulation(controller=Controller(bandwidth=100.0)), rate=1000.0
-    )  # a plant with states that is made to do the same
+    run, loop = (  # the second is a plant with states that is made to do the same
+        followed(model, pi, Simulation(controller=controller), rate=1000.0, duration=1.5)
+        for controller in (Controller("perfect"), Controller(bandwidth=100.0))
+    )
     late = run.t > 0.3
     difference = (loop.tau - run.tau)[late][:, 2]
     assert np.sqrt(np.mean(difference**2)) < 0.02 * np.sqrt(np.mean(run.tau[:, 2] ** 2))
@@ -162,7 +162,7 @@ def test_drives_give_no_more_than_their_limits(ur5):
 
 def test_a_payload_is_taken_up_in_time(ur5):
     load = Payload("ee_link", 2.0, com=(0.1, 0.0, 0.05), inertia=(0.01, 0, 0.01, 0, 0, 0.01),
-                   start=1.0)  # fmt: skip
+                   start=0.3)  # fmt: skip
     pi = truth(ur5)
     loaded = carried(ur5, pi, load)
     assert loaded[50] - pi[50] == pytest.approx(2.0)
@@ -177,11 +177,11 @@ def test_a_payload_is_taken_up_in_time(ur5):
     np.testing.assert_allclose(more, with_it - without, atol=1e-9)
     for kind in ("perfect", "feedforward"):
         run, empty = (
-            followed(ur5, pi, Simulation(controller=Controller(kind), payload=p))
+            followed(ur5, pi, Simulation(controller=Controller(kind), payload=p), duration=0.4)
             for p in (load, Payload())
         )
         first = int(np.argmax(np.abs(run.tau - empty.tau).max(axis=1) > 1e-9))
-        assert run.t[first] == 1.0
+        assert run.t[first] == 0.3
 
 
 def test_what_no_payload_can_be_is_refused(ur5):

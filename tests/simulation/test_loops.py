@@ -189,9 +189,9 @@ def test_a_gear_loses_a_share_of_its_load(planar):
 @pytest.mark.parametrize("rate", [None, 100.0])
 def test_friction_is_taken_up_as_its_equation_says(tmp_path, term, rate):
     """A body on a rail that sticks, gives way and slips, beside a stiff integration."""
-    model, t = slider(tmp_path), np.arange(200) / RATE
+    model, t = slider(tmp_path), np.arange(130) / RATE
     log = Log(
-        t, np.zeros((200, 1)), np.zeros((200, 1)), ("j",),
+        t, np.zeros((130, 1)), np.zeros((130, 1)), ("j",),
         q_ref=np.where(t < 0.1, 0.02, 0.15 * np.sin(12 * t))[:, None],
     )  # fmt: skip
     rail = loops_of(
@@ -209,14 +209,14 @@ def test_friction_is_taken_up_as_its_equation_says(tmp_path, term, rate):
     z = -float(term.level(np.array(-0.3))) * 0.3 / np.hypot(0.3, term.displacement / 0.1)
     y, exact = np.array([0.0, -0.3, z]), []
     seen = None
-    for k in range(200):
+    for k in range(130):
         exact.append(y[0])
         if rate is not None and k % 5 == 0:
             seen, told = y[:2], log.q_ref[k, 0]
         r = log.q_ref[k, 0] if rate is None else told
         span, limits = (0.0, 1 / RATE), {"rtol": 1e-10, "atol": 1e-12}
         y = solve_ivp(change, span, y, "Radau", args=(r, seen), **limits).y[:, -1]
-    window = Window(log, 0, 0, 200, given=np.array([[0.0], [-0.3]]))
+    window = Window(log, 0, 0, 130, given=np.array([[0.0], [-0.3]]))
     errors = [
         np.abs(ClosedLoopRobot(model, step=step).roll_out(rail, [window])[0].q[:, 0] - exact).max()
         for step in (1e-3, 2.5e-4)
@@ -255,6 +255,7 @@ def test_sensitivities_are_those_of_differences(request, name, rate, terms):
         limit=np.full(n, 2.5 * size if name == "legs" else 2.0 * size), rate=rate,
     )  # fmt: skip
     columns, changes = [], []
+    joints = (0, 1, n - 1)
 
     def by(field, j):
         def change(loops, x):
@@ -264,11 +265,13 @@ def test_sensitivities_are_those_of_differences(request, name, rate, terms):
 
         return change
 
-    for j in (0, 1, n - 1):
+    for place, j in enumerate(joints):
         for field in ("armature", "kp", "kd", "limit", "delay", "zero"):
             columns.append((kinds[field], j, 0))
             changes.append(by(field, j))
         for k in range(len(terms)):
+            if terms is TERMS and (k + place) % 3 != (name == "legs"):
+                continue  # each of one joint of either robot
             columns.append((kinds["term"], j, len(terms) * j + k))
             changes.append(by("values", len(terms) * j + k))
     for body, joint in enumerate(robot.joint_of_body):

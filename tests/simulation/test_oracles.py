@@ -25,7 +25,7 @@ def run(model, pi, motion, settings=LOOSE, *, rate=1000.0, duration=2.0):
 
 def test_a_pendulum_swings_as_the_elliptic_functions_say(tmp_path):
     model = one_joint(tmp_path)
-    found = run(model, parameters(model, armature=0.2), Ask((0.0,), first=(2.0,)))
+    found = run(model, parameters(model, armature=0.2), Ask((0.0,), first=(2.0,)), duration=1.2)
     inertia = 0.1 + 2.0 * 0.5**2 + 0.2
     w, m = np.sqrt(2.0 * 9.81 * 0.5 / inertia), np.sin(1.0) ** 2
     sn, _, _, _ = ellipj(ellipk(m) - w * found.t, m)
@@ -51,7 +51,8 @@ def test_the_energy_of_an_arm_without_friction_stays(ur5):
 @pytest.mark.parametrize("rate", [100.0, 1000.0])
 def test_coulomb_friction_stops_a_body_and_holds_it(tmp_path, rate):
     model = slider(tmp_path)
-    found = run(model, parameters(model, coulomb=3.0), Ask((0.0,), speed=1.0), rate=rate)
+    pi = parameters(model, coulomb=3.0)
+    found = run(model, pi, Ask((0.0,), speed=1.0), rate=rate, duration=1.2)
     way = 2.0 * 1.0**2 / (2 * 3.0)  # m v^2 / 2 F
     assert found.q[-1, 0] == pytest.approx(way, abs=0.01)
     rests = found.t > 2.0 / 3.0 + 0.05
