@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers.fitting import fit
 from helpers.synthetic import exact_log, truth
 
 from robotid.advice.steps import Origin
@@ -208,7 +209,7 @@ def test_a_simulated_robot_is_identified(model, rng):
     pi = truth(model)
     log = simulate(model, pi, random_fourier(model, rng), rate=200.0, duration=3.0, rng=rng)
     signals = SignalSettings(cutoff=20.0)
-    found = identify(model, [log], signals=signals, estimator="wls", doctor=False)
+    found = fit(model, [log], signals=signals, estimator="wls")
     beta = found.mapping.to_base(pi)
     assert np.linalg.norm(found.base - beta) < 0.02 * np.linalg.norm(beta)
 
