@@ -404,7 +404,7 @@ def arm(ur5):
 
 def spoilt_logs(model, spoil=None):
     """Return two logs of the same arm, to fit and to validate with, as a test spoils them."""
-    logs = []
+    logs, noise = [], 0.1 * NOISE[: len(model.joints)]
     for name, rng in zip(("run.csv", "kept.csv"), np.random.default_rng(0).spawn(2), strict=True):
         log = exact_log(
             model,
