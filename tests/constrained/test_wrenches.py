@@ -1,6 +1,7 @@
 """Findings on measured forces of the ground: sign, unit, foot, axes, and plates that are missed."""
 
 from dataclasses import replace
+from functools import cache
 from types import SimpleNamespace
 
 import numpy as np
@@ -27,6 +28,11 @@ PLATES = [
 ]
 
 
+@cache
+def on_no_ground(urdf):
+    return RobotModel.from_urdf(urdf, free_flyer=True, terms=())
+
+
 def human(urdf, *, plates=None, **options):
     own = [{"axes": "link"}, {"axes": "link"}]
     if plates:
@@ -38,7 +44,7 @@ def human(urdf, *, plates=None, **options):
         Contact(foot, "surface", PARTS, **{**x, **options})
         for foot, x in zip(FEET, own, strict=True)
     ]
-    return RobotModel.from_urdf(urdf, free_flyer=True, terms=(), constraints=contacts)
+    return replace(on_no_ground(urdf), constraints=tuple(contacts))
 
 
 @pytest.fixture(scope="module")

@@ -406,14 +406,7 @@ def spoilt_logs(model, spoil=None):
     """Return two logs of the same arm, to fit and to validate with, as a test spoils them."""
     logs, noise = [], 0.1 * NOISE[: len(model.joints)]
     for name, rng in zip(("run.csv", "kept.csv"), np.random.default_rng(0).spawn(2), strict=True):
-        log = exact_log(
-            model,
-            truth(model),
-            rng,
-            samples=800,
-            rate=100.0,
-            noise=0.1 * NOISE[: len(model.joints)],
-        )
+        log = exact_log(model, truth(model), rng, samples=800, rate=100.0, noise=noise)
         log = replace(log, path=name)
         logs.append(log if spoil is None else spoil(log))
     return logs
