@@ -40,7 +40,7 @@ def model():
 @pytest.fixture(scope="module")
 def four(model):
     """The first four joints: enough where nothing but one thing is to be found, and faster."""
-    return RobotModel.from_urdf(model.tree.path, joints=model.joints[:4])
+    return RobotModel.from_urdf(model.tree, joints=model.joints[:4])
 
 
 SETTINGS = EstimatorSettings(prior_weight=1.0, draws=0)

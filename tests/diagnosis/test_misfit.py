@@ -83,7 +83,7 @@ def findings_of(found):
 @pytest.fixture(scope="module")
 def three(ur5):
     """The first three joints of a UR5."""
-    return RobotModel.from_urdf(ur5.tree.path, joints=ur5.joints[:3])
+    return RobotModel.from_urdf(ur5.tree, joints=ur5.joints[:3])
 
 
 @pytest.fixture(scope="module")
@@ -219,7 +219,7 @@ def test_a_size_without_a_unit_is_that_of_the_torque_beside_base_parameters(rng)
 
 def test_coulomb_friction_that_was_left_out_is_asked_for(three):
     terms = ("armature", "viscous", "offset")
-    model = RobotModel.from_urdf(three.tree.path, joints=three.joints, terms=terms)
+    model = RobotModel.from_urdf(three.tree, joints=three.joints, terms=terms)
     logs = [log_with(three, 1, part=k) for k in (0, 1)]
     found = findings_of(concluded(model, logs))
     loud = {finding.where for finding in found if finding.severity == "warning"}
@@ -290,7 +290,7 @@ def test_noise_of_any_colour_is_no_term(three, memory):
 
 def test_a_counterbalance_is_named_taken_into_the_model_and_no_error(ur5):
     """40 N m at the lift: gravity of the URDF's is held by the other joints."""
-    model = RobotModel.from_urdf(ur5.tree.path, joints=ur5.joints[:4])
+    model = RobotModel.from_urdf(ur5.tree, joints=ur5.joints[:4])
     logs = [log_with(model, 3, "balancing", 1, part=k) for k in (0, 1)]
     guesses = check_logs(model, logs[:1], validation=logs[1:])
     said = [f for f in guesses if f.severity != "note"]

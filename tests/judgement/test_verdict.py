@@ -399,7 +399,7 @@ def test_gravity_that_was_compensated_is_refuted_by_gravity(scale, factor, sever
 @pytest.fixture(scope="module")
 def arm(ur5):
     """The first four joints of a UR5."""
-    return RobotModel.from_urdf(ur5.tree.path, joints=ur5.joints[:4])
+    return RobotModel.from_urdf(ur5.tree, joints=ur5.joints[:4])
 
 
 def spoilt_logs(model, spoil=None):
