@@ -207,7 +207,7 @@ def test_friction_that_holds_any_load_is_refused_by_the_plant():
                          ids=lambda term: term.name)  # fmt: skip
 def test_a_simulated_robot_is_identified(model, rng):
     pi = truth(model)
-    log = simulate(model, pi, random_fourier(model, rng), rate=200.0, duration=2.0, rng=rng)
+    log = simulate(model, pi, random_fourier(model, rng), rate=200.0, duration=3.0, rng=rng)
     signals = SignalSettings(cutoff=20.0)
     found = fit(model, [log], signals=signals, estimator="wls")
     beta = found.mapping.to_base(pi)
