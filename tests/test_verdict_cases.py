@@ -2,18 +2,38 @@
 
 import sys
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
 from helpers.paths import ROOT
 
 from robotid.regressor.torque import joint_torque_regressor
+from robotid.robot import geometry
 from robotid.robot.bodies import least_density
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
 
 sys.path.append(str(ROOT / "benchmarks"))
+import verdict_cases
 from verdict_cases import CASES, ROBOTS, build, coupling, make, move, periodic, stribeck
+
+
+@pytest.fixture(scope="module", autouse=True)
+def built_once():
+    """Meshes, and the robot that most faults have in common."""
+    usual = cache(build)
+
+    def built(robot, key, *, folder, **options):
+        return build(robot, key, folder=folder, **options) if any_of(options) else usual(robot, key)
+
+    def any_of(options):
+        return options["is_far"] or options["resize"] or options["turn"] is not None
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(geometry, "read_surfaces", cache(geometry.read_surfaces))
+        patch.setattr(verdict_cases, "build", built)
+        yield
 
 
 @pytest.fixture(scope="module")

@@ -242,20 +242,22 @@ def _readings(model: RobotModel, motion: Trajectory, torque: Array) -> Iterator[
     is_moment = np.array([part.startswith("m") for part in parts], dtype=bool)
     sizes = [rms(motion.wrenches[:, x]) for x in (is_moment, ~is_moment)]
     is_far = sizes[0] > _FAR * sizes[1]
-    for (words, other), pair, is_milli in product(_places(model), pairs, (False, True)):
-        if is_milli and not is_far:
-            continue
-        order = list(columns)
-        changes = [*words, *["their moments are in N mm, wanted N m"] * is_milli]
-        if pair is not None:
-            i, j = pair
-            order[i], order[j] = order[j], order[i]
-            names = [model.contacts[k].frame for k in pair]
-            changes.append(f"those of {listed(names)} are exchanged")
-        wrenches = motion.wrenches[:, np.concatenate(order)]
-        wrenches = np.where(is_moment & is_milli, _MILLI, 1.0) * wrenches
-        feet = () if pair is None else tuple(model.contacts[k].frame for k in pair)
-        yield from _fitted(other, motion, torque, wrenches, (tuple(changes), feet))
+    for words, other in _places(model):
+        rows = _base_rows(other, motion)
+        for pair, is_milli in product(pairs, (False, True)):
+            if is_milli and not is_far:
+                continue
+            order = list(columns)
+            changes = [*words, *["their moments are in N mm, wanted N m"] * is_milli]
+            if pair is not None:
+                i, j = pair
+                order[i], order[j] = order[j], order[i]
+                names = [model.contacts[k].frame for k in pair]
+                changes.append(f"those of {listed(names)} are exchanged")
+            wrenches = motion.wrenches[:, np.concatenate(order)]
+            wrenches = np.where(is_moment & is_milli, _MILLI, 1.0) * wrenches
+            feet = () if pair is None else tuple(model.contacts[k].frame for k in pair)
+            yield from _fitted(rows, torque, wrenches, (tuple(changes), feet))
 
 
 def _places(model: RobotModel) -> Iterator[tuple[tuple[str, ...], RobotModel]]:
@@ -278,14 +280,16 @@ def _places(model: RobotModel) -> Iterator[tuple[tuple[str, ...], RobotModel]]:
 
 
 def _fitted(
-    model: RobotModel,
-    motion: Trajectory,
+    rows: tuple[Array, Array],
     torque: Array,
     wrenches: Array,
     reading: tuple[tuple[str, ...], tuple[str, ...]],
 ) -> Iterator[_Reading]:
-    """Yield the residual, and that with a factor of the forces, if the URDF is not its cause."""
-    J, basis = _base_rows(model, motion)
+    """Yield the residual, and that with a factor of the forces, if the URDF is not its cause.
+
+    The rows are those of ``_base_rows``.
+    """
+    J, basis = rows
     caused = without_forces(basis, np.einsum("kmj,km->kj", J, wrenches))
     left = without_forces(basis, torque)
     square = float(np.sum(caused**2))

@@ -3,6 +3,7 @@
 import difflib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -257,8 +258,14 @@ class Loop:
 
     def _across(self, rotation: Array) -> Array:
         """Return two directions perpendicular to the axis, fixed in the first link, (2, 3)."""
-        across: Array = np.linalg.svd(np.asarray(self.axis, dtype=float)[None])[2][1:]
-        return across @ rotation.T
+        across: Array = _perpendicular(tuple(self.axis)) @ rotation.T
+        return across
+
+
+@cache
+def _perpendicular(axis: tuple[float, ...]) -> Array:
+    """Return two directions perpendicular to an axis, shape (2, 3)."""
+    return np.asarray(np.linalg.svd(np.array(axis, dtype=float)[None])[2][1:])
 
 
 Constraint = Contact | Loop

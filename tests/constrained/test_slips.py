@@ -23,7 +23,7 @@ def standing(robot, seed, slide=0.0):
     It slides along x from 3 to 6 s. Zeros of the joints are wrong by 1 deg, the pose of the base
     has noise of 0.5 mm and 1 mrad.
     """
-    rng, t = np.random.default_rng(seed), np.arange(2.0, 10.0, 0.01)
+    rng, t = np.random.default_rng(seed), np.arange(2.0, 10.0, 0.02)
     w, phase = rng.uniform(0.8, 3.0, 6), rng.uniform(0.0, 6.0, 6)
     waves = np.sin(np.outer(t, w) + phase)
     pose = np.zeros((len(t), 7))

@@ -1,6 +1,7 @@
 """Findings on measured forces of the ground: sign, unit, foot, axes, and plates that are missed."""
 
 from dataclasses import replace
+from functools import cache
 from types import SimpleNamespace
 
 import numpy as np
@@ -27,6 +28,11 @@ PLATES = [
 ]
 
 
+@cache
+def on_no_ground(urdf):
+    return RobotModel.from_urdf(urdf, free_flyer=True, terms=())
+
+
 def human(urdf, *, plates=None, **options):
     own = [{"axes": "link"}, {"axes": "link"}]
     if plates:
@@ -38,7 +44,7 @@ def human(urdf, *, plates=None, **options):
         Contact(foot, "surface", PARTS, **{**x, **options})
         for foot, x in zip(FEET, own, strict=True)
     ]
-    return RobotModel.from_urdf(urdf, free_flyer=True, terms=(), constraints=contacts)
+    return replace(on_no_ground(urdf), constraints=tuple(contacts))
 
 
 @pytest.fixture(scope="module")
@@ -476,6 +482,12 @@ def test_an_offset_of_feet_that_stand_is_named(urdf, long_log):
     pose = long_log.base.pose.copy()
     pose[:, :3] = pose[:, :3] @ tilt.matrix().T
     pose[:, 3:] = [(tilt * pin.Quaternion(x)).coeffs() for x in pose[:, 3:]]
-    (finding,) = found(model, replace(long_log, base=BaseMotion(pose)))
+    tilted = replace(long_log, base=BaseMotion(pose))
+    (finding,) = found(model, tilted)
     assert finding.code == "wrench_offset"
     assert finding.evidence["angle"] == pytest.approx(1.5, abs=0.3)
+    caused, torque = parts(model, tilted)
+    turns = [pin.Quaternion(x).matrix() for x in process(tilted, SLOW).q[:, 3:7]]
+    excess = np.einsum("kij,kj->ki", turns, (caused - torque)[:, :3])  # with the world's axes
+    mean = excess[:: len(excess) // 400, :2].mean(axis=0)
+    assert finding.evidence["horizontal"] == pytest.approx(np.hypot(*mean))

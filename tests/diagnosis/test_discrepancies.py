@@ -37,6 +37,12 @@ def model():
     return RobotModel.from_urdf(example_urdf("ur5_robot.urdf"))
 
 
+@pytest.fixture(scope="module")
+def four(model):
+    """The first four joints: enough where nothing but one thing is to be found, and faster."""
+    return RobotModel.from_urdf(model.tree, joints=model.joints[:4])
+
+
 SETTINGS = EstimatorSettings(prior_weight=1.0, draws=0)
 
 
@@ -49,7 +55,10 @@ def fitted(model, logs, estimator=SETTINGS):
 
 def found(model, change, robot="ur5_robot.urdf", turn=None, duration=16.0):
     """Return the findings on logs of a robot near its URDF that a change spoilt alike."""
-    arm, logs = build(replace(ROBOTS["ur5"], urdf=str(robot)), (3,), turn=turn), []
+    arm, logs = (
+        build(replace(ROBOTS["ur5"], urdf=str(robot), joints=model.joints), (3,), turn=turn),
+        [],
+    )
     for part in (0, 1):
         run = move(arm.model, np.random.default_rng([3, part]), 50.0, duration)
         run = replace(run, tau=arm.rigid(run) + arm.drives(run))
@@ -69,15 +78,15 @@ def on(model, joint, value, elsewhere):
     return np.where(np.array(model.joints) == joint, value, elsewhere)
 
 
-def test_nothing_is_said_of_a_robot_that_only_weighs_differently(model):
-    assert found(model, lambda log: log) == ()
+def test_nothing_is_said_of_a_robot_that_only_weighs_differently(four):
+    assert found(four, lambda log: log) == ()
 
 
 # of harmonics the slowest, which gravity is most like
 @pytest.mark.parametrize("effect", sorted(EFFECTS.keys() - {"ripple", "harmonic drive"}))
-def test_nothing_is_said_of_drives_that_do_more_than_their_model(model, effect):
-    logs = [log_with(model, 3, effect, part=part, rate=50.0, duration=20.0) for part in (0, 1)]
-    found = fitted(model, logs, EstimatorSettings("wls"))
+def test_nothing_is_said_of_drives_that_do_more_than_their_model(four, effect):
+    logs = [log_with(four, 3, effect, part=part, rate=50.0, duration=20.0) for part in (0, 1)]
+    found = fitted(four, logs, EstimatorSettings("wls"))
     _, discrepancies = explain_residual(found, take_sample(found))
     assert discrepancies == ()
 
@@ -113,10 +122,10 @@ def test_what_is_stated_wrongly_is_named_with_its_size(model, change, code, wher
         assert f"the time stamps run {faster:.3f} times as fast" in first.message
 
 
-def test_a_large_offset_of_a_zero_has_its_size_and_makes_no_other_finding(model):
+def test_a_large_offset_of_a_zero_has_its_size_and_makes_no_other_finding(four):
     joint, offset = "shoulder_lift_joint", -0.2
-    moved = offset * on(model, joint, 1.0, 0.0)
-    (finding,) = found(model, lambda log: replace(log, q=log.q + moved))
+    moved = offset * on(four, joint, 1.0, 0.0)
+    (finding,) = found(four, lambda log: replace(log, q=log.q + moved))
     assert (finding.code, finding.where) == ("position_offset", joint)
     # to first order it would be far less
     assert finding.evidence["size"] == pytest.approx(-offset, rel=0.06)
@@ -171,10 +180,8 @@ def test_what_is_found_is_said_of_the_result_and_doubts_it(model):
     assert {"spring", "position_offset"} <= {doubt.code for doubt in result.warnings}
 
 
-def test_columns_beside_the_base_parameters_are_refitted_with_them(model, rng):
-    found = fitted(
-        model, [log_with(model, 3, "spring", part=part, duration=12.0) for part in (0, 1)]
-    )
+def test_columns_beside_the_base_parameters_are_refitted_with_them(four, rng):
+    found = fitted(four, [log_with(four, 3, "spring", part=part, duration=12.0) for part in (0, 1)])
     sample = take_sample(found)
     Z = rng.standard_normal((*sample.r.shape, 2)) + sample.r[..., None]
     together, _ = Trials(sample, Z).whole.estimate([0, 1], sample.fitted)
@@ -216,9 +223,9 @@ def test_a_joint_that_lies_elsewhere_is_named(model, tmp_path):
     assert first.evidence["size"] == pytest.approx(0.05, rel=0.25)
 
 
-def test_a_base_that_is_not_level_is_named(model):
+def test_a_base_that_is_not_level_is_named(four):
     turn = pin.exp3(np.array([0.15, 0.0, 0.0]))
-    first = found(model, lambda log: log, turn=turn)[0]
+    first = found(four, lambda log: log, turn=turn)[0]
     assert (first.code, first.where) == ("gravity", "all joints")
     assert first.evidence["size"] == pytest.approx(np.tan(0.15), rel=0.03)
     stated = [float(x) for x in first.message.split("gravity = [")[1].split("]")[0].split(",")]
@@ -237,37 +244,37 @@ def test_a_small_share_of_the_residual_is_named_if_recordings_kept_apart_show_it
     assert first.evidence["size"] == pytest.approx(0.21, rel=0.25)
 
 
-def test_what_may_be_otherwise_changes_torques_as_differences_do(model, rng):
-    pi = possible_parameters(model, rng)  # armatures and friction, too
-    at = [motion(model, rng, count) for count in (7, 4)]
-    direction = [SimpleNamespace(direction=np.ones(11)) for _ in model.joints]
+def test_what_may_be_otherwise_changes_torques_as_differences_do(four, rng):
+    pi = possible_parameters(four, rng)  # armatures and friction, too
+    at = [motion(four, rng, count) for count in (7, 4)]
+    direction = [SimpleNamespace(direction=np.ones(11)) for _ in four.joints]
     sample = SimpleNamespace(at=at, motions=direction)
-    n, step = len(model.joints), 1e-6
+    n, step = len(four.joints), 1e-6
 
     def slope(scale, shift):
         def torques(x):
             f = 1 + x * scale
             changed = [replace(m, q=f * m.q + x * shift, v=f * m.v, a=f * m.a) for m in at]
-            return np.concatenate([inverse_dynamics(model, pi, m) for m in changed])
+            return np.concatenate([inverse_dynamics(four, pi, m) for m in changed])
 
         return (torques(step) - torques(-step)) / (2 * step)
 
-    own = {(x.code, x.where): x.Z[..., 0] for x in _alterations(model, pi, sample)}
-    for j, joint in enumerate(model.joints):
+    own = {(x.code, x.where): x.Z[..., 0] for x in _alterations(four, pi, sample)}
+    for j, joint in enumerate(four.joints):
         only = np.eye(n)[j]
         for code, wanted in (
             ("angle_scale", slope(only, 0.0)),
             ("position_offset", slope(0.0, only)),
-            ("torque_scale", only * np.concatenate([inverse_dynamics(model, pi, m) for m in at])),
+            ("torque_scale", only * np.concatenate([inverse_dynamics(four, pi, m) for m in at])),
         ):
             np.testing.assert_allclose(own[code, joint], wanted, rtol=1e-4, atol=1e-3)
     every = slope(np.ones(n), 0.0)
     np.testing.assert_allclose(own["angle_scale", ""], every, rtol=1e-4, atol=1e-3)
-    bodies = np.where(np.arange(len(pi)) < model.layout.n_inertial, pi, 0.0)
+    bodies = np.where(np.arange(len(pi)) < four.layout.n_inertial, pi, 0.0)
 
     def on_clock(f):  # torques of the bodies if the time stamps run f times as fast
         faster = [replace(m, v=f * m.v, a=f**2 * m.a) for m in at]
-        return np.concatenate([inverse_dynamics(model, bodies, m) for m in faster])
+        return np.concatenate([inverse_dynamics(four, bodies, m) for m in faster])
 
     np.testing.assert_allclose(own["time_scale", ""], on_clock(np.sqrt(2.0)) - on_clock(1.0),
                                atol=1e-9)  # fmt: skip

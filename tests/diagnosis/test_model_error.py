@@ -197,9 +197,9 @@ def test_an_error_of_a_shape_moves_parameters_as_refits_do(plain, hooked, fits):
     np.testing.assert_allclose(friction_curve(found, ELBOW, v).std, wanted, rtol=0.05)
 
 
-def test_shapes_that_err_together_have_one_covariance(plain, hooked):
+def test_shapes_that_err_together_have_one_covariance(fits):
     """A hook's speed and excess make up for each other: alone each looks far too sure."""
-    found = found_in(plain, [hooked[1]], friction={ELBOW: "lugre", "*": "none"}, estimator="wls")
+    found = fits("hooked", {ELBOW: "lugre", "*": "none"})
     (choice,) = found.drives
     C = np.array(choice.shape_covariance)
     np.testing.assert_allclose(np.sqrt(np.diag(C)), [s.std_error for s in choice.shapes])
@@ -209,10 +209,8 @@ def test_shapes_that_err_together_have_one_covariance(plain, hooked):
     assert abs(C[speed, excess]) > 0.5 * np.sqrt(C[speed, speed] * C[excess, excess])
 
 
-def test_shapes_are_settled_once_none_of_them_moves_by_a_fifth_of_its_error(
-    plain, hooked, monkeypatch
-):
-    found = found_in(plain, [hooked[1]], friction={ELBOW: "lugre", "*": "none"}, estimator="wls")
+def test_shapes_are_settled_once_none_of_them_moves_by_a_fifth_of_its_error(fits, monkeypatch):
+    found = fits("hooked", {ELBOW: "lugre", "*": "none"})
     (choice,) = found.drives
     values = np.array([shape.value for shape in choice.shapes])
     errors = 0.01 * values * [1.0, 2.0, 3.0]

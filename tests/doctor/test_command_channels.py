@@ -267,15 +267,16 @@ def test_recordings_show_what_is_wrong_with_them(name):
 # --- the doctor as a whole ------------------------------------------------------------------------
 
 
-def recorded(ur5, **changes):
+@pytest.fixture(scope="module")
+def of_ur5(ur5):
     """A log of a UR5 whose joints have servos of their own."""
     amplitudes = [0.3, 0.25, 0.3, 0.25, 0.3, 0.2]
     log = record(chirps(amplitudes, 8.0, duration=10.0), [Servo()] * 6, duration=10.0)
-    return replace(log, joints=ur5.joints, **changes)
+    return replace(log, joints=ur5.joints)
 
 
-def test_a_log_without_torque_is_examined(ur5, tmp_path, capsys):
-    log = recorded(ur5)
+def test_a_log_without_torque_is_examined(ur5, of_ur5, tmp_path, capsys):
+    log = of_ur5
     findings = check_logs(ur5, log, validation=log)
     assert {f.code for f in findings if f.severity != "note"} == {"repeated_motion"}
     assert {"no_torque", "rate", "noise"} <= {f.code for f in findings}
@@ -290,8 +291,8 @@ def test_a_log_without_torque_is_examined(ur5, tmp_path, capsys):
     assert "no_torque: run.csv: the log has no torque" in " ".join(capsys.readouterr().out.split())
 
 
-def test_what_is_in_the_file_is_examined(ur5, tmp_path):
-    log = recorded(ur5)
+def test_what_is_in_the_file_is_examined(ur5, of_ur5, tmp_path):
+    log = of_ur5
     table = {"time": log.t}
     for kind, values in (("q", log.q), ("qref", log.q_ref), ("tau", 5 * log.q)):
         table |= {f"{kind}_{joint}": values[:, j] for j, joint in enumerate(log.joints)}
@@ -309,9 +310,9 @@ def test_what_is_in_the_file_is_examined(ur5, tmp_path):
         check_logs(ur5, replace(log, q_ref=None))
 
 
-def test_sizes_of_loads_taken_for_torques_are_an_error(ur5):
+def test_sizes_of_loads_taken_for_torques_are_an_error(ur5, of_ur5):
     rng = np.random.default_rng(0)
-    log = recorded(ur5)
+    log = of_ur5
     v = np.gradient(log.q, log.t, axis=0)
     sizes = np.round(np.abs(3 * v + 10 * log.q + 0.1 * rng.standard_normal(v.shape)) / 0.05) * 0.05
     findings = check_logs(ur5, replace(log, tau=sizes, has_torque=True))
@@ -334,8 +335,8 @@ def test_loads_of_a_servo_arm_mapped_to_torques_are_an_error():
     assert errors == {"unsigned_torque", "velocity_scale"}  # the jaw's dq is its motor's
 
 
-def test_velocities_of_a_log_without_torque_are_judged_without_it(ur5):
-    log = recorded(ur5)
+def test_velocities_of_a_log_without_torque_are_judged_without_it(ur5, of_ur5):
+    log = of_ur5
     v = np.gradient(log.q, log.t, axis=0)
     scaled = replace(log, v=v * [1, 1, 1, 1, 1, 2.3])
     for velocity, severity in (("auto", "warning"), ("measured", "error")):

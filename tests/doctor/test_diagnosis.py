@@ -40,7 +40,12 @@ SIGNALS = SignalSettings()
 
 @pytest.fixture(scope="module")
 def table():
+    """The table of a log at 100 Hz."""
     return table_of(controlled_log("ur5", 0))
+
+
+#: Whose fault is not one at 50 Hz; for all others every other row does.
+AT_100_HERTZ = {"velocity of a 12-bit encoder", "too few rows"}
 
 
 @pytest.fixture(scope="module")
@@ -56,6 +61,8 @@ def spoil(name, table, folder):
     """Return the job of a table as a case changes it."""
     case = CASES[name]
     path = folder / "run.csv"
+    if name not in AT_100_HERTZ:
+        table = {column: values[::2] for column, values in table.items()}
     write_columns(case.change(table), path)
     urdf = example_urdf(case.urdf)
     return Job(urdf=urdf, gravity=case.gravity, identification=(LogEntry(path),))

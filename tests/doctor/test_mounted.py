@@ -60,7 +60,7 @@ def test_a_load_in_the_validation_log_only_is_weighed(arm_and_log):
     loaded = pi.copy()
     last = loaded[:size].reshape(-1, 10)[-1]
     last += np.array([1, 0, 0.05, 0.1, 0.02, 0, 0.02, 0, 0, 0.02])
-    kept = clean_log(model, 2, pi=loaded, duration=10.0)
+    kept = clean_log(model, 2, pi=loaded, rate=50.0, duration=10.0)
     (change,) = [f for f in loud(model, fitted, [kept]) if f.code == "payload_change"]
     assert change.where == f"run.csv: {model.layout.bodies[-1]}"
     assert change.evidence["mass"] == pytest.approx(1.0, abs=3 * change.evidence["std_error"])
@@ -90,7 +90,7 @@ def test_what_else_makes_a_validation_log_another_one_is_no_load(arm_and_log, ch
 def arm_and_log():
     model = robot("ur5")
     pi = another_robot(model, np.random.default_rng(0))
-    return model, *(clean_log(model, seed, pi=pi, duration=10.0) for seed in (0, 1))
+    return model, *(clean_log(model, seed, pi=pi, rate=50.0, duration=10.0) for seed in (0, 1))
 
 
 def test_joints_with_friction_of_their_own_are_examined_like_others(arm_and_log):
@@ -118,7 +118,7 @@ def test_a_load_is_named_beside_a_urdf_of_another_robot(arm_and_log):
     loaded = pi.copy()
     loaded[:size].reshape(-1, 10)[-1] += [1, 0.03, 0.02, 0.06, 0.006, 0, 0.006, 0, 0, 0.003]
     fitted, kept = (
-        clean_log(model, seed, pi=x, duration=10.0) for seed, x in ((5, pi), (6, loaded))
+        clean_log(model, seed, pi=x, rate=50.0, duration=10.0) for seed, x in ((5, pi), (6, loaded))
     )
     (change,) = [f for f in loud(model, fitted, [kept]) if f.code == "payload_change"]
     mass, error = change.evidence["mass"], change.evidence["std_error"]

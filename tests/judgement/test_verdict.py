@@ -24,6 +24,7 @@ from robotid.judgement.verdict import (
 )
 from robotid.log_files.read import write_log
 from robotid.robot.examples import example_urdf
+from robotid.robot.model import RobotModel
 
 NOISE = np.array([2.0, 2.0, 1.0, 0.3, 0.3, 0.1])
 JOINTS = ("a", "b", "c")
@@ -395,11 +396,17 @@ def test_gravity_that_was_compensated_is_refuted_by_gravity(scale, factor, sever
     assert found.severity == severity
 
 
+@pytest.fixture(scope="module")
+def arm(ur5):
+    """The first four joints of a UR5."""
+    return RobotModel.from_urdf(ur5.tree, joints=ur5.joints[:4])
+
+
 def spoilt_logs(model, spoil=None):
     """Return two logs of the same arm, to fit and to validate with, as a test spoils them."""
-    logs = []
+    logs, noise = [], 0.1 * NOISE[: len(model.joints)]
     for name, rng in zip(("run.csv", "kept.csv"), np.random.default_rng(0).spawn(2), strict=True):
-        log = exact_log(model, truth(model), rng, samples=800, rate=100.0, noise=0.1 * NOISE)
+        log = exact_log(model, truth(model), rng, samples=800, rate=100.0, noise=noise)
         log = replace(log, path=name)
         logs.append(log if spoil is None else spoil(log))
     return logs
@@ -415,14 +422,15 @@ def found_of(model, spoil=None, ignore=(), **settings):
 
 
 @pytest.fixture
-def run(ur5, tmp_path):
+def run(arm, tmp_path):
     """Run a job on such logs; return what is found, its result, and the verdict of its file."""
 
     def runner(**settings):
-        for log in spoilt_logs(ur5):
+        for log in spoilt_logs(arm):
             write_log(log, tmp_path / log.path)
         table = {
             "urdf": str(example_urdf("ur5_robot.urdf")),
+            "joints": list(arm.joints),
             "identification": [{"log": "run.csv"}],
             "validation": [{"log": "kept.csv"}],
             "model": {"friction": "viscous+coulomb"},
@@ -447,8 +455,8 @@ def test_a_stated_bound_that_binds_makes_it_usable(run):
     assert "they increase the torque error of shoulder_lift_joint," in finding["message"]
 
 
-def test_a_stated_bound_that_only_the_urdf_minds_is_a_note(ur5):
-    found = found_of(ur5, constraints={"total_mass": [10.0, 17.0]})
+def test_a_stated_bound_that_only_the_urdf_minds_is_a_note(arm):
+    found = found_of(arm, constraints={"total_mass": [10.0, 17.0]})
     (finding,) = [f for f in found.findings if f.code == "active_bound"]
     assert found.warnings == ()
     assert finding.severity == "note"
@@ -456,13 +464,13 @@ def test_a_stated_bound_that_only_the_urdf_minds_is_a_note(ur5):
     assert found.verdict.status == "good"
 
 
-def test_a_mass_that_is_stated_does_not_come_from_the_data(ur5):
-    found = found_of(ur5, constraints={"mass": {"forearm_link": 2.0}})
-    k = ur5.layout.names.index("forearm_link.m")
+def test_a_mass_that_is_stated_does_not_come_from_the_data(arm):
+    found = found_of(arm, constraints={"mass": {"forearm_link": 2.0}})
+    k = arm.layout.names.index("forearm_link.m")
     assert (found.standard[k], found.sources[k]) == (pytest.approx(2.0), "prior")
 
 
-def test_a_wrong_total_mass_makes_the_joints_usable_that_it_costs(run, ur5):
+def test_a_wrong_total_mass_makes_the_joints_usable_that_it_costs(run, arm):
     _, result, again = run(constraints={"total_mass": 5.0})
     assert result["verdict"]["status"] == again["status"] == "usable"
     lift = result["verdict"]["per_joint"]["shoulder_lift_joint"]
@@ -472,21 +480,21 @@ def test_a_wrong_total_mass_makes_the_joints_usable_that_it_costs(run, ur5):
     assert all("the constraints in [estimator] (total_mass)" in text for text in costs)
     assert "physics and data disagree" in lift["reasons"][-1]
     assert again["per_joint"]["shoulder_lift_joint"]["status"] == "usable"
-    found = found_of(ur5, constraints={"total_mass": 5.0}, ignore=["constraint_costs"])
+    found = found_of(arm, constraints={"total_mass": 5.0}, ignore=["constraint_costs"])
     assert "constraint_costs" not in {doubt.code for doubt in found.warnings}
 
 
-def test_spikes_in_torques_do_not_condemn_a_robust_fit(ur5):
+def test_spikes_in_torques_do_not_condemn_a_robust_fit(arm):
     def spoil(log):
         tau = log.tau.copy()
         if log.path == "run.csv":
             tau[[200, 400, 600], 2] += 1000.0
         return replace(log, tau=tau)
 
-    plain = found_of(ur5, spoil)
+    plain = found_of(arm, spoil)
     assert "has spikes of up to" in plain.verdict.reasons[0]
     assert plain.log_errors
-    robust = found_of(ur5, spoil, robust="tukey")
+    robust = found_of(arm, spoil, robust="tukey")
     assert robust.verdict.status == "good", robust.verdict.reasons
     assert robust.warnings == robust.log_errors == ()
 

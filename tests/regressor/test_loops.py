@@ -412,7 +412,7 @@ def test_online_identification_refuses_loops(bars):
         InstantRegressor(bars, np.arange(3))
 
 
-def motion_of(bars, pi, duration, step=2e-3):
+def motion_of(bars, pi, duration, step):
     """Return time, positions and torques of a simulated motion of the crank."""
     phase, rates = np.array([0.3, 2.0, 4.0]), 2 * np.pi * np.array([0.5, 1.1, 2.3])
     size = np.array([0.7, 0.4, 0.15])
@@ -430,7 +430,7 @@ def motion_of(bars, pi, duration, step=2e-3):
 
 def test_a_four_bar_is_identified_from_the_log_of_its_crank(bars, rng, tmp_path):
     pi = some_parameters(bars, rng)
-    t, q, tau = motion_of(bars, pi, 2.4)
+    t, q, tau = motion_of(bars, pi, 2.4, step=4e-3)
     log = Log(t, q[:, :1], tau[:, :1], ("drive",))
     settings = SignalSettings(cutoff=40.0, trim=0.1, min_velocity=0.05)
     found = identify(bars, log, signals=settings, estimator="wls", friction="none", doctor=False)
@@ -444,7 +444,7 @@ def test_a_four_bar_is_identified_from_the_log_of_its_crank(bars, rng, tmp_path)
 
 
 def test_a_file_is_read_in_pieces_as_in_memory(bars, tmp_path):
-    t = np.linspace(0.0, 2.0, 200)
+    t = np.linspace(0.0, 1.2, 120)
     drive = np.sin(2 * t)[:, None]
     write_log(Log(t, drive, 0.1 * drive, ("drive",)), tmp_path / "crank.csv")
     named = {"passive": bars.passive}
@@ -452,7 +452,7 @@ def test_a_file_is_read_in_pieces_as_in_memory(bars, tmp_path):
     assert whole.joints == ("drive",)
     layout, table = lay_out(tmp_path / "crank.csv", bars.joints, **named)
     signals = SignalSettings(cutoff=5.0)
-    in_pieces = survey_log(layout, table, bars, signals, length=70)
+    in_pieces = survey_log(layout, table, bars, signals, length=45)
     in_memory = hold_log(bars, whole, signals).whole.trajectory
     parts = [piece.read().trajectory for piece in in_pieces.pieces]
     assert len(parts) == 3

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers.fitting import fit
 from helpers.synthetic import exact_log, truth
 
 from robotid.advice.steps import Origin
@@ -79,12 +80,12 @@ def term(request):
 
 
 @pytest.fixture
-def model(term):
+def model(term, ur5):
     couplings = (MOTOR,) if term.is_shared else ()
-    path, drives = example_urdf("ur5_robot.urdf"), [*JOINTS, *(c.name for c in couplings)]
+    drives = [*JOINTS, *(c.name for c in couplings)]
     is_common = term.name in TERMS
     model = RobotModel.from_urdf(
-        path, joints=JOINTS, terms=(term.name,) if is_common else (), couplings=couplings,
+        ur5.tree, joints=JOINTS, terms=(term.name,) if is_common else (), couplings=couplings,
         own_terms={} if is_common else {drive: (term,) for drive in drives},
     )  # fmt: skip
     return model.with_reference(truth(model)) if term.has_state else model
@@ -208,14 +209,15 @@ def test_a_simulated_robot_is_identified(model, rng):
     pi = truth(model)
     log = simulate(model, pi, random_fourier(model, rng), rate=200.0, duration=3.0, rng=rng)
     signals = SignalSettings(cutoff=20.0)
-    found = identify(model, [log], signals=signals, estimator="wls", doctor=False)
+    found = fit(model, [log], signals=signals, estimator="wls")
     beta = found.mapping.to_base(pi)
     assert np.linalg.norm(found.base - beta) < 0.02 * np.linalg.norm(beta)
 
 
 def test_identification_recovers_it_and_the_table_shows_it(model, term, rng):
     pi = truth(model)
-    found = identify(model, [log_of(model, pi, rng)], signals=EXACT, estimator="wls", doctor=False)
+    own = {"signals": EXACT, "estimator": "wls", "friction": "none", "doctor": False}
+    found = identify(model, [log_of(model, pi, rng)], **own)
     np.testing.assert_allclose(found.base, found.mapping.to_base(pi), atol=1e-6)
     drives = drive_part(model)
     if not (term.is_inertia or term.name.startswith("sin")):  # those may come in a group
