@@ -402,7 +402,7 @@ def test_a_delay_at_its_bound_leaves_the_warning_of_a_slow_command(found):
 def test_friction_by_position_is_found_where_it_is_and_nowhere_else(leg):
     robot, rng = leg[0], np.random.default_rng(3)
     model, n = robot.model, 3
-    t = np.arange(1000) / 250.0
+    t = np.arange(750) / 250.0
     q_ref = multisine(t, robot.middle, robot.reach, rng)
     centre = float(robot.middle[2])
     plain = (Viscous(), Coulomb(), Offset())

@@ -84,8 +84,9 @@ def spoilt(table, tmp_path_factory):
 
 @pytest.mark.parametrize("name", ROBOTS)
 def test_a_clean_log_gives_no_more_than_notes(name):
-    log = controlled_log(name, 1, rate=50.0, duration=10.0)
-    findings = diagnose(robot(name), [log], [], SIGNALS)
+    # that of the UR5 is there, for others to be spoilt
+    short = {"rate": 50.0, "duration": 10.0} if name != "ur5" else {}
+    findings = diagnose(robot(name), [controlled_log(name, 0, **short)], [], SIGNALS)
     assert loud(findings) == set()
     assert {"rate", "noise", "excitation"} <= {f.code for f in findings}
 
