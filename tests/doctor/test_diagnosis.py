@@ -85,8 +85,8 @@ def spoilt(table, tmp_path_factory):
 @pytest.mark.parametrize("name", ROBOTS)
 def test_a_clean_log_gives_no_more_than_notes(name):
     # that of the UR5 is there, for others to be spoilt
-    short = {"rate": 50.0, "duration": 10.0} if name != "ur5" else {}
-    findings = diagnose(robot(name), [controlled_log(name, 0, **short)], [], SIGNALS)
+    how = {} if name == "ur5" else {"rate": 50.0, "duration": 7.0}
+    findings = diagnose(robot(name), [controlled_log(name, 0, **how)], [], SIGNALS)
     assert loud(findings) == set()
     assert {"rate", "noise", "excitation"} <= {f.code for f in findings}
 
@@ -235,7 +235,7 @@ def test_motor_side_columns_are_refused_by_name(recordings, monkeypatch):
 @pytest.fixture(scope="module")
 def wrong_sign(ur5, tmp_path_factory):
     path = tmp_path_factory.mktemp("doctor") / "run.csv"
-    table = table_of(clean_log(ur5, 0, duration=10.0))
+    table = table_of(clean_log(ur5, 0, duration=10.0, rate=50.0))
     write_columns(CASES["one torque negated"].change(table), path)
     return str(path)
 
