@@ -467,9 +467,9 @@ def test_a_shape_beyond_its_bounds_is_named(plain):
     assert f"elbow_joint: tanh.speed is {shape.value:.3g} rad/s, the bound" in said.message
 
 
-def test_validation_beyond_what_was_seen_is_named_and_has_no_say(plain, cases):
+def test_validation_beyond_what_was_seen_is_named_and_has_no_say(plain, cases, chosen_in):
     true, pi, log = cases("stribeck")
-    alone = found_in(plain, [log])
+    alone = chosen_in("stribeck")
     fast = driven_log(true, pi, 8, reach=QUANTILE, speed=1.8)
     found = found_in(plain, [log], validation=[fast])
     assert chosen(found) == chosen(alone) == {ELBOW: ("stribeck",)}
