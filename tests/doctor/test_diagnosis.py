@@ -148,7 +148,7 @@ def test_delays_are_measured_and_corrected_only_on_request(spoilt):
 
 
 def test_a_motion_recorded_twice_is_no_validation():
-    model, noise = robot("ur5"), np.array([0.5, 0.5, 0.25, 0.1, 0.1, 0.05])
+    model, noise = arm(), np.array([0.5, 0.25, 0.1])
 
     def recorded(seed, rate):
         rng = np.random.default_rng(seed)
