@@ -460,10 +460,8 @@ def test_a_term_stands_for_what_the_doctor_guessed_of_its_torque(three):
     ("effect", "seed", "size", "guess"),
     [("counterbalance", 5, 3.0, "current_for_torque"), ("periodic", 1, 2.0, "counterbalance")],
 )
-def test_a_joint_that_follows_its_position_is_no_other_robot(
-    ur5, four, effect, seed, size, guess
-):
-    model = ur5 if guess == "current_for_torque" else four  # of most joints
+def test_a_joint_that_follows_its_position_is_no_other_robot(ur5, four, effect, seed, size, guess):
+    model = ur5 if guess == "current_for_torque" else four  # guessed of six only
     logs = [log_with(model, seed, effect, 1, part=k, size=size) for k in (0, 1)]
     guesses = check_logs(model, logs[:1], validation=logs[1:])
     assert guess in {finding.code for finding in guesses}

@@ -16,7 +16,7 @@ from robotid.urdf_audit.inspection import inspect_urdf
 
 AUDIT, COUNTS = DOCS / "evidence/urdf_audit.md", DOCS / "evidence/base_counts.md"
 WRITES = {"ROBOTID_WRITE_AUDIT", "ROBOTID_WRITE_COUNTS"} & set(os.environ)
-#: Take three quarters of the time, and have no finding that no other robot has. All are inspected to
+#: Take most of the time, and have no finding that no other robot has. All are inspected to
 #: write the tables; every robot is opened in tests/robot/test_model.py.
 LARGE = {
     "tiago_dual", "a1", "alex_nub_hands", "tiago", "so101", "talos_full_v2", "tiago_pro", "pr2",
