@@ -16,13 +16,12 @@ from robotid.urdf_audit.inspection import inspect_urdf
 
 AUDIT, COUNTS = DOCS / "evidence/urdf_audit.md", DOCS / "evidence/base_counts.md"
 WRITES = {"ROBOTID_WRITE_AUDIT", "ROBOTID_WRITE_COUNTS"} & set(os.environ)
-#: Take most of the time, and have no finding that no other robot has. All are inspected to
+#: Take two thirds of the time, and have no finding that no other robot has. All are inspected to
 #: write the tables; every robot is opened in tests/robot/test_model.py.
 LARGE = {
     "tiago_dual", "a1", "alex_nub_hands", "tiago", "so101", "talos_full_v2", "tiago_pro", "pr2",
     "g1_29dof_with_hand_rev_1_0", "b1-z1", "z1", "g1_29dof_rev_1_0", "anymal-kinova", "kinova",
     "icub", "romeo_laas_small", "talos_full_v2_box", "alexander_v1.lowerBodyOnly",
-    "anymal", "talos_reduced", "talos_reduced_box",
 }  # fmt: skip
 
 
@@ -30,7 +29,7 @@ LARGE = {
 def inspections():
     """The inspection of example robots by path; robots of a family share meshes."""
     chosen = [path for path in example_urdfs() if WRITES or path.stem not in LARGE]
-    assert WRITES or len(chosen) == 69 - len(LARGE) - 1  # two are named anymal
+    assert WRITES or len(chosen) == 69 - len(LARGE)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(geometry, "read_surfaces", lru_cache(128)(geometry.read_surfaces))
         return {path: inspect_urdf(path) for path in chosen}
