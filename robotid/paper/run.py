@@ -29,7 +29,7 @@ from robotid.paper.study import (
     random_runs,
     study_model,
 )
-from robotid.paper.svg import STYLE, svg_element
+from robotid.paper.svg import STYLE, svg_element, svg_file
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.torque import joint_torque_regressor
 from robotid.robot.model import RobotModel
@@ -218,8 +218,9 @@ def _write(
             for name, (caption, figure) in figures.items():
                 figure.savefig(beside / f"{name}.png", dpi=150, facecolor="white")
                 figure.set_layout_engine("none")  # the layout is complete
-                figure.savefig(beside / f"{name}.svg", facecolor="white", metadata={"Date": None})
-                shown[name] = (caption, svg_element(figure, caption, name))
+                svg = svg_file(figure)
+                (beside / f"{name}.svg").write_text(svg, encoding="utf-8")
+                shown[name] = (caption, svg_element(svg, caption, name))
         (beside / "planar_2r.urdf").write_text(urdf_text(), encoding="utf-8")
         _write_replay(arm, study, beside / "replay.html")
         (beside / "paper.html").write_text(paper_page(content, shown), encoding="utf-8")

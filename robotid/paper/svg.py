@@ -9,10 +9,12 @@ __all__ = [
     "INK",
     "STYLE",
     "svg_element",
+    "svg_file",
 ]
 
 #: Colour of text and axes; in a page it becomes the colour of the page's text.
 INK = "#010101"
+_WHITE = "#ffffff"
 #: Matplotlib's settings for every plot.
 STYLE: dict[Any, Any] = {
     "axes.edgecolor": INK,
@@ -36,23 +38,32 @@ STYLE: dict[Any, Any] = {
 }
 
 
-def svg_element(figure: Any, title: str, key: str) -> str:  # noqa: ANN401
-    """Return a figure as an SVG element of a page.
+def svg_file(figure: Any) -> str:  # noqa: ANN401
+    """Return a figure as an SVG file, with a white background behind transparent axes.
 
     Args:
         figure: A figure of Matplotlib, drawn in ``STYLE``.
-        title: Its description, for screen readers.
-        key: Prefix of its ids, unique on the page.
     """
     import matplotlib
 
     stream = StringIO()
-    nothing = dict.fromkeys(("Creator", "Date", "Format", "Type"))
     with matplotlib.rc_context(STYLE):
-        figure.savefig(stream, format="svg", transparent=True, metadata=nothing)
-    svg: str = stream.getvalue()
-    svg = svg[svg.index("<svg") :]
-    svg = re.sub(r"<metadata>.*?</metadata>", "", svg, flags=re.DOTALL)
+        figure.savefig(
+            stream, format="svg", transparent=True, facecolor=_WHITE, metadata={"Date": None}
+        )
+    return stream.getvalue()
+
+
+def svg_element(file: str, title: str, key: str) -> str:
+    """Return an SVG file of ``svg_file`` as an element of a page, without the background.
+
+    Args:
+        file: Its content.
+        title: Its description, for screen readers.
+        key: Prefix of its ids, unique on the page.
+    """
+    svg = file[file.index("<svg") :].replace(f"fill: {_WHITE}", "fill: none", 1)
+    svg = re.sub(r" <metadata>.*?</metadata>\n", "", svg, flags=re.DOTALL)
     svg = re.sub(r' xmlns(:\w+)?="[^"]*"', "", svg).replace("xlink:href", "href")
     # ids are unique in a page, not only in a figure
     svg = re.sub(r'(\bid="|href="#|url\(#)', rf"\g<1>{key}-", svg)

@@ -49,6 +49,7 @@ def files(ur5, tmp_path_factory):
             columns[f"current_{joint}"] = log.tau[:, j] / GAINS[j]
         write_columns(columns, folder / f"{name}_currents.csv")
     table = {"urdf": ARM, "identification": [{"log": "bare.csv"}], "estimator": {"name": "wls"}}
+    table["output"] = {"report": False}
     run_job(job_from_settings(table, "job.toml", folder), folder / "out")
     return folder
 

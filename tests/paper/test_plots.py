@@ -10,7 +10,7 @@ import pytest
 from robotid.paper.errata import EnergyDrift, energy_drift
 from robotid.paper.plots import _energy_figure, _trajectories_figure, paper_figures
 from robotid.paper.study import MODELS, PaperSettings, paper_arm, random_runs, study_model
-from robotid.paper.svg import INK, svg_element
+from robotid.paper.svg import INK, svg_element, svg_file
 from robotid.simulation.motions import ProgramMotion
 
 
@@ -110,7 +110,8 @@ def test_iterations_are_counted_and_energies_are_in_percent():
 
 def test_an_svg_element_is_transparent_and_has_ids_of_its_own():
     drift = EnergyDrift(np.linspace(0.0, 1.0, 5), {"one": np.linspace(0.0, 0.1, 5)})
-    shown = svg_element(_energy_figure(drift), "one < two", "key")
+    file = svg_file(_energy_figure(drift))
+    shown = svg_element(file, "one < two", "key")
     root = ElementTree.fromstring(shown)
     assert (root.tag, root.get("viewBox")) == ("svg", f"0 0 {9.3 * 72:g} {2.8 * 72:g}")
     assert root.get("width") is root.get("height") is None
@@ -124,6 +125,10 @@ def test_an_svg_element_is_transparent_and_has_ids_of_its_own():
     # text and axes have the colour of the page's text, and nothing is behind them
     assert "currentColor" in shown
     assert not re.search(f"{INK}|#ffffff|xmlns|metadata", shown)
+    # in the file, the white background is behind everything
+    first, *others = re.findall(r'<path d="[^"]*?" style="fill: [^"]*"', file.replace("\n", ""))
+    assert first == '<path d="M 0 201.6 L 669.6 201.6 L 669.6 0 L 0 0 z" style="fill: #ffffff"'
+    assert not any("#ffffff" in other for other in others)
 
 
 def test_axes_have_their_unit_lines_their_name_and_figures_their_size(figures):

@@ -1,5 +1,7 @@
 """The closed-loop procedure (14)-(25), on the paper's arm and on a UR5 under gravity."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 from helpers.base_dynamics import BaseDynamics
@@ -82,8 +84,8 @@ def test_with_22_to_the_letter_prx_is_zero_and_the_estimate_never_moves():
     assert literal.prx.max() < 1e-10
     np.testing.assert_array_equal(literal.NA, [1])
     np.testing.assert_array_equal(literal.estimates[-1], [P4 / 2])
-    ours = run(settings=short(3), offset=DEGREE)
-    assert ours.prx.min() > 10.0  # 27 in the third run
+    ours = twelve_iterations("corrected")
+    assert ours.prx[:3, 0].min() > 10.0  # 27 in the third run
     assert ours.relative_error(P4)[1, 0] < 0.4
 
 
@@ -101,6 +103,16 @@ def test_a_ur5_under_gravity_tracks_with_its_true_base_parameters(gentle_ur5):
 # --- towards the true parameters --------------------------------------------------------------
 
 
+@cache
+def twelve_iterations(form):
+    """Return the courses that begin one degree off the program, and exactly on it."""
+    dynamics, P = PlanarDynamics(form), P4 if form == "corrected" else planar_2r.PAPER_PARAMETERS
+    return run_procedure(
+        dynamics, LinearPlant(dynamics, P), MOTION, np.tile(P / 2, (2, 1)),
+        settings=LoopSettings(iterations=12), offset=np.array([DEGREE, 0.0 * DEGREE]),
+    )  # fmt: skip
+
+
 @pytest.mark.parametrize(
     ("form", "P", "left"),
     [
@@ -110,10 +122,7 @@ def test_a_ur5_under_gravity_tracks_with_its_true_base_parameters(gentle_ur5):
     ],
 )
 def test_the_recursion_finds_the_papers_parameters(form, P, left):
-    dynamics = PlanarDynamics(form)
-    plant, settings = LinearPlant(dynamics, P), LoopSettings(iterations=12)
-    history = run_procedure(dynamics, plant, MOTION, P[None] / 2, settings=settings, offset=DEGREE)
-    error = history.relative_error(P)[:, 0]
+    error = twelve_iterations(form).relative_error(P)[:, 0]
     assert error[0] == 0.5
     assert 0.34 < error[1] < 0.40  # the reading has 0.39, 0.15 and, after 100, 1e-5
     assert 0.10 < error[10] < 0.16
@@ -122,7 +131,7 @@ def test_the_recursion_finds_the_papers_parameters(form, P, left):
 
 
 def test_from_the_program_exactly_the_same_procedure_is_slow():
-    error = run(settings=LoopSettings(iterations=10)).relative_error(P4)[:, 0]
+    error = twelve_iterations("corrected").relative_error(P4)[:, 1]
     assert error[10] > 0.22  # 0.25; one degree beside the program it is 0.13
 
 
@@ -156,8 +165,8 @@ def test_one_update_never_raises_the_error(rng):
 
 
 def test_prx_falls_as_the_estimate_comes_near():
-    history = run(settings=LoopSettings(iterations=7), offset=DEGREE)
-    assert (np.diff(history.prx[2:, 0]) < 0).all()
+    prx = twelve_iterations("corrected").prx[2:7, 0]
+    assert (np.diff(prx) < 0).all()
 
 
 def test_na_is_the_iteration_in_which_prx_is_zero():
@@ -220,10 +229,10 @@ def test_the_closed_form_arm_and_its_urdf_are_one_plant(tmp_path):
 def test_the_estimate_stays_in_its_bounds():
     bounds = Bounds(np.array([0.0, 0.0, 0.0, 0.0]), np.array([15.0, 4.0, 10.0, 1.0]))
     history = run(settings=short(3, bounds=bounds), offset=DEGREE)
-    free = run(settings=short(3), offset=DEGREE)
+    free = twelve_iterations("corrected").estimates[:4, 0]
     assert (history.estimates >= 0).all()
     assert (history.estimates <= bounds.upper).all()
-    assert free.estimates.min() < -1.0  # p5 goes there without them
+    assert free.min() < -1.0  # p5 goes there without them
 
 
 def test_a_disturbance_keeps_the_estimate_from_settling(rng):
@@ -280,7 +289,7 @@ def test_a_constant_torque_is_a_disturbance_too():
 
 def test_noise_is_the_same_for_the_same_seed():
     first, again, other = (
-        run(settings=short(2, eps2=1.0), offset=DEGREE, influences=noise(seed))
+        run(settings=short(2, updates=40, eps2=1.0), offset=DEGREE, influences=noise(seed))
         for seed in (1, 1, 2)
     )
     np.testing.assert_array_equal(first.estimates, again.estimates)

@@ -228,11 +228,11 @@ def test_friction_is_taken_up_as_its_equation_says(tmp_path, term, rate):
     assert np.abs(out.q[:, 0] - exact).max() > 1e-3
 
 
-def differences(model, loops, log, change, h):
+def differences(robot, loops, windows, change, h):
     """Return the derivative of positions and speeds by central differences of fourth order."""
 
     def motion(x):
-        out = rolled(model, change(loops, x), log)
+        [out] = robot.roll_out(change(loops, x), windows)
         return np.stack([out.q, out.v])
 
     near, far = ([motion(s * x) for s in (1, -1)] for x in (h, 2 * h))
@@ -245,9 +245,9 @@ def differences(model, loops, log, change, h):
 )
 def test_sensitivities_are_those_of_differences(request, name, rate, terms):
     model = request.getfixturevalue(name)
-    robot, log = ClosedLoopRobot(model), commanded(model, 0.12)
+    robot, windows = ClosedLoopRobot(model), cut_windows(commanded(model, 0.12), np.inf, 0.0)
     size = 1.0 if name == "legs" else 30.0
-    n, kinds = len(model.joints), ClosedLoopRobot(model).kinds
+    n, kinds = len(model.joints), robot.kinds
     values = VALUES if terms is TERMS else (0.1, 0.05, 0.1, 0.15, 0.1)
     values = size * np.array([*values[:-1], values[-1] / size])
     loops = loops_of(
@@ -279,11 +279,10 @@ def test_sensitivities_are_those_of_differences(request, name, rate, terms):
         columns.append((kinds["body"], joint, 10 * body + k))
         changes.append(by("bodies", (body, k)))
     directions = np.tile(np.eye(10), (n, 1))
-    [out] = robot.roll_out(
-        loops, cut_windows(log, np.inf, 0.0), columns, directions, with_speeds=True
-    )
+    [out] = robot.roll_out(loops, windows, columns, directions, with_speeds=True)
     assert len(out.slopes) == (1 if name == "ur5" else 2)
-    np.testing.assert_array_equal(out.q, rolled(model, loops, log).q)
+    [plain] = robot.roll_out(loops, windows)
+    np.testing.assert_array_equal(out.q, plain.q)
     worst, unseen, seen = {}, set(), set()
     for joints, places, slopes in out.slopes:
         k = len(joints)
@@ -291,7 +290,7 @@ def test_sensitivities_are_those_of_differences(request, name, rate, terms):
             size = np.abs(slopes[:, :k, c]).max()
             # friction turns over 1e-5 rad/s, that with a memory at once: no step may be wider
             h = 3e-8 / max(size, 1e-3 if terms is TERMS else 1e-2)
-            exact = differences(model, loops, log, changes[p], h)
+            exact = differences(robot, loops, windows, changes[p], h)
             assert not np.delete(exact, joints, axis=2).any(), "parts move by themselves"
             scale = np.abs(exact[0]).max()
             if scale < 1e-9:

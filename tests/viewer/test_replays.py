@@ -45,6 +45,12 @@ def page(arm, motion, tmp_path_factory):
     return path.read_text(encoding="utf-8")
 
 
+@pytest.fixture(autouse=True)
+def unseen(monkeypatch):
+    """What the robot looks like, which takes seconds to be thinned, is left out."""
+    monkeypatch.setattr("robotid.viewer.scene._thinned", lambda files, _: (None,) * len(files))
+
+
 def world_poses(nodes, moved):
     """Return the world pose of every node but the first, as the page's script poses them."""
     poses = [pin.SE3.Identity()]
@@ -356,10 +362,10 @@ def test_a_notebook_shows_the_page_in_a_frame_that_reaches_nothing(arm, motion):
 
 
 def test_a_long_motion_of_six_joints_stays_below_17_mb(ur5, tmp_path):
-    """Those of seven joints below 20 MB; the meshes of this arm were thinned before."""
+    """Those of seven joints below 20 MB; the meshes of this arm, left out, add 0.27 MB."""
     t = np.arange(200_000) / 100.0
     q = np.sin(t)[:, None] * np.ones(6)
-    assert replay(ur5, t, q).write(tmp_path / "r.html").stat().st_size < 17e6
+    assert replay(ur5, t, q).write(tmp_path / "r.html").stat().st_size < 17e6 - 0.3e6
 
 
 def test_no_process_no_socket_and_no_output_is_left(arm, motion, tmp_path, capfd, monkeypatch):
