@@ -135,7 +135,12 @@ def test_the_written_urdf_predicts_what_the_fit_predicts(identified, logs, capsy
         (
             ("friction", "elbow_joint", "data_range", "q"),
             [0.1],
-            "friction.elbow_joint.data_range.q has 1 numbers, wanted 2",
+            "friction.elbow_joint.data_range.q has 1 numbers, wanted 2: the smallest, the largest",
+        ),
+        (
+            ("friction", "elbow_joint", "data_range", "q"),
+            [0.1, 0.2, 0.3],
+            "friction.elbow_joint.data_range.q has 3 numbers, wanted 2",
         ),
     ],
 )
