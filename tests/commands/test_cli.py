@@ -13,6 +13,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from helpers.paths import URDF as PLANAR
+from helpers.replay_data import leave_out_meshes
 from helpers.synthetic import exact_log, truth
 
 from robotid.cli import main
@@ -425,8 +426,7 @@ def test_inspect_of_an_unusable_urdf_says_why(capsys, tmp_path):
 def test_demo_runs_from_nothing_and_finds_the_truth(tmp_path, capsys, monkeypatch):
     out, stages = tmp_path / "demo", []
     monkeypatch.setattr("robotid.commands.demo._PERIOD", 7.0)
-    # what the robot looks like takes seconds to be thinned
-    monkeypatch.setattr("robotid.viewer.scene._thinned", lambda files, _: (None,) * len(files))
+    leave_out_meshes(monkeypatch)
     shown = nullcontext(lambda *stage: stages.append(stage))
     monkeypatch.setattr("robotid.cli.demo.terminal_progress", lambda: shown)
     assert main(["demo", "--out", str(out)]) == 0

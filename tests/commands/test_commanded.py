@@ -3,7 +3,7 @@ from contextlib import redirect_stdout
 from io import StringIO
 
 import pytest
-from helpers.replay_data import shown
+from helpers.replay_data import leave_out_meshes, shown
 
 from robotid.cli import main
 from robotid.cli.identify import show_result
@@ -54,8 +54,7 @@ def found(job, tmp_path_factory):
     """The folder of its results, and what was printed."""
     folder, said = tmp_path_factory.mktemp("found") / "out", StringIO()
     with redirect_stdout(said), pytest.MonkeyPatch.context() as patch:
-        # what the robot looks like takes seconds to be thinned
-        patch.setattr("robotid.viewer.scene._thinned", lambda files, _: (None,) * len(files))
+        leave_out_meshes(patch)
         assert main(["identify", str(job), "--out", str(folder), "--json"]) == 0
     return folder, said.getvalue()
 

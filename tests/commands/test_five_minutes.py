@@ -7,6 +7,7 @@ from io import StringIO
 
 import pytest
 from helpers.paths import ROOT
+from helpers.replay_data import leave_out_meshes
 
 from robotid.cli import main
 
@@ -33,8 +34,7 @@ def user(files, done, tmp_path, monkeypatch):
     for file in files.iterdir():
         (tmp_path / file.name).write_bytes(file.read_bytes())
     monkeypatch.chdir(tmp_path)
-    # what the robot looks like takes seconds to be thinned
-    monkeypatch.setattr("robotid.viewer.scene._thinned", lambda files, _: (None,) * len(files))
+    leave_out_meshes(monkeypatch)
 
     class Quick(User):
         def run(self, words):

@@ -12,7 +12,7 @@ import pytest
 from helpers.commanded_results import drive_entries, written_result
 from helpers.mujoco_plant import plant, recorded
 from helpers.paths import ROOT
-from helpers.replay_data import shown
+from helpers.replay_data import leave_out_meshes, shown
 from helpers.synthetic import exact_log, payload_log, truth
 
 from robotid.cli import main
@@ -134,8 +134,7 @@ def test_identify_writes_the_replay_that_its_report_links_to(tmp_path, capsys):
 
 
 def test_the_urdf_with_drives_is_rnea_and_drive_terms(identified, monkeypatch):
-    # what the robot looks like is not asked for, and takes seconds to be thinned
-    monkeypatch.setattr("robotid.viewer.scene._thinned", lambda files, _: (None,) * len(files))
+    leave_out_meshes(monkeypatch)
     data = shown(replay_identified(identified).html)
     torques, (evaluation, *_) = data["torques"], identified.validation
     assert torques["labels"] == ["measured", "identified", "URDF + drives", "URDF"]

@@ -24,3 +24,8 @@ def unpacked(value):
     if isinstance(value, dict):
         return {key: unpacked(x) for key, x in value.items()}
     return [unpacked(x) for x in value] if isinstance(value, list) else value
+
+
+def leave_out_meshes(patch):
+    """Leave out of pages what a robot looks like, which takes seconds to be thinned."""
+    patch.setattr("robotid.viewer.scene._thinned", lambda files, _: (None,) * len(files))

@@ -4,7 +4,7 @@ import re
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.replay_data import shown
+from helpers.replay_data import leave_out_meshes, shown
 
 from robotid.exceptions import DataError, SettingsError
 from robotid.robot.model import RobotModel
@@ -48,7 +48,7 @@ def page(arm, motion, tmp_path_factory):
 @pytest.fixture(autouse=True)
 def unseen(monkeypatch):
     """What the robot looks like, which takes seconds to be thinned, is left out."""
-    monkeypatch.setattr("robotid.viewer.scene._thinned", lambda files, _: (None,) * len(files))
+    leave_out_meshes(monkeypatch)
 
 
 def world_poses(nodes, moved):
