@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from robotid.online.tracking import Observer, Track, track
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.model import RobotModel
 from robotid.versions import __version__
-from robotid.viewer.replays import live_page
+from robotid.viewer.replays import gap_marks, live_page
 from robotid.viewer.scene import coordinates
 from robotid.viewer.server import LivePage
 
@@ -186,6 +187,7 @@ class _LiveFeed:
     def __init__(self, live: LivePage, model: RobotModel, log: Log, speed: float) -> None:
         self._live, self._model, self._log, self._speed = live, model, log, speed
         self._due, self._marks = -np.inf, 0
+        self._gaps = gap_marks(log.t)  # those that are not sent yet
         self._started = time.monotonic()
 
     def __call__(self, k: int, identifier: OnlineIdentifier) -> None:
@@ -193,6 +195,8 @@ class _LiveFeed:
         if t < self._due and k < len(self._log.t) - 1:  # the page ends at the last pose
             return
         self._due = t + 1.0 / _RATE
+        while self._gaps and self._gaps[0].t < t:
+            self._live.send({"mark": asdict(self._gaps.pop(0))})
         if self._speed > 0:
             ahead = (t - start) / self._speed - (time.monotonic() - self._started)
             time.sleep(max(ahead, 0.0))

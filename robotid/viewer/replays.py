@@ -25,7 +25,7 @@ from robotid.viewer.page import page
 from robotid.viewer.scene import Scene, coordinates, mass_marks, packed, robot_scene
 from robotid.viewer.unexplained import residual_levels
 
-__all__ = ["Bands", "Mark", "Replay", "Torques", "live_page", "replay"]
+__all__ = ["Bands", "Mark", "Replay", "Torques", "gap_marks", "live_page", "replay"]
 
 _KEYS = 500_000  # numbers of a motion: about 3 MB
 _POINTS = 1_000_000  # numbers of all plots: about 6 MB
@@ -193,7 +193,7 @@ def replay(
         if len(require_each(own, np.ndarray, f"ghost {label!r}", "two arrays, t and q")) != 2:
             raise SettingsError(f"ghost {label!r} has {len(own)} arrays, wanted two, t and q")
         _check(*own, rate)
-    gaps = [Mark(float(t[k]), f"gap of {t[k + 1] - t[k]:.2f} s", "gap") for k in _gaps(t)]
+    gaps = gap_marks(t)
     start = float(t[0])
     scene = robot_scene(model)
     data = _data(
@@ -308,6 +308,15 @@ def _keyframes(t: Array, rate: float, most: int) -> Array:
     ticks = np.linspace(t[0], t[-1], count)
     rows: Array = np.unique(np.searchsorted(t, ticks, side="right") - 1)
     return rows
+
+
+def gap_marks(t: Array) -> list[Mark]:
+    """Return a mark for each gap of a recording, at the last sample before it.
+
+    Args:
+        t: Times of its samples, shape (N,) [s].
+    """
+    return [Mark(float(t[k]), f"gap of {t[k + 1] - t[k]:.2f} s", "gap") for k in _gaps(t)]
 
 
 def _gaps(t: Array) -> list[int]:

@@ -18,6 +18,7 @@ from helpers.synthetic import perfect, truth
 from PIL import Image
 
 from robotid.log_files.read import write_log
+from robotid.logs.data import Log
 from robotid.robot.model import RobotModel
 from robotid.simulation.closed_loop import Noise
 from robotid.simulation.motions import random_fourier
@@ -664,6 +665,8 @@ def test_the_live_page_follows_a_running_tracker_and_ends_on_ctrl_c(browser, pla
         planar, truth(planar), random_fourier(planar, rng, period=5.0), rng, rate=100.0,
         duration=10.0, sensors=Sensors(noise=Noise(q=2e-5, tau=0.02)), payload=load,
     )  # fmt: skip
+    kept = (log.t <= 5.0) | (log.t >= 5.6)
+    log = Log(log.t[kept], log.q[kept], log.tau[kept], planar.joints)
     write_log(log, tmp_path / "log.csv")
     words = ["track", str(planar.tree.path), "log.csv"]
     run = subprocess.Popen(
@@ -689,6 +692,15 @@ def test_the_live_page_follows_a_running_tracker_and_ends_on_ctrl_c(browser, pla
             assert "step change" in seen.page.locator("#marks").inner_text()
             # those out of sight, too: no news will draw them when they are scrolled to
             until(seen, "charts.all.every((chart) => chart.x.length > 100)")
+            assert "5.00 s: gap of 0.60 s" in seen.page.locator("#marks").inner_text()
+            drawn = seen.page.evaluate("charts.all.map(({x, ys}) => [x, ys[0]])")
+            assert len(drawn) > 2
+            for chart in drawn:  # without a line across the gap
+                x, y = np.array(chart, dtype=float)
+                assert (np.diff(x) > 0).all()
+                k = int(np.searchsorted(x, 5.0))
+                assert (x[k], np.isnan(y[k])) == (5.0, True)
+                assert 5.6 < x[k + 1] < 7.0
             assert seen.errors == []
             assert seen.requests == [f"{address}events"]
         assert (tmp_path / "out" / "track.json").is_file()

@@ -49,7 +49,8 @@ class Table { // times of the log and rows of numbers; in the page times are fro
     this.t.push(t);
     this.rows.push(row);
     if (this.t.length <= LONGEST) return;
-    const half = (_, k) => k % 2 === 0;
+    const { rows } = this;
+    const half = (_, k) => k % 2 === 0 || Number.isNaN(rows[k][0]); // gaps stay
     this.t = this.t.filter(half);
     this.rows = this.rows.filter(half);
   }

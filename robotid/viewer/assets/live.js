@@ -4,10 +4,14 @@
 let news = false;
 function take(message) {
   if (message.mark) addMark(message.mark);
+  if (message.mark?.kind === "gap" && torqueTable.t.length) { // no line across it
+    for (const table of [torqueTable, bandTable])
+      table.push(message.mark.t, table.rows[0].map(() => NaN));
+  }
   if (message.t === undefined) return;
   if (!motion.t.length) slider.min = clock.start = clock.time = data.start = message.t;
   motion.push(message.t, message.q);
-  if (message.tau) { // delayed by the filter
+  if (message.tau && message.at > bandTable.end) { // delayed by the filter; new
     const predicted = message.predicted.map((x) => (x === null ? NaN : x)); // a joint at rest
     torqueTable.push(message.at, [...message.tau, ...predicted]);
     bandTable.push(message.at, [...message.theta, ...message.std_error]);
