@@ -344,9 +344,10 @@ def _settled(
     """Return the estimate with the best initial states of the windows, and these windows.
 
     Fits of the initial states and joint steps of states and parameters alternate, until a step
-    changes no parameter by more than 0.2 standard errors. If such a step raises the residual or
-    cannot be simulated, as may happen far from the minimum, or derivatives are not exact, the
-    parameters are fitted from the best initial states.
+    changes no parameter by more than 0.2 standard errors. Joints that stick may make the steps
+    alternate without end: the change by the last one is then added to the covariance. If such a
+    step raises the residual or cannot be simulated, as may happen far from the minimum, or
+    derivatives are not exact, the parameters are fitted from the best initial states.
 
     Args:
         simulator: The simulator.
@@ -367,11 +368,11 @@ def _settled(
         if found is None or level > before + _RAISED:
             simulator = simulator.with_better_start(first)
             return simulator, estimator.fit(simulator, first)
-        change = np.abs(found.theta - estimate.theta)
+        change = found.theta - estimate.theta
         simulator, estimate = initialised, found
-        if (change <= _CHANGE * found.std_error).all():
-            break
-    return simulator, estimate
+        if (np.abs(change) <= _CHANGE * found.std_error).all():
+            return simulator, estimate
+    return simulator, replace(estimate, covariance=estimate.covariance + np.outer(change, change))
 
 
 def _check_settings(

@@ -1,0 +1,61 @@
+"""Alternation of initial states and parameters at the end of a fit."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+
+from robotid.closed_loop.fit import _SETTLING, _settled
+from robotid.estimators.estimator import Estimate
+
+COVARIANCE = np.array([[0.04, 0.01], [0.01, 0.09]])
+
+
+class Windows:
+    """Windows whose initial states are fitted; it is counted how often."""
+
+    exact = None
+
+    def __init__(self):
+        self.fitted = 0
+
+    def with_better_start(self, theta):
+        self.fitted += 1
+        return self
+
+
+@dataclass
+class Steps:
+    """An estimator with given steps of parameters and initial states together [-]."""
+
+    steps: list
+    taken: int = 0
+
+    def settle(self, simulator, estimate):
+        step, self.taken = np.array(self.steps[self.taken]), self.taken + 1
+        return replace(estimate, theta=estimate.theta + step)
+
+
+def at(theta):
+    return Estimate(np.array(theta), COVARIANCE, ("a", "b"), np.ones(2), 2, 1.0, (), True, 1, "")
+
+
+@pytest.mark.parametrize(
+    ("steps", "taken", "moved"),
+    [
+        # 0.2 standard errors are 0.04 and 0.06
+        ([[0.039, -0.059]], 1, [0.0, 0.0]),
+        ([[0.3, 0.5], [-0.041, 0.0], [0.02, -0.05]], 3, [0.0, 0.0]),
+        ([[0.3, -0.2], [-0.12, 0.3], [0.1, -0.3], [-0.13, 0.061]], 4, [-0.13, 0.061]),
+        ([[0.3, -0.2], [-0.12, 0.3], [0.1, -0.3], [0.01, 0.061]], 4, [0.01, 0.061]),
+    ],
+    ids=["at once", "after three", "never", "never, by one parameter"],
+)
+def test_steps_that_do_not_settle_are_in_the_covariance(steps, taken, moved):
+    windows, estimator = Windows(), Steps(steps)
+    simulator, found = _settled(windows, estimator, at([1.0, -2.0]))
+    assert simulator is windows
+    assert windows.fitted == estimator.taken == taken
+    np.testing.assert_allclose(found.theta, np.add([1.0, -2.0], np.sum(steps, axis=0)), rtol=1e-14)
+    np.testing.assert_allclose(found.covariance, COVARIANCE + np.outer(moved, moved), rtol=1e-14)
+    assert _SETTLING == 4
