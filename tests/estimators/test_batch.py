@@ -1,3 +1,5 @@
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from helpers.estimation import NOISE, Case, still_wrist
@@ -5,7 +7,7 @@ from helpers.fitting import identify
 from helpers.synthetic import exact_log, truth
 
 from robotid.estimators import OLS, TLS, WLS
-from robotid.estimators.batch import mixed_tls, solve_factor
+from robotid.estimators.batch import _noise, mixed_tls, solve_factor
 from robotid.exceptions import DataError, RankDeficientError
 from robotid.fitting.settings import EstimatorSettings
 from robotid.logs.settings import SignalSettings
@@ -41,6 +43,23 @@ def test_ols_is_plain_least_squares(ur5, rng):
     W, tau, _ = (np.concatenate(x) for x in zip(*case.problem.blocks(), strict=True))
     expected = np.linalg.lstsq(W, tau, rcond=None)[0]
     np.testing.assert_allclose(OLS().fit(case.problem).theta, expected, rtol=1e-9, atol=1e-11)
+
+
+def test_a_noise_level_without_a_residual_is_a_share_of_the_torque():
+    """1e-9 of its RMS, or of 1 N m at rest."""
+    freedoms = []
+
+    def noise_levels(theta, freedom):
+        freedoms.append(freedom.tolist())
+        return np.array([0.0, 0.0, theta])
+
+    squares = np.array([50.0, 0.0, 9.0])
+    factors = SimpleNamespace(
+        rows=np.array([2, 9, 1]), noise_levels=noise_levels, torque_squares=lambda: squares
+    )
+    levels = _noise(factors, 0.7, np.array([3.0, 2.5, 0.0]))
+    np.testing.assert_allclose(levels, [5e-9, 1e-9, 0.7], rtol=1e-12)
+    assert freedoms == [[1.0, 6.5, 1.0]]
 
 
 @pytest.mark.parametrize("estimator", [OLS(), WLS()])
