@@ -12,6 +12,7 @@ from robotid.estimators import OLS, WLS
 from robotid.fitting import regressor_noise
 from robotid.fitting.fit import solve_recordings
 from robotid.fitting.regressor_noise import (
+    _is_enough,
     acceleration_noise,
     find_regressor_noise,
     rounding_errors,
@@ -430,3 +431,16 @@ def test_a_finding_names_the_joints_of_coarse_steps_and_the_worst_inertial_sum(
             "share_pct": 40,
         }
     )
+
+
+def test_draws_end_when_the_shift_is_known_to_a_fifth_of_a_standard_error_or_is_negligible():
+    """Of k draws of scatter s the mean is known to s / sqrt(k); six are the most."""
+    scatter = {4: np.array([-1.0, -1.0, 1.0, 1.0]) * np.sqrt(0.75), 3: np.array([-1.0, 0.0, 1.0])}
+    for mean, spread, count, is_enough in (
+        (5.0, 0.39, 4, True), (5.0, 0.41, 4, False), (0.0, 0.41, 4, False),
+        (-0.09, 9.0, 3, True), (-0.11, 9.0, 3, False),
+    ):  # fmt: skip
+        moves = np.column_stack([np.zeros(count), mean + spread * scatter[count]])
+        assert _is_enough(moves) == is_enough
+    assert _is_enough(9.0 * np.arange(6.0)[:, None])
+    assert not _is_enough(9.0 * np.arange(5.0)[:, None])
