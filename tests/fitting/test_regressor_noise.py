@@ -444,3 +444,31 @@ def test_draws_end_when_the_shift_is_known_to_a_fifth_of_a_standard_error_or_is_
         assert _is_enough(moves) == is_enough
     assert _is_enough(9.0 * np.arange(6.0)[:, None])
     assert not _is_enough(9.0 * np.arange(5.0)[:, None])
+
+
+def test_steps_are_smoothed_over_a_period_of_the_filter_on_either_side(monkeypatch):
+    """At least over five rows; an angle is unwrapped before, the position of a slider is not."""
+    asked = []
+
+    def smooth(q, steps, width):
+        asked.append((q[:, 0].tolist(), q[:, 1].tolist(), steps, width))
+        return width
+
+    monkeypatch.setattr(regressor_noise, "smoothed", smooth)
+    monkeypatch.setattr(regressor_noise, "_shifted", lambda log, change: (log.name, change))
+    model = SimpleNamespace(joints=("a", "s"), layout=SimpleNamespace(prismatic=("s",)))
+    head = SimpleNamespace(q=np.array([[3.0, 3.0], [3.5 - 2 * np.pi, -3.0]]))
+    logs = [
+        SimpleNamespace(
+            name=k, model=model, head=head, step=0.002, signals=SimpleNamespace(cutoff=cutoff)
+        )
+        for k, cutoff in enumerate((None, 5.0))
+    ]
+    near = Recordings(model, None, logs, logs)
+    found = regressor_noise._without_steps(near, ["first", "second"])
+    assert found.fitted == [(0, 11), (1, 201)]
+    assert found.validation == ()
+    assert [steps for *_, steps, _ in asked] == ["first", "second"]
+    for angle, slider, *_ in asked:
+        np.testing.assert_allclose(angle, [3.0, 3.5])
+        assert slider == [3.0, -3.0]
