@@ -41,7 +41,7 @@ def human(urdf, *, plates=None, **options):
             {"plate": (*p.translation, *rpy)} for p, rpy in zip(plates, angles, strict=True)
         ]  # fmt: skip
     contacts = [
-        Contact(foot, "surface", PARTS, **{**x, **options})
+        Contact(foot, "surface", **{"measured": PARTS, **x, **options})
         for foot, x in zip(FEET, own, strict=True)
     ]
     return replace(on_no_ground(urdf), constraints=tuple(contacts))
@@ -380,6 +380,16 @@ def test_the_reading_with_the_smallest_force_and_moment_is_named(urdf, log, monk
         assert finding.evidence["best"] == pytest.approx(best.sizes[0])
         force, moment = best.sizes
         assert f"but only {force:.3g} N and {moment:.3g} N m if" in finding.message
+    # of b the moments remain, for which plates of whole wrenches can be stated
+    points = tuple(Contact(foot, "point", PARTS[:3]) for foot in FEET)
+    for own, is_asked in (
+        (model, True), (human(urdf, measured=PARTS[:3]), False),
+        (replace(model, constraints=points), False),
+    ):  # fmt: skip
+        every = [reading(*x) for x in [("", 0.8, 0.6, 1.0), ("b", 0.3, 0.4, 1.0)]]
+        monkeypatch.setattr(wrenches, "_readings", lambda *_, every=every: every)
+        (finding,) = check_wrenches(own, log, motion)
+        assert ("The moments remain: state the plate" in finding.message) == is_asked
 
 
 @pytest.mark.parametrize("foot", FEET)
