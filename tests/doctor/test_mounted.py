@@ -135,6 +135,8 @@ def test_segments_are_of_all_motions(ur5):
     assert segments.seconds == pytest.approx(sum(m.t[-1] - m.t[0] for m in motions))
     alone = [replace(segments, motions=[motion]).reductions for motion in motions]
     assert len(segments.reductions) == len(alone[0]) + len(alone[1])
+    # of 0.4 s, at most 24
+    assert [len(parts) for parts in alone] == [int(np.ptp(motions[0].t) / 0.4), 24]
     rows = [sum(part.samples for part in parts) for parts in (segments.reductions, *alone)]
     assert rows[0] == rows[1] + rows[2]
     squares = sum(part.squares for part in segments.reductions)
