@@ -417,6 +417,19 @@ def test_other_drive_terms_keep_the_rows_that_a_closed_chain_leaves(rng, tmp_pat
     assert np.argwhere(~first.mask).tolist() == [[20, pivot]]
     other = held.with_model(model.with_terms({"elbow": (Cubic(),)})).whole
     np.testing.assert_array_equal(other.mask, first.mask)
+    # read in pieces the torques of the bars are mixed likewise: every row has every column
+    write_log(log, tmp_path / "log.csv")
+    mapping = structural_mapping(model)
+    held, read = (
+        Recordings(model, mapping, [own]).problem()
+        for own in (held, long_log(model, tmp_path / "log.csv", settings, length=15))
+    )
+    assert read.is_projected
+    np.testing.assert_array_equal(read.support, held.support)
+    for blocks in zip(
+        *(map(np.concatenate, zip(*x.blocks(), strict=True)) for x in (held, read)), strict=True
+    ):
+        np.testing.assert_allclose(*blocks, atol=1e-9)
 
 
 def test_the_temperature_of_a_joint_is_the_mean_of_the_rows_read():
