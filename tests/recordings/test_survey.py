@@ -426,10 +426,9 @@ def test_other_drive_terms_keep_the_rows_that_a_closed_chain_leaves(rng, tmp_pat
     )
     assert read.is_projected
     np.testing.assert_array_equal(read.support, held.support)
-    for blocks in zip(
-        *(map(np.concatenate, zip(*x.blocks(), strict=True)) for x in (held, read)), strict=True
-    ):
-        np.testing.assert_allclose(*blocks, atol=1e-9)
+    rows = [[np.concatenate(x) for x in zip(*own.blocks(), strict=True)] for own in (held, read)]
+    for one, other in zip(*rows, strict=True):
+        np.testing.assert_allclose(other, one, atol=1e-9)
 
 
 def test_the_temperature_of_a_joint_is_the_mean_of_the_rows_read():
