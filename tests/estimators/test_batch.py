@@ -230,3 +230,21 @@ def test_what_rows_leave_open_stays_at_the_prior_by_the_size_of_the_columns(rng)
     np.testing.assert_allclose(found.theta, prior + inverse @ (tau - W @ prior) / scale)
     wanted = inverse @ inverse.T / np.outer(scale, scale)
     np.testing.assert_allclose(found.covariance, wanted, atol=1e-12 * wanted.max())
+
+
+def test_parameters_that_are_barely_determined_need_no_prior():
+    """Two pairs of columns whose difference is 3e-7 of a column, and 1e-7 is a rank too few."""
+
+    def solved(apart):
+        W = np.kron(np.eye(2), [[1.0, 1.0], [0.0, apart]])
+        factors = compress(problem(W, W @ theta, tuple("abcd")))
+        return solve_factor(factors, np.ones(1), None)
+
+    theta = np.array([2.0, -1.0, 0.5, 3.0])
+    found = solved(3e-7)
+    assert (found.rank, found.undetermined) == (4, ())
+    np.testing.assert_allclose(found.theta, theta, atol=1e-6)
+    error = [np.hypot(1.0, 1.0 / 3e-7), 1.0 / 3e-7]
+    np.testing.assert_allclose(np.sqrt(np.diag(found.covariance)), error * 2, rtol=1e-6)
+    with pytest.raises(RankDeficientError):
+        solved(1e-7)
