@@ -395,6 +395,14 @@ def test_other_drive_terms_keep_the_rows_and_torques_without_contact_forces(rng)
     np.testing.assert_array_equal(other.mask, first.mask)
     np.testing.assert_array_equal(other.trajectory.basis, first.trajectory.basis)
     np.testing.assert_array_equal(other.trajectory.tau, first.trajectory.tau)
+    # nor are rows taken again that a jump of the base without contacts left out
+    jumped = replace(
+        log, base=BaseMotion(pose + 0.3 * np.outer(t > 0.75, np.eye(7)[2])), contacts={}
+    )
+    held = hold_log(replace(model, constraints=()), jumped, settings)
+    assert held.whole.mask.any(axis=1)[[0, 38, 59]].tolist() == [True, False, True]
+    other = held.with_model(held.model.with_terms({"FL_KFE": (Cubic(),)})).whole
+    np.testing.assert_array_equal(other.mask, held.whole.mask)
     turned = replace(log, contacts=dict(reversed(flags.items())))
     with pytest.raises(DataError, match="has the contacts FL_FOOT, HR_FOOT, wanted those of the"):
         hold_log(model, turned, settings)
