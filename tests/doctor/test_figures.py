@@ -422,6 +422,10 @@ def test_a_spike_is_one_by_the_noise_of_its_own_channel():
     (found,) = channels._spikes(log, "tau", values, np.array([0.5, 0.01]))
     assert found.where == "run.csv: tau_b"
     assert found.evidence["rows"] == 2
+    assert found.severity == "note"  # four times the amplitude, which a motion may reach
+    values[[100, 250]] += 2.0
+    (found,) = channels._spikes(log, "tau", values, np.array([0.5, 0.01]))
+    assert found.severity == "error"
 
 
 def test_velocities_of_another_joint_are_reported_with_both_correlations():
