@@ -339,6 +339,17 @@ def test_the_pieces_of_a_log_have_the_bias_of_all_rests_of_its_windows(monkeypat
     np.testing.assert_array_equal(a[:, 3:], biased[:, 3:])
 
 
+def test_means_of_segments_of_a_static_robot_replace_filter_and_rate(robot, recording):
+    signals = SignalSettings(
+        cutoff=6.0, rate=50.0, velocity="measured", acceleration="measured", max_gap=0.1
+    )
+    held = hold_log(replace(robot, dynamics="static"), recording, signals)
+    assert held.signals == replace(
+        signals, cutoff=None, rate=None, velocity="differentiated", acceleration="differentiated"
+    )
+    assert hold_log(robot, recording, signals).signals.rate == 50.0
+
+
 def test_windows_of_a_long_log_are_named_by_their_own_rows(monkeypatch):
     monkeypatch.setattr(survey, "_WINDOW", 100)
     q = np.zeros((2, 1))
