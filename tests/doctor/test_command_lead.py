@@ -57,6 +57,11 @@ def test_a_constant_offset_and_a_drift_change_no_lag(log):
     assert found[0] == pytest.approx(0.08, abs=0.02)
     other = _fit(command + 30.0 - 0.2 * log.t, q - 50.0 + 0.4 * log.t, 1 / RATE)
     np.testing.assert_allclose(other, found, rtol=1e-6)
+    # where the joint follows at once, no lead explains anything
+    noise = 1e-4 * np.random.default_rng(0).standard_normal(len(q))
+    lag, *_, explained = _fit(command, command + noise, 1 / RATE)
+    assert lag == pytest.approx(0.0, abs=1e-4)
+    assert 0.0 <= explained < 0.05
 
 
 def test_short_windows_and_smooth_commands_are_no_lead(log):
