@@ -296,7 +296,7 @@ def flag_delay(t: Array, flags: Array, speed: Array, spread: float) -> tuple[flo
         wrong = np.where(is_still[first:stop] == flags[i], 1, -1)  # ... before the change
         sums = np.cumsum(wrong)
         k = int(np.argmin(sums))
-        if 0 < k + 1 < stop - first and sums[k] < 0 and sums[-1] > sums[k]:
+        if sums[k] < 0 and sums[-1] > sums[k]:
             delays[int(flags[i])].append(shift * step + float(t[i] - t[first + k + 1]))
     if min(map(len, delays)) < _FEWEST:
         return None

@@ -176,7 +176,7 @@ def _forces(
     stated = [not (x.always or x.frame in names) for x in model.contacts]
     flags[:, stated] = motion.contacts
     J, first = constraint_jacobian(model, motion.q, flags), 0
-    (torque,) = predict(replace(model, constraints=()), [model.standard_parameters()], motion)
+    (torque,) = predict(model, [model.standard_parameters()], motion)
     b = torque - motion.tau
     known, starts = [], []
     for x in model.constraints:

@@ -89,7 +89,7 @@ def check_wrenches(
         return
     whole = motion.part(0, _LONGEST)
     motion = motion.every(max(1, len(motion.t) // _MOST))
-    (torque,) = predict(replace(model, constraints=()), [model.standard_parameters()], motion)
+    (torque,) = predict(model, [model.standard_parameters()], motion)
     weight = sum(x.mass for x in model.pin_model.inertias) * float(
         np.linalg.norm(model.pin_model.gravity.linear)
     )
@@ -149,7 +149,7 @@ def _check_clock(
     model: RobotModel, name: str, motion: Trajectory, scale: Array, delay: float
 ) -> Iterator[Finding]:
     """Yield a finding if measured wrenches have a delay; ``scale`` gives the six rows one unit."""
-    (torque,) = predict(replace(model, constraints=()), [model.standard_parameters()], motion)
+    (torque,) = predict(model, [model.standard_parameters()], motion)
     J, basis = _base_rows(model, motion)
     slopes = without_forces(basis, J.swapaxes(1, 2)).swapaxes(1, 2) * scale
     yield from check_delay(

@@ -141,6 +141,8 @@ def test_a_position_in_millimetres_is_named(robot, log):
     assert found.evidence["acceleration"] == pytest.approx(size, rel=0.05)
     (later,) = check_unit(replace(log, t=log.t + 900.0, base=BaseMotion(pose)))
     assert later.evidence["acceleration"] == pytest.approx(found.evidence["acceleration"], rel=1e-6)
+    short = replace(log, base=BaseMotion(pose)).window(log.t[0], log.t[0] + 0.3)
+    assert list(check_unit(short)) == []  # no acceleration over 0.2 s in it
     noisy = log.base.pose + 5e-3 * np.random.default_rng(0).standard_normal(log.base.pose.shape)
     noisy[:, 3:] = log.base.pose[:, 3:]
     assert not [x.code for x in check_base(robot, replace(log, base=BaseMotion(noisy)), SLOW)

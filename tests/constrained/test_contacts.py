@@ -98,10 +98,10 @@ def test_the_delay_of_short_swings_is_found_beside_feet_that_hesitate(late):
 def test_delayed_flags_are_late_at_lift_offs_and_at_touch_downs():
     found = flag_delay(*steps(0.06, 0.06), spread=0.0)
     assert found[0] == pytest.approx(0.06, abs=1e-3)
-    assert found[1] == pytest.approx(stdtrit(9, 0.975) * 0.002 / np.sqrt(11), rel=0.1)
+    assert found[1] == pytest.approx(stdtrit(10, 0.975) * 0.002 / np.sqrt(12), rel=0.01)
     delay, error = flag_delay(*steps(0.06, 0.04), spread=0.02)
     assert delay == pytest.approx(0.05, abs=1e-3)  # half of the difference, half of the spread
-    assert error == pytest.approx(0.01 + 0.01 + stdtrit(9, 0.975) * 0.002 / np.sqrt(11), abs=1e-3)
+    assert error == pytest.approx(0.01 + 0.01 + stdtrit(10, 0.975) * 0.002 / np.sqrt(12), abs=1e-3)
     assert flag_delay(*steps(-0.08, -0.06), spread=0.0)[0] == pytest.approx(-0.07, abs=1e-3)
     assert flag_delay(*steps(0.06, 0.06, slips=2), spread=0.0)[0] == pytest.approx(0.06, abs=1e-3)
 

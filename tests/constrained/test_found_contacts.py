@@ -196,8 +196,8 @@ def test_forces_are_found_beside_a_measured_one_whatever_is_up(robot, axes):
     torque = predict_instants(tilted, tilted.standard_parameters(), q)
     J = constraint_jacobian(tilted, q, every)
     f = np.linalg.lstsq(J[0].T, torque[0] - np.r_[np.zeros(6), log.tau[0]], rcond=None)[0]
-    contacts = [replace(x, measured=("fx", "fy", "fz"), axes=axes, always=True) if k == 1 else x
-                for k, x in enumerate(tilted.constraints)]  # fmt: skip
+    contacts = [replace(x, axes=axes) for x in tilted.constraints]
+    contacts[1] = replace(contacts[1], measured=("fx", "fy", "fz"), always=True)
     model = replace(tilted, constraints=tuple(contacts))
     own = constraint_jacobian(model, q, every)
     measured = np.linalg.lstsq(own[0, 3:6].T, J[0, 3:6].T @ f[3:6], rcond=None)[0]

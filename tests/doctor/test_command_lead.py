@@ -7,7 +7,7 @@ import pytest
 from helpers.servos import Servo, chirps, record
 
 from robotid.doctor.command_channels import check_commands
-from robotid.doctor.command_lead import find_lead
+from robotid.doctor.command_lead import _fit, find_lead
 
 RATE = 100.0  # [Hz]
 SERVO = Servo(coulomb=2.0, quantum=1.5e-3)  # its lag at low frequency is 80 ms
@@ -49,6 +49,19 @@ def test_a_lead_of_a_part_is_found_with_its_time(log):
     (found,) = errors(delayed(log, 0.1, since=12.0))
     assert -found.evidence["lag"] == pytest.approx(0.1, abs=0.02)
     assert "before its command in 12-23.99 s: " in found.message
+
+
+def test_a_constant_offset_and_a_drift_change_no_lag(log):
+    command, q = log.q_ref[:, 0], log.q[:, 0]
+    found = _fit(command, q, 1 / RATE)
+    assert found[0] == pytest.approx(0.08, abs=0.02)
+    other = _fit(command + 30.0 - 0.2 * log.t, q - 50.0 + 0.4 * log.t, 1 / RATE)
+    np.testing.assert_allclose(other, found, rtol=1e-6)
+    # where the joint follows at once, no lead explains anything
+    noise = 1e-4 * np.random.default_rng(0).standard_normal(len(q))
+    lag, *_, explained = _fit(command, command + noise, 1 / RATE)
+    assert lag == pytest.approx(0.0, abs=1e-4)
+    assert 0.0 <= explained < 0.05
 
 
 def test_short_windows_and_smooth_commands_are_no_lead(log):

@@ -21,7 +21,7 @@ from robotid.doctor.command_channels import _held, _Loop
 from robotid.doctor.hypotheses import Explanation, _refined
 from robotid.doctor.loads import _payload
 from robotid.doctor.motions import check_excitation
-from robotid.doctor.torque_channels import check_torque_channels
+from robotid.doctor.torque_channels import _touches, check_torque_channels
 from robotid.logs.data import Log
 from robotid.logs.settings import SignalSettings
 from robotid.logs.signals import process
@@ -159,6 +159,18 @@ def test_copies_differ_by_the_largest_of_all_their_sides():
 
 @pytest.mark.parametrize("off", [0.31, -0.27, 0.02])
 def test_an_offset_is_refined_to_either_side(monkeypatch, off):
+    shifted = SimpleNamespace(
+        q=np.array([[0.5, -0.2 + off, 0.7]]), v=0.0, a=0.0, with_motion=lambda motion: motion
+    )
+    shifted.v, shifted.a = 2.0 * shifted.q, 3.0 * shifted.q
+    monkeypatch.setattr(hypotheses, "own_share", lambda motion: np.concatenate(motion).reshape(-1))
+    read = hypotheses._offset(shifted, 1, off)
+    assert (read.joints, read.values) == ((1,), (off,))
+    recorded = [0.5, -0.2 + off, 0.7]
+    np.testing.assert_allclose(
+        read.share, [0.5, -0.2, 0.7, *(k * x for k in (2.0, 3.0) for x in recorded)]
+    )
+
     def offset(_probe, j, x):
         return Explanation("position_offset", np.array([0.1 + (x - 1.5 - off) ** 2]), (j,), (x,))
 
@@ -301,6 +313,10 @@ def test_torques_without_sign_are_those_of_three_joints_that_reach_zero_thrice()
     for changed in (all_tau * [1, 1, 1, 1, -1], all_tau[:, [0, 1, 3, 3, 4]]):
         other = replace(log, tau=changed)
         assert "unsigned_torque" not in {f.code for f in check_torque_channels(other)}
+    # it is away from 0 above a fifth of its top, at 0 below a twentieth
+    for between, low, count in ((0.21, 0.04, 2), (0.19, 0.04, 1), (0.9, 0.06, 0)):
+        wave = 5.0 * np.array([1.0, low, between, low, 1.0])
+        assert _touches(wave) == count
 
 
 def test_proportional_commands_are_alike_in_their_changes_too():
@@ -406,6 +422,10 @@ def test_a_spike_is_one_by_the_noise_of_its_own_channel():
     (found,) = channels._spikes(log, "tau", values, np.array([0.5, 0.01]))
     assert found.where == "run.csv: tau_b"
     assert found.evidence["rows"] == 2
+    assert found.severity == "note"  # four times the amplitude, which a motion may reach
+    values[[100, 250]] += 2.0
+    (found,) = channels._spikes(log, "tau", values, np.array([0.5, 0.01]))
+    assert found.severity == "error"
 
 
 def test_velocities_of_another_joint_are_reported_with_both_correlations():

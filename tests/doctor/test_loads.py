@@ -1,6 +1,6 @@
 """Another scale of the torques, another robot's URDF, an uninformative torque: told apart."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -265,3 +265,36 @@ def test_the_scales_of_torques_are_those_that_they_were_divided_by(rng, decades,
                       0.0, 120.0)  # fmt: skip
     found = loads_module._torque_scales(model)
     np.testing.assert_allclose(np.log10(found), decades, atol=1e-9)
+
+
+@dataclass(frozen=True)
+class _Probe:
+    gravity: np.ndarray
+    model: SimpleNamespace
+    motion: SimpleNamespace
+    balanced: tuple[int, ...] = ()
+
+
+@pytest.mark.parametrize(("scaled", "is_found"), [(17.1, True), (16.9, False)])
+def test_a_counterbalance_explains_more_than_another_scale(monkeypatch, scaled, is_found):
+    """By five units of the misfit, which is 12 with it."""
+    given = {
+        "own_share": lambda probe, any_load: np.array([0.01 if probe.balanced else 0.9]),
+        "load_model": lambda *_: SimpleNamespace(fit=lambda ones: (12.0, "theta", None)),
+        "_is_this_robot": lambda *_: True,
+        "_lifting": lambda _: [1],
+        "_cancelled": lambda probe, j, theta: 0.37,
+        "_scaled_fit": lambda _: scaled,
+        "_lighter": lambda whole, chi: None,
+    }
+    for name, own in given.items():
+        monkeypatch.setattr(loads_module, name, own)
+    motion = SimpleNamespace(q=np.array([[0.0, -0.5], [4.0, 1.0]]))
+    probe = _Probe(np.array([0.0, 0.0, -9.81]), SimpleNamespace(joints=("a", "b")), motion)
+    other, found = loads_module.counterbalance(probe, "run.csv")
+    assert other.balanced == (1,) * is_found
+    assert len(found) == is_found
+    for finding in found:
+        assert (finding.code, finding.where) == ("counterbalance", "run.csv: b")
+        assert finding.evidence == {"cancelled_pct": pytest.approx(37.0), "turned": 1.5}
+        assert "cancels 37 % of its gravity torque" in finding.message

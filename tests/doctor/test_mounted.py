@@ -135,6 +135,8 @@ def test_segments_are_of_all_motions(ur5):
     assert segments.seconds == pytest.approx(sum(m.t[-1] - m.t[0] for m in motions))
     alone = [replace(segments, motions=[motion]).reductions for motion in motions]
     assert len(segments.reductions) == len(alone[0]) + len(alone[1])
+    # of 0.4 s, at most 24
+    assert [len(parts) for parts in alone] == [int(np.ptp(motions[0].t) / 0.4), 24]
     rows = [sum(part.samples for part in parts) for parts in (segments.reductions, *alone)]
     assert rows[0] == rows[1] + rows[2]
     squares = sum(part.squares for part in segments.reductions)
@@ -194,3 +196,24 @@ def test_a_change_of_load_is_significant_and_from_a_hundredth_of_the_arms_mass_t
         assert finding.evidence == pytest.approx({"mass": share * size, "std_error": error * size})
         word = "more" if share > 0 else "less"
         assert f" kg {word} than in the fitted logs" in finding.message
+
+
+def test_a_part_is_a_link_with_all_that_it_carries(monkeypatch):
+    """An adapter without mass carries a hand with a finger; a camera is beside it."""
+    masses = {"flange": 9.0, "adapter": 0.0, "hand": 1.0, "finger": 0.2, "camera": 0.3}
+    places = [
+        SimpleNamespace(link=x, body=2, role="fixed", parameters=m * np.arange(1.0, 11.0))
+        for x, m in masses.items()
+    ]
+    places[0].role = "moved"
+    places.append(SimpleNamespace(**{**vars(places[2]), "link": "elbow", "body": 1}))
+    monkeypatch.setattr(mounted, "link_places", lambda model: places)
+    parents = ("elbow", "flange"), ("flange", "adapter"), ("adapter", "hand"), ("hand", "finger")
+    joints = [SimpleNamespace(parent=x, child=y) for x, y in (*parents, ("flange", "camera"))]
+    model = SimpleNamespace(
+        layout=SimpleNamespace(bodies=tuple("abc")), tree=SimpleNamespace(joints=joints)
+    )
+    found = list(mounted._parts(SimpleNamespace(model=model)))
+    assert [links for links, _ in found] == [["hand", "finger"], ["finger"], ["camera"]]
+    for (_, parameters), mass in zip(found, (1.2, 0.2, 0.3), strict=True):
+        np.testing.assert_allclose(parameters, mass * np.arange(1.0, 11.0))

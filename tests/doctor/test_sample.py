@@ -6,6 +6,7 @@ import pinocchio as pin
 import pytest
 from helpers.corruptions import clean_log
 
+from robotid.doctor import sample
 from robotid.doctor.hypotheses import compensated, own_share
 from robotid.doctor.sample import _inner, coupled_columns, smooth_motion, take_probe
 from robotid.logs.settings import SignalSettings
@@ -80,3 +81,20 @@ def test_rows_near_either_end_of_a_segment_are_not_used(rng):
     np.testing.assert_array_equal(found[~edge], np.array(wanted)[~edge])
     assert not found[segment == 6].any()
     assert found[segment == 3].sum() >= 28
+
+
+def test_a_probe_has_fifty_rows_or_more_in_which_a_joint_moves(monkeypatch):
+    """By its own speed: the second joint moves at more than a tenth of the first one's."""
+    monkeypatch.setattr(sample, "_probe_at", lambda model, motion, rows: rows)
+    model = SimpleNamespace(
+        layout=SimpleNamespace(drive_speeds=np.array([1.0, 0.1, 9.0])), joints=("a", "b")
+    )
+    for moving in (50, 49):
+        v = np.tile([0.019, 0.0019], (120, 1))
+        v[30 : 30 + moving : 2, 0], v[31 : 30 + moving : 2, 1] = 0.021, -0.0021
+        motion = SimpleNamespace(t=np.arange(120) / 100.0, segment=np.zeros(120), v=v)
+        found = take_probe(model, motion, samples=7)
+        if moving < 50:
+            assert found is None
+        else:
+            np.testing.assert_array_equal(found, [30, 38, 46, 54, 62, 70, 79])

@@ -12,7 +12,7 @@ from helpers.synthetic import exact_log, truth
 from scipy.interpolate import CubicSpline
 
 from robotid.doctor import torque_delay
-from robotid.doctor.torque_delay import _EXACT, _GRID, _Misfit
+from robotid.doctor.torque_delay import _EXACT, _GRID, _common, _Misfit
 from robotid.logs.data import Trajectory
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.torque import carried_columns
@@ -402,3 +402,17 @@ def test_values_of_one_instant_are_not_interpolated():
     t = 3.0 + np.arange(6) / 10
     found = torque_delay._interpolated(t, np.column_stack([t, 2.0 - t]), np.array([[3.05], [3.41]]))
     np.testing.assert_allclose(found, [[[3.05, -1.05]], [[3.41, -1.41]]])
+
+
+def test_a_delay_has_the_error_of_the_fit_and_of_samples_that_are_held():
+    """A tenth of a sample, at least 1 ms."""
+    common = {"error": lambda: 0.003, "gain": lambda: 0.4, "is_of_load": False}
+    for delay, step, error, words in (
+        (0.012, 0.02, np.hypot(3.0, 2.0), "lags the position by 12.0 +- 3.6 ms"),
+        (-0.02, 0.002, np.hypot(3.0, 1.0), "leads the position by 20.0 +- 3.2 ms"),
+    ):
+        misfit = SimpleNamespace(delay=lambda delay=delay: delay, **common)
+        (finding,) = _common(misfit, step, SignalSettings(torque_delay=0.001), "run.csv")
+        assert f"the torque {words}. The delay explains 40 % of the torque" in finding.message
+        assert f"torque_delay = {delay + 0.001:.4f}" in finding.message
+        assert finding.evidence["std_error"] == pytest.approx(1e-3 * error)

@@ -1,3 +1,5 @@
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from helpers.estimation import NOISE, Case, still_wrist
@@ -5,7 +7,7 @@ from helpers.fitting import identify
 from helpers.synthetic import exact_log, truth
 
 from robotid.estimators import OLS, TLS, WLS
-from robotid.estimators.batch import mixed_tls, solve_factor
+from robotid.estimators.batch import _noise, mixed_tls, solve_factor
 from robotid.exceptions import DataError, RankDeficientError
 from robotid.fitting.settings import EstimatorSettings
 from robotid.logs.settings import SignalSettings
@@ -41,6 +43,23 @@ def test_ols_is_plain_least_squares(ur5, rng):
     W, tau, _ = (np.concatenate(x) for x in zip(*case.problem.blocks(), strict=True))
     expected = np.linalg.lstsq(W, tau, rcond=None)[0]
     np.testing.assert_allclose(OLS().fit(case.problem).theta, expected, rtol=1e-9, atol=1e-11)
+
+
+def test_a_noise_level_without_a_residual_is_a_share_of_the_torque():
+    """1e-9 of its RMS, or of 1 N m at rest."""
+    freedoms = []
+
+    def noise_levels(theta, freedom):
+        freedoms.append(freedom.tolist())
+        return np.array([0.0, 0.0, theta])
+
+    squares = np.array([50.0, 0.0, 9.0])
+    factors = SimpleNamespace(
+        rows=np.array([2, 9, 1]), noise_levels=noise_levels, torque_squares=lambda: squares
+    )
+    levels = _noise(factors, 0.7, np.array([3.0, 2.5, 0.0]))
+    np.testing.assert_allclose(levels, [5e-9, 1e-9, 0.7], rtol=1e-12)
+    assert freedoms == [[1.0, 6.5, 1.0]]
 
 
 @pytest.mark.parametrize("estimator", [OLS(), WLS()])
@@ -211,3 +230,21 @@ def test_what_rows_leave_open_stays_at_the_prior_by_the_size_of_the_columns(rng)
     np.testing.assert_allclose(found.theta, prior + inverse @ (tau - W @ prior) / scale)
     wanted = inverse @ inverse.T / np.outer(scale, scale)
     np.testing.assert_allclose(found.covariance, wanted, atol=1e-12 * wanted.max())
+
+
+def test_parameters_that_are_barely_determined_need_no_prior():
+    """Two pairs of columns whose difference is 3e-7 of a column, and 1e-7 is a rank too few."""
+
+    def solved(apart):
+        W = np.kron(np.eye(2), [[1.0, 1.0], [0.0, apart]])
+        factors = compress(problem(W, W @ theta, tuple("abcd")))
+        return solve_factor(factors, np.ones(1), None)
+
+    theta = np.array([2.0, -1.0, 0.5, 3.0])
+    found = solved(3e-7)
+    assert (found.rank, found.undetermined) == (4, ())
+    np.testing.assert_allclose(found.theta, theta, atol=1e-6)
+    error = [np.hypot(1.0, 1.0 / 3e-7), 1.0 / 3e-7]
+    np.testing.assert_allclose(np.sqrt(np.diag(found.covariance)), error * 2, rtol=1e-6)
+    with pytest.raises(RankDeficientError):
+        solved(1e-7)

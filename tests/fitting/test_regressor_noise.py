@@ -12,6 +12,7 @@ from robotid.estimators import OLS, WLS
 from robotid.fitting import regressor_noise
 from robotid.fitting.fit import solve_recordings
 from robotid.fitting.regressor_noise import (
+    _is_enough,
     acceleration_noise,
     find_regressor_noise,
     rounding_errors,
@@ -430,3 +431,44 @@ def test_a_finding_names_the_joints_of_coarse_steps_and_the_worst_inertial_sum(
             "share_pct": 40,
         }
     )
+
+
+def test_draws_end_when_the_shift_is_known_to_a_fifth_of_a_standard_error_or_is_negligible():
+    """Of k draws of scatter s the mean is known to s / sqrt(k); six are the most."""
+    scatter = {4: np.array([-1.0, -1.0, 1.0, 1.0]) * np.sqrt(0.75), 3: np.array([-1.0, 0.0, 1.0])}
+    for mean, spread, count, is_enough in (
+        (5.0, 0.39, 4, True), (5.0, 0.41, 4, False), (0.0, 0.41, 4, False),
+        (-0.09, 9.0, 3, True), (-0.11, 9.0, 3, False),
+    ):  # fmt: skip
+        moves = np.column_stack([np.zeros(count), mean + spread * scatter[count]])
+        assert _is_enough(moves) == is_enough
+    assert _is_enough(9.0 * np.arange(6.0)[:, None])
+    assert not _is_enough(9.0 * np.arange(5.0)[:, None])
+
+
+def test_steps_are_smoothed_over_a_period_of_the_filter_on_either_side(monkeypatch):
+    """At least over five rows; an angle is unwrapped before, the position of a slider is not."""
+    asked = []
+
+    def smooth(q, steps, width):
+        asked.append((q[:, 0].tolist(), q[:, 1].tolist(), steps, width))
+        return width
+
+    monkeypatch.setattr(regressor_noise, "smoothed", smooth)
+    monkeypatch.setattr(regressor_noise, "_shifted", lambda log, change: (log.name, change))
+    model = SimpleNamespace(joints=("a", "s"), layout=SimpleNamespace(prismatic=("s",)))
+    head = SimpleNamespace(q=np.array([[3.0, 3.0], [3.5 - 2 * np.pi, -3.0]]))
+    logs = [
+        SimpleNamespace(
+            name=k, model=model, head=head, step=0.002, signals=SimpleNamespace(cutoff=cutoff)
+        )
+        for k, cutoff in enumerate((None, 5.0))
+    ]
+    near = Recordings(model, None, logs, logs)
+    found = regressor_noise._without_steps(near, ["first", "second"])
+    assert found.fitted == [(0, 11), (1, 201)]
+    assert found.validation == ()
+    assert [steps for *_, steps, _ in asked] == ["first", "second"]
+    for angle, slider, *_ in asked:
+        np.testing.assert_allclose(angle, [3.0, 3.5])
+        assert slider == [3.0, -3.0]

@@ -60,6 +60,11 @@ def test_what_the_data_leave_of_the_prior_is_the_mean_share_of_variances(picked_
     reading = identifier.reading
     share = reading.std_error**2 / identifier._prior_variance
     assert reading.excitation == pytest.approx(1.0 - np.minimum(share, 1.0).mean())
+    # a walk of the parameters does not take away more than the prior gave
+    lost = copy.copy(identifier)
+    lost._state = replace(identifier._state, P=np.diag(identifier._prior_variance))
+    lost._state.P[2, 2] *= 9.0
+    assert lost.reading.excitation == pytest.approx(0.0)
     # after a change a load may have come, and all the rest may be off by a tenth of its spread
     size = identifier.model.layout.n_inertial
     KL = identifier.mapping.K[:, size - 10 : size] * identifier._load_spread

@@ -339,6 +339,17 @@ def test_the_pieces_of_a_log_have_the_bias_of_all_rests_of_its_windows(monkeypat
     np.testing.assert_array_equal(a[:, 3:], biased[:, 3:])
 
 
+def test_means_of_segments_of_a_static_robot_replace_filter_and_rate(robot, recording):
+    signals = SignalSettings(
+        cutoff=6.0, rate=50.0, velocity="measured", acceleration="measured", max_gap=0.1
+    )
+    held = hold_log(replace(robot, dynamics="static"), recording, signals)
+    assert held.signals == replace(
+        signals, cutoff=None, rate=None, velocity="differentiated", acceleration="differentiated"
+    )
+    assert hold_log(robot, recording, signals).signals.rate == 50.0
+
+
 def test_windows_of_a_long_log_are_named_by_their_own_rows(monkeypatch):
     monkeypatch.setattr(survey, "_WINDOW", 100)
     q = np.zeros((2, 1))
@@ -395,6 +406,14 @@ def test_other_drive_terms_keep_the_rows_and_torques_without_contact_forces(rng)
     np.testing.assert_array_equal(other.mask, first.mask)
     np.testing.assert_array_equal(other.trajectory.basis, first.trajectory.basis)
     np.testing.assert_array_equal(other.trajectory.tau, first.trajectory.tau)
+    # nor are rows taken again that a jump of the base without contacts left out
+    jumped = replace(
+        log, base=BaseMotion(pose + 0.3 * np.outer(t > 0.75, np.eye(7)[2])), contacts={}
+    )
+    held = hold_log(replace(model, constraints=()), jumped, settings)
+    assert held.whole.mask.any(axis=1)[[0, 38, 59]].tolist() == [True, False, True]
+    other = held.with_model(held.model.with_terms({"FL_KFE": (Cubic(),)})).whole
+    np.testing.assert_array_equal(other.mask, held.whole.mask)
     turned = replace(log, contacts=dict(reversed(flags.items())))
     with pytest.raises(DataError, match="has the contacts FL_FOOT, HR_FOOT, wanted those of the"):
         hold_log(model, turned, settings)
@@ -417,6 +436,18 @@ def test_other_drive_terms_keep_the_rows_that_a_closed_chain_leaves(rng, tmp_pat
     assert np.argwhere(~first.mask).tolist() == [[20, pivot]]
     other = held.with_model(model.with_terms({"elbow": (Cubic(),)})).whole
     np.testing.assert_array_equal(other.mask, first.mask)
+    # read in pieces the torques of the bars are mixed likewise: every row has every column
+    write_log(log, tmp_path / "log.csv")
+    mapping = structural_mapping(model)
+    held, read = (
+        Recordings(model, mapping, [own]).problem()
+        for own in (held, long_log(model, tmp_path / "log.csv", settings, length=15))
+    )
+    assert read.is_projected
+    np.testing.assert_array_equal(read.support, held.support)
+    rows = [[np.concatenate(x) for x in zip(*own.blocks(), strict=True)] for own in (held, read)]
+    for one, other in zip(*rows, strict=True):
+        np.testing.assert_allclose(other, one, atol=1e-9)
 
 
 def test_the_temperature_of_a_joint_is_the_mean_of_the_rows_read():

@@ -1,4 +1,5 @@
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -91,6 +92,11 @@ def test_standard_parameters_come_back_from_base_ones(panda, rng):
     np.testing.assert_allclose(
         mapping.to_standard(mapping.to_base(prior), prior), prior, atol=1e-12
     )
+    count = len(prior)
+    with pytest.raises(DataError, match=rf"pi has shape \({count - 1},\), wanted \({count},\)"):
+        mapping.to_base(prior[1:])
+    with pytest.raises(DataError, match=rf"the problem has 1 columns, wanted the {count} of the m"):
+        mapping.reduce(SimpleNamespace(names=("a",)))
 
 
 def test_the_choice_of_columns_does_not_depend_on_rounding(ur5):

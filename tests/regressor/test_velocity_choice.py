@@ -89,6 +89,20 @@ def test_a_part_is_predicted_by_the_fit_to_the_others_joint_by_joint(rng):
     assert np.isnan(error[2])
 
 
+def test_columns_that_hardly_differ_share_their_parameter(rng, monkeypatch):
+    """Relative to the largest singular value, theirs is 5e-4; the torque is of their difference."""
+    x, y = rng.standard_normal((2, 800))
+    W = np.column_stack([x, x + 1e-3 * y])
+    monkeypatch.setattr(velocity_choice, "joint_torque_regressor", lambda *_: W[:, None])
+    model = SimpleNamespace(joints=("a",), support=lambda: np.ones((1, 2), dtype=bool))
+    q = np.zeros((800, 1))
+    motion = Trajectory(
+        np.arange(800) / 50, q, q, q, y[:, None], ("a",), 50.0, np.zeros(800, dtype=int)
+    )
+    (error,) = velocity_choice._held_out_error(model, motion, np.ones((800, 1), dtype=bool), 1)
+    assert error == pytest.approx(np.linalg.norm(y), rel=0.01)  # nothing of it is predicted
+
+
 def test_both_velocities_are_compared_on_the_rows_that_both_have(monkeypatch):
     masks = {"measured": np.array([[1, 1], [0, 1], [1, 1]] * 700, dtype=bool)}
     masks["differentiated"] = np.array([[1, 0], [1, 1], [1, 1]] * 700, dtype=bool)

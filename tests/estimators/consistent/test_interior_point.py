@@ -1,12 +1,14 @@
 """The fit with the entropic prior against its conditions of optimality, Clarabel, and limits."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from robotid.estimators import Consistent
 from robotid.estimators.consistent.constraints import Constraints
+from robotid.estimators.consistent.interior_point import _Direction, _Point, _System
 from robotid.exceptions import NotConvergedError
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.examples import example_urdf
@@ -165,3 +167,35 @@ def test_data_sets_in_one_pass_are_fitted_as_one_by_one(together, rng, monkeypat
                 found.x / fit.prior_std, expected.x / fit.prior_std, atol=1e-9
             )
             np.testing.assert_allclose(found.multipliers, expected.multipliers, atol=1e-6)
+
+
+def test_a_step_that_is_short_is_taken_again_without_correction_and_nearer_to_the_path():
+    """Two points, one body and one inequality; the first point's corrected step is short."""
+    aims, of_step = [], iter([np.array([0.2, 0.27]), np.array([0.5, 2.0])])
+
+    def step(size):
+        x, body = np.full((2, 1), size), np.full((2, 1, 4, 4), size)
+        return _Direction(x, x, body, body, x, x)
+
+    def direction(t, mu, cross, pairs):
+        aims.append(np.column_stack([t, mu, cross[:, 0, 2, 3], pairs]))
+        return step(1.0)
+
+    system = SimpleNamespace(
+        point=_Point(np.array([[1.0], [2.0]]), np.zeros((2, 1, 4, 4)), *np.ones((2, 2, 1))),
+        length=np.full((2, 1, 4), np.sqrt(5.0)),
+        weight=1.0,
+        R_inverse=np.full((2, 1, 4, 4), np.eye(4)),
+        G=np.ones((2, 1, 1)),
+        direction=direction,
+        to_boundary=lambda step: next(of_step),
+    )
+    found = _System.corrected(system, step(2.0), np.array([0.9, 0.5]))
+    # left = (1 - share)^3, at least 0.3 if short; t = 1 + 4 left; products of 16 and 4 by the trust
+    np.testing.assert_allclose(
+        aims[0], [[1.004, 0.001, 14.4, 3.6], [1.5, 0.125, 8.0, 2.0]], rtol=1e-12
+    )
+    np.testing.assert_allclose(aims[1], [[2.2, 0.3, 0.0, 0.0], [1.5, 0.125, 8.0, 2.0]], rtol=1e-12)
+    assert len(aims) == 2
+    np.testing.assert_allclose(found.x, [[1.0 + 0.4975], [3.0]], rtol=1e-12)  # 0.995 of the way
+    np.testing.assert_allclose(found.multipliers, [[1.4975], [2.0]], rtol=1e-12)

@@ -234,6 +234,11 @@ def test_prx_is_zero_within_two_standard_errors_of_its_moving_average():
     still = replace(prx.init(2), prx=np.array([0.9e-9, 0.0]), prx_square=0.0, steps=1000)
     assert prx._is_zero(still)
     assert not prx._is_zero(replace(still, prx=np.array([1.1e-9, 0.0])))
+    # within its scatter it is settled if a pass lowers the squared residual by less than 1 %
+    inside = replace(still, prx=np.array([1e-3, 0.0]), prx_square=1.0)
+    for left, settled in ((0.9905, True), (0.9895, False), (1.02, True)):
+        before, after = (replace(inside, squares=np.array([x])) for x in (3.0, 3.0 * left))
+        assert prx._has_settled(before, after) == settled
 
 
 def test_an_indefinite_inertia_is_bounded_by_its_largest_eigenvalue_of_either_sign():

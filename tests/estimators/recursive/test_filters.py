@@ -173,6 +173,8 @@ def test_the_gate_turns_outliers_away_and_counts_them(ur5, rng):
     error, state = fit(1 - 1e-7)
     assert error < 0.2 * open_error
     np.testing.assert_array_equal(state.gated, [0, 0, 10, 0, 0, 0])
+    filtered = Kalman(NOISE, state.theta, np.full(len(state.theta), 5.0))
+    assert filtered.estimate(state, problem.names).converged
 
 
 def test_a_gate_does_not_shut_a_joint_out_for_good(ur5, rng):
