@@ -113,7 +113,8 @@ def _fit(command: Array, q: Array, step: float) -> tuple[float, float, float, fl
     def delayed(signal: Array, lag: int) -> Array:
         """Return a delayed signal without offset and drift, shape (windows, length)."""
         x: Array = signal[start - lag : stop - lag].reshape(windows, length)
-        return x - (x @ trends.T) @ trends
+        x = x - (x @ trends.T) @ trends
+        return x
 
     y, speed = delayed(q, 0), np.gradient(command, step)
     later = np.arange(0, most + 1, max(1, round(_STEP / step)))
