@@ -108,12 +108,12 @@ def _fit(command: Array, q: Array, step: float) -> tuple[float, float, float, fl
         return None
     start, stop = most, most + windows * length
     drift = np.linspace(-1.0, 1.0, length)
+    trends = np.stack([np.full(length, length**-0.5), drift / np.sqrt(drift @ drift)])
 
     def delayed(signal: Array, lag: int) -> Array:
         """Return a delayed signal without offset and drift, shape (windows, length)."""
         x: Array = signal[start - lag : stop - lag].reshape(windows, length)
-        x = x - x.mean(axis=1, keepdims=True)
-        x -= np.outer(x @ drift / (drift @ drift), drift)
+        x = x - (x @ trends.T) @ trends
         return x
 
     y, speed = delayed(q, 0), np.gradient(command, step)
@@ -145,6 +145,7 @@ def _fit(command: Array, q: Array, step: float) -> tuple[float, float, float, fl
 
 def _residual(x: Array, y: Array) -> tuple[float, float]:
     """Return the gain g >= 0 of y = g x, and the squared residual."""
-    size = float(np.sum(x * x))
-    g = max(float(np.sum(x * y)) / size, 0.0) if size else 0.0
-    return g, float(np.sum((y - g * x) ** 2))
+    size = float(np.vdot(x, x))
+    g = max(float(np.vdot(x, y)) / size, 0.0) if size else 0.0
+    left = y - g * x
+    return g, float(np.vdot(left, left))

@@ -1,6 +1,5 @@
 """Joints with servos of their own, simulated apart from the package: for logs of commands."""
 
-import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -50,19 +49,19 @@ def record(commands, servos, *, rate=200.0, duration=20.0, seed=0, couple=None, 
 
 
 def _follow(commands, servo):
-    """Return where one joint is at each step; plain numbers are faster than arrays."""
+    """Return where one joint is at each step; plain comparisons are faster than max and min."""
     wanted, late = commands.tolist(), round(servo.delay / STEP)
     k, top, half = servo.stiffness, servo.top, servo.play / 2
     inertia = 1 + STEP * servo.damping + STEP**2 * k
     held = STEP * servo.coulomb / (1 + STEP * servo.damping)
     q, v, joint, path = wanted[0], 0.0, wanted[0], []
-    for i in range(len(wanted)):
+    for told in [wanted[0]] * late + wanted[: len(wanted) - late]:
         path.append(joint)
-        free = (v + STEP * k * (wanted[max(i - late, 0)] - q)) / inertia
-        v = math.copysign(max(abs(free) - held, 0.0), free)
-        v = min(max(v, -top), top)
+        free = (v + STEP * k * (told - q)) / inertia
+        v = free - held if free > held else free + held if free < -held else 0.0
+        v = top if v > top else -top if v < -top else v
         q += STEP * v
-        joint = min(max(joint, q - half), q + half)
+        joint = q - half if joint < q - half else q + half if joint > q + half else joint
     return path
 
 
