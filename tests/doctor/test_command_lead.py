@@ -51,7 +51,6 @@ def test_a_lead_of_a_part_is_found_with_its_time(log):
     assert "before its command in 12-23.99 s: " in found.message
 
 
-<<<<<<< HEAD
 def test_a_constant_offset_and_a_drift_change_no_lag(log):
     command, q = log.q_ref[:, 0], log.q[:, 0]
     found = _fit(command, q, 1 / RATE)
@@ -63,18 +62,6 @@ def test_a_constant_offset_and_a_drift_change_no_lag(log):
     lag, *_, explained = _fit(command, command + noise, 1 / RATE)
     assert lag == pytest.approx(0.0, abs=1e-4)
     assert 0.0 <= explained < 0.05
-=======
-def test_offset_and_drift_of_position_and_command_have_no_part_in_a_lead(log):
-    led, away = delayed(log, 0.1), log.t - 7.0
-    command, q = led.q_ref[:, 0], led.q[:, 0]
-    plain, drifting = (
-        find_lead(x, y, 1 / RATE, np.nan)
-        for x, y in ((command, q), (command - 2.0 - 0.3 * away, q + 5.0 + 0.2 * away))
-    )
-    assert plain.lead == pytest.approx(0.1, abs=0.02)
-    assert (plain.start, plain.stop) == (drifting.start, drifting.stop)
-    assert drifting.lead == pytest.approx(plain.lead, abs=1e-6)
->>>>>>> fa
 
 
 def test_short_windows_and_smooth_commands_are_no_lead(log):
