@@ -111,11 +111,13 @@ def test_a_failure_leaves_no_half_written_file(tmp_path, monkeypatch):
     monkeypatch.setattr(paper, "energy_drift", lambda: energy_drift(duration=0.1))
     monkeypatch.setattr(study, "LoopSettings", partial(LoopSettings, updates=20))
     figure = Figure(layout="constrained")
-    figure.subplots()
+    axes = figure.subplots()
     monkeypatch.setattr(paper, "paper_figures", lambda *_: {"figure_3a": ("3", figure)})
     with pytest.raises(OSError, match="disk full"):
         run_paper(tmp_path, settings=PaperSettings(iterations=1, longest=1, runs=1, patience=1))
     assert list(tmp_path.iterdir()) == []
+    box = axes.get_tightbbox().transformed(figure.transFigure.inverted())
+    np.testing.assert_allclose([box.x0, box.y0, box.x1, box.y1], [0, 0, 1, 1], atol=0.02)  # laid out
 
 
 def test_the_command_prints_what_was_reached(tmp_path, capsys, monkeypatch, written):
