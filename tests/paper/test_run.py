@@ -117,7 +117,8 @@ def test_a_failure_leaves_no_half_written_file(tmp_path, monkeypatch):
         run_paper(tmp_path, settings=PaperSettings(iterations=1, longest=1, runs=1, patience=1))
     assert list(tmp_path.iterdir()) == []
     box = axes.get_tightbbox().transformed(figure.transFigure.inverted())
-    np.testing.assert_allclose([box.x0, box.y0, box.x1, box.y1], [0, 0, 1, 1], atol=0.02)  # laid out
+    sides = [box.x0, box.y0, box.x1, box.y1]
+    np.testing.assert_allclose(sides, [0, 0, 1, 1], atol=0.02, err_msg="not laid out")
 
 
 def test_the_command_prints_what_was_reached(tmp_path, capsys, monkeypatch, written):
