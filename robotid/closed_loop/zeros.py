@@ -9,6 +9,7 @@ identifiable: the position errors by gravity are the same with all signs reverse
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -123,7 +124,7 @@ def find_encoders(model: RobotModel, logs: Sequence[Log]) -> Encoders:
         if not ambiguous:
             break
         free = [j for j in free if j not in ambiguous]  # these have the URDF's values
-    left, without = motion.left(model, sign, zero)
+    left, without = motion.left(model, sign, zero), motion.without
     return Encoders(sign, zero, gain, 1.0 - left / without, margin, next_sign, next_zero)
 
 
@@ -182,26 +183,36 @@ class _Motion:
 
     def cost(self, model: RobotModel, sign: Array, zero: Array) -> float:
         """Return N times the summed log of the squared residuals of the position errors."""
-        left = np.maximum(self.left(model, sign, zero)[0], 1e-300)
+        left = np.maximum(self.left(model, sign, zero), 1e-300)
         return len(self.q) * float(np.log(left).sum())
 
-    def left(self, model: RobotModel, sign: Array, zero: Array) -> tuple[Array, Array]:
-        """Return squared residuals of each joint's errors, with its torque and without, (n,).
+    def left(self, model: RobotModel, sign: Array, zero: Array) -> Array:
+        """Return the squared residual of each joint's errors, (n,).
 
         The torque is left out where its coefficient, the compliance of the loop, is negative.
         """
         q, v, a = (sign * x for x in (self.q, self.v, self.a))
         torque = predict_instants(model, model.standard_parameters(), q + zero, v, a)
-        left, without = np.empty((2, len(sign)))
+        left = self.without.copy()
         for j, own in enumerate(sign):
-            plain = np.column_stack(
-                [np.ones(len(q)), self.v[:, j], self.direction[:, j], self.a[:, j]]
+            x, with_torque = _fit(
+                np.column_stack([own * torque[:, j], self._plain(j)]), self.error[:, j]
             )
-            _, without[j] = _fit(plain, self.error[:, j])
-            x, left[j] = _fit(np.column_stack([own * torque[:, j], plain]), self.error[:, j])
-            if x[0] < 0:
-                left[j] = without[j]
-        return left, without
+            if x[0] >= 0:
+                left[j] = with_torque
+        return left
+
+    @cached_property
+    def without(self) -> Array:
+        """Squared residual of each joint's errors without its torque, (n,)."""
+        joints = range(self.q.shape[1])
+        return np.array([_fit(self._plain(j), self.error[:, j])[1] for j in joints])
+
+    def _plain(self, j: int) -> Array:
+        """Return the columns of a joint without its torque, (N, 4)."""
+        return np.column_stack(
+            [np.ones(len(self.q)), self.v[:, j], self.direction[:, j], self.a[:, j]]
+        )
 
 
 def _fit(columns: Array, e: Array) -> tuple[Array, float]:

@@ -155,13 +155,13 @@ def orientation_of_imu(t: Array, values: Array, gravity: Array) -> Array:
 def _levelled(t: Array, values: Array, up: Array) -> Array:
     """Return the orientation in a part of a log without gaps, shape (N, 4)."""
     w, f = values[:, :3], values[:, 3:]
-    q = np.empty((len(t), 4))
-    q[0] = _between(_mean(t, f)[0], up)
     half = 0.25 * np.diff(t)[:, None] * (w[1:] + w[:-1])  # half of the turn between two samples
     angle = np.linalg.norm(half, axis=1, keepdims=True)
     turns = np.hstack([half * np.sinc(angle / np.pi), np.cos(angle)])
-    for k, turn in enumerate(turns):
-        q[k + 1] = _product(q[k], turn)
+    q, count = np.vstack([_between(_mean(t, f)[0], up), turns]), 1
+    while count < len(q):  # each row is the product of so many rows up to it
+        q[count:] = _product(q[:-count], q[count:])
+        count *= 2
     x, s = q[:, :3], q[:, 3:]
     u = np.cross(x, f)
     return _product(_between(_mean(t, f + 2.0 * (s * u + np.cross(x, u))), up), q)

@@ -16,7 +16,7 @@ __all__ = ["paper_figures"]
 _COLOURS = ("#0b7fd1", "#d4622a", "#23985f", "#b08400", "#b5539c")
 _STYLES = ("-", "--", ":")  # of models with coincident curves
 _SHOWN = (1, 2, 5, 20, 100)  # iterations drawn in figure 4
-_WIDTH = 9.3  # [inch] of every figure
+_WIDTH, _DPI = 9.3, 150  # [inch, 1/inch] of every figure
 _FONT = 8.5  # [pt]
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
@@ -182,7 +182,7 @@ def _grid(lines: int, columns: int, *, height: float, share: bool = False) -> tu
     from matplotlib.figure import Figure
 
     with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(_WIDTH, height), layout="constrained")
+        figure = Figure(figsize=(_WIDTH, height), dpi=_DPI, layout="constrained")
         sharey: Any = "row" if share else False
         rows = figure.subplots(lines, columns, squeeze=False, sharey=sharey)
         for axes in rows.flat:

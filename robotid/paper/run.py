@@ -216,8 +216,9 @@ def _write(
         shown = {}
         with matplotlib.rc_context(STYLE):
             for name, (caption, figure) in figures.items():
-                figure.savefig(beside / f"{name}.png", dpi=150, facecolor="white")
-                figure.set_layout_engine("none")  # the layout is complete
+                figure.get_layout_engine().execute(figure)
+                figure.set_layout_engine(None)  # no further draw before each file
+                figure.savefig(beside / f"{name}.png", facecolor="white")
                 svg = svg_file(figure)
                 (beside / f"{name}.svg").write_text(svg, encoding="utf-8")
                 shown[name] = (caption, svg_element(svg, caption, name))

@@ -150,9 +150,13 @@ class Window:
     @property
     def _near(self) -> slice:
         """The samples about the first one."""
-        dt = float(np.median(np.diff(self.log.t)))
-        wide = max(_FEWEST, round(_AROUND / dt))
+        wide = max(_FEWEST, round(_AROUND / self.dt))
         return slice(max(self.start_row - wide, 0), min(self.start_row + wide + 1, len(self.log.t)))
+
+    @cached_property
+    def dt(self) -> float:
+        """Median step of the log [s]."""
+        return float(np.median(np.diff(self.log.t)))
 
     @cached_property
     def start(self) -> Array:
@@ -399,17 +403,16 @@ class ClosedLoopRobot:
         command = np.zeros((size, n, 6, lanes.LANES))
         steps, start = np.empty((size, lanes.LANES)), np.empty((2, n, lanes.LANES))
         ticks = np.zeros((0 if loops.rate is None else size, lanes.LANES))
-        for lane in range(lanes.LANES):
-            if lane >= len(windows):  # unused lanes copy the first one
-                command[..., lane], steps[:, lane] = command[..., 0], steps[:, 0]
-                start[..., lane], ticks[:, lane] = start[..., 0], ticks[:, 0]
-                continue
-            log, (times, is_tick) = windows[lane].log, grids[lane].divided(every)
-            steps[:, lane] = np.diff(times)
-            start[..., lane] = windows[lane].start[:, part.joints]
-            edges, of_step = times, np.arange(size)
+        for lane, window in enumerate(windows):
+            log, (times, is_tick) = window.log, grids[lane].divided(every)
+            is_last = lane == len(windows) - 1
+            own = slice(lane, None if is_last else lane + 1)  # unused lanes copy the last one
+            steps[:, own] = np.diff(times)[:, None]
+            start[..., own] = window.start[:, part.joints, None]
+            edges = times
+            of_step: Array | slice = slice(None)
             if loops.rate is not None:
-                ticks[:, lane], of_step = is_tick, 2 * (np.cumsum(is_tick) - 1)
+                ticks[:, own], of_step = is_tick[:, None], 2 * (np.cumsum(is_tick) - 1)
                 edges = grids[lane].sampled(times[:-1][is_tick])
             mean, change = np.empty((2, len(edges) - 1))
             for values, k, by_delay in ((log.q_ref, 0, 1), (log.v_ref, 2, 4), (log.tau_ref, 3, 5)):
@@ -418,8 +421,8 @@ class ClosedLoopRobot:
                 for i, j in enumerate(part.joints):
                     x = values[:, j].copy()  # contiguous and writable: else Numba compiles again
                     average_command(log.t, x, edges, loops.delay[j], mean, change)
-                    command[:, i, k, lane] = mean[of_step]
-                    command[:, i, by_delay, lane] = change[of_step]
+                    command[:, i, k, own] = mean[of_step, None]
+                    command[:, i, by_delay, own] = change[of_step, None]
         course: Course = lanes.Course(command, steps, ticks, every, start)
         return course
 
@@ -435,8 +438,7 @@ class _Grid:
     @classmethod
     def of(cls, window: Window, samples: int, rate: float | None) -> "_Grid":
         """Return the grid of a window, continued with the log's median step."""
-        t = window.log.t[window.start_row : window.stop]
-        dt = float(np.median(np.diff(window.log.t)))
+        t, dt = window.log.t[window.start_row : window.stop], window.dt
         stamps = np.concatenate([t, t[-1] + dt * np.arange(1, samples - len(t) + 1)])
         if rate is None:
             return cls(stamps, np.zeros(0), dt)
@@ -455,8 +457,9 @@ class _Grid:
 
     def least_steps(self, step: float, rate: float | None) -> int:
         """Return the number of steps of a row, so that steps divide ticks and end at each."""
-        tick = math.inf if rate is None else 1.0 / rate
-        longest = step if math.isinf(tick) else tick / math.ceil(tick / step - 1e-9)
+        if rate is None:
+            return max(1, math.ceil(self.dt / step - 1e-9))
+        longest = 1.0 / rate / math.ceil(1.0 / rate / step - 1e-9)
         typical = math.ceil(self.dt / longest - 1e-9)
         inside = np.diff(np.searchsorted(self.ticks, self.stamps))
         at_rows = np.isin(self.stamps[:-1], self.ticks)

@@ -152,12 +152,13 @@ def evidence(H: Array, h: Array, unit: Array | None, scale: Array, variance: Arr
         terms = r**2 - np.einsum("ppbk->pbk", W) + np.einsum("ipbk,ipbk->pbk", W, CW)
         slope[level] = 0.5 * terms.sum(axis=-1)
         if level and unit is not None:  # mean of each unit, and its covariance: of its runs
-            D = eye * variance[level][..., None]
-            DW = np.einsum("pibk,ijbk->pjbk", D, W)
+            d = variance[level][..., None]
+            DW = d[:, None] * W
             left = eye - DW
-            own = D - np.einsum("pibk,ijbk->pjbk", DW, D)
-            around = own + np.einsum("pibk,ijbk,ljbk->plbk", left, around, left, optimize=True)
-            centre = centre + variance[level][..., None] * r
+            own = eye * d - DW * d
+            moved = np.einsum("pibk,ijbk->pjbk", left, around)
+            around = own + np.einsum("pjbk,ljbk->plbk", moved, left)
+            centre = centre + d * r
             around, centre = around[..., unit], centre[..., unit]
     return Evidence(total, slope, mean, C)
 

@@ -152,7 +152,7 @@ def test_torques_that_are_not_of_the_loop_are_named():
     """Of two joints: swapped, and of the motor before a gear of 1:50 where the gain is stated."""
     rng = np.random.default_rng(8)
     robot = plant("planar", rng)
-    log, _ = recorded(robot, rng, duration=1.5, rate=250.0, torque=0.5, noise=1e-3)
+    log, _ = recorded(robot, rng, duration=1.0, rate=250.0, torque=0.5, noise=1e-3)
     gains = LoopSettings(kp={"joint_1": 600.0, "joint_2": 250.0})
 
     def missed(tau, loop):

@@ -258,7 +258,8 @@ def test_a_load_that_would_push_a_loop_the_wrong_way_does_not_count(rng):
     gives = sign * torque * [0.02, 0.05] + 0.1 * v - 0.2 * a + 0.3 * sense + 0.7 + noise
     for way, counts in (([1.0, 1.0], [1, 1]), ([1.0, -1.0], [1, 0]), ([-1.0, 1.0], [0, 1])):
         error = gives - (1.0 - np.array(way)) * sign * torque * [0.02, 0.05]
-        left, without = _Motion(q, v, a, error, sense).left(model, sign, zero)
+        motion = _Motion(q, v, a, error, sense)
+        left, without = motion.left(model, sign, zero), motion.without
         for j in range(2):
             X = np.column_stack([np.ones(60), v[:, j], sense[:, j], a[:, j]])
             bare = np.linalg.lstsq(X, error[:, j], rcond=None)[1][0]
@@ -267,7 +268,7 @@ def test_a_load_that_would_push_a_loop_the_wrong_way_does_not_count(rng):
             assert without[j] == pytest.approx(bare)
             assert left[j] == pytest.approx(best if counts[j] else bare)
             assert best < 0.5 * bare
-        cost = _Motion(q, v, a, error, sense).cost(model, sign, zero)
+        cost = motion.cost(model, sign, zero)
         assert cost == pytest.approx(60 * np.log(left).sum())
 
 

@@ -33,7 +33,7 @@ def written(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(paper, "energy_drift", lambda: energy_drift(duration=1.0))
         for module in (paper, study):
-            patch.setattr(module, "LoopSettings", partial(LoopSettings, updates=40))
+            patch.setattr(module, "LoopSettings", partial(LoopSettings, updates=20))
         return folder, run_paper(folder, settings=FEW)
 
 
@@ -110,10 +110,15 @@ def test_a_failure_leaves_no_half_written_file(tmp_path, monkeypatch):
     monkeypatch.setattr(paper, "paper_page", fail)
     monkeypatch.setattr(paper, "energy_drift", lambda: energy_drift(duration=0.1))
     monkeypatch.setattr(study, "LoopSettings", partial(LoopSettings, updates=20))
-    monkeypatch.setattr(paper, "paper_figures", lambda *_: {"figure_3a": ("3", Figure())})
+    figure = Figure(layout="constrained")
+    axes = figure.subplots()
+    monkeypatch.setattr(paper, "paper_figures", lambda *_: {"figure_3a": ("3", figure)})
     with pytest.raises(OSError, match="disk full"):
         run_paper(tmp_path, settings=PaperSettings(iterations=1, longest=1, runs=1, patience=1))
     assert list(tmp_path.iterdir()) == []
+    box = axes.get_tightbbox().transformed(figure.transFigure.inverted())
+    sides = [box.x0, box.y0, box.x1, box.y1]
+    np.testing.assert_allclose(sides, [0, 0, 1, 1], atol=0.02, err_msg="not laid out")
 
 
 def test_the_command_prints_what_was_reached(tmp_path, capsys, monkeypatch, written):
