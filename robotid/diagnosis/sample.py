@@ -529,10 +529,12 @@ class Trials:
     @cached_property
     def _rows(self) -> list[tuple[Array, Array]]:
         """W and X = [Z r] of each segment."""
-        W, r, weight = self.sample.W, self.sample.r, self.sample.weight
-        X = np.concatenate([weight[..., None] * self.Z, r[..., None]], axis=2)
-        return [(W[k].reshape(-1, W.shape[2]), X[k].reshape(-1, X.shape[2]))
-                for k in self.sample.segments]  # fmt: skip
+        W, r, weight = self.sample.W, self.sample.r[..., None], self.sample.weight[..., None]
+        rows = []
+        for k in self.sample.segments:  # one by one: all together need twice the memory
+            X = np.concatenate([weight[k] * self.Z[k], r[k]], axis=2)
+            rows.append((W[k].reshape(-1, W.shape[2]), X.reshape(-1, X.shape[2])))
+        return rows
 
     @cached_property
     def _products(self) -> tuple[Array, Array]:
