@@ -142,7 +142,11 @@ def test_a_fault_of_the_columns_is_named(urdf, log, change, words, factor):
 def test_moments_in_newton_millimetres_are_named(urdf, log):
     milli = {x: 1e3 * y if x.startswith("m") else y for x, y in log.wrenches.items()}
     (finding,) = found(human(urdf), replace(log, wrenches=milli))
-    assert "if their moments are in N mm, wanted N m. Correct" in finding.message
+    force, moment = unexplained(human(urdf), log)
+    assert (
+        f"but only {force:.3g} N and {moment:.3g} N m if their moments are in N mm, wanted N m. "
+        "Correct"
+    ) in finding.message
     assert finding.evidence["factor"] == 1.0
 
 
