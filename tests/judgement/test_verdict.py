@@ -650,3 +650,8 @@ def test_joints_better_by_the_urdf_are_those_of_all_logs():
     ]
     errors = {name: own for name, (_, _, own) in found.on_each().items()}
     assert errors == {"a": [4.0, 4.0], "b": [4.0, 4.0], "c": [4.0], "d": [], "e": []}
+    part = replace(found, hidden=("b", "e"))  # their metrics are ignored
+    assert part.fitted.keys() == {"a", "c", "d"}
+    assert {log: [*own] for log, own in part.tested.items()} == {"one": ["a", "c"], "two": ["a"]}
+    assert part.on_each().keys() == {"a", "c", "d"}
+    assert part.better_by_urdf()[0].startswith("the URDF with fitted drives predicts a better")
