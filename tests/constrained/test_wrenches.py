@@ -113,6 +113,7 @@ def test_right_forces_have_no_finding_though_feet_move(urdf, log):
         (exchanged, ["those of LeftFoot, RightFoot are exchanged"], 1.0),
         (lambda log: scaled(exchanged(log), -1.0), ["are exchanged", "sign is reversed"], -1.0),
         (lambda log: scaled(log, 1e-3), ["another unit, kN"], 1e3),
+        (lambda log: scaled(log, 1 / 9.81), ["another unit, kgf"], 9.81),
         (lambda log: scaled(log, 0.2), ["another unit. Correct"], 5.0),
     ],
 )
@@ -190,7 +191,8 @@ def test_an_offset_has_the_standard_error_of_the_mean_of_its_swings():
                        [4.5, 0.3, 2.5], [5.5, 0.4, 1.5]])  # fmt: skip
     starts, speed, wrench = range(10, 130, 20), np.full(140, 0.01), np.full((140, 3), 300.0)
     for first, own in zip(starts, swings, strict=True):
-        speed[first : first + 8], wrench[first : first + 8] = 0.5, own
+        speed[first : first + 5], wrench[first : first + 5] = 0.5, own
+    speed[130:134] = 0.5  # a swing of less than five rows does not count
     middle, error = np.median(swings, axis=0), swings.std(axis=0, ddof=1) / np.sqrt(6.0)
     assert error[2] < middle[2] < 4.0 * error[2]  # not found
     (finding,) = check_offsets("log", "LeftFoot", speed, wrench, ("fz", "mx", "fy"), 700.0)
@@ -434,6 +436,13 @@ def test_the_gain_of_a_foot_is_relative_to_the_median_of_the_others():
     for rows, count in ((15, 0), (16, 1)):  # two in each of eight parts
         some = slice(0, 25 * rows, 25)
         assert len(list(check_gains("log", names, loads[some], 1.2 * left[some]))) == count
+    noisy = left + 60.0 * np.random.default_rng(2).normal(size=left.shape)
+    own, one = (  # of the squared residual a tenth must go
+        np.linalg.lstsq(A, noisy.ravel(), rcond=None)[1][0]
+        for A in (loads.reshape(-1, 4), loads.sum(axis=2).reshape(-1, 1))
+    )
+    assert 0.9 * one < own < 0.99 * one
+    assert not list(check_gains("log", names, loads, noisy))
     right, same = shifting(np.random.default_rng(1), np.array([1.03, 1.0, 1.0, 0.98]))
     assert not list(check_gains("log", names, right, 1.2 * same))
 
