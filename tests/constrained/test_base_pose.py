@@ -12,6 +12,7 @@ from robotid.constrained import base_pose
 from robotid.constrained.base_pose import (
     _check_readings,
     _check_vertical,
+    _names,
     _vertical,
     check_pose,
     check_twist,
@@ -83,6 +84,8 @@ def test_gravity_is_stated_along_the_one_axis_that_may_be_the_vertical():
         ([-0.1, 0.0, 0.4], "[0, 0, -3.7]"), ([0.02, 0.05, 0.29], None), ([0.7, 0.6, 0.0], None),
     ):  # fmt: skip
         assert _vertical(np.array(up), G) == (said and f"gravity = {said}")
+    turn = np.array([[0.1, 0.9, 0.0], [0.2, 0.1, -0.8], [0.7, -0.1, 0.3]])
+    assert _names(turn) == ["y", "-z", "x"]
     lying = np.array([0.18, -0.72, 0.24])  # its length is 0.78
     (found,) = _check_vertical(SimpleNamespace(name="run.csv"), lying, G)
     assert "above them along -y of the world" in found.message

@@ -475,6 +475,8 @@ def test_gains_that_the_loads_hardly_determine_are_those_of_equal_feet():
     equal = np.sqrt(1e-4 * np.sum(A**2) / 2) * np.array([[1.0, -1.0]])
     solved = np.linalg.lstsq(np.vstack([A, equal]), np.append(left, 0.0), rcond=None)[0]
     (finding,) = check_gains("log", names, loads, left)
+    shown = f"with the URDF's weight, a needs the factor {solved[0]:.3g}, b {solved[1]:.3g}"
+    assert shown in finding.message
     k = names.index(finding.message.split("that of ")[1][0])
     assert finding.evidence["factor"] == pytest.approx(solved[k] / solved[1 - k])
     alone = np.linalg.lstsq(A, left.ravel(), rcond=None)[0]
