@@ -11,6 +11,9 @@ from helpers.humans import FEET, human_urdf, logged, walk
 from robotid.constrained import base_pose
 from robotid.constrained.base_pose import (
     _check_readings,
+    _check_vertical,
+    _Feet,
+    _names,
     _vertical,
     check_pose,
     check_twist,
@@ -82,6 +85,12 @@ def test_gravity_is_stated_along_the_one_axis_that_may_be_the_vertical():
         ([-0.1, 0.0, 0.4], "[0, 0, -3.7]"), ([0.02, 0.05, 0.29], None), ([0.7, 0.6, 0.0], None),
     ):  # fmt: skip
         assert _vertical(np.array(up), G) == (said and f"gravity = {said}")
+    turn = np.array([[0.1, 0.9, 0.0], [0.2, 0.1, -0.8], [0.7, -0.1, 0.3]])
+    assert _names(turn) == ["y", "-z", "x"]
+    lying = np.array([0.18, -0.72, 0.24])  # its length is 0.78
+    (found,) = _check_vertical(SimpleNamespace(name="run.csv"), lying, G)
+    assert "above them along -y of the world" in found.message
+    assert found.evidence == {"height": pytest.approx(4 / 13), "best": pytest.approx(12 / 13)}
 
 
 @pytest.mark.parametrize(("axis", "down"), [("y", -9.81), ("-y", 9.81)])
@@ -232,6 +241,17 @@ def test_contacts_need_not_be_known_to_name_another_order(robot, log):
     assert not list(check_base(robot, unknown, SLOW))
     (found,) = check_base(robot, with_quaternion(unknown, lambda q: np.roll(q, 1, axis=1)), SLOW)
     assert "its order is qw qx qy qz: state" in found.message
+
+
+def test_without_a_place_speeds_of_feet_are_relative_and_one_foot_has_none(rng):
+    x, dx = rng.standard_normal((2, 4, 3, 3))
+    R, dR = rng.standard_normal((2, 4, 3, 3))
+    v = [[dR[i] @ x[i, k] + R[i] @ dx[i, k] for k in range(3)] for i in range(4)]
+    pairs = [[np.linalg.norm(y[j] - y[k]) for j, k in ((0, 1), (0, 2), (1, 2))] for y in v]
+    one = np.eye(3)
+    found = _Feet(np.arange(4.0), 1, x, dx, None).speed((R, dR), one, one)
+    assert found == pytest.approx(np.mean(np.min(pairs, axis=1)))
+    assert _Feet(np.arange(4.0), 1, x[:, :1], dx[:, :1], None).speed((R, dR), one, one) == 0.0
 
 
 def test_the_speed_of_feet_is_the_mean_of_the_slower_one(robot, log):

@@ -9,6 +9,7 @@ import pytest
 from scipy.special import stdtrit
 
 from robotid.constrained.contacts import (
+    _check_flags,
     _contact_jacobian,
     _flags,
     _loaded,
@@ -420,3 +421,21 @@ def test_the_radius_has_the_smallest_sum_of_absolute_speeds():
     own = [np.median(np.linalg.norm(v[:, :2] - x * rolls[:, :2], axis=1)) for x in (0.0, change)]
     assert [before, after] == pytest.approx(own)
     assert _radius(Contact("ball", radius=0.01), v, 0.0 * rolls) is None
+
+
+@pytest.mark.parametrize(
+    ("on", "off", "count"),
+    [(0.62, 2.0, 1), (0.58, 2.0, 0), (0.11, 0.3, 1), (0.09, 0.2, 0), (0.11, None, 1)],
+)
+def test_a_foot_moves_in_contact_at_a_tenth_of_a_metre_and_three_tenths_of_its_swings(
+    on, off, count
+):
+    """By RMS speeds, of which half are 0.6 and half are 1.28 times as large."""
+    t = np.arange(80) / 10
+    flags = t < (9.0 if off is None else 4.0)
+    speed = np.where(flags, on, off or 0.0) * np.resize([0.6, 1.28], 80) / np.sqrt(0.9992)
+    log = SimpleNamespace(name="walk.csv", t=t)
+    found = list(_check_flags("foot", log, flags, log, speed**2, None, has_ground=False))
+    assert [(x.code, x.evidence["speed"]) for x in found] == (
+        [("moving_contact", pytest.approx(on))] * count
+    )

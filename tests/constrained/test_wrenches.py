@@ -113,6 +113,7 @@ def test_right_forces_have_no_finding_though_feet_move(urdf, log):
         (exchanged, ["those of LeftFoot, RightFoot are exchanged"], 1.0),
         (lambda log: scaled(exchanged(log), -1.0), ["are exchanged", "sign is reversed"], -1.0),
         (lambda log: scaled(log, 1e-3), ["another unit, kN"], 1e3),
+        (lambda log: scaled(log, 1 / 9.81), ["another unit, kgf"], 9.81),
         (lambda log: scaled(log, 0.2), ["another unit. Correct"], 5.0),
     ],
 )
@@ -142,7 +143,11 @@ def test_a_fault_of_the_columns_is_named(urdf, log, change, words, factor):
 def test_moments_in_newton_millimetres_are_named(urdf, log):
     milli = {x: 1e3 * y if x.startswith("m") else y for x, y in log.wrenches.items()}
     (finding,) = found(human(urdf), replace(log, wrenches=milli))
-    assert "if their moments are in N mm, wanted N m. Correct" in finding.message
+    force, moment = unexplained(human(urdf), log)
+    assert (
+        f"but only {force:.3g} N and {moment:.3g} N m if their moments are in N mm, wanted N m. "
+        "Correct"
+    ) in finding.message
     assert finding.evidence["factor"] == 1.0
 
 
@@ -186,7 +191,8 @@ def test_an_offset_has_the_standard_error_of_the_mean_of_its_swings():
                        [4.5, 0.3, 2.5], [5.5, 0.4, 1.5]])  # fmt: skip
     starts, speed, wrench = range(10, 130, 20), np.full(140, 0.01), np.full((140, 3), 300.0)
     for first, own in zip(starts, swings, strict=True):
-        speed[first : first + 8], wrench[first : first + 8] = 0.5, own
+        speed[first : first + 5], wrench[first : first + 5] = 0.5, own
+    speed[130:134] = 0.5  # a swing of less than five rows does not count
     middle, error = np.median(swings, axis=0), swings.std(axis=0, ddof=1) / np.sqrt(6.0)
     assert error[2] < middle[2] < 4.0 * error[2]  # not found
     (finding,) = check_offsets("log", "LeftFoot", speed, wrench, ("fz", "mx", "fy"), 700.0)
@@ -430,6 +436,13 @@ def test_the_gain_of_a_foot_is_relative_to_the_median_of_the_others():
     for rows, count in ((15, 0), (16, 1)):  # two in each of eight parts
         some = slice(0, 25 * rows, 25)
         assert len(list(check_gains("log", names, loads[some], 1.2 * left[some]))) == count
+    noisy = left + 60.0 * np.random.default_rng(2).normal(size=left.shape)
+    own, one = (  # of the squared residual a tenth must go
+        np.linalg.lstsq(A, noisy.ravel(), rcond=None)[1][0]
+        for A in (loads.reshape(-1, 4), loads.sum(axis=2).reshape(-1, 1))
+    )
+    assert 0.9 * one < own < 0.99 * one
+    assert not list(check_gains("log", names, loads, noisy))
     right, same = shifting(np.random.default_rng(1), np.array([1.03, 1.0, 1.0, 0.98]))
     assert not list(check_gains("log", names, right, 1.2 * same))
 
@@ -462,6 +475,8 @@ def test_gains_that_the_loads_hardly_determine_are_those_of_equal_feet():
     equal = np.sqrt(1e-4 * np.sum(A**2) / 2) * np.array([[1.0, -1.0]])
     solved = np.linalg.lstsq(np.vstack([A, equal]), np.append(left, 0.0), rcond=None)[0]
     (finding,) = check_gains("log", names, loads, left)
+    shown = f"with the URDF's weight, a needs the factor {solved[0]:.3g}, b {solved[1]:.3g}"
+    assert shown in finding.message
     k = names.index(finding.message.split("that of ")[1][0])
     assert finding.evidence["factor"] == pytest.approx(solved[k] / solved[1 - k])
     alone = np.linalg.lstsq(A, left.ravel(), rcond=None)[0]

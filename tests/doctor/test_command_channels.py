@@ -133,6 +133,12 @@ def test_commands_lost_in_friction_or_backlash_are_named(servo, amplitude):
     assert (finding.severity, finding.where) == ("warning", "log: joint_0")
     assert finding.evidence["followed"] < 0.5
     assert finding.evidence["sweep"] == pytest.approx(2 * amplitude, rel=0.01)
+    share, sweep = finding.evidence["followed"], 2 * amplitude
+    assert finding.message == (
+        f"log: joint_0 follows {100 * share:.0f} % of slow sweeps of {sweep:.3g} rad: friction, "
+        f"backlash or the dead band of its drive suppress {(1 - share) * sweep:.2g} rad; move it "
+        f"by {5 * (1 - share) * sweep:.2g} rad or more"
+    )
 
 
 def test_commands_of_few_steps_of_the_encoder_are_named():

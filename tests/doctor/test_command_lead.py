@@ -7,7 +7,7 @@ import pytest
 from helpers.servos import Servo, chirps, record
 
 from robotid.doctor.command_channels import check_commands
-from robotid.doctor.command_lead import _fit, find_lead
+from robotid.doctor.command_lead import _fit, _smooth, find_lead
 
 RATE = 100.0  # [Hz]
 SERVO = Servo(coulomb=2.0, quantum=1.5e-3)  # its lag at low frequency is 80 ms
@@ -62,6 +62,17 @@ def test_a_constant_offset_and_a_drift_change_no_lag(log):
     lag, *_, explained = _fit(command, command + noise, 1 / RATE)
     assert lag == pytest.approx(0.0, abs=1e-4)
     assert 0.0 <= explained < 0.05
+
+
+def test_signals_are_those_of_the_loop_up_to_its_bandwidth():
+    """By the gain of a Butterworth filter of order two, forwards and backwards, at 50 Hz."""
+    t = np.arange(1000) / 50
+    for f, bandwidth in ((3.0, 5.0), (8.0, 5.0), (15.0, 19.5)):
+        x = np.sin(2 * np.pi * f * t + 0.4)
+        gain = 1 / (1 + (np.tan(np.pi * f / 50) / np.tan(np.pi * bandwidth / 50)) ** 4)
+        found = _smooth(x, 0.02, bandwidth)
+        np.testing.assert_allclose(found[100:-100], gain * x[100:-100], atol=1e-6)
+    assert all(_smooth(x, 0.02, above) is x for above in (20.5, np.nan))
 
 
 def test_short_windows_and_smooth_commands_are_no_lead(log):

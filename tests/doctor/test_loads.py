@@ -208,6 +208,20 @@ def test_what_a_load_model_expects_is_of_the_torques_that_it_uses(ur5, ur5_log):
     assert model.R.any(axis=(1, 2)).tolist() == [j in used for j in range(6)]
 
 
+def test_joints_with_a_third_of_the_largest_gravity_are_lifting(rng):
+    """By mean size, whatever the sign, and whatever the inertial torques and the links are."""
+    means = np.array([-8.0, 3.1, 10.0, 2.9, 5.0])  # [N m], [N]
+    gravity = means * rng.choice([0.5, 1.5], (3, 1)) * np.array([[1], [-1], [1.0]])
+    gravity[:] *= np.abs(means) / np.abs(gravity).mean(axis=0)
+    inertial, parts = rng.normal(size=(3, 5, 2)), np.array([1.5, -0.5])
+
+    def loads(at=None):
+        return inertial + (gravity[..., None] * parts if at is None else 0.0)
+
+    joints = SimpleNamespace(joints=tuple("abcde"), layout=SimpleNamespace(prismatic={"c"}))
+    assert loads_module._lifting(SimpleNamespace(model=joints, loads=loads)) == [0, 4, 1]
+
+
 def test_what_a_counterbalance_cancels_is_its_share_of_gravity(ur5, ur5_log):
     probe = take_probe(ur5, smooth_motion(ur5, ur5_log, SIGNALS), samples=150)
     rest = probe.loads() - probe.loads(np.zeros(3))

@@ -74,6 +74,8 @@ def test_the_nearest_matrix_has_the_positive_eigenvalues(rng):
     values, V = np.linalg.eigh(S)
     clipped = V @ (np.maximum(values, 0.0)[:, :, None] * V.transpose(0, 2, 1))
     np.testing.assert_allclose(unsvec(found.reshape(-1)), clipped, atol=5e-3)
+    far, _ = nearest(1e5 * svec(S), cone)  # solved in a larger unit
+    np.testing.assert_allclose(1e-5 * unsvec(far.reshape(-1)), clipped, atol=5e-3)
 
 
 @pytest.mark.parametrize(

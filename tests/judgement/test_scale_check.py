@@ -337,6 +337,18 @@ def test_a_factor_that_errors_of_the_urdf_explain_contradicts_nothing(common, is
     assert replace(heavy, mass_error=6.0).contradicts is is_wrong
 
 
+@pytest.mark.parametrize(
+    ("left", "limit"), [((0.05, 0.2), 0.2), ((0.01, 0.2), 0.1), ((0.05, 0.11), 0.2)]
+)
+def test_a_factor_is_one_far_from_1_by_what_it_leaves_and_better_than_a_payload(left, limit):
+    """By a tenth and four times the share that it leaves, which is less than half of the other."""
+    for off in (limit - 0.01, limit + 0.01):
+        for factor in (1.0 + off, 1.0 - off):
+            found = ScaleCheck(scale=factor, factor=factor, unexplained=left)
+            assert found.has_one_factor is (off > limit)
+            assert not replace(found, unexplained=(left[0], 1.9 * left[0])).has_one_factor
+
+
 @pytest.mark.parametrize(("error", "is_wrong"), [(6.0, False), (4.0, True)])
 def test_a_total_mass_that_torque_does_not_determine_contradicts_nothing(error, is_wrong):
     found = ScaleCheck(scale=1.04, factor=1.04, masses=(20.0, 30.0, 0.0), unexplained=(0.2, 0.2))

@@ -180,11 +180,14 @@ def test_a_message_names_the_figure_its_limit_and_the_probable_cause():
         "total mass 26 kg against the URDF's 28.7 kg; gravity torque and total mass differ by more "
         "than 5 %. Probable cause: the URDF's masses, or the gains of the torques. Verify"
     ) in plain.message
+    open_mass = StatedMass(("total_mass",), absorbed_by=tuple("abcdef"))
+    assert "(the mass of a, b, c, d and 2 more changes with it" in open_mass.message
     mass = ScaleCheck(scale=1.0, factor=1.0, masses=(10.0, 15.0, 0.0), unexplained=(0.2, 0.2))
     assert "; total mass differs by more than 35 %. Probable" in mass.message
     load = ScaleCheck(scale=1.01, factor=1.2, masses=(10.0, 13.0, 2.0), unexplained=(0.2, 0.01))
     assert "Probable cause: a load of +2 kg on the last link" in load.message
-    single = ScaleCheck(scale=1.1, factor=1.1, masses=(10.0, 10.0, 0.0), gravity={"a": 1.4})
+    gravity = {"b": 1.3, "a": 1.4, "c": 0.7}
+    single = ScaleCheck(scale=1.1, factor=1.1, masses=(10.0, 10.0, 0.0), gravity=gravity)
     assert "by joint: a 1.40: probable cause: masses of the URDF, or" in single.message
     prior = ScaleCheck(scale=1.0, factor=1.0, masses=(10.0, 10.0, 0.0), follows=False)
     assert "the residual of a joint is above 1.5 x that of WLS. Probable cause: a prior" in (

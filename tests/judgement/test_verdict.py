@@ -634,6 +634,15 @@ def test_good_needs_a_witness_or_says_that_there_is_none(scale_check, status, sa
     assert said in found.reasons[-1]
 
 
+def test_errors_of_the_wrench_on_the_base_are_noted_beside_those_of_joints():
+    base = {"base.fz": joint(12.0), "base.mx": joint(30.0)}
+    logs = {"both": {"a": joint(4.0)} | base, "joints": {"a": joint(4.0)}, "alone": base}
+    metrics = {name: Metrics(own, 1.0) for name, own in logs.items()}
+    (note,) = Predictions(Metrics({"a": joint(4.0)}, 1.0), metrics).of_base()
+    assert note.startswith("wrench on the base that contact forces cannot cause, error on both: ")
+    assert "fz 12 %, mx 30 %. The verdict is on the torque of the joints" in note
+
+
 def test_joints_better_by_the_urdf_are_those_of_all_logs():
     better, worse = {"urdf_with_drives": 3.0}, {"urdf_with_drives": 9.0}
     logs = {
@@ -650,3 +659,8 @@ def test_joints_better_by_the_urdf_are_those_of_all_logs():
     ]
     errors = {name: own for name, (_, _, own) in found.on_each().items()}
     assert errors == {"a": [4.0, 4.0], "b": [4.0, 4.0], "c": [4.0], "d": [], "e": []}
+    part = replace(found, hidden=("b", "e"))  # their metrics are ignored
+    assert part.fitted.keys() == {"a", "c", "d"}
+    assert {log: [*own] for log, own in part.tested.items()} == {"one": ["a", "c"], "two": ["a"]}
+    assert part.on_each().keys() == {"a", "c", "d"}
+    assert part.better_by_urdf()[0].startswith("the URDF with fitted drives predicts a better")

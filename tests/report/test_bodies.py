@@ -2,6 +2,7 @@
 
 import re
 from html import unescape
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -44,6 +45,19 @@ def test_intervals_contain_those_of_sampled_parameters(identified, central, i):
     quantile = identified.standard_quantile[own].max()
     wanted = quantile * np.column_stack([m, c, yy, xz]).std(axis=0) * 1e4
     np.testing.assert_allclose(central.half[i][[0, 1, 2, 3, 5, 8]], wanted, rtol=0.05)
+
+
+def test_a_body_with_a_parameter_of_unknown_error_has_no_intervals(identified, central):
+    names = "model standard prior standard_quantile standard_covariance prior_std sources"
+    own = {name: getattr(identified, name) for name in names.split()}
+    error, free = identified.standard_error.copy(), np.array(identified.errors.unbounded)
+    error[23] = np.inf
+    found = central_parameters(
+        SimpleNamespace(**own, standard_error=error, errors=SimpleNamespace(unbounded=free))
+    )
+    assert np.isposinf(found.half[2]).all()
+    others = np.arange(6) != 2
+    np.testing.assert_array_equal(found.half[others], central.half[others])
 
 
 def test_sources_are_those_of_the_parameters(identified, central):

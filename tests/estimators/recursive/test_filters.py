@@ -144,6 +144,10 @@ def test_few_samples_are_refused_with_forgetting_too(rng):
     )
     with pytest.raises(DataError, match="2 torque rows for 3 parameters"):
         RLS(np.ones(2), 0.9, np.zeros(3), np.ones(3)).fit(problem)
+    one = np.array([1.0, 0.0])  # only the first joint moves, in each of two samples
+    problem = replace(problem, stream=lambda: iter([(Y[0], tau[0], one)] * 2))
+    with pytest.raises(DataError, match="2 torque rows for 3 parameters"):
+        RLS(np.ones(2), 1.0, np.zeros(3), np.ones(3)).fit(problem)
 
 
 def test_a_filter_that_never_walks_is_wls(ur5, rng):
