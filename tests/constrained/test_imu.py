@@ -10,7 +10,13 @@ from helpers.paths import JOBS
 
 from robotid.commands.job import read_job
 from robotid.constrained.contacts import check_base
-from robotid.constrained.imu import _check_axes, _check_orientation, _named, _turn
+from robotid.constrained.imu import (
+    _check_axes,
+    _check_gravity,
+    _check_orientation,
+    _named,
+    _turn,
+)
 from robotid.logs.base import BaseMotion, base_state, in_base, quaternions_of_angles
 from robotid.logs.data import Log
 from robotid.logs.imu import ImuFrame, ImuMotion
@@ -239,6 +245,28 @@ def test_the_mean_specific_force_in_the_world_is_stated_for_a_robot_that_drives_
     assert f"is {size:.3g} m/s^2 on average, {angle:.0f} deg from the vertical" in found.message
     assert "wanted 9.81 m/s^2 upwards: its scale is wrong" in found.message
     assert not list(check_base(free, log.window(4.0, 5.9), RAW))  # too short for a mean
+
+
+@pytest.mark.parametrize(
+    ("angle", "size", "cause"),
+    [
+        (7.0, 9.81, None),
+        (9.0, 9.81, "are not those of the link"),
+        (7.0, 13.0, "its scale is wrong"),
+        (9.0, 13.0, "are not those of the link"),
+        (173.0, 9.81, "its sign is reversed"),
+        (171.0, 9.81, "are not those of the link"),
+    ],
+)
+def test_a_specific_force_is_wrong_beyond_8_degrees_from_the_vertical(angle, size, cause):
+    force = size * pin.exp3(np.radians(angle) * np.array([0.6, -0.8, 0.0])) @ -G / 9.81
+    still, upright = np.zeros((3, 6)), np.tile([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0], (3, 1))
+    motion = SimpleNamespace(q=upright, v=still, a=still + np.append(force + G, np.zeros(3)))
+    found = list(_check_gravity(SimpleNamespace(name="log"), FRAME, motion))
+    assert len(found) == (cause is not None)
+    for finding in found:
+        assert cause in finding.message
+        assert finding.evidence["angle"] == pytest.approx(angle)
 
 
 def test_the_turn_is_the_rotation_that_explains_the_motion():
