@@ -1,6 +1,7 @@
 """`robotid track`: what of a job reaches the tracker, and what of its history is told."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -151,3 +152,21 @@ def test_a_live_page_is_told_what_is_known_at_each_moment_in_the_time_of_the_log
     monkeypatch.setattr(module, "run_track", lambda job, folder, observer: vars(observer))
     real = serve_track(job, None, port=7, announce=heard.append, linger=False)
     assert real["_speed"] == 1.0  # in real time
+
+
+def test_a_gap_is_told_between_the_samples_beside_it(arm):
+    t = 4.0 + 0.01 * np.arange(300)
+    t = t[(t < 5.0) | (t > 5.59)]
+    q = np.zeros((len(t), len(arm.joints)))
+    told = []
+    feed = module._LiveFeed(
+        SimpleNamespace(send=told.append), arm, Log(t, q, q, arm.joints), speed=0.0
+    )
+    for k in range(len(t)):
+        feed(k, SimpleNamespace(is_ready=False, changes=[]))
+    (place,) = (k for k, message in enumerate(told) if "mark" in message)
+    mark = told[place]["mark"]
+    before, after = told[place - 1]["t"], told[place + 1]["t"]
+    assert (mark["t"], after) == pytest.approx((4.99, 5.6))
+    assert before <= mark["t"] < after
+    assert (mark["kind"], mark["label"]) == ("gap", "gap of 0.61 s")

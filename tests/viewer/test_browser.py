@@ -701,6 +701,12 @@ def test_the_live_page_follows_a_running_tracker_and_ends_on_ctrl_c(browser, pla
                 k = int(np.searchsorted(x, 5.0))
                 assert (x[k], np.isnan(y[k])) == (5.0, True)
                 assert 5.6 < x[k + 1] < 7.0
+            kept = seen.page.evaluate("""() => { // a table with every second row left out
+              const table = new replay.motion.constructor();
+              for (let k = 0; k <= 20000; k++) table.push(0.5 * k, [k === 7 ? NaN : k]);
+              return [table.t.slice(0, 6), table.t.length];
+            }""")
+            assert kept == [[0.0, 1.0, 2.0, 3.0, 3.5, 4.0], 10002]
             assert seen.errors == []
             assert seen.requests == [f"{address}events"]
         assert (tmp_path / "out" / "track.json").is_file()
