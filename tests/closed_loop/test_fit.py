@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from robotid.closed_loop.fit import _SETTLING, _settled
+from robotid.closed_loop.fit import _settled
 from robotid.estimators.estimator import Estimate
 
 COVARIANCE = np.array([[0.04, 0.01], [0.01, 0.09]])
@@ -58,4 +58,3 @@ def test_steps_that_do_not_settle_are_in_the_covariance(steps, taken, moved):
     np.testing.assert_allclose(simulator.fitted, before, rtol=1e-14)
     np.testing.assert_allclose(found.theta, np.add([1.0, -2.0], np.sum(steps, axis=0)), rtol=1e-14)
     np.testing.assert_allclose(found.covariance, COVARIANCE + np.outer(moved, moved), rtol=1e-14)
-    assert _SETTLING == 4

@@ -20,7 +20,18 @@ NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable"
 FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]  # no GPU needed
 #: Pages are put together by the processor, which emulates a GPU for 3-D views alone, and says so.
 FLAGS += ["--disable-gpu-compositing"]
-OF_THE_EMULATION = "GPU stall due to ReadPixels"
+OF_THE_EMULATION = (
+    "GL Driver Message (OpenGL, Performance, GL_CLOSE_PATH_NV, High): GPU stall due to ReadPixels"
+)
+#: A page that itself reads pixels gives this message, too: it gets one of ours.
+READS_PIXELS = """
+for (const { prototype } of [WebGLRenderingContext, WebGL2RenderingContext]) {
+  const read = prototype.readPixels;
+  prototype.readPixels = function (...args) {
+    console.warn("the page reads pixels");
+    return read.apply(this, args);
+  };
+}"""
 NO_BROWSER = f"no browser: none of {', '.join(NAMES)} is on PATH; apt-get install chromium"
 
 
@@ -67,6 +78,7 @@ def visit(
     address = Path(target).resolve().as_uri() if isinstance(target, Path) else target
     context = browser.new_context(viewport={"width": size[0], "height": size[1]}, **options)
     page = context.new_page()
+    page.add_init_script(READS_PIXELS)
     seen = Visit(page)
     page.on("pageerror", lambda error: seen.errors.append(str(error)))
 

@@ -644,6 +644,19 @@ def test_a_notebook_s_frame_plays(browser, planar, tmp_path):
 
 
 # the command as it is, but the page is told nothing after 3 s of the log until a file is there
+
+
+def test_a_page_that_reads_pixels_is_heard(browser, tmp_path):
+    """The browser's own message is ignored: its emulated GPU gives it for every 3-D view."""
+    page = tmp_path / "page.html"
+    page.write_text("""<canvas></canvas><script>
+      const gl = document.querySelector("canvas").getContext("webgl2");
+      gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4));
+    </script>""")
+    with visit(browser, page) as seen:
+        assert seen.errors == ["the page reads pixels"]
+
+
 HELD = """
 import pathlib, runpy, signal, time
 signal.signal(signal.SIGINT, signal.default_int_handler)  # whatever the shell of the tests ignores
