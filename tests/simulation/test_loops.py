@@ -661,3 +661,14 @@ def test_the_command_of_the_last_tick_is_averaged_to_the_next_one():
     np.testing.assert_allclose(
         grid.sampled(ticks).reshape(-1, 2), np.column_stack([ticks, ticks + 0.5])
     )
+
+
+@pytest.mark.parametrize(
+    ("step", "rate", "count"),
+    [(0.25, 2.0, 4), (0.3, 2.0, 4), (0.13, 2.0, 8), (0.5, 2.0, 2), (0.25, None, 4), (0.3, None, 4),
+     (2.0, None, 1)],
+)  # fmt: skip
+def test_steps_divide_ticks_and_are_no_more_than_needed(step, rate, count):
+    """Two ticks in each row of 1 s: a tick of 0.5 s has two steps of 0.25 s, four of 0.13 s."""
+    grid = _Grid(np.arange(5.0, 9.0), np.arange(5.0, 9.1, 0.5), 1.0)
+    assert grid.least_steps(step, rate) == count
