@@ -13,6 +13,7 @@ from robotid.exceptions import NotConvergedError
 from robotid.logs.data import Trajectory
 from robotid.regressor.memory import remember
 from robotid.regressor.prediction import predict
+from robotid.robot.assumed import with_assumed_inertials
 from robotid.robot.drives import DriveTerm
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import inertial_from_pseudo_inertia, pseudo_inertia
@@ -478,9 +479,10 @@ def with_terms(model: RobotModel, loops: Loops) -> RobotModel:
         ]
         for joint, terms in zip(model.joints, loops.terms, strict=True)
     }
-    return RobotModel.from_urdf(
+    extended = RobotModel.from_urdf(
         model.tree, **{**model.options, "own_terms": {k: v for k, v in own.items() if v}}
     )
+    return with_assumed_inertials(extended)
 
 
 def _has(model: RobotModel, joint: str) -> list[object]:

@@ -381,11 +381,12 @@ class Job(Settings):
         Raises:
             ModelError: If the URDF cannot be used, or a joint is not in it.
         """
+        from robotid.robot.assumed import with_assumed_inertials
         from robotid.robot.model import RobotModel
 
         gears = [gear for gear in self.transmissions if gear.matrix != "urdf"]
         motors = [motor for gear in gears for motor in _motors(gear)]
-        return RobotModel.from_urdf(
+        model = RobotModel.from_urdf(
             self.urdf,
             joints=self.joints,
             locked=self.locked,
@@ -403,6 +404,7 @@ class Job(Settings):
             constraints=(*self.contacts, *self.loops),
             passive=self.passive,
         )
+        return with_assumed_inertials(model)
 
     def placed(self, model: "RobotModel") -> tuple[str, ...]:
         """Return the locked joints of the model whose position the job states.

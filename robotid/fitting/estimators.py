@@ -94,6 +94,9 @@ def consistent_fit(
     if not how:
         return fit
     choice = choose_weight(fit, segments, how, known.repeated)
+    if fit.constraints.extent and not choice.is_as_good:
+        fit = replace(fit, constraints=fit.constraints.without_extent(fit.constraints.extent))
+        choice = choose_weight(fit, segments, how, known.repeated)
     return replace(
         fit, prior_weight=choice.weight, plausible_weight=choice.plausible, choice=choice
     )

@@ -38,9 +38,10 @@ from robotid.recordings.logs import Recordings
 from robotid.recordings.survey import hold_log
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.constraints import logged_base
+from robotid.robot.assumed import with_assumed_inertials
 from robotid.robot.families import AUTO, wanted_families
 from robotid.robot.model import RobotModel
-from robotid.urdf_audit.inertials import impossible_inertials
+from robotid.urdf_audit.inertials import assumed_inertials, impossible_inertials
 from robotid.variation.variation import vary
 
 __all__ = ["conclude", "identify", "robot_of", "with_drives"]
@@ -129,7 +130,7 @@ def robot_of(model: RobotModel | str | Path, logs: object) -> RobotModel:
         ModelError: If it is no robot, or the two are swapped.
     """
     if isinstance(model, RobotModel):
-        return model
+        return with_assumed_inertials(model)
     kind, is_robot = type(model).__name__, isinstance(logs, RobotModel)
     is_path = isinstance(model, str | Path)
     suffixes = [Path(x).suffix.lower() if isinstance(x, str | Path) else "" for x in (model, logs)]
@@ -141,7 +142,7 @@ def robot_of(model: RobotModel | str | Path, logs: object) -> RobotModel:
         )
     if not is_path:
         raise ModelError(f"model is a {kind}, wanted a RobotModel or the path of a URDF")
-    return RobotModel.from_urdf(model)
+    return with_assumed_inertials(RobotModel.from_urdf(model))
 
 
 def conclude(
@@ -198,7 +199,12 @@ def conclude(
     merged = rejected(merged, result.predictions, result.scale_check)
     log_errors = blocking(merged, ignore, is_robust=is_robust)
     heads = [log.head for log in (*recordings.fitted, *recordings.validation)]
-    findings = [*log_findings(heads), *impossible_inertials(model), *merged]
+    findings = [
+        *assumed_inertials(model),
+        *log_findings(heads),
+        *impossible_inertials(model),
+        *merged,
+    ]
     findings += not_written(log_errors, "" if fit.is_consistent else fit.estimator.name)
     counted = not_ignored(findings, ignore)
     names = [Path(e.recording.log.path).name for e in fit.validation if not e.is_refitted]

@@ -55,6 +55,7 @@ from robotid.regressor.constraints import logged_base
 from robotid.regressor.factors import Factors, compress, join, merge
 from robotid.regressor.prediction import predict
 from robotid.regressor.used_rows import base_problem, independent_share
+from robotid.robot.assumed import with_assumed_inertials
 from robotid.robot.closure import refuse_loops
 from robotid.robot.model import RobotModel
 from robotid.robot.prior import prior_spread
@@ -264,6 +265,7 @@ def preview(
     choice = EstimatorSettings(estimator) if isinstance(estimator, str) else estimator
     settings, run = signals or SignalSettings(), None
     model = model if isinstance(model, RobotModel) else RobotModel.from_urdf(model)
+    model = with_assumed_inertials(model)
     if given is not None:
         model, settings = given.model, signals or given.asked.signals
         logs = [hold_log(model, e.recording.log, e.recording.signals) for e in given.fitted]

@@ -17,6 +17,7 @@ from robotid.robot.parameters import pseudo_inertia
 
 __all__ = [
     "body_boxes",
+    "body_frames",
     "body_points",
     "box_half_spaces",
     "geometry_half_spaces",
@@ -131,7 +132,7 @@ def body_boxes(model: RobotModel) -> dict[str, Array]:
     Returns:
         Lower and upper corner by name of each body, shape (2, 3) [m].
     """
-    bodies, frames = model.layout.bodies, _body_frames(model)
+    bodies, frames = model.layout.bodies, body_frames(model)
     shapes, boxes = body_points(model), {}
     J = pseudo_inertia(model.standard_parameters()[: model.layout.n_inertial])
     for body, J_i in zip(bodies, J, strict=True):
@@ -163,7 +164,7 @@ def kinematic_lengths(model: RobotModel) -> dict[str, float]:
     Returns:
         Length by name of the body [m].
     """
-    pins, bodies, frames = model.pin_model, model.layout.bodies, _body_frames(model)
+    pins, bodies, frames = model.pin_model, model.layout.bodies, body_frames(model)
     steps = [float(np.linalg.norm(place.translation)) for place in pins.jointPlacements]
     reach = np.zeros(len(steps))  # from the root along the joints [m]
     for i, parent in enumerate(pins.parents):
@@ -221,8 +222,15 @@ def hull_half_spaces(points: Array) -> tuple[Array, Array]:
     return A, (A @ points.T).max(axis=1)
 
 
-def _body_frames(model: RobotModel) -> dict[str, list[Array]]:
-    """Return the origins of the frames of each body, in the frame of its moved link [m]."""
+def body_frames(model: RobotModel) -> dict[str, list[Array]]:
+    """Return the origins of the frames of each body (its joints, links, tools), by its name.
+
+    Args:
+        model: The robot.
+
+    Returns:
+        Origins in the frame of the body's moved link, shape (3,) [m].
+    """
     pins, bodies = model.pin_model, model.layout.bodies
     frames: dict[str, list[Array]] = {body: [np.zeros(3)] for body in bodies}
     for frame in pins.frames:

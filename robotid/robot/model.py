@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
@@ -53,6 +53,8 @@ class RobotModel:
         dynamics: "full", or "static" for logs of poses and slow motion: velocities and
             accelerations are used for the sign of friction only.
         constraints: Contacts with the ground, and loops that close kinematic chains.
+        assumed: Why the inertial of a body is not the URDF's, by its name; see
+            ``with_assumed_inertials``.
     """
 
     tree: Tree
@@ -66,6 +68,7 @@ class RobotModel:
     reference: Array | None = None
     dynamics: str = "full"
     constraints: tuple[Constraint, ...] = ()
+    assumed: Mapping[str, str] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         return (

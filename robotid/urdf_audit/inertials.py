@@ -6,13 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from robotid.findings import Finding
+from robotid.findings import Finding, listed
+from robotid.robot.assumed import REASONS
 from robotid.robot.bodies import link_places
 from robotid.robot.model import RobotModel
 from robotid.robot.tree import Inertial
 from robotid.robot.urdf_text import numbers
 
-__all__ = ["impossible_inertial", "impossible_inertials", "negative_masses"]
+__all__ = ["assumed_inertials", "impossible_inertial", "impossible_inertials", "negative_masses"]
 
 _SLACK = 1e-9  # relative violation of the triangle inequality that is rounding
 
@@ -35,8 +36,32 @@ def negative_masses(robot: ET.Element) -> Iterator[Finding]:
                 yield Finding("negative_mass", "error", f"link {name}", message, {"mass": value})
 
 
+def assumed_inertials(model: RobotModel) -> list[Finding]:
+    """Return a finding for each reason of the inertials that are assumed.
+
+    Args:
+        model: The robot; see ``with_assumed_inertials``.
+    """
+    pi = model.standard_parameters()
+    findings = []
+    for code, reason in REASONS.items():
+        bodies = [body for body in model.layout.bodies if model.assumed.get(body) == code]
+        if not bodies:
+            continue
+        masses = [float(pi[10 * model.layout.bodies.index(body)]) for body in bodies]
+        shape = "their stated masses in" if code == "not_positive_definite" else "the masses of"
+        message = (
+            f"the URDF has {reason}: {listed(bodies, 12)}. Assumed: {shape} uniform boxes of their "
+            f"geometry or frames, {sum(masses):.3g} kg together. What the data do not determine "
+            "keeps these values; write the inertials from CAD if you have them"
+        )
+        evidence = {"bodies": float(len(bodies)), "mass": sum(masses)}
+        findings.append(Finding(code, "warning", f"link {bodies[0]}", message, evidence))
+    return findings
+
+
 def impossible_inertials(model: RobotModel) -> list[Finding]:
-    """Return the impossible inertials of moving links, as warnings on a fit with this prior.
+    """Return the impossible inertials of links that are not assumed, as warnings on a fit.
 
     Args:
         model: The robot.
@@ -47,9 +72,10 @@ def impossible_inertials(model: RobotModel) -> list[Finding]:
         replace(finding, severity="warning", message=finding.message + effect)
         for place in link_places(model)
         if place.body >= 0 and place.link in inertials
+        and model.layout.bodies[place.body] not in model.assumed
         for finding in impossible_inertial(place.link, inertials[place.link], matters=False)
         if finding.severity == "error"
-    ]
+    ]  # fmt: skip
 
 
 def impossible_inertial(link: str, inertial: Inertial, matters: bool) -> Iterator[Finding]:

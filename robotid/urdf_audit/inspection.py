@@ -18,12 +18,13 @@ from robotid.regressor.base_parameters import (
     structural_mapping,
 )
 from robotid.regressor.torque import random_regressor
+from robotid.robot.assumed import with_assumed_inertials
 from robotid.robot.bodies import LinkPlace, link_places
 from robotid.robot.model import RobotModel
 from robotid.robot.tree import MOVABLE
 from robotid.robot.urdf_text import number_fault, numbers, parse_urdf, read_with_yourdfpy
 from robotid.urdf_audit.geometry import audit_links
-from robotid.urdf_audit.inertials import impossible_inertial, negative_masses
+from robotid.urdf_audit.inertials import assumed_inertials, impossible_inertial, negative_masses
 from robotid.urdf_audit.rounding import rounded_angles, weak_parameters
 
 __all__ = ["Inspection", "Structure", "inspect_urdf"]
@@ -124,6 +125,7 @@ def inspect_urdf(path: str | Path, *, free_flyer: bool = False) -> Inspection:
         movable = [j.get("name", "") for j in robot.findall("joint") if j.get("type") in MOVABLE]
         return Inspection(name, tuple(movable), None, (), tuple(findings))
     full, inertial = structural_mapping(model), structural_mapping(model, inertial_only=True)
+    findings += assumed_inertials(with_assumed_inertials(model))
     findings += _link_findings(model)
     findings += audit_links(model)
     rounded = list(rounded_angles(model, full))
@@ -238,7 +240,7 @@ def _link_findings(model: RobotModel) -> Iterator[Finding]:
             if place.link in inertials:
                 matters = body >= 0 and not any(inertials[link].mass > 0 for link in having)
                 yield from impossible_inertial(place.link, inertials[place.link], matters)
-            elif body >= 0:
+            elif body >= 0 and having:
                 yield _missing(place.link, having)
         lumped = [p.link for p in members if p.role == "fixed" and p.link in inertials]
         if lumped and body >= 0:
@@ -251,17 +253,11 @@ def _link_findings(model: RobotModel) -> Iterator[Finding]:
 
 
 def _missing(link: str, having: list[str]) -> Finding:
-    if having:
-        message = (
-            f"link {link!r} moves but has no <inertial>, wanted one. The mass of its body is in "
-            f"{listed(having)}; no action needed if the link is only a frame"
-        )
-        return Finding("missing_inertial", "note", f"link {link}", message)
     message = (
-        f"link {link!r} moves but has no <inertial>, nor has any link attached to it, wanted one. "
-        "Its body is massless; add estimates of mass, centre of mass and inertia"
+        f"link {link!r} moves but has no <inertial>, wanted one. The mass of its body is in "
+        f"{listed(having)}; no action needed if the link is only a frame"
     )
-    return Finding("missing_inertial", "warning", f"link {link}", message)
+    return Finding("missing_inertial", "note", f"link {link}", message)
 
 
 def _plain(finding: Finding) -> Mapping[str, Any]:

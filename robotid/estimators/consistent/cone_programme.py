@@ -12,16 +12,12 @@ from robotid.estimators.consistent.cones import Cone, ConeSolution, Subspace, le
 from robotid.estimators.consistent.interior_point import EntropicProblem
 from robotid.estimators.consistent.penalties import Entropic, Penalty
 from robotid.exceptions import NotConvergedError
-from robotid.regressor.factors import Factors
 
 __all__ = ["Programme"]
 
 _EXACT = 1e-12  # relative decrease of the objective per step at which a fit is exact
 _ROUGH = 1e-6  # ... and at which it is sufficient for a prediction
 _TOGETHER = 2**17  # entries of the data sets that are fitted in one pass: they fit into a cache
-_NOISE_STEPS, _NOISE_SETTLED = 50, 1e-4  # steps and relative change of the noise levels
-_FLOOR = 1e-6  # smallest noise level over the torque, for noise-free data
-_LEAST_FREEDOM = 0.1  # smallest degrees of freedom of a noise level, as a share of the rows
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,41 +217,6 @@ class Programme:
         L = scipy.linalg.qr(S @ basis, mode="r")[0][: basis.shape[1]]
         K = self.K * self.scale
         return K @ nearest, scipy.linalg.solve_triangular(L, (K @ basis).T, trans="T").T
-
-    def noise(self, factors: Factors, sigma: Array, share: float, weight: float) -> Array:
-        """Return the noise levels of the fit without inequalities, shape (n,) [N m or N], not 0.
-
-        sigma_j^2 = |tau_j - W_j pi|^2 / (rows_j - used_j / share), where used_j is the number of
-        effective degrees of freedom of the rows of joint j, the trace of their leverage. Filtered
-        rows are correlated: only a share of them is independent.
-
-        Args:
-            factors: The factors, of base parameters.
-            sigma: Initial noise levels, shape (n,) [N m or N].
-            share: Share of independent rows [-].
-            weight: Weight of the penalty [-].
-        """
-        beta, M = self._plausible
-        rows = np.maximum(factors.rows, 1)
-        torque = np.sqrt(factors.torque_squares() / rows)
-        least = _FLOOR * np.where(torque > 0, torque, 1.0)
-        sigma = np.maximum(sigma, least)
-        # M x = U x' with at most as many coordinates x' as base parameters
-        U = scipy.linalg.qr(M.T, mode="r")[0][: len(M)].T
-        left = factors.without(beta)
-        for _ in range(_NOISE_STEPS):
-            weights = share / sigma**2
-            information = U.T @ left.information(weights) @ U + weight * np.eye(U.shape[1])
-            factor = scipy.linalg.cho_factor(information)
-            x = scipy.linalg.cho_solve(factor, U.T @ left.score(np.zeros(len(U)), weights))
-            used = weights * left.leverages(U @ scipy.linalg.cho_solve(factor, U.T))
-            freedom = np.maximum(rows - used / share, _LEAST_FREEDOM * rows)
-            updated = np.maximum(left.noise_levels(U @ x, freedom), least)
-            change = float(np.max(np.abs(updated / sigma - 1.0)))
-            sigma = updated
-            if change < _NOISE_SETTLED:
-                break
-        return sigma
 
     def covariance(
         self, weight: float, rows: Array | None = None, pi: Array | None = None

@@ -29,6 +29,7 @@ from robotid.robot.parameters import ParameterLayout
 
 __all__ = ["Consistent"]
 
+_FLOOR = 1e-6  # smallest noise level over the torque, for noise-free data
 _ACTIVE = 1e-5  # slack below which a constraint is active, dimensionless
 
 
@@ -41,8 +42,8 @@ class Consistent(BatchEstimator):
         sum_j |tau_j - W_b,j K pi|^2 / sigma_j^2 + prior_weight penalty(pi)
 
     subject to J(pi_i) - J(held_i) >= margin T_i for each body i, armature, viscous and Coulomb
-    coefficients >= 0, and the other constraints. The noise levels sigma_j are those of the fit
-    without the inequalities, iterated from those of weighted least squares.
+    coefficients >= 0, and the other constraints. The noise levels sigma_j are those of weighted
+    least squares.
 
     The estimate contains the p standard parameters. Its covariance is that of the fit without the
     inequalities; see ``Programme.redrawn`` for the covariance with them. Its rank, condition number
@@ -118,9 +119,8 @@ class Consistent(BatchEstimator):
         return self
 
     def _fit(self, factors: Factors) -> Estimate:
-        start = self._wls_noise(factors)
-        wls = solve_factor(factors, start, self.K @ self.prior)
-        sigma = self.programme.noise(factors, start, self.independent_share, self.prior_weight)
+        sigma = self.noise(factors)
+        wls = solve_factor(factors, sigma, self.K @ self.prior)
         rows = self.rows(factors, sigma)
         solution = self.programme.minimise(rows, self.prior_weight)
         covariance = self.programme.covariance(self.prior_weight, rows, solution.x)
@@ -178,13 +178,19 @@ class Consistent(BatchEstimator):
         )
 
     def noise(self, factors: Factors) -> Array:
-        """Return the noise levels of the fit without the inequalities, shape (n,) [N m or N].
+        """Return the noise levels of weighted least squares, shape (n,) [N m or N].
+
+        They do not depend on the prior: a wrong one would otherwise make the data seem noisy.
 
         Args:
             factors: The factors, of base parameters.
         """
-        start = self._wls_noise(factors)
-        return self.programme.noise(factors, start, self.independent_share, self.prior_weight)
+        sigma = self.wls_noise
+        if sigma is None:
+            sigma = WLS(self.K @ self.prior, self.independent_share).fit(factors).sigma
+        torque = np.sqrt(factors.torque_squares() / np.maximum(factors.rows, 1))
+        level: Array = np.maximum(sigma, _FLOOR * np.where(torque > 0, torque, 1.0))
+        return level
 
     def rows(self, factors: Factors, sigma: Array) -> Array:
         """Return rows [R d], shape (b + 1, b + 1): |R K pi - d|^2 is the weighted cost of the data.
@@ -268,12 +274,6 @@ class Consistent(BatchEstimator):
         known = self.layout.owned_by(self.constraints.pinned)
         before = base_spread(self.K, self.prior_std, known)
         return determine(base_names, rows[:, :-1], before).undetermined
-
-    def _wls_noise(self, factors: Factors) -> Array:
-        """Return the noise levels of weighted least squares, shape (n,) [N m or N]."""
-        if self.wls_noise is not None:
-            return self.wls_noise
-        return WLS(self.K @ self.prior, self.independent_share).fit(factors).sigma
 
     def _details(self, pi: Array) -> dict[str, Any]:
         """Return the settings of the fit and its active constraints, as plain values."""

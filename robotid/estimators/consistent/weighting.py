@@ -17,11 +17,11 @@ from robotid.regressor.lapack import Triangle
 __all__ = ["Segments", "choose_weight", "contradicted_extents", "held_out_errors", "log_evidence"]
 
 _SMALLEST, _LARGEST = -4.0, 2.0  # decades of the weights tried
-_SMALLEST_ENTROPIC = -1.0  # at smaller weights bodies become thin, and fits converge slowly
 _PATIENCE = 2  # decades without a better score after which the search ends
 _ALIKE = 2.0  # standard errors by which the mean log error of a larger weight may be above the best
 _MOST_LOSS = 1.02  # largest ratio of the held-out errors of a larger weight, mean over joints
 _MOST_JOINT_LOSS = 1.05  # ... and of any one joint
+_AS_GOOD = 1.1  # largest ratio of the held-out error of a joint to that of least squares
 _MOST_REPEATED = 0.5  # largest share of repeated errors in the squared residual
 _BEYOND = 4.0  # standard errors by which a body must be outside its box
 _CLEAR = 0.02  # relative increase of the mean square error at which an extent is contradicted
@@ -71,6 +71,32 @@ class Segments:
                 total.fold_triangle(R, np.arange(len(R)))
         return np.array([total.R for total in rest])
 
+    @cached_property
+    def least_squares_errors(self) -> Array:
+        """Prediction errors of each segment by least squares of all others.
+
+        They have the form and unit of ``held_out_errors``, shape (segments, n).
+        """
+        errors = []
+        for fold, rows in zip(self.folds, self.others, strict=True):
+            size = np.maximum(np.linalg.norm(rows[:, :-1], axis=0), 1e-300)
+            scaled = np.linalg.lstsq(rows[:, :-1] / size, rows[:, -1], rcond=1e-7)[0]
+            errors.append(fold.residual_squares(scaled / size))
+        return self.errors(np.array(errors))
+
+    def errors(self, squares: Array) -> Array:
+        """Return squared errors over the square of the noise level and the number of rows.
+
+        Args:
+            squares: Sums by segment and joint, shape (segments, n) [N^2 m^2 or N^2].
+        """
+        squares = squares / self.sigma**2
+        rows = np.sum([fold.rows for fold in self.folds], axis=0)  # (n,)
+        if self.folds[0].is_projected:
+            squares, rows = squares.sum(axis=1, keepdims=True), rows.sum(keepdims=True)
+        errors: Array = squares / np.maximum(rows, 1)
+        return errors
+
 
 def choose_weight(
     fit: Consistent, segments: Segments, how: str, repeated: float = 0.0
@@ -85,13 +111,14 @@ def choose_weight(
       power against one or two bad segments. An error that repeats in all segments has no scatter:
       a smaller weight that only fits it is not better, so the mean log ratio may also be as large
       as such an error makes it.
+      The error of no joint may be more than 10 % above that of least squares: where the prior
+      is wrong, as of a placeholder, the weight is smaller.
     * "evidence": the weight with the largest ``log_evidence``.
 
-    Weights are tried from 100 down to 1e-4 (entropic: 0.1) in decades, until two weights in a row
-    are worse than those before, and then around the best one. A weight above 1 shifts the estimate
-    towards the prior, but does not reduce the standard errors; see ``Consistent.weight_ratio``. A
-    weight at which the fit does not converge, because bodies shrink to points, has an infinite
-    error.
+    Weights are tried from 100 down to 1e-4 in decades, until two weights in a row are worse than
+    those before, and then around the best one. A weight above 1 shifts the estimate towards the
+    prior, but does not reduce the standard errors; see ``Consistent.weight_ratio``. A weight at
+    which the fit does not converge, because bodies shrink to points, has an infinite error.
 
     Args:
         fit: The fit; its own weight is not used.
@@ -101,30 +128,28 @@ def choose_weight(
 
     Raises:
         DataError: If "cv" has fewer than two segments.
-        NotConvergedError: If the fit does not converge at the largest weight.
+        NotConvergedError: If the fit does not converge at any weight.
     """
-    smallest = _SMALLEST if fit.penalty.is_quadratic else _SMALLEST_ENTROPIC
     evidence = log_evidence(fit, segments.rows)
-    by_evidence = _search(lambda w: (-evidence(w), np.zeros(0)), "evidence", smallest, 0.0)
+    by_evidence = _search(lambda w: (-evidence(w), np.zeros(0)), "evidence", 0.0)
     plausible = plausible_weight(fit, segments.rows, by_evidence.plausible)
     if how == "evidence":
         return replace(by_evidence, plausible=plausible)
 
     starts = None  # the fits at the previous weight
+    bound = _AS_GOOD * np.sqrt(_by_joint(segments.least_squares_errors))
 
     def score(weight: float) -> tuple[float, Array]:
         nonlocal starts
         try:
             errors, starts = held_out_errors(fit, segments, weight, starts)
         except NotConvergedError:
-            if starts is None:
-                raise
-            return float("inf"), np.full((len(segments.folds), 1), np.inf)
+            return float("inf"), np.full((len(segments.folds), len(bound)), np.inf)
         return float(np.exp(0.5 * np.log(_by_joint(errors)).mean())), errors
 
     # a residual without the repeated error is smaller by this log ratio
     excess = -0.5 * np.log1p(-min(repeated, _MOST_REPEATED))
-    return replace(_search(score, how, smallest, excess), plausible=plausible)
+    return replace(_search(score, how, excess, bound), plausible=plausible)
 
 
 def plausible_weight(fit: Consistent, rows: Array, weight: float) -> float:
@@ -230,11 +255,7 @@ def held_out_errors(
     fits = fit.programme.minimise_each(segments.others, weight, is_exact=False, starts=starts)
     pairs = zip(segments.folds, fits, strict=True)
     squares = np.array([fold.residual_squares(fit.K @ x.x) for fold, x in pairs])
-    squares /= segments.sigma**2
-    rows = np.sum([fold.rows for fold in segments.folds], axis=0)  # (n,)
-    if segments.folds[0].is_projected:
-        squares, rows = squares.sum(axis=1, keepdims=True), rows.sum(keepdims=True)
-    return squares / np.maximum(rows, 1), fits
+    return segments.errors(squares), fits
 
 
 def log_evidence(fit: Consistent, rows: Array) -> Callable[[float], float]:
@@ -267,12 +288,16 @@ def log_evidence(fit: Consistent, rows: Array) -> Callable[[float], float]:
 
 
 def _search(
-    score: Callable[[float], tuple[float, Array]], how: str, smallest: float, allowed: float
+    score: Callable[[float], tuple[float, Array]],
+    how: str,
+    allowed: float,
+    bound: Array | None = None,
 ) -> WeightChoice:
     """Return the largest weight that ``_is_accepted`` in comparison with that of smallest score.
 
-    Weights are tried from 100 down in decades, until the score increases. ``score`` returns the
-    score and its parts by segment and joint, or no parts.
+    Weights are tried from 100 down in decades, until the score increases and the error of no joint
+    is above its bound, shape (n,). ``score`` returns the score and its parts by segment and joint,
+    or no parts.
     """
     tried: dict[float, float] = {}
     parts: dict[float, Array] = {}
@@ -280,19 +305,30 @@ def _search(
     def attempt(decade: float) -> None:
         tried[decade], parts[decade] = score(10.0**decade)
 
+    def is_bounded(decade: float) -> bool:
+        return bound is None or bool((np.sqrt(_by_joint(parts[decade])) <= bound).all())
+
     decade = _LARGEST
-    while decade >= smallest and _is_promising(tried):
+    while decade >= _SMALLEST and (_is_promising(tried) or not any(map(is_bounded, tried))):
         attempt(decade)
         decade -= 1.0
     best = min(tried, key=lambda k: tried[k])
     for k in (best - _STEP, best + _STEP):
-        if smallest <= k <= _LARGEST and np.isfinite(tried.get(k - _STEP, 0.0)):
+        if _SMALLEST <= k <= _LARGEST:
             attempt(k)
-    best = min(tried, key=lambda k: tried[k])
-    finite = [k for k in tried if np.isfinite(tried[k])]
-    alike = [k for k in finite if _is_accepted(parts[k], parts[best], allowed)]
-    curve = tuple((float(10.0**k), tried[k]) for k in sorted(tried) if np.isfinite(tried[k]))
-    return WeightChoice(float(10.0 ** max([best, *alike])), how, curve, float(10.0**best))
+    finite = [k for k in sorted(tried) if np.isfinite(tried[k])]
+    if not finite:
+        raise NotConvergedError(
+            f"the fit converges at no prior_weight from {10.0**_SMALLEST:g} to {10.0**_LARGEST:g}; "
+            "record a richer motion, or state the inertials of the URDF",
+            "max_iterations",
+        )
+    within = [k for k in finite if is_bounded(k)]
+    best = min(within or finite, key=lambda k: tried[k])
+    alike = [k for k in within if _is_accepted(parts[k], parts[best], allowed)]
+    curve = tuple((float(10.0**k), tried[k]) for k in finite)
+    weight = float(10.0 ** max([best, *alike]))
+    return WeightChoice(weight, how, curve, float(10.0**best), bool(within))
 
 
 def _is_accepted(parts: Array, best: Array, allowed: float) -> bool:
@@ -330,6 +366,4 @@ def _is_as_good(parts: Array, best: Array) -> bool:
 def _is_promising(tried: dict[float, float]) -> bool:
     """Return whether one of the last two weights has the smallest score."""
     scores = list(tried.values())
-    if scores and not np.isfinite(scores[-1]):
-        return False
     return len(scores) <= _PATIENCE or min(scores[-_PATIENCE:]) < min(scores[:-_PATIENCE])
