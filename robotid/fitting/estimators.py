@@ -8,7 +8,12 @@ import numpy as np
 
 from robotid._typing import Array
 from robotid.estimators import Consistent, Constraints
-from robotid.estimators.consistent.weighting import Segments, choose_weight, contradicted_extents
+from robotid.estimators.consistent.weighting import (
+    AS_GOOD,
+    Segments,
+    choose_weight,
+    contradicted_extents,
+)
 from robotid.fitting.settings import BoundedSettings, ConstraintSettings
 from robotid.regressor.base_parameters import BaseMapping
 from robotid.regressor.factors import Factors, gather
@@ -94,9 +99,11 @@ def consistent_fit(
     if not how:
         return fit
     choice = choose_weight(fit, segments, how, known.repeated)
-    if fit.constraints.extent and not choice.is_as_good:
-        fit = replace(fit, constraints=fit.constraints.without_extent(fit.constraints.extent))
-        choice = choose_weight(fit, segments, how, known.repeated)
+    if fit.constraints.extent and choice.loss > AS_GOOD:
+        unbound = replace(fit, constraints=fit.constraints.without_extent(fit.constraints.extent))
+        other = choose_weight(unbound, segments, how, known.repeated)
+        if AS_GOOD * other.loss < choice.loss:
+            fit, choice = unbound, other
     return replace(
         fit, prior_weight=choice.weight, plausible_weight=choice.plausible, choice=choice
     )

@@ -59,6 +59,9 @@ def with_assumed_inertials(model: RobotModel) -> RobotModel:
     reasons = _reasons(model, J, np.array([boxes[body] for body in bodies]))
     if not reasons:
         return model
+    if "inertial_units" in reasons.values():
+        model = replace(model, assumed=reasons)
+        held = held_parameters(model)
     geometry = body_points(model)
     boxes |= {body: _grown(geometry[body], 0.0) for body in bodies if body in geometry}
     volumes = np.array([np.prod(boxes[body][1]) for body in bodies])

@@ -44,7 +44,7 @@ class LinkPlace:
         link: Name of the link.
         body: Index of its body in ``layout.bodies``; -1 if it is fixed to the world.
         role: "moved": the link that the body's joint moves; "fixed": joined to it by fixed joints
-            only; "held": behind a locked joint.
+            only; "held": behind a locked joint, with the URDF's inertial.
         parameters: Its inertial parameters in the body's frame, shape (10,); 0 without inertial.
     """
 
@@ -80,6 +80,8 @@ def link_places(model: RobotModel) -> tuple[LinkPlace, ...]:
             joint = arriving[at]
             role = "held" if joint.is_movable or role == "held" else "fixed"
             at = joint.parent
+        if body >= 0 and model.assumed.get(model.layout.bodies[body]) == "inertial_units":
+            role = "fixed" if role == "held" else role  # its inertial has a wrong unit, too
         places.append(LinkPlace(link, body, role, parameters.get(link, np.zeros(10))))
     return tuple(places)
 

@@ -46,14 +46,14 @@ class WeightChoice:
         curve: Pairs of weight and score, by ascending weight. The score is the prediction error of
             held-out segments over the noise level ("cv"), or minus the log evidence.
         plausible: The weight with the largest log evidence [-].
-        is_as_good: Whether held-out segments are predicted as well as by least squares.
+        loss: Largest ratio of the held-out error of a joint to that of least squares [-].
     """
 
     weight: float
     how: str
     curve: tuple[tuple[float, float], ...]
     plausible: float
-    is_as_good: bool = True
+    loss: float = 0.0
 
 
 class Penalty(ABC):

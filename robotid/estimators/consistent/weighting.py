@@ -1,6 +1,6 @@
 """Cross-validation on segments of the fitted data: weight of the prior, extents of bodies."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -14,14 +14,22 @@ from robotid.exceptions import DataError, NotConvergedError
 from robotid.regressor.factors import Factors, merge
 from robotid.regressor.lapack import Triangle
 
-__all__ = ["Segments", "choose_weight", "contradicted_extents", "held_out_errors", "log_evidence"]
+__all__ = [
+    "AS_GOOD",
+    "Segments",
+    "choose_weight",
+    "contradicted_extents",
+    "held_out_errors",
+    "log_evidence",
+]
 
 _SMALLEST, _LARGEST = -4.0, 2.0  # decades of the weights tried
 _PATIENCE = 2  # decades without a better score after which the search ends
 _ALIKE = 2.0  # standard errors by which the mean log error of a larger weight may be above the best
 _MOST_LOSS = 1.02  # largest ratio of the held-out errors of a larger weight, mean over joints
 _MOST_JOINT_LOSS = 1.05  # ... and of any one joint
-_AS_GOOD = 1.1  # largest ratio of the held-out error of a joint to that of least squares
+#: Largest ratio of the held-out error of a joint to that of least squares.
+AS_GOOD = 1.1
 _MOST_REPEATED = 0.5  # largest share of repeated errors in the squared residual
 _BEYOND = 4.0  # standard errors by which a body must be outside its box
 _CLEAR = 0.02  # relative increase of the mean square error at which an extent is contradicted
@@ -137,19 +145,19 @@ def choose_weight(
         return replace(by_evidence, plausible=plausible)
 
     starts = None  # the fits at the previous weight
-    bound = _AS_GOOD * np.sqrt(_by_joint(segments.least_squares_errors))
+    least = np.sqrt(_by_joint(segments.least_squares_errors))  # (n,)
 
     def score(weight: float) -> tuple[float, Array]:
         nonlocal starts
         try:
             errors, starts = held_out_errors(fit, segments, weight, starts)
         except NotConvergedError:
-            return float("inf"), np.full((len(segments.folds), len(bound)), np.inf)
+            return float("inf"), np.full((len(segments.folds), len(least)), np.inf)
         return float(np.exp(0.5 * np.log(_by_joint(errors)).mean())), errors
 
     # a residual without the repeated error is smaller by this log ratio
     excess = -0.5 * np.log1p(-min(repeated, _MOST_REPEATED))
-    return replace(_search(score, how, excess, bound), plausible=plausible)
+    return replace(_search(score, how, excess, least), plausible=plausible)
 
 
 def plausible_weight(fit: Consistent, rows: Array, weight: float) -> float:
@@ -291,25 +299,28 @@ def _search(
     score: Callable[[float], tuple[float, Array]],
     how: str,
     allowed: float,
-    bound: Array | None = None,
+    least: Array | None = None,
 ) -> WeightChoice:
     """Return the largest weight that ``_is_accepted`` in comparison with that of smallest score.
 
-    Weights are tried from 100 down in decades, until the score increases and the error of no joint
-    is above its bound, shape (n,). ``score`` returns the score and its parts by segment and joint,
-    or no parts.
+    Weights are tried from 100 down in decades, until neither the score decreases nor, where it is
+    too large, the loss. ``score`` returns the score and its parts by segment and joint, or no
+    parts. The loss is the largest ratio of a joint's error to that of least squares, shape (n,).
     """
     tried: dict[float, float] = {}
     parts: dict[float, Array] = {}
+    loss: dict[float, float] = {}
 
     def attempt(decade: float) -> None:
         tried[decade], parts[decade] = score(10.0**decade)
-
-    def is_bounded(decade: float) -> bool:
-        return bound is None or bool((np.sqrt(_by_joint(parts[decade])) <= bound).all())
+        ratio = 0.0 if least is None else np.sqrt(_by_joint(parts[decade])) / least
+        loss[decade] = float(np.max(ratio))
 
     decade = _LARGEST
-    while decade >= _SMALLEST and (_is_promising(tried) or not any(map(is_bounded, tried))):
+    while decade >= _SMALLEST and (
+        _is_promising(tried.values())
+        or (min(loss.values()) > AS_GOOD and _is_promising(loss.values(), _MOST_LOSS))
+    ):
         attempt(decade)
         decade -= 1.0
     best = min(tried, key=lambda k: tried[k])
@@ -320,15 +331,15 @@ def _search(
     if not finite:
         raise NotConvergedError(
             f"the fit converges at no prior_weight from {10.0**_SMALLEST:g} to {10.0**_LARGEST:g}; "
-            "record a richer motion, or state the inertials of the URDF",
+            "record a richer motion, or correct the inertials of the URDF",
             "max_iterations",
         )
-    within = [k for k in finite if is_bounded(k)]
-    best = min(within or finite, key=lambda k: tried[k])
-    alike = [k for k in within if _is_accepted(parts[k], parts[best], allowed)]
+    allowed_loss = max(AS_GOOD, _MOST_LOSS * min(loss.values()))
+    within = [k for k in finite if loss[k] <= allowed_loss]
+    best = min(within, key=lambda k: tried[k])
+    chosen = max([best, *(k for k in within if _is_accepted(parts[k], parts[best], allowed))])
     curve = tuple((float(10.0**k), tried[k]) for k in finite)
-    weight = float(10.0 ** max([best, *alike]))
-    return WeightChoice(weight, how, curve, float(10.0**best), bool(within))
+    return WeightChoice(float(10.0**chosen), how, curve, float(10.0**best), loss[chosen])
 
 
 def _is_accepted(parts: Array, best: Array, allowed: float) -> bool:
@@ -363,7 +374,9 @@ def _is_as_good(parts: Array, best: Array) -> bool:
     return bool(excess.sum() <= _ALIKE * error)
 
 
-def _is_promising(tried: dict[float, float]) -> bool:
-    """Return whether one of the last two weights has the smallest score."""
-    scores = list(tried.values())
-    return len(scores) <= _PATIENCE or min(scores[-_PATIENCE:]) < min(scores[:-_PATIENCE])
+def _is_promising(values: Iterable[float], factor: float = 1.0) -> bool:
+    """Return whether one of the last two values is the smallest, clearly by a factor."""
+    scores = list(values)
+    if len(scores) <= _PATIENCE or not np.isfinite(scores).any():
+        return True
+    return factor * min(scores[-_PATIENCE:]) < min(scores[:-_PATIENCE])
