@@ -8,7 +8,7 @@ from types import MappingProxyType
 import numpy as np
 
 from robotid._typing import Array
-from robotid.robot.bodies import held_parameters, link_places
+from robotid.robot.bodies import held_parameters, link_places, negligible_bodies
 from robotid.robot.geometry import body_frames, body_points
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import inertial_from_pseudo_inertia, pseudo_inertia
@@ -39,8 +39,8 @@ def with_assumed_inertials(model: RobotModel) -> RobotModel:
     of mass), with an isotropic inertial that three or more links share, and all bodies if the
     masses or lengths of the robot have a wrong unit. The box is that of the body's geometry, or of
     its frames if it has none; its density is the median of the other bodies, or 1000 kg/m^3. A
-    massless body without geometry whose frames coincide, as between the axes of a ball joint,
-    remains as it is beside bodies with mass.
+    massless body without geometry that carries another one in the same place, as between the axes
+    of a ball joint, remains as it is beside bodies with mass.
 
     Args:
         model: The robot.
@@ -56,7 +56,11 @@ def with_assumed_inertials(model: RobotModel) -> RobotModel:
     points = {body: np.array(frames[body]) for body in bodies}
     half_width = _HALF_WIDTH * model.length
     boxes = {body: _grown(points[body], half_width) for body in bodies}
-    reasons = _reasons(model, J, np.array([boxes[body] for body in bodies]))
+    # the frames of a few bodies do not indicate their size
+    sized = bodies if len(bodies) >= _COPIES else tuple(body_points(model))
+    if sized is not bodies:
+        boxes |= {body: _grown(body_points(model)[body], 0.0) for body in sized}
+    reasons = _reasons(model, J, {body: boxes[body][1] for body in sized})
     if not reasons:
         return model
     if "inertial_units" in reasons.values():
@@ -71,6 +75,7 @@ def with_assumed_inertials(model: RobotModel) -> RobotModel:
         if body not in reasons:
             continue
         is_axis = body not in geometry and not np.ptp(points[body], axis=0).any()
+        is_axis &= k + 1 in list(model.pin_model.parents)  # it carries another body
         if reasons[body] == "missing_inertial" and is_axis and trusted.any():
             del reasons[body]
             continue
@@ -89,10 +94,10 @@ def with_assumed_inertials(model: RobotModel) -> RobotModel:
     return replace(filled, assumed=reasons)
 
 
-def _reasons(model: RobotModel, J: Array, boxes: Array) -> dict[str, str]:
+def _reasons(model: RobotModel, J: Array, sides: dict[str, Array]) -> dict[str, str]:
     """Return the code of each body that is not stated in a usable way.
 
-    The pseudo-inertias have shape (n, 4, 4), centres and sides of the boxes (n, 2, 3).
+    The pseudo-inertias have shape (n, 4, 4), the sides of a body's box (3,) [m].
     """
     bodies = model.layout.bodies
     mass, least = J[:, 3, 3], np.linalg.eigvalsh(J)[:, 0]
@@ -102,14 +107,16 @@ def _reasons(model: RobotModel, J: Array, boxes: Array) -> dict[str, str]:
     is_impossible, has_mass = least < -_SLACK * scale, mass > 0
     codes |= dict.fromkeys(compress(bodies, is_impossible), "not_positive_definite")
     codes |= dict.fromkeys(compress(bodies, ~has_mass), "missing_inertial")
-    if has_mass.sum() >= _COPIES:
-        sides = boxes[has_mass, 1]
-        density = np.median(mass[has_mass] / sides.prod(axis=1))
-        second = np.abs(np.trace(J[has_mass, :3, :3], axis1=1, axis2=2)) / mass[has_mass]
-        distance = np.median(np.sqrt(second) / np.linalg.norm(sides, axis=1))
+    sized = [k for k, body in enumerate(bodies) if mass[k] > 0 and body in sides]
+    if sized:
+        size = np.array([sides[bodies[k]] for k in sized])
+        density = np.median(mass[sized] / size.prod(axis=1))
+        second = np.abs(np.trace(J[sized, :3, :3], axis1=1, axis2=2)) / mass[sized]
+        distance = np.median(np.sqrt(second) / np.linalg.norm(size, axis=1))
         if density > _DENSEST or distance > _FARTHEST:
             codes |= dict.fromkeys(compress(bodies, has_mass), "inertial_units")
-    return {body: code for body, code in codes.items() if code}
+    negligible = negligible_bodies(model)  # as between the axes of a ball joint
+    return {body: code for body, code in codes.items() if code and body not in negligible}
 
 
 def _placeholders(model: RobotModel) -> set[str]:

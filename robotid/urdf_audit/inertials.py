@@ -106,7 +106,10 @@ def impossible_inertial(link: str, inertial: Inertial, matters: bool) -> Iterato
 def _inertia_fault(A: float, B: float, C: float) -> str | None:
     """Return why a body with these principal moments of inertia is impossible, or None."""
     stated = f"principal moments of inertia {A:.4g}, {B:.4g}, {C:.4g} kg m^2"
-    advice = "use the inertia from CAD, about the centre of mass and in the stated frame"
+    advice = (
+        "use the inertia from CAD, about the centre of mass and in the stated frame. Until then "
+        "that of a uniform box is assumed"
+    )
     margin = A + B - C
     if min(A, 0.0) < -_SLACK * abs(C):
         return f"its {stated} are not all positive, wanted > 0 ({A:.4g} is not); {advice}"

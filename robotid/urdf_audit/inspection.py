@@ -125,8 +125,10 @@ def inspect_urdf(path: str | Path, *, free_flyer: bool = False) -> Inspection:
         movable = [j.get("name", "") for j in robot.findall("joint") if j.get("type") in MOVABLE]
         return Inspection(name, tuple(movable), None, (), tuple(findings))
     full, inertial = structural_mapping(model), structural_mapping(model, inertial_only=True)
-    findings += assumed_inertials(with_assumed_inertials(model))
-    findings += _link_findings(model)
+    assumed = with_assumed_inertials(model)
+    # impossible inertials are named link by link
+    findings += [x for x in assumed_inertials(assumed) if x.code != "not_positive_definite"]
+    findings += _link_findings(assumed)
     findings += audit_links(model)
     rounded = list(rounded_angles(model, full))
     findings += rounded
@@ -240,7 +242,7 @@ def _link_findings(model: RobotModel) -> Iterator[Finding]:
             if place.link in inertials:
                 matters = body >= 0 and not any(inertials[link].mass > 0 for link in having)
                 yield from impossible_inertial(place.link, inertials[place.link], matters)
-            elif body >= 0 and having:
+            elif body >= 0 and (having or model.layout.bodies[body] not in model.assumed):
                 yield _missing(place.link, having)
         lumped = [p.link for p in members if p.role == "fixed" and p.link in inertials]
         if lumped and body >= 0:
@@ -253,11 +255,17 @@ def _link_findings(model: RobotModel) -> Iterator[Finding]:
 
 
 def _missing(link: str, having: list[str]) -> Finding:
+    if having:
+        message = (
+            f"link {link!r} moves but has no <inertial>, wanted one. The mass of its body is in "
+            f"{listed(having)}; no action needed if the link is only a frame"
+        )
+        return Finding("missing_inertial", "note", f"link {link}", message)
     message = (
-        f"link {link!r} moves but has no <inertial>, wanted one. The mass of its body is in "
-        f"{listed(having)}; no action needed if the link is only a frame"
+        f"link {link!r} moves but has no <inertial>, nor has any link attached to it, wanted one. "
+        "Its body is massless; add estimates of mass, centre of mass and inertia"
     )
-    return Finding("missing_inertial", "note", f"link {link}", message)
+    return Finding("missing_inertial", "warning", f"link {link}", message)
 
 
 def _plain(finding: Finding) -> Mapping[str, Any]:

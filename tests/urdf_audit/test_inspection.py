@@ -96,7 +96,12 @@ def test_a_moving_link_without_inertial_is_named(tmp_path):
                           '<child link="x"/></joint></robot>'))  # fmt: skip
     (finding,) = found(massless, "missing_inertial")
     assert (finding["link"], finding["severity"]) == ("lower", "warning")
-    assert "Its body is massless; add estimates" in finding["message"]
+    assert "the URDF has no <inertial> with a mass: lower. Assumed: the masses of" in (
+        finding["message"]
+    )
+    # a box of 0.2 of the robot's length, 0.5 m, with the density of the other body
+    volume = (0.5 + 0.1) * 0.1**2  # [m^3], of the upper one
+    assert finding["evidence"]["mass"] == pytest.approx(2.0 / volume * 0.1**3)
     frame = inspected(tmp_path, ("</robot>", TOOL.format(inertial="")))
     (finding,) = found(frame, "missing_inertial")
     assert (finding["link"], finding["severity"]) == ("tool", "note")

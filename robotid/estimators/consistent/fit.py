@@ -30,6 +30,7 @@ from robotid.robot.parameters import ParameterLayout
 __all__ = ["Consistent"]
 
 _FLOOR = 1e-6  # smallest noise level over the torque, for noise-free data
+_LEAST_FREEDOM = 0.1  # smallest degrees of freedom of a noise level, as a share of the rows
 _ACTIVE = 1e-5  # slack below which a constraint is active, dimensionless
 
 
@@ -180,16 +181,21 @@ class Consistent(BatchEstimator):
     def noise(self, factors: Factors) -> Array:
         """Return the noise levels of weighted least squares, shape (n,) [N m or N].
 
-        They do not depend on the prior: a wrong one would otherwise make the data seem noisy.
+        They do not depend on the prior: a wrong one would otherwise make the data seem noisy. The
+        parameters use as many independent rows as the trace of their leverage.
 
         Args:
             factors: The factors, of base parameters.
         """
-        sigma = self.wls_noise
+        sigma, prior = self.wls_noise, self.K @ self.prior
         if sigma is None:
-            sigma = WLS(self.K @ self.prior, self.independent_share).fit(factors).sigma
-        torque = np.sqrt(factors.torque_squares() / np.maximum(factors.rows, 1))
-        level: Array = np.maximum(sigma, _FLOOR * np.where(torque > 0, torque, 1.0))
+            sigma = WLS(prior, self.independent_share).fit(factors).sigma
+        rows = np.maximum(factors.rows, 1)
+        used = factors.leverages(solve_factor(factors, sigma, prior).covariance) / sigma**2
+        freedom = np.maximum(rows - used / self.independent_share, _LEAST_FREEDOM * rows)
+        torque = np.sqrt(factors.torque_squares() / rows)
+        least = _FLOOR * np.where(torque > 0, torque, 1.0)
+        level: Array = np.maximum(sigma * np.sqrt(np.maximum(rows - used, 1.0) / freedom), least)
         return level
 
     def rows(self, factors: Factors, sigma: Array) -> Array:

@@ -157,7 +157,20 @@ def choose_weight(
 
     # a residual without the repeated error is smaller by this log ratio
     excess = -0.5 * np.log1p(-min(repeated, _MOST_REPEATED))
-    return replace(_search(score, how, excess, least), plausible=plausible)
+    choice = replace(_search(score, how, excess, least), plausible=plausible)
+    larger = [weight for weight, _ in choice.curve if weight >= choice.weight]
+    return replace(choice, weight=_converging(fit, segments.rows, larger))
+
+
+def _converging(fit: Consistent, rows: Array, weights: Sequence[float]) -> float:
+    """Return the first weight at which the fit to all rows converges."""
+    for weight in weights[:-1]:
+        try:
+            fit.programme.minimise(rows, weight)
+        except NotConvergedError:  # bodies shrink to points
+            continue
+        return weight
+    return weights[-1]
 
 
 def plausible_weight(fit: Consistent, rows: Array, weight: float) -> float:

@@ -207,7 +207,7 @@ def test_a_certain_loss_is_refused_however_small(case, monkeypatch):
 
 @pytest.mark.parametrize("bad", [[3], [1, 4]])
 def test_one_or_two_bad_segments_reject_a_weight(case, monkeypatch, bad):
-    excess = np.zeros((6, 2))
+    excess = np.zeros((6, 6))
     excess[bad] = 30.0
     assert chosen(case, monkeypatch, excess).weight == pytest.approx(0.01)
 
@@ -254,21 +254,53 @@ def test_the_information_of_all_segments_but_one_counts_the_share_that_is_indepe
         np.testing.assert_allclose(rows.T @ rows, others.T @ others, rtol=1e-9, atol=1e-6)
 
 
-def test_the_noise_level_is_that_of_the_whole_regressor(case):
+def test_the_noise_level_is_that_of_the_whole_regressor_whatever_the_prior(case):
     fit, problem = case
-    fit = replace(fit, metric="euclidean", prior_weight=100.0, independent_share=0.5)
+    fit = replace(fit, prior_weight=100.0, independent_share=0.5)
     W, tau, _ = (np.concatenate(x) for x in zip(*problem.blocks(), strict=True))
-    W, tau = (W @ fit.K).reshape(-1, 6, fit.K.shape[1]).swapaxes(0, 1), tau.reshape(-1, 6).T
-    G, g = W.swapaxes(1, 2) @ W, np.einsum("jkp,jk->jp", W, tau)  # of each joint
-    sigma = np.ones(6)
-    H = 100.0 * 0.5 * fit.penalty.hessian(fit.penalty.centre)
+    W, tau = W.reshape(-1, 6, W.shape[1]).swapaxes(0, 1), tau.reshape(-1, 6).T
+    levels = np.ones(6)
     for _ in range(100):
-        weights = 0.5 / sigma**2
-        A = np.tensordot(weights, G, 1) + H
-        r = tau - W @ np.linalg.solve(A, weights @ g + H @ fit.penalty.centre)
-        spent = weights * np.trace(np.linalg.inv(A) @ G, axis1=1, axis2=2)
-        sigma = np.sqrt((r**2).sum(axis=1) / (tau.shape[1] - spent / 0.5))
+        rows = (W / levels[:, None, None]).reshape(-1, len(fit.K))
+        C = np.linalg.pinv(rows.T @ rows)
+        r = tau - W @ (C @ rows.T @ (tau / levels[:, None]).ravel())
+        used = np.einsum("jkp,jkp->j", W @ C, W) / levels**2
+        levels = np.sqrt((r**2).sum(axis=1) / (tau.shape[1] - used))
+        sigma = np.sqrt((r**2).sum(axis=1) / (tau.shape[1] - used / 0.5))
     np.testing.assert_allclose(fit.noise(compress(problem)), sigma, rtol=1e-3)
+
+
+@pytest.mark.parametrize(("ratio", "weight"), [(1.09, 100.0), (1.11, 10.0)])
+def test_no_joint_is_predicted_clearly_worse_than_by_least_squares(
+    case, monkeypatch, ratio, weight
+):
+    """Joint 4 has ``ratio`` times the error of least squares at 100, and its error below."""
+    fit, problem = case
+    segments = Segments.of(fit, cut(problem, 6))
+    least = segments.least_squares_errors
+
+    def errors(fit, segments, w, starts):
+        squares = least * (1.0 + abs(np.log10(w) + 2.0) * (1e-4 + 1e-2 * CHANCE))
+        squares[:, 4] *= ratio**2 if w > 50.0 else 1.0
+        return squares, []
+
+    monkeypatch.setattr(weighting, "held_out_errors", errors)
+    monkeypatch.setattr(weighting, "_MOST_JOINT_LOSS", 2.0)
+    monkeypatch.setattr(weighting, "_ALIKE", 1e9)
+    choice = choose_weight(fit, segments, "cv")
+    assert choice.weight == pytest.approx(weight)
+    assert choice.loss == pytest.approx(ratio if weight == 100.0 else 1.0, abs=1e-2)
+
+
+def test_least_squares_predict_each_segment_from_the_others(case):
+    fit, problem = case
+    folds = cut(problem, 3)
+    segments = Segments.of(fit, folds)
+    for k, fold in enumerate(folds):
+        R = fit.rows(merge([s for i, s in enumerate(folds) if i != k]), segments.sigma)
+        theta = np.linalg.pinv(R[:, :-1]) @ R[:, -1]
+        wanted = fold.residual_squares(theta) / segments.sigma**2 / sum(s.rows for s in folds)
+        np.testing.assert_allclose(segments.least_squares_errors[k], wanted, rtol=1e-6)
 
 
 def test_one_stretch_is_too_few(case):
@@ -436,9 +468,9 @@ def test_an_error_that_repeats_makes_a_residual_larger_by_its_share(
     """Of a squared residual it is at most one half."""
     fit, problem = case
     segments, given = Segments.of(fit, cut(problem, 4)), []
-    found = SimpleNamespace(plausible=None)
+    found = SimpleNamespace(plausible=None, curve=[(1.0, 0.0)], weight=1.0)
 
-    def search(score, how, smallest, excess):
+    def search(score, how, excess, least=None):
         given.append((how, excess))
         return found
 
@@ -458,7 +490,7 @@ def test_the_best_weight_is_one_at_which_the_held_out_fits_converge(case, monkey
         tried.append(w)
         if w < 5.0:
             raise NotConvergedError("stopped", "status")
-        return np.full((6, 2), w) * [1.0, 4.0], []
+        return np.full((6, 6), w) * [1.0, 4.0, 1.0, 4.0, 1.0, 4.0], []
 
     monkeypatch.setattr(weighting, "held_out_errors", errors)
     choice = choose_weight(fit, Segments.of(fit, cut(problem, 6)), "cv")
