@@ -108,7 +108,8 @@ def _scale(found: Identification, origin: Origin, causes: Sequence[Cause]) -> St
     if any(cause.code in ("total_mass", "urdf_mismatch") for cause in causes):
         check = "Check the sign, the order and the unit of the torques and the URDF's masses. "
     source = "stated" if is_number(found.estimator.bounds.total_mass) else "identified"
-    masses = f"{after:.4g} kg {source}, {before:.4g} kg in the URDF"
+    origin_of = "assumed" if found.scale_check.assumed else "in the URDF"
+    masses = f"{after:.4g} kg {source}, {before:.4g} kg {origin_of}"
     if payloads := found.scale_check.payloads:
         payload = next((x for x in payloads if x.contradicts), payloads[0])
         action = "Correct" if payload.contradicts else "Verify"
@@ -339,7 +340,7 @@ def _another_log(origin: Origin) -> tuple[str, ...]:
 
 
 def _inspect(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:
-    words = "Correct the URDF: the prior uses the values that its inspection rejects."
+    words = "Correct the inertials of the URDF that its inspection rejects: they are the prior."
     return Step(words, (shlex.join(["robotid", "inspect", str(found.model.tree.path)]),))
 
 

@@ -121,10 +121,11 @@ def _found(result: Mapping[str, Any]) -> str:
         text = f"{fit['parameters']} free parameters; {fit['message']}; errors are position errors"
         return text + over
     structure, (before, after, _) = result["structure"], result["scale_check"]["masses"]
+    assumed = " assumed" if result["scale_check"].get("assumed") else ""
     return (
         f"{structure['base']} base parameters ({structure['base_inertial']} inertial), condition "
         f"number {structure['condition']:.3g} (regressor, unit columns), "
-        f"total mass {before:.2f} -> {after:.2f} kg"
+        f"total mass {before:.2f}{assumed} -> {after:.2f} kg"
     )
 
 

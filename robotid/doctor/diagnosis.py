@@ -26,7 +26,9 @@ from robotid.logs.data import Log, Trajectory
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.constraints import logged_base
+from robotid.robot.assumed import with_assumed_inertials
 from robotid.robot.model import RobotModel
+from robotid.urdf_audit.inertials import assumed_inertials, explained_by_assumed
 from robotid.urdf_audit.rounding import rounded_robot
 
 __all__ = ["CODES", "check_logs", "diagnose", "findings_to_dict"]
@@ -98,8 +100,9 @@ def diagnose(
     Raises:
         SettingsError: If a setting does not fit a log.
     """
-    model = model.with_terms({})  # friction with an internal state is not examined here
-    findings: list[Finding] = []
+    # friction with an internal state is not examined here
+    model = with_assumed_inertials(model.with_terms({}))
+    findings = assumed_inertials(model)
     motions = [_examine_log(model, log, signals, findings) for log in (*fitted, *validation)]
     first = [motion for motion, _ in motions[: len(fitted)] if motion is not None]
     probes = [probe for _, probe in motions[: len(fitted)] if probe is not None]
@@ -116,7 +119,7 @@ def diagnose(
         names = ", ".join(log.name for log in fitted)
         findings += check_excitation(model, mapping, moving, signals, names)
         findings += rounded_robot(model, mapping)
-    return by_severity(findings)
+    return by_severity(x for x in findings if not explained_by_assumed(model, x))
 
 
 def findings_to_dict(findings: Sequence[Finding]) -> dict[str, Any]:

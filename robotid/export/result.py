@@ -79,6 +79,7 @@ _SHAPE = {
         "factor": NUMBER,
         "common?": [NUMBER],
         "mass_error?": NUMBER,
+        "assumed?": NUMBER,
         "stated?": {
             "names": [TEXT],
             "ratio": MAYBE,

@@ -41,7 +41,11 @@ from robotid.regressor.constraints import logged_base
 from robotid.robot.assumed import with_assumed_inertials
 from robotid.robot.families import AUTO, wanted_families
 from robotid.robot.model import RobotModel
-from robotid.urdf_audit.inertials import assumed_inertials, impossible_inertials
+from robotid.urdf_audit.inertials import (
+    assumed_inertials,
+    explained_by_assumed,
+    impossible_inertials,
+)
 from robotid.variation.variation import vary
 
 __all__ = ["conclude", "identify", "robot_of", "with_drives"]
@@ -196,15 +200,13 @@ def conclude(
     loads = {f.where.rpartition(": ")[0] or f.where for f in found if f.code == "payload_change"}
     of_fit += [*unlike_findings(fit.variation), *rescaled_findings(fit, loads)]
     merged = settled(with_known_springs(before, fit, wanted), of_fit)
+    merged = [f for f in merged if not explained_by_assumed(model, f)]
     merged = rejected(merged, result.predictions, result.scale_check)
     log_errors = blocking(merged, ignore, is_robust=is_robust)
     heads = [log.head for log in (*recordings.fitted, *recordings.validation)]
-    findings = [
-        *assumed_inertials(model),
-        *log_findings(heads),
-        *impossible_inertials(model),
-        *merged,
-    ]
+    findings = [*log_findings(heads), *impossible_inertials(model), *merged]
+    if not any(finding in merged for finding in assumed_inertials(model)):  # without the doctor
+        findings = [*assumed_inertials(model), *findings]
     findings += not_written(log_errors, "" if fit.is_consistent else fit.estimator.name)
     counted = not_ignored(findings, ignore)
     names = [Path(e.recording.log.path).name for e in fit.validation if not e.is_refitted]

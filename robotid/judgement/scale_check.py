@@ -57,6 +57,8 @@ class ScaleCheck:
         common: Factor common to the ratios of the joints, and half the width of its 95 % interval
             [-], as errors of the URDF spread the ratios; None with fewer than two.
         mass_error: Standard error of the identified total mass [kg].
+        assumed: Number of links whose inertials are assumed, so that gravity and mass of the URDF
+            are no evidence.
     """
 
     gravity: Mapping[str, float] = field(default_factory=dict)
@@ -72,6 +74,7 @@ class ScaleCheck:
     follows: bool = True
     common: tuple[float, float] | None = None
     mass_error: float = 0.0
+    assumed: int = 0
 
     @property
     def agrees(self) -> bool:
@@ -131,6 +134,9 @@ class ScaleCheck:
     def figures(self) -> str:
         """Gravity torque and total mass against the URDF's, as text."""
         before, after, _ = self.masses
+        if self.assumed:
+            count = f"{self.assumed} link{'s' if self.assumed > 1 else ''}"
+            return f"total mass {after:.4g} kg; the URDF states no usable inertials of {count}"
         mass = f"total mass {after:.4g} kg against the URDF's {before:.4g} kg"
         if self.scale is None:
             return f"gravity loads no joint, {mass}"
@@ -198,7 +204,8 @@ class ScaleCheck:
                 "URDF's errors spread theirs: 1 is possible"
             )
         by_factor, by_payload = self.unexplained
-        single = [f"{j} {x:.2f}" for j, x in self.gravity.items() if abs(x - 1.0) > _ANOTHER]
+        compared = {} if self.assumed else self.gravity
+        single = [f"{j} {x:.2f}" for j, x in compared.items() if abs(x - 1.0) > _ANOTHER]
         if self.has_one_factor:
             same = f"The same factor {self.factor:.2f} fits all joints"
             cause = "the gains of the torques, or the URDF's mass of a link that loads all of them"
@@ -226,7 +233,8 @@ class ScaleCheck:
     def _ratios_whole(self) -> dict[str, float]:
         """Identified over URDF's gravity torque and total mass, without a payload [-]."""
         before, after, _ = self.masses
-        mass = {} if self._is_total_open else {_TOTAL: after / before if before > 0 else np.inf}
+        is_open = self._is_total_open or self.assumed > 0
+        mass = {} if is_open else {_TOTAL: after / before if before > 0 else np.inf}
         return ({} if self.scale is None else {"gravity torque": self.factor}) | mass
 
     @property
@@ -329,8 +337,12 @@ def check_scale(found: Fit) -> ScaleCheck:
     factor = float(np.sum(of_urdf * of_result) / load.sum())
     scale, payload, left = _with_payload(of_urdf, of_result, last)
     rest = float(np.linalg.norm(of_result - factor * of_urdf) / np.linalg.norm(of_result))
+    plain = replace(plain, gravity=gravity, gravity_error=error)
+    of_assumed = found.prior[:size:10][[body in model.assumed for body in model.layout.bodies]]
+    if of_assumed.sum() > AGREES * before:
+        return replace(plain, assumed=len(of_assumed))
     return replace(
-        plain, gravity=gravity, gravity_error=error, scale=scale, factor=factor,
+        plain, scale=scale, factor=factor,
         unexplained=(rest, left), masses=(before, after, payload), common=common,
         mass_error=float(np.sqrt(max(found.standard_covariance[:size:10, :size:10].sum(), 0.0))),
     )  # fmt: skip

@@ -222,6 +222,10 @@ def judge(
         An impossible body concerns the result, but not the torque of its joint.
     """
     found, hidden = predictions.on_each(), predictions.hidden
+    costly = [w for w in warnings if w.code == "constraint_costs" and predictions.costs(w.joint)]
+    for warning in costly:
+        found[warning.joint][0].extend(_described([warning]))
+    warnings = [warning for warning in warnings if warning not in costly]
     largest = sorted(found.values(), key=lambda of: -max(of[2], default=0.0))
     poor = sorted((reason for worse, _, _ in largest for reason in worse), key=_rank)
     is_contradicted = scale_check is not None and scale_check.contradicts
@@ -280,7 +284,7 @@ def judge(
         log_errors=log_errors,
         scale_check=scale_check,
     )
-    return replace(verdict, warnings=tuple(warnings), use_for=uses)
+    return replace(verdict, warnings=(*costly, *warnings), use_for=uses)
 
 
 def concluded(

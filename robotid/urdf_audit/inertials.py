@@ -13,8 +13,19 @@ from robotid.robot.model import RobotModel
 from robotid.robot.tree import Inertial
 from robotid.robot.urdf_text import numbers
 
-__all__ = ["assumed_inertials", "impossible_inertial", "impossible_inertials", "negative_masses"]
+__all__ = [
+    "assumed_inertials",
+    "explained_by_assumed",
+    "impossible_inertial",
+    "impossible_inertials",
+    "negative_masses",
+]
 
+#: Findings that take the URDF's masses as evidence.
+_OF_MASSES = (
+    "current_for_torque", "joint_origin", "link_mass", "payload", "torque_scale", "total_mass",
+    "unmounted_part", "urdf_mismatch",
+)  # fmt: skip
 _SLACK = 1e-9  # relative violation of the triangle inequality that is rounding
 
 
@@ -58,6 +69,21 @@ def assumed_inertials(model: RobotModel) -> list[Finding]:
         evidence = {"bodies": float(len(bodies)), "mass": sum(masses)}
         findings.append(Finding(code, "warning", f"link {bodies[0]}", message, evidence))
     return findings
+
+
+def explained_by_assumed(model: RobotModel, finding: Finding) -> bool:
+    """Return whether a finding compares the torque of a joint with inertials that are assumed.
+
+    Args:
+        model: The robot.
+        finding: The finding.
+    """
+    if finding.code not in _OF_MASSES:
+        return False
+    named = finding.where.rpartition(": ")[2].split(", ")
+    rows = [name in named for name in model.row_names]
+    carried = model.support()[rows if any(rows) else slice(None)].any(axis=0)
+    return bool((carried & model.layout.owned_by(tuple(model.assumed))).any())
 
 
 def impossible_inertials(model: RobotModel) -> list[Finding]:
