@@ -4,7 +4,6 @@ import json
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 __all__ = [
     "FORMER_CODES",
@@ -19,7 +18,6 @@ __all__ = [
     "number_of",
     "quoted",
     "toml_key",
-    "toml_text",
 ]
 
 #: Codes that had other names before version 0.2, and their current names.
@@ -162,40 +160,6 @@ def toml_key(name: str) -> str:
     """
     is_bare = re.fullmatch(r"[A-Za-z0-9_-]+", name) is not None
     return name if is_bare else json.dumps(name, ensure_ascii=False)
-
-
-def toml_text(table: Mapping[str, Any]) -> str:
-    """Return a job file.
-
-    Args:
-        table: Its keys: plain values, tables, and lists of these.
-    """
-    plain, tables = [], []
-    for key, value in table.items():
-        if isinstance(value, Mapping):
-            tables.append(f"\n[{toml_key(key)}]\n{_toml_lines(value)}")
-        elif isinstance(value, list) and value and isinstance(value[0], Mapping):
-            tables += [f"\n[[{toml_key(key)}]]\n{_toml_lines(entry)}" for entry in value]
-        else:
-            plain.append(f"{toml_key(key)} = {_toml_value(value)}\n")
-    return "".join(plain + tables)
-
-
-def _toml_lines(table: Mapping[str, Any]) -> str:
-    return "".join(f"{toml_key(key)} = {_toml_value(x)}\n" for key, x in table.items())
-
-
-def _toml_value(value: Any) -> str:  # noqa: ANN401
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    if isinstance(value, str):
-        return quoted(value)
-    if isinstance(value, Mapping):
-        inside = ", ".join(f"{toml_key(key)} = {_toml_value(x)}" for key, x in value.items())
-        return f"{{ {inside} }}"
-    if isinstance(value, list | tuple):
-        return f"[{', '.join(map(_toml_value, value))}]"
-    return repr(value)
 
 
 def by_severity(findings: Iterable[Finding]) -> tuple[Finding, ...]:
