@@ -6,11 +6,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 __all__ = [
-    "FORMER_CODES",
     "Cause",
     "Finding",
     "by_severity",
-    "current_code",
     "grouped",
     "listed",
     "log_finding",
@@ -19,23 +17,6 @@ __all__ = [
     "quoted",
     "toml_key",
 ]
-
-#: Codes that had other names before version 0.2, and their current names.
-FORMER_CODES: Mapping[str, str] = {
-    "beyond_seen": "beyond_range",
-    "bound_binds": "active_bound",
-    "commands_alike": "proportional_commands",
-    "encoder_kept": "encoder_uncorrected",
-    "encoder_open": "encoder_undetermined",
-    "faint_parameters": "weak_parameters",
-    "gives_way": "moved_by_others",
-    "held_command": "repeated_command",
-    "held_torque": "repeated_torque",
-    "late_command": "delayed_command",
-    "told_together": "correlated_terms",
-    "torque_missed": "torque_mismatch",
-    "unlike_velocity": "velocity_mismatch",
-}
 
 _SPREAD = 0.1  # of the numbers of a setting that is stated once for several findings
 _RANK = {"error": 0, "warning": 1, "note": 2}
@@ -107,23 +88,14 @@ def log_finding(
     return Finding(code, severity, where, f"{log}: {message}", figures)
 
 
-def current_code(code: str) -> str:
-    """Return the current name of a code, which may be a former one.
-
-    Args:
-        code: The code.
-    """
-    return FORMER_CODES.get(code, code)
-
-
 def not_ignored(findings: Iterable[Finding], ignore: Iterable[str]) -> tuple[Finding, ...]:
     """Return the findings whose codes are not ignored.
 
     Args:
         findings: The findings.
-        ignore: Codes, current or former.
+        ignore: The codes.
     """
-    ignored = {current_code(code) for code in ignore}
+    ignored = set(ignore)
     return tuple(finding for finding in findings if finding.code not in ignored)
 
 

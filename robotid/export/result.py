@@ -20,7 +20,6 @@ from robotid.export.commanded import (
     loops_of,
 )
 from robotid.export.entries import SCHEMA_VERSION
-from robotid.export.former_keys import from_former_keys
 from robotid.export.shape import FILE, FLAG, MAYBE, NUMBER, TABLE, TEXT, check_shape
 from robotid.export.urdf import load_identified, terms_from_facts
 from robotid.findings import listed
@@ -332,8 +331,6 @@ def read_result(path: str | Path) -> dict[str, Any]:
         DataError: If it is missing, not JSON, or not of the schema of a result.
     """
     name, result = Path(path).name, read_json(path, "result")
-    if isinstance(result, dict):
-        result = from_former_keys(result)
     version = result.get("schema_version") if isinstance(result, dict) else None
     if version != SCHEMA_VERSION or "verdict" not in result:
         raise DataError(

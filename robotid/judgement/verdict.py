@@ -1,7 +1,6 @@
 """Verdict on a result, with reasons; what was not tested is never "good"."""
 
 import difflib
-import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
@@ -11,7 +10,7 @@ import numpy as np
 from robotid._settings import require_kind
 from robotid.doctor.diagnosis import CODES
 from robotid.exceptions import SettingsError
-from robotid.findings import Finding, current_code, listed, not_ignored
+from robotid.findings import Finding, listed, not_ignored
 from robotid.fitting.left_out import logs_that_test
 from robotid.fitting.metrics import Metrics
 from robotid.judgement.evidence import Determined, Predictions, error_of, is_harmless_cost
@@ -33,7 +32,6 @@ __all__ = [
     "warnings_of",
 ]
 
-_LOGGER = logging.getLogger("robotid")
 
 _REJECTED = 5.0  # [%] a smaller prediction error rejects a hypothesis on columns or masses
 _SCALED = 2.0  # a gravity torque within this factor of the URDF's contradicts a wrong unit
@@ -340,13 +338,8 @@ def check_ignored(ignore: Sequence[str]) -> None:
     """
     known = sorted({*CODES, *WARNING_CODES, *_OF_RESULTS})
     require_kind(ignore, (list, tuple, set, frozenset), "ignore", "a list of codes")
-    for stated in ignore:
-        require_kind(stated, str, "a code in ignore", "the code of a finding")
-        code = current_code(stated)
-        if code != stated:
-            _LOGGER.warning(
-                "doctor: ignore has the code %r, which is named %r since 0.2", stated, code
-            )
+    for code in ignore:
+        require_kind(code, str, "a code in ignore", "the code of a finding")
         if code not in known:
             near = difflib.get_close_matches(code, known, n=1)
             hint = f". Did you mean {near[0]!r}?" if near else ""
