@@ -16,9 +16,9 @@ half of its log: its URDF is the truth. With --unseen: joint torque of the last 
 fitted on the others.
 Without torques of joints: a human on two force shoes, also with errors of soft tissue, and
 an iCub that walks on the spot, of whose feet the vertical forces are measured.
-With --faults: how many logs with a wrong pose of the base, and with a wrong gain of one foot, the
-doctor names. With --flags: how many contacts it names, as delayed if all flags of a log are, and
-as slipping on the ground of the benchmark and on a slippery one.
+With --faults: how many logs with a wrong pose of the base the doctor names. With --flags: how many
+contacts it names, as delayed if all flags of a log are, and as slipping on the ground of the
+benchmark and on a slippery one.
 """
 
 import setting  # noqa: I001 -- pins the threads of BLAS before numpy is imported
@@ -382,7 +382,7 @@ def posed(pose, place, turn):
 
 
 def faults(name, seeds, duration):
-    """Print how many logs with a wrong pose, or a wrong gain of one foot, the doctor names."""
+    """Print how many logs with a wrong pose the doctor names."""
     plant, counts = PLANTS[name](), {}
     others, signals = getattr(plant, "other", with_other_bodies), getattr(plant, "signals", SIGNALS)
     for seed in seeds:
@@ -392,11 +392,6 @@ def faults(name, seeds, duration):
             wrong = replace(log, base=replace(log.base, pose=change(log.base.pose)))
             codes = [x.code for x in check_base(other, wrong, signals) if x.severity == "error"]
             counts.setdefault(label, []).append("base_orientation" in codes)
-        for foot in [x.frame for x in plant.model.contacts if x.measured]:
-            for gain in (1.0, 1.1, 1.3):
-                own = {x: f * (gain if x.endswith(foot) else 1.0) for x, f in log.wrenches.items()}
-                codes = [x.code for x in check_base(other, replace(log, wrenches=own), signals)]
-                counts.setdefault(f"gain {gain:g}", []).append("wrench_gain" in codes)
     for label, own in counts.items():
         print(f"{name}, {label}: {sum(own)} of {len(own)} named", flush=True)
 
@@ -431,7 +426,7 @@ def main():
     parser.add_argument("--seconds", type=float, default=20.0, help="length of each recording")
     parser.add_argument("--robots", nargs="+", choices=PLANTS, default=WITH_TORQUES)
     parser.add_argument("--unseen", action="store_true", help="only errors on unseen motion")
-    parser.add_argument("--faults", action="store_true", help="only wrong poses and gains")
+    parser.add_argument("--faults", action="store_true", help="only wrong poses")
     parser.add_argument("--flags", action="store_true", help="only delays of flags, and slips")
     options = parser.parse_args()
     runs, seconds = (1, 4.0) if options.quick else (options.runs, options.seconds)

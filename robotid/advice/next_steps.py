@@ -432,9 +432,6 @@ _AS_FOUND = (
     "unlike_unit",
     "unmounted_part",
     "unsigned_torque",
-    "wrench_delay",
-    "wrench_gain",
-    "wrench_offset",
 )
 #: Codes that name the cause of an error of a joint, and codes that state the error only.
 _NAMED_CAUSES = (*_CAUSES, *_AS_FOUND, "clipped", "payload_change", "position_offset")

@@ -69,7 +69,6 @@ _REASONS = {
     "rolling_contact": "feet roll as balls of a radius that is not stated: the force of the "
     "ground acts elsewhere",
     "moving_contact": "a link moves at {speed:.2g} m/s while it is in contact",
-    "measured_wrench": "forces of the ground are missing in a part of the log",
     "mass_matrix": "the mass matrix is not positive definite in all poses",
     "payload_change": "its last link carries {mass:+.2g} kg relative to the fitted logs",
     "position_offset": "the position may have an offset",
@@ -86,9 +85,6 @@ _REASONS = {
     "unexplained_torque": "gravity, inertia and friction do not explain much of the torque",
     "unlike_run": "the log differs from the other logs",
     "unlike_unit": "the robot differs from the other robots",
-    "wrench_delay": "measured forces of the ground lag the motion by {delay:+.3f} s",
-    "wrench_gain": "the force of a foot must be multiplied by {factor:.3g} relative to the others",
-    "wrench_offset": "measured forces of the ground have an offset",
     "unsigned_torque": "the torque may be a magnitude without sign",
     "unmounted_part": "{mass:.2g} kg of the URDF's last link were probably not mounted",
     "urdf_mismatch": "the torques do not fit the URDF's masses: the URDF may be of another robot "
