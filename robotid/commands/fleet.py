@@ -23,8 +23,7 @@ from robotid.log_files.text_tables import parquet_rows, parquet_values, read_tex
 from robotid.logs.data import suggestion
 from robotid.report.fleet import fleet_page
 from robotid.variation.groups import FEWEST_RUNS
-from robotid.variation.history import FALSE_ALARMS
-from robotid.variation.units import between_units
+from robotid.variation.units import FALSE_ALARMS, between_units
 from robotid.versions import code_versions
 from robotid.workers.checkpoint import Checkpoint, released_on_error
 from robotid.workers.pieces import Workload
