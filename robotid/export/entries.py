@@ -140,12 +140,7 @@ def _variation(found: Identification) -> dict[str, Any]:
     content = found.variation.to_dict() | {"next_torque_rmse": dict(rows)}
     noise = found.regressor_noise
     sums = found.sums.to_dict() | {
-        "unit": [found.variation.unit_names[k] for k in found.variation.of_runs],
-        "covariates": {
-            group.group.name: [each.to_dict() for each in group.covariates]
-            for group in found.runs
-            if group.covariates
-        },
+        "unit": [found.variation.unit_names[k] for k in found.variation.of_runs]
     }
     if noise is not None and noise.is_corrected:
         sums["shift"] = noise.shift.tolist()

@@ -462,28 +462,20 @@ def stated_covariance(result: Mapping[str, Any], names: Sequence[str]) -> Array 
     return root @ root.T
 
 
-def stated_between(
-    result: Mapping[str, Any],
-    model: RobotModel,
-    temperature: float | Mapping[str, float] | None = None,
-) -> Array | None:
+def stated_between(result: Mapping[str, Any], model: RobotModel) -> Array | None:
     """Return the covariance of a robot's parameters in another log, in addition to that of the fit.
 
     Args:
         result: Content of a result.json.
         model: The robot.
-        temperature: As of ``between_covariance``.
 
     Returns:
         Shape (p, p); None for fewer than three fitted logs, or if an earlier version wrote it.
-
-    Raises:
-        DataError: As ``at_temperature``.
     """
     variation = result.get("variation")
     if variation is None or "correlation" not in variation:
         return None
-    return between_covariance(variation, model.layout.names, temperature)
+    return between_covariance(variation, model.layout.names)
 
 
 def stated_model(result: Mapping[str, Any], model: RobotModel) -> RobotModel:

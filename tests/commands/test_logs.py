@@ -13,7 +13,6 @@ from robotid.commands.job import Job, LogEntry
 from robotid.commands.logs import (
     checkpoint_inputs,
     examine_logs,
-    hours_of,
     locked_as_logged,
     log_of_commands,
     survey_logs,
@@ -255,16 +254,11 @@ def test_a_robot_hears_commands_the_gravity_of_its_urdf_or_torques(hand, monkeyp
 
 
 @pytest.mark.parametrize("at", [0, 1, 2])
-@pytest.mark.parametrize("key", ["unit", "time", "temperature"])
-def test_what_one_log_alone_does_not_state_is_named(key, at):
-    value = {"unit": "left", "time": 2.5, "temperature": 31.0}[key]
-    entries = [LogEntry(Path(f"{name}.csv"), **{key: value}) for name in "abc"]
-    read = units_of_logs if key == "unit" else hours_of
-    assert read(entries) == {"unit": ["left"] * 3, "time": [2.5] * 3}.get(key, [None] * 3)
-    entries[at] = replace(entries[at], **{key: "" if key == "unit" else None})
+def test_a_log_that_alone_has_no_unit_is_named(at):
+    entries = [LogEntry(Path(f"{name}.csv"), unit="left") for name in "abc"]
+    assert units_of_logs(entries) == ["left"] * 3
+    entries[at] = replace(entries[at], unit="")
     other = "b.csv" if at == 0 else "a.csv"
-    has = "unit = 'left'" if key == "unit" else f"{key} = {value}"
-    with pytest.raises(
-        SettingsError, match=f"^{'abc'[at]}.csv has no {key}, but {other} has {has}; "
-    ):
-        read(entries)
+    wanted = f"^{'abc'[at]}.csv has no unit, but {other} has unit = 'left'; "
+    with pytest.raises(SettingsError, match=wanted):
+        units_of_logs(entries)
