@@ -26,14 +26,12 @@ from robotid.recordings.logs import Recordings
 from robotid.recordings.survey import SurveyedLog, survey_log
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.model import RobotModel
-from robotid.versions import code_versions
 
 if TYPE_CHECKING:
     from robotid.identification.previews import Run
 
 __all__ = [
     "LockedLogs",
-    "checkpoint_inputs",
     "examine",
     "examine_logs",
     "identity_of",
@@ -47,8 +45,6 @@ __all__ = [
 
 _PIECES = 8  # pieces per rows in memory: the filter of a piece needs memory of its own
 _SHORTEST = 256  # rows of a piece
-# for the reductions of the logs
-_IRRELEVANT = ("validation", "estimator", "output", "doctor", "payload_check")
 
 
 def survey_logs(
@@ -278,27 +274,6 @@ def result_run(job: Job, path: str | Path) -> tuple[Job, list[LogEntry], RobotMo
     recordings = Recordings(model, structural_mapping(model), logs)
     details = result["consistency"].get("fit", {})
     return job, fitted, model, Run.of(recordings, stated_parameters(result, model), details)
-
-
-def checkpoint_inputs(job: Job) -> dict[str, Any]:
-    """Return all inputs that determine the reduction of the logs of a job, as plain values.
-
-    Path, size and time of change identify a log: a hash takes as long as reading.
-
-    Args:
-        job: The job.
-
-    Raises:
-        OSError: If a file does not exist.
-    """
-    settings = {key: value for key, value in job.to_dict().items() if key not in _IRRELEVANT}
-    settings["reduction"] = {"rows_in_memory": job.rows_in_memory}
-    return {
-        "versions": code_versions(),
-        "settings": settings,
-        "urdf_sha256": file_sha256(job.urdf),
-        "logs": [identity_of(entry.path) for entry in job.identification],
-    }
 
 
 def identity_of(path: Path) -> dict[str, Any]:

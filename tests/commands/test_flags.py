@@ -82,7 +82,7 @@ def test_a_name_in_the_log_needs_its_joint():
 
 def test_words_that_identify_again_leave_out_what_is_only_shown():
     words = ["identify", "arm.urdf", "a.csv", "--out", "there", "--json", "--cutoff", "5"]
-    words += ["--verbose", "--out=here", "--validate", "b.csv", "--progress", "--resume"]
+    words += ["--verbose", "--out=here", "--validate", "b.csv", "--progress"]
     assert source_words(words) == ("arm.urdf", "a.csv", "--cutoff", "5", "--validate", "b.csv")
 
 
@@ -214,13 +214,13 @@ FORWARDED = {
         "track.serve_track", (JOB_OF_FLAGS, "there"),
         {"port": 8123, "speed": 2.5, "announce": ANY, "finished": ANY},
     ),
-    "identify u a.csv --out there --workers 3 --resume": (
+    "identify u a.csv --out there --workers 3": (
         "identify.run_job", (JOB_OF_FLAGS, "there"),
-        {"plan": WorkPlan(3, None, True, ANY), "source": ANY},
+        {"plan": WorkPlan(3, progress=ANY), "source": ANY},
     ),
     "identify u a.csv --scheduler tcp://host:8786": (
         "identify.run_job", (JOB_OF_FLAGS, "robotid-out"),
-        {"plan": WorkPlan(2, "tcp://host:8786", False, ANY), "source": ANY},  # workers of the job
+        {"plan": WorkPlan(2, "tcp://host:8786", progress=ANY), "source": ANY},  # workers of the job
     ),
     "replay u a.csv --ghost g.csv --html p.html": (
         "replay.replay_files", (JOB_OF_FLAGS, ANY), {"ghost": "g.csv"}

@@ -11,7 +11,6 @@ from robotid.closed_loop.settings import LoopSettings
 from robotid.commands import logs as module
 from robotid.commands.job import Job, LogEntry
 from robotid.commands.logs import (
-    checkpoint_inputs,
     examine_logs,
     locked_as_logged,
     log_of_commands,
@@ -201,30 +200,6 @@ def test_notes_of_a_long_log_are_told_once_and_its_looks_are_all_examined(hand, 
         (name, f"held of {name}", ()) for name in ("a.csv", "b.csv", "c.csv")
     ]
     assert found[-1] == "d"
-
-
-def test_a_checkpoint_is_of_all_fitted_logs_of_the_robot_and_of_what_reduces_them(hand, tmp_path):
-    (tmp_path / "bag").mkdir()
-    files = ("a.csv", "b.csv", "bag/0.db3", "bag/meta.yaml")
-    for k, name in enumerate(files):
-        (tmp_path / name).write_text("x" * (k + 3))
-    paths = [tmp_path / name for name in ("a.csv", "b.csv", "bag")]
-    job = replace(
-        hand,
-        identification=tuple(map(LogEntry, paths)),
-        validation=(LogEntry(tmp_path / "none.csv"),),
-        rows_in_memory=999,
-    )
-    found = checkpoint_inputs(job)
-    assert [list(log) for log in found["logs"]] == [
-        [str(tmp_path / "a.csv")], [str(tmp_path / "b.csv")],
-        [str(tmp_path / "bag" / "0.db3"), str(tmp_path / "bag" / "meta.yaml")],
-    ]  # fmt: skip
-    sizes = [about["size"] for log in found["logs"] for about in log.values()]
-    assert sizes == [3, 4, 5, 6]
-    assert found["settings"]["reduction"] == {"rows_in_memory": 999}
-    assert "validation" not in found["settings"]
-    assert found["settings"]["joints"] == ["ja", "slide"]
 
 
 @pytest.mark.parametrize(
