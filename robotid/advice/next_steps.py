@@ -424,7 +424,6 @@ _AS_FOUND = (
     "position_order",
     "position_sign",
     "rolling_contact",
-    "solvers_differ",
     "time_scale",
     "torque_order",
     "torque_sign",

@@ -74,7 +74,6 @@ _REASONS = {
     "position_offset": "the position may have an offset",
     "position_order": "the position may belong to another joint",
     "position_sign": "the position may have the opposite sign",
-    "solvers_differ": "two solvers give different parameters",
     "time_scale": "inertia and gravity contradict each other: the time stamps or the magnitude "
     "of gravity may be wrong",
     "torque_delay": "the torque is delayed by {delay:+.3f} s relative to the position (negative: "
