@@ -1,7 +1,6 @@
 """Legged robots with unknown contact forces: intervals, prediction, time.
 
     python benchmarks/bench_legged.py [--runs 20] [--robots go1 g1 talos cassie] [--unseen]
-    python benchmarks/bench_legged.py --excite [--robots go1 talos] [--design 120]
     python benchmarks/bench_legged.py --flags [--robots go1 g1 talos] [--seconds 10]
     python benchmarks/bench_legged.py --faults [--robots go1 g1 talos human human_soft icub]
     python benchmarks/bench_legged.py --robots human human_soft icub --seconds 15
@@ -14,13 +13,12 @@ a prior, since not all of its links are excited. Counted is how often the 95 % i
 inertial base parameter holds the truth. Beside it the regressor's projected rows are timed against
 those of an arm. With the recordings, a Solo12 that trots in PyBullet is identified from the first
 half of its log: its URDF is the truth. With --unseen: joint torque of the last 30 % of a recording,
-fitted on the others. With --excite: a motion on the feet is designed and followed in MuJoCo by a
-position controller; slip and load of the feet, and the intervals by its log, beside a squat's.
+fitted on the others.
 Without torques of joints: a human on two force shoes, also with errors of soft tissue, and
 an iCub that walks on the spot, of whose feet the vertical forces are measured.
-With --faults: how many logs with a wrong pose of the base, and with a wrong gain of one foot, the
-doctor names. With --flags: how many contacts it names, as delayed if all flags of a log are, and
-as slipping on the ground of the benchmark and on a slippery one.
+With --faults: how many logs with a wrong pose of the base the doctor names. With --flags: how many
+contacts it names, as delayed if all flags of a log are, and as slipping on the ground of the
+benchmark and on a slippery one.
 """
 
 import setting  # noqa: I001 -- pins the threads of BLAS before numpy is imported
@@ -42,7 +40,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 from helpers import cassie
 from helpers.humans import FEET as SHOES
 from helpers.humans import PARTS, Walk, forces, human_urdf, logged, walk, with_other_segments
-from helpers.legged import followed, recorded, with_other_bodies
+from helpers.legged import recorded, with_other_bodies
 from helpers.paths import JOBS
 from helpers.walkers import G1, ICUB, TALOS, planned, waves
 
@@ -50,11 +48,6 @@ from robotid.commands.identify import run_job
 from robotid.commands.job import read_job
 from robotid.constrained.contacts import check_base
 from robotid.exceptions import NotConvergedError, RankDeficientError
-from robotid.excitation.basis import BSplineBasis, FourierBasis
-from robotid.excitation.clearance import Clearance
-from robotid.excitation.design import Designer
-from robotid.excitation.limits import MotionLimits
-from robotid.excitation.standing import standing
 from robotid.fitting.settings import ConsistentSettings
 from robotid.identification.pipeline import identify
 from robotid.logs.settings import SignalSettings
@@ -389,7 +382,7 @@ def posed(pose, place, turn):
 
 
 def faults(name, seeds, duration):
-    """Print how many logs with a wrong pose, or a wrong gain of one foot, the doctor names."""
+    """Print how many logs with a wrong pose the doctor names."""
     plant, counts = PLANTS[name](), {}
     others, signals = getattr(plant, "other", with_other_bodies), getattr(plant, "signals", SIGNALS)
     for seed in seeds:
@@ -399,157 +392,8 @@ def faults(name, seeds, duration):
             wrong = replace(log, base=replace(log.base, pose=change(log.base.pose)))
             codes = [x.code for x in check_base(other, wrong, signals) if x.severity == "error"]
             counts.setdefault(label, []).append("base_orientation" in codes)
-        for foot in [x.frame for x in plant.model.contacts if x.measured]:
-            for gain in (1.0, 1.1, 1.3):
-                own = {x: f * (gain if x.endswith(foot) else 1.0) for x, f in log.wrenches.items()}
-                codes = [x.code for x in check_base(other, replace(log, wrenches=own), signals)]
-                counts.setdefault(f"gain {gain:g}", []).append("wrench_gain" in codes)
     for label, own in counts.items():
         print(f"{name}, {label}: {sum(own)} of {len(own)} named", flush=True)
-
-
-#: Posture, soles, lifted feet of each design and joints that lift them, gains.
-STANDS = {
-    "go1": (
-        {f"{leg}_{joint}_joint": x for leg in ("FL", "FR", "RL", "RR")
-         for joint, x in (("thigh", 0.8), ("calf", -1.6))},
-        {}, {(): {}, ("FL_foot",): {"FL_thigh_joint": 1.2, "FL_calf_joint": -2.4}}, (300.0, 5.0),
-    ),
-    "talos": (
-        {f"leg_{side}_{k}_joint": x for side in ("left", "right")
-         for k, x in ((3, -0.6), (4, 1.2), (5, -0.6))}
-        | {"arm_left_2_joint": 0.4, "arm_right_2_joint": -0.4, "arm_left_4_joint": -0.8,
-           "arm_right_4_joint": -0.8, "gripper_left_joint": -0.5, "gripper_right_joint": -0.5},
-        {foot: (-0.1, -0.06, 0.1, 0.06, 0.0) for foot in TALOS.feet}, {(): {}},
-        (TALOS.kp, TALOS.kd),
-    ),
-}  # fmt: skip
-ALLOWED = 0.45  # coefficient of friction of the design; GROUND in MuJoCo
-CLEARANCE = {"go1": 0.02, "talos": 0.005}  # [m] TALOS' thighs are 12 mm apart
-LOOKS = 250.0  # [Hz] of forces
-
-
-def designer_of(model, name, lifted, duration):
-    """Return the designer of a motion on the feet."""
-    posture, soles, lifts, _ = STANDS[name]
-    posture = posture | lifts[lifted]
-    stand = standing(model, posture=posture, lifted=lifted, soles=soles, friction=ALLOWED)
-    bodies, least = [frame.body for frame in stand.feet.frames], CLEARANCE[name]
-    return stand, Designer.of_model(
-        stand.model, FourierBasis(duration, 5), MotionLimits.of_model(stand.model),
-        clearance=Clearance(stand.model, least=least, floor=0.0, standing=bodies), stand=stand,
-    )  # fmt: skip
-
-
-def squat(designer):
-    """Return the largest squat within the limits: up and down every 2 s, at rest at both ends."""
-    duration = designer.basis.duration
-    basis = BSplineBasis(duration, round(4 * duration))
-    t = np.linspace(0.0, duration, 1000)
-    ramp = np.clip(np.minimum(t, duration - t) / 2.0, 0.0, 1.0)
-    wave = np.linalg.lstsq(
-        basis.derivatives(t, 0)[0][:, 1:], -(ramp**2) * (1 - np.cos(np.pi * t)), rcond=None
-    )[0]
-    C = np.zeros((basis.size, len(designer.information.free)))
-    C[0], C[1:, 2] = designer.start[designer.information.free], wave
-    return replace(designer, basis=basis).checked(C)
-
-
-def tracked(name, stand, designer, design, rng):
-    """Return the log of a designed motion in MuJoCo, and print what its feet did."""
-    model, duration = stand.robot, designer.basis.duration
-    first = design.motion.evaluate(np.zeros(1))[0]
-    grid = np.linspace(0.0, duration, round(LOOKS * duration) + 1)
-    state = design.motion.evaluate(grid)
-    rows = designer.along(*state)
-    planned = designer.information.torque(rows)[:, 6:]
-    at = CubicSpline(grid, np.hstack([state[0][:, 6:], planned]))
-    pose = stand.log(state, grid, "motion").base.pose[0]
-    lifted = [x.frame for x in model.contacts if x not in stand.feet.contacts]
-    feet = TALOS.feet if name == "talos" else FEET
-    kp, kd = STANDS[name][3]
-    drives = {"go1": (ARMATURE, DAMPING, 0.05), "talos": (0.1, 1.0, 0.3)}[name]
-    log = followed(
-        model, feet, lambda t: np.split(at(np.clip(t, 0.0, duration)), 2), rng,
-        posture=np.r_[pose, first[0, 6:]], duration=duration - 0.1, kp=kp, kd=kd, force=True,
-        armature=drives[0], damping=drives[1], torque=drives[2], friction=GROUND, ground=0.005,
-    )  # fmt: skip
-    own = [x.frame for x in stand.feet.contacts]
-    places = link_positions(
-        model.pin_model, model.configurations(np.hstack([log.base.pose, log.q])), own
-    )
-    slip = 1e3 * np.abs(places - places[0])[..., :2].max()
-    f = np.array([[log.wrenches[f"{part} {foot}"] for part in ("fx", "fy", "fz")] for foot in own])
-    used = np.linalg.norm(f[:, :2], axis=1) / np.maximum(f[:, 2], 1e-9)
-    limits = np.array([joint.effort for joint in model.limits])
-    q = design.motion.evaluate(log.t)[0]
-    off = np.abs(log.base.pose[:, :3] - q[:, :3]).max()
-    print(
-        f"  MuJoCo: feet move {slip:.1f} mm, smallest load {f[:, 2].min():.1f} N, friction "
-        f"{used.max():.2f}, torque {100 * (np.abs(log.tau) / limits).max():.0f} % of the limit, "
-        f"base {1e3 * off:.0f} mm off, {sum(not x.all() for x in map(log.contacts.get, own))} feet "
-        f"lift, lifted feet touch: {any(log.contacts[x].any() for x in lifted)}",
-        flush=True,
-    )
-    return replace(log, wrenches={})
-
-
-def excited(name, duration, seconds, runs):
-    """Print what a designed motion and a squat of the same length determine."""
-    errors = {}
-    for lifted in STANDS[name][2]:
-        model, rng = PLANTS[name]().model, np.random.default_rng(0)
-        stand, designer = designer_of(model, name, lifted, duration)
-        motions = {"designed": designer.design(rng, starts=1, seconds=seconds)}
-        if not lifted:
-            motions = {"squat": squat(designer), **motions}
-        for label, design in motions.items():
-            rows = designer.along(*design.motion.evaluate(np.linspace(0.0, duration, 1001)))
-            forces = stand.ground.smallest(
-                designer.information.forces(rows), np.linspace(0.0, duration, 1001)
-            )
-            words = [f"{key} {100 * entry['margin']:.0f} %" for key, entry in forces.items()]
-            base = np.ptp(
-                design.motion.evaluate(np.linspace(0.0, duration, 1001))[0][:, :6], axis=0
-            )
-            print(
-                f"{name} {label}, lifted: {', '.join(lifted) or 'none'}: criterion "
-                f"{design.objective:.3f}, limits used {100 * design.used.max():.0f} %, margins: "
-                f"{', '.join(words)}, {design.seconds:.0f} s\n  the base moves by "
-                f"{', '.join(f'{100 * x:.0f}' for x in base[:3])} cm and "
-                f"{', '.join(f'{x:.2f}' for x in base[3:])} rad"
-            )
-            plant, shares = PLANTS[name](), []
-            n = model.layout.n_inertial
-            truth = plant.truth(model)
-            for seed in range(runs):
-                log = tracked(name, stand, designer, design, np.random.default_rng([seed, 0]))
-                other = with_other_bodies(model, of_urdf(seed))
-                for estimator in (PRIOR, AUTO_PRIOR) if seed == 0 else (AUTO_PRIOR,):
-                    found = identify(
-                        other, log, signals=SIGNALS, estimator=estimator, friction="none",
-                        doctor=False,
-                    )  # fmt: skip
-                    is_body = found.mapping.independent < n
-                    z = ((found.base - found.mapping.K @ truth) / found.base_error)[is_body]
-                    share = 100 * np.mean(np.abs(z) < found.errors.quantile[is_body])
-                    own, weight = found.standard[:n:10], found.estimate.details["prior"]["weight"]
-                    print(
-                        f"  weight {weight:.3g}: {share:.0f} % of {len(z)} intervals hold the "
-                        f"truth, rms z {np.sqrt(np.mean(z**2)):.2f}, total mass {own.sum():.3f} of "
-                        f"{truth[:n:10].sum():.3f} kg, trunk {own[0]:.2f} +- "
-                        f"{np.sqrt(found.standard_covariance[0, 0]):.2f} of {truth[0]:.2f} kg",
-                        flush=True,
-                    )
-                    if estimator is PRIOR:  # standard errors of motions at one weight
-                        errors[label, lifted] = found.base_error[is_body]
-                shares.append(share)
-            line = f"  mean {np.mean(shares):.0f} %, wanted 90 to 98 %"
-            if label != "squat":
-                ratio = errors[label, lifted] / errors["squat", ()]
-                line += f"; errors over the squat's: {np.exp(np.mean(np.log(ratio))):.2f} (mean), "
-                line += f"{ratio.min():.2f} to {ratio.max():.2f}"
-            print(line, flush=True)
 
 
 def speed(duration):
@@ -582,15 +426,9 @@ def main():
     parser.add_argument("--seconds", type=float, default=20.0, help="length of each recording")
     parser.add_argument("--robots", nargs="+", choices=PLANTS, default=WITH_TORQUES)
     parser.add_argument("--unseen", action="store_true", help="only errors on unseen motion")
-    parser.add_argument("--excite", action="store_true", help="only designed motions on the feet")
-    parser.add_argument("--design", type=float, default=120.0, help="seconds of each design")
-    parser.add_argument("--faults", action="store_true", help="only wrong poses and gains")
+    parser.add_argument("--faults", action="store_true", help="only wrong poses")
     parser.add_argument("--flags", action="store_true", help="only delays of flags, and slips")
     options = parser.parse_args()
-    if options.excite:
-        for name in [name for name in STANDS if name in options.robots]:
-            excited(name, 10.0, *((10.0, 1) if options.quick else (options.design, options.runs)))
-        return
     runs, seconds = (1, 4.0) if options.quick else (options.runs, options.seconds)
     for name in ("go1", "cassie") if options.quick else options.robots:
         if options.faults:

@@ -4,7 +4,7 @@ Recordings: each log is left out of the fit; its drive parameters are compared w
 prediction interval of the other logs, and with the interval of their mean alone, as if runs were
 alike; all of them together with draws of their joint distribution; its torque error with the
 expected one. Servos: the fit is to all logs, the prediction from the others to first order.
-Estimates of simulated drives: coverage of the joint regions of samples, effects of the temperature.
+Estimates of simulated drives: coverage of the joint regions of samples.
 Warm-up within a log: the finding drift, and false ones. Simulated arms (Pinocchio's inverse
 dynamics, not the regressor): coverage for the next robot, one by one and jointly, and of the
 spreads; causes named in runs that differ, false alarms in runs that do not. Arms in MuJoCo (0.1 ms,
@@ -47,10 +47,9 @@ from robotid.robot.examples import example_urdf
 from robotid.robot.families import wanted_families
 from robotid.robot.model import RobotModel
 from robotid.simulation.motions import random_fourier
-from robotid.variation.covariates import effects_of, model_of, with_effects
 from robotid.variation.draws import scores_to_values
-from robotid.variation.groups import Covariate, Group, RunsOf, runs_of, sums_of
-from robotid.variation.mixed_effects import MixedEffects, Runs, Slope, covariance_of
+from robotid.variation.groups import Group, RunsOf, runs_of, sums_of
+from robotid.variation.mixed_effects import MixedEffects, Runs, covariance_of
 from robotid.variation.variation import SCORES, Variation, _parameters, vary
 
 JOBS = Path(__file__).parents[1] / "tests" / "jobs"
@@ -67,13 +66,6 @@ WITHIN, BETWEEN = 0.05, 0.15  # spread of friction between runs, between robots
 SLIP = 0.1, 0.2  # [rad] of the encoder of a joint in one log, of one robot
 COMMON = 0.7  # correlation of frictions between robots
 KINDS = ("friction", "gain", "payload", "zero")
-APART, BOTH = {0: -0.02, 9: -0.015}, {0: -0.02, 1: -0.02}  # slopes of terms [1/degC]
-SETS = (  # robots, logs of each, slopes by term, share of `estimates`
-    (1, 6, APART, 1.0), (1, 10, APART, 1.0), (1, 16, APART, 1.0),
-    (4, 4, APART, 1.0), (8, 2, APART, 1.0), (8, 4, APART, 1.0),
-    (1, 10, BOTH, 0.15), (1, 16, BOTH, 0.15), (4, 4, BOTH, 0.15),
-    (1, 10, {0: -0.02}, 0.15), (1, 16, {0: -0.02}, 0.15), (4, 4, {0: -0.02}, 0.15),
-)  # fmt: skip
 
 
 def main():
@@ -91,7 +83,6 @@ def main():
     print()
     fleets(1, 8) if options.quick else fleets(5)
     samples(1 if options.quick else 100)
-    temperatures(*((1, SETS[3:5]) if options.quick else (60, SETS)))
     warm_up(3, 3) if options.quick else warm_up(110, 25)
     unlike(1 if options.quick else 20)
     print("| arms in MuJoCo | sets | named | another | none |\n|---|---|---|---|---|")
@@ -446,16 +437,14 @@ def fleets(count, units=20):
     )
 
 
-def estimates(rng, x, unit, covariates=(), similar=1.0):
+def estimates(rng, x, unit):
     """Return the information of runs on three drives with four terms, whose values are x (k, 12).
 
-    Errors are 2 % of a term and correlated; the plausible spread is 10 %. The torque of the second
-    term of a drive is that of the first one, but for a share ``similar``.
+    Errors are 2 % of a term and correlated; the plausible spread is 10 %.
     """
     found = []
     for j in range(3):
         A = 0.3 * rng.normal(size=(len(x), 4, 4)) + np.eye(4)
-        A[:, :, 1] = np.sqrt(1.0 - similar**2) * A[:, :, 0] + similar * A[:, :, 1]
         H = np.einsum("kij,kil->kjl", A, A) / 0.02**2
         error = np.linalg.solve(
             np.linalg.cholesky(H).swapaxes(1, 2), rng.normal(size=(len(x), 4, 1))
@@ -464,7 +453,7 @@ def estimates(rng, x, unit, covariates=(), similar=1.0):
         names = tuple(f"joint_{j}.{term}" for term in ("viscous", "coulomb", "offset", "armature"))
         group = Group("drive", f"joint_{j}", names, ("N m",) * 4, np.eye(4), (0,))
         runs = Runs(H, h, np.asarray(unit), np.full(4, 0.1))
-        found.append(RunsOf(group, np.ones(4), runs, 1.0, tuple(covariates)))
+        found.append(RunsOf(group, np.ones(4), runs, 1.0))
     return found
 
 
@@ -513,72 +502,6 @@ def samples(count):
                 for x, y in zip(most, half, strict=True)
             )
             print(f"| {words} | {robots} | {cells} |", flush=True)
-
-
-def temperatures(count, sets):
-    """Print how effects of the temperature on friction are found, and the coverage of slopes.
-
-    The standard deviation of the temperature is 8 degC, that of terms between logs 8 %, and between
-    robots BETWEEN. The time of the logs has no effect. Terms that are hardly distinguishable: the
-    torques of viscous and Coulomb friction correlate by 0.99.
-    """
-    print("| logs | effects | found | another effect (sets) | slope found, over the true one | "
-          "slope within 95 % | of those found | next log at a temperature |\n"
-          "|---|---|---|---|---|---|---|---|")  # fmt: skip
-    for robots, logs, true, similar in sets:
-        tally(count, robots, logs, true, similar)
-
-
-def tally(count, robots, logs, true, similar, seed=2):
-    """Print the line of sets with one number of robots, logs of each, and slopes by term."""
-    hits = others = right = inside = ahead = 0
-    sizes = []
-    for k in range(count):
-        total = robots * logs
-        rng = np.random.default_rng([seed, k, total] + ([robots] if robots > 1 else []))
-        unit = np.repeat(np.arange(robots), logs)
-        warm = 20.0 + 8.0 * rng.normal(size=total)
-        c, x = warm - warm.mean(), 0.08 * rng.normal(size=(total, 12))
-        if robots > 1:
-            x += BETWEEN * rng.normal(size=(robots, 12))[unit]
-        for p, slope in true.items():
-            x[:, p] += slope * c
-        about = (Covariate("temperature", "degC", warm),
-                 Covariate("time", "h", rng.uniform(0.0, 50.0, total)))  # fmt: skip
-        found = estimates(rng, x, unit, about, similar)
-        chosen = with_effects(found)
-        used = {}
-        for j, group in enumerate(chosen):
-            for place, each in enumerate(group.runs.slopes):
-                if np.array_equal(each.covariate, c):
-                    model = model_of(group, MixedEffects(group.runs), each.parameter)
-                    used[4 * j + each.parameter] = model.slope(place)
-        own = [p for p in used if p in true]
-        hits += len(own)
-        others += sum(len(group.runs.slopes) for group in chosen) > len(own)
-        sizes += [used[p][0] / true[p] for p in own]
-        right += sum(abs(used[p][0] - true[p]) < 1.96 * used[p][1] for p in own)
-        for p, slope in true.items():
-            group, q = found[p // 4], p % 4
-            moved = group.runs.h - slope * c[:, None] * group.runs.H[:, :, q]
-            shifted = replace(  # about the true slope
-                group, runs=replace(group.runs, h=moved), covariates=about[:1]
-            )
-            inside += effects_of(shifted, MixedEffects(shifted.runs), q)[0].probability > 0.05
-            runs = group.runs.with_slopes([Slope(q, c, 0.1 / c.std())])
-            model = model_of(replace(group, runs=runs), MixedEffects(runs), q)
-            at = rng.choice([-12.0, 0.0, 12.0, 18.0])
-            covariates = [at, *np.zeros(len(model.runs.slopes) - 1)]
-            low, high = model.predict(at=covariates)[q].ends
-            spread = np.hypot(0.08, BETWEEN * (robots > 1))
-            ahead += low < slope * at + spread * rng.normal() < high
-    total = len(true) * count or np.nan
-    words = "two drives" if 9 in true else "two of a drive" if 1 in true else "one"
-    words = words if true else "none"
-    words += ", hardly distinguishable" if similar < 1.0 else ""
-    print(f"| {robots} x {logs} | {words} | {hits} of {total} | {others} of {count} | "
-          f"{np.median(sizes or [np.nan]):.2f} | {100 * inside / total:.0f} % | {right} of {hits} "
-          f"| {100 * ahead / total:.0f} % |", flush=True)  # fmt: skip
 
 
 def warm_up(honest, count):

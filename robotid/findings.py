@@ -4,14 +4,11 @@ import json
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 __all__ = [
-    "FORMER_CODES",
     "Cause",
     "Finding",
     "by_severity",
-    "current_code",
     "grouped",
     "listed",
     "log_finding",
@@ -19,25 +16,7 @@ __all__ = [
     "number_of",
     "quoted",
     "toml_key",
-    "toml_text",
 ]
-
-#: Codes that had other names before version 0.2, and their current names.
-FORMER_CODES: Mapping[str, str] = {
-    "beyond_seen": "beyond_range",
-    "bound_binds": "active_bound",
-    "commands_alike": "proportional_commands",
-    "encoder_kept": "encoder_uncorrected",
-    "encoder_open": "encoder_undetermined",
-    "faint_parameters": "weak_parameters",
-    "gives_way": "moved_by_others",
-    "held_command": "repeated_command",
-    "held_torque": "repeated_torque",
-    "late_command": "delayed_command",
-    "told_together": "correlated_terms",
-    "torque_missed": "torque_mismatch",
-    "unlike_velocity": "velocity_mismatch",
-}
 
 _SPREAD = 0.1  # of the numbers of a setting that is stated once for several findings
 _RANK = {"error": 0, "warning": 1, "note": 2}
@@ -109,23 +88,14 @@ def log_finding(
     return Finding(code, severity, where, f"{log}: {message}", figures)
 
 
-def current_code(code: str) -> str:
-    """Return the current name of a code, which may be a former one.
-
-    Args:
-        code: The code.
-    """
-    return FORMER_CODES.get(code, code)
-
-
 def not_ignored(findings: Iterable[Finding], ignore: Iterable[str]) -> tuple[Finding, ...]:
     """Return the findings whose codes are not ignored.
 
     Args:
         findings: The findings.
-        ignore: Codes, current or former.
+        ignore: The codes.
     """
-    ignored = {current_code(code) for code in ignore}
+    ignored = set(ignore)
     return tuple(finding for finding in findings if finding.code not in ignored)
 
 
@@ -162,40 +132,6 @@ def toml_key(name: str) -> str:
     """
     is_bare = re.fullmatch(r"[A-Za-z0-9_-]+", name) is not None
     return name if is_bare else json.dumps(name, ensure_ascii=False)
-
-
-def toml_text(table: Mapping[str, Any]) -> str:
-    """Return a job file.
-
-    Args:
-        table: Its keys: plain values, tables, and lists of these.
-    """
-    plain, tables = [], []
-    for key, value in table.items():
-        if isinstance(value, Mapping):
-            tables.append(f"\n[{toml_key(key)}]\n{_toml_lines(value)}")
-        elif isinstance(value, list) and value and isinstance(value[0], Mapping):
-            tables += [f"\n[[{toml_key(key)}]]\n{_toml_lines(entry)}" for entry in value]
-        else:
-            plain.append(f"{toml_key(key)} = {_toml_value(value)}\n")
-    return "".join(plain + tables)
-
-
-def _toml_lines(table: Mapping[str, Any]) -> str:
-    return "".join(f"{toml_key(key)} = {_toml_value(x)}\n" for key, x in table.items())
-
-
-def _toml_value(value: Any) -> str:  # noqa: ANN401
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    if isinstance(value, str):
-        return quoted(value)
-    if isinstance(value, Mapping):
-        inside = ", ".join(f"{toml_key(key)} = {_toml_value(x)}" for key, x in value.items())
-        return f"{{ {inside} }}"
-    if isinstance(value, list | tuple):
-        return f"[{', '.join(map(_toml_value, value))}]"
-    return repr(value)
 
 
 def by_severity(findings: Iterable[Finding]) -> tuple[Finding, ...]:

@@ -53,7 +53,6 @@ INSIDE_FUNCTIONS = {
     "coal": {"excitation"},
     "matplotlib": {"paper"},
     "clarabel": {"estimators"},
-    "scs": {"estimators"},
 }
 
 
@@ -130,7 +129,6 @@ def test_estimators_load_no_physics_engine():
 def test_importing_the_package_is_light():
     heavy = ["matplotlib", "meshcat", "cvxpy", "yourdfpy", "pyarrow", "clarabel", "rosbags", "h5py"]
     heavy += ["rich", "distributed", "loky"]
-    heavy += ["scs", "trimesh"]
     heavy += ["trimesh"]
     found = f"[m for m in {heavy} if m in sys.modules]"
     code = f"from robotid import *\nimport sys, json\nprint(json.dumps({found}))"

@@ -17,7 +17,6 @@ from helpers.synthetic import exact_log, truth
 from robotid.cli import COMMANDS, main
 from robotid.commands.job import Job, LogEntry, job_from_settings
 from robotid.doctor.diagnosis import CODES
-from robotid.export.former_keys import FORMER, from_former_keys
 from robotid.fitting.settings import EstimatorSettings
 from robotid.judgement.verdict import WARNING_CODES
 from robotid.log_files.formats import write_columns
@@ -255,14 +254,12 @@ def test_the_page_of_result_files_lists_every_key_of_them():
         for title, _, part in (x.partition("\n") for x in page.split("\n## "))
     }
     stored = [json.loads(path.read_text()) for path in (ROOT / "tests/figures").glob("*.json")]
-    results = [from_former_keys(run["result.json"]) for run in stored if "result.json" in run]
+    results = [run["result.json"] for run in stored if "result.json" in run]
     keys = {key for result in results for key in result}
     keys |= {"robotid", "versions", "variation", "left_out"}
     assert listed["Keys of result.json"] == keys
     parameters = [x for result in results for x in result["drive_parameters"]]
     assert listed["Keys of a parameter"] == {key for x in parameters for key in x}
-    for path, former in FORMER.items():
-        assert f"| `{path}` | `{former}` |" in page
     sides = {key for run in stored for key in run.get("sidecar", {})} - {"schema_version", "robot"}
     assert sides
     assert sides <= listed["Keys of the drive parameters file"] | {"robotid"}

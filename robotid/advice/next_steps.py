@@ -425,7 +425,6 @@ _AS_FOUND = (
     "position_order",
     "position_sign",
     "rolling_contact",
-    "solvers_differ",
     "time_scale",
     "torque_order",
     "torque_sign",
@@ -433,9 +432,6 @@ _AS_FOUND = (
     "unlike_unit",
     "unmounted_part",
     "unsigned_torque",
-    "wrench_delay",
-    "wrench_gain",
-    "wrench_offset",
 )
 #: Codes that name the cause of an error of a joint, and codes that state the error only.
 _NAMED_CAUSES = (*_CAUSES, *_AS_FOUND, "clipped", "payload_change", "position_offset")

@@ -26,8 +26,6 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("results", nargs="+", metavar="RESULT.json")
     add("--out", metavar="FILE.html", help="page to write")
-    words = "probability that four or more results without a change have a finding; default: 0.02"
-    add("--false-alarms", type=float, default=0.02, metavar="P", help=words)
     add_json(parser)
     add_verbose(parser, "print all base parameters")
 
@@ -41,9 +39,9 @@ def run(options: argparse.Namespace) -> None:
     from robotid.report.comparison import compare_results, write_comparison
 
     if options.out:
-        content = write_comparison(options.results, options.out, false_alarms=options.false_alarms)
+        content = write_comparison(options.results, options.out)
     else:
-        content = compare_results(options.results, false_alarms=options.false_alarms)
+        content = compare_results(options.results)
     show_found(content, options, partial(_show, is_verbose=options.verbose))
     if options.out and not options.json:
         print(f"\nwritten to {options.out}")
@@ -70,16 +68,6 @@ def _show(content: dict[str, Any], *, is_verbose: bool = False) -> None:
         rows = [[e["joint"], *map(cell, e["relative_error_pct"])] for e in per_joint]
         echo(f"\n{title}", "  ")
         print("\n".join(columns(["joint", *labels], rows)))
-    for each in content["findings"]:
-        since = f", since {each['since']}" if each["since"] != each["result"] else ""
-        echo(f"finding: {each['result']}{since}: {each['message']}. {each['remedy']}", "  ")
-    for each in content["changes"]:
-        low, high = (f"{x:.3g}" for x in each["predicted"])
-        value, error = f"{each['value']:.4g}", f"{each['std_error']:.2g}"
-        echo(
-            f"change: {each['result']}: {each['name']} is {value} +- {error} {each['unit']}; the "
-            f"results before it predict {low} to {high}", "  ",
-        )  # fmt: skip
     _print_base_parameters(content, labels, None if is_verbose else _SHOWN)
     for key in ("settings", "versions"):
         for row in content[key]:

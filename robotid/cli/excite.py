@@ -22,12 +22,9 @@ __all__ = ["EXAMPLES", "MAIN_FLAGS", "SUMMARY", "add_flags", "run"]
 SUMMARY = "design an excitation trajectory within the robot's limits"
 MAIN_FLAGS = (
     "--out", "--report", "--given", "--kind", "--link", "--mass", "--duration", "--share",
-    "--clearance", "--floor", "--posture", "--lifted", "--joints", "--lock",
+    "--clearance", "--floor", "--joints", "--lock",
 )  # fmt: skip
-EXAMPLES = (
-    "robotid excite robot.urdf --out motion.csv --report motion.html",
-    "robotid excite quadruped.toml --lifted FR_foot --out motion.csv",
-)
+EXAMPLES = ("robotid excite robot.urdf --out motion.csv --report motion.html",)
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
@@ -69,8 +66,7 @@ def run(options: argparse.Namespace) -> None:
         )  # fmt: skip
     show_found(found, options, _show)
     if not options.json:
-        more = [found[key] for key in ("job", "report") if key in found]
-        print_files("", [options.out, *more])
+        print_files("", [options.out, *([found["report"]] if "report" in found else [])])
 
 
 def motion_settings(options: argparse.Namespace) -> "MotionSettings":
@@ -119,27 +115,6 @@ def _boxes(words: Sequence[str], flag: str) -> tuple["Box", ...]:
     return tuple(boxes)
 
 
-def _soles(words: Sequence[str], flag: str) -> tuple[tuple[str, tuple[float, ...]], ...]:
-    """Return rectangles that are stated as LINK=x0,y0,x1,y1,z [m].
-
-    Raises:
-        SettingsError: If a word has another form.
-    """
-    from robotid.excitation.settings import FARTHEST
-
-    soles = []
-    for word in words:
-        name, _, numbers = word.partition("=")
-        x = _numbers(numbers)
-        if len(x) != 5 or not all(abs(number) <= FARTHEST for number in x):
-            raise SettingsError(
-                f"{flag} {word!r}: wanted LINK=x0,y0,x1,y1,z, two corners of the foot and its "
-                f"height in the frame of its link [m], within {FARTHEST:g} m"
-            )
-        soles.append((name, x))
-    return tuple(soles)
-
-
 def _centre(word: str, _: str) -> tuple[float, ...]:
     found = _numbers(word)
     if len(found) != 3:
@@ -182,17 +157,13 @@ _MOTION = Flags(
         "--clearance": ("clearance", "M"),
         "--floor": ("floor", "M"),
         "--box": ("boxes", "NAME=x0,y0,z0,x1,y1,z1"),
-        "--posture": ("posture", "JOINT=RAD"),
-        "--lifted": ("lifted", "LINKS"),
-        "--sole": ("soles", "LINK=x0,y0,x1,y1,z"),
-        "--friction-coefficient": ("friction_coefficient", "X"),
         "--noise": ("noise", "JOINT=N_M"),
         "--seed": ("seed", "N"),
         "--starts": ("starts", "N"),
         "--seconds": ("seconds", "S"),
         "--points": ("points", "HZ"),
     },
-    {"--box": _boxes, "--sole": _soles, "--clearance": _clearance, "--com": _centre},
+    {"--box": _boxes, "--clearance": _clearance, "--com": _centre},
 )
 
 
@@ -222,9 +193,6 @@ def _show(content: dict[str, Any]) -> None:
 
 def _margin(name: str, margin: Mapping[str, Any]) -> str:
     """Return the smallest margin of a motion to a limit, as text."""
-    if "words" in margin:
-        where = f"{margin['where']} at {margin['time']:.2f} s"
-        return f"{100 * margin['margin']:5.1f} %  {where}: {margin['words']}"
     if name != "collision":
         return f"{100 * margin['margin']:5.1f} %  {margin['where']}"
     text = "no pair of links or obstacles comes close"

@@ -32,8 +32,6 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
         if first.among:
             about = {"choices": first.among}
         add(f"--{name.replace('_', '-')}", help=_by_format(words), **about)
-    without = "deprecated, no effect: friction terms that a format lacks are always projected"
-    add("--mean-friction", action="store_true", help=without)
     add_json(parser)
 
 

@@ -400,7 +400,7 @@ def source_words(words: Sequence[str]) -> tuple[str, ...]:
         The words after the name of the command, without ``--out`` and flags of the output.
     """
     _, *rest = words
-    source, shown = list[str](), ("--json", "--progress", "--verbose", "--resume")
+    source, shown = list[str](), ("--json", "--progress", "--verbose")
     for before, word in zip(words, rest, strict=False):
         if before != "--out" and word not in (*shown, "--out") and not word.startswith("--out="):
             source.append(word)

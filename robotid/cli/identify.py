@@ -61,7 +61,7 @@ def run(options: argparse.Namespace) -> int:
 
         job = job_from_flags(options)
         workers = job.workers if options.workers is None else options.workers
-        plan = WorkPlan(workers, options.scheduler, options.resume, progress)
+        plan = WorkPlan(workers, options.scheduler, progress=progress)
         source = source_words(options.words)
         found, result = run_job(job, options.out, plan=plan, source=source)
     show_found(
@@ -172,5 +172,3 @@ def _add_work(parser: argparse.ArgumentParser) -> None:
     flags.add_argument("--workers", type=int, metavar="N", help=words)
     words = "address of a Dask cluster, as tcp://host:8786"
     flags.add_argument("--scheduler", metavar="ADDRESS", help=words)
-    words = "continue an interrupted run in --out"
-    flags.add_argument("--resume", action="store_true", help=words)

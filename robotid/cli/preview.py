@@ -41,9 +41,6 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     add("--noise", metavar="JOINT=N_M", action="append", default=[], help=words)
     words = "correlation time of the noise [s]; 0: uncorrelated samples; default: 0.1"
     add("--correlation", metavar="S", type=float, help=words)
-    words = "temperature of the drives [degC], where it has an effect by RESULT; default: that in "
-    words += "each motion"
-    add("--temperature", metavar="DEGC", type=float, help=words)
     add_json(parser)
     words = "print standard parameters and whole expressions, too; print choices on stderr"
     parser.add_argument("--verbose", action="store_true", help=words)
@@ -61,8 +58,7 @@ def run(options: argparse.Namespace) -> None:
 
     if options.given:
         refuse_log_flags(options, "a RESULT states how its logs are read")
-    stated = {"noise": stated_noise(options), "correlation": options.correlation,
-              "temperature": options.temperature}  # fmt: skip
+    stated = {"noise": stated_noise(options), "correlation": options.correlation}
     show_found(
         preview_job(job_from_flags(options), options.given, **stated),
         options,

@@ -28,10 +28,6 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     add("logs", nargs="+", metavar="LOG")
     words = "name of the robot of the logs, if the fitted logs are of several"
     add("--unit", metavar="NAME", help=words)
-    words = "mean temperature of the drives in the logs; default: their columns temperature"
-    add("--temperature", type=float, metavar="DEGC", help=words)
-    words = "time of the logs, as the fitted logs state it: a date with a time, or hours"
-    add("--time", metavar="TIME", help=words)
     words = "add the logs to the variation between logs in RESULT.json"
     add("--update", action="store_true", help=words)
     add_json(parser)
@@ -51,14 +47,11 @@ def run(options: argparse.Namespace) -> None:
 
 
 def _entry(log: str, options: argparse.Namespace) -> "LogEntry":
-    """Return a log with what the flags state of it, checked as in a job file."""
+    """Return a log with its robot, checked as in a job file."""
     from robotid.commands.job import LogEntry
 
-    time = options.time
-    if time is not None and time.replace(".", "", 1).isdigit():
-        time = float(time)
-    stated = {"unit": options.unit, "temperature": options.temperature, "time": time}
-    return LogEntry.from_dict({"log": log, **{k: x for k, x in stated.items() if x is not None}})
+    unit = {} if options.unit is None else {"unit": options.unit}
+    return LogEntry.from_dict({"log": log, **unit})
 
 
 def _show(found: dict[str, Any], *, is_update: bool = False) -> None:
@@ -69,9 +62,7 @@ def _show(found: dict[str, Any], *, is_update: bool = False) -> None:
         echo(f"\n{recording['name']}", "  ")
         print("\n".join(error_lines(recording, width=terminal_width())))
         expected = recording.get("expected", {})
-        if "missing" in expected:
-            echo(f"no expected rmse: {expected['missing']}", "  ")
-        elif expected:
+        if expected:
             source = "fit and spread between logs" if expected["with_spread"] else "fit"
             own = [
                 f"{joint} {each['rmse']:.3g} ({each['within_95_pct']:.0f} %)"

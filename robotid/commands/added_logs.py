@@ -1,6 +1,6 @@
 """Logs compared with those of a result, and added to their variation without reading these."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -8,20 +8,19 @@ from typing import Any
 import numpy as np
 
 from robotid._files import read_json, source_entry, write_json
-from robotid._typing import Array
 from robotid.commands.job import Job, LogEntry
-from robotid.commands.logs import hours_of, units_of_logs
+from robotid.commands.logs import units_of_logs
 from robotid.exceptions import DataError
 from robotid.export.result import Result, stated_parameters
 from robotid.findings import Finding
-from robotid.fitting.fit import covariates_of, sums_of_logs
+from robotid.fitting.fit import sums_of_logs
 from robotid.identification.repeated_errors import with_repeated_errors
 from robotid.judgement.unlike_runs import unlike_findings
 from robotid.recordings.logs import Recordings
 from robotid.recordings.survey import SurveyedLog
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.model import RobotModel
-from robotid.variation.groups import Covariate, RunSums, runs_of
+from robotid.variation.groups import RunSums, runs_of
 from robotid.variation.variation import vary
 
 __all__ = ["AddedLogs", "add_logs", "check_update"]
@@ -66,7 +65,7 @@ def check_update(result: Result, job: Job, entries: Sequence[LogEntry]) -> None:
 
     Raises:
         DataError: If the result has no sums, or a log is one of its logs.
-        SettingsError: If the robot, temperature or time of a log is missing, or stated otherwise.
+        SettingsError: If the robot of a log is missing.
     """
     stated = result.content.get("variation", {})
     if "sums" not in stated:
@@ -84,18 +83,11 @@ def check_update(result: Result, job: Job, entries: Sequence[LogEntry]) -> None:
                 "leave it out"
             )
         of_file[own] = str(entry.path)
-    every = [replace(entry, temperature=None) for entry in (*job.identification, *entries)]
-    units_of_logs(every)
-    hours_of(every)
+    units_of_logs([*job.identification, *entries])
 
 
 def add_logs(
-    result: Result,
-    model: RobotModel,
-    job: Job,
-    logs: Sequence[SurveyedLog],
-    *,
-    is_update: bool = False,
+    result: Result, model: RobotModel, job: Job, logs: Sequence[SurveyedLog]
 ) -> AddedLogs | None:
     """Return the variation between the logs of a result and new ones.
 
@@ -107,14 +99,12 @@ def add_logs(
         model: Its robot.
         job: Its job.
         logs: The new logs, of this robot.
-        is_update: Whether the temperature and time of the others must not be lost.
 
     Returns:
         The variation; None if the result has no sums of its logs.
 
     Raises:
-        DataError: If a row of a log cannot be used, a temperature is missing, or the sums are of
-            another version.
+        DataError: If a row of a log cannot be used, or the sums are of another version.
     """
     stated = result.content.get("variation", {})
     if "sums" not in stated:
@@ -131,10 +121,9 @@ def add_logs(
         )
     new_units = [log.unit or any(before["unit"]) * Path(log.path).name for log in logs]
     units = [*before["unit"], *new_units]
-    covariates = _joined(before["covariates"], recordings, is_update=is_update)
     unit_names, unit = np.unique(units, return_inverse=True)
     sums = old.joined(new)
-    groups = runs_of(model, mapping, pi, sums, unit, covariates)
+    groups = runs_of(model, mapping, pi, sums, unit)
     names = [*stated["logs"], *(Path(log.path).name for log in logs)]
     found = vary(names, groups, unit_names.tolist())
     assert found is not None
@@ -147,29 +136,7 @@ def add_logs(
     added = [source_entry(log.path) for log in logs]
     content = found.to_dict() | {
         "sums": sums.to_dict() | {key: before[key] for key in ("shift",) if key in before}
-        | {"unit": units, "covariates": {
-            name: [each.to_dict() for each in some] for name, some in covariates.items()
-        }},
+        | {"unit": units},
         "added": [*stated.get("added", ()), *added],
     }  # fmt: skip
     return AddedLogs(content, tuple(unlike_findings(own)))
-
-
-def _joined(
-    before: Mapping[str, Sequence[Mapping[str, Any]]], recordings: Recordings, *, is_update: bool
-) -> dict[str, list[Covariate]]:
-    """Return temperature and time of the logs of a result and of new ones, where all have them."""
-    found: dict[str, list[Covariate]] = {}
-    of_new = covariates_of(recordings)
-    for name, some in before.items():
-        new = {each.name: each.values for each in of_new.get(name, ())}
-        for each in some:
-            if each["name"] in new:
-                values: Array = np.concatenate([each["by_log"], new[each["name"]]])
-                found.setdefault(name, []).append(Covariate(each["name"], each["unit"], values))
-            elif is_update:
-                raise DataError(
-                    f"the logs of the result have the {each['name']} of {name}, but not all new "
-                    f"logs do; state it with --{each['name']}"
-                )
-    return found

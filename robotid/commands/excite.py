@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from robotid._files import check_file, write_text
-from robotid.commands.job import Job, LogEntry
+from robotid._files import check_file
+from robotid.commands.job import Job
 from robotid.commands.logs import result_run
 from robotid.exceptions import SettingsError
 from robotid.excitation.basis import Basis, BSplineBasis, FourierBasis
@@ -23,11 +23,7 @@ from robotid.excitation.motion_page import write_motion_page
 from robotid.excitation.payload_motion import design_payload
 from robotid.excitation.routes import design_stands, design_sweeps
 from robotid.excitation.settings import ROUTES, MotionSettings
-from robotid.excitation.standing import Stand, Standing, standing
-from robotid.findings import toml_text
 from robotid.identification.previews import Preview, Run, preview_logs
-from robotid.log_files.formats import check_suffix
-from robotid.log_files.read import write_log
 from robotid.logs.data import Log
 from robotid.recordings.survey import hold_log
 from robotid.robot.model import RobotModel
@@ -70,10 +66,7 @@ def design_motion(
         check_file(Path(file))
     check_motion_file(target)
     designer, run = _designer(job, settings, given)
-    model, stand = designer.information.model, _stand_of(designer)
-    if stand is not None:
-        check_suffix(Path(target), "motions on the feet")
-        check_file(_job_of(target))
+    model = designer.information.model
 
     def show_start(start: int, _: float) -> None:
         if progress is not None:
@@ -96,17 +89,12 @@ def design_motion(
     expected: Preview | list[str] | None = None
     if report is not None:  # computed before any file is written: the motion may be too short
         expected = (
-            _expected(job, model, design, settings, run, str(target), stand)
+            _expected(job, model, design, settings, run, str(target))
             if carried is None
             else carried.described()
         )
     content = _content(designer, design, course, settings)
-    if stand is None:
-        write_motion(design.motion, model.joints, design.duration, settings.points, target)
-    else:
-        write_log(_log(stand, design, settings, str(target)), target)
-        content["job"] = str(write_text(_identification(job, stand, target), _job_of(target)))
-        content["joints"] = list(stand.robot.joints)
+    write_motion(design.motion, model.joints, design.duration, settings.points, target)
     if carried is not None:
         content["payload"] = carried.to_dict()
     if report is not None and expected is not None:
@@ -135,8 +123,7 @@ def _designer(job: Job, settings: MotionSettings, given: str | None) -> tuple[De
             "criterion is widest, which needs an earlier result: wanted --given RESULT, and a kind "
             "other than payload; or another criterion"
         )
-    stand = _stand(model, settings)
-    model = model if stand is None else stand.model
+    model.require_fixed("motion design")
     limits = MotionLimits.of_model(
         model,
         share=settings.share,
@@ -146,85 +133,14 @@ def _designer(job: Job, settings: MotionSettings, given: str | None) -> tuple[De
     )
     clearance = None
     if settings.clearance is not None:
-        floor = settings.floor if stand is None else settings.floor or 0.0
-        standing_on_it = () if stand is None else [frame.body for frame in stand.feet.frames]
         clearance = Clearance(
-            model, least=settings.clearance, floor=floor, boxes=settings.boxes,
-            standing=standing_on_it,
-        )  # fmt: skip
+            model, least=settings.clearance, floor=settings.floor, boxes=settings.boxes
+        )
     designer = Designer.of_model(
         model, _basis(settings), limits, name=name, clearance=clearance, noise=settings.noise,
-        run=run, stand=stand,
+        run=run,
     )  # fmt: skip
     return designer, run
-
-
-def _stand(model: RobotModel, settings: MotionSettings) -> Stand | None:
-    """Return the feet of a robot whose base floats; None if it is fixed."""
-    on_feet = ("posture", "lifted", "soles")
-    if not model.free_flyer:
-        if stated := [name for name in on_feet if getattr(settings, name)]:
-            raise SettingsError(
-                f"{stated[0]} is stated, but the base of {model.name} is fixed: it is of robots on "
-                "their feet. State free_flyer = true and [[contact]] in the job file"
-            )
-        return None
-    if not model.contacts:
-        raise SettingsError(
-            f"{model.name} has no contacts: a floating base needs feet on the ground. State "
-            "[[contact]] in the job file"
-        )
-    if settings.kind not in ("fourier", "bspline") or settings.jerk or settings.floor:
-        found = "a jerk limit" if settings.jerk else f"kind {settings.kind!r}"
-        found = "a floor" if settings.floor else found
-        raise SettingsError(
-            f"{found} is stated for {model.name}, whose base floats; wanted kind fourier or "
-            "bspline, no jerk limit, and the floor under the feet"
-        )
-    return standing(
-        model,
-        posture=settings.posture,
-        lifted=settings.lifted,
-        soles=dict(settings.soles),
-        friction=settings.share * settings.friction_coefficient,
-    )
-
-
-def _log(stand: Stand, design: Design, settings: MotionSettings, path: str) -> Log:
-    """Return a motion on the feet as the table to write."""
-    t = np.arange(round(design.duration * settings.points) + 1) / settings.points
-    return stand.log(design.motion.evaluate(np.minimum(t, design.duration)), t, path)
-
-
-def _ground_margins(designer: Designer, course: Course) -> dict[str, dict[str, Any]]:
-    """Return the smallest margins of the forces of the ground; none with a fixed base."""
-    information = designer.information
-    if not isinstance(information, Standing):
-        return {}
-    forces = information.forces(designer.along(*course.values[:3]))
-    return information.stand.ground.smallest(forces, course.t)
-
-
-def _stand_of(designer: Designer) -> Stand | None:
-    """Return the feet and the ground of a designer; None if the base is fixed."""
-    information = designer.information
-    return information.stand if isinstance(information, Standing) else None
-
-
-def _job_of(target: str | Path) -> Path:
-    """Return the job file that identifies a recording of a motion."""
-    return Path(target).with_suffix(".identify.toml")
-
-
-def _identification(job: Job, stand: Stand, target: str | Path) -> str:
-    """Return the job that identifies a recording of a motion: its feet are always in contact."""
-    own = [x.frame for x in stand.feet.contacts]
-    contacts = tuple(replace(x, always=True) for x in job.contacts if x.frame in own)
-    path = Path(target)
-    log = LogEntry(path.with_name(f"{path.stem}_recorded{path.suffix}").resolve())
-    found = replace(job, contacts=contacts, identification=(log,)).to_dict()
-    plain = Job(job.urdf).to_dict()
-    return toml_text({key: x for key, x in found.items() if key == "urdf" or x != plain[key]})
 
 
 def _designed(
@@ -262,15 +178,11 @@ def _expected(
     settings: MotionSettings,
     run: Run | None,
     path: str,
-    stand: Stand | None = None,
 ) -> Preview:
     """Return the expected standard errors of a log of the motion, with those of earlier logs."""
-    if stand is not None:
-        model, log = stand.robot, _log(stand, design, settings, path)
-    else:
-        t = np.arange(round(design.duration * settings.points) + 1) / settings.points
-        q, v, a = design.motion.evaluate(np.minimum(t, design.duration))
-        log = Log(t, q, np.zeros_like(q), model.joints, v, a, path)
+    t = np.arange(round(design.duration * settings.points) + 1) / settings.points
+    q, v, a = design.motion.evaluate(np.minimum(t, design.duration))
+    log = Log(t, q, np.zeros_like(q), model.joints, v, a, path)
     in_memory = hold_log(model, log, job.signals)
     return preview_logs(model, [in_memory], job.estimator, noise=settings.noise, run=run)
 
@@ -301,7 +213,6 @@ def _content(
             "left_alone": clearance.made_to,
             "built_near": clearance.built_near,
         }
-    margins |= _ground_margins(designer, course)
     content = {
         "robot": model.name,
         "joints": list(model.joints),

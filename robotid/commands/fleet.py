@@ -23,8 +23,7 @@ from robotid.log_files.text_tables import parquet_rows, parquet_values, read_tex
 from robotid.logs.data import suggestion
 from robotid.report.fleet import fleet_page
 from robotid.variation.groups import FEWEST_RUNS
-from robotid.variation.history import FALSE_ALARMS
-from robotid.variation.units import between_units
+from robotid.variation.units import FALSE_ALARMS, between_units
 from robotid.versions import code_versions
 from robotid.workers.checkpoint import Checkpoint, released_on_error
 from robotid.workers.pieces import Workload
@@ -245,7 +244,7 @@ def identify_unit(unit: FleetUnit, threads: int | None) -> UnitResult:
     rows: list[dict[str, Any]] = []
     try:
         job = unit.stated()
-        found, _ = identify_job(
+        found = identify_job(
             job, job.model(), WorkPlan(1),
             refuse=lambda entry, error: refused.update({entry.path: str(error)}),
         )  # fmt: skip
@@ -323,7 +322,7 @@ def run_fleet(
     chosen, target, inputs = plan or WorkPlan(1), Path(folder), _inputs(units)
     check_folder(target, _FILES)
     known = _known(target, inputs) if update else frozenset()
-    checkpoint = Checkpoint.open(target, inputs, units, resume=chosen.resume, kind=UnitResult)
+    checkpoint = Checkpoint.open(target, inputs, units, UnitResult, resume=chosen.resume)
     with chosen, released_on_error(checkpoint):
         if known:
             _keep(target / "fleet.parquet", known, units, checkpoint)

@@ -13,7 +13,6 @@ from robotid.advice.steps import Origin
 from robotid.closed_loop.settings import LoopSettings
 from robotid.commands.job import Job, LogEntry
 from robotid.commands.logs import (
-    checkpoint_inputs,
     examine_logs,
     locked_as_logged,
     needed_of,
@@ -39,7 +38,6 @@ from robotid.robot.drives import DriveTerm
 from robotid.robot.families import AUTO, wanted_families
 from robotid.robot.model import RobotModel
 from robotid.robot.tree import read_tree
-from robotid.workers.checkpoint import Checkpoint, released_on_error
 from robotid.workers.plan import WorkPlan
 
 if TYPE_CHECKING:
@@ -93,16 +91,12 @@ def run_job(
     check_folder(target, ["result.json", *_names(model)])
     found: Identification | LoopIdentification
     if is_simulated:
-        found, checkpoint, used = _identify_loops(job, model, chosen.progress), None, job
+        found, used = _identify_loops(job, model, chosen.progress), job
     else:
-        found, checkpoint = identify_job(job, model, chosen, target)
+        found = identify_job(job, model, chosen)
         used = _job_of(found)
     report_stage(chosen.progress, "writing", stages)
-    with released_on_error(checkpoint):
-        saved = _write(found, used, target, source=source)
-    if checkpoint is not None:
-        checkpoint.remove()
-    return saved
+    return _write(found, used, target, source=source)
 
 
 def save_result(
@@ -274,17 +268,15 @@ def identify_job(
     job: Job,
     model: RobotModel,
     plan: WorkPlan,
-    folder: Path | None = None,
     *,
     refuse: Callable[[LogEntry, DataError], None] | None = None,
-) -> tuple[Identification, Checkpoint | None]:
-    """Identify from a job's logs; only finished pieces of long logs are written.
+) -> Identification:
+    """Identify from a job's logs; nothing is written.
 
     Args:
         job: The job.
         model: Its robot.
         plan: Workers for long logs.
-        folder: Folder of the checkpoint, which stores finished pieces; none if None.
         refuse: As of ``survey_logs``.
 
     Raises:
@@ -303,20 +295,15 @@ def identify_job(
     locked = locked_findings(model, job.placed(model))
     found = [*locked, *examine_logs(job, model, fitted, validation)]
     recordings = Recordings(model, structural_mapping(model), fitted, validation)
-    checkpoint = None
     if not recordings.is_in_memory:
-        if folder is not None:
-            checkpoint = Checkpoint.open(
-                folder, checkpoint_inputs(job), recordings.pieces, resume=plan.resume
-            )
-        recordings = replace(recordings, plan=plan, checkpoint=checkpoint)
+        recordings = replace(recordings, plan=plan)
     elif plan.is_asked_for:
         _log.warning(
-            "the logs have at most %d rows and are read whole: workers, scheduler and resume have "
-            "no effect. Reduce rows_in_memory in [reduction] to read the logs in pieces",
+            "the logs have at most %d rows and are read whole: workers and scheduler have no "
+            "effect. Reduce rows_in_memory in [reduction] to read the logs in pieces",
             job.rows_in_memory,
         )
-    with plan, released_on_error(checkpoint):
+    with plan:
         concluded = conclude(
             recordings,
             job.estimator,
@@ -329,7 +316,7 @@ def identify_job(
     findings = (*placed.notes, *concluded.findings)
     checks = check_payloads(job, concluded.model, fitted)
     stated = replace(concluded, asked=asked, findings=findings, payload_checks=checks)
-    return stated.with_scale_of(concluded), checkpoint
+    return stated.with_scale_of(concluded)
 
 
 def _loop_stages() -> Sequence[str]:

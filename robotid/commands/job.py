@@ -5,7 +5,6 @@ import re
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, asdict, dataclass
-from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -132,20 +131,6 @@ def _load_loops(tables: Sequence[Mapping[str, Any]]) -> tuple[Loop, ...]:
     return tuple(Loop.from_dict(table) for table in tables)
 
 
-def _load_time(value: datetime | str | float) -> str | float:
-    """Return a time of a job file: hours, or a date in ISO format."""
-    if isinstance(value, int | float):
-        return float(value)
-    if isinstance(value, datetime):
-        return value.isoformat()
-    try:
-        return datetime.fromisoformat(value).isoformat()
-    except ValueError as error:
-        raise SettingsError(
-            f"time is {value!r}, wanted a date with a time, as 2026-05-04T13:30:00, or hours"
-        ) from error
-
-
 def _motors(gear: Transmission) -> list[Coupling]:
     """Return the drives of a transmission's motors that move several joints."""
     return [Coupling(joint, ratios, replaces=True) for joint, ratios in gear.shared.items()]
@@ -160,19 +145,6 @@ class LogEntry(Settings):
     end: float | None = setting(None, "end of the window [s]")
     unit: str | None = setting(
         None, "name of the robot, if the logs are of several robots of one kind, as 'arm-07'"
-    )
-    temperature: float | None = setting(
-        None,
-        "mean temperature of the drives [degC], of each fitted log or of none; columns "
-        "temperature_<joint>, or temperature, of the logs if not stated",
-        within=Range("-100 to 300", lambda x: -100 <= x <= 300),
-    )
-    time: str | float | None = setting(
-        None,
-        "time of the recording, of each fitted log or of none: a date with a time, or hours, as "
-        "since power-on",
-        reads=(int, float, str, datetime),
-        load=_load_time,
     )
 
 

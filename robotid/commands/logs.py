@@ -1,8 +1,7 @@
 """The logs of a job: opened once, examined, and identified by their inputs."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime
 from functools import cache
 from itertools import chain
 from pathlib import Path
@@ -27,33 +26,25 @@ from robotid.recordings.logs import Recordings
 from robotid.recordings.survey import SurveyedLog, survey_log
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.model import RobotModel
-from robotid.variation.covariates import at_temperature, drive_temperatures
-from robotid.versions import code_versions
 
 if TYPE_CHECKING:
     from robotid.identification.previews import Run
 
 __all__ = [
     "LockedLogs",
-    "checkpoint_inputs",
     "examine",
     "examine_logs",
-    "hours_of",
     "identity_of",
     "job_of_result",
     "locked_as_logged",
     "log_of_commands",
     "needed_of",
-    "new_temperatures",
     "survey_logs",
     "units_of_logs",
-    "warmed",
 ]
 
 _PIECES = 8  # pieces per rows in memory: the filter of a piece needs memory of its own
 _SHORTEST = 256  # rows of a piece
-# for the reductions of the logs
-_IRRELEVANT = ("validation", "estimator", "output", "doctor", "payload_check")
 
 
 def survey_logs(
@@ -89,7 +80,6 @@ def survey_logs(
     def survey(entries: Sequence[LogEntry]) -> tuple[SurveyedLog, ...]:
         logs = []
         units_of_logs(entries)
-        hours = dict(zip(entries, hours_of(entries), strict=True))
         for entry in entries:
             try:
                 found = opened[entry.path]
@@ -97,7 +87,7 @@ def survey_logs(
                     raise found
                 window = entry.start, entry.end
                 log = survey_log(*found, model, job.signals, window, length=length)
-                logs.append(replace(warmed(log, entry), unit=entry.unit or "", time=hours[entry]))
+                logs.append(replace(log, unit=entry.unit or ""))
             except DataError as error:
                 if refuse is None:
                     raise
@@ -105,43 +95,6 @@ def survey_logs(
         return tuple(logs)
 
     return tuple(survey(entries) for entries in groups)
-
-
-def warmed(log: SurveyedLog, entry: LogEntry) -> SurveyedLog:
-    """Return a log with the temperature that is stated for all its drives, if any.
-
-    Args:
-        log: The log.
-        entry: What states it.
-    """
-    if entry.temperature is None:
-        return log
-    return replace(log, temperature=dict.fromkeys(log.model.joints, entry.temperature))
-
-
-def new_temperatures(
-    result: Mapping[str, Any],
-    model: RobotModel,
-    logs: Sequence[SurveyedLog],
-    stated: float | None,
-) -> list[dict[str, float]]:
-    """Return the temperatures of the drives in new logs, by drive [degC]; none where not known.
-
-    Args:
-        result: Content of the result.json that predicts them.
-        model: The robot.
-        logs: The new logs.
-        stated: Temperature of all drives; None: as each log has it.
-
-    Raises:
-        DataError: If the stated one has no effect by the result, or is far outside that of its
-            logs.
-    """
-    drives = model.layout.drives
-    if stated is None:
-        return [drive_temperatures(drives, log.temperature) for log in logs]
-    at_temperature(result.get("variation", {}), stated)  # raises
-    return [dict.fromkeys((drive.name for drive in drives), stated) for _ in logs]
 
 
 def units_of_logs(entries: Sequence[LogEntry]) -> list[str]:
@@ -161,42 +114,6 @@ def units_of_logs(entries: Sequence[LogEntry]) -> list[str]:
             f"{named.unit!r}; state the unit (name of the robot) of each log, or of none"
         )
     return [entry.unit or "" for entry in entries]
-
-
-def hours_of(entries: Sequence[LogEntry]) -> list[float | None]:
-    """Return the time of each log [h], from any origin; None if none is stated.
-
-    Args:
-        entries: The logs.
-
-    Raises:
-        SettingsError: If only some logs state time or temperature, or their times are of two kinds.
-    """
-    for key in ("temperature", "time"):
-        without = [entry for entry in entries if getattr(entry, key) is None]
-        if 0 < len(without) < len(entries):
-            stated = next(entry for entry in entries if getattr(entry, key) is not None)
-            raise SettingsError(
-                f"{without[0].path.name} has no {key}, but {stated.path.name} has {key} = "
-                f"{getattr(stated, key)}; state the {key} of each log, or of none"
-            )
-    found: dict[str, list[float | None]] = {}
-    for entry in entries:
-        kind, hours = "", None
-        if isinstance(entry.time, str):
-            date = datetime.fromisoformat(entry.time)
-            kind = (
-                "a date without a time zone" if date.tzinfo is None else "a date with a time zone"
-            )
-            hours = date.replace(tzinfo=date.tzinfo or UTC).timestamp() / 3600.0
-        elif entry.time is not None:
-            kind, hours = "a number of hours", float(entry.time)
-        found.setdefault(kind, []).append(hours)
-    if len(found) > 1:
-        raise SettingsError(
-            f"the time of a log is {' and of another '.join(found)}; state all times in one way"
-        )
-    return next(iter(found.values()), [])
 
 
 def examine(
@@ -357,27 +274,6 @@ def result_run(job: Job, path: str | Path) -> tuple[Job, list[LogEntry], RobotMo
     recordings = Recordings(model, structural_mapping(model), logs)
     details = result["consistency"].get("fit", {})
     return job, fitted, model, Run.of(recordings, stated_parameters(result, model), details)
-
-
-def checkpoint_inputs(job: Job) -> dict[str, Any]:
-    """Return all inputs that determine the reduction of the logs of a job, as plain values.
-
-    Path, size and time of change identify a log: a hash takes as long as reading.
-
-    Args:
-        job: The job.
-
-    Raises:
-        OSError: If a file does not exist.
-    """
-    settings = {key: value for key, value in job.to_dict().items() if key not in _IRRELEVANT}
-    settings["reduction"] = {"rows_in_memory": job.rows_in_memory}
-    return {
-        "versions": code_versions(),
-        "settings": settings,
-        "urdf_sha256": file_sha256(job.urdf),
-        "logs": [identity_of(entry.path) for entry in job.identification],
-    }
 
 
 def identity_of(path: Path) -> dict[str, Any]:

@@ -8,8 +8,8 @@ import numpy as np
 
 from robotid._files import file_sha256
 from robotid.commands.job import Job, LogEntry
-from robotid.commands.logs import new_temperatures, result_run, warmed
-from robotid.exceptions import DataError, SettingsError
+from robotid.commands.logs import result_run
+from robotid.exceptions import DataError
 from robotid.export.entries import build_preview
 from robotid.export.result import load_result, stated_between
 from robotid.findings import listed
@@ -26,7 +26,6 @@ def preview_job(
     *,
     noise: Mapping[str, float] | None = None,
     correlation: float | None = None,
-    temperature: float | None = None,
 ) -> dict[str, Any]:
     """Preview the logs of a job from their positions alone.
 
@@ -38,16 +37,13 @@ def preview_job(
         given: A result.json, or its folder; its settings for reading logs are then used.
         noise: Standard deviation of the torque noise by joint [N m or N].
         correlation: As of ``preview_logs``.
-        temperature: Temperature of the drives in the motions [degC], where it has an effect by the
-            given result; None: that stated for each motion, or the mean of its own columns.
 
     Returns:
         The output of ``robotid preview --json``.
 
     Raises:
-        DataError: If a motion is not usable, a log of the result is missing, only some motions are
-            logs of the result, or the temperature has no effect or is far outside that of these
-            logs.
+        DataError: If a motion is not usable, a log of the result is missing, or only some motions
+            are logs of the result.
         ModelError: If the URDF is not usable.
         SettingsError: If a setting is not usable.
     """
@@ -55,8 +51,6 @@ def preview_job(
     if not job.identification:
         raise DataError("no motion is given, wanted at least one to preview")
     if given is None:
-        if temperature is not None:
-            raise SettingsError("the temperature has an effect by a given result; state it, too")
         model = job.model()
         motions = _motions(job, model, job.identification)
         return build_preview(preview_logs(model, motions, job.estimator, **stated))
@@ -67,18 +61,13 @@ def preview_job(
     if not any(is_fitted.values()):
         motions = _motions(job, model, job.identification)
         found = preview_logs(model, motions, job.estimator, run=run, **stated)
-        warm = new_temperatures(result, model, motions, temperature)
-        between = [stated_between(result, model, each) for each in warm]
-        return build_preview(replace(found, between=tuple(between)))
+        between = stated_between(result, model)
+        return build_preview(replace(found, between=(between,) * len(motions)))
     if not all(is_fitted.values()):
         new = listed([path for path, own in is_fitted.items() if not own])
         raise DataError(
             f"the given result was fitted to some of these motions, but not to {new}; preview "
             "fitted logs and new motions separately"
-        )
-    if temperature is not None:
-        raise SettingsError(
-            "these motions are fitted logs, whose temperature is known; leave it out"
         )
     motions = _motions(job, model, fitted)
     alone = preview_logs(model, motions, job.estimator, like=run, **stated)
@@ -91,8 +80,7 @@ def _motions(job: Job, model: RobotModel, entries: Sequence[LogEntry]) -> list[S
     for entry in entries:
         layout, table = job.lay_out(entry, model, needs="motion")
         window = entry.start, entry.end
-        log = survey_log(layout, table, model, job.signals, window, length=None)
-        found.append(warmed(log, entry))
+        found.append(survey_log(layout, table, model, job.signals, window, length=None))
     return found
 
 

@@ -59,7 +59,7 @@ def rewrite_report(
     _check_inputs(job, content, loaded.path.name)
     found = None
     if "simulation" not in content:
-        found, _ = identify_job(job, job.model(), WorkPlan(job.workers or 1, progress=progress))
+        found = identify_job(job, job.model(), WorkPlan(job.workers or 1, progress=progress))
         _require_same(found, content, loaded.path.name)
     report_stage(progress, "writing")
     beside = {"result": loaded.path.name, **content["outputs"], "replay": "replay.html"}

@@ -12,9 +12,8 @@ from robotid._files import file_sha256, finite, log_exists
 from robotid.closed_loop.evaluation import OpenLoop, position_metrics
 from robotid.commands.added_logs import add_logs, check_update
 from robotid.commands.job import Job, LogEntry, job_from_settings
-from robotid.commands.logs import log_of_commands, new_temperatures, survey_logs
+from robotid.commands.logs import log_of_commands, survey_logs
 from robotid.doctor.diagnosis import diagnose
-from robotid.exceptions import DataError
 from robotid.export.entries import recording_metrics
 from robotid.export.loops import open_loop_entry
 from robotid.export.result import (
@@ -58,7 +57,7 @@ def validate_result(
 
     Args:
         path: A result.json.
-        logs: Logs of the same robot; as entries with their unit, temperature and time.
+        logs: Logs of the same robot; as entries with their unit.
         update: Whether the logs are added to the variation between logs in the result.json. The
             fitted logs are not read for it; links and drives of the result stay as they are.
 
@@ -80,8 +79,6 @@ def validate_result(
     if update:
         check_update(loaded, job, entries)
     if "simulation" in result:
-        for entry in entries:  # a stated temperature has no effect: refused
-            new_temperatures(result, loaded.robot, (), entry.temperature)
         return _validate_commands(loaded, job, entries)
     source = stated_model(result, job.model())
     if loaded.has_urdf:
@@ -91,11 +88,10 @@ def validate_result(
         model, pi = source, stated_parameters(result, source)
     prior = source.standard_parameters()
     (surveyed,) = survey_logs(job, model, entries)
-    warm = new_temperatures(result, model, surveyed, None)
     driven = stated_urdf_with_drives(result, source)
     _, evaluations = evaluate_logs((), surveyed, {"estimate": pi}, prior, driven)
     own = [log.with_model(source) for log in surveyed]
-    added = add_logs(loaded, source, job, own, is_update=update)
+    added = add_logs(loaded, source, job, own)
     unlike = () if added is None else added.findings
     verdict = _verdict(job, source, result, evaluations, surveyed, unlike)
     if update and added is not None:
@@ -104,8 +100,7 @@ def validate_result(
         "result": str(path),
         "predicted_with": result["outputs"].get("urdf", "base parameters of result.json"),
         "validation": [
-            recording_metrics(e, "estimate") | _expected(result, model, e, each)
-            for e, each in zip(evaluations, warm, strict=True)
+            recording_metrics(e, "estimate") | _expected(result, model, e) for e in evaluations
         ],
         "verdict": verdict.to_dict(),
         **({} if added is None else {"variation": added.shown}),
@@ -114,24 +109,17 @@ def validate_result(
 
 
 def _expected(
-    result: Mapping[str, Any],
-    model: RobotModel,
-    evaluation: Evaluation,
-    temperature: Mapping[str, float],
+    result: Mapping[str, Any], model: RobotModel, evaluation: Evaluation
 ) -> dict[str, Any]:
     """Return the expected torque error of a log by the result, and how often it is within 95 %.
 
     The error has the uncertainty of the parameters, the spread of the drives between logs, if three
-    or more were fitted, the effect of the temperature, as of ``at_temperature``, and the residual
-    of the fit.
+    or more were fitted, and the residual of the fit.
     """
     covariance = stated_covariance(result, model.layout.names)
     if covariance is None:
         return {}
-    try:
-        between = stated_between(result, model, temperature)
-    except DataError as error:  # the log's own temperature is far from that of the fitted logs
-        return {"expected": {"missing": str(error)}}
+    between = stated_between(result, model)
     of_fit = result["identification"]["per_joint"]
     noise = np.array([of_fit.get(row, {}).get("rmse") or 0.0 for row in model.row_names])
     recording, mapping = evaluation.recording, structural_mapping(model)

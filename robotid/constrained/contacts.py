@@ -84,7 +84,7 @@ def check_base(model: RobotModel, log: Log, signals: SignalSettings) -> Iterator
     if not model.contacts:
         return
     if not wrong:
-        yield from check_wrenches(model, log, motion, signals.wrench_delay)
+        yield from check_wrenches(model, log, motion)
     yield from _check_feet(model, log, motion, J, turn, flags, signals)
 
 

@@ -6,22 +6,13 @@ is a change of f or J, which is tried.
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise, product
+from itertools import pairwise
 
 import numpy as np
 
-from robotid._text import seconds
 from robotid._typing import Array
 from robotid.constrained.slips import rms
-from robotid.constrained.wrench_times import (
-    check_delay,
-    check_exchanged_steps,
-    check_gains,
-    check_level,
-    check_offsets,
-)
 from robotid.findings import Finding, listed, log_finding
-from robotid.logs.base import in_base
 from robotid.logs.data import Log, Trajectory
 from robotid.regressor.constraints import (
     constraint_jacobian,
@@ -35,8 +26,7 @@ from robotid.robot.model import RobotModel
 
 __all__ = ["check_wrenches"]
 
-_MOST = 400  # samples that are examined ...
-_LONGEST = 4000  # ... and the same of their delay
+_MOST = 400  # samples that are examined
 _BETTER = 0.5  # ratio of the residuals of force or moment below which another reading is found ...
 _FORCE, _MOMENT = 0.3, 0.05  # ... of the weight, and of it at the feet's distance: masses may be it
 _NO_WORSE = 1.2  # ... if that of the other one is not above this
@@ -44,10 +34,7 @@ _SIMPLER = 1.2  # ... and another change is not found unless it reduces the resi
 _SMALL = 0.01  # residual of force or moment that is as good as none, relative to the weight
 _ALIKE = (0.6, 1.6)  # factors of the forces that a wrong URDF explains
 _UNITS = {", kN": 1e3, ", kgf": 9.81}
-_MILLI = 1e-3  # N mm in N m
-_FAR = 10.0  # [m] moments over forces above which moments may be in N mm
-_MISSING = 0.5  # of the weight: residual of the vertical force of a sample that is reported ...
-_SOME = 0.02  # ... from this share of samples on
+_MISSING = 0.5  # of the weight: residual of the force from which a reading explains nothing
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +42,7 @@ class _Reading:
     """Residuals of the base rows with the forces read in one way."""
 
     changes: tuple[str, ...]  # what differs from the job file
-    exchanged: tuple[str, ...]  # two feet whose forces are exchanged, or none
+    is_exchanged: bool  # whether the forces of two feet are exchanged
     factor: float  # of the forces
     residual: Array  # (N, 6) [N, N m]
     weight: float  # RMS of the force of the base that is not caused by unknown forces [N]
@@ -73,21 +60,17 @@ class _Reading:
         return is_no_worse and any(y > small and x < _BETTER * y for x, y, small in pairs)
 
 
-def check_wrenches(
-    model: RobotModel, log: Log, motion: Trajectory, delay: float = 0.0
-) -> Iterator[Finding]:
+def check_wrenches(model: RobotModel, log: Log, motion: Trajectory) -> Iterator[Finding]:
     """Yield findings on the measured wrenches of one log.
 
     Args:
         model: The robot, whose base floats.
         log: The log.
         motion: Its smoothed motion.
-        delay: Delay of the wrenches that was corrected [s].
     """
     measured = [x for x in model.contacts if x.measured]
     if motion.wrenches is None or not measured:
         return
-    whole = motion.part(0, _LONGEST)
     motion = motion.every(max(1, len(motion.t) // _MOST))
     (torque,) = predict(model, [model.standard_parameters()], motion)
     weight = sum(x.mass for x in model.pin_model.inertias) * float(
@@ -114,112 +97,21 @@ def check_wrenches(
     remain = best.sizes[1] > _BETTER * stated.sizes[1] and best.sizes[0] < _BETTER * stated.sizes[0]
     has_plates = all(x.is_measured and x.kind == "surface" for x in measured)
     if remain:  # the force alone does not show which foot it acts on
-        best = min([x for x in better if not x.exchanged], key=size, default=best)
-    if best is not stated:
-        message = (
-            f"with the bodies of the URDF, the measured forces of the ground leave {_size(stated)} "
-            f"(RMS) of the base unexplained, but only {_size(best)} if {' and '.join(best.changes)}"
-            ". Correct the columns wrench_..., or [[contact]]"
-        )
-        if remain and has_plates:
-            message += (
-                ". The moments remain: state the plate of each foot, plate = [x, y, z, roll, "
-                "pitch, yaw]"
-            )
-        evidence = {"force": stated.sizes[0], "best": best.sizes[0], "factor": best.factor}
-        yield log_finding(log.name, "measured_wrench", "error", message, **evidence)
+        best = min([x for x in better if not x.is_exchanged], key=size, default=best)
+    if best is stated:
         return
-    scale = np.repeat([1.0, 1.0 / lever], 3)
-    for x in readings:
-        if x.exchanged and len(x.changes) == 1:
-            residuals = scale * stated.residual, scale * x.residual
-            yield from check_exchanged_steps(log.name, motion.t, residuals, x.exchanged, weight)
-    yield from _check_missing(log.name, motion.t, stated.residual[:, :3], weight)
-    yield from _check_clock(model, log.name, whole, scale, delay)
-    offsets = []
-    if log.base is not None and log.base.has_position:
-        offsets = list(_check_offsets(model, log.name, whole, weight))
-        yield from offsets
-    yield from _check_loads(
-        model, log.name, motion, torque[:, :3], weight, has_offsets=bool(offsets)
-    )
-
-
-def _check_clock(
-    model: RobotModel, name: str, motion: Trajectory, scale: Array, delay: float
-) -> Iterator[Finding]:
-    """Yield a finding if measured wrenches have a delay; ``scale`` gives the six rows one unit."""
-    (torque,) = predict(model, [model.standard_parameters()], motion)
-    J, basis = _base_rows(model, motion)
-    slopes = without_forces(basis, J.swapaxes(1, 2)).swapaxes(1, 2) * scale
-    yield from check_delay(
-        name, motion, slopes, without_forces(basis, torque[:, :6]) * scale, delay
-    )
-
-
-def _check_offsets(
-    model: RobotModel, name: str, motion: Trajectory, weight: float
-) -> Iterator[Finding]:
-    """Yield a finding for each contact whose sensor measures a wrench in the air."""
-    frames = [x.frame for x in model.contacts]
-    feet = link_positions(model.pin_model, model.configurations(motion.q), frames)
-    speeds = np.linalg.norm(np.gradient(feet, motion.t, axis=0), axis=2)
-    first = 0
-    for k, x in enumerate(model.contacts):
-        last = first + len(x.measured)
-        if motion.wrenches is not None and x.measured:
-            own = motion.wrenches[:, first:last]
-            yield from check_offsets(name, x.frame, speeds[:, k], own, x.measured, weight)
-        first = last
-
-
-def _check_loads(
-    model: RobotModel, name: str, motion: Trajectory, left: Array, weight: float, *,
-    has_offsets: bool,
-) -> Iterator[Finding]:  # fmt: skip
-    """Yield findings on the force of the base alone: gain of a foot, mean horizontal force.
-
-    Args:
-        model: The robot.
-        name: Name of the log.
-        motion: Its motion, with wrenches.
-        left: Force of the base that the bodies cause, shape (N, 3) [N].
-        weight: Weight of the robot [N].
-        has_offsets: Whether offsets of sensors are known: they cause a horizontal force.
-    """
-    if motion.wrenches is None:
-        return
-    J, basis = _base_rows(model, motion, 3)
-    edges = np.cumsum([0, *(len(x.measured) for x in model.contacts)])
-    loads = np.stack(
-        [np.einsum("kmj,km->kj", J[:, i:j], motion.wrenches[:, i:j]) for i, j in pairwise(edges)],
-        axis=2,
-    )
-    loads, left = without_forces(basis, loads), without_forces(basis, left)
-    feet = [k for k, x in enumerate(model.contacts) if rms(loads[:, :, k]) > 0.0]
-    frames = [model.contacts[k].frame for k in feet]
-    found = list(check_gains(name, frames, loads[:, :, feet], left))
-    yield from found
-    if not (found or has_offsets or basis.any()):
-        back = motion.q[:, 3:7] * np.array([-1.0, -1.0, -1.0, 1.0])
-        gravity: Array = model.pin_model.gravity.linear
-        yield from check_level(name, in_base(back, loads.sum(axis=2) - left), gravity, weight)
-
-
-def _check_missing(name: str, t: Array, residual: Array, weight: float) -> Iterator[Finding]:
-    """Yield a finding if a large part of the weight is missing in some of the samples."""
-    missing = np.abs(residual).max(axis=1) > _MISSING * weight
-    if np.mean(missing) <= _SOME:
-        return
-    t = t[missing]
     message = (
-        f"the measured forces of the ground differ by more than half of the weight in "
-        f"{np.mean(missing):.0%} of the samples, first at {seconds(float(t[0]))} s, last at "
-        f"{seconds(float(t[-1]))} s: a foot may stand beside its force plate, or something else "
-        "carries load. Select the time with start and end"
+        f"with the bodies of the URDF, the measured forces of the ground leave {_size(stated)} "
+        f"(RMS) of the base unexplained, but only {_size(best)} if {' and '.join(best.changes)}"
+        ". Correct the columns wrench_..., or [[contact]]"
     )
-    share = float(np.mean(missing))
-    yield log_finding(name, "measured_wrench", "warning", message, share=share)
+    if remain and has_plates:
+        message += (
+            ". The moments remain: state the plate of each foot, plate = [x, y, z, roll, "
+            "pitch, yaw]"
+        )
+    evidence = {"force": stated.sizes[0], "best": best.sizes[0], "factor": best.factor}
+    yield log_finding(log.name, "measured_wrench", "error", message, **evidence)
 
 
 def _size(reading: _Reading) -> str:
@@ -238,26 +130,17 @@ def _readings(model: RobotModel, motion: Trajectory, torque: Array) -> Iterator[
         for j, y in enumerate(model.contacts[:i]):
             if x.measured and (x.kind, x.measured) == (y.kind, y.measured):
                 pairs.append((j, i))
-    parts = [part for x in model.contacts for part in x.measured]
-    is_moment = np.array([part.startswith("m") for part in parts], dtype=bool)
-    sizes = [rms(motion.wrenches[:, x]) for x in (is_moment, ~is_moment)]
-    is_far = sizes[0] > _FAR * sizes[1]
     for words, other in _places(model):
         rows = _base_rows(other, motion)
-        for pair, is_milli in product(pairs, (False, True)):
-            if is_milli and not is_far:
-                continue
-            order = list(columns)
-            changes = [*words, *["their moments are in N mm, wanted N m"] * is_milli]
+        for pair in pairs:
+            order, changes = list(columns), list(words)
             if pair is not None:
                 i, j = pair
                 order[i], order[j] = order[j], order[i]
                 names = [model.contacts[k].frame for k in pair]
                 changes.append(f"those of {listed(names)} are exchanged")
             wrenches = motion.wrenches[:, np.concatenate(order)]
-            wrenches = np.where(is_moment & is_milli, _MILLI, 1.0) * wrenches
-            feet = () if pair is None else tuple(model.contacts[k].frame for k in pair)
-            yield from _fitted(rows, torque, wrenches, (tuple(changes), feet))
+            yield from _fitted(rows, torque, wrenches, (tuple(changes), pair is not None))
 
 
 def _places(model: RobotModel) -> Iterator[tuple[tuple[str, ...], RobotModel]]:
@@ -283,7 +166,7 @@ def _fitted(
     rows: tuple[Array, Array],
     torque: Array,
     wrenches: Array,
-    reading: tuple[tuple[str, ...], tuple[str, ...]],
+    reading: tuple[tuple[str, ...], bool],
 ) -> Iterator[_Reading]:
     """Yield the residual, and that with a factor of the forces, if the URDF is not its cause.
 
@@ -302,20 +185,17 @@ def _fitted(
     words = f"they are multiplied by about {factor:.2g}: another unit{unit}"
     if abs(factor + 1.0) < 1.0 - _ALIKE[0]:
         factor, words = -1.0, "their sign is reversed (forces on the ground instead of on the feet)"
-    changes, feet = reading
-    yield _Reading((*changes, words), feet, factor, left - factor * caused, size)
+    changes, is_exchanged = reading
+    yield _Reading((*changes, words), is_exchanged, factor, left - factor * caused, size)
 
 
-def _base_rows(model: RobotModel, motion: Trajectory, rows: int = 6) -> tuple[Array, Array]:
-    """Return rows of the base per measured component, and the basis of unknown forces.
-
-    The shape is (N, m, rows); the first three rows are those of its force.
-    """
-    J = constraint_jacobian(model, motion.q, touching(model, motion))[:, :, :rows]
+def _base_rows(model: RobotModel, motion: Trajectory) -> tuple[Array, Array]:
+    """Return the rows of the base per measured component, (N, m, 6), and of unknown forces."""
+    J = constraint_jacobian(model, motion.q, touching(model, motion))[:, :, :6]
     known, first = list[int](), 0
     for x in model.constraints:
         if isinstance(x, Contact):
             known += [first + k for k in x.rows_measured]
         first += x.sizes[x.kind]
-    used = np.ones((len(J), rows), dtype=bool)
+    used = np.ones((len(J), 6), dtype=bool)
     return J[:, known], force_basis(np.delete(J, known, axis=1), used, floats=True)

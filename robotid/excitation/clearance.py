@@ -126,7 +126,6 @@ class Clearance:
         floor: Height of the floor, in the frame of the root link [m].
         boxes: Obstacles around the robot.
         seed: Seed of the random poses.
-        standing: Bodies that may touch the floor.
 
     Attributes:
         pairs: Numbers of the two hulls of each pair.
@@ -151,7 +150,6 @@ class Clearance:
         floor: float | None = None,
         boxes: Sequence[Box] = (),
         seed: int = 0,
-        standing: Sequence[int] = (),
     ) -> None:
         import coal
 
@@ -171,22 +169,18 @@ class Clearance:
             below = Box("the floor", (-_WIDE, -_WIDE, floor - _WIDE), (_WIDE, _WIDE, floor))
             self._hulls.append(_hull(below.name, -1, _corners(below)))
         self._request = coal.DistanceRequest(True, True)
-        self.pairs = self._possible_pairs(set(standing) if floor is not None else set())
+        self.pairs = self._possible_pairs()
         self._classify(np.random.default_rng(seed))
 
-    def _possible_pairs(self, standing: set[int]) -> Array:
-        """Return pairs that can move against each other: not links that a joint joins.
-
-        The bodies that stand on the floor, the last hull, are not checked against it.
-        """
+    def _possible_pairs(self) -> Array:
+        """Return pairs that can move against each other: not links that a joint joins."""
         tree, hulls = self._model.pin_model, self._hulls
         joined = {(int(tree.parents[i]) - 1, i - 1) for i in range(1, tree.njoints)}
         found = []
         for i, j in combinations(range(len(hulls)), 2):
             a, b = sorted((hulls[i].body, hulls[j].body))
             is_link = hulls[j].name in self._model.tree.links
-            stands = j == len(hulls) - 1 and hulls[i].body in standing
-            if a != b and not stands and not (is_link and (a, b) in joined):
+            if a != b and not (is_link and (a, b) in joined):
                 found.append((i, j))
         return np.array(found, dtype=int).reshape(-1, 2)
 

@@ -47,7 +47,7 @@ class Course:
         """
         t = np.linspace(0.0, design.duration, design.intervals + 1)
         q, v, a = design.motion.evaluate(t)
-        torque = designer.information.torque(designer.along(q, v, a))
+        torque = designer.information.torque(designer.information.rows(q, v, a))
         return cls.of_motion(t, (q, v, a, torque), designer.limits, designer.clearance)
 
     @classmethod

@@ -19,17 +19,10 @@ from robotid.exceptions import NotConvergedError
 from robotid.excitation.basis import Basis, DesignedMotion
 from robotid.excitation.clearance import Clearance, Contact, Nearness
 from robotid.excitation.designed import Design, State
-from robotid.excitation.information import (
-    Aim,
-    Information,
-    MotionInformation,
-    MotionRows,
-    criterion,
-)
+from robotid.excitation.information import Aim, MotionInformation, MotionRows, criterion
 from robotid.excitation.limits import MotionLimits
 from robotid.excitation.multipliers import SOFT, SPARE, Multipliers
 from robotid.excitation.postures import Postures
-from robotid.excitation.standing import BASE, Stand
 from robotid.identification.assumptions import (
     CORRELATION,
     assumed_noise,
@@ -81,12 +74,11 @@ class Designer:
         clearance: The distances to collisions; None: they are not checked.
         finer: Number of samples of the grid relative to a coarse one.
         aim: The parameters of interest, if not the base parameters; there is no prior then.
-        start: Middle of the random motions, all coordinates, shape (n,) [rad or m]; random if None.
         moving: Which joints move, shape (n,), bool; all if None. The others rest where the motion
             starts and contribute no information, since static friction may carry any load.
     """
 
-    information: Information
+    information: MotionInformation
     limits: MotionLimits
     basis: Basis
     noise: Array
@@ -97,7 +89,6 @@ class Designer:
     clearance: Clearance | None = None
     finer: int = 1
     aim: Aim | None = None
-    start: Array | None = None
     moving: Array | None = None
 
     @classmethod
@@ -112,7 +103,6 @@ class Designer:
         noise: Mapping[str, float] | None = None,
         correlation: float = CORRELATION,
         run: Run | None = None,
-        stand: Stand | None = None,
     ) -> "Designer":
         """Return a designer with the assumptions of a preview on friction and noise.
 
@@ -125,35 +115,28 @@ class Designer:
             noise: Standard deviation of the torque's noise by joint [N m or N].
             correlation: Time over which it is correlated [s].
             run: Earlier logs: the motion complements their information.
-            stand: The feet and the ground; the robot is the one with joints of its base.
 
         Raises:
+            DataError: If the base floats, or the robot has contacts or loops.
             SettingsError: If a setting is not usable.
         """
         criterion(name, np.eye(1))
-        mapping = structural_mapping(own := model if stand is None else stand.robot)
+        mapping = structural_mapping(model)
         size, speed = largest_torques(model, largest_gravity(model)), limits.sizes[1]
         pi = assumed_parameters(model, size, speed) if run is None else run.standard
         found = None if run is None else run.noise(mapping.K)
         density = assumed_noise(model, size, noise or {}, correlation, found).density(0.0)
-        if stand is not None:  # the projection mixes the rows; those of the base have no noise
-            density = np.full(len(density), density[len(BASE) :].sum() / len(density))
         typical = _TYPICAL * np.array([size, speed, speed * 2 * np.pi / basis.shortest])
-        standard_spread = prior_spread(own, typical**2, 1)
+        standard_spread = prior_spread(model, typical**2, 1)
         spread = base_spread(mapping.K, standard_spread)
         given = None
         if run is not None:
             earlier = run.factors.information(run.step / density)
             given = np.eye(len(spread)) + spread[:, None] * earlier * spread
-        information: Information
-        if stand is None:
-            information, start = MotionInformation(model, mapping, mapping.to_base(pi)), None
-        else:
-            information, start = stand.information(mapping, pi), stand.feet.posture
+        information = MotionInformation(model, mapping, mapping.to_base(pi))
         return cls(
-            information, limits, basis, density, spread, standard_spread, given, name, clearance,
-            start=start,
-        )  # fmt: skip
+            information, limits, basis, density, spread, standard_spread, given, name, clearance
+        )
 
     @cached_property
     def _functions(self) -> Array:
@@ -256,24 +239,13 @@ class Designer:
         """
         count = round(duration * rate)
         q, v, a = motion.evaluate(np.linspace(0.0, duration, count + 1))
-        rows = self.along(q, v, a)
+        rows = self.information.rows(q, v, a)
         used = self.limits.used(q, v, a, 0.0 * a, self.information.torque(rows))
         return used, self._informed(rows, duration / count)
 
-    def along(self, q: Array, v: Array, a: Array) -> MotionRows:
-        """Return the rows along a motion of all coordinates.
-
-        Args:
-            q: Joint coordinates, shape (N, n) [rad or m].
-            v: Velocities, shape (N, n) [rad/s or m/s].
-            a: Accelerations, shape (N, n) [rad/s^2 or m/s^2].
-        """
-        free = self.information.free
-        return self.information.rows(q[:, free], v[:, free], a[:, free])
-
     def _motion(self, C: Array) -> Motion:
-        """Return the motion of all coordinates."""
-        return self.information.motion(DesignedMotion(self.basis, C))
+        """Return the motion with coefficients."""
+        return DesignedMotion(self.basis, C)
 
     def _assessed(
         self,
@@ -334,10 +306,8 @@ class Designer:
 
     @cached_property
     def _moves(self) -> Array:
-        """Which designed joints move, shape (k,), bool."""
-        return (
-            np.ones(len(self.information.free), dtype=bool) if self.moving is None else self.moving
-        )
+        """Which joints move, shape (n,), bool."""
+        return np.ones(len(self.limits.middle), dtype=bool) if self.moving is None else self.moving
 
     def judged(self, F: Array) -> tuple[float, Array]:
         """Return the criterion of information about the base parameters, and its gradient.
@@ -391,9 +361,8 @@ class Designer:
         *state, jerk = self._functions @ C
         rows = self.information.rows(*state)
         q, v, a = rows.motion
-        every, torque = np.zeros_like(q), self.information.torque(rows)
-        every[:, self.information.free] = jerk
-        return rows, torque, self.limits.used(q, v, a, every, torque)
+        torque = self.information.torque(rows)
+        return rows, torque, self.limits.used(q, v, a, jerk, torque)
 
     def _constraints(self, C: Array, spare: float = 0.0) -> tuple[Array, float, MotionRows]:
         """Return used shares of limits (6, N, n), the smallest margin of distances and rows.
@@ -403,24 +372,19 @@ class Designer:
             spare: Multiple of the distances' reserve that is subtracted from the margin.
         """
         rows, _, used = self._followed(C)
-        margins = SOFT * (self.information.margins(rows) - spare * SPARE)
-        if self.clearance is not None:
-            placed = self.clearance.placed(rows.motion[0])
-            own = self.clearance.margins(placed, spare, hints=self._hints)
-            margins = np.vstack([own, margins])
+        if self.clearance is None:
+            return used, np.inf, rows
+        placed = self.clearance.placed(rows.motion[0])
+        margins = self.clearance.margins(placed, spare, hints=self._hints)
         return used, float(margins.min(initial=np.inf)), rows
 
-    def _distances(
-        self, rows: MotionRows, multipliers: Multipliers
-    ) -> tuple[Array, Nearness | None]:
-        """Return distances [m] and then the information's margins, in ``SOFT``, shape (k, N)."""
-        margins, near = SOFT * self.information.margins(rows), None
-        if self.clearance is not None:
-            within = multipliers.distance_without_cost(self._wanted)[: len(self.clearance.pairs)]
-            placed = self.clearance.placed(rows.motion[0])
-            near = self.clearance.near(placed, within, hints=self._hints)
-            margins = np.vstack([near.distance, margins])
-        return margins, near
+    def _near(self, rows: MotionRows, multipliers: Multipliers) -> Nearness | None:
+        """Return the distances of near pairs; None if they are not checked."""
+        if self.clearance is None:
+            return None
+        within = multipliers.distance_without_cost(self._required)
+        placed = self.clearance.placed(rows.motion[0])
+        return self.clearance.near(placed, within, hints=self._hints)
 
     def _objective(self, C: Array) -> float:
         """Return the criterion of a motion."""
@@ -436,36 +400,33 @@ class Designer:
         D, (rows, torque, used) = self._functions, self._followed(C)
         value, by_F = self.judged(self.matrix(rows))
         cost, pushed = multipliers.of_limits(used)
+        value += cost
         by_value = pushed * 2.0 * used / (1.0 - SPARE) ** 2 / self.limits.sizes[:, None]
         by_q, by_v, by_a, by_jerk, by_torque, by_power = by_value
         by_v = by_v + by_power * torque
         by_torque = by_torque + by_power * rows.motion[1]
-        distance, near = self._distances(rows, multipliers)
-        too_near, pushed = multipliers.of_distances(distance, self._wanted)
+        near = self._near(rows, multipliers)
         if near is not None:
+            too_near, pushed = multipliers.of_distances(near.distance, self._required)
+            value += too_near
             along = -pushed[near.pairs, near.samples, None] / SOFT * near.gradient
             np.add.at(by_q, near.samples, along)
-            pushed = pushed[len(near.distance) :]
         scale = self._scale(self._step)
         by_W = 2.0 * scale * (by_F @ (scale * rows.W))
-        found = self.information.gradient(rows, by_W, by_torque, (by_q, by_v, by_a), -pushed)
-        by_state = (*found, by_jerk[:, self.information.free])
+        entries = by_W + self.information.beta[:, None] * by_torque.T[:, None]
+        by_rows = self.information.pull(rows, entries)
+        by_state = (*(x + y for x, y in zip(by_rows, (by_q, by_v, by_a), strict=True)), by_jerk)
         gradient: Array = sum(functions.T @ g for functions, g in zip(D, by_state, strict=True))
         gradient[1:, ~self._moves] = 0.0
-        return value + cost + too_near, gradient
+        return value, gradient
 
     @property
-    def _wanted(self) -> Array:
-        """Distances that the search requires, as of ``_distances``, shape (k, 1) [m]."""
-        others = np.full((self.information.constraints, 1), 2.0 * SPARE * SOFT)
+    def _required(self) -> Array:
+        """Distances that the search requires, shape (pairs, 1) [m]."""
         if self.clearance is None:
-            return others
-        return np.vstack([self.clearance.required[:, None] + 2.0 * self.clearance.spare, others])
-
-    @cached_property
-    def _designed(self) -> MotionLimits:
-        """The limits of the coordinates that are designed."""
-        return self.limits.of(self.information.free)
+            return np.zeros((0, 1))
+        required: Array = self.clearance.required[:, None] + 2.0 * self.clearance.spare
+        return required
 
     @cached_property
     def postures(self) -> Postures:
@@ -479,14 +440,12 @@ class Designer:
             rng: Random generator of the motion.
 
         Raises:
-            SettingsError: If no posture is found that the robot can hold, or not the start.
+            SettingsError: If no posture is found that the robot can hold.
         """
-        unit = self._designed.sizes[0]
+        unit = self.limits.sizes[0]
         C = rng.standard_normal((self.basis.size, len(unit))) * unit
         C[:, ~self._moves] = 0.0
-        given = self.start
-        start = self.postures.one(rng) if given is None else self.postures.required(given)
-        C[0] = start[self.information.free]
+        C[0] = self.postures.one(rng)
         return self._feasible(C, 1.0 - SPARE)
 
     def _feasible(self, C: Array, most: float) -> Array:
@@ -494,7 +453,7 @@ class Designer:
 
         Each joint is scaled to its own limits of position to jerk first; then all are scaled alike.
         """
-        limits = self._designed
+        limits = self.limits
         free = most * limits.sizes[0] - np.abs(C[0] - limits.middle)
         moving = np.abs(self._functions[:, :, 1:] @ C[1:]).max(axis=1)  # (4, n)
         over = np.vstack(
@@ -531,7 +490,7 @@ class Designer:
         """Yield the state of a search, at first and after each round, until it has converged."""
         from scipy.optimize import minimize
 
-        unit = self._designed.sizes[0]
+        unit = self.limits.sizes[0]
         before = np.inf  # violation of the limits
 
         def scaled(x: Array) -> tuple[float, Array]:
@@ -571,7 +530,7 @@ class Designer:
         used, margin, rows = self._constraints(C)
         own = self.judged(self.matrix(rows))[0]
         multipliers = state.multipliers
-        distance, _ = self._distances(rows, multipliers)
+        near = self._near(rows, multipliers)
         feasible = self._feasible(C, 1.0 - SPARE)
         objective = self._objective(feasible)
         if objective > state.objective - settled:
@@ -585,7 +544,8 @@ class Designer:
         if gain < 0.0:
             feasible, objective = state.feasible, state.objective
         violation = max(float(np.abs(used).max()) - 1.0 + SPARE, -margin / SOFT, 0.0)
-        multipliers = multipliers.raised(used, distance, self._wanted)
+        distance = None if near is None else near.distance
+        multipliers = multipliers.raised(used, distance, self._required)
         iterate = feasible if is_stalled else C
         is_settled = bool(is_near and gain < settled)
         return State(feasible, objective, iterate, multipliers, is_settled), violation

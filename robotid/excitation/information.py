@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, Protocol
 
 import numpy as np
 import scipy.linalg
@@ -14,9 +13,8 @@ from robotid.regressor.base_parameters import BaseMapping
 from robotid.regressor.columns import drive_motion
 from robotid.robot.drives import DriveMotion, DriveTerm
 from robotid.robot.model import RobotModel
-from robotid.simulation.motions import Motion
 
-__all__ = ["CRITERIA", "Aim", "Information", "MotionInformation", "MotionRows", "criterion"]
+__all__ = ["CRITERIA", "Aim", "MotionInformation", "MotionRows", "criterion"]
 
 #: The optimality criteria.
 CRITERIA = ("D", "A", "E", "condition", "widest")
@@ -35,83 +33,6 @@ class MotionRows:
     W: Array
     motion: tuple[Array, Array, Array]  # q, v, a, shape (N, n) each
     load: Array  # torque of the bodies, (N, n)
-    support: Any = None  # of a robot on its feet
-
-
-class Information(Protocol):
-    """The rows of a base problem along a motion of designed coordinates, and their gradient."""
-
-    @property
-    def model(self) -> RobotModel:
-        """The robot, with a fixed base."""
-
-    @property
-    def mapping(self) -> BaseMapping:
-        """Its base parameters."""
-
-    @property
-    def beta(self) -> Array:
-        """Base parameters by which torques are computed, shape (b,)."""
-
-    @property
-    def chains(self) -> Array:
-        """Share of each joint in the torque at rest of each, shape (n, n)."""
-
-    @property
-    def free(self) -> Array:
-        """Coordinates that are designed, shape (k,); the others follow from them."""
-
-    @property
-    def constraints(self) -> int:
-        """Number of further constraints."""
-
-    def motion(self, free: Motion) -> Motion:
-        """Return a motion of all coordinates from one of the designed ones.
-
-        Args:
-            free: A motion of the designed coordinates.
-        """
-
-    def rows(self, q: Array, v: Array, a: Array) -> MotionRows:
-        """Return the rows along a motion of the designed coordinates.
-
-        Args:
-            q: Coordinates, shape (N, k) [rad or m].
-            v: Velocities, shape (N, k) [rad/s or m/s].
-            a: Accelerations, shape (N, k) [rad/s^2 or m/s^2].
-        """
-
-    def torque(self, rows: MotionRows) -> Array:
-        """Return the torques of the joints, shape (N, n) [N m or N].
-
-        Args:
-            rows: The rows.
-        """
-
-    def margins(self, rows: MotionRows) -> Array:
-        """Return margins of further constraints, at least 0, of size 1, shape (m, N).
-
-        Args:
-            rows: The rows.
-        """
-
-    def gradient(
-        self,
-        rows: MotionRows,
-        by_W: Array,
-        by_torque: Array,
-        by_motion: tuple[Array, Array, Array],
-        by_margins: Array,
-    ) -> tuple[Array, Array, Array]:
-        """Return a gradient by the designed coordinates and their derivatives, (N, k) each.
-
-        Args:
-            rows: The rows.
-            by_W: The gradient by their entries, shape (n, b, N).
-            by_torque: By the torques, shape (N, n).
-            by_motion: By all coordinates and their derivatives, shape (N, n) each.
-            by_margins: By the margins, shape (m, N).
-        """
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,24 +77,6 @@ class MotionInformation:
             places.append(k)
             drives.append(drive)
         return [(term, *places) for term, places in found.items()]
-
-    @property
-    def free(self) -> Array:
-        """Coordinates that are designed: all, shape (n,)."""
-        return np.arange(self.model.n_rows)
-
-    @property
-    def constraints(self) -> int:
-        """Number of further constraints: none."""
-        return 0
-
-    def motion(self, free: Motion) -> Motion:
-        """Return the motion.
-
-        Args:
-            free: A motion of the designed coordinates.
-        """
-        return free
 
     @cached_property
     def chains(self) -> Array:
@@ -230,35 +133,6 @@ class MotionInformation:
         """
         torque: Array = (self.beta @ rows.W).T
         return torque
-
-    def margins(self, rows: MotionRows) -> Array:
-        """Return margins of further constraints: none, shape (0, N).
-
-        Args:
-            rows: The rows.
-        """
-        return np.zeros((0, rows.W.shape[2]))
-
-    def gradient(
-        self,
-        rows: MotionRows,
-        by_W: Array,
-        by_torque: Array,
-        by_motion: tuple[Array, Array, Array],
-        by_margins: Array,
-    ) -> tuple[Array, Array, Array]:
-        """Return a gradient by q, v and a, shape (N, n) each; see ``Information``.
-
-        Args:
-            rows: The rows.
-            by_W: The gradient by their entries, shape (n, b, N).
-            by_torque: By the torques, shape (N, n).
-            by_motion: By q, v and a, shape (N, n) each.
-            by_margins: By no margins.
-        """
-        along = self.pull(rows, by_W + self.beta[:, None] * by_torque.T[:, None])
-        q, v, a = (x + y for x, y in zip(along, by_motion, strict=True))
-        return q, v, a
 
     def pull(self, rows: MotionRows, weights: Array) -> tuple[Array, Array, Array]:
         """Return the gradient of sum(weights * W) by q, v and a, shape (N, n) each.

@@ -76,14 +76,6 @@ class MotionLimits:
         ]
         return cls(np.array(middle), np.array(sizes))
 
-    def of(self, joints: Array) -> "MotionLimits":
-        """Return the limits of some joints.
-
-        Args:
-            joints: Their numbers, shape (k,).
-        """
-        return MotionLimits(self.middle[joints], self.sizes[:, joints])
-
     def used(self, q: Array, v: Array, a: Array, jerk: Array, torque: Array) -> Array:
         """Return a motion's quantities divided by their limits, signed, shape (6, N, n).
 

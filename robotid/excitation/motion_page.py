@@ -136,31 +136,7 @@ def _limit_table(model: RobotModel, content: Mapping[str, Any], course: Course) 
         "middle of their range.</p>\n"
     )
     limits = table("Largest use of each limit", headers, rows)
-    return note + limits + _ground(content) + _collisions(content, course)
-
-
-def _ground(content: Mapping[str, Any]) -> str:
-    """Return the smallest margins of the forces of the ground; empty with a fixed base."""
-    rows = [
-        [
-            text(kind),
-            percent(100 * entry["margin"]),
-            code(entry["where"]),
-            number(entry["time"], ".2f"),
-            text(entry["words"]),
-        ]
-        for kind, entry in content["limits"].items()
-        if "words" in entry
-    ]
-    if not rows:
-        return ""
-    note = (
-        "<p>The forces of the ground are the smallest ones that cause the motion of the base. Flat "
-        "feet stand on their four corners. The margin of the vertical force is in % of the mean "
-        "one, that of the centre of pressure in % of half the width of the foot.</p>\n"
-    )
-    headers = ["constraint", "margin %", "contact", "at [s]", "found"]
-    return note + table("Forces of the ground", headers, rows)
+    return note + limits + _collisions(content, course)
 
 
 def _collisions(content: Mapping[str, Any], course: Course) -> str:

@@ -18,7 +18,7 @@ from robotid.exceptions import NotConvergedError, SettingsError
 from robotid.excitation.basis import DesignedMotion
 from robotid.excitation.design import Designer
 from robotid.excitation.designed import Design
-from robotid.excitation.information import Aim, MotionInformation
+from robotid.excitation.information import Aim
 from robotid.excitation.limits import LIMITS
 from robotid.findings import listed
 from robotid.robot.bodies import link_transfer
@@ -202,11 +202,6 @@ def _joints_before(model: RobotModel, link: str) -> tuple[str, ...]:
 def _sought(designer: Designer, payload: Payload) -> tuple[Designer, Aim]:
     """Return a designer whose aim is a payload and whose torques include it; and that aim."""
     information = designer.information
-    if not isinstance(information, MotionInformation):
-        raise SettingsError(
-            f"kind is 'payload', and the base of {information.model.name} floats; wanted fourier "
-            "or bspline: the payload of a floating base needs no motion of its own"
-        )
     model, K = information.model, information.mapping.K
     body, transfer = link_transfer(model, payload.link)
     layout = model.layout

@@ -7,7 +7,7 @@ import numpy as np
 from robotid._typing import Array
 from robotid.exceptions import SettingsError
 from robotid.excitation.clearance import Clearance
-from robotid.excitation.information import Information
+from robotid.excitation.information import MotionInformation
 from robotid.excitation.limits import LIMITS, MotionLimits
 from robotid.excitation.multipliers import SOFT
 from robotid.findings import listed
@@ -29,7 +29,7 @@ class Postures:
         clearance: The distances to collisions; None: they are not checked.
     """
 
-    information: Information
+    information: MotionInformation
     limits: MotionLimits
     clearance: Clearance | None = None
 
@@ -109,20 +109,6 @@ class Postures:
         first: Array = found[0]
         return first
 
-    def required(self, q: Array) -> Array:
-        """Return a posture that satisfies limits, distances and further constraints at rest.
-
-        Args:
-            q: The posture, shape (n,) [rad or m].
-
-        Raises:
-            SettingsError: If it does not.
-        """
-        used, margins = self._at_rest(q[None])
-        for _, words, _ in sorted(self._broken(used, margins), key=lambda entry: -entry[0]):
-            raise SettingsError(f"in the first posture {words}. State another one (--posture)")
-        return q
-
     def _drawn(self, rng: np.random.Generator, count: int) -> Array:
         """Return random postures, shape (count, n) [rad or m]."""
         share = rng.uniform(-0.8, 0.8, (count, len(self.limits.middle)))
@@ -143,8 +129,8 @@ class Postures:
 
     def _at_rest(self, q: Array) -> tuple[Array, Array]:
         """Return used shares of limits of postures, (6, N, n), and margins, (pairs, N) [m]."""
-        still, free = np.zeros_like(q), self.information.free
-        rows = self.information.rows(q[:, free], still[:, free], still[:, free])
+        still = np.zeros_like(q)
+        rows = self.information.rows(q, still, still)
         used = np.abs(self.limits.used(q, still, still, still, self.information.torque(rows)))
         return used, self._margins(q)
 

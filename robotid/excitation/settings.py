@@ -80,20 +80,6 @@ class MotionSettings(Settings):
         100.0, "rows per second of the file", within=_from(0.1, 1e5, " rows per second")
     )
     payload: Payload = setting(Payload(), "link, mass and centre of mass of the payload, if known")
-    posture: Mapping[str, float] = setting(
-        {}, "position of a joint in the first posture of a robot on its feet [rad or m]; default: 0"
-    )
-    lifted: Sequence[str] = setting(
-        (), "links of [[contact]] that are in the air during the motion, separated by commas"
-    )
-    soles: Sequence[Any] = setting(
-        (), "rectangle of a flat foot in the frame of its link: two corners, height [m]"
-    )
-    friction_coefficient: float = setting(
-        0.5,
-        "coefficient of friction of the ground, of which the usable share is used",
-        within=_from(1e-3, 10.0),
-    )
     moving: Sequence[str] = setting(
         (),
         "joints that move for payload identification, separated by commas; default: the fewest "
@@ -108,13 +94,6 @@ class MotionSettings(Settings):
                     raise SettingsError(
                         f"{name} of {joint!r} is {value:g}, wanted {_SIZES[0]:g} to {_SIZES[1]:g}"
                     )
-        for link, values in self.soles:
-            if not (values[0] < values[2] and values[1] < values[3]):
-                raise SettingsError(
-                    f"the sole of {link} reaches from {values[0]:g}, {values[1]:g} to "
-                    f"{values[2]:g}, {values[3]:g}, wanted a low corner below the high one in x "
-                    "and y"
-                )
         if self.kind != "payload" and (self.moving or self.payload != Payload()):
             raise SettingsError(
                 f"a payload or moving joints are stated, but kind is {self.kind!r}, wanted payload"

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from robotid._files import finite, source_entry
-from robotid.export.former_keys import with_former_keys
 from robotid.export.ranges import parameter_ranges
 from robotid.export.samples import covariance_entry
 from robotid.fitting.bands import QUANTILE, next_errors, typical_friction
@@ -86,7 +85,7 @@ def build_result(
     }
     if found.has_urdf:
         common["ranges"] = parameter_ranges(found) | own.pop("ranges", {})
-    return with_former_keys(common | own)
+    return common | own
 
 
 def _torque_entries(found: Identification, settings: Mapping[str, Any]) -> dict[str, Any]:
@@ -141,12 +140,7 @@ def _variation(found: Identification) -> dict[str, Any]:
     content = found.variation.to_dict() | {"next_torque_rmse": dict(rows)}
     noise = found.regressor_noise
     sums = found.sums.to_dict() | {
-        "unit": [found.variation.unit_names[k] for k in found.variation.of_runs],
-        "covariates": {
-            group.group.name: [each.to_dict() for each in group.covariates]
-            for group in found.runs
-            if group.covariates
-        },
+        "unit": [found.variation.unit_names[k] for k in found.variation.of_runs]
     }
     if noise is not None and noise.is_corrected:
         sums["shift"] = noise.shift.tolist()

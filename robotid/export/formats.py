@@ -73,8 +73,6 @@ FORMATS: dict[str, Format] = {
             "samples": Option("also FILE.samples.json with N samples of the joint distribution",
                               "N", int),
             "seed": Option("seed of these samples, default 0", "K", int),
-            "temperature": Option("ranges and samples of drives at this temperature [degC], where "
-                                  "it has an effect; any of the logs if not stated", "DEGC", float),
         },
     ),
 }  # fmt: skip

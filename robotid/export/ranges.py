@@ -7,7 +7,6 @@ fixed axes. Any positive values give a possible body, so each may be drawn indep
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -31,7 +30,6 @@ from robotid.robot.bodies import principal_moments
 from robotid.robot.drives import TERMS
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia_basis
-from robotid.variation.covariates import at_temperature
 from robotid.versions import __version__
 
 if TYPE_CHECKING:
@@ -56,8 +54,7 @@ Ranges for domain randomisation of {robot}, by robotid {version}. kg, m, kg m^2,
 nominal is the identified value, low to high its 95 % interval, limited to possible values. The low
 end of a positive parameter is computed from its logarithm. source is the source of the interval:
   data   the motion;
-  logs   the spread between logs, drives only: the 95 % prediction interval of the next log, at any
-         temperature and time of the logs if these have an effect;
+  logs   the spread between logs, drives only: the 95 % prediction interval of the next log;
   prior  the plausible error of the URDF: the motion does not determine the parameter;
   mixed  both, or the motion determines only sums with other parameters;
   bound  the value is at a physical bound; a drive at 0 has no interval: no low, no high;
@@ -83,7 +80,6 @@ def export(
     *,
     samples: int | None = None,
     seed: int | None = None,
-    temperature: float | None = None,
 ) -> Written:
     """Write the ranges that a result states, as YAML, and samples beside it, as JSON.
 
@@ -93,12 +89,10 @@ def export(
             suffix.
         samples: Number of samples of the joint distribution; None: no samples.
         seed: Seed of the samples; 0 if None.
-        temperature: Temperature of drives on whose parameters it has an effect [degC]; None: any of
-            the logs.
 
     Raises:
         DataError: If the result has no URDF, because it is wrong, or no ranges, or no covariance
-            for samples, or temperature has no effect, or is far outside that of the logs.
+            for samples.
         SettingsError: If the target is a folder, or an option is out of range.
     """
     if samples is None and seed is not None:
@@ -107,9 +101,6 @@ def export(
     has_gains = bool(commanded_drives(model, pi, result.content, result.path.name))
     if "ranges" not in result.content and not has_gains:
         raise DataError(f"{result.path.name} of an earlier version has no ranges; identify again")
-    if temperature is not None:
-        variation = at_temperature(result.content.get("variation", {}), temperature)
-        result = replace(result, content={**result.content, "variation": variation})
     files = [target]
     if samples is not None:
         files.append(target.with_suffix(".samples.json"))
@@ -147,7 +138,7 @@ def parameter_ranges(found: Identified) -> dict[str, Any]:
             found.standard[k], errors[k], source, least=least, quantile=float(quantile[k])
         )
         if layout.names[k] in between and source != "bound":
-            low, high = between[layout.names[k]].seen_ends
+            low, high = between[layout.names[k]].prediction.ends
             found_range |= {"low": max(float(low), least), "high": float(high), "source": "logs"}
         term_name = layout.names[k].removeprefix(f"{name}.")
         drives[name][term_name] = found_range | {"unit": layout.units[k]}
@@ -244,7 +235,7 @@ def stated_ranges(content: Mapping[str, Any]) -> dict[str, Any]:
         drive, _, term = name.rpartition(".")
         own = merged.get(drive, {}).get(term)
         if own is not None and "low" in own and own["source"] != "bound":
-            low, high = entry.get("seen_interval", entry["next_interval"])
+            low, high = entry["next_interval"]
             least = 0.0 if term in _NOT_NEGATIVE or term == "kp" else -math.inf
             of_logs = {"low": max(low, least), "high": high, "source": "logs"}
             merged[drive][term] = own | of_logs

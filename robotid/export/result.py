@@ -20,7 +20,6 @@ from robotid.export.commanded import (
     loops_of,
 )
 from robotid.export.entries import SCHEMA_VERSION
-from robotid.export.former_keys import from_former_keys
 from robotid.export.shape import FILE, FLAG, MAYBE, NUMBER, TABLE, TEXT, check_shape
 from robotid.export.urdf import load_identified, terms_from_facts
 from robotid.findings import listed
@@ -333,8 +332,6 @@ def read_result(path: str | Path) -> dict[str, Any]:
         DataError: If it is missing, not JSON, or not of the schema of a result.
     """
     name, result = Path(path).name, read_json(path, "result")
-    if isinstance(result, dict):
-        result = from_former_keys(result)
     version = result.get("schema_version") if isinstance(result, dict) else None
     if version != SCHEMA_VERSION or "verdict" not in result:
         raise DataError(
@@ -466,28 +463,20 @@ def stated_covariance(result: Mapping[str, Any], names: Sequence[str]) -> Array 
     return root @ root.T
 
 
-def stated_between(
-    result: Mapping[str, Any],
-    model: RobotModel,
-    temperature: float | Mapping[str, float] | None = None,
-) -> Array | None:
+def stated_between(result: Mapping[str, Any], model: RobotModel) -> Array | None:
     """Return the covariance of a robot's parameters in another log, in addition to that of the fit.
 
     Args:
         result: Content of a result.json.
         model: The robot.
-        temperature: As of ``between_covariance``.
 
     Returns:
         Shape (p, p); None for fewer than three fitted logs, or if an earlier version wrote it.
-
-    Raises:
-        DataError: As ``at_temperature``.
     """
     variation = result.get("variation")
     if variation is None or "correlation" not in variation:
         return None
-    return between_covariance(variation, model.layout.names, temperature)
+    return between_covariance(variation, model.layout.names)
 
 
 def stated_model(result: Mapping[str, Any], model: RobotModel) -> RobotModel:

@@ -23,7 +23,7 @@ from robotid.variation.draws import (
     root_of,
     scores_to_values,
 )
-from robotid.variation.variation import SCORES, effects_by_log
+from robotid.variation.variation import SCORES
 
 if TYPE_CHECKING:
     from robotid.export.result import Result
@@ -100,8 +100,8 @@ def sample(result: "Result", count: int, rng: np.random.Generator) -> tuple[list
 
     Bodies are normal with the covariance of the fit, given that all are physically possible.
     Drive parameters with a spread between logs have the predictive distribution of the next log or
-    robot; temperature and time are those of one of the logs. Their correlation is that of the error
-    of the fit, with all its parameters, and that of their values in the logs, among each other.
+    robot. Their correlation is that of the error of the fit, with all its parameters, and that of
+    their values in the logs, among each other.
 
     Args:
         result: The result.
@@ -157,14 +157,10 @@ def sample(result: "Result", count: int, rng: np.random.Generator) -> tuple[list
         share = np.minimum(np.minimum(error[at], of_mean) / total, 1.0) ** 2
         order = [between[name]["at"] for name in own]
         R = np.array(result.content["variation"]["correlation"])[np.ix_(order, order)]
-        moved = effects_by_log([result.content["variation"]["parameters"][name] for name in own])
-        logs = rng.integers(len(moved), size=count) if len(moved) else np.zeros(0, dtype=int)
         z = correlated_scores(scores, share, R, rng.standard_normal(scores.shape))
         for k, (i, name) in enumerate(zip(at.tolist(), own, strict=True)):
             least = 0.0 if signed[i] else -math.inf
             drawn[:, i] = scores_to_values(z[:, k], SCORES, between[name]["quantiles"], least)
-            if len(logs):
-                drawn[:, i] = np.maximum(drawn[:, i] + moved[logs, k], least)
     return names, drawn
 
 

@@ -81,8 +81,6 @@ def consistent_fit(
         independent_share=known.share,
         metric=settings.prior,
         constraints=make_constraints(bounds, geometry, extent),
-        solver=settings.solver,
-        check=settings.check,
         wls_noise=known.sigma,
     )
     folds = gather(known.held_out, _FOLDS)

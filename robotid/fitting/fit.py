@@ -37,12 +37,10 @@ from robotid.recordings.logs import Recordings
 from robotid.regressor.factors import Factors, Reduction, join
 from robotid.regressor.memory import is_loaded
 from robotid.robot.prior import prior_spread
-from robotid.variation.covariates import drive_temperatures
-from robotid.variation.groups import FEWEST_RUNS, Covariate, RunSums, runs_of, sums_of
+from robotid.variation.groups import FEWEST_RUNS, RunSums, runs_of, sums_of
 
 __all__ = [
     "Solved",
-    "covariates_of",
     "fit_recordings",
     "rough_choice",
     "solve_recordings",
@@ -209,7 +207,7 @@ class Solved:
         shift = noise.shift if noise is not None and noise.is_corrected else none
         sums = sums_with_zeros(sums, own, self.standard, shift)
         _, unit = np.unique([log.unit for log in own.fitted], return_inverse=True)
-        runs = runs_of(own.model, mapping, self.standard, sums, unit, covariates_of(own))
+        runs = runs_of(own.model, mapping, self.standard, sums, unit)
         return replace(fit, sums=sums, runs=runs)
 
     def _measured(self) -> tuple[Estimate, Estimate, StandardErrors]:
@@ -242,26 +240,6 @@ class Solved:
             estimate = replace(estimate, covariance=ground.grown * estimate.covariance)
             wls = replace(wls, covariance=ground.grown * wls.covariance)
         return estimate, wls, errors
-
-
-def covariates_of(recordings: Recordings) -> dict[str, list[Covariate]]:
-    """Return temperature and time of the logs to fit by drive, where every log has them.
-
-    Args:
-        recordings: The recordings.
-    """
-    found: dict[str, list[Covariate]] = {}
-    drives, logs = recordings.model.layout.drives, recordings.fitted
-    warm = [drive_temperatures(drives, log.temperature) for log in logs]
-    times = [log.time for log in logs if log.time is not None]
-    for drive in drives:
-        own = found[drive.name] = list[Covariate]()
-        if all(drive.name in each for each in warm):
-            values = np.array([each[drive.name] for each in warm])
-            own.append(Covariate("temperature", "degC", values))
-        if len(times) == len(logs):
-            own.append(Covariate("time", "h", np.array(times)))
-    return found
 
 
 def sums_of_logs(

@@ -369,7 +369,7 @@ def _in_memory(recordings: Recordings) -> Recordings:
         for window in log.looks
     ]
     usable = [log for log in windows if len(log.pieces[0].read().trajectory.t)]
-    return replace(recordings, fitted=usable, validation=(), plan=None, checkpoint=None)
+    return replace(recordings, fitted=usable, validation=(), plan=None)
 
 
 def _steps(log: SurveyedLog) -> Array:

@@ -246,12 +246,6 @@ class BoundedSettings(EstimatorSettings):
         among=("auto", "cv", "evidence"),
         within=_FINITE,
     )
-    solver: str = setting(
-        "clarabel",
-        "cone solver, for the priors euclidean and riemannian",
-        among=("clarabel", "scs"),
-    )
-    check: bool = setting(False, "whether the second cone solver checks the solution")
     draws: int = setting(
         64,
         "number of fits to resampled data and prior, which give the standard errors if bounds are "

@@ -143,7 +143,6 @@ def _without_bias(recordings: Recordings, errors: RepeatedErrors, bias: Array) -
         repeated=errors,
         fitted=[log.with_accelerometer_bias(bias) for log in recordings.fitted],
         validation=[log.with_accelerometer_bias(bias) for log in recordings.validation],
-        checkpoint=None,  # it contains pieces with the bias
     )
 
 

@@ -18,7 +18,6 @@ if TYPE_CHECKING:
 
 __all__ = [
     "cell",
-    "effect_text",
     "error_lines",
     "identification_html",
     "identification_line",
@@ -161,9 +160,6 @@ def variation_lines(variation: Mapping[str, Any] | None) -> list[str]:
         return []
     words = [f"{term} {min(x):.2g} to {max(x):.2g} %" for term, x in sorted(shares.items())]
     lines = [f"spread between {len(variation['logs'])} logs, by joint: {', '.join(words)}"]
-    for name, found in variation["parameters"].items():
-        lines += [effect_text(name, found, key) for key, own in found.get("effects", {}).items()
-                  if own["is_used"]]  # fmt: skip
     gains = {
         name: one_more_gain(found)
         for name, found in variation["parameters"].items()
@@ -179,26 +175,6 @@ def variation_lines(variation: Mapping[str, Any] | None) -> list[str]:
             f"{100 * gains[most][1]:.2g} %)"
         )
     return lines
-
-
-def effect_text(name: str, parameter: Mapping[str, Any], covariate: str) -> str:
-    """Return the effect of temperature or time on a parameter as a sentence without its end.
-
-    Args:
-        name: Name of the parameter.
-        parameter: A parameter of the variation between logs, as in result.json.
-        covariate: Name of the effect.
-    """
-    own, mean = parameter["effects"][covariate], parameter["mean"]
-    low, high = min(own["by_log"]), max(own["by_log"])
-    unit = own["unit"]
-    size, error, of = own["slope"], own["std_error"], f"{parameter['unit']} per {unit}"
-    if abs(mean) > 2.0 * parameter["std_error"]:
-        size, error, of = 100 * size / abs(mean), 100 * error / abs(mean), f"% per {unit}"
-    size = size if mean >= 0.0 else -size  # of its absolute value
-    verb = "falls" if size < 0 else "rises"
-    seen = f"{high - low:.3g} {unit}" if covariate == "time" else f"{low:.3g} to {high:.3g} {unit}"
-    return f"{name} {verb} with {covariate}: by {abs(size):.2g} +- {error:.1g} {of} (logs: {seen})"
 
 
 def one_more_gain(parameter: Mapping[str, Any]) -> tuple[float, float]:

@@ -1,4 +1,4 @@
-"""Findings about a fit: undetermined parameters, outliers, mass matrix, solvers, bounds."""
+"""Findings about a fit: undetermined parameters, outliers, mass matrix, optimum, bounds."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ __all__ = [
     "not_written",
 ]
 
-_SAME = 1e-3  # two solvers that differ by more, relative to torque or objective, disagree
+_SAME = 1e-3  # relative gap of the objective above which it is not the optimum
 _COSTS = 1.05  # residual over that of WLS above which bounds increase the torque error
 _FAR = 3.0  # a total mass differs from the URDF's at most by this factor
 _ROUNDING = 1e-6  # [m^2] tolerance of a body that touches its box
@@ -334,21 +334,6 @@ def consistency_findings(fit: Fit) -> list[Finding]:
             f"a simulation with these parameters diverges; {advice}"
         )
         findings.append(Finding("mass_matrix", "warning", "standard_parameters", message))
-    second = details.get("check")
-    if second is not None and "torque_difference" not in second:
-        message = (
-            f"the second solver, {second['solver']}, did not solve the fit "
-            f"(status: {second['status']}); the result is from {details['solver']} only"
-        )
-        findings.append(Finding("second_solver_failed", "warning", "estimator", message))
-    elif second is not None and second["torque_difference"] > _SAME:
-        message = (
-            f"{details['solver']} and {second['solver']} differ by "
-            f"{100 * second['torque_difference']:.2g} % of the torque (objective: "
-            f"{100 * second['objective_difference']:.2g} %); use the lower "
-            "objective"
-        )
-        findings.append(Finding("solvers_differ", "warning", "estimator", message))
     bounds = [name for name in details.get("active", ()) if name.startswith(_USER_BOUNDS)]
     if bounds:
         against = _contradiction(fit)

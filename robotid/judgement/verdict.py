@@ -1,7 +1,6 @@
 """Verdict on a result, with reasons; what was not tested is never "good"."""
 
 import difflib
-import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
@@ -11,7 +10,7 @@ import numpy as np
 from robotid._settings import require_kind
 from robotid.doctor.diagnosis import CODES
 from robotid.exceptions import SettingsError
-from robotid.findings import Finding, current_code, listed, not_ignored
+from robotid.findings import Finding, listed, not_ignored
 from robotid.fitting.left_out import logs_that_test
 from robotid.fitting.metrics import Metrics
 from robotid.judgement.evidence import Determined, Predictions, error_of, is_harmless_cost
@@ -33,7 +32,6 @@ __all__ = [
     "warnings_of",
 ]
 
-_LOGGER = logging.getLogger("robotid")
 
 _REJECTED = 5.0  # [%] a smaller prediction error rejects a hypothesis on columns or masses
 _SCALED = 2.0  # a gravity torque within this factor of the URDF's contradicts a wrong unit
@@ -71,13 +69,11 @@ _REASONS = {
     "rolling_contact": "feet roll as balls of a radius that is not stated: the force of the "
     "ground acts elsewhere",
     "moving_contact": "a link moves at {speed:.2g} m/s while it is in contact",
-    "measured_wrench": "forces of the ground are missing in a part of the log",
     "mass_matrix": "the mass matrix is not positive definite in all poses",
     "payload_change": "its last link carries {mass:+.2g} kg relative to the fitted logs",
     "position_offset": "the position may have an offset",
     "position_order": "the position may belong to another joint",
     "position_sign": "the position may have the opposite sign",
-    "solvers_differ": "two solvers give different parameters",
     "time_scale": "inertia and gravity contradict each other: the time stamps or the magnitude "
     "of gravity may be wrong",
     "torque_delay": "the torque is delayed by {delay:+.3f} s relative to the position (negative: "
@@ -88,9 +84,6 @@ _REASONS = {
     "unexplained_torque": "gravity, inertia and friction do not explain much of the torque",
     "unlike_run": "the log differs from the other logs",
     "unlike_unit": "the robot differs from the other robots",
-    "wrench_delay": "measured forces of the ground lag the motion by {delay:+.3f} s",
-    "wrench_gain": "the force of a foot must be multiplied by {factor:.3g} relative to the others",
-    "wrench_offset": "measured forces of the ground have an offset",
     "unsigned_torque": "the torque may be a magnitude without sign",
     "unmounted_part": "{mass:.2g} kg of the URDF's last link were probably not mounted",
     "urdf_mismatch": "the torques do not fit the URDF's masses: the URDF may be of another robot "
@@ -344,13 +337,8 @@ def check_ignored(ignore: Sequence[str]) -> None:
     """
     known = sorted({*CODES, *WARNING_CODES, *_OF_RESULTS})
     require_kind(ignore, (list, tuple, set, frozenset), "ignore", "a list of codes")
-    for stated in ignore:
-        require_kind(stated, str, "a code in ignore", "the code of a finding")
-        code = current_code(stated)
-        if code != stated:
-            _LOGGER.warning(
-                "doctor: ignore has the code %r, which is named %r since 0.2", stated, code
-            )
+    for code in ignore:
+        require_kind(code, str, "a code in ignore", "the code of a finding")
         if code not in known:
             near = difflib.get_close_matches(code, known, n=1)
             hint = f". Did you mean {near[0]!r}?" if near else ""

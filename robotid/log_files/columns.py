@@ -99,7 +99,6 @@ class Finder:
             ]
         found |= {kind: names for kind in optional if (names := self._find_optional(kind))}
         self._note_sizes()
-        self.find_temperatures()  # they are not ignored
         extra = [name for name in self.names if name not in self.seen]
         if extra:
             self.notes.append(f"columns ignored: {listed(extra)}")
@@ -108,18 +107,6 @@ class Finder:
                 f"{self.where}: {listed(twice)} are read twice; correct columns in the job file"
             )
         return found
-
-    def find_temperatures(self) -> dict[str, str]:
-        """Return the column of the temperature of each joint that has one, by joint.
-
-        That of the joint is preferred to the one of all joints, "temperature".
-        """
-        every = self._find("temperature", ["temperature"])
-        own = {
-            joint: self._find(f"temperature_{joint}", [f"temperature_{self._named(joint)}"])
-            for joint in self.joints
-        }
-        return {joint: name for joint, x in own.items() if (name := x or every)}
 
     def factors(self, torques: Sequence[str]) -> tuple[float, ...]:
         """Return the factor that converts each of n columns to a torque: a current's gain, or 1.
@@ -195,7 +182,6 @@ class Finder:
         self._check_names()
         names = dict.fromkeys([*self.joints, *self.motors.values()])
         known = ["time", *(f"{kind}_{name}" for kind in prefixes() for name in names)]
-        known += ["temperature", *(f"temperature_{joint}" for joint in self.joints)]
         for standard, name in self.columns.items():
             if standard not in known:
                 raise SettingsError(

@@ -7,7 +7,7 @@ columns of the motors are read instead, as `qm_<motor>` and `taum_<motor>` [N m]
 """
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
 from typing import Any, get_args
@@ -189,7 +189,6 @@ class LogLayout:
     gears: tuple[Transmission, ...]  # of the motors
     has_torque: bool  # whether the file has a torque or a current of any of the joints
     base: BaseColumns = _BASE  # of a floating base and of contacts
-    temperatures: Mapping[str, str] = field(default_factory=dict)  # names in the file by joint
 
     @property
     def wanted(self) -> list[str]:
@@ -389,7 +388,6 @@ def lay_out(
         gears=finder.gears,
         has_torque=any(finder.has_torque(joint) for joint in joints),
         base=base,
-        temperatures=finder.find_temperatures(),
     )
     return layout, with_even_stamps(opened, found["time"][0], source.stamp)
 

@@ -15,7 +15,6 @@ from robotid.regressor.problem import Block, Problem, concatenate
 from robotid.regressor.rows import keep_inertial_rows
 from robotid.regressor.used_rows import base_problem, independent_share
 from robotid.robot.model import RobotModel
-from robotid.workers.checkpoint import Checkpoint
 from robotid.workers.plan import WorkPlan
 
 __all__ = ["Recordings", "RepeatedErrors"]
@@ -64,7 +63,6 @@ class Recordings:
         fitted: Logs to fit.
         validation: Validation logs.
         plan: Processes that work on the pieces of logs in files; None: this process.
-        checkpoint: Storage of the reductions until the run is complete.
         weights: Weights of the rows of each log to fit, shapes (N, n_rows); 1 if None.
         repeated: Effect of errors of points of contact and of an IMU; None without any.
         levels: Noise levels of an earlier fit, shape (n,), from which the next one starts.
@@ -75,7 +73,6 @@ class Recordings:
     fitted: Sequence[SurveyedLog]
     validation: Sequence[SurveyedLog] = ()
     plan: WorkPlan | None = None
-    checkpoint: Checkpoint | None = None
     weights: tuple[Array, ...] | None = None
     repeated: RepeatedErrors | None = None
     levels: Array | None = None
@@ -109,7 +106,6 @@ class Recordings:
             mapping=self.mapping if is_same else structural_mapping(model, plain=plain),
             fitted=[log.with_model(model) for log in self.fitted],
             validation=[log.with_model(model) for log in self.validation],
-            checkpoint=None,  # it contains the pieces of the first fit
         )
 
     def reduce(self, *, is_cut: bool = True) -> tuple[Reduction, ...]:
@@ -140,7 +136,7 @@ class Recordings:
             reduced = self._segments if is_cut else self._whole
             return tuple(tuple(reduced(k)) for k in range(len(self.fitted)))
         plan = self.plan or WorkPlan()
-        found = iter(plan.reduce(self.pieces, checkpoint=self.checkpoint))
+        found = iter(plan.reduce(self.pieces))
         reductions = []
         size = 8 * self.model.n_rows * (len(self.mapping.independent) + 1) ** 2 * len(self.fitted)
         most = max(_FEW, min(_SEGMENTS_IN_FILE, _FACTORS // size))

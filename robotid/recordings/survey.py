@@ -211,8 +211,6 @@ class SurveyedLog:
         length: Rows per piece.
         places: Positions in the file at which blocks of rows start.
         unit: Name of the robot, if there are several of one kind.
-        temperature: Mean temperature of the drives of joints, by joint [degC].
-        time: Time of the recording [h]; None if it is not stated.
     """
 
     model: RobotModel
@@ -226,8 +224,6 @@ class SurveyedLog:
     length: int = PIECE
     places: Sequence[Place] = (Place(),)
     unit: str = ""
-    temperature: Mapping[str, float] = field(default_factory=dict)
-    time: float | None = None
 
     @property
     def path(self) -> str:
@@ -449,8 +445,7 @@ def survey_log(
             implausible.
     """
     locked = _locked_columns(layout, table, model)
-    warm = layout.temperatures
-    wanted = list(dict.fromkeys([*layout.wanted, *locked.values(), *warm.values()]))
+    wanted = list(dict.fromkeys([*layout.wanted, *locked.values()]))
     if length is None:
         columns = table.read(wanted)
         log = layout.to_log(columns)
@@ -458,8 +453,7 @@ def survey_log(
         used = log if window == (None, None) else log.window(*window)
         inside = slice(*np.searchsorted(log.t, [used.t[0], np.nextafter(used.t[-1], np.inf)]))
         positions = _positions(locked, [columns], layout, model, inside)
-        held = hold_log(model, used, signals, positions)
-        return replace(held, temperature=_temperatures(warm, [columns], inside))
+        return hold_log(model, used, signals, positions)
     reader, places, where = table.reader(wanted), list[Place](), Path(layout.path).name
     stamps = map_stamps(_stamps(reader, layout, places), where)
     first, stop = _window(stamps, where, *window)
@@ -474,9 +468,8 @@ def survey_log(
         length = max(stop - first, 1)
     windows = tuple(with_contacts(model, closed_log(model, log), signals) for log in windows)
     return SurveyedLog(
-        model, layout, signals, stamps, first, stop, windows, positions, length, places,
-        temperature=_temperatures(warm, found),
-    )  # fmt: skip
+        model, layout, signals, stamps, first, stop, windows, positions, length, places
+    )
 
 
 def _with_one_bias(
@@ -558,18 +551,6 @@ def _locked_columns(layout: LogLayout, table: Table, model: RobotModel) -> dict[
         names = [prefix + named for prefix in prefixes()["q"] if prefix + named in table.names]
         if names:
             found[joint] = names[0]
-    return found
-
-
-def _temperatures(
-    names: Mapping[str, str], windows: Sequence[Mapping[str, Array]], inside: slice = slice(None)
-) -> dict[str, float]:
-    """Return the mean temperature of joints in the rows read, by joint [degC]."""
-    found = {}
-    for joint, column in names.items():
-        own = np.concatenate([columns[column] for columns in windows])[inside]
-        if np.isfinite(own).any():
-            found[joint] = float(own[np.isfinite(own)].mean())
     return found
 
 

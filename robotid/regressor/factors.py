@@ -6,7 +6,7 @@ factor of both. A reduction of a segment of a log has its factors and other sums
 """
 
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -250,35 +250,6 @@ class Reduction:
             DataError: If a row is not finite.
         """
         return cls(compress(problem, threads=threads), trajectory.squares, len(trajectory.t))
-
-    def to_arrays(self) -> dict[str, Array]:
-        """Return the reduction as arrays by name, for a checkpoint."""
-        return {
-            **{f"R_{j}": R for j, R in enumerate(self.factors.triangles)},
-            **{f"columns_{j}": own for j, own in enumerate(self.factors.columns)},
-            "rows": self.factors.rows,
-            "names": np.array(self.factors.names),
-            "squares": self.squares,
-            "samples": np.array(self.samples),
-            "is_projected": np.array(self.factors.is_projected),
-        }
-
-    @classmethod
-    def from_arrays(cls, arrays: Mapping[str, Array]) -> "Reduction":
-        """Return the reduction from its arrays, bit by bit the same; see ``to_arrays``.
-
-        Args:
-            arrays: The arrays by name.
-        """
-        rows, joints = arrays["rows"], range(len(arrays["rows"]))
-        factors = Factors(
-            tuple(np.asfortranarray(arrays[f"R_{j}"]) for j in joints),
-            tuple(arrays[f"columns_{j}"] for j in joints),
-            rows,
-            tuple(arrays["names"].tolist()),
-            is_projected=bool(arrays["is_projected"]),
-        )
-        return cls(factors, arrays["squares"], int(arrays["samples"]))
 
 
 def compress(problem: Problem, *, threads: int | None = None) -> Factors:

@@ -14,9 +14,7 @@ from robotid.export.result import load_result
 from robotid.export.urdf import terms_from_facts
 from robotid.findings import listed
 from robotid.report.comparison_page import comparison_page
-from robotid.report.history import history_of
 from robotid.robot.drives import TERMS, DriveMotion
-from robotid.variation.history import FALSE_ALARMS
 
 __all__ = ["compare_results", "write_comparison"]
 
@@ -24,28 +22,23 @@ _SPEEDS = 40  # of a friction curve, in each direction
 _FILES = ("urdf", "identification", "validation")  # settings that are shown as inputs
 
 
-def compare_results(
-    paths: Sequence[str | Path], *, false_alarms: float = FALSE_ALARMS
-) -> dict[str, Any]:
+def compare_results(paths: Sequence[str | Path]) -> dict[str, Any]:
     """Compare results of the same robot and the same base parameters.
 
     Args:
         paths: At least two result.json files.
-        false_alarms: Probability that results without a change have a finding.
 
     Returns:
         Plain values: "results" (label, name, path, robot, estimator, verdict; the name is the
         unique part of the path), "validation" and "fitted" (errors by joint, one column per
         result), "fitted_alike" and "notes" (what is not comparable, and the reason),
         "friction" (curves by joint), "base_parameters" (values, standard errors, and the difference
-        to the first result over the combined standard error), "order", "changes" and "findings" of
-        the results over time, as of ``history_of``, "settings", "inputs" and "versions" that
-        differ. The largest difference comes first.
+        to the first result over the combined standard error), "settings", "inputs" and "versions"
+        that differ. The largest difference comes first.
 
     Raises:
         DataError: If there are fewer than two results, one is not readable, or their base
             parameters differ; the message names the differences.
-        SettingsError: If the probability is not between 0 and 1.
     """
     if len(paths) < 2:
         raise DataError(f"compare takes at least two results, found {len(paths)}")
@@ -54,7 +47,7 @@ def compare_results(
         _require_same_mapping(str(paths[0]), results[0], str(path), result)
     logs = _short_names([entry["log"] for result in results for entry in result["validation"]])
     common, notes = _common_recordings(results, logs)
-    names, parameters = _short_names(paths), _base_parameters(results)
+    names = _short_names(paths)
     return {
         "results": [
             {
@@ -81,30 +74,26 @@ def compare_results(
         "fitted_alike": len({_recordings(result, "identification") for result in results}) == 1,
         "notes": notes,
         "friction": _friction_curves(results),
-        "base_parameters": parameters,
-        **history_of(results, parameters, [_label(k) for k in range(len(paths))], false_alarms),
+        "base_parameters": _base_parameters(results),
         "settings": _differences([_flat(_chosen(result)) for result in results]),
         "inputs": _inputs(results),
         "versions": _differences([r.get("versions", {"robotid": r["robotid"]}) for r in results]),
     }
 
 
-def write_comparison(
-    paths: Sequence[str | Path], target: str | Path, *, false_alarms: float = FALSE_ALARMS
-) -> dict[str, Any]:
+def write_comparison(paths: Sequence[str | Path], target: str | Path) -> dict[str, Any]:
     """Compare results, write the page, and return the content of ``compare_results``.
 
     Args:
         paths: At least two result.json files.
         target: The HTML file to write, atomically.
-        false_alarms: As of ``compare_results``.
 
     Raises:
         DataError: If the results cannot be compared, or the folder of the target is missing.
-        SettingsError: If the target is a folder, or the probability is not between 0 and 1.
+        SettingsError: If the target is a folder.
     """
     check_file(Path(target))
-    content = compare_results(paths, false_alarms=false_alarms)
+    content = compare_results(paths)
     write_text(comparison_page(content), target)
     return content
 

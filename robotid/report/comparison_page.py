@@ -12,7 +12,6 @@ from robotid._text import period
 from robotid._typing import Array
 from robotid.pages.charts import Chart, Series, chart_html
 from robotid.pages.html import Cell, code, number, page, percent, table, text, with_error
-from robotid.report.history import history_section
 
 __all__ = ["comparison_page"]
 
@@ -31,7 +30,6 @@ def comparison_page(content: Mapping[str, Any]) -> str:
     """
     sections = {
         "errors": ("Prediction errors", _errors_section(content)),
-        **({"changes": ("Changes", history_section(content))} if content["changes"] else {}),
         "friction": ("Friction", _friction_section(content)),
         "settings": ("Different settings", _differing(content, "settings", "setting")),
         "base": ("Base parameters", _base_section(content)),

@@ -421,13 +421,6 @@ def _consistency_notes(found: Identification) -> str:
             notes.append(f"Extents that contradict the data: {', '.join(details['relaxed'])}.")
         if details["pinned"]:
             notes.append(f"Fixed at the URDF's values: {', '.join(details['pinned'])}.")
-    if "check" in details:
-        check = details["check"]
-        difference = check.get("torque_difference")
-        notes.append(
-            f"Check by a second solver, {check['solver']}: {check['status']}"
-            + ("." if difference is None else f"; torques differ by {100 * difference:.2g} %.")
-        )
     if "gaps" in details:
         gaps = ", ".join(f"{gap:.1e}" for gap in details["gaps"])
         notes.append(f"Gap of the log-Cholesky solution to the cone programme, per start: {gaps}.")

@@ -5,7 +5,6 @@ from html import escape
 
 import numpy as np
 
-from robotid.identification.summary import effect_text
 from robotid.pages.html import Cell, code, table, text, with_error
 from robotid.variation.variation import Variation, VaryingParameter
 
@@ -44,17 +43,6 @@ def variation_section(variation: Variation | None, torques: Mapping[str, str]) -
         "range. Links are the same in all logs. Last columns: expected error of the mean, and "
         f"width from low to high, with one more {one}, in % of those of today.</p>\n"
     )
-    effects = [
-        escape(effect_text(each.name, each.to_dict(), own.covariate.name))
-        for each in variation.parameters
-        for own in each.effects
-        if own.is_used
-    ]
-    if effects:
-        intro += (
-            f"<p>{'. '.join(effects)}. Mean, spread and values in the logs are those at their mean "
-            "temperature and time; exported ranges are those at any of the logs.</p>\n"
-        )
     if torques:
         own = ", ".join(f"{escape(row)} {error}" for row, error in torques.items())
         intro += (

@@ -123,17 +123,13 @@ def term_from_dict(table: Mapping[str, Any]) -> DriveTerm:
         raise SettingsError(f"term is {table.get('term')!r}, wanted one of {listed(TERM_CLASSES)}")
     known = {field.name: field.default for field in fields(kind)}
     values: dict[str, Any] = {}
-    for stated, value in table.items():
-        key = _FORMER_FIELDS.get(stated, stated)
+    for key, value in table.items():
         if key == "term":
             continue
         if key not in known:
             raise SettingsError(f"{kind.__name__} has no {key!r}; it has {listed(known)}")
         values[key] = _read_field(kind, key, value, known[key])
     return kind(**values)
-
-
-_FORMER_FIELDS = {"seen": "data_range"}  # names before version 0.2
 
 
 def _read_field(kind: type[DriveTerm], key: str, value: object, default: object) -> object:

@@ -44,7 +44,7 @@ def evidence_by_group(
         Akaike (1974), A new look at the statistical model identification.
     """
     H, h, scale, places = _together(groups)
-    S = np.hstack([x[:, : group.runs.n_varying] * (group.group.kind == "drive")
+    S = np.hstack([x * (group.group.kind == "drive")
                    for group, x in zip(groups, deviations, strict=True)])  # fmt: skip
     unit, is_other = groups[0].runs.unit, ~is_own
     W, w = _lifted(H, h, np.diag(S[0] ** 2))
@@ -66,28 +66,21 @@ def evidence_by_group(
 def _together(groups: Sequence[RunsOf]) -> tuple[Array, Array, Array, list[slice]]:
     """Return the information of the runs on all groups, their scales, and the groups' places.
 
-    The effects of temperature and time are those of the groups. Noise is that of a typical group.
+    Noise is that of a typical group.
     """
-    sizes = [group.runs.n_varying for group in groups]
+    sizes = [len(group.runs.scale) for group in groups]
     places = [slice(end - n, end) for n, end in zip(sizes, np.cumsum(sizes), strict=True)]
     inflation = float(np.median([group.inflation for group in groups]))
     count, total = len(groups[0].runs.h), sum(sizes)
-    H, h, moved = (
-        np.zeros((count, total, total)),
-        np.zeros((count, total)),
-        np.zeros((count, total)),
-    )
-    for group, place, n in zip(groups, places, sizes, strict=True):
+    H, h = np.zeros((count, total, total)), np.zeros((count, total))
+    for group, place in zip(groups, places, strict=True):
         runs = group.runs
         if group.across is None:
-            H[:, place, place] = runs.H[:, :n, :n] * group.inflation / inflation
+            H[:, place, place] = runs.H * group.inflation / inflation
         else:
             H[:, place] = group.across / inflation
-        h[:, place] = runs.h[:, :n] * group.inflation / inflation
-        for slope, size in zip(runs.slopes, group.slopes, strict=True):
-            moved[:, place.start + slope.parameter] += size * slope.covariate
-    scale = np.concatenate([g.runs.scale[:n] for g, n in zip(groups, sizes, strict=True)])
-    return H, h - np.einsum("kij,kj->ki", H, moved), scale, places
+        h[:, place] = runs.h * group.inflation / inflation
+    return H, h, np.concatenate([group.runs.scale for group in groups]), places
 
 
 def _lifted(H: Array, h: Array, D: Array) -> tuple[Array, Array]:

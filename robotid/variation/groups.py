@@ -9,7 +9,6 @@ the torque by the position. One group is estimated with the others at theta.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -22,7 +21,6 @@ from robotid.variation.mixed_effects import Runs
 
 __all__ = [
     "FEWEST_RUNS",
-    "Covariate",
     "Group",
     "RunSums",
     "RunsOf",
@@ -46,7 +44,6 @@ _PAYLOAD = ("m", "mcx", "mcy", "mcz")
 _SMALLEST = 0.01  # torque of a drive over that of its largest term below which this share counts
 _RANK = 1e-9  # eigenvalue over the largest below which a run does not determine a direction
 _LEAST = 1e-12  # smallest information and inflation
-_NO_COVARIATES: Mapping[str, Sequence["Covariate"]] = MappingProxyType({})
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,25 +68,6 @@ class Group:
 
 
 @dataclass(frozen=True, eq=False)
-class Covariate:
-    """A quantity of the runs that may have an effect on the parameters of a drive.
-
-    Attributes:
-        name: "temperature" or "time".
-        unit: Its unit, "degC" or "h".
-        values: Its value in each run, shape (k,).
-    """
-
-    name: str
-    unit: str
-    values: Array
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return plain values, as result.json has them."""
-        return {"name": self.name, "unit": self.unit, "by_log": self.values.tolist()}
-
-
-@dataclass(frozen=True, eq=False)
 class RunsOf:
     """The runs' information about the deviation of a group from the fit.
 
@@ -98,8 +76,6 @@ class RunsOf:
         centre: Its values in the fit, shape (q,): 0 for a payload, 1 for a gain.
         runs: Information about x, coloured noise included.
         inflation: Variance of coloured noise over that of independent rows [-].
-        covariates: Quantities of the runs that may have an effect on the parameters.
-        slopes: Sizes of the slopes of the runs.
         across: Rows of the group in A^T A with A = W B of all Q parameters of all groups, in their
             order, shape (k, q, Q); None: the other groups are independent of it.
     """
@@ -108,8 +84,6 @@ class RunsOf:
     centre: Array
     runs: Runs
     inflation: float
-    covariates: tuple[Covariate, ...] = ()
-    slopes: tuple[float, ...] = ()
     across: Array | None = None
 
 
@@ -223,7 +197,6 @@ def runs_of(
     standard: Array,
     sums: RunSums,
     unit: Array,
-    covariates: Mapping[str, Sequence[Covariate]] = _NO_COVARIATES,
 ) -> tuple[RunsOf, ...]:
     """Return the information of each run on each group of parameters.
 
@@ -233,7 +206,6 @@ def runs_of(
         standard: As of ``sums_of``.
         sums: The sums of k runs.
         unit: Index of the robot of each run, shape (k,), int, from 0.
-        covariates: Quantities of the runs by drive.
     """
     every = groups_at(model, mapping, standard)
     places = _places([group for group, _ in every])
@@ -253,9 +225,7 @@ def runs_of(
         else:
             scale = _scale(group, centre, H.sum(axis=0), model, standard)
         runs = Runs(H / inflation, sums.h[:, own] / inflation, unit, scale)
-        of_drive = covariates.get(group.name, ()) if group.kind == "drive" else ()
-        across = sums.H[:, own][:, :, columns]
-        found.append(RunsOf(group, centre, runs, inflation, tuple(of_drive), across=across))
+        found.append(RunsOf(group, centre, runs, inflation, sums.H[:, own][:, :, columns]))
     return tuple(found)
 
 

@@ -2,17 +2,14 @@
 
     x_run = mu + u_unit + u_run + e_run,    u_unit ~ N(0, D_unit),  u_run ~ N(0, D_run),
 
-with diagonal D. A linear effect of the temperature or the time of a run is a part of mu: a slope is
-a parameter without a deviation, see ``Slope``. A run gives the information H about its own x and
-the product h = H x_hat, so runs in which a parameter had no effect (singular H) need no special
-case. Deviations are integrated out level by level. The restricted likelihood of the standard
-deviations in D is weighted by a wide prior about a plausible size. The standard deviation that a
-prediction depends on is integrated numerically: with few runs, its uncertainty is the largest part
-of the prediction interval.
+with diagonal D. A run gives the information H about its own x and the product h = H x_hat, so runs
+in which a parameter had no effect (singular H) need no special case. Deviations are integrated out
+level by level. The restricted likelihood of the standard deviations in D is weighted by a wide
+prior about a plausible size. The standard deviation that a prediction depends on is integrated
+numerically: with few runs, its uncertainty is the largest part of the prediction interval.
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -22,19 +19,16 @@ import scipy.special
 from robotid._typing import Array
 from robotid.variation.restricted_likelihood import (
     GRID,
-    Evidence,
     Grid,
     by_unit,
     evidence,
     integrated,
-    log_prior,
     most_probable,
     on_grid,
-    over_all,
     prior_of,
 )
 
-__all__ = ["Compared", "MixedEffects", "Prediction", "Runs", "Slope", "covariance_of"]
+__all__ = ["Compared", "MixedEffects", "Prediction", "Runs", "covariance_of"]
 
 _FIRST = -1.0  # logarithm of the standard deviations over their plausible size, at the start
 _NEAR = 2.0  # ... and largest distance of a stated start: the slope is small beyond
@@ -42,24 +36,7 @@ _TAIL = 0.025  # probability beyond each end of an interval
 _ENDS = np.array([_TAIL, 1.0 - _TAIL])
 _ELEMENTS = 1_000_000  # of an array that compares runs, at most
 _HALVINGS = 200  # of the range of a quantile, at most
-_FAR = 0.01  # p-value of a slope below which all spreads are integrated
 _CLOSE = 1e-15  # change of a quantile that rounding decides
-
-
-@dataclass(frozen=True, eq=False)
-class Slope:
-    """A linear effect of a covariate of the runs, as their temperature, on a parameter.
-
-    Attributes:
-        parameter: Index of the parameter.
-        covariate: The covariate of each run, shape (k,).
-        scale: Plausible size of the slope, positive. Before the data, the slope is normal about 0
-            with 100 times this standard deviation, as a mean is.
-    """
-
-    parameter: int
-    covariate: Array
-    scale: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,61 +49,12 @@ class Runs:
         h: H times the estimate of each run, shape (k, q).
         unit: Index of the unit (robot) of each run, shape (k,), int, from 0.
         scale: Plausible standard deviation of each parameter, shape (q,), positive.
-        slopes: The last of the q parameters that are slopes. The others are those at the covariates
-            0. With x = Z (x_0, slopes), H is Z^T H Z.
     """
 
     H: Array
     h: Array
     unit: Array
     scale: Array
-    slopes: tuple[Slope, ...] = ()
-
-    @property
-    def n_varying(self) -> int:
-        """Number of parameters that are not slopes."""
-        return len(self.scale) - len(self.slopes)
-
-    def with_slopes(self, slopes: Sequence[Slope]) -> "Runs":
-        """Return the same runs with other slopes.
-
-        Args:
-            slopes: The slopes, in place of the present ones.
-        """
-        n = self.n_varying
-        Z = np.zeros((len(self.h), n, n + len(slopes)))
-        Z[:, range(n), range(n)] = 1.0
-        for s, slope in enumerate(slopes, start=n):
-            Z[:, slope.parameter, s] = slope.covariate
-        return replace(
-            self,
-            H=np.einsum("kia,kij,kjb->kab", Z, self.H[:, :n, :n], Z, optimize=True),
-            h=np.einsum("kia,ki->ka", Z, self.h[:, :n]),
-            scale=np.concatenate([self.scale[:n], [slope.scale for slope in slopes]]),
-            slopes=tuple(slopes),
-        )
-
-    def seen_from(self, covariates: Sequence[float]) -> "Runs":
-        """Return the runs with their parameters at other covariates than 0.
-
-        Args:
-            covariates: The covariate of each slope.
-        """
-        if not self.slopes:
-            return self
-        moved = [
-            replace(slope, covariate=slope.covariate - at)
-            for slope, at in zip(self.slopes, covariates, strict=True)
-        ]
-        return self.with_slopes(moved)
-
-    def means_of(self, own: Array) -> list[float]:
-        """Return the mean covariate of each slope in some of the runs.
-
-        Args:
-            own: Whether a run is one of these, shape (k,), bool.
-        """
-        return [float(slope.covariate[own].mean()) for slope in self.slopes]
 
     def without(self, run: int) -> "Runs":
         """Return the runs except one.
@@ -154,8 +82,7 @@ class Runs:
 
     def _only(self, left: Array) -> "Runs":
         _, unit = np.unique(self.unit[left], return_inverse=True)
-        slopes = tuple(replace(s, covariate=s.covariate[left]) for s in self.slopes)
-        return replace(self, H=self.H[left], h=self.h[left], unit=unit, slopes=slopes)
+        return replace(self, H=self.H[left], h=self.h[left], unit=unit)
 
 
 @dataclass(frozen=True, eq=False)
@@ -211,10 +138,10 @@ class Compared:
     """Runs, or units, each compared with the prediction of all others.
 
     Attributes:
-        values: Their own n parameters, without slopes, at their own covariates, shape (m, n).
-        covariance: Covariance of these, shape (m, n, n).
-        mean: Mean of the others, shape (m, n).
-        probability: Two-sided probability of such a deviation, shape (m, n).
+        values: Their own parameters, shape (m, q).
+        covariance: Covariance of these, shape (m, q, q).
+        mean: Mean of the others, shape (m, q).
+        probability: Two-sided probability of such a deviation, shape (m, q).
     """
 
     values: Array
@@ -247,11 +174,8 @@ class MixedEffects:
 
     @cached_property
     def deviation(self) -> Array:
-        """Most probable standard deviations, shape (levels, q): between runs, between units.
-
-        Those of slopes are 0.
-        """
-        first = np.full((self.n_levels, self.runs.n_varying), _FIRST)
+        """Most probable standard deviations, shape (levels, q): between runs, between units."""
+        first = np.full((self.n_levels, len(self.runs.scale)), _FIRST)
         if self.first is not None:
             first = self._near(self.first[: self.n_levels])
         found = most_probable(*self._members, self.runs.scale, first[:, :, None])
@@ -282,9 +206,8 @@ class MixedEffects:
         value: Array | None = None,
         *,
         is_unit: bool = False,
-        at: Sequence[float] = (),
     ) -> tuple[Prediction, ...]:
-        """Return the prediction of each parameter but slopes in a new run of a new unit.
+        """Return the prediction of each parameter in a new run of a new unit.
 
         With one unit it is that of a new run. The standard deviation of the highest level is
         integrated, parameter by parameter; all others have their most probable values.
@@ -293,12 +216,8 @@ class MixedEffects:
             own: Variance of the estimates of the new run, of these parameters; 0 if None.
             value: Estimates of the new run, whose probability is computed; or None.
             is_unit: Whether the mean of a new unit is predicted, without a deviation of its run.
-            at: The covariate of each slope in the new run; 0 if empty.
         """
-        if any(at):
-            moved = MixedEffects(self.runs.seen_from(at), self.deviation)
-            return moved.predict(own, value, is_unit=is_unit)
-        q = self.runs.n_varying
+        q = len(self.runs.scale)
         own = np.zeros(q) if own is None else own
         found = []
         for p in range(q):
@@ -322,7 +241,7 @@ class MixedEffects:
         return tuple(found)
 
     def with_one_more(self) -> tuple[Prediction, ...]:
-        """Return the prediction of each parameter but slopes, with what one more run would add.
+        """Return the prediction of each parameter, with what one more run would add.
 
         With several units it is one more unit. The new run or unit is expected to give as much
         information as the mean of the others. The information about the mean then increases by
@@ -344,32 +263,8 @@ class MixedEffects:
             found.append(replace(each, after=(error, width)))
         return tuple(found)
 
-    def slope(self, s: int) -> tuple[float, float, float]:
-        """Return a slope, its standard error, and the two-sided p-value of a slope of 0.
-
-        The standard deviation of its parameter is integrated between runs if its covariate varies
-        most within units, else between units. A p-value below 1 % depends on the uncertainty of all
-        others: then all are integrated, see ``over_all``.
-
-        Args:
-            s: Index of the slope.
-        """
-        own, slope, unit = self.runs.n_varying + s, self.runs.slopes[s], self.runs.unit
-        means_of = np.bincount(unit, slope.covariate) / np.bincount(unit)
-        is_within = float(np.var(slope.covariate - means_of[unit])) > float(np.var(means_of[unit]))
-        level, p, scale = 0 if is_within else self.n_levels - 1, slope.parameter, self.runs.scale
-        variance = np.repeat(self.deviation[:, :, None] ** 2, len(GRID), axis=2)
-        variance[level, p] = (scale[p] * np.exp(GRID)) ** 2
-        found = evidence(*self._members, scale, variance)
-        estimate = _slope(found.log_likelihood + log_prior(GRID), found, own)
-        if estimate[2] >= _FAR:
-            return estimate
-        return _slope(*over_all(*self._members, scale, self.deviation, level, p), own)
-
     def against_others(self, which: Array, *, is_unit: bool) -> Compared:
         """Compare runs, or units, each with the prediction of all others.
-
-        Parameters are those at the mean covariates of the run or unit that is compared.
 
         Args:
             which: Indices of the runs or units, shape (m,), int, at least one.
@@ -377,22 +272,6 @@ class MixedEffects:
         """
         unit = self.runs.unit
         own = which[:, None] == (unit if is_unit else np.arange(len(unit)))  # (m, k)
-        if not self.runs.slopes:
-            return Compared(*self._against(own, is_unit=is_unit))
-        each = []
-        for one in own:  # has covariates of its own
-            runs = self.runs.seen_from(self.runs.means_of(one))
-            each.append(MixedEffects(runs, self.deviation)._against(one[None], is_unit=is_unit))
-        return Compared(*map(np.concatenate, zip(*each, strict=True)))
-
-    def _against(self, own: Array, *, is_unit: bool) -> list[Array]:
-        """Return the arrays of ``Compared`` for m runs or units, parameters at the covariates 0.
-
-        Args:
-            own: Whether a run is left out, shape (m, k).
-            is_unit: Whether they are units.
-        """
-        unit = self.runs.unit
         found: list[tuple[Array, tuple[Array, ...]]] = []
         several = np.array([len(np.unique(unit[~each])) > 1 for each in own])
         most = max(1, _ELEMENTS // (len(GRID) * len(unit)))
@@ -402,7 +281,7 @@ class MixedEffects:
                 found.append((some, self._compared(own[some], levels, is_unit=is_unit)))
         order = np.argsort(np.concatenate([some for some, _ in found]))
         parts = zip(*(part for _, part in found), strict=True)
-        return [np.concatenate(each)[order] for each in parts]
+        return Compared(*(np.concatenate(each)[order] for each in parts))
 
     def _compared(
         self, own: Array, levels: int, *, is_unit: bool
@@ -414,7 +293,7 @@ class MixedEffects:
             levels: Levels of the model of the others.
             is_unit: Whether they are units.
         """
-        scale, (H, h, _), n = self.runs.scale, self._members, self.runs.n_varying
+        scale, (H, h, _) = self.runs.scale, self._members
         unit = self.runs.unit if levels == 2 else None
         rest = H * ~own, h * ~own, unit
         first = np.repeat(self._near(self.deviation[:levels])[:, :, None], len(own), axis=2)
@@ -424,9 +303,8 @@ class MixedEffects:
             W, w, _ = integrated(W, w, deviation[0] ** 2)
         covariance = covariance_of(np.moveaxis(W.sum(axis=-1), -1, 0), scale)
         x = np.einsum("bpi,ib->bp", covariance, w.sum(axis=-1))
-        x, covariance = x[:, :n], covariance[:, :n, :n]
         mean, probability = np.empty(x.shape), np.empty(x.shape)
-        for p in range(n):
+        for p in range(len(scale)):
             grid = on_grid(*rest, scale, deviation, p, 1)
             weight = _weight(grid.log_density)
             mean[:, p] = (weight * grid.mean).sum(axis=-1)
@@ -438,8 +316,7 @@ class MixedEffects:
 
     def _near(self, deviation: Array) -> Array:
         """Return the start of a search near deviations (levels, q), as of ``most_probable``."""
-        n = self.runs.n_varying
-        first: Array = np.log(deviation[:, :n] / self.runs.scale[:n])
+        first: Array = np.log(deviation / self.runs.scale)
         return np.clip(first, _FIRST - _NEAR, _FIRST + _NEAR)
 
     @cached_property
@@ -525,14 +402,6 @@ def _mixture_quantiles(wanted: Array, weight: Array, means: Array, std: Array) -
             break
         x = tried
     return np.asarray(tried)
-
-
-def _slope(log_density: Array, found: Evidence, own: int) -> tuple[float, float, float]:
-    """Return a slope, its standard error and p-value, from models with their log density, (b,)."""
-    weight = _weight(log_density)
-    means, variances = found.mean[:, own], found.covariance[:, own, own]
-    mean, error = _moments(weight, means, variances)
-    return mean, error, float(_beyond(np.zeros(()), weight, means, np.sqrt(variances)))
 
 
 def _weight(log_density: Array) -> Array:

@@ -20,7 +20,6 @@ from robotid.exceptions import NotConvergedError
 
 __all__ = [
     "GRID",
-    "UNKNOWN",
     "Evidence",
     "Grid",
     "by_unit",
@@ -29,13 +28,10 @@ __all__ = [
     "log_prior",
     "most_probable",
     "on_grid",
-    "over_all",
     "prior_of",
 ]
 
-#: Standard deviation of a parameter before the data, in plausible sizes.
-UNKNOWN = 100.0
-
+_UNKNOWN = 100.0  # standard deviation of a parameter before the data, in plausible sizes
 _FREEDOM = 4.0  # degrees of freedom of the half Student prior of a standard deviation
 _LEAST, _MOST = -6.0, 5.0  # logarithm of the standard deviations over their plausible size
 #: Logarithm of the standard deviations, over their plausible size, that are integrated.
@@ -49,9 +45,6 @@ _STEPS = 200  # of a search, at most
 _FALLS = 0.2  # slope over that before the step, above which the curvature is computed anew
 _FLATTEST = 0.1  # curvature of a step, at least
 _ROUNDING = 1e-10  # of a log density
-_POINTS = 64  # quasi-random points; a power of 2
-_FLATTER = 0.8  # power of the densities from which these are drawn
-_EVERYWHERE = 1e-4  # smallest share of an interval between two nodes of these densities
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,8 +166,7 @@ def most_probable(H: Array, h: Array, unit: Array | None, scale: Array, first: A
         h: As in ``evidence``.
         unit: As in ``evidence``.
         scale: Plausible standard deviation of each parameter, shape (q,).
-        first: Logarithm of the deviations over the scale at the start, shape (levels, n, b). The
-            parameters after the first n are slopes: they have no deviation.
+        first: Logarithm of the deviations over the scale at the start, shape (levels, q, b).
 
     Raises:
         NotConvergedError: If the search does not end.
@@ -183,11 +175,10 @@ def most_probable(H: Array, h: Array, unit: Array | None, scale: Array, first: A
         Gelman (2006), Prior distributions for variance parameters in hierarchical models, section
         2.2 (half Student prior).
     """
-    shape, n = first.shape, first.shape[1]
+    shape = first.shape
 
     def deviation_of(z: Array) -> Array:
-        deviation = np.zeros((shape[0], len(scale), z.shape[-1]))
-        deviation[:, :n] = scale[:n, None] * np.exp(z.reshape(*shape[:2], -1))
+        deviation: Array = scale[:, None] * np.exp(z.reshape(*shape[:2], -1))
         return deviation
 
     def density(z: Array, own: Array) -> tuple[Array, Array]:
@@ -195,7 +186,7 @@ def most_probable(H: Array, h: Array, unit: Array | None, scale: Array, first: A
         variance = deviation_of(z) ** 2
         at = own if H.shape[2] > 1 else np.zeros(1, dtype=int)
         found = evidence(H[:, :, at], h[:, at], unit, scale, variance)
-        slope = (2.0 * variance * found.slope)[:, :n].reshape(z.shape)
+        slope = (2.0 * variance * found.slope).reshape(z.shape)
         rises = 1.0 - (_FREEDOM + 1.0) / (1.0 + _FREEDOM * np.exp(-2.0 * z))
         return found.log_likelihood + log_prior(z).sum(axis=0), slope + rises
 
@@ -270,64 +261,6 @@ def on_grid(
     return Grid(np.sqrt(d), likelihood + log_prior(GRID), mean, variance, alone)
 
 
-def over_all(
-    H: Array, h: Array, unit: Array | None, scale: Array, deviation: Array, level: int, p: int
-) -> tuple[Array, Evidence]:
-    """Return models whose standard deviations are all integrated, and their log weights, (b,).
-
-    That of parameter p at a level is on every second point of ``GRID``. The others are
-    quasi-random points: each has its own density, flattened, at the most probable values of the
-    others. The weights are those of importance sampling.
-
-    Args:
-        H: As in ``evidence``, of one model.
-        h: As in ``evidence``.
-        unit: As in ``evidence``.
-        scale: Plausible standard deviation of each parameter, shape (q,).
-        deviation: The most probable standard deviations, shape (levels, q); those of slopes are 0.
-        level: The level.
-        p: The parameter.
-
-    References:
-        Geweke (1989), Bayesian inference in econometric models using Monte Carlo integration
-        (importance sampling). Sobol (1967), On the distribution of points in a cube (points).
-    """
-    from scipy.stats import qmc  # takes long to import
-
-    varies = deviation > 0.0
-    own = int(np.flatnonzero(np.flatnonzero(varies.ravel()) == level * len(scale) + p)[0])
-    scales = np.broadcast_to(scale, deviation.shape)[varies]
-
-    def models(z: Array) -> Evidence:  # z: (n, b)
-        variance = np.zeros((*deviation.shape, z.shape[1]))
-        variance[varies] = (scales[:, None] * np.exp(z)) ** 2
-        return evidence(H, h, unit, scale, variance)
-
-    n, nodes = len(scales), GRID[::2]
-    g = len(nodes)
-    z = np.repeat(np.log(deviation[varies] / scales)[:, None], n * g, axis=1)
-    z[np.repeat(np.arange(n), g), np.arange(n * g)] = np.tile(nodes, n)
-    log_density = models(z).log_likelihood + log_prior(z).sum(axis=0)
-    log_density = log_density.reshape(n, g)
-    flat = np.exp(_FLATTER * (log_density - log_density.max(axis=1, keepdims=True)))
-    share = flat[:, 1:] + flat[:, :-1]  # of the intervals of the nodes
-    share = share / share.sum(axis=1, keepdims=True) + _EVERYWHERE
-    edges = np.cumsum(np.insert(share, 0, 0.0, axis=1), axis=1)
-    edges, share = edges / edges[:, -1:], share / edges[:, -1:]
-    u = qmc.Sobol(n, scramble=False).random(_POINTS).T + 0.5 / _POINTS
-    z, log_proposal = np.empty((n, _POINTS)), np.zeros(_POINTS)
-    for k in range(n):
-        z[k] = np.interp(u[k], edges[k], nodes)
-        if k != own:
-            place = np.searchsorted(edges[k], u[k], side="right") - 1
-            log_proposal += np.log(share[k, place])
-    z = np.repeat(z, g, axis=1)
-    z[own] = np.tile(nodes, _POINTS)
-    found = models(z)
-    log_target = found.log_likelihood + log_prior(z).sum(axis=0)
-    return log_target - np.repeat(log_proposal, g), found
-
-
 def by_unit(W: Array, w: Array, unit: Array) -> tuple[Array, Array]:
     """Return the sums of the information W and W x over the runs of each unit.
 
@@ -356,7 +289,7 @@ def prior_of(scale: Array) -> Array:
     Args:
         scale: Plausible standard deviation of each parameter, shape (q,).
     """
-    information: Array = (UNKNOWN * scale) ** -2.0
+    information: Array = (_UNKNOWN * scale) ** -2.0
     return information
 
 

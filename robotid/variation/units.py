@@ -4,15 +4,19 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.special
 
 from robotid._typing import Array
 from robotid.variation.groups import FEWEST_RUNS
-from robotid.variation.history import steps_of
 from robotid.variation.mixed_effects import MixedEffects, Prediction, Runs
 
-__all__ = ["UnlikeUnit", "between_units"]
+__all__ = ["FALSE_ALARMS", "UnlikeUnit", "between_units"]
 
+#: Probability that one of all alike units is named.
+FALSE_ALARMS = 0.02
 _SCALE = 0.1  # smallest plausible standard deviation between units, over the parameter's size
+_GRID = 32  # standard deviations between units over which a test is integrated
+_LEAST, _MOST = 0.05, 30.0  # their range, over the smallest standard error, over the scatter
 
 
 @dataclass(frozen=True)
@@ -49,8 +53,7 @@ def between_units(
     while len(left) > FEWEST_RUNS:
         k = _farthest(values[left], std_errors[left])
         order = [*left[:k], *left[k + 1 :], left[k]]
-        steps = steps_of(values[order, None], std_errors[order, None])
-        probability = float(steps.probability[0, -1])
+        probability = _probability(values[order], std_errors[order])
         if probability >= level:
             break
         unlike.append(UnlikeUnit(left.pop(k), probability))
@@ -64,6 +67,26 @@ def between_units(
     one = np.zeros(len(left), dtype=int)  # a unit has one estimate here: it is the lowest level
     model = MixedEffects(Runs(H, H[:, 0] * own[:, None], one, np.array([scale])))
     return model.predict()[0], _sorted(unlike)
+
+
+def _probability(values: Array, std_errors: Array) -> float:
+    """Return the two-sided probability of the last value without a difference from the others.
+
+    The means of both, and the logarithm of the spread, have flat priors: without standard errors
+    this is the t-test, whose level holds for any spread.
+    """
+    x, error = values - np.median(values), float(std_errors.min())
+    low, high = _LEAST * error, _MOST * max(float(np.std(values)), error)
+    s = np.exp(np.linspace(np.log(low), np.log(high), _GRID))[:, None]
+    w = 1.0 / (s**2 + std_errors**2)  # (grid, u)
+    others, own = w[:, :-1], w[:, -1]
+    total = others.sum(axis=1)
+    mean = others @ x[:-1] / total
+    misfit = (others * (x[:-1] - mean[:, None]) ** 2).sum(axis=1)
+    density = 0.5 * (np.log(w).sum(axis=1) - misfit - np.log(total) - np.log(own))
+    weight = np.exp(density - density.max())
+    beyond = 2.0 * scipy.special.ndtr(-np.abs(x[-1] - mean) / np.sqrt(1.0 / total + 1.0 / own))
+    return float(weight @ beyond / weight.sum())
 
 
 def _farthest(values: Array, std_errors: Array) -> int:

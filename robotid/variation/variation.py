@@ -9,13 +9,6 @@ import numpy as np
 
 from robotid._typing import Array
 from robotid.variation.causes import evidence_by_group
-from robotid.variation.covariates import (
-    Effect,
-    at_temperature,
-    effects_of,
-    model_of,
-    with_effects,
-)
 from robotid.variation.groups import FEWEST_RUNS, RunsOf
 from robotid.variation.mixed_effects import MixedEffects, Prediction, covariance_of
 
@@ -25,7 +18,6 @@ __all__ = [
     "Variation",
     "VaryingParameter",
     "between_covariance",
-    "effects_by_log",
     "shrunk_correlation",
     "vary",
 ]
@@ -47,9 +39,8 @@ class VaryingParameter:
             units and of the next unit, if there are several.
         within: Most probable spread between runs of one unit, if there are several units.
         values: Its value in each run, shape (k,): the run's own and the mean, weighted by their
-            information; at the mean temperature and time if these have effects.
+            information.
         std_errors: Their standard errors, shape (k,).
-        effects: Effects of temperature and time. Prediction and spread are those at their means.
     """
 
     name: str
@@ -58,22 +49,6 @@ class VaryingParameter:
     values: Array
     std_errors: Array
     within: float | None = None
-    effects: tuple[Effect, ...] = ()
-
-    @property
-    def seen_ends(self) -> Array:
-        """Ends of the 95 % interval of the next run at any temperature and time of the runs, (2,).
-
-        It is the prediction interval if these have no effect.
-        """
-        low, high = self.prediction.ends
-        for each in self.effects:
-            if each.is_used:
-                own = each.covariate.values
-                ends = np.array([each.interval(float(x)) for x in (own.min(), own.max())])
-                low += min(ends[:, 0].min() - self.prediction.ends[0], 0.0)
-                high += max(ends[:, 1].max() - self.prediction.ends[1], 0.0)
-        return np.array([low, high])
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values, as result.json has them."""
@@ -86,8 +61,6 @@ class VaryingParameter:
             "spread_interval": found.spread_ends.tolist(),
             **({} if self.within is None else {"spread_within_units": self.within}),
             "next_interval": found.ends.tolist(),
-            **({"seen_interval": self.seen_ends.tolist()}
-               if any(each.is_used for each in self.effects) else {}),
             "next_quantiles": found.quantiles(SCORES).tolist(),
             "one_more": {
                 "std_error": found.after[0],
@@ -95,9 +68,7 @@ class VaryingParameter:
             },
             "by_log": self.values.tolist(),
             "std_error_by_log": self.std_errors.tolist(),
-            **({"effects": {each.covariate.name: each.to_dict() for each in self.effects}}
-               if self.effects else {}),
-        }  # fmt: skip
+        }
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,7 +169,6 @@ def vary(
     if len(names) < FEWEST_RUNS or not groups:
         return None
     parameters: list[VaryingParameter] = []
-    groups = with_effects(groups)
     models = [MixedEffects(group.runs) for group in groups]
     for group, model in zip(groups, models, strict=True):
         if group.group.kind == "drive":
@@ -208,7 +178,7 @@ def vary(
     n_units = int(unit.max()) + 1
     compared_units = np.arange(n_units if n_units > FEWEST_RUNS else 0)
     compared_runs = np.arange(len(names) if len(names) > FEWEST_RUNS else 0)
-    size = sum(group.runs.n_varying for group in groups)
+    size = sum(len(group.runs.scale) for group in groups)
     n_tests = size * (len(compared_units) + len(compared_runs))
     unlike_units = _unlike(pairs, compared_units, n_tests, is_unit=True)
     different = [each.run for each in unlike_units]
@@ -220,32 +190,20 @@ def vary(
     )  # fmt: skip
 
 
-def between_covariance(
-    variation: Mapping[str, Any],
-    names: Sequence[str],
-    temperature: float | Mapping[str, float] | None = None,
-) -> Array:
+def between_covariance(variation: Mapping[str, Any], names: Sequence[str]) -> Array:
     """Return the covariance of parameters in the next run that the fit to all runs lacks.
 
     Standard deviations are the medians of the spreads: between runs, or between units and between
-    the runs of a unit. Temperature and time of the next run are as those of the runs. At a stated
-    temperature, it is the mean square about the fit: its effect d, known but for the error of the
-    slope, adds d d^T.
+    the runs of a unit.
 
     Args:
         variation: As of ``Variation.to_dict``.
         names: Names of p parameters.
-        temperature: As of ``at_temperature``; None: any of the runs.
 
     Returns:
         Shape (p, p); 0 for parameters that do not vary.
-
-    Raises:
-        DataError: As ``at_temperature``.
     """
     at = {name: k for k, name in enumerate(names)}
-    if temperature is not None:
-        variation = at_temperature(variation, temperature)
     parameters = variation["parameters"]
     own = [k for k, name in enumerate(parameters) if name in at]
     places = [at[name] for name in parameters if name in at]
@@ -255,31 +213,6 @@ def between_covariance(
     found = np.zeros((len(names), len(names)))
     R = np.array(variation["correlation"])[np.ix_(own, own)]
     found[np.ix_(places, places)] = std[:, None] * R * std
-    moved = effects_by_log(entries)
-    if len(moved):
-        found[np.ix_(places, places)] += np.cov(moved.T).reshape(len(places), len(places))
-    change, error = np.array([e.get("change", (0.0, 0.0)) for e in entries]).reshape(-1, 2).T
-    found[np.ix_(places, places)] += np.outer(change, change) + np.diag(error**2)
-    return found
-
-
-def effects_by_log(entries: Sequence[Mapping[str, Any]]) -> Array:
-    """Return the deviations of parameters by effects of temperature and time, shape (k, m).
-
-    Without an effect, k is 0.
-
-    Args:
-        entries: As of ``VaryingParameter.to_dict``, m items.
-    """
-    own = [
-        (p, each)
-        for p, entry in enumerate(entries)
-        for each in entry.get("effects", {}).values()
-        if each["is_used"]
-    ]
-    found = np.zeros((len(own[0][1]["by_log"]) if own else 0, len(entries)))
-    for p, each in own:
-        found[:, p] += each["slope"] * (np.array(each["by_log"]) - each["mean"])
     return found
 
 
@@ -320,23 +253,19 @@ def shrunk_correlation(values: Array) -> Array:
     return np.where(off, left[:, None] * r * left, 1.0)
 
 
-def _parameters(group: RunsOf, every: MixedEffects) -> Iterator[VaryingParameter]:
+def _parameters(group: RunsOf, model: MixedEffects) -> Iterator[VaryingParameter]:
     """Yield the parameters of a group on which the runs have information."""
-    of_every = every.with_one_more()
-    known = np.einsum("kpp->p", group.runs.H) > 0.0
-    for p in range(len(of_every)):
+    known, (values, errors) = np.einsum("kpp->p", group.runs.H) > 0.0, model.values
+    for p, prediction in enumerate(model.with_one_more()):
         if known[p]:
-            centre, model = float(group.centre[p]), model_of(group, every, p)
-            predictions = of_every if model is every else model.with_one_more()
-            values, errors = model.values
+            centre = float(group.centre[p])
             yield VaryingParameter(
                 group.group.parameters[p],
                 group.group.units[p],
-                predictions[p].shifted(centre),
+                prediction.shifted(centre),
                 centre + values[:, p],
                 errors[:, p],
                 float(model.deviation[0, p]) if model.n_levels == 2 else None,
-                effects_of(group, model, p),
             )
 
 
@@ -353,19 +282,18 @@ def _unlike(
     for k in np.flatnonzero(least * n_tests < _FALSE_ALARMS):
         at = int(which[k])
         is_own = unit == at if is_unit else np.arange(len(unit)) == at
-        moved = [group.runs.seen_from(group.runs.means_of(is_own)) for group in groups]
         others = [
-            MixedEffects(runs.without_unit(at) if is_unit else runs.without(at), every.deviation)
-            for runs, (_, every) in zip(moved, pairs, strict=True)
+            MixedEffects(
+                group.runs.without_unit(at) if is_unit else group.runs.without(at), every.deviation
+            )
+            for group, every in pairs
         ]
         evidence = evidence_by_group(
             groups, [each.deviation for each in others], is_own, is_unit=is_unit
         )
         known = [g for g, probability in enumerate(found) if np.isfinite(probability[k])]
         best = max(known, key=lambda g: evidence[g])
-        own = MixedEffects(moved[best], pairs[best][1].deviation).against_others(
-            which[k : k + 1], is_unit=is_unit
-        )
+        own = pairs[best][1].against_others(which[k : k + 1], is_unit=is_unit)
         x, variance = own.values[0], np.diag(own.covariance[0])
         expected = others[best].predict(variance, x, is_unit=is_unit)
         p, group = int(np.argmin([each.probability for each in expected])), groups[best]

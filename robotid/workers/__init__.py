@@ -1,3 +1,3 @@
-"""Parallel processing of long logs: worker processes, Dask clusters and checkpoints."""
+"""Parallel processing of long logs: worker processes, Dask clusters, checkpoints of fleets."""
 
 __all__: list[str] = []

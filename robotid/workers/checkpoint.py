@@ -1,4 +1,4 @@
-"""Checkpoints: finished pieces of a long reduction, stored until it is complete."""
+"""Checkpoints: finished pieces of long work, stored until it is complete."""
 
 import errno
 import hashlib
@@ -18,7 +18,6 @@ import numpy as np
 from robotid._files import written_whole
 from robotid._typing import Array
 from robotid.exceptions import DataError
-from robotid.regressor.factors import Reduction
 from robotid.workers.pieces import Workload
 
 __all__ = ["FOLDER", "Checkpoint", "released_on_error"]
@@ -83,7 +82,7 @@ class Checkpoint:
     folder: Path
     key: str  # SHA-256 of all inputs of the results, in hexadecimal
     lock: _Lock
-    kind: type[_Stored] = Reduction  # of the results
+    kind: type[_Stored]  # of the results
 
     @classmethod
     def open(
@@ -91,9 +90,9 @@ class Checkpoint:
         parent: str | Path,
         inputs: Mapping[str, Any],
         pieces: Sequence[Workload],
+        kind: type[_Stored],
         *,
         resume: bool = False,
-        kind: type[_Stored] = Reduction,
     ) -> "Checkpoint":
         """Open the checkpoint of work on pieces; an old one is replaced unless it is resumed.
 
@@ -101,8 +100,8 @@ class Checkpoint:
             parent: Folder of the results; created if it does not exist.
             inputs: All inputs of the work, as JSON values.
             pieces: The pieces.
-            resume: Whether finished pieces of an interrupted run are used.
             kind: Type of the results, with ``to_arrays`` and ``from_arrays``.
+            resume: Whether finished pieces of an interrupted run are used.
 
         Raises:
             DataError: If the checkpoint to resume has other inputs or cannot be read, or another
@@ -158,7 +157,7 @@ class Checkpoint:
                 content = dict(arrays)
         except Exception as error:  # a damaged archive raises various exceptions
             raise DataError(
-                f"{path} cannot be read ({error}). Delete it; its piece is then reduced again",
+                f"{path} cannot be read ({error}). Delete it; its piece is then worked on again",
                 "checkpoint",
             ) from error
         if str(content.pop("key")) != self.key:
@@ -211,17 +210,16 @@ class Checkpoint:
 
 
 @contextmanager
-def released_on_error(checkpoint: Checkpoint | None) -> Iterator[None]:
+def released_on_error(checkpoint: Checkpoint) -> Iterator[None]:
     """Release a checkpoint if the work in the context fails, so that it can be resumed.
 
     Args:
-        checkpoint: The checkpoint, if there is one.
+        checkpoint: The checkpoint.
     """
     try:
         yield
     except BaseException:
-        if checkpoint is not None:
-            checkpoint.release()
+        checkpoint.release()
         raise
 
 

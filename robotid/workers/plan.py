@@ -1,4 +1,4 @@
-"""Distribution of pieces of long logs to workers, with progress and checkpoints."""
+"""Distribution of work to workers, with progress and checkpoints."""
 
 import logging
 from collections.abc import Iterator, Sequence
@@ -29,7 +29,7 @@ class WorkPlan:
 
     workers: int | None = 1  # worker processes; None: one per core for long work
     scheduler: str | None = None  # address of a Dask scheduler, whose workers are used instead
-    resume: bool = False  # whether an interrupted run continues from its checkpoint
+    resume: bool = False  # whether an interrupted fleet continues from its checkpoint
     progress: ProgressCallback | None = None  # called with work, samples done, total, "samples"
     _reused: Backend | None = field(default=None, init=False, repr=False)
     _reuses: bool = field(default=False, init=False, repr=False)
@@ -41,7 +41,7 @@ class WorkPlan:
     @property
     def is_asked_for(self) -> bool:
         """Whether settings differ from the defaults; short logs have no use for them."""
-        return self.resume or self.scheduler is not None or (self.workers or 1) > 1
+        return self.scheduler is not None or (self.workers or 1) > 1
 
     def __enter__(self) -> Self:
         self._reuses = True
@@ -70,16 +70,13 @@ class WorkPlan:
         workers = choose_workers(pieces, self.workers)
         return ProcessBackend(workers) if workers > 1 else SerialBackend()
 
-    def reduce(
-        self, pieces: Sequence[Piece], *, checkpoint: Checkpoint | None = None
-    ) -> Iterator[Reduction]:
+    def reduce(self, pieces: Sequence[Piece]) -> Iterator[Reduction]:
         """Yield one reduction per piece, in order, as ``map`` does; ``join`` combines them.
 
         Args:
             pieces: The pieces.
-            checkpoint: As in ``map_pieces``.
         """
-        return self.map(reduce_piece, pieces, "reducing", checkpoint=checkpoint)
+        return self.map(reduce_piece, pieces, "reducing")
 
     def map(
         self,

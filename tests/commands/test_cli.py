@@ -77,7 +77,6 @@ def test_result_json_has_the_promised_shape(identified, logs):
         "poorly_excited": False,
         "undetermined": [],
         "indistinguishable": [],
-        "not_told_apart": [],  # until 0.3
     }
     assert len(result["base_parameters"]) == 58
     assert set(result["base_parameters"][0]) == {

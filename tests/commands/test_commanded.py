@@ -7,7 +7,6 @@ from helpers.replay_data import leave_out_meshes, shown
 
 from robotid.cli import main
 from robotid.cli.identify import show_result
-from robotid.export.former_keys import from_former_keys
 from robotid.robot.examples import example_urdf
 from robotid.robot.tree import read_tree
 
@@ -66,7 +65,7 @@ def folder(found):
 
 @pytest.fixture
 def result(folder):
-    return from_former_keys(json.loads((folder / "result.json").read_text()))
+    return json.loads((folder / "result.json").read_text())
 
 
 def test_a_job_of_commands_writes_what_other_jobs_write(folder, result):
@@ -154,7 +153,7 @@ def test_what_was_found_is_printed_with_its_values(folder, result, capsys, tmp_p
 
 
 def test_json_is_the_result(found, result):
-    assert from_former_keys(json.loads(found[1])) == result
+    assert json.loads(found[1]) == result
 
 
 def test_a_log_without_commands_ends_with_one_sentence(tmp_path, job, capsys, ur5):

@@ -10,15 +10,13 @@ import numpy as np
 import pytest
 
 from robotid.cli import excite, main
-from robotid.commands.excite import _designer, _expected, _log
-from robotid.commands.job import Job, read_job
+from robotid.commands.excite import _designer, _expected
+from robotid.commands.job import Job
 from robotid.excitation.clearance import Box
 from robotid.excitation.design import Designer
 from robotid.excitation.settings import MotionSettings
 from robotid.log_files.formats import open_table
-from robotid.log_files.read import read_log
 from robotid.logs.settings import LogSource, SignalSettings
-from robotid.regressor.constraints import logged_base
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 from robotid.simulation.motions import random_fourier
@@ -337,17 +335,6 @@ def test_what_is_expected_of_a_motion_rests_on_the_noise_that_is_stated(pan_tilt
     assert found.before is None
 
 
-def test_the_table_of_a_motion_on_the_feet_ends_with_the_motion():
-    asked = []
-    motion = SimpleNamespace(evaluate=lambda t: asked.append(t) or "state")
-    stand = SimpleNamespace(log=lambda *words: words)
-    design = SimpleNamespace(motion=motion, duration=2.06)
-    state, t, path = _log(stand, design, MotionSettings(points=10.0), "squat.csv")
-    assert (state, path) == ("state", "squat.csv")
-    np.testing.assert_allclose(t, np.arange(22) / 10.0)
-    np.testing.assert_allclose(asked[0], np.minimum(t, 2.06))
-
-
 def test_a_box_is_kept_away_from_and_a_seed_makes_the_same_motion_again(pan_tilt, capsys):
     """The tilting link is a cube of 5 cm that turns about its centre: a wall is 6 cm from it."""
 
@@ -428,121 +415,13 @@ def stated_by_flags(*words):
     return excite.motion_settings(parser.parse_args(["arm.urdf", "--out", "m.csv", *words]))
 
 
-STANDING = """
-urdf = {urdf}
-free_flyer = true
-[signals]
-cutoff = 15.0
-[model]
-friction = "none"
-[[contact]]
-frame = "FL_foot"
-[[contact]]
-frame = "FR_foot"
-[[contact]]
-frame = "RL_foot"
-[[contact]]
-frame = "RR_foot"
-"""
-ALONE = ["--clearance", "none"]
-BENT = [
-    word
-    for leg in ("FL", "FR", "RL", "RR")
-    for joint, x in (("thigh", 0.8), ("calf", -1.6))
-    for word in ("--posture", f"{leg}_{joint}_joint={x}")
-]
-
-
-@pytest.fixture(scope="module")
-def on_feet(tmp_path_factory):
-    """Return the words that design a motion of Go1 on its feet."""
-    job = tmp_path_factory.mktemp("go1") / "go1.toml"
-    job.write_text(STANDING.format(urdf=json.dumps(str(example_urdf("go1.urdf")))))
-    return [
-        "excite", str(job), *BENT, "--duration", "4", "--harmonics", "2", "--starts", "1",
-        "--seconds", "0.01",
-    ]  # fmt: skip
-
-
-@pytest.fixture(scope="module")
-def squat(on_feet, tmp_path_factory):
-    """What is printed of a motion on three feet, and the folder that it is in."""
-    folder, printed = tmp_path_factory.mktemp("squat"), io.StringIO()
-    words = [*ALONE, "--lifted", "FR_foot", "--friction-coefficient", "0.4", "--json"]
-    words += ["--out", str(folder / "squat.csv"), "--report", str(folder / "page.html")]
-    with redirect_stdout(printed):
-        assert main([*on_feet, *words]) == 0
-    return json.loads(printed.getvalue()), folder
-
-
-def test_a_motion_on_the_feet_is_written_with_the_job_that_identifies_it(squat, tmp_path):
-    content, folder = squat
-    limits = content["limits"]
-    assert set(limits) == {"position", "velocity", "torque", "vertical force", "friction"}
-    assert all(0.0 <= entry["margin"] < 1.0 for entry in limits.values())
-    assert re.fullmatch(r"0\.\d\d, wanted 0.36 or less", limits["friction"]["words"])
-    assert content["feasible"] is True
-    assert len(content["joints"]) == 12
-    assert "Forces of the ground" in (folder / "page.html").read_text()
-    job = read_job(content["job"])
-    assert [(x.frame, x.always) for x in job.contacts] == [
-        ("FL_foot", True), ("RL_foot", True), ("RR_foot", True)
-    ]  # fmt: skip
-    assert job.signals.cutoff == 15.0
-    assert job.identification[0].path == folder / "squat_recorded.csv"
-    model = job.model()
-    log = read_log(
-        folder / "squat.csv", joints=model.joints, base=logged_base(model), needs="motion"
-    )
-    assert np.abs(np.ptp(log.base.pose[:, :3], axis=0)).min() > 1e-3
-    # the forces of the written motion by simulate's dynamics, which shares the least norm only
-    where = ["simulate", content["job"], str(folder / "squat.csv"), "--controller", "perfect"]
-    assert main([*where, "--out", str(tmp_path / "squat_recorded.csv"), "--rate", "100"]) == 0
-    simulated = read_log(tmp_path / "squat_recorded.csv", joints=model.joints)
-    used = np.abs(simulated.tau).max(axis=0) / [joint.effort for joint in model.limits]
-    wanted = 0.9 * (1.0 - limits["torque"]["margin"])  # with assumed friction of 5 %
-    assert used.max() == pytest.approx(wanted, abs=0.06)
-
-
-def test_the_terminal_names_the_margins_of_the_ground(on_feet, squat, monkeypatch, capsys):
-    content, folder = squat
-    monkeypatch.setattr("robotid.commands.excite.design_motion", lambda *_, **__: content)
-    assert main([*on_feet, *ALONE, "--out", str(folder / "squat.csv")]) == 0
-    said = capsys.readouterr().out
-    assert re.search(r"vertical force +\d+\.\d %  R?F?[LR]_foot at \d\.\d\d s: ", said)
-    assert re.search(r"friction +\d+\.\d %  ", said)
-    assert str(folder / "squat.identify.toml") in said.replace("\n", "")
-
-
-@pytest.mark.parametrize(
-    ("words", "expected"),
-    [
-        ([*ALONE, "--kind", "sweeps"], "kind 'sweeps' is stated for go1, whose base floats"),
-        ([*ALONE, "--max-jerk", "FL_calf_joint=9"], "a jerk limit is stated for go1"),
-        (
-            [*ALONE, "--share", "0.25"],
-            "in the first posture FL_thigh_joint needs at least 170 % of its position limit",
-        ),
-        (
-            ["--clearance", "0.02", "--lifted", "FR_foot"],
-            "in the first posture the distance of FR_calf and the floor is -5.7 mm",
-        ),
-        ([*ALONE, "--out", "motion.yaml"], "motions on the feet are written as .csv"),
-    ],
-)
-def test_what_a_stand_cannot_do_is_refused(on_feet, words, expected, tmp_path, capsys):
-    out = [] if "--out" in words else ["--out", str(tmp_path / "motion.csv")]
-    assert main([*on_feet, *out, *words]) in (1, 2)
-    said = " ".join(capsys.readouterr().err.split())
-    assert expected in said
-
-
-def test_feet_are_refused_for_a_fixed_base_and_wanted_for_a_floating_one(tmp_path, capsys):
-    out = ["--out", str(tmp_path / "motion.csv")]
-    assert main([*WORDS, *out, "--posture", "wrist_1_joint=0.1"]) == 2
-    assert "the base of ur10 is fixed" in " ".join(capsys.readouterr().err.split())
-    job = tmp_path / "go1.toml"
-    lines = STANDING.format(urdf=json.dumps(str(example_urdf("go1.urdf"))))
-    job.write_text(lines.partition("[[contact]]")[0])
-    assert main(["excite", str(job), *out]) == 2
-    assert "go1 has no contacts" in " ".join(capsys.readouterr().err.split())
+def test_a_floating_base_and_a_robot_with_contacts_are_refused(tmp_path, capsys):
+    for lines, found in (
+        ("free_flyer = true", "the base floats"),
+        ('[[contact]]\nframe = "FL_foot"', "the robot has contacts or loops"),
+    ):
+        job = tmp_path / "go1.toml"
+        job.write_text(f"urdf = {json.dumps(str(example_urdf('go1.urdf')))}\n{lines}\n")
+        assert main(["excite", str(job), "--out", str(tmp_path / "motion.csv")]) == 1
+        said = " ".join(capsys.readouterr().err.split())
+        assert f"{found}; motion design needs a robot with a fixed base" in said

@@ -82,7 +82,7 @@ def test_a_name_in_the_log_needs_its_joint():
 
 def test_words_that_identify_again_leave_out_what_is_only_shown():
     words = ["identify", "arm.urdf", "a.csv", "--out", "there", "--json", "--cutoff", "5"]
-    words += ["--verbose", "--out=here", "--validate", "b.csv", "--progress", "--resume"]
+    words += ["--verbose", "--out=here", "--validate", "b.csv", "--progress"]
     assert source_words(words) == ("arm.urdf", "a.csv", "--cutoff", "5", "--validate", "b.csv")
 
 
@@ -186,43 +186,41 @@ class Heard(Exception):
 
 
 JOB_OF_FLAGS = SimpleNamespace(workers=2)
-UNSTATED = dict.fromkeys(("step", "delay", "samples", "seed", "temperature"))
+UNSTATED = dict.fromkeys(("step", "delay", "samples", "seed"))
 FORWARDED = {
-    "validate out a.csv b.csv --temperature 12 --time 2.5 --unit x --update": (
+    "validate out a.csv b.csv --unit x --update": (
         "validate.validate_result",
-        ("out", [LogEntry(Path(x), temperature=12.0, time=2.5, unit="x")
-                 for x in ("a.csv", "b.csv")]),
-        {"update": True},
+        ("out", [LogEntry(Path(x), unit="x") for x in ("a.csv", "b.csv")]), {"update": True},
     ),
     "report out --out p.html": ("report.rewrite_report", ("out", "p.html"), {"progress": ANY}),
     "export out --format mjcf --out a.xml --step 0.002 --delay filter": (
         "export.export_result", ("out", "mjcf", "a.xml"),
         UNSTATED | {"step": 0.002, "delay": "filter"},
     ),
-    "export out --format ranges --out a.yaml --samples 5 --seed 3 --temperature 31.5": (
+    "export out --format ranges --out a.yaml --samples 5 --seed 3": (
         "export.export_result", ("out", "ranges", "a.yaml"),
-        UNSTATED | {"samples": 5, "seed": 3, "temperature": 31.5},
+        UNSTATED | {"samples": 5, "seed": 3},
     ),
     "payload u a.csv --reference c --reference d --link x --link y --mass x=2 --gains": (
         "payload.measure_payload", (JOB_OF_FLAGS, ["c", "d"]),
         {"links": ["x", "y"], "masses": ["x=2"], "find_gains": True, "progress": ANY},
     ),
-    "preview u a.csv --given out --noise a=0.2 --noise b=3 --correlation 0.3 --temperature 35": (
+    "preview u a.csv --given out --noise a=0.2 --noise b=3 --correlation 0.3": (
         "preview.preview_job", (JOB_OF_FLAGS, "out"),
-        {"noise": {"a": 0.2, "b": 3.0}, "correlation": 0.3, "temperature": 35.0},
+        {"noise": {"a": 0.2, "b": 3.0}, "correlation": 0.3},
     ),
     "track u a.csv --out there": ("track.run_track", (JOB_OF_FLAGS, "there"), {}),
     "track u a.csv --out there --serve 8123 --speed 2.5": (
         "track.serve_track", (JOB_OF_FLAGS, "there"),
         {"port": 8123, "speed": 2.5, "announce": ANY, "finished": ANY},
     ),
-    "identify u a.csv --out there --workers 3 --resume": (
+    "identify u a.csv --out there --workers 3": (
         "identify.run_job", (JOB_OF_FLAGS, "there"),
-        {"plan": WorkPlan(3, None, True, ANY), "source": ANY},
+        {"plan": WorkPlan(3, progress=ANY), "source": ANY},
     ),
     "identify u a.csv --scheduler tcp://host:8786": (
         "identify.run_job", (JOB_OF_FLAGS, "robotid-out"),
-        {"plan": WorkPlan(2, "tcp://host:8786", False, ANY), "source": ANY},  # workers of the job
+        {"plan": WorkPlan(2, "tcp://host:8786", progress=ANY), "source": ANY},  # workers of the job
     ),
     "replay u a.csv --ghost g.csv --html p.html": (
         "replay.replay_files", (JOB_OF_FLAGS, ANY), {"ghost": "g.csv"}

@@ -11,9 +11,7 @@ from robotid.closed_loop.settings import LoopSettings
 from robotid.commands import logs as module
 from robotid.commands.job import Job, LogEntry
 from robotid.commands.logs import (
-    checkpoint_inputs,
     examine_logs,
-    hours_of,
     locked_as_logged,
     log_of_commands,
     survey_logs,
@@ -204,30 +202,6 @@ def test_notes_of_a_long_log_are_told_once_and_its_looks_are_all_examined(hand, 
     assert found[-1] == "d"
 
 
-def test_a_checkpoint_is_of_all_fitted_logs_of_the_robot_and_of_what_reduces_them(hand, tmp_path):
-    (tmp_path / "bag").mkdir()
-    files = ("a.csv", "b.csv", "bag/0.db3", "bag/meta.yaml")
-    for k, name in enumerate(files):
-        (tmp_path / name).write_text("x" * (k + 3))
-    paths = [tmp_path / name for name in ("a.csv", "b.csv", "bag")]
-    job = replace(
-        hand,
-        identification=tuple(map(LogEntry, paths)),
-        validation=(LogEntry(tmp_path / "none.csv"),),
-        rows_in_memory=999,
-    )
-    found = checkpoint_inputs(job)
-    assert [list(log) for log in found["logs"]] == [
-        [str(tmp_path / "a.csv")], [str(tmp_path / "b.csv")],
-        [str(tmp_path / "bag" / "0.db3"), str(tmp_path / "bag" / "meta.yaml")],
-    ]  # fmt: skip
-    sizes = [about["size"] for log in found["logs"] for about in log.values()]
-    assert sizes == [3, 4, 5, 6]
-    assert found["settings"]["reduction"] == {"rows_in_memory": 999}
-    assert "validation" not in found["settings"]
-    assert found["settings"]["joints"] == ["ja", "slide"]
-
-
 @pytest.mark.parametrize(
     ("loop", "wanted"),
     [
@@ -255,16 +229,11 @@ def test_a_robot_hears_commands_the_gravity_of_its_urdf_or_torques(hand, monkeyp
 
 
 @pytest.mark.parametrize("at", [0, 1, 2])
-@pytest.mark.parametrize("key", ["unit", "time", "temperature"])
-def test_what_one_log_alone_does_not_state_is_named(key, at):
-    value = {"unit": "left", "time": 2.5, "temperature": 31.0}[key]
-    entries = [LogEntry(Path(f"{name}.csv"), **{key: value}) for name in "abc"]
-    read = units_of_logs if key == "unit" else hours_of
-    assert read(entries) == {"unit": ["left"] * 3, "time": [2.5] * 3}.get(key, [None] * 3)
-    entries[at] = replace(entries[at], **{key: "" if key == "unit" else None})
+def test_a_log_that_alone_has_no_unit_is_named(at):
+    entries = [LogEntry(Path(f"{name}.csv"), unit="left") for name in "abc"]
+    assert units_of_logs(entries) == ["left"] * 3
+    entries[at] = replace(entries[at], unit="")
     other = "b.csv" if at == 0 else "a.csv"
-    has = "unit = 'left'" if key == "unit" else f"{key} = {value}"
-    with pytest.raises(
-        SettingsError, match=f"^{'abc'[at]}.csv has no {key}, but {other} has {has}; "
-    ):
-        read(entries)
+    wanted = f"^{'abc'[at]}.csv has no unit, but {other} has unit = 'left'; "
+    with pytest.raises(SettingsError, match=wanted):
+        units_of_logs(entries)

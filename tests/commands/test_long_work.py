@@ -1,4 +1,4 @@
-"""Long logs on the command line: workers, cluster, Ctrl-C, resume; always the same result."""
+"""Long logs on the command line: workers, cluster, Ctrl-C; always the same result."""
 
 import json
 import os
@@ -17,7 +17,6 @@ from helpers.synthetic import exact_log, truth
 
 from robotid.cli import main
 from robotid.cli.console import terminal_progress
-from robotid.commands import identify as workflow
 from robotid.exceptions import SettingsError
 from robotid.log_files.read import write_log
 from robotid.robot.model import RobotModel
@@ -25,7 +24,6 @@ from robotid.workers.cluster import ClusterBackend
 from robotid.workers.plan import WorkPlan
 
 URDF = str(ROOT / "urdf" / "planar_2r.urdf")
-CHECKPOINT = ".robotid-checkpoint"
 HELD = ROOT / "tests" / "helpers" / "held.py"
 
 
@@ -57,10 +55,9 @@ def job(logs):
 
 @pytest.fixture(scope="module")
 def expected(job, tmp_path_factory):
-    """The result of an uninterrupted run in one process."""
+    """The result of a run in one process."""
     out = tmp_path_factory.mktemp("serial")
     assert main(["identify", job, "--workers", "1", "--out", str(out)]) == 0
-    assert not (out / CHECKPOINT).exists()
     return (out / "result.json").read_text()
 
 
@@ -95,11 +92,11 @@ def children(pid):
 
 
 def cut_off(job, out, number, workers, ended=None):
-    """Start the command line, send it a signal once three pieces are kept; code and stderr.
+    """Start the command line, send it a signal once three pieces are finished; code and stderr.
 
     The processes that it had started are added to ``ended``.
     """
-    mark = out.with_name("three pieces are kept")
+    mark = out.with_name("three pieces are finished")
     command = [sys.executable, HELD, mark, "3", "identify", job, "--out", out, "--workers", workers]
     run = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True)
     while not mark.exists():
@@ -112,29 +109,16 @@ def cut_off(job, out, number, workers, ended=None):
     return run.returncode, error
 
 
-def test_a_killed_run_resumes_to_the_same_bits_and_does_only_what_is_missing(
-    job, expected, tmp_path, capsys
-):
-    out = tmp_path / "out"
-    assert cut_off(job, out, signal.SIGKILL, "1")[0] == -signal.SIGKILL
-    assert [path.name for path in out.iterdir()] == [CHECKPOINT]
-    words = ["identify", job, "--workers", "1", "--out", str(out)]
-    assert main([*words, "--resume", "--verbose"]) == 0
-    assert "reducing 8 pieces, 3 of them finished before" in capsys.readouterr().err
-    assert (out / "result.json").read_text() == expected
-    assert not (out / CHECKPOINT).exists()
-
-
 @pytest.mark.parametrize(
-    ("number", "code", "count"), [(signal.SIGTERM, 143, 2), (signal.SIGHUP, 129, 1)]
+    ("number", "code", "count"),
+    [(signal.SIGINT, 130, 1), (signal.SIGTERM, 143, 2), (signal.SIGHUP, 129, 1)],
 )
-def test_a_signal_to_end_is_heard_as_ctrl_c_is(job, tmp_path, number, code, count):
+def test_a_signal_ends_a_run_with_one_line_and_without_files(job, tmp_path, number, code, count):
     out, workers = tmp_path / "out", []
     found, error = cut_off(job, out, number, str(count), workers)
     assert found == code
-    assert error.count("\n") == 1
-    assert error.startswith("robotid: interrupted; finished pieces are stored in ")
-    assert [path.name for path in out.iterdir()] == [CHECKPOINT]
+    assert error == "robotid: interrupted\n"
+    assert not out.exists()
     assert len(workers) >= (count if count > 1 else 0)
     end = time.monotonic() + 10
     while alive := [pid for pid in workers if Path(f"/proc/{pid}").exists()]:
@@ -142,62 +126,10 @@ def test_a_signal_to_end_is_heard_as_ctrl_c_is(job, tmp_path, number, code, coun
         time.sleep(0.02)
 
 
-def test_ctrl_c_ends_with_one_line_and_resumes_to_the_same_bits(job, expected, tmp_path):
-    out = tmp_path / "out"
-    code, error = cut_off(job, out, signal.SIGINT, "1")  # of workers: tests/workers
-    assert code == 130
-    assert error.count("\n") == 1
-    assert error.startswith("robotid: interrupted; finished pieces are stored in ")
-    assert [path.name for path in out.iterdir()] == [CHECKPOINT]
-    assert main(["identify", job, "--out", str(out), "--workers", "1", "--resume"]) == 0
-    assert (out / "result.json").read_text() == expected
-
-
-def break_off(job, out, monkeypatch):
-    """Run a job until its pieces are reduced, and no further."""
-
-    def interrupt(*_, **__):
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch:
-        patch.setattr(workflow, "conclude", interrupt)
-        assert main(["identify", job, "--out", out]) == 130
-
-
-def test_a_log_that_changed_since_is_refused_by_name(logs, tmp_path, capsys, monkeypatch):
-    for name in ("fit.csv", "keep.csv"):
-        (tmp_path / name).write_text((logs / name).read_text())
-    job, out = write_job(tmp_path, 1024), str(tmp_path / "out")
-    break_off(job, out, monkeypatch)
-    (tmp_path / "fit.csv").write_text((logs / "keep.csv").read_text())
-    assert main(["identify", job, "--out", out, "--resume"]) == 1
-    error = capsys.readouterr().err
-    assert "is the checkpoint of other inputs: logs[0]." in error
-    assert "fit.csv.changed was" in error
-
-
-def test_a_filter_or_a_robot_that_changed_since_is_refused_by_name(
-    logs, tmp_path, capsys, monkeypatch
-):
-    robot, out = tmp_path / "arm.urdf", str(tmp_path / "out")
-    robot.write_text(Path(URDF).read_text())
-    monkeypatch.setitem(globals(), "URDF", str(robot))
-    for name in ("fit.csv", "keep.csv"):
-        (tmp_path / name).symlink_to(logs / name)
-    break_off(write_job(tmp_path, 1024, "[signals]", "cutoff = 6.0"), out, monkeypatch)
-    job = write_job(tmp_path, 1024, "[signals]", "cutoff = 6.5")
-    assert main(["identify", job, "--out", out, "--resume"]) == 1
-    assert "other inputs: settings.signals.cutoff was 6.0, is 6.5." in capsys.readouterr().err
-    job = write_job(tmp_path, 1024, "[signals]", "cutoff = 6.0")
-    robot.write_text(robot.read_text() + "<!-- a later version -->")
-    assert main(["identify", job, "--out", out, "--resume"]) == 1
-    assert "other inputs: urdf_sha256 was" in capsys.readouterr().err
-
-
 def test_short_logs_have_no_use_of_workers_and_it_is_said(logs, tmp_path, capsys):
     words = ["identify", URDF, str(logs / "keep.csv"), "--out", str(tmp_path), "--workers", "2"]
     assert main([*words, "--no-report"]) == 0
-    assert "read whole: workers, scheduler and resume have no effect" in capsys.readouterr().err
+    assert "read whole: workers and scheduler have no effect" in capsys.readouterr().err
 
 
 def test_no_workers_are_wrong_usage(job, tmp_path, capsys):

@@ -13,7 +13,7 @@ from robotid.commands import preview
 from robotid.commands.identify import run_job
 from robotid.commands.job import LogEntry, job_from_settings
 from robotid.commands.preview import _motions
-from robotid.exceptions import DataError, SettingsError
+from robotid.exceptions import DataError
 from robotid.log_files.formats import write_columns
 from robotid.log_files.read import read_log, write_log
 from robotid.robot.examples import example_urdf
@@ -156,26 +156,19 @@ def test_noise_that_is_stated_is_that_of_every_preview(monkeypatch, given, is_ow
         "_motions": lambda job, model, entries: [str(entry.path) for entry in entries],
         "result_run": lambda job, path: (job, [before], "found", "a run"),
         "load_result": lambda path: SimpleNamespace(content=result),
-        "new_temperatures": lambda content, model, motions, stated: [
-            (content is result, model, *motions, stated)
-        ],
-        "stated_between": lambda content, model, warm: (content is result, model, warm),
+        "stated_between": lambda content, model: (content is result, model),
         "replace": lambda found, **own: heard.update(own),
         "file_sha256": str,
     }.items():
         monkeypatch.setattr(preview, name, stands_for)
-    warm = {"temperature": 21.5} if given and not is_own else {}
-    preview.preview_job(job, given, noise={"a": 0.2}, correlation=0.3, **warm)
+    preview.preview_job(job, given, noise={"a": 0.2}, correlation=0.3)
     if given and not is_own:
-        own = True, "found", "new.csv", 21.5
-        assert heard.pop("between") == ((True, "found", own),)
+        assert heard.pop("between") == ((True, "found"),)
     assert (heard.pop("noise"), heard.pop("correlation")) == ({"a": 0.2}, 0.3)
     wanted = {"model": "found" if given else "bare", "estimator": "wls"}
     wanted["motions"] = ["old.csv" if is_own else "new.csv"]
     assert heard == wanted | ({beside: "a run"} if beside else {})
     if is_own:
-        with pytest.raises(SettingsError, match="whose temperature is known; leave it out"):
-            preview.preview_job(job, given, temperature=21.5)
         job.identification = (LogEntry(Path("a.csv")), entry, LogEntry(Path("b.csv")))
         with pytest.raises(DataError, match=r"some of these motions, but not to a\.csv, b\.csv;"):
             preview.preview_job(job, given)

@@ -269,7 +269,7 @@ def test_the_expected_error_has_the_parts_of_fit_spread_and_residual(arm, rng, m
             recording=SimpleNamespace(trajectory=motion, mask=mask),
             torques={"estimate": tau - z * total},
         )
-        found = validate._expected(result, arm, evaluation, {})["expected"]
+        found = validate._expected(result, arm, evaluation)["expected"]
         assert found["with_spread"] is (spread is not None)
         for j, own in enumerate(found["per_joint"].values()):
             assert own["rmse"] == pytest.approx(np.sqrt(np.mean(total[:, j] ** 2)), rel=1e-9)

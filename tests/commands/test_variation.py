@@ -4,18 +4,15 @@ import json
 import re
 import shutil
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
 from helpers.driven import JOINTS, arm, driven_log
 from helpers.synthetic import truth
 
 from robotid.cli import main
 from robotid.cli.identify import show_result
 from robotid.cli.validate import _show as show_validation
-from robotid.commands.export import export_result
 from robotid.commands.identify import run_job
 from robotid.commands.job import LogEntry, job_from_settings
 from robotid.commands.logs import survey_logs
@@ -366,46 +363,26 @@ def test_a_new_log_that_differs_is_named_with_its_cause(result, folder, written,
     assert finding["message"].startswith(f"unit worn.csv: {COULOMB} is ")
 
 
-def test_robot_temperature_and_time_of_added_logs(written, capsys):
+def test_the_robot_of_added_logs_is_stated_if_that_of_others_is(written, capsys):
     file, log = written / "result.json", str(written / "more_0.csv")
     content = json.loads(file.read_text())
-    sums, degrees = content["variation"]["sums"], [10.0, 15.0, 22.0, 25.0]
-    assert (sums["unit"], sums["covariates"]) == ([""] * 4, {})
+    sums = content["variation"]["sums"]
+    assert sums["unit"] == [""] * 4
     sums["unit"] = ["a", "a", "b", "b"]
     for entry, unit in zip(content["settings"]["identification"], sums["unit"], strict=True):
         entry["unit"] = unit
-    hours = [0.0, 7.0, 3.0, 1.0]
-    for entry, hour in zip(content["settings"]["identification"], hours, strict=True):
-        entry["time"] = hour
-    sums["covariates"] = {
-        joint: [{"name": "temperature", "unit": "degC", "by_log": degrees},
-                {"name": "time", "unit": "h", "by_log": hours}] for joint in JOINTS
-    }  # fmt: skip
     file.write_text(json.dumps(content))
-    done = validate_result(file, [log])["variation"]  # robot and temperature unknown
+    done = validate_result(file, [log])["variation"]  # of an unknown robot
     assert done["units"] == 3
-    assert "effects" not in done["parameters"][COULOMB]
     with pytest.raises(SettingsError, match=r"more_0.csv has no unit, but run_0.csv has unit = .a"):
         validate_result(file, [log], update=True)
-    with pytest.raises(DataError, match="have the temperature of shoulder_lift_joint, but not all"):
-        validate_result(file, [LogEntry(Path(log), unit="b", time=5.0)], update=True)
-    with pytest.raises(SettingsError, match=r"more_0.csv has no time, but run_0.csv has time = 0"):
-        validate_result(file, [LogEntry(Path(log), unit="b", temperature=20.0)], update=True)
     assert json.loads(file.read_text()) == content
-    stated = ["--unit", "b", "--temperature", "31", "--time", "12.5"]
-    assert main(["validate", str(file), log, "--update", *stated]) == 0
+    assert main(["validate", str(file), log, "--update", "--unit", "b"]) == 0
     printed = " ".join(capsys.readouterr().out.split())
     assert "result.json counts these logs now: spread between 5 logs, by joint: coul" in printed
     variation = json.loads(file.read_text())["variation"]
     assert variation["units"] == 2
     assert variation["sums"]["unit"] == ["a", "a", "b", "b", "b"]
-    effect = variation["parameters"][COULOMB]["effects"]["temperature"]
-    assert effect["by_log"] == variation["sums"]["covariates"]["elbow_joint"][0]["by_log"]
-    assert effect["by_log"] == [*degrees, 31.0]
-    assert variation["parameters"][COULOMB]["effects"]["time"]["by_log"] == [*hours, 12.5]
-    capsys.readouterr()
-    assert main(["validate", str(file), log, "--temperature", "900"]) == 2
-    assert "temperature is 900.0, wanted -100 to 300" in capsys.readouterr().err
 
 
 def test_rows_of_added_logs_are_downweighted_as_those_of_the_fit(result, written):
@@ -432,176 +409,3 @@ def test_results_without_sums_cannot_be_updated(written):
     assert "variation" not in validate_result(file, [written / "more_0.csv"])
     with pytest.raises(DataError, match="wanted a result of three or more logs with torques; id"):
         validate_result(file, [written / "more_0.csv"], update=True)
-
-
-@pytest.fixture(scope="module")
-def warm(tmp_path_factory):
-    """Eight logs of an arm whose elbow has 2 % less viscous friction per degC; temperatures."""
-    model, rng, where = arm(), np.random.default_rng(3), tmp_path_factory.mktemp("warm")
-    k, degrees = model.layout.names.index("elbow_joint.viscous"), rng.uniform(15.0, 40.0, 8)
-    for run, own in enumerate(degrees):
-        pi = truth(model)
-        pi[k] *= 1.0 - 0.02 * (own - 25.0)
-        log = driven_log(model, pi, 40 + run, duration=6.0)
-        file = where / f"run_{run}.csv"
-        write_log(log, file)
-        rows = file.read_text().splitlines()
-        rising = own + np.linspace(-1.0, 1.0, len(rows) - 1)  # its mean counts
-        columns = ["temperature_elbow_joint,temperature", *(f"{x},30.0" for x in rising)]
-        file.write_text("\n".join(map(",".join, zip(rows, columns, strict=True))) + "\n")
-    return where, degrees
-
-
-def warm_job(where, **keys):
-    logs = [{"log": str(where / f"run_{k}.csv")} | {key: own[k] for key, own in keys.items()}
-            for k in range(8)]  # fmt: skip
-    return job_from_settings({**settings(where), "identification": logs}, "job.toml", where)
-
-
-def test_friction_falls_with_the_temperature_in_the_logs(warm, capsys, monkeypatch):
-    where, degrees = warm
-    monkeypatch.setattr("robotid.commands.validate.diagnose", lambda *_: [])
-    days = [f"2026-05-{4 + k:02d}T10:00:00" for k in range(8)]
-    _, content = run_job(warm_job(where, time=days), where / "out")
-    parameters = content["variation"]["parameters"]
-    used = [(name, key) for name, own in parameters.items()
-            for key, each in own["effects"].items() if each["is_used"]]  # fmt: skip
-    assert used == [("elbow_joint.viscous", "temperature")]
-    model = arm()
-    true = -0.02 * truth(model)[model.layout.names.index("elbow_joint.viscous")]
-    effect = parameters["elbow_joint.viscous"]["effects"]["temperature"]
-    assert effect["by_log"] == pytest.approx(degrees, abs=0.01)
-    assert effect["slope"] == pytest.approx(true, abs=3 * effect["std_error"])
-    assert effect["std_error"] < 0.1 * abs(true)
-    # one temperature of all logs has no effect; days count from any origin, in hours
-    assert list(parameters["wrist_1_joint.viscous"]["effects"]) == ["time"]
-    hours = parameters["elbow_joint.viscous"]["effects"]["time"]["by_log"]
-    assert np.diff(hours) == pytest.approx(24.0)
-    show_result(content)
-    printed = " ".join(capsys.readouterr().out.split())
-    share = 100 * abs(effect["slope"]) / parameters["elbow_joint.viscous"]["mean"]
-    said = f"elbow_joint.viscous falls with temperature: by {share:.2g} +- "
-    low, high = min(effect["by_log"]), max(effect["by_log"])
-    assert said in printed
-    assert f"% per degC (logs: {low:.3g} to {high:.3g} degC)" in printed
-    page = (where / "out" / "report.html").read_text()
-    assert said in page
-    # exports: any temperature of the logs, or one of them
-    exports = {}
-    for name, options in (
-        ("any", {}),
-        ("cold", {"temperature": 15.0}),
-        ("hot", {"temperature": 39}),
-    ):
-        target = where / f"{name}.yaml"
-        export_result(where / "out", "ranges", target, samples=300, seed=1, **options)
-        own = yaml.safe_load(target.read_text())["drives"]["elbow_joint"]["viscous"]
-        ends = [own[key] for key in ("low", "high")]
-        drawn = json.loads(target.with_suffix(".samples.json").read_text())["drives"]
-        exports[name] = ends, np.array(drawn["elbow_joint"]["viscous"])
-    (low, high), drawn = exports["any"]
-    seen = parameters["elbow_joint.viscous"]["seen_interval"]
-    assert (low, high) == pytest.approx(tuple(seen), rel=1e-5)
-    spread = abs(effect["slope"]) * np.std(degrees)
-    assert np.std(drawn) == pytest.approx(spread, rel=0.15)
-    (cold, hot), change = (exports[name] for name in ("cold", "hot")), effect["slope"] * 24.0
-    assert np.mean(hot[0]) - np.mean(cold[0]) == pytest.approx(change, rel=0.03)
-    assert np.mean(hot[1]) - np.mean(cold[1]) == pytest.approx(change, rel=0.03)
-    assert np.std(cold[1]) < 0.3 * spread
-    with pytest.raises(DataError, match="temperature is -60 degC, wanted"):
-        export_result(where / "out", "ranges", where / "no.yaml", temperature=-60.0)
-    monkeypatch.setattr("robotid.commands.validate.add_logs", lambda *_, **__: None)
-    expect_at_temperatures(where, model, effect, capsys)
-
-
-def expect_at_temperatures(where, model, effect, capsys):
-    """Check the expected torque error and the bands of two motions at temperatures of the elbow."""
-    given, files, v = where / "out" / "result.json", [], []
-    degrees = 38.0, 17.0
-    for k, own in enumerate(degrees):
-        log = driven_log(model, truth(model), 80 + k, duration=6.0)
-        files.append(where / f"next_{k}.csv")
-        write_log(log, files[k])
-        rows = files[k].read_text().splitlines()
-        cells = ["temperature_elbow_joint", *[str(own)] * (len(rows) - 1)]
-        files[k].write_text("\n".join(map(",".join, zip(rows, cells, strict=True))) + "\n")
-        v.append(np.sqrt(np.mean(log.v[:, 1] ** 2)))
-    variances = {
-        key: np.array([
-            [each["expected"]["per_joint"][joint]["rmse"] ** 2 for joint in JOINTS[1:]]
-            for each in validate_result(
-                given, [LogEntry(file, temperature=own) for file in files]
-            )["validation"]
-        ])
-        for key, own in {"own": None, "mean": effect["mean"], "cold": 17.0}.items()
-    }  # fmt: skip
-
-    def added(degree):  # by the elbow's viscous friction, nothing by the last joint
-        away = degree - effect["mean"]
-        return away**2 * (effect["slope"] ** 2 + effect["std_error"] ** 2)
-
-    for k, own in enumerate(degrees):
-        for key, degree in (("own", own), ("cold", 17.0)):
-            elbow, wrist = variances[key][k] - variances["mean"][k]
-            assert elbow == pytest.approx(added(degree) * v[k] ** 2, rel=0.06)  # not filtered
-            assert wrist == pytest.approx(0.0, abs=1e-9)
-    hot = variances["own"][0, 0] - variances["mean"][0, 0]
-    cold = variances["cold"][0, 0] - variances["mean"][0, 0]
-    assert hot / cold == pytest.approx(added(38.0) / added(17.0), rel=1e-6)
-    bands = {}
-    for key, stated, option in (("own", {}, {}), ("mean", {}, {"temperature": effect["mean"]}),
-                                ("job", {"temperature": 17.0}, {})):  # fmt: skip
-        entries = [{"log": str(file)} | stated for file in files]
-        job = job_from_settings({**settings(where), "identification": entries}, "j", where)
-        torque = preview_job(job, str(given), **option)["torque"]["elbow_joint"]
-        bands[key] = (torque["half_width"] / 1.96) ** 2
-    own, cold = (np.mean([added(x) * y**2 for x, y in zip(each, v, strict=True)])
-                 for each in (degrees, (17.0, 17.0)))  # fmt: skip
-    assert bands["own"] - bands["mean"] == pytest.approx(own, rel=0.06)
-    assert bands["job"] - bands["mean"] == pytest.approx(cold, rel=0.06)
-    files[0].write_text(files[0].read_text().replace("38.0", "88.0"))
-    done = validate_result(given, files)
-    show_validation(done)
-    assert "no expected rmse: temperature is 88 degC, wanted" in capsys.readouterr().out
-    assert done["validation"][1]["expected"]["per_joint"]
-    done = validate_result(given, [LogEntry(file, temperature=88.0) for file in files])
-    for each in done["validation"]:
-        assert each["expected"]["missing"].startswith("temperature is 88 degC, wanted")
-    with pytest.raises(SettingsError, match="by a given result; state it, too"):
-        preview_job(job, temperature=20.0)
-
-
-def test_stated_temperatures_replace_those_of_the_logs(warm):
-    where, degrees = warm
-    job = warm_job(where, temperature=[20.5, *range(21, 28)], time=[5.0, 1, 2, 3, 4, 6, 7, 8.5])
-    (logs,) = survey_logs(job, job.model(), job.identification)
-    assert logs[0].temperature == dict.fromkeys(JOINTS, 20.5)
-    assert [log.time for log in logs][:2] == [5.0, 1.0]
-    (logs,) = survey_logs(warm_job(where), job.model(), warm_job(where).identification[:1])
-    assert logs[0].temperature["wrist_1_joint"] == 30.0
-    assert logs[0].temperature["elbow_joint"] == pytest.approx(degrees[0])
-    assert not any("temperature" in note for note in logs[0].head.notes)
-    named = replace(warm_job(where), columns={"temperature": "temperature_elbow_joint"})
-    (logs,) = survey_logs(named, job.model(), warm_job(where).identification[:1])
-    assert logs[0].temperature == pytest.approx(dict.fromkeys(JOINTS, degrees[0]))
-    assert logs[0].time is None
-
-
-def test_times_and_temperatures_are_of_every_log_and_of_one_kind(warm):
-    where, _ = warm
-    wanted = r"run_0.csv has no temperature, but run_2.csv has temperature = 20.0"
-    job = warm_job(where)
-    entries = list(job.identification)
-    entries[2] = replace(entries[2], temperature=20.0)
-    with pytest.raises(SettingsError, match=wanted):
-        survey_logs(job, job.model(), entries)
-    mixed = ["2026-05-04T10:00:00Z", *map(float, range(7))]
-    with pytest.raises(SettingsError, match="a date with a time zone and of another a number of h"):
-        survey_logs(job, job.model(), warm_job(where, time=mixed).identification)
-    zones = ["2026-05-04T10:00:00+02:00", *["2026-05-04T10:00:00Z"] * 7]
-    (logs,) = survey_logs(job, job.model(), warm_job(where, time=zones).identification)
-    assert logs[1].time - logs[0].time == pytest.approx(2.0)
-    with pytest.raises(SettingsError, match="time is 'monday', wanted a date with a time, as 2026"):
-        warm_job(where, time=["monday"] * 8)
-    with pytest.raises(SettingsError, match=r"temperature is 3000.0, wanted -100 to 300"):
-        warm_job(where, temperature=[3000.0] * 8)

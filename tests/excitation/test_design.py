@@ -212,7 +212,7 @@ def test_a_search_has_converged_near_its_limits_when_it_gains_no_more(designer, 
     monkeypatch.setattr(Designer, "_feasible", lambda self, C, most: zero + 2.0)
     monkeypatch.setattr(Designer, "_towards", lambda self, kept, C, most: zero + 3.0)
     monkeypatch.setattr(Designer, "matrix", lambda self, rows: rows)
-    monkeypatch.setattr(Designer, "_distances", lambda self, rows, multipliers: (None, None))
+    monkeypatch.setattr(Designer, "_near", lambda self, rows, multipliers: None)
     monkeypatch.setattr(Multipliers, "raised", lambda self, *_: self)
     for used, margin, own, scaled, mixed, *wanted in [
         (1.005, 0.0, 4.980, 4.990, None, 4.990, 2, 1, 0.008, False),  # gains more
@@ -255,7 +255,7 @@ def test_random_motions_leave_the_reserve_of_limits_and_of_distances(wrist, desi
     )  # fmt: skip
     near = replace(designer, clearance=around)
     assert near._constraints(motions[0], 0.7)[1] == pytest.approx(0.1 - 0.7)
-    np.testing.assert_allclose(near._wanted, [[0.014], [0.031]])
+    np.testing.assert_allclose(near._required, [[0.014], [0.031]])
     near._feasible(motions[0], 0.5)
     assert asked[0] == 0.7
     assert set(asked[1:]) == {1.0}
@@ -280,7 +280,7 @@ def test_distances_without_a_cost_are_not_looked_at_and_change_nothing(wrist, de
     placed = around.placed((designer._functions @ C)[0])
     pairs = len(around.pairs), 43
     held = Multipliers(0.2, 0.0, rng.uniform(0.0, 0.05, pairs) * (rng.random(pairs) < 0.5))
-    aim = near._wanted
+    aim = near._required
     some, every = (
         held.of_distances(around.near(placed, within).distance, aim)
         for within in (held.distance_without_cost(aim), np.inf)
@@ -340,15 +340,6 @@ def test_what_most_postures_violate_is_named_if_no_limit_rules_out_all(wrist, de
         "rest: the distance of arm and post is 29.5 mm at most, wanted 31.0 mm; lower the "
         "clearance, or move the floor and the boxes"
     )
-    used[0], margins[:] = 1.5, 0.1
-    used[0, :, 1] = 1.7
-    weak = replace(
-        designer.postures, limits=replace(designer.limits, sizes=designer.limits.sizes * 1e-3)
-    )
-    with pytest.raises(SettingsError, match=r"^in the first posture \w+ needs at least \d+ % of"):
-        weak.required(np.full(3, 2.0))
-    ok = designer.postures.resting(np.random.default_rng(0))[0]
-    assert designer.postures.required(ok) is ok
 
 
 def test_a_motion_that_collides_between_samples_is_scaled_more_and_more(designer):
@@ -411,7 +402,8 @@ def test_an_examined_motion_is_judged_with_what_is_known_and_its_condition_witho
     np.testing.assert_allclose(found.used, np.abs(used).max(axis=1))
     assert (found.intervals, found.duration) == (100, 5.02)
     whole = designer.checked(designer.random(rng)).motion  # all joints move
-    alone, rows = designer.examined(whole, 5.02, 20.0), designer.along(*whole.evaluate(t))
+    alone = designer.examined(whole, 5.02, 20.0)
+    rows = designer.information.rows(*whole.evaluate(t))
     W = np.concatenate(
         [np.sqrt(0.0502 / n) * w.T * designer.spread
          for n, w in zip(designer.noise, rows.W, strict=True)]

@@ -70,7 +70,7 @@ def test_a_course_peaks_where_most_of_a_limit_is_used_either_way():
 
 def test_settings_of_a_motion_have_safe_defaults_and_ranges():
     own = MotionSettings()
-    assert (own.share, own.clearance, own.friction_coefficient) == (0.9, 0.02, 0.5)
+    assert (own.share, own.clearance) == (0.9, 0.02)
     assert (own.kind, own.duration, own.harmonics, own.points) == ("fourier", 10.0, 5, 100.0)
     assert (own.starts, own.seconds, own.seed) == (3, np.inf, 0)
     for name, low, high, words in (
@@ -79,7 +79,6 @@ def test_settings_of_a_motion_have_safe_defaults_and_ranges():
         ("harmonics", 2, 100, "2 to 100"),
         ("starts", 1, 1000, "1 to 1000"),
         ("points", 0.1, 1e5, "0.1 to 100000 rows per second"),
-        ("friction_coefficient", 1e-3, 10.0, "0.001 to 10"),
     ):
         for value in (low, high):
             assert getattr(MotionSettings(**{name: value}), name) == value
@@ -95,11 +94,6 @@ def test_settings_of_a_motion_have_safe_defaults_and_ranges():
             MotionSettings(**{name: {"a": 1.0, "b": 2e12}})
         with pytest.raises(SettingsError, match=f"^{name} of 'a' is 5e-10, wanted"):
             MotionSettings(**{name: {"a": 5e-10, "b": 1.0}})
-    sole = (-0.1, -0.05, 0.2, 0.05, -0.03)
-    MotionSettings(soles=[("foot", sole)])
-    for x, y in ((-0.1, 0.05), (0.2, -0.05)):
-        with pytest.raises(SettingsError, match=r"^the sole of other reaches from -0\.1, -0\.05"):
-            MotionSettings(soles=[("foot", sole), ("other", (-0.1, -0.05, x, y, 0.0))])
     for stated in ({"moving": ["a"]}, {"payload": Payload(link="tool")}):
         MotionSettings(kind="payload", **stated)
         with pytest.raises(SettingsError, match="but kind is 'bspline', wanted payload"):

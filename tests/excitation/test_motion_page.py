@@ -201,12 +201,6 @@ def test_the_page_states_use_margin_joint_time_value_and_unit_of_each_limit():
                "acceleration": ("elbow", 0.75)}  # fmt: skip
     content = {"limits": {k: {"where": x, "margin": y} for k, (x, y) in entries.items()},
                "share": 0.85}  # fmt: skip
-    content["limits"]["friction"] = {
-        "margin": 0.123,
-        "where": "foot",
-        "time": 3.456,
-        "words": "0.4",
-    }
     found = _limit_table(model, content, course)
     rows = [re.sub(r"<[^>]+>", "|", row) for row in found.split("<tr>")]
     texts = ([y.strip() for y in row.split("|") if y.strip()] for row in rows)
@@ -215,7 +209,6 @@ def test_the_page_states_use_margin_joint_time_value_and_unit_of_each_limit():
     assert cells["velocity"] == ["61.3", "38.7", "rail", "4.75", "0.4", "m/s"]
     assert cells["torque"] == ["47.5", "52.5", "rail", "4.00", "900", "N"]
     assert cells["acceleration"] == ["25.0", "75.0", "elbow", "3.25", "11", "rad/s²"]
-    assert cells["friction"][:4] == ["12.3", "foot", "3.46", "0.4"]
     assert "100 % of position, velocity and torque is 85 % of the URDF's limit" in found
     assert "Collisions were not checked" in found
     assert "torque [N m or N]" in _free_chart(model, course, "torque", np.array([0, 1]))
@@ -350,4 +343,3 @@ def test_each_limit_has_a_chart_of_its_joints_and_some_quantities_without_one(mo
         course.nearest, course.clearance = nearest, clearance
         found = motion_page._over_time("model", {}, course)
         assert found == f'<div class="plots">\n{"".join(shown)}{last}</div>\n'
-    assert motion_page._ground({"limits": {"torque": {"margin": 0.1}}}) == ""

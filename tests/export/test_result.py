@@ -13,7 +13,6 @@ from helpers.figures import figures
 from robotid import __version__
 from robotid.exceptions import DataError, ModelError
 from robotid.export.entries import _curve, _expected_torque, build_result, recording_metrics
-from robotid.export.former_keys import from_former_keys
 from robotid.export.result import read_result, stated_parameters
 from robotid.findings import Finding
 from robotid.robot.parameters import INERTIAL_TERMS
@@ -25,7 +24,7 @@ FINDINGS = [Finding("late", "warning", "a.csv", "late by 4 ms"), Finding("b", "n
 def result(identified):
     settings = {"estimator": {"name": "consistent"}}
     found = replace(identified, findings=FINDINGS)
-    return from_former_keys(build_result(found, settings, {"report": "report.html"}))
+    return build_result(found, settings, {"report": "report.html"})
 
 
 def test_the_head_says_what_was_identified_and_how(result, identified):

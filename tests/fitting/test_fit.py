@@ -1,7 +1,6 @@
 """Steps of a fit that other tests see only in part."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,7 +11,7 @@ from robotid.estimators import Consistent
 from robotid.estimators.consistent.penalties import WeightChoice
 from robotid.fitting import estimators
 from robotid.fitting.estimators import Known, consistent_fit
-from robotid.fitting.fit import covariates_of, rough_choice
+from robotid.fitting.fit import rough_choice
 from robotid.fitting.settings import ConsistentSettings, EstimatorSettings
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.base_parameters import BaseMapping, structural_mapping
@@ -96,12 +95,12 @@ def test_a_consistent_fit_has_every_setting_and_the_weight_of_its_choice(monkeyp
     monkeypatch.setattr(estimators, "choose_weight", chosen)
     monkeypatch.setattr(Consistent, "noise", lambda fit, factors: sigma)
     settings = ConsistentSettings(
-        prior="riemannian", prior_weight=weight, margin=3e-3, solver="scs", check=True,
+        prior="riemannian", prior_weight=weight, margin=3e-3,
         constraints={"extent": "none", "total_mass": [1.0, 9.0]},
     )  # fmt: skip
     known = Known(model, mapping, pi, spread, 0.3, sigma, tuple(folds), 0.25)
     fit = consistent_fit(settings, known)
-    assert (fit.metric, fit.margin, fit.solver, fit.check) == ("riemannian", 3e-3, "scs", True)
+    assert (fit.metric, fit.margin) == ("riemannian", 3e-3)
     assert fit.independent_share == 0.3
     assert fit.constraints.total_mass == (1.0, 9.0)
     held = held_parameters(model)
@@ -122,24 +121,3 @@ def test_a_consistent_fit_has_every_setting_and_the_weight_of_its_choice(monkeyp
     assert len(segments.folds) == 6
     alone = consistent_fit(settings, replace(known, held_out=tuple(folds[:1])))
     assert (alone.prior_weight, len(asked)) == ((1.0, 1) if how == "cv" else (7.0, 2))
-
-
-def test_temperature_and_time_are_effects_only_if_every_log_has_them():
-    """The temperature of a drive is the mean of those of its joints, in the order of the logs."""
-    drives = [SimpleNamespace(name="one", ratios=[("a", 1.0)]),
-              SimpleNamespace(name="both", ratios=[("a", 2.0), ("b", -1.0)])]  # fmt: skip
-
-    def found(*logs):
-        fitted = [SimpleNamespace(temperature=x, time=t) for x, t in logs]
-        layout = SimpleNamespace(drives=drives)
-        own = covariates_of(SimpleNamespace(model=SimpleNamespace(layout=layout), fitted=fitted))
-        return {d: [(x.name, x.unit, x.values.tolist()) for x in y] for d, y in own.items()}
-
-    warm = [{"a": 20.0, "b": 30.0}, {"a": 26.0, "b": 24.0}]
-    time = ("time", "h", [5.0, 2.5])
-    assert found((warm[0], 5.0), (warm[1], 2.5)) == {
-        "one": [("temperature", "degC", [20.0, 26.0]), time],
-        "both": [("temperature", "degC", [25.0, 25.0]), time],
-    }
-    assert found((warm[0], 5.0), (warm[1], None))["one"] == [("temperature", "degC", [20.0, 26.0])]
-    assert found(({"b": 30.0}, 5.0), (warm[1], 2.5))["one"] == [time]

@@ -16,7 +16,6 @@ from robotid.commands.identify import run_job
 from robotid.commands.job import LogEntry, job_from_settings, read_job
 from robotid.commands.schema import job_schema
 from robotid.estimators import WLS, BatchEstimator
-from robotid.estimators.consistent.cones import SOLVERS
 from robotid.estimators.consistent.penalties import METRICS
 from robotid.exceptions import SettingsError
 from robotid.fitting.fit import fit_recordings
@@ -112,8 +111,6 @@ def test_a_job_with_a_recursive_estimator_runs_from_file_to_report(rng, tmp_path
         "margin": 1e-4,
         "prior": "entropic",
         "prior_weight": "auto",
-        "solver": "clarabel",
-        "check": False,
         "draws": 64,
         "constraints": {},
     }
@@ -149,7 +146,6 @@ def test_a_setting_that_does_not_fit_is_refused(options, text):
 def test_words_of_the_settings_are_those_that_the_estimators_know():
     keys = EstimatorSettings("consistent").paths()
     assert set(keys["prior"].among) == set(METRICS)
-    assert set(keys["solver"].among) == set(SOLVERS)
     assert set(keys["robust"].among) == {"none", *LOSSES}
 
 

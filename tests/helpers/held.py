@@ -1,4 +1,4 @@
-"""The command line as ever, but held once some pieces are kept: ``held.py MARK COUNT ARGUMENT...``.
+"""The command line, held once some pieces are finished: ``held.py MARK COUNT ARGUMENT...``.
 
 Then it writes the file MARK and waits for a signal, so that a test never races with the work.
 """
@@ -9,19 +9,20 @@ import time
 from pathlib import Path
 
 from robotid.cli import main
-from robotid.workers.checkpoint import Checkpoint
+from robotid.workers import plan
 
-_save = Checkpoint.save
+_map_pieces = plan.map_pieces
 
 
 def held(mark, count):
-    def save(self, *piece):
-        _save(self, *piece)
-        if len(self.finished()) == count:
-            mark.touch()
-            time.sleep(600)
+    def map_pieces(*stated, **options):
+        for k, result in enumerate(_map_pieces(*stated, **options), start=1):
+            if k == count:
+                mark.touch()
+                time.sleep(600)
+            yield result
 
-    return save
+    return map_pieces
 
 
 if __name__ == "__main__":
@@ -29,5 +30,5 @@ if __name__ == "__main__":
     signal.signal(signal.SIGINT, signal.default_int_handler)
     for number in (signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_DFL)
-    Checkpoint.save = held(Path(sys.argv[1]), int(sys.argv[2]))
+    plan.map_pieces = held(Path(sys.argv[1]), int(sys.argv[2]))
     sys.exit(main(sys.argv[3:]))

@@ -519,7 +519,6 @@ flags = st.sampled_from(
         "--serve",
         "--speed",
         "--json",
-        "--resume",
     ]
 )
 arguments = st.sampled_from(
@@ -563,7 +562,7 @@ def run_flags(example, folder):
     flat = [
         word
         for flag, argument in given
-        for word in ((flag,) if flag in ("--json", "--resume") else (flag, argument))
+        for word in ((flag,) if flag == "--json" else (flag, argument))
     ]
     if command == "track" and "--serve" in flat:
         flat += ["--serve", "-5"]  # so that it ends

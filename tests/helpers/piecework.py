@@ -11,6 +11,7 @@ import socket
 import sys
 import time
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -62,7 +63,37 @@ class RandomPiece(Piece):
         own = np.arange(len(NAMES))
         rows = np.full(2, self.samples)
         factors = Factors(tuple(np.asfortranarray(R_j) for R_j in R), (own, own), rows, NAMES)
-        return Reduction(factors, rng.random((3, 2)), self.samples)
+        return KeptReduction(factors, rng.random((3, 2)), self.samples)
+
+
+class KeptReduction(Reduction):
+    """A reduction that a checkpoint can store."""
+
+    def to_arrays(self):
+        return arrays_of(self)
+
+    @classmethod
+    def from_arrays(cls, arrays):
+        parts = [
+            tuple(np.asfortranarray(arrays[f"{kind}_{j}"]) for j in range(len(arrays["rows"])))
+            for kind in ("R", "columns")
+        ]
+        factors = Factors(*parts, arrays["rows"], tuple(arrays["names"].tolist()))
+        return cls(factors, arrays["squares"], int(arrays["samples"]))
+
+
+def arrays_of(reduction):
+    """Return a reduction as arrays by name."""
+    factors = reduction.factors
+    return {
+        **{f"R_{j}": R for j, R in enumerate(factors.triangles)},
+        **{f"columns_{j}": own for j, own in enumerate(factors.columns)},
+        "rows": factors.rows, "names": np.array(factors.names), "squares": reduction.squares,
+        "samples": np.array(reduction.samples),
+    }  # fmt: skip
+
+
+open_checkpoint = partial(Checkpoint.open, kind=KeptReduction)
 
 
 def mark(piece):
@@ -112,7 +143,7 @@ def reduce_all(pieces, **options):
 
 def same_bits(one, other):
     """Return whether two reductions are equal to the last bit."""
-    ours, theirs = one.to_arrays(), other.to_arrays()
+    ours, theirs = arrays_of(one), arrays_of(other)
     return all(
         ours[key].dtype == theirs[key].dtype and ours[key].tobytes() == theirs[key].tobytes()
         for key in ours.keys() | theirs.keys()
@@ -131,12 +162,12 @@ def local_cluster():
 def main(folder, workers, word):
     faults = dict.fromkeys(range(5, 10), "hold") if word == "hold" else {}
     pieces = pieces_in(Path(folder) / "marks", faults=faults)
-    checkpoint = Checkpoint.open(folder, {"inputs": "these"}, pieces, resume=word == "resume")
+    checkpoint = open_checkpoint(folder, {"inputs": "these"}, pieces, resume=word == "resume")
     backend = ProcessBackend(int(workers)) if int(workers) > 1 else SerialBackend()
     with backend:
         found = reduce_all(pieces, backend=backend, checkpoint=checkpoint)
     with open(Path(folder) / "joined.npz", "wb") as file:
-        np.savez(file, **join(found).to_arrays())
+        np.savez(file, **arrays_of(join(found)))
     checkpoint.remove()
 
 

@@ -18,7 +18,6 @@ from robotid.identification.summary import (
     _errors,
     _tables,
     cell,
-    effect_text,
     error_lines,
     friction_lines,
     joint_reason,
@@ -256,22 +255,3 @@ def test_a_notebook_shows_each_joint_s_error_before_that_of_the_urdf():
     metrics = Metrics({"a": one, "b": other}, 1.0)
     rows = tables(_errors("log.csv: not fitted", metrics))["log.csv: not fitted"].rows
     assert rows == [["a", "2.5", "0.125", "N m", "41.5"], ["b", "7.5", "3", "N", "–"]]
-
-
-def test_an_effect_has_its_share_of_a_known_mean_or_its_unit():
-    """A share is of more than two standard errors; of a negative mean the absolute value rises."""
-    effects = {
-        "temperature": {"slope": -0.5, "std_error": 0.08, "unit": "degC", "by_log": [31, 25, 40]},
-        "time": {"slope": 0.25, "std_error": 0.02, "unit": "h", "by_log": [3.0, 7.5]},
-    }
-    for mean, error, temperature, time in (
-        (4.0, 1.9, "falls with temperature: by 12 +- 2 %", "rises with time: by 6.2 +- 0.5 %"),
-        (-4.0, 1.9, "rises with temperature: by 12 +- 2 %", "falls with time: by 6.2 +- 0.5 %"),
-        (4.0, 2.1, "falls with temperature: by 0.5 +- 0.08 N m",
-         "rises with time: by 0.25 +- 0.02 N m"),
-    ):  # fmt: skip
-        parameter = {"mean": mean, "std_error": error, "unit": "N m", "effects": effects}
-        assert effect_text("a.b", parameter, "temperature") == (
-            f"a.b {temperature} per degC (logs: 25 to 40 degC)"
-        )
-        assert effect_text("a.b", parameter, "time") == f"a.b {time} per h (logs: 4.5 h)"

@@ -69,15 +69,6 @@ def test_of_several_starts_the_best_is_above_the_optimum_by_its_own_gap():
     assert finding.message.startswith("the objective of log-Cholesky is 1.2 % above the optimum")
 
 
-def test_two_solvers_differ_by_the_shares_that_are_said():
-    check = {"solver": "two", "torque_difference": 0.9e-3, "objective_difference": 0.5}
-    assert consistency_findings(solved(solver="one", check=check)) == []
-    check |= {"torque_difference": 0.0234, "objective_difference": 4.5e-4}
-    (finding,) = consistency_findings(solved(solver="one", check=check))
-    assert finding.code == "solvers_differ"
-    assert "one and two differ by 2.3 % of the torque (objective: 0.045 %)" in finding.message
-
-
 def test_the_share_of_poses_with_a_mass_matrix_that_is_none_is_said():
     fit = solved()
     fit.mass_matrix = SimpleNamespace(

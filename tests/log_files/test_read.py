@@ -362,16 +362,6 @@ def test_rows_of_a_part_are_named_by_their_number_in_the_file(name, value, messa
         layout.to_log(part, 200)
 
 
-def test_the_temperature_of_a_joint_is_preferred_to_that_of_all():
-    cold = {name: np.zeros(300) for name in ("temperature", "temperature_shoulder", "T3")}
-    frame = pd.DataFrame(make_table(**cold))
-    assert lay_out(frame, JOINTS)[0].temperatures == {
-        "shoulder": "temperature_shoulder", "elbow": "temperature",
-    }  # fmt: skip
-    layout, _ = lay_out(frame, JOINTS, columns={"temperature_elbow": "T3"})
-    assert layout.temperatures == {"shoulder": "temperature_shoulder", "elbow": "T3"}
-
-
 def test_percentages_become_positions_between_their_ends(run):
     truth = make_log()
     share = (truth.q[:, 1] + 0.5) / 2.5  # from -0.5 to 2 rad

@@ -54,7 +54,7 @@ def test_logs_in_files_have_segments_as_many_as_fit_into_the_memory(monkeypatch)
         SimpleNamespace(pieces=[None] * n, is_in_memory=False, too_short=lambda: DataError("short"))
         for n in (2, 1, 3)
     ]
-    plan = SimpleNamespace(reduce=lambda pieces, checkpoint: iter(parts))
+    plan = SimpleNamespace(reduce=lambda pieces: iter(parts))
     mapping = SimpleNamespace(independent=np.arange(120))
     recordings = Recordings(SimpleNamespace(n_rows=7), mapping, logs, plan=plan)
     assert recordings.reduce() == tuple(parts)

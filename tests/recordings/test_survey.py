@@ -23,7 +23,7 @@ from robotid.logs.imu import ImuFrame
 from robotid.logs.settings import LogUnits, SignalSettings
 from robotid.recordings import survey
 from robotid.recordings.logs import Recordings
-from robotid.recordings.survey import ReducedPiece, _temperatures, hold_log, survey_log
+from robotid.recordings.survey import ReducedPiece, hold_log, survey_log
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.factors import join
 from robotid.regressor.torque import joint_torque_regressor, mass_regressor
@@ -448,15 +448,3 @@ def test_other_drive_terms_keep_the_rows_that_a_closed_chain_leaves(rng, tmp_pat
     rows = [[np.concatenate(x) for x in zip(*own.blocks(), strict=True)] for own in (held, read)]
     for one, other in zip(*rows, strict=True):
         np.testing.assert_allclose(other, one, atol=1e-9)
-
-
-def test_the_temperature_of_a_joint_is_the_mean_of_the_rows_read():
-    """Of all windows, without missing values; a joint without any value has none."""
-    names = {"a": "temperature_a", "b": "temperature_b", "c": "temperature"}
-    nan, none = np.nan, np.full(3, np.nan)
-    first = {"temperature_a": np.array([90.0, 20.0, nan]), "temperature_b": none,
-             "temperature": np.array([7.0, 1.0, 2.0])}  # fmt: skip
-    last = {"temperature_a": np.array([26.0, 29.0, 80.0]), "temperature_b": none,
-            "temperature": np.array([3.0, 4.0, 8.0])}  # fmt: skip
-    assert _temperatures(names, [first, last], slice(1, 5)) == {"a": 25.0, "c": 2.5}
-    assert _temperatures(names, [first]) == {"a": 55.0, "c": pytest.approx(10.0 / 3.0)}

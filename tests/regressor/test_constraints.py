@@ -22,7 +22,7 @@ from robotid.regressor.constraints import (
     logged_base,
     without_forces,
 )
-from robotid.regressor.factors import Factors, Reduction, compress, compress_segments, merge
+from robotid.regressor.factors import Factors, compress, compress_segments, merge
 from robotid.regressor.prediction import predict
 from robotid.regressor.torque import build_problem, joint_torque_regressor
 from robotid.robot.constraints import Contact, Loop
@@ -245,8 +245,6 @@ def test_rows_are_projected_and_counted(quadruped, rng):
     assert factors.rows.tolist() == np.rint(count).astype(int).tolist()
     blocks = np.concatenate([W for W, _, _ in problem.blocks()]).reshape(40, 18, -1)
     np.testing.assert_allclose(blocks, P @ Y, atol=1e-12)
-    again = Reduction.from_arrays(Reduction(factors, motion.squares, 40).to_arrays())
-    assert again.factors.is_projected
     both = merge([factors, factors.select(np.arange(len(factors.names)))])
     assert both.is_projected
     assert factors.select(np.arange(3)).is_projected

@@ -299,18 +299,6 @@ def test_nothing_cannot_be_joined():
         join([])
 
 
-def test_a_reduction_survives_its_arrays_to_the_last_bit(ur5, rng, tmp_path):
-    found, _ = reduction(ur5, exact_log(ur5, truth(ur5), rng))
-    np.savez(tmp_path / "part.npz", **found.to_arrays())
-    with np.load(tmp_path / "part.npz") as arrays:
-        again = Reduction.from_arrays(arrays)
-    assert again.factors.names == found.factors.names
-    assert again.samples == found.samples
-    np.testing.assert_array_equal(again.factors.R, found.factors.R)
-    np.testing.assert_array_equal(again.factors.rows, found.factors.rows)
-    np.testing.assert_array_equal(again.squares, found.squares)
-
-
 def unlike(rng):
     """Two logs of three joints with columns of their own and rows left out, and their rows."""
     support = np.array([[1, 1, 1, 0, 1], [0, 1, 0, 1, 1], [0, 0, 0, 1, 1]], dtype=bool)

@@ -251,7 +251,6 @@ def test_the_notes_on_consistency_state_every_figure_with_its_unit(identified):
         "active": ["a", "b"],
         "relaxed": ["c"],
         "pinned": ["d", "e"],
-        "check": {"solver": "SCS", "status": "solved", "torque_difference": 0.00123},
         "gaps": [1e-9, 2.5e-8],
     }
     check = SimpleNamespace(
@@ -267,9 +266,8 @@ def test_the_notes_on_consistency_state_every_figure_with_its_unit(identified):
         "eigenvalue -0.0123). The prior is the distance from the URDF's values by the divergence "
         "of the pseudo-inertias (entropic); its weight is 0.0234, selected by cross-validation on "
         "the fitted logs. Active constraints: a, b. Extents that contradict the data: c. Fixed at "
-        "the URDF's values: d, e. Check by a second solver, SCS: solved; torques differ by "
-        "0.12 %. Gap of the log-Cholesky solution to the cone programme, per start: "
-        "1.0e-09, 2.5e-08."
+        "the URDF's values: d, e. Gap of the log-Cholesky solution to the cone programme, per "
+        "start: 1.0e-09, 2.5e-08."
     )
     sources = ["prior"] * len(identified.sources)
     sources[:3], sources[60:] = ["data", "mixed", "bound"], ["data"] * (len(sources) - 60)

@@ -1,13 +1,11 @@
 """The cause of a difference, against generalised least squares of all runs and groups together."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from robotid.variation.causes import evidence_by_group
 from robotid.variation.groups import Group, RunsOf
-from robotid.variation.mixed_effects import Runs, Slope
+from robotid.variation.mixed_effects import Runs
 
 UNIT = np.array([0, 0, 1, 1, 1, 2, 2])
 SIZES = {"drive": 2, "gain": 1, "payload": 2}
@@ -99,31 +97,3 @@ def test_groups_without_common_information_are_independent():
     deviations = [np.full((2, size), 0.4) for size in SIZES.values()]
     found = [evidence_by_group(x, deviations, UNIT == 2, is_unit=True) for x in (alone, blocks)]
     assert found[0] == pytest.approx(found[1])
-
-
-def test_effects_of_temperature_and_time_are_no_evidence():
-    rng = np.random.default_rng(7)
-    groups, x, C = together(rng, UNIT)
-    c, sizes, H = rng.normal(size=(2, 7)), (1.7, -0.9), np.linalg.inv(C) * INFLATION
-    moved = np.zeros((7, 5))
-    moved[:, 1] = sizes @ c
-    warm = [
-        replace(g, runs=replace(g.runs, h=h / INFLATION))
-        for g, h in zip(
-            groups, np.split(np.einsum("kij,kj->ki", H, x + moved), [2, 3], axis=1), strict=True
-        )
-    ]
-    drive = warm[0]
-    warm[0] = replace(
-        drive, runs=drive.runs.with_slopes([Slope(1, own, 1.0) for own in c]), slopes=sizes
-    )
-    deviations = [np.full((2, n), 0.4) for n in SIZES.values()]
-    with_slope = [np.full((2, 4), 0.4), *deviations[1:]]
-    wanted = evidence_by_group(groups, deviations, UNIT == 1, is_unit=True)
-    found = evidence_by_group(warm, with_slope, UNIT == 1, is_unit=True)
-    assert found == pytest.approx(wanted)
-    last = [*warm[1:], replace(drive, runs=warm[0].runs, slopes=sizes)]  # the drive is last
-    columns = np.array([2, 3, 4, 0, 1])
-    last = [replace(g, across=g.across[:, :, columns]) for g in last]
-    found = evidence_by_group(last, [*with_slope[1:], with_slope[0]], UNIT == 1, is_unit=True)
-    assert found == pytest.approx([*wanted[1:], wanted[0]])

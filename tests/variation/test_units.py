@@ -59,6 +59,26 @@ def test_a_unit_of_precise_values_has_the_probability_of_the_t_test():
     assert (found.unit, found.probability) == (3, pytest.approx(p, rel=0.05))
 
 
+def test_the_probability_is_that_of_weighted_least_squares_over_all_spreads():
+    """Dense: at each s, x = mu + delta [last] with covariance s^2 + e^2; restricted likelihoods."""
+    rng = np.random.default_rng(3)
+    e = 0.1 * np.exp(rng.normal(size=7))
+    x = 5.0 + 0.2 * rng.normal(size=7)
+    x[6], X = 9.0, np.column_stack([np.ones(7), np.arange(7) == 6])
+    unlike = {each.unit: each.probability for each in between_units(x, e, 0.05)[1]}
+    found = []
+    for s in np.geomspace(0.05 * e.min(), 30.0 * np.std(x), 32):
+        W = np.diag(1.0 / (s**2 + e**2))
+        C = np.linalg.inv(X.T @ W @ X)
+        b = C @ X.T @ W @ x
+        r = x - X @ b
+        log = 0.5 * (np.log(np.diag(W)).sum() + np.linalg.slogdet(C)[1] - r @ W @ r)
+        found.append([log, 2.0 * scipy.stats.norm.sf(abs(b[1]) / np.sqrt(C[1, 1]))])
+    log, p = np.array(found).T
+    weight = np.exp(log - log.max())
+    assert unlike[6] == pytest.approx(weight @ p / weight.sum())
+
+
 @pytest.mark.parametrize(("x", "error", "scale"), [
     ([-4.0, -4.0, -4.0], 0.05, 0.4),  # a tenth of their size
     ([0.3, -0.1, 0.1, 0.1], 0.7, 0.7),  # their errors

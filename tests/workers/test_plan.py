@@ -35,7 +35,7 @@ def test_workers_are_as_many_as_are_asked_for_or_pay_their_start(monkeypatch):
     ("options", "wanted"),
     [
         ({}, False), ({"workers": None}, False), ({"workers": 2}, True), ({"workers": 3}, True),
-        ({"resume": True}, True), ({"scheduler": "tcp://a:1"}, True),
+        ({"scheduler": "tcp://a:1"}, True),
     ],
 )  # fmt: skip
 def test_what_short_logs_have_no_use_of_is_known(options, wanted):
@@ -110,16 +110,16 @@ def test_a_plan_hands_on_work_name_progress_and_backend():
 def test_other_inputs_are_named_up_to_five_and_the_rest_is_counted(tmp_path):
     inputs = {f"key{k}": k for k in range(7)} | {"long": "x" * 90}
     pieces = pieces_of(1, 2, 3)
-    Checkpoint.open(tmp_path, inputs, pieces).release()
+    Checkpoint.open(tmp_path, inputs, pieces, dict).release()
     other = {key: -1 for key in inputs}
     pieces[2].name = "another"
     with pytest.raises(DataError) as caught:
-        Checkpoint.open(tmp_path, other, pieces, resume=True)
+        Checkpoint.open(tmp_path, other, pieces, dict, resume=True)
     said = str(caught.value)
     assert "key0 was 0, is -1; key1 was 1, is -1; " in said
     assert "key4 was 4, is -1, and 4 more. Restore the inputs" in said
     with pytest.raises(DataError) as caught:
-        Checkpoint.open(tmp_path, inputs | {"long": "y"}, pieces, resume=True)
+        Checkpoint.open(tmp_path, inputs | {"long": "y"}, pieces, dict, resume=True)
     said = str(caught.value)
     assert f"long was '{'x' * 56}..., is 'y'; pieces[2] was 'piece 2', is 'another'. " in said
     # what was kept is as it was

@@ -11,14 +11,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers import piecework
-from helpers.piecework import marks, pieces_in, reduce_all, same_bits, workers_of
+from helpers.piecework import KeptReduction, marks, pieces_in, reduce_all, same_bits, workers_of
 
 from robotid.exceptions import (
     DataError,
     SettingsError,
     WorkerError,
 )
-from robotid.regressor.factors import Reduction, available_cores, join
+from robotid.regressor.factors import available_cores, join
 from robotid.workers.pieces import reduce_piece
 from robotid.workers.plan import choose_workers
 from robotid.workers.processes import ProcessBackend, _interrupts_deferred
@@ -218,7 +218,7 @@ def test_a_run_that_was_ended_resumes_to_the_same_bits(tmp_path, end):
     after = marks(tmp_path / "marks")
     assert [seed for seed in sorted(after) if after[seed] > before.get(seed, 0)] == [5, 6, 7, 8, 9]
     with np.load(tmp_path / "joined.npz") as arrays:
-        resumed = Reduction.from_arrays(arrays)
+        resumed = KeptReduction.from_arrays(arrays)
     assert same_bits(resumed, join(reduce_all(pieces_in(tmp_path / "other"))))
     assert not (tmp_path / ".robotid-checkpoint").exists()
 

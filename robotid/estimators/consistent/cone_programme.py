@@ -30,7 +30,6 @@ class Programme:
         penalty: Distance from the prior.
         cone: The inequalities.
         space: Subspace of the points that meet the equalities.
-        solver: Cone solver for quadratic priors and for the check: "clarabel" or "scs".
         max_iterations: Largest number of iterations of each solve.
     """
 
@@ -39,7 +38,6 @@ class Programme:
     penalty: Penalty
     cone: Cone
     space: Subspace
-    solver: str = "clarabel"
     max_iterations: int = 200
 
     @property
@@ -263,7 +261,6 @@ class Programme:
             triangle[:, :-1],
             triangle[:, -1],
             cone,
-            solver=self.solver,
             max_iterations=self.max_iterations,
             is_exact=is_exact,
         )

@@ -1,9 +1,9 @@
-"""The feasible set of a consistent fit, and convex solvers of |A x - d|^2 over it.
+"""The feasible set of a consistent fit, and the minimum of |A x - d|^2 over it by Clarabel.
 
-The set has linear inequalities, pseudo-inertias and equalities. The solvers are Clarabel and SCS.
+The set has linear inequalities, pseudo-inertias and equalities.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from typing import TYPE_CHECKING, Any
@@ -12,13 +12,12 @@ import numpy as np
 import scipy.linalg
 
 from robotid._typing import Array
-from robotid.exceptions import MissingDependencyError, NotConvergedError
+from robotid.exceptions import NotConvergedError
 
 if TYPE_CHECKING:
     import clarabel
 
 __all__ = [
-    "SOLVERS",
     "Cone",
     "ConeSolution",
     "Subspace",
@@ -32,19 +31,9 @@ _SIZE = 4  # of a pseudo-inertia
 _ENTRIES = _SIZE * (_SIZE + 1) // 2
 _UNITS = (1.0, 1e-3, 1e-5)  # units of the first solution and of its corrections
 _SOLVED, _ALMOST, _INFEASIBLE = "Solved", "AlmostSolved", "PrimalInfeasible"
-_NAMES = {"clarabel": "Clarabel", "scs": "SCS"}
-_SCS_STATUS = {
-    1: _SOLVED,
-    2: _ALMOST,
-    -1: "DualInfeasible",
-    -2: _INFEASIBLE,
-    -6: "DualInfeasible",
-    -7: _INFEASIBLE,
-}
 _FAR = 1e3  # distance from the cone above which a larger unit is used
 _NEAREST = 1e-6  # duality gap for an error of 1e-3 standard deviations
 _CONTRADICTED = 1e-7  # distance of the NNLS problem below which the inequalities contradict
-_SCS_ITERATIONS = 100  # iterations of SCS per iteration of an interior-point method
 
 
 @dataclass(frozen=True, eq=False)
@@ -248,7 +237,6 @@ def least_squares(
     d: Array,
     cone: Cone,
     *,
-    solver: str = "clarabel",
     max_iterations: int = 200,
     is_exact: bool = True,
 ) -> ConeSolution:
@@ -262,14 +250,12 @@ def least_squares(
         A: Upper triangular factor, shape (p, p), not singular.
         d: Right-hand side, shape (p,).
         cone: Feasible set of x.
-        solver: One of ``SOLVERS``.
-        max_iterations: Largest number of its iterations.
+        max_iterations: Largest number of Clarabel's iterations.
         is_exact: Whether to solve for the corrections, too. If not, the error is about 1e-3 in
             units of A x, which are standard deviations for weighted rows. This takes half the time,
             and for a cone of linear rows a fiftieth.
 
     Raises:
-        MissingDependencyError: If the solver is not installed.
         NotConvergedError: If the solver fails, or no point meets the constraints.
     """
     x = scipy.linalg.solve_triangular(A, d)
@@ -281,20 +267,20 @@ def least_squares(
         y, failures = nearest(np.zeros((1, len(d))), whitened, max_iterations=max_iterations)
         if not failures:  # otherwise continue with the exact solution
             status = f"{_SOLVED} at reduced precision"
-            return ConeSolution(x + inverse @ y[0], 0, f"{_NAMES['clarabel']}: {status}")
-    call, name = SOLVERS[solver], _NAMES[solver]
+            return ConeSolution(x + inverse @ y[0], 0, f"Clarabel: {status}")
     G, h = cone.rows
     x, iterations, statuses = np.zeros(len(d)), 0, []
     for unit in _UNITS:
-        y, status, count = call(A, (d - A @ x) / unit, G, (h + G @ x) / unit, cone, max_iterations)
+        right, slack = (d - A @ x) / unit, (h + G @ x) / unit
+        y, status, count = _clarabel(A, right, G, slack, cone, max_iterations)
         statuses.append(status)
         iterations += count
         if status not in (_SOLVED, _ALMOST):
             break
         x = x + unit * y
     if _SOLVED not in statuses:
-        raise _failure(name, statuses[0], cone)
-    return ConeSolution(x, iterations, f"{name}: {_described(statuses)}")
+        raise _failure(statuses[0], cone)
+    return ConeSolution(x, iterations, f"Clarabel: {_described(statuses)}")
 
 
 def _described(statuses: Sequence[str]) -> str:
@@ -392,16 +378,16 @@ def _nearest_by_clarabel(points: Array, cone: Cone, max_iterations: int) -> list
     return solved
 
 
-def _failure(name: str, status: str, cone: Cone) -> NotConvergedError:
+def _failure(status: str, cone: Cone) -> NotConvergedError:
     families = ", ".join(cone.families)
     if _INFEASIBLE in status:
         return NotConvergedError(
-            f"{name} found that no parameters meet all constraints ({families}, known masses and "
+            f"Clarabel found that no parameters meet all constraints ({families}, known masses and "
             "pinned links); widen the bounds in [estimator.constraints], or reduce the margin",
             status,
         )
     return NotConvergedError(
-        f"{name} failed to solve the physically consistent fit with the constraints {families}; "
+        f"Clarabel failed to solve the physically consistent fit with the constraints {families}; "
         "check the URDF's inertials with 'robotid inspect', or use the estimator 'wls'",
         status,
     )
@@ -456,43 +442,3 @@ def _clarabel_settings(max_iterations: int, gap: float) -> "clarabel.DefaultSett
     settings.max_iter = max_iterations
     settings.tol_gap_abs = settings.tol_gap_rel = gap
     return settings
-
-
-def _scs(
-    A: Array, d: Array, G: Array, h: Array, cone: Cone, max_iterations: int
-) -> tuple[Array, str, int]:
-    """Solve the same problem by SCS, which stores matrices as lower triangles."""
-    try:
-        import scs
-    except ImportError as error:
-        raise MissingDependencyError("solver = 'scs'", "scs", "scs") from error
-    from scipy import sparse
-
-    p = len(d)
-    size = np.linalg.norm(A, axis=0).max()
-    columns, rows_of = np.tril_indices(4)
-    lower = np.argsort(4 * rows_of + columns)  # by columns of the lower triangle
-    linear = len(cone.h)
-    blocks = np.arange(10 * cone.n_matrices).reshape(-1, 10)[:, lower].reshape(-1)
-    order = np.concatenate([np.arange(linear), linear + blocks])
-    P = sparse.block_diag([sparse.csc_matrix((p, p)), sparse.eye(p)], format="csc")
-    rows = sparse.bmat([[A / size, -sparse.eye(p)], [-G[order], None]], format="csc")
-    solver = scs.SCS(
-        {"P": P, "A": rows, "b": np.concatenate([d / size, h[order]]), "c": np.zeros(2 * p)},
-        {"z": p, "l": linear, "s": [4] * cone.n_matrices},
-        verbose=False,
-        max_iters=_SCS_ITERATIONS * max_iterations,
-        eps_abs=1e-9,
-        eps_rel=1e-9,
-    )
-    solution = solver.solve()
-    info = solution["info"]
-    status = _SCS_STATUS.get(info["status_val"], str(info["status"]))
-    return np.array(solution["x"][:p]), status, int(info["iter"])
-
-
-#: The solvers by name.
-SOLVERS: Mapping[str, Callable[[Array, Array, Array, Array, Cone, int], tuple[Array, str, int]]] = {
-    "clarabel": _clarabel,
-    "scs": _scs,
-}

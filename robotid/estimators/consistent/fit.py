@@ -10,7 +10,7 @@ import scipy.linalg
 from robotid._typing import Array
 from robotid.estimators.batch import WLS, solve_factor
 from robotid.estimators.consistent.cone_programme import Programme
-from robotid.estimators.consistent.cones import SOLVERS, Subspace
+from robotid.estimators.consistent.cones import Subspace
 from robotid.estimators.consistent.constraints import Constraints
 from robotid.estimators.consistent.penalties import (
     METRICS,
@@ -22,7 +22,7 @@ from robotid.estimators.consistent.penalties import (
 )
 from robotid.estimators.determination import base_spread, determine
 from robotid.estimators.estimator import BatchEstimator, Estimate
-from robotid.exceptions import DataError, NotConvergedError
+from robotid.exceptions import DataError
 from robotid.findings import listed
 from robotid.regressor.factors import Factors
 from robotid.robot.parameters import ParameterLayout
@@ -66,9 +66,7 @@ class Consistent(BatchEstimator):
         metric: Metric of the distance from the prior: "euclidean", "riemannian" or "entropic"; see
             ``make_penalty``.
         constraints: Bounds in addition to physical consistency.
-        solver: Cone solver for quadratic priors and for the check: "clarabel" or "scs".
         choice: How ``prior_weight`` was chosen; None: it was given.
-        check: Whether the second cone solver checks the solution; the details have the difference.
         wls_noise: Noise levels of weighted least squares of the fitted rows, shape (n,) [N m or N];
             None: they are computed.
 
@@ -90,8 +88,6 @@ class Consistent(BatchEstimator):
     max_iterations: int = 200
     metric: str = "euclidean"
     constraints: Constraints = field(default_factory=Constraints)
-    solver: str = "clarabel"
-    check: bool = False
     wls_noise: Array | None = None
     choice: WeightChoice | None = None
 
@@ -108,11 +104,8 @@ class Consistent(BatchEstimator):
             raise DataError(
                 f"margin {self.margin} and prior_weight {self.prior_weight} must be positive"
             )
-        if self.metric not in METRICS or self.solver not in SOLVERS:
-            raise DataError(
-                f"metric is {self.metric!r}, wanted one of {listed(METRICS)}; solver is "
-                f"{self.solver!r}, wanted one of {listed(SOLVERS)}"
-            )
+        if self.metric not in METRICS:
+            raise DataError(f"metric is {self.metric!r}, wanted one of {listed(METRICS)}")
         self.constraints.check(self.layout, self.prior, self.known_share)
 
     @property
@@ -126,8 +119,6 @@ class Consistent(BatchEstimator):
         solution = self.programme.minimise(rows, self.prior_weight)
         covariance = self.programme.covariance(self.prior_weight, rows, solution.x)
         details = self._details(solution.x)
-        if self.check:
-            details["check"] = self._second_opinion(rows, solution.x, factors)
         return Estimate(
             theta=solution.x,
             covariance=covariance,
@@ -239,7 +230,7 @@ class Consistent(BatchEstimator):
         cone = self.constraints.cone(self.layout, scale, held, units, self.margin)
         penalty = make_penalty(self.metric, self.layout, self.prior, scale, held)
         space = Subspace.of(E * scale, e)
-        return Programme(self.K, scale, penalty, cone, space, self.solver, self.max_iterations)
+        return Programme(self.K, scale, penalty, cone, space, self.max_iterations)
 
     @property
     def penalty(self) -> Penalty:
@@ -294,29 +285,11 @@ class Consistent(BatchEstimator):
             prior["curve"] = [list(pair) for pair in self.choice.curve]
         return {
             "prior": prior,
-            "solver": "interior point" if isinstance(self.penalty, Entropic) else self.solver,
+            "solver": "interior point" if isinstance(self.penalty, Entropic) else "clarabel",
             "constraints": [*self.programme.cone.families, *(["equalities"] if is_bound else [])],
             "active": sorted(set(self.active(pi)[1])),
             "pinned": list(self.constraints.pinned),
             "relaxed": list(self.constraints.relaxed),
-        }
-
-    def _second_opinion(self, rows: Array, pi: Array, factors: Factors) -> dict[str, Any]:
-        """Return the result of the other solver, as plain values."""
-        (other,) = (name for name in SOLVERS if name != self.solver)
-        try:
-            programme = replace(self.programme, solver=other)
-            solution = programme.expanded(rows, self.prior_weight, pi)
-        except NotConvergedError as error:
-            return {"solver": other, "status": error.status}
-        objective = self.objective(rows, pi)
-        change = factors.R[:, :, :-1] @ (self.K @ (solution.x - pi))
-        torque = np.sqrt((change**2).sum() / factors.torque_squares().sum())
-        return {
-            "solver": other,
-            "status": solution.message,
-            "objective_difference": (self.objective(rows, solution.x) - objective) / objective,
-            "torque_difference": float(torque),
         }
 
 

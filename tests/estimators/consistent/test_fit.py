@@ -5,8 +5,6 @@ import pytest
 from helpers.estimation import NOISE, Case, consistent, still_wrist
 
 from robotid.estimators import PRX, RLS, WLS, Consistent, Kalman, fold
-from robotid.estimators.consistent.cone_programme import Programme
-from robotid.estimators.consistent.cones import ConeSolution
 from robotid.estimators.estimator import Estimate
 from robotid.exceptions import DataError, NotConvergedError
 from robotid.regressor.factors import Factors, triangle_of
@@ -169,26 +167,3 @@ def test_a_projection_is_of_the_parameters_with_a_variance_and_the_prior(rng):
     assert found.message.startswith("rls; projected onto physically consistent parameters, no con")
     assert "c" in found.undetermined
     np.testing.assert_allclose(found.prior_std, case.std / np.sqrt(0.5))
-
-
-def test_a_second_solver_is_compared_by_torque_and_objective(rng, monkeypatch):
-    case = Small(rng)
-    found = case.fit.fit(case.factors)
-    rows, change = case.fit.rows(case.factors, found.sigma), 0.01 * case.std
-    asked = []
-
-    def expanded(programme, rows, weight, pi):
-        asked.append((programme.solver, weight))
-        return ConeSolution(pi + change, 3, "SCS: Solved")
-
-    monkeypatch.setattr(Programme, "expanded", expanded)
-    second = case.fit._second_opinion(rows, found.theta, case.factors)
-    assert asked == [("scs", 2.5)]
-    moved, tau = (np.concatenate(x) for x in ([W @ case.K @ change for W in case.W], case.tau))
-    before, after = (case.fit.objective(rows, x) for x in (found.theta, found.theta + change))
-    assert second == {
-        "solver": "scs",
-        "status": "SCS: Solved",
-        "objective_difference": pytest.approx(after / before - 1.0),
-        "torque_difference": pytest.approx(np.linalg.norm(moved) / np.linalg.norm(tau)),
-    }

@@ -90,7 +90,7 @@ def test_the_evidence_finds_the_spread_that_parameters_were_drawn_with(case):
 
 def test_the_plausible_weight_of_a_quadratic_prior_is_that_of_the_largest_evidence(case):
     fit, problem = case
-    fit = replace(fit, metric="euclidean", solver="clarabel")
+    fit = replace(fit, metric="euclidean")
     rows = fit.rows(compress(problem), NOISE)
     found = scipy.optimize.minimize_scalar(
         lambda decade: -log_evidence(fit, rows)(10.0**decade), bounds=(-4, 2), method="bounded"
