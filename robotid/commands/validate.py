@@ -240,7 +240,7 @@ def _warnings(
     missing: Sequence[str],
 ) -> list[VerdictWarning]:
     """Return the warnings of the result, without those of its validation, and of the new logs."""
-    own = [VerdictWarning(d["code"], d["joint"], d["message"]) for d in stated.get("warnings", ())]
+    own = [VerdictWarning(**warning) for warning in stated.get("warnings", ())]
     is_robust = job.estimator.is_robust
     warnings = [warning for warning in own if warning.code != "repeated_motion"]
     warnings += warnings_of(found, model.joints, names, is_robust=is_robust)

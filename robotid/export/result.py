@@ -28,7 +28,6 @@ from robotid.judgement.parameter_table import parameter_table
 from robotid.judgement.payload_check import PayloadCheck
 from robotid.judgement.scale_check import ScaleCheck
 from robotid.judgement.stated_mass import StatedMass
-from robotid.judgement.verdict import VerdictWarning
 from robotid.logs.data import Log, suggestion
 from robotid.regressor.friction_projection import (
     DriveMoments,
@@ -116,7 +115,7 @@ _SHAPE = {
         "use_for?": {...: TEXT},
         "per_joint?": {...: {"status": _STATUS, "reasons": [TEXT]}},
         "log_errors?": [TEXT],
-        "warnings?": [{field.name: TEXT for field in dataclasses.fields(VerdictWarning)}],
+        "warnings?": [{"code": TEXT, "joint": TEXT, "message": TEXT, "effect?": TEXT}],
     },
 }
 

@@ -11,6 +11,7 @@ from robotid.fitting.metrics import JointMetrics, Metrics
 
 __all__ = [
     "BEATEN",
+    "COSTLY",
     "GOOD",
     "POOR",
     "Determined",
@@ -26,13 +27,14 @@ GOOD = 15.0
 POOR = 50.0
 #: A simpler model is better if its error is smaller by this factor ...
 BEATEN = 1.05
+#: [%] a larger error on the fitted logs, twice that of WLS, makes a joint poor.
+COSTLY = 3.0
 
 _TIE = 0.3  # [%] ... and, for the URDF with fitted drives, by this share of the torque
 _OPTIMISM = 2.0  # validation error over fitted error beyond which the fit is over-fitted
 _BASE = "base."  # of the rows of a floating base
 _WRONG = 2.0  # an error this many times that of WLS gives a warning ...
 _HARMLESS = 1.0  # [%] ... but not below this share of the torque
-_COSTLY = 3.0  # [%] ... and above this one the result is poor
 _NAMED = 8  # parameters that a reason names
 
 
@@ -69,15 +71,6 @@ class Predictions:
         found = {joint: m for joint, m in metrics.per_joint.items() if joint not in self.hidden}
         joints = {name: m for name, m in found.items() if not name.startswith(_BASE)}
         return joints or found
-
-    def costs(self, joint: str) -> bool:
-        """Return whether the error on fitted recordings is too large to be worse than WLS.
-
-        Args:
-            joint: A joint whose constraints increase its error.
-        """
-        measured = self.fitted.get(joint)
-        return measured is not None and error_of(measured) > _COSTLY
 
     def of_base(self) -> list[str]:
         """Return the prediction errors of the wrench on a floating base, beside its joints'."""

@@ -13,7 +13,13 @@ from robotid.exceptions import SettingsError
 from robotid.findings import Finding, listed, not_ignored
 from robotid.fitting.left_out import logs_that_test
 from robotid.fitting.metrics import Metrics
-from robotid.judgement.evidence import Determined, Predictions, error_of, is_harmless_cost
+from robotid.judgement.evidence import (
+    COSTLY,
+    Determined,
+    Predictions,
+    error_of,
+    is_harmless_cost,
+)
 from robotid.judgement.scale_check import ScaleCheck
 from robotid.judgement.uses import uses_of_torques
 
@@ -134,11 +140,13 @@ class VerdictWarning:
         code: Code of the finding.
         joint: The joint concerned; empty if the whole result is.
         message: The reason as text.
+        effect: The best verdict on the joint with this warning: "usable" or "poor".
     """
 
     code: str
     joint: str
     message: str
+    effect: str = "usable"
 
 
 @dataclass(frozen=True)
@@ -215,10 +223,10 @@ def judge(
         An impossible body concerns the result, but not the torque of its joint.
     """
     found, hidden = predictions.on_each(), predictions.hidden
-    costly = [w for w in warnings if w.code == "constraint_costs" and predictions.costs(w.joint)]
+    costly = [w for w in warnings if w.effect == "poor" and w.joint in found]
     for warning in costly:
         found[warning.joint][0].extend(_described([warning]))
-    warnings = [warning for warning in warnings if warning not in costly]
+    stated, warnings = warnings, [warning for warning in warnings if warning not in costly]
     largest = sorted(found.values(), key=lambda of: -max(of[2], default=0.0))
     poor = sorted((reason for worse, _, _ in largest for reason in worse), key=_rank)
     is_contradicted = scale_check is not None and scale_check.contradicts
@@ -252,15 +260,8 @@ def judge(
         for joint, (worse, cautions, errors) in found.items()
     }
     per_joint |= {joint: JointVerdict("not evaluated", (_HIDDEN,)) for joint in hidden}
-    best = {joint: max(found[joint][2]) for joint, v in per_joint.items() if v.status == "good"}
-    if best and cause_of is not None:
-        largest_good = max(best, key=lambda joint: best[joint])
-        limit = f"largest error of the good joints: {cause_of(largest_good)}"
-        own = per_joint[largest_good]
-        per_joint[largest_good] = replace(own, reasons=(*own.reasons, limit))
-        if len(best) == len(per_joint):
-            cause = cause_of(largest_good).partition(". ")[0]
-            notes.insert(0, f"{largest_good}: largest error: {cause}")
+    if cause_of is not None:
+        notes = [*_largest_error(per_joint, found, cause_of), *notes]
     worst = max((error for _, _, errors in found.values() for error in errors), default=0.0)
     good = (
         f"torque prediction error on {logs_that_test(predictions.validation)}: at most "
@@ -277,7 +278,24 @@ def judge(
         log_errors=log_errors,
         scale_check=scale_check,
     )
-    return replace(verdict, warnings=(*costly, *warnings), use_for=uses)
+    return replace(verdict, warnings=tuple(stated), use_for=uses)
+
+
+def _largest_error(
+    per_joint: dict[str, JointVerdict],
+    found: Mapping[str, tuple[list[str], list[str], list[float]]],
+    cause_of: Callable[[str], str],
+) -> list[str]:
+    """Add the cause to the good joint with the largest error; return it if all joints are good."""
+    good = [joint for joint, verdict in per_joint.items() if verdict.status == "good"]
+    if not good:
+        return []
+    last = max(good, key=lambda joint: max(found[joint][2]))
+    cause = cause_of(last)
+    reasons = (*per_joint[last].reasons, f"largest error of the good joints: {cause}")
+    per_joint[last] = replace(per_joint[last], reasons=reasons)
+    is_all = len(good) == len(per_joint)
+    return [f"{last}: largest error: {cause.partition('. ')[0]}"] if is_all else []
 
 
 def concluded(
@@ -474,8 +492,9 @@ def _warnings(finding: Finding, joints: Sequence[str]) -> Iterator[VerdictWarnin
     message = _REASONS[finding.code].format(**finding.evidence)
     log, _, last = finding.where.rpartition(": ")
     named = [joint for joint in last.split(", ") if joint in joints]
+    is_costly = finding.code == "constraint_costs" and finding.evidence["error_pct"] > COSTLY
     for joint in named:
-        yield VerdictWarning(finding.code, joint, message)
+        yield VerdictWarning(finding.code, joint, message, "poor" if is_costly else "usable")
     if not named:
         where = "" if finding.where in _OF_THE_FIT else f"{log or last}: "
         yield VerdictWarning(finding.code, "", f"{where}{message}")

@@ -211,7 +211,12 @@ def test_a_doubt_makes_its_joint_and_the_whole_usable_at_best():
     assert found.reasons == ("run.csv: masses do not fit (urdf_mismatch)",)
     assert {v.status for v in found.joints.values()} == {"usable"}
     assert found.to_dict()["warnings"] == [
-        {"code": "urdf_mismatch", "joint": "", "message": "run.csv: masses do not fit"}
+        {
+            "code": "urdf_mismatch",
+            "joint": "",
+            "message": "run.csv: masses do not fit",
+            "effect": "usable",
+        }
     ]
 
 
@@ -470,16 +475,16 @@ def test_a_mass_that_is_stated_does_not_come_from_the_data(arm):
     assert (found.standard[k], found.sources[k]) == (pytest.approx(2.0), "prior")
 
 
-def test_a_wrong_total_mass_makes_the_joints_usable_that_it_costs(run, arm):
+def test_a_wrong_total_mass_makes_the_joints_poor_that_it_costs(run, arm):
     _, result, again = run(constraints={"total_mass": 5.0})
-    assert result["verdict"]["status"] == again["status"] == "usable"
+    assert result["verdict"]["status"] == again["status"] == "poor"
     lift = result["verdict"]["per_joint"]["shoulder_lift_joint"]
-    assert lift["status"] == "usable"
+    assert lift["status"] == "poor"
     costs = [f["message"] for f in result["warnings"] if f["code"] == "constraint_costs"]
     assert costs
     assert all("the constraints in [estimator] (total_mass)" in text for text in costs)
     assert "physics and data disagree" in lift["reasons"][-1]
-    assert again["per_joint"]["shoulder_lift_joint"]["status"] == "usable"
+    assert again["per_joint"]["shoulder_lift_joint"]["status"] == "poor"
     found = found_of(arm, constraints={"total_mass": 5.0}, ignore=["constraint_costs"])
     assert "constraint_costs" not in {doubt.code for doubt in found.warnings}
 
