@@ -320,7 +320,8 @@ def _in_one(values: list[str]) -> str:
         return ", ".join(values)
     ends = [(value.split(" to ")[0], value.split(" to ")[-1]) for value in values]
     if any(float(first) > float(last) for first, last in ends):  # decreases are not ranges
-        return " to ".join(max(ends, key=lambda pair: float(pair[1])))  # the least favourable
+        first, last = max(ends, key=lambda pair: float(pair[1]))  # the smallest decrease
+        return f"{first} to {last}"
     numbers = [number for pair in ends for number in pair]
     return f"{min(numbers, key=float)} to {max(numbers, key=float)}"
 

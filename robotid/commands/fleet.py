@@ -25,7 +25,7 @@ from robotid.report.fleet import fleet_page
 from robotid.variation.groups import FEWEST_RUNS
 from robotid.variation.history import FALSE_ALARMS
 from robotid.variation.units import between_units
-from robotid.versions import code_versions
+from robotid.versions import __version__, code_versions
 from robotid.workers.checkpoint import Checkpoint, released_on_error
 from robotid.workers.pieces import Workload
 from robotid.workers.plan import WorkPlan
@@ -339,7 +339,8 @@ def run_fleet(
                     result = checkpoint.load(k)
                     table.add(result.rows)
                     gathered.add(result)
-            content = gathered.content(units) | {"inputs": inputs}
+            about = {"robotid": __version__, "outputs": dict(table=_FILES[0], page=_FILES[2])}
+            content = about | gathered.content(units) | {"inputs": inputs}
             write_json(content, partial / "fleet.json")
             write_text(fleet_page(content), partial / "fleet.html")
     checkpoint.remove()

@@ -145,6 +145,14 @@ class Result:
         """Whether the identified URDF was written; an impossible result has none."""
         return "urdf" in self.content["outputs"]
 
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """The result.json, its URDF and sidecar, and the inputs of the fit; not the report."""
+        outputs = self.content["outputs"]
+        beside = [self.path.with_name(outputs[x]) for x in ("urdf", "sidecar") if x in outputs]
+        inputs = [Path(entry["path"]) for entry in self.content["inputs"] if entry["path"]]
+        return (self.path, *beside, *inputs)
+
     @cached_property
     def identified(self) -> tuple[RobotModel, Array]:
         """The robot of the identified URDF with its sidecar, and its standard parameters."""

@@ -103,7 +103,7 @@ def write_comparison(
         DataError: If the results cannot be compared, or the folder of the target is missing.
         SettingsError: If the target is a folder, or the probability is not between 0 and 1.
     """
-    check_file(Path(target))
+    check_file(Path(target), paths)
     content = compare_results(paths, false_alarms=false_alarms)
     write_text(comparison_page(content), target)
     return content
