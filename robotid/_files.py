@@ -9,7 +9,7 @@ import os
 import re
 import shutil
 import tempfile
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
@@ -28,6 +28,7 @@ __all__ = [
     "folder_beside",
     "log_exists",
     "missing_file",
+    "moved_file",
     "read_json",
     "remove_written",
     "source_entry",
@@ -447,6 +448,32 @@ def file_sha256(path: str | Path) -> str:
         return hashlib.sha256(listing.encode()).hexdigest()
     about = source.stat()
     return _sha256(source.resolve(), about.st_size, about.st_mtime_ns, about.st_ino)
+
+
+def moved_file(path: Path, result: Path, hashes: Collection[str]) -> Path:
+    """Return an input of a result, also if the folder that has both was moved or renamed.
+
+    Args:
+        path: The path of the input when the result was written.
+        result: The file of the result.
+        hashes: Permitted SHA-256 of the input.
+
+    Returns:
+        The path if it exists; else that at the same place below a folder of the result, if its
+        SHA-256 is permitted; else the path.
+    """
+    try:
+        check_path(path)
+    except SettingsError:  # reported where it is read
+        return path
+    if log_exists(path):
+        return path
+    for folder in result.resolve().parents:
+        for k in range(len(path.parts)):
+            place = folder.joinpath(*path.parts[k:])
+            if log_exists(place) and file_sha256(place) in hashes:
+                return place
+    return path
 
 
 _DEEPEST = 40  # levels of tables and lists

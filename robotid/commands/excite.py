@@ -1,5 +1,6 @@
 """An excitation trajectory: designed for a robot within its limits, and written to a file."""
 
+import os
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -9,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from robotid._files import check_file, write_text
-from robotid.commands.job import Job, LogEntry
+from robotid.commands.job import Job
 from robotid.commands.logs import result_run
 from robotid.exceptions import SettingsError
 from robotid.excitation.basis import Basis, BSplineBasis, FourierBasis
@@ -221,8 +222,10 @@ def _identification(job: Job, stand: Stand, target: str | Path) -> str:
     own = [x.frame for x in stand.feet.contacts]
     contacts = tuple(replace(x, always=True) for x in job.contacts if x.frame in own)
     path = Path(target)
-    log = LogEntry(path.with_name(f"{path.stem}_recorded{path.suffix}").resolve())
-    found = replace(job, contacts=contacts, identification=(log,)).to_dict()
+    found = replace(job, contacts=contacts).to_dict()
+    found["identification"] = [{"log": f"{path.stem}_recorded{path.suffix}"}]
+    if not job.urdf.is_absolute():  # the folder of both may be moved
+        found["urdf"] = Path(os.path.relpath(job.urdf, path.parent)).as_posix()
     plain = Job(job.urdf).to_dict()
     return toml_text({key: x for key, x in found.items() if key == "urdf" or x != plain[key]})
 

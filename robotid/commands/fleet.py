@@ -212,7 +212,9 @@ def _unit(
 def _path(source: Path, number: int, column: str, text: str) -> Path:
     """Return a path of a row, relative to the table, with $VARIABLES replaced as in job files."""
     try:
-        return stated_path(text, f"{source.name} row {number}, column {column!r}", source.parent)
+        return stated_path(
+            text, f"{source.name} row {number}, column {column!r}", source.parent, expand=True
+        )
     except SettingsError as error:
         raise DataError(str(error)) from error
 
