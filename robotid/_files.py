@@ -3,12 +3,13 @@
 import difflib
 import hashlib
 import json
+import logging
 import math
 import os
 import re
 import shutil
 import tempfile
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
@@ -27,12 +28,16 @@ __all__ = [
     "folder_beside",
     "log_exists",
     "missing_file",
+    "moved_file",
     "read_json",
+    "remove_written",
     "source_entry",
     "write_json",
     "write_text",
     "written_whole",
 ]
+
+_log = logging.getLogger(__name__)
 
 #: The description of a LeRobot dataset, in its folder.
 DATASET = Path("meta") / "info.json"
@@ -64,15 +69,21 @@ def check_path(path: str | Path) -> None:
         )
 
 
-def check_file(target: Path) -> None:
+def check_file(target: Path, inputs: Iterable[str | Path | None] = ()) -> None:
     """Refuse a path where no file can be written, before its content is computed.
+
+    A file that exists is replaced only if robotid wrote it, and it has not changed since: its
+    SHA-256 is in ``~/.local/state/robotid/written``, or it is of the result in its folder.
 
     Args:
         target: The file.
+        inputs: Files, or folders of results, from which its content is computed; "" and None are
+            inputs in memory.
 
     Raises:
         DataError: If its folder does not exist.
-        SettingsError: If it is a folder, or its name is too long.
+        SettingsError: If it is a folder, its name is too long, its folder is not writable, it is
+            one of the inputs, or robotid did not write it.
     """
     check_path(target)
     if not target.parent.is_dir():
@@ -83,18 +94,35 @@ def check_file(target: Path) -> None:
         raise SettingsError(
             f"{str(target)!r} is a folder, wanted a file to write; remove it, or name another file"
         )
+    if _is_stream(target):
+        return
+    _require_writable(target.parent)
+    if not target.exists() or _is_hidden(target):
+        return
+    named = [Path(path) for path in inputs if path]
+    files = [*named, *(folder / name for folder in named for name in _RECORDS)]
+    if any(path.exists() and target.samefile(path) for path in files):
+        raise SettingsError(f"{str(target)!r} is an input and is not replaced; name another file")
+    if not _is_written(target):
+        raise SettingsError(
+            f"{str(target)!r} exists, and robotid did not write it, or it has changed since; it is "
+            "not replaced. Remove it, or name another file"
+        )
 
 
-def check_folder(target: Path, names: Iterable[str] = ()) -> None:
+def check_folder(
+    target: Path, names: Iterable[str] = (), inputs: Iterable[str | Path | None] = ()
+) -> None:
     """Refuse a folder where no results can be written, before the results are computed.
 
     Args:
         target: The folder; it may be missing.
         names: Names of the files to write in it.
+        inputs: As of ``check_file``.
 
     Raises:
         SettingsError: If it, or a folder above it, is a file or not writable, or if one of its
-            files is a folder or has a name that is too long.
+            files is refused by ``check_file``.
     """
     check_path(target)
     existing = next(folder for folder in (target, *target.absolute().parents) if folder.exists())
@@ -102,14 +130,73 @@ def check_folder(target: Path, names: Iterable[str] = ()) -> None:
         raise SettingsError(
             f"{str(existing)!r} is a file, wanted a folder for the results; name another folder"
         )
-    if not os.access(existing, os.W_OK | os.X_OK):
-        raise SettingsError(f"the folder {str(existing)!r} is not writable; name another folder")
+    _require_writable(existing)
     for name in names:
         check_path(name)
         if existing == target:
-            check_file(target / name)
+            check_file(target / name, inputs)
 
 
+def remove_written(files: Iterable[Path]) -> None:
+    """Remove files of an earlier run, with a warning; a file that robotid did not write stays.
+
+    Args:
+        files: The files; they may be missing.
+    """
+    for file in files:
+        if file.is_file() and _is_written(file):
+            _log.warning("removed %s of an earlier run: this run did not write it", file)
+            file.unlink()
+
+
+def _require_writable(folder: Path) -> None:
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise SettingsError(f"the folder {str(folder)!r} is not writable; name another folder")
+
+
+def _is_hidden(path: Path) -> bool:
+    """Return whether a file is in a hidden folder of robotid, as that of a checkpoint."""
+    return any(part.startswith(".robotid-") for part in path.parts[:-1])
+
+
+def _is_written(path: Path) -> bool:
+    """Return whether robotid wrote a file with this content, or a result beside it names it."""
+    ledger = _ledger()
+    if ledger.is_file() and file_sha256(path) in ledger.read_text(encoding="utf-8"):
+        return True
+    for record in (path.with_name(name) for name in _RECORDS):
+        try:
+            content = json.loads(record.read_bytes())
+        except (OSError, ValueError):  # no result
+            continue
+        if isinstance(content, dict) and "robotid" in content:
+            outputs = content.get("outputs", {})
+            if path == record or (isinstance(outputs, dict) and path.name in outputs.values()):
+                return True
+    return False
+
+
+def _record(path: Path) -> None:
+    """Record the SHA-256 of a written file, so that a later run may replace the file."""
+    ledger = _ledger()
+    if _is_hidden(path) or not ledger.is_absolute():  # the user has no home
+        return
+    try:
+        ledger.parent.mkdir(parents=True, exist_ok=True)
+        with ledger.open("a", encoding="utf-8") as file:
+            file.write(f"{file_sha256(path)}\n")
+    except OSError as error:  # a home that is not writable
+        _log.info("%s is not recorded as written by robotid: %s", path, error)
+
+
+def _ledger() -> Path:
+    """Return the file with a SHA-256 for each file that robotid wrote."""
+    state = os.environ.get("XDG_STATE_HOME") or os.path.expanduser("~/.local/state")
+    return Path(state, "robotid", "written")
+
+
+#: Files of results, which name the other files that were written with them.
+_RECORDS = ("result.json", "track.json", "fleet.json")
 _LONGEST = 255  # bytes of a file's name
 _LONGEST_PATH = 4095  # bytes of a whole path
 _HIDDEN = 32  # further bytes in the name of a hidden file
@@ -117,7 +204,7 @@ _SHOWN = 60  # characters of a name in a message
 
 
 @contextmanager
-def written_whole(target: str | Path) -> Iterator[Path]:
+def written_whole(target: str | Path, inputs: Iterable[str | Path | None] = ()) -> Iterator[Path]:
     """Provide a hidden name in the folder of a file; the written file then replaces the target.
 
     After an error the target is unchanged, and no hidden file remains. A device, a pipe or
@@ -125,16 +212,17 @@ def written_whole(target: str | Path) -> Iterator[Path]:
 
     Args:
         target: The file.
+        inputs: As of ``check_file``.
 
     Yields:
         The path to write.
 
     Raises:
         DataError: If its folder does not exist, or the reader of a pipe has closed it.
-        SettingsError: If it is a folder.
+        SettingsError: As of ``check_file``.
     """
     path = Path(target)
-    check_file(path)
+    check_file(path, inputs)
     if _is_stream(path):
         with tempfile.TemporaryDirectory(prefix="robotid-") as folder:
             yield Path(folder, path.name)
@@ -148,6 +236,7 @@ def written_whole(target: str | Path) -> Iterator[Path]:
     try:
         yield hidden
         os.replace(hidden, path)
+        _record(path)
     except OSError as error:  # most messages do not name the file
         error.add_note(f"while writing {str(path)!r}")
         raise
@@ -200,6 +289,8 @@ def folder_beside(target: Path) -> Iterator[Path]:
         except BaseException:
             _put_back(names, new, old, target)
             raise
+        for name in names:
+            _record(target / name)
 
 
 def _put_back(names: Iterable[str], new: Path, old: Path, target: Path) -> None:
@@ -357,6 +448,32 @@ def file_sha256(path: str | Path) -> str:
         return hashlib.sha256(listing.encode()).hexdigest()
     about = source.stat()
     return _sha256(source.resolve(), about.st_size, about.st_mtime_ns, about.st_ino)
+
+
+def moved_file(path: Path, result: Path, hashes: Collection[str]) -> Path:
+    """Return an input of a result, also if the folder that has both was moved or renamed.
+
+    Args:
+        path: The path of the input when the result was written.
+        result: The file of the result.
+        hashes: Permitted SHA-256 of the input.
+
+    Returns:
+        The path if it exists; else that at the same place below a folder of the result, if its
+        SHA-256 is permitted; else the path.
+    """
+    try:
+        check_path(path)
+    except SettingsError:  # reported where it is read
+        return path
+    if log_exists(path):
+        return path
+    for folder in result.resolve().parents:
+        for k in range(len(path.parts)):
+            place = folder.joinpath(*path.parts[k:])
+            if log_exists(place) and file_sha256(place) in hashes:
+                return place
+    return path
 
 
 _DEEPEST = 40  # levels of tables and lists

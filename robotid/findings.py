@@ -254,7 +254,11 @@ def _in_one(values: list[str]) -> str:
         return _typed_once(values)
     if not all(re.fullmatch(_RANGE, value) for value in values):
         return ", ".join(values)
-    numbers = [number for value in values for number in value.split(" to ")]
+    ends = [(value.split(" to ")[0], value.split(" to ")[-1]) for value in values]
+    if any(float(first) > float(last) for first, last in ends):  # decreases are not ranges
+        first, last = max(ends, key=lambda pair: float(pair[1]))  # the smallest decrease
+        return f"{first} to {last}"
+    numbers = [number for pair in ends for number in pair]
     return f"{min(numbers, key=float)} to {max(numbers, key=float)}"
 
 

@@ -1,5 +1,6 @@
 """Files are put in place whole or not at all, and nothing that is no file is replaced."""
 
+import json
 import os
 import stat
 import subprocess
@@ -14,6 +15,7 @@ from robotid._files import (
     file_sha256,
     folder_beside,
     missing_file,
+    remove_written,
     write_text,
     written_whole,
 )
@@ -33,7 +35,7 @@ def replace(folder, *files, error=None):
 
 
 def test_after_an_error_every_file_is_as_it_was(tmp_path):
-    (tmp_path / "a").write_text("old")
+    write_text("old", tmp_path / "a")
     with pytest.raises(ZeroDivisionError):
         replace(tmp_path, "a", error=ZeroDivisionError())
     assert names(tmp_path) == ["a"]
@@ -43,7 +45,7 @@ def test_after_an_error_every_file_is_as_it_was(tmp_path):
 @pytest.mark.parametrize("failing", range(1, 6))
 def test_a_replacement_that_fails_half_way_is_undone(tmp_path, monkeypatch, failing):
     for name in "ac":
-        (tmp_path / name).write_text("old")
+        write_text("old", tmp_path / name)
     move, calls = os.replace, []
 
     def fail_once(source, target):
@@ -60,7 +62,7 @@ def test_a_replacement_that_fails_half_way_is_undone(tmp_path, monkeypatch, fail
 
 
 def test_files_of_a_folder_replace_those_of_their_names(tmp_path):
-    (tmp_path / "a").write_text("old")
+    write_text("old", tmp_path / "a")
     (tmp_path / "other").write_text("kept")
     replace(tmp_path, "a", "b")
     assert names(tmp_path) == ["a", "b", "other"]
@@ -68,7 +70,7 @@ def test_files_of_a_folder_replace_those_of_their_names(tmp_path):
 
 
 def test_a_folder_in_the_place_of_a_file_is_refused_and_nothing_is_mixed(tmp_path):
-    (tmp_path / "a").write_text("old")
+    write_text("old", tmp_path / "a")
     (tmp_path / "b").mkdir()
     message = r"b' is a folder, wanted a file to write; remove it, or name another"
     with pytest.raises(SettingsError, match=message):
@@ -79,6 +81,37 @@ def test_a_folder_in_the_place_of_a_file_is_refused_and_nothing_is_mixed(tmp_pat
         check_folder(tmp_path, ["a", "b"])
     with pytest.raises(SettingsError, match=message):
         check_file(tmp_path / "b")
+
+
+def test_only_files_that_robotid_wrote_are_replaced(tmp_path, monkeypatch):
+    """Not those of a user, nor those that a user changed; by another user, those of a result."""
+    own, mine, result = tmp_path / "own.html", tmp_path / "log.csv", tmp_path / "result.json"
+    write_text("1", own)
+    write_text("2", own)
+    mine.write_text("time\n")
+    write_text(json.dumps({"robotid": "1", "outputs": {"report": "report.html"}}), result)
+    write_text("page", tmp_path / "report.html")
+    own.write_text("2 and a note")
+    for path in (own, mine):
+        before = path.read_text()
+        for write in (lambda p: write_text("3", p), lambda p: replace(tmp_path, p.name)):
+            with pytest.raises(SettingsError, match="robotid did not write it, or it has changed"):
+                write(path)
+        remove_written([path])
+        assert path.read_text() == before
+    with pytest.raises(SettingsError, match=r"result.json' is an input and is not replaced"):
+        check_file(result, [tmp_path])
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "other"))
+    replace(tmp_path, "report.html", "result.json")
+    assert (tmp_path / "report.html").read_text() == "new"
+
+
+def test_a_state_folder_that_is_not_writable_stops_no_work(tmp_path, monkeypatch):
+    (tmp_path / "home").write_text("a file")
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "home"))
+    write_text("1", tmp_path / "a")
+    with pytest.raises(SettingsError, match="robotid did not write it"):
+        write_text("2", tmp_path / "a")
 
 
 def test_places_where_nothing_can_be_written_are_refused(tmp_path):

@@ -85,6 +85,19 @@ def test_what_is_typed_keeps_one_value_and_ranges_of_ranges_are_one_range():
     assert "torque_delay = 0.0199 (--torque-delay 0.0199)" in cause.messages[0]
 
 
+def test_of_decreases_the_smallest_is_stated_as_a_decrease():
+    def exchanged(log, before, after):
+        message = (
+            f"{log}: with these columns exchanged, the share decreases from {before} to {after} %"
+        )
+        return Finding("torque_order", "error", log, message)
+
+    (cause,) = grouped([exchanged("a", "102", "0.39"), exchanged("b", "87", "0.56")])
+    assert cause.messages == (
+        "a, b: with these columns exchanged, the share decreases from 87 to 0.56 %",
+    )
+
+
 def cut(log, start, end):
     message = f"{log}: at rest for {start} s; cut it with start = {start} and end = {end}"
     return Finding("standstill", "note", log, message)

@@ -53,7 +53,7 @@ def run(options: argparse.Namespace) -> None:
         job = stated_job(findings, options.source, options.logs[0])
     if options.html or options.serve is None:
         page_file = Path(options.html or findings.beside / "replay.html")
-        check_file(page_file)
+        check_file(page_file, [options.source, *options.logs, *options.results])
         target = replay_files(job, findings, ghost=options.ghost).write(page_file)
         print(f"written: {target}, {target.stat().st_size / 1e6:.1f} MB", file=sys.stderr)
     if options.serve is not None:

@@ -49,7 +49,8 @@ def convert(
 
     Args:
         path: The log to read.
-        target: The file to write, .csv, .parquet, .npz, .h5, .hdf5 or .mat; replaced if it exists.
+        target: The file to write, .csv, .parquet, .npz, .h5, .hdf5 or .mat; an
+            existing one is replaced only if robotid wrote it.
         joints: Names of the joints to write; all joints of the file if None. Columns of a base, of
             an IMU, of contacts and of wrenches are always written.
         source: Topic or group, names of joints in the file, meaning of effort, topics of sensors.
@@ -60,7 +61,7 @@ def convert(
         SettingsError: If the target is a folder.
     """
     file = Path(path)
-    check_file(Path(target))
+    check_file(Path(target), [file])
     opened = open_table(file, source)
     found, by_joint = _standard_names(file.name, opened.names, source)
     for joint in joints or ():

@@ -63,7 +63,7 @@ def design_motion(
         SettingsError: If a setting is not usable, or no motion satisfies the limits.
     """
     for file in (target, *([] if report is None else [report])):
-        check_file(Path(file))
+        check_file(Path(file), [job.urdf, given])
     check_motion_file(target)
     designer, run = _designer(job, settings, given)
     model = designer.information.model

@@ -4,6 +4,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+from robotid._files import check_file
 from robotid.exceptions import SettingsError
 from robotid.export.exported import Written
 from robotid.export.formats import FORMATS, options_of
@@ -35,7 +36,8 @@ def export_result(
         DataError: If the result has no URDF, or no ranges or gains that the format needs, or the
             folder does not exist.
         ModelError: If the URDF was changed, or one of its links is impossible.
-        SettingsError: If the target is a folder, or the format or an option is unknown.
+        SettingsError: If the target is a folder, an input of the result or a file that robotid did
+            not write, or the format or an option is unknown.
     """
     if kind not in FORMATS:
         raise SettingsError(f"format is {kind!r}, wanted one of {listed(FORMATS)}")
@@ -47,8 +49,9 @@ def export_result(
                 f"--{name.replace('_', '-')} is an option of {listed(having.get(name, {}))}, "
                 f"not of {kind}; remove it"
             )
-    module = import_module(f"robotid.export.{kind}")
-    written: Written = module.export(load_result(path), Path(target), **stated)
+    result, module = load_result(path), import_module(f"robotid.export.{kind}")
+    check_file(Path(target), result.files)
+    written: Written = module.export(result, Path(target), **stated)
     return {
         "result": str(path), "format": kind, "files": [*map(str, written.files)],
         "not_stated": list(written.notes), "projected": dict(written.projected),

@@ -24,7 +24,7 @@ from robotid.logs.data import suggestion
 from robotid.report.fleet import fleet_page
 from robotid.variation.groups import FEWEST_RUNS
 from robotid.variation.units import FALSE_ALARMS, between_units
-from robotid.versions import code_versions
+from robotid.versions import __version__, code_versions
 from robotid.workers.checkpoint import Checkpoint, released_on_error
 from robotid.workers.pieces import Workload
 from robotid.workers.plan import WorkPlan
@@ -211,7 +211,9 @@ def _unit(
 def _path(source: Path, number: int, column: str, text: str) -> Path:
     """Return a path of a row, relative to the table, with $VARIABLES replaced as in job files."""
     try:
-        return stated_path(text, f"{source.name} row {number}, column {column!r}", source.parent)
+        return stated_path(
+            text, f"{source.name} row {number}, column {column!r}", source.parent, expand=True
+        )
     except SettingsError as error:
         raise DataError(str(error)) from error
 
@@ -338,7 +340,8 @@ def run_fleet(
                     result = checkpoint.load(k)
                     table.add(result.rows)
                     gathered.add(result)
-            content = gathered.content(units) | {"inputs": inputs}
+            about = {"robotid": __version__, "outputs": dict(table=_FILES[0], page=_FILES[2])}
+            content = about | gathered.content(units) | {"inputs": inputs}
             write_json(content, partial / "fleet.json")
             write_text(fleet_page(content), partial / "fleet.html")
     checkpoint.remove()

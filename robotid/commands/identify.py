@@ -1,12 +1,12 @@
 """A job: from its files to the folder of results."""
 
 import logging
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from robotid._files import check_folder, folder_beside, write_json
+from robotid._files import check_folder, folder_beside, remove_written, write_json
 from robotid._settings import require_kind
 from robotid._typing import STAGES, ProgressCallback, ignore_progress, report_stage
 from robotid.advice.steps import Origin
@@ -177,7 +177,7 @@ def _write(
         if job.replay:
             _replay_of(found, job, partial).write(partial / replay)
     others = {*names} - set(outputs.values())
-    _remove_stale(target / other for other in sorted(others))
+    remove_written(target / other for other in sorted(others))
     return found, result
 
 
@@ -254,14 +254,6 @@ def _entries(runs: "Sequence[Evaluation | OpenLoop]") -> tuple[LogEntry, ...]:
         for run in runs
     ]
     return tuple(LogEntry(Path(path), start, end) for path, start, end in windows if path)
-
-
-def _remove_stale(files: Iterable[Path]) -> None:
-    """Remove files of an earlier run that are not part of this result."""
-    for stale in files:
-        if stale.exists():
-            _log.warning("removed %s of an earlier run: this run did not write it", stale)
-            stale.unlink()
 
 
 def identify_job(

@@ -468,16 +468,19 @@ def read_job(path: str | Path) -> Job:
         ) from error
     except (ValueError, RecursionError) as error:  # not UTF-8, numbers too long, tables too deep
         raise SettingsError(f"{source.name} is not valid TOML: {error}") from error
-    return job_from_settings(table, source.name, source.parent)
+    return job_from_settings(table, source.name, source.parent, expand=True)
 
 
-def job_from_settings(table: Mapping[str, Any], where: str, folder: Path) -> Job:
+def job_from_settings(
+    table: Mapping[str, Any], where: str, folder: Path, *, expand: bool = False
+) -> Job:
     """Return the job that a table states.
 
     Args:
         table: The keys of a job file.
         where: Name of its source, for errors.
         folder: Folder that paths in it are relative to.
+        expand: As of ``stated_path``.
 
     Raises:
         SettingsError: If a key or a value is wrong.
@@ -485,11 +488,12 @@ def job_from_settings(table: Mapping[str, Any], where: str, folder: Path) -> Job
     check_keys(table, Job.schema(), where)
     if "urdf" not in table:
         raise SettingsError(f"{where} has no key 'urdf'; name the robot's URDF file")
-    found = dict(table, urdf=stated_path(table["urdf"], where, folder))
+    found = dict(table, urdf=stated_path(table["urdf"], where, folder, expand=expand))
     for key in ("identification", "validation", "payload_check"):
         entries = table.get(key, [])
         found[key] = [
-            dict(entry, log=stated_path(entry["log"], where, folder)) for entry in entries
+            dict(entry, log=stated_path(entry["log"], where, folder, expand=expand))
+            for entry in entries
         ]
     try:
         return Job.from_dict(found)
@@ -497,13 +501,15 @@ def job_from_settings(table: Mapping[str, Any], where: str, folder: Path) -> Job
         raise SettingsError(f"{where}: {error}") from error
 
 
-def stated_path(text: str, where: str, folder: Path) -> Path:
-    """Return a path relative to a folder, with $VARIABLES of the environment replaced.
+def stated_path(text: str, where: str, folder: Path, *, expand: bool) -> Path:
+    """Return a path relative to a folder.
 
     Args:
         text: The path as stated.
         where: Where it is stated, for errors.
         folder: The folder.
+        expand: Whether $VARIABLES of the environment are replaced, as in files that a user writes;
+            the shell replaces those of a command line.
 
     Raises:
         SettingsError: If it is no path, or names a variable that is not set.
@@ -514,7 +520,7 @@ def stated_path(text: str, where: str, folder: Path) -> Path:
             f"{where}: {text[:80]!r} is not a valid path, wanted UTF-8 without NUL, at most "
             f"{_LONGEST_PATH} characters"
         )
-    expanded = os.path.expandvars(text)
-    if "$" in expanded:
+    expanded = os.path.expandvars(text) if expand else text
+    if expand and "$" in expanded:
         raise SettingsError(f"{where}: path {text!r} names an environment variable that is not set")
     return folder / expanded

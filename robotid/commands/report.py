@@ -11,7 +11,7 @@ from robotid.advice.steps import Origin
 from robotid.commands.identify import identify_job
 from robotid.commands.job import Job, job_from_settings
 from robotid.commands.logs import log_of_commands
-from robotid.exceptions import DataError, SettingsError
+from robotid.exceptions import DataError
 from robotid.export.result import load_result
 from robotid.findings import listed
 from robotid.identification.result import Identification
@@ -37,8 +37,8 @@ def rewrite_report(
 
     Args:
         path: A result.json, or its folder.
-        target: The page to write; report.html in the folder of the result if None. An existing
-            page is replaced, another file is not.
+        target: The page to write; report.html in the folder of the result if None. A file
+            that robotid did not write is not replaced.
         progress: Called at the start of each stage, as by ``identify``.
 
     Returns:
@@ -47,12 +47,12 @@ def rewrite_report(
     Raises:
         DataError: If the result or an input is not usable, an input is missing or was changed, or
             the fit gives other base parameters than those of the result.
-        SettingsError: If the settings are not usable, or the target is another kind of file.
+        SettingsError: If the settings are not usable, or robotid did not write an existing target.
     """
     loaded = load_result(path)
     content, folder = loaded.content, loaded.path.parent
     goal = folder / "report.html" if target is None else Path(target)
-    _check_target(goal)
+    check_file(goal, loaded.files)
     report_stage(progress, "reading logs")
     settings = {key: value for key, value in content["settings"].items() if value != {}}
     job = job_from_settings(settings, loaded.path.name, Path())
@@ -86,19 +86,6 @@ def rewrite_report(
     else:
         write_report(found, goal, files=files, origin=origin)
     return {"result": str(loaded.path), "report": str(goal)}
-
-
-def _check_target(goal: Path) -> None:
-    """Refuse to replace a file that is not a page."""
-    check_file(goal)
-    if not goal.is_file():  # a pipe receives the page
-        return
-    with goal.open("rb") as file:
-        is_page = file.read(15).lower().startswith(b"<!doctype html")
-    if not is_page:
-        raise SettingsError(
-            f"{str(goal)!r} exists and is not an HTML page; it is not replaced. Name another --out"
-        )
 
 
 def _check_inputs(job: Job, content: Mapping[str, Any], name: str) -> None:

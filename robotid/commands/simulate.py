@@ -78,7 +78,7 @@ def simulate_log(
         SettingsError: If a setting does not fit the robot or the motion.
     """
     for path in (files.log, files.truth, *([files.urdf] if files.urdf else [])):
-        check_file(path)
+        check_file(path, [files.motion, job.urdf])
     check_suffix(files.log)
     model = job.model()
     motion = _motion(job, model, files)

@@ -49,7 +49,8 @@ def run_track(
     """
     model, history = job.model(), _history_name()
     if folder is not None:
-        check_folder(Path(folder), [history, "track.json"])
+        inputs = [job.urdf, *(entry.path for entry in job.identification)]
+        check_folder(Path(folder), [history, "track.json"], inputs)
     if len(job.identification) != 1:
         raise SettingsError(f"{len(job.identification)} logs are given, wanted one to track")
     log = job.read(job.identification[0], model)

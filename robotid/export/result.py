@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from robotid._files import check_path, read_json
+from robotid._files import check_path, moved_file, read_json
 from robotid._settings import Range, require_kind
 from robotid._typing import Array
 from robotid.exceptions import DataError, ModelError
@@ -143,6 +143,14 @@ class Result:
     def has_urdf(self) -> bool:
         """Whether the identified URDF was written; an impossible result has none."""
         return "urdf" in self.content["outputs"]
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """The result.json, its URDF and sidecar, and the inputs of the fit; not the report."""
+        outputs = self.content["outputs"]
+        beside = [self.path.with_name(outputs[x]) for x in ("urdf", "sidecar") if x in outputs]
+        inputs = [Path(entry["path"]) for entry in self.content["inputs"] if entry["path"]]
+        return (self.path, *beside, *inputs)
 
     @cached_property
     def identified(self) -> tuple[RobotModel, Array]:
@@ -321,8 +329,32 @@ def load_result(path: str | Path) -> Result:
     return Result(source, read_result(source))
 
 
+def _with_moved_inputs(result: dict[str, Any], path: Path) -> dict[str, Any]:
+    """Return the content of a result with the present paths of its inputs."""
+    payloads = result.get("scale_check", {}).get("payloads", [])
+    known = [(x["path"], x["sha256"]) for x in result["inputs"]]
+    known += [(x["log"], x["sha256"]) for x in payloads]
+    hashes: dict[str, set[str]] = {}
+    for text, sha256 in known:
+        if sha256:
+            hashes.setdefault(Path(text).name, set()).add(sha256)
+
+    def present(table: Mapping[str, Any], key: str) -> dict[str, Any]:
+        old = table.get(key)
+        if not isinstance(old, str) or Path(old).name not in hashes:
+            return dict(table)
+        return {**table, key: str(moved_file(Path(old), path, hashes[Path(old).name]))}
+
+    settings = present(result["settings"], "urdf")
+    for group in ("identification", "validation", "payload_check"):
+        if isinstance(entries := settings.get(group), list):
+            settings[group] = [present(x, "log") if isinstance(x, dict) else x for x in entries]
+    inputs = [present(entry, "path") for entry in result["inputs"]]
+    return {**result, "settings": settings, "inputs": inputs}
+
+
 def read_result(path: str | Path) -> dict[str, Any]:
-    """Read the content of a result.json.
+    """Read the content of a result.json; inputs in a moved folder have their present paths.
 
     Args:
         path: The file.
@@ -354,7 +386,7 @@ def read_result(path: str | Path) -> dict[str, Any]:
             f"{name} has {len(validation)} validation recordings among its inputs, but errors of "
             f"{len(result['validation'])}: the file is incomplete. Identify again"
         )
-    return dict(result)
+    return _with_moved_inputs(result, Path(path))
 
 
 def stated_scale_check(result: Mapping[str, Any]) -> ScaleCheck | None:

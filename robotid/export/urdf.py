@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from robotid._files import folder_beside, read_json
+from robotid._files import check_folder, folder_beside, read_json
 from robotid._settings import require_kind
 from robotid._typing import Array
 from robotid.exceptions import DataError, ModelError
@@ -118,6 +118,8 @@ def write_urdf(
     original, places = source.read_bytes(), link_places(model)
     content = _content(original, model, pi, written, dynamics=dynamics)
     sidecar = goal.with_name(f"{goal.stem}.drive.json")
+    of_source = source.with_name(f"{source.stem}.drive.json")
+    check_folder(goal.parent, [goal.name, sidecar.name], [source, of_source])
     facts = {
         "schema_version": _SCHEMA_VERSION,
         "robotid": __version__,

@@ -14,7 +14,7 @@ from typing import Any, get_args
 
 import numpy as np
 
-from robotid._files import check_path
+from robotid._files import check_file, check_path
 from robotid._settings import require_each, require_kind
 from robotid._typing import Array
 from robotid.exceptions import DataError, SettingsError
@@ -416,15 +416,17 @@ def write_log(log: Log, path: str | Path) -> None:
 
     Args:
         log: The log.
-        path: A .csv, .parquet, .npz, .h5, .hdf5 or .mat file; an existing one is replaced.
+        path: A .csv, .parquet, .npz, .h5, .hdf5 or .mat file; an existing one is
+            replaced only if robotid wrote it.
 
     Raises:
         DataError: If the suffix is another one, or a name is not valid in the format.
         MissingDependencyError: If a package that writes the format is not installed.
-        OSError: If the folder cannot be written to.
+        SettingsError: If the file is that of the log, or another that robotid did not write.
     """
     require_kind(log, Log, "log", "a robotid.Log")
     require_kind(path, (str, Path), "path", "the path of a file")
+    check_file(Path(path), [log.path])
     table = {"time": log.t}
     for kind, name in COLUMNS.items():
         values = getattr(log, name)

@@ -92,7 +92,7 @@ def write_comparison(paths: Sequence[str | Path], target: str | Path) -> dict[st
         DataError: If the results cannot be compared, or the folder of the target is missing.
         SettingsError: If the target is a folder.
     """
-    check_file(Path(target))
+    check_file(Path(target), paths)
     content = compare_results(paths)
     write_text(comparison_page(content), target)
     return content

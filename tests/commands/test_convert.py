@@ -10,6 +10,7 @@ import pytest
 from helpers.recorders import JOINT_STATE, messages_of, wide, write_bag2, write_mcap
 from helpers.synthetic import exact_log, truth
 
+from robotid._files import write_text
 from robotid.cli import main
 from robotid.commands.convert import convert
 from robotid.commands.job import job_from_settings
@@ -142,7 +143,7 @@ def test_the_command_converts_and_names_what_it_wrote(tmp_path, log, bag, capsys
 
 def test_the_command_refuses_by_name_and_leaves_what_was_there(tmp_path, bag, capsys):
     target = tmp_path / "run.csv"
-    target.write_text("precious")
+    write_text("precious", target)
     assert main(["convert", str(bag), str(target)]) == 1
     assert f"bag has 2 topics of {JOINT_STATE}: /arm, /other" in capsys.readouterr().err
     assert main(["convert", str(bag), str(target), "--topic", "/arm", "--effort", "x"]) == 2
@@ -172,7 +173,7 @@ def test_on_a_full_disk_the_old_file_stays_and_no_part_of_the_new(tmp_path):
     suffixes = ("csv", "parquet", "npz", "h5", "hdf5", "mat")
     targets = [tmp_path / f"out.{suffix}" for suffix in suffixes]
     for target in targets:
-        target.write_text("precious")
+        write_text("precious", target)
     command = [sys.executable, "-c", FULL_DISK, tmp_path / "in.npz", *targets]
     run = subprocess.run(command, capture_output=True, text=True, check=True)
     for target, (code, said) in zip(targets, json.loads(run.stdout), strict=True):

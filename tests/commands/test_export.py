@@ -106,6 +106,23 @@ def test_a_result_that_must_not_be_used_is_not_exported(result, tmp_path, capsys
     assert sorted(path.name for path in tmp_path.iterdir()) == ["bad"]
 
 
+def test_neither_inputs_nor_files_of_a_user_are_replaced(result, tmp_path, capsys):
+    """A result's own URDF or log, its URDF under another name, notes; an export may be repeated."""
+    inputs = ["first.csv", "robot/planar.urdf", "out/result.json", "out/planar.identified.urdf"]
+    (tmp_path / "notes.txt").write_text("mine")
+    files = [*(result.parent / name for name in inputs), tmp_path / "notes.txt"]
+    before = [path.read_bytes() for path in files]
+    for kind in ("urdf", "mjcf", "sdf", "ranges"):
+        for path in files:
+            code, _, err = export(result, kind, path, capsys)
+            assert code == 2
+            assert f"{str(path)!r}" in err.replace("\n  ", " ")
+            assert "not replaced" in " ".join(err.split())
+        target = tmp_path / f"again.{kind}"
+        assert [export(result, kind, target, capsys)[0] for _ in range(2)] == [0, 0]
+    assert [path.read_bytes() for path in files] == before
+
+
 def test_a_place_that_cannot_be_written_is_named(result, tmp_path, capsys):
     code, _, err = export(result, "mjcf", tmp_path / "none" / "a.xml", capsys)
     assert code == 1

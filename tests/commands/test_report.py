@@ -158,11 +158,11 @@ def test_a_result_that_the_fit_does_not_give_again_has_no_page(out, capsys):
     assert main(["report", str(out)]) == 0
 
 
-def test_what_is_no_page_is_not_written_over(out, capsys):
+def test_a_report_does_not_replace_what_it_is_made_of(out, capsys):
     before = contents(out)
     for target in ("result.json", "arm.identified.urdf"):
         assert main(["report", str(out), "--out", str(out / target)]) == 2
-        assert "exists and is not an HTML page; it is not replaced" in capsys.readouterr().err
+        assert "is an input and is not replaced" in capsys.readouterr().err
     assert contents(out) == before
 
 

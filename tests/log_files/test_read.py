@@ -591,7 +591,7 @@ def test_parquet_without_pyarrow_says_how_to_install_it(tmp_path, monkeypatch):
     with refused(f"reading Parquet {how}", MissingDependencyError):
         read_log(path, JOINTS)
     with refused(f"writing Parquet {how}", MissingDependencyError):
-        write_log(make_log(), path)
+        write_log(make_log(), tmp_path / "new.parquet")
 
 
 def test_import_does_not_load_pyarrow():

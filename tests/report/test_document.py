@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from helpers.pages import chart, tables
 
+from robotid._files import write_text
 from robotid.exceptions import DataError
 from robotid.findings import Finding
 from robotid.identification.pipeline import identify
@@ -320,7 +321,7 @@ def test_the_same_result_gives_the_same_file(found, tmp_path):
 
 def test_a_failure_leaves_the_old_file_and_nothing_beside_it(found, tmp_path, monkeypatch):
     target = tmp_path / "report.html"
-    target.write_text("old")
+    write_text("old", target)
 
     def refuse(*_):
         raise OSError("disk full")

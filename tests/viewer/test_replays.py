@@ -6,6 +6,7 @@ import pinocchio as pin
 import pytest
 from helpers.replay_data import leave_out_meshes, shown
 
+from robotid._files import write_text
 from robotid.exceptions import DataError, SettingsError
 from robotid.robot.model import RobotModel
 from robotid.viewer.replays import Bands, Mark, Torques, _moved, _plotted, _view, replay
@@ -384,7 +385,7 @@ def test_no_process_no_socket_and_no_output_is_left(arm, motion, tmp_path, capfd
 
 def test_a_failure_leaves_the_old_file_and_nothing_beside_it(arm, motion, tmp_path, monkeypatch):
     target = tmp_path / "r.html"
-    target.write_text("old")
+    write_text("old", target)
 
     def refuse(*_):
         raise OSError("disk full")
