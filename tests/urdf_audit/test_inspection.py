@@ -158,6 +158,17 @@ def test_a_joint_without_a_range_is_named(tmp_path, limit, said):
     assert found(half, "no_limits") == []
 
 
+def test_limits_of_zero_are_named_with_what_states_them(tmp_path):
+    stated = '<limit lower="-1" upper="1" effort="9" velocity="2"/>'
+    (finding,) = found(
+        inspected(tmp_path, (stated, stated.replace('"9"', '"0"').replace('"2"', '"0.0"'))),
+        "no_limits",
+    )
+    assert (finding["joint"], finding["severity"]) == ("shoulder", "warning")
+    assert "has limits velocity 0 and effort 0, wanted more than 0" in finding["message"]
+    assert finding["message"].endswith("--max-velocity shoulder=X --max-torque shoulder=X")
+
+
 @pytest.mark.parametrize(("key", "old"), [("damping", "0.5"), ("friction", "0.25")])
 def test_negative_friction_is_named(tmp_path, key, old):
     (finding,) = found(
