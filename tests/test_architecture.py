@@ -17,7 +17,7 @@ import robotid
 PACKAGE = Path(robotid.__file__).parent
 LINES = [
     "",
-    "exceptions _text _typing _similar _native_messages",
+    "exceptions _text _typing _native_messages",
     "findings versions _files pages",
     "_settings pages kernels",
     "robot logs",

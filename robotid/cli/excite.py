@@ -151,6 +151,8 @@ _MOTION = Flags(
         "--harmonics": ("harmonics", "N"),
         "--criterion": ("criterion", ""),
         "--share": ("share", "X"),
+        "--max-velocity": ("velocity", "JOINT=X"),
+        "--max-torque": ("torque", "JOINT=X"),
         "--max-acceleration": ("acceleration", "JOINT=X"),
         "--max-jerk": ("jerk", "JOINT=X"),
         "--max-power": ("power", "JOINT=X"),

@@ -7,9 +7,9 @@ from pathlib import Path
 from robotid._files import check_file
 from robotid.exceptions import DataError
 from robotid.findings import listed
+from robotid.log_files.column_names import KINDS, is_clock, quantity_of
 from robotid.log_files.even_stamps import with_even_stamps
 from robotid.log_files.formats import open_table, write_columns
-from robotid.log_files.table import prefixes, quantity_of
 from robotid.logs.base import ACCELERATION, POSE, TWIST
 from robotid.logs.data import repeated, suggestion
 from robotid.logs.imu import IMU
@@ -93,10 +93,10 @@ def _standard_names(
 ) -> tuple[dict[str, str], dict[str, list[str]]]:
     """Return the columns by standard name, ordered by quantity, and the standard names by joint."""
     joint_of = {name: joint for joint, name in source.joints.items()}
-    pairs = [("time", name) for name in names if name in ("time", "t")]
+    pairs = [("time", name) for name in names if is_clock(name)]
     by_joint: dict[str, list[str]] = {}
-    quantities = [(name, quantity_of(name, source.effort)) for name in names]
-    for kind in prefixes(source.effort):
+    quantities = [(name, quantity_of(name, source.effort, joint_of)) for name in names]
+    for kind in KINDS:
         for name, found in quantities:
             if found and found[0] == kind:
                 joint = joint_of.get(found[1], found[1])

@@ -127,6 +127,8 @@ def _designer(job: Job, settings: MotionSettings, given: str | None) -> tuple[De
     limits = MotionLimits.of_model(
         model,
         share=settings.share,
+        velocity=settings.velocity,
+        torque=settings.torque,
         acceleration=settings.acceleration,
         jerk=settings.jerk,
         power=settings.power,

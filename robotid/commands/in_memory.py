@@ -135,7 +135,13 @@ def identify(
         )
     needs: Literal["torque", "commands"] = "torque" if loop.kind == "torque" else "commands"
     fitted, held_out = (
-        read_logs(some, model.joints, prismatic=model.layout.prismatic, needs=needs)
+        read_logs(
+            some,
+            model.joints,
+            prismatic=model.layout.prismatic,
+            needs=needs,
+            robot=model.tree.movable,
+        )
         for some in (logs, validation)
     )
     return identify_loops(

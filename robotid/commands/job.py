@@ -438,6 +438,7 @@ class Job(Settings):
             "source": self.source,
             "base": logged_base(model, self.base),
             "passive": model.passive,
+            "robot": model.tree.movable,
             "transmissions": [gear.stated(model.tree.reductions) for gear in self.transmissions],
         }
 

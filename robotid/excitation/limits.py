@@ -38,6 +38,8 @@ class MotionLimits:
         model: RobotModel,
         *,
         share: float = 0.9,
+        velocity: float | Mapping[str, float] = np.inf,
+        torque: float | Mapping[str, float] = np.inf,
         acceleration: float | Mapping[str, float] = np.inf,
         jerk: float | Mapping[str, float] = np.inf,
         power: float | Mapping[str, float] = np.inf,
@@ -47,6 +49,9 @@ class MotionLimits:
         Args:
             model: The robot.
             share: Usable share of the URDF's range, velocity and torque.
+            velocity: Largest velocity of all joints, or of some [rad/s or m/s]. Of it and the
+                usable share of the URDF's, the lower one counts.
+            torque: Largest torque, likewise [N m or N].
             acceleration: Largest acceleration of all joints, or of some [rad/s^2 or m/s^2].
             jerk: Largest jerk, likewise [rad/s^3 or m/s^3].
             power: Largest mechanical power, likewise [W].
@@ -56,22 +61,28 @@ class MotionLimits:
         """
         if not 0 < share <= 1:
             raise SettingsError(f"share is {share}, wanted more than 0 and at most 1")
-        missing = [text for joint in model.limits if (text := _missing(joint))]
+        fastest = np.array([j.velocity if j.velocity > 0 else np.inf for j in model.limits])
+        fastest = np.minimum(share * fastest, _each(model, velocity, "velocity"))
+        missing = [
+            text
+            for joint, limit in zip(model.limits, fastest, strict=True)
+            if (text := _missing(joint, float(limit)))
+        ]
         if missing:
             raise SettingsError(
                 f"{Path(model.tree.path).name} states no limit of {listed(missing)}: without it no "
                 "safe motion can be designed; add <limit lower upper velocity effort> to these "
-                "joints, or lock them"
+                "joints, state velocities as --max-velocity JOINT=X, or lock the joints"
             )
         middle = [(j.lower + j.upper) / 2 if j.has_limits else 0.0 for j in model.limits]
         half = [(j.upper - j.lower) / 2 if j.has_limits else _FREE for j in model.limits]
         effort = [j.effort if j.effort > 0 else np.inf for j in model.limits]
         sizes = [
             share * np.array(half),
-            share * np.array([j.velocity for j in model.limits]),
+            fastest,
             _each(model, acceleration, "acceleration"),
             _each(model, jerk, "jerk"),
-            share * np.array(effort),
+            np.minimum(share * np.array(effort), _each(model, torque, "torque")),
             _each(model, power, "power"),
         ]
         return cls(np.array(middle), np.array(sizes))
@@ -90,11 +101,11 @@ class MotionLimits:
         return values / self.sizes[:, None]
 
 
-def _missing(joint: Joint) -> str:
-    """Return a joint and the limits that the URDF does not state; empty if none."""
+def _missing(joint: Joint, velocity: float) -> str:
+    """Return a joint and the limits that neither the URDF nor the user states; empty if none."""
     known = {
         "position": joint.has_limits or joint.type == "continuous",
-        "velocity": 0 < joint.velocity < np.inf,
+        "velocity": velocity < np.inf,
     }
     lacks = [what for what, is_known in known.items() if not is_known]
     return f"{joint.name} ({' and '.join(lacks)})" if lacks else ""

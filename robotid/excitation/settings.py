@@ -52,6 +52,10 @@ class MotionSettings(Settings):
     share: float = setting(
         0.9, "usable share of the URDF's limits", within=_from(1e-3, 1.0, " of the limits")
     )
+    velocity: Mapping[str, float] = setting(
+        {}, "largest velocity of a joint whose URDF states none, or a lower one [rad/s or m/s]"
+    )
+    torque: Mapping[str, float] = setting({}, "largest torque of a joint, likewise [N m or N]")
     acceleration: Mapping[str, float] = setting(
         {}, "largest acceleration of a joint [rad/s^2 or m/s^2]"
     )
@@ -88,7 +92,7 @@ class MotionSettings(Settings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name in ("acceleration", "jerk", "power", "noise"):
+        for name in ("velocity", "torque", "acceleration", "jerk", "power", "noise"):
             for joint, value in getattr(self, name).items():
                 if not _SIZES[0] <= value <= _SIZES[1]:
                     raise SettingsError(

@@ -106,6 +106,7 @@ def identify_payload(
             prismatic=model.layout.prismatic,
             base=logged_base(model),
             passive=model.passive,
+            robot=model.tree.movable,
         )
         for given in (logs, reference)
     ]

@@ -109,6 +109,7 @@ def identify(
             prismatic=model.layout.prismatic,
             base=logged_base(model),
             passive=model.passive,
+            robot=model.tree.movable,
         )
         for some in (logs, validation)
     )

@@ -273,7 +273,7 @@ def preview(
         run = Run.of(recordings, given.standard, given.estimate.details)
     read = read_logs(
         motions, model.joints, prismatic=model.layout.prismatic, needs="motion",
-        base=logged_base(model), passive=model.passive,
+        base=logged_base(model), passive=model.passive, robot=model.tree.movable,
     )  # fmt: skip
     in_memory = [hold_log(model, motion, settings) for motion in read]
     found = preview_logs(model, in_memory, choice, noise=noise, run=run)

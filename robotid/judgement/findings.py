@@ -302,18 +302,20 @@ def _in_line(model: RobotModel) -> set[str]:
 
 
 def log_findings(logs: Sequence[Log]) -> list[Finding]:
-    """Return the notes on logs, each once, with the names of its logs.
+    """Return what was noted and assumed of logs, each once, with the names of its logs.
 
     Args:
         logs: The logs.
     """
-    by_note: dict[str, list[str]] = {}
+    logs_of: dict[tuple[str, str, str], list[str]] = {}
     for log in logs:
         for note in log.notes:
-            by_note.setdefault(note, []).append(Path(log.path).name)
+            logs_of.setdefault(("log_note", "note", note), []).append(Path(log.path).name)
+        for text in log.assumed:
+            logs_of.setdefault(("column_order", "warning", text), []).append(Path(log.path).name)
     return [
-        Finding("log_note", "note", ", ".join(names), f"{', '.join(names)}: {note}")
-        for note, names in by_note.items()
+        Finding(code, severity, ", ".join(names), f"{', '.join(names)}: {text}")
+        for (code, severity, text), names in logs_of.items()
     ]
 
 

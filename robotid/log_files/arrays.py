@@ -15,8 +15,9 @@ import numpy as np
 from robotid._typing import Array
 from robotid.exceptions import DataError, MissingDependencyError
 from robotid.findings import listed
-from robotid.log_files.simulator_arrays import with_simulator_arrays
-from robotid.log_files.table import Table, WritableFormat, choose, parsing, prefixes
+from robotid.log_files.column_names import is_quantity
+from robotid.log_files.simulator_arrays import ARRAYS, with_simulator_arrays
+from robotid.log_files.table import Table, WritableFormat, choose, parsing
 from robotid.logs.data import suggestion
 from robotid.logs.settings import LogSource
 
@@ -24,7 +25,6 @@ __all__ = ["Hdf5Format", "MatFormat", "NpzFormat"]
 
 _CLOCKS = ("time", "t")
 _LISTS = ("joints", "joint_names")  # entries that name the columns of wide arrays
-_WIDE = {prefix[:-1] for kinds in prefixes().values() for prefix in kinds}  # q, position, ...
 _MAT73 = b"MATLAB 7.3"  # first bytes of a MAT file in HDF5 format
 _LARGEST_RATIO = 1032  # of the sizes before and after compression by deflate
 _MAT_NAME = 63  # largest number of characters of a name in MATLAB
@@ -179,7 +179,7 @@ def _columns_of(
 ) -> dict[str, _Column]:
     """Return the columns of one array, by name."""
     slim = len(shape) == 1 or (len(shape) == 2 and 1 in shape)
-    is_wide = name.rpartition("/")[2] in _WIDE and name not in _CLOCKS
+    is_wide = is_quantity(name.rpartition("/")[2]) and name not in ARRAYS
     if len(shape) not in (1, 2) or (len(shape) == 2 and 0 in shape):
         return {}
     if slim and not is_wide:

@@ -1,8 +1,8 @@
 """Columns of a table: positions, velocities, torques and commands of the joints by their names."""
 
-import difflib
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Literal, TypeAlias
 
 import numpy as np
@@ -10,11 +10,12 @@ import numpy as np
 from robotid._settings import is_number
 from robotid.exceptions import DataError, SettingsError
 from robotid.findings import listed, quoted, toml_key
+from robotid.log_files.column_names import KINDS, Reading, is_clock, read_names
 from robotid.log_files.missing import NOUNS, SIZES, Missing
-from robotid.log_files.table import prefixes
 from robotid.logs.data import repeated, suggestion
 from robotid.logs.settings import LogSource
 from robotid.logs.transmission import Transmission
+from robotid.robot.tree import Joint
 
 __all__ = ["NOUNS", "TORQUES", "Finder", "Needs", "without_torque"]
 
@@ -68,6 +69,7 @@ class Finder:
         notes: Notes for the user.
         seen: Columns that are read or named in a note.
         passive: Joints without a drive, which need no torque.
+        robot: All movable joints of the robot, in the order of the URDF.
     """
 
     where: str
@@ -81,11 +83,13 @@ class Finder:
     notes: list[str] = field(default_factory=list)
     seen: set[str] = field(default_factory=set)
     passive: Collection[str] = ()
+    robot: Sequence[Joint] = ()
 
     def find_all(self) -> dict[str, list[str]]:
         """Return the columns to read: time, q, required quantities, complete optional ones."""
         self._check_arguments()
-        found = {"time": [self._find("time", ["time", "t"]) or self._no_time()]}
+        self.notes.extend(self.reading.notes)
+        found = {"time": [self._find("time", self._clocks()) or self._no_time()]}
         optional, wanted = ["dq", "ddq"], self._wanted()
         self._require(wanted)
         found["q"] = [column for _, column in self._each("q") if column]
@@ -120,6 +124,17 @@ class Finder:
             for name in names
         }
         return tuple(float(self.gains[currents[n]]) if n in currents else 1.0 for n in torques)
+
+    @cached_property
+    def reading(self) -> Reading:
+        """The columns of all joints and motors of the robot, by their names."""
+        every = [joint.name for joint in self.robot]
+        leaders = [joint.name for joint in self.robot if joint.mimic is None]
+        places = dict.fromkeys([*self.joints, *every, *self.motors.values()])
+        names = [x for x in self.names if x not in {*self.columns.values(), *self.seen}]
+        named = {place: self._named(place) for place in places}
+        orders = () if self.source.joints else (self.joints, leaders, every)
+        return read_names(names, named, self.source.effort, orders)
 
     @property
     def motors(self) -> dict[str, str]:
@@ -181,7 +196,7 @@ class Finder:
             self._require_read(joint, "log.joints renames")
         self._check_names()
         names = dict.fromkeys([*self.joints, *self.motors.values()])
-        known = ["time", *(f"{kind}_{name}" for kind in prefixes() for name in names)]
+        known = ["time", *(f"{kind}_{name}" for kind in KINDS for name in names)]
         for standard, name in self.columns.items():
             if standard not in known:
                 raise SettingsError(
@@ -218,7 +233,7 @@ class Finder:
 
     def _find(self, standard: str, aliases: Sequence[str]) -> str | None:
         """Return the column of one quantity, or None."""
-        found = [a for a in aliases if a in self.names and a not in self.columns.values()]
+        found = [x for x in aliases if x in self.names and x not in self.columns.values()]
         if standard in self.columns:
             found = [self.columns[standard]]
         if len(found) > 1:
@@ -232,8 +247,7 @@ class Finder:
 
     def _find_of(self, kind: str, joint: str) -> str | None:
         """Return the column of one quantity of one joint, or None."""
-        named, starts = self._named(joint), prefixes(self.source.effort)[kind]
-        return self._find(f"{kind}_{joint}", [prefix + named for prefix in starts])
+        return self._find(f"{kind}_{joint}", self.reading.columns.get((kind, joint), ()))
 
     def _named(self, joint: str) -> str:
         """Return the name of a joint in the file."""
@@ -331,15 +345,18 @@ class Finder:
             self.notes.append(f"{listed(names)} ignored: {listed(without)} have no {NOUNS[kind]}")
         return [] if without else names
 
+    def _clocks(self) -> list[str]:
+        """Return the columns with time stamps: "time" or "t", else that of the measurement."""
+        clocks = [name for name in self.names if is_clock(name)]
+        plain = [name for name in clocks if name in ("time", "t")]
+        return plain or [name for name in clocks if "header" in name.lower()] or clocks
+
     def _no_time(self) -> str:
         """Reject a log without a time column."""
-        by_words = {name.lower(): name for name in self.names}
-        near = difflib.get_close_matches("time", by_words, n=1)
-        hint = f"Did you mean {by_words[near[0]]!r}? " if near else ""
-        stated = quoted(by_words[near[0]] if near else "NAME")
         raise DataError(
-            f"{self.where} has no column 'time'; columns found: {listed(self.names)}. {hint}"
-            f"Rename it, or state it in the job file: columns = {{ time = {stated} }}",
+            f"{self.where} has no column 'time'; columns found: {listed(self.names)}. Rename it, "
+            'or state in the job file: columns = { time = "NAME" }, or without time stamps the '
+            "rate of the rows [Hz]: log = { rate = 100 }",
             code="missing_column",
         )
 
@@ -357,12 +374,14 @@ class Finder:
             ]
         if not absent:
             return
-        missing = Missing(
-            self.where, self.names, absent, (*self.joints, *self.motors.values()), self.source
-        )
         has_no_gain = any(self._has("current", x) and x not in self.gains for x in self.joints)
-        if has_no_gain and all(kind == "tau" for kind, _ in absent) and not missing.similar():
+        if has_no_gain and all(kind == "tau" for kind, _ in absent):
             return  # that error names these joints, too
+        clock = self._find("time", self._clocks())
+        found = {"time": clock} if clock else {}
+        found |= {f"{kind}_{x}": own for (kind, x), (own, *_) in self.reading.columns.items()}
+        found |= self.columns
+        missing = Missing(self.where, self.names, absent, self.joints, self.source, found)
         raise missing.error(self._remedy(absent))
 
     def _remedy(self, absent: Sequence[tuple[str, str]]) -> str:
@@ -380,6 +399,12 @@ class Finder:
         at_rest = [joint for joint in self.joints if joint in joints]
         if len(at_rest) == len(self.joints):
             return f"Record the {NOUNS[kind.removesuffix('m')]} of each joint"
+        if leaders := {x.name: x.mimic[0] for x in self.robot if x.mimic and x.name in at_rest}:
+            moved = ", ".join(f"{joint} mimics {leader}" for joint, leader in leaders.items())
+            return (
+                f"{moved}: a joint that moves with its leader needs no column; state mimic = "
+                '"coupled" in the job file'
+            )
         locks = " ".join(f"--lock {joint}=0" for joint in at_rest)
         locked = ", ".join(f"{toml_key(joint)} = 0" for joint in at_rest)
         one = len(at_rest) == 1
@@ -404,9 +429,8 @@ class Finder:
 
     def _has(self, kind: str, joint: str) -> bool:
         """Return whether the file has a quantity of a joint or of its motor."""
-        names = (prefix + self._named(joint) for prefix in prefixes(self.source.effort)[kind])
         return (
             f"{kind}_{joint}" in self.columns
-            or any(name in self.names for name in names)
+            or (kind, joint) in self.reading.columns
             or (joint in self.motors and self._has(f"{kind}m", self.motors[joint]))
         )

@@ -1,6 +1,7 @@
 """CSV files as tables of named columns."""
 
 import csv
+import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -13,25 +14,29 @@ import numpy as np
 
 from robotid._typing import Array
 from robotid.exceptions import DataError
+from robotid.findings import quoted
+from robotid.log_files.column_names import is_quantity
 from robotid.log_files.table import Place, RowReader, Table, WritableFormat
 from robotid.logs.settings import LogSource
 
 __all__ = ["CsvFormat"]
 
 _BLOCK = 4096  # lines read at a time
+_NAME = re.compile(r"(.*?)name(\W*\d+\W*)")  # of a joint, in each row: field.name0
 _SENSED = ("base_", "imu_", "contact_", "wrench_")  # columns that other devices record
 
 
 class CsvFormat(WritableFormat):
-    """CSV files: UTF-8, the first line contains the names of the columns.
+    """CSV files and text with white space: UTF-8, the first line names the columns, or a job does.
 
     Numbers are written with the fewest digits that reproduce them exactly.
     """
 
     def open(self, path: Path, source: LogSource) -> Table:
-        names, separator = _csv_header(path)
-        rows = _CsvRows(path, names, separator)
-        return Table(names, rows.read_all, (), rows)
+        names, separator, header = _csv_header(path, source)
+        named = _named_by_cells(path, names, separator)
+        rows = _CsvRows(path, [named.get(x, x) for x in names], separator, header)
+        return Table(rows.names, rows.read_all, (), rows, named)
 
     def write(self, table: Mapping[str, Array], path: Path) -> None:
         rows = np.column_stack(list(table.values()))
@@ -45,12 +50,13 @@ class CsvFormat(WritableFormat):
 class _CsvRows(RowReader):
     path: Path
     names: list[str]
-    separator: str
+    separator: str | None  # None: any white space
+    header: int  # lines before the first row
 
     def count(self) -> int:
         with self.path.open("rb") as file:
             blocks = iter(partial(file.read, 2**20), b"")
-            return sum(block.count(b"\n") for block in blocks) - 1
+            return sum(block.count(b"\n") for block in blocks) - self.header
 
     def scan(self, name: str) -> Iterator[tuple[Array, Place]]:
         for lines, place, _ in self._blocks(Place(), None):
@@ -70,7 +76,8 @@ class _CsvRows(RowReader):
         with self.path.open("rb") as file:
             place = near
             if near.offset == 0:
-                place = Place(0, 2, len(file.readline()))
+                skipped = sum(len(file.readline()) for _ in range(self.header))
+                place = Place(0, 1 + self.header, skipped)
             file.seek(place.offset)
             while stop is None or place.row < stop:
                 raw = list(islice(file, _BLOCK))
@@ -89,8 +96,7 @@ class _CsvRows(RowReader):
     def read_all(self, wanted: Sequence[str]) -> dict[str, Array]:
         """Return whole columns by name."""
         with _open_csv(self.path) as file:
-            file.readline()
-            rows = self._whole(file)
+            rows = self._whole(islice(file, self.header, None), 1 + self.header)
             first = list(islice(rows, 1))
             if not first:
                 raise DataError(f"{self.path.name} has a header but no rows; record at least 2")
@@ -107,13 +113,15 @@ class _CsvRows(RowReader):
             raise self._bad_cell(columns) from error
         return dict(zip(wanted, values.T, strict=True))
 
-    def _whole(self, lines: Iterable[str], first: int = 2) -> Iterator[str]:
+    def _whole(self, lines: Iterable[str], first: int) -> Iterator[str]:
         """Yield the lines that are not blank, and reject those with too few or too many cells."""
         count, separator = len(self.names), self.separator
         for number, line in enumerate(lines, start=first):
             if line.isspace():
                 continue
-            if line.count(separator) != count - 1:  # unless a separator is in quotes
+            if (
+                separator is None or line.count(separator) != count - 1
+            ):  # unless a separator is in quotes
                 found = len(self._cells(line, number))
                 if found != count:
                     raise DataError(
@@ -129,9 +137,9 @@ class _CsvRows(RowReader):
         """Return the error on the first cell that is not a number."""
         where = self.path.name
         with _open_csv(self.path) as file:
-            file.readline()
-            for row, line in enumerate(self._whole(file)):
-                cells = self._cells(line, row + 2)
+            lines = islice(file, self.header, None)
+            for row, line in enumerate(self._whole(lines, 1 + self.header)):
+                cells = self._cells(line, row + 1 + self.header)
                 for i in columns:
                     if not _is_number(cells[i]):
                         found = repr(cells[i][:80]) if cells[i].strip() else "empty"
@@ -159,22 +167,58 @@ def _not_utf8(path: Path, error: UnicodeDecodeError) -> DataError:
     return DataError(f"{path.name} is not UTF-8 text: {error}; save it as UTF-8")
 
 
-def _csv_header(path: Path) -> tuple[list[str], str]:
-    """Return the column names of a CSV file and their separator."""
+def _csv_header(path: Path, source: LogSource) -> tuple[list[str], str | None, int]:
+    """Return the names in the first line, the separator and the number of lines before the rows.
+
+    Without a header, the names are the numbers of the columns.
+    """
     with _open_csv(path) as file:
         line = file.readline()
     if not line.strip():
         raise DataError(f"{path.name} is empty; its first line must name the columns")
-    separator = max(",;\t", key=line.count)  # the comma, if there is none
-    cells = _split(path.name, line.strip("\r\n").lstrip("# "), separator, 1)
-    names = [cell.strip() for cell in cells]
-    if all(_is_number(name) for name in names):
-        raise DataError(f"{path.name} has no header; its first line must name the columns")
-    return names, separator
+    text = re.sub(r"^(#|% )\s*", "", line.strip("\r\n"))
+    separator: str | None = max(",;\t", key=text.count)
+    if str(separator) not in text:
+        separator = None if len(text.split()) > 1 else ","
+    names = [cell.strip() for cell in _split(path.name, text, separator, 1)]
+    if not all(_is_number(name) for name in names):
+        return names, separator, 1
+    if not source.names:
+        half = range(1, len(names) // 2 + 1)
+        likely = ["time"] * (len(names) % 2)
+        likely += [f"{kind}_{k}" for kind in ("q", "tau") for k in half]
+        raise DataError(
+            f"{path.name} has no header. State the names of its {len(names)} columns in the job "
+            "file, and the rate of its rows if none of them is the time. An example:\n"
+            f"[log]\nnames = [{', '.join(map(quoted, likely))}]"
+            + "\nrate = 100  # [Hz]"
+            * ("time" not in likely),
+            code="missing_column",
+        )
+    return [str(k) for k in range(len(names))], separator, 0
 
 
-def _split(where: str, line: str, separator: str, number: int) -> list[str]:
+def _named_by_cells(path: Path, names: Sequence[str], separator: str | None) -> dict[str, str]:
+    """Return new names of columns that the first row names, as field.position0 by field.name0."""
+    ends = {x: found.groups() for x in names if (found := _NAME.fullmatch(x))}
+    if not ends:
+        return {}
+    with _open_csv(path) as file:
+        cells = _split(path.name, "".join(islice(file, 1, 2)), separator, 2)
+    first = dict(zip(names, cells, strict=False))
+    by_place = {place: first.get(name, "").strip() for name, place in ends.items()}
+    return {
+        x: f"{x[: len(x) - len(end)]}_{joint}"
+        for (start, end), joint in by_place.items()
+        for x in names
+        if joint and x.startswith(start) and x.endswith(end) and is_quantity(x[: len(x) - len(end)])
+    }
+
+
+def _split(where: str, line: str, separator: str | None, number: int) -> list[str]:
     """Return the cells of a line; quoted cells may contain separators."""
+    if separator is None:
+        return line.split()
     try:
         return next(csv.reader([line], delimiter=separator))
     except (csv.Error, StopIteration) as error:

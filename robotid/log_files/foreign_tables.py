@@ -1,7 +1,7 @@
 """Tables with column names of other programs: PlotJuggler's, and DataFrames."""
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Protocol, TypeGuard
 
@@ -10,14 +10,16 @@ import numpy as np
 from robotid._typing import Array
 from robotid.exceptions import DataError
 from robotid.findings import listed
-from robotid.log_files.table import Place, RowReader, Table, choose, prefixes
+from robotid.log_files.column_names import is_clock, quantity_of
+from robotid.log_files.table import Place, RowReader, Table, choose
 from robotid.logs.data import suggestion
 from robotid.logs.settings import LogSource
 
-__all__ = ["Frame", "is_frame", "open_frame", "with_own_names"]
+__all__ = ["Frame", "is_frame", "open_frame", "with_own_names", "with_stated_names", "with_time"]
 
 _CLOCK = "__time"  # PlotJuggler's
 _COLUMNS = "its columns have names as <topic>/<joint>/position"
+_SECONDS = re.compile(r"(.*)(?<![a-z])(secs?|n(?:ano)?secs?)")  # of a stamp in two columns
 _NAMED = re.compile(r"(.*)/([^/]+)/(position|velocity|acceleration|effort)")  # topic, joint, kind
 
 
@@ -81,7 +83,7 @@ def with_own_names(table: Table, where: str, kind: str, source: LogSource) -> Ta
         DataError: If it has joint states of several topics and no topic, or another one, is stated.
     """
     topics: dict[str, dict[str, str]] = {}  # names in the file, by topic and own name
-    standard = [name for name in table.names if name.startswith(prefixes()["q"])]
+    standard = [name for name in table.names if name.startswith(("q_", "position_"))]
     for name in table.names if _CLOCK in table.names or not standard else ():
         if found := _NAMED.fullmatch(name):
             topic, joint, quantity = found.groups()
@@ -94,6 +96,68 @@ def with_own_names(table: Table, where: str, kind: str, source: LogSource) -> Ta
         own |= topics[_topic(topics, where, source)]
     if not own:
         return table
+    return _renamed(table, own)
+
+
+def with_stated_names(table: Table, where: str, names: Sequence[str]) -> Table:
+    """Return a table with the names that a job states for all columns, in their order.
+
+    Args:
+        table: The table.
+        where: Name of its file, for errors.
+        names: The names; none: the table stays as it is.
+
+    Raises:
+        DataError: If their number is another one.
+    """
+    if not names:
+        return table
+    if len(names) != len(table.names):
+        raise DataError(
+            f"{where} has {len(table.names)} columns, but log.names states {len(names)}; name "
+            "each column, in their order"
+        )
+    return _renamed(table, dict(zip(names, table.names, strict=True)))
+
+
+def with_time(table: Table, rate: float | None) -> Table:
+    """Return a table with a column "time" from seconds and nanoseconds, or from a stated rate.
+
+    Args:
+        table: A table; it stays as it is if it has time stamps.
+        rate: Rate of the rows [Hz], if stated.
+    """
+    if any(is_clock(name) for name in table.names):
+        note = "log.rate is not used: the log has time stamps"
+        return table if rate is None else replace(table, notes=(*table.notes, note))
+    if rate is not None:
+        first = next((x for x in table.names if quantity_of(x)), table.names[0])
+        return _timed(table, (first,), lambda row, x: (row + np.arange(len(x))) / rate)
+    parts: dict[str, list[str]] = {}
+    for name in table.names:
+        if found := _SECONDS.fullmatch(name):
+            parts.setdefault(found[1], []).append(name)
+    pairs = [sorted(own, key=lambda x: x.endswith(("nsec", "nsecs", "nanosec", "nanosecs")))
+             for own in parts.values() if len(own) == 2]  # fmt: skip
+    if len(pairs) != 1:
+        return table
+    return _timed(table, tuple(pairs[0]), lambda _, sec, nanosec: sec + 1e-9 * nanosec)
+
+
+def _timed(table: Table, sources: tuple[str, ...], stamps: Callable[..., Array]) -> Table:
+    """Return a table with a column "time" from others and the number of the first row."""
+
+    def read(wanted: Sequence[str]) -> dict[str, Array]:
+        columns = table.read(list(dict.fromkeys([*(x for x in wanted if x != "time"), *sources])))
+        return columns | {"time": stamps(0, *(columns[x] for x in sources))}
+
+    rows = None if table.rows is None else _Timed(table.rows, sources, stamps)
+    names = ["time", *(x for x in table.names if x not in sources or len(sources) == 1)]
+    return replace(table, names=names, read=read, rows=rows)
+
+
+def _renamed(table: Table, own: Mapping[str, str]) -> Table:
+    """Return a table with other names: those in the file by the new one."""
     theirs = {name: mine for mine, name in own.items()}
 
     def read(wanted: Sequence[str]) -> dict[str, Array]:
@@ -102,7 +166,7 @@ def with_own_names(table: Table, where: str, kind: str, source: LogSource) -> Ta
 
     rows = None if table.rows is None else _Renamed(table.rows, own)
     names = [theirs.get(name, name) for name in table.names]
-    return replace(table, names=names, read=read, rows=rows, renamed=theirs)
+    return replace(table, names=names, read=read, rows=rows, renamed={**table.renamed, **theirs})
 
 
 def _topic(topics: Mapping[str, Mapping[str, str]], where: str, source: LogSource) -> str:
@@ -116,6 +180,29 @@ def _topic(topics: Mapping[str, Mapping[str, str]], where: str, source: LogSourc
         return source.topic
     moved = [topic for topic, names in topics.items() if any("effort_" in x for x in names)]
     return choose(where, moved or list(topics), "topics of joint states", _COLUMNS)
+
+
+@dataclass(frozen=True)
+class _Timed(RowReader):
+    rows: RowReader
+    sources: tuple[str, ...]
+    stamps: Callable[..., Array]
+
+    def count(self) -> int:
+        return self.rows.count()
+
+    def scan(self, name: str) -> Iterator[tuple[Array, Place]]:
+        if name != "time":
+            yield from self.rows.scan(name)
+            return
+        for blocks in zip(*map(self.rows.scan, self.sources), strict=True):
+            place = blocks[0][1]
+            yield self.stamps(place.row, *(values for values, _ in blocks)), place
+
+    def read(self, wanted: Sequence[str], first: int, stop: int, near: Place) -> dict[str, Array]:
+        names = list(dict.fromkeys([*(x for x in wanted if x != "time"), *self.sources]))
+        columns = self.rows.read(names, first, stop, near)
+        return columns | {"time": self.stamps(first, *(columns[x] for x in self.sources))}
 
 
 @dataclass(frozen=True)

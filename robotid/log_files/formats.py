@@ -10,7 +10,7 @@ from robotid.exceptions import DataError, SettingsError
 from robotid.log_files.arrays import Hdf5Format, MatFormat, NpzFormat
 from robotid.log_files.bags import BagFormat
 from robotid.log_files.csv_files import CsvFormat
-from robotid.log_files.foreign_tables import with_own_names
+from robotid.log_files.foreign_tables import with_own_names, with_stated_names, with_time
 from robotid.log_files.lerobot import LeRobotFormat
 from robotid.log_files.parquet_files import ParquetFormat
 from robotid.log_files.table import Format, Table, WritableFormat
@@ -20,6 +20,8 @@ __all__ = ["check_suffix", "open_table", "write_columns"]
 
 _FORMATS: dict[str, Format] = {
     ".csv": CsvFormat(),
+    ".dat": CsvFormat(),
+    ".txt": CsvFormat(),
     ".parquet": ParquetFormat(),
     ".npz": NpzFormat(),
     ".h5": Hdf5Format(),
@@ -29,7 +31,12 @@ _FORMATS: dict[str, Format] = {
     ".db3": BagFormat(),
     ".bag": BagFormat(),
 }
-_WRITTEN = {suffix: f for suffix, f in _FORMATS.items() if isinstance(f, WritableFormat)}
+_READ_ONLY = (".dat", ".txt")
+_WRITTEN = {
+    suffix: f
+    for suffix, f in _FORMATS.items()
+    if isinstance(f, WritableFormat) and suffix not in _READ_ONLY
+}
 _LONGEST_NAME = 1000  # characters of a column
 
 
@@ -60,9 +67,10 @@ def open_table(path: Path, source: LogSource) -> Table:
             f"log.command is {source.command!r}, the topic of a bag, but {path.name} is no bag; "
             "write the commands to columns, as qref_<joint>"
         )
-    table = form.open(path, source)
+    table = with_stated_names(form.open(path, source), path.name, source.names)
     if isinstance(form, CsvFormat | ParquetFormat):  # with one table per file
         table = with_own_names(table, path.name, f"{path.suffix} files", source)
+    table = with_time(table, source.rate)
     for name in table.names:
         if len(name) > _LONGEST_NAME:
             raise DataError(

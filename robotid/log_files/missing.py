@@ -1,12 +1,11 @@
-"""The error of a log that lacks required columns: similar names in it, and what to state."""
+"""The error of a log that lacks required columns: what was found, and a table to complete."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from robotid._similar import is_commanded, similar_columns, similar_joints
 from robotid.exceptions import DataError
 from robotid.findings import listed, quoted, toml_key
-from robotid.log_files.table import prefixes, quantity_of
+from robotid.log_files.column_names import by_number, is_commanded, quantity_of
 from robotid.logs.settings import LogSource
 
 __all__ = ["NOUNS", "SIZES", "Missing"]
@@ -34,139 +33,74 @@ class Missing:
         where: Name of the file.
         names: Names of its columns.
         absent: Quantity and joint, or motor, of each column that it lacks.
-        places: Joints and motors that are read.
+        joints: The joints that are read.
         source: Names of the joints in the file, and the quantity of effort columns.
+        found: The recognised columns by standard name.
     """
 
     where: str
     names: Sequence[str]
     absent: Sequence[tuple[str, str]]
-    places: Sequence[str]
+    joints: Sequence[str]
     source: LogSource
-
-    def similar(self) -> dict[tuple[str, str], str]:
-        """Return columns that may be the missing ones, by quantity and joint."""
-        named = [(kind, self._named(place)) for kind, place in self.absent]
-        other = self._other_joints()
-        free = [x for x in self.names if self._of(x)[1] not in {*self._read_names(), *other}]
-        found = similar_columns(named, free, prefixes(self.source.effort))
-        own = {self._named(place): place for _, place in self.absent}
-        return {(kind, own[name]): column for (kind, name), column in found.items()}
+    found: Mapping[str, str]
 
     def error(self, remedy: str) -> DataError:
         """Return the error.
 
         Args:
-            remedy: What to do if no name is similar.
+            remedy: What to do if the log has no other columns.
         """
-        return DataError(self._of_joints() or self._of_columns(remedy), code="missing_column")
-
-    def _of_joints(self) -> str:
-        """Return the message on joints that have other names in the log, "" if none has."""
-        logged = dict.fromkeys(self._of(name)[1] for name in self.names)
-        absent = dict.fromkeys(x for _, x in self.absent if self._named(x) not in logged)
-        others = self._other_joints()
-        sought = {self._named(joint): joint for joint in absent}
-        found, ordered = similar_joints(list(sought), others)
-        pairs = {sought[name]: other for name, other in found.items()}
-        by_order = {sought[name] for name in ordered}
-        if any(x not in (*absent, *self.source.joints) for x in self.places):
-            # others may be of joints that are not read, as locked ones
-            pairs = {joint: name for joint, name in pairs.items() if joint not in by_order}
-        stated = [joint for joint in absent if joint in self.source.joints]
-        if not (pairs or stated):
-            return ""
-        head = f"{self.where} has no columns of joints {listed(absent)} under the names of the URDF"
-        if stated:
-            named = ", ".join(f"{x} = {quoted(self._named(x))}" for x in stated)
-            head = f"{self.where} has no columns under the names that [log.joints] states: {named}"
-        if not pairs:
-            return f"{head}; names in the log: {listed(filter(None, logged))}"
-        width = max(len(f"{toml_key(joint)} = {quoted(name)}") for joint, name in pairs.items())
-        lines = [
-            f"{f'{toml_key(joint)} = {quoted(name)}':{width}}"
-            f"  # {'by order' if joint in by_order else 'similar name'}"
-            for joint, name in pairs.items()
-        ]
-        without = [joint for joint in absent if joint not in pairs]
-        left = [name for name in others if name not in pairs.values()]
-        rest = f"\nJoints without a name in the log: {listed(without)}." if without else ""
-        rest += f"\nOther names in the log: {listed(left, _SHOWN)}." if left else ""
-        joint, name = next(iter(pairs.items()))
-        return (
-            f"{head}; names in the log: {listed(others)}. State the name of each joint in the job "
-            f"file, or with one flag per joint, as --rename {joint}={name}. This table is a guess: "
-            "check each line, an exchange of joints gives wrong parameters.\n[log.joints]\n"
-            + "\n".join(lines)
-            + rest
-        )
-
-    def _of_columns(self, remedy: str) -> str:
-        """Return the message on missing columns."""
-        near = self.similar()
-        sought = [f"{kind}_{self._named(place)}" for kind, place in self.absent]
-        kinds = dict.fromkeys(kind.removesuffix("m") for kind, _ in self.absent)
-        of_kinds = {x for kind, _ in self.absent for x in (kind, kind.replace("tau", "current"))}
-        commanded, found, others = list[str](), list[str](), list[str]()
+        named = self.source.joints
+        sought = [f"{kind}_{named.get(place, place)}" for kind, place in self.absent]
         sizes = [name for name in self.names if name.startswith(SIZES)]
-        for name in (x for x in self.names if x not in sizes):
-            kind, place = self._of(name)
-            if kind in of_kinds and (kind.startswith("qref") or not is_commanded(name)):
-                found.append(name)
-            elif kind.removesuffix("ref") in kinds:
-                commanded.append(name)
-            elif name not in near.values() and place not in self._read_names():
-                (commanded if is_commanded(name) else others).append(name)
-        plural, it = ("s", "them") if len(sought) > 1 else ("", "it")
+        left = [x for x in self.names if x not in {*self.found.values(), *sizes}]
+        references = tuple(f"{kind.removesuffix('ref')}ref_" for kind, _ in self.absent)
+        read = [x for key, x in self.found.items() if key.startswith(references)]
+        commanded = [x for x in self.names if is_commanded(x) and x in {*left, *read}]
+        others = [name for name in left if name not in commanded]
+        nouns = dict.fromkeys(NOUNS[kind.removesuffix("m")] for kind, _ in self.absent)
+        ends = tuple(kind.replace("tau", t) + "_" for kind, _ in self.absent
+                     for t in ("tau", "current"))  # fmt: skip
+        of_kind = [column for key, column in self.found.items() if key.startswith(ends)]
+        commanded = [name for name in commanded if name not in of_kind]
         text = (
-            f"{self.where} has no column{plural} {listed(map(repr, sought), 6)}; "
-            f"{' and '.join(NOUNS[kind] for kind in kinds)} columns found: {listed(found, _SHOWN)}."
+            f"{self.where} has no column{'s' * (len(sought) > 1)} {listed(map(repr, sought), 6)}; "
+            f"{' and '.join(nouns)} columns found: {listed(of_kind, _SHOWN)}."
         )
-        others = [name for name in others if name not in ("time", "t")]
-        if commanded:
-            text += f" Commanded, not measured: {listed(commanded, _SHOWN)}."
-        if sizes:
-            text += f" Loads without sign, which are no torques: {listed(sizes, _SHOWN)}."
-        if others:
-            text += f" Other columns: {listed(others, _SHOWN)}."
-        stated = {f"{kind}_{place}": column for (kind, place), column in near.items()}
-        if len(stated) > 1:
-            lines = [f"{toml_key(key)} = {quoted(column)}" for key, column in stated.items()]
-            return (
-                f"{text} Similar names are in the log. Rename these columns, or check them and "
-                "state them in the job file:\n[columns]\n" + "\n".join(lines)
+        for label, some in (
+            ("Commanded, not measured", commanded),
+            ("Loads without sign, which are no torques", sizes),
+            ("Other columns", others),
+        ):
+            text += f" {label}: {listed(some, _SHOWN)}." if some else ""
+        by_order = self._by_order(left)
+        if not (by_order or others):
+            return DataError(f"{text} {remedy}", code="missing_column")
+        absent = [key for key in map("_".join, self.absent) if key not in by_order]
+        lines = [f"{toml_key(key)} = {quoted(x)}" for key, x in self.found.items()]
+        lines += [f"{toml_key(key)} = {quoted(x)}  # by order" for key, x in by_order.items()]
+        lines += [f'# {toml_key(key)} = "NAME"' for key in absent]
+        if by_order:
+            remedy += (
+                ". If joints have other names in the log, this table pairs them by order: check "
+                "each line, an exchange of joints gives wrong parameters"
             )
-        read = self._read_names()
-        if not stated and not others and all(self._of(name)[1] in read for name in found):
-            return f"{text} {remedy}"  # every column has its meaning: there is none to rename
-        hint = "".join(f"Did you mean {column!r}? " for column in stated.values())
-        ((key, column),) = stated.items() or [("_".join(self.absent[0]), "NAME")]
-        inside = f"{{ {toml_key(key)} = {quoted(column)} }}"
-        end = "" if stated else f". {remedy}"
-        return f"{text} {hint}Rename {it}, or state {it} in the job file: columns = {inside}{end}"
+        return DataError(
+            f"{text} {remedy}. Rename the columns, or state them in the job file:\n[columns]\n"
+            + "\n".join(lines),
+            code="missing_column",
+        )
 
-    def _named(self, place: str) -> str:
-        """Return the name of a joint or motor in the file."""
-        return self.source.joints.get(place, place)
-
-    def _read_names(self) -> set[str]:
-        return {self._named(place) for place in self.places}
-
-    def _of(self, name: str) -> tuple[str, str]:
-        """Return quantity and joint of a column, "" without a standard name."""
-        return quantity_of(name, self.source.effort) or ("", "")
-
-    def _other_joints(self) -> list[str]:
-        """Return the names of other joints in the log.
-
-        A single column, as q_elbw, is a misspelt one if the log has columns of joints as named.
-        """
-        kinds, least = dict[str, set[str]](), 1
-        for name in self.names:
-            kind, joint = self._of(name)
-            if joint in self._read_names():
-                least = 2
-            elif joint and not joint.endswith(("]", ")")):  # no unit
-                kinds.setdefault(joint, set()).add(kind)
-        first = {"q", *(kind for kind, _ in self.absent if kind == "qm")}
-        return [joint for joint, of in kinds.items() if of & first and len(of) >= least]
+    def _by_order(self, names: Sequence[str]) -> dict[str, str]:
+        """Return the columns of joints with other names by standard name, in their order."""
+        read = [(name, quantity_of(name, self.source.effort)) for name in names]
+        known = [(name, *found) for name, found in read if found]
+        absent = by_number([joint for joint in self.joints if ("q", joint) in self.absent])
+        labels = by_number([label for _, kind, label in known if kind == "q"])
+        if not absent or len(labels) != len(absent):
+            return {}
+        joint_of = dict(zip(labels, absent, strict=True))
+        return {
+            f"{kind}_{joint_of[label]}": name for name, kind, label in known if label in joint_of
+        }

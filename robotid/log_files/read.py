@@ -2,12 +2,12 @@
 
 Columns are `time` [s], and for each joint `q_<joint>` [rad or m], optionally `dq_<joint>` and
 `ddq_<joint>`, and `tau_<joint>` [N m or N] or `current_<joint>` [A]. Commands are `qref_<joint>`,
-optionally `dqref_<joint>` and `tauref_<joint>`. Aliases are read, too. With a transmission,
-columns of the motors are read instead, as `qm_<motor>` and `taum_<motor>` [N m].
+optionally `dqref_<joint>` and `tauref_<joint>`. With a transmission, columns of the motors are
+read instead, as `qm_<motor>` and `taum_<motor>` [N m]. ``column_names`` reads other spellings.
 """
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import chain
 from pathlib import Path
 from typing import Any, get_args
@@ -21,7 +21,14 @@ from robotid.exceptions import DataError, SettingsError
 from robotid.findings import listed
 from robotid.log_files.columns import NOUNS, TORQUES, Finder, Needs, without_torque
 from robotid.log_files.even_stamps import with_even_stamps
-from robotid.log_files.foreign_tables import Frame, is_frame, open_frame, with_own_names
+from robotid.log_files.foreign_tables import (
+    Frame,
+    is_frame,
+    open_frame,
+    with_own_names,
+    with_stated_names,
+    with_time,
+)
 from robotid.log_files.formats import open_table, write_columns
 from robotid.log_files.table import Table
 from robotid.logs.base import BaseColumns, base_columns, base_of, contacts_of, table_of_base
@@ -34,6 +41,7 @@ from robotid.logs.data import (
 from robotid.logs.settings import PER_SECOND, LogSource, LogUnits
 from robotid.logs.transmission import Transmission, check_transmissions
 from robotid.logs.units import check_units
+from robotid.robot.tree import Joint
 
 __all__ = ["LogLayout", "Readable", "lay_out", "read_log", "read_logs", "write_log"]
 
@@ -62,6 +70,7 @@ def read_log(
     needs: Needs = "torque",
     base: BaseColumns = _BASE,
     passive: Collection[str] = (),
+    robot: Sequence[Joint] = (),
 ) -> Log:
     """Return the log in a file or a DataFrame, in SI units; its notes list ignored columns.
 
@@ -83,6 +92,7 @@ def read_log(
         base: Columns of a floating base and of contacts; none if not stated.
         passive: Joints without a drive, which need no torque; without a position, they are not
             joints of the log.
+        robot: All movable joints of the robot, in the order of the URDF: that of numbered columns.
 
     Raises:
         DataError: If a required column is missing, or the values look like other units.
@@ -92,6 +102,7 @@ def read_log(
     layout, table = lay_out(
         path, joints, gains=gains, columns=columns, units=units, prismatic=prismatic,
         source=source, transmissions=transmissions, needs=needs, base=base, passive=passive,
+        robot=robot,
     )  # fmt: skip
     log = layout.to_log(table.read(layout.wanted))
     check_units(log, units, prismatic)
@@ -106,6 +117,7 @@ def read_logs(
     needs: Needs = "torque",
     base: BaseColumns = _BASE,
     passive: Collection[str] = (),
+    robot: Sequence[Joint] = (),
 ) -> tuple[Log, ...]:
     """Return the logs of a user, one or several; files and DataFrames are read.
 
@@ -116,6 +128,7 @@ def read_logs(
         needs: Quantities that are required besides positions, as of ``lay_out``.
         base: As of ``read_log``.
         passive: As of ``read_log``.
+        robot: As of ``read_log``.
 
     Raises:
         DataError: If it is no log, or a required quantity is missing.
@@ -130,7 +143,9 @@ def read_logs(
     return tuple(
         _of_joints(log, joints, "motion" if log.wrenches else needs, passive)
         if isinstance(log, Log)
-        else read_log(log, joints, prismatic=prismatic, needs=needs, base=base, passive=passive)
+        else read_log(
+            log, joints, prismatic=prismatic, needs=needs, base=base, passive=passive, robot=robot
+        )
         for log in logs
     )
 
@@ -189,6 +204,8 @@ class LogLayout:
     gears: tuple[Transmission, ...]  # of the motors
     has_torque: bool  # whether the file has a torque or a current of any of the joints
     base: BaseColumns = _BASE  # of a floating base and of contacts
+    positions: Mapping[str, str] = field(default_factory=dict)  # likewise, of all joints in it
+    assumed: tuple[str, ...] = ()  # of the columns, for the user
 
     @property
     def wanted(self) -> list[str]:
@@ -248,7 +265,8 @@ class LogLayout:
             values["tau"] = np.zeros_like(values["q"])
         arrays = {name: values[kind] for kind, name in COLUMNS.items() if kind in values}
         return Log(
-            t=t, joints=self.joints, path=self.path, notes=notes, has_torque=has_torque,
+            t=t, joints=self.joints, path=self.path, notes=notes, assumed=self.assumed,
+            has_torque=has_torque,
             base=base, contacts=contacts, wrenches=wrenches, **arrays,
         )  # fmt: skip
 
@@ -307,6 +325,7 @@ def lay_out(
     needs: Needs = "torque",
     base: BaseColumns = _BASE,
     passive: Collection[str] = (),
+    robot: Sequence[Joint] = (),
 ) -> tuple[LogLayout, Table]:
     """Return the layout of a log in a file, before its columns are read, and its open table.
 
@@ -325,6 +344,7 @@ def lay_out(
             has them. Other quantities are ignored; torques that are not read are 0.
         base: As of ``read_log``.
         passive: As of ``read_log``.
+        robot: As of ``read_log``.
 
     Raises:
         DataError: If a required column is missing.
@@ -349,13 +369,7 @@ def lay_out(
     for key, name in (columns or {}).items():
         require_kind(key, str, "a key of columns", "the standard name of a column")
         require_kind(name, str, f"columns[{key!r}]", "the name of a column")
-    if isinstance(path, str | Path):
-        check_path(path)
-        where, opened = Path(path).name, open_table(Path(path), source)
-    elif is_frame(path):
-        where, opened = "log", with_own_names(open_frame(path), "log", "DataFrames", source)
-    else:
-        raise _no_log(path)
+    where, opened = _opened(path, source)
     if opened.angle_unit and units.angle is None:
         raise DataError(f"{where}: {opened.angle_unit}", code="angle_unit")
     check_transmissions(transmissions, joints)
@@ -367,11 +381,11 @@ def lay_out(
     of_joints = {x: y for x, y in stated.items() if y not in chain.from_iterable(of_base.values())}
     finder = Finder(
         where, opened.names, of_joints, tuple(joints), gains or {}, source, tuple(transmissions),
-        needs, notes, passive=passive,
+        needs, notes, {*chain.from_iterable(of_base.values()), *opened.sensors}, passive,
+        tuple(robot),
     )  # fmt: skip
     joints = [joint for joint in joints if joint not in passive or finder.has_position(joint)]
     finder = replace(finder, joints=tuple(joints))
-    finder.seen.update(chain.from_iterable(of_base.values()), opened.sensors)
     if base.wrenches and needs in ("torque", "any") and not any(map(finder.has_torque, joints)):
         finder = replace(finder, needs="motion")
     found = finder.find_all() | of_base  # names of columns by kind
@@ -388,8 +402,21 @@ def lay_out(
         gears=finder.gears,
         has_torque=any(finder.has_torque(joint) for joint in joints),
         base=base,
+        positions=finder.reading.positions,
+        assumed=finder.reading.assumed,
     )
     return layout, with_even_stamps(opened, found["time"][0], source.stamp)
+
+
+def _opened(path: str | Path | Frame, source: LogSource) -> tuple[str, Table]:
+    """Return the name of a log and its open table."""
+    if isinstance(path, str | Path):
+        check_path(path)
+        return Path(path).name, open_table(Path(path), source)
+    if not is_frame(path):
+        raise _no_log(path)
+    table = with_stated_names(open_frame(path), "log", source.names)
+    return "log", with_time(with_own_names(table, "log", "DataFrames", source), source.rate)
 
 
 def _notes_of_sensors(

@@ -10,10 +10,10 @@ from robotid.exceptions import DataError
 from robotid.log_files.table import Table
 from robotid.logs.base import ACCELERATION, POSE, TWIST, in_base
 
-__all__ = ["with_simulator_arrays"]
+__all__ = ["ARRAYS", "with_simulator_arrays"]
 
 #: Prefixes of columns by array with one value per joint; before these, MuJoCo's has the base's.
-_JOINTS = {
+ARRAYS = {
     "qpos": "q", "qvel": "dq", "qacc": "ddq", "qfrc_actuator": "tau",
     "joint_pos": "q", "joint_vel": "dq", "joint_acc": "ddq", "applied_torque": "tau",
 }  # fmt: skip
@@ -50,12 +50,12 @@ def with_simulator_arrays(where: str, table: Table, joints: Sequence[str]) -> Ta
     Raises:
         DataError: If an array has another width.
     """
-    widths = {name: _width(table.names, name, joints) for name in (*_JOINTS, *_ROOTS)}
+    widths = {name: _width(table.names, name, joints) for name in (*ARRAYS, *_ROOTS)}
     widths = {name: width for name, width in widths.items() if width}
     if not widths or any(name.startswith("q_") for name in table.names):
         return table
     derived = [_of_joints(where, name, width, joints) for name, width in widths.items()
-               if name in _JOINTS]  # fmt: skip
+               if name in ARRAYS]  # fmt: skip
     notes = table.notes
     if widths.get("qpos") == len(joints) + 7 and joints:
         derived.append(_of_free_joint(widths))
@@ -109,7 +109,7 @@ def _of_joints(where: str, name: str, width: int, joints: Sequence[str]) -> _Der
     is_numbered = before > 0 or not joints
     sources = [f"{name}_{before + k if is_numbered else end}" for k, end in enumerate(ends)]
     return _Derived(
-        tuple(sources), tuple(f"{_JOINTS[name]}_{end}" for end in ends), lambda values: values
+        tuple(sources), tuple(f"{ARRAYS[name]}_{end}" for end in ends), lambda values: values
     )
 
 

@@ -20,36 +20,7 @@ __all__ = [
     "WritableFormat",
     "choose",
     "parsing",
-    "prefixes",
-    "quantity_of",
 ]
-
-_PREFIXES: dict[str, tuple[str, ...]] = {
-    "q": ("q_", "position_"),
-    "dq": ("dq_", "velocity_", "qd_"),
-    "ddq": ("ddq_", "acceleration_", "qdd_"),
-    "tau": ("tau_", "effort_", "torque_"),
-    "current": ("current_", "i_"),
-}
-_COMMANDED = ("ref", "reference", "des", "desired", "cmd", "command", "target")
-
-
-def _commanded(kind: str) -> tuple[str, ...]:
-    """Return the prefixes of a commanded quantity, as qref_, q_des_, position_command_."""
-    stems = [prefix.removesuffix("_") for prefix in _PREFIXES[kind]]
-    return (
-        *(f"{kind}{word}_" for word in ("ref", "des", "cmd")),
-        *(f"{stem}_{word}_" for stem in stems for word in _COMMANDED),
-        *(f"{word}_{stem}_" for stem in stems for word in _COMMANDED),
-    )
-
-
-_PREFIXES |= {
-    "qref": (*_commanded("q"), "command_"),
-    "dqref": _commanded("dq"),
-    "tauref": _commanded("tau"),
-}
-_PREFIXES |= {f"{kind}m": (f"{kind}m_",) for kind in _PREFIXES}  # motors'
 
 
 @dataclass(frozen=True)
@@ -166,40 +137,6 @@ class WritableFormat(Format):
             DataError: If a name is not valid in this format.
             MissingDependencyError: If a package that writes it is not installed.
         """
-
-
-def prefixes(effort: str = "torque") -> dict[str, tuple[str, ...]]:
-    """Return the prefixes of columns by quantity: the standard prefix first, then its aliases.
-
-    Args:
-        effort: Quantity of effort columns: "torque" or "current".
-    """
-    if effort == "torque":
-        return dict(_PREFIXES)
-    torques = {
-        kind: tuple(prefix for prefix in _PREFIXES[kind] if "effort" not in prefix)
-        for kind in ("tau", "tauref")
-    }
-    return _PREFIXES | torques | {"current": (*_PREFIXES["current"], "effort_")}
-
-
-def quantity_of(name: str, effort: str = "torque") -> tuple[str, str] | None:
-    """Return quantity and joint of a column, or None: "q_des_elbow" is qref of elbow.
-
-    Args:
-        name: The column.
-        effort: Quantity of effort columns: "torque" or "current".
-    """
-    starts = [
-        (start, kind)
-        for kind, all_starts in prefixes(effort).items()
-        for start in all_starts
-        if name.startswith(start) and name != start
-    ]
-    if not starts:
-        return None
-    start, kind = max(starts, key=lambda found: len(found[0]))
-    return kind, name[len(start) :]
 
 
 def choose(where: str, found: Sequence[str], noun: str, listing: str) -> str:

@@ -57,6 +57,7 @@ class Log:
         a: Measured accelerations, shape (N, n) [rad/s^2 or m/s^2], or None.
         path: The file of the log; "" if it was created in memory.
         notes: Notes for the user, as columns that were ignored.
+        assumed: What was assumed of the columns, as the order of numbered ones.
         q_ref: Commanded positions, shape (N, n) [rad or m], or None.
         v_ref: Commanded velocities, shape (N, n) [rad/s or m/s], or None.
         tau_ref: Commanded feed-forward torques, shape (N, n) [N m or N], or None.
@@ -82,6 +83,7 @@ class Log:
     base: BaseMotion | None = None
     contacts: Mapping[str, Array] = field(default_factory=dict)
     wrenches: Mapping[str, Array] = field(default_factory=dict)
+    assumed: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         require_kind(self.path, (str, Path), "path", "the path of the log's file, or ''")

@@ -163,6 +163,14 @@ class LogSource(Settings):
         "ones",
     )
     joints: Mapping[str, str] = setting({}, "name in the file by joint, if they differ")
+    names: tuple[str, ...] = setting(
+        (),
+        "names of all columns in their order, of a file without a header or with other names",
+        dump=lambda names: list(names) or None,
+    )
+    rate: float | None = setting(
+        None, "rate of the rows of a log without time stamps [Hz]", within=_HZ
+    )
     effort: str = setting(
         "torque",
         "quantity of effort columns: torque [N m or N], or current [A], which needs a gain",
@@ -187,6 +195,8 @@ class LogSource(Settings):
         require_kind(self.joints, Mapping, "joints", "a table of names by joint")
         for name, topic in (("topic", self.topic), ("command", self.command)):
             require_kind(topic, (str, type(None)), name, "the name of a topic or group, or none")
+        if len(set(self.names)) != len(self.names):
+            raise SettingsError("log: names has a name more than once; wanted one for each column")
         for joint, name in self.joints.items():
             if not isinstance(name, str):
                 raise SettingsError(f"log: joints.{joint} is {name!r}, wanted a name")

@@ -22,7 +22,7 @@ from robotid.exceptions import DataError
 from robotid.findings import listed
 from robotid.log_files.formats import open_table
 from robotid.log_files.read import LogLayout
-from robotid.log_files.table import Place, RowReader, Table, prefixes
+from robotid.log_files.table import Place, RowReader, Table
 from robotid.logs.data import Log, Trajectory
 from robotid.logs.imu import bias_at_rest
 from robotid.logs.settings import SignalSettings
@@ -444,7 +444,7 @@ def survey_log(
         DataError: If time does not increase, the window contains fewer than two rows, or units are
             implausible.
     """
-    locked = _locked_columns(layout, table, model)
+    locked = {x: layout.positions[x] for x in model.locked if x in layout.positions}
     wanted = list(dict.fromkeys([*layout.wanted, *locked.values()]))
     if length is None:
         columns = table.read(wanted)
@@ -541,17 +541,6 @@ def _close_looks(first: int, stop: int) -> list[tuple[int, int]]:
         return [(first, stop)]
     middle = (first + stop - _WINDOW) // 2
     return [(row, row + _WINDOW) for row in (first, middle, stop - _WINDOW)]
-
-
-def _locked_columns(layout: LogLayout, table: Table, model: RobotModel) -> dict[str, str]:
-    """Return the columns of a file with the positions of locked joints, by joint."""
-    found = {}
-    for joint in model.locked:
-        named = layout.source.joints.get(joint, joint)
-        names = [prefix + named for prefix in prefixes()["q"] if prefix + named in table.names]
-        if names:
-            found[joint] = names[0]
-    return found
 
 
 def _positions(

@@ -26,6 +26,7 @@ from robotid.robot.urdf_text import LARGEST
 __all__ = ["GRAVITY", "RobotModel"]
 
 GRAVITY = (0.0, 0.0, -9.81)  # [m/s^2]
+_OFFSET = 0.01  # [m] axes that are nearer have no distance: 78 URDFs have 0.05 m or more, or 0.5 mm
 _STRONGEST = 100.0  # [m/s^2] with more, accelerations are negligible beside gravity
 _MOST = 1e30  # largest absolute value of a parameter, SI units: products of a few are finite
 _UNIT = 1e-6  # tolerance of the norm of a quaternion
@@ -263,10 +264,13 @@ class RobotModel:
 
     @property
     def length(self) -> float:
-        """The longest distance between neighbouring joints [m], a scale of the robot; 1 if 0."""
+        """The longest distance between neighbouring joints [m], a scale of the robot.
+
+        1 if all axes are within 1 cm, as that of a pendulum: its links are longer than this.
+        """
         placements = self.pin_model.jointPlacements[1:]
         longest = max(float(np.linalg.norm(placement.translation)) for placement in placements)
-        return longest if longest > 1e-6 else 1.0
+        return longest if longest > _OFFSET else 1.0
 
     @property
     def carried_by(self) -> Array:
@@ -453,6 +457,12 @@ def _inertia(values: Array) -> pin.Inertia:
 def _build(tree: Tree, free_flyer: bool, gravity: Sequence[float]) -> pin.Model:
     acceleration = _gravity(gravity)
     root = (pin.JointModelFreeFlyer(),) if free_flyer else ()
+    for name in [joint.name for joint in tree.movable]:
+        if name == "universe" or (free_flyer and name == "root_joint"):
+            raise ModelError(
+                f"{Path(tree.path).name}: a joint is named {name!r}, which is reserved by "
+                "Pinocchio; rename it"
+            )
     refused = ""
     with caught_messages() as messages:
         try:

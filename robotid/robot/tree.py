@@ -28,7 +28,7 @@ _ZERO = (0.0, 0.0, 0.0)
 MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 _LIGHTEST = 1e-15  # [kg] smallest mass of a link that has one: quotients stay finite
 _DEEPEST = 500  # joints from the root to a link; Pinocchio uses recursion
-_RESERVED = ("universe", "root_joint")  # Pinocchio's names of the world and of a floating base
+_WORLD = "world"  # the parent link that need not be in the file
 
 
 @dataclass(frozen=True)
@@ -195,6 +195,9 @@ def _tree(robot: ET.Element, path: str) -> Tree:
         )
     links = _unique(robot.findall("link"), "link", where)
     elements = _unique(robot.findall("joint"), "joint", where)
+    parents = {tag.get("link") for tag in robot.iterfind("joint/parent")}
+    if _WORLD in parents and _WORLD not in links:  # Drake and yourdfpy do not require it
+        links = {_WORLD: ET.Element("link", name=_WORLD), **links}
     joints = tuple(_joint(element, links, where) for element in elements.values())
     root = _root(tuple(links), joints, where)
     inertials = {
@@ -211,10 +214,6 @@ def _unique(elements: list[ET.Element], kind: str, where: str) -> dict[str, ET.E
         name = element.get("name")
         if not name:
             raise ModelError(f"{where}: a <{kind}> has no name; give it one")
-        if kind == "joint" and name in _RESERVED:
-            raise ModelError(
-                f"{where}: a joint is named {name!r}, which is reserved by Pinocchio; rename it"
-            )
         if name in named:
             raise ModelError(f"{where}: two {kind}s are named {name!r}, wanted unique names")
         named[name] = element

@@ -1,4 +1,4 @@
-"""The text of a URDF: checked XML, numbers as urdfdom reads them, rounded angles.
+"""The text of a URDF: checked XML, numbers, rounded angles.
 
 All numbers of URDFs are read here, so that a text is a number in all places or in none.
 """
@@ -12,6 +12,7 @@ from decimal import Decimal
 from itertools import chain
 from pathlib import Path
 from typing import Any
+from xml.parsers import expat
 
 from robotid._files import missing_file
 from robotid.exceptions import ModelError
@@ -29,6 +30,7 @@ __all__ = [
 
 #: Largest absolute value of numbers, SI units: squares and products of them stay finite.
 LARGEST = 1e9
+_BLANKS = " \t\n\r\f\v"  # that separate numbers
 _NUMBER = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 _MOST_BYTES = 2**26  # of a file; that of a robot with a thousand links has 2**20
 _DEEPEST = 100  # nested elements; other readers of XML allow 256
@@ -69,8 +71,8 @@ def parse_urdf(path: str | Path) -> ET.Element:
             "them by their text"
         )
     try:
-        robot = ET.fromstring(content)  # as a whole: in parts a long name takes quadratic time
-    except (ET.ParseError, LookupError, ValueError) as error:  # the latter two: its encoding
+        robot = _parsed(content)
+    except (expat.ExpatError, LookupError, ValueError) as error:  # the latter two: its encoding
         raise ModelError(
             f"{path.name} is not well-formed XML: {error}; wanted a URDF file"
         ) from error
@@ -82,20 +84,31 @@ def parse_urdf(path: str | Path) -> ET.Element:
     return robot
 
 
+def _parsed(content: bytes) -> ET.Element:
+    """Return the top element; prefixes of names, as sensor:camera, need no declaration."""
+    builder, parser = ET.TreeBuilder(), expat.ParserCreate()
+    parser.buffer_text = True
+    parser.StartElementHandler = builder.start
+    parser.EndElementHandler = builder.end
+    parser.CharacterDataHandler = builder.data
+    parser.Parse(content, True)  # as a whole: in parts a long name takes quadratic time
+    return builder.close()
+
+
 def numbers(text: str, count: int, most: float = LARGEST) -> tuple[float, ...]:
-    """Return the numbers of an attribute as urdfdom reads them, none if it is not valid.
+    """Return the numbers of an attribute, none if it is not valid.
 
     Args:
-        text: The attribute: decimal numbers separated by blanks; no blank after a single one.
+        text: The attribute: decimal numbers, with blanks between and around them.
         count: Required number of them.
         most: Their largest absolute value.
     """
-    words = [word for word in text.split(" ") if word]
+    words = re.findall(f"[^{_BLANKS}]+", text)
     if len(words) != count or not all(map(_NUMBER.fullmatch, words)):
         return ()
     values = tuple(map(float, words))
     is_usable = all(math.isfinite(x) and abs(x) <= most for x in values)
-    return values if is_usable and not (count == 1 and text.endswith(" ")) else ()
+    return values if is_usable else ()
 
 
 def number_fault(element: ET.Element, key: str) -> str | None:

@@ -183,6 +183,8 @@ def _joint_findings(path: Path) -> Iterator[Finding]:
     for joint in joints:
         if joint.type in ("revolute", "prismatic"):
             yield from _no_limits(joint)
+        if joint.type in MOVABLE and joint.limit is not None:
+            yield from _zero_limits(joint)
         for key in ("damping", "friction") if joint.dynamics is not None else ():
             yield from _negative(joint, key, getattr(joint.dynamics, key))
         if joint.mimic is not None:
@@ -199,6 +201,18 @@ def _no_limits(joint: Any) -> Iterator[Finding]:  # noqa: ANN401
         + ('or type="continuous" if it has no limits' if joint.type == "revolute" else "in m")
     )
     yield Finding("no_limits", "warning", f"joint {joint.name}", message)
+
+
+def _zero_limits(joint: Any) -> Iterator[Finding]:  # noqa: ANN401
+    found = {"velocity": joint.limit.velocity, "effort": joint.limit.effort}
+    if zero := [key for key, limit in found.items() if limit == 0.0]:
+        flags = {"velocity": "--max-velocity", "effort": "--max-torque"}
+        message = (
+            f"joint {joint.name!r} has limits {' and '.join(f'{key} 0' for key in zero)}, wanted "
+            "more than 0; they count as not stated. Write those of the drive, or state them for "
+            f"robotid excite: {' '.join(f'{flags[key]} {joint.name}=X' for key in zero)}"
+        )
+        yield Finding("no_limits", "warning", f"joint {joint.name}", message)
 
 
 def _negative(joint: Any, key: str, text: str | None) -> Iterator[Finding]:  # noqa: ANN401

@@ -383,6 +383,21 @@ def test_a_format_that_motions_are_not_written_in_is_refused_before_the_design(t
     assert ".yaml or .script files, not '.txt'" in said
 
 
+def test_limits_that_the_urdf_states_as_zero_are_stated_by_flags(tmp_path):
+    text = example_urdf("ur10_robot.urdf").read_text()
+    zero = re.sub(r'effort="[^"]*"', 'effort="0"', text)
+    (tmp_path / "zero.urdf").write_text(re.sub(r'velocity="[^"]*"', 'velocity="0"', zero))
+    words = ["excite", str(tmp_path / "zero.urdf"), *WORDS[2:], "--clearance", "none"]
+    words += ["--out", str(tmp_path / "motion.csv")]
+    assert main(words) == 2
+    for joint in WRIST:
+        words += ["--max-velocity", f"{joint}=0.7", "--max-torque", f"{joint}=30"]
+    assert main(words) == 0
+    table = open_table(tmp_path / "motion.csv", LogSource())
+    speeds = table.read([f"dq_{joint}" for joint in WRIST]).values()
+    assert 0.3 < max(np.abs(speed).max() for speed in speeds) <= 0.7
+
+
 def test_every_flag_states_its_setting():
     """Each with a value that is not the default, two where the flag is repeatable."""
     words = {
@@ -391,7 +406,14 @@ def test_every_flag_states_its_setting():
         "points": "50",
     }  # fmt: skip
     line = [word for name, value in words.items() for word in (f"--{name}", value)]
-    for flag in ("--max-acceleration", "--max-jerk", "--max-power", "--noise"):
+    for flag in (
+        "--max-velocity",
+        "--max-torque",
+        "--max-acceleration",
+        "--max-jerk",
+        "--max-power",
+        "--noise",
+    ):
         line += [flag, "one=3", flag, "two=0.5"]
     line += ["--box", "post=0,1,2,3,4,5", "--box", "wall=-1,0,0,0,1,1"]
     found = stated_by_flags(*line)
@@ -399,7 +421,7 @@ def test_every_flag_states_its_setting():
     assert found == MotionSettings(
         kind="bspline", duration=4.0, harmonics=3, criterion="E", share=0.5, clearance=0.1,
         floor=-0.2, seed=7, starts=2, seconds=9.0, points=50.0,
-        acceleration=each, jerk=each, power=each, noise=each,
+        velocity=each, torque=each, acceleration=each, jerk=each, power=each, noise=each,
         boxes=(Box("post", (0, 1, 2), (3, 4, 5)), Box("wall", (-1, 0, 0), (0, 1, 1))),
     )  # fmt: skip
     load = ["--link", "wrist_3_link", "--mass", "2", "--com", "0.1,0,-0.2", "--moving", "one,two"]

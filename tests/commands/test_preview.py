@@ -194,7 +194,7 @@ def test_wrong_words_are_answered(files, capsys):
     assert "a RESULT states how its logs are read" in error
     write_columns({"time": np.arange(9.0), "q_a": np.zeros(9)}, files / "other_robot.csv")
     error = asked(capsys, files / "other_robot.csv", code=1)
-    assert 'shoulder_pan_joint = "a"  # by order' in error
+    assert '# q_shoulder_pan_joint = "NAME"' in error
     assert "tau" not in error
 
 

@@ -285,7 +285,8 @@ def test_what_is_concluded_counts_all_findings_but_the_ignored_ones(
     monkeypatch.setattr(pipeline, "explain_residual", lambda fit, sample: ((), ()))
     monkeypatch.setattr(pipeline, "with_model_error", lambda fit, *_: (fit, ("a.viscous",)))
     logs = [
-        SimpleNamespace(head=SimpleNamespace(name=name, path=name, notes=(f"note {k}",)),
+        SimpleNamespace(head=SimpleNamespace(name=name, path=name, assumed=(),
+                                             notes=(f"note {k}",)),
                         asked=SignalSettings(cutoff=3.0 + k), unit=None)
         for k, name in enumerate(("a.csv", "b.csv", "c.csv"))
     ]  # fmt: skip

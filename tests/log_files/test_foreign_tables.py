@@ -153,8 +153,9 @@ def test_what_is_wrong_with_a_data_frame_is_told():
     frame = pd.DataFrame(juggled("/joint_states"))
     with refused(
         "log has no column 'time'; columns found: position_elbow, velocity_elbow, effort_elbow, "
-        "position_shoulder, velocity_shoulder, effort_shoulder. Rename it, or state "
-        'it in the job file: columns = { time = "NAME" }'
+        "position_shoulder, velocity_shoulder, effort_shoulder. Rename it, or state in the job "
+        'file: columns = { time = "NAME" }, or without time stamps the rate of the rows [Hz]: log '
+        "= { rate = 100 }"
     ):
         order = [f"/joint_states/{j}/{w}" for j in ("elbow", "shoulder") for w in WORDS]
         read_log(frame[order], JOINTS)

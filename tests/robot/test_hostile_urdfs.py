@@ -5,6 +5,7 @@ import subprocess
 import sys
 from xml.sax.saxutils import quoteattr
 
+import numpy as np
 import pytest
 from helpers.hostile_urdfs import FILES, MESHES, HostileUrdf, run_urdf, urdf_inputs
 from hypothesis import HealthCheck, given, settings
@@ -204,3 +205,49 @@ def test_motions_that_are_no_numbers_are_refused():
     pi[12] = np.inf
     with pytest.raises(DataError, match=r"shoulder_link.mcy is inf kg m, wanted a finite number"):
         model.with_parameters(pi)
+
+
+ARM = """<robot name="arm">{first}<link name="l1"><inertial><origin xyz="0 0.4 0"/>
+<mass value="0.7"/><inertia ixx="0.01" ixy="0" ixz="0" iyy="0.004" iyz="0" izz="0.01"/></inertial>
+</link><joint name="{name}" type="{kind}"><origin xyz="{origin}"/><parent link="{parent}"/>
+<child link="l1"/><axis xyz="1 0 0"/><limit lower="-1" upper="1" velocity="3" effort="9"/></joint>
+<link name="l2"><inertial><origin xyz="0 0.4 0"/><mass value="0.7"/>
+<inertia ixx="0.01" ixy="0" ixz="0" iyy="0.004" iyz="0" izz="0.01"/></inertial></link>
+<joint name="j" type="revolute"><origin xyz="{origin}"/><parent link="l1"/><child link="l2"/>
+<axis xyz="1 0 0"/><limit lower="-1" upper="1" velocity="3" effort="9"/></joint>{last}</robot>"""
+USUAL = {
+    "first": '<link name="base"/>', "name": "i", "kind": "revolute", "origin": "0 0 0.3",
+    "parent": "base", "last": "",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "odd",
+    [
+        {"name": "root_joint"},
+        {"name": "root_joint", "kind": "fixed"},
+        {"first": "", "parent": "world"},
+        {"last": '<gazebo reference="l1"><sensor:camera name="c" sensor:rate="3"/></gazebo>'},
+        {"origin": "0 \n\t 0  0.3\n"},
+    ],
+)
+def test_what_other_readers_load_is_loaded_with_the_same_dynamics(tmp_path, odd):
+    models = []
+    for changes in (odd, {k: v for k, v in odd.items() if k == "kind"}):
+        path = tmp_path / "arm.urdf"
+        path.write_text(ARM.format(**USUAL | changes))
+        models.append(RobotModel.from_urdf(path))
+        assert not [f for f in inspect_urdf(path).findings if f.severity == "error"]
+    odd_one, plain = models
+    np.testing.assert_array_equal(odd_one.standard_parameters(), plain.standard_parameters())
+    placements = [[p.homogeneous for p in m.pin_model.jointPlacements] for m in models]
+    np.testing.assert_array_equal(*placements)
+
+
+@pytest.mark.parametrize("origin", ["0 0 0", "-0.0005 0 0"])
+def test_friction_is_identifiable_at_a_joint_beside_the_origin(tmp_path, origin):
+    path = tmp_path / "arm.urdf"
+    path.write_text(ARM.format(**USUAL | {"kind": "fixed", "origin": origin}))
+    inspection = inspect_urdf(path)
+    assert (inspection.structure.base_inertial, inspection.structure.base) == (3, 6)
+    assert not [f for f in inspection.findings if f.code == "weak_parameters"]

@@ -96,8 +96,9 @@ def test_a_moving_link_without_inertial_is_named(tmp_path):
                           '<child link="x"/></joint></robot>'))  # fmt: skip
     (finding,) = found(massless, "missing_inertial")
     assert (finding["link"], finding["severity"]) == ("lower", "warning")
-    assert "the URDF has no <inertial> with a mass: lower. Assumed: the masses of" in (
-        finding["message"]
+    assert (
+        "the URDF has no <inertial> with a mass: lower. Assumed: the masses of"
+        in (finding["message"])
     )
     # a box of 0.2 of the robot's length, 0.5 m, with the density of the other body
     volume = (0.5 + 0.1) * 0.1**2  # [m^3], of the upper one
@@ -161,6 +162,17 @@ def test_a_joint_without_a_range_is_named(tmp_path, limit, said):
     assert f"limits are {said}, wanted lower < upper" in finding["message"]
     half = inspected(tmp_path, ('lower="-1" ', ""))  # a missing bound is 0
     assert found(half, "no_limits") == []
+
+
+def test_limits_of_zero_are_named_with_what_states_them(tmp_path):
+    stated = '<limit lower="-1" upper="1" effort="9" velocity="2"/>'
+    (finding,) = found(
+        inspected(tmp_path, (stated, stated.replace('"9"', '"0"').replace('"2"', '"0.0"'))),
+        "no_limits",
+    )
+    assert (finding["joint"], finding["severity"]) == ("shoulder", "warning")
+    assert "has limits velocity 0 and effort 0, wanted more than 0" in finding["message"]
+    assert finding["message"].endswith("--max-velocity shoulder=X --max-torque shoulder=X")
 
 
 @pytest.mark.parametrize(("key", "old"), [("damping", "0.5"), ("friction", "0.25")])
