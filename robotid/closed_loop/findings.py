@@ -86,7 +86,7 @@ def _of_fit(found: LoopIdentification) -> Iterator[Finding]:
     yield from _limits_found(found)
     yield from _unequal_gains(found)
     yield from _encoder_findings(found)
-    yield from map(_friction_found, (t for t in found.fit.tried if t.is_chosen))
+    yield from map(_friction_found, (t for t in found.fit.tried if t.is_chosen or t.dropped))
 
 
 def _at_rest(found: LoopIdentification) -> Iterator[Finding]:
@@ -344,14 +344,18 @@ def _torque_mismatches(found: LoopIdentification) -> Iterator[Finding]:
 
 def _friction_found(tried: Tried) -> Finding:
     """Return the finding of friction terms that cross-validation confirmed."""
-    return Finding(
-        "friction_found",
-        "note",
-        tried.joint,
+    message = (
         f"{tried.joint}: {' and '.join(tried.terms)} lowers the squared error of held-out windows "
-        f"by {100 * tried.gain:.0f} %",
-        {"gain_pct": 100 * tried.gain},
+        f"by {100 * tried.gain:.0f} %"
     )
+    figures = {"gain_pct": 100 * tried.gain}
+    if not tried.dropped:
+        return Finding("friction_found", "note", tried.joint, message, figures)
+    message += (
+        f", but with it {tried.dropped}. The fit is without this term: another effect than friction "
+        "acts on the joint. Check the mounting of the base, the torque limit and the zeros"
+    )
+    return Finding("friction_dropped", "warning", tried.joint, message, figures)
 
 
 def _encoder_findings(found: LoopIdentification) -> Iterator[Finding]:

@@ -1,6 +1,6 @@
 """The stages of a closed-loop identification: initial values, fit, friction terms, step size."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -27,7 +27,7 @@ from robotid.closed_loop.initial_values import (
 )
 from robotid.closed_loop.second_order import SecondOrder, fit_second_order
 from robotid.closed_loop.settings import LoopSettings, groups_of
-from robotid.closed_loop.term_choice import Tried, candidates, choose
+from robotid.closed_loop.term_choice import Tried, candidates, choose, impossible
 from robotid.closed_loop.zeros import Encoders, find_encoders, same_encoders
 from robotid.doctor.command_channels import largest_speeds
 from robotid.estimators.estimator import Estimate
@@ -149,20 +149,65 @@ def fit_loops(
             theta = estimator.joint_step(simulator, theta)
         if initialised.linear is not None and simulator.torque is not None:
             estimator = replace(estimator, inflation=_BOTH * estimate.details["inflation"])
+    fitted = (simulator, theta, None if is_rough else estimate)
+    dropped: dict[str, Tried] = {}
+    while True:
+        simulator, estimate, tried = _with_chosen_terms(
+            model, logs, signals, initialised, estimator, fitted, dropped,
+            passes=_PASSES if chooses else 0, progress=progress,
+        )  # fmt: skip
+        failing = impossible(simulator, estimate.theta, tried)
+        try:
+            if initialised.linear is None and not failing:
+                simulator, estimate = refine_steps(simulator, estimator, estimate)
+        except NotConvergedError as error:
+            failing = {t: str(error) for t in tried if t.is_chosen}
+            if not failing:
+                raise
+        if not failing:
+            break
+        for t, why in failing.items():
+            dropped[f"{t.joint}.{t.terms[0]}"] = replace(t, is_chosen=False, dropped=why)
+    scale = None
+    if initialised.linear is None and simulator.error == "output":
+        if is_stated(loop.kp, model).all():
+            scale = gain_scale(simulator, estimator, estimate)
+    others = (initialised.encoders, tuple(tried), initialised.linear, scale)
+    return Fitted(simulator, estimate, initialised.plain, *others)
+
+
+def _with_chosen_terms(
+    model: RobotModel,
+    logs: Sequence[Log],
+    signals: SignalSettings | None,
+    initialised: "_Initial",
+    estimator: OutputError,
+    fitted: tuple[LoopSimulator, Array, Estimate | None],
+    dropped: Mapping[str, Tried],
+    *,
+    passes: int,
+    progress: ProgressCallback,
+) -> tuple[LoopSimulator, Estimate, list[Tried]]:
+    """Return the fit with the friction terms that held-out windows confirm, and those tried.
+
+    It starts from a simulator, its parameters, and their estimate if the fit is complete; terms
+    that were ``dropped`` are not offered again, by name of their first parameter.
+    """
+    simulator, theta, estimate = fitted
     tried: list[Tried] = []
-    for _ in range(_PASSES if chooses else 0):
+    for _ in range(passes):
         report_stage(progress, "trying friction terms", STAGES)
         offered = [
             set_
             for set_ in candidates(simulator, initialised.torque)
-            if set_[0].name not in simulator.names
+            if set_[0].name not in simulator.names and set_[0].name not in dropped
         ]
         found = choose(
             *_with(simulator, theta, offered), offered, replace(estimator, inflation=1.0)
         )
         tried = [*(t for t in tried if t.is_chosen), *found]
         chosen = [set_ for set_, t in zip(offered, found, strict=True) if t.is_chosen]
-        if not chosen and not is_rough:
+        if not chosen and estimate is not None:
             break
         report_stage(progress, "fitting loops", STAGES)
         simulator, theta = _with(simulator, theta, chosen)
@@ -170,15 +215,10 @@ def fit_loops(
             own = with_terms(model, simulator.base)
             rows = torque_rows(identified_rows(own, logs, signals), initialised.share)
             simulator = replace(simulator, torque=rows)
-        estimate, is_rough = estimator.fit(simulator, theta, exact=simulator.exact), False
+        estimate = estimator.fit(simulator, theta, exact=simulator.exact)
         theta = estimate.theta
-    scale = None
-    if initialised.linear is None:
-        simulator, estimate = refine_steps(simulator, estimator, estimate)
-        if is_stated(loop.kp, model).all() and simulator.error == "output":
-            scale = gain_scale(simulator, estimator, estimate)
-    others = (initialised.encoders, tuple(tried), initialised.linear, scale)
-    return Fitted(simulator, estimate, initialised.plain, *others)
+    assert estimate is not None  # of a rough fit, the first pass makes it
+    return simulator, estimate, [*tried, *dropped.values()]
 
 
 def _with_bodies_of_urdf(simulator: LoopSimulator, estimator: OutputError) -> Array:

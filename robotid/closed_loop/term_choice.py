@@ -17,8 +17,9 @@ from robotid.diagnosis.selection import Round, Rule
 from robotid.estimators.output_error import OutputError, linearised
 from robotid.robot.drive_term import ANYWHERE
 from robotid.robot.drives import FAMILIES, LoadFriction, PositionCoulomb
+from robotid.simulation.failures import friction_at_rest
 
-__all__ = ["Tried", "candidates", "choose"]
+__all__ = ["Tried", "candidates", "choose", "impossible"]
 
 _OFFERED = ("stribeck", "load", "position")  # candidate families
 # share: of a joint's squared residual in held-out windows, with unit noise; bench_commands.py
@@ -26,6 +27,7 @@ _RULE = Rule(most=len(_OFFERED), share=0.02, p_value=None, alike=0.0)
 _FOLDS = 6
 _FEWEST = 2  # smallest number of windows for a cross-validation
 _SLOW = 0.3  # Stribeck speed of candidates, over the typical speed of the joint
+_POSITIONS = 201  # at which the sign of the friction is checked
 _WIDE = 0.05  # smallest half-range of a position-dependent candidate [rad or m]
 
 _log = logging.getLogger(__name__)
@@ -40,12 +42,14 @@ class Tried:
         terms: Names of its terms.
         gain: Reduction of the joint's squared residual in held-out windows [-].
         is_chosen: Whether it is chosen.
+        dropped: Why it was dropped after a fit with it, else empty.
     """
 
     joint: str
     terms: tuple[str, ...]
     gain: float
     is_chosen: bool
+    dropped: str = ""
 
 
 def candidates(simulator: LoopSimulator, torque: Array) -> list[tuple[FreeParameter, ...]]:
@@ -132,6 +136,34 @@ def choose(
         )
         for s, free_parameters in enumerate(offered)
     ]
+
+
+def impossible(
+    simulator: LoopSimulator, theta: Array, tried: Sequence[Tried]
+) -> dict[Tried, str]:
+    """Return the weakest chosen term of each joint whose friction is negative, and the figures.
+
+    Negative friction at some position would drive the joint: no simulation that comes to rest there
+    has a solution. Beyond the range of the data, terms of the position are constant.
+
+    Args:
+        simulator: The fitted simulator with the terms.
+        theta: Values of its free parameters, shape (c,).
+        tried: The candidates.
+    """
+    model, loops = simulator.robot.model, simulator.loops(theta)
+    weakest = {t.joint: t for t in sorted(tried, key=lambda t: -t.gain) if t.is_chosen}
+    found = {}
+    for t in weakest.values():
+        j = model.joints.index(t.joint)
+        own = np.concatenate([w.log.q[w.counted, j] for w in simulator.windows])
+        q = np.linspace(own.min(), own.max(), _POSITIONS)
+        friction = friction_at_rest(loops, j, q)
+        if (least := float(friction.min())) < 0.0:
+            at = float(q[np.argmin(friction)])
+            unit, force = ("m", "N") if t.joint in model.layout.prismatic else ("rad", "N m")
+            found[t] = f"the friction at {at:.3g} {unit} is {least:.2g} {force}, wanted 0 or more"
+    return found
 
 
 def _by_joint(

@@ -13,7 +13,7 @@ from robotid.robot.model import RobotModel
 if TYPE_CHECKING:
     from robotid.simulation.loops import Loops
 
-__all__ = ["why_no_solution"]
+__all__ = ["friction_at_rest", "why_no_solution"]
 
 
 def why_no_solution(
@@ -46,7 +46,7 @@ def why_no_solution(
 
 def _wrong_friction(model: RobotModel, loops: "Loops", j: int, angle: float) -> str:
     """Return which friction of a joint makes its motion impossible or ambiguous; else ""."""
-    name, at_rest = model.joints[j], 0.0
+    name = model.joints[j]
     for term in loops.terms[j]:
         value, wanted = float(loops.values[loops.place(j, term)]), ""
         if term.is_nonnegative and value < 0.0:
@@ -58,8 +58,7 @@ def _wrong_friction(model: RobotModel, loops: "Loops", j: int, angle: float) -> 
                 f"the simulation of {name} has no solution: {name}.{term.name} is {value:.3g}, "
                 f"wanted {wanted}. Set other friction terms of {name} in [drives]"
             )
-        if isinstance(term, MemorylessTerm) and term.kind == DIRECTED:
-            at_rest += value * float(term.amplitude(np.array([angle]), np.zeros(1))[0])
+    at_rest = float(friction_at_rest(loops, j, np.array([angle]))[0])
     if at_rest >= 0.0:
         return ""
     unit, force = ("m", "N") if model.limits[j].type == "prismatic" else ("rad", "N m")
@@ -67,6 +66,21 @@ def _wrong_friction(model: RobotModel, loops: "Loops", j: int, angle: float) -> 
         f"the simulation of {name} has no solution: its Coulomb friction is {at_rest:.3g} {force} "
         f"at {angle:.3g} {unit}, wanted 0 or more. Set other friction terms of {name} in [drives]"
     )
+
+
+def friction_at_rest(loops: "Loops", j: int, q: Array) -> Array:
+    """Return the friction of a joint without load that opposes the start of a motion, shape (N,).
+
+    Args:
+        loops: Drives.
+        j: Index of the joint.
+        q: Its positions, shape (N,) [rad or m].
+    """
+    friction = np.zeros(len(q))
+    for term in loops.terms[j]:
+        if isinstance(term, MemorylessTerm) and term.kind == DIRECTED:
+            friction += loops.values[loops.place(j, term)] * term.amplitude(q, np.zeros(len(q)))
+    return friction
 
 
 def _slow_rate(loops: "Loops", rate: float, names: list[str], joints: Array, M: Array) -> str:
