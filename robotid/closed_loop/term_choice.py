@@ -138,9 +138,7 @@ def choose(
     ]
 
 
-def impossible(
-    simulator: LoopSimulator, theta: Array, tried: Sequence[Tried]
-) -> dict[Tried, str]:
+def impossible(simulator: LoopSimulator, theta: Array, tried: Sequence[Tried]) -> dict[Tried, str]:
     """Return the weakest chosen term of each joint whose friction is negative, and the figures.
 
     Negative friction at some position would drive the joint: no simulation that comes to rest there

@@ -57,10 +57,11 @@ def with_assumed_inertials(model: RobotModel) -> RobotModel:
     half_width = _HALF_WIDTH * model.length
     boxes = {body: _grown(points[body], half_width) for body in bodies}
     # the frames of a few bodies do not indicate their size
-    sized = bodies if len(bodies) >= _COPIES else tuple(body_points(model))
-    if sized is not bodies:
-        boxes |= {body: _grown(body_points(model)[body], 0.0) for body in sized}
-    reasons = _reasons(model, J, {body: boxes[body][1] for body in sized})
+    size_of = {body: boxes[body][1] for body in bodies}
+    if len(bodies) < _COPIES:
+        shapes = body_points(model)
+        size_of = {x: np.maximum(size_of[x], np.ptp(shapes[x], axis=0)) for x in shapes}
+    reasons = _reasons(model, J, size_of)
     if not reasons:
         return model
     if "inertial_units" in reasons.values():

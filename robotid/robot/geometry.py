@@ -60,7 +60,7 @@ def geometry_half_spaces(model: RobotModel, shape: str) -> dict[str, tuple[Array
     return {body: around(cloud) for body, cloud in points.items()}
 
 
-def body_points(model: RobotModel) -> dict[str, Array]:
+def body_points(model: RobotModel, *, with_visual: bool = False) -> dict[str, Array]:
     """Return points whose convex hull contains each body, in the frame of its moved link.
 
     They are those of a link's collision geometry, or of its visual one if it has none. Curved
@@ -69,11 +69,16 @@ def body_points(model: RobotModel) -> dict[str, Array]:
 
     Args:
         model: The robot.
+        with_visual: Whether a link's visual geometry that can be read is used beside its collision
+            geometry, which may be a small stand-in.
 
     Returns:
         Points by name of the body, shape (k, 3) [m].
     """
     clouds = _clouds(model.tree.robot, model.tree.path)
+    if with_visual:
+        visual = _visual_clouds(model.tree.robot, model.tree.path)
+        clouds = {x: [*own, *visual[x]] if x in visual else own for x, own in clouds.items()}
     found: dict[str, list[Array]] = {body: [] for body in model.layout.bodies}
     open_bodies = set()
     for place in link_places(model):
@@ -250,6 +255,14 @@ def _clouds(robot: ET.Element, urdf: str) -> dict[str, list[Array | None]]:
     """
     shapes = _by_link(read_shapes(robot, "visual")) | _by_link(read_shapes(robot, "collision"))
     return {link: [_cloud(shape, Path(urdf)) for shape in own] for link, own in shapes.items()}
+
+
+@lru_cache(maxsize=2)
+def _visual_clouds(robot: ET.Element, urdf: str) -> dict[str, list[Array]]:
+    """Return the points of each visual shape of each link that can be read, in its frame."""
+    shapes, path = _by_link(read_shapes(robot, "visual")), Path(urdf)
+    clouds = {link: [_cloud(shape, path) for shape in own] for link, own in shapes.items()}
+    return {link: [x for x in own if x is not None] for link, own in clouds.items()}
 
 
 def _by_link(shapes: Sequence[Shape]) -> dict[str, list[Shape]]:

@@ -81,9 +81,12 @@ def audit_bodies(model: RobotModel, pi: Array, points: Mapping[str, Array]) -> I
             continue
         is_note = J_i[3, 3] < _SMALL * np.abs(J[:, 3, 3]).sum()
         if body in points:
-            found = _against_geometry(body, J_i, points[body])
+            found = list(_against_geometry(body, J_i, points[body]))
+            if found:  # the collision geometry may be a stand-in
+                whole = body_points(model, with_visual=True)
+                found = list(_against_geometry(body, J_i, whole.get(body, points[body])))
         else:
-            found = _against_kinematics(body, J_i, lengths.get(body, np.inf), model.length)
+            found = list(_against_kinematics(body, J_i, lengths.get(body, np.inf), model.length))
             is_note |= body not in inner
         for finding in found:
             yield replace(finding, severity="note") if is_note else finding
