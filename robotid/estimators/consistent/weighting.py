@@ -34,7 +34,7 @@ _MOST_REPEATED = 0.5  # largest share of repeated errors in the squared residual
 _BEYOND = 4.0  # standard errors by which a body must be outside its box
 _CLEAR = 0.02  # relative increase of the mean square error at which an extent is contradicted
 _REESTIMATED = 8  # largest number of steps of the plausible weight
-_EXPECTED = 1.02  # distance from the prior over the expected one at which they end
+_EXPECTED = (0.5, 1.02)  # distances from the prior over the expected one at which they end
 _STEP = 0.5  # decades between the best weight and the refined ones
 
 
@@ -178,8 +178,9 @@ def plausible_weight(fit: Consistent, rows: Array, weight: float) -> float:
 
     The evidence expands the penalty at its centre. At the minimum with a weight w that agrees with
     the data, w times the penalty is the number of parameters that the data determine, g = d -
-    trace(w H C / 2) of d free ones. If it is more, the prior is less certain than w states: the
-    next weight is g over the penalty. The weight is reduced by half a decade at most, the distance
+    trace(w H C / 2) of d free ones. If it is more, the prior is less certain than w states; if it
+    is less than half, more certain, as far from the centre the penalty is not quadratic: the next
+    weight is g over the penalty. The weight is reduced by half a decade at most, the distance
     of the weights tried: a larger disagreement is not due to the expansion, but to errors of the
     model. The steps end before a weight at which the fit does not converge.
 
@@ -202,7 +203,8 @@ def plausible_weight(fit: Consistent, rows: Array, weight: float) -> float:
         H, C = programme.penalty.hessian(solution.x), programme.covariance(weight, rows, solution.x)
         determined = programme.space.basis.shape[1] - 0.5 * weight * float(np.sum(H * C))
         distance = weight * programme.penalty.value(solution.x)
-        if distance <= _EXPECTED * determined or weight == least:
+        low, high = np.multiply(_EXPECTED, determined)
+        if low <= distance <= high or (distance > high and weight == least):
             break
         weight = max(least, weight * determined / distance)
     return found

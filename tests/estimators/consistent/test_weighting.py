@@ -97,8 +97,9 @@ def test_the_plausible_weight_of_a_quadratic_prior_is_that_of_the_largest_eviden
     )
     best = 10.0**found.x
     assert plausible_weight(fit, rows, 2.5 * best) == pytest.approx(best, rel=0.1)
-    # a smaller weight is not increased, a larger one is reduced by half a decade
-    assert plausible_weight(fit, rows, 0.1 * best) == 0.1 * best
+    # a smaller weight is increased, a larger one is reduced by half a decade
+    assert plausible_weight(fit, rows, 0.1 * best) == pytest.approx(best, rel=0.1)
+    assert plausible_weight(fit, rows, 0.7 * best) == 0.7 * best
     assert plausible_weight(fit, rows, 20.0 * best) == pytest.approx(20.0 * best / 10.0**0.5)
 
 
