@@ -22,6 +22,9 @@ __all__ = ["SUMMARY", "add_flags", "run"]
 SUMMARY = "simulate a log of a motion with a robot of known parameters"
 
 
+_HALF = 0.5  # of the commanded range: a joint that moves less does not follow
+
+
 def _simulation() -> Settings:
     from robotid.simulation.settings import Simulation
 
@@ -135,3 +138,14 @@ def _show(content: dict[str, Any]) -> None:
         if joint["at_limit"] > 0:
             line += f"; at the effort limit for {100 * joint['at_limit']:.2g} % of the time"
         print(line)
+    for joint in content["following"]:
+        if joint["range"] < _HALF * joint["commanded"]:
+            name, unit = joint["joint"], joint["unit"]
+            echo(
+                f"warning: {name} moves {joint['range']:.2g} {unit}, wanted the "
+                f"{joint['commanded']:.2g} {unit} commanded. If its friction stops it, state it in "
+                "the file of --plant: "
+                f'[truth] values = {{ "{name}.coulomb" = 0 }}, or larger gains under [controller]',
+                "  ",
+                "warning",
+            )

@@ -17,6 +17,7 @@ from robotid.doctor.locked_joints import STILL, check_locked, percent_hint
 from robotid.exceptions import DataError, SettingsError
 from robotid.export.result import Result, load_result, stated_model, stated_parameters
 from robotid.findings import Finding, by_severity
+from robotid.judgement.findings import log_findings
 from robotid.judgement.verdict import check_ignored
 from robotid.log_files.columns import Needs
 from robotid.log_files.read import LogLayout
@@ -219,8 +220,7 @@ def examine_logs(
         name = Path(log.path).name
         findings += check_locked(model, log.locked, name, job.placed(model), job.units)
         if len(log.windows) > 1:  # the windows have no notes of their own
-            notes = log.head.notes
-            findings += [Finding("log_note", "note", name, f"{name}: {note}") for note in notes]
+            findings += log_findings([log.head])
     first, second = ([look for log in logs for look in log.looks] for logs in (fitted, validation))
     return (*findings, *diagnose(model, first, second, job.signals))
 

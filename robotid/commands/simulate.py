@@ -165,11 +165,21 @@ def _truth(
         "drive_parameters": standard[size:],
         "base_parameters": base(pi),
         "following": [
-            {"joint": joint, "rms": rms, "largest": largest, "unit": unit, "at_limit": share}
-            for joint, rms, largest, unit, share in zip(
+            {
+                "joint": joint,
+                "rms": rms,
+                "largest": largest,
+                "range": moved,
+                "commanded": commanded,
+                "unit": unit,
+                "at_limit": share,
+            }
+            for joint, rms, largest, moved, commanded, unit, share in zip(
                 model.joints,
                 np.sqrt(np.mean(error**2, axis=0)).tolist(),
                 np.abs(error).max(axis=0).tolist(),
+                np.ptp(run.q, axis=0).tolist(),
+                np.ptp(run.reference, axis=0).tolist(),
                 ["m" if joint in layout.prismatic else "rad" for joint in model.joints],
                 run.saturated.tolist(),
                 strict=True,

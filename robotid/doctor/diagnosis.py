@@ -145,7 +145,7 @@ def _examine_log(
     """Add the findings on one log; return its smooth motion and a probe of it, or None."""
     name = log.name
     findings += [log_finding(name, "log_note", "note", note) for note in log.notes]
-    findings += [log_finding(name, "column_order", "warning", text) for text in log.assumed]
+    findings += [log_finding(name, "log_assumption", "warning", text) for text in log.assumed]
     if not model.is_static:  # rows of static poses may have gaps between them
         findings += [*check_clock(log), *check_channels(log, signals)]
     prismatic = [limit.name for limit in model.limits if limit.type == "prismatic"]

@@ -195,8 +195,9 @@ def conclude(
     own = {field.name: getattr(fit, field.name) for field in fields(fit)}
     asked = Asked(recordings.fitted[0].asked, friction, tuple(ignore))
     result = Identification(**own, misfits=misfits, on_misfit=on_misfit, asked=asked)
-    # the fit reports the excitation over all samples, see finding "undetermined"
-    before = [f for f in found if f.severity != "note" and f.code != "excitation"]
+    # the fit reports the excitation over all samples, see finding "undetermined"; logs follow below
+    repeated = ("excitation", "log_assumption")
+    before = [f for f in found if f.severity != "note" and f.code not in repeated]
     of_fit = fit_findings(fit, misfits, on_misfit, discrepancies)
     loads = {f.where.rpartition(": ")[0] or f.where for f in found if f.code == "payload_change"}
     of_fit += [*unlike_findings(fit.variation), *rescaled_findings(fit, loads)]

@@ -312,7 +312,7 @@ def log_findings(logs: Sequence[Log]) -> list[Finding]:
         for note in log.notes:
             logs_of.setdefault(("log_note", "note", note), []).append(Path(log.path).name)
         for text in log.assumed:
-            logs_of.setdefault(("column_order", "warning", text), []).append(Path(log.path).name)
+            logs_of.setdefault(("log_assumption", "warning", text), []).append(Path(log.path).name)
     return [
         Finding(code, severity, ", ".join(names), f"{', '.join(names)}: {text}")
         for (code, severity, text), names in logs_of.items()

@@ -40,7 +40,7 @@ from robotid.logs.data import (
 )
 from robotid.logs.settings import PER_SECOND, LogSource, LogUnits
 from robotid.logs.transmission import Transmission, check_transmissions
-from robotid.logs.units import check_units
+from robotid.logs.units import check_units, turned
 from robotid.robot.tree import Joint
 
 __all__ = ["LogLayout", "Readable", "lay_out", "read_log", "read_logs", "write_log"]
@@ -105,7 +105,7 @@ def read_log(
         robot=robot,
     )  # fmt: skip
     log = layout.to_log(table.read(layout.wanted))
-    check_units(log, units, prismatic)
+    check_units(log, units, prismatic, layout.turning)
     return log if start is None and end is None else log.window(start, end)
 
 
@@ -206,6 +206,7 @@ class LogLayout:
     base: BaseColumns = _BASE  # of a floating base and of contacts
     positions: Mapping[str, str] = field(default_factory=dict)  # likewise, of all joints in it
     assumed: tuple[str, ...] = ()  # of the columns, for the user
+    turning: tuple[str, ...] = ()  # names of revolute joints whose rotation has no limits
 
     @property
     def wanted(self) -> list[str]:
@@ -260,12 +261,14 @@ class LogLayout:
             array.flags.writeable = False  # so that the log does not copy it
         require_increasing(t, where, first)
         notes = (*self.notes, note) if note else self.notes
+        unstated = self.turning if self.units.angle is None else ()
+        assumed = (*self.assumed, *turned(self.joints, values["q"], unstated))
         has_torque = "tau" in values
         if not has_torque:
             values["tau"] = np.zeros_like(values["q"])
         arrays = {name: values[kind] for kind, name in COLUMNS.items() if kind in values}
         return Log(
-            t=t, joints=self.joints, path=self.path, notes=notes, assumed=self.assumed,
+            t=t, joints=self.joints, path=self.path, notes=notes, assumed=assumed,
             has_torque=has_torque,
             base=base, contacts=contacts, wrenches=wrenches, **arrays,
         )  # fmt: skip
@@ -404,6 +407,7 @@ def lay_out(
         base=base,
         positions=finder.reading.positions,
         assumed=finder.reading.assumed,
+        turning=tuple(joint.name for joint in robot if joint.turns_freely),
     )
     return layout, with_even_stamps(opened, found["time"][0], source.stamp)
 

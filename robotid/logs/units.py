@@ -1,22 +1,24 @@
 """Units of a log: stated by the user, or checked; never guessed."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from robotid._typing import Array
 from robotid.exceptions import DataError
+from robotid.findings import listed
 from robotid.logs.data import Log
 from robotid.logs.settings import PER_SECOND, LogUnits
 
-__all__ = ["check_reach", "check_units"]
+__all__ = ["check_reach", "check_units", "turned"]
 
 _TIME_NAMES = {"ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}
 _DEGREES = 180 / np.pi  # degrees in a radian
 _EPOCHS = 6e8, 5e9  # [s] since 1970: dates from 1989 to 2128
 _SLOWEST = 0.1  # [s] a longer median step has another unit
 _FARTHEST = 4 * np.pi  # [rad] a joint beyond two revolutions is in degrees
+_FREE = 10 * np.pi  # [rad] ... one without limits beyond five: pendulums were recorded over 4.5
 _USUAL = 2 * np.pi  # [rad] ... and one within a revolution is in radians if others are farther
 _SEGMENT = 0.1  # [s] over which the motion is averaged against noise and jitter
 _GAP = 5  # [median steps] a longer step is a gap
@@ -24,7 +26,9 @@ _ALIKE = 0.9  # correlation from which two signals are proportional
 _NEAR = 0.1  # relative tolerance of the factor between them
 
 
-def check_units(log: Log, units: LogUnits, prismatic: Collection[str] = ()) -> None:
+def check_units(
+    log: Log, units: LogUnits, prismatic: Collection[str] = (), turning: Collection[str] = ()
+) -> None:
     """Reject a log whose numbers look like another unit than SI, unless the unit is stated.
 
     The measured velocity is compared with the position over short segments: the factor between
@@ -34,6 +38,7 @@ def check_units(log: Log, units: LogUnits, prismatic: Collection[str] = ()) -> N
         log: The log.
         units: The stated units; a stated unit is not checked.
         prismatic: Names of the prismatic joints; the others are revolute.
+        turning: Names of the revolute joints whose rotation has no limits.
 
     Raises:
         DataError: If the unit of time or angle, or the sign of the velocity, is implausible.
@@ -44,7 +49,7 @@ def check_units(log: Log, units: LogUnits, prismatic: Collection[str] = ()) -> N
         _check_step(float(np.median(np.diff(log.t))), float(log.t[0]), log.name)
         _check_clock(log, factor)
     if units.angle is None:
-        check_reach(log, units, prismatic)
+        check_reach(log, units, prismatic, turning)
         _check_degrees(log, np.where(is_revolute, factor, np.nan))
         _check_commands(log, is_revolute)
     for j in np.flatnonzero(_is_near(factor, -1.0)):
@@ -83,13 +88,16 @@ def _check_clock(log: Log, factor: Array) -> None:
             )
 
 
-def check_reach(log: Log, units: LogUnits, prismatic: Collection[str] = ()) -> None:
+def check_reach(
+    log: Log, units: LogUnits, prismatic: Collection[str] = (), turning: Collection[str] = ()
+) -> None:
     """Reject revolute joints with angles too large for radians, unless the unit is stated.
 
     Args:
         log: The log, or rows of it.
         units: The stated units.
         prismatic: Names of the prismatic joints.
+        turning: Names of the revolute joints whose rotation has no limits.
 
     Raises:
         DataError: If an angle is too large.
@@ -101,8 +109,9 @@ def check_reach(log: Log, units: LogUnits, prismatic: Collection[str] = ()) -> N
         if values is None:
             continue
         largest = np.where(is_revolute, np.abs(values).max(axis=0), 0.0)  # (n,)
-        j = int(np.argmax(largest))
-        if largest[j] > _FARTHEST:
+        most = np.array([_FREE if name in turning else _FARTHEST for name in log.joints])
+        j = int(np.argmax(largest / most))
+        if largest[j] > most[j]:
             how = _how_to_state("angle", "deg", "rad")
             if alone := _alone(log, kind, j, np.delete(largest, j)[np.delete(is_revolute, j)]):
                 how = f"{alone}. If all joints are in degrees, {how[0].lower()}{how[1:]}"
@@ -111,6 +120,24 @@ def check_reach(log: Log, units: LogUnits, prismatic: Collection[str] = ()) -> N
                 f"degrees (in radians {largest[j] / (2 * np.pi):.1f} revolutions). {how}",
                 code="angle_unit",
             )
+
+
+def turned(joints: Sequence[str], q: Array, turning: Collection[str]) -> tuple[str, ...]:
+    """Return what is assumed of joints without limits beyond the angles that others may reach.
+
+    Args:
+        joints: Names of the joints.
+        q: Their positions, read as radians, shape (N, n).
+        turning: Names of the revolute joints whose rotation has no limits.
+    """
+    far = [name for name, x in zip(joints, q.T, strict=True)
+           if name in turning and np.abs(x).max() > _FARTHEST]  # fmt: skip
+    if not far:
+        return ()
+    return (
+        f"more than two revolutions of {listed(far)} are read in radians, since the URDF states no "
+        'range; if the log is in degrees, state units angle = "deg" (--angle-unit deg)',
+    )
 
 
 def _alone(log: Log, kind: str, j: int, others: Array) -> str:

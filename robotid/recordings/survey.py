@@ -243,7 +243,8 @@ class SurveyedLog:
             return log
         looks = ", ".join(f"{first}-{stop}" for first, stop in _close_looks(self.first, self.stop))
         note = f"the log is too long for the memory; the doctor checked rows {looks} only"
-        return replace(log, notes=(*log.notes, note))
+        assumed = dict.fromkeys(text for window in self.windows for text in window.assumed)
+        return replace(log, notes=(*log.notes, note), assumed=tuple(assumed))
 
     @property
     def looks(self) -> tuple[Log, ...]:
@@ -252,7 +253,7 @@ class SurveyedLog:
             return self.windows
         ranges = _close_looks(self.first, self.stop)
         return tuple(
-            replace(log, path=f"{log.path} rows {first}-{stop}", notes=())
+            replace(log, path=f"{log.path} rows {first}-{stop}", notes=(), assumed=())
             for log, (first, stop) in zip(self.windows, ranges, strict=True)
         )
 
@@ -449,7 +450,7 @@ def survey_log(
     if length is None:
         columns = table.read(wanted)
         log = layout.to_log(columns)
-        check_units(log, layout.units, layout.prismatic)
+        check_units(log, layout.units, layout.prismatic, layout.turning)
         used = log if window == (None, None) else log.window(*window)
         inside = slice(*np.searchsorted(log.t, [used.t[0], np.nextafter(used.t[-1], np.inf)]))
         positions = _positions(locked, [columns], layout, model, inside)
@@ -462,7 +463,7 @@ def survey_log(
     windows = tuple(_log_of(layout, x, i) for x, (i, _) in zip(found, ranges, strict=True))
     layout, windows = _with_one_bias(layout, windows)
     for log in windows:
-        check_units(log, layout.units, layout.prismatic)
+        check_units(log, layout.units, layout.prismatic, layout.turning)
     positions = _positions(locked, found, layout, model)
     if table.rows is None:
         length = max(stop - first, 1)
@@ -497,7 +498,7 @@ def _with_one_bias(
 def _log_of(layout: LogLayout, columns: Mapping[str, Array], first: int) -> Log:
     """Return rows of a file as a log in SI units, angles not unwrapped."""
     log = layout.to_log(columns, first)
-    check_reach(log, layout.units, layout.prismatic)
+    check_reach(log, layout.units, layout.prismatic, layout.turning)
     return log
 
 

@@ -181,38 +181,33 @@ def _joint_findings(path: Path) -> Iterator[Finding]:
         return
     names = {joint.name for joint in joints if joint.type in MOVABLE}
     for joint in joints:
-        if joint.type in ("revolute", "prismatic"):
-            yield from _no_limits(joint)
-        if joint.type in MOVABLE and joint.limit is not None:
-            yield from _zero_limits(joint)
+        if faults := [*_no_range(joint), *_zero_limits(joint)]:
+            yield Finding("no_limits", "warning", f"joint {joint.name}", ". ".join(faults))
         for key in ("damping", "friction") if joint.dynamics is not None else ():
             yield from _negative(joint, key, getattr(joint.dynamics, key))
         if joint.mimic is not None:
             yield _mimic(joint, names)
 
 
-def _no_limits(joint: Any) -> Iterator[Finding]:  # noqa: ANN401
+def _no_range(joint: Any) -> Iterator[str]:  # noqa: ANN401
     lower, upper = (getattr(joint.limit, key, None) for key in ("lower", "upper"))
-    if (lower or 0.0) < (upper or 0.0):
-        return
-    message = (
-        f"joint {joint.name!r} is {joint.type}, but its limits are lower {lower}, upper "
-        f'{upper}, wanted lower < upper; write <limit lower="..." upper="..."/>, '
-        + ('or type="continuous" if it has no limits' if joint.type == "revolute" else "in m")
-    )
-    yield Finding("no_limits", "warning", f"joint {joint.name}", message)
+    if joint.type in ("revolute", "prismatic") and (lower or 0.0) >= (upper or 0.0):
+        yield (
+            f"joint {joint.name!r} is {joint.type}, but its limits are lower {lower}, upper "
+            f'{upper}, wanted lower < upper; write <limit lower="..." upper="..."/>, '
+            + ('or type="continuous" if it has no limits' if joint.type == "revolute" else "in m")
+        )
 
 
-def _zero_limits(joint: Any) -> Iterator[Finding]:  # noqa: ANN401
-    found = {"velocity": joint.limit.velocity, "effort": joint.limit.effort}
-    if zero := [key for key, limit in found.items() if limit == 0.0]:
-        flags = {"velocity": "--max-velocity", "effort": "--max-torque"}
-        message = (
+def _zero_limits(joint: Any) -> Iterator[str]:  # noqa: ANN401
+    flags = {"velocity": "--max-velocity", "effort": "--max-torque"}
+    zero = [key for key in flags if getattr(joint.limit, key, None) == 0.0]
+    if joint.type in MOVABLE and zero:
+        yield (
             f"joint {joint.name!r} has limits {' and '.join(f'{key} 0' for key in zero)}, wanted "
             "more than 0; they count as not stated. Write those of the drive, or state them for "
             f"robotid excite: {' '.join(f'{flags[key]} {joint.name}=X' for key in zero)}"
         )
-        yield Finding("no_limits", "warning", f"joint {joint.name}", message)
 
 
 def _negative(joint: Any, key: str, text: str | None) -> Iterator[Finding]:  # noqa: ANN401

@@ -188,7 +188,7 @@ def test_notes_of_a_long_log_are_told_once_and_its_looks_are_all_examined(hand, 
     def log(name, *looks):
         return SimpleNamespace(
             path=f"runs/{name}", locked=f"held of {name}", windows=looks, looks=list(looks),
-            head=SimpleNamespace(notes=[f"a note of {name}"]),
+            head=SimpleNamespace(notes=[f"a note of {name}"], assumed=(), path=name),
         )  # fmt: skip
 
     long, short, kept = log("a.csv", "a1", "a2"), log("b.csv", "b1"), log("c.csv", "c1", "c2")

@@ -77,8 +77,10 @@ def test_simulate(shown):
         "robot": "arm", "samples": 801, "duration": 4.5, "joints": ["one", "slide"],
         "settings": {"seed": 7, "sensors": {"noise": {"q": 1e-5}}},
         "following": [
-            {"joint": "one", "rms": 0.01234, "largest": 0.0456, "unit": "rad", "at_limit": 0.123},
-            {"joint": "slide", "rms": 2e-4, "largest": 3e-3, "unit": "m", "at_limit": 0.0},
+            {"joint": "one", "rms": 0.01234, "largest": 0.0456, "range": 0.9, "commanded": 1.0,
+             "unit": "rad", "at_limit": 0.123},
+            {"joint": "slide", "rms": 2e-4, "largest": 3e-3, "range": 0.1, "commanded": 0.1,
+             "unit": "m", "at_limit": 0.0},
         ],
     }  # fmt: skip
     assert shown(simulate._show, content) == [

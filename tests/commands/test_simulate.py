@@ -309,3 +309,19 @@ def test_a_flag_replaces_one_value_of_a_table_of_the_plants_file(tmp_path):
     assert (found.sensors.jitter, found.sensors.noise.q, found.sensors.noise.tau) == (
         1e-4, 2e-5, 0.02
     )  # fmt: skip
+
+
+def test_a_joint_that_does_not_follow_its_command_is_named(arm, tmp_path, capsys):
+    t = np.arange(300) / 100
+    columns = {f"q_{j}": 0.2 * np.sin(3 * t) for j in arm.joints}
+    write_columns({"time": t, **columns}, tmp_path / "motion.csv")
+    stuck = f'[controller]\nkind = "pd"\n[truth.values]\n"{arm.joints[1]}.coulomb" = 1e4\n'
+    for text, count in (("", 0), (stuck, 1)):
+        (tmp_path / "plant.toml").write_text(text)
+        words = [str(arm.tree.path), str(tmp_path / "motion.csv"), "--out", str(tmp_path / "l.csv")]
+        assert main(["simulate", *words, "--plant", str(tmp_path / "plant.toml")]) == 0
+        assert capsys.readouterr().out.count(f"warning: {arm.joints[1]} moves ") == count
+    truth = json.loads((tmp_path / "l.truth.json").read_text())
+    entry = truth["following"][1]
+    assert entry["range"] < 0.01
+    assert entry["commanded"] == pytest.approx(0.4, rel=1e-3)

@@ -12,12 +12,13 @@ from helpers.synthetic import exact_log, truth
 
 import robotid
 from robotid.commands.convert import convert
+from robotid.commands.job import read_job
 from robotid.exceptions import DataError, ModelError
 from robotid.log_files.formats import open_table
 from robotid.log_files.read import read_log, read_logs, write_log
 from robotid.log_files.table import Place
 from robotid.logs.data import Log
-from robotid.logs.settings import LogSource
+from robotid.logs.settings import LogSource, LogUnits
 from robotid.robot.examples import example_urdf
 
 JOINTS = ("shoulder", "elbow")
@@ -250,3 +251,65 @@ def test_a_log_is_taken_by_the_names_of_its_joints(ur5, rng):
         "locked={'wrist_1_joint': 0.0})"
     ):
         read_logs(log.select(["elbow_joint"]), ["elbow_joint", "wrist_1_joint"])
+
+
+NANOSECONDS = 1_700_000_000_000_000_000 + (T * 1e9).round().astype(int)
+
+
+def test_rostopics_export_names_the_joints_in_its_rows(tmp_path):
+    """rostopic echo -p: the time of arrival, the stamp, and texts beside the numbers."""
+    columns = {"%time": NANOSECONDS + 7_000_000, "field.header.seq": range(60)}
+    columns |= {"field.header.stamp": NANOSECONDS, "field.header.frame_id": ["base"] * 60}
+    columns |= {f"field.name{k}": [name] * 60 for k, name in enumerate(JOINTS)}
+    for word, values in WORDS.items():
+        columns |= {f"field.{word}{k}": values[:, k] for k in range(2)}
+    pd.DataFrame(columns).to_csv(tmp_path / "run.csv", index=False)
+    back = read_log(tmp_path / "run.csv", JOINTS[::-1], units=LogUnits(time="ns"))
+    np.testing.assert_allclose(back.t, 1.7e9 + T, rtol=0, atol=5e-7)
+    np.testing.assert_array_equal(back.q, LOG.q[:, ::-1])
+    np.testing.assert_array_equal(back.tau, LOG.tau[:, ::-1])
+    assert "columns ignored: %time" in back.notes[0]
+
+
+@pytest.mark.parametrize(("sec", "nanosec"), [("sec", "nanosec"), ("stamp.secs", "stamp.nsecs")])
+def test_seconds_and_nanoseconds_are_one_stamp(given, sec, nanosec):
+    columns = {nanosec: NANOSECONDS % 10**9, sec: NANOSECONDS // 10**9}
+    columns |= {f"{joint}_pos": LOG.q[:, k] for k, joint in enumerate(JOINTS)}
+    columns |= {f"{joint}_eff": LOG.tau[:, k] for k, joint in enumerate(JOINTS)}
+    back = read_log(given(columns), JOINTS)
+    np.testing.assert_allclose(back.t, 1.7e9 + T, rtol=0, atol=5e-7)
+    np.testing.assert_array_equal(back.tau, LOG.tau)
+    assert back.notes == ()
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".dat", ".txt"])
+def test_a_job_states_names_and_rate_of_a_file_without_them(ur5, tmp_path, rng, suffix):
+    log = exact_log(ur5, truth(ur5), rng, samples=300, rate=50.0)
+    table = np.hstack([log.q, log.tau])
+    separator = "," if suffix == ".csv" else " "
+    np.savetxt(tmp_path / f"run{suffix}", table, fmt="%.17g", delimiter=separator)
+    names = [f"{kind}_{joint}" for kind in ("q", "tau") for joint in log.joints]
+    job = f'urdf = "{ur5.tree.path}"\n[log]\nnames = {names}\nrate = 50\n'
+    (tmp_path / "job.toml").write_text(f'{job}[[identification]]\nlog = "run{suffix}"\n')
+    job = read_job(tmp_path / "job.toml")
+    back = job.read(job.identification[0], ur5)
+    np.testing.assert_array_equal(back.tau, log.tau)
+    np.testing.assert_allclose(back.t, np.arange(300) / 50, rtol=0, atol=1e-12)
+    rows = open_table(tmp_path / f"run{suffix}", job.source).rows
+    (stamps,) = [values for values, _ in rows.scan("time")]
+    part = rows.read(["time", "tau_elbow_joint"], 100, 120, Place())
+    np.testing.assert_array_equal(stamps, back.t)
+    np.testing.assert_array_equal(part["time"], back.t[100:120])
+    np.testing.assert_array_equal(part["tau_elbow_joint"], log.tau[100:120, 2])
+
+
+def test_names_that_do_not_fit_and_a_rate_that_is_not_needed_are_told(tmp_path):
+    np.savez(tmp_path / "run.npz", data=np.hstack([LOG.q, LOG.tau]))
+    names = ("q_shoulder", "q_elbow", "tau_shoulder", "tau_elbow")
+    back = read_log(tmp_path / "run.npz", JOINTS, source=LogSource(names=names, rate=50.0))
+    np.testing.assert_array_equal(back.tau, LOG.tau)
+    with refused("run.npz has 4 columns, but log.names states 3; name each column, in their order"):
+        read_log(tmp_path / "run.npz", JOINTS, source=LogSource(names=names[:3], rate=50.0))
+    timed = read_log(pd.DataFrame(juggled("/arm")), JOINTS, source=LogSource(rate=7.0))
+    np.testing.assert_array_equal(timed.t, LOG.t)
+    assert timed.notes == ("log.rate is not used: the log has time stamps",)

@@ -10,6 +10,8 @@ import pytest
 from robotid.exceptions import DataError, SettingsError
 from robotid.log_files.read import read_log
 from robotid.logs.settings import LogSource
+from robotid.robot.examples import example_urdf
+from robotid.robot.model import RobotModel
 
 UR = ("pan", "lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
 T = np.arange(5) / 100.0
@@ -156,3 +158,17 @@ def test_two_joints_with_one_name_in_the_log_are_refused(stated):
         read_log(table(*of("q", "ab1")), ("a", "b"), source=LogSource(joints=stated))
     with pytest.raises(SettingsError, match="joints has a more than once; name each joint once"):
         read_log(table(*of("q", "ab1")), ("a", "b", "a"))
+
+
+def test_a_joint_that_mimics_another_needs_no_column_and_no_lock(tmp_path):
+    model = RobotModel.from_urdf(example_urdf("panda.urdf"))
+    leaders = [joint.name for joint in model.tree.movable if joint.mimic is None]
+    names = [*of("q", leaders), *of("tau", leaders)]
+    found = said(names, model.joints, robot=model.tree.movable)
+    assert found.endswith(
+        "panda_finger_joint2 mimics panda_finger_joint1: a joint that moves with its leader needs "
+        'no column; state mimic = "coupled" in the job file'
+    )
+    coupled = RobotModel.from_urdf(example_urdf("panda.urdf"), mimic="coupled")
+    log = read_log(table(*names), coupled.joints, robot=coupled.tree.movable)
+    assert log.joints == coupled.joints

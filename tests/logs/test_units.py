@@ -3,8 +3,10 @@
 import re
 
 import numpy as np
+import pandas as pd
 import pytest
 
+import robotid
 from robotid.exceptions import DataError
 from robotid.log_files.formats import write_columns
 from robotid.log_files.read import read_log
@@ -64,6 +66,44 @@ def test_more_than_two_turns_look_like_degrees(turns, is_refused):
         ):
             check_units(log(q=-q[:, ::-1], v=None), LogUnits())  # of either sign
     check_units(far, LogUnits(), prismatic=["a"])
+
+
+PENDULUM = """<robot name="pendulum"><link name="base"/><link name="rod"><inertial>
+<origin xyz="0 0 -0.4"/><mass value="0.7"/><inertia ixx="0.01" ixy="0" ixz="0" iyy="0.01" iyz="0"
+izz="0.001"/></inertial></link><joint name="pivot" type="{kind}"><parent link="base"/>
+<child link="rod"/><axis xyz="0 1 0"/>{limit}</joint></robot>"""
+
+
+@pytest.mark.parametrize(
+    ("kind", "limit", "turns", "is_read"),
+    [
+        ("continuous", "", 4.5, True),
+        ("revolute", '<limit lower="0" upper="0" velocity="0" effort="0"/>', 2.5, True),
+        ("continuous", "", 5.2, False),
+        ("revolute", '<limit lower="-3" upper="3" velocity="9" effort="9"/>', 2.5, False),
+    ],
+)
+def test_a_pendulum_that_turns_several_times_is_read_in_radians(
+    tmp_path, kind, limit, turns, is_read
+):
+    path = tmp_path / "pendulum.urdf"
+    path.write_text(PENDULUM.format(kind=kind, limit=limit))
+    t = np.arange(2000) / 200
+    q = 2 * np.pi * turns * np.sin(0.35 * t) ** 2 * np.cos(0.2 * t)
+    q *= 2 * np.pi * turns / np.abs(q).max()
+    v = np.gradient(q, t)
+    tau = 0.122 * np.gradient(v, t) + 0.7 * 9.81 * 0.4 * np.sin(q) + 0.1 * v + 0.2 * np.sign(v)
+    frame = pd.DataFrame({"time": t, "q_pivot": q, "tau_pivot": tau})
+    if not is_read:
+        with pytest.raises(DataError, match=r"q_pivot reaches .* looks like degrees"):
+            robotid.identify(path, frame)
+        return
+    found = robotid.identify(path, frame)
+    (assumed,) = [f for f in found.findings if f.code == "log_assumption"]
+    assert assumed.severity == "warning"
+    assert "more than two revolutions of pivot are read in radians" in assumed.message
+    estimated = dict(zip(found.mapping.names, found.standard, strict=True))
+    assert estimated["pivot.viscous"] == pytest.approx(0.1, abs=0.005)
 
 
 def three(scale, **scales):
