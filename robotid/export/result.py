@@ -21,7 +21,16 @@ from robotid.export.commanded import (
 )
 from robotid.export.entries import SCHEMA_VERSION
 from robotid.export.former_keys import from_former_keys
-from robotid.export.shape import FILE, FLAG, MAYBE, NUMBER, TABLE, TEXT, check_shape
+from robotid.export.shape import (
+    FILE,
+    FLAG,
+    MAYBE,
+    NUMBER,
+    TABLE,
+    TEXT,
+    check_shape,
+    require_lengths,
+)
 from robotid.export.urdf import load_identified, terms_from_facts
 from robotid.findings import listed
 from robotid.fitting.bands import FrictionCurve
@@ -37,7 +46,8 @@ from robotid.regressor.friction_projection import (
 )
 from robotid.regressor.prediction import predict_instants
 from robotid.robot.model import RobotModel
-from robotid.variation.variation import between_covariance
+from robotid.variation.groups import RunSums
+from robotid.variation.variation import SCORES, between_covariance
 
 if TYPE_CHECKING:
     from robotid.closed_loop.evaluation import OpenLoop
@@ -61,6 +71,37 @@ _PARAMETER = {"name": TEXT, "value": NUMBER, "unit": TEXT}
 _RECORDING = {
     **dict.fromkeys(("start", "end", "rows_used"), NUMBER),
     "signals": TABLE,
+}
+_ROUNDING = 1e-9  # [-] of eigenvalues that may be 0
+_EFFECT = {
+    **dict.fromkeys(("slope", "std_error", "mean"), NUMBER),
+    "unit": TEXT,
+    "is_used": FLAG,
+    "by_log": [NUMBER],
+    "next_interval_at?": {"at": [NUMBER], "low": [NUMBER], "high": [NUMBER]},
+}
+_VARIATION = {
+    "logs": [TEXT],
+    "parameters": {
+        ...: {
+            **dict.fromkeys(("mean", "std_error", "spread", "spread_within_units?"), NUMBER),
+            "next_interval": [NUMBER] * 2,
+            "seen_interval?": [NUMBER] * 2,
+            "next_quantiles": [NUMBER] * len(SCORES),
+            "effects?": {...: _EFFECT},
+        }
+    },
+    "correlation": [[NUMBER]],
+    "sums?": {
+        "H": [[NUMBER]],
+        "h": [[NUMBER]],
+        "scatter": [[NUMBER] * 2],
+        "sigma": [NUMBER],
+        "shift?": [NUMBER],
+        "unit": [TEXT],
+        "covariates": {...: [{"name": TEXT, "unit": TEXT, "by_log": [NUMBER]}]},
+    },
+    "added?": [{"path": TEXT, "sha256": (str, type(None))}],
 }
 #: The entries of a result.json that are read.
 _SHAPE = {
@@ -105,6 +146,7 @@ _SHAPE = {
     "ranges?": {"robot": TEXT, "drives": {...: TABLE}},
     "simulation?": {"controller": {"kind": TEXT, "rate?": MAYBE}},
     "own_terms?": {...: [TABLE]},
+    "variation?": _VARIATION,
     "covariance?": {"names": [TEXT], "root": [[NUMBER]]},
     "friction?": {...: {"data_range?": {...: [NUMBER]}}},
     "drive_moments?": {...: {"terms": [TEXT], "products": [[NUMBER]], "torque": NUMBER}},
@@ -389,7 +431,45 @@ def read_result(path: str | Path) -> dict[str, Any]:
             f"{name} has {len(validation)} validation recordings among its inputs, but errors of "
             f"{len(result['validation'])}: the file is incomplete. Identify again"
         )
+    if "variation" in result:
+        _check_variation(result, f"{name}.variation")
     return _with_moved_inputs(result, Path(path))
+
+
+def _check_variation(result: Mapping[str, Any], at: str) -> None:
+    """Refuse a variation whose lists do not fit its logs and parameters, or the result's."""
+    stated = result["variation"]
+    k, m = len(stated["logs"]), len(stated["parameters"])
+    require_lengths(stated["correlation"], [m, m], f"{at}.correlation")
+    known = [entry["name"] for entry in result["drive_parameters"]]
+    for name, entry in stated["parameters"].items():
+        own = f"{at}.parameters.{name[:80]}"
+        if name not in known:
+            raise DataError(f"{own} is not among the drive parameters of the result")
+        is_rising = [(np.diff(entry[x]) > 0).all() for x in ("next_interval", "next_quantiles")]
+        if not all(is_rising) or min(entry["std_error"], entry["spread"]) < 0:
+            raise DataError(f"{own} has a negative standard error, or an interval without width")
+        for effect in entry.get("effects", {}).values():
+            require_lengths(effect["by_log"], [k], f"{own}.effects")
+            table = effect.get("next_interval_at", {} if effect["is_used"] else None)
+            for key in ("at", "low", "high") if table is not None else ():
+                size = max(len(table.get("at", ())), 2)
+                require_lengths(table.get(key, ()), [size], f"{own}.effects")
+    _check_definite([stated["correlation"]], f"{at}.correlation")
+    if sums := stated.get("sums"):
+        size = len(sums["h"][0]) if sums["h"] else 0
+        for key, shape in (("h", [k, size]), ("H", [k, size * (size + 1) // 2]), ("unit", [k])):
+            require_lengths(sums[key], shape, f"{at}.sums.{key}")
+        _check_definite(RunSums.from_dict(sums).H, f"{at}.sums.H", least=-_ROUNDING)
+        for covariate in (x for some in sums["covariates"].values() for x in some):
+            require_lengths(covariate["by_log"], [k], f"{at}.sums.covariates")
+
+
+def _check_definite(matrices: ArrayLike, at: str, least: float = 0.0) -> None:
+    """Refuse symmetric matrices with an eigenvalue below a multiple of the largest one."""
+    of_each = np.linalg.eigvalsh(np.array(matrices, dtype=float))
+    if of_each.size and (of_each[:, 0] <= least * of_each[:, -1]).any():
+        raise DataError(f"{at} is not a positive definite matrix")
 
 
 def stated_scale_check(result: Mapping[str, Any]) -> ScaleCheck | None:

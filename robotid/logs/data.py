@@ -41,7 +41,7 @@ _BY_SAMPLE = (
     "t", "q", "v", "a", "tau", "segment", "direction", "memory", "contacts",
     "wrenches", "switching", "basis", "loaded",
 )  # fmt: skip
-_LARGEST = 1e30  # in any unit, so that squares and products are finite
+_LARGEST = 1e20  # in any unit; time in ns is 2e18; products of ten of them are finite
 
 
 @dataclass(frozen=True, eq=False)
@@ -434,7 +434,7 @@ def _frozen(values: ArrayLike, dtype: type = np.float64) -> Array:
 def require_finite(
     values: Array, t: Array, names: Sequence[str], where: str, first: int = 0
 ) -> None:
-    """Reject NaN, infinite values and values beyond 1e30; the error names the first.
+    """Reject NaN, infinite values and values beyond 1e20; the error names the first.
 
     Args:
         values: Shape (N, k).
