@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from robotid._arguments import checked
 from robotid._files import check_path, moved_file, read_json
 from robotid._settings import Range, require_kind
 from robotid._typing import Array
@@ -226,8 +227,9 @@ class Result:
     @property
     def rate(self) -> float | None:
         """Sampling rate of the controller of those drives [Hz]; None for continuous time."""
-        stated: float | None = self.content["simulation"]["controller"].get("rate")
-        return stated
+        stated = self.content.get("simulation", {"controller": {}})["controller"]
+        rate: float | None = stated.get("rate")
+        return rate
 
     def follow_commands(self, log: Log) -> Array:
         """Return the positions of the robot simulated on the commands of a log.
@@ -249,6 +251,7 @@ class Result:
             raise DataError(f"{log.name} has no commands, columns qref_ of each joint")
         return self._signs * self.open_loop(log, horizons=()).q
 
+    @checked()
     def open_loop(self, log: Log, *, horizons: Sequence[float] | None = None) -> "OpenLoop":
         """Return a log with the positions simulated for it, in the URDF's sense of the joints.
 
@@ -259,6 +262,7 @@ class Result:
             horizons: Horizons of errors [s]; those of result.json if None.
 
         Raises:
+            DataError: If the result is from torques.
             MissingDependencyError: If Numba is not installed.
             NotConvergedError: If a step has no solution.
             SettingsError: If a term of the drives cannot be simulated.
@@ -266,6 +270,11 @@ class Result:
         from robotid.closed_loop.evaluation import HORIZONS, run_open_loop
         from robotid.simulation.loops import ClosedLoopRobot, open_loops
 
+        if "simulation" not in self.content:
+            raise DataError(
+                f"{self.path.name} is a result from torques, wanted one of the estimator "
+                "'simulation'; use predict(q, v, a)"
+            )
         (model, pi), drives = self.identified, self.commanded
         loops = loops_of(model, pi, drives, self.rate) if drives else open_loops(model, pi)
         times = HORIZONS if horizons is None else horizons
