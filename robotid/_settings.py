@@ -18,6 +18,7 @@ __all__ = [
     "NOT_NEGATIVE",
     "POSITIVE",
     "REQUIRED",
+    "SIZE",
     "Entries",
     "Key",
     "Range",
@@ -28,6 +29,7 @@ __all__ = [
     "require_flag",
     "require_kind",
     "setting",
+    "shown",
     "table_in",
 ]
 
@@ -62,7 +64,7 @@ def require_kind(value: object, kind: type | tuple[type, ...], name: str, wanted
         SettingsError: If it has another type.
     """
     if not isinstance(value, kind):
-        raise SettingsError(f"{name} is {_shown(value)}, a {type(value).__name__}, wanted {wanted}")
+        raise SettingsError(f"{name} is {shown(value)}, a {type(value).__name__}, wanted {wanted}")
 
 
 def require_each(
@@ -83,7 +85,7 @@ def require_each(
     entries = list(values) if is_list and getattr(values, "ndim", 1) == 1 else [None]  # type: ignore[call-overload]
     if not all(isinstance(entry, kind) for entry in entries):
         raise SettingsError(
-            f"{name} is {_shown(values)}, a {type(values).__name__}, wanted {wanted}"
+            f"{name} is {shown(values)}, a {type(values).__name__}, wanted {wanted}"
         )
     return entries
 
@@ -119,6 +121,8 @@ def require_flag(value: object, name: str) -> None:
 #: Keys that are required in a table of a list of tables, if its schema has them.
 REQUIRED = ("log", "name", "ratios", "joints", "matrix", "mass")
 POSITIVE = Range("a positive number", lambda x: x > 0)
+#: Of limits and noise, in any unit: their squares and ratios are finite.
+SIZE = Range("1e-09 to 1e+12", lambda x: 1e-9 <= x <= 1e12)
 NOT_NEGATIVE = Range("0 or a positive number", lambda x: x >= 0)
 
 
@@ -258,12 +262,12 @@ def check_keys(
             near = difflib.get_close_matches(key, schema, n=1)
             hint = f"; did you mean {near[0]!r}?" if near else "."
             raise SettingsError(
-                f"{_shown(at)[1:-1]} is not a known key{hint} Known: {listed(sorted(schema))}"
+                f"{shown(at)[1:-1]} is not a known key{hint} Known: {listed(sorted(schema))}"
             )
         wanted = schema[key]
         if isinstance(wanted, dict):
             if not isinstance(value, Mapping):
-                raise SettingsError(f"{at} is {_shown(value)}, wanted a table [{section}{key}]")
+                raise SettingsError(f"{at} is {shown(value)}, wanted a table [{section}{key}]")
             check_keys(value, wanted, where, f"{section}{key}.")
         elif isinstance(wanted, list):
             _check_array(value, wanted[0], where, f"{section}{key}")
@@ -276,7 +280,7 @@ def check_keys(
 def _check_array(value: object, schema: Mapping[str, Any], where: str, name: str) -> None:
     if not isinstance(value, list) or not all(isinstance(item, Mapping) for item in value):
         raise SettingsError(
-            f"{where}: {name} is {_shown(value)}, wanted tables written as [[{name}]]"
+            f"{where}: {name} is {shown(value)}, wanted tables written as [[{name}]]"
         )
     for item in value:
         check_keys(item, schema, where, f"{name}.")
@@ -288,7 +292,7 @@ def _check_array(value: object, schema: Mapping[str, Any], where: str, name: str
 def _check_entries(value: object, wanted: Entries, at: str) -> None:
     if wanted.count is not None and not isinstance(value, wanted.outer):
         kind = "numbers" if float in wanted.inner else "entries"
-        raise SettingsError(f"{at} is {_shown(value)}, wanted a list of {wanted.count} {kind}")
+        raise SettingsError(f"{at} is {shown(value)}, wanted a list of {wanted.count} {kind}")
     _check_type(value, (wanted.outer,), at)
     if isinstance(value, Mapping):
         for name, entry in value.items():
@@ -302,13 +306,17 @@ def _check_entries(value: object, wanted: Entries, at: str) -> None:
 
 def _check_type(value: object, kinds: tuple[type, ...], at: str) -> None:
     if not isinstance(value, kinds) or (isinstance(value, bool) and bool not in kinds):
-        raise SettingsError(f"{at} is {_shown(value)}, wanted {_type_name(kinds)}")
+        raise SettingsError(f"{at} is {shown(value)}, wanted {_type_name(kinds)}")
     if isinstance(value, int | float) and not abs(value) <= _LARGEST:  # NaN, too
-        raise SettingsError(f"{at} is {_shown(value)}, wanted a number between -1e30 and 1e30")
+        raise SettingsError(f"{at} is {shown(value)}, wanted a number between -1e30 and 1e30")
 
 
-def _shown(value: object) -> str:
-    """Return a value as text of one line, for a message."""
+def shown(value: object) -> str:
+    """Return a value as text of one line, for a message.
+
+    Args:
+        value: The value.
+    """
     try:
         text = " ".join(repr(value).split())
     except ValueError:  # Python does not print integers of more than 4300 digits
@@ -328,7 +336,7 @@ def _check_value(value: Any, key: Key, name: str) -> None:  # noqa: ANN401
         within = key.within
         is_right, words = _is_so(lambda: within.holds(value)), [within.words]
     if not is_right:
-        raise SettingsError(f"{name} is {_shown(value)}, wanted {' or '.join(words)}")
+        raise SettingsError(f"{name} is {shown(value)}, wanted {' or '.join(words)}")
 
 
 def _is_so(holds: Callable[[], Any]) -> bool:

@@ -20,6 +20,7 @@ LINES = [
     "exceptions _text _typing _native_messages",
     "findings versions _files pages",
     "_settings pages kernels",
+    "_arguments",
     "robot logs",
     "log_files regressor",
     "constrained estimators simulation urdf_audit variation workers",

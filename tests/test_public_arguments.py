@@ -302,3 +302,53 @@ def test_files_of_a_page_are_named_by_text(found, tmp_path):
     with pytest.raises(SettingsError, match=r"an entry of files is \['result', 5\]"):
         robotid.write_report(found, tmp_path / "page.html", files={"result": 5})
     assert not list(tmp_path.iterdir())
+
+
+JUNK = (5, 0.5, "x", [None], {1: 2}, object(), np.zeros(0), np.array(["a", "b", "c"]))
+
+
+@pytest.mark.parametrize("junk", JUNK, ids=lambda x: type(x).__name__)
+def test_each_public_boundary_names_the_argument_and_its_type(model, log, junk, tmp_path):
+    """No AttributeError, TypeError, KeyError or IndexError comes out of any of them."""
+    found = identify(model, log, validation=log)
+    result = robotid.load_result(robotid.save_result(found, tmp_path / "out"))
+    pose = np.tile([0.0] * 6 + [1.0], (60, 1))
+    segment = np.zeros(60, dtype=int)
+    motion = robotid.Trajectory(log.t, log.q, log.q, log.q, log.tau, log.joints, 50.0, segment)
+    path = tmp_path / "log.csv"
+    robotid.write_log(log, path)
+    for name, call in {
+        "pose": lambda: robotid.BaseMotion(junk),
+        "twist": lambda: robotid.BaseMotion(pose, twist=junk),
+        "contacts": lambda: Log(**fields(log, contacts=junk)),
+        "wrenches": lambda: Log(**fields(log, wrenches=junk)),
+        "kind": lambda: robotid.Contact("x", kind=junk),
+        "frames": lambda: robotid.Loop(junk),
+        "progress": lambda: identify(model, log, progress=junk),
+        "identification": lambda: robotid.save_result(junk, tmp_path / "other"),
+        "base": lambda: robotid.read_log(path, log.joints, base=junk),
+        "log": lambda: result.open_loop(junk),
+        "evaluation": lambda: found.band(junk),
+        "fit": lambda: found.with_scale_of(junk),
+        "own": lambda: model.with_terms(junk),
+        "gravity": lambda: model.with_gravity(junk),
+        "pi": lambda: model.with_parameters(junk),
+        "q": lambda: model.configurations(junk),
+        "sign": lambda: log.turned(junk),
+        "rows": lambda: motion.at(junk),
+    }.items():
+        with pytest.raises(RobotIdError, match=rf"^(log: )?.*\b{name}\b"):
+            call()
+    assert not (tmp_path / "other").exists()
+
+
+def test_a_result_from_torques_has_no_controller(model, log, tmp_path):
+    result = robotid.load_result(robotid.save_result(identify(model, log), tmp_path / "out"))
+    assert result.rate is None
+    with pytest.raises(DataError, match=r"result.json is a result from torques, wanted one of"):
+        result.open_loop(log)
+
+
+def test_lists_are_arrays(model, log):
+    np.testing.assert_array_equal(model.configurations([[0.1, 0.2]]), [[0.1, 0.2]])
+    np.testing.assert_array_equal(log.turned([1, -1]).q, log.q * [1, -1])

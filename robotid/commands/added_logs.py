@@ -1,6 +1,6 @@
 """Logs compared with those of a result, and added to their variation without reading these."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -113,30 +113,42 @@ def add_logs(
     recordings = with_repeated_errors(Recordings(model, mapping, logs))
     pi, old = stated_parameters(result.content, model), RunSums.from_dict(before)
     shift = np.array(before.get("shift", np.zeros(len(mapping.base_names))))
-    new = sums_of_logs(recordings, job.estimator, pi, old.sigma, shift)
-    if new.H.shape[1:] != old.H.shape[1:]:
-        raise DataError(
-            f"the variation in {result.path.name} has {old.H.shape[1]} parameters, wanted "
-            f"{new.H.shape[1]}: another version of robotid wrote it; {_ADVICE}"
-        )
+    sigma = old.sigma if (old.sigma > 0).all() else np.zeros(0)
+    wanted = {"sigma": (model.n_rows,), "shift": (len(mapping.base_names),)}
+    _require_shapes(result, {"sigma": sigma.shape, "shift": shift.shape}, wanted)
+    new = sums_of_logs(recordings, job.estimator, pi, sigma, shift)
+    old_sizes, sizes = ({"H": x.H.shape[1:], "scatter": x.scatter.shape} for x in (old, new))
+    _require_shapes(result, old_sizes, sizes)
     new_units = [log.unit or any(before["unit"]) * Path(log.path).name for log in logs]
     units = [*before["unit"], *new_units]
     unit_names, unit = np.unique(units, return_inverse=True)
     sums = old.joined(new)
     groups = runs_of(model, mapping, pi, sums, unit)
     names = [*stated["logs"], *(Path(log.path).name for log in logs)]
-    found = vary(names, groups, unit_names.tolist())
-    assert found is not None
+    varied = vary(names, groups, unit_names.tolist())
+    assert varied is not None
     count = len(stated["logs"])
-    own = replace(
-        found,
-        unlike=tuple(each for each in found.unlike if each.run >= count),
-        unlike_units=tuple(each for each in found.unlike_units if each.run in unit[count:]),
+    unlike = replace(
+        varied,
+        unlike=tuple(each for each in varied.unlike if each.run >= count),
+        unlike_units=tuple(each for each in varied.unlike_units if each.run in unit[count:]),
     )
     added = [source_entry(log.path) for log in logs]
-    content = found.to_dict() | {
+    content = varied.to_dict() | {
         "sums": sums.to_dict() | {key: before[key] for key in ("shift",) if key in before}
         | {"unit": units},
         "added": [*stated.get("added", ()), *added],
     }  # fmt: skip
-    return AddedLogs(content, tuple(unlike_findings(own)))
+    return AddedLogs(content, tuple(unlike_findings(unlike)))
+
+
+def _require_shapes(
+    result: Result, found: Mapping[str, tuple[int, ...]], wanted: Mapping[str, tuple[int, ...]]
+) -> None:
+    """Refuse sums of other sizes than those of this version."""
+    for key, shape in wanted.items():
+        if found[key] != shape:
+            raise DataError(
+                f"variation.sums.{key} in {result.path.name} has the shape {found[key]}, wanted "
+                f"{shape}: another version of robotid wrote it; {_ADVICE}"
+            )

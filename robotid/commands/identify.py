@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from robotid._arguments import checked
 from robotid._files import check_folder, folder_beside, remove_written, write_json
 from robotid._settings import require_kind
 from robotid._typing import STAGES, ProgressCallback, ignore_progress, report_stage
@@ -99,6 +100,7 @@ def run_job(
     return _write(found, used, target, source=source)
 
 
+@checked("identification")
 def save_result(
     identification: "Identification | LoopIdentification",
     folder: str | Path,

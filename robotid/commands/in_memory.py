@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, overload
 
+from robotid._arguments import checked
 from robotid._settings import require_flag, require_kind
 from robotid._typing import ProgressCallback, ignore_progress, report_stage
 from robotid.doctor.diagnosis import diagnose
@@ -56,6 +57,7 @@ def identify(
 ) -> Identification: ...
 
 
+@checked("progress")
 def identify(
     model: RobotModel | str | Path,
     logs: Readable | Sequence[Readable],

@@ -22,6 +22,8 @@ _FLOOR = 1e-9  # smallest noise level over the torque, for noise-free data
 _TOLERANCE = 1e-8  # relative change of the noise levels at which WLS has converged
 _MAX_ITERATIONS = 200
 _SETTLED = 1e-5  # relative change that is sufficient after the largest number of iterations
+_TLS_NOISE = 0.01  # [-] of the regressor's columns
+_TLS_SHARE = 0.5  # of the residual's variance, the most that noise not stated by a user explains
 _TLS_ITERATIONS = 100
 _TLS_TOLERANCE = 1e-12  # change of the torque relative to its norm
 _ALONE = 1e-6  # relative gap of the two smallest singular values below which they are equal
@@ -120,7 +122,8 @@ class TLS(BatchEstimator):
     if the smallest solution is not unique, or if the regressor's noise exceeds the residual.
 
     Attributes:
-        regressor_noise: RMS noise of the columns over their RMS [-].
+        regressor_noise: RMS noise of the columns over their RMS [-]; None: 0.01, reduced if it
+            exceeds half of the residual's variance.
         exact: Columns without noise, by the last part of their names.
         independent_share: As in ``OLS``.
 
@@ -129,7 +132,7 @@ class TLS(BatchEstimator):
         approximation theorem; Van Huffel, Vandewalle (1991), The Total Least Squares Problem, 3.6.
     """
 
-    regressor_noise: float = 0.01
+    regressor_noise: float | None = _TLS_NOISE
     exact: Sequence[str] = ("offset",)
     independent_share: float = 1.0
 
@@ -139,7 +142,8 @@ class TLS(BatchEstimator):
             raise RankDeficientError(wls.rank, wls.undetermined, len(factors.names))
         R = factors.weighted(wls.sigma)
         count = max(int(factors.rows.sum()), 1)
-        noise = self.regressor_noise * np.linalg.norm(R[:, :-1], axis=0) / np.sqrt(count)
+        level = _TLS_NOISE if self.regressor_noise is None else self.regressor_noise
+        noise = level * np.linalg.norm(R[:, :-1], axis=0) / np.sqrt(count)
         is_exact = [name.rsplit(".", 1)[-1] in self.exact for name in factors.names]
         theta, share = self._split(R, np.where(is_exact, 0.0, noise), wls.theta)
         freedom = np.maximum(factors.rows - len(theta) / len(factors.rows), 1.0)
@@ -159,7 +163,9 @@ class TLS(BatchEstimator):
         """
         for _ in range(_TLS_ITERATIONS):
             share = float(((noise * theta) ** 2).sum())
-            if share >= 1.0:
+            if self.regressor_noise is None and share > _TLS_SHARE:
+                noise, share = noise * np.sqrt(_TLS_SHARE / share), _TLS_SHARE
+            elif self.regressor_noise is not None and share >= 1.0:
                 raise DataError(
                     f"regressor_noise = {self.regressor_noise:g} corresponds to "
                     f"{np.sqrt(share):.3g} times the actual residual, wanted less than 1; reduce "

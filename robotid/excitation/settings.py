@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from robotid._settings import Range, Settings, setting
+from robotid._settings import SIZE, Range, Settings, setting
 from robotid.exceptions import SettingsError
 from robotid.simulation.settings import Payload
 
@@ -14,7 +14,6 @@ __all__ = ["FARTHEST", "ROUTES", "MotionSettings"]
 ROUTES = ("sweeps", "stands")
 #: [m] Largest coordinate of an obstacle.
 FARTHEST = 1e3
-_SIZES = 1e-9, 1e12  # of limits and noise, in any unit
 
 
 def _from(least: float, most: float, unit: str = "") -> Range:
@@ -94,10 +93,8 @@ class MotionSettings(Settings):
         super().__post_init__()
         for name in ("velocity", "torque", "acceleration", "jerk", "power", "noise"):
             for joint, value in getattr(self, name).items():
-                if not _SIZES[0] <= value <= _SIZES[1]:
-                    raise SettingsError(
-                        f"{name} of {joint!r} is {value:g}, wanted {_SIZES[0]:g} to {_SIZES[1]:g}"
-                    )
+                if not SIZE.holds(value):
+                    raise SettingsError(f"{name} of {joint!r} is {value:g}, wanted {SIZE.words}")
         if self.kind != "payload" and (self.moving or self.payload != Payload()):
             raise SettingsError(
                 f"a payload or moving joints are stated, but kind is {self.kind!r}, wanted payload"

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from robotid._arguments import checked
 from robotid._files import check_path, moved_file, read_json
 from robotid._settings import Range, require_kind
 from robotid._typing import Array
@@ -20,7 +21,16 @@ from robotid.export.commanded import (
     loops_of,
 )
 from robotid.export.entries import SCHEMA_VERSION
-from robotid.export.shape import FILE, FLAG, MAYBE, NUMBER, TABLE, TEXT, check_shape
+from robotid.export.shape import (
+    FILE,
+    FLAG,
+    MAYBE,
+    NUMBER,
+    TABLE,
+    TEXT,
+    check_shape,
+    require_lengths,
+)
 from robotid.export.urdf import load_identified, terms_from_facts
 from robotid.findings import listed
 from robotid.fitting.bands import FrictionCurve
@@ -35,7 +45,8 @@ from robotid.regressor.friction_projection import (
 )
 from robotid.regressor.prediction import predict_instants
 from robotid.robot.model import RobotModel
-from robotid.variation.variation import between_covariance
+from robotid.variation.groups import RunSums
+from robotid.variation.variation import SCORES, between_covariance
 
 if TYPE_CHECKING:
     from robotid.closed_loop.evaluation import OpenLoop
@@ -59,6 +70,37 @@ _PARAMETER = {"name": TEXT, "value": NUMBER, "unit": TEXT}
 _RECORDING = {
     **dict.fromkeys(("start", "end", "rows_used"), NUMBER),
     "signals": TABLE,
+}
+_ROUNDING = 1e-9  # [-] of eigenvalues that may be 0
+_EFFECT = {
+    **dict.fromkeys(("slope", "std_error", "mean"), NUMBER),
+    "unit": TEXT,
+    "is_used": FLAG,
+    "by_log": [NUMBER],
+    "next_interval_at?": {"at": [NUMBER], "low": [NUMBER], "high": [NUMBER]},
+}
+_VARIATION = {
+    "logs": [TEXT],
+    "parameters": {
+        ...: {
+            **dict.fromkeys(("mean", "std_error", "spread", "spread_within_units?"), NUMBER),
+            "next_interval": [NUMBER] * 2,
+            "seen_interval?": [NUMBER] * 2,
+            "next_quantiles": [NUMBER] * len(SCORES),
+            "effects?": {...: _EFFECT},
+        }
+    },
+    "correlation": [[NUMBER]],
+    "sums?": {
+        "H": [[NUMBER]],
+        "h": [[NUMBER]],
+        "scatter": [[NUMBER] * 2],
+        "sigma": [NUMBER],
+        "shift?": [NUMBER],
+        "unit": [TEXT],
+        "covariates": {...: [{"name": TEXT, "unit": TEXT, "by_log": [NUMBER]}]},
+    },
+    "added?": [{"path": TEXT, "sha256": (str, type(None))}],
 }
 #: The entries of a result.json that are read.
 _SHAPE = {
@@ -104,6 +146,7 @@ _SHAPE = {
     "ranges?": {"robot": TEXT, "drives": {...: TABLE}},
     "simulation?": {"controller": {"kind": TEXT, "rate?": MAYBE}},
     "own_terms?": {...: [TABLE]},
+    "variation?": _VARIATION,
     "covariance?": {"names": [TEXT], "root": [[NUMBER]]},
     "friction?": {...: {"data_range?": {...: [NUMBER]}}},
     "drive_moments?": {...: {"terms": [TEXT], "products": [[NUMBER]], "torque": NUMBER}},
@@ -183,8 +226,9 @@ class Result:
     @property
     def rate(self) -> float | None:
         """Sampling rate of the controller of those drives [Hz]; None for continuous time."""
-        stated: float | None = self.content["simulation"]["controller"].get("rate")
-        return stated
+        stated = self.content.get("simulation", {"controller": {}})["controller"]
+        rate: float | None = stated.get("rate")
+        return rate
 
     def follow_commands(self, log: Log) -> Array:
         """Return the positions of the robot simulated on the commands of a log.
@@ -206,6 +250,7 @@ class Result:
             raise DataError(f"{log.name} has no commands, columns qref_ of each joint")
         return self._signs * self.open_loop(log, horizons=()).q
 
+    @checked()
     def open_loop(self, log: Log, *, horizons: Sequence[float] | None = None) -> "OpenLoop":
         """Return a log with the positions simulated for it, in the URDF's sense of the joints.
 
@@ -216,6 +261,7 @@ class Result:
             horizons: Horizons of errors [s]; those of result.json if None.
 
         Raises:
+            DataError: If the result is from torques.
             MissingDependencyError: If Numba is not installed.
             NotConvergedError: If a step has no solution.
             SettingsError: If a term of the drives cannot be simulated.
@@ -223,6 +269,11 @@ class Result:
         from robotid.closed_loop.evaluation import HORIZONS, run_open_loop
         from robotid.simulation.loops import ClosedLoopRobot, open_loops
 
+        if "simulation" not in self.content:
+            raise DataError(
+                f"{self.path.name} is a result from torques, wanted one of the estimator "
+                "'simulation'; use predict(q, v, a)"
+            )
         (model, pi), drives = self.identified, self.commanded
         loops = loops_of(model, pi, drives, self.rate) if drives else open_loops(model, pi)
         times = HORIZONS if horizons is None else horizons
@@ -386,7 +437,45 @@ def read_result(path: str | Path) -> dict[str, Any]:
             f"{name} has {len(validation)} validation recordings among its inputs, but errors of "
             f"{len(result['validation'])}: the file is incomplete. Identify again"
         )
+    if "variation" in result:
+        _check_variation(result, f"{name}.variation")
     return _with_moved_inputs(result, Path(path))
+
+
+def _check_variation(result: Mapping[str, Any], at: str) -> None:
+    """Refuse a variation whose lists do not fit its logs and parameters, or the result's."""
+    stated = result["variation"]
+    k, m = len(stated["logs"]), len(stated["parameters"])
+    require_lengths(stated["correlation"], [m, m], f"{at}.correlation")
+    known = [entry["name"] for entry in result["drive_parameters"]]
+    for name, entry in stated["parameters"].items():
+        own = f"{at}.parameters.{name[:80]}"
+        if name not in known:
+            raise DataError(f"{own} is not among the drive parameters of the result")
+        is_rising = [(np.diff(entry[x]) > 0).all() for x in ("next_interval", "next_quantiles")]
+        if not all(is_rising) or min(entry["std_error"], entry["spread"]) < 0:
+            raise DataError(f"{own} has a negative standard error, or an interval without width")
+        for effect in entry.get("effects", {}).values():
+            require_lengths(effect["by_log"], [k], f"{own}.effects")
+            table = effect.get("next_interval_at", {} if effect["is_used"] else None)
+            for key in ("at", "low", "high") if table is not None else ():
+                size = max(len(table.get("at", ())), 2)
+                require_lengths(table.get(key, ()), [size], f"{own}.effects")
+    _check_definite([stated["correlation"]], f"{at}.correlation")
+    if sums := stated.get("sums"):
+        size = len(sums["h"][0]) if sums["h"] else 0
+        for key, shape in (("h", [k, size]), ("H", [k, size * (size + 1) // 2]), ("unit", [k])):
+            require_lengths(sums[key], shape, f"{at}.sums.{key}")
+        _check_definite(RunSums.from_dict(sums).H, f"{at}.sums.H", least=-_ROUNDING)
+        for covariate in (x for some in sums["covariates"].values() for x in some):
+            require_lengths(covariate["by_log"], [k], f"{at}.sums.covariates")
+
+
+def _check_definite(matrices: ArrayLike, at: str, least: float = 0.0) -> None:
+    """Refuse symmetric matrices with an eigenvalue below a multiple of the largest one."""
+    of_each = np.linalg.eigvalsh(np.array(matrices, dtype=float))
+    if of_each.size and (of_each[:, 0] <= least * of_each[:, -1]).any():
+        raise DataError(f"{at} is not a positive definite matrix")
 
 
 def stated_scale_check(result: Mapping[str, Any]) -> ScaleCheck | None:

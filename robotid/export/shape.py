@@ -1,18 +1,18 @@
 """Schemas of the JSON files that are read, one per kind of file; checked before any use.
 
 A schema is a type or a tuple of types, a ``Range`` of words, ``[schema]`` for the entries of a
-list, ``{key: schema}`` for a table, where ``"key?"`` is optional, or ``{...: schema}`` for a table
-whose keys are names. Keys that are not in the schema are ignored.
+list, ``[schema] * n`` for those of a list of n, ``{key: schema}`` for a table, where ``"key?"`` is
+optional, or ``{...: schema}`` for a table whose keys are names. Other keys are ignored.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from robotid._settings import Range
 from robotid.exceptions import DataError
 
-__all__ = ["FILE", "FLAG", "MAYBE", "NUMBER", "TABLE", "TEXT", "check_shape"]
+__all__ = ["FILE", "FLAG", "MAYBE", "NUMBER", "TABLE", "TEXT", "check_shape", "require_lengths"]
 
 TEXT, NUMBER, FLAG, TABLE = (str,), (int, float), (bool,), (dict,)
 FILE = Range("the name of a file in the same folder", lambda x: Path(x).name == x and "\0" not in x)
@@ -46,6 +46,7 @@ def check_shape(value: Any, wanted: Any, at: str) -> None:  # noqa: ANN401
                 )
     elif isinstance(wanted, list):
         _check_type(value, (list,), at)
+        require_lengths(value, [len(wanted)] if len(wanted) > 1 else [], at)
         for k, entry in enumerate(value):
             check_shape(entry, wanted[0], f"{at}[{k}]")
     elif isinstance(wanted, Range):
@@ -53,6 +54,23 @@ def check_shape(value: Any, wanted: Any, at: str) -> None:  # noqa: ANN401
             raise DataError(f"{at} is {_shown(value)}, wanted {wanted.words}")
     else:
         _check_type(value, wanted, at)
+
+
+def require_lengths(value: Any, shape: Sequence[int], at: str) -> None:  # noqa: ANN401
+    """Refuse nested lists of other lengths.
+
+    Args:
+        value: The lists.
+        shape: The lengths, level by level.
+        at: Name of the value, for errors.
+
+    Raises:
+        DataError: If a length differs.
+    """
+    if shape and len(value) != shape[0]:
+        raise DataError(f"{at} has {len(value)} entries, wanted {shape[0]}")
+    for k, entry in enumerate(value if shape[1:] else ()):
+        require_lengths(entry, shape[1:], f"{at}[{k}]")
 
 
 def _check_type(value: object, kinds: tuple[type, ...], at: str) -> None:

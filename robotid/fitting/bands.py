@@ -7,13 +7,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from robotid._arguments import checked, real_numbers
 from robotid._settings import is_number, require_kind
 from robotid._typing import Array
 from robotid.exceptions import DataError
 from robotid.findings import listed
 from robotid.fitting.joint_motion import JointMotion
 from robotid.fitting.open_terms import open_torques
-from robotid.logs.data import Trajectory, real_numbers, suggestion
+from robotid.logs.data import Trajectory, suggestion
 from robotid.regressor.base_parameters import BaseMapping
 from robotid.regressor.friction_projection import DriveMoments, drive_moments
 from robotid.regressor.memory import drive_motion_along
@@ -117,6 +118,7 @@ def torque_band(
     return TorqueBand(samples, std, np.asarray(noise))
 
 
+@checked("evaluation")
 def expected_band(
     found: "Fit", evaluation: "Evaluation", between: Array | None = None
 ) -> TorqueBand:

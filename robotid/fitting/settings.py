@@ -324,9 +324,10 @@ class TLSSettings(EstimatorSettings):
     allows_for_noise: ClassVar[bool] = True
 
     name: str = _called("tls", "total least squares, which also models noise of the regressor")
-    regressor_noise: float = setting(
-        0.01,
-        "RMS noise of each regressor column, relative to the RMS of the column [-]",
+    regressor_noise: float | None = setting(
+        None,
+        "RMS noise of each regressor column, relative to the RMS of the column [-]; if not stated "
+        "0.01, at most half of the residual's variance",
         within=Range("x > 0", lambda x: x > 0),
     )
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from robotid._settings import is_number
+from robotid._settings import SIZE, is_number
 from robotid._typing import Array
 from robotid.exceptions import SettingsError
 from robotid.findings import listed
@@ -83,7 +83,7 @@ def assumed_noise(
         found: Noise of an earlier run, if there is one.
 
     Raises:
-        SettingsError: If a joint is unknown, or a number is not positive.
+        SettingsError: If a joint is unknown, or a number is out of range.
     """
     for joint, value in stated.items():
         if joint not in model.joints:
@@ -91,8 +91,8 @@ def assumed_noise(
                 f"noise is stated for {joint!r}, which is not among the joints "
                 f"{listed(model.joints)}{suggestion(str(joint), model.joints)}"
             )
-        if not (is_number(value) and value > 0):
-            raise SettingsError(f"noise of {joint!r} is {value!r}, wanted a positive number")
+        if not (is_number(value) and SIZE.holds(value)):
+            raise SettingsError(f"noise of {joint!r} is {value!r}, wanted {SIZE.words}")
     if correlation is not None and not 0 <= correlation < np.inf:
         raise SettingsError(f"correlation is {correlation:g} s, wanted 0 (white noise) or more")
     is_stated = np.isin(model.joints, list(stated))

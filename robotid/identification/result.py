@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
+from robotid._arguments import checked
 from robotid._settings import Settings, require_kind
 from robotid.diagnosis.misfit import Misfit
 from robotid.diagnosis.torque_split import JointTorque, joint_torques
@@ -199,6 +200,7 @@ class Identification(Fit):
     def _scale(self) -> ScaleCheck:
         return check_scale(self)
 
+    @checked()
     def with_scale_of(self, fit: "Identification") -> "Identification":
         """Return the result with the scale check of the same fit, which is not computed again.
 

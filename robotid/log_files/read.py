@@ -14,6 +14,7 @@ from typing import Any, get_args
 
 import numpy as np
 
+from robotid._arguments import checked
 from robotid._files import check_file, check_path
 from robotid._settings import require_each, require_kind
 from robotid._typing import Array
@@ -55,6 +56,7 @@ _SPARSE = 0.02  # share of rows without a value from which a column has another 
 _BASE = BaseColumns()
 
 
+@checked("base", "passive")
 def read_log(
     path: str | Path | Frame,
     joints: Sequence[str],

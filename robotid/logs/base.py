@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from robotid._arguments import real_numbers
 from robotid._typing import Array
 from robotid.exceptions import DataError
 from robotid.findings import listed
@@ -86,7 +87,7 @@ class BaseMotion:
     def __post_init__(self) -> None:
         for name, width in (("pose", 7), ("twist", 6), ("acceleration", 6)):
             values = getattr(self, name)
-            if values is not None:
+            if values is not None or name == "pose":
                 object.__setattr__(self, name, _checked(values, name, width))
         sizes = np.linalg.norm(self.pose[:, 3:], axis=1)
         if len(wrong := np.flatnonzero(np.abs(sizes - 1.0) > _UNIT)):
@@ -459,7 +460,7 @@ def quaternions_of_angles(angles: Array) -> Array:
 
 
 def _checked(values: ArrayLike, name: str, width: int) -> Array:
-    array: Array = np.array(values, dtype=float)
+    array: Array = real_numbers(values, f"{name} of the base").copy()
     if array.ndim != 2 or array.shape[1] != width:
         raise DataError(f"{name} of the base has shape {array.shape}, wanted (N, {width})")
     if not np.isfinite(array).all():

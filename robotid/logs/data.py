@@ -13,12 +13,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
+from robotid._arguments import check_fields, checked, frozen, real_numbers
 from robotid._settings import is_number, require_each, require_flag, require_kind
 from robotid._text import seconds
 from robotid._typing import Array
-from robotid.exceptions import DataError
+from robotid.exceptions import DataError, SettingsError
 from robotid.findings import listed
 from robotid.logs.base import POSE, BaseMotion
 
@@ -105,8 +105,12 @@ class Log:
                 f"{where}: the pose of the base has {len(self.base.pose)} rows, wanted "
                 f"{len(self.t)}, one for each time stamp"
             )
+        check_fields(self, "contacts", "wrenches")
         for kind, dtype in (("contacts", np.bool_), ("wrenches", np.float64)):
-            own = {name: _frozen(x, dtype) for name, x in getattr(self, kind).items()}
+            own = {
+                name: frozen(real_numbers(x, f"{where}: {name!r} of {kind}"), dtype)
+                for name, x in getattr(self, kind).items()
+            }
             for name, values in own.items():
                 if values.shape != self.t.shape:
                     raise DataError(
@@ -176,12 +180,15 @@ class Log:
         chosen = {name: x[:, columns] for name, x in self._arrays().items()}
         return replace(self, joints=tuple(joints), **chosen)
 
+    @checked()
     def turned(self, sign: Array) -> "Log":
         """Return the log with the signs of some joints reversed.
 
         Args:
             sign: 1 or -1 of each joint, shape (n,).
         """
+        if sign.shape != (len(self.joints),):
+            raise DataError(f"sign has shape {sign.shape}, wanted ({len(self.joints)},)")
         return replace(self, **{name: sign * x for name, x in self._arrays().items()})
 
     def _arrays(self) -> dict[str, Any]:
@@ -246,9 +253,9 @@ class Trajectory:
                 f"trajectory: segment is {segment.dtype} of shape {segment.shape}, wanted integers "
                 f"of shape {self.t.shape}"
             )
-        object.__setattr__(self, "segment", _frozen(segment, np.int_))
+        object.__setattr__(self, "segment", frozen(segment, np.int_))
         if self.direction is not None:
-            direction = _frozen(self.direction)
+            direction = frozen(self.direction)
             if direction.ndim != 2 or len(direction) != len(self.t):
                 raise DataError(
                     f"trajectory: direction has shape {direction.shape}, wanted ({len(self.t)}, c)"
@@ -294,6 +301,7 @@ class Trajectory:
         """Sums of tau^2, v^2 and a^2 over the samples, shape (3, n)."""
         return np.array([np.einsum("kj,kj->j", x, x) for x in (self.tau, self.v, self.a)])
 
+    @checked()
     def part(self, start: int, stop: int) -> "Trajectory":
         """Return the samples start to stop.
 
@@ -303,18 +311,22 @@ class Trajectory:
         """
         return self.at(slice(start, stop))
 
+    @checked()
     def every(self, step: int) -> "Trajectory":
         """Return every n-th sample, without a rate.
 
         Args:
             step: The number n.
         """
+        if step < 1:
+            raise SettingsError(f"step is {step}, wanted 1 or more")
         if step == 1:
             return self
         thinned = self.at(slice(None, None, step))
         vars(thinned)["rate"] = None
         return thinned
 
+    @checked()
     def at(self, rows: Array | slice) -> "Trajectory":
         """Return some samples, without new checks of their values.
 
@@ -326,7 +338,10 @@ class Trajectory:
         for name in _BY_SAMPLE:
             values = getattr(self, name)
             if values is not None:
-                vars(some)[name] = own = values[rows]
+                try:
+                    vars(some)[name] = own = values[rows]
+                except IndexError as error:
+                    raise DataError(f"rows are not samples of the trajectory: {error}") from error
                 own.flags.writeable = False
         return some
 
@@ -395,42 +410,6 @@ def _names(joints: object, where: str) -> tuple[str, ...]:
     if not found or not all(isinstance(name, str) for name in found):
         raise DataError(f"{where}: joints is {joints!r}, wanted at least one name in a tuple")
     return found
-
-
-def real_numbers(values: ArrayLike | None, name: str, *, hint: str = "") -> Array:
-    """Return values as a read-only array of numbers; NaN where a masked array is masked.
-
-    Args:
-        values: The values.
-        name: Their name, for errors.
-        hint: Another remedy, for the error if they are None.
-
-    Raises:
-        DataError: If they are no real numbers, or rows have unequal lengths.
-    """
-    if values is None:
-        raise DataError(f"{name} is None, wanted an array{hint}")
-    try:
-        array: Array = np.ma.asanyarray(values)
-        if array.dtype.kind not in "biufO":
-            raise TypeError(f"numbers of kind {array.dtype.kind!r}")
-        if np.ma.is_masked(array):
-            return _frozen(np.ma.filled(array.astype(np.float64), np.nan))
-        return _frozen(values)
-    except (TypeError, ValueError, OverflowError) as error:
-        raise DataError(
-            f"{name} is not an array of real numbers ({str(error)[:100]}); wanted an array of "
-            "floats with rows of equal length"
-        ) from error
-
-
-def _frozen(values: ArrayLike, dtype: type = np.float64) -> Array:
-    """Return the values as a read-only array; copied unless they are read-only already."""
-    array: Array = np.asarray(values, dtype=dtype)
-    if array.flags.writeable:
-        array = array.copy()
-        array.flags.writeable = False
-    return array
 
 
 def require_finite(

@@ -6,11 +6,12 @@ from typing import overload
 
 import numpy as np
 
+from robotid._arguments import real_numbers
 from robotid._settings import is_number, require_kind
 from robotid._typing import Array
 from robotid.estimators import Estimate, Kalman, KalmanState
 from robotid.exceptions import DataError
-from robotid.logs.data import Trajectory, real_numbers
+from robotid.logs.data import Trajectory
 from robotid.online.change_detection import (
     ChangeDetector,
     Innovations,

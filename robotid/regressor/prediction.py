@@ -7,10 +7,11 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike
 
+from robotid._arguments import real_numbers
 from robotid._typing import Array
 from robotid.exceptions import DataError
 from robotid.findings import listed
-from robotid.logs.data import Trajectory, real_numbers
+from robotid.logs.data import Trajectory
 from robotid.regressor.columns import friction_directions, trajectory_values
 from robotid.regressor.compiled import work_per_sample
 from robotid.regressor.constraints import without_forces

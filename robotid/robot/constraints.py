@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 import pinocchio as pin
 
+from robotid._arguments import check_fields
 from robotid._settings import is_number, require_each, require_flag, require_kind
 from robotid._typing import Array
 from robotid.exceptions import ModelError, SettingsError
@@ -92,6 +93,7 @@ class Contact:
                 f"uncertainty of the contact {self.frame!r} is {length:g}, wanted a length [m], at "
                 "least 0"
             )
+        check_fields(self, "axes")
         if self.axes not in ("world", "link"):
             raise SettingsError(
                 f"axes of the contact {self.frame!r} is {self.axes!r}, wanted 'world' or 'link'"
@@ -272,6 +274,7 @@ Constraint = Contact | Loop
 
 
 def _check_kind(constraint: Any, where: str) -> None:  # noqa: ANN401
+    check_fields(constraint, "kind")
     for frame in constraint.frames:
         require_kind(frame, str, "a frame", "the name of a link")
     if constraint.kind not in constraint.sizes:

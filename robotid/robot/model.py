@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
+from robotid._arguments import checked
 from robotid._native_messages import caught_messages
 from robotid._settings import require_each, require_flag, require_kind
 from robotid._typing import Array
@@ -289,6 +290,7 @@ class RobotModel:
         inertial = [inertia.toDynamicParameters() for inertia in self.pin_model.inertias[1:]]
         return np.concatenate([*inertial, np.zeros(len(self.layout.drive_names))])
 
+    @checked()
     def with_terms(self, own: Mapping[str, Sequence[DriveTerm]]) -> "RobotModel":
         """Return the same robot with other terms of single drives, and no reference.
 
@@ -301,12 +303,15 @@ class RobotModel:
         by_drive = {name: tuple(terms) for name, terms in own.items() if terms}
         return replace(self, layout=replace(self.layout, own=by_drive), reference=None)
 
+    @checked()
     def with_gravity(self, gravity: Array) -> "RobotModel":
         """Return the same robot under another gravity.
 
         Args:
             gravity: In the root link's frame, shape (3,) [m/s^2].
         """
+        if gravity.shape != (3,):
+            raise DataError(f"gravity has shape {gravity.shape}, wanted (3,)")
         pin_model = self.pin_model.copy()
         pin_model.gravity.linear = gravity
         return replace(self, pin_model=pin_model)
@@ -319,6 +324,7 @@ class RobotModel:
         """
         return replace(self, reference=pi)
 
+    @checked()
     def with_parameters(self, pi: Array) -> "RobotModel":
         """Return the same robot with other inertial parameters.
 
@@ -342,6 +348,7 @@ class RobotModel:
             copy.inertias[i + 1] = _inertia(values)
         return replace(self, pin_model=copy)
 
+    @checked()
     def configurations(self, q: Array) -> Array:
         """Return Pinocchio's configurations from joint coordinates.
 

@@ -15,11 +15,11 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
+from robotid._arguments import real_numbers
 from robotid._files import write_text
 from robotid._settings import is_number, require_each, require_kind
 from robotid._typing import Array
 from robotid.exceptions import DataError, SettingsError
-from robotid.logs.data import real_numbers
 from robotid.robot.model import RobotModel
 from robotid.viewer.page import page
 from robotid.viewer.scene import Scene, coordinates, mass_marks, packed, robot_scene

@@ -235,6 +235,40 @@ def test_robots_are_stated_by_unit(folder):
         run_job(part, folder / "part")
 
 
+@pytest.mark.parametrize(
+    ("places", "value"),
+    [
+        ((), 5),
+        (("parameters",), []),
+        (("parameters", COULOMB, "next_interval"), [1.0]),
+        (("parameters", COULOMB, "next_quantiles", 0), 1e9),
+        (("parameters", COULOMB, "std_error"), -1.0),
+        (("parameters", "elbow.warmth"), {}),
+        (("correlation", 0), [1.0]),
+        (("correlation", 0, 0), -1.0),
+        (("sums", "H", 0, 0), -1.0),
+        (("sums", "h"), [[]]),
+        (("sums", "scatter", 0), []),
+        (("sums", "sigma"), []),
+    ],
+    ids=str,
+)
+def test_a_variation_that_was_changed_by_hand_is_refused(
+    result, folder, tmp_path, places, value, capsys
+):
+    shutil.copytree(folder / "out", tmp_path / "out")
+    path = tmp_path / "out" / "result.json"
+    content = json.loads(path.read_text())
+    *rest, last = ("variation", *places)
+    table = content
+    for key in rest:
+        table = table[key]
+    table[last] = value
+    path.write_text(json.dumps(content))
+    assert main(["validate", str(path), str(folder / "run_0.csv")]) == 1
+    assert "variation" in capsys.readouterr().err
+
+
 def changed_log(found, seed, **factors):
     """Return a log of a robot with changed drive parameters, in place of __ a point."""
     pi = truth(found.model)

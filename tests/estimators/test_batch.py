@@ -195,6 +195,15 @@ def test_more_noise_than_the_residual_holds_is_refused(rng):
         TLS().fit(compress(problem(W, tau, ("a", "b"))))
 
 
+def test_noise_that_is_not_stated_explains_at_most_half_of_the_residual(rng):
+    W = rng.standard_normal((300, 2))
+    for noise, share in ((0.01, 50.0), (1.0, 0.84)):  # 0.01^2 (10^2 + 3^2) of 1
+        tau = W @ [10.0, 3.0] + noise * rng.standard_normal(300)
+        found = TLS(regressor_noise=None).fit(compress(problem(W, tau, ("a", "b"))))
+        assert float(found.message.split("; ")[1].split(" %")[0]) == pytest.approx(share, rel=0.5)
+        np.testing.assert_allclose(found.theta, [10.0, 3.0], atol=4 * found.std_error.max())
+
+
 def test_a_robot_is_identified_and_the_message_tells_the_noise(ur5):
     log = exact_log(ur5, truth(ur5), np.random.default_rng(0), noise=np.full(6, 0.5))
     signals = SignalSettings(cutoff=None, trim=0.0, min_velocity=0.0)

@@ -338,8 +338,9 @@ def test_noise_is_stated_or_a_hundredth_of_the_largest_torque(ur5):
     np.testing.assert_array_equal(told.correlation, [0.3, 0.3, 0.0, 0.3, 0.3, 0.3])
     with pytest.raises(SettingsError, match="Did you mean 'elbow_joint'"):
         assumed_noise(ur5, size, {"elbow": 0.7})
-    with pytest.raises(SettingsError, match=r"noise of 'elbow_joint' is -1\.0, wanted"):
-        assumed_noise(ur5, size, {"elbow_joint": -1.0})
+    for value in (-1.0, 1e160, 1e-300):
+        with pytest.raises(SettingsError, match=re.escape(f"is {value}, wanted 1e-09")):
+            assumed_noise(ur5, size, {"elbow_joint": value})
     with pytest.raises(SettingsError, match="correlation is -1 s"):
         assumed_noise(ur5, size, {}, -1.0)
 
