@@ -114,6 +114,13 @@ def test_a_state_folder_that_is_not_writable_stops_no_work(tmp_path, monkeypatch
         write_text("2", tmp_path / "a")
 
 
+def test_folders_that_are_not_writable_are_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(os, "access", lambda place, _: place != tmp_path)
+    for check in (lambda: check_file(tmp_path / "a"), lambda: check_folder(tmp_path / "b", ["a"])):
+        with pytest.raises(SettingsError, match=f"the folder '{tmp_path}' is not writable"):
+            check()
+
+
 def test_places_where_nothing_can_be_written_are_refused(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(SettingsError, match="file' is a file, wanted a folder for the results"):

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from robotid._files import file_sha256, finite, log_exists
+from robotid._files import check_file, file_sha256, finite, log_exists
 from robotid.closed_loop.evaluation import OpenLoop, position_metrics
 from robotid.commands.added_logs import add_logs, check_update
 from robotid.commands.job import Job, LogEntry, job_from_settings
@@ -77,6 +77,7 @@ def validate_result(
     job = job_from_settings(settings, Path(path).name, Path())
     entries = [log if isinstance(log, LogEntry) else LogEntry(Path(log)) for log in logs]
     if update:
+        check_file(loaded.path)
         check_update(loaded, job, entries)
     if "simulation" in result:
         return _validate_commands(loaded, job, entries)
