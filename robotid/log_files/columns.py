@@ -10,7 +10,7 @@ import numpy as np
 from robotid._settings import is_number
 from robotid.exceptions import DataError, SettingsError
 from robotid.findings import listed, quoted, toml_key
-from robotid.log_files.column_names import KINDS, Reading, is_clock, read_names
+from robotid.log_files.column_names import KINDS, Reading, by_number, is_clock, read_names
 from robotid.log_files.missing import NOUNS, SIZES, Missing
 from robotid.logs.data import repeated, suggestion
 from robotid.logs.settings import LogSource
@@ -146,7 +146,9 @@ class Finder:
         places = dict.fromkeys([*self.joints, *every, *self.motors.values()])
         names = [x for x in self.names if x not in {*self.columns.values(), *self.seen}]
         named = {place: self._named(place) for place in places}
-        orders = () if self.source.joints else (self.joints, leaders, every)
+        in_file = [joint for joint in every if joint in self.joints] or list(self.joints)
+        is_clear = in_file == list(self.joints) or by_number(in_file) == by_number(self.joints)
+        orders = (self.joints, leaders, every) if is_clear and not self.source.joints else ()
         return read_names(names, named, self.source.effort, orders)
 
     @property

@@ -87,6 +87,17 @@ def test_joints_that_differ_by_number_are_read_by_number():
     np.testing.assert_array_equal(log.q, T[:, None] + [1, 0])
 
 
+def test_numbers_are_not_read_if_the_order_of_the_joints_is_ambiguous():
+    """The legs of the file are not in Pinocchio's order, which is alphabetical."""
+    model = RobotModel.from_urdf(example_urdf("a1.urdf"))
+    joints = [joint.name for joint in model.tree.movable]
+    assert joints != list(model.joints)
+    names = [f"{kind}{k}" for kind in ("q", "tau") for k in range(len(joints))]
+    assert 'q0"  # by order' in said(names, model.joints, robot=model.tree.movable)
+    log = read_log(table(*names), joints, robot=model.tree.movable)
+    np.testing.assert_array_equal(log.q[0], np.arange(12.0))
+
+
 @pytest.mark.parametrize("names", ["q1 q2 q4", "q1 q2", "q_a q_b q_c", "left1 left2 right1"])
 def test_other_numbers_are_not_read_by_order(names):
     columns = [x for name in names.split() for x in (name, name.replace("q", "tau"))]
