@@ -42,7 +42,7 @@ _KIND_OF |= {
 _NO_MEANING = {"measured", "meas", "actual", "act", "state", "states", "field", "data", "joint",
                "joints", "rad", "deg", "nm"}  # fmt: skip
 _CLOCKS = {("time",), ("t",), ("timestamp",), ("stamp",), ("header", "stamp")}
-_WORD = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|[0-9]+")
+_WORD = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|[0-9]+|[^\W\d_]+")
 
 
 @dataclass(frozen=True)
@@ -145,15 +145,15 @@ def quantity_of(
     for joint, rest in _around(name, sorted(joints, key=len, reverse=True)):
         if kind := _kind(rest, effort):
             return kind, joint
-    spans = [(match.group().lower(), *match.span()) for match in _WORD.finditer(name)]
+    spans = [match.span() for match in _WORD.finditer(name)]
     words = _words(name)
     others = [k for k, word in enumerate(words) if not _is_known(word)]
     if not others:
         return None
     if kind := _kind(words[: others[0]], effort):  # the quantity first
-        return kind, name[spans[others[0]][1] :].rstrip(")]")
+        return kind, name[spans[others[0]][0] :].rstrip(")]")
     if kind := _kind(words[others[-1] + 1 :], effort):
-        return kind, name[: spans[others[-1]][2]]
+        return kind, name[: spans[others[-1]][1]]
     return None
 
 

@@ -395,9 +395,13 @@ class Finder:
             return  # that error names these joints, too
         clock = self._find("time", self._clocks())
         found = {"time": clock} if clock else {}
-        found |= {f"{kind}_{x}": own for (kind, x), (own, *_) in self.reading.columns.items()}
+        read = {*self.joints, *self.motors.values()}
+        columns = self.reading.columns.items()
+        found |= {f"{kind}_{x}": own for (kind, x), (own, *_) in columns if x in read}
         found |= self.columns
-        missing = Missing(self.where, self.names, absent, self.joints, self.source, found)
+        of_others = {name for (_, x), own in columns if x not in read for name in own}
+        names = [name for name in self.names if name not in of_others]
+        missing = Missing(self.where, names, absent, self.joints, self.source, found)
         raise missing.error(self._remedy(absent))
 
     def _remedy(self, absent: Sequence[tuple[str, str]]) -> str:
