@@ -269,13 +269,7 @@ class Designer:
         )
 
     def _clear(self, C: Array) -> tuple[Array, Contact | None]:
-        """Return a motion scaled down until it is clear between samples too, and its contact.
-
-        The first factor is 0.99; each further one is smaller.
-
-        Raises:
-            NotConvergedError: If it is not collision-free at a thirtieth of its size.
-        """
+        """Return a motion scaled down until it is clear between samples too, and its contact."""
         if self.clearance is None:
             return C, None
         for k in range(_TRIALS):
@@ -365,12 +359,7 @@ class Designer:
         return rows, torque, self.limits.used(q, v, a, jerk, torque)
 
     def _constraints(self, C: Array, spare: float = 0.0) -> tuple[Array, float, MotionRows]:
-        """Return used shares of limits (6, N, n), the smallest margin of distances and rows.
-
-        Args:
-            C: Coefficients of a motion, shape (h, n).
-            spare: Multiple of the distances' reserve that is subtracted from the margin.
-        """
+        """Return used shares of limits (6, N, n), the smallest margin of distances and rows."""
         rows, _, used = self._followed(C)
         if self.clearance is None:
             return used, np.inf, rows
@@ -463,13 +452,7 @@ class Designer:
         return self._towards(_scaled(C, 0.0), C, most)
 
     def _towards(self, feasible: Array, C: Array, most: float) -> Array:
-        """Return the farthest feasible motion on the line to another motion, shape (h, n).
-
-        Args:
-            feasible: Start of the line; it is returned if no other point satisfies the limits.
-            C: End of the line.
-            most: Share of the limits that may be used.
-        """
+        """Return the farthest feasible motion on the line to another motion, shape (h, n)."""
         way, low, high, share = C - feasible, 0.0, 1.0, 1.0
         under, over = -1.0, np.inf  # violations of the limits at both
         for _ in range(_TRIALS):
@@ -520,13 +503,7 @@ class Designer:
                 return
 
     def _updated(self, state: State, C: Array, settled: float) -> tuple[State, float]:
-        """Return the state of a search after a round, and the violation of the limits.
-
-        Args:
-            state: The state before.
-            C: The iterate at the end of the round.
-            settled: Change of the criterion below which the search has converged.
-        """
+        """Return the state of a search after a round, and the violation of the limits."""
         used, margin, rows = self._constraints(C)
         own = self.judged(self.matrix(rows))[0]
         multipliers = state.multipliers

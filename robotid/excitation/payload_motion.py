@@ -167,11 +167,7 @@ def _best_of_some(designer: Designer, rng: np.random.Generator) -> Array:
 
 
 def _check_bare(designer: Designer, design: Design) -> None:
-    """Refuse a motion that exceeds a limit without the payload.
-
-    Raises:
-        NotConvergedError: If it is.
-    """
+    """Refuse a motion that exceeds a limit without the payload."""
     used, _ = designer.used_and_informed(design.motion, design.duration, _RATE)
     most = np.abs(used).max(axis=1)
     kind, joint = np.unravel_index(int(np.argmax(most)), most.shape)
@@ -185,11 +181,7 @@ def _check_bare(designer: Designer, design: Design) -> None:
 
 
 def _joints_before(model: RobotModel, link: str) -> tuple[str, ...]:
-    """Return the joints that move a link, from the root.
-
-    Raises:
-        SettingsError: If none does.
-    """
+    """Return the joints that move a link, from the root."""
     body, _ = link_transfer(model, link)
     if body < 0:
         raise SettingsError(f"{link} does not move: no torque depends on a payload on it")

@@ -52,18 +52,7 @@ class Postures:
         return found
 
     def _repaired(self, q: Array, rng: np.random.Generator) -> Array:
-        """Return the postures that satisfy all limits after joints with violations are redrawn.
-
-        One such joint of each posture is redrawn at a time; a change that increases the violation
-        is discarded. Of a robot with many joints, one random posture in a million is feasible.
-
-        Args:
-            q: Postures, shape (N, n) [rad or m].
-            rng: Random generator of the joints and of their positions.
-
-        References:
-            Selman, Kautz, Cohen (1994), Noise strategies for improving local search.
-        """
+        """Return the postures that satisfy all limits after joints with violations are redrawn."""
         q, broken = q.copy(), self._broken_by_joint(q)
         for _ in range(_REPAIRS):
             total = broken.sum(axis=1)

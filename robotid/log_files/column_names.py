@@ -16,6 +16,7 @@ __all__ = [
     "is_clock",
     "is_commanded",
     "is_quantity",
+    "named_by_row",
     "quantity_of",
     "read_names",
 ]
@@ -42,7 +43,8 @@ _KIND_OF |= {
 _NO_MEANING = {"measured", "meas", "actual", "act", "state", "states", "field", "data", "joint",
                "joints", "rad", "deg", "nm"}  # fmt: skip
 _CLOCKS = {("time",), ("t",), ("timestamp",), ("stamp",), ("header", "stamp")}
-_WORD = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|[0-9]+")
+_NAME = re.compile(r"(.*?)name(\W*\d+\W*)")  # of a joint, in each row: field.name0
+_WORD = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|[0-9]+|[^\W\d_]+")
 
 
 @dataclass(frozen=True)
@@ -145,16 +147,31 @@ def quantity_of(
     for joint, rest in _around(name, sorted(joints, key=len, reverse=True)):
         if kind := _kind(rest, effort):
             return kind, joint
-    spans = [(match.group().lower(), *match.span()) for match in _WORD.finditer(name)]
+    spans = [match.span() for match in _WORD.finditer(name)]
     words = _words(name)
     others = [k for k, word in enumerate(words) if not _is_known(word)]
     if not others:
         return None
     if kind := _kind(words[: others[0]], effort):  # the quantity first
-        return kind, name[spans[others[0]][1] :].rstrip(")]")
+        return kind, name[spans[others[0]][0] :].rstrip(")]")
     if kind := _kind(words[others[-1] + 1 :], effort):
-        return kind, name[: spans[others[-1]][2]]
+        return kind, name[: spans[others[-1]][1]]
     return None
+
+
+def named_by_row(row: Mapping[str, object]) -> dict[str, str]:
+    """Return new names of columns whose joint is a text in a row: field.position0 by field.name0.
+
+    Args:
+        row: The first row of a table, by column.
+    """
+    found = {match: cell for x, cell in row.items() if (match := _NAME.fullmatch(x))}
+    return {
+        x: f"{x.removesuffix(match[2])}_{str(joint).strip()}"
+        for match, joint in found.items()
+        for x in row
+        if x.startswith(match[1]) and x.endswith(match[2]) and is_quantity(x.removesuffix(match[2]))
+    }
 
 
 def is_quantity(name: str) -> bool:

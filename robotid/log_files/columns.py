@@ -10,7 +10,7 @@ import numpy as np
 from robotid._settings import is_number
 from robotid.exceptions import DataError, SettingsError
 from robotid.findings import listed, quoted, toml_key
-from robotid.log_files.column_names import KINDS, Reading, is_clock, read_names
+from robotid.log_files.column_names import KINDS, Reading, by_number, is_clock, read_names
 from robotid.log_files.missing import NOUNS, SIZES, Missing
 from robotid.logs.data import repeated, suggestion
 from robotid.logs.settings import LogSource
@@ -133,7 +133,9 @@ class Finder:
         places = dict.fromkeys([*self.joints, *every, *self.motors.values()])
         names = [x for x in self.names if x not in {*self.columns.values(), *self.seen}]
         named = {place: self._named(place) for place in places}
-        orders = () if self.source.joints else (self.joints, leaders, every)
+        in_file = [joint for joint in every if joint in self.joints] or list(self.joints)
+        is_clear = in_file == list(self.joints) or by_number(in_file) == by_number(self.joints)
+        orders = (self.joints, leaders, every) if is_clear and not self.source.joints else ()
         return read_names(names, named, self.source.effort, orders)
 
     @property
@@ -379,9 +381,13 @@ class Finder:
             return  # that error names these joints, too
         clock = self._find("time", self._clocks())
         found = {"time": clock} if clock else {}
-        found |= {f"{kind}_{x}": own for (kind, x), (own, *_) in self.reading.columns.items()}
+        read = {*self.joints, *self.motors.values()}
+        columns = self.reading.columns.items()
+        found |= {f"{kind}_{x}": own for (kind, x), (own, *_) in columns if x in read}
         found |= self.columns
-        missing = Missing(self.where, self.names, absent, self.joints, self.source, found)
+        of_others = {name for (_, x), own in columns if x not in read for name in own}
+        names = [name for name in self.names if name not in of_others]
+        missing = Missing(self.where, names, absent, self.joints, self.source, found)
         raise missing.error(self._remedy(absent))
 
     def _remedy(self, absent: Sequence[tuple[str, str]]) -> str:

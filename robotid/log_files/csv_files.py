@@ -15,14 +15,13 @@ import numpy as np
 from robotid._typing import Array
 from robotid.exceptions import DataError
 from robotid.findings import quoted
-from robotid.log_files.column_names import is_quantity
+from robotid.log_files.column_names import named_by_row
 from robotid.log_files.table import Place, RowReader, Table, WritableFormat
 from robotid.logs.settings import LogSource
 
 __all__ = ["CsvFormat"]
 
 _BLOCK = 4096  # lines read at a time
-_NAME = re.compile(r"(.*?)name(\W*\d+\W*)")  # of a joint, in each row: field.name0
 _SENSED = ("base_", "imu_", "contact_", "wrench_")  # columns that other devices record
 
 
@@ -34,7 +33,9 @@ class CsvFormat(WritableFormat):
 
     def open(self, path: Path, source: LogSource) -> Table:
         names, separator, header = _csv_header(path, source)
-        named = _named_by_cells(path, names, separator)
+        with _open_csv(path) as file:
+            row = _split(path.name, "".join(islice(file, 1, 2)) or ",", separator, 2)
+        named = named_by_row(dict(zip(names, row, strict=False)))
         rows = _CsvRows(path, [named.get(x, x) for x in names], separator, header)
         return Table(rows.names, rows.read_all, (), rows, named)
 
@@ -196,23 +197,6 @@ def _csv_header(path: Path, source: LogSource) -> tuple[list[str], str | None, i
             code="missing_column",
         )
     return [str(k) for k in range(len(names))], separator, 0
-
-
-def _named_by_cells(path: Path, names: Sequence[str], separator: str | None) -> dict[str, str]:
-    """Return new names of columns that the first row names, as field.position0 by field.name0."""
-    ends = {x: found.groups() for x in names if (found := _NAME.fullmatch(x))}
-    if not ends:
-        return {}
-    with _open_csv(path) as file:
-        cells = _split(path.name, "".join(islice(file, 1, 2)), separator, 2)
-    first = dict(zip(names, cells, strict=False))
-    by_place = {place: first.get(name, "").strip() for name, place in ends.items()}
-    return {
-        x: f"{x[: len(x) - len(end)]}_{joint}"
-        for (start, end), joint in by_place.items()
-        for x in names
-        if joint and x.startswith(start) and x.endswith(end) and is_quantity(x[: len(x) - len(end)])
-    }
 
 
 def _split(where: str, line: str, separator: str | None, number: int) -> list[str]:

@@ -10,12 +10,20 @@ import numpy as np
 from robotid._typing import Array
 from robotid.exceptions import DataError
 from robotid.findings import listed
-from robotid.log_files.column_names import is_clock, quantity_of
+from robotid.log_files.column_names import is_clock, named_by_row, quantity_of
 from robotid.log_files.table import Place, RowReader, Table, choose
 from robotid.logs.data import suggestion
 from robotid.logs.settings import LogSource
 
-__all__ = ["Frame", "is_frame", "open_frame", "with_own_names", "with_stated_names", "with_time"]
+__all__ = [
+    "Frame",
+    "is_frame",
+    "open_frame",
+    "renamed",
+    "with_own_names",
+    "with_stated_names",
+    "with_time",
+]
 
 _CLOCK = "__time"  # PlotJuggler's
 _COLUMNS = "its columns have names as <topic>/<joint>/position"
@@ -50,11 +58,13 @@ def open_frame(frame: Frame) -> Table:
     if getattr(getattr(frame, "index", None), "name", None) is not None:
         frame = frame.reset_index()  # type: ignore[attr-defined]
     keys = {str(key): key for key in frame.columns}
+    named = named_by_row({x: next(iter(frame[key]), "") for x, key in keys.items()})
+    keys = {named.get(x, x): key for x, key in keys.items()}
 
     def read(wanted: Sequence[str]) -> dict[str, Array]:
         return {name: _numbers(frame[keys[name]], name) for name in wanted}
 
-    return Table([str(key) for key in frame.columns], read)
+    return Table(list(keys), read, renamed=named)
 
 
 def _numbers(values: Any, name: str) -> Array:  # noqa: ANN401
@@ -94,9 +104,7 @@ def with_own_names(table: Table, where: str, kind: str, source: LogSource) -> Ta
     own = {"time": _CLOCK} if _CLOCK in table.names and "time" not in table.names else {}
     if topics:
         own |= topics[_topic(topics, where, source)]
-    if not own:
-        return table
-    return _renamed(table, own)
+    return renamed(table, {name: mine for mine, name in own.items()})
 
 
 def with_stated_names(table: Table, where: str, names: Sequence[str]) -> Table:
@@ -117,7 +125,7 @@ def with_stated_names(table: Table, where: str, names: Sequence[str]) -> Table:
             f"{where} has {len(table.names)} columns, but log.names states {len(names)}; name "
             "each column, in their order"
         )
-    return _renamed(table, dict(zip(names, table.names, strict=True)))
+    return renamed(table, dict(zip(table.names, names, strict=True)))
 
 
 def with_time(table: Table, rate: float | None) -> Table:
@@ -156,9 +164,16 @@ def _timed(table: Table, sources: tuple[str, ...], stamps: Callable[..., Array])
     return replace(table, names=names, read=read, rows=rows)
 
 
-def _renamed(table: Table, own: Mapping[str, str]) -> Table:
-    """Return a table with other names: those in the file by the new one."""
-    theirs = {name: mine for mine, name in own.items()}
+def renamed(table: Table, theirs: Mapping[str, str]) -> Table:
+    """Return a table with other names of columns.
+
+    Args:
+        table: The table.
+        theirs: The new names by those in the file.
+    """
+    own = {name: old for old, name in theirs.items()}
+    if not own:
+        return table
 
     def read(wanted: Sequence[str]) -> dict[str, Array]:
         columns = table.read([own.get(name, name) for name in wanted])

@@ -12,11 +12,14 @@ import numpy as np
 
 from robotid._typing import Array
 from robotid.exceptions import DataError, MissingDependencyError
+from robotid.log_files.column_names import named_by_row
+from robotid.log_files.foreign_tables import renamed
 from robotid.log_files.table import Place, RowReader, Table, WritableFormat, parsing
 from robotid.logs.settings import LogSource
 
 __all__ = ["ParquetFormat", "load_pyarrow"]
 
+_TEXTS = ("string", "large_string")  # types of columns
 _BATCH = 16384  # rows decoded together, if not all are required
 _BUFFER = 2**16  # bytes of each column read together in this case, not whole row groups
 
@@ -27,7 +30,11 @@ class ParquetFormat(WritableFormat):
     def open(self, path: Path, source: LogSource) -> Table:
         with _open(path) as file:
             names = list(file.schema_arrow.names)
-        return Table(names, partial(_read, path), (), _ParquetRows(path))
+            texts = [x for x in names if str(file.schema_arrow.field(x).type) in _TEXTS]
+            rows = next(file.iter_batches(1, columns=texts), None) if texts else None
+        first = rows.to_pylist()[0] if rows is not None and len(rows) else {}
+        table = Table(names, partial(_read, path), (), _ParquetRows(path))
+        return renamed(table, named_by_row(dict.fromkeys(names, "") | first))
 
     def write(self, table: Mapping[str, Array], path: Path) -> None:
         pa = load_pyarrow("writing Parquet")

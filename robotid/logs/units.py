@@ -141,14 +141,7 @@ def turned(joints: Sequence[str], q: Array, turning: Collection[str]) -> tuple[s
 
 
 def _alone(log: Log, kind: str, j: int, others: Array) -> str:
-    """Return how to convert one joint that alone looks like degrees, as text; else "".
-
-    Args:
-        log: The log.
-        kind: "q", or "qref" if only the commanded position is too large.
-        j: Index of the joint.
-        others: Largest position of each other revolute joint; one alone is not enough to compare.
-    """
+    """Return how to convert one joint that alone looks like degrees, as text; else ""."""
     if len(others) < 2 or others.max() > _USUAL:
         return ""
     kinds = [kind]

@@ -77,12 +77,7 @@ def check_mass_matrix(
 
 
 def _are_above(M: Array, least: float) -> bool:
-    """Return whether all eigenvalues of all matrices exceed a bound, without computing them.
-
-    Args:
-        M: Symmetric matrices, shape (N, n, n).
-        least: The bound.
-    """
+    """Return whether all eigenvalues of all matrices exceed a bound, without computing them."""
     try:
         np.linalg.cholesky(M - least * np.eye(M.shape[-1]))
     except np.linalg.LinAlgError:

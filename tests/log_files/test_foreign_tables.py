@@ -256,15 +256,14 @@ def test_a_log_is_taken_by_the_names_of_its_joints(ur5, rng):
 NANOSECONDS = 1_700_000_000_000_000_000 + (T * 1e9).round().astype(int)
 
 
-def test_rostopics_export_names_the_joints_in_its_rows(tmp_path):
+def test_rostopics_export_names_the_joints_in_its_rows(given):
     """rostopic echo -p: the time of arrival, the stamp, and texts beside the numbers."""
     columns = {"%time": NANOSECONDS + 7_000_000, "field.header.seq": range(60)}
     columns |= {"field.header.stamp": NANOSECONDS, "field.header.frame_id": ["base"] * 60}
     columns |= {f"field.name{k}": [name] * 60 for k, name in enumerate(JOINTS)}
     for word, values in WORDS.items():
         columns |= {f"field.{word}{k}": values[:, k] for k in range(2)}
-    pd.DataFrame(columns).to_csv(tmp_path / "run.csv", index=False)
-    back = read_log(tmp_path / "run.csv", JOINTS[::-1], units=LogUnits(time="ns"))
+    back = read_log(given(columns), JOINTS[::-1], units=LogUnits(time="ns"))
     np.testing.assert_allclose(back.t, 1.7e9 + T, rtol=0, atol=5e-7)
     np.testing.assert_array_equal(back.q, LOG.q[:, ::-1])
     np.testing.assert_array_equal(back.tau, LOG.tau[:, ::-1])

@@ -12,6 +12,7 @@ from robotid.log_files.read import read_log
 from robotid.logs.settings import LogSource
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
+from robotid.robot.tree import Joint
 
 UR = ("pan", "lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
 T = np.arange(5) / 100.0
@@ -87,6 +88,17 @@ def test_joints_that_differ_by_number_are_read_by_number():
     np.testing.assert_array_equal(log.q, T[:, None] + [1, 0])
 
 
+def test_numbers_are_not_read_if_the_order_of_the_joints_is_ambiguous():
+    """The legs of the file are not in Pinocchio's order, which is alphabetical."""
+    model = RobotModel.from_urdf(example_urdf("a1.urdf"))
+    joints = [joint.name for joint in model.tree.movable]
+    assert joints != list(model.joints)
+    names = [f"{kind}{k}" for kind in ("q", "tau") for k in range(len(joints))]
+    assert 'q0"  # by order' in said(names, model.joints, robot=model.tree.movable)
+    log = read_log(table(*names), joints, robot=model.tree.movable)
+    np.testing.assert_array_equal(log.q[0], np.arange(12.0))
+
+
 @pytest.mark.parametrize("names", ["q1 q2 q4", "q1 q2", "q_a q_b q_c", "left1 left2 right1"])
 def test_other_numbers_are_not_read_by_order(names):
     columns = [x for name in names.split() for x in (name, name.replace("q", "tau"))]
@@ -96,8 +108,9 @@ def test_other_numbers_are_not_read_by_order(names):
 def test_the_whole_table_is_proposed_and_read_once_it_is_pasted():
     """Joints with other names are paired by order; commands are in the table."""
     joints, own = ("pan", "lift"), ("turn", "raise")
-    names = [*of("q", own), *of("tau", own), *of("qref", own), "voltage"]
-    found = said(names, joints)
+    names = [*of("q", own), *of("tau", own), *of("qref", own), "voltage", "wrist_1_pos"]
+    locked = [Joint("wrist_1", "revolute", "a", "b")]  # its column is no line of the table
+    found = said(names, joints, robot=locked)
     columns = tomllib.loads("[columns]" + found.partition("[columns]")[2])["columns"]
     expected = {f"{kind}_{j}": f"{kind}_{m}" for kind in ("q", "tau", "qref")
                 for j, m in zip(joints, own, strict=True)}  # fmt: skip
@@ -133,7 +146,7 @@ def test_commanded_columns_are_no_torques(kind):
     )
 
 
-@pytest.mark.parametrize("kind", ["temp", "voltage", "iq", "tau_ext", "power", "force"])
+@pytest.mark.parametrize("kind", ["temp", "voltage", "iq", "tau_ext", "power", "force", "\u03b1q"])
 def test_a_column_with_an_unknown_word_is_listed_and_not_read(kind):
     found = said([*of("q"), *of(kind)])
     assert f"{kind}_elbow" in found.partition("[columns]")[0]
