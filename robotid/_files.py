@@ -73,7 +73,7 @@ def check_file(target: Path, inputs: Iterable[str | Path | None] = ()) -> None:
     """Refuse a path where no file can be written, before its content is computed.
 
     A file that exists is replaced only if robotid wrote it, and it has not changed since: its
-    SHA-256 is in ``~/.local/state/robotid/written``, or it is of the result in its folder.
+    SHA-256 is in ``.robotid-written`` beside it, or it is of the result in its folder.
 
     Args:
         target: The file.
@@ -161,7 +161,7 @@ def _is_hidden(path: Path) -> bool:
 
 def _is_written(path: Path) -> bool:
     """Return whether robotid wrote a file with this content, or a result beside it names it."""
-    ledger = _ledger()
+    ledger = path.with_name(_LEDGER)
     if ledger.is_file() and file_sha256(path) in ledger.read_text(encoding="utf-8"):
         return True
     for record in (path.with_name(name) for name in _RECORDS):
@@ -177,24 +177,18 @@ def _is_written(path: Path) -> bool:
 
 
 def _record(path: Path) -> None:
-    """Record the SHA-256 of a written file, so that a later run may replace the file."""
-    ledger = _ledger()
-    if _is_hidden(path) or not ledger.is_absolute():  # the user has no home
+    """Record the SHA-256 of a written file beside it, so that a later run may replace the file.
+
+    Files of a result are named in its record.
+    """
+    if _is_hidden(path) or any(path.with_name(name).exists() for name in _RECORDS):
         return
-    try:
-        ledger.parent.mkdir(parents=True, exist_ok=True)
-        with ledger.open("a", encoding="utf-8") as file:
-            file.write(f"{file_sha256(path)}\n")
-    except OSError as error:  # a home that is not writable
-        _log.info("%s is not recorded as written by robotid: %s", path, error)
+    with path.with_name(_LEDGER).open("a", encoding="utf-8") as ledger:
+        ledger.write(f"{file_sha256(path)}\n")
 
 
-def _ledger() -> Path:
-    """Return the file with a SHA-256 for each file that robotid wrote."""
-    state = os.environ.get("XDG_STATE_HOME") or os.path.expanduser("~/.local/state")
-    return Path(state, "robotid", "written")
-
-
+#: Has the SHA-256 of each file that robotid wrote in its folder, beside those of results.
+_LEDGER = ".robotid-written"
 #: Files of results, which name the other files that were written with them.
 _RECORDS = ("result.json", "track.json", "fleet.json")
 _LONGEST = 255  # bytes of a file's name

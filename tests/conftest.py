@@ -52,14 +52,6 @@ def pytest_collection_finish():
     gc.enable()
 
 
-@pytest.fixture(scope="session", autouse=True)
-def state(tmp_path_factory):
-    """Give the record of written files a folder of its own; programs that tests start share it."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("XDG_STATE_HOME", str(tmp_path_factory.mktemp("state")))
-        yield
-
-
 @pytest.fixture
 def rng():
     return np.random.default_rng(0)

@@ -15,6 +15,7 @@ __all__ = [
     "DEPENDENCE_SHARE",
     "FAMILY",
     "FAMILY_LEAST",
+    "FAMILY_P_VALUE",
     "GROWN",
     "MAIN",
     "MISFIT",
@@ -33,7 +34,9 @@ __all__ = [
 _ALIKE = 0.02  # of the squared residual: within this difference the simpler option is selected
 
 # Families selected for a joint's drive: benchmarks/bench_friction.py
-FAMILY = Rule(most=4, share=0.05, p_value=0.01, alike=_ALIKE)
+# The same p-value decides whether least squares predicts better than bodies bound to the prior.
+FAMILY_P_VALUE = 0.01
+FAMILY = Rule(most=4, share=0.05, p_value=FAMILY_P_VALUE, alike=_ALIKE)
 #: Share of the torque: a smaller gain may be an effect of the filter on velocity signs.
 FAMILY_LEAST = 0.006
 #: p-value below which a family that is not selected is undecided: it widens intervals.

@@ -3,6 +3,8 @@
 Terms are added to viscous and Coulomb friction, joint by joint, on samples spread over the fitted
 logs. The family that explains most of the held-out segments is selected if it is significant, then
 the next one together with it, until no family improves the fit. Validation logs are not used.
+Where the prior binds the bodies, those of least squares replace them: a wrong prior does not become
+friction, and a term that inertia explains as well has no gain.
 
 The nonlinear parameters of a family, its shape, are searched on a grid. Then all shapes of a joint
 are refined together, with the linear parameters refitted in each step (variable projection, Golub,
@@ -19,7 +21,14 @@ from itertools import product
 import numpy as np
 
 from robotid._typing import Array
-from robotid.diagnosis.decisions import AT_BOUND, FAMILY, FAMILY_LEAST, TENFOLD, UNDECIDED_P_VALUE
+from robotid.diagnosis.decisions import (
+    AT_BOUND,
+    FAMILY,
+    FAMILY_LEAST,
+    GROWN,
+    TENFOLD,
+    UNDECIDED_P_VALUE,
+)
 from robotid.diagnosis.sample import RIDGE, Sample, Trial, Trials, take_sample
 from robotid.diagnosis.selection import Round, select
 from robotid.exceptions import SettingsError
@@ -78,22 +87,32 @@ def choose_drives(
         fit: The fit with viscous and Coulomb friction only.
         wanted: Families stated for each joint, by name; None: those that held-out segments of the
             fitted logs require; see ``wanted_families``.
-        balanced: Family of the counterbalance of joints whose families are selected.
+        balanced: Family of a suspected counterbalance of joints whose families are selected. It is
+            selected as any other, or if no standard error increases: where only the URDF's masses
+            distinguish it from gravity, it has no gain.
 
     Returns:
         A choice per joint; none for a joint that hardly moved, or if the logs are too short.
     """
-    sample = take_sample(fit, for_drives=True)
+    sample = take_sample(fit, for_drives=True, is_free=True)
     if sample is None:
         return ()
     drives, choices = _drives(fit, sample, wanted), dict[str, DriveChoice]()
+    bound = take_sample(fit, for_drives=True) if balanced else None
 
     def choose(j: int, together: Sample) -> None:
         joint = sample.joints[j]
         names, alone, drive = wanted[joint], together.of_joint(j), drives[j]
-        first = [own for own in [(balanced or {}).get(joint)] if own is not None]
-        chosen = _auto(alone, drive, first) if names is None else _fixed(alone, drive, names)
-        choices[joint] = chosen
+        if names is not None:
+            choices[joint] = _fixed(alone, drive, names)
+            return
+        suspected = [FAMILIES[balanced[joint]]] if balanced and joint in balanced else []
+        first = list(_candidates(drive, suspected))
+        if bound is not None and first:
+            own = bound.of_joint(j)
+            grown = _grown(_reweighted(own, drive, first), drive, first)
+            first = first if max(grown.values(), default=1.0) < GROWN else []
+        choices[joint] = _auto(alone, drive, suspected, first)
 
     for j in drives:
         choose(j, sample)
@@ -129,7 +148,7 @@ def _drives(
     fit: Solution, sample: Sample, wanted: Mapping[str, Sequence[str] | None]
 ) -> dict[int, _Drive]:
     """Return the drives whose families are stated or selected, by the index of their joint."""
-    model = fit.model.with_reference(fit.standard)
+    model = fit.model.with_reference(sample.standard)
     motions = [drive_motion_along(model, x.trajectory) for x in sample.recordings]
     is_free, first = sample.basis is None, sample.weight.shape[1] - len(sample.joints)
     largest = np.concatenate(
@@ -252,10 +271,15 @@ def _amplitude(drive: _Drive, term: DriveTerm) -> float:
     return float(np.abs(term.amplitude(np.zeros_like(v), v)).max()) + _NOTHING
 
 
-def _auto(sample: Sample, drive: _Drive, first: Sequence[str] = ()) -> DriveChoice:
-    """Return the fewest families that held-out segments require together with the first ones."""
-    grid = list(_candidates(drive, [f for f in FAMILIES.values() if f.is_automatic]))
-    known = list(_candidates(drive, [FAMILIES[name] for name in first]))
+def _auto(
+    sample: Sample,
+    drive: _Drive,
+    suspected: Sequence[Family] = (),
+    known: Sequence[tuple[Family, list[float]]] = (),
+) -> DriveChoice:
+    """Return the fewest families that held-out segments require together with known ones."""
+    automatic = [f for f in FAMILIES.values() if f.is_automatic]
+    grid = list(_candidates(drive, [*automatic, *suspected]))
     start = _reweighted(sample, drive, known)
     every = _Options.of(start, drive, [*known, *grid])
     torque = float(start.torque[0])
@@ -288,7 +312,7 @@ def _auto(sample: Sample, drive: _Drive, first: Sequence[str] = ()) -> DriveChoi
                 undecided = [every.own[nearest]]
             break
         own = found.own
-        known = known if set(chosen) <= set(retained[best]) else []
+        known = known if set(chosen) <= set(retained[best]) else ()
         weighted = found.weighted
         every, torque = _Options.of(weighted, drive, [*own, *grid]), float(weighted.torque[0])
         chosen = list(range(len(own)))

@@ -22,6 +22,8 @@ from typing import TypeVar
 import numpy as np
 
 from robotid._typing import Array
+from robotid.diagnosis.decisions import FAMILY_P_VALUE
+from robotid.diagnosis.selection import p_value
 from robotid.fitting.evaluation import Evaluation, Recording
 from robotid.fitting.joint_motion import JointMotion, joint_motions, travelled
 from robotid.fitting.result import Solution
@@ -125,6 +127,7 @@ class Sample:
         independent: Columns of the regressor that belong to base parameters, shape (b,), int.
         U: Factor of the prior covariance of base parameters, C = U^T U, shape (b, b).
         normal: Normal equations of the segments, of all joints of the robot.
+        standard: Standard parameters of the estimate, shape (p,).
         basis: As of ``Trajectory.basis``, at these samples.
     """
 
@@ -143,6 +146,7 @@ class Sample:
     independent: Array
     U: Array
     normal: Normal
+    standard: Array
     basis: Array | None = None
 
     @property
@@ -238,13 +242,15 @@ class Sample:
         )
 
 
-def take_sample(fit: Solution, *, for_drives: bool = False) -> Sample | None:
+def take_sample(fit: Solution, *, for_drives: bool = False, is_free: bool = False) -> Sample | None:
     """Return samples spread over the recordings; None if there are too few, or static ones.
 
     Args:
         fit: The fit.
         for_drives: Whether drive terms are selected with them: only samples of fitted logs, also
             those near reversals, where the filter smears stiction.
+        is_free: Whether the bodies are those of least squares if these predict held-out segments
+            better than bodies bound to the prior.
     """
     model, mapping = fit.model, fit.mapping
     if model.is_static:
@@ -273,14 +279,13 @@ def take_sample(fit: Solution, *, for_drives: bool = False) -> Sample | None:
     used = np.concatenate([e.recording.mask[k] for e, k in parts])
     if basis is None and not for_drives:
         used &= np.concatenate([_is_steady(e.recording)[k] for e, k in parts])
-    used, scale = _noise_level(r, used, own, basis)
-    weight = used * np.sqrt(independent) / np.where(scale > 0, scale, np.inf)
     # C = U^T U: base parameters over their prior spread are of size 1
     U = np.asarray(np.linalg.qr((mapping.K * fit.prior_std).T, mode="r"))
+    used, scale = _noise_level(r, used, own, basis)
+    weight = used * np.sqrt(independent) / np.where(scale > 0, scale, np.inf)
     W = _in_units(Y, mapping.independent, U)
     W *= weight[:, :, None]
-    r = weight * r
-    return Sample(
+    sample = Sample(
         joints=model.joints,
         is_prismatic=np.isin(model.joints, list(model.layout.prismatic)),
         motions=joint_motions([e.recording for e, _ in parts], rows, load, model),
@@ -292,12 +297,49 @@ def take_sample(fit: Solution, *, for_drives: bool = False) -> Sample | None:
         segments=segments,
         rows=own,
         W=W,
-        r=r,
+        r=weight * r,
         independent=mapping.independent,
         U=U,
-        normal=Normal.of(W, r, segments, number),
+        normal=Normal.of(W, weight * r, segments, number),
+        standard=fit.standard,
         basis=basis,
     )
+    return _free(sample, Y[..., mapping.independent]) if is_free else sample
+
+
+def _free(sample: Sample, X: Array) -> Sample:
+    """Return the samples with the bodies of least squares, if these predict held-out segments.
+
+    A prior that is wrong binds the bodies, and its error looks like friction.
+
+    Args:
+        sample: The samples.
+        X: Regressor of the base parameters, shape (N, n_rows, b).
+    """
+    W = sample.weight[..., None] * X
+    size = np.linalg.norm(W[: sample.rows], axis=(0, 1))
+    spread = _FREE * np.linalg.norm(sample.r) / np.where(size > 0, size, np.inf)
+    W *= spread
+    normal = Normal.of(W, sample.r, sample.segments, sample.fitted)
+    free = replace(sample, W=W, U=np.diag(spread), normal=normal)
+    none = np.empty((*sample.r.shape, 0))
+    before, after = (Trials(x, none).held_out.left([]) for x in (sample, free))
+    if p_value(before, after, sample.fitted) >= FAMILY_P_VALUE:
+        return sample
+    change = normal.whole[1] @ normal.B[: sample.fitted].sum(axis=0)
+    standard = sample.standard.copy()
+    standard[sample.independent] += spread * change
+    r = sample.r - W @ change
+    # rows that were projected together have one noise level
+    old, new = (np.sum(x[: sample.rows] ** 2, axis=0) for x in (sample.r, r))
+    if sample.basis is not None:
+        old, new = (np.full(len(x), x.sum()) for x in (old, new))
+    factor = np.sqrt(old / np.where(new > 0, new, np.inf))
+    weight, W, r = factor * sample.weight, factor[:, None] * W, factor * r
+    return replace(
+        free, weight=weight, W=W, r=r, torque=factor**2 * sample.torque, standard=standard,
+        normal=Normal.of(W, r, sample.segments, sample.fitted),
+    )  # fmt: skip
 
 
 def along(sample: Sample, model: RobotModel, at: Sequence[Trajectory], tau: Array) -> Sample:

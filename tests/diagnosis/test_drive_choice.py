@@ -643,6 +643,7 @@ def test_derivatives_of_terms_by_each_shape_follow_their_columns(rng):
         joints=("a",), is_prismatic=np.array([False]), motions=(), recordings=(), at=(), taken=(),
         weight=weight, torque=np.ones(1), segments=segments, rows=n, W=W, r=r,
         independent=np.arange(2), U=np.eye(2), normal=Normal.of(W, r, segments, 6),
+        standard=np.zeros(0),
     )  # fmt: skip
     drive = drive_choice._Drive(False, True, (motion,), (np.arange(n),), ranges, 9.0, {})
     count, trial = drive_choice._with_slopes(sample, drive, families, sizes)
@@ -689,7 +690,8 @@ def test_a_candidate_counts_if_all_of_its_parameters_are_possible():
     assert given == {4: [0, 1, 7]}
 
 
-def test_each_joint_is_given_its_own_drive_and_what_is_wanted_of_it(monkeypatch, rng):
+@pytest.mark.parametrize("growth", [1.2, 5.0])  # of a standard error with the suspected family
+def test_each_joint_is_given_its_own_drive_and_what_is_wanted_of_it(monkeypatch, rng, growth):
     """The second joint has no sample that is used, the fourth is to have nothing."""
     names, n = ("a", "b", "c", "d"), 9
     q, v, tau = rng.standard_normal((3, n, 4)) * [1.0, 50.0, 7.0, 2.0]
@@ -700,11 +702,15 @@ def test_each_joint_is_given_its_own_drive_and_what_is_wanted_of_it(monkeypatch,
     sample = SimpleNamespace(
         joints=names, weight=weight, taken=(np.arange(n),), is_prismatic=np.array([0, 0, 1, 0]),
         recordings=[SimpleNamespace(trajectory=None)], at=[SimpleNamespace(tau=tau)], U=U,
-        of_joint=lambda j: ("of", j), basis=None,
+        of_joint=lambda j: ("of", j), basis=None, standard=None,
     )  # fmt: skip
     motion = SimpleNamespace(of=lambda j: SimpleNamespace(q=q[:, j], v=v[:, j]))
-    monkeypatch.setattr(drive_choice, "take_sample", lambda fit, for_drives: sample)
+    monkeypatch.setattr(drive_choice, "take_sample", lambda fit, **given: sample)
     monkeypatch.setattr(drive_choice, "drive_motion_along", lambda model, trajectory: motion)
+    monkeypatch.setattr(drive_choice, "_candidates", lambda drive, families: families)
+    monkeypatch.setattr(drive_choice, "_reweighted", lambda own, drive, first: own)
+    grown = {"a.offset": growth}
+    monkeypatch.setattr(drive_choice, "_grown", lambda own, drive, first: grown)
     monkeypatch.setattr(drive_choice, "_auto", lambda *given: ("auto", *given))
     monkeypatch.setattr(drive_choice, "_fixed", lambda *given: ("fixed", *given))
     model = SimpleNamespace(passive=(), with_reference=lambda pi: None)
@@ -712,9 +718,11 @@ def test_each_joint_is_given_its_own_drive_and_what_is_wanted_of_it(monkeypatch,
     fit = SimpleNamespace(model=model, mapping=mapping, standard=None)
     wanted = {"a": None, "b": None, "c": ("load", "tanh"), "d": ()}
     first, second = choose_drives(fit, wanted, {"a": "harmonics1", "c": "spring"})
-    assert (first[:2], first[3]) == (("auto", ("of", 0)), ["harmonics1"])
+    suspected = [FAMILIES["harmonics1"]]
+    assert first[:2] == ("auto", ("of", 0))
+    assert first[3:] == (suspected, suspected if growth < 1.3 else [])
     assert (second[:2], second[3]) == (("fixed", ("of", 2)), ("load", "tanh"))
-    for (_, _, drive, _), j in ((first, 0), (second, 2)):
+    for (_, _, drive, *_), j in ((first, 0), (second, 2)):
         used = weight[:, j] > 0
         assert drive.largest == np.abs(tau[:, j]).max()
         assert drive.is_prismatic is (j == 2)

@@ -197,6 +197,7 @@ def test_a_size_without_a_unit_is_that_of_the_torque_beside_base_parameters(rng)
         joints=("a", "b"), is_prismatic=np.array([False, True]), motions=(), recordings=(), at=(),
         taken=(), weight=weight, torque=np.ones(2), segments=segments, rows=fitted,
         W=W, r=r, independent=np.arange(3), U=np.eye(3), normal=Normal.of(W, r, segments, 6),
+        standard=np.zeros(0),
     )  # fmt: skip
     Z = rng.standard_normal((count, 3)) + r[:, [1]]
     whole = Trials(sample.of_joint(1), Z[:, None]).whole
@@ -632,6 +633,7 @@ def test_each_term_is_reported_with_what_it_adds_to_those_before(rng, monkeypatc
         motions=(JointMotion(*7 * [still]),) * 2, recordings=(), at=(), taken=(), weight=weight,
         torque=np.array([900.0, 1600.0]), segments=segments, rows=fitted, W=W, r=r,
         independent=np.arange(3), U=np.eye(3), normal=Normal.of(W, r, segments, 8),
+        standard=np.zeros(0),
     )  # fmt: skip
     one = candidates.Candidate("one", "first", lambda m: x[1], "", units=("N m", "N"))
     two = candidates.Candidate("two", "second", lambda m: y, "")

@@ -36,7 +36,7 @@ def sample(rng):
     return Sample(
         joints=("a", "b"), is_prismatic=np.zeros(2, dtype=bool), motions=(), recordings=(), at=(),
         taken=(), weight=weight, torque=np.ones(2), segments=segments, rows=10 * FITTED,
-        W=W, r=r, independent=np.arange(BASE), U=np.eye(BASE), normal=normal,
+        W=W, r=r, independent=np.arange(BASE), U=np.eye(BASE), normal=normal, standard=np.zeros(0),
     )  # fmt: skip
 
 
