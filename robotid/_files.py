@@ -72,8 +72,8 @@ def check_path(path: str | Path) -> None:
 def check_file(target: Path, inputs: Iterable[str | Path | None] = ()) -> None:
     """Refuse a path where no file can be written, before its content is computed.
 
-    A file that exists is replaced only if robotid wrote it, and it has not changed since: its
-    SHA-256 is in ``.robotid-written`` beside it, or it is of the result in its folder.
+    A file that exists is replaced only if robotid wrote it, and it has not changed since: it has
+    the mark of ``_mark``, or it is of the result in its folder.
 
     Args:
         target: The file.
@@ -161,8 +161,7 @@ def _is_hidden(path: Path) -> bool:
 
 def _is_written(path: Path) -> bool:
     """Return whether robotid wrote a file with this content, or a result beside it names it."""
-    ledger = path.with_name(_LEDGER)
-    if ledger.is_file() and file_sha256(path) in ledger.read_text(encoding="utf-8"):
+    if path.stat().st_mtime_ns % _MARKS == _mark(path):
         return True
     for record in (path.with_name(name) for name in _RECORDS):
         try:
@@ -176,21 +175,25 @@ def _is_written(path: Path) -> bool:
     return False
 
 
-def _record(path: Path) -> None:
-    """Record the SHA-256 of a written file beside it, so that a later run may replace the file.
+def _mark(path: Path) -> int:
+    """Return the last digits of the modification time of a file that robotid wrote [ns].
 
-    Files of a result are named in its record.
+    They are a hash of its content: a file that is copied or edited has others. The mark needs no
+    record beside the file, and NTFS has it, too, whose times are multiples of 100 ns.
     """
-    if _is_hidden(path) or any(path.with_name(name).exists() for name in _RECORDS):
-        return
-    with path.with_name(_LEDGER).open("a", encoding="utf-8") as ledger:
-        ledger.write(f"{file_sha256(path)}\n")
+    return 100 * (int(file_sha256(path)[:12], 16) % (_MARKS // 100))
 
 
-#: Has the SHA-256 of each file that robotid wrote in its folder, beside those of results.
-_LEDGER = ".robotid-written"
+def _marked(path: Path) -> None:
+    """Mark a file as written by robotid, so that a later run may replace it."""
+    times = path.stat()
+    written = times.st_mtime_ns // _MARKS * _MARKS + _mark(path)
+    os.utime(path, ns=(times.st_atime_ns, written))
+
+
 #: Files of results, which name the other files that were written with them.
 _RECORDS = ("result.json", "track.json", "fleet.json")
+_MARKS = 10**6  # [ns] of a modification time that are a mark
 _LONGEST = 255  # bytes of a file's name
 _LONGEST_PATH = 4095  # bytes of a whole path
 _HIDDEN = 32  # further bytes in the name of a hidden file
@@ -229,8 +232,8 @@ def written_whole(target: str | Path, inputs: Iterable[str | Path | None] = ()) 
     hidden = path.with_name(_hidden(path.name))
     try:
         yield hidden
+        _marked(hidden)
         os.replace(hidden, path)
-        _record(path)
     except OSError as error:  # most messages do not name the file
         error.add_note(f"while writing {str(path)!r}")
         raise
@@ -284,7 +287,7 @@ def folder_beside(target: Path) -> Iterator[Path]:
             _put_back(names, new, old, target)
             raise
         for name in names:
-            _record(target / name)
+            _marked(target / name)
 
 
 def _put_back(names: Iterable[str], new: Path, old: Path, target: Path) -> None:

@@ -24,7 +24,10 @@ MAIN_FLAGS = (
     "--out", "--report", "--given", "--kind", "--link", "--mass", "--duration", "--share",
     "--clearance", "--floor", "--joints", "--lock",
 )  # fmt: skip
-EXAMPLES = ("robotid excite robot.urdf --out motion.csv --report motion.html",)
+EXAMPLES = (
+    "robotid excite robot.urdf --out motion.csv --report motion.html",
+    "robotid excite robot.urdf --kind sweeps --out sweeps.csv",
+)
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:

@@ -98,7 +98,6 @@ _VARIATION = {
         "sigma": [NUMBER],
         "shift?": [NUMBER],
         "unit": [TEXT],
-        "covariates": {...: [{"name": TEXT, "unit": TEXT, "by_log": [NUMBER]}]},
     },
     "added?": [{"path": TEXT, "sha256": (str, type(None))}],
 }
@@ -455,20 +454,12 @@ def _check_variation(result: Mapping[str, Any], at: str) -> None:
         is_rising = [(np.diff(entry[x]) > 0).all() for x in ("next_interval", "next_quantiles")]
         if not all(is_rising) or min(entry["std_error"], entry["spread"]) < 0:
             raise DataError(f"{own} has a negative standard error, or an interval without width")
-        for effect in entry.get("effects", {}).values():
-            require_lengths(effect["by_log"], [k], f"{own}.effects")
-            table = effect.get("next_interval_at", {} if effect["is_used"] else None)
-            for key in ("at", "low", "high") if table is not None else ():
-                size = max(len(table.get("at", ())), 2)
-                require_lengths(table.get(key, ()), [size], f"{own}.effects")
     _check_definite([stated["correlation"]], f"{at}.correlation")
     if sums := stated.get("sums"):
         size = len(sums["h"][0]) if sums["h"] else 0
         for key, shape in (("h", [k, size]), ("H", [k, size * (size + 1) // 2]), ("unit", [k])):
             require_lengths(sums[key], shape, f"{at}.sums.{key}")
         _check_definite(RunSums.from_dict(sums).H, f"{at}.sums.H", least=-_ROUNDING)
-        for covariate in (x for some in sums["covariates"].values() for x in some):
-            require_lengths(covariate["by_log"], [k], f"{at}.sums.covariates")
 
 
 def _check_definite(matrices: ArrayLike, at: str, least: float = 0.0) -> None:

@@ -17,6 +17,7 @@ from robotid.judgement.stated_mass import AGREES, StatedMass, determines_total_m
 from robotid.regressor.constraints import loop_basis, without_forces
 from robotid.regressor.prediction import predict
 from robotid.regressor.torque import joint_torque_regressor
+from robotid.robot.assumed import assumed_masses
 from robotid.robot.parameters import pseudo_inertia
 
 __all__ = ["ScaleCheck", "check_scale", "common_factor", "friction_shares"]
@@ -338,7 +339,7 @@ def check_scale(found: Fit) -> ScaleCheck:
     scale, payload, left = _with_payload(of_urdf, of_result, last)
     rest = float(np.linalg.norm(of_result - factor * of_urdf) / np.linalg.norm(of_result))
     plain = replace(plain, gravity=gravity, gravity_error=error)
-    of_assumed = found.prior[:size:10][[body in model.assumed for body in model.layout.bodies]]
+    of_assumed = found.prior[:size:10][np.isin(model.layout.bodies, assumed_masses(model))]
     if of_assumed.sum() > AGREES * before:
         return replace(plain, assumed=len(of_assumed))
     return replace(

@@ -13,7 +13,7 @@ from robotid.robot.geometry import body_frames, body_points
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import inertial_from_pseudo_inertia, pseudo_inertia
 
-__all__ = ["REASONS", "with_assumed_inertials"]
+__all__ = ["REASONS", "assumed_masses", "with_assumed_inertials"]
 
 #: Why the inertial of a body is assumed, by the code of the finding.
 REASONS = MappingProxyType({
@@ -93,6 +93,15 @@ def with_assumed_inertials(model: RobotModel) -> RobotModel:
         return model
     filled = model.with_parameters(inertial_from_pseudo_inertia(J).reshape(-1) + held)
     return replace(filled, assumed=reasons)
+
+
+def assumed_masses(model: RobotModel) -> tuple[str, ...]:
+    """Return the bodies whose mass is assumed: the URDF's is no evidence.
+
+    Args:
+        model: The robot.
+    """
+    return tuple(x for x, code in model.assumed.items() if code != "not_positive_definite")
 
 
 def _reasons(model: RobotModel, J: Array, sides: dict[str, Array]) -> dict[str, str]:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from robotid.findings import Finding, listed
-from robotid.robot.assumed import REASONS
+from robotid.robot.assumed import REASONS, assumed_masses
 from robotid.robot.bodies import link_places
 from robotid.robot.model import RobotModel
 from robotid.robot.tree import Inertial
@@ -83,7 +83,7 @@ def explained_by_assumed(model: RobotModel, finding: Finding) -> bool:
     named = finding.where.rpartition(": ")[2].split(", ")
     rows = [name in named for name in model.row_names]
     carried = model.support()[rows if any(rows) else slice(None)].any(axis=0)
-    return bool((carried & model.layout.owned_by(tuple(model.assumed))).any())
+    return bool((carried & model.layout.owned_by(assumed_masses(model))).any())
 
 
 def impossible_inertials(model: RobotModel) -> list[Finding]:
