@@ -138,9 +138,7 @@ def choose(
     ]
 
 
-def impossible(
-    simulator: LoopSimulator, theta: Array, tried: Sequence[Tried]
-) -> dict[Tried, str]:
+def impossible(simulator: LoopSimulator, theta: Array, tried: Sequence[Tried]) -> dict[Tried, str]:
     """Return the weakest chosen term of each joint whose friction is negative, and the figures.
 
     Negative friction at some position would drive the joint: no simulation that comes to rest there
@@ -151,10 +149,10 @@ def impossible(
         theta: Values of its free parameters, shape (c,).
         tried: The candidates.
     """
-    model, loops = simulator.robot.model, simulator.loops(theta)
     weakest = {t.joint: t for t in sorted(tried, key=lambda t: -t.gain) if t.is_chosen}
     found = {}
     for t in weakest.values():
+        model, loops = simulator.robot.model, simulator.loops(theta)
         j = model.joints.index(t.joint)
         own = np.concatenate([w.log.q[w.counted, j] for w in simulator.windows])
         q = np.linspace(own.min(), own.max(), _POSITIONS)
