@@ -1,7 +1,7 @@
 """Columns of a table: positions, velocities, torques and commands of the joints by their names."""
 
 import difflib
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal, TypeAlias
 
@@ -68,6 +68,7 @@ class Finder:
         notes: Notes for the user.
         seen: Columns that are read or named in a note.
         passive: Joints without a drive, which need no torque.
+        moves: Returns whether the position in a column of a joint changes.
     """
 
     where: str
@@ -81,6 +82,7 @@ class Finder:
     notes: list[str] = field(default_factory=list)
     seen: set[str] = field(default_factory=set)
     passive: Collection[str] = ()
+    moves: Callable[[str, str], bool] = lambda _joint, _column: False
 
     def find_all(self) -> dict[str, list[str]]:
         """Return the columns to read: time, q, required quantities, complete optional ones."""
@@ -394,6 +396,17 @@ class Finder:
         at_rest = [joint for joint in self.joints if joint in joints]
         if len(at_rest) == len(self.joints):
             return f"Record the {NOUNS[kind.removesuffix('m')]} of each joint"
+        moving = [
+            joint
+            for joint in at_rest
+            if kind == "tau" and (column := self._find_of("q", joint)) and self.moves(joint, column)
+        ]
+        if moving:
+            names = ", ".join(map(quoted, moving))
+            return (
+                f"If {listed(moving)}, which moves in the log, has no drive, state passive = "
+                f"[{names}] in the job file; else record its torque"
+            )
         locks = " ".join(f"--lock {joint}=0" for joint in at_rest)
         locked = ", ".join(f"{toml_key(joint)} = 0" for joint in at_rest)
         one = len(at_rest) == 1

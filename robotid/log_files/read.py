@@ -45,6 +45,7 @@ _SI = LogUnits()
 _WHOLE = LogSource()
 _SPARSE = 0.02  # share of rows without a value from which a column has another rate
 _BASE = BaseColumns()
+_STILL = 0.02  # range of the position of a joint at rest [rad or m]
 
 
 def read_log(
@@ -366,9 +367,14 @@ def lay_out(
     base = replace(base.present([*opened.names, *stated]), twist=twist)
     notes = [*opened.notes, *_notes_of_sensors(where, opened, of_base, base)]
     of_joints = {x: y for x, y in stated.items() if y not in chain.from_iterable(of_base.values())}
+
+    def moves(joint: str, column: str) -> bool:
+        _, scale = units.scale(joint, is_angle=joint not in prismatic)
+        return bool(scale * np.ptp(opened.read([column])[column]) > _STILL)
+
     finder = Finder(
         where, opened.names, of_joints, tuple(joints), gains or {}, source, tuple(transmissions),
-        needs, notes, passive=passive,
+        needs, notes, passive=passive, moves=moves,
     )  # fmt: skip
     joints = [joint for joint in joints if joint not in passive or finder.has_position(joint)]
     finder = replace(finder, joints=tuple(joints))
