@@ -68,7 +68,7 @@ class Finder:
         notes: Notes for the user.
         seen: Columns that are read or named in a note.
         passive: Joints without a drive, which need no torque.
-        moves: Returns whether the position in a column of a joint changes.
+        moves: Returns whether the position of a joint, in a column, changes; None if unknown.
     """
 
     where: str
@@ -82,7 +82,7 @@ class Finder:
     notes: list[str] = field(default_factory=list)
     seen: set[str] = field(default_factory=set)
     passive: Collection[str] = ()
-    moves: Callable[[str, str], bool] = lambda _joint, _column: False
+    moves: Callable[[str, str], bool] | None = None
 
     def find_all(self) -> dict[str, list[str]]:
         """Return the columns to read: time, q, required quantities, complete optional ones."""
@@ -396,11 +396,10 @@ class Finder:
         at_rest = [joint for joint in self.joints if joint in joints]
         if len(at_rest) == len(self.joints):
             return f"Record the {NOUNS[kind.removesuffix('m')]} of each joint"
-        moving = [
-            joint
-            for joint in at_rest
-            if kind == "tau" and (column := self._find_of("q", joint)) and self.moves(joint, column)
-        ]
+        moving = []
+        if kind == "tau" and (moves := self.moves) is not None:
+            columns = {joint: self._find_of("q", joint) for joint in at_rest}
+            moving = [joint for joint, column in columns.items() if column and moves(joint, column)]
         if moving:
             names = ", ".join(map(quoted, moving))
             return (

@@ -8,6 +8,7 @@ columns of the motors are read instead, as `qm_<motor>` and `taum_<motor>` [N m]
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import chain
 from pathlib import Path
 from typing import Any, get_args
@@ -367,14 +368,9 @@ def lay_out(
     base = replace(base.present([*opened.names, *stated]), twist=twist)
     notes = [*opened.notes, *_notes_of_sensors(where, opened, of_base, base)]
     of_joints = {x: y for x, y in stated.items() if y not in chain.from_iterable(of_base.values())}
-
-    def moves(joint: str, column: str) -> bool:
-        _, scale = units.scale(joint, is_angle=joint not in prismatic)
-        return bool(scale * np.ptp(opened.read([column])[column]) > _STILL)
-
     finder = Finder(
         where, opened.names, of_joints, tuple(joints), gains or {}, source, tuple(transmissions),
-        needs, notes, passive=passive, moves=moves,
+        needs, notes, passive=passive, moves=partial(_moves, opened, units, prismatic),
     )  # fmt: skip
     joints = [joint for joint in joints if joint not in passive or finder.has_position(joint)]
     finder = replace(finder, joints=tuple(joints))
@@ -398,6 +394,14 @@ def lay_out(
         temperatures=finder.find_temperatures(),
     )
     return layout, with_even_stamps(opened, found["time"][0], source.stamp)
+
+
+def _moves(
+    table: Table, units: LogUnits, prismatic: Collection[str], joint: str, column: str
+) -> bool:
+    """Return whether the position of a joint changes in its column."""
+    _, scale = units.scale(joint, is_angle=joint not in prismatic)
+    return bool(scale * np.ptp(table.read([column])[column]) > _STILL)
 
 
 def _notes_of_sensors(

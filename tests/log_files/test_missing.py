@@ -16,7 +16,7 @@ SOUGHT = ", ".join(f"'tau_{joint}'" for joint in UR)
 
 def said(names, joints=UR, **reading):
     """Return the error of a log with these columns."""
-    frame = pd.DataFrame({name: np.arange(3.0) for name in ("time", *names)})
+    frame = pd.DataFrame({name: np.zeros(3) for name in names} | {"time": np.arange(3.0)})
     with pytest.raises(DataError) as caught:
         read_log(frame, joints, **reading)
     assert caught.value.code == "missing_column"
