@@ -291,6 +291,7 @@ def _unequal_gains(found: LoopIdentification) -> Iterator[Finding]:
 def _limits_found(found: LoopIdentification) -> Iterator[Finding]:
     """Yield the estimated torque limits of the drives, except those at a bound."""
     estimate = found.estimate
+    is_expected = found.loop.limit == "find"
     for free, value, error in zip(
         found.fit.simulator.free_parameters, estimate.theta, estimate.std_error, strict=True
     ):
@@ -299,11 +300,11 @@ def _limits_found(found: LoopIdentification) -> Iterator[Finding]:
             unit = "N" if joint.type == "prismatic" else "N m"
             yield Finding(
                 "limit",
-                "note",
+                "note" if is_expected else "warning",
                 joint.name,
-                f"{joint.name}: the torque limit of the drive is estimated as {value:.3g} +- "
-                f"{error:.2g} {unit}; at the limit the joint does not follow its command. If you "
-                "know the limit, state it in [controller]",
+                f"{joint.name}: its drive saturates. The torque limit of the drive is estimated as "
+                f"{value:.3g} +- {error:.2g} {unit}; at the limit the joint does not follow its "
+                "command. If you know the limit, state it in [controller]",
                 {"limit": float(value), "std_error": float(error)},
             )
 
@@ -352,8 +353,8 @@ def _friction_found(tried: Tried) -> Finding:
     if not tried.dropped:
         return Finding("friction_found", "note", tried.joint, message, figures)
     message += (
-        f", but with it {tried.dropped}. The fit is without this term: another effect than friction "
-        "acts on the joint. Check the mounting of the base, the torque limit and the zeros"
+        f", but with it {tried.dropped}. The term was dropped: another effect than friction acts "
+        "on the joint. Check the mounting of the base, the torque limit and the zeros"
     )
     return Finding("friction_dropped", "warning", tried.joint, message, figures)
 

@@ -1,7 +1,10 @@
 """The stages of a closed-loop identification: initial values, fit, friction terms, step size."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from functools import cache
+from itertools import product
 
 import numpy as np
 
@@ -36,6 +39,8 @@ from robotid.exceptions import DataError, NotConvergedError, SettingsError
 from robotid.findings import listed
 from robotid.fitting.settings import SimulationSettings
 from robotid.identification.result import Identification
+from robotid.judgement.evidence import BEATEN
+from robotid.judgement.positions import GOOD, HARDLY
 from robotid.logs.data import Log
 from robotid.logs.measured_velocity import is_trustworthy
 from robotid.logs.settings import SignalSettings
@@ -54,6 +59,7 @@ STAGES = (
 
 _NAMES = {"output": "output error", "input": "input error", "direct": "direct input error"}
 _WHITE = 2.0  # cut-off of the whitening, relative to 1 / time constant of the loop
+_SCALES = (1.0, 0.1, 10.0, 0.01, 1e3)  # of torques with unknown gains; at 1e3 bodies hardly count
 _FEW = 12  # number of windows of the first fit
 _SOME = 48  # number of windows of the fits before the last improvement of initial states
 _STARTS = 3  # number of fits with improved initial states of the windows
@@ -123,13 +129,15 @@ def fit_loops(
     _check_settings(model, logs, loop, settings)
     initialise = _initialise_from_torque if loop.kind == "torque" else _initialise_from_commands
     initialised = initialise(model, logs, loop, settings, signals, progress)
+    initialised, theta = _best_start(initialised)
     simulator, estimator = initialised.simulator, initialised.estimator
-    theta = _with_bodies_of_urdf(simulator, estimator)
     simulator = replace(simulator, error=settings.error)
     is_plain, every = settings.error == "output" and initialised.linear is None, simulator.windows
     if is_plain:
         simulator = replace(simulator, windows=_few(every, _SOME))
     for left in reversed(range(_STARTS)):
+        if not left and np.any(initialised.limited):
+            simulator, theta = _with_limits_reached(initialised, simulator, theta)
         if not left and len(simulator.windows) < len(every):
             simulator = replace(simulator, windows=every).with_better_start(theta)
         simulator = simulator.with_better_start(theta)
@@ -169,9 +177,9 @@ def fit_loops(
         for t, why in failing.items():
             dropped[f"{t.joint}.{t.terms[0]}"] = replace(t, is_chosen=False, dropped=why)
     scale = None
-    if initialised.linear is None and simulator.error == "output":
-        if is_stated(loop.kp, model).all():
-            scale = gain_scale(simulator, estimator, estimate)
+    is_loop = initialised.linear is None and simulator.error == "output"
+    if is_loop and is_stated(loop.kp, model).all():
+        scale = gain_scale(simulator, estimator, estimate)
     others = (initialised.encoders, tuple(tried), initialised.linear, scale)
     return Fitted(simulator, estimate, initialised.plain, *others)
 
@@ -221,6 +229,86 @@ def _with_chosen_terms(
     return simulator, estimate, [*tried, *dropped.values()]
 
 
+def _best_start(initial: "_Initial") -> tuple["_Initial", Array]:
+    """Return the initial values with the best first fit, and its parameters, shape (c,).
+
+    Others are tried where the error of a joint is larger than that of a good fit and hardly smaller
+    than that of its second-order model: other scales of the torques, and torque limits. Each group
+    of joints with one gain takes its best. A fit that cannot be simulated is no candidate.
+    """
+    if initial.vary is None or initial.plain is None:
+        return initial, _with_bodies_of_urdf(initial.simulator, initial.estimator)
+    n, groups = len(initial.torque), np.array(initial.groups)
+    factor, limited, best = np.ones(n), np.zeros(n, dtype=bool), np.full(n, np.inf)
+    fits, failures = [], []
+    second_order = _errors_of(initial.simulator, initial.plain.loops)
+    for has_limit, scale in product((False, True), initial.scales):
+        try:
+            fits.append(_first_fit(initial.vary(np.full(n, scale), np.full(n, has_limit))))
+        except NotConvergedError as failure:
+            failures.append(failure)
+            continue
+        error = fits[-1][2]
+        for own in (groups == group for group in dict.fromkeys(initial.groups)):
+            if np.mean(error[own] / best[own]) < 1.0 / BEATEN:
+                factor[own], limited[own], best[own] = scale, has_limit, error[own]
+        if not ((best > GOOD) & (best > HARDLY * second_order)).any():
+            break
+    if not fits:
+        raise failures[0]
+    chosen = next((fit for fit in fits if fit[0].starts_as(factor, limited)), None)
+    if chosen is None:  # several groups, each from its best
+        with suppress(NotConvergedError):
+            chosen = _first_fit(initial.vary(factor, limited))
+    found, theta, _ = chosen or min(fits, key=lambda fit: float(fit[2].max()))
+    return found, theta
+
+
+def _with_limits_reached(
+    initial: "_Initial", simulator: LoopSimulator, theta: Array
+) -> tuple[LoopSimulator, Array]:
+    """Return the simulator without limits that were not asked for and do not change the motion.
+
+    A speed gain that only a limit distinguishes from viscous friction is part of it without.
+    """
+    loops = simulator.loops(theta)
+    unlimited = replace(loops, limit=np.where(initial.limited, np.inf, loops.limit))
+    matters = _errors_of(simulator, unlimited) > BEATEN * _errors_of(simulator, loops)
+    if initial.vary is None or (matters | ~initial.limited).all():
+        return simulator, theta
+    other = initial.vary(initial.factor, initial.limited & matters).simulator
+    values = dict(zip(simulator.names, theta.tolist(), strict=True))
+    for name in {*simulator.names}.difference(other.names):
+        owner, _, what = name.rpartition(".")
+        if what == "kd":
+            values[f"{owner}.viscous"] += values[name]
+    kept = tuple(free for free in simulator.free_parameters if free.name in other.names)
+    base = replace(simulator.base, limit=other.base.limit)
+    simulator = replace(simulator, base=base, free_parameters=kept)
+    return simulator, np.array([values[name] for name in simulator.names])
+
+
+def _first_fit(initial: "_Initial") -> tuple["_Initial", Array, Array]:
+    """Return initial values, the parameters of a first fit, and its errors of positions."""
+    theta = _with_bodies_of_urdf(initial.simulator, initial.estimator)
+    return initial, theta, _errors_of(initial.simulator, initial.simulator.loops(theta))
+
+
+def _errors_of(simulator: LoopSimulator, loops: Loops) -> Array:
+    """Return the errors of simulated positions in few windows, shape (n,) [% of RMS motion].
+
+    The error of joints that are not commanded to move is 1 %.
+    """
+    outs = simulator.robot.roll_out(loops, _few(simulator.windows))
+    q, q_ref = (
+        np.concatenate([getattr(out.window.log, name)[out.window.counted] for out in outs])
+        for name in ("q", "q_ref")
+    )
+    error = q - np.concatenate([out.q for out in outs])
+    share: Array = 100.0 * np.sqrt(np.mean(error**2, axis=0)) / np.maximum(q.std(axis=0), 1e-12)
+    return np.where(np.ptp(q_ref, axis=0) > 0.0, share, 1.0)
+
+
 def _with_bodies_of_urdf(simulator: LoopSimulator, estimator: OutputError) -> Array:
     """Return the parameters of a first fit of the drives alone to few windows, shape (c,).
 
@@ -247,6 +335,17 @@ class _Initial:
     encoders: Encoders
     plain: SecondOrder | None = None
     linear: Identification | None = None
+    groups: tuple[str, ...] = ()  # of joints with one gain
+    scales: tuple[float, ...] = (1.0,)  # of the torques, from which fits may start
+    factor: Array = field(default_factory=lambda: np.ones(1))  # of the scale of torques, (n,)
+    #: Whether a limit is fitted that was not asked for, shape (n,), bool.
+    limited: Array = field(default_factory=lambda: np.zeros(1, dtype=bool))
+    #: Returns other initial values by scales, shape (n,), and by which torque limits are fitted.
+    vary: "Callable[[Array, Array], _Initial] | None" = None
+
+    def starts_as(self, factor: Array, limited: Array) -> bool:
+        """Return whether these are its scales and its joints with limits."""
+        return bool((self.factor == factor).all() and (self.limited == limited).all())
 
     @property
     def share(self) -> float:
@@ -279,30 +378,49 @@ def _initialise_from_commands(
         )
         has_gain, stated = has_gain | (found.kp != stated.kp), found
     report_stage(progress, "trying second-order models", STAGES)
-    plain = fit_second_order(robot, windows, stated, finds_delay=loop.delay is None)
-    groups = groups_of(loop, model.joints, likeness(model))
-    top = _largest_speeds(model, loop, logs)
-    typical = typical_sizes(robot, plain, windows, has_gain, top, groups)
-    finds_limit = (top > 0.0) | (loop.limit == "find")
-    base = first_loops(model, stated, plain, typical, finds_limit)
-    # positions alone determine only the sum of kd and viscous friction
-    finds_kd = uses_torques or all(log.v_ref is not None for log in logs)
-    free_parameters = free_drive_parameters(
-        model, loop, groups, base, typical, finds_kd=finds_kd, finds_limit=finds_limit
+    second_order = cache(
+        lambda finds_limit: fit_second_order(
+            robot, windows, stated, finds_delay=loop.delay is None, finds_limit=finds_limit
+        )
     )
-    free_parameters += free_zeros(model, encoders) if loop.zeros == "find" else []
-    free_parameters += free_body_parameters(robot, settings.bodies) if settings.bodies else []
+    plain, groups = second_order(False), groups_of(loop, model.joints, likeness(model))
+    top = _largest_speeds(model, loop, logs)
+    # positions alone determine only the sum of kd and viscous friction, except at a torque limit
+    finds_kd = uses_torques or all(log.v_ref is not None for log in logs)
     dt = max(float(np.median(np.diff(log.t))) for log in logs)
     most = np.tile(np.exp(-_WHITE * dt / plain.time_constant), 3)  # positions, speeds, torques
     estimator = OutputError(_NAMES[settings.error], settings.whiten, most, progress=progress)
-    simulator = LoopSimulator(
-        robot, windows, base, tuple(free_parameters), velocities=settings.velocities, lag=lag
-    )
+    may_limit = ~is_stated(loop.limit, model) & (loop.limit != "find")
+    scales = (1.0,) if has_gain.all() else _SCALES
+
+    def vary(factor: Array, limited: Array) -> _Initial:
+        limited = limited & may_limit
+        from_limit = limited | (loop.limit == "find")
+        start = plain.replaced(second_order(True), from_limit) if from_limit.any() else plain
+        typical = typical_sizes(robot, start, windows, has_gain, top, groups, factor)
+        finds_limit = (top > 0.0) | from_limit
+        base = first_loops(model, stated, start, typical, finds_limit)
+        by_limit = finds_limit | np.isfinite(stated.limit)
+        free_parameters = free_drive_parameters(
+            model, loop, groups, base, typical,
+            finds_kd=finds_kd | by_limit, finds_limit=finds_limit,
+        )  # fmt: skip
+        free_parameters += free_zeros(model, encoders) if loop.zeros == "find" else []
+        free_parameters += free_body_parameters(robot, settings.bodies) if settings.bodies else []
+        simulator = LoopSimulator(
+            robot, windows, base, tuple(free_parameters), velocities=settings.velocities, lag=lag
+        )
+        if uses_torques and lag is None:
+            rows = torque_rows(identified_rows(with_terms(model, base), logs, signals))
+            simulator = replace(simulator, torque=rows)
+        return _Initial(
+            simulator, estimator, typical.torque, encoders, plain,
+            groups=tuple(groups), scales=scales, factor=factor, limited=limited, vary=vary,
+        )  # fmt: skip
+
     report_stage(progress, "fitting loops", STAGES)
-    if uses_torques and lag is None:
-        rows = torque_rows(identified_rows(with_terms(model, base), logs, signals))
-        simulator = replace(simulator, torque=rows)
-    return _Initial(simulator, estimator, typical.torque, encoders, plain)
+    n = len(model.joints)
+    return vary(np.ones(n), np.zeros(n, dtype=bool))
 
 
 def _initialise_from_torque(

@@ -66,6 +66,7 @@ def typical_sizes(
     has_gain: Array,
     top: Array,
     groups: Sequence[str],
+    factor: Array | float = 1.0,
 ) -> TypicalSizes:
     """Return typical sizes; where a gain is unknown, the inertia of bodies scales all torques.
 
@@ -82,6 +83,7 @@ def typical_sizes(
         has_gain: Whether the gain of a joint is known, shape (n,), bool.
         top: Speeds of joints that run at their largest speed, else 0, shape (n,) [rad/s or m/s].
         groups: Name of the group of each joint.
+        factor: Factor of the scale where the gain is unknown, shape (n,) [-].
     """
     model = robot.model
     q = np.concatenate([w.log.q[w.counted] for w in windows])
@@ -93,10 +95,12 @@ def typical_sizes(
         shown = own & plain.shows_inertia
         if own.any():
             scale[own] = np.median(scale[shown if shown.any() else own])
+    scale = np.where(has_gain, 1.0, factor * scale)
     # friction may hide the inertia in a second-order model
     inertia = np.maximum(plain.inertia * scale, bodies)
     error = np.concatenate([w.log.q_ref[w.counted] for w in windows]) - q  # type: ignore[index]
     unlimited = _LIMITED * plain.loops.kp * np.abs(error).max(axis=0)
+    unlimited = np.minimum(unlimited, plain.loops.limit)
     friction = plain.friction("viscous") * top + plain.friction("coulomb")
     largest = scale * np.where(top > 0.0, np.minimum(friction, unlimited), unlimited)
     return TypicalSizes(inertia, bodies, plain.torque * scale, largest, _speed(windows), scale)
@@ -180,7 +184,7 @@ def free_drive_parameters(
     base: Loops,
     typical: TypicalSizes,
     *,
-    finds_kd: bool,
+    finds_kd: Array | bool,
     finds_limit: Array,
 ) -> list[FreeParameter]:
     """Return the free parameters of drives and loops, with initial values from ``base``.
@@ -191,7 +195,7 @@ def free_drive_parameters(
         groups: Name of the group of each joint.
         base: The initial loops.
         typical: Typical sizes.
-        finds_kd: Whether the logs determine the gains of the speed.
+        finds_kd: Whether the logs determine the gain of the speed of a joint, shape (n,), bool.
         finds_limit: Whether the limit of a joint is fitted, shape (n,), bool.
     """
     members: dict[str, list[int]] = {}

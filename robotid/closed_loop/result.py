@@ -181,6 +181,7 @@ class LoopIdentification(Identified):
         return judge_positions(
             position_metrics(self.model, self.validation or self.fitted, moving=True),
             self.model.joints,
+            fitted=position_metrics(self.model, self.fitted, moving=True),
             is_validation=bool(self.validation),
             is_settled=self.estimate.converged,
             log_errors=self.log_errors,

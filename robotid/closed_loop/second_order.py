@@ -1,9 +1,10 @@
 """The second-order model of each commanded joint, decoupled, with Coulomb friction.
 
-J a + d v + Fc sign(v) + c = kp (q_ref(t - delay) - q) + kd (v_ref - v). It gives the initial values
-of the fit with bodies, and is its baseline.
+J a + d v + Fc sign(v) + c = kp (q_ref(t - delay) - q) + kd (v_ref - v), within a torque limit where
+one is fitted. It gives the initial values of the fit with bodies; without a limit, its baseline.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 
@@ -21,6 +22,7 @@ __all__ = ["SecondOrder", "fit_second_order"]
 _FREQUENCIES = (6.0, 12.0, 24.0, 48.0, 96.0)  # natural frequencies that are tried [rad/s]
 _DAMPINGS = (0.5, 1.5)  # damping ratios that are tried
 _FRICTIONS = (0.05, 0.5)  # Coulomb friction that is tried, over the typical torque
+_LIMITS = (0.6, 0.3, 0.15)  # torque limits that are tried, over the largest torque without a limit
 _DELAYS = (0.0, 0.005, 0.01, 0.02, 0.04, 0.08)  # delays that are tried [s]
 _TRIED = 8  # number of windows of the grid search
 _FITTED = 16  # number of windows of the fit
@@ -76,6 +78,23 @@ class SecondOrder:
         slow: Array = np.maximum(damped, np.sqrt(loops.armature / loops.kp))
         return slow
 
+    def replaced(self, other: "SecondOrder", joints: Array) -> "SecondOrder":
+        """Return the model with the values of another one for some joints.
+
+        Args:
+            other: The other model of the same robot.
+            joints: Which joints, shape (n,), bool.
+        """
+        each = np.repeat(joints, len(_TERMS))
+        changed = {
+            name: np.where(joints, getattr(other.loops, name), getattr(self.loops, name))
+            for name in ("armature", "delay", "limit")
+        }
+        values = np.where(each, other.loops.values, self.loops.values)
+        error = np.where(joints, other.inertia_error, self.inertia_error)
+        loops = replace(self.loops, values=values, **changed)
+        return replace(self, loops=loops, inertia_error=error)
+
     def friction(self, name: str) -> Array:
         """Return the values of one friction term, shape (n,).
 
@@ -88,7 +107,12 @@ class SecondOrder:
 
 
 def fit_second_order(
-    robot: ClosedLoopRobot, windows: tuple[Window, ...], stated: Loops, *, finds_delay: bool
+    robot: ClosedLoopRobot,
+    windows: tuple[Window, ...],
+    stated: Loops,
+    *,
+    finds_delay: bool,
+    finds_limit: bool = False,
 ) -> SecondOrder:
     """Fit the second-order model to windows: a coarse grid for every joint, then least squares.
 
@@ -97,6 +121,7 @@ def fit_second_order(
         windows: Windows of its logs.
         stated: Gains and delay, as far as they are known; kp is 1 where it is not.
         finds_delay: Whether the delay of each joint is fitted.
+        finds_limit: Whether the torque limit of each joint is fitted; else there is none.
 
     Raises:
         NotConvergedError: If no trial can be simulated.
@@ -112,8 +137,10 @@ def fit_second_order(
         terms=(_TERMS,) * n,
         values=np.zeros(n * len(_TERMS)),
     )
-    start = _coarse(robot, windows[:_TRIED], bare, torque, finds_delay)
-    free_parameters = _free_parameters(robot, start, torque, finds_delay)
+    largest = stated.kp * np.abs(error).max(axis=0)
+    limits = [share * largest for share in _LIMITS] if finds_limit else [bare.limit]
+    start = _coarse(robot, windows[:_TRIED], bare, torque, finds_delay, limits)
+    free_parameters = _free_parameters(robot, start, torque, finds_delay, finds_limit)
     some = windows[:: max(1, len(windows) // _FITTED)]
     simulator = LoopSimulator(robot, some, start, free_parameters)
     estimate = OutputError(whitens=False, steps=_STEPS).fit(simulator)
@@ -123,9 +150,9 @@ def fit_second_order(
 
 
 def _free_parameters(
-    robot: ClosedLoopRobot, start: Loops, torque: Array, finds_delay: bool
+    robot: ClosedLoopRobot, start: Loops, torque: Array, finds_delay: bool, finds_limit: bool
 ) -> tuple[FreeParameter, ...]:
-    """Return inertia, friction, offset and delay of each joint as free parameters."""
+    """Return inertia, friction, offset, delay and limit of each joint as free parameters."""
     found = []
     for j, joint in enumerate(robot.model.joints):
         J = start.armature[j]
@@ -138,6 +165,9 @@ def _free_parameters(
             found.append(
                 FreeParameter(f"{joint}.delay", "delay", (j,), float(start.delay[j]), 0.1, 0.0)
             )
+        if finds_limit:
+            F = float(start.limit[j])
+            found.append(FreeParameter(f"{joint}.limit", "limit", (j,), F, 10 * F, _LEAST * F))
     return tuple(found)
 
 
@@ -147,22 +177,22 @@ def _coarse(
     bare: Loops,
     torque: Array,
     finds_delay: bool,
+    limits: Sequence[Array],
 ) -> Loops:
     """Return the best of a grid for each joint: without bodies the joints are decoupled."""
     n = len(bare.kp)
     best, found = np.full(n, np.inf), bare
     delays = np.array(_DELAYS) if finds_delay else np.zeros(1)
     first = float(delays[min(1, len(delays) - 1)])
-    tries = [(w, z, f, first) for w, z, f in product(_FREQUENCIES, _DAMPINGS, _FRICTIONS)]
-    for w, z, f, delay in tries:
+    for w, z, f, limit in product(_FREQUENCIES, _DAMPINGS, _FRICTIONS, limits):
         J = bare.kp / w**2
         viscous = np.maximum(2 * z * w * J - bare.kd, 0.0)
         values = np.column_stack([viscous, f * torque, np.zeros(n)]).reshape(-1)
-        delays_ = np.full(n, delay) if finds_delay else bare.delay
-        trial = replace(bare, armature=J, values=values, delay=delays_)
+        delay = np.full(n, first) if finds_delay else bare.delay
+        trial = replace(bare, armature=J, values=values, delay=delay, limit=limit)
         best, found = _better(robot, windows, trial, best, found)
-    for delay in delays if finds_delay else ():
-        best, found = _better(robot, windows, replace(found, delay=np.full(n, delay)), best, found)
+    for every in delays if finds_delay else ():
+        best, found = _better(robot, windows, replace(found, delay=np.full(n, every)), best, found)
     if not np.isfinite(best).all():
         rate = "" if bare.rate is None else f", and another rate than {bare.rate:g} Hz or none,"
         raise NotConvergedError(
@@ -189,5 +219,6 @@ def _better(
         found,
         armature=np.where(better, trial.armature, found.armature),
         delay=np.where(better, trial.delay, found.delay),
+        limit=np.where(better, trial.limit, found.limit),
         values=values,
     )

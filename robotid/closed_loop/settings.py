@@ -42,7 +42,7 @@ class LoopSettings(Settings):
     limit: PerJoint | str | None = setting(
         None,
         "torque limit of the drive [N m or N], for all joints or by joint; if not stated, it is "
-        "fitted for joints that reach a constant largest speed; 'find': fitted for every joint",
+        "fitted where the drive saturates; 'find': fitted for every joint",
         reads=(int, float, dict, str),
         within=GAIN["within"],
         among=("find",),

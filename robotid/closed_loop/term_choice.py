@@ -149,10 +149,10 @@ def impossible(simulator: LoopSimulator, theta: Array, tried: Sequence[Tried]) -
         theta: Values of its free parameters, shape (c,).
         tried: The candidates.
     """
-    model, loops = simulator.robot.model, simulator.loops(theta)
     weakest = {t.joint: t for t in sorted(tried, key=lambda t: -t.gain) if t.is_chosen}
     found = {}
     for t in weakest.values():
+        model, loops = simulator.robot.model, simulator.loops(theta)
         j = model.joints.index(t.joint)
         own = np.concatenate([w.log.q[w.counted, j] for w in simulator.windows])
         q = np.linspace(own.min(), own.max(), _POSITIONS)

@@ -189,7 +189,8 @@ def _alterations(model: RobotModel, pi: Array, sample: Sample) -> Iterator[_Alte
         backlash = 0.5 * Z * sample.motions[j].direction[:, None, None]
         yield _Alteration("lost_motion", joint, backlash, 0.005, _lost_motion(joint, unit))
         yield _Alteration("angle_scale", joint, moved(only, none), 0.02, _scale(f"q_{joint}"))
-        yield _Alteration("torque_scale", joint, (tau * only)[..., None], 0.05, _gain(joint))
+        if sample.torque[j]:  # a torque of 0 has no scale
+            yield _Alteration("torque_scale", joint, (tau * only)[..., None], 0.05, _gain(joint))
     for first in range(1, n - 1):  # the drives of a wrist are of the same type
         names = listed(model.joints[first:])
         Z = (tau * (np.arange(n) >= first))[..., None]

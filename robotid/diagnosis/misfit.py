@@ -102,8 +102,8 @@ def find_misfits(sample: "Sample | None") -> tuple[Misfit, ...]:
 def _of_joint(sample: Sample, j: int) -> Iterator[Misfit]:
     """Yield the terms that a joint's drive model lacks, one after the other."""
     motion = sample.motions[j]
-    if not sample.weight[: sample.rows, j].any():
-        return
+    if not sample.weight[: sample.rows, j].any() or not sample.torque[j]:
+        return  # of a torque of 0 there is no relative error
     fitted = slice(sample.rows)
     periodic = ripples(motion.at(fitted), sample.weight[fitted, j], sample.r[fitted, j])
     every = (*CANDIDATES, *couplings(motion), *periodic)

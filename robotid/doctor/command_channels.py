@@ -380,9 +380,9 @@ def _slow(log: Log, loops: Sequence[_Loop]) -> Iterator[Finding]:
     least, most = min(low for low, _ in ranges), max(high for _, high in ranges)
     message = (
         f"the command of {listed(names)} is too slow to identify the delay: the joints follow it "
-        f"up to {fastest:.2g} Hz, the largest excited frequency. Any delay from "
-        f"{1e3 * least:.0f} to {1e3 * most:.0f} ms is consistent with this, with more or less "
-        "damping. Record a chirp beyond the bandwidth of the loop (a response of 70 %), or steps"
+        f"up to {fastest:.2g} Hz, the largest excited frequency. Any delay up to "
+        f"{1e3 * most:.0f} ms is consistent with this, with more or less damping, friction or "
+        "saturation. Record a chirp beyond the bandwidth of the loop (a response of 70 %), or steps"
     )
     part = "" if len(names) == len(log.joints) else listed(names)
     yield log_finding(

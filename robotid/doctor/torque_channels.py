@@ -6,7 +6,8 @@ import numpy as np
 
 from robotid._typing import Array
 from robotid.doctor.clock import runs_of
-from robotid.findings import Finding, listed, log_finding
+from robotid.doctor.locked_joints import STILL
+from robotid.findings import Finding, listed, log_finding, quoted
 from robotid.logs.data import Log
 from robotid.logs.measured_velocity import COARSE, quantum
 
@@ -34,12 +35,13 @@ def check_torque_channels(log: Log) -> Iterator[Finding]:
     """
     moving = np.append((np.diff(log.q, axis=0) != 0).any(axis=1), False)
     for joint, x in zip(log.joints, log.tau.T, strict=True):
-        yield from _clipping(log, joint, x, moving)
+        own = bool(np.ptp(log.q[:, log.joints.index(joint)]) > STILL)
+        yield from _clipping(log, joint, x, moving, moves=own)
     yield from _unsigned(log)
     yield from _held(log)
 
 
-def _clipping(log: Log, joint: str, x: Array, moving: Array) -> Iterator[Finding]:
+def _clipping(log: Log, joint: str, x: Array, moving: Array, *, moves: bool) -> Iterator[Finding]:
     """Yield a torque that is at a limit, or constant, in rows where the robot moves."""
     if moving.any() and np.ptp(x) == 0:
         value = float(x[0]) + 0.0  # no -0
@@ -48,6 +50,12 @@ def _clipping(log: Log, joint: str, x: Array, moving: Array) -> Iterator[Finding
             "is dead. The drive of this joint cannot be identified; log "
             f"tau_{joint}, or leave the joint out"
         )
+        if moves and value == 0.0:
+            message = (
+                f"the torque of {joint} is 0 in every row while the joint moves: it has no drive, "
+                f"or the channel is dead. If it has no drive, state passive = [{quoted(joint)}] in "
+                f"the job file; else log tau_{joint}"
+            )
         yield log_finding(log.name, "constant_torque", "warning", message, joint, value=value)
         return
     step = quantum(x)

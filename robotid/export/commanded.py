@@ -129,10 +129,11 @@ def loops_of(
 
 
 def limit_of(drive: CommandedDrive, joint: Joint) -> float:
-    """Return the torque limit of a drive, the smaller of controller and URDF; inf without limits.
+    """Return the torque limit of a drive; the URDF's where none was stated or found, else inf.
 
     Args:
         drive: The drive.
         joint: Its joint in the URDF.
     """
-    return min(drive.effort_limit, joint.effort if joint.effort > 0 else np.inf)
+    stated = joint.effort if joint.effort > 0 else np.inf
+    return drive.effort_limit if np.isfinite(drive.effort_limit) else stated

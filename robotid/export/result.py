@@ -72,13 +72,6 @@ _RECORDING = {
     "signals": TABLE,
 }
 _ROUNDING = 1e-9  # [-] of eigenvalues that may be 0
-_EFFECT = {
-    **dict.fromkeys(("slope", "std_error", "mean"), NUMBER),
-    "unit": TEXT,
-    "is_used": FLAG,
-    "by_log": [NUMBER],
-    "next_interval_at?": {"at": [NUMBER], "low": [NUMBER], "high": [NUMBER]},
-}
 _VARIATION = {
     "logs": [TEXT],
     "parameters": {
@@ -87,7 +80,6 @@ _VARIATION = {
             "next_interval": [NUMBER] * 2,
             "seen_interval?": [NUMBER] * 2,
             "next_quantiles": [NUMBER] * len(SCORES),
-            "effects?": {...: _EFFECT},
         }
     },
     "correlation": [[NUMBER]],

@@ -293,8 +293,9 @@ def _score(
         part = motion if stop - start == len(motion.t) else motion.part(start, stop)
         shown = ((part, mask[start:stop], stored),)
     recorded = np.hstack([rows.positions, rows.torques])
+    measured = mask & [name not in model.passive for name in model.row_names]
     return _Score(
-        sums={x: TorqueSums.of(motion.tau, torques[x], mask, baselines) for x in parameters},
+        sums={x: TorqueSums.of(motion.tau, torques[x], measured, baselines) for x in parameters},
         smooth=len(motion.t),
         used=int(mask.sum()),
         segments=frozenset(np.unique(motion.segment).tolist()),

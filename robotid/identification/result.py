@@ -222,10 +222,11 @@ class Identification(Fit):
     def verdict(self) -> Verdict:
         """Verdict on the result, with reasons."""
         logs = [e.recording.log for e in (*self.fitted, *self.validation)]
+        driven = [joint for joint in self.model.joints if joint not in self.model.passive]
         predictions = Predictions(
             self.metrics(),
             self.predictions,
-            self.model.joints if any(log.has_torque for log in logs) else (),
+            driven if any(log.has_torque for log in logs) else (),
             refitted=[e.recording.name for e in self.refitted],
             hidden=hidden_joints(self.model, self.fitted),
         )

@@ -6,7 +6,7 @@ from functools import cached_property
 
 import numpy as np
 
-from robotid.findings import listed
+from robotid.findings import listed, quoted
 from robotid.fitting.metrics import JointMetrics, Metrics
 
 __all__ = [
@@ -249,7 +249,10 @@ def _judge_joint(
     error = error_of(measured)
     urdf = measured.baselines.get("urdf")
     if measured.relative_error_pct is None:
-        return [f"{joint}: the torque is 0 throughout {log}: not evaluated"], []
+        return [
+            f"{joint}: the torque is 0 throughout {log}: not evaluated. If the joint has no drive, "
+            f"state passive = [{quoted(joint)}] in the job file"
+        ], []
     if not measured.better_than_constant and not joint.startswith(_BASE):  # its weight is constant
         constant = error / np.sqrt(1.0 - measured.r2)
         why = f"error {error:.1f} %; a constant would give {constant:.1f} %"

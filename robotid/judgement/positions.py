@@ -9,10 +9,13 @@ from robotid.judgement.evidence import BEATEN, error_of
 from robotid.judgement.uses import uses_of_motion
 from robotid.judgement.verdict import JointVerdict, Verdict, concluded, on_joint
 
-__all__ = ["GOOD", "POOR", "judge_positions"]
+__all__ = ["GOOD", "HARDLY", "POOR", "judge_positions"]
 
 #: [%] simulated position error of a joint on validation logs: limits of "good" and "usable".
 GOOD, POOR = 5.0, 30.0
+#: Error over that of the second-order model from which it is hardly smaller: half the squares.
+HARDLY = 0.7
+_FITTED = 15.0  # [%] ... on fitted logs: then the model lacks an effect if this large
 #: Simpler models, by name of the baseline; "urdf" has fitted drives where torques are the input.
 _SIMPLER = {
     "command": "the command itself",
@@ -28,6 +31,7 @@ def judge_positions(
     metrics: Metrics,
     joints: Sequence[str],
     *,
+    fitted: Metrics | None = None,
     is_validation: bool,
     is_settled: bool = True,
     log_errors: Sequence[str] = (),
@@ -40,6 +44,7 @@ def judge_positions(
     Args:
         metrics: Position errors over all logs together, of the joints commanded to move.
         joints: Names of the model's joints; one without metrics is not evaluated.
+        fitted: Position errors over the fitted logs; None if not compared.
         is_validation: Whether the logs are validation logs: not fitted.
         is_settled: Whether the fit has converged.
         log_errors: Faults of the logs that make the result wrong.
@@ -47,8 +52,10 @@ def judge_positions(
         scale: What the scale of all parameters depends on, if no measurement verifies it.
         knows_torques: Whether measured torques were fitted: they determine the scale.
     """
+    own = {} if fitted is None else fitted.per_joint
     found = {
-        joint: _judge_joint(joint, metrics.per_joint.get(joint), is_validation) for joint in joints
+        joint: _judge_joint(joint, metrics.per_joint.get(joint), own.get(joint), is_validation)
+        for joint in joints
     }
     worst_first = sorted(
         found, key=lambda j: -error_of(metrics.per_joint[j]) if j in metrics.per_joint else 0.0
@@ -81,8 +88,20 @@ def judge_positions(
     return replace(verdict, use_for=uses)
 
 
-def _judge_joint(joint: str, measured: JointMetrics | None, is_validation: bool) -> JointVerdict:
-    """Return the verdict on one joint; ``measured`` is None if no log commands it to move."""
+def _judge_joint(
+    joint: str, measured: JointMetrics | None, fitted: JointMetrics | None, is_validation: bool
+) -> JointVerdict:
+    """Return the verdict on one joint; metrics are None if no log commands it to move."""
+    simple = None if fitted is None else fitted.baselines.get("second_order")
+    if fitted is not None and simple is not None:
+        own = error_of(fitted)
+        if own > max(_FITTED, HARDLY * simple):
+            lacking = (
+                f"{joint}: simulated position error {own:.2g} % of its RMS motion on the fitted "
+                f"logs, {simple:.2g} % with a second-order model: the model lacks an effect of "
+                "this joint, such as a torque limit"
+            )
+            return on_joint([lacking], [], is_tested=is_validation, checked=lacking)
     if measured is None:
         still = f"{joint}: commanded to rest in all logs: not evaluated"
         return on_joint([], [], is_tested=False, checked=still)

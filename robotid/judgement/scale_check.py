@@ -381,7 +381,7 @@ def common_factor(ratios: Array, sensitivity: Array, inertial: Array) -> tuple[f
 
 
 def friction_shares(found: Fit) -> dict[str, float]:
-    """Return the share of friction in the RMS torque of each joint [-].
+    """Return the share of friction in the RMS torque of each joint [-]; 0 of a torque that is 0.
 
     Args:
         found: The fit.
@@ -392,7 +392,8 @@ def friction_shares(found: Fit) -> dict[str, float]:
     motions = [e.recording.trajectory for e in found.fitted]
     torque = np.vstack([predict(found.model, [pi], motion)[0] for motion in motions])
     measured = np.vstack([motion.tau for motion in motions])
-    share = np.linalg.norm(torque, axis=0) / np.maximum(np.linalg.norm(measured, axis=0), 1e-300)
+    torque, measured = np.linalg.norm([torque, measured], axis=1)
+    share = np.divide(torque, measured, where=measured > 0.0, out=np.zeros_like(torque))
     return dict(zip(found.model.row_names, share.tolist(), strict=True))
 
 

@@ -74,6 +74,8 @@ def rescaled_findings(fit: Fit, loaded: Collection[str] = ()) -> Iterator[Findin
             measured = e.metrics["estimate"].per_joint.get(joint)
             if joint not in fit.model.joints or measured is None or error_of(measured) <= GOOD:
                 continue
+            if measured.relative_error_pct is None:
+                continue  # the torque is 0: it has no gain
             tau, own = motion.tau[mask[:, k], k], e.torques["estimate"][mask[:, k], k]
             factor = float(own @ tau) / max(float(own @ own), 1e-300)
             left = float(np.sum((tau - factor * own) ** 2) / np.sum((tau - own) ** 2))

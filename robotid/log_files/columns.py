@@ -1,6 +1,6 @@
 """Columns of a table: positions, velocities, torques and commands of the joints by their names."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Literal, TypeAlias
@@ -70,6 +70,7 @@ class Finder:
         seen: Columns that are read or named in a note.
         passive: Joints without a drive, which need no torque.
         robot: All movable joints of the robot, in the order of the URDF.
+        moves: Returns whether the position of a joint, in a column, changes; None if unknown.
     """
 
     where: str
@@ -84,6 +85,7 @@ class Finder:
     seen: set[str] = field(default_factory=set)
     passive: Collection[str] = ()
     robot: Sequence[Joint] = ()
+    moves: Callable[[str, str], bool] | None = None
 
     def find_all(self) -> dict[str, list[str]]:
         """Return the columns to read: time, q, required quantities, complete optional ones."""
@@ -410,6 +412,16 @@ class Finder:
             return (
                 f"{moved}: a joint that moves with its leader needs no column; state mimic = "
                 '"coupled" in the job file'
+            )
+        moving = []
+        if kind == "tau" and (moves := self.moves) is not None:
+            columns = {joint: self._find_of("q", joint) for joint in at_rest}
+            moving = [joint for joint, column in columns.items() if column and moves(joint, column)]
+        if moving:
+            names = ", ".join(map(quoted, moving))
+            return (
+                f"If {listed(moving)}, which moves in the log, has no drive, state passive = "
+                f"[{names}] in the job file; else record its torque"
             )
         locks = " ".join(f"--lock {joint}=0" for joint in at_rest)
         locked = ", ".join(f"{toml_key(joint)} = 0" for joint in at_rest)

@@ -8,6 +8,7 @@ read instead, as `qm_<motor>` and `taum_<motor>` [N m]. ``column_names`` reads o
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import chain
 from pathlib import Path
 from typing import Any, get_args
@@ -54,6 +55,7 @@ _SI = LogUnits()
 _WHOLE = LogSource()
 _SPARSE = 0.02  # share of rows without a value from which a column has another rate
 _BASE = BaseColumns()
+_STILL = 0.02  # range of the position of a joint at rest [rad or m]
 
 
 @checked("base", "passive")
@@ -387,7 +389,7 @@ def lay_out(
     finder = Finder(
         where, opened.names, of_joints, tuple(joints), gains or {}, source, tuple(transmissions),
         needs, notes, {*chain.from_iterable(of_base.values()), *opened.sensors}, passive,
-        tuple(robot),
+        tuple(robot), partial(_moves, opened, units, prismatic),
     )  # fmt: skip
     joints = [joint for joint in joints if joint not in passive or finder.has_position(joint)]
     finder = replace(finder, joints=tuple(joints))
@@ -423,6 +425,14 @@ def _opened(path: str | Path | Frame, source: LogSource) -> tuple[str, Table]:
         raise _no_log(path)
     table = with_stated_names(open_frame(path), "log", source.names)
     return "log", with_time(with_own_names(table, "log", "DataFrames", source), source.rate)
+
+
+def _moves(
+    table: Table, units: LogUnits, prismatic: Collection[str], joint: str, column: str
+) -> bool:
+    """Return whether the position of a joint changes in its column."""
+    _, scale = units.scale(joint, is_angle=joint not in prismatic)
+    return bool(scale * np.ptp(table.read([column])[column]) > _STILL)
 
 
 def _notes_of_sensors(

@@ -309,7 +309,9 @@ def _projected(
     free = (*best, "offset")
     T = dict(zip(free, moments.transfer(names, free), strict=True))
     stated = [name for name in _SIMPLE if name in bounded or (name in onto and name in names)]
-    transfer = np.array([T.get(name, np.zeros(len(names))) for name in stated])
+    transfer = np.zeros((len(stated), len(names)))
+    for k, name in enumerate(stated):
+        transfer[k] = T.get(name, 0.0)
     return ProjectedDrive(
         name=model.layout.drives[d].name,
         replaced=tuple(excess),

@@ -38,7 +38,7 @@ def test_the_first_fit_is_of_drives_alone_with_the_bodies_of_the_urdf(monkeypatc
         for name, what in (("m", "body"), ("kp", "kp"), ("mcx", "body"), ("coulomb", "term"))
     )
     simulator = Simulator(free_parameters, ("first", "second", "third"), np.zeros(4))
-    initialised = SimpleNamespace(simulator=simulator, estimator=Estimator(rounds=9))
+    initialised = SimpleNamespace(simulator=simulator, estimator=Estimator(rounds=9), vary=None)
     named = {"pd": "_initialise_from_commands", "torque": "_initialise_from_torque"}
     monkeypatch.setattr(fit, named[kind], lambda *_: initialised)
     monkeypatch.setattr(fit, "_check_settings", lambda *_: None)
@@ -81,7 +81,7 @@ class Recorder:
 
 def test_only_the_last_fit_is_to_all_windows_from_better_starts(monkeypatch):
     simulator, fits = Started((), tuple(range(96)), np.zeros(0)), []
-    others = dict.fromkeys(("linear", "encoders", "plain", "torque"))
+    others = dict.fromkeys(("linear", "encoders", "plain", "torque", "vary", "limited"))
     initialised = SimpleNamespace(simulator=simulator, estimator=Recorder(9, fits), **others)
     monkeypatch.setattr(fit, "_initialise_from_commands", lambda *_: initialised)
     monkeypatch.setattr(fit, "_check_settings", lambda *_: None)
@@ -111,7 +111,7 @@ def test_terms_that_are_not_chosen_are_tried_a_second_time(monkeypatch, chosen, 
     """And the loops are fitted with those of each pass; after the first one in any case."""
     fits, tried = [], []
     simulator = Started((), tuple(range(3)), np.zeros(0))
-    others = dict.fromkeys(("linear", "encoders", "plain"))
+    others = dict.fromkeys(("linear", "encoders", "plain", "vary", "limited"))
     initialised = SimpleNamespace(
         simulator=simulator, estimator=Recorder(9, fits), torque="torque", **others
     )
@@ -136,6 +136,7 @@ def test_terms_that_are_not_chosen_are_tried_a_second_time(monkeypatch, chosen, 
     monkeypatch.setattr(fit, "candidates", lambda simulator, torque: every * (torque == "torque"))
     monkeypatch.setattr(fit, "choose", choose)
     monkeypatch.setattr(fit, "_with", extended)
+    monkeypatch.setattr(fit, "impossible", lambda *_: {})
     monkeypatch.setattr(fit, "refine_steps", lambda simulator, _, estimate: (simulator, estimate))
     monkeypatch.setattr(fit, "is_stated", lambda *_: np.array([False]))
     stages = []

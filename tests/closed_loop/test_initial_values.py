@@ -331,7 +331,7 @@ def test_whitening_and_free_gains_are_those_of_all_logs(planar, monkeypatch, spe
     assert any(name.endswith(".kp") for name in names)
     assert not any(name.endswith(".delay") for name in names)  # stated
     [(given, how)] = seen
-    assert how == {"finds_delay": False}
+    assert how == {"finds_delay": False, "finds_limit": False}
     np.testing.assert_allclose(given[2].delay, 0.01)
     lengths = {round(float(w.log.t[w.stop - 1] - w.log.t[w.first]), 1) for w in given[1]}
     assert max(lengths) == 0.5
@@ -398,7 +398,8 @@ def test_a_second_order_model_is_of_some_windows_and_all_position_errors(
     found = second_order.fit_second_order(
         ClosedLoopRobot(planar), windows, stated, finds_delay=finds_delay
     )
-    ((_, tried, bare, torque, _),) = coarse
+    ((_, tried, bare, torque, _, [limit]),) = coarse
+    np.testing.assert_array_equal(limit, np.inf)
     assert tried == windows[:8]
     assert fitted[0].windows == (windows[::3] if count == 50 else windows)
     error = np.concatenate([(w.log.q_ref - w.log.q)[2:9] for w in windows])
@@ -432,7 +433,7 @@ def test_tried_loops_have_a_damping_to_which_the_stated_gain_contributes(planar,
         second_order, "_better",
         lambda robot, windows, trial, best, found: tried.append(trial) or (np.zeros(2), trial),
     )  # fmt: skip
-    second_order._coarse(None, (), bare, torque, False)
+    second_order._coarse(None, (), bare, torque, False, [bare.limit])
     wanted = iter([(w, z, f) for w in _FREQUENCIES for z in (0.5, 1.5) for f in (0.05, 0.5)])
     for trial, (w, z, f) in zip(tried, wanted, strict=True):
         viscous, coulomb, offset = trial.values.reshape(2, 3).T

@@ -2,7 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.mujoco_plant import loaded, plant, rolled_out
+from helpers.mujoco_plant import loaded, multisine, plant, rolled_out
 
 from robotid.closed_loop.fit import fit_loops
 from robotid.closed_loop.identify import identify_loops
@@ -84,3 +84,31 @@ def test_a_limit_that_is_stated_is_taken(limited):
 
 def test_drives_below_their_limits_have_none():
     assert largest_speeds(stepped(np.inf)[1]) == {}
+
+
+def test_a_drive_that_saturates_while_it_follows_has_its_limit_and_gain_found():
+    """The limit bounds kp and kd together: there, and only there, kd is not viscous friction."""
+    rng = np.random.default_rng(5)
+    robot = plant("leg", rng, kp=14.0, kd=0.3, viscous=0.5, coulomb=0.1, armature=0.03, delay=0.012)
+    robot = replace(robot, drives=tuple(replace(d, effort_limit=1.2) for d in robot.drives))
+    t = np.arange(1200) / RATE
+    q_ref = robot.middle + 0.8 * (multisine(t, robot.middle, robot.reach, rng) - robot.middle)
+    q = rolled_out(loaded(robot, RATE), q_ref, RATE)[0]
+    q = q + 1e-4 * rng.standard_normal(q.shape)
+    log = Log(1000.0 + t, q, 0 * q, robot.model.joints, q_ref=q_ref, has_torque=False)
+    assert not largest_speeds(log)
+    found = identify_loops(robot.model, [log], [log], LoopSettings(), SETTINGS, chooses=False)
+    values = dict(zip(found.fit.estimate.names, found.fit.estimate.theta, strict=True))
+    hip = robot.model.joints[0]
+    for key, truth in {
+        "kp": 14.0,
+        "kd": 0.3,
+        "limit": 1.2,
+        "viscous": 0.5,
+        "armature": 0.03,
+    }.items():
+        assert values[f"{hip}.{key}"] == pytest.approx(truth, rel=0.03), key
+    said = next(f for f in found.findings if f.code == "limit")
+    assert (said.where, said.severity) == (hip, "warning")
+    assert "saturates" in said.message
+    assert not any(name.endswith("calf_joint.limit") for name in values), "its drive stays below"

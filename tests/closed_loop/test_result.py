@@ -145,8 +145,9 @@ def test_a_limit_and_a_gain_at_their_lower_bound_are_findings(found):
     assert free.where == "rail"
     assert free.evidence["limit"] == 0.25
     error = found.estimate.std_error[0]
-    assert f"rail: the torque limit of the drive is estimated as 0.25 +- {error:.2g} N; at the" in (
-        free.message
+    assert (
+        f"saturates. The torque limit of the drive is estimated as 0.25 +- {error:.2g} N; at the"
+        in (free.message)
     )
     first = replace(limit, joints=(1,))
     (other,) = [f for f in loop_findings(at_limit(found, first, theta), ()) if f.code == "limit"]

@@ -88,10 +88,10 @@ def drive(**others):
 
 @pytest.mark.parametrize(
     ("own", "urdf", "wanted"),
-    [(5.0, 7.0, 5.0), (9.0, 7.0, 7.0), (5.0, 0.0, 5.0), (math.inf, 0.0, math.inf),
+    [(5.0, 7.0, 5.0), (9.0, 7.0, 9.0), (5.0, 0.0, 5.0), (math.inf, 0.0, math.inf),
      (math.inf, 7.0, 7.0)],
 )  # fmt: skip
-def test_a_drive_gives_no_more_than_controller_and_urdf_allow(own, urdf, wanted):
+def test_a_drive_has_its_own_limit_or_that_of_the_urdf(own, urdf, wanted):
     assert limit_of(drive(effort_limit=own), Joint("ja", "revolute", "a", "b", effort=urdf)) == (
         wanted
     )

@@ -241,7 +241,10 @@ def test_kept_recordings_that_were_fitted_are_named():
 def test_a_torque_of_zero_is_no_prediction():
     found = verdict({"a": joint(None, constant=False)})
     assert found.status == "poor"
-    assert found.reasons == ("a: the torque is 0 throughout val.csv: not evaluated",)
+    assert found.reasons == (
+        "a: the torque is 0 throughout val.csv: not evaluated. If the joint has no drive, state "
+        'passive = ["a"] in the job file',
+    )
 
 
 @pytest.mark.parametrize(

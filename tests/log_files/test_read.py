@@ -145,8 +145,8 @@ def test_missing_column_is_named_with_those_of_its_kind(run):
     path = run(make_table(tau_elbow=None))
     with refused(
         f"{path.name} has no column 'tau_elbow'; torque or current columns found: tau_shoulder. "
-        "If elbow was at rest, lock it at its position, as --lock elbow=0, or locked = { elbow = 0 "
-        "} in the job file"
+        'If elbow, which moves in the log, has no drive, state passive = ["elbow"] in the job '
+        "file; else record its torque"
     ):
         read_log(path, JOINTS)
     path = run({k: v for k, v in make_table().items() if not k.startswith("q_")})
