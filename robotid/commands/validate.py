@@ -211,7 +211,7 @@ def _verdict(
     predictions = Predictions(
         Metrics({}, 0.0),
         {e.recording.name: e.metrics["estimate"] for e in compress(evaluations, is_new)},
-        [joint for joint in model.joints if joint not in model.passive],
+        tuple(joint for joint in model.joints if joint not in model.passive),
         refitted=[e.recording.name for e in compress(evaluations, again)],
         hidden=hidden_joints(model, evaluations),
     )

@@ -222,7 +222,7 @@ class Identification(Fit):
     def verdict(self) -> Verdict:
         """Verdict on the result, with reasons."""
         logs = [e.recording.log for e in (*self.fitted, *self.validation)]
-        driven = [joint for joint in self.model.joints if joint not in self.model.passive]
+        driven = tuple(x for x in self.model.joints if x not in self.model.passive)
         predictions = Predictions(
             self.metrics(),
             self.predictions,

@@ -251,7 +251,7 @@ def test_what_may_be_otherwise_changes_torques_as_differences_do(four, rng):
     pi = possible_parameters(four, rng)  # armatures and friction, too
     at = [motion(four, rng, count) for count in (7, 4)]
     direction = [SimpleNamespace(direction=np.ones(11)) for _ in four.joints]
-    sample = SimpleNamespace(at=at, motions=direction)
+    sample = SimpleNamespace(at=at, motions=direction, torque=np.ones(4))
     n, step = len(four.joints), 1e-6
 
     def slope(scale, shift):

@@ -332,7 +332,9 @@ def test_a_verdict_is_given_all_that_is_known_of_a_result(monkeypatch):
     own = {
         "metrics": lambda: "fitted", "predictions": {"c": 1}, "fitted": (fit,),
         "validation": (),
-        "model": SimpleNamespace(joints=("x", "y"), is_static=True, constraints=()),
+        "model": SimpleNamespace(
+            joints=("x", "y", "free"), passive=("free",), is_static=True, constraints=()
+        ),
         "refitted": refitted,
         "determination": SimpleNamespace(undetermined=("u",)), "is_consistent": False,
         "_uncertain_drives": ["d"], "is_poorly_excited": "poorly", "log_errors": ("e",),
