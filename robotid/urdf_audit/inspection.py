@@ -129,7 +129,10 @@ def inspect_urdf(path: str | Path, *, free_flyer: bool = False) -> Inspection:
     # impossible inertials are named link by link
     findings += [x for x in assumed_inertials(assumed) if x.code != "not_positive_definite"]
     findings += _link_findings(assumed)
-    findings += audit_links(model)
+    named = {f"link {body}" for body in assumed.assumed}  # as one finding for all
+    findings += [
+        x for x in audit_links(model) if x.code != "default_inertial" or x.where not in named
+    ]
     rounded = list(rounded_angles(model, full))
     findings += rounded
     if not any(finding.evidence["felt"] for finding in rounded):

@@ -378,6 +378,7 @@ def test_a_new_log_that_differs_is_named_with_its_cause(result, folder, written,
         "code": "unlike_run",
         "joint": "",
         "message": "worn.csv: the log differs from the other logs",
+        "effect": "usable",
     } in done["verdict"]["warnings"]
     show_validation(done)
     assert f"worn.csv: {COULOMB} is " in " ".join(capsys.readouterr().out.split())

@@ -396,7 +396,7 @@ def test_rounded_angles_are_reported_by_what_they_change_with_the_largest_error(
     assert other.evidence == pytest.approx({"largest_error": np.pi / 4 - 0.785, "felt": 0.0})
 
 
-def test_a_body_is_small_beside_the_mass_of_all():
+def test_a_body_is_small_beside_the_mass_of_all(monkeypatch):
     """Of 3 x 5 kg and 7.5 g: a fault of the last is a note, of 16 g a warning."""
     for mass, severity in ((0.0075, "note"), (0.016, "warning")):
         pi = np.zeros(40)
@@ -406,6 +406,7 @@ def test_a_body_is_small_beside_the_mass_of_all():
         pi[31] = 0.9 * mass  # the centre is outside by 0.4 m
         layout = SimpleNamespace(n_inertial=40, bodies=tuple("abcd"))
         points = dict.fromkeys("abcd", np.array([[-0.5, -0.2, -0.1], [0.5, 0.2, 0.1]]))
+        monkeypatch.setattr(geometry, "body_points", lambda *_, with_visual, own=points: own)
         found = list(geometry.audit_bodies(SimpleNamespace(layout=layout), pi, points))
         outside = one(found, "com_outside")
         assert outside.severity == severity

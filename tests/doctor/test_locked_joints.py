@@ -61,7 +61,7 @@ def test_a_joint_that_nobody_placed_is_locked_where_the_logs_have_it(job, tmp_pa
     log = read_log(tmp_path / "run.csv", (*unplaced.model().joints, HELD))
     q = log.q.copy()
     q[0, -1] += 0.01  # the first row is no better than others
-    write_log(replace(log, q=q, a=None), tmp_path / "run.csv")
+    write_log(replace(log, q=q, a=None, path=""), tmp_path / "run.csv")
     assert found(unplaced) == []
     identification, result = run_job(unplaced, tmp_path / "out")
     assert dict(identification.model.locked) == {HELD: 0.7}
@@ -161,9 +161,9 @@ def test_a_locked_gripper_in_percent_is_named_and_read(job, tmp_path):
     log = read_log(tmp_path / "run.csv", (*job(0.7).model().joints, HELD))
     q = np.degrees(log.q)
     q[:, -1] = 20.0
-    write_log(replace(log, q=q, v=None), tmp_path / "run.csv")
+    write_log(replace(log, q=q, v=None, path=""), tmp_path / "run.csv")
     in_degrees = replace(job(0.7), units=LogUnits(angle="deg"))
-    write_log(replace(log, q=q, v=None), tmp_path / "run.csv")
+    write_log(replace(log, q=q, v=None, path=""), tmp_path / "run.csv")
     (finding,) = found(in_degrees)
     assert "If 20, the number in the log, is a percentage" in finding.message
     stated = LogUnits(angle="deg", percent={HELD: [0.5, 1.5]})

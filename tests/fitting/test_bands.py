@@ -19,6 +19,7 @@ from robotid.fitting.bands import (
     torque_band,
     typical_friction,
 )
+from robotid.fitting.evaluation import Evaluation
 from robotid.fitting.open_terms import OpenTerm
 from robotid.fitting.settings import EstimatorSettings
 from robotid.logs.data import Trajectory
@@ -282,7 +283,9 @@ def test_the_band_of_a_recording_has_each_open_term_with_what_it_moves(rng):
         estimate=SimpleNamespace(sigma=np.array([3.0, 1.0, 0.5])),
     )  # fmt: skip
     recording = SimpleNamespace(trajectory=motion, signals=SignalSettings(cutoff=5.0))
-    band = expected_band(found, SimpleNamespace(recording=recording))
+    evaluation = object.__new__(Evaluation)
+    vars(evaluation).update(recording=recording)
+    band = expected_band(found, evaluation)
     Y = joint_torque_regressor(model, q, v, a)
     load = (Y[:, :size] @ standard[:size]).reshape(9, 3)
     W, z = Y[:, mapping.independent] @ mapping.K, np.zeros((2, 9, 3))
@@ -293,13 +296,13 @@ def test_the_band_of_a_recording_has_each_open_term_with_what_it_moves(rng):
     np.testing.assert_allclose(band.parameters, np.sqrt(variance).reshape(9, 3), rtol=1e-9)
     np.testing.assert_allclose(band.total**2, band.parameters**2 + [9.0, 1.0, 0.25], rtol=1e-12)
     other = rng.standard_normal((30, len(standard)))  # as much as the next log may differ
-    wide = expected_band(found, SimpleNamespace(recording=recording), other.T @ other)
+    wide = expected_band(found, evaluation, other.T @ other)
     more = np.sum((W @ other.T) ** 2, axis=1).reshape(9, 3)
     np.testing.assert_allclose(wide.parameters**2, band.parameters**2 + more, rtol=1e-9)
     short = replace(wide, samples=wide.samples[:4], parameters=wide.parameters[:4])
     squares = np.vstack([wide.total, short.total]) ** 2
     np.testing.assert_allclose(rms_error([wide, short]), np.sqrt(squares.mean(axis=0)))
     after = replace_in(
-        found, between=other.T @ other, fitted=[SimpleNamespace(recording=recording)]
+        found, between=other.T @ other, fitted=[evaluation]
     )
     np.testing.assert_allclose(next_errors(after), np.sqrt(np.mean(wide.total**2, axis=0)))

@@ -18,15 +18,15 @@ UR = ("pan", "lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
 T = np.arange(5) / 100.0
 
 
-def table(*names, clock="time"):
+def table(*names, clock="time", moved=1.0):
     """Return columns of which each has its own values."""
-    return pd.DataFrame({clock: T, **{name: T + k for k, name in enumerate(names)}})
+    return pd.DataFrame({clock: T, **{name: moved * T + k for k, name in enumerate(names)}})
 
 
-def said(names, joints=UR, **reading):
+def said(names, joints=UR, moved=1.0, **reading):
     """Return the error of a log with these columns."""
     with pytest.raises(DataError) as caught:
-        read_log(table(*names), joints, **reading)
+        read_log(table(*names, moved=moved), joints, **reading)
     assert caught.value.code == "missing_column"
     return str(caught.value)
 
@@ -154,11 +154,11 @@ def test_a_column_with_an_unknown_word_is_listed_and_not_read(kind):
 
 
 def test_a_joint_that_was_at_rest_may_be_locked():
-    assert said([*of("q"), *of("tau")[:5]]).endswith(
+    assert said([*of("q"), *of("tau")[:5]], moved=0.0).endswith(
         "If wrist_3 was at rest, lock it at its position, as --lock wrist_3=0, or locked = "
         "{ wrist_3 = 0 } in the job file"
     )
-    assert said([*of("q"), *of("tau")[:4]]).endswith(
+    assert said([*of("q"), *of("tau")[:4]], moved=0.0).endswith(
         "If wrist_2, wrist_3 were at rest, lock them there, as --lock wrist_2=0 --lock wrist_3=0, "
         "or locked = { wrist_2 = 0, wrist_3 = 0 } in the job file"
     )

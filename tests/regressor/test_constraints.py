@@ -7,7 +7,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from robotid.estimators.consistent.weighting import held_out_errors
+from robotid.estimators.consistent.weighting import Segments, held_out_errors
 from robotid.exceptions import DataError, ModelError, SettingsError
 from robotid.logs.base import BaseColumns
 from robotid.logs.data import Trajectory
@@ -413,7 +413,7 @@ def test_rows_that_are_projected_together_are_held_out_together(rng):
     found = [SimpleNamespace(x=x) for x in rng.standard_normal((2, 2))]
     programme = SimpleNamespace(minimise_each=lambda *_, **__: found)
     fit = SimpleNamespace(programme=programme, K=np.eye(2))
-    segments = SimpleNamespace(folds=folds, sigma=np.array([2.0, 2.0]), others=None)
+    segments = Segments(folds, np.array([2.0, 2.0]), np.zeros((3, 3)), 1.0)
     errors, _ = held_out_errors(fit, segments, 1.0)
     squares = [
         sum(np.sum((own[:, 2] - own[:, :2] @ x.x) ** 2) for own in fold)
