@@ -170,7 +170,8 @@ def _is_written(path: Path) -> bool:
             continue
         if isinstance(content, dict) and "robotid" in content:
             outputs = content.get("outputs", {})
-            if path == record or (isinstance(outputs, dict) and path.name in outputs.values()):
+            named = outputs.values() if isinstance(outputs, dict) else ()
+            if path == record or path.name in (*named, *_PAGES):
                 return True
     return False
 
@@ -193,6 +194,7 @@ def _marked(path: Path) -> None:
 
 #: Files of results, which name the other files that were written with them.
 _RECORDS = ("result.json", "track.json", "fleet.json")
+_PAGES = ("report.html", "replay.html")  # beside a result
 _MARKS = 10**6  # [ns] of a modification time that are a mark
 _LONGEST = 255  # bytes of a file's name
 _LONGEST_PATH = 4095  # bytes of a whole path

@@ -13,6 +13,7 @@ from robotid.estimators.consistent.weighting import (
     Segments,
     choose_weight,
     contradicted_extents,
+    loss_of,
 )
 from robotid.fitting.settings import BoundedSettings, ConstraintSettings
 from robotid.regressor.base_parameters import BaseMapping
@@ -99,9 +100,8 @@ def consistent_fit(
     choice = choose_weight(fit, segments, how, known.repeated)
     if fit.constraints.extent and choice.loss > AS_GOOD:
         unbound = replace(fit, constraints=fit.constraints.without_extent(fit.constraints.extent))
-        other = choose_weight(unbound, segments, how, known.repeated)
-        if AS_GOOD * other.loss < choice.loss:
-            fit, choice = unbound, other
+        if AS_GOOD * loss_of(unbound, segments, choice.weight) < choice.loss:
+            fit, choice = unbound, choose_weight(unbound, segments, how, known.repeated)
     return replace(
         fit, prior_weight=choice.weight, plausible_weight=choice.plausible, choice=choice
     )

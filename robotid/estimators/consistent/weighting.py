@@ -21,9 +21,11 @@ __all__ = [
     "contradicted_extents",
     "held_out_errors",
     "log_evidence",
+    "loss_of",
 ]
 
 _SMALLEST, _LARGEST = -4.0, 2.0  # decades of the weights tried
+_USUAL = -1.0  # at smaller entropic weights bodies become thin, and fits converge slowly
 _PATIENCE = 2  # decades without a better score after which the search ends
 _ALIKE = 2.0  # standard errors by which the mean log error of a larger weight may be above the best
 _MOST_LOSS = 1.02  # largest ratio of the held-out errors of a larger weight, mean over joints
@@ -123,10 +125,11 @@ def choose_weight(
       is wrong, as of a placeholder, the weight is smaller.
     * "evidence": the weight with the largest ``log_evidence``.
 
-    Weights are tried from 100 down to 1e-4 in decades, until two weights in a row are worse than
-    those before, and then around the best one. A weight above 1 shifts the estimate towards the
-    prior, but does not reduce the standard errors; see ``Consistent.weight_ratio``. A weight at
-    which the fit does not converge, because bodies shrink to points, has an infinite error.
+    Weights are tried from 100 down to 1e-4 (entropic: 0.1, and below where least squares is better)
+    in decades, until two weights in a row are worse than those before, and then around the best
+    one. A weight above 1 shifts the estimate towards the prior, but does not reduce the standard
+    errors; see ``Consistent.weight_ratio``. A weight at which the fit does not converge, because
+    bodies shrink to points, has an infinite error.
 
     Args:
         fit: The fit; its own weight is not used.
@@ -157,9 +160,28 @@ def choose_weight(
 
     # a residual without the repeated error is smaller by this log ratio
     excess = -0.5 * np.log1p(-min(repeated, _MOST_REPEATED))
-    choice = replace(_search(score, how, excess, least), plausible=plausible)
+    usual = _SMALLEST if fit.penalty.is_quadratic else _USUAL
+    choice = replace(_search(score, how, excess, least, usual), plausible=plausible)
     larger = [weight for weight, _ in choice.curve if weight >= choice.weight]
     return replace(choice, weight=_converging(fit, segments.rows, larger))
+
+
+def loss_of(fit: Consistent, segments: Segments, weight: float) -> float:
+    """Return the largest ratio of the held-out error of a joint to that of least squares [-].
+
+    Args:
+        fit: The fit; its own weight is not used.
+        segments: The fitted data, at least two segments.
+        weight: Weight of the prior [-].
+
+    Returns:
+        The ratio; inf if a fit does not converge.
+    """
+    try:
+        errors, _ = held_out_errors(fit, segments, weight)
+    except NotConvergedError:
+        return float("inf")
+    return float(np.sqrt(_by_joint(errors) / _by_joint(segments.least_squares_errors)).max())
 
 
 def _converging(fit: Consistent, rows: Array, weights: Sequence[float]) -> float:
@@ -315,12 +337,14 @@ def _search(
     how: str,
     allowed: float,
     least: Array | None = None,
+    usual: float = _SMALLEST,
 ) -> WeightChoice:
     """Return the largest weight that ``_is_accepted`` in comparison with that of smallest score.
 
-    Weights are tried from 100 down in decades, until neither the score decreases nor, where it is
-    too large, the loss. ``score`` returns the score and its parts by segment and joint, or no
-    parts. The loss is the largest ratio of a joint's error to that of least squares, shape (n,).
+    Weights are tried from 100 down to the usual smallest one in decades, until the score does not
+    decrease; and further while the loss is too large and decreases. ``score`` returns the score and
+    its parts by segment and joint, or no parts. The loss is the largest ratio of a joint's error to
+    that of least squares, shape (n,).
     """
     tried: dict[float, float] = {}
     parts: dict[float, Array] = {}
@@ -333,7 +357,7 @@ def _search(
 
     decade = _LARGEST
     while decade >= _SMALLEST and (
-        _is_promising(tried.values())
+        (decade >= usual and _is_promising(tried.values()))
         or (min(loss.values()) > AS_GOOD and _is_promising(loss.values(), _MOST_LOSS))
     ):
         attempt(decade)

@@ -471,7 +471,7 @@ def test_an_error_that_repeats_makes_a_residual_larger_by_its_share(
     segments, given = Segments.of(fit, cut(problem, 4)), []
     found = SimpleNamespace(plausible=None, curve=[(1.0, 0.0)], weight=1.0)
 
-    def search(score, how, excess, least=None):
+    def search(score, how, excess, *_):
         given.append((how, excess))
         return found
 
