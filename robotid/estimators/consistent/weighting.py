@@ -1,6 +1,6 @@
 """Cross-validation on segments of the fitted data: weight of the prior, extents of bodies."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -147,13 +147,13 @@ def choose_weight(
     if how == "evidence":
         return replace(by_evidence, plausible=plausible)
 
-    starts = None  # the fits at the previous weight
+    fits: dict[float, list[ConeSolution]] = {}  # by weight, one without each segment
     least = np.sqrt(_by_joint(segments.least_squares_errors))  # (n,)
 
     def score(weight: float) -> tuple[float, Array]:
-        nonlocal starts
+        starts = next(reversed(fits.values()), None)
         try:
-            errors, starts = held_out_errors(fit, segments, weight, starts)
+            errors, fits[weight] = held_out_errors(fit, segments, weight, starts)
         except NotConvergedError:
             return float("inf"), np.full((len(segments.folds), len(least)), np.inf)
         return float(np.exp(0.5 * np.log(_by_joint(errors)).mean())), errors
@@ -163,7 +163,7 @@ def choose_weight(
     usual = _SMALLEST if fit.penalty.is_quadratic else _USUAL
     choice = replace(_search(score, how, excess, least, usual), plausible=plausible)
     larger = [weight for weight, _ in choice.curve if weight >= choice.weight]
-    return replace(choice, weight=_converging(fit, segments.rows, larger))
+    return replace(choice, weight=_converging(fit, segments.rows, larger, fits))
 
 
 def loss_of(fit: Consistent, segments: Segments, weight: float) -> float:
@@ -184,11 +184,16 @@ def loss_of(fit: Consistent, segments: Segments, weight: float) -> float:
     return float(np.sqrt(_by_joint(errors) / _by_joint(segments.least_squares_errors)).max())
 
 
-def _converging(fit: Consistent, rows: Array, weights: Sequence[float]) -> float:
-    """Return the first weight at which the fit to all rows converges."""
+def _converging(
+    fit: Consistent,
+    rows: Array,
+    weights: Sequence[float],
+    fits: Mapping[float, Sequence[ConeSolution]],
+) -> float:
+    """Return the first weight at which the fit to all rows converges, from fits to most of them."""
     for weight in weights[:-1]:
         try:
-            fit.programme.minimise(rows, weight)
+            fit.programme.minimise(rows, weight, start=next(iter(fits.get(weight, ())), None))
         except NotConvergedError:  # bodies shrink to points
             continue
         return weight
