@@ -63,7 +63,9 @@ def _show(found: dict[str, Any], *, is_update: bool = False) -> None:
         print("\n".join(error_lines(recording, width=terminal_width())))
         expected = recording.get("expected", {})
         if expected:
-            source = "fit and spread between logs" if expected["with_spread"] else "fit"
+            source = "fit, for logs of the same day"
+            if expected["with_spread"]:
+                source = "fit and spread between logs"
             own = [
                 f"{joint} {each['rmse']:.3g} ({each['within_95_pct']:.0f} %)"
                 for joint, each in expected["per_joint"].items()

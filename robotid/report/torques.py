@@ -247,8 +247,9 @@ def _residuals(evaluations: Sequence[Evaluation], row: int) -> Iterator[Residual
 
 def _intro(found: Identification, shown: Sequence[Evaluation], left: Sequence[Evaluation]) -> str:
     """Return the description of the charts and their recordings."""
+    band = "95 % band" if found.between is not None else "95 % band (for logs of the same day)"
     parts = [
-        "<p>Torque: measured, identified model with its 95 % band, and URDF; below, the residual "
+        f"<p>Torque: measured, identified model with its {band}, and URDF; below, the residual "
         "(measured − identified). Shaded: gaps, and samples that are not used because the joint is "
         "at rest and the sign of its friction is unknown. Drag to zoom; double-click or Escape "
         "shows all.</p>\n"
