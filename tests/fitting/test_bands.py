@@ -302,7 +302,5 @@ def test_the_band_of_a_recording_has_each_open_term_with_what_it_moves(rng):
     short = replace(wide, samples=wide.samples[:4], parameters=wide.parameters[:4])
     squares = np.vstack([wide.total, short.total]) ** 2
     np.testing.assert_allclose(rms_error([wide, short]), np.sqrt(squares.mean(axis=0)))
-    after = replace_in(
-        found, between=other.T @ other, fitted=[evaluation]
-    )
+    after = replace_in(found, between=other.T @ other, fitted=[evaluation])
     np.testing.assert_allclose(next_errors(after), np.sqrt(np.mean(wide.total**2, axis=0)))
