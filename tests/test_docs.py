@@ -22,6 +22,7 @@ from robotid.fitting.settings import EstimatorSettings
 from robotid.judgement.verdict import WARNING_CODES
 from robotid.log_files.formats import write_columns
 from robotid.robot import examples
+from robotid.robot.assumed import REASONS
 from robotid.robot.drives import TERM_CLASSES, TERMS
 from robotid.robot.examples import example_urdf
 from robotid.simulation.motions import random_fourier
@@ -212,7 +213,7 @@ def test_doctor_lists_every_corruption_and_none_other():
 def codes_of_findings():
     """Return the codes that the code gives to findings, those of unread logs included."""
     places = {"Finding": 0, "_Alteration": 0, "log_finding": 1, "Candidate": 1}
-    codes = {*CODES, *WARNING_CODES, "unusable_log"}
+    codes = {*CODES, *WARNING_CODES, *REASONS, "unusable_log"}
     for path in (ROOT / "robotid").rglob("*.py"):
         text = path.read_text()
         if not re.search(rf"\bcode\b|\b({'|'.join(places)})\(", text):
