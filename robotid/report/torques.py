@@ -145,11 +145,14 @@ def _names(evaluations: Sequence[Evaluation]) -> str:
 
 def _facts(found: Identification) -> dict[str, str]:
     before, after, _ = found.scale_check.masses
-    change = f" ({100 * (after / before - 1):+.0f} %)".replace("-", "−") if before > 0 else ""
+    is_assumed = found.scale_check.assumed > 0
+    is_compared = before > 0 and not is_assumed
+    change = f" ({100 * (after / before - 1):+.0f} %)".replace("-", "−") if is_compared else ""
     if not found.scale_check.is_total_determined:
         change += ", not determined by torque alone"
+    masses = f"{before:.2f}{' assumed' * is_assumed} → {after:.2f}"
     return {
-        "Total mass": f"<strong>{before:.2f} → {after:.2f} kg</strong>{change}",
+        "Total mass": f"<strong>{masses} kg</strong>{change}",
         "Base parameters determined": (
             f"<strong>{found.determination.rank} of {len(found.base)}</strong>, condition number "
             f"{found.wls.condition:.3g} (regressor, unit columns)"
