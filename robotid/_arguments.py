@@ -133,6 +133,7 @@ def _checked(value: Any, hint: Any, name: str) -> Any:  # noqa: ANN401
 
 def _choices(hint: Any) -> list[Any]:  # noqa: ANN401
     """Return the alternatives of an annotation."""
+    hint = getattr(get_origin(hint) or hint, "__value__", hint)  # of a type alias, as NDArray
     if get_origin(hint) in (Union, types.UnionType):
         return [x for part in get_args(hint) for x in _choices(part)]
     return [type(None) if hint is None else hint]
