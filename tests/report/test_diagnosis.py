@@ -184,12 +184,12 @@ def test_charts_of_a_long_recording_state_how_much_of_it_is_drawn():
         return SimpleNamespace(recording=recording)
 
     shown, left = [run("<a>", 300, 4000), run("b", 500, 500)], [run("c", 5, 5), run("d", 6, 6)]
-    html = _intro(SimpleNamespace(validation=()), shown, left)
+    html = _intro(SimpleNamespace(validation=(), between=None), shown, left)
     assert "&lt;a&gt; is long: 300 of its 4000 samples are drawn" in html
     assert "b is long" not in html
     assert "Not drawn, to limit the file size: c, d." in html
     assert "There is no validation log. The charts show the fitted logs." in html
-    other = _intro(SimpleNamespace(validation=shown), shown[1:], [])
+    other = _intro(SimpleNamespace(validation=shown, between=None), shown[1:], [])
     assert "no validation log" not in other
     assert "Not drawn" not in other
 
