@@ -1,6 +1,7 @@
 """What the report's appendix says in figures beside its charts."""
 
 import re
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 from helpers.pages import charts, tables
 
 from robotid.identification.pictures import residual_charts
+from robotid.judgement.scale_check import ScaleCheck
 from robotid.logs.settings import SignalSettings
 from robotid.pages.charts import Chart, Series
 from robotid.report.diagnosis import (
@@ -163,7 +165,7 @@ def test_a_joint_is_remarked_where_a_simpler_prediction_is_better(error, urdf, b
     ("is_determined", "beside"), [(True, ""), (False, ", not determined by torque alone")]
 )
 def test_a_total_mass_that_torque_leaves_open_says_so(is_determined, beside):
-    check = SimpleNamespace(masses=(20.0, 23.0, 0.0), is_total_determined=is_determined)
+    check = ScaleCheck(masses=(20.0, 23.0, 0.0), is_total_determined=is_determined)
     found = SimpleNamespace(
         scale_check=check,
         determination=SimpleNamespace(rank=4),
@@ -173,6 +175,8 @@ def test_a_total_mass_that_torque_leaves_open_says_so(is_determined, beside):
     facts = _facts(found)
     assert facts["Total mass"] == f"<strong>20.00 → 23.00 kg</strong> (+15 %){beside}"
     assert facts["Base parameters determined"].startswith("<strong>4 of 5</strong>")
+    found.scale_check = replace(check, assumed=2)
+    assert "<strong>20.00 assumed → 23.00 kg</strong>" + beside == _facts(found)["Total mass"]
 
 
 def test_charts_of_a_long_recording_state_how_much_of_it_is_drawn():
