@@ -1,5 +1,6 @@
 import json
 import math
+import re
 
 import numpy as np
 import pytest
@@ -7,12 +8,14 @@ from helpers.synthetic import exact_log, truth
 
 from robotid.doctor.diagnosis import check_logs
 from robotid.exceptions import ModelError
+from robotid.findings import Finding
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.torque import random_regressor
+from robotid.robot.assumed import with_assumed_inertials
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 from robotid.robot.urdf_text import read_with_yourdfpy
-from robotid.urdf_audit.inertials import impossible_inertials
+from robotid.urdf_audit.inertials import explained_by_assumed, impossible_inertials
 from robotid.urdf_audit.inspection import inspect_urdf
 from robotid.urdf_audit.rounding import rounded_robot
 
@@ -388,3 +391,18 @@ def test_a_chain_whose_last_joints_are_hardly_felt_is_named(tmp_path):
     assert weak > 0
     assert f"{weak:.0f} parameters have less than 1e-4 of the effect" in finding["message"]
     assert f"left out of the {base} base parameters" in finding["message"]
+
+
+def test_only_findings_that_take_assumed_masses_as_evidence_are_explained(tmp_path):
+    (tmp_path / "clean.urdf").write_text(CLEAN)
+    (tmp_path / "none.urdf").write_text(re.sub(r"<inertial>.*?</inertial>", "", CLEAN, flags=re.S))
+    clean, none = (
+        with_assumed_inertials(RobotModel.from_urdf(tmp_path / f"{x}.urdf"))
+        for x in ("clean", "none")
+    )
+    scale, spikes = (
+        Finding(code, "warning", "a.csv: elbow", "") for code in ("torque_scale", "spikes")
+    )
+    assert explained_by_assumed(none, scale)
+    assert not explained_by_assumed(none, spikes)
+    assert not explained_by_assumed(clean, scale)
