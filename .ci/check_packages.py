@@ -6,9 +6,9 @@ import zipfile
 from pathlib import Path
 
 WHEEL = (
-    *(path.as_posix() for path in sorted(Path("robotid").glob("*/assets/*"))),
-    "robotid/pages/assets/uPlot.LICENSE.txt",
-    "robotid/pages/assets/charts.js",
+    *(path.as_posix() for path in sorted(Path("robotid").rglob("assets/*"))),
+    "robotid/output/pages/assets/uPlot.LICENSE.txt",
+    "robotid/output/pages/assets/charts.js",
     "robotid/py.typed",
     "dist-info/licenses/LICENSE",
 )

@@ -39,25 +39,25 @@ import mujoco
 from helpers import mujoco_plant
 from mujoco import rollout
 
-from robotid.closed_loop.driven import driven_log
-from robotid.closed_loop.evaluation import run_open_loop
-from robotid.closed_loop.fit import stated_loops
-from robotid.closed_loop.free_parameters import LoopSimulator, free_body_parameters
-from robotid.closed_loop.identify import identify_loops
-from robotid.closed_loop.settings import LoopSettings
-from robotid.commands.job import read_job
-from robotid.exceptions import SettingsError
-from robotid.export.commanded import CommandedDrive, loops_of
-from robotid.fitting.evaluation import evaluate_logs
-from robotid.fitting.settings import SimulationSettings
+from robotid.base.exceptions import SettingsError
+from robotid.cli.work.job import read_job
+from robotid.data.log import Log
+from robotid.data.signal_settings import SignalSettings
+from robotid.dynamics.simulation.loops import ClosedLoopRobot, Window, open_loops
+from robotid.estimation.fitting.estimator_settings import SimulationSettings
+from robotid.estimation.fitting.evaluation import evaluate_logs
+from robotid.estimation.fitting.survey import hold_log
+from robotid.identification.closed_loop.driven import driven_log
+from robotid.identification.closed_loop.free_parameters import LoopSimulator, free_body_parameters
+from robotid.identification.closed_loop.from_commands import identify_loops
+from robotid.identification.closed_loop.loop_settings import LoopSettings
+from robotid.identification.closed_loop.position_errors import run_open_loop
+from robotid.identification.closed_loop.stages import stated_loops
 from robotid.identification.pipeline import identify
-from robotid.logs.data import Log
-from robotid.logs.settings import SignalSettings
-from robotid.recordings.survey import hold_log
+from robotid.output.files.commanded import CommandedDrive, loops_of
 from robotid.robot.examples import example_urdf
 from robotid.robot.families import AUTO
 from robotid.robot.model import RobotModel
-from robotid.simulation.loops import ClosedLoopRobot, Window, open_loops
 
 FINE = 5e-5  # [s] step of the plant
 STEP = 5e-4  # [s] of our roll-outs beside it

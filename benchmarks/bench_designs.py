@@ -17,11 +17,11 @@ from unittest import mock
 import numpy as np
 from bench_excitation import CASES, DURATION, designer
 
-from robotid.excitation.multipliers import Multipliers
-from robotid.excitation.information import criterion
-from robotid.excitation.limits import LIMITS
-from robotid.logs.data import Trajectory
-from robotid.regressor.compiled import row_lanes
+from robotid.design.multipliers import Multipliers
+from robotid.design.information import criterion
+from robotid.design.limits import LIMITS
+from robotid.data.log import Trajectory
+from robotid.dynamics.compiled import row_lanes
 
 FINE = 30  # ten times 3 times the grid of the first rounds
 

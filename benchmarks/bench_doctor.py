@@ -28,15 +28,15 @@ import numpy as np
 from helpers.corruptions import CASES, ROBOTS, clean_log, robot, table_of
 from helpers.servos import bandwidth, faulty_logs, good_commands, record, some_servos
 
-from robotid.commands.job import Job, LogEntry, read_job
-from robotid.commands.logs import examine
-from robotid.doctor.command_channels import check_commands
-from robotid.doctor.diagnosis import diagnose
-from robotid.log_files.formats import write_columns
-from robotid.logs.settings import SignalSettings
+from robotid.cli.work.job import Job, LogEntry, read_job
+from robotid.cli.work.logs import examine
+from robotid.data.files.table_files import write_columns
+from robotid.data.signal_settings import SignalSettings
+from robotid.diagnosis.logs.check_logs import diagnose
+from robotid.diagnosis.logs.command_channels import check_commands
+from robotid.dynamics.simulation.closed_loop import another_robot
 from robotid.robot.examples import example_urdf
 from robotid.robot.parameters import INERTIAL_TERMS
-from robotid.simulation.closed_loop import another_robot
 
 DURATIONS = (8.0, 20.0)  # [s] of clean logs
 

@@ -19,7 +19,7 @@ import numpy as np
 from bench_figaroh import compare
 from setting import ROBOTS, full_qr, identify, machine, motion, peak_memory, robot, side_by_side
 
-from robotid.regressor.base_parameters import structural_mapping
+from robotid.dynamics.base_parameters import structural_mapping
 
 PANDA_SIZES = (10_000, 100_000, 1_000_000)
 LARGEST = 2**30  # [bytes] of W that full QR is asked to hold

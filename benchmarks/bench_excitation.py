@@ -29,10 +29,10 @@ import numpy as np
 import scipy.optimize
 
 from robotid.cli import main as robotid
-from robotid.excitation.basis import FourierBasis
-from robotid.excitation.clearance import Clearance
-from robotid.excitation.design import Designer
-from robotid.excitation.limits import MotionLimits
+from robotid.design.basis import FourierBasis
+from robotid.design.clearance import Clearance
+from robotid.design.design import Designer
+from robotid.design.limits import MotionLimits
 from robotid.robot.examples import example_urdf
 
 CASES = ("panda", "UR10")

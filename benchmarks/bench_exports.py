@@ -23,10 +23,10 @@ import numpy as np
 import scipy.optimize
 from setting import machine
 
-from robotid.commands.export import export_result
-from robotid.commands.identify import run_job
-from robotid.commands.job import read_job
-from robotid.export.result import load_result
+from robotid.cli.work.export import export_result
+from robotid.cli.work.identify import run_job
+from robotid.cli.work.job import read_job
+from robotid.output.files.result_file import load_result
 
 JOBS = Path(__file__).parents[1] / "tests" / "jobs"
 MOST = 3000  # rows
@@ -76,7 +76,7 @@ def compare(name, folder):
 
 def validation_rows(name, model):
     """Return q, v, a of the validation motions where all joints move, at most ``MOST`` rows."""
-    from robotid.recordings.survey import hold_log
+    from robotid.estimation.fitting.survey import hold_log
 
     job = read_job(JOBS / f"{name}.toml")
     rows = [hold_log(model, job.read(e, model), job.signals).whole for e in job.validation]

@@ -173,10 +173,10 @@ def robotid(compiled):
     """Return robotid's identification, its prediction and its version."""
     from setting import identify, robot
 
-    from robotid.logs.data import Trajectory
-    from robotid.regressor.base_parameters import structural_mapping
-    from robotid.regressor.torque import joint_torque_regressor
-    from robotid.versions import __version__
+    from robotid.base.versions import __version__
+    from robotid.data.log import Trajectory
+    from robotid.dynamics.base_parameters import structural_mapping
+    from robotid.dynamics.torque import joint_torque_regressor
 
     model = robot("panda")
 

@@ -22,13 +22,13 @@ from pathlib import Path
 import numpy as np
 from setting import machine
 
-from robotid.log_files.formats import write_columns
-from robotid.regressor.prediction import predict_instants
+from robotid.data.files.table_files import write_columns
+from robotid.dynamics.prediction import predict_instants
+from robotid.dynamics.simulation.closed_loop import another_robot
+from robotid.dynamics.simulation.motions import random_fourier
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import Coupling
-from robotid.simulation.closed_loop import another_robot
-from robotid.simulation.motions import random_fourier
 
 README = (Path(__file__).parents[1] / "README.md").read_text()
 ARM = [f"panda_joint{i}" for i in range(1, 8)]

@@ -29,12 +29,12 @@ import pyarrow.parquet
 from distributed import Client, LocalCluster
 from setting import PLANAR, machine
 
-from robotid.log_files.read import write_log
-from robotid.logs.data import Log
-from robotid.regressor.torque import joint_torque_regressor
+from robotid.data.files.read import write_log
+from robotid.data.log import Log
+from robotid.dynamics.simulation.motions import random_fourier
+from robotid.dynamics.torque import joint_torque_regressor
+from robotid.estimation.workers.checkpoint import FOLDER
 from robotid.robot.model import RobotModel
-from robotid.simulation.motions import random_fourier
-from robotid.workers.checkpoint import FOLDER
 
 BETWEEN, WITHIN, NOISE = 0.15, 0.05, 0.02
 FILES = ("fleet.parquet", "fleet.json", "fleet.html")

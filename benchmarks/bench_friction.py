@@ -20,18 +20,18 @@ from pathlib import Path
 import numpy as np
 from scipy.signal import lfilter
 
-from robotid.commands.job import read_job
-from robotid.fitting.bands import QUANTILE, friction_curve
+from robotid.cli.work.job import read_job
+from robotid.estimation.fitting.bands import QUANTILE, friction_curve
 from robotid.identification.pipeline import identify
-from robotid.logs.data import Log
-from robotid.logs.settings import SignalSettings
-from robotid.logs.signals import process
-from robotid.regressor.memory import remember
-from robotid.regressor.prediction import predict
+from robotid.data.log import Log
+from robotid.data.signal_settings import SignalSettings
+from robotid.data.signals import process
+from robotid.dynamics.memory import remember
+from robotid.dynamics.prediction import predict
 from robotid.robot.drives import DriveMotion, LoadFriction, Stribeck
 from robotid.robot.families import AUTO
-from robotid.simulation.closed_loop import another_robot
-from robotid.simulation.motions import random_fourier
+from robotid.dynamics.simulation.closed_loop import another_robot
+from robotid.dynamics.simulation.motions import random_fourier
 
 JOBS = Path(__file__).parents[1] / "tests" / "jobs"
 PLAIN = "viscous+coulomb"

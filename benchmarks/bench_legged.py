@@ -44,17 +44,17 @@ from helpers.legged import recorded, with_other_bodies
 from helpers.paths import JOBS
 from helpers.walkers import G1, ICUB, TALOS, planned, waves
 
-from robotid.commands.identify import run_job
-from robotid.commands.job import read_job
-from robotid.constrained.contacts import check_base
-from robotid.exceptions import NotConvergedError, RankDeficientError
-from robotid.fitting.settings import ConsistentSettings
+from robotid.base.exceptions import NotConvergedError, RankDeficientError
+from robotid.cli.work.identify import run_job
+from robotid.cli.work.job import read_job
+from robotid.data.signal_settings import SignalSettings
+from robotid.diagnosis.logs.contacts import check_base
+from robotid.dynamics.base_parameters import structural_mapping
+from robotid.dynamics.factors import compress
+from robotid.dynamics.used_rows import base_problem
+from robotid.estimation.fitting.estimator_settings import ConsistentSettings
+from robotid.estimation.fitting.survey import hold_log
 from robotid.identification.pipeline import identify
-from robotid.logs.settings import SignalSettings
-from robotid.recordings.survey import hold_log
-from robotid.regressor.base_parameters import structural_mapping
-from robotid.regressor.factors import compress
-from robotid.regressor.used_rows import base_problem
 from robotid.robot.constraints import Contact, link_positions
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel

@@ -25,11 +25,11 @@ import pyarrow.csv
 import pyarrow.parquet
 from setting import machine
 
-from robotid.regressor.torque import joint_torque_regressor
+from robotid.dynamics.simulation.closed_loop import another_robot
+from robotid.dynamics.simulation.motions import random_fourier
+from robotid.dynamics.torque import joint_torque_regressor
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
-from robotid.simulation.closed_loop import another_robot
-from robotid.simulation.motions import random_fourier
 
 RATE = 1000.0  # [Hz]
 PERIOD = 100.0  # [s] of the motion, which repeats; the noise does not

@@ -23,10 +23,10 @@ import mujoco
 from bench_commands import FINE, QUANTILE, RATE, STIFF
 from helpers import mujoco_plant
 
-from robotid.closed_loop.fit import fit_loops
-from robotid.closed_loop.settings import LoopSettings
-from robotid.fitting.settings import SimulationSettings
-from robotid.logs.data import Log
+from robotid.data.log import Log
+from robotid.estimation.fitting.estimator_settings import SimulationSettings
+from robotid.identification.closed_loop.loop_settings import LoopSettings
+from robotid.identification.closed_loop.stages import fit_loops
 
 SECONDS, NOISE, TORQUE, DELAY = 6.0, 3e-4, 0.05, 0.005  # [s], [rad], [N m], [s]
 STEP = 1e-3  # [s] of our roll-outs

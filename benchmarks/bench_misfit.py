@@ -23,9 +23,9 @@ import numpy as np
 from helpers.corruptions import robot
 from helpers.misfits import EFFECTS, log_with
 
-from robotid.commands.job import read_job
-from robotid.diagnosis.misfit import find_misfits
-from robotid.diagnosis.sample import take_sample
+from robotid.cli.work.job import read_job
+from robotid.diagnosis.residual.misfit import find_misfits
+from robotid.diagnosis.residual.term_trials import take_sample
 from robotid.identification.pipeline import identify
 
 JOINTS = 4  # of the UR5, the first ones, which get a term: a wrist carries no load to speak of

@@ -28,10 +28,10 @@ from pathlib import Path
 import numpy as np
 from bench_excitation import identified, must, record
 
-from robotid.excitation.basis import DesignedMotion, FourierBasis
-from robotid.excitation.design import Designer
-from robotid.excitation.files import write_motion
-from robotid.excitation.limits import MotionLimits
+from robotid.design.basis import DesignedMotion, FourierBasis
+from robotid.design.design import Designer
+from robotid.design.motion_files import write_motion
+from robotid.design.limits import MotionLimits
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 

@@ -20,11 +20,11 @@ import numpy as np
 import pinocchio as pin
 
 from robotid.identification.payload_fit import identify_payload
-from robotid.logs.data import Log
-from robotid.logs.settings import SignalSettings
+from robotid.data.log import Log
+from robotid.data.signal_settings import SignalSettings
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
-from robotid.simulation.motions import random_fourier
+from robotid.dynamics.simulation.motions import random_fourier
 
 ARMS = {
     "UR5": ("ur5_robot.urdf", None, "tool0"),

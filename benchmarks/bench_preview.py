@@ -26,15 +26,15 @@ import numpy as np
 import scipy.linalg
 import scipy.signal
 
-from robotid.commands.job import read_job
+from robotid.cli.work.job import read_job
 from robotid.identification.pipeline import identify
 from robotid.identification.assumptions import TorqueNoise
-from robotid.identification.previews import preview
-from robotid.logs.data import Log
-from robotid.regressor.torque import joint_torque_regressor
+from robotid.design.previews import preview
+from robotid.data.log import Log
+from robotid.dynamics.torque import joint_torque_regressor
 from robotid.robot.parameters import inertial_from_pseudo_inertia, pseudo_inertia
-from robotid.simulation.closed_loop import another_robot
-from robotid.simulation.motions import random_fourier
+from robotid.dynamics.simulation.closed_loop import another_robot
+from robotid.dynamics.simulation.motions import random_fourier
 
 RATE, DURATION = 200.0, 20.0
 COLOUR = 0.9

@@ -21,17 +21,17 @@ import numpy as np
 import pinocchio as pin
 from setting import machine
 
-from robotid.commands.job import read_job
-from robotid.exceptions import RobotIdError
-from robotid.fitting.evaluation import pool
-from robotid.fitting.settings import EstimatorSettings
+from robotid.base.exceptions import RobotIdError
+from robotid.cli.work.job import read_job
+from robotid.data.log import Log
+from robotid.data.signal_settings import SignalSettings
+from robotid.dynamics.simulation.motions import random_fourier
+from robotid.estimation.fitting.estimator_settings import EstimatorSettings
+from robotid.estimation.fitting.evaluation import pool
 from robotid.identification.pipeline import identify
-from robotid.logs.data import Log
-from robotid.logs.settings import SignalSettings
 from robotid.robot.bodies import link_places
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
-from robotid.simulation.motions import random_fourier
 
 JOBS = Path(__file__).parents[1] / "tests" / "jobs"
 DATA = os.environ.get("ROBOTID_DATA")

@@ -19,22 +19,22 @@ import pinocchio as pin
 import scipy
 
 import robotid
-from robotid.estimators import PRX, RLS, Kalman, NormalisedGradient, fold
-from robotid.estimators.recursive.descent import column_scale
-from robotid.logs.data import Trajectory
-from robotid.online.identifier import OnlineIdentifier
-from robotid.regressor.base_parameters import structural_mapping
-from robotid.regressor.problem import Problem, Sample
-from robotid.regressor.torque import (
+from robotid.data.log import Trajectory
+from robotid.dynamics.base_parameters import structural_mapping
+from robotid.dynamics.problem import Problem, Sample
+from robotid.dynamics.simulation.closed_loop import another_robot
+from robotid.dynamics.simulation.motions import random_fourier
+from robotid.dynamics.torque import (
     InstantRegressor,
     build_problem,
     joint_torque_regressor,
     mass_regressor,
 )
+from robotid.estimation.estimators import PRX, RLS, Kalman, NormalisedGradient, fold
+from robotid.estimation.estimators.recursive.descent import column_scale
+from robotid.identification.online.identifier import OnlineIdentifier
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
-from robotid.simulation.closed_loop import another_robot
-from robotid.simulation.motions import random_fourier
 
 ARM = [f"panda_joint{i}" for i in range(1, 8)]
 TARGETS = {"RLS": 37.0, "Kalman": 70.0, "PRX": 21.0}  # [us] on the machine they were stated for

@@ -14,9 +14,9 @@ import numpy as np
 import scipy.linalg
 from setting import ROBOTS, machine, motion, robot, rows_of, side_by_side
 
-from robotid.regressor.base_parameters import structural_mapping
-from robotid.regressor.lapack import Triangle
-from robotid.regressor.torque import build_problem
+from robotid.dynamics.base_parameters import structural_mapping
+from robotid.dynamics.lapack import Triangle
+from robotid.dynamics.torque import build_problem
 
 
 def main():

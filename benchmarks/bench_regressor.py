@@ -13,7 +13,7 @@ import argparse
 import numpy as np
 from setting import ROBOTS, bare_loop, exhaust, machine, motion, robot, rows_of, side_by_side
 
-from robotid.regressor.torque import build_problem
+from robotid.dynamics.torque import build_problem
 
 
 def main():

@@ -19,9 +19,9 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 from helpers.browsing import FLAGS, NAMES
 
+from robotid.output.viewer.replays import Torques, replay
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
-from robotid.viewer.replays import Torques, replay
 
 FRAMES = "[replay.clock.frames, replay.clock.at / 1000]"
 

@@ -30,27 +30,27 @@ import numpy as np
 import pinocchio as pin
 from scipy.linalg import block_diag
 
-from robotid.closed_loop.runs import loop_runs
-from robotid.commands.identify import run_job
-from robotid.commands.job import LogEntry, job_from_settings, read_job
-from robotid.commands.logs import survey_logs
-from robotid.fitting.bands import expected_band
-from robotid.fitting.fit import solve_recordings
-from robotid.fitting.settings import EstimatorSettings
+from robotid.cli.work.identify import run_job
+from robotid.cli.work.job import LogEntry, job_from_settings, read_job
+from robotid.cli.work.logs import survey_logs
+from robotid.data.log import Log
+from robotid.data.signal_settings import SignalSettings
+from robotid.dynamics.base_parameters import structural_mapping
+from robotid.dynamics.simulation.motions import random_fourier
+from robotid.estimation.fitting.bands import expected_band
+from robotid.estimation.fitting.estimator_settings import EstimatorSettings
+from robotid.estimation.fitting.fit import solve_recordings
+from robotid.estimation.fitting.recorded import Recordings
+from robotid.estimation.fitting.survey import hold_log
+from robotid.estimation.variation.draws import scores_to_values
+from robotid.estimation.variation.groups import Group, RunsOf, runs_of, sums_of
+from robotid.estimation.variation.mixed_effects import MixedEffects, Runs, covariance_of
+from robotid.estimation.variation.variation import SCORES, Variation, _parameters, vary
+from robotid.identification.closed_loop.runs import loop_runs
 from robotid.identification.pipeline import identify, with_drives
-from robotid.logs.data import Log
-from robotid.logs.settings import SignalSettings
-from robotid.recordings.logs import Recordings
-from robotid.recordings.survey import hold_log
-from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.examples import example_urdf
 from robotid.robot.families import wanted_families
 from robotid.robot.model import RobotModel
-from robotid.simulation.motions import random_fourier
-from robotid.variation.draws import scores_to_values
-from robotid.variation.groups import Group, RunsOf, runs_of, sums_of
-from robotid.variation.mixed_effects import MixedEffects, Runs, covariance_of
-from robotid.variation.variation import SCORES, Variation, _parameters, vary
 
 JOBS = Path(__file__).parents[1] / "tests" / "jobs"
 UNLOADED = (

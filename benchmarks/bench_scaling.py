@@ -15,7 +15,7 @@ import time
 import numpy as np
 from setting import full_qr, identify, machine, motion, peak_memory, robot, side_by_side
 
-from robotid.regressor.base_parameters import structural_mapping
+from robotid.dynamics.base_parameters import structural_mapping
 
 BY_JOINTS = ("planar 2R", "UR10", "panda", "Solo12", "TIAGo", "TALOS reduced", "TALOS")
 

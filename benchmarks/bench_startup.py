@@ -29,11 +29,11 @@ PROGRAMS = {
 FIRST_USE = """
 import time
 import numpy as np
-from robotid.logs.data import Trajectory
+from robotid.data.log import Trajectory
 from robotid.robot.examples import example_urdf
-from robotid.regressor.factors import compress
+from robotid.dynamics.factors import compress
 from robotid.robot.model import RobotModel
-from robotid.regressor.torque import build_problem
+from robotid.dynamics.torque import build_problem
 model = RobotModel.from_urdf(example_urdf("ur10_robot.urdf"))
 x = np.ones((64, 6))
 log = Trajectory(t=np.arange(64.0), q=x, v=x, a=x, tau=x, joints=model.joints, rate=1.0,

@@ -29,18 +29,18 @@ import pinocchio as pin
 import scipy.linalg
 import scipy.signal
 
-from robotid.logs.data import Log
-from robotid.simulation.motions import random_fourier
-from robotid.fitting import fit
+from robotid.data.log import Log
+from robotid.dynamics.simulation.motions import random_fourier
+from robotid.estimation.fitting import fit
 from robotid.identification.pipeline import identify
-from robotid.regressor.base_parameters import structural_mapping
+from robotid.dynamics.base_parameters import structural_mapping
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import inertial_from_pseudo_inertia, pseudo_inertia
-from robotid.regressor.torque import joint_torque_regressor
-from robotid.logs.settings import SignalSettings
-from robotid.simulation.closed_loop import another_robot
-from robotid.estimators.segments import quantile
+from robotid.dynamics.torque import joint_torque_regressor
+from robotid.data.signal_settings import SignalSettings
+from robotid.dynamics.simulation.closed_loop import another_robot
+from robotid.estimation.estimators.segments import quantile
 
 CHAINS = {"filtered": SignalSettings(), "raw": SignalSettings(cutoff=None)}
 NOISES = ("white", "unequal", "coloured")

@@ -21,13 +21,13 @@ from pathlib import Path
 import bench_memory
 from setting import ROBOTS, machine
 
-from robotid.commands.job import Job, LogEntry
-from robotid.commands.logs import survey_logs
-from robotid.recordings.logs import Recordings
-from robotid.regressor.base_parameters import structural_mapping
-from robotid.regressor.factors import join
+from robotid.cli.work.job import Job, LogEntry
+from robotid.cli.work.logs import survey_logs
+from robotid.dynamics.base_parameters import structural_mapping
+from robotid.dynamics.factors import join
+from robotid.estimation.fitting.recorded import Recordings
+from robotid.estimation.workers.plan import WorkPlan
 from robotid.robot.examples import example_urdf
-from robotid.workers.plan import WorkPlan
 
 WRITE = Path(bench_memory.__file__)
 

@@ -13,14 +13,14 @@ for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
 import numpy as np
 import pinocchio as pin
 
-from robotid.estimators import WLS
-from robotid.logs.data import Trajectory
-from robotid.regressor.base_parameters import structural_mapping
-from robotid.regressor.factors import compress
-from robotid.regressor.torque import build_problem
+from robotid.data.log import Trajectory
+from robotid.dynamics.base_parameters import structural_mapping
+from robotid.dynamics.factors import compress
+from robotid.dynamics.simulation.motions import random_fourier
+from robotid.dynamics.torque import build_problem
+from robotid.estimation.estimators import WLS
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
-from robotid.simulation.motions import random_fourier
 
 PLANAR = Path(__file__).parents[1] / "urdf" / "planar_2r.urdf"
 ROBOTS = {

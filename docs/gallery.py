@@ -20,11 +20,11 @@ import pinocchio as pin
 from scipy.spatial import ConvexHull
 
 import robotid
-from robotid.commands.demo import run_demo
+from robotid.cli.work.demo import run_demo
+from robotid.dynamics.simulation.closed_loop import Noise, another_robot, simulate
+from robotid.dynamics.simulation.motions import random_fourier
 from robotid.robot.examples import example_urdf
 from robotid.robot.geometry import link_clouds
-from robotid.simulation.closed_loop import Noise, another_robot, simulate
-from robotid.simulation.motions import random_fourier
 
 ROOT = Path(__file__).parents[1]
 GALLERY = ROOT / "build" / "gallery"

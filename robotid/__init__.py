@@ -4,32 +4,32 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from robotid.commands.identify import run_job, save_result
-    from robotid.commands.in_memory import identify
-    from robotid.commands.job import read_job
-    from robotid.doctor.diagnosis import check_logs
-    from robotid.exceptions import RobotIdError
-    from robotid.export.mjcf import write_mjcf
-    from robotid.export.ranges import write_ranges
-    from robotid.export.result import load_result
-    from robotid.export.sdf import write_sdf
-    from robotid.export.urdf import write_urdf
-    from robotid.fitting.settings import EstimatorSettings
+    from robotid.base.exceptions import RobotIdError
+    from robotid.base.versions import __version__
+    from robotid.cli.work.identify import run_job, save_result
+    from robotid.cli.work.in_memory import identify
+    from robotid.cli.work.job import read_job
+    from robotid.data.base_motion import BaseColumns, BaseMotion
+    from robotid.data.files.read import read_log, write_log
+    from robotid.data.log import Log, Trajectory
+    from robotid.data.signal_settings import LogSource, LogUnits, SignalSettings
+    from robotid.design.previews import preview
+    from robotid.diagnosis.logs.check_logs import check_logs
+    from robotid.diagnosis.urdf.inspection import inspect_urdf
+    from robotid.estimation.fitting.estimator_settings import EstimatorSettings
+    from robotid.identification.online.identifier import OnlineIdentifier
     from robotid.identification.payload_fit import identify_payload
-    from robotid.identification.previews import preview
     from robotid.identification.result import Identification
-    from robotid.log_files.read import read_log, write_log
-    from robotid.logs.base import BaseColumns, BaseMotion
-    from robotid.logs.data import Log, Trajectory
-    from robotid.logs.settings import LogSource, LogUnits, SignalSettings
-    from robotid.online.identifier import OnlineIdentifier
-    from robotid.report.document import write_report
+    from robotid.output.files.mjcf import write_mjcf
+    from robotid.output.files.ranges import write_ranges
+    from robotid.output.files.result_file import load_result
+    from robotid.output.files.sdf import write_sdf
+    from robotid.output.files.urdf import write_urdf
+    from robotid.output.report.document import write_report
+    from robotid.output.viewer.replays import replay
     from robotid.robot.constraints import Contact, Loop
     from robotid.robot.model import RobotModel
     from robotid.robot.parameters import Coupling
-    from robotid.urdf_audit.inspection import inspect_urdf
-    from robotid.versions import __version__
-    from robotid.viewer.replays import replay
 
 __all__ = [
     "BaseColumns",
@@ -68,32 +68,32 @@ __all__ = [
 ]
 
 _MODULES = {
-    "commands.identify": ["run_job", "save_result"],
-    "commands.in_memory": ["identify"],
-    "commands.job": ["read_job"],
-    "doctor.diagnosis": ["check_logs"],
-    "urdf_audit.inspection": ["inspect_urdf"],
-    "exceptions": ["RobotIdError"],
-    "export.mjcf": ["write_mjcf"],
-    "export.ranges": ["write_ranges"],
-    "export.result": ["load_result"],
-    "export.sdf": ["write_sdf"],
-    "export.urdf": ["write_urdf"],
-    "fitting.settings": ["EstimatorSettings"],
+    "cli.work.identify": ["run_job", "save_result"],
+    "cli.work.in_memory": ["identify"],
+    "cli.work.job": ["read_job"],
+    "diagnosis.logs.check_logs": ["check_logs"],
+    "diagnosis.urdf.inspection": ["inspect_urdf"],
+    "base.exceptions": ["RobotIdError"],
+    "output.files.mjcf": ["write_mjcf"],
+    "output.files.ranges": ["write_ranges"],
+    "output.files.result_file": ["load_result"],
+    "output.files.sdf": ["write_sdf"],
+    "output.files.urdf": ["write_urdf"],
+    "estimation.fitting.estimator_settings": ["EstimatorSettings"],
     "identification.payload_fit": ["identify_payload"],
-    "identification.previews": ["preview"],
+    "design.previews": ["preview"],
     "identification.result": ["Identification"],
-    "logs.base": ["BaseColumns", "BaseMotion"],
-    "logs.data": ["Log", "Trajectory"],
-    "log_files.read": ["read_log", "write_log"],
-    "logs.settings": ["LogSource", "LogUnits", "SignalSettings"],
-    "online.identifier": ["OnlineIdentifier"],
-    "report.document": ["write_report"],
+    "data.base_motion": ["BaseColumns", "BaseMotion"],
+    "data.log": ["Log", "Trajectory"],
+    "data.files.read": ["read_log", "write_log"],
+    "data.signal_settings": ["LogSource", "LogUnits", "SignalSettings"],
+    "identification.online.identifier": ["OnlineIdentifier"],
+    "output.report.document": ["write_report"],
     "robot.constraints": ["Contact", "Loop"],
     "robot.model": ["RobotModel"],
     "robot.parameters": ["Coupling"],
-    "versions": ["__version__"],
-    "viewer.replays": ["replay"],
+    "base.versions": ["__version__"],
+    "output.viewer.replays": ["replay"],
 }
 
 

@@ -8,6 +8,7 @@ import pkgutil
 import subprocess
 import sys
 from functools import cache
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -15,45 +16,36 @@ import pytest
 import robotid
 
 PACKAGE = Path(robotid.__file__).parent
-LINES = [
-    "",
-    "exceptions _text _typing _native_messages",
-    "findings versions _files pages",
-    "_settings pages kernels",
-    "_arguments",
-    "robot logs",
-    "log_files regressor",
-    "constrained estimators simulation urdf_audit variation workers",
-    "doctor recordings",
-    "fitting",
-    "diagnosis",
-    "judgement",
-    "identification",
-    "closed_loop",
-    "online export viewer excitation",
-    "advice",
-    "report",
-    "commands paper",
-    "cli",
-    "__init__ __main__",
-    "",
-][1:-1]
-LINE = {room: number for number, line in enumerate(LINES) for room in line.split()}
-PINOCCHIO = {"robot", "regressor", "simulation", "viewer"}
+#: a package imports those before it, and so do sub-packages; "." are the files of the package
+PACKAGES = {
+    "base": ["."],
+    "robot": ["."],
+    "data": [".", "files"],
+    "dynamics": ["kernels", ".", "constraints", "simulation"],
+    "estimation": ["workers", "estimators", "variation", "fitting"],
+    "diagnosis": ["urdf", "logs", "residual", "verdict"],
+    "identification": [".", "closed_loop", "online"],
+    "design": ["."],
+    "output": ["pages", "files", "viewer", "report"],
+    "paper": ["."],
+    "cli": ["work", "."],
+}
+PLACES = [(package, part) for package, parts in PACKAGES.items() for part in parts]
+PINOCCHIO = {"robot", "dynamics", "dynamics/simulation", "output/viewer"}
 INSIDE_FUNCTIONS = {
     "yourdfpy": {"robot"},
-    "meshcat": {"viewer"},
+    "meshcat": {"output/viewer"},
     "trimesh": {"robot"},
-    "pandas": {"judgement"},
-    "pyarrow": {"log_files"},
-    "rosbags": {"log_files"},
-    "h5py": {"log_files"},
-    "distributed": {"workers"},
-    "loky": {"workers"},
+    "pandas": {"diagnosis/verdict"},
+    "pyarrow": {"data/files"},
+    "rosbags": {"data/files"},
+    "h5py": {"data/files"},
+    "distributed": {"estimation/workers"},
+    "loky": {"estimation/workers"},
     "rich": {"cli"},
-    "coal": {"excitation"},
+    "coal": {"design"},
     "matplotlib": {"paper"},
-    "clarabel": {"estimators"},
+    "clarabel": {"estimation/estimators"},
 }
 
 
@@ -61,10 +53,21 @@ def modules():
     return sorted(PACKAGE.rglob("*.py"))
 
 
+def place(path):
+    """Return the package and the sub-package of a file."""
+    package, *inside = path.relative_to(PACKAGE).parts
+    return package, inside[0] if len(inside) > 1 and inside[0] in PACKAGES[package] else "."
+
+
 def room(path):
-    """Return the room of a file; a file at the top of the package is one of its own."""
-    inside = path.relative_to(PACKAGE).parts
-    return inside[0] if len(inside) > 1 else path.stem
+    """Return the place of a file as text, "output/viewer"."""
+    return "/".join(place(path)).removesuffix("/.")
+
+
+def module_file(name):
+    """Return the file of a module of robotid, named with its dots."""
+    path = PACKAGE.parent.joinpath(*name.split("."))
+    return path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
 
 
 @cache
@@ -85,7 +88,9 @@ def _imports(tree):
         if isinstance(node, ast.Import):
             yield from ((alias.name, at_top, typing_only) for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
-            yield node.module, at_top, typing_only
+            inner = [f"{node.module}.{alias.name}" for alias in node.names]
+            files = [name for name in inner if module_file(name).is_file()]
+            yield from ((name, at_top, typing_only) for name in files or [node.module])
         at_top &= not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
         typing_only |= isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test)
         for part in ("body", "orelse", "finalbody", "handlers", "cases"):  # imports are statements
@@ -94,16 +99,35 @@ def _imports(tree):
                 waiting += [(child, at_top, typing_only) for child in inside]
 
 
-def test_a_room_imports_only_rooms_of_the_lines_above():
+def arrows():
+    """Yield (file, imported file) of every import inside the package, for type checkers too."""
+    for path in modules():
+        if path.parent != PACKAGE:
+            for name, *_ in imports(path):
+                if name.startswith("robotid."):
+                    yield path, module_file(name)
+
+
+def test_every_file_is_in_one_of_the_eleven_packages():
+    assert {path.name for path in PACKAGE.iterdir()} - {"__pycache__"} == {
+        *PACKAGES, "__init__.py", "__main__.py", "py.typed",
+    }  # fmt: skip
+
+
+def test_a_package_imports_only_those_before_it():
     upwards = [
-        f"{path.relative_to(PACKAGE)} imports {name}"
-        for path in modules()
-        for name, at_top, typing_only in imports(path)
-        if name.startswith("robotid.") and not typing_only
-        for mine, other in [(room(path), name.split(".")[1])]
-        if mine != other and not LINE[other] < LINE[mine]
+        f"{path.relative_to(PACKAGE)} imports {other.relative_to(PACKAGE)}"
+        for path, other in arrows()
+        if PLACES.index(place(other)) > PLACES.index(place(path))
     ]
     assert not upwards, "\n".join(upwards)
+
+
+def test_no_files_import_each_other_in_a_circle():
+    graph = {path: set() for path in modules()}
+    for path, other in arrows():
+        graph[path].add(other)
+    assert set(TopologicalSorter(graph).static_order()) == set(graph)  # a CycleError names a circle
 
 
 def test_third_parties_stay_in_their_rooms():
@@ -122,7 +146,7 @@ def test_third_parties_stay_in_their_rooms():
 
 
 def test_estimators_load_no_physics_engine():
-    code = "import robotid.estimators, sys; print('pinocchio' in sys.modules)"
+    code = "import robotid.estimation.estimators, sys; print('pinocchio' in sys.modules)"
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert run.stdout.strip() == "False"
 
@@ -139,8 +163,10 @@ def test_importing_the_package_is_light():
 
 def test_logs_and_results_are_handled_without_the_simulator():
     code = (
-        "import sys, robotid.commands.logs, robotid.export.entries, robotid.recordings.survey\n"
-        "slow = ('robotid.closed_loop.fit', 'robotid.simulation.loops', 'scipy.interpolate')\n"
+        "import sys, robotid.cli.work.logs, robotid.output.files.entries\n"
+        "import robotid.estimation.fitting.survey\n"
+        "slow = ('robotid.identification.closed_loop.stages', 'scipy.interpolate',\n"
+        "        'robotid.dynamics.simulation.loops')\n"
         "print([m for m in slow if m in sys.modules])"
     )
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
@@ -158,7 +184,7 @@ def test_help_needs_neither_numpy_nor_pinocchio():
 
 
 def test_the_package_shows_its_public_api_and_nothing_else():
-    import robotid.logs.data  # a room that was loaded stays out of sight
+    import robotid.data.log  # a room that was loaded stays out of sight
 
     assert dir(robotid) == [
         "BaseColumns", "BaseMotion", "Contact", "Coupling", "EstimatorSettings", "Identification",

@@ -9,7 +9,8 @@ import threading
 
 import pytest
 
-from robotid._files import (
+from robotid.base.exceptions import DataError, SettingsError
+from robotid.base.files import (
     check_file,
     check_folder,
     file_sha256,
@@ -19,7 +20,6 @@ from robotid._files import (
     write_text,
     written_whole,
 )
-from robotid.exceptions import DataError, SettingsError
 
 
 def names(folder):
@@ -154,7 +154,7 @@ def test_a_pipe_gets_the_content_and_a_reader_that_leaves_is_named(tmp_path):
 
 @pytest.mark.parametrize("name", ["/dev/stdout", "/dev/fd/1", "/proc/self/fd/1"])
 def test_the_standard_output_is_written_to_whatever_it_is(tmp_path, name):
-    code = f"from robotid._files import write_text; write_text('page', {name!r})"
+    code = f"from robotid.base.files import write_text; write_text('page', {name!r})"
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert run.stdout == "page"
     with (tmp_path / "out").open("w") as file:

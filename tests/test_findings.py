@@ -1,6 +1,6 @@
 import tomllib
 
-from robotid.findings import Finding, by_severity, grouped, listed, toml_key
+from robotid.base.findings import Finding, by_severity, grouped, listed, toml_key
 
 
 def test_names_stand_in_a_sentence_and_a_long_list_is_cut():

@@ -20,14 +20,14 @@ from helpers.synthetic import exact_log, truth
 
 import robotid
 from robotid.cli import COMMANDS, main
-from robotid.commands.job import job_from_settings
-from robotid.excitation.files import write_motion
-from robotid.export.samples import sample
-from robotid.log_files.read import write_log
-from robotid.regressor.prediction import predict_instants
+from robotid.cli.work.job import job_from_settings
+from robotid.data.files.read import write_log
+from robotid.design.motion_files import write_motion
+from robotid.dynamics.prediction import predict_instants
+from robotid.dynamics.simulation.motions import random_fourier
+from robotid.dynamics.simulation.simulation_settings import Simulation
+from robotid.output.files.samples import sample
 from robotid.robot.examples import example_urdf
-from robotid.simulation.motions import random_fourier
-from robotid.simulation.settings import Simulation
 
 PAGES = sorted([*DOCS.glob("tutorials/*.md"), *DOCS.glob("how_to/*.md")])
 

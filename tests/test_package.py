@@ -7,8 +7,8 @@ import pytest
 import yaml
 from helpers.paths import DOCS, ROOT
 
+from robotid.base.versions import __version__
 from robotid.cli import COMMANDS, main
-from robotid.versions import __version__
 
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 #: Names that differ on conda-forge.

@@ -13,7 +13,7 @@ from helpers.synthetic import exact_log, truth
 
 import robotid
 from robotid import Log, RobotModel, SignalSettings, identify, identify_payload
-from robotid.exceptions import DataError, RobotIdError, SettingsError
+from robotid.base.exceptions import DataError, RobotIdError, SettingsError
 
 URDF = FOLDER / "planar_2r.urdf"
 

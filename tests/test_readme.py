@@ -10,8 +10,8 @@ from helpers.synthetic import exact_log, truth
 
 import robotid
 from robotid.cli import main
-from robotid.commands.job import job_from_settings
-from robotid.log_files.read import write_log
+from robotid.cli.work.job import job_from_settings
+from robotid.data.files.read import write_log
 from robotid.robot.examples import example_urdf
 
 README = (ROOT / "README.md").read_text()

@@ -5,7 +5,7 @@ import shlex
 
 import pytest
 
-from robotid._text import columns, command_lines, in_digits_of, period, tinted, wrapped
+from robotid.base.text import columns, command_lines, in_digits_of, period, tinted, wrapped
 
 
 def test_lines_fit_and_keep_their_indentation():

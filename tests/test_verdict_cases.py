@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from helpers.paths import ROOT
 
-from robotid.regressor.torque import joint_torque_regressor
+from robotid.dynamics.torque import joint_torque_regressor
 from robotid.robot import geometry
 from robotid.robot.bodies import least_density
 from robotid.robot.model import RobotModel

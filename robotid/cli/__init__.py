@@ -10,6 +10,8 @@ import sys
 from collections.abc import Sequence
 from importlib import import_module
 
+from robotid.base.exceptions import RobotIdError, SettingsError
+from robotid.base.versions import __version__
 from robotid.cli.console import (
     Terminated,
     closed_output_ignored,
@@ -19,8 +21,6 @@ from robotid.cli.console import (
     terminations_raised,
 )
 from robotid.cli.parser import CommandParser
-from robotid.exceptions import RobotIdError, SettingsError
-from robotid.versions import __version__
 
 __all__ = ["COMMANDS", "main"]
 

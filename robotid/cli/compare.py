@@ -5,11 +5,11 @@ from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any
 
-from robotid._text import columns, in_digits_of
+from robotid.base.findings import listed
+from robotid.base.text import columns, in_digits_of
 from robotid.cli.flags import add_json, add_verbose
 from robotid.cli.printing import echo, window_name
 from robotid.cli.running import show_found
-from robotid.findings import listed
 
 __all__ = ["SUMMARY", "add_flags", "run"]
 
@@ -36,7 +36,7 @@ def run(options: argparse.Namespace) -> None:
     Args:
         options: Its flags.
     """
-    from robotid.report.comparison import compare_results, write_comparison
+    from robotid.output.report.comparison import compare_results, write_comparison
 
     if options.out:
         content = write_comparison(options.results, options.out)

@@ -13,12 +13,12 @@ from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, TextIO
 
-from robotid._text import terminal_width, tinted, wrapped
+from robotid.base.text import terminal_width, tinted, wrapped
 
 if TYPE_CHECKING:
     from rich.progress import TaskID
 
-    from robotid._typing import ProgressCallback
+    from robotid.base.typing import ProgressCallback
 
 __all__ = [
     "Terminated",

@@ -35,8 +35,8 @@ def run(options: argparse.Namespace) -> None:
     """
     from dataclasses import asdict
 
-    from robotid.commands.convert import convert
-    from robotid.logs.settings import LogSource
+    from robotid.cli.work.convert import convert
+    from robotid.data.signal_settings import LogSource
 
     joints = options.joints.split(",") if options.joints else None
     topics = tuple(options.sensors.split(",")) if options.sensors else ()

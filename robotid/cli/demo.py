@@ -27,7 +27,7 @@ def run(options: argparse.Namespace) -> None:
     Args:
         options: Its flags.
     """
-    from robotid.commands.demo import run_demo
+    from robotid.cli.work.demo import run_demo
 
     echo("simulating a Unitree Z1 arm whose masses, armature and friction differ from its URDF ...")
     with terminal_progress() as progress:

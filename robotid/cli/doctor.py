@@ -5,10 +5,10 @@ from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any
 
+from robotid.base.findings import Finding, grouped
 from robotid.cli.flags import add_job, job_from_flags
 from robotid.cli.printing import as_finding, echo, print_causes
 from robotid.cli.running import progress_of, show_found
-from robotid.findings import Finding, grouped
 
 __all__ = ["SUMMARY", "add_flags", "run", "show"]
 
@@ -30,9 +30,9 @@ def run(options: argparse.Namespace) -> int:
     Args:
         options: Its flags.
     """
-    from robotid.commands.logs import examine
-    from robotid.doctor.diagnosis import findings_to_dict
-    from robotid.judgement.verdict import blocking
+    from robotid.cli.work.logs import examine
+    from robotid.diagnosis.logs.check_logs import findings_to_dict
+    from robotid.diagnosis.verdict.verdict import blocking
 
     with progress_of(options) as progress:
         job = job_from_flags(options)

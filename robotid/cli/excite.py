@@ -4,17 +4,17 @@ import argparse
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from robotid._settings import Settings
+from robotid.base.exceptions import SettingsError
+from robotid.base.findings import listed
+from robotid.base.settings import Settings
 from robotid.cli.console import terminal_progress
 from robotid.cli.flags import JOB, ROBOT, Flags, add_json, add_progress, job_from_flags
 from robotid.cli.printing import echo, print_files
 from robotid.cli.running import show_found
-from robotid.exceptions import SettingsError
-from robotid.findings import listed
 
 if TYPE_CHECKING:
-    from robotid.excitation.clearance import Box
-    from robotid.excitation.settings import MotionSettings
+    from robotid.design.clearance import Box
+    from robotid.design.excitation_settings import MotionSettings
 
 
 __all__ = ["EXAMPLES", "MAIN_FLAGS", "SUMMARY", "add_flags", "run"]
@@ -57,7 +57,7 @@ def run(options: argparse.Namespace) -> None:
     Args:
         options: Its flags.
     """
-    from robotid.commands.excite import design_motion
+    from robotid.cli.work.excite import design_motion
 
     options.logs = []
     job = job_from_flags(options, needs_logs=False)
@@ -81,7 +81,7 @@ def motion_settings(options: argparse.Namespace) -> "MotionSettings":
     Raises:
         SettingsError: If a flag is not usable.
     """
-    from robotid.excitation.settings import MotionSettings
+    from robotid.design.excitation_settings import MotionSettings
 
     if options.com is not None and not options.mass:
         raise SettingsError(_COM.format(options.com))
@@ -102,8 +102,8 @@ def _boxes(words: Sequence[str], flag: str) -> tuple["Box", ...]:
     Raises:
         SettingsError: If a word has another form.
     """
-    from robotid.excitation.clearance import Box
-    from robotid.excitation.settings import FARTHEST
+    from robotid.design.clearance import Box
+    from robotid.design.excitation_settings import FARTHEST
 
     boxes = []
     for word in words:
@@ -135,7 +135,7 @@ def _clearance(word: str, flag: str) -> float | None:
 
 
 def _motion() -> Settings:
-    from robotid.excitation.settings import MotionSettings
+    from robotid.design.excitation_settings import MotionSettings
 
     return MotionSettings()
 

@@ -7,7 +7,7 @@ from typing import Any
 from robotid.cli.flags import add_json
 from robotid.cli.printing import echo
 from robotid.cli.running import show_found
-from robotid.export.formats import FORMATS, options_of
+from robotid.output.files.export_formats import FORMATS, options_of
 
 __all__ = ["SUMMARY", "add_flags", "run"]
 
@@ -46,7 +46,7 @@ def run(options: argparse.Namespace) -> None:
     Args:
         options: Its flags.
     """
-    from robotid.commands.export import export_result
+    from robotid.cli.work.export import export_result
 
     chosen = {name: getattr(options, name) for name in options_of(FORMATS)}
     done = export_result(options.result, options.format, options.out, **chosen)

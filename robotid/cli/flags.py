@@ -6,12 +6,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from robotid._settings import Entries, Settings, table_in
-from robotid.exceptions import SettingsError
-from robotid.findings import listed
+from robotid.base.exceptions import SettingsError
+from robotid.base.findings import listed
+from robotid.base.settings import Entries, Settings, table_in
 
 if TYPE_CHECKING:
-    from robotid.commands.job import Job
+    from robotid.cli.work.job import Job
 
 
 __all__ = [
@@ -199,7 +199,7 @@ def _listed(words: Sequence[str], _: str) -> list[str]:
 
 
 def _job() -> Settings:
-    from robotid.commands.job import Job
+    from robotid.cli.work.job import Job
 
     return Job(Path())
 
@@ -365,7 +365,7 @@ def job_from_flags(options: argparse.Namespace, *, needs_logs: bool = True) -> "
     Raises:
         SettingsError: If a job file is given with flags, or a flag is not usable.
     """
-    from robotid.commands.job import job_from_settings, read_job
+    from robotid.cli.work.job import job_from_settings, read_job
 
     if Path(options.source).suffix == ".toml":
         given = _given(options)

@@ -45,9 +45,9 @@ def run(options: argparse.Namespace) -> int:
         options: Its flags.
     """
     with progress_of(options) as progress:
-        from robotid.commands.fleet import read_fleet, run_fleet
-        from robotid.regressor.factors import available_cores
-        from robotid.workers.plan import WorkPlan
+        from robotid.cli.work.fleet import read_fleet, run_fleet
+        from robotid.dynamics.factors import available_cores
+        from robotid.estimation.workers.plan import WorkPlan
 
         units = read_fleet(options.table, options.urdf, options.job)
         workers = available_cores() if options.workers is None else options.workers

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
-from robotid._text import columns, terminal_width, wrapped
+from robotid.base.text import columns, terminal_width, wrapped
 from robotid.cli.flags import OUTPUT, add_job, add_out, add_progress, job_from_flags, source_words
 from robotid.cli.printing import (
     echo,
@@ -48,16 +48,16 @@ def run(options: argparse.Namespace) -> int:
     Args:
         options: Its flags.
     """
-    from robotid._typing import report_stage
+    from robotid.base.typing import report_stage
 
     with progress_of(options) as progress:
         report_stage(progress, "reading logs")  # before what takes the first second: its modules
-        from robotid.advice.loop_steps import loop_steps
-        from robotid.advice.next_steps import next_steps
-        from robotid.advice.steps import Origin
-        from robotid.commands.identify import run_job
+        from robotid.cli.work.identify import run_job
+        from robotid.estimation.workers.plan import WorkPlan
         from robotid.identification.result import Identification
-        from robotid.workers.plan import WorkPlan
+        from robotid.output.report.loop_steps import loop_steps
+        from robotid.output.report.next_steps import next_steps
+        from robotid.output.report.steps import Origin
 
         job = job_from_flags(options)
         workers = job.workers if options.workers is None else options.workers
@@ -114,7 +114,7 @@ def show_result(result: dict[str, Any], *, is_verbose: bool = False) -> None:
 def _found(result: Mapping[str, Any]) -> str:
     """Return the number of parameters and their conditioning, as text."""
     if "simulation" in result:
-        from robotid.closed_loop.evaluation import DRIFTS  # imports numpy
+        from robotid.identification.closed_loop.position_errors import DRIFTS  # imports numpy
 
         fit, kind = (result["simulation"][key] for key in ("fit", "controller"))
         over = f" over {DRIFTS:g} s" if kind["kind"] == "torque" else ""

@@ -5,10 +5,10 @@ import shlex
 from functools import partial
 from typing import Any
 
+from robotid.base.findings import listed
 from robotid.cli.flags import add_json, add_verbose
 from robotid.cli.printing import echo, print_causes
 from robotid.cli.running import show_found
-from robotid.findings import listed
 
 __all__ = ["SUMMARY", "add_flags", "run"]
 
@@ -35,8 +35,8 @@ def run(options: argparse.Namespace) -> None:
     Args:
         options: Its flags.
     """
-    from robotid.exceptions import ModelError
-    from robotid.urdf_audit.inspection import inspect_urdf
+    from robotid.base.exceptions import ModelError
+    from robotid.diagnosis.urdf.inspection import inspect_urdf
 
     content = inspect_urdf(options.urdf, free_flyer=options.free_flyer).to_dict()
     if not (content["robot"] or options.json):

@@ -4,11 +4,11 @@ import argparse
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from robotid._text import columns, in_digits_of
+from robotid.base.findings import listed
+from robotid.base.text import columns, in_digits_of
 from robotid.cli.flags import JOB, LOG, add_json, job_from_flags, refuse_log_flags
 from robotid.cli.printing import echo
 from robotid.cli.running import progress_of, show_found
-from robotid.findings import listed
 
 __all__ = ["SUMMARY", "add_flags", "run"]
 
@@ -44,7 +44,7 @@ def run(options: argparse.Namespace) -> None:
     Args:
         options: Its flags.
     """
-    from robotid.commands.payload import is_result, measure_payload
+    from robotid.cli.work.payload import is_result, measure_payload
 
     if any(map(is_result, options.reference)):
         refuse_log_flags(options, "a RESULT states how its logs are read")

@@ -6,7 +6,8 @@ from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
-from robotid._text import columns
+from robotid.base.findings import listed
+from robotid.base.text import columns
 from robotid.cli.flags import (
     JOB,
     MOTION,
@@ -17,7 +18,6 @@ from robotid.cli.flags import (
 )
 from robotid.cli.printing import echo, recordings_of
 from robotid.cli.running import show_found
-from robotid.findings import listed
 
 __all__ = ["SUMMARY", "add_flags", "run"]
 
@@ -54,7 +54,7 @@ def run(options: argparse.Namespace) -> None:
     Args:
         options: Its flags.
     """
-    from robotid.commands.preview import preview_job
+    from robotid.cli.work.preview import preview_job
 
     if options.given:
         refuse_log_flags(options, "a RESULT states how its logs are read")

@@ -5,11 +5,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from robotid._text import command_lines, period, terminal_width, tinted, wrapped
-from robotid.findings import Finding, grouped, number_of
+from robotid.base.findings import Finding, grouped, number_of
+from robotid.base.text import command_lines, period, terminal_width, tinted, wrapped
 
 if TYPE_CHECKING:
-    from robotid.advice.steps import Step
+    from robotid.output.report.steps import Step
 
 
 __all__ = [

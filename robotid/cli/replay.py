@@ -4,7 +4,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from robotid._files import check_file
+from robotid.base.files import check_file
 from robotid.cli.flags import (
     JOB,
     ONLINE,
@@ -43,7 +43,7 @@ def run(options: argparse.Namespace) -> None:
     Args:
         options: Its flags.
     """
-    from robotid.commands.replay import read_findings, replay_files, stated_job
+    from robotid.cli.work.replay import read_findings, replay_files, stated_job
 
     findings = read_findings(options.results)
     if findings.settings is None:

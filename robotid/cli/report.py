@@ -31,11 +31,11 @@ def run(options: argparse.Namespace) -> None:
     Args:
         options: Its flags.
     """
-    from robotid._typing import report_stage
+    from robotid.base.typing import report_stage
 
     with progress_of(options) as progress:
         report_stage(progress, "reading logs")
-        from robotid.commands.report import rewrite_report
+        from robotid.cli.work.report import rewrite_report
 
         written = rewrite_report(options.result, options.out, progress=progress)
     show_found(written, options, _show)

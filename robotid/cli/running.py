@@ -12,8 +12,8 @@ from robotid.cli.printing import print_files
 if TYPE_CHECKING:
     from contextlib import AbstractContextManager
 
-    from robotid._typing import ProgressCallback
-    from robotid.commands.job import Job
+    from robotid.base.typing import ProgressCallback
+    from robotid.cli.work.job import Job
 
 __all__ = ["progress_of", "serve", "show_found"]
 
@@ -68,7 +68,7 @@ def serve(
         options: The flags of the command.
         finished: Called with the result at the end of the log.
     """
-    from robotid.commands.track import serve_track
+    from robotid.cli.work.track import serve_track
 
     def announce(url: str) -> None:
         print(f"live: {url}  (stop with Ctrl-C)", file=sys.stderr, flush=True)

@@ -26,6 +26,6 @@ def run(options: argparse.Namespace) -> None:
     Args:
         options: Its flags.
     """
-    from robotid.commands.schema import job_schema
+    from robotid.cli.work.schema import job_schema
 
     print(json.dumps(job_schema(), indent=2))

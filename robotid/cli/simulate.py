@@ -4,17 +4,17 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from robotid._settings import Settings
+from robotid.base.exceptions import SettingsError
+from robotid.base.findings import listed
+from robotid.base.settings import Settings
 from robotid.cli.console import terminal_progress
 from robotid.cli.flags import JOB, ROBOT, Flags, add_json
 from robotid.cli.printing import echo, print_files
 from robotid.cli.running import show_found
-from robotid.exceptions import SettingsError
-from robotid.findings import listed
 
 if TYPE_CHECKING:
-    from robotid.commands.job import Job
-    from robotid.simulation.settings import Simulation
+    from robotid.cli.work.job import Job
+    from robotid.dynamics.simulation.simulation_settings import Simulation
 
 
 __all__ = ["SUMMARY", "add_flags", "run"]
@@ -26,7 +26,7 @@ _HALF = 0.5  # of the commanded range: a joint that moves less does not follow
 
 
 def _simulation() -> Settings:
-    from robotid.simulation.settings import Simulation
+    from robotid.dynamics.simulation.simulation_settings import Simulation
 
     return Simulation()
 
@@ -74,7 +74,7 @@ def run(options: argparse.Namespace) -> None:
     Args:
         options: Its flags.
     """
-    from robotid.commands.simulate import SimulatedFiles, simulate_log
+    from robotid.cli.work.simulate import SimulatedFiles, simulate_log
 
     job, settings = simulation_from_flags(options)
     urdf = Path(options.urdf) if options.urdf else None
@@ -95,8 +95,8 @@ def simulation_from_flags(options: argparse.Namespace) -> "tuple[Job, Simulation
     Raises:
         SettingsError: If the file of the plant, or a flag, is not usable.
     """
-    from robotid.commands.job import job_from_settings, read_job
-    from robotid.simulation.settings import read_simulation
+    from robotid.cli.work.job import job_from_settings, read_job
+    from robotid.dynamics.simulation.simulation_settings import read_simulation
 
     settings, drives = read_simulation(options.plant, _PLANT.stated(options))
     for joint, entries in drives.items():

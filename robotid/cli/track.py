@@ -4,7 +4,7 @@ import argparse
 import sys
 from typing import Any
 
-from robotid._text import columns, in_digits_of
+from robotid.base.text import columns, in_digits_of
 from robotid.cli.flags import (
     JOB,
     ONLINE,
@@ -43,7 +43,7 @@ def run(options: argparse.Namespace) -> None:
     Args:
         options: Its flags.
     """
-    from robotid.commands.track import run_track
+    from robotid.cli.work.track import run_track
 
     job = job_from_flags(options)
 

@@ -4,13 +4,13 @@ import argparse
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from robotid._text import terminal_width
+from robotid.base.text import terminal_width
 from robotid.cli.flags import add_json
 from robotid.cli.printing import echo, print_verdict
 from robotid.cli.running import show_found
 
 if TYPE_CHECKING:
-    from robotid.commands.job import LogEntry
+    from robotid.cli.work.job import LogEntry
 
 __all__ = ["SUMMARY", "add_flags", "run"]
 
@@ -39,7 +39,7 @@ def run(options: argparse.Namespace) -> None:
     Args:
         options: Its flags.
     """
-    from robotid.commands.validate import validate_result
+    from robotid.cli.work.validate import validate_result
 
     entries = [_entry(log, options) for log in options.logs]
     found = validate_result(options.result, entries, update=options.update)
@@ -48,7 +48,7 @@ def run(options: argparse.Namespace) -> None:
 
 def _entry(log: str, options: argparse.Namespace) -> "LogEntry":
     """Return a log with its robot, checked as in a job file."""
-    from robotid.commands.job import LogEntry
+    from robotid.cli.work.job import LogEntry
 
     unit = {} if options.unit is None else {"unit": options.unit}
     return LogEntry.from_dict({"log": log, **unit})

@@ -1,3 +1,3 @@
-"""Analysis of the residual of a fit: missing drive terms, faults of recordings and of the URDF."""
+"""What is wrong, with evidence: the URDF, the logs, the residual, the verdict."""
 
 __all__: list[str] = []

@@ -5,12 +5,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from robotid._settings import SIZE, is_number
-from robotid._typing import Array
-from robotid.exceptions import SettingsError
-from robotid.findings import listed
-from robotid.logs.data import suggestion
-from robotid.regressor.prediction import predict_instants
+from robotid.base.exceptions import SettingsError
+from robotid.base.findings import listed
+from robotid.base.settings import SIZE, is_number
+from robotid.base.typing import Array
+from robotid.data.log import suggestion
+from robotid.dynamics.prediction import predict_instants
 from robotid.robot.model import RobotModel
 
 __all__ = [

@@ -6,24 +6,24 @@ from pathlib import Path
 
 import numpy as np
 
-from robotid._settings import is_number, require_each, require_kind
-from robotid._typing import Array
-from robotid.estimators import Consistent, Constraints, Estimate
-from robotid.estimators.segments import quantile
-from robotid.estimators.two_runs import Compared, TwoRuns, payload_runs
-from robotid.exceptions import DataError, NotConvergedError, SettingsError
-from robotid.findings import listed
-from robotid.fitting.settings import ConsistentSettings
-from robotid.identification.payload import Gain, PayloadFit, payload_of
+from robotid.base.exceptions import DataError, NotConvergedError, SettingsError
+from robotid.base.findings import listed
+from robotid.base.settings import is_number, require_each, require_kind
+from robotid.base.typing import Array
+from robotid.data.files.read import Readable, read_logs
+from robotid.data.signal_settings import SignalSettings
+from robotid.diagnosis.verdict.payload_check import PayloadCheck
+from robotid.dynamics.base_parameters import structural_mapping
+from robotid.dynamics.constraint_rows import logged_base
+from robotid.dynamics.factors import join
+from robotid.estimation.estimators import Consistent, Constraints, Estimate
+from robotid.estimation.estimators.segments import quantile
+from robotid.estimation.estimators.two_runs import Compared, TwoRuns, payload_runs
+from robotid.estimation.fitting.estimator_settings import ConsistentSettings
+from robotid.estimation.fitting.recorded import Recordings
+from robotid.estimation.fitting.survey import hold_log
+from robotid.identification.payload_estimate import Gain, PayloadFit, payload_of
 from robotid.identification.pipeline import robot_of, with_drives
-from robotid.judgement.payload_check import PayloadCheck
-from robotid.log_files.read import Readable, read_logs
-from robotid.logs.settings import SignalSettings
-from robotid.recordings.logs import Recordings
-from robotid.recordings.survey import hold_log
-from robotid.regressor.base_parameters import structural_mapping
-from robotid.regressor.constraints import logged_base
-from robotid.regressor.factors import join
 from robotid.robot.bodies import link_transfer, usual_links
 from robotid.robot.closure import refuse_loops
 from robotid.robot.drives import DriveTerm

@@ -6,12 +6,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from robotid._typing import Array
-from robotid.diagnosis.residuals import autocorrelation, friction_split, spectrum
-from robotid.fitting.bands import QUANTILE, TorqueBand, friction_curve
-from robotid.fitting.evaluation import Evaluation
-from robotid.pages.charts import Chart, Series, broken
-from robotid.regressor.memory import drive_motion_along
+from robotid.base.typing import Array
+from robotid.diagnosis.residual.residuals import autocorrelation, friction_split, spectrum
+from robotid.dynamics.memory import drive_motion_along
+from robotid.estimation.fitting.bands import QUANTILE, TorqueBand, friction_curve
+from robotid.estimation.fitting.evaluation import Evaluation
+from robotid.output.pages.charts import Chart, Series, broken
 
 if TYPE_CHECKING:
     from robotid.identification.result import Identification

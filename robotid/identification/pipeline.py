@@ -7,46 +7,46 @@ from pathlib import Path
 
 import numpy as np
 
-from robotid._settings import require_flag, require_kind
-from robotid._typing import ProgressCallback, ignore_progress, report_stage
-from robotid.diagnosis.discrepancies import explain_residual
-from robotid.diagnosis.drive_choice import choose_drives
-from robotid.diagnosis.misfit_findings import counterbalanced, settled, with_known_springs
-from robotid.diagnosis.model_error import settled_shapes, with_model_error
-from robotid.diagnosis.sample import take_sample
-from robotid.doctor.diagnosis import diagnose
-from robotid.exceptions import (
+from robotid.base.exceptions import (
     DataError,
     ModelError,
     NotConvergedError,
     RankDeficientError,
     SettingsError,
 )
-from robotid.findings import Finding, not_ignored
-from robotid.fitting.drives import DriveChoice
-from robotid.fitting.fit import fit_recordings, rough_choice, solve_recordings
-from robotid.fitting.result import Fit, Solution
-from robotid.fitting.settings import EstimatorSettings
-from robotid.identification.repeated_errors import with_repeated_errors
-from robotid.identification.result import Asked, Identification
-from robotid.judgement.findings import fit_findings, log_findings, not_written
-from robotid.judgement.unlike_runs import rescaled_findings, unlike_findings
-from robotid.judgement.verdict import blocking, check_ignored, rejected, warnings_of
-from robotid.log_files.read import Readable, read_logs
-from robotid.logs.settings import SignalSettings
-from robotid.recordings.logs import Recordings
-from robotid.recordings.survey import hold_log
-from robotid.regressor.base_parameters import structural_mapping
-from robotid.regressor.constraints import logged_base
-from robotid.robot.assumed import with_assumed_inertials
-from robotid.robot.families import AUTO, wanted_families
-from robotid.robot.model import RobotModel
-from robotid.urdf_audit.inertials import (
+from robotid.base.findings import Finding, not_ignored
+from robotid.base.settings import require_flag, require_kind
+from robotid.base.typing import ProgressCallback, ignore_progress, report_stage
+from robotid.data.files.read import Readable, read_logs
+from robotid.data.signal_settings import SignalSettings
+from robotid.diagnosis.logs.check_logs import diagnose
+from robotid.diagnosis.residual.discrepancies import explain_residual
+from robotid.diagnosis.residual.drive_choice import choose_drives
+from robotid.diagnosis.residual.misfit_findings import counterbalanced, settled, with_known_springs
+from robotid.diagnosis.residual.model_error import settled_shapes, with_model_error
+from robotid.diagnosis.residual.term_trials import take_sample
+from robotid.diagnosis.urdf.inertials import (
     assumed_inertials,
     explained_by_assumed,
     impossible_inertials,
 )
-from robotid.variation.variation import vary
+from robotid.diagnosis.verdict.fit_findings import fit_findings, log_findings, not_written
+from robotid.diagnosis.verdict.unlike_runs import rescaled_findings, unlike_findings
+from robotid.diagnosis.verdict.verdict import blocking, check_ignored, rejected, warnings_of
+from robotid.dynamics.base_parameters import structural_mapping
+from robotid.dynamics.constraint_rows import logged_base
+from robotid.estimation.fitting.estimator_settings import EstimatorSettings
+from robotid.estimation.fitting.fit import fit_recordings, rough_choice, solve_recordings
+from robotid.estimation.fitting.fitted import Fit, Solution
+from robotid.estimation.fitting.recorded import Recordings
+from robotid.estimation.fitting.selected_drives import DriveChoice
+from robotid.estimation.fitting.survey import hold_log
+from robotid.estimation.variation.variation import vary
+from robotid.identification.repeated_errors import with_repeated_errors
+from robotid.identification.result import Asked, Identification
+from robotid.robot.assumed import with_assumed_inertials
+from robotid.robot.families import AUTO, wanted_families
+from robotid.robot.model import RobotModel
 
 __all__ = ["conclude", "identify", "robot_of", "with_drives"]
 

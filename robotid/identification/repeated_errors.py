@@ -39,19 +39,19 @@ import numpy as np
 import scipy.linalg
 from scipy.optimize import minimize_scalar
 
-from robotid._typing import Array
-from robotid.estimators import WLS
-from robotid.logs.base import in_base
-from robotid.logs.data import Trajectory
-from robotid.logs.imu import ImuFrame
-from robotid.recordings.logs import Recordings, RepeatedErrors
-from robotid.recordings.survey import Rows, SurveyedLog
-from robotid.regressor.base_parameters import BaseMapping
-from robotid.regressor.constraints import constraint_forces, contact_links, without_forces
-from robotid.regressor.factors import join, triangle_of
-from robotid.regressor.lapack import Triangle
-from robotid.regressor.prediction import predict
-from robotid.regressor.used_rows import base_problem
+from robotid.base.typing import Array
+from robotid.data.base_motion import in_base
+from robotid.data.imu_frame import ImuFrame
+from robotid.data.log import Trajectory
+from robotid.dynamics.base_parameters import BaseMapping
+from robotid.dynamics.constraint_rows import constraint_forces, contact_links, without_forces
+from robotid.dynamics.factors import join, triangle_of
+from robotid.dynamics.lapack import Triangle
+from robotid.dynamics.prediction import predict
+from robotid.dynamics.used_rows import base_problem
+from robotid.estimation.estimators import WLS
+from robotid.estimation.fitting.recorded import Recordings, RepeatedErrors
+from robotid.estimation.fitting.survey import Rows, SurveyedLog
 from robotid.robot.constraints import Contact
 from robotid.robot.model import RobotModel
 from robotid.robot.prior import prior_spread

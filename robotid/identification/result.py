@@ -6,14 +6,21 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
-from robotid._arguments import checked
-from robotid._settings import Settings, require_kind
-from robotid.diagnosis.misfit import Misfit
-from robotid.diagnosis.torque_split import JointTorque, joint_torques
-from robotid.exceptions import DataError
-from robotid.findings import Finding, listed
-from robotid.fitting.evaluation import Evaluation, hidden_joints
-from robotid.fitting.result import Fit
+from robotid.base.arguments import checked
+from robotid.base.exceptions import DataError
+from robotid.base.findings import Finding, listed
+from robotid.base.settings import Settings, require_kind
+from robotid.data.log import suggestion
+from robotid.data.signal_settings import SignalSettings
+from robotid.diagnosis.residual.misfit import Misfit
+from robotid.diagnosis.residual.torque_split import JointTorque, joint_torques
+from robotid.diagnosis.verdict.evidence import Determined, Predictions
+from robotid.diagnosis.verdict.parameter_table import parameter_entries, parameter_table
+from robotid.diagnosis.verdict.payload_check import PayloadCheck
+from robotid.diagnosis.verdict.scale_check import ScaleCheck, check_scale
+from robotid.diagnosis.verdict.verdict import Verdict, VerdictWarning, judge
+from robotid.estimation.fitting.evaluation import Evaluation, hidden_joints
+from robotid.estimation.fitting.fitted import Fit
 from robotid.identification.pictures import friction_chart, shown_evaluation, torque_charts
 from robotid.identification.summary import (
     identification_html,
@@ -21,14 +28,7 @@ from robotid.identification.summary import (
     identification_text,
 )
 from robotid.identification.why_pictures import why_charts
-from robotid.judgement.evidence import Determined, Predictions
-from robotid.judgement.parameter_table import parameter_entries, parameter_table
-from robotid.judgement.payload_check import PayloadCheck
-from robotid.judgement.scale_check import ScaleCheck, check_scale
-from robotid.judgement.verdict import Verdict, VerdictWarning, judge
-from robotid.logs.data import suggestion
-from robotid.logs.settings import SignalSettings
-from robotid.pages.plots import Plot
+from robotid.output.pages.plots import Plot
 from robotid.robot.families import AUTO
 
 __all__ = ["Asked", "Identification"]

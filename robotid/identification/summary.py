@@ -7,13 +7,13 @@ from html import escape
 from statistics import median
 from typing import TYPE_CHECKING, Any
 
-from robotid._text import columns
-from robotid.judgement.uses import uses_line
-from robotid.pages.html import code, number, percent, table, text
+from robotid.base.text import columns
+from robotid.diagnosis.verdict.uses import uses_line
+from robotid.output.pages.html import code, number, percent, table, text
 
 if TYPE_CHECKING:
-    from robotid.fitting.identified import Identified
-    from robotid.fitting.metrics import Metrics
+    from robotid.estimation.fitting.identified import Identified
+    from robotid.estimation.fitting.metrics import Metrics
     from robotid.identification.result import Identification
 
 __all__ = [

@@ -2,12 +2,12 @@
 
 import numpy as np
 
-from robotid._typing import Array
-from robotid.diagnosis.dependence import Dependence
-from robotid.diagnosis.torque_split import JointTorque, spread_rows
-from robotid.fitting.bands import QUANTILE
+from robotid.base.typing import Array
+from robotid.diagnosis.residual.dependence import Dependence
+from robotid.diagnosis.residual.torque_split import JointTorque, spread_rows
+from robotid.estimation.fitting.bands import QUANTILE
 from robotid.identification.pictures import unused_spans
-from robotid.pages.charts import Chart, Series, broken
+from robotid.output.pages.charts import Chart, Series, broken
 
 __all__ = ["why_charts"]
 

@@ -9,8 +9,8 @@ from typing import Literal, Protocol, TypeAlias
 
 import numpy as np
 
-from robotid._typing import Array
-from robotid.exceptions import DataError, RankDeficientError, SettingsError
+from robotid.base.exceptions import DataError, RankDeficientError, SettingsError
+from robotid.base.typing import Array
 from robotid.paper import planar_2r
 
 __all__ = [

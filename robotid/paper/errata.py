@@ -4,7 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from robotid._typing import Array
+from robotid.base.typing import Array
+from robotid.dynamics.simulation.plant import rk4
 from robotid.paper.equations import LinearPlant, PlanarDynamics, mass_matrix, torque
 from robotid.paper.planar_2r import (
     PAPER_LINKS,
@@ -14,7 +15,6 @@ from robotid.paper.planar_2r import (
     regressor,
 )
 from robotid.paper.study import DURATION, MODELS, PROGRAM, paper_arm
-from robotid.simulation.plant import rk4
 
 __all__ = ["EnergyDrift", "Erratum", "energy_drift", "errata"]
 

@@ -15,9 +15,9 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 
-from robotid._typing import Array
-from robotid.exceptions import DataError, ModelError, SettingsError
-from robotid.findings import listed
+from robotid.base.exceptions import DataError, ModelError, SettingsError
+from robotid.base.findings import listed
+from robotid.base.typing import Array
 
 __all__ = [
     "PAPER_LINKS",

@@ -12,8 +12,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from robotid._typing import Array
-from robotid.exceptions import DataError, SettingsError
+from robotid.base.exceptions import DataError, SettingsError
+from robotid.base.typing import Array
+from robotid.dynamics.simulation.motions import ProgramMotion
+from robotid.dynamics.simulation.plant import rk4
 from robotid.paper.equations import (
     Bounds,
     LinearDynamics,
@@ -26,8 +28,6 @@ from robotid.paper.equations import (
     reference_acceleration,
     smallest_eigenvalue,
 )
-from robotid.simulation.motions import ProgramMotion
-from robotid.simulation.plant import rk4
 
 __all__ = ["History", "Influences", "LoopSettings", "random_torque", "run_procedure"]
 

@@ -8,13 +8,17 @@ from typing import Any
 
 import numpy as np
 
-from robotid._files import check_folder, folder_beside, write_json
-from robotid._typing import Array, ProgressCallback, ignore_progress
+from robotid.base.files import check_folder, folder_beside, write_json
+from robotid.base.typing import Array, ProgressCallback, ignore_progress
+from robotid.base.versions import __version__
+from robotid.dynamics.base_parameters import structural_mapping
+from robotid.dynamics.torque import joint_torque_regressor
+from robotid.output.viewer.replays import Torques, replay
 from robotid.paper.equations import PlanarDynamics, torque
 from robotid.paper.errata import EnergyDrift, energy_drift, errata
-from robotid.paper.page import paper_page
+from robotid.paper.paper_figures import paper_figures
+from robotid.paper.paper_page import paper_page
 from robotid.paper.planar_2r import urdf_text
-from robotid.paper.plots import paper_figures
 from robotid.paper.procedure import LoopSettings
 from robotid.paper.study import (
     AMPLITUDE,
@@ -30,12 +34,8 @@ from robotid.paper.study import (
     study_model,
 )
 from robotid.paper.svg import STYLE, svg_element, svg_file
-from robotid.regressor.base_parameters import structural_mapping
-from robotid.regressor.torque import joint_torque_regressor
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import PAPER_TERMS, to_paper_order
-from robotid.versions import __version__
-from robotid.viewer.replays import Torques, replay
 
 __all__ = ["run_paper"]
 

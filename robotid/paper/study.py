@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robotid._typing import Array
-from robotid.exceptions import SettingsError
-from robotid.findings import listed
+from robotid.base.exceptions import SettingsError
+from robotid.base.findings import listed
+from robotid.base.typing import Array
+from robotid.dynamics.simulation.motions import ProgramMotion
 from robotid.paper.equations import LinearDynamics, LinearPlant, PlanarDynamics, torque
 from robotid.paper.planar_2r import PAPER_LINKS, PAPER_PARAMETERS, Form, parameters
 from robotid.paper.procedure import History, Influences, LoopSettings, random_torque, run_procedure
-from robotid.simulation.motions import ProgramMotion
 
 __all__ = [
     "AMPLITUDE",

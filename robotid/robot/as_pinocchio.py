@@ -5,8 +5,8 @@ import warnings
 import numpy as np
 import pinocchio as pin
 
-from robotid._typing import Array
-from robotid.findings import listed
+from robotid.base.findings import listed
+from robotid.base.typing import Array
 from robotid.robot.model import RobotModel
 
 __all__ = ["pinocchio_model"]

@@ -7,7 +7,7 @@ from types import MappingProxyType
 
 import numpy as np
 
-from robotid._typing import Array
+from robotid.base.typing import Array
 from robotid.robot.bodies import held_parameters, link_places, negligible_bodies
 from robotid.robot.geometry import body_frames, body_points
 from robotid.robot.model import RobotModel

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 
-from robotid._typing import Array
-from robotid.exceptions import ModelError
-from robotid.findings import listed
+from robotid.base.exceptions import ModelError
+from robotid.base.findings import listed
+from robotid.base.typing import Array
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import (
     inertial_from_pseudo_inertia,

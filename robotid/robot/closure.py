@@ -4,9 +4,9 @@ import numpy as np
 import pinocchio as pin
 from scipy.linalg import qr
 
-from robotid._typing import Array
-from robotid.exceptions import DataError, ModelError
-from robotid.findings import listed
+from robotid.base.exceptions import DataError, ModelError
+from robotid.base.findings import listed
+from robotid.base.typing import Array
 from robotid.robot.constraints import frame_id
 from robotid.robot.model import RobotModel
 

@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 import pinocchio as pin
 
-from robotid._arguments import check_fields
-from robotid._settings import is_number, require_each, require_flag, require_kind
-from robotid._typing import Array
-from robotid.exceptions import ModelError, SettingsError
-from robotid.findings import listed
+from robotid.base.arguments import check_fields
+from robotid.base.exceptions import ModelError, SettingsError
+from robotid.base.findings import listed
+from robotid.base.settings import is_number, require_each, require_flag, require_kind
+from robotid.base.typing import Array
 from robotid.robot.drive_term import DriveTerm
 
 if TYPE_CHECKING:

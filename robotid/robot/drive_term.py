@@ -13,9 +13,9 @@ from typing import Any, ClassVar, TypeAlias
 
 import numpy as np
 
-from robotid._settings import is_number
-from robotid._typing import Array
-from robotid.exceptions import SettingsError
+from robotid.base.exceptions import SettingsError
+from robotid.base.settings import is_number
+from robotid.base.typing import Array
 
 __all__ = [
     "ANYWHERE",

@@ -16,7 +16,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from robotid._typing import Array
+from robotid.base.typing import Array
 from robotid.robot.drive_term import (
     DataRange,
     DriveMotion,

@@ -4,8 +4,8 @@ from functools import cache
 from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 
-from robotid.exceptions import MissingDependencyError, ModelError
-from robotid.findings import listed
+from robotid.base.exceptions import MissingDependencyError, ModelError
+from robotid.base.findings import listed
 
 __all__ = ["example_urdf", "example_urdfs"]
 

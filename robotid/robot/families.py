@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from robotid._settings import is_number, require_kind
-from robotid.exceptions import SettingsError
-from robotid.findings import listed, toml_key
+from robotid.base.exceptions import SettingsError
+from robotid.base.findings import listed, toml_key
+from robotid.base.settings import is_number, require_kind
 from robotid.robot.drives import FAMILIES, TERM_CLASSES, DriveTerm
 
 __all__ = [

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 
-from robotid._typing import Array
-from robotid.exceptions import SettingsError
+from robotid.base.exceptions import SettingsError
+from robotid.base.typing import Array
 from robotid.robot.bodies import link_places
 from robotid.robot.meshes import Shape, find_mesh, read_shapes, read_surfaces
 from robotid.robot.model import RobotModel

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from robotid.exceptions import ModelError
-from robotid.findings import listed
+from robotid.base.exceptions import ModelError
+from robotid.base.findings import listed
 from robotid.robot.tree import Tree
 from robotid.robot.urdf_text import LARGEST
 

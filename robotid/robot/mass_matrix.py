@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import pinocchio as pin
 
-from robotid._typing import Array
+from robotid.base.typing import Array
 from robotid.robot.closure import Chains
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import ParameterLayout

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from robotid._typing import Array
-from robotid.exceptions import MissingDependencyError
+from robotid.base.exceptions import MissingDependencyError
+from robotid.base.typing import Array
 from robotid.robot.examples import example_urdfs
 from robotid.robot.urdf_text import LARGEST, numbers
 

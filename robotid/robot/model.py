@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from robotid._arguments import checked
-from robotid._native_messages import caught_messages
-from robotid._settings import require_each, require_flag, require_kind
-from robotid._typing import Array
-from robotid.exceptions import DataError, ModelError, SettingsError
-from robotid.findings import listed
+from robotid.base.arguments import checked
+from robotid.base.exceptions import DataError, ModelError, SettingsError
+from robotid.base.findings import listed
+from robotid.base.native_messages import caught_messages
+from robotid.base.settings import require_each, require_flag, require_kind
+from robotid.base.typing import Array
 from robotid.robot.constraints import Constraint, Contact, Loop, check_constraints
 from robotid.robot.drives import DRIVE_TERMS, TERMS, DriveMotion, DriveTerm
 from robotid.robot.joint_choice import choose_joints, mimic_followers

@@ -7,10 +7,10 @@ from numbers import Real
 
 import numpy as np
 
-from robotid._settings import require_each, require_flag, require_kind
-from robotid._typing import Array
-from robotid.exceptions import DataError, SettingsError
-from robotid.findings import listed
+from robotid.base.exceptions import DataError, SettingsError
+from robotid.base.findings import listed
+from robotid.base.settings import require_each, require_flag, require_kind
+from robotid.base.typing import Array
 from robotid.robot.drives import DRIVE_TERMS, TERMS, DriveTerm
 from robotid.robot.urdf_text import LARGEST
 

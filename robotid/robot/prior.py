@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from robotid._typing import Array
+from robotid.base.typing import Array
 from robotid.robot.drives import DriveMotion
 from robotid.robot.mass_matrix import carried_inertia
 from robotid.robot.model import RobotModel

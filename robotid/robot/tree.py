@@ -14,8 +14,8 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from robotid.exceptions import ModelError
-from robotid.findings import listed
+from robotid.base.exceptions import ModelError
+from robotid.base.findings import listed
 from robotid.robot.urdf_text import parse_urdf, read_numbers, write_exact_angles
 
 __all__ = ["MOMENTS", "MOVABLE", "Inertial", "Joint", "Tree", "read_tree"]

@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any
 from xml.parsers import expat
 
-from robotid._files import missing_file
-from robotid.exceptions import ModelError
+from robotid.base.exceptions import ModelError
+from robotid.base.files import missing_file
 
 __all__ = [
     "LARGEST",

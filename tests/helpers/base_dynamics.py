@@ -2,10 +2,10 @@
 
 from dataclasses import dataclass
 
-from robotid._typing import Array
+from robotid.base.typing import Array
+from robotid.dynamics.base_parameters import BaseMapping
+from robotid.dynamics.torque import joint_torque_regressor
 from robotid.paper.equations import LinearDynamics
-from robotid.regressor.base_parameters import BaseMapping
-from robotid.regressor.torque import joint_torque_regressor
 from robotid.robot.model import RobotModel
 
 

@@ -4,9 +4,9 @@ import json
 
 import numpy as np
 
-from robotid.export.urdf import write_urdf
-from robotid.logs.data import Trajectory
-from robotid.regressor.friction_projection import drive_moments
+from robotid.data.log import Trajectory
+from robotid.dynamics.friction_projection import drive_moments
+from robotid.output.files.urdf import write_urdf
 from robotid.robot.drives import PositionCoulomb
 
 _UNITS = {

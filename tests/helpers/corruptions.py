@@ -5,12 +5,12 @@ from functools import cache
 
 import numpy as np
 
-from robotid.logs.data import Log
+from robotid.data.log import Log
+from robotid.dynamics.simulation.closed_loop import Noise, another_robot, simulate
+from robotid.dynamics.simulation.motions import random_fourier
+from robotid.dynamics.simulation.simulation_settings import Controller, Simulation
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
-from robotid.simulation.closed_loop import Noise, another_robot, simulate
-from robotid.simulation.motions import random_fourier
-from robotid.simulation.settings import Controller, Simulation
 
 NOISE = Noise(q=2e-5, v=2e-4, tau=0.02)
 ROBOTS = {

@@ -5,14 +5,14 @@ from dataclasses import replace
 import numpy as np
 
 from helpers.mujoco_plant import multisine
-from robotid.closed_loop.fit import stated_loops
-from robotid.closed_loop.identify import identify_loops
-from robotid.closed_loop.settings import LoopSettings
-from robotid.fitting.settings import SimulationSettings
-from robotid.logs.data import Log
+from robotid.data.log import Log
+from robotid.dynamics.simulation.loops import ClosedLoopRobot, cut_windows
+from robotid.estimation.fitting.estimator_settings import SimulationSettings
+from robotid.identification.closed_loop.from_commands import identify_loops
+from robotid.identification.closed_loop.loop_settings import LoopSettings
+from robotid.identification.closed_loop.stages import stated_loops
 from robotid.robot.drives import Viscous
 from robotid.robot.model import RobotModel
-from robotid.simulation.loops import ClosedLoopRobot, cut_windows
 
 INERTIAL = """<inertial><mass value="2"/><origin xyz="0.1 0 0"/>
 <inertia ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/></inertial>"""

@@ -5,18 +5,18 @@ from dataclasses import dataclass
 import numpy as np
 
 from helpers.synthetic import perfect
-from robotid.fitting.settings import EstimatorSettings
+from robotid.data.signal_settings import SignalSettings
+from robotid.dynamics.base_parameters import structural_mapping
+from robotid.dynamics.simulation.closed_loop import Noise, another_robot
+from robotid.dynamics.simulation.motions import random_fourier
+from robotid.dynamics.simulation.simulation_settings import Sensors
+from robotid.estimation.fitting.estimator_settings import EstimatorSettings
+from robotid.estimation.fitting.recorded import Recordings
+from robotid.estimation.fitting.survey import hold_log
 from robotid.identification.pipeline import identify, with_drives
-from robotid.logs.settings import SignalSettings
-from robotid.recordings.logs import Recordings
-from robotid.recordings.survey import hold_log
-from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.examples import example_urdf
 from robotid.robot.families import AUTO, wanted_families
 from robotid.robot.model import RobotModel
-from robotid.simulation.closed_loop import Noise, another_robot
-from robotid.simulation.motions import random_fourier
-from robotid.simulation.settings import Sensors
 
 EXACT = SignalSettings(cutoff=None, trim=0.0)
 FIT = EstimatorSettings(draws=0)  # bounds of bodies have no part in what drives have

@@ -5,7 +5,13 @@ from dataclasses import replace
 import numpy as np
 
 from helpers.synthetic import exact_log, truth
-from robotid.estimators import (
+from robotid.data.log import Trajectory
+from robotid.data.signal_settings import SignalSettings
+from robotid.data.signals import process
+from robotid.dynamics.base_parameters import structural_mapping
+from robotid.dynamics.problem import Problem
+from robotid.dynamics.torque import build_problem, joint_torque_regressor, mass_regressor
+from robotid.estimation.estimators import (
     OLS,
     PRX,
     RLS,
@@ -16,12 +22,6 @@ from robotid.estimators import (
     LogCholesky,
     NormalisedGradient,
 )
-from robotid.logs.data import Trajectory
-from robotid.logs.settings import SignalSettings
-from robotid.logs.signals import process
-from robotid.regressor.base_parameters import structural_mapping
-from robotid.regressor.problem import Problem
-from robotid.regressor.torque import build_problem, joint_torque_regressor, mass_regressor
 from robotid.robot.prior import prior_spread
 
 EXACT = SignalSettings(cutoff=None, trim=0.0, min_velocity=0.0)

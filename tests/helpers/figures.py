@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from robotid.regressor.torque import joint_torque_regressor
+from robotid.dynamics.torque import joint_torque_regressor
 
 
 def torques(found, trajectory):

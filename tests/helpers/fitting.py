@@ -3,13 +3,13 @@
 ``fit`` is the fit alone, without what is concluded from it.
 """
 
-from robotid.fitting.fit import fit_recordings
-from robotid.fitting.settings import EstimatorSettings
+from robotid.data.signal_settings import SignalSettings
+from robotid.dynamics.base_parameters import structural_mapping
+from robotid.estimation.fitting.estimator_settings import EstimatorSettings
+from robotid.estimation.fitting.fit import fit_recordings
+from robotid.estimation.fitting.recorded import Recordings
+from robotid.estimation.fitting.survey import hold_log
 from robotid.identification import pipeline
-from robotid.logs.settings import SignalSettings
-from robotid.recordings.logs import Recordings
-from robotid.recordings.survey import hold_log
-from robotid.regressor.base_parameters import structural_mapping
 
 PLAIN = {"doctor": False, "friction": "viscous+coulomb"}  # what tests of fits do not read
 

@@ -9,7 +9,7 @@ import time
 from pathlib import Path
 
 from robotid.cli import main
-from robotid.workers import plan
+from robotid.estimation.workers import plan
 
 _map_pieces = plan.map_pieces
 

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 import robotid
 from helpers.hostile_inputs import JOINTS, URDF, good_log, good_result
 from robotid import Log, LogSource, LogUnits, RobotModel, SignalSettings, Trajectory
-from robotid.exceptions import RobotIdError
+from robotid.base.exceptions import RobotIdError
 
 __all__ = ["ARGUMENT_KINDS"]
 

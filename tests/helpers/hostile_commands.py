@@ -31,11 +31,11 @@ from helpers.hostile_inputs import (
     write_csv,
 )
 from helpers.recorders import write_lerobot
-from robotid.closed_loop.settings import LoopSettings
-from robotid.log_files.read import write_log
-from robotid.logs.data import Log
+from robotid.data.files.read import write_log
+from robotid.data.log import Log
+from robotid.dynamics.simulation.simulation_settings import Simulation
+from robotid.identification.closed_loop.loop_settings import LoopSettings
 from robotid.robot.drives import FAMILIES
-from robotid.simulation.settings import Simulation
 
 __all__ = ["COMMAND_KINDS"]
 

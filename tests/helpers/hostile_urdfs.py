@@ -13,14 +13,14 @@ from pathlib import Path
 import numpy as np
 from hypothesis import strategies as st
 
-from robotid.exceptions import RobotIdError
-from robotid.export.urdf import write_urdf
-from robotid.regressor.base_parameters import structural_mapping
+from robotid.base.exceptions import RobotIdError
+from robotid.diagnosis.urdf.inspection import inspect_urdf
+from robotid.dynamics.base_parameters import structural_mapping
+from robotid.output.files.urdf import write_urdf
+from robotid.output.viewer.scene import robot_scene
 from robotid.robot.geometry import body_boxes, geometry_half_spaces
 from robotid.robot.mass_matrix import check_mass_matrix
 from robotid.robot.model import RobotModel
-from robotid.urdf_audit.inspection import inspect_urdf
-from robotid.viewer.scene import robot_scene
 
 __all__ = ["HostileUrdf", "run_urdf", "urdf_inputs"]
 

@@ -7,8 +7,8 @@ import pinocchio as pin
 from scipy.interpolate import CubicSpline
 
 from helpers.walkers import shares, waves
-from robotid.logs.base import BaseMotion
-from robotid.logs.data import Log
+from robotid.data.base_motion import BaseMotion
+from robotid.data.log import Log
 
 MASS = 70.0  # [kg]
 FEET = ("LeftFoot", "RightFoot")

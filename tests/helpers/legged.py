@@ -6,9 +6,9 @@ import mujoco
 import numpy as np
 import pinocchio as pin
 
-from robotid.logs.base import BaseMotion
-from robotid.logs.data import Log
-from robotid.logs.imu import ImuFrame, motion_of_imu
+from robotid.data.base_motion import BaseMotion
+from robotid.data.imu_frame import ImuFrame, motion_of_imu
+from robotid.data.log import Log
 from robotid.robot.constraints import Contact, frame_id
 from robotid.robot.parameters import pseudo_inertia
 

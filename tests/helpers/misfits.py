@@ -4,11 +4,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from robotid.logs.data import Log
-from robotid.regressor.torque import joint_torque_regressor
+from robotid.data.log import Log
+from robotid.dynamics.simulation.closed_loop import another_robot
+from robotid.dynamics.simulation.motions import random_fourier
+from robotid.dynamics.torque import joint_torque_regressor
 from robotid.robot.parameters import Coupling
-from robotid.simulation.closed_loop import another_robot
-from robotid.simulation.motions import random_fourier
 
 
 @dataclass(frozen=True)

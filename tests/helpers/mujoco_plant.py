@@ -10,9 +10,9 @@ import numpy as np
 from mujoco import rollout
 
 from helpers.paths import URDF
-from robotid.export.commanded import CommandedDrive
-from robotid.export.mjcf import write_mjcf
-from robotid.logs.data import Log
+from robotid.data.log import Log
+from robotid.output.files.commanded import CommandedDrive
+from robotid.output.files.mjcf import write_mjcf
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 

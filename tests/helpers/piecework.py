@@ -16,12 +16,12 @@ from pathlib import Path
 
 import numpy as np
 
-from robotid.exceptions import DataError
-from robotid.regressor.factors import Factors, Reduction, join
-from robotid.workers.checkpoint import Checkpoint
-from robotid.workers.pieces import Piece, reduce_piece
-from robotid.workers.plan import map_pieces
-from robotid.workers.processes import ProcessBackend, SerialBackend
+from robotid.base.exceptions import DataError
+from robotid.dynamics.factors import Factors, Reduction, join
+from robotid.estimation.workers.checkpoint import Checkpoint
+from robotid.estimation.workers.pieces import Piece, reduce_piece
+from robotid.estimation.workers.plan import map_pieces
+from robotid.estimation.workers.processes import ProcessBackend, SerialBackend
 
 NAMES = ("a", "b", "c", "d", "e")
 

@@ -14,7 +14,7 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Bag2Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from robotid.logs.data import COLUMNS
+from robotid.data.log import COLUMNS
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
 FIELDS = {"position": "q", "velocity": "v", "effort": "tau"}

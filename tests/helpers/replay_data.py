@@ -28,4 +28,4 @@ def unpacked(value):
 
 def leave_out_meshes(patch):
     """Leave out of pages what a robot looks like, which takes seconds to be thinned."""
-    patch.setattr("robotid.viewer.scene._thinned", lambda files, _: (None,) * len(files))
+    patch.setattr("robotid.output.viewer.scene._thinned", lambda files, _: (None,) * len(files))

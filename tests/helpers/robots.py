@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pinocchio as pin
 
-from robotid.logs.data import Trajectory
+from robotid.data.log import Trajectory
 from robotid.robot.bodies import held_parameters
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import Coupling, inertial_from_pseudo_inertia, pseudo_inertia

@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from robotid.logs.data import Log
+from robotid.data.log import Log
 
 
 @dataclass(frozen=True)

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from robotid.logs.base import quaternions_of_angles
-from robotid.simulation.motions import FloatingMotion
-from robotid.simulation.stand import on_feet
+from robotid.data.base_motion import quaternions_of_angles
+from robotid.dynamics.simulation.motions import FloatingMotion
+from robotid.dynamics.simulation.stand import on_feet
 
 
 def stand(model, middle, height, rng, *, parts=4, length=3.0, rate=100.0, size=1.0):

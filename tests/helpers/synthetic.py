@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from robotid.simulation.closed_loop import Noise, another_robot, simulate
-from robotid.simulation.motions import random_fourier
-from robotid.simulation.settings import Controller, Payload, Sensors, Simulation
+from robotid.dynamics.simulation.closed_loop import Noise, another_robot, simulate
+from robotid.dynamics.simulation.motions import random_fourier
+from robotid.dynamics.simulation.simulation_settings import Controller, Payload, Sensors, Simulation
 
 EXACT = Sensors(acceleration=True)
 

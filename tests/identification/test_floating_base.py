@@ -9,16 +9,16 @@ from helpers.legged import recorded, with_other_bodies
 from helpers.paths import JOBS
 
 import robotid
-from robotid.commands.identify import run_job
-from robotid.commands.job import read_job
-from robotid.estimators import WLS
-from robotid.fitting.settings import ConsistentSettings
+from robotid.cli.work.identify import run_job
+from robotid.cli.work.job import read_job
+from robotid.data.base_motion import BaseMotion, in_base
+from robotid.data.signal_settings import BaseSource
+from robotid.dynamics.base_parameters import structural_mapping
+from robotid.estimation.estimators import WLS
+from robotid.estimation.fitting.estimator_settings import ConsistentSettings
+from robotid.estimation.fitting.recorded import Recordings
+from robotid.estimation.fitting.survey import hold_log
 from robotid.identification.repeated_errors import with_repeated_errors
-from robotid.logs.base import BaseMotion, in_base
-from robotid.logs.settings import BaseSource
-from robotid.recordings.logs import Recordings
-from robotid.recordings.survey import hold_log
-from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.constraints import Contact
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
@@ -105,7 +105,7 @@ def test_unseen_motion_is_predicted_and_judged_by_the_joints(found):
 
 def test_a_report_has_the_friction_of_joints_and_none_of_the_base(found):
     from robotid.identification.pictures import friction_chart
-    from robotid.report.diagnosis import friction_section
+    from robotid.output.report.plot_sections import friction_section
 
     result, _, _ = found
     assert friction_chart(result, "base.mz") is None
@@ -122,7 +122,7 @@ def test_a_report_has_the_friction_of_joints_and_none_of_the_base(found):
 
 def test_the_residual_at_the_truth_is_the_noise(found):
     """What contact forces cannot cause is equal in MuJoCo and in the rows."""
-    from robotid.regressor.prediction import predict
+    from robotid.dynamics.prediction import predict
 
     result, truth, _ = found
     recording = result.fitted[0].recording
@@ -136,7 +136,7 @@ def test_the_residual_at_the_truth_is_the_noise(found):
 
 
 def test_contacts_without_flags_are_found(go1, trot):
-    from robotid.regressor.prediction import predict
+    from robotid.dynamics.prediction import predict
 
     whole = trot[0].window(0.5, 6.5)
     log = replace(whole, base=BaseMotion(whole.base.pose))
@@ -154,7 +154,7 @@ def test_contacts_without_flags_are_found(go1, trot):
 
 
 def test_an_imu_replaces_position_and_velocity_of_the_base(go1, trot):
-    from robotid.regressor.prediction import predict
+    from robotid.dynamics.prediction import predict
 
     log, truth = trot[0].window(0.5, 6.5), truth_of(go1)
     pose = log.base.pose * np.append(np.zeros(3), np.ones(4))

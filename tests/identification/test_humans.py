@@ -9,16 +9,16 @@ import pytest
 from helpers.humans import FEET, PARTS, human_urdf, logged, walk, with_other_segments
 
 from robotid import identify
-from robotid.advice.next_steps import _watch
-from robotid.advice.steps import Origin
-from robotid.commands.job import Job, LogEntry
-from robotid.commands.replay import Findings, replay_files
-from robotid.exceptions import SettingsError
-from robotid.fitting.estimators import pinned_links
-from robotid.fitting.settings import ConsistentSettings, ConstraintSettings
-from robotid.log_files.read import write_log
-from robotid.logs.base import BaseMotion
-from robotid.logs.settings import SignalSettings
+from robotid.base.exceptions import SettingsError
+from robotid.cli.work.job import Job, LogEntry
+from robotid.cli.work.replay import Findings, replay_files
+from robotid.data.base_motion import BaseMotion
+from robotid.data.files.read import write_log
+from robotid.data.signal_settings import SignalSettings
+from robotid.estimation.fitting.consistent_estimator import pinned_links
+from robotid.estimation.fitting.estimator_settings import ConsistentSettings, ConstraintSettings
+from robotid.output.report.next_steps import _watch
+from robotid.output.report.steps import Origin
 from robotid.robot.bodies import negligible_bodies
 from robotid.robot.constraints import Contact
 from robotid.robot.model import RobotModel

@@ -4,15 +4,21 @@ import numpy as np
 import pytest
 from helpers.stands import stand
 
-from robotid.estimators import two_runs
-from robotid.exceptions import SettingsError
+from robotid.base.exceptions import SettingsError
+from robotid.data.signal_settings import SignalSettings
+from robotid.dynamics.simulation.closed_loop import simulate
+from robotid.dynamics.simulation.simulation_settings import (
+    Controller,
+    Noise,
+    Payload,
+    Sensors,
+    Simulation,
+)
+from robotid.estimation.estimators import two_runs
 from robotid.identification.payload_fit import identify_payload
-from robotid.logs.settings import SignalSettings
 from robotid.robot.constraints import Contact
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
-from robotid.simulation.closed_loop import simulate
-from robotid.simulation.settings import Controller, Noise, Payload, Sensors, Simulation
 
 RAW = SignalSettings(cutoff=None, velocity="measured", acceleration="measured")
 PACK = Payload("base_link", 0.4, (0.05, 0.02, 0.06), (1e-3, 0, 1e-3, 0, 0, 1e-3))

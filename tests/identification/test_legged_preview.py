@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from helpers.stands import stand
 
-from robotid.exceptions import DataError
-from robotid.export.entries import build_preview
-from robotid.identification.previews import preview
-from robotid.logs.base import BaseMotion
-from robotid.logs.data import Log
-from robotid.logs.settings import SignalSettings
-from robotid.regressor.constraints import constraint_jacobian
-from robotid.regressor.torque import joint_torque_regressor
+from robotid.base.exceptions import DataError
+from robotid.data.base_motion import BaseMotion
+from robotid.data.log import Log
+from robotid.data.signal_settings import SignalSettings
+from robotid.design.previews import preview
+from robotid.dynamics.constraint_rows import constraint_jacobian
+from robotid.dynamics.torque import joint_torque_regressor
+from robotid.output.files.entries import build_preview
 from robotid.robot.constraints import Contact
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel

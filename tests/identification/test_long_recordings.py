@@ -10,16 +10,16 @@ import pytest
 from helpers.driven import arm
 from helpers.synthetic import exact_log, truth
 
-from robotid.commands.identify import run_job
-from robotid.commands.job import Job, LogEntry, job_from_settings, read_job
-from robotid.commands.logs import examine, survey_logs
-from robotid.commands.validate import validate_result
-from robotid.exceptions import DataError, SettingsError
-from robotid.fitting.evaluation import evaluate_logs
-from robotid.fitting.settings import EstimatorSettings
-from robotid.log_files.read import read_log, write_log
-from robotid.logs.data import Log
-from robotid.logs.settings import SignalSettings
+from robotid.base.exceptions import DataError, SettingsError
+from robotid.cli.work.identify import run_job
+from robotid.cli.work.job import Job, LogEntry, job_from_settings, read_job
+from robotid.cli.work.logs import examine, survey_logs
+from robotid.cli.work.validate import validate_result
+from robotid.data.files.read import read_log, write_log
+from robotid.data.log import Log
+from robotid.data.signal_settings import SignalSettings
+from robotid.estimation.fitting.estimator_settings import EstimatorSettings
+from robotid.estimation.fitting.evaluation import evaluate_logs
 from robotid.robot.drives import DRIVE_TERMS
 
 HELD = 1024  # rows in memory, so that pieces have 256
@@ -46,7 +46,7 @@ def noisy_job(tmp_path_factory):
 
 @pytest.fixture
 def without_doctor(monkeypatch):
-    monkeypatch.setattr("robotid.commands.identify.examine_logs", lambda *_: ())
+    monkeypatch.setattr("robotid.cli.work.identify.examine_logs", lambda *_: ())
 
 
 def _reasons(content):
@@ -177,8 +177,8 @@ def test_a_fitted_recording_is_no_validation_in_pieces_either(noisy_job, tmp_pat
 
 
 def test_only_stretches_of_a_long_log_are_drawn_and_examined(noisy_job, tmp_path, monkeypatch):
-    monkeypatch.setattr("robotid.fitting.evaluation._SHOWN", 100)
-    monkeypatch.setattr("robotid.recordings.survey._WINDOW", 400)
+    monkeypatch.setattr("robotid.estimation.fitting.evaluation._SHOWN", 100)
+    monkeypatch.setattr("robotid.estimation.fitting.survey._WINDOW", 400)
     job = replace(noisy_job, rows_in_memory=HELD, validation=(), report=True)
     identification, result = run_job(job, tmp_path)
     (evaluation,) = identification.fitted

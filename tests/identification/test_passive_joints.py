@@ -7,9 +7,9 @@ import pinocchio as pin
 import pytest
 
 from robotid import identify, save_result
-from robotid.exceptions import DataError
-from robotid.log_files.read import read_log
-from robotid.logs.data import Log
+from robotid.base.exceptions import DataError
+from robotid.data.files.read import read_log
+from robotid.data.log import Log
 from robotid.robot.drives import Spring, Viscous
 from robotid.robot.model import RobotModel
 

@@ -13,18 +13,18 @@ from helpers.driven import arm
 from helpers.synthetic import exact_log, truth
 from scipy.stats import t as t_of
 
-from robotid.commands.job import LogEntry, read_job
-from robotid.estimators.segments import quantile
-from robotid.exceptions import DataError, ModelError, SettingsError
+from robotid.base.exceptions import DataError, ModelError, SettingsError
+from robotid.cli.work.job import LogEntry, read_job
+from robotid.data.log import Log
+from robotid.data.signal_settings import SignalSettings
+from robotid.dynamics.base_parameters import structural_mapping
+from robotid.dynamics.torque import joint_torque_regressor
+from robotid.estimation.estimators.segments import quantile
+from robotid.estimation.fitting.recorded import Recordings
+from robotid.estimation.fitting.survey import hold_log
 from robotid.identification import payload_fit
-from robotid.identification.payload import Gain, Payload, PayloadFit, payload_of
+from robotid.identification.payload_estimate import Gain, Payload, PayloadFit, payload_of
 from robotid.identification.payload_fit import _check_gains, _gains, identify_payload
-from robotid.logs.data import Log
-from robotid.logs.settings import SignalSettings
-from robotid.recordings.logs import Recordings
-from robotid.recordings.survey import hold_log
-from robotid.regressor.base_parameters import structural_mapping
-from robotid.regressor.torque import joint_torque_regressor
 from robotid.robot.drives import FAMILIES
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel

@@ -8,21 +8,21 @@ from helpers.fitting import fit, identify
 from helpers.paths import ROOT
 from helpers.synthetic import exact_log, truth
 
-from robotid.estimators import batch
-from robotid.exceptions import DataError, NotConvergedError, RankDeficientError, SettingsError
-from robotid.findings import Finding
-from robotid.fitting.result import Fit
-from robotid.fitting.settings import EstimatorSettings
+from robotid.base.exceptions import DataError, NotConvergedError, RankDeficientError, SettingsError
+from robotid.base.findings import Finding
+from robotid.data.log import Log
+from robotid.data.signal_settings import SignalSettings
+from robotid.diagnosis.verdict.evidence import Determined, Predictions
+from robotid.dynamics.base_parameters import structural_mapping
+from robotid.estimation.estimators import batch
+from robotid.estimation.fitting.estimator_settings import EstimatorSettings
+from robotid.estimation.fitting.fitted import Fit
+from robotid.estimation.fitting.recorded import Recordings
+from robotid.estimation.fitting.survey import hold_log
 from robotid.identification import pipeline
 from robotid.identification import result as result_module
 from robotid.identification.pipeline import conclude
 from robotid.identification.result import Asked, Identification
-from robotid.judgement.evidence import Determined, Predictions
-from robotid.logs.data import Log
-from robotid.logs.settings import SignalSettings
-from robotid.recordings.logs import Recordings
-from robotid.recordings.survey import hold_log
-from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.drives import Harmonic, LoadFriction
 from robotid.robot.examples import example_urdf
 from robotid.robot.mass_matrix import MassMatrixCheck
@@ -208,7 +208,7 @@ def test_the_mass_matrix_is_checked_once_and_again_for_other_parameters(ur5, rng
         asked.append(pi)
         return MassMatrixCheck(1, 1.0, 1.0)
 
-    monkeypatch.setattr("robotid.fitting.result.check_mass_matrix", check)
+    monkeypatch.setattr("robotid.estimation.fitting.fitted.check_mass_matrix", check)
     found = fit(ur5, [exact_log(ur5, truth(ur5), rng)], signals=EXACT, estimator="wls")
     assert found.mass_matrix is replace(found, drives=()).mass_matrix is found.mass_matrix
     assert len(asked) == 1

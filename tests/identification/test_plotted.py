@@ -10,14 +10,14 @@ import pytest
 import scipy.signal
 from scipy.stats import norm
 
-from robotid.diagnosis.torque_split import joint_torques
-from robotid.exceptions import DataError
+from robotid.base.exceptions import DataError
+from robotid.data.log import Trajectory
+from robotid.data.signal_settings import SignalSettings
+from robotid.diagnosis.residual.torque_split import joint_torques
 from robotid.identification import pictures
 from robotid.identification import result as result_module
 from robotid.identification.pictures import residual_charts
 from robotid.identification.why_pictures import why_charts
-from robotid.logs.data import Trajectory
-from robotid.logs.settings import SignalSettings
 
 
 def series(chart, label):

@@ -8,16 +8,16 @@ import pinocchio as pin
 import pytest
 from helpers.driven import ELBOW, LIFT, arm, driven, driven_log, found_in
 
-from robotid.commands.export import export_result
-from robotid.commands.identify import save_result
-from robotid.exceptions import DataError, SettingsError
-from robotid.export.ranges import parameter_ranges
-from robotid.export.result import load_result
-from robotid.export.urdf import read_sidecar
-from robotid.fitting.bands import QUANTILE, friction_curve
-from robotid.fitting.settings import EstimatorSettings
-from robotid.regressor.friction_projection import project_friction
-from robotid.regressor.memory import drive_motion_along
+from robotid.base.exceptions import DataError, SettingsError
+from robotid.cli.work.export import export_result
+from robotid.cli.work.identify import save_result
+from robotid.dynamics.friction_projection import project_friction
+from robotid.dynamics.memory import drive_motion_along
+from robotid.estimation.fitting.bands import QUANTILE, friction_curve
+from robotid.estimation.fitting.estimator_settings import EstimatorSettings
+from robotid.output.files.ranges import parameter_ranges
+from robotid.output.files.result_file import load_result
+from robotid.output.files.urdf import read_sidecar
 from robotid.robot.drives import LoadFriction
 
 

@@ -12,19 +12,11 @@ from helpers.driven import arm
 from helpers.fitting import identify
 from helpers.synthetic import truth
 
-from robotid.estimators.segments import scatter
-from robotid.exceptions import DataError, SettingsError
-from robotid.export.entries import build_preview
-from robotid.fitting.settings import EstimatorSettings
-from robotid.identification import previews
-from robotid.identification.assumptions import (
-    TorqueNoise,
-    assumed_noise,
-    assumed_parameters,
-    largest_gravity,
-    largest_torques,
-)
-from robotid.identification.previews import (
+from robotid.base.exceptions import DataError, SettingsError
+from robotid.data.log import Log
+from robotid.data.signal_settings import SignalSettings
+from robotid.design import previews
+from robotid.design.previews import (
     Preview,
     Run,
     _band,
@@ -33,18 +25,26 @@ from robotid.identification.previews import (
     _white_step,
     preview,
 )
-from robotid.logs.data import Log
-from robotid.logs.settings import SignalSettings
-from robotid.recordings.logs import Recordings
-from robotid.recordings.survey import hold_log
-from robotid.regressor.base_parameters import structural_mapping
-from robotid.regressor.factors import Factors, compress
-from robotid.regressor.prediction import predict
-from robotid.regressor.torque import joint_torque_regressor, trajectory_regressor
-from robotid.regressor.used_rows import base_problem
+from robotid.dynamics.base_parameters import structural_mapping
+from robotid.dynamics.factors import Factors, compress
+from robotid.dynamics.prediction import predict
+from robotid.dynamics.simulation.motions import random_fourier
+from robotid.dynamics.torque import joint_torque_regressor, trajectory_regressor
+from robotid.dynamics.used_rows import base_problem
+from robotid.estimation.estimators.segments import scatter
+from robotid.estimation.fitting.estimator_settings import EstimatorSettings
+from robotid.estimation.fitting.recorded import Recordings
+from robotid.estimation.fitting.survey import hold_log
+from robotid.identification.assumptions import (
+    TorqueNoise,
+    assumed_noise,
+    assumed_parameters,
+    largest_gravity,
+    largest_torques,
+)
+from robotid.output.files.entries import build_preview
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
-from robotid.simulation.motions import random_fourier
 
 STD = np.array([2.0, 3.0, 1.0, 0.3, 0.2, 0.1])  # [N m]
 RATE, DURATION = 100.0, 12.0

@@ -9,13 +9,13 @@ from helpers.estimation import EXACT, NOISE
 from helpers.fitting import fit
 from helpers.synthetic import exact_log, truth
 
-from robotid.estimators import Consistent
-from robotid.estimators.consistent.cone_programme import Programme
-from robotid.estimators.consistent.cones import Cone, nearest, svec, unsvec
-from robotid.exceptions import NotConvergedError, SettingsError
-from robotid.fitting.settings import EstimatorSettings
-from robotid.logs.signals import process
-from robotid.regressor.base_parameters import structural_mapping
+from robotid.base.exceptions import NotConvergedError, SettingsError
+from robotid.data.signals import process
+from robotid.dynamics.base_parameters import structural_mapping
+from robotid.estimation.estimators import Consistent
+from robotid.estimation.estimators.consistent.cone_programme import Programme
+from robotid.estimation.estimators.consistent.cones import Cone, nearest, svec, unsvec
+from robotid.estimation.fitting.estimator_settings import EstimatorSettings
 from robotid.robot.prior import prior_spread
 
 BOUND = {"prior": "euclidean", "prior_weight": 1.0}  # which leaves bodies on their bounds

@@ -7,7 +7,18 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from robotid.fitting.drives import DriveChoice
+from robotid.data.base_motion import BaseMotion
+from robotid.data.imu_frame import ImuFrame, ImuMotion
+from robotid.data.log import Log
+from robotid.data.signal_settings import SignalSettings
+from robotid.dynamics.base_parameters import structural_mapping
+from robotid.dynamics.constraint_rows import constraint_jacobian, touching
+from robotid.dynamics.factors import triangle_of
+from robotid.dynamics.prediction import predict
+from robotid.dynamics.used_rows import base_problem
+from robotid.estimation.fitting.recorded import Recordings
+from robotid.estimation.fitting.selected_drives import DriveChoice
+from robotid.estimation.fitting.survey import hold_log
 from robotid.identification import pipeline, repeated_errors
 from robotid.identification.repeated_errors import (
     EstimatedErrors,
@@ -20,17 +31,6 @@ from robotid.identification.repeated_errors import (
     mean_drift,
     with_repeated_errors,
 )
-from robotid.logs.base import BaseMotion
-from robotid.logs.data import Log
-from robotid.logs.imu import ImuFrame, ImuMotion
-from robotid.logs.settings import SignalSettings
-from robotid.recordings.logs import Recordings
-from robotid.recordings.survey import hold_log
-from robotid.regressor.base_parameters import structural_mapping
-from robotid.regressor.constraints import constraint_jacobian, touching
-from robotid.regressor.factors import triangle_of
-from robotid.regressor.prediction import predict
-from robotid.regressor.used_rows import base_problem
 from robotid.robot.constraints import Contact, frame_id
 from robotid.robot.drives import Cubic, Viscous
 from robotid.robot.examples import example_urdf

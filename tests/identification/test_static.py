@@ -8,21 +8,21 @@ import pinocchio as pin
 import pytest
 from helpers.synthetic import truth
 
-from robotid.commands.identify import run_job
-from robotid.commands.job import read_job
-from robotid.commands.validate import validate_result
-from robotid.exceptions import DataError, ModelError, SettingsError
-from robotid.export.result import load_result
-from robotid.fitting.settings import EstimatorSettings
+from robotid.base.exceptions import DataError, ModelError, SettingsError
+from robotid.cli.work.identify import run_job
+from robotid.cli.work.job import read_job
+from robotid.cli.work.validate import validate_result
+from robotid.data.files.read import write_log
+from robotid.data.log import Log
+from robotid.data.signal_settings import SignalSettings
+from robotid.data.signals import resolve
+from robotid.dynamics.base_parameters import structural_mapping
+from robotid.dynamics.torque import joint_torque_regressor
+from robotid.dynamics.used_rows import static_rows
+from robotid.estimation.fitting.estimator_settings import EstimatorSettings
+from robotid.identification.online.identifier import OnlineIdentifier
 from robotid.identification.pipeline import identify
-from robotid.log_files.read import write_log
-from robotid.logs.data import Log
-from robotid.logs.settings import SignalSettings
-from robotid.logs.signals import resolve
-from robotid.online.identifier import OnlineIdentifier
-from robotid.regressor.base_parameters import structural_mapping
-from robotid.regressor.torque import joint_torque_regressor
-from robotid.regressor.used_rows import static_rows
+from robotid.output.files.result_file import load_result
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 

@@ -10,9 +10,10 @@ from helpers.pages import tables
 from helpers.paths import ROOT
 from helpers.synthetic import exact_log, truth
 
-from robotid.commands.identify import run_job
-from robotid.commands.job import Job, LogEntry
-from robotid.fitting.metrics import JointMetrics, Metrics
+from robotid.cli.work.identify import run_job
+from robotid.cli.work.job import Job, LogEntry
+from robotid.data.files.read import write_log
+from robotid.estimation.fitting.metrics import JointMetrics, Metrics
 from robotid.identification.pipeline import identify
 from robotid.identification.summary import (
     _errors,
@@ -23,7 +24,6 @@ from robotid.identification.summary import (
     joint_reason,
     verdict_lines,
 )
-from robotid.log_files.read import write_log
 from robotid.robot.model import RobotModel
 
 

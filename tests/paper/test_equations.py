@@ -4,7 +4,9 @@ import pytest
 from helpers.base_dynamics import BaseDynamics
 from helpers.synthetic import truth
 
-from robotid.exceptions import DataError, RankDeficientError, SettingsError
+from robotid.base.exceptions import DataError, RankDeficientError, SettingsError
+from robotid.dynamics.base_parameters import structural_mapping
+from robotid.dynamics.simulation.plant import RobotPlant
 from robotid.paper import planar_2r
 from robotid.paper.equations import (
     Bounds,
@@ -18,9 +20,7 @@ from robotid.paper.equations import (
     smallest_eigenvalue,
     torque,
 )
-from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.model import RobotModel
-from robotid.simulation.plant import RobotPlant
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,8 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from robotid.exceptions import DataError, ModelError, SettingsError
+from robotid.base.exceptions import DataError, ModelError, SettingsError
+from robotid.dynamics.simulation.motions import ProgramMotion
 from robotid.paper.planar_2r import (
     PAPER_LINKS,
     PAPER_PARAMETERS,
@@ -21,7 +22,6 @@ from robotid.paper.planar_2r import (
     urdf_text,
 )
 from robotid.robot.parameters import pseudo_inertia
-from robotid.simulation.motions import ProgramMotion
 
 URDF = Path(__file__).parents[2] / "urdf" / "planar_2r.urdf"
 FORMS = tuple(PARAMETER_NAMES)

@@ -7,11 +7,11 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
+from robotid.dynamics.simulation.motions import ProgramMotion
 from robotid.paper.errata import EnergyDrift, energy_drift
-from robotid.paper.plots import _energy_figure, _trajectories_figure, paper_figures
+from robotid.paper.paper_figures import _energy_figure, _trajectories_figure, paper_figures
 from robotid.paper.study import MODELS, PaperSettings, paper_arm, random_runs, study_model
 from robotid.paper.svg import INK, svg_element, svg_file
-from robotid.simulation.motions import ProgramMotion
 
 
 @pytest.fixture(scope="module")

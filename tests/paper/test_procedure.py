@@ -8,7 +8,10 @@ from helpers.base_dynamics import BaseDynamics
 from helpers.synthetic import truth
 from scipy.integrate import solve_ivp
 
-from robotid.exceptions import DataError, RankDeficientError, SettingsError
+from robotid.base.exceptions import DataError, RankDeficientError, SettingsError
+from robotid.dynamics.base_parameters import structural_mapping
+from robotid.dynamics.simulation.motions import ProgramMotion
+from robotid.dynamics.simulation.plant import RobotPlant
 from robotid.paper import planar_2r
 from robotid.paper.equations import (
     Bounds,
@@ -25,10 +28,7 @@ from robotid.paper.procedure import (
     random_torque,
     run_procedure,
 )
-from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.model import RobotModel
-from robotid.simulation.motions import ProgramMotion
-from robotid.simulation.plant import RobotPlant
 
 P4 = planar_2r.parameters(planar_2r.PAPER_LINKS)
 ARM = PlanarDynamics("corrected")

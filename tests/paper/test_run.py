@@ -13,8 +13,9 @@ from helpers.pages import number, tables
 from matplotlib.figure import Figure
 
 from robotid.cli import main
-from robotid.paper import page, study
+from robotid.paper import paper_page as page
 from robotid.paper import run as paper
+from robotid.paper import study
 from robotid.paper.errata import EnergyDrift, energy_drift
 from robotid.paper.procedure import LoopSettings
 from robotid.paper.run import run_paper

@@ -7,7 +7,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from robotid.exceptions import SettingsError
+from robotid.base.exceptions import SettingsError
+from robotid.dynamics.simulation.motions import ProgramMotion
 from robotid.paper import errata as errata_module
 from robotid.paper import study
 from robotid.paper.equations import LinearPlant, torque
@@ -22,7 +23,6 @@ from robotid.paper.study import (
     random_runs,
     study_model,
 )
-from robotid.simulation.motions import ProgramMotion
 
 
 def test_the_physical_arm_has_four_parameters_and_the_others_the_papers_five():

@@ -7,7 +7,7 @@ import pinocchio as pin
 import pytest
 from helpers.robots import ROBOTS, motion, possible_parameters
 
-from robotid.regressor.prediction import predict_instants
+from robotid.dynamics.prediction import predict_instants
 from robotid.robot.as_pinocchio import pinocchio_model
 from robotid.robot.drives import Cubic, LoadFriction
 from robotid.robot.examples import example_urdf

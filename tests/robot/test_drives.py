@@ -9,24 +9,27 @@ import pytest
 from helpers.fitting import fit
 from helpers.synthetic import exact_log, truth
 
-from robotid.advice.steps import Origin
-from robotid.exceptions import DataError, NotConvergedError, SettingsError
-from robotid.export.urdf import load_identified, read_sidecar, write_urdf
-from robotid.identification.pipeline import identify
-from robotid.logs.data import Log, Trajectory
-from robotid.logs.settings import SignalSettings
-from robotid.logs.signals import process
-from robotid.regressor import prediction
-from robotid.regressor.base_parameters import structural_mapping
-from robotid.regressor.memory import drive_motion_along, remember
-from robotid.regressor.prediction import predict
-from robotid.regressor.rows import COMPILED, TrajectoryRows
-from robotid.regressor.torque import (
+from robotid.base.exceptions import DataError, NotConvergedError, SettingsError
+from robotid.data.log import Log, Trajectory
+from robotid.data.signal_settings import SignalSettings
+from robotid.data.signals import process
+from robotid.dynamics import prediction
+from robotid.dynamics.base_parameters import structural_mapping
+from robotid.dynamics.memory import drive_motion_along, remember
+from robotid.dynamics.prediction import predict
+from robotid.dynamics.rows import COMPILED, TrajectoryRows
+from robotid.dynamics.simulation.closed_loop import simulate
+from robotid.dynamics.simulation.motions import random_fourier
+from robotid.dynamics.simulation.plant import RobotPlant
+from robotid.dynamics.torque import (
     InstantRegressor,
     joint_torque_regressor,
     trajectory_regressor,
 )
-from robotid.report.torques import shown_torques
+from robotid.identification.pipeline import identify
+from robotid.output.files.urdf import load_identified, read_sidecar, write_urdf
+from robotid.output.report.steps import Origin
+from robotid.output.report.torque_section import shown_torques
 from robotid.robot.drives import (
     DRIVE_TERMS,
     FAMILIES,
@@ -54,9 +57,6 @@ from robotid.robot.mass_matrix import joint_mass_matrices
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import Coupling
 from robotid.robot.prior import prior_spread
-from robotid.simulation.closed_loop import simulate
-from robotid.simulation.motions import random_fourier
-from robotid.simulation.plant import RobotPlant
 
 EXACT = SignalSettings(cutoff=None, trim=0.0, min_velocity=0.0)
 JOINTS = ("shoulder_lift_joint", "elbow_joint", "wrist_1_joint")

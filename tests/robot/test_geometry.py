@@ -4,9 +4,10 @@ from helpers.fitting import fit
 from helpers.hostile_urdfs import FILES
 from helpers.synthetic import exact_log, truth
 
-from robotid.exceptions import SettingsError
-from robotid.fitting.settings import EstimatorSettings
-from robotid.logs.settings import SignalSettings
+from robotid.base.exceptions import SettingsError
+from robotid.data.signal_settings import SignalSettings
+from robotid.diagnosis.urdf.inspection import inspect_urdf
+from robotid.estimation.fitting.estimator_settings import EstimatorSettings
 from robotid.robot.geometry import (
     body_boxes,
     body_points,
@@ -19,7 +20,6 @@ from robotid.robot.geometry import (
 from robotid.robot.meshes import Surface
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
-from robotid.urdf_audit.inspection import inspect_urdf
 
 URDF = """<robot name="arm">
 <link name="base"/>

@@ -10,12 +10,12 @@ import pytest
 from helpers.hostile_urdfs import FILES, MESHES, HostileUrdf, run_urdf, urdf_inputs
 from hypothesis import HealthCheck, given, settings
 
-from robotid.exceptions import DataError, ModelError, SettingsError
+from robotid.base.exceptions import DataError, ModelError, SettingsError
+from robotid.diagnosis.urdf.inspection import inspect_urdf
 from robotid.robot.examples import example_urdf
 from robotid.robot.meshes import find_mesh, read_surfaces
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import Coupling
-from robotid.urdf_audit.inspection import inspect_urdf
 
 CHAIN = """<link name="l{0}"/>
 <joint name="j{0}" type="{2}"><parent link="l{1}"/><child link="l{0}"/></joint>"""
@@ -105,7 +105,7 @@ def test_what_urdfdom_prints_is_an_error_and_not_on_stderr(tmp_path, monkeypatch
 
 
 def test_what_others_print_meanwhile_is_not_lost(capfd):
-    from robotid._native_messages import caught_messages
+    from robotid.base.native_messages import caught_messages
 
     with caught_messages() as complaints:
         os.write(
@@ -188,7 +188,7 @@ def test_only_files_of_meshes_inside_their_package_are_read(tmp_path):
 def test_motions_that_are_no_numbers_are_refused():
     import numpy as np
 
-    from robotid.regressor.torque import joint_torque_regressor
+    from robotid.dynamics.torque import joint_torque_regressor
 
     model = RobotModel.from_urdf(example_urdf("ur5_robot.urdf"), free_flyer=True)
     q, v = np.zeros((3, 13)), np.zeros((3, 12))

@@ -4,11 +4,11 @@ import pytest
 from helpers.fitting import identify
 from helpers.synthetic import exact_log, truth
 
-from robotid.export.entries import build_result
-from robotid.fitting.settings import EstimatorSettings
-from robotid.judgement.findings import consistency_findings
-from robotid.logs.settings import SignalSettings
-from robotid.regressor.torque import joint_torque_regressor
+from robotid.data.signal_settings import SignalSettings
+from robotid.diagnosis.verdict.fit_findings import consistency_findings
+from robotid.dynamics.torque import joint_torque_regressor
+from robotid.estimation.fitting.estimator_settings import EstimatorSettings
+from robotid.output.files.entries import build_result
 from robotid.robot.examples import example_urdf
 from robotid.robot.mass_matrix import check_mass_matrix, joint_mass_matrices
 from robotid.robot.model import RobotModel

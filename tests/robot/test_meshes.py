@@ -3,13 +3,13 @@ import pinocchio as pin
 import pytest
 import trimesh
 
+from robotid.output.viewer import scene
+from robotid.output.viewer.scene import robot_scene
+from robotid.output.viewer.thinning import thin
 from robotid.robot.examples import example_urdfs
 from robotid.robot.meshes import find_mesh, read_shapes, read_surfaces
 from robotid.robot.model import RobotModel
 from robotid.robot.urdf_text import parse_urdf
-from robotid.viewer import scene
-from robotid.viewer.scene import robot_scene
-from robotid.viewer.thinning import thin
 
 URDF = """<robot name="r">
   <material name="rust"><color rgba="0.5 0.2 0.1 1"/></material>

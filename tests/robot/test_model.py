@@ -2,8 +2,8 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from robotid.exceptions import DataError, ModelError
-from robotid.regressor.torque import joint_torque_regressor
+from robotid.base.exceptions import DataError, ModelError
+from robotid.dynamics.torque import joint_torque_regressor
 from robotid.robot.constraints import Contact
 from robotid.robot.examples import example_urdf, example_urdfs
 from robotid.robot.model import RobotModel

@@ -9,16 +9,16 @@ import pytest
 from helpers.driven import driven, driven_log, fitted_in
 from helpers.paths import URDF
 
-from robotid.export.mjcf import write_mjcf
+from robotid.data.log import Log
+from robotid.dynamics.friction_projection import drive_moments, project_friction
+from robotid.dynamics.simulation.loops import ClosedLoopRobot, cut_windows, open_loops
+from robotid.dynamics.simulation.plant import RobotPlant, rk4
 from robotid.identification.pictures import friction_chart
-from robotid.logs.data import Log
-from robotid.regressor.friction_projection import drive_moments, project_friction
+from robotid.output.files.mjcf import write_mjcf
 from robotid.robot.drive_term import Family, MemorylessTerm, Shape
 from robotid.robot.drives import FAMILIES, TERM_CLASSES
 from robotid.robot.families import term_from_dict
 from robotid.robot.model import RobotModel
-from robotid.simulation.loops import ClosedLoopRobot, cut_windows, open_loops
-from robotid.simulation.plant import RobotPlant, rk4
 
 JOINT = "joint_1"
 TRUE, SIZE, SPEED = f"{JOINT}.bend", 1.4, 0.25

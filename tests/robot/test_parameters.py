@@ -4,7 +4,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from robotid.exceptions import DataError, SettingsError
+from robotid.base.exceptions import DataError, SettingsError
 from robotid.robot.parameters import (
     INERTIAL_TERMS,
     Coupling,

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 from helpers.synthetic import exact_log, truth
 
-from robotid.logs.settings import SignalSettings
-from robotid.logs.signals import process
+from robotid.data.signal_settings import SignalSettings
+from robotid.data.signals import process
 from robotid.robot.mass_matrix import carried_inertia
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import Coupling, pseudo_inertia

@@ -6,7 +6,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from robotid.exceptions import ModelError
+from robotid.base.exceptions import ModelError
 from robotid.robot.model import RobotModel
 from robotid.robot.tree import read_tree
 from robotid.robot.urdf_text import numbers, parse_urdf

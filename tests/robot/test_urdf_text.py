@@ -6,7 +6,7 @@ import re
 import pinocchio as pin
 import pytest
 
-from robotid.exceptions import ModelError
+from robotid.base.exceptions import ModelError
 from robotid.robot.model import RobotModel
 from robotid.robot.tree import read_tree
 from robotid.robot.urdf_text import exact_angle, numbers, parse_urdf

@@ -1,0 +1,3 @@
+"""Errors, findings, settings, text and files; nothing of robots."""
+
+__all__: list[str] = []

@@ -1,0 +1,470 @@
+"""Motion of a floating base: pose, twist and acceleration of its link."""
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from robotid.base.arguments import real_numbers
+from robotid.base.exceptions import DataError
+from robotid.base.findings import listed
+from robotid.base.typing import Array
+from robotid.data.imu_frame import (
+    IMU,
+    ImuFrame,
+    ImuMotion,
+    inertial_state,
+    motion_of_imu,
+    orientation_of_imu,
+)
+
+__all__ = [
+    "ACCELERATION",
+    "POSE",
+    "TWIST",
+    "BaseColumns",
+    "BaseMotion",
+    "base_columns",
+    "base_of",
+    "base_state",
+    "contacts_of",
+    "in_base",
+    "pose_jumps",
+    "quaternions_of_angles",
+    "table_of_base",
+]
+
+#: Names of the coordinates of a pose: position [m], and the orientation as a quaternion.
+POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
+_ANGLES = ("x", "y", "z", "roll", "pitch", "yaw")
+#: Names of the components of a twist: linear [m/s] and angular velocity [rad/s].
+TWIST = ("vx", "vy", "vz", "wx", "wy", "wz")
+#: Names of the components of its time derivative [m/s^2, rad/s^2].
+ACCELERATION = ("ax", "ay", "az", "alx", "aly", "alz")
+_POSE_REMEDY = (
+    "Record base_x, base_y, base_z [m] and the orientation base_qx, base_qy, base_qz, base_qw, or "
+    "base_roll, base_pitch, base_yaw [rad]; or state the link of an IMU, imu in [base]"
+)
+_IMU_REMEDY = (
+    "Record imu_wx, imu_wy, imu_wz [rad/s], imu_ax, imu_ay, imu_az [m/s^2], and the orientation "
+    "imu_qx, imu_qy, imu_qz, imu_qw, or that of the base"
+)
+_TURN = 2.0 * np.pi  # [rad] larger roll and pitch are in degrees
+_UNIT = 1e-3  # tolerance of the norm of a logged quaternion
+_BESIDE, _USUAL = 32, 75.0  # rows beside a step, and the percentile of their steps ...
+_JUMPS = 15.0  # ... times which a step relative to those before and after it is a jump ...
+_SMALLEST = (5e-3, 0.02)  # [m], [rad] ... if it is not below this
+_GAP = 2.5  # median steps of time: a longer one is a gap, over which the pose may change
+
+
+@dataclass(frozen=True, eq=False)
+class BaseMotion:
+    """Recorded motion of a floating base, sample by sample. The arrays are read-only.
+
+    Attributes:
+        pose: Position of the base link in the world [m] and its orientation as a quaternion,
+            x y z qx qy qz qw, shape (N, 7). Quaternions are normalised, with continuous signs.
+        twist: Linear [m/s] and angular velocity [rad/s] with the axes of the base link, shape
+            (N, 6); None if it was not recorded.
+        acceleration: Time derivative of the twist, shape (N, 6) [m/s^2, rad/s^2]; None if it was
+            not recorded.
+        imu: Values of an IMU, which determine angular velocity and acceleration; None without one.
+            The position is 0 if it was not recorded.
+        link: The link whose pose it is; "" for the root link. Only the root link has velocities.
+
+    Raises:
+        DataError: If a shape is not the expected one, or a quaternion is not of length 1.
+    """
+
+    pose: Array
+    twist: Array | None = None
+    acceleration: Array | None = None
+    imu: ImuMotion | None = None
+    link: str = ""
+
+    def __post_init__(self) -> None:
+        for name, width in (("pose", 7), ("twist", 6), ("acceleration", 6)):
+            values = getattr(self, name)
+            if values is not None or name == "pose":
+                object.__setattr__(self, name, _checked(values, name, width))
+        sizes = np.linalg.norm(self.pose[:, 3:], axis=1)
+        if len(wrong := np.flatnonzero(np.abs(sizes - 1.0) > _UNIT)):
+            raise DataError(
+                f"the quaternion of the base has length {sizes[wrong[0]]:g} in row {wrong[0]}, "
+                "wanted 1, in the order qx qy qz qw"
+            )
+        is_opposite = np.sum(self.pose[1:, 3:] * self.pose[:-1, 3:], axis=1) < 0
+        signs = np.where(np.append(0, np.cumsum(is_opposite)) % 2, -1.0, 1.0)
+        pose = self.pose.copy()
+        pose[:, 3:] *= (signs / sizes)[:, None]
+        pose.flags.writeable = False
+        object.__setattr__(self, "pose", pose)
+
+    def at(self, rows: slice) -> "BaseMotion":
+        """Return some samples.
+
+        Args:
+            rows: Their numbers.
+        """
+        imu = None if self.imu is None else self.imu.at(rows)
+        arrays = {"pose": self.pose, "twist": self.twist, "acceleration": self.acceleration}
+        some: dict[str, Any] = {name: x[rows] for name, x in arrays.items() if x is not None}
+        return replace(self, imu=imu, **some)
+
+    @property
+    def has_position(self) -> bool:
+        """Whether the position was recorded."""
+        return bool(self.pose[:, :3].any())
+
+
+@dataclass(frozen=True)
+class BaseColumns:
+    """The columns of a floating base and of contacts that are read from a file.
+
+    Attributes:
+        floats: Whether the motion of a floating base is read: ``base_x`` to ``base_z`` [m] and
+            ``base_qx`` to ``base_qw``, or ``base_roll``, ``base_pitch``, ``base_yaw`` [rad]; also
+            velocities ``base_vx`` to ``base_wz`` and accelerations ``base_ax`` to ``base_alz``, if
+            they are there.
+        contacts: Links whose contacts are read from ``contact_<link>``, 1 or 0.
+        wrenches: Components of wrenches, as "fz l_sole" from ``wrench_fz_l_sole``. With these, a
+            log need not have torques.
+        twist: Axes of the velocities: "base" or "world".
+        thresholds: For each contact the force above which it counts, if its column is a force, or
+            None; empty: none is.
+        local: Links whose wrenches have the axes of the link instead of the world's.
+        imu: Place of an IMU in the base, whose ``imu_wx`` to ``imu_az`` replace velocities and
+            accelerations; orientation is that of the base, or of the IMU, ``imu_qx`` to
+            ``imu_qw``; the position may be missing. None without an IMU.
+        link: The link whose pose is read; "" for the root link. Its velocities are not read.
+    """
+
+    floats: bool = False
+    contacts: tuple[str, ...] = ()
+    wrenches: tuple[str, ...] = ()
+    twist: str = "base"
+    thresholds: tuple[float | None, ...] = ()
+    local: tuple[str, ...] = ()
+    imu: ImuFrame | None = None
+    link: str = ""
+
+    @property
+    def needs_heading(self) -> bool:
+        """Whether components of wrenches have horizontal axes of the world."""
+        if self.imu is None:
+            return False
+        vertical = "f" + "xyz"[int(np.argmax(np.abs(self.imu.gravity)))]
+        pairs = [name.split(" ", 1) for name in self.wrenches]
+        return any(part != vertical and link not in self.local for part, link in pairs)
+
+    def present(self, names: Collection[str]) -> "BaseColumns":
+        """Return the same with only those contacts that a file has; the others may be found.
+
+        Args:
+            names: Names of its columns, and standard names that are renamed.
+        """
+        kept = [k for k, link in enumerate(self.contacts) if f"contact_{link}" in names]
+        limits = self.thresholds or (None,) * len(self.contacts)
+        return replace(
+            self,
+            contacts=tuple(self.contacts[k] for k in kept),
+            thresholds=tuple(limits[k] for k in kept),
+        )
+
+
+def base_columns(
+    where: str, names: Sequence[str], wanted: BaseColumns, columns: Mapping[str, str]
+) -> dict[str, list[str]]:
+    """Return the columns of a floating base and of contacts in a file, by kind.
+
+    Args:
+        where: Name of the file.
+        names: Names of its columns.
+        wanted: Which are read.
+        columns: Names in the file by standard name, if they differ.
+
+    Raises:
+        DataError: If the pose of a floating base, or a wrench, is missing.
+    """
+    names = [*names, *columns]
+    found = _columns_of_base(where, names, wanted) if wanted.floats else {}
+    found["contact"] = [f"contact_{link}" for link in wanted.present(names).contacts]
+    found["wrench"] = [f"wrench_{name.replace(' ', '_', 1)}" for name in wanted.wrenches]
+    if missing := [name for name in found["wrench"] if name not in names]:
+        seen = [name for name in names if name.startswith("wrench_")]
+        cells = [x for x in seen if x.startswith(tuple(f"{name}_" for name in missing))]
+        sums = (
+            f"If {listed(cells)} are cells of a foot, add a column of their sum. " if cells else ""
+        )
+        raise DataError(
+            f"{where} has no column {listed(missing)}; columns of that kind found: {listed(seen)}. "
+            f"{sums}Name the column in [columns], or remove the component from measured in "
+            "[[contact]]",
+            code="missing_column",
+        )
+    return {
+        kind if kind in ("contact", "wrench") else f"base {kind}": [columns.get(x, x) for x in own]
+        for kind, own in found.items()
+        if own
+    }
+
+
+def _columns_of_base(where: str, names: Sequence[str], wanted: BaseColumns) -> dict[str, list[str]]:
+    """Return the columns of the motion of the base, by kind."""
+    forms = {"pose": POSE, "angles": _ANGLES, "twist": TWIST, "acceleration": ACCELERATION}
+    if wanted.link:
+        forms = {"pose": POSE, "angles": _ANGLES}
+    whole = {kind: [f"base_{end}" for end in ends] for kind, ends in forms.items()}
+    orientations = ["pose", "angles"]
+    if wanted.imu is not None:
+        whole = {kind: whole[kind] for kind in orientations}
+        whole |= {
+            "imu quaternion": [f"imu_{end}" for end in IMU[:4]],
+            "quaternion": [f"base_{end}" for end in POSE[3:]],
+            "rpy": [f"base_{end}" for end in _ANGLES[3:]],
+            "imu": [f"imu_{end}" for end in IMU[4:]],
+        }
+        orientations = [kind for kind in whole if kind != "imu"]
+    found = {kind: own for kind, own in whole.items() if set(own) <= set(names)}
+    used = next((kind for kind in orientations if kind in found), "")
+    required = ["imu"] if wanted.imu is not None else []
+    missing = [x for kind in required for x in whole[kind] if x not in names]
+    is_blind = wanted.needs_heading or (wanted.imu is not None and not wanted.imu.gravity.any())
+    if not used and not missing and (not required or is_blind):
+        missing = [x for x in whole["imu quaternion" if required else "pose"] if x not in names]
+    if missing:
+        seen = [name for name in names if name.startswith(("base_", "imu_"))]
+        what = "the IMU" if required else "the pose of the floating base"
+        remedy = _IMU_REMEDY if required else _POSE_REMEDY
+        raise DataError(
+            f"{where} has no column {listed(missing)} of {what}; columns of the base found: "
+            f"{listed(seen)}. {remedy}",
+            code="missing_column",
+        )
+    return {kind: own for kind, own in found.items() if kind == used or kind not in orientations}
+
+
+def base_of(
+    t: Array, q: Array, values: Mapping[str, Array], wanted: BaseColumns
+) -> tuple[BaseMotion | None, str]:
+    """Return the motion of the base from its columns, None without these, and a note or "".
+
+    Args:
+        t: Time stamps, shape (N,) [s].
+        q: Joint positions, shape (N, n) [rad or m].
+        values: Columns by kind, as of ``base_columns``, each of shape (N, k).
+        wanted: Axes of the velocities, and place of the IMU.
+
+    Raises:
+        DataError: If a value is not finite, or a quaternion is not of length 1.
+    """
+    pose, frame = _pose_of(values, wanted.imu), wanted.imu
+    if pose is None and frame is not None and "base imu" in values:
+        imu, note = motion_of_imu(t, q, _checked(values["base imu"], "IMU", 6), frame)
+        pose = np.zeros((len(t), 7))
+        pose[:, 3:] = orientation_of_imu(t, imu.values, frame.gravity)
+        note += "; the orientation is estimated from angular velocity and specific force"
+        return BaseMotion(pose, imu=imu), note
+    if pose is None:
+        return None, ""
+    twist, acceleration = values.get("base twist"), values.get("base acceleration")
+    link = "" if "base imu quaternion" in values else wanted.link  # its place is stated by imu
+    base = BaseMotion(pose, twist, acceleration, link=link)
+    if frame is not None:
+        imu, note = motion_of_imu(t, q, _checked(values["base imu"], "IMU", 6), frame)
+        return replace(base, imu=imu), note
+    if wanted.twist == "base" or base.twist is None:
+        return base, ""
+    quaternion = base.pose[:, 3:]
+    parts = [in_base(quaternion, part) for part in (base.twist[:, :3], base.twist[:, 3:])]
+    return replace(base, twist=np.hstack(parts)), ""
+
+
+def _pose_of(values: Mapping[str, Array], frame: ImuFrame | None) -> Array | None:
+    """Return the pose (N, 7) from its columns by kind; a position that is missing is 0."""
+    if (pose := values.get("base pose")) is not None:
+        return pose
+    if (angles := values.get("base angles")) is not None:
+        return np.hstack([angles[:, :3], quaternions_of_angles(_radians(angles[:, 3:]))])
+    quaternion = values.get("base quaternion")
+    if (own := values.get("base imu quaternion")) is not None and frame is not None:
+        quaternion = _of_base(own, frame.quaternion)
+    elif (angles := values.get("base rpy")) is not None:
+        quaternion = quaternions_of_angles(_radians(angles))
+    return None if quaternion is None else np.hstack([0.0 * quaternion[:, :3], quaternion])
+
+
+def _radians(angles: Array) -> Array:
+    """Return roll, pitch and yaw (N, 3); refuse those in degrees. Yaw may count full turns."""
+    largest = float(np.abs(angles[:, :2]).max(initial=0.0))
+    if largest > _TURN:
+        raise DataError(
+            f"base_roll and base_pitch are up to {largest:.4g}, wanted at most pi: they look like "
+            "degrees. Convert base_roll, base_pitch and base_yaw to rad",
+            code="angle_unit",
+        )
+    return angles
+
+
+def _of_base(quaternion: Array, own: Array) -> Array:
+    """Return the orientation of the base (N, 4) from that of an IMU, and the IMU's in the base."""
+    x, w, back = quaternion[:, :3], quaternion[:, 3:], -own[:3]
+    vector = w * back + own[3] * x + np.cross(x, back)
+    return np.hstack([vector, w * own[3] - x @ back[:, None]])
+
+
+def contacts_of(values: Array, wanted: BaseColumns, where: str) -> dict[str, Array]:
+    """Return whether links touch the ground, by link, each of shape (N,), bool.
+
+    Args:
+        values: Columns of 0 and 1, or of forces of contacts with a threshold, shape (N, k).
+        wanted: The links, and their thresholds.
+        where: Name of the file.
+
+    Raises:
+        DataError: If a flag is neither 0 nor 1.
+    """
+    links = wanted.contacts
+    limits = np.full(len(links), np.nan)
+    if wanted.thresholds:
+        limits[:] = [np.nan if x is None else x for x in wanted.thresholds]
+    is_force = ~np.isnan(limits)
+    values = np.where(is_force, values > limits, values)
+    for link, flags in zip(links, values.T, strict=True):
+        wrong = np.flatnonzero((flags != 0.0) & (flags != 1.0))
+        if len(wrong):
+            raise DataError(
+                f"{where}: contact_{link} is {flags[wrong[0]]:g} in row {wrong[0]}, wanted 0 or "
+                "1; if it is a force, state threshold in [[contact]]"
+            )
+    return {link: flags == 1.0 for link, flags in zip(links, values.T, strict=True)}
+
+
+def table_of_base(
+    base: BaseMotion | None, contacts: Mapping[str, Array], wrenches: Mapping[str, Array]
+) -> dict[str, Array]:
+    """Return the columns of a log with the motion of a base, contacts and wrenches, by name.
+
+    Args:
+        base: The motion, or None.
+        contacts: As of ``Log.contacts``.
+        wrenches: As of ``Log.wrenches``.
+    """
+    table: dict[str, Array] = {}
+    forms = {"pose": POSE, "twist": TWIST, "acceleration": ACCELERATION}
+    for kind, ends in forms.items():
+        values = getattr(base, kind, None)
+        if values is not None:
+            table |= {f"base_{end}": values[:, k] for k, end in enumerate(ends)}
+    table |= {f"contact_{link}": flags.astype(float) for link, flags in contacts.items()}
+    return table | {f"wrench_{x.replace(' ', '_', 1)}": values for x, values in wrenches.items()}
+
+
+def base_state(
+    t: Array,
+    pose: Array,
+    twist: Array | None,
+    acceleration: Array | None,
+    imu: ImuMotion | None = None,
+) -> tuple[Array, Array, Array]:
+    """Return pose (N, 7), twist (N, 6) and acceleration (N, 6) of a base as of Pinocchio.
+
+    What was not recorded is differentiated: with the axes R of the base, v = R^T dx/dt and
+    w = 2 (q* dq/dt), the vector part of the product of quaternions.
+
+    Args:
+        t: Time stamps, shape (N,) [s].
+        pose: Smoothed pose, shape (N, 7) [m, -]; the quaternions need not be of length 1.
+        twist: Smoothed twist, shape (N, 6); None to differentiate the pose.
+        acceleration: Smoothed acceleration, shape (N, 6); None to differentiate the twist.
+        imu: Smoothed values of an IMU, which replace angular velocity and acceleration; None
+            without one.
+    """
+    quaternion = pose[:, 3:] / np.linalg.norm(pose[:, 3:], axis=1, keepdims=True)
+    pose = np.hstack([pose[:, :3], quaternion])
+    if twist is None:
+        rate = np.gradient(pose, t, axis=0)
+        vector, scalar = quaternion[:, :3], quaternion[:, 3:]
+        w = 2.0 * (scalar * rate[:, 3:6] - rate[:, 6:] * vector - np.cross(vector, rate[:, 3:6]))
+        twist = np.hstack([in_base(quaternion, rate[:, :3]), w])
+    if imu is not None:
+        down = in_base(quaternion, imu.frame.gravity)
+        twist, acceleration = inertial_state(t, twist[:, :3], down, imu.values, imu.frame)
+    elif acceleration is None:
+        acceleration = np.gradient(twist, t, axis=0)
+    return pose, twist, acceleration
+
+
+def pose_jumps(t: Array, pose: Array) -> tuple[Array, Array, Array]:
+    """Return the jumps of a pose from one row to the next: rows, lengths and angles.
+
+    A step is compared with the mean of the steps before and after it, and their difference with
+    those of 32 rows on each side. A change of the speed, as by an impact, is no jump.
+
+    Args:
+        t: Time stamps, shape (N,) [s].
+        pose: Pose as of ``BaseMotion``, shape (N, 7).
+
+    Returns:
+        The rows after the jumps, shape (k,); their sizes, 0 if not a jump of this kind [m], [rad].
+    """
+    dt, sizes = np.diff(t), np.zeros((2, len(t)))
+    if len(dt) < 3:
+        return np.empty(0, dtype=int), np.empty(0), np.empty(0)
+    whole = dt < _GAP * np.median(dt)
+    whole = whole[1:-1] & whole[:-2] & whole[2:]
+    for found, values, least in zip(
+        sizes, (pose[:, :3], 2.0 * pose[:, 3:]), _SMALLEST, strict=True
+    ):
+        steps = np.diff(values, axis=0)
+        size = np.linalg.norm(steps[1:-1] - 0.5 * (steps[:-2] + steps[2:]), axis=1)
+        impact = np.linalg.norm(steps[2:] - steps[:-2], axis=1) > size  # a change of the speed
+        for k in np.flatnonzero(whole & ~impact & (size > least)):
+            beside = slice(max(k - _BESIDE, 0), k + _BESIDE + 1)
+            usual = np.percentile(size[beside][whole[beside]], _USUAL)
+            if size[k] > _JUMPS * usual and size[k] == size[max(k - 1, 0) : k + 2].max():
+                found[k + 2] = size[k]
+    rows = np.flatnonzero(sizes.any(axis=0))
+    return rows, *sizes[:, rows]
+
+
+def in_base(quaternion: Array, vector: Array) -> Array:
+    """Return vectors with the axes of the base, R^T x, shape (N, 3).
+
+    Args:
+        quaternion: Orientation of the base, qx qy qz qw, shape (N, 4).
+        vector: Vectors with the axes of the world, shape (N, 3), or one, shape (3,).
+    """
+    u = np.cross(vector, quaternion[:, :3])
+    turned: Array = vector + 2.0 * (quaternion[:, 3:] * u + np.cross(u, quaternion[:, :3]))
+    return turned
+
+
+def quaternions_of_angles(angles: Array) -> Array:
+    """Return qx qy qz qw of roll, pitch and yaw, R = Rz(yaw) Ry(pitch) Rx(roll), shape (N, 4).
+
+    Args:
+        angles: Roll, pitch and yaw, shape (N, 3) [rad].
+    """
+    (cr, cp, cy), (sr, sp, sy) = np.cos(angles.T / 2), np.sin(angles.T / 2)
+    return np.column_stack(
+        [
+            sr * cp * cy - cr * sp * sy,
+            cr * sp * cy + sr * cp * sy,
+            cr * cp * sy - sr * sp * cy,
+            cr * cp * cy + sr * sp * sy,
+        ]
+    )
+
+
+def _checked(values: ArrayLike, name: str, width: int) -> Array:
+    array: Array = real_numbers(values, f"{name} of the base").copy()
+    if array.ndim != 2 or array.shape[1] != width:
+        raise DataError(f"{name} of the base has shape {array.shape}, wanted (N, {width})")
+    if not np.isfinite(array).all():
+        row = int(np.argmin(np.isfinite(array).all(axis=1)))
+        raise DataError(f"{name} of the base is not finite in row {row}")
+    array.flags.writeable = False
+    return array

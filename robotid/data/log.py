@@ -1,0 +1,502 @@
+"""Motion of a robot as arrays: `Log`, the recording, and `Trajectory`, the input of a fit.
+
+Files are read and written by `robotid.data.files.read`.
+"""
+
+import difflib
+from collections import Counter
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from copy import copy
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from robotid.base.arguments import check_fields, checked, frozen, real_numbers
+from robotid.base.exceptions import DataError, SettingsError
+from robotid.base.findings import listed
+from robotid.base.settings import is_number, require_each, require_flag, require_kind
+from robotid.base.text import seconds
+from robotid.base.typing import Array
+from robotid.data.base_motion import POSE, BaseMotion
+
+__all__ = ["COLUMNS", "Log", "Trajectory"]
+
+#: Attributes of a `Log` with one column per joint, by the prefix of these columns in files.
+COLUMNS = {
+    "q": "q",
+    "dq": "v",
+    "ddq": "a",
+    "tau": "tau",
+    "qref": "q_ref",
+    "dqref": "v_ref",
+    "tauref": "tau_ref",
+}
+_SHORTEST = 1e-12  # [s] smallest mean time step
+_REQUIRED = ("q", "tau")
+_NO_TORQUE = "; without torques, pass zeros and has_torque=False"
+_BY_SAMPLE = (
+    "t", "q", "v", "a", "tau", "segment", "direction", "memory", "contacts",
+    "wrenches", "switching", "basis", "loaded",
+)  # fmt: skip
+_LARGEST = 1e30  # in any unit, so that squares and products are finite
+
+
+@dataclass(frozen=True, eq=False)
+class Log:
+    """A recording, sample by sample, in SI units. The arrays are read-only.
+
+    Attributes:
+        t: Time stamps, strictly increasing, shape (N,) [s].
+        q: Joint positions, shape (N, n) [rad or m].
+        tau: Joint torques, shape (N, n) [N m or N]; 0 if they were not recorded.
+        joints: Names of the n joints, in the order of the columns.
+        v: Measured velocities, shape (N, n) [rad/s or m/s], or None.
+        a: Measured accelerations, shape (N, n) [rad/s^2 or m/s^2], or None.
+        path: The file of the log; "" if it was created in memory.
+        notes: Notes for the user, as columns that were ignored.
+        assumed: What was assumed of the columns, as the order of numbered ones.
+        q_ref: Commanded positions, shape (N, n) [rad or m], or None.
+        v_ref: Commanded velocities, shape (N, n) [rad/s or m/s], or None.
+        tau_ref: Commanded feed-forward torques, shape (N, n) [N m or N], or None.
+        has_torque: Whether torques were recorded.
+        base: Motion of the base of a robot whose base floats, or None.
+        contacts: Whether links touch the ground, by link, each of shape (N,), bool.
+        wrenches: Measured components of the wrenches of the ground, by name as "fz l_sole", each of
+            shape (N,) [N or N m].
+    """
+
+    t: Array
+    q: Array
+    tau: Array
+    joints: tuple[str, ...]
+    v: Array | None = None
+    a: Array | None = None
+    path: str = ""
+    notes: tuple[str, ...] = ()
+    q_ref: Array | None = None
+    v_ref: Array | None = None
+    tau_ref: Array | None = None
+    has_torque: bool = True
+    base: BaseMotion | None = None
+    contacts: Mapping[str, Array] = field(default_factory=dict)
+    wrenches: Mapping[str, Array] = field(default_factory=dict)
+    assumed: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        require_kind(self.path, (str, Path), "path", "the path of the log's file, or ''")
+        require_flag(self.has_torque, "has_torque")
+        require_each(self.notes, str, "notes", "a list of sentences")
+        where = self.name
+        _settle(self, where, {kind: getattr(self, name) for kind, name in COLUMNS.items()})
+        if not self.has_torque and self.tau.any():
+            raise DataError(
+                f"{where}: has_torque is False, but tau is not 0; leave has_torque out, or pass "
+                "zeros"
+            )
+        if len(self.t) < 2:
+            raise DataError(f"{where} has {len(self.t)} rows, wanted at least 2; record longer")
+        require_increasing(self.t, where)
+        require_kind(self.base, (BaseMotion, type(None)), "base", "a robotid.BaseMotion")
+        if self.base is not None and len(self.base.pose) != len(self.t):
+            raise DataError(
+                f"{where}: the pose of the base has {len(self.base.pose)} rows, wanted "
+                f"{len(self.t)}, one for each time stamp"
+            )
+        check_fields(self, "contacts", "wrenches")
+        for kind, dtype in (("contacts", np.bool_), ("wrenches", np.float64)):
+            own = {
+                name: frozen(real_numbers(x, f"{where}: {name!r} of {kind}"), dtype)
+                for name, x in getattr(self, kind).items()
+            }
+            for name, values in own.items():
+                if values.shape != self.t.shape:
+                    raise DataError(
+                        f"{where}: {name!r} of {kind} has shape {values.shape}, wanted "
+                        f"{self.t.shape}"
+                    )
+                require_finite(values[:, None], self.t, [f"{kind} {name}"], where)
+            object.__setattr__(self, kind, own)
+
+    @property
+    def name(self) -> str:
+        """Name of the file, "log" if there is none."""
+        return Path(self.path).name or "log"
+
+    def __repr__(self) -> str:
+        return f"<Log {Path(self.path).name or 'in memory'}: {_extent(self)}>"
+
+    def window(self, start: float | None = None, end: float | None = None) -> "Log":
+        """Return the log from start to end, both included.
+
+        Args:
+            start: First time stamp, on the log's own clock [s]; None for the first row.
+            end: Last time stamp [s]; None for the last row.
+
+        Raises:
+            DataError: If fewer than two rows lie in this window.
+        """
+        for name, limit in (("start", start), ("end", end)):
+            is_end = isinstance(limit, float | np.floating) and bool(np.isinf(limit))
+            if not (limit is None or is_end or is_number(limit)):
+                raise DataError(f"{name} is {str(limit)[:60]!r}, wanted a time [s], or None")
+        first = self.t[0] if start is None else start
+        last = self.t[-1] if end is None else end
+        rows = np.flatnonzero((self.t >= first) & (self.t <= last))
+        if len(rows) < 2:
+            raise DataError(
+                f"{self.name}: {len(rows)} rows lie between {seconds(first)} s and {seconds(last)} "
+                f"s; the log spans {seconds(self.t[0])} s to {seconds(self.t[-1])} s. Choose start "
+                "and end inside it"
+            )
+        within = slice(rows[0], rows[-1] + 1)
+        return replace(
+            self,
+            t=self.t[within],
+            base=None if self.base is None else self.base.at(within),
+            contacts={link: flags[within] for link, flags in self.contacts.items()},
+            wrenches={name: values[within] for name, values in self.wrenches.items()},
+            **{k: x[within] for k, x in self._arrays().items()},
+        )
+
+    def select(self, joints: Sequence[str]) -> "Log":
+        """Return the log of some joints.
+
+        Args:
+            joints: Names of these joints, in the required order.
+
+        Raises:
+            DataError: If a joint is not in the log.
+        """
+        for name in require_each(joints, str, "joints", "a list of names"):
+            if name not in self.joints:
+                raise DataError(
+                    f"joint {name!r} is not in {self.name}; joints: {listed(self.joints)}"
+                    f"{suggestion(name, self.joints)}"
+                )
+        columns = [self.joints.index(name) for name in joints]
+        chosen = {name: x[:, columns] for name, x in self._arrays().items()}
+        return replace(self, joints=tuple(joints), **chosen)
+
+    @checked()
+    def turned(self, sign: Array) -> "Log":
+        """Return the log with the signs of some joints reversed.
+
+        Args:
+            sign: 1 or -1 of each joint, shape (n,).
+        """
+        if sign.shape != (len(self.joints),):
+            raise DataError(f"sign has shape {sign.shape}, wanted ({len(self.joints)},)")
+        return replace(self, **{name: sign * x for name, x in self._arrays().items()})
+
+    def _arrays(self) -> dict[str, Any]:
+        """Return the existing arrays with one column per joint."""
+        arrays = {name: getattr(self, name) for name in COLUMNS.values()}
+        return {name: x for name, x in arrays.items() if x is not None}
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """A motion that is smooth within each segment, in SI units. The arrays are read-only.
+
+    Attributes:
+        t: Time stamps, shape (N,) [s].
+        q: Joint positions, shape (N, n) [rad or m]; of a floating base the pose before them,
+            (N, 7 + n).
+        v: Velocities, shape (N, n) [rad/s or m/s]; with the twist of the base, (N, 6 + n).
+        a: Accelerations, likewise [rad/s^2 or m/s^2].
+        tau: Torques, shape (N, n) [N m or N]; with the wrench of the base, 0, (N, 6 + n). With a
+            basis, the torques without those of constraint forces.
+        joints: Names of the n joints, in the order of the columns.
+        rate: Rate of the uniform grid [Hz]; None if the rows are those of the log.
+        segment: Number of the segment without gaps of each row, shape (N,), int.
+        direction: Sign of each speed that determines Coulomb friction, filtered as the torque,
+            shape (N, c) [-], in the order of ``friction_speeds``; None: the sign of the speed.
+        memory: Regressor columns of drive parameters that depend on internal states, shape (N, m),
+            in the order of ``ParameterLayout.remembering``; None if there are none.
+        contacts: Which contacts may touch the ground, shape (N, k), bool; None without contacts.
+        switching: Samples at which a contact changes and the acceleration jumps, or that a jump of
+            the logged pose of the base reaches, shape (N,), bool; None without contacts and base.
+        wrenches: Measured components of wrenches, shape (N, m) [N or N m]; None without any.
+        basis: Basis of the torques of constraint forces, shape (N, n_rows, m), as of
+            ``force_basis``; None without constraints.
+        loaded: Torques with those of unknown constraint forces, shape (N, n_rows) [N m, N]; None
+            without constraints.
+    """
+
+    t: Array
+    q: Array
+    v: Array
+    a: Array
+    tau: Array
+    joints: tuple[str, ...]
+    rate: float | None
+    segment: Array
+    direction: Array | None = None
+    memory: Array | None = None
+    contacts: Array | None = None
+    wrenches: Array | None = None
+    switching: Array | None = None
+    basis: Array | None = None
+    loaded: Array | None = None
+
+    def __post_init__(self) -> None:
+        _settle(self, "trajectory", {"q": self.q, "v": self.v, "a": self.a, "tau": self.tau})
+        try:
+            segment = np.asarray(self.segment)
+        except ValueError:  # rows of unequal length
+            segment = np.asarray(None)
+        if segment.shape != self.t.shape or segment.dtype.kind not in "iu":
+            raise DataError(
+                f"trajectory: segment is {segment.dtype} of shape {segment.shape}, wanted integers "
+                f"of shape {self.t.shape}"
+            )
+        object.__setattr__(self, "segment", frozen(segment, np.int_))
+        if self.direction is not None:
+            direction = frozen(self.direction)
+            if direction.ndim != 2 or len(direction) != len(self.t):
+                raise DataError(
+                    f"trajectory: direction has shape {direction.shape}, wanted ({len(self.t)}, c)"
+                    ": a column for each speed that determines Coulomb friction"
+                )
+            names = [f"direction {k}" for k in range(direction.shape[1])]
+            require_finite(direction, self.t, names, "trajectory")
+            object.__setattr__(self, "direction", direction)
+        if self.rate is not None and not (is_number(self.rate) and self.rate > 0):
+            raise DataError(f"trajectory: rate is {self.rate!r}, wanted a positive number or None")
+
+    def __repr__(self) -> str:
+        segments = len(np.unique(self.segment))
+        return f"<Trajectory: {_extent(self, self.rate)}, in {segments} segments>"
+
+    @cached_property
+    def derived(self) -> dict[str, Any]:
+        """Cache of values computed from this motion, by name."""
+        return {}
+
+    def with_states(self, memory: Array | None) -> "Trajectory":
+        """Return the same motion with other internal states of drives, and the same cache.
+
+        Args:
+            memory: Columns of internal states, as of ``memory``.
+        """
+        same = copy(self)
+        vars(same).update(memory=memory, derived=self.derived)
+        return same
+
+    def projected(self, basis: Array, tau: Array, loaded: Array) -> "Trajectory":
+        """Return the same motion without the torques of constraint forces.
+
+        Args:
+            basis: As of ``force_basis``, shape (N, n_rows, m).
+            tau: The remaining torques, shape (N, n_rows) [N m, N].
+            loaded: The torques with them, shape (N, n_rows) [N m, N].
+        """
+        return replace(self, basis=basis, tau=tau, loaded=loaded)
+
+    @property
+    def squares(self) -> Array:
+        """Sums of tau^2, v^2 and a^2 over the samples, shape (3, n)."""
+        return np.array([np.einsum("kj,kj->j", x, x) for x in (self.tau, self.v, self.a)])
+
+    @checked()
+    def part(self, start: int, stop: int) -> "Trajectory":
+        """Return the samples start to stop.
+
+        Args:
+            start: First sample.
+            stop: Sample after the last one; beyond the end means to the end.
+        """
+        return self.at(slice(start, stop))
+
+    @checked()
+    def every(self, step: int) -> "Trajectory":
+        """Return every n-th sample, without a rate.
+
+        Args:
+            step: The number n.
+        """
+        if step < 1:
+            raise SettingsError(f"step is {step}, wanted 1 or more")
+        if step == 1:
+            return self
+        thinned = self.at(slice(None, None, step))
+        vars(thinned)["rate"] = None
+        return thinned
+
+    @checked()
+    def at(self, rows: Array | slice) -> "Trajectory":
+        """Return some samples, without new checks of their values.
+
+        Args:
+            rows: Their numbers.
+        """
+        some = copy(self)
+        vars(some).pop("derived", None)
+        for name in _BY_SAMPLE:
+            values = getattr(self, name)
+            if values is not None:
+                try:
+                    vars(some)[name] = own = values[rows]
+                except IndexError as error:
+                    raise DataError(f"rows are not samples of the trajectory: {error}") from error
+                own.flags.writeable = False
+        return some
+
+
+def suggestion(name: str, known: Collection[str]) -> str:
+    """Return ". Did you mean 'x'?" for the most similar known name, or "" if none is similar.
+
+    Args:
+        name: The unknown name.
+        known: The known names.
+    """
+    near = difflib.get_close_matches(name, known, n=1)
+    return f". Did you mean {near[0]!r}?" if near else ""
+
+
+def repeated(names: Sequence[str]) -> list[str]:
+    """Return the names that occur more than once, each once, sorted.
+
+    Args:
+        names: The names.
+    """
+    return sorted(name for name, count in Counter(names).items() if count > 1)
+
+
+def _settle(owner: Log | Trajectory, where: str, arrays: dict[str, Array | None]) -> None:
+    """Check joints, shapes and values of the arrays, and replace them by read-only ones."""
+    joints = _names(owner.joints, where)
+    if twice := repeated(joints):
+        raise DataError(f"{where}: joints contains {listed(twice)} twice; name each joint once")
+    t = real_numbers(owner.t, f"{where}: t")
+    if t.ndim != 1:
+        raise DataError(f"{where}: t has shape {t.shape}, wanted (N,)")
+    require_finite(t[:, None], t, ["time"], where)
+    settled = {"t": t}
+    for name, values in arrays.items():
+        if values is None and name not in _REQUIRED:
+            continue
+        array = real_numbers(values, f"{where}: {name}", hint=_NO_TORQUE if name == "tau" else "")
+        base = _base_width(owner, name)
+        if array.shape != (len(t), base + len(joints)):
+            raise DataError(
+                f"{where}: {name} has shape {array.shape}, wanted {(len(t), len(joints))}: a row "
+                f"for each time stamp, a column for each of the joints {listed(joints)}"
+            )
+        names = [f"{name}_{x}" for x in (*(f"base {k}" for k in range(base)), *joints)]
+        require_finite(array, t, names, where)
+        settled[COLUMNS.get(name, name)] = array
+    for name, array in settled.items():
+        object.__setattr__(owner, name, array)
+    object.__setattr__(owner, "joints", joints)
+
+
+def _base_width(owner: Log | Trajectory, name: str) -> int:
+    """Return the columns of an array before those of the joints: 7 or 6 of a floating base."""
+    floats = isinstance(owner, Trajectory) and np.ndim(owner.q) == 2
+    if not floats or np.shape(owner.q)[1] != len(tuple(owner.joints)) + len(POSE):
+        return 0
+    return len(POSE) if name == "q" else 6
+
+
+def _names(joints: object, where: str) -> tuple[str, ...]:
+    """Return the names of joints as a tuple."""
+    names = joints.tolist() if isinstance(joints, np.ndarray) else joints
+    is_list = isinstance(names, Iterable) and not isinstance(names, str | Mapping)
+    found: tuple[Any, ...] = tuple(names) if is_list else ()  # type: ignore[arg-type]
+    if not found or not all(isinstance(name, str) for name in found):
+        raise DataError(f"{where}: joints is {joints!r}, wanted at least one name in a tuple")
+    return found
+
+
+def require_finite(
+    values: Array, t: Array, names: Sequence[str], where: str, first: int = 0
+) -> None:
+    """Reject NaN, infinite values and values beyond 1e30; the error names the first.
+
+    Args:
+        values: Shape (N, k).
+        t: Time stamps of the rows, shape (N,) [s].
+        names: Names of the k columns.
+        where: Name of the log.
+        first: Number of the first row in its file.
+
+    Raises:
+        DataError: If a value is not finite, or so large that its square may not be.
+    """
+    is_fine = np.abs(values) <= _LARGEST  # False for NaN, too
+    if is_fine.all():
+        return
+    row, column = (int(i) for i in np.argwhere(~is_fine)[0])
+    value = values[row, column]
+    found = "NaN" if np.isnan(value) else f"{value:g}" if np.isfinite(value) else str(value)
+    what = ", which is implausibly large," if np.isfinite(value) else ""
+    at = f" (t = {seconds(t[row])} s)" if np.isfinite(t[row]) else ""
+    raise DataError(
+        f"{where}: {names[column]} is {found}{what} at row {first + row}{at}; remove the row or "
+        "correct the recording",
+        code="not_finite",
+    )
+
+
+def require_increasing(t: Array, where: str, first: int = 0) -> None:
+    """Reject time stamps that repeat or decrease; the error names the first.
+
+    Args:
+        t: Time stamps, shape (N,) [s].
+        where: Name of the log.
+        first: Number of the first row in its file.
+
+    Raises:
+        DataError: If a time stamp is not after the one before, or the time steps are too small.
+    """
+    back = np.flatnonzero(np.diff(t) <= 0)
+    if len(back) == 0:
+        _check_rate(t, where)
+        return
+    k = int(back[0]) + 1
+    row, now, before = first + k, _stamp(t[k]), _stamp(t[k - 1])
+    if t[k] == t[k - 1]:
+        raise DataError(
+            f"{where}: t must increase, but t[{row}] = {now} s is a duplicate time stamp, "
+            f"the same as t[{row - 1}]; remove one of the two rows",
+            code="duplicate_stamp",
+        )
+    raise DataError(
+        f"{where}: t must increase, but t[{row}] = {now} s follows t[{row - 1}] = {before} s; "
+        "sort the rows, or correct the recording",
+        code="stamp_order",
+    )
+
+
+def _check_rate(t: Array, where: str) -> None:
+    """Reject time stamps with implausibly small steps."""
+    if len(t) < 2:
+        return
+    step = float(t[-1] - t[0]) / (len(t) - 1)
+    if step < _SHORTEST:
+        raise DataError(
+            f"{where}: {len(t)} rows lie within {float(t[-1] - t[0]):.3g} s, so the mean time step "
+            f"is {step:.3g} s, wanted at least {_SHORTEST:g} s; correct the time stamps or their "
+            "unit",
+            code="time_unit",
+        )
+
+
+def _stamp(t: float) -> str:
+    """Return a time stamp with three decimals, or with more if it has more."""
+    return f"{t:.3f}" if round(t, 3) == t else f"{t:.13g}"
+
+
+def _extent(motion: Log | Trajectory, rate: float | None = None) -> str:
+    """Return a text with the joints, the duration and the rate of a motion."""
+    t, joints = motion.t, motion.joints
+    if rate is None:
+        rate = 1.0 / float(np.median(np.diff(t))) if len(t) > 1 else np.nan
+    return (
+        f"{len(t)} samples of {len(joints)} joints ({', '.join(joints)}) over "
+        f"{t[-1] - t[0] if len(t) else 0.0:.6g} s at {rate:.4g} Hz"
+    )

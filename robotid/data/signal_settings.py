@@ -1,0 +1,226 @@
+"""Settings of reading and filtering logs."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+from robotid.base.exceptions import SettingsError
+from robotid.base.settings import (
+    NOT_NEGATIVE,
+    POSITIVE,
+    Entries,
+    Range,
+    Settings,
+    is_number,
+    require_kind,
+    setting,
+)
+
+__all__ = ["PER_SECOND", "BaseSource", "LogSource", "LogUnits", "SignalSettings"]
+
+#: Number of each time unit in a second.
+PER_SECOND = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
+_HZ = Range("0.001 to 1e6", lambda x: 1e-3 <= x <= 1e6)
+_MEASURED = ("auto", "measured", "differentiated")
+_DELAY = Range("seconds between -1 and 1", lambda x: abs(x) <= 1)
+
+
+def _load_cutoff(value: float | bool) -> float | None:
+    if value is True:
+        raise SettingsError("cutoff is true, wanted a frequency [Hz], or false for no filter")
+    return None if value is False else value
+
+
+@dataclass(frozen=True)
+class SignalSettings(Settings):
+    """Settings that convert a log to a trajectory."""
+
+    rate: float | None = setting(
+        None,
+        "rate of the uniform grid [Hz]; if not stated, the log's median rate (without a filter, "
+        "the rows of the log)",
+        within=_HZ,
+    )
+    cutoff: float | None = setting(
+        8.0,
+        "cut-off of the zero-phase Butterworth filter [Hz]; false for no filter",
+        within=_HZ,
+        reads=(int, float, bool),
+        load=_load_cutoff,
+        dump=lambda value: False if value is None else value,
+    )
+    order: int = setting(
+        4,
+        "order of the filter, which runs once forward and once backward",
+        within=Range("1 to 10", lambda x: 1 <= x <= 10),
+    )
+    velocity: str = setting(
+        "auto",
+        "measured, differentiated (from the position), or auto: measured, if consistent with the "
+        "position, of sufficient resolution, and as good as differentiated in predicting the "
+        "torque of held-out segments",
+        among=_MEASURED,
+    )
+    acceleration: str = setting(
+        "auto",
+        "measured, differentiated (from the velocity), or auto: measured, if the log has it and "
+        "the measured velocity is used",
+        among=_MEASURED,
+    )
+    trim: float = setting(
+        0.2, "time removed at each end of each segment without gaps [s]", within=NOT_NEGATIVE
+    )
+    min_velocity: float = setting(
+        0.02,
+        "joint speed below which rows are not used to identify Coulomb friction and a drive may be "
+        "in stiction [rad/s]; a prismatic joint crosses its range (1 m if the URDF has none) in "
+        "the time of a full turn at this speed; 0 uses all rows",
+        within=NOT_NEGATIVE,
+    )
+    friction_band: float = setting(
+        0.0,
+        "speed from which Coulomb friction has its full value [rad/s], of prismatic joints as for "
+        "min_velocity; it changes linearly between the two signs of this speed; 0: sign of the "
+        "speed, the Coulomb model",
+        within=Range("0, or 1e-9 or more", lambda x: x == 0 or x >= 1e-9),
+    )
+    max_gap: float | None = setting(
+        None,
+        "a longer time step is a gap [s]; if not stated, 2.5 median steps, or a quarter of the "
+        "filter's period if that is longer",
+        within=POSITIVE,
+    )
+    torque_delay: float = setting(
+        0.0,
+        "delay of the logged torque relative to the position [s], which is corrected",
+        within=_DELAY,
+    )
+    velocity_delay: float = setting(
+        0.0, "delay of the measured velocity, likewise [s]", within=_DELAY
+    )
+    wrench_delay: float = setting(
+        0.0, "delay of the measured wrenches of contacts, likewise [s]", within=_DELAY
+    )
+
+
+@dataclass(frozen=True)
+class LogUnits(Settings):
+    """Units of a log file; SI if not stated, and an error if the numbers look like another unit."""
+
+    _table: ClassVar[str] = "units"
+
+    time: str | None = setting(
+        None, "unit of the time stamps; velocities are per second", among=tuple(PER_SECOND)
+    )
+    angle: str | None = setting(
+        None, "unit of q, dq and ddq of revolute joints", among=("rad", "deg")
+    )
+    percent: Mapping[str, Sequence[float]] = setting(
+        {}, "joints logged from 0 to 100, such as grippers of LeRobot: the positions at 0 and at "
+        "100 by joint [rad or m], as { gripper = [-0.17, 1.75] }",
+        reads=Entries(dict, (list,)),
+    )  # fmt: skip
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require_kind(self.percent, Mapping, "percent", "a table of two positions by joint")
+        for joint, ends in self.percent.items():
+            is_pair = isinstance(ends, Sequence) and len(ends) == 2 and all(map(is_number, ends))
+            if not is_pair or ends[0] == ends[1]:
+                raise SettingsError(
+                    f"units: percent of {joint} is {ends!r}, wanted two different numbers, the "
+                    "positions at 0 and at 100 [rad or m]"
+                )
+
+    def scale(self, joint: str, *, is_angle: bool) -> tuple[float, float]:
+        """Return a and b of a joint's positions a + b x [rad or m], x the number in the log.
+
+        Args:
+            joint: The joint.
+            is_angle: Whether its positions are angles.
+        """
+        if joint in self.percent:
+            first, last = self.percent[joint]
+            return float(first), (last - first) / 100
+        return 0.0, math.pi / 180 if is_angle and self.angle == "deg" else 1.0
+
+
+@dataclass(frozen=True)
+class LogSource(Settings):
+    """Place of the signals in a log file; the defaults are for files with one log."""
+
+    _table: ClassVar[str] = "log"
+
+    topic: str | None = setting(
+        None,
+        "the topic of a bag, the group or struct of an HDF5, MAT or NPZ file, or the episode of "
+        "a LeRobot dataset, as episode_3; not needed if there is only one",
+    )
+    command: str | None = setting(
+        None,
+        "the topic of a bag with commanded joint states, if it is not the topic of the measured "
+        "ones",
+    )
+    joints: Mapping[str, str] = setting({}, "name in the file by joint, if they differ")
+    names: tuple[str, ...] = setting(
+        (),
+        "names of all columns in their order, of a file without a header or with other names",
+        dump=lambda names: list(names) or None,
+    )
+    rate: float | None = setting(
+        None, "rate of the rows of a log without time stamps [Hz]", within=_HZ
+    )
+    effort: str = setting(
+        "torque",
+        "quantity of effort columns: torque [N m or N], or current [A], which needs a gain",
+        among=("torque", "current"),
+    )
+    stamp: str = setting(
+        "header",
+        "the time stamps: even, equal time steps for all rows, for a recorder that stamps rows of "
+        "one rate on arrival, in bunches; of a bag also header, the stamp in the message, or log, "
+        "the time of recording",
+        among=("header", "log", "even"),
+    )
+    sensors: tuple[str, ...] = setting(
+        (),
+        "the topics of a bag with odometry, IMU, wrenches or foot forces; all topics of these "
+        "kinds if not stated",
+        dump=lambda topics: list(topics) or None,
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require_kind(self.joints, Mapping, "joints", "a table of names by joint")
+        for name, topic in (("topic", self.topic), ("command", self.command)):
+            require_kind(topic, (str, type(None)), name, "the name of a topic or group, or none")
+        if len(set(self.names)) != len(self.names):
+            raise SettingsError("log: names has a name more than once; wanted one for each column")
+        for joint, name in self.joints.items():
+            if not isinstance(name, str):
+                raise SettingsError(f"log: joints.{joint} is {name!r}, wanted a name")
+
+
+@dataclass(frozen=True)
+class BaseSource(Settings):
+    """The motion of a floating base in a log file."""
+
+    _table: ClassVar[str] = "base"
+
+    twist: str = setting(
+        "base",
+        "axes of the velocities base_vx to base_wz: base, those of the base link, or world",
+        among=("base", "world"),
+    )
+    link: str | None = setting(
+        None,
+        "the link whose pose base_x to base_qw are, as the chest of a human; the root link if not "
+        "stated. Velocities of another link are not read",
+    )
+    imu: str | None = setting(
+        None,
+        "the link of an IMU, fixed to the root link; its angular velocity and specific force, "
+        "imu_wx to imu_az, are used instead of velocities and accelerations of the base, and its "
+        "orientation, imu_qx to imu_qw, if there is none of the base",
+    )

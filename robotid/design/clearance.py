@@ -1,0 +1,443 @@
+"""Distances between the links of a moving robot, and to the floor and to boxes.
+
+Every shape is replaced by its convex hull, which contains it. Distances between hulls are computed
+by coal. A hull moves with the screws of the joints before it, so a distance has an exact gradient.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+
+from robotid.base.exceptions import DataError, SettingsError
+from robotid.base.findings import listed
+from robotid.base.typing import Array
+from robotid.design.along import Placements, fixed_tree
+from robotid.dynamics.simulation.motions import Motion
+from robotid.robot.geometry import link_clouds
+from robotid.robot.model import RobotModel
+
+__all__ = ["Box", "Clearance", "Contact", "Nearness"]
+
+_TRIED = 400  # random poses by which the pairs of links that may meet are found
+_DISTANT = 0.05  # [m] links whose distance is larger at all of them are checked in the end only
+_ALMOST_ALL = 0.95  # share of the poses
+_TOUCH = 1e-3  # [m] hulls at a smaller distance touch
+_CLOSE = 5e-3  # [m] beyond the clearance: links within it are close by design
+_THINNEST = 1e-3  # [m] thickness given to a flat shape
+_FIRST = 0.05  # [s] the first intervals in which a motion is checked ...
+_SHORTEST = 1e-3  # [s] ... and the shortest
+_TOLERANCE = 5e-4  # [m] by which a lower bound may be too low
+_WIDE = 100.0  # [m] extent of the floor
+_SPARE = 0.002  # [m] reserve of distances for the motion between samples, but at most ...
+_SPARE_SHARE = 0.25  # ... this share of the slack of links that are close by design
+_EXACT = 0.01  # [m] margin below which distances are exact
+_SIGNS = np.array(np.meshgrid(*[[-1.0, 1.0]] * 3)).reshape(3, -1).T  # corners of a box, (8, 3)
+
+
+@dataclass(frozen=True)
+class Box:
+    """A box at rest beside the robot, in the frame of the root link.
+
+    Attributes:
+        name: Its name.
+        low: Its lower corner [m].
+        high: Its upper corner [m].
+    """
+
+    name: str
+    low: tuple[float, float, float]
+    high: tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Contact:
+    """The smallest distance between two shapes.
+
+    Attributes:
+        first: Name of one.
+        second: Name of the other.
+        distance: Between their hulls, below 0 if they overlap [m].
+        time: Time [s].
+        required: Required distance between them [m].
+    """
+
+    first: str
+    second: str
+    distance: float
+    time: float
+    required: float = 0.0
+
+    @property
+    def margin(self) -> float:
+        """Distance minus the required one [m]."""
+        return self.distance - self.required
+
+    def __str__(self) -> str:
+        is_clear = self.distance > 0
+        words = f"approach to {1e3 * self.distance:.0f} mm" if is_clear else "overlap"
+        return f"{self.first} and {self.second} {words} at {self.time:.2f} s"
+
+
+@dataclass(frozen=True, eq=False)
+class Nearness:
+    """Distances of near pairs along a motion.
+
+    Attributes:
+        distance: Shape (pairs, N) [m]; a lower bound beyond the distance asked for.
+        pairs: Pair of each of k distances that have a gradient, shape (k,).
+        samples: Sample of each, shape (k,).
+        gradient: Of each by the n joints, shape (k, n) [m/rad or 1].
+    """
+
+    distance: Array
+    pairs: Array
+    samples: Array
+    gradient: Array
+
+
+@dataclass(frozen=True, eq=False)
+class _Hull:
+    """A convex piece of a link, or of a fixed shape (body -1), in the frame of its body."""
+
+    name: str
+    body: int
+    centre: Array
+    radius: float
+    half: Array  # of the box around it, in that frame, shape (3,)
+    corners: Array  # about the centre, shape (k, 3)
+    shape: Any  # of coal, about the centre
+
+
+class Clearance:
+    """The distances of a robot's links to each other, to the floor and to obstacles.
+
+    Links joined by a joint are not checked. Nor are two links whose hulls touch at zero position
+    and in 95 % of random poses: they are in contact by design. Two links whose distance is smaller
+    than the clearance in 95 % of the poses, but which do not always touch, are close by design:
+    half their median distance is required.
+
+    Args:
+        model: The robot, with a fixed base.
+        least: Required distance [m].
+        floor: Height of the floor, in the frame of the root link [m].
+        boxes: Obstacles around the robot.
+        seed: Seed of the random poses.
+
+    Attributes:
+        pairs: Numbers of the two hulls of each pair.
+        likely: Which pairs may meet within the limits, shape (pairs,), bool.
+        required: Required distance of each pair, shape (pairs,) [m].
+        slack: Median distance beyond the required one of pairs that are close by design, shape
+            (pairs,) [m]; inf for the others.
+        unread: Links of which a shape cannot be read: they are not checked.
+        made_to: Links in contact by design, by two, with their smallest distance.
+        built_near: Links that are close by design, by two, with the required distance.
+
+    Raises:
+        DataError: If no link has a shape that can be read, or the base floats.
+        SettingsError: If a number is not usable, or a joint is of a kind that is not compiled.
+    """
+
+    def __init__(
+        self,
+        model: RobotModel,
+        *,
+        least: float = 0.02,
+        floor: float | None = None,
+        boxes: Sequence[Box] = (),
+        seed: int = 0,
+    ) -> None:
+        import coal
+
+        if not least >= 0:
+            raise SettingsError(f"clearance is {least}, wanted 0 m or more")
+        self.least, self._model, self._tree = least, model, fixed_tree(model)
+        self._ratios = model.velocity_map  # of joints by body, (m, n)
+        clouds, self.unread = link_clouds(model)
+        if not clouds:
+            raise DataError(
+                f"{model.tree.path} has no shape that can be read, so collisions cannot be "
+                "checked; give it collision geometry, or design without clearance"
+            )
+        self._hulls = [_hull(name, body, points) for name, body, points in clouds]
+        self._hulls += [_hull(box.name, -1, _corners(box)) for box in boxes]
+        if floor is not None:
+            below = Box("the floor", (-_WIDE, -_WIDE, floor - _WIDE), (_WIDE, _WIDE, floor))
+            self._hulls.append(_hull(below.name, -1, _corners(below)))
+        self._request = coal.DistanceRequest(True, True)
+        self.pairs = self._possible_pairs()
+        self._classify(np.random.default_rng(seed))
+
+    def _possible_pairs(self) -> Array:
+        """Return pairs that can move against each other: not links that a joint joins."""
+        tree, hulls = self._model.pin_model, self._hulls
+        joined = {(int(tree.parents[i]) - 1, i - 1) for i in range(1, tree.njoints)}
+        found = []
+        for i, j in combinations(range(len(hulls)), 2):
+            a, b = sorted((hulls[i].body, hulls[j].body))
+            is_link = hulls[j].name in self._model.tree.links
+            if a != b and not (is_link and (a, b) in joined):
+                found.append((i, j))
+        return np.array(found, dtype=int).reshape(-1, 2)
+
+    def _classify(self, rng: np.random.Generator) -> None:
+        """Find by random poses which pairs may meet, are in contact, or are close by design."""
+        low = [j.lower if j.has_limits else -np.pi for j in self._model.limits]
+        high = [j.upper if j.has_limits else np.pi for j in self._model.limits]
+        q = np.vstack([np.clip(0.0, low, high), rng.uniform(low, high, (_TRIED, len(low)))])
+        distance = self.near(self.placed(q), self.least + _DISTANT, self.everything).distance
+        is_link = np.array([hull.name in self._model.tree.links for hull in self._hulls])
+        are_links = np.all(is_link[self.pairs], axis=1)
+        touch = np.less(distance, _TOUCH)
+        always = are_links & touch[:, 0] & (touch.mean(axis=1) > _ALMOST_ALL)
+        self.made_to = self._listed(always, distance.min(axis=1))
+        self.pairs, distance, touch = self.pairs[~always], distance[~always], touch[~always]
+        near = (distance < self.least + _CLOSE).mean(axis=1) > _ALMOST_ALL
+        near &= are_links[~always] & ~touch.all(axis=1)
+        self.required, self.slack = np.full(len(near), self.least), np.full(len(near), np.inf)
+        for k in np.flatnonzero(near):
+            median = float(np.median(distance[k, ~touch[k]]))
+            self.required[k] = min(self.least, median / 2)
+            self.slack[k] = median - self.required[k]
+        self.built_near = self._listed(near, self.required)
+        distant = self.required + np.minimum(_DISTANT, self.slack / 2)
+        self.likely = distance.min(axis=1, initial=np.inf) < distant
+
+    def _listed(self, chosen: Array, distance: Array) -> list[str]:
+        """Return the links of pairs and their smallest distances as text, each two once."""
+        least: dict[tuple[str, str], float] = {}
+        for k in np.flatnonzero(chosen).tolist():
+            names = self.named[k]
+            least[names] = min(least.get(names, np.inf), float(distance[k]))
+        return [
+            f"{a} and {b} ({'overlap by ' * (d < 0)}{abs(1e3 * d):.0f} mm)"
+            for (a, b), d in least.items()
+        ]
+
+    @cached_property
+    def _supports(self) -> Array:
+        """Which joints move which body, shape (m + 1, m), bool; the last row is at rest."""
+        is_below = self._tree.is_below
+        return np.vstack([is_below, np.zeros(len(is_below), dtype=bool)])
+
+    @cached_property
+    def movers(self) -> Array:
+        """Which joints move the hulls of each pair against each other, shape (pairs, n), bool."""
+        moved: Array = (self._levers > 0.0) @ np.abs(self._ratios) > 0.0
+        return moved
+
+    @property
+    def everything(self) -> Array:
+        """All pairs, as ``near`` takes them, shape (pairs,), bool."""
+        return np.ones(len(self.pairs), dtype=bool)
+
+    @property
+    def named(self) -> list[tuple[str, str]]:
+        """The names of each pair."""
+        return [(self._hulls[i].name, self._hulls[j].name) for i, j in self.pairs.tolist()]
+
+    @property
+    def spare(self) -> Array:
+        """Reserve of the distances for the motion between samples, shape (pairs, 1) [m]."""
+        spare: Array = np.minimum(_SPARE, _SPARE_SHARE * self.slack)[:, None]
+        return spare
+
+    def margins(self, placed: Placements, spare: float, *, hints: Array | None = None) -> Array:
+        """Return margins of distances, shape (pairs, N) [m]; a lower bound of those over 1 cm.
+
+        Args:
+            placed: Poses of the bodies at N samples.
+            spare: Multiple of the reserve that is subtracted from the margin.
+            hints: As of ``near``.
+        """
+        required = self.required[:, None] + spare * self.spare
+        exact = np.minimum(_EXACT, self.slack[:, None] / 4)
+        return self.near(placed, required + exact, hints=hints).distance - required
+
+    def placed(self, q: Array) -> Placements:
+        """Return the poses of the bodies.
+
+        Args:
+            q: Joint coordinates, shape (N, n) [rad or m].
+        """
+        return Placements.along(self._tree, q)
+
+    def near(
+        self,
+        placed: Placements,
+        within: float | Array,
+        chosen: Array | None = None,
+        hints: Array | None = None,
+    ) -> Nearness:
+        """Return the distances of pairs along a motion, exact where they are near.
+
+        Args:
+            placed: Poses of the bodies at N samples.
+            within: Distance from which a lower bound suffices, one, or one per pair and sample,
+                shape (pairs, N) or one that broadcasts to it [m].
+            chosen: Pairs to check, shape (pairs,), bool; those that may meet if None.
+            hints: Earlier separating directions of the hulls, shape (pairs, N, 3), initially 0;
+                good ones save time. The directions found are written to it.
+        """
+        import coal
+
+        from robotid.design.gap_lanes import lower_bounds  # imports Numba
+
+        chosen = self.likely if chosen is None else chosen
+        bound = np.full((len(self.pairs), placed.p.shape[2]), np.inf)
+        limit = np.broadcast_to(within, bound.shape)
+        hints = np.zeros((*bound.shape, 3)) if hints is None else hints
+        numbers, enough = np.flatnonzero(chosen), np.array(limit, order="C")
+        lower_bounds(numbers, self.pairs, enough, hints, bound, placed.R, placed.p, *self._corners)
+        pairs, samples = np.nonzero(bound < limit)
+        hulls = self.pairs[pairs].T  # (2, k)
+        centres, rotations = self._poses(placed, hulls.ravel(), np.tile(samples, 2))
+        shapes = [self._hulls[k].shape for k in hulls.ravel().tolist()]
+        poses = [coal.Transform3s(R, x) for R, x in zip(rotations, centres, strict=True)]
+        count, result, exact = len(pairs), coal.DistanceResult(), np.empty(len(pairs))
+        points, normals = np.empty((2, count, 3)), np.empty((count, 3))
+        for k in range(count):
+            one, other = (shapes[k], poses[k]), (shapes[count + k], poses[count + k])
+            result.clear()
+            exact[k] = coal.distance(*one, *other, self._request, result)
+            points[:, k] = result.getNearestPoint1(), result.getNearestPoint2()
+            normals[k] = result.normal
+        bound[pairs, samples], hints[pairs, samples] = exact, normals
+        gradient = self._gradient(placed, pairs, samples, points, normals)
+        return Nearness(bound, pairs, samples, gradient)
+
+    def nearest(self, motion: Motion, duration: float) -> Contact | None:
+        """Return the smallest margin of a motion to a collision, at all times, not only at samples.
+
+        An interval of time is halved until, by the largest motion of the joints between two hulls
+        within it, their margin cannot be more than 0.5 mm below the smallest one found elsewhere.
+
+        Args:
+            motion: The motion.
+            duration: Its length [s].
+
+        Returns:
+            The pair with the smallest margin, by a lower bound of its distance; None if all margins
+            are at least 5 cm.
+
+        References:
+            Schwarzer, Saha, Latombe (2005), Adaptive dynamic collision checking for robots.
+        """
+        smallest, required = _DISTANT, self.required[:, None]  # smallest: margin so far
+        lowest, nearest = smallest, None
+        h = duration / max(2, round(duration / _FIRST)) / 2
+        middles = np.arange(h, duration, 2 * h)
+        a = motion.evaluate(np.linspace(0.0, duration, 40 * len(middles)))[2]
+        fastest = 1.05 * np.abs(a @ self._ratios.T).max(axis=0)
+        while len(middles):
+            q, v, _ = motion.evaluate(middles)
+            way = np.abs(v @ self._ratios.T) * h + fastest * h**2 / 2  # of each joint, (N, m)
+            moved = self._levers @ way.T  # (pairs, N)
+            near = self.near(self.placed(q), required + smallest + moved, self.everything)
+            exact = near.distance[near.pairs, near.samples] - self.required[near.pairs]
+            if exact.min(initial=np.inf) < smallest:
+                k = int(np.argmin(exact))
+                smallest = float(exact[k])
+                nearest = int(near.pairs[k]), float(middles[near.samples[k]])
+            bound = near.distance - required - moved
+            is_open = (bound < smallest - _TOLERANCE).any(axis=0) & (2 * h > _SHORTEST)
+            lowest = min(lowest, float(bound[:, ~is_open].min(initial=np.inf)))
+            h /= 2
+            middles = np.sort(np.r_[middles[is_open] - h, middles[is_open] + h])
+        if nearest is None:
+            return None
+        pair, time = nearest
+        own = float(self.required[pair])
+        return Contact(*self.named[pair], min(lowest, smallest) + own, time, own)
+
+    @cached_property
+    def _levers(self) -> Array:
+        """Largest relative motion of a pair's hulls per motion of each joint, (pairs, m)."""
+        tree, prismatic = self._model.pin_model, self._tree.prismatic
+        lengths = np.linalg.norm([M.translation for M in tree.jointPlacements], axis=1)[1:]
+        travel = {joint.name: max(-joint.lower, joint.upper) for joint in self._model.limits}
+        for i in np.flatnonzero(prismatic).tolist():
+            lengths[i] += min(travel.get(tree.names[i + 1], _WIDE), _WIDE)
+        out = np.zeros((len(self.pairs), len(prismatic)))
+        for k, (one, other) in enumerate(self.pairs.tolist()):
+            two = self._hulls[one], self._hulls[other]
+            between = self._supports[two[0].body] ^ self._supports[two[1].body]
+            for hull in two:
+                lever, body = float(np.linalg.norm(hull.centre)) + hull.radius, hull.body
+                while body >= 0 and between[body]:
+                    out[k, body] += 1.0 if prismatic[body] else lever
+                    lever += lengths[body]
+                    body = int(tree.parents[body + 1]) - 1
+        return out
+
+    @cached_property
+    def _corners(self) -> tuple[Array, ...]:
+        """The hulls as ``lower_bounds`` takes them."""
+        hulls = self._hulls
+        starts = np.cumsum([0, *(len(hull.corners) for hull in hulls)])
+        of_each = zip(*[(h.body, h.centre, h.radius, h.half) for h in hulls], strict=True)
+        points = np.array(np.vstack([hull.corners for hull in hulls]), order="C")
+        return *map(np.array, of_each), points, starts
+
+    def _poses(self, placed: Placements, hulls: Array, samples: Array) -> tuple[Array, Array]:
+        """Return centres of k hulls at k samples, (k, 3), and their rotations, (k, 3, 3)."""
+        bodies = np.array([hull.body for hull in self._hulls])[hulls]
+        middles = np.array([hull.centre for hull in self._hulls])[hulls]
+        rotations = np.moveaxis(placed.R[:, :, bodies, samples], -1, 0)  # (k, 3, 3)
+        centres = placed.p[:, bodies, samples].T + (rotations @ middles[..., None])[..., 0]
+        is_fixed = bodies < 0
+        rotations = np.where(is_fixed[:, None, None], np.eye(3), rotations)
+        return np.where(is_fixed[:, None], middles, centres), np.ascontiguousarray(rotations)
+
+    def _gradient(
+        self, placed: Placements, pairs: Array, samples: Array, points: Array, normals: Array
+    ) -> Array:
+        """Return distances' derivatives by each joint: normal . (velocity of nearest points)."""
+        prismatic = self._tree.prismatic[:, None]
+        axes = np.einsum("cdjk,jd->kjc", placed.R[..., samples], self._tree.axes)  # in the world
+        origins = placed.p[..., samples].T  # (k, m, 3)
+        bodies = np.array([hull.body for hull in self._hulls])[self.pairs[pairs]]  # (k, 2)
+        out = np.zeros(axes.shape[:2])
+        for side, sign in ((0, -1.0), (1, 1.0)):
+            levers = np.cross(axes, points[side][:, None] - origins)
+            along = np.einsum("kjc,kc->kj", np.where(prismatic, axes, levers), normals)
+            out += sign * np.where(self._supports[bodies[:, side]], along, 0.0)
+        by_joint: Array = out @ self._ratios
+        return by_joint
+
+
+def _hull(name: str, body: int, points: Array) -> _Hull:
+    """Return the convex hull of points; a flat one as the box around it."""
+    import coal
+    from scipy.spatial import ConvexHull
+
+    centre = (points.min(axis=0) + points.max(axis=0)) / 2
+    about = points - centre
+    radius = float(np.linalg.norm(about, axis=1).max())
+    extent = np.ptp(about, axis=0)  # the centre is the middle of it
+    is_flat = np.linalg.matrix_rank(about, tol=_THINNEST) < 3
+    if is_flat or (len(points) == 8 and np.allclose(np.abs(about), extent / 2)):
+        extent, radius = np.maximum(extent, _THINNEST), radius + is_flat * _THINNEST
+        corners = _SIGNS * extent / 2
+        return _Hull(name, body, centre, radius, extent / 2, corners, coal.Box(*extent))
+    corners = np.unique(np.round(about, 6), axis=0)
+    corners = corners[ConvexHull(corners).vertices]
+    listed_ones = coal.StdVec_Vec3s()
+    for corner in corners:
+        listed_ones.append(corner)
+    shape = coal.ConvexBase.convexHull(listed_ones, False, "Qt")
+    return _Hull(name, body, centre, radius, extent / 2, corners, shape)
+
+
+def _corners(box: Box) -> Array:
+    low, high = np.array(box.low), np.array(box.high)
+    if not (low < high).all():
+        raise SettingsError(
+            f"box {box.name!r} reaches from {listed(map(str, box.low))} to "
+            f"{listed(map(str, box.high))}, wanted a low corner below the high one in x, y and z"
+        )
+    return np.array(np.meshgrid(*zip(low, high, strict=True))).reshape(3, -1).T

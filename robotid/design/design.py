@@ -1,0 +1,537 @@
+"""Optimal excitation trajectories within a robot's limits, by gradient-based optimisation.
+
+The information about the base parameters of a motion q = Phi C is the sum of W^T W / sigma^2 over
+its samples, in units of the prior deviations, plus 1, or plus the information of earlier runs. An
+augmented Lagrangian enforces the limits: at each sample, (used share)^2 - 1 <= 0 of each limit, and
+distances of at least the clearance.
+"""
+
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from robotid.base.exceptions import NotConvergedError
+from robotid.base.typing import Array
+from robotid.design.basis import Basis, DesignedMotion
+from robotid.design.clearance import Clearance, Contact, Nearness
+from robotid.design.designed import Design, State
+from robotid.design.information import Aim, MotionInformation, MotionRows, criterion
+from robotid.design.limits import MotionLimits
+from robotid.design.multipliers import SOFT, SPARE, Multipliers
+from robotid.design.postures import Postures
+from robotid.design.previews import Run
+from robotid.dynamics.base_parameters import structural_mapping
+from robotid.dynamics.simulation.motions import Motion
+from robotid.estimation.estimators.determination import base_spread
+from robotid.identification.assumptions import (
+    CORRELATION,
+    assumed_noise,
+    assumed_parameters,
+    largest_gravity,
+    largest_torques,
+)
+from robotid.robot.model import RobotModel
+from robotid.robot.prior import prior_spread
+
+__all__ = ["Designer"]
+
+_PER_PERIOD = 14  # samples of the grid within the shortest period of a basis
+_POLISHED = 3  # times as many in the last rounds ...
+_FINER = 15  # ... and in the final check of the limits
+_ROUNDS = 14  # of the augmented Lagrangian ...
+_LAST_ROUNDS = 8  # ... and on the finer grid
+_STEPS = 20  # of L-BFGS in each
+_WEIGHT = 3.0  # initial weight of the violations of all samples together
+_LESS = 0.25  # share of a round's violation: the weight increases if the next violation exceeds it
+_NEARLY = 1e-2  # change of the criterion below which the finer grid is used ...
+_SETTLED = 2e-3  # ... and below which a design has converged
+_LOSS = 0.02  # largest increase of the criterion when a motion is scaled to satisfy its limits
+_OVER = 1.01  # largest use of a limit by a converged design before it is scaled
+_TRIALS = 10  # shares of a motion tried for the largest that satisfies the limits ...
+_SHARE = 1e-3  # ... to this accuracy, or as near to a limit
+_TYPICAL = 0.3  # of the largest torque, speed and acceleration: about the RMS of a motion
+_WIDEST = 0.25  # share of the base parameters in the criterion "widest"
+_STARTED = 10  # random motions of which the best is a start
+
+
+@dataclass(frozen=True, eq=False)
+class Designer:
+    """Optimises a motion for the information about the parameters.
+
+    Attributes:
+        information: The rows of the base problem, and their gradient.
+        limits: The robot's limits.
+        basis: Basis functions of the motion.
+        noise: Density of each joint's noise, variance times the time over which it is correlated,
+            shape (n,) [(N m)^2 s or N^2 s].
+        spread: Prior deviations of the base parameters, shape (b,).
+        standard_spread: Prior deviations of the standard parameters, shape (p,).
+        given: Prior information, shape (b, b), in units of the spread; 1 if None.
+        name: The criterion, as of ``criterion``.
+        clearance: The distances to collisions; None: they are not checked.
+        finer: Number of samples of the grid relative to a coarse one.
+        aim: The parameters of interest, if not the base parameters; there is no prior then.
+        moving: Which joints move, shape (n,), bool; all if None. The others rest where the motion
+            starts and contribute no information, since static friction may carry any load.
+    """
+
+    information: MotionInformation
+    limits: MotionLimits
+    basis: Basis
+    noise: Array
+    spread: Array
+    standard_spread: Array
+    given: Array | None = None
+    name: str = "D"
+    clearance: Clearance | None = None
+    finer: int = 1
+    aim: Aim | None = None
+    moving: Array | None = None
+
+    @classmethod
+    def of_model(
+        cls,
+        model: RobotModel,
+        basis: Basis,
+        limits: MotionLimits,
+        *,
+        name: str = "D",
+        clearance: Clearance | None = None,
+        noise: Mapping[str, float] | None = None,
+        correlation: float = CORRELATION,
+        run: Run | None = None,
+    ) -> "Designer":
+        """Return a designer with the assumptions of a preview on friction and noise.
+
+        Args:
+            model: The robot; with the friction of an earlier run, if there is one.
+            basis: Basis functions of the motion.
+            limits: The robot's limits.
+            name: The criterion.
+            clearance: The distances to collisions.
+            noise: Standard deviation of the torque's noise by joint [N m or N].
+            correlation: Time over which it is correlated [s].
+            run: Earlier logs: the motion complements their information.
+
+        Raises:
+            DataError: If the base floats, or the robot has contacts or loops.
+            SettingsError: If a setting is not usable.
+        """
+        criterion(name, np.eye(1))
+        mapping = structural_mapping(model)
+        size, speed = largest_torques(model, largest_gravity(model)), limits.sizes[1]
+        pi = assumed_parameters(model, size, speed) if run is None else run.standard
+        found = None if run is None else run.noise(mapping.K)
+        density = assumed_noise(model, size, noise or {}, correlation, found).density(0.0)
+        typical = _TYPICAL * np.array([size, speed, speed * 2 * np.pi / basis.shortest])
+        standard_spread = prior_spread(model, typical**2, 1)
+        spread = base_spread(mapping.K, standard_spread)
+        given = None
+        if run is not None:
+            earlier = run.factors.information(run.step / density)
+            given = np.eye(len(spread)) + spread[:, None] * earlier * spread
+        information = MotionInformation(model, mapping, mapping.to_base(pi))
+        return cls(
+            information, limits, basis, density, spread, standard_spread, given, name, clearance
+        )
+
+    @cached_property
+    def _functions(self) -> Array:
+        """The basis functions and three derivatives on the grid, shape (4, N, h)."""
+        count = self.finer * round(_PER_PERIOD * self.basis.duration / self.basis.shortest)
+        return self.basis.derivatives(np.linspace(0.0, self.basis.duration, count + 1), 3)
+
+    def design(
+        self,
+        rng: np.random.Generator,
+        *,
+        starts: int = 3,
+        seconds: float = np.inf,
+        progress: Callable[[int, float], None] | None = None,
+    ) -> Design:
+        """Return the best motion, checked on a grid 15 times as fine as the first one.
+
+        Args:
+            rng: Random generator of the starts.
+            starts: Number of random starts.
+            seconds: Limit of the computing time [s]; the best motion found by then is returned.
+            progress: Called with the number of the start and the best criterion.
+
+        Raises:
+            SettingsError: If the robot can hold no posture within its limits.
+        """
+        began, best = time.monotonic(), np.inf
+        history: list[tuple[float, float]] = []
+        followed: list[State] = []
+
+        def is_over() -> bool:
+            return bool(history) and time.monotonic() - began > seconds
+
+        def follow(designer: Designer, state: State, rounds: int, settled: float) -> State:
+            """Return the end of the search from a start."""
+            nonlocal best
+            for state in designer._search(state, rounds, settled, is_over):  # noqa: B020
+                if state.objective < best:
+                    best = state.objective
+                    history.append((time.monotonic() - began, best))
+                if progress is not None:
+                    progress(len(followed), best)
+            return state
+
+        while len(followed) < starts and not is_over():
+            random = [self.random(rng) for _ in range(_STARTED)]
+            objective, k = min((self._objective(C), k) for k, C in enumerate(random))
+            multipliers = Multipliers(_WEIGHT / self._functions.shape[1])
+            initial = State(random[k], objective, random[k], multipliers)
+            followed.append(follow(self, initial, _ROUNDS, _NEARLY))
+        chosen = min(followed, key=lambda state: state.objective)
+        fine, best = replace(self, finer=_POLISHED * self.finer), np.inf
+        feasible = fine._feasible(chosen.feasible, 1.0 - SPARE)
+        multipliers = chosen.multipliers.finer(_POLISHED)
+        initial = State(feasible, fine._objective(feasible), chosen.iterate, multipliers)
+        polished = follow(fine, initial, _LAST_ROUNDS, _SETTLED)
+        found = replace(self, finer=_FINER * self.finer).checked(polished.feasible)
+        return replace(
+            found,
+            seconds=time.monotonic() - began,
+            starts=len(followed),
+            is_converged=polished.is_settled,
+            history=tuple(history),
+        )
+
+    def checked(self, C: Array) -> Design:
+        """Return a motion, scaled down until it satisfies all limits, also between the samples.
+
+        Args:
+            C: Coefficients of a motion, shape (h, n).
+        """
+        C, contact = self._clear(self._feasible(C, 1.0))
+        used, _, rows = self._constraints(C)
+        information = self.matrix(rows)
+        return self._assessed(self._motion(C), self.basis.duration, information, used, contact)
+
+    def examined(self, motion: Motion, duration: float, rate: float) -> Design:
+        """Return the criterion of any motion, and its use of the limits other than jerk.
+
+        Args:
+            motion: The motion.
+            duration: Its length [s].
+            rate: Rate of the samples at which it is evaluated [Hz].
+        """
+        used, information = self.used_and_informed(motion, duration, rate)
+        contact = None
+        if self.clearance is not None:
+            contact = self.clearance.nearest(motion, duration)
+        return self._assessed(motion, duration, information, used, contact)
+
+    def used_and_informed(
+        self, motion: Motion, duration: float, rate: float
+    ) -> tuple[Array, Array]:
+        """Return a motion's use of limits but jerk, (6, N, n), and its information, (b, b).
+
+        Args:
+            motion: The motion.
+            duration: Its length [s].
+            rate: Rate of the samples at which it is evaluated [Hz].
+        """
+        count = round(duration * rate)
+        q, v, a = motion.evaluate(np.linspace(0.0, duration, count + 1))
+        rows = self.information.rows(q, v, a)
+        used = self.limits.used(q, v, a, 0.0 * a, self.information.torque(rows))
+        return used, self._informed(rows, duration / count)
+
+    def _motion(self, C: Array) -> Motion:
+        """Return the motion with coefficients."""
+        return DesignedMotion(self.basis, C)
+
+    def _assessed(
+        self,
+        motion: Motion,
+        duration: float,
+        information: Array,
+        used: Array,
+        contact: Contact | None,
+    ) -> Design:
+        own = information - self.known
+        own = own if self.aim is None else self.aim.information(own)[0]
+        low, *_, high = np.linalg.eigvalsh(own)
+        return Design(
+            motion=motion,
+            duration=duration,
+            intervals=used.shape[1] - 1,
+            objective=self.judged(information)[0],
+            condition=float(np.sqrt(high / low)) if low > 0 else np.inf,
+            used=np.abs(used).max(axis=1),
+            contact=contact,
+        )
+
+    def _clear(self, C: Array) -> tuple[Array, Contact | None]:
+        """Return a motion scaled down until it is clear between samples too, and its contact."""
+        if self.clearance is None:
+            return C, None
+        for k in range(_TRIALS):
+            contact = self.clearance.nearest(self._motion(C), self.basis.duration)
+            if contact is None or contact.margin >= 0.0:
+                return C, contact
+            C = _scaled(C, max(1.0 - 0.01 * 2.0**k, 0.5))
+        raise NotConvergedError(
+            f"between the samples of the design {contact}, margin "
+            f"{1e3 * (contact.margin if contact else 0.0):.2g} mm, wanted 0 or more; raise the "
+            "clearance or try another seed",
+            "max_iterations",
+        )
+
+    @property
+    def known(self) -> Array:
+        """Prior information, in units of the spread, shape (b, b)."""
+        if self.aim is not None:
+            return np.zeros((len(self.spread), len(self.spread)))
+        known: Array = np.eye(len(self.spread)) if self.given is None else self.given
+        return known
+
+    @cached_property
+    def widest(self) -> Array:
+        """The quarter of the base parameters with the largest prior variance, shape (k,)."""
+        variance = np.diag(np.linalg.inv(self.known))
+        return np.argsort(variance, kind="stable")[-max(1, round(_WIDEST * len(variance))) :]
+
+    @cached_property
+    def _moves(self) -> Array:
+        """Which joints move, shape (n,), bool."""
+        return np.ones(len(self.limits.middle), dtype=bool) if self.moving is None else self.moving
+
+    def judged(self, F: Array) -> tuple[float, Array]:
+        """Return the criterion of information about the base parameters, and its gradient.
+
+        Args:
+            F: The information, in units of the spread, shape (b, b).
+        """
+        if self.aim is None:
+            return criterion(self.name, F, self.widest)
+        own, L = self.aim.information(F)
+        value, by_own = criterion(self.name, own)
+        return value, L @ by_own @ L.T
+
+    def _scale(self, step: float) -> Array:
+        """Return the factor of rows with which their squares are information, (n, b, 1)."""
+        used = 1.0 if self.moving is None else self.moving
+        weight = used * np.sqrt(step / self.noise)
+        scale: Array = weight[:, None, None] * self.spread[:, None]
+        return scale
+
+    @cached_property
+    def _step(self) -> float:
+        """Time between two samples of the grid [s]."""
+        step: float = self.basis.duration / (self._functions.shape[1] - 1)
+        return step
+
+    def matrix(self, rows: MotionRows) -> Array:
+        """Return the information of a motion plus the prior's, in units of the spread, (b, b).
+
+        Args:
+            rows: Its rows.
+        """
+        return self._informed(rows, self._step)
+
+    def _informed(self, rows: MotionRows, step: float) -> Array:
+        n, b, N = rows.W.shape
+        scaled = rows.W * self._scale(step)
+        flat = scaled.swapaxes(0, 1).reshape(b, n * N)
+        F: Array = flat @ flat.T + self.known
+        return F
+
+    @cached_property
+    def _hints(self) -> Array | None:
+        """Separating directions of the hulls in the last motion, shape (pairs, N, 3)."""
+        if self.clearance is None:
+            return None
+        return np.zeros((len(self.clearance.pairs), self._functions.shape[1], 3))
+
+    def _followed(self, C: Array) -> tuple[MotionRows, Array, Array]:
+        """Return rows, torques (N, n) and used shares of limits (6, N, n) of a motion."""
+        *state, jerk = self._functions @ C
+        rows = self.information.rows(*state)
+        q, v, a = rows.motion
+        torque = self.information.torque(rows)
+        return rows, torque, self.limits.used(q, v, a, jerk, torque)
+
+    def _constraints(self, C: Array, spare: float = 0.0) -> tuple[Array, float, MotionRows]:
+        """Return used shares of limits (6, N, n), the smallest margin of distances and rows."""
+        rows, _, used = self._followed(C)
+        if self.clearance is None:
+            return used, np.inf, rows
+        placed = self.clearance.placed(rows.motion[0])
+        margins = self.clearance.margins(placed, spare, hints=self._hints)
+        return used, float(margins.min(initial=np.inf)), rows
+
+    def _near(self, rows: MotionRows, multipliers: Multipliers) -> Nearness | None:
+        """Return the distances of near pairs; None if they are not checked."""
+        if self.clearance is None:
+            return None
+        within = multipliers.distance_without_cost(self._required)
+        placed = self.clearance.placed(rows.motion[0])
+        return self.clearance.near(placed, within, hints=self._hints)
+
+    def _objective(self, C: Array) -> float:
+        """Return the criterion of a motion."""
+        *state, _ = self._functions @ C
+        return self.judged(self.matrix(self.information.rows(*state)))[0]
+
+    def _lagrangian(self, C: Array, multipliers: Multipliers) -> tuple[float, Array]:
+        """Return the augmented Lagrangian of a motion and its gradient, shape (h, n).
+
+        References:
+            Nocedal, Wright (2006), Numerical Optimization, section 17.4.
+        """
+        D, (rows, torque, used) = self._functions, self._followed(C)
+        value, by_F = self.judged(self.matrix(rows))
+        cost, pushed = multipliers.of_limits(used)
+        value += cost
+        by_value = pushed * 2.0 * used / (1.0 - SPARE) ** 2 / self.limits.sizes[:, None]
+        by_q, by_v, by_a, by_jerk, by_torque, by_power = by_value
+        by_v = by_v + by_power * torque
+        by_torque = by_torque + by_power * rows.motion[1]
+        near = self._near(rows, multipliers)
+        if near is not None:
+            too_near, pushed = multipliers.of_distances(near.distance, self._required)
+            value += too_near
+            along = -pushed[near.pairs, near.samples, None] / SOFT * near.gradient
+            np.add.at(by_q, near.samples, along)
+        scale = self._scale(self._step)
+        by_W = 2.0 * scale * (by_F @ (scale * rows.W))
+        entries = by_W + self.information.beta[:, None] * by_torque.T[:, None]
+        by_rows = self.information.pull(rows, entries)
+        by_state = (*(x + y for x, y in zip(by_rows, (by_q, by_v, by_a), strict=True)), by_jerk)
+        gradient: Array = sum(functions.T @ g for functions, g in zip(D, by_state, strict=True))
+        gradient[1:, ~self._moves] = 0.0
+        return value, gradient
+
+    @property
+    def _required(self) -> Array:
+        """Distances that the search requires, shape (pairs, 1) [m]."""
+        if self.clearance is None:
+            return np.zeros((0, 1))
+        required: Array = self.clearance.required[:, None] + 2.0 * self.clearance.spare
+        return required
+
+    @cached_property
+    def postures(self) -> Postures:
+        """The postures that the robot can hold."""
+        return Postures(self.information, self.limits, self.clearance)
+
+    def random(self, rng: np.random.Generator) -> Array:
+        """Return the coefficients of a random motion that satisfies the limits, shape (h, n).
+
+        Args:
+            rng: Random generator of the motion.
+
+        Raises:
+            SettingsError: If no posture is found that the robot can hold.
+        """
+        unit = self.limits.sizes[0]
+        C = rng.standard_normal((self.basis.size, len(unit))) * unit
+        C[:, ~self._moves] = 0.0
+        C[0] = self.postures.one(rng)
+        return self._feasible(C, 1.0 - SPARE)
+
+    def _feasible(self, C: Array, most: float) -> Array:
+        """Return the largest share of a motion about its middle that satisfies the limits, (h, n).
+
+        Each joint is scaled to its own limits of position to jerk first; then all are scaled alike.
+        """
+        limits = self.limits
+        free = most * limits.sizes[0] - np.abs(C[0] - limits.middle)
+        moving = np.abs(self._functions[:, :, 1:] @ C[1:]).max(axis=1)  # (4, n)
+        over = np.vstack(
+            [moving[:1] / np.maximum(free, 1e-9), moving[1:] / limits.sizes[1:4] / most]
+        )
+        C = _scaled(C, 1.0 / np.maximum(1.0, over.max(axis=0)))
+        return self._towards(_scaled(C, 0.0), C, most)
+
+    def _towards(self, feasible: Array, C: Array, most: float) -> Array:
+        """Return the farthest feasible motion on the line to another motion, shape (h, n)."""
+        way, low, high, share = C - feasible, 0.0, 1.0, 1.0
+        under, over = -1.0, np.inf  # violations of the limits at both
+        for _ in range(_TRIALS):
+            used, margin, _ = self._constraints(feasible + share * way, 1.0)
+            violation = max(float(np.abs(used).max()) / most - 1.0, -margin / SOFT)
+            if violation <= 0.0:
+                low, under, over = share, violation, over / 2
+            else:
+                high, over, under = share, violation, under / 2
+            if low == 1.0 or high - low < _SHARE or (low > 0.0 and under > -_SHARE):
+                break
+            share = low + (high - low) * np.clip(under / (under - over), 0.02, 0.98)
+        return feasible + low * way
+
+    def _search(
+        self, state: State, rounds: int, settled: float, is_over: Callable[[], bool]
+    ) -> Iterator[State]:
+        """Yield the state of a search, at first and after each round, until it has converged."""
+        from scipy.optimize import minimize
+
+        unit = self.limits.sizes[0]
+        before = np.inf  # violation of the limits
+
+        def scaled(x: Array) -> tuple[float, Array]:
+            if is_over():
+                raise _OutOfTime
+            value, gradient = self._lagrangian(x.reshape(-1, len(unit)) * unit, state.multipliers)
+            return value, (gradient * unit).reshape(-1)
+
+        yield state
+        for _ in range(rounds):
+            try:
+                found = minimize(
+                    scaled,
+                    (state.iterate / unit).reshape(-1),
+                    jac=True,
+                    method="L-BFGS-B",
+                    options={"maxiter": _STEPS, "maxcor": 20},
+                )
+            except _OutOfTime:
+                return
+            state, violation = self._updated(state, found.x.reshape(-1, len(unit)) * unit, settled)
+            if violation > _LESS * before:
+                state = replace(state, multipliers=state.multipliers.increased())
+            before = violation
+            yield state
+            if state.is_settled:
+                return
+
+    def _updated(self, state: State, C: Array, settled: float) -> tuple[State, float]:
+        """Return the state of a search after a round, and the violation of the limits."""
+        used, margin, rows = self._constraints(C)
+        own = self.judged(self.matrix(rows))[0]
+        multipliers = state.multipliers
+        near = self._near(rows, multipliers)
+        feasible = self._feasible(C, 1.0 - SPARE)
+        objective = self._objective(feasible)
+        if objective > state.objective - settled:
+            mixed = self._towards(state.feasible, C, 1.0 - SPARE)
+            objective, feasible = min(
+                [(objective, feasible), (self._objective(mixed), mixed)], key=lambda pair: pair[0]
+            )
+        gain = state.objective - objective
+        is_near = np.abs(used).max() < _OVER and margin >= 0.0 and objective - own < _LOSS
+        is_stalled = not is_near and gain < _LOSS  # restart from the feasible motion
+        if gain < 0.0:
+            feasible, objective = state.feasible, state.objective
+        violation = max(float(np.abs(used).max()) - 1.0 + SPARE, -margin / SOFT, 0.0)
+        distance = None if near is None else near.distance
+        multipliers = multipliers.raised(used, distance, self._required)
+        iterate = feasible if is_stalled else C
+        is_settled = bool(is_near and gain < settled)
+        return State(feasible, objective, iterate, multipliers, is_settled), violation
+
+
+class _OutOfTime(Exception):
+    """The limit of the computing time is reached."""
+
+
+def _scaled(C: Array, share: float | Array) -> Array:
+    """Return a motion with its deviation from the middle scaled, shape (h, n)."""
+    return np.vstack([C[:1], C[1:] * share])

@@ -1,0 +1,249 @@
+"""The information of a motion's torques about the base parameters, and its gradient."""
+
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+import scipy.linalg
+
+from robotid.base.exceptions import DataError, SettingsError
+from robotid.base.typing import Array
+from robotid.design.along import MotionRegressor
+from robotid.dynamics.base_parameters import BaseMapping
+from robotid.dynamics.drive_columns import drive_motion
+from robotid.robot.drives import DriveMotion, DriveTerm
+from robotid.robot.model import RobotModel
+
+__all__ = ["CRITERIA", "Aim", "MotionInformation", "MotionRows", "criterion"]
+
+#: The optimality criteria.
+CRITERIA = ("D", "A", "E", "condition", "widest")
+_STEP = 1e-6  # of the finite differences of drive columns, in their argument's scale
+_REVERSAL = 0.01  # [rad/s or m/s] speed over which the sign of friction changes
+
+
+@dataclass(frozen=True, eq=False)
+class MotionRows:
+    """The regressor's base columns along a motion, and the quantities that their gradient needs.
+
+    Attributes:
+        W: Row r, base column c at each of N samples, shape (n, b, N).
+    """
+
+    W: Array
+    motion: tuple[Array, Array, Array]  # q, v, a, shape (N, n) each
+    load: Array  # torque of the bodies, (N, n)
+
+
+@dataclass(frozen=True, eq=False)
+class MotionInformation:
+    """The rows W of the base problem along a motion, W beta = tau, and their gradient.
+
+    Drive terms depend on the current motion only: internal states are at their steady value. The
+    sign of friction is tanh(w / 0.01 rad/s), so that it has a gradient.
+
+    Attributes:
+        model: The robot, with a fixed base.
+        mapping: Its base parameters.
+        beta: Base parameters by which torques are computed, shape (b,).
+    """
+
+    model: RobotModel
+    mapping: BaseMapping
+    beta: Array
+    _regressor: MotionRegressor = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        wanted = (len(self.mapping.independent),)
+        if self.beta.shape != wanted:
+            raise DataError(f"beta has shape {self.beta.shape}, wanted {wanted}")
+        regressor = MotionRegressor(self.model, self.mapping.independent)
+        object.__setattr__(self, "_regressor", regressor)
+
+    @cached_property
+    def _drives(self) -> tuple[Array, Array]:
+        """The columns of drive terms, and which drive parameter each is, shape (k,) each."""
+        size = self.model.layout.n_inertial
+        columns = np.flatnonzero(self.mapping.independent >= size)
+        return columns, self.mapping.independent[columns] - size
+
+    @cached_property
+    def _terms(self) -> list[tuple[DriveTerm, list[int], list[int]]]:
+        """Each term of the base drive parameters, which of those it has, and their drives."""
+        found: dict[DriveTerm, tuple[list[int], list[int]]] = {}
+        for k, parameter in enumerate(self._drives[1]):
+            drive, term = self.model.layout.drive_parameters[parameter]
+            places, drives = found.setdefault(term, ([], []))
+            places.append(k)
+            drives.append(drive)
+        return [(term, *places) for term, places in found.items()]
+
+    @cached_property
+    def chains(self) -> Array:
+        """Share of each joint (column) in the torque at rest of each (row), shape (n, n).
+
+        It is the same for all joints on the chain through it, 0 for others.
+        """
+        ratios = self.model.velocity_map != 0.0  # (m, n)
+        chain = np.eye(len(ratios), dtype=bool)
+        for i in range(len(ratios)):
+            chain[i, [j - 1 for j in list(self.model.pin_model.supports[i + 1])[1:]]] = True
+        linked = ratios.T.astype(int) @ (chain | chain.T) @ ratios > 0
+        share: Array = linked / linked.sum(axis=1, keepdims=True)
+        return share
+
+    def rows(self, q: Array, v: Array, a: Array) -> MotionRows:
+        """Return the rows along a motion of N samples.
+
+        Args:
+            q: Joint coordinates, shape (N, n) [rad or m].
+            v: Velocities, shape (N, n) [rad/s or m/s].
+            a: Accelerations, shape (N, n) [rad/s^2 or m/s^2].
+        """
+        W = self._regressor(q, v, a)
+        load = (self.beta @ W).T  # drive columns are still 0
+        columns, parameters = self._drives
+        values = self._drive_values(self._drive_motion(q, v, a, load))
+        W[:, columns] = self.model.layout.drive_loads[:, parameters, None] * values
+        return MotionRows(W, (q, v, a), load)
+
+    def _drive_motion(self, q: Array, v: Array, a: Array, load: Array) -> DriveMotion:
+        """Return how the drives move, with smooth signs, arrays of shape (d, N)."""
+        layout = self.model.layout
+        motion = drive_motion(layout, q, v, a, v @ layout.drive_ratios.T, load)
+        return self._with_signs(motion)
+
+    def _with_signs(self, motion: DriveMotion) -> DriveMotion:
+        """Return the motion of drives with the smooth signs of its speeds."""
+        speeds = (motion.v.T / self.model.layout.drive_speeds).T
+        return replace(motion, direction=np.tanh(speeds / _REVERSAL))
+
+    def _drive_values(self, motion: DriveMotion) -> Array:
+        """Return the factors of the base drive parameters, shape (k, N); of (d, ..., N), alike."""
+        values = np.empty((len(self._drives[1]), *motion.v.shape[1:]))
+        for term, places, drives in self._terms:
+            values[places] = term.column(motion.of(drives))
+        return values
+
+    def torque(self, rows: MotionRows) -> Array:
+        """Return the torque along the motion, shape (N, n) [N m or N].
+
+        Args:
+            rows: The rows.
+        """
+        torque: Array = (self.beta @ rows.W).T
+        return torque
+
+    def pull(self, rows: MotionRows, weights: Array) -> tuple[Array, Array, Array]:
+        """Return the gradient of sum(weights * W) by q, v and a, shape (N, n) each.
+
+        Args:
+            rows: The rows.
+            weights: Weight of each entry, shape (n, b, N).
+        """
+        columns, parameters = self._drives
+        loads = self.model.layout.drive_loads[:, parameters]
+        by_value = np.einsum("rk,rkn->kn", loads, weights[:, columns])
+        *direct, by_load = self._pull_drives(rows, by_value)
+        entries = weights + by_load.T[:, None] * self.beta[:, None]
+        bodies = self._regressor.pull(*rows.motion, entries)
+        q, v, a = (x + y for x, y in zip(bodies, direct, strict=True))
+        return q, v, a
+
+    def _pull_drives(self, rows: MotionRows, weights: Array) -> list[Array]:
+        """Return the gradient of sum(weights * values) by q, v, a and load, by differences."""
+        layout, motion = self.model.layout, self._drive_motion(*rows.motion, rows.load)
+        own = [layout.drive_parameters[k][0] for k in self._drives[1]]
+        by_drive = np.zeros((len(layout.drives), len(own)))
+        by_drive[own, np.arange(len(own))] = 1.0
+        R = layout.drive_ratios
+        share = R / np.sum(R**2, axis=1, keepdims=True).clip(min=1e-300)
+        names = ("q", "v", "a", "load")
+        steps = [_STEP * np.maximum(1.0, np.abs(getattr(motion, name))) for name in names]  # (d, N)
+        beside = {}
+        for k, (name, step) in enumerate(zip(names, steps, strict=True)):
+            x = np.repeat(getattr(motion, name)[:, None], 2 * len(names), axis=1)  # (d, 8, N)
+            x[:, 2 * k] += step
+            x[:, 2 * k + 1] -= step
+            beside[name] = x
+        still = np.zeros_like(x)
+        values = self._drive_values(self._with_signs(replace(motion, **beside, rate=still)))
+        gradients = []
+        for k, (name, step) in enumerate(zip(names, steps, strict=True)):
+            slope = by_drive @ (weights * (values[:, 2 * k] - values[:, 2 * k + 1])) / (2 * step)
+            gradients.append(slope.T @ (share if name == "load" else R))
+        return gradients
+
+
+@dataclass(frozen=True, eq=False)
+class Aim:
+    """Parameters of interest other than the base parameters: some of u that determine these.
+
+    Attributes:
+        columns: Derivatives of the base parameters by each parameter, both in units of their
+            spreads, shape (b, u).
+        asked: Number of parameters of interest, the last ones; the others are nuisance parameters.
+    """
+
+    columns: Array
+    asked: int
+
+    def information(self, F: Array) -> tuple[Array, Array]:
+        """Return the information about those of interest, and L with d information = L^T dF L.
+
+        Args:
+            F: Information about the base parameters in units of their spread, shape (b, b).
+
+        Returns:
+            Shapes (asked, asked), in units of the spreads and with 1 for the prior; and (b, asked).
+        """
+        T, rest = self.columns, self.columns.shape[1] - self.asked
+        N = T.T @ F @ T + np.eye(T.shape[1])
+        others = np.linalg.solve(N[:rest, :rest], N[:rest, rest:])
+        L = np.vstack([-others, np.eye(self.asked)])
+        return L.T @ N @ L, T @ L
+
+
+def criterion(name: str, F: Array, widest: Array | None = None) -> tuple[float, Array]:
+    """Return a criterion of an information matrix, the smaller the better, and its gradient.
+
+    Args:
+        name: "D": -log det F / b; "A": log(trace F^-1 / b); "E": -log of the smallest eigenvalue;
+            "condition": log of the condition number; "widest": the mean log variance of some.
+        F: Information about b parameters in units of like size, shape (b, b), positive definite.
+        widest: The parameters of the criterion "widest"; all if None.
+
+    Raises:
+        SettingsError: If there is no such criterion.
+
+    References:
+        Pukelsheim (2006), Optimal Design of Experiments, chapter 6.
+    """
+    if name not in CRITERIA:
+        raise SettingsError(f"criterion is {name!r}, wanted one of {', '.join(CRITERIA)}")
+    size = len(F)
+    if name == "D":
+        L, failed = scipy.linalg.lapack.dpotrf(F, lower=1)
+        if not failed:
+            inverse = scipy.linalg.lapack.dpotri(L, lower=1)[0]
+            inverse = np.tril(inverse) + np.tril(inverse, -1).T
+            return -2.0 * float(np.log(np.diag(L)).mean()), -inverse / size
+    values, vectors = np.linalg.eigh(F)
+    values = np.maximum(values, values[-1] * np.finfo(float).eps)
+    if name == "D":
+        by_value = -1.0 / values / size
+        return -float(np.log(values).mean()), (vectors * by_value) @ vectors.T
+    if name == "A":
+        total = float(np.sum(1.0 / values))
+        by_value = -1.0 / values**2 / total
+        return float(np.log(total / size)), (vectors * by_value) @ vectors.T
+    if name == "widest":
+        some = np.arange(size) if widest is None else widest
+        C = (vectors[some] / values) @ vectors.T  # (k, b) of F^-1
+        variance = C[np.arange(len(some)), some]
+        return float(np.log(variance).mean()), -(C.T / variance) @ C / len(some)
+    low, high = vectors[:, 0], vectors[:, -1]
+    by_low = -np.outer(low, low) / values[0]
+    if name == "E":
+        return -float(np.log(values[0])), by_low
+    return float(np.log(values[-1] / values[0])), np.outer(high, high) / values[-1] + by_low

@@ -1,0 +1,550 @@
+"""Expected standard errors of a motion before it is recorded.
+
+The motion is processed like a log, with the torque that the model predicts: filter, used samples,
+factors and base parameters are those of an identification. Only the noise must be assumed. Noise of
+standard deviation s with correlation time T has the density S = s^2 T; for white noise T is one
+sample. Behind the filter the residual has the variance s_j^2 <= S_j 2 B, with the bandwidth B of
+the filter. The score of a joint, W_j^T (tau_j - W_j theta) / s_j^2, has the covariance
+S_j r W_j^T W_j / s_j^4, with r samples per second, however few of them are independent: W_j is
+slow, and slow noise passes the filter. With the bread (sum_j W_j^T W_j / s_j^2)^-1 this gives the
+covariance of weighted least squares, and with the prior's information that of a consistent fit.
+
+Where constraint forces are eliminated, W_j are the projected rows, which have one noise level s.
+The noise e is in the torques of the joints, none in the rows of the base: the score is
+sum_j (P W)_j^T e_j, and its covariance the sum above, without the base's rows.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import repeat
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from robotid.base.exceptions import DataError
+from robotid.base.findings import listed
+from robotid.base.settings import require_kind
+from robotid.base.typing import Array
+from robotid.data.files.read import Readable, read_logs
+from robotid.data.log import Log
+from robotid.data.signal_settings import SignalSettings
+from robotid.data.smoothing import low_pass
+from robotid.diagnosis.logs.motion_checks import excitation_finding
+from robotid.dynamics.base_parameters import BaseMapping, structural_mapping
+from robotid.dynamics.constraint_rows import logged_base
+from robotid.dynamics.factors import Factors, compress, join, merge
+from robotid.dynamics.prediction import predict
+from robotid.dynamics.used_rows import base_problem, independent_share
+from robotid.estimation.estimators import Estimate
+from robotid.estimation.estimators.batch import solve_factor
+from robotid.estimation.estimators.determination import base_spread, determine
+from robotid.estimation.estimators.segments import FEWEST_SEGMENTS, scatter
+from robotid.estimation.fitting.bands import TorqueBand, expected_band
+from robotid.estimation.fitting.consistent_estimator import Known, consistent_fit, pinned_links
+from robotid.estimation.fitting.estimator_settings import ConsistentSettings, EstimatorSettings
+from robotid.estimation.fitting.evaluation import evaluate_logs
+from robotid.estimation.fitting.recorded import Recordings
+from robotid.estimation.fitting.standard_errors import StandardErrors, about_prior, standard_of
+from robotid.estimation.fitting.survey import SurveyedLog, hold_log
+from robotid.identification.assumptions import (
+    FAINTEST,
+    TorqueNoise,
+    assumed_noise,
+    assumed_parameters,
+    largest_torques,
+)
+from robotid.identification.result import Identification
+from robotid.robot.assumed import with_assumed_inertials
+from robotid.robot.closure import refuse_loops
+from robotid.robot.model import RobotModel
+from robotid.robot.prior import prior_spread
+
+__all__ = ["Preview", "Run", "preview", "preview_logs"]
+
+#: Typical weight of a consistent fit's prior with "auto", and the plausible weight: the largest one
+#: that held-out segments do not reject, for robots that differ from their URDF as much.
+_WEIGHT = (10.0, 1.0)
+_EXACT = 1e-9  # smallest residual of a joint, as a share of the largest one
+_LEAST_FREE = 0.1  # smallest share of residual degrees of freedom in a joint's samples
+_IMPULSE = 40.0  # periods of the filter after which its impulse response is 0
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """An earlier recording and its identification.
+
+    Attributes:
+        segments: Factors of its segments, for base parameters.
+        standard: The identified parameters, shape (p,).
+        squares: As of ``Reduction``.
+        samples: As of ``Reduction``.
+        share: Share of its samples that count as independent [-].
+        step: Time between two samples [s].
+        weight: Weight of the prior selected by its fit, and the plausible one; None if its fit
+            selected none.
+    """
+
+    segments: tuple[Factors, ...]
+    standard: Array
+    squares: Array
+    samples: int
+    share: float
+    step: float
+    weight: tuple[float, float] | None = None
+
+    @classmethod
+    def of(cls, recordings: Recordings, standard: Array, details: Mapping[str, Any]) -> "Run":
+        """Return the run of logs that were identified earlier.
+
+        Args:
+            recordings: Its fitted logs, with the model that includes the identified friction.
+            standard: The identified parameters, shape (p,).
+            details: Details of its estimate.
+
+        Raises:
+            DataError: If a log cannot be used.
+        """
+        reductions = recordings.reduce()
+        whole = join(reductions)
+        segments = tuple(part.factors for part in reductions if part.factors.rows.any())
+        step = float(np.mean([_row_step(log) for log in recordings.fitted]))
+        prior = details.get("prior")
+        weight = None if prior is None else (prior["weight"], prior.get("plausible_weight", 1.0))
+        return cls(segments, standard, whole.squares, whole.samples, recordings.share, step, weight)
+
+    @property
+    def factors(self) -> Factors:
+        """Factors of all segments together."""
+        return merge(self.segments)
+
+    def noise(self, K: Array) -> TorqueNoise:
+        """Return the noise of its residuals, with the correlation given by the scatter of scores.
+
+        The scatter of a joint's score depends on the direction. The geometric mean over the
+        parameters, weighted by the joint's share of their variance, is used.
+
+        Args:
+            K: Map to the base parameters, shape (b, p).
+        """
+        factors, beta = self.factors, K @ self.standard
+        sigma = np.sqrt(factors.residual_squares(beta) / np.maximum(factors.rows, 1))
+        sigma = np.maximum(sigma, _EXACT * max(float(sigma.max()), _EXACT))
+        bread = solve_factor(factors, sigma, beta).covariance
+        inflation = np.full(len(sigma), 1.0 / self.share)
+        if len(self.segments) >= FEWEST_SEGMENTS:
+            for j in np.flatnonzero(factors.rows):
+                alone = np.where(np.arange(len(sigma)) == j, sigma, np.inf)
+                own = np.diag(bread @ factors.information(alone**-2.0) @ bread)
+                share = own / np.diag(bread)  # of each parameter's variance, by this joint
+                counts = share > FAINTEST
+                scattered = np.diag(scatter(self.segments, beta, alone, bread).covariance)
+                ratio = np.log(scattered[counts] / own[counts])
+                inflation[j] = np.exp(np.average(ratio, weights=share[counts]))
+        effective = factors.leverages(bread) / sigma**2  # degrees of freedom
+        free = np.maximum(1.0 - effective / np.maximum(factors.rows, 1), _LEAST_FREE)
+        # its density is sigma^2 inflation step, whatever its standard deviation is
+        return TorqueNoise(
+            sigma / np.sqrt(free), free * inflation * self.step, ("found",) * len(sigma)
+        )
+
+    def meat(self, K: Array, sigma: Array) -> Array:
+        """Return the covariance of its score for samples weighted by sigma^-2, shape (b, b).
+
+        Args:
+            K: Map to the base parameters, shape (b, p).
+            sigma: Noise level per joint, shape (n,) [N m or N].
+        """
+        factors, beta = self.factors, K @ self.standard
+        if len(self.segments) < FEWEST_SEGMENTS:
+            return factors.information(1.0 / sigma**2) / self.share
+        bread = solve_factor(factors, sigma, beta).covariance
+        return scatter(self.segments, beta, sigma, bread).meat
+
+
+@dataclass(frozen=True, eq=False)
+class Preview:
+    """Expected result of motions that are not recorded yet.
+
+    Attributes:
+        expected: The expected identification: it predicts their torque exactly, and has the
+            standard errors, sources and bands that follow from the noise.
+        noise: The noise of the torque.
+        before: Standard errors of the base parameters from the earlier run only, shape (b,), inf
+            where it does not determine one; None without an earlier run.
+        between: As of ``Fit.between`` of an earlier result, of each motion, which widens the bands.
+    """
+
+    expected: Identification
+    noise: TorqueNoise
+    before: Array | None = None
+    between: tuple[Array | None, ...] = ()
+
+    def __repr__(self) -> str:
+        determined, found = self.expected.determination, self.expected
+        return (
+            f"<Preview of {found.model.name}: {determined.rank} of {len(determined.names)} base "
+            f"parameters determined by {len(found.fitted)} motions>"
+        )
+
+    @property
+    def base_error(self) -> Array:
+        """Standard errors of the base parameters, shape (b,); inf where not determined."""
+        return self.expected.base_error
+
+    @property
+    def standard_error(self) -> Array:
+        """Standard errors of the standard parameters given the prior, shape (p,)."""
+        return self.expected.standard_error
+
+    @property
+    def gain(self) -> Array | None:
+        """Factor by which the base standard errors decrease, shape (b,); None without a run."""
+        if self.before is None:
+            return None
+        before, after = (np.minimum(x, self.plausible) for x in (self.before, self.base_error))
+        gain: Array = before / after
+        return gain
+
+    @property
+    def plausible(self) -> Array:
+        """Plausible difference of the base parameters from the URDF's, shape (b,)."""
+        return base_spread(self.expected.mapping.K, self.expected.prior_std)
+
+    @property
+    def bands(self) -> tuple[TorqueBand, ...]:
+        """Expected band of each motion's predicted torques."""
+        found = self.expected
+        between = self.between or (None,) * len(found.fitted)
+        return tuple(map(expected_band, repeat(found), found.fitted, between))
+
+    @property
+    def words(self) -> str:
+        """What the motions determine, and what they do not determine, as text."""
+        found = self.expected
+        names = listed(dict.fromkeys(e.recording.log.name for e in found.fitted))
+        return excitation_finding(found.wls, found.determination, names).message
+
+
+def preview(
+    model: RobotModel | str | Path,
+    motions: Readable | Sequence[Readable],
+    *,
+    noise: TorqueNoise | Mapping[str, float] | None = None,
+    signals: SignalSettings | None = None,
+    estimator: EstimatorSettings | str = "consistent",
+    given: Identification | None = None,
+) -> Preview:
+    """Return the expected standard errors of motions before they are recorded.
+
+    Args:
+        model: The robot; or the path of its URDF, all of whose joints move. With an earlier
+            run, the robot is that of the run.
+        motions: The motions: a ``Log``, whose torques are ignored, the path of a file with
+            positions, a DataFrame, or several of these.
+        noise: Standard deviation of the torque's noise [N m or N], by joint for those where it is
+            known, or a ``TorqueNoise``; for the others that of the earlier run, or that of
+            ``assumed_noise``.
+        signals: How logs become trajectories; those of the earlier run, or the defaults, if None.
+        estimator: Name or settings of the estimator.
+        given: An earlier identification, whose information is added.
+
+    Raises:
+        DataError: If a motion cannot be read, does not fit the model or is too short, or the base
+            floats without contacts.
+        SettingsError: If a setting is out of range, or a joint is unknown.
+    """
+    require_kind(signals, (SignalSettings, type(None)), "signals", "a robotid.SignalSettings")
+    require_kind(
+        estimator, (str, EstimatorSettings), "estimator", "a name or a robotid.EstimatorSettings"
+    )
+    require_kind(
+        noise, (TorqueNoise, Mapping, type(None)), "noise", "a TorqueNoise, or numbers by joint"
+    )
+    require_kind(given, (Identification, type(None)), "given", "a robotid.Identification, or none")
+    choice = EstimatorSettings(estimator) if isinstance(estimator, str) else estimator
+    settings, run = signals or SignalSettings(), None
+    model = model if isinstance(model, RobotModel) else RobotModel.from_urdf(model)
+    model = with_assumed_inertials(model)
+    if given is not None:
+        model, settings = given.model, signals or given.asked.signals
+        logs = [hold_log(model, e.recording.log, e.recording.signals) for e in given.fitted]
+        recordings = Recordings(model, given.mapping, logs)
+        run = Run.of(recordings, given.standard, given.estimate.details)
+    read = read_logs(
+        motions, model.joints, prismatic=model.layout.prismatic, needs="motion",
+        base=logged_base(model), passive=model.passive, robot=model.tree.movable,
+    )  # fmt: skip
+    in_memory = [hold_log(model, motion, settings) for motion in read]
+    found = preview_logs(model, in_memory, choice, noise=noise, run=run)
+    return found if given is None else replace(found, between=(given.between,) * len(in_memory))
+
+
+def preview_logs(
+    model: RobotModel,
+    motions: Sequence[SurveyedLog],
+    choice: EstimatorSettings,
+    *,
+    noise: TorqueNoise | Mapping[str, float] | None = None,
+    correlation: float | None = None,
+    run: Run | None = None,
+    like: Run | None = None,
+) -> Preview:
+    """Return the expected standard errors of motions that were read.
+
+    Args:
+        model: The robot, with the friction that an earlier run identified.
+        motions: The motions, in memory.
+        choice: Which estimator.
+        noise: As of ``preview``.
+        correlation: Correlation time of stated or assumed noise [s]; if None, that of an earlier
+            run, or 0.1 s.
+        run: An earlier run, if any, whose information is added.
+        like: A run whose noise and parameters are used, without adding its information.
+
+    Raises:
+        DataError: As of ``preview``.
+        SettingsError: As of ``preview``.
+    """
+    if not motions:
+        raise DataError("no motion was given; at least one is needed to preview anything")
+    refuse_loops(model, "a preview")
+    if model.free_flyer and not model.contacts:
+        raise DataError(
+            f"{model.name}: the base floats without contacts; a preview needs [[contact]], or a "
+            "robot with a fixed base"
+        )
+    mapping = structural_mapping(model)
+    motions = [_with_torque(motion) for motion in motions]
+    peak, fastest = _largest(model, motions)
+    size = largest_torques(model, peak)
+    earlier = run or like
+    pi = assumed_parameters(model, size, fastest) if earlier is None else earlier.standard
+    for motion in motions:
+        _expect(motion, pi)
+    if not isinstance(noise, TorqueNoise):
+        found = None if earlier is None else earlier.noise(mapping.K).last(len(model.joints))
+        noise = assumed_noise(model, size, noise or {}, correlation, found)
+    information = _Information.of(model, mapping, motions, noise)
+    information = information if run is None else information.added_to(run)
+    prior, spread = (
+        model.standard_parameters(),
+        prior_spread(model, information.squares, information.samples),
+    )
+    ground = Known(model, mapping, prior, spread, information.share, information.sigma)
+    weight = _WEIGHT if earlier is None or earlier.weight is None else earlier.weight
+    estimate, wls = _errors(information, ground, choice, weight)
+    expected = _expected(motions, pi, information, ground, choice, estimate, wls)
+    before = None
+    if run is not None:
+        alone, _ = _errors(information.without_motions(), ground, choice, weight)
+        before = _base_error(alone, mapping, prior, spread)
+    return Preview(expected, noise, before)
+
+
+@dataclass(frozen=True, eq=False)
+class _Information:
+    """Information in recordings, made or planned."""
+
+    factors: Factors
+    sigma: Array  # (n_rows,), noise level of each row behind the filter [N m or N]
+    levels: tuple[tuple[Factors, Array], ...]  # of planned motions: density per sample, (n_rows,)
+    run: Run | None  # an earlier recording
+    squares: Array  # as of Reduction
+    samples: int
+    share: float  # share of their samples that count as independent [-]
+
+    @classmethod
+    def of(
+        cls,
+        model: RobotModel,
+        mapping: BaseMapping,
+        motions: Sequence[SurveyedLog],
+        noise: TorqueNoise,
+    ) -> "_Information":
+        """Return the information of planned motions with predicted torque."""
+        levels, residuals = [], []
+        for log in motions:
+            part = compress(base_problem(model, mapping, log.whole.trajectory, log.whole.mask))
+            density = noise.density(_white_step(log))
+            residual = np.minimum(noise.std**2, density * _band(log))
+            no_noise = np.zeros(model.n_rows - len(density))  # in the rows of the base
+            levels.append((part, np.append(no_noise, density) / _row_step(log)))
+            residuals.append(np.append(no_noise, residual))
+        rows = np.array([part.rows for part, _ in levels]) + 1e-9
+        mean = np.average(residuals, axis=0, weights=rows)
+        if model.constraints:
+            mean = np.full(len(mean), np.average(residuals, weights=rows))
+        return cls(
+            merge([part for part, _ in levels]),
+            np.sqrt(mean),
+            tuple(levels),
+            None,
+            np.sum([log.whole.trajectory.squares for log in motions], axis=0),
+            sum(len(log.whole.trajectory.t) for log in motions),
+            min(independent_share(log.signals) for log in motions),
+        )
+
+    def added_to(self, run: Run) -> "_Information":
+        """Return the information of an earlier run and of these motions together."""
+        return replace(
+            self,
+            factors=merge([run.factors, self.factors]),
+            run=run,
+            squares=run.squares + self.squares,
+            samples=run.samples + self.samples,
+            share=min(run.share, self.share),
+        )
+
+    def without_motions(self) -> "_Information":
+        """Return the information of the earlier run only, with the same weights."""
+        if self.run is None:
+            return self
+        return replace(self, factors=self.run.factors, levels=(), share=self.run.share)
+
+    def meat(self, K: Array, sigma: Array) -> Array:
+        """Return the covariance of the score of samples weighted by sigma^-2, shape (b, b)."""
+        meat = np.zeros((len(K), len(K))) if self.run is None else self.run.meat(K, sigma)
+        for part, level in self.levels:
+            meat = meat + part.information(level / sigma**4)
+        return meat
+
+
+def _white_step(log: SurveyedLog) -> float:
+    """Return the time between two samples of independent noise, if it is white [s]."""
+    return log.step if log.signals.cutoff is not None else max(log.step, _row_step(log))
+
+
+def _row_step(log: SurveyedLog) -> float:
+    """Return the time between two samples of a trajectory [s]; 1 s for poses at rest."""
+    if log.model.is_static:
+        return 1.0
+    rate = log.signals.rate
+    return log.step if rate is None else 1.0 / rate
+
+
+def _band(log: SurveyedLog) -> float:
+    """Return the bandwidth of a log's filter for noise, both signs of frequency [Hz]."""
+    cutoff, rate = log.signals.cutoff, 1.0 / log.step
+    if cutoff is None:
+        return np.inf
+    half = int(_IMPULSE * rate / cutoff)
+    impulse = np.zeros(2 * half + 1)
+    impulse[half] = 1.0
+    return float(rate * np.sum(low_pass(impulse, rate, log.signals) ** 2))
+
+
+def _largest(model: RobotModel, motions: Sequence[SurveyedLog]) -> tuple[Array, Array]:
+    """Return the largest torque (URDF's bodies) and speed of each joint in motions, (n,)."""
+    bodies = model.standard_parameters()
+    moved = [np.abs(predict(model, [bodies], log.whole.trajectory)[0]) for log in motions]
+    speeds = [np.abs(log.whole.trajectory.v) for log in motions]
+    peak, fastest = (np.max([x.max(axis=0) for x in own], axis=0) for own in (moved, speeds))
+    first = model.n_rows - len(model.joints)
+    return peak[first:], fastest[first:]
+
+
+def _with_torque(log: SurveyedLog) -> SurveyedLog:
+    """Return a motion whose joints will have torques: without, their rows would not be used."""
+    if log.model.constraints and isinstance(log.source, Log):
+        return hold_log(log.model, replace(log.source, has_torque=True), log.asked, log.locked)
+    return log
+
+
+def _expect(log: SurveyedLog, pi: Array) -> None:
+    """Set the torque of a motion to the one that parameters predict, behind its filter."""
+    rows = log.whole
+    (torque,) = predict(log.model, [pi], rows.trajectory)
+    (piece,) = log.pieces
+    piece.take(replace(rows, trajectory=replace(rows.trajectory, tau=torque)), log.model)
+
+
+def _errors(
+    information: _Information, known: Known, choice: EstimatorSettings, typical: tuple[float, float]
+) -> tuple[Estimate, Estimate]:
+    """Return the expected estimate and that of WLS, both at the prior.
+
+    The bounds of a consistent fit are left out: it is not known in advance which are active. The
+    weight of its prior, unless it is stated, and the plausible weight are the typical ones.
+    """
+    factors, K = information.factors, known.mapping.K
+    plain, alike = (
+        _least_squares(information, known, sigma)
+        for sigma in (information.sigma, np.ones_like(information.sigma))
+    )
+    if not isinstance(choice, ConsistentSettings):
+        return (alike if choice.has_equal_weights else plain), plain
+    stated = choice.prior_weight
+    weight, plausible = typical if isinstance(stated, str) else (stated, 1.0)
+    bounds = {**choice.constraints, "extent": "none"}
+    settings = replace(choice, prior_weight=weight, constraints=bounds)
+    fit = replace(consistent_fit(settings, known), plausible_weight=plausible)
+    C = fit.programme.covariance(weight, fit.rows(factors, information.sigma))
+    R, meat = factors.weighted(information.sigma)[:-1, :-1], information.meat(K, information.sigma)
+    covariance = about_prior(
+        C, K, information.share**2 * meat, R, information.share, fit.weight_ratio
+    )
+    estimate = replace(
+        plain, theta=known.pi, covariance=covariance, names=known.mapping.names,
+        prior_std=fit.spread_before,
+    )  # fmt: skip
+    return estimate, plain
+
+
+def _least_squares(information: _Information, known: Known, sigma: Array) -> Estimate:
+    """Return least squares of samples weighted by sigma^-2, at the prior."""
+    solution = solve_factor(information.factors, sigma, known.beta)
+    bread = solution.covariance
+    covariance = bread @ information.meat(known.mapping.K, sigma) @ bread
+    found = solution.estimate(
+        information.factors.names, covariance, information.sigma, 0, "expected"
+    )
+    return replace(found, theta=known.beta)
+
+
+def _expected(
+    motions: Sequence[SurveyedLog],
+    pi: Array,
+    information: _Information,
+    known: Known,
+    choice: EstimatorSettings,
+    estimate: Estimate,
+    wls: Estimate,
+) -> Identification:
+    """Return the expected identification."""
+    model, mapping = known.model, known.mapping
+    standard = known.pi if information.run is None else pi
+    rows = information.factors.weighted(information.sigma / np.sqrt(information.share))[:, :-1]
+    pinned = model.layout.owned_by(pinned_links(choice.bounds, model))
+    before = base_spread(mapping.K, known.spread, pinned)
+    fitted, _ = evaluate_logs(motions, (), {"estimate": pi, "wls": pi}, known.pi)
+    inflation = np.mean([level / information.sigma**2 for _, level in information.levels])
+    errors = StandardErrors("noise expected", 0, float(inflation), np.full(len(mapping.K), np.inf))
+    return Identification(
+        model=model,
+        mapping=mapping,
+        estimator=choice,
+        estimate=estimate,
+        wls=wls,
+        prior=known.pi,
+        urdf_with_drives=pi,
+        prior_std=known.spread if estimate.prior_std is None else estimate.prior_std,
+        standard=standard,
+        standard_covariance=standard_of(estimate, mapping, known.pi, known.spread)[1],
+        base=mapping.to_base(standard),
+        base_error=_base_error(estimate, mapping, known.pi, known.spread),
+        fitted=fitted,
+        validation=(),
+        errors=errors,
+        factors=information.factors,
+        determination=determine(information.factors.names, rows, before),
+    )
+
+
+def _base_error(estimate: Estimate, mapping: BaseMapping, prior: Array, spread: Array) -> Array:
+    """Return the standard errors of the base parameters, shape (b,); inf if not determined."""
+    if estimate.names == mapping.base_names:
+        return estimate.std_error
+    _, covariance = standard_of(estimate, mapping, prior, spread)
+    variance = np.einsum("bi,ij,bj->b", mapping.K, covariance, mapping.K)
+    return np.asarray(np.sqrt(np.maximum(variance, 0.0)))

@@ -1,0 +1,184 @@
+"""The doctor: finds faults of logs, and of the URDF for these logs, before an identification.
+
+Findings never change data. An error is a fault that makes the result wrong; it stops an
+identification unless its code is ignored.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+from robotid.base.exceptions import DataError
+from robotid.base.findings import Finding, by_severity, log_finding
+from robotid.base.settings import require_kind
+from robotid.data.files.read import Readable, read_logs
+from robotid.data.log import Log, Trajectory
+from robotid.data.signal_settings import SignalSettings
+from robotid.diagnosis.logs.channels import check_channels
+from robotid.diagnosis.logs.clock import check_clock, check_rest
+from robotid.diagnosis.logs.command_channels import check_commands
+from robotid.diagnosis.logs.contacts import check_base
+from robotid.diagnosis.logs.motion_checks import check_excitation, check_repeated_motion
+from robotid.diagnosis.logs.mounted import Segments, check_payload_change
+from robotid.diagnosis.logs.torque_channels import check_torque_channels
+from robotid.diagnosis.logs.torque_checks import check_torques
+from robotid.diagnosis.logs.torque_delay import check_torque_delay
+from robotid.diagnosis.logs.torque_sample import Probe, smooth_motion, take_probe
+from robotid.diagnosis.urdf.inertials import assumed_inertials, explained_by_assumed
+from robotid.diagnosis.urdf.rounding import rounded_robot
+from robotid.dynamics.base_parameters import structural_mapping
+from robotid.dynamics.constraint_rows import logged_base
+from robotid.robot.assumed import with_assumed_inertials
+from robotid.robot.model import RobotModel
+
+__all__ = ["CODES", "check_logs", "diagnose", "findings_to_dict"]
+
+#: Codes of the doctor's errors, which can be ignored.
+CODES = (
+    "base_orientation", "base_twist", "gravity", "gravity_compensated", "imu_axes", "imu_gravity",
+    "joint_axis", "joint_order", "delayed_command",
+    "locked_position", "measured_wrench", "position_offset", "position_order", "position_sign",
+    "spikes",
+    "torque_order", "torque_sign", "velocity_mismatch", "unsigned_torque", "velocity_order",
+    "velocity_scale",
+)  # fmt: skip
+
+
+def check_logs(
+    model: RobotModel,
+    logs: Readable | Sequence[Readable],
+    *,
+    validation: Readable | Sequence[Readable] = (),
+    signals: SignalSettings | None = None,
+) -> tuple[Finding, ...]:
+    """Check logs for faults before an identification.
+
+    Args:
+        model: The robot.
+        logs: Logs to fit, one or several: of the model's joints in its order, or paths or
+            DataFrames with their columns.
+        validation: Validation logs, likewise.
+        signals: How logs become trajectories; the defaults if None.
+
+    Returns:
+        The findings, errors first. Each has a code, a severity, a place and a message.
+
+    Raises:
+        DataError: If a file or a DataFrame is no log.
+        SettingsError: If a setting does not fit a log.
+    """
+    require_kind(model, RobotModel, "model", "a robotid.RobotModel")
+    require_kind(signals, (SignalSettings, type(None)), "signals", "a robotid.SignalSettings")
+    first, second = (
+        read_logs(
+            some,
+            model.joints,
+            prismatic=model.layout.prismatic,
+            needs="any",
+            base=logged_base(model),
+            passive=model.passive,
+            robot=model.tree.movable,
+        )
+        for some in (logs, validation)
+    )
+    return diagnose(model, first, second, signals or SignalSettings())
+
+
+def diagnose(
+    model: RobotModel, fitted: Sequence[Log], validation: Sequence[Log], signals: SignalSettings
+) -> tuple[Finding, ...]:
+    """Check logs that are in memory, as ``check_logs`` does.
+
+    Args:
+        model: The robot.
+        fitted: Logs to fit, of the model's joints in its order.
+        validation: Validation logs.
+        signals: How the logs become trajectories.
+
+    Returns:
+        The findings, errors first.
+
+    Raises:
+        SettingsError: If a setting does not fit a log.
+    """
+    # friction with an internal state is not examined here
+    model = with_assumed_inertials(model.with_terms({}))
+    findings = assumed_inertials(model)
+    motions = [_examine_log(model, log, signals, findings) for log in (*fitted, *validation)]
+    first = [motion for motion, _ in motions[: len(fitted)] if motion is not None]
+    probes = [probe for _, probe in motions[: len(fitted)] if probe is not None]
+    mapping = structural_mapping(model) if probes else None
+    moving = [probe.motion for probe in probes]
+    segments = Segments(model, mapping, moving, signals.min_velocity) if mapping else None
+    for log, (motion, probe) in zip(validation, motions[len(fitted) :], strict=True):
+        if motion is not None:
+            findings += check_repeated_motion(first, motion, log.name)
+        if probe is not None and segments is not None:
+            own = replace(segments, motions=[probe.motion])
+            findings += check_payload_change(segments, own, signals, log.name)
+    if mapping is not None:
+        names = ", ".join(log.name for log in fitted)
+        findings += check_excitation(model, mapping, moving, signals, names)
+        findings += rounded_robot(model, mapping)
+    return by_severity(x for x in findings if not explained_by_assumed(model, x))
+
+
+def findings_to_dict(findings: Sequence[Finding]) -> dict[str, Any]:
+    """Return findings as plain values, as ``robotid doctor --json`` prints them.
+
+    Args:
+        findings: The findings.
+
+    Returns:
+        {"findings": [{"code", "severity", "where", "message", "evidence"}]}.
+    """
+    plain = [
+        vars(finding) | {"evidence": {key: float(x) for key, x in finding.evidence.items()}}
+        for finding in findings
+    ]
+    return {"findings": plain}
+
+
+def _examine_log(
+    model: RobotModel, log: Log, signals: SignalSettings, findings: list[Finding]
+) -> tuple[Trajectory | None, Probe | None]:
+    """Add the findings on one log; return its smooth motion and a probe of it, or None."""
+    name = log.name
+    findings += [log_finding(name, "log_note", "note", note) for note in log.notes]
+    findings += [log_finding(name, "log_assumption", "warning", text) for text in log.assumed]
+    if not model.is_static:  # rows of static poses may have gaps between them
+        findings += [*check_clock(log), *check_channels(log, signals)]
+    prismatic = [limit.name for limit in model.limits if limit.type == "prismatic"]
+    findings += check_commands(log, prismatic)
+    driven = [joint for joint in log.joints if joint not in model.passive]
+    has_torque = log.has_torque and bool(driven)
+    sizes = list(check_torque_channels(log.select(driven))) if has_torque else []
+    findings += sizes
+    if model.free_flyer or model.constraints or model.passive:
+        message = "torques of a robot with a floating base, contacts, loops or passive joints are "
+        message += "not checked"
+        findings.append(log_finding(name, "floating_base", "note", message))
+        findings += check_base(model, log, signals)
+        return None, None
+    if model.is_static:
+        return None, None  # the other checks need accelerations
+    try:
+        motion = smooth_motion(model, log, signals)
+    except DataError as error:
+        findings.append(Finding(error.code, "error", name, str(error)))
+        return None, None
+    findings += check_rest(log, motion, model.layout)
+    if not log.has_torque:
+        return motion, None
+    probe = take_probe(model, motion)
+    if probe is None:
+        message = "the motion is too small to check the torques; record motion of every joint"
+        findings.append(log_finding(name, "no_motion", "warning", message))
+        return motion, None
+    if any(finding.severity == "error" for finding in sizes):
+        return motion, probe  # torques without signs fit no model
+    torques = list(check_torques(probe, name))
+    findings += torques
+    if not any(finding.severity == "error" for finding in torques):
+        findings += check_torque_delay(model, log, signals, name)
+    return motion, probe

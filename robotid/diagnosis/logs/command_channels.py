@@ -1,0 +1,502 @@
+"""Checks of the position loops, from commands and positions of a log; no model of the robot."""
+
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+
+import numpy as np
+
+from robotid.base.findings import Finding, listed, log_finding
+from robotid.base.text import period
+from robotid.base.typing import Array
+from robotid.data.log import Log
+from robotid.data.measured_velocity import quantum
+from robotid.diagnosis.logs.clock import runs_of
+from robotid.diagnosis.logs.command_lead import find_lead
+
+__all__ = ["check_commands", "largest_speeds"]
+
+_SECONDS = 5.0  # [s] length of the segments whose spectra are averaged
+_GAP = 5  # [median steps] a longer step ends the segment that is examined
+_COHERENT = 0.8  # least coherence of command and position at a frequency that is used
+_EXCITED = 1e-4  # least power of a command, over that of its strongest frequency
+_LARGEST_COHERENCE = 0.999  # that is believed: joints are not linear
+_HALF_POWER = np.sqrt(0.5)  # response at the bandwidth of a loop, over the response at rest
+_RIPPLE = 5  # number of frequencies over which the size of a response is smoothed
+_DELAYS = np.arange(0.0, 0.2, 0.001)  # [s] grid of the delays
+_LONGEST = 0.5  # [s] longest delay, or lead, of the position
+_AS_ALIKE = 0.9  # share of the largest correlation that counts as equal to it
+_QUANTILE = 3.84  # 95 % quantile of chi-square with one degree of freedom
+_DETERMINED = 0.02  # [s] width of the range of delays below which a delay is determined
+_RATE = 10.0  # least number of rows per period of the bandwidth
+_ALIKE = 0.95  # correlation from which two commands are proportional
+_UPDATED = 1.5  # [rows] mean time between updates from which a command is zero-order held
+_LEVELS = 20  # number of values from which a command is smooth, not a series of steps
+_PAUSE = 20  # [rows] a longer constant command is intended
+_INTERVAL = 0.1  # [s] over which changes of commands are compared
+_FOLLOWED = 0.5  # share of slow sweeps that a joint should follow
+_STUCK = 0.2  # ... if its lag is unknown, so that it is unknown which sweeps are slow
+_SLOW = 5.0  # [lags] least duration of a slow sweep
+_FEW = 10.0  # least number of encoder steps in a sweep
+_SWEEPS = 4  # least number of sweeps to judge a joint by
+_SETTLED = 0.5  # [s] after its last change a command is constant
+_CONSTANT = 2.0  # [s] least total time of constant command
+_DISTURBED = 0.01  # [rad or m] motion that is allowed under a constant command
+_EXPLAINED = 0.7  # share of this motion that the other joints must explain
+_TOP = 0.1  # relative distance from the largest speed within which a joint runs at it
+_FLAT = 0.6  # least share at the largest speed, of the rows above half of it; a sine has 0.43
+_OFTEN = 0.02  # share of the rows at the largest speed from which it is reported
+_UNLIKE = 0.2  # least relative difference between this speed and the speed of the command
+_PULSES = 3  # least number of movements that end at one speed
+
+
+def check_commands(log: Log, prismatic: Collection[str] = ()) -> Iterator[Finding]:
+    """Yield the findings on the position loops of the joints.
+
+    Args:
+        log: The log; without commands, only "no_torque" is yielded.
+        prismatic: Names of the prismatic joints, whose positions are in m.
+
+    Yields:
+        Notes "no_torque", "loops" (bandwidth and lag of each joint) and "repeated_command"; a
+        warning "proportional_commands" per group of joints with proportional commands; an error
+        "delayed_command" per joint that moves before its command; warnings "slow_command",
+        "small_command", "saturated" and "slow_sampling"; and a warning "moved_by_others" per joint
+        that moves although its command is constant.
+    """
+    if not log.has_torque:
+        yield _without_torque(log)
+    if log.q_ref is None:
+        return
+    loops = [
+        _Loop(log, j, "m" if name in prismatic else "rad") for j, name in enumerate(log.joints)
+    ]
+    moved = [loop for loop in loops if loop.is_commanded]
+    yield from _shown(log, moved)
+    yield from _held(log, moved)
+    yield from _alike(log, moved)
+    early = list(_early(log, moved))
+    clipped = dict(_saturated(log, moved))
+    small = list(_small(log, [loop for loop in moved if loop.name not in clipped]))
+    yield from (*early, *clipped.values(), *small)
+    if not early and not small:
+        yield from _slow(log, moved)
+    yield from _sampled(log, moved)
+    yield from _disturbed(log, loops)
+
+
+def largest_speeds(log: Log) -> dict[str, float]:
+    """Return the speeds of the joints that run at their largest speed for any position error.
+
+    Args:
+        log: The log, with commands.
+    """
+    moved = [loop for j in range(len(log.joints)) if (loop := _Loop(log, j)).is_commanded]
+    return {name: float(found.evidence["speed"]) for name, found in _saturated(log, moved)}
+
+
+@dataclass(frozen=True, eq=False)
+class _Loop:
+    """The position loop of one joint, in the longest segment of a log without a gap."""
+
+    log: Log
+    joint: int
+    unit: str = "rad"
+
+    @property
+    def name(self) -> str:
+        return self.log.joints[self.joint]
+
+    @cached_property
+    def step(self) -> float:
+        """Median time step [s]."""
+        return float(np.median(np.diff(self.log.t)))
+
+    @cached_property
+    def rows(self) -> slice:
+        """The longest segment without a gap."""
+        breaks = np.flatnonzero(np.diff(self.log.t) > _GAP * self.step) + 1
+        edges = np.array([0, *breaks, len(self.log.t)])
+        k = int(np.argmax(np.diff(edges)))
+        return slice(int(edges[k]), int(edges[k + 1]))
+
+    @property
+    def q(self) -> Array:
+        """Positions, shape (N,)."""
+        q: Array = self.log.q[self.rows, self.joint]
+        return q
+
+    @property
+    def command(self) -> Array:
+        """Commanded positions, shape (N,)."""
+        assert self.log.q_ref is not None
+        command: Array = self.log.q_ref[self.rows, self.joint]
+        return command
+
+    @property
+    def is_commanded(self) -> bool:
+        """Whether its command changes."""
+        return bool(np.ptp(self.command) > 0)
+
+    @cached_property
+    def response(self) -> tuple[Array, Array, Array]:
+        """Frequency response from command to position: frequency [Hz], response, weight.
+
+        Only frequencies that the command excites are used. The weight is the inverse of the
+        relative variance, from the coherence.
+        """
+        from scipy.signal import csd, welch
+
+        n = min(len(self.q), max(8, round(_SECONDS / self.step)))
+        how = {"fs": 1 / self.step, "nperseg": n, "detrend": "linear"}
+        f, both = csd(self.command, self.q, **how)
+        command, q = welch(self.command, **how)[1], welch(self.q, **how)[1]
+        share = np.abs(both) ** 2 / np.where(command * q > 0, command * q, np.inf)
+        used = (share > _COHERENT) & (command > _EXCITED * command.max()) & (f > 0)
+        segments = 2 * len(self.q) / n - 1
+        share = np.minimum(share[used], _LARGEST_COHERENCE)
+        return f[used], both[used] / command[used], 2 * segments * share / (1 - share)
+
+    @cached_property
+    def bandwidth(self) -> float:
+        """Frequency at which the response is 0.71 [Hz]; nan if it is above at all excited ones."""
+        from scipy.ndimage import median_filter
+
+        f, H, _ = self.response
+        if not len(f):
+            return np.nan
+        size = median_filter(np.abs(H), size=_RIPPLE, mode="nearest")
+        slow = int(np.argmax(size[:3]))  # the first one may be due to drift
+        weak = np.flatnonzero(size[slow:] < _HALF_POWER * size[slow])
+        return float(f[slow + weak[0]]) if len(weak) else np.nan
+
+    @cached_property
+    def lag(self) -> tuple[float, float]:
+        """Delay of the position within the bandwidth, and its standard error [s].
+
+        It is the lag of the largest correlation of their changes, plus the weighted mean of the
+        remaining phase over the frequency; nan if nothing is excited.
+        """
+        f, H, weight = self.response
+        first = self._first_lag()
+        phase = np.angle(H * np.exp(2j * np.pi * f * first))
+        near = (np.abs(phase) < np.pi / 2) & ~(f >= self.bandwidth)
+        w, phase, weight = 2 * np.pi * f[near], phase[near], weight[near]
+        if not len(w):
+            return np.nan, np.nan
+        share = weight * w**2 / np.sum(weight * w**2)
+        delay = float(share @ (-phase / w))
+        spread = np.sqrt(float(share @ (-phase / w - delay) ** 2) / max(len(w) - 1, 1))
+        return first + delay, max(float(spread), float(1 / np.sqrt(np.sum(weight * w**2))))
+
+    def _first_lag(self) -> float:
+        """Return the lag at which changes of position and command correlate most [s].
+
+        Of several lags with about this correlation, as for a sine, it is the shortest; nan if none
+        is positive.
+        """
+        from scipy.signal import correlate
+
+        alike = correlate(np.diff(self.q), np.diff(self.command), method="fft")
+        rows = np.arange(len(alike)) - len(self.q) + 2
+        within = np.abs(rows) * self.step <= _LONGEST
+        alike, rows = alike[within], rows[within]
+        if not alike.max() > 0:
+            return np.nan
+        best = rows[alike >= _AS_ALIKE * alike.max()]
+        return float(best[np.argmin(np.abs(best))]) * self.step
+
+    @cached_property
+    def delays(self) -> tuple[float, float]:
+        """The shortest and the longest pure delay that are consistent with the response [s].
+
+        H = exp(-i w T) / (g + d i w - j w^2), in which g, d and j are linear for each T; as d is
+        not negative, T is at most the lag.
+        """
+        f, H, weight = self.response
+        lag, error = self.lag
+        delays = _DELAYS[max(lag + 2 * error, 0.0) >= _DELAYS] if np.isfinite(lag) else _DELAYS
+        if len(f) < 4:
+            return float(delays[0]), float(delays[-1])
+        w, root = 2 * np.pi * f, np.sqrt(weight)
+        A = np.column_stack([H, 1j * w * H, -(w**2) * H]) * root[:, None]  # (m, 3)
+        Q = np.linalg.qr(np.concatenate([A.real, A.imag]))[0]
+        b = np.exp(-1j * w * delays[:, None]) * root  # (delays, m)
+        b = np.concatenate([b.real, b.imag], axis=1)
+        squares = np.sum(b**2, axis=1) - np.sum((b @ Q) ** 2, axis=1)
+        least = squares.min()
+        noise = max(float(least) / (2 * len(f) - 4), 1.0)
+        fits = delays[squares < least + _QUANTILE * noise]
+        return float(fits[0]), float(fits[-1])
+
+    @cached_property
+    def sweeps(self) -> tuple[Array, Array]:
+        """Ranges of the command between slow reversals, and of the joint, as arrays."""
+        command, q = self.command, self.q
+        moves = np.flatnonzero(np.diff(command) != 0)
+        reversals = moves[1:][np.diff(np.sign(np.diff(command)[moves])) != 0]
+        lag = self.lag[0] if np.isfinite(self.lag[0]) else 0.0
+        delay = max(0, round(lag / self.step))  # [samples]
+        pairs = [
+            (i, k)
+            for i, k in pairwise(reversals.tolist())
+            if (k - i) * self.step > max(_SLOW * lag, _SETTLED / 2)
+        ]
+        swept = np.array([abs(command[k] - command[i]) for i, k in pairs])
+        followed = np.array([np.ptp(q[i : k + delay + 1]) for i, k in pairs])
+        is_large = swept > 0.2 * swept.max(initial=0.0)
+        return swept[is_large], followed[is_large]
+
+
+def _without_torque(log: Log) -> Finding:
+    without_commands = (
+        "the log has forces of the ground and no torques: the rows of the base identify masses; "
+        "friction and armature of the joints are not identified"
+        if log.wrenches
+        else "the log has neither torques nor commands: nothing can be identified from motion alone"
+    )
+    message = (
+        "the log has no torque. Commands and positions determine the delay of each drive. They "
+        "determine friction, armature and load only as ratios to the gains of the controller; "
+        "state a known gain, else the inertias of the URDF set the scale"
+        if log.q_ref is not None
+        else without_commands
+    )
+    return log_finding(log.name, "no_torque", "note", message)
+
+
+def _shown(log: Log, loops: Sequence[_Loop]) -> Iterator[Finding]:
+    """Yield the delays of the joints behind their commands, and the bandwidths of their loops."""
+    lags = {loop.name: loop.lag[0] for loop in loops if loop.lag[0] > 0}
+    if not lags:
+        return
+    ends = {loop.name: loop.bandwidth for loop in loops if np.isfinite(loop.bandwidth)}
+    shown = ", ".join(
+        f"{name} {1e3 * lag:.3g} ms" + (f" to {ends[name]:.2g} Hz" if name in ends else "")
+        for name, lag in lags.items()
+    )
+    message = (
+        f"lag of the positions behind their commands, and bandwidth if it is excited: {shown}. "
+        "The delay of a drive is at most this lag; no action needed"
+    )
+    evidence = {f"lag_{name}": lag for name, lag in lags.items()}
+    evidence |= {f"bandwidth_{name}": width for name, width in ends.items()}
+    yield log_finding(log.name, "loops", "note", message, **evidence)
+
+
+def _held(log: Log, loops: Sequence[_Loop]) -> Iterator[Finding]:
+    """Yield whether smooth commands are updated less often than they are logged."""
+    rows: dict[str, Array] = {}
+    for loop in loops:
+        changes = np.flatnonzero(np.diff(loop.command))
+        lengths = np.diff(changes)
+        lengths = lengths[lengths <= _PAUSE]
+        is_smooth = len(np.unique(loop.command)) >= _LEVELS
+        if len(lengths) > 20 and is_smooth and lengths.mean() > _UPDATED:
+            rows[loop.name] = lengths
+    if not rows:
+        return
+    lengths = np.concatenate(list(rows.values()))
+    least, most = (int(x) for x in np.quantile(lengths, [0.05, 0.95]))
+    mean, step = float(lengths.mean()), loops[0].step
+    span = f"{least}" if least == most else f"{least} to {most}"
+    message = (
+        f"the command of {listed(rows)} is updated every {span} rows, at {1 / (mean * step):.3g} "
+        f"Hz on average, and is constant for {1e3 * mean * step:.3g} ms. This zero-order hold acts "
+        "as a delay of half that time; simulate the rows as logged, else "
+        f"{500 * mean * step:.2g} ms are added to the identified delay of the drive"
+    )
+    part = "" if len(rows) == len(log.joints) else listed(rows)
+    yield log_finding(
+        log.name, "repeated_command", "note", message, part, rows=mean, period=mean * step
+    )
+
+
+def _alike(log: Log, loops: Sequence[_Loop]) -> Iterator[Finding]:
+    """Yield groups of joints with proportional commands."""
+    if len(loops) < 2:
+        return
+    commands = np.stack([loop.command for loop in loops], axis=1)
+    lag = max(1, round(_INTERVAL / loops[0].step))
+    changes = commands[lag:] - commands[:-lag]
+    same = np.minimum(*(np.abs(np.corrcoef(x.T)) for x in (commands, changes)))
+    left = list(range(len(loops)))
+    while left:
+        group = [left.pop(0)]
+        for k in group:
+            near = [i for i in left if same[k, i] > _ALIKE]
+            group += near
+            left = [i for i in left if i not in near]
+        if len(group) == 1:
+            continue
+        least = min(max(same[i, k] for k in group if k != i) for i in group)
+        names = [loops[i].name for i in sorted(group)]
+        message = (
+            f"the commands of {listed(names)} are proportional (correlation {least:.3f} or more): "
+            "effects of the position or speed of one joint are not distinguishable from those of "
+            "another, nor the coupling between joints from their own inertia and friction; give "
+            "each joint its own frequencies or phases"
+        )
+        yield log_finding(
+            log.name, "proportional_commands", "warning", message, listed(names),
+            correlation=float(least), joints=len(names),
+        )  # fmt: skip
+
+
+def _early(log: Log, loops: Sequence[_Loop]) -> Iterator[Finding]:
+    """Yield joints that move before their command, which is impossible."""
+    for loop in loops:
+        found = find_lead(loop.command, loop.q, loop.step, loop.bandwidth, len(loops))
+        if found is None:
+            continue
+        t = log.t[loop.rows]
+        is_whole = found.stop - found.start == len(t)
+        part = "" if is_whole else f" in {period(float(t[found.start]), float(t[found.stop - 1]))}"
+        message = (
+            f"{loop.name} moves {1e3 * found.lead:.3g} +- {1e3 * found.std_error:.2g} ms before "
+            f"its command{part}: the logged command is not the command of the drive, or it has "
+            "another clock; log the command that is sent to the drive, with the time of sending"
+        )
+        yield log_finding(
+            log.name, "delayed_command", "error", message, loop.name,
+            lag=-found.lead, std_error=found.std_error,
+        )  # fmt: skip
+
+
+def _slow(log: Log, loops: Sequence[_Loop]) -> Iterator[Finding]:
+    """Yield the joints whose command is too slow to distinguish a delay from damping."""
+    names, ranges = list[str](), list[tuple[float, float]]()
+    fastest = 0.0
+    for loop in loops:
+        (f, _, _), (least, most), lag = loop.response, loop.delays, loop.lag[0]
+        width = most - least
+        is_determined = width <= _DETERMINED and (most < lag - 1e-3 or lag < _DETERMINED)
+        if np.isnan(loop.bandwidth) and not is_determined:
+            names, ranges = [*names, loop.name], [*ranges, (least, most)]
+            fastest = max(fastest, float(f.max(initial=0.0)))
+    if fastest == 0.0:
+        return
+    least, most = min(low for low, _ in ranges), max(high for _, high in ranges)
+    message = (
+        f"the command of {listed(names)} is too slow to identify the delay: the joints follow it "
+        f"up to {fastest:.2g} Hz, the largest excited frequency. Any delay up to "
+        f"{1e3 * most:.0f} ms is consistent with this, with more or less damping, friction or "
+        "saturation. Record a chirp beyond the bandwidth of the loop (a response of 70 %), or steps"
+    )
+    part = "" if len(names) == len(log.joints) else listed(names)
+    yield log_finding(
+        log.name, "slow_command", "warning", message, part,
+        frequency=fastest, shortest=least, longest=most,
+    )  # fmt: skip
+
+
+def _small(log: Log, loops: Sequence[_Loop]) -> Iterator[Finding]:
+    """Yield joints whose slow sweeps are as small as their backlash or their encoder steps."""
+    for loop in loops:
+        (swept, followed), step = loop.sweeps, quantum(log.q[:, loop.joint])
+        sweep = float(np.ptp(loop.command))
+        share = float(np.median(followed / swept)) if len(swept) >= _SWEEPS else 1.0
+        if share < (_FOLLOWED if loop.lag[0] > 0 else _STUCK):
+            sweep, dead = float(np.median(swept)), float(np.median(swept - followed))
+            message = (
+                f"{loop.name} follows {100 * share:.0f} % of slow sweeps of {sweep:.3g} "
+                f"{loop.unit}: friction, backlash or the dead band of its drive suppress "
+                f"{dead:.2g} {loop.unit}; move it by {5 * dead:.2g} {loop.unit} or more"
+            )
+        elif sweep < _FEW * step:
+            message = (
+                f"{loop.name} has a command range of {sweep:.3g} {loop.unit}, {sweep / step:.1f} "
+                "steps of its encoder: the motion is too small; move it by "
+                f"{5 * _FEW * step:.2g} {loop.unit} or more"
+            )
+        else:
+            continue
+        yield log_finding(
+            log.name, "small_command", "warning", message, loop.name,
+            sweep=sweep, followed=share, step=step,
+        )  # fmt: skip
+
+
+def _saturated(log: Log, loops: Sequence[_Loop]) -> Iterator[tuple[str, Finding]]:
+    """Yield names and findings of joints that run at their largest speed for any error."""
+    for loop in loops:
+        v, wanted = np.gradient(loop.q, loop.step), np.gradient(loop.command, loop.step)
+        error, top = loop.command - loop.q, float(np.quantile(np.abs(v), 0.995))
+        if top < _FEW * quantum(log.q[:, loop.joint]) / loop.step or top == 0:
+            continue
+        clipped = []
+        for start, stop in runs_of(np.abs(v) > 0.5 * top):
+            at = np.flatnonzero(np.abs(v[start:stop]) > (1 - _TOP) * top) + start
+            flat = len(at) / (stop - start)
+            if len(at) < 5 or flat < _FLAT:
+                continue
+            unlike = abs(float(np.mean(wanted[at])) / float(np.mean(v[at])) - 1)
+            if unlike > _UNLIKE:
+                clipped.append((at, float(np.ptp(error[at]))))
+        share = sum(len(at) for at, _ in clipped) / len(v)
+        if len(clipped) < _PULSES or share < _OFTEN:
+            continue
+        change = max(change for _, change in clipped)
+        message = (
+            f"{loop.name} runs at its largest speed of {top:.3g} {loop.unit}/s in {len(clipped)} "
+            f"movements, {100 * share:.2g} % of the rows, while its position error changes by up "
+            f"to {change:.2g} {loop.unit}: the drive is at its limit of speed or torque; state the "
+            "limit in [controller], or record a slower motion"
+        )
+        evidence = {"speed": top, "share": share, "error": change}
+        found = log_finding(log.name, "saturated", "warning", message, loop.name, **evidence)
+        yield loop.name, found
+
+
+def _sampled(log: Log, loops: Sequence[_Loop]) -> Iterator[Finding]:
+    """Yield the joints whose log rate is too low for the bandwidth of their loops."""
+    found = {}
+    for loop in loops:
+        f = loop.response[0]
+        width = loop.bandwidth if np.isfinite(loop.bandwidth) else float(f[-1]) if len(f) else 0.0
+        if width * loop.step * _RATE > 1:
+            found[loop.name] = width
+    if not found:
+        return
+    rate, width = 1 / loops[0].step, max(found.values())
+    message = (
+        f"{listed(found)} follow their commands up to {width:.3g} Hz and are logged at {rate:.3g} "
+        f"Hz, {rate / width:.2g} rows per period: delay and damping are not distinguishable at "
+        f"this rate; log at {_RATE * width:.2g} Hz or more"
+    )
+    part = "" if len(found) == len(log.joints) else listed(found)
+    yield log_finding(
+        log.name, "slow_sampling", "warning", message, part, rate=rate, bandwidth=width
+    )
+
+
+def _disturbed(log: Log, loops: Sequence[_Loop]) -> Iterator[Finding]:
+    """Yield joints with a constant command that move with the other joints."""
+    q = log.q[loops[0].rows]
+    for loop in loops:
+        since = round(_SETTLED / loop.step)
+        changed = np.append(True, np.diff(loop.command) != 0)
+        last = np.maximum.accumulate(np.where(changed, np.arange(len(changed)), 0))
+        runs = [run for run in runs_of(np.arange(len(last)) - last >= since)]
+        rows = np.concatenate([np.arange(i, k) for i, k in runs] or [np.empty(0, int)])
+        if len(rows) * loop.step < _CONSTANT:
+            continue
+        centred = np.concatenate([q[i:k] - q[i:k].mean(axis=0) for i, k in runs])
+        own, others = centred[:, loop.joint], np.delete(centred, loop.joint, axis=1)
+        size = float(np.sqrt(2) * own.std())
+        if size < max(_DISTURBED, 3 * quantum(log.q[:, loop.joint])):
+            continue
+        fit = others @ np.linalg.lstsq(others, own)[0]
+        share = 1 - float(np.sum((own - fit) ** 2) / np.sum(own**2))
+        if share < _EXPLAINED:
+            continue
+        message = (
+            f"{loop.name} moves by {size:.2g} although its command is constant, and the motion of "
+            f"the other joints explains {100 * share:.0f} % of it: the base moves, or the gains of "
+            "this joint are too low for its load; fix the base, and identify the stiffness of this "
+            "joint"
+        )
+        yield log_finding(
+            log.name, "moved_by_others", "warning", message, loop.name, size=size, share=share
+        )

@@ -1,0 +1,367 @@
+"""Tests of how well the model explains each torque, as stated and under other hypotheses.
+
+The torque of a joint must be a sum, with factors >= 0, of the torques of the links that it carries
+by the URDF, of the inertia and the frictions of its drive, and of a constant. Masses may be wrong
+by any factor; signs, columns, gravity and positions may not.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import combinations
+
+import numpy as np
+
+from robotid.base.typing import Array
+from robotid.diagnosis.logs.torque_sample import Probe
+
+__all__ = ["HINT", "Explanation", "compensated", "explanations", "own_share", "unexplained"]
+
+#: Decrease of the misfit from which another gravity is reported.
+HINT = 0.7
+
+_FLOOR = 1e-3  # an unexplained share below this is negligible
+_POOR = 0.08  # unexplained share from which other readings of the positions are tested
+_CLEARLY = 2.0  # decrease of the misfit, a factor 7, beyond the readings with stated positions
+_ROWS, _QUARTER = 200, 4  # rows of these tests, and the divisor of their number in a first pass
+_OFFSETS = (0.4, -0.4, np.pi / 2, -np.pi / 2, np.pi)  # [rad] errors of a zero position
+_EARTH = 9.81  # [m/s^2]
+_RINGING = 0.05  # of its largest value, undershoot below 0 by the filter
+_ITERATIONS = 8  # of signs and fit
+_FOLDED = 0.4  # largest ratio of unexplained shares at which a torque is an absolute value
+_CONSTANT = 1e-9  # relative variation of a torque that is rounding
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """A hypothesis on the log, and how well the torques are explained under it.
+
+    Attributes:
+        kind: "stated", "payload", "torque_sign", "unsigned_torque", "torque_order", "gravity",
+            "joint_order", "joint_axis", "position_order", "position_sign" or "position_offset".
+        share: Unexplained share of each torque's variance, shape (n,).
+        joints: Indices of the joints concerned.
+        values: "torque_order": the joint of each torque column; "gravity": the vector [m/s^2];
+            "position_offset": the offset [rad].
+    """
+
+    kind: str
+    share: Array
+    joints: tuple[int, ...] = ()
+    values: tuple[float, ...] = ()
+
+    @property
+    def misfit(self) -> float:
+        """The sum of the logarithms of the unexplained shares: lower is better."""
+        return float(np.sum(np.log(self.share + _FLOOR)))
+
+
+def compensated(probe: Probe) -> tuple[Probe, Array]:
+    """Return a motion with the URDF's gravity added to its torques, and its unexplained shares.
+
+    Args:
+        probe: The motion.
+
+    Returns:
+        The motion, and the unexplained shares of the variance of the torques as logged, shape (n,).
+    """
+    gravity = probe.loads() - probe.loads(np.zeros(3))
+    whole = replace(probe, tau=probe.tau + gravity.sum(axis=2))
+    size, logged = _variation(whole.tau), _variation(probe.tau)
+    return whole, _over(own_share(whole) * size, logged)
+
+
+def unexplained(probe: Probe) -> Array:
+    """Return the share of each torque column that the model of each joint does not explain.
+
+    Args:
+        probe: The motion.
+
+    Returns:
+        Shares of variance, shape (n, n, 2): torque column i, model of joint k, with the stated and
+        the reversed sign of the column. 0 for a constant column.
+    """
+    N, n = probe.tau.shape
+    every = np.hstack([probe.tau, -probe.tau])
+    share = _shares(probe, np.broadcast_to(every, (n, N, 2 * n)))
+    return share.reshape(n, 2, n).transpose(2, 0, 1)
+
+
+def explanations(probe: Probe) -> tuple[Explanation, Explanation, list[Explanation]]:
+    """Return how well the torques are explained as stated, and under each other hypothesis.
+
+    Args:
+        probe: The motion.
+
+    Returns:
+        The stated reading; the same with any load on the last link; and the others.
+    """
+    share = unexplained(probe)
+    own = np.diagonal(share).T  # (n, 2)
+    stated = Explanation("stated", own[:, 0])
+    others = [_signs(own), _unsigned(probe, own), _order(share), _gravity(probe, stated)]
+    loaded = Explanation("payload", np.minimum(own_share(probe, any_load=True), stated.share))
+    if stated.share.max() > _POOR:
+        others += _positions(probe, min(e.misfit for e in [stated, *others]))
+    return stated, loaded, others
+
+
+def _signs(own: Array) -> Explanation:
+    reversed_ = np.flatnonzero(own[:, 1] < own[:, 0])
+    return Explanation("torque_sign", own.min(axis=1), tuple(reversed_.tolist()))
+
+
+def _unsigned(probe: Probe, own: Array) -> Explanation:
+    """Return the hypothesis that torques that are never negative are absolute values.
+
+    The signs are those of the torque predicted from the signed torque, iterated from the signs of
+    the URDF's torque, of the velocity or of the acceleration. The variation of the absolute value
+    must be explained, because a constant value with the sign of the speed looks like friction. The
+    unexplained share refers to the signed torque, because the absolute value of a torque that is
+    mostly friction hardly varies.
+    """
+    share, joints = own[:, 0].copy(), []
+    loads = probe.loads()
+    for j, tau in enumerate(probe.tau.T):
+        if tau.min() < -_RINGING * tau.max() or share[j] < _POOR:
+            continue
+        X = np.hstack([loads[:, j], probe.drives[:, j]])
+        starts = (loads[:, j].sum(axis=1), probe.v[:, j], probe.a[:, j])
+        of_size, signed = min(_folded_misfit(X, tau, np.sign(start)) for start in starts)
+        if of_size < _FOLDED * own[j].min():
+            share[j] = signed
+            joints.append(j)
+    return Explanation("unsigned_torque", share, tuple(joints))
+
+
+def _folded_misfit(X: Array, tau: Array, sign: Array) -> tuple[float, float]:
+    """Return the unexplained shares of a torque whose signs are iterated from initial ones.
+
+    Returns:
+        The share of the variance of the torque as logged, and of the torque with signs.
+    """
+    for _ in range(_ITERATIONS):
+        sign = np.where(_nonnegative_prediction(X, sign * tau) < 0, -1.0, 1.0)
+    signed = sign * tau
+    left = float(_misfits(X[None], signed[None, :, None])[0, 0])
+    of_size, of_signed = (float(np.sum((x - x.mean()) ** 2)) for x in (tau, signed))
+    return (left / of_size, left / max(of_signed, left)) if of_size > 0 else (1.0, 1.0)
+
+
+def _order(share: Array) -> Explanation:
+    """Return the best assignment of torque columns to joints."""
+    from scipy.optimize import linear_sum_assignment
+
+    columns, joints = linear_sum_assignment(np.log(share[:, :, 0] + _FLOOR))
+    moved = tuple(np.flatnonzero(columns != joints).tolist())
+    found = share[columns, joints, 0]
+    return Explanation("torque_order", found, moved, tuple(joints.astype(float).tolist()))
+
+
+def _gravity(probe: Probe, stated: Explanation) -> Explanation:
+    """Return the direction of gravity that explains the torques best.
+
+    It is the stated one if the torques are explained, and no masses and no gravity, of any size
+    and sign, explain them better by ``HINT``.
+    """
+    from scipy.optimize import minimize
+
+    size = float(np.linalg.norm(probe.gravity)) or _EARTH
+    joints = tuple(range(len(probe.model.joints)))
+    is_stated = replace(stated, kind="gravity", joints=joints, values=tuple(probe.gravity.tolist()))
+    is_poor = stated.share.max() > _POOR
+    if not is_poor and stated.misfit - len(joints) * np.log(_FLOOR) < HINT:
+        return is_stated
+    share_in, least = _shares_by_gravity(probe)
+    if not is_poor and stated.misfit - Explanation("", least).misfit < HINT:
+        return is_stated
+
+    def explained(g: Array) -> Explanation:
+        return Explanation("gravity", share_in(g), joints, tuple(g.tolist()))
+
+    axes = [sign * size * axis for axis in np.eye(3) for sign in (1, -1)]
+    best = min(map(explained, [probe.gravity, *axes, np.zeros(3)]), key=lambda e: e.misfit)
+    start = np.array(best.values)
+    if not start.any():
+        return best
+    # two directions orthogonal to the start; x are tangents of the tilt in these directions
+    _, _, frame = np.linalg.svd(start.reshape(1, 3))
+    orthogonal = frame[1:]
+
+    def tilted(x: Array) -> Explanation:
+        g = start + size * x @ orthogonal
+        return explained(size * g / np.linalg.norm(g))
+
+    simplex = [[0.0, 0.0], [0.1, 0.0], [0.0, 0.1]]
+    options = {"initial_simplex": simplex, "xatol": 5e-3, "fatol": 1e-2, "maxfev": 60}
+    found = minimize(lambda x: tilted(x).misfit, np.zeros(2), method="Nelder-Mead", options=options)
+    return tilted(found.x)
+
+
+def _shares_by_gravity(probe: Probe) -> tuple[Callable[[Array], Array], Array]:
+    """Return a function of gravity (3,): the unexplained share of each torque, (n,).
+
+    Loads are linear in gravity, so one triangular factor per joint is used for all of them. Second,
+    the shares that all their columns leave, with factors of any sign, (n,): no gravity leaves less.
+    """
+    links, size = probe.loads(), _variation(probe.tau)
+    X = [links, *probe.parts.gravity_loads, probe.drives, probe.tau[:, :, None]]
+    R = _triangles(np.concatenate(X, axis=2).swapaxes(0, 1))
+    bodies = links.shape[2]
+    parts = R[:, :, : 4 * bodies].reshape(*R.shape[:2], 4, bodies)
+
+    def shares(g: Array) -> Array:
+        more = g - probe.gravity
+        loads = parts[:, :, 0] + np.tensordot(more, parts[:, :, 1:], axes=(0, 2))
+        columns = np.concatenate([loads, R[:, :, 4 * bodies : -1]], axis=2)
+        return _over(_misfits(columns, R[:, :, -1:])[:, 0], size)
+
+    left = R[:, -1, -1] ** 2 if R.shape[1] == R.shape[2] else np.zeros(len(R))
+    return shares, _over(left, size)
+
+
+def _positions(probe: Probe, best: float) -> Iterator[Explanation]:
+    """Yield readings with another position column, sign or zero, if one is clearly better.
+
+    They are tested with few rows, first with a quarter of them: a reading without half of the
+    required decrease there is not tested further.
+    """
+    every = max(1, len(probe.rows) // _ROWS)
+    some, few = (probe.at(probe.rows[::k]) for k in (every, _QUARTER * every))
+    joints = range(len(probe.model.joints))
+    enough, likely = best - _CLEARLY, best - 0.5 * _CLEARLY
+    readings: list[Callable[[Probe], list[Explanation]]] = [
+        *(partial(_exchanged, pair=pair) for pair in combinations(joints, 2)),
+        *(partial(_reversed, j=j) for j in joints),
+    ]
+    for read in readings:
+        if any(e.misfit < likely for e in read(few)):
+            yield from (e for e in read(some) if e.misfit < enough)
+    offsets = [_offset(few, j, offset) for j in _revolute(few) for offset in _OFFSETS]
+    first = min(offsets, key=lambda e: e.misfit, default=None)
+    if first is not None and _refined(few, first).misfit < likely:
+        near = [e for e in offsets if e.misfit < first.misfit + 0.5 * _CLEARLY]
+        tried = [_offset(some, e.joints[0], e.values[0]) for e in near]
+        found = _refined(some, min(tried, key=lambda e: e.misfit))
+        yield from [found] if found.misfit < enough else []
+
+
+def _revolute(probe: Probe) -> list[int]:
+    """Return the revolute joints."""
+    names = probe.model.joints
+    return [j for j in range(len(names)) if names[j] not in probe.model.layout.prismatic]
+
+
+def _exchanged(probe: Probe, pair: tuple[int, int]) -> list[Explanation]:
+    """Return the readings that the position columns, or all columns, of two joints are exchanged.
+
+    Each joint is tested with its own torque, and with the torque of the other joint.
+    """
+    order = np.arange(len(probe.model.joints))
+    order[list(pair)] = pair[::-1]
+    moved = probe.with_motion((probe.q[:, order], probe.v[:, order], probe.a[:, order]))
+    share = _shares(moved, np.stack([probe.tau.T, probe.tau.T[order]], axis=2))
+    return [
+        Explanation("position_order", share[:, 0], pair),
+        Explanation("joint_order", share[order, 1], pair),
+    ]
+
+
+def _reversed(probe: Probe, j: int) -> list[Explanation]:
+    """Return the readings that the position of a joint is reversed, and its torque as well."""
+    other = probe.with_motion(_moved(probe, j, -1.0, 0.0))
+    share = _shares(other, np.stack([probe.tau.T, -probe.tau.T], axis=2))
+    is_j = np.arange(len(share)) == j
+    axis = Explanation("joint_axis", np.where(is_j, share[:, 1], share[:, 0]), (j,))
+    sign = Explanation("position_sign", share[:, 0], (j,))
+    return [sign, axis] if j in _revolute(probe) else [axis]
+
+
+def _offset(probe: Probe, j: int, offset: float) -> Explanation:
+    share = own_share(probe.with_motion(_moved(probe, j, 1.0, -offset)))
+    return Explanation("position_offset", share, (j,), (offset,))
+
+
+def _refined(probe: Probe, rough: Explanation) -> Explanation:
+    """Return the reading with the offset near a rough one that explains the torques best."""
+    from scipy.optimize import minimize_scalar
+
+    j, centre = rough.joints[0], rough.values[0]
+    found = minimize_scalar(
+        lambda offset: _offset(probe, j, float(offset)).misfit,
+        bounds=(centre - 0.4, centre + 0.4), method="bounded",
+        options={"xatol": 5e-3, "maxiter": 15},
+    )  # fmt: skip
+    return min(rough, _offset(probe, j, float(found.x)), key=lambda e: e.misfit)
+
+
+def _moved(probe: Probe, j: int, sign: float, offset: float) -> tuple[Array, Array, Array]:
+    q, v, a = probe.q.copy(), probe.v.copy(), probe.a.copy()
+    q[:, j] = sign * q[:, j] + offset
+    v[:, j] *= sign
+    a[:, j] *= sign
+    return q, v, a
+
+
+def own_share(probe: Probe, gravity: Array | None = None, any_load: bool = False) -> Array:
+    """Return the unexplained share of each joint's torque, shape (n,).
+
+    Args:
+        probe: The motion.
+        gravity: Gravity, shape (3,) [m/s^2]; the model's if None.
+        any_load: Whether the last link may have an additional load with any mass and any centre of
+            mass, in the model's gravity.
+    """
+    return _shares(probe, probe.tau.T[:, :, None], gravity, any_load)[:, 0]
+
+
+def _shares(
+    probe: Probe, torques: Array, gravity: Array | None = None, any_load: bool = False
+) -> Array:
+    """Return the unexplained shares of k torques per joint, (n, N, k), shape (n, k)."""
+    loads = probe.loads(gravity)
+    if any_load:
+        last = probe.last_body
+        loads = np.concatenate([loads, last, -last[:, :, 1:]], axis=2)
+    X = np.concatenate([loads, probe.drives], axis=2).swapaxes(0, 1)  # (n, N, c)
+    return _over(_misfits(X, torques), _variation(torques.swapaxes(0, 1)))
+
+
+def _over(left: Array, size: Array) -> Array:
+    """Return sums of squares over a size, at most 1; 0 if the size is 0."""
+    share = np.divide(left, size, out=np.zeros_like(size), where=size > 0)
+    return np.minimum(share, 1.0)
+
+
+def _variation(tau: Array) -> Array:
+    """Return the sum of squares of torques (N, ...) about their mean, 0 if constant."""
+    centred = tau - tau.mean(axis=0)
+    is_constant = np.ptp(tau, axis=0) <= _CONSTANT * np.abs(tau).max(axis=0)
+    return np.where(is_constant, 0.0, np.sum(centred**2, axis=0))
+
+
+def _misfits(X: Array, torques: Array) -> Array:
+    """Return the residual squares of torques, (n, N, k), by columns, (n, N, c), factors >= 0."""
+    from scipy.optimize import nnls
+
+    size = np.linalg.norm(X, axis=1, keepdims=True)
+    used = size > 1e-9 * size.max(axis=2, keepdims=True, initial=1e-300)
+    unit = np.divide(X, size, out=np.zeros_like(X), where=used)
+    R, c = _triangles(np.concatenate([unit, torques], axis=2)), X.shape[2]
+    left = [[nnls(R_j[:, :c], tau)[1] for tau in R_j[:, c:].T] for R_j in R]
+    return np.square(left)
+
+
+def _triangles(rows: Array) -> Array:
+    """Return the triangular factors of the rows of each joint, (n, N, c), shape (n, c, c)."""
+    return np.asarray(np.linalg.qr(rows, mode="r"))
+
+
+def _nonnegative_prediction(X: Array, tau: Array) -> Array:
+    """Return the prediction of a torque by columns with factors >= 0, shape (N,)."""
+    from scipy.optimize import nnls
+
+    size = np.linalg.norm(X, axis=0)
+    columns = X / np.where(size > 0, size, 1.0)
+    predicted: Array = columns @ nnls(columns, tau)[0]
+    return predicted

@@ -1,0 +1,454 @@
+"""Estimate of the delay of the torque relative to the position, from the model.
+
+The regressor is computed from a motion with three times the bandwidth. The same filter is then
+applied to torque and regressor, because a filter of only one of them looks like a delay.
+"""
+
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+
+from robotid.base.findings import Finding, log_finding
+from robotid.base.typing import Array
+from robotid.data.log import Log, Trajectory
+from robotid.data.signal_settings import SignalSettings
+from robotid.data.smoothing import low_pass
+from robotid.data.splines import cubic_spline
+from robotid.diagnosis.logs.torque_sample import coupled_columns, smooth_motion
+from robotid.dynamics.torque import carried_columns
+from robotid.robot.model import RobotModel
+
+__all__ = ["check_torque_delay"]
+
+_LONGEST = 0.1  # [s] largest delay of the grid
+_ROUNDING = 1e-10  # of the longest column: shorter columns are 0 except for rounding
+_DEPENDENT = 1e-5  # of the largest singular value: smaller ones are of dependent columns
+_GRID = np.linspace(-_LONGEST, _LONGEST, 81)
+_NEAR = 0.01  # [s] around the delay, where the misfit is a parabola
+_FINEST = 0.001  # [s] apparent delay by friction that the model does not describe
+_HELD = 0.1  # [samples] ... or by a zero-order hold of the torque
+_SIGNIFICANT = 3.0  # [standard errors] from which a delay is reported
+_DELAYED = 0.04  # [s] a longer delay must explain more: other model errors look like one, too
+_HELPS = 0.15  # least share of the unexplained torque that it must explain
+_FEW = 100  # least number of rows of a joint that is used
+_MOVING = 0.1  # least share of the instants in which it moves
+_SLOW = 0.05  # [rad/s] slower: a drive may be in stiction
+_STILL = 0.02  # [rad/s] width of the change of the direction of friction
+_AWAY = 0.75  # [periods of the filter] closer to a slow instant, friction is unknown
+_ROWS = 2000  # number of instants that are used
+_WINDOWS = 8  # number of segments with these instants in a long log
+_BLOCKS = 8  # number of blocks of the jackknife
+_OVERSAMPLED = 8.0  # instants per period of the filter: the regressor has a larger bandwidth
+# Cut-off of the comparison over the job's, and over the rate at most, since interpolation smooths
+# the noise at higher frequencies.
+_BAND = 1.5, 0.15
+_WIDE = 3.0, 0.4  # the same of the motion from which the regressor is computed
+_SETTLED = 1.5  # [periods of the filter] settling time of the filter at an end of a segment
+_HARMONICS = 4  # of a torque that is periodic in the position, as of gears and magnets
+_EXACT = 1e-5  # share of a torque that is noise even in an exact log
+# Least share of the unexplained torque that a joint's own delay must explain, and some of it in
+# each block of the log: friction and elasticity alone explain up to 0.71 with a long delay, and up
+# to 0.32 with one inside the half of the grid (honest recordings: 0.17)
+_EXPLAINS, _EXPLAINS_INSIDE = 0.75, 0.35
+# Difference from the others' delay below which the larger share is needed: [s], and [samples]
+_OWN, _ROWS_APART = 0.01, 1.5
+
+
+@dataclass(frozen=True, eq=False)
+class _Misfit:
+    """The unexplained part of each torque at each delay of the grid.
+
+    Attributes:
+        squares: Sums of squares in each block of the log, as shares of the joint's torque, shape
+            (n, blocks, delays).
+        rows: Number of instants of each joint, shape (n,).
+        joints: Names of these joints.
+        loaded: The same sums if friction also grows with the load, shape (n, blocks, delays); None:
+            not compared.
+    """
+
+    squares: Array
+    rows: Array
+    joints: tuple[str, ...]
+    loaded: Array | None = None
+
+    def delays_without(self, axis: int) -> list[float]:
+        """Return the delays of the jackknife over joints (axis 0) or blocks of the log (1)."""
+        parts = range(self.squares.shape[axis])
+        if axis == 0:
+            return [self.without({k}).delay() for k in parts]
+        return [replace(self, squares=np.delete(self.squares, k, axis=1)).delay() for k in parts]
+
+    @property
+    def is_of_load(self) -> bool:
+        """Whether friction by load, which looks like a delay, explains more than the delay."""
+        return self.loaded is not None and self.gain() < float(self.by_load(0.0).mean())
+
+    def by_load(self, delay: float) -> Array:
+        """Return the share of the unexplained torque that friction by load explains, shape (n,).
+
+        Args:
+            delay: The delay of the torque [s].
+        """
+        if self.loaded is None:
+            return np.zeros(len(self.squares))
+        now, then = (_at(delay, squares) for squares in (self.squares, self.loaded))
+        share: Array = 1.0 - (then.sum(axis=1) + _EXACT) / (now.sum(axis=1) + _EXACT)
+        return share
+
+    def without(self, left_out: Collection[int]) -> "_Misfit":
+        """Return the misfit of the joints that are not left out."""
+        used = [k for k in range(len(self.rows)) if k not in left_out]
+        names = tuple(self.joints[k] for k in used)
+        loaded = None if self.loaded is None else self.loaded[used]
+        return _Misfit(self.squares[used], self.rows[used], names, loaded)
+
+    def exceptions(self, step: float) -> dict[int, "_OwnDelay"]:
+        """Return the joints with a delay of their own, the clearest first.
+
+        Each is left out of the common delay with which the next ones are compared.
+        """
+        found: dict[int, _OwnDelay] = {}
+        while len(found) < len(self.joints) - 1:
+            names = [k for k in range(len(self.joints)) if k not in found]
+            rest = self.without(found)
+            delays = {k: rest.own_delay(i, step) for i, k in enumerate(names)}
+            distinct = [k for k, one in delays.items() if one.is_significant]
+            if not distinct:
+                break
+            clearest = max(distinct, key=lambda k: delays[k].explained)
+            found[clearest] = delays[clearest]
+        return found
+
+    def own_delay(self, k: int, step: float) -> "_OwnDelay":
+        """Return the delay that explains the torque of one joint best."""
+        others = self.without({k})
+        common = 0.0 if others.is_of_load else others.delay()
+        common = common if np.isfinite(common) else 0.0
+        squares = self.squares[k]
+        rests = [np.delete(squares, b, axis=0).sum(axis=0) for b in range(len(squares))]
+        delays = [float(_GRID[np.argmin(rest)]) for rest in rests]
+        pairs = list(zip(delays, squares, strict=True))
+        now = _at(common, squares)
+        then = np.array([_at(delay, block) for delay, block in pairs])
+        best = float(_GRID[np.argmin(squares.sum(axis=0))])
+        error = float(np.hypot(_GRID[1] - _GRID[0], np.sqrt((len(delays) - 1) * np.var(delays))))
+        explained = 1.0 - float((then.sum() + _EXACT) / (now.sum() + _EXACT))
+        is_better = bool(np.count_nonzero(then < now) >= len(now) - 1)
+        is_better = is_better and explained > float(self.by_load(common)[k])
+        is_distinct = bool(abs(best - common) > _SIGNIFICANT * error) and is_better
+        is_inside = abs(best) <= 0.5 * _LONGEST and abs(best - common) > max(
+            _OWN, _ROWS_APART * step
+        )
+        least = _EXPLAINS_INSIDE if is_inside else _EXPLAINS
+        return _OwnDelay(best, error, common, explained, is_distinct and explained > least)
+
+    def delay(self) -> float:
+        """Return the delay with the smallest misfit [s], NaN if it is at an end of the grid."""
+        share = self.squares.sum(axis=1) + _EXACT
+        # relative to the smallest of each joint: a joint that is explained well has more weight
+        cost = self.rows @ (share / share.min(axis=1, keepdims=True)) / self.rows.sum()
+        best = float(_GRID[np.argmin(cost)])
+        if abs(best) + _NEAR > _LONGEST:
+            return float("nan")
+        near = np.abs(_GRID - best) <= _NEAR
+        square, slope, _ = np.polyfit(_GRID[near] - best, cost[near], 2)
+        return best - float(slope / (2 * square)) if square > 0 else float("nan")
+
+    def error(self) -> float:
+        """Return the standard error of the delay [s]: jackknife over joints and over blocks."""
+        variance = 0.0
+        for delays in (self.delays_without(0), self.delays_without(1)):
+            variance += (len(delays) - 1) * float(np.var(delays))
+        return float(np.sqrt(variance))
+
+    def gain(self) -> float:
+        """Return the share of the unexplained torque that the delay of other blocks explains."""
+        blocks = zip(self.delays_without(1), np.swapaxes(self.squares, 0, 1), strict=True)
+        then = np.sum([_at(delay, block) for delay, block in blocks], axis=0)
+        now = _at(0.0, self.squares).sum(axis=1)
+        return float(1.0 - np.mean((then + _EXACT) / (now + _EXACT)))
+
+
+def _at(delay: float, values: Array) -> Array:
+    """Return values on the grid, shape (..., delays), at a delay of it, linear in between."""
+    k = min(max(int(np.searchsorted(_GRID, delay)), 1), len(_GRID) - 1)
+    share = (delay - _GRID[k - 1]) / (_GRID[k] - _GRID[k - 1])
+    found: Array = values[..., k - 1] + share * (values[..., k] - values[..., k - 1])
+    return found
+
+
+@dataclass(frozen=True)
+class _OwnDelay:
+    """The delay of one joint's torque [s], and its standard error.
+
+    Attributes:
+        common: Delay of the torques of the other joints [s].
+        explained: Share of the unexplained torque that the delay of the other blocks explains.
+        is_significant: Whether the delay differs from the common one.
+    """
+
+    delay: float
+    error: float
+    common: float
+    explained: float
+    is_significant: bool
+
+    def finding(self, joint: str, log: str) -> Finding:
+        """Return the finding that the torque of a joint has another delay."""
+        size = 1e3 * abs(self.delay)
+        is_end = abs(self.delay) >= _LONGEST - 1e-9
+        value = f"{size:.0f} ms or more" if is_end else f"{size:.0f} +- {1e3 * self.error:.0f} ms"
+        message = (
+            f"the torque of {joint} {'lags' if self.delay > 0 else 'leads'} the position by "
+            f"{value}, the torques of the other joints lag it by {1e3 * self.common:.0f} ms. The "
+            f"delay explains {100 * self.explained:.0f} % of the torque that the model does not "
+            f"explain; correct the time stamps or the filter of tau_{joint} in the logger, "
+            "because torque_delay shifts all joints"
+        )
+        evidence = {"delay": self.delay, "std_error": self.error, "gain": self.explained}
+        return log_finding(log, "joint_torque_delay", "warning", message, joint, **evidence)
+
+
+@dataclass(frozen=True, eq=False)
+class _Window:
+    """Filtered torques of contiguous rows of a motion, and the columns that may explain them.
+
+    Attributes:
+        inertial: Of the bodies that each joint carries, joint after joint, shape (N, columns).
+        drive: Of each joint's inertia, frictions and position, and of coupled drives, (N, n, k).
+        steady: Whether the drive is far from stiction, shape (N, n), bool.
+        delayed: Torques at each delay of the grid after the instants, shape (n, delays, N).
+        load: Friction that grows with the URDF's torque, per unit of its coefficient, (N, n).
+    """
+
+    inertial: Array
+    drive: Array
+    steady: Array
+    delayed: Array
+    load: Array
+
+
+def check_torque_delay(
+    model: RobotModel, log: Log, signals: SignalSettings, name: str
+) -> Iterator[Finding]:
+    """Yield the delay of the torque relative to the position: "torque_delay", at most once.
+
+    Before it, a warning "joint_torque_delay" per joint whose torque has another delay; this joint
+    is then not used for the common delay.
+
+    The delay minimises the unexplained part of the delayed torque. The model has, besides the
+    inertias, friction as an antisymmetric function of the speed, and a torque that is periodic in
+    the position. Instants near slow ones are not used. The standard error is the jackknife's over
+    the joints and over blocks of the log. The finding is a warning from three standard errors, if
+    the delay of the other blocks explains each block better. A delay of more than 40 ms must
+    explain at least 15 % of the unexplained torque.
+
+    Args:
+        model: The robot, with a fixed base.
+        log: The log, of the model's joints in its order.
+        signals: How it becomes a trajectory.
+        name: Name of the log.
+
+    Raises:
+        DataError: If the log is too short.
+        SettingsError: If a setting does not fit the log.
+    """
+    step = float(np.median(np.diff(log.t)))
+    rate = min(1 / step, signals.rate or np.inf)
+    # the comparison is filtered even if the job has no filter: see _BAND
+    times, most = _BAND
+    cutoff = min(times * (signals.cutoff or np.inf), most * rate)
+    times, most = _WIDE
+    wide = replace(signals, cutoff=signals.cutoff and min(times * signals.cutoff, most * rate))
+    motion = smooth_motion(model, log, wide)
+    misfit = _misfit(model, motion, replace(signals, cutoff=cutoff), 1 / cutoff)
+    if misfit is None:
+        return
+    own = misfit.exceptions(step)
+    if 2 * len(own) < len(misfit.joints):  # at most half of the joints are exceptions
+        yield from (own[k].finding(misfit.joints[k], name) for k in sorted(own))
+        misfit = misfit.without(own)
+    if len(misfit.joints) > 1:
+        yield from _common(misfit, step, signals, name)
+
+
+def _common(misfit: _Misfit, step: float, signals: SignalSettings, name: str) -> Iterator[Finding]:
+    """Yield the common delay of all torques, if it is determined."""
+    delay, error, gain = misfit.delay(), misfit.error(), misfit.gain()
+    if not np.isfinite([delay, error, gain]).all():
+        return
+    error = float(np.hypot(error, max(_FINEST, _HELD * step)))
+    is_significant = abs(delay) > _SIGNIFICANT * error and gain > (
+        _HELPS if abs(delay) > _DELAYED else 0.0
+    )
+    is_of_load = is_significant and misfit.is_of_load
+    is_significant = is_significant and not is_of_load
+    total = delay + signals.torque_delay
+    if is_of_load:
+        todo = (
+            ", but friction that grows with the load explains the torques better; no action needed"
+        )
+    elif not is_significant:
+        todo = ", which is not significant; no action needed"
+    elif gain > _HELPS:
+        todo = (
+            f". The delay explains {100 * gain:.0f} % of the torque that the model does not "
+            "explain; correct the logger's clock, or set "
+            f"torque_delay = {total:.4f} (--torque-delay {total:.4f})"
+        )
+    else:
+        todo = (
+            ". Unmodelled friction can look like this; if the drive filters its torque, "
+            f"set torque_delay = {total:.4f} (--torque-delay {total:.4f})"
+        )
+    message = (
+        f"the torque {'lags' if delay > 0 else 'leads'} the position by {1e3 * abs(delay):.1f} "
+        f"+- {1e3 * error:.1f} ms{todo}"
+    )
+    evidence = {"delay": delay, "std_error": error, "gain": gain}
+    yield log_finding(
+        name, "torque_delay", "warning" if is_significant else "note", message, **evidence
+    )
+
+
+def _misfit(
+    model: RobotModel, motion: Trajectory, signals: SignalSettings, period: float
+) -> _Misfit | None:
+    """Return the misfit of the joints that move enough, None if they are less than half of all."""
+    step = float(np.median(np.diff(motion.t)))
+    every = max(1, int(period / (step * _OVERSAMPLED)))
+    windows = [
+        _window(model, motion, part, step, every, signals, period)
+        for part in _segments(model, motion, every)
+    ]
+    ends = np.cumsum(model.support()[:, : model.layout.n_inertial].sum(axis=1)).tolist()
+    own = [slice(*pair) for pair in pairwise([0, *ends])]
+    found = [_squares(windows, j, part) for j, part in enumerate(own)] if windows else []
+    used = {j: one for j, one in enumerate(found) if one is not None}
+    if len(used) < max(2.0, len(own) / 2):
+        return None
+    squares, loaded, rows = zip(*used.values(), strict=True)
+    names = tuple(model.joints[j] for j in used)
+    return _Misfit(np.array(squares), np.array(rows, dtype=float), names, np.array(loaded))
+
+
+def _segments(model: RobotModel, motion: Trajectory, every: int) -> list[Array]:
+    """Return contiguous rows, of one segment each, spread over the motion."""
+    moving = np.flatnonzero((np.abs(motion.v) > _STILL * _units(model)).any(axis=1))
+    if len(moving) == 0:
+        return []
+    first, stop = int(moving[0]), int(moving[-1]) + 1
+    length = _ROWS * every // _WINDOWS
+    if stop - first > _WINDOWS * length:
+        starts = np.linspace(first, stop - length, _WINDOWS).astype(int)
+        chosen = [np.arange(start, start + length) for start in starts]
+    else:
+        chosen = [np.arange(first, stop)]
+    cuts = [np.flatnonzero(np.diff(motion.segment[rows])) + 1 for rows in chosen]
+    return [part for rows, at in zip(chosen, cuts, strict=True) for part in np.split(rows, at)]
+
+
+def _units(model: RobotModel) -> Array:
+    """Return the speed of each joint that counts as 1 rad/s, shape (n,)."""
+    speeds: Array = model.layout.drive_speeds[: len(model.joints)]
+    return speeds
+
+
+def _window(
+    model: RobotModel, motion: Trajectory, rows: Array, step: float, every: int,
+    signals: SignalSettings, period: float,
+) -> _Window:  # fmt: skip
+    """Return the filtered columns at every n-th of contiguous rows, without the ends."""
+    t, q, v, coarse = motion.t[rows], motion.q[rows], motion.v[rows] / _units(model), rows[::every]
+    edge = max(_LONGEST, _SETTLED * period)
+    inner = (motion.t[coarse] >= t[0] + edge) & (motion.t[coarse] <= t[-1] - edge)
+    # friction as an antisymmetric function of the speed and torques periodic in the position, so
+    # that they do not look like a delay; filtered before decimation, because friction jumps
+    top = np.maximum(np.abs(motion.v).max(axis=0) / _units(model), _STILL)
+    signs = [np.tanh(v / speed) for speed in (_STILL, 0.1 * top, 0.3 * top)]
+    waves = [wave(k * q) for k in range(1, 1 + _HARMONICS) for wave in (np.cos, np.sin)]
+    own = np.stack([motion.a[rows], v, *signs, v * np.abs(v), *waves], axis=2)
+    own = low_pass(own, 1 / step, signals)[::every][inner]
+    state = motion.q[coarse], motion.v[coarse], motion.a[coarse]
+    inertial, coupled = (columns(model, *state) for columns in (carried_columns, coupled_columns))
+    load = _interpolated(motion.t[coarse], np.abs(_of_urdf(model, inertial)), t) * signs[0]
+    load = low_pass(load, 1 / step, signals)[::every][inner]
+    inertial, coupled = (
+        low_pass(columns, 1 / (step * every), signals)[inner] for columns in (inertial, coupled)
+    )
+    at = motion.t[coarse[inner]]
+    is_reversal = np.diff(np.sign(v), axis=0, append=np.sign(v[-1:])) != 0
+    slow = is_reversal | (np.abs(v) < _SLOW)
+    steady = [_distance(at, t[slow[:, j]]) > _AWAY * period for j in range(v.shape[1])]
+    tau = low_pass(motion.tau[rows], 1 / step, signals)
+    delayed = np.moveaxis(_interpolated(t, tau, at + _GRID[:, None]), 2, 0)
+    drive = np.concatenate([own, coupled], axis=2)
+    return _Window(inertial, drive, np.column_stack(steady), delayed, load)
+
+
+def _of_urdf(model: RobotModel, carried: Array) -> Array:
+    """Return the torque of the URDF's bodies from ``carried_columns``, shape (N, n)."""
+    size = model.layout.n_inertial
+    support, pi = model.support()[:, :size], model.standard_parameters()[:size]
+    ends = np.cumsum(support.sum(axis=1))
+    weighted = np.cumsum(carried * np.concatenate([pi[row] for row in support]), axis=1)
+    torque: Array = np.diff(weighted[:, ends - 1], axis=1, prepend=0.0)
+    return torque
+
+
+def _interpolated(t: Array, values: Array, times: Array) -> Array:
+    """Return values, shape (N, n), at times of any shape, shape (..., n)."""
+    if len(t) < 2:
+        return np.empty((*times.shape, values.shape[1]))
+    return cubic_spline(t, values, times)
+
+
+def _distance(at: Array, slow: Array) -> Array:
+    """Return the distance of each time from the nearest slow instant, shape as at [s]."""
+    bounds = np.concatenate([[-np.inf], slow, [np.inf]])
+    after = np.searchsorted(bounds, at)
+    distance: Array = np.minimum(at - bounds[after - 1], bounds[after] - at)
+    return distance
+
+
+def _squares(windows: Sequence[_Window], j: int, own: slice) -> tuple[Array, Array, int] | None:
+    """Return the unexplained part of joint j's torque, and its instants.
+
+    Its inertial columns are ``own``. The parts have shape (blocks, delays); in the second one
+    friction grows with the load, too. None for a joint that moves in too few instants.
+    """
+    steady = [window.steady[:, j] for window in windows]
+    used = sum(map(np.count_nonzero, steady))
+    if used < max(_FEW, _MOVING * sum(map(len, steady))):
+        return None
+    pairs = list(zip(windows, steady, strict=True))
+    inertial = np.concatenate([window.inertial[at, own] for window, at in pairs])
+    drive = np.concatenate([window.drive[at, j] for window, at in pairs])
+    load = np.concatenate([window.load[at, j] for window, at in pairs])
+    tau = np.concatenate([window.delayed[j][:, at] for window, at in pairs], axis=1)
+    tau -= tau.mean(axis=1, keepdims=True)  # (delays, N)
+    size = np.einsum("dk,dk->d", tau, tau)
+    if size.min() <= 0:
+        return None
+    Q = _orthonormal(np.hstack([inertial, drive, np.ones((used, 1))]))
+    tau -= (tau @ Q) @ Q.T
+    blocks = np.array_split(tau, _BLOCKS, axis=1)
+    plain = np.array([np.einsum("dk,dk->d", b, b) for b in blocks]) / size
+    rest = load - Q @ (Q.T @ load)
+    if rest @ rest > _DEPENDENT**2 * load @ load:
+        tau -= np.outer(tau @ rest, rest / (rest @ rest))
+    return plain, np.array([np.einsum("dk,dk->d", b, b) for b in blocks]) / size, used
+
+
+def _orthonormal(X: Array) -> Array:
+    """Return an orthonormal basis of columns, (N, k), without those that are dependent."""
+    length = np.linalg.norm(X, axis=0)
+    is_excited = length > _ROUNDING * length.max()  # other columns are 0 except for rounding
+    X = X[:, is_excited] / length[is_excited]
+    squares, V = np.linalg.eigh(X.T @ X)
+    independent = squares > _DEPENDENT**2 * squares[-1]
+    basis: Array = X @ (V[:, independent] / np.sqrt(squares[independent]))
+    return basis

@@ -1,0 +1,362 @@
+"""Tests for recordings or URDFs that differ from what was stated: offsets, scales, clock, origins.
+
+Other masses cannot imitate any of these: each changes the predicted torque tau(q, v, a) in its own
+way. To first order, in all joints together,
+
+    tau_measured - tau = W delta + Z x + e,    Z = d tau / d x,
+
+where W delta is the effect of other base parameters. x is the size of the difference, with its
+standard error. It is refitted with one segment of the recordings held out after the other
+(``misfit``).
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+
+from robotid.base.findings import Finding, listed
+from robotid.base.typing import Array
+from robotid.data.log import Trajectory
+from robotid.diagnosis.residual.decisions import (
+    ALTERATION,
+    ALTERATION_P_VALUE,
+    ALTERATION_SHARE,
+    CONFIRMED,
+    SIGNIFICANT,
+    WEAK,
+    WEAK_P_VALUE,
+    WEAK_SIZE,
+)
+from robotid.diagnosis.residual.misfit import Misfit, find_misfits
+from robotid.diagnosis.residual.selection import Round, select
+from robotid.diagnosis.residual.term_trials import Sample, Trials, along
+from robotid.dynamics.prediction import body_slopes, drive_torque, inverse_dynamics
+from robotid.estimation.fitting.fitted import Fit
+from robotid.robot.model import RobotModel
+
+__all__ = ["explain_residual"]
+
+_Applied = Callable[[Array], tuple[RobotModel, Sequence[Trajectory]]]
+
+_STEP = 1e-5  # step of a finite difference [-, rad or m]
+_STEPS = 5  # Gauss-Newton steps of a size
+
+
+@dataclass(frozen=True, eq=False)
+class _Alteration:
+    """A possible difference from what was stated, with sizes x, 0 if there is none.
+
+    Attributes:
+        code: Code of the finding.
+        where: Joint concerned; empty for all of them.
+        Z: Torques of sizes of 1, shape (N, n, c).
+        least: Smallest size that changes a result.
+        words: Returns the finding's sentence for sizes (c,) and their standard errors (c,).
+        applied: Returns the robot and its motions with sizes (c,), if torques are nonlinear.
+    """
+
+    code: str
+    where: str
+    Z: Array
+    least: float
+    words: Callable[[Array, Array], str]
+    applied: _Applied | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class _Found:
+    """An alteration that was found: its finding, and the samples corrected by it."""
+
+    alteration: _Alteration
+    finding: Finding
+    there: Sample
+
+
+def explain_residual(
+    fit: Fit, sample: Sample | None
+) -> tuple[tuple[Misfit, ...], tuple[Finding, ...]]:
+    """Return the terms that drive models lack, and differences of recordings or URDF.
+
+    A spring and a position offset imitate each other: what explains more of the residual of all
+    joints together is accepted first, and the other hypotheses are tested again together with it.
+
+    Args:
+        fit: The fit.
+        sample: Samples of its recordings; None if there are too few for a test.
+
+    Returns:
+        For a robot with a fixed base, without loops and passive joints, else nothing: terms that
+        drive models lack, the largest first, and warnings "position_offset",
+        "lost_motion", "angle_scale", "torque_scale", "time_scale", "gravity" and "joint_origin",
+        the one that explains most of the residual first.
+    """
+    model = fit.model
+    if sample is None or model.free_flyer or model.constraints or model.passive:
+        return (), ()
+    misfits = find_misfits(sample)
+    own = list(_alterations(model, fit.standard, sample))
+    found = list(_found(fit, sample, own))
+    if misfits and found:
+        altered = np.concatenate([one.alteration.Z for one in found], axis=2)
+        lacking = _columns(misfits, sample)
+        if _left(sample, altered) < _left(sample, lacking):
+            alone = {(misfit.joint, misfit.term.code) for misfit in misfits}
+            remaining = find_misfits(found[0].there.with_columns(altered))
+            misfits = tuple(m for m in remaining if (m.joint, m.term.code) in alone)
+        else:
+            among = {one.alteration for one in found}
+            retested = _found(fit, sample.with_columns(lacking), own)
+            found = [one for one in retested if one.alteration in among]
+    return misfits, tuple(one.finding for one in found)
+
+
+def _columns(misfits: Sequence[Misfit], sample: Sample) -> Array:
+    """Return the columns of terms that drive models lack, shape (N, n, c)."""
+    columns = []
+    for misfit in misfits:
+        j = sample.joints.index(misfit.joint)
+        of_joint = misfit.term.columns(sample.motions[j])  # (N, k)
+        only = np.eye(len(sample.joints))[j]
+        columns.append(only[None, :, None] * of_joint[:, None, :])
+    return np.concatenate(columns, axis=2)
+
+
+def _left(sample: Sample, Z: Array) -> float:
+    """Return the squared residual of held-out segments with columns added."""
+    left = Trials(sample, Z).held_out.left(list(range(Z.shape[2])))
+    return float(left[: sample.fitted].sum())
+
+
+def _refined(applied: _Applied, x: Array, pi: Array, sample: Sample) -> tuple[Array, Array, Sample]:
+    """Return the sizes of an alteration, their standard errors, and the samples corrected by it.
+
+    Torques are nonlinear over a tenth of a radian: Gauss-Newton steps are repeated until the sizes
+    converge.
+
+    Args:
+        applied: Returns the robot and its motions with sizes (c,).
+        x: The sizes to first order, shape (c,).
+        pi: Standard parameters of the estimate, shape (p,).
+        sample: Samples of the recordings.
+    """
+    every, error = list(range(len(x))), np.full(len(x), np.inf)
+    for _ in range(_STEPS):
+        model, at = applied(x)
+        tau = _torques(model, pi, at)
+        sample = along(sample, model, at, tau)
+        beyond = [applied(x + _STEP * axis) for axis in np.eye(len(x))]
+        moved = [_torques(model, pi, at) for model, at in beyond]
+        Z = (np.stack(moved, axis=-1) - tau[..., None]) / _STEP
+        step, covariance = Trials(sample, Z).whole.estimate(every, sample.fitted)
+        x, error = x + step, np.sqrt(np.diag(covariance))
+        if np.linalg.norm(step) < 0.1 * np.linalg.norm(error):
+            break
+    return x, error, sample
+
+
+def _alterations(model: RobotModel, pi: Array, sample: Sample) -> Iterator[_Alteration]:
+    """Yield the possible differences, with their effect on the torques of the sample."""
+    n = len(model.joints)
+    tau, of_drives = _torques(model, pi, sample.at), _drives(model, pi, sample.at)
+    of_motions = [body_slopes(model, pi, motion).arrays for motion in sample.at]
+    *by_motion, by_gravity, by_origin = map(np.concatenate, zip(*of_motions, strict=True))
+    q, v, a = (np.concatenate([getattr(m, key) for m in sample.at]) for key in "qva")
+
+    def moved(scale: Array, shift: Array) -> Array:
+        """Return the derivative of the torques for positions (1 + e scale) q + e shift by e."""
+        factor = 1.0 + _STEP * scale
+        change = [
+            replace(m, q=factor * m.q + _STEP * shift, v=factor * m.v, a=factor * m.a)
+            for m in sample.at
+        ]
+        Z: Array = (_drives(model, pi, change) - of_drives)[..., None] / _STEP
+        for D, x in zip(by_motion, (scale * q + shift, scale * v, scale * a), strict=True):
+            Z += D @ x[..., None]
+        return Z
+
+    def offset(joint: int, x: Array) -> tuple[RobotModel, Sequence[Trajectory]]:
+        """Return the motions with x added to the position of a joint."""
+        return model, [replace(m, q=m.q + x * np.eye(n)[joint]) for m in sample.at]
+
+    for j, joint in enumerate(model.joints):
+        only, none = np.eye(n)[j], np.zeros(n)
+        unit = "m" if joint in model.layout.prismatic else "rad"
+        applied = partial(offset, j)
+        Z = moved(none, only)
+        yield _Alteration("position_offset", joint, Z, 0.01, _zero(joint, unit), applied)
+        backlash = 0.5 * Z * sample.motions[j].direction[:, None, None]
+        yield _Alteration("lost_motion", joint, backlash, 0.005, _lost_motion(joint, unit))
+        yield _Alteration("angle_scale", joint, moved(only, none), 0.02, _scale(f"q_{joint}"))
+        if sample.torque[j]:  # a torque of 0 has no scale
+            yield _Alteration("torque_scale", joint, (tau * only)[..., None], 0.05, _gain(joint))
+    for first in range(1, n - 1):  # the drives of a wrist are of the same type
+        names = listed(model.joints[first:])
+        Z = (tau * (np.arange(n) >= first))[..., None]
+        yield _Alteration("torque_scale", ", ".join(model.joints[first:]), Z, 0.05, _gains(names))
+    every = moved(np.ones(n), np.zeros(n))
+    yield _Alteration("angle_scale", "", every, 0.02, _scale("every position"))
+    bodies = np.where(np.arange(len(pi)) < model.layout.n_inertial, pi, 0.0)
+    still = [replace(m, v=0.0 * m.v, a=0.0 * m.a) for m in sample.at]
+    inertial = tau - of_drives - _torques(model, bodies, still)
+    yield _Alteration("time_scale", "", inertial[..., None], 0.04, _clock)
+    down = np.array(model.pin_model.gravity.linear)
+    if down.any():
+        across = np.linalg.svd(down[None])[2][1:]  # two directions perpendicular to gravity
+
+        def tilted(x: Array) -> tuple[RobotModel, Sequence[Trajectory]]:
+            return model.with_gravity(_tilted(x, across, down)), sample.at
+
+        Z = by_gravity @ (np.linalg.norm(down) * across).T
+        yield _Alteration("gravity", "", Z, 0.05, _tilt(across, down), tilted)
+    for j, joint in enumerate(model.joints):
+        yield _Alteration("joint_origin", joint, by_origin[:, :, j], 0.01, _origin(joint))
+    anywhere = by_origin.reshape(len(tau), n, -1)
+    yield _Alteration("joint_origin", "", anywhere, 0.01, _origin("a joint"))
+
+
+def _torques(model: RobotModel, pi: Array, at: Sequence[Trajectory]) -> Array:
+    """Return the torques of motions by standard parameters, shape (N, n)."""
+    return np.concatenate([inverse_dynamics(model, pi, motion) for motion in at])
+
+
+def _drives(model: RobotModel, pi: Array, at: Sequence[Trajectory]) -> Array:
+    """Return the torques of drives in motions, shape (N, n)."""
+    return np.concatenate([drive_torque(model, pi, motion) for motion in at])
+
+
+def _tilted(x: Array, across: Array, down: Array) -> Array:
+    """Return gravity rotated towards two perpendicular axes, by tangents x of angles (2,)."""
+    size = np.linalg.norm(down)
+    tilted = down + size * x @ across
+    return np.asarray(tilted * size / np.linalg.norm(tilted))
+
+
+def _found(fit: Fit, sample: Sample, own: Sequence[_Alteration]) -> Iterator[_Found]:
+    """Yield the alterations that explain the residual, each together with those found before."""
+    Z = np.concatenate([alteration.Z for alteration in own], axis=2)
+    ends = np.cumsum([alteration.Z.shape[2] for alteration in own]).tolist()
+    place = [list(range(end - a.Z.shape[2], end)) for a, end in zip(own, ends, strict=True)]
+    trials = Trials(sample, Z)
+    held_out, whole = trials.held_out, trials.whole
+    chosen: list[int] = []
+    total = before = held_out.left([])
+    of_fitted, of_validation = (float(part.sum()) for part in np.split(total, [sample.fitted]))
+    untried = dict(zip(own, place, strict=True))
+
+    def offered() -> Round[_Alteration]:
+        left = held_out.left_each({one: [*chosen, *which] for one, which in untried.items()})
+        return Round(before, left, sample.fitted, of_fitted)
+
+    for this, best in select(offered, ALTERATION, _complexity):
+        if best is None:
+            return
+        gain = float((before - this.left[best])[sample.fitted :].sum())
+        confirmed = gain / max(of_validation, 1e-300)
+        share, by_p_value = this.share(best), this.p_value(best)
+        has_validation, is_weak = len(total) > sample.fitted, share < ALTERATION_SHARE
+        is_confirmed = not has_validation or confirmed > CONFIRMED * share
+        if is_weak:
+            is_confirmed = has_validation and confirmed > share > WEAK and by_p_value < WEAK_P_VALUE
+        if by_p_value > ALTERATION_P_VALUE or not is_confirmed:
+            return
+        which = untried.pop(best)
+        chosen, before = [*chosen, *which], this.left[best]
+        sizes, covariance = whole.estimate(chosen, sample.fitted)
+        size, error = (x[-len(which) :] for x in (sizes, np.sqrt(np.diag(covariance))))
+        least = best.least * (WEAK_SIZE if is_weak else 1.0)
+        if np.linalg.norm(size) < max(least, SIGNIFICANT * float(np.linalg.norm(error))):
+            return
+        there = sample
+        if best.applied is not None and len(chosen) == len(which):
+            size, error, there = _refined(best.applied, size, fit.standard, sample)
+        others = [one for one in this.alike(ALTERATION) if one is not best]
+        yield _Found(best, _finding(best, size, error, share, others), there)
+
+
+def _complexity(one: _Alteration) -> tuple[int, int]:
+    """Return the number of sizes of an alteration, and the number of joints it names."""
+    return one.Z.shape[2], one.where.count(",")
+
+
+def _finding(
+    found: _Alteration, size: Array, error: Array, share: float, alike: Sequence[_Alteration]
+) -> Finding:
+    others = [f"{one.code} of {one.where}" for one in alike if one.where]
+    also = f"; {listed(others)} would explain the same share" if others else ""
+    message = (
+        f"{found.words(size, error)}. This explains {100 * share:.0f} % of the squared residual, "
+        f"which other masses and friction do not explain{also}"
+    )
+    evidence = {
+        "size": float(size[0] if len(size) == 1 else np.linalg.norm(size)),
+        "std_error": float(np.linalg.norm(error)),
+        "share_pct": 100 * share,
+    }
+    return Finding(found.code, "warning", found.where or "all joints", message, evidence)
+
+
+def _zero(joint: str, unit: str) -> Callable[[Array, Array], str]:
+    return lambda x, error: (
+        f"{joint}: position offset {-x[0]:.3g} +- {error[0]:.2g} {unit}: correct q_{joint}, or the "
+        "joint's origin in the URDF"
+    )
+
+
+def _lost_motion(joint: str, unit: str) -> Callable[[Array, Array], str]:
+    return lambda x, error: (
+        f"{joint}: its position differs by {abs(x[0]):.2g} +- {error[0]:.1g} {unit} between the "
+        "directions of motion: backlash between the joint and its encoder; remove the backlash, or "
+        "log the position of an encoder on the joint"
+    )
+
+
+def _scale(what: str) -> Callable[[Array, Array], str]:
+    return lambda x, error: (
+        f"{what} fits best with a factor of {1 + x[0]:.3f} +- {error[0]:.2g}: check the unit, the "
+        "gear ratio and the encoder counts per revolution"
+    )
+
+
+def _gain(joint: str) -> Callable[[Array, Array], str]:
+    return lambda x, error: (
+        f"{joint}: its torque is about {1 + x[0]:.2f} (+- {error[0]:.1g}) times the value that the "
+        f"other joints indicate: check its gain and gear ratio (--gain {joint}=...)"
+    )
+
+
+def _gains(joints: str) -> Callable[[Array, Array], str]:
+    return lambda x, error: (
+        f"{joints}: their torques are {'at least' if x[0] > 0 else 'at most'} {1 + x[0]:.2f} (+- "
+        f"{error[0]:.1g}) times the values that the joints before them indicate: check their gains "
+        "and gear ratios (--gain JOINT=...)"
+    )
+
+
+def _clock(x: Array, error: Array) -> str:
+    return (
+        f"inertial torques are {1 + x[0]:.3f} +- {error[0]:.2g} times the value that gravity "
+        f"indicates: the time stamps run {np.sqrt(max(1 + x[0], 0.0)):.3f} times as fast as the "
+        "clock, or the stated gravity is wrong"
+    )
+
+
+def _tilt(across: Array, down: Array) -> Callable[[Array, Array], str]:
+    def words(x: Array, error: Array) -> str:
+        tilted = _tilted(x, across, down)
+        angle, std_error = (np.degrees(np.arctan(np.linalg.norm(size))) for size in (x, error))
+        shown = ", ".join(f"{value:.2f}" for value in tilted)
+        return (
+            f"gravity is tilted by about {angle:.2g} +- {std_error:.1g} degrees from the stated "
+            f"direction: if the base is not level, set gravity = [{shown}] in the job file"
+        )
+
+    return words
+
+
+def _origin(joint: str) -> Callable[[Array, Array], str]:
+    return lambda x, error: (
+        f"{joint}: its origin differs by {np.linalg.norm(x):.2g} +- {np.linalg.norm(error):.1g} m "
+        "from the URDF's: check that the URDF is of this robot"
+    )

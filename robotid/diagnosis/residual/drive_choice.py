@@ -1,0 +1,607 @@
+"""Selection of the terms of each joint's drive: the fewest that explain held-out segments.
+
+Terms are added to viscous and Coulomb friction, joint by joint, on samples spread over the fitted
+logs. The family that explains most of the held-out segments is selected if it is significant, then
+the next one together with it, until no family improves the fit. Validation logs are not used.
+Where the prior binds the bodies, those of least squares replace them: a wrong prior does not become
+friction, and a term that inertia explains as well has no gain.
+
+The nonlinear parameters of a family, its shape, are searched on a grid. Then all shapes of a joint
+are refined together, with the linear parameters refitted in each step (variable projection, Golub,
+Pereyra 2003).
+
+Where constraint forces were eliminated, the torque of a drive appears in the rows of other joints,
+too. The families of each joint are then selected again together with those of the others.
+"""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import product
+
+import numpy as np
+
+from robotid.base.exceptions import SettingsError
+from robotid.base.findings import listed
+from robotid.base.typing import Array
+from robotid.diagnosis.residual.decisions import (
+    AT_BOUND,
+    FAMILY,
+    FAMILY_LEAST,
+    GROWN,
+    TENFOLD,
+    UNDECIDED_P_VALUE,
+)
+from robotid.diagnosis.residual.selection import Round, select
+from robotid.diagnosis.residual.term_trials import RIDGE, Sample, Trial, Trials, take_sample
+from robotid.dynamics.memory import drive_motion_along
+from robotid.estimation.fitting.fitted import Solution
+from robotid.estimation.fitting.selected_drives import DriveChoice, FoundShape, Tried, with_shapes
+from robotid.robot.drives import FAMILIES, DataRange, DriveMotion, DriveTerm, Family, MemorylessTerm
+
+__all__ = ["choose_drives"]
+
+_GRID = 6  # values of a shape tested between its bounds
+_SPAN = 100.0  # largest over smallest of them; an upper bound beyond is also tested
+_SLOWEST = 0.0  # share of samples slower than the data range
+_REVOLUTION = 2 * np.pi  # [rad]
+_ROUNDING = 1e-10  # share of a column below which it is rounding: the ridge of shapes
+_STEP = 1e-3  # relative step of a finite difference
+_STEPS = 40  # iterations of the search for all shapes of a joint together
+_SHARPEST = 1e-6  # of the squared residual: lower limit for weights, for exact data
+_NOTHING = 1e-300
+_LOADED = ("load", "lag")  # families that depend on the torque of the drive
+
+
+@dataclass(frozen=True, eq=False)
+class _Drive:
+    """A joint's drive along the samples."""
+
+    is_prismatic: bool
+    has_load: bool  # whether its torque is known, with no unknown force of a contact or loop
+    motions: tuple[DriveMotion, ...]  # of each recording, all its samples
+    taken: tuple[Array, ...]  # indices of the samples in each recording
+    data_range: DataRange
+    largest: float  # largest absolute torque in the samples [N m or N]
+    plain: Mapping[str, Array]  # columns of U of its plain parameters, by name
+    known: dict[DriveTerm, Array] = field(default_factory=dict)  # columns of terms, (N,)
+
+    def columns(self, terms: Sequence[DriveTerm]) -> Array:
+        """Return the columns of terms in the samples, shape (N, c)."""
+        Z = np.empty((sum(map(len, self.taken)), len(terms)))
+        for k, term in enumerate(terms):
+            if term not in self.known:
+                along = zip(self.motions, self.taken, strict=True)
+                self.known[term] = np.concatenate([term.column(m)[rows] for m, rows in along])
+            Z[:, k] = self.known[term]
+        return Z
+
+
+def choose_drives(
+    fit: Solution,
+    wanted: Mapping[str, Sequence[str] | None],
+    balanced: Mapping[str, str] | None = None,
+) -> tuple[DriveChoice, ...]:
+    """Return the terms of each joint's drive.
+
+    Args:
+        fit: The fit with viscous and Coulomb friction only.
+        wanted: Families stated for each joint, by name; None: those that held-out segments of the
+            fitted logs require; see ``wanted_families``.
+        balanced: Family of a suspected counterbalance of joints whose families are selected. It is
+            selected as any other, or if no standard error increases: where only the URDF's masses
+            distinguish it from gravity, it has no gain.
+
+    Returns:
+        A choice per joint; none for a joint that hardly moved, or if the logs are too short.
+    """
+    sample = take_sample(fit, for_drives=True, is_free=True)
+    if sample is None:
+        return ()
+    drives, choices = _drives(fit, sample, wanted), dict[str, DriveChoice]()
+    bound = take_sample(fit, for_drives=True) if balanced else None
+
+    def choose(j: int, together: Sample) -> None:
+        joint = sample.joints[j]
+        names, alone, drive = wanted[joint], together.of_joint(j), drives[j]
+        if names is not None:
+            choices[joint] = _fixed(alone, drive, names)
+            return
+        suspected = [FAMILIES[balanced[joint]]] if balanced and joint in balanced else []
+        first = list(_candidates(drive, suspected))
+        if bound is not None and first:
+            own = bound.of_joint(j)
+            grown = _grown(_reweighted(own, drive, first), drive, first)
+            first = first if max(grown.values(), default=1.0) < GROWN else []
+        choices[joint] = _auto(alone, drive, suspected, first)
+
+    for j in drives:
+        choose(j, sample)
+    if sample.basis is not None:
+        _choose_together(sample, drives, choices, choose)
+    return tuple(choices.values())
+
+
+def _choose_together(
+    sample: Sample,
+    drives: Mapping[int, _Drive],
+    choices: Mapping[str, DriveChoice],
+    choose: Callable[[int, Sample], None],
+) -> None:
+    """Select the terms of each joint again, together with those of all others."""
+    chosen = {j: choices[sample.joints[j]].terms for j in drives}
+    chosen = {j: terms for j, terms in chosen.items() if terms}
+    if len(chosen) < 2:
+        return
+    first, size = sample.W.shape[1] - len(sample.joints), sample.W.shape[2]
+    owner = np.repeat(list(chosen), [len(terms) for terms in chosen.values()])
+    Z = np.zeros((*sample.r.shape, len(owner)))
+    for j, terms in chosen.items():
+        Z[:, first + j, owner == j] = drives[j].columns(terms)
+    together = sample.with_columns(Z)
+    for j in chosen:
+        others = [k for k in chosen if k != j and choices[sample.joints[k]].terms]
+        which = np.append(np.arange(size), size + np.flatnonzero(np.isin(owner, others)))
+        choose(j, together.with_some_columns(which))
+
+
+def _drives(
+    fit: Solution, sample: Sample, wanted: Mapping[str, Sequence[str] | None]
+) -> dict[int, _Drive]:
+    """Return the drives whose families are stated or selected, by the index of their joint."""
+    model = fit.model.with_reference(sample.standard)
+    motions = [drive_motion_along(model, x.trajectory) for x in sample.recordings]
+    is_free, first = sample.basis is None, sample.weight.shape[1] - len(sample.joints)
+    largest = np.concatenate(
+        [motion.tau[:, first:] for motion in sample.at]
+        if is_free
+        else [x.log.tau for x in sample.recordings]  # with torques of constraint forces
+    )
+    used = sample.weight[:, first:] > 0
+    drives = {}
+    for j, joint in enumerate(sample.joints):
+        names = wanted[joint]
+        if not used[:, j].any() or (names is not None and not names) or joint in fit.model.passive:
+            continue
+        own = tuple(motion.of(j) for motion in motions)
+        data_range = _range_of(own, sample.taken, used[:, j])
+        plain = {
+            name: sample.U[:, k]
+            for k, name in enumerate(fit.mapping.base_names)
+            if name.startswith(f"{joint}.")
+        }
+        drives[j] = _Drive(
+            bool(sample.is_prismatic[j]), is_free, own, sample.taken, data_range,
+            float(np.abs(largest[:, j]).max()), plain,
+        )  # fmt: skip
+    return drives
+
+
+def _range_of(motions: Sequence[DriveMotion], taken: Sequence[Array], used: Array) -> DataRange:
+    """Return the ranges of position and of absolute velocity in the used samples."""
+    own = [(m.q[rows], m.v[rows]) for m, rows in zip(motions, taken, strict=True)]
+    q, v = (np.concatenate(x)[used] for x in zip(*own, strict=True))
+    speed = np.abs(v)
+    return {
+        "q": (float(q.min()), float(q.max())),
+        "v": (float(np.quantile(speed, _SLOWEST)), float(speed.max())),
+    }
+
+
+def _candidates(drive: _Drive, families: Sequence[Family]) -> Iterator[tuple[Family, list[float]]]:
+    """Yield families with every shape on its grid."""
+    for family in families:
+        revolutions = (drive.data_range["q"][1] - drive.data_range["q"][0]) / _REVOLUTION
+        bounds = [shape.within(drive.data_range) for shape in family.shapes]
+        if family.needs and (drive.is_prismatic or revolutions < family.needs):
+            continue
+        if not all(0.0 < low < high for low, high in bounds):  # it hardly moved
+            continue
+        grids = [_sizes(*pair) for pair in bounds]
+        terms = family.make(drive.data_range, *[float(sizes[0]) for sizes in grids])
+        if not drive.has_load and any(term.needs_load for term in terms):
+            continue
+        yield from ((family, [float(x) for x in sizes]) for sizes in product(*grids))
+
+
+def _sizes(low: float, high: float) -> Array:
+    """Return the tested values of a shape."""
+    own = np.geomspace(low, min(high, _SPAN * low), _GRID)
+    return own if own[-1] >= high else np.append(own, high)
+
+
+@dataclass(frozen=True, eq=False)
+class _Options:
+    """Candidates of a joint, with every shape on the grid, and their residuals."""
+
+    own: list[tuple[Family, list[float]]]
+    place: list[list[int]]  # columns of each
+    is_positive: Array  # columns whose parameter cannot be negative, bool
+    highest: Array  # upper bounds of their parameters
+    trials: Trials
+
+    @classmethod
+    def of(cls, sample: Sample, drive: _Drive, own: list[tuple[Family, list[float]]]) -> "_Options":
+        terms = [family.make(drive.data_range, *sizes) for family, sizes in own]
+        ends = np.cumsum([len(those) for those in terms]).tolist()
+        place = [list(range(e - len(those), e)) for those, e in zip(terms, ends, strict=True)]
+        flat = [term for those in terms for term in those]
+        positive = np.array([term.is_nonnegative for term in flat], dtype=bool)
+        highest = np.array([min(x.highest, drive.largest / _amplitude(drive, x)) for x in flat])
+        return cls(own, place, positive, highest, _trials(sample, drive, flat))
+
+    def left(self, chosen: Sequence[int]) -> Array:
+        """Return the squared residual of each segment with some candidates."""
+        return self.trials.held_out.left(self._columns(chosen))
+
+    def left_each(self, retained: Mapping[int, Sequence[int]]) -> dict[int, Array]:
+        """Return the squared residual of each segment with each candidate and some others.
+
+        Only of candidates with physical parameters: friction opposes motion and is below the
+        largest torque of the joint.
+        """
+        columns = {i: self._columns([*others, i]) for i, others in retained.items()}
+        theta = self.trials.whole.parameters_each(columns)
+        possible = {
+            i: which
+            for i, which in columns.items()
+            if (theta[i][self.is_positive[which]] >= 0).all()
+            and (np.abs(theta[i]) <= self.highest[which]).all()
+        }
+        return self.trials.held_out.left_each(possible)
+
+    def _columns(self, chosen: Sequence[int]) -> list[int]:
+        return [k for i in chosen for k in self.place[i]]
+
+
+def _trials(
+    sample: Sample, drive: _Drive, terms: Sequence[DriveTerm], ridge: float = RIDGE
+) -> Trials:
+    """Return the trials of terms of a drive."""
+    return Trials(sample, drive.columns(terms)[:, None], ridge)
+
+
+def _amplitude(drive: _Drive, term: DriveTerm) -> float:
+    """Return the largest value of a curve of velocity; next to 0 for another term.
+
+    At low speed the filter reduces the sign of the velocity and hides the amplitude of the curve.
+    """
+    if term.guards != "v" or not isinstance(term, MemorylessTerm):
+        return _NOTHING
+    v = np.linspace(*drive.data_range["v"], 50)
+    return float(np.abs(term.amplitude(np.zeros_like(v), v)).max()) + _NOTHING
+
+
+def _auto(
+    sample: Sample,
+    drive: _Drive,
+    suspected: Sequence[Family] = (),
+    known: Sequence[tuple[Family, list[float]]] = (),
+) -> DriveChoice:
+    """Return the fewest families that held-out segments require together with known ones."""
+    automatic = [f for f in FAMILIES.values() if f.is_automatic]
+    grid = list(_candidates(drive, [*automatic, *suspected]))
+    start = _reweighted(sample, drive, known)
+    every = _Options.of(start, drive, [*known, *grid])
+    torque = float(start.torque[0])
+    chosen = list(range(len(known)))
+    undecided: list[tuple[Family, list[float]]] = []
+    before = every.left(chosen)
+    retained: dict[int, list[int]] = {}
+    names = tuple(family.name for family, _ in known)
+    tried = [Tried(names, _percent(before, torque), 1.0, True)]
+
+    def offered() -> Round[int]:
+        nonlocal retained
+        retained = _retained(every, chosen, len(known))
+        left = every.left_each(retained)
+        whole = float(before.sum())
+        return Round(before, left, len(before), whole, FAMILY_LEAST**2 * torque)
+
+    def cost(i: int) -> tuple[int, int]:
+        return _simplicity(every, i)
+
+    for this, best in select(offered, FAMILY, cost):
+        found = None
+        if best is not None:
+            found = _conditioned(sample, drive, every, this, retained, best)
+            best = found.number
+        tried += list(_considered(every, this, torque, retained, best))
+        if found is None or best is None:
+            nearest = min(this.left, key=lambda i: float(this.left[i].sum()), default=None)
+            if nearest is not None and this.p_value(nearest) < UNDECIDED_P_VALUE:
+                undecided = [every.own[nearest]]
+            break
+        own = found.own
+        known = known if set(chosen) <= set(retained[best]) else ()
+        weighted = found.weighted
+        every, torque = _Options.of(weighted, drive, [*own, *grid]), float(weighted.torque[0])
+        chosen = list(range(len(own)))
+        before = every.left(chosen)
+    choice = _found(sample, drive, [every.own[i] for i in chosen], tuple(tried))
+    return replace(choice, undecided=_terms(drive, undecided))
+
+
+def _retained(every: _Options, chosen: Sequence[int], known: int) -> dict[int, list[int]]:
+    """Return the chosen candidates that remain with each candidate that may be added.
+
+    A joint has one family of each kind. Only families given before the selection are replaced.
+    """
+    groups = [_group(every.own[k][0]) for k in chosen]
+    return {
+        i: [k for k, group in zip(chosen, groups, strict=True) if group != _group(family)]
+        for i, (family, _) in enumerate(every.own)
+        if i not in chosen and _group(family) not in groups[known:]
+    }
+
+
+def _group(family: Family) -> str:
+    """Return the kind of a family; a joint has one family of each kind."""
+    return family.name.rstrip("0123456789")
+
+
+def _simplicity(every: _Options, i: int) -> tuple[int, int]:
+    """Return the number of columns of a candidate, and the place of its family in their order."""
+    return len(every.place[i]), list(FAMILIES).index(every.own[i][0].name)
+
+
+@dataclass(frozen=True, eq=False)
+class _Refined:
+    """A candidate together with those chosen, with shapes refined between the grid's values."""
+
+    number: int
+    own: list[tuple[Family, list[float]]]  # those chosen and the candidate
+    weighted: Sample  # the samples with weights from the residual with these
+    faults: tuple[bool, bool]  # a shape is at its bound, a standard error increases tenfold
+
+
+def _conditioned(
+    sample: Sample,
+    drive: _Drive,
+    every: _Options,
+    this: Round[int],
+    retained: Mapping[int, Sequence[int]],
+    best: int,
+) -> _Refined:
+    """Return the best candidate, or an equally good and better conditioned one of another family.
+
+    Equally good: its residual of held-out segments is not larger than that of the best, within the
+    standard error of the difference. Better conditioned: no shape is at its bound, or no term
+    increases the standard error of another parameter of the drive tenfold, unlike the best.
+    """
+
+    def refined(i: int) -> _Refined:
+        own = _refined(sample, drive, [every.own[k] for k in (*retained[i], i)])
+        weighted = _reweighted(sample, drive, own)
+        is_grown = max(_grown(weighted, drive, own).values(), default=1.0) > TENFOLD
+        return _Refined(i, own, weighted, (bool(_at_bound(drive, own).any()), is_grown))
+
+    def left_of(other: _Refined) -> Array:
+        return _Options.of(sample, drive, other.own).left(range(len(other.own)))
+
+    first = refined(best)
+    if not any(first.faults):
+        return first
+    by_family: dict[str, int] = {}
+    left, whole = this.left, float(this.before.sum())
+    for i in sorted(left, key=lambda i: float(left[i].sum())):
+        by_family.setdefault(every.own[i][0].name, i)
+    by_family.pop(every.own[best][0].name)
+    others = [refined(i) for i in by_family.values() if left[i].sum() < whole]
+    better = [other for other in others if other.faults < first.faults]
+    least, slack = left_of(first), FAMILY.alike * whole
+    alike = [other for other in better if _is_alike(least, left_of(other), slack)]
+    return min((first, *alike), key=lambda x: (x.faults, *_simplicity(every, x.number)))
+
+
+def _is_alike(best: Array, other: Array, slack: float) -> bool:
+    """Return whether residuals are equal within a slack or the scatter of their difference."""
+    more = other - best
+    scatter = np.sqrt(len(more)) * float(np.std(more, ddof=1))
+    return bool(float(more.sum()) <= max(slack, scatter))
+
+
+def _considered(
+    every: _Options,
+    this: Round[int],
+    torque: float,
+    retained: Mapping[int, Sequence[int]],
+    best: int | None,
+) -> Iterator[Tried]:
+    """Yield the error that each family would give at its best shape."""
+    by_family: dict[str, int] = {}
+    left = this.left
+    for i, after in left.items():
+        name = every.own[i][0].name
+        if i == best or (
+            by_family.get(name, i) != best and after.sum() <= left[by_family.get(name, i)].sum()
+        ):
+            by_family[name] = i
+    for name, i in by_family.items():
+        names = [every.own[k][0].name for k in retained[i]]
+        yield Tried((*names, name), _percent(left[i], torque), this.p_value(i), i == best)
+
+
+def _percent(left: Array, torque: float) -> float:
+    return 100.0 * float(np.sqrt(left.sum() / max(torque, _NOTHING)))
+
+
+def _fixed(sample: Sample, drive: _Drive, names: Sequence[str]) -> DriveChoice:
+    """Return the stated families with the shapes that fit best."""
+    families = [FAMILIES[name] for name in names]
+    every = _Options.of(sample, drive, list(_candidates(drive, families)))
+    groups = [[i for i, (f, _) in enumerate(every.own) if f.name == name] for name in names]
+    missing = [name for name, group in zip(names, groups, strict=True) if not group]
+    if missing:
+        raise SettingsError(
+            f"friction of {sample.joints[0]} has {listed(missing)}, which needs "
+            + (
+                "a revolute joint and at least half a revolution in the fitted logs; remove it, or "
+                "record more motion"
+                if drive.has_load or missing[0] not in _LOADED
+                else "the joint load torque, which unknown forces of contacts or loops change; "
+                "remove it"
+            )
+        )
+    chosen = [group[len(group) // 2] for group in groups]
+    for _ in range(3 if len(names) > 1 else 1):  # one after the other, repeated a few times
+        for at, group in enumerate(groups):
+            rest = [*chosen[:at], *chosen[at + 1 :]]
+            chosen[at] = min(group, key=lambda i: float(every.left([*rest, i]).sum()))
+    torque = float(sample.torque[0])
+    tried = (
+        Tried((), _percent(every.left([]), torque), 1.0, False),
+        Tried(tuple(names), _percent(every.left(chosen), torque), 1.0, True),
+    )
+    return _found(sample, drive, [every.own[i] for i in chosen], tried)
+
+
+def _found(
+    sample: Sample,
+    drive: _Drive,
+    chosen: Sequence[tuple[Family, list[float]]],
+    tried: tuple[Tried, ...],
+) -> DriveChoice:
+    """Return the choice with its shapes refined."""
+    refined = _refined(sample, drive, chosen)
+    families = [family for family, _ in refined]
+    flat = _flat(refined)
+    shapes = [(family, shape) for family in families for shape in family.shapes]
+    is_at_bound = _at_bound(drive, refined)
+    weighted = _reweighted(sample, drive, refined)
+    covariance = _shape_covariance(weighted, drive, families, flat)
+    return DriveChoice(
+        joint=sample.joints[0],
+        families=tuple(family.name for family in families),
+        terms=_terms(drive, refined),
+        tried=tried,
+        shapes=tuple(
+            FoundShape(
+                name=f"{family.name}.{shape.name}",
+                value=float(value),
+                std_error=float(std_error),
+                unit=shape.units[int(drive.is_prismatic)],
+                is_at_bound=bool(is_edge),
+            )
+            for (family, shape), value, std_error, is_edge in zip(
+                shapes, flat, np.sqrt(np.diag(covariance)), is_at_bound, strict=True
+            )
+        ),
+        shape_covariance=tuple(tuple(row) for row in covariance.tolist()),
+        sizes=tuple(tuple(own) for _, own in refined),
+        data_range=drive.data_range,
+        grown=_grown(weighted, drive, refined),
+    )
+
+
+def _flat(chosen: Sequence[tuple[Family, Sequence[float]]]) -> Array:
+    """Return all shapes of families in a row, shape (k,)."""
+    return np.array([size for _, own in chosen for size in own])
+
+
+def _at_bound(drive: _Drive, chosen: Sequence[tuple[Family, Sequence[float]]]) -> Array:
+    """Return which shapes are at a bound of their search range, shape (k,)."""
+    bounds = _log_bounds(drive, [family for family, _ in chosen])
+    margin = AT_BOUND * np.ptp(bounds, axis=1)
+    is_near: Array = np.min(np.abs(np.log(_flat(chosen))[:, None] - bounds), axis=1) < margin
+    return is_near
+
+
+def _grown(
+    sample: Sample, drive: _Drive, chosen: Sequence[tuple[Family, Sequence[float]]]
+) -> dict[str, float]:
+    """Return the factor by which terms increase the standard error of each plain parameter.
+
+    With X the columns of terms and shapes, M = 1 - W (W^T W + 1)^-1 W^T and T = (W^T W + 1)^-1 W^T
+    X, the covariance (W^T W + 1)^-1 of the base parameters becomes that plus T (X^T M X)^-1 T^T.
+    """
+    families = [family for family, _ in chosen]
+    if not families:
+        return {}
+    _, trial = _with_slopes(sample, drive, families, _flat(chosen))
+    T, S = trial.T[:, :-1], trial.S[:-1, :-1]
+    _, before = sample.normal.whole
+    grown = {}
+    for name, u in drive.plain.items():
+        more = u @ T[: len(u)] @ np.linalg.solve(S, T[: len(u)].T @ u)
+        variance = u @ before[: len(u), : len(u)] @ u  # without the columns added to W
+        grown[name] = float(np.sqrt(1.0 + max(more, 0.0) / variance))
+    return grown
+
+
+def _reweighted(
+    sample: Sample, drive: _Drive, chosen: Sequence[tuple[Family, Sequence[float]]]
+) -> Sample:
+    """Return the samples with the joint's weights from its residual with the new terms.
+
+    With the residual without them the weights of this joint would be far too small, compared with
+    those of other joints and with the prior.
+    """
+    if not chosen:
+        return sample
+    terms = _terms(drive, chosen)
+    whole = _trials(sample, drive, terms).whole
+    before, after = (float(whole.left(which).sum()) for which in ([], list(range(len(terms)))))
+    return sample.reweighted(np.sqrt(before / max(after, _SHARPEST * before, _NOTHING)))
+
+
+def _terms(
+    drive: _Drive, chosen: Sequence[tuple[Family, Sequence[float]]]
+) -> tuple[DriveTerm, ...]:
+    """Return the terms of families with their shapes."""
+    return tuple(term for family, own in chosen for term in family.make(drive.data_range, *own))
+
+
+def _log_bounds(drive: _Drive, families: Sequence[Family]) -> Array:
+    """Return the logarithms of the search range of each shape, shape (k, 2)."""
+    bounds = [shape.within(drive.data_range) for family in families for shape in family.shapes]
+    logs: Array = np.log(np.reshape(bounds, (-1, 2)))
+    return logs
+
+
+def _refined(
+    sample: Sample, drive: _Drive, chosen: Sequence[tuple[Family, Sequence[float]]]
+) -> list[tuple[Family, list[float]]]:
+    """Return families with the nearby shapes that give the smallest residual together."""
+    from scipy.optimize import minimize
+
+    families = [family for family, _ in chosen]
+    start = np.log(_flat(chosen))
+
+    def left(log_sizes: Array) -> float:
+        terms = _terms(drive, with_shapes(families, np.exp(log_sizes)))
+        (squares,) = _trials(sample, drive, terms, _ROUNDING).whole.left(list(range(len(terms))))
+        return float(np.log(squares + _NOTHING))
+
+    best = start
+    if len(start):
+        sample = _reweighted(sample, drive, chosen).joined()
+        bounds, options = _log_bounds(drive, families), {"eps": _STEP, "maxiter": _STEPS}
+        found = minimize(left, start, method="L-BFGS-B", bounds=bounds, options=options)
+        best = found.x if found.fun <= left(start) else start
+    return with_shapes(families, np.exp(best))
+
+
+def _shape_covariance(
+    sample: Sample, drive: _Drive, families: Sequence[Family], flat: Array
+) -> Array:
+    """Return the covariance of shapes: of columns d(torque)/d(shape), fitted with all others."""
+    if not len(flat):
+        return np.empty((0, 0))
+    count, trial = _with_slopes(sample, drive, families, flat)
+    _, every = trial.estimate(list(range(count + len(flat))), sample.fitted)
+    covariance: Array = every[count:, count:]
+    return covariance
+
+
+def _with_slopes(
+    sample: Sample, drive: _Drive, families: Sequence[Family], flat: Array
+) -> tuple[int, Trial]:
+    """Return the number c of columns of terms, and a trial of them and of d(torque)/d(shape)."""
+    Z = drive.columns(_terms(drive, with_shapes(families, flat)))
+    theta = Trials(sample, Z[:, None], _ROUNDING).whole.parameters(list(range(Z.shape[1])))
+    slopes = np.empty((len(Z), len(flat)))
+    for k, h in enumerate(_STEP * flat):
+        larger = flat + h * (np.arange(len(flat)) == k)
+        moved = drive.columns(_terms(drive, with_shapes(families, larger)))
+        slopes[:, k] = (moved - Z) @ theta / h
+    return Z.shape[1], Trials(sample, np.hstack([Z, slopes])[:, None], _ROUNDING).whole

@@ -1,0 +1,201 @@
+"""Findings of terms that a drive model lacks, and the entries of a job file that add them."""
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+from robotid.base.findings import Finding, listed, toml_key
+from robotid.diagnosis.residual.candidates import Candidate
+from robotid.diagnosis.residual.decisions import MAIN
+from robotid.diagnosis.residual.misfit import Misfit
+from robotid.estimation.fitting.fitted import Fit
+from robotid.robot.drives import COUNTERBALANCE, DriveTerm
+from robotid.robot.families import drive_line, spring_family
+
+__all__ = [
+    "counterbalanced",
+    "misfit_findings",
+    "setting_of",
+    "settled",
+    "with_entries",
+    "with_known_springs",
+]
+
+_OF_POSITION = ("position_periodic", "spring", "position_offset")
+_BALANCES = ("counterbalance", "link_mass")
+_OF_MASSES = (*_BALANCES, "current_for_torque", "urdf_mismatch")
+_SPRINGS = ("ripple", "spring")  # parts of the torque that depend on the position
+_DIGITS = "0123456789"
+
+
+def misfit_findings(fit: Fit, misfits: Sequence[Misfit], on_misfit: Sequence[str]) -> list[Finding]:
+    """Return a finding for each term that a drive model lacks.
+
+    Args:
+        fit: The fit.
+        misfits: The terms.
+        on_misfit: Names of the drive parameters whose errors increased for them.
+    """
+    return [_finding(misfit, fit, on_misfit) for misfit in misfits]
+
+
+def setting_of(misfit: Misfit, fit: Fit) -> str:
+    """Return the entry of a job file that adds a term to the model; empty if there is none.
+
+    It is a line of [drives] that includes the present terms of the joint, or a table [[coupling]].
+
+    Args:
+        misfit: The term.
+        fit: The fit without it.
+    """
+    joint, other = misfit.joint, misfit.term.coupled
+    if other:
+        ratios = f"{toml_key(joint)} = 1.0, {toml_key(other)} = {misfit.term.ratio}"
+        return f"[[coupling]]\nname = {json.dumps(f'{joint}_{other}')}\nratios = {{ {ratios} }}"
+    if not misfit.entries:
+        return ""
+    return f"[drives]\n{with_entries(fit, joint, misfit.entries)}"
+
+
+def with_entries(fit: Fit, joint: str, entries: Sequence[str | DriveTerm]) -> str:
+    """Return the line of a job's [drives] that adds entries to the present ones of a joint.
+
+    Args:
+        fit: The fit without them.
+        joint: The joint.
+        entries: Names of families, or terms.
+    """
+    (families, chosen), *_ = [
+        *((c.families, c.terms) for c in fit.drives if c.joint == joint),
+        ((), ()),
+    ]
+    stated = [t for t in fit.model.layout.own.get(joint, ()) if t not in chosen]
+    kinds = {entry.rstrip(_DIGITS) for entry in entries if isinstance(entry, str)}
+    others = [name for name in families if name.rstrip(_DIGITS) not in kinds]
+    return drive_line(joint, *stated, *others, *entries)
+
+
+def counterbalanced(found: Sequence[Finding], logs: Sequence[str]) -> dict[str, str]:
+    """Return the family of the counterbalance of each joint with one in the fitted logs.
+
+    Args:
+        found: Findings before the fit.
+        logs: Names of the fitted logs.
+    """
+    joints = {}
+    for finding in found:
+        log, _, joint = finding.where.rpartition(": ")
+        if finding.code in _BALANCES and log in logs:
+            joints[joint] = spring_family(finding.evidence["turned"], COUNTERBALANCE)
+    return joints
+
+
+def with_known_springs(
+    found: Sequence[Finding], fit: Fit, wanted: Mapping[str, Sequence[str] | None]
+) -> list[Finding]:
+    """Return the findings before a fit; a counterbalance that its model includes becomes a note.
+
+    A spring that a wrong mass would imitate becomes a note only if it was stated, not selected.
+
+    Args:
+        found: Findings before the fit.
+        fit: The fit, with the terms of its drives.
+        wanted: Families stated for each joint; None: selected.
+    """
+    own = fit.model.layout.own
+    springs = {joint for joint, terms in own.items() if any(t.part in _SPRINGS for t in terms)}
+    auto = [c for c in fit.drives if wanted[c.joint] is None]
+    selected = {c.joint for c in auto if any(t.part in _SPRINGS for t in c.terms)}
+    known = {"counterbalance": springs, "link_mass": springs - selected}
+
+    def as_known(finding: Finding) -> Finding:
+        joint = finding.where.rpartition(": ")[2]
+        if joint not in known.get(finding.code, ()):
+            return finding
+        names = listed(term.name for term in own[joint] if term.part in _SPRINGS)
+        what, _, _ = finding.message.replace(". Correct the mass", ". Add it").partition(". Add it")
+        message = f"{what}. The model includes it: {names} of {joint}"
+        return replace(finding, severity="note", message=message)
+
+    return [as_known(finding) for finding in found]
+
+
+def settled(found: Sequence[Finding], of_fit: Sequence[Finding]) -> list[Finding]:
+    """Return the findings before and of the fit, without hypotheses that a term explains.
+
+    The doctor's model has no springs: it attributes a torque that depends on the position to wrong
+    masses, or to nothing. The term that explains it is then a warning, even if it is small.
+
+    Args:
+        found: Findings before the fit.
+        of_fit: Findings of the fit.
+    """
+    rest, terms = list(found), []
+    for term in of_fit:
+        hypotheses = [f for f in rest if _explains(term, f)]
+        rest = [f for f in rest if f not in hypotheses]
+        if hypotheses:
+            codes = listed(dict.fromkeys(f.code for f in hypotheses))
+            message = f"{term.message}. It explains {codes} and may bias the masses"
+            evidence = {**term.evidence, "replaces": float(len(hypotheses))}
+            term = replace(term, severity="warning", message=message, evidence=evidence)
+        terms.append(term)
+    return rest + terms
+
+
+def _explains(term: Finding, hypothesis: Finding) -> bool:
+    """Return whether a term of the fit explains a hypothesis from before the fit."""
+    if term.evidence.get("share_pct", 0.0) < MAIN:
+        return False
+    if hypothesis.code == "unexplained_torque":
+        return hypothesis.where.rpartition(": ")[2] == term.where
+    return hypothesis.code in _OF_MASSES and term.code in _OF_POSITION
+
+
+def _advice(term: Candidate, setting: str) -> str:
+    """Return the remedy for a term that the model lacks, as text."""
+    if not setting:
+        return term.advice
+    table, *lines = setting.split("\n")
+    if term.coupled:
+        size = "with the second ratio from the data sheet"
+        return f"Add {table} to the job: {' and '.join(lines)}, {size}"
+    added = f"add it to the model with {lines[0]} in {table}"
+    return f"{term.advice}, or {added}" if term.advice else f"{added[0].upper()}{added[1:]}"
+
+
+def _finding(misfit: Misfit, found: Fit, on_misfit: Sequence[str]) -> Finding:
+    term, validation = misfit.term, misfit.confirmed
+    wide = [name for name in on_misfit if name.startswith(f"{misfit.joint}.")]
+    widened = f"; the intervals of {listed(wide)} include this misfit" if wide else ""
+    confirmed = ""
+    if validation is not None:
+        confirmed = f" ({100 * max(validation, 0.0):.0f} % on the validation logs)"
+    remedy = _advice(term, setting_of(misfit, found))
+    trend, unit = "", misfit.unit.removesuffix(" rms")
+    if not math.isnan(misfit.trend[0]):
+        change, error = misfit.trend
+        verb = "falls" if change < 0 else "rises"
+        trend = (
+            f"; friction at the RMS speed {verb} by {abs(change):.2g} +- {error:.1g} {unit} per min"
+        )
+    message = (
+        f"{misfit.joint}: {term.meaning}: {misfit.size:.3g} +- {misfit.std_error:.2g} "
+        f"{misfit.unit}{trend}. It would explain {100 * misfit.share:.0f} % of the squared residual"
+        f"{confirmed}; the residual is {100 * misfit.error:.1f} % of the torque. "
+        f"{remedy or 'The model has no such term'}{widened}"
+    )
+    evidence = {
+        "share_pct": 100 * misfit.share,
+        "error_pct": 100 * misfit.error,
+        "size": misfit.size,
+        "std_error": misfit.std_error,
+        "p_value": misfit.p_value,
+    }
+    if trend:
+        evidence |= {"trend": misfit.trend[0], "trend_std_error": misfit.trend[1]}
+    if validation is not None:
+        evidence["validation_share_pct"] = 100 * validation
+    severity = "warning" if misfit.matters else "note"
+    return Finding(term.code, severity, misfit.joint, message, evidence)

@@ -1,0 +1,596 @@
+"""Samples of the recordings for tests of terms, and trials of columns added to the regressor.
+
+Columns Z of a candidate term are added to the regressor. Its parameters theta are refitted together
+with the base parameters, with one segment of the logs held out after the other:
+
+    r = W delta + Z theta + e,    theta = (Z^T M Z)^-1 Z^T M r,    M = 1 - W (W^T W + C^-1)^-1 W^T,
+
+so that what base parameters can explain does not count (Frisch, Waugh 1933). C is their prior
+covariance. A term that is not in the data does not reduce the residual of held-out segments.
+
+With constraint forces eliminated, the torque z of joint j is P e_j z in all rows, along the unit
+vector u = P e_j / sqrt(P_jj). The equation of the joint alone is that along u: row j of the
+projected rows over sqrt(P_jj), where the column is sqrt(P_jj) z.
+"""
+
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import pairwise
+from typing import TypeVar
+
+import numpy as np
+
+from robotid.base.typing import Array
+from robotid.data.log import Trajectory
+from robotid.diagnosis.residual.decisions import FAMILY_P_VALUE
+from robotid.diagnosis.residual.selection import p_value
+from robotid.dynamics.constraint_rows import without_forces
+from robotid.dynamics.torque import trajectory_regressor
+from robotid.dynamics.used_rows import independent_share
+from robotid.estimation.fitting.evaluation import Evaluation, Recording
+from robotid.estimation.fitting.fitted import Solution
+from robotid.estimation.fitting.joint_motion import JointMotion, joint_motions, travelled
+from robotid.robot.model import RobotModel
+
+__all__ = ["RIDGE", "Normal", "Sample", "Trial", "Trials", "along", "take_sample"]
+
+#: Smallest share of a column that the regressor must not explain.
+RIDGE = 1e-4
+_ROWS = 3000  # samples of all fitted logs together, and of all validation logs
+_NUMBERS = 2**24  # elements of their regressor
+_PER_INDEPENDENT = 2.0  # samples per independent one behind the filter
+_SEGMENTS = 16  # held out in turn
+_SHORTEST = 10  # independent samples in a segment
+_FEWEST = 6  # segments for a test
+_NEAR = 0.5  # periods of the filter's cut-off
+_OUTLIER = 12.0  # typical residuals above which a sample is excluded
+_FREE = 1e3  # prior spread of an added column, in residuals
+_SHORTEST_UNIT = 1e-4  # rows with a smaller sqrt(P_jj) are not used
+
+OptionT = TypeVar("OptionT", bound=Hashable)
+
+
+@dataclass(frozen=True, eq=False)
+class Normal:
+    """Normal equations of the base parameters in K segments, all joints together.
+
+    Attributes:
+        A: W^T W of each segment, shape (K, b, b).
+        B: W^T r of each segment, shape (K, b).
+        fitted: Number of segments of fitted logs, which come first.
+    """
+
+    A: Array
+    B: Array
+    fitted: int
+
+    @classmethod
+    def of(cls, W: Array, r: Array, segments: Sequence[slice], fitted: int) -> "Normal":
+        """Return the normal equations of samples.
+
+        Args:
+            W: Regressor, shape (N, n, b).
+            r: Residual, shape (N, n).
+            segments: Samples of each segment.
+            fitted: Number of segments of fitted logs.
+        """
+        rows = [(W[k].reshape(-1, W.shape[2]), r[k].ravel()) for k in segments]
+        A, B = (np.array(x) for x in zip(*[(w.T @ w, w.T @ e) for w, e in rows], strict=True))
+        return cls(A, B, fitted)
+
+    @cached_property
+    def is_fitted(self) -> Array:
+        """Which of the segments are of fitted logs, shape (K,), bool."""
+        return np.arange(len(self.A)) < self.fitted
+
+    @cached_property
+    def held_out(self) -> tuple[Array, Array]:
+        """Segments fitted while segment k is held out, row k of (K, K), and the inverses."""
+        K, fitted = len(self.A), self.fitted
+        used = (self.is_fitted & ~np.eye(K, dtype=bool)).astype(float)
+        own, whole = self._inverse(used[:fitted]), self.whole[1]
+        return used, np.concatenate([own, np.broadcast_to(whole, (K - fitted, *whole.shape))])
+
+    @cached_property
+    def whole(self) -> tuple[Array, Array]:
+        """All segments of fitted logs, shape (K,), and the inverse (A + 1)^-1 of their sum."""
+        used = self.is_fitted.astype(float)
+        return used, self._inverse(used)
+
+    def _inverse(self, used: Array) -> Array:
+        A: Array = np.tensordot(used, self.A, axes=1)
+        return np.asarray(np.linalg.inv(A + np.eye(A.shape[-1])))
+
+
+@dataclass(frozen=True, eq=False)
+class Sample:
+    """Samples of the recordings, weighted for each joint by its RMS residual, 0 where not used.
+
+    Rows of a floating base precede those of the n joints.
+
+    Attributes:
+        joints: Names of the n joints.
+        is_prismatic: Which of them are prismatic, shape (n,), bool.
+        motions: Motion of each joint in the N samples.
+        recordings: The fitted recordings, then the validation recordings, if they are used.
+        at: Their motions at these samples.
+        taken: Indices of these samples in each recording.
+        weight: Weights of the torques, shape (N, n_rows) [1/(N m), 1/N]; one for all rows if
+            constraint forces were eliminated.
+        torque: Weighted sum of the squared torques of fitted samples, shape (n_rows,).
+        segments: Samples of each of the K segments, those of the validation logs last.
+        rows: Number of samples of fitted logs.
+        W: Regressor of the base parameters over their prior spread, shape (N, n_rows, b), and
+            columns that are refitted with them.
+        r: Residual of the estimate, shape (N, n_rows).
+        independent: Columns of the regressor that belong to base parameters, shape (b,), int.
+        U: Factor of the prior covariance of base parameters, C = U^T U, shape (b, b).
+        normal: Normal equations of the segments, of all joints of the robot.
+        standard: Standard parameters of the estimate, shape (p,).
+        basis: As of ``Trajectory.basis``, at these samples.
+    """
+
+    joints: tuple[str, ...]
+    is_prismatic: Array
+    motions: tuple[JointMotion, ...]
+    recordings: tuple[Recording, ...]
+    at: tuple[Trajectory, ...]
+    taken: tuple[Array, ...]
+    weight: Array
+    torque: Array
+    segments: tuple[slice, ...]
+    rows: int
+    W: Array
+    r: Array
+    independent: Array
+    U: Array
+    normal: Normal
+    standard: Array
+    basis: Array | None = None
+
+    @property
+    def fitted(self) -> int:
+        """Number of segments of fitted logs."""
+        return self.normal.fitted
+
+    def with_columns(self, Z: Array) -> "Sample":
+        """Return the same samples with more columns that are refitted with the base parameters.
+
+        Args:
+            Z: Torques of parameters of 1, shape (N, n_rows, c) [N m or N].
+        """
+        left = Z if self.basis is None else without_forces(self.basis, Z)
+        columns = self.weight[:, :, None] * left
+        size = np.linalg.norm(columns, axis=(0, 1))
+        spread = _FREE * np.linalg.norm(self.r) / np.where(size > 0, size, np.inf)
+        W = np.concatenate([self.W, columns * spread], axis=2)
+        return replace(self, W=W, normal=Normal.of(W, self.r, self.segments, self.fitted))
+
+    def with_some_columns(self, which: Array) -> "Sample":
+        """Return the same samples with fewer columns.
+
+        Args:
+            which: The columns of W, shape (c,), int.
+        """
+        A, B = self.normal.A[:, which[:, None], which], self.normal.B[:, which]
+        return replace(self, W=self.W[..., which], normal=Normal(A, B, self.fitted))
+
+    def of_joint(self, j: int) -> "Sample":
+        """Return the samples of one joint; other joints count only in the normal equations.
+
+        Args:
+            j: Index of the joint.
+        """
+        row = self.weight.shape[1] - len(self.joints) + j
+        own, joint = slice(row, row + 1), slice(j, j + 1)
+        alone = replace(
+            self,
+            joints=self.joints[joint],
+            is_prismatic=self.is_prismatic[joint],
+            motions=self.motions[joint],
+            weight=self.weight[:, own],
+            torque=self.torque[own],
+            W=np.ascontiguousarray(self.W[:, own]),
+            r=self.r[:, own],
+            basis=None,
+        )
+        if self.basis is None:
+            return alone
+        u = _lengths(self.basis)[:, own]
+        tau = np.concatenate([motion.tau[:, own] for motion in self.at])
+        return replace(
+            alone,
+            weight=u * alone.weight,
+            torque=np.sum((alone.weight * tau / u)[: self.rows] ** 2, axis=0),
+            W=alone.W / u[..., None],
+            r=alone.r / u,
+        )
+
+    @cached_property
+    def own(self) -> Normal:
+        """Normal equations of its own samples, those of one joint."""
+        return Normal.of(self.W, self.r, self.segments, self.fitted)
+
+    def reweighted(self, factor: float) -> "Sample":
+        """Return the samples of one joint with other weights.
+
+        Args:
+            factor: Factor on the weights.
+        """
+        normal, more = self.normal, factor**2 - 1.0
+        return replace(
+            self,
+            weight=factor * self.weight,
+            torque=factor**2 * self.torque,
+            W=factor * self.W,
+            r=factor * self.r,
+            normal=replace(normal, A=normal.A + more * self.own.A, B=normal.B + more * self.own.B),
+        )
+
+    def joined(self) -> "Sample":
+        """Return the samples of fitted logs as one segment, for a fit to all of them."""
+        normal, rows = self.normal, slice(self.rows)
+        A, B = (x[: self.fitted].sum(axis=0, keepdims=True) for x in (normal.A, normal.B))
+        return replace(
+            self,
+            weight=self.weight[rows],
+            segments=(rows,),
+            W=self.W[rows],
+            r=self.r[rows],
+            normal=Normal(A, B, 1),
+        )
+
+
+def take_sample(fit: Solution, *, for_drives: bool = False, is_free: bool = False) -> Sample | None:
+    """Return samples spread over the recordings; None if there are too few, or static ones.
+
+    Args:
+        fit: The fit.
+        for_drives: Whether drive terms are selected with them: only samples of fitted logs, also
+            those near reversals, where the filter smears stiction.
+        is_free: Whether the bodies are those of least squares if these predict held-out segments
+            better than bodies bound to the prior.
+    """
+    model, mapping = fit.model, fit.mapping
+    if model.is_static:
+        return None
+    validation = [e for e in fit.validation if not e.is_refitted]
+    rows, independent = _spread_rows(model, fit.fitted, validation)
+    parts = list(zip([*fit.fitted, *validation], rows, strict=True))
+    if for_drives:
+        del parts[len(fit.fitted) :]
+    rows = [k for _, k in parts]
+    own = sum(map(len, rows[: len(fit.fitted)]))
+    segments = _segments(own, sum(map(len, rows)) - own, independent)
+    number = sum(part.stop <= own for part in segments)
+    if number < _FEWEST:
+        return None
+    motion = [e.recording.trajectory.at(k) for e, k in parts]
+    Y = np.concatenate([_regressor(model, e.recording.trajectory, k) for e, k in parts])
+    tau = np.concatenate([m.tau for m in motion])
+    size, first = model.layout.n_inertial, model.n_rows - len(model.joints)
+    load = Y[:, first:, :size] @ fit.standard[:size]
+    basis = None
+    if model.constraints:
+        basis = np.concatenate([m.basis for m in motion if m.basis is not None])
+        Y = without_forces(basis, Y)
+    r = tau - Y @ fit.standard
+    used = np.concatenate([e.recording.mask[k] for e, k in parts])
+    if basis is None and not for_drives:
+        used &= np.concatenate([_is_steady(e.recording)[k] for e, k in parts])
+    # C = U^T U: base parameters over their prior spread are of size 1
+    U = np.asarray(np.linalg.qr((mapping.K * fit.prior_std).T, mode="r"))
+    used, scale = _noise_level(r, used, own, basis)
+    weight = used * np.sqrt(independent) / np.where(scale > 0, scale, np.inf)
+    W = _in_units(Y, mapping.independent, U)
+    W *= weight[:, :, None]
+    sample = Sample(
+        joints=model.joints,
+        is_prismatic=np.isin(model.joints, list(model.layout.prismatic)),
+        motions=joint_motions([e.recording for e, _ in parts], rows, load, model),
+        recordings=tuple(e.recording for e, _ in parts),
+        at=tuple(motion),
+        taken=tuple(rows),
+        weight=weight,
+        torque=np.sum((weight * tau)[:own] ** 2, axis=0),
+        segments=segments,
+        rows=own,
+        W=W,
+        r=weight * r,
+        independent=mapping.independent,
+        U=U,
+        normal=Normal.of(W, weight * r, segments, number),
+        standard=fit.standard,
+        basis=basis,
+    )
+    return _free(sample, Y[..., mapping.independent]) if is_free else sample
+
+
+def _free(sample: Sample, X: Array) -> Sample:
+    """Return the samples with the bodies of least squares, if these predict held-out segments.
+
+    A prior that is wrong binds the bodies, and its error looks like friction.
+
+    Args:
+        sample: The samples.
+        X: Regressor of the base parameters, shape (N, n_rows, b).
+    """
+    W = sample.weight[..., None] * X
+    size = np.linalg.norm(W[: sample.rows], axis=(0, 1))
+    spread = _FREE * np.linalg.norm(sample.r) / np.where(size > 0, size, np.inf)
+    W *= spread
+    normal = Normal.of(W, sample.r, sample.segments, sample.fitted)
+    free = replace(sample, W=W, U=np.diag(spread), normal=normal)
+    none = np.empty((*sample.r.shape, 0))
+    before, after = (Trials(x, none).held_out.left([]) for x in (sample, free))
+    if p_value(before, after, sample.fitted) >= FAMILY_P_VALUE:
+        return sample
+    change = normal.whole[1] @ normal.B[: sample.fitted].sum(axis=0)
+    standard = sample.standard.copy()
+    standard[sample.independent] += spread * change
+    r = sample.r - W @ change
+    # rows that were projected together have one noise level
+    old, new = (np.sum(x[: sample.rows] ** 2, axis=0) for x in (sample.r, r))
+    if sample.basis is not None:
+        old, new = (np.full(len(x), x.sum()) for x in (old, new))
+    factor = np.sqrt(old / np.where(new > 0, new, np.inf))
+    weight, W, r = factor * sample.weight, factor[:, None] * W, factor * r
+    return replace(
+        free, weight=weight, W=W, r=r, torque=factor**2 * sample.torque, standard=standard,
+        normal=Normal.of(W, r, sample.segments, sample.fitted),
+    )  # fmt: skip
+
+
+def along(sample: Sample, model: RobotModel, at: Sequence[Trajectory], tau: Array) -> Sample:
+    """Return the same samples for another robot, or with changed positions.
+
+    Args:
+        sample: The samples.
+        model: The robot, with the same parameters.
+        at: The motions, as of ``Sample.at``.
+        tau: Torques of the estimate along them, shape (N, n) [N m or N].
+    """
+    Y = np.concatenate([_regressor(model, motion) for motion in at])
+    W = sample.weight[:, :, None] * _in_units(Y, sample.independent, sample.U)
+    W = np.concatenate([W, sample.W[:, :, W.shape[2] :]], axis=2)
+    r = sample.weight * (np.concatenate([motion.tau for motion in at]) - tau)
+    normal = Normal.of(W, r, sample.segments, sample.fitted)
+    return replace(sample, at=tuple(at), W=W, r=r, normal=normal)
+
+
+def _spread_rows(
+    model: RobotModel, fitted: Sequence[Evaluation], validation: Sequence[Evaluation]
+) -> tuple[list[Array], float]:
+    """Return the samples used of each recording, and the share of them that is independent."""
+    most = min(_ROWS, _NUMBERS // (model.n_rows * len(model.layout.names)))
+    rows, shares = [], []
+    for evaluations in (fitted, validation):
+        least = -(-sum(len(e.recording.trajectory.t) for e in evaluations) // most)
+        for e in evaluations:
+            share = independent_share(e.recording.signals)
+            step = max(least, int(1.0 / (_PER_INDEPENDENT * share)), 1)
+            rows.append(np.arange(0, len(e.recording.trajectory.t), step))
+            shares.append(min(1.0, share * step))
+    return rows, min(shares)
+
+
+def _segments(fitted: int, validation: int, independent: float) -> tuple[slice, ...]:
+    """Return the segments of the samples of fitted and of validation recordings."""
+    edges = [0]
+    for rows in (fitted, validation):
+        count = min(_SEGMENTS, max(1, int(rows * independent / _SHORTEST))) if rows else 0
+        first = edges[-1]
+        edges += [first + rows * (i + 1) // count for i in range(count)]
+    return tuple(slice(*pair) for pair in pairwise(edges))
+
+
+def _regressor(model: RobotModel, motion: Trajectory, samples: Array | None = None) -> Array:
+    """Return the regressor of the standard parameters at some samples, shape (N, n, p)."""
+    Y = trajectory_regressor(model, motion, samples)
+    return Y.reshape(-1, model.n_rows, Y.shape[1])
+
+
+def _in_units(Y: Array, independent: Array, U: Array) -> Array:
+    """Return the independent columns of regressors (N, n, p) times U^T, shape (N, n, b)."""
+    units = np.zeros((Y.shape[2], len(U)))
+    units[independent] = U.T  # one product of all rows, without a copy of these columns
+    return (Y.reshape(-1, len(units)) @ units).reshape(*Y.shape[:2], len(U))
+
+
+def _lengths(basis: Array) -> Array:
+    """Return sqrt(P_jj), the length of P e_j, of each row, shape (N, n_rows)."""
+    squares = 1.0 - np.sum(basis**2, axis=2)
+    lengths: Array = np.sqrt(np.maximum(squares, _SHORTEST_UNIT**2))
+    return lengths
+
+
+def _noise_level(r: Array, used: Array, own: int, basis: Array | None) -> tuple[Array, Array]:
+    """Return the used rows without outliers, and the RMS residual of each row, (n_rows,).
+
+    Rows that were projected together have one noise level, and an outlier excludes its sample.
+    """
+    u = np.ones(r.shape) if basis is None else _lengths(basis)
+    size = np.abs(r) / u
+    usual: Array = size <= _OUTLIER * _typical_size(size[:own], used[:own])
+    if basis is not None:
+        usual = np.all(usual | ~used, axis=1, keepdims=True)
+    used = used & usual
+    squares = np.sum(r[:own] ** 2, axis=0, where=used[:own])
+    freedom = np.sum(u[:own] ** 2, axis=0, where=used[:own])
+    if basis is not None:
+        squares, freedom = (np.full(len(x), x.sum()) for x in (squares, freedom))
+    return used, np.sqrt(squares / np.maximum(freedom, 1))
+
+
+def _typical_size(r: Array, used: Array) -> Array:
+    """Return the median absolute residual of each joint over the used samples, shape (n,)."""
+    columns = zip(r.T, used.T, strict=True)
+    return np.array([np.median(np.abs(x[k])) if k.any() else np.inf for x, k in columns])
+
+
+def _is_steady(recording: Recording) -> Array:
+    """Return the samples that are far from reversals and rest of each joint, shape (N, n), bool.
+
+    Near these the filter smears stiction, which then does not look like friction.
+    """
+    motion, signals = recording.trajectory, recording.signals
+    if signals.cutoff is None:
+        return np.ones(motion.v.shape, dtype=bool)
+    slow = (np.abs(motion.v) < signals.min_velocity) | (travelled(motion) == 0.0)
+    steady = np.empty(slow.shape, dtype=bool)
+    for j, at in enumerate(slow.T):
+        times = np.concatenate([[-np.inf], motion.t[at], [np.inf]])
+        after = np.searchsorted(times, motion.t, side="right")
+        near = np.minimum(motion.t - times[after - 1], times[after] - motion.t)
+        steady[:, j] = near > _NEAR / signals.cutoff
+    return steady
+
+
+@dataclass(frozen=True, eq=False)
+class Trial:
+    """Fit of columns Z, together with the base parameters, to a residual.
+
+    Attributes:
+        S: [Z r]^T M [Z r] of the fitted samples, shape (..., c + 1, c + 1).
+        T: Fit of the columns of W to [Z r], shape (..., b, c + 1).
+        rows: W and [Z r] of each of K segments, shapes (N_k, b) and (N_k, c + 1).
+    """
+
+    S: Array
+    T: Array
+    rows: Sequence[tuple[Array, Array]]
+
+    @cached_property
+    def H(self) -> Array:
+        """Products of [Z r] less its fit by the regressor in each segment, (K, c + 1, c + 1)."""
+        every_T = np.broadcast_to(self.T, (len(self.rows), *self.T.shape[-2:]))
+        left = [X - W @ T for (W, X), T in zip(self.rows, every_T, strict=True)]
+        return np.array([E.T @ E for E in left])
+
+    def parameters(self, which: Sequence[int] | Array) -> Array:
+        """Return the parameters of some columns, shape (..., k).
+
+        Args:
+            which: The k columns; or m choices of k, shape (m, k), for parameters (..., m, k).
+        """
+        S, k = self.S, np.asarray(which, dtype=int)
+        theta: Array = np.linalg.solve(
+            S[..., k[..., :, None], k[..., None, :]], S[..., k, -1][..., None]
+        )
+        return theta[..., 0]
+
+    def estimate(self, which: Sequence[int], fitted: int) -> tuple[Array, Array]:
+        """Return the parameters of some columns and their covariance, shapes (k,) and (k, k).
+
+        Of a fit to all samples. The covariance is that of clusters: from the scatter of the scores
+        between segments, valid for noise of any colour.
+
+        Args:
+            which: The k columns.
+            fitted: Number of segments of fitted logs.
+        """
+        theta, S = self.parameters(which), self.S[which][:, which]
+        H = self.H[:fitted, which]
+        scores = H[:, :, -1] - H[:, :, which] @ theta  # (K, k)
+        inverse, few = np.linalg.inv(S), len(scores) / (len(scores) - 1)
+        covariance: Array = few * (inverse @ (scores.T @ scores) @ inverse)
+        return theta, covariance
+
+    def left(self, which: Sequence[int] | Array) -> Array:
+        """Return the squared residual of each segment with some columns fitted, shape (K,).
+
+        Args:
+            which: The k columns; or m choices of k, shape (m, k), for residuals (K, m).
+        """
+        k = np.asarray(which, dtype=int)
+        theta = self.parameters(k)
+        with_r = np.concatenate([k, np.full((*k.shape[:-1], 1), -1)], axis=-1)
+        x = np.concatenate([-theta, np.ones((*theta.shape[:-1], 1))], axis=-1)
+        square = self.H[:, with_r[..., :, None], with_r[..., None, :]]
+        left: Array = (x[..., None, :] @ square @ x[..., :, None])[..., 0, 0]
+        return left
+
+    def left_each(self, choices: Mapping[OptionT, Sequence[int]]) -> dict[OptionT, Array]:
+        """Return the squared residual of each segment with columns of each option, shapes (K,).
+
+        Args:
+            choices: Columns of each option.
+        """
+        return _each(choices, lambda which: self.left(which).T)
+
+    def parameters_each(self, choices: Mapping[OptionT, Sequence[int]]) -> dict[OptionT, Array]:
+        """Return the parameters of columns of each option, shapes (k,), of a fit to all samples.
+
+        Args:
+            choices: Columns of each option.
+        """
+        return _each(choices, self.parameters)
+
+
+def _each(
+    choices: Mapping[OptionT, Sequence[int]], of: Callable[[Array], Array]
+) -> dict[OptionT, Array]:
+    """Evaluate a function of the columns of each option, all options of one size together.
+
+    Args:
+        choices: Columns of each option.
+        of: Returns one entry for each of m choices of k columns, shape (m, k).
+    """
+    found: dict[OptionT, Array] = {}
+    for size in {len(which) for which in choices.values()}:
+        alike = {x: which for x, which in choices.items() if len(which) == size}
+        found.update(zip(alike, of(np.array([*alike.values()])), strict=True))
+    return {x: found[x] for x in choices}
+
+
+@dataclass(frozen=True, eq=False)
+class Trials:
+    """Trials of columns.
+
+    Attributes:
+        sample: The samples.
+        Z: Torques of parameters of 1, shape (N, n, c).
+        ridge: Smallest share of a column that the regressor must not explain.
+    """
+
+    sample: Sample
+    Z: Array
+    ridge: float = RIDGE
+
+    @cached_property
+    def held_out(self) -> Trial:
+        """Fitted without the segment that is evaluated."""
+        return self._trial(*self.sample.normal.held_out)
+
+    @cached_property
+    def whole(self) -> Trial:
+        """Fitted to all segments of fitted logs."""
+        return self._trial(*self.sample.normal.whole)
+
+    @cached_property
+    def _rows(self) -> list[tuple[Array, Array]]:
+        """W and X = [Z r] of each segment."""
+        W, r, weight = self.sample.W, self.sample.r[..., None], self.sample.weight[..., None]
+        rows = []
+        for k in self.sample.segments:  # one by one: all together need twice the memory
+            X = np.concatenate([weight[k] * self.Z[k], r[k]], axis=2)
+            rows.append((W[k].reshape(-1, W.shape[2]), X.reshape(-1, X.shape[2])))
+        return rows
+
+    @cached_property
+    def _products(self) -> tuple[Array, Array]:
+        """X^T X and W^T X of each segment, shapes (K, c + 1, c + 1) and (K, b, c + 1)."""
+        D = np.array([X.T @ X for _, X in self._rows])
+        B = np.array([W.T @ X for W, X in self._rows])
+        B[:, :, -1] = self.sample.normal.B  # other joints determine the base parameters, too
+        return D, B
+
+    def _trial(self, used: Array, inverse: Array) -> Trial:
+        D, B = (np.tensordot(used, x, axes=1) for x in self._products)
+        T = inverse @ B  # (..., b, c + 1)
+        S = D - B.swapaxes(-1, -2) @ T
+        c = np.arange(S.shape[-1] - 1)
+        is_zero = D[..., c, c] == 0  # a column of a joint that does not move
+        S[..., c, c] += np.where(is_zero, 1.0, self.ridge * D[..., c, c])
+        return Trial(S, T, self._rows)

@@ -1,0 +1,438 @@
+"""Parts of a joint's torque, and the quantities that its residual depends on.
+
+A torque is the sum of gravity, inertia, velocity torques, and the torques of the drives:
+
+    tau = g(q) + M(q) a + C(q, v) v + friction + motor inertia + offset + ... + residual.
+
+``dependence`` tests what the residual depends on.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from robotid.base.exceptions import DataError
+from robotid.base.typing import Array
+from robotid.diagnosis.residual.dependence import FEWEST, Dependence, even_bins, follow
+from robotid.dynamics.drive_columns import drive_values, friction_directions
+from robotid.dynamics.prediction import rigid_parts
+from robotid.dynamics.used_rows import independent_share
+from robotid.estimation.fitting.evaluation import Evaluation
+from robotid.estimation.fitting.fitted import Fit
+from robotid.robot.model import RobotModel
+
+__all__ = ["JointTorque", "Rows", "TorqueSplit", "joint_torques", "split_torque", "spread_rows"]
+
+_RIGID = ("gravity", "inertia", "Coriolis")
+_ROWS = 4000  # samples of all recordings together that are split
+_SEGMENTS = 16  # held out in turn
+_SHORTEST = 10  # independent samples in a segment
+_OUTLIER = 12.0  # typical residuals above which a sample is excluded
+_QUARTERS = 4  # parts of a recording for the test of a drift, and pieces of each part
+_ROUNDING = 1e-10  # of the torque, below which a part counts as 0
+_SLOW = 0.25  # of the RMS speed: below is low speed
+_NOISY = 0.5  # broadband share above which the residual counts as noise
+_ADVICE = {
+    "constant": "Zero the torque sensor, and check for a spring or a load that the model lacks",
+    "position": "Check for a spring, a cable or a gear ripple that the model lacks",
+    "speed": "Try another friction model",
+    "acceleration": "Check for an inertia that the model lacks, or a delayed torque",
+    "load": "Check the scale of the torque, and for friction that increases with the load",
+    "time": "Possible causes: warm-up of the friction, drift of a sensor, a changed load",
+}
+_CHANGED = (
+    "The fitted recordings do not have this dependence: something has changed since (friction with "
+    "temperature, a sensor offset, a load), or the joint does not move this way in them"
+)
+
+
+@dataclass(frozen=True, eq=False)
+class TorqueSplit:
+    """Parts of predicted torques.
+
+    Attributes:
+        parts: "gravity", "inertia" and "Coriolis" (with centrifugal torques) of the bodies, then
+            the torques of the drives, by ``DriveTerm.part``; each of shape (N, n_rows) [N m, N].
+        names: Names of the k drive parameters.
+        kinds: Part that each of them belongs to.
+        terms: Torque of each of them at its drive, shape (k, N) [N m, N].
+        loads: Ratio of each row to the drive of each parameter, shape (n_rows, k) [-].
+    """
+
+    parts: Mapping[str, Array]
+    names: tuple[str, ...]
+    kinds: tuple[str, ...]
+    terms: Array
+    loads: Array
+
+    @cached_property
+    def predicted(self) -> Array:
+        """The torque predicted, the sum of the parts, shape (N, n_rows) [N m, N]."""
+        return np.asarray(sum(self.parts.values()))
+
+    @cached_property
+    def load(self) -> Array:
+        """The torque of the bodies, shape (N, n_rows) [N m, N]."""
+        return np.asarray(sum(self.parts[name] for name in _RIGID if name in self.parts))
+
+    def terms_of(self, row: int) -> dict[str, dict[str, Array]]:
+        """Return the torque (N,) of each drive parameter in a row, by part and name.
+
+        Args:
+            row: Index of the row.
+        """
+        terms: dict[str, dict[str, Array]] = {}
+        for name, kind, ratio, torque in zip(
+            self.names, self.kinds, self.loads[row], self.terms, strict=True
+        ):
+            if ratio:
+                terms.setdefault(kind, {})[name] = ratio * torque
+        return terms
+
+
+def split_torque(
+    model: RobotModel,
+    pi: Array,
+    q: Array,
+    v: Array,
+    a: Array,
+    direction: Array | None = None,
+    memory: Array | None = None,
+) -> TorqueSplit:
+    """Return the parts of the torques that parameters predict.
+
+    A static model has no torques of motion: gravity is the only part of the bodies.
+
+    Args:
+        model: The robot.
+        pi: Standard parameters, shape (p,).
+        q: Joint coordinates, shape (N, n) or (N, 7 + n) [rad, m].
+        v: Velocities, shape (N, n_rows) [rad/s, m/s].
+        a: Accelerations, shape (N, n_rows) [rad/s^2, m/s^2].
+        direction: As of ``joint_torque_regressor``.
+        memory: As of ``Trajectory.memory``; needed if drive terms have internal states.
+
+    Raises:
+        DataError: If a shape does not fit the model.
+    """
+    layout, first = model.layout, model.n_rows - len(model.joints)
+    wanted = (len(q), model.n_rows)
+    if v.shape != wanted or a.shape != wanted or len(pi) != len(layout.names):
+        raise DataError(
+            f"v, a and pi have shapes {v.shape}, {a.shape} and {pi.shape}, wanted {wanted}, "
+            f"{wanted} and ({len(layout.names)},)"
+        )
+    parts = dict(zip(_RIGID, rigid_parts(model, pi, q, v, a), strict=True))
+    if model.is_static:
+        parts = {"gravity": parts["gravity"]}
+    signs = friction_directions(layout, v, direction)
+    terms = pi[layout.n_inertial :, None] * drive_values(layout, q, v, a, signs, memory)  # (k, N)
+    loads = np.vstack([np.zeros((first, len(terms))), layout.drive_loads])  # (n_rows, k)
+    kinds = tuple(term.part for _, term in layout.drive_parameters)
+    for kind in dict.fromkeys(kinds):
+        own = [k for k, other in enumerate(kinds) if other == kind]
+        parts[kind] = terms[own].T @ loads[:, own].T  # (N, n_rows)
+    return TorqueSplit(parts, layout.drive_names, kinds, terms, loads)
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """Samples of recordings, one after the other.
+
+    Attributes:
+        recordings: Names of the recordings.
+        t: Time stamps, shape (N,) [s].
+        recording: Recording of each sample, shape (N,), int.
+        segment: Uninterrupted segment of it, shape (N,), int.
+        segments: Segment that is held out in turn, shape (N,), int; None if the recordings are too
+            short for six.
+    """
+
+    recordings: tuple[str, ...]
+    t: Array
+    recording: Array
+    segment: Array
+    segments: Array | None
+
+    @property
+    def time(self) -> Array:
+        """Time of the log; for several recordings, from the start of the first, without breaks."""
+        starts = np.flatnonzero(np.diff(self.recording, prepend=-1))
+        if len(starts) == 1:
+            return self.t
+        lengths = np.array([np.ptp(self.t[self.recording == k]) for k in range(len(starts))])
+        before = np.concatenate([[0.0], np.cumsum(lengths)[:-1]])
+        return np.asarray(self.t - self.t[starts][self.recording] + before[self.recording])
+
+    @cached_property
+    def pieces(self) -> Array:
+        """Piece of each sample, 16 per recording, numbered on, shape (N,), int."""
+        count = _QUARTERS**2
+        pieces = np.empty(len(self.t), dtype=int)
+        for k in range(len(self.recordings)):
+            own = self.recording == k
+            pieces[own] = count * k + np.arange(own.sum()) * count // max(own.sum(), 1)
+        return pieces
+
+
+@dataclass(frozen=True, eq=False)
+class JointTorque:
+    """Torque of one row of the equations, its parts, and what its residual depends on.
+
+    Attributes:
+        joint: Name of the row.
+        unit: Unit of its torque.
+        rows: The N samples.
+        used: Whether each sample is used, shape (N,), bool.
+        tau: Measured torque, shape (N,).
+        parts: Parts of the predicted torque, by name, each of shape (N,).
+        terms: Torque of each drive parameter, shape (N,), by part and name.
+        quantities: Quantities that the residual may depend on: unit and values, (N,), by name.
+        broadband: Share of the squared residual above the filter's cut-off: not correlated over
+            one period of it, or from sample to sample without a filter; None if not available.
+        fitted: The same for the fitted recordings; None if it is of them itself.
+    """
+
+    joint: str
+    unit: str
+    rows: Rows
+    used: Array
+    tau: Array
+    parts: Mapping[str, Array]
+    terms: Mapping[str, Mapping[str, Array]]
+    quantities: Mapping[str, tuple[str, Array]]
+    broadband: float | None
+    fitted: "JointTorque | None" = None
+
+    @cached_property
+    def residual(self) -> Array:
+        """Measured minus predicted torque, shape (N,)."""
+        return np.asarray(self.tau - sum(self.parts.values()))
+
+    @cached_property
+    def present(self) -> tuple[str, ...]:
+        """Names of the parts that are more than rounding in any row."""
+        least = _ROUNDING * float(np.abs(self.tau).max())
+        return tuple(name for name, x in self.parts.items() if np.abs(x).max() > least)
+
+    @property
+    def power(self) -> Array | None:
+        """Mechanical power tau v, shape (N,) [W]; None without a speed."""
+        speed = self.quantities.get("speed")
+        return None if speed is None else self.tau * speed[1]
+
+    @property
+    def rms(self) -> dict[str, float]:
+        """RMS value of each part, of "residual" and of "measured" over the used samples."""
+        every = {**self.parts, "residual": self.residual, "measured": self.tau}
+        return {name: self.size(x) for name, x in every.items()}
+
+    def size(self, x: Array) -> float:
+        """Return the RMS value of a signal over the used samples; NaN without one.
+
+        Args:
+            x: The signal, shape (N,).
+        """
+        return float(np.sqrt(np.mean(x[self.used] ** 2))) if self.used.any() else float("nan")
+
+    @cached_property
+    def follows(self) -> tuple[Dependence, ...]:
+        """Dependence of the residual on a constant, on each quantity, and on time.
+
+        A quantity is tested together with a constant, time on the residual after the best other.
+        """
+        r = self.residual
+        if not self.used.any():
+            return ()
+        used = self.used & (np.abs(r) <= _OUTLIER * np.median(np.abs(r[self.used])))
+        everywhere, piece = np.zeros(int(used.sum()), dtype=int), self.rows.pieces[used]
+        segments = None if self.rows.segments is None else self.rows.segments[used]
+        found = [follow("constant", self.unit, r[used], r[used], everywhere, segments)]
+        for name, (unit, x) in self.quantities.items():
+            if np.ptp(x[used]) > 0:
+                found.append(follow(name, unit, x[used], r[used], even_bins(x[used]), segments))
+        left = self._less_best(found)[0]
+        quarter = np.unique(piece // _QUARTERS, return_inverse=True)[1]
+        time = follow("time", "s", self.rows.time[used], left[used], quarter, piece)
+        return (*found, time)
+
+    @cached_property
+    def against_time(self) -> tuple[Array, str]:
+        """The residual that is tested against time, shape (N,), and the subtracted quantity.
+
+        The means over the quantity that explains most are subtracted; "" if there is none.
+        """
+        return self._less_best(self.follows[:-1])
+
+    def _less_best(self, found: Sequence[Dependence]) -> tuple[Array, str]:
+        """Return the residual after the best quantity, and its name."""
+        best = self._best(found)
+        if best is None or best.name not in self.quantities:
+            return self.residual, ""
+        means = np.interp(self.quantities[best.name][1], best.centres, best.means)
+        return self.residual - means, best.name
+
+    @staticmethod
+    def _best(follows: Sequence[Dependence]) -> Dependence | None:
+        significant = [d for d in follows if d.is_significant]
+        return max(significant, key=lambda d: d.share or 0.0, default=None)
+
+    @property
+    def sentence(self) -> str:
+        """The cause of the residual, as text."""
+        rms, best = self.rms, self._best(self.follows)
+        if np.isnan(rms["measured"]):
+            return "no sample is used: the joint does not move"
+        if rms["measured"] == 0:
+            return "the measured torque is 0 throughout"
+        left = f"the residual is {_percent(rms['residual'] / rms['measured'])} of the torque"
+        if best is not None:
+            advice = _CHANGED if self._has_changed(best.name) else _ADVICE[best.name]
+            return f"{left} and {self._described(best)}. {advice}"
+        if self.broadband is None or self.rows.segments is None:
+            return f"{left}; the recordings are too short to determine its cause"
+        if self.broadband >= _NOISY:
+            share = _percent(self.broadband)
+            return f"{left}; {share} of its power is broadband (above the cut-off): noise"
+        names = [d.name for d in self.follows if d.name != "constant"]
+        return (
+            f"{left}; neither a constant nor {', '.join(names)} explain it, but "
+            f"{_percent(1.0 - self.broadband)} of its power is below the cut-off: systematic. "
+            "Check the motion of other joints, and elasticity"
+        )
+
+    def _described(self, best: Dependence) -> str:
+        """Return the dependence of the residual as text."""
+        share = _percent(best.share or 0.0)
+        if best.name == "constant":
+            return f"{share} of its power is a constant of {best.means[0]:.2g} {self.unit}"
+        rms_speed = self.size(self.quantities[best.name][1]) if best.name == "speed" else 0.0
+        low = " at low speed," if abs(best.where) < _SLOW * rms_speed else ""
+        return (
+            f"depends on the {best.name}, which explains {share} of its variance (most "
+            f"clearly{low} at {best.where:.2g} {best.unit})"
+        )
+
+    def _has_changed(self, name: str) -> bool:
+        """Whether the residual of the fitted recordings does not depend on a quantity."""
+        before = () if self.fitted is None else self.fitted.follows
+        return any(d.name == name and d.share is not None and not d.is_significant for d in before)
+
+
+def joint_torques(found: Fit) -> tuple[JointTorque, ...]:
+    """Return the torque of each row, its parts, and what its residual depends on.
+
+    The samples, at most 4000, are spread over the validation recordings, or over the fitted ones if
+    there are none.
+
+    Args:
+        found: The fit.
+    """
+    validation = [e for e in found.validation if not e.is_refitted]
+    fitted = _torques_of(found, found.fitted)
+    if not validation:
+        return fitted
+    judged = zip(_torques_of(found, validation), fitted, strict=True)
+    return tuple(replace(torque, fitted=of_fit) for torque, of_fit in judged)
+
+
+def _torques_of(found: Fit, evaluations: Sequence[Evaluation]) -> tuple[JointTorque, ...]:
+    """Return the torque of each row in some recordings."""
+    model, pi = found.model, found.standard
+    most = _ROWS // len(evaluations)
+    own = [(e, spread_rows(len(e.recording.trajectory.t), most)) for e in evaluations]
+    motions = [e.recording.trajectory.at(k) for e, k in own]
+    splits = [split_torque(model, pi, m.q, m.v, m.a, m.direction, m.memory) for m in motions]
+    used = np.concatenate([e.recording.mask[k] for e, k in own])
+    q, v, a, tau = (
+        np.concatenate([getattr(m, x) for m in motions]) for x in ("q", "v", "a", "tau")
+    )
+    load = np.concatenate([s.load for s in splits])
+    rows, broadband = _rows(own), _broadband_shares(evaluations)
+    judged = []
+    for j, joint in enumerate(model.row_names):
+        terms = [split.terms_of(j) for split in splits]  # equal in all
+        angle = "m" if joint in model.layout.prismatic else "rad"
+        quantities = {
+            "position": (angle, q[:, j]),
+            "speed": (f"{angle}/s", v[:, j]),
+            "acceleration": (f"{angle}/s^2", a[:, j]),
+            "load": (model.row_units[j], load[:, j]),
+        }
+        if model.is_static:  # its samples are means of segments, without speeds
+            quantities = {name: quantities[name] for name in ("position", "load")}
+        judged.append(
+            JointTorque(
+                joint=joint,
+                unit=model.row_units[j],
+                rows=rows,
+                used=used[:, j],
+                tau=tau[:, j],
+                parts={
+                    x: np.concatenate([s.parts[x][:, j] for s in splits]) for x in splits[0].parts
+                },
+                terms={
+                    part: {x: np.concatenate([each[part][x] for each in terms]) for x in own}
+                    for part, own in terms[0].items()
+                },
+                quantities=quantities,
+                broadband=broadband[j],
+            )
+        )
+    return tuple(judged)
+
+
+def spread_rows(count: int, most: int) -> Array:
+    """Return the indices of selected samples, spread evenly over all.
+
+    Args:
+        count: Number of samples.
+        most: Largest number of selected samples.
+    """
+    return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int))
+
+
+def _rows(own: Sequence[tuple[Evaluation, Array]]) -> Rows:
+    """Return samples of recordings, cut into segments long enough to be held out in turn."""
+    counts = [len(k) for _, k in own]
+    independent = sum(
+        min(len(k), independent_share(e.recording.signals) * len(e.recording.trajectory.t))
+        for e, k in own
+    )
+    many, total = min(_SEGMENTS, int(independent / _SHORTEST)), sum(counts)
+    return Rows(
+        recordings=tuple(e.recording.name for e, _ in own),
+        t=np.concatenate([e.recording.trajectory.t[k] for e, k in own]),
+        recording=np.repeat(np.arange(len(own)), counts),
+        segment=np.concatenate([e.recording.trajectory.segment[k] for e, k in own]),
+        segments=np.arange(total) * many // total if many >= FEWEST else None,
+    )
+
+
+def _broadband_shares(evaluations: Sequence[Evaluation]) -> list[float | None]:
+    """Return the broadband share of each row's squared residual, as of filtered noise.
+
+    It is 1 - r(L) / r(0) with r the autocovariance and L a period of the filter's cut-off.
+    """
+    rows = evaluations[0].recording.mask.shape[1]
+    squares, products = np.zeros(rows), np.zeros(rows)
+    for e in evaluations:
+        motion, signals = e.recording.trajectory, e.recording.signals
+        r = np.where(e.recording.mask, motion.tau - e.torques["estimate"], 0.0)
+        lag = 1
+        if signals.cutoff is not None and motion.rate is not None:
+            lag = max(1, round(motion.rate / signals.cutoff))
+        same_segment = (motion.segment[lag:] == motion.segment[:-lag])[:, None]
+        both = same_segment & e.recording.mask[lag:] & e.recording.mask[:-lag]
+        products += np.sum(r[lag:] * r[:-lag], axis=0, where=both)
+        squares += np.sum(0.5 * (r[lag:] ** 2 + r[:-lag] ** 2), axis=0, where=both)
+    return [
+        min(1.0, 1.0 - product / square) if square > 0 else None
+        for product, square in zip(products.tolist(), squares.tolist(), strict=True)
+    ]
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.2g} %" if share < 0.1 else f"{100 * share:.0f} %"

@@ -1,0 +1,276 @@
+"""Evidence for a verdict: torque prediction errors, and what the data determine."""
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from robotid.base.findings import listed, quoted
+from robotid.estimation.fitting.metrics import JointMetrics, Metrics
+
+__all__ = [
+    "BEATEN",
+    "COSTLY",
+    "GOOD",
+    "POOR",
+    "Determined",
+    "Predictions",
+    "error_of",
+    "is_beaten",
+    "is_harmless_cost",
+]
+
+#: [%] largest torque prediction error on validation logs of a joint that is "good".
+GOOD = 15.0
+#: [%] a joint with a larger torque prediction error is not usable.
+POOR = 50.0
+#: A simpler model is better if its error is smaller by this factor ...
+BEATEN = 1.05
+#: [%] a larger error on the fitted logs, twice that of WLS, makes a joint poor.
+COSTLY = 3.0
+
+_TIE = 0.3  # [%] ... and, for the URDF with fitted drives, by this share of the torque
+_OPTIMISM = 2.0  # validation error over fitted error beyond which the fit is over-fitted
+_BASE = "base."  # of the rows of a floating base
+_WRONG = 2.0  # an error this many times that of WLS gives a warning ...
+_HARMLESS = 1.0  # [%] ... but not below this share of the torque
+_NAMED = 8  # parameters that a reason names
+
+
+@dataclass(frozen=True)
+class Predictions:
+    """Torque prediction errors of each joint.
+
+    Attributes:
+        fit: Metrics over the fitted recordings.
+        validation: Metrics of each validation log, by its name; or of each log left out in turn.
+        joints: The model's joints; one without a sample in any recording is not evaluated.
+        refitted: Names of validation logs that are left out because they contain fitted samples.
+        hidden: Joints that are not evaluated, as of ``hidden_joints``; their metrics are ignored.
+    """
+
+    fit: Metrics
+    validation: Mapping[str, Metrics]
+    joints: Sequence[str] = ()
+    refitted: Sequence[str] = ()
+    hidden: Sequence[str] = ()
+
+    @cached_property
+    def fitted(self) -> dict[str, JointMetrics]:
+        """Metrics of each joint over the fitted recordings."""
+        return self._evaluated(self.fit)
+
+    @cached_property
+    def tested(self) -> dict[str, dict[str, JointMetrics]]:
+        """Metrics of each joint on each validation log."""
+        return {log: self._evaluated(metrics) for log, metrics in self.validation.items()}
+
+    def _evaluated(self, metrics: Metrics) -> dict[str, JointMetrics]:
+        """Return the metrics of joints; those of a floating base if no joint has any."""
+        found = {joint: m for joint, m in metrics.per_joint.items() if joint not in self.hidden}
+        joints = {name: m for name, m in found.items() if not name.startswith(_BASE)}
+        return joints or found
+
+    def of_base(self) -> list[str]:
+        """Return the prediction errors of the wrench on a floating base, beside its joints'."""
+        notes = []
+        for log, metrics in self.validation.items():
+            own = {x: m for x, m in metrics.per_joint.items() if x.startswith(_BASE)}
+            if not own or own.keys() & self.tested[log].keys():
+                continue
+            errors = [f"{x.removeprefix(_BASE)} {error_of(m):.0f} %" for x, m in own.items()]
+            notes.append(
+                f"wrench on the base that contact forces cannot cause, error on {log}: "
+                f"{listed(errors)}. The verdict is on the torque of the joints"
+            )
+        return notes
+
+    def on_each(self) -> dict[str, tuple[list[str], list[str], list[float]]]:
+        """Return the errors, the warnings and the prediction errors [%] by log of each joint."""
+        moved = [joint for m in (self.fitted, *self.tested.values()) for joint in m]
+        named = [joint for joint in self.joints if joint not in self.hidden]
+        return {joint: self._on(joint) for joint in dict.fromkeys([*named, *moved])}
+
+    def _on(self, joint: str) -> tuple[list[str], list[str], list[float]]:
+        poor, warnings, errors = [], [], []
+        for log, metrics in self.tested.items():
+            measured = metrics.get(joint)
+            if measured is not None:
+                found = _judge_joint(joint, log, measured, self.fitted.get(joint))
+                poor += found[0]
+                warnings += found[1]
+                errors.append(error_of(measured))
+        return poor, warnings, errors
+
+    def untested(self) -> list[str]:
+        """Return why no prediction of unseen motion was evaluated; empty if one was."""
+        if self.validation:
+            return []
+        why = "no validation log given"
+        if self.refitted:
+            why = f"{listed(self.refitted)} contain fitted samples"
+        return [f"prediction of unseen motion not evaluated: {why}"]
+
+    def better_by_urdf(self, rescaled: Collection[str] = ()) -> list[str]:
+        """Return the joints that the URDF with fitted drives predicts better, and the remedy.
+
+        Args:
+            rescaled: Joints whose gain differs between the logs: that is the cause.
+        """
+        worse = [j for own in self.tested.values() for j, m in own.items() if is_beaten(m)]
+        worse = [joint for joint in worse if joint not in rescaled]
+        if not worse:
+            return []
+        return [
+            f"the URDF with fitted drives predicts {listed(dict.fromkeys(worse))} better than the "
+            "identified bodies: keep the URDF's values for the links of these joints (pinned in "
+            "[estimator.constraints])"
+        ]
+
+    def at_rest(self) -> list[str]:
+        """Return the joints at rest in all recordings, and those at rest in all validation logs."""
+        fitted, validated = self.fitted, {joint for own in self.tested.values() for joint in own}
+        names = [joint for joint in self.on_each() if joint not in validated]
+        still = [joint for joint in names if joint not in fitted]
+        missing = [joint for joint in names if joint in fitted]
+        if still and not fitted:  # evaluated again without the fitted recordings
+            still, missing = [], still
+        reasons = []
+        if still:
+            reasons.append(
+                f"the joints {listed(still)} do not move in any recording: not evaluated"
+            )
+        if missing and self.validation:
+            reasons.append(
+                f"the joints {listed(missing)} do not move in any validation log: not evaluated"
+            )
+        return reasons
+
+    def why_untested(self, joint: str) -> str:
+        """Return why a joint was evaluated on no validation log.
+
+        Args:
+            joint: The joint.
+        """
+        if joint not in self.fitted:
+            return "it does not move in any recording"
+        if self.validation:
+            return "it does not move in any validation log"
+        return "no validation log given"
+
+
+@dataclass(frozen=True)
+class Determined:
+    """Parameters that the data determine.
+
+    Attributes:
+        undetermined: Base parameters that the data do not determine individually.
+        is_consistent: Whether the parameters are physically consistent.
+        is_poorly_excited: Whether a richer motion would determine them; else noise is the limit.
+        is_static: Whether the model is static.
+        uncertain_drives: Other drive parameters whose standard error is not smaller than 0.9 of
+            their prior standard deviation.
+    """
+
+    undetermined: Sequence[str] = ()
+    is_consistent: bool = True
+    is_poorly_excited: bool = True
+    is_static: bool = False
+    uncertain_drives: Sequence[str] = ()
+
+    def warnings(self) -> list[str]:
+        """Return the reasons why the result is at best usable."""
+        reasons = []
+        if self.undetermined and self.is_poorly_excited:
+            reasons.append(
+                f"the data do not determine {len(self.undetermined)} base parameters "
+                f"individually: {listed(self.undetermined, _NAMED)}"
+            )
+        if not self.is_consistent:
+            reasons.append(
+                "the standard parameters are not physically consistent: URDF not written. The "
+                "base parameters still predict torque"
+            )
+        return reasons
+
+    def notes(self) -> list[str]:
+        """Return notes that do not change the verdict: parameters hidden by the noise."""
+        alone = [
+            f"{listed(self.uncertain_drives, _NAMED)}: the standard error is as large as that of "
+            "the prior: only a sum with other terms is identifiable; use the friction curve"
+        ]
+        alone = alone if self.uncertain_drives else []
+        if not self.undetermined or self.is_poorly_excited:
+            return alone
+        return [
+            f"{len(self.undetermined)} base parameters are not identifiable above the noise of a "
+            "rich motion, or only in sums with others. What is not determined keeps the URDF's "
+            "values: "
+            f"{listed(self.undetermined, _NAMED)}",
+            *alone,
+        ]
+
+
+def is_beaten(measured: JointMetrics) -> bool:
+    """Return whether the URDF with fitted drives predicts a joint clearly better.
+
+    Args:
+        measured: Prediction errors of the joint.
+    """
+    driven = measured.baselines.get("urdf_with_drives")
+    return driven is not None and error_of(measured) > max(BEATEN * driven, driven + _TIE)
+
+
+def is_harmless_cost(error: float, wls_error: float) -> bool:
+    """Return whether constraints cost so little torque error that the verdict does not count it.
+
+    Args:
+        error: Torque error with them [%].
+        wls_error: Torque error of unconstrained WLS [%].
+    """
+    return error < max(_WRONG * wls_error, _HARMLESS)
+
+
+def error_of(measured: JointMetrics) -> float:
+    """Return the relative error of a joint [%], inf where nothing was measured.
+
+    Args:
+        measured: Prediction errors of the joint.
+    """
+    value = measured.relative_error_pct
+    return float("inf") if value is None else value
+
+
+def _judge_joint(
+    joint: str, log: str, measured: JointMetrics, fitted: JointMetrics | None
+) -> tuple[list[str], list[str]]:
+    """Return the errors (the result is poor) and the warnings about one joint."""
+    error = error_of(measured)
+    urdf = measured.baselines.get("urdf")
+    if measured.relative_error_pct is None:
+        return [
+            f"{joint}: the torque is 0 throughout {log}: not evaluated. If the joint has no drive, "
+            f"state passive = [{quoted(joint)}] in the job file"
+        ], []
+    if not measured.better_than_constant and not joint.startswith(_BASE):  # its weight is constant
+        constant = error / np.sqrt(1.0 - measured.r2)
+        why = f"error {error:.1f} %; a constant would give {constant:.1f} %"
+        return [f"{joint}: worse than a constant torque on {log}: {why}"], []
+    if urdf is not None and error > urdf:
+        return [f"{joint}: error {error:.1f} % on {log}, worse than the URDF's {urdf:.1f} %"], []
+    if error > POOR:
+        return [f"{joint}: error {error:.1f} % on {log}, above {POOR:g} %"], []
+    if error > GOOD:
+        why = f"error {error:.1f} % on {log} (wanted: at most {GOOD:g} %)"
+        return [], [f"{joint}: {why}; see its residual in the report"]
+    if fitted is not None and error > max(_OPTIMISM * error_of(fitted), 5.0):
+        return [], [
+            f"{joint}: error {error:.1f} % on {log}, {error_of(fitted):.1f} % on the fitted "
+            "recordings; record and fit a richer motion"
+        ]
+    if is_beaten(measured):
+        driven = measured.baselines["urdf_with_drives"]
+        why = f"error {error:.1f} % on {log}, {driven:.1f} % with the URDF and fitted drives"
+        return [], [f"{joint}: {why}: keep the URDF's values for its link"]
+    return [], []

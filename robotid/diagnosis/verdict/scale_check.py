@@ -1,0 +1,417 @@
+"""Scale check of a result, independent of the torque sensors: the URDF's gravity and masses."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any
+
+import numpy as np
+import scipy.special
+
+from robotid.base.findings import listed
+from robotid.base.typing import Array
+from robotid.diagnosis.verdict.payload_check import PayloadCheck
+from robotid.diagnosis.verdict.stated_mass import (
+    AGREES,
+    StatedMass,
+    determines_total_mass,
+    stated_mass,
+)
+from robotid.dynamics.constraint_rows import loop_basis, without_forces
+from robotid.dynamics.prediction import predict
+from robotid.dynamics.torque import joint_torque_regressor
+from robotid.estimation.fitting.fitted import Fit
+from robotid.robot.assumed import assumed_masses
+from robotid.robot.parameters import pseudo_inertia
+
+__all__ = ["ScaleCheck", "check_scale", "common_factor", "friction_shares"]
+
+_POSES = 300  # at which gravity is compared
+_LOADED = 0.02  # share of the largest gravity torque above which a joint is compared
+_KNOWN = 0.1  # standard error of a ratio below which it is used
+_HELD_BACK = 1.5  # residual over that of WLS beyond which the prior determines the result
+_ANOTHER = 0.35  # difference of gravity and total mass from which on they contradict the scale
+_OFF = 0.1  # a common factor of all torques is reported if it is at least so far from 1,
+_CLEARLY = 4.0  # ... if that distance is so many times the unexplained share of gravity
+_LIKE = 1e-6  # variance of a ratio beside errors of links, for joints that the same links load
+_TOTAL = "total mass"
+_NORMAL = 1.96  # half width of a 95 % interval in standard errors
+_BETTER = 0.5  # ... and that share is less than this times the one with a payload
+
+
+@dataclass(frozen=True)
+class ScaleCheck:
+    """The identified gravity and masses against the URDF's.
+
+    Attributes:
+        gravity: Identified over URDF's gravity torque, by joint that gravity loads [-].
+        gravity_error: Standard errors of these ratios [-].
+        scale: Ratio over all joints together, fitted with a payload; None if gravity loads none.
+        factor: Ratio over all joints together, without a payload [-].
+        unexplained: Share of the identified gravity torque that remains unexplained by one factor,
+            and by a payload [-].
+        masses: Total mass of the URDF, identified total mass, mass of that payload [kg].
+        stated: The masses that the user states, and what torque alone determines of them; None if
+            none is stated.
+        payloads: The checks with payloads of known mass, that with the narrowest interval first.
+        is_total_determined: Whether torque alone determines the total mass within 5 %, so that a
+            measured one verifies the scale.
+        friction: Share of viscous and Coulomb friction in each joint's torque [-].
+        follows: Whether the result fits the data about as well as WLS. A result that its prior
+            determines agrees with the URDF whatever the sensors measured.
+        common: Factor common to the ratios of the joints, and half the width of its 95 % interval
+            [-], as errors of the URDF spread the ratios; None with fewer than two.
+        mass_error: Standard error of the identified total mass [kg].
+        assumed: Number of links whose inertials are assumed, so that gravity and mass of the URDF
+            are no evidence.
+    """
+
+    gravity: Mapping[str, float] = field(default_factory=dict)
+    gravity_error: Mapping[str, float] = field(default_factory=dict)
+    scale: float | None = None
+    factor: float = 1.0
+    unexplained: tuple[float, float] = (0.0, 0.0)
+    masses: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    stated: StatedMass | None = None
+    payloads: tuple[PayloadCheck, ...] = ()
+    is_total_determined: bool = False
+    friction: Mapping[str, float] = field(default_factory=dict)
+    follows: bool = True
+    common: tuple[float, float] | None = None
+    mass_error: float = 0.0
+    assumed: int = 0
+
+    @property
+    def agrees(self) -> bool:
+        """Whether known masses, or else gravity and total mass of the URDF, confirm the scale."""
+        if self._decisive:
+            return all(check.verifies for check in self._decisive)
+        return self.scale is not None and self._off <= AGREES and self.follows
+
+    @property
+    def contradicts(self) -> bool:
+        """Whether a known mass, or else gravity and total mass of the URDF, contradict it.
+
+        A difference that errors of the URDF's links explain contradicts nothing, nor does a total
+        mass whose interval includes that of the URDF.
+        """
+        if self._decisive:
+            return any(check.contradicts for check in self._decisive)
+        return self.has_one_factor or self._is_far
+
+    @property
+    def _is_far(self) -> bool:
+        """Whether gravity or a determined total mass differs by more than errors of the URDF."""
+        before, after, payload = self.masses
+        has_mass = abs(after - before) > _NORMAL * self.mass_error
+        if self._is_urdf:  # gravity is no evidence, a total mass that is determined is
+            least = min(abs(after - before), abs(after - payload - before))
+            return has_mass and not self._is_total_open and least > _ANOTHER * before
+        is_any = self._ratios_whole if has_mass else self.scale is not None
+        return bool(is_any) and self._off_by(has_mass=has_mass) > _ANOTHER
+
+    @property
+    def _is_urdf(self) -> bool:
+        """Whether the spread of the joints' ratios explains a common factor other than 1."""
+        return self.common is not None and abs(self.common[0] - 1.0) <= self.common[1]
+
+    @property
+    def _decisive(self) -> dict[PayloadCheck | StatedMass, str]:
+        """The known masses that verify or contradict the scale, and their names."""
+        checks: dict[PayloadCheck | StatedMass, str] = dict.fromkeys(
+            self.payloads, "payload of known mass"
+        )
+        if self.stated is not None:
+            checks[self.stated] = "stated mass"
+        return {c: name for c, name in checks.items() if c.verifies or c.contradicts}
+
+    @property
+    def has_one_factor(self) -> bool:
+        """Whether one common factor explains gravity: the scale is wrong, not single masses."""
+        by_factor, by_payload = self.unexplained
+        return (
+            abs(self.factor - 1.0) > max(_OFF, _CLEARLY * by_factor)
+            and by_factor < _BETTER * by_payload
+            and not self._is_urdf
+        )
+
+    @property
+    def figures(self) -> str:
+        """Gravity torque and total mass against the URDF's, as text."""
+        before, after, _ = self.masses
+        if self.assumed:
+            count = f"{self.assumed} link{'s' if self.assumed > 1 else ''}"
+            return f"total mass {after:.4g} kg; the URDF states no usable inertials of {count}"
+        mass = f"total mass {after:.4g} kg against the URDF's {before:.4g} kg"
+        if self.scale is None:
+            return f"gravity loads no joint, {mass}"
+        return f"gravity torque {self.factor:.2f} x the URDF's, {mass}"
+
+    @property
+    def message(self) -> str:
+        """What was verified, or the figure that exceeds its limit, its cause and the remedy."""
+        checks: list[PayloadCheck | StatedMass] = [*self.payloads]
+        checks += [] if self.stated is None else [self.stated]
+        beside = "".join(
+            f". {check.message[0].upper()}{check.message[1:]}"
+            for check in reversed(checks)
+            if check not in self._decisive
+        )
+        sentences = [
+            f"absolute scale {'verified' if check.verifies else 'contradicted'} by a {name}: "
+            f"{check.message}"
+            for check, name in sorted(self._decisive.items(), key=lambda item: item[0].verifies)
+        ]
+        if sentences:
+            others = [f"{x[0].upper()}{x[1:]}" for x in sentences[1:]]
+            return ". ".join([sentences[0], *others]) + beside
+        if self.agrees:
+            return f"{self._agreement}{beside}"
+        remedy = (
+            "State the measured mass of the moving links (total_mass)"
+            if self.is_total_determined
+            else "Verify it with a payload of known mass (robotid payload)"
+        )
+        remedy = "" if self.payloads else f". {remedy}"
+        return f"absolute scale not verified: {self.figures}{self._excess}{beside}{remedy}"
+
+    @property
+    def _agreement(self) -> str:
+        """How gravity and total mass confirm the scale."""
+        agrees = "absolute scale: gravity and total mass agree with the URDF's within 5 %"
+        if self._is_total_open:
+            agrees = "absolute scale: gravity agrees with the URDF's within 5 %"
+        if self._off_whole <= AGREES:
+            return f"{agrees}: {self.figures}"
+        before, after, payload = self.masses
+        return (
+            f"{agrees} only if a load of {payload:+.3g} kg is added to the last link, "
+            "which the URDF does not have. Without the load: gravity torque "
+            f"{self.scale:.2f} x the URDF's, total mass {after - payload:.4g} kg against the "
+            f"URDF's {before:.4g} kg. With it: {self.figures}. If no such load was mounted, "
+            "check the gains of the torques"
+        )
+
+    @property
+    def _excess(self) -> str:
+        """Which figures exceed which limit, and the probable cause."""
+        limit = _ANOTHER if self._off > _ANOTHER else AGREES
+        ratios = self._ratios_whole
+        beyond = [what for what, ratio in ratios.items() if abs(ratio - 1.0) > limit]
+        excess = "; the residual of a joint is above 1.5 x that of WLS" if not self.follows else ""
+        if beyond:
+            verb = "differs" if len(beyond) == 1 else "differ"
+            excess = f"; {' and '.join(beyond)} {verb} by more than {100 * limit:.0f} %{excess}"
+        if self.common is not None and limit > AGREES and self._is_urdf:
+            common, half = self.common
+            excess += (
+                f". The factor common to the joints is {common:.2f} +- {half:.2g} (95 %), as the "
+                "URDF's errors spread theirs: 1 is possible"
+            )
+        by_factor, by_payload = self.unexplained
+        compared = {} if self.assumed else self.gravity
+        single = [f"{j} {x:.2f}" for j, x in compared.items() if abs(x - 1.0) > _ANOTHER]
+        if self.has_one_factor:
+            same = f"The same factor {self.factor:.2f} fits all joints"
+            cause = "the gains of the torques, or the URDF's mass of a link that loads all of them"
+            return f"{excess}. {same}: probable cause: {cause}"
+        is_urdf = self.scale is not None and abs(self.scale - 1.0) <= AGREES
+        if is_urdf and self.masses[2] > 0 and by_payload < _BETTER * by_factor:
+            load = f"a load of {self.masses[2]:+.3g} kg on the last link that the URDF lacks"
+            return f"{excess}. Probable cause: {load}"
+        if single:
+            by_joint = f"Gravity torque over the URDF's, by joint: {listed(single)}"
+            return f"{excess}. {by_joint}: probable cause: masses of the URDF, or single gains"
+        if not self.follows:
+            return f"{excess}. Probable cause: a prior or constraint that the data contradict"
+        if beyond:
+            return f"{excess}. Probable cause: the URDF's masses, or the gains of the torques"
+        return excess
+
+    @property
+    def _is_total_open(self) -> bool:
+        """Whether the total mass is stated, and not by torque: it does not count as identified."""
+        stated = self.stated
+        return stated is not None and stated.ratio is None and "total_mass" in stated.names
+
+    @property
+    def _ratios_whole(self) -> dict[str, float]:
+        """Identified over URDF's gravity torque and total mass, without a payload [-]."""
+        before, after, _ = self.masses
+        is_open = self._is_total_open or self.assumed > 0
+        mass = {} if is_open else {_TOTAL: after / before if before > 0 else np.inf}
+        return ({} if self.scale is None else {"gravity torque": self.factor}) | mass
+
+    @property
+    def _off(self) -> float:
+        """Relative difference of gravity and total mass, less a payload if it explains them [-]."""
+        return self._off_by(has_mass=True)
+
+    def _off_by(self, *, has_mass: bool) -> float:
+        """Return the relative difference, less a payload if it explains it [-].
+
+        A payload without mass is ignored: it does not determine the scale.
+
+        Args:
+            has_mass: Whether the total mass counts, not gravity alone.
+        """
+        before, after, payload = self.masses
+        ratios = {k: x for k, x in self._ratios_whole.items() if has_mass or k != _TOTAL}
+        whole = max((abs(ratio - 1.0) for ratio in ratios.values()), default=np.inf)
+        if not (before > 0 and payload > 0):
+            return whole
+        with_load = abs((self.scale or 1.0) - 1.0)
+        if has_mass and not self._is_total_open:
+            with_load = max(with_load, abs((after - payload) / before - 1.0))
+        return min(with_load, whole)
+
+    @property
+    def _off_whole(self) -> float:
+        """Relative difference of gravity and total mass without a payload [-]."""
+        return max((abs(ratio - 1.0) for ratio in self._ratios_whole.values()), default=np.inf)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the figures as result.json has them."""
+        figures = asdict(self) | {
+            key: list(getattr(self, key)) for key in ("unexplained", "masses")
+        }
+        del figures["stated"], figures["payloads"], figures["common"]
+        figures |= {} if self.common is None else {"common": list(self.common)}
+        stated = {} if self.stated is None else {"stated": self.stated.to_dict()}
+        checks = {"payloads": [x.to_dict() for x in self.payloads]} if self.payloads else {}
+        concluded = {"agrees": self.agrees, "message": self.message}
+        return figures | {"is_stated": self.stated is not None} | stated | checks | concluded
+
+
+def check_scale(found: Fit) -> ScaleCheck:
+    """Compare gravity and masses of a result with the URDF's.
+
+    With g_u and g the gravity torques of the URDF and of the result over the fitted poses, a
+    joint's ratio is g_u . g / g_u . g_u. It is linear in the base parameters: the covariance of the
+    result gives its standard error.
+
+    Args:
+        found: The identification.
+    """
+    model, size = found.model, found.model.layout.n_inertial
+    before, after = (float(pi[:size:10].sum()) for pi in (found.prior, found.standard))
+    friction = friction_shares(found)
+    errors = [found.metrics(name).per_joint for name in ("estimate", "wls")]
+    follows = all(
+        errors[0][j].rmse <= _HELD_BACK * free.rmse or j in found.overfitted
+        for j, free in errors[1].items()
+    )
+    plain = ScaleCheck(
+        masses=(before, after, 0.0), stated=stated_mass(found), friction=friction, follows=follows,
+        is_total_determined=determines_total_mass(found),
+    )  # fmt: skip
+    q = np.vstack([e.recording.trajectory.q for e in found.fitted])
+    if model.free_flyer:  # gravity loads its base with the whole mass
+        ratio = after / before if before > 0 else 1.0
+        return replace(plain, scale=ratio, factor=ratio, is_total_determined=True)
+    q = q[:: -(-len(q) // _POSES)]
+    still = np.zeros_like(q)
+    G = joint_torque_regressor(model, q, still, still).reshape(len(q), model.n_rows, -1)
+    if model.loops:
+        G = without_forces(loop_basis(model, q), G)
+    last = G[:, :, size - 10 : size - 6]  # m, mcx, mcy, mcz of the last body
+    by_body = G[:, :, :size]
+    G = G[:, :, found.mapping.independent]
+    at_rest = np.arange(len(found.prior)) < size
+    of_urdf, of_result = (
+        G @ found.mapping.to_base(np.where(at_rest, pi, 0.0))
+        for pi in (found.prior, found.standard)
+    )  # (N, n)
+    load = np.sum(of_urdf**2, axis=0)
+    if not load.any():
+        return plain
+    K = found.mapping.K * at_rest
+    covariance = K @ found.standard_covariance @ K.T
+    gravity, error, known = {}, {}, []
+    for j in np.flatnonzero(load > _LOADED**2 * load.max()).tolist():
+        w = of_urdf[:, j] @ G[:, j] / load[j]  # (b,), ratio = w beta
+        spread = float(np.sqrt(max(w @ covariance @ w, 0.0)))
+        if spread < _KNOWN:
+            gravity[model.row_names[j]] = float(of_urdf[:, j] @ of_result[:, j] / load[j])
+            error[model.row_names[j]] = spread
+            known.append(j)
+    common = None
+    if len(known) > 1:
+        A = np.einsum("nj,njk->jk", of_urdf[:, known], by_body[:, known]) / load[known, None]
+        common = common_factor(np.array([*gravity.values()]), A, found.prior[:size])
+    factor = float(np.sum(of_urdf * of_result) / load.sum())
+    scale, payload, left = _with_payload(of_urdf, of_result, last)
+    rest = float(np.linalg.norm(of_result - factor * of_urdf) / np.linalg.norm(of_result))
+    plain = replace(plain, gravity=gravity, gravity_error=error)
+    of_assumed = found.prior[:size:10][np.isin(model.layout.bodies, assumed_masses(model))]
+    if of_assumed.sum() > AGREES * before:
+        return replace(plain, assumed=len(of_assumed))
+    return replace(
+        plain, scale=scale, factor=factor,
+        unexplained=(rest, left), masses=(before, after, payload), common=common,
+        mass_error=float(np.sqrt(max(found.standard_covariance[:size:10, :size:10].sum(), 0.0))),
+    )  # fmt: skip
+
+
+def common_factor(ratios: Array, sensitivity: Array, inertial: Array) -> tuple[float, float]:
+    """Return the factor common to the gravity torques of joints, and its 95 % half-width [-].
+
+    A scale s of all torques and relative errors of the URDF's links give ratios r = s (1 + E e):
+    e are errors of mass and of the centre of mass, over the link's radius of gyration; independent,
+    of one unknown standard deviation. Generalised least squares with the covariance E E^T gives s;
+    the residual gives the deviation, Student's t with one degree of freedom less than joints the
+    interval. Errors of the data spread the ratios, too, and are included so.
+
+    Args:
+        ratios: Identified over URDF's gravity torque of at least two joints, shape (k,).
+        sensitivity: Derivatives of the URDF's ratios by its parameters, shape (k, 10 b).
+        inertial: The URDF's inertial parameters, shape (10 b,).
+    """
+    A, pi = sensitivity.reshape(len(ratios), -1, 10), inertial.reshape(-1, 10)
+    J = pseudo_inertia(inertial)
+    # mass times radius of gyration
+    moment = np.sqrt(
+        np.maximum(
+            pi[:, 0] * np.trace(J[:, :3, :3], axis1=1, axis2=2) - np.sum(pi[:, 1:4] ** 2, 1), 0
+        )
+    )
+    E = np.column_stack([np.einsum("kbp,bp->kb", A, pi), *(A[:, :, i] * moment for i in (1, 2, 3))])
+    L = np.linalg.cholesky(E @ E.T + _LIKE * np.eye(len(ratios)))
+    one, r = np.linalg.solve(L, np.column_stack([np.ones(len(ratios)), ratios])).T
+    factor = float(one @ r / (one @ one))
+    free = len(ratios) - 1
+    spread = np.linalg.norm(r - factor * one) / np.sqrt(free)
+    return factor, float(scipy.special.stdtrit(free, 0.975) * spread / np.linalg.norm(one))
+
+
+def friction_shares(found: Fit) -> dict[str, float]:
+    """Return the share of friction in the RMS torque of each joint [-]; 0 of a torque that is 0.
+
+    Args:
+        found: The fit.
+    """
+    layout = found.model.layout
+    is_friction = [name.endswith((".viscous", ".coulomb")) for name in layout.names]
+    pi = np.where(is_friction, found.standard, 0.0)
+    motions = [e.recording.trajectory for e in found.fitted]
+    torque = np.vstack([predict(found.model, [pi], motion)[0] for motion in motions])
+    measured = np.vstack([motion.tau for motion in motions])
+    torque, measured = np.linalg.norm([torque, measured], axis=1)
+    share = np.divide(torque, measured, where=measured > 0.0, out=np.zeros_like(torque))
+    return dict(zip(found.model.row_names, share.tolist(), strict=True))
+
+
+def _with_payload(of_urdf: Array, of_result: Array, last: Array) -> tuple[float, float, float]:
+    """Return scale and mass of a payload, and the share that a payload alone leaves unexplained.
+
+    Args:
+        of_urdf: Gravity torque of the URDF, shape (N, n).
+        of_result: The same as identified.
+        last: Gravity torque of m, mcx, mcy and mcz of the last body, shape (N, n, 4).
+    """
+    P, u, g = last.reshape(-1, 4), of_urdf.reshape(-1), of_result.reshape(-1)
+    alone = np.linalg.lstsq(P, g - u)[0]
+    left = float(np.linalg.norm(g - u - P @ alone) / np.linalg.norm(g))
+    both = np.linalg.lstsq(np.column_stack([u, P]), g)[0]
+    return float(both[0]), max(float(both[1]), 0.0), left

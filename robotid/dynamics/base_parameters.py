@@ -1,0 +1,389 @@
+"""Base parameters: the combinations of the standard parameters that affect the torque.
+
+QR with column pivoting of the regressor at random states: W P = Q [R1 R2], so the dependent columns
+are combinations of the independent ones, W_2 = W_1 R1^-1 R2, and W pi = W_1 beta with
+beta = K pi = pi_1 + R1^-1 R2 pi_2 (Gautier 1991).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import scipy.linalg
+
+from robotid.base.exceptions import DataError
+from robotid.base.typing import Array
+from robotid.dynamics.problem import Problem
+from robotid.dynamics.torque import random_regressor
+from robotid.robot.model import RobotModel
+
+__all__ = [
+    "RANK_TOLERANCE",
+    "BaseMapping",
+    "base_mapping",
+    "independent_factors",
+    "structural_mapping",
+]
+
+#: Pivots below this share of the largest count as 0. Over example-robot-data, every pivot is above
+#: 1e-3 or below 1e-12, except with rounded angles in a URDF (3.1416): 1e-5 to 1e-6.
+RANK_TOLERANCE = 1e-4
+_CLOSED_RANK = 1e-9  # the same for closed chains, whose small motions have pivots down to 1e-6
+_TIE = 1e-6  # share by which each column is shortened relative to the one before it
+_FAINTEST = 1e-12  # norm of a column that is 0 at every state
+_PANEL = 24  # columns eliminated at a time
+_CLEAN = 1e-10  # smaller coefficients, relative to the scales, are rounding errors
+_SHOWN = 1e-6  # smaller coefficients are omitted in the expressions, not in K
+
+
+@dataclass(frozen=True, eq=False)
+class BaseMapping:
+    """The linear map from standard to base parameters and back.
+
+    Attributes:
+        K: Map with beta = K pi and W pi = W[:, independent] beta, shape (b, p).
+        independent: Independent columns of W, shape (b,), ascending.
+        names: Names of the p standard parameters.
+        pivots: Absolute values of all p pivots, descending, relative to the first, shape (p,).
+    """
+
+    K: Array
+    independent: Array
+    names: tuple[str, ...]
+    pivots: Array
+
+    @property
+    def base_names(self) -> tuple[str, ...]:
+        """Name of each base parameter: that of its independent column."""
+        return tuple(self.names[i] for i in self.independent)
+
+    @cached_property
+    def expressions(self) -> tuple[str, ...]:
+        """Each base parameter as a sum, for example ``link_2.Izz + 0.5 link_3.m``."""
+        return tuple(
+            _expression(row, self.names, int(first))
+            for row, first in zip(self.K, self.independent, strict=True)
+        )
+
+    @cached_property
+    def unidentifiable(self) -> tuple[str, ...]:
+        """Names of the standard parameters that affect no torque in any motion."""
+        return tuple(self.names[i] for i in np.flatnonzero(~self.K.any(axis=0)))
+
+    def described(self, names: Sequence[str]) -> dict[str, tuple[str, ...]]:
+        """Return how some standard parameters are structurally identifiable.
+
+        Args:
+            names: Standard parameters.
+
+        Returns:
+            The names by kind: "alone", the parameter is a base parameter itself; "in sums", only
+            its sum with others is identifiable; "never", not identifiable by any motion.
+        """
+        terms = np.abs(self.K) > 0
+        kinds: dict[str, tuple[str, ...]] = {"alone": (), "in sums": (), "never": ()}
+        for name in names:
+            rows = np.flatnonzero(terms[:, self.names.index(name)])
+            is_alone = len(rows) == 1 and terms[rows[0]].sum() == 1
+            kind = "never" if not len(rows) else "alone" if is_alone else "in sums"
+            kinds[kind] += (name,)
+        return kinds
+
+    def to_base(self, pi: Array) -> Array:
+        """Return the base parameters beta = K pi, shape (b,).
+
+        Args:
+            pi: Standard parameters, shape (p,), SI units, in ``names`` order.
+
+        Raises:
+            DataError: If pi does not have p entries.
+        """
+        if pi.shape != (self.K.shape[1],):
+            raise DataError(f"pi has shape {pi.shape}, wanted ({self.K.shape[1]},)")
+        return self.K @ pi
+
+    def to_standard(self, beta: Array, prior: Array, spread: Array | None = None) -> Array:
+        """Return the standard parameters nearest to a prior that have these base parameters.
+
+        Nearest in units of the spread: pi = prior + G (beta - K prior) with
+        G = S^2 K^T (K S^2 K^T)^-1, S = diag(spread).
+
+        Args:
+            beta: Base parameters, shape (b,).
+            prior: Prior standard parameters, shape (p,).
+            spread: Prior standard deviation of each, shape (p,); 1 if None.
+
+        Returns:
+            Standard parameters, shape (p,), with K pi = beta. They need not be physically
+            consistent.
+
+        Raises:
+            DataError: If a shape is not the expected one.
+        """
+        if beta.shape != (len(self.K),):
+            raise DataError(f"beta has shape {beta.shape}, wanted ({len(self.K)},)")
+        pi: Array = prior + self.gain(spread) @ (beta - self.to_base(prior))
+        return pi
+
+    def gain(self, spread: Array | None = None) -> Array:
+        """Return G = S^2 K^T (K S^2 K^T)^-1, shape (p, b): the change of pi per change of beta.
+
+        Args:
+            spread: Prior standard deviation of each standard parameter, shape (p,); 1 if None.
+        """
+        s = np.ones(self.K.shape[1]) if spread is None else spread
+        # K S = (Q R)^T, so that S (K S)^+ = S Q R^-T has no loss of digits
+        Q, R = scipy.linalg.qr((self.K * s).T, mode="economic")
+        gain: Array = s[:, None] * scipy.linalg.solve_triangular(R, Q.T).T
+        return gain
+
+    def reduce(self, problem: Problem) -> Problem:
+        """Return the problem in the b base parameters, W_b beta = tau.
+
+        Args:
+            problem: A problem over the standard parameters.
+
+        Raises:
+            DataError: If the columns of the problem are not those of this mapping.
+        """
+        if problem.names != self.names:
+            raise DataError(
+                f"the problem has {len(problem.names)} columns, wanted the {len(self.names)} of "
+                "the mapping; build both from one model"
+            )
+        return problem.select(self.independent)
+
+
+def base_mapping(
+    W: Array,
+    names: tuple[str, ...],
+    *,
+    scales: Array | None = None,
+    preference: Array | None = None,
+    rtol: float = RANK_TOLERANCE,
+    n_rows: int = 1,
+) -> BaseMapping:
+    """Return the base parameters of a regressor taken at random states.
+
+    The columns are compared after multiplication by ``scales``, physical magnitudes. They are not
+    normalised, since a column of rounding errors would become a parameter.
+
+    Args:
+        W: Regressor at enough random states, shape (m, p), m >= p.
+        names: Names of the columns.
+        scales: Magnitude of each parameter, shape (p,); 1 if None. See
+            ``ParameterLayout.scales``.
+        preference: Preference of each column when the independent columns are chosen, shape (p,);
+            1 if None. It changes which groups are formed, not their number. See
+            ``ParameterLayout.preference``.
+        rtol: Pivots below this share of the largest count as 0.
+        n_rows: Rows of W per sample, each of another equation.
+
+    Raises:
+        DataError: If a shape is not the expected one, W is not finite or all zero.
+
+    References:
+        Gautier (1991), Numerical calculation of the base inertial parameters of robots.
+    """
+    if W.ndim != 2 or W.shape[1] != len(names) or len(W) < len(names):
+        raise DataError(f"W has shape {W.shape}, wanted at least {len(names)} rows of {len(names)}")
+    if not np.isfinite(W).all() or not W.any():
+        raise DataError("W is all zero or not finite, wanted finite numbers")
+    magnitude = np.ones(len(names)) if scales is None else scales
+    favour = np.ones(len(names)) if preference is None else preference
+    parts = [(own, R * magnitude[own]) for own, R in independent_factors(W, n_rows)]
+    first = [_pivot(R, columns) for columns, R in parts]
+    pivots = np.sort(np.concatenate([sizes for _, sizes in first]))[::-1]
+    K, independent = np.zeros((len(names), len(names))), np.zeros(len(names), dtype=bool)
+    for (columns, R), (order, sizes) in zip(parts, first, strict=True):
+        rank = int(np.sum(sizes > rtol * pivots[0]))
+        order = order if preference is None else _pivot(R * favour[columns], columns)[0]
+        own, others = np.sort(order[:rank]), np.sort(order[rank:])
+        triangle = scipy.linalg.qr(R[:, np.append(own, others)], mode="r")[0][:rank]
+        X = scipy.linalg.solve_triangular(triangle[:, :rank], triangle[:, rank:])  # scaled
+        X[np.abs(X) < _CLEAN] = 0.0
+        own, others = columns[own], columns[others]
+        independent[own] = True
+        K[own, own] = 1.0
+        K[np.ix_(own, others)] = X * magnitude[own][:, None] / magnitude[others]
+    return BaseMapping(K[independent], np.flatnonzero(independent), names, pivots / pivots[0])
+
+
+def independent_factors(W: Array, n_rows: int) -> list[tuple[Array, Array]]:
+    """Return factors of the parts of a regressor that have no equation and no column in common.
+
+    For example, arms on a common fixed base are such parts.
+
+    Args:
+        W: Regressor, shape (N n_rows, p).
+        n_rows: Rows per sample, each of another equation.
+
+    Returns:
+        For each part its c columns, and their R with R^T R = W^T W, shape (c, c).
+    """
+    samples = W.reshape(-1, n_rows, W.shape[1])
+    filled = (samples != 0.0).any(axis=0)  # (n_rows, p)
+    linked = filled.astype(float) @ filled.T > 0.0
+    count, label = _linked_parts(linked)
+    # a column of zeros is assigned to the first equation
+    of_column = label[filled.argmax(axis=0)]
+    parts = [(np.flatnonzero(label == k), np.flatnonzero(of_column == k)) for k in range(count)]
+    return [
+        (own, _factor(samples[:, rows][:, :, own], filled[np.ix_(rows, own)]))
+        for rows, own in parts
+        if len(own)
+    ]
+
+
+def _linked_parts(linked: Array) -> tuple[int, Array]:
+    """Return the number of parts of a graph, and the part of each node, int.
+
+    Args:
+        linked: Which nodes are linked, flags, shape (m, m), symmetric.
+    """
+    if linked.all(axis=1).any():  # to one node, as to the first joint of an arm
+        return 1, np.zeros(len(linked), dtype=int)
+    from scipy.sparse.csgraph import connected_components  # takes long to import
+
+    count, label = connected_components(linked, directed=False)
+    return int(count), label
+
+
+def _factor(rows: Array, filled: Array) -> Array:
+    """Return R with R^T R = W^T W.
+
+    The equation of a joint has the columns of all bodies that the joint moves, so it contains those
+    of every joint after it. The equations are folded from the ends of the robot to its base; the
+    columns of each are adjacent in a suitable order. If the equations are not nested so, the rows
+    are factored as a whole.
+
+    Args:
+        rows: W, shape (N, m, c).
+        filled: Columns of each equation, shape (m, c), bool.
+    """
+    c, filled = rows.shape[2], _with_carried(filled)
+    fewest = np.argsort(filled.sum(axis=1), kind="stable")
+    place = np.lexsort(filled[fewest])  # by the equation with the most columns first
+    spans = [_span(own) for own in filled[:, place]]
+    if None in spans:  # equations with common columns of which neither contains the other
+        R: Array = scipy.linalg.qr(rows.reshape(-1, c), mode="r", check_finite=False)[0]
+        return R[:c]
+    R = np.zeros((c, c))
+    for k in fewest:
+        first, last = spans[k] or (0, 0)
+        if first == last:
+            continue
+        own = slice(first, last)
+        panel = min(_PANEL, last - first)
+        # pentagonal of height 0: the rows below the triangle are full
+        R[own, own] = scipy.linalg.lapack.dtpqrt(
+            0, panel, np.asfortranarray(R[own, own]), np.asfortranarray(rows[:, k, place[own]])
+        )[0]
+    found = np.empty((c, c))
+    found[:, place] = R
+    return found
+
+
+def _with_carried(filled: Array) -> Array:
+    """Return the columns of each equation, extended by all of an equation of which it has most.
+
+    A parameter may affect a joint, but not the one before it, if its axis has a special direction.
+    """
+    wider, sizes = filled.copy(), filled.sum(axis=1)
+    for k in np.argsort(sizes, kind="stable"):
+        shared = (filled & filled[k]).sum(axis=1)
+        wider[k] |= wider[(sizes <= sizes[k]) & (2 * shared > sizes)].any(axis=0)
+    return wider
+
+
+def _span(own: Array) -> tuple[int, int] | None:
+    """Return first and end of columns, None if they are not adjacent."""
+    places = np.flatnonzero(own)
+    if not len(places):
+        return 0, 0
+    first, last = int(places[0]), int(places[-1]) + 1
+    return (first, last) if last - first == len(places) else None
+
+
+def _pivot(R: Array, columns: Array) -> tuple[Array, Array]:
+    """Return the order in which columns are chosen and the pivot of each.
+
+    LAPACK's QR with column pivoting chooses the remaining column with the largest norm; later
+    columns are slightly shortened, so that of equal ones the first is chosen despite rounding.
+
+    Args:
+        R: The columns.
+        columns: Their indices among all columns.
+    """
+    triangle, order = scipy.linalg.qr(R * (1.0 - _TIE * columns), mode="r", pivoting=True)
+    sizes = np.zeros(len(columns))
+    diagonal = np.abs(np.diag(triangle))
+    sizes[: len(diagonal)] = diagonal
+    return order, sizes
+
+
+def _expression(row: Array, names: tuple[str, ...], first: int) -> str:
+    text = names[first]
+    for i in np.flatnonzero(np.abs(row) > _SHOWN):
+        if i == first:
+            continue
+        sign = "-" if row[i] < 0 else "+"
+        size = f"{abs(row[i]):.6g}"
+        text += f" {sign} {names[i]}" if size == "1" else f" {sign} {size} {names[i]}"
+    return text
+
+
+def structural_mapping(
+    model: RobotModel, *, inertial_only: bool = False, plain: BaseMapping | None = None
+) -> BaseMapping:
+    """Return the structural base parameters of a robot, always the same for one robot.
+
+    Further terms of single drives do not change the base parameters without them. They add new
+    ones, or are added to existing sums, for example a torque with the period of gravity.
+
+    Args:
+        model: The robot.
+        inertial_only: Whether to exclude the drive terms.
+        plain: The mapping without further terms of single drives, if it is known.
+    """
+    columns = model.layout.n_inertial if inertial_only else len(model.layout.names)
+    if model.layout.own and not inertial_only:
+        return _with_own_terms(model, plain or structural_mapping(model.with_terms({})))
+    samples = 2 * columns // model.n_rows + 20
+    W = random_regressor(model, samples, np.random.default_rng(0))
+    return base_mapping(
+        W[:, :columns],
+        model.layout.names[:columns],
+        scales=model.layout.scales(model.length)[:columns],
+        preference=model.layout.preference()[:columns],
+        rtol=_CLOSED_RANK if model.loops else RANK_TOLERANCE,
+        n_rows=model.n_rows,
+    )
+
+
+def _with_own_terms(model: RobotModel, plain: BaseMapping) -> BaseMapping:
+    """Return the mapping of a robot with further drive terms, from that without them."""
+    names = model.layout.names
+    place = [names.index(name) for name in plain.names]
+    own = np.setdiff1d(np.arange(len(names)), place)
+    base = np.array(place)[plain.independent]
+    W = random_regressor(model, 2 * len(names) // model.n_rows + 20, np.random.default_rng(0))
+    Q, R = scipy.linalg.qr(W[:, base], mode="economic")
+    size = np.maximum(np.linalg.norm(W[:, own], axis=0), _FAINTEST)
+    T = Q.T @ W[:, own] / size
+    S, order = scipy.linalg.qr(W[:, own] / size - Q @ T, mode="r", pivoting=True)
+    rank = int(np.sum(np.abs(np.diag(S)) > RANK_TOLERANCE))
+    first, rest = order[:rank], order[rank:]
+    # W_rest = W_base A + W_first B
+    B = scipy.linalg.solve_triangular(S[:rank, :rank], S[:rank, rank:])
+    A = scipy.linalg.solve_triangular(R, T[:, rest] - T[:, first] @ B)
+    K = np.zeros((len(base) + rank, len(names)))
+    K[: len(base), place] = plain.K
+    K[len(base) + np.arange(rank), own[first]] = 1.0
+    K[: len(base), own[rest]] = np.where(np.abs(A) < _CLEAN, 0.0, A) * size[rest]
+    K[len(base) :, own[rest]] = B * size[rest] / size[first][:, None]
+    independent = np.concatenate([base, own[first]])
+    ascending = np.argsort(independent)
+    pivots = np.append(plain.pivots, np.abs(np.diag(S)))
+    return BaseMapping(K[ascending], independent[ascending], names, pivots)

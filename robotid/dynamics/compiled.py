@@ -1,0 +1,285 @@
+"""The compiled path to the inertial columns of the regressor.
+
+A robot's tree is flattened to arrays for ``lanes``. Any joint's placement is
+R(q) = A + B cos q + C sin q, p(q) = p0 + d q, with the axis from Pinocchio's own joint, so that
+revolute and prismatic joints, aligned or not, are one case.
+"""
+
+from functools import cache
+from types import ModuleType
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+import pinocchio as pin
+
+from robotid.base.typing import Array
+from robotid.data.base_motion import in_base
+from robotid.data.log import Trajectory
+from robotid.dynamics.drive_columns import RowPlan
+
+if TYPE_CHECKING:
+    from robotid.robot.model import RobotModel
+
+__all__ = [
+    "LONG_ENOUGH",
+    "Tree",
+    "flatten",
+    "joint_constants",
+    "keeps_code",
+    "own_motion",
+    "row_lanes",
+    "why_not",
+    "work_per_sample",
+]
+
+#: Work, samples times ``work_per_sample``, from which the compiled path is faster despite its start
+#: of about 0.5 s per process (importing Numba, reading the compiled code). For seven joints in
+#: series that is 1e5 samples. Compiling it takes some 10 s, once per installation.
+LONG_ENOUGH = 3_500_000
+
+
+def work_per_sample(model: "RobotModel") -> int:
+    """Return the work of one sample: pairs of a body and a joint that moves it, plus a constant.
+
+    Args:
+        model: The robot.
+
+    Returns:
+        The work, in units of about 0.15 us of Pinocchio's function called from Python.
+    """
+    return 8 + sum(len(support) - 1 for support in model.pin_model.supports[1:])
+
+
+def why_not(model: "RobotModel") -> str | None:
+    """Return why the compiled path does not support a robot, or None if it does.
+
+    Args:
+        model: The robot.
+    """
+    joints, first = list(model.pin_model.joints), 2 if model.free_flyer else 1
+    for name, joint in list(zip(model.pin_model.names, joints, strict=True))[first:]:
+        if joint.nv != 1 or not _is_simple(_joint_axis(model.pin_model, joint.id)):
+            return f"the compiled code does not support joint {name!r} ({joint.shortname()})"
+    try:
+        row_lanes()
+    except ImportError as error:
+        return f"Numba cannot be imported: {error}"
+    return None
+
+
+def keeps_code() -> bool:
+    """Return whether there is a cache folder for compiled code."""
+    return row_lanes().inertial_rows.stats.cache_path is not None
+
+
+class CompiledWriter:
+    """Writes blocks of rows into the same memory; one writer per thread."""
+
+    def __init__(self, model: "RobotModel", tree: "Tree", plan: RowPlan, out: Array) -> None:
+        """Prepare to write to ``out``, shape (C, k), k a multiple of 8; see ``why_not`` before."""
+        self._model, self._tree, self._out = model, tree, out
+        self._places = _places(tree, plan)
+        drives = [drive for row in plan.drives for drive in row]
+        self._drives = [k for _, k, _ in drives]
+        self._ratios = np.array([[ratio] for _, _, ratio in drives]).reshape(-1, 1)
+        self._ends = np.array([*(place for place, _, _ in drives), *plan.torques])
+        self._widths = np.diff(plan.first)
+        self._root = np.zeros(out.shape[1])
+        self._work = tree.work_space()
+
+    def load(self, motion: Trajectory, part: slice, values: Array, weights: Array | None) -> None:
+        """Load the samples of the next blocks, and their drive columns.
+
+        Args:
+            motion: The trajectory.
+            part: Its samples to load.
+            values: As of ``drive_values``, shape (k, N).
+            weights: Weight of each row; None: all 1.
+        """
+        q, v, a, tau = motion.q[part], motion.v[part], motion.a[part], motion.tau[part]
+        if self._model.free_flyer:  # the pose has one more entry than the twist
+            self._motion = own_motion(q[:, 1:], v, a, _base_state(self._model, q, v, a))
+        else:
+            self._motion = own_motion(q, v, a)
+        values = values[self._drives]
+        if (self._ratios != 1.0).any():
+            values *= self._ratios
+        self._values = np.array(np.vstack([values, tau.T]), order="C")  # as of ``own_motion``
+        self._weights = np.zeros((0, 0)) if weights is None else np.array(weights, float, order="C")
+
+    def write(self, start: int, stop: int) -> None:
+        """Write the rows of samples start to stop of those loaded, at most k."""
+        lanes, span = row_lanes(), (start, stop)
+        lanes.inertial_rows(self._tree, self._places, self._motion, self._work, self._out, span)
+        lanes.finish_rows(
+            self._values, self._ends, self._widths, self._weights, self._root, self._out, span
+        )
+
+
+class Tree(NamedTuple):
+    """A robot's B bodies as arrays for compiled code. Parents come before their children.
+
+    Attributes:
+        parents: Parent of each body, shape (B,), int; -1: the world.
+        joints: Constants of each joint, its ratio to its coordinate and its offset, shape (B, 41).
+        leaders: Coordinate that moves each joint, shape (B,), int.
+        rows: Row of the regressor of each slot of each body, shape (B, D), int; -1 if unused.
+        depths: Number of rows that each body affects, shape (B,), int.
+        slots: Slot of a body's own joint, shape (B,), int; -1: floating base.
+        is_below: Whether joint k moves body i, its own included, shape (B, B), bool, [i, k].
+        gravity: Shape (3,) [m/s^2].
+    """
+
+    parents: Array
+    joints: Array
+    leaders: Array
+    rows: Array
+    depths: Array
+    slots: Array
+    is_below: Array
+    gravity: Array
+
+    @property
+    def prismatic(self) -> Array:
+        """Which joints are prismatic, shape (B,), bool."""
+        prismatic: Array = np.any(self.joints[:, 33:36], axis=1)
+        return prismatic
+
+    @property
+    def axes(self) -> Array:
+        """Directions of the joints in the frames of their bodies, shape (B, 3)."""
+        axes: Array = self.joints[:, 33:36] + self.joints[:, 36:39]  # of which one is 0
+        return axes
+
+    def work_space(self) -> Array:
+        """Return a new work space for ``row_lanes``."""
+        lanes = row_lanes()
+        work: Array = lanes.work_space(lanes.rows_size(*self.rows.shape))
+        return work
+
+    def places(self, wanted: Array) -> Array:
+        """Return the places of the columns of each body in each of its rows, shape (B, D, 10).
+
+        Args:
+            wanted: Place of each inertial column in each row, shape (n_rows, 10 B), int; -1: none.
+        """
+        by_body = wanted.reshape(len(wanted), -1, 10).swapaxes(0, 1)  # (B, n_rows, 10)
+        found = np.take_along_axis(by_body, self.rows.clip(min=0)[..., None], axis=1)
+        return np.where(self.rows[..., None] >= 0, found, -1)
+
+    def part(self, bodies: Array) -> "Tree":
+        """Return some bodies as a separate tree.
+
+        Args:
+            bodies: Their indices, ascending, shape (k,); with each body also its parents.
+        """
+        place = {-1: -1} | {int(body): k for k, body in enumerate(bodies)}
+        parents = np.array([place[int(i)] for i in self.parents[bodies]])
+        own = {name: getattr(self, name)[bodies] for name in self._fields[1:-2]}
+        is_below = np.ascontiguousarray(self.is_below[np.ix_(bodies, bodies)])
+        return self._replace(parents=parents, is_below=is_below, **own)
+
+
+def own_motion(
+    q: Array, v: Array, a: Array, base: Array | None = None
+) -> tuple[Array, Array, Array, Array]:
+    """Return writable copies in C order: for other arrays Numba would compile again.
+
+    Args:
+        q: Coordinates, shape (N, n_rows) [rad, m].
+        v: Velocities, shape (N, n_rows) [rad/s, m/s].
+        a: Accelerations, shape (N, n_rows) [rad/s^2, m/s^2].
+        base: State of a floating base, shape (12, N), as of ``inertial_rows``; None: it is fixed.
+    """
+    base = np.zeros((12, 0)) if base is None else base
+    q, v, a, base = (np.array(x, dtype=float, order="C") for x in (q, v, a, base))
+    return q, v, a, base
+
+
+def flatten(model: "RobotModel") -> Tree:
+    """Return a robot as arrays.
+
+    Args:
+        model: The robot; ``why_not`` must return None for it.
+    """
+    pin_model, G = model.pin_model, model.velocity_map
+    size = pin_model.njoints - 1
+    parents = np.array([int(parent) - 1 for parent in pin_model.parents])[1:]
+    slots, leaders = np.zeros((2, size), dtype=int)
+    joints, is_below = np.zeros((size, 41)), np.eye(size, dtype=bool)
+    rows: list[list[int]] = []
+    for i, parent in enumerate(parents):
+        above = rows[parent] if parent >= 0 else []
+        is_below[i] |= is_below[parent] if parent >= 0 else False
+        joint = pin_model.joints[i + 1]
+        if joint.nv == 6:
+            rows.append(list(range(6)))
+            slots[i] = -1
+            continue
+        leader = int(np.flatnonzero(G[joint.idx_v])[0]) if G[joint.idx_v].any() else 0
+        rows.append(above if leader in above else [*above, leader])
+        slots[i], leaders[i] = rows[-1].index(leader), leader
+        ratio, offset = G[joint.idx_v, leader], model.position_offset[joint.idx_v]
+        joints[i] = np.append(joint_constants(pin_model, i + 1), [ratio, offset])
+    table = np.full((size, max(map(len, rows))), -1)
+    for i, own in enumerate(rows):
+        table[i, : len(own)] = own
+    depths = np.array([len(own) for own in rows])
+    gravity = np.array(pin_model.gravity.linear)
+    return Tree(parents, joints, leaders, table, depths, slots, is_below, gravity)
+
+
+def _places(tree: Tree, plan: RowPlan) -> Array:
+    """Return the places of each body's columns in each of its rows, (B, D, 10); -1: none."""
+    table = np.full((len(plan.inertial), 10 * len(tree.parents)), -1)
+    for row, wanted, place in zip(table, plan.inertial, plan.places, strict=True):
+        row[wanted] = place
+    return tree.places(table)
+
+
+def joint_constants(pin_model: pin.Model, body: int) -> Array:
+    """Return A, B, C (by columns), p0, d and the axis (v, w) of a joint, shape (39,).
+
+    Args:
+        pin_model: The robot.
+        body: Index of the joint.
+    """
+    linear, angular = _joint_axis(pin_model, body).reshape(2, 3)
+    P, p0 = pin_model.jointPlacements[body].rotation, pin_model.jointPlacements[body].translation
+    along = np.outer(angular, angular)
+    about = np.eye(3) - along if angular.any() else np.zeros((3, 3))
+    A = P @ (np.eye(3) - about)
+    rotation = [(P @ M).T.reshape(-1) for M in (about, pin.skew(angular))]
+    return np.concatenate([A.T.reshape(-1), *rotation, p0, P @ linear, linear, angular])
+
+
+def _joint_axis(pin_model: pin.Model, body: int) -> Array:
+    """Return the axis (v, w) of a joint in its own frame, at its neutral position, shape (6,)."""
+    data, q = pin_model.createData(), pin.neutral(pin_model)
+    joint = pin_model.joints[body]
+    jacobian = pin.computeJointJacobian(pin_model, data, q, body)
+    axis: Array = jacobian.reshape(6, -1)[
+        :, joint.idx_v
+    ]  # Pinocchio has one dimension of one joint
+    return axis
+
+
+def _is_simple(axis: Array) -> bool:
+    """Return whether a joint is prismatic or revolute with an axis of length 1."""
+    lengths = np.linalg.norm(axis.reshape(2, 3), axis=1)
+    return bool(np.allclose(np.sort(lengths), [0.0, 1.0]))
+
+
+def _base_state(model: "RobotModel", q: Array, v: Array, a: Array) -> Array:
+    """Return v, w, a - g, dw of the floating base in its own frame, shape (12, k)."""
+    g = model.pin_model.gravity.linear
+    gravity = in_base(q[:, 3:7], g)
+    return np.vstack([v[:, :6].T, (a[:, :3] - gravity).T, a[:, 3:6].T])
+
+
+@cache
+def row_lanes() -> ModuleType:
+    """Return the compiled code of rows; it imports Numba."""
+    import robotid.dynamics.row_lanes
+
+    return robotid.dynamics.row_lanes

@@ -1,0 +1,364 @@
+"""Elimination of unknown constraint forces: contacts with the ground and closed chains.
+
+With the Jacobian J of the constraints, W pi = tau + J^T f with the forces f. The rows are
+projected orthogonally to the columns of J^T of unknown forces, P W pi = P tau with P = I - B B^T
+and B an orthonormal basis of these columns. The forces disappear, and as many equations as they
+have components. A force of 1 N counts as much as a torque of 1 N m.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+import pinocchio as pin
+
+from robotid.base.exceptions import DataError, ModelError
+from robotid.base.findings import listed
+from robotid.base.typing import Array
+from robotid.data.base_motion import BaseColumns
+from robotid.data.imu_frame import ImuFrame
+from robotid.data.log import Trajectory, suggestion
+from robotid.data.signal_settings import BaseSource
+from robotid.dynamics.problem import RowSource
+from robotid.robot.constraints import Contact, frame_id
+from robotid.robot.model import RobotModel
+
+__all__ = [
+    "ProjectedRows",
+    "constrained",
+    "constraint_forces",
+    "constraint_jacobian",
+    "contact_links",
+    "force_basis",
+    "logged_base",
+    "loop_basis",
+    "mixed_rows",
+    "touching",
+    "without_forces",
+]
+
+_RANK = 1e-8  # singular values below this share of the largest are of dependent constraints ...
+_WEAK = 0.01  # ... if rows of the base alone are used, which feet of equal height hardly load
+_AS_IS = BaseSource()
+_BLOCK = 1024  # samples whose Jacobians are in memory together
+_CACHED = 64  # samples that are projected together
+
+
+def constraint_jacobian(model: RobotModel, q: Array, contacts: Array) -> Array:
+    """Return the Jacobian of a robot's constraints at each sample, shape (N, m, n_rows).
+
+    Args:
+        model: The robot; its contacts have the axes that they state, its loops those of the world.
+        q: Joint coordinates, shape (N, n) or (N, 7 + n) [rad, m].
+        contacts: Which contacts touch the ground, shape (N, k), bool; the rows of others are 0.
+
+    Raises:
+        DataError: If the shape of q is not that of the model.
+    """
+    pin_model, G = model.pin_model, model.velocity_map
+    data, axes = pin_model.createData(), pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+    frames = [[frame_id(pin_model, link) for link in x.frames] for x in model.constraints]
+    edges = np.cumsum([0, *(x.sizes[x.kind] for x in model.constraints)])
+    place = {x: k for k, x in enumerate(c for c in model.constraints if isinstance(c, Contact))}
+    J = np.zeros((len(q), edges[-1], model.n_rows))
+    for k, q_k in enumerate(np.ascontiguousarray(model.configurations(q))):
+        pin.computeJointJacobians(pin_model, data, q_k)
+        for x, ids, first, stop in zip(model.constraints, frames, edges, edges[1:], strict=False):
+            if x in place and not contacts[k, place[x]]:
+                continue
+            own = [pin.getFrameJacobian(pin_model, data, i, axes) for i in ids]
+            placement = pin.updateFramePlacement(pin_model, data, ids[0])
+            J[k, first:stop] = x.rows(own, placement) @ G
+    return J
+
+
+def contact_links(model: RobotModel, q: Array) -> tuple[Array, Array]:
+    """Return axes and Jacobians of rotation of the links of contacts, with the world's axes.
+
+    Args:
+        model: The robot.
+        q: Joint coordinates, shape (N, n) or (N, 7 + n) [rad, m].
+
+    Returns:
+        Axes, shape (N, k, 3, 3), and Jacobians, shape (N, k, 3, n_rows).
+    """
+    pin_model, data = model.pin_model, model.pin_model.createData()
+    frames = [frame_id(pin_model, x.frame) for x in model.contacts]
+    rotation = np.empty((len(q), len(frames), 3, 3))
+    turning = np.empty((len(q), len(frames), 3, pin_model.nv))
+    axes = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+    for k, q_k in enumerate(np.ascontiguousarray(model.configurations(q))):
+        pin.computeJointJacobians(pin_model, data, q_k)
+        for i, frame in enumerate(frames):
+            rotation[k, i] = pin.updateFramePlacement(pin_model, data, frame).rotation
+            turning[k, i] = pin.getFrameJacobian(pin_model, data, frame, axes)[3:]
+    return rotation, turning @ model.velocity_map
+
+
+def force_basis(J: Array, used: Array, floats: bool = False) -> Array:
+    """Return orthonormal bases of the torques that unknown constraint forces can cause.
+
+    Two feet that press against each other hardly load the base: by their difference in height, if
+    their vertical forces are known. In the rows of a floating base alone, forces that would have to
+    be a hundred times larger than others for an effect of the same size are taken to have none.
+
+    Args:
+        J: Jacobians of the constraints, shape (N, m, n_rows).
+        used: Rows used, shape (N, n_rows), bool: the torques are those in these rows.
+        floats: Whether the first six rows are those of a floating base.
+
+    Returns:
+        B with columns of length 1 or 0, shape (N, n_rows, k), k the smaller of m and n_rows.
+    """
+    A = J.swapaxes(1, 2) * used[:, :, None]
+    parts, least = [], _least(used, floats)
+    for start in range(0, len(A), _BLOCK):
+        U, s, _ = np.linalg.svd(A[start : start + _BLOCK], full_matrices=False)
+        is_independent = s > least * s.max(axis=1, keepdims=True, initial=1e-300)
+        parts.append(U * is_independent[:, None])
+    return np.concatenate(parts) if parts else A
+
+
+def _least(used: Array, floats: bool) -> float:
+    """Return the smallest relative singular value of forces that have an effect."""
+    return _WEAK if floats and not used[:, 6:].any() else _RANK
+
+
+def loop_basis(model: RobotModel, q: Array) -> Array:
+    """Return bases of the torques that the forces of loops can cause, as of ``force_basis``.
+
+    Args:
+        model: The robot.
+        q: Joint coordinates, shape (N, n) or (N, 7 + n) [rad, m].
+    """
+    J = constraint_jacobian(replace(model, constraints=model.loops), q, np.ones((len(q), 0)))
+    return force_basis(J, np.ones((len(q), model.n_rows), dtype=bool))
+
+
+def without_forces(basis: Array, rows: Array) -> Array:
+    """Return rows orthogonal to the torques of constraint forces, same shape.
+
+    Args:
+        basis: As of ``force_basis``, shape (N, n_rows, m).
+        rows: Torques, shape (N, n_rows), or regressors, shape (N, n_rows, c).
+    """
+    if rows.ndim == 2:
+        return without_forces(basis, rows[..., None])[..., 0]
+    projected: Array = basis @ (basis.swapaxes(1, 2) @ rows)
+    return np.subtract(rows, projected, out=projected)
+
+
+def mixed_rows(basis: Array, weights: Array) -> Array:
+    """Return the rows that are used or projected into used rows, shape (n_rows,), bool.
+
+    Args:
+        basis: As of ``force_basis``.
+        weights: Weight of each row, shape (N, n_rows).
+    """
+    return np.asarray(np.any(weights, axis=0) | np.any(basis, axis=(0, 2)))
+
+
+@dataclass(frozen=True, eq=False)
+class ProjectedRows(RowSource):
+    """Rows of a trajectory without the torques of its constraint forces; see ``RowSource``.
+
+    Every used row has the columns of all rows; a row with weight 0 in all samples has none. The
+    count of rows is that of independent equations, the sum of the diagonal of P.
+
+    Attributes:
+        own: The rows before the projection, not weighted.
+        basis: As of ``force_basis``.
+        weights: Weight of each row, shape (N, n_rows).
+    """
+
+    own: RowSource
+    basis: Array
+    weights: Array
+
+    @property
+    def samples(self) -> int:
+        return self.own.samples
+
+    @property
+    def is_parallel(self) -> bool:
+        return self.own.is_parallel
+
+    @cached_property
+    def columns(self) -> tuple[Array, ...]:
+        every: Array = np.unique(np.concatenate(self.own.columns))
+        is_used = np.asarray(np.any(self.weights, axis=0))
+        return tuple(every if used else every[:0] for used in is_used)
+
+    def rows(self, start: int, stop: int) -> Array:
+        B = self.basis[start:stop]
+        left = 1.0 - np.einsum("kij,kij->ki", B, B)  # (k, n_rows), diagonal of P
+        is_used = self.weights[start:stop] > 0
+        count: Array = np.rint(np.sum(left, axis=0, where=is_used)).astype(int)
+        return count
+
+    def select(self, columns: Array) -> "ProjectedRows":
+        return replace(self, own=self.own.select(columns))
+
+    def blocks(self, start: int, stop: int, segment: int | None = None) -> Iterator[list[Array]]:
+        every = np.unique(np.concatenate(self.own.columns))
+        places = [np.append(np.searchsorted(every, own), len(every)) for own in self.own.columns]
+        mixed = np.flatnonzero(mixed_rows(self.basis, self.weights))
+        room, done = np.zeros((2, _CACHED, len(mixed), len(every) + 1))
+        found: list[Array] = []
+        for block in self.own.blocks(start, stop, segment):
+            size = len(block[0])
+            if not found or len(found[0]) < size:
+                found = [np.zeros((size, len(own) + 1), order="F") for own in self.columns]
+            for first in range(0, size, _CACHED):  # as many as the cache of a core holds
+                some = slice(first, min(first + _CACHED, size))
+                k = slice(start + some.start, start + some.stop)
+                X, Y = (x[: some.stop - some.start] for x in (room, done))
+                for i, j in enumerate(mixed):
+                    X[:, i, places[j]] = block[j][some]  # other columns of the room remain 0
+                B, root = self.basis[k][:, mixed], np.sqrt(self.weights[k][:, mixed, None])
+                P = root * (np.eye(len(mixed)) - B @ B.swapaxes(1, 2))
+                np.matmul(P, X, out=Y)
+                for j, rows in zip(mixed, Y.swapaxes(0, 1), strict=True):
+                    if len(self.columns[j]):
+                        found[j][some] = rows
+            start += size
+            yield [rows[:size] for rows in found]
+
+
+def constrained(
+    model: RobotModel, motion: Trajectory, used: Array, *, has_torque: bool = True
+) -> tuple[Trajectory, Array]:
+    """Return a motion with torques without those of constraint forces, and the rows used.
+
+    Torques of measured forces are subtracted, those of unknown forces are eliminated. Rows in which
+    nothing remains, and samples at which a contact changes or the base jumps, are not used.
+
+    Args:
+        model: The robot.
+        motion: Its motion, with contacts and wrenches.
+        used: Rows used for other reasons, shape (N, n_rows), bool.
+        has_torque: Whether torques of the joints were measured; else their rows are not used.
+    """
+    if not has_torque:
+        used = used & (np.arange(model.n_rows) < model.n_rows - len(model.joints))
+    if motion.switching is not None:
+        used = used & ~motion.switching[:, None]
+    if not model.constraints:
+        return motion, used
+    known, tau, parts = _measured(model), motion.tau.copy(), []
+    contacts, floats = touching(model, motion), model.free_flyer and not used[:, 6:].any()
+    for start in range(0, max(len(tau), 1), _BLOCK):
+        k = slice(start, start + _BLOCK)
+        J = constraint_jacobian(model, motion.q[k], contacts[k])
+        if motion.wrenches is not None:
+            tau[k] += np.einsum("kmj,km->kj", J[:, known], motion.wrenches[k])
+        parts.append(force_basis(np.delete(J, known, axis=1), used[k], floats))
+    basis = np.concatenate(parts)
+    used = used & (np.sum(basis**2, axis=2) < 1.0 - _RANK)
+    return motion.projected(basis, without_forces(basis, tau), tau), used
+
+
+def touching(model: RobotModel, motion: Trajectory) -> Array:
+    """Return which contacts of a robot may touch the ground, shape (N, k), bool.
+
+    Args:
+        model: The robot.
+        motion: Its motion.
+
+    Raises:
+        DataError: If the motion has flags of another number of contacts.
+    """
+    contacts = np.ones((len(motion.t), len(model.contacts)), dtype=bool)
+    if motion.contacts is not None:
+        flagged = [not x.always for x in model.contacts]
+        if motion.contacts.shape[1] != sum(flagged):
+            raise DataError(
+                f"the log has contact flags of {motion.contacts.shape[1]} contacts, wanted "
+                f"{sum(flagged)}, one for each contact that may be in the air and is not measured "
+                "completely; leave out the others"
+            )
+        contacts[:, flagged] = motion.contacts
+    return contacts
+
+
+def constraint_forces(model: RobotModel, motion: Trajectory, torque: Array, used: Array) -> Array:
+    """Return the constraint forces for which a robot has a torque, shape (N, m) [N, N m].
+
+    Unknown ones are those of least squares.
+
+    Args:
+        model: The robot.
+        motion: Its motion, as of ``constrained``.
+        torque: W pi, the torque without constraint forces, shape (N, n_rows) [N m, N].
+        used: Rows used, shape (N, n_rows), bool.
+    """
+    J = constraint_jacobian(model, motion.q, touching(model, motion))
+    known, tau = _measured(model), motion.tau if motion.loaded is None else motion.loaded
+    f = np.zeros(J.shape[:2])
+    if motion.wrenches is not None:
+        f[:, known] = motion.wrenches
+    A = np.delete(J, known, axis=1).swapaxes(1, 2) * used[:, :, None]
+    inverse = np.linalg.pinv(A, rcond=_least(used, model.free_flyer))
+    others = np.delete(np.arange(J.shape[1]), known)
+    f[:, others] = (inverse @ ((torque - tau) * used)[..., None])[..., 0]
+    return f
+
+
+def logged_base(model: RobotModel, source: BaseSource = _AS_IS) -> BaseColumns:
+    """Return the columns of a floating base and of contacts that logs of a robot have.
+
+    Args:
+        model: The robot.
+        source: Axes of the velocities of the base, its link, and the link of its IMU.
+
+    Raises:
+        ModelError: If a link is unknown, or that of the IMU is not fixed to the base.
+    """
+    link = source.link or ""
+    if link:
+        _require_link(model, link, "link")
+    flagged = [x for x in model.contacts if not x.always]
+    return BaseColumns(
+        model.free_flyer,
+        tuple(x.frame for x in flagged),
+        tuple(f"{part} {x.frame}" for x in model.contacts for part in x.measured),
+        source.twist,
+        thresholds=tuple(x.threshold for x in flagged),
+        local=tuple(x.frame for x in model.contacts if x.axes == "link"),
+        imu=None if source.imu is None or not model.free_flyer else _imu_frame(model, source.imu),
+        link="" if link == model.tree.root else link,
+    )
+
+
+def _require_link(model: RobotModel, link: str, key: str) -> None:
+    if link not in model.tree.links:
+        raise ModelError(
+            f"{key} in [base] is {link!r}, which is not a link of {model.name}; links: "
+            f"{listed(model.tree.links)}{suggestion(link, model.tree.links)}"
+        )
+
+
+def _imu_frame(model: RobotModel, link: str) -> ImuFrame:
+    """Return the place of an IMU in the base."""
+    _require_link(model, link, "imu")
+    frame = model.pin_model.frames[frame_id(model.pin_model, link)]
+    if frame.parentJoint != 1:
+        raise ModelError(
+            f"imu in [base] is {link!r}, which moves relative to the root link "
+            f"{model.tree.root!r}; wanted a link that is fixed to it"
+        )
+    place = frame.placement
+    coefficients: Array = pin.Quaternion(place.rotation).coeffs()
+    gravity: Array = model.pin_model.gravity.linear
+    return ImuFrame(coefficients.copy(), place.translation.copy(), gravity.copy())
+
+
+def _measured(model: RobotModel) -> list[int]:
+    """Return the rows of the Jacobian whose forces are measured."""
+    rows, first = [], 0
+    for x in model.constraints:
+        if isinstance(x, Contact):
+            rows += [first + k for k in x.rows_measured]
+        first += x.sizes[x.kind]
+    return rows

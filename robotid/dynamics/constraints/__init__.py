@@ -1,0 +1,3 @@
+"""Motions and contact forces that constraints determine."""
+
+__all__: list[str] = []

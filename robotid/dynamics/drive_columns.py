@@ -1,0 +1,248 @@
+"""The drive columns of the regressor, and the plan of a block of rows."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from robotid.base.exceptions import DataError
+from robotid.base.typing import Array
+from robotid.data.log import Trajectory
+from robotid.robot.drives import DriveMotion
+from robotid.robot.parameters import ParameterLayout
+
+__all__ = [
+    "RowPlan",
+    "drive_motion",
+    "drive_values",
+    "friction_directions",
+    "friction_speeds",
+    "instant_state",
+    "plan_rows",
+    "remembered",
+    "sure_rows",
+    "trajectory_values",
+]
+
+
+@dataclass(frozen=True)
+class RowPlan:
+    """The columns of a block of rows and their places, joint by joint.
+
+    Attributes:
+        inertial: Per row its inertial columns, n arrays of shape (c_j,).
+        places: Per row their places in the block, likewise.
+        drives: Per row the place of each drive column, its drive parameter, and its ratio.
+        torques: Per row the place of the torque, the last one of the row.
+        first: First place of each row, and the end, shape (n + 1,), int.
+    """
+
+    inertial: tuple[Array, ...]
+    places: tuple[Array, ...]
+    drives: tuple[tuple[tuple[int, int, float], ...], ...]
+    torques: tuple[int, ...]
+    first: Array
+
+
+def drive_values(
+    layout: ParameterLayout,
+    q: Array,
+    v: Array,
+    a: Array,
+    direction: Array,
+    memory: Array | None = None,
+) -> Array:
+    """Return the columns of drive parameters, shape (k, N), at the speed w of their drives.
+
+    Row j of the regressor has them times ``layout.drive_loads[j]``.
+
+    Args:
+        layout: The standard parameters.
+        q: Joint coordinates, shape (N, n) or (N, 7 + n) [rad, m]; those of the joints come last.
+        v: Velocities, shape (N, n_rows) [rad/s, m/s]; those of the joints come last.
+        a: Accelerations, shape (N, n_rows) [rad/s^2, m/s^2].
+        direction: As of ``friction_directions``, shape (N, c).
+        memory: As of ``Trajectory.memory``, shape (N, m); None if the layout has none.
+
+    Raises:
+        DataError: If the shape of direction or memory is not the expected one.
+    """
+    motion = drive_motion(layout, q, v, a, direction)
+    states = np.empty((len(v), 0)) if memory is None else memory
+    if states.shape != (len(v), len(layout.remembering)):
+        raise DataError(
+            f"memory has shape {states.shape}, wanted {(len(v), len(layout.remembering))}: a "
+            "column for each drive parameter with internal state or load; call remember() with "
+            "the trajectory first"
+        )
+    place = {k: m for m, k in enumerate(layout.remembering)}
+    values = np.empty((len(layout.drive_parameters), len(v)))
+    for k, (x, (d, term)) in enumerate(zip(values, layout.drive_parameters, strict=True)):
+        x[:] = states[:, place[k]] if k in place else term.column(motion.of(d))
+    return values
+
+
+def trajectory_values(
+    layout: ParameterLayout, motion: Trajectory, part: slice = slice(None)
+) -> Array:
+    """Return the columns of drive parameters along a trajectory, (k, N); see ``drive_values``.
+
+    Args:
+        layout: The standard parameters.
+        motion: The trajectory.
+        part: N samples of it.
+    """
+    direction, memory = (None if x is None else x[part] for x in (motion.direction, motion.memory))
+    signs = friction_directions(layout, motion.v[part], direction)
+    state = motion.q[part], motion.v[part], motion.a[part]
+    return drive_values(layout, *state, signs, memory)
+
+
+def drive_motion(
+    layout: ParameterLayout,
+    q: Array,
+    v: Array,
+    a: Array,
+    direction: Array,
+    load: Array | None = None,
+    rate: Array | None = None,
+    begins: Array | None = None,
+) -> DriveMotion:
+    """Return the motion and load of drives, arrays of shape (d, N).
+
+    Args:
+        layout: The standard parameters.
+        q: Joint coordinates, as of ``drive_values``.
+        v: Velocities, as of ``drive_values``.
+        a: Accelerations, as of ``drive_values``.
+        direction: As of ``friction_directions``, shape (N, c).
+        load: Torque of the rigid bodies in the rows of the joints, shape (N, n) [N m, N]; None: 0.
+        rate: Time derivative of the whole torque in them, shape (N, n) [N m/s, N/s]; None: 0.
+        begins: First samples of segments, shape (N,), bool; None: the samples are not a sequence.
+    """
+    R = layout.drive_ratios
+    n = R.shape[1]
+    w = R @ v[:, v.shape[1] - n :].T
+    still = np.broadcast_to(0.0, w.shape)
+    share = R / np.sum(R**2, axis=1, keepdims=True).clip(min=1e-300)  # a drive's part of the load
+    return DriveMotion(
+        q=R @ q[:, q.shape[1] - n :].T,
+        v=w,
+        a=R @ a[:, a.shape[1] - n :].T,
+        direction=direction.T if direction.shape[1] else w,
+        load=still if load is None else share @ load.T,
+        rate=still if rate is None else share @ rate.T,
+        begins=begins,
+    )
+
+
+def instant_state(
+    layout: ParameterLayout, q: Array, v: Array, a: Array, direction: Array | None, load: Array
+) -> Array:
+    """Return the columns with internal state or load at independent samples, shape (N, m).
+
+    Internal states are at their steady value, and the torque is constant.
+
+    Args:
+        layout: The standard parameters.
+        q: Joint coordinates, as of ``drive_values``.
+        v: Velocities, as of ``drive_values``.
+        a: Accelerations, as of ``drive_values``.
+        direction: As of ``friction_directions``, shape (N, c), or None.
+        load: Torque of the rigid bodies in the rows of the joints, shape (N, n) [N m, N].
+    """
+    signs = friction_directions(layout, v, direction)
+    return remembered(layout, drive_motion(layout, q, v, a, signs, load))
+
+
+def remembered(layout: ParameterLayout, motion: DriveMotion) -> Array:
+    """Return the columns of drive parameters with internal state or load, shape (N, m).
+
+    Args:
+        layout: The standard parameters.
+        motion: Motion of the d drives, arrays of shape (d, N).
+    """
+    own = [layout.drive_parameters[k] for k in layout.remembering]
+    return np.column_stack([term.column(motion.of(d)) for d, term in own])
+
+
+def friction_speeds(layout: ParameterLayout) -> Array:
+    """Return the speeds whose sign is the direction of friction: of joints, then of couplings.
+
+    Args:
+        layout: The standard parameters of a robot with n joints.
+
+    Returns:
+        Their ratios to the speeds of the joints, w = ratios v, shape (c, n), with w in rad/s for
+        prismatic joints too (``drive_speeds``); c is the number of drives, or 0 if no term of the
+        layout depends on a direction.
+    """
+    ratios: Array = layout.drive_ratios / layout.drive_speeds[:, None]
+    return ratios if layout.follows_direction else ratios[:0]
+
+
+def sure_rows(layout: ParameterLayout, v: Array, least: float) -> Array:
+    """Return the rows in which the sign of friction is certain, shape (N, n_rows), bool.
+
+    Args:
+        layout: The standard parameters.
+        v: Velocities, shape (N, n_rows) [rad/s, m/s]; those of the joints come last.
+        least: Speed from which the sign is certain [rad/s], times ``drive_speeds``.
+    """
+    ratios = friction_speeds(layout)
+    first = v.shape[1] - ratios.shape[1]
+    slow = np.abs(v[:, first:] @ ratios.T) < least  # (N, c)
+    certain = np.ones(v.shape, dtype=bool)
+    certain[:, first:] = ~(slow @ (ratios != 0.0))
+    return certain
+
+
+def friction_directions(layout: ParameterLayout, v: Array, direction: Array | None) -> Array:
+    """Return the directions of friction, shape (N, c): those given, or the signs of the speeds.
+
+    Args:
+        layout: The standard parameters.
+        v: Velocities, shape (N, n_rows) [rad/s, m/s]; those of the joints come last.
+        direction: Filtered signs of the speeds, shape (N, c), or None.
+
+    Raises:
+        DataError: If the shape of those given is not the expected one.
+    """
+    speeds = friction_speeds(layout)
+    if direction is None:
+        signs: Array = np.sign(v[:, v.shape[1] - speeds.shape[1] :] @ speeds.T)
+        return signs
+    wanted = (len(v), len(speeds))
+    if direction.shape != wanted:
+        raise DataError(
+            f"direction has shape {direction.shape}, wanted {wanted}: a column for each Coulomb "
+            "parameter of the model; process the log with the speeds of this model"
+        )
+    return direction
+
+
+def plan_rows(layout: ParameterLayout, columns: Sequence[Array]) -> RowPlan:
+    """Return the plan of a block of rows: each row's columns in that order, then its torque.
+
+    Args:
+        layout: The standard parameters.
+        columns: Indices of the standard parameters of each row, n arrays.
+    """
+    loads, size = layout.drive_loads, layout.n_inertial
+    base = len(columns) - len(loads)  # rows of a floating base, without drives
+    first = np.concatenate([[0], np.cumsum([len(row) + 1 for row in columns])])
+    inertial = [np.flatnonzero(row < size) for row in columns]
+    return RowPlan(
+        inertial=tuple(row[k] for row, k in zip(columns, inertial, strict=True)),
+        places=tuple(start + k for start, k in zip(first[:-1], inertial, strict=True)),
+        drives=tuple(
+            tuple(
+                (int(first[j]) + k, int(g) - size, float(loads[j - base, g - size]))
+                for k, g in enumerate(row)
+                if g >= size
+            )
+            for j, row in enumerate(columns)
+        ),
+        torques=tuple(int(end) - 1 for end in first[1:]),
+        first=first,
+    )

@@ -1,0 +1,522 @@
+"""The compressed problem: one triangular factor per joint, by sequential QR.
+
+Least squares, weighted least squares and convex fits need only the triangular factor R_j of each
+joint's rows, with R_j^T R_j = [W_j tau_j]^T [W_j tau_j]. The factors of two logs merge into the
+factor of both. A reduction of a segment of a log has its factors and other sums over its samples.
+"""
+
+import os
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+from itertools import chain, pairwise
+from typing import TypeVar
+
+import numpy as np
+import scipy.linalg.lapack
+
+from robotid.base.exceptions import DataError
+from robotid.base.typing import Array
+from robotid.data.log import Trajectory
+from robotid.dynamics.lapack import Triangle
+from robotid.dynamics.problem import Problem, RowSource
+
+__all__ = [
+    "Factors",
+    "Reduction",
+    "available_cores",
+    "compress",
+    "compress_segments",
+    "gather",
+    "in_order",
+    "join",
+    "join_segments",
+    "merge",
+    "triangle_of",
+]
+
+ItemT = TypeVar("ItemT")
+ResultT = TypeVar("ResultT")
+
+_PART = 16384  # samples per part: merging costs little, and there are enough parts for threads
+
+
+@dataclass(frozen=True, eq=False)
+class Factors:
+    """Triangular factors of [W_j tau_j], joint by joint, each with its own columns.
+
+    Attributes:
+        triangles: Upper triangular factors, n arrays of shape (c_j + 1, c_j + 1).
+        columns: The columns of joint j, n arrays of shape (c_j,), ascending.
+        rows: Number of rows folded in per joint, shape (n,), int.
+        names: Names of the c columns.
+        is_projected: Whether constraint forces were eliminated from the rows: the rows of all
+            joints are mixed, and have one noise level.
+    """
+
+    triangles: tuple[Array, ...]
+    columns: tuple[Array, ...]
+    rows: Array
+    names: tuple[str, ...]
+    is_projected: bool = False
+
+    @property
+    def R(self) -> Array:
+        """The factors over all c columns, shape (n, c + 1, c + 1), 0 for columns not of a joint."""
+        size = len(self.names) + 1
+        dense = np.zeros((len(self.triangles), size, size))
+        for R, triangle, own in zip(dense, self.triangles, self.columns, strict=True):
+            places = np.append(own, size - 1)
+            R[np.ix_(places, places)] = triangle
+        return dense
+
+    def select(self, columns: Array) -> "Factors":
+        """Return the factors of the same rows with fewer columns.
+
+        Args:
+            columns: Indices of the remaining columns, shape (b,).
+        """
+        columns = np.asarray(columns, dtype=int)
+        triangles, remaining = [], []
+        for triangle, own in zip(self.triangles, self.columns, strict=True):
+            remaining.append(np.flatnonzero(np.isin(columns, own)))
+            places = np.append(np.searchsorted(own, columns[remaining[-1]]), len(own))
+            triangles.append(triangle_of(triangle[:, places]))
+        names = tuple(self.names[i] for i in columns)
+        return Factors(
+            tuple(triangles), tuple(remaining), self.rows, names, is_projected=self.is_projected
+        )
+
+    def weighted(self, sigma: Array) -> Array:
+        """Return one factor, shape (c + 1, c + 1), of all joints' rows [W_j tau_j] / sigma_j.
+
+        From the ends of the robot to its base, each factor is folded into the smallest one that has
+        all its columns: a joint's columns are among those of the joint before it.
+
+        Args:
+            sigma: Noise level per joint, shape (n,) [N m or N], positive.
+        """
+        c = len(self.names)
+        folded, everything = [Triangle(len(own) + 1) for own in self.columns], Triangle(c + 1)
+        for total, own, level in zip(folded, self.triangles, sigma, strict=True):
+            total.fold_triangle(own / level, np.arange(len(own)))
+        for j, k, places in self._carriers:
+            carrier = everything if k is None else folded[k]
+            carrier.fold_triangle(folded[j].R, places)
+        return everything.R
+
+    def weighted_rows(self, theta: Array, sigma: Array) -> tuple[Array, Array]:
+        """Return rows W_j / sigma_j and (tau_j - W_j theta) / sigma_j that have these factors.
+
+        Args:
+            theta: Parameters, shape (c,).
+            sigma: Noise level per joint, shape (n,) [N m or N], positive.
+
+        Returns:
+            The rows of all joints, shape (m, c), and their residuals, shape (m,); m is the sum of
+            the sizes of the factors.
+        """
+        ends = np.cumsum([len(R) for R in self.triangles])
+        W, residual = np.zeros((ends[-1], len(self.names))), np.empty(ends[-1])
+        for R, own, level, end in zip(self.triangles, self.columns, sigma, ends, strict=True):
+            rows = slice(end - len(R), end)
+            W[rows, own] = R[:, :-1] / level
+            residual[rows] = R[:, -1] / level - W[rows, own] @ theta[own]
+        return W, residual
+
+    def residual_squares(self, theta: Array) -> Array:
+        """Return |tau_j - W_j theta|^2 of each joint, shape (n,) [(N m)^2 or N^2].
+
+        Args:
+            theta: Parameters, shape (c,).
+        """
+        residuals = [
+            R[:, -1] - R[:, :-1] @ theta[own]
+            for R, own in zip(self.triangles, self.columns, strict=True)
+        ]
+        return np.array([residual @ residual for residual in residuals])
+
+    def score(self, theta: Array, weights: Array) -> Array:
+        """Return sum_j weight_j W_j^T (tau_j - W_j theta), shape (c,).
+
+        Args:
+            theta: Parameters, shape (c,).
+            weights: Weight per joint, shape (n,).
+        """
+        total = np.zeros(len(self.names))
+        for R, own, weight in zip(self.triangles, self.columns, weights, strict=True):
+            total[own] += weight * (R[:, :-1].T @ (R[:, -1] - R[:, :-1] @ theta[own]))
+        return total
+
+    def without(self, theta: Array) -> "Factors":
+        """Return the factors of the same rows with the torque tau_j - W_j theta.
+
+        Args:
+            theta: Parameters, shape (c,).
+        """
+        triangles = []
+        for R, own in zip(self.triangles, self.columns, strict=True):
+            left = R.copy(order="K")
+            left[:, -1] -= R[:, :-1] @ theta[own]
+            triangles.append(left)
+        return replace(self, triangles=tuple(triangles))
+
+    def noise_levels(self, theta: Array, freedom: Array) -> Array:
+        """Return the standard deviation of each joint's residual, shape (n,) [N m or N].
+
+        Args:
+            theta: Parameters, shape (c,).
+            freedom: Degrees of freedom of each joint's residual, shape (n,), positive.
+        """
+        squares = self.residual_squares(theta)
+        if self.is_projected:
+            squares, freedom = (np.full(len(x), x.sum()) for x in (squares, freedom))
+        levels: Array = np.sqrt(squares / freedom)
+        return levels
+
+    def torque_squares(self) -> Array:
+        """Return the sum of squared torques |tau_j|^2, shape (n,) [(N m)^2 or N^2]."""
+        return np.array([R[:, -1] @ R[:, -1] for R in self.triangles])
+
+    def information(self, weights: Array) -> Array:
+        """Return sum_j weight_j W_j^T W_j, shape (c, c).
+
+        Args:
+            weights: Weight per joint, shape (n,).
+        """
+        total = np.zeros((len(self.names), len(self.names)))
+        for R, own, weight in zip(self.triangles, self.columns, weights, strict=True):
+            total[np.ix_(own, own)] += weight * (R[:, :-1].T @ R[:, :-1])
+        return total
+
+    def leverages(self, covariance: Array) -> Array:
+        """Return the trace of W_j C W_j^T for each joint, shape (n,).
+
+        Args:
+            covariance: C, shape (c, c).
+        """
+        pairs = [
+            (R[:, :-1], covariance[np.ix_(own, own)])
+            for R, own in zip(self.triangles, self.columns, strict=True)
+        ]
+        return np.array([np.vdot(A @ C, A) for A, C in pairs])
+
+    @cached_property
+    def _carriers(self) -> list[tuple[int, int | None, Array]]:
+        """Each joint, the one with the fewest columns that has all of its, or None, and the places.
+
+        Joints with few columns come first, so that a joint is complete before it is folded. The
+        places are those of its columns and of the torque in the other factor.
+        """
+        order = sorted(range(len(self.columns)), key=lambda j: (len(self.columns[j]), -j))
+        sets = [set(own.tolist()) for own in self.columns]
+        found: list[tuple[int, int | None, Array]] = []
+        for position, j in enumerate(order, start=1):
+            carrier = next((k for k in order[position:] if sets[j] <= sets[k]), None)
+            places = np.append(self.columns[j], len(self.names))
+            if carrier is not None:
+                places = np.searchsorted(self.columns[carrier], places)
+            found.append((j, carrier, places))
+        return found
+
+
+@dataclass(frozen=True, eq=False)
+class Reduction:
+    """The reduction of the rows of one piece of a log, or of several.
+
+    Attributes:
+        factors: Their triangular factors.
+        squares: Sums of tau^2, v^2 and a^2 over all samples, used or not, shape (3, n_rows).
+        samples: Number of these samples.
+    """
+
+    factors: Factors
+    squares: Array
+    samples: int
+
+    @classmethod
+    def of(
+        cls, problem: Problem, trajectory: Trajectory, *, threads: int | None = None
+    ) -> "Reduction":
+        """Reduce the problem of one trajectory.
+
+        Args:
+            problem: The base problem of the trajectory, rows weighted.
+            trajectory: The trajectory.
+            threads: As of ``compress``.
+
+        Raises:
+            DataError: If a row is not finite.
+        """
+        return cls(compress(problem, threads=threads), trajectory.squares, len(trajectory.t))
+
+
+def compress(problem: Problem, *, threads: int | None = None) -> Factors:
+    """Fold a problem into its factors, block by block.
+
+    Long problems are cut into parts of a fixed number of samples, whose factors are merged in
+    order: the result does not depend on the number of threads.
+
+    Args:
+        problem: The rows; each is scaled by the square root of its weight, so a weight of 0
+            excludes it.
+        threads: Number of threads, at least 1; None: one per core if the problem's rows are
+            computed faster so, otherwise one.
+
+    Raises:
+        DataError: If a row is not finite.
+
+    References:
+        Demmel, Grigori, Hoemmen, Langou (2012), Communication-optimal parallel and sequential QR.
+    """
+    columns = [np.flatnonzero(row) for row in problem.support]
+    triangles = [Triangle(len(own) + 1) for own in columns]
+    if problem.sources:
+        rows = _fold_sources(triangles, columns, problem.sources, threads)
+    else:
+        rows = _fold_blocks(triangles, columns, problem)
+    found = tuple(triangle.R for triangle in triangles)
+    _require_finite(found)
+    return Factors(found, tuple(columns), rows, problem.names, is_projected=problem.is_projected)
+
+
+def compress_segments(
+    problem: Problem, length: int, *, threads: int | None = None
+) -> tuple[Factors, ...]:
+    """Fold each segment of a problem into its own factors, for held-out segments.
+
+    Args:
+        problem: The rows of one log or several; a problem with row sources.
+        length: Samples per segment, at least 1; the last segment of each log may have fewer.
+        threads: As of ``compress``.
+
+    Raises:
+        DataError: If a row is not finite, or the problem has no row sources.
+    """
+    if not problem.sources:
+        raise DataError("the problem has blocks only, wanted row sources to cut into segments")
+    columns = tuple(np.flatnonzero(row) for row in problem.support)
+    part = -(-_PART // length) * length  # whole segments
+    found = []
+    for source in problem.sources:
+        places = _places(source, columns)
+        starts = range(0, source.samples, part)
+        fold = partial(_fold_part, source, part, length)
+        folded = chain.from_iterable(
+            in_order(fold, starts, is_parallel=source.is_parallel, threads=threads)
+        )
+        for start, triangles in zip(range(0, source.samples, length), folded, strict=True):
+            _require_finite(triangles)
+            rows = source.rows(start, min(start + length, source.samples))
+            placed = zip(triangles, places, columns, strict=True)
+            own = tuple(_placed(R, place, len(wanted) + 1) for R, place, wanted in placed)
+            found.append(
+                Factors(own, columns, rows, problem.names, is_projected=problem.is_projected)
+            )
+    return tuple(found)
+
+
+def merge(factors: Sequence[Factors]) -> Factors:
+    """Return the factors of all rows of several logs.
+
+    Args:
+        factors: At least one; all with the same columns and joints.
+
+    Raises:
+        DataError: If there is none, or their columns or joints differ.
+    """
+    if not factors:
+        raise DataError("there are no factors, wanted those of at least one log")
+    first = factors[0]
+    for other in factors[1:]:
+        if other.names != first.names or len(other.rows) != len(first.rows):
+            raise DataError(
+                f"factors differ: {len(first.rows)} joints x {len(first.names)} columns and "
+                f"{len(other.rows)} joints x {len(other.names)} columns"
+            )
+    triangles, columns = [], []
+    for j in range(len(first.rows)):
+        own = np.unique(np.concatenate([f.columns[j] for f in factors]))
+        total = Triangle(len(own) + 1)
+        for f in factors:
+            places = np.append(np.searchsorted(own, f.columns[j]), len(own))
+            total.fold_triangle(f.triangles[j], places)
+        triangles.append(total.R)
+        columns.append(own)
+    rows = np.sum([f.rows for f in factors], axis=0)
+    return replace(first, triangles=tuple(triangles), columns=tuple(columns), rows=rows)
+
+
+def gather(segments: Sequence[Factors], count: int) -> tuple[Factors, ...]:
+    """Return fewer, longer segments: neighbours are merged, for held-out segments.
+
+    Args:
+        segments: Factors of segments, in order.
+        count: Wanted number, at least 1.
+    """
+    edges = np.linspace(0, len(segments), min(count, len(segments)) + 1).round().astype(int)
+    return tuple(merge(segments[i:j]) for i, j in pairwise(edges))
+
+
+def join(reductions: Sequence[Reduction]) -> Reduction:
+    """Return the reduction of all rows of several reductions.
+
+    Args:
+        reductions: At least one; all with the same columns and joints.
+
+    Raises:
+        DataError: If there is none, or their columns or joints differ.
+    """
+    if not reductions:
+        raise DataError("there is no reduction, wanted that of at least one log")
+    return Reduction(
+        merge([r.factors for r in reductions]),
+        np.sum([r.squares for r in reductions], axis=0),
+        sum(r.samples for r in reductions),
+    )
+
+
+def join_segments(reductions: Iterable[Reduction], count: int, most: int) -> list[Reduction]:
+    """Return the reductions of at most so many segments of neighbouring pieces, in order.
+
+    They are joined one by one, to limit the memory; the last one may be shorter.
+
+    Args:
+        reductions: One per piece, in order.
+        count: Number of pieces, at least 1.
+        most: Largest number of segments, at least 1.
+
+    Raises:
+        DataError: If their columns or joints differ.
+    """
+    length = -(-count // most)
+    segments: list[Reduction] = []
+    for k, reduction in enumerate(reductions):
+        if k % length:
+            segments[-1] = join([segments[-1], reduction])
+        else:
+            segments.append(reduction)
+    return segments
+
+
+def available_cores() -> int:
+    """Return the number of cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def in_order(
+    work: Callable[[ItemT], ResultT],
+    items: Sequence[ItemT],
+    *,
+    is_parallel: bool = True,
+    threads: int | None = None,
+) -> Iterator[ResultT]:
+    """Yield the result of work for each item in order, with threads where that is faster.
+
+    Args:
+        work: What is done with an item.
+        items: The items.
+        is_parallel: Whether the work releases the interpreter's lock.
+        threads: Number of threads; None: the number of cores if the work is parallel.
+    """
+    workers = (available_cores() if is_parallel else 1) if threads is None else threads
+    if min(workers, len(items)) <= 1:
+        yield from map(work, items)
+        return
+    with ThreadPoolExecutor(min(workers, len(items))) as pool:
+        yield from pool.map(work, items)
+
+
+def _fold_blocks(
+    triangles: Sequence[Triangle], columns: Sequence[Array], problem: Problem
+) -> Array:
+    """Fold whole blocks into the factors; return the number of rows per joint."""
+    n = problem.n_joints
+    rows = np.zeros(n, dtype=int)
+    for W, tau, weight in problem.blocks():
+        by_joint, torque = W.reshape(-1, n, W.shape[1]), tau.reshape(-1, n)
+        root = np.sqrt(weight).reshape(-1, n)
+        rows += (root > 0).sum(axis=0)
+        for j, own in enumerate(columns):
+            used = np.flatnonzero(root[:, j] != 0)  # NaN counts as used: it appears in R
+            scaled = np.empty((len(used), len(own) + 1), order="F")
+            scaled[:, :-1] = by_joint[used, j][:, own]
+            scaled[:, -1] = torque[used, j]
+            scaled *= root[used, j, None]
+            triangles[j].fold(scaled)
+    return rows
+
+
+def _fold_sources(
+    triangles: Sequence[Triangle],
+    columns: Sequence[Array],
+    sources: Sequence[RowSource],
+    threads: int | None,
+) -> Array:
+    """Fold each source into the factors, part by part; return the number of rows per joint."""
+    for source in sources:
+        places = _places(source, columns)
+        starts = range(0, source.samples, _PART)
+        fold = partial(_fold_part, source, _PART, _PART)
+        for part in chain.from_iterable(
+            in_order(fold, starts, is_parallel=source.is_parallel, threads=threads)
+        ):
+            for triangle, place, R_j in zip(triangles, places, part, strict=True):
+                triangle.fold_triangle(R_j, place)
+    rows: Array = np.sum([source.rows(0, source.samples) for source in sources], axis=0)
+    return rows
+
+
+def _places(source: RowSource, columns: Sequence[Array]) -> list[Array]:
+    """Return the places of each row's columns, and of its torque, among the wanted columns."""
+    return [
+        np.append(np.searchsorted(wanted, own), len(wanted))
+        for wanted, own in zip(columns, source.columns, strict=True)
+    ]
+
+
+def _placed(R: Array, places: Array, size: int) -> Array:
+    """Return the factor of the same rows with more columns, shape (size, size)."""
+    if len(places) == size:
+        return R
+    total = Triangle(size)
+    total.fold_triangle(R, places)
+    return total.R
+
+
+def _require_finite(triangles: Sequence[Array]) -> None:
+    """Refuse factors of rows that are not finite: R is not finite then either."""
+    if not all(np.isfinite(R).all() for R in triangles):
+        raise DataError("the problem has a row that is not finite; check the trajectory")
+
+
+def _fold_part(source: RowSource, length: int, segment: int, start: int) -> list[list[Array]]:
+    """Return the factors of each segment of a part of so many samples, joint by joint."""
+    folded: list[list[Triangle]] = []
+    done = 0
+    for block in source.blocks(start, min(start + length, source.samples), segment):
+        if done % segment == 0:
+            folded.append([Triangle(len(own) + 1) for own in source.columns])
+        done += len(block[0])
+        for triangle, rows in zip(folded[-1], block, strict=True):
+            triangle.fold(rows)
+    return [[triangle.R for triangle in triangles] for triangles in folded]
+
+
+def triangle_of(rows: Array) -> Array:
+    """Return the square upper triangular factor R of rows, padded with zeros if m < k.
+
+    Args:
+        rows: Rows, shape (m, k).
+    """
+    k = rows.shape[1]
+    if len(rows) == 0:
+        return np.zeros((k, k))
+    packed = scipy.linalg.lapack.dgeqrf(np.asfortranarray(rows), overwrite_a=True)[0]
+    R = np.zeros((k, k))
+    filled = min(k, len(rows))
+    R[:filled] = np.triu(packed[:filled])
+    return R

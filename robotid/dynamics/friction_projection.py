@@ -1,0 +1,352 @@
+"""Projection of drive friction on the terms of simulators: viscous, Coulomb, spring, offset.
+
+A drive's torque X x of all its terms is replaced by Y z of the terms of a format, the nearest to
+X x in least squares over the rows of the logs. This needs only the mean products of the columns of
+X and Y over the rows. A result contains them, so that the logs are not needed.
+"""
+
+import warnings
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+
+from robotid.base.exceptions import DataError
+from robotid.base.typing import Array
+from robotid.data.log import Trajectory
+from robotid.dynamics.memory import drive_motion_along
+from robotid.robot.as_pinocchio import pinocchio_model
+from robotid.robot.drives import (
+    TERMS,
+    DriveMotion,
+    DriveTerm,
+    Lag,
+    LuGre,
+    Presliding,
+    Spring,
+)
+from robotid.robot.model import RobotModel
+
+__all__ = [
+    "DriveMoments",
+    "ProjectedDrive",
+    "Projection",
+    "drive_moments",
+    "project_friction",
+    "projected_pinocchio_model",
+]
+
+#: The terms that friction is projected on. The offset is always one of them, so that it does not
+#: become friction in a format without offset.
+_SIMPLE: dict[str, DriveTerm] = {
+    **{name: TERMS[name] for name in ("viscous", "coulomb", "offset")}, "spring": Spring()
+}  # fmt: skip
+_STATES = (Presliding.label, LuGre.label)  # terms with an internal state
+_NEGLIGIBLE = 1e-4  # error of a projection over the torque of its drive
+_ROUNDING = 1e-12  # of the largest eigenvalue of products: a smaller one counts as 0
+
+
+@dataclass(frozen=True, eq=False)
+class DriveMoments:
+    """Second moments of the terms of one drive over the rows of the logs.
+
+    Attributes:
+        terms: The drive's own terms except inertia, then the terms of a simulator that it lacks.
+        products: Mean products of their columns over the rows, shape (k, k).
+        torque: RMS torque of the rows in the drive's joints [N m or N].
+    """
+
+    terms: tuple[str, ...]
+    products: Array
+    torque: float
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain values for result.json."""
+        return {
+            "terms": list(self.terms), "products": self.products.tolist(), "torque": self.torque
+        }  # fmt: skip
+
+    @classmethod
+    def from_dict(cls, table: Mapping[str, Any]) -> "DriveMoments":
+        """Return the moments from plain values.
+
+        Args:
+            table: As of ``to_dict``.
+
+        Raises:
+            DataError: If the products are not a finite matrix over the terms.
+        """
+        terms, products = tuple(table["terms"]), np.array(table["products"], dtype=float)
+        if products.shape != (len(terms), len(terms)) or not np.isfinite(products).all():
+            raise DataError(
+                f"drive_moments: products have shape {products.shape}, wanted a finite matrix over "
+                f"the {len(terms)} terms; identify again"
+            )
+        return cls(terms, products, float(table["torque"]))
+
+    def transfer(self, own: Sequence[str], onto: Sequence[str]) -> Array:
+        """Return the linear map from a drive's parameters to those of its projection.
+
+        Args:
+            own: The drive's terms, in the order of its parameters.
+            onto: Names of the terms of the projection.
+
+        Returns:
+            Map T with z = T x, shape (len(onto), len(own)), without the bounds of z.
+        """
+        root = self._root()
+        Y, X = (root[:, [self.terms.index(name) for name in names]] for names in (onto, own))
+        T: Array = np.linalg.lstsq(Y, X, rcond=None)[0]
+        return T
+
+    def _root(self) -> Array:
+        """Return M with M^T M the products, shape (k, k)."""
+        values, vectors = np.linalg.eigh(self.products)
+        floor = _ROUNDING * max(float(values[-1]), 0.0)
+        root: Array = np.sqrt(np.where(values > floor, values, 0.0))[:, None] * vectors.T
+        return root
+
+    def rms(self, x: Mapping[str, float]) -> float:
+        """Return the RMS torque of a sum of terms over the rows [N m or N].
+
+        Args:
+            x: Parameters by name of the term.
+        """
+        weights = np.array([x.get(name, 0.0) for name in self.terms])
+        return float(np.linalg.norm(self._root() @ weights))
+
+
+@dataclass(frozen=True, eq=False)
+class ProjectedDrive:
+    """A drive whose terms were projected.
+
+    Attributes:
+        name: Joint or coupling.
+        replaced: The terms that the format lacks.
+        values: Parameters of the terms that the format has, by name.
+        transfer: Map from the drive's parameters to these, shape (len(values), m); 0 in the row of
+            a parameter at its bound of 0.
+        own: Indices of the drive's m parameters in the layout of the robot.
+        error: RMS error of the projection [N m or N].
+        torque: RMS torque of the drive's joints [N m or N].
+        is_linear: Whether its joints are prismatic.
+    """
+
+    name: str
+    replaced: tuple[str, ...]
+    values: Mapping[str, float]
+    transfer: Array
+    own: tuple[int, ...]
+    error: float
+    torque: float
+    is_linear: bool = False
+
+    def __str__(self) -> str:
+        unit = {name: term.units[self.is_linear] for name, term in _SIMPLE.items()}
+        stated = ", ".join(f"{term} {x:.4g} {unit[term]}" for term, x in self.values.items())
+        share = f" ({100 * self.error / self.torque:.2g} % of its torque)" if self.torque else ""
+        note = f"error {self.error:.3g} {unit['offset']} RMS{share}"
+        if self.error <= _NEGLIGIBLE * self.torque:
+            note = f"error below {100 * _NEGLIGIBLE:g} % of its torque"
+        if states := [name for name in self.replaced if name in _STATES]:
+            note += f"; {', '.join(states)} at steady value, without the transient after reversals"
+        return f"{self.name}: {', '.join(self.replaced)} projected on {stated}; {note}"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain values for sidecars."""
+        return {
+            "replaced": list(self.replaced), **self.values,
+            "error": self.error, "torque": self.torque,
+        }  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Projection:
+    """A robot whose drives have only the terms of a format.
+
+    Attributes:
+        model: The robot.
+        pi: Its standard parameters, shape (p,), SI units.
+        drives: The drives whose terms were projected; the others are unchanged.
+    """
+
+    model: RobotModel
+    pi: Array
+    drives: tuple[ProjectedDrive, ...]
+
+
+def drive_moments(
+    model: RobotModel, recordings: Iterable[tuple[Trajectory, Array]]
+) -> dict[str, DriveMoments]:
+    """Return the moments of the drives with further terms, by name.
+
+    Friction is that of ``predict``: internal states are at their steady value, without a delay.
+
+    Args:
+        model: The robot.
+        recordings: Trajectories and their used rows, shape (N, n_rows), bool.
+    """
+    layout = model.layout
+    sums: dict[str, tuple[tuple[str, ...], Array, float, int]] = {}
+    first = model.n_rows - len(model.joints)
+    for trajectory, mask in recordings if layout.own else ():
+        along = drive_motion_along(model, trajectory)
+        motion = replace(along, rate=np.zeros_like(along.rate), begins=None)
+        for d, drive in enumerate(layout.drives):
+            if drive.name not in layout.own:
+                continue
+            moved = layout.drive_ratios[d] != 0.0
+            rows = mask[:, first:][:, moved].all(axis=1)
+            names, columns = _columns(model, d, motion.of(d))
+            X = columns[:, rows]
+            torque = float((trajectory.tau[:, -len(model.joints) :][rows][:, moved] ** 2).sum())
+            _, products, total, count = sums.get(drive.name, (names, 0.0 * X @ X.T, 0.0, 0))
+            sums[drive.name] = (names, products + X @ X.T, total + torque, count + int(rows.sum()))
+    return {
+        name: DriveMoments(names, products / count, float(np.sqrt(total / count)))
+        for name, (names, products, total, count) in sums.items()
+        if count
+    }
+
+
+def _columns(model: RobotModel, d: int, motion: DriveMotion) -> tuple[tuple[str, ...], Array]:
+    """Return the names and columns, shape (k, N), of a drive's terms and of those it lacks."""
+    terms = {term.name: term for _, term in _own_terms(model, d)}
+    terms |= {name: term for name, term in _SIMPLE.items() if name not in terms}
+    return tuple(terms), np.array([term.column(motion) for term in terms.values()])
+
+
+def _own_terms(model: RobotModel, d: int) -> list[tuple[int, DriveTerm]]:
+    """Return indices and terms of a drive's parameters except inertia."""
+    layout = model.layout
+    return [
+        (k, term)
+        for k, (drive, term) in enumerate(layout.drive_parameters, start=layout.n_inertial)
+        if drive == d and not term.is_inertia
+    ]
+
+
+def project_friction(
+    model: RobotModel, pi: Array, moments: Mapping[str, DriveMoments], onto: Collection[str]
+) -> Projection:
+    """Return a robot whose drives have only the terms of a format, by least squares.
+
+    Drives whose terms the format has are unchanged. So are inertia and, in a format without them,
+    offsets. Viscous and Coulomb friction and a spring are not negative.
+
+    Args:
+        model: The robot.
+        pi: Standard parameters, shape (p,), SI units, in ``layout.names`` order.
+        moments: Of the drives with further terms, as of ``drive_moments``.
+        onto: Names of the terms of the format.
+
+    Raises:
+        DataError: If the moments of a drive are missing.
+    """
+    layout, projected = model.layout, []
+    for d, drive in enumerate(layout.drives):
+        own = _own_terms(model, d)
+        simple = (*_SIMPLE, Lag.label)  # a delay is not friction: it is omitted and named
+        excess = [term.name for k, term in own if term.name not in simple and pi[k] != 0.0]
+        excess += [t.name for k, t in own if t.name == "spring" not in onto and pi[k] != 0.0]
+        if excess:
+            if drive.name not in moments:
+                raise DataError(
+                    f"{drive.name} has {', '.join(excess)}, but the result of an earlier version "
+                    "has no drive_moments, which the projection on simpler friction needs; "
+                    "identify again"
+                )
+            projected.append(_projected(model, d, pi, moments[drive.name], excess, onto))
+    if not projected:
+        return Projection(model, pi, ())
+    return Projection(*_simplified(model, pi, projected), tuple(projected))
+
+
+def projected_pinocchio_model(
+    model: RobotModel, pi: Array, moments: Mapping[str, DriveMoments]
+) -> Any:  # noqa: ANN401
+    """Return ``pinocchio_model`` of a robot with projected friction; a warning names its drives.
+
+    Args:
+        model: The robot.
+        pi: Standard parameters, shape (p,), SI units, in ``layout.names`` order.
+        moments: As of ``project_friction``.
+    """
+    projection = project_friction(model, pi, moments, ("viscous", "coulomb", "offset"))
+    if projection.drives:
+        changes = "; ".join(str(drive) for drive in projection.drives)
+        warnings.warn(
+            f"Pinocchio's model has only viscous and Coulomb friction and an offset: {changes}; "
+            "predict(q, v, a) includes all terms",
+            stacklevel=3,
+        )
+    return pinocchio_model(projection.model, projection.pi)
+
+
+def _projected(
+    model: RobotModel,
+    d: int,
+    pi: Array,
+    moments: DriveMoments,
+    excess: Sequence[str],
+    onto: Collection[str],
+) -> ProjectedDrive:
+    """Return one drive with the terms of a format."""
+    own = _own_terms(model, d)
+    names, x = [term.name for _, term in own], pi[[k for k, _ in own]]
+    has_spring = any(term.part in ("spring", "ripple") for _, term in own)
+    usable = {*names, "spring"} if has_spring else {*names}
+    bounded = [name for name in _SIMPLE if name in onto and name in usable and name != "offset"]
+    best, least = tuple[str, ...](), np.inf
+    for size in range(len(bounded) + 1):
+        for free in combinations(bounded, size):  # the others at their bound of 0
+            z = moments.transfer(names, (*free, "offset")) @ x
+            error = moments.rms(_difference(names, x, (*free, "offset"), z))
+            if (z[:-1] >= 0).all() and error < least:
+                best, least = free, error
+    free = (*best, "offset")
+    T = dict(zip(free, moments.transfer(names, free), strict=True))
+    stated = [name for name in _SIMPLE if name in bounded or (name in onto and name in names)]
+    transfer = np.zeros((len(stated), len(names)))
+    for k, name in enumerate(stated):
+        transfer[k] = T.get(name, 0.0)
+    return ProjectedDrive(
+        name=model.layout.drives[d].name,
+        replaced=tuple(excess),
+        values=dict(zip(stated, (transfer @ x).tolist(), strict=True)),
+        transfer=transfer,
+        own=tuple(k for k, _ in own),
+        error=least,
+        torque=moments.torque,
+        is_linear={joint for joint, _ in model.layout.drives[d].ratios} <= model.layout.prismatic,
+    )
+
+
+def _difference(
+    names: Sequence[str], x: Array, others: Sequence[str], z: Array
+) -> dict[str, float]:
+    """Return the parameters x minus z by name of the term."""
+    difference = dict(zip(names, x.tolist(), strict=True))
+    for name, value in zip(others, z.tolist(), strict=True):
+        difference[name] = difference.get(name, 0.0) - value
+    return difference
+
+
+def _simplified(
+    model: RobotModel, pi: Array, projected: Sequence[ProjectedDrive]
+) -> tuple[RobotModel, Array]:
+    """Return the robot without the projected terms, and its parameters."""
+    values = dict(zip(model.layout.names, pi.tolist(), strict=True))
+    changed = {drive.name: drive.values for drive in projected}
+    replaced = {drive.name: (*drive.replaced, "spring") for drive in projected}
+    own = {
+        name: tuple(term for term in terms if term.name not in replaced.get(name, ()))
+        + ((Spring(),) if "spring" in changed.get(name, {}) else ())
+        for name, terms in model.layout.own.items()
+    }
+    simple = model.with_terms(own)
+    for name, terms in changed.items():
+        values |= {f"{name}.{term}": value for term, value in terms.items()}
+    return simple, np.array([values.get(name, 0.0) for name in simple.layout.names])

@@ -1,0 +1,222 @@
+"""Work spaces of compiled code, and vector algebra in three dimensions, compiled by Numba.
+
+Imported only where compiled code is used, since importing Numba takes time. Numba stores the
+compiled code in the folder ``__pycache__`` beside this file or, if that is not writable, in its own
+folder in the user's cache; the environment variable ``NUMBA_CACHE_DIR`` sets another one.
+
+Compiled code computes ``LANES`` states together, one in each lane. An entry ``at`` of a work space
+is one quantity of all of them, adjacent in memory: ``get`` reads it as a vector, ``put`` writes it.
+"""
+
+import math
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import numpy as np
+from llvmlite import ir
+from numba import cfunc, njit, types
+from numba.core.cgutils import unpack_tuple
+from numba.extending import intrinsic
+
+from robotid.base.typing import Array
+from robotid.dynamics.kernels.vector_lanes import LANES, read, where, write
+
+__all__ = [
+    "add",
+    "applied",
+    "compiled",
+    "cos_sin",
+    "cross",
+    "dot",
+    "factor",
+    "get",
+    "get3",
+    "pointed",
+    "put",
+    "put3",
+    "put_lane",
+    "scale",
+    "solve",
+    "times",
+    "work_space",
+]
+
+_PAIR = types.UniTuple(types.float64, 2)
+_HALF_PI = (1.57079632673412561417, 6.07710050630396597660e-11, 2.02226624879595063154e-21)
+_ROUND = 6755399441055744.0  # 1.5 2^52: adding and subtracting it rounds to the nearest integer
+
+
+def work_space(entries: int) -> Array:
+    """Return a work space of zeros, shape (entries LANES,), each entry in one line of the cache.
+
+    Args:
+        entries: Number of entries.
+    """
+    numbers = np.zeros((entries + 1) * LANES)
+    first = -(numbers.ctypes.data // numbers.itemsize) % LANES
+    return numbers[first : first + entries * LANES]
+
+
+def compiled(function: Any) -> Any:
+    """Compile without the interpreter's lock; contract: a b + c may be rounded once.
+
+    Only compiled code may call a function whose name begins with an underscore: it has no entry for
+    the interpreter. These entries, and those for C, take a fifth of the time of compilation.
+
+    Args:
+        function: The function.
+    """
+    is_private = function.__name__.startswith("_")
+    entries = {"no_cfunc_wrapper": True, "no_cpython_wrapper": is_private}
+    return _cached(njit, function, nogil=True, **entries)
+
+
+def pointed(function: Callable[..., Any], arguments: int) -> Any:
+    """Compile a function of numbers that returns two, for ``applied``, which uses its address.
+
+    Args:
+        function: The function.
+        arguments: Number of its arguments.
+    """
+    return _cached(partial(cfunc, _PAIR(*[types.float64] * arguments)), function)
+
+
+def _cached(compile: Any, function: Any, **options: Any) -> Any:
+    options |= {"fastmath": {"contract"}, "error_model": "numpy"}
+    try:
+        return compile(cache=True, **options)(function)
+    except RuntimeError:  # no cache folder: the code exists only in this process
+        return compile(**options)(function)
+
+
+def _applied(typing, address, x):
+    """Return the result of the function at an address of ``pointed`` for a tuple of numbers."""
+
+    def code(context, builder, signature, given):
+        numbers = unpack_tuple(builder, given[1])
+        kind = ir.FunctionType(context.get_value_type(_PAIR), [number.type for number in numbers])
+        return builder.call(builder.inttoptr(given[0], kind.as_pointer()), numbers)
+
+    return _PAIR(address, x), code
+
+
+applied: Any = intrinsic(_applied)
+
+
+@compiled
+def get(work, at):
+    """Return a quantity."""
+    return read(work, at * LANES)
+
+
+@compiled
+def get3(work, at):
+    """Return three neighbouring quantities."""
+    return get(work, at), get(work, at + 1), get(work, at + 2)
+
+
+@compiled
+def put(work, at, value):
+    """Write a quantity."""
+    write(work, at * LANES, value)
+
+
+@compiled
+def put3(work, at, u):
+    """Write three neighbouring quantities."""
+    put(work, at, u[0])
+    put(work, at + 1, u[1])
+    put(work, at + 2, u[2])
+
+
+@compiled
+def put_lane(work, at, lane, value):
+    """Write a quantity of one lane."""
+    work[np.uintp(at * LANES + lane)] = value  # Numba checks the sign of other indices
+
+
+@compiled
+def cross(u, v):
+    """Return u x v."""
+    return u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]
+
+
+@compiled
+def add(u, v):
+    """Return u + v."""
+    return u[0] + v[0], u[1] + v[1], u[2] + v[2]
+
+
+@compiled
+def scale(s, u):
+    """Return s u."""
+    return s * u[0], s * u[1], s * u[2]
+
+
+@compiled
+def dot(u, v):
+    """Return u . v."""
+    return u[0] * v[0] + u[1] * v[1] + u[2] * v[2]
+
+
+@compiled
+def times(J, u):
+    """Return J u of a symmetric matrix xx xy yy xz yz zz."""
+    return (
+        J[0] * u[0] + J[1] * u[1] + J[3] * u[2],
+        J[1] * u[0] + J[2] * u[1] + J[4] * u[2],
+        J[3] * u[0] + J[4] * u[1] + J[5] * u[2],
+    )
+
+
+@compiled
+def cos_sin(angle):
+    """Return cosine and sine: Cody and Waite's reduction, fdlibm's polynomials, no branch."""
+    n = (angle * 0.6366197723675814 + _ROUND) - _ROUND  # quarter turns
+    r = ((angle - n * _HALF_PI[0]) - n * _HALF_PI[1]) - n * _HALF_PI[2]
+    z = r * r
+    sine = -2.50507602534068634195e-08 + z * 1.58969099521155010221e-10
+    sine = -1.98412698298579493134e-04 + z * (2.75573137070700676789e-06 + z * sine)
+    sine = -1.66666666666666324348e-01 + z * (8.33333333332248946124e-03 + z * sine)
+    sine = r + r * z * sine
+    cosine = 2.08757232129817482790e-09 + z * -1.13596475577881948265e-11
+    cosine = 2.48015872894767294178e-05 + z * (-2.75573143513906633035e-07 + z * cosine)
+    cosine = 4.16666666666666019037e-02 + z * (-1.38888888888741095749e-03 + z * cosine)
+    cosine = (1.0 - 0.5 * z) + z * z * cosine
+    quarter = n - 4.0 * ((n * 0.25 - 0.375 + _ROUND) - _ROUND)  # 0, 1, 2 or 3
+    is_odd = (quarter == 1.0) | (quarter == 3.0)
+    x, y = where(is_odd, sine, cosine), where(is_odd, cosine, sine)
+    return where((quarter == 1.0) | (quarter == 2.0), -x, x), where(quarter > 1.5, -y, y)
+
+
+@compiled
+def factor(work, n, H):
+    """Write the lower Cholesky factor of the symmetric positive definite H, in place.
+
+    Its diagonal is written as the reciprocals, by which ``solve`` multiplies.
+    """
+    for j in range(n):
+        for i in range(j, n):
+            x = get(work, H + i * n + j)
+            for k in range(j):
+                x -= get(work, H + j * n + k) * get(work, H + i * n + k)
+            if i == j:
+                put(work, H + j * n + j, 1.0 / math.sqrt(x))
+            else:
+                put(work, H + i * n + j, x * get(work, H + j * n + j))
+
+
+@compiled
+def solve(work, n, H, x):
+    """Solve H y = x with the factor of H, in place."""
+    for i in range(n):
+        y = get(work, x + i)
+        for k in range(i):
+            y -= get(work, H + i * n + k) * get(work, x + k)
+        put(work, x + i, y * get(work, H + i * n + i))
+    for i in range(n - 1, -1, -1):
+        y = get(work, x + i)
+        for k in range(i + 1, n):
+            y -= get(work, H + k * n + i) * get(work, x + k)
+        put(work, x + i, y * get(work, H + i * n + i))

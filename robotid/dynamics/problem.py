@@ -1,0 +1,206 @@
+"""The linear problem W theta = tau as a stream of row blocks; W is never in memory as a whole."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import chain, repeat
+from typing import TypeAlias
+
+import numpy as np
+
+from robotid.base.exceptions import DataError
+from robotid.base.typing import Array
+
+__all__ = ["Block", "Problem", "RowSource", "Sample", "concatenate", "shuffled"]
+
+_SHUFFLED = 8192  # samples in the buffer of the shuffle: all of a short log, 30 MB of a long one
+
+#: Rows of k samples: W (k n, c), tau (k n,), weight (k n,); row of sample k, joint j: k n + j.
+Block: TypeAlias = tuple[Array, Array, Array]
+
+
+@dataclass(frozen=True, eq=False)
+class Sample:
+    """One sample, for recursive estimators.
+
+    Attributes:
+        Y: Regressor, shape (n, c).
+        tau: Measured torque, shape (n,) [N m or N].
+        weight: Row weights, shape (n,); 0 excludes a row.
+        mass_regressor: Regressor of the mass matrix, shape (n, n, c), or None.
+    """
+
+    Y: Array
+    tau: Array
+    weight: Array
+    mass_regressor: Array | None = None
+
+
+class RowSource(ABC):
+    """A problem's rows joint by joint, without columns that are zero or not selected."""
+
+    @property
+    @abstractmethod
+    def samples(self) -> int:
+        """Number N of samples."""
+
+    @property
+    @abstractmethod
+    def columns(self) -> tuple[Array, ...]:
+        """The columns of row j, n arrays of shape (c_j,), ascending."""
+
+    @abstractmethod
+    def rows(self, start: int, stop: int) -> Array:
+        """Return the number of rows with a positive weight per joint, shape (n,), int.
+
+        Args:
+            start: First sample.
+            stop: Sample after the last one.
+        """
+
+    @property
+    @abstractmethod
+    def is_parallel(self) -> bool:
+        """Whether several threads are faster than one."""
+
+    @abstractmethod
+    def blocks(self, start: int, stop: int, segment: int | None = None) -> Iterator[list[Array]]:
+        """Yield the rows of samples start to stop, a few hundred samples at a time.
+
+        Args:
+            start: First sample.
+            stop: Sample after the last one.
+            segment: A block ends after each multiple of this number of samples; None: anywhere.
+
+        Yields:
+            Per joint j the rows sqrt(weight) [W_j tau_j], shape (k, c_j + 1), column-major. They
+            are valid until the next iteration.
+        """
+
+    @abstractmethod
+    def select(self, columns: Array) -> "RowSource":
+        """Return the same rows with fewer columns, column k being ``columns[k]`` of this one.
+
+        Args:
+            columns: Indices of the selected columns, shape (b,), in the whole problem.
+        """
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """The rows of W theta = tau, which can be read in blocks repeatedly.
+
+    Attributes:
+        stream: Starts a new pass and yields the blocks in order.
+        names: Names of the c columns.
+        n_joints: Number n of rows per sample.
+        support: Shape (n, c), bool: False where row j is zero for every motion.
+        mass_stream: Starts a new pass over the regressors of the mass matrix of each block's
+            samples, shape (k, n, n, c), or None if the problem has none.
+        sources: The same rows joint by joint, in order; empty if there are only blocks.
+        is_projected: Whether constraint forces were eliminated from the rows, as of ``Factors``.
+    """
+
+    stream: Callable[[], Iterator[Block]]
+    names: tuple[str, ...]
+    n_joints: int
+    support: Array
+    mass_stream: Callable[[], Iterator[Array]] | None = None
+    sources: tuple[RowSource, ...] = ()
+    is_projected: bool = False
+
+    def __post_init__(self) -> None:
+        wanted = (self.n_joints, len(self.names))
+        if self.support.shape != wanted:
+            raise DataError(f"support has shape {self.support.shape}, wanted {wanted}")
+
+    def blocks(self) -> Iterator[Block]:
+        """Yield the blocks (W (k n, c), tau (k n,), weight (k n,)) from the first one on."""
+        return self.stream()
+
+    def samples(self) -> Iterator[Sample]:
+        """Yield the problem sample by sample, for recursive estimators."""
+        n, c = self.n_joints, len(self.names)
+        masses = repeat(None) if self.mass_stream is None else self.mass_stream()
+        for (W, tau, weight), mass in zip(self.blocks(), masses, strict=False):
+            rows = zip(W.reshape(-1, n, c), tau.reshape(-1, n), weight.reshape(-1, n), strict=True)
+            by_sample = repeat(None) if mass is None else mass
+            for (Y, torque, row_weight), M in zip(rows, by_sample, strict=False):
+                yield Sample(Y, torque, row_weight, M)
+
+    def select(self, columns: Array) -> "Problem":
+        """Return the same rows with only the given columns.
+
+        Args:
+            columns: Indices of the selected columns, shape (b,).
+        """
+
+        def stream() -> Iterator[Block]:
+            for W, tau, weight in self.blocks():
+                yield W[:, columns], tau, weight
+
+        masses = self.mass_stream
+
+        def mass_stream() -> Iterator[Array]:
+            for mass in masses() if masses is not None else ():
+                yield mass[..., columns]
+
+        return replace(
+            self,
+            stream=stream,
+            names=tuple(self.names[i] for i in columns),
+            support=self.support[:, columns],
+            mass_stream=None if masses is None else mass_stream,
+            sources=tuple(source.select(columns) for source in self.sources),
+        )
+
+
+def concatenate(problems: Sequence[Problem]) -> Problem:
+    """Return one problem with the rows of several in order, for several logs of one robot.
+
+    Args:
+        problems: At least one problem; all with the same columns and joints.
+
+    Raises:
+        DataError: If there is none, or their columns or joints differ.
+    """
+    if not problems:
+        raise DataError("there is no problem, wanted that of at least one log")
+    first = problems[0]
+    for other in problems[1:]:
+        if other.names != first.names or other.n_joints != first.n_joints:
+            raise DataError(
+                f"problems differ in their columns: {len(first.names)} of {first.n_joints} "
+                f"joints and {len(other.names)} of {other.n_joints} joints"
+            )
+    masses = [p.mass_stream for p in problems if p.mass_stream is not None]
+    has_mass = len(masses) == len(problems)
+    return replace(
+        first,
+        stream=lambda: chain.from_iterable(problem.blocks() for problem in problems),
+        support=np.any([problem.support for problem in problems], axis=0),
+        mass_stream=(lambda: chain.from_iterable(m() for m in masses)) if has_mass else None,
+        sources=tuple(chain.from_iterable(problem.sources for problem in problems))
+        if all(problem.sources for problem in problems)
+        else (),
+    )
+
+
+def shuffled(samples: Iterable[Sample], rng: np.random.Generator) -> Iterator[Sample]:
+    """Yield samples in random order; those of a long stream are drawn from a buffer of 8192.
+
+    Args:
+        samples: The samples.
+        rng: Random generator of the order.
+
+    Yields:
+        Each sample once.
+    """
+    buffer: list[Sample] = []
+    for sample in samples:
+        buffer.append(sample)
+        if len(buffer) > _SHUFFLED:
+            k = int(rng.integers(len(buffer)))
+            buffer[k], buffer[-1] = buffer[-1], buffer[k]
+            yield buffer.pop()
+    yield from (buffer[k] for k in rng.permutation(len(buffer)))

@@ -1,0 +1,540 @@
+"""Closed-loop simulation of windows of logs, with sensitivities.
+
+A robot with a fixed base consists of parts that only the base joins, such as the legs of a
+quadruped; each part is simulated independently. The lanes of the compiled code simulate several
+windows in parallel.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+from types import ModuleType
+from typing import TYPE_CHECKING, TypeAlias
+
+import numpy as np
+
+from robotid.base.exceptions import NotConvergedError, SettingsError
+from robotid.base.typing import Array
+from robotid.data.log import Log
+from robotid.dynamics.compiled import Tree, flatten, why_not
+from robotid.dynamics.factors import in_order
+from robotid.dynamics.simulation.failures import why_no_solution
+from robotid.robot.drive_term import BRISTLES
+from robotid.robot.drives import Bristles, DriveTerm, MemorylessTerm
+from robotid.robot.model import RobotModel
+
+if TYPE_CHECKING:
+    from robotid.dynamics.simulation.loop_lanes import Course
+
+__all__ = [
+    "ClosedLoopRobot",
+    "Column",
+    "Loops",
+    "RollOut",
+    "Window",
+    "cut_windows",
+    "open_loops",
+]
+
+#: Kind, joint and index of a parameter of the sensitivities; see ``loop_lanes``.
+Column: TypeAlias = tuple[int, int, int]
+
+_GAP = 3.0  # step in time above which a segment ends [median steps]
+_AROUND = 0.03  # half-width of the fit for the initial speed [s]
+_FEWEST = 2  # smallest number of samples on each side of that fit
+_SHORT = 0.5  # smallest last window; a shorter one is part of the previous one [windows]
+_SAME = 1e-3  # largest difference of a tick from the row at the same time [ticks]
+_FASTEST = 1e6  # speed above which a closed loop is unstable [rad/s or m/s]
+
+
+@dataclass(frozen=True, eq=False)
+class Loops:
+    """Parameters of bodies, drives and the drives' control loops.
+
+    torque = kp (q_ref - q) + kd (v_ref - v) + tau_ref, at most ``limit``, with commands delayed by
+    ``delay``; position 0 of a joint's encoder is position ``zero`` of the URDF. With a ``rate``,
+    the controller samples all signals at its ticks, with a zero-order hold of the torque. Ticks are
+    counted from the first row of a log. A command at a tick is averaged over the row after the
+    tick, so that a delay of part of a row interpolates between whole rows.
+
+    Attributes:
+        bodies: Ten inertial parameters of each body, shape (n, 10), in the order of the layout.
+        armature: Shape (n,) [kg m^2 or kg].
+        kp: Shape (n,) [N m/rad or N/m].
+        kd: Shape (n,) [N m s/rad or N s/m].
+        limit: Largest torque, shape (n,) [N m or N]; infinite without one.
+        delay: Shape (n,) [s].
+        zero: Shape (n,) [rad or m].
+        terms: Friction and offset of each joint.
+        values: Their parameters, joint by joint, shape (T,).
+        rate: Sampling rate of the controller [Hz]; None: continuous time.
+    """
+
+    bodies: Array
+    armature: Array
+    kp: Array
+    kd: Array
+    limit: Array
+    delay: Array
+    zero: Array
+    terms: tuple[tuple[DriveTerm, ...], ...]
+    values: Array
+    rate: float | None = None
+
+    def place(self, joint: int, term: DriveTerm) -> int:
+        """Return the index of the parameter of a joint's term in ``values``.
+
+        Args:
+            joint: Index of the joint.
+            term: One of its terms.
+        """
+        return sum(map(len, self.terms[:joint])) + self.terms[joint].index(term)
+
+
+def open_loops(model: RobotModel, pi: Array) -> Loops:
+    """Return bodies and drives of standard parameters without control: no gain, no delay.
+
+    Args:
+        model: The robot.
+        pi: Standard parameters, shape (p,), SI units, in ``layout.names`` order.
+    """
+    layout, n = model.layout, len(model.joints)
+    terms: list[list[DriveTerm]] = [[] for _ in range(n)]
+    values: list[list[float]] = [[] for _ in range(n)]
+    armature, none = np.zeros(n), np.zeros(n)
+    drives = zip(layout.drive_parameters, pi[layout.n_inertial :].tolist(), strict=True)
+    for (d, term), value in drives:
+        if term.is_inertia:
+            armature[d] = value
+        else:
+            terms[d].append(term)
+            values[d].append(value)
+    return Loops(
+        bodies=pi[: layout.n_inertial].reshape(-1, 10), armature=armature, kp=none, kd=none,
+        limit=np.full(n, np.inf), delay=none, zero=none, terms=tuple(map(tuple, terms)),
+        values=np.concatenate([np.zeros(0), *values]),
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Window:
+    """A segment of a log of commands that is simulated from its measured initial state.
+
+    Attributes:
+        log: The log, with commands.
+        start_row: First simulated sample.
+        first: First counted sample; before it, the error of the initial state decays.
+        stop: Sample after the last one.
+        given: Initial position and speed, shape (2, n); the measured ones if None.
+    """
+
+    log: Log
+    start_row: int
+    first: int
+    stop: int
+    given: Array | None = None
+
+    @property
+    def counted(self) -> slice:
+        """The counted samples."""
+        return slice(self.first, self.stop)
+
+    @property
+    def around(self) -> Array:
+        """Mean position about the first sample, shape (n,): that of a joint at rest."""
+        mean: Array = self.log.q[self._near].mean(axis=0)
+        return mean
+
+    @property
+    def _near(self) -> slice:
+        """The samples about the first one."""
+        wide = max(_FEWEST, round(_AROUND / self.dt))
+        return slice(max(self.start_row - wide, 0), min(self.start_row + wide + 1, len(self.log.t)))
+
+    @cached_property
+    def dt(self) -> float:
+        """Median step of the log [s]."""
+        return float(np.median(np.diff(self.log.t)))
+
+    @cached_property
+    def start(self) -> Array:
+        """Initial position and speed, shape (2, n)."""
+        if self.given is not None:
+            return self.given
+        t, q, k = self.log.t, self.log.q, self.start_row
+        near = self._near
+        along, order = t[near] - t[k], min(2, len(t[near]) - 1)
+        fit = np.polynomial.polynomial.polyfit(along, q[near], order)
+        return np.stack([q[k], fit[1]])
+
+
+def cut_windows(log: Log, length: float, lead: float) -> tuple[Window, ...]:
+    """Return the windows of a log, segment by segment between its gaps.
+
+    Args:
+        log: The log, with commands.
+        length: Their length [s]; infinite for whole segments.
+        lead: Simulated time before the counted samples, where the segment has it [s].
+    """
+    steps = np.diff(log.t)
+    dt = float(np.median(steps))
+    edges = [0, *(np.flatnonzero(steps > _GAP * dt) + 1), len(log.t)]
+    ahead = round(lead / dt)
+    windows = []
+    for start, stop in pairwise(edges):
+        size = stop - start if math.isinf(length) else max(2, round(length / dt))
+        firsts = list(range(start, stop, size))
+        if len(firsts) > 1 and stop - firsts[-1] < max(_SHORT * size, 2):
+            firsts.pop()
+        ends = [*firsts[1:], stop]
+        windows += [
+            Window(log, max(start, first - ahead), first, end)
+            for first, end in zip(firsts, ends, strict=True)
+            if end - first > 1
+        ]
+    return tuple(windows)
+
+
+@dataclass(frozen=True, eq=False)
+class RollOut:
+    """The simulated motion of a window.
+
+    Attributes:
+        window: The window.
+        q: Positions of the counted samples, shape (N, n) [rad or m].
+        v: Speeds of the counted samples, shape (N, n) [rad/s or m/s].
+        slopes: For each part of the robot: its joints, shape (k,); the indices of its
+            sensitivities, ascending, shape (c,); and the derivatives of its positions, shape
+            (N, k, c), or of its positions and speeds, shape (N, 2k, c).
+    """
+
+    window: Window
+    q: Array
+    v: Array
+    slopes: tuple[tuple[Array, Array, Array], ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """A part of the robot that only the base joins to others, for the compiled code."""
+
+    joints: Array  # indices of its joints in the model, (k,)
+    bodies: Array  # indices of their bodies in the layout, (k,)
+    tree: Tree
+
+
+class ClosedLoopRobot:
+    """Simulator of a robot with closed-loop drives."""
+
+    def __init__(self, model: RobotModel, *, step: float = 2e-3, corrects: bool = False) -> None:
+        """Flatten a robot.
+
+        Args:
+            model: The robot.
+            step: Longest step of the integration [s].
+            corrects: Whether each step is solved a second time, at its midpoint; such roll-outs
+                have no derivatives.
+
+        Raises:
+            DataError: If the base floats, or the robot has contacts or loops.
+            SettingsError: If a drive couples several joints, or the compiled code has no joint of
+                some type.
+        """
+        model.require_fixed("the estimator 'simulation', which simulates the controlled joints,")
+        if model.layout.couplings or model.mimic == "coupled":
+            raise SettingsError(
+                f"{model.name}: drives that couple several joints and coupled mimic joints cannot "
+                "be simulated. Leave out [[coupling]], and set mimic = 'independent'"
+            )
+        if (why := why_not(model)) is not None:
+            raise SettingsError(f"{model.name} cannot be simulated: {why}")
+        self.model, self.step, self.corrects = model, step, corrects
+        self._parts = _parts(flatten(model))
+
+    @property
+    def kinds(self) -> dict[str, int]:
+        """Numbers of the kinds of sensitivities, by name."""
+        lanes = _lanes()
+        return {
+            "armature": lanes.ARMATURE,
+            "kp": lanes.KP,
+            "kd": lanes.KD,
+            "limit": lanes.LIMIT,
+            "term": lanes.TERM,
+            "delay": lanes.DELAY,
+            "zero": lanes.ZERO,
+            "body": lanes.INERTIAL,
+            "start": lanes.START,
+            "speed": lanes.SPEED,
+        }
+
+    @property
+    def parts(self) -> tuple[Array, ...]:
+        """The joints of each independent part."""
+        return tuple(part.joints for part in self._parts)
+
+    @property
+    def joint_of_body(self) -> tuple[int, ...]:
+        """The joint that moves each body of the layout."""
+        found = {
+            int(body): int(joint)
+            for part in self._parts
+            for body, joint in zip(part.bodies, part.joints, strict=True)
+        }
+        return tuple(found[body] for body in range(len(found)))
+
+    def roll_out(
+        self,
+        loops: Loops,
+        windows: Sequence[Window],
+        columns: Sequence[Column] = (),
+        directions: Array | None = None,
+        *,
+        owners: Sequence[int] | None = None,
+        with_speeds: bool = False,
+    ) -> list[RollOut]:
+        """Return the simulated motion of windows.
+
+        Args:
+            loops: Bodies, drives and loops.
+            windows: The windows.
+            columns: Parameters of the sensitivities: kind, joint, and index of a term or direction.
+            directions: Directions in a body's ten parameters, shape (D, 10).
+            owners: Index of the sensitivity of each column. A sensitivity is the sum of its
+                columns, for a parameter that joints share; with None, and for initial states, each
+                column is a sensitivity.
+            with_speeds: Whether speeds are differentiated, too.
+
+        Raises:
+            NotConvergedError: If a step has no solution, for example with negative friction.
+        """
+        wanted = np.array(columns, dtype=np.int64).reshape(-1, 3)
+        numbers = np.arange(len(wanted)) if owners is None else np.array(owners, dtype=np.int64)
+        wanted = np.column_stack([wanted, numbers])[np.argsort(numbers, kind="stable")]
+        along = np.zeros((0, 10)) if directions is None else np.array(directions, order="C")
+        lanes = _lanes()
+        blocks = [windows[k : k + lanes.LANES] for k in range(0, len(windows), lanes.LANES)]
+        pieces = [(part, block) for block in blocks for part in self._parts]
+        outputs = 2 if with_speeds else 1
+        done = list(
+            in_order(lambda p: self._block(p[0], p[1], loops, wanted, along, outputs), pieces)
+        )
+        n, each = len(self.model.joints), len(self._parts)
+        found = []
+        for b, block in enumerate(blocks):
+            parts = list(zip(self._parts, done[b * each : (b + 1) * each], strict=True))
+            for lane, window in enumerate(block):
+                counted = slice(window.first - window.start_row, window.stop - window.start_row)
+                q, v = np.empty((2, counted.stop - counted.start, n))
+                slopes = []
+                for part, (numbers_of, q_part, v_part, S) in parts:
+                    q[:, part.joints], v[:, part.joints] = (
+                        q_part[counted, :, lane],
+                        v_part[counted, :, lane],
+                    )
+                    slopes.append((part.joints, numbers_of, S[counted, :, :, lane]))
+                found.append(RollOut(window, q, v, tuple(slopes) if len(wanted) else ()))
+        return found
+
+    def _block(
+        self,
+        part: _Part,
+        windows: Sequence[Window],
+        loops: Loops,
+        wanted: Array,
+        along: Array,
+        outputs: int,
+    ) -> tuple[Array, Array, Array, Array]:
+        """Return sensitivities, positions, speeds and derivatives of a part in a block of windows.
+
+        ``wanted`` has a row for each column: kind, joint, index, and index of the sensitivity.
+        """
+        lanes = _lanes()
+        own, n = part.joints, len(part.joints)
+        columns = wanted[np.isin(wanted[:, 1], own)]
+        numbers, first = np.unique(columns[:, 3], return_index=True)
+        sums = np.append(first, len(columns)).astype(np.int64)
+        columns = np.ascontiguousarray(columns[:, :3])
+        columns[:, 1] = [np.flatnonzero(own == j)[0] for j in columns[:, 1]]
+        places, spans, affine = _arranged(loops, own)
+        is_term = columns[:, 0] == lanes.TERM
+        columns[is_term, 2] = [np.flatnonzero(places == k)[0] for k in columns[is_term, 2]]
+        every_term = [term for terms in loops.terms for term in terms]
+        coded = [lanes.coded_term(every_term[k]) for k in places]
+        codes = np.array([code for code, _ in coded], dtype=np.int64).reshape(-1, 5)
+        shapes = np.array([numbers for _, numbers in coded]).reshape(-1, 11)
+        has_state = codes[:, 2] == BRISTLES
+        shapes[has_state, 3] = np.arange(has_state.sum())
+        drives = np.column_stack(
+            [x[own] for x in (loops.armature, loops.kp, loops.kd, loops.limit)] + [affine]
+        )
+        course = self._course(part, windows, loops)
+        samples = len(course.steps) // course.every + 1
+        q, v = np.zeros((2, samples, n, lanes.LANES))
+        S = np.zeros((samples, outputs * n, len(numbers), lanes.LANES))
+        q[0], v[0] = course.start
+        work = lanes.work_of(n, len(numbers), int(has_state.sum()))
+        failed = lanes.roll_out(
+            part.tree, loops.zero[own], loops.bodies[part.bodies], drives,
+            lanes.Terms(codes, shapes, loops.values[places], spans),
+            lanes.Columns(columns, sums, along), course, lanes.Motion(q, v, S),
+            work, self.corrects,
+        )  # fmt: skip
+        if failed >= 0 or not (np.abs(v) < _FASTEST).all():
+            last = lanes.last_step(work, n) if failed >= 0 else None
+            at, lane, i, angles = _failed_at(failed // course.every, last, q, v)
+            window = windows[lane]
+            time = float(window.log.t[min(window.start_row + at, window.stop - 1)])
+            why = why_no_solution(self.model, loops, own, angles, i, self.step)
+            raise NotConvergedError(why, f"{window.log.name} at {time:.4g} s")
+        return numbers, q, v, S
+
+    def _course(self, part: _Part, windows: Sequence[Window], loops: Loops) -> "Course":
+        """Return the commands of a part's joints in a block of windows."""
+        from robotid.dynamics.simulation.course_lanes import average_command  # imports Numba
+
+        lanes = _lanes()
+        samples = max(window.stop - window.start_row for window in windows)
+        grids = [_Grid.of(window, samples, loops.rate) for window in windows]
+        every = max(grid.least_steps(self.step, loops.rate) for grid in grids)
+        size, n = (samples - 1) * every, len(part.joints)
+        command = np.zeros((size, n, 6, lanes.LANES))
+        steps, start = np.empty((size, lanes.LANES)), np.empty((2, n, lanes.LANES))
+        ticks = np.zeros((0 if loops.rate is None else size, lanes.LANES))
+        for lane, window in enumerate(windows):
+            log, (times, is_tick) = window.log, grids[lane].divided(every)
+            is_last = lane == len(windows) - 1
+            own = slice(lane, None if is_last else lane + 1)  # unused lanes copy the last one
+            steps[:, own] = np.diff(times)[:, None]
+            start[..., own] = window.start[:, part.joints, None]
+            edges = times
+            of_step: Array | slice = slice(None)
+            if loops.rate is not None:
+                ticks[:, own], of_step = is_tick[:, None], 2 * (np.cumsum(is_tick) - 1)
+                edges = grids[lane].sampled(times[:-1][is_tick])
+            mean, change = np.empty((2, len(edges) - 1))
+            for values, k, by_delay in ((log.q_ref, 0, 1), (log.v_ref, 2, 4), (log.tau_ref, 3, 5)):
+                if values is None:
+                    continue
+                for i, j in enumerate(part.joints):
+                    x = values[:, j].copy()  # contiguous and writable: else Numba compiles again
+                    average_command(log.t, x, edges, loops.delay[j], mean, change)
+                    command[:, i, k, own] = mean[of_step, None]
+                    command[:, i, by_delay, own] = change[of_step, None]
+        course: Course = lanes.Course(command, steps, ticks, every, start)
+        return course
+
+
+@dataclass(frozen=True, eq=False)
+class _Grid:
+    """Rows and controller ticks of a window, which the integration steps divide."""
+
+    stamps: Array  # of its rows, continued to the number of rows of the longest window, (N,) [s]
+    ticks: Array  # of the controller after the first row, to the first one after the last row [s]
+    dt: float  # median step of the log [s]
+
+    @classmethod
+    def of(cls, window: Window, samples: int, rate: float | None) -> "_Grid":
+        """Return the grid of a window, continued with the log's median step."""
+        t, dt = window.log.t[window.start_row : window.stop], window.dt
+        stamps = np.concatenate([t, t[-1] + dt * np.arange(1, samples - len(t) + 1)])
+        if rate is None:
+            return cls(stamps, np.zeros(0), dt)
+        count = rate * (stamps[[0, -1]] - window.log.t[0])
+        ticks = window.log.t[0] + np.arange(np.floor(count[0]), count[1] + 2) / rate
+        after = np.clip(np.searchsorted(stamps, ticks), 1, len(stamps) - 1)
+        for row in (after - 1, after):
+            ticks = np.where(np.abs(ticks - stamps[row]) < _SAME / rate, stamps[row], ticks)
+        return cls(stamps, ticks[ticks > stamps[0]], dt)
+
+    def sampled(self, ticks: Array) -> Array:
+        """Return start and end of the command average of ticks: one row, but at most one tick."""
+        after = self.ticks[np.searchsorted(self.ticks, self.stamps[-1])]
+        ends = ticks + np.minimum(self.dt, np.diff(ticks, append=after))
+        return np.stack([ticks, ends], axis=1).reshape(-1)
+
+    def least_steps(self, step: float, rate: float | None) -> int:
+        """Return the number of steps of a row, so that steps divide ticks and end at each."""
+        if rate is None:
+            return max(1, math.ceil(self.dt / step - 1e-9))
+        longest = 1.0 / rate / math.ceil(1.0 / rate / step - 1e-9)
+        typical = math.ceil(self.dt / longest - 1e-9)
+        inside = np.diff(np.searchsorted(self.ticks, self.stamps))
+        at_rows = np.isin(self.stamps[:-1], self.ticks)
+        return max(1, typical, int((inside - at_rows).max()) + 1)
+
+    def divided(self, every: int) -> tuple[Array, Array]:
+        """Return the ends of all steps, and which steps start with a tick."""
+        size = (len(self.stamps) - 1) * every
+        times, is_tick = np.empty(size + 1), np.empty(size, dtype=bool)
+        from robotid.dynamics.simulation.course_lanes import divide_rows  # imports Numba
+
+        divide_rows(self.stamps, self.ticks, times, is_tick)
+        return times, is_tick
+
+
+def _parts(tree: Tree) -> list[_Part]:
+    """Return the parts of a robot that only the world joins."""
+    root: list[int] = []
+    for i, parent in enumerate(tree.parents):
+        root.append(i if parent < 0 else root[parent])
+    parts = []
+    for r in sorted(set(root)):
+        bodies = np.flatnonzero(np.array(root) == r)
+        parts.append(_Part(tree.leaders[bodies], bodies, tree.part(bodies)))
+    return parts
+
+
+def _failed_at(
+    row: int, last: tuple[Array, Array] | None, q: Array, v: Array
+) -> tuple[int, int, int, Array]:
+    """Return row, lane and joint of a failed roll-out, and the positions in this lane, shape (n,).
+
+    The positions of an unstable one are the initial ones.
+
+    Args:
+        row: Row of the step without a solution.
+        last: Positions before this step and the last correction of speeds; None if every step has
+            one, but speeds are too large.
+        q: Positions, shape (N, n, LANES).
+        v: Speeds, shape (N, n, LANES).
+    """
+    if last is None:
+        is_fast = ~(np.abs(v) < _FASTEST)
+        row, i, lane = (int(k) for k in np.unravel_index(np.argmax(is_fast), v.shape))
+        return row, lane, i, q[0, :, lane]
+    before, change = last
+    size = np.where(np.isfinite(change), np.abs(change), np.inf)
+    i, lane = (int(k) for k in np.unravel_index(np.argmax(size), size.shape))
+    return row, lane, i, np.clip(np.nan_to_num(before[:, lane]), -_FASTEST, _FASTEST)
+
+
+def _arranged(loops: Loops, joints: Array) -> tuple[Array, Array, Array]:
+    """Return the indices in ``loops.values`` of the terms of joints, joint by joint.
+
+    Also, for each joint, the index of its first term, of its first bristle or affine term, and of
+    its end, shape (n, 3); and the sums of its affine terms: constant, by the speed, and by its
+    direction, shape (n, 3).
+    """
+    first = np.cumsum([0, *map(len, loops.terms)])
+    places, spans, affine = list[int](), [], np.zeros((len(joints), 3))
+    for i, j in enumerate(joints):
+        others, rest = list[int](), list[int]()
+        for k, term in enumerate(loops.terms[j], start=first[j]):
+            if isinstance(term, MemorylessTerm) and term.affine is not None:
+                affine[i, term.affine] += loops.values[k]
+                rest.append(k)
+            else:
+                (rest if isinstance(term, Bristles) else others).append(k)
+        spans.append([len(places), len(places) + len(others)])
+        places += [*others, *rest]
+        spans[-1].append(len(places))
+    return np.array(places, dtype=int), np.array(spans, dtype=np.int64), affine
+
+
+def _lanes() -> ModuleType:
+    import robotid.dynamics.simulation.loop_lanes  # imports Numba
+
+    return robotid.dynamics.simulation.loop_lanes

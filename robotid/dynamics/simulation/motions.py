@@ -1,0 +1,253 @@
+"""Reference motions: Fourier series, quintics from rest to rest, samples, legged robots."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Protocol
+
+import numpy as np
+
+from robotid.base.exceptions import DataError, SettingsError
+from robotid.base.typing import Array
+from robotid.data.base_motion import in_base
+from robotid.robot.model import RobotModel
+
+__all__ = [
+    "FloatingMotion",
+    "FourierTrajectory",
+    "Motion",
+    "ProgramMotion",
+    "SampledMotion",
+    "random_fourier",
+]
+
+_ORDER = 5  # of the polynomials through samples
+_HARMONICS = 5  # of a random motion
+_ROTARY_AMPLITUDE = 1.2  # largest amplitude of a revolute joint [rad]
+_LINEAR_AMPLITUDE = 0.15  # largest amplitude of a prismatic joint [m]
+_ROTARY_SPEED = 1.5  # largest peak speed of a revolute joint [rad/s]
+_LINEAR_SPEED = 0.3  # largest peak speed of a prismatic joint [m/s]
+
+
+class Motion(Protocol):
+    """A motion that a controller can track."""
+
+    def evaluate(self, t: Array) -> tuple[Array, Array, Array]:
+        """Return q, v, a, each of shape (N, n) [rad, rad/s, rad/s^2 or m, m/s, m/s^2].
+
+        Args:
+            t: Times, shape (N,) [s].
+        """
+
+
+@dataclass(frozen=True, eq=False)
+class FourierTrajectory(Motion):
+    """A periodic motion q(t) = q0 + sum_k s_k sin(k w t) + c_k cos(k w t), w = 2 pi / period.
+
+    References:
+        Swevers et al. (1997), Optimal robot excitation and identification.
+    """
+
+    q0: Array  # mean position, shape (n,) [rad or m]
+    sine: Array  # coefficients s_k, shape (h, n) [rad or m]
+    cosine: Array  # coefficients c_k, shape (h, n) [rad or m]
+    period: float  # [s]
+
+    def __post_init__(self) -> None:
+        if self.sine.shape != self.cosine.shape or self.sine.shape[1:] != self.q0.shape:
+            raise DataError(
+                f"sine has shape {self.sine.shape} and cosine {self.cosine.shape}, wanted the same "
+                f"shape (h, {len(self.q0)})"
+            )
+
+    def evaluate(self, t: Array) -> tuple[Array, Array, Array]:
+        w = 2 * np.pi / self.period * np.arange(1, len(self.sine) + 1)  # (h,)
+        sin, cos = np.sin(np.outer(t, w)), np.cos(np.outer(t, w))  # (N, h)
+        q = self.q0 + sin @ self.sine + cos @ self.cosine
+        v = (cos * w) @ self.sine - (sin * w) @ self.cosine
+        a = -(sin * w**2) @ self.sine - (cos * w**2) @ self.cosine
+        return q, v, a
+
+
+@dataclass(frozen=True)
+class ProgramMotion(Motion):
+    """The motion q(t) = q0 + A (a1 t^5 + a2 t^4 + a3 t^3), from rest to rest.
+
+    With a1 = 6 / T^5, a2 = -15 / T^4, a3 = 10 / T^3 the motion is from q0 to q0 + A, with zero
+    velocity and acceleration at both ends. Before 0 and after T the robot is at rest.
+
+    References:
+        Tzvetkova, (28).
+    """
+
+    amplitude: Array  # A, displacement of each joint, (n,), or (R, n) for R motions [rad or m]
+    duration: float | Array  # T, one for all or one per motion, shape () or (R,) [s]
+    start: float | Array = 0.0  # q0, of the amplitude's shape or that of one motion [rad or m]
+
+    def __post_init__(self) -> None:
+        A, T = np.asarray(self.amplitude, dtype=float), np.asarray(self.duration, dtype=float)
+        if A.ndim not in (1, 2) or not np.isfinite(A).all():
+            raise DataError(f"amplitude has shape {A.shape}, wanted (n,) or (R, n), finite")
+        if T.ndim > 0 and T.shape != A.shape[:-1]:
+            raise DataError(f"duration has shape {T.shape}, wanted () or {A.shape[:-1]}")
+        if not np.all((T > 0) & (np.inf > T)):
+            raise SettingsError(f"duration is {self.duration}, wanted a positive number")
+
+    def evaluate(self, t: Array | float) -> tuple[Array, Array, Array]:
+        """Return q, v and a as in ``Motion``, each of shape t.shape + (n,), or (R, n).
+
+        Args:
+            t: Times of one motion, any shape, or one per motion, shape (R,) [s].
+        """
+        A, T = np.asarray(self.amplitude, dtype=float), np.asarray(self.duration)[..., None]
+        s = np.clip(np.asarray(t, dtype=float)[..., None] / T, 0.0, 1.0)  # t / T
+        q = self.start + A * (6 * s**5 - 15 * s**4 + 10 * s**3)
+        v = A * (30 * s**4 - 60 * s**3 + 30 * s**2) / T
+        a = A * (120 * s**3 - 180 * s**2 + 60 * s) / T**2
+        return q, v, a
+
+
+@dataclass(frozen=True, eq=False)
+class SampledMotion(Motion):
+    """A motion through samples: piecewise quintics through q, v and a, or a spline through q.
+
+    Both have a continuous acceleration. Time starts at the first sample.
+    """
+
+    t: Array  # shape (N,) [s]
+    q: Array  # shape (N, n) [rad or m]
+    v: Array | None = None  # [rad/s or m/s]
+    a: Array | None = None  # [rad/s^2 or m/s^2]
+
+    def __post_init__(self) -> None:
+        if len(self.t) < _ORDER + 1:
+            raise DataError(f"the motion has {len(self.t)} rows, wanted at least {_ORDER + 1}")
+
+    @property
+    def duration(self) -> float:
+        """Duration [s]."""
+        return float(self.t[-1] - self.t[0])
+
+    @cached_property
+    def _curves(self) -> tuple[Any, Any, Any]:
+        """The position and its derivatives, functions of time since the start."""
+        from scipy.interpolate import BPoly, make_interp_spline
+
+        t = self.t - self.t[0]
+        if self.v is None or self.a is None:
+            curve = make_interp_spline(t, self.q, k=_ORDER)
+        else:
+            curve = BPoly.from_derivatives(t, np.stack([self.q, self.v, self.a], axis=1))
+        return curve, curve.derivative(1), curve.derivative(2)
+
+    def evaluate(self, t: Array) -> tuple[Array, Array, Array]:
+        q, v, a = (curve(t) for curve in self._curves)
+        return q, v, a
+
+
+@dataclass(frozen=True, eq=False)
+class FloatingMotion(Motion):
+    """A motion of a robot whose base floats: splines through poses and joint positions.
+
+    Attributes:
+        t: Times, shape (N,) [s].
+        pose: Pose of the base, as of ``BaseMotion``, shape (N, 7) [m, -].
+        q: Joint positions, shape (N, n) [rad or m].
+        contacts: Which contacts touch the ground, shape (N, k), bool; each until the next sample.
+    """
+
+    t: Array
+    pose: Array
+    q: Array
+    contacts: Array
+
+    @property
+    def duration(self) -> float:
+        """Duration [s]."""
+        return float(self.t[-1] - self.t[0])
+
+    @cached_property
+    def _samples(self) -> SampledMotion:
+        return SampledMotion(self.t, np.hstack([self.pose, self.q]))
+
+    def touching(self, t: Array) -> Array:
+        """Return which contacts touch the ground, shape (N, k), bool.
+
+        Args:
+            t: Times since the first sample, shape (N,) [s].
+        """
+        rows = np.searchsorted(self.t - self.t[0], t + 1e-9, side="right") - 1
+        flags: Array = self.contacts[np.clip(rows, 0, len(self.t) - 1)]
+        return flags
+
+    def evaluate(self, t: Array) -> tuple[Array, Array, Array]:
+        """Return q (N, 7 + n), v (N, 6 + n) and a (N, 6 + n), the twist with the axes of the base.
+
+        With the unit quaternion p / |p| of the spline p, w = 2 p* dp/dt / |p|^2 (vector part).
+
+        Args:
+            t: Times since the first sample, shape (N,) [s].
+        """
+        x, rate, change = self._samples.evaluate(t)
+        p, dp, ddp = x[:, 3:7], rate[:, 3:7], change[:, 3:7]
+        square = np.sum(p**2, axis=1, keepdims=True)
+        unit = p / np.sqrt(square)
+        w = 2.0 * _vector_part(p, dp) / square
+        alpha = 2.0 * _vector_part(p, ddp) / square
+        alpha -= 2.0 * np.sum(p * dp, axis=1, keepdims=True) / square * w
+        v = in_base(unit, rate[:, :3])
+        a = in_base(unit, change[:, :3]) - np.cross(w, v)
+        return (
+            np.hstack([x[:, :3], unit, x[:, 7:]]),
+            np.hstack([v, w, rate[:, 7:]]),
+            np.hstack([a, alpha, change[:, 7:]]),
+        )
+
+
+def _vector_part(p: Array, rate: Array) -> Array:
+    """Return the vector part of the product p* r of quaternions x y z w, shape (N, 3)."""
+    vector, scalar = p[:, :3], p[:, 3:]
+    part: Array = scalar * rate[:, :3] - rate[:, 3:] * vector - np.cross(vector, rate[:, :3])
+    return part
+
+
+def random_fourier(
+    model: RobotModel,
+    rng: np.random.Generator,
+    *,
+    period: float = 10.0,
+    centre: Array | None = None,
+) -> FourierTrajectory:
+    """Return a random motion within the limits of a robot.
+
+    Args:
+        model: The robot; the motion is within the position and speed limits of its URDF.
+        rng: Source of the coefficients.
+        period: Period [s].
+        centre: Mean position, shape (n,) [rad or m]; the middle of the limits, or 0, if None.
+
+    Raises:
+        DataError: If the centre lies outside the limits.
+    """
+    n = len(model.joints)
+    sine, cosine = rng.standard_normal((2, _HARMONICS, n)) / np.arange(1, _HARMONICS + 1)[:, None]
+    middle = [(j.lower + j.upper) / 2 if j.has_limits else 0.0 for j in model.limits]
+    mean = np.array(middle) if centre is None else centre
+    amplitude, speed = np.empty(n), np.empty(n)
+    for j, joint in enumerate(model.limits):
+        is_prismatic = joint.type == "prismatic"
+        amplitude[j] = _LINEAR_AMPLITUDE if is_prismatic else _ROTARY_AMPLITUDE
+        if joint.has_limits:
+            amplitude[j] = min(
+                amplitude[j], 0.9 * min(joint.upper - mean[j], mean[j] - joint.lower)
+            )
+            if amplitude[j] <= 0:
+                raise DataError(
+                    f"the centre {mean[j]:g} of joint {joint.name!r} is not inside its limits "
+                    f"{joint.lower:g} to {joint.upper:g}"
+                )
+        highest = _LINEAR_SPEED if is_prismatic else _ROTARY_SPEED
+        speed[j] = min(highest, 0.9 * joint.velocity) if joint.velocity > 0 else highest
+    unit = FourierTrajectory(np.zeros(n), sine, cosine, period)
+    q, v, _ = unit.evaluate(np.linspace(0.0, period, 1000))
+    scale = np.minimum(amplitude / np.abs(q).max(axis=0), speed / np.abs(v).max(axis=0))
+    return FourierTrajectory(mean, sine * scale, cosine * scale, period)

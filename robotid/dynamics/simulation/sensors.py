@@ -1,0 +1,103 @@
+"""Sensor models: noise, resolution, delay, jitter, and dropped samples."""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from robotid.base.exceptions import DataError
+from robotid.base.typing import Array
+from robotid.data.log import Log
+from robotid.dynamics.simulation.simulation_settings import PerJoint, Sensors, by_joint
+
+if TYPE_CHECKING:
+    from robotid.dynamics.simulation.closed_loop import Run
+
+__all__ = ["measure"]
+
+_TICK = 1e-6  # smallest step between time stamps [s]
+
+
+def measure(
+    run: "Run",
+    sensors: Sensors,
+    joints: tuple[str, ...],
+    rng: np.random.Generator,
+    *,
+    delay: Array | float = 0.0,
+) -> Log:
+    """Return the log of a robot's motion by sensors.
+
+    Delay, noise and rounding are applied in this order. Jitter changes only the time stamps.
+
+    Args:
+        run: The motion of the robot.
+        sensors: Logged signals and sensor errors.
+        joints: Names of the n joints.
+        rng: Source of noise, jitter and dropped samples.
+        delay: Delay of each torque by its drive, in addition to the sensors', shape (n,) [s].
+
+    Raises:
+        DataError: If fewer than two samples remain.
+        SettingsError: If a setting names an unknown joint.
+    """
+
+    def of(value: PerJoint, name: str) -> Array:
+        return by_joint(value, joints, f"sensors: {name}")
+
+    noise, step, n = sensors.noise, sensors.step, len(joints)
+    v = _delayed(run.t, run.v, np.full(n, sensors.velocity_delay))
+    tau = _delayed(run.t, run.tau, sensors.torque_delay + delay * np.ones(n))
+    share = of(noise.tau, "noise.tau") * np.sqrt(np.mean(tau**2, axis=0))
+    level = np.hypot(share, of(noise.torque, "noise.torque"))
+    q = _noisy(run.q, of(noise.q, "noise.q"), rng)
+    v = _noisy(v, of(noise.v, "noise.v"), rng)
+    tau = _noisy(tau, level, rng)
+    q, v, tau = (
+        _rounded(x, of(size, f"step.{name}"))
+        for x, size, name in ((q, step.q, "q"), (v, step.v, "v"), (tau, step.tau, "tau"))
+    )
+    logged = np.ones(len(run.t), dtype=bool)
+    if sensors.dropped:
+        logged = rng.random(len(logged)) >= sensors.dropped
+        if logged.sum() < 2:
+            raise DataError(
+                f"{logged.sum()} of {len(logged)} samples remain, wanted at least 2. Set a smaller "
+                "dropped, or a longer duration"
+            )
+    t = run.t
+    if sensors.jitter:
+        spread = _TICK * np.arange(len(t))
+        t = t + sensors.jitter * rng.standard_normal(len(t))
+        t = np.maximum.accumulate(t - spread) + spread
+    of_stand = {} if run.stand is None else run.stand.logged(sensors, logged)
+    return Log(
+        t=t[logged],
+        q=q[logged],
+        v=v[logged] if sensors.velocity else None,
+        a=run.a[logged] if sensors.acceleration else None,
+        tau=tau[logged],
+        joints=joints,
+        **of_stand,
+    )
+
+
+def _delayed(t: Array, values: Array, delay: Array) -> Array:
+    """Return values delayed by joint; before the start, the first values."""
+    if not delay.any():
+        return values
+    columns = [np.interp(t - d, t, x) for d, x in zip(delay, values.T, strict=True)]
+    return np.column_stack(columns)
+
+
+def _noisy(values: Array, level: Array, rng: np.random.Generator) -> Array:
+    """Return values with white noise, its standard deviation given by joint."""
+    if not level.any():
+        return values
+    noisy: Array = values + level * rng.standard_normal(values.shape)
+    return noisy
+
+
+def _rounded(values: Array, step: Array) -> Array:
+    """Return values rounded to steps, for the joints that have one."""
+    size = np.where(step > 0, step, 1.0)
+    return np.where(step > 0, np.round(values / size) * size, values)

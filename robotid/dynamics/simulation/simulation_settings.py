@@ -1,0 +1,344 @@
+"""Settings of a simulation: true parameters, controller, actuators, sensors and payload."""
+
+import tomllib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar, TypeAlias
+
+import numpy as np
+
+from robotid.base.exceptions import SettingsError
+from robotid.base.files import missing_file
+from robotid.base.findings import listed
+from robotid.base.settings import NOT_NEGATIVE, POSITIVE, Range, Settings, check_keys, setting
+from robotid.base.typing import Array
+from robotid.data.log import suggestion
+
+__all__ = [
+    "DELAY",
+    "GAIN",
+    "LEVEL",
+    "Actuator",
+    "Controller",
+    "Noise",
+    "Payload",
+    "PerJoint",
+    "Sensors",
+    "Simulation",
+    "Truth",
+    "by_joint",
+    "read_simulation",
+]
+
+#: A number for every joint, or numbers by joint; other joints have the default.
+PerJoint: TypeAlias = float | Mapping[str, float]
+
+_SHARE = Range("0 to less than 1", lambda x: 0 <= x < 1)
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _are_within(values: Sequence[float], most: float) -> bool:
+    return all(_is_number(x) and abs(x) <= most for x in values)
+
+
+def _all_of(is_right: Any) -> Any:  # noqa: ANN401
+    """Return a check of a number, or of each number in a table."""
+
+    def holds(value: PerJoint) -> bool:
+        values = list(value.values()) if isinstance(value, Mapping) else [value]
+        return all(_is_number(x) and is_right(x) for x in values)
+
+    return holds
+
+
+_NUMBERS = "a number, or a table of numbers by joint"
+_LEAST, _LARGEST = 1e-9, 1e12  # of gains, in any unit, so that squares do not overflow
+_LONGEST = 1.0  # of delays [s]
+LEVEL: Mapping[str, Any] = {
+    "reads": (int, float, dict),
+    "within": Range(f"0 to 1e12: {_NUMBERS}", _all_of(lambda x: 0 <= x <= _LARGEST)),
+}
+GAIN: Mapping[str, Any] = {
+    "reads": (int, float, dict),
+    "within": Range(f"1e-9 to 1e12: {_NUMBERS}", _all_of(lambda x: _LEAST <= x <= _LARGEST)),
+}
+DELAY: Mapping[str, Any] = {
+    "reads": (int, float, dict),
+    "within": Range(f"0 to 1 s: {_NUMBERS}", _all_of(lambda x: 0 <= x <= _LONGEST)),
+}
+
+
+def _effort_from(value: float | bool) -> float | None:
+    if value is True:
+        raise SettingsError(
+            "effort is true, wanted a factor of the URDF's effort limits, or false for no limits"
+        )
+    return None if value is False else value
+
+
+@dataclass(frozen=True)
+class Truth(Settings):
+    """How the true robot differs from its URDF."""
+
+    _table: ClassVar[str] = "truth"
+
+    inertials: float = setting(
+        0.1,
+        "difference of the bodies from the URDF's: standard deviation of ten coordinates in the "
+        "metric of pseudo-inertias, so that every draw is physically consistent; 0.1: masses "
+        "differ by about 14 % [-]",
+        within=Range("0 to 5", lambda x: 0 <= x <= 5),
+    )
+    drives: str = setting(
+        "usual",
+        "drive parameters: by default, each is drawn from the typical range of its term, scaled "
+        "down for joints with an effort limit below 50 N m or N; 'none': all are 0",
+        among=("usual", "none"),
+    )
+    values: Mapping[str, float] = setting(
+        {}, 'stated standard parameters, by name, for example "elbow.viscous" [SI units]'
+    )
+
+
+@dataclass(frozen=True)
+class Controller(Settings):
+    """The controller that tracks the motion; its model of the bodies is the URDF."""
+
+    _table: ClassVar[str] = "controller"
+
+    kind: str = setting(
+        "feedforward",
+        "feedforward: the URDF's inverse dynamics along the motion and PD; pd: PD alone; "
+        "computed_torque: the URDF's inverse dynamics at the measured state; perfect: exact "
+        "tracking, by the true inverse dynamics",
+        among=("feedforward", "pd", "computed_torque", "perfect"),
+    )
+    bandwidth: float = setting(
+        20.0,
+        "bandwidth w of the default gains: kp = w^2 times the inertia of the joint, kd = 2 w times "
+        "this inertia [rad/s]",
+        within=Range("1e-3 to 1e6 rad/s", lambda x: 1e-3 <= x <= 1e6),
+    )
+    kp: PerJoint | None = setting(None, "position gain [N m/rad or N/m]", **GAIN)
+    kd: PerJoint | None = setting(None, "speed gain [N m s/rad or N s/m]", **GAIN)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.kind in ("computed_torque", "perfect") and not (self.kp is self.kd is None):
+            raise SettingsError(
+                f"controller: kp and kd apply to kind pd or feedforward, not {self.kind}. Leave "
+                "them out" + ("" if self.kind == "perfect" else ", or state bandwidth")
+            )
+
+
+@dataclass(frozen=True)
+class Actuator(Settings):
+    """Actuators: torque limits and elastic gears."""
+
+    _table: ClassVar[str] = "actuator"
+
+    effort: float | None = setting(
+        None,
+        "torque limit of each drive, relative to the URDF's effort limit; false: no limit",
+        within=POSITIVE,
+        reads=(int, float, bool),
+        load=_effort_from,
+        dump=lambda value: False if value is None else value,
+    )
+    limits: Mapping[str, float] = setting(
+        {},
+        "torque limit of a drive, by joint, instead of the URDF's [N m or N]",
+        within=Range("positive numbers by joint", _all_of(lambda x: x > 0)),
+    )
+    stiffness: PerJoint | None = setting(
+        None, "stiffness of elastic gears [N m/rad or N/m]; rigid gears if not stated", **GAIN
+    )
+    damping: PerJoint = setting(0.0, "damping of elastic gears [N m s/rad or N s/m]", **LEVEL)
+    backlash: PerJoint = setting(
+        0.0, "backlash of elastic gears, from end to end [rad or m]", **LEVEL
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.stiffness is None and (self.damping or self.backlash):
+            what = "damping" if self.damping else "backlash"
+            raise SettingsError(
+                f"actuator: {what} applies only to elastic gears. State their stiffness, for "
+                "example stiffness = 2e4 [N m/rad]"
+            )
+
+    @property
+    def is_elastic(self) -> bool:
+        """Whether motors and joints have separate positions."""
+        return self.stiffness is not None
+
+
+@dataclass(frozen=True)
+class Noise(Settings):
+    """Standard deviations of white sensor noise; 0 for none."""
+
+    _table: ClassVar[str] = "sensors.noise"
+
+    q: PerJoint = setting(0.0, "noise of positions [rad or m]", **LEVEL)
+    v: PerJoint = setting(0.0, "noise of velocities [rad/s or m/s]", **LEVEL)
+    tau: PerJoint = setting(
+        0.0, "noise of torques, relative to the joint's RMS torque [-]", **LEVEL
+    )
+    torque: PerJoint = setting(0.0, "further noise of torques, absolute [N m or N]", **LEVEL)
+
+
+@dataclass(frozen=True)
+class Steps(Settings):
+    """Resolutions of the sensors; 0: exact."""
+
+    _table: ClassVar[str] = "sensors.step"
+
+    q: PerJoint = setting(0.0, "resolution of positions [rad or m]", **LEVEL)
+    v: PerJoint = setting(0.0, "resolution of velocities [rad/s or m/s]", **LEVEL)
+    tau: PerJoint = setting(0.0, "resolution of torques [N m or N]", **LEVEL)
+
+
+@dataclass(frozen=True)
+class Sensors(Settings):
+    """Logged signals and sensor errors."""
+
+    _table: ClassVar[str] = "sensors"
+
+    velocity: bool = setting(True, "whether velocities are logged")
+    acceleration: bool = setting(False, "whether accelerations are logged, without noise")
+    side: str = setting(
+        "motor",
+        "side of an elastic gear on which position, velocity and torque are logged: motor or joint",
+        among=("motor", "joint"),
+    )
+    noise: Noise = setting(Noise(), "white noise")
+    step: Steps = setting(Steps(), "resolution; readings with noise are rounded to it")
+    torque_delay: float = setting(0.0, "delay of logged torques [s]", within=NOT_NEGATIVE)
+    velocity_delay: float = setting(0.0, "delay of logged velocities [s]", within=NOT_NEGATIVE)
+    jitter: float = setting(
+        0.0,
+        "jitter: standard deviation of the time stamps about the sample times [s]",
+        within=NOT_NEGATIVE,
+    )
+    dropped: float = setting(0.0, "share of samples dropped at random [-]", within=_SHARE)
+
+
+@dataclass(frozen=True)
+class Payload(Settings):
+    """A payload on a link that is not in the URDF, from a time on."""
+
+    _table: ClassVar[str] = "payload"
+
+    link: str = setting("", "name of the link; the last moving one if not stated")
+    mass: float = setting(
+        0.0,
+        "mass [kg]; 0: no payload",
+        within=Range("0 to 1e9 kg", lambda x: 0 <= x <= 1e9),
+    )
+    com: tuple[float, float, float] = setting(
+        (0.0, 0.0, 0.0),
+        "centre of mass in the link's frame [m]",
+        within=Range("three numbers within 1e3 m", lambda x: len(x) == 3 and _are_within(x, 1e3)),
+    )
+    inertia: tuple[float, ...] = setting(
+        (0.0,) * 6,
+        "Ixx, Ixy, Iyy, Ixz, Iyz, Izz about the centre of mass, along the link's axes [kg m^2]",
+        within=Range("six numbers within 1e9", lambda x: len(x) == 6 and _are_within(x, 1e9)),
+    )
+    start: float = setting(0.0, "time at which it is attached [s]", within=NOT_NEGATIVE)
+
+
+@dataclass(frozen=True)
+class Simulation(Settings):
+    """Settings of a simulated log, in addition to robot and motion."""
+
+    seed: int = setting(
+        0, "seed of true parameters, noise and dropped samples", within=NOT_NEGATIVE
+    )
+    rate: float = setting(
+        1000.0, "rate of the log [Hz]", within=Range("1e-3 to 1e5", lambda x: 1e-3 <= x <= 1e5)
+    )
+    duration: float | None = setting(
+        None, "length of the log [s]; that of the motion if not stated", within=POSITIVE
+    )
+    truth: Truth = setting(Truth(), "differences of the true robot from its URDF")
+    controller: Controller = setting(Controller(), "controller that tracks the motion")
+    actuator: Actuator = setting(Actuator(), "torque limits and elastic gears")
+    sensors: Sensors = setting(Sensors(), "logged signals and sensor errors")
+    payload: Payload = setting(Payload(), "payload that is not in the URDF")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.controller.kind == "perfect" and (
+            self.actuator.is_elastic or self.actuator.effort is not None or self.actuator.limits
+        ):
+            raise SettingsError(
+                "controller: kind is perfect, which has no limits and no elastic gears. Leave out "
+                "[actuator], or set kind to feedforward, pd or computed_torque"
+            )
+
+
+def by_joint(value: PerJoint | None, joints: Sequence[str], name: str, other: float = 0.0) -> Array:
+    """Return a setting of each joint, shape (n,).
+
+    Args:
+        value: A number for all, or numbers by joint; None: the default.
+        joints: Names of the n joints.
+        name: Name of the setting, for errors.
+        other: Default of joints that are not named.
+
+    Raises:
+        SettingsError: If the setting names an unknown joint.
+    """
+    if not isinstance(value, Mapping):
+        return np.full(len(joints), other if value is None else float(value))
+    for joint in value:
+        if joint not in joints:
+            raise SettingsError(
+                f"{name} is stated for {joint!r}, which is not a moving joint: "
+                f"{listed(joints)}{suggestion(joint, joints)}"
+            )
+    return np.array([float(value.get(joint, other)) for joint in joints])
+
+
+def read_simulation(
+    path: str | Path | None, given: Mapping[str, Any]
+) -> tuple[Simulation, dict[str, Any]]:
+    """Return the settings in a TOML file, and its table of further drive terms by joint.
+
+    Args:
+        path: The file; its table ``drives`` has the form of a job file's. None: the defaults.
+        given: Settings that replace those of the file, in the same structure.
+
+    Raises:
+        SettingsError: If the file is missing or not TOML, or a key or a value is invalid.
+    """
+    table: dict[str, Any] = {}
+    if path is not None:
+        if not Path(path).is_file():
+            raise SettingsError(missing_file(Path(path), "file of a plant"))
+        try:
+            table = tomllib.loads(Path(path).read_text(encoding="utf-8-sig"))
+        except (ValueError, RecursionError) as error:
+            raise SettingsError(f"{Path(path).name} is not valid TOML: {error}") from error
+    where = "command line" if path is None else Path(path).name
+    schema = Simulation.schema() | {"drives": (dict,)}
+    check_keys(table, schema, where)
+    check_keys(given, schema, "command line")
+    try:
+        return Simulation.from_dict(_over(table, given)), table.get("drives", {})
+    except SettingsError as error:
+        raise SettingsError(f"{where}: {error}") from error
+
+
+def _over(table: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a table with entries replaced by those of another one, nested tables likewise."""
+    merged = dict(table)
+    for key, value in given.items():
+        inside = merged.get(key, {})
+        merged[key] = _over(inside, value) if isinstance(value, Mapping) else value
+    return merged

@@ -1,0 +1,185 @@
+"""A robot on the ground: joints that keep its feet in place, and the forces of its contacts."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+
+from robotid.base.exceptions import DataError, SettingsError
+from robotid.base.typing import Array
+from robotid.data.base_motion import BaseMotion
+from robotid.dynamics.constraint_rows import constraint_jacobian, logged_base
+from robotid.dynamics.simulation.motions import FloatingMotion
+from robotid.dynamics.simulation.simulation_settings import Sensors
+from robotid.robot.constraints import frame_id
+from robotid.robot.model import RobotModel
+
+__all__ = ["Stand", "contact_forces", "on_feet", "supported"]
+
+_LEFT = 1e-6  # largest part of the wrench on the base that contacts cannot cause [-]
+_RANK = 1e-8  # singular values below this share of the largest are of dependent forces
+_CLOSED = 1e-10  # [m, rad] largest motion of a foot on the ground
+_MOST = 30  # iterations of Newton's method
+
+
+@dataclass(frozen=True, eq=False)
+class Stand:
+    """Base and contacts of a robot along its motion.
+
+    Attributes:
+        pose: Pose of the base, shape (N, 7) [m, -].
+        twist: Twist with the axes of the base, shape (N, 6) [m/s, rad/s].
+        acceleration: Its time derivative, shape (N, 6).
+        contacts: Whether links touch the ground, by link; only of those that may leave it.
+        wrenches: Measured components of wrenches, by name as "fz l_sole", each (N,) [N or N m].
+    """
+
+    pose: Array
+    twist: Array
+    acceleration: Array
+    contacts: Mapping[str, Array]
+    wrenches: Mapping[str, Array]
+
+    def logged(self, sensors: Sensors, rows: Array) -> dict[str, Any]:
+        """Return base, contacts and wrenches of a log.
+
+        Args:
+            sensors: Which signals are logged.
+            rows: Which samples are logged, shape (N,), bool.
+        """
+        return {
+            "base": BaseMotion(
+                self.pose[rows],
+                self.twist[rows] if sensors.velocity else None,
+                self.acceleration[rows] if sensors.acceleration else None,
+            ),
+            "contacts": {link: flags[rows] for link, flags in self.contacts.items()},
+            "wrenches": {name: values[rows] for name, values in self.wrenches.items()},
+        }
+
+
+def contact_forces(J: Array, wrench: Array) -> tuple[Array, Array]:
+    """Return the smallest forces with J^T f = w, shape (N, m), and what they leave, (N, 6).
+
+    Args:
+        J: The part of the constraints' Jacobian for the base, shape (N, m, 6).
+        wrench: The wrench w that the base needs, shape (N, 6) [N, N m].
+    """
+    f = np.einsum("kmi,ki->km", np.linalg.pinv(J.swapaxes(1, 2), rcond=_RANK), wrench)
+    return f, wrench - np.einsum("kmi,km->ki", J, f)
+
+
+def supported(
+    model: RobotModel,
+    motion: FloatingMotion,
+    t: Array,
+    state: tuple[Array, Array, Array],
+    torque: Array,
+) -> tuple[Array, Stand]:
+    """Return the torques of the joints, shape (N, n), and the stand of a robot along a motion.
+
+    The forces of the ground f are the smallest ones that cause the motion of the base: of W pi =
+    tau + J^T f the first six rows, where tau is 0. The other rows give tau.
+
+    Args:
+        model: The robot, with contacts.
+        motion: The motion.
+        t: Times, shape (N,) [s].
+        state: q, v and a at these times.
+        torque: The torque W pi, shape (N, 6 + n) [N m, N].
+
+    Raises:
+        DataError: If forces at the contacts cannot cause the motion of the base.
+        SettingsError: If the robot has loops, or no contacts.
+    """
+    if model.loops or not model.contacts:
+        found = "loops" if model.loops else "no contacts"
+        raise SettingsError(
+            f"{model.name} has {found}: a floating base is simulated with contacts and without "
+            "loops; state [[contact]] in the job file"
+        )
+    q, v, a = state
+    flags = motion.touching(t)
+    J = constraint_jacobian(model, q, flags)
+    f, left = contact_forces(J[:, :, :6], torque[:, :6])
+    sizes = np.linalg.norm(left, axis=1)
+    k = int(sizes.argmax())
+    if sizes[k] > _LEFT * (1.0 + np.linalg.norm(torque[k, :6])):
+        raise DataError(
+            f"forces at the contacts cannot cause the motion of the base at t = {t[k]:.3f} s: "
+            f"{sizes[k]:.3g} N of the wrench remain, with {int(flags[k].sum())} links on the "
+            "ground. Three feet on the ground can support any motion"
+        )
+    tau = torque[:, 6:] - np.einsum("kmj,km->kj", J[:, :, 6:], f)
+    wanted, names = logged_base(model), [c.frame for c in model.contacts]
+    parts = [
+        f"{part} {c.frame}" for c in model.contacts for part in c.components[: c.sizes[c.kind]]
+    ]
+    contacts = {link: flags[:, names.index(link)] for link in wanted.contacts}
+    wrenches = {name: f[:, parts.index(name)] for name in wanted.wrenches}
+    return tau, Stand(q[:, :7], v[:, :6], a[:, :6], contacts, wrenches)
+
+
+def on_feet(model: RobotModel, pose: Array, q: Array, contacts: Array) -> Array:
+    """Return the joint positions nearest to q with which feet on the ground do not move, (N, n).
+
+    A foot remains where it is at the first sample of its contact.
+
+    Args:
+        model: The robot, whose base floats.
+        pose: Pose of the base, shape (N, 7) [m, -].
+        q: Wanted joint positions, shape (N, n) [rad or m].
+        contacts: Which contacts touch the ground, shape (N, k), bool.
+
+    Raises:
+        DataError: If a foot cannot remain where it is.
+    """
+    feet, found, change = _Feet(model), np.empty_like(q), np.zeros(q.shape[1])
+    places: dict[int, pin.SE3] = {}
+    for k, (base, wanted, touching) in enumerate(zip(pose, q, contacts, strict=True)):
+        x = wanted + change
+        places = feet.places(base, x) | places
+        places = {i: place for i, place in places.items() if touching[i]}
+        for _ in range(_MOST):
+            error, J = feet.moved(base, x, places)
+            if np.abs(error).max(initial=0.0) < _CLOSED:
+                break
+            x = x - np.linalg.lstsq(J, error, rcond=_RANK)[0]
+        else:
+            raise DataError(
+                f"sample {k}: the feet on the ground cannot remain where they are; "
+                f"{np.abs(error).max():.3g} m remain. Move the base less"
+            )
+        found[k], change = x, x - wanted
+    return found
+
+
+class _Feet:
+    """The contacts of a robot as equations of its joint coordinates."""
+
+    def __init__(self, model: RobotModel) -> None:
+        self._model, self._data = model, model.pin_model.createData()
+        self._ids = [frame_id(model.pin_model, x.frame) for x in model.contacts]
+        self._sizes = [x.sizes[x.kind] for x in model.contacts]
+
+    def places(self, base: Array, x: Array) -> dict[int, pin.SE3]:
+        """Return the placement of each contact in the world, and compute all Jacobians."""
+        pin_model, data = self._model.pin_model, self._data
+        (configuration,) = self._model.configurations(np.append(base, x)[None])
+        pin.computeJointJacobians(pin_model, data, configuration)
+        pin.updateFramePlacements(pin_model, data)
+        return {i: data.oMf[at].copy() for i, at in enumerate(self._ids)}
+
+    def moved(self, base: Array, x: Array, places: Mapping[int, pin.SE3]) -> tuple[Array, Array]:
+        """Return how far contacts are from places, (m,) [m, rad], and its slopes, (m, n)."""
+        now, axes = self.places(base, x), pin.LOCAL_WORLD_ALIGNED
+        errors, rows = [np.empty(0)], [np.empty((0, self._model.n_rows))]
+        for i, place in places.items():
+            turned = pin.log3(now[i].rotation @ place.rotation.T)
+            moved = np.append(now[i].translation - place.translation, turned)
+            J = pin.getFrameJacobian(self._model.pin_model, self._data, self._ids[i], axes)
+            errors.append(moved[: self._sizes[i]])
+            rows.append(J[: self._sizes[i]] @ self._model.velocity_map)
+        return np.concatenate(errors), np.vstack(rows)[:, 6:]

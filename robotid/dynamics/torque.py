@@ -1,0 +1,382 @@
+"""Regressor of joint torques: RobotModel + Trajectory -> Problem.
+
+Pinocchio computes the inertial columns; the drive columns follow them.
+"""
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+import pinocchio as pin
+
+from robotid.base.exceptions import DataError
+from robotid.base.typing import Array
+from robotid.data.log import Trajectory
+from robotid.dynamics.constraint_rows import ProjectedRows, loop_basis, mixed_rows, without_forces
+from robotid.dynamics.drive_columns import drive_values, friction_directions, instant_state
+from robotid.dynamics.problem import Block, Problem, RowSource
+from robotid.dynamics.rows import BLOCK, kept_rows, trajectory_rows
+from robotid.robot.closure import Chains
+from robotid.robot.drives import TERMS, DriveMotion
+from robotid.robot.model import RobotModel
+
+__all__ = [
+    "InstantRegressor",
+    "build_problem",
+    "carried_columns",
+    "joint_torque_regressor",
+    "mass_regressor",
+    "random_regressor",
+    "trajectory_regressor",
+]
+
+_DECADES = 3.0  # of speeds, at random states of a robot with nonlinear friction
+_INSTANTS = 32  # samples whose whole regressors are in memory together
+_BLOCK_SIZE = 2**19  # numbers per block of W, 4 MiB
+
+
+def joint_torque_regressor(
+    model: RobotModel,
+    q: Array,
+    v: Array,
+    a: Array,
+    direction: Array | None = None,
+    memory: Array | None = None,
+) -> Array:
+    """Return the regressor Y with tau = Y pi at each of N samples.
+
+    The columns are those of the ten inertial parameters of each body, from Pinocchio, and then of
+    the drives: ``tau_j = Ia a_j + Fv v_j + Fc sign(v_j) + off``, likewise for couplings.
+
+    Args:
+        model: The robot.
+        q: Joint coordinates, shape (N, n) or (N, 7 + n) [rad, m].
+        v: Velocities, shape (N, n_rows) [rad/s, m/s].
+        a: Accelerations, shape (N, n_rows) [rad/s^2, m/s^2].
+        direction: Direction of friction in the c Coulomb columns, shape (N, c), as
+            ``Trajectory.direction``; None: the signs of the speeds.
+        memory: Columns with internal state or load, shape (N, m), as ``Trajectory.memory``; None:
+            internal states at their steady value, under the torque of the model's reference.
+
+    Returns:
+        Regressors, shape (N n_rows, p): row of sample k, joint j is k n_rows + j.
+
+    Raises:
+        DataError: If a shape is not that of the model, or a value is not finite.
+
+    References:
+        Atkeson, An, Hollerbach (1986), Estimation of Inertial Parameters of Manipulator Loads and
+        Links; Carpentier et al. (2019), The Pinocchio C++ library.
+    """
+    _check_motion(model, q, v, a)
+    Y = np.empty((len(q), model.n_rows, len(model.layout.names)))
+    size = model.layout.n_inertial
+    _write_inertial(model, q, v, a, Y[:, :, :size])
+    if memory is None and model.layout.remembering:
+        load = Y[:, model.n_rows - len(model.joints) :, :size] @ model.carried_by[:size]
+        memory = instant_state(model.layout, q, v, a, direction, load)
+    _write_drives(model, q, v, a, direction, memory, Y[:, :, size:])
+    return Y.reshape(len(q) * model.n_rows, -1)
+
+
+def carried_columns(model: RobotModel, q: Array, v: Array, a: Array) -> Array:
+    """Return the inertial columns of the bodies that affect each row.
+
+    For robots with many joints they are a tenth of the regressor.
+
+    Args:
+        model: The robot.
+        q: Joint coordinates, shape (N, n) or (N, 7 + n) [rad, m].
+        v: Velocities, shape (N, n_rows) [rad/s, m/s].
+        a: Accelerations, shape (N, n_rows) [rad/s^2, m/s^2].
+
+    Returns:
+        Columns, row by row, in the order of ``model.support()``, shape (N, columns).
+
+    Raises:
+        DataError: If a shape is not that of the model, or a value is not finite.
+    """
+    _check_motion(model, q, v, a)
+    carried = model.support()[:, : model.layout.n_inertial]
+    found = np.empty((len(q), int(carried.sum())))
+    G = model.velocity_map
+    if not np.array_equal(G, np.eye(len(G))):
+        for first in range(0, len(q), _INSTANTS):
+            part = slice(first, first + _INSTANTS)
+            Y = np.empty((len(q[part]), *carried.shape))
+            _write_inertial(model, q[part], v[part], a[part], Y)
+            found[part] = Y[:, carried]
+        return found
+    pin_model, wanted = model.pin_model, np.flatnonzero(carried)
+    data, regressor = pin_model.createData(), pin.computeJointTorqueRegressor
+    instants = zip(found, np.ascontiguousarray(model.configurations(q)), v, a, strict=True)
+    for found_k, q_k, v_k, a_k in instants:
+        regressor(pin_model, data, q_k, v_k, a_k).take(wanted, None, found_k, "clip")
+    return found
+
+
+def trajectory_regressor(
+    model: RobotModel, trajectory: Trajectory, samples: Array | None = None
+) -> Array:
+    """Return the regressor of N samples of a trajectory, shape (N n_rows, p).
+
+    As ``joint_torque_regressor``; inertial columns stored with the trajectory are used.
+
+    Args:
+        model: The robot.
+        trajectory: The trajectory, with the internal states of the model's drives.
+        samples: Indices of the samples; None: all.
+    """
+    m = trajectory if samples is None else trajectory.at(samples)
+    stored, layout = kept_rows(model, trajectory), model.layout
+    if stored is None or (m.memory is None and layout.remembering):
+        return joint_torque_regressor(model, m.q, m.v, m.a, m.direction, m.memory)
+    Y = np.zeros((len(m.t), model.n_rows, len(layout.names)))
+    stored.write(slice(None) if samples is None else samples, Y)
+    _write_drives(model, m.q, m.v, m.a, m.direction, m.memory, Y[:, :, layout.n_inertial :])
+    return Y.reshape(len(m.t) * model.n_rows, -1)
+
+
+def mass_regressor(model: RobotModel, q: Array) -> Array:
+    """Return the regressor of D(q, pi) = mass_regressor @ pi, shape (N, n_rows, n_rows, p).
+
+    With drives, column j is W(q, 0, e_j) - W(q, 0, 0), where gravity and offsets cancel.
+
+    Args:
+        model: The robot.
+        q: Joint coordinates, shape (N, n) or (N, 7 + n) [rad, m].
+
+    Raises:
+        DataError: If the shape of q is not that of the model.
+
+    References:
+        Tzvetkova, Extracting Inertial Parameters from Robotic Manipulators Dynamics, (11), (13).
+    """
+    N, n = len(q), model.n_rows
+    still = np.zeros((N, n))
+    at_rest = joint_torque_regressor(model, q, still, still).reshape(N, n, -1)
+    D = np.empty((N, n, n, at_rest.shape[2]))
+    for j in range(n):
+        unit = still + np.eye(n)[j]
+        D[:, :, j] = joint_torque_regressor(model, q, still, unit).reshape(N, n, -1) - at_rest
+    return D
+
+
+class InstantRegressor:
+    """The regressor of one sample at a time, without repeated initialisation.
+
+    Args:
+        model: The robot, with a fixed base.
+        columns: Indices of the wanted standard parameters, shape (c,).
+
+    Raises:
+        DataError: If the base floats.
+    """
+
+    def __init__(self, model: RobotModel, columns: Array) -> None:
+        if model.free_flyer:
+            raise DataError("the base floats, wanted a robot with a fixed base")
+        model.require_fixed("recursive identification")
+        self._model, self._data = model, model.pin_model.createData()
+        self._columns = np.asarray(columns)
+        G = model.velocity_map
+        self._map = None if np.array_equal(G, np.eye(len(G))) else G
+        self._is_plain = self._map is None and not model.position_offset.any()
+        self._is_plain &= model.pin_model.nq == model.pin_model.nv
+        layout = model.layout
+        self._Y = np.zeros((model.n_rows, len(layout.names)))
+        # place of each term that all joints have; other drives are written as for a trajectory
+        count, joints = len(layout.terms), np.arange(len(layout.joints))
+        self._terms = [
+            (TERMS[name], layout.n_inertial + joints * count + k)
+            for k, name in enumerate(layout.terms)
+        ]
+        self._is_uniform = not (layout.couplings or layout.own or layout.passive)
+
+    def __call__(self, q: Array, v: Array, a: Array) -> Array:
+        """Return the regressor of one sample, shape (n, c), as of ``joint_torque_regressor``.
+
+        Args:
+            q: Joint coordinates, shape (n,) [rad, m].
+            v: Velocities, shape (n,) [rad/s, m/s].
+            a: Accelerations, shape (n,) [rad/s^2, m/s^2].
+        """
+        model, layout, Y = self._model, self._model.layout, self._Y
+        x = q if self._is_plain else model.configurations(q[None])[0]
+        regressor, G = pin.computeJointTorqueRegressor, self._map
+        w, dw = (v, a) if G is None else (G @ v, G @ a)
+        inertial = regressor(model.pin_model, self._data, x, w, dw)
+        Y[:, : layout.n_inertial] = inertial if G is None else G.T @ inertial
+        if self._is_uniform:
+            rows, still = np.arange(len(v)), np.zeros_like(v)
+            motion = DriveMotion(q, v, a, np.sign(v), still, still)
+            for term, place in self._terms:
+                Y[rows, place] = term.column(motion)
+            return Y[:, self._columns]
+        size, memory = layout.n_inertial, None
+        if layout.remembering:
+            load = Y[:, :size] @ model.carried_by[:size]
+            memory = instant_state(layout, q[None], v[None], a[None], None, load[None])
+        _write_drives(model, q[None], v[None], a[None], None, memory, Y[None, :, size:])
+        return Y[:, self._columns]
+
+    def mass(self, q: Array) -> Array:
+        """Return the regressor of the mass matrix, shape (n, n, c); see ``mass_regressor``.
+
+        Args:
+            q: Joint coordinates, shape (n,) [rad, m].
+        """
+        still, unit = np.zeros(len(q)), np.eye(len(q))
+        at_rest = self(q, still, still)
+        return np.stack([self(q, still, a) - at_rest for a in unit], axis=1)
+
+
+def build_problem(
+    model: RobotModel,
+    trajectory: Trajectory,
+    weight: Array | None = None,
+    *,
+    with_mass: bool = False,
+    compiled: bool | None = None,
+) -> Problem:
+    """Return the problem W pi = tau of a trajectory: a stream of row blocks with p columns.
+
+    Its blocks are computed by Pinocchio. Its rows joint by joint, which the factors need, are
+    computed by Pinocchio or by the compiled path, equal to 1e-12; ``problem.sources[0].engine`` and
+    the logger "robotid" state by which of them, and why.
+
+    Args:
+        model: The robot; the trajectory's joints must be its joints, in its order.
+        trajectory: N samples of q, v, a, tau.
+        weight: Weight of each row, shape (N, n_rows), 0 excludes it; all 1 if None.
+        with_mass: Whether each sample has the regressor of its mass matrix.
+        compiled: Whether to use the compiled path if it supports the robot; None: if the trajectory
+            is so long that it is faster.
+
+    Raises:
+        DataError: If joints or shapes are not those of the model.
+    """
+    own = trajectory_rows(model, trajectory, weight, compiled)
+    weights, used = own.weights, np.any(own.weights, axis=0, keepdims=True).T
+    own = replace(own, support=own.support & used)
+    source: RowSource = own
+    support = own.support
+    if trajectory.basis is not None:
+        own = trajectory_rows(model, trajectory, None, compiled)
+        mixed = mixed_rows(trajectory.basis, weights)[:, None]
+        own = replace(own, support=own.support & mixed)
+        source = ProjectedRows(own, trajectory.basis, weights)
+        support = own.support.any(axis=0) & used
+    shape = weights.shape
+    length = max(1, min(BLOCK, _BLOCK_SIZE // (model.n_rows * len(model.layout.names))))
+
+    def stream() -> Iterator[Block]:
+        for start in range(0, shape[0], length):
+            part = slice(start, start + length)
+            m = trajectory
+            direction, memory = (None if x is None else x[part] for x in (m.direction, m.memory))
+            W = joint_torque_regressor(model, m.q[part], m.v[part], m.a[part], direction, memory)
+            if m.basis is not None:
+                Y = W.reshape(-1, model.n_rows, W.shape[1])
+                W = without_forces(m.basis[part], Y).reshape(W.shape)
+            yield W, trajectory.tau[part].reshape(-1), weights[part].reshape(-1)
+
+    def mass_stream() -> Iterator[Array]:
+        for start in range(0, shape[0], length):
+            yield mass_regressor(model, trajectory.q[start : start + length])
+
+    masses = mass_stream if with_mass else None
+    return Problem(
+        stream, model.layout.names, model.n_rows, support, masses, (source,),
+        is_projected=trajectory.basis is not None,
+    )  # fmt: skip
+
+
+def random_regressor(model: RobotModel, samples: int, rng: np.random.Generator) -> Array:
+    """Return the regressor at random states, shape (N n_rows, p), for structural properties.
+
+    For a static model, the speeds of the states affect only the direction of friction.
+
+    The states are scaled to the robot: speeds sqrt(g / length), accelerations g / length, so that
+    the ratio of gravity to inertia is the same for a finger and a crane. The loops of the robot are
+    closed in them, and their forces eliminated from the rows.
+
+    Args:
+        model: The robot.
+        samples: Number N of states.
+        rng: Random generator of the states.
+    """
+    n = len(model.joints)
+    rate = np.sqrt(9.81 / model.length)  # [1/s]
+    size = np.array([model.length if j.type == "prismatic" else np.pi for j in model.limits])
+    q = rng.uniform(-1, 1, (samples, n)) * size
+    unit = np.minimum(size, 1.0)  # [rad or m]
+    v = rng.uniform(-1, 1, (samples, n)) * unit * rate
+    if model.layout.own:  # terms that only slow motion excites
+        v *= 10.0 ** rng.uniform(-_DECADES, 0.0, v.shape)
+    a = rng.uniform(-1, 1, (samples, n)) * unit * rate**2
+    if model.loops:
+        chains = Chains(model)
+        q, Z = chains.random_states(samples, rng)
+        v, a = (np.einsum("kij,kj->ki", Z, x) for x in (v, a))
+        a += chains.accelerations(q, v)
+    if model.free_flyer:
+        linear = np.array([model.length] * 3 + [1.0] * 3)
+        quaternions = rng.standard_normal((samples, 4))
+        quaternions /= np.linalg.norm(quaternions, axis=1, keepdims=True)
+        pose = np.column_stack([np.zeros((samples, 3)), quaternions])
+        q = np.hstack([pose, q])
+        v = np.hstack([rng.uniform(-1, 1, (samples, 6)) * linear * rate, v])
+        a = np.hstack([rng.uniform(-1, 1, (samples, 6)) * linear * rate**2, a])
+    count = len(model.layout.remembering)  # internal states and loads are random, too
+    memory = rng.uniform(-1, 1, (samples, count)) if count else None
+    signs = friction_directions(model.layout, v, None)
+    if model.is_static:
+        v, a = 0.0 * v, 0.0 * a
+    W = joint_torque_regressor(model, q, v, a, signs, memory)
+    if not model.loops:
+        return W
+    return without_forces(loop_basis(model, q), W.reshape(samples, model.n_rows, -1)).reshape(
+        W.shape
+    )
+
+
+def _check_motion(model: RobotModel, q: Array, v: Array, a: Array) -> None:
+    """Refuse velocities and accelerations with a wrong shape, or not finite."""
+    wanted = (len(q), model.n_rows)
+    if v.shape != wanted or a.shape != wanted:
+        raise DataError(f"v and a have shapes {v.shape} and {a.shape}, wanted {wanted}")
+    for name, values in (("v", v), ("a", a)):
+        if not np.isfinite(values).all():
+            k, j = np.argwhere(~np.isfinite(values))[0]
+            row = model.row_names[j]
+            raise DataError(f"{name}[{k}] of {row} is {values[k, j]}, wanted a finite number")
+
+
+def _write_drives(
+    model: RobotModel,
+    q: Array,
+    v: Array,
+    a: Array,
+    direction: Array | None,
+    memory: Array | None,
+    out: Array,
+) -> None:
+    """Write the columns of the drive parameters, shape (N, n_rows, drive)."""
+    layout, first = model.layout, model.n_rows - len(model.joints)
+    values = drive_values(layout, q, v, a, friction_directions(layout, v, direction), memory)
+    out[:, :first] = 0.0
+    np.multiply(layout.drive_loads, values.T[:, None], out=out[:, first:])
+
+
+def _write_inertial(model: RobotModel, q: Array, v: Array, a: Array, out: Array) -> None:
+    """Write Pinocchio's joint-torque regressor at each sample, shape (N, n_rows, 10 bodies)."""
+    pin_model, G = model.pin_model, model.velocity_map
+    data, regressor = pin_model.createData(), pin.computeJointTorqueRegressor
+    is_plain = np.array_equal(G, np.eye(len(G)))
+    if not is_plain:
+        v, a = v @ G.T, a @ G.T  # (N, nv)
+    instants = zip(out, np.ascontiguousarray(model.configurations(q)), v, a, strict=True)
+    for Y, q_k, v_k, a_k in instants:
+        Y_k = regressor(pin_model, data, q_k, v_k, a_k)
+        Y[:] = Y_k if is_plain else G.T @ Y_k  # tau = G^T tau_pinocchio

@@ -1,0 +1,3 @@
+"""From rows or factors to estimates, and from recordings to fits with standard errors."""
+
+__all__: list[str] = []

@@ -1,0 +1,426 @@
+"""Cross-validation on segments of the fitted data: weight of the prior, extents of bodies."""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from robotid.base.exceptions import DataError, NotConvergedError
+from robotid.base.typing import Array
+from robotid.dynamics.factors import Factors, merge
+from robotid.dynamics.lapack import Triangle
+from robotid.estimation.estimators.consistent.cones import ConeSolution
+from robotid.estimation.estimators.consistent.consistent_fit import Consistent
+from robotid.estimation.estimators.consistent.penalties import WeightChoice
+
+__all__ = [
+    "AS_GOOD",
+    "Segments",
+    "choose_weight",
+    "contradicted_extents",
+    "held_out_errors",
+    "log_evidence",
+    "loss_of",
+]
+
+_SMALLEST, _LARGEST = -4.0, 2.0  # decades of the weights tried
+_USUAL = -1.0  # at smaller entropic weights bodies become thin, and fits converge slowly
+_PATIENCE = 2  # decades without a better score after which the search ends
+_ALIKE = 2.0  # standard errors by which the mean log error of a larger weight may be above the best
+_MOST_LOSS = 1.02  # largest ratio of the held-out errors of a larger weight, mean over joints
+_MOST_JOINT_LOSS = 1.05  # ... and of any one joint
+#: Largest ratio of the held-out error of a joint to that of least squares.
+AS_GOOD = 1.1
+_MOST_REPEATED = 0.5  # largest share of repeated errors in the squared residual
+_BEYOND = 4.0  # standard errors by which a body must be outside its box
+_CLEAR = 0.02  # relative increase of the mean square error at which an extent is contradicted
+_REESTIMATED = 8  # largest number of steps of the plausible weight
+_EXPECTED = (0.5, 1.02)  # distances from the prior over the expected one at which they end
+_STEP = 0.5  # decades between the best weight and the refined ones
+
+
+@dataclass(frozen=True, eq=False)
+class Segments:
+    """Contiguous segments of the fitted data: the folds of a cross-validation.
+
+    Attributes:
+        folds: Factors of the K segments.
+        sigma: Noise level per joint, shape (n,) [N m or N].
+        rows: Rows of all segments, shape (b + 1, b + 1), from ``Consistent.rows``.
+        share: Share of independent rows [-].
+    """
+
+    folds: tuple[Factors, ...]
+    sigma: Array
+    rows: Array
+    share: float
+
+    @classmethod
+    def of(
+        cls, fit: Consistent, segments: Sequence[Factors], sigma: Array | None = None
+    ) -> "Segments":
+        """Return segments with the noise level of a fit to all of them.
+
+        Args:
+            fit: The fit; its constraints are not used.
+            segments: Factors of contiguous segments of the fitted data.
+            sigma: The noise level, shape (n,) [N m or N]; None: it is computed.
+        """
+        whole = merge(segments)
+        level = fit.noise(whole) if sigma is None else sigma
+        return cls(tuple(segments), level, fit.rows(whole, level), fit.independent_share)
+
+    @cached_property
+    def others(self) -> Array:
+        """Rows of all segments except one, for each segment, shape (K, b + 1, b + 1)."""
+        own = [factors.weighted(self.sigma / np.sqrt(self.share)) for factors in self.folds]
+        rest = [Triangle(len(self.rows)) for _ in own]
+        for k, total in enumerate(rest):
+            for R in (*own[:k], *own[k + 1 :]):
+                total.fold_triangle(R, np.arange(len(R)))
+        return np.array([total.R for total in rest])
+
+    @cached_property
+    def least_squares_errors(self) -> Array:
+        """Prediction errors of each segment by least squares of all others.
+
+        They have the form and unit of ``held_out_errors``, shape (segments, n).
+        """
+        errors = []
+        for fold, rows in zip(self.folds, self.others, strict=True):
+            size = np.maximum(np.linalg.norm(rows[:, :-1], axis=0), 1e-300)
+            scaled = np.linalg.lstsq(rows[:, :-1] / size, rows[:, -1], rcond=1e-7)[0]
+            errors.append(fold.residual_squares(scaled / size))
+        return self.errors(np.array(errors))
+
+    def errors(self, squares: Array) -> Array:
+        """Return squared errors over the square of the noise level and the number of rows.
+
+        Args:
+            squares: Sums by segment and joint, shape (segments, n) [N^2 m^2 or N^2].
+        """
+        squares = squares / self.sigma**2
+        rows = np.sum([fold.rows for fold in self.folds], axis=0)  # (n,)
+        if self.folds[0].is_projected:
+            squares, rows = squares.sum(axis=1, keepdims=True), rows.sum(keepdims=True)
+        errors: Array = squares / np.maximum(rows, 1)
+        return errors
+
+
+def choose_weight(
+    fit: Consistent, segments: Segments, how: str, repeated: float = 0.0
+) -> WeightChoice:
+    """Return the weight of the prior, chosen from the fitted data.
+
+    * "cv": the largest weight with the same prediction error on held-out segments as the best one.
+      The error of a joint is the RMS over all segments, the error of a weight is the geometric mean
+      over joints. A larger weight is accepted if its error is at most 2 % above the smallest one,
+      at most 5 % for any joint, and the mean log ratio of the errors by segment is at most two
+      standard errors above 0. This test alone is not sufficient: with six segments it has little
+      power against one or two bad segments. An error that repeats in all segments has no scatter:
+      a smaller weight that only fits it is not better, so the mean log ratio may also be as large
+      as such an error makes it.
+      The error of no joint may be more than 10 % above that of least squares: where the prior
+      is wrong, as of a placeholder, the weight is smaller.
+    * "evidence": the weight with the largest ``log_evidence``.
+
+    Weights are tried from 100 down to 1e-4 (entropic: 0.1, and below where least squares is better)
+    in decades, until two weights in a row are worse than those before, and then around the best
+    one. A weight above 1 shifts the estimate towards the prior, but does not reduce the standard
+    errors; see ``Consistent.weight_ratio``. A weight at which the fit does not converge, because
+    bodies shrink to points, has an infinite error.
+
+    Args:
+        fit: The fit; its own weight is not used.
+        segments: The fitted data.
+        how: "cv" or "evidence".
+        repeated: Share of errors that repeat in all segments in the squared residual [-].
+
+    Raises:
+        DataError: If "cv" has fewer than two segments.
+        NotConvergedError: If the fit does not converge at any weight.
+    """
+    evidence = log_evidence(fit, segments.rows)
+    by_evidence = _search(lambda w: (-evidence(w), np.zeros(0)), "evidence", 0.0)
+    plausible = plausible_weight(fit, segments.rows, by_evidence.plausible)
+    if how == "evidence":
+        return replace(by_evidence, plausible=plausible)
+
+    fits: dict[float, list[ConeSolution]] = {}  # by weight, one without each segment
+    least = np.sqrt(_by_joint(segments.least_squares_errors))  # (n,)
+
+    def score(weight: float) -> tuple[float, Array]:
+        starts = next(reversed(fits.values()), None)
+        try:
+            errors, fits[weight] = held_out_errors(fit, segments, weight, starts)
+        except NotConvergedError:
+            return float("inf"), np.full((len(segments.folds), len(least)), np.inf)
+        return float(np.exp(0.5 * np.log(_by_joint(errors)).mean())), errors
+
+    # a residual without the repeated error is smaller by this log ratio
+    excess = -0.5 * np.log1p(-min(repeated, _MOST_REPEATED))
+    usual = _SMALLEST if fit.penalty.is_quadratic else _USUAL
+    choice = replace(_search(score, how, excess, least, usual), plausible=plausible)
+    larger = [weight for weight, _ in choice.curve if weight >= choice.weight]
+    return replace(choice, weight=_converging(fit, segments.rows, larger, fits))
+
+
+def loss_of(fit: Consistent, segments: Segments, weight: float) -> float:
+    """Return the largest ratio of the held-out error of a joint to that of least squares [-].
+
+    Args:
+        fit: The fit; its own weight is not used.
+        segments: The fitted data, at least two segments.
+        weight: Weight of the prior [-].
+
+    Returns:
+        The ratio; inf if a fit does not converge.
+    """
+    try:
+        errors, _ = held_out_errors(fit, segments, weight)
+    except NotConvergedError:
+        return float("inf")
+    return float(np.sqrt(_by_joint(errors) / _by_joint(segments.least_squares_errors)).max())
+
+
+def _converging(
+    fit: Consistent,
+    rows: Array,
+    weights: Sequence[float],
+    fits: Mapping[float, Sequence[ConeSolution]],
+) -> float:
+    """Return the first weight at which the fit to all rows converges, from fits to most of them."""
+    for weight in weights[:-1]:
+        try:
+            fit.programme.minimise(rows, weight, start=next(iter(fits.get(weight, ())), None))
+        except NotConvergedError:  # bodies shrink to points
+            continue
+        return weight
+    return weights[-1]
+
+
+def plausible_weight(fit: Consistent, rows: Array, weight: float) -> float:
+    """Return the weight at which the distance from the prior is as expected, or the given one.
+
+    The evidence expands the penalty at its centre. At the minimum with a weight w that agrees with
+    the data, w times the penalty is the number of parameters that the data determine, g = d -
+    trace(w H C / 2) of d free ones. If it is more, the prior is less certain than w states; if it
+    is less than half, more certain, as far from the centre the penalty is not quadratic: the next
+    weight is g over the penalty. The weight is reduced by half a decade at most, the distance
+    of the weights tried: a larger disagreement is not due to the expansion, but to errors of the
+    model. The steps end before a weight at which the fit does not converge.
+
+    Args:
+        fit: The fit; its own weight is not used.
+        rows: Rows of the data, shape (k, b + 1), from ``Consistent.rows``.
+        weight: The weight with the largest ``log_evidence`` [-].
+
+    References:
+        MacKay (1992), Bayesian interpolation, section 4.
+    """
+    programme, solution, found = fit.programme, None, weight
+    least = weight * 10.0**-_STEP
+    for _ in range(_REESTIMATED):
+        try:
+            solution = programme.minimise(rows, weight, is_exact=False, start=solution)
+        except NotConvergedError:  # bodies shrink to points
+            break
+        found = weight
+        H, C = programme.penalty.hessian(solution.x), programme.covariance(weight, rows, solution.x)
+        determined = programme.space.basis.shape[1] - 0.5 * weight * float(np.sum(H * C))
+        distance = weight * programme.penalty.value(solution.x)
+        low, high = np.multiply(_EXPECTED, determined)
+        if low <= distance <= high or (distance > high and weight == least):
+            break
+        weight = max(least, weight * determined / distance)
+    return found
+
+
+def contradicted_extents(fit: Consistent, segments: Segments) -> tuple[str, ...]:
+    """Return the bodies whose extent is contradicted by the data.
+
+    These are the bodies that are outside their box by more than four standard errors in a fit
+    without extents, at a weight of 1. That fit must also predict held-out segments better than the
+    fit with extents, by more than two standard errors and 2 % of the mean square error.
+
+    Args:
+        fit: The fit; its own weight is not used.
+        segments: The fitted data; with one segment the prediction is not tested.
+    """
+    cone, rows, count = fit.programme.cone.linear, segments.rows, len(segments.folds)
+    free = replace(fit, constraints=fit.constraints.without_extent(fit.constraints.extent))
+    try:
+        solution = free.programme.minimise(rows, 1.0, is_exact=False)
+    except NotConvergedError:  # bodies diverge: this contradicts no extent
+        return ()
+    G, covariance = cone.G / fit.prior_std, free.programme.covariance(1.0, rows, solution.x)
+    error = np.sqrt(np.maximum(np.einsum("ki,ij,kj->k", G, covariance, G), 0.0))
+    beyond = G @ solution.x + cone.h < -_BEYOND * error
+    outside = [label for label, is_out in zip(cone.labels, beyond, strict=True) if is_out]
+    bodies = tuple(body for body in fit.layout.bodies if f"extent {body}" in outside)
+    if not bodies or count < 2:
+        return bodies
+    try:
+        unbound = held_out_errors(free, segments, 1.0, [solution] * count)[0].sum(axis=1)
+    except NotConvergedError:
+        return ()
+    try:
+        bound = held_out_errors(fit, segments, 1.0)[0].sum(axis=1)
+    except NotConvergedError:  # noise-free data that contradict the extents
+        return bodies
+    is_clear = bound.sum() > (1.0 + _CLEAR) * unbound.sum() and not _is_as_good(bound, unbound)
+    return bodies if is_clear else ()
+
+
+def held_out_errors(
+    fit: Consistent,
+    segments: Segments,
+    weight: float,
+    starts: Sequence[ConeSolution] | None = None,
+) -> tuple[Array, list[ConeSolution]]:
+    """Return the prediction errors of each segment by the fit to all others, with constraints.
+
+    Args:
+        fit: The fit; its own weight is not used.
+        segments: The fitted data, at least two segments.
+        weight: Weight of the prior [-].
+        starts: Initial values, one fit without each segment.
+
+    Returns:
+        Sums of squared prediction errors by segment and joint, over the square of the joint's noise
+        level and its number of rows in all segments, shape (segments, n) [-]: the sum over segments
+        is the mean square of each joint. Rows that are projected together count as one joint. And
+        the fits, as initial values of other fits.
+
+    Raises:
+        DataError: If there are fewer than two segments.
+        NotConvergedError: If a fit does not converge.
+    """
+    if len(segments.folds) < 2:
+        raise DataError(
+            f"prior_weight = 'cv' needs at least 2 segments, found {len(segments.folds)}; fit "
+            "longer logs, or set prior_weight = 'evidence'"
+        )
+    fits = fit.programme.minimise_each(segments.others, weight, is_exact=False, starts=starts)
+    pairs = zip(segments.folds, fits, strict=True)
+    squares = np.array([fold.residual_squares(fit.K @ x.x) for fold, x in pairs])
+    return segments.errors(squares), fits
+
+
+def log_evidence(fit: Consistent, rows: Array) -> Callable[[float], float]:
+    """Return the log marginal likelihood of the data as a function of the prior's weight.
+
+    With the prior x = L (pi - centre) ~ N(0, 1 / weight) and r = A x + noise of unit variance,
+    r ~ N(0, I + A A^T / weight). A penalty that is not quadratic is expanded at its centre. The
+    inequalities are neglected, and a constant is omitted.
+
+    Args:
+        fit: The fit; its own weight is not used.
+        rows: Rows of the data, shape (k, b + 1), from ``Consistent.rows``.
+
+    Returns:
+        The function of the weight [-].
+
+    References:
+        MacKay (1992), Bayesian interpolation, section 4.
+    """
+    A, r = fit.programme.whitened(rows)
+    U, s, _ = np.linalg.svd(A, full_matrices=False)
+    along = U.T @ r
+
+    def likelihood(weight: float) -> float:
+        spread = 1.0 + s**2 / weight
+        # |r|^2 outside the range of A is constant
+        return float(-0.5 * ((along**2 / spread).sum() + np.log(spread).sum()))
+
+    return likelihood
+
+
+def _search(
+    score: Callable[[float], tuple[float, Array]],
+    how: str,
+    allowed: float,
+    least: Array | None = None,
+    usual: float = _SMALLEST,
+) -> WeightChoice:
+    """Return the largest weight that ``_is_accepted`` in comparison with that of smallest score.
+
+    Weights are tried from 100 down to the usual smallest one in decades, until the score does not
+    decrease; and further while the loss is too large and decreases. ``score`` returns the score and
+    its parts by segment and joint, or no parts. The loss is the largest ratio of a joint's error to
+    that of least squares, shape (n,).
+    """
+    tried: dict[float, float] = {}
+    parts: dict[float, Array] = {}
+    loss: dict[float, float] = {}
+
+    def attempt(decade: float) -> None:
+        tried[decade], parts[decade] = score(10.0**decade)
+        ratio = 0.0 if least is None else np.sqrt(_by_joint(parts[decade])) / least
+        loss[decade] = float(np.max(ratio))
+
+    decade = _LARGEST
+    while decade >= _SMALLEST and (
+        (decade >= usual and _is_promising(tried.values()))
+        or (min(loss.values()) > AS_GOOD and _is_promising(loss.values(), _MOST_LOSS))
+    ):
+        attempt(decade)
+        decade -= 1.0
+    best = min(tried, key=lambda k: tried[k])
+    for k in (best - _STEP, best + _STEP):
+        if _SMALLEST <= k <= _LARGEST:
+            attempt(k)
+    finite = [k for k in sorted(tried) if np.isfinite(tried[k])]
+    if not finite:
+        raise NotConvergedError(
+            f"the fit converges at no prior_weight from {10.0**_SMALLEST:g} to {10.0**_LARGEST:g}; "
+            "record a richer motion, or correct the inertials of the URDF",
+            "max_iterations",
+        )
+    allowed_loss = max(AS_GOOD, _MOST_LOSS * min(loss.values()))
+    within = [k for k in finite if loss[k] <= allowed_loss]
+    best = min(within, key=lambda k: tried[k])
+    chosen = max([best, *(k for k in within if _is_accepted(parts[k], parts[best], allowed))])
+    curve = tuple((float(10.0**k), tried[k]) for k in finite)
+    return WeightChoice(float(10.0**chosen), how, curve, float(10.0**best), loss[chosen])
+
+
+def _is_accepted(parts: Array, best: Array, allowed: float) -> bool:
+    """Return whether errors are about as small as the best ones, both of shape (segments, n).
+
+    The mean log ratio is at most the allowed one, or two standard errors.
+    """
+    if not parts.size:
+        return False
+    ratio = np.sqrt(_by_joint(parts) / _by_joint(best))  # (n,)
+    if np.exp(np.log(ratio).mean()) > _MOST_LOSS or ratio.max() > _MOST_JOINT_LOSS:
+        return False
+    both = (parts > 0) & (best > 0)  # a joint at rest has no rows in a segment
+    logs = 0.5 * np.log(np.where(both, parts, 1.0) / np.where(both, best, 1.0))
+    excess = logs.sum(axis=1) / np.maximum(both.sum(axis=1), 1)  # (segments,)
+    error = excess.std(ddof=1) / np.sqrt(len(excess))
+    return bool(excess.mean() <= max(allowed, _ALIKE * error))
+
+
+def _by_joint(parts: Array) -> Array:
+    """Return the mean squares of the joints with rows, shape (n,), from errors by segment."""
+    squares: Array = parts.sum(axis=0)
+    return squares[squares > 0]
+
+
+def _is_as_good(parts: Array, best: Array) -> bool:
+    """Return whether the sum of parts is within two standard errors of the best, paired."""
+    excess = parts - best
+    if not len(excess):
+        return False
+    error = np.sqrt(len(excess)) * excess.std(ddof=1)
+    return bool(excess.sum() <= _ALIKE * error)
+
+
+def _is_promising(values: Iterable[float], factor: float = 1.0) -> bool:
+    """Return whether one of the last two values is the smallest, clearly by a factor."""
+    scores = list(values)
+    if len(scores) <= _PATIENCE or not np.isfinite(scores).any():
+        return True
+    return factor * min(scores[-_PATIENCE:]) < min(scores[:-_PATIENCE])

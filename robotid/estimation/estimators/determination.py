@@ -1,0 +1,249 @@
+"""Identifiability of base parameters: individually, only in sums with others, or not at all.
+
+One criterion is used everywhere: a direction in the space of base parameters is identifiable if the
+data reduce its standard deviation in comparison with the prior.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import scipy.linalg
+
+from robotid.base.exceptions import RankDeficientError
+from robotid.base.typing import Array
+
+__all__ = ["Combination", "Determination", "Group", "base_spread", "determine"]
+
+_PRIOR_LED = 0.9  # ratio of the spreads after and before the data above which a direction is weak
+_LED_IN_PART = 0.3  # share of a parameter's spread in weak directions that makes it a group member
+_COUPLED = 0.5  # ... or its coefficient relative to another member, in units of the spreads
+_JOINED = 0.05  # relative coefficient below which a term is not printed, in units of the spreads
+_TERM = 1e-3  # ... and below which it is not a term of the sum
+_TIE = 0.95  # coefficients above this share of the largest are equal to it: the first one leads
+_TERMS = 4  # largest number of printed terms of a sum
+_DIGITS = 3  # printed digits of a coefficient
+_NAMED = 5  # largest number of parameters of a group, and half as many sums, that are printed
+_GROUPS = 2  # largest number of groups whose sums are printed
+
+
+@dataclass(frozen=True)
+class Combination:
+    """A sum of base parameters that is identifiable, while its terms are not.
+
+    Attributes:
+        names: Base parameters in the sum, in their order.
+        coefficients: Factor of each, SI units; that of the leading one is 1.
+        shares: The same in units of the spreads [-]; that of the leading one is the largest.
+    """
+
+    names: tuple[str, ...]
+    coefficients: tuple[float, ...]
+    shares: tuple[float, ...]
+
+    def __str__(self) -> str:
+        shares = np.abs(self.shares)
+        leading = self.coefficients.index(1.0)
+        order = [i for i in np.argsort(-shares, kind="stable") if i != leading]
+        terms = [i for i in order if shares[i] > _JOINED * shares[leading]]
+        text = self.names[leading]
+        for i in terms[: _TERMS - 1]:
+            sign = "-" if self.coefficients[i] < 0 else "+"
+            size = f"{abs(self.coefficients[i]):.{_DIGITS}g}"
+            text += f" {sign} {self.names[i]}" if size == "1" else f" {sign} {size} {self.names[i]}"
+        return text + (" + ..." if len(terms) >= _TERMS else "")
+
+
+@dataclass(frozen=True)
+class Group:
+    """Base parameters that cannot be distinguished from the data.
+
+    Attributes:
+        names: The base parameters.
+        combinations: Their identifiable sums, fewer than there are names.
+    """
+
+    names: tuple[str, ...]
+    combinations: tuple[Combination, ...]
+
+    def __str__(self) -> str:
+        if not self.combinations:
+            return f"{_and(self.names)} {'is' if len(self.names) == 1 else 'are'} not identifiable"
+        count = len(self.combinations)
+        if len(self.names) > _NAMED or count > _NAMED // 2:
+            return (
+                f"the {len(self.names)} parameters {self.names[0]} ... {self.names[-1]} are "
+                f"identifiable only in {count} sum{'s' * (count > 1)}, as {self.combinations[0]}"
+            )
+        sums = _and([str(combination) for combination in self.combinations])
+        return f"{_and(self.names)} are identifiable only as {sums}"
+
+
+@dataclass(frozen=True, eq=False)
+class Determination:
+    """Identifiability of the base parameters from data.
+
+    Attributes:
+        names: Names of the b base parameters.
+        spread: Prior standard deviation (spread) of each, shape (b,), SI units; 0 for known ones.
+        shrinkage: Standard deviation after the data over that before them, for b orthogonal
+            directions in units of the spread, ascending, shape (b,) [-]; 0 for known ones.
+        weak: The weak directions, in units of the spread, orthonormal, shape (b, b - rank).
+        groups: Base parameters that cannot be distinguished from the data.
+    """
+
+    names: tuple[str, ...]
+    spread: Array
+    shrinkage: Array
+    weak: Array
+    groups: tuple[Group, ...]
+
+    @property
+    def rank(self) -> int:
+        """Number of directions that the data determine."""
+        return len(self.names) - int(self.weak.shape[1])
+
+    @property
+    def undetermined(self) -> tuple[str, ...]:
+        """Names of the base parameters that are not identifiable individually, in their order."""
+        listed = {name for group in self.groups for name in group.names}
+        return tuple(name for name in self.names if name in listed)
+
+    @property
+    def merged(self) -> tuple[Group, ...]:
+        """The groups; those without an identifiable sum are merged into the last one."""
+        sums = tuple(group for group in self.groups if group.combinations)
+        alone = [name for group in self.groups if not group.combinations for name in group.names]
+        return (*sums, Group(tuple(alone), ())) if alone else sums
+
+    def described(self) -> str:
+        """Return a description of the groups, as "a and b are identifiable only as a + b".
+
+        Returns:
+            One line with the first groups; empty if every parameter is identifiable.
+        """
+        sums = [str(group) for group in self.merged if group.combinations]
+        texts = sums[:_GROUPS]
+        if len(sums) > _GROUPS:
+            more = len(sums) - _GROUPS
+            texts.append(f"{more} more group{'s' * (more > 1)} of this kind")
+        return "; ".join(texts + [str(group) for group in self.merged if not group.combinations])
+
+    def refusal(self, error: RankDeficientError) -> RankDeficientError:
+        """Return the error of least squares with the groups of this criterion.
+
+        Args:
+            error: Error by the numerical rank of least squares; returned if there are no groups.
+        """
+        if not self.groups:
+            return error
+        return RankDeficientError(self.rank, self.undetermined, len(self.names), self.described())
+
+    def to_list(self) -> list[dict[str, Any]]:
+        """Return the groups as plain values, as they are written to result.json.
+
+        Returns:
+            Per group {"parameters": [names], "determined": [{"text", "terms": {name: coefficient}}]
+            }, coefficients in SI units.
+        """
+        return [
+            {
+                "parameters": list(group.names),
+                "determined": [
+                    {"text": str(c), "terms": dict(zip(c.names, c.coefficients, strict=True))}
+                    for c in group.combinations
+                ],
+            }
+            for group in self.groups
+        ]
+
+
+def base_spread(K: Array, spread: Array, known: Sequence[bool] | Array = ()) -> Array:
+    """Return the prior standard deviation of each base parameter, shape (b,); 0 if known.
+
+    Args:
+        K: Map to the base parameters, shape (b, p).
+        spread: Prior standard deviation of each standard parameter, shape (p,), SI units.
+        known: Whether each standard parameter is known, shape (p,); none if empty.
+    """
+    free = spread * ~np.asarray(known, dtype=bool) if len(known) else spread
+    size: Array = np.linalg.norm(K * free, axis=1)
+    return size
+
+
+def determine(names: Sequence[str], rows: Array, spread: Array) -> Determination:
+    """Return which directions are identifiable, and the groups of parameters that are not.
+
+    In units of the spread, the rows A have singular values s_i. Along their right singular vectors
+    the data reduce the spread to 1 / sqrt(1 + s_i^2). Directions that are hardly reduced, V_w, span
+    the space that is not identifiable. Solved for as many base parameters f, x_p = V_p V_f^-1 x_f
+    along them, so that each x_p - V_p V_f^-1 x_f is identifiable.
+
+    Args:
+        names: Names of the base parameters.
+        rows: A, where A^T A is the inverse covariance of the base parameters by the data alone at
+            their noise level, shape (k, b), in inverse SI units.
+        spread: Prior standard deviation of each, shape (b,), SI units; 0 if known.
+    """
+    free = np.flatnonzero(spread > 0)
+    weak, shrinkage = np.zeros((len(spread), 0)), np.zeros(len(spread))
+    if len(free):
+        _, s, Vt = np.linalg.svd(rows[:, free] * spread[free])
+        s = np.append(s, np.zeros(len(free) - len(s)))
+        after = 1.0 / np.sqrt(1.0 + s**2)
+        open_ones = after > _PRIOR_LED
+        weak = np.zeros((len(spread), int(open_ones.sum())))
+        weak[free] = Vt[open_ones].T
+        shrinkage[len(spread) - len(free) :] = after
+    groups = _groups(tuple(names), weak, spread)
+    return Determination(tuple(names), spread, shrinkage, weak, groups)
+
+
+def _groups(names: tuple[str, ...], weak: Array, spread: Array) -> tuple[Group, ...]:
+    """Return the groups of base parameters that are coupled along the weak directions."""
+    count = weak.shape[1]
+    if not count:
+        return ()
+    order = scipy.linalg.qr(weak.T, mode="r", pivoting=True)[1]
+    chosen, others = order[:count], np.sort(order[count:])
+    moved = np.linalg.solve(weak[chosen].T, weak[others].T).T  # V_p V_f^-1
+    share = np.linalg.norm(weak[others], axis=1)
+    is_open = (share > _LED_IN_PART) | (np.abs(moved) > _COUPLED).any(axis=1)
+    others, moved = others[is_open], moved[is_open]
+    label = np.append(np.arange(count), np.zeros(len(others), dtype=int))
+    for k, row in enumerate(moved):
+        joined = np.abs(row) > _JOINED
+        joined[np.argmax(np.abs(row))] = True
+        met = np.unique(label[:count][joined])
+        label[np.isin(label, met)] = met[0]
+        label[count + k] = met[0]
+    places = np.append(chosen, others)
+    groups = []
+    for one in np.unique(label[np.argsort(places)]):
+        members = np.sort(places[label == one])
+        sums = [
+            _combination(names, spread, [int(p), *chosen], [1.0, *-row])
+            for p, row, own in zip(others, moved, label[count:], strict=True)
+            if own == one
+        ]
+        groups.append(Group(tuple(names[i] for i in members), tuple(sums)))
+    return tuple(sorted(groups, key=lambda group: names.index(group.names[0])))
+
+
+def _combination(
+    names: tuple[str, ...], spread: Array, places: Sequence[int], scaled: Sequence[float]
+) -> Combination:
+    """Return a sum in SI units, from one in units of the spread."""
+    terms = sorted((p, c) for p, c in zip(places, scaled, strict=True) if abs(c) > _TERM)
+    shares = np.array([c for _, c in terms])
+    leading = int(np.argmax(np.abs(shares) >= _TIE * np.abs(shares).max()))
+    shares /= shares[leading]
+    physical = shares * spread[terms[leading][0]] / spread[[p for p, _ in terms]]
+    physical[leading] = 1.0
+    chosen = tuple(names[p] for p, _ in terms)
+    return Combination(chosen, tuple(physical.tolist()), tuple(shares.tolist()))
+
+
+def _and(words: Sequence[str]) -> str:
+    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"

@@ -1,0 +1,549 @@
+"""Output error method: parameters for which simulated outputs agree with measured ones.
+
+The closed loop is simulated over windows and its outputs are compared. Nothing is differentiated,
+and neither torque nor acceleration needs to be measured. The residual of a simulation is
+correlated. It is whitened by joint, e_t - rho e_(t-1); without whitening, slow drift would mask
+fast effects such as a delay.
+"""
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+import scipy.linalg
+
+from robotid.base.exceptions import DataError, NotConvergedError
+from robotid.base.typing import Array, ProgressCallback, ignore_progress
+from robotid.dynamics.factors import Factors, triangle_of
+from robotid.estimation.estimators.estimator import Estimate, Estimator
+from robotid.estimation.estimators.segments import FEWEST_SEGMENTS, at_least, sandwich, scatter
+from robotid.estimation.estimators.simulator import Residual, Simulator
+
+__all__ = ["OutputError", "is_at_bound", "linearised", "segment_scores"]
+
+_CAUTIOUS = 1e-3  # damping of a step: parameters that are not identifiable do not move
+_NEARLY_FREE = 1e-6  # damping of the last step, near the minimum
+_STEPS = 25  # largest number of damped Gauss-Newton steps in a round
+_ROUNDS = 5  # largest number of updates of whitening and noise levels ...
+_SETTLED = 2e-2  # ... until their relative change is smaller
+_ROUGH, _CLOSE = 1e-3, 1e-5  # relative decrease that ends the first round, and the others
+_TOO_STIFF = 1e10  # damping at which no step reduces the cost any more
+_UPHILL = 1e-2  # largest relative increase of the cost by a step with inexact derivatives
+_NEAR = 1e-2  # step in standard errors, squared, at which such steps end
+_MOST_RHO = 0.95  # largest correlation: beyond it, whitening removes offsets and gains
+_NO_TRACE = 1e-3  # effect of an initial state in noise levels below which it is neglected
+#: Number of segments for the scatter of scores: few enough that each is longer than the time for
+#: which an encoder stays at one step while a joint reverses.
+_SEGMENTS = 48
+_LOST = 1e-6  # relative reduction of the prior variance below which a parameter is undetermined
+
+
+@dataclass(frozen=True, eq=False)
+class _Weights:
+    """Whitening and noise level of the residuals, by joint."""
+
+    rho: Array  # correlation of one sample with the next [-]
+    sigma: Array  # noise level of the whitened residual
+
+    def whiten(self, x: Array, joints: Array) -> Array:
+        rho, sigma = self.rho[joints], self.sigma[joints]
+        if x.ndim == 3:
+            rho, sigma = rho[:, None], sigma[:, None]
+        whitened: Array = (x[1:] - rho * x[:-1]) / sigma
+        return whitened
+
+
+@dataclass(frozen=True, eq=False)
+class OutputError(Estimator[Simulator]):
+    """Least squares of a simulator's whitened residuals, with priors and bounds.
+
+    A damped Gauss-Newton method (Levenberg, Marquardt) in rounds. Each round computes the weights
+    from the residuals, then the parameters with these weights, until both have converged.
+
+    Attributes:
+        name: Name of the method, by the compared signal.
+        whitens: Whether the residual is whitened by its estimated correlation.
+        most: Largest correlation of successive samples that is used, shape (n,): whitening with
+            more than the correlation of the loop removes the information. None: 0.95.
+        steps: Largest number of steps in a round.
+        rounds: Largest number of rounds.
+        inflation: Factor of the residuals' variance for the correlation that remains after
+            whitening. It determines the weight relative to additional rows.
+        frees: Whether the initial states of windows are fitted together with the parameters, to
+            first order, in each step; needed if the loop does not correct a wrong initial state.
+        progress: Callback for the progress of the steps.
+
+    References:
+        Ljung (1999), System identification, 4.3 and 10.2.
+    """
+
+    reads: ClassVar[Literal["simulator"]] = "simulator"
+
+    name: str = "output error"
+    whitens: bool = True
+    most: Array | None = None
+    steps: int = _STEPS
+    rounds: int = _ROUNDS
+    inflation: float = 1.0
+    frees: bool = False
+    progress: ProgressCallback = field(default=ignore_progress)
+
+    def fit(
+        self,
+        data: Simulator,
+        start: Array | None = None,
+        *,
+        exact: Simulator | None = None,
+    ) -> Estimate:
+        """Estimate the parameters.
+
+        If the simulator's derivatives A are approximate, with the exact ones S of its residuals e,
+        the steps converge to A'e = 0, and standard errors are those of (A'S)^-1 A'e. A step leaves
+        the share 1 - (A'A)^-1 A'S of the error; ``details["left"]`` has the largest one.
+
+        Args:
+            data: The simulator.
+            start: Initial values, shape (c,); the prior if None.
+            exact: The same simulator with exact derivatives, if its own are approximate.
+
+        Raises:
+            DataError: If there are fewer samples than parameters.
+            NotConvergedError: If the simulation with the initial values fails.
+        """
+        weights, theta, how = self._minimised(data, start, exact)
+        return self._estimate(data, weights, theta, how, exact=exact)
+
+    def minimise(self, data: Simulator, start: Array | None = None) -> Array:
+        """Return the parameters of ``fit`` alone, shape (c,), without their standard errors.
+
+        Args:
+            data: The simulator.
+            start: Initial values, shape (c,); the prior if None.
+
+        Raises:
+            NotConvergedError: If the simulation with the initial values fails.
+        """
+        return self._minimised(data, start, None)[1]
+
+    def _minimised(
+        self, simulator: Simulator, start: Array | None, exact: Simulator | None
+    ) -> tuple[_Weights, Array, dict[str, Any]]:
+        """Return the last weights, the parameters, and how they were found."""
+        initial = simulator.prior if start is None else start
+        theta = np.clip(np.array(initial, dtype=float), *simulator.bounds)
+        found = self._left(simulator, theta)
+        weights, rounds, count, converged = self._weigh(found), 0, 0, False
+        for rounds in range(1, self.rounds + 1):
+            close = _ROUGH if rounds == 1 else _CLOSE
+            theta, found, steps, converged = self._descend(
+                simulator, weights, theta, found, close, is_exact=exact is None
+            )
+            count += steps
+            if exact is not None and not converged:
+                break  # other weights would not help
+            before, weights = weights, self._weigh(found)
+            change = np.abs(weights.sigma / before.sigma - 1.0).max()
+            if rounds > 1 and converged and max(change, _rho_change(before, weights)) < _SETTLED:
+                break
+            converged = False
+        state = "converged" if converged else "not converged"
+        message = f"{self.name}, {count} steps in {rounds} rounds, {state}"
+        how = {"converged": converged, "n_iter": count, "message": message}
+        return weights, theta, how
+
+    def weights(self, simulator: Simulator, theta: Array) -> "_Weights":
+        """Return correlation and noise level of the residuals, their weights.
+
+        Args:
+            simulator: The simulator.
+            theta: Parameters, shape (c,).
+        """
+        return self._weigh(self._left(simulator, theta))
+
+    def _left(self, simulator: Simulator, theta: Array) -> Sequence[Residual]:
+        """Return residuals; with derivatives by the initial states only if these are free."""
+        return simulator.residuals(theta, with_slopes=False, with_starts=self.frees)
+
+    def _weigh(self, found: Sequence[Residual], *, frees: bool | None = None) -> "_Weights":
+        """Return correlation and noise level of residuals, with fitted initial states if free."""
+        if self.frees if frees is None else frees:
+            found = [replace(r, e=_freed(r)) for r in found]
+        n = 1 + max(int(r.joints.max()) for r in found)
+        rho, sigma = np.zeros(n), np.ones(n)
+        most = np.full(n, _MOST_RHO) if self.most is None else self.most
+        for j in range(n):
+            own = [r.e[:, k] for r in found for k in np.flatnonzero(r.joints == j)]
+            if self.whitens:
+                along = sum(float(x[1:] @ x[:-1]) for x in own)
+                rho[j] = np.clip(along / max(_squares(x[:-1] for x in own), 1e-300), 0, most[j])
+            size = sum(len(x) - 1 for x in own)
+            level = np.sqrt(_squares(x[1:] - rho[j] * x[:-1] for x in own) / max(size, 1))
+            sigma[j] = max(level, 1e-12) * np.sqrt(self.inflation)
+        return _Weights(rho, sigma)
+
+    def _cost(
+        self, simulator: Simulator, weights: _Weights, theta: Array, found: Sequence[Residual]
+    ) -> float:
+        """Return the cost of parameters with the residuals ``found``."""
+        cost = 0.0
+        for r in found:
+            b = weights.whiten(r.e, r.joints).reshape(-1)
+            U = _by_start(r, weights) if self.frees else np.zeros((len(b), 0))
+            cost += float(b @ b) - float(np.sum((U.T @ b) ** 2))
+        cost += float(np.sum(((theta - simulator.prior) / simulator.prior_std) ** 2))
+        cost += float(np.sum(simulator.rows(theta)[1] ** 2))
+        return cost if np.isfinite(cost) else np.inf
+
+    def joint_step(self, simulator: Simulator, theta: Array) -> Array:
+        """Return the parameters after a step of them together with the windows' initial states.
+
+        They do not change if the simulation after the step fails.
+
+        Args:
+            simulator: The simulator.
+            theta: Parameters of the best fit with fixed initial states, shape (c,).
+        """
+        H, g = self.normal(simulator, self.weights(simulator, theta), theta, frees=True)
+        moved = _bounded_step(H, g, theta, simulator.bounds, _CAUTIOUS)
+        try:
+            self._left(simulator, moved)
+        except NotConvergedError:
+            return theta
+        return moved
+
+    def settle(self, simulator: Simulator, estimate: Estimate) -> Estimate:
+        """Return the estimate after a step of it together with the windows' initial states.
+
+        With fixed initial states the fit is biased, because these were fitted with earlier
+        parameters. The standard errors of an estimate assume free initial states.
+
+        Args:
+            simulator: The simulator, with initial states fitted for the estimate.
+            estimate: Result of ``fit``, with exact derivatives.
+
+        Raises:
+            NotConvergedError: If the simulation after the step fails.
+        """
+        found = simulator.residuals(estimate.theta, with_slopes=True, with_starts=True)
+        weights = self._weigh(found, frees=True)
+        how = {key: getattr(estimate, key) for key in ("converged", "n_iter", "message")}
+        settled = self._estimate(simulator, weights, estimate.theta, how, found=found)
+        self._left(simulator, settled.theta)
+        return settled
+
+    def moved(self, simulator: Simulator, other: Simulator, theta: Array) -> tuple[Array, Array]:
+        """Return the first-order change of the estimate for other residuals, and standard errors.
+
+        Args:
+            simulator: The simulator.
+            other: The same simulator with other residuals, as of a smaller integration step.
+            theta: Parameters near the estimate, shape (c,).
+
+        Returns:
+            Change of the parameters, and standard errors for independent whitened residuals of
+            ``other``, both of shape (c,).
+        """
+        weights = self.weights(other, theta)
+        (H, g), (_, changed) = (
+            self.normal(s, weights, theta, frees=True) for s in (simulator, other)
+        )
+        free = ~is_at_bound(simulator, theta)
+        scale = 1.0 / np.sqrt(np.diag(H)[free])
+        inverse = scipy.linalg.pinvh(H[np.ix_(free, free)] * np.outer(scale, scale))
+        change, error = np.zeros_like(theta), np.zeros_like(theta)
+        change[free] = scale * (inverse @ (scale * (changed - g)[free]))
+        error[free] = scale * np.sqrt(np.diag(inverse))
+        return change, error
+
+    def normal(
+        self, simulator: Simulator, weights: _Weights, theta: Array, *, frees: bool = False
+    ) -> tuple[Array, Array]:
+        """Return H = A'A and A'b of the linearised problem, prior included.
+
+        Args:
+            simulator: The simulator.
+            weights: As from ``weights``.
+            theta: Parameters, shape (c,).
+            frees: Whether the effect of the windows' initial states is projected out.
+        """
+        return _summed(simulator, theta, linearised(simulator, weights, theta, frees=frees))
+
+    def _descend(
+        self,
+        simulator: Simulator,
+        weights: _Weights,
+        theta: Array,
+        found: Sequence[Residual],
+        close: float,
+        *,
+        is_exact: bool,
+    ) -> tuple[Array, Sequence[Residual], int, bool]:
+        """Minimise with fixed weights from parameters with the residuals ``found``.
+
+        Return the parameters, their residuals, the number of steps, and whether it converged.
+        """
+        damping, cost = _CAUTIOUS, self._cost(simulator, weights, theta, found)
+        if not np.isfinite(cost):
+            raise NotConvergedError(
+                "the simulation of the closed loop with the initial values diverges; state gains "
+                "in [controller] that are closer to those of the drives",
+                "no start",
+            )
+        highest = 1.0 if is_exact else 1.0 + _UPHILL
+        for step in range(1, self.steps + 1):
+            self.progress("fitting loops", step, self.steps, "steps")
+            H, g = self.normal(simulator, weights, theta, frees=self.frees)
+            while True:
+                trial = _bounded_step(H, g, theta, simulator.bounds, damping)
+                left, new = found, np.inf
+                try:
+                    left = self._left(simulator, trial)
+                    new = self._cost(simulator, weights, trial, left)
+                except NotConvergedError:
+                    pass  # the step is too long
+                if new < highest * cost or damping > _TOO_STIFF:
+                    break
+                if is_exact and float(g @ (trial - theta)) < close * cost:
+                    break  # the predicted decrease is negligible
+                damping *= 6.0
+            if not new < highest * cost:
+                return theta, found, step, True  # no step reduces the cost noticeably
+            is_near = float(g @ (trial - theta)) < _NEAR
+            decrease, theta, found, cost = (cost - new) / cost, trial, left, new
+            damping = max(damping / 6.0, 1e-9)
+            if decrease < close if is_exact else is_near:
+                return theta, found, step, True
+        return theta, found, self.steps, False
+
+    def _estimate(
+        self,
+        simulator: Simulator,
+        weights: _Weights,
+        theta: Array,
+        how: Mapping[str, Any],
+        *,
+        exact: Simulator | None = None,
+        found: Sequence[Residual] | None = None,
+    ) -> Estimate:
+        """Return the estimate with standard errors from the scatter of the scores of segments.
+
+        With residuals ``found``, it is the estimate after a step with free initial states.
+        """
+        moves = found is not None
+        if found is None:
+            found = simulator.residuals(theta, with_slopes=True, with_starts=True)
+        parts = list(_whitened(found, weights, frees=True))
+        rows = sum(r.e.size for r in found)
+        if rows < len(theta):
+            raise DataError(
+                f"{rows} samples of position for {len(theta)} parameters, wanted at least as many "
+                "samples as parameters; record a longer motion"
+            )
+        H, g = _summed(simulator, theta, parts)
+        change = np.zeros_like(theta)
+        if moves:
+            change = _bounded_step(H, g, theta, simulator.bounds, _NEARLY_FREE) - theta
+        known = 1.0 / simulator.prior_std**2
+        scale = 1.0 / np.sqrt(np.diag(H))
+        values, vectors = np.linalg.eigh(H * np.outer(scale, scale))
+        bread = (vectors / np.maximum(values, 1e-13)) @ vectors.T * np.outer(scale, scale)
+        segments = _segments(parts, len(theta), are_windows=self.frees)
+        meat, inflation, freedom = H - np.diag(known), 1.0, np.full(len(theta), np.inf)
+        if len(segments) >= FEWEST_SEGMENTS:
+            seen = scatter(segments, change, np.ones(1), bread)
+            meat, inflation, freedom = seen.meat, seen.inflation, seen.freedom()
+            further = simulator.rows(theta)[0]
+            meat = meat + further.T @ further
+        left = 0.0
+        if exact is not None:
+            C = _cross(simulator, exact, weights, theta) + np.diag(known)
+            left = float(np.abs(np.linalg.eigvals(np.eye(len(theta)) - bread @ C)).max())
+            bread = np.linalg.inv(C)
+        # standard errors are at least those for independent rows
+        independent = np.diag(bread @ H @ bread.T)
+        gained = 1.0 - independent * known  # relative reduction of each prior variance
+        undetermined = tuple(
+            name for name, share in zip(simulator.names, gained, strict=True) if share < _LOST
+        )
+        theta = theta + change
+        at_bound = np.array(simulator.names)[is_at_bound(simulator, theta)]
+        return Estimate(
+            theta=theta,
+            covariance=at_least(sandwich(bread, meat + np.diag(known)), independent),
+            names=simulator.names,
+            sigma=weights.sigma / np.sqrt(self.inflation),
+            rank=len(theta) - len(undetermined),
+            condition=float(np.sqrt(values[-1] / max(values[0], 1e-300))),
+            undetermined=undetermined,
+            prior_std=simulator.prior_std,
+            details={
+                "correlation": weights.rho,
+                "inflation": inflation * self.inflation,
+                "freedom": freedom,
+                "left": left,
+                "at_bound": tuple(at_bound.tolist()),
+            },
+            **{**how, "converged": how["converged"] and left < 1.0},
+        )
+
+
+def _summed(
+    simulator: Simulator, theta: Array, parts: Iterable[tuple[Array, Array, Array]]
+) -> tuple[Array, Array]:
+    """Return H = A'A and A'b of linearised rows, additional rows and the prior included."""
+    tau = 1.0 / simulator.prior_std**2
+    H, g = np.diag(tau), tau * (simulator.prior - theta)
+    for A, b, columns in parts:
+        H[np.ix_(columns, columns)] += A.T @ A
+        g[columns] += A.T @ b
+    A, b = simulator.rows(theta)
+    return H + A.T @ A, g + A.T @ b
+
+
+def _squares(arrays: Iterable[Array]) -> float:
+    return float(sum((x * x).sum() for x in arrays))
+
+
+def _rho_change(before: _Weights, after: _Weights) -> float:
+    return float(np.abs(after.rho - before.rho).max())
+
+
+def linearised(
+    simulator: Simulator, weights: _Weights, theta: Array, *, frees: bool = False
+) -> Iterable[tuple[Array, Array, Array]]:
+    """Yield whitened rows A, b and the indices of their columns, window by window.
+
+    Args:
+        simulator: The simulator.
+        weights: As from ``OutputError.weights``.
+        theta: Parameters, shape (c,).
+        frees: Whether the effect of a window's initial state is projected out of its rows.
+    """
+    found = simulator.residuals(theta, with_slopes=True, with_starts=frees)
+    yield from _whitened(found, weights, frees=frees)
+
+
+def segment_scores(simulator: Simulator, estimate: Estimate) -> tuple[Array, Array]:
+    """Return A'A (s, c, c) and A'b (s, c) of whitened residuals, window by window.
+
+    The effect of the windows' initial states is projected out.
+
+    Args:
+        simulator: The simulator, with s windows and parts of robots that are simulated together.
+        estimate: Result of ``OutputError.fit``: its parameters, correlation and noise level.
+    """
+    weights = _Weights(estimate.details["correlation"], estimate.sigma)
+    parts = list(linearised(simulator, weights, estimate.theta, frees=True))
+    H = np.zeros((len(parts), len(estimate.theta), len(estimate.theta)))
+    g = np.zeros(H.shape[:2])
+    for k, (A, b, columns) in enumerate(parts):
+        H[k][np.ix_(columns, columns)] = A.T @ A
+        g[k, columns] = A.T @ b
+    return H, g
+
+
+def _whitened(
+    found: Iterable[Residual], weights: _Weights, *, frees: bool
+) -> Iterable[tuple[Array, Array, Array]]:
+    """Yield the whitened rows of residuals; see ``linearised``."""
+    for r in found:
+        b = weights.whiten(r.e, r.joints)
+        A = weights.whiten(_given(r), r.joints).reshape(b.size, -1)
+        b = b.reshape(-1)
+        if frees:
+            U = _by_start(r, weights)
+            A, b = A - U @ (U.T @ A), b - U @ (U.T @ b)
+        yield A, b, r.columns
+
+
+def _cross(simulator: Simulator, exact: Simulator, weights: _Weights, theta: Array) -> Array:
+    """Return A'S of a simulator's derivatives A and the exact ones S, whitened, shape (c, c)."""
+    product = np.zeros((len(theta), len(theta)))
+    parts = (linearised(one, weights, theta) for one in (simulator, exact))
+    for (A, _, rows), (S, _, columns) in zip(*parts, strict=True):
+        product[np.ix_(rows, columns)] += A.T @ S
+    return product
+
+
+def _by_start(r: Residual, weights: _Weights) -> Array:
+    """Return an orthonormal basis of the effect of a window's initial state on whitened rows."""
+    if r.by_start is None:
+        return np.zeros((r.e[1:].size, 0))
+    G = weights.whiten(r.by_start, r.joints).reshape(r.e[1:].size, -1)
+    U, sizes, _ = np.linalg.svd(G, full_matrices=False)
+    basis: Array = U[:, sizes > _NO_TRACE]
+    return basis
+
+
+def _freed(r: Residual) -> Array:
+    """Return a residual after a fit of the initial state, joints weighted by their RMS residual."""
+    if r.by_start is None:
+        return r.e
+    size = np.maximum(np.sqrt(np.mean(r.e**2, axis=0)), 1e-12)
+    G = (r.by_start / size[:, None]).reshape(r.e.size, -1)
+    moved = G @ np.linalg.lstsq(G, (r.e / size).reshape(-1), rcond=None)[0]
+    freed: Array = r.e - size * moved.reshape(r.e.shape)
+    return freed
+
+
+def _given(r: Residual) -> Array:
+    if r.slopes is None:
+        raise DataError("the simulator returned no derivatives, wanted with_slopes=True")
+    return r.slopes
+
+
+def is_at_bound(simulator: Simulator, theta: Array) -> Array:
+    """Return which parameters are at a bound, shape (c,), bool.
+
+    Args:
+        simulator: The simulator.
+        theta: Parameters, shape (c,).
+    """
+    lowest, highest = simulator.bounds
+    at_bound: Array = (theta <= lowest) | (theta >= highest)
+    return at_bound
+
+
+def _bounded_step(H: Array, g: Array, theta: Array, bounds: Array, damping: float) -> Array:
+    """Return the parameters after a damped step, limited to their bounds."""
+    lowest, highest = bounds
+    scale = 1.0 / np.sqrt(np.diag(H))
+    H = H * np.outer(scale, scale) + damping * np.eye(len(H))  # its condition, not that of units
+    free = ((theta > lowest) | (g > 0)) & ((theta < highest) | (g < 0))
+    trial = theta.copy()
+    while free.any():
+        step = scipy.linalg.solve(H[np.ix_(free, free)], (scale * g)[free], assume_a="pos")
+        trial[free] = theta[free] + scale[free] * step
+        outside = free & ((trial < lowest) | (trial > highest))
+        if not outside.any():
+            break
+        trial[outside] = np.clip(trial, lowest, highest)[outside]
+        g = g - H[:, outside] @ ((trial - theta) / scale)[outside] / scale
+        free = free & ~outside
+    return trial
+
+
+def _segments(
+    found: Sequence[tuple[Array, Array, Array]], c: int, *, are_windows: bool
+) -> list[Factors]:
+    """Return the factors of the whitened rows of c parameters, segment by segment.
+
+    With ``are_windows`` each window is about one segment: without feedback an early error persists
+    until the end of the window.
+    """
+    total = sum(len(b) for _, b, _ in found)
+    segments: list[Factors] = []
+    for A, b, columns in found:
+        cuts = max(1, round(_SEGMENTS * len(b) / total))
+        if are_windows:
+            cuts = math.ceil(FEWEST_SEGMENTS / len(found))
+        for rows in np.array_split(np.arange(len(b)), cuts):
+            triangle = triangle_of(np.column_stack([A[rows], b[rows]]))
+            segments.append(Factors((triangle,), (columns,), np.array([len(rows)]), _names(c)))
+    return segments
+
+
+def _names(count: int) -> tuple[str, ...]:
+    return tuple(map(str, range(count)))

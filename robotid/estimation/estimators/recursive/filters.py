@@ -1,0 +1,343 @@
+"""Recursive least squares in square-root information form, and a Kalman filter."""
+
+from abc import abstractmethod
+from dataclasses import dataclass
+from statistics import NormalDist
+
+import numpy as np
+from scipy.linalg.lapack import dtpqrt
+
+from robotid.base.exceptions import DataError, RankDeficientError
+from robotid.base.typing import Array
+from robotid.dynamics.factors import Factors
+from robotid.dynamics.problem import Problem, Sample
+from robotid.estimation.estimators.batch import solve_factor
+from robotid.estimation.estimators.estimator import Estimate, Weighing, require_rows
+from robotid.estimation.estimators.recursive.recursive import (
+    RecursiveEstimator,
+    StateT,
+    fold,
+    require_samples,
+    scaled_rows,
+)
+
+__all__ = ["RLS", "Kalman", "KalmanState", "RLSState"]
+
+_BLOCK = 8  # block size of LAPACK
+_TINY = 1e-12  # smallest noise over sigma, for noise-free data
+_PATIENCE = 50  # largest number of successive rows of a joint that the gate rejects
+_PRIOR_LED = 0.9  # ratio to the prior standard deviation above which a parameter is undetermined
+
+
+class Filter(RecursiveEstimator[StateT]):
+    """A recursive estimator that reads the samples once, in the order of time."""
+
+    prior: Array | None
+
+    @abstractmethod
+    def _rows_of(self, state: StateT) -> int:
+        """Return the number of rows that a state depends on."""
+
+    def fit(self, data: Problem) -> Estimate:
+        require_samples(data)
+        c = len(data.names)
+        state = fold(self, data.samples(), self.init(c))
+        require_rows(self._rows_of(state), c, data.n_joints)
+        estimate = self.estimate(state, data.names)
+        if estimate.rank < c and self.prior is None:
+            raise RankDeficientError(estimate.rank, estimate.undetermined, c)
+        return estimate
+
+
+@dataclass(frozen=True, eq=False)
+class RLSState:
+    """State of recursive least squares.
+
+    Attributes:
+        R: Upper triangular factor of the weighted rows [Y tau], shape (c + 1, c + 1).
+        rows: Effective number of rows in it, with forgetting.
+        steps: Number of samples used.
+    """
+
+    R: Array
+    rows: float
+    steps: int
+
+
+@dataclass(frozen=True, eq=False)
+class RLS(Filter[RLSState]):
+    """Recursive least squares with exponential forgetting.
+
+    The state is the triangular factor R of all rows. It is updated with a sample by QR:
+
+        R <- triangle of [sqrt(forgetting) R; [Y tau] / sigma].
+
+    Nothing is inverted until an estimate is computed, so the update is numerically stable, and the
+    initial state has no information: without forgetting the result is that of batch least squares.
+    With forgetting, information that is not updated by motion would vanish (wind-up). Each step
+    therefore adds one row of the prior, one parameter after the other, so that the prior
+    information of each stays between forgetting^c and 1 times that of the prior. Parameters that
+    are not identifiable have infinite variance.
+
+    Attributes:
+        sigma: Noise level of each joint, shape (n,) [N m or N]. Only the ratios matter: the
+            common factor is estimated.
+        forgetting: Weight of a sample relative to the next one, 0 < forgetting <= 1 [-].
+        prior: Parameter values for directions that are not identifiable, shape (c,); None: 0, and
+            ``fit`` raises an error if there are any.
+        prior_std: Prior standard deviations, shape (c,); None: no prior information.
+        independent_share: Share of independent rows, 2 cutoff / rate [-].
+
+    Raises:
+        DataError: If a setting is out of its range, or forgetting < 1 comes without a prior.
+
+    References:
+        Bierman (1977), Factorization Methods for Discrete Sequential Estimation, chapter IV.
+    """
+
+    sigma: Array
+    forgetting: float = 1.0
+    prior: Array | None = None
+    prior_std: Array | None = None
+    independent_share: float = 1.0
+
+    def __post_init__(self) -> None:
+        if not 0 < self.forgetting <= 1:
+            raise DataError(f"forgetting is {self.forgetting}, wanted above 0 and at most 1")
+        if not (np.isfinite(self.sigma).all() and (self.sigma > 0).all()):
+            raise DataError(f"sigma is {self.sigma}, wanted positive finite numbers")
+        if self.prior_std is not None and self.prior is None:
+            raise DataError("prior_std was given without prior; state both, or neither")
+        if self.forgetting < 1 and self.prior_std is None:
+            raise DataError(
+                f"forgetting is {self.forgetting}, which needs prior and prior_std: information "
+                "that is not updated by motion vanishes otherwise; state both"
+            )
+
+    @property
+    def weighing(self) -> Weighing:
+        return "by joint" if self.forgetting == 1 else "by age"
+
+    def init(self, c: int) -> RLSState:
+        R = np.zeros((c + 1, c + 1), order="F")
+        if self.prior is not None and self.prior_std is not None:
+            R[:c, :c] = np.diag(1.0 / self.prior_std)
+            R[:c, c] = self.prior / self.prior_std
+        return RLSState(R, 0.0, 0)
+
+    def update(self, state: RLSState, sample: Sample) -> RLSState:
+        rows = scaled_rows(sample, self.sigma, len(state.R) - 1)  # (k, c + 1)
+        if not len(rows):
+            return state
+        count = self.forgetting * state.rows + len(rows)
+        if self.forgetting == 1:
+            R = dtpqrt(0, min(_BLOCK, len(state.R)), state.R, rows)[0]
+        else:
+            root = np.sqrt(self.forgetting)
+            rows = np.vstack([rows, self._prior_row(state)])
+            R = dtpqrt(0, min(_BLOCK, len(state.R)), root * state.R, rows)[0]
+        return RLSState(R, count, state.steps + 1)
+
+    def estimate(self, state: RLSState, names: tuple[str, ...]) -> Estimate:
+        c = len(names)
+        factors = Factors((state.R,), (np.arange(c),), np.array([int(state.rows)]), names)
+        start = np.zeros(c) if self.prior is None else self.prior
+        solution = solve_factor(factors, np.ones(1), start)
+        freedom = max(state.rows - solution.rank, 1.0)
+        scale = max(abs(float(state.R[c, c])) / np.sqrt(freedom), _TINY)
+        covariance = scale**2 / self.independent_share * solution.covariance
+        message = (
+            f"{state.steps} samples used, forgetting {self.forgetting:g}; noise levels "
+            f"{scale:.3g} times the given ones"
+        )
+        return solution.estimate(names, covariance, scale * self.sigma, state.steps, message)
+
+    def _rows_of(self, state: RLSState) -> int:
+        # forgotten rows count, too
+        return int(state.rows) if self.forgetting == 1 else state.steps * len(self.sigma)
+
+    def _prior_row(self, state: RLSState) -> Array:
+        """Return a row of the prior that replaces the information forgotten in c steps."""
+        c = len(state.R) - 1
+        row = np.zeros(c + 1)
+        if self.prior is not None and self.prior_std is not None:
+            i = state.steps % c
+            weight = np.sqrt(1.0 - self.forgetting**c) / self.prior_std[i]
+            row[i], row[c] = weight, weight * self.prior[i]
+        return row
+
+
+@dataclass(frozen=True, eq=False)
+class KalmanState:
+    """State of the Kalman filter.
+
+    Attributes:
+        theta: Parameters, shape (c,).
+        P: Their covariance, shape (c, c).
+        products: Sum of innovation times residual per joint, shape (n,): rows times variance.
+        rows: Number of rows used per joint, shape (n,).
+        gated: Number of rows rejected by the gate per joint, shape (n,).
+        in_a_row: Number of rows rejected since the last one used, shape (n,).
+        steps: Number of samples read.
+    """
+
+    theta: Array
+    P: Array
+    products: Array
+    rows: Array
+    gated: Array
+    in_a_row: Array
+    steps: int
+
+
+@dataclass(frozen=True, eq=False)
+class Kalman(Filter[KalmanState]):
+    """Kalman filter: theta_k+1 = theta_k + w, tau = Y theta + noise.
+
+    The covariance is updated in Joseph's form, P <- (1 - K Y) P (1 - K Y)^T + K R K^T, multiplied
+    out: P - A - A^T with A = K (P Y^T - K T / 2)^T and T = Y P Y^T + R. This form is as robust to
+    an inexact K, exactly symmetric, and its products have only n columns. A row with an improbable
+    innovation is rejected and counted. After 50 rejected rows in a row the next row of the joint is
+    used. A parameter with almost no information from the data is undetermined, and its standard
+    deviation is that of its prior.
+
+    Attributes:
+        sigma: Noise level of each joint, shape (n,) [N m or N].
+        prior: Prior values, shape (c,).
+        prior_std: Prior standard deviations, shape (c,), positive; or the prior covariance, shape
+            (c, c).
+        walk: Standard deviation of the random walk per sample, over prior_std [-].
+        gate: Probability that a row without a fault passes the chi-square gate (one degree of
+            freedom per row), below 1; None: no gate.
+        independent_share: Share of independent rows, 2 cutoff / rate [-].
+
+    Raises:
+        DataError: If a setting is out of its range.
+
+    References:
+        Bierman (1977), Factorization Methods for Discrete Sequential Estimation, II (Joseph form);
+        Bar-Shalom, Li, Kirubarajan (2001), Estimation with Applications to Tracking, 5.4.
+    """
+
+    sigma: Array
+    prior: Array
+    prior_std: Array
+    walk: float = 0.0
+    gate: float | None = 1 - 1e-7
+    independent_share: float = 1.0
+
+    def __post_init__(self) -> None:
+        for name in ("sigma", "prior_std"):
+            values = getattr(self, name)
+            diagonal = np.diag(values) if values.ndim == 2 else values
+            if not (np.isfinite(values).all() and (diagonal > 0).all()):
+                raise DataError(f"{name} is {diagonal}, wanted positive finite numbers")
+        if not np.isfinite(self.prior).all():
+            raise DataError(f"prior is {self.prior}, wanted finite numbers")
+        if not self.walk >= 0:
+            raise DataError(f"walk is {self.walk}, wanted 0 or a positive number")
+        if self.gate is not None and not 0.5 <= self.gate < 1:
+            raise DataError(f"gate is {self.gate}, wanted at least 0.5 and below 1, or None")
+
+    @property
+    def weighing(self) -> Weighing:
+        return "by age"
+
+    def init(self, c: int) -> KalmanState:
+        if self.prior.shape != (c,) or len(self.prior_std) != c:
+            raise DataError(
+                f"prior has shape {self.prior.shape} and prior_std {self.prior_std.shape}, wanted "
+                f"{c} parameters"
+            )
+        n = len(self.sigma)
+        P = self.prior_std if self.prior_std.ndim == 2 else np.diag(self.prior_std**2)
+        none = np.zeros(n, dtype=int)
+        return KalmanState(self.prior, P, np.zeros(n), none, none, none, 0)
+
+    def update(self, state: KalmanState, sample: Sample) -> KalmanState:
+        c = len(state.theta)
+        used = np.flatnonzero(sample.weight)
+        # in units of each row's noise, increased for rows that are not independent
+        scale = self.sigma / np.sqrt(self.independent_share)
+        rows = scaled_rows(sample, scale, c)
+        Y, e = rows[:, :c], rows[:, c] - rows[:, :c] @ state.theta  # (k, c), (k,)
+        P = self._walked(state.P)
+        PY = P @ Y.T  # (c, k)
+        T = Y @ PY  # (k, k), covariance of the prediction, then of the innovation
+        passed = self._passes(e, np.diag(T), state.in_a_row[used])
+        if not passed.all():
+            Y, e, PY, T = Y[passed], e[passed], PY[:, passed], T[np.ix_(passed, passed)]
+        T.flat[:: len(T) + 1] += 1.0
+        solved = np.linalg.solve(T, np.column_stack([PY.T, e])) if len(T) else np.zeros((0, c + 1))
+        K, residual = solved[:, :c].T, solved[:, c]  # (c, k), (k,): tau - Y theta afterwards
+        A = K @ (PY - K @ T / 2).T
+        rows, gated, in_a_row = _count(state, used, passed)
+        products = state.products.copy()
+        k = used[passed]
+        products[k] += scale[k] ** 2 / sample.weight[k] * e * residual
+        return KalmanState(
+            state.theta + K @ e,
+            P - (A + A.T),  # exactly symmetric
+            products,
+            rows,
+            gated,
+            in_a_row,
+            state.steps + 1,
+        )
+
+    def estimate(self, state: KalmanState, names: tuple[str, ...]) -> Estimate:
+        std = self._prior_spread()
+        after = np.sqrt(np.maximum(np.diag(state.P), 0.0))
+        # the mean of innovation times residual is the noise variance, independent of P
+        variance = np.maximum(state.products, 0.0) / np.maximum(state.rows, 1)
+        is_open = after > _PRIOR_LED * std
+        eigenvalues = np.linalg.eigvalsh(state.P / np.outer(std, std))
+        return Estimate(
+            theta=state.theta,
+            covariance=state.P,
+            names=names,
+            sigma=np.sqrt(variance),
+            rank=int(np.sum(eigenvalues < _PRIOR_LED**2)),
+            condition=float(np.sqrt(eigenvalues[-1] / max(eigenvalues[0], 1e-300))),
+            undetermined=tuple(np.array(names)[is_open].tolist()),
+            converged=True,
+            n_iter=state.steps,
+            message=f"{state.steps} samples, {int(state.gated.sum())} rows rejected by the gate, "
+            f"{int(state.rows.sum())} used",
+        )
+
+    def _rows_of(self, state: KalmanState) -> int:
+        return int(state.rows.sum())
+
+    def _prior_spread(self) -> Array:
+        if self.prior_std.ndim == 1:
+            return self.prior_std
+        spread: Array = np.sqrt(np.diag(self.prior_std))
+        return spread
+
+    def _walked(self, P: Array) -> Array:
+        """Return the covariance after one step of the random walk."""
+        if self.walk == 0:
+            return P
+        P = P.copy()
+        P.flat[:: len(P) + 1] += (self.walk * self._prior_spread()) ** 2
+        return P
+
+    def _passes(self, e: Array, variance: Array, in_a_row: Array) -> Array:
+        """Return which rows pass the gate: e^2 / (variance + 1) below the chi-square quantile."""
+        if self.gate is None:
+            return np.ones(len(e), dtype=bool)
+        bound = NormalDist().inv_cdf((1 + self.gate) / 2) ** 2
+        return (e**2 <= bound * (variance + 1)) | (in_a_row >= _PATIENCE)
+
+
+def _count(state: KalmanState, used: Array, passed: Array) -> tuple[Array, Array, Array]:
+    """Return the numbers of rows used, rejected, and rejected since the last one used."""
+    rows = state.rows.copy()
+    rows[used] += passed
+    if passed.all() and not state.in_a_row.any():
+        return rows, state.gated, state.in_a_row
+    gated, in_a_row = state.gated.copy(), state.in_a_row.copy()
+    gated[used] += ~passed
+    in_a_row[used] = np.where(passed, 0, in_a_row[used] + 1)
+    return rows, gated, in_a_row

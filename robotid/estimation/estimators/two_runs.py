@@ -1,0 +1,385 @@
+"""Two runs of one robot, without and with a load, for payloads and unknown drive gains.
+
+Reference run   k_j i_j = W_j beta
+Loaded run      k_j i_j = W_j (beta + c + D x)
+
+The difference of the runs has a known part c and an unknown part x. W D is computed from W: an
+added body has the regressor columns of the link to which it is attached. A current i_j of unknown
+gain k_j is the only noisy signal, so the equation is i_j = W_j (...) / k_j. It is bilinear and
+solved by Gauss-Newton steps, with one additional column -W_j beta per gain. Everything is computed
+from triangular factors, and all standard errors are from one covariance, which includes the gains.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+import scipy.linalg
+
+from robotid.base.exceptions import DataError, NotConvergedError
+from robotid.base.typing import Array
+from robotid.dynamics.factors import Factors, Reduction, merge, triangle_of
+from robotid.estimation.estimators.segments import FEWEST_SEGMENTS, at_least, sandwich, scatter
+from robotid.robot.parameters import ParameterLayout
+
+__all__ = ["Compared", "TwoRuns", "payload_runs"]
+
+_WIDE = 10.0  # factor of the prior standard deviations about the URDF's values
+_FLOOR = 1e-7  # smallest noise level over the torque, for noise-free data
+_LEAST_FREEDOM = 0.1  # smallest degrees of freedom of a noise level, as a share of the rows
+_SINGULAR = 1e-12  # pivot below which a column of unit norm is singular
+_STEPS = 50
+_SETTLED = 1e-9  # relative change of the gains at convergence
+_LONGEST = 1.0  # largest step of the logarithm of a gain
+
+
+@dataclass(frozen=True, eq=False)
+class Compared:
+    """Result of the comparison of two runs.
+
+    Attributes:
+        theta: beta and x, shape (b + d,), SI units.
+        gain: Gain k of each joint's signal, shape (n,) [N m/A]; 1 for a torque.
+        covariance: Covariance of beta, x and the logarithms of the u unknown gains,
+            shape (b + d + u, b + d + u).
+        freedom: Degrees of freedom of their standard errors, shape (b + d + u,).
+        unexplained: Residual of each joint over its torque, shape (n,) [-].
+    """
+
+    theta: Array
+    gain: Array
+    covariance: Array
+    freedom: Array
+    unexplained: Array
+
+
+@dataclass(frozen=True, eq=False)
+class TwoRuns:
+    """Factors of two runs, and the prior of their difference.
+
+    Attributes:
+        reference: Factors of the segments of the reference run, of b base parameters.
+        loaded: Factors of the segments of the loaded run.
+        D: Columns of the difference in base parameters, shape (b, d).
+        known: Known part c of the difference, shape (b,).
+        mean: Prior mean of beta and x, shape (b + d,).
+        precision: Prior precision (inverse covariance), shape (b + d, b + d), positive definite.
+        share: Share of independent rows [-].
+        unknown: Joints whose gain is unknown, shape (u,), int.
+    """
+
+    reference: tuple[Factors, ...]
+    loaded: tuple[Factors, ...]
+    D: Array
+    known: Array
+    mean: Array
+    precision: Array
+    share: float
+    unknown: Array
+
+    def compare(self, *, by_joint: bool = True) -> Compared:
+        """Fit both runs and the unknown gains together.
+
+        Standard errors are from the scatter of the scores of segments and of joints, and are at
+        least those for a ``share`` of independent rows. With fewer than 12 segments the latter are
+        used.
+
+        Args:
+            by_joint: Whether standard errors include the scatter between joints of each run.
+
+        Raises:
+            NotConvergedError: If the gains do not converge.
+
+        References:
+            Gautier, Briot (2014), Global identification of joint drive gains and dynamic parameters
+            of robots, Journal of Dynamic Systems, Measurement, and Control 136, section 3, which
+            uses total least squares instead.
+        """
+        size, u = len(self.mean), len(self.unknown)
+        gain = self._first_gains()
+        theta = self.alike(gain)[0]
+        for _ in range(_STEPS if u else 1):
+            at = theta if u else None
+            solution, bread = self._minimum(self._both(gain, at), self._level(gain))
+            theta, step = solution[:size], np.clip(solution[size:], -_LONGEST, _LONGEST)
+            if not u or np.abs(step).max() < _SETTLED:
+                break
+            gain[self.unknown] *= np.exp(step)
+        else:
+            raise NotConvergedError(
+                f"the gains have not converged: relative change {np.abs(step).max():.1e} after "
+                f"{_STEPS} steps, wanted less than {_SETTLED:g}; record motions with more "
+                "excitation in both runs, or state some of the gains",
+                "max_iterations",
+            )
+        covariance, freedom = self._errors(gain, at, solution, bread, by_joint)
+        squares = self._both(gain, at).residual_squares(solution)
+        torque = np.maximum(np.abs(gain) * np.sqrt(self._logged.torque_squares()), 1e-300)
+        return Compared(theta, gain, covariance, freedom, np.sqrt(squares) / torque)
+
+    def alike(self, gain: Array | None = None) -> tuple[Array, Array]:
+        """Return beta and x for a ``share`` of independent rows.
+
+        Args:
+            gain: Gains, shape (n,); None: 1.
+
+        Returns:
+            beta and x, shape (b + d,), and their covariance; its variances are at most those of
+            ``compare``.
+        """
+        gain = np.ones(len(self._logged.rows)) if gain is None else gain
+        return self._minimum(self._both(gain), self._level(gain))
+
+    def residual_ratios(self, theta: Array) -> Array:
+        """Return the joint residual of both runs over that of separate fits, shape (n,) [-].
+
+        Args:
+            theta: beta and x, shape (b + d,), of runs without unknown gains.
+
+        Returns:
+            Ratios of sums of squares, at least 1. They are large if the runs differ by something
+            other than x.
+        """
+        b = len(self.known)
+        without, loaded = self._whole
+        other = theta[:b] + self.known + self.D @ theta[b:]
+        together = without.residual_squares(theta[:b]) + loaded.residual_squares(other)
+        ratio: Array = together / np.maximum(self._own_squares, 1e-300)
+        return ratio
+
+    def residual_ratios_by_scales(self, free: int) -> Array:
+        """Return these ratios if the runs differ by the scale of torques instead of x.
+
+        Args:
+            free: Number of the first elements of x that may differ in addition.
+
+        Returns:
+            The ratios with one scale for all torques or with one per joint, whichever have the
+            smaller mean.
+        """
+        (without, loaded), size = self._whole, len(self.known)
+        one = np.ones(len(without.rows))
+        beta = self._minimum(self._extended(without, 0, one, None), self._level(one))[0][:size]
+        explained = np.column_stack([self.D[:, :free], beta])
+        end = size + free
+        precision = scipy.linalg.block_diag(self.precision[:end, :end], 1.0)
+        mean = np.append(self.mean[:end], 0.0)
+        scaled = replace(self, D=explained, mean=mean, precision=precision)
+        left = without.residual_squares(beta)
+        for j, (R, own) in enumerate(zip(loaded.triangles, loaded.columns, strict=True)):
+            A = R[:, :-1] @ explained[own]
+            left[j] += np.sum((R[:, -1] - A @ np.linalg.lstsq(A, R[:, -1], rcond=None)[0]) ** 2)
+        of_each: Array = left / np.maximum(self._own_squares, 1e-300)
+        return min(scaled.residual_ratios(scaled.compare().theta), of_each, key=np.mean)
+
+    def _level(self, gain: Array) -> Array:
+        """Return noise levels for rows treated as independent, shape (n,) [N m or N]."""
+        level: Array = np.abs(gain) * self._noise / np.sqrt(self.share)
+        return level
+
+    @cached_property
+    def _whole(self) -> tuple[Factors, Factors]:
+        """Factors of the whole reference run, and of the whole loaded run."""
+        return merge(self.reference), merge(self.loaded)
+
+    @cached_property
+    def _logged(self) -> Factors:
+        """Factors of all rows of both runs together."""
+        return merge(self._whole)
+
+    @cached_property
+    def _own_squares(self) -> Array:
+        """Residual sums of squares of separate fits for each joint and run, shape (n,)."""
+        own: Array = np.sum(
+            [[R[-1, -1] ** 2 for R in run.triangles] for run in self._whole], axis=0
+        )
+        return own
+
+    @cached_property
+    def _noise(self) -> Array:
+        """Noise level of each joint's signal, shape (n,), above 0.
+
+        If a joint moves in a few rows only, its residual is 0 whatever its noise; its RMS signal is
+        used then. Rows that are projected together have one noise level.
+        """
+        if self._logged.is_projected:
+            return self._common_noise
+        rows = np.maximum(self._logged.rows, 1)
+        used = len(self._whole) * np.array([len(own) for own in self._logged.columns])
+        freedom = np.maximum(rows - used / self.share, _LEAST_FREEDOM * rows)
+        signal = np.sqrt(self._logged.torque_squares() / rows)
+        left = np.where(self.share * rows > used, np.sqrt(self._own_squares / freedom), signal)
+        noise: Array = np.maximum(left, _FLOOR * signal)
+        return np.where(noise > 0, noise, 1.0)
+
+    @cached_property
+    def _common_noise(self) -> Array:
+        """Noise level of all rows together from a separate fit of each run, shape (n,)."""
+        one, count = np.ones(len(self._logged.rows)), int(self._logged.rows.sum())
+        squares = sum(run.weighted(one)[-1, -1] ** 2 for run in self._whole)
+        used = len(self._whole) * len(self.known)
+        freedom = max(count - used / self.share, _LEAST_FREEDOM * count)
+        signal = np.sqrt(self._logged.torque_squares().sum() / max(count, 1))
+        noise: Array = max(np.sqrt(squares / max(freedom, 1.0)), _FLOOR * signal) * one
+        return np.where(noise > 0, noise, 1.0)
+
+    def _first_gains(self) -> Array:
+        """Return initial gains, shape (n,): least squares of k i - W (beta + D x) = W c.
+
+        Noise of the currents biases them slightly towards 0.
+        """
+        gain = np.ones(len(self._logged.rows))
+        if len(self.unknown):
+            solution = self._minimum(self._both(gain, is_start=True), self._noise)[0]
+            gain[self.unknown] = solution[len(self.mean) :]
+        return gain
+
+    def _both(self, gain: Array, at: Array | None = None, *, is_start: bool = False) -> Factors:
+        """Return the factors of both runs with the columns of ``_extended``."""
+        runs = enumerate(self._whole)
+        return merge([self._extended(run, loaded, gain, at, is_start) for loaded, run in runs])
+
+    def _extended(
+        self, run: Factors, loaded: int, gain: Array, at: Array | None, is_start: bool = False
+    ) -> Factors:
+        """Return factors with the columns of beta, x and the unknown gains.
+
+        Args:
+            run: Factors of rows of one run, base parameters.
+            loaded: 1 of the loaded run, 0 of the reference.
+            gain: Gains, shape (n,).
+            at: Parameters beta and x of the gains' columns -W (beta + c + D x), shape (b + d,);
+                None: no such columns.
+            is_start: Whether the gains' columns are -i instead.
+        """
+        S, c = np.hstack([np.eye(len(self.known)), loaded * self.D]), loaded * self.known
+        unknown = self.unknown.tolist() if at is not None or is_start else []
+        added = range(S.shape[1] - len(S) + len(unknown))
+        triangles, columns = [], []
+        for j, (R, own) in enumerate(zip(run.triangles, run.columns, strict=True)):
+            used = np.flatnonzero(S[own].any(axis=0))
+            W, known, torque = R[:, :-1] @ S[own], R[:, :-1] @ c[own], gain[j] * R[:, -1]
+            rows = W[:, used]
+            if j in unknown:
+                used = np.append(used, S.shape[1] + unknown.index(j))
+                column = -torque if at is None else -(W @ at + known)
+                rows = np.column_stack([rows, column])
+                torque = 0.0 * torque if at is None else torque
+            triangles.append(triangle_of(np.column_stack([rows, torque - known])))
+            columns.append(used)
+        names = (*run.names, *map(str, added))
+        return Factors(
+            tuple(triangles), tuple(columns), run.rows, names, is_projected=run.is_projected
+        )
+
+    def _minimum(self, whole: Factors, sigma: Array) -> tuple[Array, Array]:
+        """Return the minimum of rows and prior, and the inverse information."""
+        rows, size = whole.weighted(sigma), len(self.mean)
+        root = np.zeros((size, rows.shape[1]))
+        root[:, :size] = scipy.linalg.cholesky(self.precision)
+        root[:, -1] = root[:, :size] @ self.mean
+        stacked = np.vstack([rows, root])
+        scale = np.linalg.norm(stacked[:, :-1], axis=0)
+        scale[scale == 0] = 1.0
+        R = triangle_of(np.column_stack([stacked[:, :-1] / scale, stacked[:, -1]]))
+        if len(self.unknown) and np.abs(np.diag(R)[:-1]).min() < _SINGULAR:
+            raise DataError(
+                "an unknown gain is not identifiable: the current of a joint is 0 or constant, or "
+                "it is not coupled to a joint of known gain or to the known mass; state the gain "
+                "of this joint"
+            )
+        inverse = np.linalg.inv(R[:-1, :-1]) / scale[:, None]
+        return inverse @ R[:-1, -1], inverse @ inverse.T
+
+    def _errors(
+        self, gain: Array, at: Array | None, solution: Array, bread: Array, by_joint: bool
+    ) -> tuple[Array, Array]:
+        """Return covariance and degrees of freedom, including the uncertainty of the prior.
+
+        The scatter between segments includes errors that vary with time. The scatter between the
+        joints of each run includes constant errors, as those of a gain or of friction. The larger
+        standard error of a parameter is used. The scatter of few parts may be too small, so a
+        standard error is at least that of independent noise.
+        """
+        if len(self.reference) + len(self.loaded) < FEWEST_SEGMENTS:
+            return bread, np.full(len(solution), np.inf)
+        runs = list(enumerate((self.reference, self.loaded)))
+        segments = [self._extended(f, loaded, gain, at) for loaded, run in runs for f in run]
+        covariance, freedom = self._scattered(segments, gain, solution, bread)
+        whole = [self._extended(run, loaded, gain, at) for loaded, run in enumerate(self._whole)]
+        joints = [_of_joint(run, j) for run in whole for j in range(len(gain))]
+        is_alone = not self._logged.is_projected  # else the rows of joints are mixed
+        if by_joint and is_alone and len(joints) >= FEWEST_SEGMENTS:
+            other, few = self._scattered(joints, gain, solution, bread)
+            freedom = np.where(np.diag(other) > np.diag(covariance), few, freedom)
+            covariance = at_least(covariance, np.diag(other))
+        return at_least(covariance, np.diag(bread)), freedom
+
+    def _scattered(
+        self, parts: Sequence[Factors], gain: Array, solution: Array, bread: Array
+    ) -> tuple[Array, Array]:
+        """Return covariance and degrees of freedom from the scores of parts of the rows."""
+        own, size = self.share * bread, len(self.mean)
+        found = scatter(parts, solution, np.abs(gain) * self._noise, own)
+        meat = self.share**2 * found.meat
+        meat[:size, :size] += self.precision
+        return sandwich(bread, meat), found.freedom()
+
+
+def _of_joint(factors: Factors, joint: int) -> Factors:
+    """Return the factors with the rows of one joint only."""
+    triangles = [R if j == joint else 0.0 * R for j, R in enumerate(factors.triangles)]
+    rows = np.where(np.arange(len(factors.rows)) == joint, factors.rows, 0)
+    return replace(factors, triangles=tuple(triangles), rows=rows)
+
+
+def payload_runs(
+    reference: Sequence[Reduction],
+    loaded: Sequence[Reduction],
+    layout: ParameterLayout,
+    K: Array,
+    urdf: Array,
+    spread: Array,
+    payloads: tuple[Array, Array, Array],
+    *,
+    share: float,
+    unknown: Sequence[int] = (),
+) -> TwoRuns:
+    """Return the comparison of a run without and a run with payloads.
+
+    The robot's inertias are the same in both runs. Friction and offsets of the drives differ,
+    because they change with load and temperature.
+
+    Args:
+        reference: The segments of the run without payloads.
+        loaded: The segments of the run with payloads.
+        layout: The robot's standard parameters.
+        K: Map to the base parameters, shape (b, p).
+        urdf: Standard parameters of the URDF, shape (p,).
+        spread: Their prior standard deviations, shape (p,).
+        payloads: Map from the payloads' parameters to the base parameters, shape (b, c); known
+            values of the parameters, NaN if unknown, shape (c,); and their plausible sizes, shape
+            (c,).
+        share: Share of independent rows [-].
+        unknown: Joints whose torque is a current of unknown gain.
+    """
+    columns, known, size = payloads
+    changing = [not term.is_inertia for _, term in layout.drive_parameters]
+    drives = layout.n_inertial + np.flatnonzero(changing)
+    free = np.isnan(known)
+    KS = K * (_WIDE * spread)
+    sizes = np.linalg.norm(KS, axis=1)
+    alike = KS / sizes[:, None]  # base parameters in units of their spread
+    about_urdf = np.linalg.inv(alike @ alike.T) / np.outer(sizes, sizes)
+    change = _WIDE * np.append(spread[drives], size[free])
+    return TwoRuns(
+        tuple(reduction.factors for reduction in reference),
+        tuple(reduction.factors for reduction in loaded),
+        np.hstack([K[:, drives], columns[:, free]]),
+        columns @ np.nan_to_num(known),
+        np.append(K @ urdf, np.zeros(len(change))),
+        scipy.linalg.block_diag(0.5 * (about_urdf + about_urdf.T), np.diag(change**-2.0)),
+        share,
+        np.array(unknown, dtype=int),
+    )

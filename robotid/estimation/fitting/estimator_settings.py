@@ -1,0 +1,539 @@
+"""The choice of the estimator and its settings: one table of settings per estimator."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING, Any, ClassVar, Self
+
+import numpy as np
+
+from robotid.base.exceptions import SettingsError
+from robotid.base.findings import listed
+from robotid.base.settings import Range, Settings, require_kind, setting
+
+if TYPE_CHECKING:
+    from robotid.estimation.estimators import BatchEstimator, RecursiveEstimator
+    from robotid.estimation.fitting.consistent_estimator import Known
+
+__all__ = [
+    "ESTIMATORS",
+    "BoundedSettings",
+    "ConsistentSettings",
+    "ConstraintSettings",
+    "DescentSettings",
+    "EstimatorSettings",
+    "GradientSettings",
+    "KalmanSettings",
+    "LogCholeskySettings",
+    "OLSSettings",
+    "PRXSettings",
+    "RLSSettings",
+    "RecursiveSettings",
+    "SimulationSettings",
+    "TLSSettings",
+    "WLSSettings",
+]
+
+_NOT_NEGATIVE = Range("x >= 0", lambda x: x >= 0)
+_COUNT = Range("1 to 10000", lambda x: 1 <= x <= 10_000)
+_LARGEST = 1e9  # [kg] or [m] of bounds, as of numbers in a URDF
+_WINDOW = Range("0.05 s or more", lambda x: 0.05 <= x < math.inf)
+_FINITE = Range("a positive, finite number", lambda x: 0 < x < math.inf)
+
+
+@dataclass(frozen=True)
+class ConstraintSettings(Settings):
+    """Bounds in addition to physical consistency, by name of the link that a joint moves."""
+
+    mass: Mapping[str, Any] = setting(
+        {}, "mass, or smallest and largest mass, of a link with all links fixed to it [kg]"
+    )
+    total_mass: float | Sequence[float] | None = setting(
+        None,
+        "mass, or smallest and largest mass, of all moving links [kg]",
+        reads=(int, float, list),
+    )
+    com: Mapping[str, Any] = setting(
+        {},
+        "lower and upper corner [[x, y, z], [x, y, z]] of a box in the link's frame that contains "
+        "the centre of mass [m]",
+    )
+    com_within: str = setting(
+        "none",
+        "constraint on all other centres of mass: inside the box or the convex hull of the link's "
+        "geometry in the URDF (links without geometry or meshes are not constrained); or none",
+        among=("none", "box", "hull"),
+    )
+    extent: str = setting(
+        "box",
+        "constraint on the mass distribution of a link: all mass inside the box of its geometry in "
+        "the URDF, or of its frames if it has no geometry, unless the data contradict it; or none",
+        among=("box", "none"),
+    )
+    pinned: Sequence[str] = setting((), "links that keep the URDF's inertial values")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _ = self.masses, self.total, self.boxes
+
+    @property
+    def masses(self) -> dict[str, tuple[float, float]]:
+        """Smallest and largest mass by link [kg]."""
+        return {name: _interval(value, f"mass of {name}") for name, value in self.mass.items()}
+
+    @property
+    def total(self) -> tuple[float, float] | None:
+        """Smallest and largest mass of all moving links together [kg]."""
+        return None if self.total_mass is None else _interval(self.total_mass, "total_mass")
+
+    @property
+    def boxes(self) -> dict[str, tuple[list[float], list[float]]]:
+        """Lower and upper corner of the box of the centre of mass, by link [m]."""
+        return {name: _corners(value, name) for name, value in self.com.items()}
+
+
+def _interval(value: object, what: str) -> tuple[float, float]:
+    """Return the bounds given by a number or by a pair of numbers."""
+    pair = [value, value] if _is_number(value) else value
+    if not (isinstance(pair, Sequence) and len(pair) == 2 and all(map(_is_number, pair))):
+        raise SettingsError(f"{what} is {value!r}, wanted a number or [smallest, largest] [kg]")
+    low, high = (math.inf if abs(x) > _LARGEST else float(x) for x in pair)
+    found = f"{what} is [{low:g}, {high:g}] kg"
+    if not (math.isfinite(low) and math.isfinite(high)):
+        raise SettingsError(
+            f"{what} is {value!r}, wanted finite numbers of at most {_LARGEST:g} kg; write "
+            f"{_LARGEST:g} for no upper bound"
+        )
+    if not low <= high:
+        raise SettingsError(
+            f"{found}: the first value is larger than the second; write the smaller one first"
+        )
+    return low, high
+
+
+def _corners(value: Any, name: str) -> tuple[list[float], list[float]]:  # noqa: ANN401
+    """Return the two corners of a box."""
+    try:
+        corners = [[float(x) for x in corner] for corner in value]
+    except (TypeError, ValueError, OverflowError):
+        corners = []
+    is_box = [len(corner) for corner in corners] == [3, 3]
+    if not is_box or not all(abs(x) <= _LARGEST for corner in corners for x in corner):
+        raise SettingsError(
+            f"com of {name} is {value!r}, wanted [[x, y, z], [x, y, z]] [m], each value at most "
+            f"{_LARGEST:g}"
+        )
+    low, high = corners
+    if any(a > b for a, b in zip(low, high, strict=True)):
+        raise SettingsError(
+            f"com of {name} is {value!r}: a coordinate of the first corner is larger than that of "
+            "the second; write the corner with the smaller coordinates first"
+        )
+    return low, high
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+@dataclass(frozen=True, init=False)
+class EstimatorSettings(Settings):
+    """The estimator and its settings, as ``EstimatorSettings("wls", robust="huber")``.
+
+    The call returns the settings class of that estimator. A setting of another estimator is an
+    error.
+
+    Attributes:
+        has_equal_weights: Whether all rows have equal weights, whatever the noise of their joints.
+        allows_for_noise: Whether the estimator itself accounts for noise of the regressor.
+    """
+
+    has_equal_weights: ClassVar[bool] = False
+    allows_for_noise: ClassVar[bool] = False
+
+    name: str = setting("consistent", "name of the estimator")
+
+    def __new__(cls, name: str = "consistent", **options: object) -> "EstimatorSettings":
+        require_kind(name, str, "estimator", f"one of {listed(ESTIMATORS)}")
+        kind = ESTIMATORS.get(name)
+        if cls is not EstimatorSettings:
+            return super().__new__(cls)
+        if kind is None:
+            raise SettingsError(f"estimator is {name!r}, wanted one of {listed(ESTIMATORS)}")
+        own = [f.name for f in fields(kind) if f.name != "name"]
+        own.sort(key=lambda key: key not in kind.__annotations__)
+        for key in options:
+            if key not in own:
+                had = listed(own)
+                raise SettingsError(f"estimator {name!r} has no setting {key!r}; it has {had}")
+        return super().__new__(kind)
+
+    @classmethod
+    def schema(cls) -> dict[str, Any]:
+        kinds = ESTIMATORS.values() if cls is EstimatorSettings else [cls]
+        schemas = [super(EstimatorSettings, kind).schema() for kind in kinds]
+        return {key: value for schema in schemas for key, value in schema.items()}
+
+    @classmethod
+    def from_dict(cls, table: Mapping[str, Any]) -> Self:
+        return cls(**table)
+
+    def make(self, known: "Known") -> "BatchEstimator | RecursiveEstimator[Any]":
+        """Return the estimator that reads rows or samples.
+
+        Args:
+            known: The robot and its prior.
+
+        Raises:
+            SettingsError: If constraints contradict each other or do not match the robot, or the
+                estimator reads a simulator.
+        """
+        raise SettingsError(f"{self!r} describes no estimator; use EstimatorSettings(name)")
+
+    @property
+    def words(self) -> str:
+        """Description of the estimator."""
+        return self.paths()["name"].text
+
+    @property
+    def loss(self) -> str:
+        """The robust loss; "none" for squared residuals."""
+        return str(getattr(self, "robust", "none"))
+
+    @property
+    def is_robust(self) -> bool:
+        """Whether rows with large residuals are downweighted."""
+        return self.loss != "none"
+
+    @property
+    def bounds(self) -> ConstraintSettings:
+        """The bounds in addition to physical consistency."""
+        return ConstraintSettings(**getattr(self, "constraints", {}))
+
+
+def _called(name: str, words: str) -> Any:  # noqa: ANN401
+    return setting(name, words, among=(name,))
+
+
+@dataclass(frozen=True, init=False)
+class RobustSettings(EstimatorSettings):
+    """Settings of estimators that can downweight rows with large residuals."""
+
+    robust: str = setting(
+        "none", "loss that downweights rows with large residuals", among=("none", "huber", "tukey")
+    )
+
+
+@dataclass(frozen=True, init=False)
+class BoundedSettings(EstimatorSettings):
+    """Settings of fits whose result is physically consistent."""
+
+    margin: float = setting(
+        1e-4,
+        "smallest eigenvalue of a body's pseudo-inertia relative to its prior size [-]",
+        within=_FINITE,
+    )
+    prior: str = setting(
+        "entropic",
+        "metric of the distance from the URDF's values (the prior)",
+        among=("entropic", "euclidean", "riemannian"),
+    )
+    prior_weight: float | str = setting(
+        "auto",
+        "weight of the URDF's values [-], or the method that chooses it from the fitted logs: cv "
+        "(cross-validation), evidence (marginal likelihood), or auto (cv; 1 if the logs are too "
+        "short for cv)",
+        among=("auto", "cv", "evidence"),
+        within=_FINITE,
+    )
+    draws: int = setting(
+        64,
+        "number of fits to resampled data and prior, which give the standard errors if bounds are "
+        "active; 0: standard errors without the bounds",
+        within=Range("0, or 10 to 10000", lambda x: x == 0 or 10 <= x <= 10_000),
+    )
+    constraints: Mapping[str, Any] = setting(
+        {}, "bounds in addition to physical consistency", reads=ConstraintSettings
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require_kind(self.constraints, Mapping, "constraints", "a table of bounds")
+        known = [each.name for each in fields(ConstraintSettings)]
+        if strange := [key for key in self.constraints if key not in known]:
+            raise SettingsError(
+                f"constraints has the key {strange[0]!r}, wanted keys of {listed(known)}"
+            )
+        _ = self.bounds
+
+
+@dataclass(frozen=True, init=False)
+class RecursiveSettings(BoundedSettings):
+    """Settings of estimators that read the samples one by one."""
+
+    physical: bool = setting(
+        False, "whether the last estimate is projected onto physically consistent parameters"
+    )
+
+
+@dataclass(frozen=True, init=False)
+class DescentSettings(RecursiveSettings):
+    """Settings of gradient methods, which end near the least squares solution."""
+
+    average: bool = setting(True, "whether the iterates are averaged")
+    passes: int = setting(4, "largest number of passes over the logs", within=_COUNT)
+    seed: int = setting(0, "seed of the random order of the samples; negative: order of time")
+
+    @property
+    def _common(self) -> dict[str, Any]:
+        """Return the arguments common to these estimators."""
+        rng = np.random.default_rng(self.seed) if self.seed >= 0 else None
+        return {"average": self.average, "passes": self.passes, "rng": rng}
+
+
+@dataclass(frozen=True)
+class OLSSettings(EstimatorSettings):
+    """Settings of ordinary least squares: none."""
+
+    has_equal_weights: ClassVar[bool] = True
+
+    name: str = _called("ols", "ordinary least squares")
+
+    def make(self, known: "Known") -> "BatchEstimator":
+        from robotid.estimation.estimators import OLS
+
+        return OLS(independent_share=known.share)
+
+
+@dataclass(frozen=True)
+class WLSSettings(RobustSettings):
+    """Settings of weighted least squares."""
+
+    name: str = _called("wls", "weighted least squares, rows weighted by the noise of their joint")
+
+    def make(self, known: "Known") -> "BatchEstimator":
+        from robotid.estimation.estimators import WLS
+
+        return WLS(independent_share=known.share)
+
+
+@dataclass(frozen=True)
+class TLSSettings(EstimatorSettings):
+    """Settings of total least squares."""
+
+    allows_for_noise: ClassVar[bool] = True
+
+    name: str = _called("tls", "total least squares, which also models noise of the regressor")
+    regressor_noise: float | None = setting(
+        None,
+        "RMS noise of each regressor column, relative to the RMS of the column [-]; if not stated "
+        "0.01, at most half of the residual's variance",
+        within=Range("x > 0", lambda x: x > 0),
+    )
+
+    def make(self, known: "Known") -> "BatchEstimator":
+        from robotid.estimation.estimators import TLS
+
+        return TLS(self.regressor_noise, independent_share=known.share)
+
+
+@dataclass(frozen=True)
+class ConsistentSettings(RobustSettings, BoundedSettings):
+    """Settings of the physically consistent fit."""
+
+    name: str = _called(
+        "consistent",
+        "weighted least squares with physically consistent bodies and the URDF's values as prior",
+    )
+
+    def make(self, known: "Known") -> "BatchEstimator":
+        from robotid.estimation.fitting.consistent_estimator import consistent_fit
+
+        return consistent_fit(self, known)
+
+
+@dataclass(frozen=True)
+class LogCholeskySettings(ConsistentSettings):
+    """Settings of the physically consistent fit in log-Cholesky parameters."""
+
+    name: str = _called(
+        "log_cholesky", "physically consistent fit in log-Cholesky parameters, without a cone"
+    )
+    starts: int = setting(
+        0,
+        "number of random initial values in addition to the solution of the cone programme",
+        within=Range("0 to 1000", lambda x: 0 <= x <= 1000),
+    )
+    seed: int = setting(0, "seed of the random initial values", within=_NOT_NEGATIVE)
+
+    def make(self, known: "Known") -> "BatchEstimator":
+        from robotid.estimation.estimators import LogCholesky
+        from robotid.estimation.fitting.consistent_estimator import consistent_fit
+
+        rng = np.random.default_rng(self.seed)
+        fit = consistent_fit(self, known, pins_negligible=False)
+        return LogCholesky(fit, starts=self.starts, rng=rng)
+
+
+@dataclass(frozen=True)
+class RLSSettings(RecursiveSettings):
+    """Settings of recursive least squares."""
+
+    name: str = _called("rls", "recursive least squares, sample by sample")
+    forgetting: float = setting(
+        1.0,
+        "forgetting factor: weight of a sample relative to the next one [-]",
+        within=Range("0 < x <= 1", lambda x: 0 < x <= 1),
+    )
+
+    def make(self, known: "Known") -> "RecursiveEstimator[Any]":
+        from robotid.estimation.estimators import RLS
+
+        # without forgetting the prior is not used: the result is that of batch least squares
+        std = np.sqrt(np.diag(known.covariance)) if self.forgetting < 1 else None
+        return RLS(known.sigma, self.forgetting, known.beta, std, known.share)
+
+
+@dataclass(frozen=True)
+class KalmanSettings(RecursiveSettings):
+    """Settings of the Kalman filter."""
+
+    name: str = _called("kalman", "a Kalman filter over the samples")
+    walk: float = setting(
+        0.0,
+        "standard deviation of the parameters' random walk per sample, over that of the prior [-]",
+        within=_NOT_NEGATIVE,
+    )
+    gate: float | bool = setting(
+        1 - 1e-7,
+        "innovation gate: probability that a row without a fault passes; false: no gate",
+        within=Range(
+            "0.5 <= x < 1, or false", lambda x: x is False or (x is not True and 0.5 <= x < 1)
+        ),
+    )
+
+    def make(self, known: "Known") -> "RecursiveEstimator[Any]":
+        from robotid.estimation.estimators import Kalman
+
+        gate = None if self.gate is False else float(self.gate)
+        return Kalman(known.sigma, known.beta, known.covariance, self.walk, gate, known.share)
+
+
+@dataclass(frozen=True)
+class PRXSettings(DescentSettings):
+    """Settings of the paper's update law."""
+
+    name: str = _called("prx", "gradient steps along PRX (the paper's update), sample by sample")
+    step: str = setting(
+        "exact",
+        "step length: exact (line search) or printed (as in the paper)",
+        among=("exact", "printed"),
+    )
+    metric: str = setting(
+        "noise",
+        "metric of the residual for the exact step: noise (levels), mass (matrix), or rows",
+        among=("noise", "mass", "rows"),
+    )
+
+    def make(self, known: "Known") -> "RecursiveEstimator[Any]":
+        from robotid.estimation.estimators import PRX
+
+        own = {"step": self.step, "metric": self.metric, **self._common}
+        return PRX(known.sigma, known.beta, **own)
+
+
+@dataclass(frozen=True)
+class GradientSettings(DescentSettings):
+    """Settings of normalised gradient steps."""
+
+    name: str = _called("gradient", "normalised gradient steps, sample by sample")
+    step_size: float = setting(
+        1.0, "relaxation factor [-]", within=Range("0 < x < 2", lambda x: 0 < x < 2)
+    )
+
+    def make(self, known: "Known") -> "RecursiveEstimator[Any]":
+        from robotid.estimation.estimators import NormalisedGradient
+
+        own = {"step_size": self.step_size, **self._common}
+        return NormalisedGradient(known.sigma, known.beta, **own)
+
+
+@dataclass(frozen=True)
+class SimulationSettings(EstimatorSettings):
+    """Settings of closed-loop output error: simulated from commands, fitted to positions."""
+
+    name: str = _called(
+        "simulation",
+        "closed-loop output error: simulates the controlled robot from the logged commands and "
+        "fits it to the logged positions; [controller] has the known parameters of the controllers",
+    )
+    window: float | None = setting(
+        None, "length of the simulated windows [s]; default 2.5, or 0.5 if the logged torque "
+        "drives the robot", within=_WINDOW,
+    )  # fmt: skip
+    lead: float | None = setting(
+        None, "time by which the simulation starts before each window [s]; default 0.6, or 0 if "
+        "the logged torque drives the robot", within=_NOT_NEGATIVE,
+    )  # fmt: skip
+    step: float = setting(
+        2e-3,
+        "largest step of the integration [s]",
+        within=Range("2e-5 to 0.1", lambda x: 2e-5 <= x <= 0.1),
+    )
+    bodies: float = setting(
+        0.1,
+        "plausible relative error of the URDF's inertial parameters; 0: they are fixed",
+        within=_NOT_NEGATIVE,
+    )
+    error: str = setting(
+        "output",
+        "compared signal: output, positions (closed-loop output error, CLOE); input, simulated "
+        "and logged torques (closed-loop input error, CLIE); direct, as input, but with the "
+        "derivatives of inverse dynamics, which neglect the change of the motion (DIDIM; gains "
+        "and delay must be stated)",
+        among=("output", "input", "direct"),
+    )
+    velocities: bool = setting(
+        False,
+        "whether logged velocities are fitted in addition to the positions; velocities that a "
+        "drive computes from its encoder add no information",
+    )
+    torques: bool = setting(
+        True, "whether torques are fitted in addition to the positions, if all logs have them"
+    )
+    whiten: bool = setting(
+        True, "whether the residuals are whitened by their estimated correlation"
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.error == "output":
+            return
+        compared = f"estimator: error = {self.error!r} compares torques"
+        if not self.torques:
+            raise SettingsError(
+                f"{compared}, but torques is false; remove torques = false, or set error = 'output'"
+            )
+        if self.velocities:
+            raise SettingsError(
+                f"{compared}, but velocities is true; remove velocities = true, or set "
+                "error = 'output'"
+            )
+
+
+#: The settings of each estimator, by its name.
+ESTIMATORS: Mapping[str, type[EstimatorSettings]] = {
+    kind.name: kind
+    for kind in (
+        OLSSettings,
+        WLSSettings,
+        TLSSettings,
+        ConsistentSettings,
+        LogCholeskySettings,
+        RLSSettings,
+        KalmanSettings,
+        PRXSettings,
+        GradientSettings,
+        SimulationSettings,
+    )
+}

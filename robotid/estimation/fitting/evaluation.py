@@ -1,0 +1,383 @@
+"""Predicted torques of recordings and their metrics; logs in files are processed in pieces."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial, reduce
+from itertools import chain
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from robotid.base.text import period
+from robotid.base.typing import Array
+from robotid.data.log import Log, Trajectory
+from robotid.data.signal_settings import SignalSettings
+from robotid.data.signals import turns_note
+from robotid.dynamics.prediction import predict
+from robotid.estimation.fitting.metrics import Metrics, TorqueSums
+from robotid.estimation.fitting.survey import PieceTask, SurveyedLog
+from robotid.estimation.workers.plan import WorkPlan
+from robotid.robot.model import RobotModel
+
+__all__ = [
+    "Evaluation",
+    "Extent",
+    "Recording",
+    "evaluate_logs",
+    "hidden_joints",
+    "pool",
+    "predict",
+    "shares_rows",
+]
+
+_SHOWN = 10_000  # samples at the start, in the middle and at the end that are stored for plots
+_SAMPLED = 200  # rows spread over a log that are searched for in other logs
+_SHARED = 0.02  # share of them that another log may contain: adjacent windows share a row
+
+
+@dataclass(frozen=True)
+class Extent:
+    """Size of a log.
+
+    Attributes:
+        samples: Number of rows of the log.
+        rate: Median sampling rate [Hz].
+        start: First time stamp [s].
+        end: Last time stamp [s].
+        smooth: Number of samples of the smoothed trajectory.
+        rows_used: Number of torque rows used.
+        segments: Number of uninterrupted segments of the trajectory.
+    """
+
+    samples: int
+    rate: float
+    start: float
+    end: float
+    smooth: int
+    rows_used: int
+    segments: int
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """A log processed for a model. Of a long log, only some segments are in memory.
+
+    Attributes:
+        log: The raw log, or its first rows.
+        signals: The settings of the processing, automatic settings resolved.
+        trajectory: The smoothed motion or segments of it, N samples.
+        mask: Rows used, shape (N, n_rows), bool.
+        extent: Size of the whole log.
+    """
+
+    log: Log
+    signals: SignalSettings
+    trajectory: Trajectory
+    mask: Array
+    extent: Extent
+
+    @property
+    def name(self) -> str:
+        """Name of the log's file and its time range, as ``run3.parquet 5-7.4 s``."""
+        file = Path(self.log.path).name or "log"
+        return f"{file} {period(self.extent.start, self.extent.end)}"
+
+    @property
+    def is_partial(self) -> bool:
+        """Whether only segments of the motion are in memory."""
+        return len(self.trajectory.t) < self.extent.smooth
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """A recording with its predicted torques.
+
+    Attributes:
+        recording: The recording.
+        torques: Predicted torques by name of the parameters, each of shape (N, n_rows) [N m, N];
+            they include the baselines "urdf", "gravity_only" and "urdf_with_drives".
+        sums: Sums over the whole log from which the metrics are computed, by name of the
+            parameters, without the baselines.
+        metrics: Metrics over the whole log, likewise.
+        is_refitted: Whether it is a validation recording that contains fitted rows.
+    """
+
+    recording: Recording
+    torques: Mapping[str, Array]
+    sums: Mapping[str, TorqueSums]
+    metrics: Mapping[str, Metrics]
+    is_refitted: bool = False
+
+
+def evaluate_logs(
+    fitted: Sequence[SurveyedLog],
+    validation: Sequence[SurveyedLog],
+    parameters: Mapping[str, Array],
+    prior: Array | None,
+    driven: Array | None = None,
+    *,
+    plan: WorkPlan | None = None,
+) -> tuple[tuple[Evaluation, ...], tuple[Evaluation, ...]]:
+    """Return the torques that parameters predict for logs, and their metrics.
+
+    Args:
+        fitted: Logs that were fitted, surveyed with the model that predicts.
+        validation: Validation logs.
+        parameters: Standard parameters by name, each of shape (p,).
+        prior: Parameters of the URDF, shape (p,): the baselines are its torque with and without
+            motion; None: no baselines.
+        driven: Parameters of the URDF with drives fitted to the logs, shape (p,), a baseline;
+            None: no such baseline.
+        plan: Processes that work on the pieces of logs in files; None: this process.
+
+    Returns:
+        Evaluations of the fitted logs and of the validation logs. For logs in files the torques
+        are those of the segments stored for plots.
+
+    Raises:
+        DataError: If no row of a log is used.
+    """
+    work = partial(_score, parameters=parameters, prior=prior, driven=driven)
+    other = _score_logs(validation, work, plan)
+    sought = [score.sampled for score in other]
+    own = _score_logs(fitted, partial(work, sought=sought), plan)
+    again = [any(_is_shared(score.found[k]) for score in own) for k in range(len(other))]
+    return tuple(map(_conclude, fitted, own)), tuple(map(_conclude, validation, other, again))
+
+
+def shares_rows(one: Log, other: Log) -> bool:
+    """Return whether two logs contain the same recorded rows, whatever the names of their files.
+
+    Args:
+        one: A log.
+        other: Another log of the same joints.
+
+    Returns:
+        Whether the second log contains more than 2 % of 200 rows of positions and torques spread
+        over the first. The common row of two adjacent windows does not count.
+    """
+    rows, others = (np.hstack([log.q, log.tau]) for log in (one, other))
+    return _is_shared(_rows_in(rows[:: _sampled_every(len(rows))], others))
+
+
+def pool(model: RobotModel, evaluations: Sequence[Evaluation], name: str) -> Metrics:
+    """Return the metrics over several recordings together.
+
+    Args:
+        model: The robot.
+        evaluations: The recordings, at least one.
+        name: Which parameters predict.
+
+    Raises:
+        DataError: If no row of any recording is used.
+    """
+    together = reduce(TorqueSums.merge, [evaluation.sums[name] for evaluation in evaluations])
+    return together.metrics(model.row_names, model.row_units)
+
+
+def hidden_joints(model: RobotModel, evaluations: Sequence[Evaluation]) -> tuple[str, ...]:
+    """Return the joints of a static model whose gravity torque is smaller than their residual.
+
+    Stiction at rest hides small changes of the gravity torque of these joints.
+
+    Args:
+        model: The robot.
+        evaluations: The recordings.
+    """
+    if not model.is_static or not evaluations:
+        return ()
+    metrics = pool(model, evaluations, "estimate").per_joint
+    torque = np.vstack([e.torques["estimate"] for e in evaluations])
+    used = np.vstack([e.recording.mask for e in evaluations])
+    hidden = tuple(
+        row
+        for j, row in enumerate(model.row_names)
+        if row in metrics and np.std(torque[used[:, j], j]) <= metrics[row].rmse
+    )
+    return hidden if len(hidden) < len(metrics) else ()
+
+
+_Shown = tuple[Trajectory, Array, Mapping[str, Array]]  # motion, rows used, torques
+
+
+@dataclass(frozen=True, eq=False)
+class _Score:
+    """Result of a log, or of its pieces so far."""
+
+    sums: Mapping[str, TorqueSums]  # from which the metrics are computed, by parameters
+    smooth: int  # samples
+    used: int  # torque rows used
+    segments: frozenset[int]  # numbers of the segments that have samples
+    turned: Array  # (n,), bool: joints whose position was unwrapped
+    shown: tuple[_Shown, ...]  # all samples, or a few segments
+    sampled: Array  # (m, 2 n), recorded rows spread over the log
+    found: tuple[Array, ...]  # which of the sampled rows of each other log are in this one
+
+    def join(self, other: "_Score") -> "_Score":
+        """Return the result together with that of the following pieces."""
+        return _Score(
+            sums={name: x.merge(other.sums[name]) for name, x in self.sums.items()},
+            smooth=self.smooth + other.smooth,
+            used=self.used + other.used,
+            segments=self.segments | other.segments,
+            turned=self.turned | other.turned,
+            shown=self.shown + other.shown,
+            sampled=np.concatenate([self.sampled, other.sampled]),
+            found=tuple(one | two for one, two in zip(self.found, other.found, strict=True)),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class _Part(PieceTask):
+    """A piece, with the rows of it that are stored: sampled rows, and a segment for plots."""
+
+    sampled: slice
+    shown: slice | None
+
+
+def _parts(log: SurveyedLog) -> list[_Part]:
+    last = len(log.pieces) - 1
+    shown = {0: slice(_SHOWN), (last + 1) // 2: slice(_SHOWN), last: slice(-_SHOWN, None)}
+    if log.is_in_memory:
+        shown = {0: slice(None)}
+    every = _sampled_every(log.stop - log.first)
+    return [
+        _Part(piece, slice((log.first - piece.first) % every, None, every), shown.get(k))
+        for k, piece in enumerate(log.pieces)
+    ]
+
+
+def _score_logs(
+    logs: Sequence[SurveyedLog], work: "partial[_Score]", plan: WorkPlan | None
+) -> list[_Score]:
+    """Return the result of each log; raise an error for a log without samples."""
+    parts = [_parts(log) for log in logs]
+    every = list(chain.from_iterable(parts))
+    found = (work(x, None) for x in every) if plan is None else plan.map(work, every, "evaluating")
+    scores = []
+    for log, own in zip(logs, parts, strict=True):
+        by_piece = [next(found) for _ in own]
+        score = reduce(_Score.join, by_piece)
+        if not score.smooth:
+            raise log.too_short()
+        if not score.shown:  # the chosen pieces have no samples: choose another piece
+            filled = next(k for k, piece in enumerate(by_piece) if piece.smooth)
+            again = work(replace(own[filled], shown=slice(_SHOWN)), None)
+            score = replace(score, shown=again.shown)
+        scores.append(score)
+    return scores
+
+
+def _score(
+    whole: _Part,
+    threads: int | None,
+    *,
+    parameters: Mapping[str, Array],
+    prior: Array | None,
+    driven: Array | None,
+    sought: Sequence[Array] = (),
+) -> _Score:
+    """Return the result of a piece, with the torques of a part of it."""
+    header, rows = whole.piece.header, whole.piece.read()
+    model, motion, mask = header.model, rows.trajectory, rows.mask
+    of_urdf = {"urdf": prior, "urdf_with_drives": driven}
+    moving = {name: pi for name, pi in of_urdf.items() if pi is not None}
+    torques = _predict_all(model, motion, {**parameters, **moving}, prior, header.is_compiled)
+    baselines = {x: torques[x] for x in ("gravity_only", *moving) if x in torques}
+    shown: tuple[_Shown, ...] = ()
+    if whole.shown is not None and len(motion.t):
+        start, stop, _ = whole.shown.indices(len(motion.t))
+        stored = {name: torque[start:stop] for name, torque in torques.items()}
+        # the whole motion is used as it is, with its cached properties
+        part = motion if stop - start == len(motion.t) else motion.part(start, stop)
+        shown = ((part, mask[start:stop], stored),)
+    recorded = np.hstack([rows.positions, rows.torques])
+    measured = mask & [name not in model.passive for name in model.row_names]
+    return _Score(
+        sums={x: TorqueSums.of(motion.tau, torques[x], measured, baselines) for x in parameters},
+        smooth=len(motion.t),
+        used=int(mask.sum()),
+        segments=frozenset(np.unique(motion.segment).tolist()),
+        turned=rows.turned,
+        shown=shown,
+        sampled=recorded[whole.sampled],
+        found=tuple(_rows_in(sampled, recorded) for sampled in sought),
+    )
+
+
+def _predict_all(
+    model: RobotModel,
+    trajectory: Trajectory,
+    parameters: Mapping[str, Array],
+    prior: Array | None,
+    compiled: bool | None,
+) -> dict[str, Array]:
+    """Return the torques by each set of parameters and by the URDF's gravity, (N, n_rows) each."""
+    names = [*parameters] if prior is None else [*parameters, "gravity_only"]
+    if not len(trajectory.t) or not names:
+        return {name: np.empty((0, model.n_rows)) for name in names}
+    torques = predict(model, [*parameters.values()], trajectory, compiled=compiled)
+    if prior is not None:
+        inertial = np.where(np.arange(len(prior)) < model.layout.n_inertial, prior, 0.0)
+        still = np.zeros_like(trajectory.v)
+        at_rest = replace(trajectory, v=still, a=still, direction=None)  # without drive torques
+        torques += predict(model, [inertial], at_rest, compiled=compiled)
+    return dict(zip(names, torques, strict=True))
+
+
+def _conclude(log: SurveyedLog, score: _Score, is_refitted: bool = False) -> Evaluation:
+    """Return the evaluation of a log."""
+    motions, masks, torques = zip(*score.shown, strict=True)
+    extent = Extent(
+        samples=log.stop - log.first,
+        rate=1.0 / log.step,
+        start=float(log.stamps[log.first]),
+        end=float(log.stamps[log.stop - 1]),
+        smooth=score.smooth,
+        rows_used=score.used,
+        segments=len(score.segments),
+    )
+    head, model, sums = log.head, log.model, score.sums
+    names = [head.joints[j] for j in np.flatnonzero(score.turned)]
+    if names:
+        head = replace(head, notes=(*head.notes, turns_note(names)))
+    recording = Recording(head, log.signals, _joined(motions), np.concatenate(masks), extent)
+    predicted = {name: np.concatenate([t[name] for t in torques]) for name in torques[0]}
+    metrics = {name: s.metrics(model.row_names, model.row_units) for name, s in sums.items()}
+    return Evaluation(recording, predicted, sums, metrics, is_refitted)
+
+
+def _joined(motions: Sequence[Trajectory]) -> Trajectory:
+    """Return the motions as one trajectory, each with segments of its own."""
+    if len(motions) == 1:
+        return motions[0]
+    segments, number = [], 0
+    for motion in motions:
+        segments.append(np.unique(motion.segment, return_inverse=True)[1] + number)
+        number = int(segments[-1][-1]) + 1
+    joined: dict[str, Any] = {
+        key: np.concatenate([getattr(motion, key) for motion in motions])
+        for key in ("t", "q", "v", "a", "tau", "direction", "memory")
+        if getattr(motions[0], key) is not None
+    }
+    return replace(motions[0], **joined, segment=np.concatenate(segments))
+
+
+def _sampled_every(rows: int) -> int:
+    """Return the step between sampled rows of a log."""
+    return max(1, rows // _SAMPLED)
+
+
+def _rows_in(sampled: Array, rows: Array) -> Array:
+    """Return which sampled rows (m, 2 n) of positions and torques are among rows, shape (m,)."""
+    found = np.isin(sampled[:, 0], rows[:, 0])
+    likely = rows[np.isin(rows[:, 0], sampled[found, 0])]
+    for k in np.flatnonzero(found):
+        found[k] = (likely == sampled[k]).all(axis=1).any()
+    return found
+
+
+def _is_shared(found: Array) -> bool:
+    """Return whether enough rows were found in another log to call it the same recording."""
+    return int(found.sum()) > max(1, _SHARED * len(found))

@@ -1,0 +1,394 @@
+"""Bias of least squares due to encoder quantisation: errors in the variables of the regressor.
+
+A quantised position has noisy derivatives. The regressor W therefore has noise E, whose effect does
+not average out: H = W^T S^-1 W contains D = E[E^T S^-1 E], and least squares gives
+theta_ls = H^-1 (H - D) theta. The corrected estimate is theta = theta_ls + (H - D)^-1 D theta_ls.
+
+D is estimated by additional quantisation. Rounding errors e of the same encoder on the same motion,
+with a random zero of the encoder, are added to smoothed positions. They pass the same filter,
+differentiation and regressor. Terms linear in e cancel in the mean of +e and -e. With the scores
+s(theta) = W^T S^-1 (tau - W theta):
+
+    D theta = s(theta) - mean over e of [s_{+e}(theta) + s_{-e}(theta)] / 2
+
+The eigenvalues x of D relative to H are the shares of noise in the information along the
+eigenvectors. Along each of them the correction is a factor of 1 / (1 - x). D is estimated with an
+error, so directions that contain only noise cannot be corrected: x is limited by a bound, and the
+error of D is counted as an error of the estimate. The correction amplifies errors by the same
+factor. The bias varies over a log, so the scatter of the segments is also larger by about this
+factor; it is used as it is (coverages: docs/explanation/intervals.md).
+
+The part linear in e, [s_{+e} - s_{-e}] / 2, is the noise of the score due to the encoder. If a
+motion is repeated, its rounding errors are repeated, and the segments of the log scatter less than
+their sum. The difference is added to the covariance of the score.
+
+References:
+    Carroll, Ruppert, Stefanski, Crainiceanu (2006), Measurement Error in Nonlinear Models, chapters
+    5 (simulation extrapolation) and 7 (corrected scores).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from robotid.base.findings import Finding, listed
+from robotid.base.typing import Array
+from robotid.data.log import Trajectory
+from robotid.data.measured_velocity import quantum
+from robotid.data.signal_filters import local_polynomial
+from robotid.data.signal_settings import SignalSettings
+from robotid.dynamics.factors import Factors, Reduction
+from robotid.estimation.estimators.batch import solve_factor
+from robotid.estimation.fitting.recorded import Recordings
+from robotid.estimation.fitting.survey import SurveyedLog, hold_log
+
+if TYPE_CHECKING:
+    from robotid.estimation.fitting.fitted import Fit
+
+__all__ = [
+    "RegressorNoise",
+    "acceleration_noise",
+    "encoder_findings",
+    "find_regressor_noise",
+    "rounding_errors",
+    "smoothed",
+    "without_noise",
+]
+
+_FEWEST, _MOST = 4, 6  # pairs of rounding errors
+_PRECISE = 0.2  # uncertainty of the shift in standard errors at which no more pairs are drawn
+_WORST = 0.8  # largest share of noise in a direction that is corrected
+_SHARE_ERROR = 0.1  # relative standard error of a share of noise
+_MATTERS = 0.1  # shift of the parameters in standard errors below which nothing is corrected
+_NAMED, _WARNED = 0.5, 2.0  # shift of a parameter in standard errors: note, warning
+_ALIKE = 0.1  # share of noise over the largest share, from which a joint is named
+_CUBIC = 5  # smallest number of rows on each side for smoothing
+_JOINED = 4  # segments that are joined into one, for speed
+_ROWS = 20_000  # rows of a log in which the step of its positions is searched
+_FREQUENCIES = 2048  # frequencies at which the noise of an acceleration is summed
+_JOINTS = 4  # largest number of joints named in a finding
+
+
+@dataclass(frozen=True, eq=False)
+class RegressorNoise:
+    """Effect of position quantisation on least squares.
+
+    Attributes:
+        steps: Largest quantisation step of each joint's position in the logs, shape (n,)
+            [rad or m]; 0: none, or without effect because velocities are measured.
+        share: RMS of the quantisation noise of each acceleration, over the RMS of the
+            acceleration, shape (n,) [-].
+        shift: Bias of the base parameters, E[theta_ls] - theta, shape (b,).
+        std_error: Standard errors of the base parameters by residual and filter, without the
+            quantisation, shape (b,); inf if not identifiable.
+        meat: Covariance of the score that the scatter of segments does not include, shape (b, b):
+            of repeated rounding errors and of the shift.
+        is_corrected: Whether the estimate is corrected; if not, its covariance includes the shift.
+    """
+
+    steps: Array
+    share: Array
+    shift: Array
+    std_error: Array
+    meat: Array
+    is_corrected: bool = True
+
+    def uncorrected(self, information: Array) -> "RegressorNoise":
+        """Return the same with the shift counted as an error instead of corrected.
+
+        Args:
+            information: H = W^T S^-1 W of all rows, shape (b, b).
+        """
+        score = information @ self.shift
+        return replace(self, meat=self.meat + np.outer(score, score), is_corrected=False)
+
+
+def find_regressor_noise(
+    recordings: Recordings, whole: Reduction, theta: Array, sigma: Array, level: Array
+) -> RegressorNoise | None:
+    """Return the effect of position quantisation on least squares; None if it is negligible.
+
+    Args:
+        recordings: The recordings. Logs in files are represented by their windows in memory.
+        whole: Reduction of all of their rows, base parameters.
+        theta: Base parameters by least squares, shape (b,).
+        sigma: Noise level per joint that weighted the rows, shape (n_rows,) [N m or N].
+        level: Noise level per joint of the residual, shape (n_rows,) [N m or N].
+    """
+    model, factors, weights = recordings.model, whole.factors, 1.0 / sigma**2
+    if model.is_static or model.free_flyer:
+        return None
+    near = _in_memory(recordings)
+    if not near.fitted:
+        return None
+    steps = [_steps(log) for log in near.fitted]
+    share = _share(near.fitted, steps, whole)
+    size = np.sqrt(recordings.share * theta @ factors.information(1.0 / level**2) @ theta)
+    if share.max() ** 2 * size < _MATTERS:
+        return None
+    near = _without_steps(near, steps)
+    plain = _sums(near, [log.whole.trajectory for log in near.fitted], theta, weights)
+    scale = float(factors.rows.sum() / plain.rows)  # all rows over those in memory
+    bread = solve_factor(factors, sigma, theta).covariance
+    variance = np.diag(bread @ factors.information((level * weights) ** 2) @ bread)
+    error = np.sqrt(np.maximum(variance, 0.0) / recordings.share)
+    error = np.where(error > 0, error, np.inf)  # inf: not identifiable
+    rng, pairs = np.random.default_rng(0), list[tuple[_Sums, _Sums]]()
+    is_enough = False
+    while not is_enough:
+        pairs.append(_pair(near, steps, theta, weights, rng))
+        draws = np.array([plain.score - 0.5 * (one.score + two.score) for one, two in pairs])
+        is_enough = _is_enough(scale * draws @ bread / error)
+    if len(pairs) < _FEWEST:
+        return None
+    D = np.mean([0.5 * (one.information + two.information) for one, two in pairs], axis=0)
+    D, D_theta = scale * (D - plain.information), scale * draws.mean(axis=0)
+    root, move, error_of_move = without_noise(bread, D, D_theta)
+    linear = np.array([0.5 * (one.segments - two.segments) @ root for one, two in pairs])
+    along = factors.information(weights) @ root  # change of the score per move along a direction
+    meat = (along * (scale * _repeated(linear) + error_of_move**2)) @ along.T
+    meat = meat + scale**2 * np.cov(draws.T) / len(draws)
+    shift = -root @ move
+    return RegressorNoise(np.max(steps, axis=0), share, shift, error, meat)
+
+
+def encoder_findings(fit: "Fit") -> list[Finding]:
+    """Return a finding if encoder quantisation biases inertial parameters.
+
+    Args:
+        fit: The fit.
+    """
+    noise, model = fit.regressor_noise, fit.model
+    if noise is None:
+        return []
+    is_inertial = fit.mapping.K[:, : model.layout.n_inertial].any(axis=1)
+    moved = np.where(is_inertial, np.abs(noise.shift) / noise.std_error, 0.0)
+    worst = int(np.argmax(moved))
+    if moved[worst] < _NAMED:
+        return []
+    coarse = np.flatnonzero(noise.share > _ALIKE * noise.share.max())
+    names = [model.joints[j] for j in coarse]
+    largest = int(coarse[np.argmax(noise.steps[coarse])])
+    step, unit = float(noise.steps[largest]), "rad"
+    resolution = f" ({np.log2(2 * np.pi / step):.1f} bits per revolution)"
+    if model.joints[largest] in model.layout.prismatic:
+        unit, resolution = "m", ""
+    effect = (
+        "the estimate is corrected for this bias"
+        if noise.is_corrected
+        else "this estimator does not correct the bias, its standard errors include it"
+    )
+    message = (
+        f"{listed(names, _JOINTS)}: the position is quantised in steps of up to {step:.3g} "
+        f"{unit}{resolution}. The resulting noise is up to {100 * noise.share.max():.2g} % of the "
+        f"RMS acceleration and shifts {fit.mapping.base_names[worst]} by {moved[worst]:.1f} "
+        f"standard errors; {effect}. A longer log does not reduce it: lower cutoff, move faster, "
+        "log the velocity of the drive, or use an encoder of higher resolution"
+    )
+    evidence = {
+        f"step_{name}": float(noise.steps[j]) for name, j in zip(names, coarse, strict=True)
+    }
+    evidence |= {"std_errors": float(moved[worst]), "share_pct": 100 * float(noise.share.max())}
+    severity = "warning" if moved[worst] >= _WARNED else "note"
+    return [Finding("encoder_noise", severity, listed(names), message, evidence)]
+
+
+def smoothed(q: Array, steps: Array, width: int) -> Array:
+    """Return the change that removes most of the quantisation of positions, shape (N, n).
+
+    A cubic polynomial is fitted to the rows around each sample; the change is at most one step.
+
+    Args:
+        q: Unwrapped positions, shape (N, n) [rad or m].
+        steps: Quantisation steps of the encoders, shape (n,) [rad or m]; 0: none.
+        width: Number of rows over which the motion is approximated by a cubic, not even.
+    """
+    rows = (len(q) - 1) // 2 * 2 + 1
+    smooth = local_polynomial(q, min(width, rows), min(3, rows - 1))
+    change: Array = np.clip(smooth - q, -steps, steps)
+    return change
+
+
+def rounding_errors(q: Array, steps: Array, rng: np.random.Generator) -> Array:
+    """Return rounding errors of encoders with random zeros, shape (N, n) [rad or m].
+
+    Args:
+        q: Positions before quantisation, shape (N, n) [rad or m].
+        steps: Quantisation steps of the encoders, shape (n,) [rad or m]; 0: none.
+        rng: Random generator of the zeros.
+    """
+    count = q / np.where(steps > 0, steps, 1.0) + rng.random(q.shape[1])
+    errors: Array = (np.round(count) - count) * steps
+    return errors
+
+
+def without_noise(bread: Array, D: Array, D_theta: Array) -> tuple[Array, Array, Array]:
+    """Return (H - D)^-1 D theta along directions in which H and D are diagonal.
+
+    Args:
+        bread: Inverse of the information H, shape (b, b); 0 for parameters not identifiable.
+        D: Noise of H, shape (b, b).
+        D_theta: D theta, shape (b,).
+
+    Returns:
+        The directions, columns X with X X^T = H^-1 and X^T D X diagonal, shape (b, b); the step
+        along each, with a share of noise of at most 80 %, shape (b,); and the uncertainty of the
+        step due to that of D, shape (b,).
+    """
+    size, axes = np.linalg.eigh(bread)
+    root = axes * np.sqrt(np.maximum(size, 0.0))
+    x, rotation = np.linalg.eigh(root.T @ D @ root)
+    root, x = root @ rotation, np.clip(x, 0.0, _WORST)
+    move = root.T @ D_theta / (1.0 - x)
+    return root, move, move * _SHARE_ERROR * x / (1.0 - x)
+
+
+def acceleration_noise(step: float, signals: SignalSettings) -> float:
+    """Return the RMS acceleration due to white position noise of RMS 1 [1/s^2].
+
+    The noise passes the digital Butterworth filter, forward and backward, and two central
+    differences:
+
+    1 / (1 + (tan(pi f step) / tan(pi cutoff step))^(2 order)) and (sin(2 pi f step) / step)^2.
+
+    Args:
+        step: Time step of the rows [s].
+        signals: The settings, resolved.
+    """
+    f = (np.arange(_FREQUENCIES) + 0.5) / (2 * _FREQUENCIES * step)
+    gain = (np.sin(2 * np.pi * f * step) / step) ** 2
+    if signals.cutoff is not None:
+        ratio = np.tan(np.pi * f * step) / np.tan(np.pi * signals.cutoff * step)
+        gain = gain / (1.0 + ratio ** (2 * signals.order))
+    return float(np.sqrt(np.mean(gain**2)))
+
+
+@dataclass(frozen=True, eq=False)
+class _Sums:
+    """Score and information of the rows of logs for some motion."""
+
+    segments: Array  # (s, b), score W^T S^-1 (tau - W theta) of each segment
+    information: Array  # (b, b), W^T S^-1 W of all rows
+    rows: int
+
+    @property
+    def score(self) -> Array:
+        """Score of all rows, shape (b,)."""
+        total: Array = self.segments.sum(axis=0)
+        return total
+
+
+def _is_enough(moves: Array) -> bool:
+    """Return whether the shift of the parameters is known precisely, or is negligible.
+
+    Args:
+        moves: Shift in standard errors by each of k draws, shape (k, b).
+    """
+    count = len(moves)
+    if count < _FEWEST:
+        return bool((np.abs(moves.mean(axis=0)) < _MATTERS).all())
+    return count >= _MOST or bool((moves.std(axis=0, ddof=1) <= _PRECISE * np.sqrt(count)).all())
+
+
+def _sums(near: Recordings, motions: Sequence[Trajectory], theta: Array, weights: Array) -> _Sums:
+    """Return the sums over the rows of the logs in memory, for other motions."""
+    segments, rows = list[Array](), 0
+    information = np.zeros((len(theta), len(theta)))
+    for k, motion in enumerate(motions):
+        factors: Factors
+        for factors in near.segments(k, motion, _JOINED):
+            segments.append(factors.score(theta, weights))
+            information += factors.information(weights)
+            rows += int(factors.rows.sum())
+    return _Sums(np.array(segments), information, rows)
+
+
+def _pair(
+    near: Recordings,
+    steps: Sequence[Array],
+    theta: Array,
+    weights: Array,
+    rng: np.random.Generator,
+) -> tuple[_Sums, _Sums]:
+    """Return the sums over the rows with rounding errors added, and subtracted."""
+    logs = zip(near.fitted, steps, strict=True)
+    errors = [rounding_errors(log.head.q, own, rng) for log, own in logs]
+
+    def summed(sign: float) -> _Sums:
+        pairs = zip(near.fitted, errors, strict=True)
+        motions = [_shifted(log, sign * e).whole.trajectory for log, e in pairs]
+        return _sums(near, motions, theta, weights)
+
+    return summed(1.0), summed(-1.0)
+
+
+def _shifted(log: SurveyedLog, change: Array) -> SurveyedLog:
+    """Return a log in memory with changed positions, smoothed in the same way."""
+    source = replace(log.head, q=log.head.q + change)
+    return replace(log, source=source, windows=(source,), asked=log.signals)
+
+
+def _without_steps(near: Recordings, steps: Sequence[Array]) -> Recordings:
+    """Return logs in memory with most of the quantisation removed from the positions.
+
+    Added rounding errors then do not interact with those of the recorded positions.
+    """
+    logs = []
+    for log, own in zip(near.fitted, steps, strict=True):
+        period = 1.0 / ((log.signals.cutoff or np.inf) * log.step)  # [rows], of the filter
+        width = 2 * max(_CUBIC, round(period)) + 1
+        is_prismatic = np.isin(log.model.joints, list(log.model.layout.prismatic))
+        q = np.where(is_prismatic, log.head.q, np.unwrap(log.head.q, axis=0))
+        logs.append(_shifted(log, smoothed(q, own, width)))
+    return replace(near, fitted=logs, validation=())
+
+
+def _repeated(linear: Array) -> Array:
+    """Return the variance of the score along each direction due to repeated errors, shape (b,).
+
+    Segments with the same rounding errors do not scatter, but their errors add up.
+
+    Args:
+        linear: Part of the score linear in the rounding errors, of k draws, s segments and b
+            directions, shape (k, s, b).
+    """
+    total, scattered = linear.sum(axis=1) ** 2, (linear**2).sum(axis=1)
+    more: Array = np.maximum(np.mean(total - scattered, axis=0), 0.0)
+    return more
+
+
+def _in_memory(recordings: Recordings) -> Recordings:
+    """Return the fitted logs in memory; for logs in files, their windows in memory."""
+    if all(log.is_in_memory for log in recordings.fitted):
+        return recordings
+    windows = [
+        hold_log(log.model, window, log.signals)
+        for log in recordings.fitted
+        for window in log.looks
+    ]
+    usable = [log for log in windows if len(log.pieces[0].read().trajectory.t)]
+    return replace(recordings, fitted=usable, validation=(), plan=None)
+
+
+def _steps(log: SurveyedLog) -> Array:
+    """Return the quantisation steps of the positions of a log in memory, shape (n,).
+
+    They are 0 if velocities are measured.
+    """
+    if log.signals.velocity == "measured":
+        return np.zeros(len(log.model.joints))
+    return np.array([quantum(x, repeats=False) for x in log.head.q[:_ROWS].T])
+
+
+def _share(logs: Sequence[SurveyedLog], steps: Sequence[Array], whole: Reduction) -> Array:
+    """Return the quantisation noise of each acceleration over its RMS, at most 1, shape (n,)."""
+    noise = [
+        own / np.sqrt(12.0) * acceleration_noise(log.step, log.signals)
+        for log, own in zip(logs, steps, strict=True)
+    ]
+    own = np.sqrt(whole.squares[2] / max(whole.samples, 1))
+    largest = np.max(noise, axis=0)
+    share: Array = np.where(own > 0, largest / np.where(own > 0, own, 1.0), 0.0)
+    return np.minimum(share, 1.0)

@@ -1,0 +1,258 @@
+"""Standard errors for coloured noise, from the scatter of the scores of segments.
+
+Low-pass filtered residuals are correlated, and model errors are correlated over longer times, so
+rows are not independent measurements. Segments longer than the correlation time are independent:
+the covariance of the score of segment s, W_s^T (tau_s - W_s theta), is that of the noise, whatever
+its colour. It is computed from the factors of the segments, without a second pass over the rows.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from robotid.base.exceptions import NotConvergedError
+from robotid.base.typing import Array
+from robotid.dynamics.base_parameters import BaseMapping
+from robotid.dynamics.factors import Factors
+from robotid.estimation.estimators import Consistent, Estimate
+from robotid.estimation.estimators.batch import solve_factor
+from robotid.estimation.estimators.segments import FEWEST_SEGMENTS, quantile, scatter
+
+__all__ = [
+    "Redraws",
+    "StandardErrors",
+    "about_prior",
+    "measured_errors",
+    "standard_of",
+    "with_wls_errors",
+]
+
+_LEAST_SOLVED = 0.8  # smallest share of the resampled fits that must be solved
+
+
+@dataclass(frozen=True, eq=False)
+class StandardErrors:
+    """How the standard errors of an estimate were computed.
+
+    Attributes:
+        method: Description of the method.
+        segments: Number of segments whose scores were used.
+        inflation: Variance of the scores over that of independent rows [-].
+        freedom: Degrees of freedom of each base parameter's standard error, shape (b,).
+        unbounded: Standard errors of the standard parameters without the bounds, shape (p,); None
+            if no bound is active.
+    """
+
+    method: str
+    segments: int
+    inflation: float
+    freedom: Array
+    unbounded: Array | None = None
+
+    @property
+    def quantile(self) -> Array:
+        """Half-width of each base parameter's 95 % interval in standard errors, shape (b,)."""
+        return quantile(self.freedom)
+
+
+@dataclass(frozen=True, eq=False)
+class Redraws:
+    """Resampling of a physically consistent fit, for standard errors with active bounds."""
+
+    fit: Consistent
+    draws: int  # number of fits to resampled data and prior; 0: without the bounds
+    rng: np.random.Generator  # of the noise
+
+
+def measured_errors(
+    estimate: Estimate,
+    segments: Sequence[Factors],
+    factors: Factors,
+    share: float,
+    K: Array,
+    sigma: Array,
+    *,
+    is_filter: bool = False,
+    weight_ratio: float = 1.0,
+    redraws: Redraws | None = None,
+    more: Array | None = None,
+) -> tuple[Estimate, StandardErrors]:
+    """Return an estimate with its covariance from the scatter of the segments.
+
+    With the bread B, the covariance if rows were independent, and the meat M, the covariance of the
+    score:
+
+    * base parameters: B M B, as for any least squares with correlated rows;
+    * standard parameters: B (K^T M K + g L) B with B = (K^T H K + L)^-1. L is the precision of the
+      prior as it was weighted, g is its ratio to the precision L / g of the plausible prior; this
+      is the mean square error if the true parameters have the plausible prior. If bounds are
+      active, it is computed from fits to resampled data and prior; without ``redraws`` the bounds
+      are neglected;
+    * a filter with forgetting: its own covariance times the mean inflation.
+
+    Args:
+        estimate: Base parameters, shape (b,), or standard ones, shape (p,), with the covariance
+            for a ``share`` of independent rows.
+        segments: Factors of the segments, base parameters.
+        factors: Factors of all segments together.
+        share: Share of the rows that the covariance assumes to be independent [-].
+        K: Map to the base parameters, shape (b, p).
+        sigma: Noise level per joint that weighted the rows, shape (n,) [N m or N].
+        is_filter: Whether the estimator weights rows in another way, by forgetting or a gate.
+        weight_ratio: Weight of the prior over its plausible weight [-].
+        redraws: Resampling, for an estimate whose details name active bounds.
+        more: Covariance of the score in addition to the scatter, shape (b, b); None: 0.
+
+    Returns:
+        The estimate, and how its standard errors were computed. With fewer than 12 segments, the
+        given share of the rows is assumed to be independent.
+
+    Raises:
+        NotConvergedError: If more than a fifth of the resampled fits are not solved.
+    """
+    b = len(factors.names)
+    if not (estimate.details.get("active") and redraws is not None and redraws.draws > 0):
+        redraws = None  # no bound is active, or bounds are neglected
+    if len(segments) < FEWEST_SEGMENTS:
+        method = (
+            f"the bandwidth of the filter: a share of {share:.3g} of the rows is assumed to be "
+            f"independent, because the logs have only {len(segments)} segments longer than the "
+            "correlation time of the filter"
+        )
+        errors = StandardErrors(method, len(segments), 1 / share, np.full(b, np.inf))
+        R = factors.weighted(sigma)[:b, :b]
+        meat = share * R.T @ R + (0.0 if more is None else share**2 * more)
+        if redraws is not None:
+            return _bounded(estimate, errors, redraws, factors, sigma, meat)
+        if len(estimate.theta) != b and (weight_ratio > 1.0 or more is not None):
+            C = about_prior(estimate.covariance, K, meat, R, share, max(weight_ratio, 1.0))
+            estimate = replace(estimate, covariance=C)
+        elif more is not None:
+            C = np.where(np.isfinite(estimate.covariance), estimate.covariance, 0.0)
+            estimate = replace(estimate, covariance=estimate.covariance + share**2 * C @ more @ C)
+        return estimate, errors
+    is_open = ~np.isfinite(np.diag(estimate.covariance))
+    C = np.where(np.isfinite(estimate.covariance), estimate.covariance, 0.0)
+    if len(estimate.theta) != b:
+        found = scatter(segments, K @ estimate.theta, sigma, share * K @ C @ K.T)
+        found = found if more is None else replace(found, meat=found.meat + more)
+        R = factors.weighted(sigma)[:b, :b]
+        covariance = about_prior(C, K, share**2 * found.meat, R, share, weight_ratio)
+    elif not is_filter:
+        bread = solve_factor(factors, sigma, estimate.theta).covariance
+        found = scatter(segments, estimate.theta, sigma, bread)
+        found = found if more is None else replace(found, meat=found.meat + more)
+        covariance = found.covariance
+    else:
+        found = scatter(segments, estimate.theta, sigma, share * C)
+        covariance = C * (share * found.inflation)
+        if more is not None:
+            covariance += share**2 * C @ more @ C
+    covariance[is_open, is_open] = np.inf
+    estimate = replace(estimate, covariance=covariance)
+    method = f"the scatter of the scores of {len(segments)} segments"
+    errors = StandardErrors(method, len(segments), found.inflation, found.freedom())
+    if redraws is not None:
+        return _bounded(estimate, errors, redraws, factors, sigma, share**2 * found.meat)
+    return estimate, errors
+
+
+def with_wls_errors(estimate: Estimate, wls: Estimate) -> Estimate:
+    """Return a gradient method's estimate with a covariance derived from weighted least squares.
+
+    A gradient method ends near the minimum of least squares. Its mean square error is the
+    covariance of that minimum plus the square of the distance to it.
+
+    Args:
+        estimate: Base parameters, shape (b,).
+        wls: Weighted least squares of the same rows.
+    """
+    distance = estimate.theta - wls.theta
+    covariance = wls.covariance + np.outer(distance, distance)
+    reason = "standard errors are those of wls plus the distance to it"
+    return replace(
+        estimate,
+        covariance=covariance,
+        rank=wls.rank,
+        condition=wls.condition,
+        undetermined=wls.undetermined,
+        message=estimate.message.split("; a gradient method")[0] + f"; {reason}",
+    )
+
+
+def standard_of(
+    estimate: Estimate, mapping: BaseMapping, prior: Array, spread: Array
+) -> tuple[Array, Array]:
+    """Return the standard parameters of an estimate and their covariance, prior included.
+
+    Args:
+        estimate: Base parameters, shape (b,), or standard ones, shape (p,).
+        mapping: Standard to base parameters.
+        prior: Standard parameters of the URDF, shape (p,).
+        spread: Their prior standard deviations, shape (p,).
+    """
+    if estimate.names == mapping.names:
+        return estimate.theta, estimate.covariance
+    G, K = mapping.gain(spread), mapping.K
+    before = np.diag(spread**2)
+    # parameters that are not identifiable (infinite variance) keep the variance of the prior
+    base = np.where(np.isfinite(estimate.covariance), estimate.covariance, K @ before @ K.T)
+    covariance = before - G @ K @ before + G @ base @ G.T
+    return mapping.to_standard(estimate.theta, prior, spread), covariance
+
+
+def about_prior(
+    C: Array, K: Array, meat: Array, R: Array, share: float, weight_ratio: float
+) -> Array:
+    """Return C (K^T meat K + weight_ratio L) C with L = C^-1 - share K^T R^T R K, shape (p, p).
+
+    Args:
+        C: Covariance of the standard parameters if a share of the rows is independent, (p, p).
+        K: Map to the base parameters, shape (b, p).
+        meat: Covariance of the score of these rows, shape (b, b).
+        R: Weighted factor of all rows, base parameters, shape (b, b).
+        share: Share of the rows that the covariance assumes to be independent [-].
+        weight_ratio: Weight of the prior over its plausible weight [-].
+    """
+    KC = K @ C
+    RKC = R @ KC
+    covariance: Array = weight_ratio * (C - share * RKC.T @ RKC) + KC.T @ meat @ KC
+    return 0.5 * (covariance + covariance.T)
+
+
+def _bounded(
+    estimate: Estimate,
+    errors: StandardErrors,
+    redraws: Redraws,
+    factors: Factors,
+    sigma: Array,
+    meat: Array,
+) -> tuple[Estimate, StandardErrors]:
+    """Return the estimate with the mean square distance of resampled fits as its covariance.
+
+    The meat is the covariance of the score of the rows of ``Consistent.rows``.
+    """
+    fit = redraws.fit
+    rows = fit.rows(factors, sigma)
+    found, failures = fit.programme.redrawn(
+        rows, fit.prior_weight, estimate.theta, meat, fit.weight_ratio, redraws.draws, redraws.rng
+    )
+    if len(found) < _LEAST_SOLVED * redraws.draws:
+        raise NotConvergedError(
+            f"standard errors with active bounds cannot be computed: Clarabel solved {len(found)} "
+            f"of {redraws.draws} fits to resampled data; set draws = 0 for standard errors without "
+            "the bounds",
+            failures[0],
+        )
+    unsolved = f" ({len(failures)} more not solved: {failures[0]})" if failures else ""
+    method = (
+        f"{errors.method}; bounds are active: {len(found)} fits to resampled data and "
+        f"prior{unsolved}"
+    )
+    freedom = 1.0 / (1.0 / errors.freedom + 1.0 / len(found))
+    covariance = found.T @ found / len(found)
+    return (
+        replace(estimate, covariance=covariance),
+        replace(errors, method=method, freedom=freedom, unbounded=estimate.std_error),
+    )

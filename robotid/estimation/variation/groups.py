@@ -1,0 +1,354 @@
+"""Parameters that may vary between runs, and the information of each run on them.
+
+The drive terms of each drive, the gain of each joint's torque signal, and a payload on the last
+link are three kinds of groups with the same form: columns B in base parameters, and the rows that
+they act on. The torque of a run is W (theta + B x) with theta of the fit to all runs and x of the
+group in this run. The zero of each joint's position has no columns: its rows are the derivatives of
+the torque by the position. One group is estimated with the others at theta.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from robotid.base.typing import Array
+from robotid.dynamics.base_parameters import BaseMapping
+from robotid.dynamics.factors import Factors
+from robotid.estimation.variation.mixed_effects import Runs
+from robotid.robot.model import RobotModel
+
+__all__ = [
+    "FEWEST_RUNS",
+    "Group",
+    "RunSums",
+    "RunsOf",
+    "columns_of",
+    "groups_at",
+    "inflation_of",
+    "runs_of",
+    "sums_of",
+    "with_zeros",
+]
+
+#: Smallest number of runs whose scatter is estimated.
+FEWEST_RUNS = 3
+_DRIVE = 0.1  # plausible standard deviation of a drive term, over the drive's torque
+_GAIN = 0.02  # ... of a gain
+_MASS = 0.01  # ... of the mass on the last link, over the mass of the robot
+_REACH = 0.1  # [m] ... of its centre of mass
+_ZERO = {"rad": 0.005, "m": 0.001}  # ... of the zero of a position
+_LEVER = 0.01  # ... and its torque over that of its joint, at least
+_PAYLOAD = ("m", "mcx", "mcy", "mcz")
+_SMALLEST = 0.01  # torque of a drive over that of its largest term below which this share counts
+_RANK = 1e-9  # eigenvalue over the largest below which a run does not determine a direction
+_LEAST = 1e-12  # smallest information and inflation
+
+
+@dataclass(frozen=True, eq=False)
+class Group:
+    """Parameters that vary together.
+
+    Attributes:
+        kind: "drive", "gain", "payload" or "zero".
+        name: Name of the drive, joint or link.
+        parameters: Their names, q items.
+        units: Their units, q items.
+        columns: B, shape (b, q); 0 for a zero.
+        rows: The joints whose torque they change, indices.
+    """
+
+    kind: str
+    name: str
+    parameters: tuple[str, ...]
+    units: tuple[str, ...]
+    columns: Array
+    rows: tuple[int, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class RunsOf:
+    """The runs' information about the deviation of a group from the fit.
+
+    Attributes:
+        group: The group.
+        centre: Its values in the fit, shape (q,): 0 for a payload, 1 for a gain.
+        runs: Information about x, coloured noise included.
+        inflation: Variance of coloured noise over that of independent rows [-].
+        across: Rows of the group in A^T A with A = W B of all Q parameters of all groups, in their
+            order, shape (k, q, Q); None: the other groups are independent of it.
+    """
+
+    group: Group
+    centre: Array
+    runs: Runs
+    inflation: float
+    across: Array | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class RunSums:
+    """Sums over the rows of k runs; those of new runs are added without the rows of the others.
+
+    The rows are A = W B of the Q parameters of all groups, in their order, and the residuals
+    r = tau - W theta, over the noise level of their joint. Zeros are last: see ``with_zeros``.
+
+    Attributes:
+        H: A^T A of each run, shape (k, Q, Q). A pair of groups counts the joints of both.
+        h: A^T r of each run, shape (k, Q), each group over its own joints.
+        scatter: Of each group, the scatter of the scores of segments about each run's estimate,
+            and that of independent rows, shape (g, 2); see ``inflation_of``.
+        sigma: Noise level per joint, shape (n,) [N m or N].
+    """
+
+    H: Array
+    h: Array
+    scatter: Array
+    sigma: Array
+
+    def joined(self, new: "RunSums") -> "RunSums":
+        """Return the sums of these runs and of new ones.
+
+        Args:
+            new: Sums of the new runs, of the same groups, theta and noise levels.
+        """
+        H, h = np.concatenate([self.H, new.H]), np.concatenate([self.h, new.h])
+        return RunSums(H, h, self.scatter + new.scatter, self.sigma)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain values, as result.json has them: of H, the upper triangle, row by row."""
+        upper = np.triu_indices(self.H.shape[1])
+        return {
+            "H": self.H[:, *upper].tolist(),
+            "h": self.h.tolist(),
+            "scatter": self.scatter.tolist(),
+            "sigma": self.sigma.tolist(),
+        }
+
+    @classmethod
+    def from_dict(cls, stated: Mapping[str, Any]) -> "RunSums":
+        """Return the sums from plain values; see ``to_dict``.
+
+        Args:
+            stated: The values.
+        """
+        h = np.array(stated["h"])
+        H = np.zeros((*h.shape, h.shape[1]))
+        rows, columns = np.triu_indices(h.shape[1])
+        H[:, rows, columns] = H[:, columns, rows] = stated["H"]
+        return cls(H, h, np.array(stated["scatter"]), np.array(stated["sigma"]))
+
+
+def sums_of(
+    model: RobotModel,
+    mapping: BaseMapping,
+    segments: Sequence[Sequence[Factors]],
+    standard: Array,
+    sigma: Array,
+) -> RunSums:
+    """Return the sums of runs over all groups of parameters.
+
+    Args:
+        model: The robot.
+        mapping: Standard to base parameters.
+        segments: Factors of the segments of each run, base parameters; k items.
+        standard: Standard parameters of the residual, shape (p,).
+        sigma: Noise level per joint, shape (n,) [N m or N].
+    """
+    theta, groups = mapping.to_base(standard), [g for g, _ in groups_at(model, mapping, standard)]
+    products = [_products(run, groups, theta, sigma) for run in segments]
+    scatter = [
+        _scatter([(H[:, own, own], g[:, own]) for H, g in products]) for own in _places(groups)
+    ]
+    H, h = (np.array([each[k].sum(axis=0) for each in products]) for k in (0, 1))
+    return RunSums(H, h, np.array(scatter), sigma)
+
+
+def with_zeros(
+    sums: RunSums, groups: Sequence[Group], rows: Sequence[Sequence[tuple[Array, Array, Array]]]
+) -> RunSums:
+    """Return sums with those over the rows of the zeros of the positions.
+
+    Args:
+        sums: The sums of k runs, in which they are 0.
+        groups: All groups, as of ``groups_at``, those of the zeros last.
+        rows: Of each run and segment, over N samples with n rows each, divided by the noise level:
+            A of the other groups, shape (N n, Q - z), that of the z zeros, (N n, z), and r, (N n,).
+    """
+    H, h, scatter = sums.H.copy(), sums.h.copy(), sums.scatter.copy()
+    z = sum(group.kind == "zero" for group in groups)
+    own, others = slice(H.shape[1] - z, None), slice(0, H.shape[1] - z)
+    parts = [[(D.T @ D, D.T @ r) for _, D, r in run] for run in rows]
+    for k, run in enumerate(rows):
+        H[k, own, own] = sum(D_D for D_D, _ in parts[k])
+        h[k, own] = sum(D_r for _, D_r in parts[k])
+        H[k, others, own] = sum(A.T @ D for A, D, _ in run)
+    H[:, own, others] = H[:, others, own].transpose(0, 2, 1)
+    for j in range(z):
+        each = [np.array([(D_D[j, j], D_r[j]) for D_D, D_r in run]) for run in parts]
+        scatter[len(groups) - z + j] = _scatter([(x[:, :1, None], x[:, 1:]) for x in each])
+    return RunSums(H, h, scatter, sums.sigma)
+
+
+def runs_of(
+    model: RobotModel,
+    mapping: BaseMapping,
+    standard: Array,
+    sums: RunSums,
+    unit: Array,
+) -> tuple[RunsOf, ...]:
+    """Return the information of each run on each group of parameters.
+
+    Args:
+        model: The robot.
+        mapping: Standard to base parameters.
+        standard: As of ``sums_of``.
+        sums: The sums of k runs.
+        unit: Index of the robot of each run, shape (k,), int, from 0.
+    """
+    every = groups_at(model, mapping, standard)
+    places = _places([group for group, _ in every])
+    kept = [k for k, own in enumerate(places) if sums.H[:, own, own].any()]  # some run has effects
+    columns = np.concatenate([np.r_[places[k]] for k in kept]) if kept else np.empty(0, dtype=int)
+    squares = np.einsum("kqq->q", sums.H)
+    of_gains = {group.name: squares[own].item()
+                for (group, _), own in zip(every, places, strict=True)
+                if group.kind == "gain"}  # fmt: skip
+    found = []
+    for k in kept:
+        (group, centre), own = every[k], places[k]
+        H, inflation = sums.H[:, own, own], _ratio(*sums.scatter[k])
+        if group.kind == "zero":
+            like_gain = np.sqrt(of_gains[group.name] / squares[own])
+            scale = np.maximum(_ZERO[group.units[0]], _LEVER * like_gain)
+        else:
+            scale = _scale(group, centre, H.sum(axis=0), model, standard)
+        runs = Runs(H / inflation, sums.h[:, own] / inflation, unit, scale)
+        found.append(RunsOf(group, centre, runs, inflation, sums.H[:, own][:, :, columns]))
+    return tuple(found)
+
+
+def _places(groups: Sequence[Group]) -> list[slice]:
+    """Return the places of the parameters of each group among those of all."""
+    ends = np.cumsum([group.columns.shape[1] for group in groups]).tolist()
+    return [slice(end - g.columns.shape[1], end) for g, end in zip(groups, ends, strict=True)]
+
+
+def groups_at(
+    model: RobotModel, mapping: BaseMapping, standard: Array
+) -> list[tuple[Group, Array]]:
+    """Return the groups and their values in the fit.
+
+    Args:
+        model: The robot.
+        mapping: Standard to base parameters.
+        standard: Standard parameters of the fit, shape (p,).
+    """
+    layout, base = model.layout, mapping.base_names
+    rows = tuple(range(model.n_rows))
+    eye, found = np.eye(len(base)), []
+    units = dict(zip(layout.names, layout.units, strict=True))
+    places = {name: k for k, name in enumerate(layout.names)}
+    for drive in layout.drives:
+        own = [k for k, name in enumerate(base) if name.rpartition(".")[0] == drive.name
+               and name in layout.drive_names]  # fmt: skip
+        if own:
+            names = tuple(base[k] for k in own)
+            own_units = tuple(units[name] for name in names)
+            group = Group("drive", drive.name, names, own_units, eye[:, own], rows)
+            found.append((group, standard[[places[n] for n in names]]))
+    theta = mapping.to_base(standard)
+    if not model.constraints:  # rows of one joint each
+        first = model.n_rows - len(layout.joints)
+        for j, joint in enumerate(layout.joints, start=first):
+            gain = Group("gain", joint, (f"{joint}.gain",), ("-",), theta[:, None], (j,))
+            found.append((gain, np.ones(1)))
+    link = layout.bodies[-1]
+    names = tuple(f"{link}.{term}" for term in _PAYLOAD)
+    columns = mapping.K[:, [places[name] for name in names]]
+    payload = Group("payload", link, names, tuple(units[n] for n in names), columns, rows)
+    found.append((payload, np.zeros(len(names))))
+    if not (model.constraints or model.free_flyer):
+        for joint in layout.joints:
+            unit, none = "m" if joint in layout.prismatic else "rad", np.zeros((len(base), 1))
+            zero = Group("zero", joint, (f"{joint}.zero",), (unit,), none, rows)
+            found.append((zero, np.zeros(1)))
+    return found
+
+
+def _products(
+    segments: Sequence[Factors], groups: Sequence[Group], theta: Array, sigma: Array
+) -> tuple[Array, Array]:
+    """Return A^T A (s, Q, Q) and A^T r (s, Q) of each segment with A = W B, r = tau - W theta.
+
+    A of a group is 0 in rows of joints that it does not act on. Rows are divided by the noise level
+    of their joint.
+    """
+    B, acts = columns_of(groups, len(sigma))
+    H, g = np.zeros((len(segments), B.shape[1], B.shape[1])), np.zeros((len(segments), B.shape[1]))
+    for k, segment in enumerate(segments):
+        for j, level in enumerate(sigma):
+            R, own = segment.triangles[j] / level, segment.columns[j]
+            A = R[:, :-1] @ (B[own] * acts[j])
+            H[k] += A.T @ A
+            g[k] += A.T @ (R[:, -1] - R[:, :-1] @ theta[own])
+    return H, g
+
+
+def columns_of(groups: Sequence[Group], n_rows: int) -> tuple[Array, Array]:
+    """Return B of all groups, shape (b, Q), and in which of a sample's rows each acts, (n_rows, Q).
+
+    Args:
+        groups: The groups.
+        n_rows: Number of rows of a sample.
+    """
+    sizes = [group.columns.shape[1] for group in groups]
+    acts = np.array([[j in group.rows for group in groups] for j in range(n_rows)])
+    return np.hstack([group.columns for group in groups]), np.repeat(acts, sizes, axis=1)
+
+
+def inflation_of(runs: Sequence[tuple[Array, Array]]) -> float:
+    """Return the variance of the scores of segments about each run's estimate.
+
+    It is relative to that of independent rows of the stated noise level, and common to all runs: a
+    run alone has too few segments.
+
+    Args:
+        runs: Of each run, A^T A (s, q, q) and A^T r (s, q) of its s segments.
+    """
+    return _ratio(*_scatter(runs))
+
+
+def _scatter(runs: Sequence[tuple[Array, Array]]) -> tuple[float, float]:
+    """Return the scatter of the scores of segments, and the one of independent rows."""
+    scatter, expected = 0.0, 0.0
+    for H, g in runs:
+        bread = np.linalg.pinv(H.sum(axis=0), rcond=_RANK, hermitian=True)
+        scores = g - H @ (bread @ g.sum(axis=0))
+        scatter += float(np.einsum("si,ij,sj->", scores, bread, scores))
+        leverage = H @ bread
+        expected += float(np.einsum("sii->", leverage) - np.einsum("sij,sji->", leverage, leverage))
+    return scatter, expected
+
+
+def _ratio(scatter: float, expected: float) -> float:
+    """Return the inflation of two sums of ``_scatter``; 1 if there is one segment per run."""
+    return max(scatter / expected, _LEAST) if expected > _LEAST else 1.0
+
+
+def _scale(group: Group, centre: Array, H: Array, model: RobotModel, standard: Array) -> Array:
+    """Return the plausible standard deviation of each parameter of a group, shape (q,).
+
+    Terms of a drive may change its torque by a tenth.
+    """
+    if group.kind == "gain":
+        return np.array([_GAIN])
+    if group.kind == "payload":
+        mass = _MASS * float(standard[: model.layout.n_inertial : 10].sum())
+        return mass * np.array([1.0, _REACH, _REACH, _REACH])
+    norms = np.sqrt(np.maximum(np.diag(H), _LEAST))
+    torque = np.sqrt(max(float(centre @ H @ centre), 0.0))
+    least = _SMALLEST * np.abs(norms).max()
+    scale: Array = _DRIVE * np.maximum(torque, least) / norms
+    return scale

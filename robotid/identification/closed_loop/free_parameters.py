@@ -1,0 +1,513 @@
+"""Free parameters of drives, loops and bodies, and the simulator that an estimator calls."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from robotid.base.exceptions import NotConvergedError
+from robotid.base.typing import Array
+from robotid.data.log import Trajectory
+from robotid.dynamics.memory import remember
+from robotid.dynamics.prediction import predict
+from robotid.dynamics.simulation.loops import ClosedLoopRobot, Column, Loops, RollOut, Window
+from robotid.estimation.estimators.simulator import Residual
+from robotid.identification.closed_loop.drive_torques import drive_torques
+from robotid.robot.assumed import with_assumed_inertials
+from robotid.robot.drives import DriveTerm
+from robotid.robot.model import RobotModel
+from robotid.robot.parameters import inertial_from_pseudo_inertia, pseudo_inertia
+
+__all__ = ["FreeParameter", "LoopSimulator", "TorqueRows", "free_body_parameters", "with_terms"]
+
+_STARTS = 2  # steps of the initial states of windows
+_SHARES = (1.0, 0.3, 0.1)  # step lengths that are tried
+_NEAR = 3.0  # prior of an initial position about the measured one [RMS position errors]
+_POSSIBLE = 1e-9  # smallest relative eigenvalue of the pseudo-inertia of a body that may change
+#: Entries of a body's triangle: the logarithm of the root of its mass, and its centre.
+_ENTRIES = ((3, 3), (0, 3), (1, 3), (2, 3))
+
+
+@dataclass(frozen=True, eq=False)
+class FreeParameter:
+    """A free parameter of one joint, or of several joints that share it.
+
+    Attributes:
+        name: Such as ``"elbow.armature"``; of several joints, ``"calf.armature"``.
+        what: "armature", "kp", "kd", "limit", "delay", "zero", "term", or "body": a coordinate of
+            the difference between a body and the URDF's.
+        joints: Indices of the joints.
+        prior: Prior value.
+        spread: Prior standard deviation; inf without a prior.
+        lowest: Lower bound.
+        highest: Upper bound.
+        term: The friction term.
+        coordinate: Number of a body's coordinate, 0 to 3.
+    """
+
+    name: str
+    what: str
+    joints: tuple[int, ...]
+    prior: float
+    spread: float
+    lowest: float = -np.inf
+    highest: float = np.inf
+    term: DriveTerm | None = None
+    coordinate: int = 0
+
+    @classmethod
+    def of_term(
+        cls, owner: str, term: DriveTerm, joints: tuple[int, ...], prior: float, spread: float
+    ) -> "FreeParameter":
+        """Return the parameter of a friction term, with the bounds of the term.
+
+        Args:
+            owner: The joint, or the group of joints that share it.
+            term: The term.
+            joints: Indices of the joints.
+            prior: Prior value.
+            spread: Prior standard deviation.
+        """
+        lowest = 0.0 if term.is_nonnegative else -np.inf
+        name = f"{owner}.{term.name}"
+        return cls(name, "term", joints, prior, spread, lowest, term.highest, term)
+
+
+def free_body_parameters(robot: ClosedLoopRobot, spread: float) -> list[FreeParameter]:
+    """Return free parameters of bodies relative to the URDF, four each, with prior 0.
+
+    J' = U T T' U' with U U' the URDF's pseudo-inertia, and T the unit matrix except its last
+    column, (c, exp m). Mass, centre of mass and the moments about the joint change; the
+    distribution about the centre does not. Every value is a physically consistent body.
+
+    Args:
+        robot: The robot.
+        spread: Prior standard deviation of each coordinate [-]; 0.1 is about 20 % of the mass, and
+            a tenth of the radius of gyration for the centre of mass.
+
+    References:
+        Rucker, Wensing (2022), Smooth parameterization of rigid-body inertia, (12)-(14).
+    """
+    model = robot.model
+    J = pseudo_inertia(model.standard_parameters()[: model.layout.n_inertial])
+    values = np.linalg.eigvalsh(J)
+    found = []
+    for body, joint in enumerate(robot.joint_of_body):
+        if values[body, 0] <= _POSSIBLE * values[body, -1]:
+            continue  # a massless frame or an inconsistent body of the URDF stays fixed
+        name = model.layout.bodies[body]
+        found += [
+            FreeParameter(f"{name}.{what}", "body", (joint,), 0.0, spread, coordinate=k)
+            for k, what in enumerate(("mass", "cx", "cy", "cz"))
+        ]
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class TorqueRows:
+    """Torque rows of logs, reduced: R [K pi, 1] is their residual, weighted to unit noise.
+
+    Attributes:
+        model: The robot with the standard parameters pi.
+        R: Triangular factor, shape (b + 1, b + 1).
+        K: Base parameters of standard ones, shape (b, p).
+    """
+
+    model: RobotModel
+    R: Array
+    K: Array
+
+
+@dataclass(frozen=True, eq=False)
+class LoopSimulator:
+    """A robot in closed loop with free parameters and windows of logs, for an estimator.
+
+    Attributes:
+        robot: The robot.
+        windows: Windows of its logs.
+        base: Values of the loops; the free parameters replace theirs.
+        free_parameters: The free parameters.
+        torque: Rows of measured torques along the measured motion; None if not used.
+        velocities: Whether measured velocities are compared in addition to positions.
+        error: The compared signals. "output": positions, and torques of the drives if ``lag`` is
+            given; "input": only these torques; "direct": the same, with derivatives that neglect
+            the change of the motion.
+        lag: Lag of each torque after its command, shape (n,) [samples], as in ``drive_torques``;
+            None if torques of roll-outs are not compared.
+        fine: The robot with smaller steps, whose roll-outs are compared; derivatives are those of
+            ``robot``. None: ``robot`` itself.
+    """
+
+    robot: ClosedLoopRobot
+    windows: tuple[Window, ...]
+    base: Loops
+    free_parameters: tuple[FreeParameter, ...]
+    torque: "TorqueRows | None" = None
+    velocities: bool = False
+    error: str = "output"
+    lag: Array | None = None
+    fine: ClosedLoopRobot | None = None
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        return tuple(free.name for free in self.free_parameters)
+
+    @cached_property
+    def prior(self) -> Array:
+        return np.array([free.prior for free in self.free_parameters])
+
+    @cached_property
+    def prior_std(self) -> Array:
+        return np.array([free.spread for free in self.free_parameters])
+
+    @cached_property
+    def bounds(self) -> Array:
+        bounds = [(free.lowest, free.highest) for free in self.free_parameters]
+        return np.array(bounds).reshape(-1, 2).T
+
+    def loops(self, theta: Array) -> Loops:
+        """Return bodies, drives and loops at given values of the free parameters.
+
+        Args:
+            theta: Values of the free parameters, shape (c,).
+        """
+        base = self.base
+        changed = {
+            name: getattr(base, name).copy()
+            for name in ("armature", "kp", "kd", "limit", "delay", "zero", "values")
+        }
+        for free, value in zip(self.free_parameters, theta, strict=True):
+            if free.term is not None:
+                places = [base.place(j, free.term) for j in free.joints]
+                changed["values"][places] = value
+            elif free.what != "body":
+                changed[free.what][list(free.joints)] = value
+        return replace(base, bodies=self._bodies(theta)[0], **changed)
+
+    def roll_out(self, theta: Array, windows: Sequence[Window] | None = None) -> list[RollOut]:
+        """Return the roll-outs of windows.
+
+        Args:
+            theta: Values of the free parameters, shape (c,).
+            windows: The windows; all if None.
+
+        Raises:
+            NotConvergedError: If a step has no solution.
+        """
+        return self.robot.roll_out(self.loops(theta), self.windows if windows is None else windows)
+
+    def with_better_start(self, theta: Array) -> "LoopSimulator":
+        """Return the simulator with fitted initial states: measured ones have noise.
+
+        With friction an initial error may persist, so that a lead before the window is not enough.
+
+        Args:
+            theta: Values of the free parameters, shape (c,).
+
+        Raises:
+            NotConvergedError: If a step has no solution.
+        """
+        n, loops, columns = len(self.base.kp), self.loops(theta), self._starts()
+        windows = [replace(window, first=window.start_row) for window in self.windows]
+        for _ in range(_STARTS):
+            outs = self.robot.roll_out(loops, windows, columns)
+            errors = np.concatenate([_error(out) for out in outs])
+            sigma = np.maximum(np.sqrt(np.mean(errors**2, axis=0)), 1e-12)
+            best = [float(np.sum((_error(out) / sigma) ** 2)) for out in outs]
+            changes = [_better_start(out, sigma) for out in outs]
+            at_rest = [np.stack([w.around, np.zeros(n)]) for w in windows]
+            corrected = list(zip([w.start for w in windows], changes, strict=True))
+            tries = [at_rest, *([q + share * x for q, x in corrected] for share in _SHARES)]
+            left = list(range(len(windows)))  # without a corrected start that is better
+            for starts in tries:
+                tried = {k: replace(windows[k], given=starts[k]) for k in left}
+                try:
+                    outs = (self.fine or self.robot).roll_out(loops, list(tried.values()))
+                except NotConvergedError:
+                    continue  # these starts cannot be simulated; others can
+                for k, out in zip(tried, outs, strict=True):
+                    cost = float(np.sum((_error(out) / sigma) ** 2))
+                    if cost < best[k]:
+                        best[k], windows[k] = cost, tried[k]
+                if starts is not at_rest:
+                    left = [k for k in left if windows[k] is not tried[k]]
+        both = zip(self.windows, windows, strict=True)
+        return replace(self, windows=tuple(replace(w, given=new.start) for w, new in both))
+
+    def rows(self, theta: Array) -> tuple[Array, Array]:
+        """Return the derivatives and residuals of the torque rows; see ``Simulator``.
+
+        Args:
+            theta: Values of the free parameters, shape (c,).
+        """
+        if self.torque is None:
+            return np.zeros((0, len(theta))), np.zeros(0)
+        R, K = self.torque.R, self.torque.K
+        pi, slopes = self.standard(self.torque.model, theta)
+        return R[:, :-1] @ (K @ slopes), R[:, -1] - R[:, :-1] @ (K @ pi)
+
+    def torque_mismatch(self, theta: Array) -> Array:
+        """Return the relative RMS error of the torques of roll-outs, shape (n,) [-].
+
+        It is relative to the logged torque or that of the roll-outs, whichever is larger.
+
+        Args:
+            theta: Values of the free parameters, shape (c,).
+
+        Raises:
+            NotConvergedError: If a step has no solution.
+        """
+        torques = replace(self, error="input").residuals(theta, with_slopes=False)
+        error = np.concatenate([part.e for part in torques])
+        logged = np.concatenate([w.log.tau[w.counted] for w in self.windows])
+        size = np.maximum(np.mean(logged**2, axis=0), np.mean((logged - error) ** 2, axis=0))
+        share: Array = np.sqrt(np.mean(error**2, axis=0) / np.maximum(size, 1e-300))
+        return share
+
+    def standard(self, model: RobotModel, theta: Array) -> tuple[Array, Array]:
+        """Return a robot's standard parameters, shape (p,), and their derivatives, shape (p, c).
+
+        Args:
+            model: The robot, with the terms of the loops; a term that the loops lack is 0.
+            theta: Values of the free parameters, shape (c,).
+        """
+        layout, loops = model.layout, self.loops(theta)
+        place, pi = {}, np.zeros(len(layout.names))
+        pi[: layout.n_inertial] = loops.bodies.reshape(-1)
+        for i, (d, term) in enumerate(layout.drive_parameters, start=layout.n_inertial):
+            j = model.joints.index(layout.drives[d].name)
+            place[j, "armature" if term.is_inertia else term] = i
+            if term.is_inertia:
+                pi[i] = loops.armature[j]
+            elif term in loops.terms[j]:
+                pi[i] = loops.values[loops.place(j, term)]
+        slopes = np.zeros((len(pi), len(theta)))
+        changes = iter(self._bodies(theta)[1])
+        body_of = {joint: body for body, joint in enumerate(self.robot.joint_of_body)}
+        for k, free in enumerate(self.free_parameters):
+            if free.what == "body":
+                first = 10 * body_of[free.joints[0]]
+                slopes[first : first + 10, k] = next(changes)
+                continue
+            for j in free.joints:
+                row = place.get((j, free.term or free.what))
+                if row is not None:
+                    slopes[row, k] = 1.0
+        return pi, slopes
+
+    def residuals(
+        self, theta: Array, *, with_slopes: bool, with_starts: bool = False
+    ) -> list[Residual]:
+        """Return measured minus simulated outputs, window by window; see ``Simulator``.
+
+        With ``error`` "direct", derivatives are those of inverse dynamics along the roll-out.
+
+        Args:
+            theta: Values of the free parameters, shape (c,).
+            with_slopes: Whether derivatives are returned.
+            with_starts: Whether derivatives with respect to initial states are.
+
+        Raises:
+            NotConvergedError: If a step has no solution.
+
+        References:
+            Gautier, Janot, Vandanjon (2013), A new closed-loop output error method for parameter
+            identification of robot dynamics, IEEE TCST 21(2): DIDIM.
+        """
+        loops, (_, directions) = self.loops(theta), self._bodies(theta)
+        columns = self._columns(loops) if with_slopes else []
+        if with_starts:
+            columns += [(len(theta) + k, column) for k, column in enumerate(self._starts())]
+        rolls = (with_slopes or with_starts) and self.error != "direct"
+        if not rolls or self.fine is not None:
+            outs = (self.fine or self.robot).roll_out(loops, self.windows)
+        if rolls:
+            coarse = self.robot.roll_out(
+                loops,
+                self.windows,
+                [column for _, column in columns],
+                directions,
+                owners=[owner for owner, _ in columns],
+                with_speeds=self.velocities or self.lag is not None,
+            )
+            errors = [self._error(out, loops) for out in (coarse if self.fine is None else outs)]
+            return [
+                part
+                for out, error in zip(coarse, errors, strict=True)
+                for part in self._parts(out, error, loops, columns)
+            ]
+        everything, none = np.arange(self._outputs), np.array([], dtype=int)
+        if not with_slopes:
+            return [Residual(self._error(out, loops), None, everything, none) for out in outs]
+        slopes, own = self._inverse_dynamics(outs, theta), np.arange(len(theta))
+        return [
+            Residual(self._error(out, loops)[:, joints], Y[:, joints], joints, own)
+            for out, Y in zip(outs, slopes, strict=True)
+            for joints in self.robot.parts
+        ]
+
+    @property
+    def exact(self) -> "LoopSimulator | None":
+        """The simulator with exact derivatives, if its own neglect the change of the motion."""
+        return replace(self, error="input") if self.error == "direct" else None
+
+    @property
+    def knows_torques(self) -> bool:
+        """Whether measured torques are fitted, along the measured motion or along roll-outs."""
+        return self.torque is not None or self.lag is not None
+
+    @property
+    def _outputs(self) -> int:
+        """Number of compared outputs: positions, speeds, torques, in this order."""
+        further = self.velocities + (self.lag is not None) if self.error == "output" else 0
+        return len(self.base.kp) * (1 + further)
+
+    def _error(self, out: RollOut, loops: Loops) -> Array:
+        """Return measured minus simulated outputs, shape (N, outputs)."""
+        counted, parts = out.window.counted, []
+        if self.error == "output":
+            parts.append(_error(out))
+            if self.velocities:
+                parts.append(out.window.log.v[counted] - out.v)  # type: ignore[index]
+        if self.lag is not None:
+            simulated = drive_torques(out, loops, self.lag).limited
+            parts.append(out.window.log.tau[counted] - simulated)
+        error: Array = np.hstack(parts)
+        return error
+
+    def _parts(
+        self, out: RollOut, error: Array, loops: Loops, columns: list[tuple[int, Column]]
+    ) -> Iterator[Residual]:
+        """Yield the residuals of a roll-out's parts with their derivatives."""
+        n, free_parameters = len(loops.kp), len(self.free_parameters)
+        torques = None if self.lag is None else drive_torques(out, loops, self.lag)
+        for joints, places, slopes in out.slopes:
+            k = len(joints)
+            parts = [slopes[:, :k]] if self.error == "output" else []
+            parts += [slopes[:, k:]] if self.velocities else []
+            if torques is not None:
+                place = {int(owner): c for c, owner in enumerate(places)}
+                by = [(place[owner], own) for owner, own in columns if owner in place]
+                parts.append(torques.slopes(joints, by, slopes, self.robot.kinds))
+            slopes = np.concatenate(parts, axis=1)
+            outputs = np.concatenate([joints + n * i for i in range(len(parts))])
+            own = places[places < free_parameters]  # initial states follow
+            by_start = slopes[:, :, len(own) :]
+            yield Residual(error[:, outputs], slopes[:, :, : len(own)], outputs, own, by_start)
+
+    def _inverse_dynamics(self, outs: Sequence[RollOut], theta: Array) -> list[Array]:
+        """Return Y(q, v, a) d pi along roll-outs, window by window, shape (N, n, c)."""
+        model, (_, slopes) = self._full_model, self.standard(self._full_model, theta)
+        found = []
+        for out in outs:
+            t = out.window.log.t[out.window.counted]
+            a, none = np.gradient(out.v, t, axis=0), np.zeros_like(out.q)
+            segment = np.zeros(len(t), dtype=int)
+            motion = Trajectory(t, out.q, out.v, a, none, model.joints, None, segment)
+            torques = predict(model, list(slopes.T), remember(model, motion))
+            found.append(np.stack(torques, axis=-1))
+        return found
+
+    @cached_property
+    def _full_model(self) -> RobotModel:
+        """The robot with the terms of its loops."""
+        return with_terms(self.robot.model, self.base)
+
+    def _starts(self) -> list[Column]:
+        """Return the columns of the initial positions and speeds of windows."""
+        kinds, n = self.robot.kinds, len(self.base.kp)
+        return [(kinds[what], j, 0) for what in ("start", "speed") for j in range(n)]
+
+    def _columns(self, loops: Loops) -> list[tuple[int, Column]]:
+        """Return the columns of the sensitivities, each with the index of its free parameter."""
+        kinds, columns, body = self.robot.kinds, [], 0
+        for k, free in enumerate(self.free_parameters):
+            for j in free.joints:
+                index = 0
+                if free.term is not None:
+                    index = loops.place(j, free.term)
+                elif free.what == "body":
+                    index, body = body, body + 1
+                columns.append((k, (kinds[free.what], j, index)))
+        return columns
+
+    @cached_property
+    def _roots(self) -> Array:
+        """Upper triangular root U of the pseudo-inertia of each free body, shape (n, 4, 4)."""
+        roots = np.zeros((len(self.base.bodies), 4, 4))
+        J = pseudo_inertia(self.base.bodies.reshape(-1))
+        body_of = {joint: body for body, joint in enumerate(self.robot.joint_of_body)}
+        for body in {body_of[u.joints[0]] for u in self.free_parameters if u.what == "body"}:
+            roots[body] = np.linalg.cholesky(J[body, ::-1, ::-1])[::-1, ::-1]
+        return roots
+
+    def _bodies(self, theta: Array) -> tuple[Array, Array]:
+        """Return the bodies, (n, 10), and their derivatives by each coordinate, (D, 10)."""
+        bodies, directions = self.base.bodies.copy(), []
+        body_of = {joint: body for body, joint in enumerate(self.robot.joint_of_body)}
+        by_body: dict[int, list[int]] = {}
+        for k, free in enumerate(self.free_parameters):
+            if free.what == "body":
+                by_body.setdefault(body_of[free.joints[0]], []).append(k)
+        for body, places in by_body.items():
+            U, T = self._roots[body], np.eye(4)
+            for k in places:
+                row, column = _ENTRIES[self.free_parameters[k].coordinate]
+                T[row, column] = np.exp(theta[k]) if row == column else theta[k]
+            bodies[body] = inertial_from_pseudo_inertia(U @ T @ T.T @ U.T)
+            for k in places:
+                row, column = _ENTRIES[self.free_parameters[k].coordinate]
+                change = np.zeros((4, 4))
+                change[row, column] = T[row, column] if row == column else 1.0
+                half = U @ change @ T.T @ U.T
+                directions.append(inertial_from_pseudo_inertia(half + half.T))
+        return bodies, np.array(directions).reshape(-1, 10)
+
+
+def with_terms(model: RobotModel, loops: Loops) -> RobotModel:
+    """Return the model extended by the terms of loops that it lacks.
+
+    Args:
+        model: The robot.
+        loops: Its loops.
+    """
+    own = {
+        joint: [
+            *model.layout.own.get(joint, ()),
+            *(t for t in terms if t not in _has(model, joint)),
+        ]
+        for joint, terms in zip(model.joints, loops.terms, strict=True)
+    }
+    extended = RobotModel.from_urdf(
+        model.tree, **{**model.options, "own_terms": {k: v for k, v in own.items() if v}}
+    )
+    return with_assumed_inertials(extended)
+
+
+def _has(model: RobotModel, joint: str) -> list[object]:
+    """Return the terms that the model has of a joint."""
+    layout = model.layout
+    return [term for d, term in layout.drive_parameters if layout.drives[d].name == joint]
+
+
+def _better_start(out: RollOut, sigma: Array) -> Array:
+    """Return the first-order correction of the initial position and speed, shape (2, n).
+
+    The prior is the measured state, within some position errors and the typical speed.
+    """
+    log = out.window.log
+    speed = np.sqrt(np.mean((np.diff(log.q, axis=0) / np.diff(log.t)[:, None]) ** 2, axis=0))
+    spread = np.maximum(np.concatenate([_NEAR * sigma, speed]), 1e-9)
+    change = np.zeros(2 * len(sigma))
+    for joints, places, slopes in out.slopes:
+        b = (_error(out)[:, joints] / sigma[joints]).reshape(-1)
+        A = (slopes / sigma[joints, None]).reshape(b.size, -1) * spread[places]
+        A, b = np.vstack([A, np.eye(len(places))]), np.concatenate([b, np.zeros(len(places))])
+        change[places] = spread[places] * np.linalg.lstsq(A, b, rcond=None)[0]
+    return change.reshape(2, -1)
+
+
+def _error(out: RollOut) -> Array:
+    error: Array = out.window.log.q[out.window.counted] - out.q
+    return error

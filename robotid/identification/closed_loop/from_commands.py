@@ -1,0 +1,143 @@
+"""identify_loops(): closed-loop identification of drives, loops and bodies from command logs."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from robotid.base.exceptions import DataError
+from robotid.base.findings import Finding
+from robotid.base.typing import ProgressCallback, ignore_progress, report_stage
+from robotid.data.log import Log
+from robotid.data.signal_settings import SignalSettings
+from robotid.diagnosis.verdict.fit_findings import not_written
+from robotid.diagnosis.verdict.unlike_runs import unlike_findings
+from robotid.diagnosis.verdict.verdict import blocking
+from robotid.dynamics.prediction import predict_instants
+from robotid.dynamics.simulation.loops import Loops, open_loops
+from robotid.estimation.fitting.estimator_settings import SimulationSettings
+from robotid.estimation.variation.variation import vary
+from robotid.identification.closed_loop.driven import driven_log
+from robotid.identification.closed_loop.loop_findings import loop_findings
+from robotid.identification.closed_loop.loop_result import LoopIdentification, identified_loops
+from robotid.identification.closed_loop.loop_settings import LoopSettings
+from robotid.identification.closed_loop.position_errors import run_open_loop
+from robotid.identification.closed_loop.runs import loop_runs
+from robotid.identification.closed_loop.stages import STAGES, Fitted, fit_loops, stated_loops
+from robotid.identification.result import Asked
+from robotid.robot.model import RobotModel
+
+__all__ = ["identify_loops", "with_gravity"]
+
+
+def identify_loops(
+    model: RobotModel,
+    logs: Sequence[Log],
+    validation: Sequence[Log],
+    loop: LoopSettings,
+    settings: SimulationSettings,
+    *,
+    signals: SignalSettings | None = None,
+    chooses: bool = True,
+    examined: Sequence[Finding] = (),
+    ignore: Sequence[str] = (),
+    units: Sequence[str] = (),
+    progress: ProgressCallback = ignore_progress,
+) -> LoopIdentification:
+    """Identify drives, loops and bodies from logs of commands and positions.
+
+    Args:
+        model: The robot.
+        logs: Logs to fit, of its joints in its order, with commands, or with torques if these
+            drive the robot.
+        validation: Validation logs.
+        loop: What is known of the loops.
+        settings: Settings of the estimator.
+        signals: Processing of the torques into rows, and their delay.
+        chooses: Whether further friction terms are tried.
+        examined: The doctor's findings of the logs.
+        ignore: Codes of its errors to ignore.
+        units: Name of the robot of each log to fit; one robot if empty.
+        progress: Called with the stages.
+
+    Raises:
+        DataError: If no log is given, or one has no commands.
+        MissingDependencyError: If Numba is not installed.
+        NotConvergedError: If it cannot be simulated.
+        SettingsError: If a setting does not fit the robot.
+    """
+    if not logs:
+        raise DataError("no log was given. An identification needs at least one log")
+    used = signals or SignalSettings()
+    if loop.kind == "torque":
+        logs, validation = (
+            [driven_log(model, log, used) for log in part] for part in (logs, validation)
+        )
+    for log in (*logs, *validation):
+        if log.q_ref is None:
+            raise DataError(
+                f"{log.name} has no commands, which the estimator 'simulation' needs. Record "
+                "columns qref_ of each joint, or simulate from the logged torque: [controller] "
+                "kind = 'torque'"
+            )
+    if loop.gravity_compensation:
+        logs, validation = (
+            [with_gravity(model, log) for log in part] for part in (logs, validation)
+        )
+    fitted = fit_loops(
+        model, logs, loop, settings, signals=signals, chooses=chooses, progress=progress
+    )
+    report_stage(progress, "testing", STAGES)
+    sign, simulator = fitted.encoders.sign, fitted.simulator
+    robot = simulator.fine or simulator.robot  # with the steps of the fit
+    runs = [
+        [
+            run_open_loop(
+                robot, fitted.loops, log.turned(sign), _others(model, loop, fitted)
+            )
+            for log in part
+        ]
+        for part in (logs, validation)
+    ]  # fmt: skip
+    found = identified_loops(model, loop, settings, fitted, *map(tuple, runs))
+    errors = blocking(examined, ignore)
+    found = replace(
+        found,
+        log_errors=tuple(finding.message for finding in errors),
+        asked=Asked(used, ignore=tuple(ignore)),
+        variation=vary(
+            [log.name for log in logs],
+            loop_runs(model, simulator, fitted.estimate, units),
+            sorted(set(units)),
+        ),
+    )
+    examined = [*examined, *unlike_findings(found.variation)]
+    return replace(found, findings=(*loop_findings(found, examined), *not_written(errors)))
+
+
+def _others(model: RobotModel, loop: LoopSettings, fitted: Fitted) -> dict[str, Loops]:
+    """Return simpler models by name, for ``run_open_loop``.
+
+    The URDF with the stated gains has no friction and no rotor inertia.
+    """
+    if fitted.linear is not None:
+        driven, found = fitted.linear.urdf_with_drives, fitted.linear.standard
+        return {"urdf": open_loops(model, driven), "rows": open_loops(model, found)}
+    others = {} if fitted.plain is None else {"second_order": fitted.plain.loops}
+    if loop.kp is not None and not any(u.what == "kp" for u in fitted.simulator.free_parameters):
+        n, stated = len(model.joints), stated_loops(model, loop)
+        bare = replace(stated, terms=((),) * n, values=np.zeros(0), armature=np.full(n, 1e-9))
+        others["urdf"] = bare
+    return others
+
+
+def with_gravity(model: RobotModel, log: Log) -> Log:
+    """Return a log with the URDF's gravity torque at the measured position added to tau_ref.
+
+    Args:
+        model: The robot of the URDF.
+        log: The log, of its joints in its order, with commands.
+    """
+    torque = predict_instants(model, model.standard_parameters(), log.q)
+    fed = torque if log.tau_ref is None else log.tau_ref + torque
+    return replace(log, tau_ref=fed)

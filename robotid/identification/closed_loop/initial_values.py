@@ -1,0 +1,295 @@
+"""Initial values and prior spreads of the free parameters of loops and drives."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from robotid.base.typing import Array
+from robotid.dynamics.simulation.loops import ClosedLoopRobot, Loops, Window
+from robotid.dynamics.simulation.simulation_settings import PerJoint
+from robotid.identification.closed_loop.encoder_zeros import Encoders
+from robotid.identification.closed_loop.free_parameters import FreeParameter
+from robotid.identification.closed_loop.loop_settings import LoopSettings
+from robotid.identification.closed_loop.second_order import SecondOrder
+from robotid.robot.drives import DriveTerm, Viscous
+from robotid.robot.mass_matrix import joint_mass_matrices
+from robotid.robot.model import RobotModel
+
+__all__ = [
+    "TypicalSizes",
+    "first_loops",
+    "free_drive_parameters",
+    "free_zeros",
+    "is_stated",
+    "likeness",
+    "typical_sizes",
+    "typical_sizes_of_torques",
+]
+
+_WIDE = 10.0  # prior spread of drive parameters over their typical size: a weak prior
+_SHARE = 0.5  # initial share of the bodies in a joint's inertia, where its gain is unknown
+_DELAY_SPREAD = 0.1  # prior spread of a delay [s]
+_ZERO_SPREAD = 0.3  # prior spread of an encoder's zero about its first estimate [rad or m]
+_SMALLEST_BODY = 0.3  # smallest body inertia over the largest: small joints have gears, too
+_POSES = 50  # number of poses at which the inertia of the bodies is computed
+_LEAST = 0.05  # smallest initial armature and lower bound of a gain, over the typical size
+_LIMITED = 0.8  # initial torque limit over the largest torque without a limit
+
+
+@dataclass(frozen=True, eq=False)
+class TypicalSizes:
+    """Typical sizes of each joint, for initial values and prior spreads; arrays of shape (n,).
+
+    Attributes:
+        inertia: Inertia of joint and rotor [kg m^2 or kg].
+        bodies: Part of the URDF's bodies in it [kg m^2 or kg].
+        torque: Torque [N m or N].
+        largest: Initial torque limit: somewhat less than the largest torque without a limit
+            [N m or N].
+        speed: Speed [rad/s or m/s].
+        scale: Torque relative to that of the second-order model [-].
+    """
+
+    inertia: Array
+    bodies: Array
+    torque: Array
+    largest: Array
+    speed: Array
+    scale: Array
+
+
+def typical_sizes(
+    robot: ClosedLoopRobot,
+    plain: SecondOrder,
+    windows: Sequence[Window],
+    has_gain: Array,
+    top: Array,
+    groups: Sequence[str],
+    factor: Array | float = 1.0,
+) -> TypicalSizes:
+    """Return typical sizes; where a gain is unknown, the inertia of bodies scales all torques.
+
+    Joints of a group have one gain, and so one scale: the median of those whose motion determines
+    their inertia. With scales of their own, the friction of one relative to their common gain would
+    not be that of its motion: more than the drive can overcome, and its simulation never moves.
+
+    At its largest speed, ``top`` if more than 0, the limit of a drive is the friction torque.
+
+    Args:
+        robot: The robot, which can be simulated.
+        plain: Second-order model of each joint.
+        windows: Windows of the logs.
+        has_gain: Whether the gain of a joint is known, shape (n,), bool.
+        top: Speeds of joints that run at their largest speed, else 0, shape (n,) [rad/s or m/s].
+        groups: Name of the group of each joint.
+        factor: Factor of the scale where the gain is unknown, shape (n,) [-].
+    """
+    model = robot.model
+    q = np.concatenate([w.log.q[w.counted] for w in windows])
+    bodies = _inertia(model, model.standard_parameters(), windows)
+    measure = np.maximum(bodies, _SMALLEST_BODY * bodies.max()) / _SHARE
+    scale = np.where(has_gain, 1.0, measure / plain.inertia)
+    for group in dict.fromkeys(groups):
+        own = (np.array(groups) == group) & ~has_gain
+        shown = own & plain.shows_inertia
+        if own.any():
+            scale[own] = np.median(scale[shown if shown.any() else own])
+    scale = np.where(has_gain, 1.0, factor * scale)
+    # friction may hide the inertia in a second-order model
+    inertia = np.maximum(plain.inertia * scale, bodies)
+    error = np.concatenate([w.log.q_ref[w.counted] for w in windows]) - q  # type: ignore[index]
+    unlimited = _LIMITED * plain.loops.kp * np.abs(error).max(axis=0)
+    unlimited = np.minimum(unlimited, plain.loops.limit)
+    friction = plain.friction("viscous") * top + plain.friction("coulomb")
+    largest = scale * np.where(top > 0.0, np.minimum(friction, unlimited), unlimited)
+    return TypicalSizes(inertia, bodies, plain.torque * scale, largest, _speed(windows), scale)
+
+
+def typical_sizes_of_torques(
+    model: RobotModel, pi: Array, armature: Array, windows: Sequence[Window]
+) -> TypicalSizes:
+    """Return typical sizes from logged torques, without a closed loop.
+
+    Args:
+        model: The robot.
+        pi: Standard parameters, shape (p,).
+        armature: Inertia of the motors, shape (n,) [kg m^2 or kg].
+        windows: Windows of the logs.
+    """
+    tau = np.concatenate([w.log.tau[w.counted] for w in windows])
+    torque = np.maximum(np.sqrt(np.mean(tau**2, axis=0)), 1e-6)
+    inertia, one = _inertia(model, pi, windows), np.ones(len(armature))
+    return TypicalSizes(inertia, inertia - armature, torque, np.inf * one, _speed(windows), one)
+
+
+def _inertia(model: RobotModel, pi: Array, windows: Sequence[Window]) -> Array:
+    """Return the typical diagonal of the joint-space mass matrix, shape (n,)."""
+    q = np.concatenate([w.log.q[w.counted] for w in windows])
+    M = joint_mass_matrices(model, pi, q[:: max(1, len(q) // _POSES)])
+    typical: Array = np.median(np.diagonal(M, axis1=1, axis2=2), axis=0)
+    return typical
+
+
+def _speed(windows: Sequence[Window]) -> Array:
+    """Return the typical speed of each joint, shape (n,)."""
+    steps = [np.diff(w.log.q[w.counted], axis=0) / _period(w) for w in windows]
+    speed: Array = np.maximum(np.sqrt(np.mean(np.concatenate(steps) ** 2, axis=0)), 1e-6)
+    return speed
+
+
+def _period(window: Window) -> float:
+    """Return the time between the rows of a window's log [s]."""
+    return float(np.median(np.diff(window.log.t)))
+
+
+def first_loops(
+    model: RobotModel, stated: Loops, plain: SecondOrder, typical: TypicalSizes, finds_limit: Array
+) -> Loops:
+    """Return the initial loops of the fit.
+
+    Args:
+        model: The robot.
+        stated: The loops as stated.
+        plain: Second-order model of each joint.
+        typical: Typical sizes.
+        finds_limit: Whether the limit of a joint is fitted, shape (n,), bool.
+    """
+    friction = {name: plain.friction(name) * typical.scale for name in ("viscous", "coulomb")}
+    none = np.zeros(len(typical.scale))
+    terms = tuple(
+        tuple(
+            term
+            for d, term in model.layout.drive_parameters
+            if model.layout.drives[d].name == joint and not term.is_inertia
+        )
+        for joint in model.joints
+    )
+    values = [friction.get(t.name, none)[j] for j, own in enumerate(terms) for t in own]
+    return replace(
+        stated,
+        kp=stated.kp * typical.scale,
+        armature=np.maximum(typical.inertia - typical.bodies, _LEAST * typical.inertia),
+        delay=plain.loops.delay,
+        limit=np.where(finds_limit, typical.largest, stated.limit),
+        terms=terms,
+        values=np.array(values),
+    )
+
+
+def free_drive_parameters(
+    model: RobotModel,
+    loop: LoopSettings,
+    groups: Sequence[str],
+    base: Loops,
+    typical: TypicalSizes,
+    *,
+    finds_kd: Array | bool,
+    finds_limit: Array,
+) -> list[FreeParameter]:
+    """Return the free parameters of drives and loops, with initial values from ``base``.
+
+    Args:
+        model: The robot.
+        loop: What is known of the loops.
+        groups: Name of the group of each joint.
+        base: The initial loops.
+        typical: Typical sizes.
+        finds_kd: Whether the logs determine the gain of the speed of a joint, shape (n,), bool.
+        finds_limit: Whether the limit of a joint is fitted, shape (n,), bool.
+    """
+    members: dict[str, list[int]] = {}
+    for j, group in enumerate(groups):
+        members.setdefault(group, []).append(j)
+    is_closed = np.full(len(groups), loop.kind != "torque")
+    # each drive has its own limit; delays are mostly those of the bus and the controller
+    sharing: dict[str, dict[str, list[int]]] = {
+        "limit": {joint: [j] for j, joint in enumerate(model.joints)}
+    }
+    if loop.delays == "one":
+        sharing["delay"] = {"robot": [*range(len(groups))]}
+    free = {
+        "armature": np.full(len(groups), "armature" in model.layout.terms),
+        "kp": ~is_stated(loop.kp, model) & is_closed,
+        "kd": ~is_stated(loop.kd, model) & finds_kd,
+        "limit": finds_limit,
+        "delay": ~is_stated(loop.delay, model) & is_closed,
+    }
+    spread = {
+        "armature": typical.inertia,
+        "kp": base.kp / _WIDE,
+        "kd": typical.torque / typical.speed,
+        "limit": typical.torque,
+        "delay": np.full(len(groups), _DELAY_SPREAD / _WIDE),
+    }
+    found = []
+    for what, is_free in free.items():
+        for name, joints in sharing.get(what, members).items():
+            own = tuple(j for j in joints if is_free[j])
+            if own:
+                initial = float(np.median(getattr(base, what)[list(own)]))
+                wide = _WIDE * float(np.median(spread[what][list(own)]))
+                lowest = _LEAST * initial if what in ("kp", "limit") else 0.0
+                found.append(FreeParameter(f"{name}.{what}", what, own, initial, wide, lowest))
+    for group, joints in members.items():
+        for term in {t: None for j in joints for t in base.terms[j]}:
+            having = [j for j in joints if term in base.terms[j]]
+            # Coulomb friction and offset depend on wear and load, viscous friction on the type
+            for owners in [having] if isinstance(term, Viscous) else [[j] for j in having]:
+                name = group if len(owners) > 1 else model.joints[owners[0]]
+                found.append(_term(name, term, owners, base, typical))
+    return found
+
+
+def _term(
+    owner: str, term: DriveTerm, joints: Sequence[int], base: Loops, typical: TypicalSizes
+) -> FreeParameter:
+    """Return the free parameter of a term of one joint, or of several that share it."""
+    initial = float(np.median([base.values[base.place(j, term)] for j in joints]))
+    size = typical.torque / (typical.speed if isinstance(term, Viscous) else 1.0)
+    wide = _WIDE * float(np.median(size[list(joints)]))
+    return FreeParameter.of_term(owner, term, tuple(joints), initial, wide)
+
+
+def free_zeros(model: RobotModel, encoders: Encoders) -> list[FreeParameter]:
+    """Return free parameters for the encoder zeros that differ from the URDF's.
+
+    Args:
+        model: The robot.
+        encoders: Signs and zeros of the encoders: the initial values.
+    """
+    return [
+        FreeParameter(
+            f"{model.joints[j]}.zero", "zero", (int(j),), float(encoders.zero[j]), _ZERO_SPREAD
+        )
+        for j in np.flatnonzero(encoders.gain > 0)
+    ]
+
+
+def likeness(model: RobotModel) -> list[tuple[object, ...]]:
+    """Return the properties in which equal joints agree: limits, mass and moments of the body.
+
+    Args:
+        model: The robot.
+    """
+    bodies = model.standard_parameters()[: model.layout.n_inertial].reshape(-1, 10)
+    sizes = np.column_stack([bodies[:, 0], bodies[:, [4, 6, 9]]])
+    found: list[tuple[object, ...]] = []
+    for body, joint in zip(sizes, model.limits, strict=True):
+        digits = tuple(f"{x:.2g}" for x in body)
+        found.append((joint.type, f"{joint.effort:.3g}", f"{joint.velocity:.3g}", digits))
+    return found
+
+
+def is_stated(value: PerJoint | str | None, model: RobotModel) -> Array:
+    """Return whether a number is stated for each joint, shape (n,), bool.
+
+    Args:
+        value: A number, or numbers by joint.
+        model: The robot.
+    """
+    named = [
+        value is not None and (not isinstance(value, Mapping) or joint in value)
+        for joint in model.joints
+    ]
+    return np.array(named)

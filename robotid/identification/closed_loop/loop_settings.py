@@ -1,0 +1,137 @@
+"""Settings of the drives' closed loop in a job file: its known and its fitted parameters."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import Any, ClassVar
+
+from robotid.base.exceptions import SettingsError
+from robotid.base.findings import listed
+from robotid.base.settings import Entries, Range, Settings, setting
+from robotid.data.log import suggestion
+from robotid.dynamics.simulation.simulation_settings import DELAY, GAIN, LEVEL, PerJoint
+
+__all__ = ["LoopSettings", "groups_of"]
+
+_CLOCK = Range("1 to 2e4 Hz", lambda x: 1.0 <= x <= 2e4)
+#: Settings that do not apply where the logged torque drives the robot.
+_OF_LOOPS = ("kp", "kd", "limit", "delay", "delays", "rate", "gravity_compensation", "zeros")
+
+
+@dataclass(frozen=True)
+class LoopSettings(Settings):
+    """The controller of logs with commands, torque = kp (q_ref - q) + kd (v_ref - v) + tau_ref.
+
+    With kind "torque" there is no closed loop: the logged torque drives the robot.
+    """
+
+    _table: ClassVar[str] = "controller"
+
+    kind: str = setting(
+        "pd", "input of the simulation: 'pd', a PD controller with the commands of the log; "
+        "'torque', the logged torque without a controller, where no commands are needed",
+        among=("pd", "torque"),
+    )  # fmt: skip
+    kp: PerJoint | None = setting(
+        None, "position gain [N m/rad or N/m], for all joints or by joint; fitted if not stated, "
+        "relative to gravity and inertia of the bodies", **GAIN,
+    )  # fmt: skip
+    kd: PerJoint | None = setting(
+        None, "speed gain [N m s/rad or N s/m], for all joints or by joint; if not stated, it is "
+        "part of the viscous friction, unless the logs have speed commands or torques", **LEVEL,
+    )  # fmt: skip
+    limit: PerJoint | str | None = setting(
+        None,
+        "torque limit of the drive [N m or N], for all joints or by joint; if not stated, it is "
+        "fitted where the drive saturates; 'find': fitted for every joint",
+        reads=(int, float, dict, str),
+        within=GAIN["within"],
+        among=("find",),
+    )
+    delay: PerJoint | None = setting(
+        None, "delay of the command [s], for all joints or by joint; fitted if not stated", **DELAY
+    )
+    delays: str = setting(
+        "one", "the fitted delays: 'one' for the robot (bus and controller), or one per 'group'",
+        among=("one", "group"),
+    )  # fmt: skip
+    rate: float | None = setting(
+        None, "sampling rate of a discrete-time controller, which holds its torque until the next "
+        "sample [Hz]; if not stated, the controller is in continuous time", within=_CLOCK,
+    )  # fmt: skip
+    gravity_compensation: bool = setting(
+        False, "whether the controller adds the gravity torque of the URDF"
+    )
+    groups: Mapping[str, Sequence[str]] = setting(
+        {}, "joints with equal drives, by name of the group; they share gains, armature and "
+        "viscous friction. If not stated, joints that are equal in the URDF form a group",
+        reads=Entries(dict, (list,)),
+    )  # fmt: skip
+    zeros: str = setting(
+        "urdf", "zero and sign of the encoders: 'urdf', those of the URDF; 'find', fitted from "
+        "gravity",
+        among=("urdf", "find"),
+    )  # fmt: skip
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.kind != "torque":
+            return
+        for each in fields(self):
+            if each.name in _OF_LOOPS and getattr(self, each.name) != each.default:
+                how = (
+                    " The delay of a logged torque is [signals] torque_delay."
+                    if each.name == "delay"
+                    else ""
+                )
+                raise SettingsError(
+                    f"[controller] {each.name} is {getattr(self, each.name)!r}, but with kind = "
+                    "'torque' the logged torque drives the robot, without a controller. Leave "
+                    f"{each.name} out, or set kind = 'pd'.{how}"
+                )
+
+
+def groups_of(settings: LoopSettings, joints: Sequence[str], alike: Sequence[Any]) -> list[str]:
+    """Return the group of each joint.
+
+    Args:
+        settings: The stated groups; if none, equal joints form a group.
+        joints: Names of the n joints.
+        alike: Properties in which joints of a group agree, n entries.
+
+    Raises:
+        SettingsError: If a group names an unknown joint, or two groups name the same joint.
+    """
+    found: dict[str, str] = {}
+    for group, members in settings.groups.items():
+        if isinstance(members, str) or not isinstance(members, Sequence):
+            raise SettingsError(
+                f"controller: groups.{group} is {members!r}, wanted a list of joints"
+            )
+        for joint in members:
+            if joint not in joints:
+                raise SettingsError(
+                    f"controller: groups.{group} has {joint!r}, which is not a moving joint: "
+                    f"{listed(joints)}{suggestion(joint, joints)}"
+                )
+            if joint in found:
+                raise SettingsError(
+                    f"controller: joint {joint!r} is in the groups {found[joint]} and {group}; "
+                    "name it once"
+                )
+            found[joint] = group
+    if settings.groups:
+        return [found.get(joint, joint) for joint in joints]
+    first: dict[Any, str] = {}
+    named = [first.setdefault(key, joint) for key, joint in zip(alike, joints, strict=True)]
+    return [
+        joint if named.count(name) == 1 else _common(name, joints, named)
+        for name, joint in zip(named, joints, strict=True)
+    ]
+
+
+def _common(name: str, joints: Sequence[str], named: Sequence[str]) -> str:
+    """Return the name of a group: the words common to its joints' names, or its first joint."""
+    members = [joint for joint, first in zip(joints, named, strict=True) if first == name]
+    shared = [word for word in members[0].split("_") if all(word in m.split("_") for m in members)]
+    shared = [word for word in shared if word != "joint"]
+    return "_".join(shared) or members[0]

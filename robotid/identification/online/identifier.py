@@ -1,0 +1,277 @@
+"""Online identification: samples as input, an estimate at any time as output."""
+
+from collections import deque
+from dataclasses import replace
+from typing import overload
+
+import numpy as np
+
+from robotid.base.arguments import real_numbers
+from robotid.base.exceptions import DataError
+from robotid.base.settings import is_number, require_kind
+from robotid.base.typing import Array
+from robotid.data.log import Trajectory
+from robotid.dynamics.base_parameters import structural_mapping
+from robotid.dynamics.drive_columns import sure_rows
+from robotid.dynamics.problem import Sample
+from robotid.dynamics.torque import InstantRegressor
+from robotid.estimation.estimators import Estimate, Kalman, KalmanState
+from robotid.identification.online.causal_signals import Instant, LiveSignals
+from robotid.identification.online.change_detection import (
+    ChangeDetector,
+    Innovations,
+    Payload,
+    load_spread,
+    payload_of,
+)
+from robotid.identification.online.online_settings import Change, OnlineSettings, Reading
+from robotid.robot.model import RobotModel
+from robotid.robot.prior import prior_spread
+
+__all__ = ["OnlineIdentifier"]
+
+_ARRAYS = {1: ("q", "tau"), 3: ("q", "v", "a", "tau")}  # by the number of arrays after t and q
+_OVERSAMPLED = 12.0  # estimator updates per period of the cut-off
+_STORED_EVERY = 0.1  # time between stored states, for the reset after a change [s]
+_STORED = 30  # number of stored states
+_REOPENED = 0.1  # change of every parameter after a change, relative to its prior spread
+
+
+class OnlineIdentifier:
+    """Identifies a robot sample by sample, with detection of step changes.
+
+    A Kalman filter with a slow random walk of the parameters processes the regressor of each
+    filtered instant. The noise level of each joint is the running mean of innovation times
+    residual. When the innovations of a joint remain too large (CUSUM), a change is flagged and the
+    covariance is increased: by that of a payload on the last body, and slightly for all parameters.
+
+    Args:
+        model: The robot, with a fixed base.
+        settings: The settings; the defaults if None.
+
+    Attributes:
+        delay: Delay of the estimate after the newest sample [s] with ``update(t, q, tau)``; 0 with
+            ``update(t, q, v, a, tau)``.
+        changes: The changes flagged so far.
+        names: Names of the base parameters.
+
+    Raises:
+        DataError: If the base floats or the model is static; from ``reading``, ``compared`` and
+            ``estimate``, before the end of the warm-up.
+        SettingsError: If the cut-off is not below half the rate.
+    """
+
+    def __init__(self, model: RobotModel, settings: OnlineSettings | None = None) -> None:
+        require_kind(model, RobotModel, "model", "a robotid.RobotModel")
+        require_kind(settings, (OnlineSettings, type(None)), "settings", "an OnlineSettings")
+        model.require_fixed("an online identification")
+        if model.is_static:
+            raise DataError("the model is static. An online identification needs dynamics = 'full'")
+        self.model, self.settings = model, settings or OnlineSettings()
+        s = self.settings
+        self.mapping = structural_mapping(model)
+        self.names = self.mapping.base_names
+        self.changes: tuple[Change, ...] = ()
+        n = len(model.joints)
+        is_continuous = np.array([joint.turns_freely for joint in model.limits])
+        self._signals = LiveSignals(n, s.rate, s.cutoff, s.order, is_continuous)
+        self.delay = self._signals.delay
+        self._every = max(1, int(s.rate / (_OVERSAMPLED * s.cutoff)))
+        self._pace()
+        self._regressor = InstantRegressor(model, self.mapping.independent)
+        self._skipped, self._t, self._now = 0, -np.inf, -np.inf
+        self._warmup: list[Instant] = []
+        self._kalman: Kalman | None = None
+        self._recent: deque[tuple[float, KalmanState]] = deque(maxlen=_STORED)
+
+    @overload
+    def update(self, t: float, q: Array, tau: Array, /) -> None: ...
+
+    @overload
+    def update(self, t: float, q: Array, v: Array, a: Array, tau: Array, /) -> None: ...
+
+    def update(self, t: float, q: Array, *rest: Array) -> None:
+        """Process one sample: ``update(t, q, tau)``, or ``update(t, q, v, a, tau)`` if smooth.
+
+        Args:
+            t: Time stamp [s].
+            q: Joint positions, shape (n,) [rad or m].
+            rest: tau, or v, a, tau: velocities, accelerations, torques, shape (n,) each.
+
+        Raises:
+            DataError: If a number is not finite, a shape is wrong or time does not increase; the
+                state does not change then.
+        """
+        names = _ARRAYS.get(len(rest))
+        if names is None:
+            raise DataError(
+                f"update takes (t, q, tau) or (t, q, v, a, tau), found {2 + len(rest)} values"
+            )
+        if not is_number(t):
+            raise DataError(f"the sample at t = {str(t)[:60]} s is not finite, so it was refused")
+        arrays = [real_numbers(x, name) for name, x in zip(names, (q, *rest), strict=True)]
+        if len(rest) == 1:
+            for instant in self._signals.push(t, *arrays):
+                self._skipped += 1
+                if self._skipped % self._every == 0:
+                    self._take(instant, t)
+        else:
+            self._check(t, *arrays)
+            if self.delay:  # no filter, and every sample is used
+                self.delay, self._every = 0.0, 1
+                self._pace()
+            q, v, a, tau = arrays
+            self._take((t, q, v, a, tau), t)
+        self._now = t
+
+    @property
+    def is_ready(self) -> bool:
+        """Whether there is an estimate: the warm-up is over."""
+        return self._kalman is not None
+
+    @property
+    def reading(self) -> Reading:
+        """The current estimate with its uncertainty."""
+        self._require_ready()
+        variance = np.maximum(np.diag(self._state.P), 0.0)
+        left = np.minimum(variance / self._prior_variance, 1.0)
+        return Reading(
+            t=self._t,
+            theta=self._state.theta,
+            std_error=np.sqrt(variance),
+            sigma=np.sqrt(self._innovations.variance),
+            excitation=float(1.0 - left.mean()),
+            converged=self._innovations.is_converged,
+        )
+
+    @property
+    def compared(self) -> tuple[Array, Array]:
+        """Measured and predicted torque at the time of the reading, shape (n,) each.
+
+        The prediction is NaN where a joint is at rest, since its friction has no sign.
+        """
+        self._require_ready()
+        return self._compared
+
+    @property
+    def estimate(self) -> Estimate:
+        """The estimate in the form of the batch estimators."""
+        kalman = self._require_ready()
+        sigma = np.sqrt(self._innovations.variance)
+        estimate = kalman.estimate(self._state, self.names)
+        return replace(estimate, converged=self._innovations.is_converged, sigma=sigma)
+
+    def payload(self, index: int = -1) -> Payload:
+        """Return the payload on the last body that explains a change of the parameters.
+
+        Args:
+            index: Index of the change in ``changes``.
+
+        Raises:
+            DataError: If there is no such change.
+        """
+        if not -len(self.changes) <= index < len(self.changes):
+            raise DataError(f"there is no change {index}: {len(self.changes)} were flagged")
+        change = self.changes[index]
+        return payload_of(
+            self._state.theta - change.theta,
+            self._state.P + change.covariance,
+            self._load_columns,
+            self._load_spread,
+        )
+
+    def _require_ready(self) -> Kalman:
+        if self._kalman is None:
+            raise DataError(
+                "no estimate yet: the robot has moved for "
+                f"{len(self._warmup) * self._dt:.2f} s, and the warm-up needs "
+                f"{self.settings.warmup:g} s of motion"
+            )
+        return self._kalman
+
+    def _pace(self) -> None:
+        self._dt = self._every / self.settings.rate  # time between updates of the estimator [s]
+        # filtered rows are correlated
+        self._share = min(1.0, 2.0 * self.settings.cutoff * self._dt)
+
+    def _check(self, t: float, *arrays: Array) -> None:
+        n = len(self.model.joints)
+        if any(np.shape(x) != (n,) for x in arrays):
+            raise DataError(
+                f"q, v, a and tau have shapes {[np.shape(x) for x in arrays]}, wanted ({n},) each"
+            )
+        if not (np.isfinite(t) and all(np.isfinite(x).all() for x in arrays)):
+            raise DataError(f"the sample at t = {t:g} s is not finite, so it was refused")
+        if t <= self._now:
+            raise DataError(f"t must increase, but {t:.15g} s follows {self._now:.15g} s")
+
+    def _take(self, instant: Instant, now: float) -> None:
+        """Process one instant; store it before the end of the warm-up."""
+        if self._kalman is not None:
+            self._step(instant, now)
+            return
+        v = instant[2]
+        speeds = self.model.layout.drive_speeds[: len(v)]
+        if (np.abs(v) >= self.settings.min_velocity * speeds).any():
+            self._warmup.append(instant)
+        if len(self._warmup) * self._dt >= self.settings.warmup:
+            self._start()
+
+    def _start(self) -> None:
+        """Initialise the filter from the instants of the warm-up, then process these."""
+        t, q, v, a, tau = (np.array(x) for x in zip(*self._warmup, strict=True))
+        joints, segment = self.model.joints, np.zeros(len(t), dtype=int)
+        motion = Trajectory(t, q, v, a, tau, joints, 1.0 / self._dt, segment)
+        spread = prior_spread(self.model, motion.squares, len(motion.t))
+        beta = self.mapping.to_base(self.model.standard_parameters())
+        KS = self.mapping.K * spread
+        C = KS @ KS.T
+        size = self.model.layout.n_inertial
+        self._load_columns = self.mapping.K[:, size - 10 : size]  # of the last body
+        self._load_spread = load_spread(spread[:size])
+        KL = self._load_columns * self._load_spread
+        self._reopening = KL @ KL.T + _REOPENED**2 * C
+        self._prior_variance = np.diag(C)
+        rms = np.sqrt(np.mean(tau**2, axis=0))
+        s = self.settings
+        detector = ChangeDetector(len(joints), s.threshold, s.drift)
+        self._innovations = Innovations(rms, self._dt, s.noise_memory, s.model_error, detector)
+        walk = s.walk * np.sqrt(self._dt)
+        # noise levels are estimated online, so the weights of the rows include them
+        self._kalman = Kalman(np.ones(len(joints)), beta, C, walk, None, self._share)
+        self._state: KalmanState = self._kalman.init(len(beta))
+        early, self._warmup = self._warmup, []
+        for instant in early:
+            self._step(instant, instant[0] + self.delay)
+
+    def _step(self, instant: Instant, now: float) -> None:
+        t, q, v, a, tau = instant
+        kalman = self._require_ready()
+        used = sure_rows(self.model.layout, v[None], self.settings.min_velocity)[0]
+        Y = self._regressor(q, v, a)
+        e = tau - Y @ self._state.theta
+        uncertainty = np.einsum("ij,ij->i", Y @ self._state.P, Y)  # variance of the prediction
+        state = kalman.update(self._state, Sample(Y, tau, used / self._innovations.variance))
+        self._store(t)
+        self._state, self._t = state, t
+        residual = tau - Y @ state.theta
+        self._compared = tau, np.where(used, tau - residual, np.nan)
+        onset = self._innovations.push(t, tau, e, residual, uncertainty, used, self._share)
+        if onset is not None:
+            self._reopen(now, onset)
+
+    def _reopen(self, now: float, onset: float) -> None:
+        """Restore the state before the change, and increase the covariance."""
+        # the filter spreads a step over its delay, which biases the estimate before the onset
+        start = onset - self.delay
+        clean = [state for t, state in self._recent if t <= start]
+        before = clean[-1] if clean else self._recent[0][1]
+        self.changes = (*self.changes, Change(float(now), onset, before.theta, before.P))
+        self._state = replace(self._state, theta=before.theta, P=before.P + self._reopening)
+        self._recent.clear()
+        self._innovations.forget_convergence()
+
+    def _store(self, t: float) -> None:
+        """Store the state every tenth of a second."""
+        if not self._recent or t >= self._recent[-1][0] + _STORED_EVERY:
+            self._recent.append((t, self._state))

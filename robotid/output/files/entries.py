@@ -1,0 +1,362 @@
+"""Content of result.json for an identification and for a preview."""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from robotid.base.files import finite, source_entry
+from robotid.base.versions import __version__, versions
+from robotid.data.transmission import Transmission
+from robotid.diagnosis.verdict.parameter_table import parameter_entries
+from robotid.dynamics.base_parameters import structural_mapping
+from robotid.estimation.fitting.bands import QUANTILE, next_errors, typical_friction
+from robotid.estimation.fitting.evaluation import Evaluation
+from robotid.estimation.fitting.identified import SOURCES, Identified
+from robotid.estimation.fitting.left_out import LEFT_OUT
+from robotid.estimation.fitting.selected_drives import DriveChoice
+from robotid.identification.result import Identification
+from robotid.output.files.ranges import parameter_ranges
+from robotid.output.files.samples import covariance_entry
+from robotid.robot.drives import TERMS
+from robotid.robot.parameters import pseudo_inertia
+
+if TYPE_CHECKING:
+    from robotid.design.previews import Preview
+    from robotid.identification.closed_loop.loop_result import LoopIdentification
+
+__all__ = [
+    "SCHEMA_VERSION",
+    "build_preview",
+    "build_result",
+    "input_entries",
+    "recording_metrics",
+]
+
+SCHEMA_VERSION = 1
+
+_EXTENT = ("samples", "rate", "start", "end", "rows_used", "segments")
+
+
+def build_result(
+    found: "Identification | LoopIdentification",
+    settings: Mapping[str, Any],
+    outputs: Mapping[str, str] | None = None,
+) -> dict[str, Any]:
+    """Return the content of result.json: plain values, all numbers finite.
+
+    Args:
+        found: The identification.
+        settings: The job, in the form of its file.
+        outputs: Further files in the same folder, by kind.
+    """
+    model, (bodies, drives) = found.model, parameter_entries(found)
+    if isinstance(found, Identification):
+        own = _torque_entries(found, settings)
+        beside = found.urdf_with_drives[len(bodies) :].tolist()
+        drives = [x | {"with_urdf": value} for x, value in zip(drives, beside, strict=True)]
+    else:
+        from robotid.output.files.loop_export import loop_entries
+
+        own = loop_entries(found)
+    common = {
+        "schema_version": SCHEMA_VERSION,
+        "robotid": __version__,
+        "versions": versions(),
+        "robot": model.name,
+        "joints": list(model.joints),
+        "settings": dict(settings),
+        "inputs": input_entries(found),
+        "outputs": dict(outputs or {}),
+        "structure": _structure(found) | own.pop("structure"),
+        "base_parameters": _base_parameters(found),
+        "standard_parameters": bodies,
+        "drive_parameters": [*drives, *own.pop("loop_parameters", ())],
+        "own_terms": model.options["own_terms"],
+        "drive_moments": {name: moments.to_dict() for name, moments in found.moments.items()},
+        "consistency": _consistency(found) | own.pop("consistency", {}),
+        "identification": found.metrics().to_dict(),
+        "warnings": [
+            {"code": f.code, "severity": f.severity, "message": f.message, "where": f.where}
+            for f in found.findings
+        ],
+        "verdict": found.verdict.to_dict(),
+    }
+    if found.has_urdf:
+        common["ranges"] = parameter_ranges(found) | own.pop("ranges", {})
+    return common | own
+
+
+def _torque_entries(found: Identification, settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the entries of result.json that only an identification from torques has."""
+    return {
+        "structure": _determined(found),
+        "uncertainty": {
+            "method": found.errors.method,
+            "segments": found.errors.segments,
+            "inflation": found.errors.inflation,
+        },
+        "covariance": covariance_entry(
+            found.model.layout.names, found.standard_covariance, found.at_bound
+        ),
+        "motors": _motors(found, settings),
+        "friction": {drive.joint: _friction(found, drive) for drive in found.drives},
+        "consistency": {
+            "mass_matrix": dataclasses.asdict(found.mass_matrix),
+            "fit": dict(found.estimate.details),
+            "sources": {kind: found.sources.count(kind) for kind in SOURCES},
+        },
+        "validation": [
+            recording_metrics(e, "estimate") | {"band": _band(found, e)} for e in found.validation
+        ],
+        "wls": {
+            "base_values": found.wls.theta.tolist(),
+            "base_std_errors": [finite(error) for error in found.wls.std_error],
+            "identification": found.metrics("wls").to_dict(),
+            "validation": [recording_metrics(e, "wls") for e in found.validation],
+        },
+        "scale_check": found.scale_check.to_dict(),
+        **_left_out(found),
+        **_variation(found),
+    }
+
+
+def _left_out(found: Identification) -> dict[str, Any]:
+    """Return the metrics of each log as a fit to the others predicts it."""
+    logs = [{"log": name.removesuffix(LEFT_OUT), **metrics.to_dict()}
+            for name, metrics in found.left_out.items()]  # fmt: skip
+    return {"left_out": logs} if logs else {}
+
+
+def _variation(found: Identification) -> dict[str, Any]:
+    """Return the variation between three or more logs, with the torque error of the next log.
+
+    Sums over the rows of each log are those to which the next logs are added.
+    """
+    if found.variation is None or found.sums is None:
+        return {}
+    rows = zip(found.model.row_names, next_errors(found).tolist(), strict=True)
+    content = found.variation.to_dict() | {"next_torque_rmse": dict(rows)}
+    noise = found.regressor_noise
+    sums = found.sums.to_dict() | {
+        "unit": [found.variation.unit_names[k] for k in found.variation.of_runs]
+    }
+    if noise is not None and noise.is_corrected:
+        sums["shift"] = noise.shift.tolist()
+    return {"variation": content | {"sums": sums}}
+
+
+def build_preview(preview: "Preview") -> dict[str, Any]:
+    """Return the content of a preview: plain values, all numbers finite.
+
+    Args:
+        preview: The preview.
+    """
+    found, noise = preview.expected, preview.noise
+    bodies, drives = parameter_entries(found)
+    keys = ("name", "expression", "std_error", "unit")
+    base = [
+        {key: entry[key] for key in keys} | {"plausible": float(spread)}
+        for entry, spread in zip(_base_parameters(found), preview.plausible, strict=True)
+    ]
+    if preview.before is not None and preview.gain is not None:
+        for entry, before, gain in zip(base, preview.before, preview.gain, strict=True):
+            entry |= {"std_error_before": finite(before), "gain": finite(gain)}
+    units = dict(zip(found.model.row_names, found.model.row_units, strict=True))
+    return {
+        "robot": found.model.name,
+        "joints": list(found.model.joints),
+        "estimator": found.estimator.name,
+        "motions": [
+            {"role": "motion", **source_entry(e.recording.log.path), **_extent(e)}
+            for e in found.fitted
+        ],
+        "noise": {
+            joint: {"std": float(std), "unit": units[joint], "correlation": float(time), "is": of}
+            for joint, std, time, of in zip(
+                found.model.joints, noise.std, noise.correlation, noise.origins, strict=True
+            )
+        },
+        "structure": _structure(found) | _determined(found),
+        "undetermined": list(found.determination.undetermined),
+        "words": preview.words,
+        "base_parameters": base,
+        "standard_parameters": [_without_value(entry) for entry in bodies],
+        "drive_parameters": [_without_value(entry) for entry in drives],
+        "torque": _expected_torque(preview),
+    }
+
+
+def recording_metrics(evaluation: Evaluation, name: str) -> dict[str, Any]:
+    """Return the metrics of one recording for result.json.
+
+    Args:
+        evaluation: The recording.
+        name: Name of the parameters of the prediction.
+    """
+    recording = evaluation.recording
+    return {"log": recording.log.path, "name": recording.name, **evaluation.metrics[name].to_dict()}
+
+
+def _friction(found: Identification, drive: DriveChoice) -> dict[str, Any]:
+    """Return the friction terms of a joint, and the terms that were tried."""
+    own = [term for term in found.model.layout.terms if TERMS[term].is_friction]
+    choice = drive.to_dict()
+    return {
+        "terms": [*own, *drive.families],
+        **choice,
+        **_curve(found, drive.joint),
+        "on_misfit": [name for name in found.on_misfit if name.startswith(f"{drive.joint}.")],
+        "tried": [{"terms": [*own, *tried["families"]], **tried} for tried in choice["tried"]],
+    }
+
+
+def _curve(found: Identification, joint: str) -> dict[str, Any]:
+    """Return the friction of a joint over its speed; nothing if no log moves it."""
+    row = found.model.row_names.index(joint)
+    speeds = [e.recording.trajectory.v[e.recording.mask[:, row], row] for e in found.fitted]
+    if not np.any(np.concatenate(speeds)):
+        return {}
+    return {"curve": typical_friction(found, joint).to_dict()}
+
+
+def _structure(found: Identified) -> dict[str, Any]:
+    """Return the numbers of parameters, and the undetermined ones."""
+    return {
+        "standard": found.model.layout.n_inertial,
+        "base_inertial": len(structural_mapping(found.model, inertial_only=True).K),
+        "base": len(found.base),
+        "undetermined": list(found.undetermined),
+    }
+
+
+def _determined(found: Identification) -> dict[str, Any]:
+    """Return the number of base parameters that torques determine, and indistinguishable ones."""
+    return {
+        "rank": found.determination.rank,
+        "condition": finite(found.wls.condition),
+        "poorly_excited": found.is_poorly_excited,
+        "indistinguishable": found.determination.to_list(),
+    }
+
+
+def _without_value(entry: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a parameter's entry without the keys that require data."""
+    return {key: x for key, x in entry.items() if key not in ("value", "at_bound")}
+
+
+def _expected_torque(preview: "Preview") -> dict[str, dict[str, Any]]:
+    """Return RMS torque and RMS half width of the 95 % band of each joint on the motions."""
+    found, bands = preview.expected, preview.bands
+    torque = np.vstack([e.recording.trajectory.tau for e in found.fitted])
+    of_parameters = QUANTILE * np.sqrt(
+        np.mean(np.vstack([b.parameters for b in bands]) ** 2, axis=0)
+    )
+    half = QUANTILE * np.sqrt(np.mean(np.vstack([b.total for b in bands]) ** 2, axis=0))
+    rms = np.sqrt(np.mean(torque**2, axis=0))
+    model = found.model
+    return {
+        row: {
+            "rms": float(rms[j]),
+            "half_width": float(half[j]),
+            "of_parameters": float(of_parameters[j]),
+            "unit": model.row_units[j],
+        }
+        for j, row in enumerate(model.row_names)
+        if row in model.joints
+    }
+
+
+def input_entries(found: "Identification | LoopIdentification") -> list[dict[str, Any]]:
+    """Return the files that were read, for result.json, the URDF first.
+
+    Args:
+        found: The identification.
+    """
+    inputs = [{"role": "urdf", **source_entry(found.model.tree.path)}]
+    if not isinstance(found, Identification):
+        from robotid.output.files.loop_export import loop_inputs
+
+        return [*inputs, *loop_inputs(found)]
+    for role, evaluations in (
+        ("identification", found.fitted),
+        ("validation", found.validation),
+    ):
+        for evaluation in evaluations:
+            recording = evaluation.recording
+            signals = {"signals": dataclasses.asdict(recording.signals)}
+            source = source_entry(recording.log.path)
+            inputs.append({"role": role, **source, **_extent(evaluation), **signals})
+    return inputs
+
+
+def _extent(evaluation: Evaluation) -> dict[str, Any]:
+    return {key: getattr(evaluation.recording.extent, key) for key in _EXTENT}
+
+
+def _base_parameters(found: Identified) -> list[dict[str, Any]]:
+    mapping, units = found.mapping, found.model.layout.units
+    return [
+        {
+            "name": name,
+            "expression": mapping.expressions[k],
+            "value": float(found.base[k]),
+            "std_error": finite(found.base_error[k]),
+            "interval_95": [finite(end) for end in found.base_interval[k]],
+            "unit": units[i],
+        }
+        for k, (name, i) in enumerate(zip(mapping.base_names, mapping.independent, strict=True))
+    ]
+
+
+def _motors(found: Identification, settings: Mapping[str, Any]) -> dict[str, dict[str, float]]:
+    """Return gear ratio and motor inertia, armature / ratio^2, of geared drives."""
+    model, gears = found.model, dict[str, float]()
+    for table in settings.get("transmission", ()):
+        gears |= Transmission.from_dict(table).stated(model.tree.reductions).gears
+    drives = [
+        (model.layout.drives[d].name, value)
+        for (d, term), value in zip(
+            model.layout.drive_parameters, found.standard[model.layout.n_inertial :], strict=True
+        )
+        if term.is_inertia
+    ]
+    return {
+        name: {"gear": gears[name], "inertia": float(value) / gears[name] ** 2}
+        for name, value in drives
+        if name in gears
+    }
+
+
+def _consistency(found: Identified) -> dict[str, Any]:
+    """Return whether the bodies are physically consistent, and their masses."""
+    layout = found.model.layout
+    J = pseudo_inertia(found.standard[: layout.n_inertial])
+    smallest = np.linalg.eigvalsh(J)[:, 0]
+    return {
+        "is_consistent": found.is_consistent,
+        "links": [
+            {"name": body, "mass": float(J[i, 3, 3]), "min_eigenvalue": float(smallest[i])}
+            for i, body in enumerate(layout.bodies)
+        ],
+        "total_mass": float(J[:, 3, 3].sum()),
+    }
+
+
+def _band(identification: Identification, evaluation: Evaluation) -> dict[str, Any]:
+    """Return the 95 % band of the predicted torque: its half width, and its coverage."""
+    recording, band = evaluation.recording, identification.band(evaluation)
+    covered = band.coverage(
+        recording.trajectory.tau, evaluation.torques["estimate"], recording.mask
+    )
+    return {
+        row: {
+            "half_width": float(QUANTILE * np.sqrt(np.mean(total**2))),
+            "of_parameters": float(QUANTILE * np.sqrt(np.mean(parameters**2))),
+            "coverage_pct": finite(100 * share),
+        }
+        for row, total, parameters, share in zip(
+            identification.model.row_names, band.total.T, band.parameters.T, covered, strict=True
+        )
+    }

@@ -1,0 +1,160 @@
+"""Write drives with position controllers as actuators of Isaac Lab, without its package."""
+
+import json
+import math
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from robotid.base.exceptions import DataError, SettingsError
+from robotid.base.files import write_text
+from robotid.base.findings import listed
+from robotid.base.typing import Array
+from robotid.base.versions import __version__
+from robotid.output.files.commanded import CommandedDrive, limit_of
+from robotid.output.files.exported import Exported, Written, unstated_terms
+from robotid.output.files.result_file import Result
+from robotid.output.files.yaml_text import yaml_text
+from robotid.robot.model import RobotModel
+from robotid.robot.tree import Joint
+
+__all__ = ["export", "isaac_actuators", "write_isaac"]
+
+# drive terms of Isaac Lab's actuators; a note of its own states the offset
+_TERMS = ("armature", "viscous", "coulomb", "offset")
+_STEP = 0.005  # [s]
+_HEAD = """\
+Actuators of {robot} for Isaac Lab 2.2 or later (Isaac Sim 5, where friction is a torque), by
+robotid {version}. N m, N m s/rad, kg m^2, rad/s; N, N s/m, kg, m/s of prismatic joints.
+
+  import yaml
+  from isaaclab.actuators import DelayedPDActuatorCfg
+  groups = yaml.safe_load(open("{file}"))["actuators"]
+  actuators = {{name: DelayedPDActuatorCfg(**group) for name, group in groups.items()}}
+
+Delays are rounded to steps of physics_dt; sim.dt must be equal to it. If min_delay is less than
+max_delay, Isaac Lab draws a delay for each robot at each reset. Friction is Coulomb friction, at
+rest and in motion.
+"""
+
+
+def export(result: Result, target: Path, *, step: float = _STEP) -> Written:
+    """Write the drives of a result as the YAML of Isaac Lab's actuators.
+
+    Args:
+        result: The result.
+        target: The file to write.
+        step: As of ``write_isaac``.
+
+    Raises:
+        DataError, SettingsError: As of ``write_isaac``; also if it has no URDF.
+    """
+    of = Exported.of(result, _TERMS)
+    notes = write_isaac(of.model, of.pi, of.commanded, target, step=step, notes=of.notes)
+    return of.written(target, notes=notes)
+
+
+def isaac_actuators(
+    model: RobotModel, commanded: Sequence[CommandedDrive], physics_dt: float
+) -> dict[str, Any]:
+    """Return the groups of joints with equal drives, with the names of Isaac Lab's fields.
+
+    Args:
+        model: The robot; its URDF has the speed limits, and torque limits of drives without one.
+        commanded: The drives of its joints.
+        physics_dt: Time step of the simulator, the unit of delays [s].
+
+    Returns:
+        {"physics_dt", "actuators": {group: fields of ``DelayedPDActuatorCfg``}}; a limit that is
+        not stated is None. Isaac Lab then uses the limit of its own model of the robot.
+
+    Raises:
+        DataError: If there are no drives with position controllers.
+        SettingsError: If physics_dt is not positive.
+    """
+    if not 0 < physics_dt < math.inf:
+        raise SettingsError(f"step is {physics_dt:g} s, wanted a positive time")
+    if not commanded:
+        raise DataError(
+            "the result has no gains of drives, which Isaac Lab's actuators require; identify from "
+            'a log with commands, with [controller] and [estimator] name = "simulation"'
+        )
+    groups: dict[str, tuple[dict[str, Any], list[str]]] = {}
+    for drive, joint in zip(commanded, model.limits, strict=True):
+        fields = _fields(drive, joint, physics_dt)
+        groups.setdefault(yaml_text(fields, ""), (fields, []))[1].append(drive.joint)
+    actuators: dict[str, Any] = {}
+    for fields, joints in groups.values():
+        name = _group_name(joints)
+        while name in actuators:
+            name += "_"
+        actuators[name] = {"joint_names_expr": [re.escape(joint) for joint in joints], **fields}
+    return {"physics_dt": physics_dt, "actuators": actuators}
+
+
+def write_isaac(
+    model: RobotModel,
+    pi: Array,
+    commanded: Sequence[CommandedDrive],
+    target: str | Path,
+    *,
+    step: float = _STEP,
+    notes: Sequence[str] = (),
+) -> tuple[str, ...]:
+    """Write drives with position controllers as the YAML of Isaac Lab's actuators.
+
+    Args:
+        model: The robot.
+        pi: Standard parameters, shape (p,), SI units, in ``layout.names`` order.
+        commanded: Its drives.
+        target: The file to write.
+        step: Time step of the simulator, the unit of delays [s].
+        notes: Further notes on the file.
+
+    Returns:
+        Properties that the file does not state, a sentence each; its head has them, too.
+
+    Raises:
+        DataError: If there are no drives with position controllers, or the folder does not exist.
+        SettingsError: If step is not positive, or the target is a folder.
+    """
+    content = isaac_actuators(model, commanded, step)
+    every = [*notes, *unstated_terms(model, pi, "Isaac Lab", _TERMS)]
+    for key, words, remedy in (
+        ("offset", "the torque offset", "subtract it from the effort target"),
+        ("zero", "the encoder's zero", "the simulator's position is the encoder's plus the zero"),
+    ):
+        values = [f"{drive.joint} {x:.4g}" for drive in commanded if (x := getattr(drive, key))]
+        if values:
+            every.append(f"Isaac Lab cannot state {words} ({listed(values)}); {remedy}")
+    head = _HEAD.format(robot=json.dumps(model.name), version=__version__, file=Path(target).name)
+    write_text(yaml_text(content, "\n".join([head, *every]) if every else head), target)
+    return tuple(every)
+
+
+def _fields(drive: CommandedDrive, joint: Joint, physics_dt: float) -> dict[str, Any]:
+    """Return the fields of one joint's actuator without its name."""
+    steps = round(drive.delay / physics_dt)
+    return {
+        "effort_limit": _limit(limit_of(drive, joint)),
+        "velocity_limit": _limit(joint.velocity),
+        "stiffness": drive.kp,
+        "damping": drive.kd,
+        "armature": drive.armature,
+        "friction": drive.coulomb,
+        "dynamic_friction": drive.coulomb,
+        "viscous_friction": drive.viscous,
+        "min_delay": steps,
+        "max_delay": steps,
+    }
+
+
+def _limit(value: float) -> float | None:
+    return value if 0 < value < math.inf else None
+
+
+def _group_name(joints: Sequence[str]) -> str:
+    """Return the words that the names of joints have in common."""
+    words = [set(joint.split("_")) for joint in joints]
+    return "_".join(w for w in joints[0].split("_") if all(w in own for own in words)) or "drives"

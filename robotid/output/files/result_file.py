@@ -1,0 +1,597 @@
+"""result.json: the result of an identification, in a schema for other programs."""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from robotid.base.arguments import checked
+from robotid.base.exceptions import DataError, ModelError
+from robotid.base.files import check_path, moved_file, read_json
+from robotid.base.findings import listed
+from robotid.base.settings import Range, require_kind
+from robotid.base.typing import Array
+from robotid.data.log import Log, suggestion
+from robotid.diagnosis.verdict.parameter_table import parameter_table
+from robotid.diagnosis.verdict.payload_check import PayloadCheck
+from robotid.diagnosis.verdict.scale_check import ScaleCheck
+from robotid.diagnosis.verdict.stated_mass import StatedMass
+from robotid.dynamics.friction_projection import (
+    DriveMoments,
+    projected_pinocchio_model,
+)
+from robotid.dynamics.prediction import predict_instants
+from robotid.estimation.fitting.bands import FrictionCurve
+from robotid.estimation.variation.groups import RunSums
+from robotid.estimation.variation.variation import SCORES, between_covariance
+from robotid.output.files.commanded import (
+    CommandedDrive,
+    commanded_drives,
+    loops_of,
+)
+from robotid.output.files.entries import SCHEMA_VERSION
+from robotid.output.files.shape import (
+    FILE,
+    FLAG,
+    MAYBE,
+    NUMBER,
+    TABLE,
+    TEXT,
+    check_shape,
+    require_lengths,
+)
+from robotid.output.files.urdf import load_identified, terms_from_facts
+from robotid.robot.model import RobotModel
+
+if TYPE_CHECKING:
+    from robotid.identification.closed_loop.position_errors import OpenLoop
+
+__all__ = [
+    "Result",
+    "load_result",
+    "read_result",
+    "stated_between",
+    "stated_covariance",
+    "stated_model",
+    "stated_parameters",
+    "stated_scale_check",
+    "stated_urdf_with_drives",
+]
+
+_STATUSES = ("good", "usable", "poor", "not evaluated")
+_STATUS = Range("good, usable, poor or not evaluated", _STATUSES.__contains__)
+_METRICS = {"per_joint": {...: {"relative_error_pct": MAYBE, "rmse": MAYBE, "unit": TEXT}}}
+_PARAMETER = {"name": TEXT, "value": NUMBER, "unit": TEXT}
+_RECORDING = {
+    **dict.fromkeys(("start", "end", "rows_used"), NUMBER),
+    "signals": TABLE,
+}
+_ROUNDING = 1e-9  # [-] of eigenvalues that may be 0
+_VARIATION = {
+    "logs": [TEXT],
+    "parameters": {
+        ...: {
+            **dict.fromkeys(("mean", "std_error", "spread", "spread_within_units?"), NUMBER),
+            "next_interval": [NUMBER] * 2,
+            "seen_interval?": [NUMBER] * 2,
+            "next_quantiles": [NUMBER] * len(SCORES),
+        }
+    },
+    "correlation": [[NUMBER]],
+    "sums?": {
+        "H": [[NUMBER]],
+        "h": [[NUMBER]],
+        "scatter": [[NUMBER] * 2],
+        "sigma": [NUMBER],
+        "shift?": [NUMBER],
+        "unit": [TEXT],
+    },
+    "added?": [{"path": TEXT, "sha256": (str, type(None))}],
+}
+#: The entries of a result.json that are read.
+_SHAPE = {
+    "robotid": TEXT,
+    "robot": TEXT,
+    "joints": [TEXT],
+    "versions?": {...: TEXT},
+    "settings": {"estimator": {"name": TEXT}},
+    "inputs": [{"role": TEXT, "path": TEXT, "sha256": (str, type(None))}],
+    "outputs": {"urdf?": FILE, "sidecar?": FILE},
+    "structure": {"base": NUMBER, "undetermined": [TEXT]},
+    "scale_check?": {
+        **{key: {...: NUMBER} for key in ("gravity", "gravity_error", "friction")},
+        **{key: [NUMBER] for key in ("unexplained", "masses")},
+        "scale": MAYBE,
+        "factor": NUMBER,
+        "common?": [NUMBER],
+        "mass_error?": NUMBER,
+        "assumed?": NUMBER,
+        "stated?": {
+            "names": [TEXT],
+            "ratio": MAYBE,
+            "half_width": NUMBER,
+            "absorbed_by": [TEXT],
+        },
+        "payloads?": [
+            {
+                **dict.fromkeys(("link", "log", "sha256"), TEXT),
+                **dict.fromkeys(("known", "std_error"), NUMBER),
+                "identified": MAYBE,
+                "interval": [NUMBER],
+            }
+        ],
+        "is_stated": FLAG,
+    },
+    "consistency": {
+        "is_consistent": FLAG,
+        "fit?": {"prior?": {"weight": NUMBER, "plausible_weight?": NUMBER}},
+    },
+    "base_parameters": [{**_PARAMETER, "expression": TEXT, "std_error": MAYBE}],
+    "standard_parameters": [_PARAMETER],
+    "drive_parameters": [{**_PARAMETER, "with_urdf?": NUMBER}],
+    "ranges?": {"robot": TEXT, "drives": {...: TABLE}},
+    "simulation?": {"controller": {"kind": TEXT, "rate?": MAYBE}},
+    "own_terms?": {...: [TABLE]},
+    "variation?": _VARIATION,
+    "covariance?": {"names": [TEXT], "root": [[NUMBER]]},
+    "friction?": {...: {"data_range?": {...: [NUMBER]}}},
+    "drive_moments?": {...: {"terms": [TEXT], "products": [[NUMBER]], "torque": NUMBER}},
+    "identification": _METRICS,
+    "validation": [{"log": TEXT, **_METRICS}],
+    "verdict": {
+        "status": _STATUS,
+        "reasons": [TEXT],
+        "use_for?": {...: TEXT},
+        "per_joint?": {...: {"status": _STATUS, "reasons": [TEXT]}},
+        "log_errors?": [TEXT],
+        "warnings?": [{"code": TEXT, "joint": TEXT, "message": TEXT, "effect?": TEXT}],
+    },
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """A written identification: result.json, with URDF and sidecar in the same folder.
+
+    Attributes:
+        path: The result.json.
+        content: Its content.
+    """
+
+    path: Path
+    content: Mapping[str, Any]
+
+    def __repr__(self) -> str:
+        return (
+            f"<Result of {self.content['robot']}: {self.content['structure']['base']} base "
+            f"parameters by {self.content['settings']['estimator']['name']}, verdict "
+            f"{self.verdict['status']}>"
+        )
+
+    @property
+    def has_urdf(self) -> bool:
+        """Whether the identified URDF was written; an impossible result has none."""
+        return "urdf" in self.content["outputs"]
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """The result.json, its URDF and sidecar, and the inputs of the fit; not the report."""
+        outputs = self.content["outputs"]
+        beside = [self.path.with_name(outputs[x]) for x in ("urdf", "sidecar") if x in outputs]
+        inputs = [Path(entry["path"]) for entry in self.content["inputs"] if entry["path"]]
+        return (self.path, *beside, *inputs)
+
+    @cached_property
+    def identified(self) -> tuple[RobotModel, Array]:
+        """The robot of the identified URDF with its sidecar, and its standard parameters."""
+        if not self.has_urdf:
+            raise DataError(
+                f"{self.path.name} has no URDF, because its parameters are wrong or impossible: "
+                f"{self.verdict['reasons'][0]}"
+            )
+        outputs, folder = self.content["outputs"], self.path.parent
+        return load_identified(folder / outputs["urdf"], folder / outputs["sidecar"])
+
+    @property
+    def robot(self) -> RobotModel:
+        """The identified robot."""
+        return self.identified[0]
+
+    @property
+    def parameters(self) -> Array:
+        """Its standard parameters, shape (p,), SI units, in ``robot.layout.names`` order."""
+        return self.identified[1]
+
+    @cached_property
+    def commanded(self) -> tuple[CommandedDrive, ...]:
+        """The drives with position controllers, in the order of the joints; none without gains."""
+        if "simulation" not in self.content:
+            return ()
+        return commanded_drives(*self.identified, self.content, self.path.name)
+
+    @property
+    def rate(self) -> float | None:
+        """Sampling rate of the controller of those drives [Hz]; None for continuous time."""
+        stated = self.content.get("simulation", {"controller": {}})["controller"]
+        rate: float | None = stated.get("rate")
+        return rate
+
+    def follow_commands(self, log: Log) -> Array:
+        """Return the positions of the robot simulated on the commands of a log.
+
+        Args:
+            log: The log, with commands; its joints are those of the robot in the same order.
+
+        Returns:
+            Simulated encoder readings, shape (N, n) [rad or m].
+
+        Raises:
+            DataError: If the result has no gains of drives, or the log no commands.
+        """
+        if not self.commanded:
+            raise DataError(
+                f"{self.path.name} has no gains of drives, which a simulation on commands requires"
+            )
+        if log.q_ref is None:
+            raise DataError(f"{log.name} has no commands, columns qref_ of each joint")
+        return self._signs * self.open_loop(log, horizons=()).q
+
+    @checked()
+    def open_loop(self, log: Log, *, horizons: Sequence[float] | None = None) -> "OpenLoop":
+        """Return a log with the positions simulated for it, in the URDF's sense of the joints.
+
+        The inputs are its commands; for a result without gains, its feed-forward torques.
+
+        Args:
+            log: The log, with commands; its joints are those of the robot in the same order.
+            horizons: Horizons of errors [s]; those of result.json if None.
+
+        Raises:
+            DataError: If the result is from torques.
+            MissingDependencyError: If Numba is not installed.
+            NotConvergedError: If a step has no solution.
+            SettingsError: If a term of the drives cannot be simulated.
+        """
+        from robotid.dynamics.simulation.loops import ClosedLoopRobot, open_loops
+        from robotid.identification.closed_loop.position_errors import HORIZONS, run_open_loop
+
+        if "simulation" not in self.content:
+            raise DataError(
+                f"{self.path.name} is a result from torques, wanted one of the estimator "
+                "'simulation'; use predict(q, v, a)"
+            )
+        (model, pi), drives = self.identified, self.commanded
+        loops = loops_of(model, pi, drives, self.rate) if drives else open_loops(model, pi)
+        times = HORIZONS if horizons is None else horizons
+        turned = log.turned(self._signs)
+        return run_open_loop(ClosedLoopRobot(model), loops, turned, horizons=times)
+
+    @property
+    def _signs(self) -> Array:
+        """Sense of each encoder against the URDF's, shape (n,): 1 or -1."""
+        signs = self.content["simulation"].get("signs", {})
+        return np.array([signs.get(joint, 1.0) for joint in self.robot.joints])
+
+    def predict(
+        self, q: ArrayLike, v: ArrayLike | None = None, a: ArrayLike | None = None
+    ) -> Array:
+        """Return the torques that the result predicts; see ``Identification.predict``.
+
+        Args:
+            q: Positions, shape (n,) or (N, n) [rad, m].
+            v: Velocities, same shape [rad/s, m/s]; None: at rest.
+            a: Accelerations, same shape [rad/s^2, m/s^2]; None: 0.
+
+        Returns:
+            Torques, same shape [N m, N].
+
+        Raises:
+            DataError: If a shape is wrong, or the result has no URDF.
+        """
+        return predict_instants(*self.identified, q, v, a)
+
+    def friction(self, joint: str) -> FrictionCurve:
+        """Return friction and offset of a joint over its speed, in the range of the fitted logs.
+
+        Args:
+            joint: The joint.
+
+        Raises:
+            DataError: If the result has no friction curve of the joint.
+        """
+        require_kind(joint, str, "joint", "the name of a joint")
+        curves = {
+            name: about["curve"]
+            for name, about in self.content.get("friction", {}).items()
+            if "curve" in about
+        }
+        if joint not in curves:
+            raise DataError(
+                f"{self.path.name} has no friction curve of {joint!r}; joints with a curve: "
+                f"{listed(curves)}{suggestion(joint, curves)}"
+            )
+        curve = curves[joint]
+        v, torque, std = (np.array(curve[key]) for key in ("v", "torque", "std_error"))
+        return FrictionCurve(v, torque, std, curve["load"])
+
+    def table(self) -> Any:  # noqa: ANN401
+        """Return the parameters as a table; see ``Identification.table``."""
+        return parameter_table(
+            self.content["standard_parameters"], self.content["drive_parameters"]
+        )
+
+    @property
+    def drive_moments(self) -> dict[str, DriveMoments]:
+        """Moments for the projection of friction on simpler terms, of drives with further terms."""
+        tables = self.content.get("drive_moments", {})
+        return {name: DriveMoments.from_dict(table) for name, table in tables.items()}
+
+    def pinocchio_model(self) -> Any:  # noqa: ANN401
+        """Return Pinocchio's model of the robot; see ``Identification.pinocchio_model``.
+
+        Raises:
+            DataError: If the result has no URDF.
+        """
+        return projected_pinocchio_model(*self.identified, self.drive_moments)
+
+    @property
+    def verdict(self) -> Mapping[str, Any]:
+        """The verdict: "status", "reasons" and "per_joint"."""
+        verdict: Mapping[str, Any] = self.content["verdict"]
+        return verdict
+
+    @property
+    def metrics(self) -> dict[str, Mapping[str, Any]]:
+        """Metrics by joint: for the "fitted" rows, and for each validation log, by its file."""
+        logs = {entry["log"]: entry["per_joint"] for entry in self.content["validation"]}
+        return {"fitted": self.content["identification"]["per_joint"], **logs}
+
+
+def load_result(path: str | Path) -> Result:
+    """Load a written identification.
+
+    Args:
+        path: A result.json, or its folder. The URDF in that folder is read at its first use.
+
+    Returns:
+        The result: ``robot``, ``parameters``, ``verdict``, ``metrics``, and its whole content.
+
+    Raises:
+        DataError: If it is missing, not JSON, or of another schema.
+    """
+    require_kind(path, (str, Path), "path", "the path of a result.json or of its folder")
+    check_path(path)
+    source = Path(path)
+    source = source / "result.json" if source.is_dir() else source
+    return Result(source, read_result(source))
+
+
+def _with_moved_inputs(result: dict[str, Any], path: Path) -> dict[str, Any]:
+    """Return the content of a result with the present paths of its inputs."""
+    payloads = result.get("scale_check", {}).get("payloads", [])
+    known = [(x["path"], x["sha256"]) for x in result["inputs"]]
+    known += [(x["log"], x["sha256"]) for x in payloads]
+    hashes: dict[str, set[str]] = {}
+    for text, sha256 in known:
+        if sha256:
+            hashes.setdefault(Path(text).name, set()).add(sha256)
+
+    def present(table: Mapping[str, Any], key: str) -> dict[str, Any]:
+        old = table.get(key)
+        if not isinstance(old, str) or Path(old).name not in hashes:
+            return dict(table)
+        return {**table, key: str(moved_file(Path(old), path, hashes[Path(old).name]))}
+
+    settings = present(result["settings"], "urdf")
+    for group in ("identification", "validation", "payload_check"):
+        if isinstance(entries := settings.get(group), list):
+            settings[group] = [present(x, "log") if isinstance(x, dict) else x for x in entries]
+    inputs = [present(entry, "path") for entry in result["inputs"]]
+    return {**result, "settings": settings, "inputs": inputs}
+
+
+def read_result(path: str | Path) -> dict[str, Any]:
+    """Read the content of a result.json; inputs in a moved folder have their present paths.
+
+    Args:
+        path: The file.
+
+    Raises:
+        DataError: If it is missing, not JSON, or not of the schema of a result.
+    """
+    name, result = Path(path).name, read_json(path, "result")
+    version = result.get("schema_version") if isinstance(result, dict) else None
+    if version != SCHEMA_VERSION or "verdict" not in result:
+        raise DataError(
+            f"{name} has schema_version {version!r}, wanted {SCHEMA_VERSION} of a result "
+            "written by 'robotid identify'"
+        )
+    check_shape(result, _SHAPE, name)
+    for k, entry in enumerate(result["inputs"]):
+        if entry["role"] != "urdf":
+            check_shape(entry, _RECORDING, f"{name}.inputs[{k}]")
+    for joint, own in result.get("friction", {}).items():
+        for quantity, ends in own.get("data_range", {}).items():
+            if len(ends) != 2:
+                at = f"{name}.friction.{joint}.data_range.{quantity}"
+                raise DataError(
+                    f"{at} has {len(ends)} numbers, wanted 2: the smallest, the largest"
+                )
+    validation = [entry for entry in result["inputs"] if entry["role"] == "validation"]
+    if len(validation) != len(result["validation"]):
+        raise DataError(
+            f"{name} has {len(validation)} validation recordings among its inputs, but errors of "
+            f"{len(result['validation'])}: the file is incomplete. Identify again"
+        )
+    if "variation" in result:
+        _check_variation(result, f"{name}.variation")
+    return _with_moved_inputs(result, Path(path))
+
+
+def _check_variation(result: Mapping[str, Any], at: str) -> None:
+    """Refuse a variation whose lists do not fit its logs and parameters, or the result's."""
+    stated = result["variation"]
+    k, m = len(stated["logs"]), len(stated["parameters"])
+    require_lengths(stated["correlation"], [m, m], f"{at}.correlation")
+    known = [entry["name"] for entry in result["drive_parameters"]]
+    for name, entry in stated["parameters"].items():
+        own = f"{at}.parameters.{name[:80]}"
+        if name not in known:
+            raise DataError(f"{own} is not among the drive parameters of the result")
+        is_rising = [(np.diff(entry[x]) > 0).all() for x in ("next_interval", "next_quantiles")]
+        if not all(is_rising) or min(entry["std_error"], entry["spread"]) < 0:
+            raise DataError(f"{own} has a negative standard error, or an interval without width")
+    _check_definite([stated["correlation"]], f"{at}.correlation")
+    if sums := stated.get("sums"):
+        size = len(sums["h"][0]) if sums["h"] else 0
+        for key, shape in (("h", [k, size]), ("H", [k, size * (size + 1) // 2]), ("unit", [k])):
+            require_lengths(sums[key], shape, f"{at}.sums.{key}")
+        _check_definite(RunSums.from_dict(sums).H, f"{at}.sums.H", least=-_ROUNDING)
+
+
+def _check_definite(matrices: ArrayLike, at: str, least: float = 0.0) -> None:
+    """Refuse symmetric matrices with an eigenvalue below a multiple of the largest one."""
+    of_each = np.linalg.eigvalsh(np.array(matrices, dtype=float))
+    if of_each.size and (of_each[:, 0] <= least * of_each[:, -1]).any():
+        raise DataError(f"{at} is not a positive definite matrix")
+
+
+def stated_scale_check(result: Mapping[str, Any]) -> ScaleCheck | None:
+    """Return the scale check of a result, if it has one.
+
+    Args:
+        result: Content of a result.json.
+
+    Raises:
+        DataError: If a list of it has the wrong length.
+    """
+    stated = result.get("scale_check")
+    if stated is None:
+        return None
+    lists = {"unexplained": (stated["unexplained"], 2), "masses": (stated["masses"], 3)}
+    lists |= {"common": (stated["common"], 2)} if "common" in stated else {}
+    payloads = stated.get("payloads", [])
+    for k, check in enumerate(payloads):
+        lists[f"payloads[{k}].interval"] = check["interval"], 2
+    for name, (numbers, size) in lists.items():
+        if len(numbers) != size:
+            raise DataError(f"scale_check.{name} has {len(numbers)} numbers, wanted {size}")
+    own = {x.name: stated[x.name] for x in dataclasses.fields(ScaleCheck) if x.name in stated}
+    own |= {"common": tuple(stated["common"])} if "common" in stated else {}
+    own["payloads"] = tuple(map(PayloadCheck.from_dict, payloads))
+    if stated["is_stated"]:  # an earlier version did not test whether torque determines it
+        mass = stated.get("stated")
+        own["stated"] = StatedMass(()) if mass is None else StatedMass.from_dict(mass)
+    return ScaleCheck(**own)
+
+
+def stated_urdf_with_drives(result: Mapping[str, Any], model: RobotModel) -> Array | None:
+    """Return the URDF's bodies with the drives fitted to them, if a result states them.
+
+    Args:
+        result: Content of a result.json.
+        model: The robot.
+
+    Raises:
+        DataError: If their number differs from that of the robot.
+    """
+    drives = [entry.get("with_urdf") for entry in result["drive_parameters"]]
+    if None in drives:
+        return None
+    pi = model.standard_parameters()
+    if len(drives) != len(pi) - model.layout.n_inertial:
+        wanted = len(pi) - model.layout.n_inertial
+        raise DataError(
+            f"drive_parameters has {len(drives)} entries, wanted the {wanted} of the robot"
+        )
+    pi[model.layout.n_inertial :] = drives
+    return pi
+
+
+def stated_parameters(result: Mapping[str, Any], model: RobotModel) -> Array:
+    """Return the standard parameters that a result states.
+
+    Args:
+        result: Content of a result.json.
+        model: Its robot.
+
+    Returns:
+        Parameters, shape (p,), SI units, in ``layout.names`` order.
+
+    Raises:
+        ModelError: If a parameter of the robot is not in it.
+    """
+    stated = {
+        entry["name"]: entry["value"]
+        for entry in (*result["standard_parameters"], *result["drive_parameters"])
+    }
+    missing = [name for name in model.layout.names if name not in stated]
+    if missing:
+        raise ModelError(
+            f"the result has no value of {listed(missing, 5)}: the URDF has changed; identify again"
+        )
+    return np.array([stated[name] for name in model.layout.names])
+
+
+def stated_covariance(result: Mapping[str, Any], names: Sequence[str]) -> Array | None:
+    """Return the covariance of parameters of a result; None if an earlier version wrote it.
+
+    Args:
+        result: Content of a result.json.
+        names: Names of k parameters.
+
+    Returns:
+        Shape (k, k); 0 for a parameter that was not identified.
+
+    Raises:
+        DataError: If the covariance has not a row for each name.
+    """
+    if "covariance" not in result:
+        return None
+    stated, rows = result["covariance"]["names"], result["covariance"]["root"]
+    if len(stated) != len(rows):
+        raise DataError(
+            f"covariance of the result has {len(rows)} rows, wanted {len(stated)}, one for each "
+            "name; write the result again"
+        )
+    own = dict(zip(stated, rows, strict=True))
+    root = np.zeros((len(names), max(map(len, own.values()), default=0)))
+    for row, name in zip(root, names, strict=True):
+        row[: len(own.get(name, ()))] = own.get(name, ())
+    return root @ root.T
+
+
+def stated_between(result: Mapping[str, Any], model: RobotModel) -> Array | None:
+    """Return the covariance of a robot's parameters in another log, in addition to that of the fit.
+
+    Args:
+        result: Content of a result.json.
+        model: The robot.
+
+    Returns:
+        Shape (p, p); None for fewer than three fitted logs, or if an earlier version wrote it.
+    """
+    variation = result.get("variation")
+    if variation is None or "correlation" not in variation:
+        return None
+    return between_covariance(variation, model.layout.names)
+
+
+def stated_model(result: Mapping[str, Any], model: RobotModel) -> RobotModel:
+    """Return the robot with the friction terms and parameters of a result.
+
+    Args:
+        result: Content of a result.json.
+        model: Its robot, as its job states it.
+
+    Raises:
+        ModelError: If a parameter of the robot is not in it.
+        SettingsError: If a term of it is unknown.
+    """
+    found = model.with_terms(terms_from_facts(result.get("own_terms", {})))
+    return found.with_reference(stated_parameters(result, found))

@@ -1,0 +1,512 @@
+"""Write an identified model as a URDF with a sidecar, and read the pair.
+
+Only the inertials of the original file change; all other bytes are unchanged. The sidecar
+``<name>.drive.json`` has the parameters that a URDF cannot state, as armature and friction of
+coupled drives.
+"""
+
+import difflib
+import hashlib
+import json
+import math
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from robotid.base.exceptions import DataError, ModelError
+from robotid.base.files import check_folder, folder_beside, read_json
+from robotid.base.findings import listed
+from robotid.base.settings import require_kind
+from robotid.base.typing import Array
+from robotid.base.versions import __version__
+from robotid.dynamics.friction_projection import Projection
+from robotid.dynamics.torque import random_regressor
+from robotid.output.files import xml_splice
+from robotid.output.files.exported import Exported, Written, unstated_terms
+from robotid.output.files.shape import FLAG, NUMBER, TABLE, TEXT, check_shape
+from robotid.output.files.xml_splice import Document, Edit
+from robotid.robot.bodies import (
+    LinkPlace,
+    central_inertial,
+    held_parameters,
+    inertial_parameters,
+    link_places,
+)
+from robotid.robot.constraints import Loop
+from robotid.robot.drives import TERMS
+from robotid.robot.families import term_from_dict
+from robotid.robot.model import RobotModel
+from robotid.robot.parameters import Coupling, pseudo_inertia
+from robotid.robot.tree import MOMENTS, Inertial
+
+if TYPE_CHECKING:
+    from robotid.output.files.result_file import Result
+
+__all__ = [
+    "DYNAMICS_TERMS",
+    "export",
+    "link_parameters",
+    "load_identified",
+    "numbers_text",
+    "read_sidecar",
+    "terms_from_facts",
+    "urdf_changes",
+    "write_urdf",
+]
+
+#: The drive terms of ``<dynamics>``.
+DYNAMICS_TERMS = tuple(name for name, term in TERMS.items() if term.dynamics)
+_SCHEMA_VERSION = 1
+_SHAPE = {
+    "urdf_sha256": TEXT,
+    "joints": [TEXT],
+    "locked": {...: NUMBER},
+    "gravity": [NUMBER],
+    "free_flyer": FLAG,
+    "mimic": TEXT,
+    "dynamics?": TEXT,
+    "terms": [TEXT],
+    "own_terms?": {...: [TABLE]},
+    "passive?": [TEXT],
+    "loops?": [{"frames": [TEXT], "kind": TEXT, "axis": [NUMBER]}],
+    "drives": {...: {...: NUMBER}},
+    "couplings": [{"name": TEXT, "ratios": {...: NUMBER}, "replaces?": FLAG}],
+    "lumped": TABLE,
+}
+_HUNK = re.compile(r"@@ -(\d+)")
+_OWNER = re.compile(r"""<(?:link|joint)\s[^>]*?\bname\s*=\s*["']([^"']*)""")
+_UNCHANGED = 1e-12  # relative difference below which a parameter counts as unchanged
+_ROUNDING = 1e-12  # of the size of a link, below which a number is 0
+_STATES = 64  # random states at which the written file must give the same torque
+_SAME = 1e-6  # largest relative difference of a row's torque over these states
+
+
+def write_urdf(
+    model: RobotModel, pi: Array, target: str | Path, *, dynamics: Projection | bool = False
+) -> Path:
+    """Write standard parameters into a copy of the model's URDF, and a sidecar in the same folder.
+
+    The moving link of a body gets the inertial of the body. The inertials of links fixed to it are
+    removed, because the body includes them. Links beyond locked joints are unchanged. Angles that
+    the model has in exact form (``snap_angles``) are written in this form. Both files are read
+    again, and must give the torque of pi, before they replace existing files.
+
+    Args:
+        model: The robot; a copy of its file is edited.
+        pi: Standard parameters, shape (p,), SI units, in ``layout.names`` order.
+        target: The URDF to write; not the original.
+        dynamics: Whether viscous and Coulomb friction are also written to ``<dynamics>``: those of
+            a projection, which the sidecar then states, or those of pi.
+
+    Returns:
+        Path of the sidecar, ``<target stem>.drive.json``.
+
+    Raises:
+        DataError: If pi does not have p finite entries.
+        ModelError: If a link or a drive would be physically impossible, the original is missing or
+            cannot be edited, the target is not usable, or the written file differs from pi.
+    """
+    require_kind(model, RobotModel, "model", "a robotid.RobotModel")
+    require_kind(target, (str, Path), "target", "the path of a URDF to write")
+    source, goal = Path(model.tree.path), Path(target)
+    written = link_parameters(model, pi)
+    _check_target(source, goal)
+    original, places = source.read_bytes(), link_places(model)
+    content = _content(original, model, pi, written, dynamics=dynamics)
+    sidecar = goal.with_name(f"{goal.stem}.drive.json")
+    of_source = source.with_name(f"{source.stem}.drive.json")
+    check_folder(goal.parent, [goal.name, sidecar.name], [source, of_source])
+    facts = {
+        "schema_version": _SCHEMA_VERSION,
+        "robotid": __version__,
+        "robot": model.name,
+        "urdf": goal.name,
+        "urdf_sha256": _digest(content),
+        "source": {"urdf": source.name, "sha256": _digest(original)},
+        **_facts(model, pi, places),
+        **_projected_facts(dynamics),
+    }
+    with folder_beside(goal.parent) as partial:
+        (partial / goal.name).write_bytes(content)
+        text = json.dumps(facts, indent=1, allow_nan=False, ensure_ascii=False)
+        (partial / sidecar.name).write_text(text + "\n", encoding="utf-8")
+        _check_torque(model, pi, partial / goal.name, partial / sidecar.name)
+    return sidecar
+
+
+def export(result: "Result", target: Path) -> Written:
+    """Write the URDF of a result with ``<dynamics>``, and its sidecar.
+
+    Args:
+        result: The result.
+        target: The URDF to write.
+
+    Raises:
+        DataError, ModelError: As of ``write_urdf``; also if the result has no URDF.
+    """
+    of = Exported.of(result, DYNAMICS_TERMS)
+    sidecar = write_urdf(*result.identified, target, dynamics=of.projection)
+    unstated = unstated_terms(of.model, of.pi, "URDF", DYNAMICS_TERMS)
+    return of.written(target, sidecar, notes=[*of.notes, *unstated])
+
+
+def urdf_changes(model: RobotModel, pi: Array, *, dynamics: Projection | bool = False) -> list[str]:
+    """Return the differences of the URDF of ``write_urdf`` from the original, line by line.
+
+    Args:
+        model: The robot; its file is compared.
+        pi: Standard parameters, shape (p,), SI units, in ``layout.names`` order.
+        dynamics: As of ``write_urdf``.
+
+    Returns:
+        A unified diff without context, each segment with the name of its link or joint; empty if
+        the original is missing.
+
+    Raises:
+        DataError: If pi does not have p finite entries.
+        ModelError: If a link or a drive would be physically impossible, or the original cannot be
+            edited.
+    """
+    source = Path(model.tree.path)
+    if not source.is_file():
+        return []
+    original, written = source.read_bytes(), link_parameters(model, pi)
+    texts = original, _content(original, model, pi, written, dynamics=dynamics)
+    before, after = (text.decode("utf-8", errors="replace").splitlines() for text in texts)
+    names = source.name, f"{source.stem}.identified.urdf"
+    lines = list(difflib.unified_diff(before, after, *names, n=0, lineterm=""))
+    for k, line in enumerate(lines):
+        if place := _HUNK.match(line):
+            around = "\n".join(before[: int(place[1])])
+            owners = _OWNER.findall(around)
+            lines[k] = f"{line} {owners[-1] if owners else ''}".rstrip()
+    return lines
+
+
+def read_sidecar(path: str | Path) -> dict[str, Any]:
+    """Return the content of the sidecar of a written URDF, schema_version 1.
+
+    Args:
+        path: The ``.drive.json`` file.
+
+    Raises:
+        DataError: If it is missing, not JSON, or not of the schema of a sidecar.
+    """
+    source, content = Path(path), read_json(path, "drive parameters file")
+    version = content.get("schema_version") if isinstance(content, dict) else None
+    if version != _SCHEMA_VERSION:
+        raise DataError(
+            f"{source.name} has schema_version {version!r}, wanted {_SCHEMA_VERSION} of a drive "
+            "parameters file written by robotid"
+        )
+    check_shape(content, _SHAPE, source.name)
+    return dict(content)
+
+
+def load_identified(urdf: str | Path, sidecar: str | Path) -> tuple[RobotModel, Array]:
+    """Return the model and the standard parameters, shape (p,), of a URDF with its sidecar.
+
+    Args:
+        urdf: The written URDF.
+        sidecar: Its ``.drive.json``.
+
+    Raises:
+        DataError: If the sidecar is not usable.
+        ModelError: If the URDF is missing, is not the one of the sidecar, or lacks a joint of the
+            sidecar.
+    """
+    facts, path = read_sidecar(sidecar), Path(urdf)
+    if not path.is_file():
+        raise ModelError(f"there is no URDF file {str(path)!r}")
+    found = _digest(path.read_bytes())
+    if found != facts["urdf_sha256"]:
+        raise ModelError(
+            f"{path.name} has changed since {Path(sidecar).name} was written: its SHA-256 starts "
+            f"with {found[:12]}, wanted {facts['urdf_sha256'][:12]}; restore the file, or write "
+            "both again"
+        )
+    couplings = [
+        Coupling(c["name"], tuple(c["ratios"].items()), c.get("replaces", False))
+        for c in facts["couplings"]
+    ]
+    drives = {**facts["drives"], **{c["name"]: c for c in facts["couplings"]}}
+    model = RobotModel.from_urdf(
+        path,
+        couplings=couplings,
+        own_terms=terms_from_facts(facts.get("own_terms", {})),
+        dynamics=facts.get("dynamics", "full"),
+        passive=facts.get("passive", ()),
+        constraints=[Loop.from_dict(table) for table in facts.get("loops", ())],
+        **{
+            key: facts[key]
+            for key in ("joints", "locked", "free_flyer", "mimic", "gravity", "terms")
+        },
+    )
+    values = [_drive_value(drives, name, Path(sidecar).name) for name in model.layout.drive_names]
+    pi = np.array([*model.standard_parameters()[: model.layout.n_inertial], *values])
+    return (model.with_reference(pi) if model.layout.remembering else model), pi
+
+
+def terms_from_facts(tables: Mapping[str, Sequence[Mapping[str, Any]]]) -> dict[str, Any]:
+    """Return the further terms of single drives, by name, from their plain values.
+
+    Args:
+        tables: Their values, as of ``RobotModel.options``.
+
+    Raises:
+        SettingsError: If a term is unknown.
+    """
+    return {name: [term_from_dict(term) for term in terms] for name, terms in tables.items()}
+
+
+def _content(
+    original: bytes,
+    model: RobotModel,
+    pi: Array,
+    written: Mapping[str, Array],
+    *,
+    dynamics: Projection | bool,
+) -> bytes:
+    """Return the original URDF with new parameters of links and drives."""
+    document = xml_splice.parse(original, Path(model.tree.path).name)
+    changed = {
+        link: pi
+        for link, pi in written.items()
+        if not _is_as_stated(pi, model.tree.inertials.get(link))
+    }
+    edits = _inertial_edits(document, changed, link_places(model)) + _angle_edits(document, model)
+    if isinstance(dynamics, Projection):
+        edits += _dynamics_edits(document, dynamics.model, dynamics.pi)
+    elif dynamics:
+        edits += _dynamics_edits(document, model, pi)
+    return xml_splice.apply(document, edits)
+
+
+def _digest(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()
+
+
+def _facts(model: RobotModel, pi: Array, places: Sequence[LinkPlace]) -> dict[str, Any]:
+    """Return the content of a sidecar: options of the model, and parameters of the drives."""
+    layout, first = model.layout, model.layout.n_inertial
+    units = dict(zip(layout.names[first:], layout.units[first:], strict=True))
+    values: dict[str, dict[str, float]] = {drive.name: {} for drive in layout.drives}
+    for (d, term), value in zip(layout.drive_parameters, pi[first:], strict=True):
+        values[layout.drives[d].name][term.name] = float(value)
+    own = [drive.name for drive in layout.drives if drive not in layout.couplings]
+    return {
+        **model.options,
+        **({"loops": [loop.to_dict() for loop in model.loops]} if model.loops else {}),
+        "drives": {name: values[name] for name in own},
+        "couplings": [
+            {"name": c.name, "ratios": {joint: float(ratio) for joint, ratio in c.ratios}}
+            | ({"replaces": True} if c.replaces else {})
+            | values[c.name]
+            for c in layout.couplings
+        ],
+        "lumped": _lumped(model, places),
+        "units": {"gravity": "m/s^2", "locked": "rad, or m if prismatic", "ratios": "-", **units},
+    }
+
+
+def _projected_facts(dynamics: Projection | bool) -> dict[str, Any]:
+    """Return the projection of friction on ``<dynamics>``, if there is one."""
+    if not isinstance(dynamics, Projection) or not dynamics.drives:
+        return {}
+    return {"projected_dynamics": {drive.name: drive.to_dict() for drive in dynamics.drives}}
+
+
+def _lumped(model: RobotModel, places: Sequence[LinkPlace]) -> dict[str, list[str]]:
+    lumped: dict[str, list[str]] = {}
+    for place in places:
+        if place.is_lumped and place.link in model.tree.inertials:
+            lumped.setdefault(model.layout.bodies[place.body], []).append(place.link)
+    return lumped
+
+
+def _drive_value(drives: Mapping[str, Any], name: str, where: str) -> float:
+    owner, term = name.rsplit(".", 1)
+    entry = drives.get(owner)
+    value = entry.get(term) if isinstance(entry, dict) else None
+    if not isinstance(value, int | float) or not math.isfinite(value):
+        raise DataError(f"{where}: {name} is {value!r}, wanted a finite number")
+    return float(value)
+
+
+def _check_parameters(model: RobotModel, pi: Array) -> None:
+    wanted = (len(model.layout.names),)
+    require_kind(pi, np.ndarray, "pi", f"an array of shape {wanted}")
+    if pi.shape != wanted:
+        raise DataError(f"pi has shape {pi.shape}, wanted {wanted}")
+    for name, value in zip(model.layout.names, pi, strict=True):
+        if not math.isfinite(value):
+            raise DataError(f"{name} is {value}, wanted a finite number")
+
+
+def _check_target(source: Path, target: Path) -> None:
+    if not source.is_file():
+        raise ModelError(f"the model's URDF {str(source)!r} no longer exists; restore it")
+    if not target.parent.is_dir():
+        raise ModelError(f"the folder {str(target.parent)!r} does not exist; create it")
+    if target.is_dir():
+        raise ModelError(f"the target {str(target)!r} is a folder, wanted a file")
+    if target.exists() and target.samefile(source):
+        raise ModelError(f"the target {str(target)!r} is the original URDF; choose another name")
+
+
+def link_parameters(model: RobotModel, pi: Array) -> dict[str, Array]:
+    """Return the ten parameters of each moving link in its frame, without locked links.
+
+    Args:
+        model: The robot.
+        pi: Standard parameters, shape (p,), SI units, in ``layout.names`` order.
+
+    Returns:
+        Parameters by name of the link, shape (10,).
+
+    Raises:
+        DataError: If pi does not have p finite entries.
+        ModelError: If a link or a drive would be physically impossible.
+    """
+    _check_parameters(model, pi)
+    layout = model.layout
+    advice = "identify with the estimator 'consistent', whose bodies and drives are possible"
+    held = held_parameters(model)
+    whole, urdf = pi[: layout.n_inertial], model.standard_parameters()[: layout.n_inertial]
+    own = whole - held
+    for k, link in enumerate(layout.bodies):
+        smallest, of_whole, of_urdf = (
+            float(np.linalg.eigvalsh(pseudo_inertia(x[10 * k : 10 * k + 10])[0])[0])
+            for x in (own, whole, urdf - held)
+        )
+        if not smallest > 0:
+            others = f", without links beyond {listed(model.locked)}," if model.locked else ""
+            todo = advice
+            if not of_urdf > 0:
+                todo = "the URDF's own is impossible, too: correct it (robotid inspect)"
+            elif of_whole > 0:  # what is taken off makes it impossible
+                todo = (
+                    f"links beyond locked joints keep the URDF's inertials, {held[10 * k]:.3g} kg "
+                    f"of {whole[10 * k]:.3g} kg; correct these, or identify the locked joints, too"
+                )
+            raise ModelError(
+                f"link {link!r}{others} would be physically impossible: the smallest eigenvalue of "
+                f"its pseudo-inertia is {smallest:.3g}, wanted > 0; {todo}"
+            )
+    for i in np.flatnonzero(layout.is_nonnegative() & (pi < 0)):
+        raise ModelError(
+            f"{layout.names[i]} is {pi[i]:.3g} {layout.units[i]}, wanted 0 or more; {advice}"
+        )
+    return dict(zip(layout.bodies, own.reshape(-1, 10), strict=True))
+
+
+def _inertial_edits(
+    document: Document, written: Mapping[str, Array], places: Sequence[LinkPlace]
+) -> list[Edit]:
+    removed = {place.link for place in places if place.is_lumped}
+    edits = []
+    for link in document.root.find_all("link"):
+        name, inertials = link.attributes.get("name", ""), link.find_all("inertial")
+        if name in removed:
+            edits += [xml_splice.remove(document, inertial) for inertial in inertials]
+        elif name in written and inertials:
+            edits.append(xml_splice.replace(document, inertials[0], _inertial(written[name])))
+        elif name in written:
+            edits.append(xml_splice.insert(document, link, _inertial(written[name])))
+    return edits
+
+
+def _angle_edits(document: Document, model: RobotModel) -> list[Edit]:
+    """Return the edits of joint angles that the model has in exact form."""
+    used = {j.get("name"): j.find("origin") for j in model.tree.robot.findall("joint")}
+    edits: list[Edit] = []
+    for joint in document.root.find_all("joint"):
+        origin = used.get(joint.attributes.get("name", ""))
+        rpy = "" if origin is None else origin.get("rpy", "")
+        for element in joint.find_all("origin")[:1]:
+            if element.attributes.get("rpy", "") != rpy:
+                edits += xml_splice.set_attributes(document, element, {"rpy": rpy})
+    return edits
+
+
+def _is_as_stated(parameters: Array, stated: Inertial | None) -> bool:
+    """Return whether a link's parameters, shape (10,), equal those of its ``<inertial>``."""
+    if stated is None:
+        return False
+    before = inertial_parameters(stated)
+    return bool(np.allclose(parameters, before, rtol=_UNCHANGED, atol=_ROUNDING * before[0]))
+
+
+def _inertial(parameters: Array) -> list[str]:
+    """Return an ``<inertial>`` about the centre of mass, line by line."""
+    body = central_inertial(parameters)
+    size = np.sqrt(np.trace(pseudo_inertia(parameters)[0][:3, :3]) / body.mass)  # [m]
+    com = np.where(np.abs(body.com) > _ROUNDING * size, body.com, 0.0)
+    least = _ROUNDING * body.mass * size**2
+    inertia = np.where(np.abs(body.inertia) > least, body.inertia, 0.0)
+    moments = " ".join(
+        f'{key}="{numbers_text([value])}"' for key, value in zip(MOMENTS, inertia, strict=True)
+    )
+    return [
+        "<inertial>",
+        f'<origin xyz="{numbers_text(com)}" rpy="0 0 0"/>',
+        f'<mass value="{numbers_text([body.mass])}"/>',
+        f"<inertia {moments}/>",
+        "</inertial>",
+    ]
+
+
+def numbers_text(values: Iterable[float]) -> str:
+    """Return numbers as the value of an XML attribute, exact to the last bit.
+
+    Args:
+        values: The numbers.
+    """
+    return " ".join(repr(float(value) + 0.0) for value in values)  # no "-0.0"
+
+
+def _dynamics_edits(document: Document, model: RobotModel, pi: Array) -> list[Edit]:
+    attributes = {name: term.dynamics for name, term in TERMS.items() if term.dynamics}
+    values = dict(zip(model.layout.names, pi, strict=True))
+    shared = {coupling.name for coupling in model.layout.couplings}  # they load other joints, too
+    edits: list[Edit] = []
+    for joint in document.root.find_all("joint"):
+        name, found = joint.attributes.get("name", ""), joint.find_all("dynamics")
+        if name not in model.joints or name in shared:
+            continue
+        names = {f"{name}.{term}": attribute for term, attribute in attributes.items()}
+        new = {names[key]: numbers_text([values[key]]) for key in names if key in values}
+        if new and found:
+            edits += xml_splice.set_attributes(document, found[0], new)
+        elif new:
+            words = " ".join(f'{key}="{value}"' for key, value in new.items())
+            edits.append(xml_splice.insert(document, joint, [f"<dynamics {words}/>"]))
+    return edits
+
+
+def _check_torque(model: RobotModel, pi: Array, urdf: Path, sidecar: Path) -> None:
+    """Raise if the files do not give the torque of pi in every row."""
+    loaded, read_back = load_identified(urdf, sidecar)
+    if loaded.layout != model.layout:
+        raise ModelError(
+            f"{urdf.name} is not written: in the test reading, it has other bodies or joints"
+        )
+    wanted, found = (
+        (random_regressor(robot, _STATES, np.random.default_rng(0)) @ x).reshape(_STATES, -1)
+        for robot, x in (
+            (replace(model, constraints=()), pi),
+            (replace(loaded, constraints=()), read_back),
+        )
+    )
+    difference = np.linalg.norm(found - wanted, axis=0)  # (n_rows,)
+    off = np.flatnonzero(difference > _SAME * np.linalg.norm(wanted, axis=0))
+    if off.size:
+        raise ModelError(
+            f"{urdf.name} is not written: in the test reading, its torque differs from that of the "
+            f"parameters at {listed(model.row_names[i] for i in off)}. If {model.tree.path} has "
+            "changed since the model was read, read the model again"
+        )

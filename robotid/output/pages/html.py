@@ -1,0 +1,359 @@
+"""HTML of the pages: scaffold, style, sections, tables. All parts are inline."""
+
+import base64
+import hashlib
+import math
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from html import escape
+from pathlib import Path
+from typing import NamedTuple
+
+from robotid.base.text import arguments
+
+__all__ = [
+    "Cell",
+    "Section",
+    "asset",
+    "code",
+    "command_html",
+    "facts_html",
+    "figure",
+    "folded",
+    "number",
+    "page",
+    "percent",
+    "scaffold",
+    "steps_html",
+    "table",
+    "text",
+    "verdict_html",
+    "with_error",
+]
+
+_ASSETS = Path(__file__).parent / "assets"
+_FIRST = 3  # reasons of a verdict that are visible without unfolding
+#: Scripts, and the pattern of pages that need them.
+_KINDS = {"urdf": "URDF", "sidecar": "drive parameters"}  # of files, by key of result.json
+_DOCK = '<div id="replay" class="dock"'
+_SCRIPTS = {
+    "page.js": '<details|<table class="data"',
+    "tables.js": '<table class="data"',
+    "dock.js": _DOCK,
+}
+
+
+@cache
+def asset(name: str) -> str:
+    """Return the text of an asset file.
+
+    Args:
+        name: Its name in the folder of assets.
+    """
+    return (_ASSETS / name).read_text(encoding="utf-8")
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One cell of a table."""
+
+    html: str  # escaped
+    kind: str = ""  # style: "" for prose, "text" for short texts, "number", "code", "flag"
+    value: float | None = None  # the number in full precision
+
+
+class Section(NamedTuple):
+    """A section of a page.
+
+    Attributes:
+        title: Its heading, HTML.
+        html: Its content.
+        summary: Summary of its content, HTML, if it is folded.
+        is_open: Whether it is open initially; None if it cannot be folded.
+    """
+
+    title: str
+    html: str
+    summary: str = ""
+    is_open: bool | None = None
+
+
+def text(value: str, *, flag: bool = False) -> Cell:
+    """Return a cell of text.
+
+    Args:
+        value: The text, not escaped; a short one stays on one line.
+        flag: Whether it is marked as a fault.
+    """
+    return Cell(escape(value), "flag" if flag else "text" if len(value) < 24 else "")
+
+
+def code(value: str) -> Cell:
+    """Return a cell for names, hashes and formulas.
+
+    Args:
+        value: The text, not escaped.
+    """
+    # long names and formulas may break after a dot, an underscore or a slash only
+    html = escape(value)
+    for mark in (".", "_", "/"):
+        html = html.replace(mark, f"{mark}<wbr>")
+    return Cell(html, "code")
+
+
+def number(value: float | None, spec: str = ".4g") -> Cell:
+    """Return a cell for a number.
+
+    Args:
+        value: The number; None and non-finite values are shown as a dash.
+        spec: Its format.
+    """
+    if value is None or not math.isfinite(value):
+        return Cell("–", "number")
+    return Cell(format(value, spec).replace("-", "−"), "number", float(value))
+
+
+def percent(value: float | None) -> Cell:
+    """Return a cell for a percentage.
+
+    Args:
+        value: The percentage; None and non-finite values are shown as a dash.
+    """
+    if value is not None and value >= 1000:
+        return number(value, ".0f")
+    return number(value, ".1f" if value is None or value >= 0.995 else ".2f")
+
+
+def with_error(value: float, error: float, *, sign: str = "") -> tuple[Cell, Cell]:
+    """Return cells for a number and its error, the error with two digits, both to the same place.
+
+    Args:
+        value: The number.
+        error: Its error; a non-finite one is shown as a dash.
+        sign: "+" to write positive numbers with their sign.
+    """
+    if not (math.isfinite(error) and error > 0 and math.isfinite(value)):
+        return number(value, f"{sign}.4g"), number(None)
+    exponent = math.floor(
+        math.log10(float(f"{error:.1e}"))
+    )  # of the first digit of the rounded error
+    size = math.floor(math.log10(abs(value))) if value else exponent
+    if max(size, exponent) < -3 or exponent > 4:
+        digits = max(size - exponent + 1, 0)
+        return number(value, f"{sign}z.{digits}e"), number(error, ".1e")
+    decimals = max(1 - exponent, 0)
+    return number(value, f"{sign}z.{decimals}f"), number(error, f".{decimals}f")
+
+
+def table(
+    caption: str,
+    headers: Sequence[str],
+    rows: Sequence[Sequence[Cell]],
+    foot: Sequence[Cell] = (),
+    *,
+    is_data: bool = False,
+) -> str:
+    """Return the HTML of a table in a box that scrolls on narrow pages.
+
+    Args:
+        caption: Its caption.
+        headers: Heads of the columns.
+        rows: Cells; the first of each row is its head.
+        foot: Cells of a last row with totals, if any.
+        is_data: Whether tables.js can sort, filter and export its rows.
+    """
+    first = rows[0] if rows else [Cell("")] * len(headers)
+    kinds = ["number" if cell.kind == "number" else "text" for cell in first]
+    head = "".join(
+        f'<th scope="col" class="{kind}">{escape(title)}</th>'
+        for title, kind in zip(headers, kinds, strict=True)
+    )
+    body = "".join(_row(row, is_data=is_data) for row in rows)
+    last = f"<tfoot>{_row(foot)}</tfoot>" if foot else ""
+    title, kind = escape(caption), ' class="data"' if is_data else ""
+    return (
+        f'<div class="scroll" tabindex="0" role="region" aria-label="{title}">'
+        f"<table{kind}><caption>{title}</caption>"
+        f"<thead><tr>{head}</tr></thead><tbody>{body}</tbody>{last}</table></div>\n"
+    )
+
+
+def figure(caption: str, svg: str, *, single: bool = False) -> str:
+    """Return the HTML of a figure, which scrolls on narrow pages, also by keyboard.
+
+    Args:
+        caption: Its caption, HTML.
+        svg: The ``<svg>`` element.
+        single: Whether its width is limited, as of a figure alone in its row.
+    """
+    kind = ' class="single"' if single else ""
+    return f'<figure{kind} tabindex="0"><figcaption>{caption}</figcaption>{svg}</figure>\n'
+
+
+def folded(key: str, summary: str, html: str, *, is_open: bool = False) -> str:
+    """Return the HTML of foldable content, which is open in print.
+
+    Args:
+        key: Its id; links to it open it.
+        summary: Its visible summary, HTML.
+        html: Its content.
+        is_open: Whether it is open initially.
+    """
+    opened = " open" if is_open else ""
+    return f'<details id="{key}"{opened}><summary>{summary}</summary>\n{html}</details>\n'
+
+
+def verdict_html(robot: str, status: str, reasons: Sequence[str], uses: str = "") -> str:
+    """Return the heading of a result: robot, verdict and the first reasons.
+
+    Args:
+        robot: Name of the robot, not escaped.
+        status: The verdict.
+        reasons: Its reasons, not escaped, the most severe first.
+        uses: What the result can be used for, not escaped.
+    """
+    items = [f"<li>{escape(reason)}</li>" for reason in reasons]
+    more = "".join(items[_FIRST:])
+    if more:
+        count = len(items) - _FIRST
+        title = f"{count} more reason{'s' if count > 1 else ''}"
+        more = f"<details><summary>{title}</summary><ul>{more}</ul></details>"
+    uses = f'<p class="uses">{escape(uses)}</p>' if uses else ""
+    return (
+        f'<div class="verdict {status.replace(" ", "-")}"><h1>{escape(robot)} '
+        f"<span>Verdict: <strong>{status}</strong></span></h1>"
+        f"<ul>{''.join(items[:_FIRST])}</ul>{more}{uses}</div>\n"
+    )
+
+
+def facts_html(facts: Mapping[str, str], files: Mapping[str, str] | None = None) -> str:
+    """Return the HTML of figures with their names.
+
+    Args:
+        facts: Figures by their names, both HTML.
+        files: Files to link to, by their kind; they come last.
+    """
+    links = ", ".join(
+        f'<a href="{escape(path)}">{escape(_KINDS.get(kind, kind))}</a>'
+        for kind, path in (files or {}).items()
+    )
+    shown = {**facts, "Files": links} if links else facts
+    cells = "".join(f"<div><dt>{name}</dt><dd>{html}</dd></div>" for name, html in shown.items())
+    return f'<dl class="facts">{cells}</dl>\n'
+
+
+def steps_html(steps: Iterable[tuple[str, Sequence[str]]]) -> str:
+    """Return the HTML of the next steps; nothing if there are none.
+
+    Args:
+        steps: Each action, and its commands or lines to copy, not escaped.
+    """
+    items = "".join(
+        f"<li><p>{escape(action)}</p>"
+        + "".join(f'<div class="copy">{command_html(block)}</div>' for block in blocks)
+        + "</li>\n"
+        for action, blocks in steps
+    )
+    return f'<h2 id="next">Do next</h2>\n<ol class="next">{items}</ol>\n' if items else ""
+
+
+def command_html(block: str) -> str:
+    """Return the HTML of a command, or of lines of a job file; lines break between arguments.
+
+    Args:
+        block: The text to copy, not escaped.
+    """
+    html = escape(block)
+    if block.startswith("robotid ") and "\n" not in block:  # an argument does not end at a hyphen
+        html = " ".join(f"<span>{escape(argument)}</span>" for argument in arguments(block))
+    return f'<pre class="command">{html}</pre>'
+
+
+def page(title: str, header: str, sections: Mapping[str, Section | tuple[str, str]]) -> str:
+    """Return the HTML of a page: links to its sections, its header, the sections.
+
+    Args:
+        title: Title of the window, not escaped.
+        header: HTML of the header.
+        sections: The sections by their ids, or title and HTML of each.
+    """
+    shown = {key: Section(*section) for key, section in sections.items()}
+    links = "".join(f'<a href="#{key}">{x.title}</a> ' for key, x in shown.items())
+    body = "".join(_section(key, section) for key, section in shown.items())
+    named = [name for name, mark in _SCRIPTS.items() if re.search(mark, header + body)]
+    has_dock = _DOCK in body
+    return scaffold(
+        title,
+        f"<style>/*tones*/{asset('page.css')}{asset('dock.css') if has_dock else ''}</style>\n",
+        '<a class="skip" href="#content">Skip to the content</a>\n'
+        f'<nav aria-label="Sections"><div><a href="#content">{escape(title)}</a> {links}'
+        f'</div></nav>\n<main id="content" tabindex="-1">\n<header>\n{header}</header>\n'
+        f"{body}</main>\n",
+        policy="; frame-src 'self'" if has_dock else "",
+        scripts=named,
+    )
+
+
+def _section(key: str, section: Section) -> str:
+    """Return the HTML of a section."""
+    head = f'<h2 id="{key}">{section.title}</h2>'
+    html = f"{head}\n{section.html}"
+    if section.is_open is not None:
+        summary = f"<span>{section.summary}</span>" if section.summary else ""
+        html = folded(f"{key}-fold", f"{head}{summary}", section.html, is_open=section.is_open)
+    return f'<section aria-labelledby="{key}">\n{html}</section>\n'
+
+
+def scaffold(
+    title: str, head: str, body: str, *, policy: str = "", scripts: Sequence[str] = ()
+) -> str:
+    """Return the HTML of a document, which loads only what its policy allows.
+
+    A body with charts gets the scripts that draw them. Only these and the named scripts may run.
+
+    Args:
+        title: Title of the window, not escaped.
+        head: HTML of the head: style, icon; ``/*tones*/`` in it becomes the pages' colours.
+        body: HTML of the body.
+        policy: Additional permissions of the page, as a content security policy.
+        scripts: Names of the assets that it runs.
+    """
+    style, run = "", [asset(name) for name in scripts]
+    if '<figure class="chart"' in body:
+        style = f"<style>{asset('uPlot.min.css')}\n{asset('charts.css')}</style>\n"
+        run += [asset("uPlot.iife.min.js"), asset("charts.js")]
+    if run:
+        policy += "; script-src " + " ".join(map(_allowed, run))
+    inline = "".join(f"<script>{script}</script>\n" for script in run)
+    # with this policy the page stays offline, whatever names it contains
+    return (
+        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+        '<meta http-equiv="Content-Security-Policy" '
+        f"content=\"default-src 'none'; style-src 'unsafe-inline'{policy}\">\n"
+        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+        '<meta name="color-scheme" content="light dark">\n'
+        f"<title>{escape(title)}</title>\n{_toned(head)}{style}</head>\n"
+        f"<body>\n{body}{inline}</body>\n</html>\n"
+    )
+
+
+@cache
+def _allowed(script: str) -> str:
+    """Return the entry of a content security policy that allows this script."""
+    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode("ascii")
+    return f"'sha256-{digest}'"
+
+
+def _toned(head: str) -> str:
+    return head.replace("/*tones*/", "\n" + asset("tones.css"))
+
+
+def _row(cells: Sequence[Cell], *, is_data: bool = False) -> str:
+    first, *others = cells
+    html = f'<th scope="row" class="{first.kind}">{first.html}</th>'
+    for cell in others:
+        value = f' data-value="{cell.value:.10g}"' if is_data and cell.value is not None else ""
+        html += f'<td class="{cell.kind}"{value}>{cell.html}</td>'
+    return f"<tr>{html}</tr>\n"

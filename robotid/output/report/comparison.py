@@ -1,0 +1,355 @@
+"""Comparison of results, from their result.json files only."""
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from robotid.base.exceptions import DataError
+from robotid.base.files import check_file, write_text
+from robotid.base.findings import listed
+from robotid.base.typing import Array
+from robotid.output.files.result_file import load_result
+from robotid.output.files.urdf import terms_from_facts
+from robotid.output.report.comparison_page import comparison_page
+from robotid.robot.drives import TERMS, DriveMotion
+
+__all__ = ["compare_results", "write_comparison"]
+
+_SPEEDS = 40  # of a friction curve, in each direction
+_FILES = ("urdf", "identification", "validation")  # settings that are shown as inputs
+
+
+def compare_results(paths: Sequence[str | Path]) -> dict[str, Any]:
+    """Compare results of the same robot and the same base parameters.
+
+    Args:
+        paths: At least two result.json files.
+
+    Returns:
+        Plain values: "results" (label, name, path, robot, estimator, verdict; the name is the
+        unique part of the path), "validation" and "fitted" (errors by joint, one column per
+        result), "fitted_alike" and "notes" (what is not comparable, and the reason),
+        "friction" (curves by joint), "base_parameters" (values, standard errors, and the difference
+        to the first result over the combined standard error), "settings", "inputs" and "versions"
+        that differ. The largest difference comes first.
+
+    Raises:
+        DataError: If there are fewer than two results, one is not readable, or their base
+            parameters differ; the message names the differences.
+    """
+    if len(paths) < 2:
+        raise DataError(f"compare takes at least two results, found {len(paths)}")
+    results = [load_result(path).content for path in paths]
+    for path, result in zip(paths[1:], results[1:], strict=True):
+        _require_same_mapping(str(paths[0]), results[0], str(path), result)
+    logs = _short_names([entry["log"] for result in results for entry in result["validation"]])
+    common, notes = _common_recordings(results, logs)
+    names = _short_names(paths)
+    return {
+        "results": [
+            {
+                "label": _label(k),
+                "name": names[str(path)],
+                "path": str(path),
+                "robot": result["robot"],
+                "estimator": result["settings"].get("estimator", {}).get("name", ""),
+                "verdict": result["verdict"],
+            }
+            for k, (path, result) in enumerate(zip(paths, results, strict=True))
+        ],
+        "validation": [
+            {
+                "log": result_log["log"],
+                "name": logs[result_log["log"]],
+                "start": key[1],
+                "end": key[2],
+                "per_joint": _errors([by_key[key] for by_key in map(_by_recording, results)]),
+            }
+            for key, result_log in common.items()
+        ],
+        "fitted": _errors([result["identification"] for result in results]),
+        "fitted_alike": len({_recordings(result, "identification") for result in results}) == 1,
+        "notes": notes,
+        "friction": _friction_curves(results),
+        "base_parameters": _base_parameters(results),
+        "settings": _differences([_flat(_chosen(result)) for result in results]),
+        "inputs": _inputs(results),
+        "versions": _differences([r.get("versions", {"robotid": r["robotid"]}) for r in results]),
+    }
+
+
+def write_comparison(paths: Sequence[str | Path], target: str | Path) -> dict[str, Any]:
+    """Compare results, write the page, and return the content of ``compare_results``.
+
+    Args:
+        paths: At least two result.json files.
+        target: The HTML file to write, atomically.
+
+    Raises:
+        DataError: If the results cannot be compared, or the folder of the target is missing.
+        SettingsError: If the target is a folder.
+    """
+    check_file(Path(target), paths)
+    content = compare_results(paths)
+    write_text(comparison_page(content), target)
+    return content
+
+
+def _label(k: int) -> str:
+    """Return A to Z, then A2 and so on."""
+    return chr(ord("A") + k % 26) + (str(k // 26 + 1) if k >= 26 else "")
+
+
+def _short_names(paths: Sequence[str | Path]) -> dict[str, str]:
+    """Return the shortest unique end of each path.
+
+    A common end of all paths is left out, as "result.json" of folders a and b.
+    """
+    parts = {str(path): Path(path).resolve().parts for path in paths}
+    every = set(parts.values())
+    common = 0
+    while len(every) > 1 and len({own[-common - 1 :][:1] for own in every}) == 1:
+        common += 1
+    cut = {own: own[: len(own) - common] for own in every}
+    return {path: _shortest(cut[own], set(cut.values())) for path, own in parts.items()}
+
+
+def _shortest(own: tuple[str, ...], every: set[tuple[str, ...]]) -> str:
+    """Return the shortest end that only one path has."""
+    for size in range(1, len(own)):
+        if sum(other[-size:] == own[-size:] for other in every) == 1:
+            return str(Path(*own[-size:]))
+    return str(Path(*own))
+
+
+def _require_same_mapping(
+    first: str, one: Mapping[str, Any], second: str, other: Mapping[str, Any]
+) -> None:
+    """Refuse results whose base parameters have other expressions."""
+    ours, theirs = (
+        {
+            entry["name"]: entry["expression"]
+            for entry in result["base_parameters"]
+            if not _is_chosen(entry["name"], result)
+        }
+        for result in (one, other)
+    )
+    what = "compare results of one URDF, with the same joints and drive terms"
+    for has, lacks, names in (
+        (first, second, [name for name in ours if name not in theirs]),
+        (second, first, [name for name in theirs if name not in ours]),
+    ):
+        if names:
+            raise DataError(
+                f"{has} has {len(names)} base parameters that {lacks} does not have: "
+                f"{listed(names, 5)}; {what}"
+            )
+    changed = [name for name in ours if ours[name] != theirs[name]]
+    if changed:
+        name = changed[0]
+        raise DataError(
+            f"{len(changed)} base parameters have other expressions in {first} and {second}: "
+            f"{listed(changed, 5)}; {name} is {ours[name]} and {theirs[name]}; {what}"
+        )
+
+
+def _is_chosen(name: str, result: Mapping[str, Any]) -> bool:
+    """Return whether a parameter is a friction term that some results may not have."""
+    drives = {entry["name"] for entry in result["drive_parameters"]}
+    return name in drives and name.rpartition(".")[2] not in TERMS
+
+
+def _recordings(result: Mapping[str, Any], role: str) -> tuple[tuple[Any, ...], ...]:
+    """Return the inputs of a role: the file's hash, or its path without hash, and the window."""
+    return tuple(
+        (entry["sha256"] or entry["path"], round(entry["start"], 6), round(entry["end"], 6))
+        for entry in result["inputs"]
+        if entry.get("role") == role
+    )
+
+
+def _by_recording(result: Mapping[str, Any]) -> dict[tuple[Any, ...], dict[str, Any]]:
+    return dict(zip(_recordings(result, "validation"), result["validation"], strict=True))
+
+
+def _signals(result: Mapping[str, Any], key: tuple[Any, ...]) -> dict[str, Any]:
+    """Return the signal settings of a validation recording, and its number of samples used."""
+    entries = [entry for entry in result["inputs"] if entry.get("role") == "validation"]
+    entry = entries[_recordings(result, "validation").index(key)]
+    return {**entry["signals"], "rows": entry["rows_used"]}
+
+
+def _common_recordings(
+    results: Sequence[Mapping[str, Any]], names: Mapping[str, str]
+) -> tuple[dict[tuple[Any, ...], dict[str, Any]], list[str]]:
+    """Return the validation recordings of all results, and notes on what is not comparable."""
+    each = [_by_recording(result) for result in results]
+    common = {k: v for k, v in each[0].items() if all(k in other for other in each[1:])}
+    notes = []
+    for k, by_recording in enumerate(each):
+        left = [names[v["log"]] for key, v in by_recording.items() if key not in common]
+        if left:
+            notes.append(
+                f"{_label(k)} was validated on {', '.join(left)}, other results were not: these "
+                "errors are not compared"
+            )
+    if not common:
+        notes.append(
+            "the results have no common validation recording, so their prediction errors are not "
+            "comparable; run 'robotid validate' with each result on the same log"
+        )
+    for key, entry in common.items():
+        prepared = [_flat(_signals(result, key)) for result in results]
+        if other := [f"{d['name']} {' | '.join(d['values'])}" for d in _differences(prepared)]:
+            notes.append(
+                f"the signal settings of {names[entry['log']]} differ ({'; '.join(other)}): "
+                "smoother torque and fewer samples reduce the error"
+            )
+    return common, notes
+
+
+def _errors(metrics: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Return error and RMSE of each joint, one entry per result; None without samples."""
+    joints = dict.fromkeys(joint for m in metrics for joint in m["per_joint"])
+    rows = []
+    for joint in joints:
+        cells = [m["per_joint"].get(joint, {}) for m in metrics]
+        row = {key: [cell.get(key) for cell in cells] for key in ("relative_error_pct", "rmse")}
+        unit = next(cell["unit"] for cell in cells if cell)
+        rows.append({"joint": joint, "unit": unit, **row})
+    return sorted(rows, key=lambda row: -_spread(row["relative_error_pct"]))
+
+
+def _spread(values: Sequence[float | None]) -> float:
+    """Return the range of the values; -1 for fewer than two."""
+    known = [value for value in values if value is not None]
+    return max(known) - min(known) if len(known) > 1 else -1.0
+
+
+def _friction_curves(results: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Return the friction of each joint's drive over its speed, without load, at q = 0.
+
+    The speeds span the range of all recordings. A joint without stated range or without friction
+    is left out. "load" is the friction torque per load torque, None without such a term.
+    """
+    found = []
+    for joint in dict.fromkeys(joint for result in results for joint in result["joints"]):
+        frictions = [result.get("friction", {}).get(joint, {}) for result in results]
+        ranges = [friction.get("data_range", {}) for friction in frictions]
+        fastest = max((own["v"][1] for own in ranges if "v" in own), default=0.0)
+        v = fastest * np.arange(-_SPEEDS, _SPEEDS + 1) / _SPEEDS
+        curves = [_friction_curve(result, joint, v) for result in results]
+        if not (fastest > 0 and any(torque is not None for torque, _ in curves)):
+            continue
+        known = np.array([torque for torque, _ in curves if torque is not None])
+        found.append(
+            {
+                "joint": joint,
+                "unit": _unit_of_force(results, joint),
+                "speeds": v.tolist(),
+                "torques": [None if x is None else x.tolist() for x, _ in curves],
+                "load": [load for _, load in curves],
+                "difference": float(np.max(np.ptp(known, axis=0)) / (np.abs(known).max() or 1.0)),
+            }
+        )
+    return sorted(found, key=lambda entry: -entry["difference"])
+
+
+def _friction_curve(
+    result: Mapping[str, Any], joint: str, v: Array
+) -> tuple[Array | None, float | None]:
+    """Return the friction of a joint's own drive at some speeds, and its load coefficient."""
+    value = {entry["name"]: entry["value"] for entry in result["drive_parameters"]}
+    own = terms_from_facts(result.get("own_terms", {})).get(joint, ())
+    terms = (*TERMS.values(), *own)
+    none = np.zeros_like(v)
+    motion = DriveMotion(none, v, none, np.sign(v), none, none)
+    parts = [
+        value[name] * term.column(motion)
+        for term in terms
+        if term.part == "friction" and (name := f"{joint}.{term.name}") in value
+    ]
+    return (np.sum(parts, axis=0) if parts else None), value.get(f"{joint}.load")
+
+
+def _unit_of_force(results: Sequence[Mapping[str, Any]], joint: str) -> str:
+    """Return the unit of a joint's torque."""
+    stated = (result["identification"]["per_joint"].get(joint) for result in results)
+    return next((entry["unit"] for entry in stated if entry), "N m")
+
+
+def _base_parameters(results: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Return the values of all results, with (b_k - b_1) / sqrt(s_k^2 + s_1^2) or None."""
+    each = [{e["name"]: e for e in result["base_parameters"]} for result in results]
+    stated = {name: entry for by_name in reversed(each) for name, entry in by_name.items()}
+    rows = []
+    for name in dict.fromkeys(name for by_name in each for name in by_name):
+        own = [by_name.get(name, {}) for by_name in each]
+        rows.append(
+            {
+                "name": name,
+                "unit": stated[name]["unit"],
+                "expression": stated[name]["expression"],
+                "values": [entry.get("value") for entry in own],
+                "std_errors": [entry.get("std_error") for entry in own],
+                "differences": [_difference(own[0], entry) for entry in own[1:]],
+            }
+        )
+    return sorted(rows, key=lambda row: -_farthest(row["differences"]))
+
+
+def _farthest(differences: Sequence[float | None]) -> float:
+    return max((abs(d) for d in differences if d is not None), default=-1.0)
+
+
+def _difference(one: Mapping[str, Any], other: Mapping[str, Any]) -> float | None:
+    if one.get("std_error") is None or other.get("std_error") is None:
+        return None
+    combined = math.hypot(one["std_error"], other["std_error"])
+    ratio = (other["value"] - one["value"]) / combined if combined > 0 else math.inf
+    return ratio if math.isfinite(ratio) else None
+
+
+def _chosen(result: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the settings of a job without its files, which are inputs."""
+    return {k: v for k, v in result["settings"].items() if k not in _FILES}
+
+
+def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
+    found: dict[str, str] = {}
+    for key, value in values.items():
+        if isinstance(value, dict):
+            found |= _flat(value, f"{prefix}{key}.")
+        else:
+            found[prefix + key] = _plain(value)
+    return found
+
+
+def _plain(value: object) -> str:
+    if isinstance(value, list):
+        return listed(map(_plain, value))
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def _differences(each: Sequence[Mapping[str, str]]) -> list[dict[str, Any]]:
+    """Return the keys whose values differ; "" where a key is missing."""
+    keys = dict.fromkeys(key for values in each for key in values)
+    rows = [{"name": key, "values": [values.get(key, "") for values in each]} for key in keys]
+    return [row for row in rows if len(set(row["values"])) > 1]
+
+
+def _inputs(results: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Return every file and window with the results that use it, the common ones last."""
+    found: dict[tuple[Any, ...], dict[str, Any]] = {}
+    for k, result in enumerate(results):
+        for entry in result["inputs"]:
+            where = {key: entry.get(key) for key in ("path", "sha256", "start", "end")}
+            row = {"role": entry.get("role", ""), **where, "in": [False] * len(results)}
+            what = (row["role"], row["sha256"] or row["path"], row["start"], row["end"])
+            found.setdefault(what, row)["in"][k] = True
+    return sorted(found.values(), key=lambda row: all(row["in"]))

@@ -1,0 +1,278 @@
+"""The page of a designed motion: criterion, smallest margin to each limit, expected errors."""
+
+from collections.abc import Mapping, Sequence
+from html import escape
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from robotid.base.files import write_text
+from robotid.base.findings import listed
+from robotid.base.typing import Array
+from robotid.base.versions import __version__
+from robotid.design.clearance import Clearance
+from robotid.design.course import Course
+from robotid.design.limits import LIMITS
+from robotid.design.previews import Preview
+from robotid.output.pages.charts import Chart, Series, chart_html
+from robotid.output.pages.html import Section, code, facts_html, number, page, percent, table, text
+from robotid.robot.model import RobotModel
+
+__all__ = ["write_motion_page"]
+
+_UNITS = ("rad", "rad/s", "rad/s²", "rad/s³", "N m", "W")
+_PRISMATIC = ("m", "m/s", "m/s²", "m/s³", "N", "W")
+_TONES = 8  # distinguishable colours of lines in one chart
+_NAMED = 5  # base parameters with the largest expected standard errors that are named
+_SHARP = 0.1  # share of the plausible range below which one is well determined ...
+_OPEN = 0.5  # ... and above which it is undetermined
+_VISIBLE = 1e-3  # change of a criterion that is worth a chart
+_WIDE = 10.0  # ratio of distances from which their axis is logarithmic
+_SOURCES = {
+    "data": "by the motion",
+    "mixed": "by motion and URDF together",
+    "prior": "by the URDF alone",
+    "bound": "by the bounds of physical consistency",
+}
+_CRITERIA = {
+    "D": "D: −log det of the information matrix, per parameter",
+    "A": "A: log of the mean variance",
+    "E": "E: −log of the smallest eigenvalue of the information matrix",
+    "condition": "log of the condition number of the information matrix",
+    "widest": "mean log variance of the quarter of the parameters with the largest prior variance",
+}
+
+
+def write_motion_page(
+    target: str | Path,
+    model: RobotModel,
+    content: Mapping[str, Any],
+    course: Course,
+    expected: Preview | Sequence[str],
+) -> Path:
+    """Write a designed motion's use of the limits and its expected errors, as one HTML file.
+
+    The file loads nothing from the network. It is written under a temporary name, then renamed.
+
+    Args:
+        target: The file to write.
+        model: The robot.
+        content: What ``robotid excite --json`` prints of the motion.
+        course: The motion over time.
+        expected: The standard errors expected of it; or sentences that state them.
+
+    Returns:
+        Path of the file.
+
+    Raises:
+        DataError: If the folder of the target does not exist.
+    """
+    errors = _expected(expected) if isinstance(expected, Preview) else _paragraphs(expected)
+    sections = {
+        "limits": Section("Smallest margin to each limit", _limit_table(model, content, course)),
+        "time": Section("Course over time", _over_time(model, content, course)),
+        "expected": Section("Expected standard errors", errors),
+    }
+    best = [entry[1] for entry in content["history"]]
+    if best and max(best) - min(best) > _VISIBLE:
+        sections["design"] = Section("Course of the optimisation", _history(content))
+    return write_text(
+        page(f"{model.name}: excitation trajectory", _head(model, content), sections), target
+    )
+
+
+def _head(model: RobotModel, content: Mapping[str, Any]) -> str:
+    """Return the heading, and the criterion and constraints of the design."""
+    condition = content["condition_number"]
+    how = f"{content['seconds']:.1f} s"
+    if content["starts"]:
+        settled = "converged" if content["converged"] else "not converged: allow more seconds"
+        plural = "start" if content["starts"] == 1 else "starts"
+        how += f", {content['starts']} {plural}, {settled}"
+    facts = {
+        "motion": f"{content['kind']}, {content['duration']:.4g} s",
+        "joints": f"{len(model.joints)}",
+        "criterion": content["criterion"],
+        "condition number": (
+            "infinite"
+            if condition is None
+            else f"{condition:,.0f} (regressor, columns in units of the prior)"
+        ),
+        "computing time": how,
+    }
+    listing = facts_html({name: escape(value) for name, value in facts.items()})
+    return (
+        f"<h1>{escape(model.name)}: excitation trajectory</h1>\n"
+        f"<h2>Criterion and constraints</h2>\n{listing}"
+        "<p>The torques are computed from the URDF's masses and from assumed friction. Execute the "
+        f'motion slowly first.</p>\n<p class="note">Written by robotid {__version__}.</p>\n'
+    )
+
+
+def _limit_table(model: RobotModel, content: Mapping[str, Any], course: Course) -> str:
+    """Return the largest used share of each limit, its joint and time, and the margin."""
+    rows = []
+    for kind, entry in content["limits"].items():
+        if kind not in LIMITS:
+            continue
+        joint, k = model.joints.index(entry["where"]), LIMITS.index(kind)
+        unit = (_PRISMATIC if entry["where"] in model.layout.prismatic else _UNITS)[k]
+        rows.append(
+            [
+                text(kind),
+                percent(100 * (1.0 - entry["margin"])),
+                percent(100 * entry["margin"]),
+                code(entry["where"]),
+                number(course.peak(kind, joint), ".2f"),
+                number(float(course.limits.sizes[k, joint]), ".4g"),
+                text(unit),
+            ]
+        )
+    headers = ["limit", "largest use %", "margin %", "joint", "at [s]", "value of limit", "unit"]
+    note = (
+        f"<p>100 % of position, velocity and torque is {100 * content['share']:.0f} % of the "
+        "URDF's limit. 100 % of the others is the stated limit. Positions are measured from the "
+        "middle of their range.</p>\n"
+    )
+    limits = table("Largest use of each limit", headers, rows)
+    return note + limits + _collisions(content, course)
+
+
+def _collisions(content: Mapping[str, Any], course: Course) -> str:
+    """Return the smallest margin of the motion to a collision, as a paragraph."""
+    entry, contact = content["limits"].get("collision"), course.nearest
+    if entry is None or course.clearance is None:
+        return "<p>Collisions were not checked.</p>\n"
+    words = "No two links can collide."
+    if entry["margin"] is not None:
+        required = entry["kept"]
+        words = (
+            f"Smallest margin to a collision: {entry['where']}, distance "
+            f"{1e3 * (entry['margin'] + required):.0f} mm at {entry['time']:.2f} s. Required: "
+            f"{1e3 * required:.0f} mm, also between the samples."
+        )
+    elif contact is not None:
+        words = (
+            f"Smallest margin to a collision: {contact.first} and {contact.second}, distance "
+            f"{1e3 * contact.distance:.0f} mm at {contact.time:.2f} s. Required: "
+            f"{1e3 * contact.required:.0f} mm."
+        )
+    if entry["unread"]:
+        words += f" Not checked, since no shape can be read: {listed(entry['unread'])}."
+    if entry["left_alone"]:
+        words += f" Not checked, since in contact by design: {listed(entry['left_alone'])}."
+    if entry["built_near"]:
+        words += f" Close by design, with a smaller clearance: {listed(entry['built_near'])}."
+    return f"<p>{escape(words)}</p>\n"
+
+
+def _over_time(model: RobotModel, content: Mapping[str, Any], course: Course) -> str:
+    """Return charts of the use of each limit, of unlimited quantities, and of distances."""
+    charts = []
+    for k, kind in enumerate(LIMITS):
+        is_limited = np.isfinite(course.limits.sizes[k])
+        if is_limited.any():
+            charts.append(_share_chart(model, course, kind, np.flatnonzero(is_limited)))
+        free = np.flatnonzero(~is_limited)
+        if len(free) and kind in ("acceleration", "torque"):
+            charts.append(_free_chart(model, course, kind, free))
+    if course.clearance is not None and course.nearest is not None:
+        charts.append(_distance_chart(model, course, course.clearance))
+    return f'<div class="plots">\n{"".join(charts)}</div>\n'
+
+
+def _share_chart(model: RobotModel, course: Course, kind: str, joints: Array) -> str:
+    """Return the chart of the joints' use of a limit."""
+    bound = np.full(len(course.t), 100.0)
+    lines = _lines(model, 100.0 * course.used[LIMITS.index(kind)], joints)
+    edges = [Series(label, sign * bound, "text") for label, sign in (("limit", 1), ("−limit", -1))]
+    chart = Chart(
+        f"{kind} of each joint relative to its limit", course.t, (*edges, *lines),
+        "time [s]", "% of the limit", link="time",
+    )  # fmt: skip
+    return chart_html(chart, f"{kind.capitalize()}, % of the limit")
+
+
+def _free_chart(model: RobotModel, course: Course, kind: str, joints: Array) -> str:
+    """Return the chart of a quantity without limit, in its unit."""
+    k = LIMITS.index(kind)
+    prismatic = [model.joints[j] in model.layout.prismatic for j in joints]
+    units = [_UNITS[k]] * (not all(prismatic)) + [_PRISMATIC[k]] * any(prismatic)
+    unit, lines = " or ".join(units), _lines(model, course.values[k], joints)
+    chart = Chart(
+        f"{kind} of each joint", course.t, tuple(lines), "time [s]", f"{kind} [{unit}]",
+        link="time",
+    )  # fmt: skip
+    return chart_html(chart, f"{kind.capitalize()} without a stated limit")
+
+
+def _lines(model: RobotModel, values: Array, joints: Array) -> list[Series]:
+    return [
+        Series(model.joints[j], values[:, j], f"tone-{j % _TONES + 1}") for j in joints.tolist()
+    ]
+
+
+def _distance_chart(model: RobotModel, course: Course, clearance: Clearance) -> str:
+    """Return the chart of distances between links, and to the floor and boxes."""
+    course = course.thinned
+    own = np.array([b in model.tree.links and a in model.tree.links for a, b in clearance.named])
+    series = [Series("clearance", np.full(len(course.t), 1e3 * clearance.least), "text")]
+    changes = course.changes(clearance)
+    near = np.isfinite(clearance.slack)
+    groups = (
+        ("links", own & ~near, "tone-1"),
+        ("floor and boxes", ~own, "tone-2"),
+        ("links close by design", near, "tone-3"),
+    )
+    for label, chosen, tone in groups:
+        if (chosen & changes).any():
+            series.append(Series(label, 1e3 * course.nearness(chosen & changes)[0], tone))
+    low, high = (float(f([f(x.y) for x in series])) for f in (np.min, np.max))
+    is_wide = low > 0 and high > _WIDE * low
+    chart = Chart(
+        "distance of the two nearest hulls", course.t, tuple(series), "time [s]",
+        "distance [mm]", link="time", logarithmic="y" if is_wide else "",
+    )  # fmt: skip
+    return chart_html(
+        chart, "Smallest distance between two links, and to floor and boxes, where it changes"
+    )
+
+
+def _expected(preview: Preview) -> str:
+    """Return the standard errors expected of a log of the motion, as paragraphs."""
+    found, noise = preview.expected, preview.noise
+    ratio = np.minimum(preview.base_error / preview.plausible, 1.0)
+    order = np.argsort(-ratio, kind="stable")[:_NAMED]
+    least = [
+        f"{found.mapping.base_names[k]} {100 * ratio[k]:.0f} %" for k in order if ratio[k] > _OPEN
+    ]
+    counts = {source: found.sources.count(source) for source in dict.fromkeys(found.sources)}
+    sources = [f"{count} {_SOURCES[source]}" for source, count in counts.items()]
+    stds = [f"{joint} {s:.2g}" for joint, s in zip(found.model.joints, noise.std, strict=True)]
+    sentences = [
+        f"{preview.words}.",
+        f"Of {len(ratio)} base parameters, {int((ratio < _SHARP).sum())} have an expected standard "
+        f"error below 10 % of their plausible range, {int((ratio > _OPEN).sum())} above 50 %.",
+        f"Largest, in % of the plausible range: {', '.join(least)}." if least else "",
+        f"The standard parameters will be determined: {listed(sources)}.",
+        f"Standard deviation of the torque noise, {listed(dict.fromkeys(noise.origins))}: "
+        f"{', '.join(stds)} (N m or N).",
+    ]
+    return _paragraphs(sentences)
+
+
+def _paragraphs(sentences: Sequence[str]) -> str:
+    return "".join(f"<p>{escape(words)}</p>\n" for words in sentences if words)
+
+
+def _history(content: Mapping[str, Any]) -> str:
+    """Return the chart of the best criterion against the computing time."""
+    seconds, best = np.array(content["history"]).T
+    chart = Chart(
+        "criterion of the best motion against the computing time", seconds,
+        (Series("best so far", best, "tone-1"),),
+        "computing time [s]", "criterion",
+    )  # fmt: skip
+    criterion = escape(_CRITERIA[content["criterion"]])
+    return chart_html(chart, f"Criterion {criterion}; smaller is better")

@@ -1,0 +1,398 @@
+"""The robot as scene of the viewer: joints as nodes, meshes or a skeleton as their parts."""
+
+import base64
+import itertools
+import os
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+
+from robotid.base.typing import Array
+from robotid.output.viewer.thinning import thin
+from robotid.robot.meshes import Shape, Surface, find_mesh, read_shapes, read_surfaces
+from robotid.robot.model import RobotModel
+from robotid.robot.parameters import pseudo_inertia
+
+__all__ = ["Ellipsoid", "Scene", "coordinates", "ellipsoids", "mass_marks", "packed", "robot_scene"]
+
+_TRIANGLES = 20_000  # of all meshes as they are drawn: at most 0.9 MB in the page
+_LINK, _JOINT, _BASE = "#9aa7b4", "#e07b1f", "#4a5560"
+_THICKNESS = 0.035  # radius of a link over the robot's reach
+_SHORT = 1e-4  # [m] joints closer than this are one point
+_UP = np.array([0.0, 1.0, 0.0])  # the viewer's axis of a cylinder
+#: Where a mesh is, its scale, and when it was written and how long it is; None if there is none.
+_File = tuple[Path | None, tuple[float, ...], tuple[int, int] | None]
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """The scene, in plain values for JSON, lengths in m.
+
+    Attributes:
+        content: ``nodes``: one per joint, the first fixed to the world, each with its parent, its
+            pose at 0 and its kind of motion; ``parts``: shapes on nodes; ``meshes``: triangles
+            that parts share; ``reach``: the size of the robot.
+        notes: Shapes that are not drawn, as sentences.
+        corners: Points on each node whose hull contains its parts, shape (k, 3) each [m].
+    """
+
+    content: dict[str, Any]
+    notes: tuple[str, ...]
+    corners: tuple[Array, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Ellipsoid:
+    """The mass distribution of a body as a solid.
+
+    Attributes:
+        mass: Mass [kg].
+        com: Centre of mass in the body's frame, shape (3,) [m]; None without mass.
+        semi_axes: Lengths of the semi-axes, shape (3,) [m]; None if no solid has this inertia.
+        rotation: Directions of the axes as columns, a rotation, shape (3, 3).
+        fault: Reason for no solid; empty if there is one.
+    """
+
+    mass: float
+    com: Array | None
+    semi_axes: Array | None
+    rotation: Array
+    fault: str
+
+
+def robot_scene(model: RobotModel) -> Scene:
+    """Return the nodes and the parts of a robot.
+
+    A body is drawn with the visual shapes of its links if they are found, otherwise as a
+    skeleton: capsules from its joint to the next ones, and a drum along the joint's axis.
+
+    Args:
+        model: The robot.
+    """
+    tree = model.pin_model
+    library, notes = _Library(model), []
+    parts = list(library.parts)
+    drawn = {part["node"] for part in parts}
+    if library.missing:
+        count, first = len(library.missing), library.missing[0]
+        notes.append(f"{count} meshes were not found or are not readable, for example {first}")
+    for i in range(tree.njoints):
+        if i not in drawn:
+            parts += _skeleton(model, i)
+    content = {
+        "nodes": [_node(model, i) for i in range(tree.njoints)],
+        "parts": parts,
+        "meshes": library.meshes,
+        "reach": _reach(model),
+    }
+    corners = [[np.zeros((1, 3))] for _ in range(tree.njoints)]
+    for part in parts:
+        corners[part["node"]].append(_corners(part, library.boxes))
+    return Scene(content, tuple(notes), tuple(map(np.vstack, corners)))
+
+
+def coordinates(model: RobotModel, q: Array) -> Array:
+    """Return the displacements of the nodes of a scene.
+
+    Args:
+        model: The robot.
+        q: Joint coordinates, shape (N, n), or (N, 7 + n) with a floating base [rad, m].
+
+    Returns:
+        Angles and lengths in Pinocchio's order, shape (N, nv), or (N, 7 + nv - 6) with a
+        floating base [rad, m]; ``column`` of a node is the index of its own.
+    """
+    base, first = (7, 6) if model.free_flyer else (0, 0)
+    G = model.velocity_map[first:, first:]
+    moved: Array = np.hstack([q[:, :base], q[:, base:] @ G.T + model.position_offset[first:]])
+    return moved
+
+
+def mass_marks(model: RobotModel, pi: Array, label: str) -> dict[str, Any]:
+    """Return the centre of mass and the equimomental ellipsoid of each body, for the viewer.
+
+    Args:
+        model: The robot.
+        pi: Its standard parameters, shape (p,), or the inertial ones alone.
+        label: Their label.
+
+    Returns:
+        Plain values: the label, and per body its node, name, mass [kg], centre of mass [m],
+        semi-axes [m] and their direction, or the reason for no ellipsoid.
+    """
+    found = ellipsoids(pi[: model.layout.n_inertial])
+    return {
+        "label": label,
+        "bodies": [
+            {
+                "node": i + 1,
+                "name": body,
+                "mass": mark.mass,
+                "com": None if mark.com is None else mark.com.tolist(),
+                "semi_axes": None if mark.semi_axes is None else mark.semi_axes.tolist(),
+                "quaternion": pin.Quaternion(mark.rotation).coeffs().tolist(),
+                "fault": mark.fault,
+            }
+            for i, (body, mark) in enumerate(zip(model.layout.bodies, found, strict=True))
+        ],
+    }
+
+
+def ellipsoids(pi: Array) -> tuple[Ellipsoid, ...]:
+    """Return the equimomental ellipsoid of each body.
+
+    The second moments about the centre of mass, Sigma_c = Sigma - m c c', are those of a solid
+    ellipsoid of uniform density whose semi-axes have the lengths sqrt(5 s_i / m), s_i the
+    eigenvalues of Sigma_c.
+
+    Args:
+        pi: Inertial parameters of the bodies, shape (10 bodies,), SI units.
+
+    References:
+        Wensing, Kim, Slotine (2018), Linear matrix inequalities for physically consistent
+        inertial parameter identification, section IV.
+    """
+    return tuple(_ellipsoid(J) for J in pseudo_inertia(pi))
+
+
+def packed(values: Array, kind: str = "<f4") -> dict[str, Any]:
+    """Return an array for the page: base64 of little-endian numbers.
+
+    Args:
+        values: The array.
+        kind: "<f4", "<u4" or "<u2".
+
+    Returns:
+        {"kind", "shape", "data"}.
+    """
+    array = np.ascontiguousarray(values, dtype=kind)
+    data = base64.b64encode(array.tobytes()).decode("ascii")
+    return {"kind": kind, "shape": list(array.shape), "data": data}
+
+
+def _ellipsoid(J: Array) -> Ellipsoid:
+    m = float(J[3, 3])
+    if not m > 0:
+        return Ellipsoid(m, None, None, np.eye(3), "no mass" if m == 0 else "negative mass")
+    c = J[:3, 3] / m
+    s, axes = np.linalg.eigh(J[:3, :3] - m * np.outer(c, c))
+    if np.linalg.det(axes) < 0:
+        axes[:, 0] = -axes[:, 0]
+    rounding = 1e-12 * float(np.trace(J[:3, :3]))
+    if s[0] < -rounding:
+        return Ellipsoid(m, c, None, np.eye(3), "no solid has this inertia")
+    return Ellipsoid(m, c, np.sqrt(5.0 * np.maximum(s, 0.0) / m), axes, "")
+
+
+class _Library:
+    """The meshes of a robot, each once, and the parts that use them."""
+
+    def __init__(self, model: RobotModel) -> None:
+        self.missing: list[str] = []
+        self.meshes: list[dict[str, Any]] = []
+        self.parts: list[dict[str, Any]] = []
+        self.boxes: list[Array] = []  # the two corners of each mesh, shape (2, 3)
+        visuals = [v for v in read_shapes(model.tree.robot) if v.kind]
+        # each mesh once at each scale, with the current file
+        uses = Counter((v.file, v.size) for v in visuals if v.kind == "mesh")
+        files = {(v.file, v.size): _file(model, v) for v in visuals if v.kind == "mesh"}
+        thinned = _thinned(tuple(files.values()), tuple(uses[key] for key in files))
+        numbers: dict[tuple[str, tuple[float, ...]], list[tuple[int, Surface]]] = {}
+        for key, surfaces in zip(files, thinned, strict=True):
+            if surfaces is None:
+                self.missing.append(key[0])
+            shown = [surface for surface in surfaces or () if len(surface.faces)]
+            numbers[key] = [*enumerate(shown, len(self.meshes))]
+            for surface in shown:
+                self.boxes.append(np.array([surface.vertices.min(0), surface.vertices.max(0)]))
+                self.meshes.append(_packed_mesh(surface, self.boxes[-1]))
+        for visual in visuals:
+            which = numbers.get((visual.file, visual.size), [])
+            self.parts += _visual_parts(model, visual, which)
+
+
+def _file(model: RobotModel, visual: Shape) -> _File:
+    path = find_mesh(visual.file, model.tree.path)
+    stamp = None if path is None else os.stat(path)
+    return path, visual.size, stamp and (stamp.st_mtime_ns, stamp.st_size)
+
+
+@lru_cache(maxsize=4)  # thinning needs seconds, and a robot has many pages
+def _thinned(files: tuple[_File, ...], uses: tuple[int, ...]) -> tuple[list[Surface] | None, ...]:
+    """Return the scaled surfaces of each file, drawn so often, thinned for a page.
+
+    None: not readable.
+    """
+    found: list[list[Surface] | None] = []
+    for path, scale, _ in files:
+        try:
+            read = () if path is None else read_surfaces(path)
+        except ValueError:
+            read = ()
+        scaled = [replace(s, vertices=s.vertices * np.array(scale)) for s in read]
+        found.append(scaled or None)
+    sizes = [sum(len(s.faces) for s in surfaces or []) for surfaces in found]
+    drawn = sum(size * count for size, count in zip(sizes, uses, strict=True))
+    most = _TRIANGLES * sum(sizes) // max(drawn, 1)  # files of four equal legs count four times
+    thinned = thin([surfaces or [] for surfaces in found], most)
+    return tuple(t if f else None for t, f in zip(thinned, found, strict=True))
+
+
+def _packed_mesh(surface: Surface, box: Array) -> dict[str, Any]:
+    """Return triangles in half the bytes: corners in steps of a 65,535th of their box (2, 3)."""
+    low, step = box[0], np.maximum(np.ptp(box, axis=0), 1e-9) / 65_535
+    kind = "<u2" if len(surface.vertices) <= 2**16 else "<u4"
+    return {
+        "low": low.tolist(),
+        "step": step.tolist(),
+        "vertices": packed(np.round((surface.vertices - low) / step), "<u2"),
+        "faces": packed(surface.faces, kind),
+        "closed": surface.is_closed,
+    }
+
+
+def _visual_parts(
+    model: RobotModel, visual: Shape, which: Sequence[tuple[int, Surface]]
+) -> Iterator[dict[str, Any]]:
+    tree = model.pin_model
+    frame = tree.frames[tree.getFrameId(visual.link, pin.FrameType.BODY)]
+    M = frame.placement.homogeneous @ visual.placement
+    if visual.kind == "cylinder":  # of a URDF: along z
+        M = M @ _from_y_axis(np.array([0.0, 0.0, 1.0]), np.zeros(3))
+    if visual.kind == "mesh":
+        for k, surface in which:
+            colour = _hex(surface.rgba or visual.rgba)
+            yield _part(frame.parentJoint, "mesh", [k], colour, M)
+    else:
+        yield _part(frame.parentJoint, visual.kind, visual.size, _hex(visual.rgba), M)
+
+
+def _corners(part: Mapping[str, Any], boxes: Sequence[Array]) -> Array:
+    """Return the corners of the box about a part, in the frame of its node, shape (8, 3)."""
+    size = part["size"]
+    match part["shape"]:
+        case "mesh":
+            low, high = boxes[size[0]]
+        case "sphere":
+            low, high = np.full(3, -size[0]), np.full(3, size[0])
+        case "cylinder":
+            high = np.array([size[0], size[1] / 2, size[0]])
+            low = -high
+        case _:
+            high = np.array(size) / 2
+            low = -high
+    box = np.array(list(itertools.product(*zip(low, high, strict=True))))
+    M = np.array(part["matrix"]).reshape(4, 4).T
+    moved: Array = box @ M[:3, :3].T + M[:3, 3]
+    return moved
+
+
+def _part(
+    node: int, shape: str, size: Sequence[float], colour: str, placement: Array
+) -> dict[str, Any]:
+    return {
+        "node": node,
+        "shape": shape,
+        "size": list(size),
+        "colour": colour,
+        "matrix": placement.T.ravel().tolist(),  # by columns
+    }
+
+
+def _hex(rgba: Sequence[float] | None) -> str:
+    if rgba is None:
+        return _LINK
+    return "#" + "".join(f"{round(255 * x):02x}" for x in rgba[:3])
+
+
+def _node(model: RobotModel, i: int) -> dict[str, Any]:
+    tree = model.pin_model
+    M = tree.jointPlacements[i]
+    base = 1 if model.free_flyer else 0
+    kind, axis = _movement(model, i)
+    column = tree.joints[i].idx_v + base if kind != "fixed" else -1
+    return {
+        "name": tree.names[i],
+        "parent": int(tree.parents[i]) if i else -1,
+        "position": np.array(M.translation).tolist(),
+        "quaternion": pin.Quaternion(M.rotation).coeffs().tolist(),
+        "kind": kind,
+        "axis": axis,
+        "column": 0 if kind == "free" else column,
+    }
+
+
+def _movement(model: RobotModel, i: int) -> tuple[str, list[float]]:
+    """Return the kind of joint: fixed, free, revolute or prismatic; and its own axis."""
+    if i == 0:
+        return "fixed", []
+    kind = model.pin_model.joints[i]
+    if kind.nv != 1:
+        return "free", []
+    data = kind.createData()
+    kind.calc(data, pin.neutral(model.pin_model), np.zeros(model.pin_model.nv))
+    S = np.array(data.S).reshape(6)
+    is_revolute = bool(S[3:].any())
+    return ("revolute", S[3:].tolist()) if is_revolute else ("prismatic", S[:3].tolist())
+
+
+def _skeleton(model: RobotModel, joint: int) -> Iterator[dict[str, Any]]:
+    """Return the drum of a joint and the links to its children."""
+    radius = _THICKNESS * _reach(model)
+    skin = _LINK if joint else _BASE
+    for end in _ends(model, joint):
+        length = float(np.linalg.norm(end))
+        if length > _SHORT:
+            along = _from_y_axis(end / length, end / 2)
+            yield _part(joint, "cylinder", [0.7 * radius, length], skin, along)
+        yield _part(joint, "sphere", [0.7 * radius], skin, _from_y_axis(_UP, end))
+    kind, axis = _movement(model, joint)
+    if kind in ("revolute", "prismatic"):
+        drum = _from_y_axis(np.array(axis), np.zeros(3))
+        yield _part(joint, "cylinder", [radius, 2.6 * radius], _JOINT, drum)
+    elif joint == 0 and not model.free_flyer:
+        foot = _from_y_axis(np.array([0.0, 0.0, 1.0]), np.zeros(3))
+        yield _part(joint, "cylinder", [2 * radius, 0.6 * radius], skin, foot)
+
+
+def _ends(model: RobotModel, joint: int) -> list[Array]:
+    """Return the end points of a joint's links: its children, or its farthest fixed frame."""
+    tree = model.pin_model
+    children = [
+        np.array(tree.jointPlacements[i].translation)
+        for i in range(1, tree.njoints)
+        if tree.parents[i] == joint
+    ]
+    if joint == 0 and model.free_flyer:
+        return []
+    frames = [np.array(f.placement.translation) for f in tree.frames if f.parentJoint == joint]
+    if children or not frames:
+        return children or [np.array(tree.inertias[joint].lever)]
+    farthest = max(frames, key=lambda point: float(np.linalg.norm(point)))
+    is_point = np.linalg.norm(farthest) < _SHORT
+    return [np.array(tree.inertias[joint].lever) if is_point else farthest]
+
+
+def _reach(model: RobotModel) -> float:
+    """Return the longest path from the root along the joints [m]; 0.1 or more."""
+    tree = model.pin_model
+    paths = [0.0] * tree.njoints
+    for i in range(1, tree.njoints):
+        paths[i] = paths[tree.parents[i]] + float(
+            np.linalg.norm(tree.jointPlacements[i].translation)
+        )
+    return max(0.1, *paths)
+
+
+def _from_y_axis(axis: Array, position: Array) -> Array:
+    """Return the pose that maps the y axis, the viewer's axis of a cylinder, to an axis."""
+    M = np.eye(4)
+    M[:3, :3] = pin.Quaternion.FromTwoVectors(_UP, axis).toRotationMatrix()
+    M[:3, 3] = position
+    return M

@@ -1,0 +1,225 @@
+"""`convert` writes what a robot recorded under standard names, or nothing."""
+
+import json
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.recorders import JOINT_STATE, messages_of, wide, write_bag2, write_mcap
+from helpers.synthetic import exact_log, truth
+
+from robotid.base.exceptions import DataError
+from robotid.base.files import write_text
+from robotid.cli import main
+from robotid.cli.work.convert import convert
+from robotid.cli.work.job import job_from_settings
+from robotid.data.files.read import read_log
+from robotid.data.files.table_files import open_table, write_columns
+from robotid.data.log import Log
+from robotid.data.signal_settings import LogSource
+from robotid.robot.examples import example_urdf
+
+JOINTS = ("shoulder", "elbow")
+
+
+@pytest.fixture
+def log():
+    t = np.arange(60) / 50
+    phase = t[:, None] * [2.0, 3.0]
+    velocity = np.cos(phase) * [2.0, 3.0]
+    return Log(t=t, q=np.sin(phase), v=velocity, tau=10 * np.cos(phase), joints=JOINTS)
+
+
+@pytest.fixture
+def bag(tmp_path, log):
+    """A bag whose second topic is another arm's."""
+    other = replace(log, joints=("left", "right"))
+    topics = {"/arm": messages_of(log), "/other": messages_of(other)}
+    return write_bag2(tmp_path / "bag", topics)
+
+
+def assert_same(back, log):
+    for name in ("t", "q", "v", "tau"):
+        np.testing.assert_array_equal(getattr(back, name), getattr(log, name), name)
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".parquet", ".npz", ".h5", ".hdf5", ".mat"])
+def test_a_bag_becomes_a_table_of_standard_names(tmp_path, log, bag, suffix):
+    target = tmp_path / f"run{suffix}"
+    done = convert(bag, target, source=LogSource(topic="/arm"))
+    standard = [f"{kind}_{joint}" for kind in ("q", "dq", "tau") for joint in JOINTS]
+    assert (done.columns, done.joints) == (("time", *standard), JOINTS)
+    assert (done.path, done.samples, done.ignored) == (str(target), 60, ())
+    assert_same(read_log(target, JOINTS), log)
+
+
+def test_commands_are_kept_under_their_standard_names(tmp_path, log):
+    names = {"q": log.q, "q_des": log.q + 1, "qd_cmd": log.v, "loadsize": log.tau}
+    table = {f"{start}_{j}": x[:, k] for start, x in names.items() for k, j in enumerate(JOINTS)}
+    write_columns({"time": log.t, **table}, tmp_path / "run.parquet")
+    done = convert(tmp_path / "run.parquet", tmp_path / "run.csv")
+    standard = [f"{kind}_{joint}" for kind in ("q", "qref", "dqref") for joint in JOINTS]
+    assert done.columns == ("time", *standard)
+    assert done.ignored == ("loadsize_shoulder", "loadsize_elbow")
+    back = read_log(tmp_path / "run.csv", JOINTS, needs="commands")
+    np.testing.assert_array_equal(back.q_ref, log.q + 1)
+    np.testing.assert_array_equal(back.v_ref, log.v)
+
+
+def test_joints_without_torque_are_converted_too(tmp_path, log):
+    messages = [(*message[:4], []) for message in messages_of(log)]
+    path = write_mcap(tmp_path / "run.mcap", messages)
+    done = convert(path, tmp_path / "run.csv")
+    assert done.columns == ("time", "q_shoulder", "q_elbow", "dq_shoulder", "dq_elbow")
+
+
+def test_joints_are_chosen_renamed_and_effort_may_be_current(tmp_path, log, bag):
+    source = LogSource(topic="/arm", joints={"joint_2": "elbow"}, effort="current")
+    done = convert(bag, tmp_path / "run.csv", joints=["joint_2"], source=source)
+    assert done.columns == ("time", "q_joint_2", "dq_joint_2", "current_joint_2")
+    back = read_log(tmp_path / "run.csv", ["joint_2"], gains={"joint_2": 2.0})
+    np.testing.assert_array_equal(back.tau[:, 0], 2 * log.tau[:, 1])
+    assert done.ignored == ()
+
+
+def test_columns_of_no_joint_are_left_out_and_named(tmp_path, log, capsys):
+    np.savez(tmp_path / "run.npz", **wide(log), temperature=np.zeros(60))
+    done = convert(tmp_path / "run.npz", tmp_path / "run.csv")
+    assert done.ignored == ("temperature",)
+    assert_same(read_log(tmp_path / "run.csv", JOINTS), log)
+    assert main(["convert", str(tmp_path / "run.npz"), str(tmp_path / "run.csv")]) == 0
+    assert capsys.readouterr().out.endswith("\n  not written, not of a joint: temperature\n")
+
+
+@pytest.mark.parametrize(
+    ("arrays", "message"),
+    [
+        ({"time": [0.0, 1.0], "x": [0.0, 1.0]}, "has no column of a joint, as 'q_<joint>'; "),
+        ({"q_a": [0.0, 1.0]}, "has no column 'time'; columns found: q_a. Rename the time column"),
+        (
+            {"t": [0.0, 1.0], "q_a": [0.0, 1.0], "position_a": [0.0, 1.0]},
+            "has several columns for 'q_a': q_a, position_a; keep one of them",
+        ),
+    ],
+)
+def test_what_cannot_be_named_is_refused_and_nothing_is_written(tmp_path, arrays, message):
+    np.savez(tmp_path / "run.npz", **arrays)
+    with pytest.raises(DataError) as caught:
+        convert(tmp_path / "run.npz", tmp_path / "out.csv")
+    assert str(caught.value).startswith(f"run.npz {message}")
+    with pytest.raises(DataError, match=r"has no joint 'b'|has no column|several columns"):
+        convert(tmp_path / "run.npz", tmp_path / "out.csv", joints=["b"])
+    assert [path.name for path in tmp_path.iterdir()] == ["run.npz"]
+
+
+def test_columns_of_base_contacts_and_forces_are_kept(tmp_path, log):
+    kept = ["base_x", "base_qw", "base_roll", "base_alz", "imu_qx", "imu_az", "contact_l_foot",
+            "wrench_mz_l_foot", "foot_force_0"]  # fmt: skip
+    lost = ["base_state", "imu_temperature", "wrench_size_l_foot"]
+    table = {"time": log.t} | {f"q_{x}": log.q[:, k] for k, x in enumerate(JOINTS)}
+    table |= {name: k + log.t for k, name in enumerate([*kept, *lost])}
+    write_columns(table, tmp_path / "run.parquet")
+    done = convert(tmp_path / "run.parquet", tmp_path / "run.csv", joints=["elbow"])
+    assert done.columns == ("time", "q_elbow", *kept)
+    assert done.ignored == tuple(lost)
+    assert not done.local
+    back = open_table(tmp_path / "run.csv", LogSource()).read(kept)
+    for k, name in enumerate(kept):
+        np.testing.assert_array_equal(back[name], k + log.t)
+
+
+def test_the_command_converts_and_names_what_it_wrote(tmp_path, log, bag, capsys):
+    target = str(tmp_path / "run.csv")
+    assert main(["convert", str(bag), target, "--topic", "/arm", "--joints", "elbow"]) == 0
+    assert capsys.readouterr().out == (
+        f"{target}: 60 samples of 1 joints\n  columns time, q_elbow, dq_elbow, tau_elbow\n"
+    )
+    assert main(["convert", str(bag), target, "--topic", "/arm", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["joints"] == list(JOINTS)
+    assert_same(read_log(target, JOINTS), log)
+
+
+def test_the_command_refuses_by_name_and_leaves_what_was_there(tmp_path, bag, capsys):
+    target = tmp_path / "run.csv"
+    write_text("precious", target)
+    assert main(["convert", str(bag), str(target)]) == 1
+    assert f"bag has 2 topics of {JOINT_STATE}: /arm, /other" in capsys.readouterr().err
+    assert main(["convert", str(bag), str(target), "--topic", "/arm", "--effort", "x"]) == 2
+    assert "log: effort is 'x', wanted one of" in capsys.readouterr().err
+    assert main(["convert", str(bag), str(tmp_path / "run.mcap"), "--topic", "/arm"]) == 1
+    assert "run.mcap: logs are written as .csv, " in capsys.readouterr().err
+    assert target.read_text() == "precious"
+    assert {path.name for path in tmp_path.iterdir()} == {"bag", "run.csv"}
+
+
+FULL_DISK = """
+import contextlib, io, json, resource, sys
+sys.dont_write_bytecode = True  # a cut file would be read by the next process
+from robotid.cli import main
+resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))
+ends = []
+for target in sys.argv[2:]:
+    with contextlib.redirect_stderr(io.StringIO()) as said:
+        ends.append((main(["convert", sys.argv[1], target]), said.getvalue()))
+print(json.dumps(ends))
+"""
+
+
+def test_on_a_full_disk_the_old_file_stays_and_no_part_of_the_new(tmp_path):
+    t, q = np.arange(20_000) / 100, np.random.default_rng(0).normal(size=20_000)
+    np.savez(tmp_path / "in.npz", time=t, q_a=q)
+    suffixes = ("csv", "parquet", "npz", "h5", "hdf5", "mat")
+    targets = [tmp_path / f"out.{suffix}" for suffix in suffixes]
+    for target in targets:
+        write_text("precious", target)
+    command = [sys.executable, "-c", FULL_DISK, tmp_path / "in.npz", *targets]
+    run = subprocess.run(command, capture_output=True, text=True, check=True)
+    for target, (code, said) in zip(targets, json.loads(run.stdout), strict=True):
+        assert code == 1
+        assert said.startswith("robotid: [Errno 27] ")
+        assert said.endswith(f"\n  while writing {str(target)!r}\n")
+        assert target.read_text() == "precious"
+    assert run.stderr == ""
+    assert {*tmp_path.iterdir()} == {tmp_path / "in.npz", *targets}
+
+
+def test_a_job_reads_a_bag_and_its_result_validates_on_it(tmp_path, ur5, rng, capsys):
+    made = exact_log(ur5, truth(ur5), rng, noise=0.1)
+    names = tuple(f"M{j}" for j in range(6))
+    renamed = list(messages_of(replace(made, joints=names)))
+    still = messages_of(replace(made, joints=names, q=0 * made.q))
+    write_bag2(tmp_path / "bag", {"/arm": renamed, "/command": still})
+    mapping = ", ".join(f'{j} = "{m}"' for j, m in zip(ur5.joints, names, strict=True))
+    (tmp_path / "job.toml").write_text(
+        f'urdf = "{example_urdf("ur5_robot.urdf")}"\n'
+        f'[log]\ntopic = "/arm"\njoints = {{ {mapping} }}\nstamp = "header"\neffort = "torque"\n'
+        '[estimator]\nname = "wls"\n[output]\nreport = false\n'
+        '[[identification]]\nlog = "bag"\n'
+    )
+    out = tmp_path / "out"
+    assert main(["identify", str(tmp_path / "job.toml"), "--out", str(out)]) == 0
+    result = json.loads((out / "result.json").read_text())
+    assert result["settings"]["log"]["topic"] == "/arm"
+    assert len(result["inputs"][1]["sha256"]) == 64  # of the folder
+    assert main(["validate", str(out / "result.json"), str(tmp_path / "bag")]) == 0
+    again = job_from_settings(result["settings"], "result.json", tmp_path)
+    assert again.source.joints == dict(zip(ur5.joints, names, strict=True))
+    capsys.readouterr()
+
+
+def test_the_flags_of_identify_say_where_the_signals_are(tmp_path, ur5, rng, capsys):
+    made = exact_log(ur5, truth(ur5), rng, noise=0.1)
+    path = write_mcap(tmp_path / "run.mcap", messages_of(made), topic="/arm")
+    urdf = str(example_urdf("ur5_robot.urdf"))
+    words = ["identify", urdf, str(path), "--out", str(tmp_path / "out")]
+    assert main([*words, "--topic", "/leg"]) == 1
+    assert f"run.mcap has no topic '/leg'; topics: {{'/arm': '{JOINT_STATE}'}}" in (
+        capsys.readouterr().err
+    )
+    assert main([*words, "--stamp", "wall"]) == 2
+    assert main([*words, "--topic", "/arm", "--effort", "current"]) == 1
+    said = capsys.readouterr().err
+    assert f"joints {', '.join(ur5.joints)} have currents but no gain" in said
+    assert "--gain shoulder_pan_joint=... --gain shoulder_lift_joint=..." in said

@@ -1,0 +1,149 @@
+"""How a command ends that cannot go on: outputs in the way, readers that leave, full disks."""
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.paths import ROOT
+from helpers.synthetic import exact_log, truth
+
+from robotid.cli import main
+from robotid.data.files.read import write_log
+from robotid.robot.model import RobotModel
+
+URDF = str(ROOT / "urdf" / "planar_2r.urdf")
+OUTPUTS = [
+    *("result.json", "report.html"),
+    *("planar_2r.identified.urdf", "planar_2r.identified.drive.json"),
+]
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory):
+    path = tmp_path_factory.mktemp("log") / "fit.csv"
+    model, rng = RobotModel.from_urdf(URDF), np.random.default_rng(0)
+    write_log(exact_log(model, truth(model), rng, samples=1000, rate=100.0, noise=0.1), path)
+    return str(path)
+
+
+@pytest.fixture(scope="module")
+def made(log, tmp_path_factory):
+    """What is written from the log."""
+    folder = tmp_path_factory.mktemp("made")
+    assert main(["identify", URDF, log, "--friction", "viscous", "--out", str(folder)]) == 0
+    return folder
+
+
+@pytest.mark.parametrize("name", OUTPUTS)
+def test_a_folder_in_the_place_of_an_output_is_refused_before_the_work(
+    log, made, tmp_path, capsys, monkeypatch, name
+):
+    shutil.copytree(made, tmp_path, dirs_exist_ok=True)
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    assert sorted(before) == sorted(OUTPUTS)
+    (tmp_path / name).unlink()
+    (tmp_path / name).mkdir()
+    monkeypatch.setattr("robotid.cli.work.identify.identify_job", None)  # is not come to
+    assert main(["identify", URDF, log, "--out", str(tmp_path), "--cutoff", "5"]) == 2
+    assert f"{name}' is a folder, wanted a file to write" in capsys.readouterr().err
+    assert {p.name: p.read_bytes() for p in tmp_path.iterdir() if p.is_file()} == {
+        other: content for other, content in before.items() if other != name
+    }
+
+
+def test_a_track_is_put_in_place_whole(log, tmp_path, capsys):
+    (tmp_path / "track.json").mkdir()
+    assert main(["track", URDF, log, "--out", str(tmp_path)]) == 2
+    assert "track.json' is a folder, wanted a file to write" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["track.json"]
+
+
+def test_a_page_that_cannot_be_written_is_refused_before_the_work(log, tmp_path, capsys):
+    assert main(["replay", "none.urdf", log, "--html", str(tmp_path)]) == 2
+    assert main(["compare", "none.json", "none.json", "--out", str(tmp_path)]) == 2
+    assert main(["convert", "none.csv", str(tmp_path)]) == 2
+    assert capsys.readouterr().err.count("is a folder, wanted a file to write") == 3
+
+
+def robotid(*words, **where):
+    """Run the command line in a process of its own."""
+    return subprocess.run(
+        [sys.executable, "-m", "robotid", *words], stderr=subprocess.PIPE, text=True, **where
+    )
+
+
+@pytest.mark.parametrize(
+    ("words", "code"),
+    [
+        (["--help"], 0),
+        (["inspect", URDF, "--json"], 0),
+        (["doctor", URDF, "{zeros}"], 1),
+    ],
+    ids=["help", "json", "doctor"],
+)
+def test_a_reader_that_leaves_is_no_error_and_hides_none(log, tmp_path, words, code):
+    zeros = tmp_path / "zeros.csv"
+    text = Path(log).read_text().splitlines()
+    zeros.write_text("\n".join([text[0], *text[1:400], *text[300:]]))  # time goes back
+    read, write = os.pipe()
+    os.close(read)
+    run = robotid(*[word.format(zeros=zeros) for word in words], stdout=write)
+    os.close(write)
+    assert (run.returncode, run.stderr) == (code, "")
+
+
+def test_a_standard_output_that_is_full_is_said():
+    with open("/dev/full", "w") as full:
+        run = robotid("inspect", URDF, stdout=full)
+    assert (run.returncode, run.stderr) == (1, "robotid: [Errno 28] No space left on device\n")
+
+
+def test_a_warning_that_nobody_reads_does_not_end_the_work(log, tmp_path):
+    read, write = os.pipe()
+    os.close(read)
+    words = ["identify", URDF, log, "--workers", "2", "--friction", "viscous", "--no-report"]
+    words += ["--out", str(tmp_path)]
+    run = subprocess.run([sys.executable, "-m", "robotid", *words], stdout=write, stderr=write)
+    os.close(write)
+    assert run.returncode == 0
+    written = {path.name for path in tmp_path.iterdir()}
+    assert written == set(OUTPUTS) - {"report.html"}
+
+
+def test_names_that_the_standard_output_cannot_show_are_shown_otherwise(log, tmp_path):
+    here = tmp_path / "\u2713"
+    environment = {**os.environ, "PYTHONIOENCODING": "ascii"}
+    words = ["convert", log, str(tmp_path / "\u2713.csv")]
+    run = robotid(*words, stdout=subprocess.PIPE, env=environment)
+    assert (run.returncode, run.stderr) == (0, "")
+    assert run.stdout.startswith(str(here).replace("\u2713", "\\u2713") + ".csv: 1000 samples")
+
+
+@pytest.mark.parametrize("command", ["doctor", "validate", "compare", "replay"])
+def test_pipes_and_folders_are_no_input(log, tmp_path, capsys, command):
+    os.mkfifo(tmp_path / "pipe.json")
+    os.mkfifo(tmp_path / "pipe.toml")
+    pipe = str(tmp_path / "pipe.json")
+    words = {
+        "doctor": [str(tmp_path / "pipe.toml")],
+        "validate": [pipe, log],
+        "compare": [pipe, pipe],
+        "replay": [URDF, log, pipe],
+    }
+    assert main([command, *words[command]]) in (1, 2)
+    assert "is a pipe or a device, wanted a" in capsys.readouterr().err
+
+
+def test_a_signal_ends_the_live_page(log, tmp_path):
+    words = [sys.executable, "-m", "robotid", "track", URDF, log, "--out", str(tmp_path)]
+    run = subprocess.Popen([*words, "--serve"], stderr=subprocess.PIPE, text=True)
+    assert run.stderr.readline().startswith("live: http://127.0.0.1:")
+    run.send_signal(signal.SIGTERM)
+    assert run.communicate(timeout=60)[1] == "robotid: interrupted\n"
+    assert run.returncode == 143
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,132 @@
+"""robotid export: a written result in the formats of simulators."""
+
+import json
+import shutil
+
+import mujoco
+import numpy as np
+import pytest
+import yaml
+from helpers.paths import URDF
+from helpers.synthetic import exact_log, truth
+
+import robotid
+from robotid.cli import main
+from robotid.output.files.urdf import load_identified
+from robotid.robot.model import RobotModel
+from robotid.robot.urdf_text import read_with_yourdfpy
+
+
+@pytest.fixture(scope="module")
+def result(tmp_path_factory):
+    """The folder of a result; the URDF is kept elsewhere, with a mesh beside it."""
+    folder, rng = tmp_path_factory.mktemp("export"), np.random.default_rng(0)
+    (folder / "robot").mkdir()
+    urdf, shape = folder / "robot" / "planar.urdf", '<geometry><mesh filename="{}"/></geometry>'
+    shown = "".join(f"<visual>{shape.format(name)}</visual>" for name in ("link.obj", "no.dae"))
+    text = (URDF / "planar_2r.urdf").read_text()
+    urdf.write_text(text.replace('<link name="link_1">', f'<link name="link_1">{shown}'))
+    (folder / "robot" / "link.obj").write_text(
+        "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+    )
+    model = RobotModel.from_urdf(urdf)
+    log = exact_log(model, truth(model), rng, samples=400, noise=0.1)
+    robotid.write_log(log, folder / "first.csv")
+    (folder / "job.toml").write_text(
+        f'urdf = "{urdf}"\n[estimator]\ndraws = 0\n[[identification]]\nlog = "first.csv"\n'
+    )
+    robotid.run_job(robotid.read_job(folder / "job.toml"), folder / "out")
+    return folder / "out"
+
+
+def export(result, kind, target, capsys, *flags):
+    code = main(["export", str(result), "--format", kind, "--out", str(target), *flags])
+    return code, *capsys.readouterr()
+
+
+def test_each_format_is_written_and_what_it_does_not_state_is_said(result, tmp_path, capsys):
+    wanted = robotid.load_result(result)
+    values = dict(zip(wanted.robot.layout.names, wanted.parameters, strict=True))
+    masses = [values["link_1.m"], values["link_2.m"]]
+
+    code, out, _ = export(result, "urdf", tmp_path / "a.urdf", capsys)
+    assert code == 0
+    lines = out.splitlines()
+    assert lines[0] == f"written: {tmp_path / 'a.urdf'}, {tmp_path / 'a.drive.json'}"
+    has_place = [f"{j}.{t}" for j in ("joint_1", "joint_2") for t in ("armature", "offset")]
+    missing = ", ".join(name for name in has_place if values[name])
+    said = " ".join(line.strip() for line in lines[1:])
+    assert said == f"URDF cannot state {missing}; the drive parameters file of the URDF has them"
+    dynamics = read_with_yourdfpy(tmp_path / "a.urdf").joints[-1].dynamics
+    assert float(dynamics.damping) == values["joint_2.viscous"]
+    _, again = load_identified(tmp_path / "a.urdf", tmp_path / "a.drive.json")
+    np.testing.assert_allclose(again, wanted.parameters, rtol=1e-9, atol=1e-12)
+
+    code, out, _ = export(result / "result.json", "mjcf", tmp_path / "a.xml", capsys, "--json")
+    assert code == 0
+    assert json.loads(out) == {
+        "result": str(result / "result.json"),
+        "format": "mjcf",
+        "files": [str(tmp_path / "a.xml")],
+        "not_stated": ["meshes not exported, missing or in a format that MJCF cannot read: no.dae"],
+        "projected": {},
+    }
+    robot = mujoco.MjModel.from_xml_path(str(tmp_path / "a.xml"))
+    np.testing.assert_allclose(robot.body_mass[-2:], masses, rtol=1e-12)
+    assert robot.nmesh == 1  # found beside the URDF that was identified
+
+    code, out, _ = export(result, "sdf", tmp_path / "a.sdf", capsys)
+    assert code == 0
+    assert "joint_2.offset" in out
+    assert f"<mass>{float(masses[1])!r}</mass>" in (tmp_path / "a.sdf").read_text()
+
+    code, out, _ = export(result, "ranges", tmp_path / "a.yaml", capsys)
+    assert (code, out) == (0, f"written: {tmp_path / 'a.yaml'}\n")
+    read = yaml.safe_load((tmp_path / "a.yaml").read_text())
+    nominal = [read["bodies"][link]["mass"]["nominal"] for link in ("link_1", "link_2")]
+    np.testing.assert_allclose(nominal, masses, rtol=1e-5)
+
+
+def test_a_result_that_must_not_be_used_is_not_exported(result, tmp_path, capsys):
+    content = json.loads((result / "result.json").read_text())
+    shutil.copytree(result, tmp_path / "bad")
+    for key in ("urdf", "sidecar"):
+        del content["outputs"][key]
+    ranges = content.pop("ranges")
+    (tmp_path / "bad" / "result.json").write_text(json.dumps(content))
+    for kind in ("urdf", "mjcf", "sdf", "ranges"):
+        code, _, err = export(tmp_path / "bad", kind, tmp_path / "a", capsys)
+        assert code == 1
+        assert "because its parameters are wrong or impossible" in err
+    ranges["robot"] = 3
+    (tmp_path / "bad" / "result.json").write_text(json.dumps(content | {"ranges": ranges}))
+    code, _, err = export(tmp_path / "bad", "ranges", tmp_path / "a", capsys)
+    assert code == 1
+    assert "result.json.ranges.robot is 3, wanted text" in err
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["bad"]
+
+
+def test_neither_inputs_nor_files_of_a_user_are_replaced(result, tmp_path, capsys):
+    """A result's own URDF or log, its URDF under another name, notes; an export may be repeated."""
+    inputs = ["first.csv", "robot/planar.urdf", "out/result.json", "out/planar.identified.urdf"]
+    (tmp_path / "notes.txt").write_text("mine")
+    files = [*(result.parent / name for name in inputs), tmp_path / "notes.txt"]
+    before = [path.read_bytes() for path in files]
+    for kind in ("urdf", "mjcf", "sdf", "ranges"):
+        for path in files:
+            code, _, err = export(result, kind, path, capsys)
+            assert code == 2
+            assert f"{str(path)!r}" in err.replace("\n  ", " ")
+            assert "not replaced" in " ".join(err.split())
+        target = tmp_path / f"again.{kind}"
+        assert [export(result, kind, target, capsys)[0] for _ in range(2)] == [0, 0]
+    assert [path.read_bytes() for path in files] == before
+
+
+def test_a_place_that_cannot_be_written_is_named(result, tmp_path, capsys):
+    code, _, err = export(result, "mjcf", tmp_path / "none" / "a.xml", capsys)
+    assert code == 1
+    assert "does not exist; create it" in err
+    code, _, err = export(result, "sdf", tmp_path, capsys)
+    assert code == 2
+    assert "is a folder, wanted a file to write" in err

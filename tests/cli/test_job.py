@@ -1,0 +1,295 @@
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from robotid.base.exceptions import SettingsError
+from robotid.cli.work.job import Job, _motors, job_from_settings, read_job
+from robotid.data.files.read import write_log
+from robotid.data.log import Log
+from robotid.data.signal_settings import LogSource
+from robotid.robot.constraints import Loop
+from robotid.robot.drives import DRIVE_TERMS
+from robotid.robot.families import AUTO
+from robotid.robot.model import GRAVITY
+from robotid.robot.parameters import Coupling
+from tests.helpers.closed_chains import FOUR_BAR, FOUR_BAR_LOOP
+from tests.helpers.paths import ROOT
+
+FULL = """
+urdf = "robot.urdf"
+joints = ["a", "b"]
+locked = { c = 0.8 }
+passive = ["b"]
+gravity = [0.0, -9.81, 0.0]
+
+[signals]
+rate = 200.0
+cutoff = 8.0
+order = 4
+velocity = "auto"
+acceleration = "differentiated"
+trim = 0.2
+min_velocity = 0.02
+max_gap = 0.1
+
+[model]
+armature = true
+friction = "viscous"
+offset = false
+
+[torque]
+gains = { a = 14.87 }
+
+[log]
+topic = "/arm"
+joints = { a = "M1" }
+effort = "current"
+stamp = "log"
+
+[units]
+time = "ms"
+
+[[coupling]]
+name = "motor"
+ratios = { a = 1, b = -1.0 }
+
+[[transmission]]
+joints = ["a", "b"]
+motors = ["m", "n"]
+matrix = [[32, 0], [45, 45]]
+efficiency = [0.9, 1.0]
+
+[[loop]]
+frames = ["hand", "rod"]
+kind = "point"
+
+[estimator]
+name = "wls"
+
+[output]
+dynamics = true
+
+[[identification]]
+log = "ident.parquet"
+start = 0.3
+end = 13.5
+[[validation]]
+log = "val.parquet"
+"""
+
+
+def write(tmp_path, text):
+    path = tmp_path / "job.toml"
+    path.write_text(text)
+    return path
+
+
+def test_every_key_of_a_job_arrives(tmp_path):
+    job = read_job(write(tmp_path, FULL))
+    assert job.urdf == tmp_path / "robot.urdf"
+    assert job.joints == ("a", "b")
+    assert job.locked == {"c": 0.8}
+    assert job.gravity == (0.0, -9.81, 0.0)
+    assert job.signals.rate == 200.0
+    assert job.signals.acceleration == "differentiated"
+    assert job.terms == ("armature", "viscous")
+    assert job.gains == {"a": 14.87}
+    assert job.units.time == "ms"
+    assert job.source == LogSource("/arm", joints={"a": "M1"}, effort="current", stamp="log")
+    assert job.couplings == (Coupling("motor", (("a", 1.0), ("b", -1.0))),)
+    assert job.loops == (Loop(("hand", "rod"), "point"),)
+    assert job.passive == ("b",)
+    (gear,) = job.transmissions
+    assert (gear.motors, gear.efficiency) == (("m", "n"), (0.9, 1.0))
+    assert gear.T.tolist() == [[32.0, 0.0], [45.0, 45.0]]
+    assert job.estimator.name == "wls"
+    assert job.dynamics is True
+    (entry,) = job.identification
+    assert (entry.path, entry.start, entry.end) == (tmp_path / "ident.parquet", 0.3, 13.5)
+    assert job.validation[0].end is None
+
+
+def test_settings_written_into_a_result_are_the_same_job(tmp_path):
+    job = read_job(write(tmp_path, FULL))
+    again = job_from_settings(job.to_dict(), "result.json", Path())
+    assert again == job
+    off = read_job(write(tmp_path, FULL.replace("cutoff = 8.0", "cutoff = false")))
+    assert off.signals.cutoff is None
+    assert job_from_settings(off.to_dict(), "result.json", Path()) == off
+
+
+def test_paths_may_name_environment_variables(tmp_path, monkeypatch):
+    path = write(tmp_path, 'urdf = "$SOME_FOLDER/robot.urdf"')
+    monkeypatch.setenv("SOME_FOLDER", str(tmp_path / "data"))
+    assert read_job(path).urdf == tmp_path / "data" / "robot.urdf"
+    monkeypatch.delenv("SOME_FOLDER")
+    with pytest.raises(SettingsError, match="names an environment variable that is not set"):
+        read_job(path)
+
+
+CONSTRAINTS = '"consistent"\n[estimator.constraints]\n'
+WRONG = {
+    "misspelt key": ("order = 4", "ordr = 4", "ordr is not a known key; did you mean 'order'?"),
+    "misspelt table": ("[signals]", "[signal]", "known key; did you mean 'signals'?"),
+    "text for a number": ("trim = 0.2", 'trim = "0.2"', "signals.trim is '0.2', wanted a number"),
+    "true for a number": ("rate = 200.0", "rate = true", "signals.rate is True, wanted a number"),
+    "cutoff true": ("cutoff = 8.0", "cutoff = true", "cutoff is true, wanted a frequency [Hz]"),
+    "negative cutoff": ("cutoff = 8.0", "cutoff = -8.0", "cutoff is -8.0, wanted 0.001 to 1e6"),
+    "friction model": (
+        '"viscous"', '"stribek"', "friction is 'stribek', wanted auto, none, or some of viscous",
+    ),
+    "estimator": ('"wls"', '"magic"', "estimator is 'magic', wanted one of"),
+    "gain": ("a = 14.87", 'a = "14.87"', "gains.a is '14.87', wanted a number"),
+    "one bracket": ("[[validation]]", "[validation]", "wanted tables written as [[validation]]"),
+    "no log": ('log = "val.parquet"', "end = 2.0", "a [[validation]] has no key 'log'"),
+    "loop's kind": ('"point"', '"ball"', "loop hand, rod is 'ball', wanted one of point, hinge"),
+    "loop's frames": ('["hand", "rod"]', '["hand"]', "loop has the frames hand, wanted two links"),
+    "no frames": ('frames = ["hand", "rod"]', "", "loop has the frames none, wanted two links"),
+    "loop's axis": ('"point"', '"hinge"\naxis = [0, 1]', "is (0, 1), wanted x, y, z"),
+    "axis as text": ('"point"', '"hinge"\naxis = "z"', "axis is 'z', wanted a list"),
+    "passive": ('passive = ["b"]', 'passive = "b"', "passive is 'b', wanted a list"),
+    "no urdf": ('urdf = "robot.urdf"', "", "has no key 'urdf'"),
+    "joints text": ('joints = ["a", "b"]', 'joints = "a"', "joints is 'a', wanted a list"),
+    "unit": ('time = "ms"', 'time = "sec"', "time is 'sec', wanted one of"),
+    "effort": ('effort = "current"', 'effort = "force"', "log: effort is 'force', wanted one of"),
+    "stamp": ('stamp = "log"', 'stamp = "wall"', "log: stamp is 'wall', wanted one of"),
+    "joint's name": ('a = "M1"', "a = 1", "log.joints.a is 1, wanted text"),
+    "joint a number": ('["a", "b"]', "[1]", "joints[0] is 1, wanted"),
+    "joint a list": ('["a", "b"]', '[["a"]]', "joints[0] is ['a'], wanted text"),
+    "gravity of text": ("gravity = [0.0, -9.81, 0.0]", 'gravity = ["a", 0, 0]', "gravity[0] is"),
+    "gravity too short": ("-9.81, 0.0]", "-9.81]", "gravity has 2 entries, wanted 3"),
+    "gravity NaN": ("-9.81", "nan", "gravity[1] is nan, wanted a number between -1e30 and 1e30"),
+    "gravity too large": ("-9.81", "1e308", "gravity[1] is 1e+308, wanted a number between"),
+    "gain infinite": ("a = 14.87", "a = inf", "gains.a is inf, wanted a number"),
+    "ratio": ("a = 1, b", "a = true, b", "ratios.a is True, wanted a number"),
+    "column": ("[signals]", "columns = { tau_a = 2 }\n[signals]", "columns.tau_a is 2, wanted"),
+    "no matrix": ("matrix = [[32, 0], [45, 45]]", "", "a [[transmission]] has no key 'matrix'"),
+    "matrix of text": ("[45, 45]]", '["a", 45]]', "matrix is [[32, 0], ['a', 45]], wanted"),
+    "singular": ("[45, 45]]", "[45, 0]]", "matrix [[32, 0], [45, 0]] is singular"),
+    "motor twice": ('["m", "n"]', '["m", "m"]', "motors contains m twice"),
+    "ignore": ("[output]", "[doctor]\nignore = [1]\n[output]", "ignore[0] is 1, wanted"),
+    "ignore text": ("[output]", '[doctor]\nignore = "a"\n[output]', "ignore is 'a', wanted a list"),
+    "rate too high": ("rate = 200.0", "rate = 1e9", "rate is 1000000000.0, wanted 0.001 to 1e6"),
+    "cutoff too low": ("cutoff = 8.0", "cutoff = 1e-30", "cutoff is 1e-30, wanted 0.001 to 1e6"),
+    "band": ("trim = 0.2", "friction_band = 1e-320", "friction_band is 1e-320, wanted 0, or"),
+    "order of 5000 digits": ("order = 4", f"order = 0x{'f' * 5000}", "is a number of thousands of"),
+    "order too large": ("order = 4", f"order = {10**40}", "order is 1000000"),
+    "digits": ("order = 4", f"order = {'1' * 5000}", "is not valid TOML: Exceeds the limit"),
+    "pinned": ('"wls"', CONSTRAINTS + "pinned = [1]", "pinned[0] is 1"),
+    "gearless": ("[estimator]", "[[transmission]]\nmatrix = [[1.0]]\n[estimator]",
+                 "a [[transmission]] has no key 'joints'"),
+    "term in lists": ("[estimator]", "[drives]\nj1 = [[]]\n[estimator]",
+                      "a drive term is [], wanted a table, for example { term = 'Stribeck'"),
+    "group": ('"wls"', '"simulation"\n[controller]\ngroups = { a = "j1" }',
+              "groups.a is 'j1', wanted a list"),
+    "step": ('"wls"', '"simulation"\nstep = 1e-9', "step is 1e-09, wanted 2e-5 to 0.1"),
+    "window": ('"wls"', '"simulation"\nwindow = 1e-3', "window is 0.001, wanted 0.05 s or more"),
+    "delay": ('"wls"', '"simulation"\n[controller]\ndelay = 1.5', "delay is 1.5, wanted 0 to 1 s"),
+    "clock": ('"wls"', '"simulation"\n[controller]\nrate = 1e9', "rate is 1000000000.0, wanted 1"),
+    "stiff": ('"wls"', '"simulation"\n[controller]\nkp = 1e20', "kp is 1e+20, wanted 1e-9 to 1e12"),
+    "no bound": ('"wls"', CONSTRAINTS + "mass = { a = 1e300 }", "write 1e+09 for no upper bound"),
+    "mass": ('"wls"', CONSTRAINTS + "mass = { a = nan }", "mass of a is nan, wanted finite"),
+    "huge mass": ('"wls"', CONSTRAINTS + f"mass = {{ a = {10**400} }}", "mass of a"),
+    "huge box": ('"wls"', CONSTRAINTS + f"com = {{ a = [{10**400}] }}", "com of a"),
+    "draws": ('"wls"', '"consistent"\ndraws = 1000000000', "draws is 1000000000, wanted 0, or"),
+    "starts": ('"wls"', '"log_cholesky"\nstarts = 100000', "starts is 100000, wanted 0 to 1000"),
+    "seed": ('"wls"', '"log_cholesky"\nseed = -1', "seed is -1, wanted x >= 0"),
+    "seed of text": ('"wls"', '"log_cholesky"\nseed = "a"', "seed is 'a', wanted a whole number"),
+    "deep": ("locked = { c = 0.8 }", f"locked = {'[' * 5000}", "is not valid TOML"),
+    "NUL in a path": ('"robot.urdf"', '"robot\\u0000.urdf"', "is not a valid path"),
+    "long path": ('"robot.urdf"', f'"{"r" * 5000}"', "is not a valid path, wanted UTF-8"),
+    "misspelt topic": ("topic =", "topics =", "topics is not a known key; did you mean 'topic'?"),
+    "gravity": ("[0.0, -9.81, 0.0]", "9.81", "9.81, wanted a list of 3 numbers"),
+    "no quotes": (
+        'urdf = "robot.urdf"', "urdf = robot.urdf", ": urdf = robot.urdf. Text and paths need",
+    ),
+    "no TOML": ("[signals]", "[signals", "is not valid TOML"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("old", "new", "message"), WRONG.values(), ids=WRONG)
+def test_a_wrong_job_names_what_is_wrong(tmp_path, old, new, message):
+    assert old in FULL
+    with pytest.raises(SettingsError) as caught:
+        read_job(write(tmp_path, FULL.replace(old, new, 1)))
+    assert message in str(caught.value)
+    assert "job.toml" in str(caught.value)
+
+
+def test_a_missing_job_file_is_named(tmp_path):
+    with pytest.raises(SettingsError, match=r"there is no job file '.*none.toml'"):
+        read_job(tmp_path / "none.toml")
+
+
+def test_gravity_and_drive_terms_default_to_those_of_the_model():
+    job = Job(urdf=Path("robot.urdf"))
+    assert job.gravity == GRAVITY
+    assert job.terms == (*DRIVE_TERMS, AUTO)
+
+
+def test_a_controller_that_the_estimator_does_not_read_is_refused(tmp_path):
+    table = {"urdf": "arm.urdf", "controller": {"kp": 20.0}, "estimator": {"name": "wls"}}
+    with pytest.raises(SettingsError, match=r"'wls', wanted 'simulation'; set \[estimator\] name"):
+        job_from_settings(table, "job.toml", tmp_path)
+    table["estimator"] = {"name": "simulation"}
+    job = job_from_settings(table, "job.toml", tmp_path)
+    assert job.controller.kp == 20.0
+    assert job.to_dict()["controller"]["kp"] == 20.0
+    del table["controller"]
+    assert "controller" not in job_from_settings(table, "job.toml", tmp_path).to_dict()
+
+
+def test_the_motor_of_several_joints_replaces_the_drive_of_the_joint_with_its_name():
+    ratios = (("a", 60.0), ("b", -1.5))
+    gear = SimpleNamespace(shared={"a": ratios})
+    assert _motors(gear) == [Coupling("a", ratios, replaces=True)]
+
+
+def test_a_job_of_a_closed_chain_reads_the_log_of_its_driven_joint(tmp_path):
+    (tmp_path / "bars.urdf").write_text(FOUR_BAR)
+    t = np.linspace(0.0, 1.0, 20)
+    write_log(Log(t, t[:, None], t[:, None], ("drive",)), tmp_path / "log.csv")
+    table = {
+        "urdf": "bars.urdf",
+        "passive": ["elbow", "pivot"],
+        "loop": [{"frames": ["coupler_end", "rocker_end"]}],
+        "drives": {"pivot": [{"term": "Viscous"}]},
+        "identification": [{"log": "log.csv"}],
+    }
+    job = job_from_settings(table, "job.toml", tmp_path)
+    model = job.model()
+    assert model.loops == (FOUR_BAR_LOOP,)
+    assert model.passive == ("elbow", "pivot")
+    assert model.layout.drive_names[-1] == "pivot.viscous"
+    assert job.read(job.identification[0], model).joints == ("drive",)
+    assert job_from_settings(job.to_dict(), "result.json", Path()) == job
+
+
+def test_gear_ratios_of_the_urdf_need_no_matrix_and_shared_motors_are_couplings(tmp_path):
+    gears = "".join(
+        f"<transmission name='{joint}'><joint name='{joint}'/><actuator name='m'>"
+        f"<mechanicalReduction>{ratio}</mechanicalReduction></actuator></transmission>"
+        for joint, ratio in (("joint_1", 80), ("joint_2", -40))
+    )
+    text = (ROOT / "urdf" / "planar_2r.urdf").read_text()
+    (tmp_path / "arm.urdf").write_text(text.replace("</robot>", f"{gears}</robot>"))
+    t = np.linspace(0.0, 1.0, 20)
+    head = ",".join(f"{kind}_joint_{k}" for kind in ("qm", "taum") for k in (1, 2))
+    rows = np.column_stack([t, np.outer(t, [8.0, 4.0, 1.0, 2.0])])
+    np.savetxt(tmp_path / "log.csv", rows, delimiter=",", header=f"time,{head}", comments="")
+    table = {
+        "urdf": "arm.urdf",
+        "transmission": [{"joints": ["joint_1", "joint_2"], "matrix": "urdf"}],
+        "identification": [{"log": "log.csv"}],
+    }
+    job = job_from_settings(table, "job.toml", tmp_path)
+    model = job.model()
+    assert model.layout.couplings == ()
+    log = job.read(job.identification[0], model)
+    np.testing.assert_allclose(log.q, np.outer(t, [0.1, -0.1]), atol=1e-12)
+    np.testing.assert_allclose(log.tau, np.outer(t, [80.0, -80.0]), atol=1e-12)
+    table["transmission"][0]["matrix"] = [[80.0, 0.0], [60.0, -40.0]]
+    (shared,) = job_from_settings(table, "job.toml", tmp_path).model().layout.couplings
+    assert shared == Coupling("joint_2", (("joint_1", 1.0), ("joint_2", -2 / 3)), replaces=True)

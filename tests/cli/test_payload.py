@@ -1,0 +1,288 @@
+"""`robotid payload`: from files to what controllers ask for."""
+
+import json
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.synthetic import exact_log, truth
+
+from robotid.base.exceptions import SettingsError
+from robotid.base.files import file_sha256
+from robotid.cli import main
+from robotid.cli.work import payload
+from robotid.cli.work.identify import run_job
+from robotid.cli.work.job import job_from_settings
+from robotid.cli.work.payload import stated_masses
+from robotid.data.files.read import write_log
+from robotid.data.files.table_files import write_columns
+from robotid.diagnosis.verdict.payload_check import PayloadCheck
+from robotid.output.files.result_file import load_result, stated_scale_check
+from robotid.output.report.next_steps import next_steps
+from robotid.output.report.steps import Origin
+from robotid.robot.bodies import link_transfer
+from robotid.robot.drives import Tanh
+from robotid.robot.examples import example_urdf
+
+LOAD = np.array([2.0, 0.04, 0.06, 0.2, 0.06, 0.0, 0.06, 0.0, 0.0, 0.03])
+GAINS = np.array([14.0, 13.0, 11.0, 9.0, 8.0, 7.0])
+NOISE = np.array([0.3, 0.4, 0.2, 0.04, 0.03, 0.02])  # [N m]
+ARM = str(example_urdf("ur5_robot.urdf"))
+
+
+@pytest.fixture(scope="module")
+def files(ur5, tmp_path_factory):
+    """Logs without and with a load on tool0, as torques and as currents, and a result."""
+    folder = tmp_path_factory.mktemp("payload")
+    pi, (body, transfer) = truth(ur5), link_transfer(ur5, "tool0")
+    loaded = pi.copy()
+    loaded[10 * body : 10 * body + 10] += transfer @ LOAD
+    rng = np.random.default_rng(0)
+    for name, x in {"bare": pi, "loaded": loaded}.items():
+        log = exact_log(ur5, x, rng, samples=1000, rate=100.0, noise=NOISE)
+        log = replace(log, v=None, a=None)
+        write_log(log, folder / f"{name}.csv")
+        columns = {"time": log.t}
+        for j, joint in enumerate(ur5.joints):
+            columns[f"q_{joint}"] = log.q[:, j]
+            columns[f"current_{joint}"] = log.tau[:, j] / GAINS[j]
+        write_columns(columns, folder / f"{name}_currents.csv")
+    table = {"urdf": ARM, "identification": [{"log": "bare.csv"}], "estimator": {"name": "wls"}}
+    table["output"] = {"report": False}
+    run_job(job_from_settings(table, "job.toml", folder), folder / "out")
+    return folder
+
+
+STATED = ("--friction", "viscous+coulomb")  # so that none has to be chosen
+
+
+def asked(capsys, *words, code=0):
+    assert main(["payload", ARM, *map(str, words)]) == code
+    printed = capsys.readouterr()
+    return printed.out if code == 0 else printed.err
+
+
+def test_a_log_and_a_result_are_references_alike(files, capsys):
+    found = [
+        json.loads(asked(capsys, files / "loaded.csv", "--reference", files / reference,
+                         "--link", "tool0", "--json"))
+        for reference in ("bare.csv", "out", "out/result.json")
+    ]  # fmt: skip
+    assert found[0] == found[1] == found[2]
+    (payload,) = found[0]["payloads"]
+    assert payload["link"] == "tool0"
+    assert payload["mass"] == pytest.approx(2.0, abs=4 * payload["mass_std_error"])
+    assert payload["mass_std_error"] < 0.05
+    error = np.array(payload["com"]) - LOAD[1:4] / LOAD[0]
+    assert (np.abs(error) < 4 * np.array(payload["com_std_error"])).all()
+    assert "gains" not in found[0]
+
+
+def test_a_mass_is_said_to_be_in_the_scale_of_the_torques(files, capsys):
+    words = [files / "loaded.csv", "--reference", files / "bare.csv", "--link", "tool0", *STATED]
+    said = asked(capsys, *words)
+    mass, low, high = re.search(
+        r"mass ([.\d]+) kg \(95 % interval ([.\d]+) to ([.\d]+)\)\.", said
+    ).groups()
+    assert float(low) < float(mass) < float(high)
+    assert "It is proportional to the torque scale" in " ".join(said.split())
+
+
+def test_the_text_says_what_a_controller_asks_for(files, capsys):
+    said = asked(capsys, files / "loaded.csv", "--reference", files / "bare.csv", "--link", "tool0",
+                 "--mass", "2", *STATED)  # fmt: skip
+    assert said.startswith("payload on tool0\n  mass 2 kg, stated\n  scale of the torques: payload")
+    check = " ".join(said.split())
+    assert re.search(r"of 2 kg on tool0: torque alone determines [12][.\d]* kg \(95 % inter", check)
+    assert "wanted: at most 5 %" in check
+    assert re.search(r"centre of mass in the frame of tool0 \[m\]\n    x +0.0", said)
+    assert re.search(r"about the origin of tool0, axes of tool0 \[kg m\^2\]\n    Ixx +0.0", said)
+    assert "inertia about its centre of mass, axes of tool0" in said
+    # the last digit of a value is the second one of its error
+    figures = re.findall(r"-?\d\.(\d+)(e-..)? +\+- \d\.(\d+)(e-..)?\n", said)
+    assert len(figures) == 9
+    assert all((len(x), power) == (len(e), same) for x, power, e, same in figures)
+    assert max(map(len, said.splitlines())) <= 80
+
+
+def test_a_job_states_a_check_of_the_scale_which_its_result_has(files):
+    table = {
+        "urdf": ARM, "identification": [{"log": "bare.csv"}], "estimator": {"draws": 0},
+        "model": {"friction": "viscous+coulomb"}, "output": {"report": False},
+        "payload_check": [
+            {"log": "loaded.csv", "mass": 1.8, "link": "tool0", "end": 3.0},
+            {"log": "loaded.csv", "mass": 1.8, "link": "tool0"},
+        ],
+    }  # fmt: skip
+    found, _ = run_job(job_from_settings(table, "job.toml", files), files / "checked")
+    check, other = found.scale_check.payloads  # the narrower interval first: the whole log
+    widths = [high - low for low, high in (check.interval, other.interval)]
+    assert widths[0] < widths[1]
+    assert (check.known, check.link) == (1.8, "tool0")
+    assert check.identified == pytest.approx(2.0, abs=0.06)
+    assert check.interval[0] < 2.0 < check.interval[1]
+    assert check.sha256 == file_sha256(files / "loaded.csv")
+    assert found.scale_check.contradicts  # 2 kg are not 1.8 kg
+    (reason,) = [r for r in found.verdict.reasons if "payload of known mass" in r]
+    assert check.message in reason
+    assert f"{other.message[0].upper()}{other.message[1:]}" in reason or other.message in reason
+    whole = load_result(files / "checked").content
+    assert stated_scale_check(whole).payloads == (check, other)
+    assert job_from_settings(whole["settings"], "x", files).payload_checks == (
+        found.asked.job.payload_checks
+    )
+    (step,) = [
+        s for s in next_steps(found, Origin(("job.toml",), "out")) if "torque scale" in s.words
+    ]
+    assert step.words.startswith("Correct the torque scale: payload of 1.8 kg on tool0")
+    urdf, bare, loaded = found.model.tree.path, files / "bare.csv", files / "loaded.csv"
+    assert step.blocks[0] == (
+        f"robotid payload {urdf} {loaded} --reference {bare} --link tool0 --mass 1.8 --gains"
+    )
+    typed = Origin((str(urdf), "bare.csv", "--gain", "elbow_joint=3", "--cutoff", "8"), "out")
+    (step,) = [s for s in next_steps(found, typed) if "torque scale" in s.words]
+    assert step.blocks[1:] == (
+        f"robotid identify {urdf} bare.csv --cutoff 8 --gain elbow_joint=GAIN --out out",
+    )
+    assert "verify them with another log of a payload: this one determines them" in step.words
+    rewritten = next_steps(found, Origin((), "out"))  # the report of a result names no source
+    assert not any("robotid identify" in block for step in rewritten for block in step.blocks)
+    right = replace(check, known=2.0)
+    verified = replace(found, payload_checks=(right,))
+    assert verified.scale_check.agrees == right.verifies
+    steps = next_steps(verified, Origin(("job.toml",), "out"))
+    assert right.verifies
+    assert not any("torque scale" in step.words for step in steps)
+
+
+def test_a_check_of_the_scale_reads_the_windows_that_a_job_states(files, monkeypatch):
+    windows = [(2.0, 5.0), (None, 3.0), (6.0, None)]
+    table = {
+        "urdf": ARM, "identification": [{"log": "bare.csv"}],
+        "payload_check": [
+            {k: x for k, x in (("start", a), ("end", b)) if x is not None}
+            | {"log": "loaded.csv", "mass": 1.8, "link": "tool0"}
+            for a, b in windows
+        ],
+    }  # fmt: skip
+    read = []
+
+    def checked(loaded, reference, *, masses):
+        assert reference == ("first", "second")
+        read.append([log.t[[0, -1]] for own in loaded for log in own.looks])
+        return {"tool0": PayloadCheck("tool0", masses["tool0"])}
+
+    monkeypatch.setattr(payload, "Recordings", lambda model, mapping, run: run)
+    monkeypatch.setattr(payload, "mass_checks", checked)
+    job = job_from_settings(table, "job.toml", files)
+    checks = payload.check_payloads(job, job.model(), ("first", "second"))
+    assert len(checks) == 3
+    for check in checks:
+        assert (check.known, check.sha256) == (1.8, file_sha256(files / "loaded.csv"))
+    first, last = 0.0, 9.99
+    wanted = [[[a or first, last if b is None else b]] for a, b in windows]
+    np.testing.assert_allclose(read, wanted, atol=0.011)
+
+
+def test_gains_come_from_a_known_mass(files, capsys, ur5):
+    words = [files / "loaded_currents.csv", "--reference", files / "bare_currents.csv", "--link",
+             "tool0", "--mass", "tool0=2", "--gains"]  # fmt: skip
+    found = json.loads(asked(capsys, *words, "--json"))
+    assert list(found["gains"]) == list(ur5.joints)
+    assert not found.get("mass_checks")  # the known mass was used
+    for gain, true in zip(found["gains"].values(), GAINS, strict=True):
+        assert gain["gain"] == pytest.approx(true, abs=4 * gain["std_error"])
+        assert gain["std_error"] < 0.05 * true
+    assert all(entry["std_error"] > 0 for entry in found["base_parameters"])
+    said = asked(capsys, *words, *STATED)
+    assert "verify them with another payload or another log of it" in " ".join(said.split())
+    assert "[torque.gains]\nshoulder_pan_joint = 1" in said
+    stated = f"{ur5.joints[0]}={GAINS[0]}"
+    some = json.loads(asked(capsys, *words, "--gain", stated, *STATED, "--json"))
+    assert list(some["gains"]) == list(ur5.joints[1:])
+
+
+def test_friction_is_chosen_of_torques_in_the_gains_that_were_found(
+    files, capsys, ur5, monkeypatch
+):
+    asked_of = []
+
+    def no_terms(job, *_):
+        asked_of.append(job.gains)
+        return {}
+
+    monkeypatch.setattr("robotid.cli.work.payload._chosen_terms", no_terms)
+    words = [files / "loaded_currents.csv", "--reference", files / "bare_currents.csv", "--link",
+             "tool0", "--mass", "2", "--gains", "--gain", "elbow_joint=11", "--json"]  # fmt: skip
+    found = json.loads(asked(capsys, *words))["gains"]
+    gains = {joint: gain["gain"] for joint, gain in found.items()} | {"elbow_joint": 11.0}
+    assert asked_of == [gains]
+    np.testing.assert_allclose([gains[joint] for joint in ur5.joints], GAINS, rtol=0.1)
+
+
+def test_what_is_missing_is_named(files, capsys):
+    loaded, bare = files / "loaded.csv", files / "bare.csv"
+    said = asked(capsys, bare, "--reference", loaded, "--link", "tool0", *STATED, code=1)
+    assert "less than in the reference" in said
+    said = asked(capsys, loaded, "--reference", files / "out", "--cutoff", "5", code=2)
+    assert "a RESULT states how its logs are read; remove --cutoff" in said
+    said = asked(capsys, loaded, "--reference", files / "out", "--reference", bare, code=2)
+    assert "wanted one result alone, or logs" in said
+    said = asked(capsys, loaded, "--reference", bare, "--mass", "heavy", code=2)
+    assert "--mass 'heavy': wanted KG or LINK=KG" in said
+    with pytest.raises(SettingsError, match=r"the link is ambiguous, wanted one of a, b"):
+        stated_masses(["2"], ["a", "b"])
+    content = bare.read_bytes()
+    try:
+        bare.write_bytes(content + b"\n")
+        said = asked(capsys, loaded, "--reference", files / "out", code=1)
+    finally:
+        bare.write_bytes(content)
+    assert "is missing or was changed; give a log without the payload" in said
+
+
+def test_friction_that_the_reference_shows_is_that_of_the_payload_s_logs(upright, tmp_path, capsys):
+    """A drive with a slope at rest: viscous and Coulomb's alone leave ten times the error."""
+    model = upright.with_terms({"joint_1": [Tanh(speed=0.3)]})
+    bare, rng = truth(model), np.random.default_rng(3)
+    bare[model.layout.names.index("joint_1.tanh")] = 8.0
+    loaded = bare.copy()
+    loaded[10:20] += [2.0, 0.4, 0.1, 0.0, 0.05, 0.0, 0.1, 0.0, 0.0, 0.1]  # of link_2
+    gains = np.array([3.0, 7.0])  # [N m/A]
+    for name, pi in {"bare": bare, "loaded": loaded}.items():
+        log = exact_log(model, pi, rng, samples=800, rate=100.0, noise=0.05)
+        write_log(log, tmp_path / f"{name}.csv")
+        columns = {"time": log.t}
+        for j, joint in enumerate(model.joints):
+            columns |= {f"q_{joint}": log.q[:, j], f"current_{joint}": log.tau[:, j] / gains[j]}
+        write_columns(columns, tmp_path / f"{name}_currents.csv")
+
+    def found(kind, *words):
+        logs = [str(tmp_path / f"{name}{kind}.csv") for name in ("loaded", "bare")]
+        command = ["payload", model.tree.path, logs[0], "--reference", logs[1], *words, "--json"]
+        assert main(command) == 0
+        return json.loads(capsys.readouterr().out)
+
+    chosen, plain = found(""), found("", "--friction", "viscous+coulomb")
+    (payload,), (other,) = chosen["payloads"], plain["payloads"]
+    assert payload["mass"] == pytest.approx(2.0, abs=3 * payload["mass_std_error"])
+    assert payload["mass_std_error"] < 0.2 * other["mass_std_error"]
+    missed = [content["relative_error_pct"]["joint_1"] for content in (chosen, plain)]
+    assert missed[0] < 0.2 < 1.0 < missed[1]
+    scaled = found("_currents", "--gains", "--mass", "2")["gains"]
+    one = found("_currents", "--gains", "--mass", "2", "--gain", "joint_2=7")["gains"]
+    assert (list(scaled), list(one)) == (["joint_1", "joint_2"], ["joint_1"])
+    for gain, true in ((scaled["joint_1"], 3.0), (scaled["joint_2"], 7.0), (one["joint_1"], 3.0)):
+        assert gain["gain"] == pytest.approx(true, abs=4 * gain["std_error"])
+        assert gain["std_error"] < 0.02 * true
+
+
+def test_the_narrowest_check_is_that_of_the_smallest_share_of_its_mass():
+    checks = [
+        PayloadCheck("tool", 1.0, interval=(0.9, 1.1), identified=1.0),
+        PayloadCheck("tool", 4.0, interval=(3.8, 4.2), identified=4.0),
+        PayloadCheck("tool", 2.0),
+    ]
+    widths = [payload._width(check) for check in checks]
+    assert widths == [pytest.approx(0.2), pytest.approx(0.1), np.inf]

@@ -1,0 +1,207 @@
+"""`robotid preview`: from positions to what they will tell, and to what they told."""
+
+import json
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from helpers.synthetic import exact_log, truth
+
+from robotid.base.exceptions import DataError
+from robotid.cli import main
+from robotid.cli.work import preview
+from robotid.cli.work.identify import run_job
+from robotid.cli.work.job import LogEntry, job_from_settings
+from robotid.cli.work.preview import _motions
+from robotid.data.files.read import read_log, write_log
+from robotid.data.files.table_files import write_columns
+from robotid.robot.examples import example_urdf
+
+NOISE = np.array([2.0, 3.0, 1.0, 0.3, 0.2, 0.1])  # [N m]
+ARM = str(example_urdf("ur5_robot.urdf"))
+
+
+@pytest.fixture(scope="module")
+def files(ur5, tmp_path_factory):
+    """A log and its result, and the same and another motion without torques."""
+    folder = tmp_path_factory.mktemp("preview")
+    for seed, name in enumerate(("log", "other")):
+        rng = np.random.default_rng(seed)
+        log = exact_log(ur5, truth(ur5), rng, samples=1200, rate=100.0, noise=NOISE)
+        write_log(log, folder / f"{name}.csv")
+        columns = {f"q_{joint}": log.q[:, j] for j, joint in enumerate(ur5.joints)}
+        write_columns({"time": log.t} | columns, folder / f"{name}_motion.csv")
+    table = {
+        "urdf": ARM,
+        "identification": [{"log": "log.csv"}],
+        "estimator": {"name": "wls"},
+        "model": {"friction": "viscous+coulomb"},
+    }
+    run_job(job_from_settings(table, "job.toml", folder), folder / "out")
+    return folder
+
+
+def asked(capsys, *words, code=0):
+    assert main(["preview", ARM, *map(str, words)]) == code
+    printed = capsys.readouterr()
+    return printed.out if code == 0 else printed.err
+
+
+def base(content, key="std_error"):
+    return {entry["name"]: entry[key] for entry in content["base_parameters"]}
+
+
+def test_a_motion_without_torques_is_previewed(files, ur5, capsys):
+    words = [f"--noise={j}={s}" for j, s in zip(ur5.joints, NOISE, strict=True)]
+    plain = json.loads(asked(capsys, files / "log_motion.csv", "--json", *words[1:]))
+    assert plain["noise"]["elbow_joint"] == {
+        "std": 1.0, "unit": "N m", "correlation": 0.1, "is": "stated",
+    }  # fmt: skip
+    assert plain["noise"]["shoulder_pan_joint"]["std"] == pytest.approx(1.5)
+    assert plain["noise"]["shoulder_pan_joint"]["is"] == "assumed"
+    assert plain["undetermined"] == plain["structure"]["undetermined"]
+    for entry in plain["base_parameters"]:
+        assert 0 < entry["std_error"] <= entry["plausible"] * 1.001
+        assert entry["name"] in entry["expression"]
+    assert {e["source"] for e in plain["standard_parameters"]} <= {"data", "mixed", "prior"}
+    for torque in plain["torque"].values():
+        assert 0 < torque["of_parameters"] < torque["half_width"]
+    whole = json.loads(asked(capsys, files / "log.csv", "--velocity", "differentiated",
+                             "--acceleration", "differentiated", "--json", *words[1:]))  # fmt: skip
+    assert base(whole) == base(plain)  # its torques are ignored
+    white = json.loads(asked(capsys, files / "log_motion.csv", "--correlation", "0", "--json"))
+    slow = json.loads(asked(capsys, files / "log_motion.csv", "--json"))
+    assert sum(base(white).values()) < sum(base(slow).values())
+
+
+def test_a_run_before_says_what_gains_most(files, capsys):
+    words = [files / "other_motion.csv", "--given", files / "out"]
+    content = json.loads(asked(capsys, *words, "--json"))
+    assert content["estimator"] == "wls"
+    assert {noise["is"] for noise in content["noise"].values()} == {"found"}
+    before, after, gain = (base(content, k) for k in ("std_error_before", "std_error", "gain"))
+    for name, factor in gain.items():
+        assert factor >= 1.0
+        assert factor <= before[name] / after[name] * 1.001
+    assert max(gain.values()) > 1.3
+    text = asked(capsys, *words)
+    assert "before" in text
+    assert "gain" in text
+    assert "assumed" not in text
+
+
+def test_what_was_achieved_stands_beside_what_was_expected(files, capsys):
+    words = [files / "log.csv", "--given", files / "out"]
+    content = json.loads(asked(capsys, *words, "--json"))
+    result = json.loads((files / "out" / "result.json").read_text())
+    achieved = base(content, "achieved_std_error")
+    assert achieved == {e["name"]: e["std_error"] for e in result["base_parameters"]}
+    ratio, expected = base(content, "ratio"), base(content)
+    for name, value in ratio.items():
+        assert value == pytest.approx(achieved[name] / expected[name])
+    assert content["achieved"]["count"] == len(ratio)
+    assert content["achieved"]["median"] == pytest.approx(1.0, abs=0.2)
+    assert content["achieved"]["median"] == pytest.approx(np.median([*ratio.values()]))
+    tenths = np.quantile([*ratio.values()], [0.1, 0.9])
+    assert content["achieved"]["range_80"] == pytest.approx(tenths)
+    for joint, noise in content["noise"].items():
+        assert noise["achieved"] == result["identification"]["per_joint"][joint]["rmse"]
+        assert noise["achieved"] == pytest.approx(noise["std"], rel=0.1)
+    assert "times the expected ones" in " ".join(asked(capsys, *words).split())
+
+
+def test_of_each_motion_its_window_is_previewed(files):
+    job = job_from_settings(
+        {
+            "urdf": ARM,
+            "identification": [
+                {"log": "log_motion.csv", "start": 2.0, "end": 7.0},
+                {"log": "other_motion.csv", "start": 1.0, "end": 4.5},
+            ],
+            "signals": {"trim": 0.0},
+        },
+        "job.toml",
+        files,
+    )
+    first, second = _motions(job, job.model(), job.identification)
+    for motion, start, end in ((first, 2.0, 7.0), (second, 1.0, 4.5)):
+        (look,) = motion.looks
+        assert (look.t[0], look.t[-1]) == pytest.approx((start, end), abs=0.0101)
+    shown = preview.preview_job(job)["motions"]
+    assert [Path(motion["path"]).name for motion in shown] == ["log_motion.csv", "other_motion.csv"]
+    ends = [(motion["start"], motion["end"]) for motion in shown]
+    np.testing.assert_allclose(ends, [(2.0, 7.0), (1.0, 4.5)], atol=0.0101)
+
+
+@pytest.mark.parametrize(
+    ("given", "is_own", "beside"), [(None, False, None), ("r", False, "run"), ("r", True, "like")]
+)
+def test_noise_that_is_stated_is_that_of_every_preview(monkeypatch, given, is_own, beside):
+    heard = {}
+
+    def preview_logs(model, motions, estimator, **stated):
+        heard.update(stated, model=model, motions=motions, estimator=estimator)
+
+    entry, before = LogEntry(Path("new.csv")), LogEntry(Path("old.csv"))
+    job = SimpleNamespace(identification=(entry,), model=lambda: "bare", estimator="wls")
+    result = {
+        "inputs": [{"role": "identification", "sha256": "new.csv" if is_own else "old.csv"}],
+        "base_parameters": [],
+        "identification": {"per_joint": {}},
+    }
+    for name, stands_for in {
+        "preview_logs": preview_logs,
+        "build_preview": lambda _: {"base_parameters": [], "noise": {}},
+        "_motions": lambda job, model, entries: [str(entry.path) for entry in entries],
+        "result_run": lambda job, path: (job, [before], "found", "a run"),
+        "load_result": lambda path: SimpleNamespace(content=result),
+        "stated_between": lambda content, model: (content is result, model),
+        "replace": lambda found, **own: heard.update(own),
+        "file_sha256": str,
+    }.items():
+        monkeypatch.setattr(preview, name, stands_for)
+    preview.preview_job(job, given, noise={"a": 0.2}, correlation=0.3)
+    if given and not is_own:
+        assert heard.pop("between") == ((True, "found"),)
+    assert (heard.pop("noise"), heard.pop("correlation")) == ({"a": 0.2}, 0.3)
+    wanted = {"model": "found" if given else "bare", "estimator": "wls"}
+    wanted["motions"] = ["old.csv" if is_own else "new.csv"]
+    assert heard == wanted | ({beside: "a run"} if beside else {})
+    if is_own:
+        job.identification = (LogEntry(Path("a.csv")), entry, LogEntry(Path("b.csv")))
+        with pytest.raises(DataError, match=r"some of these motions, but not to a\.csv, b\.csv;"):
+            preview.preview_job(job, given)
+
+
+def test_the_text_says_what_it_rests_on(files, capsys):
+    text = " ".join(asked(capsys, files / "log_motion.csv").split())
+    assert "assumed noise: 1 % of the URDF's effort limit" in text
+    assert "log_motion.csv: the motion determines " in text
+    assert "standard parameters, given the URDF: by " in text
+    assert "shoulder_link.Izz + 13 more" in text
+    whole = " ".join(asked(capsys, files / "log_motion.csv", "--verbose").split())
+    assert "wrist_3_link.Iyz" in whole
+    assert "shoulder_link.Izz + 0.0" in whole
+
+
+def test_wrong_words_are_answered(files, capsys):
+    motion = files / "log_motion.csv"
+    error = asked(capsys, motion, "--noise", "elbow=1", code=2)
+    assert "Did you mean 'elbow_joint'" in error
+    assert "wanted JOINT=NUMBER" in asked(capsys, motion, "--noise", "elbow_joint", code=2)
+    error = asked(capsys, motion, "--given", files / "out", "--cutoff", "5", code=2)
+    assert "a RESULT states how its logs are read" in error
+    write_columns({"time": np.arange(9.0), "q_a": np.zeros(9)}, files / "other_robot.csv")
+    error = asked(capsys, files / "other_robot.csv", code=1)
+    assert '# q_shoulder_pan_joint = "NAME"' in error
+    assert "tau" not in error
+
+
+def test_a_motion_read_as_a_log_has_no_torque(files, ur5):
+    log = read_log(files / "log_motion.csv", ur5.joints, needs="motion")
+    assert not log.tau.any()
+    full = read_log(files / "log.csv", ur5.joints, needs="motion")
+    np.testing.assert_array_equal(log.q, full.q)
+    assert not full.tau.any()
+    assert any("columns ignored: tau_shoulder_pan_joint" in note for note in full.notes)

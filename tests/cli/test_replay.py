@@ -1,0 +1,506 @@
+"""``robotid replay``: a log, results, a track and a ghost from files to one page."""
+
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from helpers.commanded_results import drive_entries, written_result
+from helpers.mujoco_plant import plant, recorded
+from helpers.paths import ROOT
+from helpers.replay_data import leave_out_meshes, shown
+from helpers.synthetic import exact_log, payload_log, truth
+
+from robotid.base.exceptions import DataError
+from robotid.cli import main
+from robotid.cli.work import replay
+from robotid.cli.work.job import Job, LogEntry
+from robotid.cli.work.replay import _base_poses, read_findings, replay_identified
+from robotid.data.files.read import write_log
+from robotid.data.files.table_files import write_columns
+from robotid.data.log import Log
+from robotid.output.files.result_file import load_result
+from robotid.robot.examples import example_urdf
+from robotid.robot.model import RobotModel
+
+URDF = str(example_urdf("ur5_robot.urdf"))
+
+
+def of_boxes(urdf, path):
+    """Write a URDF that shows boxes for all meshes but one: they take seconds to be thinned."""
+    text = Path(urdf).read_text()
+    first, *others = re.split(r"(?=<visual>)", text, maxsplit=2)[1:]
+    head = text.partition("<visual>")[0]
+    box = r'\g<1><box size="0.1 0.1 0.1"/>'
+    others = [re.sub(r"(<visual>.*?)<mesh [^>]*/>", box, x, flags=re.DOTALL) for x in others]
+    path.write_text("".join([head, first, *others]))
+    return str(path)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A UR5, a log of one that its URDF does not describe, and what identify found in it."""
+    folder = tmp_path_factory.mktemp("replay")
+    urdf = of_boxes(URDF, folder / "ur5.urdf")
+    model = RobotModel.from_urdf(urdf)
+    rng = np.random.default_rng(0)
+    log = exact_log(model, truth(model), rng, samples=1500, rate=100.0)
+    write_log(log, folder / "log.csv")
+    words = ["identify", urdf, str(folder / "log.csv"), "--out", str(folder / "out")]
+    assert main([*words, "--estimator", "wls", "--no-report"]) == 0
+    return folder
+
+
+def run(folder, *words):
+    target = folder / "page.html"
+    code = main(["replay", str(folder / "ur5.urdf"), *map(str, words), "--html", str(target)])
+    return code, shown(target.read_text(encoding="utf-8")) if code == 0 else None
+
+
+def test_a_log_alone_plays_with_its_torques(folder, capsys):
+    code, data = run(folder, folder / "log.csv")
+    assert code == 0
+    assert data["motion"]["t"][-1] == pytest.approx(14.99)
+    assert data["torques"]["labels"] == ["measured"]
+    assert data["masses"] == []
+    assert data["notes"] == ["Motion: log.csv."]
+    assert len(data["scene"]["meshes"]) > 0
+    assert "page.html, " in capsys.readouterr().err
+
+
+def test_a_result_predicts_and_shows_masses_before_and_after(folder):
+    _, data = run(folder, folder / "log.csv", folder / "out")
+    assert data["torques"]["labels"] == ["measured", "identified", "URDF + drives", "URDF"]
+    measured, predicted, driven, _ = np.split(data["torques"]["values"], 4, axis=1)
+    assert np.array_equal(np.isnan(driven), np.isnan(predicted))
+    stated = json.loads((folder / "out" / "result.json").read_text())["identification"]["per_joint"]
+    for j, metrics in enumerate(stated.values()):
+        used = np.isfinite(driven[:, j])
+        error = np.linalg.norm((measured - driven)[used, j]) / np.linalg.norm(measured[used, j])
+        wanted = metrics["urdf_with_drives_relative_error_pct"]
+        assert 100 * error == pytest.approx(wanted, rel=0.02)
+    known = np.isfinite(predicted)
+    assert known.mean() > 0.8
+    # the motion is exact and the fit explains it, but for what the filter takes
+    residual = (predicted - measured)[known]
+    assert np.linalg.norm(residual) < 0.01 * np.linalg.norm(measured[known])
+    result = json.loads((folder / "out" / "result.json").read_text())
+    stated = {entry["name"]: entry["value"] for entry in result["standard_parameters"]}
+    before, after = data["masses"]
+    assert (before["label"], after["label"]) == ("URDF", "identified")
+    for body in after["bodies"]:
+        assert body["mass"] == pytest.approx(stated[f"{body['name']}.m"])
+
+
+def test_the_page_is_beside_the_first_result_unless_stated(folder, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    log, out, other = str(folder / "log.csv"), folder / "out", tmp_path / "other"
+    other.mkdir()
+    (other / "result.json").write_bytes((out / "result.json").read_bytes())
+    one, both = [str(out / "result.json")], [str(x / "result.json") for x in (other, out)]
+    for words, page in ((one, out), (both, other), ([], tmp_path)):
+        assert main(["replay", str(folder / "ur5.urdf"), log, *words]) == 0
+        assert capsys.readouterr().err.startswith("written: ")
+        assert (page / "replay.html").is_file()
+        (page / "replay.html").unlink()
+
+
+def test_identify_writes_the_replay_that_its_report_links_to(tmp_path, capsys):
+    urdf, out = str(ROOT / "urdf" / "planar_2r.urdf"), tmp_path / "out"
+    model, rng = RobotModel.from_urdf(urdf), np.random.default_rng(0)
+    for name in ("log", "kept"):
+        log = exact_log(model, truth(model), rng, samples=300, rate=100.0)
+        write_log(log, tmp_path / f"{name}.csv")
+    words = [urdf, str(tmp_path / "log.csv"), "--validate", str(tmp_path / "kept.csv")]
+    words = ["identify", *words, "--estimator", "wls", "--friction", "none", "--out", str(out)]
+    assert main([*words, "--replay"]) == 0
+    assert f"  {out}/replay.html\n" in capsys.readouterr().out
+    data = shown((out / "replay.html").read_text(encoding="utf-8"))
+    assert data["log"] == "kept.csv"
+    assert data["torques"]["labels"] == ["measured", "identified", "URDF + drives", "URDF"]
+    report = (out / "report.html").read_text()
+    assert '<a href="replay.html">replay</a>' in report
+    assert 'href="replay.html#t=' in report
+    assert load_result(out).content["outputs"]["replay"] == "replay.html"
+    # the replay of an earlier result would be that of another robot
+    assert main(words) == 0
+    assert "/replay.html of an earlier run" in capsys.readouterr().err
+    assert not (out / "replay.html").exists()
+    assert 'href="#replay"' in (out / "report.html").read_text()
+
+
+def test_the_urdf_with_drives_is_rnea_and_drive_terms(identified, monkeypatch):
+    leave_out_meshes(monkeypatch)
+    data = shown(replay_identified(identified).html)
+    torques, (evaluation, *_) = data["torques"], identified.validation
+    assert torques["labels"] == ["measured", "identified", "URDF + drives", "URDF"]
+    assert data["log"] == Path(evaluation.recording.log.path).name
+    motion, model = evaluation.recording.trajectory, identified.model
+    pi = dict(zip(model.layout.names, identified.urdf_with_drives, strict=True))
+    real = np.isfinite(torques["values"][:, 0])  # without the row of a gap
+    values = torques["values"][real]
+    rows = np.abs(torques["t"][real, None] + motion.t[0] - motion.t).argmin(axis=1)
+    robot = pin.buildModelFromUrdf(str(model.tree.path))
+    of_pin = robot.createData()
+    bodies = [pin.rnea(robot, of_pin, motion.q[k], motion.v[k], motion.a[k]) for k in rows]
+    for j, joint in ((1, model.joints[1]), (4, model.joints[4])):
+        v, a = motion.v[rows, j], motion.a[rows, j]
+        drive = pi[f"{joint}.armature"] * a + pi[f"{joint}.viscous"] * v
+        drive += pi[f"{joint}.coulomb"] * motion.direction[rows, j] + pi[f"{joint}.offset"]
+        assert np.std(drive) > 0.1
+        found, used = values[:, 12 + j], evaluation.recording.mask[rows, j]
+        np.testing.assert_array_equal(np.isfinite(found), used)
+        wanted = (np.array(bodies)[:, j] + drive)[used]
+        np.testing.assert_allclose(found[used], wanted, atol=np.ptp(wanted) / 60_000)
+
+
+def test_masses_are_shown_of_a_result_whose_drives_have_more_terms(tmp_path):
+    urdf = ROOT / "urdf" / "planar_2r.urdf"
+    model, rng = RobotModel.from_urdf(urdf), np.random.default_rng(0)
+    write_log(exact_log(model, truth(model), rng, samples=600, rate=100.0), tmp_path / "log.csv")
+    job, page = tmp_path / "job.toml", tmp_path / "page.html"
+    job.write_text(
+        f'urdf = "{urdf}"\n[estimator]\nname = "wls"\n[drives]\njoint_2 = ["load"]\n'
+        '[output]\nreport = false\n[[identification]]\nlog = "log.csv"\n'
+    )
+    assert main(["identify", str(job), "--out", str(tmp_path / "out")]) == 0
+    words = ["replay", str(urdf), str(tmp_path / "log.csv"), str(tmp_path / "out")]
+    assert main([*words, "--html", str(page)]) == 0
+    result = json.loads((tmp_path / "out" / "result.json").read_text())
+    stated = {entry["name"]: entry["value"] for entry in result["standard_parameters"]}
+    assert "joint_2.load" in {entry["name"] for entry in result["drive_parameters"]}
+    _, after = shown(page.read_text(encoding="utf-8"))["masses"]
+    for body in after["bodies"]:
+        assert body["mass"] == pytest.approx(stated[f"{body['name']}.m"])
+
+
+def test_residuals_are_compared_to_those_of_the_identification(folder):
+    _, data = run(folder, folder / "log.csv", folder / "out")
+    result = json.loads((folder / "out" / "result.json").read_text())
+    fitted = result["identification"]["per_joint"]
+    scale = data["torques"]["scale"]
+    assert scale["unit"] == "RMS noise"
+    assert scale["of"] == [fitted[joint]["rmse"] for joint in result["joints"]]
+    # the log is that of the identification: its residual is the noise
+    codes = data["torques"]["strips"][0]
+    strip = np.where(codes < 65_000, codes / 100, np.nan)
+    assert np.sqrt(np.nanmean(strip**2, axis=0)) == pytest.approx(np.ones(6), abs=0.15)
+
+
+def test_two_results_are_called_by_their_folders(folder):
+    out = folder / "out" / "result.json"
+    _, data = run(folder, folder / "log.csv", out, folder / "out")
+    assert data["torques"]["labels"] == ["measured", "out", "out 2", "URDF + drives", "URDF"]
+    assert [m["label"] for m in data["masses"]] == ["URDF", "out", "out 2"]
+
+
+def test_a_ghost_starts_with_the_motion(folder):
+    _, data = run(folder, folder / "log.csv", "--ghost", folder / "log.csv")
+    assert data["ghosts"][0]["label"] == "log.csv"
+    np.testing.assert_array_equal(data["ghosts"][0]["q"], data["motion"]["q"])
+
+
+def test_a_designed_motion_without_torques_is_a_ghost_too(folder, capsys):
+    header, *rows = (folder / "log.csv").read_text().splitlines()
+    kept = [k for k, name in enumerate(header.split(",")) if name.startswith(("time", "q_"))]
+    cut = [",".join(line.split(",")[k] for k in kept) for line in (header, *rows)]
+    (folder / "design.csv").write_text("\n".join(cut) + "\n")
+    _, data = run(folder, folder / "log.csv", "--ghost", folder / "design.csv")
+    np.testing.assert_array_equal(data["ghosts"][0]["q"], data["motion"]["q"])
+    cut[0] = cut[0].replace("q_elbow", "x_elbow")
+    (folder / "design.csv").write_text("\n".join(cut) + "\n")
+    assert run(folder, folder / "log.csv", "--ghost", folder / "design.csv")[0] == 1
+    assert (
+        "design.csv has no column 'q_elbow_joint'; position columns found: "
+        in capsys.readouterr().err
+    )
+
+
+def test_a_joint_that_stands_still_has_no_prediction(folder):
+    text = (folder / "log.csv").read_text().splitlines()
+    names, last = text[0].split(","), text[-1].split(",")
+    held = ["0" if name.startswith("d") else x for name, x in zip(names, last, strict=True)]
+    still = [",".join([f"{15 + k / 100:.2f}", *held[1:]]) for k in range(300)]
+    (folder / "still.csv").write_text("\n".join([*text, *still]) + "\n")
+    _, data = run(folder, folder / "still.csv", folder / "out")
+    torques = data["torques"]
+    rest = (torques["t"] > 16.0) & (torques["t"] < 17.0)
+    assert np.isfinite(torques["values"][rest, :6]).all()
+    assert np.isnan(torques["values"][rest, 6:12]).all()
+    strip = torques["strips"][0]  # of 18 s
+    bins = len(strip)
+    assert (strip[16 * bins // 18 + 1 : 17 * bins // 18] == 65_534).all()
+    assert (strip[5 * bins // 18 : 10 * bins // 18] < 65_000).mean() > 0.8
+
+
+def test_torque_that_the_result_does_not_explain_is_marked(folder):
+    header, *rows = (folder / "log.csv").read_text().splitlines()
+    pushed = header.split(",").index("tau_elbow_joint")
+    table = [row.split(",") for row in rows]
+    for cells in table[700:740]:  # from 7 s to 7.4 s
+        cells[pushed] = str(float(cells[pushed]) + 30.0)
+    text = "\n".join([header, *(",".join(cells) for cells in table)])
+    (folder / "pushed.csv").write_text(text + "\n")
+    (mark,) = run(folder, folder / "pushed.csv", folder / "out")[1]["marks"]
+    assert mark["kind"] == "contact"
+    assert mark["t"] == pytest.approx(7.0, abs=0.15)
+    assert mark["label"].startswith("unexplained torque, largest at elbow_joint (")
+    assert re.search(r"\(mean \S+ N m, for ", mark["label"])
+    assert run(folder, folder / "log.csv", folder / "out")[1]["marks"] == []
+
+
+def test_a_track_gives_parameters_over_time_and_marks_the_load(panda, tmp_path, capsys):
+    log = payload_log(panda, np.random.default_rng(0), duration=12.0, at=10.0)
+    write_log(log, tmp_path / "log.csv")
+    urdf = of_boxes(panda.tree.path, tmp_path / "panda.urdf")
+    joints = ",".join(panda.joints)
+    words = [urdf, str(tmp_path / "log.csv")]
+    assert main(["track", *words, "--joints", joints, "--out", str(tmp_path / "track")]) == 0
+    page = tmp_path / "page.html"
+    assert main(["replay", *words, str(tmp_path / "track"), "--html", str(page)]) == 0
+    data = shown(page.read_text(encoding="utf-8"))
+    track = json.loads((tmp_path / "track" / "track.json").read_text())
+    (mark,) = data["marks"]
+    assert mark["kind"] == "payload"
+    assert mark["t"] == pytest.approx(10.0, abs=0.05)
+    assert mark["label"].endswith("kg on panda_link7")
+    entries = track["base_parameters"]
+    assert data["bands"]["names"] == [entry["name"] for entry in entries]
+    wanted = [e["value"] for e in entries] + [e["std_error"] for e in entries]
+    np.testing.assert_allclose(data["bands"]["values"][-1], wanted, rtol=1e-6)
+
+
+def test_flags_that_a_result_states_are_refused(folder, capsys):
+    code, _ = run(folder, folder / "log.csv", folder / "out", "--rate", "100")
+    assert code == 2
+    assert "a RESULT states how its logs are read; remove --rate" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("lost.json", None, "there is no result '.*lost.json'"),
+        ("other.json", '{"schema_version": 7}', r"other\.json has schema_version 7, wanted 1"),
+        ("text.json", "oh", r"text\.json is not JSON"),
+    ],
+)
+def test_what_is_no_result_is_refused(tmp_path, name, content, message, folder, capsys):
+    if content is not None:
+        (tmp_path / name).write_text(content)
+    assert run(folder, folder / "log.csv", tmp_path / name)[0] == 1
+    import re
+
+    assert re.search(message, capsys.readouterr().err)
+
+
+def test_an_empty_folder_and_a_second_track_are_refused(tmp_path):
+    with pytest.raises(Exception, match=r"has no result\.json and no track\.json"):
+        read_findings([tmp_path])
+    for k in (1, 2):
+        content = {"history": "", "changes": [], "settings": {}, "base_parameters": []}
+        (tmp_path / f"{k}.json").write_text(json.dumps(content))
+    with pytest.raises(Exception, match="2 tracks are given, wanted at most one"):
+        read_findings([tmp_path / "1.json", tmp_path / "2.json"])
+
+
+def test_a_result_of_another_robot_is_refused(folder, capsys):
+    other = Path(example_urdf("panda.urdf"))
+    words = ["replay", str(other), str(folder / "log.csv"), str(folder / "out")]
+    assert main([*words, "--html", str(folder / "p.html")]) == 1
+    assert "panda" in capsys.readouterr().err
+    assert not (folder / "p.html").exists()
+
+
+def test_a_base_is_where_the_log_says_or_said_to_be_held(tmp_path, capsys):
+    urdf = example_urdf("solo12.urdf")
+    model = RobotModel.from_urdf(urdf)
+    t = np.arange(300) / 100.0
+    q = 0.2 * np.sin(t[:, None] + np.arange(12))
+    yaw = 3.0 * t  # more than one turn
+    base = np.column_stack(
+        [0.5 * t, -0.2 * t, 0.3 + 0 * t, 0 * t, 0 * t, np.sin(yaw / 2), np.cos(yaw / 2)]
+    )
+    base[150:, 3:] *= -1  # the same turns
+    names = ["base_x", "base_y", "base_z", "base_qx", "base_qy", "base_qz", "base_qw"]
+
+    def play(table, header):
+        path = tmp_path / "log.csv"
+        np.savetxt(path, table, delimiter=",", header=",".join(header), comments="")
+        code = main(["replay", str(urdf), str(path), "--html", str(tmp_path / "r.html")])
+        return shown((tmp_path / "r.html").read_text(encoding="utf-8")) if code == 0 else None
+
+    columns = ["time", *(f"q_{j}" for j in model.joints), *(f"tau_{j}" for j in model.joints)]
+    rows = np.column_stack([t, q, 0.1 * q])
+    held = play(rows, columns)
+    assert "The base is drawn as fixed: the log has no pose of the base." in held["notes"]
+    told = base.copy()
+    told[149] = np.nan  # between two signs of one turn
+    data = play(np.column_stack([rows, told]), [*columns, *names])
+    assert not any("drawn as fixed" in note for note in data["notes"])
+    assert data["torques"]["labels"] == ["measured"]
+    assert [joint["node"] for joint in data["torques"]["joints"]] == list(range(2, 14))
+    times, moved = data["motion"]["t"], data["motion"]["q"]
+    row = np.abs(times[:, None] - t).argmin(axis=1)
+    np.testing.assert_allclose(moved[:, :3], base[row, :3], atol=1e-6)
+    np.testing.assert_allclose(moved[:, 7:], q[row], atol=1e-6)
+    overlap = np.abs((moved[:, 3:7] * base[row, 3:]).sum(axis=1))
+    np.testing.assert_allclose(overlap, 1.0, atol=1e-6)
+    assert np.linalg.norm(np.diff(moved[:, 3:7], axis=0), axis=1).max() < 0.1
+    capsys.readouterr()
+    base[:, 3:] *= 0.5
+    assert play(np.column_stack([rows, base]), [*columns, *names]) is None
+    assert "log.csv: base_qx to base_qw is not a unit quaternion" in capsys.readouterr().err
+
+
+def test_between_the_poses_of_a_base_it_turns_the_short_way(tmp_path):
+    """Poses at 10 Hz, whose quaternions change their signs at will, asked for at other times."""
+    t = 4.0 + np.arange(21) / 10.0
+    half, sign = 0.4 * (t - 4.0), np.where(np.isin(np.arange(21), [3, 4, 9, 15, 16, 17]), -1.0, 1.0)
+    turn = sign[:, None] * np.column_stack([0 * t, np.sin(half), 0 * t, np.cos(half)])
+    table = np.column_stack([t, 2.0 * t, -t, 0.5 * t, 1.004 * turn])
+    table[7, 5] = np.nan
+    header = "time,base_x,base_y,base_z,base_qx,base_qy,base_qz,base_qw"
+    path = tmp_path / "log.csv"
+    np.savetxt(path, table, delimiter=",", header=header, comments="")
+    at = np.array([4.0, 4.25, 4.35, 4.45, 4.7, 4.85, 5.55, 6.0])
+    job = Job(Path(URDF))
+    found = _base_poses(job, LogEntry(path), SimpleNamespace(t=at))
+    np.testing.assert_allclose(found[:, :3], at[:, None] * [2.0, -1.0, 0.5])
+    wanted = np.column_stack([0 * at, np.sin(0.4 * (at - 4)), 0 * at, np.cos(0.4 * (at - 4))])
+    np.testing.assert_allclose(found[:, 3:], wanted, atol=1e-12)  # half-way, where it is exact
+    assert _base_poses(job, LogEntry(path), SimpleNamespace(t=at[:1])).shape == (1, 7)
+    for name, has_pose in (("t", True), ("clock", False)):  # of the time, without which is no pose
+        text = path.read_text().partition(",")[2]
+        path.write_text(f"{name},{text}")
+        again = _base_poses(job, LogEntry(path), SimpleNamespace(t=at))
+        assert (again is not None) == has_pose
+    np.savetxt(path, np.where(np.arange(8) == 4, np.nan, table), delimiter=",", header=header,
+               comments="")  # fmt: skip
+    with pytest.raises(DataError, match="base_qx to base_qw is not a unit quaternion"):
+        _base_poses(job, LogEntry(path), SimpleNamespace(t=at))
+    path.write_text(f"time,{text}".replace("base_qw", "other"))
+    assert _base_poses(job, LogEntry(path), SimpleNamespace(t=at)) is None
+
+
+def test_a_motion_without_torques_plays_and_marks_where_it_uses_the_most_of_limits(folder):
+    model = RobotModel.from_urdf(URDF)
+    t = np.arange(401) / 100.0
+    table = {"time": t}
+    for j, joint in enumerate(model.joints):
+        size = {"elbow_joint": 1.5, "wrist_1_joint": 0.4}.get(joint, 0.1)
+        table[f"q_{joint}"] = -0.5 * (j == 1) + size * np.sin(np.pi * t / 4 * (1.3 + j)) ** 2
+    write_columns(table, folder / "motion.csv")
+    code, data = run(folder, folder / "motion.csv")
+    assert code == 0
+    assert data["torques"] is None
+    marks = {mark["label"].split(" limit")[0].split()[-1]: mark for mark in data["marks"]}
+    q, elbow = table["q_elbow_joint"], model.limits[2]
+    share = 100 * q.max() / elbow.upper  # its range is even about 0
+    said = f"elbow_joint at {share:.0f} % of its position limit"
+    assert marks["position"]["label"] == said
+    assert q[round(100 * marks["position"]["t"])] == pytest.approx(q.max(), abs=1e-6)
+    speed = np.abs(np.gradient(q, t))
+    assert (
+        f"{100 * speed.max() / elbow.velocity:.0f} % of its velocity" in marks["velocity"]["label"]
+    )
+    assert marks["velocity"]["joint"] == "elbow_joint"
+    assert speed[round(100 * marks["velocity"]["t"])] == pytest.approx(speed.max(), abs=1e-6)
+    assert marks["torque"]["joint"] == "shoulder_lift_joint"  # which carries the arm
+    (nearest,) = (mark for mark in data["marks"] if "smallest distance" in mark["label"])
+    assert re.fullmatch(r"\w+ and \w+: smallest distance \d+ mm", nearest["label"])
+    assert data["notes"][1].startswith("The motion has no torques")
+
+
+def test_a_motion_of_a_robot_without_limits_plays_and_says_what_is_not_marked(folder, tmp_path):
+    text = re.sub(r'velocity="[^"]*"', 'velocity="0"', (folder / "ur5.urdf").read_text())
+    (tmp_path / "arm.urdf").write_text(text)
+    t = np.arange(50) / 100.0
+    write_columns(
+        {"time": t, **{f"q_{j}": 0.1 * t for j in RobotModel.from_urdf(URDF).joints}},
+        tmp_path / "motion.csv",
+    )
+    page = tmp_path / "page.html"
+    words = ["replay", str(tmp_path / "arm.urdf"), str(tmp_path / "motion.csv")]
+    assert main([*words, "--html", str(page)]) == 0
+    data = shown(page.read_text(encoding="utf-8"))
+    assert data["marks"] == []
+    assert "Limits are not marked: arm.urdf states no limit of" in data["notes"][1]
+
+
+def test_drives_that_follow_commands_are_played_with_their_ghosts(tmp_path):
+    """Poses are the URDF's, plots what the encoders read."""
+    rng = np.random.default_rng(0)
+    arm = plant("planar", rng, zero=0.1)
+    log, _ = recorded(arm, rng, duration=3.0, rate=200.0, noise=0.0)
+    write_log(log, tmp_path / "log.csv")
+    urdf = str(arm.model.tree.path)
+    out = written_result(
+        arm, tmp_path / "out",
+        settings={"urdf": urdf, "estimator": {"name": "wls"}, "identification": [{"log": "l"}]},
+    )  # fmt: skip
+    words = ["replay", urdf, str(tmp_path / "log.csv"), str(out), "--html"]
+    ghost = ["--ghost", str(tmp_path / "log.csv")]
+    assert main([*words, str(tmp_path / "page.html"), *ghost]) == 0
+    data = shown((tmp_path / "page.html").read_text(encoding="utf-8"))
+    again = data["ghosts"].pop()
+    assert again["label"] == "log.csv"
+    np.testing.assert_allclose(again["q"], data["motion"]["q"], atol=1e-6)
+    assert data["torques"]["quantity"] == "position"
+    assert data["torques"]["labels"] == ["measured", "simulated", "commanded"]
+    assert [joint["unit"] for joint in data["torques"]["joints"]] == ["rad", "rad"]
+    assert [ghost["label"] for ghost in data["ghosts"]] == ["simulated", "commanded"]
+    simulated, commanded = (ghost["q"] for ghost in data["ghosts"])
+    assert np.abs(simulated - data["motion"]["q"]).max() < 2e-3  # MuJoCo's robot is the true one
+    assert np.abs(commanded - data["motion"]["q"]).max() > 0.1
+    np.testing.assert_allclose(commanded[0], log.q_ref[0] + 0.1, atol=1e-6)
+    error = np.sqrt(np.mean((log.q_ref - log.q) ** 2, axis=0))
+    np.testing.assert_allclose(data["torques"]["scale"]["of"], error, rtol=1e-6)
+    assert data["torques"]["scale"]["unit"] == "RMS command error"
+    assert data["notes"][0] == "Motion: log.csv, as measured; ghosts: command and simulation."
+    left = 1e3 * np.sqrt(np.nanmean((load_result(out).follow_commands(log) - log.q) ** 2, axis=0))
+    worst = ", ".join(f"{arm.model.joints[j]} {left[j]:.2g}" for j in np.argsort(left)[::-1])
+    assert data["notes"][1] == f"Simulated position error, RMS [mrad or mm]: {worst}."
+
+    bare = [e for e in drive_entries(arm) if not e["name"].endswith((".kp", ".kd"))]
+    other = load_result(written_result(arm, tmp_path / "bare", drive_parameters=bare))
+    with pytest.raises(DataError, match="has no gains of drives, which a simulation"):
+        other.follow_commands(log)
+    with pytest.raises(DataError, match="log has no commands, columns qref_ of each joint"):
+        load_result(out).follow_commands(replace(log, q_ref=None))
+
+
+def test_of_two_results_both_are_shown_and_the_error_is_that_of_the_first(monkeypatch):
+    t = 3.0 + 0.01 * np.arange(50)
+    q = np.column_stack([np.sin(t), np.cos(t)])
+    log = Log(t, q, 0.0 * q, ("a", "b"), q_ref=q + np.array([0.04, 0.05]), has_torque=False)
+
+    def result(zeros, *errors):
+        drives = [SimpleNamespace(zero=zero) for zero in zeros]
+        robot = SimpleNamespace(joints=log.joints)
+        return SimpleNamespace(
+            robot=robot, commanded=drives, follow_commands=lambda log: log.q + errors
+        )
+
+    results = {"one": result((0.1, -0.2), 1e-3, 3e-3), "two": result((0.5, 0.5), 0.02, 0.01)}
+    heard = {}
+    monkeypatch.setattr(
+        replay, "replay", lambda model, t, q, **stated: heard.update(stated, q=q, model=model)
+    )
+    monkeypatch.setattr(replay, "log_of_commands", lambda job, entry, result: log)
+    job = SimpleNamespace(identification=(LogEntry(Path("day/log.csv")),))
+    replay._replay_commanded(job, results, None)
+    zero = [0.1, -0.2]  # of the first
+    assert heard["model"] is results["one"].robot
+    np.testing.assert_allclose(heard["q"], q + zero)
+    wanted = {"simulated: one": [1e-3, 3e-3], "simulated: two": [0.02, 0.01],
+              "commanded": [0.04, 0.05]}  # fmt: skip
+    assert list(heard["ghosts"]) == list(heard["torques"].predicted) == list(wanted)
+    for label, error in wanted.items():
+        np.testing.assert_allclose(heard["torques"].predicted[label], q + error)
+        np.testing.assert_allclose(heard["ghosts"][label][1], q + error + zero)
+    np.testing.assert_allclose(heard["torques"].noise, [0.04, 0.05])
+    assert heard["notes"][1] == "Simulated position error, RMS [mrad or mm]: b 3, a 1."

@@ -1,0 +1,242 @@
+"""``robotid report``: the page of a result again, from the same inputs or not at all."""
+
+import json
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from helpers.commanded_results import written_result
+from helpers.mujoco_plant import plant, recorded
+from helpers.pages import chart
+from helpers.paths import ROOT
+from helpers.synthetic import exact_log, truth
+
+from robotid.base.exceptions import DataError
+from robotid.base.files import file_sha256
+from robotid.base.versions import versions
+from robotid.cli import main
+from robotid.cli.work.identify import run_job
+from robotid.cli.work.job import Job, LogEntry
+from robotid.cli.work.logs import log_of_commands
+from robotid.cli.work.report import _require_same
+from robotid.data.files.read import write_log
+from robotid.dynamics.prediction import predict_instants
+from robotid.estimation.fitting.estimator_settings import SimulationSettings
+from robotid.identification.closed_loop.loop_settings import LoopSettings
+from robotid.output.files.result_file import load_result
+from robotid.robot.model import RobotModel
+
+URDF = ROOT / "urdf" / "planar_2r.urdf"
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    tmp_path = tmp_path_factory.mktemp("report")
+    model, rng = RobotModel.from_urdf(URDF), np.random.default_rng(0)
+    for name in ("fit", "keep"):
+        log = exact_log(model, truth(model), rng, samples=800, rate=100.0, noise=0.1)
+        write_log(log, tmp_path / f"{name}.csv")
+    (tmp_path / "arm.urdf").write_bytes(URDF.read_bytes())
+    fit, keep = (LogEntry(tmp_path / f"{name}.csv") for name in ("fit", "keep"))
+    terms = ("viscous", "coulomb")
+    job = Job(tmp_path / "arm.urdf", terms=terms, identification=(fit,), validation=(keep,))
+    run_job(job, tmp_path / "out")
+    return tmp_path / "out"
+
+
+@pytest.fixture
+def out(made):
+    """A folder with a result, in the one of its logs; it is as it was for the next test."""
+    files = {path: path.read_bytes() for path in made.parent.rglob("*") if path.is_file()}
+    yield made
+    for path, content in files.items():
+        if not path.exists() or path.read_bytes() != content:
+            path.write_bytes(content)
+
+
+def contents(folder):
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+def test_the_page_is_the_one_that_identify_wrote_and_nothing_else_is(out, capsys, monkeypatch):
+    before = contents(out)
+    (out / "report.html").unlink()
+    monkeypatch.chdir(out.parent.parent)  # the result names its inputs in full
+    assert main(["report", str(out)]) == 0
+    assert contents(out) == before
+    assert capsys.readouterr().out == f"written: {out / 'report.html'}\n"
+    page = out.parent / "page.html"
+    assert main(["report", str(out / "result.json"), "--out", str(page), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["report"] == str(page)
+    assert b'href="result.json"' in before["report.html"]
+    assert b'href="result.json"' not in page.read_bytes(), "it lies elsewhere"
+    assert contents(out) == before
+
+
+@pytest.mark.parametrize(("name", "what"), [("fit.csv", "log"), ("arm.urdf", "URDF")])
+def test_an_input_that_was_changed_or_is_gone_is_named(out, capsys, name, what):
+    path, before = out.parent / name, contents(out)
+    path.write_bytes(path.read_bytes() + b"\n")
+    assert main(["report", str(out)]) == 1
+    said = capsys.readouterr().err
+    assert f"the {what} '{path}' has changed since result.json was written" in said
+    path.unlink()
+    assert main(["report", str(out)]) == 1
+    assert f"the {what} '{path}', an input of result.json, does not exist" in (
+        capsys.readouterr().err
+    )
+    assert contents(out) == before
+
+
+def test_a_log_that_is_a_device_now_is_not_read(out, capsys):
+    path, before = out.parent / "fit.csv", contents(out)
+    path.unlink()
+    path.symlink_to("/dev/null")
+    assert main(["report", str(out)]) == 1
+    path.unlink()
+    assert f"'{path}' is a pipe or a device" in capsys.readouterr().err
+    assert contents(out) == before
+
+
+def test_an_input_without_a_hash_is_named(out, capsys):
+    path = out / "result.json"
+    content = json.loads(path.read_text())
+    content["inputs"][1]["sha256"] = None
+    path.write_text(json.dumps(content))
+    assert main(["report", str(out)]) == 1
+    said = f"result.json states no SHA-256 of its input, the log '{out.parent / 'fit.csv'}'"
+    assert said in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda inputs: inputs.pop(0), "has 0 inputs of the role 'urdf', but its settings name 1"),
+        (lambda inputs: inputs.pop(1), "has 0 inputs of the role 'identification', but its"),
+        (lambda inputs: inputs.append(inputs[1]), "has 2 inputs of the role 'identification', but"),
+    ],
+)
+def test_inputs_that_are_not_those_of_the_settings_are_named(out, capsys, change, words):
+    path = out / "result.json"
+    content = json.loads(path.read_text())
+    change(content["inputs"])
+    path.write_text(json.dumps(content))
+    before = contents(out)
+    assert main(["report", str(out)]) == 1
+    assert words in " ".join(capsys.readouterr().err.split())
+    assert contents(out) == before
+
+
+def test_a_recording_that_the_settings_lack_is_named(out, capsys):
+    path = out / "result.json"
+    content = json.loads(path.read_text())
+    content["settings"]["validation"] = []
+    path.write_text(json.dumps(content))
+    assert main(["report", str(out)]) == 1
+    said = "has 1 inputs of the role 'validation', but its settings name 0"
+    assert said in " ".join(capsys.readouterr().err.split())
+
+
+def test_a_result_that_the_fit_does_not_give_again_has_no_page(out, capsys):
+    path = out / "result.json"
+    content = json.loads(path.read_text())
+    entry = content["base_parameters"][1]
+    true = entry["value"]
+    entry["value"] = true + 0.02 * entry["std_error"]
+    content["versions"]["numpy"] = "1.0"
+    path.write_text(json.dumps(content))
+    before = contents(out)
+    assert main(["report", str(out)]) == 1
+    said = capsys.readouterr().err
+    count = len(content["base_parameters"])
+    assert f"1 of {count} base parameters differ: {entry['name']} is {true:.6g}, " in said
+    assert "changed versions: numpy 1.0 -> " in said
+    assert contents(out) == before
+    entry["value"] = true + 0.005 * entry["std_error"]  # as solvers round
+    path.write_text(json.dumps(content))
+    assert main(["report", str(out)]) == 0
+
+
+def test_a_report_does_not_replace_what_it_is_made_of(out, capsys):
+    before = contents(out)
+    for target in ("result.json", "arm.identified.urdf"):
+        assert main(["report", str(out), "--out", str(out / target)]) == 2
+        assert "is an input and is not replaced" in capsys.readouterr().err
+    assert contents(out) == before
+
+
+def test_the_report_of_drives_that_follow_commands_rolls_the_result_out(tmp_path):
+    """The chart's simulated position is that of the robot that MuJoCo simulated."""
+    rng = np.random.default_rng(0)
+    arm = plant("planar", rng)
+    log, _ = recorded(arm, rng, duration=3.0, rate=200.0, noise=0.0)
+    write_log(log, tmp_path / "log.csv")
+    urdf, path = str(arm.model.tree.path), str(tmp_path / "log.csv")
+    per_joint = {joint: {"rmse": 1e-3, "unit": "rad"} for joint in log.joints}
+    entry = {"log": path, "start": 0.0, "end": 2.995, "per_joint": per_joint, "horizons": {}}
+    made_from = {"role": "identification", "signals": {}, "start": 0.0, "end": 3.0, "rows_used": 9}
+    out = written_result(
+        arm, tmp_path / "out",
+        settings={"urdf": urdf, "estimator": {"name": "wls"}, "identification": [{"log": path}]},
+        inputs=[
+            {"role": "urdf", "path": urdf, "sha256": file_sha256(Path(urdf))},
+            {"path": path, "sha256": file_sha256(Path(path)), **made_from},
+        ],
+        simulation={"controller": {"kind": "pd"}, "validation": [], "identification": [entry]},
+    )  # fmt: skip
+    assert main(["report", str(out), "--out", str(tmp_path / "page.html")]) == 0
+    page = (tmp_path / "page.html").read_text(encoding="utf-8")
+    shown = chart(page, f"position of {log.joints[0]}")
+    lines = {series["label"]: series["y"] for series in shown["series"]}
+    np.testing.assert_allclose(lines["simulated"], lines["measured"], atol=2e-3)
+    assert "log.csv 0-2.995 s, fitted: RMSE" in page
+    (tmp_path / "log.csv").write_text("time\n")
+    assert main(["report", str(out), "--out", str(tmp_path / "page.html")]) == 1
+
+
+def test_a_controller_that_carries_the_weight_does_so_in_the_report_too(tmp_path):
+    arm = plant("planar", np.random.default_rng(0))
+    log, _ = recorded(arm, np.random.default_rng(1), duration=0.5, rate=200.0)
+    write_log(log, tmp_path / "log.csv")
+    entry, result = LogEntry(tmp_path / "log.csv"), load_result(written_result(arm, tmp_path / "a"))
+    job = Job(
+        Path(arm.model.tree.path),
+        estimator=SimulationSettings(),
+        controller=LoopSettings(gravity_compensation=True),
+    )
+    heard = log_of_commands(job, entry, result)
+    pi, still = arm.model.standard_parameters(), np.zeros_like(log.q)
+    weight = predict_instants(arm.model, pi, log.q, still, still)
+    np.testing.assert_allclose(heard.tau_ref, weight, atol=1e-4)
+    plain = log_of_commands(Job(job.urdf), entry, result)
+    assert plain.tau_ref is None
+
+
+def test_the_fit_is_the_same_within_a_hundredth_of_each_error_or_a_millionth():
+    values = {"a": 2.0, "b": 300.0, "c": -4.0}
+    errors = {"a": 0.5, "b": None, "c": 1e-9}
+    content = {
+        "robotid": versions()["robotid"],
+        "versions": versions(),
+        "base_parameters": [
+            {"name": name, "value": x, "std_error": errors[name]} for name, x in values.items()
+        ],
+    }
+
+    def fitted(**changes):
+        now = values | changes
+        base = np.array([*now.values()])
+        mapping = SimpleNamespace(base_names=tuple(now))
+        _require_same(SimpleNamespace(mapping=mapping, base=base), content, "result.json")
+
+    fitted()
+    fitted(a=2.0049, b=300.00029, c=-4.0000039)
+    for name, x in (("a", 2.0051), ("b", 300.00031), ("c", -4.0000041)):
+        with pytest.raises(DataError, match=f"1 of 3 base parameters differ: {name} is "):
+            fitted(**{name: x})
+    with pytest.raises(DataError, match="only one of the two has the parameters d"):
+        fitted(d=1.0)
+    del content["base_parameters"][1]
+    with pytest.raises(DataError, match="only one of the two has the parameters b"):
+        fitted()

@@ -1,0 +1,327 @@
+"""`simulate` writes a log and what it was made from; identify finds that again."""
+
+import argparse
+import json
+import re
+
+import numpy as np
+import pytest
+
+from robotid.base.files import file_sha256
+from robotid.cli import main, simulate
+from robotid.cli.work.job import Job
+from robotid.cli.work.simulate import SimulatedFiles, _motion
+from robotid.data.files.read import read_log
+from robotid.data.files.table_files import write_columns
+from robotid.dynamics.base_parameters import structural_mapping
+from robotid.dynamics.simulation.motions import SampledMotion, random_fourier
+from robotid.dynamics.simulation.simulation_settings import (
+    Actuator,
+    Controller,
+    Noise,
+    Payload,
+    Sensors,
+    Simulation,
+    Truth,
+    read_simulation,
+)
+from robotid.identification.pipeline import identify
+from robotid.output.files.urdf import load_identified
+from robotid.robot.examples import example_urdf
+
+URDF = str(example_urdf("ur5_robot.urdf"))
+PLANT = """
+seed = 3
+rate = 200.0
+[truth]
+inertials = 0.2
+values = { "elbow_joint.stribeck" = 3.0 }
+[drives]
+elbow_joint = [{ term = "Stribeck", speed = 0.2 }]
+[controller]
+kind = "pd"
+kp = { shoulder_pan_joint = 900.0 }
+[actuator]
+effort = 0.5
+[sensors]
+noise = { tau = 0.01, q = 1e-5 }
+"""
+
+
+def write_motion(path, model, seed, *, derivatives=True, duration=8.0):
+    t = np.arange(0.0, duration + 0.005, 0.01)
+    found = random_fourier(model, np.random.default_rng(seed), period=8.0).evaluate(t)
+    table = {"time": t + 100.0}
+    for kind, values in zip(("q", "dq", "ddq")[: 3 if derivatives else 1], found, strict=False):
+        table |= {f"{kind}_{joint}": values[:, j] for j, joint in enumerate(model.joints)}
+    write_columns(table, path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory, ur5):
+    folder = tmp_path_factory.mktemp("simulate")
+    write_motion(folder / "design.parquet", ur5, 1)
+    (folder / "plant.toml").write_text(PLANT)
+    return folder
+
+
+def simulated(folder, *words, motion="design.parquet", out="log.parquet"):
+    files = [URDF, str(folder / motion), "--out", str(folder / out)]
+    code = main(["simulate", *files, *words])
+    truth = folder / f"{out.partition('.')[0]}.truth.json"
+    return code, json.loads(truth.read_text()) if truth.exists() else None
+
+
+def by_name(entries):
+    return {entry["name"]: entry["value"] for entry in entries}
+
+
+def test_identify_finds_the_truth_that_stands_beside_the_log(folder, ur5, capsys):
+    code, truth = simulated(folder, "--rate", "200", "--seed", "4", "--urdf", f"{folder}/true.urdf")
+    assert code == 0
+    said = capsys.readouterr().out
+    assert "written" in said
+    assert "the torques have no noise" in said
+    log = read_log(folder / "log.parquet", ur5.joints)
+    assert (len(log.t), truth["samples"], truth["duration"]) == (1601, 1601, 8.0)
+    found = identify(ur5, [log], friction="viscous+coulomb", doctor=False)
+    true = by_name(truth["base_parameters"])
+    assert list(true) == list(found.mapping.base_names)
+    beta = np.array(list(true.values()))
+    assert np.linalg.norm(found.base - beta) < 0.01 * np.linalg.norm(beta)
+    error = np.abs(found.base - beta) / found.base_error
+    assert np.mean(error < 3) > 0.9
+    # the URDF of the truth is the truth
+    model, pi = load_identified(folder / "true.urdf", folder / "true.drive.json")
+    values = by_name(truth["standard_parameters"] + truth["drive_parameters"])
+    assert list(values) == list(model.layout.names)
+    np.testing.assert_allclose(pi, list(values.values()), rtol=1e-9, atol=1e-12)
+    text = (folder / "true.urdf").read_text()
+    for joint in ur5.joints:
+        (own,) = re.findall(rf'<joint name="{joint}".*?<dynamics (.*?)/>', text, re.DOTALL)
+        viscous, coulomb = (values[f"{joint}.{term}"] for term in ("viscous", "coulomb"))
+        assert own == f'damping="{viscous!r}" friction="{coulomb!r}"'
+    assert truth["log_sha256"] == file_sha256(folder / "log.parquet")
+    assert truth["motion"]["sha256"] == file_sha256(folder / "design.parquet")
+    shipped = ur5.standard_parameters()[:60]
+    assert [entry["urdf"] for entry in truth["standard_parameters"]] == shipped.tolist()
+
+
+def test_a_seed_gives_the_same_bytes_and_another_seed_others(folder):
+    logs = []
+    for seed, out in (("7", "a.csv"), ("7", "b.csv"), ("8", "c.csv")):
+        words = ["--rate", "50", "--torque-noise", "0.02", "--duration", "1"]
+        simulated(folder, "--seed", seed, *words, out=out)
+        logs.append((folder / out).read_bytes())
+    assert logs[0] == logs[1] != logs[2]
+
+
+def test_a_file_states_the_plant_and_flags_stand_over_it(folder, capsys):
+    words = ["--plant", f"{folder}/plant.toml", "--json", "--duration", "2", "--seed", "5"]
+    code, truth = simulated(folder, *words, out="stated.csv")
+    assert code == 0
+    assert json.loads(capsys.readouterr().out)["settings"] == truth["settings"]
+    stated = truth["settings"]
+    assert (stated["seed"], stated["rate"], stated["duration"]) == (5, 200.0, 2.0)
+    assert stated["controller"]["kp"] == {"shoulder_pan_joint": 900.0}
+    assert (stated["truth"]["inertials"], stated["actuator"]["effort"]) == (0.2, 0.5)
+    assert by_name(truth["drive_parameters"])["elbow_joint.stribeck"] == 3.0
+    own = truth["model"]["own_terms"]["elbow_joint"]
+    assert own == [{"term": "Stribeck", "speed": 0.2}]
+    assert truth["following"][1]["rms"] > 0.01  # PD alone sags
+
+
+def test_a_log_with_noise_is_not_said_to_have_none(folder, capsys):
+    words = ["--rate", "50", "--controller", "perfect", "--duration", "1"]
+    assert simulated(folder, *words, "--torque-noise", "0.02", out="noisy.csv")[0] == 0
+    assert "no noise" not in capsys.readouterr().out
+
+
+def test_a_motion_of_positions_alone_is_splined_and_a_recorded_one_smoothed(folder, ur5):
+    write_motion(folder / "plain.csv", ur5, 1, derivatives=False)
+    words = ["--rate", "100", "--controller", "perfect", "--duration", "5", "--perturb", "0"]
+    logs = []
+    for motion, out in (("design.parquet", "x.csv"), ("plain.csv", "y.csv")):
+        assert simulated(folder, *words, motion=motion, out=out)[0] == 0
+        logs.append(read_log(folder / out, ur5.joints))
+    inside = slice(20, -20)  # a spline bends at its ends
+    np.testing.assert_allclose(logs[1].tau[inside], logs[0].tau[inside], atol=2e-3)
+    rough = write_motion(folder / "rough.csv", ur5, 1, derivatives=False)
+    table = np.loadtxt(rough, delimiter=",", skiprows=1)
+    table[:, 1:] += 1e-4 * np.random.default_rng(0).standard_normal(table[:, 1:].shape)
+    header = rough.read_text().partition("\n")[0]
+    np.savetxt(rough, table, delimiter=",", header=header, comments="")
+    simulated(folder, *words, "--cutoff", "5", motion="rough.csv", out="z.csv")
+    smooth = read_log(folder / "z.csv", ur5.joints)
+    error = np.sqrt(np.mean((smooth.tau - logs[0].tau)[inside] ** 2))
+    assert error < 0.03 * np.sqrt(np.mean(logs[0].tau ** 2))
+
+
+def test_a_sampled_motion_is_the_one_it_was_sampled_from(ur5):
+    source = random_fourier(ur5, np.random.default_rng(2), period=6.0)
+    t, fine = np.arange(0, 6.001, 0.02), np.linspace(0.3, 5.7, 700)
+    sampled = SampledMotion(t + 5.0, *source.evaluate(t))
+    for found, wanted, atol in zip(
+        sampled.evaluate(fine), source.evaluate(fine), (1e-9, 1e-6, 1e-4), strict=True
+    ):
+        np.testing.assert_allclose(found, wanted, atol=atol)
+    assert sampled.duration == pytest.approx(6.0)
+
+
+ERRORS = {
+    "duration is 9 s, wanted at most the 8 s of the motion": ["--duration", "9"],
+    "logs are written as .csv": ["--out", "log.txt"],
+    "controller: kind is 'pid', wanted one of feedforward, pd": ["--controller", "pid"],
+    "there is no file of a plant": ["--plant", "nowhere.toml"],
+    "has no column 'q_elbow'": ["--joints", "elbow"],
+}
+
+
+@pytest.mark.parametrize("message", list(ERRORS)[:4])
+def test_errors_say_what_to_do_and_nothing_is_written(folder, message, capsys):
+    words = ERRORS[message]
+    files = [URDF, str(folder / "design.parquet"), "--out", str(folder / "never.csv")]
+    if words[0] == "--out":
+        files, words = files[:3], [str(folder / words[1])]
+    assert main(["simulate", *files, *words]) in (1, 2)
+    assert message in capsys.readouterr().err
+    assert not list(folder.glob("never*"))
+
+
+def test_a_plant_file_is_checked_key_by_key(folder, capsys):
+    for text, words in (
+        ("[sensor]\nnoise = 1", "sensor is not a known key; did you mean 'sensors'?"),
+        ("[sensors.noise]\nq = 'much'", "sensors.noise.q is 'much', wanted a number"),
+        ("[actuator]\nbacklash = 0.1", "backlash applies only to elastic gears. State"),
+        ("[drives]\nelbow_joint = ['stribeck']", "wanted a term with its shape"),
+        ("rate = ", "is not valid TOML"),
+    ):
+        (folder / "wrong.toml").write_text(text)
+        code, _ = simulated(folder, "--plant", f"{folder}/wrong.toml", out="never.csv")
+        assert code == 2
+        assert words in capsys.readouterr().err
+
+
+def test_a_robot_that_cannot_be_a_urdf_leaves_no_file(folder, capsys):
+    """A part of a link that was drawn as a whole with what is locked to it may be impossible."""
+    words = ["--controller", "perfect", "--perturb", "5", "--lock", "elbow_joint=0.5"]
+    code, _ = simulated(folder, *words, "--urdf", f"{folder}/never.urdf", out="never.csv")
+    assert code == 1
+    assert "would be physically impossible" in " ".join(capsys.readouterr().err.split())
+    assert not list(folder.glob("never*"))
+
+
+def test_a_flag_is_not_named_as_a_key_of_the_plants_file(folder, capsys):
+    (folder / "right.toml").write_text("rate = 100")
+    words = ["--plant", f"{folder}/right.toml", "--lock", "elbow_joint=1e300"]
+    assert simulated(folder, *words, out="never.csv")[0] == 2
+    said = capsys.readouterr().err
+    assert "command line: locked.elbow_joint is 1e+300, wanted a number" in said
+    (folder / "wrong.toml").write_text("[drives]\nelbow_joint = [{ term = 'Tanh', speed = 'x' }]")
+    assert simulated(folder, "--plant", f"{folder}/wrong.toml", out="never.csv")[0] == 2
+    assert (
+        "wrong.toml: drives.elbow_joint: Tanh: speed is 'x', wanted a finite number"
+        in capsys.readouterr().err
+    )
+
+
+def test_every_flag_states_its_setting():
+    words = {"seed": "7", "rate": "50", "duration": "3", "perturb": "0.3", "controller": "pd",
+             "torque-noise": "0.02", "limits": "0.4", "payload": "1.5"}  # fmt: skip
+    parser = argparse.ArgumentParser()
+    simulate.add_flags(parser)
+    flags = [word for name, value in words.items() for word in (f"--{name}", value)]
+    robot = ["--lock", "wrist_3_joint=0.25", "--time-unit", "ms"]
+    files = ["arm.urdf", "motion.csv", "--out", "log.csv"]
+    job, settings = simulate.simulation_from_flags(parser.parse_args([*files, *flags, *robot]))
+    assert settings == Simulation(
+        seed=7, rate=50.0, duration=3.0, truth=Truth(inertials=0.3), controller=Controller("pd"),
+        sensors=Sensors(noise=Noise(tau=0.02)), actuator=Actuator(effort=0.4),
+        payload=Payload(mass=1.5),
+    )  # fmt: skip
+    assert (job.locked, job.units.time) == ({"wrist_3_joint": 0.25}, "ms")
+
+
+def test_a_limit_and_a_load_do_what_they_say_and_the_truth_states_it(arm, tmp_path):
+    """A load at the origin of the last link: by hand, three times its mass in the columns."""
+    write_motion(tmp_path / "motion.csv", arm, 3, duration=4.0)
+    words = ["--controller", "pd", "--rate", "100", "--seed", "3", "--duration", "3"]
+    words += ["--limits", "0.02", "--payload", "3", "--perturb", "0.2"]
+    files = [arm.tree.path, str(tmp_path / "motion.csv"), "--out", str(tmp_path / "log.csv")]
+    assert main(["simulate", *files, *words]) == 0
+    truth = json.loads((tmp_path / "log.truth.json").read_text())
+    log = read_log(tmp_path / "log.csv", arm.joints)
+    assert len(log.t) == 301
+    most = 0.02 * np.array([joint.effort for joint in arm.limits])
+    held = np.isclose(np.abs(log.tau), most, rtol=1e-9)
+    assert (np.abs(log.tau) <= most * (1 + 1e-9)).all()
+    assert held.any()
+    q_ref = SampledMotion(*motion_of(tmp_path / "motion.csv", arm)).evaluate(log.t)[0]
+    error = np.abs(log.q - q_ref)
+    assert ((log.q - q_ref).max(axis=0) < error.max(axis=0)).any()  # the largest is a lag
+    for j, entry in enumerate(truth["following"]):
+        assert entry["joint"] == arm.joints[j]
+        assert entry["unit"] == "rad"
+        assert entry["rms"] == pytest.approx(np.sqrt(np.mean(error[:, j] ** 2)), rel=1e-6)
+        assert entry["largest"] == pytest.approx(error[:, j].max(), rel=1e-6)
+        assert entry["at_limit"] == pytest.approx(held[:, j].mean(), abs=0.05)
+    mapping = structural_mapping(arm)
+    load = np.zeros(len(arm.layout.names))
+    load[arm.layout.names.index("link_2.m")] = 3.0
+    bare, loaded = (
+        np.array([entry["value"] for entry in truth[key]])
+        for key in ("base_parameters", "base_parameters_with_payload")
+    )
+    np.testing.assert_allclose(loaded - bare, mapping.to_base(load), atol=1e-9)
+
+
+def motion_of(path, model):
+    """Return instants, positions, velocities and accelerations of a motion's table."""
+    log = read_log(path, model.joints, needs="motion")
+    return log.t, log.q, log.v, log.a
+
+
+def test_a_motion_passes_its_rows_with_their_speeds_and_accelerations(tmp_path, ur5):
+    t, w = 3.0 + 0.05 * np.arange(41), np.linspace(1.0, 3.0, 6)
+    angle = np.outer(t, w)
+    q, v, a = np.sin(angle), 1.05 * w * np.cos(angle), -0.9 * w**2 * np.sin(angle)
+    columns = {"time": t}
+    for key, values in (("q", q), ("dq", v), ("ddq", a)):
+        columns |= {f"{key}_{joint}": values[:, j] for j, joint in enumerate(ur5.joints)}
+    write_columns(columns, tmp_path / "motion.csv")
+    job = Job(urdf=URDF)
+    files = SimulatedFiles(tmp_path / "motion.csv", tmp_path / "log.csv")
+    found = _motion(job, ur5, files).evaluate(t - 3.0)
+    for one, stated in zip(found, (q, v, a), strict=True):
+        np.testing.assert_allclose(one, stated, atol=1e-9)
+
+
+def test_a_flag_replaces_one_value_of_a_table_of_the_plants_file(tmp_path):
+    (tmp_path / "plant.toml").write_text(
+        "rate = 250.0\n[controller]\nkind = 'pd'\nbandwidth = 9.0\n[sensors]\njitter = 1e-4\n"
+        "[sensors.noise]\nq = 2e-5\ntau = 0.05\n"
+    )
+    given = {"seed": 3, "controller": {"kind": "feedforward"}, "sensors": {"noise": {"tau": 0.02}}}
+    found, drives = read_simulation(tmp_path / "plant.toml", given)
+    assert (found.seed, found.rate, drives) == (3, 250.0, {})
+    assert (found.controller.kind, found.controller.bandwidth) == ("feedforward", 9.0)
+    assert (found.sensors.jitter, found.sensors.noise.q, found.sensors.noise.tau) == (
+        1e-4, 2e-5, 0.02
+    )  # fmt: skip
+
+
+def test_a_joint_that_does_not_follow_its_command_is_named(arm, tmp_path, capsys):
+    t = np.arange(300) / 100
+    columns = {f"q_{j}": 0.2 * np.sin(3 * t) for j in arm.joints}
+    write_columns({"time": t, **columns}, tmp_path / "motion.csv")
+    stuck = f'[controller]\nkind = "pd"\n[truth.values]\n"{arm.joints[1]}.coulomb" = 1e4\n'
+    for text, count in (("", 0), (stuck, 1)):
+        (tmp_path / "plant.toml").write_text(text)
+        words = [str(arm.tree.path), str(tmp_path / "motion.csv"), "--out", str(tmp_path / "l.csv")]
+        assert main(["simulate", *words, "--plant", str(tmp_path / "plant.toml")]) == 0
+        assert capsys.readouterr().out.count(f"warning: {arm.joints[1]} moves ") == count
+    truth = json.loads((tmp_path / "l.truth.json").read_text())
+    entry = truth["following"][1]
+    assert entry["range"] < 0.01
+    assert entry["commanded"] == pytest.approx(0.4, rel=1e-3)

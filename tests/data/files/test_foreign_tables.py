@@ -1,0 +1,314 @@
+"""Logs that others named: PlotJuggler's exports, DataFrames, and lists of logs of every kind."""
+
+import dataclasses
+import re
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pandas as pd
+import pytest
+from helpers.synthetic import exact_log, truth
+
+import robotid
+from robotid.base.exceptions import DataError, ModelError
+from robotid.cli.work.convert import convert
+from robotid.cli.work.job import read_job
+from robotid.data.files.read import read_log, read_logs, write_log
+from robotid.data.files.table import Place
+from robotid.data.files.table_files import open_table
+from robotid.data.log import Log
+from robotid.data.signal_settings import LogSource, LogUnits
+from robotid.robot.examples import example_urdf
+
+JOINTS = ("shoulder", "elbow")
+T = np.arange(60) / 50
+PHASE = T[:, None] * [2.0, 3.0]
+LOG = Log(
+    t=T, q=np.sin(PHASE), v=np.cos(PHASE) * [2.0, 3.0], tau=10 * np.cos(PHASE), joints=JOINTS
+)  # fmt: skip
+WORDS = {"position": LOG.q, "velocity": LOG.v, "effort": LOG.tau}
+
+
+def refused(text):
+    return pytest.raises(DataError, match="^" + re.escape(text) + "$")
+
+
+def assert_same(back, log=LOG):
+    for name in ("t", "q", "v", "tau"):
+        np.testing.assert_array_equal(getattr(back, name), getattr(log, name), name)
+
+
+def juggled(*topics, words=WORDS, scale=1.0):
+    """Return the columns of PlotJuggler's export of joint states, in the order of their names."""
+    columns = {
+        f"{topic}/{joint}/{word}": scale * values[:, j]
+        for topic in topics
+        for word, values in words.items()
+        for j, joint in enumerate(JOINTS)
+    }
+    return {"__time": LOG.t} | dict(sorted(columns.items()))
+
+
+@pytest.fixture(params=["csv", "parquet", "frame"])
+def given(request, tmp_path):
+    """A function that makes a file or a DataFrame of columns."""
+
+    def make(columns):
+        frame = pd.DataFrame(columns)
+        if request.param == "csv":
+            frame.to_csv(tmp_path / "run.csv", index=False)
+        if request.param == "parquet":
+            frame.to_parquet(tmp_path / "run.parquet")
+        return frame if request.param == "frame" else tmp_path / f"run.{request.param}"
+
+    return make
+
+
+def test_plotjugglers_export_is_read(given):
+    extra = {"/imu/linear_acceleration/x": LOG.t}
+    back = read_log(given(juggled("/joint_states") | extra), JOINTS)
+    assert_same(back)
+    assert back.notes == ("columns ignored: /imu/linear_acceleration/x",)
+
+
+def test_of_several_topics_that_with_efforts_is_taken_and_of_two_such_one_must_be_stated(given):
+    ghost = juggled("/ghost", words={"position": LOG.q + 1.0})
+    assert_same(read_log(given(juggled("/joint_states") | ghost), JOINTS))
+    both = given(juggled("/left") | juggled("/right", scale=2.0))
+    with pytest.raises(
+        DataError, match="2 topics of joint states: /left, /right; its columns have"
+    ):
+        read_log(both, JOINTS)
+    np.testing.assert_array_equal(
+        read_log(both, JOINTS, source=LogSource(topic="/right")).tau, 2.0 * LOG.tau
+    )
+    with pytest.raises(DataError, match=r"no topic '/rigt'; topics: /left, /right\. Did you mean"):
+        read_log(both, JOINTS, source=LogSource(topic="/rigt"))
+
+
+def test_efforts_may_be_currents_and_columns_may_be_mapped_by_the_names_in_the_file(given):
+    log = read_log(
+        given(juggled("/joint_states")),
+        JOINTS,
+        gains={"elbow": 3.0, "shoulder": 2.0},
+        source=LogSource(effort="current"),
+    )
+    np.testing.assert_allclose(log.tau, LOG.tau * [2.0, 3.0])
+    columns = juggled("/js") | {"M2": 5 * LOG.tau[:, 1]}
+    names = {"tau_elbow": "M2", "q_elbow": "/js/elbow/position"}
+    mapped = read_log(given(columns), JOINTS, columns=names)
+    np.testing.assert_array_equal(mapped.tau[:, 1], 5 * LOG.tau[:, 1])
+
+
+def test_a_table_with_standard_columns_and_another_clock_is_left_as_it_is(given):
+    table = {"time": LOG.t}
+    for kind, values in (("q", LOG.q), ("dq", LOG.v), ("tau", LOG.tau)):
+        table |= {f"{kind}_{joint}": values[:, j] for j, joint in enumerate(JOINTS)}
+    others = juggled("/a") | juggled("/b")
+    del others["__time"]
+    assert_same(read_log(given(table | others), JOINTS))
+
+
+def test_a_time_beside_that_of_plotjuggler_is_the_time_of_the_log():
+    both = pd.DataFrame(juggled("/joints") | {"time": 7.0 + LOG.t})
+    back = read_log(both, JOINTS)
+    np.testing.assert_array_equal(back.t, 7.0 + LOG.t)
+    assert back.notes == ("columns ignored: __time",)
+
+
+def test_rows_of_a_file_are_read_by_the_same_names(tmp_path):
+    pd.DataFrame(juggled("/joint_states")).to_csv(tmp_path / "run.csv", index=False)
+    rows = open_table(tmp_path / "run.csv", LogSource()).rows
+    assert rows.count() == 60
+    (stamps,) = [values for values, _ in rows.scan("time")]
+    np.testing.assert_array_equal(stamps, LOG.t)
+    part = rows.read(["effort_elbow", "position_shoulder"], 10, 20, Place())
+    np.testing.assert_array_equal(part["effort_elbow"], LOG.tau[10:20, 1])
+    np.testing.assert_array_equal(part["position_shoulder"], LOG.q[10:20, 0])
+    convert(tmp_path / "run.csv", tmp_path / "own.csv")
+    assert_same(read_log(tmp_path / "own.csv", JOINTS))
+
+
+def frame_of(log):
+    columns = {"time": log.t}
+    for kind, values in (("q", log.q), ("dq", log.v), ("ddq", log.a), ("tau", log.tau)):
+        columns |= {f"{kind}_{joint}": values[:, j] for j, joint in enumerate(log.joints)}
+    return pd.DataFrame(columns)
+
+
+def test_a_data_frame_may_have_time_as_its_index_or_come_from_another_library():
+    frame = pd.DataFrame(juggled("/joint_states"))
+    assert_same(read_log(frame.set_index("__time"), JOINTS))
+    columns = juggled("/joint_states")
+
+    class Other:
+        def __getitem__(self, name):
+            return columns[name].tolist()
+
+    Other.columns = tuple(columns)
+    assert_same(read_log(Other(), JOINTS))
+
+
+def test_what_is_wrong_with_a_data_frame_is_told():
+    frame = pd.DataFrame(juggled("/joint_states"))
+    with refused(
+        "log has no column 'time'; columns found: position_elbow, velocity_elbow, effort_elbow, "
+        "position_shoulder, velocity_shoulder, effort_shoulder. Rename it, or state in the job "
+        'file: columns = { time = "NAME" }, or without time stamps the rate of the rows [Hz]: log '
+        "= { rate = 100 }"
+    ):
+        order = [f"/joint_states/{j}/{w}" for j in ("elbow", "shoulder") for w in WORDS]
+        read_log(frame[order], JOINTS)
+    position = np.where(T.round(9) == 0.08, np.nan, T)
+    spoilt = frame.assign(**{"/joint_states/elbow/position": position})
+    with pytest.raises(DataError, match=r"log: q_elbow is NaN at row 4 \(t = 0.08 s\); remove"):
+        read_log(spoilt, JOINTS)
+    words = frame.assign(**{"/joint_states/elbow/effort": "much"})
+    with pytest.raises(DataError, match="log: column '/joint_states/elbow/effort' contains str"):
+        read_log(words, JOINTS)
+
+
+def test_logs_are_given_one_or_several_of_every_kind(ur5, tmp_path, rng):
+    log = exact_log(ur5, truth(ur5), rng, samples=100)
+    write_log(log, tmp_path / "run.csv")
+    for one in (log, tmp_path / "run.csv", str(tmp_path / "run.csv"), frame_of(log)):
+        for some in (one, [one], (x for x in [one])):
+            (back,) = read_logs(some, ur5.joints)
+            np.testing.assert_array_equal(back.tau, log.tau)
+    assert len(read_logs([log, frame_of(log), tmp_path / "run.csv"], ur5.joints)) == 3
+    assert read_logs((), ur5.joints) == ()
+    cases = ((3, "int"), ([log, None], "NoneType"), ({"q": 1}, "dict"), (log.q, "ndarray"))
+    for wrong, kind in cases:
+        with pytest.raises(DataError, match=f"^a log is a {kind}, wanted a robotid.Log, the path"):
+            read_logs(wrong, ur5.joints)
+
+
+def test_identify_takes_paths_and_frames_and_finds_what_it_finds_in_logs(ur5, tmp_path, rng):
+    first, second = (
+        exact_log(ur5, truth(ur5), rng, samples=200, rate=50.0, noise=0.1) for _ in range(2)
+    )
+    write_log(first, tmp_path / "first.csv")
+    settings = robotid.EstimatorSettings("wls")
+    one = robotid.identify(ur5, [first], validation=[second], estimator=settings)
+    other = robotid.identify(
+        ur5.tree.path, tmp_path / "first.csv", validation=frame_of(second), estimator=settings
+    )
+    np.testing.assert_array_equal(one.standard, other.standard)
+    assert one.verdict.to_dict()["status"] == other.verdict.to_dict()["status"]
+    assert [f.code for f in robotid.check_logs(ur5, tmp_path / "first.csv")] == [
+        f.code for f in robotid.check_logs(ur5, [first])
+    ]
+    with pytest.raises(DataError, match="no log was given; at least one is needed"):
+        robotid.identify(ur5, [])
+    with pytest.raises(ModelError, match="model is a NoneType, wanted a RobotModel or the path"):
+        robotid.identify(None, first)
+
+
+def test_swapped_arguments_are_named(ur5, rng, tmp_path):
+    log = exact_log(ur5, truth(ur5), rng, samples=100)
+    urdf = example_urdf("ur5_robot.urdf")
+    table = tmp_path / "run.csv"
+    robotid.write_log(log, table)
+    for given, robot, what in (
+        (log, ur5, "a Log"),
+        ([log], urdf, "a list"),
+        (table, ur5, "the file run.csv"),
+        (str(table), str(urdf), "the file run.csv"),
+    ):
+        for call in (robotid.identify, partial(robotid.identify_payload, reference=[log])):
+            with pytest.raises(ModelError, match=rf"model is {what}, and .*; swap the two"):
+                call(given, robot)
+    with pytest.raises(ModelError, match="model is a Log, wanted a RobotModel or the path"):
+        robotid.identify(log, log)
+
+
+def test_names_that_differ_in_case_alone_are_to_be_renamed(ur5, rng):
+    log = exact_log(ur5, truth(ur5), rng, samples=100)
+    names = tuple(name.upper() for name in ur5.joints[:2]) + ur5.joints[2:]
+    other = replace(log, joints=names)
+    with pytest.raises(DataError) as refusal:
+        read_logs(other, ur5.joints)
+    said = str(refusal.value)
+    assert said.startswith(
+        "log has the joints SHOULDER_PAN_JOINT, SHOULDER_LIFT_JOINT, which are "
+        "shoulder_pan_joint, shoulder_lift_joint in the model; rename them: "
+        "dataclasses.replace(log, joints="
+    )
+    renamed = eval(said.rpartition("rename them: ")[2], {"dataclasses": dataclasses, "log": other})
+    (back,) = read_logs(renamed, ur5.joints)
+    np.testing.assert_array_equal(back.q, log.q)
+
+
+def test_a_log_is_taken_by_the_names_of_its_joints(ur5, rng):
+    log = exact_log(ur5, truth(ur5), rng, samples=100)
+    (back,) = read_logs(log.select(ur5.joints[::-1]), ur5.joints)
+    assert back.joints == ur5.joints
+    np.testing.assert_array_equal(back.tau, log.tau)
+    with refused(
+        "log has the joints elbow_joint, but not wrist_1_joint, which the model has; record them, "
+        "or if they were at rest, lock them at their positions: RobotModel.from_urdf(..., "
+        "locked={'wrist_1_joint': 0.0})"
+    ):
+        read_logs(log.select(["elbow_joint"]), ["elbow_joint", "wrist_1_joint"])
+
+
+NANOSECONDS = 1_700_000_000_000_000_000 + (T * 1e9).round().astype(int)
+
+
+def test_rostopics_export_names_the_joints_in_its_rows(given):
+    """rostopic echo -p: the time of arrival, the stamp, and texts beside the numbers."""
+    columns = {"%time": NANOSECONDS + 7_000_000, "field.header.seq": range(60)}
+    columns |= {"field.header.stamp": NANOSECONDS, "field.header.frame_id": ["base"] * 60}
+    columns |= {f"field.name{k}": [name] * 60 for k, name in enumerate(JOINTS)}
+    for word, values in WORDS.items():
+        columns |= {f"field.{word}{k}": values[:, k] for k in range(2)}
+    back = read_log(given(columns), JOINTS[::-1], units=LogUnits(time="ns"))
+    np.testing.assert_allclose(back.t, 1.7e9 + T, rtol=0, atol=5e-7)
+    np.testing.assert_array_equal(back.q, LOG.q[:, ::-1])
+    np.testing.assert_array_equal(back.tau, LOG.tau[:, ::-1])
+    assert "columns ignored: %time" in back.notes[0]
+
+
+@pytest.mark.parametrize(("sec", "nanosec"), [("sec", "nanosec"), ("stamp.secs", "stamp.nsecs")])
+def test_seconds_and_nanoseconds_are_one_stamp(given, sec, nanosec):
+    columns = {nanosec: NANOSECONDS % 10**9, sec: NANOSECONDS // 10**9}
+    columns |= {f"{joint}_pos": LOG.q[:, k] for k, joint in enumerate(JOINTS)}
+    columns |= {f"{joint}_eff": LOG.tau[:, k] for k, joint in enumerate(JOINTS)}
+    back = read_log(given(columns), JOINTS)
+    np.testing.assert_allclose(back.t, 1.7e9 + T, rtol=0, atol=5e-7)
+    np.testing.assert_array_equal(back.tau, LOG.tau)
+    assert back.notes == ()
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".dat", ".txt"])
+def test_a_job_states_names_and_rate_of_a_file_without_them(ur5, tmp_path, rng, suffix):
+    log = exact_log(ur5, truth(ur5), rng, samples=300, rate=50.0)
+    table = np.hstack([log.q, log.tau])
+    separator = "," if suffix == ".csv" else " "
+    np.savetxt(tmp_path / f"run{suffix}", table, fmt="%.17g", delimiter=separator)
+    names = [f"{kind}_{joint}" for kind in ("q", "tau") for joint in log.joints]
+    job = f'urdf = "{ur5.tree.path}"\n[log]\nnames = {names}\nrate = 50\n'
+    (tmp_path / "job.toml").write_text(f'{job}[[identification]]\nlog = "run{suffix}"\n')
+    job = read_job(tmp_path / "job.toml")
+    back = job.read(job.identification[0], ur5)
+    np.testing.assert_array_equal(back.tau, log.tau)
+    np.testing.assert_allclose(back.t, np.arange(300) / 50, rtol=0, atol=1e-12)
+    rows = open_table(tmp_path / f"run{suffix}", job.source).rows
+    (stamps,) = [values for values, _ in rows.scan("time")]
+    part = rows.read(["time", "tau_elbow_joint"], 100, 120, Place())
+    np.testing.assert_array_equal(stamps, back.t)
+    np.testing.assert_array_equal(part["time"], back.t[100:120])
+    np.testing.assert_array_equal(part["tau_elbow_joint"], log.tau[100:120, 2])
+
+
+def test_names_that_do_not_fit_and_a_rate_that_is_not_needed_are_told(tmp_path):
+    np.savez(tmp_path / "run.npz", data=np.hstack([LOG.q, LOG.tau]))
+    names = ("q_shoulder", "q_elbow", "tau_shoulder", "tau_elbow")
+    back = read_log(tmp_path / "run.npz", JOINTS, source=LogSource(names=names, rate=50.0))
+    np.testing.assert_array_equal(back.tau, LOG.tau)
+    with refused("run.npz has 4 columns, but log.names states 3; name each column, in their order"):
+        read_log(tmp_path / "run.npz", JOINTS, source=LogSource(names=names[:3], rate=50.0))
+    timed = read_log(pd.DataFrame(juggled("/arm")), JOINTS, source=LogSource(rate=7.0))
+    np.testing.assert_array_equal(timed.t, LOG.t)
+    assert timed.notes == ("log.rate is not used: the log has time stamps",)

@@ -1,0 +1,233 @@
+"""Units of a log file: what is stated becomes SI, what looks wrong is refused."""
+
+import re
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import robotid
+from robotid.base.exceptions import DataError
+from robotid.data.files.read import read_log
+from robotid.data.files.table_files import write_columns
+from robotid.data.log import Log
+from robotid.data.signal_settings import LogUnits
+from robotid.data.units import _velocity_factor, check_units
+
+T = np.arange(400) * 0.01
+Q = np.column_stack([0.8 * np.sin(2 * T), 0.3 * np.cos(3 * T)])
+V = np.column_stack([1.6 * np.cos(2 * T), -0.9 * np.sin(3 * T)])
+A = np.column_stack([-3.2 * np.sin(2 * T), -2.7 * np.cos(3 * T)])
+TAU = np.column_stack([5 * Q[:, 0], 2 * Q[:, 1]])
+
+
+def log(**changes):
+    return Log(**{"t": T, "q": Q, "v": V, "tau": TAU, "joints": ("a", "b")} | changes)
+
+
+def table(t=T, scale=(1.0, 1.0)):
+    columns = {"time": t}
+    for kind, values in (("q", Q), ("dq", V), ("ddq", A)):
+        columns |= {f"{kind}_{j}": values[:, k] * scale[k] for k, j in enumerate("ab")}
+    return columns | {"tau_a": TAU[:, 0], "tau_b": TAU[:, 1]}
+
+
+@pytest.mark.parametrize(("unit", "per_second"), [("ms", 1e3), ("us", 1e6), ("ns", 1e9)])
+def test_stated_time_becomes_seconds_and_velocities_stay(tmp_path, unit, per_second):
+    write_columns(table(T * per_second), tmp_path / "run.csv")
+    found = read_log(tmp_path / "run.csv", ["a", "b"], units=LogUnits(time=unit))
+    np.testing.assert_allclose(found.t, T, rtol=1e-14)
+    np.testing.assert_array_equal(found.v, V)
+
+
+def test_stated_degrees_become_radians_but_of_joints_that_slide(tmp_path):
+    write_columns(table(scale=(180 / np.pi, 1.0)), tmp_path / "run.csv")
+    units = LogUnits(angle="deg")
+    found = read_log(tmp_path / "run.csv", ["a", "b"], units=units, prismatic=["b"])
+    for values, wanted in ((found.q, Q), (found.v, V), (found.a, A)):
+        np.testing.assert_allclose(values, wanted, rtol=1e-13, atol=1e-15)
+    np.testing.assert_array_equal(found.tau, TAU)
+
+
+@pytest.mark.parametrize(("turns", "is_refused"), [(1.9, False), (2.1, True)])
+def test_more_than_two_turns_look_like_degrees(turns, is_refused):
+    q = Q.copy()
+    q[200, 0] = 2 * np.pi * turns
+    far = log(q=q, v=None)
+    if is_refused:
+        with pytest.raises(DataError, match=r"q_a reaches .* looks like degrees"):
+            check_units(far, LogUnits())
+    else:
+        check_units(far, LogUnits())
+    if is_refused:
+        check_units(far, LogUnits(angle="rad"))
+        with pytest.raises(
+            DataError, match=rf"q_b reaches {2 * np.pi * turns:.4g}, .* {turns} rev"
+        ):
+            check_units(log(q=-q[:, ::-1], v=None), LogUnits())  # of either sign
+    check_units(far, LogUnits(), prismatic=["a"])
+
+
+PENDULUM = """<robot name="pendulum"><link name="base"/><link name="rod"><inertial>
+<origin xyz="0 0 -0.4"/><mass value="0.7"/><inertia ixx="0.01" ixy="0" ixz="0" iyy="0.01" iyz="0"
+izz="0.001"/></inertial></link><joint name="pivot" type="{kind}"><parent link="base"/>
+<child link="rod"/><axis xyz="0 1 0"/>{limit}</joint></robot>"""
+
+
+@pytest.mark.parametrize(
+    ("kind", "limit", "turns", "is_read"),
+    [
+        ("continuous", "", 4.5, True),
+        ("revolute", '<limit lower="0" upper="0" velocity="0" effort="0"/>', 2.5, True),
+        ("continuous", "", 5.2, False),
+        ("revolute", '<limit lower="-3" upper="3" velocity="9" effort="9"/>', 2.5, False),
+    ],
+)
+def test_a_pendulum_that_turns_several_times_is_read_in_radians(
+    tmp_path, kind, limit, turns, is_read
+):
+    path = tmp_path / "pendulum.urdf"
+    path.write_text(PENDULUM.format(kind=kind, limit=limit))
+    t = np.arange(2000) / 200
+    q = 2 * np.pi * turns * np.sin(0.35 * t) ** 2 * np.cos(0.2 * t)
+    q *= 2 * np.pi * turns / np.abs(q).max()
+    v = np.gradient(q, t)
+    tau = 0.122 * np.gradient(v, t) + 0.7 * 9.81 * 0.4 * np.sin(q) + 0.1 * v + 0.2 * np.sign(v)
+    frame = pd.DataFrame({"time": t, "q_pivot": q, "tau_pivot": tau})
+    if not is_read:
+        with pytest.raises(DataError, match=r"q_pivot reaches .* looks like degrees"):
+            robotid.identify(path, frame)
+        return
+    found = robotid.identify(path, frame)
+    (assumed,) = [f for f in found.findings if f.code == "log_assumption"]
+    assert assumed.severity == "warning"
+    assert "more than two revolutions of pivot are read in radians" in assumed.message
+    estimated = dict(zip(found.mapping.names, found.standard, strict=True))
+    assert estimated["pivot.viscous"] == pytest.approx(0.1, abs=0.005)
+
+
+def three(scale, **scales):
+    """A log from 5 s of three joints; columns in other units by factors (3,), q if not stated."""
+    t = 5.0 + T
+    q = np.column_stack([0.8 * np.sin(2 * T), 0.3 * np.cos(3 * T), 0.5 + np.sin(T)])
+    v = np.column_stack([1.6 * np.cos(2 * T), -0.9 * np.sin(3 * T), np.cos(T)])
+    columns = {"v": v, "q_ref": q + 0.01}
+    changed = {key: columns[key] * scales[key] for key in scales}
+    return Log(t, q * scale, np.zeros_like(q), ("a", "b", "c"), **changed)
+
+
+def test_one_joint_in_degrees_is_converted_alone():
+    """pi / 180 is 0.0174533; the others reach 0.8 (a), 0.3 (b), 1.5 (c)."""
+    one, c = np.array([1.0, 1.0, 1.0]), np.array([1.0, 1.0, 180 / np.pi])
+    advice = "at most 0.8: this joint alone may be in degrees. Then multiply {} by 0.0174533"
+    for changes, columns in (
+        ({"scale": c}, "q_c"),
+        ({"scale": c, "v": c}, "q_c and dq_c"),
+        ({"scale": c, "v": one}, "q_c"),  # the velocity is in radians
+        ({"scale": c, "v": c, "q_ref": c}, "q_c, dq_c and qref_c"),
+        ({"scale": c, "q_ref": one}, "q_c"),
+        ({"scale": c, "q_ref": c[::-1]}, "q_c"),  # the command of another joint is in degrees
+    ):
+        with pytest.raises(DataError, match=re.escape(advice.format(columns))) as caught:
+            check_units(three(**changes), LogUnits())
+        assert "in the recording, because a stated unit applies to all joints" in str(caught.value)
+        assert '. If all joints are in degrees, state units angle = "deg"' in str(caught.value)
+    a = 180 / np.pi * np.array([1.0, 0.0, 0.0]) + [0.0, 1.0, 1.0]
+    with pytest.raises(DataError, match=r"most 1\.51: this joint alone .* multiply qref_a by"):
+        check_units(three(one, q_ref=a), LogUnits())
+    # all in degrees, a joint farther than a revolution, and too few joints to compare
+    for log, prismatic in (
+        (three(180 / np.pi * one), ()), (three([8.0, 1.0, 180 / np.pi]), ()), (three(c), ("a",))
+    ):  # fmt: skip
+        with pytest.raises(DataError, match="looks like degrees") as caught:
+            check_units(log, LogUnits(), prismatic)
+        assert "alone" not in str(caught.value)
+
+
+@pytest.mark.parametrize(("step", "unit"), [(0.2, "ms"), (10.0, "ms"), (1e4, "us"), (1e7, "ns")])
+def test_a_long_step_looks_like_another_unit(step, unit):
+    words = {"ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}
+    slow = log(t=np.arange(400) * step, v=None)
+    with pytest.raises(DataError, match=f"looks like {words[unit]}") as caught:
+        check_units(slow, LogUnits())
+    assert caught.value.code == "time_unit"
+    hertz = {"ms": 1e3, "us": 1e6, "ns": 1e9}[unit] / step
+    said = f"median step {step:.6g} looks like {words[unit]} ({hertz:.4g} Hz); in seconds it would "
+    assert f"{said}be {1 / step:.3g} Hz" in str(caught.value)
+    check_units(slow, LogUnits(time="s"))
+    check_units(log(t=np.arange(400) * 0.1, v=None), LogUnits())
+
+
+@pytest.mark.parametrize(
+    ("changes", "code", "said"),
+    [
+        ({"v": V * 180 / np.pi}, "angle_unit", "the velocity looks like degrees"),
+        ({"q": Q * 180 / np.pi / 10, "v": V / 10}, "angle_unit", "the position looks like degrees"),
+        ({"v": -V}, "velocity_sign", "has the opposite sign of"),
+        ({"v": V / 1000}, "time_unit", "dq_a is 0.001 times"),
+    ],
+)
+def test_a_velocity_that_does_not_go_with_its_position_is_refused(changes, code, said):
+    with pytest.raises(DataError, match=said) as caught:
+        check_units(log(**changes), LogUnits())
+    assert caught.value.code == code
+
+
+@pytest.mark.parametrize(
+    ("step", "factor", "unit"),
+    # 1 kHz, 5 Hz and 20 kHz since 1970: the step alone would say seconds, us, us
+    [(1e-3, 1e3, "ms"), (0.2, 1e3, "ms"), (5e-5, 1e9, "ns"), (0.01, 1e6, "us"), (0.01, 1e9, "ns")],
+)
+def test_a_date_tells_the_unit_of_the_time(step, factor, unit):
+    t = np.round((1.7e9 + step * np.arange(200)) * factor)
+    t = t if (np.diff(t) > 0).all() else (1.7e9 + step * np.arange(200)) * factor
+    q = np.sin(np.arange(200) * 0.05)[:, None]
+    with pytest.raises(DataError) as caught:
+        check_units(Log(t, q, q, ("a",)), LogUnits())
+    assert caught.value.code == "time_unit"
+    assert f'units time = "{unit}"' in str(caught.value)
+    assert str(caught.value).endswith(f"multiply by {1 / factor:g}")
+
+
+def test_seconds_since_1970_are_seconds():
+    q = np.sin(np.arange(200) * 0.05)[:, None]
+    check_units(Log(1.7e9 + 0.01 * np.arange(200), q, q, ("a",)), LogUnits())
+
+
+@pytest.mark.parametrize("factor", [180 / np.pi, np.pi / 180])
+def test_a_command_in_degrees_is_told_from_one_that_goes_far_along_a_slider(factor):
+    """Only a revolute joint has degrees."""
+    far = log(q=0.5 * Q, q_ref=0.5 * Q * [1.0, factor], v=None)
+    check_units(far, LogUnits(), prismatic=["b"])
+    for sign in (1.0, -1.0):  # a command that is reversed as well
+        far = log(q=0.5 * Q, q_ref=0.5 * Q * [1.0, sign * factor], v=None)
+        with pytest.raises(
+            DataError, match=rf"qref_b is {sign * factor:.3g} times that of q_b: one of them"
+        ):
+            check_units(far, LogUnits(), prismatic=["a"])
+    check_units(log(q=Q, q_ref=-Q, v=None), LogUnits())
+
+
+def test_a_command_that_is_not_followed_shows_no_unit():
+    """57 times as large as the motion, and at another frequency."""
+    for share in (0.0, 0.85):  # the correlation from which two signals are alike is 0.9
+        y = np.sin(7.3 * T) * np.sqrt(2) * np.std(Q[:, 1])
+        other = share * (Q[:, 1] - Q[:, 1].mean()) + np.sqrt(1 - share**2) * y
+        q_ref = np.column_stack([Q[:, 0], 180 / np.pi * 0.1 * other])
+        check_units(log(q=0.1 * Q, q_ref=q_ref, v=None), LogUnits())
+    with pytest.raises(DataError, match=r"qref_b is 57\.3 times that of q_b"):
+        check_units(log(q=0.1 * Q, q_ref=0.1 * Q * [1.0, 180 / np.pi], v=None), LogUnits())
+
+
+@pytest.mark.parametrize(("turn", "unit"), [(2 * np.pi, 1.0), (360.0, 180 / np.pi)])
+def test_speeds_are_compared_beside_gaps_and_full_turns(turn, unit):
+    """The factor of dq by d(q)/dt, of a log with jumps of a turn and a gap with a long way."""
+    t = 6.0 + np.where(T < 2.0, T, T + 9.0) + np.where(np.arange(400) < 250, 0.0, 0.1)
+    q = unit * np.column_stack([0.7 * T + 0.02 * np.sin(5 * T), np.cos(3 * T)])
+    v = unit * np.column_stack([0.7 + 0.1 * np.cos(5 * T), -3.0 * np.sin(3 * T)])
+    q[200:] += [4.0 * unit, -2.0 * unit]  # while nothing was recorded
+    q[250:, 0] += unit  # in a gap of 11 steps
+    q[60:, 0] -= turn
+    q[300:, 1] += turn
+    found = _velocity_factor(log(t=t, q=q, v=[2.0, -0.5] * v))
+    np.testing.assert_allclose(found, [2.0, -0.5], rtol=2e-3)

@@ -1,0 +1,298 @@
+import numpy as np
+import pytest
+
+from robotid.base.exceptions import DataError, SettingsError
+from robotid.design.clearance import _FIRST, Box, Clearance
+from robotid.dynamics.simulation.motions import ProgramMotion, random_fourier
+from robotid.robot.examples import example_urdf
+from robotid.robot.model import RobotModel
+
+# a slider that carries a ball past a post: distances are known by hand
+SLIDER = """
+<robot name="slider">
+  <link name="base"><collision><geometry><box size="0.1 0.1 0.1"/></geometry></collision></link>
+  <link name="car"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0"
+    iyz="0"/></inertial></link>
+  <link name="ball"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0"
+    iyz="0"/></inertial>
+    <collision><origin xyz="0 0.5 0"/><geometry><box size="0.1 0.1 0.1"/></geometry></collision>
+  </link>
+  <joint name="slide" type="prismatic"><parent link="base"/><child link="car"/>
+    <axis xyz="1 0 0"/><limit lower="-1" upper="1" velocity="2" effort="100"/></joint>
+  <joint name="turn" type="revolute"><parent link="car"/><child link="ball"/>
+    <axis xyz="0 0 1"/><limit lower="-3" upper="3" velocity="2" effort="100"/></joint>
+</robot>"""
+
+
+@pytest.fixture
+def slider(tmp_path):
+    (tmp_path / "slider.urdf").write_text(SLIDER)
+    return RobotModel.from_urdf(tmp_path / "slider.urdf")
+
+
+def distances(clearance, q):
+    return clearance.near(clearance.placed(np.atleast_2d(q)), 10.0, clearance.everything)
+
+
+def test_distances_are_those_of_the_boxes(slider):
+    post = Box("post", (0.3, 0.4, -0.2), (0.4, 0.6, 0.2))
+    clearance = Clearance(slider, boxes=[post])
+    near = distances(clearance, [[0.0, 0.0], [-0.2, 0.0], [0.33, 0.0]])
+    # from the ball's face at x + 0.05 to the post's at 0.3; the base is 0.4 from the ball
+    (ball_post,) = (k for k, p in enumerate(clearance.named) if p == ("ball", "post"))
+    np.testing.assert_allclose(near.distance[ball_post, :2], [0.25, 0.45], atol=1e-6)
+    assert near.distance[ball_post, 2] < 0
+    (base_ball,) = (k for k, p in enumerate(clearance.named) if p == ("base", "ball"))
+    assert near.distance[base_ball, 0] == pytest.approx(0.4, abs=1e-6)
+
+
+def test_gradients_of_distances_are_those_of_differences(panda):
+    clearance, rng = Clearance(panda, floor=-0.05), np.random.default_rng(5)
+    low, high = np.array([(j.lower, j.upper) for j in panda.limits]).T
+    q, d, h = rng.uniform(low, high, (20, 7)), rng.standard_normal(7), 1e-6
+    near = clearance.near(clearance.placed(q), 0.2)
+    up, down = (clearance.near(clearance.placed(q + s * h * d), 0.3).distance for s in (1, -1))
+    at = near.pairs, near.samples
+    slope = (up[at] - down[at]) / (2 * h)
+    assert len(slope) > 50
+    np.testing.assert_allclose(near.gradient @ d, slope, atol=1e-4)
+
+
+def test_what_lies_between_samples_is_found(slider):
+    # the ball passes a thin post in 30 ms, between samples that are all clear of it
+    post = Box("post", (0.0, 0.4, -0.2), (0.001, 0.6, 0.2))
+    clearance = Clearance(slider, boxes=[post])
+    motion = ProgramMotion(np.array([1.8, 0.0]), 0.3, np.array([-0.9, 0.0]))
+    coarse = clearance.near(
+        clearance.placed(motion.evaluate(np.linspace(0.0, 0.3, 6))[0]), 0.0, clearance.everything
+    )
+    assert coarse.distance.min() > 0.0
+    contact = clearance.nearest(motion, 0.3)
+    assert {contact.first, contact.second} == {"ball", "post"}
+    assert contact.distance < 0
+    assert contact.time == pytest.approx(0.15, abs=0.02)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_nearest_place_is_a_lower_bound_within_a_millimetre(panda, seed):
+    clearance = Clearance(panda, floor=-0.05)
+    motion = random_fourier(panda, np.random.default_rng(seed))
+    contact = clearance.nearest(motion, 3.0)
+    q = motion.evaluate(np.linspace(0.0, 3.0, 3001))[0]
+    dense = clearance.near(clearance.placed(q), 0.07, clearance.everything).distance.min(axis=1)
+    margins = dense - clearance.required
+    assert margins.min() - 2e-3 < contact.margin <= margins.min()
+    pair = clearance.named.index((contact.first, contact.second))
+    assert margins[pair] < margins.min() + 1e-4  # it is that pair, not one that has a lower bound
+
+
+def test_bad_surroundings_are_refused(slider, tmp_path):
+    with pytest.raises(SettingsError, match="clearance is -1, wanted 0 m or more"):
+        Clearance(slider, least=-1)
+    with pytest.raises(SettingsError, match="box 'post' reaches from 1, 0, 0 to 0, 1, 1"):
+        Clearance(slider, boxes=[Box("post", (1, 0, 0), (0, 1, 1))])
+    bare = SLIDER.replace("collision", "nothing")
+    (tmp_path / "bare.urdf").write_text(bare)
+    with pytest.raises(DataError, match="has no shape that can be read"):
+        Clearance(RobotModel.from_urdf(tmp_path / "bare.urdf"))
+
+
+# a plate that tilts 15 mm above the base: nearer than the clearance in every pose, and its edge
+# hits the base if it tilts far; a pin of the plate goes through the base
+TILTED = """
+<robot name="tilted">
+  <link name="base"><collision><geometry><box size="0.1 0.1 0.1"/></geometry></collision></link>
+  <link name="axle"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0"
+    iyz="0"/></inertial></link>
+  <link name="plate"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0"
+    iyz="0"/></inertial>
+    <collision><origin xyz="0 0 0.01"/><geometry><box size="0.1 0.1 0.02"/></geometry></collision>
+  </link>
+  <link name="pin"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0"
+    iyz="0"/></inertial>
+    <collision><geometry><box size="0.02 0.02 0.2"/></geometry></collision></link>
+  <joint name="turn" type="revolute"><parent link="base"/><child link="axle"/>
+    <axis xyz="0 0 1"/><limit lower="-1" upper="1" velocity="2" effort="100"/></joint>
+  <joint name="tilt" type="revolute"><parent link="axle"/><child link="plate"/>
+    <origin xyz="0 0 0.065"/>
+    <axis xyz="1 0 0"/><limit lower="-0.35" upper="0.35" velocity="2" effort="100"/></joint>
+  <joint name="spin" type="revolute"><parent link="plate"/><child link="pin"/>
+    <axis xyz="0 0 1"/><limit lower="-1" upper="1" velocity="2" effort="100"/></joint>
+</robot>"""
+
+
+def test_links_that_are_built_near_each_other_are_watched_and_those_that_touch_are_named(tmp_path):
+    (tmp_path / "tilted.urdf").write_text(TILTED)
+    clearance = Clearance(RobotModel.from_urdf(tmp_path / "tilted.urdf"), least=0.02)
+    # the pin's end is 35 + 50 mm deep in the base, 30 + 30 mm from its sides
+    (touching,) = clearance.made_to
+    assert touching.startswith("base and pin (overlap by ")
+    assert int(touching.split()[-2]) == pytest.approx(60, abs=6)
+    assert clearance.named == [("base", "plate")]
+    tilts = np.random.default_rng(1).uniform(-0.35, 0.35, 2000)
+    apart = 0.015 - 0.05 * np.sin(np.abs(tilts))
+    usual = np.median(apart[apart > 1e-3])
+    assert clearance.required == pytest.approx(usual / 2, abs=5e-4)
+    assert clearance.slack == pytest.approx(usual / 2, abs=5e-4)
+    assert clearance.built_near == [f"base and plate ({1e3 * clearance.required[0]:.0f} mm)"]
+    assert clearance.likely.all()
+    far, less = (
+        clearance.nearest(ProgramMotion(np.array([0.0, speed, 0.0]), 2.0, np.zeros(3)), 2.0)
+        for speed in (0.3, 0.1)
+    )
+    assert {far.first, far.second} == {"base", "plate"}
+    assert far.margin < 0.0 < less.margin
+    assert far.required == clearance.required[0]
+
+
+def test_links_that_touch_in_almost_every_pose_but_not_at_zero_are_watched(tmp_path):
+    # a plate that is driven into the base, from 4 mm above it
+    driven = TILTED.replace('name="tilt" type="revolute"', 'name="tilt" type="prismatic"')
+    driven = driven.replace('<axis xyz="1 0 0"/><limit lower="-0.35" upper="0.35"',
+                            '<axis xyz="0 0 -1"/><limit lower="0" upper="0.1"')  # fmt: skip
+    driven = driven.replace('<origin xyz="0 0 0.065"/>', '<origin xyz="0 0 0.054"/>')
+    (tmp_path / "driven.urdf").write_text(driven)
+    clearance = Clearance(RobotModel.from_urdf(tmp_path / "driven.urdf"))
+    assert len(clearance.made_to) == 1  # the pin
+    assert clearance.named == [("base", "plate")]
+    assert 0.0005 < clearance.required[0] < 0.002  # half of what lies between 1 and 4 mm
+
+
+def test_links_that_stay_at_their_distance_are_kept_at_half_of_it():
+    # pairs of links of the SO-101 are 9 to 16 mm apart in almost every posture
+    model = RobotModel.from_urdf(example_urdf("so101.urdf"))
+    clearance = Clearance(model, least=0.02)
+    assert not clearance.made_to
+    assert len(clearance.built_near) == 1  # two hulls of one link
+    q = np.random.default_rng(0).uniform(
+        [j.lower for j in model.limits], [j.upper for j in model.limits], (100, 6)
+    )
+    near = np.isfinite(clearance.slack)
+    distance = clearance.near(clearance.placed(q), 0.05, clearance.everything).distance
+    assert near.sum() == 2
+    np.testing.assert_allclose(
+        clearance.required[near], np.median(distance[near], axis=1) / 2, rtol=0.1
+    )
+    assert (clearance.required[~near] == 0.02).all()
+    assert (
+        (distance >= clearance.required[:, None]).all(axis=0)
+    ).any()  # there are postures to be in
+
+
+@pytest.fixture(scope="module", params=["panda", "ur10_robot"])
+def scattered(request):
+    """A robot at random, its distances, and how far they are looked at."""
+    model = RobotModel.from_urdf(example_urdf(f"{request.param}.urdf"))
+    low, high = np.array([(j.lower, j.upper) for j in model.limits]).T
+    q = np.random.default_rng(2).uniform(low, high, (60, len(low)))
+    clearance = Clearance(model, floor=-0.05)
+    poses = clearance.placed(q)
+    return model, clearance, poses, clearance.near(poses, np.inf, clearance.everything).distance
+
+
+@pytest.mark.parametrize("spare", [0.0, 1.0, 2.0])
+def test_margins_leave_what_is_kept_and_spared(scattered, spare):
+    _, clearance, placed, _ = scattered
+    wanted = np.minimum(0.002, clearance.slack / 4)[:, None]  # 2 mm, or a quarter of the room
+    likely = clearance.near(placed, np.inf).distance
+    exactly = likely - clearance.required[:, None] - spare * wanted
+    found = clearance.margins(placed, spare)
+    near = exactly < np.minimum(0.01, clearance.slack / 4)[:, None]
+    assert near.any()
+    np.testing.assert_allclose(found[near], exactly[near], atol=1e-9)
+    assert (found <= exactly + 1e-9).all()  # farther ones have a lower bound
+
+
+def test_hulls_that_are_far_apart_are_left_out(scattered):
+    _, clearance, placed, exact = scattered
+    found = clearance.near(placed, 0.05, clearance.everything)
+    np.testing.assert_array_equal(found.distance[exact < 0.05], exact[exact < 0.05])
+    assert (found.distance[exact >= 0.05] >= 0.05).all()
+    assert (found.distance <= exact + 1e-6).all()
+    assert len(found.pairs) < 1.3 * int((exact < 0.05).sum())
+
+
+def test_directions_that_parted_hulls_before_spare_their_distances(scattered):
+    _, clearance, poses, exact = scattered
+    hints = np.zeros((*exact.shape, 3))
+    first, again = (clearance.near(poses, 0.05, clearance.everything, hints) for _ in range(2))
+    needed = int((exact < 0.05).sum())
+    assert len(first.pairs) > needed + 1
+    assert len(again.pairs) <= needed + 1
+    for found in (first, again):
+        np.testing.assert_array_equal(found.distance[exact < 0.05], exact[exact < 0.05])
+        assert (found.distance <= exact + 1e-6).all()
+    wrong = np.random.default_rng(0).standard_normal(hints.shape)
+    wrong /= np.linalg.norm(wrong, axis=2, keepdims=True)
+    found = clearance.near(poses, 0.05, clearance.everything, wrong)
+    np.testing.assert_array_equal(found.distance[exact < 0.05], exact[exact < 0.05])
+
+
+# an arm that a turning base carries out, farther to one side than to the other
+TURRET = """
+<robot name="turret">
+  <link name="base"/>
+  <link name="arm"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0"
+    iyz="0"/></inertial></link>
+  <link name="ball"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0"
+    iyz="0"/></inertial>
+    <collision><geometry><box size="0.1 0.1 0.1"/></geometry></collision></link>
+  <joint name="turn" type="revolute"><parent link="base"/><child link="arm"/>
+    <axis xyz="0 0 1"/><limit lower="-3" upper="3" velocity="2" effort="100"/></joint>
+  <joint name="reach" type="prismatic"><parent link="arm"/><child link="ball"/>
+    <origin xyz="0 0.3 0"/>
+    <axis xyz="1 0 0"/><limit lower="-1.5" upper="0.2" velocity="2" effort="100"/></joint>
+</robot>"""
+
+
+def test_a_joint_can_move_a_hull_as_far_as_what_slides_beyond_it_reaches(tmp_path):
+    (tmp_path / "turret.urdf").write_text(TURRET)
+    model = RobotModel.from_urdf(tmp_path / "turret.urdf")
+    clearance = Clearance(model, boxes=[Box("post", (2.0, 0.0, -0.2), (2.1, 0.2, 0.2))])
+    (levers,) = clearance._levers
+    # radius of the ball, its way to the joint, the joint's way
+    assert levers == pytest.approx([0.05 * np.sqrt(3) + 0.3 + 1.5, 1.0])
+    # a turn by 1e-3 rad moves the farthest corner by less than that, but hardly so
+    corner = np.hypot(1.5 + 0.05, 0.3 + 0.05)
+    assert 0.8 * levers[0] < corner < levers[0]
+
+
+def test_a_motion_that_swings_between_the_first_samples_is_followed_by_its_acceleration(slider):
+    clearance = Clearance(slider, boxes=[Box("post", (0.0, 0.4, -0.2), (0.1, 0.6, 0.2))])
+    h = 0.5 * _FIRST  # the first instants that are looked at are its odd multiples
+
+    class Swing:
+        """A motion that is at rest at these instants, 0.25 m from the post, and in it between."""
+
+        def evaluate(self, t):
+            w, none = np.pi / h, np.zeros_like(t)
+            x, v, a = (
+                -0.1 + 0.2 * np.cos(w * t),
+                -0.2 * w * np.sin(w * t),
+                -0.2 * w**2 * np.cos(w * t),
+            )
+            return tuple(np.column_stack([y, none]) for y in (x, v, a))
+
+    contact = clearance.nearest(Swing(), 20 * h)
+    assert {contact.first, contact.second} == {"ball", "post"}
+    assert contact.distance < 0.0
+    assert min(abs(contact.time - 2 * h * k) for k in range(11)) < 0.35 * h
+
+
+def test_links_of_several_pairs_are_told_with_the_least_of_their_distances(slider):
+    clearance = Clearance(slider, boxes=[Box("post", (0.3, 0.4, -0.2), (0.4, 0.6, 0.2))])
+    clearance.pairs = np.repeat(clearance.pairs[:1], 3, axis=0)
+    (told,) = clearance._listed(np.array([True, True, False]), np.array([0.009, 0.016, 0.001]))
+    assert told.endswith("(9 mm)")
+    (told,) = clearance._listed(np.array([True, True, True]), np.array([0.009, -0.004, 0.001]))
+    assert told.endswith("(overlap by 4 mm)")
+
+
+def test_of_links_close_by_design_no_more_than_the_clearance_is_required(tmp_path):
+    # the plate hardly tilts, 6 mm above the base: half of it is more than the clearance
+    text = TILTED.replace('"0 0 0.065"', '"0 0 0.056"').replace("0.35", "0.001")
+    (tmp_path / "flat.urdf").write_text(text)
+    clearance = Clearance(RobotModel.from_urdf(tmp_path / "flat.urdf"), least=0.002)
+    assert clearance.named == [("base", "plate")]
+    assert clearance.required == pytest.approx(0.002)
+    assert clearance.slack == pytest.approx(0.004, abs=1e-4)

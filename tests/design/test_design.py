@@ -1,0 +1,440 @@
+import re
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from robotid.base.exceptions import NotConvergedError, SettingsError
+from robotid.design.basis import BSplineBasis, FourierBasis
+from robotid.design.clearance import Box, Clearance, Contact
+from robotid.design.design import Designer, State
+from robotid.design.limits import LIMITS, MotionLimits
+from robotid.design.multipliers import SOFT, Multipliers
+from robotid.dynamics.base_parameters import structural_mapping
+from robotid.dynamics.simulation.motions import ProgramMotion
+from robotid.dynamics.torque import joint_torque_regressor
+from robotid.identification.assumptions import TorqueNoise
+from robotid.robot.examples import example_urdf
+from robotid.robot.model import RobotModel
+from robotid.robot.prior import prior_spread
+
+WRIST = ["wrist_1_joint", "wrist_2_joint", "wrist_3_joint"]
+
+
+@pytest.fixture(scope="module")
+def wrist():
+    """The last three joints of a UR10: small, and its links may meet."""
+    return RobotModel.from_urdf(example_urdf("ur10_robot.urdf"), joints=WRIST)
+
+
+@pytest.fixture(scope="module")
+def designer(wrist):
+    limits = MotionLimits.of_model(wrist, acceleration=8.0, jerk={"wrist_1_joint": 60.0}, power=40)
+    return Designer.of_model(wrist, FourierBasis(4.0, 3), limits, noise={"wrist_2_joint": 0.7})
+
+
+@pytest.fixture(scope="module")
+def design(designer):
+    return designer.design(np.random.default_rng(1), starts=1)  # some starts end 0.15 higher
+
+
+def test_the_information_is_that_of_the_regressor(wrist, designer, rng):
+    C = designer.random(rng)
+    step = 4.0 / 42  # 14 instants within a third of 4 s
+    t = step * np.arange(43)
+    q, v, a, _ = designer.basis.derivatives(t, 3) @ C
+    signs = np.tanh(v / 0.01)
+    W = joint_torque_regressor(wrist, q, v, a, signs)[:, designer.information.mapping.independent]
+    density = 0.1 * (np.array([0.01 * 54.0, 0.7, 0.01 * 54.0])) ** 2  # 1 % of 54 N m, for 0.1 s
+    weights = np.tile(step / density, 43)[:, None]
+    S = designer.spread
+    expected = S[:, None] * (W.T @ (weights * W)) * S + np.eye(len(S))
+    rows = designer.information.rows(q, v, a)
+    np.testing.assert_allclose(designer.matrix(rows), expected, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["D", "A", "E"])
+def test_the_gradient_of_the_lagrangian_is_that_of_differences(designer, wrist, rng, name):
+    around = Clearance(wrist, least=0.05, boxes=[Box("post", (0.9, 0.2, -0.5), (1.0, 0.4, 0.5))])
+    designer = replace(designer, name=name, clearance=around)
+    C, D = 1.5 * designer.random(rng), rng.standard_normal((5, 3))
+    shape = (len(LIMITS), 43, 3)
+    pairs = (len(around.pairs), 43)
+    held = rng.uniform(0.0, 0.05, shape), rng.uniform(0.0, 0.1, pairs) * (rng.random(pairs) < 0.3)
+    multipliers, h = Multipliers(0.2, *held), 1e-6
+    up, down = (designer._lagrangian(C + s * h * D, multipliers)[0] for s in (1, -1))
+    slope = np.sum(designer._lagrangian(C, multipliers)[1] * D)
+    assert slope == pytest.approx((up - down) / (2 * h), rel=1e-4)
+
+
+def test_a_design_tells_more_than_random_motions_within_the_same_limits(designer, design):
+    rng = np.random.default_rng(1)
+    random = [designer._objective(designer.random(rng)) for _ in range(100)]
+    assert design.objective < min(random) - 0.2
+    assert design.used.max() <= 1.0
+    assert (design.used.max(axis=1) > 0.9).sum() >= 2  # it goes to its limits
+    times, objectives = zip(*design.history, strict=True)
+    assert list(times) == sorted(times)
+    assert min(objectives) < objectives[0]
+
+
+def test_a_design_keeps_its_limits_between_its_instants(wrist, designer, design):
+    t = np.linspace(0.0, 4.0, 20_001)
+    q, v, a, jerk = design.motion.basis.derivatives(t, 3) @ design.motion.coefficients
+    information = designer.information
+    torque = information.torque(information.rows(q, v, a))
+    used = np.abs(designer.limits.used(q, v, a, jerk, torque))
+    assert used.max() < 1.001
+    np.testing.assert_allclose(used.max(axis=1), design.used, atol=2e-3)
+    assert np.abs(v[[0, -1]]).max() < 1e-9
+    assert np.abs(a[[0, -1]]).max() < 1e-9
+
+
+def test_designs_are_the_same_under_a_seed_and_stop_when_told(designer):
+    short = replace(designer, basis=BSplineBasis(4.0, 5))
+    told = []
+    one, other = (
+        short.design(np.random.default_rng(3), starts=1, seconds=0.0, progress=progress)
+        for progress in (None, lambda *call: told.append(call))
+    )
+    assert [start for start, _ in told] == [0, 1]  # as it starts, and before the finer grid
+    assert told[0][1] == other.history[0][1]
+    np.testing.assert_array_equal(one.motion.coefficients, other.motion.coefficients)
+    assert not one.is_converged
+    assert one.used.max() <= 1.0
+
+
+def test_what_is_known_already_is_not_asked_for_again(designer, design):
+    rows = designer.information.rows(*(design.motion.evaluate(np.linspace(0, 4.0, 61))))
+    told = designer.matrix(rows)
+    next_one = replace(designer, given=told)
+    again = next_one._objective(design.motion.coefficients)
+    fresh = next_one.design(np.random.default_rng(4), starts=1)
+    assert fresh.objective < again - 0.02
+    # its condition is that of the motion itself, without what was known before
+    own = designer.used_and_informed(fresh.motion, 4.0, fresh.intervals / 4.0)[1] - np.eye(
+        len(told)
+    )
+    assert fresh.condition == pytest.approx(np.sqrt(np.linalg.cond(own)), rel=1e-6)
+
+
+def test_a_motion_after_another_narrows_what_that_one_left_wide(designer, design):
+    rows = designer.information.rows(*(design.motion.evaluate(np.linspace(0, 4.0, 61))))
+    told = designer.matrix(rows)
+    after = replace(designer, given=told, name="widest")
+    before = np.diag(np.linalg.inv(told))
+    widest = after.widest
+    assert len(widest) == round(len(told) / 4)
+    assert before[widest].min() >= np.delete(before, widest).max()
+    found, usual = (some.design(np.random.default_rng(7), starts=1) for some in (after, designer))
+
+    def left(F):
+        return np.mean(np.log(np.diag(np.linalg.inv(F))[widest]))
+
+    again, fresh, own = (
+        left(told + designer.matrix(designer.information.rows(*x)) - np.eye(len(told)))
+        for x in (some.motion.evaluate(np.linspace(0, 4.0, 61)) for some in (design, usual, found))
+    )
+    assert own < fresh - 0.02
+    assert own < again - 0.1
+
+
+def test_a_design_keeps_clear_of_what_stands_around(wrist, designer):
+    # a wall 3 cm beside the tool at rest
+    wall = Box("wall", (-2.0, 0.35, -2.0), (2.0, 0.40, 2.0))
+    around = Clearance(wrist, least=0.01, boxes=[wall])
+    found = replace(designer, clearance=around).design(np.random.default_rng(5), starts=1)
+    assert found.contact is None or found.contact.margin >= 0.0
+    t = np.linspace(0.0, 4.0, 4001)
+    near = around.near(around.placed(found.motion.evaluate(t)[0]), 0.05, around.everything)
+    assert (near.distance.min(axis=1) >= around.required).all()
+
+
+def test_what_keeps_a_robot_from_resting_is_named(wrist, designer):
+    weak = designer.limits.sizes.copy()
+    weak[4, 0] = 1e-3
+    limits = replace(designer.limits, sizes=weak)
+    with pytest.raises(SettingsError, match=r"wrist_1_joint needs at least \d+ % of its torque"):
+        replace(designer, limits=limits).design(np.random.default_rng(0), starts=1)
+    inside = Clearance(wrist, boxes=[Box("room", (-3.0, -3.0, -3.0), (3.0, 3.0, 3.0))])
+    with pytest.raises(SettingsError, match=r"the distance of \w+ and room is -\d+"):
+        replace(designer, clearance=inside).design(np.random.default_rng(0), starts=1)
+
+
+def test_spread_and_noise_are_those_of_a_preview(wrist, designer):
+    speed = designer.limits.sizes[1]
+    usual = 0.3 * np.array([[54.0] * 3, speed, speed * 2 * np.pi / (4.0 / 3)])
+    K = designer.information.mapping.K
+    expected = np.linalg.norm(K * prior_spread(wrist, usual**2, 1), axis=1)
+    np.testing.assert_allclose(designer.spread, expected)
+
+
+def test_a_motion_whose_middle_collides_is_mixed_with_one_that_keeps_the_limits(wrist, designer):
+    wall = Box("wall", (-2.0, 0.35, -2.0), (2.0, 0.40, 2.0))
+    near = replace(designer, clearance=Clearance(wrist, least=0.01, boxes=[wall]))
+    kept = near.random(np.random.default_rng(5))
+    C = kept.copy()
+    C[0] += np.pi / 2 * np.array([1.0, 1.0, 0.0])  # the middle, about which it would be scaled
+    assert not near.postures.can_rest(C[:1])[0]
+    mixed = near._towards(kept, C, 0.997)
+    used, margin, _ = near._constraints(mixed, 1.0)
+    share = np.linalg.norm(mixed - kept) / np.linalg.norm(C - kept)
+    assert 0.0 < share < 1.0
+    assert np.abs(used).max() <= 0.997
+    assert margin >= 0.0
+    used, margin, _ = near._constraints(mixed + 2e-3 * (C - kept), 1.0)
+    assert np.abs(used).max() > 0.995 or margin < 1e-3  # it can hardly go farther
+
+
+def test_a_round_of_the_search_leaves_the_reserve_of_the_limits(designer, monkeypatch):
+    """0.3 % for the motion between samples, also on the way between two motions."""
+    fast, slow = (designer.random(np.random.default_rng(k)) * x for k, x in ((5, 3.0), (6, 0.2)))
+    kept = designer._feasible(slow, 0.2)
+    state = State(kept, -np.inf, kept, Multipliers(0.2))
+    asked = []
+    monkeypatch.setattr(
+        Designer, "_towards", lambda self, start, end, most: asked.append((start, most)) or start
+    )
+    designer._updated(state, fast, 1e-3)
+    assert [most for _, most in asked] == [1.0 - 0.003] * len(asked)
+    assert any(start is kept for start, _ in asked)
+
+
+def test_a_search_has_converged_near_its_limits_when_it_gains_no_more(designer, monkeypatch):
+    """Before the round the criterion is 5; 1 is the iterate, 2 it scaled, 3 mixed, 0 that before.
+
+    Per round: use of the limits, margin [m], criterion of 1, 2 and 3; criterion, number and next
+    iterate after it, violation, whether it has converged.
+    """
+    zero = np.zeros((designer.basis.size, 3))
+    before = State(zero, 5.0, zero, Multipliers(0.2))
+    monkeypatch.setattr(Designer, "_feasible", lambda self, C, most: zero + 2.0)
+    monkeypatch.setattr(Designer, "_towards", lambda self, kept, C, most: zero + 3.0)
+    monkeypatch.setattr(Designer, "matrix", lambda self, rows: rows)
+    monkeypatch.setattr(Designer, "_near", lambda self, rows, multipliers: None)
+    monkeypatch.setattr(Multipliers, "raised", lambda self, *_: self)
+    for used, margin, own, scaled, mixed, *wanted in [
+        (1.005, 0.0, 4.980, 4.990, None, 4.990, 2, 1, 0.008, False),  # gains more
+        (1.005, 0.0, 4.990, 4.999, 5.100, 4.999, 2, 1, 0.008, True),
+        (0.900, 0.0, 4.990, 5.010, 4.999, 4.999, 3, 1, 0.0, True),
+        (1.020, 0.0, 4.990, 4.999, 5.100, 4.999, 2, 2, 0.023, False),  # not near the limits
+        (0.900, -1e-3, 4.99, 4.999, 5.100, 4.999, 2, 2, 1e-3 / SOFT, False),
+        (0.900, -1e-3, 4.94, 4.950, None, 4.950, 2, 1, 1e-3 / SOFT, False),
+        (0.900, 0.0, 4.940, 4.985, None, 4.985, 2, 2, 0.0, False),  # scaling costs too much
+        (0.900, 0.0, 4.940, 4.970, None, 4.970, 2, 1, 0.0, False),
+        (0.900, 0.0, 5.040, 5.100, 5.050, 5.000, 0, 1, 0.0, True),  # worse than before
+        (1.020, 0.0, 5.040, 5.100, 5.050, 5.000, 0, 0, 0.023, False),
+    ]:
+        shares = np.full((6, 4, 3), 0.1)
+        shares[2, 1, 0] = -used
+        monkeypatch.setattr(Designer, "_constraints", lambda *_, x=shares, y=margin: (x, y, "rows"))
+        monkeypatch.setattr(Designer, "judged", lambda *_, x=own: (x, None))
+        values = {2.0: scaled, 3.0: mixed}
+        monkeypatch.setattr(Designer, "_objective", lambda _, C, x=values: x[C[0, 0]])
+        after, violation = designer._updated(before, zero + 1.0, 2e-3)
+        found = [after.objective, after.feasible[0, 0], after.iterate[0, 0], violation]
+        assert found == pytest.approx(wanted[:4], abs=1e-12), (used, margin, own)
+        assert after.is_settled is wanted[4], (used, margin, own)
+
+
+def test_random_motions_leave_the_reserve_of_limits_and_of_distances(wrist, designer):
+    """0.3 % of the limits, and of a pair its own; the search requires twice that of distances."""
+    motions = [designer.random(np.random.default_rng(seed)) for seed in range(10)]
+    largest = [np.abs(designer._constraints(C)[0]).max() for C in motions]
+    assert 0.996 < max(largest) <= 0.997 + 1e-9
+    asked = []
+
+    def margins(placed, spare, hints):
+        asked.append(spare)
+        return np.outer([0.2, 0.1 - spare], np.ones(43))
+
+    around = SimpleNamespace(
+        pairs=[(0, 1), (1, 2)], required=np.array([0.01, 0.03]), placed=lambda q: q,
+        spare=np.array([[2e-3], [5e-4]]), margins=margins,
+    )  # fmt: skip
+    near = replace(designer, clearance=around)
+    assert near._constraints(motions[0], 0.7)[1] == pytest.approx(0.1 - 0.7)
+    np.testing.assert_allclose(near._required, [[0.014], [0.031]])
+    near._feasible(motions[0], 0.5)
+    assert asked[0] == 0.7
+    assert set(asked[1:]) == {1.0}
+
+
+def test_multipliers_push_as_hard_on_a_finer_grid():
+    limits = np.random.default_rng(0).uniform(0.0, 0.1, (6, 61, 3))
+    distances = np.random.default_rng(1).uniform(0.0, 0.1, (4, 61))
+    fine = Multipliers(0.2, limits, distances).finer(3)
+    assert fine.limits.shape == (6, 181, 3)
+    np.testing.assert_allclose(fine.limits[:, ::3], limits / 3)
+    between = (2 * distances[:, :-1] + distances[:, 1:]) / 9
+    np.testing.assert_allclose(fine.distances[:, 1::3], between)
+    assert fine.weight == pytest.approx(0.2 / 3)
+
+
+def test_distances_without_a_cost_are_not_looked_at_and_change_nothing(wrist, designer):
+    wall = Box("wall", (-2.0, 0.35, -2.0), (2.0, 0.40, 2.0))
+    around = Clearance(wrist, least=0.01, boxes=[wall])
+    near, rng = replace(designer, clearance=around), np.random.default_rng(2)
+    C = near.random(rng)
+    placed = around.placed((designer._functions @ C)[0])
+    pairs = len(around.pairs), 43
+    held = Multipliers(0.2, 0.0, rng.uniform(0.0, 0.05, pairs) * (rng.random(pairs) < 0.5))
+    aim = near._required
+    some, every = (
+        held.of_distances(around.near(placed, within).distance, aim)
+        for within in (held.distance_without_cost(aim), np.inf)
+    )
+    assert some[0] == pytest.approx(every[0], rel=1e-12)
+    np.testing.assert_allclose(some[1], every[1], atol=1e-12)
+    looked_at = len(around.near(placed, held.distance_without_cost(aim)).pairs)
+    assert 0 < looked_at < len(around.near(placed, np.inf).pairs) / 2
+
+
+def test_a_posture_in_collision_counts_by_what_its_distances_are_short_of(wrist, designer):
+    inside = Clearance(wrist, least=0.01, boxes=[Box("room", (-3.0, -3.0, -3.0), (3.0, 3.0, 3.0))])
+    near = replace(designer, clearance=inside).postures
+    q = near._drawn(np.random.default_rng(0), 20)
+    distance = inside.near(inside.placed(q), np.inf, inside.everything).distance
+    short = np.maximum(inside.required[:, None] + inside.spare - distance, 0.0)
+    limits = replace(near, clearance=None)._broken_by_joint(q)
+    of_pairs = (near._broken_by_joint(q) - limits).sum(axis=1)
+    np.testing.assert_allclose(of_pairs, short.sum(axis=0) / 0.05, rtol=1e-6)
+    text = near._why_not(*near._at_rest(q))
+    found, wanted = re.search(r"room is (\S+) mm at most, wanted (\S+) mm", text).groups()
+    assert float(found) in [pytest.approx(1e3 * own.max(), abs=0.06) for own in distance]
+    assert float(wanted) == pytest.approx(1e3 * (0.01 + inside.spare.max()), abs=0.06)
+
+
+def test_what_a_joint_needs_to_rest_is_the_least_of_what_postures_need(wrist, designer):
+    q = designer.postures._drawn(np.random.default_rng(3), 10)
+    none, pi = np.zeros_like(q), wrist.standard_parameters()
+    tau = np.abs((joint_torque_regressor(wrist, q, none, none) @ pi).reshape(10, 3)[:, 0])
+    assert tau.max() > 1.5 * tau.min() > 0.0
+    weak = designer.limits.sizes.copy()
+    weak[4, 0] = tau.min() / 3
+    postures = replace(designer.postures, limits=replace(designer.limits, sizes=weak))
+    words = postures._why_not(*postures._at_rest(q))
+    assert "wrist_1_joint needs at least 300 % of its torque limit; state" in words
+
+
+def test_what_most_postures_violate_is_named_if_no_limit_rules_out_all(wrist, designer):
+    """Of eight postures; two pairs of links and two limits."""
+    around = SimpleNamespace(
+        named=[("tool", "floor"), ("arm", "post")], required=np.array([0.02, 0.03]),
+        spare=np.array([[2e-3], [1e-3]]),
+    )  # fmt: skip
+    used, margins = np.full((6, 8, 3), 0.5), np.full((2, 8), 0.1)
+    used[4, :3, 1], used[0, 7, 2], used[4, 3, 1] = 1.4, 1.01, 1.0
+    margins[1, 2:7], margins[0, 0] = -0.004, -0.001
+    postures = replace(designer.postures, clearance=around)
+    assert postures._why_not(used, margins).startswith(
+        "none of 8 random postures is feasible at rest: each violates a limit or a distance, "
+        "wanted one without violations. Most frequent: arm and post are nearer than 31.0 mm in "
+        "62 %, wrist_2_joint needs more than its torque limit in 38 %, wrist_3_joint needs more "
+        "than its position limit in 12 %"
+    )
+    margins[1] = -0.004
+    margins[1, 5] = -0.0015
+    assert postures._why_not(used, margins).endswith(
+        "rest: the distance of arm and post is 29.5 mm at most, wanted 31.0 mm; lower the "
+        "clearance, or move the floor and the boxes"
+    )
+
+
+def test_a_motion_that_collides_between_samples_is_scaled_more_and_more(designer):
+    C = np.arange(1.0, 1.0 + designer.basis.size * 3).reshape(-1, 3)
+    margins, seen = [], []
+
+    def nearest(motion, duration):
+        assert duration == 4.0
+        seen.append(motion.coefficients)
+        return Contact("arm", "post", 0.02 + margins.pop(0), 1.5, 0.02)
+
+    near = replace(designer, clearance=SimpleNamespace(nearest=nearest))
+    margins[:] = [-0.01, -0.005, -0.001, 0.0]
+    found, contact = near._clear(C)
+    for own, share in zip(seen, np.cumprod([1.0, 0.99, 0.98, 0.96]), strict=True):
+        np.testing.assert_allclose(own, np.vstack([C[:1], share * C[1:]]))
+    assert found is seen[-1]
+    assert contact.margin == 0.0
+    margins[:] = [-0.01] * 9 + [-0.0042]
+    with pytest.raises(NotConvergedError) as caught:
+        near._clear(C)
+    words = "of the design arm and post approach to 16 mm at 1.50 s, margin -4.2 mm, wanted 0 or"
+    assert words in str(caught.value)
+    share = np.prod([0.99, 0.98, 0.96, 0.92, 0.84, 0.68, 0.5, 0.5, 0.5])
+    np.testing.assert_allclose(seen[-1][1:], share * C[1:])
+    assert str(Contact("a", "b", -0.003, 2.346)) == "a and b overlap at 2.35 s"
+
+
+def test_postures_are_drawn_from_the_middle_of_wide_ranges(designer):
+    sizes = designer.limits.sizes.copy()
+    sizes[0], sizes[1] = (1.0, 3.0, 3.0), (3.0, 1.0, 1.0)
+    postures = replace(designer.postures, limits=replace(designer.limits, sizes=sizes))
+    q = postures._drawn(np.random.default_rng(0), 4000) - designer.limits.middle
+    np.testing.assert_allclose(np.abs(q).max(axis=0), [0.8, 1.44, 1.44], rtol=0.01)
+
+
+def test_an_examined_motion_is_judged_with_what_is_known_and_its_condition_without(designer, rng):
+    """Of 5.02 s in 100 steps, about 20 Hz; the second joint rests and contributes nothing."""
+    size = len(designer.spread)
+    A = rng.standard_normal((size, size))
+    given = np.eye(size) + 0.3 * A @ A.T
+    some = replace(
+        designer, given=given, moving=np.array([True, False, True]), name="widest",
+        noise=np.array([0.01, 0.4, 0.09]),
+    )  # fmt: skip
+    motion = some.checked(some.random(rng)).motion
+    found = some.examined(motion, 5.02, 20.0)
+    t = np.linspace(0.0, 5.02, 101)
+    q, v, a = motion.evaluate(t)
+    rows = some.information.rows(q, v, a)
+    F = given.copy()
+    for j, noise in ((0, 0.01), (2, 0.09)):
+        W = rows.W[j].T * some.spread
+        F += 0.0502 / noise * W.T @ W
+    variance = np.diag(np.linalg.inv(F))
+    widest = np.argsort(np.diag(np.linalg.inv(given)))[-round(size / 4) :]
+    assert sorted(some.widest) == sorted(widest)
+    assert found.objective == pytest.approx(np.log(variance[widest]).mean())
+    used = some.limits.used(q, v, a, 0.0 * a, some.information.torque(rows))
+    np.testing.assert_allclose(found.used, np.abs(used).max(axis=1))
+    assert (found.intervals, found.duration) == (100, 5.02)
+    whole = designer.checked(designer.random(rng)).motion  # all joints move
+    alone = designer.examined(whole, 5.02, 20.0)
+    rows = designer.information.rows(*whole.evaluate(t))
+    W = np.concatenate(
+        [np.sqrt(0.0502 / n) * w.T * designer.spread
+         for n, w in zip(designer.noise, rows.W, strict=True)]
+    )  # fmt: skip
+    assert alone.condition == pytest.approx(np.linalg.cond(W), rel=1e-4)
+    assert alone.objective == pytest.approx(-np.linalg.slogdet(W.T @ W + np.eye(size))[1] / size)
+
+
+def test_a_motion_longer_than_the_basis_is_examined_for_collisions_to_its_end(wrist, designer):
+    heard = []
+    around = SimpleNamespace(nearest=lambda *asked: heard.append(asked) or None)
+    near, motion = replace(designer, clearance=around), ProgramMotion(np.full(3, 0.2), 9.0)
+    assert near.examined(motion, 9.0, 10.0).contact is None
+    assert heard == [(motion, 9.0)]  # that of the basis is 4 s
+
+
+def test_a_motion_after_a_run_has_its_noise_its_parameters_and_its_information(wrist, rng):
+    mapping, heard = structural_mapping(wrist), []
+    A = rng.standard_normal(2 * (len(mapping.K),))
+    noise = TorqueNoise(np.array([0.3, 0.5, 0.2]), np.array([0.02, 0.04, 0.05]), 3 * ("found",))
+    pi = wrist.standard_parameters()
+    pi[wrist.layout.n_inertial :] = rng.uniform(0.1, 0.3, len(pi) - wrist.layout.n_inertial)
+    factors = SimpleNamespace(information=lambda weights: heard.append(weights) or A @ A.T)
+    run = SimpleNamespace(standard=pi, noise=lambda K: noise, step=0.01, factors=factors)
+    found = Designer.of_model(
+        wrist, FourierBasis(4.0, 3), MotionLimits.of_model(wrist), run=run, noise={WRIST[1]: 0.9}
+    )
+    density = np.array([0.3, 0.9, 0.2]) ** 2 * [0.02, 0.1, 0.05]  # one is stated, over 0.1 s
+    np.testing.assert_allclose(found.noise, density)
+    np.testing.assert_allclose(heard, [0.01 / density])
+    S = found.spread
+    np.testing.assert_allclose(found.given, np.eye(len(A)) + S[:, None] * (A @ A.T) * S)
+    np.testing.assert_allclose(found.known, found.given)
+    np.testing.assert_allclose(found.information.beta, mapping.to_base(pi))

@@ -1,0 +1,220 @@
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from robotid.base.exceptions import SettingsError
+from robotid.design import routes
+from robotid.design.basis import FourierBasis
+from robotid.design.clearance import Clearance, Contact
+from robotid.design.course import Course
+from robotid.design.design import Designer
+from robotid.design.limits import LIMITS, MotionLimits
+from robotid.design.routes import (
+    _PLACES,
+    Route,
+    _free_range,
+    _legs,
+    _sweeps,
+    _visited,
+    design_stands,
+    design_sweeps,
+)
+from robotid.robot.examples import example_urdf
+from robotid.robot.model import RobotModel
+
+
+@pytest.fixture(scope="module")
+def designer():
+    joints = ["shoulder_lift_joint", "elbow_joint", "wrist_1_joint"]
+    model = RobotModel.from_urdf(example_urdf("ur10_robot.urdf"), joints=joints)
+    limits = MotionLimits.of_model(model, share=0.8)
+    return Designer.of_model(
+        model, FourierBasis(10.0, 5), limits, clearance=Clearance(model, least=0.01, floor=-0.1)
+    )
+
+
+def test_a_route_rests_cruises_and_its_derivatives_are_true():
+    places = np.array([[0.0, 1.0], [1.0, 1.0], [0.5, -1.0]])
+    route = Route(places, np.array([2.0, 1.0]), np.array([0.1, 0.5]), np.array([0.5, 0.3, 0.2]))
+    assert route.duration == pytest.approx(4.0)
+    t = np.linspace(0.0, 4.0, 40_001)
+    q, v, a = route.evaluate(t)
+    np.testing.assert_allclose(np.gradient(q, t, axis=0)[1:-1], v[1:-1], atol=2e-4)
+    np.testing.assert_allclose(np.gradient(v, t, axis=0)[1:-1], a[1:-1], atol=4e-2)
+    for time, place in ((0.4, 0), (2.6, 1), (3.9, 2)):
+        k = np.searchsorted(t, time)
+        np.testing.assert_allclose(q[k], places[place], atol=1e-12)
+        assert np.abs(v[k]).max() == 0.0
+    cruise = (t > 0.71) & (t < 2.29)  # 0.5 + 0.2 to 2.5 - 0.2
+    np.testing.assert_allclose(v[cruise, 0], 1.0 / (2.0 * 0.9), rtol=1e-12)
+
+
+def test_room_ends_at_the_nearest_place_where_the_robot_cannot_rest(designer):
+    low, high = (designer.limits.middle + s * designer.limits.sizes[0] for s in (-1, 1))
+    step, blocked = (high - low) / (_PLACES - 1), 0
+    for posture in designer.postures.resting(np.random.default_rng(0), 200)[:5]:
+        for j, room in enumerate(_free_range(designer, posture)):
+            for way, left in zip((-1.0, 1.0), room, strict=True):
+                q = np.tile(posture, (50, 1))
+                q[:, j] += way * np.linspace(0.0, max(left - step[j], 0.0), 50)
+                assert designer.postures.can_rest(q).mean() > 0.95  # but between the places
+                q[0, j] = posture[j] + way * left
+                if min(q[0, j] - low[j], high[j] - q[0, j]) > 1e-9:
+                    assert not designer.postures.can_rest(q[:1])[0]
+                    blocked += 1
+    assert blocked > 10
+
+
+def test_a_sweep_lasts_three_seconds_if_there_is_room(designer):
+    posture, fastest = np.array([0.1, 0.2, 0.3]), designer.limits.sizes[1]
+    room = np.array([[0.2, 9.0], [9.0, 0.3], [9.0, 9.0]])
+    route = _sweeps(designer, posture, room, (0.1, 0.4))
+    k = 0
+    for j in range(3):
+        for share in (0.1, 0.4):
+            speed = share * fastest[j]
+            down, up = np.minimum(room[j], 1.5 * speed)  # half of it either way
+            wanted = np.array([posture[j], posture[j] + up, posture[j] - down, posture[j]])
+            np.testing.assert_allclose(route.places[k : k + 4, j], wanted)
+            way = np.abs(np.diff(wanted))
+            np.testing.assert_allclose(route.times[k : k + 3], way / speed + 0.25)
+            np.testing.assert_allclose(route.ramps[k : k + 3] * route.times[k : k + 3], 0.25)
+            k += 3
+    assert len(route.places) == k + 1
+
+
+def test_sweeps_go_both_ways_at_each_speed_while_the_others_rest(designer, rng):
+    design = design_sweeps(designer, rng, speeds=(0.1, 0.4))
+    # the page shows what was checked, at the same instants
+    kinds = [k for k, kind in enumerate(LIMITS) if kind != "jerk"]
+    shown = Course.of_design(designer, design)
+    np.testing.assert_allclose(shown.largest[kinds], design.used[kinds], rtol=1e-9)
+    assert len(shown.t) - 1 == round(100 * design.duration)
+    assert design.used.max() <= 1.0
+    assert design.contact is None or design.contact.distance >= 0.01
+    t = np.arange(0.0, design.motion.duration, 0.01)
+    _, v, a = design.motion.evaluate(t)
+    for j, fastest in enumerate(designer.limits.sizes[1]):
+        steady = v[(np.abs(a).max(axis=1) < 1e-9) & (np.abs(v[:, j]) > 1e-6)]
+        assert set(np.round(steady[:, j] / fastest, 6)) == {-0.4, -0.1, 0.1, 0.4}
+        assert np.abs(np.delete(steady, j, axis=1)).max() == 0.0
+
+
+def test_sweeps_are_about_the_posture_whose_worst_joint_has_the_largest_share(monkeypatch):
+    """Of half ranges of 2 and 1 rad, shares of the worst joints are 0.1, 0.5 and 0.4."""
+    free = np.array([[[2.0, 2.0], [0.0, 0.1]], [[0.5, 0.5], [0.7, 0.1]], [[1.8, 0.6], [0.2, 0.2]]])
+    about = SimpleNamespace(
+        postures=SimpleNamespace(resting=lambda rng, count: np.arange(6.0).reshape(3, 2)),
+        limits=SimpleNamespace(sizes=np.array([[2.0, 1.0]])),
+        examined=lambda *_: SimpleNamespace(contact=None, used=np.zeros((6, 2))),
+    )
+    told = []
+    monkeypatch.setattr(routes, "_free_range", lambda designer, posture: free[int(posture[0]) // 2])
+    monkeypatch.setattr(
+        routes, "_sweeps", lambda *asked: told.append(asked[1:]) or SimpleNamespace(duration=1.0)
+    )
+    design_sweeps(about, None, speeds=(0.1,))
+    [(posture, room, speeds)] = told
+    np.testing.assert_array_equal(posture, [2.0, 3.0])
+    np.testing.assert_allclose(room, 0.8 * free[1])
+    assert speeds == (0.1,)
+
+
+@pytest.mark.parametrize("feasible", [8, 9])
+def test_sweeps_are_shortened_by_a_fifth_seven_times_at_most(monkeypatch, feasible):
+    shares, joints = [], ("a", "b")
+
+    def examined(*_):
+        used = np.full((6, 2), 0.5)
+        used[4, 1] = 0.9 if len(shares) == feasible else 3.5
+        return SimpleNamespace(contact=None, used=used, number=len(shares))
+
+    about = SimpleNamespace(
+        postures=SimpleNamespace(resting=lambda rng, count: np.zeros((30, 2))),
+        limits=SimpleNamespace(sizes=np.array([[2.0, 1.0]])), examined=examined,
+        information=SimpleNamespace(model=SimpleNamespace(joints=joints)),
+    )  # fmt: skip
+    monkeypatch.setattr(routes, "_free_range", lambda *_: np.array([[1.0, 2.0], [0.5, 0.5]]))
+    monkeypatch.setattr(
+        routes, "_sweeps",
+        lambda designer, posture, free, _: shares.append(free[0]) or SimpleNamespace(duration=1.0),
+    )  # fmt: skip
+    contact = Contact("arm", "post", -0.01, 2.0)
+    stuck = SimpleNamespace(contact=contact, used=np.zeros((6, 2)))
+    assert routes._why(stuck, about) == "arm and post overlap at 2.00 s"
+    if feasible == 8:
+        assert design_sweeps(about, None).number == 8
+    else:
+        wanted = r"about none of 20 random .* can sweep: b needs 350 %; lower"
+        with pytest.raises(SettingsError, match=wanted):
+            design_sweeps(about, None)
+    np.testing.assert_allclose(shares, 0.8 ** np.arange(1, 9)[:, None] * [1.0, 2.0])
+
+
+def test_stands_weigh_torques_by_their_noise_over_two_seconds(monkeypatch):
+    """Six of nine postures, one by one: each adds most to log det of the information."""
+    rng = np.random.default_rng(3)
+    q, W = rng.uniform(-3.0, 3.0, (9, 2)), rng.standard_normal((2, 3, 9))
+    noise, spread = np.array([4.0, 0.01]), np.array([1.0, 2.0, 0.5])  # [(N m)^2 s]
+    W[1] *= 0.05
+    about = SimpleNamespace(
+        postures=SimpleNamespace(resting=lambda rng, count: q), noise=noise, spread=spread,
+        information=SimpleNamespace(rows=lambda *_: SimpleNamespace(W=W)), known=np.eye(3),
+    )  # fmt: skip
+    monkeypatch.setattr(routes, "_visited", lambda designer, places: places)
+    F, wanted = np.eye(3), []
+    of = [(W[..., k] * spread).T @ np.diag(2.0 / noise) @ (W[..., k] * spread) for k in range(9)]
+    for _ in range(6):
+        left = [k for k in range(9) if k not in wanted]
+        wanted.append(max(left, key=lambda k: np.linalg.det(F + of[k])))
+        F = F + of[wanted[-1]]
+    places = design_stands(about, None, count=6)
+    np.testing.assert_array_equal(places[0], q[wanted[0]])
+    assert sorted(places[:, 0]) == sorted(q[wanted, 0])
+    for k in range(1, 6):  # from each to the nearest that is left
+        assert np.abs(places[k:] - places[k - 1]).max(axis=1).argmin() == 0
+
+
+def test_stands_tell_more_of_gravity_than_random_ones(designer):
+    design = design_stands(designer, np.random.default_rng(0), count=6)
+    assert design.used.max() <= 1.0
+    assert design.contact is None or design.contact.distance >= 0.01
+    places = design.motion.places
+    assert len(places) >= 4
+
+    def told(q):
+        rows = designer.information.rows(q, 0.0 * q, 0.0 * q)
+        scale = designer.spread * np.sqrt(2.0 / designer.noise)[:, None]
+        A = (scale[..., None] * rows.W).swapaxes(0, 1).reshape(len(designer.spread), -1)
+        return np.linalg.slogdet(A @ A.T + np.eye(len(A)))[1]
+
+    rng = np.random.default_rng(1)
+    some = designer.postures.resting(rng)
+    random = [told(rng.choice(some, len(places), replace=False)) for _ in range(50)]
+    assert told(places) > max(random)
+
+
+def test_a_leg_has_half_the_speed_limit_of_the_slowest_joint_and_at_least_a_second(designer):
+    fastest = designer.limits.sizes[1]
+    way = np.array([0.4, -1.5, 0.9]) * fastest
+    route = _legs(designer, np.array([0.0 * way, way, 1.01 * way]))
+    np.testing.assert_allclose(route.times, [2.0 * 1.5 / 0.5, 1.0])
+    np.testing.assert_array_equal(route.holds, 2.0)
+    t = np.linspace(2.0, 8.0, 601)  # the first leg, after 2 s at rest
+    v = np.abs(route.evaluate(t)[1]).max(axis=0)
+    np.testing.assert_allclose(v, 0.5 * np.abs(way) / 1.5, rtol=1e-9)
+
+
+def test_a_posture_is_reached_from_the_last_one_visited_or_left_out(monkeypatch):
+    def examined(leg, *_):
+        is_blocked = leg.places[:, 0].tolist() == [1.0, 2.0]  # the line from 1 to 2
+        return SimpleNamespace(contact=None, used=np.full((6, 1), 0.5 + is_blocked), leg=leg)
+
+    monkeypatch.setattr(
+        routes, "_legs", lambda designer, places: SimpleNamespace(places=places, duration=1.0)
+    )
+    found = _visited(SimpleNamespace(examined=examined), np.arange(5.0)[:, None])
+    assert found.leg.places[:, 0].tolist() == [0.0, 1.0, 3.0, 4.0]
+    with pytest.raises(SettingsError, match="every line between two postures has a collision"):
+        _visited(SimpleNamespace(examined=examined), np.array([[1.0], [2.0], [2.0]]))

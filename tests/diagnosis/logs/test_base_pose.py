@@ -1,0 +1,411 @@
+"""Findings on the pose of a floating base: jumps, and the order of its quaternion."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from helpers.humans import FEET, human_urdf, logged, walk
+
+from robotid.data.base_motion import BaseMotion, base_state, in_base, quaternions_of_angles
+from robotid.data.log import Log
+from robotid.data.signal_settings import SignalSettings
+from robotid.data.signals import process
+from robotid.diagnosis.logs import base_pose
+from robotid.diagnosis.logs.base_pose import (
+    _check_readings,
+    _check_vertical,
+    _Feet,
+    _names,
+    _vertical,
+    check_pose,
+    check_twist,
+    check_unit,
+)
+from robotid.diagnosis.logs.contacts import check_base
+from robotid.robot.constraints import Contact, frame_id, link_positions
+from robotid.robot.examples import example_urdf
+from robotid.robot.model import RobotModel
+
+UNTURNED = pin.SE3(pin.exp3(np.array([0.0, 0.0, -1.5])), np.zeros(3))
+SLOW = SignalSettings(cutoff=4.0)
+
+
+@pytest.fixture(scope="module")
+def robot(tmp_path_factory):
+    path = tmp_path_factory.mktemp("human") / "human.urdf"
+    path.write_text(human_urdf())
+    return RobotModel.from_urdf(
+        path, free_flyer=True, terms=(), constraints=[Contact(foot, "surface") for foot in FEET]
+    )
+
+
+@pytest.fixture(scope="module")
+def log(robot):
+    """Return a walk with flags of the feet: which one has the lower height."""
+    motion = walk(robot, robot, np.random.default_rng(2), duration=6.0, rate=60.0)
+    log = logged(robot, motion, np.random.default_rng(3))
+    heights = np.array([[place.translation[2] for place in row] for row in motion.feet])
+    flags = {foot: heights[:, k] < 0.0801 for k, foot in enumerate(FEET)}
+    return replace(log, contacts=flags, wrenches={})
+
+
+def with_quaternion(log, change):
+    pose = log.base.pose.copy()
+    pose[:, 3:] = change(pose[:, 3:])
+    return replace(log, base=BaseMotion(pose))
+
+
+def test_signs_of_quaternions_have_no_effect(robot, log):
+    signs = np.where(np.random.default_rng(0).random(len(log.t)) < 0.5, -1.0, 1.0)
+    flipped = with_quaternion(log, lambda q: signs[:, None] * q)
+    assert not list(check_base(robot, flipped, SLOW))
+    assert np.abs(flipped.base.pose - log.base.pose).max() < 1e-15
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda q: np.roll(q, 1, axis=1), "its order is qw qx qy qz"),
+        (lambda q: q * [-1.0, -1.0, -1.0, 1.0], "it is the orientation of the world in the base"),
+    ],
+)
+def test_another_order_of_the_quaternion_is_named(robot, log, change, words):
+    (found,) = check_base(robot, with_quaternion(log, change), SLOW)
+    assert (found.code, found.severity) == ("base_orientation", "error")
+    assert words in found.message
+    assert found.evidence["best"] < 0.1  # [m/s], noise of the markers
+
+
+def test_gravity_is_stated_along_the_one_axis_that_may_be_the_vertical():
+    G = np.array([0.0, 0.0, -3.7])
+    for up, said in (
+        ([0.9, 0.1, -0.3], "[-3.7, 0, 0]"), ([0.2, -0.8, 0.1], "[0, 3.7, 0]"),
+        ([-0.1, 0.0, 0.4], "[0, 0, -3.7]"), ([0.02, 0.05, 0.29], None), ([0.7, 0.6, 0.0], None),
+    ):  # fmt: skip
+        assert _vertical(np.array(up), G) == (said and f"gravity = {said}")
+    turn = np.array([[0.1, 0.9, 0.0], [0.2, 0.1, -0.8], [0.7, -0.1, 0.3]])
+    assert _names(turn) == ["y", "-z", "x"]
+    lying = np.array([0.18, -0.72, 0.24])  # its length is 0.78
+    (found,) = _check_vertical(SimpleNamespace(name="run.csv"), lying, G)
+    assert "above them along -y of the world" in found.message
+    assert found.evidence == {"height": pytest.approx(4 / 13), "best": pytest.approx(12 / 13)}
+
+
+@pytest.mark.parametrize(("axis", "down"), [("y", -9.81), ("-y", 9.81)])
+def test_another_vertical_axis_of_the_world_is_named(robot, log, axis, down):
+    turn = pin.Quaternion(pin.rpy.rpyToMatrix(np.sign(down) * np.pi / 2, 0.0, 0.0))  # z becomes it
+    pose = log.base.pose.copy()
+    pose[:, :3] = pose[:, :3] @ turn.matrix().T
+    pose[:, 3:] = [(turn * pin.Quaternion(x)).coeffs() for x in pose[:, 3:]]
+    other = replace(log, base=BaseMotion(pose))
+    (found,) = check_base(robot, other, SLOW)
+    assert (found.code, found.severity) == ("base_orientation", "error")
+    assert f"above them along {axis} of the world" in found.message
+    assert f"state gravity = [0, {down}, 0] at the top" in found.message
+    assert abs(found.evidence["height"]) < 0.2
+    assert found.evidence["best"] > 0.9
+    stated = RobotModel.from_urdf(
+        robot.tree.path, free_flyer=True, terms=(), constraints=robot.contacts,
+        gravity=(0.0, down, 0.0),
+    )  # fmt: skip
+    assert not list(check_base(stated, other, SLOW))
+
+
+def test_the_pose_of_another_link_is_that_of_the_root_first(robot, log):
+    data, head = robot.pin_model.createData(), frame_id(robot.pin_model, "Head")
+    poses = []
+    for q in robot.configurations(np.hstack([log.base.pose, log.q])):
+        pin.framesForwardKinematics(robot.pin_model, data, q)
+        leans = data.oMf[head].act(pin.SE3(pin.exp3(np.array([0.0, 0.0, 1.5])), np.zeros(3)))
+        poses.append(pin.SE3ToXYZQUAT(leans))
+    straight = [pin.SE3ToXYZQUAT(pin.XYZQUATToSE3(x) * UNTURNED) for x in poses]
+    stated = replace(log, base=BaseMotion(np.array(straight), link="Head"))
+    assert not list(check_base(robot, stated, SLOW))
+    other = replace(log, base=BaseMotion(np.array(poses), link="Head"))  # turned about its axis
+    assert [x.code for x in check_base(robot, other, SLOW)] == ["base_orientation"]
+
+
+def test_a_base_that_rolls_over_has_no_wrong_axes(robot, log):
+    angle = np.pi * np.clip(log.t - log.t[-1] / 2 + 0.5, 0.0, 1.0)  # the whole world turns in 1 s
+    turns = [pin.Quaternion(pin.exp3(np.array([x, 0.0, 0.0]))) for x in angle]
+    pose = [
+        np.r_[turn * x[:3], (turn * pin.Quaternion(x[3:])).coeffs()]
+        for turn, x in zip(turns, log.base.pose, strict=True)
+    ]
+    rolls = replace(log, base=BaseMotion(np.array(pose)))
+    assert "base_orientation" not in {x.code for x in check_base(robot, rolls, SLOW)}
+
+
+def test_a_position_in_millimetres_is_named(robot, log):
+    pose = log.base.pose.copy()
+    pose[:, :3] *= 1e3
+    (found,) = check_base(robot, replace(log, base=BaseMotion(pose)), SLOW)
+    assert (found.code, found.severity) == ("base_unit", "error")
+    step = 12  # rows in 0.2 s
+    x = pose[::step, :3]
+    second = (x[2:] - 2 * x[1:-1] + x[:-2]) / 0.2**2
+    size = np.sqrt(np.mean(np.sum(second**2, axis=1)))
+    assert found.evidence["acceleration"] == pytest.approx(size, rel=0.05)
+    (later,) = check_unit(replace(log, t=log.t + 900.0, base=BaseMotion(pose)))
+    assert later.evidence["acceleration"] == pytest.approx(found.evidence["acceleration"], rel=1e-6)
+    short = replace(log, base=BaseMotion(pose)).window(log.t[0], log.t[0] + 0.3)
+    assert list(check_unit(short)) == []  # no acceleration over 0.2 s in it
+    noisy = log.base.pose + 5e-3 * np.random.default_rng(0).standard_normal(log.base.pose.shape)
+    noisy[:, 3:] = log.base.pose[:, 3:]
+    assert not [x.code for x in check_base(robot, replace(log, base=BaseMotion(noisy)), SLOW)
+                if x.code == "base_unit"]  # fmt: skip
+    assert f"are in mm, it is {1e-3 * found.evidence['acceleration']:.2g} m/s^2" in found.message
+
+
+def test_jumps_are_found_with_size_and_time(log):
+    assert not list(check_pose(log))
+    pose = log.base.pose.copy()
+    pose[100:, 0] += 0.04
+    pose[200:, 2] -= 0.06
+    (found,) = check_pose(replace(log, base=BaseMotion(pose)))
+    assert (found.code, found.severity) == ("base_jump", "warning")
+    assert found.evidence["jumps"] == 2
+    assert found.evidence["size"] == pytest.approx(0.06, rel=0.1)
+    assert found.evidence["first"] == log.t[100]
+    assert "jumps 2 times, first at t = 1.667 s by 0.041 m: a marker" in found.message
+    pose[:50, 3:] = np.roll(pose[:50, 3:], 1, axis=1)  # turned before: each kind has its own time
+    of_kind = list(check_pose(replace(log, base=BaseMotion(pose))))
+    assert [x.evidence["first"] for x in of_kind] == [log.t[100], log.t[50]]
+
+
+def test_an_impact_is_no_jump(log):
+    still = BaseMotion(np.tile([0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0], (len(log.t), 1)))
+    pose = still.pose.copy()
+    pose[100:, 2] += 2.0 * (log.t[100:] - log.t[100])  # 33 mm per row from one row on
+    assert not list(check_pose(replace(log, base=BaseMotion(pose))))
+    pose[100:, 2] += 0.1
+    (found,) = check_pose(replace(log, base=BaseMotion(pose)))
+    assert found.code == "base_jump"
+
+
+def test_a_turn_of_the_tag_is_found_and_one_in_a_gap_is_not(log):
+    half = np.array([0.0, 0.0, np.sin(0.1), np.cos(0.1)])  # 0.2 rad about z
+
+    def turned(q):
+        x, y, z, w = q.T
+        a, b = half[2], half[3]
+        later = np.column_stack([b * x - a * y, b * y + a * x, b * z + a * w, b * w - a * z])
+        return np.where(np.arange(len(q))[:, None] < 150, q, later)
+
+    jumped = with_quaternion(log, turned)
+    (found,) = check_pose(jumped)
+    assert found.evidence["size"] == pytest.approx(0.2, abs=0.02)
+    assert " rad: " in found.message
+    apart = np.where(np.arange(len(log.t)) < 150, log.t, log.t + 5.0)
+    assert not list(check_pose(replace(jumped, t=apart)))
+    after = log.base.pose.copy()
+    after[150, 0] += 0.05
+    after[151:, 0] -= 0.1  # the step after a gap has no step before it
+    assert list(check_pose(replace(log, base=BaseMotion(after))))
+    assert not list(check_pose(replace(log, t=apart, base=BaseMotion(after))))
+
+
+Y_UP = pin.rpy.rpyToMatrix(-np.pi / 2, 0.0, 0.0)  # z becomes y
+QUARTER = pin.rpy.rpyToMatrix(0.0, 0.0, np.pi / 2)
+MIRROR = np.eye(3)[[0, 2, 1]]  # y and z exchanged: left-handed
+
+
+@pytest.mark.parametrize(
+    ("place", "turn", "words"),
+    [
+        (Y_UP, lambda R: R, ["replace base_x, base_y, base_z by base_x, -base_z, base_y"]),
+        (np.diag([1.0, -1.0, 1.0]), lambda R: R, ["by base_x, -base_y, base_z"]),
+        (np.eye(3), lambda R: R @ QUARTER.T,
+         ["base in the log are -y, x, z of its link: add a link with these axes"]),
+        (Y_UP, lambda R: Y_UP @ R @ Y_UP.T,
+         ["are x, z, -y of its link", "state gravity = [0, -9.81, 0]"]),
+        (MIRROR, lambda R: MIRROR @ R @ MIRROR,
+         ["are x, z, y of its link, left-handed", "state gravity = [0, -9.81, 0]"]),
+    ],
+)  # fmt: skip
+def test_axes_of_another_tool_are_named(robot, log, place, turn, words):
+    pose = log.base.pose.copy()
+    pose[:, :3] = pose[:, :3] @ place.T
+    pose[:, 3:] = [pin.Quaternion(turn(pin.Quaternion(x).matrix())).coeffs() for x in pose[:, 3:]]
+    (found,) = check_base(robot, replace(log, base=BaseMotion(pose)), SLOW)
+    assert (found.code, found.severity) == ("base_orientation", "error")
+    assert all(text in found.message for text in words)
+    assert ("gravity" in found.message) == (len(words) == 2)
+    assert found.evidence["best"] < 0.1 < 2.0 * found.evidence["speed"]
+
+
+def test_contacts_need_not_be_known_to_name_another_order(robot, log):
+    unknown = replace(log, contacts={})  # not found either: the log has no torque
+    assert not list(check_base(robot, unknown, SLOW))
+    (found,) = check_base(robot, with_quaternion(unknown, lambda q: np.roll(q, 1, axis=1)), SLOW)
+    assert "its order is qw qx qy qz: state" in found.message
+
+
+def test_without_a_place_speeds_of_feet_are_relative_and_one_foot_has_none(rng):
+    x, dx = rng.standard_normal((2, 4, 3, 3))
+    R, dR = rng.standard_normal((2, 4, 3, 3))
+    v = [[dR[i] @ x[i, k] + R[i] @ dx[i, k] for k in range(3)] for i in range(4)]
+    pairs = [[np.linalg.norm(y[j] - y[k]) for j, k in ((0, 1), (0, 2), (1, 2))] for y in v]
+    one = np.eye(3)
+    found = _Feet(np.arange(4.0), 1, x, dx, None).speed((R, dR), one, one)
+    assert found == pytest.approx(np.mean(np.min(pairs, axis=1)))
+    assert _Feet(np.arange(4.0), 1, x[:, :1], dx[:, :1], None).speed((R, dR), one, one) == 0.0
+
+
+def test_the_speed_of_feet_is_the_mean_of_the_slower_one(robot, log):
+    """With the inverse quaternion, by finite differences of the places of the feet."""
+    wrong = with_quaternion(log, lambda q: q * [-1.0, -1.0, -1.0, 1.0])
+    (found,) = check_base(robot, wrong, SLOW)
+    speeds = []
+    for own in (wrong, log):
+        motion = process(own, replace(SLOW, velocity="differentiated"))
+        feet = link_positions(robot.pin_model, robot.configurations(motion.q), FEET)
+        v = np.linalg.norm(np.gradient(feet, motion.t, axis=0), axis=2)
+        speeds.append(v.min(axis=1).mean())
+    assert [found.evidence[x] for x in ("speed", "best")] == pytest.approx(speeds, rel=0.02)
+    low, high = sorted(f"{x:.2g} m/s" for x in speeds)
+    assert f"move at {high} (mean) below the base, else at {low} below it" in found.message
+
+
+def test_of_readings_that_are_almost_as_slow_the_one_with_fewer_changes_is_named(
+    robot, log, monkeypatch
+):
+    as_logged = []
+
+    def speed(feet, pose, body, world):
+        as_logged.append(pose[0])  # the first one is asked first
+        if (pose[0] == as_logged[0]).all():
+            return 0.2
+        return 0.020 if (body == np.eye(3)).all() and (world == np.eye(3)).all() else 0.019
+
+    another = {"inverse": log.base.pose[:1, 3:] * [-1.0, -1.0, -1.0, 1.0]}
+    monkeypatch.setattr(
+        base_pose,
+        "orientation_readings",
+        lambda q: {words: np.tile(one, (len(q), 1)) for words, one in another.items()},
+    )
+    monkeypatch.setattr(base_pose._Feet, "speed", speed)
+    monkeypatch.setattr(base_pose._Feet, "upwards", lambda feet, R: np.array([0.0, 0.0, 1.0]))
+    (found,) = (x for x in check_base(robot, log, SLOW) if x.code == "base_orientation")
+    assert found.evidence["best"] == 0.020
+    assert found.message.endswith("below it: inverse")
+
+
+@pytest.mark.parametrize(
+    ("logged", "inverse", "both", "wanted"),
+    [
+        (4.9e-3, 1e-3, 1.0, None),  # feet that hardly move are not examined
+        (5.1e-3, 1e-3, 1.0, "inverse"),
+        (0.1, 0.0649, 1.0, "inverse"),  # 0.65 of the speed as logged
+        (0.1, 0.0651, 1.0, None),
+        (0.1, 0.05, 0.0416, "inverse"),  # (0.05 + 0.001) 1.2 = (0.0415 + 0.001) 1.2^2
+        (0.1, 0.05, 0.0414, "inverse; the axes x, y, z of the base"),
+    ],
+)
+def test_a_pose_is_another_one_if_its_feet_are_slower(
+    robot, monkeypatch, logged, inverse, both, wanted
+):
+    """Of the axes of the base, one other order is as slow as stated; ``both``: with the inverse."""
+    order = np.eye(3)[[1, 0, 2]]
+
+    def speed(pose, body, world):
+        if pose[0, 0, 0] == 1.0:
+            return logged if (body == np.eye(3)).all() else 1.0
+        if (world != np.eye(3)).any():
+            return 1.0
+        return {True: inverse}.get((body == np.eye(3)).all(), both if (body == order).all() else 1)
+
+    monkeypatch.setattr(base_pose, "orientation_readings", lambda q: {"inverse": 2.0 * q})
+    feet = SimpleNamespace(
+        turned=lambda q: q[:, 0, None, None] * np.eye(3), speed=speed, dp=0.0,
+        upwards=lambda R: np.array([0.0, 0.0, 1.0]),
+    )  # fmt: skip
+    found = list(_check_readings(robot, SimpleNamespace(name="log"), feet, np.ones((5, 4))))
+    assert len(found) == (wanted is not None)
+    for finding in found:
+        best = inverse if wanted == "inverse" else both
+        assert finding.evidence == pytest.approx({"speed": logged, "best": best})
+        assert f"below it: {wanted}" in finding.message
+
+
+def test_inverted_flags_are_no_error_of_the_pose(robot, log):
+    inverted = replace(log, contacts={foot: ~x for foot, x in log.contacts.items()})
+    assert "base_orientation" not in {x.code for x in check_base(robot, inverted, SLOW)}
+
+
+@pytest.fixture(scope="module")
+def free():
+    return RobotModel.from_urdf(example_urdf("solo12.urdf"), free_flyer=True, terms=())
+
+
+def flight(free, noise=0.0):
+    """Return a log at 500 Hz with pose and right twist, with noise of the position [m]."""
+    t = 3.0 + 0.002 * np.arange(2000)
+    pose = np.zeros((len(t), 7))
+    pose[:, :3] = 0.1 * np.column_stack([np.sin(t), np.cos(2 * t), np.sin(3 * t)])
+    angles = np.column_stack([0.2 * np.sin(2 * t), 0.1 * np.cos(3 * t), 0.15 * np.sin(t)])
+    pose[:, 3:] = quaternions_of_angles(angles)
+    twist = base_state(t, pose, None, None)[1]
+    pose[:, :3] += noise * np.random.default_rng(0).standard_normal((len(t), 3))
+    q = np.zeros((len(t), 12))
+    return Log(t, q, q, free.joints, base=BaseMotion(pose, twist))
+
+
+def changed(log, linear=1.0, angular=1.0, turned=()):
+    """Return a log with a scaled twist, parts of it with the axes of the world."""
+    twist, back = log.base.twist.copy(), log.base.pose[:, 3:] * [-1.0, -1.0, -1.0, 1.0]
+    for part in turned:
+        twist[:, part] = in_base(back, twist[:, part])
+    return replace(log, base=replace(log.base, twist=twist * np.repeat([linear, angular], 3)))
+
+
+def test_noise_of_the_pose_is_no_error_of_the_twist(free):
+    assert not list(check_twist(flight(free, noise=5e-4), SignalSettings(cutoff=20.0)))
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"linear": 1e3}, ["linear", "if it is in mm/s: convert it to m/s"]),
+        ({"angular": 180 / np.pi}, ["angular", "if it is in deg/s: convert it to rad/s"]),
+        ({"turned": [slice(0, 3)]},
+         ["linear", "State twist = 'world' in [base], and turn the angular velocity"]),
+    ],
+)  # fmt: skip
+def test_a_wrong_part_of_the_twist_is_named(free, change, words):
+    # how the identification takes its velocities has no effect
+    signals = SignalSettings(cutoff=20.0, velocity="differentiated")
+    (found,) = check_twist(changed(flight(free), **change), signals)
+    assert (found.code, found.severity) == ("base_twist", "error")
+    assert all(text in found.message for text in words)
+
+
+def test_axes_of_the_world_are_named_though_the_base_hardly_turns(free):
+    """By 0.1 rad: the velocities differ by less than 30 % of the motion."""
+    both = changed(flight(free), turned=[slice(0, 3), slice(3, 6)])
+    found = list(check_twist(both, SignalSettings(cutoff=20.0)))
+    assert len(found) == 2
+    for finding in found:
+        assert finding.message.endswith("State twist = 'world' in [base]")
+        assert 0.05 < finding.evidence["off"] / finding.evidence["size"] < 0.3
+
+
+def test_a_twist_that_was_turned_though_it_had_the_axes_of_the_base_is_named(free):
+    log = flight(free)
+    twist = np.hstack([in_base(log.base.pose[:, 3:], log.base.twist[:, k : k + 3]) for k in (0, 3)])
+    wrong = replace(log, base=replace(log.base, twist=twist))
+    found = list(check_twist(wrong, SignalSettings(cutoff=20.0)))
+    assert len(found) == 2
+    assert all("State twist = 'base' in [base]" in x.message for x in found)
+
+
+def test_a_right_twist_shows_that_the_quaternion_is_the_inverse(free):
+    log = flight(free)
+    pose = log.base.pose * [1, 1, 1, -1, -1, -1, 1]
+    inverse = replace(log, base=replace(log.base, pose=pose))
+    (found,) = check_base(free, inverse, SignalSettings(cutoff=20.0))
+    assert (found.code, found.severity) == ("base_orientation", "error")
+    assert "it is the orientation of the world in the base" in found.message
+    assert found.evidence["best"] < 0.02 * found.evidence["speed"]

@@ -1,0 +1,368 @@
+"""The doctor finds what is wrong with commands, and nothing where nothing is."""
+
+import os
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from helpers.servos import Servo, chirps, record
+
+from robotid.base.exceptions import DataError
+from robotid.cli import main
+from robotid.data.files.read import read_log, write_log
+from robotid.data.files.table_files import write_columns
+from robotid.data.log import Log
+from robotid.data.signal_settings import LogSource, SignalSettings
+from robotid.diagnosis.logs.check_logs import check_logs
+from robotid.diagnosis.logs.command_channels import _sampled, check_commands
+from robotid.robot.examples import example_urdf
+from robotid.robot.model import RobotModel
+
+GOOD = (Servo(), Servo(coulomb=2.0, delay=0.03))
+FOLDERS = (os.environ.get("ROBOTID_DATA"), Path(__file__).resolve().parents[4] / "shared" / "data")
+DATA = next((Path(folder) for folder in FOLDERS if folder and Path(folder).is_dir()), Path("none"))
+real = pytest.mark.usefixtures("recordings")  # which skips, or fails in CI, if there are none
+
+
+@pytest.fixture(scope="module")
+def log():
+    """Two joints that follow chirps beyond their bandwidth of 3 Hz, each in its own time."""
+    return record(chirps([0.3, 0.2], 8.0), GOOD)
+
+
+def found(log):
+    """The findings but the notes that every such log gets, by code."""
+    return {f.code: f for f in check_commands(log) if f.code not in ("no_torque", "loops")}
+
+
+def waves(amplitudes, speeds):
+    return lambda t: np.asarray(amplitudes) * np.sin(np.multiply.outer(t, speeds))
+
+
+# --- nothing where nothing is ---------------------------------------------------------------------
+
+
+def test_forces_of_the_ground_identify_masses_without_torques_and_commands(log):
+    bare = replace(log, q_ref=None, v_ref=None, tau_ref=None, tau=0.0 * log.tau, has_torque=False)
+    (note,) = check_commands(bare)
+    assert note.message.endswith("nothing can be identified from motion alone")
+    (note,) = check_commands(replace(bare, wrenches={"fz foot": np.ones(len(log.t))}))
+    assert note.message.endswith(
+        "the rows of the base identify masses; friction and armature of the joints are not "
+        "identified"
+    )
+
+
+def test_a_good_chirp_gives_notes_alone(log):
+    note, loops = check_commands(log)
+    assert (note.code, note.severity, note.where) == ("no_torque", "note", "log")
+    assert "as ratios to the gains of the controller" in note.message
+    assert (loops.code, loops.severity, loops.where) == ("loops", "note", "log")
+    for servo, joint in zip(GOOD, log.joints, strict=True):
+        # of exp(-s T) k / (s^2 + d s + k): phase T + d / k at rest, 0.707 at sqrt(k) for d = 1.4
+        late = servo.delay + servo.damping / servo.stiffness
+        assert loops.evidence[f"lag_{joint}"] == pytest.approx(late, rel=0.15)
+        ends = np.sqrt(servo.stiffness) / (2 * np.pi)
+        assert loops.evidence[f"bandwidth_{joint}"] == pytest.approx(ends, abs=0.3)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_steps_and_pseudo_random_commands_are_fine(seed):
+    rng = np.random.default_rng(seed)
+    levels = 0.2 * rng.choice([-1.0, 1.0], (200, 2)) * rng.uniform(0.5, 1, (200, 2))
+
+    def commands(t):
+        places = np.column_stack([t / 0.4, t / 0.5]).astype(int)
+        return np.take_along_axis(levels, places, axis=0)
+
+    assert found(record(commands, GOOD, rate=100.0)) == {}
+
+
+def test_a_log_without_commands_shows_nothing():
+    t = np.arange(100) / 100
+    log = Log(t, np.zeros((100, 1)), np.zeros((100, 1)), ("a",))
+    assert list(check_commands(log)) == []
+    (note,) = check_commands(replace(log, has_torque=False))
+    assert "neither torques nor commands" in note.message
+
+
+def test_a_gap_and_a_joint_that_is_told_to_stand_are_no_fault(log):
+    kept = (log.t < 5.0) | (log.t > 7.0)
+    cut = {name: getattr(log, name)[kept] for name in ("t", "q", "tau", "q_ref")}
+    assert found(replace(log, **cut)) == {}
+    still = np.column_stack([log.q_ref[:, 0], np.zeros(len(log.t))])
+    noisy = 1e-4 * np.random.default_rng(0).standard_normal(len(log.t))
+    q = np.column_stack([log.q[:, 0], noisy])
+    assert found(replace(log, q=q, q_ref=still)) == {}
+
+
+# --- each fault by its own code -------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("fastest", [0.5, 1.0, 1.5])
+def test_a_chirp_below_the_bandwidth_does_not_tell_the_delay(fastest):
+    slow = found(record(chirps([0.3, 0.3], fastest), GOOD))
+    assert list(slow) == ["slow_command"]
+    finding = slow["slow_command"]
+    assert (finding.severity, finding.where) == ("warning", "log")
+    assert finding.evidence["longest"] - finding.evidence["shortest"] > 0.02
+    assert 0.08 < finding.evidence["longest"] < 0.11  # the lag: no delay is longer
+    assert fastest <= finding.evidence["frequency"] < 2 * fastest + 0.5
+
+
+def test_one_slow_joint_is_named():
+    told = chirps([0.3, 0.3], 8.0)
+    slow = found(record(lambda t: told(t) * [1, 0] + waves([0, 0.3], [0, 3.0])(t), GOOD))
+    assert list(slow) == ["slow_command"]
+    assert slow["slow_command"].where == "log: joint_1"
+    assert "the command of joint_1 is too slow to identify the delay: " in (
+        slow["slow_command"].message
+    )
+
+
+@pytest.mark.parametrize(
+    ("servo", "amplitude"), [(Servo(coulomb=2.0), 0.004), (Servo(play=0.02), 0.01)]
+)
+def test_commands_lost_in_friction_or_backlash_are_named(servo, amplitude):
+    small = found(record(chirps([amplitude, 0.3], 4.0), [servo, GOOD[1]]))
+    assert list(small) == ["small_command"]
+    finding = small["small_command"]
+    assert (finding.severity, finding.where) == ("warning", "log: joint_0")
+    assert finding.evidence["followed"] < 0.5
+    assert finding.evidence["sweep"] == pytest.approx(2 * amplitude, rel=0.01)
+    share, sweep = finding.evidence["followed"], 2 * amplitude
+    assert finding.message == (
+        f"log: joint_0 follows {100 * share:.0f} % of slow sweeps of {sweep:.3g} rad: friction, "
+        f"backlash or the dead band of its drive suppress {(1 - share) * sweep:.2g} rad; move it "
+        f"by {5 * (1 - share) * sweep:.2g} rad or more"
+    )
+
+
+def test_commands_of_few_steps_of_the_encoder_are_named():
+    coarse = found(record(chirps([0.01, 0.3], 4.0), [Servo(quantum=0.003), GOOD[1]]))
+    assert list(coarse) == ["small_command"]
+    assert "6.7 steps of its encoder" in coarse["small_command"].message
+    assert found(record(chirps([0.1, 0.3], 4.0), [Servo(quantum=0.003), GOOD[1]])) == {}
+
+
+def test_a_drive_at_its_largest_speed_is_named():
+    log = record(chirps([0.3, 0.3], 8.0), [Servo(top=1.0), Servo()])
+    clipped = found(log)
+    assert list(clipped) == ["saturated"]
+    finding = clipped["saturated"]
+    assert f"largest speed of {finding.evidence['speed']:.3g} rad/s in" in finding.message
+    [rail] = [x for x in check_commands(log, ["joint_0"]) if x.code == "saturated"]
+    assert f"largest speed of {finding.evidence['speed']:.3g} m/s in" in rail.message
+    assert f"changes by up to {finding.evidence['error']:.2g} m: " in rail.message
+    assert (finding.severity, finding.where) == ("warning", "log: joint_0")
+    assert finding.evidence["speed"] == pytest.approx(1.0, rel=0.05)
+    assert finding.evidence["error"] > 0.2
+
+
+def test_ramps_that_are_followed_are_no_saturation():
+    def ramps(t):
+        return np.column_stack([np.abs((0.4 * t + s) % 2 - 1) for s in (0.0, 0.7)])
+
+    stiff = Servo(damping=40.0, noise=1e-5)  # which runs at the ramps' speed all the time
+    assert "saturated" not in found(record(ramps, [stiff, stiff]))
+
+
+def test_a_base_that_moves_is_named():
+    told = chirps([0.3, 0.0, 0.2], 8.0)
+
+    def give(t, q):
+        return 0.05 * np.column_stack([0 * t, q[:, 0] + q[:, 2], 0 * t])
+
+    loose = found(record(told, [Servo()] * 3, couple=give))
+    assert list(loose) == ["moved_by_others"]
+    finding = loose["moved_by_others"]
+    assert (finding.severity, finding.where) == ("warning", "log: joint_1")
+    assert finding.evidence["share"] > 0.95
+    assert finding.evidence["size"] == pytest.approx(0.011, rel=0.3)
+    assert found(record(told, [Servo()] * 3)) == {}
+
+
+def test_joints_that_are_told_the_same_are_named_in_groups():
+    told = chirps([0.3, 0.3], 8.0)
+
+    def commands(t):
+        one, other = told(t).T
+        return np.column_stack(
+            [one, -0.5 * one, other, 1 + 0.2 * other, 0.1 * told(20.0 - t)[:, 0]]
+        )
+
+    codes = [f for f in check_commands(record(commands, [Servo()] * 5)) if f.severity != "note"]
+    assert [(f.code, f.severity, f.where) for f in codes] == [
+        ("proportional_commands", "warning", "log: joint_0, joint_1"),
+        ("proportional_commands", "warning", "log: joint_2, joint_3"),
+    ]
+    assert codes[0].evidence == {"correlation": pytest.approx(1.0), "joints": 2.0}
+
+
+def test_rows_that_are_too_few_for_the_bandwidth_are_named():
+    few = found(record(chirps([0.3, 0.3], 8.0), GOOD, rate=20.0))
+    assert list(few) == ["slow_sampling"]
+    finding = few["slow_sampling"]
+    assert finding.severity == "warning"
+    assert finding.evidence["rate"] == pytest.approx(20.0)
+    assert finding.evidence["bandwidth"] == pytest.approx(3.0, abs=0.7)
+
+
+@pytest.mark.parametrize("early", [0.02, 0.1])
+def test_a_command_that_the_drive_had_before_is_an_error(log, early):
+    # the lag of the loop is 80 to 100 ms; what is logged comes later than that
+    rows = round((0.13 + early) * 200)
+    late = replace(
+        log.window(1.0, 19.0), q_ref=log.window(1.0 - rows / 200, 19.0 - rows / 200).q_ref
+    )
+    errors = [f for f in check_commands(late) if f.code == "delayed_command"]
+    assert {(f.severity, f.where) for f in errors} == {
+        ("error", "log: joint_0"),
+        ("error", "log: joint_1"),
+    }
+    assert "before its command: the logged command is not the command of the drive" in (
+        errors[0].message
+    )
+    assert errors[0].evidence["lag"] < -early / 2
+
+
+def test_a_command_that_is_held_is_noted():
+    held = found(record(chirps([0.3, 0.3], 8.0), GOOD, hold=4))
+    assert list(held) == ["repeated_command"]
+    assert held["repeated_command"].severity == "note"
+    assert held["repeated_command"].evidence == {"rows": 4.0, "period": pytest.approx(0.02)}
+    assert "at 50 Hz on average, and is constant for 20 ms" in held["repeated_command"].message
+
+
+# --- recordings -----------------------------------------------------------------------------------
+
+#: Findings above a note of each recording: go2's joints are all told one chirp; so101's jaw runs
+#: at 1.1 rad/s at most, its lift and elbow have a dead band, and slow motions show no delay.
+RECORDED = {
+    "go2/chirp": {"proportional_commands"},
+    "so101/chirp_sweep": {"proportional_commands", "saturated"},
+    "so101/friction_gravity": {"slow_command"},
+    "so101/large_amplitude": {"slow_command"},
+    "so101/multisine": {"slow_command"},
+    "so101/prbs_excitation": {"saturated"},
+    "so101/static_holding": {"proportional_commands"},
+    "so101/step_response": {"small_command"},
+    "so101/workspace_sweep": {"slow_command", "moved_by_others"},
+}
+
+
+@real
+@pytest.mark.parametrize("name", RECORDED)
+def test_recordings_show_what_is_wrong_with_them(name):
+    path = DATA / "commands" / f"{name}.parquet"
+    joints = [x[2:] for x in pq.read_schema(path).names if x.startswith("q_")]
+    log = read_log(path, joints, needs="commands")
+    loud = {f.code: f for f in check_commands(log) if f.severity != "note"}
+    assert set(loud) == RECORDED[name]
+    if name == "go2/chirp":
+        alike = loud["proportional_commands"]
+        assert all(joint in alike.message for joint in joints)
+        assert alike.evidence["joints"] == 12
+    sizes = [note for note in log.notes if "loadsize" in note]
+    assert len(sizes) == name.startswith("so101")
+
+
+# --- the doctor as a whole ------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def of_ur5(ur5):
+    """A log of a UR5 whose joints have servos of their own."""
+    amplitudes = [0.3, 0.25, 0.3, 0.25, 0.3, 0.2]
+    log = record(chirps(amplitudes, 8.0, duration=10.0), [Servo()] * 6, duration=10.0)
+    return replace(log, joints=ur5.joints)
+
+
+def test_a_log_without_torque_is_examined(ur5, of_ur5, tmp_path, capsys):
+    log = of_ur5
+    findings = check_logs(ur5, log, validation=log)
+    assert {f.code for f in findings if f.severity != "note"} == {"repeated_motion"}
+    assert {"no_torque", "rate", "noise"} <= {f.code for f in findings}
+    assert not any("tau" in f.message for f in findings)
+    write_log(log, tmp_path / "run.csv")
+    assert (
+        main(
+            ["doctor", str(example_urdf("ur5_robot.urdf")), str(tmp_path / "run.csv"), "--verbose"]
+        )
+        == 0
+    )
+    assert "no_torque: run.csv: the log has no torque" in " ".join(capsys.readouterr().out.split())
+
+
+def test_what_is_in_the_file_is_examined(ur5, of_ur5, tmp_path):
+    log = of_ur5
+    table = {"time": log.t}
+    for kind, values in (("q", log.q), ("qref", log.q_ref), ("tau", 5 * log.q)):
+        table |= {f"{kind}_{joint}": values[:, j] for j, joint in enumerate(log.joints)}
+    for gone, needed in (("qref_", "torque"), ("tau_", "commands"), ("none", "both")):
+        path = tmp_path / f"{needed}.parquet"
+        write_columns({n: x for n, x in table.items() if not n.startswith(gone)}, path)
+        read = read_log(path, log.joints, needs="any")
+        assert read.has_torque == (needed != "commands")
+        assert (read.q_ref is None) == (needed == "torque")
+    half = dict(list(table.items())[:9])  # two joints have a command, none a torque
+    write_columns(half, tmp_path / "half.parquet")
+    with pytest.raises(DataError, match=r"no columns 'qref_elbow_joint', 'qref_wrist_1_joint'"):
+        read_log(tmp_path / "half.parquet", log.joints, needs="any")
+    with pytest.raises(DataError, match="has no torque"):
+        check_logs(ur5, replace(log, q_ref=None))
+
+
+def test_sizes_of_loads_taken_for_torques_are_an_error(ur5, of_ur5):
+    rng = np.random.default_rng(0)
+    log = of_ur5
+    v = np.gradient(log.q, log.t, axis=0)
+    sizes = np.round(np.abs(3 * v + 10 * log.q + 0.1 * rng.standard_normal(v.shape)) / 0.05) * 0.05
+    findings = check_logs(ur5, replace(log, tau=sizes, has_torque=True))
+    assert {"unsigned_torque"} <= {f.code for f in findings if f.severity == "error"}
+
+
+@real
+def test_loads_of_a_servo_arm_mapped_to_torques_are_an_error():
+    model = RobotModel.from_urdf(example_urdf("so101.urdf"))
+    names = ("Rotation", "Pitch", "Elbow", "Wrist_Pitch", "Wrist_Roll", "Jaw")
+    path = DATA / "commands" / "so101" / "multisine.parquet"
+    source = LogSource(joints=dict(zip(model.joints, names, strict=True)))
+    with pytest.raises(DataError, match=r"no columns 'tau_Rotation'.*\. The log has commanded"):
+        read_log(path, model.joints, source=source)
+    loads = {
+        f"tau_{joint}": f"loadsize_{name}" for joint, name in zip(model.joints, names, strict=True)
+    }
+    log = read_log(path, model.joints, source=source, columns=loads)
+    errors = {f.code for f in check_logs(model, log) if f.severity == "error"}
+    assert errors == {"unsigned_torque", "velocity_scale"}  # the jaw's dq is its motor's
+
+
+def test_velocities_of_a_log_without_torque_are_judged_without_it(ur5, of_ur5):
+    log = of_ur5
+    v = np.gradient(log.q, log.t, axis=0)
+    scaled = replace(log, v=v * [1, 1, 1, 1, 1, 2.3])
+    for velocity, severity in (("auto", "warning"), ("measured", "error")):
+        findings = check_logs(ur5, scaled, signals=SignalSettings(velocity=velocity))
+        (finding,) = [f for f in findings if f.code == "velocity_scale"]
+        assert finding.severity == severity
+
+
+def test_the_rate_that_is_wanted_is_that_of_the_widest_loop():
+    log = SimpleNamespace(name="run", joints=("a", "b", "c", "d"))
+    widths = {"a": 4.0, "b": 7.0, "c": 2.9, "d": np.nan}  # of d all that is excited is followed
+    loops = [
+        SimpleNamespace(
+            name=name, bandwidth=width, step=1 / 30, response=(np.array([1.0, 5.5]), None, None)
+        )
+        for name, width in widths.items()
+    ]
+    (found,) = _sampled(log, loops)
+    assert found.where == "run: a, b, d"
+    assert found.evidence == {"rate": pytest.approx(30.0), "bandwidth": 7.0}
+    assert "up to 7 Hz and are logged at 30 Hz, 4.3 rows per period" in found.message
+    assert "log at 70 Hz or more" in found.message
+    assert list(_sampled(log, loops[2:3])) == []

@@ -1,0 +1,95 @@
+"""Robots of example-robot-data: inspected once, for the tables in the docs, too."""
+
+import json
+import os
+from collections import Counter
+from functools import lru_cache
+
+import pytest
+from helpers.paths import DOCS
+
+from robotid.diagnosis.urdf.inspection import inspect_urdf
+from robotid.dynamics.base_parameters import structural_mapping
+from robotid.robot import geometry
+from robotid.robot.examples import example_urdfs
+from robotid.robot.model import RobotModel
+
+AUDIT, COUNTS = DOCS / "evidence/urdf_audit.md", DOCS / "evidence/base_counts.md"
+WRITES = {"ROBOTID_WRITE_AUDIT", "ROBOTID_WRITE_COUNTS"} & set(os.environ)
+#: Take two thirds of the time, and have no finding that no other robot has. All are inspected to
+#: write the tables; every robot is opened in tests/robot/test_model.py.
+LARGE = {
+    "tiago_dual", "a1", "alex_nub_hands", "tiago", "so101", "talos_full_v2", "tiago_pro", "pr2",
+    "g1_29dof_with_hand_rev_1_0", "b1-z1", "z1", "g1_29dof_rev_1_0", "anymal-kinova", "kinova",
+    "icub", "romeo_laas_small", "talos_full_v2_box", "alexander_v1.lowerBodyOnly",
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def inspections():
+    """The inspection of example robots by path; robots of a family share meshes."""
+    chosen = [path for path in example_urdfs() if WRITES or path.stem not in LARGE]
+    assert WRITES or len(chosen) == 69 - len(LARGE)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(geometry, "read_surfaces", lru_cache(128)(geometry.read_surfaces))
+        return {path: inspect_urdf(path) for path in chosen}
+
+
+def assert_documented(document, lines):
+    """Assert that a table's head and rows are in a document, which has no row twice."""
+    documented = document.read_text().splitlines()
+    assert documented.count(lines[0]) == 1
+    assert [line for line in documented if line in set(lines)] == lines
+
+
+def test_example_robots_can_be_inspected(inspections):
+    unusable = {}
+    for path, inspection in inspections.items():
+        content = json.loads(json.dumps(inspection.to_dict(), allow_nan=False))
+        assert set(content) == {"robot", "joints", "structure", "base_groups", "findings"}
+        for finding in content["findings"]:
+            wanted = {"code", "severity", "message", "evidence"}
+            wanted |= set(finding) & {"link", "joint"}
+            assert set(finding) == wanted
+            assert finding["severity"] in ("note", "warning", "error")
+        if content["structure"] is None:
+            (finding,) = [f for f in content["findings"] if f["code"] == "unusable"]
+            unusable[path.name] = finding["message"]
+    assert set(unusable) == {"ur3.urdf", "quadrotor_base.urdf", "iris_simple.urdf"}
+    assert "<robot> has no name" in unusable["ur3.urdf"]
+
+
+def test_the_table_of_example_robots_is_the_documents(inspections):
+    lines = ["| robot | joints | errors | warnings | which |", "|---|---|---|---|---|"]
+    for path, found in inspections.items():
+        graves = [f for f in found.findings if f.severity != "note"]
+        counts = Counter(f.code for f in graves)
+        errors = sum(f.severity == "error" for f in graves)
+        which = ", ".join(f"{code} {count}" for code, count in sorted(counts.items()))
+        name = f"{path.parent.parent.name}/{path.name}"
+        cells = [name, len(found.joints), errors, len(graves) - errors, which or "–"]
+        lines.append(f"| {' | '.join(map(str, cells))} |")
+    if os.environ.get("ROBOTID_WRITE_AUDIT"):
+        AUDIT.write_text(AUDIT.read_text().split("| robot |")[0] + "\n".join(lines) + "\n")
+    assert_documented(AUDIT, lines)
+
+
+def test_table_of_every_example_robot_is_the_one_in_the_docs(inspections):
+    lines = [
+        "| robot | joints | standard | base, fixed | base, floating |",
+        "|---|---|---|---|---|",
+    ]
+    for path, inspection in inspections.items():
+        if inspection.structure is None:
+            continue
+        fixed = inspection.structure
+        floating = RobotModel.from_urdf(path, terms=(), free_flyer=True)
+        counts = fixed.base_inertial, len(structural_mapping(floating).K)
+        assert counts[0] <= counts[1] <= floating.layout.n_inertial
+        lines.append(
+            f"| {path.parent.parent.name}/{path.name} | {len(inspection.joints)} | "
+            f"{fixed.standard} | {counts[0]} | {counts[1]} |"
+        )
+    if os.environ.get("ROBOTID_WRITE_COUNTS"):
+        COUNTS.write_text(COUNTS.read_text().split("| robot |")[0] + "\n".join(lines) + "\n")
+    assert_documented(COUNTS, lines)

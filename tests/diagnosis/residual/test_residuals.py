@@ -1,0 +1,99 @@
+"""Spectrum and autocorrelation against brute force and closed form; friction against the truth."""
+
+import numpy as np
+import pytest
+from helpers.synthetic import exact_log, truth
+
+from robotid.data.signal_settings import SignalSettings
+from robotid.diagnosis.residual.residuals import autocorrelation, friction_split, spectrum
+from robotid.estimation.fitting.evaluation import evaluate_logs
+from robotid.estimation.fitting.survey import hold_log
+
+
+def brute_force(x, used, segment, lags):
+    found = []
+    for k in range(lags + 1):
+        pairs = [
+            (x[i], x[i + k])
+            for i in range(len(x) - k)
+            if used[i] and used[i + k] and segment[i] == segment[i + k]
+        ]
+        one, other = np.array(pairs).T if pairs else np.full((2, 1), np.nan)
+        found.append(one @ other / np.sqrt(one @ one * (other @ other)))
+    return np.array(found)
+
+
+def test_autocorrelation_is_the_mean_of_products_of_used_pairs(rng):
+    x = np.cumsum(rng.standard_normal(120))
+    used = rng.random(120) > 0.3
+    segment = np.repeat([0, 1, 2], [50, 30, 40])
+    r = autocorrelation(x, used, segment, 60)
+    np.testing.assert_allclose(r, brute_force(x, used, segment, 60), atol=1e-10)
+    assert np.isnan(r[55:]).all()  # longer than every segment
+
+
+def test_no_correlation_exceeds_1_where_few_pairs_are_far_apart():
+    # the largest values are one lag apart, and there is no other pair of that lag
+    x = np.r_[5.0, np.full(60, 0.1), 5.0, np.full(20, 0.1)]
+    r = autocorrelation(x, np.ones(82, dtype=bool), np.zeros(82), 81)
+    assert np.nanmax(np.abs(r)) <= 1.0
+    assert r[61] > 0.9
+
+
+def test_a_sine_correlates_as_a_cosine_across_rows_left_out(rng):
+    t = np.arange(20_000) / 100.0
+    used = rng.random(len(t)) > 0.5
+    r = autocorrelation(np.sin(2 * np.pi * t), used, np.zeros(len(t)), 200)
+    np.testing.assert_allclose(r, np.cos(2 * np.pi * np.arange(201) / 100.0), atol=0.02)
+
+
+def test_the_spectrum_s_integral_is_the_mean_square_of_the_rows_used(rng):
+    x, segment = 3.0 * rng.standard_normal(30_000), np.repeat([0, 1], [20_000, 10_000])
+    used = rng.random(len(x)) > 0.4
+    for dt in (0.01, 0.002):
+        f, S = spectrum(x, used, segment, dt, length=200 * dt)
+        assert np.sum(S) * f[1] == pytest.approx(9.0, rel=0.03)
+        # white: half the rate holds it evenly
+        assert np.median(S) == pytest.approx(9.0 * 2 * dt, rel=0.1)
+
+
+def test_the_spectrum_equals_that_of_scipy_where_no_row_is_left_out(rng):
+    from scipy.signal import welch
+
+    x = rng.standard_normal(1000)
+    window = np.hanning(202)[1:-1]
+    ours = spectrum(x, np.ones(1000, bool), np.zeros(1000), 0.01, length=2.0)
+    theirs = welch(x, 100.0, window=window, noverlap=100, detrend=False)
+    np.testing.assert_allclose(ours[0], theirs[0], atol=1e-12)
+    np.testing.assert_allclose(ours[1], theirs[1], rtol=1e-10)
+
+
+def test_a_window_never_crosses_a_gap():
+    """Two halves of a sine whose phase turns by pi in the gap: the peak stays one line."""
+    t = np.arange(2000) / 100.0
+    x = np.sin(2 * np.pi * 5.0 * t) * np.where(t < 10.0, 1.0, -1.0)
+    f, S = spectrum(x, np.ones(2000, bool), (t >= 10.0).astype(int), 0.01, length=4.0)
+    assert f[np.argmax(S)] == pytest.approx(5.0)
+    assert S[np.abs(f - 5.0) > 1.0].max() < 1e-4 * S.max()
+
+
+def test_no_used_row_gives_no_spectrum():
+    f, S = spectrum(np.ones(50), np.zeros(50, bool), np.zeros(50), 0.01)
+    assert len(f) == len(S) == 0
+
+
+def test_friction_is_the_torque_that_viscous_coulomb_and_offset_add(ur5, rng):
+    pi = truth(ur5)
+    log = hold_log(ur5, exact_log(ur5, pi, rng), SignalSettings(cutoff=None))
+    ((evaluation,), ()) = evaluate_logs([log], (), {"estimate": pi}, ur5.standard_parameters())
+    left, friction = friction_split(ur5, evaluation, pi)
+    value = dict(zip(ur5.layout.names, pi, strict=True))
+    v = evaluation.recording.trajectory.v
+    for j, name in enumerate(ur5.joints):
+        known = (
+            value[f"{name}.viscous"] * v[:, j]
+            + value[f"{name}.coulomb"] * np.sign(v[:, j])
+            + value[f"{name}.offset"]
+        )
+        np.testing.assert_allclose(friction[:, j], known, atol=1e-9)
+        np.testing.assert_allclose(left[:, j], known, atol=1e-9)

@@ -1,0 +1,447 @@
+"""What torques consist of, against Pinocchio; and what residuals follow, where it is known."""
+
+import re
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from helpers.driven import ELBOW, EXACT, LIFT, WRIST, arm, driven, driven_log
+from helpers.misfits import coloured
+from helpers.synthetic import truth
+from scipy.signal import butter, sosfiltfilt
+
+from robotid.base.exceptions import DataError
+from robotid.data.signal_settings import SignalSettings
+from robotid.data.signals import process
+from robotid.diagnosis.residual import torque_split
+from robotid.diagnosis.residual.dependence import even_bins, follow
+from robotid.diagnosis.residual.torque_split import (
+    JointTorque,
+    Rows,
+    _broadband_shares,
+    joint_torques,
+    split_torque,
+)
+from robotid.dynamics.memory import remember
+from robotid.dynamics.prediction import predict
+from robotid.dynamics.torque import joint_torque_regressor
+from robotid.identification.why_pictures import why_charts
+from robotid.robot.drives import Harmonic, Hat, Lag, LoadFriction, Presliding, Spring, Stribeck
+from robotid.robot.examples import example_urdf
+from robotid.robot.model import RobotModel
+from robotid.robot.parameters import Coupling
+
+
+def states(model, rng, samples=7):
+    """Random configurations, velocities and accelerations; a floating base turned at random."""
+    n = model.n_rows
+    q, v, a = (rng.uniform(-2, 2, (samples, k)) for k in (len(model.joints), n, n))
+    if model.free_flyer:
+        turned = rng.standard_normal((samples, 4))
+        turned /= np.linalg.norm(turned, axis=1, keepdims=True)
+        q = np.hstack([rng.uniform(-1, 1, (samples, 3)), turned, q])
+    return q, v, a
+
+
+ROBOTS = {
+    "fixed": lambda: RobotModel.from_urdf(example_urdf("ur5_robot.urdf")),
+    "floating": lambda: RobotModel.from_urdf(example_urdf("ur5_robot.urdf"), free_flyer=True),
+    "coupled": lambda: RobotModel.from_urdf(
+        example_urdf("ur5_robot.urdf"),
+        couplings=(Coupling("wrist", (("wrist_1_joint", 1.0), ("wrist_2_joint", -0.7))),),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_the_parts_of_the_bodies_are_pinocchios(name, rng):
+    model = ROBOTS[name]()
+    pi, (q, v, a) = truth(model), states(model, rng)
+    split = split_torque(model, pi, q, v, a)
+    bodies, still = model.with_parameters(pi).pin_model, np.zeros(model.n_rows)
+    data = bodies.createData()
+    for k, x in enumerate(model.configurations(q)):
+        gravity = pin.computeGeneralizedGravity(bodies, data, x)
+        M = pin.crba(bodies, data, x)
+        M = np.triu(M) + np.triu(M, 1).T
+        velocity = pin.rnea(bodies, data, x, v[k], still) - gravity
+        np.testing.assert_allclose(split.parts["gravity"][k], gravity, atol=1e-11)
+        np.testing.assert_allclose(split.parts["inertia"][k], M @ a[k], atol=1e-11)
+        np.testing.assert_allclose(split.parts["Coriolis"][k], velocity, atol=1e-11)
+
+
+@pytest.mark.parametrize("is_possible", [True, False])
+@pytest.mark.parametrize("name", ROBOTS)
+def test_the_parts_sum_to_the_prediction(name, is_possible, rng):
+    model = ROBOTS[name]()
+    pi, (q, v, a) = truth(model), states(model, rng)
+    if not is_possible:  # base parameters: first moments without a mass
+        pi = pi * (rng.uniform(-1, 1, pi.shape) > 0.3)
+    split = split_torque(model, pi, q, v, a)
+    whole = (joint_torque_regressor(model, q, v, a) @ pi).reshape(v.shape)
+    np.testing.assert_allclose(split.predicted, whole, rtol=1e-12, atol=1e-11)
+    rigid = np.where(np.arange(len(pi)) < model.layout.n_inertial, pi, 0.0)
+    np.testing.assert_allclose(
+        split.load, (joint_torque_regressor(model, q, v, a) @ rigid).reshape(v.shape), atol=1e-11
+    )
+    for row in range(model.n_rows):  # what drive parameters add, is what the drives' parts are
+        every = [x for own in split.terms_of(row).values() for x in own.values()]
+        drives = sum(every, start=np.zeros(len(q)))
+        np.testing.assert_allclose(drives, (split.predicted - split.load)[:, row], atol=1e-11)
+
+
+def test_every_kind_of_drive_term_has_its_part(rng):
+    own = {
+        LIFT: (LoadFriction(), Spring(), Harmonic(order=3.0), Lag()),
+        ELBOW: (Stribeck(speed=0.3), Hat(number=1, at=0.2)),
+        WRIST: (Presliding(displacement=0.05),),
+    }
+    sizes = {f"{LIFT}.load": 0.1, f"{LIFT}.spring": 7.0, f"{LIFT}.cos3": 2.0, f"{LIFT}.lag": 0.01}
+    sizes |= {f"{ELBOW}.stribeck": 3.0, f"{ELBOW}.spring1": 4.0, f"{WRIST}.presliding": 1.0}
+    model, pi = driven(arm(), own, sizes)
+    motion = remember(model, process(driven_log(model, pi, 3, duration=4.0), EXACT))
+    m = motion
+    split = split_torque(model, pi, m.q, m.v, m.a, m.direction, m.memory)
+    (whole,) = predict(model, [pi], m)
+    scale = np.abs(whole).max()
+    np.testing.assert_allclose(split.predicted, whole, atol=1e-12 * scale)
+    np.testing.assert_allclose(split.parts["spring"][:, 0], 7.0 * m.q[:, 0], atol=1e-12 * scale)
+    np.testing.assert_allclose(
+        split.parts["ripple"][:, 0], 2.0 * np.cos(3 * m.q[:, 0]), atol=1e-12 * scale
+    )
+    index = list(model.layout.names).index
+    armature, offset = (
+        np.array([pi[index(f"{joint}.{term}")] for joint in model.joints])
+        for term in ("armature", "offset")
+    )
+    np.testing.assert_allclose(split.parts["motor inertia"], armature * m.a, atol=1e-12 * scale)
+    np.testing.assert_allclose(split.parts["offset"], offset + 0 * m.a, atol=1e-12 * scale)
+    friction = [f"{LIFT}.{x}" for x in ("viscous", "coulomb", "load")]
+    own = split.terms_of(0)["friction"]
+    assert list(own) == friction
+    np.testing.assert_allclose(
+        split.parts["friction"][:, 0], sum(own[x] for x in friction), atol=1e-12 * scale
+    )
+    assert set(split.parts) == {
+        "gravity", "inertia", "Coriolis", "motor inertia", "friction", "offset", "spring", "ripple",
+        "delay",
+    }  # fmt: skip
+    assert np.abs(split.parts["delay"][:, 0]).max() > 0
+
+
+def test_a_static_model_has_gravity_and_no_motion(rng):
+    model = RobotModel.from_urdf(example_urdf("ur5_robot.urdf"), dynamics="static")
+    pi = truth(model)
+    q, still, signs = rng.uniform(-2, 2, (5, 6)), np.zeros((5, 6)), np.ones((5, 6))
+    split = split_torque(model, pi, q, still, still, signs)
+    assert set(split.parts) == {"gravity", "friction", "offset"}
+    whole = (joint_torque_regressor(model, q, still, still, signs) @ pi).reshape(q.shape)
+    np.testing.assert_allclose(split.predicted, whole, atol=1e-11)
+
+
+def test_other_shapes_are_refused(rng):
+    model = ROBOTS["fixed"]()
+    q, v, a = states(model, rng)
+    with pytest.raises(DataError, match=r"v, a and pi have shapes \(7, 5\), \(7, 6\) and"):
+        split_torque(model, truth(model), q, v[:, :5], a)
+
+
+def test_a_joint_is_judged_on_what_was_kept_apart(identified):
+    kept, names = identified.validation[0], identified.model.row_names
+    for j, torque in enumerate(joint_torques(identified)):
+        measured = kept.metrics["estimate"].per_joint[names[j]]
+        motion = kept.recording.trajectory
+        assert torque.rows.recordings == (kept.recording.name,)
+        np.testing.assert_allclose(
+            torque.residual, (motion.tau - kept.torques["estimate"])[:, j], atol=1e-11
+        )
+        assert torque.rms["residual"] == pytest.approx(measured.rmse)
+        assert torque.rms["measured"] == pytest.approx(
+            measured.rmse * 100 / measured.relative_error_pct
+        )
+        np.testing.assert_array_equal(torque.power, (motion.tau * motion.v)[:, j])
+        np.testing.assert_allclose(
+            sum(torque.parts.values()) + torque.residual, motion.tau[:, j], atol=1e-11
+        )
+        # white noise is all that this log has beside its model
+        assert torque.broadband > 0.5
+        assert torque.fitted.rows.recordings == tuple(e.recording.name for e in identified.fitted)
+
+
+def torque(residual, v, q, load, *, segments=16):
+    """A joint whose residual is known; its friction is 10 N m."""
+    N = len(residual)
+    rows = Rows(
+        ("log",), np.arange(N) / 100, np.zeros(N, int), np.zeros(N, int),
+        None if segments is None else np.arange(N) * segments // N,
+    )  # fmt: skip
+    friction = 10 * np.sign(v)
+    quantities = {
+        "position": ("rad", q),
+        "speed": ("rad/s", v),
+        "acceleration": ("rad/s^2", np.gradient(v)),
+        "load": ("N m", load),
+    }
+    return JointTorque(
+        "elbow", "N m", rows, np.ones(N, bool), friction + residual, {"friction": friction},
+        {"friction": {"elbow.coulomb": friction}}, quantities, 0.9,
+    )  # fmt: skip
+
+
+def test_recordings_have_pieces_of_their_own_and_follow_each_other_in_time():
+    rows, starts = (37, 20, 5), (10.0, 3.0, 50.0)
+    recording = np.repeat(np.arange(3), rows)
+    t = np.concatenate([s + 0.1 * np.arange(n) for n, s in zip(rows, starts, strict=True)])
+    found = Rows(("a", "b", "c"), t, recording, 0 * recording, None)
+    pieces = [16 * k + (16 * i) // n for k, n in enumerate(rows) for i in range(n)]
+    assert found.pieces.tolist() == pieces
+    time = np.concatenate(
+        [0.1 * np.arange(37), 3.6 + 0.1 * np.arange(20), 5.5 + 0.1 * np.arange(5)]
+    )
+    np.testing.assert_allclose(found.time, time)
+
+
+def motion(rng, N=4000):
+    """Speed, position and load that have nothing to do with each other, 40 s of them."""
+    t = np.arange(N) / 100
+    shift = rng.uniform(0, 6, (3, 4))
+    f = rng.uniform(0.15, 1.0, (3, 4))
+    return [np.sin(2 * np.pi * f[k] * t[:, None] + shift[k]).sum(axis=1) for k in range(3)]
+
+
+@pytest.mark.parametrize("name", ["speed", "position", "load", "time", "constant"])
+def test_what_a_residual_follows_is_found_with_its_share(name, rng):
+    v, q, load = motion(rng)
+    cause = {
+        "speed": np.exp(-np.abs(v) / 0.3) * np.sign(v),
+        "position": q,
+        "load": np.abs(load),
+        "time": np.linspace(-1, 1, len(v)),
+        "constant": np.ones(len(v)),
+    }[name]
+    effect = cause - (name != "constant") * cause.mean()
+    noise = rng.standard_normal(len(v))
+    noise *= np.sqrt(np.mean(effect**2)) / np.std(noise)  # half of the square is the effect's
+    found = torque(effect + noise, v, q, load)
+    share = {d.name: d.share for d in found.follows}
+    # bins take a part of it that their width blurs
+    low = 0.35 if name in ("speed", "time") else 0.44
+    assert low < share[name] < 0.53
+    assert [d.name for d in found.follows if d.is_significant] == [name]
+    said = found.sentence
+    if name == "constant":
+        assert re.search(r"4\d % of its power is a constant of (1|0.9\d|1.0) N m", said)
+        assert "Zero the torque sensor" in said
+    else:
+        assert f"depends on the {name}, which explains" in said
+    assert ("at low speed" in said) == (name == "speed")
+
+
+def test_the_residual_against_time_is_drawn_as_time_is_asked_of_it(rng):
+    v, q, load = motion(rng)
+    drift = 0.3 * np.linspace(-1, 1, len(v))
+    found = torque(2.0 * q + drift + 0.1 * rng.standard_normal(len(v)), v, q, load)
+    residual, less = found.against_time
+    assert less == "position"
+    left = found.residual - np.interp(q, *_bins(found, "position"))
+    np.testing.assert_allclose(residual, left)
+    time = found.follows[-1]
+    assert time.name == "time"
+    chart = why_charts(found)["time"]
+    assert "minus its mean over position against time" in chart.title
+    assert chart.series[0].y.std() < 0.6  # drift and noise; the plain residual is far larger
+    assert why_charts(found)["position"].series[0].y.std() > 1.0
+
+
+def _bins(found, name):
+    (dependence,) = [d for d in found.follows if d.name == name]
+    return dependence.centres, dependence.means
+
+
+def test_noise_of_any_colour_follows_nothing():
+    rng, log_errors, tried, shares = np.random.default_rng(0), 0, 0, []
+    for trial in range(60):
+        v, q, load = motion(rng)
+        noise = coloured(rng, (len(v),), (0, 5, 20)[trial % 3])
+        found = torque(noise, v, q, load)
+        log_errors += sum(d.is_significant for d in found.follows)
+        tried += len(found.follows)
+        shares.append([d.share for d in found.follows])
+    assert log_errors <= 1, f"{log_errors} of {tried}"
+    assert (np.mean(shares, axis=0) < 0).all(), "what was fitted to noise predicts no other noise"
+    assert "90 % of its power is broadband (above the cut-off): noise" in found.sentence
+
+
+def test_errors_of_bins_hold_the_scatter_of_correlated_noise():
+    rng, z = np.random.default_rng(0), []
+    for _ in range(60):
+        v, q, load = motion(rng)
+        found = torque(coloured(rng, (len(v),), 10), v, q, load)
+        (speed,) = (d for d in found.follows if d.name == "speed")
+        z.append(speed.means / speed.errors)
+    # unbiased means: their scatter over the error is Student's of some segments
+    assert 0.85 < np.sqrt(np.nanmean(np.square(z))) < 1.35
+
+
+def test_too_short_a_recording_says_so(rng):
+    v, q, load = motion(rng, 300)
+    found = torque(rng.standard_normal(300), v, q, load, segments=None)
+    assert all(d.share is None for d in found.follows if d.name != "time")
+    assert "the recordings are too short" in found.sentence
+
+
+def test_what_the_fitted_recordings_do_not_show_has_changed(rng):
+    v, q, load = motion(rng)
+    noise = 0.3 * rng.standard_normal(len(v))
+    before, after = (torque(x + noise, v, q, load) for x in (0.0, np.tanh(v)))
+    assert "Try another friction model" in replace(after, fitted=after).sentence
+    assert "something has changed since" in replace(after, fitted=before).sentence
+
+
+@pytest.mark.parametrize(("kind", "low", "high"), [("noise", 0.9, 1.0), ("slow", 0.046, 0.07)])
+def test_filtered_noise_is_quick_and_what_is_slow_is_not(kind, low, high):
+    rng, rate, cutoff, N = np.random.default_rng(0), 500.0, 10.0, 20_000
+    t, segment = np.arange(N) / rate, np.arange(N) // 500
+    if kind == "noise":
+        sos = butter(4, cutoff, fs=rate, output="sos")
+        r = sosfiltfilt(sos, rng.standard_normal(N))
+    else:  # 1 - cos(2 pi f L) of f = cutoff / 20, for L = 1 / cutoff; its sign changes at gaps
+        r = (-1.0) ** segment * np.cos(2 * np.pi * cutoff / 20 * t)
+    mask = np.ones((N, 1), bool)
+    mask[:100] = False
+    r = np.where(mask[:, 0], r, 1e3)
+    e = SimpleNamespace(
+        recording=SimpleNamespace(
+            trajectory=SimpleNamespace(tau=r[:, None], segment=segment, rate=rate),
+            signals=SignalSettings(cutoff=cutoff), mask=mask,
+        ),
+        torques={"estimate": np.zeros((N, 1))},
+    )  # fmt: skip
+    (broadband,) = _broadband_shares([e])
+    assert low <= broadband <= high
+
+
+def test_what_is_forgotten_is_one_less_the_autocorrelation_of_all_recordings(rng):
+    """Of two recordings of other rates, with gaps and rows left out; without a filter of a row."""
+    shares = np.zeros((2, 3))  # products and squares
+    evaluations = []
+    for rate, cutoff, lag in ((100.0, 9.0, 11), (40.0, None, 1), (None, 5.0, 1)):
+        r = rng.standard_normal((60, 3)).cumsum(axis=0) + 2.0
+        mask, segment = rng.uniform(size=r.shape) < 0.8, np.repeat([0, 1], 30)
+        mask[:, 2] = False  # a joint that does not move
+        tau = rng.standard_normal(r.shape)
+        recording = SimpleNamespace(
+            trajectory=SimpleNamespace(tau=tau, segment=segment, rate=rate),
+            signals=SignalSettings(cutoff=cutoff), mask=mask,
+        )  # fmt: skip
+        evaluations.append(SimpleNamespace(recording=recording, torques={"estimate": tau - r}))
+        for j in range(3):
+            for i in range(60 - lag):
+                if mask[i, j] and mask[i + lag, j] and segment[i] == segment[i + lag]:
+                    a, b = r[i, j], r[i + lag, j]
+                    shares[:, j] += a * b, (a**2 + b**2) / 2
+    *found, still = _broadband_shares(evaluations)
+    np.testing.assert_allclose(found, 1.0 - shares[0, :2] / shares[1, :2])
+    assert still is None
+
+
+def test_samples_of_two_recordings_are_cut_together_into_segments_of_ten(rng):
+    def evaluation(name, count, rate, cutoff, start):
+        t = start + np.arange(count) / rate
+        trajectory = SimpleNamespace(t=t, segment=(np.arange(count) > count // 3).astype(int))
+        signals = SignalSettings(cutoff=cutoff, rate=rate)
+        recording = SimpleNamespace(name=name, trajectory=trajectory, signals=signals)
+        return SimpleNamespace(recording=recording)
+
+    own = [
+        (evaluation("a", 400, 100.0, 10.0, 3.0), np.arange(0, 400, 5)),
+        (evaluation("b", 300, 50.0, 5.0, 9.0), np.arange(0, 300, 2)),
+    ]
+    found = torque_split._rows(own)
+    # a fifth of either is independent: 80 of the first and 60 of the second, ten each
+    assert found.segments.tolist() == [14 * k // 230 for k in range(230)]
+    assert found.recordings == ("a", "b")
+    assert found.recording.tolist() == [0] * 80 + [1] * 150
+    t, segment = (
+        np.concatenate([getattr(e.recording.trajectory, x)[k] for e, k in own])
+        for x in ("t", "segment")
+    )
+    np.testing.assert_array_equal(found.t, t)
+    np.testing.assert_array_equal(found.segment, segment)
+    assert torque_split._rows([(own[1][0], np.arange(55))]).segments is None
+
+
+def test_a_residual_is_examined_without_outliers_of_the_samples_used(rng):
+    v, q, load = motion(rng)
+    found = torque(0.5 * np.tanh(v) + 0.1 * rng.standard_normal(len(v)), v, q, load)
+    used = np.arange(len(v)) % 4 != 1
+    parts = {"friction": found.parts["friction"] + np.where(used, 0.0, 1e4)}
+    tau = found.tau + np.where(np.arange(len(v)) % 400 == 0, 40.0, 0.0)
+    spoilt = replace(found, used=used, parts=parts, tau=tau)
+    r = spoilt.residual
+    counted = used & (np.abs(r) <= 12 * np.median(np.abs(r[used])))
+    assert (used & ~counted).sum() == 10
+    segments = spoilt.rows.segments[counted]
+    (speed,) = (d for d in spoilt.follows if d.name == "speed")
+    wanted = follow("speed", "", v[counted], r[counted], even_bins(v[counted]), segments)
+    np.testing.assert_allclose(speed.means, wanted.means)
+    np.testing.assert_allclose(speed.centres, wanted.centres)
+    assert (speed.share, speed.p_value) == (wanted.share, wanted.p_value)
+    rms = spoilt.rms
+    assert rms["measured"] == pytest.approx(np.sqrt(np.mean(tau[used] ** 2)))
+    assert rms["residual"] == pytest.approx(np.sqrt(np.mean(r[used] ** 2)))
+    np.testing.assert_allclose(spoilt.power, tau * v)
+
+
+def test_only_what_fitted_recordings_could_have_shown_has_changed(rng):
+    found = torque(np.zeros(800), *motion(rng, 800))
+    parts = {
+        "significant": ("speed", 0.5, True), "none": ("speed", 0.0, False),
+        "short": ("speed", None, False), "other": ("position", 0.0, False),
+    }  # fmt: skip
+    changed = {}
+    for key, (name, share, is_significant) in parts.items():
+        before = SimpleNamespace(
+            follows=(SimpleNamespace(name=name, share=share, is_significant=is_significant),)
+        )
+        changed[key] = replace(found, fitted=before)._has_changed("speed")
+    assert changed == {"significant": False, "none": True, "short": False, "other": False}
+
+
+def test_samples_of_all_recordings_together_are_at_most_so_many(identified, monkeypatch):
+    """A half of them of each of two fitted logs, whose parts follow each other."""
+    monkeypatch.setattr(torque_split, "_ROWS", 90)
+    found = torque_split._torques_of(identified, identified.fitted)
+    assert [torque.joint for torque in found] == list(identified.model.joints)
+    taken = []
+    for e in identified.fitted:
+        count = len(e.recording.trajectory.t)
+        taken.append(np.linspace(0, count - 1, 45).round().astype(int))
+    for j, torque in enumerate(found):
+        for name, own in (
+            (
+                "tau",
+                [
+                    e.recording.trajectory.tau[k, j]
+                    for e, k in zip(identified.fitted, taken, strict=True)
+                ],
+            ),
+            (
+                "used",
+                [e.recording.mask[k, j] for e, k in zip(identified.fitted, taken, strict=True)],
+            ),
+        ):
+            np.testing.assert_array_equal(getattr(torque, name), np.concatenate(own))
+        whole = np.concatenate(
+            [e.torques["estimate"][k, j] for e, k in zip(identified.fitted, taken, strict=True)]
+        )
+        np.testing.assert_allclose(sum(torque.parts.values()), whole, atol=1e-8)
+        for part, terms in torque.terms.items():
+            np.testing.assert_allclose(sum(terms.values()), torque.parts[part], atol=1e-9)
+        speed = [
+            e.recording.trajectory.v[k, j] for e, k in zip(identified.fitted, taken, strict=True)
+        ]
+        assert torque.quantities["speed"][0] == "rad/s"
+        np.testing.assert_array_equal(torque.quantities["speed"][1], np.concatenate(speed))

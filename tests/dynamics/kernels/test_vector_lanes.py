@@ -1,0 +1,125 @@
+"""Vectors of compiled code: each operator beside NumPy, lane by lane."""
+
+import math
+
+import numpy as np
+import pytest
+
+from robotid.dynamics.kernels.lanes import (
+    compiled,
+    cos_sin,
+    factor,
+    get,
+    put,
+    put_lane,
+    solve,
+    work_space,
+)
+from robotid.dynamics.kernels.vector_lanes import (
+    LANES,
+    copysign,
+    is_any,
+    lane_of,
+    read,
+    where,
+    wide,
+    with_lane,
+    write,
+)
+
+x = np.array([1.5, -2.0, 0.0, 3.25, -0.5, 7.0, -4.0, np.nan])
+y = np.array([-0.5, 4.0, -2.5, 3.25, 1.0, 2.0, -9.0, 1.0])
+
+
+@compiled
+def arithmetic(a, b, out):
+    u, v = read(a, 0), read(b, 0)
+    found = (u + v, u - 2.0, 3.0 * u, 1.0 / v, -u, abs(u), math.sqrt(abs(v)), copysign(u, v))
+    for k in range(8):
+        write(out, k * LANES, found[k])
+    w = wide(2.0)
+    w += u
+    w *= v
+    w -= 1.0
+    w /= 4.0
+    write(out, 8 * LANES, w)
+
+
+@compiled
+def comparisons(a, b, out):
+    u, v = read(a, 0), read(b, 0)
+    both = (u < v) & (v > 0.0)
+    either = (u <= v) | (v >= 4.0)
+    masks = (u < v, u <= v, u > v, u >= v, u == v, both, either, ~(u < v))
+    for k in range(8):
+        write(out, k * LANES, where(masks[k], 1.0, 0.0))
+    write(out, 8 * LANES, where(u > v, u, v))
+    return is_any(u > 6.9), is_any(u > 7.1)
+
+
+def test_arithmetic_is_numpys():
+    out = np.zeros(9 * LANES)
+    arithmetic(x, y, out)
+    expected = [x + y, x - 2, 3 * x, 1 / y, -x, abs(x), np.sqrt(abs(y)), np.copysign(x, y)]
+    expected.append(((2 + x) * y - 1) / 4)
+    np.testing.assert_allclose(out.reshape(9, LANES), expected, rtol=1e-15)
+
+
+def test_comparisons_are_numpys_and_false_for_nan():
+    out = np.zeros(9 * LANES)
+    assert comparisons(x, y, out) == (True, False)
+    expected = [x < y, x <= y, x > y, x >= y, x == y, (x < y) & (y > 0), (x <= y) | (y >= 4)]
+    expected += [~(x < y), np.where(x > y, x, y)]
+    np.testing.assert_array_equal(out.reshape(9, LANES), np.array(expected, dtype=float))
+
+
+@compiled
+def lanes_of(work):
+    total = 0.0
+    for lane in range(LANES):
+        put_lane(work, 2, lane, 10.0 * lane)
+        total += lane * lane_of(get(work, 1), lane)
+    put(work, 0, with_lane(get(work, 2), 3, total))
+    return total
+
+
+def test_single_lanes_are_read_and_written():
+    work = work_space(3)
+    work[LANES : 2 * LANES] = y
+    assert lanes_of(work) == pytest.approx(np.arange(LANES) @ y)
+    expected = 10.0 * np.arange(LANES)
+    expected[3] = np.arange(LANES) @ y
+    np.testing.assert_allclose(work[:LANES], expected)
+
+
+def test_a_work_space_begins_at_a_line_of_the_cache():
+    for entries in (1, 7, 100):
+        work = work_space(entries)
+        assert work.shape == (entries * LANES,)
+        assert work.ctypes.data % (8 * LANES) == 0
+
+
+@compiled
+def turn(angles, out):
+    c, s = cos_sin(read(angles, 0))
+    write(out, 0, c)
+    write(out, LANES, s)
+
+
+def test_cosine_and_sine_in_all_quarters():
+    for angles in (np.linspace(-7.0, 7.0, LANES), 1e3 + np.arange(LANES), np.zeros(LANES)):
+        out = np.zeros(2 * LANES)
+        turn(angles, out)
+        np.testing.assert_allclose(out.reshape(2, -1), [np.cos(angles), np.sin(angles)], atol=3e-13)
+
+
+def test_factor_and_solve_each_lane_on_its_own():
+    n, rng = 4, np.random.default_rng(0)
+    A = rng.normal(size=(LANES, n, n))
+    A, b = A @ A.swapaxes(1, 2) + np.eye(n), rng.normal(size=(LANES, n))
+    work = work_space(n * n + n)
+    work.reshape(-1, LANES)[:] = np.concatenate([A.reshape(LANES, -1), b], axis=1).T
+    factor(work, n, 0)
+    solve(work, n, 0, n * n)
+    found = work.reshape(-1, LANES)[n * n :].T
+    np.testing.assert_allclose(found, np.linalg.solve(A, b[..., None])[..., 0], rtol=1e-10)

@@ -1,0 +1,153 @@
+"""A robot on its feet: motion, contact forces and torques against Pinocchio's."""
+
+from dataclasses import replace
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from helpers.stands import stand
+
+from robotid.base.exceptions import DataError, SettingsError
+from robotid.dynamics.simulation.closed_loop import follow, simulate
+from robotid.dynamics.simulation.simulation_settings import Controller, Sensors, Simulation
+from robotid.dynamics.simulation.stand import Stand, contact_forces, on_feet
+from robotid.robot.constraints import Contact
+from robotid.robot.examples import example_urdf
+from robotid.robot.model import RobotModel
+
+FEET = ("FL_FOOT", "FR_FOOT", "HL_FOOT", "HR_FOOT")
+MIDDLE = np.tile([0.0, 0.8, -1.6], 4)
+PERFECT = Simulation(controller=Controller(kind="perfect"))
+
+
+@pytest.fixture(scope="module")
+def robot():
+    contacts = [Contact(foot, measured=("fz",) * (foot == FEET[0])) for foot in FEET]
+    return RobotModel.from_urdf(
+        example_urdf("solo12.urdf"), free_flyer=True, constraints=contacts, terms=()
+    )
+
+
+@pytest.fixture(scope="module")
+def motion(robot):
+    return stand(robot, MIDDLE, 0.25, np.random.default_rng(1), parts=2, length=1.0)
+
+
+def test_feet_on_the_ground_do_not_move(robot, motion):
+    t = np.linspace(0.0, 2.0, 41)
+    q, v, a = motion.evaluate(t)
+    model, data = robot.pin_model, robot.pin_model.createData()
+    ids = [model.getFrameId(foot, pin.FrameType.BODY) for foot in FEET]
+    touching, places = motion.touching(t), []
+    for q_k, v_k, a_k in zip(q, v, a, strict=True):
+        pin.forwardKinematics(model, data, q_k, v_k, a_k)
+        pin.updateFramePlacements(model, data)
+        places.append([data.oMf[i].translation.copy() for i in ids])
+        axes = pin.LOCAL_WORLD_ALIGNED
+        speed = [np.linalg.norm(pin.getFrameVelocity(model, data, i, axes).linear) for i in ids]
+        k = len(places) - 1
+        lands = touching[max(k - 1, 0) : k + 2].all(axis=0)  # not beside a change of contact
+        assert np.array(speed)[lands].max() < 1e-5
+    moved = np.abs(places - np.array(places[0])).max(axis=2)
+    assert moved[touching & (t < 1.9)[:, None]].max() < 1e-6
+    assert moved.max() > 0.01
+    assert not touching.all()
+
+
+def test_the_twist_and_its_derivative_are_those_of_the_pose(robot, motion):
+    h, t = 1e-5, np.array([0.33, 0.71, 1.47])
+    (_, v, a), before, after = (motion.evaluate(x) for x in (t, t - h, t + h))
+    assert np.abs(v[:, :6]).max() > 0.05
+    np.testing.assert_allclose(a, (after[1] - before[1]) / (2 * h), atol=1e-4)
+    for k in range(3):
+        difference = pin.difference(robot.pin_model, before[0][k], after[0][k])
+        np.testing.assert_allclose(v[k], difference / (2 * h), atol=1e-7)
+
+
+def test_the_torques_cause_the_motion_in_constrained_dynamics(robot, motion):
+    pi = robot.standard_parameters()
+    run = follow(robot, pi, motion, rate=10.0, duration=2.0, settings=PERFECT)
+    model, contacts = robot.pin_model, motion.touching(run.t)
+    q, v, a = motion.evaluate(run.t)
+    for k in range(2, 19):
+        if (contacts[k - 1] != contacts[k + 1]).any():  # the feet are not at rest there
+            continue
+        feet = [
+            pin.RigidConstraintModel(
+                pin.ContactType.CONTACT_3D, model, model.frames[i].parentJoint,
+                model.frames[i].placement, pin.LOCAL_WORLD_ALIGNED,
+            )
+            for i in (model.getFrameId(foot, pin.FrameType.BODY) for foot in FEET)
+        ]  # fmt: skip
+        feet = [foot for foot, touches in zip(feet, contacts[k], strict=True) if touches]
+        own = pin.StdVec_RigidConstraintData([foot.createData() for foot in feet])
+        feet = pin.StdVec_RigidConstraintModel(feet)
+        data = model.createData()
+        pin.initConstraintDynamics(model, data, feet, own)
+        tau = np.append(np.zeros(6), run.tau[k])
+        found = pin.constraintDynamics(model, data, q[k], v[k], tau, feet, own)
+        np.testing.assert_allclose(found, a[k], atol=1e-4 * (1.0 + np.abs(a[k]).max()))
+    force = run.stand.wrenches["fz FL_FOOT"]
+    assert force[contacts[:, 0]].min() > 1.0
+    np.testing.assert_allclose(force[~contacts[:, 0]], 0.0, atol=1e-9)
+
+
+def test_a_log_has_base_contacts_and_measured_forces(robot, motion):
+    sensors = Sensors(velocity=False, dropped=0.2)
+    log = simulate(
+        robot, robot.standard_parameters(), motion, rate=50.0, duration=2.0,
+        rng=np.random.default_rng(0), settings=replace(PERFECT, sensors=sensors),
+    )  # fmt: skip
+    assert 60 < len(log.t) < 101
+    np.testing.assert_allclose(log.base.pose, motion.evaluate(log.t)[0][:, :7], atol=1e-12)
+    assert log.base.twist is None
+    assert tuple(log.contacts) == FEET
+    assert [*log.wrenches] == ["fz FL_FOOT"]
+    np.testing.assert_array_equal(np.transpose([*log.contacts.values()]), motion.touching(log.t))
+
+
+def test_forces_are_the_smallest_that_cause_a_wrench(rng):
+    J, w = rng.standard_normal((3, 9, 6)), rng.standard_normal((3, 6))
+    f, left = contact_forces(J, w)
+    np.testing.assert_allclose(left, 0.0, atol=1e-10)
+    wanted = [np.linalg.lstsq(own.T, x, rcond=None)[0] for own, x in zip(J, w, strict=True)]
+    np.testing.assert_allclose(f, wanted, atol=1e-10)
+
+
+def test_what_a_stand_cannot_do_is_refused(robot, motion):
+    pi, rng = robot.standard_parameters(), {"rate": 10.0, "duration": 1.0}
+    flying = replace(motion, contacts=np.zeros_like(motion.contacts))
+    with pytest.raises(DataError, match=r"forces at the contacts cannot cause .* t = "):
+        follow(robot, pi, flying, settings=PERFECT, **rng)
+    with pytest.raises(SettingsError, match="kind is feedforward, wanted perfect"):
+        follow(robot, pi, motion, settings=Simulation(), **rng)
+    fixed = RobotModel.from_urdf(example_urdf("solo12.urdf"), constraints=[Contact(FEET[0])])
+    with pytest.raises(DataError, match="has contacts or loops; simulation needs a robot with"):
+        follow(fixed, fixed.standard_parameters(), motion, settings=PERFECT, **rng)
+    alone = RobotModel.from_urdf(example_urdf("solo12.urdf"), free_flyer=True, terms=())
+    with pytest.raises(SettingsError, match="has no contacts"):
+        follow(alone, pi, motion, settings=PERFECT, **rng)
+    away = motion.pose + np.r_[0, 0, 1.0, 0, 0, 0, 0] * (motion.t > 0.5)[:, None]
+    with pytest.raises(DataError, match=r"sample 51: the feet on the ground cannot remain"):
+        on_feet(robot, away, motion.q, motion.contacts)
+
+
+@pytest.mark.parametrize("velocity", [True, False])
+@pytest.mark.parametrize("acceleration", [True, False])
+def test_the_base_has_the_signals_that_are_logged(rng, velocity, acceleration):
+    pose, twist, change = rng.standard_normal((5, 7)), *rng.standard_normal((2, 5, 6))
+    pose[:, 3:] = [0.0, 0.6, 0.0, 0.8]
+    rows, flags, force = np.array([0, 1, 1, 0, 1]) > 0, np.arange(5) > 2, np.arange(5.0)
+    found = Stand(pose, twist, change, {"foot": flags}, {"fz foot": force}).logged(
+        Sensors(velocity=velocity, acceleration=acceleration), rows
+    )
+    np.testing.assert_allclose(found["base"].pose, pose[rows])
+    for values, is_logged, true in (
+        (found["base"].twist, velocity, twist), (found["base"].acceleration, acceleration, change)
+    ):  # fmt: skip
+        if is_logged:
+            np.testing.assert_array_equal(values, true[rows])
+        else:
+            assert values is None
+    assert found["contacts"]["foot"].tolist() == [False, False, True]
+    assert found["wrenches"]["fz foot"].tolist() == [1.0, 2.0, 4.0]

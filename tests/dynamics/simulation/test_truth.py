@@ -1,0 +1,90 @@
+"""True robots are possible, as far from the URDF as was asked, and known by name."""
+
+import re
+
+import numpy as np
+import pytest
+from helpers.single_joint import one_joint
+from scipy.linalg import eigvalsh
+
+from robotid.base.exceptions import ModelError, SettingsError
+from robotid.dynamics.simulation.simulation_settings import Truth
+from robotid.dynamics.simulation.truth import draw_parameters, perturbed_bodies
+from robotid.robot.drives import LoadFriction
+from robotid.robot.parameters import pseudo_inertia
+
+
+def distances(model, pi):
+    """Return d^2 = 1/2 sum log^2 of the eigenvalues of J^-1 J', per body."""
+    size = model.layout.n_inertial
+    pairs = zip(
+        pseudo_inertia(pi[:size]), pseudo_inertia(model.standard_parameters()[:size]), strict=True
+    )
+    return np.array([0.5 * np.sum(np.log(eigvalsh(new, old)) ** 2) for new, old in pairs])
+
+
+@pytest.mark.parametrize("size", [0.02, 0.1, 1.0])
+def test_bodies_lie_as_far_in_the_metric_as_was_asked(panda, rng, size):
+    squares = np.concatenate(
+        [distances(panda, perturbed_bodies(panda, size, rng)) for _ in range(60)]
+    )
+    # ten independent squares of one standard deviation: mean 10, standard deviation sqrt(20)
+    assert np.mean(squares) / size**2 == pytest.approx(10.0, abs=4 * np.sqrt(20 / len(squares)))
+    assert np.std(squares) / size**2 == pytest.approx(np.sqrt(20), rel=0.25)
+
+
+def test_a_scale_of_one_tenth_moves_masses_by_a_seventh(ur5, rng):
+    masses = ur5.standard_parameters()[0:60:10]
+    drawn = np.array([perturbed_bodies(ur5, 0.1, rng)[0::10] for _ in range(400)])
+    np.testing.assert_allclose(np.log(drawn / masses).std(axis=0), 0.14, rtol=0.2)
+
+
+def test_wild_draws_are_possible_bodies(ur5, rng):
+    for _ in range(20):
+        J = pseudo_inertia(perturbed_bodies(ur5, 3.0, rng))
+        values = np.linalg.eigvalsh(J)
+        assert (values[:, 0] > -1e-12 * values[:, -1]).all()
+
+
+def test_drives_are_usual_for_the_size_of_their_joint(ur5, panda):
+    model = panda.with_terms({"panda_joint1": (LoadFriction(),)})
+    pi = draw_parameters(model, Truth(), np.random.default_rng(3))
+    effort = {joint.name: joint.effort for joint in model.limits}
+    assert effort["panda_joint7"] == 12.0
+    entries = zip(model.layout.drive_parameters, pi[model.layout.n_inertial :], strict=True)
+    for (d, term), value in entries:
+        size = min(1.0, effort[model.joints[d]] / 50.0) if term.name != "load" else 1.0
+        low, high = term.typical
+        assert size * low <= value <= size * high
+    none = draw_parameters(ur5, Truth(drives="none", inertials=0.0), np.random.default_rng(3))
+    np.testing.assert_array_equal(none, ur5.standard_parameters())
+
+
+def test_the_same_seed_draws_the_same_and_stated_values_stand(ur5):
+    first, second = (
+        draw_parameters(ur5, truth, np.random.default_rng(5))
+        for truth in (Truth(), Truth(values={"elbow_joint.viscous": 7.5, "forearm_link.m": 4.0}))
+    )
+    changed = [ur5.layout.names[i] for i in np.flatnonzero(first != second)]
+    assert changed == ["forearm_link.m", "elbow_joint.viscous"]
+    assert second[ur5.layout.names.index("elbow_joint.viscous")] == 7.5
+
+
+ERRORS = {
+    "truth: values: 'elbow_joint.viscos' is not a parameter of ur5. Did you mean "
+    "'elbow_joint.viscous'?": {"elbow_joint.viscos": 1.0},
+    "truth: body 'forearm_link' is physically inconsistent": {"forearm_link.m": 0.01},
+    "truth: elbow_joint.viscous is -1 N m s/rad, wanted 0 or more": {"elbow_joint.viscous": -1.0},
+}
+
+
+@pytest.mark.parametrize("message", ERRORS)
+def test_values_that_cannot_be_are_refused(ur5, rng, message):
+    with pytest.raises(SettingsError, match=re.escape(message)):
+        draw_parameters(ur5, Truth(inertials=0.0, values=ERRORS[message]), rng)
+
+
+def test_a_urdf_that_cannot_be_is_no_start(tmp_path, rng):
+    model = one_joint(tmp_path, inertia=-0.1)
+    with pytest.raises(ModelError, match=r"body 'body' of the URDF is phys.*robotid inspect"):
+        perturbed_bodies(model, 0.1, rng)

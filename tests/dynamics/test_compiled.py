@@ -1,0 +1,200 @@
+import logging
+
+import numpy as np
+import pytest
+from helpers.robots import JOINT, LINK, ROBOTS, mimicking, motion
+
+from robotid.base.exceptions import DataError
+from robotid.data.log import Trajectory
+from robotid.dynamics import compiled, factors, rows
+from robotid.dynamics.base_parameters import structural_mapping
+from robotid.dynamics.drive_columns import friction_speeds
+from robotid.dynamics.factors import compress
+from robotid.dynamics.problem import concatenate
+from robotid.dynamics.rows import COMPILED, TrajectoryRows
+from robotid.dynamics.torque import build_problem, joint_torque_regressor
+from robotid.estimation.estimators import WLS
+from robotid.robot.examples import example_urdf
+from robotid.robot.model import RobotModel
+
+
+def source(model, trajectory, engine=COMPILED, weights=None):
+    weights = np.ones(trajectory.v.shape) if weights is None else weights
+    kept = np.arange(len(model.layout.names))
+    return TrajectoryRows(model, trajectory, weights, model.support(), kept, engine)
+
+
+def stacked(source, start=0, stop=None):
+    stop = source.samples if stop is None else stop
+    blocks = [[rows.copy() for rows in block] for block in source.blocks(start, stop)]
+    return [np.vstack(parts) for parts in zip(*blocks, strict=True)]
+
+
+def assert_is_pinocchio(model, trajectory):
+    W = joint_torque_regressor(
+        model, trajectory.q, trajectory.v, trajectory.a, trajectory.direction
+    )
+    W = W.reshape(len(trajectory.t), model.n_rows, -1)
+    for engine in (COMPILED, "Pinocchio"):
+        found = source(model, trajectory, engine)
+        for j, (columns, rows_j) in enumerate(zip(found.columns, stacked(found), strict=True)):
+            expected = np.column_stack([W[:, j, columns], trajectory.tau[:, j]])
+            # a body's ten columns share their rounding: relative to the largest of the row
+            bound = 1e-12 * np.abs(expected).max(axis=1, keepdims=True)
+            assert (np.abs(rows_j - expected) <= bound).all()
+            np.testing.assert_allclose(
+                rows_j @ (pi := np.cos(np.arange(len(columns) + 1))),
+                expected @ pi,
+                atol=1e-11 * np.abs(expected).max(),
+            )
+
+
+@pytest.mark.parametrize("case", ROBOTS)
+def test_compiled_rows_are_pinocchios(case, rng):
+    name, options = ROBOTS[case]
+    model = RobotModel.from_urdf(example_urdf(name), **options)
+    assert compiled.why_not(model) is None
+    assert_is_pinocchio(model, motion(model, rng, 150))  # two groups of lanes and a part
+    direction = rng.uniform(-1.2, 1.2, (150, len(friction_speeds(model.layout))))
+    assert_is_pinocchio(model, motion(model, rng, 150, direction=direction))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_compiled_rows_are_pinocchios_on_random_trees(seed, tmp_path):
+    rng = np.random.default_rng(seed)
+    parts = [LINK.format("l0")]
+    for i in range(1, 8):
+        text = {k: " ".join(map(str, rng.standard_normal(3))) for k in ("axis", "xyz", "rpy")}
+        kind = rng.choice(["revolute", "prismatic", "continuous"])
+        parts += [
+            LINK.format(f"l{i}"),
+            JOINT.format(i=i, kind=kind, parent=rng.integers(i), **text),
+        ]
+    path = tmp_path / "tree.urdf"
+    path.write_text(f'<robot name="tree">{"".join(parts)}</robot>')
+    model = RobotModel.from_urdf(path, free_flyer=bool(seed % 2))
+    assert_is_pinocchio(model, motion(model, rng, 64))
+
+
+def test_a_mimic_joint_follows_at_its_ratio_above_and_beside_its_leader(tmp_path, rng):
+    model = mimicking(tmp_path, rng)
+    assert model.joints == ("j1", "j4")
+    assert_is_pinocchio(model, motion(model, rng, 64))
+
+
+@pytest.mark.parametrize("reach", [1e-9, 1.0, 1e3, 1e5])
+def test_small_and_large_angles_keep_their_digits(reach, ur5, rng):
+    assert_is_pinocchio(ur5, motion(ur5, rng, 100, reach))
+
+
+def test_quarter_turns_keep_their_digits(ur5, rng):
+    trajectory = motion(ur5, rng, 130)
+    quarters = np.arange(-65, 65) * np.pi / 4
+    trajectory = Trajectory(
+        **{**vars(trajectory), "q": np.tile(quarters[:, None], (1, 6)) + rng.choice([0, 1e-9], 6)}
+    )
+    assert_is_pinocchio(ur5, trajectory)
+
+
+@pytest.fixture
+def long_log(panda, monkeypatch):
+    """Three parts, the last one short, weights of a mask."""
+    monkeypatch.setattr(factors, "_PART", 2048)
+    rng = np.random.default_rng(1)
+    trajectory = motion(panda, rng, 2 * 2048 + 777)
+    return trajectory, rng.choice([0.0, 1.0, 4.0], trajectory.v.shape)
+
+
+def test_factors_do_not_depend_on_the_number_of_threads(panda, long_log):
+    problem = structural_mapping(panda).reduce(build_problem(panda, *long_log, compiled=True))
+    one, two, three = (compress(problem, threads=threads) for threads in (1, 2, 3))
+    np.testing.assert_array_equal(one.R, two.R)
+    np.testing.assert_array_equal(one.R, three.R)
+    np.testing.assert_array_equal(one.R, compress(problem).R)
+
+
+def test_estimates_are_the_same_on_both_paths_and_from_whole_blocks(panda, long_log):
+    mapping = structural_mapping(panda)
+    problems = [build_problem(panda, *long_log, compiled=flag) for flag in (True, False)]
+    problems = [mapping.reduce(problem) for problem in problems]
+    blocks = type(problems[1])(
+        problems[1].stream, problems[1].names, problems[1].n_joints, problems[1].support
+    )
+    fits = [WLS().fit(problem) for problem in [*problems, blocks]]
+    for fit in fits[1:]:
+        scale = np.abs(fit.theta).max()
+        np.testing.assert_allclose(fits[0].theta, fit.theta, atol=1e-12 * scale)
+        np.testing.assert_allclose(fits[0].std_error, fit.std_error, rtol=1e-11)
+    counts = [compress(problem).rows for problem in [*problems, blocks]]
+    np.testing.assert_array_equal(counts[0], (long_log[1] > 0).sum(axis=0))
+    np.testing.assert_array_equal(counts[0], counts[1])
+    np.testing.assert_array_equal(counts[0], counts[2])
+
+
+def test_columns_may_be_chosen_in_any_order_and_twice(ur5, rng):
+    problem = build_problem(ur5, motion(ur5, rng, 200), compiled=True)
+    chosen = problem.select(np.array([70, 3, 9, 61, 12, 40])).select(np.array([4, 1, 0]))
+    (W, tau, _), *_ = problem.blocks()
+    for j, (columns, rows_j) in enumerate(
+        zip(chosen.sources[0].columns, stacked(chosen.sources[0]), strict=True)
+    ):
+        wanted = W[j::6][:, np.array([12, 3, 70])[columns]]
+        np.testing.assert_allclose(rows_j[:, :-1], wanted, atol=1e-12)
+        np.testing.assert_array_equal(rows_j[:, -1], tau[j::6])
+
+
+def test_several_logs_are_one_problem_whatever_computes_them(ur5, rng):
+    logs = [motion(ur5, rng, samples) for samples in (70, 600)]
+    mixed = concatenate([build_problem(ur5, log, compiled=k == 0) for k, log in enumerate(logs)])
+    plain = concatenate([build_problem(ur5, log, compiled=False) for log in logs])
+    assert len(mixed.sources) == 2
+    first, second = compress(mixed), compress(plain)
+    for a, b in zip(first.R, second.R, strict=True):
+        np.testing.assert_allclose(a.T @ a, b.T @ b, atol=1e-9)
+
+
+@pytest.mark.parametrize("flag", [True, False])
+def test_a_row_that_is_not_finite_is_refused_on_both_paths(flag, ur5, rng):
+    weights = np.ones((200, 6))
+    weights[17, 3] = np.nan
+    with pytest.raises(DataError, match="a row that is not finite"):
+        compress(build_problem(ur5, motion(ur5, rng, 200), weights, compiled=flag))
+
+
+def test_the_path_is_chosen_by_the_length_of_the_log_and_said(ur5, rng, monkeypatch, caplog):
+    trajectory = motion(ur5, rng, 200)
+    with caplog.at_level(logging.INFO, logger="robotid"):
+        short = build_problem(ur5, trajectory).sources[0]
+    assert short.engine.startswith("Pinocchio (the compiled path is slower below 120690 samples")
+    assert f"ur5: regressor of 200 samples: {short.engine}" in caplog.text
+    monkeypatch.setattr(rows, "LONG_ENOUGH", 200 * compiled.work_per_sample(ur5))
+    assert build_problem(ur5, trajectory).sources[0].engine == COMPILED
+    assert build_problem(ur5, trajectory, compiled=False).sources[0].engine == "Pinocchio"
+
+
+def test_where_numba_does_not_run_pinocchio_computes_the_rows(ur5, rng, monkeypatch):
+    def fail():
+        raise ImportError("Numba needs NumPy 2.4 or less")
+
+    monkeypatch.setattr(compiled, "row_lanes", fail)
+    found = build_problem(ur5, motion(ur5, rng, 200), compiled=True).sources[0]
+    assert found.engine == "Pinocchio (Numba cannot be imported: Numba needs NumPy 2.4 or less)"
+
+
+def test_a_joint_that_is_not_supported_falls_back_by_itself(ur5, rng, monkeypatch):
+    monkeypatch.setattr(compiled, "_is_simple", lambda axis: False)
+    found = build_problem(ur5, motion(ur5, rng, 200), compiled=True).sources[0]
+    assert found.engine.startswith(
+        "Pinocchio (the compiled code does not support joint 'shoulder_pan"
+    )
+    assert not found.is_parallel
+
+
+def test_without_a_folder_for_compiled_code_pinocchio_takes_over(ur5, rng, monkeypatch):
+    assert compiled.keeps_code()
+    monkeypatch.setattr(rows, "LONG_ENOUGH", 0)
+    monkeypatch.setattr(rows, "keeps_code", lambda: False)
+    engine = build_problem(ur5, motion(ur5, rng, 200)).sources[0].engine
+    assert engine.startswith("Pinocchio (no folder for compiled code; set one as NUMBA_")
+    asked = build_problem(ur5, motion(ur5, rng, 200), compiled=True).sources[0]
+    assert asked.engine == COMPILED

@@ -1,0 +1,122 @@
+"""How drives move along a trajectory: segment by segment, under the load of the bodies."""
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from helpers.robots import motion
+
+from robotid.data.log import Trajectory
+from robotid.dynamics.memory import _rate, drive_motion_along, is_loaded, remember
+from robotid.dynamics.prediction import rigid_parts
+from robotid.robot.drives import Lag, LoadFriction, Presliding
+from robotid.robot.examples import example_urdf
+from robotid.robot.model import RobotModel
+
+JOINTS = ("shoulder_lift_joint", "elbow_joint", "wrist_1_joint")
+
+
+def motion_of(t, segment):
+    w, phase = np.array([1.3, 2.1, 3.4]), np.array([0.2, 1.0, -0.5])
+    x = np.outer(t, w) + phase
+    q, v, a = np.sin(x), w * np.cos(x), -(w**2) * np.sin(x)
+    return Trajectory(t, q, v, a, 0 * q, JOINTS, None, segment)
+
+
+def test_changes_of_torques_are_taken_within_each_stretch():
+    t = 4.0 + np.concatenate([np.arange(40), 90 + np.arange(30), [200]]) / 50
+    segment = np.repeat([3, 5, 6], [40, 30, 1])
+    torque = np.column_stack([t**2, 3.0 * t, np.sin(t)])
+    torque[40:] += 100.0  # while nothing was recorded
+    found = _rate(torque, motion_of(t, segment))
+    exact = np.column_stack([2 * t, 3.0 + 0 * t, np.cos(t)])
+    inner = np.delete(np.arange(71), [0, 39, 40, 69, 70])
+    np.testing.assert_allclose(found[inner], exact[inner], atol=2e-4)
+    np.testing.assert_allclose(found[[0, 39, 40, 69]], exact[[0, 39, 40, 69]], atol=0.03)
+    assert not found[70].any(), "one sample shows no change"
+
+
+def test_drives_are_loaded_by_the_bodies_and_their_stretches_begin_anew():
+    model = RobotModel.from_urdf(
+        example_urdf("ur5_robot.urdf"), joints=JOINTS, own_terms={JOINTS[1]: (LoadFriction(),)}
+    )
+    pi = model.standard_parameters()
+    drives = dict(zip(model.layout.names, range(len(pi)), strict=True))
+    for name, x in (("armature", 0.4), ("viscous", 2.0), ("coulomb", 1.5), ("load", 0.3)):
+        pi[drives[f"{JOINTS[1]}.{name}"]] = x
+    model = model.with_reference(pi)
+    t = 4.0 + np.concatenate([np.arange(400), 900 + np.arange(300)]) / 500
+    motion = motion_of(t, np.repeat([2, 7], [400, 300]))
+    found = drive_motion_along(model, motion)
+    assert np.flatnonzero(found.begins).tolist() == [0, 400]
+    engine, data = model.with_parameters(pi).pin_model, model.pin_model.createData()
+    rows = zip(model.configurations(motion.q), motion.v, motion.a, strict=True)
+    load = np.array([pin.rnea(engine, data, *row) for row in rows])
+    np.testing.assert_allclose(found.load, load.T, atol=1e-9)
+    v, a = motion.v[:, 1], motion.a[:, 1]
+    friction = 0.4 * a + 2.0 * v + np.sign(v) * (1.5 + 0.3 * np.abs(load[:, 1]))
+    whole = load.copy()
+    whole[:, 1] += friction
+    for part in (slice(0, 400), slice(400, 700)):
+        rate = np.gradient(whole[part], t[part], axis=0)
+        np.testing.assert_allclose(found.rate[:, part], rate.T, atol=1e-6)
+
+
+def test_the_parts_of_a_rigid_torque_are_gravity_inertia_and_speed(rng):
+    model = RobotModel.from_urdf(example_urdf("ur5_robot.urdf"), joints=JOINTS)
+    pi = model.standard_parameters()
+    pi[model.layout.n_inertial :] = 5.0  # drives, which have no part
+    q, v, a = rng.uniform(-1, 1, (3, 5, 3))
+    gravity, inertia, speed = rigid_parts(model, pi, q, v, a)
+    engine, data = model.pin_model, model.pin_model.createData()
+    for k, x in enumerate(model.configurations(q)):
+        np.testing.assert_allclose(
+            gravity[k], pin.computeGeneralizedGravity(engine, data, x), atol=1e-10
+        )
+        M = pin.crba(engine, data, x)
+        M = np.triu(M) + np.triu(M, 1).T
+        np.testing.assert_allclose(inertia[k], M @ a[k], atol=1e-10)
+        C = pin.computeCoriolisMatrix(engine, data, x, v[k])
+        np.testing.assert_allclose(speed[k], C @ v[k], atol=1e-10)
+    impossible = pi.copy()
+    impossible[0], impossible[1] = 0.0, 0.7  # a moment without a mass
+    parts = rigid_parts(model, impossible, q, v, a)
+    more = rigid_parts(model, impossible - pi, q, v, a)
+    for one, other, change in zip(parts, (gravity, inertia, speed), more, strict=True):
+        np.testing.assert_allclose(one, other + change, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("term", "depends"), [(Presliding(), False), (LoadFriction(), True), (Lag(), True)]
+)
+def test_bristles_alone_remember_the_same_whatever_the_bodies_weigh(ur5, rng, term, depends):
+    model = ur5.with_terms({ur5.joints[1]: (term,)})
+    assert is_loaded(model) is depends
+    trajectory, pi = motion(model, rng, 50), model.standard_parameters()
+    light, heavy = (remember(model.with_reference(x * pi), trajectory).memory for x in (1.0, 2.0))
+    assert np.array_equal(light, heavy) is not depends
+
+
+def test_one_drive_that_bears_a_load_is_enough(ur5):
+    first, second, third = ur5.joints[:3]
+    assert not is_loaded(ur5)
+    assert not is_loaded(ur5.with_terms({first: (Presliding(),), second: (Presliding(),)}))
+    own = {first: (Presliding(),), second: (Lag(),), third: (Presliding(),)}
+    assert is_loaded(ur5.with_terms(own))
+
+
+def test_motions_that_were_kept_are_not_those_of_another_reference(ur5, rng):
+    model = ur5.with_terms({JOINTS[1]: (LoadFriction(), Lag())})
+    m = motion(ur5, rng, samples=40)
+    pi = model.standard_parameters()
+    pi[model.layout.n_inertial :] = 0.5
+    heavier = model.with_reference(
+        np.where(np.arange(len(pi)) < model.layout.n_inertial, 2, 3) * pi
+    )
+    first, again = (drive_motion_along(model.with_reference(pi), m) for _ in range(2))
+    assert first is again
+    other = drive_motion_along(heavier, m)
+    np.testing.assert_allclose(other.load, 2 * first.load)
+    alone = drive_motion_along(heavier, motion(ur5, np.random.default_rng(1), samples=40))
+    assert not np.allclose(alone.load, other.load), "of another trajectory"
+    assert not drive_motion_along(heavier, m, has_rate=False).rate.any()
+    assert drive_motion_along(heavier, m).rate.any()

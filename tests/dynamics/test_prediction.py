@@ -1,0 +1,161 @@
+"""Predicted torques against the regressor times the parameters."""
+
+import numpy as np
+import pytest
+from helpers.robots import ROBOTS, motion
+
+from robotid.base.exceptions import DataError
+from robotid.dynamics import prediction
+from robotid.dynamics.base_parameters import structural_mapping
+from robotid.dynamics.drive_columns import friction_speeds
+from robotid.dynamics.prediction import (
+    body_slopes,
+    body_slopes_by_position,
+    predict,
+    predict_instants,
+)
+from robotid.dynamics.torque import joint_torque_regressor
+from robotid.robot.drives import Lag, LoadFriction, Presliding, Stribeck
+from robotid.robot.examples import example_urdf
+from robotid.robot.model import RobotModel
+
+
+def vectors(model, rng):
+    """Return a possible robot with drives, a heavier one, and base parameters alone."""
+    drives = len(model.layout.drive_names)
+    possible = model.standard_parameters()
+    possible[model.layout.n_inertial :] = rng.uniform(0.1, 1.0, drives)
+    mapping = structural_mapping(model)
+    base_only = np.zeros(len(possible))
+    base_only[mapping.independent] = rng.standard_normal(len(mapping.independent))
+    return possible, 1.3 * possible, base_only
+
+
+def assert_is_regressor_times(model, parameters, trajectory, **options):
+    W = joint_torque_regressor(
+        model, trajectory.q, trajectory.v, trajectory.a, trajectory.direction
+    )
+    for torque, pi in zip(
+        predict(model, parameters, trajectory, **options), parameters, strict=True
+    ):
+        expected = (W @ pi).reshape(torque.shape)
+        np.testing.assert_allclose(torque, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("case", ROBOTS)
+def test_predicted_torque_is_the_regressor_times_the_parameters(case, rng):
+    path, options = ROBOTS[case]
+    model = RobotModel.from_urdf(example_urdf(path), **options)
+    direction = rng.uniform(-1.2, 1.2, (70, len(friction_speeds(model.layout))))
+    trajectory = motion(model, rng, 70, direction=direction)
+    possible, heavier, base_only = vectors(model, rng)
+    assert_is_regressor_times(model, [possible], trajectory, compiled=False)  # inverse dynamics
+    assert_is_regressor_times(model, [possible, heavier, base_only], trajectory, compiled=False)
+    assert_is_regressor_times(model, [possible, base_only], trajectory, compiled=True)
+
+
+def test_inverse_dynamics_takes_few_possible_robots_and_rows_the_rest(panda, rng, monkeypatch):
+    calls = []
+    real = prediction.inverse_dynamics
+    monkeypatch.setattr(
+        prediction, "inverse_dynamics", lambda *args: calls.append(args) or real(*args)
+    )
+    trajectory = motion(panda, rng, 5)
+    possible, heavier, base_only = vectors(panda, rng)
+    predict(panda, [possible, heavier, possible], trajectory)
+    assert len(calls) == 3
+    predict(panda, [possible] * 4, trajectory)
+    predict(panda, [possible, base_only], trajectory)
+    assert len(calls) == 3
+
+
+@pytest.mark.parametrize("mass", [0.0, -0.5, 1e-9])
+def test_bodies_that_are_none_keep_their_digits(mass, ur5, rng):
+    trajectory = motion(ur5, rng, 20)
+    pi = ur5.standard_parameters()
+    pi[10:20] = [mass, 0.3, -0.2, 0.5, 0.1, 0.0, 0.2, 0.0, 0.0, 0.1]
+    assert_is_regressor_times(ur5, [pi], trajectory, compiled=False)
+    pi[11:14] = 0.0
+    assert_is_regressor_times(ur5, [pi], trajectory, compiled=False)
+
+
+def test_slopes_of_bodies_that_are_none_are_those_of_differences(ur5, rng):
+    m, h, n = motion(ur5, rng, 3), 1e-6, len(ur5.joints)
+    pi = ur5.standard_parameters()
+    pi[10:20] = [-0.5, 0.3, -0.2, 0.5, 0.1, 0.0, 0.2, 0.0, 0.0, 0.1]
+    found = body_slopes(ur5, pi, m)
+    np.testing.assert_allclose(body_slopes_by_position(ur5, pi, m), found.by_q, atol=1e-9)
+    state = (m.q, m.v, m.a)
+    for k, slope in enumerate((found.by_q, found.by_v, found.by_a)):
+        for j in range(n):
+            up, down = ([x + s * h * (i == k) * np.eye(n)[j] for i, x in enumerate(state)]
+                        for s in (1, -1))  # fmt: skip
+            rows = [joint_torque_regressor(ur5, *moved) @ pi for moved in (up, down)]
+            wanted = ((rows[0] - rows[1]) / (2 * h)).reshape(-1, n)
+            np.testing.assert_allclose(slope[:, :, j], wanted, atol=1e-6 * np.abs(wanted).max())
+    for axis in range(3):
+        g = np.array([0.0, 0.0, -9.81]) + np.eye(3)[axis]
+        other = RobotModel.from_urdf(example_urdf("ur5_robot.urdf"), gravity=tuple(g))
+        rows = [joint_torque_regressor(robot, *state) @ pi for robot in (other, ur5)]
+        wanted = (rows[0] - rows[1]).reshape(-1, n)
+        np.testing.assert_allclose(
+            found.by_gravity[:, :, axis], wanted, atol=1e-9 * np.abs(wanted).max()
+        )
+
+
+def test_other_joints_are_refused(ur5, panda, rng):
+    with pytest.raises(DataError, match="the trajectory has the joints"):
+        predict(ur5, [ur5.standard_parameters()], motion(panda, rng, 5))
+
+
+def test_an_instant_is_predicted_as_by_inverse_dynamics_and_the_formulas_of_friction(ur5, rng):
+    terms = (LoadFriction(), Stribeck(speed=0.2), Presliding(), Lag())
+    model = ur5.with_terms({"elbow_joint": terms})
+    pi = model.standard_parameters()
+    values = dict(zip(model.layout.drive_names, rng.uniform(0.1, 0.4, 30), strict=False))
+    pi[model.layout.n_inertial :] = list(values.values())
+    m, j = motion(ur5, rng, 40), ur5.joints.index("elbow_joint")
+    rigid = predict(ur5, [ur5.standard_parameters()], m)[0]
+    expected = rigid.copy()
+    for k, joint in enumerate(ur5.joints):
+        Ia, Fv, Fc, off = (
+            values[f"{joint}.{term}"] for term in ("armature", "viscous", "coulomb", "offset")
+        )
+        expected[:, k] += Ia * m.a[:, k] + Fv * m.v[:, k] + Fc * np.sign(m.v[:, k]) + off
+    mu, hook, slide = (values[f"elbow_joint.{x}"] for x in ("load", "stribeck", "presliding"))
+    sign = np.sign(m.v[:, j])  # it has slid for long, and its torque does not change: no lag
+    expected[:, j] += sign * (mu * np.abs(rigid[:, j]) + slide)
+    expected[:, j] += hook * sign * np.exp(-np.abs(m.v[:, j]) / 0.2)
+    torque = predict_instants(model, pi, m.q, m.v, m.a)
+    np.testing.assert_allclose(torque, expected, rtol=0, atol=1e-11 * np.abs(expected).max())
+    one = predict_instants(model, pi, m.q[3].tolist(), m.v[3], m.a[3])
+    assert one.shape == (6,)
+    np.testing.assert_array_equal(one, predict_instants(model, pi, m.q[3:4], m.v[3:4], m.a[3:4])[0])
+    at_rest = predict_instants(ur5, ur5.standard_parameters(), m.q)
+    still = predict_instants(ur5, ur5.standard_parameters(), m.q, 0 * m.v, 0 * m.a)
+    np.testing.assert_array_equal(at_rest, still)
+    many = np.tile(m.q, (20, 1))  # more than are computed at once
+    np.testing.assert_array_equal(
+        predict_instants(ur5, ur5.standard_parameters(), many)[-40:], at_rest
+    )
+
+
+def test_a_static_robot_is_predicted_by_gravity_and_the_sign_of_friction(rng):
+    model = RobotModel.from_urdf(example_urdf("ur5_robot.urdf"), dynamics="static")
+    pi, m = model.standard_parameters(), motion(model, rng, 10)
+    pi[model.layout.n_inertial :] = 0.5
+    fast = predict_instants(model, pi, m.q, m.v, m.a)
+    slow = predict_instants(model, pi, m.q, 1e-3 * m.v)
+    np.testing.assert_array_equal(fast, slow)
+    rest = predict_instants(model, pi, m.q)
+    np.testing.assert_allclose(fast - rest, 0.5 * np.sign(m.v), atol=1e-12)
+
+
+def test_instants_of_another_shape_are_refused(ur5):
+    pi = ur5.standard_parameters()
+    with pytest.raises(DataError, match=r"v has shape \(5,\), wanted \(6,\), as q is \(6,\): a"):
+        predict_instants(ur5, pi, np.zeros(6), np.zeros(5))
+    with pytest.raises(DataError, match=r"q has shape \(5,\), wanted \(6,\) or \(N, 6\)"):
+        predict_instants(ur5, pi, np.zeros(5), np.zeros(6))
+    with pytest.raises(DataError, match=r"q has shape \(1, 2, 6\), wanted \(6,\) or \(N, 6\)"):
+        predict_instants(ur5, pi, np.zeros((1, 2, 6)))

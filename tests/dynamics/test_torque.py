@@ -1,0 +1,243 @@
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from robotid.base.exceptions import DataError
+from robotid.data.log import Trajectory
+from robotid.data.transmission import Transmission
+from robotid.dynamics.base_parameters import structural_mapping
+from robotid.dynamics.problem import Sample, concatenate, shuffled
+from robotid.dynamics.simulation.closed_loop import another_robot
+from robotid.dynamics.torque import (
+    InstantRegressor,
+    build_problem,
+    carried_columns,
+    joint_torque_regressor,
+    mass_regressor,
+    random_regressor,
+)
+from robotid.robot.examples import example_urdf
+from robotid.robot.model import RobotModel
+from robotid.robot.parameters import Coupling
+
+ROBOTS = ["ur5_robot.urdf", "double_pendulum_continuous.urdf", "kinova.urdf", "tiago_no_hand.urdf",
+          "borinot_flying_arm_2.urdf", "finger_edu.urdf"]  # fmt: skip
+
+
+def states(model, rng, samples=5):
+    n = len(model.joints)
+    q = rng.uniform(-3, 3, (samples, n))
+    v, a = rng.uniform(-2, 2, (2, samples, model.n_rows))
+    if model.free_flyer:
+        pose = np.array([pin.SE3ToXYZQUAT(pin.SE3.Random()) for _ in range(samples)])
+        q = np.hstack([pose, q])
+    return q, v, a
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+@pytest.mark.parametrize("free_flyer", [False, True])
+def test_regressor_times_parameters_is_inverse_dynamics(name, free_flyer, rng):
+    model = RobotModel.from_urdf(example_urdf(name), free_flyer=free_flyer, terms=())
+    q, v, a = states(model, rng)
+    tau = (joint_torque_regressor(model, q, v, a) @ model.standard_parameters()).reshape(v.shape)
+    data = model.pin_model.createData()
+    for k, configuration in enumerate(model.configurations(q)):
+        expected = pin.rnea(model.pin_model, data, configuration, v[k], a[k])
+        np.testing.assert_allclose(tau[k], expected, atol=1e-11 * np.abs(expected).max())
+
+
+def test_joints_in_another_order_give_the_same_torques_in_that_order(ur5, rng):
+    order = [3, 0, 5, 1, 4, 2]
+    other = RobotModel.from_urdf(ur5.tree.path, joints=[ur5.joints[i] for i in order])
+    q, v, a = states(ur5, rng)
+    tau = (joint_torque_regressor(ur5, q, v, a) @ ur5.standard_parameters()).reshape(v.shape)
+    moved = joint_torque_regressor(other, q[:, order], v[:, order], a[:, order])
+    np.testing.assert_allclose(
+        (moved @ other.standard_parameters()).reshape(v.shape), tau[:, order], atol=1e-12
+    )
+
+
+def test_a_coupled_mimic_joint_loads_its_leader(rng):
+    path = example_urdf("panda.urdf")
+    coupled = RobotModel.from_urdf(path, mimic="coupled", terms=())
+    free = RobotModel.from_urdf(path, terms=())
+    assert len(coupled.joints) == 8
+    assert len(free.joints) == 9
+    q, v, a = states(coupled, rng)
+    G = coupled.velocity_map
+    full = joint_torque_regressor(free, q @ G.T, v @ G.T, a @ G.T) @ free.standard_parameters()
+    tau = joint_torque_regressor(coupled, q, v, a) @ coupled.standard_parameters()
+    np.testing.assert_allclose(tau.reshape(-1, 8), full.reshape(-1, 9) @ G, atol=1e-12)
+
+
+def test_drive_columns_are_the_textbook_ones(ur5, rng):
+    q, v, a = states(ur5, rng, samples=3)
+    Y = joint_torque_regressor(ur5, q, v, a).reshape(3, 6, -1)
+    column = dict(zip(ur5.layout.names, np.moveaxis(Y, 2, 0), strict=True))
+    np.testing.assert_array_equal(column["elbow_joint.armature"][:, 2], a[:, 2])
+    np.testing.assert_array_equal(column["elbow_joint.viscous"][:, 2], v[:, 2])
+    np.testing.assert_array_equal(column["elbow_joint.coulomb"][:, 2], np.sign(v[:, 2]))
+    np.testing.assert_array_equal(column["elbow_joint.offset"][:, 2], 1)
+    assert not column["elbow_joint.viscous"][:, [0, 1, 3, 4, 5]].any()
+
+
+def test_a_coupled_drive_loads_every_joint_it_turns_with(ur5, rng):
+    ratios = (("wrist_2_joint", 1.0), ("wrist_3_joint", 0.5))
+    model = RobotModel.from_urdf(ur5.tree.path, couplings=(Coupling("motor", ratios),))
+    q, v, a = states(model, rng, samples=4)
+    Y = joint_torque_regressor(model, q, v, a).reshape(4, 6, -1)
+    column = dict(zip(model.layout.names, np.moveaxis(Y, 2, 0), strict=True))
+    w, dw = v[:, 4] + 0.5 * v[:, 5], a[:, 4] + 0.5 * a[:, 5]
+    np.testing.assert_allclose(column["motor.armature"][:, 4], dw)
+    np.testing.assert_allclose(column["motor.armature"][:, 5], 0.5 * dw)
+    np.testing.assert_allclose(column["motor.coulomb"][:, 5], 0.5 * np.sign(w))
+    # the power the drive takes is that of its own friction: tau . v = Fv w^2
+    np.testing.assert_allclose(np.sum(column["motor.viscous"] * v, axis=1), w**2)
+
+
+def test_drives_of_a_transmission_are_what_its_motors_take(ur5, rng):
+    T = np.array([[120.0, 0.0], [80.0, -60.0]])  # motor speeds w_m = T v
+    wrist = dict(joints=ur5.joints[4:], motors=("m5", "m6"))
+    ((joint, ratios),) = Transmission(**wrist, matrix=T.tolist()).shared.items()
+    motor = Coupling(joint, ratios, replaces=True)
+    model = RobotModel.from_urdf(ur5.tree.path, couplings=(motor,))
+    own, gear = rng.uniform(0.1, 1.0, (2, 4)), np.array([120.0, 80.0])  # at the motors
+    pi = model.standard_parameters()
+    # inertia and viscous friction are seen through the square of the gear ratio
+    pi[-8:] = (own * gear[:, None] ** [2, 2, 1, 1]).ravel()
+    assert model.layout.names[-8:] == tuple(
+        f"{joint}.{term}" for joint in ur5.joints[4:] for term in model.layout.terms
+    )
+    q, v, a = states(model, rng, samples=5)
+    w, dw = v[:, 4:] @ T.T, a[:, 4:] @ T.T
+    tau_m = own[:, 0] * dw + own[:, 1] * w + own[:, 2] * np.sign(w) + own[:, 3]
+    bodies = np.where(np.arange(len(pi)) < len(pi) - 8, pi, 0.0)
+    W = joint_torque_regressor(model, q, v, a)
+    np.testing.assert_allclose((W @ (pi - bodies)).reshape(-1, 6)[:, 4:], tau_m @ T, rtol=1e-12)
+    instant = InstantRegressor(model, np.arange(len(pi)))
+    np.testing.assert_allclose(instant(q[0], v[0], a[0]), W[:6], atol=1e-12)
+    # every offset and friction is told from the others, as without a transmission
+    assert len(structural_mapping(model).K) == len(structural_mapping(ur5).K)
+
+
+@pytest.mark.parametrize("free_flyer", [False, True])
+def test_support_is_where_the_regressor_can_be_non_zero(free_flyer, rng):
+    coupling = Coupling("motor", (("wrist_2_joint", 1.0), ("wrist_3_joint", 0.5)))
+    model = RobotModel.from_urdf(
+        example_urdf("ur5_robot.urdf"), free_flyer=free_flyer, couplings=(coupling,)
+    )
+    W = random_regressor(model, 30, rng).reshape(30, model.n_rows, -1)
+    seen = np.abs(W).max(axis=0) > 1e-12
+    assert not (seen & ~model.support()).any()
+    # and not much more: a body's ten columns are all allowed where one is seen
+    assert model.support().sum() < 2 * seen.sum()
+
+
+def trajectory(model, rng, samples=1200):
+    q, v, a = states(model, rng, samples)
+    t = np.arange(samples) / 100
+    segment = np.zeros(samples, dtype=int)
+    tau = rng.standard_normal(v.shape)
+    return Trajectory(t=t, q=q, v=v, a=a, tau=tau, joints=model.joints, rate=100.0, segment=segment)
+
+
+def test_a_problem_streams_the_regressor_in_blocks_as_often_as_wanted(ur5, rng):
+    motion = trajectory(ur5, rng)
+    problem = build_problem(ur5, motion)
+    W = joint_torque_regressor(ur5, motion.q, motion.v, motion.a)
+    for _ in range(2):
+        blocks = list(problem.blocks())
+        assert len(blocks) == 3
+        np.testing.assert_array_equal(np.vstack([block[0] for block in blocks]), W)
+        np.testing.assert_array_equal(
+            np.concatenate([block[1] for block in blocks]), motion.tau.reshape(-1)
+        )
+
+
+def test_a_trajectory_of_other_joints_is_refused(ur5, panda, rng):
+    with pytest.raises(DataError, match="has the joints shoulder_pan_joint, shoulder_lift"):
+        build_problem(panda, trajectory(ur5, rng))
+    with pytest.raises(DataError, match=r"weight has shape \(3,\), wanted \(1200, 6\)"):
+        build_problem(ur5, trajectory(ur5, rng), np.ones(3))
+    with pytest.raises(DataError, match=r"v and a have shapes"):
+        joint_torque_regressor(ur5, np.zeros((2, 6)), np.zeros((2, 5)), np.zeros((2, 6)))
+
+
+@pytest.mark.parametrize("robot", ["ur5", "panda"])
+def test_the_regressor_of_one_instant_is_that_of_many(robot, request, rng):
+    model = request.getfixturevalue(robot)
+    n, p = len(model.joints), len(model.layout.names)
+    q, v, a = rng.uniform(-1, 1, (3, 5, n))
+    columns = np.arange(0, p, 2)
+    instant = InstantRegressor(model, columns)
+    expected = joint_torque_regressor(model, q, v, a).reshape(5, n, p)[..., columns]
+    for k in range(5):
+        np.testing.assert_allclose(instant(q[k], v[k], a[k]), expected[k], atol=1e-14)
+    D = mass_regressor(model, q)[..., columns]
+    np.testing.assert_allclose(instant.mass(q[2]), D[2], atol=1e-14)
+
+
+def test_the_regressor_of_one_instant_knows_couplings_order_and_mimic(rng):
+    names = ["wrist_3_joint", "elbow_joint", "wrist_2_joint"]
+    coupling = Coupling("motor", (("wrist_3_joint", 1.0), ("wrist_2_joint", -0.5)))
+    model = RobotModel.from_urdf(example_urdf("ur5_robot.urdf"), joints=names, couplings=[coupling])
+    q, v, a = rng.uniform(-1, 1, (3, 1, 3))
+    everything = np.arange(len(model.layout.names))
+    instant = InstantRegressor(model, everything)
+    expected = joint_torque_regressor(model, q, v, a)
+    np.testing.assert_allclose(instant(q[0], v[0], a[0]), expected, atol=1e-14)
+
+
+def test_the_mass_regressor_gives_the_mass_matrix_with_armature(ur5, rng):
+    pi = another_robot(ur5, rng)
+    q = rng.uniform(-1, 1, (4, 6))
+    D = mass_regressor(ur5, q) @ pi
+    other = ur5.with_parameters(pi).pin_model
+    armature = [pi[ur5.layout.names.index(f"{j}.armature")] for j in ur5.joints]
+    for k in range(4):
+        M = pin.crba(other, other.createData(), q[k])
+        M = np.triu(M) + np.triu(M, 1).T + np.diag(armature)
+        np.testing.assert_allclose(D[k], M, atol=1e-12 * np.abs(M).max())
+
+
+def test_a_problem_carries_the_mass_regressor_through_selection_and_concatenation(ur5, rng):
+    q, v, a = rng.uniform(-1, 1, (3, 7, 6))
+    t = np.arange(7.0)
+    trajectory = Trajectory(t, q, v, a, a, ur5.joints, None, np.zeros(7, dtype=int))
+    problem = build_problem(ur5, trajectory, with_mass=True)
+    chosen = concatenate([problem.select(np.array([3, 5]))] * 2)
+    samples = list(chosen.samples())
+    assert len(samples) == 14
+    D = mass_regressor(ur5, q)[..., [3, 5]]
+    np.testing.assert_array_equal(samples[8].mass_regressor, D[1])
+    plain = build_problem(ur5, trajectory)
+    assert next(concatenate([problem, plain]).samples()).mass_regressor is None
+    assert next(plain.select(np.array([3])).samples()).mass_regressor is None
+
+
+def test_samples_are_shuffled_without_loss(rng):
+    one = np.ones((1, 1))
+    samples = [Sample(one, np.array([float(k)]), one[0]) for k in range(20_000)]
+    found = [int(s.tau[0]) for s in shuffled(samples, rng)]
+    assert sorted(found) == list(range(20_000))
+    assert np.mean(np.abs(np.array(found) - np.arange(20_000))) > 1000
+    # one of 8193 is drawn at a time: k draws leave each of the first as likely (1 - 1/8193)^k
+    left = np.mean(np.array(found[4000:]) < 8192) * 16_000 / 8192
+    assert left == pytest.approx((1 - 1 / 8193) ** 4000, abs=0.02)
+
+
+@pytest.mark.parametrize("name", ["ur5", "coupled"])
+def test_columns_of_what_is_carried_are_those_of_the_regressor(ur5, rng, name):
+    model = ur5
+    if name == "coupled":
+        model = RobotModel.from_urdf(example_urdf("tiago.urdf"), mimic="coupled")
+    n = len(model.joints)
+    q, v, a = rng.uniform(-1.0, 1.0, (3, 40, n))
+    Y = joint_torque_regressor(model, q, v, a).reshape(40, model.n_rows, -1)
+    inertial = Y[:, :, : model.layout.n_inertial]
+    carried = model.support()[:, : model.layout.n_inertial]
+    np.testing.assert_array_equal(carried_columns(model, q, v, a), inertial[:, carried])
+    assert not inertial[:, ~carried].any()
+    v[3, 1] = np.nan
+    with pytest.raises(DataError, match=r"v\[3\] of .* is nan, wanted a finite number"):
+        carried_columns(model, q, v, a)

@@ -1,0 +1,325 @@
+"""Bounds of bodies: kept by the fit, refused where they contradict each other."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.estimation import EXACT, NOISE, Case, consistent
+from helpers.fitting import identify
+from helpers.synthetic import exact_log, truth
+
+from robotid.base.exceptions import DataError, NotConvergedError, SettingsError
+from robotid.dynamics.factors import compress
+from robotid.estimation.estimators import Consistent
+from robotid.estimation.estimators.consistent.body_constraints import Constraints, slabs
+from robotid.estimation.fitting.consistent_estimator import make_constraints
+from robotid.estimation.fitting.estimator_settings import ConstraintSettings, EstimatorSettings
+from robotid.robot.geometry import body_boxes
+from robotid.robot.parameters import ParameterLayout, pseudo_inertia
+
+
+@pytest.fixture
+def case(ur5, rng):
+    """The fit of a UR5 whose masses are unlike its URDF's, and the factors of a noisy log."""
+    case = Case(ur5, rng, NOISE)
+    return consistent(case), compress(case.problem)
+
+
+def constrained(fit, **bounds):
+    return replace(fit, constraints=Constraints(**bounds))
+
+
+def masses(estimate):
+    return estimate.theta[:60:10]
+
+
+def centre(estimate, body):
+    values = estimate.theta[10 * body : 10 * body + 4]
+    return values[1:] / values[0]
+
+
+@pytest.mark.parametrize("metric", ["euclidean", "riemannian", "entropic"])
+def test_bounds_of_mass_are_kept_and_reached(case, metric):
+    fit, factors = case
+    fit = replace(fit, metric=metric)
+    free = masses(fit.fit(factors))
+    low, high = 1.2 * free[2], 0.7 * free[3]
+    mass = {"forearm_link": (low, np.inf), "wrist_1_link": (0.0, high)}
+    estimate = constrained(fit, mass=mass).fit(factors)
+    assert masses(estimate)[2] == pytest.approx(low, rel=1e-6)
+    assert masses(estimate)[3] == pytest.approx(high, rel=1e-6)
+    assert {"mass forearm_link", "mass wrist_1_link"} <= set(estimate.details["active"])
+    assert "mass" in estimate.details["constraints"]
+
+
+def test_a_bound_that_does_not_bind_changes_nothing(case):
+    fit, factors = case
+    free = fit.fit(factors)
+    wide = {name: (0.01, 100.0) for name in fit.layout.bodies}
+    estimate = constrained(fit, mass=wide, total_mass=(0.1, 500.0)).fit(factors)
+    np.testing.assert_allclose(estimate.theta, free.theta, rtol=0, atol=1e-6 * fit.prior_std.max())
+
+
+def test_a_known_total_mass_is_met_exactly(case):
+    fit, factors = case
+    total = 1.1 * masses(fit.fit(factors)).sum()
+    estimate = constrained(fit, total_mass=(total, total)).fit(factors)
+    assert masses(estimate).sum() == pytest.approx(total, rel=1e-12)
+    bounded = constrained(fit, total_mass=(total, 2 * total)).fit(factors)
+    assert masses(bounded).sum() == pytest.approx(total, rel=1e-6)
+    # the known sum leaves it less room: its variance in that direction is 0
+    one = np.zeros(len(fit.prior))
+    one[:60:10] = 1.0
+    assert one @ estimate.covariance @ one == pytest.approx(0.0, abs=1e-12)
+
+
+def test_pinned_bodies_keep_the_urdf_and_the_rest_is_the_constrained_least_squares(case, ur5):
+    fit, factors = case
+    estimate = constrained(fit, pinned=("forearm_link", "wrist_1_link")).fit(factors)
+    np.testing.assert_allclose(estimate.theta[20:40], fit.prior[20:40], rtol=1e-12, atol=1e-14)
+    assert not estimate.std_error[20:40].any()
+    # oracle: the same quadratic without those columns, where no inequality binds
+    fit = replace(fit, prior=truth(ur5), prior_weight=10.0, metric="riemannian")
+    pinned = constrained(fit, pinned=("forearm_link", "wrist_1_link"))
+    estimate = pinned.fit(factors)
+    assert estimate.message == "no constraint is active"
+    rows = pinned.rows(factors, estimate.sigma)
+    D = rows[:, :-1] @ fit.K
+    H = D.T @ D + 0.5 * fit.prior_weight * fit.penalty.hessian(fit.prior)
+    slope = D.T @ (D @ fit.prior - rows[:, -1])
+    slope += 0.5 * fit.prior_weight * fit.penalty.gradient(fit.prior)
+    kept = np.setdiff1d(np.arange(len(fit.prior)), np.arange(20, 40))
+    step = np.linalg.solve(H[np.ix_(kept, kept)], -slope[kept])
+    np.testing.assert_allclose(
+        (estimate.theta - fit.prior)[kept] / fit.prior_std[kept],
+        step / fit.prior_std[kept],
+        atol=1e-8,
+    )
+
+
+def test_a_centre_of_mass_stays_in_its_box(case):
+    fit, factors = case
+    free = centre(fit.fit(factors), 2)
+    corners = [free - 0.2, free - [0.02, -0.1, -0.1]]  # x at least 2 cm less
+    settings = ConstraintSettings(com={"forearm_link": [list(c) for c in corners]})
+    estimate = replace(fit, constraints=make_constraints(settings, {})).fit(factors)
+    found = centre(estimate, 2)
+    assert (corners[0] - 1e-6 <= found).all()
+    assert (found <= corners[1] + 1e-6).all()
+    assert found[0] == pytest.approx(corners[1][0], abs=1e-6)
+    assert "centre_of_mass forearm_link" in estimate.details["active"]
+
+
+def test_gradients_of_active_constraints_are_those_of_their_slack(case):
+    fit, factors = case
+    low = 1.2 * masses(fit.fit(factors))[2]
+    fit = constrained(fit, mass={"forearm_link": (low, np.inf)})
+    estimate = fit.fit(factors)
+    gradients, labels = fit.active(estimate.theta)
+    row = gradients[labels.index("mass forearm_link")]
+    assert np.flatnonzero(row).tolist() == [20]
+    # stationary: the gradient of the objective is a combination of the active ones
+    rows = fit.rows(factors, estimate.sigma)
+    D = rows[:, :-1] @ fit.K
+    slope = 2 * D.T @ (D @ estimate.theta - rows[:, -1])
+    slope += fit.prior_weight * fit.penalty.gradient(estimate.theta)
+    slope, gradients = slope * fit.prior_std, gradients * fit.prior_std
+    left = slope - gradients.T @ np.linalg.lstsq(gradients.T, slope, rcond=None)[0]
+    assert np.linalg.norm(left) < 1e-4 * np.linalg.norm(slope)
+
+
+@pytest.mark.parametrize(
+    ("bounds", "text"),
+    [
+        ({"mass": {"tool0": (1.0, 2.0)}}, r"\['tool0'\], which are not bodies of the model"),
+        ({"mass": {"forearm_link": (3.0, 2.0)}}, r"\[3, 2\] kg: the first value is larger"),
+        ({"mass": {"forearm_link": (-2.0, -1.0)}}, "is bounded by -1 kg, wanted a positive"),
+        ({"total_mass": (0.0, 2.0), "mass": {"forearm_link": (3.0, 9.0)}}, "allow .3, inf. kg"),
+        (
+            {"mass": {"forearm_link": (0.1, 0.2)}, "pinned": ("forearm_link",)},
+            "forearm_link is pinned at the URDF's 2.275 kg, outside its bounds",
+        ),
+        (
+            {
+                "com": {"forearm_link": (np.eye(3)[:1], np.array([-1.0]))},
+                "pinned": ("forearm_link",),
+            },
+            "forearm_link is pinned, but the URDF's centre of mass .* mm outside its bounds",
+        ),
+    ],
+)
+def test_bounds_that_contradict_each_other_are_refused_before_the_solver_runs(case, bounds, text):
+    with pytest.raises(SettingsError, match=text):
+        constrained(case[0], **bounds)
+
+
+def test_links_on_locked_joints_count_in_the_bounds(case):
+    held = np.zeros(60)
+    held[20:30] = [2.0, 0, 0, 0, 0.01, 0, 0.01, 0, 0, 0.01]
+    with pytest.raises(SettingsError, match="its links on locked joints alone have 2 kg"):
+        constrained(replace(case[0], held=held), mass={"forearm_link": (0.5, 1.0)})
+
+
+def test_bounds_that_no_body_meets_are_named(case):
+    # the centre of mass above one plane and below another one under it
+    A = np.array([[1.0, 0, 0], [-1.0, 0, 0]])
+    fit = constrained(case[0], com={"forearm_link": (A, np.array([-0.2, 0.1]))})
+    with pytest.raises(NotConvergedError, match="no parameters meet all constraints") as caught:
+        fit.fit(case[1])
+    assert "centre_of_mass" in str(caught.value)
+    assert caught.value.status == "PrimalInfeasible"
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        ({"mass": {"a": "heavy"}}, "mass of a is 'heavy', wanted a number or"),
+        ({"mass": {"a": [np.inf, np.inf]}}, r"a is \[inf, inf\], wanted finite numbers of at most"),
+        ({"total_mass": [1.0, np.nan]}, r"total_mass is \[1.0, nan\], wanted finite numbers"),
+        ({"total_mass": [1.0, 1e300]}, r"1e\+300\], .* at most 1e\+09 kg; write 1e\+09 for no"),
+        ({"total_mass": [3.0]}, r"total_mass is \[3.0\], wanted a number or"),
+        ({"total_mass": [4.0, 3.0]}, "the first value is larger than the second"),
+        ({"com": {"a": [[0, 0], [1, 1]]}}, "com of a is .* wanted"),
+        ({"com": {"a": [[0, 0, 1], [1, 1, 0]]}}, "a coordinate of the first corner is larger"),
+        ({"com_within": "sphere"}, "com_within is 'sphere', wanted one of"),
+    ],
+)
+def test_settings_that_are_no_bounds_are_refused(options, text):
+    with pytest.raises(SettingsError, match=text):
+        EstimatorSettings(constraints=options)
+
+
+def test_a_job_states_its_constraints(ur5, rng):
+    log = exact_log(ur5, truth(ur5), rng, noise=NOISE)
+    settings = EstimatorSettings(
+        constraints={"mass": {"forearm_link": 2.5}, "pinned": ["wrist_3_link"], "total_mass": 20.0}
+    )
+    found = identify(ur5, [log], signals=EXACT, estimator=settings)
+    assert found.standard[20] == pytest.approx(2.5, rel=1e-9)
+    assert found.standard[:60:10].sum() == pytest.approx(20.0, rel=1e-9)
+    np.testing.assert_allclose(found.standard[50:60], found.prior[50:60], rtol=1e-9, atol=1e-12)
+    assert found.sources[50:60] == ("prior",) * 10
+    assert found.is_consistent
+
+
+def test_an_unknown_metric_is_refused(case):
+    with pytest.raises(DataError, match="metric is 'manhattan', wanted one of"):
+        replace(case[0], metric="manhattan")
+
+
+def test_the_slabs_of_a_box_hold_for_grains_inside_and_fail_for_one_outside(rng):
+    box = np.array([[-0.1, -0.2, 0.0], [0.3, 0.2, 0.5]])
+    grains = rng.uniform(*box, size=(50, 3))
+    homogeneous = np.column_stack([grains, np.ones(50)])
+    masses = rng.uniform(0.1, 1.0, 50)
+    J = (homogeneous * masses[:, None]).T @ homogeneous
+    value = np.einsum("kij,ij->k", slabs(box), J)
+    # the integral of (x - l) (u - x), grain by grain
+    np.testing.assert_allclose(value, masses @ ((grains - box[0]) * (box[1] - grains)), rtol=1e-12)
+    assert (value > 0).all()
+    x = np.array([0.31, 0.0, 0.1, 1.0])
+    np.testing.assert_array_equal(np.sign(np.einsum("kij,i,j->k", slabs(box), x, x)), [-1, 1, 1])
+
+
+@pytest.mark.parametrize("metric", ["euclidean", "entropic"])
+def test_extents_keep_the_mass_of_each_body_in_its_box(case, ur5, metric):
+    boxes = {b: 0.2 * box + 0.8 * box.mean(axis=0) for b, box in body_boxes(ur5).items()}
+    fit, factors = case
+    loose = replace(fit, metric=metric)
+    tight = replace(loose, constraints=Constraints(extent=boxes))
+    free, kept = (one.fit(factors) for one in (loose, tight))
+
+    def slack(estimate):
+        J = pseudo_inertia(estimate.theta[:60])
+        return np.array(
+            [np.einsum("kij,ij->k", slabs(boxes[b]), J_i) for b, J_i in zip(boxes, J, strict=True)]
+        )
+
+    assert slack(free).min() < -1e-3
+    assert slack(kept).min() > -1e-7
+    bound = [b for b, values in zip(boxes, slack(kept), strict=True) if values.min() < 1e-7]
+    assert [f"extent {body}" for body in sorted(bound)] == [
+        label for label in kept.details["active"] if label.startswith("extent")
+    ]
+
+
+def test_what_is_stated_of_a_centre_of_mass_widens_the_extent_of_its_body(ur5):
+    bounds = ConstraintSettings(com={"forearm_link": [[1.0, -0.1, 0.0], [1.2, 0.0, 0.1]]})
+    extent = body_boxes(ur5)["forearm_link"]
+    made = make_constraints(bounds, {}, {"forearm_link": extent}).extent["forearm_link"]
+    np.testing.assert_array_equal(made[0], np.minimum(extent[0], [1.0, -0.1, 0.0]))
+    np.testing.assert_array_equal(made[1], np.maximum(extent[1], [1.2, 0.0, 0.1]))
+
+
+@pytest.fixture(scope="module")
+def two_bodies():
+    """Two bodies of 3 and 5 kg; the first has 1 kg on locked joints."""
+    layout = ParameterLayout(("one", "two"), (), ())
+    ball = np.array([1.0, 0.1, 0.2, -0.3, 0.4, 0, 0.4, 0, 0, 0.4])
+    return layout, np.concatenate([3 * ball, 5 * ball]), np.concatenate([ball, 0 * ball])
+
+
+@pytest.mark.parametrize(
+    ("bounds", "text"),
+    [
+        ({"mass": {"two": (2.0, 4.0)}, "total_mass": (9.0, 12.0), "pinned": ("one",)},
+         r"allow \[5, 7\] kg"),
+        ({"mass": {"one": (2.0, 4.0), "two": (1.5, 2.5)}, "total_mass": (1.0, 3.4)},
+         r"allow \[3.5, 6.5\] kg"),
+        ({"mass": {"one": (0.1, 0.9)}}, "joints alone have 1 kg"),
+        ({"mass": {"two": (0.1, 4.0)}, "pinned": ("two",)}, r"the URDF's 5 kg, outside its bounds"),
+        ({"pinned": ("two",),
+          "com": {"two": (np.vstack([np.eye(3), -np.eye(3)]), np.array([9, 0.15, 9, 9, 9, 9.0]))}},
+         r"\[0.1, 0.2, -0.3\] m is 50.0 mm outside"),
+    ],
+)  # fmt: skip
+def test_bounds_are_checked_with_the_figures_of_each_body(two_bodies, bounds, text):
+    layout, prior, held = two_bodies
+    with pytest.raises(SettingsError, match=text):
+        Constraints(**bounds).check(layout, prior, held)
+
+
+def test_bounds_that_meet_are_no_contradiction(two_bodies):
+    layout, prior, held = two_bodies
+    for low, high in ((3.5, 3.5), (6.5, 9.0), (1.0, 3.5)):
+        masses = {"one": (2.0, 4.0), "two": (1.5, 2.5)}
+        Constraints(mass=masses, total_mass=(low, high)).check(layout, prior, held)
+    Constraints(mass={"one": (1.0, 1.1), "two": (0.1, 0.2)}).check(layout, prior, held)
+
+
+def test_rows_of_bounds_are_those_of_their_body_and_sign(two_bodies):
+    layout, prior, _ = two_bodies
+    normal = np.array([[0.6, 0.0, 0.8], [0.0, -1.0, 0.0]])
+    bounds = Constraints(
+        mass={"two": (2.0, 9.0), "one": (-np.inf, 7.0)}, total_mass=(4.0, 8.5),
+        com={"two": (normal, np.array([0.3, 0.7]))},
+        extent={"one": np.array([[-0.5, -0.4, -0.9], [0.6, 0.7, 0.2]])},
+    )  # fmt: skip
+    C, c, labels = bounds._bounds(layout)
+    mx = prior[11:14]
+    J = pseudo_inertia(prior[:10])[0]
+    wanted = [5 - 2.0, 9.0 - 5, 7.0 - 3, 8 - 4.0, 8.5 - 8]
+    wanted += [5 * b - n @ mx for n, b in zip(normal, (0.3, 0.7), strict=True)]
+    for k, (low, high) in enumerate(((-0.5, 0.6), (-0.4, 0.7), (-0.9, 0.2))):
+        wanted.append(-J[k, k] + (low + high) * J[k, 3] - low * high * J[3, 3])
+    np.testing.assert_allclose(C @ prior + c, wanted)
+    assert labels == [
+        "mass two", "mass two", "mass one", "total_mass all", "total_mass all",
+        "centre_of_mass two", "centre_of_mass two", *["extent one"] * 3,
+    ]  # fmt: skip
+    fixed = Constraints(mass={"one": (2.5, 2.5)}, total_mass=(7.5, 7.5), pinned=("two",))
+    E, e = fixed.equalities(layout, prior)
+    np.testing.assert_array_equal(E @ prior, [*prior[10:], 3.0, 8.0])
+    np.testing.assert_array_equal(e, [*prior[10:], 2.5, 7.5])
+    assert fixed._bounds(layout)[2] == []
+
+
+def test_the_spread_before_the_data_is_that_of_the_plausible_weight(two_bodies):
+    layout, prior, held = two_bodies
+    std = np.linspace(0.5, 2.4, 20)
+    for weight, plausible, factor in ((6.0, 1.5, 1.5), (1.0, 1.5, 1.0), (0.25, 0.5, 0.25)):
+        fit = Consistent(
+            layout, np.eye(20), prior, std, held, prior_weight=weight, plausible_weight=plausible
+        )
+        np.testing.assert_allclose(fit.spread_before, std / np.sqrt(factor), rtol=1e-9)
+        assert fit.weight_ratio == max(weight / plausible, 1.0)

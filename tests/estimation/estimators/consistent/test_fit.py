@@ -1,0 +1,169 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.estimation import NOISE, Case, consistent, still_wrist
+
+from robotid.base.exceptions import DataError, NotConvergedError
+from robotid.dynamics.factors import Factors, triangle_of
+from robotid.estimation.estimators import PRX, RLS, WLS, Consistent, Kalman, fold
+from robotid.estimation.estimators.estimator import Estimate
+from robotid.robot.parameters import ParameterLayout, pseudo_inertia
+
+
+def test_consistent_fit_names_what_it_took_from_the_prior(ur5, rng):
+    case = still_wrist(ur5, rng)
+    assert "wrist_3_joint.viscous" in consistent(case).fit(case.problem).undetermined
+
+
+def test_consistent_fit_is_physical_where_least_squares_is_not(ur5, rng):
+    case = Case(ur5, rng, 40 * NOISE, samples=200)
+    free = case.mapping.to_standard(WLS().fit(case.problem).theta, ur5.standard_parameters())
+    assert np.linalg.eigvalsh(pseudo_inertia(free[:60])).min() < 0
+    estimate = consistent(case).fit(case.problem)
+    assert np.linalg.eigvalsh(pseudo_inertia(estimate.theta[:60])).min() > 0
+    assert (estimate.theta[ur5.layout.is_nonnegative()] >= 0).all()
+
+
+def test_consistent_fit_agrees_with_wls_where_physics_does_not_bind(ur5, rng):
+    case = Case(ur5, rng, 0.01 * NOISE, samples=2000)
+    wls, ours = WLS().fit(case.problem), consistent(case).fit(case.problem)
+    difference = np.abs(case.base(ours) - wls.theta) / wls.std_error
+    assert difference.max() < 1.0
+
+
+def test_the_held_share_of_a_body_is_respected(ur5, rng):
+    case = Case(ur5, rng, NOISE)
+    held = np.zeros(60)
+    # the last link is known to carry a 5 kg part, more than it has: the rest must stay possible
+    held[50:] = [5.0, 0, 0, 0, 0.05, 0, 0.05, 0, 0, 0.05]
+    estimate = consistent(case, held=held).fit(case.problem)
+    rest = pseudo_inertia(estimate.theta[:60] - held)
+    assert np.linalg.eigvalsh(rest).min() > 0
+    assert estimate.theta[50] > 5.0
+
+
+def test_a_solver_that_fails_says_so(ur5, rng):
+    case = Case(ur5, rng, 40 * NOISE, samples=200)
+    with pytest.raises(NotConvergedError, match="Clarabel failed to solve") as caught:
+        consistent(case, max_iterations=1).fit(case.problem)
+    assert caught.value.status == "MaxIterations"
+
+
+def test_a_prior_that_is_not_finite_is_refused(ur5, rng):
+    case = Case(ur5, rng, NOISE)
+    with pytest.raises(DataError, match="prior and held must be finite"):
+        consistent(case, held=np.full(60, np.nan))
+
+
+@pytest.mark.parametrize("kind", ["rls", "kalman"])
+def test_the_running_estimate_can_be_made_physical(ur5, rng, kind):
+    case = Case(ur5, rng, 40 * NOISE, samples=200)
+    prior = case.mapping.to_base(ur5.standard_parameters())
+    sigma = 40 * NOISE
+    estimator = RLS(sigma) if kind == "rls" else Kalman(sigma, prior, 50 + 0 * prior, gate=None)
+    state = fold(estimator, case.problem.samples(), estimator.init(len(prior)))
+    running = estimator.estimate(state, case.problem.names)
+    free = case.mapping.to_standard(running.theta, ur5.standard_parameters())
+    assert np.linalg.eigvalsh(pseudo_inertia(free[:60])).min() < 0
+    projected = consistent(case).project(running)
+    assert np.linalg.eigvalsh(pseudo_inertia(projected.theta[:60])).min() > 0
+    assert "projected onto physically consistent" in projected.message
+
+
+def test_projection_is_the_consistent_fit_of_the_same_data(ur5, rng):
+    case = Case(ur5, rng, 4 * NOISE)
+    wls = WLS().fit(case.problem)
+    fit = consistent(case).fit(case.problem)
+    projected = consistent(case).project(wls)
+    distance = np.abs(case.base(projected) - case.base(fit)) / wls.std_error
+    assert distance.max() < 1e-3
+    nothing = PRX(np.ones(6)).estimate(PRX(np.ones(6)).init(58), case.problem.names)
+    with pytest.raises(DataError, match="the estimate has no covariance"):
+        consistent(case).project(nothing)
+
+
+class Small:
+    """Two bodies, 7 base parameters, 60 and 35 rows of two joints with noise of 0.3 and 2."""
+
+    def __init__(self, rng):
+        ball = np.array([1.0, 0.1, 0.2, -0.3, 0.4, 0, 0.4, 0, 0, 0.4])
+        self.prior = np.concatenate([3 * ball, 5 * ball])
+        self.std = np.linspace(0.03, 0.09, 20)
+        self.K = rng.standard_normal((7, 20))
+        truth = self.K @ (self.prior + 0.3 * self.std * rng.standard_normal(20))
+        self.W = [rng.standard_normal((n, 7)) * np.linspace(1, 3, 7) for n in (60, 35)]
+        self.tau = [
+            W @ truth + x * rng.standard_normal(len(W))
+            for W, x in zip(self.W, (0.3, 2.0), strict=True)
+        ]
+        rows = [np.column_stack(pair) for pair in zip(self.W, self.tau, strict=True)]
+        names = tuple("abcdefg")
+        triangles = tuple(triangle_of(x) for x in rows)
+        self.factors = Factors(triangles, (np.arange(7),) * 2, np.array([60, 35]), names)
+        self.fit = Consistent(
+            ParameterLayout(("one", "two"), (), ()), self.K, self.prior, self.std,
+            prior_weight=2.5, plausible_weight=0.5, independent_share=0.4,
+        )  # fmt: skip
+
+    def least_squares(self, sigma):
+        """Return the minimum without inequalities, and its covariance."""
+        H, g = np.diag(2.5 / self.std**2), 2.5 * self.prior / self.std**2
+        for W, tau, x in zip(self.W, self.tau, sigma, strict=True):
+            A = np.sqrt(0.4) / x * W @ self.K
+            H, g = H + A.T @ A, g + A.T @ (np.sqrt(0.4) / x * tau)
+        return np.linalg.solve(H, g), np.linalg.inv(H)
+
+
+def test_all_that_a_fit_states_is_of_least_squares_with_the_noise_that_it_leaves(rng):
+    case = Small(rng)
+    found = case.fit.fit(case.factors)
+    theta, C = case.least_squares(found.sigma)
+    np.testing.assert_allclose(found.theta, theta, rtol=1e-8)
+    np.testing.assert_allclose(found.covariance, C, rtol=1e-7, atol=1e-12)
+    wls = WLS(case.K @ case.prior, 0.4).fit(case.factors)
+    for W, tau, level, sigma in zip(case.W, case.tau, wls.sigma, found.sigma, strict=True):
+        # of 0.4 independent rows, the parameters use the trace of their leverage
+        used = np.trace(W @ wls.covariance @ W.T) / level**2
+        left = np.sum((tau - W @ wls.theta) ** 2)
+        assert sigma == pytest.approx(np.sqrt(left / (len(W) - used)), rel=1e-3)
+    np.testing.assert_allclose(case.fit.noise(case.factors), found.sigma)
+    np.testing.assert_allclose(found.prior_std, case.std / np.sqrt(0.5))
+    assert (found.rank, found.names) == (7, case.fit.layout.names)
+    assert found.condition == pytest.approx(wls.condition, rel=5e-3)
+    assert found.undetermined == ()
+    assert found.details["prior"] == {"metric": "euclidean", "weight": 2.5, "plausible_weight": 0.5}
+    assert found.details["active"] == []
+    rows = case.fit.rows(case.factors, found.sigma)
+    pi = theta + 0.02
+    residual = [
+        np.sqrt(0.4) / x * (tau - W @ case.K @ pi)
+        for W, tau, x in zip(case.W, case.tau, found.sigma, strict=True)
+    ]
+    objective = np.sum(np.concatenate(residual) ** 2)
+    objective += 2.5 * np.sum(((pi - case.prior) / case.std) ** 2)
+    assert case.fit.objective(rows, pi) == pytest.approx(objective)
+
+
+def test_a_projection_is_of_the_parameters_with_a_variance_and_the_prior(rng):
+    case = Small(rng)
+    half = rng.standard_normal((7, 7))
+    C, beta = half @ half.T + np.eye(7), case.K @ case.prior + rng.standard_normal(7)
+    C[2, 2] = np.inf
+    own = np.delete(np.arange(7), 2)
+    running = Estimate(beta, C, tuple("abcdefg"), np.ones(2), 6, 9.0, ("c",), True, 41, "rls")
+    found = case.fit.project(running)
+    A = np.linalg.cholesky(np.linalg.inv(C[np.ix_(own, own)])).T
+    H = case.K[own].T @ A.T @ A @ case.K[own] + np.diag(2.5 / case.std**2)
+    g = case.K[own].T @ A.T @ A @ beta[own] + 2.5 * case.prior / case.std**2
+    np.testing.assert_allclose(found.theta, np.linalg.solve(H, g), rtol=1e-8)
+    np.testing.assert_allclose(found.covariance, np.linalg.inv(H), rtol=1e-7, atol=1e-12)
+    assert (found.rank, found.condition, found.converged) == (6, 9.0, True)
+    assert found.n_iter == 41  # and none of a solver: no constraint is active
+    binding = replace(case.fit, prior_weight=1e-6, plausible_weight=1e-6)
+    light = replace(running, theta=np.zeros(7))
+    projected = binding.project(light)
+    assert projected.n_iter > 41
+    assert found.message.startswith("rls; projected onto physically consistent parameters, no con")
+    assert "c" in found.undetermined
+    np.testing.assert_allclose(found.prior_std, case.std / np.sqrt(0.5))

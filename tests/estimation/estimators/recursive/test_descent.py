@@ -1,0 +1,249 @@
+"""The gradient methods: PRX as the paper has it, and the normalised gradient."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from helpers.estimation import RandomStates
+
+from robotid.base.exceptions import DataError
+from robotid.dynamics.problem import Sample
+from robotid.estimation.estimators import PRX, NormalisedGradient
+from robotid.estimation.estimators.recursive.descent import column_scale
+from robotid.robot.examples import example_urdf
+from robotid.robot.model import RobotModel
+
+
+def _rng():
+    return np.random.default_rng(0)
+
+
+@pytest.fixture(scope="module")
+def states():
+    return RandomStates(RobotModel.from_urdf(example_urdf("ur10_robot.urdf")), _rng())
+
+
+@pytest.mark.parametrize("options", [{}, {"metric": "rows"}, {"metric": "mass"}])
+def test_prx_never_moves_away_from_the_truth(states, options):
+    problem, beta = states.problem, states.beta
+    scale = column_scale(problem, np.ones(6))
+    estimator = PRX(np.ones(6), scale=scale, average=False, **options)
+    assert_monotone(estimator, problem, scale * beta)
+
+
+def test_printed_prx_never_moves_away_from_the_truth(states):
+    problem, beta = states.problem, states.beta
+    # half the truth, as in the paper: D(q, P^) starts positive definite
+    estimator = PRX(np.ones(6), prior=beta / 2, step="printed", average=False)
+    distance = assert_monotone(estimator, problem, beta)
+    assert distance[-1] < distance[0]
+    assert distance[-1] > 0.3 * distance[0]  # on six joints it hardly moves
+
+
+def assert_monotone(estimator, problem, truth):
+    state = estimator.init(len(truth))
+    distance = [np.linalg.norm(state.x - truth)]
+    for sample in problem.samples():
+        state = estimator.update(state, sample)
+        distance.append(np.linalg.norm(state.x - truth))
+    growth = np.diff(distance) / distance[0]
+    assert growth.max() < 1e-12  # rounding of 58 products
+    return distance
+
+
+def test_exact_prx_needs_two_passes_where_the_printed_step_stands_still(states):
+    problem, beta = states.problem, states.beta
+    start = 1.3 * beta
+
+    def miss(**options):
+        estimator = PRX(np.ones(6), prior=start, average=False, passes=2, rng=_rng(), **options)
+        return np.linalg.norm(estimator.fit(problem).theta - beta) / np.linalg.norm(beta)
+
+    assert miss() < 1e-6
+    assert miss(metric="rows") < 1e-8
+    assert miss(step="printed") > 0.1
+
+
+def test_prx_says_what_it_lacks_and_refuses_settings(states):
+    problem = states.problem
+    sample = replace(next(problem.samples()), mass_regressor=None)
+    for options in ({"step": "printed"}, {"metric": "mass"}):
+        estimator = PRX(np.ones(6), **options)
+        with pytest.raises(
+            DataError, match=r"PRX needs the mass regressor of each sample, found none"
+        ):
+            estimator.update(estimator.init(58), sample)
+    with pytest.raises(DataError, match="step is 'wrong', wanted 'exact' or 'printed'"):
+        PRX(np.ones(6), step="wrong")
+    positive = "wanted a positive number"
+    for method, name, value, words in (
+        (PRX, "metric", "torque", "wanted 'noise', 'mass' or 'rows'"),
+        (PRX, "bounds", 0.0, positive),
+        (PRX, "passes", 0, positive),
+        (PRX, "eps1", 0.0, positive),
+        (PRX, "eps2", -1e-12, positive),
+        (NormalisedGradient, "regularisation", 0.0, positive),
+        (NormalisedGradient, "step_size", 0.0, "wanted above 0 and below 2"),
+        (NormalisedGradient, "step_size", 2.0, "wanted above 0 and below 2"),
+    ):
+        with pytest.raises(DataError, match=rf"^{name} is '?{value}'?, {words}$"):
+            method(np.ones(6), **{name: value})
+
+
+@pytest.mark.parametrize("average", [False, True])
+def test_prx_stays_within_omega(states, average):
+    problem, beta = states.problem, states.beta
+    estimator = PRX(np.ones(6), prior=0 * beta, bounds=1.0, average=average)
+    state = estimator.init(58)
+    for sample in problem.samples():
+        state = estimator.update(state, sample)
+        assert max(np.linalg.norm(state.x), np.linalg.norm(state.mean)) < 1.0 + 1e-12
+    assert np.linalg.norm(state.x) == pytest.approx(1.0)
+
+
+def test_only_steps_that_use_the_mass_matrix_ask_for_its_regressor():
+    asks = {
+        (step, metric): PRX(np.ones(2), step=step, metric=metric).needs_mass
+        for step in ("exact", "printed")
+        for metric in ("noise", "rows", "mass")
+    }
+    assert {key for key, needs in asks.items() if not needs} == {
+        ("exact", "noise"),
+        ("exact", "rows"),
+    }
+    assert not NormalisedGradient(np.ones(2)).needs_mass
+
+
+def test_the_gradient_step_is_its_formula(rng):
+    sigma, scale, theta = (
+        np.array([0.5, 2.0]),
+        np.array([1.0, 3.0, 0.2]),
+        np.array([1.0, -1.0, 2.0]),
+    )
+    ours = NormalisedGradient(sigma, theta, scale, step_size=0.7, regularisation=0.3, average=False)
+    Y, tau, weight = rng.standard_normal((2, 3)), rng.standard_normal(2), np.array([4.0, 1.0])
+    state = ours.update(ours.init(3), Sample(Y, tau, weight))
+    root = np.sqrt(weight) / sigma
+    Psi = root[:, None] * Y / scale
+    e = root * (Y @ theta - tau)
+    x = scale * theta - 0.7 / (0.3 + (Psi**2).sum()) * Psi.T @ e
+    np.testing.assert_allclose(state.x, x, rtol=1e-12)
+    np.testing.assert_allclose(ours.estimate(state, ("a", "b", "c")).theta, x / scale, rtol=1e-12)
+
+
+def test_averaging_takes_the_noise_out_of_prx(states, rng):
+    problem, beta = states.problem, states.beta
+    ((W, tau, weight),) = problem.blocks()
+    noisy = tau + rng.standard_normal(len(tau))
+    data = replace(problem, stream=lambda: iter([(W, noisy, weight)]))
+    best = np.linalg.lstsq(W, noisy, rcond=None)[0]
+
+    def residual(average):
+        fit = PRX(np.ones(6), average=average, passes=6, rng=_rng()).fit(data)
+        return np.linalg.norm(W @ (fit.theta - best)) / np.linalg.norm(W @ (beta - best)), fit
+
+    last, _ = residual(False)
+    mean, fit = residual(True)
+    assert last > 2.0  # each iterate fits its own sample
+    assert mean < 1.0  # nearer to least squares than that is to the truth
+    assert np.isinf(fit.std_error).all()
+    assert "a gradient method has no covariance" in fit.message
+
+
+def test_prx_stops_when_the_gradient_is_zero(states):
+    problem = states.problem
+    fit = PRX(np.ones(6), average=False, passes=30, rng=_rng(), eps1=1e-7).fit(problem)
+    assert fit.converged
+    assert fit.n_iter < 30_000
+    short = PRX(np.ones(6), average=False, passes=1, rng=_rng()).fit(problem)
+    assert not short.converged
+
+
+def test_a_state_averages_what_rows_of_their_own_weight_leave(rng):
+    """Of three samples of three joints; a row of weight 0 changes nothing of its joint."""
+    sigma, scale = np.array([0.5, 2.0, 1.5]), np.array([1.0, 4.0])
+    prior = np.array([0.3, -0.2])
+    estimator = NormalisedGradient(sigma, prior=prior, scale=scale, step_size=0.7)
+    state, x = estimator.init(2), prior * scale
+    mean, squares, prx, square = x.copy(), np.zeros(3), np.zeros(2), 0.0
+    for k, weight in enumerate(([1.0, 4.0, 0.25], [2.0, 0.0, 1.0], [1.0, 1.0, 9.0]), start=1):
+        weight = np.array(weight)
+        Y, tau = rng.standard_normal((3, 2)), rng.standard_normal(3)
+        state = estimator.update(state, Sample(Y, tau, weight))
+        used = np.flatnonzero(weight)
+        rows = (np.sqrt(weight) / sigma)[used]
+        Psi, u = rows[:, None] * Y[used] / scale, rows * tau[used]
+        gradient = (Psi @ mean - u) @ Psi
+        left = (Y[used] / scale @ mean - tau[used]) ** 2
+        x = x - 0.7 / (1e-9 + np.sum(Psi**2)) * (Psi @ x - u) @ Psi
+        squares[used] += (left - squares[used]) / k
+        prx, square = prx + (gradient - prx) / k, square + (gradient @ gradient - square) / k
+        mean = mean + 3.0 / (k + 2) * (x - mean)
+        np.testing.assert_allclose(state.x, x, rtol=1e-9)
+        np.testing.assert_allclose(state.mean, mean, rtol=1e-9)
+        np.testing.assert_allclose(state.squares, squares, rtol=1e-9)
+        np.testing.assert_allclose(state.prx, prx, rtol=1e-9)
+        assert state.prx_square == pytest.approx(square)
+    assert (state.steps, state.rows, state.skipped) == (3, 8, 0)
+    found = estimator.estimate(state, ("a", "b"))
+    np.testing.assert_allclose(found.theta, mean / scale)
+    np.testing.assert_allclose(found.sigma, np.sqrt(squares))
+    silent = estimator.update(state, Sample(np.zeros((3, 2)), np.ones(3), np.ones(3)))
+    assert (silent.steps, silent.rows, silent.skipped) == (4, 8, 1)
+
+
+def test_omega_is_a_ball_about_the_scaled_prior():
+    scale, prior = np.array([1.0, 4.0]), np.array([3.0, -2.0])
+    estimator = PRX(np.ones(2), prior=prior, scale=scale, bounds=2.0)
+    centre = np.array([3.0, -8.0])
+    inside, outside = np.add(centre, [1.2, -1.5]), np.add(centre, [3.0, -4.0])
+    np.testing.assert_array_equal(estimator._bounded(inside, 2.0), inside)
+    np.testing.assert_allclose(estimator._bounded(outside, 2.0), np.add(centre, [1.2, -1.6]))
+
+
+def test_columns_are_scaled_by_the_rows_of_every_block_with_their_weights(rng):
+    sigma = np.array([0.5, 2.0])
+    blocks = []
+    for n in (3, 5):
+        W, weight = rng.standard_normal((2 * n, 3)), rng.uniform(0.5, 2.0, 2 * n)
+        weight[1] = 0.0
+        W[1] = np.nan  # of a row that is not used
+        W[:, 2] = 0.0
+        blocks.append((W, rng.standard_normal(2 * n), weight))
+    problem = SimpleNamespace(n_joints=2, names=("a", "b", "c"), blocks=lambda: iter(blocks))
+    squares = sum(
+        np.nansum((weight / np.tile(sigma, len(W) // 2) ** 2)[:, None] * W**2, axis=0)
+        for W, _, weight in blocks
+    )
+    np.testing.assert_allclose(column_scale(problem, sigma), [*np.sqrt(squares[:2] / 8), 1.0])
+    # below 1e-9 of the largest, a column has no data
+    small = np.array([[2.0, 2.4e-9, 1.6e-9]])
+    problem.n_joints, problem.blocks = 1, lambda: iter([(small, np.ones(1), np.ones(1))])
+    np.testing.assert_allclose(column_scale(problem, np.ones(1)), [2.0, 2.4e-9, 1.0])
+
+
+def test_prx_is_zero_within_two_standard_errors_of_its_moving_average():
+    """Averaged over 1000 samples, independent ones have the variance of one over 2000."""
+    prx, limit = PRX(np.ones(1), eps1=1e-9), 2.0 * np.sqrt(5.0 / 2000)
+    for size, steps, is_zero in (
+        (0.99 * limit, 1000, True), (1.01 * limit, 1000, False), (0.99 * limit, 999, False),
+    ):  # fmt: skip
+        state = replace(prx.init(2), prx=size * np.array([0.6, -0.8]), prx_square=5.0, steps=steps)
+        assert prx._is_zero(state) == is_zero
+    still = replace(prx.init(2), prx=np.array([0.9e-9, 0.0]), prx_square=0.0, steps=1000)
+    assert prx._is_zero(still)
+    assert not prx._is_zero(replace(still, prx=np.array([1.1e-9, 0.0])))
+    # within its scatter it is settled if a pass lowers the squared residual by less than 1 %
+    inside = replace(still, prx=np.array([1e-3, 0.0]), prx_square=1.0)
+    for left, settled in ((0.9905, True), (0.9895, False), (1.02, True)):
+        before, after = (replace(inside, squares=np.array([x])) for x in (3.0, 3.0 * left))
+        assert prx._has_settled(before, after) == settled
+
+
+def test_an_indefinite_inertia_is_bounded_by_its_largest_eigenvalue_of_either_sign():
+    turn = np.array([[0.6, -0.8], [0.8, 0.6]])
+    sample = SimpleNamespace(mass_regressor=(turn * [-5.0, 2.0] @ turn.T)[..., None])
+    values, vectors = PRX(np.ones(2))._inertia(np.ones(1), sample)
+    np.testing.assert_allclose(values, [5e-6, 2.0], rtol=1e-12)
+    np.testing.assert_allclose(np.abs(vectors), np.abs(turn), rtol=1e-12)

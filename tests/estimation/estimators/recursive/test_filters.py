@@ -1,0 +1,352 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scipy.stats
+from helpers.estimation import NOISE, Case
+
+from robotid.base.exceptions import DataError, RankDeficientError
+from robotid.dynamics.problem import Problem, Sample
+from robotid.dynamics.torque import build_problem, joint_torque_regressor
+from robotid.estimation.estimators import OLS, RLS, WLS, Kalman, fold
+from robotid.estimation.estimators.recursive import filters
+from robotid.estimation.estimators.recursive.filters import KalmanState
+
+NAMES = ("a", "b", "c")
+
+
+def test_rls_without_forgetting_is_ols_after_the_last_sample(ur5, rng):
+    case = Case(ur5, rng, NOISE)
+    ours, ols = RLS(np.ones(6)).fit(case.problem), OLS().fit(case.problem)
+    np.testing.assert_allclose(ours.theta, ols.theta, rtol=1e-9, atol=1e-11)
+
+
+def test_rls_with_the_noise_levels_of_wls_is_wls(ur5, rng):
+    case = Case(ur5, rng, NOISE)
+    wls = WLS().fit(case.problem)
+    ours = RLS(wls.sigma).fit(case.problem)
+    np.testing.assert_allclose(ours.theta, wls.theta, rtol=1e-7, atol=1e-9)  # WLS iterates to 1e-8
+    np.testing.assert_allclose(ours.std_error, wls.std_error, rtol=0.01)
+    np.testing.assert_allclose(ours.sigma, wls.sigma, rtol=0.01)
+
+
+def test_forgetting_does_not_wind_up_where_nothing_moves():
+    # one sample over and over: with forgetting 0.8 the rest would be forgotten after ten
+    rng, c = np.random.default_rng(0), 12
+    prior, std = np.arange(1.0, c + 1), np.full(c, 2.0)
+    estimator = RLS(np.full(2, 0.1), 0.8, prior, std)
+    state = estimator.init(c)
+    Y = np.zeros((2, c))
+    Y[:, :2] = [[1.0, 0.5], [0.0, 1.0]]
+    truth = np.array([3.0, -1.0])
+    for _ in range(7_000):  # 0.8^(n / 2) is below the smallest double
+        tau = Y[:, :2] @ truth + 1e-3 * rng.standard_normal(2)
+        state = estimator.update(state, Sample(Y, tau, np.ones(2)))
+    assert np.isfinite(state.R).all()
+    smallest = np.linalg.svd(state.R[:c, :c], compute_uv=False)[-1]
+    assert smallest > 0.5 * 0.8 ** (c / 2) / 2.0  # the floor, forgetting^(c/2) / prior_std
+    estimate = estimator.estimate(state, tuple("abcdefghijkl"))
+    np.testing.assert_allclose(estimate.theta[:2], truth, atol=0.05)
+    np.testing.assert_allclose(estimate.theta[2:], prior[2:], atol=1e-9)
+    # and the first jump that comes is taken calmly
+    jump = estimator.update(state, Sample(np.ones((2, c)), np.full(2, prior.sum()), np.ones(2)))
+    assert np.abs(estimator.estimate(jump, tuple("abcdefghijkl")).theta).max() < 50
+
+
+def test_what_rls_was_not_shown_is_refused_by_name_or_keeps_its_prior():
+    rng, names = np.random.default_rng(0), ("a", "b", "c")
+    W = rng.standard_normal((40, 3))
+    W[:, 2] = 0.0
+    block = (W, W @ [1.0, 2.0, 3.0], np.ones(40))
+    problem = Problem(lambda: iter([block]), names, 2, np.ones((2, 3), dtype=bool))
+    with pytest.raises(RankDeficientError, match="undetermined"):
+        RLS(np.ones(2)).fit(problem)
+    kept = RLS(np.ones(2), prior=np.full(3, 7.0)).fit(problem)
+    np.testing.assert_allclose(kept.theta, [1.0, 2.0, 7.0])
+    assert kept.undetermined == ("c",)
+    assert np.isinf(kept.std_error[2])
+    with pytest.raises(DataError, match="which needs prior and prior_std"):
+        RLS(np.ones(2), 0.99)
+    with pytest.raises(DataError, match="forgetting is 0"):
+        RLS(np.ones(2), 0.0)
+
+
+def samples_of_known(rng, count, sigma, theta=(1.0, -2.0, 0.5)):
+    """Return samples of two rows, a fifth of which are left out, and all of them stacked."""
+    Y = rng.standard_normal((count, 2, 3))
+    tau = Y @ np.array(theta) + sigma * rng.standard_normal((count, 2))
+    weight = np.where(rng.random((count, 2)) < 0.2, 0.0, rng.uniform(0.5, 2.0, (count, 2)))
+    weight[:, 0] = np.maximum(weight[:, 0], 0.5)  # no sample is left out altogether
+    return [Sample(*x) for x in zip(Y, tau, weight, strict=True)], Y, tau, weight
+
+
+@pytest.mark.parametrize("forgetting", [0.9, 0.98])
+def test_forgetting_weighs_sample_k_of_n_by_its_power(rng, forgetting):
+    sigma = np.array([0.5, 0.1])
+    samples, Y, tau, weight = samples_of_known(rng, 60, sigma)
+    ours = RLS(sigma, forgetting, np.zeros(3), np.full(3, 1e6))
+    state = fold(ours, samples, ours.init(3))
+    age = forgetting ** np.arange(59.0, -1, -1)
+    w = (age[:, None] * weight / sigma**2).reshape(-1)
+    W, d = Y.reshape(-1, 3), tau.reshape(-1)
+    H = W.T @ (w[:, None] * W)
+    theta = np.linalg.solve(H, W.T @ (w * d))
+    estimate = ours.estimate(state, NAMES)
+    np.testing.assert_allclose(estimate.theta, theta, rtol=1e-9)
+    # the common factor of the noise levels: weighted squares over weighted rows less c
+    rows = (age[:, None] * (weight > 0)).sum()
+    assert state.rows == pytest.approx(rows, rel=1e-12)
+    scale = np.sqrt((w @ (d - W @ theta) ** 2) / (rows - 3))
+    np.testing.assert_allclose(estimate.sigma, scale * sigma, rtol=1e-8)
+    np.testing.assert_allclose(estimate.covariance, scale**2 * np.linalg.inv(H), rtol=1e-8)
+
+
+def test_each_step_renews_what_a_round_forgets_of_one_parameters_prior(rng):
+    sigma, forgetting, prior = np.ones(2), 0.9, np.array([1.0, 2.0, 3.0])
+    std = np.array([0.5, 1.0, 2.0])
+    samples, Y, tau, weight = samples_of_known(rng, 20, sigma)
+    ours = RLS(sigma, forgetting, prior, std)
+    state = fold(ours, samples, ours.init(3))
+    L, eta = np.diag(std**-2.0), prior / std**2
+    for k in range(20):
+        W = np.sqrt(weight[k])[:, None] * Y[k]
+        renewed = np.zeros(3)
+        renewed[k % 3] = (1 - forgetting**3) / std[k % 3] ** 2
+        L = forgetting * L + W.T @ W + np.diag(renewed)
+        eta = forgetting * eta + W.T @ (np.sqrt(weight[k]) * tau[k]) + renewed * prior
+    np.testing.assert_allclose(state.R[:3, :3].T @ state.R[:3, :3], L, rtol=1e-12)
+    estimate = ours.estimate(state, NAMES)
+    np.testing.assert_allclose(estimate.theta, np.linalg.solve(L, eta), rtol=1e-10)
+
+
+@pytest.mark.parametrize("share", [1.0, 0.2])
+def test_without_forgetting_sigma_has_n_minus_c_degrees_of_freedom(rng, share):
+    sigma = np.array([0.5, 0.1])
+    samples, Y, tau, weight = samples_of_known(rng, 12, sigma)
+    ours = RLS(sigma, independent_share=share)
+    estimate = ours.estimate(fold(ours, samples, ours.init(3)), NAMES)
+    used = weight.reshape(-1) > 0
+    root = (np.sqrt(weight) / sigma).reshape(-1)[used]
+    W, d = root[:, None] * Y.reshape(-1, 3)[used], root * tau.reshape(-1)[used]
+    theta, squares, *_ = np.linalg.lstsq(W, d, rcond=None)
+    variance = squares[0] / (len(d) - 3)
+    np.testing.assert_allclose(estimate.theta, theta, rtol=1e-9)
+    np.testing.assert_allclose(estimate.sigma, np.sqrt(variance) * sigma, rtol=1e-9)
+    expected = variance / share * np.linalg.inv(W.T @ W)
+    np.testing.assert_allclose(estimate.covariance, expected, rtol=1e-8)
+    np.testing.assert_allclose(estimate.std_error, np.sqrt(np.diag(expected)), rtol=1e-8)
+
+
+def test_few_samples_are_refused_with_forgetting_too(rng):
+    _, Y, tau, weight = samples_of_known(rng, 1, np.ones(2))
+    problem = Problem(
+        lambda: iter([(Y[0], tau[0], weight[0])]), NAMES, 2, np.ones((2, 3), dtype=bool)
+    )
+    with pytest.raises(DataError, match="2 torque rows for 3 parameters"):
+        RLS(np.ones(2), 0.9, np.zeros(3), np.ones(3)).fit(problem)
+    one = np.array([1.0, 0.0])  # only the first joint moves, in each of two samples
+    problem = replace(problem, stream=lambda: iter([(Y[0], tau[0], one)] * 2))
+    with pytest.raises(DataError, match="2 torque rows for 3 parameters"):
+        RLS(np.ones(2), 1.0, np.zeros(3), np.ones(3)).fit(problem)
+
+
+def test_a_filter_that_never_walks_is_wls(ur5, rng):
+    case = Case(ur5, rng, NOISE, samples=2000)
+    wls = WLS().fit(case.problem)
+    ours = Kalman(wls.sigma, 0 * case.beta, 1e3 + 0 * case.beta, gate=None).fit(case.problem)
+    assert np.max(np.abs(ours.theta - wls.theta) / wls.std_error) < 0.01
+    np.testing.assert_allclose(ours.std_error, wls.std_error, rtol=0.01)
+    np.testing.assert_allclose(ours.sigma, NOISE, rtol=0.05)
+
+
+def test_the_gate_turns_outliers_away_and_counts_them(ur5, rng):
+    case = Case(ur5, rng, 0.1 * NOISE)
+    tau = np.array(case.trajectory.tau)
+    tau[100::50, 2] += 300.0
+    spoiled = replace(case.trajectory, tau=tau)
+    problem = case.mapping.reduce(build_problem(ur5, spoiled))
+
+    def fit(gate):
+        prior = case.mapping.to_base(ur5.standard_parameters())
+        filtered = Kalman(0.1 * NOISE, prior, 5.0 + np.abs(prior), gate=gate)
+        state = fold(filtered, problem.samples(), filtered.init(len(prior)))
+        error = np.linalg.norm(state.theta - case.beta) / np.linalg.norm(case.beta)
+        return error, state
+
+    open_error, _ = fit(None)
+    error, state = fit(1 - 1e-7)
+    assert error < 0.2 * open_error
+    np.testing.assert_array_equal(state.gated, [0, 0, 10, 0, 0, 0])
+    filtered = Kalman(NOISE, state.theta, np.full(len(state.theta), 5.0))
+    assert filtered.estimate(state, problem.names).converged
+
+
+def test_a_gate_does_not_shut_a_joint_out_for_good(ur5, rng):
+    case = Case(ur5, rng, samples=200)
+    # the prior is far too sure of itself, so at first every row looks like an outlier
+    far = Kalman(0.1 * NOISE, case.beta + 5.0, 1e-3 + 0 * case.beta)
+    state = fold(far, case.problem.samples(), far.init(len(case.beta)))
+    assert (state.gated >= 50).any()
+    assert (state.rows > 0).all()
+
+
+def test_a_walking_filter_follows_a_change_and_a_still_one_does_not(ur5, rng):
+    case = Case(ur5, rng, 0.1 * NOISE, samples=2000)
+    other = 1.2 * case.pi
+    tau = np.array(case.trajectory.tau)
+    t = case.trajectory
+    tau[1000:] += (joint_torque_regressor(ur5, t.q, t.v, t.a) @ (other - case.pi)).reshape(-1, 6)[
+        1000:
+    ]
+    problem = case.mapping.reduce(build_problem(ur5, replace(t, tau=tau)))
+    target = case.mapping.to_base(other)
+
+    def miss(estimator):
+        return np.linalg.norm(estimator.fit(problem).theta - target) / np.linalg.norm(target)
+
+    prior, std = case.beta, np.full(len(case.beta), 5.0)
+    still = miss(Kalman(0.1 * NOISE, prior, std, gate=None))
+    assert miss(Kalman(0.1 * NOISE, prior, std, walk=1e-3, gate=None)) < 0.2 * still
+    assert miss(RLS(NOISE, 0.99, prior, std)) < 0.05 * still
+
+
+def random_samples(rng, count, sigma, c=3):
+    Y = rng.standard_normal((count, len(sigma), c))
+    tau = Y @ np.arange(1.0, c + 1) + sigma * rng.standard_normal((count, len(sigma)))
+    weight = rng.uniform(0.5, 2.0, tau.shape)
+    return [Sample(*x) for x in zip(Y, tau, weight, strict=True)], Y, tau, weight
+
+
+@pytest.mark.parametrize("share", [1.0, 0.2])
+def test_without_walk_it_is_the_posterior_of_the_prior(rng, share):
+    sigma, prior, std = np.array([0.5, 0.1]), np.array([1.0, 0.0, -1.0]), np.array([0.3, 1.0, 2.0])
+    samples, Y, tau, weight = random_samples(rng, 8, sigma)
+    ours = Kalman(sigma, prior, std, gate=None, independent_share=share)
+    state = fold(ours, samples, ours.init(3))
+    w = (share * weight / sigma**2).reshape(-1)
+    W, d = Y.reshape(-1, 3), tau.reshape(-1)
+    H = np.diag(std**-2.0) + W.T @ (w[:, None] * W)
+    theta = np.linalg.solve(H, prior / std**2 + W.T @ (w * d))
+    np.testing.assert_allclose(state.theta, theta, rtol=1e-10)
+    np.testing.assert_allclose(state.P, np.linalg.inv(H), rtol=1e-9)
+    np.testing.assert_array_equal(state.rows, [8, 8])
+    estimate = ours.estimate(state, ("a", "b", "c"))
+    np.testing.assert_allclose(estimate.std_error, np.sqrt(np.diag(np.linalg.inv(H))), rtol=1e-9)
+
+
+def test_sigma_is_the_whole_misfit_prior_included_over_all_rows(rng):
+    # each innovation counts with what was known before it, so no row is spent on a parameter
+    sigma, prior, std = np.array([0.5]), np.zeros(3), np.array([0.3, 1.0, 2.0])
+    samples, Y, tau, _ = random_samples(rng, 10, sigma)
+    samples = [replace(sample, weight=np.ones(1)) for sample in samples]
+    ours = Kalman(sigma, prior, std, gate=None)
+    state = fold(ours, samples, ours.init(3))
+    residual = (tau[:, 0] - Y[:, 0] @ state.theta) / sigma
+    misfit = residual @ residual + ((state.theta / std) ** 2).sum()
+    (level,) = ours.estimate(state, ("a", "b", "c")).sigma
+    assert level == pytest.approx(0.5 * np.sqrt(misfit / 10), rel=1e-9)
+
+
+@pytest.mark.parametrize("full", [False, True])
+def test_what_is_not_seen_walks_as_far_as_the_walk_says(full):
+    std = np.array([0.3, 1.0, 2.0])
+    before = np.diag(std**2) if full else std
+    ours = Kalman(np.ones(1), np.zeros(3), before, walk=0.1)
+    unseen = Sample(np.zeros((1, 3)), np.zeros(1), np.ones(1))
+    state = fold(ours, [unseen] * 7, ours.init(3))
+    np.testing.assert_allclose(state.P, np.diag(std**2 * (1 + 7 * 0.01)), rtol=1e-12)
+
+
+@pytest.mark.parametrize("gate", [0.5, 0.99])
+def test_the_gate_turns_away_as_many_good_rows_as_it_says(rng, gate):
+    known = Kalman(np.array([2.0, 0.5]), np.ones(3), np.full(3, 1e-9), gate=gate)
+    state, count = known.init(3), 3000
+    for Y in rng.standard_normal((count, 2, 3)):
+        tau = Y.sum(axis=1) + known.sigma * rng.standard_normal(2)
+        state = known.update(state, Sample(Y, tau, np.ones(2)))
+    turned_away = state.gated / count
+    # four standard deviations of a binomial share
+    bound = 4 * np.sqrt(gate * (1 - gate) / count)
+    np.testing.assert_allclose(turned_away, 1 - gate, atol=bound)
+    np.testing.assert_array_equal(state.rows + state.gated, count)
+
+
+@pytest.mark.parametrize("share", [1.0, 0.25])
+def test_the_gate_is_chi_squares_bound_on_the_innovation(share):
+    sigma, std, gate = np.array([0.5, 0.2]), np.array([0.3, 1.0]), 0.95
+    ours = Kalman(sigma, np.zeros(2), std, gate=gate, independent_share=share)
+    Y, weight = np.array([[1.0, 2.0], [-1.0, 0.5]]), np.array([1.0, 4.0])
+    variance = ((Y * std) ** 2).sum(axis=1) + sigma**2 / share / weight
+    edge = np.sqrt(scipy.stats.chi2.ppf(gate, 1) * variance)
+    for factor, turned_away in ((0.999, [0, 0]), (1.001, [1, 1])):
+        state = ours.update(ours.init(2), Sample(Y, factor * edge, weight))
+        np.testing.assert_array_equal(state.gated, turned_away)
+    # one joint alone, of either sign
+    state = ours.update(ours.init(2), Sample(Y, edge * [-1.001, -0.999], weight))
+    np.testing.assert_array_equal(state.gated, [1, 0])
+    np.testing.assert_array_equal(state.rows, [0, 1])
+
+
+def test_after_fifty_rows_turned_away_the_next_is_believed():
+    sure = Kalman(np.ones(1), np.zeros(1), np.full(1, 1e-3))
+    far = Sample(np.ones((1, 1)), np.full(1, 100.0), np.ones(1))
+    state = fold(sure, [far] * 50, sure.init(1))
+    assert (state.gated[0], state.rows[0], state.theta[0]) == (50, 0, 0.0)
+    state = sure.update(state, far)
+    assert (state.gated[0], state.rows[0], state.in_a_row[0]) == (50, 1, 0)
+    assert state.theta[0] == pytest.approx(100.0 * 1e-6 / (1 + 1e-6))
+
+
+def test_rows_are_counted_joint_by_joint_used_or_rejected():
+    """Of five joints the second has no row; the last is used after some were rejected."""
+    state = KalmanState(
+        None, None, None, rows=np.array([7, 5, 3, 2, 9]), gated=np.array([1, 2, 0, 4, 6]),
+        in_a_row=np.array([0, 3, 0, 1, 2]), steps=9,
+    )  # fmt: skip
+    used, passed = np.array([0, 2, 3, 4]), np.array([True, False, False, True])
+    rows, gated, in_a_row = filters._count(state, used, passed)
+    assert rows.tolist() == [8, 5, 3, 2, 10]
+    assert gated.tolist() == [1, 2, 1, 5, 6]
+    assert in_a_row.tolist() == [0, 3, 1, 2, 0]
+    assert state.rows.tolist() == [7, 5, 3, 2, 9]
+
+
+def test_a_walk_is_in_units_of_each_parameter_s_own_spread():
+    P = np.array([[2.0, 0.5], [0.5, 3.0]])
+    for spread in (np.array([0.3, 7.0]), np.array([[0.09, 0.2], [0.2, 49.0]])):
+        kalman = Kalman(np.ones(2), np.zeros(2), spread, walk=0.1)
+        walked = kalman._walked(P)
+        np.testing.assert_allclose(walked, P + np.diag([0.0009, 0.49]))
+    np.testing.assert_array_equal(P, [[2.0, 0.5], [0.5, 3.0]])
+
+
+def test_two_steps_of_weighted_rows_are_bayes_rule_with_the_noise_of_each_joint(rng):
+    """All that a state and its estimate state, against the update in information form."""
+    sigma, share, std = np.array([0.5, 3.0]), 0.4, np.array([2.0, 0.3, 7.0])
+    kalman = Kalman(sigma, np.array([1.0, -2.0, 0.5]), std, 0.1, None, share)
+    state, theta, P = kalman.init(3), kalman.prior, np.diag(std**2)
+    products, rows = np.zeros(2), np.zeros(2, dtype=int)
+    for weight in np.array([[0.25, 1.7], [3.0, 0.0]]):
+        Y, tau = rng.standard_normal((2, 3)), 5.0 * rng.standard_normal(2)
+        state = kalman.update(state, Sample(Y, tau, weight))
+        used = weight > 0
+        precision = (weight * share / sigma**2)[used]
+        P = P + np.diag((0.1 * std) ** 2)
+        e, A = tau[used] - Y[used] @ theta, Y[used]
+        P = np.linalg.inv(np.linalg.inv(P) + A.T @ (precision[:, None] * A))
+        theta = theta + P @ A.T @ (precision * e)
+        products[used] += e * (tau[used] - A @ theta)
+        rows += used
+    np.testing.assert_allclose(state.theta, theta, rtol=1e-9)
+    np.testing.assert_allclose(state.P, P, rtol=1e-8, atol=1e-12)
+    np.testing.assert_allclose(state.products, products, rtol=1e-9)
+    np.testing.assert_array_equal([state.rows, state.gated], [rows, [0, 0]])
+    found = kalman.estimate(state, NAMES)
+    np.testing.assert_allclose(found.sigma, np.sqrt(np.maximum(products, 0.0) / rows))
+    ratio = np.linalg.svd(np.linalg.cholesky(P / np.outer(std, std)), compute_uv=False)
+    assert found.condition == pytest.approx(ratio[0] / ratio[-1])
+    assert found.rank == np.sum(ratio < 0.9)
+    after = np.sqrt(np.diag(P)) / std
+    assert found.undetermined == tuple(np.array(NAMES)[after > 0.9].tolist())
+    assert found.n_iter == 2
+    assert found.message == f"2 samples, 0 rows rejected by the gate, {rows.sum()} used"

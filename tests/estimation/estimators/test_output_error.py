@@ -1,0 +1,532 @@
+from dataclasses import dataclass, field, replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from robotid.base.exceptions import DataError, NotConvergedError
+from robotid.estimation.estimators import Estimator, output_error
+from robotid.estimation.estimators.output_error import OutputError, _freed, linearised
+from robotid.estimation.estimators.simulator import Residual
+
+DT, RHO, SIGMA = 0.02, 0.9, 0.02
+TRUTH = np.array([1.5, 0.3, 0.1])  # gain, time constant [s], offset
+
+
+@dataclass(frozen=True, eq=False)
+class Lagging:
+    """First-order lags with a gain and an offset that follow held commands, window by window."""
+
+    told: np.ndarray  # (W, N), N samples of W windows
+    measured: np.ndarray  # likewise
+    prior: np.ndarray
+    prior_std: np.ndarray
+    bounds: np.ndarray
+    further: np.ndarray = field(default_factory=lambda: np.zeros((0, 4)))  # rows A theta = b
+    names: tuple[str, ...] = ("gain", "time", "offset")
+
+    def simulated(self, theta):
+        gain, time, offset = theta
+        if not time > 0:
+            raise NotConvergedError("a lag needs a time constant above 0", "no lag")
+        a = np.exp(-DT / time)
+        return gain * lfilter([0.0, 1.0 - a], [1.0, -a], self.told, axis=1) + offset
+
+    def rows(self, theta):
+        A, b = self.further[:, :-1], self.further[:, -1]
+        return A, b - A @ theta
+
+    def residuals(self, theta, *, with_slopes, with_starts=False):
+        e = self.measured - self.simulated(theta)
+        slopes = None
+        if with_slopes:
+            gain, time, _ = theta
+            a = np.exp(-DT / time)
+            y = lfilter([0.0, 1.0 - a], [1.0, -a], self.told, axis=1)
+            # y_k = a y_(k-1) + (1 - a) u_(k-1), so dy = a dy + da (y - u)
+            late = lfilter([0.0, 1.0], [1.0, -a], y - self.told, axis=1) * a * DT / time**2
+            slopes = np.stack([y, gain * late, np.ones_like(y)], axis=-1)
+        joints, columns = np.array([0]), np.arange(3)
+        return [
+            Residual(e[w, :, None], None if slopes is None else slopes[w, :, None], joints, columns)
+            for w in range(len(e))
+        ]
+
+
+def lagging(rng, *, rho=RHO, sigma=SIGMA, windows=24, samples=120, **changes):
+    told = np.repeat(rng.standard_normal((windows, samples // 10)), 10, axis=1)
+    exact = Lagging(told, told, np.zeros(3), np.full(3, np.inf), UNBOUNDED)
+    white = sigma * rng.standard_normal(told.shape)
+    white[:, 0] /= np.sqrt(1.0 - rho**2)
+    noise = lfilter([1.0], [1.0, -rho], white, axis=1)
+    return replace(exact, measured=exact.simulated(TRUTH) + noise, **changes)
+
+
+START = np.array([1.0, 0.2, 0.0])
+UNBOUNDED = np.outer([-1.0, 1.0], np.full(3, np.inf))
+
+
+def test_the_slopes_of_the_lag_are_those_of_differences(rng):
+    lag, h = lagging(rng), 1e-6
+    slopes = np.stack([r.slopes[:, 0] for r in lag.residuals(TRUTH, with_slopes=True)])
+    for k in range(3):
+        up, down = TRUTH.copy(), TRUTH.copy()
+        up[k], down[k] = TRUTH[k] + h, TRUTH[k] - h
+        exact = (lag.simulated(up) - lag.simulated(down)) / (2 * h)
+        np.testing.assert_allclose(slopes[..., k], exact, atol=1e-7)
+
+
+def test_parameters_are_recovered_without_noise(rng):
+    found = OutputError().fit(lagging(rng, sigma=1e-9), START)
+    np.testing.assert_allclose(found.theta, TRUTH, rtol=1e-6)
+    assert found.converged
+    assert found.undetermined == ()
+    assert found.names == ("gain", "time", "offset")
+
+
+@pytest.mark.parametrize("rounds", [1, 5])
+def test_parameters_alone_are_those_of_the_fit(rng, rounds):
+    lag, estimator = lagging(rng), OutputError(rounds=rounds)
+    found = estimator.fit(lag, START).theta
+    np.testing.assert_array_equal(estimator.minimise(lag, START), found)
+    about_start = replace(lag, prior=START, prior_std=np.full(3, 1e3))
+    np.testing.assert_allclose(estimator.minimise(about_start), found, rtol=1e-6)
+    assert (found != OutputError(rounds=6 - rounds).fit(lag, START).theta).any()
+
+
+def test_the_noise_that_is_left_is_found(rng):
+    found = OutputError().fit(lagging(rng, windows=100), START)
+    np.testing.assert_allclose(found.details["correlation"], [RHO], atol=0.03)
+    np.testing.assert_allclose(found.sigma, [SIGMA], rtol=0.03)
+    plain = OutputError(whitens=False).fit(lagging(rng, windows=100), START)
+    np.testing.assert_allclose(plain.sigma, [SIGMA / np.sqrt(1 - RHO**2)], rtol=0.1)
+    assert plain.details["correlation"] == [0.0]
+
+
+def test_no_more_correlation_is_taken_out_than_is_allowed(rng):
+    found = OutputError(most=np.array([0.5])).fit(lagging(rng), START)
+    assert found.details["correlation"] == [0.5]
+
+
+def test_the_condition_is_that_of_the_slopes_of_unit_columns(rng):
+    lag = lagging(rng)
+    found = OutputError(whitens=False).fit(lag, START)
+    A = np.concatenate([r.slopes[:, 0] for r in lag.residuals(found.theta, with_slopes=True)])
+    unit = A / np.linalg.norm(A, axis=0)
+    assert found.condition == pytest.approx(np.linalg.cond(unit), rel=1e-3)  # a last step apart
+    assert found.condition > 1.5
+
+
+def test_standard_errors_are_the_scatter_of_many_noises():
+    rng = np.random.default_rng(5)
+    draws = [OutputError().fit(lagging(rng, windows=12), TRUTH) for _ in range(60)]
+    theta = np.array([d.theta for d in draws])
+    ratio = np.mean([d.std_error for d in draws], axis=0) / theta.std(axis=0)
+    assert ((ratio > 0.8) & (ratio < 1.25)).all(), ratio
+    bias = (theta.mean(axis=0) - TRUTH) / (theta.std(axis=0) / np.sqrt(60))
+    assert np.abs(bias).max() < 4
+
+
+class Neglecting(Lagging):
+    """The same, whose derivatives of later samples are too small, the time's too large."""
+
+    def residuals(self, theta, *, with_slopes, with_starts=False):
+        found = super().residuals(theta, with_slopes=with_slopes)
+        if not with_slopes:
+            return found
+        fading = np.linspace(1.0, 0.4, self.told.shape[1])[:, None, None] * np.array(
+            [1.0, 2.0, 1.0]
+        )
+        return [replace(r, slopes=r.slopes * fading) for r in found]
+
+
+def neglecting(lag):
+    return Neglecting(**{name: getattr(lag, name) for name in lag.__dataclass_fields__})
+
+
+def test_inexact_slopes_end_where_they_see_no_residual(rng):
+    lag = lagging(rng, sigma=1e-9)
+    exact = OutputError().fit(neglecting(lag), START, exact=lag)
+    np.testing.assert_allclose(exact.theta, TRUTH, rtol=1e-6)
+    lag = lagging(rng, rho=0.0, windows=8)
+    own = neglecting(lag)
+    found = OutputError(whitens=False).fit(own, START, exact=lag)
+    A, e = (
+        np.concatenate([getattr(r, name) for r in own.residuals(found.theta, with_slopes=True)])
+        for name in ("slopes", "e")
+    )
+    assert found.converged
+    g = A[:, 0].T @ e[:, 0] / found.sigma[0] ** 2  # 0 but for a tenth of a standard error
+    assert g @ np.linalg.solve(A[:, 0].T @ A[:, 0] / found.sigma[0] ** 2, g) < 0.02
+    S = np.concatenate([r.slopes for r in lag.residuals(found.theta, with_slopes=True)])[:, 0]
+    left = np.eye(3) - np.linalg.solve(A[:, 0].T @ A[:, 0], A[:, 0].T @ S)
+    largest = np.abs(np.linalg.eigvals(left)).max()
+    assert found.details["left"] == pytest.approx(largest, rel=1e-3)
+    assert 0.2 < largest < 0.9
+    plain = OutputError(whitens=False).fit(lag, START)
+    assert np.abs(found.theta - plain.theta).max() > 1e-4, "another equation has another root"
+
+
+def test_errors_of_inexact_slopes_are_the_scatter_of_many_noises():
+    rng = np.random.default_rng(6)
+    draws = []
+    for _ in range(40):
+        lag = lagging(rng, rho=0.0, windows=8)
+        draws.append(OutputError(whitens=False).fit(neglecting(lag), TRUTH, exact=lag))
+    theta = np.array([d.theta for d in draws])
+    ratio = np.mean([d.std_error for d in draws], axis=0) / theta.std(axis=0)
+    assert ((ratio > 0.75) & (ratio < 1.35)).all(), ratio
+
+
+def test_slopes_that_are_far_too_small_never_settle(rng):
+    lag = lagging(rng, rho=0.0, windows=8)
+    own = neglecting(lag)
+
+    class Small(Neglecting):
+        def residuals(self, theta, *, with_slopes, with_starts=False):
+            found = super().residuals(theta, with_slopes=with_slopes)
+            return [replace(r, slopes=0.2 * r.slopes) for r in found] if with_slopes else found
+
+    small = Small(**{name: getattr(own, name) for name in own.__dataclass_fields__})
+    found = OutputError(whitens=False).fit(small, TRUTH, exact=lag)
+    assert found.details["left"] > 1
+    assert not found.converged
+    assert found.n_iter == 25, "one round"
+
+
+def test_correlated_noise_does_not_make_plain_squares_sure(rng):
+    """Their errors come from the scatter of segments, five times those of white noise here."""
+    found = OutputError(whitens=False).fit(lagging(rng), START)
+    assert found.details["inflation"] > 2
+
+
+@pytest.mark.parametrize("bounds", [(2.0, np.inf), (-np.inf, 1.2)])
+def test_a_bound_holds_and_is_named(rng, bounds):
+    lag = lagging(rng, bounds=np.array([bounds, (0.0, np.inf), (-np.inf, np.inf)]).T)
+    found = OutputError().fit(lag, START)
+    assert found.theta[0] in bounds
+    assert found.details["at_bound"] == ("gain",)
+    fixed = lag.measured - lag.simulated(found.theta)
+    nearby = [lag.simulated(found.theta + np.array([0.0, d, 0.0])) for d in (-0.02, 0.02)]
+    whitened = [np.sum(np.diff(lag.measured - s, axis=1) ** 2) for s in nearby]
+    assert np.sum(np.diff(fixed, axis=1) ** 2) < min(whitened), "the others are at their best"
+
+
+def test_a_prior_weighs_as_an_observation(rng):
+    lag = lagging(rng)
+    free = OutputError().fit(lag, START)
+    prior, spread = free.theta + 3 * free.std_error, free.std_error
+    both = OutputError().fit(replace(lag, prior=prior, prior_std=spread), START)
+    middle = (free.theta + prior) / 2  # of two that are equally sure
+    assert (np.abs(both.theta - middle) < 0.2 * np.abs(prior - free.theta)).all()
+    assert (both.std_error < 0.9 * free.std_error).all()
+    held = OutputError().fit(replace(lag, prior=prior, prior_std=np.full(3, 1e-9)), START)
+    np.testing.assert_allclose(held.theta, prior, atol=1e-6)
+    assert held.undetermined == lag.names
+
+
+def test_rows_of_torque_weigh_in_one_estimate(rng):
+    lag = lagging(rng)
+    free = OutputError().fit(lag, START)
+    sure = 0.2 * free.std_error[0]  # a row that knows the gain five times as well
+    rows = np.array([[1.0, 0.0, 0.0, TRUTH[0]]]) / sure
+    both = OutputError().fit(replace(lag, further=rows), START)
+    assert abs(both.theta[0] - TRUTH[0]) < 3 * sure
+    np.testing.assert_allclose(both.std_error[0], sure, rtol=0.1)
+    assert both.std_error[1] < free.std_error[1], "what goes with the gain is surer, too"
+
+
+def test_it_says_that_it_has_not_settled(rng):
+    found = OutputError(steps=1, rounds=1).fit(lagging(rng), START)
+    assert not found.converged
+    assert found.message.endswith("not converged")
+    assert OutputError().fit(lagging(rng), START).message.endswith(", converged")
+
+
+def test_a_step_that_cannot_be_simulated_is_shortened(rng):
+    """From far away, the first full step leads to a time constant below 0."""
+    lag = lagging(rng, sigma=1e-6)
+    start = np.array([0.1, 5.0, 0.0])
+    found = OutputError(whitens=False, steps=80).fit(lag, start)
+    np.testing.assert_allclose(found.theta, TRUTH, rtol=1e-3)
+
+
+def test_a_start_that_cannot_be_simulated_is_refused(rng):
+    with pytest.raises(NotConvergedError, match=r"time constant above 0"):
+        OutputError().fit(lagging(rng), np.array([1.0, -1.0, 0.0]))
+
+
+def test_fewer_samples_than_parameters_are_refused(rng):
+    lag = lagging(rng, windows=1)
+    short = replace(lag, told=lag.told[:, :2], measured=lag.measured[:, :2])
+    with pytest.raises(DataError, match=r"2 samples of position for 3 parameters"):
+        OutputError(whitens=False).fit(short, START)
+
+
+def test_what_a_start_could_do_is_taken_out_of_rows(rng):
+    lag = lagging(rng)
+    [first, *others] = lag.residuals(TRUTH, with_slopes=True)
+    fades = 0.9 ** np.arange(len(first.e))
+    by_start = np.tile(fades[:, None, None], (1, first.e.shape[1], 1))
+    weights = OutputError().weights(lag, TRUTH)
+    freed = SimpleNamespace(residuals=lambda *_, **__: [replace(first, by_start=by_start), *others])
+    A, b, _ = next(iter(linearised(freed, weights, TRUTH, frees=True)))
+    G = weights.whiten(by_start, first.joints).reshape(-1)
+    size = np.linalg.norm(G)
+    assert np.abs(G @ A).max() < 1e-9 * size * np.linalg.norm(A)
+    plain, e, _ = next(iter(linearised(lag, weights, TRUTH)))
+    u = G / size
+    np.testing.assert_allclose(A, plain - np.outer(u, u @ plain), atol=1e-9 * np.abs(plain).max())
+    np.testing.assert_allclose(b, e - u * (u @ e), atol=1e-9 * np.abs(e).max())
+
+
+@dataclass(frozen=True, eq=False)
+class Started(Lagging):
+    """The same, where a window's start adds what fades away."""
+
+    def residuals(self, theta, *, with_slopes, with_starts=False):
+        found = super().residuals(theta, with_slopes=with_slopes)
+        fades = 0.97 ** np.arange(self.told.shape[1])[:, None, None]
+        return [replace(r, by_start=fades) if with_slopes or with_starts else r for r in found]
+
+
+def test_what_a_window_starts_with_changes_nothing_where_starts_are_free(rng):
+    lag = lagging(rng)
+    fades = 0.97 ** np.arange(lag.told.shape[1])
+    off = lag.measured + rng.standard_normal((len(lag.told), 1)) * fades
+    exact, moved = (
+        OutputError(frees=True).fit(Started(**{**vars(lag), "measured": x}), START)
+        for x in (lag.measured, off)
+    )
+    np.testing.assert_allclose(moved.theta, exact.theta, rtol=1e-6)
+    np.testing.assert_allclose(moved.sigma, exact.sigma, rtol=1e-6)
+    assert (np.abs(exact.theta - TRUTH) < 3.3 * exact.std_error).all()
+    held = OutputError().fit(Started(**{**vars(lag), "measured": off}), START)
+    assert np.abs(held.theta - exact.theta).max() > 1e-3
+
+
+def test_a_step_of_parameters_and_starts_together_settles_what_held_starts_bind(rng):
+    lag = lagging(rng)
+    fades = 0.97 ** np.arange(lag.told.shape[1])
+    off = lag.measured + rng.standard_normal((len(lag.told), 1)) * fades
+    simulator = Started(**{**vars(lag), "measured": off})
+    exact = OutputError(frees=True).fit(simulator, START)
+    held = OutputError().fit(simulator, START)
+    assert (np.abs(held.theta - exact.theta) > 0.5 * exact.std_error).any()
+    settled = OutputError().settle(simulator, held)
+    assert np.abs((settled.theta - exact.theta) / exact.std_error).max() < 0.02
+    np.testing.assert_allclose(settled.sigma, exact.sigma, rtol=5e-3)
+    near = OutputError().settle(simulator, exact)
+    np.testing.assert_allclose(settled.std_error, near.std_error, rtol=0.02)
+    assert (settled.n_iter, settled.message) == (held.n_iter, held.message)
+    low = replace(simulator, bounds=np.array([[-np.inf, -np.inf, 0.2], np.full(3, np.inf)]))
+    settled = OutputError().settle(low, replace(held, theta=np.array([1.5, 0.3, 0.2001])))
+    assert settled.theta[2] == 0.2
+    assert settled.details["at_bound"] == ("offset",)
+
+
+def test_a_step_to_parameters_that_cannot_be_simulated_is_not_taken(rng):
+    simulator = Started(**vars(lagging(rng)))
+    near, far = np.array([1.4, 0.31, 0.1]), np.array([1.5, 1.5, 0.1])  # and then below 0 s
+    moved = OutputError().joint_step(simulator, near)
+    assert np.abs(moved - near).max() > 1e-3
+    np.testing.assert_array_equal(OutputError().joint_step(simulator, far), far)
+    held = OutputError().fit(simulator, START)
+    with pytest.raises(NotConvergedError, match="a lag needs"):
+        OutputError().settle(simulator, replace(held, theta=far))
+
+
+@pytest.mark.parametrize("spread", [np.inf, 0.01])
+def test_a_covariance_is_of_scores_rows_and_prior_together(rng, spread):
+    """Bell and McCaffrey's scatter of segments; rows and prior are as sure as they say."""
+    lag = lagging(rng, windows=16, prior=TRUTH + 0.003, prior_std=np.full(3, spread))
+    further = np.array([[400.0, -100.0, 30.0, 575.0], [0.0, 500.0, 0.0, 150.0]])
+    estimator = OutputError(whitens=False)
+    lag = replace(lag, further=further)
+    found = estimator.fit(lag, START)
+    sigma = found.sigma[0]
+    meat, H = further[:, :3].T @ further[:, :3] + np.eye(3) / spread**2, 0.0
+    segments = []
+    for r in lag.residuals(found.theta, with_slopes=True):
+        rows = np.hstack([r.slopes[1:, 0], r.e[1:]]) / sigma  # whitened by a correlation of 0
+        segments += np.array_split(rows, 3)
+        H = H + rows[:, :3].T @ rows[:, :3]
+    bread = np.linalg.inv(H + meat)
+    for rows in segments:  # 48 of them
+        A, e = rows[:, :3], rows[:, 3]
+        values, vectors = np.linalg.eigh(np.eye(len(A)) - A @ bread @ A.T)
+        assert values.min() > 0.05
+        score = A.T @ (vectors @ ((vectors.T @ e) / np.sqrt(values)))
+        meat = meat + np.outer(score, score)
+    wanted = bread @ meat @ bread
+    own, least = np.sqrt(np.diag(wanted)), np.sqrt(np.diag(bread))
+    assert (own > 1.1 * least).any()
+    wider = np.maximum(own, least) / own
+    np.testing.assert_allclose(found.covariance, wanted * np.outer(wider, wider), rtol=1e-5)
+
+
+def test_a_better_start_is_sought_by_residuals_over_their_size(rng):
+    """Of two joints, one in small units, and two numbers that a start has."""
+    e, G = rng.standard_normal((40, 2)) * [1.0, 1e-3], rng.standard_normal((40, 2, 2))
+    G[:, 1] *= 1e-3
+    residual = Residual(e, None, np.array([0, 1]), np.arange(0), G)
+    size = np.sqrt(np.mean(e**2, axis=0))
+    H = np.einsum("kji,kjl,j->il", G, G, size**-2.0)
+    x = np.linalg.solve(H, np.einsum("kji,kj,j->i", G, e, size**-2.0))
+    np.testing.assert_allclose(_freed(residual), e - G @ x, rtol=1e-9, atol=1e-12)
+    assert _freed(replace(residual, by_start=None)) is e
+
+
+def test_other_residuals_move_an_estimate_by_its_normal_equations(rng):
+    """Whitened by the other residuals, free starts taken out, without parameters at a bound."""
+    one = lagging(rng, windows=5)
+    other = replace(one, measured=one.measured + SIGMA * rng.standard_normal(one.told.shape))
+    theta, std = np.array([1.4, 0.32, 0.1]), np.array([2.0, 0.1, 0.3])
+    known = {"prior": np.array([1.3, 0.4, 0.0]), "prior_std": std}
+    known["further"] = np.array([[3.0, -5.0, 1.0, 0.5]])
+    known["bounds"] = np.array([[-np.inf, 0.0, 0.1], np.full(3, np.inf)])  # the offset is at one
+    simulators = [Started(**{**vars(lag), **known}) for lag in (one, other)]
+    change, error = OutputError(inflation=3.0).moved(*simulators, theta)
+    e = [lag.measured - one.simulated(theta) for lag in (one, other)]
+    rho = np.sum(e[1][:, 1:] * e[1][:, :-1]) / np.sum(e[1][:, :-1] ** 2)
+    assert 0.1 < rho < 0.95
+    sigma = np.sqrt(3.0 * np.mean((e[1][:, 1:] - rho * e[1][:, :-1]) ** 2))
+    slopes = np.stack([r.slopes[:, 0] for r in one.residuals(theta, with_slopes=True)])
+    fades = 0.97 ** np.arange(one.told.shape[1])
+    u = fades[1:] - rho * fades[:-1]
+    without = np.eye(len(u)) - np.outer(u, u) / (u @ u)
+    A = without @ (slopes[:, 1:] - rho * slopes[:, :-1]) / sigma
+    H = np.einsum("wki,wkl->il", A, A) + np.diag(std**-2.0)
+    H += known["further"][:, :3].T @ known["further"][:, :3]
+    pulls = [np.einsum("wki,wk->i", A, (x[:, 1:] - rho * x[:, :-1]) @ without / sigma) for x in e]
+    inverse = np.linalg.inv(H[:2, :2])
+    wanted = inverse @ (pulls[1] - pulls[0])[:2]
+    np.testing.assert_allclose(change, [*wanted, 0.0], rtol=1e-9)
+    np.testing.assert_allclose(error, [*np.sqrt(np.diag(inverse)), 0.0], rtol=1e-9)
+    # in units that differ by twelve orders the change is the same
+    H, unit = H[:2, :2], np.array([1e6, 1e-6])
+    fit = SimpleNamespace(
+        weights=lambda *_: None,
+        normal=lambda lag, *_, **__: (H * np.outer(unit, unit), unit * lag.pulls[:2]),
+    )
+    lags = [SimpleNamespace(pulls=x, bounds=UNBOUNDED[:, :2]) for x in pulls]
+    moved = OutputError.moved(fit, *lags, theta[:2])
+    np.testing.assert_allclose(moved[0] * unit, wanted, rtol=1e-9)
+    np.testing.assert_allclose(moved[1] * unit, np.sqrt(np.diag(inverse)), rtol=1e-9)
+
+
+def test_residuals_of_larger_variance_count_less_beside_further_rows(rng):
+    lag = lagging(rng)
+    row = np.array([[30.0, 0.0, 0.0, 30.0 * 1.6]])  # says 1.6 of the gain, which is 1.5
+    less = OutputError(inflation=4.0).fit(replace(lag, further=row), START)
+    same = OutputError().fit(replace(lag, further=2.0 * row), START)
+    plain = OutputError().fit(replace(lag, further=row), START)
+    np.testing.assert_allclose(less.theta, same.theta, rtol=1e-6)
+    np.testing.assert_allclose(less.sigma, same.sigma, rtol=1e-6)
+    assert plain.theta[0] + 0.002 < less.theta[0] < 1.6
+    assert less.details["inflation"] == pytest.approx(same.details["inflation"], rel=1e-4)
+
+
+def test_what_is_linearised_is_whitened(rng):
+    lag, estimator = lagging(rng), OutputError()
+    weights = estimator.weights(lag, TRUTH)
+    A, b, columns = next(iter(linearised(lag, weights, TRUTH)))
+    r = lag.residuals(TRUTH, with_slopes=True)[0]
+    rho, sigma = weights.rho[0], weights.sigma[0]
+    np.testing.assert_allclose(b, (r.e[1:, 0] - rho * r.e[:-1, 0]) / sigma)
+    np.testing.assert_allclose(A, (r.slopes[1:, 0] - rho * r.slopes[:-1, 0]) / sigma)
+    np.testing.assert_array_equal(columns, [0, 1, 2])
+
+
+def test_standard_errors_of_what_drifts_are_the_scatter_of_many_drifts():
+    """What an input's noise adds up to: whitening leaves much of it, as long as a window goes."""
+    rng = np.random.default_rng(9)
+    draws = []
+    for _ in range(60):
+        lag = lagging(rng, windows=20, samples=160)
+        drift = 0.002 * np.cumsum(rng.standard_normal(lag.told.shape), axis=1)
+        own = {**vars(lag), "measured": lag.simulated(TRUTH) + drift}
+        draws.append(OutputError(frees=True, rounds=2).fit(Started(**own), TRUTH))
+    theta = np.array([d.theta for d in draws])
+    ratio = np.mean([d.std_error for d in draws], axis=0) / theta.std(axis=0)
+    assert ((ratio > 0.8) & (ratio < 1.25)).all(), ratio
+
+
+def test_it_is_an_estimator_that_reads_a_simulator_and_begins_with_its_prior(rng):
+    estimator, lag = OutputError(), lagging(rng)
+    assert isinstance(estimator, Estimator)
+    assert estimator.reads == "simulator"
+    near = replace(lag, prior=1.1 * TRUTH, prior_std=np.full(3, np.inf))
+    found, initialised = estimator.fit(near), estimator.fit(near, near.prior)
+    np.testing.assert_array_equal(found.theta, initialised.theta)
+    assert not np.array_equal(found.theta, estimator.fit(near, START).theta), "to the last bit"
+
+
+def test_noise_and_correlation_of_a_joint_are_those_of_all_its_windows(rng):
+    """Of the first in two windows, of the third in one; the second has none."""
+    e = [rng.standard_normal((30, 2)).cumsum(axis=0), rng.standard_normal((11, 1)) * 5.0]
+    e[0][:, 1] = rng.standard_normal(30) + 0.2 * e[0][:, 1]
+    joints = (np.array([0, 2]), np.array([0]))
+    found = [Residual(x, None, j, np.arange(3)) for x, j in zip(e, joints, strict=True)]
+    most = np.array([0.9, 0.9, 0.05])
+    weights = OutputError(most=most, inflation=2.25)._weigh(found)
+    own = {0: [e[0][:, 0], e[1][:, 0]], 2: [e[0][:, 1]]}
+    for j, windows in own.items():
+        along = sum(x[1:] @ x[:-1] for x in windows) / sum(x[:-1] @ x[:-1] for x in windows)
+        rho = np.clip(along, 0.0, most[j])
+        squares = sum(np.sum((x[1:] - rho * x[:-1]) ** 2) for x in windows)
+        sigma = 1.5 * np.sqrt(squares / sum(len(x) - 1 for x in windows))
+        assert (weights.rho[j], weights.sigma[j]) == pytest.approx((rho, sigma))
+    assert weights.rho[2] == 0.05
+    whitened = weights.whiten(e[0], joints[0])
+    wanted = (e[0][1:] - weights.rho[[0, 2]] * e[0][:-1]) / weights.sigma[[0, 2]]
+    np.testing.assert_allclose(whitened, wanted)
+    assert OutputError(whitens=False)._weigh(found).rho.tolist() == [0.0, 0.0, 0.0]
+
+
+def test_a_step_stops_at_bounds_and_the_others_go_as_far_as_is_best_then(rng):
+    """Two of five are at their bounds; their damped normal equations are solved by hand."""
+    A = rng.standard_normal((20, 5)) * [1.0, 30.0, 0.1, 4.0, 2.0]
+    H, theta = A.T @ A, np.array([1.0, 2.0, 30.0, 4.0, 5.0])
+    step = np.array([-3.0, 0.1, 5.0, -6.0, 0.7])
+    g, damping = H @ step, 0.2
+    lowest = np.array([0.5, 1.0, 0.0, 3.0, 0.0])
+    damped = H + damping * np.diag(np.diag(H))
+    free = theta + np.linalg.solve(damped, g)
+    assert (free < lowest).tolist() == [True, False, False, True, False]
+    moved = np.array([0, 3])
+    others = np.array([1, 2, 4])
+    left = g[others] - H[np.ix_(others, moved)] @ (lowest - theta)[moved]
+    wanted = lowest.copy()
+    wanted[others] = theta[others] + np.linalg.solve(damped[np.ix_(others, others)], left)
+    infinite = np.full(5, np.inf)
+    below, above = np.array([lowest, infinite]), np.array([-infinite, -lowest])
+    for sign, bounds in ((1, below), (-1, above)):
+        found = output_error._bounded_step(H, sign * g, sign * theta, bounds, damping)
+        np.testing.assert_allclose(found, sign * wanted, rtol=1e-9)
+    # at its bound, a parameter that would go beyond it stays
+    theta[0] = 0.5
+    for sign, bounds in ((1, below), (-1, above)):
+        found = output_error._bounded_step(H, sign * g, sign * theta, bounds, damping)
+        assert found[0] == sign * 0.5
+
+
+def test_windows_are_cut_into_segments_by_their_rows_or_each_alike(rng):
+    found = [
+        (rng.standard_normal((n, 2)), rng.standard_normal(n), np.array(columns))
+        for n, columns in ((410, [0, 2]), (95, [1, 2]))
+    ]
+    for are_windows, counts in ((False, (39, 9)), (True, (6, 6))):
+        parts = output_error._segments(found, 3, are_windows=are_windows)
+        assert len(parts) == sum(counts)
+        first = 0
+        for (A, b, columns), count in zip(found, counts, strict=True):
+            own = parts[first : first + count]
+            first += count
+            rows = np.column_stack([A, b])
+            for part, cut in zip(own, np.array_split(rows, count), strict=True):
+                np.testing.assert_array_equal(part.columns[0], columns)
+                (R,) = part.triangles
+                np.testing.assert_allclose(R.T @ R, cut.T @ cut, atol=1e-9)
+                assert part.rows.tolist() == [len(cut)]

@@ -1,0 +1,300 @@
+"""Two runs that differ by what loads only one of them."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from robotid.dynamics.factors import Factors, triangle_of
+from robotid.estimation.estimators.two_runs import TwoRuns, payload_runs
+
+BETA, CHANGE = np.array([2.0, -1.0, 0.5]), 0.3  # of the third parameter, in the loaded run
+NOISE = np.array([0.2, 0.05])
+NAMES = ("a", "b", "c")
+
+
+def segments(rng, beta, hold):
+    """Return the factors of 12 segments of 60 rows of two joints, noise of so many rows alike."""
+    found = []
+    for _ in range(12):
+        triangles = []
+        for sigma in NOISE:
+            W = rng.standard_normal((60, 3))
+            noise = sigma * np.repeat(rng.standard_normal(60 // hold), hold)
+            triangles.append(triangle_of(np.column_stack([W, W @ beta + noise])))
+        found.append(Factors(tuple(triangles), (np.arange(3),) * 2, np.array([60, 60]), NAMES))
+    return tuple(found)
+
+
+@pytest.mark.parametrize("hold", [1, 6])
+def test_errors_that_count_what_changes_with_time_are_no_smaller_than_those_of_alike_rows(
+    rng, hold
+):
+    loaded = segments(rng, np.add(BETA, [0.0, 0.0, CHANGE]), hold)
+    runs = TwoRuns(
+        segments(rng, BETA, hold), loaded, np.eye(3)[:, 2:], np.zeros(3), np.zeros(4),
+        1e-6 * np.eye(4), 1.0, np.empty(0, dtype=int),
+    )  # fmt: skip
+    theta, covariance = runs.alike()
+    found = runs.compare()
+    np.testing.assert_allclose(found.theta, theta, atol=1e-12)
+    assert (np.diag(found.covariance) >= np.diag(covariance) * (1 - 1e-12)).all()
+    # rows with weights 1 / noise^2: 12 x 60 of each joint with, and without the change
+    information = (720 * NOISE**-2.0).sum()
+    expected = np.sqrt(np.array([0.5, 2.0]) / information)  # of what both have, of the change
+    np.testing.assert_allclose(np.sqrt(np.diag(covariance))[[0, 3]], expected, rtol=0.1)
+    assert np.abs(theta - [*BETA, CHANGE]).max() < 5 * np.sqrt(hold) * expected[1]
+
+
+def of_rows(W, tau, count):
+    """Return the factors of so many segments of rows W (n, N, c) and torques (n, N)."""
+    columns, rows = (np.arange(W.shape[2]),) * len(W), np.full(len(W), W.shape[1] // count)
+    whole = np.concatenate([W, tau[:, :, None]], axis=2)
+    return tuple(
+        Factors(tuple(triangle_of(A) for A in part), columns, rows, NAMES)
+        for part in np.split(whole, count, axis=1)
+    )
+
+
+@pytest.mark.parametrize("share", [1.0, 0.5])
+def test_both_runs_are_one_fit_with_the_prior_by_the_noise_of_each_joint(rng, share):
+    n, N = 2, 48
+    D, known = np.array([[0.0], [0.4], [1.0]]), np.array([0.2, 0.0, -0.3])
+    mean, precision = np.array([1.0, 0.0, 0.0, 0.1]), np.diag([3.0, 0.5, 1.0, 20.0])
+    W = rng.standard_normal((2, n, N, 3))
+    noise = NOISE[:, None] * rng.standard_normal((2, n, N))
+    tau = np.stack([W[0] @ BETA, W[1] @ (BETA + known + 0.3 * D[:, 0])]) + noise
+    runs = TwoRuns(
+        of_rows(W[0], tau[0], 4), of_rows(W[1], tau[1], 4), D, known, mean, precision, share,
+        np.empty(0, dtype=int),
+    )  # fmt: skip
+    found = runs.compare()
+    alone = [
+        np.linalg.lstsq(W[k, j], tau[k, j], rcond=None)[1][0] for k in (0, 1) for j in range(n)
+    ]
+    own = np.array(alone).reshape(2, n).sum(axis=0)  # of each joint and run by itself
+    level = np.sqrt(own / (2 * N - 6 / share)) / np.sqrt(share)
+    A = [
+        np.concatenate([W[0], np.zeros((n, N, 1))], axis=2),
+        np.concatenate([W[1], W[1] @ D], axis=2),
+    ]
+    b = [tau[0], tau[1] - W[1] @ known]
+    H, pull = precision.copy(), precision @ mean
+    for X, y in zip(A, b, strict=True):
+        for j in range(n):
+            H += X[j].T @ X[j] / level[j] ** 2
+            pull += X[j].T @ y[j] / level[j] ** 2
+    theta = np.linalg.solve(H, pull)
+    np.testing.assert_allclose(found.theta, theta, rtol=1e-9)
+    np.testing.assert_allclose(found.covariance, np.linalg.inv(H), rtol=1e-8, atol=1e-12)
+    assert np.isinf(found.freedom).all()  # eight segments show no scatter
+    left = sum(np.sum((y - X @ theta) ** 2, axis=1) for X, y in zip(A, b, strict=True))
+    torque = np.sum(tau**2, axis=(0, 2))
+    np.testing.assert_allclose(found.unexplained, np.sqrt(left / torque), rtol=1e-9)
+    # one set of both runs' own parameters leaves more than each by itself
+    np.testing.assert_allclose(runs.residual_ratios(theta), left / own, rtol=1e-9)
+
+
+@pytest.mark.parametrize("hold", [1, 20])
+def test_errors_are_those_of_rows_that_last_as_long_as_their_noise(rng, hold):
+    """Of one joint, whose rows come in runs of so many alike: they count once."""
+    W = np.repeat(rng.standard_normal((2, 1, 600 // hold, 3)), hold, axis=2)
+    noise = np.repeat(rng.standard_normal((2, 1, 600 // hold)), hold, axis=2)
+    tau = W @ BETA + noise
+    runs = TwoRuns(
+        of_rows(W[0], tau[0], 10), of_rows(W[1], tau[1], 10), np.eye(3)[:, 2:], np.zeros(3),
+        np.zeros(4), 1e-6 * np.eye(4), 1.0, np.empty(0, dtype=int),
+    )  # fmt: skip
+    found, alike = runs.compare(), runs.alike()[1]
+    ratio = np.diag(found.covariance) / np.diag(alike)
+    assert (ratio >= 1.0 - 1e-12).all()
+    assert np.median(ratio) == pytest.approx(hold, rel=0.6)
+    assert ((found.freedom > 2.0) & (found.freedom < 20.0)).all()  # of 20 segments
+
+
+def test_freedom_is_that_of_the_scatter_whose_error_is_larger(rng):
+    """The first parameter differs from joint to joint, the third from segment to segment."""
+    n, N, count = 6, 240, 12
+    W = rng.standard_normal((2, n, N, 3))
+    beta = np.tile(BETA, (2, n, N, 1))
+    beta[..., 0] += 0.3 * (-1.0) ** np.arange(n)[:, None]
+    beta[..., 2] += 0.5 * np.repeat((-1.0) ** (np.arange(count) // 2), N // count)
+    tau = np.einsum("rjkc,rjkc->rjk", W, beta) + 0.02 * rng.standard_normal((2, n, N))
+    runs = TwoRuns(
+        of_rows(W[0], tau[0], count), of_rows(W[1], tau[1], count), np.eye(3)[:, 1:2], np.zeros(3),
+        np.zeros(4), 1e-6 * np.eye(4), 1.0, np.empty(0, dtype=int),
+    )  # fmt: skip
+    found, segments = runs.compare(), runs.compare(by_joint=False)
+    grown = np.diag(found.covariance) > 1.01 * np.diag(segments.covariance)
+    assert grown[[0, 2]].tolist() == [True, False]
+    assert (found.freedom[grown] != segments.freedom[grown]).all()
+    assert (found.freedom[grown] < 12.0).all()  # of 12 parts, not of 24
+    np.testing.assert_array_equal(found.freedom[~grown], segments.freedom[~grown])
+    assert segments.freedom[0] > 12.0
+
+
+def scattered(parts, theta, bread):
+    """Return sum and degrees of freedom of scores of parts (A, b), by matrices of all rows.
+
+    Bell and McCaffrey (2002): residuals over (I - leverage)^(1/2), as if rows were independent.
+    """
+    A = np.concatenate([X for X, _ in parts])
+    residual_maker = np.eye(len(A)) - A @ bread @ A.T
+    edges = np.cumsum([0, *(len(X) for X, _ in parts)])
+    pull, meat = np.zeros((len(parts), len(theta), len(A))), np.zeros((len(theta),) * 2)
+    for k, (X, y) in enumerate(parts):
+        values, V = np.linalg.eigh(np.eye(len(X)) - X @ bread @ X.T)
+        assert values.min() > 0.05
+        pull[k, :, edges[k] : edges[k + 1]] = X.T @ (V / np.sqrt(values)) @ V.T
+        meat += np.outer(*2 * [pull[k][:, edges[k] : edges[k + 1]] @ (y - X @ theta)])
+    freedom = []
+    for loads in (bread @ pull).swapaxes(0, 1):  # what each part adds to one parameter
+        G = loads @ residual_maker @ loads.T
+        freedom.append(np.trace(G) ** 2 / np.sum(G**2))
+    return meat, np.array(freedom)
+
+
+@pytest.mark.parametrize("by_joint", [True, False])
+def test_errors_are_the_larger_of_what_stretches_and_what_joints_scatter(rng, by_joint):
+    n, N, count, share = 6, 56, 7, 0.5
+    D, known = np.array([[0.0], [0.4], [1.0]]), np.array([0.2, 0.0, -0.3])
+    mean, precision = np.array([1.0, 0.0, 0.0, 0.1]), np.diag([3.0, 0.5, 1.0, 20.0])
+    W = rng.standard_normal((2, n, N, 3))
+    tau = np.stack([W[0] @ BETA, W[1] @ (BETA + known + 0.3 * D[:, 0])])
+    tau += np.linspace(0.2, 0.4, n)[:, None] * rng.standard_normal((2, n, N))
+    tau += 0.2 * W[..., 0] * np.array([1, -1, 1, -1, 1, -1])[:, None]  # joints disagree
+    tau += 0.4 * W[..., 1] * np.repeat(rng.standard_normal((2, 1, count)), N // count, axis=2)
+    runs = TwoRuns(
+        of_rows(W[0], tau[0], count), of_rows(W[1], tau[1], count), D, known, mean, precision,
+        share, np.empty(0, dtype=int),
+    )  # fmt: skip
+    found = runs.compare(by_joint=by_joint)
+    own = np.array([
+        np.linalg.lstsq(W[k, j], tau[k, j], rcond=None)[1][0] for k in (0, 1) for j in range(n)
+    ]).reshape(2, n).sum(axis=0)  # fmt: skip
+    noise = np.sqrt(own / (2 * N - 6 / share))[:, None]
+    A = np.stack([np.concatenate([W[0], np.zeros((n, N, 1))], axis=2),
+                  np.concatenate([W[1], W[1] @ D], axis=2)]) / noise[..., None]  # fmt: skip
+    b = np.stack([tau[0], tau[1] - W[1] @ known]) / noise
+    bread = np.linalg.inv(share * np.einsum("rjki,rjkl->il", A, A) + precision)
+    times = [
+        (X.reshape(-1, 4), y.ravel())
+        for run in zip(A, b, strict=True)
+        for X, y in zip(*(np.split(x, count, axis=1) for x in run), strict=True)
+    ]
+    joints = [pair for run in zip(A, b, strict=True) for pair in zip(*run, strict=True)]
+    (covariance, freedom), (other, few) = (
+        (bread @ (share**2 * meat + precision) @ bread, freedom)
+        for meat, freedom in (scattered(x, found.theta, share * bread) for x in (times, joints))
+    )
+    is_wider = np.diag(other) > np.diag(covariance)
+    assert 0 < is_wider.sum() < 4
+    least = np.diag(bread)
+    if by_joint:
+        freedom = np.where(is_wider, few, freedom)
+        least = np.maximum(least, np.diag(other))
+    own = np.sqrt(np.diag(covariance))
+    wider = np.maximum(own, np.sqrt(least)) / own
+    np.testing.assert_allclose(found.freedom, np.maximum(freedom, 1.0), rtol=1e-6)
+    np.testing.assert_allclose(found.covariance, covariance * np.outer(wider, wider), rtol=1e-6)
+
+
+def test_runs_of_payloads_have_the_prior_of_the_urdf_and_the_known_part(rng):
+    """Two bodies, drives of two terms that change and one that does not, a known parameter."""
+    terms = [SimpleNamespace(is_inertia=x) for x in (True, False, False)]
+    layout = SimpleNamespace(n_inertial=4, drive_parameters=[(0, term) for term in terms])
+    K, spread, urdf = rng.standard_normal((3, 7)), rng.uniform(0.5, 3.0, 7), rng.random(7)
+    columns, size = rng.standard_normal((3, 4)), np.array([1.0, 20.0, 0.3, 7.0])
+    known = np.array([np.nan, 2.5, np.nan, np.nan])
+    parts = [[SimpleNamespace(factors=f"{run}{k}") for k in range(2)] for run in ("one", "two")]
+    runs = payload_runs(
+        *parts, layout, K, urdf, spread, (columns, known, size), share=0.3, unknown=(1, 0)
+    )
+    assert (runs.reference, runs.loaded) == (("one0", "one1"), ("two0", "two1"))
+    np.testing.assert_array_equal(runs.D, np.column_stack([K[:, 5:], columns[:, [0, 2, 3]]]))
+    np.testing.assert_allclose(runs.known, 2.5 * columns[:, 1])
+    np.testing.assert_allclose(runs.mean, [*(K @ urdf), 0, 0, 0, 0, 0])
+    C = 100.0 * K @ np.diag(spread**2) @ K.T
+    np.testing.assert_allclose(runs.precision[:3, :3], np.linalg.inv(C), rtol=1e-9)
+    change = 10.0 * np.array([spread[5], spread[6], 1.0, 0.3, 7.0])
+    np.testing.assert_allclose(np.diag(runs.precision)[3:], change**-2.0)
+    assert not runs.precision[:3, 3:].any()
+    assert (runs.share, runs.unknown.tolist()) == (0.3, [1, 0])
+
+
+def test_runs_that_differ_by_scales_leave_more_by_a_load_than_by_scales(rng):
+    """One scale of both joints, or one of each, with one column that differs in addition."""
+    W, D = rng.standard_normal((2, 2, 80, 3)), np.array([[0.0, 1.0], [0.4, 0.0], [1.0, -1.0]])
+    for scale in ((1.3, 1.3), (1.3, 0.8)):
+        noise = NOISE[:, None] * rng.standard_normal((2, 2, 80))
+        loaded = np.array(scale)[:, None] * (W[1] @ BETA) + 0.6 * W[1] @ D[:, 0]
+        tau = np.stack([W[0] @ BETA, loaded]) + noise
+        runs = TwoRuns(
+            of_rows(W[0], tau[0], 2), of_rows(W[1], tau[1], 2), D, np.zeros(3), np.zeros(5),
+            1e-6 * np.eye(5), 1.0, np.empty(0, dtype=int),
+        )  # fmt: skip
+        own = np.array(
+            [np.linalg.lstsq(W[k, j], tau[k, j], rcond=None)[1][0] for k in (0, 1) for j in (0, 1)]
+        )
+        level = np.sqrt(own.reshape(2, 2).sum(axis=0) / (2 * 80 - 6))
+        rows = np.concatenate([W[0, j] / level[j] for j in (0, 1)])
+        beta = np.linalg.lstsq(rows, np.concatenate([tau[0, j] / level[j] for j in (0, 1)]))[0]
+        left = np.sum((tau[0] - W[0] @ beta) ** 2, axis=1)
+        for j in (0, 1):
+            A = W[1, j] @ np.column_stack([D[:, 0], beta])
+            left[j] += np.linalg.lstsq(A, tau[1, j], rcond=None)[1][0]
+        found = runs.residual_ratios_by_scales(1)
+        if scale[0] != scale[1]:
+            np.testing.assert_allclose(found, left / own.reshape(2, 2).sum(axis=0), rtol=1e-4)
+        assert (found < 1.3).all()
+        assert runs.residual_ratios(runs.compare().theta).mean() > 2.0
+
+
+def test_the_noise_of_a_joint_is_its_residual_or_its_signal_or_one():
+    """Of joints with many rows, some, few, without noise, without a signal, and without rows."""
+    logged = SimpleNamespace(
+        is_projected=False,
+        rows=np.array([1000, 85, 10, 1000, 1000, 0]),
+        columns=[np.arange(count) for count in (20, 20, 10, 20, 20, 0)],
+        torque_squares=lambda: np.array([80.0, 80.0, 90.0, 4000.0, 0.0, 0.0]),
+    )
+    runs = SimpleNamespace(
+        _logged=logged, _whole=(None, None), share=0.5,
+        _own_squares=np.array([46.0, 34.0, 1e-9, 0.0, 0.0, 0.0]),
+    )  # fmt: skip
+    # two runs' columns over the independent share of the rows: 80 degrees of freedom; a tenth of
+    # the rows are left at least
+    wanted = [np.sqrt(46 / 920), np.sqrt(34 / 8.5), 3.0, 2e-7, 1.0, 1.0]
+    np.testing.assert_allclose(TwoRuns._noise.func(runs), wanted)
+
+
+@pytest.mark.parametrize("unknown", [[1], [0, 1]])
+def test_gains_start_at_least_squares_of_both_runs(rng, unknown):
+    """Torques over their gains, of a load that is known: exact ones start at their gains."""
+    W, c = rng.standard_normal((2, 2, 40, 3)), np.array([0.0, 0.7, -0.4])
+    gains = np.ones(2)
+    gains[unknown] = [2.5, 0.3][: len(unknown)]
+    tau = np.stack([W[0] @ BETA, W[1] @ (BETA + c)]) / gains[:, None]
+    runs = TwoRuns(
+        of_rows(W[0], tau[0], 2), of_rows(W[1], tau[1], 2), np.zeros((3, 0)), c, np.zeros(3),
+        1e-9 * np.eye(3), 1.0, np.array(unknown),
+    )  # fmt: skip
+    np.testing.assert_allclose(runs._first_gains(), gains, rtol=1e-6)
+    found = runs.compare()
+    np.testing.assert_allclose(found.gain, gains, rtol=1e-6)
+    np.testing.assert_allclose(found.theta, BETA, rtol=1e-6)
+
+
+def test_rows_without_constraint_forces_have_one_noise_level_in_both_runs(rng):
+    W, tau = rng.standard_normal((2, 40, 3)), rng.standard_normal((2, 40))
+    for is_projected in (True, False):
+        parts = tuple(replace(x, is_projected=is_projected) for x in of_rows(W, tau, 2))
+        runs = TwoRuns(
+            parts, parts, np.zeros((3, 0)), np.zeros(3), np.zeros(3), np.eye(3), 1.0,
+            np.empty(0, dtype=int),
+        )  # fmt: skip
+        levels = runs._both(np.ones(2)).noise_levels(np.zeros(3), np.array([80.0, 80.0]))
+        own = np.sqrt(np.mean(tau**2, axis=1))
+        wanted = np.full(2, np.sqrt(np.mean(own**2))) if is_projected else own
+        np.testing.assert_allclose(levels, wanted, rtol=1e-12)

@@ -1,0 +1,267 @@
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from helpers.synthetic import exact_log, truth
+
+from robotid.data.log import Log, Trajectory
+from robotid.data.signal_settings import SignalSettings
+from robotid.data.signals import turns_note
+from robotid.dynamics.used_rows import row_mask
+from robotid.estimation.fitting.evaluation import (
+    _conclude,
+    _joined,
+    _parts,
+    _Score,
+    evaluate_logs,
+    hidden_joints,
+    pool,
+    predict,
+    shares_rows,
+)
+from robotid.estimation.fitting.metrics import TorqueSums
+from robotid.estimation.fitting.survey import hold_log
+from robotid.robot.parameters import Coupling
+
+EXACT = SignalSettings(cutoff=None, trim=0.0, min_velocity=0.0)
+
+
+def evaluated(model, log, parameters, prior):
+    """Return the evaluation of one log in memory."""
+    ((found,), ()) = evaluate_logs([hold_log(model, log, EXACT)], (), parameters, prior)
+    return found
+
+
+def test_baselines_are_the_urdf_with_and_without_motion(ur5, rng):
+    pi, prior = truth(ur5), ur5.standard_parameters()
+    found = evaluated(ur5, exact_log(ur5, pi, rng), {"truth": pi}, prior)
+    recording = found.recording
+    assert set(found.torques) == {"truth", "urdf", "gravity_only"}
+    np.testing.assert_allclose(found.torques["truth"], recording.trajectory.tau, atol=1e-10)
+    (urdf,) = predict(ur5, [prior], recording.trajectory)
+    np.testing.assert_allclose(found.torques["urdf"], urdf, rtol=1e-12, atol=1e-12)
+    assert (
+        np.abs(found.torques["gravity_only"][:, 0]).max() < 1e-9
+    )  # a vertical axis carries no weight
+    measured = found.metrics["truth"].per_joint["elbow_joint"]
+    assert measured.relative_error_pct < 1e-9
+    assert measured.baselines["gravity_only"] > 10
+
+
+def test_without_parameters_there_are_recordings_but_no_predictions(ur5, rng):
+    own, other = (hold_log(ur5, exact_log(ur5, truth(ur5), rng), EXACT) for _ in range(2))
+    (fitted,), kept = evaluate_logs([own], [other, own], {}, None)
+    assert [e.is_refitted for e in kept] == [False, True]
+    for e in (fitted, *kept):
+        assert e.torques == e.sums == e.metrics == {}
+    # not copied: what was computed of the motion is there for all that follows
+    assert fitted.recording.trajectory is own.whole.trajectory
+
+
+def test_each_kept_log_is_looked_for_in_each_fitted_one(ur5, rng):
+    a, b, new = (hold_log(ur5, exact_log(ur5, truth(ur5), rng), EXACT) for _ in range(3))
+    for fitted in ([a, b], [b, a]):
+        _, kept = evaluate_logs(fitted, [b, new, a], {}, None)
+        assert [e.is_refitted for e in kept] == [True, False, True]
+
+
+def test_gravity_knows_no_offset(ur5, rng):
+    pi = truth(ur5)
+    found = evaluated(ur5, exact_log(ur5, pi, rng), {"truth": pi}, pi)
+    assert np.abs(found.torques["gravity_only"][:, 0]).max() < 1e-9
+
+
+def test_pooled_metrics_are_those_of_all_rows(ur5, rng):
+    pi = truth(ur5)
+    logs = [exact_log(ur5, pi, rng, noise=np.full(6, s), samples=200) for s in (0.1, 0.3)]
+    found = [evaluated(ur5, log, {"x": pi}, pi) for log in logs]
+    squares = [f.metrics["x"].pooled_rmse ** 2 for f in found]
+    np.testing.assert_allclose(pool(ur5, found, "x").pooled_rmse, np.sqrt(np.mean(squares)))
+
+
+def test_joints_are_hidden_whose_torque_changes_less_over_the_rows_used_than_is_left():
+    model = SimpleNamespace(is_static=True, row_names=tuple("abcd"), row_units=("N m",) * 4)
+    k = np.arange(40)
+    way = (-1.0) ** k[:, None]  # of a mean of 0, and of size 1
+
+    def evaluation(mean, used):
+        torque = mean + way * [1.0, 1.0, 2.1, 1.0]
+        torque[k % 4 > 1, 0] += 90.0  # where no row is used
+        mask = np.column_stack([used, used | True, used | True, used & False])
+        left = 2.0 * (-1.0) ** (k[:, None] // 2)
+        sums = TorqueSums.of(torque + left, torque, mask, {})
+        return SimpleNamespace(
+            torques={"estimate": torque}, sums={"estimate": sums},
+            recording=SimpleNamespace(mask=mask),
+        )  # fmt: skip
+
+    logs = [evaluation(np.array([0.0, mean, 0.0, 0.0]), k % 4 <= 1) for mean in (-1.8, 1.8)]
+    assert hidden_joints(model, logs) == ("a",), "the second's stands differ from log to log"
+    assert hidden_joints(model, logs[:1]) == ("a", "b"), "the fourth has no row"
+    full = SimpleNamespace(is_static=False, row_names=model.row_names, row_units=model.row_units)
+    assert hidden_joints(full, logs) == ()
+
+
+def test_rows_of_slow_joints_and_slow_coupled_drives_are_left_out(ur5, rng):
+    from robotid.robot.model import RobotModel
+
+    coupling = Coupling("motor", (("wrist_2_joint", 1.0), ("wrist_3_joint", 1.0)))
+    coupled = RobotModel.from_urdf(ur5.tree.path, couplings=(coupling,))
+    trajectory = hold_log(ur5, exact_log(ur5, truth(ur5), rng), EXACT).whole.trajectory
+    v = trajectory.v
+    mask = row_mask(ur5, trajectory, 0.1)
+    np.testing.assert_array_equal(mask, np.abs(v) >= 0.1)
+    slow = np.abs(v[:, 4] + v[:, 5]) < 0.1
+    both = row_mask(coupled, trajectory, 0.1)
+    assert not both[slow][:, 4:].any()
+    np.testing.assert_array_equal(both[:, :4], mask[:, :4])
+    frictionless = RobotModel.from_urdf(ur5.tree.path, terms=("viscous",))
+    assert row_mask(frictionless, trajectory, 0.1).all()
+
+
+def test_a_slow_slider_is_slow_by_its_own_stroke():
+    from helpers.corruptions import robot
+
+    tiago = robot("tiago")  # its torso lifts 0.35 m: 0.02 rad/s is 1.1 mm/s of it
+    v = np.zeros((4, len(tiago.joints)))
+    v[:, 0] = [0.0010, 0.0012, 0.019, 0.021]
+    v[:, 1] = [0.019, 0.021, 0.019, 0.021]
+    q, rows = np.zeros_like(v), np.arange(4)
+    motion = Trajectory(rows / 1.0, q, v, q, q, tiago.joints, None, rows * 0)
+    mask = row_mask(tiago, motion, 0.02)
+    assert mask[:, 0].tolist() == [False, True, True, True]
+    assert mask[:, 1].tolist() == [False, True, False, True]
+
+
+def test_rows_recorded_twice_are_found_whatever_the_clock_says(ur5, rng):
+    log, other = (exact_log(ur5, truth(ur5), rng) for _ in range(2))
+    later = Log(t=log.t + 5.0, q=log.q, tau=log.tau, joints=log.joints)
+    part = later.window(8.0, 9.0)
+    assert shares_rows(part, log)
+    assert not shares_rows(other, log)
+    before, after = log.window(end=6.0), log.window(start=6.0)
+    assert before.t[-1] == after.t[0]  # both hold the row where they meet
+    assert not shares_rows(after, before)
+    jittered = Log(t=log.t, q=log.q, tau=log.tau * (1 + 1e-12), joints=log.joints)
+    assert not shares_rows(jittered, log)
+
+
+def test_two_hundred_rows_of_a_window_are_looked_for_whatever_its_pieces():
+    first, stop = 5003, 7003  # of a long file
+    ends = [first, 5600, 6205, stop]
+    pieces = [SimpleNamespace(first=row) for row in ends[:-1]]
+    log = SimpleNamespace(pieces=pieces, first=first, stop=stop, is_in_memory=False)
+    rows = [
+        np.arange(piece.first, end)[part.sampled]
+        for piece, part, end in zip(pieces, _parts(log), ends[1:], strict=True)
+    ]
+    np.testing.assert_array_equal(np.concatenate(rows), np.arange(first, stop, 10))
+
+
+def test_a_recording_is_named_by_its_file_and_stretch(ur5, rng):
+    pi = truth(ur5)
+    found = evaluated(ur5, exact_log(ur5, pi, rng), {"x": pi}, pi)
+    assert found.recording.name == "log 0-11.98 s"
+    log = replace(exact_log(ur5, pi, rng), path="some/run.csv").window(2.0, 7.5)
+    later = replace(log, t=log.t + 3.0)
+    extent = evaluated(ur5, later, {"x": pi}, pi).recording.extent
+    assert (extent.start, extent.end) == pytest.approx((5.0, 10.5))
+    assert (extent.samples, extent.rate) == (len(log.t), pytest.approx(50.0))
+    assert (extent.smooth, extent.rows_used, extent.segments) == (len(log.t), 6 * len(log.t), 1)
+    assert evaluated(ur5, later, {"x": pi}, pi).recording.name == "run.csv 5-10.5 s"
+
+
+def test_parts_of_a_log_keep_the_gaps_between_them(rng):
+    q = rng.standard_normal((3, 5, 2))
+    segments = ([0, 0, 1, 1, 3], [3, 3, 4, 4, 4], [9, 9, 9, 9, 9])
+    motions = [
+        Trajectory(k + np.arange(5) / 10.0, x, x, x, x, ("a", "b"), 10.0, np.array(segment))
+        for k, (x, segment) in enumerate(zip(q, segments, strict=True))
+    ]
+    whole = _joined(motions)
+    assert whole.segment.tolist() == [0, 0, 1, 1, 2, 3, 3, 4, 4, 4, 5, 5, 5, 5, 5]
+    np.testing.assert_array_equal(whole.q, np.concatenate(q))
+    np.testing.assert_array_equal(whole.t, np.concatenate([m.t for m in motions]))
+
+
+@pytest.mark.parametrize(
+    ("rows", "same", "shared"), [(200, 4, False), (200, 5, True), (10, 1, False), (10, 2, True)]
+)
+def test_more_than_two_percent_and_more_than_one_row_make_a_shared_log(rng, rows, same, shared):
+    def log(q):
+        return Log(t=np.arange(rows) / 100.0, q=q, v=None, tau=q + 1.0, joints=("a", "b"))
+
+    q, other = rng.standard_normal((2, rows, 2))
+    other[:same] = q[:same]
+    assert shares_rows(log(q), log(other)) is shared
+
+
+def test_of_a_long_log_its_start_its_middle_and_its_end_are_shown():
+    def shown(count, is_in_memory=False):
+        pieces = [SimpleNamespace(first=100 * k) for k in range(count)]
+        log = SimpleNamespace(pieces=pieces, first=0, stop=100 * count, is_in_memory=is_in_memory)
+        return [part.shown for part in _parts(log)]
+
+    start, end = slice(10_000), slice(-10_000, None)
+    assert shown(5) == [start, None, start, None, end]
+    assert shown(4) == [start, None, start, end]
+    assert shown(2) == [start, end]
+    assert shown(1, is_in_memory=True) == [slice(None)]
+
+
+def test_scores_of_pieces_join_field_by_field(rng):
+    def score(k):
+        tau = rng.standard_normal((4, 2))
+        sums = TorqueSums.of(tau, 0.5 * tau, np.ones((4, 2), dtype=bool), {"urdf": 0.1 * tau})
+        return _Score(
+            sums={"x": sums}, smooth=3 + k, used=5 * k, segments=frozenset({k, 7}),
+            turned=np.arange(3) == k, shown=((k, k, {}),), sampled=rng.standard_normal((k, 4)),
+            found=(np.arange(4) == k, np.arange(3) < k),
+        )  # fmt: skip
+
+    one, two = score(1), score(2)
+    both = one.join(two)
+    assert (both.smooth, both.used, both.segments) == (9, 15, {1, 2, 7})
+    assert both.turned.tolist() == [False, True, True]
+    assert both.shown == ((1, 1, {}), (2, 2, {}))
+    np.testing.assert_array_equal(both.sampled, np.concatenate([one.sampled, two.sampled]))
+    assert [x.tolist() for x in both.found] == [[False, True, True, False], [True, True, False]]
+    wanted = one.sums["x"].residual + two.sums["x"].residual
+    np.testing.assert_allclose(both.sums["x"].residual, wanted)
+
+
+def test_an_evaluation_of_a_window_has_its_extent_and_what_its_pieces_show(rng):
+    """Rows 3 to 8 of twelve in a file; the position of the second joint was unwrapped."""
+    stamps, values = 1.0 + 0.5 * np.arange(12), rng.standard_normal((6, 2))
+    head = Log(stamps[3:9], values, 2 * values, ("a", "b"), path="x/run.csv")
+    motions = [
+        Trajectory(stamps[k], *[rng.standard_normal((2, 2)) for _ in range(4)], ("a", "b"), 2.0,
+                   np.zeros(2, dtype=int))
+        for k in (slice(3, 5), slice(6, 8))
+    ]  # fmt: skip
+    masks, torques = rng.random((2, 2, 2)) < 0.7, rng.standard_normal((2, 2, 2))
+    tau = rng.standard_normal((9, 2))
+    sums = {"x": TorqueSums.of(tau, 0.5 * tau, np.ones((9, 2), dtype=bool), {})}
+    score = _Score(
+        sums=sums, smooth=41, used=77, segments=frozenset({2, 5, 7}),
+        turned=np.array([False, True]), sampled=None, found=(),
+        shown=tuple((m, k, {"x": t}) for m, k, t in zip(motions, masks, torques, strict=True)),
+    )  # fmt: skip
+    model = SimpleNamespace(row_names=("a", "b"), row_units=("N m", "N"))
+    log = SimpleNamespace(
+        first=3, stop=9, step=0.5, stamps=stamps, head=head, model=model, signals=EXACT
+    )
+    found = _conclude(log, score, True)
+    extent, recording = found.recording.extent, found.recording
+    assert (extent.samples, extent.rate, extent.start, extent.end) == (6, 2.0, 2.5, 5.0)
+    assert (extent.smooth, extent.rows_used, extent.segments) == (41, 77, 3)
+    assert (recording.name, recording.is_partial) == ("run.csv 2.5-5 s", True)
+    assert recording.log.notes == (*head.notes, turns_note(["b"]))
+    np.testing.assert_array_equal(recording.mask, np.concatenate(masks))
+    np.testing.assert_array_equal(found.torques["x"], np.concatenate(torques))
+    np.testing.assert_array_equal(recording.trajectory.q, np.concatenate([m.q for m in motions]))
+    assert (found.metrics["x"].per_joint["b"].unit, found.is_refitted) == ("N", True)
+    assert found.metrics["x"].per_joint["a"].rmse == pytest.approx(
+        0.5 * np.sqrt(np.mean(tau[:, 0] ** 2))
+    )

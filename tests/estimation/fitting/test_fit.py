@@ -1,0 +1,123 @@
+"""Steps of a fit that other tests see only in part."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.fitting import fit
+from helpers.synthetic import exact_log, truth
+
+from robotid.data.signal_settings import SignalSettings
+from robotid.dynamics.base_parameters import BaseMapping, structural_mapping
+from robotid.dynamics.factors import Factors
+from robotid.estimation.estimators import Consistent
+from robotid.estimation.estimators.consistent.penalties import WeightChoice
+from robotid.estimation.fitting import consistent_estimator as estimators
+from robotid.estimation.fitting.consistent_estimator import Known, consistent_fit
+from robotid.estimation.fitting.estimator_settings import ConsistentSettings, EstimatorSettings
+from robotid.estimation.fitting.fit import rough_choice
+from robotid.robot.bodies import held_parameters
+from robotid.robot.examples import example_urdf
+from robotid.robot.model import RobotModel
+from robotid.robot.prior import prior_spread
+
+
+@pytest.mark.parametrize(("weight", "rough"), [("auto", 1.0), ("evidence", 1.0), (2.5, 2.5)])
+def test_rough_settings_keep_a_stated_weight_and_draw_nothing(weight, rough):
+    choice = EstimatorSettings("consistent", prior_weight=weight, draws=40, margin=1e-3)
+    assert rough_choice(choice) == replace(choice, prior_weight=rough, draws=0)
+    least_squares = EstimatorSettings("wls", robust="huber")
+    assert rough_choice(least_squares) is least_squares
+
+
+def test_a_base_parameter_of_terms_at_their_bound_alone_has_no_error(rng):
+    model = RobotModel.from_urdf(example_urdf("double_pendulum_simple.urdf"))
+    joint = model.joints[1]
+    log = exact_log(model, truth(model), rng, samples=250, noise=np.array([0.5, 0.1]))
+    log = replace(log, tau=log.tau - [0.0, 9.0] * log.v)  # negative friction of the second joint
+    choice = EstimatorSettings("consistent", prior_weight=1.0, draws=0)
+    found = fit(model, [log], signals=SignalSettings(cutoff=None, trim=0.0), estimator=choice)
+    K = found.mapping.K
+    at_bound = set(np.flatnonzero(found.at_bound))
+    wanted = np.array([at_bound >= set(np.flatnonzero(row)) for row in K])
+    assert found.mapping.base_names[int(np.flatnonzero(wanted)[0])] == f"{joint}.viscous"
+    is_open = np.isinf(found.base_error)
+    np.testing.assert_array_equal(is_open, wanted)
+    C = found.standard_covariance
+    np.testing.assert_allclose(found.base_error[~is_open] ** 2, np.diag(K @ C @ K.T)[~is_open])
+
+
+def test_what_is_known_of_base_parameters_follows_from_the_standard_ones(rng):
+    K = np.hstack([np.eye(3), rng.standard_normal((3, 2))])
+    mapping = BaseMapping(K, np.arange(3), tuple("abcde"), np.ones(5))
+    pi, spread = rng.standard_normal(5), np.array([0.1, 2.0, 0.5, 7.0, 1.5])
+    known = Known(None, mapping, pi, spread, 0.3, np.ones(2))
+    np.testing.assert_allclose(known.beta, K @ pi)
+    np.testing.assert_allclose(known.covariance, K @ np.diag(spread**2) @ K.T)
+
+
+def test_the_prior_of_a_fit_has_the_scale_of_the_samples_of_all_logs(rng):
+    model = RobotModel.from_urdf(example_urdf("double_pendulum_simple.urdf"))
+    logs = [exact_log(model, truth(model), rng, samples=n, noise=0.3) for n in (130, 70)]
+    logs[1] = replace(logs[1], tau=9.0 * logs[1].tau)
+    found = fit(model, logs, signals=SignalSettings(cutoff=None, trim=0.0), estimator="wls")
+    motions = [e.recording.trajectory for e in found.fitted]
+    squares = sum(np.array([np.sum(x**2, axis=0) for x in (m.tau, m.v, m.a)]) for m in motions)
+    samples = sum(len(m.t) for m in motions)
+    np.testing.assert_allclose(found.prior_std, prior_spread(model, squares, samples))
+    np.testing.assert_array_equal(found.prior, model.standard_parameters())
+    K = found.mapping.K
+    C = np.diag(found.prior_std**2)  # the nearest to the prior in units of its spread
+    gain = C @ K.T @ np.linalg.inv(K @ C @ K.T)
+    wanted = found.prior + gain @ (found.estimate.theta - K @ found.prior)
+    np.testing.assert_allclose(found.standard, wanted, atol=1e-9)
+    np.testing.assert_allclose(found.base, found.estimate.theta, atol=1e-9)
+    np.testing.assert_allclose(found.base_error, found.estimate.std_error)
+    np.testing.assert_allclose(found.wls.theta, found.estimate.theta, rtol=1e-6)
+
+
+@pytest.mark.parametrize(("weight", "how"), [(2.5, ""), ("auto", "cv"), ("evidence", "evidence")])
+def test_a_consistent_fit_has_every_setting_and_the_weight_of_its_choice(monkeypatch, weight, how):
+    urdf = example_urdf("double_pendulum_simple.urdf")
+    model = RobotModel.from_urdf(urdf, locked={"joint2": 0.4})
+    mapping, pi = structural_mapping(model), model.standard_parameters() + 0.1
+    spread, sigma = np.linspace(0.2, 0.9, len(pi)), np.array([0.7])
+    triangle = (np.eye(len(mapping.K) + 1),)
+    columns = (np.arange(len(mapping.K)),)
+    folds = [Factors(triangle, columns, np.array([k + 9]), mapping.base_names) for k in range(13)]
+    asked = []
+
+    def chosen(fit, segments, how, repeated):
+        assert repeated == 0.25
+        asked.append((fit, segments, how))
+        return WeightChoice(7.0, how, ((7.0, 0.2),), 0.5)
+
+    monkeypatch.setattr(estimators, "choose_weight", chosen)
+    monkeypatch.setattr(Consistent, "noise", lambda fit, factors: sigma)
+    settings = ConsistentSettings(
+        prior="riemannian", prior_weight=weight, margin=3e-3,
+        constraints={"extent": "none", "total_mass": [1.0, 9.0]},
+    )  # fmt: skip
+    known = Known(model, mapping, pi, spread, 0.3, sigma, tuple(folds), 0.25)
+    fit = consistent_fit(settings, known)
+    assert (fit.metric, fit.margin) == ("riemannian", 3e-3)
+    assert fit.independent_share == 0.3
+    assert fit.constraints.total_mass == (1.0, 9.0)
+    held = held_parameters(model)
+    assert held.any()
+    wanted = (mapping.K, pi, spread, held, sigma)
+    for ours, own in zip(
+        (fit.K, fit.prior, fit.prior_std, fit.held, fit.wls_noise), wanted, strict=True
+    ):
+        np.testing.assert_array_equal(ours, own)
+    if not how:
+        assert (fit.prior_weight, fit.plausible_weight, fit.choice) == (2.5, 1.0, None)
+        assert not asked
+        return
+    assert (fit.prior_weight, fit.plausible_weight, fit.choice.how) == (7.0, 0.5, how)
+    [(before, segments, other)] = asked
+    assert (before.prior_weight, other) == (1.0, how)
+    assert sum(fold.rows.sum() for fold in segments.folds) == sum(range(9, 22))
+    assert len(segments.folds) == 6
+    alone = consistent_fit(settings, replace(known, held_out=tuple(folds[:1])))
+    assert (alone.prior_weight, len(asked)) == ((1.0, 1) if how == "cv" else (7.0, 2))

@@ -1,0 +1,473 @@
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import scipy.linalg
+from helpers.fitting import fit, identify
+from helpers.paths import ROOT
+from helpers.synthetic import truth
+
+from robotid.data.files.read import lay_out, write_log
+from robotid.data.log import Log
+from robotid.data.signal_settings import SignalSettings
+from robotid.data.signals import process
+from robotid.dynamics.base_parameters import structural_mapping
+from robotid.dynamics.factors import Factors, join
+from robotid.dynamics.simulation.motions import random_fourier
+from robotid.dynamics.torque import joint_torque_regressor
+from robotid.estimation.estimators import OLS, WLS
+from robotid.estimation.fitting import regressor_noise, survey
+from robotid.estimation.fitting.estimator_settings import EstimatorSettings
+from robotid.estimation.fitting.fit import solve_recordings
+from robotid.estimation.fitting.recorded import Recordings
+from robotid.estimation.fitting.regressor_noise import (
+    _is_enough,
+    acceleration_noise,
+    find_regressor_noise,
+    rounding_errors,
+    smoothed,
+    without_noise,
+)
+from robotid.estimation.fitting.standard_errors import measured_errors
+from robotid.estimation.fitting.survey import hold_log, survey_log
+from robotid.robot.model import RobotModel
+
+RATE, STEP = 200.0, 2 * np.pi / 2**11  # [Hz], [rad]
+SIGNALS = SignalSettings(velocity="differentiated")
+
+
+@pytest.fixture(scope="module")
+def planar():
+    return RobotModel.from_urdf(ROOT / "urdf" / "planar_2r.urdf")
+
+
+@pytest.fixture(scope="module")
+def motion(planar):
+    """Times, positions and exact torques of 24 s; no rounding error is like one before."""
+    return exact(planar, period=8.00372)
+
+
+def exact(model, period):
+    t = np.arange(round(24 * RATE)) / RATE
+    q, v, a = random_fourier(model, np.random.default_rng(3), period=period).evaluate(t)
+    return t, q, (joint_torque_regressor(model, q, v, a) @ truth(model)).reshape(v.shape)
+
+
+def recorded(model, motion, *, step=STEP, noise=0.01, seed=0, **more):
+    """Return what encoders whose zeros lie anywhere, and noisy torque sensors log of a motion."""
+    (t, q, tau), rng = motion, np.random.default_rng([5, seed])
+    zero = rng.random(q.shape[1]) * step
+    rounded = q if step == 0 else np.round((q + zero) / step) * step - zero
+    noisy = tau + noise * np.std(tau, axis=0) * rng.standard_normal(tau.shape)
+    return Log(t=t, q=rounded, tau=noisy, joints=model.joints, **more)
+
+
+def fitted(model, *logs):
+    """Return recordings, what they come down to, and weighted least squares on them."""
+    recordings = Recordings(
+        model, structural_mapping(model), [hold_log(model, log, SIGNALS) for log in logs]
+    )
+    parts = recordings.reduce()
+    whole = join(parts)
+    return recordings, parts, whole, WLS(independent_share=recordings.share).fit(whole.factors)
+
+
+def found_in(model, *logs):
+    recordings, _, whole, wls = fitted(model, *logs)
+    return find_regressor_noise(recordings, whole, wls.theta, wls.sigma, wls.sigma)
+
+
+@pytest.mark.parametrize(("cutoff", "order"), [(8.0, 4), (20.0, 2), (None, 4)])
+def test_noise_of_an_acceleration_is_that_of_noisy_positions_behind_the_filter(cutoff, order):
+    rng, settings = np.random.default_rng(0), SignalSettings(rate=RATE, cutoff=cutoff, order=order)
+    t = np.arange(20_000) / RATE
+    noise = rng.standard_normal((len(t), 2))
+    log = Log(t=t, q=noise, tau=noise, joints=("a", "b"))
+    size = np.std(process(log, replace(settings, velocity="differentiated")).a)
+    assert acceleration_noise(1 / RATE, settings) == pytest.approx(size, rel=0.03)
+
+
+def test_rounding_errors_are_those_of_any_zero_of_the_encoder():
+    t, rng = np.arange(8000) / RATE, np.random.default_rng(0)
+    q = np.column_stack([np.sin(t), np.sin(1.3 * t), 0.4 * (t < 20)])
+    steps = np.array([0.01, 0.0, 0.002])
+    draws = [rounding_errors(q, steps, rng) for _ in range(40)]
+    errors, true = draws[0], np.round(q[:, 0] / 0.01) * 0.01 - q[:, 0]
+    assert (np.abs(errors).max(axis=0) <= 0.5 * steps * (1 + 1e-9)).all()
+    assert np.std(errors[:, 0]) == pytest.approx(0.01 / np.sqrt(12), rel=0.05)
+    # each is like the true one at some zero, all together are not
+    assert abs(np.mean([np.corrcoef(e[:, 0], true)[0, 1] for e in draws])) < 0.1
+    assert not errors[:, 1].any()
+    assert np.ptp(errors[:4000, 2]) == 0.0  # at rest
+
+
+def test_smoothed_positions_are_nearer_to_the_truth_and_at_most_a_step_from_what_was_read():
+    t = np.arange(4000) / RATE
+    q = np.column_stack([np.sin(t), np.sin(1.3 * t)])
+    q[2000:, 0] += 1.0  # a gap
+    rounded, steps = np.round(q / 0.01) * 0.01, np.array([0.01, 0.0])
+    change = smoothed(rounded, steps, 51)
+    assert np.std((rounded + change - q)[:1900, 0]) < 0.3 * 0.01 / np.sqrt(12)
+    assert np.abs(change).max(axis=0).tolist() == pytest.approx([0.01, 0.0])
+
+
+def test_the_correction_solves_without_the_noise_and_not_beyond_a_bound(rng):
+    A, E = rng.standard_normal((2, 30, 4))
+    H, pull = A.T @ A, rng.standard_normal(4)
+    D = 0.05 * E.T @ E
+    root, move, unsure = without_noise(np.linalg.inv(H), D, pull)
+    np.testing.assert_allclose(root @ move, np.linalg.solve(H - D, pull), rtol=1e-9)
+    x = np.diag(root.T @ D @ root)
+    np.testing.assert_allclose(root.T @ D @ root, np.diag(x), atol=1e-12)
+    # to first order what an error of a tenth of D does
+    np.testing.assert_allclose(unsure, 0.1 * x / (1 - x) * move, rtol=1e-9)
+    root, move, _ = without_noise(np.linalg.inv(H), 0.99 * H, pull)
+    np.testing.assert_allclose(root @ move, 5.0 * np.linalg.solve(H, pull), rtol=1e-9)
+
+
+@pytest.fixture(scope="module")
+def runs(planar, motion):
+    """Errors of least squares on many encoders' logs (k, b), and what is found of a few of them."""
+    return many(planar, motion)
+
+
+def many(model, motion, count=24, looked=6):
+    beta, errors, few = structural_mapping(model).to_base(truth(model)), [], []
+    for seed in range(count):
+        recordings, parts, whole, wls = fitted(model, recorded(model, motion, seed=seed))
+        errors.append(wls.theta - beta)
+        if seed < looked:
+            noise = find_regressor_noise(recordings, whole, wls.theta, wls.sigma, wls.sigma)
+            fixed = wls, [part.factors for part in parts], whole.factors, recordings.share
+            known, plain = (
+                measured_errors(*fixed, np.eye(len(beta)), wls.sigma, more=x)[0].std_error
+                for x in (noise.meat, None)
+            )
+            few.append((noise, known, plain))
+    return np.array(errors), *(list(x) for x in zip(*few, strict=True))
+
+
+def test_the_shift_is_what_many_encoders_move_least_squares_by(runs):
+    errors, noises, _, _ = runs
+    mean, scatter = errors.mean(axis=0), errors.std(axis=0)
+    shift = np.array([noise.shift for noise in noises])
+    uncertain = np.hypot(
+        scatter / np.sqrt(len(errors)), shift.std(axis=0, ddof=1) / np.sqrt(len(shift))
+    )
+    assert np.abs(mean / scatter).max() > 2.0  # least squares are biased
+    assert (np.abs(shift.mean(axis=0) - mean) < 3.5 * uncertain).all()
+    worst = int(np.argmax(np.abs(mean) / scatter))
+    assert shift[:, worst].mean() == pytest.approx(mean[worst], rel=0.15)
+    np.testing.assert_allclose(noises[0].steps, [STEP, STEP])
+
+
+def test_intervals_hold_the_truth_behind_the_correction_and_not_without_it(runs):
+    errors, noises, known, plain = runs
+    shift = np.array([noise.shift for noise in noises])
+    z = (errors[: len(shift)] - shift) / np.array(known)
+    assert np.mean(np.abs(errors[: len(shift)] / np.array(plain)) > 2.0) > 0.25
+    assert np.mean(np.abs(z) > 2.0) < 0.1
+    assert np.median(np.array(known) / np.array(plain)) < 1.5  # nor do they grow out of bounds
+
+
+def test_repeated_rounding_errors_count_as_often_as_they_are_repeated(planar):
+    errors, _, known, plain = many(planar, exact(planar, period=3.0), looked=4)
+    scatter = errors.std(axis=0)
+    assert np.median(np.sqrt(np.mean(np.square(plain), axis=0)) / scatter) < 0.8
+    ratio = np.sqrt(np.mean(np.square(known), axis=0)) / scatter
+    assert 0.8 < np.median(ratio) < 1.5, ratio
+
+
+def test_a_finding_names_joints_step_and_parameter(planar, motion):
+    log = recorded(planar, motion)
+    found = identify(planar, [log], signals=SIGNALS, estimator=EstimatorSettings(draws=0))
+    (finding,) = [f for f in found.findings if f.code == "encoder_noise"]
+    assert finding.severity == "warning"
+    assert "steps of up to 0.00307 rad (11.0 bits per revolution)" in finding.message
+    assert "the estimate is corrected for this bias" in finding.message
+    assert finding.evidence["std_errors"] >= 2.0
+    noise = found.regressor_noise
+    moved = np.abs(noise.shift) / noise.std_error
+    inertial = found.mapping.K[:, : planar.layout.n_inertial].any(axis=1)
+    worst = int(np.flatnonzero(inertial)[np.argmax(moved[inertial])])
+    assert finding.evidence["std_errors"] == pytest.approx(moved[worst])
+    assert found.mapping.base_names[worst] in finding.message
+
+
+@pytest.mark.parametrize("step", [2 * np.pi / 2**18, 0.0])
+def test_fine_encoders_change_nothing_and_are_not_named(planar, motion, step):
+    log = recorded(planar, motion, step=step)
+    found = fit(planar, [log], signals=SIGNALS, estimator="wls")
+    assert found.regressor_noise is None
+    assert regressor_noise.encoder_findings(found) == []
+
+
+def test_measured_velocities_have_no_noise_of_the_positions(planar, motion):
+    t, q, _ = motion
+    v = np.gradient(q, t, axis=0)
+    log = recorded(planar, motion, v=v)
+    recordings = replace(
+        fitted(planar, log)[0],
+        fitted=[hold_log(planar, log, SignalSettings(velocity="measured"))],
+    )
+    whole = join(recordings.reduce())
+    wls = WLS().fit(whole.factors)
+    assert find_regressor_noise(recordings, whole, wls.theta, wls.sigma, wls.sigma) is None
+
+
+def test_an_estimator_that_reads_samples_counts_the_shift_as_an_error(planar, motion):
+    log = recorded(planar, motion)
+    wls = fit(planar, [log], estimator="wls", signals=SIGNALS)
+    rls = identify(planar, [log], estimator="rls", signals=SIGNALS)
+    noise = rls.regressor_noise
+    assert not noise.is_corrected
+    np.testing.assert_allclose(rls.base - noise.shift, wls.base, rtol=1e-3, atol=1e-4)
+    assert (rls.base_error >= 0.95 * np.abs(noise.shift)).all()
+    (finding,) = [f for f in rls.findings if f.code == "encoder_noise"]
+    assert "its standard errors include it" in finding.message
+
+
+def test_corrected_factors_are_those_of_the_fit(planar, motion, runs):
+    _, noises, known, _ = runs
+    found = fit(planar, [recorded(planar, motion)], signals=SIGNALS, estimator="wls")
+    np.testing.assert_allclose(found.regressor_noise.shift, noises[0].shift, rtol=1e-6)
+    np.testing.assert_allclose(found.base_error, known[0], rtol=1e-4)
+    np.testing.assert_allclose(found.wls.theta, found.base, rtol=1e-6)
+    beta = found.mapping.to_base(truth(planar))
+    assert (np.abs(found.base - beta) < 3.0 * known[0]).all()
+
+
+def test_what_is_held_out_is_corrected_as_the_whole_is(planar, motion):
+    recordings, parts, whole, wls = fitted(planar, recorded(planar, motion))
+    ground = solve_recordings(recordings, EstimatorSettings("wls")).ground
+    theta, shift = wls.theta * 1.01, ground.noise.shift
+    assert len(ground.before.held_out) == len(ground.segments) == len(parts)
+    for own in (ground.before.held_out, ground.segments):
+        for part, corrected in zip(parts, own, strict=True):
+            np.testing.assert_allclose(
+                corrected.residual_squares(theta), part.factors.residual_squares(theta + shift),
+                rtol=1e-6,
+            )  # fmt: skip
+    np.testing.assert_allclose(
+        ground.factors.residual_squares(theta), whole.factors.residual_squares(theta + shift)
+    )
+    np.testing.assert_allclose(ground.rough.theta, wls.theta - shift)
+
+
+def test_ordinary_least_squares_are_corrected_by_their_own_weights(planar, motion):
+    log = recorded(planar, motion)
+    recordings, _, whole, _ = fitted(planar, log)
+    found = fit(planar, [log], estimator="ols", signals=SIGNALS)
+    plain = OLS(independent_share=recordings.share).fit(whole.factors)
+    np.testing.assert_allclose(found.base, plain.theta - found.regressor_noise.shift, rtol=1e-6)
+    np.testing.assert_allclose(found.regressor_noise.std_error, plain.std_error, rtol=0.05)
+    beta = found.mapping.to_base(truth(planar))
+    assert np.mean(np.abs(plain.theta - beta) > 2.5 * found.base_error) > 0.15
+    assert (np.abs(found.base - beta) < 2.5 * found.base_error).all()
+
+
+def test_total_least_squares_have_a_correction_of_their_own(planar, motion):
+    log = recorded(planar, motion)
+    found = fit(planar, [log], estimator="tls", signals=SIGNALS)
+    assert found.regressor_noise is None
+
+
+def test_rows_that_are_not_looked_at_scale_the_covariance_of_the_score(planar, motion, monkeypatch):
+    """Of thrice the rows, D, H and the shift's score are three times as large, its variance nine.
+
+    The scatter of repeated rounding errors is a variance of rows: three times as large.
+    """
+    monkeypatch.setattr(regressor_noise, "_is_enough", lambda moves: len(moves) == 4)
+    log = recorded(planar, [x[:700] for x in motion])
+    recordings, parts, whole, wls = fitted(planar, log)
+
+    def found(reduction):
+        return find_regressor_noise(recordings, reduction, wls.theta, wls.sigma, wls.sigma)
+
+    thrice = join(parts * 3)
+    both = found(whole), found(thrice)
+    monkeypatch.setattr(regressor_noise, "_repeated", lambda linear: np.zeros(linear.shape[-1]))
+    alone = found(whole), found(thrice)
+    size = np.sqrt(np.outer(np.diag(both[1].meat), np.diag(both[1].meat)))
+    for one, more in (both, alone):
+        np.testing.assert_allclose(more.shift / one.std_error, one.shift / one.std_error, atol=1e-6)
+        np.testing.assert_allclose(more.std_error, one.std_error / np.sqrt(3), rtol=1e-6)
+        np.testing.assert_allclose(more.share, one.share, rtol=1e-9)
+    np.testing.assert_allclose(alone[1].meat / size, 9 * alone[0].meat / size, atol=1e-6)
+    repeated = [x.meat - y.meat for x, y in zip(both, alone, strict=True)]
+    assert (np.diag(repeated[0]) > 0).any()
+    np.testing.assert_allclose(repeated[1] / size, 3 * repeated[0] / size, atol=1e-6)
+
+
+def test_of_a_log_in_a_file_windows_stand_for_all_rows(planar, motion, tmp_path, monkeypatch):
+    log = recorded(planar, motion)
+    whole_log = found_in(planar, log)
+    monkeypatch.setattr(survey, "_WINDOW", 1000)
+    path = tmp_path / "log.csv"
+    write_log(log, path)
+    layout, table = lay_out(path, planar.joints)
+    surveyed = survey_log(layout, table, planar, SIGNALS, length=1600)
+    assert [len(x.t) for x in surveyed.windows] == [1000] * 3
+    recordings = Recordings(planar, structural_mapping(planar), [surveyed])
+    whole = join(recordings.reduce())
+    wls = WLS(independent_share=recordings.share).fit(whole.factors)
+    found = find_regressor_noise(recordings, whole, wls.theta, wls.sigma, wls.sigma)
+    worst = int(np.argmax(np.abs(whole_log.shift) / wls.std_error))
+    assert found.shift[worst] == pytest.approx(whole_log.shift[worst], rel=0.3)
+
+
+def test_the_share_of_the_noise_is_that_of_the_log_in_which_it_is_largest():
+    logs = [SimpleNamespace(step=h, signals=SIGNALS) for h in (0.01, 0.004)]
+    steps = [np.array([0.02, 0.0, 1e-4]), np.array([1e-3, 0.0, 0.03])]
+    whole = SimpleNamespace(squares=np.array([[0.0] * 3, [0.0] * 3, [8e4, 5.0, 2e5]]), samples=20)
+    noise = [e / np.sqrt(12) * acceleration_noise(x.step, SIGNALS)
+             for x, e in zip(logs, steps, strict=True)]  # fmt: skip
+    wanted = np.maximum(*noise) / np.sqrt(whole.squares[2] / 20)
+    assert (wanted < 1.0).all()
+    np.testing.assert_allclose(regressor_noise._share(logs, steps, whole), wanted, rtol=1e-12)
+
+
+def test_shift_and_covariance_are_those_of_given_draws_of_two_logs(rng, monkeypatch):
+    """The formulas at the top of the module, with the sums of each draw given."""
+    rows, sigma, level = (11, 16), np.array([0.3, 1.7]), np.array([0.5, 0.9])
+    W = [3.0 * rng.standard_normal((count, 3)) for count in rows]
+    triangles = [np.linalg.qr(np.column_stack([x, x[:, 0]]), mode="r") for x in W]
+    factors = Factors(tuple(triangles), (np.arange(3),) * 2, np.array(rows), tuple("abc"))
+    logs = [
+        SimpleNamespace(
+            step=h, signals=SIGNALS, is_in_memory=True, whole=SimpleNamespace(trajectory=h)
+        )
+        for h in (0.01, 0.004)
+    ]
+    steps = {0.01: np.array([0.02, 1e-4]), 0.004: np.array([1e-3, 0.03])}
+    E = [0.4 * rng.standard_normal((4, 3)) for _ in range(12)]
+    pairs = [
+        [regressor_noise._Sums(60 * rng.standard_normal((5, 3)), x.T @ x, 9) for x in two]
+        for two in zip(E[::2], E[1::2], strict=True)
+    ]
+    plain = regressor_noise._Sums(rng.standard_normal((5, 3)), np.zeros((3, 3)), 9)
+    given = iter(pairs)
+    monkeypatch.setattr(regressor_noise, "_steps", lambda log: steps[log.step])
+    monkeypatch.setattr(regressor_noise, "_without_steps", lambda near, _: near)
+    monkeypatch.setattr(regressor_noise, "_sums", lambda near, motions, *_: plain)
+    monkeypatch.setattr(regressor_noise, "_pair", lambda *_: next(given))
+    model = SimpleNamespace(is_static=False, free_flyer=False)
+    recordings = SimpleNamespace(model=model, share=0.3, fitted=logs)
+    squares = np.array([[0.0] * 2, [0.0] * 2, [8e4, 2e5]])
+    whole = SimpleNamespace(factors=factors, squares=squares, samples=20)
+    found = find_regressor_noise(recordings, whole, 1e4 * np.array([9.0, -7.0, 5.0]), sigma, level)
+    H = sum(x.T @ x / s**2 for x, s in zip(W, sigma, strict=True))
+    B = np.linalg.inv(H)
+    noisy = sum(x.T @ x * (e / s**2) ** 2 for x, s, e in zip(W, sigma, level, strict=True))
+    scale = sum(rows) / 9
+    moved = np.array([plain.score - 0.5 * (one.score + two.score) for one, two in pairs])
+    D = scale * np.mean([0.5 * (one.information + two.information) for one, two in pairs], axis=0)
+    D_theta = scale * moved.mean(axis=0)
+    np.testing.assert_allclose(found.shift, -np.linalg.solve(H - D, D_theta), rtol=1e-9)
+    np.testing.assert_allclose(found.std_error, np.sqrt(np.diag(B @ noisy @ B) / 0.3), rtol=1e-9)
+    x, X = scipy.linalg.eigh(D, H)  # X X^T = H^-1
+    assert (x > 0).all()
+    assert (x < 0.8).all()
+    linear = np.array([0.5 * (one.segments - two.segments) @ X for one, two in pairs])
+    repeated = np.mean(linear.sum(axis=1) ** 2 - np.sum(linear**2, axis=1), axis=0)
+    unsure = 0.1 * x / (1 - x) ** 2 * (X.T @ D_theta)
+    meat = H @ X @ np.diag(scale * np.maximum(repeated, 0.0) + unsure**2) @ X.T @ H
+    meat += scale**2 * np.cov(moved.T) / 6
+    np.testing.assert_allclose(found.meat, meat, rtol=1e-8, atol=1e-9 * meat.max())
+    np.testing.assert_array_equal(found.steps, [0.02, 0.03])
+    np.testing.assert_array_equal(
+        found.share, regressor_noise._share(logs, list(steps.values()), whole)
+    )
+    counted = found.uncorrected(H)
+    np.testing.assert_allclose(
+        counted.meat - found.meat, H @ np.outer(found.shift, found.shift) @ H
+    )
+    assert (found.is_corrected, counted.is_corrected) == (True, False)
+
+
+@pytest.mark.parametrize(
+    ("steps", "shift", "severity", "coarsest"),
+    [
+        ((0.001, 0.9, 0.003, 0.002), -1.5, "warning", "0.003 rad (11.0 bits per revolution)"),
+        ((0.001, 0.9, 0.003, 0.04), 0.75, "note", "0.04 m"),
+        ((0.001, 0.9, 0.003, 0.04), 0.3, None, ""),
+    ],
+)
+def test_a_finding_names_the_joints_of_coarse_steps_and_the_worst_inertial_sum(
+    steps, shift, severity, coarsest
+):
+    K = np.array([[0.0, 0.0, 1.0], [1.0, 0.5, 0.0], [0.0, 2.0, 1.0]])  # the first is of a drive
+    noise = regressor_noise.RegressorNoise(
+        steps=np.array(steps), share=np.array([0.4, 0.03, 0.05, 0.2]),
+        shift=np.array([90.0, 0.2, shift]), std_error=np.array([1.0, 0.5, 0.75]), meat=np.eye(3),
+    )  # fmt: skip
+    layout = SimpleNamespace(n_inertial=2, prismatic={"d"})
+    fit = SimpleNamespace(
+        regressor_noise=noise, model=SimpleNamespace(joints=tuple("abcd"), layout=layout),
+        mapping=SimpleNamespace(K=K, base_names=("x", "y", "z")),
+    )  # fmt: skip
+    found = regressor_noise.encoder_findings(fit)
+    assert len(found) == (severity is not None)
+    if not found:
+        return
+    (finding,) = found
+    assert (finding.severity, finding.where) == (severity, "a, c, d")
+    assert finding.message.startswith(
+        f"a, c, d: the position is quantised in steps of up to {coarsest}. "
+    )
+    size = abs(shift) / 0.75
+    assert (
+        f"40 % of the RMS acceleration and shifts z by {size:.1f} standard errors"
+        in finding.message
+    )
+    assert finding.evidence == pytest.approx(
+        {
+            "step_a": steps[0],
+            "step_c": steps[2],
+            "step_d": steps[3],
+            "std_errors": size,
+            "share_pct": 40,
+        }
+    )
+
+
+def test_draws_end_when_the_shift_is_known_to_a_fifth_of_a_standard_error_or_is_negligible():
+    """Of k draws of scatter s the mean is known to s / sqrt(k); six are the most."""
+    scatter = {4: np.array([-1.0, -1.0, 1.0, 1.0]) * np.sqrt(0.75), 3: np.array([-1.0, 0.0, 1.0])}
+    for mean, spread, count, is_enough in (
+        (5.0, 0.39, 4, True), (5.0, 0.41, 4, False), (0.0, 0.41, 4, False),
+        (-0.09, 9.0, 3, True), (-0.11, 9.0, 3, False),
+    ):  # fmt: skip
+        moves = np.column_stack([np.zeros(count), mean + spread * scatter[count]])
+        assert _is_enough(moves) == is_enough
+    assert _is_enough(9.0 * np.arange(6.0)[:, None])
+    assert not _is_enough(9.0 * np.arange(5.0)[:, None])
+
+
+def test_steps_are_smoothed_over_a_period_of_the_filter_on_either_side(monkeypatch):
+    """At least over five rows; an angle is unwrapped before, the position of a slider is not."""
+    asked = []
+
+    def smooth(q, steps, width):
+        asked.append((q[:, 0].tolist(), q[:, 1].tolist(), steps, width))
+        return width
+
+    monkeypatch.setattr(regressor_noise, "smoothed", smooth)
+    monkeypatch.setattr(regressor_noise, "_shifted", lambda log, change: (log.name, change))
+    model = SimpleNamespace(joints=("a", "s"), layout=SimpleNamespace(prismatic=("s",)))
+    head = SimpleNamespace(q=np.array([[3.0, 3.0], [3.5 - 2 * np.pi, -3.0]]))
+    logs = [
+        SimpleNamespace(
+            name=k, model=model, head=head, step=0.002, signals=SimpleNamespace(cutoff=cutoff)
+        )
+        for k, cutoff in enumerate((None, 5.0))
+    ]
+    near = Recordings(model, None, logs, logs)
+    found = regressor_noise._without_steps(near, ["first", "second"])
+    assert found.fitted == [(0, 11), (1, 201)]
+    assert found.validation == ()
+    assert [steps for *_, steps, _ in asked] == ["first", "second"]
+    for angle, slider, *_ in asked:
+        np.testing.assert_allclose(angle, [3.0, 3.5])
+        assert slider == [3.0, -3.0]

@@ -1,0 +1,406 @@
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import scipy.signal
+import scipy.stats
+from helpers.fitting import fit
+from helpers.synthetic import exact_log, truth
+
+from robotid.base.exceptions import DataError, NotConvergedError
+from robotid.data.signal_settings import SignalSettings
+from robotid.dynamics.base_parameters import BaseMapping
+from robotid.dynamics.factors import Factors, compress, merge
+from robotid.dynamics.problem import Problem
+from robotid.estimation.estimators import OLS, WLS
+from robotid.estimation.estimators.segments import quantile, scatter
+from robotid.estimation.fitting.standard_errors import (
+    Redraws,
+    about_prior,
+    measured_errors,
+    standard_of,
+    with_wls_errors,
+)
+from robotid.robot.examples import example_urdf
+from robotid.robot.model import RobotModel
+
+N, JOINTS, STRETCHES = 2400, 2, 40
+SIGMA = np.array([2.0, 0.1])
+TRUTH = np.array([1.0, -2.0, 0.5, 3.0])
+
+
+@pytest.fixture(scope="module")
+def W():
+    rng = np.random.default_rng(0)
+    slow = scipy.signal.lfilter([1.0], [1.0, -0.95], rng.standard_normal((N, JOINTS, 3)), axis=0)
+    return np.concatenate([slow, np.ones((N, JOINTS, 1))], axis=2)
+
+
+def noise(rng, colour):
+    white = rng.standard_normal((N, JOINTS))
+    coloured = scipy.signal.lfilter([np.sqrt(1 - colour**2)], [1.0, -colour], white, axis=0)
+    return SIGMA * coloured
+
+
+def segments(W, tau):
+    """Return the factors of each segment, of all by one call."""
+    rows = np.concatenate([W, tau[:, :, None]], axis=2).reshape(STRETCHES, -1, JOINTS, 5)
+    triangles = np.linalg.qr(rows.transpose(0, 2, 1, 3), mode="r")  # (Segments, JOINTS, 5, 5)
+    every, counts = (np.arange(4),) * JOINTS, np.full(JOINTS, N // STRETCHES)
+    return [Factors(tuple(own), every, counts, tuple("abcd")) for own in triangles]
+
+
+def estimate(W, tau):
+    parts = segments(W, tau)
+    whole = merge(parts)
+    rough = WLS().fit(whole)
+    return measured_errors(rough, parts, whole, 1.0, np.eye(4), rough.sigma)
+
+
+@pytest.mark.parametrize("colour", [0.0, 0.9])
+def test_standard_errors_are_the_scatter_of_many_recordings(W, colour):
+    rng = np.random.default_rng(1)
+    errors, reported, held = [], [], []
+    for _ in range(150):
+        found, basis = estimate(W, W @ TRUTH + noise(rng, colour))
+        errors.append(found.theta - TRUTH)
+        reported.append(found.std_error)
+        held.append(np.abs(errors[-1]) <= basis.quantile * found.std_error)
+    scattered = np.sqrt(np.mean(np.square(errors), axis=0))
+    ratio = np.sqrt(np.mean(np.square(reported), axis=0)) / scattered
+    # 150 runs know their own scatter to 6 %
+    assert ((ratio > 0.82) & (ratio < 1.25)).all(), ratio
+    assert 0.92 < np.mean(held) < 0.98
+
+
+@pytest.mark.parametrize(
+    ("samples", "basis"), [(1600, "16 segments"), (800, "bandwidth of the filter")]
+)
+def test_behind_the_filter_errors_are_the_scatter_and_those_of_independent_rows_are_not(
+    samples, basis
+):
+    model = RobotModel.from_urdf(example_urdf("double_pendulum_simple.urdf"))
+    rng, filtered = np.random.default_rng(1), SignalSettings(cutoff=5.0)  # of logs at 100 Hz
+    clean = exact_log(model, truth(model), np.random.default_rng(0), samples=samples, rate=100.0)
+    level = np.array([0.1, 0.005]) * np.sqrt(np.mean(clean.tau**2, axis=0))
+    found, stated, naive = [], [], []
+    for _ in range(20):
+        log = replace(clean, tau=clean.tau + level * rng.standard_normal(clean.tau.shape))
+        result = fit(model, [log], signals=filtered, estimator="ols")
+        assert basis in result.errors.method
+        pair = (result.estimate, result.wls)
+        found.append([estimate.theta for estimate in pair])
+        stated.append([estimate.std_error for estimate in pair])
+        naive.append([kind.fit(result.factors).std_error for kind in (OLS(), WLS())])
+    scattered = np.std(found, axis=0, ddof=1)  # (2, 13)
+    ratio = np.sqrt(np.mean(np.square(stated), axis=0)) / scattered
+    # 20 runs know a standard deviation to 16 %
+    assert ((ratio > 0.67) & (ratio < 1.5)).all(), ratio
+    assert ((np.median(ratio, axis=1) > 0.8) & (np.median(ratio, axis=1) < 1.2)).all()
+    # one row in ten is independent, 2 cutoff / rate: errors of as many as there are rows are short
+    blind = np.sqrt(np.mean(np.square(naive), axis=0)) / scattered
+    assert np.median(blind) == pytest.approx(0.3, abs=0.06)
+    assert blind.max() < 0.5
+
+
+def test_independent_rows_need_no_inflation_and_coloured_ones_do(W):
+    rng = np.random.default_rng(2)
+    _, white = estimate(W, W @ TRUTH + noise(rng, 0.0))
+    _, coloured = estimate(W, W @ TRUTH + noise(rng, 0.9))
+    assert 0.7 < white.inflation < 1.4
+    assert coloured.inflation > 5  # (1 + 0.9) / (1 - 0.9) = 19 for rows that never change
+
+
+def test_an_open_parameter_has_no_error_and_leaves_that_of_others(W):
+    tau = W @ TRUTH + noise(np.random.default_rng(3), 0.5)
+    parts = segments(W, tau)
+    whole = merge(parts)
+    rough = WLS().fit(whole)
+    wanted = measured_errors(rough, parts, whole, 1.0, np.eye(4), rough.sigma)[0].covariance
+    open_one = rough.covariance.copy()
+    open_one[2, 2] = np.inf
+    given = replace(rough, covariance=open_one)
+    found = measured_errors(given, parts, whole, 1.0, np.eye(4), rough.sigma)[0].covariance
+    others = wanted.copy()
+    others[2, 2] = np.inf
+    np.testing.assert_allclose(found, others, rtol=1e-9)
+
+
+def test_one_parameter_is_the_closed_form_of_cr2(rng):
+    x, e = rng.standard_normal((20, 10)), rng.standard_normal((20, 10))
+    y = 0.7 * x + e
+    theta = (x * y).sum() / (x**2).sum()
+    bread = 1 / (x**2).sum()
+
+    def problem(x, y):
+        blocks = [(x[:, None], y, np.ones(len(x)))]
+        return Problem(lambda: iter(blocks), ("a",), 1, np.ones((1, 1), dtype=bool))
+
+    parts = [compress(problem(*part)) for part in zip(x, y, strict=True)]
+    found = scatter(parts, np.array([theta]), np.ones(1), np.array([[bread]]))
+    # with one column, (I - H_ss)^-1/2 acts along x_s alone, with leverage h_s
+    h = (x**2).sum(axis=1) * bread
+    scores = (x * (y - theta * x)).sum(axis=1) / np.sqrt(1 - h)
+    assert found.covariance[0, 0] == pytest.approx(bread**2 * (scores**2).sum(), rel=1e-9)
+    a = np.sqrt((x**2).sum(axis=1) / (1 - h)) * bread
+    back = np.sqrt((x**2).sum(axis=1)) * a
+    gram = np.diag(a**2) - np.outer(back, back) * bread
+    freedom = np.trace(gram) ** 2 / (gram**2).sum()
+    assert found.freedom()[0] == pytest.approx(freedom, rel=1e-9)
+
+
+def test_scores_scatter_as_the_matrices_of_their_rows_say(W):
+    """Of two joints and four columns, one of which a single segment has nearly alone."""
+    W = W.copy()
+    W[:60, :, 2] *= 30.0
+    tau = W @ TRUTH + 2.0 * noise(np.random.default_rng(8), 0.9)
+    sigma = np.array([1.5, 0.2])
+    rows, y = (x / sigma[:, None] for x in (W, tau[:, :, None]))
+    X, b = rows.reshape(STRETCHES, -1, 4), y.reshape(STRETCHES, -1)
+    B = np.linalg.inv(np.einsum("sia,sib->ab", X, X))
+    theta = B @ np.einsum("sia,si->a", X, b)
+    meat, alone, left, expected, a = np.zeros((4, 4)), np.zeros((4, 4)), 0.0, 0.0, []
+    for R, z in zip(X, b - X @ theta, strict=True):
+        H = R @ B @ R.T
+        leverage, V = np.linalg.eigh(H)
+        gain = np.maximum(1.0 - leverage, 0.05) ** -0.5  # of no more leverage than 0.95
+        A = (V * gain) @ V.T
+        score = R.T @ A @ z
+        meat += np.outer(score, score)
+        left += (A @ z) @ H @ (A @ z)
+        shown = A @ (np.eye(len(H)) - H) @ A  # of its own noise
+        expected += np.trace(H @ shown)
+        alone += R.T @ (np.eye(len(H)) - shown) @ R
+        a.append(A @ R @ B)
+    found = scatter(segments(W, tau), theta, sigma, B)
+    assert found.inflation == pytest.approx(left / expected)
+    assert found.inflation > 3.0
+    np.testing.assert_allclose(found.meat, meat + left / expected * alone, rtol=1e-6)
+    assert alone[2, 2] > 0.3 / B[2, 2]
+    np.testing.assert_allclose(found.covariance, B @ found.meat @ B, rtol=1e-6)
+    for k in range(4):
+        back = np.array([R.T @ x[:, k] for R, x in zip(X, a, strict=True)])
+        gram = np.diag([x[:, k] @ x[:, k] for x in a]) - back @ B @ back.T
+        wanted = np.trace(gram) ** 2 / np.sum(gram**2)
+        assert found.freedom()[k] == pytest.approx(max(wanted, 1.0), rel=1e-6)
+
+
+def test_a_direction_of_one_stretch_alone_gets_the_scatter_of_the_others(W):
+    alone = W.copy()
+    alone[:, :, 1] = 0.0
+    alone[60:120, :, 1] = W[60:120, :, 1]  # the second of 40 segments
+    rng = np.random.default_rng(3)
+    ratio = []
+    for _ in range(40):
+        found, _ = estimate(alone, alone @ TRUTH + noise(rng, 0.0))
+        ratio.append(((found.theta - TRUTH)[1] / found.std_error[1]) ** 2)
+    assert 0.5 < np.mean(ratio) < 2.0
+
+
+def test_few_stretches_keep_the_band_of_the_filter(W):
+    parts = segments(W, W @ TRUTH + noise(np.random.default_rng(0), 0.0))[:11]
+    whole = merge(parts)
+    rough = WLS(independent_share=0.2).fit(whole)
+    found, basis = measured_errors(rough, parts, whole, 0.2, np.eye(4), rough.sigma)
+    np.testing.assert_array_equal(found.covariance, rough.covariance)
+    assert basis.inflation == pytest.approx(5.0)
+    assert "only 11 segments" in basis.method
+    with pytest.raises(DataError, match="11 segments"):
+        scatter(parts, rough.theta, rough.sigma, rough.covariance)
+
+
+def test_few_segments_have_errors_that_repeat_in_every_row(W, rng):
+    parts = segments(W, W @ TRUTH + noise(np.random.default_rng(0), 0.0))[:11]
+    whole, share = merge(parts), 0.2
+    rough = WLS(independent_share=share).fit(whole)
+    root = rng.standard_normal((4, 2))
+    more = 1e6 * root @ root.T
+    found, _ = measured_errors(rough, parts, whole, share, np.eye(4), rough.sigma, more=more)
+    R = whole.weighted(rough.sigma)[:4, :4]
+    H = share * R.T @ R  # information
+    wanted = np.linalg.solve(H, np.linalg.solve(H, H + share**2 * more).T)
+    np.testing.assert_allclose(found.covariance, wanted, rtol=1e-6, atol=1e-12)
+    assert np.diag(wanted).max() > 1.5 * np.diag(rough.covariance).max()
+    without = replace(rough, covariance=rough.covariance.copy())  # the third is not identifiable
+    without.covariance[2], without.covariance[:, 2], without.covariance[2, 2] = 0.0, 0.0, np.inf
+    found, _ = measured_errors(without, parts, whole, share, np.eye(4), rough.sigma, more=more)
+    C = np.where(np.isinf(without.covariance), 0.0, without.covariance)
+    wanted = without.covariance + share**2 * C @ more @ C
+    np.testing.assert_allclose(found.covariance, wanted, rtol=1e-9)
+    K, L = rng.standard_normal((4, 6)), np.diag(rng.uniform(1.0, 2.0, 6))
+    prior = K.T @ H @ K + L  # of standard parameters, with a prior
+    own = replace(rough, theta=np.zeros(6), covariance=np.linalg.inv(prior))
+    found, _ = measured_errors(own, parts, whole, share, K, rough.sigma, more=more)
+    wanted = own.covariance @ (prior + share**2 * K.T @ more @ K) @ own.covariance
+    np.testing.assert_allclose(found.covariance, wanted, rtol=1e-6, atol=1e-9)
+
+
+def test_quantiles_are_students():
+    np.testing.assert_allclose(
+        quantile(np.array([5.0, 30.0, np.inf])), scipy.stats.t.ppf(0.975, [5.0, 30.0, 1e12]), 1e-9
+    )
+
+
+def test_a_filter_that_forgets_keeps_its_own_covariance_grown_by_the_inflation(W):
+    parts = segments(W, W @ TRUTH + noise(np.random.default_rng(4), 0.9))
+    whole = merge(parts)
+    share = 0.25  # the covariance of the fit takes a quarter of the rows to be independent
+    own = WLS(independent_share=share).fit(whole)
+    found, errors = measured_errors(own, parts, whole, share, np.eye(4), own.sigma, is_filter=True)
+    _, plain = measured_errors(own, parts, whole, share, np.eye(4), own.sigma)
+    assert errors.inflation == pytest.approx(plain.inflation, rel=1e-6)
+    assert errors.inflation > 5
+    np.testing.assert_allclose(found.covariance, own.covariance * share * errors.inflation)
+
+
+def test_a_gradient_method_ends_beside_the_minimum_and_says_so(W):
+    parts = segments(W, W @ TRUTH + noise(np.random.default_rng(5), 0.0))
+    wls = WLS().fit(merge(parts))
+    away = np.array([0.1, 0.0, -0.2, 0.3])
+    rough = replace(wls, theta=wls.theta + away, covariance=np.zeros((4, 4)))
+    found = with_wls_errors(rough, wls)
+    np.testing.assert_allclose(found.covariance, wls.covariance + np.outer(away, away))
+    np.testing.assert_array_equal(found.theta, rough.theta)
+    assert "plus the distance to it" in found.message
+
+
+def test_the_prior_makes_the_sandwich_of_its_formula(W):
+    # B (K^T M K + L) B with B = (K^T H K + L)^-1, computed from the rows themselves
+    rng, share = np.random.default_rng(6), 0.25
+    tau = W @ TRUTH + noise(rng, 0.0)
+    parts = segments(W, tau)
+    whole, K = merge(parts), np.hstack([np.eye(4), rng.standard_normal((4, 2))])
+    wls = WLS().fit(whole)
+    L = np.diag(np.arange(1.0, 7.0))
+    rows = W.reshape(-1, 4) / np.tile(wls.sigma, N)[:, None]
+    B = np.linalg.inv(share * K.T @ rows.T @ rows @ K + L)
+    theta = np.linalg.lstsq(K, wls.theta, rcond=None)[0]
+    estimate = replace(wls, theta=theta, covariance=B, names=tuple("abcdef"))
+    found, _ = measured_errors(estimate, parts, whole, share, K, wls.sigma)
+    meat = scatter(parts, K @ theta, wls.sigma, share * K @ B @ K.T).meat
+    np.testing.assert_allclose(
+        found.covariance, B @ (share**2 * K.T @ meat @ K + L) @ B, rtol=1e-6, atol=1e-12
+    )
+
+
+@pytest.mark.parametrize("pull", [1.0, 2.5])
+def test_a_prior_that_pulls_more_than_it_is_sure_widens_by_its_own_part(rng, pull):
+    K, R, share = rng.standard_normal((4, 6)), np.triu(rng.standard_normal((4, 4))), 0.3
+    L, root = np.diag(np.arange(1.0, 7.0)), rng.standard_normal((4, 4))
+    meat = root @ root.T
+    C = np.linalg.inv(share * K.T @ R.T @ R @ K + L)
+    found = about_prior(C, K, meat, R, share, pull)
+    np.testing.assert_allclose(found, C @ (K.T @ meat @ K + pull * L) @ C, atol=1e-12)
+    np.testing.assert_array_equal(found, found.T)
+
+
+def test_what_is_scattered_beside_the_rows_adds_to_the_meat(W):
+    """Of a filter, of least squares and of a fit with a prior."""
+    parts = segments(W, W @ TRUTH + noise(np.random.default_rng(7), 0.0))
+    whole, share, more = merge(parts), 0.25, np.diag([3.0, 1.0, 0.0, 2.0])
+    wls = WLS(independent_share=share).fit(whole)
+    for is_filter, bread in ((True, share * wls.covariance), (False, share * wls.covariance)):
+        plain, wide = (
+            measured_errors(
+                wls, parts, whole, share, np.eye(4), wls.sigma, is_filter=is_filter, more=x
+            )[0].covariance
+            for x in (None, more)
+        )
+        np.testing.assert_allclose(wide - plain, bread @ more @ bread, atol=1e-9 * wide.max())
+    K = np.hstack([np.eye(4), np.ones((4, 1))])
+    L = np.eye(5)
+    R = whole.weighted(wls.sigma)[:4, :4]
+    B = np.linalg.inv(share * K.T @ R.T @ R @ K + L)
+    fit = replace(wls, theta=np.append(wls.theta, 0.0), covariance=B, names=tuple("abcde"))
+    plain, wide = (
+        measured_errors(fit, parts, whole, share, K, wls.sigma, more=x)[0].covariance
+        for x in (None, more)
+    )
+    BK = B @ K.T
+    np.testing.assert_allclose(wide - plain, share**2 * BK @ more @ BK.T, atol=1e-9 * wide.max())
+
+
+def test_standard_parameters_are_the_prior_moved_by_the_least_to_the_base_parameters(W, rng):
+    wls = WLS().fit(merge(segments(W, W @ TRUTH + noise(rng, 0.0))))
+    K, spread = np.hstack([np.eye(4), rng.standard_normal((4, 2))]), np.arange(1.0, 7.0)
+    mapping = BaseMapping(K, np.arange(4), tuple("abcdef"), np.ones(6))
+    prior, before = rng.standard_normal(6), np.diag(spread**2)
+    pi, C = standard_of(wls, mapping, prior, spread)
+    G = before @ K.T @ np.linalg.inv(K @ before @ K.T)
+    np.testing.assert_allclose(pi, prior + G @ (wls.theta - K @ prior))
+    np.testing.assert_allclose(K @ C @ K.T, wls.covariance, atol=1e-12)
+    left = before - G @ K @ before
+    np.testing.assert_allclose(C, left + G @ wls.covariance @ G.T, atol=1e-12)
+    # a base parameter that the data leave open is as wide as the prior has it
+    variance = np.diag(np.where(np.arange(4) == 1, np.inf, np.diag(wls.covariance)))
+    _, C = standard_of(replace(wls, covariance=variance), mapping, prior, spread)
+    after = np.diag(K @ C @ K.T)
+    assert after[1] == pytest.approx((K @ before @ K.T)[1, 1])
+    assert after[0] == pytest.approx(wls.covariance[0, 0])
+
+
+@pytest.mark.parametrize("count", [40, 11])
+def test_with_active_bounds_errors_are_those_of_resampled_fits(W, rng, count):
+    share, given, distances = 0.25, [], rng.standard_normal((8, 6))
+    parts = segments(W, W @ TRUTH + noise(rng, 0.9))[:count]
+    whole, K = merge(parts), np.hstack([np.eye(4), rng.standard_normal((4, 2))])
+    wls = WLS(independent_share=share).fit(whole)
+    R = whole.weighted(wls.sigma)[:4, :4]
+    C = np.linalg.inv(share * K.T @ R.T @ R @ K + np.diag(np.arange(1.0, 7.0)))
+    theta = np.linalg.lstsq(K, wls.theta, rcond=None)[0]
+    estimate = replace(
+        wls, theta=theta, covariance=C, names=tuple("abcdef"), details={"active": ("x y",)}
+    )
+    solved = [distances, ["slow", "other"]]
+
+    def redrawn(*arguments):
+        given.append(arguments)
+        return solved
+
+    fit = SimpleNamespace(
+        rows=lambda factors, sigma: (factors, sigma), prior_weight=2.5, weight_ratio=1.5,
+        programme=SimpleNamespace(redrawn=redrawn),
+    )  # fmt: skip
+    every = (estimate, parts, whole, share, K, wls.sigma)
+    plain, without = measured_errors(*every)
+    found, errors = measured_errors(*every, redraws=Redraws(fit, 10, "noise"))
+    (rows, weight, pi, meat, ratio, draws, source), *_ = given
+    assert rows == (whole, wls.sigma)
+    assert (weight, ratio, draws, source) == (2.5, 1.5, 10, "noise")
+    np.testing.assert_array_equal(pi, theta)
+    wanted = share * R.T @ R
+    if count == 40:
+        wanted = share**2 * scatter(parts, K @ theta, wls.sigma, share * K @ C @ K.T).meat
+    np.testing.assert_allclose(meat, wanted, rtol=1e-9)
+    np.testing.assert_allclose(found.covariance, distances.T @ distances / 8, rtol=1e-12)
+    np.testing.assert_allclose(1 / errors.freedom, 1 / without.freedom + 1 / 8, rtol=1e-12)
+    np.testing.assert_array_equal(errors.unbounded, plain.std_error)
+    assert errors.method == (
+        f"{without.method}; bounds are active: 8 fits to resampled data and prior "
+        "(2 more not solved: slow)"
+    )
+    solved[:] = distances[:7], ["slow", "other", "other"]
+    with pytest.raises(NotConvergedError, match="solved 7 of 10 fits") as error:
+        measured_errors(*every, redraws=Redraws(fit, 10, "noise"))
+    assert error.value.status == "slow"
+    for off in (Redraws(fit, 0, "noise"), None):  # bounds are neglected
+        assert measured_errors(*every, redraws=off)[1].unbounded is None
+    if count == 11:
+        wide = measured_errors(*every, weight_ratio=3.0)[0]
+        L = np.diag(np.arange(1.0, 7.0))
+        np.testing.assert_allclose(
+            wide.covariance, C @ (share * K.T @ R.T @ R @ K + 3.0 * L) @ C, atol=1e-9
+        )
+
+
+def test_a_gradient_method_has_rank_and_names_of_least_squares(W):
+    wls = WLS().fit(merge(segments(W, W @ TRUTH + noise(np.random.default_rng(5), 0.0))))
+    wls = replace(wls, rank=3, condition=7.5, undetermined=("b",), sigma=np.array([1.0, 2.0]))
+    own = {"rank": 4, "condition": np.inf, "undetermined": (), "sigma": SIGMA, "n_iter": 11}
+    rough = replace(wls, **own, message="11 steps; a gradient method has no covariance")
+    found = with_wls_errors(rough, wls)
+    assert (found.rank, found.condition, found.undetermined) == (3, 7.5, ("b",))
+    assert (found.n_iter, found.message.split("; ")[0]) == (11, "11 steps")
+    assert "gradient" not in found.message
+    np.testing.assert_array_equal(found.sigma, SIGMA)

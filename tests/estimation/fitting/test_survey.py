@@ -1,0 +1,450 @@
+"""A log read in pieces gives what the same log in memory gives."""
+
+import pickle
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pinocchio as pin
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from helpers.closed_chains import four_bar
+from helpers.driven import arm
+from helpers.synthetic import truth
+
+from robotid.base.exceptions import DataError
+from robotid.data.base_motion import BaseColumns, BaseMotion
+from robotid.data.files.read import lay_out, read_log, write_log
+from robotid.data.files.table_files import open_table, write_columns
+from robotid.data.imu_frame import ImuFrame
+from robotid.data.log import Log
+from robotid.data.signal_settings import LogUnits, SignalSettings
+from robotid.dynamics.base_parameters import structural_mapping
+from robotid.dynamics.factors import join
+from robotid.dynamics.simulation.motions import random_fourier
+from robotid.dynamics.torque import joint_torque_regressor, mass_regressor
+from robotid.estimation.estimators import WLS
+from robotid.estimation.fitting import survey
+from robotid.estimation.fitting.recorded import Recordings
+from robotid.estimation.fitting.survey import ReducedPiece, hold_log, survey_log
+from robotid.robot.closure import Chains
+from robotid.robot.constraints import Contact
+from robotid.robot.drives import Cubic
+from robotid.robot.examples import example_urdf
+from robotid.robot.model import RobotModel
+
+LENGTH = 500  # rows per piece
+
+
+@pytest.fixture(scope="module")
+def robot():
+    return arm()
+
+
+@pytest.fixture(scope="module")
+def recording(robot):
+    """Return a noisy log of three joints with jitter and gaps, one of them where a piece ends."""
+    rng = np.random.default_rng(0)
+    step = 0.01 * (1 + 0.1 * rng.uniform(-1, 1, 1999))
+    step[[2 * LENGTH - 1, 1234]] = [0.5, 0.7]
+    t = np.concatenate([[0.0], np.cumsum(step)])
+    q, v, a = random_fourier(robot, rng, period=7.0).evaluate(t)
+    tau = (joint_torque_regressor(robot, q, v, a) @ truth(robot)).reshape(v.shape)
+    noisy = {"q": q + 1e-5 * rng.standard_normal(q.shape), "v": v, "a": a}
+    return Log(t=t, tau=tau + 0.1 * rng.standard_normal(q.shape), joints=robot.joints, **noisy)
+
+
+def long_log(model, path, signals, *, start=None, end=None, length=LENGTH, **reading):
+    layout, table = lay_out(path, model.joints, **reading)
+    return survey_log(layout, table, model, signals, (start, end), length=length)
+
+
+def pieces_of(log):
+    """Return the pieces of a log, ready to be reduced."""
+    mapping = structural_mapping(log.model)
+    return [ReducedPiece(piece, mapping) for piece in log.pieces]
+
+
+def assert_alike(model, path, signals, *, start=None, end=None, **reading):
+    """Check pieces against the log in memory; return both."""
+    mapping = structural_mapping(model)
+    found = long_log(model, path, signals, start=start, end=end, **reading)
+    whole = hold_log(model, read_log(path, model.joints, start=start, end=end, **reading), signals)
+    wanted = join(Recordings(model, mapping, [whole]).reduce())
+    joined = join([piece.reduce() for piece in pieces_of(found)])
+    assert found.signals == whole.signals
+    assert joined.samples == wanted.samples
+    np.testing.assert_array_equal(joined.factors.rows, wanted.factors.rows)
+    np.testing.assert_allclose(joined.squares, wanted.squares, rtol=1e-9)
+    one, other = WLS().fit(joined.factors), WLS().fit(wanted.factors)
+    size = np.abs(other.theta).max()
+    np.testing.assert_allclose(one.theta, other.theta, rtol=1e-9, atol=1e-10 * size)
+    np.testing.assert_allclose(one.std_error, other.std_error, rtol=1e-8)
+    if signals.cutoff is None:
+        assert whole.whole.trajectory.direction is None
+    else:
+        directions = [piece.read().trajectory.direction for piece in found.pieces]
+        wanted = whole.whole.trajectory.direction
+        np.testing.assert_allclose(np.concatenate(directions), wanted, rtol=0, atol=1e-10)
+    return found, whole
+
+
+@pytest.mark.parametrize(
+    ("suffix", "given"),
+    [
+        ("csv", {}),
+        ("parquet", {"velocity": "differentiated", "cutoff": 12.0, "order": 2}),
+        ("csv", {"cutoff": None, "min_velocity": 0.0}),
+        ("parquet", {"cutoff": None, "rate": 70.0}),
+        ("csv", {"rate": 50.0, "trim": 0.6, "torque_delay": 0.02}),
+        ("npz", {}),
+        ("npz", {"rate": 50.0, "trim": 0.6, "torque_delay": 0.02}),
+    ],
+    ids=str,
+)
+def test_pieces_reduce_to_what_the_whole_log_reduces_to(robot, recording, suffix, given, tmp_path):
+    path = tmp_path / f"run.{suffix}"
+    write_log(recording, path)
+    found, _ = assert_alike(robot, path, SignalSettings(**given))
+    assert len(found.pieces) == (4 if suffix != "npz" else 1)
+    assert [p.name for p in found.pieces][:1] in (
+        ["run.csv rows 0-500"],
+        ["run.parquet rows 0-500"],
+        ["run.npz rows 0-2000"],
+    )
+    assert sum(piece.samples for piece in found.pieces) == len(recording.t)
+    assert found.stamps[[found.first, found.stop - 1]].tolist() == [recording.t[0], recording.t[-1]]
+    assert found.step == np.median(np.diff(recording.t))
+
+
+def test_a_window_of_a_file_is_cut_as_in_memory(robot, recording, tmp_path):
+    path = tmp_path / "run.csv"
+    write_log(recording, path)
+    found, whole = assert_alike(robot, path, SignalSettings(), start=3.3, end=12.01)
+    np.testing.assert_array_equal(found.stamps[found.first : found.stop], whole.stamps)
+    with pytest.raises(DataError) as in_memory:
+        read_log(path, robot.joints, start=50.0, end=60.0)
+    with pytest.raises(DataError) as in_pieces:
+        long_log(robot, path, SignalSettings(), start=50.0, end=60.0)
+    assert str(in_pieces.value) == str(in_memory.value)
+
+
+def test_units_and_gains_are_read_as_in_memory(robot, recording, tmp_path):
+    columns = {"time": 1e3 * recording.t}
+    for j, joint in enumerate(robot.joints):
+        columns[f"q_{joint}"] = np.rad2deg(recording.q[:, j])
+        columns[f"dq_{joint}"] = np.rad2deg(recording.v[:, j])
+        columns[f"current_{joint}"] = recording.tau[:, j] / (j + 2.0)
+    path = tmp_path / "run.parquet"
+    write_columns(columns, path)
+    gains = {joint: j + 2.0 for j, joint in enumerate(robot.joints)}
+    assert_alike(robot, path, SignalSettings(), gains=gains, units=LogUnits("ms", "deg"))
+    with pytest.raises(DataError, match="milliseconds"):
+        long_log(robot, path, SignalSettings(), gains=gains, units=LogUnits(None, "deg"))
+    with pytest.raises(DataError, match=r"q_.* looks like degrees"):
+        long_log(robot, path, SignalSettings(), gains=gains, units=LogUnits("ms"))
+
+
+def test_full_turns_are_taken_out_of_each_piece(tmp_path):
+    """A turn more or less of a joint without limits changes neither motion nor torque."""
+    kinova = RobotModel.from_urdf(example_urdf("kinova.urdf"))
+    free = np.array([joint.turns_freely for joint in kinova.limits])
+    assert free.any()
+    rng = np.random.default_rng(1)
+    t = 0.01 * np.arange(1500)
+    q, v, a = random_fourier(kinova, rng, period=8.0).evaluate(t)
+    turn = np.sin(0.5 * t)[:, None] * 6.0 * free  # [rad] beyond a half turn to both sides
+    q, v, a = q + turn, v + 3.0 * np.cos(0.5 * t)[:, None] * free, a - 0.25 * turn
+    tau = (joint_torque_regressor(kinova, q, v, a) @ truth(kinova)).reshape(v.shape)
+    wrapped = np.where(free, (q + np.pi) % (2 * np.pi) - np.pi, q)
+    tau += 0.1 * rng.standard_normal(tau.shape)
+    path = tmp_path / "run.parquet"
+    write_log(Log(t=t, q=wrapped, tau=tau, joints=kinova.joints), path)
+    found, _ = assert_alike(kinova, path, SignalSettings())
+    turned = [piece.read().turned for piece in found.pieces]
+    assert np.any(turned, axis=0).tolist() == free.tolist()
+
+
+def test_parquet_is_read_across_its_row_groups(robot, recording, tmp_path):
+    path = tmp_path / "run.parquet"
+    write_log(recording, path)
+    table = pq.read_table(path)
+    pq.write_table(table, path, row_group_size=170)
+    rows = open_table(path, lay_out(path, robot.joints)[0].source).rows
+    assert rows.count() == 2000
+    for first, stop in ((0, 2000), (169, 341), (170, 340), (1999, 2000)):
+        part = rows.read(["time", "q_elbow_joint"], first, stop, None)
+        np.testing.assert_array_equal(part["time"], recording.t[first:stop])
+        np.testing.assert_array_equal(part["q_elbow_joint"], recording.q[first:stop, 1])
+    with_null = table.set_column(0, "time", pa.array([None, *recording.t[1:].tolist()]))
+    pq.write_table(with_null, path)
+    with pytest.raises(DataError, match=r"run.parquet: time is NaN at row 0"):
+        long_log(robot, path, SignalSettings())
+
+
+def test_blank_lines_of_a_csv_are_no_rows(robot, recording, tmp_path, monkeypatch):
+    monkeypatch.setattr(
+        "robotid.data.files.csv_files._BLOCK", 170
+    )  # lines, so that pieces start within one
+    path = tmp_path / "run.csv"
+    write_log(recording, path)
+    lines = path.read_text().splitlines()
+    lines[700:700] = ["", "  "]
+    path.write_text("\ufeff" + "\r\n".join(lines) + "\r\n\r\n", encoding="utf-8")
+    assert_alike(robot, path, SignalSettings())
+    lines[1500] = lines[1500].replace(",", ",,", 1)
+    path.write_text("\n".join(lines))
+    with pytest.raises(DataError, match=r"line 1501 has 14 cells, the header has 13"):
+        long_log(robot, path, SignalSettings())
+
+
+def spoilt(recording, tmp_path, name, row, value):
+    table = {"time": recording.t.copy()}
+    for j, joint in enumerate(recording.joints):
+        table[f"q_{joint}"] = recording.q[:, j].copy()
+        table[f"tau_{joint}"] = recording.tau[:, j].copy()
+    table[name][row] = value
+    path = tmp_path / "run.parquet"
+    write_columns(table, path)
+    return path
+
+
+def test_a_hole_in_the_last_piece_is_named_by_its_row_in_the_file(
+    robot, recording, tmp_path, monkeypatch
+):
+    path = spoilt(recording, tmp_path, "tau_elbow_joint", 1801, np.nan)
+    layout, table = lay_out(path, robot.joints)
+    short = replace(layout, notes=())
+    monkeypatch.setattr(survey, "_WINDOW", 100)
+    window = (2.0, None)
+    log = survey_log(short, table, robot, SignalSettings(cutoff=None), window, length=LENGTH)
+    pieces = pieces_of(log)
+    pieces[-2].reduce()
+    with pytest.raises(DataError, match=r"tau_elbow_joint is NaN at row 1801 \(t = ") as found:
+        pieces[-1].reduce()
+    assert found.value.code == "not_finite"
+
+
+@pytest.mark.parametrize("row", [LENGTH, 2 * LENGTH, LENGTH + 1])
+def test_time_must_increase_where_pieces_meet_too(robot, recording, tmp_path, row):
+    path = spoilt(recording, tmp_path, "time", row, recording.t[row - 1])
+    with pytest.raises(DataError) as in_memory:
+        read_log(path, robot.joints)
+    with pytest.raises(DataError) as in_pieces:
+        long_log(robot, path, SignalSettings())
+    assert str(in_pieces.value) == str(in_memory.value)
+    assert f"t[{row}]" in str(in_pieces.value)
+
+
+def test_a_log_is_read_in_pieces_of_16384_rows_if_nothing_else_is_said(tmp_path):
+    arm = RobotModel.from_urdf(example_urdf("ur5_robot.urdf"), joints=["elbow_joint"])
+    t = 3.0 + 0.01 * np.arange(16_500)
+    columns = {"t": t, "q_elbow_joint": np.sin(t), "tau_elbow_joint": np.cos(t)}
+    write_columns(columns, tmp_path / "run.parquet")
+    layout, table = lay_out(tmp_path / "run.parquet", arm.joints)
+    found = survey_log(layout, table, arm, SignalSettings(), (4.0, None))
+    assert [(p.first, p.stop) for p in found.pieces] == [(100, 16_484), (16_484, 16_500)]
+    assert found.with_accelerometer_bias(np.ones(3)).windows == found.windows  # it has no IMU
+
+
+def test_samples_have_the_regressor_of_their_mass_matrix(robot, recording, tmp_path):
+    """Of two logs, in memory and in pieces."""
+    mapping, signals = structural_mapping(robot), SignalSettings(cutoff=None, trim=0.0)
+    logs = [recording.window(start, start + 0.8) for start in (1.0, 3.0)]
+    held = [hold_log(robot, log, signals) for log in logs]
+    q = np.concatenate([log.whole.trajectory.q for log in held])
+    wanted = mass_regressor(robot, q)[..., mapping.independent]
+    for k, log in enumerate(logs):
+        write_log(log, tmp_path / f"{k}.csv")
+    read = [long_log(robot, tmp_path / f"{k}.csv", signals, length=30) for k in range(2)]
+    for own in (held, read):
+        recordings = Recordings(robot, mapping, own)
+        found = [sample.mass_regressor for sample in recordings.problem(with_mass=True).samples()]
+        np.testing.assert_allclose(np.array(found), wanted, atol=1e-9)
+        assert next(recordings.problem().samples()).mass_regressor is None
+
+
+def test_pieces_travel_as_they_are(robot, recording, tmp_path):
+    path = tmp_path / "run.parquet"
+    write_log(recording, path)
+    pieces = pieces_of(long_log(robot, path, SignalSettings()))
+    for piece, again in zip(pieces, pickle.loads(pickle.dumps(pieces)), strict=True):
+        np.testing.assert_array_equal(again.reduce().factors.R, piece.reduce().factors.R)
+    # the model and the mapping go along once
+    assert len(pickle.dumps(pieces)) < len(pickle.dumps(pieces[:1])) + 1000 * len(pieces)
+
+
+def test_positions_of_locked_joints_are_those_of_all_windows_in_radians():
+    kinds = {"a": "revolute", "b": "continuous", "s": "prismatic", "c": "revolute"}
+    joints = [SimpleNamespace(name=name, type=kind) for name, kind in kinds.items()]
+    model = SimpleNamespace(tree=SimpleNamespace(movable=joints))
+    layout = SimpleNamespace(units=LogUnits("s", "deg"))
+    windows = [
+        {
+            "x": np.array([10.0, np.nan, 30.0]),
+            "y": np.array([1.0, 2.0, 3.0]),
+            "z": np.full(3, np.nan),
+        },
+        {"x": np.array([40.0, 50.0]), "y": np.array([4.0, 5.0]), "z": np.full(2, np.nan)},
+    ]
+    names = {"a": "x", "s": "y", "c": "z"}
+    found = survey._positions(names, windows, layout, model)
+    assert found.keys() == {"a", "s"}  # nothing of the one whose column is empty
+    np.testing.assert_allclose(found["a"], np.deg2rad([10.0, 30.0, 40.0, 50.0]))
+    np.testing.assert_array_equal(found["s"], [1.0, 2.0, 3.0, 4.0, 5.0])
+    part = survey._positions(names, windows, layout, model, slice(2, 4))
+    np.testing.assert_allclose(part["a"], np.deg2rad([30.0, 40.0]))
+    layout.units = LogUnits("s", "rad")
+    plain = survey._positions({"b": "x"}, windows[1:], layout, model)
+    np.testing.assert_array_equal(plain["b"], [40.0, 50.0])
+
+
+def test_the_pieces_of_a_log_have_the_bias_of_all_rests_of_its_windows(monkeypatch, tmp_path):
+    """The robot moves in the first window, rests in the middle one and a part of the last one."""
+    monkeypatch.setattr(survey, "_WINDOW", 200)
+    robot = RobotModel.from_urdf(example_urdf("solo12.urdf"), free_flyer=True, terms=())
+    t = 3.0 + 0.01 * np.arange(1000)
+    rests = ((t > 6.9) & (t < 9.1)) | (t > 11.495)
+    q = np.where(rests, 0.0, np.sin(9.0 * t))
+    bias, turn = np.array([0.011, -0.02, 0.005]), pin.rpy.rpyToMatrix(0.4, -1.1, 2.9)
+    w = bias + np.where(rests, 0.0, np.cos(7.0 * t))[:, None] + 0.002 * (t > 11.495)[:, None]
+    columns = {"t": t} | {f"{x}_{j}": q for j in robot.joints for x in ("q", "tau")}
+    columns |= {f"imu_{x}": 0.0 * t for x in ("qx", "qy", "qz", "ax", "ay")}
+    columns |= {"imu_qw": 1.0 + 0.0 * t, "imu_az": 9.81 + 0.0 * t}
+    columns |= {f"imu_{x}": y for x, y in zip(("wx", "wy", "wz"), w.T, strict=True)}
+    write_columns(columns, tmp_path / "run.csv")
+    frame = ImuFrame(pin.Quaternion(turn).coeffs(), np.zeros(3), np.array([0.0, 0.0, -9.81]))
+    base, signals = BaseColumns(True, imu=frame), SignalSettings(cutoff=None, trim=0.0)
+    found = long_log(robot, tmp_path / "run.csv", signals, base=base, length=250)
+    # whole half seconds at rest: 3 in the middle window from 7 s, 2 in the last one from 11 s
+    wanted = turn @ (bias + 0.002 * 2 / 5)
+    np.testing.assert_allclose(found.source.base.imu.bias, wanted, atol=1e-6)
+    for log in found.windows:
+        rows = np.searchsorted(t, log.t)
+        values = log.base.imu.values[:, :3]
+        np.testing.assert_allclose(values, w[rows] @ turn.T - wanted, atol=1e-6)
+        (note,) = [x for x in log.notes if "gyroscopes" in x]
+        assert "estimated in 2.5 s at rest" in note
+    offset = np.array([0.3, -0.2, 0.1])
+    changed = found.with_accelerometer_bias(offset)
+    for log in changed.windows:
+        np.testing.assert_array_equal(log.base.imu.frame.offset, offset)
+    pieces, others = ([x.read().trajectory for x in log.pieces] for log in (found, changed))
+    at, own, a = (np.concatenate([getattr(x, name) for x in pieces]) for name in ("t", "v", "a"))
+    rows = np.searchsorted(t, at - 1e-6)
+    np.testing.assert_allclose(own[:, 3:6], w[rows] @ turn.T - wanted, atol=1e-6)
+    biased = np.concatenate([x.a for x in others])
+    np.testing.assert_allclose(a[:, :3] - biased[:, :3], np.tile(offset, (len(a), 1)), atol=1e-9)
+    np.testing.assert_array_equal(a[:, 3:], biased[:, 3:])
+
+
+def test_means_of_segments_of_a_static_robot_replace_filter_and_rate(robot, recording):
+    signals = SignalSettings(
+        cutoff=6.0, rate=50.0, velocity="measured", acceleration="measured", max_gap=0.1
+    )
+    held = hold_log(replace(robot, dynamics="static"), recording, signals)
+    assert held.signals == replace(
+        signals, cutoff=None, rate=None, velocity="differentiated", acceleration="differentiated"
+    )
+    assert hold_log(robot, recording, signals).signals.rate == 50.0
+
+
+def test_windows_of_a_long_log_are_named_by_their_own_rows(monkeypatch):
+    monkeypatch.setattr(survey, "_WINDOW", 100)
+    q = np.zeros((2, 1))
+    windows = tuple(Log(np.arange(2.0), q, q, ("a",), path="run.csv", notes=(n,)) for n in "xyz")
+    log = SimpleNamespace(windows=windows, first=7, stop=1008)
+    looks = survey.SurveyedLog.looks.fget(log)
+    assert [own.path for own in looks] == [
+        "run.csv rows 7-107", "run.csv rows 457-557", "run.csv rows 908-1008",
+    ]  # fmt: skip
+    assert {own.notes for own in looks} == {()}
+    head = survey.SurveyedLog.head.fget(log)
+    assert head.notes == (
+        "x", "the log is too long for the memory; the doctor checked rows 7-107, 457-557, "
+        "908-1008 only",
+    )  # fmt: skip
+    short = SimpleNamespace(windows=windows[:1], first=7, stop=300)
+    assert survey.SurveyedLog.looks.fget(short) == windows[:1]
+    assert survey.SurveyedLog.head.fget(short) is windows[0]
+
+
+def test_a_log_without_a_segment_of_sufficient_length_is_named():
+    for is_static, words in (
+        (False, "none of its 2 segments without gaps is long enough for the filter and a trim of "
+         "0.75 s at each end"),
+        (True, "no segment of 0.25 s is slow enough for dynamics = 'static'"),
+    ):  # fmt: skip
+        for path, name in (("", "log"), ("run.csv", "run.csv")):
+            log = SimpleNamespace(
+                model=SimpleNamespace(is_static=is_static), path=path, segments=("a", "b"),
+                signals=SignalSettings(trim=0.75),
+            )  # fmt: skip
+            error = survey.SurveyedLog.too_short(log)
+            assert str(error).startswith(f"{name}: {words}; record")
+            assert error.code == "too_short"
+
+
+def test_other_drive_terms_keep_the_rows_and_torques_without_contact_forces(rng):
+    """A quadruped on two feet; of a log without them, or in another order, nothing is read."""
+    feet = ("HR_FOOT", "FL_FOOT")
+    model = RobotModel.from_urdf(
+        example_urdf("solo12.urdf"), free_flyer=True, terms=("viscous",),
+        constraints=[Contact(foot) for foot in feet],
+    )  # fmt: skip
+    t = np.arange(60) / 50.0
+    pose = np.column_stack([np.sin(t), t, 0 * t, 0 * t, 0 * t, np.sin(t / 2), np.cos(t / 2)])
+    flags = {foot: (t > 0.5) == (foot == feet[0]) for foot in feet}
+    q, tau = np.sin(np.outer(t, rng.uniform(1, 3, 12))), rng.standard_normal((60, 12))
+    log = Log(t, q, tau, model.joints, base=BaseMotion(pose), contacts=flags)
+    settings = SignalSettings(cutoff=None, trim=0.0, velocity="differentiated")
+    held = hold_log(model, log, settings)
+    first = held.whole
+    assert np.flatnonzero(~first.mask.all(axis=1)).tolist() == [25, 26]  # the feet change
+    other = held.with_model(model.with_terms({"FL_KFE": (Cubic(),)})).whole
+    np.testing.assert_array_equal(other.mask, first.mask)
+    np.testing.assert_array_equal(other.trajectory.basis, first.trajectory.basis)
+    np.testing.assert_array_equal(other.trajectory.tau, first.trajectory.tau)
+    # nor are rows taken again that a jump of the base without contacts left out
+    jumped = replace(
+        log, base=BaseMotion(pose + 0.3 * np.outer(t > 0.75, np.eye(7)[2])), contacts={}
+    )
+    held = hold_log(replace(model, constraints=()), jumped, settings)
+    assert held.whole.mask.any(axis=1)[[0, 38, 59]].tolist() == [True, False, True]
+    other = held.with_model(held.model.with_terms({"FL_KFE": (Cubic(),)})).whole
+    np.testing.assert_array_equal(other.mask, held.whole.mask)
+    turned = replace(log, contacts=dict(reversed(flags.items())))
+    with pytest.raises(DataError, match="has the contacts FL_FOOT, HR_FOOT, wanted those of the"):
+        hold_log(model, turned, settings)
+    with pytest.raises(DataError, match="log has no pose of the floating base"):
+        hold_log(model, replace(log, base=None), settings)
+
+
+def test_other_drive_terms_keep_the_rows_that_a_closed_chain_leaves(rng, tmp_path):
+    """Crank and coupler in line: the rocker cannot move, and the bars hold all of its torque."""
+    model = four_bar(tmp_path, terms=("viscous",))
+    t = np.arange(41) / 50.0
+    given = np.zeros((41, 3))
+    given[:, model.joints.index("elbow")] = np.sin(2 * (t - t[20]))
+    missing = np.array([joint != "elbow" for joint in model.joints])
+    q = Chains(model).closed(given, missing)
+    log = Log(t, q, rng.standard_normal(q.shape), model.joints)
+    settings = SignalSettings(cutoff=None, trim=0.0, min_velocity=0.0)
+    held = hold_log(model, log, settings)
+    first, pivot = held.whole, model.joints.index("pivot")
+    assert np.argwhere(~first.mask).tolist() == [[20, pivot]]
+    other = held.with_model(model.with_terms({"elbow": (Cubic(),)})).whole
+    np.testing.assert_array_equal(other.mask, first.mask)
+    # read in pieces the torques of the bars are mixed likewise: every row has every column
+    write_log(log, tmp_path / "log.csv")
+    mapping = structural_mapping(model)
+    held, read = (
+        Recordings(model, mapping, [own]).problem()
+        for own in (held, long_log(model, tmp_path / "log.csv", settings, length=15))
+    )
+    assert read.is_projected
+    np.testing.assert_array_equal(read.support, held.support)
+    rows = [[np.concatenate(x) for x in zip(*own.blocks(), strict=True)] for own in (held, read)]
+    for one, other in zip(*rows, strict=True):
+        np.testing.assert_allclose(other, one, atol=1e-9)

@@ -1,0 +1,183 @@
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from helpers.mujoco_plant import plant, torque_log
+
+from robotid.base.exceptions import DataError
+from robotid.base.typing import ignore_progress
+from robotid.data.log import Log
+from robotid.data.signal_settings import SignalSettings
+from robotid.dynamics.simulation.loops import ClosedLoopRobot, cut_windows, open_loops
+from robotid.estimation.fitting.estimator_settings import SimulationSettings
+from robotid.identification.closed_loop.driven import driven_log, torque_rows
+from robotid.identification.closed_loop.from_commands import identify_loops
+from robotid.identification.closed_loop.loop_settings import LoopSettings
+from robotid.identification.closed_loop.position_errors import DRIFTS, run_open_loop
+from robotid.identification.closed_loop.stages import _initialise_from_torque
+from robotid.robot.model import RobotModel
+
+SIGNALS = SignalSettings(cutoff=30.0)
+DRIVEN = LoopSettings(kind="torque")
+
+
+def true_parameters(robot):
+    pi, names = robot.model.standard_parameters(), robot.model.layout.names
+    for name, value in robot.truth.items():
+        if name in names:
+            pi[names.index(name)] = value
+    return pi
+
+
+@pytest.fixture(scope="module")
+def arm():
+    """A planar arm in MuJoCo, a log to fit and one kept apart: positions and torques."""
+    rng = np.random.default_rng(5)
+    robot = plant("planar", rng, delay=0.0)
+    logs = [torque_log(robot, rng, duration=d, noise=2e-5, torque=0.05) for d in (6.0, 3.0)]
+    return robot, *logs
+
+
+def found_by(arm, **settings):
+    robot, log, kept = arm
+    chosen = SimulationSettings(bodies=0.0, step=4e-3, **settings)
+    return identify_loops(
+        robot.model, [log], [kept], DRIVEN, chosen, signals=SIGNALS, chooses=False
+    )
+
+
+@pytest.fixture(scope="module")
+def alone(arm):
+    return found_by(arm, torques=False)
+
+
+@pytest.fixture(scope="module")
+def both(arm):
+    return found_by(arm)
+
+
+def test_what_is_fed_forward_is_the_mean_torque_between_two_rows():
+    t = np.arange(5) * 0.01
+    tau = np.column_stack([t, t**2])
+    model = RobotModel.from_urdf(plant("planar", np.random.default_rng(0)).model.tree)
+    log = Log(t, np.zeros((5, 2)), tau, model.joints, v=np.ones((5, 2)))
+    heard = driven_log(model, log, SignalSettings())
+    np.testing.assert_allclose(heard.tau_ref[:4, 0], t[:4] + 0.005)
+    np.testing.assert_allclose(heard.tau_ref[:4, 1], (t[:4] ** 2 + t[1:] ** 2) / 2)
+    np.testing.assert_allclose(heard.tau_ref[4], tau[4])
+    assert heard.v_ref is None
+    late = driven_log(model, log, SignalSettings(torque_delay=0.01))
+    np.testing.assert_allclose(late.tau_ref[:3], heard.tau_ref[1:4])
+    np.testing.assert_array_equal(late.tau, log.tau)  # rows of torque are moved back elsewhere
+
+
+def test_the_true_robot_does_under_its_torque_what_mujocos_does(arm):
+    robot, rng = arm[0], np.random.default_rng(8)
+    log = driven_log(robot.model, torque_log(robot, rng, duration=2.0, rate=500.0), SIGNALS)
+    loops = open_loops(robot.model, true_parameters(robot))
+    run = run_open_loop(ClosedLoopRobot(robot.model, step=1e-3), loops, log)
+    # its friction is soft over 1e-2 rad/s, ours over 1e-4
+    assert (run.rmse < 3e-3).all()
+    assert (run.rmse < 0.05 * run.spread).all()
+
+
+def assert_drives_are_found(robot, estimate, share):
+    for name, value in zip(estimate.names, estimate.theta, strict=True):
+        joint, _, kind = name.rpartition(".")
+        size = robot.truth[f"{joint}.coulomb" if kind == "offset" else name]
+        assert abs(value - robot.truth[name]) < share * size, name
+
+
+def test_roll_outs_alone_find_the_drives_of_an_arm(arm, alone):
+    estimate = alone.fit.estimate
+    assert estimate.converged
+    kinds = {name.rpartition(".")[2] for name in estimate.names}
+    assert kinds == {"armature", "viscous", "coulomb", "offset"}, "no gain, no delay"
+    assert alone.fit.simulator.torque is None
+    assert_drives_are_found(arm[0], estimate, 0.04)
+    urdf = arm[0].model.standard_parameters()[:20]
+    np.testing.assert_array_equal(alone.standard[:20], urdf)  # bodies stay: bodies=0
+
+
+def test_rows_of_torque_and_roll_outs_weigh_in_one_estimate(arm, alone, both):
+    simulator, estimate = both.fit.simulator, both.fit.estimate
+    assert estimate.converged
+    assert_drives_are_found(arm[0], estimate, 0.04)
+    A, _ = simulator.rows(estimate.theta)
+    # each row counts by half, for what it drives counts, too
+    whole = torque_rows(both.fit.linear)
+    np.testing.assert_allclose(np.sqrt(2.0) * simulator.torque.R, whole.R, atol=1e-9)
+    # one noise is in both: they tell no more than the better of them, by itself
+    rows = np.linalg.inv(2.0 * A.T @ A + np.diag(1.0 / simulator.prior_std**2))
+    best = np.minimum(np.sqrt(np.diag(rows)), alone.fit.estimate.std_error)
+    assert (estimate.std_error > 0.5 * best).all()
+
+
+def test_open_loops_of_torques_are_put_back_and_beside_plainer_models(arm, both):
+    [run] = both.validation
+    robot, loops = both.fit.simulator.robot, both.fit.loops
+    windows = cut_windows(run.log, DRIFTS, 0.0)
+    assert {round(w.log.t[w.stop - 1] - w.log.t[w.first], 2) for w in windows} == {0.5}
+    q = np.concatenate([out.q for out in robot.roll_out(loops, windows)])
+    np.testing.assert_allclose(run.rmse, np.sqrt(np.mean((run.log.q - q) ** 2, axis=0)))
+    assert run.baselines["command"] is None
+    assert run.baselines["second_order"] is None
+    start = np.concatenate([np.tile(w.start[0], (w.stop - w.first, 1)) for w in windows])
+    speed = np.concatenate([
+        np.outer(w.log.t[w.counted] - w.log.t[w.first], w.start[1]) for w in windows
+    ])  # fmt: skip
+    np.testing.assert_allclose(run.spread, np.sqrt(np.mean((run.log.q - start) ** 2, axis=0)))
+    on = np.sqrt(np.mean((run.log.q - start - speed) ** 2, axis=0))
+    np.testing.assert_allclose(run.baselines["steady"], on)
+    for other in map(run.baselines.get, ("steady", "urdf", "rows")):
+        assert (run.rmse < 1.05 * other).all()
+    assert (run.rmse < 0.02 * run.baselines["steady"]).all()
+    assert both.verdict.status in ("good", "usable")
+
+
+def test_windows_have_the_stated_length_and_lead(arm):
+    robot, *logs = arm
+    logs = [driven_log(robot.model, log.window(0.5, 2.0), SIGNALS) for log in logs]
+    stated = SimulationSettings(bodies=0.0, torques=False, window=0.4, lead=0.1)
+    found = _initialise_from_torque(robot.model, logs, DRIVEN, stated, SIGNALS, ignore_progress)
+    wanted = [(x.first, x.start_row, x.stop) for log in logs for x in cut_windows(log, 0.4, 0.1)]
+    windows = found.simulator.windows
+    assert [(x.first, x.start_row, x.stop) for x in windows] == wanted
+    assert wanted[1][0] - wanted[1][1] == 25  # rows of 4 ms
+
+
+def test_full_turns_are_taken_out_of_joints_that_turn_freely(tmp_path):
+    tree = plant("planar", np.random.default_rng(0)).model.tree
+    path = tmp_path / "free.urdf"
+    path.write_text(Path(tree.path).read_text().replace('type="revolute"', 'type="continuous"'))
+    model = RobotModel.from_urdf(path)
+    t = np.arange(80) * 0.01
+    angle = 3.0 + 2.0 * t
+    q = np.column_stack([np.angle(np.exp(1j * angle)), 0 * t])
+    heard = driven_log(model, Log(t, q, 0 * q, model.joints), SignalSettings())
+    np.testing.assert_allclose(heard.q[:, 0], angle)
+    np.testing.assert_array_equal(heard.q_ref, heard.q)
+
+
+def test_a_log_without_torque_drives_nothing(arm):
+    robot, log, _ = arm
+    bare = Log(log.t, log.q, np.zeros_like(log.q), log.joints, has_torque=False)
+    with pytest.raises(
+        DataError, match=r"has no torque, which \[controller\] kind = 'torque' needs"
+    ):
+        identify_loops(robot.model, [bare], [], DRIVEN, SimulationSettings())
+
+
+@pytest.mark.parametrize(("scatter", "counted", "variance"), [(4.0, 2.0, 8.0), (0.3, 2.0, 2.0)])
+def test_rows_of_torque_weigh_as_independent_as_their_scatter_shows(scatter, counted, variance):
+    found = SimpleNamespace(
+        model="the model", mapping=SimpleNamespace(K=np.eye(2)),
+        wls=SimpleNamespace(sigma=np.array([0.5, 2.0])),
+        errors=SimpleNamespace(inflation=scatter),
+        factors=SimpleNamespace(weighted=lambda sigma: np.diag(1.0 / sigma)),
+    )  # fmt: skip
+    rows = torque_rows(found, counted)
+    np.testing.assert_allclose(np.diag(rows.R), np.array([2.0, 0.5]) / np.sqrt(variance))
+    np.testing.assert_array_equal(rows.K, np.eye(2))
+    assert rows.model == "the model"

@@ -1,0 +1,344 @@
+from dataclasses import replace
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from helpers.mujoco_plant import multisine, plant, recorded
+
+from robotid.data.log import Log
+from robotid.dynamics.simulation.loops import ClosedLoopRobot, RollOut, Window, cut_windows
+from robotid.estimation.estimators.output_error import OutputError
+from robotid.identification.closed_loop.drive_torques import (
+    drive_torques,
+    find_gains,
+    measured_motion,
+)
+from robotid.identification.closed_loop.free_parameters import (
+    FreeParameter,
+    LoopSimulator,
+    free_body_parameters,
+)
+from robotid.identification.closed_loop.loop_settings import LoopSettings
+from robotid.identification.closed_loop.stages import stated_loops
+from robotid.output.files.commanded import loops_of
+from robotid.robot.drives import Coulomb, Viscous
+from robotid.robot.parameters import pseudo_inertia
+
+
+@pytest.fixture(scope="module")
+def simulator():
+    """A leg whose upper joints share armature and viscous friction, its bodies free."""
+    rng = np.random.default_rng(0)
+    robot = plant("leg", rng)
+    log, _ = recorded(robot, rng, duration=0.5, torque=0.1, speed=0.01)
+    looped = ClosedLoopRobot(robot.model)
+    base = replace(
+        stated_loops(robot.model, LoopSettings(kp=20.0, kd=1.5)),
+        armature=np.full(3, 0.02), terms=((Viscous(), Coulomb()),) * 3,
+        values=np.tile([0.1, 0.2], 3), delay=np.full(3, 0.0047),
+    )  # fmt: skip
+    free_parameters = (
+        FreeParameter("calf.coulomb", "term", (2,), 0.2, 1.0, 0.0, term=Coulomb()),
+        FreeParameter("upper.armature", "armature", (0, 1), 0.02, 1.0, 0.0),
+        FreeParameter("upper.viscous", "term", (0, 1), 0.1, 1.0, 0.0, term=Viscous()),
+        FreeParameter("delay", "delay", (0, 1, 2), 0.0047, 0.1, 0.0),
+        *free_body_parameters(looped, 0.1),
+        FreeParameter("hip.kp", "kp", (0,), 20.0, 100.0, 1.0),
+    )
+    return LoopSimulator(looped, cut_windows(log, 0.25, 0.0), base, free_parameters)
+
+
+def limited(simulator):
+    """The same with a largest torque, which is unknown as gains and zeros are."""
+    limit = np.array([np.inf, 0.3, 0.3])
+    free_parameters = (
+        FreeParameter("lower.limit", "limit", (1, 2), 0.3, 3.0, 0.1),
+        FreeParameter("lower.kd", "kd", (1, 2), 1.5, 1.0, 0.0),
+        FreeParameter("calf.zero", "zero", (2,), 0.0, 0.3),
+    )
+    base = replace(simulator.base, limit=limit)
+    return replace(
+        simulator, base=base, free_parameters=simulator.free_parameters + free_parameters
+    )
+
+
+def off(simulator, rng):
+    """Parameters whose bodies are not the URDF's."""
+    is_body = np.array([u.what == "body" for u in simulator.free_parameters])
+    return simulator.prior + np.where(is_body, 0.05 * rng.standard_normal(len(is_body)), 0.0)
+
+
+@pytest.mark.parametrize("compared", ["positions", "speeds", "torques", "all"])
+def test_slopes_of_residuals_are_those_of_differences(simulator, rng, compared):
+    if compared in ("speeds", "all"):
+        simulator = replace(simulator, velocities=True)
+    if compared in ("torques", "all"):
+        error = "output" if compared == "all" else "input"
+        simulator = replace(limited(simulator), error=error, lag=np.array([3, 2, 2.5]))
+    theta = off(simulator, rng)
+    found = simulator.residuals(theta, with_slopes=True)
+    slopes = np.concatenate([r.slopes for r in found])  # of the outputs
+    np.testing.assert_array_equal(found[0].columns, np.arange(len(theta)))
+    assert slopes.shape[1] == {"speeds": 6, "all": 9}.get(compared, 3)
+    plain = simulator.residuals(theta, with_slopes=False)
+    for one, bare in zip(found, plain, strict=True):
+        np.testing.assert_array_equal(one.e, bare.e)
+        np.testing.assert_array_equal(one.joints, bare.joints)
+    for k, name in enumerate(simulator.names):
+        h = 1e-8 / max(np.abs(slopes[:, :3, k]).max(), 1e-4)
+        if compared in ("torques", "all"):
+            h = 3e-8 / max(np.abs(slopes[:, -3:, k]).max(), 1e-2)
+        ends = []
+        for s in (1, -1):
+            moved = theta.copy()
+            moved[k] += s * h
+            ends.append(
+                np.concatenate([r.e for r in simulator.residuals(moved, with_slopes=False)])
+            )
+        exact = -(ends[0] - ends[1]) / (2 * h)
+        close, least = 1e-5, 1e-6
+        if compared in ("torques", "all"):  # by a wider step, too wide for a limit's positions
+            close, least = 1e-4, 1e-3 if compared == "all" else 1e-6
+        size = np.maximum(np.abs(exact).max(axis=0), least)
+        size = np.repeat(size.reshape(-1, 3).max(axis=1), 3)  # of positions, speeds, torques
+        assert (np.abs(slopes[..., k] - exact).max(axis=0) <= close * size).all(), name
+    if compared == "torques":
+        given = np.concatenate([out.window.log.tau[out.window.counted] - r.e for out, r in zip(
+            simulator.roll_out(theta), simulator.residuals(theta, with_slopes=False), strict=True
+        )])  # fmt: skip
+        at_limit = np.isclose(np.abs(given), 0.3)
+        assert 0.02 < at_limit[:, 1:].mean() < 0.9, "drives are at their limit, and are not"
+
+
+def test_unknowns_stand_over_what_is_known(simulator):
+    theta = simulator.prior.copy()
+    theta[:4] = 0.3, 0.05, 0.4, 0.01
+    loops = simulator.loops(theta)
+    np.testing.assert_array_equal(loops.armature, [0.05, 0.05, 0.02])
+    np.testing.assert_array_equal(loops.values, [0.4, 0.2, 0.4, 0.2, 0.1, 0.3])
+    np.testing.assert_array_equal(loops.delay, np.full(3, 0.01))
+    np.testing.assert_allclose(loops.bodies, simulator.base.bodies, atol=1e-12)
+    np.testing.assert_array_equal(simulator.base.armature, np.full(3, 0.02))
+
+
+def test_every_value_is_a_body_that_can_be(simulator, rng):
+    is_body = np.array([u.what == "body" for u in simulator.free_parameters])
+    for _ in range(20):
+        theta = np.where(is_body, rng.standard_normal(len(is_body)), simulator.prior)
+        bodies = simulator.loops(theta).bodies
+        assert (np.linalg.eigvalsh(pseudo_inertia(bodies.reshape(-1)))[:, 0] > -1e-12).all()
+    theta = simulator.prior.copy()
+    k = simulator.names.index(next(n for n in simulator.names if n.endswith(".mass")))
+    theta[k] = 0.1  # mass changes by exp(2 m)
+    body = simulator.robot.joint_of_body.index(simulator.free_parameters[k].joints[0])
+    ratio = simulator.loops(theta).bodies[body, 0] / simulator.base.bodies[body, 0]
+    assert ratio == pytest.approx(np.exp(0.2), rel=1e-9)
+
+
+def test_what_is_compared_is_what_was_logged(simulator):
+    theta = simulator.prior
+    log, n = simulator.windows[0].log, 3
+    outs = simulator.roll_out(theta)
+    both = replace(simulator, velocities=True).residuals(theta, with_slopes=False)
+    lag = np.array([0, 3, 2.25])
+    torques = replace(simulator, error="input", lag=lag).residuals(theta, with_slopes=False)
+    all_ = replace(simulator, velocities=True, lag=lag).residuals(theta, with_slopes=False)
+    for out, moved, given, whole in zip(outs, both, torques, all_, strict=True):
+        np.testing.assert_array_equal(whole.e, np.hstack([moved.e, given.e]))
+        k = out.window.counted
+        np.testing.assert_array_equal(moved.e[:, :n], log.q[k] - out.q)
+        np.testing.assert_array_equal(moved.e[:, n:], log.v[k] - out.v)
+        rows = np.arange(k.start, k.stop)
+        for j in range(n):
+            told = np.interp(rows - lag[j], np.arange(len(log.t)), log.q_ref[:, j])
+            tau = 20.0 * (told - out.q[:, j]) - 1.5 * out.v[:, j]
+            np.testing.assert_allclose(given.e[:, j], log.tau[k, j] - tau, atol=1e-12)
+
+
+def test_direct_slopes_are_those_of_inverse_dynamics_along_the_roll_out(simulator, rng):
+    """By the recursive Newton-Euler algorithm, with bodies a little different."""
+    theta = off(simulator, rng)
+    direct = replace(simulator, error="direct", lag=np.full(3, 3))
+    found = direct.residuals(theta, with_slopes=True)
+    torques = direct.exact.residuals(theta, with_slopes=False)
+    model = simulator.robot.model
+    outs, names = simulator.roll_out(theta), simulator.names
+    for out, one, exact in zip(outs, found, torques, strict=True):
+        np.testing.assert_array_equal(one.e, exact.e)
+        t = out.window.log.t[out.window.counted]
+        a = np.gradient(out.v, t, axis=0)
+        own = one.slopes[:, :, names.index("upper.armature")]
+        np.testing.assert_allclose(own, a * [1, 1, 0], atol=1e-9)
+        own = one.slopes[:, :, names.index("calf.coulomb")]
+        np.testing.assert_array_equal(own, np.sign(out.v) * [0, 0, 1])
+        assert not one.slopes[:, :, [names.index("delay"), names.index("hip.kp")]].any()
+        for k, unknown in enumerate(simulator.free_parameters):
+            if unknown.what != "body":
+                continue
+            ends = []
+            for s in (1, -1):
+                moved = theta.copy()
+                moved[k] += s * 1e-5
+                pi = model.standard_parameters()
+                pi[: model.layout.n_inertial] = simulator.loops(moved).bodies.reshape(-1)
+                engine = model.with_parameters(pi).pin_model
+                data = engine.createData()
+                ends.append([pin.rnea(engine, data, *x) for x in zip(out.q, out.v, a, strict=True)])
+            slope = (np.array(ends[0]) - ends[1]) / 2e-5
+            np.testing.assert_allclose(one.slopes[:, :, k], slope, atol=1e-6)
+
+
+def truth_of(arm):
+    """The standard parameters of a plant, and its loops."""
+    pi, names = arm.model.standard_parameters(), arm.model.layout.names
+    for drive in arm.drives:
+        for term in ("armature", "viscous", "coulomb"):
+            pi[names.index(f"{drive.joint}.{term}")] = getattr(drive, term)
+    return loops_of(arm.model, pi, arm.drives)
+
+
+def stiff(error, highest=1.5):
+    """A stiff arm with exact logs, windows that begin as it did, its drives unknown."""
+    rng, lag = np.random.default_rng(2), np.zeros(2, dtype=int)
+    arm = plant("planar", rng, delay=0.0, kp=2e4, kd=1.6e3)
+    t = np.arange(1000) / 500.0
+    q_ref = multisine(t, arm.middle, arm.reach, rng, highest=highest)
+    told = Log(t, q_ref, 0 * q_ref, arm.model.joints, q_ref=q_ref, has_torque=False)
+    robot, loops = ClosedLoopRobot(arm.model), truth_of(arm)
+    [out] = robot.roll_out(loops, cut_windows(told, np.inf, 0.0))
+    tau = drive_torques(out, loops, lag).limited
+    log, free_parameters = replace(told, q=out.q, tau=tau, has_torque=True), []
+    for j in range(2):
+        J = loops.armature[j]
+        free_parameters.append(FreeParameter(f"{j}.armature", "armature", (j,), J, 1e6, 0.0))
+        for term in loops.terms[j]:
+            value, name = loops.values[loops.place(j, term)], f"{j}.{term.name}"
+            free_parameters.append(FreeParameter(name, "term", (j,), value, 1e6, term=term))
+    windows = [
+        replace(w, given=np.stack([out.q[w.start_row], out.v[w.start_row]]))
+        for w in cut_windows(log, 0.5, 0.0)
+    ]
+    told_by = None if error == "output" else lag
+    return LoopSimulator(
+        robot, tuple(windows), loops, tuple(free_parameters), error=error, lag=told_by
+    )
+
+
+@pytest.mark.parametrize("error", ["output", "input", "direct"])
+def test_drives_of_exact_data_are_recovered_from_20_percent_off(error):
+    simulator = stiff(error)
+    truth = simulator.prior
+    estimator, exact = OutputError(whitens=False), simulator.exact
+    first = replace(estimator, rounds=1).fit(simulator, 0.8 * truth, exact=exact)
+    np.testing.assert_allclose(first.theta, truth, rtol=0.02, atol=0.1)
+    assert first.n_iter <= {"output": 20, "input": 14, "direct": 6}[error], "a few steps"
+    found = estimator.fit(simulator, 0.8 * truth, exact=exact)
+    np.testing.assert_allclose(found.theta, truth, rtol=1e-4, atol=1e-3)
+    assert found.converged
+    left = found.details["left"]
+    assert 0.05 < left < 0.4 if error == "direct" else left == 0.0
+
+
+@pytest.fixture(scope="module")
+def told():
+    """A planar arm whose commands act within the third row of 2 ms, its loops, and its log."""
+    rng = np.random.default_rng(6)
+    arm = plant("planar", rng, delay=0.0053)
+    log, _ = recorded(arm, rng, duration=2.0, torque=0.3, step=5e-5)
+    return arm, truth_of(arm), log
+
+
+def with_torques(outs, tau):
+    """The same roll-outs beside a log with other torques."""
+    return [replace(o, window=replace(o.window, log=replace(o.window.log, tau=tau))) for o in outs]
+
+
+def test_the_row_whose_command_a_torque_follows_is_found(told):
+    arm, loops, log = told
+    outs = ClosedLoopRobot(arm.model).roll_out(loops, cut_windows(log, np.inf, 0.0))
+    known, unknown = np.zeros((2, 2), dtype=bool), np.array([[False, True], [True, False]])
+    for is_free in (known, unknown):
+        lag, found = find_gains(outs, loops, is_free, knows_delay=True, is_whole=False)
+        np.testing.assert_array_equal(lag, [3, 3])
+        np.testing.assert_allclose(found.kp, loops.kp, rtol=5e-3)
+        np.testing.assert_allclose(found.kd, loops.kd, rtol=2e-2)
+        np.testing.assert_array_equal(found.kp[0], loops.kp[0])  # is stated
+    noise = 0.3 * np.random.default_rng(7).standard_normal(log.tau.shape)
+    for true, told_as, loud in (
+        ([2.0, 4.0], [2.0, 4.0], 1.0),
+        ([2.3, 3.8], [2.3, 3.8], 1.0),  # between two rows
+        ([2.06, 3.95], [2.0, 4.0], 0.1),  # hardly
+        ([2.3, 3.8], [2.0, 4.0], 30.0),  # as far as can be told
+    ):
+        tau = drive_torques(outs[0], loops, np.array(true)).limited + loud * noise
+        lag, _ = find_gains(with_torques(outs, tau), loops, known, knows_delay=True, is_whole=False)
+        np.testing.assert_allclose(lag, told_as, atol=0.05 if true == told_as else 0.0)
+
+
+def test_torques_tell_gains_before_anything_is_fitted(told):
+    _, loops, log = told
+    moved = [measured_motion(window) for window in cut_windows(log, np.inf, 0.0)]
+    open_ = replace(loops, kp=np.ones(2), kd=np.zeros(2), delay=np.zeros(2))
+    is_free = np.ones((2, 2), dtype=bool)
+    lag, found = find_gains(moved, open_, is_free, knows_delay=False, is_whole=True)
+    np.testing.assert_array_equal(lag, [3, 3])
+    np.testing.assert_allclose(found.kp, loops.kp, rtol=0.02)
+    np.testing.assert_allclose(found.kd, loops.kd, rtol=0.05)
+    _, found = find_gains(
+        with_torques(moved, -log.tau), open_, is_free, knows_delay=False, is_whole=True
+    )
+    np.testing.assert_array_equal(found.kp, open_.kp)  # no gain that would drive it away
+    np.testing.assert_array_equal(found.kd, open_.kd)
+    largest = np.abs(log.tau).max(axis=0)
+    for share in ([0.4, 2.0], [2.0, 0.4]):  # the samples at the limit of their own joint are none
+        limit = share * largest
+        at_limit = with_torques(moved, np.clip(log.tau, -limit, limit))
+        _, found = find_gains(
+            at_limit, replace(open_, limit=limit), is_free, knows_delay=False, is_whole=True
+        )
+        np.testing.assert_allclose(found.kp, loops.kp, rtol=0.02)
+
+
+def test_torques_are_missed_over_all_windows_by_the_larger_of_logged_and_given(simulator):
+    lag = np.array([3.0, 2.0, 2.5])
+    theta = simulator.prior.copy()
+    for share in ([0.5, 1.0, 4.0], [4.0, 0.2, 1.0]):
+        windows = [
+            replace(w, log=replace(w.log, tau=w.log.tau * own)) for w, own in zip(
+                simulator.windows, (1.0, np.array(share)), strict=True
+            )
+        ]  # fmt: skip
+        sim = replace(simulator, windows=tuple(windows), lag=lag)
+        outs, loops = sim.roll_out(theta), sim.loops(theta)
+        given = np.concatenate([drive_torques(out, loops, lag).limited for out in outs])
+        logged = np.concatenate([w.log.tau[w.counted] for w in windows])
+        rms = [np.sqrt(np.mean(x**2, axis=0)) for x in (logged - given, logged, given)]
+        np.testing.assert_allclose(sim.torque_mismatch(theta), rms[0] / np.maximum(*rms[1:]))
+
+
+def test_what_drives_give_follows_commands_whole_or_broken_rows_late():
+    """Kinds, limits and delays of two joints, beside the equation row by row."""
+    rng = np.random.default_rng(2)
+    q, v, q_ref, v_ref, tau_ref = rng.standard_normal((5, 9, 2))
+    log = Log(5.0 + np.arange(9) / 100, q, 0 * q, ("a", "b"), q_ref=q_ref, v_ref=v_ref,
+              tau_ref=tau_ref, has_torque=False)  # fmt: skip
+    window = Window(log, 0, 2, 8)
+    out = RollOut(window, q[2:8], v[2:8])
+    kp, kd, limit = np.array([3.0, 5.0]), np.array([0.7, 0.2]), np.array([2.0, np.inf])
+    loops = replace(
+        stated_loops(plant("planar", rng).model, LoopSettings()), kp=kp, kd=kd, limit=limit
+    )
+    for lag in ([0.0, 1.0], [2.25, 0.5], [4.0, 1.75]):
+        found = drive_torques(out, loops, np.array(lag))
+        for j, late in enumerate(lag):
+            at = np.arange(2, 8) - late  # between two rows their mean, by how near they are
+
+            def told(x, j=j, at=at):
+                return np.interp(at, np.arange(9), x[:, j])
+
+            reach, rate = told(q_ref) - q[2:8, j], told(v_ref) - v[2:8, j]
+            asked = kp[j] * reach + kd[j] * rate + told(tau_ref)
+            np.testing.assert_allclose(found.position_error[:, j], reach)
+            np.testing.assert_allclose(found.speed_error[:, j], rate)
+            np.testing.assert_allclose(found.unlimited[:, j], asked)
+            np.testing.assert_allclose(found.limited[:, j], np.clip(asked, -limit[j], limit[j]))

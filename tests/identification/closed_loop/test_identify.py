@@ -1,0 +1,505 @@
+from dataclasses import replace
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from helpers.mujoco_plant import held, multisine, plant, recorded
+from helpers.single_joint import slider
+
+from robotid.base.exceptions import DataError
+from robotid.base.findings import Finding
+from robotid.cli.work.identify import save_result
+from robotid.data.log import Log
+from robotid.diagnosis.verdict.position_verdict import judge_positions
+from robotid.dynamics.simulation.loops import ClosedLoopRobot, cut_windows
+from robotid.estimation.estimators.output_error import OutputError
+from robotid.estimation.fitting.estimator_settings import SimulationSettings
+from robotid.identification.closed_loop import from_commands as identify
+from robotid.identification.closed_loop.from_commands import identify_loops, with_gravity
+from robotid.identification.closed_loop.gain_check import gain_scale
+from robotid.identification.closed_loop.loop_findings import loop_findings
+from robotid.identification.closed_loop.loop_settings import LoopSettings
+from robotid.identification.closed_loop.position_errors import position_metrics, run_open_loop
+from robotid.identification.closed_loop.second_order import SecondOrder
+from robotid.identification.closed_loop.stages import fit_loops, stated_loops
+from robotid.identification.closed_loop.term_choice import _Fold, _gains
+from robotid.output.files.entries import build_result
+from robotid.output.report.document import write_report
+from robotid.robot.drives import Coulomb, Offset, PositionCoulomb, Presliding, Viscous
+
+NOISE = 1e-3  # [rad]: with less, that MuJoCo's friction is a little soft shows beside the errors
+SETTINGS = SimulationSettings(window=1.0, lead=0.3, bodies=0.0, step=2e-3)
+COARSE = replace(SETTINGS, step=4e-3)  # of logs at 250 Hz: the fit halves it where it matters
+
+
+def stated(robot, **changes):
+    drives = robot.drives
+    gains = {"kp": {d.joint: d.kp for d in drives}, "kd": {d.joint: d.kd for d in drives}}
+    return LoopSettings(**({"delays": "group"} | gains | changes))
+
+
+@pytest.fixture(scope="module")
+def leg():
+    """A leg of a Go2 in MuJoCo, a log to fit and one kept apart."""
+    rng = np.random.default_rng(4)
+    robot = plant("leg", rng)
+    return robot, *(recorded(robot, rng, duration=d, noise=NOISE)[0] for d in (3.0, 2.2))
+
+
+@pytest.fixture(scope="module")
+def found(leg):
+    """What is found with stated gains; the doctor said of the log that it shows no delay."""
+    robot, log, kept = leg
+    evidence = {"frequency": 2.0, "shortest": 0.0, "longest": 0.09}
+    slow = Finding("slow_command", "warning", "log", "any delay explains it", evidence)
+    return identify_loops(
+        robot.model, [log], [kept], stated(robot), SETTINGS, chooses=False, examined=[slow]
+    )
+
+
+@pytest.fixture(scope="module")
+def scaleless(leg):
+    """What is found without gains, hip and thigh having the same drives."""
+    robot, log, kept = leg
+    loop = LoopSettings(groups={"upper": list(robot.model.joints[:2])})
+    return identify_loops(robot.model, [log], [kept], loop, SETTINGS, chooses=False)
+
+
+def test_the_drives_of_a_leg_are_recovered_within_their_errors(leg, found):
+    truth, estimate = leg[0].truth, found.fit.estimate
+    assert estimate.converged
+    assert {name.rpartition(".")[2] for name in estimate.names} == {
+        "armature", "viscous", "coulomb", "offset", "delay",
+    }  # fmt: skip
+    for name, value, error in zip(estimate.names, estimate.theta, estimate.std_error, strict=True):
+        assert abs(value - truth[name]) < 3.3 * error, name
+        if not name.endswith("offset"):  # which is 0
+            assert error < 0.15 * truth[name], name
+    windows = found.fit.simulator.windows
+    assert {len(window.log.t) for window in windows} == {len(leg[1].t)}, "kept ones are not fitted"
+
+
+def test_drives_behind_a_slow_clock_are_recovered_once_it_is_stated(rng):
+    """At 100 Hz the hold is worth some 5 ms, which damping has to give else."""
+    robot = plant("planar", rng, delay=0.0, coulomb=0.0)
+    t = np.arange(800) / 500.0
+    q_ref = multisine(t, robot.middle, 0.5 * robot.reach, rng, highest=8.0)
+    q = held(robot, q_ref, 500.0, 100.0) + 1e-4 * rng.standard_normal(q_ref.shape)
+    log = Log(t, q, 0 * q, robot.model.joints, q_ref=q_ref, has_torque=False)
+    worst = {}
+    for rate in (100.0, None):
+        loop = stated(robot, rate=rate)
+        found = identify_loops(robot.model, [log], [], loop, SETTINGS, chooses=False)
+        values = dict(zip(found.fit.estimate.names, found.fit.estimate.theta, strict=True))
+        off = {
+            what: max(abs(values[f"{d.joint}.{what}"] / getattr(d, what) - 1) for d in robot.drives)
+            for what in ("armature", "viscous")
+        }
+        worst[rate] = (max(off.values()), found.fitted[0].rmse.max())
+        late = max(value for name, value in values.items() if name.endswith("delay"))
+        assert rate is None or late < 2e-4
+    assert worst[100.0] == pytest.approx((0.0, 1e-4), abs=0.02), worst
+    assert worst[None][0] > 0.2
+
+
+def test_the_drives_of_an_arm_are_recovered_with_steps_that_are_halved():
+    """From commands that last as long as the steps to begin with, which are too long by far."""
+    rng = np.random.default_rng(1)
+    robot = plant("planar", rng)
+    usual = {"rate": 250.0, "noise": 3e-4, "step": 1e-4}
+    first, second = (recorded(robot, rng, duration=d, **usual)[0] for d in (2.4, 1.6))
+    logs, truth = [first, replace(second, t=second.t + 7.0)], robot.truth
+    found = identify_loops(robot.model, logs, [], stated(robot), COARSE, chooses=False)
+    assert [len(run.q) for run in found.fitted] == [600, 400]
+    windows = found.fit.simulator.windows
+    assert [sum(w.stop - w.first for w in windows if w.log.t[0] == t) for t in (0, 7)] == [600, 400]
+    estimate, fine = found.fit.estimate, found.fit.simulator.fine
+    errors = np.array(
+        [value - truth[n] for n, value in zip(estimate.names, estimate.theta, strict=True)]
+    )
+    for name, error in zip(estimate.names, errors, strict=True):
+        wide = {"delay": 3e-4, "offset": 0.05}.get(name.rpartition(".")[2], 0.03 * truth[name])
+        assert abs(error) < wide, name
+    assert np.sqrt(np.mean((errors / estimate.std_error) ** 2)) < 1.7
+    assert fine.step == pytest.approx(estimate.details["step"])
+    assert round(4e-3 / fine.step) in (8, 16)
+    assert estimate.details["halving"] <= 0.2  # of a standard error, that another would move
+    again, coarse = (
+        run_open_loop(r, found.fit.loops, first) for r in (fine, found.fit.simulator.robot)
+    )
+    np.testing.assert_allclose(found.fitted[0].rmse, again.rmse, rtol=1e-12)
+    assert (found.fitted[0].rmse < coarse.rmse).all(), "errors of the steps of the fit"
+
+
+def test_the_standard_parameters_are_what_was_found(leg, found):
+    names = found.model.layout.names
+    values = dict(zip(names, found.standard, strict=True))
+    estimate = found.fit.estimate
+    errors = dict(zip(names, np.sqrt(np.diag(found.standard_covariance)), strict=True))
+    for name, value, error in zip(estimate.names, estimate.theta, estimate.std_error, strict=True):
+        if name in values:
+            assert values[name] == value
+            assert errors[name] == pytest.approx(error, rel=1e-6)
+    urdf = leg[0].model.standard_parameters()
+    np.testing.assert_array_equal(found.standard[:30], urdf[:30])  # bodies stay: bodies=0
+
+
+def test_it_is_an_identification_as_others_are(found, tmp_path):
+    layout, estimate = found.model.layout, found.estimate
+    size, count = layout.n_inertial, len(found.base)
+    name = f"Identification of {found.model.name}: {count} base parameters"
+    assert repr(found) == f"<{name} by simulation, verdict good>"
+    assert set(found.sources[:size]) == {"prior"}, "bodies stay: bodies=0"
+    assert np.isinf(found.standard_error[:size]).all()
+    content = build_result(found, {"estimator": {"name": "simulation"}})
+    entries = {entry["name"]: entry for entry in content["drive_parameters"]}
+    share = dict(zip(estimate.names, found.shrunk, strict=True))
+    known = zip(estimate.names, estimate.theta, estimate.std_error, estimate.quantile, strict=True)
+    for key, value, error, quantile in known:
+        own = entries[key]
+        assert (own["value"], own["quantile"]) == (value, quantile)
+        assert own["std_error"] == pytest.approx(error, rel=1e-6)
+        if key in layout.names:
+            ends = [value - quantile * error, value + quantile * error]
+            assert own["interval_95"] == pytest.approx(ends, rel=1e-6)
+            assert own["source"] == ("data" if share[key] < 0.3 else "mixed")
+            i = layout.names.index(key)
+            ends = content["ranges"]["drives"][key.rpartition(".")[0]][key.rpartition(".")[2]]
+            assert ends["high"] == pytest.approx(found.standard_interval[i, 1])
+    stated = entries[f"{found.model.joints[0]}.kp"]
+    assert (stated["std_error"], stated["source"]) == (None, "stated")
+    of_bodies = ~found.mapping.K[:, size:].any(axis=1)
+    unfitted = [entry["std_error"] is None for entry in content["base_parameters"]]
+    np.testing.assert_array_equal(unfitted, np.isinf(found.base_error))
+    np.testing.assert_array_equal(unfitted, of_bodies)
+    joint = content["validation"][0]["per_joint"][found.model.joints[1]]
+    [run] = found.validation
+    assert joint["relative_error_pct"] == pytest.approx(100 * run.rmse[1] / run.spread[1])
+    command = run.baselines["command"][1]
+    assert joint["command_relative_error_pct"] == pytest.approx(100 * command / run.spread[1])
+    page = write_report(found, tmp_path / "report.html").read_text()
+    assert "<strong>good</strong>" in page
+    assert f"{found.model.name}: drives from commands" in page
+
+
+def test_open_loops_beat_plainer_models(leg, found):
+    [run] = found.validation
+    assert found.verdict.status == "good"
+    assert (run.rmse < 1.2 * NOISE).all()
+    assert list(run.baselines) == ["command", "urdf", "second_order"]
+    for other in run.baselines.values():
+        assert (run.rmse < 0.9 * other).all()
+    np.testing.assert_allclose(
+        run.baselines["command"], np.sqrt(np.mean((run.log.q_ref - run.log.q) ** 2, 0))
+    )
+    np.testing.assert_allclose(run.rmse, np.sqrt(np.mean((run.log.q - run.q) ** 2, axis=0)))
+    middle = run.log.q.mean(axis=0)
+    np.testing.assert_allclose(run.spread, np.sqrt(np.mean((run.log.q - middle) ** 2, axis=0)))
+    assert list(run.horizons) == [0.1, 0.5, 2.0]
+    robot, loops = found.fit.simulator.robot, found.fit.loops
+    for horizon, error in run.horizons.items():
+        assert (error < 3 * NOISE).all()
+        outs = robot.roll_out(loops, cut_windows(run.log, horizon, 0.0))
+        missed = np.concatenate([out.window.log.q[out.window.counted] - out.q for out in outs])
+        np.testing.assert_allclose(error, np.sqrt(np.mean(missed**2, axis=0)))
+
+
+def test_friction_of_joints_that_no_log_moves_is_reported(leg, found):
+    hip, thigh, calf = leg[0].model.joints
+    [run] = found.fitted
+
+    def undetermined(rests):
+        logs = [run]
+        for moving in rests:
+            q_ref = np.where(moving, run.log.q_ref, run.log.q_ref[3])
+            logs.append(replace(run, log=replace(run.log, q_ref=q_ref)))
+        findings = loop_findings(replace(found, fitted=tuple(logs[1:])), [])
+        return [f.where for f in findings if f.code == "undetermined"]
+
+    assert undetermined([[True, True, True]]) == []
+    assert undetermined([[True, False, True], [False, True, True]]) == []
+    [where] = undetermined([[True, False, True], [True, False, False]])
+    assert where == f"{thigh}.viscous, {thigh}.coulomb, {thigh}.offset"
+    [where] = undetermined([[False, False, True]])
+    for joint in (hip, thigh):
+        assert f"{joint}.coulomb" in where
+    assert calf not in where
+    # a term that two joints share is of a joint that moves if one of them does
+    simulator = found.fit.simulator
+    shared = [
+        replace(x, name="upper.viscous", joints=(0, 1)) if x.name == f"{hip}.viscous" else x
+        for x in simulator.free_parameters
+    ]
+    simulator = replace(simulator, free_parameters=tuple(shared))
+    found = replace(found, fit=replace(found.fit, simulator=simulator))
+    [where] = undetermined([[False, True, True], [False, True, True]])
+    assert where == f"{hip}.coulomb, {hip}.offset"
+
+
+def test_robots_of_logs_are_those_of_their_variation(leg, found, monkeypatch):
+    given, log = [], leg[1]
+    monkeypatch.setattr(identify, "fit_loops", lambda *_, **__: found.fit)
+    monkeypatch.setattr(identify, "run_open_loop", lambda *_: found.fitted[0])
+    monkeypatch.setattr(identify, "loop_runs", lambda *args: given.append(args[3]) or ())
+    monkeypatch.setattr(identify, "vary", lambda names, _, units: given.append((names, units)))
+    logs = [replace(log, path=f"{k}.csv") for k in range(3)]
+    identify_loops(leg[0].model, logs, [], stated(leg[0]), SETTINGS, units=["go", "arm", "go"])
+    assert given == [["go", "arm", "go"], (["0.csv", "1.csv", "2.csv"], ["arm", "go"])]
+
+
+def test_a_second_order_model_has_the_standard_error_of_each_inertia(found):
+    plain = found.fit.plain
+    again = OutputError(whitens=False).fit(plain.simulator, plain.theta)
+    wanted = [again.std_error[again.names.index(f"{j}.armature")] for j in found.model.joints]
+    np.testing.assert_allclose(plain.inertia_error, wanted, rtol=0.1)
+    assert plain.shows_inertia.all()
+
+
+def test_each_kept_log_is_judged(leg, found):
+    _, log, kept = leg
+    robot, loops = found.fit.simulator.robot, found.fit.loops
+    n = 400  # 0.8 s
+    short = replace(log, t=log.t[:n], q=log.q[:n], tau=log.tau[:n], q_ref=log.q_ref[:n])
+    assert list(run_open_loop(robot, loops, short).horizons) == [0.1, 0.5], "as long as the log"
+    [good], otherwise = found.validation, replace(kept, q=kept.q[::-1].copy())
+    poor = run_open_loop(robot, loops, otherwise)
+    for runs in ((good, poor), (poor, good)):
+        verdict = replace(found, validation=runs).verdict
+        assert verdict.status == "poor"
+        assert "simulated position error" in verdict.reasons[0]
+    verdict = replace(found, validation=()).verdict
+    assert verdict.status == "not evaluated"
+    assert verdict.reasons[0].endswith("no validation log given")
+
+
+def test_a_joint_that_is_told_to_stand_is_not_evaluated(leg, found):
+    model, [run] = leg[0].model, found.validation
+    joints = model.joints
+
+    def judged(runs):
+        return judge_positions(
+            position_metrics(model, runs, moving=True), joints, is_validation=True
+        )
+
+    still = replace(run.log, q_ref=np.where([True, True, False], run.log.q_ref, run.log.q_ref[0]))
+    stands = replace(run, log=still, spread=np.array([*run.spread[:2], 1e-4]))
+    verdict = judged([stands])
+    assert [verdict.joints[joint].status for joint in joints] == ["good", "good", "not evaluated"]
+    assert verdict.status == "usable"
+    assert verdict.reasons == (f"{joints[2]}: commanded to rest in all logs: not evaluated",)
+    assert judged([stands, run]).status == "good"
+    nobody = replace(run, log=replace(still, q_ref=np.tile(still.q_ref[0], (len(still.t), 1))))
+    assert judged([nobody]).status == "not evaluated"
+
+
+def test_without_gains_the_scale_is_said_to_rest_on_the_urdf(scaleless):
+    assert not scaleless.has_gains
+    [scale] = [f for f in scaleless.findings if f.code == "scale"]
+    assert scale.severity == "warning"
+    assert "state kp in [controller]" in scale.message
+    assert scaleless.validation[0].baselines["urdf"] is None, "no open loop without gains"
+
+
+def test_joints_of_a_group_share_their_drive(leg, scaleless):
+    hip, thigh, calf = leg[0].model.joints
+    names, loops = scaleless.fit.estimate.names, scaleless.fit.loops
+    for shared in ("kp", "armature", "viscous"):
+        assert f"upper.{shared}" in names
+        assert f"{calf}.{shared}" in names
+    assert f"{hip}.coulomb" in names, "what wears is each drive's own"
+    assert f"{thigh}.coulomb" in names
+    for own in (loops.armature, loops.kp):
+        assert own[0] == own[1] != own[2]
+
+
+def test_of_many_scales_that_suit_the_positions_the_urdfs_is_taken():
+    rng = np.random.default_rng(5)
+    robot = plant("planar", rng)
+    log, truth = recorded(robot, rng, duration=2.0, rate=250.0, step=2e-4)
+    settings, loop = replace(COARSE, bodies=0.1), LoopSettings(delays="group")
+    fitted = fit_loops(robot.model, [log], loop, settings, chooses=False)
+    gains = [unknown.what == "kp" for unknown in fitted.simulator.free_parameters]
+    exact = np.array([truth[name] for name in np.array(fitted.estimate.names)[gains]])
+    np.testing.assert_allclose(fitted.estimate.theta[gains], exact, rtol=0.02)
+    assert (fitted.estimate.std_error[gains] > 0.1 * exact).all(), "others would do, too"
+
+
+def test_a_joint_whose_inertia_does_not_show_begins_as_the_fastest_loop(leg):
+    stated_ = stated_loops(leg[0].model, LoopSettings(kp={"FL_calf_joint": 50.0}))
+    loops = replace(stated_, armature=np.array([1e-12, 0.01, 1e-6]))
+    plain = SecondOrder(None, np.zeros(0), loops, np.ones(3))
+    np.testing.assert_allclose(plain.inertia, [1 / 96**2, 0.01, 50 / 96**2])
+
+
+def test_a_stated_delay_that_is_wrong_is_no_good_result(leg):
+    robot, log, kept = leg
+    wrong = stated(robot, delay=0.03)
+    found = identify_loops(robot.model, [log], [kept], wrong, SETTINGS, chooses=False)
+    [bound] = [f for f in found.findings if f.code == "at_bound"]
+    assert bound.severity == "warning"
+    assert "armature" in bound.message
+    assert "leave the delay out of [controller]" in bound.message.lower()
+    assert found.verdict.status != "good"
+    assert bound.message in found.verdict.reasons
+
+
+def test_a_stated_gain_is_named_as_what_the_scale_rests_on(found):
+    [scale] = [f for f in found.findings if f.code == "scale"]
+    assert scale.severity == "note"
+    assert "scale with kp as stated" in scale.message
+    assert found.verdict.reasons[-1] == scale.message
+
+
+def test_stated_gains_that_the_bodies_contradict_are_named(leg, found):
+    robot, log, kept = leg
+    assert not [f for f in found.findings if f.code == "gains_contradicted"]
+    scale = found.fit.scale
+    assert (np.abs(scale.change) < 4.0 * scale.error).all()
+    assert abs(scale.common) < 4.0 * scale.common_error < 0.05
+    gains = {k: {d.joint: 1.25 * getattr(d, k) for d in robot.drives} for k in ("kp", "kd")}
+    wrong = stated(robot, **gains)
+    other = identify_loops(robot.model, [log], [kept], wrong, SETTINGS, chooses=False)
+    [named] = [f for f in other.findings if f.code == "gains_contradicted"]
+    assert named.severity == "warning"
+    assert named.where == "controller"
+    assert named.evidence["scale"] == pytest.approx(0.8, abs=0.08)
+    each = other.fit.scale
+    assert (np.abs(each.change + 0.2) < 4.0 * each.error).all()
+    assert (each.error > each.common_error).all(), "together they show it better"
+    kp = 1.25 * robot.drives[0].kp * named.evidence["scale"]
+    assert f"{robot.drives[0].joint} = {kp:.3g}" in named.message
+    assert other.verdict.status != "good"
+    assert named.message in other.verdict.reasons
+
+
+def test_a_slow_command_does_not_contradict_the_delay_that_was_found(found):
+    [settled] = [f for f in found.findings if f.code == "slow_command"]
+    assert settled.severity == "note"
+    assert "any delay" not in settled.message
+    names, errors = found.fit.estimate.names, found.fit.estimate.std_error
+    worst = max(e for n, e in zip(names, errors, strict=True) if n.endswith("delay"))
+    assert settled.evidence["std_error"] == pytest.approx(worst)
+    assert f"{1e3 * worst:.2g} ms" in settled.message
+
+
+def test_a_delay_at_its_bound_leaves_the_warning_of_a_slow_command(found):
+    evidence = {"frequency": 2.0, "shortest": 0.0, "longest": 0.09}
+    slow = Finding("slow_command", "warning", "log", "any delay explains it", evidence)
+    delay = next(name for name in found.fit.estimate.names if name.endswith("delay"))
+    other = next(name for name in found.fit.estimate.names if name.endswith("coulomb"))
+    details = {**found.estimate.details, "at_bound": (other, delay)}
+    fitted = replace(found.fit, estimate=replace(found.estimate, details=details))
+    bound = replace(found, fit=fitted)
+    named = {finding.code: finding for finding in loop_findings(bound, [slow])}
+    assert named["slow_command"].severity == "warning"
+    assert "any delay explains it. The delay of the fit is 0" in named["slow_command"].message
+    assert "the data do not determine it" in named["no_delay"].message
+    entries = build_result(bound, {"estimator": {"name": "simulation"}})["drive_parameters"]
+    sources = {e["source"] for e in entries if e["name"].endswith(".delay")}
+    assert "bound" in sources
+
+
+def test_friction_by_position_is_found_where_it_is_and_nowhere_else(leg):
+    robot, rng = leg[0], np.random.default_rng(3)
+    model, n = robot.model, 3
+    t = np.arange(750) / 250.0
+    q_ref = multisine(t, robot.middle, robot.reach, rng)
+    centre = float(robot.middle[2])
+    plain = (Viscous(), Coulomb(), Offset())
+    bent = (
+        *plain,
+        PositionCoulomb(order=1, centre=centre),
+        PositionCoulomb(order=2, centre=centre),
+    )
+    loops = replace(
+        stated_loops(model, stated(robot)), armature=np.full(n, 0.02), delay=np.full(n, 0.006),
+        terms=(plain, plain, bent),
+        values=np.array([0.1, 0.2, 0.0, 0.1, 0.2, 0.0, 0.1, 0.25, 0.0, 0.5, 1.0]),
+    )  # fmt: skip
+    told = Log(t, q_ref, np.zeros_like(q_ref), model.joints, q_ref=q_ref, has_torque=False)
+    [out] = ClosedLoopRobot(model, step=5e-4).roll_out(loops, cut_windows(told, np.inf, 0.0))
+    log = replace(told, q=out.q + 3e-4 * rng.standard_normal(out.q.shape))
+    found = identify_loops(model, [log], [], stated(robot), COARSE)
+    chosen = {(t.joint, t.terms) for t in found.fit.tried if t.is_chosen}
+    assert {joint for joint, _ in chosen} == {model.joints[2]}
+    values = dict(zip(found.fit.estimate.names, found.fit.estimate.theta, strict=True))
+    [name] = [f.where for f in found.findings if f.code == "friction_found"]
+    assert name == model.joints[2]
+    terms = [t for t in found.fit.loops.terms[2] if isinstance(t, PositionCoulomb)]
+    parts = zip((1, 2), terms, strict=True)
+    q = np.linspace(centre - 0.2, centre + 0.2, 9)
+    size = values[f"{name}.coulomb"] + sum(
+        values[f"{name}.{term.name}"] * (q - term.centre) ** k for k, term in parts
+    )
+    exact = 0.25 + 0.5 * (q - centre) + (q - centre) ** 2
+    np.testing.assert_allclose(size, exact, rtol=0.05)
+    assert f"{name}.{terms[0].name}" in found.model.layout.names
+
+
+def test_friction_with_a_stated_way_is_recovered(tmp_path, rng):
+    """A body on a rail that sticks, as ``[drives]`` of the job states it."""
+    way, t = Presliding(displacement=0.01), np.arange(1000) / 500.0
+    model = slider(tmp_path, terms=("armature", "viscous"), own_terms={"j": [way]})
+    q_ref = multisine(t, np.zeros(1), np.array([0.2]), rng)
+    loop = LoopSettings(kp=300.0, kd=8.0)
+    loops = replace(
+        stated_loops(model, loop), armature=np.array([0.5]), delay=np.array([0.004]),
+        terms=((Viscous(), way),), values=np.array([5.0, 8.0]),
+    )  # fmt: skip
+    told = Log(t, q_ref, 0 * q_ref, ("j",), q_ref=q_ref, has_torque=False)
+    [out] = ClosedLoopRobot(model, step=5e-4).roll_out(loops, cut_windows(told, np.inf, 0.0))
+    log = replace(told, q=out.q + 1e-4 * rng.standard_normal(out.q.shape))
+    found = identify_loops(model, [log], [], loop, SETTINGS, chooses=False)
+    values = dict(zip(found.fit.estimate.names, found.fit.estimate.theta, strict=True))
+    for name, value in (("armature", 0.5), ("viscous", 5.0), ("presliding", 8.0)):
+        assert values[f"j.{name}"] == pytest.approx(value, rel=0.05)
+    assert "j.presliding" in found.model.layout.names
+
+
+def test_a_log_without_commands_is_refused(leg):
+    robot, log, _ = leg
+    bare = replace(log, q_ref=None)
+    with pytest.raises(DataError, match=r"has no commands, which the estimator 'simulation'"):
+        identify_loops(robot.model, [bare], [], stated(robot), SETTINGS)
+    with pytest.raises(DataError, match="no log was given"):
+        identify_loops(robot.model, [], [], stated(robot), SETTINGS)
+
+
+def test_terms_that_no_other_window_judges_gain_nothing():
+    """Of one window the others are none; of two, one alone may leave a parameter open."""
+    alone = _Fold(np.eye(3), np.ones(3), 10)
+    assert _gains([alone], [0, 1], {5: [2]})[5].tolist() == [0.0]
+    blind = _Fold(np.diag([1.0, 0.0, 1.0]), np.ones(3), 10)
+    assert _gains([blind, blind], [0, 1], {5: [2]})[5].tolist() == [0.0, 0.0]
+    known = _gains([alone, alone], [0, 1], {5: [2]})[5]
+    assert known == pytest.approx([1.0, 1.0])  # of each fold 2 y - y^2, y = 1
+
+
+def test_gravity_that_a_controller_compensates_is_fed_forward(leg):
+    robot, log, _ = leg
+    pin_model, data = robot.model.pin_model, robot.model.pin_model.createData()
+    few = replace(log, **{key: getattr(log, key)[:5] for key in ("t", "q", "tau", "q_ref")})
+    weight = [pin.computeGeneralizedGravity(pin_model, data, q).copy() for q in few.q]
+    np.testing.assert_allclose(with_gravity(robot.model, few).tau_ref, weight, atol=1e-10)
+    more = replace(few, tau_ref=np.arange(15.0).reshape(5, 3))
+    np.testing.assert_allclose(
+        with_gravity(robot.model, more).tau_ref - more.tau_ref, weight, atol=1e-10
+    )
+
+
+def test_what_whitening_leaves_correlated_widens_the_scale_of_gains(found):
+    simulator, estimate = found.fit.simulator, found.fit.estimate
+    plain, twice, less = (
+        gain_scale(simulator, OutputError(), replace(estimate, details={"inflation": inflation}))
+        for inflation in (1.0, 4.0, 0.25)
+    )
+    np.testing.assert_allclose(twice.change, plain.change)
+    np.testing.assert_allclose(twice.error, 2.0 * plain.error)
+    assert twice.common_error == pytest.approx(2.0 * plain.common_error)
+    np.testing.assert_allclose(less.error, plain.error)
+
+
+def test_a_replay_of_logs_in_memory_is_refused(found, tmp_path):
+    with pytest.raises(DataError, match="the logs are in memory, and a replay of position-contr"):
+        save_result(found, tmp_path / "out", report=False, replay=True)
+    assert list((tmp_path / "out").iterdir()) == []

@@ -1,0 +1,404 @@
+"""Figures that are derived of a fit of loops, with errors that are given."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import scipy.stats
+from helpers.crane import identified_crane
+
+from robotid.base.findings import Finding
+from robotid.data.log import Log
+from robotid.dynamics.simulation.loops import cut_windows
+from robotid.estimation.fitting.bands import QUANTILE
+from robotid.identification.closed_loop import loop_findings as findings
+from robotid.identification.closed_loop import loop_result as result
+from robotid.identification.closed_loop.encoder_zeros import Encoders
+from robotid.identification.closed_loop.gain_check import GainScale
+from robotid.identification.closed_loop.initial_values import _speed
+from robotid.identification.closed_loop.loop_findings import loop_findings
+from robotid.identification.closed_loop.loop_result import LoopIdentification, logged_motion
+from robotid.identification.closed_loop.loop_settings import LoopSettings
+from robotid.identification.closed_loop.runs import units_of
+from robotid.identification.closed_loop.term_choice import Tried
+
+#: Names of the unknowns, in the order of the fit.
+NAMES = ("rail.armature", "turn.armature", "robot.delay", "rail.viscous", "turn.viscous")
+
+
+@pytest.fixture(scope="module")
+def found(tmp_path_factory):
+    return identified_crane(tmp_path_factory.mktemp("crane"))
+
+
+def of(found, **changes):
+    """Return the same with another estimate."""
+    return replace(found, fit=replace(found.fit, estimate=replace(found.estimate, **changes)))
+
+
+def test_intervals_reach_as_far_as_those_of_what_they_follow_from(found):
+    assert found.estimate.names == NAMES
+    freedom = np.array([5.0, 4.0, 3.0, 8.0, 12.0])
+    own = of(found, details={**found.estimate.details, "freedom": freedom})
+    reach = dict(zip(found.model.layout.names, own.standard_quantile, strict=True))
+    stated = dict(zip(NAMES, scipy.stats.t.ppf(0.975, freedom), strict=True))
+    assert reach == pytest.approx({name: stated.get(name, QUANTILE) for name in reach}, rel=1e-6)
+    sums = found.mapping.K != 0.0
+    assert sums.sum(axis=1).max() > 1, "a base parameter sums several"
+    for row, base in zip(sums, own.base_quantile, strict=True):
+        assert base == own.standard_quantile[row].max()
+    opposite = replace(own)  # parameters that decrease, as moments do if a body moves to one side
+    vars(opposite)["_slopes"] = -own._slopes
+    np.testing.assert_array_equal(opposite.standard_quantile, own.standard_quantile)
+
+
+def test_errors_of_sums_are_those_of_their_parameters(found):
+    variance = dict(zip(NAMES, np.diag(found.estimate.covariance), strict=True))
+    C = np.diag([variance.get(name, 0.0) for name in found.model.layout.names])
+    standard = dict(zip(found.model.layout.names, found.standard_error, strict=True))
+    for name, error in standard.items():
+        assert error == pytest.approx(np.sqrt(variance[name]) if name in variance else np.inf)
+    k = [found.model.layout.names.index(name) for name in NAMES if name in standard]
+    places = [NAMES.index(found.model.layout.names[i]) for i in k]
+    C[np.ix_(k, k)] = found.estimate.covariance[np.ix_(places, places)]
+    for row, error in zip(found.mapping.K, found.base_error, strict=True):
+        size = np.sqrt(row @ C @ row)
+        assert error == (pytest.approx(size) if size > 0 else np.inf)
+
+
+@pytest.mark.parametrize("pairs", [[(0, 3), (3, 4)], [(0, 4), (3, 4)], [(0, 3), (0, 4)]])
+def test_unknowns_whose_errors_go_together_are_sets(found, pairs):
+    R = np.eye(5)
+    for (a, b), rho in zip([*pairs, (1, 2)], (0.99, -0.96, 0.94), strict=True):
+        R[a, b] = R[b, a] = rho
+    std = np.array([1e-3, 10.0, 0.1, 2.0, 5e-2])
+    other = of(found, covariance=R * np.outer(std, std))
+    assert other.correlated == (("rail.armature", "rail.viscous", "turn.viscous"),)
+
+
+def test_what_the_data_hardly_shrink_is_undetermined(found):
+    spread = found.fit.simulator.prior_std
+    assert (found.shrunk < 0.3).all()
+    assert found.undetermined == ()
+    share = np.array([0.85, 0.95, 0.2, 0.92, 0.1])
+    other = of(found, covariance=np.diag((share * spread) ** 2))
+    np.testing.assert_allclose(other.shrunk, share)
+    assert other.undetermined == ("turn.armature", "rail.viscous")
+    said = [f.message for f in loop_findings(other, ()) if f.code == "undetermined"]
+    first, second, *others = other.fit.simulator.free_parameters
+    gain = (first, replace(second, name="turn.kp"), *others)
+    simulator = replace(other.fit.simulator, free_parameters=gain)
+    estimate = replace(other.estimate, names=tuple(free.name for free in gain))
+    gain = replace(other, fit=replace(other.fit, simulator=simulator, estimate=estimate))
+    said += [f.message for f in loop_findings(gain, ()) if f.code == "undetermined"]
+    assert ["groups of joints with equal drives" in words for words in said] == [False, True]
+    simulator = found.fit.simulator
+    body = replace(simulator.free_parameters[1], what="body")
+    free_parameters = (simulator.free_parameters[0], body, *simulator.free_parameters[2:])
+    fit = replace(other.fit, simulator=replace(simulator, free_parameters=free_parameters))
+    assert replace(other, fit=fit).undetermined == ("rail.viscous",), "bodies have a prior"
+
+
+def test_a_parameter_at_its_upper_bound_is_told_from_one_at_0(found):
+    simulator, theta = found.fit.simulator, found.estimate.theta.copy()
+    first, second, *others = simulator.free_parameters
+    theta[:2] = 0.5, 0.0
+    wide = replace(simulator, free_parameters=(replace(first, highest=0.5), second, *others))
+    details = {**found.estimate.details, "at_bound": NAMES[:2]}
+    estimate = replace(found.estimate, theta=theta, details=details)
+    bound = replace(found, fit=replace(found.fit, simulator=wide, estimate=estimate))
+    above, below = [f for f in loop_findings(bound, ()) if f.code == "at_bound"]
+    assert above.where == f"{NAMES[0]} = 0.5"
+    assert "the estimate is the upper bound; with more, the gear is self-locking" in above.message
+    assert below.where == NAMES[1]
+    assert below.message.startswith(f"{NAMES[1]}: the estimate is 0, the lower bound")
+
+
+def at_limit(found, limit, theta):
+    """Return the same with a limit in place of the first parameter."""
+    simulator = found.fit.simulator
+    others = replace(simulator, free_parameters=(limit, *simulator.free_parameters[1:]))
+    estimate = replace(found.estimate, theta=theta, names=("turn.limit", *NAMES[1:]))
+    return replace(found, fit=replace(found.fit, simulator=others, estimate=estimate))
+
+
+def test_a_limit_and_a_gain_at_their_lower_bound_are_findings(found):
+    simulator, theta = found.fit.simulator, found.estimate.theta.copy()
+    first, second, *others = simulator.free_parameters
+    limit = replace(first, name="rail.limit", what="limit", lowest=0.25)
+    gain = replace(second, name="turn.kp", what="kp", lowest=1.5)
+    theta[:2] = 0.25, 1.5
+    names = ("rail.limit", "turn.kp", *NAMES[2:])
+
+    def said(*at_bound):
+        details = {**found.estimate.details, "at_bound": at_bound}
+        estimate = replace(found.estimate, theta=theta, details=details, names=names)
+        both = replace(simulator, free_parameters=(limit, gain, *others))
+        at = replace(found, fit=replace(found.fit, simulator=both, estimate=estimate))
+        return [f for f in loop_findings(at, ()) if f.code in ("at_bound", "limit")]
+
+    [bound] = said("rail.limit", "turn.kp")
+    assert (bound.code, bound.severity) == ("at_bound", "warning")
+    assert bound.where == "rail.limit = 0.25, turn.kp = 1.5"
+    bound, free = sorted(said("turn.kp"), key=lambda finding: finding.code)
+    assert bound.where == "turn.kp = 1.5"
+    assert free.where == "rail"
+    assert free.evidence["limit"] == 0.25
+    error = found.estimate.std_error[0]
+    assert (
+        f"saturates. The torque limit of the drive is estimated as 0.25 +- {error:.2g} N; at the"
+        in (free.message)
+    )
+    first = replace(limit, joints=(1,))
+    (other,) = [f for f in loop_findings(at_limit(found, first, theta), ()) if f.code == "limit"]
+    assert f"0.25 +- {error:.2g} N m; at the limit" in other.message
+
+
+def test_gains_of_joints_with_equal_limits_that_differ_are_a_note(found):
+    simulator = found.fit.simulator
+    first, second, *others = simulator.free_parameters
+    gains = tuple(
+        replace(x, name=f"{joint}.kp", what="kp", joints=(j,), lowest=0.0)
+        for j, (x, joint) in enumerate(zip((first, second), ("rail", "turn"), strict=True))
+    )
+    estimate = replace(found.estimate, names=("rail.kp", "turn.kp", *NAMES[2:]))
+
+    def said(kp, **limit):
+        loops = replace(found.fit.loops, kp=np.array(kp))
+        own = replace(simulator, free_parameters=(*gains, *others))
+        model = SimpleNamespace(
+            joints=("rail", "turn"),
+            limits=[
+                SimpleNamespace(
+                    name=name, type="revolute", **({"effort": 9.0, "velocity": 4.0} | x)
+                )
+                for name, x in (("rail", {}), ("turn", limit))
+            ],
+        )
+        fit = SimpleNamespace(simulator=own, loops=loops, estimate=estimate)
+        return list(findings._unequal_gains(SimpleNamespace(fit=fit, model=model)))
+
+    [note] = said([6.0, 75.0])
+    assert (note.code, note.severity, note.where) == ("unequal_gains", "note", "rail, turn")
+    assert note.evidence == {"lowest": 6.0, "highest": 75.0}
+    assert "kp from 6 to 75" in note.message
+    assert 'groups = { NAME = ["rail", "turn"] } in [controller]' in note.message
+    assert said([25.0, 75.0]) == []
+    [note] = said([75.0, 6.0])  # in any order
+    assert note.evidence == {"lowest": 6.0, "highest": 75.0}
+    assert said([6.0, 75.0], effort=8.0) == []
+    assert said([6.0, 75.0], velocity=3.0) == []
+
+
+def test_two_sets_that_a_third_pair_joins_are_one(found):
+    R = np.eye(5)
+    for a, b in ((0, 3), (1, 2), (2, 3)):
+        R[a, b] = R[b, a] = 0.99
+    [names] = of(found, covariance=R).correlated
+    assert names == ("rail.armature", "turn.armature", "robot.delay", "rail.viscous")
+
+
+def test_friction_is_projected_where_a_joint_moves_by_its_own_largest_speed(monkeypatch):
+    seen = []
+    monkeypatch.setattr(result, "drive_moments", lambda _, motions: seen.extend(motions))
+    t = 2.0 + np.arange(200) / 100.0
+    logs = [
+        Log(t, q, 0 * q, ("a", "b"), q_ref=q, has_torque=False)
+        for q in (np.sin(6.0 * t)[:, None] * size for size in ([1.0, 0.01], [0.02, 3.0]))
+    ]
+    model = SimpleNamespace(layout=SimpleNamespace(own={"a": ()}))
+    model.with_reference = lambda standard: model
+    runs = [SimpleNamespace(log=log) for log in logs]
+    stub = SimpleNamespace(model=model, standard=None, fitted=runs)
+    LoopIdentification.moments.fget(stub)
+    assert len(seen) == 2
+    for motion, moving in seen:
+        speed = np.abs(motion.v)
+        np.testing.assert_array_equal(moving, speed > 0.05 * speed.max(axis=0))
+        assert moving.mean(axis=0) == pytest.approx(0.97, abs=0.01)  # |cos| > 0.05
+
+
+@pytest.mark.parametrize(
+    ("stated", "cause", "remedy"),
+    [
+        ({}, "excite it. ", "Command a motion that depends more on rail.armature"),
+        ({"delay": 0.01}, "excite it, or delay in [controller] is wrong. ",
+         "Leave the delay out of [controller], so that it is fitted; command a motion"),
+        ({"kp": 9.0, "kd": 1.0}, "excite it, or kp or kd in [controller] is wrong. ",
+         "Compare kp and kd with the gains of the drive; command a motion"),
+    ],
+)  # fmt: skip
+def test_remedies_of_a_parameter_at_its_bound_name_only_what_is_stated(
+    found, stated, cause, remedy
+):
+    loop = LoopSettings(**stated)
+    at_bound = of(found, details={**found.estimate.details, "at_bound": ("rail.armature",)})
+    [finding] = (x for x in loop_findings(replace(at_bound, loop=loop), ()) if x.code == "at_bound")
+    assert f"{cause}{remedy}" in finding.message
+    assert ("delay" in finding.message) == ("delay" in stated)
+
+
+def test_encoders_are_told_with_the_figures_of_their_own_joint(found):
+    def told(**changes):
+        both = dict.fromkeys(Encoders.__dataclass_fields__, np.zeros(2))
+        both |= {"sign": np.ones(2), "next_sign": np.ones(2)}
+        encoders = Encoders(**{key: np.array(x) for key, x in (both | changes).items()})
+        fit = replace(found.fit, encoders=encoders)
+        loop = replace(found.loop, zeros="find")
+        said = loop_findings(replace(found, fit=fit, loop=loop), ())
+        return {f.code: f for f in said if f.code.startswith("encoder")}
+
+    [open_] = told(margin=[0.13, 0.05]).values()
+    assert open_.evidence == {"margin": 0.13}
+    [open_] = told(margin=[0.05, 0.13]).values()
+    assert (open_.where, open_.evidence) == ("rail, turn", {"margin": 0.13})
+    assert "leaves at most 13 % more squared position error" in open_.message
+    turned = {"gain": [0.0, 0.31], "sign": [1.0, -1.0], "next_zero": [0.4, -0.25]}
+    every = told(**turned, margin=[0.5, 2.1], explained=[0.62, 0.9])
+    assert {code: f.where for code, f in every.items()} == {
+        "encoder": "turn", "encoder_uncorrected": "rail",
+    }  # fmt: skip
+    said = every["encoder"].message
+    assert "turn: its encoder has the opposite sign and reads 0" in said
+    assert "explains 31 % of the squared position error" in said
+    assert "The next best, -0.25 rad and the other sign, leaves 210 % more" in said
+    kept = every["encoder_uncorrected"].message
+    assert "explains 62 % of the slow part" in kept
+    assert "The next best, +0.4 rad leaves 50 % more" in kept
+
+
+def test_speeds_of_a_log_are_those_between_its_gaps():
+    t = 3.0 + np.concatenate([np.arange(50), 80 + np.arange(30)]) / 100.0
+    q = np.column_stack([2.0 * t, -0.5 * t**2])
+    q[50:] += 7.0  # while nothing was recorded
+    log = Log(t, q, 0 * q, ("a", "b"), q_ref=q, has_torque=False)
+    motion = logged_motion(log)
+    np.testing.assert_array_equal(motion.segment, np.repeat([0, 1], [50, 30]))
+    np.testing.assert_allclose(motion.v[:, 0], 2.0)
+    inner = np.delete(np.arange(80), [0, 49, 50, 79])  # ends have half a step
+    np.testing.assert_allclose(motion.v[inner, 1], -t[inner])
+    np.testing.assert_allclose(motion.v[:, 1], -t, atol=0.0051)
+    assert not motion.a.any()
+
+
+def test_the_usual_speed_of_a_joint_is_the_root_of_its_mean_square():
+    t = 3.0 + np.arange(200) / 100.0
+    q = np.sin(20.0 * t)[:, None] * [1.0, 0.5]
+    windows = cut_windows(Log(t, q, 0 * q, ("a", "b"), q_ref=q, has_torque=False), 0.5, 0.0)
+    rms = np.sqrt(np.mean((20.0 * np.cos(20.0 * t)) ** 2))
+    np.testing.assert_allclose(_speed(windows), [rms, 0.5 * rms], rtol=0.02)
+    seldom = Log(t[::2], q[::2], 0 * q[::2], ("a", "b"), q_ref=q[::2], has_torque=False)
+    both = [*windows, *cut_windows(seldom, 0.5, 0.0)]  # each log has a rate of its own
+    np.testing.assert_allclose(_speed(both), [rms, 0.5 * rms], rtol=0.02)
+
+
+def test_a_result_is_consistent_if_every_body_is(found):
+    assert found.is_consistent
+    for body in range(found.model.layout.n_inertial // 10):
+        standard = found.standard.copy()
+        standard[10 * body] *= -1.0  # its mass
+        assert not replace(found, standard=standard).is_consistent
+
+
+def test_a_result_of_wrong_logs_has_no_urdf(found):
+    assert found.has_urdf
+    assert not replace(found, log_errors=("the command is delayed",)).has_urdf
+
+
+def test_findings_of_the_fit_have_its_figures(found):
+    details = {**found.estimate.details, "left": 0.634, "halving": 2.46, "step": 4e-3}
+    scale = GainScale(np.array([0.2, 0.26]), np.array([0.05, 0.04]), 0.234, 0.0152)
+    tried = (
+        Tried("turn", ("stribeck", "load"), 0.316, is_chosen=True),
+        Tried("rail", ("load",), 0.5, is_chosen=False),
+    )
+    own = of(found, details=details, converged=False, n_iter=17)
+    own = replace(own, fit=replace(own.fit, scale=scale, tried=tried))
+    said = {f.code: f for f in loop_findings(own, ())}
+    assert "has not converged after 17 steps" in said["not_settled"].message
+    assert "leaves 63 % of the residual that it should remove, wanted at most 50 %" in (
+        said["soft_loop"].message
+    )
+    assert said["soft_loop"].evidence == {"left": 0.634}
+    assert "halving the steps of 4 ms changes a parameter by 2.5 standard errors" in (
+        said["coarse_steps"].message
+    )
+    gains = said["gains_contradicted"]
+    rail, turn = 1.234 * found.fit.loops.kp
+    assert "weight and inertia indicate gains of 1.23 +- 0.015 times those stated" in gains.message
+    assert f"of kp: rail = {rail:.3g}, turn = {turn:.3g}; kd" in gains.message
+    assert gains.evidence == {"scale": pytest.approx(1.234), "std_error": 0.0152}
+    friction = said["friction_found"]
+    assert friction.where == "turn"
+    assert friction.message == (
+        "turn: stribeck and load lowers the squared error of held-out windows by 32 %"
+    )
+    assert friction.evidence == {"gain_pct": pytest.approx(31.6)}
+    assert said["scale"].severity == "note"
+    quiet = of(found, details={**details, "left": 0.49, "halving": 0.99})
+    codes = {f.code for f in loop_findings(quiet, ())}
+    assert not codes & {"not_settled", "soft_loop", "coarse_steps", "gains_contradicted"}
+
+
+def test_a_delay_that_the_fit_determines_is_a_note(found):
+    """Within a tenth of the 30 ms that one response leaves open."""
+    evidence = {"shortest": 0.01, "longest": 0.04, "frequency": 3.46}
+    slow = Finding("slow_command", "warning", "a.csv", "a.csv: slow", evidence)
+    delay, std = NAMES.index("robot.delay"), found.estimate.std_error.copy()
+
+    def settled(error, **changes):
+        std[delay] = error
+        details = {**found.estimate.details, **changes}
+        own = of(found, covariance=np.diag(std**2), details=details)
+        return next(f for f in loop_findings(own, (slow,)) if f.code == "slow_command")
+
+    note = settled(2.9e-3)
+    assert (note.severity, note.evidence) == ("note", {**evidence, "std_error": 2.9e-3})
+    assert "the fit determines it to +- 2.9 ms" in note.message
+    assert "power only up to 3.5 Hz" in note.message
+    assert settled(3.1e-3) == slow
+    bound = settled(1e-4, at_bound=("robot.delay",))
+    assert bound.severity == "warning"
+    assert bound.message.startswith("a.csv: slow. The delay of the fit is 0, its lower bound")
+    fixed = tuple(x for x in found.fit.simulator.free_parameters if x.what != "delay")
+    keep = [k for k in range(5) if k != delay]
+    estimate = replace(
+        found.estimate, theta=found.estimate.theta[keep],
+        covariance=found.estimate.covariance[np.ix_(keep, keep)],
+        names=tuple(np.array(NAMES)[keep].tolist()),
+    )  # fmt: skip
+    simulator = replace(found.fit.simulator, free_parameters=fixed)
+    fit = SimpleNamespace(simulator=simulator)
+    stated = findings._settled_delay(slow, SimpleNamespace(fit=fit, estimate=estimate))
+    assert "[controller] states it" in stated.message
+    assert stated.evidence["std_error"] == 0.0
+
+
+def test_units_of_a_rail_and_of_a_joint_that_turns(found):
+    """The rail is prismatic."""
+    wanted = {"kp": ("N/m", "N m/rad"), "kd": ("N s/m", "N m s/rad"), "zero": ("m", "rad"),
+              "limit": ("N", "N m"), "armature": ("kg", "kg m^2"), "delay": ("s", "s")}  # fmt: skip
+    free = found.fit.simulator.free_parameters[0]
+    for what, units in wanted.items():
+        own = [replace(free, name="x", what=what, joints=(j,), term=None) for j in (0, 1)]
+        assert tuple(units_of(found.model, x) for x in own) == units
+
+
+def test_metrics_are_those_of_each_joint_in_its_unit(found):
+    metrics, runs = found.metrics(), found.fitted
+    assert len(runs) == 2
+    for j, joint in enumerate(("rail", "turn")):
+        own = metrics.per_joint[joint]
+        assert own.unit == ("m", "rad")[j]
+        rmse = [np.sqrt(np.mean((x.log.q - x.q)[:, j] ** 2)) for x in runs]
+        spread = [np.std(x.log.q[:, j]) for x in runs]
+        command = [np.sqrt(np.mean((x.log.q_ref - x.log.q)[:, j] ** 2)) for x in runs]
+        size = np.linalg.norm(spread)
+        assert own.rmse == pytest.approx(np.linalg.norm(rmse) / np.sqrt(2))
+        assert own.relative_error_pct == pytest.approx(100 * np.linalg.norm(rmse) / size)
+        assert own.baselines["command"] == pytest.approx(100 * np.linalg.norm(command) / size)
+        assert own.r2 == pytest.approx(1.0 - (np.linalg.norm(rmse) / size) ** 2)
+        assert own.rows == sum(len(x.log.t) for x in runs)
+    each = [np.sqrt(np.mean((x.log.q - x.q) ** 2, axis=0)) for x in runs]
+    assert metrics.pooled_rmse == pytest.approx(np.sqrt(np.mean(np.square(each))))

@@ -1,0 +1,159 @@
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from helpers.mujoco_plant import plant, recorded
+
+from robotid.dynamics.simulation.loops import ClosedLoopRobot
+from robotid.estimation.fitting.estimator_settings import SimulationSettings
+from robotid.identification.closed_loop.encoder_zeros import (
+    CLEAR,
+    _descend,
+    find_encoders,
+    parallel_axes,
+)
+from robotid.identification.closed_loop.free_parameters import LoopSimulator, free_body_parameters
+from robotid.identification.closed_loop.from_commands import identify_loops
+from robotid.identification.closed_loop.loop_findings import _undetermined_encoders
+from robotid.identification.closed_loop.loop_settings import LoopSettings
+from robotid.identification.closed_loop.stages import stated_loops
+from robotid.robot.examples import example_urdf
+from robotid.robot.model import RobotModel
+
+AWAY = 0.5  # [rad] of the thigh's zero from the URDF's
+SETTINGS = SimulationSettings(window=1.0, lead=0.3, bodies=0.0, step=4e-3)
+
+
+@pytest.fixture(scope="module")
+def leg():
+    rng = np.random.default_rng(1)
+    robot = plant("leg", rng, coulomb=0.01, viscous=0.01)
+    return robot, recorded(robot, rng, duration=8.0, rate=250.0)[0]
+
+
+@pytest.fixture(scope="module")
+def moved(leg):
+    """The log of a leg whose thigh reads 0 where the URDF is at 0.5 rad."""
+    robot, log = leg
+    away = np.array([0.0, AWAY, 0.0])
+    return robot, replace(log, q=log.q - away, q_ref=log.q_ref - away)
+
+
+def test_encoders_with_the_zeros_of_the_urdf_keep_them(leg):
+    found = find_encoders(leg[0].model, [leg[1]])
+    np.testing.assert_array_equal(found.zero, 0.0)
+    np.testing.assert_array_equal(found.sign, 1.0)
+    np.testing.assert_array_equal(found.gain, 0.0)
+    assert (found.margin[:2] > CLEAR).all()
+    assert 0.0 <= found.margin[2] < CLEAR, "the calf bears little"
+    assert (found.explained[:2] > 0.3).all()
+    # ... and none where the motion is too small to tell
+    middle = leg[1].q.mean(axis=0)
+    small = replace(leg[1], q=middle + 0.2 * (leg[1].q - middle))
+    np.testing.assert_array_equal(find_encoders(leg[0].model, [small]).margin, 0.0)
+
+
+def test_a_zero_is_found_to_the_grid_and_then_by_the_fit(moved):
+    robot, log = moved
+    first = find_encoders(robot.model, [log])
+    np.testing.assert_array_equal(first.sign, 1.0)
+    assert first.zero[1] == pytest.approx(AWAY, abs=np.deg2rad(15.0))
+    assert (first.zero[[0, 2]] == 0.0).all()
+    assert first.next_zero[1] == 0.0  # that of the URDF, so gain and margin are of the same two
+    np.testing.assert_allclose(first.gain, [0.0, 1.0 - 1.0 / (1.0 + first.margin[1]), 0.0])
+    drives = robot.drives
+    loop = LoopSettings(
+        kp={d.joint: d.kp for d in drives}, kd={d.joint: d.kd for d in drives}, zeros="find"
+    )
+    found = identify_loops(robot.model, [log], [], loop, SETTINGS, chooses=False)
+    zero = dict(zip(found.fit.estimate.names, found.fit.estimate.theta, strict=True))
+    assert zero["FL_thigh_joint.zero"] == pytest.approx(AWAY, abs=0.03)
+    [said] = [f for f in found.findings if f.code == "encoder"]
+    assert said.where == "FL_thigh_joint"
+    assert said.evidence["zero"] == pytest.approx(AWAY, abs=0.03)
+    assert f"leaves {100 * said.evidence['margin']:.0f} % more" in said.message
+    assert said.evidence["next_zero"] == 0.0, "that of the URDF"
+    [kept] = [f for f in found.findings if f.code == "encoder_uncorrected"]
+    assert kept.where == "FL_hip_joint"
+    assert f"explains {100 * kept.evidence['explained']:.0f} %" in kept.message
+    [open_] = [f for f in found.findings if f.code == "encoder_undetermined"]
+    assert open_.where == "FL_calf_joint"
+    [mirror] = [f for f in found.findings if f.code == "mirror_image"]
+    assert mirror.where == "FL_thigh_joint, FL_calf_joint"
+
+
+def test_joints_that_gravity_leaves_open_are_named_with_the_largest_margin(leg):
+    margin = np.array([0.01, 0.02, 0.04])
+    found = SimpleNamespace(
+        model=leg[0].model, fit=SimpleNamespace(encoders=SimpleNamespace(margin=margin))
+    )
+    joints = leg[0].model.joints
+    for which, most in (([0, 1], 0.02), ([2, 0], 0.04), ([1], 0.02)):
+        open_, _ = _undetermined_encoders(found, [joints[k] for k in which])
+        assert open_.evidence == {"margin": most}
+        assert f"at most {100 * most:.0f} % more" in open_.message
+
+
+def test_parallel_axes_are_found_chain_by_chain(leg):
+    assert parallel_axes(leg[0].model) == [("FL_thigh_joint", "FL_calf_joint")]
+    arm = RobotModel.from_urdf(example_urdf("ur5_robot.urdf"))
+    assert parallel_axes(arm) == [("shoulder_lift_joint", "elbow_joint", "wrist_1_joint")]
+
+
+def test_an_encoder_that_counts_the_other_way_is_turned(leg):
+    robot, log = leg
+    turned = log.turned(np.array([1.0, -1.0, 1.0]))
+    np.testing.assert_array_equal(turned.q[:, 1], -log.q[:, 1])
+    np.testing.assert_array_equal(turned.q_ref[:, [0, 2]], log.q_ref[:, [0, 2]])
+    sign = find_encoders(robot.model, [turned]).sign
+    # a chain with parallel axes is its mirror image: thigh or calf
+    assert sorted(sign[1:].tolist()) == [-1.0, 1.0]
+    assert sign[0] == 1.0
+
+
+def test_the_gain_of_an_encoder_is_that_of_all_passes():
+    """The squared error is 1 with the URDF's zeros, 0.5 and 0.3 after the first pass, then 0.2."""
+    least = {(0, 0): 1.0, (15, 0): 0.5, (15, 30): 0.3, (45, 30): 0.2, (45, -90): 0.19}
+
+    def cost(model, sign, zero):
+        degrees = tuple(round(float(x)) for x in np.rad2deg(zero))
+        return 7 * np.log(least.get(degrees, 1.0) if (sign == 1.0).all() else 1.0)
+
+    motion = SimpleNamespace(q=np.zeros((7, 2)), cost=cost)
+    sign, zero, gain, left, costs = _descend(None, motion, np.array([0, 1]), [0, 1])
+    np.testing.assert_array_equal(sign, 1.0)
+    np.testing.assert_allclose(np.rad2deg(zero), [45.0, 30.0])
+    np.testing.assert_allclose(gain, [(1.0 - 0.5) + (0.3 - 0.2), 0.5 - 0.3])
+    assert left == pytest.approx(7 * np.log(0.2))
+    assert costs.min(axis=1) == pytest.approx(7 * np.log([0.2, 0.19]))
+
+
+def test_torques_tell_the_gains_that_positions_leave_open():
+    rng = np.random.default_rng(3)
+    robot = plant("planar", rng)
+    looped = ClosedLoopRobot(robot.model)
+    free_parameters = tuple(free_body_parameters(looped, 0.1))
+    simulator = LoopSimulator(
+        looped, (), stated_loops(robot.model, LoopSettings()), free_parameters
+    )
+    lighter = [np.log(0.7) / 2 if u.name.endswith("mass") else 0.0 for u in free_parameters]
+    # by the URDF's masses positions take the scale, which the torques then have to move
+    robot = replace(robot, bodies=simulator.loops(np.array(lighter)).bodies.reshape(-1))
+    log, truth = recorded(robot, rng, duration=2.4, rate=250.0, noise=1e-4, torque=0.5, step=1e-4)
+    settings, loop = replace(SETTINGS, bodies=0.1), LoopSettings(delays="group")
+    told = identify_loops(robot.model, [log], [], loop, settings, chooses=False)
+    for joint in robot.model.joints:
+        name = f"{joint}.kp"
+        m = told.fit.estimate.names.index(name)
+        assert told.fit.estimate.theta[m] == pytest.approx(truth[name], rel=0.001)
+        assert told.fit.simulator.prior[m] == pytest.approx(truth[name], rel=0.01), "begins there"
+        # by positions alone a tenth at least: test_of_many_scales_that_suit_the_positions_...
+        assert told.fit.estimate.std_error[m] < 0.001 * truth[name]
+    estimate = told.fit.estimate
+    np.testing.assert_allclose(estimate.sigma[2:], 0.5, rtol=0.05)  # of torques: nothing is left
+    for name, value, std in zip(estimate.names, estimate.theta, estimate.std_error, strict=True):
+        if not name.endswith("offset") and name in truth:  # the plant's friction creeps
+            assert abs(value - truth[name]) < 4 * std, name
+    assert f"{robot.model.joints[0]}.kd" in told.fit.estimate.names
+    assert "scale" not in {f.code for f in told.findings}

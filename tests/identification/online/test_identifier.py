@@ -1,0 +1,239 @@
+import copy
+from collections import deque
+from dataclasses import fields, replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from helpers.synthetic import exact_log, payload_log, truth
+
+from robotid.base.exceptions import DataError, SettingsError
+from robotid.dynamics.torque import joint_torque_regressor
+from robotid.identification.online.causal_signals import LiveSignals
+from robotid.identification.online.identifier import OnlineIdentifier
+from robotid.identification.online.online_settings import OnlineSettings
+
+
+def run(identifier, log, start=0, end=None):
+    for k in range(start, len(log.t) if end is None else end):
+        identifier.update(log.t[k], log.q[k], log.tau[k])
+    return identifier
+
+
+@pytest.fixture(scope="module")
+def picked_up(panda):
+    log = payload_log(panda, np.random.default_rng(0))
+    return log, run(OnlineIdentifier(panda), log)
+
+
+def test_a_load_picked_up_at_ten_seconds_is_flagged_and_weighed(picked_up):
+    _, identifier = picked_up
+    assert len(identifier.changes) == 1
+    (change,) = identifier.changes
+    assert 10.0 < change.flagged < 10.3
+    assert change.onset == pytest.approx(10.0, abs=0.05)
+    load = identifier.payload()
+    assert load.mass == pytest.approx(2.0, abs=0.06)
+    assert load.mass_std_error < 0.03
+    assert load.parameters[3] / load.mass == pytest.approx(0.1, abs=0.01)  # 10 cm behind
+    with pytest.raises(DataError, match="there is no change 1: 1 were flagged"):
+        identifier.payload(1)
+
+
+def test_a_load_is_as_sure_as_the_parameters_before_and_after_it(picked_up):
+    _, identifier = picked_up
+    (change,), estimate, model = identifier.changes, identifier.estimate, identifier.model
+    size = model.layout.n_inertial
+    columns = identifier.mapping.K[:, size - 10 : size]
+    load = identifier.payload(0)
+    C = estimate.covariance + change.covariance
+    spread = identifier._load_spread
+    H = np.diag(spread**-2.0) + columns.T @ np.linalg.solve(C, columns)
+    np.testing.assert_allclose(load.std_error, np.sqrt(np.diag(np.linalg.inv(H))), rtol=1e-3)
+    pull = columns.T @ np.linalg.solve(C, estimate.theta - change.theta)
+    miss = np.abs(load.parameters - np.linalg.solve(H, pull)) / load.std_error
+    assert miss.max() < 1e-3
+
+
+def test_what_the_data_leave_of_the_prior_is_the_mean_share_of_variances(picked_up):
+    _, identifier = picked_up
+    reading = identifier.reading
+    share = reading.std_error**2 / identifier._prior_variance
+    assert reading.excitation == pytest.approx(1.0 - np.minimum(share, 1.0).mean())
+    # a walk of the parameters does not take away more than the prior gave
+    lost = copy.copy(identifier)
+    lost._state = replace(identifier._state, P=np.diag(identifier._prior_variance))
+    lost._state.P[2, 2] *= 9.0
+    assert lost.reading.excitation == pytest.approx(0.0)
+    # after a change a load may have come, and all the rest may be off by a tenth of its spread
+    size = identifier.model.layout.n_inertial
+    KL = identifier.mapping.K[:, size - 10 : size] * identifier._load_spread
+    wanted = np.sum(KL**2, axis=1) + 0.01 * identifier._prior_variance
+    np.testing.assert_allclose(np.diag(identifier._reopening), wanted)
+    # behind the filter two rows per period of the cut-off are independent
+    s = identifier.settings
+    step = max(1, int(s.rate / (12.0 * s.cutoff))) / s.rate
+    assert identifier._share == pytest.approx(min(1.0, 2.0 * s.cutoff * step))
+
+
+def test_a_change_goes_back_to_the_last_state_a_delay_before_it_began(picked_up):
+    again = copy.copy(picked_up[1])
+    again._innovations = SimpleNamespace(forget_convergence=lambda: None)
+    state, size = again._state, len(again._state.theta)
+    states = [replace(state, theta=np.full(size, k), P=(1.0 + k) * np.eye(size)) for k in range(4)]
+    onset = 3.0 + again.delay
+    for times, wanted in (((2.0, 2.9, 3.0 + 0.5 * again.delay, 3.5), 1), ((3.1, 3.2, 3.3, 3.4), 0)):
+        again._recent = deque(zip(times, states, strict=True))
+        again._reopen(3.6, onset)
+        change = again.changes[-1]
+        assert (change.flagged, change.onset) == (3.6, onset)
+        np.testing.assert_array_equal(change.theta, states[wanted].theta)
+        np.testing.assert_array_equal(change.covariance, states[wanted].P)
+        np.testing.assert_array_equal(again._state.theta, states[wanted].theta)
+        np.testing.assert_array_equal(again._state.P, states[wanted].P + again._reopening)
+        assert not again._recent
+    s = again.settings
+    step = max(1, int(s.rate / (12.0 * s.cutoff))) / s.rate
+    assert again._kalman.walk == pytest.approx(s.walk * np.sqrt(step))
+
+
+def test_a_change_starts_from_what_was_known_before_it(panda, picked_up):
+    log, identifier = picked_up
+    (change,) = identifier.changes
+    before = run(OnlineIdentifier(panda), log, 0, int(np.searchsorted(log.t, change.onset))).reading
+    # a state of every tenth of a second is kept; what the load bends is six standard errors
+    assert np.abs((change.theta - before.theta) / before.std_error).max() < 1.0
+
+
+def test_the_new_parameters_are_followed(panda, picked_up):
+    _, identifier = picked_up
+    pi = truth(panda)
+    last = slice(panda.layout.n_inertial - 10, panda.layout.n_inertial)
+    own = 0.4 * 2.0 * 0.05**2
+    loaded = pi.copy()
+    load = [2.0, 0, 0, 0.2, own + 0.02, 0, own + 0.02, 0, 0, own]
+    loaded[last] += load
+    reading = identifier.reading
+    beta, before = identifier.mapping.to_base(loaded), identifier.mapping.to_base(pi)
+    error = np.abs(reading.theta - beta) / reading.std_error
+    # filter and differentiation leave a little that is not noise
+    assert np.sqrt(np.mean(error**2)) < 2.5
+    miss = np.linalg.norm(reading.theta - beta)
+    assert miss < 0.5 * np.linalg.norm(before - beta)
+    assert identifier.estimate.names == identifier.names
+    np.testing.assert_array_equal(identifier.estimate.sigma, reading.sigma)
+    np.testing.assert_array_equal(identifier.estimate.std_error, reading.std_error)
+    assert identifier.estimate.converged == reading.converged
+    np.testing.assert_array_equal(identifier.estimate.theta, reading.theta)
+
+
+def test_without_a_change_none_is_flagged_and_it_converges(panda):
+    log = payload_log(panda, np.random.default_rng(1), mass=0.0, duration=15.0)
+    identifier = OnlineIdentifier(panda)
+    run(identifier, log, 0, 1000)
+    early = identifier.reading
+    run(identifier, log, 1000)
+    late = identifier.reading
+    assert identifier.changes == ()
+    assert len(identifier._recent) == 30  # states, one every tenth of a second
+    assert np.diff([t for t, _ in identifier._recent]) == pytest.approx(0.1, abs=0.011)
+    assert not early.converged
+    assert late.converged
+    assert 0.5 < early.excitation < late.excitation <= 1.0
+    assert (late.std_error < early.std_error * 1.001).all()
+    assert late.t == pytest.approx(log.t[-1] - identifier.delay, abs=0.011)
+    # the filter keeps 2 * 8 / 200 of the variance of white noise, and smears Coulomb friction
+    white = 0.02 * np.sqrt(np.mean(log.tau**2, axis=0) * 2 * 8 / 200)
+    assert (late.sigma < 6 * white).all()
+    assert (late.sigma > 0.5 * white).all()
+
+
+def test_smooth_motion_can_be_given_as_it_is(ur5, rng):
+    noise = np.array([4.0, 2.0, 1.0, 0.3, 0.2, 0.1])
+    log = exact_log(ur5, truth(ur5), rng, samples=2000, rate=50.0, noise=0.1 * noise)
+    # a cut-off of 2 Hz would leave two of three filtered samples out; these are all taken
+    identifier = OnlineIdentifier(ur5, OnlineSettings(rate=50.0, cutoff=2.0))
+    for k in range(len(log.t)):
+        identifier.update(log.t[k], log.q[k], log.v[k], log.a[k], log.tau[k])
+    reading = identifier.reading
+    assert identifier.delay == 0.0
+    assert reading.t == log.t[-1]
+    assert identifier.changes == ()
+    assert identifier.estimate.n_iter == len(log.t)
+    # each sample is a step of its own
+    assert identifier._share == pytest.approx(2 * 2.0 / 50.0)
+    assert identifier._kalman.walk == pytest.approx(1e-4 / np.sqrt(50.0))
+    error = np.abs(reading.theta - identifier.mapping.to_base(truth(ur5))) / reading.std_error
+    assert np.sqrt(np.mean(error**2)) < 1.5
+    np.testing.assert_allclose(reading.sigma, 0.1 * noise, rtol=0.3)
+    # a torque is compared with what the estimate makes of it once it has seen it
+    q, v, a, tau = (getattr(log, key)[5] for key in ("q", "v", "a", "tau"))
+    v = np.where(np.arange(6) == 2, 0.01, v)  # too slow for a sign
+    identifier.update(log.t[-1] + 0.02, q, v, a, tau + 1.0)
+    measured, predicted = identifier.compared
+    np.testing.assert_array_equal(measured, tau + 1.0)
+    W = joint_torque_regressor(ur5, q[None], v[None], a[None])[:, identifier.mapping.independent]
+    wanted = np.where(np.abs(v) < 0.02, np.nan, W @ identifier.reading.theta)
+    np.testing.assert_allclose(predicted, wanted)
+
+
+def test_a_bad_sample_is_refused_without_harm(ur5, rng):
+    log = exact_log(ur5, truth(ur5), rng, samples=600, rate=200.0)
+    clean, disturbed = OnlineIdentifier(ur5), OnlineIdentifier(ur5)
+    run(clean, log)
+    bad = np.full(6, np.nan)
+    for k in range(len(log.t)):
+        disturbed.update(log.t[k], log.q[k], log.tau[k])
+        with pytest.raises(DataError, match="is not finite, so it was refused"):
+            disturbed.update(log.t[k] + 1e-3, bad, log.tau[k])
+    np.testing.assert_array_equal(disturbed.reading.theta, clean.reading.theta)
+    with pytest.raises(DataError, match=r"update takes \(t, q, tau\) or .* found 4 values"):
+        clean.update(9.0, log.q[0], log.q[0], log.q[0])
+    with pytest.raises(DataError, match="t must increase"):
+        clean.update(log.t[-1], log.q[0], log.q[0], log.q[0], log.tau[0])
+    with pytest.raises(DataError, match="is not finite, so it was refused"):
+        clean.update(9.0, log.q[0], bad, log.q[0], log.tau[0])
+    with pytest.raises(DataError, match=r"wanted \(6,\) each"):
+        clean.update(9.0, log.q[0], bad[:5], log.q[0], log.tau[0])
+
+
+def test_before_the_robot_has_moved_there_is_no_estimate(ur5):
+    identifier = OnlineIdentifier(ur5)
+    for k in range(400):
+        identifier.update(k / 200.0, np.zeros(6), np.ones(6))
+    assert not identifier.is_ready
+    with pytest.raises(
+        DataError, match=r"the robot has moved for 0\.00 s, and the warm-up needs 1 s of motion"
+    ):
+        _ = identifier.reading
+    with pytest.raises(DataError, match="there is no change -1: 0 were flagged"):
+        identifier.payload()
+    # of two hundred instants a second every other one is a step; one joint that moves is enough
+    signals, seen = LiveSignals(6, 200.0, 8.0, 4, np.zeros(6, dtype=bool)), 0
+    identifier = OnlineIdentifier(ur5)
+    for k in range(140):
+        q = np.append(np.zeros(5), k / 200.0)
+        seen += len(list(signals.push(k / 200.0, q, np.ones(6))))
+        identifier.update(k / 200.0, q, np.ones(6))
+    assert seen > 80
+    with pytest.raises(DataError, match=rf"moved for {seen // 2 / 100:.2f} s, and the warm-up"):
+        _ = identifier.compared
+    # the instants of the warm-up are processed as if their own samples had just come
+    steps, identifier._step = [], lambda instant, now: steps.append(now - instant[0])
+    for k in range(140, 300):
+        identifier.update(k / 200.0, np.append(np.zeros(5), k / 200.0), np.ones(6))
+    assert len(steps) > 100
+    np.testing.assert_allclose(steps, identifier.delay, atol=1e-9)
+
+
+def test_settings_out_of_range_are_refused():
+    with pytest.raises(SettingsError, match="threshold is 0"):
+        OnlineSettings(threshold=0)
+    with pytest.raises(SettingsError, match="walk is -1, wanted 0 or a positive number"):
+        OnlineSettings(walk=-1)
+    may_be_0 = {"walk", "min_velocity", "model_error"}
+    for name in {f.name for f in fields(OnlineSettings)} - {"order"}:  # which the signals check
+        for value in (-1.0,) if name in may_be_0 else (-1.0, 0.0):
+            with pytest.raises(SettingsError, match=f"{name} is {value}, wanted .*positive number"):
+                OnlineSettings(**{name: value})
+    assert OnlineSettings(**dict.fromkeys(may_be_0, 0.0)).walk == 0.0

@@ -1,0 +1,269 @@
+"""What MuJoCo loads moves as what was identified."""
+
+import xml.etree.ElementTree as ET
+
+import mujoco
+import numpy as np
+import pinocchio as pin
+import pytest
+from helpers.closed_chains import Oracle, ankle, four_bar
+from helpers.robots import possible_parameters
+from helpers.simulators import SIMULATED, simulated, states
+from scipy.spatial.distance import pdist
+
+from robotid.base.exceptions import ModelError
+from robotid.output.files.commanded import CommandedDrive
+from robotid.output.files.exported import unstated_terms
+from robotid.output.files.mjcf import write_mjcf
+from robotid.robot.closure import Chains
+from robotid.robot.constraints import Loop
+from robotid.robot.drives import Cubic, Spring
+from robotid.robot.model import RobotModel
+from robotid.robot.parameters import Coupling
+
+OFF = mujoco.mjtDisableBit
+SMALL = """<robot name="arm--1">
+<link name="base"><visual><geometry><mesh filename="a.stl"/></geometry></visual></link>
+<link name="upper">{inertials[0]}
+  <visual><origin xyz="0 0 .1" rpy="0 0 1"/><geometry><box size=".1 .2 .4"/></geometry></visual>
+  <collision><geometry><cylinder radius=".05" length=".4"/></geometry></collision></link>
+<link name="{last}">{inertials[1]}
+  <collision><geometry><sphere radius=".07"/></geometry></collision>
+  <visual><geometry><mesh filename="b.stl" scale="1 2 3"/></geometry></visual></link>
+<joint name="j" type="revolute"><parent link="base"/><child link="upper"/><axis xyz="0 3 4"/>
+  <limit lower="-1" upper="2" effort="7" velocity="1"/></joint>
+<joint name="k" type="continuous"><parent link="upper"/><child link="{last}"/><axis xyz="1 0 0"/>
+  <limit effort="0" velocity="1"/></joint></robot>"""
+INERTIAL = """<inertial><origin xyz=".1 0 0"/><mass value="2"/>
+<inertia ixx=".1" iyy=".1" izz="{izz}" ixy="0" ixz="0" iyz="0"/></inertial>"""
+
+
+def small(folder, last="lower", held=".1", **options):
+    path, inertials = folder / "arm.urdf", [INERTIAL.format(izz=izz) for izz in (".1", held)]
+    path.write_text(SMALL.format(last=last, inertials=inertials))
+    return RobotModel.from_urdf(path, **options)
+
+
+def load(path):
+    model = mujoco.MjModel.from_xml_path(str(path))
+    return model, mujoco.MjData(model)
+
+
+def named(model, joint):
+    return mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, joint)
+
+
+@pytest.mark.parametrize("name", SIMULATED)
+def test_mass_matrix_and_forces_are_pinocchios(name, tmp_path):
+    model, pi = simulated(name)
+    write_mjcf(model, pi, tmp_path / "robot.xml")
+    robot, data = load(tmp_path / "robot.xml")
+    robot.opt.disableflags = OFF.mjDSBL_CONSTRAINT
+    for state in states(model, pi, 5):
+        assert robot.nv == len(state.v)
+        P, turning = np.zeros((robot.nv, robot.nv)), np.zeros(robot.nv)  # v_mujoco = P v
+        if model.free_flyer:  # MuJoCo's base velocity is in the world's axes, its spin in its own
+            assert named(robot, "root_joint") == 0
+            R = pin.XYZQUATToSE3(state.q[:7]).rotation
+            P[:3, :3], P[3:6, 3:6] = R, np.eye(3)
+            turning[:3] = R @ np.cross(state.v[3:6], state.v[:3])
+            data.qpos[:7] = state.q[[0, 1, 2, 6, 3, 4, 5]]
+        for joint, column in state.columns.items():
+            P[robot.jnt_dofadr[named(robot, joint)], column] = 1.0
+            data.qpos[robot.jnt_qposadr[named(robot, joint)]] = state.angles[joint]
+        data.qvel, data.qacc = P @ state.v, P @ state.a + turning
+        mujoco.mj_inverse(robot, data)
+        M = np.zeros((robot.nv, robot.nv))
+        for row, unit in zip(M, np.eye(robot.nv), strict=True):
+            mujoco.mj_mulM(robot, data, row, unit)
+        np.testing.assert_allclose(P.T @ M @ P, state.M, atol=1e-9 * abs(state.M).max(), rtol=0)
+        found = P.T @ data.qfrc_inverse
+        np.testing.assert_allclose(found, state.tau, atol=1e-9 * abs(state.tau).max(), rtol=0)
+
+
+def test_inverse_dynamics_on_a_log_are_the_fits(identified, tmp_path):
+    """Friction is a constraint to MuJoCo, sign(v) only where the joint moves."""
+    model, pi = identified.model, identified.standard
+    write_mjcf(model, pi, tmp_path / "robot.xml")
+    robot, data = load(tmp_path / "robot.xml")
+    robot.opt.disableflags = OFF.mjDSBL_LIMIT | OFF.mjDSBL_CONTACT
+    assert robot.nu == len(model.joints)
+    at = [robot.jnt_dofadr[named(robot, joint)] for joint in model.joints]
+    evaluation = identified.validation[0]
+    motion, wanted = evaluation.recording.trajectory, evaluation.torques["estimate"]
+    found = np.empty_like(wanted)
+    for k in range(len(motion.t)):
+        data.qpos[at], data.qvel[at], data.qacc[at] = motion.q[k], motion.v[k], motion.a[k]
+        mujoco.mj_inverse(robot, data)
+        # the control whose force, without the bias, moves the joint so
+        data.ctrl = 0.0
+        mujoco.mj_fwdActuation(robot, data)
+        found[k] = (data.qfrc_inverse - data.qfrc_actuator)[at]
+    moves = np.abs(motion.v) > 0.2  # [rad/s]
+    assert moves.mean() > 0.5
+    values = dict(zip(model.layout.names, pi, strict=True))
+    coulomb, offset = (
+        np.array([values[f"{joint}.{term}"] for joint in model.joints])
+        for term in ("coulomb", "offset")
+    )
+    assert np.abs([coulomb, offset]).min() > 0
+    wanted = wanted + coulomb * (np.sign(motion.v) - motion.direction)  # filtered as the torque is
+    np.testing.assert_allclose(found[moves], wanted[moves], atol=1e-9 * abs(wanted).max(), rtol=0)
+
+
+def test_friction_is_coulombs_at_slow_speeds_too(identified, tmp_path):
+    model, pi = identified.model, identified.standard
+    write_mjcf(model, pi, tmp_path / "robot.xml")
+    robot, data = load(tmp_path / "robot.xml")
+    data.qpos, data.qvel, data.qacc = 0.5, 0.005, 0.0
+    mujoco.mj_inverse(robot, data)
+    coulomb = [pi[model.layout.names.index(f"{joint}.coulomb")] for joint in model.joints]
+    np.testing.assert_allclose(-data.qfrc_constraint, coulomb, rtol=1e-12)
+    # at rest, with a torque below the friction: one in a thousand of the acceleration remains
+    robot.opt.gravity, data.qvel = 0.0, 0.0
+    k = model.joints.index("elbow_joint")
+    data.qfrc_applied[k] = 0.5 * coulomb[k]
+    mujoco.mj_forward(robot, data)
+    assert abs(data.qacc[k]) < 0.002 * abs(data.qacc_smooth[k])
+
+
+def test_limits_shapes_and_meshes(tmp_path):
+    box = b"\0" * 80 + (4).to_bytes(4, "little")
+    corners = np.vstack([np.zeros(3), np.eye(3)]).astype("<f4")
+    for face in ([0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]):
+        box += bytes(12) + corners[face].tobytes() + b"\0\0"
+    (tmp_path / "b.stl").write_bytes(box)
+    (tmp_path / "a.stl").write_text("solid a\nendsolid a\n")  # MuJoCo reads no text
+    model = small(tmp_path)
+    pi = possible_parameters(model, np.random.default_rng(0))
+    pi[model.layout.names.index("k.offset")] = 0.0
+    notes = write_mjcf(model, pi, tmp_path / "robot.xml")
+    assert notes == ("meshes not exported, missing or in a format that MJCF cannot read: a.stl",)
+    robot, _ = load(tmp_path / "robot.xml")
+    np.testing.assert_array_equal(robot.jnt_range, [[-1, 2], [0, 0]])
+    np.testing.assert_allclose(robot.jnt_axis, [[0, 0.6, 0.8], [1, 0, 0]])
+    np.testing.assert_array_equal(robot.actuator_ctrlrange, [[-7, 7], [0, 0]])
+    np.testing.assert_array_equal(robot.actuator_ctrllimited, [True, False])
+    np.testing.assert_array_equal(robot.actuator_biastype, [1, 0])
+    kinds = mujoco.mjtGeom
+    sizes = {kinds.mjGEOM_BOX: [0.05, 0.1, 0.2], kinds.mjGEOM_CYLINDER: [0.05, 0.2, 0]}
+    sizes[kinds.mjGEOM_SPHERE] = [0.07, 0, 0]
+    for kind, size in sizes.items():
+        (geom,) = np.flatnonzero(robot.geom_type == kind)
+        np.testing.assert_allclose(robot.geom_size[geom], size)
+        assert robot.geom_contype[geom] == (kind != kinds.mjGEOM_BOX)  # which is only seen
+        assert robot.geom_group[geom] == (2 if kind == kinds.mjGEOM_BOX else 3)
+    assert not robot.geom_conaffinity.any()
+    turned = [np.cos(0.5), 0, 0, np.sin(0.5)]
+    np.testing.assert_allclose(robot.geom_quat[0], turned)
+    edges = [1, 2, 5**0.5, 3, 10**0.5, 13**0.5]  # of the scaled mesh, wherever it was moved
+    np.testing.assert_allclose(np.sort(pdist(robot.mesh_vert)), edges, rtol=1e-5)
+
+
+def test_joints_that_follow_are_held_to_their_leader(tmp_path):
+    model, pi = simulated("fingers that slide")
+    write_mjcf(model, pi, tmp_path / "robot.xml")
+    robot, _ = load(tmp_path / "robot.xml")
+    pair = [named(robot, f"panda_finger_joint{i}") for i in (2, 1)]
+    assert [robot.eq_obj1id[0], robot.eq_obj2id[0]] == pair
+    np.testing.assert_array_equal(robot.eq_data[0, :5], [0, 1, 0, 0, 0])
+    assert robot.nu == robot.nv - 1
+
+
+def test_an_actuator_takes_off_the_offsets_of_all_drives_that_turn_with_its_joint(tmp_path):
+    shared = Coupling("k", (("j", 0.5), ("k", -3.0)), replaces=True)
+    model = small(tmp_path, couplings=[shared])
+    pi = possible_parameters(model, np.random.default_rng(0))
+    for name, offset in {"j": 0.7, "k": 0.9}.items():
+        pi[model.layout.names.index(f"{name}.offset")] = offset
+    write_mjcf(model, pi, tmp_path / "robot.xml")
+    robot, _ = load(tmp_path / "robot.xml")
+    bias = [-(0.7 + 0.5 * 0.9), 3.0 * 0.9]
+    np.testing.assert_allclose(robot.actuator_biasprm[:, 0], bias, rtol=1e-12)
+
+
+def test_springs_are_at_rest_at_the_zero_of_the_urdf_wherever_the_encoder_has_its_own(tmp_path):
+    model = small(tmp_path, own_terms={"j": [Spring()], "k": [Spring()]})
+    pi = possible_parameters(model, np.random.default_rng(0))
+    values = dict(zip(model.layout.names, pi.tolist(), strict=True))
+    drives = [
+        CommandedDrive(
+            joint, 50.0, 2.0, 0.0, zero,
+            *(values[f"{joint}.{term}"] for term in ("armature", "viscous", "coulomb", "offset")),
+            np.inf,
+        )
+        for joint, zero in (("j", 0.3), ("k", -0.7))
+    ]  # fmt: skip
+    write_mjcf(model, pi, tmp_path / "robot.xml", commanded=drives)
+    robot, data = load(tmp_path / "robot.xml")
+    read = np.array([0.25, 0.4])  # by the encoders
+    data.qpos = read
+    mujoco.mj_forward(robot, data)
+    stiffness = np.array([values["j.spring"], values["k.spring"]])
+    assert (stiffness != 0.0).all()
+    np.testing.assert_allclose(data.qfrc_passive, -stiffness * (read + np.array([0.3, -0.7])))
+    np.testing.assert_allclose(robot.qpos0, [-0.3, 0.7])
+    np.testing.assert_allclose(robot.jnt_range[0], [-1.3, 1.7])
+
+
+def test_a_term_that_mjcf_has_no_place_for_is_named(tmp_path):
+    model = small(tmp_path, own_terms={"j": [Cubic()], "k": [Spring(), Cubic()]})
+    pi = possible_parameters(model, np.random.default_rng(0))
+    pi[model.layout.names.index("j.cubic")] = 0.0  # nothing is lost of it
+    pi[model.layout.names.index("k.spring")] = stiffness = -3.0
+    notes = write_mjcf(model, pi, tmp_path / "robot.xml")
+    robot, data = load(tmp_path / "robot.xml")
+    data.qpos = [0.0, 0.4]
+    mujoco.mj_forward(robot, data)
+    np.testing.assert_allclose(data.qfrc_passive, [0.0, -stiffness * 0.4])
+    assert notes[0] == "MJCF cannot state k.cubic; the drive parameters file of the URDF has them"
+    parser = ET.XMLParser(target=ET.TreeBuilder(insert_comments=True))
+    comment = ET.parse(tmp_path / "robot.xml", parser).getroot()[0].text
+    assert notes[0] in comment
+    assert notes[1] in comment
+    assert "arm- -1" in comment  # two dashes would end it
+
+
+def test_what_no_simulator_reads_is_refused_before_anything_is_written(tmp_path):
+    model = small(tmp_path, last="world")
+    pi = possible_parameters(model, np.random.default_rng(0))
+    with pytest.raises(ModelError, match="a moving link is named 'world'"):
+        write_mjcf(model, pi, tmp_path / "robot.xml")
+    model = small(tmp_path, held=".5", joints=["j"])
+    pi = model.standard_parameters()  # the sum of both links, of which one is impossible
+    with pytest.raises(
+        ModelError, match="link 'lower', beyond a locked joint, has a physically impossible"
+    ):
+        write_mjcf(model, pi, tmp_path / "robot.xml")
+    assert not (tmp_path / "robot.xml").exists()
+
+
+@pytest.mark.parametrize("robot", [four_bar, ankle])
+def test_loops_are_closed_in_mujoco(robot, tmp_path, rng):
+    model = robot(tmp_path, terms=("viscous",))
+    pi = model.standard_parameters()
+    pi[model.layout.n_inertial :] = rng.uniform(0.02, 0.1, len(model.layout.drive_names))
+    write_mjcf(model, pi, tmp_path / "closed.xml")
+    robot, data = load(tmp_path / "closed.xml")
+    assert robot.nu == len(model.joints) - len(model.passive)
+    oracle = Oracle(model, pi)
+    q, Z = Chains(model).random_states(5, rng)
+    at = np.array([robot.joint(joint).qposadr[0] for joint in model.joints])
+    for q_k, Z_k in zip(q, Z, strict=True):
+        v = Z_k @ rng.standard_normal(len(q_k))
+        tau = rng.standard_normal(len(q_k)) * ~np.isin(model.joints, model.passive)
+        data.qpos[at], data.qvel[at] = q_k, v
+        data.ctrl[:] = [tau[model.joints.index(robot.actuator(k).name)] for k in range(robot.nu)]
+        mujoco.mj_forward(robot, data)
+        wanted = oracle.acceleration(q_k, v, tau)
+        np.testing.assert_allclose(data.qacc[at], wanted, atol=1e-2 * np.abs(wanted).max())
+
+
+def test_a_rigid_loop_is_a_weld_and_others_are_stated_elsewhere(tmp_path):
+    model = four_bar(tmp_path, constraints=[Loop(("coupler_end", "rocker_end"), "rigid")])
+    pi = model.standard_parameters()
+    write_mjcf(model, pi, tmp_path / "welded.xml")
+    robot, _ = load(tmp_path / "welded.xml")
+    assert list(robot.eq_type) == [mujoco.mjtEq.mjEQ_WELD]
+    (note,) = unstated_terms(model, pi, "SDF", ())
+    assert note.startswith("SDF cannot state the loop coupler_end - rocker_end; the drive param")

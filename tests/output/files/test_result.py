@@ -1,0 +1,333 @@
+"""Every figure of result.json, against the result and against figures worked out again."""
+
+import hashlib
+import json
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from helpers.figures import figures
+
+from robotid import __version__
+from robotid.base.exceptions import DataError, ModelError
+from robotid.base.findings import Finding
+from robotid.output.files.entries import _curve, _expected_torque, build_result, recording_metrics
+from robotid.output.files.result_file import read_result, stated_parameters
+from robotid.robot.parameters import INERTIAL_TERMS
+
+FINDINGS = [Finding("late", "warning", "a.csv", "late by 4 ms"), Finding("b", "note", "c", "d")]
+
+
+@pytest.fixture(scope="module")
+def result(identified):
+    settings = {"estimator": {"name": "consistent"}}
+    found = replace(identified, findings=FINDINGS)
+    return build_result(found, settings, {"report": "report.html"})
+
+
+def test_the_head_says_what_was_identified_and_how(result, identified):
+    assert (result["schema_version"], result["robotid"]) == (1, __version__)
+    assert (result["robot"], result["joints"]) == ("ur5", list(identified.model.joints))
+    assert result["settings"] == {"estimator": {"name": "consistent"}}
+    assert result["outputs"] == {"report": "report.html"}
+    assert result["warnings"] == [
+        {"code": "late", "severity": "warning", "message": "late by 4 ms", "where": "a.csv"},
+        {"code": "b", "severity": "note", "message": "d", "where": "c"},
+    ]
+    assert result["uncertainty"] == {
+        "method": identified.errors.method,
+        "segments": identified.errors.segments,
+        "inflation": identified.errors.inflation,
+    }
+    assert result["verdict"]["status"] == identified.verdict.status
+    assert result["verdict"]["reasons"] == list(identified.verdict.reasons)
+
+
+def test_the_structure_counts_parameters(result, identified):
+    assert result["structure"] == {
+        "standard": 60,
+        "base_inertial": 36,  # of a UR5, as in the literature
+        "base": len(identified.mapping.base_names),
+        "rank": identified.determination.rank,
+        "condition": pytest.approx(identified.wls.condition),
+        "undetermined": list(identified.determination.undetermined),
+        "poorly_excited": identified.wls.condition > 1e3,
+        "indistinguishable": identified.determination.to_list(),
+    }
+
+
+def test_drives_behind_gears_have_their_inertia_at_the_motor(identified):
+    gears = {"joints": list(identified.model.joints[:2]), "matrix": [-100.0, 50.0]}
+    motors = build_result(identified, {"transmission": [gears]})["motors"]
+    armature = dict(zip(identified.model.layout.names, identified.standard, strict=True))
+    wanted = {
+        joint: {"gear": ratio, "inertia": pytest.approx(armature[f"{joint}.armature"] / ratio**2)}
+        for joint, ratio in zip(gears["joints"], gears["matrix"], strict=True)
+    }
+    assert motors == wanted
+    each = [{"joints": [j], "matrix": [g["gear"]]} for j, g in wanted.items()]
+    assert build_result(identified, {"transmission": each})["motors"] == wanted, "in two tables"
+
+
+def finite(value, rel=1e-6):
+    """Return what result.json has for a figure: none where it has no end."""
+    return pytest.approx(value, rel=rel) if np.isfinite(value) else None
+
+
+def test_base_parameters_have_values_errors_and_intervals(result, identified):
+    mapping = identified.mapping
+    beta = mapping.K @ identified.standard
+    half = identified.errors.quantile * identified.base_error
+    assert len({entry["std_error"] for entry in result["base_parameters"]}) == len(beta)
+    for k, entry in enumerate(result["base_parameters"]):
+        assert entry == {
+            "name": mapping.base_names[k],
+            "expression": mapping.expressions[k],
+            "value": pytest.approx(beta[k], rel=1e-9),
+            "std_error": finite(identified.base_error[k]),
+            "interval_95": [
+                finite(beta[k] - half[k], rel=1e-8),
+                finite(beta[k] + half[k], rel=1e-8),
+            ],
+            "unit": identified.model.layout.units[mapping.independent[k]],
+        }
+
+
+def test_standard_and_drive_parameters_have_value_error_prior_and_source(result, identified):
+    layout = identified.model.layout
+    links = [f"{body}.{term}" for body in layout.bodies for term in INERTIAL_TERMS]
+    terms = ("armature", "viscous", "coulomb", "offset")
+    drives = [f"{joint}.{term}" for joint in identified.model.joints for term in terms]
+    entries = [*result["standard_parameters"], *result["drive_parameters"]]
+    assert [entry["name"] for entry in result["standard_parameters"]] == links
+    assert {entry["name"] for entry in result["drive_parameters"]} == set(drives)
+    urdf = [body.toDynamicParameters() for body in list(identified.model.pin_model.inertias)[1:]]
+    # what no drive can have less of, and noise of 8 N m on the joint leaves nothing of
+    names_at_bound = [
+        entry["name"]
+        for entry in entries[60:]
+        if not entry["name"].endswith("offset") and entry["value"] < 1e-6
+    ]
+    assert names_at_bound == ["elbow_joint.viscous"]
+    for i, entry in enumerate(entries):
+        assert entry == {
+            "name": layout.names[i],
+            "value": identified.standard[i],
+            "std_error": None
+            if entry["at_bound"]
+            else pytest.approx(np.sqrt(identified.standard_covariance[i, i])),
+            "quantile": None if entry["at_bound"] else identified.standard_quantile[i],
+            "interval_95": [None, None]
+            if entry["at_bound"]
+            else list(identified.standard_interval[i]),
+            "unit": layout.units[i],
+            "prior": identified.prior[i],
+            "source": identified.sources[i],
+            "at_bound": i >= 60 and names_at_bound.count(layout.names[i]) == 1,
+            **({} if i < 60 else {"with_urdf": identified.urdf_with_drives[i]}),
+        }
+    np.testing.assert_allclose(
+        [entry["prior"] for entry in entries[:60]], np.concatenate(urdf), atol=1e-12
+    )
+    assert sum(entry["prior"] != entry["value"] for entry in entries) > 40
+
+
+def assert_metrics(found, wanted):
+    assert list(found["per_joint"]) == list(wanted)
+    for joint, row in wanted.items():
+        assert found["per_joint"][joint] == {
+            "rmse": pytest.approx(row["rmse"]),
+            "unit": "N m",
+            "relative_error_pct": pytest.approx(row["error"]),
+            "r2": pytest.approx(row["r2"]),
+            "rows": row["rows"],
+            "urdf_relative_error_pct": pytest.approx(row["urdf"]),
+            "gravity_only_relative_error_pct": pytest.approx(row["gravity_only"]),
+            "urdf_with_drives_relative_error_pct": pytest.approx(row["urdf_with_drives"]),
+            "better_than_constant": bool(row["r2"] > 0),
+        }
+    squares = sum(row["rows"] * row["rmse"] ** 2 for row in wanted.values())
+    rows = sum(row["rows"] for row in wanted.values())
+    assert found["pooled_rmse"] == pytest.approx(np.sqrt(squares / rows))
+
+
+@pytest.mark.parametrize("name", ["estimate", "wls"])
+def test_metrics_are_those_of_the_prediction_they_name(result, identified, name):
+    part = result if name == "estimate" else result["wls"]
+    assert_metrics(part["identification"], figures(identified, identified.fitted, name))
+    (kept,) = part["validation"]
+    assert kept["log"] == identified.validation[0].recording.log.path
+    assert_metrics(kept, figures(identified, identified.validation, name))
+    assert recording_metrics(identified.validation[0], name).items() <= kept.items()
+    other = result["wls"] if name == "estimate" else result
+    joints = part["validation"][0]["per_joint"]
+    for joint, row in other["validation"][0]["per_joint"].items():
+        assert joints[joint]["rmse"] != row["rmse"]
+
+
+def test_wls_states_its_own_base_parameters(result, identified):
+    np.testing.assert_array_equal(result["wls"]["base_values"], identified.wls.theta)
+    np.testing.assert_array_equal(result["wls"]["base_std_errors"], identified.wls.std_error)
+    assert not np.allclose(identified.wls.theta, identified.base, rtol=1e-2)
+
+
+def test_the_band_is_that_of_each_joint(result, identified):
+    kept = identified.validation[0]
+    recording, band = kept.recording, identified.band(kept)
+    shown = result["validation"][0]["band"]
+    assert list(shown) == list(identified.model.joints)
+    for j, row in enumerate(shown.values()):
+        used = recording.mask[:, j].astype(bool)
+        residual = recording.trajectory.tau[:, j] - kept.torques["estimate"][:, j]
+        half = 1.96 * band.total[:, j]
+        assert row["half_width"] == pytest.approx(np.sqrt(np.mean(half**2)), rel=1e-6)
+        own = 1.96 * np.sqrt(np.mean(band.parameters[:, j] ** 2))
+        assert row["of_parameters"] == pytest.approx(own, rel=1e-6)
+        if len(band.samples) == len(residual):
+            held = 100 * np.mean(np.abs(residual[used]) <= half[used])
+            assert row["coverage_pct"] == pytest.approx(held, abs=0.2)
+        assert row["of_parameters"] < row["half_width"]
+
+
+def test_consistency_tells_mass_and_eigenvalue_of_each_body(result, identified):
+    shown = result["consistency"]
+    assert shown["is_consistent"] is identified.is_consistent
+    assert [link["name"] for link in shown["links"]] == list(identified.model.layout.bodies)
+    for i, link in enumerate(shown["links"]):
+        m, *c = identified.standard[10 * i : 10 * i + 4]
+        Ixx, Ixy, Iyy, Ixz, Iyz, Izz = identified.standard[10 * i + 4 : 10 * i + 10]
+        inertia = np.array([[Ixx, Ixy, Ixz], [Ixy, Iyy, Iyz], [Ixz, Iyz, Izz]])
+        J = np.zeros((4, 4))
+        J[:3, :3] = np.trace(inertia) / 2 * np.eye(3) - inertia
+        J[:3, 3] = J[3, :3] = c
+        J[3, 3] = m
+        assert link["mass"] == m
+        assert link["min_eigenvalue"] == pytest.approx(np.linalg.eigvalsh(J)[0], rel=1e-6)
+    assert shown["total_mass"] == pytest.approx(identified.standard[:60:10].sum())
+    check = identified.mass_matrix
+    assert shown["mass_matrix"]["smallest_eigenvalue"] == check.smallest_eigenvalue
+    assert shown["fit"] == identified.estimate.details
+    counts = {kind: identified.sources.count(kind) for kind in ("data", "mixed", "prior", "bound")}
+    assert shown["sources"] == counts
+    assert len(set(counts.values())) == 4
+    assert sum(counts.values()) == len(identified.standard)
+
+
+def test_inputs_tell_files_hashes_windows_and_rows(result, identified):
+    urdf, *logs = map(dict, result["inputs"])
+    path = identified.model.tree.path
+    digest = hashlib.sha256(Path(path).read_bytes()).hexdigest()
+    assert urdf == {"role": "urdf", "path": str(path), "sha256": digest}
+    evaluations = [*identified.fitted, *identified.validation]
+    roles = ["identification", "identification", "validation"]
+    wanted = [(180, 50.0, 3.58, 1), (140, 40.0, 3.475, 1), (270, 50.0, 5.98, 2)]
+    for entry, role, evaluation, (samples, rate, end, segments) in zip(
+        logs, roles, evaluations, wanted, strict=True
+    ):
+        recording = evaluation.recording
+        signals = entry.pop("signals")
+        assert entry == {
+            "role": role,
+            "path": recording.log.path,
+            "sha256": hashlib.sha256(Path(recording.log.path).read_bytes()).hexdigest(),
+            "samples": samples,
+            "rate": pytest.approx(rate),
+            "start": 0.0,
+            "end": pytest.approx(end),
+            "rows_used": int(recording.mask.sum()),
+            "segments": segments,
+        }
+        assert (signals["cutoff"], signals["min_velocity"]) == (12.0, 0.05)
+        assert signals["rate"] == pytest.approx(rate)
+
+
+def test_what_was_written_is_read_back_with_its_parameters(result, identified, tmp_path):
+    path = tmp_path / "result.json"
+    path.write_text(json.dumps(result, allow_nan=False))
+    stated = stated_parameters(read_result(path), identified.model)
+    np.testing.assert_array_equal(stated, identified.standard)
+
+
+def test_results_that_are_not_whole_are_refused(result, identified, tmp_path):
+    path = tmp_path / "result.json"
+    with pytest.raises(DataError, match=r"^there is no result '.*result\.json'$"):
+        read_result(path)
+    path.write_text("no")
+    with pytest.raises(DataError, match=r"^result\.json is not JSON: "):
+        read_result(path)
+    path.write_text(json.dumps({**result, "schema_version": 2}))
+    with pytest.raises(DataError, match=r"^result\.json has schema_version 2, wanted 1 of a"):
+        read_result(path)
+    path.write_text(json.dumps({k: v for k, v in result.items() if k != "inputs"}))
+    with pytest.raises(
+        DataError, match=r"^result\.json has no entry 'inputs': the file is incomplete"
+    ):
+        read_result(path)
+    for part, words in (([], r"\[\], wanted a table"), (5, "5, wanted a table")):
+        path.write_text(json.dumps({**result, "verdict": part}))
+        with pytest.raises(DataError, match=rf"^result\.json\.verdict is {words}"):
+            read_result(path)
+    for value in (-1.01e100, -(10**101)):
+        structure = {**result["structure"], "base": value}
+        path.write_text(json.dumps({**result, "structure": structure}))
+        words = r"^result\.json\.structure\.base is -1.*, wanted a number of at most 1e\+100$"
+        with pytest.raises(DataError, match=words):
+            read_result(path)
+    structure = {**result["structure"], "base": -1e100}
+    path.write_text(json.dumps({**result, "structure": structure}))
+    assert read_result(path)["structure"]["base"] == -1e100
+    *others, last = result["inputs"]
+    assert len(others) == 3
+    for changed, words in (
+        ({**last, "rows_used": "x"}, r"inputs\[3\]\.rows_used is 'x', wanted a number"),
+        ({k: v for k, v in last.items() if k != "end"}, r"inputs\[3\] has no entry 'end': the"),
+    ):
+        path.write_text(json.dumps({**result, "inputs": [*others, changed]}))
+        with pytest.raises(DataError, match=rf"^result\.json\.{words}"):
+            read_result(path)
+    short = {**result, "drive_parameters": result["drive_parameters"][1:]}
+    with pytest.raises(ModelError, match=r"^the result has no value of shoulder_pan_joint\.arm"):
+        stated_parameters(short, identified.model)
+
+
+def test_a_friction_curve_is_of_the_logs_in_which_its_joint_moves(identified):
+    first, second = identified.fitted
+    row = identified.model.row_names.index("elbow_joint")
+
+    def still(e):
+        motion, mask = e.recording.trajectory, e.recording.mask.copy()
+        mask[:, row] &= False
+        return replace(e, recording=replace(e.recording, trajectory=motion, mask=mask))
+
+    one = replace(identified, fitted=(still(first), second))
+    speed = np.abs(second.recording.trajectory.v[second.recording.mask[:, row], row])
+    curve = _curve(one, "elbow_joint")["curve"]
+    np.testing.assert_allclose(
+        [np.abs(curve["v"]).min(), np.abs(curve["v"]).max()], [speed.min(), speed.max()]
+    )
+    assert _curve(replace(identified, fitted=(still(first), still(second))), "elbow_joint") == {}
+
+
+def test_the_torque_to_be_expected_is_that_of_all_motions_with_its_95_percent(rng):
+    counts = (30, 50)
+    tau, parameters, total = ([rng.normal(size=(n, 2)) for n in counts] for _ in range(3))
+    fitted = [
+        SimpleNamespace(recording=SimpleNamespace(trajectory=SimpleNamespace(tau=x))) for x in tau
+    ]
+    bands = [SimpleNamespace(parameters=a, total=b) for a, b in zip(parameters, total, strict=True)]
+    names = ("one", "two")
+    model = SimpleNamespace(row_names=names, joints=names, row_units=("N m", "N"))
+    preview = SimpleNamespace(expected=SimpleNamespace(fitted=fitted, model=model), bands=bands)
+    found = _expected_torque(preview)
+    assert list(found) == ["one", "two"]
+    for j, (own, unit) in enumerate(zip(found.values(), ("N m", "N"), strict=True)):
+        rms, band, part = (
+            np.sqrt(np.mean(np.concatenate([x[:, j] for x in each]) ** 2))
+            for each in (tau, total, parameters)
+        )
+        assert own == {
+            "rms": pytest.approx(rms), "half_width": pytest.approx(1.96 * band),
+            "of_parameters": pytest.approx(1.96 * part), "unit": unit,
+        }  # fmt: skip

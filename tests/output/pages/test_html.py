@@ -1,0 +1,170 @@
+"""Blocks that several pages share: the verdict, figures beside their names, commands to copy."""
+
+from decimal import Decimal
+
+import numpy as np
+import pytest
+
+from robotid.output.pages.html import (
+    Section,
+    asset,
+    code,
+    command_html,
+    facts_html,
+    figure,
+    number,
+    page,
+    percent,
+    steps_html,
+    table,
+    text,
+    verdict_html,
+    with_error,
+)
+
+
+def test_a_verdict_shows_three_reasons_and_folds_all_others():
+    html = verdict_html("<arm>", "not evaluated", ["a & b", "c", "d", "e", "f"])
+    assert html == (
+        '<div class="verdict not-evaluated"><h1>&lt;arm&gt; '
+        "<span>Verdict: <strong>not evaluated</strong></span></h1>"
+        "<ul><li>a &amp; b</li><li>c</li><li>d</li></ul>"
+        "<details><summary>2 more reasons</summary><ul><li>e</li><li>f</li></ul></details></div>\n"
+    )
+    assert "<summary>1 more reason</summary>" in verdict_html("arm", "poor", "abcd")
+    assert "<details>" not in verdict_html("arm", "good", "abc")
+    assert verdict_html("arm", "good", [], "a < b").endswith(
+        '<ul></ul><p class="uses">a &lt; b</p></div>\n'
+    )
+
+
+def test_facts_end_with_links_to_the_files():
+    html = facts_html({"Mass": "<b>2 kg</b>"}, {"urdf": "a b.urdf", "result": 'r".json'})
+    assert html == (
+        '<dl class="facts"><div><dt>Mass</dt><dd><b>2 kg</b></dd></div>'
+        '<div><dt>Files</dt><dd><a href="a b.urdf">URDF</a>, '
+        '<a href="r&quot;.json">result</a></dd></div></dl>\n'
+    )
+    assert "Files" not in facts_html({"Mass": "2 kg"})
+
+
+def test_a_step_has_each_of_its_blocks_to_copy():
+    html = steps_html([("Try <it>.", ("one", "a & b")), ("Read.", ())])
+    assert html == (
+        '<h2 id="next">Do next</h2>\n<ol class="next"><li><p>Try &lt;it&gt;.</p>'
+        '<div class="copy"><pre class="command">one</pre></div>'
+        '<div class="copy"><pre class="command">a &amp; b</pre></div></li>\n'
+        "<li><p>Read.</p></li>\n</ol>\n"
+    )
+    assert steps_html([]) == ""
+
+
+def test_a_command_breaks_between_arguments_only():
+    assert command_html("robotid replay 'my log.csv' --lock a=0 <x>") == (
+        '<pre class="command"><span>robotid</span> <span>replay</span> '
+        "<span>&#x27;my log.csv&#x27;</span> <span>--lock</span> <span>a=0</span> "
+        "<span>&lt;x&gt;</span></pre>"
+    )
+    assert command_html("[locked]\na = 0") == '<pre class="command">[locked]\na = 0</pre>'
+
+
+def test_a_small_error_of_a_plain_number_is_written_in_full():
+    """Powers of ten are for numbers that are small, too, and for errors of 100,000 and more."""
+    for value, error, wanted in (
+        (1.5, 1.2e-5, ("1.500000", "0.000012")), (0.00123, 2e-4, ("0.00123", "0.00020")),
+        (1.5e-4, 0.0012, ("0.0001", "0.0012")), (2e-4, 3e-4, ("2.0e−04", "3.0e−04")),
+        (-1.5e6, 9.94e4, ("−1500000", "99400")), (-1.5e6, 1.2e5, ("−1.50e+06", "1.2e+05")),
+    ):  # fmt: skip
+        assert tuple(cell.html for cell in with_error(value, error)) == wanted
+
+
+def test_a_number_ends_at_the_second_digit_of_its_error(rng):
+    sizes = zip(rng.uniform(-6, 6, 300), rng.uniform(-7, 5, 300), strict=True)
+    for value, error in ((rng.choice([-1, 1]) * 10.0**a, 10.0**b) for a, b in sizes):
+        cells = with_error(value, error)
+        shown, half = (Decimal(cell.html.replace("−", "-")) for cell in cells)
+        assert [cell.value for cell in cells] == [value, error]
+        ends, digits = half.as_tuple().exponent, len(half.as_tuple().digits)
+        if error < 99.5:
+            assert digits == 2 or half == 0
+        assert float(half) == pytest.approx(error, rel=0.051)
+        assert shown.as_tuple().exponent == ends or abs(value) < error
+        assert abs(float(shown) - value) <= 0.5001 * 10.0 ** shown.as_tuple().exponent
+    assert [cell.html for cell in with_error(1.234, np.inf)] == ["1.234", "–"]
+    assert with_error(0.5, 0.25, sign="+")[0].html == "+0.50"
+
+
+def test_a_cell_has_the_style_of_its_content_and_its_number_in_full():
+    for cell, wanted in (
+        (text("<" * 23), ("&lt;" * 23, "text", None)), (text("a" * 24), ("a" * 24, "", None)),
+        (text("a", flag=True), ("a", "flag", None)),
+        (code("a.b_c/<"), ("a.<wbr>b_<wbr>c/<wbr>&lt;", "code", None)),
+        (number(-12.3456), ("−12.35", "number", -12.3456)), (number(None), ("–", "number", None)),
+        (number(np.nan), ("–", "number", None)), (number(2.0, "+.2f"), ("+2.00", "number", 2.0)),
+        (percent(1000.4), ("1000", "number", 1000.4)),
+        (percent(999.94), ("999.9", "number", 999.94)),
+        (percent(0.995), ("1.0", "number", 0.995)), (percent(0.994), ("0.99", "number", 0.994)),
+        (percent(-0.5), ("−0.50", "number", -0.5)), (percent(None), ("–", "number", None)),
+    ):  # fmt: skip
+        assert (cell.html, cell.kind, cell.value) == wanted
+
+
+def test_a_table_has_heads_by_its_first_row_and_numbers_for_its_scripts():
+    rows = [[text("one"), number(1.5), text("x")], [text("two"), number(None), number(1 / 3)]]
+    box = '<div class="scroll" tabindex="0" role="region" aria-label="&lt;t&gt;">'
+    head = (
+        '<thead><tr><th scope="col" class="text">a</th><th scope="col" class="number">b</th>'
+        '<th scope="col" class="text">&lt;c&gt;</th></tr></thead>'
+    )
+    first = '<tr><th scope="row" class="text">{}</th><td class="number"{}>{}</td><td class="{}"{}>'
+    one = first.format("one", "{}", "1.5", "text", "") + "x</td></tr>\n"
+    two = first.format("two", "", "–", "number", "{}") + "0.3333</td></tr>\n"
+    wanted = (
+        f"{box}<table><caption>&lt;t&gt;</caption>{head}<tbody>{one.format('')}{two.format('')}"
+        f"</tbody><tfoot>{one.format('')}</tfoot></table></div>\n"
+    )
+    assert table("<t>", ("a", "b", "<c>"), rows, rows[0]) == wanted
+    filled = one.format(' data-value="1.5"') + two.format(' data-value="0.3333333333"')
+    wanted = (
+        f'{box}<table class="data"><caption>&lt;t&gt;</caption>{head}<tbody>{filled}</tbody>'
+        "</table></div>\n"
+    )
+    assert table("<t>", ("a", "b", "<c>"), rows, is_data=True) == wanted
+    assert '<th scope="col" class="text">b</th>' in table("none", ("a", "b"), [])
+    assert figure("c", "<svg/>").startswith('<figure tabindex="0"><figcaption>c</figcaption><svg/>')
+    assert figure("c", "<svg/>", single=True).startswith('<figure class="single" tabindex="0">')
+
+
+def test_a_page_links_to_its_sections_and_runs_the_scripts_that_they_need():
+    plain, folds, still = (
+        page("<p>", "<h1>h</h1>", sections)
+        for sections in (
+            {"a": ("A", "text a"), "b": Section("B", "text b")},
+            {
+                "a": Section("A", "text", "in short", is_open=False),
+                "b": Section("B", "x", "", True),
+            },
+            {"a": ("A", '<table class="data">')},
+        )
+    )
+    assert "<title>&lt;p&gt;</title>" in plain
+    assert (
+        '<div><a href="#content">&lt;p&gt;</a> <a href="#a">A</a> <a href="#b">B</a> </div>'
+        in plain
+    )
+    assert (
+        '<header>\n<h1>h</h1></header>\n<section aria-labelledby="a">\n<h2 id="a">A</h2>\n'
+        'text a</section>\n<section aria-labelledby="b">\n<h2 id="b">B</h2>\ntext b</section>\n'
+        "</main>" in plain
+    )
+    assert (
+        '<section aria-labelledby="a">\n<details id="a-fold"><summary><h2 id="a">A</h2>'
+        "<span>in short</span></summary>\ntext</details>\n</section>\n" in folds
+    )
+    assert '<details id="b-fold" open><summary><h2 id="b">B</h2></summary>\nx</details>' in folds
+    for html, names in ((plain, []), (folds, ["page.js"]), (still, ["page.js", "tables.js"])):
+        run = [n for n in ("page.js", "tables.js", "dock.js", "charts.js") if asset(n) in html]
+        assert run == names
+        assert html.count("sha256-") == len(names)
+        assert "frame-src" not in html
+        assert asset("tones.css") in html

@@ -1,0 +1,49 @@
+"""Findings by cause and by joint: counts, order and links."""
+
+import re
+
+import pytest
+from helpers.pages import tables
+
+from robotid.base.findings import Finding
+from robotid.output.report.causes_section import findings_line, findings_section
+
+JOINTS = ("one", "two", "three")
+
+
+def finding(code, severity, where, message=""):
+    return Finding(code, severity, where, message or f"{where} has {code}")
+
+
+MANY = [
+    finding("late", "warning", "two"), finding("late", "warning", "one"),
+    finding("spikes", "error", "two"), finding("slow", "note", "two"),
+    finding("slow", "note", "three"), finding("gap", "note", "a.csv"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("findings", "worst", "line"),
+    [
+        ([], "two", "none"),
+        (MANY[3:4], "two", "1 note"),
+        (MANY[3:], "two", "2 notes"),
+        (MANY, "t<o", "2 findings, 2 causes; worst: t&lt;o; 2 notes"),
+        (MANY[2:4], "", "1 finding, 1 cause; 1 note"),
+        (MANY[:2], "one", "1 finding, 1 cause; worst: one"),
+    ],
+)
+def test_the_line_counts_what_is_grave_its_causes_and_notes(findings, worst, line):
+    assert findings_line(findings, JOINTS, worst) == line
+
+
+def test_each_joint_has_its_causes_the_worst_first_and_notes_apart():
+    html = findings_section(MANY, JOINTS, ["two", "three", "one"])
+    assert tables(html)["Findings by joint, the worst first"].rows == [
+        ["two", "spikes, late", "slow"], ["three", "–", "slow"], ["one", "late", "–"],
+    ]  # fmt: skip
+    assert re.findall(r'<div class="cause (\w+)" id="cause-(\w+)">', html) == [
+        ("error", "spikes"), ("warning", "late"), ("note", "slow"), ("note", "gap"),
+    ]  # fmt: skip
+    assert set(re.findall(r'href="#cause-(\w+)"', html)) == {"spikes", "late", "slow"}
+    assert findings_section([], JOINTS, JOINTS) == "<p>None.</p>\n"

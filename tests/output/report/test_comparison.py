@@ -1,0 +1,562 @@
+"""Results side by side: what is compared, what is refused, what is said to differ."""
+
+import copy
+import json
+import math
+import re
+from html import unescape
+
+import numpy as np
+import pytest
+from helpers.browsing import until, visit
+from helpers.pages import charts, number, percent, tables
+from helpers.paths import ROOT
+from helpers.synthetic import exact_log, truth
+
+from robotid.base.exceptions import DataError
+from robotid.base.files import write_json
+from robotid.cli import main
+from robotid.data.files.read import write_log
+from robotid.diagnosis.residual.torque_split import split_torque
+from robotid.output.files.entries import build_result
+from robotid.output.files.result_file import read_result
+from robotid.output.pages.html import code
+from robotid.output.report import comparison_page
+from robotid.output.report.comparison import _friction_curves, compare_results, write_comparison
+from robotid.robot.drives import Asymmetric, LoadFriction, Stribeck
+from robotid.robot.model import RobotModel
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A folder with a.json and b.json: the same logs, fitted as ``consistent`` and as ``wls``."""
+    rng, path = np.random.default_rng(0), tmp_path_factory.mktemp("results")
+    urdf = ROOT / "urdf" / "planar_2r.urdf"
+    arm = RobotModel.from_urdf(urdf)
+    for name in ("first", "second"):
+        write_log(exact_log(arm, truth(arm), rng, samples=800, noise=0.1), path / f"{name}.csv")
+    words = ["identify", str(urdf), str(path / "first.csv"), "--validate", str(path / "second.csv")]
+    for name, estimator in (("a", "consistent"), ("b", "wls")):
+        own = ["--estimator", estimator, "--out", str(path / name), "--no-report"]
+        assert main([*words, *own]) == 0
+        (path / f"{name}.json").write_bytes((path / name / "result.json").read_bytes())
+    return path
+
+
+@pytest.fixture
+def changed(folder, tmp_path):
+    """Return a function that writes b.json with a change and compares a.json with it."""
+
+    def compare(change):
+        result = copy.deepcopy(read_result(folder / "b.json"))
+        change(result)
+        write_json(result, tmp_path / "b.json")
+        return compare_results([folder / "a.json", tmp_path / "b.json"])
+
+    return compare
+
+
+def test_differences_are_in_combined_standard_errors(folder):
+    a, b = (read_result(folder / f"{name}.json") for name in "ab")
+    found = compare_results([folder / "a.json", folder / "b.json"])
+    assert len(found["base_parameters"]) == len(a["base_parameters"])
+    shown = {entry["name"]: entry for entry in found["base_parameters"]}
+    for one, other in zip(a["base_parameters"], b["base_parameters"], strict=True):
+        entry = shown[one["name"]]
+        s = math.sqrt(one["std_error"] ** 2 + other["std_error"] ** 2)
+        assert entry["differences"] == [pytest.approx((other["value"] - one["value"]) / s)]
+        assert entry["values"] == [one["value"], other["value"]]
+    sizes = [abs(entry["differences"][0]) for entry in found["base_parameters"]]
+    assert sizes == sorted(sizes, reverse=True)
+
+
+def test_errors_of_the_same_recording_stand_side_by_side(folder):
+    a, b = (read_result(folder / f"{name}.json") for name in "ab")
+    found = compare_results([folder / "a.json", folder / "b.json"])
+    assert found["notes"] == []
+    assert found["fitted_alike"]
+    (entry,) = found["validation"]
+    for joint in entry["per_joint"]:
+        assert joint["relative_error_pct"] == [
+            r["validation"][0]["per_joint"][joint["joint"]]["relative_error_pct"] for r in (a, b)
+        ]
+    assert [r["verdict"] for r in found["results"]] == [a["verdict"], b["verdict"]]
+    names = [row["name"] for row in found["settings"]]
+    assert "estimator.name" in names
+    assert not {"identification", "validation", "urdf"} & set(names)
+    assert found["versions"] == []
+    assert all(all(row["in"]) for row in found["inputs"])
+
+
+def test_another_recording_is_not_compared(changed):
+    def other_log(result):
+        result["inputs"][-1]["sha256"] = "0" * 64
+
+    found = changed(other_log)
+    assert found["validation"] == []
+    assert "A was validated on second.csv, other results were not" in found["notes"][0]
+    assert "the results have no common validation recording" in found["notes"][-1]
+    assert [row["in"] for row in found["inputs"]][:2] == [[True, False], [False, True]]
+
+
+def test_another_window_of_the_same_file_is_another_recording(changed):
+    found = changed(lambda result: result["inputs"][-1].update(start=1.0))
+    assert found["validation"] == []
+
+
+def test_another_filter_is_said(changed):
+    def smoother(result):
+        result["inputs"][-1]["signals"]["cutoff"] = 3.0
+
+    (note,) = changed(smoother)["notes"]
+    assert note.startswith("the signal settings of second.csv differ (cutoff 8 | 3)")
+
+
+def test_each_common_recording_is_compared_by_its_own_signals_and_rows(folder, tmp_path):
+    results = [copy.deepcopy(read_result(folder / f"{name}.json")) for name in "ab"]
+    for result in results:  # a recording more, read before the other one
+        *others, kept = result["inputs"]
+        more = kept | {"path": "more.csv", "sha256": "1" * 64, "signals": {"cutoff": 5.0}}
+        result["inputs"] = [*others, more | {"rows_used": 9}, kept]
+        result["validation"].insert(0, result["validation"][0] | {"log": "more.csv"})
+    paths = [tmp_path / f"{name}.json" for name in "ab"]
+
+    def notes():
+        for path, result in zip(paths, results, strict=True):
+            write_json(result, path)
+        return compare_results(paths)["notes"]
+
+    assert notes() == []
+    last = results[1]["inputs"][-1]
+    rows = last["rows_used"]
+    last["rows_used"] = 77
+    last["signals"] = last["signals"] | {"cutoff": 3.0}
+    (note,) = notes()
+    said = f"the signal settings of second.csv differ (cutoff 8 | 3; rows {rows} | 77)"
+    assert note.startswith(said)
+    results[1]["inputs"][-2]["signals"] = {"cutoff": 4.5}
+    first, second = notes()
+    assert first.startswith("the signal settings of more.csv differ (cutoff 5 | 4.5)")
+    assert second == note
+
+
+def test_other_fitted_recordings_and_versions_are_said(changed):
+    def older(result):
+        result["inputs"][1]["sha256"] = "1" * 64
+        result["versions"]["numpy"] = "1.26.0"
+
+    found = changed(older)
+    assert not found["fitted_alike"]
+    assert [row["name"] for row in found["versions"]] == ["numpy"]
+
+
+def test_a_third_result_is_compared_with_the_first_and_with_what_all_have(folder, tmp_path):
+    paths = [folder / "a.json", folder / "b.json", tmp_path / "c.json"]
+
+    def compared(change):
+        result = read_result(folder / "b.json")
+        change(result)
+        write_json(result, paths[2])
+        return compare_results(paths)
+
+    def farther(result):
+        for entry in result["base_parameters"]:
+            entry["value"], entry["std_error"] = entry["value"] + 0.5, 3.0 * entry["std_error"]
+        result["settings"]["signals"] = {"order": 6}
+        result["inputs"][-1]["rows_used"] = 77
+
+    found, a = compared(farther), read_result(folder / "a.json")
+    first = {entry["name"]: entry for entry in a["base_parameters"]}
+    c = {entry["name"]: entry for entry in read_result(paths[2])["base_parameters"]}
+    for entry in found["base_parameters"]:
+        one, other = first[entry["name"]], c[entry["name"]]
+        s = math.hypot(one["std_error"], other["std_error"])
+        assert entry["differences"][1] == pytest.approx((other["value"] - one["value"]) / s)
+        assert entry["values"][2] == other["value"]
+    assert [result["label"] for result in found["results"]] == ["A", "B", "C"]
+    (order,) = [row for row in found["settings"] if row["name"] == "signals.order"]
+    assert (order["values"][2], order["values"][0]) == ("6", order["values"][1])
+    assert found["fitted_alike"]
+    (entry,) = found["validation"]
+    assert all(len(joint["rmse"]) == 3 for joint in entry["per_joint"])
+    (note,) = found["notes"]
+    rows = a["inputs"][-1]["rows_used"]
+    assert f"the signal settings of second.csv differ (rows {rows} | {rows} | 77)" in note
+
+    found = compared(lambda result: result["inputs"][1].update(sha256="1" * 64))
+    assert not found["fitted_alike"]
+    assert [row["in"] for row in found["inputs"] if not all(row["in"])] == [
+        [True, True, False], [False, False, True],
+    ]  # fmt: skip
+    found = compared(lambda result: result["inputs"][-1].update(sha256="0" * 64))
+    assert found["validation"] == []
+    assert [note[:15] for note in found["notes"]] == [
+        *(f"{label} was validated"[:15] for label in "ABC"), "the results hav",
+    ]  # fmt: skip
+
+
+def test_other_base_parameters_are_refused_by_name(changed):
+    with pytest.raises(
+        DataError, match=r"a\.json has 1 base parameters that .*b\.json does not have: "
+    ):
+        changed(lambda result: result["base_parameters"].pop())
+
+    def other_sum(result):
+        result["base_parameters"][0]["expression"] = "2 x"
+
+    with pytest.raises(
+        DataError, match=r"1 base parameters have other expressions in .* and 2 x; "
+    ):
+        changed(other_sum)
+
+
+def test_one_result_is_not_compared(folder):
+    with pytest.raises(DataError, match="compare takes at least two results, found 1"):
+        compare_results([folder / "a.json"])
+
+
+def test_the_command_prints_a_table_or_one_json_object_and_writes_the_page(
+    folder, tmp_path, capsys
+):
+    paths = [str(folder / "a.json"), str(folder / "b.json")]
+    page = tmp_path / "compare.html"
+    assert main(["compare", *paths, "--out", str(page)]) == 0
+    printed = capsys.readouterr().out
+    assert re.search(r"A  \w+ +consistent .*a\.json\nB  \w+ +wls .*b\.json\n", printed)
+    assert "settings: estimator.name: consistent | wls" in printed
+    html = page.read_text(encoding="utf-8")
+    assert "2 results compared" in html
+    assert not re.search(r'(src|href)="\w+:', html)
+    assert [p.name for p in tmp_path.iterdir()] == ["compare.html"]
+    assert main(["compare", *paths, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out) == compare_results(paths)
+    assert main(["compare", paths[0]]) == 1
+    assert "at least two results" in capsys.readouterr().err
+
+
+def test_the_page_shows_the_figures_of_the_two_results(folder, tmp_path):
+    a, b = (read_result(folder / f"{name}.json") for name in "ab")
+    b = copy.deepcopy(b)
+    last = b["base_parameters"][-1]
+    last["value"] += 4 * math.hypot(last["std_error"], a["base_parameters"][-1]["std_error"])
+    write_json(b, tmp_path / "b.json")
+    write_comparison([folder / "a.json", tmp_path / "b.json"], tmp_path / "c.html")
+    html = (tmp_path / "c.html").read_text(encoding="utf-8")
+    shown = tables(html)
+    (kept,) = [caption for caption in shown if caption.endswith(": not fitted")]
+    assert kept.startswith("second.csv 0-")
+    for caption, parts in (
+        (kept, [r["validation"][0] for r in (a, b)]),
+        ("Fitted samples of each result", [r["identification"] for r in (a, b)]),
+    ):
+        for row in shown[caption].rows:
+            one, other = (part["per_joint"][row[0]] for part in parts)
+            errors = [percent(x["relative_error_pct"]) for x in (one, other)]
+            rmse = [number(x["rmse"], ".3g") for x in (one, other)]
+            assert row[2:] == [*errors, *rmse, one["unit"]]
+        heads = ["joint", "error", "A %", "B %", "A RMSE", "B RMSE", "unit"]
+        assert shown[caption].headers == heads
+        apart = [
+            abs(np.subtract(*(p["per_joint"][row[0]]["relative_error_pct"] for p in parts)))
+            for row in shown[caption].rows
+        ]
+        assert apart == sorted(apart, reverse=True)
+    table = shown["Base parameters with standard errors"]
+    assert table.headers == ["parameter", "(B − A) / s", "A", "± A", "B", "± B", "unit"]
+    ours, theirs = ({e["name"]: e for e in r["base_parameters"]} for r in (a, b))
+    assert table.rows[0][0] == last["name"]
+    assert {row[0] for row in table.rows} == set(ours)
+    for row in table.rows:
+        one, other = ours[row[0]], theirs[row[0]]
+        difference = other["value"] - one["value"]
+        apart = difference / math.hypot(one["std_error"], other["std_error"])
+        assert row[1] == number(apart, "z.1f")
+        assert row[6] == one["unit"]
+        for value, error, entry in ((row[2], row[3], one), (row[4], row[5], other)):
+            value, error = (float(x.replace("−", "-")) for x in (value, error))
+            assert error == pytest.approx(entry["std_error"], rel=0.051)
+            assert value == pytest.approx(entry["value"], abs=0.051 * entry["std_error"])
+    far = sum(abs(float(row[1].replace("−", "-"))) > 3.0 for row in table.rows)
+    assert f"{far} of {len(table.rows)} parameters differ from A by more than 3 combined" in html
+    assert html.count(f"<strong>{table.rows[0][1]}</strong>") == 1
+    settings = dict((row[0], row[1:]) for row in shown["Different settings"].rows)
+    assert settings["estimator.name"] == ["consistent", "wls"]
+    files = shown["Files read, different ones first"]
+    assert files.headers == ["role", "A", "B", "file", "from s", "to s", "SHA-256"]
+    for row, entry in zip(files.rows, a["inputs"], strict=True):
+        window = [number(entry.get(end), ".6g") for end in ("start", "end")]
+        assert row == [entry["role"], "yes", "yes", entry["path"], *window, entry["sha256"]]
+    for label, result in (("A", a), ("B", b)):
+        box = html.split(f"{label}: <strong>")[1].split("</div>")[0]
+        assert box.startswith(f"{result['verdict']['status']}</strong>")
+        assert f"({result['settings']['estimator']['name']})" in box
+        reasons = [unescape(reason) for reason in re.findall(r"<li>(.*?)</li>", box)]
+        assert reasons == result["verdict"]["reasons"]
+
+
+def test_the_least_error_of_comparable_results_is_bold(folder, tmp_path):
+    b = copy.deepcopy(read_result(folder / "b.json"))
+    a = read_result(folder / "a.json")
+    joint = next(iter(b["validation"][0]["per_joint"]))
+    for part in (b["validation"][0], b["identification"]):
+        part["per_joint"][joint]["relative_error_pct"] = 0.01
+    write_json(b, tmp_path / "b.json")
+    write_comparison([folder / "a.json", tmp_path / "b.json"], tmp_path / "c.html")
+    html = (tmp_path / "c.html").read_text(encoding="utf-8")
+    assert html.count("<strong>0.01</strong>") == 2
+    error = a["validation"][0]["per_joint"][joint]["relative_error_pct"]
+    assert f"<strong>{percent(error)}</strong>" not in html.split(">unit<")[1].split("</tr>")[1]
+
+
+def test_versions_that_differ_stand_on_the_page(folder, tmp_path):
+    b = copy.deepcopy(read_result(folder / "b.json"))
+    b["versions"]["numpy"] = "1.26.0"
+    b["inputs"][-1]["sha256"] = "0" * 64
+    write_json(b, tmp_path / "b.json")
+    content = write_comparison([folder / "a.json", tmp_path / "b.json"], tmp_path / "c.html")
+    html = (tmp_path / "c.html").read_text(encoding="utf-8")
+    assert tables(html)["Different versions"].rows == [["numpy", np.__version__, "1.26.0"]]
+    files = tables(html)["Files read, different ones first"].rows
+    assert [row[1:3] for row in files] == [["yes", "no"], ["no", "yes"], *[["yes", "yes"]] * 2]
+    for note in content["notes"]:
+        assert f"<li>{note.replace(chr(39), '&#x27;')}</li>" in html
+
+
+def test_names_of_files_cannot_inject_markup(folder, tmp_path):
+    path = tmp_path / "<b>x.json"
+    write_json({**read_result(folder / "b.json"), "robot": "<i>r"}, path)
+    write_comparison([folder / "a.json", path], tmp_path / "c.html")
+    html = (tmp_path / "c.html").read_text(encoding="utf-8")
+    assert "<b>" not in html
+    assert "<i>" not in html
+
+
+def test_no_least_of_equals_is_bold(folder, tmp_path):
+    b = read_result(folder / "a.json")
+    write_json(b, tmp_path / "b.json")
+    write_comparison([folder / "a.json", tmp_path / "b.json"], tmp_path / "c.html")
+    for caption, shown in tables((tmp_path / "c.html").read_text(encoding="utf-8")).items():
+        if "%" in " ".join(shown.headers):
+            assert all(row[2] == row[3] for row in shown.rows), caption
+    assert '<td class="number"><strong>' not in (tmp_path / "c.html").read_text(encoding="utf-8")
+
+
+def test_results_and_logs_of_one_name_are_told_apart_by_the_shortest_path(folder, tmp_path):
+    result = read_result(folder / "a.json")
+    places = [tmp_path / day / "out" / "result.json" for day in ("monday", "tuesday")]
+    places.append(tmp_path / "wls" / "result.json")
+    for k, place in enumerate(places):
+        place.parent.mkdir(parents=True)
+        own = copy.deepcopy(result)
+        own["validation"][0]["log"] = f"/data/{'ab'[k > 0]}/run.csv"
+        own["inputs"][-1] |= {"path": f"/data/{'ab'[k > 0]}/run.csv", "sha256": str(k > 0)}
+        write_json(own, place)
+    found = compare_results(places)
+    assert [x["name"] for x in found["results"]] == ["monday/out", "tuesday/out", "wls"]
+    assert "A was validated on a, other results were not" in found["notes"][0]
+    assert "B was validated on b, other" in found["notes"][1]
+    write_comparison(places, tmp_path / "c.html")
+    html = (tmp_path / "c.html").read_text(encoding="utf-8")
+    for label, name in zip("ABC", ("monday/out", "tuesday/out", "wls"), strict=True):
+        assert f"</svg> {label} {name}</span>" in html
+    assert [x["name"] for x in compare_results(places[:2])["results"]] == ["monday", "tuesday"]
+
+
+def test_friction_curves_are_those_of_the_identified_drives(identified, tmp_path):
+    """The curve from result.json alone is the library's own, terms with shapes included."""
+    term = Stribeck(data_range=(0.05, 1.5), speed=0.2)
+    joint, other = "elbow_joint", "wrist_1_joint"
+    model = identified.model.with_terms({joint: (term, LoadFriction())})
+    pi, old = (
+        np.zeros(len(model.layout.names)),
+        dict(zip(identified.model.layout.names, identified.standard, strict=True)),
+    )
+    own = {f"{joint}.stribeck": 3.0, f"{joint}.load": 0.08}
+    pi[:] = [old.get(name, own.get(name, 0.0)) for name in model.layout.names]
+    result = build_result(identified, {"estimator": {"name": "consistent"}})
+    seen = {"q": [-1.0, 1.0], "v": [0.05, 1.5]}
+    result["friction"] = {name: {"data_range": seen} for name in model.joints}
+    write_json(result, tmp_path / "a.json")
+    b = copy.deepcopy(result)
+    b["own_terms"] = model.options["own_terms"]
+    b["drive_parameters"] += [{"name": n, "value": v, "unit": "N m"} for n, v in own.items()]
+    write_json(b, tmp_path / "b.json")
+    found = compare_results([tmp_path / "a.json", tmp_path / "b.json"])["friction"]
+    first, curves = found[0], {entry["joint"]: entry for entry in found}
+    assert first["joint"] == joint, "what differs most comes first"
+    assert first["load"] == [None, 0.08]
+    v = np.array(first["speeds"])
+    assert (v.min(), v.max(), first["unit"]) == (-1.5, 1.5, "N m")
+    zero = np.zeros((len(v), 6))
+    speeds = zero.copy()
+    speeds[:, 2] = v
+    friction = split_torque(model, pi, zero, speeds, zero, memory=np.zeros((len(v), 1))).parts[
+        "friction"
+    ]
+    np.testing.assert_allclose(first["torques"][1], friction[:, 2], atol=1e-12)
+    plain = old[f"{joint}.viscous"] * v + old[f"{joint}.coulomb"] * np.sign(v)
+    np.testing.assert_allclose(first["torques"][0], plain, atol=1e-12)
+    assert curves[other]["torques"][0] == curves[other]["torques"][1]
+    write_comparison([tmp_path / "a.json", tmp_path / "b.json"], tmp_path / "c.html")
+    drawn = charts((tmp_path / "c.html").read_text(encoding="utf-8"))
+    chart = next(c for c in drawn if joint in c["title"])
+    assert [s["label"] for s in chart["series"]] == ["A", "B"]
+    moving = v != 0
+    np.testing.assert_allclose(
+        np.asarray(chart["series"][1]["y"])[moving], friction[moving, 2],
+        atol=np.ptp(friction[:, 2]) / 60_000,
+    )  # fmt: skip
+    assert np.isnan(np.asarray(chart["series"][1]["y"])[~moving]).all()
+
+
+def test_results_that_state_no_speeds_have_no_curves(folder, tmp_path):
+    for name in "ab":
+        write_json({**read_result(folder / f"{name}.json"), "friction": {}}, tmp_path / name)
+    content = write_comparison([tmp_path / "a", tmp_path / "b"], tmp_path / "c.html")
+    assert content["friction"] == []
+    assert "No result has friction curves" in (tmp_path / "c.html").read_text()
+
+
+def test_bars_are_as_long_as_what_they_show(folder, tmp_path):
+    content = write_comparison([folder / "a.json", folder / "b.json"], tmp_path / "c.html")
+    html = (tmp_path / "c.html").read_text(encoding="utf-8")
+    (entry,) = content["validation"]
+    most = max(max(row["relative_error_pct"]) for row in entry["per_joint"])
+    for row in entry["per_joint"]:
+        cells = html.split(f"{code(row['joint']).html}</th>")[1].split("</td>")[0]
+        widths = [float(x) for x in re.findall(r"h([\d.]+)v", cells)]
+        np.testing.assert_allclose(
+            widths, [160 * x / most for x in row["relative_error_pct"]], atol=0.06
+        )
+    largest = content["base_parameters"][0]
+    cells = html.split(f"{code(largest['name']).html}</th>")[1].split("</td>")[0]
+    (reach,) = re.findall(r'd="M45 3h(-?[\d.]+)l', cells)
+    d = largest["differences"][0]
+    assert abs(d) < 6
+    assert float(reach) == pytest.approx(d * 45 / 6, abs=0.06)
+
+
+def test_the_page_in_the_browser(folder, tmp_path, browser):
+    write_comparison([folder / "a.json", folder / "b.json"], tmp_path / "c.html")
+    with visit(browser, tmp_path / "c.html", color_scheme="dark") as seen:
+        seen.page.locator("#friction").scroll_into_view_if_needed()
+        until(seen, "charts.all.some((c) => c.plot)")
+        for width in (1280, 360):
+            seen.page.set_viewport_size({"width": width, "height": 800})
+            until(seen, f"document.documentElement.scrollWidth <= {width}")
+        head = seen.page.get_by_role("button", name="(B − A) / s")
+        head.click()
+        head.click()
+        column = 'tr => parseFloat(tr.cells[1].textContent.replace("−", "-"))'
+        shown = seen.page.evaluate(
+            f'[...document.querySelectorAll("table.data tbody tr")].map({column})'
+        )
+        assert shown == sorted(shown, reverse=shown[0] > shown[-1])
+        assert not seen.errors
+        assert not seen.requests
+
+
+def test_a_difference_is_far_if_that_to_any_result_is_and_ends_in_a_point_beyond_six():
+    entries = [
+        ("a", [4.0, 1.0]), ("b", [-0.5, -7.25]), ("c", [2.9, -2.9]), ("d", [None, 0.0]),
+        ("e", [None, None]),
+    ]  # fmt: skip
+    content = {
+        "results": [{"label": label, "name": label} for label in "ABC"],
+        "base_parameters": [
+            {"name": name, "unit": "kg", "values": [1.0, None, 2.0],
+             "std_errors": [0.1, None, 0.02], "differences": differences}
+            for name, differences in entries
+        ],
+    }  # fmt: skip
+    html = comparison_page._base_section(content)
+    assert "<p>2 of 5 parameters differ from A by more than 3 combined standard errors" in html
+    rows = tables(html)["Base parameters with standard errors"].by_name()
+    assert rows["b"]["(C − A) / s"] == "−7.2"
+    assert rows["d"]["(C − A) / s"] == "0.0"
+    assert rows["e"]["(B − A) / s"] == "–"
+    assert rows["a"]["B"] == rows["a"]["± B"] == "–"
+    assert (rows["a"]["C"], rows["a"]["± C"]) == ("2.000", "0.020")
+    half, widest = comparison_page._HALF, comparison_page._WIDEST
+    for difference, end, tip in ((2.0, 2.0, 0), (-5.0, -5.0, 0), (9.0, 6.0, 4), (-7.25, -6.0, -4)):
+        cell = comparison_page._difference(difference, 1)
+        assert '<svg width="90" height="14"' in cell.html
+        assert 'd="M45 0v14M22 0v14M68 0v14"' in cell.html  # zero and three errors
+        assert f'd="M{half} 3h{end * half / widest - tip:.1f}l{tip} 4l{-tip} 4H{half}z"' in (
+            cell.html
+        )
+        assert ("<strong>" in cell.html) == (abs(difference) > 3)
+        assert cell.value == difference
+
+
+def test_bars_of_results_stand_below_each_other_over_the_largest():
+    html = comparison_page._bars([2.0, None, 1.0], 4.0).html
+    width, high = comparison_page._BAR, comparison_page._HIGH
+    assert f'width="{width}" height="{3 * high}"' in html
+    assert re.findall(r'd="M0 (.*?)h(.*?)v(.*?)H0z" fill="var\(--(.*?)\)"', html) == [
+        ("1", f"{width / 2:.1f}", str(high - 2), "tone-1"),
+        (str(2 * high + 1), f"{width / 4:.1f}", str(high - 2), "tone-3"),
+    ]
+    assert "h0.0v" in comparison_page._bars([0.0], 0.0).html
+
+
+def test_friction_is_compared_up_to_the_fastest_speed_of_any_result():
+    def result(viscous, coulomb, fastest, other):
+        values = {"one.viscous": viscous, "one.coulomb": coulomb, "two.viscous": other}
+        return {
+            "joints": ["two", "one"],
+            "friction": {joint: {"data_range": {"v": [0.1, fastest]}} for joint in ("one", "two")},
+            "drive_parameters": [{"name": k, "value": x} for k, x in values.items()],
+            "identification": {"per_joint": {"one": {"unit": "N m"}, "two": {"unit": "N"}}},
+        }
+
+    first, second = _friction_curves([result(2.0, 1.0, 2.0, 1.0), result(4.0, 0.5, 3.0, 1.1)])
+    assert (first["joint"], first["unit"]) == ("one", "N m")  # differs the most
+    assert (second["joint"], second["unit"]) == ("two", "N")
+    v = np.array(first["speeds"])
+    np.testing.assert_allclose(v, np.linspace(-3.0, 3.0, len(v)))
+    for torque, (viscous, coulomb) in zip(first["torques"], ((2.0, 1.0), (4.0, 0.5)), strict=True):
+        np.testing.assert_allclose(torque, viscous * v + coulomb * np.sign(v), atol=1e-12)
+    # at 3 rad/s: 7 N m and 12.5 N m; 3 N and 3.3 N
+    assert first["difference"] == pytest.approx(5.5 / 12.5)
+    assert second["difference"] == pytest.approx(0.3 / 3.3)
+
+
+def test_friction_differs_by_a_share_of_the_most_in_either_direction():
+    facts = RobotModel.from_urdf(
+        ROOT / "urdf" / "planar_2r.urdf", own_terms={"joint_1": (Asymmetric(),)}
+    ).options["own_terms"]
+
+    def result(asymmetric):
+        values = {"joint_1.viscous": 2.0, "joint_1.asymmetric": asymmetric}
+        return {
+            "joints": ["joint_1"],
+            "own_terms": facts,
+            "friction": {"joint_1": {"data_range": {"v": [0.1, 4.0]}}},
+            "drive_parameters": [{"name": k, "value": x} for k, x in values.items()],
+            "identification": {"per_joint": {}},
+        }
+
+    (found,) = _friction_curves([result(-0.5), result(-0.8)])
+    v = np.array(found["speeds"])
+    np.testing.assert_allclose(found["torques"][1], 2.0 * v - 0.8 * np.abs(v), atol=1e-12)
+    # at 4 rad/s: 6 N m and 4.8 N m; at -4 rad/s: -10 N m and -11.2 N m
+    assert found["difference"] == pytest.approx(1.2 / 11.2)
+
+
+def test_the_chart_of_a_friction_has_its_units_its_loads_and_no_line_across_standstill():
+    content = {"results": [{"label": label} for label in "ABC"]}
+    v = [-0.5, 0.0, 0.5]
+    entry = {"joint": "ra<il", "unit": "N", "speeds": v, "load": [0.0812, None, 0.5],
+             "torques": [[-3.0, 0.5, 4.0], None, [-1.0, 0.0, 2.0]]}  # fmt: skip
+    html = comparison_page._friction_figure(content, entry)
+    (drawn,) = charts(html)
+    assert (drawn["x_label"], drawn["y_label"]) == ("speed [m/s]", "friction [N]")
+    assert [series["label"] for series in drawn["series"]] == ["A", "C"]
+    wanted = [[-3.0, np.nan, 4.0], [-1.0, np.nan, 2.0]]
+    np.testing.assert_allclose([s["y"] for s in drawn["series"]], wanted, atol=1e-3)
+    caption = "<strong>ra&lt;il</strong>; additional friction per N of load: A 0.0812, C 0.5"
+    assert caption in html
+    plain = comparison_page._friction_figure(content, entry | {"unit": "N m", "load": 3 * [None]})
+    assert charts(plain)[0]["x_label"] == "speed [rad/s]"
+    assert "of load" not in plain

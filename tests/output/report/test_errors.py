@@ -1,0 +1,166 @@
+"""The first screen: bars, figures and steps against the result."""
+
+import re
+from dataclasses import replace
+from html import unescape
+
+import numpy as np
+import pytest
+from helpers.pages import bars
+
+from robotid.diagnosis.verdict.evidence import GOOD, POOR
+from robotid.output.report import bars as errors
+from robotid.output.report.errors import TORQUE, Errors, error_bars, worst_errors
+from robotid.output.report.next_steps import next_steps
+from robotid.output.report.shown import first_screen
+from robotid.output.report.steps import Origin
+from robotid.output.report.torque_section import shown_torques
+
+ORIGIN = Origin(("arm.toml",), "out")
+
+
+def screen_of(found, files=None):
+    return first_screen(shown_torques(found, ORIGIN), files or {})
+
+
+@pytest.fixture(scope="module")
+def screen(identified):
+    return screen_of(identified, {"urdf": "arm identified.urdf"})
+
+
+def test_each_joint_has_a_bar_of_its_error_the_worst_first(screen, identified):
+    (kept,) = identified.validation
+    errors = {j: m.relative_error_pct for j, m in kept.metrics["estimate"].per_joint.items()}
+    found = bars(screen)
+    assert list(found) == sorted(errors, key=errors.get, reverse=True)
+    for joint, (width, marks) in found.items():
+        measured = kept.metrics["estimate"].per_joint[joint]
+        wls = kept.metrics["wls"].per_joint[joint].relative_error_pct
+        others = [measured.baselines[key] for key in ("urdf_with_drives", "gravity_only", "urdf")]
+        assert 1.5 * width**2 / 100 == pytest.approx(errors[joint], rel=2e-3)
+        wanted = [min(value, 150.0) for value in (wls, *others)]
+        assert [1.5 * x**2 / 100 for x in marks] == pytest.approx(wanted, rel=2e-3)
+    limits = re.findall(r'<line x1="([\d.]*)%"', screen)
+    assert [1.5 * float(x) ** 2 / 100 for x in limits[:2]] == pytest.approx([GOOD, POOR], rel=2e-3)
+
+
+def test_of_several_recordings_the_worst_counts(identified):
+    (kept,) = identified.validation
+    metrics = kept.metrics["estimate"]
+    joint = next(iter(metrics.per_joint))
+    worse = replace(metrics.per_joint[joint], relative_error_pct=99.0)
+    better = {j: replace(m, relative_error_pct=0.1) for j, m in metrics.per_joint.items()}
+    other = replace(metrics, per_joint=better | {joint: worse})
+    second = replace(kept, metrics={**kept.metrics, "estimate": other})
+    shown = shown_torques(replace(identified, validation=(kept, second)), ORIGIN)
+    errors = worst_errors(shown.counted)
+    assert next(iter(errors)) == joint
+    for name, measured in errors.items():
+        wanted = worse if name == joint else metrics.per_joint[name]
+        assert measured["relative_error_pct"] == wanted.relative_error_pct
+
+
+def test_a_recording_that_was_fitted_is_none_that_was_predicted(identified):
+    (kept,) = identified.validation
+    metrics = kept.metrics["estimate"]
+    worse = {j: replace(m, relative_error_pct=99.0) for j, m in metrics.per_joint.items()}
+    changed = {**kept.metrics, "estimate": replace(metrics, per_joint=worse)}
+    again = replace(kept, metrics=changed, is_refitted=True)
+
+    def counted(**changes):
+        return worst_errors(shown_torques(replace(identified, **changes), ORIGIN).counted)
+
+    for both in ((kept, again), (again, kept)):
+        assert counted(validation=both) == counted()
+    fitted, wls = identified.metrics(), identified.metrics("wls")
+    for joint, own in counted(validation=(again,)).items():
+        assert own["relative_error_pct"] == fitted.per_joint[joint].relative_error_pct
+        assert own["wls_relative_error_pct"] == wls.per_joint[joint].relative_error_pct
+
+
+def test_every_joint_has_its_verdict_and_its_reason(screen, identified):
+    said = re.findall(
+        r'<li class="([\w-]*)"><a [^>]*>(.*?)</a>.*?<span class="why">(.*?)</span>', screen
+    )
+    shown = {
+        re.sub("<wbr>", "", name): (status.replace("-", " "), unescape(why.split(" <a")[0]))
+        for status, name, why in said
+    }
+    verdicts = identified.verdict.joints
+    assert {joint: status for joint, (status, _) in shown.items()} == {
+        joint: v.status for joint, v in verdicts.items()
+    }
+    good = {j: v for j, v in verdicts.items() if v.status == "good"}
+    worst = next(joint for joint in shown if joint in good)
+    (cause,) = good[worst].reasons[1:]  # of the joint with the largest error
+    assert cause.startswith("largest error of the good joints: the residual is ")
+    assert {why for joint, (_, why) in shown.items() if joint in good} == {cause, ""}
+    (common,) = re.findall(r'<p class="common good"><strong>good</strong>: (.*?)</p>', screen)
+    errors = [float(v.reasons[0].split()[3]) for v in good.values()]
+    names = [joint for joint in shown if joint in good]
+    assert unescape(common) == (
+        f"{', '.join(names)}: error at most {min(errors)} to {max(errors)} %, smaller than that of "
+        "a constant and that of the URDF"
+    )
+
+
+def test_joints_that_differ_in_the_numbers_of_their_reasons_have_one_line():
+    reasons = {"a": "a: error 17.4 % on x", "b": "b: error 16.2 % on x", "c": "c: error 51 %"}
+    verdicts = {
+        joint: {"status": "poor" if joint == "c" else "usable", "reasons": [why]}
+        for joint, why in reasons.items()
+    }
+    measured = {joint: {"relative_error_pct": 20.0} for joint in verdicts}
+    html = error_bars(TORQUE, [Errors("y", measured)], list(verdicts), verdicts)
+    (common,) = re.findall(r'<p class="common usable">(.*?)</p>', html)
+    assert common == "<strong>usable</strong>: a, b: error 16.2 to 17.4 % on x"
+    whys = re.findall(r'<span class="why">(.*?)</span>', html)
+    assert whys == ["", "", "error 51 %"]
+
+
+def test_a_recording_is_named_in_reasons_unless_it_is_the_only_one(screen, identified):
+    (kept,) = identified.validation
+    named = f" on {kept.recording.name}"
+    assert any(named in reason for v in identified.verdict.joints.values() for reason in v.reasons)
+    assert named not in screen[screen.index('id="worst"') :]
+    log = replace(kept.recording.log, path="other.csv")
+    second = replace(kept, recording=replace(kept.recording, log=log))
+    both = screen_of(replace(identified, validation=(kept, second)))
+    assert named in both[both.index('id="worst"') :]
+
+
+def test_masses_and_sources_are_those_of_the_result(screen, identified):
+    before, after = (pi[:60:10].sum() for pi in (identified.prior, identified.standard))
+    assert f"{before:.2f} → {after:.2f} kg" in screen
+    assert f"{identified.determination.rank} of {len(identified.base)}" in screen
+    flex = {k: int(n) for k, n in re.findall(r'<i class="from-(\w+)" style="flex: (\d+)"', screen)}
+    assert flex == {kind: identified.sources.count(kind) for kind in set(identified.sources)}
+    assert '<a href="arm identified.urdf">URDF</a>' in screen
+
+
+def test_the_steps_stand_in_order_with_what_to_copy(screen, identified):
+    steps = next_steps(identified, ORIGIN)
+    html = screen[screen.index('<ol class="next">') :]
+    assert [unescape(x) for x in re.findall(r"<li><p>(.*?)</p>", html)] == [s.words for s in steps]
+    blocks = re.findall(r'<pre class="command">(.*?)</pre>', html, re.DOTALL)
+    typed = [unescape(x.replace("<span>", "").replace("</span>", "")) for x in blocks]
+    assert typed == [block for step in steps for block in step.blocks]
+    assert typed
+
+
+def test_the_best_of_many_joints_are_folded_away(identified, screen, monkeypatch):
+    monkeypatch.setattr(errors, "_ROWS", 4)
+    html = screen_of(identified)
+    shown, folded = html.split("2 more joints with smaller errors")
+    assert [*bars(shown), *bars(folded)] == list(bars(screen))
+    assert len(bars(shown)) == 4
+
+
+def test_the_total_mass_changes_by_its_share(identified, report):
+    names = identified.model.layout.names
+    is_mass = np.array([name.endswith("_link.m") for name in names])
+    before, after = (pi[is_mass].sum() for pi in (identified.prior, identified.standard))
+    change = 100 * (after - before) / before
+    assert abs(change) > 1
+    said = f"<strong>{before:.2f} → {after:.2f} kg</strong> ({change:+.0f} %)"
+    assert said.replace("(-", "(−") in report

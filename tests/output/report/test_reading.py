@@ -1,0 +1,205 @@
+"""The report in a browser: sorting, filtering, taking away, folding, printing, without script."""
+
+import csv
+import io
+import re
+from pathlib import Path
+
+import pytest
+from helpers.browsing import until, visit
+from helpers.pages import tables
+
+from robotid.output.pages.html import asset
+from robotid.output.report.document import write_report
+from robotid.output.report.steps import Origin
+
+PARAMETERS = "Parameters of links and drives"
+
+
+@pytest.fixture(scope="module")
+def path(identified, tmp_path_factory):
+    target = tmp_path_factory.mktemp("reading") / "report.html"
+    return write_report(identified, target, origin=Origin(("arm.toml",), "out"))
+
+
+@pytest.fixture(scope="module")
+def opened(browser, path):
+    with visit(browser, path, accept_downloads=True) as seen:
+        seen.page.context.grant_permissions(["clipboard-read", "clipboard-write"])
+        seen.page.evaluate(
+            "window.first = [...document.querySelectorAll('details')].map((fold) => fold.open)"
+        )
+        yield seen
+
+
+@pytest.fixture
+def seen(opened):
+    """The page as it opens, but for the order of rows."""
+    opened.page.evaluate(
+        """() => {
+          document.querySelectorAll('details').forEach((fold, k) => { fold.open = first[k]; });
+          document.querySelectorAll('input[type=search]').forEach((box) => {
+            box.value = ''; box.dispatchEvent(new Event('input', { bubbles: true })); });
+          location.hash = '';
+          scrollTo(0, 0);
+        }"""
+    )
+    yield opened
+    assert opened.errors == []
+    assert opened.requests == []
+
+
+def table_of(seen, caption=PARAMETERS):
+    """Open what holds a table, and return it and its tools."""
+    seen.page.evaluate("location.hash = 'parameters'")
+    table = seen.page.locator("table.data", has_text=caption).first
+    return table, seen.page.locator(f".tools:has(+ .scroll[aria-label='{caption}'])")
+
+
+def column(table, number):
+    return table.locator("tbody tr:visible").locator(f":nth-child({number})").all_inner_texts()
+
+
+def test_rows_are_filtered_by_all_words(seen, identified):
+    table, tools = table_of(seen)
+    tools.get_by_role("searchbox").fill("elbow_JOINT off")
+    names = column(table, 2)
+    assert names == ["offset"]
+    assert tools.locator("output").inner_text() == f"1 of {len(identified.standard)} rows"
+
+
+def test_csv_holds_every_number_in_full_with_ascii_minus_signs(seen, identified):
+    _table, tools = table_of(seen)
+    with seen.page.expect_download() as caught:
+        tools.get_by_role("button", name="Save CSV").click()
+    text = Path(caught.value.path()).read_bytes().decode("utf-8")
+    assert caught.value.suggested_filename == "Parameters_of_links_and_drives.csv"
+    assert "\u2212" not in text
+    head, *rows = csv.reader(io.StringIO(text))
+    assert head == [
+        "link or drive", "parameter", "URDF", "identified", "± error", "low", "high", "change",
+        "determined by", "unit",
+    ]  # fmt: skip
+    assert [".".join(row[:2]) for row in rows] == list(identified.model.layout.names)
+    for row, prior, value, error in zip(
+        rows, identified.prior, identified.standard, identified.standard_error, strict=True
+    ):
+        assert [float(x) for x in row[2:4]] == pytest.approx([prior, value], rel=1e-9)
+        assert float(row[7]) == pytest.approx(value - prior, rel=1e-9)
+        assert float(row[4] or "inf") == pytest.approx(error, rel=1e-9)
+    assert any(row[3].startswith("-") for row in rows)
+
+
+def test_a_column_is_sorted_by_its_numbers_by_mouse_and_by_keys(seen, identified):
+    table, _ = table_of(seen)
+    head = table.locator("thead th").nth(3)
+    head.get_by_role("button").click()
+    assert head.get_attribute("aria-sort") == "ascending"
+    values = table.locator("tbody td:nth-child(4)").evaluate_all(
+        "cells => cells.map(cell => Number(cell.dataset.value))"
+    )
+    assert values == pytest.approx(sorted(identified.standard), rel=1e-9)
+    head.get_by_role("button").focus()
+    seen.page.keyboard.press("Enter")
+    assert head.get_attribute("aria-sort") == "descending"
+    first = table.locator("tbody td:nth-child(4)").first.get_attribute("data-value")
+    assert float(first) == pytest.approx(max(identified.standard), rel=1e-9)
+    error = table.locator("thead th").nth(4)
+    for _ in range(2):  # what has no number stays last
+        error.get_by_role("button").click()
+        assert column(table, 5)[-1] == "–"
+    assert table.locator("thead th[aria-sort='none']").count() == 9
+
+
+def test_shown_rows_and_commands_are_copied(seen):
+    _, tools = table_of(seen)
+    tools.get_by_role("searchbox").fill("forearm_link mcx")
+    tools.get_by_role("button", name="Copy").click()
+    read = "navigator.clipboard.readText()"
+    head, row = seen.page.evaluate(read).split("\n")
+    assert head.split("\t")[:2] == ["link or drive", "parameter"]
+    assert row.split("\t")[:2] == ["forearm_link", "mcx"]
+    block = seen.page.locator("pre.command").first
+    block.locator("+ button").focus()
+    seen.page.keyboard.press("Enter")
+    until(seen, "document.querySelector('pre.command + button').textContent === 'Copied'")
+    assert seen.page.evaluate(read) == block.inner_text().strip()
+
+
+def test_a_link_opens_what_it_leads_to(seen):
+    page = seen.page
+    assert not page.locator("#errors-fold").evaluate("fold => fold.open")
+    page.locator("nav a", has_text="Errors").focus()
+    page.keyboard.press("Enter")
+    until(seen, "document.querySelector('#errors-fold').open")
+    page.locator(".bars a").last.click()
+    key = page.locator(".bars a").last.get_attribute("href")
+    until(seen, f"document.querySelector('{key}').open")
+    top = page.locator(key).bounding_box()["y"]
+    assert 30 < top < 400  # below the contents, which stay
+    assert page.locator("nav").bounding_box()["y"] == 0
+
+
+def test_the_worst_joints_open_on_few_screens(seen):
+    screens = "document.documentElement.scrollHeight / innerHeight"
+    assert seen.page.evaluate(screens) <= 6.0
+    assert seen.page.locator(".next").bounding_box()["y"] < 800
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_nothing_is_wider_than_a_phone(browser, path, scheme):
+    with visit(browser, path, size=(390, 844), color_scheme=scheme) as seen:
+        width = "document.querySelector('{}').scrollWidth"
+        assert [seen.page.evaluate(width.format(x)) for x in ("html", "nav")] == [390, 390]
+        until(seen, "document.querySelectorAll('#friction ~ .plots canvas').length >= 6")
+        place = seen.page.locator("#friction ~ .plots .place").first.bounding_box()
+        assert place["width"] > 340
+        assert seen.errors == []
+
+
+def test_printing_opens_everything(seen):
+    page = seen.page
+    count = page.locator("details").count()
+    page.evaluate("window.dispatchEvent(new Event('beforeprint'))")
+    assert page.locator("details[open]").count() == count > 15
+    page.evaluate("window.dispatchEvent(new Event('afterprint'))")
+    assert page.locator("details[open]").count() < count
+
+
+def test_without_script_everything_can_be_read_and_is_printed(browser, path):
+    with visit(browser, path, java_script_enabled=False) as seen:
+        page = seen.page
+        assert page.locator("button").count() == 0
+        shown = tables(page.content())
+        assert len(shown[PARAMETERS].rows) == 84
+        page.locator("#parameters-fold > summary").click()
+        assert page.locator(f"caption:has-text('{PARAMETERS}')").is_visible()
+        page.emulate_media(media="print")
+        assert page.locator("caption:has-text('Versions that ran')").bounding_box()["height"] > 5
+
+
+def luminance(colour):
+    rgb = [int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5)]
+    linear = [x / 12.92 if x <= 0.04045 else ((x + 0.055) / 1.055) ** 2.4 for x in rgb]
+    return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
+
+
+def contrast(one, other):
+    high, low = sorted((luminance(one), luminance(other)), reverse=True)
+    return (high + 0.05) / (low + 0.05)
+
+
+def test_every_tone_of_text_can_be_read_on_the_page_and_on_its_boxes():
+    def tones(css):
+        found = dict(re.findall(r"--([\w-]+):\s*(#[0-9a-f]+)", css))
+        return {
+            k: v if len(v) == 7 else "#" + "".join(2 * c for c in v[1:]) for k, v in found.items()
+        }
+
+    light, dark = asset("tones.css").split("@media", 1)
+    schemes = [tones(light), tones(light) | tones(dark)]
+    schemes.append(tones(light) | tones(asset("page.css").split("@media print", 1)[1]))
+    for scheme in schemes:
+        for name in ("text", "quiet", "predicted", "residual", "good", "usable", "poor"):
+            for ground in ("page", "soft"):
+                assert contrast(scheme[name], scheme[ground]) >= 4.5, (name, ground, scheme[name])

@@ -1,0 +1,775 @@
+"""What only a browser can show. Pages are opened from files; nothing is fetched."""
+
+import io
+import os
+import signal
+import subprocess
+import sys
+import time
+from contextlib import contextmanager
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from helpers.browsing import until
+from helpers.browsing import visit as visit_large
+from helpers.paths import URDF
+from helpers.synthetic import perfect, truth
+from PIL import Image
+
+from robotid.data.files.read import write_log
+from robotid.data.log import Log
+from robotid.dynamics.simulation.closed_loop import Noise
+from robotid.dynamics.simulation.motions import random_fourier
+from robotid.dynamics.simulation.simulation_settings import Payload, Sensors
+from robotid.output.viewer.replays import Bands, Mark, Torques, replay
+from robotid.robot.model import RobotModel
+
+T = np.arange(401) / 100.0 + 7.0  # [s]
+OPEN = {"reduced_motion": "reduce"}  # opens with the clock stopped
+SMALL = (820, 480)  # [px] drawn faster by the processor
+
+
+def predicted():
+    """A fit that is off by 0.6 N m from 9 s on at joint 3, and does not know joint 4 before 8 s."""
+    fit = motion(6)[1] + np.random.default_rng(1).normal(0.0, 0.1, (len(T), 6))
+    fit[T >= 9.0, 3] += 0.6
+    fit[T < 8.0, 4] = np.nan
+    return fit
+
+
+def visit(browser, target, *, size=SMALL, **options):
+    return visit_large(browser, target, size=size, **options)
+
+
+def motion(n):
+    q = np.sin((T - T[0])[:, None] * np.linspace(0.5, 1.5, n)) + 0.2
+    return q, 10.0 * np.cos(3.0 * q)
+
+
+NOISE = np.full(6, 0.1)
+FIT = predicted()
+
+
+@pytest.fixture(scope="module")
+def page(ur5, tmp_path_factory):
+    q, tau = motion(6)
+    pi = ur5.standard_parameters()
+    heavier = pi.copy()
+    heavier[10] *= 2.0
+    theta = np.column_stack([np.cumsum(q[:, 0]), q[:, 1]])
+    shown = replay(
+        ur5, T, q,
+        torques=Torques(T, tau, {"fit": FIT}, NOISE),
+        masses={"URDF": pi, "fit": heavier},
+        ghosts={"designed </script>": (T, q + 0.3)},
+        bands=Bands(T, ["elbow.m", "wrist.m"], ["kg", "kg"], theta, 0.1 + 0 * theta),
+        marks=[Mark(T[0] + 3.0, "payload <b>2 kg</b>", "payload", ur5.joints[2])],
+        log="own.csv",
+    )  # fmt: skip
+    return shown.write(tmp_path_factory.mktemp("page") / "replay.html")
+
+
+@pytest.fixture(scope="module")
+def opened(browser, page):
+    """The page as it opens, once for all tests; loading it takes a second or two."""
+    with visit(browser, page) as seen:
+        yield seen
+
+
+@pytest.fixture
+def still(opened):
+    """The page with its clock stopped at the start, 7 s."""
+    opened.page.evaluate("replay.pause(); replay.seek(7); replay.pick(null)")
+    yield opened
+    assert opened.errors == []
+
+
+@pytest.fixture
+def playing(opened):
+    """The page while its clock runs, which the processor draws as long as it does."""
+    # keys are those of the page, not of a button that was clicked last
+    opened.page.evaluate("document.activeElement.blur(); replay.seek(7); replay.play()")
+    yield opened
+    opened.page.evaluate("replay.pause()")
+    assert opened.errors == []
+
+
+@pytest.fixture(scope="module")
+def planar():
+    """A robot without meshes, where it does not matter which: it is drawn faster."""
+    return RobotModel.from_urdf(URDF / "planar_2r.urdf")
+
+
+@contextmanager
+def sized(seen, width, height):
+    """Show the page in a window of another size [px]."""
+    seen.page.set_viewport_size({"width": width, "height": height})
+    seen.page.wait_for_timeout(100)
+    yield seen
+    seen.page.set_viewport_size(dict(zip(("width", "height"), SMALL, strict=True)))
+    seen.page.evaluate("scrollTo(0, 0)")
+    seen.page.wait_for_timeout(100)
+
+
+def pixels(seen):
+    """Return what the 3-D view shows, shape (height, width, 3)."""
+    seen.page.wait_for_timeout(120)  # a frame is drawn
+    image = seen.page.screenshot(clip=seen.page.locator("#meshcat-pane").bounding_box())
+    return np.asarray(Image.open(io.BytesIO(image)).convert("RGB")).astype(int)
+
+
+def poses(seen, which="robot"):
+    flat = seen.page.evaluate(f"replay.poses(replay.{which})")
+    return [np.array(values).reshape(4, 4).T for values in flat]
+
+
+def cursors(seen):
+    """Return the time that the cursor of each chart in sight stands at [s]."""
+    return seen.page.evaluate(
+        "[...charts.link('time').seen].filter(c => c.cursor).map(c => c.plot.posToVal("
+        "new DOMMatrix(getComputedStyle(c.cursor).transform).e, 'x'))"
+    )
+
+
+def test_the_page_loads_and_plays_without_an_error_or_a_request(opened):
+    seen = opened
+    until(seen, "replay.clock.time > 7")
+    assert seen.errors == []
+    assert seen.requests == []
+    assert seen.page.locator("#marks li").inner_text() == "10.00 s: payload <b>2 kg</b>"
+    assert "ghost: designed </script>" in seen.page.locator("#switches").inner_text()
+
+
+def test_the_robot_is_drawn_where_pinocchio_says(still, ur5):
+    q, _ = motion(6)
+    data = ur5.pin_model.createData()
+    seen = still
+    for row in (0, 130, 400):
+        seen.page.evaluate(f"replay.seek({T[row]})")
+        for which, shift in (("robot", 0.0), ("ghosts[0]", 0.3)):
+            pin.forwardKinematics(ur5.pin_model, data, q[row] + shift)
+            for M, drawn in zip(list(data.oMi), poses(seen, which), strict=True):
+                # keyframes are 1/30 s apart, and straight lines between them
+                np.testing.assert_allclose(drawn, M.homogeneous, atol=2e-3)
+    shown = pixels(seen)
+    seen.page.evaluate("replay.robot.root.visible = replay.ghosts[0].root.visible = false")
+    seen.page.evaluate("replay.viewer.set_dirty()")
+    differs = np.abs(shown - pixels(seen)).max(axis=2) > 30
+    seen.page.evaluate("replay.robot.root.visible = replay.ghosts[0].root.visible = true")
+    assert 0.01 < differs.mean() < 0.6
+
+
+def test_playback_moves_the_robot_at_true_time_and_stops(playing):
+    seen = playing
+    watch = "[replay.clock.time, replay.clock.at / 1000 * 0.25]"  # at: of the last frame
+    seen.page.select_option("#speed", "0.25")  # or screenshots take longer than the motion
+    until(seen, "replay.clock.time > 7")
+    before, pose, first = seen.page.evaluate(watch), poses(seen), pixels(seen)
+    seen.page.wait_for_timeout(900)
+    after, second = seen.page.evaluate(watch), pixels(seen)
+    assert after[0] - before[0] == pytest.approx(after[1] - before[1], abs=1e-6)
+    assert after[0] - before[0] > 0.2
+    assert not np.allclose(pose, poses(seen), atol=0.02)
+    assert (np.abs(first - second).max(axis=2) > 30).mean() > 0.003
+    seen.page.locator("body").press("Space")
+    assert seen.page.locator("#play").inner_text() == "Play"
+    stopped = seen.page.evaluate("replay.clock.time")
+    seen.page.wait_for_timeout(200)
+    assert seen.page.evaluate("replay.clock.time") == stopped
+    seen.page.select_option("#speed", "1")
+
+
+def test_a_paused_page_draws_no_frame_until_something_changes(still):
+    seen, frames = still, "replay.clock.frames"
+    seen.page.wait_for_timeout(200)
+    before = seen.page.evaluate(frames)
+    seen.page.wait_for_timeout(400)
+    assert seen.page.evaluate(frames) == before
+    seen.page.evaluate("replay.seek(8.5); replay.seek(9)")
+    seen.page.wait_for_timeout(200)
+    assert seen.page.evaluate(frames) == before + 1
+    # the time of a pause is not part of the motion
+    seen.page.evaluate("replay.play()")
+    until(seen, f"{frames} > {before + 4}")
+    assert seen.page.evaluate("replay.clock.time") < 10.5
+
+
+def test_the_motion_fills_the_view_and_the_shadow_is_below_the_lowest_points(still):
+    """In a wide and in a narrow window no point of the motion is outside, one is at the rim."""
+    for width in (1280, 390):
+        with sized(still, width, 800) as seen:
+            seen.page.click("#view")
+            rims = seen.page.evaluate("""() => {
+              const { THREE } = MeshCat, { camera } = replay.viewer;
+              camera.updateMatrixWorld(true);
+              const { points } = JSON.parse(document.getElementById('data').textContent).view;
+              const at = points.map(([x, y, z]) => new THREE.Vector3(x, z, -y).project(camera));
+              const range = v => [Math.min(...v), Math.max(...v)];
+              return ['x', 'y'].map(k => range(at.map(p => p[k])));
+            }""")
+            assert np.abs(rims).max() == pytest.approx(0.9, abs=1e-3)
+            np.testing.assert_allclose(np.sum(rims, axis=1), 0.0, atol=0.05)  # in the middle
+    places, opacities = seen.page.evaluate("""() => {
+      const { position, color } = replay.shadow.geometry.attributes;
+      return [[...position.array], [...color.array].filter((_, i) => i % 16 === 3)];
+    }""")
+    corners = np.array(places).reshape(-1, 4, 3)
+    # the base stands on the ground, or above that of a motion that goes below it
+    assert np.ptp(corners[:, :, 2]) == 0.0
+    np.testing.assert_allclose(corners[0].mean(axis=0)[:2], 0.0, atol=0.02)
+    assert 0.0 < min(opacities) < max(opacities) <= 0.5
+
+
+def test_a_ghost_at_the_place_of_the_robot_is_not_seen(still):
+    seen = still
+    seen.page.evaluate("replay.ghosts[0].root.visible = false; replay.viewer.set_dirty()")
+    alone = pixels(seen)
+    seen.page.evaluate("replay.ghosts[0].pose(replay.motion.at(7))")
+    seen.page.evaluate("replay.ghosts[0].root.visible = true; replay.viewer.set_dirty()")
+    assert (np.abs(alone - pixels(seen)).max(axis=2) > 10).mean() < 2e-4
+    seen.page.evaluate("replay.seek(7.5)")
+    apart = pixels(seen)
+    seen.page.evaluate("replay.ghosts[0].root.visible = false; replay.viewer.set_dirty()")
+    assert (np.abs(apart - pixels(seen)).max(axis=2) > 10).mean() > 0.005
+    seen.page.evaluate("replay.ghosts[0].root.visible = true")
+
+
+def test_a_small_residual_has_its_own_axis(still):
+    """The charts of joint 2: torques of 10 N m, and a residual of about 0.1 N m below them."""
+    seen = still
+    seen.page.locator(".plot").nth(1).scroll_into_view_if_needed()
+    until(seen, "document.querySelectorAll('.plot')[1].querySelectorAll('.u-over').length === 2")
+    torque, residual = seen.page.evaluate(
+        "[replay.torqueCharts[1].chart, replay.torqueCharts[1].below].map(c => c.extent())"
+    )
+    shown = motion(6)[1][:, 1] - FIT[:, 1]
+    room = 0.04 * np.ptp(shown)
+    assert residual == pytest.approx([shown.min() - room, shown.max() + room], abs=2e-3)
+    assert np.diff(torque) > 10 * np.diff(residual)
+
+
+def test_names_of_joints_do_not_overlap(still):
+    for width, height in ((820, 480), (390, 844)):
+        with sized(still, width, height) as seen:
+            seen.page.get_by_label("names").check()
+            seen.page.wait_for_timeout(200)
+            boxes = np.array(seen.page.evaluate(
+                "[...document.querySelectorAll('#names span')].map(e => e.getBoundingClientRect())"
+                ".map(b => [b.left, b.top, b.right, b.bottom])"
+            ))  # fmt: skip
+            for k, (left, top, right, bottom) in enumerate(boxes):
+                for other in boxes[:k]:
+                    is_beside = other[0] >= right - 0.2 or other[2] <= left + 0.2
+                    assert is_beside or other[1] >= bottom - 0.2 or other[3] <= top + 0.2
+            # the heat strip has names in a narrow window too, in their rows
+            strip = seen.page.locator("#sheet").bounding_box()
+            name = seen.page.locator("#joints span").nth(2)
+            assert "elbow" in name.inner_text()
+            middle = name.bounding_box()["y"] + name.bounding_box()["height"] / 2
+            assert middle == pytest.approx(strip["y"] + 2.5 / 6 * strip["height"], abs=2)
+            seen.page.get_by_label("names").uncheck()
+
+
+def test_speed_and_loop(still):
+    seen = still
+    seen.page.select_option("#speed", "10")
+    seen.page.click("#play")
+    seen.page.wait_for_timeout(1000)  # 10 s of a motion of 4 s
+    assert seen.page.evaluate("replay.clock.playing")
+    seen.page.uncheck("#loop")
+    until(seen, "!replay.clock.playing")
+    assert seen.page.evaluate("replay.clock.time") == pytest.approx(11.0, abs=1e-5)
+    seen.page.check("#loop")
+    seen.page.select_option("#speed", "1")
+
+
+def test_a_click_in_a_chart_moves_robot_slider_and_every_cursor(still):
+    seen = still
+    before = poses(seen)
+    seen.page.locator(".plot").nth(1).scroll_into_view_if_needed()
+    until(seen, "document.querySelectorAll('.plot')[1].querySelector('.u-over') !== null")
+    chart = seen.page.locator(".plot").nth(1).locator(".u-over").first
+    chart.scroll_into_view_if_needed()
+    seen.page.wait_for_timeout(150)  # charts that come into sight are drawn
+    box = chart.bounding_box()
+    seen.page.mouse.click(box["x"] + 0.75 * box["width"], box["y"] + 20)
+    seen.page.wait_for_timeout(200)
+    time = seen.page.evaluate("replay.clock.time")
+    assert time == pytest.approx(10.0, abs=0.05)
+    assert float(seen.page.locator("#time").input_value()) == pytest.approx(time, abs=1e-4)
+    shown = cursors(seen)
+    assert len(shown) >= 2
+    assert shown == pytest.approx([time] * len(shown), abs=0.02)
+    assert not np.allclose(before, poses(seen), atol=0.1)
+    k = int(np.argmin(np.abs(T - time)))
+    tau, fit = motion(6)[1][k, 1], FIT[k, 1]
+    text = [b.replace("−", "-") for b in seen.page.locator(".plot").nth(1).locator(
+        ".keys b:not(.at)").all_inner_texts()]  # fmt: skip
+    assert [float(x) for x in text] == pytest.approx([tau, fit, tau - fit], abs=2e-3)
+    # the key of a mark on the time line, in the log's own time
+    assert seen.page.locator("#clock").inner_text() == f"{time:.2f} of 11.00 s"
+
+
+def test_keys_move_the_clock_and_a_mark_is_a_button_that_picks_its_joint(still, ur5):
+    seen = still
+    at = lambda: seen.page.evaluate("replay.clock.time")  # noqa: E731
+    seen.page.locator("#play").focus()
+    seen.page.keyboard.press("ArrowRight")
+    assert at() == pytest.approx(8.0)
+    seen.page.locator("#time").focus()
+    seen.page.keyboard.press("Shift+ArrowLeft")
+    assert at() == pytest.approx(8.0 - 1 / 30)
+    seen.page.keyboard.press("End")
+    assert at() == pytest.approx(11.0)
+    seen.page.keyboard.press("Home")
+    assert at() == 7.0
+    seen.page.click("#marks button")
+    assert at() == pytest.approx(10.0)
+    assert seen.page.locator("#time").get_attribute("aria-valuetext") == "10.0 of 11.0 seconds"
+    assert seen.page.evaluate("replay.picked") == ur5.joints[2]
+
+
+def test_play_is_the_first_tab_stop_and_every_target_is_large_enough(still):
+    with sized(still, 1280, 800) as seen:
+        seen.page.locator("summary").click()
+        seen.page.mouse.click(5, 5)
+        seen.page.keyboard.press("Tab")
+        assert seen.page.evaluate("document.activeElement.id") == "play"
+        small = seen.page.evaluate("""
+            [...document.querySelectorAll('button, input, select, summary')].filter(e => {
+              const target = e.matches('input[type=checkbox]') ? e.closest('label') : e;
+              const { width, height } = target.getBoundingClientRect();
+              return width && (width < 23.9 || height < 23.9);
+            }).map(e => e.outerHTML.slice(0, 90))""")
+        assert small == []
+
+
+def test_ellipsoids_wait_to_be_asked_for_by_the_name_of_their_link(still):
+    seen = still
+    hidden = "replay.masses.every(s => s.bodies.every(b => b.objects.every(o => !o.visible)))"
+    assert seen.page.evaluate(hidden)
+    solid = (
+        "[...replay.robot.joints.flatMap(j => [...j.skins.values()])].every(m => m.opacity === 1)"
+    )
+    assert seen.page.evaluate(solid)
+    shown = pixels(seen)
+    box = seen.page.get_by_label("fit: upper_arm_link, 16.8 kg")
+    seen.page.evaluate("document.querySelector('details').open = true")
+    box.check()
+    assert (np.abs(shown - pixels(seen)).max(axis=2) > 10).mean() > 0.0005
+    box.uncheck()
+    assert seen.page.evaluate(hidden)
+
+
+def shows(seen, node):
+    """Return what is picked in every place of the page, by nodes."""
+    return seen.page.evaluate(
+        """node => ({
+          picked: replay.picked,
+          places: [...new Set([...document.querySelectorAll('.picked')].map(e => e.dataset.node))],
+          kinds: [...document.querySelectorAll('.picked')].map(e => e.tagName),
+          ellipsoids: replay.masses.map(s => s.bodies.filter(b =>
+            b.objects.length && b.objects.every(o => o.visible)).map(b => b.node)),
+          arcs: replay.arcs.map(a => a.measured.material.opacity),
+          chart: (([...document.querySelectorAll('.plot')][node - 1]).getBoundingClientRect().top
+            < innerHeight)
+        })""",
+        node,
+    )
+
+
+@pytest.mark.parametrize("how", ["view", "chart", "strip", "table"])
+def test_a_joint_picked_anywhere_shows_everywhere(still, ur5, how):
+    seen, node = still, {"view": 2, "chart": 5, "strip": 4, "table": 3}[how]
+    if how == "view":  # a point inside the link
+        x, y = seen.page.evaluate("""() => {
+          const { THREE } = MeshCat, joint = replay.robot.joints[2].object;
+          const mesh = replay.robot.solids.find(s => s.userData.node === 2);
+          replay.viewer.render();
+          const box = new THREE.Box3().setFromObject(mesh), at = box.getCenter(new THREE.Vector3());
+          at.project(replay.viewer.camera);
+          const pane = document.getElementById('meshcat-pane').getBoundingClientRect();
+          return [pane.left + (at.x + 1) / 2 * pane.width, pane.top + (1 - at.y) / 2 * pane.height];
+        }""")
+        seen.page.mouse.click(x, y)
+    elif how == "strip":
+        box = seen.page.locator("#sheet").bounding_box()
+        row = box["height"] / 6
+        seen.page.mouse.click(box["x"] + box["width"] * 0.75, box["y"] + 3.5 * row)
+        assert seen.page.evaluate("replay.clock.time") == pytest.approx(10.0, abs=0.05)
+        assert "× RMS noise" in seen.page.locator("#reading").inner_text()
+        seen.page.locator("#sheet").press("ArrowUp")
+        assert seen.page.evaluate("replay.picked") == ur5.joints[2]
+        seen.page.locator("#sheet").press("ArrowDown")
+    elif how == "chart":
+        seen.page.locator(".plot h3 button").nth(node - 1).click()
+    else:
+        seen.page.evaluate("document.querySelector('details').open = true")
+        seen.page.locator("tbody th button").nth(node - 1).click()
+    found = shows(seen, node)
+    assert found["picked"] == ur5.joints[node - 1]
+    assert found["places"] == [str(node)]
+    assert {"SECTION", "TR", "SPAN"} <= set(found["kinds"])
+    assert found["ellipsoids"] == [[node], [node]]
+    assert found["arcs"] == [1 if j == node - 1 else 0.25 for j in range(6)]
+    assert found["chart"]
+    assert seen.page.locator("#picked").inner_text() == ur5.joints[node - 1]
+    seen.page.mouse.click(10, 120)  # beside the robot: none is picked
+    assert seen.page.evaluate("replay.picked") is None
+
+
+def test_the_heat_strip_is_the_residual_over_the_noise(still):
+    seen = still
+    shown = np.array(
+        seen.page.evaluate("[...Array(replay.bins)].map((_, b) => "
+                           "[0, 1, 2, 3, 4, 5].map(j => replay.level(b, j)))"),
+        dtype=float,
+    )  # fmt: skip
+    bins = len(shown)
+    assert bins == 100  # 401 samples, four of them in each
+    edges = np.linspace(T[0], T[-1], bins + 1)
+    which = np.minimum(np.searchsorted(edges, T, side="right") - 1, bins - 1)
+    residual = (motion(6)[1] - FIT) / NOISE
+    for b in range(0, bins, 7):
+        wanted = np.sqrt(np.mean(residual[which == b] ** 2, axis=0))
+        np.testing.assert_allclose(shown[b], wanted, atol=0.006)
+    # a fault that does not go away shows as long as it lasts; what is not known has no value
+    fault = np.arange(bins) >= 50
+    assert np.nanmin(shown[fault, 3]) > 4.0
+    assert np.nanmax(shown[~fault, 3]) < 3.0
+    assert np.isnan(shown[:25, 4]).all()
+    box = seen.page.locator("#sheet").bounding_box()
+    image = np.asarray(Image.open(io.BytesIO(seen.page.screenshot(clip=box))).convert("RGB"))
+    height, width = image.shape[:2]
+    at = lambda x, row: image[int((row + 0.4) / 6 * height), int(x * width)].astype(int)  # noqa: E731
+    before, faulty, sound = at(0.4, 3), at(0.8, 3), at(0.8, 2)
+    assert faulty[0] > faulty[2] + 100  # red
+    assert before[2] > before[0] + 20
+    assert sound[2] > sound[0] + 20
+
+
+def test_links_take_the_colour_of_their_residual_frames_and_names_show_when_asked(still, ur5):
+    seen = still
+    colour = "[...replay.robot.joints[4].skins.values()].map(m => '#' + m.color.getHexString())"
+    plain = seen.page.evaluate(colour)
+    seen.page.evaluate("replay.seek(10.5)")
+    seen.page.get_by_label("links coloured by residual").check()
+    seen.page.wait_for_timeout(150)
+    tinted = seen.page.evaluate("[...replay.robot.joints[4].skins.values()][0].color.toArray()")
+    k = int(np.argmin(np.abs(T - 10.5)))
+    share = 2 * min(abs(motion(6)[1][k, 3] - FIT[k, 3]) / NOISE[3] / 6.0, 1.0)  # of the ramp
+    wanted = np.array([255, 255, 191]) + (share - 1) * (np.array([215, 25, 28]) - [255, 255, 191])
+    assert share > 1
+    np.testing.assert_allclose(255 * np.array(tinted), wanted, atol=4)
+    seen.page.get_by_label("links coloured by residual").uncheck()
+    assert seen.page.evaluate(colour) == plain
+    shown = pixels(seen)
+    seen.page.get_by_label("frames").check()
+    seen.page.get_by_label("names").check()
+    assert (np.abs(shown - pixels(seen)).max(axis=2) > 30).mean() > 0.002
+    assert seen.page.locator("#names").inner_text().split() == list(ur5.joints)
+    seen.page.get_by_label("frames").uncheck()
+    seen.page.get_by_label("names").uncheck()
+    assert seen.page.locator("#names").is_hidden()
+
+
+def test_axe_finds_no_fault(browser, page):
+    from axe_playwright_python.sync_playwright import Axe
+
+    # axe is put in from outside, which the page's own policy forbids
+    with visit(browser, page, bypass_csp=True, **OPEN) as seen:
+        seen.page.evaluate("replay.pick(3)")
+        for scheme, rules in (
+            ("light", {"type": "tag", "values": ["wcag2a", "wcag2aa"]}),
+            ("dark", {"type": "rule", "values": ["color-contrast"]}),  # the rest is as before
+        ):
+            seen.page.emulate_media(color_scheme=scheme)
+            found = Axe().run(seen.page, options={"runOnly": rules}).response
+            faults = {v["id"]: [n["html"][:200] for n in v["nodes"]] for v in found["violations"]}
+            assert faults == {}
+            assert len(found["passes"]) > 10 or scheme == "dark"
+            assert found["passes"]
+        assert seen.errors == []
+
+
+def test_the_address_keeps_time_joint_and_camera(browser, still, ur5):
+    seen = still
+    seen.page.evaluate("replay.seek(9.25); replay.pick(3)")
+    box = seen.page.locator("#meshcat-pane").bounding_box()
+    x, y = box["x"] + 30, box["y"] + box["height"] - 30
+    seen.page.mouse.move(x, y)
+    seen.page.mouse.down()
+    seen.page.mouse.move(x + 90, y - 20, steps=4)
+    seen.page.mouse.up()
+    camera = "replay.viewer.camera.position.toArray()"
+    place, address = seen.page.evaluate(camera), seen.page.url
+    assert "t=9.250" in address
+    assert f"joint={ur5.joints[2]}" in address
+    with visit(browser, address, **OPEN) as seen:
+        assert seen.page.evaluate("replay.clock.time") == pytest.approx(9.25)
+        assert seen.page.evaluate("replay.picked") == ur5.joints[2]
+        assert seen.page.evaluate(camera) == pytest.approx(place, rel=1e-4)
+        # a link of a report to the open replay, and one to another recording
+        seen.page.evaluate(f"location.hash = 't=8.125&joint={ur5.joints[4]}'")
+        until(seen, "replay.clock.time === 8.125")
+        assert seen.page.evaluate("replay.picked") == ur5.joints[4]
+        assert seen.page.locator("#state").inner_text() == ""
+        seen.page.evaluate("location.hash = 't=8.5&log=other.csv'")
+        until(seen, "replay.clock.time === 8.5")
+        assert "to other.csv; this replay shows another" in seen.page.inner_text("#state")
+        assert seen.errors == []
+
+
+def test_a_picture_and_a_film_are_saved_and_not_blank(still, tmp_path):
+    seen = still
+    with seen.page.expect_download() as download:
+        seen.page.click("#picture")
+    download.value.save_as(tmp_path / "picture.png")
+    image = np.asarray(Image.open(tmp_path / "picture.png").convert("RGB")).astype(int)
+    assert download.value.suggested_filename == "ur5_7.00s.png"
+    assert np.ptp(image.reshape(-1, 3), axis=0).max() > 100
+    seen.page.click("#film")
+    seen.page.wait_for_timeout(1200)
+    with seen.page.expect_download() as download:
+        seen.page.click("#film")
+    download.value.save_as(tmp_path / "film.webm")
+    film = (tmp_path / "film.webm").read_bytes()
+    assert film[:4] == bytes.fromhex("1a45dfa3")  # Matroska
+    assert len(film) > 5000
+    assert seen.errors == []
+
+
+def test_what_stands_still_is_drawn_with_all_pixels(playing):
+    seen = playing
+    seen.page.evaluate("replay.draw(0.5)")
+    # drawn in the same task: a canvas of a new size is empty until then
+    width = seen.page.evaluate("document.querySelector('#meshcat-pane canvas').width")
+    assert np.ptp(pixels(seen).reshape(-1, 3), axis=0).max() > 60
+    seen.page.locator("body").press("Space")
+    whole = seen.page.evaluate("document.querySelector('#meshcat-pane canvas').width")
+    assert whole == pytest.approx(2 * width, abs=2)
+    assert seen.page.evaluate("replay.pace.pixels") == 1
+
+
+def test_colours_follow_the_scheme_of_an_open_page(still):
+    seen = still
+    seen.page.emulate_media(color_scheme="dark")
+    seen.page.locator(".plot").first.scroll_into_view_if_needed()
+    until(seen, "document.querySelector('.u-over') !== null")
+    axis = "charts.all.find(c => c.plot).plot.axes[0].stroke()"
+    corner, ink = pixels(seen)[5, 5], seen.page.evaluate(axis)
+    assert corner.max() < 90
+    seen.page.emulate_media(color_scheme="light")
+    assert pixels(seen)[5, 5].min() > 150
+    assert (ink, seen.page.evaluate(axis)) == ("#e3e7eb", "#1c2126")
+
+
+def test_the_camera_follows_a_floating_base(browser, tmp_path, planar):
+    floating = RobotModel.from_urdf(planar.tree, free_flyer=True)
+    base = np.zeros((len(T), 7))
+    base[:, 0], base[:, 6] = 2.0 * (T - T[0]), 1.0
+    q, tau = motion(2)
+    shown = replay(floating, T, np.hstack([base, q]), torques=Torques(T, tau))
+    with visit(browser, shown.write(tmp_path / "r.html"), **OPEN) as seen:
+        target = "replay.viewer.controls.target.toArray()"
+        first = np.array(seen.page.evaluate(target))
+        seen.page.evaluate("replay.seek(9.0)")
+        moved = np.array(seen.page.evaluate(target)) - first
+        np.testing.assert_allclose(moved, [4.0, 0.0, 0.0], atol=1e-3)
+        seen.page.get_by_label("camera follows the robot").uncheck()
+        seen.page.evaluate("replay.seek(10.0)")
+        assert seen.page.evaluate(target) == pytest.approx(list(first + moved))
+        assert seen.page.locator(".plot").count() == 2
+        assert seen.errors == []
+
+
+def test_a_page_at_twice_its_size_leaves_room_above_its_footer(still):
+    with sized(still, 640, 400) as seen:
+        assert seen.page.locator("footer").bounding_box()["height"] < 100
+    with sized(still, 800, 400) as seen:
+        assert seen.page.locator("footer").bounding_box()["height"] < 60
+
+
+def test_arcs_take_the_colour_of_the_residual(browser, planar, tmp_path):
+    q, _ = motion(2)
+    constant = np.full((len(T), 2), 10.0)
+    # all of it is predicted at first, then half of it, and at last nothing is known
+    fit = constant * np.select([T[0] + 1 > T, T[0] + 2 > T], [1.0, 0.5], np.nan)[:, None]
+    shown = replay(planar, T, q, torques=Torques(T, constant, {"fit": fit}))
+    colours = {"blue": [43, 131, 186], "red": [215, 25, 28], "grey": [138, 151, 165]}
+    with visit(browser, shown.write(tmp_path / "r.html"), **OPEN) as seen:
+        for time, wanted in ((7.5, "blue"), (8.5, "red"), (10.0, "grey")):
+            seen.page.evaluate(f"replay.seek({time})")
+            image = pixels(seen)
+            count = {c: (abs(image - rgb).max(axis=2) < 10).sum() for c, rgb in colours.items()}
+            assert count[wanted] > 100
+            assert wanted == "grey" or all(count[c] < 20 for c in ("blue", "red") if c != wanted)
+            assert wanted != "grey" or count["blue"] + count["red"] < 20
+
+
+def test_a_phone_shows_everything_without_scrolling_sideways(still):
+    with sized(still, 390, 844) as seen:
+        assert seen.page.evaluate("document.documentElement.scrollWidth") <= 390
+        assert seen.page.locator("#play").is_visible()
+        drawn = pixels(seen)
+        assert np.ptp(drawn.reshape(-1, 3), axis=0).max() > 60
+        seen.page.locator(".plot").last.scroll_into_view_if_needed()
+        assert seen.errors == []
+
+
+def test_every_control_has_a_name(still):
+    seen = still
+    seen.page.evaluate("document.querySelector('details').open = true")
+    named = seen.page.evaluate(
+        "[...document.querySelectorAll('button:not([hidden]), input, select')].map(e => "
+        "(e.labels && e.labels.length && e.labels[0].innerText.trim()) || "
+        "e.getAttribute('aria-label') || e.innerText.trim())"
+    )
+    assert len(named) > 15
+    assert all(named)
+
+
+def test_a_notebook_s_frame_plays(browser, planar, tmp_path):
+    cell = tmp_path / "notebook.html"
+    cell.write_text(f"<title>n</title>{replay(planar, T, motion(2)[0])._repr_html_()}")
+    with visit(browser, cell) as seen:
+        inside = seen.page.frame_locator("iframe")
+        inside.locator("#clock").wait_for()
+        assert inside.locator("#play").inner_text() == "Pause"
+        end = time.monotonic() + 20.0
+        while inside.locator("#clock").inner_text().startswith("7.00 "):
+            assert time.monotonic() < end
+        assert [e for e in seen.errors if "sandbox" not in e] == []
+
+
+# the command as it is, but the page is told nothing after 3 s of the log until a file is there
+
+
+def test_a_page_that_reads_pixels_is_heard(browser, tmp_path):
+    """The browser's own message is ignored: its emulated GPU gives it for every 3-D view."""
+    page = tmp_path / "page.html"
+    page.write_text("""<canvas></canvas><script>
+      const gl = document.querySelector("canvas").getContext("webgl2");
+      gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4));
+    </script>""")
+    with visit(browser, page) as seen:
+        assert seen.errors == ["the page reads pixels"]
+
+
+HELD = """
+import pathlib, runpy, signal, time
+signal.signal(signal.SIGINT, signal.default_int_handler)  # whatever the shell of the tests ignores
+from robotid.output.viewer.server import LivePage
+send = LivePage.send
+def held(self, message):
+    while message.get("t", 0.0) > 3.0 and not pathlib.Path("go on").exists():
+        time.sleep(0.02)
+    send(self, message)
+LivePage.send = held
+runpy.run_module("robotid", run_name="__main__", alter_sys=True)
+"""
+
+
+def test_the_live_page_follows_a_running_tracker_and_ends_on_ctrl_c(browser, planar, tmp_path):
+    rng = np.random.default_rng(0)
+    load = Payload("link_2", 2.0, (1.5, 0.0, 0.0), inertia=(0.01, 0, 0.01, 0, 0, 0.01), start=8.0)
+    log = perfect(
+        planar, truth(planar), random_fourier(planar, rng, period=5.0), rng, rate=100.0,
+        duration=10.0, sensors=Sensors(noise=Noise(q=2e-5, tau=0.02)), payload=load,
+    )  # fmt: skip
+    kept = (log.t <= 5.0) | (log.t >= 5.6)
+    log = Log(log.t[kept], log.q[kept], log.tau[kept], planar.joints)
+    write_log(log, tmp_path / "log.csv")
+    words = ["track", str(planar.tree.path), "log.csv"]
+    run = subprocess.Popen(
+        [sys.executable, "-c", HELD, *words, "--out", "out", "--serve", "--speed", "10"],
+        cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        env=os.environ | {"PYTHONUNBUFFERED": "1"},
+    )  # fmt: skip
+    try:
+        address = run.stderr.readline().split()[1]
+        assert address.startswith("http://127.0.0.1:")
+        with visit(browser, address) as seen:
+            until(seen, "replay.clock.time > 1.5", 120.0)
+            assert seen.page.locator("#state").inner_text() == "live"
+            early = seen.page.evaluate("replay.clock.time")
+            assert early <= 3.0
+            (tmp_path / "go on").touch()
+            until(seen, "document.getElementById('state').textContent.includes('finished')", 120.0)
+            # the page shows the last pose of the log
+            assert seen.page.evaluate("replay.clock.time") == pytest.approx(10.0, abs=0.05)
+            data = planar.pin_model.createData()
+            pin.forwardKinematics(planar.pin_model, data, log.q[-1])
+            np.testing.assert_allclose(poses(seen)[-1], data.oMi[-1].homogeneous, atol=0.05)
+            assert "step change" in seen.page.locator("#marks").inner_text()
+            # those out of sight, too: no news will draw them when they are scrolled to
+            until(seen, "charts.all.every((chart) => chart.x.length > 100)")
+            assert "5.00 s: gap of 0.60 s" in seen.page.locator("#marks").inner_text()
+            drawn = seen.page.evaluate("charts.all.map(({x, ys}) => [x, ys[0]])")
+            assert len(drawn) > 2
+            for chart in drawn:  # without a line across the gap
+                x, y = np.array(chart, dtype=float)
+                assert (np.diff(x) > 0).all()
+                k = int(np.searchsorted(x, 5.0))
+                assert (x[k], np.isnan(y[k])) == (5.0, True)
+                assert 5.6 < x[k + 1] < 7.0
+            kept = seen.page.evaluate("""() => { // a table with every second row left out
+              const table = new replay.motion.constructor();
+              for (let k = 0; k <= 20000; k++) table.push(0.5 * k, [k === 7 ? NaN : k]);
+              return [table.t.slice(0, 6), table.t.length];
+            }""")
+            assert kept == [[0.0, 1.0, 2.0, 3.0, 3.5, 4.0], 10002]
+            assert seen.errors == []
+            assert seen.requests == [f"{address}events"]
+        assert (tmp_path / "out" / "track.json").is_file()
+        run.send_signal(signal.SIGINT)
+        assert run.wait(60) == 0
+        assert "Traceback" not in run.stderr.read()
+        assert "step change at" in run.stdout.read()
+    finally:
+        run.kill()
+        run.wait()
+        run.stderr.close()
+        run.stdout.close()
+
+
+def test_ghosts_of_positions_may_stand_farther_away(browser, arm_page):
+    """Positions have no torque arcs; the difference of a ghost is shown ten times as large."""
+    with visit(browser, arm_page, **OPEN) as seen:
+        assert seen.errors == []
+        said = seen.page.locator("#switches").inner_text()
+        assert "ghost: simulated" in said
+        assert "ghost: commanded" in said
+        assert "torque" not in said
+        assert not seen.page.locator("#arcs").is_visible()
+        assert seen.page.locator("#plots h2").inner_text() == "Position"
+        seen.page.evaluate("replay.seek(0)")
+        turned = [relative_turn(seen, which) for which in ("ghosts[0]", "ghosts[1]")]
+        np.testing.assert_allclose(turned, [0.01, 0.05], atol=1e-4)
+        seen.page.get_by_label("ghost distance × 10").click()
+        seen.page.evaluate("replay.seek(0)")
+        np.testing.assert_allclose(relative_turn(seen, "ghosts[0]"), 0.1, atol=1e-4)
+
+
+@pytest.fixture(scope="module")
+def arm_page(planar, tmp_path_factory):
+    """A planar arm, its first joint simulated 0.01 rad and commanded 0.05 rad farther."""
+    t = np.linspace(0.0, 2.0, 100)
+    q = np.stack([np.sin(t), np.cos(t)], axis=1)
+    others = {
+        label: q + np.array([x, 0.0]) for label, x in (("simulated", 0.01), ("commanded", 0.05))
+    }
+    made = replay(
+        planar, t, q,
+        torques=Torques(t, q, others, np.array([0.05, 0.05]), "position"),
+        ghosts={label: (t, x) for label, x in others.items()},
+    )  # fmt: skip
+    return made.write(tmp_path_factory.mktemp("positions") / "page.html")
+
+
+def relative_turn(seen, which):
+    """Return by how much the first joint of a ghost is turned against the robot's [rad]."""
+    own, other = poses(seen, "robot")[1], poses(seen, which)[1]
+    R = own[:3, :3].T @ other[:3, :3]
+    return np.arccos(np.clip((np.trace(R) - 1) / 2, -1, 1))

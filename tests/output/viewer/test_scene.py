@@ -1,0 +1,110 @@
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from robotid.output.viewer.scene import _corners, _ends, _reach, ellipsoids, robot_scene
+from robotid.robot.model import RobotModel
+
+
+def test_the_ellipsoid_of_a_solid_ellipsoid_is_itself(rng):
+    for _ in range(20):
+        a = np.sort(rng.uniform(0.02, 0.5, 3))
+        M = pin.SE3.Random()
+        body = M.act(pin.Inertia.FromEllipsoid(3.7, *a))
+        (found,) = ellipsoids(body.toDynamicParameters())
+        assert found.mass == pytest.approx(3.7)
+        np.testing.assert_allclose(found.com, M.translation, atol=1e-12)
+        np.testing.assert_allclose(found.semi_axes, a, rtol=1e-9)
+        assert np.linalg.det(found.rotation) == pytest.approx(1.0)
+        # the axes agree but for their signs
+        np.testing.assert_allclose(np.abs(found.rotation.T @ M.rotation), np.eye(3), atol=1e-7)
+
+
+def test_a_rod_has_no_width():
+    pi = np.array([2.0, 0, 0, 0, 0, 0, 0.3, 0, 0, 0.3])  # along x
+    (found,) = ellipsoids(pi)
+    np.testing.assert_allclose(found.semi_axes, [0, 0, np.sqrt(5 * 0.3 / 2)], atol=1e-7)
+
+
+def test_what_no_solid_can_be_has_no_ellipsoid_and_says_why():
+    thin = [1.0, 0, 0, 0, 0.1, 0, 0.1, 0, 0, 0.3]  # one moment exceeds the sum of the others
+    pi = np.array([np.zeros(10), [-1.0, *np.ones(9)], thin]).ravel()
+    nothing, negative, impossible = ellipsoids(pi)
+    assert (nothing.fault, nothing.com) == ("no mass", None)
+    assert (negative.fault, negative.com) == ("negative mass", None)
+    assert impossible.fault == "no solid has this inertia"
+    assert impossible.semi_axes is None
+    np.testing.assert_allclose(impossible.com, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("shape", "size", "half"),
+    [
+        ("box", [0.2, 0.4, 0.6], [0.1, 0.2, 0.3]),
+        ("sphere", [0.3], [0.3, 0.3, 0.3]),
+        ("cylinder", [0.1, 0.8], [0.1, 0.4, 0.1]),  # along y, as the viewer has them
+        ("mesh", [1], None),
+    ],
+)
+def test_the_box_about_a_part_is_where_the_part_is(shape, size, half):
+    M = pin.SE3.Random().homogeneous
+    boxes = [np.zeros((2, 3)), np.array([[-0.1, 0.2, 0.3], [0.4, 0.5, 0.9]])]
+    part = {"shape": shape, "size": size, "matrix": M.T.ravel().tolist()}
+    found = _corners(part, boxes)
+    own = (found - M[:3, 3]) @ M[:3, :3]  # in the part's own frame
+    low, high = boxes[1] if half is None else (-np.array(half), np.array(half))
+    np.testing.assert_allclose(own.min(axis=0), low, atol=1e-12)
+    np.testing.assert_allclose(own.max(axis=0), high, atol=1e-12)
+    assert len(np.unique(own.round(9), axis=0)) == 8
+
+
+def test_shapes_are_placed_as_in_the_urdf_and_cylinders_along_its_z(tmp_path):
+    shapes = (
+        '<box size="1 2 3"/>',
+        '<sphere radius="0.2"/>',
+        '<cylinder radius="0.1" length="0.5"/>',
+    )
+    visual = (
+        '<visual><origin xyz="0.1 0.2 0.3" rpy="0.4 -0.5 0.6"/><geometry>{}</geometry></visual>'
+    )
+    (tmp_path / "shapes.urdf").write_text(
+        '<robot name="s"><link name="base"/><link name="a">'
+        f"{''.join(visual.format(shape) for shape in shapes)}</link>"
+        '<joint name="j" type="revolute"><parent link="base"/><child link="a"/>'
+        '<axis xyz="0 0 1"/><limit effort="1" velocity="1"/></joint></robot>'
+    )
+    scene = robot_scene(RobotModel.from_urdf(tmp_path / "shapes.urdf"))
+    parts = {part["shape"]: part for part in scene.content["parts"] if part["node"] == 1}
+    wanted = pin.SE3(pin.rpy.rpyToMatrix(0.4, -0.5, 0.6), np.array([0.1, 0.2, 0.3])).homogeneous
+    found = {name: np.array(part["matrix"]).reshape(4, 4).T for name, part in parts.items()}
+    for name, size in (("box", [1, 2, 3]), ("sphere", [0.2]), ("cylinder", [0.1, 0.5])):
+        assert parts[name]["size"] == size
+        np.testing.assert_allclose(found[name][:, 3], wanted[:, 3])
+    np.testing.assert_allclose(found["box"], wanted, atol=1e-12)
+    np.testing.assert_allclose(found["sphere"], wanted, atol=1e-12)
+    np.testing.assert_allclose(found["cylinder"][:3, 1], wanted[:3, 2], atol=1e-12)
+    assert np.linalg.det(found["cylinder"]) == pytest.approx(1.0)
+
+
+BRANCHED = """<robot name="tree"><link name="base"/><link name="a"/><link name="b"/><link name="c"/>
+<link name="near"/><link name="far"/>
+<joint name="ja" type="revolute"><parent link="base"/><child link="a"/><origin xyz="0 0 0.5"/>
+<axis xyz="0 0 1"/><limit effort="1" velocity="1"/></joint>
+<joint name="jb" type="revolute"><parent link="base"/><child link="b"/><origin xyz="0.3 0 0"/>
+<axis xyz="0 0 1"/><limit effort="1" velocity="1"/></joint>
+<joint name="jc" type="revolute"><parent link="b"/><child link="c"/><origin xyz="0 0.4 0"/>
+<axis xyz="0 0 1"/><limit effort="1" velocity="1"/></joint>
+<joint name="f1" type="fixed"><parent link="c"/><child link="near"/><origin xyz="0 0 0.1"/></joint>
+<joint name="f2" type="fixed"><parent link="c"/><child link="far"/><origin xyz="0.2 0 0"/></joint>
+</robot>"""
+
+
+def test_a_skeleton_reaches_to_each_child_and_to_the_farthest_frame(tmp_path):
+    (tmp_path / "tree.urdf").write_text(BRANCHED)
+    model = RobotModel.from_urdf(tmp_path / "tree.urdf")
+    tree = model.pin_model
+    assert _reach(model) == pytest.approx(0.7)  # 0.3 + 0.4 along one branch, 0.5 along the other
+    number = {name: tree.getJointId(name) for name in ("ja", "jb", "jc")}
+    np.testing.assert_allclose(sorted(map(tuple, _ends(model, 0))), [(0, 0, 0.5), (0.3, 0, 0)])
+    np.testing.assert_allclose(_ends(model, number["jb"]), [[0, 0.4, 0]])
+    np.testing.assert_allclose(_ends(model, number["jc"]), [[0.2, 0, 0]])

@@ -1,0 +1,151 @@
+import numpy as np
+import pytest
+import trimesh
+
+from robotid.output.viewer.thinning import thin
+from robotid.robot.meshes import Surface
+
+
+def surface_of(mesh, rgba=None):
+    return Surface(np.asarray(mesh.vertices), np.asarray(mesh.faces), rgba)
+
+
+def welded(surfaces):
+    """Return surfaces as one mesh whose equal corners are one."""
+    return trimesh.util.concatenate([
+        trimesh.Trimesh(s.vertices, s.faces, process=False) for s in surfaces
+    ]).process(merge_norm=True, merge_tex=True)  # fmt: skip
+
+
+def test_thinned_surfaces_stay_near_and_have_few_triangles():
+    ball = trimesh.creation.icosphere(subdivisions=5)  # 20,480 triangles, radius 1
+    ((thinned,),) = thin([[surface_of(ball)]], 3000)
+    assert 2900 < len(thinned.faces) <= 3000
+    radius = np.linalg.norm(thinned.vertices, axis=1)
+    assert radius.max() < 1.003
+    assert radius.min() > 0.997
+    assert set(np.unique(thinned.faces)) <= set(range(len(thinned.vertices)))
+
+
+def test_what_is_closed_stays_closed_whatever_its_colours():
+    """A ring of two colours that meet along a wave, thinned to a quarter."""
+    ring = trimesh.creation.torus(1.0, 0.4, major_sections=120, minor_sections=60)
+    left = ring.triangles_center[:, 0] < 0.1 * np.sin(5 * ring.triangles_center[:, 1])
+    halves = [surface_of(ring.submesh([np.flatnonzero(side)])[0]) for side in (left, ~left)]
+    (thinned,) = thin([halves], 3700)
+    assert sum(len(s.faces) for s in thinned) <= 3700
+    whole = welded(thinned)
+    assert whole.is_watertight
+    assert whole.volume == pytest.approx(ring.volume, rel=0.02)
+    assert all(s.is_closed for s in thinned)
+    # each colour keeps its half
+    assert whole.area == pytest.approx(ring.area, rel=0.02)
+    areas = [trimesh.Trimesh(s.vertices, s.faces).area for s in (*thinned, *halves)]
+    assert areas[:2] == pytest.approx(areas[2:], rel=0.03)
+
+
+def test_far_too_many_triangles_are_thinned_too_without_holes():
+    ball = trimesh.creation.icosphere(subdivisions=6)  # 81,920 triangles
+    ((thinned,),) = thin([[surface_of(ball)]], 2000)
+    assert len(thinned.faces) <= 2000
+    corners = thinned.vertices[thinned.faces]  # what is seen from the middle is the whole sphere
+    r = np.linalg.norm(corners, axis=2)
+    A, B, C = corners.transpose(1, 0, 2)
+    below = r.prod(axis=1) + sum(
+        (X * Y).sum(axis=1) * r[:, k] for X, Y, k in ((A, B, 2), (B, C, 0), (C, A, 1))
+    )
+    seen = 2 * np.arctan2(np.linalg.det(corners), below)  # van Oosterom and Strackee (1983)
+    assert seen.sum() == pytest.approx(4 * np.pi, rel=0.01)
+    assert np.abs(np.linalg.norm(thinned.vertices, axis=1) - 1).max() < 0.01
+
+
+def test_triangles_are_turned_alike_and_outwards(rng):
+    ball = trimesh.creation.icosphere(subdivisions=3)
+    faces = ball.faces.copy()
+    turned = rng.random(len(faces)) < 0.5
+    faces[turned] = faces[turned, ::-1]
+    away = Surface(ball.vertices + 3.0, faces, None)
+    inside_out = Surface(np.asarray(ball.vertices), ball.faces[:, ::-1], None)
+    for (solid,) in thin([[away], [inside_out]], 10_000):
+        mesh = trimesh.Trimesh(solid.vertices, solid.faces)
+        assert mesh.is_winding_consistent
+        assert mesh.volume == pytest.approx(ball.volume)
+        assert solid.is_closed
+
+
+def test_a_sheet_keeps_its_rim_and_is_not_called_closed():
+    x, y = np.meshgrid(np.linspace(0, 1, 40), np.linspace(0, 2, 40), indexing="ij")
+    k = np.arange(1600).reshape(40, 40)
+    a, b, c, d = (k[i : 39 + i, j : 39 + j].ravel() for i, j in ((0, 0), (1, 0), (1, 1), (0, 1)))
+    faces = np.vstack([np.column_stack([a, b, c]), np.column_stack([a, c, d])])
+    sheet = Surface(np.column_stack([x.ravel(), y.ravel(), 0 * x.ravel()]), faces, None)
+    ((thinned,),) = thin([[sheet]], 200)
+    assert trimesh.Trimesh(thinned.vertices, thinned.faces).area == pytest.approx(2.0, rel=1e-3)
+    assert not thinned.is_closed
+    ((thinned,),) = thin([[sheet]], 60)  # its rim alone has 156 sides
+    assert 50 < len(thinned.faces) <= 60
+
+
+def test_solids_that_lie_in_each_other_stay_apart():
+    ball, scale = trimesh.creation.icosphere(subdivisions=4), 1e3
+    sizes = scale * np.array([1.0, 1.02, 1.0])
+    solids = [[Surface(size * ball.vertices, ball.faces, None)] for size in sizes]
+    for (solid,), size in zip(thin(solids, 6000), sizes, strict=True):
+        mesh = trimesh.Trimesh(solid.vertices, solid.faces)
+        assert mesh.volume == pytest.approx(ball.volume * size**3, rel=0.01)
+        assert 1700 < len(solid.faces) < 2300
+        np.testing.assert_allclose(np.linalg.norm(solid.vertices, axis=1), size, rtol=3e-3)
+
+
+def test_sharp_edges_get_a_corner_for_each_side_and_smooth_ones_do_not():
+    box, ball = trimesh.creation.box((1, 1, 1)), trimesh.creation.icosphere(subdivisions=3)
+    (cube,), (sphere,) = thin([[surface_of(box)], [surface_of(ball)]], 10_000)
+    assert len(cube.faces) == 12
+    assert len(cube.vertices) == 24
+    assert len(sphere.vertices) == len(ball.vertices)
+    assert thin([[]], 100) == [[]]
+
+
+def test_edges_stay_sharp_when_few_triangles_are_left():
+    box = trimesh.creation.box((1, 2, 3)).subdivide_loop(0)
+    for _ in range(5):
+        box = box.subdivide()
+    ((thinned,),) = thin([[surface_of(box)]], 100)
+    assert len(thinned.faces) <= 100
+    mesh = trimesh.Trimesh(thinned.vertices, thinned.faces)
+    assert mesh.volume == pytest.approx(6.0, rel=1e-3)
+    np.testing.assert_allclose(np.ptp(mesh.vertices, axis=0), [1, 2, 3], atol=1e-3)
+
+
+def test_patches_of_a_closed_solid_are_closed_beside_an_open_one():
+    box = trimesh.creation.box((1, 1, 1))
+    halves = [Surface(np.asarray(box.vertices), box.faces[part], None)
+              for part in (slice(5), slice(5, None))]  # fmt: skip
+    sheet = Surface(np.asarray(box.vertices) + 3.0, box.faces[:4], None)
+    closed, (opened,) = thin([halves, [sheet]], 100)
+    assert [s.is_closed for s in closed] == [True, True]
+    assert not opened.is_closed
+
+
+def test_a_robot_of_any_size_keeps_its_corners():
+    ball = trimesh.creation.icosphere(subdivisions=3)
+    for size in (1e-6, 1e5):
+        ((same,),) = thin([[Surface(size * ball.vertices, ball.faces, None)]], 10_000)
+        assert len(same.faces) == len(ball.faces)
+        assert len(same.vertices) == len(ball.vertices)
+
+
+def test_a_surface_without_an_outside_is_not_called_closed(rng):
+    """Six corners and ten triangles, every edge on two of them: a projective plane has one side."""
+    ball = trimesh.creation.icosahedron()
+    opposite = np.argmin(ball.vertices @ ball.vertices.T, axis=1)
+    corner = np.unique(np.minimum(np.arange(12), opposite), return_inverse=True)[1]
+    faces = np.unique(np.sort(corner[ball.faces], axis=1), axis=0)
+    assert faces.shape == (10, 3)
+    sides = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    assert (np.unique(sides, axis=0, return_counts=True)[1] == 2).all()
+    plane = Surface(rng.standard_normal((6, 3)), faces, None)
+    (thinned,), (solid,) = thin([[plane], [surface_of(ball)]], 100)
+    assert len(thinned.faces) == 10
+    assert not thinned.is_closed
+    assert solid.is_closed
