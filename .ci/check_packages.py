@@ -17,7 +17,6 @@ SDIST = (
     "CHANGELOG.md",
     "docs/index.md",
     "docs/pictures/report.png",
-    "tests/mutants.toml",
 )
 
 wheel, sdist = map(Path, sys.argv[1:])

@@ -24,8 +24,8 @@ from setting import machine
 
 from robotid.data.files.table_files import write_columns
 from robotid.dynamics.prediction import predict_instants
-from robotid.dynamics.simulation.closed_loop import another_robot
 from robotid.dynamics.simulation.motions import random_fourier
+from robotid.dynamics.simulation.truth import another_robot
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import Coupling

@@ -30,7 +30,7 @@ from robotid.dynamics.memory import remember
 from robotid.dynamics.prediction import predict
 from robotid.robot.drives import DriveMotion, LoadFriction, Stribeck
 from robotid.robot.families import AUTO
-from robotid.dynamics.simulation.closed_loop import another_robot
+from robotid.dynamics.simulation.truth import another_robot
 from robotid.dynamics.simulation.motions import random_fourier
 
 JOBS = Path(__file__).parents[1] / "tests" / "jobs"

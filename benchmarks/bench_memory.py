@@ -25,8 +25,8 @@ import pyarrow.csv
 import pyarrow.parquet
 from setting import machine
 
-from robotid.dynamics.simulation.closed_loop import another_robot
 from robotid.dynamics.simulation.motions import random_fourier
+from robotid.dynamics.simulation.truth import another_robot
 from robotid.dynamics.torque import joint_torque_regressor
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel

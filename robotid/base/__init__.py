@@ -1,3 +1,1 @@
 """Errors, findings, settings, text and files; nothing of robots."""
-
-__all__: list[str] = []

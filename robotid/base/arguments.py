@@ -15,8 +15,6 @@ from robotid.base.exceptions import DataError, SettingsError
 from robotid.base.settings import shown
 from robotid.base.typing import Array
 
-__all__ = ["check_fields", "checked", "frozen", "real_numbers"]
-
 P = ParamSpec("P")
 T = TypeVar("T")
 _NUMBERS: Mapping[type, type] = {float: Real, int: Integral}
@@ -30,9 +28,6 @@ def checked(*names: str) -> Callable[[Callable[P, T]], Callable[P, T]]:
     """Return a decorator that refuses arguments whose types the annotations do not permit.
 
     A list for an array becomes an array.
-
-    Args:
-        names: The arguments to check; none: all.
     """
 
     def decorate(function: Callable[P, T]) -> Callable[P, T]:
@@ -57,28 +52,14 @@ def checked(*names: str) -> Callable[[Callable[P, T]], Callable[P, T]]:
 
 
 def check_fields(instance: object, *names: str) -> None:
-    """Refuse fields of a dataclass whose types the annotations do not permit.
-
-    Args:
-        instance: The dataclass.
-        names: The fields to check.
-    """
+    """Refuse fields of a dataclass whose types the annotations do not permit."""
     kinds = _annotations(type(instance))  # type: ignore[arg-type]
     for name in names:
         _checked(getattr(instance, name), kinds[name], f"{name} of {type(instance).__name__}")
 
 
 def real_numbers(values: ArrayLike | None, name: str, *, hint: str = "") -> Array:
-    """Return values as a read-only array of numbers; NaN where a masked array is masked.
-
-    Args:
-        values: The values.
-        name: Their name, for errors.
-        hint: Another remedy, for the error if they are None.
-
-    Raises:
-        DataError: If they are no real numbers, or rows have unequal lengths.
-    """
+    """Return values as a read-only array of numbers; NaN where a masked array is masked."""
     if values is None:
         raise DataError(f"{name} is None, wanted an array{hint}")
     try:
@@ -96,12 +77,7 @@ def real_numbers(values: ArrayLike | None, name: str, *, hint: str = "") -> Arra
 
 
 def frozen(values: ArrayLike, dtype: type = np.float64) -> Array:
-    """Return the values as a read-only array; copied unless they are read-only already.
-
-    Args:
-        values: The values.
-        dtype: Their type.
-    """
+    """Return the values as a read-only array; copied unless they are read-only already."""
     array: Array = np.asarray(values, dtype=dtype)
     if array.flags.writeable:
         array = array.copy()

@@ -17,26 +17,6 @@ from typing import Any
 
 from robotid.base.exceptions import DataError, SettingsError
 
-__all__ = [
-    "DATASET",
-    "check_file",
-    "check_folder",
-    "check_path",
-    "dataset_of",
-    "file_sha256",
-    "finite",
-    "folder_beside",
-    "log_exists",
-    "missing_file",
-    "moved_file",
-    "read_json",
-    "remove_written",
-    "source_entry",
-    "write_json",
-    "write_text",
-    "written_whole",
-]
-
 _log = logging.getLogger(__name__)
 
 #: The description of a LeRobot dataset, in its folder.
@@ -44,14 +24,7 @@ DATASET = Path("meta") / "info.json"
 
 
 def check_path(path: str | Path) -> None:
-    """Refuse a path that no file system accepts.
-
-    Args:
-        path: The path.
-
-    Raises:
-        SettingsError: If it is not UTF-8, has a NUL, or the path or a name in it is too long.
-    """
+    """Refuse a path that no file system accepts."""
     try:
         raw = os.fsencode(path)
     except UnicodeEncodeError:
@@ -74,16 +47,6 @@ def check_file(target: Path, inputs: Iterable[str | Path | None] = ()) -> None:
 
     A file that exists is replaced only if robotid wrote it, and it has not changed since: it has
     the mark of ``_mark``, or it is of the result in its folder.
-
-    Args:
-        target: The file.
-        inputs: Files, or folders of results, from which its content is computed; "" and None are
-            inputs in memory.
-
-    Raises:
-        DataError: If its folder does not exist.
-        SettingsError: If it is a folder, its name is too long, its folder is not writable, it is
-            one of the inputs, or robotid did not write it.
     """
     check_path(target)
     if not target.parent.is_dir():
@@ -113,17 +76,7 @@ def check_file(target: Path, inputs: Iterable[str | Path | None] = ()) -> None:
 def check_folder(
     target: Path, names: Iterable[str] = (), inputs: Iterable[str | Path | None] = ()
 ) -> None:
-    """Refuse a folder where no results can be written, before the results are computed.
-
-    Args:
-        target: The folder; it may be missing.
-        names: Names of the files to write in it.
-        inputs: As of ``check_file``.
-
-    Raises:
-        SettingsError: If it, or a folder above it, is a file or not writable, or if one of its
-            files is refused by ``check_file``.
-    """
+    """Refuse a folder where no results can be written, before the results are computed."""
     check_path(target)
     existing = next(folder for folder in (target, *target.absolute().parents) if folder.exists())
     if not existing.is_dir():
@@ -138,11 +91,7 @@ def check_folder(
 
 
 def remove_written(files: Iterable[Path]) -> None:
-    """Remove files of an earlier run, with a warning; a file that robotid did not write stays.
-
-    Args:
-        files: The files; they may be missing.
-    """
+    """Remove files of an earlier run, with a warning; a file that robotid did not write stays."""
     for file in files:
         if file.is_file() and _is_written(file):
             _log.warning("removed %s of an earlier run: this run did not write it", file)
@@ -208,17 +157,6 @@ def written_whole(target: str | Path, inputs: Iterable[str | Path | None] = ()) 
 
     After an error the target is unchanged, and no hidden file remains. A device, a pipe or
     ``/dev/stdout`` is not replaced: it receives the content when that is complete.
-
-    Args:
-        target: The file.
-        inputs: As of ``check_file``.
-
-    Yields:
-        The path to write.
-
-    Raises:
-        DataError: If its folder does not exist, or the reader of a pipe has closed it.
-        SettingsError: As of ``check_file``.
     """
     path = Path(target)
     check_file(path, inputs)
@@ -263,15 +201,6 @@ def folder_beside(target: Path) -> Iterator[Path]:
 
     After an error no file is moved, existing files are unchanged, and the hidden folder is
     removed.
-
-    Args:
-        target: The folder; it must exist.
-
-    Yields:
-        The folder to write in.
-
-    Raises:
-        SettingsError: If a file to be replaced is a folder.
     """
     with tempfile.TemporaryDirectory(prefix=".robotid-", dir=target) as hidden:
         new, old = Path(hidden, "new"), Path(hidden, "old")
@@ -302,16 +231,7 @@ def _put_back(names: Iterable[str], new: Path, old: Path, target: Path) -> None:
 
 
 def write_text(text: str, target: str | Path) -> Path:
-    """Write a text file completely or not at all, and return its path.
-
-    Args:
-        text: Its content.
-        target: The file.
-
-    Raises:
-        DataError: If its folder does not exist.
-        SettingsError: If it is a folder.
-    """
+    """Write a text file completely or not at all, and return its path."""
     path = Path(target)
     with written_whole(path) as hidden:
         hidden.write_text(text, encoding="utf-8")
@@ -319,35 +239,17 @@ def write_text(text: str, target: str | Path) -> Path:
 
 
 def write_json(content: Mapping[str, Any], target: str | Path) -> None:
-    """Write a JSON file completely or not at all.
-
-    Args:
-        content: Its content; non-finite numbers are refused.
-        target: The file.
-
-    Raises:
-        DataError: If its folder does not exist.
-        SettingsError: If it is a folder.
-    """
+    """Write a JSON file completely or not at all."""
     write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", target)
 
 
 def finite(value: float) -> float | None:
-    """Return a number for JSON: None if it is not finite.
-
-    Args:
-        value: The number.
-    """
+    """Return a number for JSON: None if it is not finite."""
     return float(value) if math.isfinite(value) else None
 
 
 def missing_file(path: Path, what: str) -> str:
-    """Return the message for a path that is not a regular file.
-
-    Args:
-        path: The path.
-        what: The expected kind of file, as "log file".
-    """
+    """Return the message for a path that is not a regular file."""
     if path.is_dir():
         return f"{str(path)!r} is a folder, wanted a {what}"
     if path.exists():
@@ -369,15 +271,7 @@ def _similar_file(path: Path) -> str:
 
 
 def read_json(path: str | Path, what: str) -> Any:  # noqa: ANN401
-    """Return the content of a JSON file with finite numbers, valid Unicode and few levels.
-
-    Args:
-        path: The file.
-        what: The kind of file, for errors.
-
-    Raises:
-        DataError: If it is missing or has other content.
-    """
+    """Return the content of a JSON file with finite numbers, valid Unicode and few levels."""
     source = Path(path)
     if not source.is_file():
         raise DataError(missing_file(source, what))
@@ -400,24 +294,13 @@ def read_json(path: str | Path, what: str) -> Any:  # noqa: ANN401
 
 
 def dataset_of(path: Path) -> Path | None:
-    """Return the folder of the LeRobot dataset that a path as ``dataset/episode_3`` names.
-
-    Args:
-        path: The path of a log.
-
-    Returns:
-        The folder; None if the path names no episode of a dataset.
-    """
+    """Return the folder of the LeRobot dataset that a path as ``dataset/episode_3`` names."""
     is_episode = re.fullmatch(r"episode_[0-9]+", path.name) and not path.exists()
     return path.parent if is_episode and (path.parent / DATASET).is_file() else None
 
 
 def log_exists(path: Path) -> bool:
-    """Return whether a log exists: a file, a folder, or a dataset of which it is an episode.
-
-    Args:
-        path: The path of the log.
-    """
+    """Return whether a log exists: a file, a folder, or a dataset of which it is an episode."""
     return path.exists() or dataset_of(path) is not None
 
 
@@ -425,12 +308,6 @@ def file_sha256(path: str | Path) -> str:
     """Return the SHA-256 of a file, in hexadecimal; of a folder, that of its files' hashes.
 
     That of an episode depends on the files of its dataset and on its number.
-
-    Args:
-        path: The file, the folder of a bag or a dataset, or an episode, as ``dataset/episode_3``.
-
-    Raises:
-        DataError: If it is a pipe or a device, whose content changes or does not end.
     """
     source = Path(path)
     if source.exists() and not source.is_file() and not source.is_dir():
@@ -450,17 +327,7 @@ def file_sha256(path: str | Path) -> str:
 
 
 def moved_file(path: Path, result: Path, hashes: Collection[str]) -> Path:
-    """Return an input of a result, also if the folder that has both was moved or renamed.
-
-    Args:
-        path: The path of the input when the result was written.
-        result: The file of the result.
-        hashes: Permitted SHA-256 of the input.
-
-    Returns:
-        The path if it exists; else that at the same place below a folder of the result, if its
-        SHA-256 is permitted; else the path.
-    """
+    """Return an input of a result, also if the folder that has both was moved or renamed."""
     try:
         check_path(path)
     except SettingsError:  # reported where it is read
@@ -486,10 +353,6 @@ def _sha256(path: Path, *_state: int) -> str:
 
 
 def source_entry(path: str) -> dict[str, Any]:
-    """Return the path of an input and the hash of its file, None for an input in memory.
-
-    Args:
-        path: The file; "" for an input in memory.
-    """
+    """Return the path of an input and the hash of its file, None for an input in memory."""
     is_file = bool(path) and log_exists(Path(path))
     return {"path": str(path), "sha256": file_sha256(path) if is_file else None}

@@ -5,19 +5,6 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
-__all__ = [
-    "Cause",
-    "Finding",
-    "by_severity",
-    "grouped",
-    "listed",
-    "log_finding",
-    "not_ignored",
-    "number_of",
-    "quoted",
-    "toml_key",
-]
-
 _SPREAD = 0.1  # of the numbers of a setting that is stated once for several findings
 _RANK = {"error": 0, "warning": 1, "note": 2}
 _NUMBER = r"(?<![\w.])[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?(?!\w|\.\w)"
@@ -70,45 +57,20 @@ class Cause:
 def log_finding(
     log: str, code: str, severity: str, message: str, part: str = "", /, **evidence: float
 ) -> Finding:
-    """Return a finding about a log.
-
-    Args:
-        log: Name of the log; the message is prefixed with it.
-        code: A fixed word for programs.
-        severity: "note", "warning" or "error".
-        message: The fault, the value found, the value expected, the remedy.
-        part: Joint, link or channel concerned; the whole log if empty.
-        evidence: The numbers it depends on, by name.
-
-    Returns:
-        The finding.
-    """
+    """Return a finding about a log."""
     where = f"{log}: {part}" if part else log
     figures = {name: float(value) for name, value in evidence.items()}
     return Finding(code, severity, where, f"{log}: {message}", figures)
 
 
 def not_ignored(findings: Iterable[Finding], ignore: Iterable[str]) -> tuple[Finding, ...]:
-    """Return the findings whose codes are not ignored.
-
-    Args:
-        findings: The findings.
-        ignore: The codes.
-    """
+    """Return the findings whose codes are not ignored."""
     ignored = set(ignore)
     return tuple(finding for finding in findings if finding.code not in ignored)
 
 
 def listed(names: Iterable[object], limit: int | None = None) -> str:
-    """Return names as text, "a, b and 12 more".
-
-    Args:
-        names: The names.
-        limit: Maximum number of names in the text; all if None.
-
-    Returns:
-        The names with commas; "none" if there is none.
-    """
+    """Return names as text, "a, b and 12 more"."""
     words = [str(name) for name in names]
     shown = words[:limit]
     more = f" and {len(words) - len(shown)} more" if len(words) > len(shown) else ""
@@ -116,46 +78,23 @@ def listed(names: Iterable[object], limit: int | None = None) -> str:
 
 
 def quoted(name: str) -> str:
-    """Return a name as text of a job file.
-
-    Args:
-        name: The name, as of a column.
-    """
+    """Return a name as text of a job file."""
     return json.dumps(name, ensure_ascii=False)
 
 
 def toml_key(name: str) -> str:
-    """Return a name as a key of a job file, in quotes if required.
-
-    Args:
-        name: The name, as of a joint.
-    """
+    """Return a name as a key of a job file, in quotes if required."""
     is_bare = re.fullmatch(r"[A-Za-z0-9_-]+", name) is not None
     return name if is_bare else json.dumps(name, ensure_ascii=False)
 
 
 def by_severity(findings: Iterable[Finding]) -> tuple[Finding, ...]:
-    """Return findings with the errors first, then warnings, then notes.
-
-    Args:
-        findings: The findings; the order within a severity is retained.
-
-    Returns:
-        The same, sorted.
-    """
+    """Return findings with the errors first, then warnings, then notes."""
     return tuple(sorted(findings, key=lambda finding: _RANK[finding.severity]))
 
 
 def grouped(findings: Iterable[Finding], joints: Sequence[str] = ()) -> tuple[Cause, ...]:
-    """Return findings by cause, by descending severity.
-
-    Args:
-        findings: The findings.
-        joints: Names of the robot's joints, in its order.
-
-    Returns:
-        One cause for each code.
-    """
+    """Return findings by cause, by descending severity."""
     by_code: dict[str, list[Finding]] = {}
     for finding in by_severity(findings):
         by_code.setdefault(finding.code, []).append(finding)
@@ -169,11 +108,7 @@ def grouped(findings: Iterable[Finding], joints: Sequence[str] = ()) -> tuple[Ca
 
 
 def number_of(causes: Iterable[Cause]) -> int:
-    """Return the number of findings; those with one common message count once.
-
-    Args:
-        causes: The causes.
-    """
+    """Return the number of findings; those with one common message count once."""
     return sum(len(cause.messages) for cause in causes)
 
 

@@ -7,8 +7,6 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-__all__ = ["caught_messages"]
-
 _ONE_AT_A_TIME = threading.Lock()
 _KINDS = ("Error:", "Warning:")  # first word of console_bridge's messages, which urdfdom uses
 _PLACE = "         at line "  # the second line of such a message: a line of urdfdom's source
@@ -19,9 +17,6 @@ def caught_messages() -> Iterator[list[str]]:
     """Catch the messages that urdfdom and Pinocchio print on file descriptor 2.
 
     Other output there is printed at the end of the block.
-
-    Yields:
-        The messages, complete at the end of the block.
     """
     messages: list[str] = []
     with _ONE_AT_A_TIME, tempfile.TemporaryFile() as caught:

@@ -14,25 +14,6 @@ from typing import Any, ClassVar, Self, TypeGuard, get_args, get_origin
 from robotid.base.exceptions import SettingsError
 from robotid.base.findings import listed
 
-__all__ = [
-    "NOT_NEGATIVE",
-    "POSITIVE",
-    "REQUIRED",
-    "SIZE",
-    "Entries",
-    "Key",
-    "Range",
-    "Settings",
-    "check_keys",
-    "is_number",
-    "require_each",
-    "require_flag",
-    "require_kind",
-    "setting",
-    "shown",
-    "table_in",
-]
-
 
 @dataclass(frozen=True)
 class Range:
@@ -52,17 +33,7 @@ class Entries:
 
 
 def require_kind(value: object, kind: type | tuple[type, ...], name: str, wanted: str) -> None:
-    """Refuse an argument of the wrong type.
-
-    Args:
-        value: The argument.
-        kind: Its permitted types.
-        name: Its name.
-        wanted: Description of the permitted types.
-
-    Raises:
-        SettingsError: If it has another type.
-    """
+    """Refuse an argument of the wrong type."""
     if not isinstance(value, kind):
         raise SettingsError(f"{name} is {shown(value)}, a {type(value).__name__}, wanted {wanted}")
 
@@ -70,17 +41,7 @@ def require_kind(value: object, kind: type | tuple[type, ...], name: str, wanted
 def require_each(
     values: object, kind: type | tuple[type, ...], name: str, wanted: str
 ) -> list[Any]:
-    """Return the entries of an argument that is a list, or refuse the argument.
-
-    Args:
-        values: The argument: a list, a tuple, a set or an array of one dimension.
-        kind: The permitted types of its entries.
-        name: Its name.
-        wanted: Description of the permitted types.
-
-    Raises:
-        SettingsError: If it has another type; text or a table is not a list.
-    """
+    """Return the entries of an argument that is a list, or refuse the argument."""
     is_list = isinstance(values, Collection) and not isinstance(values, str | bytes | Mapping)
     entries = list(values) if is_list and getattr(values, "ndim", 1) == 1 else [None]  # type: ignore[call-overload]
     if not all(isinstance(entry, kind) for entry in entries):
@@ -91,11 +52,7 @@ def require_each(
 
 
 def is_number(value: object) -> bool:
-    """Return whether a value is a finite number of Python or NumPy; a boolean is not.
-
-    Args:
-        value: The value.
-    """
+    """Return whether a value is a finite number of Python or NumPy; a boolean is not."""
     if not isinstance(value, Real) or isinstance(value, bool):
         return False
     try:
@@ -105,15 +62,7 @@ def is_number(value: object) -> bool:
 
 
 def require_flag(value: object, name: str) -> None:
-    """Refuse an argument that is not a boolean of Python or NumPy.
-
-    Args:
-        value: The argument.
-        name: Its name.
-
-    Raises:
-        SettingsError: If it has another type.
-    """
+    """Refuse an argument that is not a boolean of Python or NumPy."""
     if type(value).__name__ not in ("bool", "bool_"):
         require_kind(value, bool, name, "True or False")
 
@@ -147,13 +96,7 @@ class Key:
 
 
 def setting(default: Any, text: str, **about: Any) -> Any:  # noqa: ANN401
-    """Declare a setting, as a field of a ``Settings``.
-
-    Args:
-        default: Its default; MISSING if it is required.
-        text: Its meaning, with its unit.
-        about: The other attributes of ``Key``.
-    """
+    """Declare a setting, as a field of a ``Settings``."""
     metadata = {"key": Key(text, **about)}
     if isinstance(default, dict):
         return field(default_factory=default.copy, metadata=metadata)
@@ -231,12 +174,7 @@ class Settings:
 
 
 def table_in(table: dict[str, Any], names: Sequence[str]) -> dict[str, Any]:
-    """Return an inner table; it is created if it is missing.
-
-    Args:
-        table: The outermost table.
-        names: The path to the inner table.
-    """
+    """Return an inner table; it is created if it is missing."""
     for name in names:
         table = table.setdefault(name, {})
     return table
@@ -245,17 +183,7 @@ def table_in(table: dict[str, Any], names: Sequence[str]) -> dict[str, Any]:
 def check_keys(
     table: Mapping[str, Any], schema: Mapping[str, Any], where: str, section: str = ""
 ) -> None:
-    """Refuse keys that are not in the schema and values of the wrong type.
-
-    Args:
-        table: The table.
-        schema: The known keys, as of ``Settings.schema``.
-        where: Name of its source, for errors.
-        section: Path of the table with a dot at its end, for errors.
-
-    Raises:
-        SettingsError: If a key is unknown or missing, or its value has another type.
-    """
+    """Refuse keys that are not in the schema and values of the wrong type."""
     for key, value in table.items():
         at = f"{where}: {section}{key}"
         if key not in schema:
@@ -312,11 +240,7 @@ def _check_type(value: object, kinds: tuple[type, ...], at: str) -> None:
 
 
 def shown(value: object) -> str:
-    """Return a value as text of one line, for a message.
-
-    Args:
-        value: The value.
-    """
+    """Return a value as text of one line, for a message."""
     try:
         text = " ".join(repr(value).split())
     except ValueError:  # Python does not print integers of more than 4300 digits

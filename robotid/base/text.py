@@ -9,20 +9,6 @@ import textwrap
 from collections.abc import Sequence
 from typing import Any, TextIO
 
-__all__ = [
-    "arguments",
-    "columns",
-    "command_lines",
-    "in_digits_of",
-    "period",
-    "seconds",
-    "terminal_width",
-    "tinted",
-    "wrapped",
-    "yaml_name",
-    "yaml_plain",
-]
-
 _ARGUMENT = re.compile(r"(?:'[^'\n]*'|[^\s'])+")  # of a command, with its quotes
 _PATH = re.compile(r"'[^' ]*/[^'\n]*'")  # a quoted path, which may have blanks
 _UNIT = re.compile(r"(?<=\d) (?=%|(?:m?s|kg|N|m|Hz|rad)\b)")  # between a number and its unit
@@ -42,12 +28,6 @@ def tinted(text: str, word: str, tone: str, stream: TextIO) -> str:
     """Return text with the first occurrence of a word in colour, for a terminal with colours.
 
     The text is unchanged for other streams, or if the environment variable NO_COLOR is set.
-
-    Args:
-        text: The text.
-        word: The word.
-        tone: "good", "usable", "poor", "error" or "warning"; other tones have no colour.
-        stream: The stream of the text.
     """
     has_codes = "WT_SESSION" in os.environ if os.name == "nt" else os.getenv("TERM") != "dumb"
     if tone not in _TONES or os.environ.get("NO_COLOR") or not (has_codes and stream.isatty()):
@@ -56,13 +36,7 @@ def tinted(text: str, word: str, tone: str, stream: TextIO) -> str:
 
 
 def wrapped(text: str, width: int | None, indent: str = "") -> str:
-    """Return text in lines of at most a width; words, paths and numbers with units stay together.
-
-    Args:
-        text: The text; its line ends and their indentation are retained.
-        width: Characters per line; None for unlimited.
-        indent: Further indentation of continued lines, after the indentation of the first line.
-    """
+    """Return text in lines of at most a width; words, paths and numbers with units stay whole."""
     if width is None:
         return text
     lines = []
@@ -80,11 +54,7 @@ def wrapped(text: str, width: int | None, indent: str = "") -> str:
 
 
 def arguments(command: str) -> list[str]:
-    """Return the arguments of a command line as they are typed, quotes included.
-
-    Args:
-        command: The command, in a single line.
-    """
+    """Return the arguments of a command line as they are typed, quotes included."""
     return _ARGUMENT.findall(command)
 
 
@@ -92,10 +62,6 @@ def command_lines(command: str, width: int) -> list[str]:
     """Return a command in lines of at most a width, to paste into a shell.
 
     Each argument is in one line, however long; a line that continues ends with a backslash.
-
-    Args:
-        command: The command, in a single line.
-        width: Characters per line.
     """
     lines = [""]
     for argument in arguments(command):
@@ -114,16 +80,7 @@ def columns(
     needed: int | None = None,
     left: Sequence[int] = (0,),
 ) -> list[str]:
-    """Return the lines of a table, indented by two.
-
-    Args:
-        heads: Heads of the columns, all with the same number of lines.
-        rows: Cells.
-        width: Characters per line; None for unlimited.
-        needed: Number of columns that are always shown; all if None. A last line names the columns
-            that do not fit into ``width``.
-        left: Columns that are left-aligned.
-    """
+    """Return the lines of a table, indented by two."""
     table = [*zip(*(head.split("\n") for head in heads), strict=True), *rows]
     sizes = [max(map(len, column)) for column in zip(*table, strict=True)]
     count = len(heads)
@@ -145,16 +102,7 @@ def columns(
 
 
 def in_digits_of(value: float, error: float | None) -> tuple[str, str]:
-    """Return a value rounded to the second digit of its error, and the error.
-
-    Args:
-        value: The value.
-        error: Its standard error; without one the value has four digits.
-
-    Returns:
-        Both, with the same power of ten, as "8.562" and "0.023"; a dash without an error. A value
-        that is rounded to 0 has no power of ten: "0" and "1.2e-05".
-    """
+    """Return a value rounded to the second digit of its error, and the error."""
     if error is None or not (math.isfinite(error) and error > 0):
         return f"{value:.4g}", "-"
     error = float(f"{error:.1e}")  # 0.0996 rounds to 0.10, which moves the second digit
@@ -168,12 +116,7 @@ def in_digits_of(value: float, error: float | None) -> tuple[str, str]:
 
 
 def period(start: float, end: float) -> str:
-    """Return a range of time with its unit, in four digits and three of its length: "0-11.99 s".
-
-    Args:
-        start: Start [s].
-        end: End [s].
-    """
+    """Return a range of time with its unit, in four digits and three of its length: "0-11.99 s"."""
     sizes = ((3, max(abs(start), abs(end))), (2, end - start))  # digits after the first one [s]
     digits = max(
         (n - max(math.floor(math.log10(x)), 0) for n, x in sizes if 0 < x < math.inf), default=0
@@ -182,31 +125,18 @@ def period(start: float, end: float) -> str:
 
 
 def seconds(t: float, digits: int = 3) -> str:
-    """Return a time without exponent: of 0.0000050167 "0", of 1.7e9 + 0.25 "1700000000.25".
-
-    Args:
-        t: Time [s].
-        digits: Decimals.
-    """
+    """Return a time without exponent: of 0.0000050167 "0", of 1.7e9 + 0.25 "1700000000.25"."""
     return f"{round(float(t), max(digits, 0)) + 0.0:.15g}"
 
 
 def yaml_name(text: str) -> str:
-    """Return a name for YAML in one line, quoted unless it is a plain word.
-
-    Args:
-        text: The name.
-    """
+    """Return a name for YAML in one line, quoted unless it is a plain word."""
     is_plain = text.isascii() and text.isidentifier() and text.lower() not in _YAML_WORDS
     return text if is_plain else yaml_plain(text)
 
 
 def yaml_plain(entry: Any) -> str:  # noqa: ANN401
-    """Return a plain value for YAML; characters that end a line of YAML are escaped.
-
-    Args:
-        entry: Text, which is quoted, a number, a boolean or None.
-    """
+    """Return a plain value for YAML; characters that end a line of YAML are escaped."""
     text = json.dumps(entry, ensure_ascii=False)
     return "".join(c if c.isprintable() else _escaped(c) for c in text)
 

@@ -3,8 +3,6 @@
 import platform
 from functools import cache
 
-__all__ = ["__version__", "code_versions", "versions"]
-
 __version__ = "0.2.0"
 
 _PACKAGES = {
@@ -17,12 +15,7 @@ _PACKAGES = {
 
 
 def code_versions() -> dict[str, str]:
-    """Return the versions that determine results to the last bit.
-
-    Returns:
-        Versions of this package, of its numerical packages and of Python, by name; "not installed
-        by pip" if no package of that name is recorded.
-    """
+    """Return the versions that determine results to the last bit."""
     found = {name: _installed(package) for name, package in _PACKAGES.items()}
     return {"robotid": __version__, **found, "python": platform.python_version()}
 

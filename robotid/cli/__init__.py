@@ -43,15 +43,7 @@ COMMANDS = (
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line.
-
-    Args:
-        arguments: The words after ``robotid``; those of the process if None.
-
-    Returns:
-        Exit code: 0 success; 1 the data or the model do not allow the command, or the doctor found
-        an error that is not ignored; 2 wrong usage; 129 SIGHUP; 130 Ctrl-C; 143 SIGTERM.
-    """
+    """Run the command line."""
     code = 0
     gc.set_threshold(_OBJECTS)
     atexit.register(gc.freeze)  # no search for cycles in all that the end of the process frees

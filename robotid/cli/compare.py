@@ -11,18 +11,12 @@ from robotid.cli.flags import add_json, add_verbose
 from robotid.cli.printing import echo, window_name
 from robotid.cli.running import show_found
 
-__all__ = ["SUMMARY", "add_flags", "run"]
-
 SUMMARY = "compare several results"
 _SHOWN = 12  # base parameters in the table, so that two results fit a screen
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
-    """Add the flags of the command.
-
-    Args:
-        parser: Its parser.
-    """
+    """Add the flags of the command."""
     add = parser.add_argument
     add("results", nargs="+", metavar="RESULT.json")
     add("--out", metavar="FILE.html", help="page to write")
@@ -31,11 +25,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Run the command.
-
-    Args:
-        options: Its flags.
-    """
+    """Run the command."""
     from robotid.output.report.comparison import compare_results, write_comparison
 
     if options.out:

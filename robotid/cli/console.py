@@ -20,17 +20,6 @@ if TYPE_CHECKING:
 
     from robotid.base.typing import ProgressCallback
 
-__all__ = [
-    "Terminated",
-    "closed_output_ignored",
-    "open_closed_streams",
-    "print_error",
-    "shown_log",
-    "terminal_progress",
-    "terminations_raised",
-]
-
-
 _LAST_STREAM = 2  # the number of the standard error stream
 _ENDS = tuple(getattr(signal, n) for n in ("SIGTERM", "SIGHUP") if hasattr(signal, n))
 
@@ -101,11 +90,7 @@ def terminations_raised() -> Iterator[None]:
 
 @contextmanager
 def closed_output_ignored() -> Iterator[None]:
-    """Discard further output if the reader of the standard output has closed it, as ``| head``.
-
-    Raises:
-        OSError: If the standard output is not writable for another reason, as a full disk.
-    """
+    """Discard further output if the reader of the standard output has closed it, as ``| head``."""
     try:
         try:
             yield
@@ -119,12 +104,7 @@ def closed_output_ignored() -> Iterator[None]:
 
 
 def print_error(error: BaseException, words: str = "") -> None:
-    """Print an error on the standard error stream, with its notes.
-
-    Args:
-        error: The error.
-        words: Its text, if the message of the error is not to be used.
-    """
+    """Print an error on the standard error stream, with its notes."""
     notes = getattr(error, "__notes__", ())
     separator = "; " if words else "\n  "
     text = f"robotid: {separator.join([words or str(error), *notes])}"
@@ -136,11 +116,7 @@ def print_error(error: BaseException, words: str = "") -> None:
 
 @contextmanager
 def shown_log(*, is_verbose: bool) -> Iterator[None]:
-    """Show warnings of the logger "robotid" on the standard error stream in the context.
-
-    Args:
-        is_verbose: Whether to show messages of the level "info", too.
-    """
+    """Show warnings of the logger "robotid" on the standard error stream in the context."""
     logger, handler = logging.getLogger("robotid"), _EachOnce()
     level = logger.level
     logger.addHandler(handler)
@@ -175,17 +151,7 @@ class _EachOnce(logging.Handler):
 def terminal_progress(
     *, quiet: bool = False, force: bool = False, is_verbose: bool = False
 ) -> "Iterator[ProgressCallback | None]":
-    """Show progress on the standard error stream in the context, if it is a terminal.
-
-    Args:
-        quiet: Show no progress on a terminal either, as with JSON output.
-        force: Show progress in any case.
-        is_verbose: Whether to print a line per stage where there is no terminal.
-
-    Yields:
-        A function of the name of the work, the units done, the total units and their name; None if
-        nothing is shown. A new name starts a new bar. "stages" remain, with their parts below.
-    """
+    """Show progress on the standard error stream in the context, if it is a terminal."""
     if force or not (quiet or not sys.stderr.isatty()):
         with _bars(force=force) as show:
             yield show

@@ -7,17 +7,11 @@ from robotid.cli.flags import JOB, SOURCE, add_json
 from robotid.cli.printing import echo
 from robotid.cli.running import show_found
 
-__all__ = ["SUMMARY", "add_flags", "run"]
-
 SUMMARY = "write a log as CSV, Parquet, NPZ, HDF5 or MAT, with standard column names"
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
-    """Add the flags of the command.
-
-    Args:
-        parser: Its parser.
-    """
+    """Add the flags of the command."""
     add = parser.add_argument
     add("log", metavar="IN", help="log of any format, or the folder of a bag")
     add("out", metavar="OUT", help="file to write; its suffix determines the format")
@@ -28,11 +22,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Run the command.
-
-    Args:
-        options: Its flags.
-    """
+    """Run the command."""
     from dataclasses import asdict
 
     from robotid.cli.work.convert import convert
@@ -46,11 +36,7 @@ def run(options: argparse.Namespace) -> None:
 
 
 def source_settings(options: argparse.Namespace) -> dict[str, Any]:
-    """Return the settings of a ``LogSource`` that the flags state, by name.
-
-    Args:
-        options: The flags of the command "convert".
-    """
+    """Return the settings of a ``LogSource`` that the flags state, by name."""
     return dict(JOB.stated(options, SOURCE).get("log", {}))
 
 

@@ -7,26 +7,16 @@ from robotid.cli.flags import add_out
 from robotid.cli.identify import show_result
 from robotid.cli.printing import echo, print_files
 
-__all__ = ["SUMMARY", "add_flags", "run"]
-
 SUMMARY = "simulate a Unitree Z1 arm, identify it and write a report; no input is needed"
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
-    """Add the flags of the command.
-
-    Args:
-        parser: Its parser.
-    """
+    """Add the flags of the command."""
     add_out(parser, "robotid-demo")
 
 
 def run(options: argparse.Namespace) -> None:
-    """Run the command.
-
-    Args:
-        options: Its flags.
-    """
+    """Run the command."""
     from robotid.cli.work.demo import run_demo
 
     echo("simulating a Unitree Z1 arm whose masses, armature and friction differ from its URDF ...")

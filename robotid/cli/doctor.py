@@ -10,26 +10,16 @@ from robotid.cli.flags import add_job, job_from_flags
 from robotid.cli.printing import as_finding, echo, print_causes
 from robotid.cli.running import progress_of, show_found
 
-__all__ = ["SUMMARY", "add_flags", "run", "show"]
-
 SUMMARY = "check logs for faults: JOB.toml, or URDF LOG ..."
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
-    """Add the flags of the command.
-
-    Args:
-        parser: Its parser.
-    """
+    """Add the flags of the command."""
     add_job(parser)
 
 
 def run(options: argparse.Namespace) -> int:
-    """Run the command.
-
-    Args:
-        options: Its flags.
-    """
+    """Run the command."""
     from robotid.cli.work.logs import examine
     from robotid.diagnosis.logs.check_logs import findings_to_dict
     from robotid.diagnosis.verdict.verdict import blocking
@@ -45,13 +35,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def show(content: dict[str, Any], *, is_verbose: bool, logs: int) -> None:
-    """Print the findings of the doctor, or that there is no fault.
-
-    Args:
-        content: Findings and joints, as ``--json`` prints them.
-        is_verbose: Whether to print notes, too.
-        logs: Number of examined logs.
-    """
+    """Print the findings of the doctor, or that there is no fault."""
     findings, joints = content["findings"], content["joints"]
     worst = _worst_of(findings, joints)
     print_causes(findings, joints, is_verbose=is_verbose, worst=worst, none="")

@@ -17,8 +17,6 @@ if TYPE_CHECKING:
     from robotid.design.excitation_settings import MotionSettings
 
 
-__all__ = ["EXAMPLES", "MAIN_FLAGS", "SUMMARY", "add_flags", "run"]
-
 SUMMARY = "design an excitation trajectory within the robot's limits"
 MAIN_FLAGS = (
     "--out", "--report", "--given", "--kind", "--link", "--mass", "--duration", "--share",
@@ -31,11 +29,7 @@ EXAMPLES = (
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
-    """Add the flags of the command.
-
-    Args:
-        parser: Its parser.
-    """
+    """Add the flags of the command."""
     add = parser.add_argument
     add("source", metavar="JOB.toml | URDF")
     words = "motion to write: .csv, .parquet, .yaml (ROS 2 JointTrajectory) or .script (UR)"
@@ -52,11 +46,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Run the command.
-
-    Args:
-        options: Its flags.
-    """
+    """Run the command."""
     from robotid.cli.work.excite import design_motion
 
     options.logs = []
@@ -73,14 +63,7 @@ def run(options: argparse.Namespace) -> None:
 
 
 def motion_settings(options: argparse.Namespace) -> "MotionSettings":
-    """Return the settings of the motion.
-
-    Args:
-        options: The flags of the command "excite".
-
-    Raises:
-        SettingsError: If a flag is not usable.
-    """
+    """Return the settings of the motion."""
     from robotid.design.excitation_settings import MotionSettings
 
     if options.com is not None and not options.mass:
@@ -97,11 +80,7 @@ def _numbers(word: str) -> tuple[float, ...]:
 
 
 def _boxes(words: Sequence[str], flag: str) -> tuple["Box", ...]:
-    """Return boxes that are stated as NAME=x0,y0,z0,x1,y1,z1, two corners [m].
-
-    Raises:
-        SettingsError: If a word has another form.
-    """
+    """Return boxes that are stated as NAME=x0,y0,z0,x1,y1,z1, two corners [m]."""
     from robotid.design.clearance import Box
     from robotid.design.excitation_settings import FARTHEST
 

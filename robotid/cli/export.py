@@ -9,17 +9,11 @@ from robotid.cli.printing import echo
 from robotid.cli.running import show_found
 from robotid.output.files.export_formats import FORMATS, options_of
 
-__all__ = ["SUMMARY", "add_flags", "run"]
-
 SUMMARY = f"write a result for other programs: {', '.join(FORMATS)}"
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
-    """Add the flags of the command.
-
-    Args:
-        parser: Its parser.
-    """
+    """Add the flags of the command."""
     add = parser.add_argument
     add("result", metavar="RESULT", help="result.json or its folder")
     words = {kind: form.words for kind, form in FORMATS.items()}
@@ -41,11 +35,7 @@ def _by_format(words: Mapping[str, str]) -> str:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Run the command.
-
-    Args:
-        options: Its flags.
-    """
+    """Run the command."""
     from robotid.cli.work.export import export_result
 
     chosen = {name: getattr(options, name) for name in options_of(FORMATS)}

@@ -14,37 +14,8 @@ if TYPE_CHECKING:
     from robotid.cli.work.job import Job
 
 
-__all__ = [
-    "FIT",
-    "JOB",
-    "LOG",
-    "MOTION",
-    "ONLINE",
-    "OUTPUT",
-    "ROBOT",
-    "SOURCE",
-    "Flags",
-    "add_job",
-    "add_json",
-    "add_out",
-    "add_progress",
-    "add_robot_and_log",
-    "add_serve",
-    "add_verbose",
-    "job_from_flags",
-    "pairs",
-    "refuse_log_flags",
-    "source_words",
-]
-
-
 def pairs(words: Sequence[str], flag: str) -> dict[str, float]:
-    """Return numbers by joint.
-
-    Args:
-        words: Words like JOINT=NUMBER.
-        flag: The flag, for errors.
-    """
+    """Return numbers by joint."""
     found = {}
     for name, number in _once(words, flag).items():
         try:
@@ -117,12 +88,7 @@ class Flags:
     read: Mapping[str, Callable[[Any, str], Any]] = field(default_factory=dict)
 
     def add(self, parser: "argparse._ActionsContainer", wanted: Sequence[str] = ()) -> None:
-        """Add flags.
-
-        Args:
-            parser: The parser, or a group of it.
-            wanted: Which flags; all if none is named.
-        """
+        """Add flags."""
         settings = self.defaults()
         schema, about, values = settings.schema(), settings.paths(), settings.to_dict()
         for flag in wanted or self.keys:
@@ -144,23 +110,11 @@ class Flags:
             parser.add_argument(flag, help=words.replace("%", "%%"), **about_flag)
 
     def given(self, options: argparse.Namespace) -> list[str]:
-        """Return the flags that are given.
-
-        Args:
-            options: The flags of the command; it may lack some of these.
-        """
+        """Return the flags that are given."""
         return [flag for flag in self.keys if getattr(options, _name(flag), None) is not None]
 
     def stated(self, options: argparse.Namespace, wanted: Sequence[str] = ()) -> dict[str, Any]:
-        """Return the settings that flags state, as a table of a job file.
-
-        Args:
-            options: The flags of the command; it may lack some of these.
-            wanted: Which flags; all if none is named.
-
-        Raises:
-            SettingsError: If a value has the wrong type.
-        """
+        """Return the settings that flags state, as a table of a job file."""
         schema, table = self.defaults().schema(), dict[str, Any]()
         for flag in self.given(options):
             if wanted and flag not in wanted:
@@ -273,63 +227,35 @@ _VERBOSE = "print notes, too; print stages and choices with their reasons on std
 
 
 def add_out(parser: argparse.ArgumentParser, folder: str) -> None:
-    """Add the folder to write to.
-
-    Args:
-        parser: The parser.
-        folder: The default.
-    """
+    """Add the folder to write to."""
     words = f"folder to write to; default: {folder}"
     parser.add_argument("--out", default=folder, metavar="DIR", help=words)
 
 
 def add_json(parser: argparse.ArgumentParser, what: str = "one JSON object") -> None:
-    """Add the flag for JSON output.
-
-    Args:
-        parser: The parser.
-        what: The content of the output.
-    """
+    """Add the flag for JSON output."""
     parser.add_argument("--json", action="store_true", help=f"print {what}")
 
 
 def add_verbose(parser: argparse.ArgumentParser, words: str = _VERBOSE) -> None:
-    """Add the flag for more output.
-
-    Args:
-        parser: The parser.
-        words: Its help.
-    """
+    """Add the flag for more output."""
     parser.add_argument("--verbose", action="store_true", help=words)
 
 
 def add_progress(parser: argparse.ArgumentParser) -> None:
-    """Add the flag for progress in any case.
-
-    Args:
-        parser: The parser.
-    """
+    """Add the flag for progress in any case."""
     words = "show progress on stderr even if it is no terminal, or with --json"
     parser.add_argument("--progress", action="store_true", help=words)
 
 
 def add_robot_and_log(parser: argparse.ArgumentParser) -> None:
-    """Add a URDF and one log.
-
-    Args:
-        parser: The parser.
-    """
+    """Add a URDF and one log."""
     parser.add_argument("source", metavar="URDF")
     parser.add_argument("logs", nargs=1, metavar="LOG")
 
 
 def add_serve(parser: argparse.ArgumentParser, words: str) -> None:
-    """Add the flags of a live page.
-
-    Args:
-        parser: The parser.
-        words: The help of ``--serve``.
-    """
+    """Add the flags of a live page."""
     parser.add_argument("--serve", nargs="?", const=0, type=int, metavar="PORT", help=words)
     speed = "speed of --serve, relative to real time; 0: as fast as possible; default: 1"
     parser.add_argument("--speed", type=float, default=1.0, metavar="X", help=speed)
@@ -338,13 +264,7 @@ def add_serve(parser: argparse.ArgumentParser, words: str) -> None:
 def add_job(
     parser: argparse.ArgumentParser, json_: str = "one JSON object", output: Sequence[str] = ()
 ) -> None:
-    """Add a job file, or the flags in place of one.
-
-    Args:
-        parser: The parser.
-        json_: The content of the output of ``--json``.
-        output: Flags of the files to write.
-    """
+    """Add a job file, or the flags in place of one."""
     parser.add_argument("source", metavar="JOB.toml | URDF")
     parser.add_argument("logs", nargs="*", metavar="LOG", help="logs to fit")
     add_json(parser, json_)
@@ -356,15 +276,7 @@ def add_job(
 
 
 def job_from_flags(options: argparse.Namespace, *, needs_logs: bool = True) -> "Job":
-    """Return the job that a command line names or states.
-
-    Args:
-        options: The flags of the command.
-        needs_logs: Whether at least one log is required.
-
-    Raises:
-        SettingsError: If a job file is given with flags, or a flag is not usable.
-    """
+    """Return the job that a command line names or states."""
     from robotid.cli.work.job import job_from_settings, read_job
 
     if Path(options.source).suffix == ".toml":
@@ -391,14 +303,7 @@ def job_from_flags(options: argparse.Namespace, *, needs_logs: bool = True) -> "
 
 
 def source_words(words: Sequence[str]) -> tuple[str, ...]:
-    """Return the words of a command line that determine the identification.
-
-    Args:
-        words: The words after ``robotid``.
-
-    Returns:
-        The words after the name of the command, without ``--out`` and flags of the output.
-    """
+    """Return the words of a command line that determine the identification."""
     _, *rest = words
     source, shown = list[str](), ("--json", "--progress", "--verbose")
     for before, word in zip(words, rest, strict=False):
@@ -408,15 +313,7 @@ def source_words(words: Sequence[str]) -> tuple[str, ...]:
 
 
 def refuse_log_flags(options: argparse.Namespace, why: str) -> None:
-    """Refuse the flags of the reading of logs.
-
-    Args:
-        options: The flags of the command.
-        why: The reason, which states what is used in their place.
-
-    Raises:
-        SettingsError: If one is given.
-    """
+    """Refuse the flags of the reading of logs."""
     if given := _given(options):
         raise SettingsError(f"{why}; remove {listed(given)}")
 

@@ -8,18 +8,12 @@ from robotid.cli.flags import add_json, add_out, add_progress
 from robotid.cli.printing import echo
 from robotid.cli.running import progress_of, show_found
 
-__all__ = ["SUMMARY", "add_flags", "run"]
-
 SUMMARY = "identify many robots from a table of units and logs"
 _SHOWN = 10  # failures and units that differ
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
-    """Add the flags of the command.
-
-    Args:
-        parser: Its parser.
-    """
+    """Add the flags of the command."""
     add = parser.add_argument
     words = "table, .csv or .parquet, with columns unit, log, and optionally urdf, payload, job"
     add("table", metavar="TABLE", help=words)
@@ -39,11 +33,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Run the command.
-
-    Args:
-        options: Its flags.
-    """
+    """Run the command."""
     with progress_of(options) as progress:
         from robotid.cli.work.fleet import read_fleet, run_fleet
         from robotid.dynamics.factors import available_cores

@@ -17,8 +17,6 @@ from robotid.cli.printing import (
 )
 from robotid.cli.running import progress_of, show_found
 
-__all__ = ["EXAMPLES", "MAIN_FLAGS", "SUMMARY", "add_flags", "run", "show_result"]
-
 SUMMARY = "identify a robot: JOB.toml, or URDF LOG [LOG ...]"
 MAIN_FLAGS = (
     "--validate", "--out", "--estimator", "--friction", "--gain", "--joints", "--lock", "--cutoff",
@@ -31,11 +29,7 @@ EXAMPLES = (
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
-    """Add the flags of the command.
-
-    Args:
-        parser: Its parser.
-    """
+    """Add the flags of the command."""
     add_job(parser, "result.json", OUTPUT)
     add_out(parser, "robotid-out")
     _add_work(parser)
@@ -43,11 +37,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Run the command.
-
-    Args:
-        options: Its flags.
-    """
+    """Run the command."""
     from robotid.base.typing import report_stage
 
     with progress_of(options) as progress:
@@ -80,12 +70,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def show_result(result: dict[str, Any], *, is_verbose: bool = False) -> None:
-    """Print an identification.
-
-    Args:
-        result: The content of result.json.
-        is_verbose: Whether to print notes, too.
-    """
+    """Print an identification."""
     from robotid.identification.summary import error_lines
 
     width, wls = terminal_width(), result.get("wls")

@@ -10,17 +10,11 @@ from robotid.cli.flags import add_json, add_verbose
 from robotid.cli.printing import echo, print_causes
 from robotid.cli.running import show_found
 
-__all__ = ["SUMMARY", "add_flags", "run"]
-
 SUMMARY = "list joints, parameters and faults of a URDF"
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
-    """Add the flags of the command.
-
-    Args:
-        parser: Its parser.
-    """
+    """Add the flags of the command."""
     add = parser.add_argument
     add("urdf", metavar="URDF")
     add("--free-flyer", action="store_true", help="floating base")
@@ -30,11 +24,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Run the command.
-
-    Args:
-        options: Its flags.
-    """
+    """Run the command."""
     from robotid.base.exceptions import ModelError
     from robotid.diagnosis.urdf.inspection import inspect_urdf
 

@@ -6,17 +6,11 @@ from typing import Any
 from robotid.cli.flags import add_json, add_out, add_progress
 from robotid.cli.running import progress_of, show_found
 
-__all__ = ["SUMMARY", "add_flags", "run"]
-
 SUMMARY = "repeat the simulation of the paper: figures, tables, numbers"
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
-    """Add the flags of the command.
-
-    Args:
-        parser: Its parser.
-    """
+    """Add the flags of the command."""
     add = parser.add_argument
     add_out(parser, "robotid-paper")
     add_json(parser, "paper.json")
@@ -25,11 +19,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Run the command.
-
-    Args:
-        options: Its flags.
-    """
+    """Run the command."""
     from robotid.paper.run import run_paper
     from robotid.paper.study import PaperSettings
 

@@ -5,8 +5,6 @@ import difflib
 from collections.abc import Sequence
 from typing import Any, NoReturn
 
-__all__ = ["CommandParser"]
-
 
 class CommandParser(argparse.ArgumentParser):
     """A parser that suggests the nearest choice, and whose help may show its main flags only.
@@ -27,24 +25,14 @@ class CommandParser(argparse.ArgumentParser):
             self.register("action", name, _StoreOnce)
 
     def shorten_help(self, main_flags: Sequence[str], examples: Sequence[str]) -> None:
-        """Show only the main flags and examples by ``--help``, and all flags by ``--help-all``.
-
-        Args:
-            main_flags: The main flags.
-            examples: Command lines.
-        """
+        """Show only the main flags and examples by ``--help``, and all flags by ``--help-all``."""
         self.main_flags, self.examples = main_flags, examples
         self.add_argument("--help-all", action=_HelpAll, help="show all flags and exit")
 
     def parse_known_args(  # type: ignore[override]
         self, args: Sequence[str] | None = None, namespace: argparse.Namespace | None = None
     ) -> tuple[argparse.Namespace, list[str]]:
-        """Parse words; refuse a flag that a command does not have, with the nearest flag.
-
-        Args:
-            args: The words.
-            namespace: Where values are stored.
-        """
+        """Parse words; refuse a flag that a command does not have, with the nearest flag."""
         found, unknown = super().parse_known_args(args, namespace)
         flags = [word.partition("=")[0] for word in unknown if word.startswith("--")]
         if flags and self._subparsers is None:
@@ -60,11 +48,7 @@ class CommandParser(argparse.ArgumentParser):
         return found, unknown
 
     def error(self, message: str) -> NoReturn:
-        """Print the arguments and a message, and exit with code 2.
-
-        Args:
-            message: The message.
-        """
+        """Print the arguments and a message, and exit with code 2."""
         self.exit(2, f"{self._usage()}{self.prog}: error: {message}\n")
 
     def format_usage(self) -> str:

@@ -10,17 +10,11 @@ from robotid.cli.flags import JOB, LOG, add_json, job_from_flags, refuse_log_fla
 from robotid.cli.printing import echo
 from robotid.cli.running import progress_of, show_found
 
-__all__ = ["SUMMARY", "add_flags", "run"]
-
 SUMMARY = "identify a payload from a log with it and a log without it"
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
-    """Add the flags of the command.
-
-    Args:
-        parser: Its parser.
-    """
+    """Add the flags of the command."""
     add = parser.add_argument
     add("source", metavar="URDF")
     add("logs", nargs="+", metavar="LOG", help="logs with the payload")
@@ -39,11 +33,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Run the command.
-
-    Args:
-        options: Its flags.
-    """
+    """Run the command."""
     from robotid.cli.work.payload import is_result, measure_payload
 
     if any(map(is_result, options.reference)):

@@ -19,18 +19,12 @@ from robotid.cli.flags import (
 from robotid.cli.printing import echo, recordings_of
 from robotid.cli.running import show_found
 
-__all__ = ["SUMMARY", "add_flags", "run"]
-
 SUMMARY = "compute the expected standard errors of a motion before it is recorded"
 _TERM = re.compile(r" [+-] ")  # the sign before each further term of an expression
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
-    """Add the flags of the command.
-
-    Args:
-        parser: Its parser.
-    """
+    """Add the flags of the command."""
     add = parser.add_argument
     add("source", metavar="JOB.toml | URDF")
     add("logs", nargs="*", metavar="MOTION", help="motions or logs; only positions are read")
@@ -49,11 +43,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Run the command.
-
-    Args:
-        options: Its flags.
-    """
+    """Run the command."""
     from robotid.cli.work.preview import preview_job
 
     if options.given:
@@ -67,14 +57,7 @@ def run(options: argparse.Namespace) -> None:
 
 
 def stated_noise(options: argparse.Namespace) -> dict[str, float]:
-    """Return the noise that the flags state, by joint [N m or N].
-
-    Args:
-        options: The flags of the command "preview".
-
-    Raises:
-        SettingsError: If a word is not JOINT=NUMBER.
-    """
+    """Return the noise that the flags state, by joint [N m or N]."""
     return pairs(options.noise, "--noise")
 
 

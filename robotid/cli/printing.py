@@ -12,49 +12,20 @@ if TYPE_CHECKING:
     from robotid.output.report.steps import Step
 
 
-__all__ = [
-    "as_finding",
-    "echo",
-    "print_block",
-    "print_causes",
-    "print_files",
-    "print_steps",
-    "print_verdict",
-    "recordings_of",
-    "window_name",
-]
-
-
 def echo(text: str, indent: str = "", tone: str = "") -> None:
-    """Print text in lines that fit the terminal.
-
-    Args:
-        text: The text.
-        indent: Indentation of continued lines.
-        tone: A word of the text to be coloured, as "error", on a terminal with colours, unless the
-            environment variable NO_COLOR is set.
-    """
+    """Print text in lines that fit the terminal."""
     print(tinted(wrapped(text, terminal_width(), indent), tone, tone, sys.stdout))
 
 
 def print_files(folder: str, names: Sequence[str]) -> None:
-    """Print the files that were written, one per line.
-
-    Args:
-        folder: Their folder.
-        names: Their names.
-    """
+    """Print the files that were written, one per line."""
     print("\nwritten:")
     for name in names:
         print(f"  {Path(folder) / name}")
 
 
 def print_steps(steps: "Sequence[Step]") -> None:
-    """Print the next steps, each with its commands on separate lines, for copying.
-
-    Args:
-        steps: The steps.
-    """
+    """Print the next steps, each with its commands on separate lines, for copying."""
     print("\nnext steps:")
     for number, step in enumerate(steps, start=1):
         echo(f"  {number}. {step.words}", "   ")
@@ -66,11 +37,7 @@ def print_steps(steps: "Sequence[Step]") -> None:
 
 
 def print_block(*lines: str) -> None:
-    """Print lines after an empty line.
-
-    Args:
-        lines: The lines.
-    """
+    """Print lines after an empty line."""
     print("\n" + "\n".join(lines))
 
 
@@ -83,16 +50,7 @@ def print_causes(
     printed: Sequence[str] = (),
     none: str = "no findings",
 ) -> None:
-    """Print findings by cause, then their number.
-
-    Args:
-        findings: Findings with code, severity, message and where, as in JSON.
-        joints: Names of joints or links that findings may concern.
-        is_verbose: Whether notes are printed.
-        worst: The worst joint, with its figure.
-        printed: Messages that are printed elsewhere.
-        none: The text if there is no finding; no line if it is empty.
-    """
+    """Print findings by cause, then their number."""
     every = [Finding(**as_finding(f)) for f in findings]
     shown = [f for f in every if is_verbose or f.severity != "note"]
     causes, others = grouped(shown, joints), grouped([f for f in every if f not in shown], joints)
@@ -110,11 +68,7 @@ def print_causes(
 
 
 def as_finding(found: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the attributes of a ``Finding`` from a finding in JSON.
-
-    Args:
-        found: The finding; it may have further keys.
-    """
+    """Return the attributes of a ``Finding`` from a finding in JSON."""
     return {key: found[key] for key in ("code", "severity", "where", "message")}
 
 
@@ -123,12 +77,7 @@ def _some(count: int, what: str) -> str:
 
 
 def recordings_of(inputs: Sequence[Mapping[str, Any]], role: str) -> list[str]:
-    """Return the file of each recording of a role, with its path if names occur more than once.
-
-    Args:
-        inputs: Inputs, as in result.json.
-        role: The role.
-    """
+    """Return the file of each recording of a role, with its path if names occur more than once."""
     paths = {Path(entry["path"]) for entry in inputs}
     names = [path.name for path in paths]
     files = {str(path): path.name if names.count(path.name) == 1 else str(path) for path in paths}
@@ -140,21 +89,12 @@ def recordings_of(inputs: Sequence[Mapping[str, Any]], role: str) -> list[str]:
 
 
 def window_name(name: str, entry: Mapping[str, Any]) -> str:
-    """Return the name of a recording with its window of the log.
-
-    Args:
-        name: The name.
-        entry: Its start and end [s].
-    """
+    """Return the name of a recording with its window of the log."""
     return f"{name} {period(entry['start'], entry['end'])}"
 
 
 def print_verdict(verdict: Mapping[str, Any]) -> None:
-    """Print a verdict.
-
-    Args:
-        verdict: Status, reasons and joints, as in result.json.
-    """
+    """Print a verdict."""
     from robotid.identification.summary import verdict_lines
 
     first, *others = verdict_lines(verdict)

@@ -15,17 +15,11 @@ from robotid.cli.flags import (
 )
 from robotid.cli.running import serve
 
-__all__ = ["SUMMARY", "add_flags", "run"]
-
 SUMMARY = "play a log in the browser: robot, torques, identified parameters"
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
-    """Add the flags of the command.
-
-    Args:
-        parser: Its parser.
-    """
+    """Add the flags of the command."""
     add = parser.add_argument
     add_robot_and_log(parser)
     results = "result.json, track.json or their folder"
@@ -38,11 +32,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Run the command.
-
-    Args:
-        options: Its flags.
-    """
+    """Run the command."""
     from robotid.cli.work.replay import read_findings, replay_files, stated_job
 
     findings = read_findings(options.results)

@@ -6,17 +6,11 @@ from typing import Any
 from robotid.cli.flags import add_json, add_progress, add_verbose
 from robotid.cli.running import progress_of, show_found
 
-__all__ = ["SUMMARY", "add_flags", "run"]
-
 SUMMARY = "write the report of a result again from its inputs"
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
-    """Add the flags of the command.
-
-    Args:
-        parser: Its parser.
-    """
+    """Add the flags of the command."""
     add = parser.add_argument
     add("result", metavar="RESULT", help="result.json or its folder")
     add("--out", metavar="FILE", help="page to write; default: report.html in the folder of RESULT")
@@ -26,11 +20,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Run the command.
-
-    Args:
-        options: Its flags.
-    """
+    """Run the command."""
     from robotid.base.typing import report_stage
 
     with progress_of(options) as progress:

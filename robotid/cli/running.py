@@ -15,15 +15,9 @@ if TYPE_CHECKING:
     from robotid.base.typing import ProgressCallback
     from robotid.cli.work.job import Job
 
-__all__ = ["progress_of", "serve", "show_found"]
-
 
 def progress_of(options: argparse.Namespace) -> "AbstractContextManager[ProgressCallback | None]":
-    """Return the progress display that the flags of a command select.
-
-    Args:
-        options: The flags.
-    """
+    """Return the progress display that the flags of a command select."""
     return terminal_progress(
         quiet=options.json,
         force=getattr(options, "progress", False),
@@ -37,14 +31,7 @@ def show_found(
     show: Callable[[dict[str, Any]], None],
     files: Sequence[str] = (),
 ) -> None:
-    """Print the result of a command and the files that it wrote, or the JSON alone.
-
-    Args:
-        content: The result.
-        options: The flags of the command.
-        show: Prints the result as text.
-        files: Names of the files in the folder ``--out``.
-    """
+    """Print the result of a command and the files that it wrote, or the JSON alone."""
     with closed_output_ignored():
         if options.json:
             print(json.dumps(content, allow_nan=False))
@@ -60,14 +47,7 @@ def serve(
     options: argparse.Namespace,
     finished: Callable[[dict[str, Any]], None],
 ) -> None:
-    """Show a log in the browser while an estimator runs over it, until it is interrupted.
-
-    Args:
-        job: The robot and its log.
-        folder: Folder of the results; None: nothing is written.
-        options: The flags of the command.
-        finished: Called with the result at the end of the log.
-    """
+    """Show a log in the browser while an estimator runs over it, until it is interrupted."""
     from robotid.cli.work.track import serve_track
 
     def announce(url: str) -> None:

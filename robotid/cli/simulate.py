@@ -17,8 +17,6 @@ if TYPE_CHECKING:
     from robotid.dynamics.simulation.simulation_settings import Simulation
 
 
-__all__ = ["SUMMARY", "add_flags", "run"]
-
 SUMMARY = "simulate a log of a motion with a robot of known parameters"
 
 
@@ -48,11 +46,7 @@ _PLANT = Flags(
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
-    """Add the flags of the command.
-
-    Args:
-        parser: Its parser.
-    """
+    """Add the flags of the command."""
     add = parser.add_argument
     add("source", metavar="JOB.toml | URDF")
     add("motion", metavar="MOTION", help="table of time and q_<joint>, as a log or a design")
@@ -69,11 +63,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Run the command.
-
-    Args:
-        options: Its flags.
-    """
+    """Run the command."""
     from robotid.cli.work.simulate import SimulatedFiles, simulate_log
 
     job, settings = simulation_from_flags(options)
@@ -87,14 +77,7 @@ def run(options: argparse.Namespace) -> None:
 
 
 def simulation_from_flags(options: argparse.Namespace) -> "tuple[Job, Simulation]":
-    """Return the robot and the settings of a simulation.
-
-    Args:
-        options: The flags of the command "simulate".
-
-    Raises:
-        SettingsError: If the file of the plant, or a flag, is not usable.
-    """
+    """Return the robot and the settings of a simulation."""
     from robotid.cli.work.job import job_from_settings, read_job
     from robotid.dynamics.simulation.simulation_settings import read_simulation
 

@@ -18,17 +18,11 @@ from robotid.cli.flags import (
 from robotid.cli.printing import echo
 from robotid.cli.running import serve, show_found
 
-__all__ = ["SUMMARY", "add_flags", "run"]
-
 SUMMARY = "run the online estimator over a log: history, step changes"
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
-    """Add the flags of the command.
-
-    Args:
-        parser: Its parser.
-    """
+    """Add the flags of the command."""
     add_robot_and_log(parser)
     add_out(parser, "robotid-track")
     add_json(parser, "track.json")
@@ -38,11 +32,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Run the command.
-
-    Args:
-        options: Its flags.
-    """
+    """Run the command."""
     from robotid.cli.work.track import run_track
 
     job = job_from_flags(options)

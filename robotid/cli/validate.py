@@ -12,17 +12,11 @@ from robotid.cli.running import show_found
 if TYPE_CHECKING:
     from robotid.cli.work.job import LogEntry
 
-__all__ = ["SUMMARY", "add_flags", "run"]
-
 SUMMARY = "compute a result's prediction error on other logs"
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
-    """Add the flags of the command.
-
-    Args:
-        parser: Its parser.
-    """
+    """Add the flags of the command."""
     add = parser.add_argument
     add("result", metavar="RESULT.json")
     add("logs", nargs="+", metavar="LOG")
@@ -34,11 +28,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Run the command.
-
-    Args:
-        options: Its flags.
-    """
+    """Run the command."""
     from robotid.cli.work.validate import validate_result
 
     entries = [_entry(log, options) for log in options.logs]

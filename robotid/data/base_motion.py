@@ -20,22 +20,6 @@ from robotid.data.imu_frame import (
     orientation_of_imu,
 )
 
-__all__ = [
-    "ACCELERATION",
-    "POSE",
-    "TWIST",
-    "BaseColumns",
-    "BaseMotion",
-    "base_columns",
-    "base_of",
-    "base_state",
-    "contacts_of",
-    "in_base",
-    "pose_jumps",
-    "quaternions_of_angles",
-    "table_of_base",
-]
-
 #: Names of the coordinates of a pose: position [m], and the orientation as a quaternion.
 POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
 _ANGLES = ("x", "y", "z", "roll", "pitch", "yaw")
@@ -177,17 +161,7 @@ class BaseColumns:
 def base_columns(
     where: str, names: Sequence[str], wanted: BaseColumns, columns: Mapping[str, str]
 ) -> dict[str, list[str]]:
-    """Return the columns of a floating base and of contacts in a file, by kind.
-
-    Args:
-        where: Name of the file.
-        names: Names of its columns.
-        wanted: Which are read.
-        columns: Names in the file by standard name, if they differ.
-
-    Raises:
-        DataError: If the pose of a floating base, or a wrench, is missing.
-    """
+    """Return the columns of a floating base and of contacts in a file, by kind."""
     names = [*names, *columns]
     found = _columns_of_base(where, names, wanted) if wanted.floats else {}
     found["contact"] = [f"contact_{link}" for link in wanted.present(names).contacts]
@@ -251,14 +225,7 @@ def base_of(
 ) -> tuple[BaseMotion | None, str]:
     """Return the motion of the base from its columns, None without these, and a note or "".
 
-    Args:
-        t: Time stamps, shape (N,) [s].
-        q: Joint positions, shape (N, n) [rad or m].
-        values: Columns by kind, as of ``base_columns``, each of shape (N, k).
-        wanted: Axes of the velocities, and place of the IMU.
-
-    Raises:
-        DataError: If a value is not finite, or a quaternion is not of length 1.
+    t (N,) [s], q (N, n) [rad or m], values (N, k).
     """
     pose, frame = _pose_of(values, wanted.imu), wanted.imu
     if pose is None and frame is not None and "base imu" in values:
@@ -316,16 +283,7 @@ def _of_base(quaternion: Array, own: Array) -> Array:
 
 
 def contacts_of(values: Array, wanted: BaseColumns, where: str) -> dict[str, Array]:
-    """Return whether links touch the ground, by link, each of shape (N,), bool.
-
-    Args:
-        values: Columns of 0 and 1, or of forces of contacts with a threshold, shape (N, k).
-        wanted: The links, and their thresholds.
-        where: Name of the file.
-
-    Raises:
-        DataError: If a flag is neither 0 nor 1.
-    """
+    """Return whether links touch the ground, by link, each of shape (N,), bool: values (N, k)."""
     links = wanted.contacts
     limits = np.full(len(links), np.nan)
     if wanted.thresholds:
@@ -345,13 +303,7 @@ def contacts_of(values: Array, wanted: BaseColumns, where: str) -> dict[str, Arr
 def table_of_base(
     base: BaseMotion | None, contacts: Mapping[str, Array], wrenches: Mapping[str, Array]
 ) -> dict[str, Array]:
-    """Return the columns of a log with the motion of a base, contacts and wrenches, by name.
-
-    Args:
-        base: The motion, or None.
-        contacts: As of ``Log.contacts``.
-        wrenches: As of ``Log.wrenches``.
-    """
+    """Return the columns of a log with the motion of a base, contacts and wrenches, by name."""
     table: dict[str, Array] = {}
     forms = {"pose": POSE, "twist": TWIST, "acceleration": ACCELERATION}
     for kind, ends in forms.items():
@@ -374,13 +326,7 @@ def base_state(
     What was not recorded is differentiated: with the axes R of the base, v = R^T dx/dt and
     w = 2 (q* dq/dt), the vector part of the product of quaternions.
 
-    Args:
-        t: Time stamps, shape (N,) [s].
-        pose: Smoothed pose, shape (N, 7) [m, -]; the quaternions need not be of length 1.
-        twist: Smoothed twist, shape (N, 6); None to differentiate the pose.
-        acceleration: Smoothed acceleration, shape (N, 6); None to differentiate the twist.
-        imu: Smoothed values of an IMU, which replace angular velocity and acceleration; None
-            without one.
+    t (N,) [s], pose (N, 7) [m, -], twist (N, 6), acceleration (N, 6).
     """
     quaternion = pose[:, 3:] / np.linalg.norm(pose[:, 3:], axis=1, keepdims=True)
     pose = np.hstack([pose[:, :3], quaternion])
@@ -403,12 +349,7 @@ def pose_jumps(t: Array, pose: Array) -> tuple[Array, Array, Array]:
     A step is compared with the mean of the steps before and after it, and their difference with
     those of 32 rows on each side. A change of the speed, as by an impact, is no jump.
 
-    Args:
-        t: Time stamps, shape (N,) [s].
-        pose: Pose as of ``BaseMotion``, shape (N, 7).
-
-    Returns:
-        The rows after the jumps, shape (k,); their sizes, 0 if not a jump of this kind [m], [rad].
+    t (N,) [s], pose (N, 7) -> (k,) [m].
     """
     dt, sizes = np.diff(t), np.zeros((2, len(t)))
     if len(dt) < 3:
@@ -433,9 +374,7 @@ def pose_jumps(t: Array, pose: Array) -> tuple[Array, Array, Array]:
 def in_base(quaternion: Array, vector: Array) -> Array:
     """Return vectors with the axes of the base, R^T x, shape (N, 3).
 
-    Args:
-        quaternion: Orientation of the base, qx qy qz qw, shape (N, 4).
-        vector: Vectors with the axes of the world, shape (N, 3), or one, shape (3,).
+    quaternion (N, 4), vector (N, 3).
     """
     u = np.cross(vector, quaternion[:, :3])
     turned: Array = vector + 2.0 * (quaternion[:, 3:] * u + np.cross(u, quaternion[:, :3]))
@@ -445,8 +384,7 @@ def in_base(quaternion: Array, vector: Array) -> Array:
 def quaternions_of_angles(angles: Array) -> Array:
     """Return qx qy qz qw of roll, pitch and yaw, R = Rz(yaw) Ry(pitch) Rx(roll), shape (N, 4).
 
-    Args:
-        angles: Roll, pitch and yaw, shape (N, 3) [rad].
+    angles (N, 3) [rad].
     """
     (cr, cp, cy), (sr, sp, sy) = np.cos(angles.T / 2), np.sin(angles.T / 2)
     return np.column_stack(

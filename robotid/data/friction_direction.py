@@ -6,8 +6,6 @@ import numpy as np
 
 from robotid.base.typing import Array
 
-__all__ = ["acting_directions"]
-
 _REST = 1e-6  # [rad/s] slower: at rest, because the sign is a rounding error
 # Least time of stiction in the band, over the time by the slopes at its edges.
 _REVERSAL = 2.0  # a straight line through zero has 1, a cubic that rests there has 3
@@ -23,14 +21,10 @@ def acting_directions(t: Array, w: Array, band: float, longest: float) -> Array:
     sign after. A drive was in stiction if it was in the band longer than the slopes at the edges
     of the band indicate: by a factor of two if it reverses, of four if it does not.
 
-    Args:
-        t: Times, shape (N,) [s].
-        w: Smooth speeds, shape (N, c) [rad/s]; of prismatic joints as in ``friction_speeds``.
-        band: Speed from which the sign is certain [rad/s]; 0: everywhere.
-        longest: Longest time of stiction [s]; in longer slow motion the signs are used.
-
     References:
         Karnopp (1985), Computer simulation of stick-slip friction in mechanical dynamic systems.
+
+    t (N,) [s], w (N, c) [rad/s].
     """
     directions = np.where(np.abs(w) < _REST, 0.0, np.sign(w))
     for x, direction in zip(w.T, directions.T, strict=True):

@@ -8,16 +8,6 @@ import numpy as np
 
 from robotid.base.typing import Array
 
-__all__ = [
-    "IMU",
-    "ImuFrame",
-    "ImuMotion",
-    "bias_at_rest",
-    "inertial_state",
-    "motion_of_imu",
-    "orientation_of_imu",
-]
-
 #: Names of the values of an IMU: orientation, angular velocity [rad/s], specific force [m/s^2].
 IMU = ("qx", "qy", "qz", "qw", "wx", "wy", "wz", "ax", "ay", "az")
 _WINDOW = 0.5  # [s] shortest rest in which the bias of the gyroscopes is estimated
@@ -69,11 +59,7 @@ class ImuMotion:
     frame: ImuFrame
 
     def at(self, rows: slice) -> "ImuMotion":
-        """Return some samples.
-
-        Args:
-            rows: Their numbers.
-        """
+        """Return some samples."""
         return replace(self, values=self.values[rows])
 
 
@@ -82,12 +68,7 @@ def motion_of_imu(t: Array, q: Array, values: Array, frame: ImuFrame) -> tuple[I
 
     The bias is that of ``bias_at_rest``.
 
-    Args:
-        t: Time stamps, shape (N,) [s].
-        q: Joint positions, shape (N, n) [rad or m].
-        values: Angular velocity [rad/s] and specific force [m/s^2] with the axes of the IMU, shape
-            (N, 6).
-        frame: Place of the IMU.
+    t (N,) [s], q (N, n) [rad or m], values (N, 6).
     """
     turned = np.hstack([values[:, :3] @ frame.rotation.T, values[:, 3:] @ frame.rotation.T])
     bias, note = frame.bias, ""
@@ -102,10 +83,6 @@ def bias_at_rest(parts: Sequence[tuple[Array, Array, Array]]) -> tuple[Array, st
 
     It is the mean angular velocity in all windows of 0.5 s in which joints and gyroscopes are at
     rest; 0 without one.
-
-    Args:
-        parts: Parts of a log: time stamps (N,) [s], joint positions (N, n) [rad or m], angular
-            velocity with bias (N, 3) [rad/s].
     """
     means = []
     for t, q, w in parts:
@@ -138,15 +115,11 @@ def orientation_of_imu(t: Array, values: Array, gravity: Array) -> Array:
     seconds is opposite to gravity, for the velocity of a robot hardly changes in them: this
     corrects the tilt. The heading starts at 0.
 
-    Args:
-        t: Time stamps, shape (N,) [s].
-        values: Angular velocity without bias [rad/s] and specific force [m/s^2] with the axes of
-            the base, shape (N, 6).
-        gravity: Gravity in the world, shape (3,) [m/s^2].
-
     References:
         Mahony, Hamel, Pflimlin (2008), Nonlinear Complementary Filters on the Special Orthogonal
         Group; here without delay, for the whole log is known.
+
+    t (N,) [s], values (N, 6), gravity (3,) [m/s^2].
     """
     parts = np.split(np.arange(len(t)), np.flatnonzero(np.diff(t) > _BREAK) + 1)
     return np.concatenate([_levelled(t[k], values[k], -gravity) for k in parts])
@@ -205,12 +178,7 @@ def inertial_state(
     With the lever r of the IMU, its specific force f without bias and gravity g, the specific
     force at the origin is f - alpha x r - w x (w x r), and dv/dt = that + g - w x v.
 
-    Args:
-        t: Time stamps, shape (N,) [s].
-        velocity: Linear velocity v of the base, shape (N, 3) [m/s]; forces do not depend on it.
-        down: Gravity g, shape (N, 3) [m/s^2].
-        values: Smoothed values of the IMU, as of ``ImuMotion``.
-        frame: Place of the IMU.
+    t (N,) [s], velocity (N, 3) [m/s], down (N, 3) [m/s^2].
     """
     w, f, r = values[:, :3], values[:, 3:], frame.lever
     f = f if frame.offset is None else f - frame.offset

@@ -22,8 +22,6 @@ from robotid.base.text import seconds
 from robotid.base.typing import Array
 from robotid.data.base_motion import POSE, BaseMotion
 
-__all__ = ["COLUMNS", "Log", "Trajectory"]
-
 #: Attributes of a `Log` with one column per joint, by the prefix of these columns in files.
 COLUMNS = {
     "q": "q",
@@ -347,22 +345,13 @@ class Trajectory:
 
 
 def suggestion(name: str, known: Collection[str]) -> str:
-    """Return ". Did you mean 'x'?" for the most similar known name, or "" if none is similar.
-
-    Args:
-        name: The unknown name.
-        known: The known names.
-    """
+    """Return ". Did you mean 'x'?" for the most similar known name, or "" if none is similar."""
     near = difflib.get_close_matches(name, known, n=1)
     return f". Did you mean {near[0]!r}?" if near else ""
 
 
 def repeated(names: Sequence[str]) -> list[str]:
-    """Return the names that occur more than once, each once, sorted.
-
-    Args:
-        names: The names.
-    """
+    """Return the names that occur more than once, each once, sorted."""
     return sorted(name for name, count in Counter(names).items() if count > 1)
 
 
@@ -415,18 +404,7 @@ def _names(joints: object, where: str) -> tuple[str, ...]:
 def require_finite(
     values: Array, t: Array, names: Sequence[str], where: str, first: int = 0
 ) -> None:
-    """Reject NaN, infinite values and values beyond 1e30; the error names the first.
-
-    Args:
-        values: Shape (N, k).
-        t: Time stamps of the rows, shape (N,) [s].
-        names: Names of the k columns.
-        where: Name of the log.
-        first: Number of the first row in its file.
-
-    Raises:
-        DataError: If a value is not finite, or so large that its square may not be.
-    """
+    """Reject NaN, infinite values and values beyond 1e30; the error names the first: t (N,) [s]."""
     is_fine = np.abs(values) <= _LARGEST  # False for NaN, too
     if is_fine.all():
         return
@@ -443,16 +421,7 @@ def require_finite(
 
 
 def require_increasing(t: Array, where: str, first: int = 0) -> None:
-    """Reject time stamps that repeat or decrease; the error names the first.
-
-    Args:
-        t: Time stamps, shape (N,) [s].
-        where: Name of the log.
-        first: Number of the first row in its file.
-
-    Raises:
-        DataError: If a time stamp is not after the one before, or the time steps are too small.
-    """
+    """Reject time stamps that repeat or decrease; the error names the first: t (N,) [s]."""
     back = np.flatnonzero(np.diff(t) <= 0)
     if len(back) == 0:
         _check_rate(t, where)

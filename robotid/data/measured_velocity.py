@@ -11,18 +11,6 @@ from robotid.base.exceptions import DataError
 from robotid.base.typing import Array
 from robotid.data.log import Log
 
-__all__ = [
-    "COARSE",
-    "LARGEST_LAG",
-    "coarse_velocities",
-    "is_timely",
-    "is_trustworthy",
-    "quantum",
-    "unlike_velocities",
-    "velocity_lag",
-    "velocity_lags",
-]
-
 #: [s] Largest lag of a measured velocity that "auto" uses.
 LARGEST_LAG = 0.02
 #: Least number of steps over the range of a channel with sufficient resolution.
@@ -54,33 +42,17 @@ def is_trustworthy(log: Log, stated: float = 0.0) -> bool:
     """Return whether the measured velocities have a small lag and a sufficient resolution.
 
     They must also correlate with the derivatives of their positions.
-
-    Args:
-        log: A log with measured velocities.
-        stated: Their stated delay, which is corrected [s].
     """
     return is_timely(log, stated) and not coarse_velocities(log) and not unlike_velocities(log)
 
 
 def is_timely(log: Log, stated: float = 0.0) -> bool:
-    """Return whether the measured velocities lag their positions by less than 20 ms.
-
-    Args:
-        log: A log with measured velocities.
-        stated: Their stated delay, which is corrected [s].
-    """
+    """Return whether the measured velocities lag their positions by less than 20 ms."""
     return velocity_lag(log) - stated < LARGEST_LAG
 
 
 def velocity_lag(log: Log) -> float:
-    """Return the delay of the measured velocities relative to the derivatives of the positions [s].
-
-    Args:
-        log: A log with measured velocities.
-
-    Raises:
-        DataError: If the log has no velocities.
-    """
+    """Delay of the measured velocities relative to the derivatives of the positions [s]."""
     return velocity_lags(log)[0]
 
 
@@ -92,14 +64,7 @@ def velocity_lags(log: Log) -> tuple[float, Array]:
     found on a uniform grid in segments without gaps and refined by a parabola. It is positive if
     the measured velocity lags, and 0 if the joints are at rest.
 
-    Args:
-        log: A log with measured velocities.
-
-    Returns:
-        The common delay of all joints, and the delay of each joint, shape (n,).
-
-    Raises:
-        DataError: If the log has no velocities.
+    -> (n,).
     """
     v = _measured(log)
     step = float(np.median(np.diff(log.t)))
@@ -130,11 +95,7 @@ def velocity_lags(log: Log) -> tuple[float, Array]:
 
 @_once
 def coarse_velocities(log: Log) -> tuple[str, ...]:
-    """Return the joints whose measured velocity is coarsely quantised, as from an encoder.
-
-    Args:
-        log: A log with measured velocities.
-    """
+    """Return the joints whose measured velocity is coarsely quantised, as from an encoder."""
     return tuple(
         joint
         for joint, x in zip(log.joints, _measured(log).T, strict=True)
@@ -144,14 +105,7 @@ def coarse_velocities(log: Log) -> tuple[str, ...]:
 
 @_once
 def unlike_velocities(log: Log) -> dict[str, float]:
-    """Return the joints whose measured velocity is not the derivative of their position at any lag.
-
-    Args:
-        log: A log with measured velocities.
-
-    Returns:
-        The largest correlation of each with d(q)/dt over the lags, by joint [-].
-    """
+    """Joints whose measured velocity is not the derivative of their position at any lag."""
     v, dt = _measured(log), np.diff(log.t)[:, None]
     median = float(np.median(dt))
     is_regular = dt < _GAP * median
@@ -172,12 +126,7 @@ def unlike_velocities(log: Log) -> dict[str, float]:
 
 
 def quantum(x: Array, *, repeats: bool = True) -> float:
-    """Return the quantisation step of a channel, 0 if it is not quantised.
-
-    Args:
-        x: A channel, shape (N,).
-        repeats: Whether values must repeat, twice on average.
-    """
+    """Return the quantisation step of a channel, 0 if it is not quantised: x (N,)."""
     levels = np.unique(x)
     if len(levels) < 3 or (repeats and len(levels) > 0.5 * len(x)):
         return 0.0

@@ -13,20 +13,12 @@ from scipy.linalg.lapack import dtbtrs
 
 from robotid.base.typing import Array
 
-__all__ = ["butterworth_poles", "local_polynomial", "zero_phase"]
-
 
 @cache  # a log has few filters, each for many channels
 def butterworth_poles(order: int, cutoff: float, rate: float) -> Array:
     """Return the poles of a digital Butterworth low-pass filter, by the bilinear transform.
 
-    Args:
-        order: Number of poles.
-        cutoff: Frequency of half the power [Hz].
-        rate: Rows per second.
-
-    Returns:
-        The poles with an imaginary part >= 0, shape (ceil(order / 2),), complex, read-only.
+    -> (ceil(order / 2),).
     """
     angles = np.pi * (2 * np.arange((order + 1) // 2) + order + 1) / (2 * order)
     analog = np.tan(np.pi * cutoff / rate) * np.exp(1j * angles)
@@ -41,12 +33,7 @@ def zero_phase(x: Array, order: int, cutoff: float, rate: float, pad: int) -> Ar
     The initial state of each pass is the steady state for the first value; both ends are extended
     by point reflection of the signal (Gustafsson 1996 compares such initial states).
 
-    Args:
-        x: Signals over time, shape (N, ...).
-        order: Order of the filter.
-        cutoff: Frequency of half the power in one pass [Hz].
-        rate: Rows per second.
-        pad: Rows by which both ends are extended, below N.
+    x (N, ...).
     """
     if not x.size:
         return x  # LAPACK would write beyond an empty array
@@ -92,12 +79,7 @@ def local_polynomial(
     At the ends the polynomial of the first and of the last ``width`` rows is used (Savitzky, Golay
     1964).
 
-    Args:
-        x: Signals over time, shape (N, ...).
-        width: Rows of each polynomial, not even, at most N.
-        degree: Its degree, below ``width``.
-        derivative: Order of the derivative that is returned.
-        step: Time between rows [s].
+    x (N, ...).
     """
     half = width // 2
     offsets = np.arange(-half, half + 1)

@@ -17,8 +17,6 @@ from robotid.base.settings import (
     setting,
 )
 
-__all__ = ["PER_SECOND", "BaseSource", "LogSource", "LogUnits", "SignalSettings"]
-
 #: Number of each time unit in a second.
 PER_SECOND = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
 _HZ = Range("0.001 to 1e6", lambda x: 1e-3 <= x <= 1e6)

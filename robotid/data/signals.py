@@ -20,8 +20,6 @@ from robotid.data.measured_velocity import is_trustworthy
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.smoothing import KEPT, Segment, process_segments, too_short
 
-__all__ = ["decide", "process", "resolve", "turns_note", "unwrap"]
-
 _SLOWEST = 1e-6  # smallest cut-off over the rate
 _GAP_STEPS = 2.5  # [median steps] a longer step may be a gap
 _UNWRAPPED: WeakKeyDictionary[Log, Log] = WeakKeyDictionary()
@@ -29,20 +27,7 @@ _GAP_CYCLES = 0.25  # [periods of the filter] ... if it is also longer than this
 
 
 def resolve(log: Log, settings: SignalSettings) -> SignalSettings:
-    """Return the settings with the automatic values for this log.
-
-    Args:
-        log: The log.
-        settings: The settings of the user.
-
-    Returns:
-        Settings with values of rate (unless the rows of the log are used), velocity, acceleration
-        and max_gap.
-
-    Raises:
-        DataError: If measured velocity or acceleration is required and the log has none.
-        SettingsError: If the cut-off is not below half the rate.
-    """
+    """Return the settings with the automatic values for this log."""
     return decide(
         settings,
         float(np.median(np.diff(log.t))),
@@ -62,20 +47,7 @@ def decide(
     has_acceleration: bool,
     is_trusted: Callable[[], bool],
 ) -> SignalSettings:
-    """Return the settings as of ``resolve``, from a few properties of the log.
-
-    Args:
-        settings: The settings of the user.
-        step: Median time step of the log [s].
-        where: Name of the log, for errors.
-        has_velocity: Whether it has measured velocities.
-        has_acceleration: Whether it has measured accelerations.
-        is_trusted: Returns whether measured velocities are used; called only if necessary.
-
-    Raises:
-        DataError: If measured velocity or acceleration is required and the log has none.
-        SettingsError: If the cut-off is not below half the rate.
-    """
+    """Return the settings as of ``resolve``, from a few properties of the log."""
     rate, cutoff = settings.rate, settings.cutoff
     if rate is None and cutoff is not None:
         rate = 1.0 / step
@@ -110,18 +82,7 @@ def decide(
 
 
 def process(log: Log, settings: SignalSettings, speeds: Array | None = None) -> Trajectory:
-    """Return the smooth trajectory of a log, with the number of the ``segment`` of each row.
-
-    Args:
-        log: The log.
-        settings: The settings; automatic values are resolved first.
-        speeds: As of ``process_segments``; required for a model with Coulomb friction if the
-            torque is filtered.
-
-    Raises:
-        DataError: If no segment is long enough.
-        SettingsError: If the cut-off is not below half the rate.
-    """
+    """Return the smooth trajectory of a log, with the number of the ``segment`` of each row."""
     settings = resolve(log, settings)
     breaks = np.flatnonzero(np.diff(log.t) > (settings.max_gap or np.inf)) + 1
     edges = [0, *breaks.tolist(), len(log.t)]
@@ -139,16 +100,7 @@ def process(log: Log, settings: SignalSettings, speeds: Array | None = None) -> 
 
 
 def unwrap(log: Log, is_free: Array) -> Log:
-    """Return the log without jumps of a full turn of joints without limits.
-
-    Args:
-        log: The log.
-        is_free: Which joints are continuous, or revolute without limits, shape (n,), bool. The
-            changed ones are in a note.
-
-    Raises:
-        DataError: If a joint with limits jumps by a full turn.
-    """
+    """Return the log without jumps of a full turn of joints without limits: is_free (n,)."""
     jumps = np.abs(np.abs(np.diff(log.q, axis=0)) - 2 * np.pi) < 0.5  # [rad]
     has_jump = jumps.any(axis=0)
     for j in np.flatnonzero(has_jump & ~np.asarray(is_free, dtype=bool)):
@@ -173,9 +125,5 @@ def unwrap(log: Log, is_free: Array) -> Log:
 
 
 def turns_note(joints: Sequence[str]) -> str:
-    """Return the note that full turns were removed.
-
-    Args:
-        joints: Names of the joints.
-    """
+    """Return the note that full turns were removed."""
     return f"full turns removed from the angle of {listed(joints)}"

@@ -18,8 +18,6 @@ from robotid.data.signal_filters import butterworth_poles, zero_phase
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.splines import cubic_spline
 
-__all__ = ["KEPT", "SPLINE", "Segment", "filter_reach", "low_pass", "process_segments", "too_short"]
-
 #: Rows after which the end of a cubic spline has no effect: it decreases by half or more per row.
 SPLINE = 64
 _SETTLED = 42.0  # [time constants] after which a filter's transient is negligible: 6e-19
@@ -66,19 +64,7 @@ def process_segments(
     The result for a part equals that for the whole, if the log has the rows of its segments
     within ``filter_reach`` of the part.
 
-    Args:
-        log: Rows of the segments, all of them or a part.
-        segments: The whole segments, in order.
-        settings: The settings, resolved.
-        first: Number of the log's first row in the segments.
-        own: Rows of the part, numbered as in the segments; the log must have the row after it.
-        speeds: Ratios of the speeds that determine Coulomb friction [rad/s] to those of the
-            joints, shape (c, n), as of ``friction_speeds``.
-
-    Returns:
-        The trajectory, without samples if no segment is long enough, with the numbers of the
-        segments. Its directions are those of Coulomb friction after the filter of the torque; None
-        without speeds, and if they are the signs of the speeds.
+    speeds (c, n).
     """
     is_sharp = settings.cutoff is None and settings.friction_band == 0
     ratios = np.empty((0, len(log.joints))) if speeds is None or is_sharp else speeds
@@ -140,12 +126,6 @@ def filter_reach(settings: SignalSettings) -> float:
 
     It is more than twice the settling time of one filter: the sign of a smooth speed depends on
     the longest time of stiction, and is filtered a second time.
-
-    Args:
-        settings: The settings, resolved.
-
-    Returns:
-        The time, including delays; some rows must be added for splines and differences.
     """
     delay = max(map(abs, (settings.torque_delay, settings.velocity_delay, settings.wrench_delay)))
     if settings.cutoff is None or settings.rate is None:
@@ -167,10 +147,7 @@ def _time_constant(settings: SignalSettings) -> float:
 def low_pass(values: Array, rate: float, settings: SignalSettings) -> Array:
     """Return values after the zero-phase Butterworth filter, same shape; unchanged without one.
 
-    Args:
-        values: Values over time, shape (N, ...).
-        rate: Rows per second.
-        settings: The settings.
+    values (N, ...).
     """
     if settings.cutoff is None or len(values) < 2:
         return values
@@ -179,13 +156,7 @@ def low_pass(values: Array, rate: float, settings: SignalSettings) -> Array:
 
 
 def too_short(where: str, segments: int, settings: SignalSettings) -> DataError:
-    """Return the error of a log without a segment that is long enough.
-
-    Args:
-        where: Name of the log.
-        segments: Number of its segments without gaps.
-        settings: The settings.
-    """
+    """Return the error of a log without a segment that is long enough."""
     return DataError(
         f"{where}: none of its {segments} segments without gaps is long "
         f"enough for the filter and a trim of {settings.trim:g} s at each end; record longer, "

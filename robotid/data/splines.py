@@ -9,8 +9,6 @@ from scipy.linalg.lapack import dgtsv
 
 from robotid.base.typing import Array
 
-__all__ = ["cubic_spline"]
-
 
 def cubic_spline(t: Array, x: Array, at: Array) -> Array:
     """Return signals at other times, by the cubic spline through all of their rows.
@@ -18,16 +16,10 @@ def cubic_spline(t: Array, x: Array, at: Array) -> Array:
     The third derivative is continuous at the second and the last but one row ("not a knot"): two
     rows give a straight line, three a parabola. The outer polynomials extrapolate.
 
-    Args:
-        t: Time stamps, increasing, shape (N,) with N >= 2 [s].
-        x: Signals, shape (N, k).
-        at: Times, of any shape [s].
-
-    Returns:
-        The signals at these times, shape (..., k).
-
     References:
         de Boor (1978), A Practical Guide to Splines, chapter IV.
+
+    t (N,) [s], x (N, k) -> (..., k).
     """
     h = np.diff(t)[:, None]  # (N - 1, 1)
     chord = np.diff(x, axis=0) / h

@@ -7,8 +7,6 @@ import numpy as np
 from robotid.base.typing import Array
 from robotid.data.log import Log, Trajectory
 
-__all__ = ["standing_motion"]
-
 _LENGTH = 0.25  # [s] of a block whose rows become one sample
 
 
@@ -22,17 +20,7 @@ def standing_motion(
     are joined: each pose at rest is one sample. There is no filter and no derivative: the speed is
     the slope of the positions over the block, and 0 for a single row.
 
-    Args:
-        log: The log, without full turns.
-        max_gap: A longer time step is a gap, which ends a block [s].
-        least: Speeds below which joints are at rest, shape (n,) [rad/s or m/s].
-        fastest: Largest speeds, shape (n,).
-        hardest: Largest changes of speed, shape (n,) [rad/s^2 or m/s^2].
-
-    Returns:
-        K samples without accelerations; their speeds are 0 at rest and where a joint starts, stops
-        or reverses; and which samples are at rest, shape (K,), bool. Their segments are those
-        between gaps.
+    least (n,) [rad/s or m/s], fastest (n,), hardest (n,) [rad/s^2 or m/s^2] -> (K,).
     """
     of_block, segment = _blocks(log.t, max_gap)
     first = np.flatnonzero(np.diff(of_block, prepend=-1))

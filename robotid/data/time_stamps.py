@@ -8,21 +8,11 @@ import numpy as np
 from robotid.base.typing import Array
 from robotid.data.log import require_finite, require_increasing
 
-__all__ = ["blocks_of", "map_stamps", "median_step"]
-
 _BLOCK = 2**17  # stamps processed together
 
 
 def map_stamps(blocks: Iterable[Array], where: str) -> Array:
-    """Return the time stamps of a log, shape (N,) [s], in a file that exists as long as the array.
-
-    Args:
-        blocks: The stamps, a block of rows at a time [s].
-        where: Name of the log.
-
-    Raises:
-        DataError: If a stamp is not finite, or not after the one before.
-    """
+    """Time stamps of a log, shape (N,) [s], in a file that exists as long as the array."""
     count, last = 0, np.empty(0)
     with tempfile.TemporaryFile() as file:
         for block in blocks:
@@ -35,14 +25,7 @@ def map_stamps(blocks: Iterable[Array], where: str) -> Array:
 
 
 def blocks_of(t: Array) -> Iterator[tuple[int, Array]]:
-    """Yield time stamps in blocks; each block shares a stamp with the block before.
-
-    Args:
-        t: The stamps, shape (N,) [s].
-
-    Yields:
-        The first row of a block, and its stamps, at least two [s].
-    """
+    """Yield time stamps in blocks; each block shares a stamp with the block before: t (N,) [s]."""
     for row in range(0, len(t) - 1, _BLOCK):
         yield row, t[row : row + _BLOCK + 1]
 
@@ -50,8 +33,7 @@ def blocks_of(t: Array) -> Iterator[tuple[int, Array]]:
 def median_step(t: Array) -> float:
     """Return the median time step [s]; those of a long log are sorted in a temporary file.
 
-    Args:
-        t: The stamps, shape (N,), N >= 2 [s].
+    t (N,) [s].
     """
     if len(t) <= _BLOCK:
         return float(np.median(np.diff(t)))

@@ -12,8 +12,6 @@ from robotid.base.settings import Settings, setting
 from robotid.base.typing import Array
 from robotid.data.log import repeated
 
-__all__ = ["Transmission", "check_transmissions"]
-
 _SINGULAR = 1e-9  # smallest singular value over the largest, for rows of length 1
 
 
@@ -137,14 +135,7 @@ class Transmission(Settings):
         return float(self.T[i, np.argmax(np.abs(self.T[i]))])
 
     def stated(self, reductions: Mapping[str, float]) -> "Transmission":
-        """Return the transmission with the gear ratios of the URDF, if its matrix is "urdf".
-
-        Args:
-            reductions: Gear ratios of the URDF's joints, by name.
-
-        Raises:
-            SettingsError: If a joint has none.
-        """
+        """Return the transmission with the gear ratios of the URDF, if its matrix is "urdf"."""
         if self.matrix != "urdf":
             return self
         if missing := [joint for joint in self.joints if joint not in reductions]:
@@ -180,15 +171,7 @@ class Transmission(Settings):
 def check_transmissions(
     transmissions: Sequence[Transmission], joints: Sequence[str] | None = None
 ) -> None:
-    """Reject joints and motors that are in several transmissions, and joints that are not read.
-
-    Args:
-        transmissions: The transmissions.
-        joints: The joints that are identified, if known.
-
-    Raises:
-        SettingsError: If there is one.
-    """
+    """Reject joints and motors that are in several transmissions, and joints that are not read."""
     driven = [joint for gear in transmissions for joint in gear.joints]
     motors = [motor for gear in transmissions for motor in gear.names]
     for noun, names in (("joints", driven), ("motors", motors)):

@@ -11,8 +11,6 @@ from robotid.base.typing import Array
 from robotid.data.log import Log
 from robotid.data.signal_settings import PER_SECOND, LogUnits
 
-__all__ = ["check_reach", "check_units", "turned"]
-
 _TIME_NAMES = {"ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}
 _DEGREES = 180 / np.pi  # degrees in a radian
 _EPOCHS = 6e8, 5e9  # [s] since 1970: dates from 1989 to 2128
@@ -33,15 +31,6 @@ def check_units(
 
     The measured velocity is compared with the position over short segments: the factor between
     the integral of dq and the change of q is 1 if both are in SI units.
-
-    Args:
-        log: The log.
-        units: The stated units; a stated unit is not checked.
-        prismatic: Names of the prismatic joints; the others are revolute.
-        turning: Names of the revolute joints whose rotation has no limits.
-
-    Raises:
-        DataError: If the unit of time or angle, or the sign of the velocity, is implausible.
     """
     is_revolute = np.array([name not in prismatic for name in log.joints])
     factor = _velocity_factor(log)  # (n,), NaN for a joint that does not determine it
@@ -91,17 +80,7 @@ def _check_clock(log: Log, factor: Array) -> None:
 def check_reach(
     log: Log, units: LogUnits, prismatic: Collection[str] = (), turning: Collection[str] = ()
 ) -> None:
-    """Reject revolute joints with angles too large for radians, unless the unit is stated.
-
-    Args:
-        log: The log, or rows of it.
-        units: The stated units.
-        prismatic: Names of the prismatic joints.
-        turning: Names of the revolute joints whose rotation has no limits.
-
-    Raises:
-        DataError: If an angle is too large.
-    """
+    """Reject revolute joints with angles too large for radians, unless the unit is stated."""
     if units.angle is not None:
         return
     is_revolute = np.array([name not in prismatic for name in log.joints])
@@ -125,10 +104,7 @@ def check_reach(
 def turned(joints: Sequence[str], q: Array, turning: Collection[str]) -> tuple[str, ...]:
     """Return what is assumed of joints without limits beyond the angles that others may reach.
 
-    Args:
-        joints: Names of the joints.
-        q: Their positions, read as radians, shape (N, n).
-        turning: Names of the revolute joints whose rotation has no limits.
+    q (N, n).
     """
     far = [name for name, x in zip(joints, q.T, strict=True)
            if name in turning and np.abs(x).max() > _FARTHEST]  # fmt: skip

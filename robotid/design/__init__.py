@@ -1,3 +1,1 @@
 """Excitation trajectories: motions within a robot's limits that determine its parameters best."""
-
-__all__: list[str] = []

@@ -9,19 +9,9 @@ from robotid.base.typing import Array
 from robotid.dynamics.compiled import Tree, flatten, own_motion, row_lanes, why_not
 from robotid.robot.model import RobotModel
 
-__all__ = ["MotionRegressor", "Placements", "fixed_tree"]
-
 
 def fixed_tree(model: RobotModel) -> Tree:
-    """Return a robot with a fixed base as arrays.
-
-    Args:
-        model: The robot.
-
-    Raises:
-        DataError: If the base floats, or the robot has contacts or loops.
-        SettingsError: If the compiled code does not support a joint.
-    """
+    """Return a robot with a fixed base as arrays."""
     model.require_fixed("motion design")
     if (why := why_not(model)) is not None:
         raise SettingsError(f"{model.name}: no motion can be designed: {why}")
@@ -31,13 +21,7 @@ def fixed_tree(model: RobotModel) -> Tree:
 class MotionRegressor:
     """Columns of the torque regressor of a robot's bodies along motions, and their gradient.
 
-    Args:
-        model: The robot, with a fixed base.
-        columns: Indices of the b standard parameters, shape (b,); columns of drives are 0 here.
-
-    Raises:
-        DataError: If the base floats, or the robot has contacts or loops.
-        SettingsError: If the compiled code does not support a joint.
+    columns (b,).
     """
 
     def __init__(self, model: RobotModel, columns: Array) -> None:
@@ -53,10 +37,7 @@ class MotionRegressor:
     def __call__(self, q: Array, v: Array, a: Array) -> Array:
         """Return the columns at N samples, shape (n, b, N).
 
-        Args:
-            q: Joint coordinates, shape (N, n) [rad, m].
-            v: Velocities, shape (N, n) [rad/s, m/s].
-            a: Accelerations, shape (N, n) [rad/s^2, m/s^2].
+        q (N, n) [rad, m], v (N, n) [rad/s, m/s], a (N, n) [rad/s^2, m/s^2].
         """
         N, lanes = len(q), row_lanes()
         block = lanes.LANES
@@ -68,11 +49,8 @@ class MotionRegressor:
     def pull(self, q: Array, v: Array, a: Array, weights: Array) -> Array:
         """Return the gradient of sum(weights * columns) by q, v and a, shape (3, N, n).
 
-        Args:
-            q: Joint coordinates, shape (N, n) [rad, m].
-            v: Velocities, shape (N, n) [rad/s, m/s].
-            a: Accelerations, shape (N, n) [rad/s^2, m/s^2].
-            weights: Weight of each entry, shape (n, b, N).
+        q (N, n) [rad, m], v (N, n) [rad/s, m/s], a (N, n) [rad/s^2, m/s^2], weights (n, b,
+        N).
         """
         by_column = np.array(weights.reshape(-1, len(q)), order="C")
         motion, out = own_motion(q, v, a), np.zeros((3, *q.shape))
@@ -94,12 +72,7 @@ class Placements:
 
     @classmethod
     def along(cls, tree: Tree, q: Array) -> "Placements":
-        """Return the poses of the bodies.
-
-        Args:
-            tree: The robot, with a fixed base.
-            q: Joint coordinates, shape (N, n) [rad, m].
-        """
+        """Return the poses of the bodies: q (N, n) [rad, m]."""
         R = np.empty((3, 3, len(tree.parents), len(q)))
         p = np.empty(R.shape[1:])
         row_lanes().placements(tree, np.array(q, order="C"), tree.work_space(), R, p)

@@ -11,8 +11,6 @@ from robotid.base.exceptions import SettingsError
 from robotid.base.typing import Array
 from robotid.dynamics.simulation.motions import Motion
 
-__all__ = ["BSplineBasis", "Basis", "DesignedMotion", "FourierBasis"]
-
 _DEGREE = 5  # of B-splines: their jerk is continuous
 
 
@@ -30,12 +28,7 @@ class Basis(Protocol):
         """Shortest period [s]."""
 
     def derivatives(self, t: Array, order: int) -> Array:
-        """Return the functions and their derivatives, shape (order + 1, N, size).
-
-        Args:
-            t: Times within the motion, shape (N,) [s].
-            order: Highest derivative.
-        """
+        """Return the functions and their derivatives, shape (order + 1, N, size): t (N,) [s]."""
 
 
 @dataclass(frozen=True)

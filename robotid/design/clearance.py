@@ -20,8 +20,6 @@ from robotid.dynamics.simulation.motions import Motion
 from robotid.robot.geometry import link_clouds
 from robotid.robot.model import RobotModel
 
-__all__ = ["Box", "Clearance", "Contact", "Nearness"]
-
 _TRIED = 400  # random poses by which the pairs of links that may meet are found
 _DISTANT = 0.05  # [m] links whose distance is larger at all of them are checked in the end only
 _ALMOST_ALL = 0.95  # share of the poses
@@ -120,13 +118,6 @@ class Clearance:
     than the clearance in 95 % of the poses, but which do not always touch, are close by design:
     half their median distance is required.
 
-    Args:
-        model: The robot, with a fixed base.
-        least: Required distance [m].
-        floor: Height of the floor, in the frame of the root link [m].
-        boxes: Obstacles around the robot.
-        seed: Seed of the random poses.
-
     Attributes:
         pairs: Numbers of the two hulls of each pair.
         likely: Which pairs may meet within the limits, shape (pairs,), bool.
@@ -136,10 +127,6 @@ class Clearance:
         unread: Links of which a shape cannot be read: they are not checked.
         made_to: Links in contact by design, by two, with their smallest distance.
         built_near: Links that are close by design, by two, with the required distance.
-
-    Raises:
-        DataError: If no link has a shape that can be read, or the base floats.
-        SettingsError: If a number is not usable, or a joint is of a kind that is not compiled.
     """
 
     def __init__(
@@ -247,23 +234,13 @@ class Clearance:
         return spare
 
     def margins(self, placed: Placements, spare: float, *, hints: Array | None = None) -> Array:
-        """Return margins of distances, shape (pairs, N) [m]; a lower bound of those over 1 cm.
-
-        Args:
-            placed: Poses of the bodies at N samples.
-            spare: Multiple of the reserve that is subtracted from the margin.
-            hints: As of ``near``.
-        """
+        """Return margins of distances, shape (pairs, N) [m]; a lower bound of those over 1 cm."""
         required = self.required[:, None] + spare * self.spare
         exact = np.minimum(_EXACT, self.slack[:, None] / 4)
         return self.near(placed, required + exact, hints=hints).distance - required
 
     def placed(self, q: Array) -> Placements:
-        """Return the poses of the bodies.
-
-        Args:
-            q: Joint coordinates, shape (N, n) [rad or m].
-        """
+        """Return the poses of the bodies: q (N, n) [rad or m]."""
         return Placements.along(self._tree, q)
 
     def near(
@@ -275,13 +252,7 @@ class Clearance:
     ) -> Nearness:
         """Return the distances of pairs along a motion, exact where they are near.
 
-        Args:
-            placed: Poses of the bodies at N samples.
-            within: Distance from which a lower bound suffices, one, or one per pair and sample,
-                shape (pairs, N) or one that broadcasts to it [m].
-            chosen: Pairs to check, shape (pairs,), bool; those that may meet if None.
-            hints: Earlier separating directions of the hulls, shape (pairs, N, 3), initially 0;
-                good ones save time. The directions found are written to it.
+        within (pairs, N) [m], chosen (pairs,), hints (pairs, N, 3).
         """
         import coal
 
@@ -315,14 +286,6 @@ class Clearance:
 
         An interval of time is halved until, by the largest motion of the joints between two hulls
         within it, their margin cannot be more than 0.5 mm below the smallest one found elsewhere.
-
-        Args:
-            motion: The motion.
-            duration: Its length [s].
-
-        Returns:
-            The pair with the smallest margin, by a lower bound of its distance; None if all margins
-            are at least 5 cm.
 
         References:
             Schwarzer, Saha, Latombe (2005), Adaptive dynamic collision checking for robots.

@@ -11,8 +11,6 @@ from robotid.design.design import Designer
 from robotid.design.designed import Design
 from robotid.design.limits import LIMITS, MotionLimits
 
-__all__ = ["Course"]
-
 _MOST = 1000  # samples at which distances are computed
 _FEW = 20  # samples by which the changing distances are found ...
 _STILL = 1e-4  # [m] ... those that change by more than this
@@ -40,10 +38,6 @@ class Course:
         """Return the course of a designed motion at the samples at which its limits were checked.
 
         The torque is the one that its design assumes.
-
-        Args:
-            designer: The designer of the motion.
-            design: The motion.
         """
         t = np.linspace(0.0, design.duration, design.intervals + 1)
         q, v, a = design.motion.evaluate(t)
@@ -60,11 +54,7 @@ class Course:
     ) -> "Course":
         """Return the course of a sampled motion; its jerk by finite differences.
 
-        Args:
-            t: Times, shape (N,) [s].
-            motion: Positions, velocities, accelerations and torques, shape (N, n) each, SI units.
-            limits: The robot's limits.
-            clearance: The distances to collisions.
+        t (N,) [s], motion (N, n).
         """
         q, v, a, torque = motion
         jerk = np.gradient(a, t, axis=0)
@@ -82,12 +72,7 @@ class Course:
         return largest
 
     def peak(self, kind: str, joint: int) -> float:
-        """Return the time of a joint's largest use of a limit [s].
-
-        Args:
-            kind: The limit, of ``LIMITS``.
-            joint: Number of the joint.
-        """
+        """Return the time of a joint's largest use of a limit [s]."""
         return float(self.t[np.argmax(np.abs(self.used[LIMITS.index(kind), :, joint]))])
 
     @cached_property
@@ -99,12 +84,7 @@ class Course:
     def nearness(self, chosen: Array) -> tuple[Array, Array]:
         """Return the smallest distance at each sample, and its pair, shape (N,) each.
 
-        Args:
-            chosen: Pairs of the clearance that are checked, shape (pairs,), bool.
-
-        Returns:
-            Distances [m], inf without any pair, and numbers of pairs. The smallest distances are
-            exact; larger ones are lower bounds.
+        chosen (pairs,).
         """
         distance, pairs = np.full(len(self.t), np.inf), np.zeros(len(self.t), dtype=int)
         left = np.arange(len(self.t) if chosen.any() else 0)
@@ -120,11 +100,7 @@ class Course:
         return distance, pairs
 
     def changes(self, clearance: Clearance) -> Array:
-        """Return which pairs of a clearance change their distance in the motion, (pairs,), bool.
-
-        Args:
-            clearance: The pairs.
-        """
+        """Return which pairs of a clearance change their distance in the motion, (pairs,), bool."""
         few = np.unique(np.linspace(0, len(self.t) - 1, _FEW).astype(int))
         placed = clearance.placed(self.values[0][few])
         change: Array = np.ptp(

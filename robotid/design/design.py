@@ -36,8 +36,6 @@ from robotid.identification.assumptions import (
 from robotid.robot.model import RobotModel
 from robotid.robot.prior import prior_spread
 
-__all__ = ["Designer"]
-
 _PER_PERIOD = 14  # samples of the grid within the shortest period of a basis
 _POLISHED = 3  # times as many in the last rounds ...
 _FINER = 15  # ... and in the final check of the limits
@@ -104,22 +102,7 @@ class Designer:
         correlation: float = CORRELATION,
         run: Run | None = None,
     ) -> "Designer":
-        """Return a designer with the assumptions of a preview on friction and noise.
-
-        Args:
-            model: The robot; with the friction of an earlier run, if there is one.
-            basis: Basis functions of the motion.
-            limits: The robot's limits.
-            name: The criterion.
-            clearance: The distances to collisions.
-            noise: Standard deviation of the torque's noise by joint [N m or N].
-            correlation: Time over which it is correlated [s].
-            run: Earlier logs: the motion complements their information.
-
-        Raises:
-            DataError: If the base floats, or the robot has contacts or loops.
-            SettingsError: If a setting is not usable.
-        """
+        """Return a designer with the assumptions of a preview on friction and noise."""
         criterion(name, np.eye(1))
         mapping = structural_mapping(model)
         size, speed = largest_torques(model, largest_gravity(model)), limits.sizes[1]
@@ -152,17 +135,7 @@ class Designer:
         seconds: float = np.inf,
         progress: Callable[[int, float], None] | None = None,
     ) -> Design:
-        """Return the best motion, checked on a grid 15 times as fine as the first one.
-
-        Args:
-            rng: Random generator of the starts.
-            starts: Number of random starts.
-            seconds: Limit of the computing time [s]; the best motion found by then is returned.
-            progress: Called with the number of the start and the best criterion.
-
-        Raises:
-            SettingsError: If the robot can hold no posture within its limits.
-        """
+        """Return the best motion, checked on a grid 15 times as fine as the first one."""
         began, best = time.monotonic(), np.inf
         history: list[tuple[float, float]] = []
         followed: list[State] = []
@@ -205,8 +178,7 @@ class Designer:
     def checked(self, C: Array) -> Design:
         """Return a motion, scaled down until it satisfies all limits, also between the samples.
 
-        Args:
-            C: Coefficients of a motion, shape (h, n).
+        C (h, n).
         """
         C, contact = self._clear(self._feasible(C, 1.0))
         used, _, rows = self._constraints(C)
@@ -214,13 +186,7 @@ class Designer:
         return self._assessed(self._motion(C), self.basis.duration, information, used, contact)
 
     def examined(self, motion: Motion, duration: float, rate: float) -> Design:
-        """Return the criterion of any motion, and its use of the limits other than jerk.
-
-        Args:
-            motion: The motion.
-            duration: Its length [s].
-            rate: Rate of the samples at which it is evaluated [Hz].
-        """
+        """Return the criterion of any motion, and its use of the limits other than jerk."""
         used, information = self.used_and_informed(motion, duration, rate)
         contact = None
         if self.clearance is not None:
@@ -230,13 +196,7 @@ class Designer:
     def used_and_informed(
         self, motion: Motion, duration: float, rate: float
     ) -> tuple[Array, Array]:
-        """Return a motion's use of limits but jerk, (6, N, n), and its information, (b, b).
-
-        Args:
-            motion: The motion.
-            duration: Its length [s].
-            rate: Rate of the samples at which it is evaluated [Hz].
-        """
+        """Return a motion's use of limits but jerk, (6, N, n), and its information, (b, b)."""
         count = round(duration * rate)
         q, v, a = motion.evaluate(np.linspace(0.0, duration, count + 1))
         rows = self.information.rows(q, v, a)
@@ -306,8 +266,7 @@ class Designer:
     def judged(self, F: Array) -> tuple[float, Array]:
         """Return the criterion of information about the base parameters, and its gradient.
 
-        Args:
-            F: The information, in units of the spread, shape (b, b).
+        F (b, b).
         """
         if self.aim is None:
             return criterion(self.name, F, self.widest)
@@ -329,11 +288,7 @@ class Designer:
         return step
 
     def matrix(self, rows: MotionRows) -> Array:
-        """Return the information of a motion plus the prior's, in units of the spread, (b, b).
-
-        Args:
-            rows: Its rows.
-        """
+        """Return the information of a motion plus the prior's, in units of the spread, (b, b)."""
         return self._informed(rows, self._step)
 
     def _informed(self, rows: MotionRows, step: float) -> Array:
@@ -423,14 +378,7 @@ class Designer:
         return Postures(self.information, self.limits, self.clearance)
 
     def random(self, rng: np.random.Generator) -> Array:
-        """Return the coefficients of a random motion that satisfies the limits, shape (h, n).
-
-        Args:
-            rng: Random generator of the motion.
-
-        Raises:
-            SettingsError: If no posture is found that the robot can hold.
-        """
+        """Return the coefficients of a random motion that satisfies the limits, shape (h, n)."""
         unit = self.limits.sizes[0]
         C = rng.standard_normal((self.basis.size, len(unit))) * unit
         C[:, ~self._moves] = 0.0

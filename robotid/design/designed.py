@@ -7,8 +7,6 @@ from robotid.design.clearance import Contact
 from robotid.design.multipliers import Multipliers
 from robotid.dynamics.simulation.motions import Motion
 
-__all__ = ["Design", "State"]
-
 
 @dataclass(frozen=True, eq=False)
 class Design:

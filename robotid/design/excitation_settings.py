@@ -8,8 +8,6 @@ from robotid.base.exceptions import SettingsError
 from robotid.base.settings import SIZE, Range, Settings, setting
 from robotid.dynamics.simulation.simulation_settings import Payload
 
-__all__ = ["FARTHEST", "ROUTES", "MotionSettings"]
-
 #: Kinds of motion from posture to posture.
 ROUTES = ("sweeps", "stands")
 #: [m] Largest coordinate of an obstacle.

@@ -15,8 +15,6 @@ import numpy as np
 
 from robotid.dynamics.kernels.lanes import compiled
 
-__all__ = ["lower_bounds"]
-
 _STEPS = 20  # largest number of iterations
 
 
@@ -145,20 +143,9 @@ def lower_bounds(
 ):
     """Write lower bounds of the distances of pairs of hulls [m].
 
-    Args:
-        chosen: Numbers of the pairs that are checked, int.
-        pairs: Numbers of two hulls, shape (pairs, 2), int.
-        enough: Distances from which a bound suffices, shape (pairs, N) [m].
-        hints: First directions to try, shape (pairs, N, 3); better ones are written.
-        out: The bounds, shape (pairs, N); written.
-        R: Rotations of the m bodies at N samples, shape (3, 3, m, N).
-        p: Origins of the bodies, shape (3, m, N) [m].
-        bodies: Body of each of h hulls, shape (h,), int; -1: it is fixed.
-        middles: Middle of each in the frame of its body, shape (h, 3) [m].
-        radii: Radii of the bounding spheres about them, shape (h,) [m].
-        half: Half the box around each in the frame of its body, shape (h, 3) [m].
-        points: Corners of all hulls about their middles, shape (k, 3) [m].
-        starts: First corner of each hull, and the number of all, shape (h + 1,), int.
+    pairs (pairs, 2), enough (pairs, N) [m], hints (pairs, N, 3), out (pairs, N), R (3, 3, m,
+    N), p (3, m, N) [m], bodies (h,), middles (h, 3) [m], radii (h,) [m], half (h, 3) [m],
+    points (k, 3) [m], starts (h + 1,).
     """
     centres = _centres(R, p, bodies, middles)
     for k in chosen:

@@ -14,8 +14,6 @@ from robotid.dynamics.drive_columns import drive_motion
 from robotid.robot.drives import DriveMotion, DriveTerm
 from robotid.robot.model import RobotModel
 
-__all__ = ["CRITERIA", "Aim", "MotionInformation", "MotionRows", "criterion"]
-
 #: The optimality criteria.
 CRITERIA = ("D", "A", "E", "condition", "widest")
 _STEP = 1e-6  # of the finite differences of drive columns, in their argument's scale
@@ -95,10 +93,7 @@ class MotionInformation:
     def rows(self, q: Array, v: Array, a: Array) -> MotionRows:
         """Return the rows along a motion of N samples.
 
-        Args:
-            q: Joint coordinates, shape (N, n) [rad or m].
-            v: Velocities, shape (N, n) [rad/s or m/s].
-            a: Accelerations, shape (N, n) [rad/s^2 or m/s^2].
+        q (N, n) [rad or m], v (N, n) [rad/s or m/s], a (N, n) [rad/s^2 or m/s^2].
         """
         W = self._regressor(q, v, a)
         load = (self.beta @ W).T  # drive columns are still 0
@@ -126,20 +121,14 @@ class MotionInformation:
         return values
 
     def torque(self, rows: MotionRows) -> Array:
-        """Return the torque along the motion, shape (N, n) [N m or N].
-
-        Args:
-            rows: The rows.
-        """
+        """Return the torque along the motion, shape (N, n) [N m or N]."""
         torque: Array = (self.beta @ rows.W).T
         return torque
 
     def pull(self, rows: MotionRows, weights: Array) -> tuple[Array, Array, Array]:
         """Return the gradient of sum(weights * W) by q, v and a, shape (N, n) each.
 
-        Args:
-            rows: The rows.
-            weights: Weight of each entry, shape (n, b, N).
+        weights (n, b, N).
         """
         columns, parameters = self._drives
         loads = self.model.layout.drive_loads[:, parameters]
@@ -191,11 +180,7 @@ class Aim:
     def information(self, F: Array) -> tuple[Array, Array]:
         """Return the information about those of interest, and L with d information = L^T dF L.
 
-        Args:
-            F: Information about the base parameters in units of their spread, shape (b, b).
-
-        Returns:
-            Shapes (asked, asked), in units of the spreads and with 1 for the prior; and (b, asked).
+        F (b, b).
         """
         T, rest = self.columns, self.columns.shape[1] - self.asked
         N = T.T @ F @ T + np.eye(T.shape[1])
@@ -207,17 +192,10 @@ class Aim:
 def criterion(name: str, F: Array, widest: Array | None = None) -> tuple[float, Array]:
     """Return a criterion of an information matrix, the smaller the better, and its gradient.
 
-    Args:
-        name: "D": -log det F / b; "A": log(trace F^-1 / b); "E": -log of the smallest eigenvalue;
-            "condition": log of the condition number; "widest": the mean log variance of some.
-        F: Information about b parameters in units of like size, shape (b, b), positive definite.
-        widest: The parameters of the criterion "widest"; all if None.
-
-    Raises:
-        SettingsError: If there is no such criterion.
-
     References:
         Pukelsheim (2006), Optimal Design of Experiments, chapter 6.
+
+    F (b, b).
     """
     if name not in CRITERIA:
         raise SettingsError(f"criterion is {name!r}, wanted one of {', '.join(CRITERIA)}")

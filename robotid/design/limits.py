@@ -12,8 +12,6 @@ from robotid.base.typing import Array
 from robotid.robot.model import RobotModel
 from robotid.robot.tree import Joint
 
-__all__ = ["LIMITS", "MotionLimits"]
-
 #: The limited quantities, in the order of ``MotionLimits.sizes``.
 LIMITS = ("position", "velocity", "acceleration", "jerk", "torque", "power")
 _FREE = np.pi  # [rad] half the range of a continuous joint
@@ -44,21 +42,7 @@ class MotionLimits:
         jerk: float | Mapping[str, float] = np.inf,
         power: float | Mapping[str, float] = np.inf,
     ) -> "MotionLimits":
-        """Return the limits stated in a URDF, and those stated in addition.
-
-        Args:
-            model: The robot.
-            share: Usable share of the URDF's range, velocity and torque.
-            velocity: Largest velocity of all joints, or of some [rad/s or m/s]. Of it and the
-                usable share of the URDF's, the lower one counts.
-            torque: Largest torque, likewise [N m or N].
-            acceleration: Largest acceleration of all joints, or of some [rad/s^2 or m/s^2].
-            jerk: Largest jerk, likewise [rad/s^3 or m/s^3].
-            power: Largest mechanical power, likewise [W].
-
-        Raises:
-            SettingsError: If the URDF lacks a limit that is needed, or one is not usable.
-        """
+        """Return the limits stated in a URDF, and those stated in addition."""
         if not 0 < share <= 1:
             raise SettingsError(f"share is {share}, wanted more than 0 and at most 1")
         fastest = np.array([j.velocity if j.velocity > 0 else np.inf for j in model.limits])
@@ -90,12 +74,7 @@ class MotionLimits:
     def used(self, q: Array, v: Array, a: Array, jerk: Array, torque: Array) -> Array:
         """Return a motion's quantities divided by their limits, signed, shape (6, N, n).
 
-        Args:
-            q: Joint coordinates, shape (N, n); the others likewise, SI units.
-            v: Velocities.
-            a: Accelerations.
-            jerk: Jerks.
-            torque: Torques.
+        q (N, n).
         """
         values = np.array([q - self.middle, v, a, jerk, torque, torque * v])
         return values / self.sizes[:, None]

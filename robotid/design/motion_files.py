@@ -12,22 +12,13 @@ from robotid.base.typing import Array
 from robotid.data.files.table_files import check_suffix, write_columns
 from robotid.dynamics.simulation.motions import Motion
 
-__all__ = ["check_motion_file", "write_motion"]
-
 _UR_JOINTS = 6
 _UR_STEP = 0.008  # [s] of servoj on every UR
 _SETTLES = 1.0  # [s] at rest at the first posture
 
 
 def check_motion_file(target: str | Path) -> None:
-    """Refuse an unknown format of motion files before a design is computed.
-
-    Args:
-        target: The file.
-
-    Raises:
-        DataError: If a motion cannot be written in its format.
-    """
+    """Refuse an unknown format of motion files before a design is computed."""
     if Path(target).suffix not in (".yaml", ".script"):
         check_suffix(Path(target), "motions", also=(".yaml", ".script"))
 
@@ -40,20 +31,6 @@ def write_motion(
     A table has the columns time, q_, dq_ and ddq_ of each joint [s, rad or m], like a log. A .yaml
     file is a trajectory_msgs/JointTrajectory. A .script is a URScript function that moves to the
     first posture and then calls servoj every 8 ms.
-
-    Args:
-        motion: The motion.
-        joints: Names of its n joints.
-        duration: Its length [s].
-        rate: Rows or points per second [Hz]; a .script has 125.
-        target: The file; written under a temporary name, then renamed.
-
-    Returns:
-        Path of the file.
-
-    Raises:
-        DataError: If the folder does not exist, or a table cannot be written in that format.
-        SettingsError: If the rate is not positive, or the robot of a .script has not 6 joints.
     """
     path = Path(target)
     if not 0 < rate < np.inf:

@@ -10,8 +10,6 @@ import numpy as np
 
 from robotid.base.typing import Array
 
-__all__ = ["SOFT", "SPARE", "Multipliers"]
-
 #: Share of limits reserved for the motion between the samples of a design.
 SPARE = 0.003
 #: Distance whose violation has the cost of a whole limit [m].
@@ -34,11 +32,7 @@ class Multipliers:
     distances: Array | float = 0.0
 
     def finer(self, times: int) -> "Multipliers":
-        """Return the same on a finer grid.
-
-        Args:
-            times: Ratio of the numbers of intervals.
-        """
+        """Return the same on a finer grid."""
         limits, distances = _between(self.limits, times), _between(self.distances, times)
         return Multipliers(self.weight / times, limits, distances)
 
@@ -49,10 +43,7 @@ class Multipliers:
     def raised(self, used: Array, distance: Array | None, aim: Array) -> "Multipliers":
         """Return the slopes as the new multipliers.
 
-        Args:
-            used: Shares of limits used, shape (6, N, n).
-            distance: Distances of pairs, shape (pairs, N) [m]; None: they are not checked.
-            aim: Required distances, shape (pairs, 1) [m].
+        used (6, N, n), distance (pairs, N) [m], aim (pairs, 1) [m].
         """
         distances = 0.0 if distance is None else self.of_distances(distance, aim)[1]
         return replace(self, limits=self.of_limits(used)[1], distances=distances)
@@ -60,25 +51,21 @@ class Multipliers:
     def of_limits(self, used: Array) -> tuple[float, Array]:
         """Return the cost of limits and its derivative by their violations, shape (6, N, n).
 
-        Args:
-            used: Shares of limits used, shape (6, N, n).
+        used (6, N, n).
         """
         return self._cost(used**2 / (1.0 - SPARE) ** 2 - 1.0, self.limits)
 
     def of_distances(self, distance: Array, aim: Array) -> tuple[float, Array]:
         """Return the cost of distances and its derivative by their deficits, shape (pairs, N).
 
-        Args:
-            distance: Distances of pairs, shape (pairs, N) [m].
-            aim: Required distances, shape (pairs, 1) [m].
+        distance (pairs, N) [m], aim (pairs, 1) [m].
         """
         return self._cost((aim - distance) / SOFT, self.distances)
 
     def distance_without_cost(self, aim: Array) -> Array:
         """Return the distances from which there is no cost, shape (pairs, N) or (pairs, 1) [m].
 
-        Args:
-            aim: Required distances, shape (pairs, 1) [m].
+        aim (pairs, 1) [m].
         """
         return aim + SOFT / self.weight * self.distances
 

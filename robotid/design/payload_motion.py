@@ -28,8 +28,6 @@ from robotid.robot.model import RobotModel
 from robotid.robot.parameters import INERTIAL_TERMS
 from robotid.robot.prior import payload_spread
 
-__all__ = ["PayloadDesign", "design_payload"]
-
 _PARAMETERS = len(INERTIAL_TERMS)
 _RUNS = 2.0  # of the same noise: with the payload and without it
 _CHANGE = 10.0  # prior deviations by which friction and offsets may change between the runs
@@ -119,22 +117,7 @@ def design_payload(
     seconds: float = np.inf,
     progress: Callable[[int, float], None] | None = None,
 ) -> PayloadDesign:
-    """Return a motion of the few joints next to a link that determines the payload on the link.
-
-    Args:
-        designer: The robot, its limits and the basis functions.
-        rng: Random generator of the starts.
-        payload: The link, the last moving one if it is empty; and its payload, as far as it is
-            known: the motion obeys the limits with it and without it.
-        moving: Joints that move; if none, the fewest before the link that determine all ten.
-        starts: As of ``Designer.design``.
-        seconds: As of ``Designer.design``.
-        progress: As of ``Designer.design``.
-
-    Raises:
-        NotConvergedError: If the motion exceeds a limit without the payload.
-        SettingsError: If the link does not move, or a joint does not move it.
-    """
+    """Return a motion of the few joints next to a link that determines the payload on the link."""
     model = designer.information.model
     payload = replace(payload, link=payload.link or model.layout.bodies[-1])
     chain = _joints_before(model, payload.link)

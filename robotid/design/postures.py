@@ -12,8 +12,6 @@ from robotid.design.information import MotionInformation
 from robotid.design.limits import LIMITS, MotionLimits
 from robotid.design.multipliers import SOFT
 
-__all__ = ["Postures"]
-
 _TRIED = 200  # random postures tried for one that the robot can hold ...
 _AT_ONCE = 10  # ... so many at a time
 _REPAIRS = 300  # joints that are redrawn of a posture that violates a limit, one after another
@@ -34,15 +32,7 @@ class Postures:
     clearance: Clearance | None = None
 
     def resting(self, rng: np.random.Generator, tried: int = _TRIED) -> Array:
-        """Return the random postures that satisfy limits and distances at rest, shape (k, n).
-
-        Args:
-            rng: Random generator of the postures.
-            tried: Number of random postures.
-
-        Raises:
-            SettingsError: If none of them does.
-        """
+        """Return the random postures that satisfy limits and distances at rest, shape (k, n)."""
         q = self._drawn(rng, tried)
         found: Array = q[self.can_rest(q)]
         if not len(found):
@@ -80,14 +70,7 @@ class Postures:
         return by_joint
 
     def one(self, rng: np.random.Generator) -> Array:
-        """Return the first of ``resting``, which are tried a few at a time, shape (n,).
-
-        Args:
-            rng: Random generator of the postures.
-
-        Raises:
-            SettingsError: If no posture is feasible.
-        """
+        """Return the first of ``resting``, which are tried a few at a time, shape (n,)."""
         for _ in range(_TRIED // _AT_ONCE):
             q = self._drawn(rng, _AT_ONCE)
             found: Array = q[self.can_rest(q)]
@@ -108,8 +91,7 @@ class Postures:
     def can_rest(self, q: Array) -> Array:
         """Return whether postures satisfy limits and distances at rest, shape (N,), bool.
 
-        Args:
-            q: Postures, shape (N, n) [rad or m].
+        q (N, n) [rad or m].
         """
         used, margins = self._at_rest(q)
         is_clear = (margins >= 0.0).all(axis=0)

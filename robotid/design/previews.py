@@ -60,8 +60,6 @@ from robotid.robot.closure import refuse_loops
 from robotid.robot.model import RobotModel
 from robotid.robot.prior import prior_spread
 
-__all__ = ["Preview", "Run", "preview", "preview_logs"]
-
 #: Typical weight of a consistent fit's prior with "auto", and the plausible weight: the largest one
 #: that held-out segments do not reject, for robots that differ from their URDF as much.
 _WEIGHT = (10.0, 1.0)
@@ -95,16 +93,7 @@ class Run:
 
     @classmethod
     def of(cls, recordings: Recordings, standard: Array, details: Mapping[str, Any]) -> "Run":
-        """Return the run of logs that were identified earlier.
-
-        Args:
-            recordings: Its fitted logs, with the model that includes the identified friction.
-            standard: The identified parameters, shape (p,).
-            details: Details of its estimate.
-
-        Raises:
-            DataError: If a log cannot be used.
-        """
+        """Return the run of logs that were identified earlier: standard (p,)."""
         reductions = recordings.reduce()
         whole = join(reductions)
         segments = tuple(part.factors for part in reductions if part.factors.rows.any())
@@ -124,8 +113,7 @@ class Run:
         The scatter of a joint's score depends on the direction. The geometric mean over the
         parameters, weighted by the joint's share of their variance, is used.
 
-        Args:
-            K: Map to the base parameters, shape (b, p).
+        K (b, p).
         """
         factors, beta = self.factors, K @ self.standard
         sigma = np.sqrt(factors.residual_squares(beta) / np.maximum(factors.rows, 1))
@@ -151,9 +139,7 @@ class Run:
     def meat(self, K: Array, sigma: Array) -> Array:
         """Return the covariance of its score for samples weighted by sigma^-2, shape (b, b).
 
-        Args:
-            K: Map to the base parameters, shape (b, p).
-            sigma: Noise level per joint, shape (n,) [N m or N].
+        K (b, p), sigma (n,) [N m or N].
         """
         factors, beta = self.factors, K @ self.standard
         if len(self.segments) < FEWEST_SEGMENTS:
@@ -290,22 +276,7 @@ def preview_logs(
     run: Run | None = None,
     like: Run | None = None,
 ) -> Preview:
-    """Return the expected standard errors of motions that were read.
-
-    Args:
-        model: The robot, with the friction that an earlier run identified.
-        motions: The motions, in memory.
-        choice: Which estimator.
-        noise: As of ``preview``.
-        correlation: Correlation time of stated or assumed noise [s]; if None, that of an earlier
-            run, or 0.1 s.
-        run: An earlier run, if any, whose information is added.
-        like: A run whose noise and parameters are used, without adding its information.
-
-    Raises:
-        DataError: As of ``preview``.
-        SettingsError: As of ``preview``.
-    """
+    """Return the expected standard errors of motions that were read."""
     if not motions:
         raise DataError("no motion was given; at least one is needed to preview anything")
     refuse_loops(model, "a preview")

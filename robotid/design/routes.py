@@ -13,8 +13,6 @@ from robotid.design.design import Designer
 from robotid.design.designed import Design
 from robotid.dynamics.simulation.motions import Motion
 
-__all__ = ["Route", "design_stands", "design_sweeps"]
-
 _RAMP = 0.25  # [s] until a sweep has its speed
 _SPEEDS = (0.03, 0.1, 0.3, 0.8)  # of sweeps, as shares of the joint's largest speed
 _STROKE = 3.0  # [s] largest duration of a sweep ...
@@ -85,14 +83,6 @@ def design_sweeps(
 
     Each joint sweeps about one posture, through it in both directions, at each speed; the others
     rest.
-
-    Args:
-        designer: The parameters and the limits.
-        rng: Random generator of the posture.
-        speeds: Shares of each joint's largest speed.
-
-    Raises:
-        SettingsError: If no posture is found about which every joint can sweep.
     """
     postures = designer.postures.resting(rng, _CANDIDATES)[:_SWEPT]
     ranges = [_free_range(designer, posture) for posture in postures]  # (n, 2) each
@@ -149,14 +139,6 @@ def design_stands(designer: Designer, rng: np.random.Generator, count: int = 20)
 
     The postures are chosen one by one from random ones: each adds the most to log det of the
     information of those before. The motion goes from each to the nearest that is not visited yet.
-
-    Args:
-        designer: The parameters and the limits.
-        rng: Random generator of the postures.
-        count: Number of static postures.
-
-    Raises:
-        SettingsError: If there are too few postures, or no line between them is collision-free.
 
     References:
         Fedorov (1972), Theory of Optimal Experiments.

@@ -1,3 +1,1 @@
 """What is wrong, with evidence: the URDF, the logs, the residual, the verdict."""
-
-__all__: list[str] = []

@@ -1,3 +1,1 @@
 """Torque linear in the parameters: rows of W theta = tau, base parameters, factors, prediction."""
-
-__all__: list[str] = []

@@ -18,14 +18,6 @@ from robotid.dynamics.problem import Problem
 from robotid.dynamics.torque import random_regressor
 from robotid.robot.model import RobotModel
 
-__all__ = [
-    "RANK_TOLERANCE",
-    "BaseMapping",
-    "base_mapping",
-    "independent_factors",
-    "structural_mapping",
-]
-
 #: Pivots below this share of the largest count as 0. Over example-robot-data, every pivot is above
 #: 1e-3 or below 1e-12, except with rounded angles in a URDF (3.1416): 1e-5 to 1e-6.
 RANK_TOLERANCE = 1e-4
@@ -72,15 +64,7 @@ class BaseMapping:
         return tuple(self.names[i] for i in np.flatnonzero(~self.K.any(axis=0)))
 
     def described(self, names: Sequence[str]) -> dict[str, tuple[str, ...]]:
-        """Return how some standard parameters are structurally identifiable.
-
-        Args:
-            names: Standard parameters.
-
-        Returns:
-            The names by kind: "alone", the parameter is a base parameter itself; "in sums", only
-            its sum with others is identifiable; "never", not identifiable by any motion.
-        """
+        """Return how some standard parameters are structurally identifiable."""
         terms = np.abs(self.K) > 0
         kinds: dict[str, tuple[str, ...]] = {"alone": (), "in sums": (), "never": ()}
         for name in names:
@@ -91,14 +75,7 @@ class BaseMapping:
         return kinds
 
     def to_base(self, pi: Array) -> Array:
-        """Return the base parameters beta = K pi, shape (b,).
-
-        Args:
-            pi: Standard parameters, shape (p,), SI units, in ``names`` order.
-
-        Raises:
-            DataError: If pi does not have p entries.
-        """
+        """Return the base parameters beta = K pi, shape (b,): pi (p,)."""
         if pi.shape != (self.K.shape[1],):
             raise DataError(f"pi has shape {pi.shape}, wanted ({self.K.shape[1]},)")
         return self.K @ pi
@@ -109,17 +86,7 @@ class BaseMapping:
         Nearest in units of the spread: pi = prior + G (beta - K prior) with
         G = S^2 K^T (K S^2 K^T)^-1, S = diag(spread).
 
-        Args:
-            beta: Base parameters, shape (b,).
-            prior: Prior standard parameters, shape (p,).
-            spread: Prior standard deviation of each, shape (p,); 1 if None.
-
-        Returns:
-            Standard parameters, shape (p,), with K pi = beta. They need not be physically
-            consistent.
-
-        Raises:
-            DataError: If a shape is not the expected one.
+        beta (b,), prior (p,), spread (p,) -> (p,).
         """
         if beta.shape != (len(self.K),):
             raise DataError(f"beta has shape {beta.shape}, wanted ({len(self.K)},)")
@@ -129,8 +96,7 @@ class BaseMapping:
     def gain(self, spread: Array | None = None) -> Array:
         """Return G = S^2 K^T (K S^2 K^T)^-1, shape (p, b): the change of pi per change of beta.
 
-        Args:
-            spread: Prior standard deviation of each standard parameter, shape (p,); 1 if None.
+        spread (p,).
         """
         s = np.ones(self.K.shape[1]) if spread is None else spread
         # K S = (Q R)^T, so that S (K S)^+ = S Q R^-T has no loss of digits
@@ -139,14 +105,7 @@ class BaseMapping:
         return gain
 
     def reduce(self, problem: Problem) -> Problem:
-        """Return the problem in the b base parameters, W_b beta = tau.
-
-        Args:
-            problem: A problem over the standard parameters.
-
-        Raises:
-            DataError: If the columns of the problem are not those of this mapping.
-        """
+        """Return the problem in the b base parameters, W_b beta = tau."""
         if problem.names != self.names:
             raise DataError(
                 f"the problem has {len(problem.names)} columns, wanted the {len(self.names)} of "
@@ -169,22 +128,10 @@ def base_mapping(
     The columns are compared after multiplication by ``scales``, physical magnitudes. They are not
     normalised, since a column of rounding errors would become a parameter.
 
-    Args:
-        W: Regressor at enough random states, shape (m, p), m >= p.
-        names: Names of the columns.
-        scales: Magnitude of each parameter, shape (p,); 1 if None. See
-            ``ParameterLayout.scales``.
-        preference: Preference of each column when the independent columns are chosen, shape (p,);
-            1 if None. It changes which groups are formed, not their number. See
-            ``ParameterLayout.preference``.
-        rtol: Pivots below this share of the largest count as 0.
-        n_rows: Rows of W per sample, each of another equation.
-
-    Raises:
-        DataError: If a shape is not the expected one, W is not finite or all zero.
-
     References:
         Gautier (1991), Numerical calculation of the base inertial parameters of robots.
+
+    W (m, p), scales (p,), preference (p,).
     """
     if W.ndim != 2 or W.shape[1] != len(names) or len(W) < len(names):
         raise DataError(f"W has shape {W.shape}, wanted at least {len(names)} rows of {len(names)}")
@@ -215,12 +162,7 @@ def independent_factors(W: Array, n_rows: int) -> list[tuple[Array, Array]]:
 
     For example, arms on a common fixed base are such parts.
 
-    Args:
-        W: Regressor, shape (N n_rows, p).
-        n_rows: Rows per sample, each of another equation.
-
-    Returns:
-        For each part its c columns, and their R with R^T R = W^T W, shape (c, c).
+    W (N n_rows, p) -> (c, c).
     """
     samples = W.reshape(-1, n_rows, W.shape[1])
     filled = (samples != 0.0).any(axis=0)  # (n_rows, p)
@@ -237,11 +179,7 @@ def independent_factors(W: Array, n_rows: int) -> list[tuple[Array, Array]]:
 
 
 def _linked_parts(linked: Array) -> tuple[int, Array]:
-    """Return the number of parts of a graph, and the part of each node, int.
-
-    Args:
-        linked: Which nodes are linked, flags, shape (m, m), symmetric.
-    """
+    """Return the number of parts of a graph, and the part of each node, int: linked (m, m)."""
     if linked.all(axis=1).any():  # to one node, as to the first joint of an arm
         return 1, np.zeros(len(linked), dtype=int)
     from scipy.sparse.csgraph import connected_components  # takes long to import
@@ -258,9 +196,7 @@ def _factor(rows: Array, filled: Array) -> Array:
     columns of each are adjacent in a suitable order. If the equations are not nested so, the rows
     are factored as a whole.
 
-    Args:
-        rows: W, shape (N, m, c).
-        filled: Columns of each equation, shape (m, c), bool.
+    rows (N, m, c), filled (m, c).
     """
     c, filled = rows.shape[2], _with_carried(filled)
     fewest = np.argsort(filled.sum(axis=1), kind="stable")
@@ -311,10 +247,6 @@ def _pivot(R: Array, columns: Array) -> tuple[Array, Array]:
 
     LAPACK's QR with column pivoting chooses the remaining column with the largest norm; later
     columns are slightly shortened, so that of equal ones the first is chosen despite rounding.
-
-    Args:
-        R: The columns.
-        columns: Their indices among all columns.
     """
     triangle, order = scipy.linalg.qr(R * (1.0 - _TIE * columns), mode="r", pivoting=True)
     sizes = np.zeros(len(columns))
@@ -341,11 +273,6 @@ def structural_mapping(
 
     Further terms of single drives do not change the base parameters without them. They add new
     ones, or are added to existing sums, for example a torque with the period of gravity.
-
-    Args:
-        model: The robot.
-        inertial_only: Whether to exclude the drive terms.
-        plain: The mapping without further terms of single drives, if it is known.
     """
     columns = model.layout.n_inertial if inertial_only else len(model.layout.names)
     if model.layout.own and not inertial_only:

@@ -20,18 +20,6 @@ from robotid.dynamics.drive_columns import RowPlan
 if TYPE_CHECKING:
     from robotid.robot.model import RobotModel
 
-__all__ = [
-    "LONG_ENOUGH",
-    "Tree",
-    "flatten",
-    "joint_constants",
-    "keeps_code",
-    "own_motion",
-    "row_lanes",
-    "why_not",
-    "work_per_sample",
-]
-
 #: Work, samples times ``work_per_sample``, from which the compiled path is faster despite its start
 #: of about 0.5 s per process (importing Numba, reading the compiled code). For seven joints in
 #: series that is 1e5 samples. Compiling it takes some 10 s, once per installation.
@@ -39,23 +27,12 @@ LONG_ENOUGH = 3_500_000
 
 
 def work_per_sample(model: "RobotModel") -> int:
-    """Return the work of one sample: pairs of a body and a joint that moves it, plus a constant.
-
-    Args:
-        model: The robot.
-
-    Returns:
-        The work, in units of about 0.15 us of Pinocchio's function called from Python.
-    """
+    """Return the work of one sample: pairs of a body and a joint that moves it, plus a constant."""
     return 8 + sum(len(support) - 1 for support in model.pin_model.supports[1:])
 
 
 def why_not(model: "RobotModel") -> str | None:
-    """Return why the compiled path does not support a robot, or None if it does.
-
-    Args:
-        model: The robot.
-    """
+    """Return why the compiled path does not support a robot, or None if it does."""
     joints, first = list(model.pin_model.joints), 2 if model.free_flyer else 1
     for name, joint in list(zip(model.pin_model.names, joints, strict=True))[first:]:
         if joint.nv != 1 or not _is_simple(_joint_axis(model.pin_model, joint.id)):
@@ -88,14 +65,7 @@ class CompiledWriter:
         self._work = tree.work_space()
 
     def load(self, motion: Trajectory, part: slice, values: Array, weights: Array | None) -> None:
-        """Load the samples of the next blocks, and their drive columns.
-
-        Args:
-            motion: The trajectory.
-            part: Its samples to load.
-            values: As of ``drive_values``, shape (k, N).
-            weights: Weight of each row; None: all 1.
-        """
+        """Load the samples of the next blocks, and their drive columns: values (k, N)."""
         q, v, a, tau = motion.q[part], motion.v[part], motion.a[part], motion.tau[part]
         if self._model.free_flyer:  # the pose has one more entry than the twist
             self._motion = own_motion(q[:, 1:], v, a, _base_state(self._model, q, v, a))
@@ -160,19 +130,14 @@ class Tree(NamedTuple):
     def places(self, wanted: Array) -> Array:
         """Return the places of the columns of each body in each of its rows, shape (B, D, 10).
 
-        Args:
-            wanted: Place of each inertial column in each row, shape (n_rows, 10 B), int; -1: none.
+        wanted (n_rows, 10 B).
         """
         by_body = wanted.reshape(len(wanted), -1, 10).swapaxes(0, 1)  # (B, n_rows, 10)
         found = np.take_along_axis(by_body, self.rows.clip(min=0)[..., None], axis=1)
         return np.where(self.rows[..., None] >= 0, found, -1)
 
     def part(self, bodies: Array) -> "Tree":
-        """Return some bodies as a separate tree.
-
-        Args:
-            bodies: Their indices, ascending, shape (k,); with each body also its parents.
-        """
+        """Return some bodies as a separate tree: bodies (k,)."""
         place = {-1: -1} | {int(body): k for k, body in enumerate(bodies)}
         parents = np.array([place[int(i)] for i in self.parents[bodies]])
         own = {name: getattr(self, name)[bodies] for name in self._fields[1:-2]}
@@ -185,11 +150,8 @@ def own_motion(
 ) -> tuple[Array, Array, Array, Array]:
     """Return writable copies in C order: for other arrays Numba would compile again.
 
-    Args:
-        q: Coordinates, shape (N, n_rows) [rad, m].
-        v: Velocities, shape (N, n_rows) [rad/s, m/s].
-        a: Accelerations, shape (N, n_rows) [rad/s^2, m/s^2].
-        base: State of a floating base, shape (12, N), as of ``inertial_rows``; None: it is fixed.
+    q (N, n_rows) [rad, m], v (N, n_rows) [rad/s, m/s], a (N, n_rows) [rad/s^2, m/s^2], base
+    (12, N).
     """
     base = np.zeros((12, 0)) if base is None else base
     q, v, a, base = (np.array(x, dtype=float, order="C") for x in (q, v, a, base))
@@ -197,11 +159,7 @@ def own_motion(
 
 
 def flatten(model: "RobotModel") -> Tree:
-    """Return a robot as arrays.
-
-    Args:
-        model: The robot; ``why_not`` must return None for it.
-    """
+    """Return a robot as arrays."""
     pin_model, G = model.pin_model, model.velocity_map
     size = pin_model.njoints - 1
     parents = np.array([int(parent) - 1 for parent in pin_model.parents])[1:]
@@ -238,12 +196,7 @@ def _places(tree: Tree, plan: RowPlan) -> Array:
 
 
 def joint_constants(pin_model: pin.Model, body: int) -> Array:
-    """Return A, B, C (by columns), p0, d and the axis (v, w) of a joint, shape (39,).
-
-    Args:
-        pin_model: The robot.
-        body: Index of the joint.
-    """
+    """Return A, B, C (by columns), p0, d and the axis (v, w) of a joint, shape (39,)."""
     linear, angular = _joint_axis(pin_model, body).reshape(2, 3)
     P, p0 = pin_model.jointPlacements[body].rotation, pin_model.jointPlacements[body].translation
     along = np.outer(angular, angular)

@@ -24,20 +24,6 @@ from robotid.dynamics.problem import RowSource
 from robotid.robot.constraints import Contact, frame_id
 from robotid.robot.model import RobotModel
 
-__all__ = [
-    "ProjectedRows",
-    "constrained",
-    "constraint_forces",
-    "constraint_jacobian",
-    "contact_links",
-    "force_basis",
-    "logged_base",
-    "loop_basis",
-    "mixed_rows",
-    "touching",
-    "without_forces",
-]
-
 _RANK = 1e-8  # singular values below this share of the largest are of dependent constraints ...
 _WEAK = 0.01  # ... if rows of the base alone are used, which feet of equal height hardly load
 _AS_IS = BaseSource()
@@ -48,13 +34,7 @@ _CACHED = 64  # samples that are projected together
 def constraint_jacobian(model: RobotModel, q: Array, contacts: Array) -> Array:
     """Return the Jacobian of a robot's constraints at each sample, shape (N, m, n_rows).
 
-    Args:
-        model: The robot; its contacts have the axes that they state, its loops those of the world.
-        q: Joint coordinates, shape (N, n) or (N, 7 + n) [rad, m].
-        contacts: Which contacts touch the ground, shape (N, k), bool; the rows of others are 0.
-
-    Raises:
-        DataError: If the shape of q is not that of the model.
+    q (N, n) [rad, m], contacts (N, k).
     """
     pin_model, G = model.pin_model, model.velocity_map
     data, axes = pin_model.createData(), pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
@@ -76,12 +56,7 @@ def constraint_jacobian(model: RobotModel, q: Array, contacts: Array) -> Array:
 def contact_links(model: RobotModel, q: Array) -> tuple[Array, Array]:
     """Return axes and Jacobians of rotation of the links of contacts, with the world's axes.
 
-    Args:
-        model: The robot.
-        q: Joint coordinates, shape (N, n) or (N, 7 + n) [rad, m].
-
-    Returns:
-        Axes, shape (N, k, 3, 3), and Jacobians, shape (N, k, 3, n_rows).
+    q (N, n) [rad, m] -> (N, k, 3, 3), (N, k, 3, n_rows).
     """
     pin_model, data = model.pin_model, model.pin_model.createData()
     frames = [frame_id(pin_model, x.frame) for x in model.contacts]
@@ -103,13 +78,7 @@ def force_basis(J: Array, used: Array, floats: bool = False) -> Array:
     their vertical forces are known. In the rows of a floating base alone, forces that would have to
     be a hundred times larger than others for an effect of the same size are taken to have none.
 
-    Args:
-        J: Jacobians of the constraints, shape (N, m, n_rows).
-        used: Rows used, shape (N, n_rows), bool: the torques are those in these rows.
-        floats: Whether the first six rows are those of a floating base.
-
-    Returns:
-        B with columns of length 1 or 0, shape (N, n_rows, k), k the smaller of m and n_rows.
+    J (N, m, n_rows), used (N, n_rows) -> (N, n_rows, k).
     """
     A = J.swapaxes(1, 2) * used[:, :, None]
     parts, least = [], _least(used, floats)
@@ -128,9 +97,7 @@ def _least(used: Array, floats: bool) -> float:
 def loop_basis(model: RobotModel, q: Array) -> Array:
     """Return bases of the torques that the forces of loops can cause, as of ``force_basis``.
 
-    Args:
-        model: The robot.
-        q: Joint coordinates, shape (N, n) or (N, 7 + n) [rad, m].
+    q (N, n) [rad, m].
     """
     J = constraint_jacobian(replace(model, constraints=model.loops), q, np.ones((len(q), 0)))
     return force_basis(J, np.ones((len(q), model.n_rows), dtype=bool))
@@ -139,9 +106,7 @@ def loop_basis(model: RobotModel, q: Array) -> Array:
 def without_forces(basis: Array, rows: Array) -> Array:
     """Return rows orthogonal to the torques of constraint forces, same shape.
 
-    Args:
-        basis: As of ``force_basis``, shape (N, n_rows, m).
-        rows: Torques, shape (N, n_rows), or regressors, shape (N, n_rows, c).
+    basis (N, n_rows, m), rows (N, n_rows).
     """
     if rows.ndim == 2:
         return without_forces(basis, rows[..., None])[..., 0]
@@ -152,9 +117,7 @@ def without_forces(basis: Array, rows: Array) -> Array:
 def mixed_rows(basis: Array, weights: Array) -> Array:
     """Return the rows that are used or projected into used rows, shape (n_rows,), bool.
 
-    Args:
-        basis: As of ``force_basis``.
-        weights: Weight of each row, shape (N, n_rows).
+    weights (N, n_rows).
     """
     return np.asarray(np.any(weights, axis=0) | np.any(basis, axis=(0, 2)))
 
@@ -234,11 +197,7 @@ def constrained(
     Torques of measured forces are subtracted, those of unknown forces are eliminated. Rows in which
     nothing remains, and samples at which a contact changes or the base jumps, are not used.
 
-    Args:
-        model: The robot.
-        motion: Its motion, with contacts and wrenches.
-        used: Rows used for other reasons, shape (N, n_rows), bool.
-        has_torque: Whether torques of the joints were measured; else their rows are not used.
+    used (N, n_rows).
     """
     if not has_torque:
         used = used & (np.arange(model.n_rows) < model.n_rows - len(model.joints))
@@ -260,15 +219,7 @@ def constrained(
 
 
 def touching(model: RobotModel, motion: Trajectory) -> Array:
-    """Return which contacts of a robot may touch the ground, shape (N, k), bool.
-
-    Args:
-        model: The robot.
-        motion: Its motion.
-
-    Raises:
-        DataError: If the motion has flags of another number of contacts.
-    """
+    """Return which contacts of a robot may touch the ground, shape (N, k), bool."""
     contacts = np.ones((len(motion.t), len(model.contacts)), dtype=bool)
     if motion.contacts is not None:
         flagged = [not x.always for x in model.contacts]
@@ -287,11 +238,7 @@ def constraint_forces(model: RobotModel, motion: Trajectory, torque: Array, used
 
     Unknown ones are those of least squares.
 
-    Args:
-        model: The robot.
-        motion: Its motion, as of ``constrained``.
-        torque: W pi, the torque without constraint forces, shape (N, n_rows) [N m, N].
-        used: Rows used, shape (N, n_rows), bool.
+    torque (N, n_rows) [N m, N], used (N, n_rows).
     """
     J = constraint_jacobian(model, motion.q, touching(model, motion))
     known, tau = _measured(model), motion.tau if motion.loaded is None else motion.loaded
@@ -306,15 +253,7 @@ def constraint_forces(model: RobotModel, motion: Trajectory, torque: Array, used
 
 
 def logged_base(model: RobotModel, source: BaseSource = _AS_IS) -> BaseColumns:
-    """Return the columns of a floating base and of contacts that logs of a robot have.
-
-    Args:
-        model: The robot.
-        source: Axes of the velocities of the base, its link, and the link of its IMU.
-
-    Raises:
-        ModelError: If a link is unknown, or that of the IMU is not fixed to the base.
-    """
+    """Return the columns of a floating base and of contacts that logs of a robot have."""
     link = source.link or ""
     if link:
         _require_link(model, link, "link")

@@ -11,19 +11,6 @@ from robotid.data.log import Trajectory
 from robotid.robot.drives import DriveMotion
 from robotid.robot.parameters import ParameterLayout
 
-__all__ = [
-    "RowPlan",
-    "drive_motion",
-    "drive_values",
-    "friction_directions",
-    "friction_speeds",
-    "instant_state",
-    "plan_rows",
-    "remembered",
-    "sure_rows",
-    "trajectory_values",
-]
-
 
 @dataclass(frozen=True)
 class RowPlan:
@@ -56,16 +43,8 @@ def drive_values(
 
     Row j of the regressor has them times ``layout.drive_loads[j]``.
 
-    Args:
-        layout: The standard parameters.
-        q: Joint coordinates, shape (N, n) or (N, 7 + n) [rad, m]; those of the joints come last.
-        v: Velocities, shape (N, n_rows) [rad/s, m/s]; those of the joints come last.
-        a: Accelerations, shape (N, n_rows) [rad/s^2, m/s^2].
-        direction: As of ``friction_directions``, shape (N, c).
-        memory: As of ``Trajectory.memory``, shape (N, m); None if the layout has none.
-
-    Raises:
-        DataError: If the shape of direction or memory is not the expected one.
+    q (N, n) [rad, m], v (N, n_rows) [rad/s, m/s], a (N, n_rows) [rad/s^2, m/s^2], direction (N,
+    c), memory (N, m).
     """
     motion = drive_motion(layout, q, v, a, direction)
     states = np.empty((len(v), 0)) if memory is None else memory
@@ -85,13 +64,7 @@ def drive_values(
 def trajectory_values(
     layout: ParameterLayout, motion: Trajectory, part: slice = slice(None)
 ) -> Array:
-    """Return the columns of drive parameters along a trajectory, (k, N); see ``drive_values``.
-
-    Args:
-        layout: The standard parameters.
-        motion: The trajectory.
-        part: N samples of it.
-    """
+    """Return the columns of drive parameters along a trajectory, (k, N); see ``drive_values``."""
     direction, memory = (None if x is None else x[part] for x in (motion.direction, motion.memory))
     signs = friction_directions(layout, motion.v[part], direction)
     state = motion.q[part], motion.v[part], motion.a[part]
@@ -110,15 +83,7 @@ def drive_motion(
 ) -> DriveMotion:
     """Return the motion and load of drives, arrays of shape (d, N).
 
-    Args:
-        layout: The standard parameters.
-        q: Joint coordinates, as of ``drive_values``.
-        v: Velocities, as of ``drive_values``.
-        a: Accelerations, as of ``drive_values``.
-        direction: As of ``friction_directions``, shape (N, c).
-        load: Torque of the rigid bodies in the rows of the joints, shape (N, n) [N m, N]; None: 0.
-        rate: Time derivative of the whole torque in them, shape (N, n) [N m/s, N/s]; None: 0.
-        begins: First samples of segments, shape (N,), bool; None: the samples are not a sequence.
+    direction (N, c), load (N, n) [N m, N], rate (N, n) [N m/s, N/s], begins (N,).
     """
     R = layout.drive_ratios
     n = R.shape[1]
@@ -143,13 +108,7 @@ def instant_state(
 
     Internal states are at their steady value, and the torque is constant.
 
-    Args:
-        layout: The standard parameters.
-        q: Joint coordinates, as of ``drive_values``.
-        v: Velocities, as of ``drive_values``.
-        a: Accelerations, as of ``drive_values``.
-        direction: As of ``friction_directions``, shape (N, c), or None.
-        load: Torque of the rigid bodies in the rows of the joints, shape (N, n) [N m, N].
+    direction (N, c), load (N, n) [N m, N].
     """
     signs = friction_directions(layout, v, direction)
     return remembered(layout, drive_motion(layout, q, v, a, signs, load))
@@ -158,9 +117,7 @@ def instant_state(
 def remembered(layout: ParameterLayout, motion: DriveMotion) -> Array:
     """Return the columns of drive parameters with internal state or load, shape (N, m).
 
-    Args:
-        layout: The standard parameters.
-        motion: Motion of the d drives, arrays of shape (d, N).
+    motion (d, N).
     """
     own = [layout.drive_parameters[k] for k in layout.remembering]
     return np.column_stack([term.column(motion.of(d)) for d, term in own])
@@ -169,13 +126,7 @@ def remembered(layout: ParameterLayout, motion: DriveMotion) -> Array:
 def friction_speeds(layout: ParameterLayout) -> Array:
     """Return the speeds whose sign is the direction of friction: of joints, then of couplings.
 
-    Args:
-        layout: The standard parameters of a robot with n joints.
-
-    Returns:
-        Their ratios to the speeds of the joints, w = ratios v, shape (c, n), with w in rad/s for
-        prismatic joints too (``drive_speeds``); c is the number of drives, or 0 if no term of the
-        layout depends on a direction.
+    -> (c, n).
     """
     ratios: Array = layout.drive_ratios / layout.drive_speeds[:, None]
     return ratios if layout.follows_direction else ratios[:0]
@@ -184,10 +135,7 @@ def friction_speeds(layout: ParameterLayout) -> Array:
 def sure_rows(layout: ParameterLayout, v: Array, least: float) -> Array:
     """Return the rows in which the sign of friction is certain, shape (N, n_rows), bool.
 
-    Args:
-        layout: The standard parameters.
-        v: Velocities, shape (N, n_rows) [rad/s, m/s]; those of the joints come last.
-        least: Speed from which the sign is certain [rad/s], times ``drive_speeds``.
+    v (N, n_rows) [rad/s, m/s].
     """
     ratios = friction_speeds(layout)
     first = v.shape[1] - ratios.shape[1]
@@ -200,13 +148,7 @@ def sure_rows(layout: ParameterLayout, v: Array, least: float) -> Array:
 def friction_directions(layout: ParameterLayout, v: Array, direction: Array | None) -> Array:
     """Return the directions of friction, shape (N, c): those given, or the signs of the speeds.
 
-    Args:
-        layout: The standard parameters.
-        v: Velocities, shape (N, n_rows) [rad/s, m/s]; those of the joints come last.
-        direction: Filtered signs of the speeds, shape (N, c), or None.
-
-    Raises:
-        DataError: If the shape of those given is not the expected one.
+    v (N, n_rows) [rad/s, m/s], direction (N, c).
     """
     speeds = friction_speeds(layout)
     if direction is None:
@@ -222,12 +164,7 @@ def friction_directions(layout: ParameterLayout, v: Array, direction: Array | No
 
 
 def plan_rows(layout: ParameterLayout, columns: Sequence[Array]) -> RowPlan:
-    """Return the plan of a block of rows: each row's columns in that order, then its torque.
-
-    Args:
-        layout: The standard parameters.
-        columns: Indices of the standard parameters of each row, n arrays.
-    """
+    """Return the plan of a block of rows: each row's columns in that order, then its torque."""
     loads, size = layout.drive_loads, layout.n_inertial
     base = len(columns) - len(loads)  # rows of a floating base, without drives
     first = np.concatenate([[0], np.cumsum([len(row) + 1 for row in columns])])

@@ -22,20 +22,6 @@ from robotid.data.log import Trajectory
 from robotid.dynamics.lapack import Triangle
 from robotid.dynamics.problem import Problem, RowSource
 
-__all__ = [
-    "Factors",
-    "Reduction",
-    "available_cores",
-    "compress",
-    "compress_segments",
-    "gather",
-    "in_order",
-    "join",
-    "join_segments",
-    "merge",
-    "triangle_of",
-]
-
 ItemT = TypeVar("ItemT")
 ResultT = TypeVar("ResultT")
 
@@ -72,11 +58,7 @@ class Factors:
         return dense
 
     def select(self, columns: Array) -> "Factors":
-        """Return the factors of the same rows with fewer columns.
-
-        Args:
-            columns: Indices of the remaining columns, shape (b,).
-        """
+        """Return the factors of the same rows with fewer columns: columns (b,)."""
         columns = np.asarray(columns, dtype=int)
         triangles, remaining = [], []
         for triangle, own in zip(self.triangles, self.columns, strict=True):
@@ -94,8 +76,7 @@ class Factors:
         From the ends of the robot to its base, each factor is folded into the smallest one that has
         all its columns: a joint's columns are among those of the joint before it.
 
-        Args:
-            sigma: Noise level per joint, shape (n,) [N m or N], positive.
+        sigma (n,) [N m or N].
         """
         c = len(self.names)
         folded, everything = [Triangle(len(own) + 1) for own in self.columns], Triangle(c + 1)
@@ -109,13 +90,7 @@ class Factors:
     def weighted_rows(self, theta: Array, sigma: Array) -> tuple[Array, Array]:
         """Return rows W_j / sigma_j and (tau_j - W_j theta) / sigma_j that have these factors.
 
-        Args:
-            theta: Parameters, shape (c,).
-            sigma: Noise level per joint, shape (n,) [N m or N], positive.
-
-        Returns:
-            The rows of all joints, shape (m, c), and their residuals, shape (m,); m is the sum of
-            the sizes of the factors.
+        theta (c,), sigma (n,) [N m or N] -> (m, c), (m,).
         """
         ends = np.cumsum([len(R) for R in self.triangles])
         W, residual = np.zeros((ends[-1], len(self.names))), np.empty(ends[-1])
@@ -126,11 +101,7 @@ class Factors:
         return W, residual
 
     def residual_squares(self, theta: Array) -> Array:
-        """Return |tau_j - W_j theta|^2 of each joint, shape (n,) [(N m)^2 or N^2].
-
-        Args:
-            theta: Parameters, shape (c,).
-        """
+        """Return |tau_j - W_j theta|^2 of each joint, shape (n,) [(N m)^2 or N^2]: theta (c,)."""
         residuals = [
             R[:, -1] - R[:, :-1] @ theta[own]
             for R, own in zip(self.triangles, self.columns, strict=True)
@@ -138,23 +109,14 @@ class Factors:
         return np.array([residual @ residual for residual in residuals])
 
     def score(self, theta: Array, weights: Array) -> Array:
-        """Return sum_j weight_j W_j^T (tau_j - W_j theta), shape (c,).
-
-        Args:
-            theta: Parameters, shape (c,).
-            weights: Weight per joint, shape (n,).
-        """
+        """Return sum_j weight_j W_j^T (tau_j - W_j theta), shape (c,): theta (c,), weights (n,)."""
         total = np.zeros(len(self.names))
         for R, own, weight in zip(self.triangles, self.columns, weights, strict=True):
             total[own] += weight * (R[:, :-1].T @ (R[:, -1] - R[:, :-1] @ theta[own]))
         return total
 
     def without(self, theta: Array) -> "Factors":
-        """Return the factors of the same rows with the torque tau_j - W_j theta.
-
-        Args:
-            theta: Parameters, shape (c,).
-        """
+        """Return the factors of the same rows with the torque tau_j - W_j theta: theta (c,)."""
         triangles = []
         for R, own in zip(self.triangles, self.columns, strict=True):
             left = R.copy(order="K")
@@ -165,9 +127,7 @@ class Factors:
     def noise_levels(self, theta: Array, freedom: Array) -> Array:
         """Return the standard deviation of each joint's residual, shape (n,) [N m or N].
 
-        Args:
-            theta: Parameters, shape (c,).
-            freedom: Degrees of freedom of each joint's residual, shape (n,), positive.
+        theta (c,), freedom (n,).
         """
         squares = self.residual_squares(theta)
         if self.is_projected:
@@ -180,22 +140,14 @@ class Factors:
         return np.array([R[:, -1] @ R[:, -1] for R in self.triangles])
 
     def information(self, weights: Array) -> Array:
-        """Return sum_j weight_j W_j^T W_j, shape (c, c).
-
-        Args:
-            weights: Weight per joint, shape (n,).
-        """
+        """Return sum_j weight_j W_j^T W_j, shape (c, c): weights (n,)."""
         total = np.zeros((len(self.names), len(self.names)))
         for R, own, weight in zip(self.triangles, self.columns, weights, strict=True):
             total[np.ix_(own, own)] += weight * (R[:, :-1].T @ R[:, :-1])
         return total
 
     def leverages(self, covariance: Array) -> Array:
-        """Return the trace of W_j C W_j^T for each joint, shape (n,).
-
-        Args:
-            covariance: C, shape (c, c).
-        """
+        """Return the trace of W_j C W_j^T for each joint, shape (n,): covariance (c, c)."""
         pairs = [
             (R[:, :-1], covariance[np.ix_(own, own)])
             for R, own in zip(self.triangles, self.columns, strict=True)
@@ -239,16 +191,7 @@ class Reduction:
     def of(
         cls, problem: Problem, trajectory: Trajectory, *, threads: int | None = None
     ) -> "Reduction":
-        """Reduce the problem of one trajectory.
-
-        Args:
-            problem: The base problem of the trajectory, rows weighted.
-            trajectory: The trajectory.
-            threads: As of ``compress``.
-
-        Raises:
-            DataError: If a row is not finite.
-        """
+        """Reduce the problem of one trajectory."""
         return cls(compress(problem, threads=threads), trajectory.squares, len(trajectory.t))
 
 
@@ -257,15 +200,6 @@ def compress(problem: Problem, *, threads: int | None = None) -> Factors:
 
     Long problems are cut into parts of a fixed number of samples, whose factors are merged in
     order: the result does not depend on the number of threads.
-
-    Args:
-        problem: The rows; each is scaled by the square root of its weight, so a weight of 0
-            excludes it.
-        threads: Number of threads, at least 1; None: one per core if the problem's rows are
-            computed faster so, otherwise one.
-
-    Raises:
-        DataError: If a row is not finite.
 
     References:
         Demmel, Grigori, Hoemmen, Langou (2012), Communication-optimal parallel and sequential QR.
@@ -284,16 +218,7 @@ def compress(problem: Problem, *, threads: int | None = None) -> Factors:
 def compress_segments(
     problem: Problem, length: int, *, threads: int | None = None
 ) -> tuple[Factors, ...]:
-    """Fold each segment of a problem into its own factors, for held-out segments.
-
-    Args:
-        problem: The rows of one log or several; a problem with row sources.
-        length: Samples per segment, at least 1; the last segment of each log may have fewer.
-        threads: As of ``compress``.
-
-    Raises:
-        DataError: If a row is not finite, or the problem has no row sources.
-    """
+    """Fold each segment of a problem into its own factors, for held-out segments."""
     if not problem.sources:
         raise DataError("the problem has blocks only, wanted row sources to cut into segments")
     columns = tuple(np.flatnonzero(row) for row in problem.support)
@@ -318,14 +243,7 @@ def compress_segments(
 
 
 def merge(factors: Sequence[Factors]) -> Factors:
-    """Return the factors of all rows of several logs.
-
-    Args:
-        factors: At least one; all with the same columns and joints.
-
-    Raises:
-        DataError: If there is none, or their columns or joints differ.
-    """
+    """Return the factors of all rows of several logs."""
     if not factors:
         raise DataError("there are no factors, wanted those of at least one log")
     first = factors[0]
@@ -349,25 +267,13 @@ def merge(factors: Sequence[Factors]) -> Factors:
 
 
 def gather(segments: Sequence[Factors], count: int) -> tuple[Factors, ...]:
-    """Return fewer, longer segments: neighbours are merged, for held-out segments.
-
-    Args:
-        segments: Factors of segments, in order.
-        count: Wanted number, at least 1.
-    """
+    """Return fewer, longer segments: neighbours are merged, for held-out segments."""
     edges = np.linspace(0, len(segments), min(count, len(segments)) + 1).round().astype(int)
     return tuple(merge(segments[i:j]) for i, j in pairwise(edges))
 
 
 def join(reductions: Sequence[Reduction]) -> Reduction:
-    """Return the reduction of all rows of several reductions.
-
-    Args:
-        reductions: At least one; all with the same columns and joints.
-
-    Raises:
-        DataError: If there is none, or their columns or joints differ.
-    """
+    """Return the reduction of all rows of several reductions."""
     if not reductions:
         raise DataError("there is no reduction, wanted that of at least one log")
     return Reduction(
@@ -381,14 +287,6 @@ def join_segments(reductions: Iterable[Reduction], count: int, most: int) -> lis
     """Return the reductions of at most so many segments of neighbouring pieces, in order.
 
     They are joined one by one, to limit the memory; the last one may be shorter.
-
-    Args:
-        reductions: One per piece, in order.
-        count: Number of pieces, at least 1.
-        most: Largest number of segments, at least 1.
-
-    Raises:
-        DataError: If their columns or joints differ.
     """
     length = -(-count // most)
     segments: list[Reduction] = []
@@ -414,14 +312,7 @@ def in_order(
     is_parallel: bool = True,
     threads: int | None = None,
 ) -> Iterator[ResultT]:
-    """Yield the result of work for each item in order, with threads where that is faster.
-
-    Args:
-        work: What is done with an item.
-        items: The items.
-        is_parallel: Whether the work releases the interpreter's lock.
-        threads: Number of threads; None: the number of cores if the work is parallel.
-    """
+    """Yield the result of work for each item in order, with threads where that is faster."""
     workers = (available_cores() if is_parallel else 1) if threads is None else threads
     if min(workers, len(items)) <= 1:
         yield from map(work, items)
@@ -509,8 +400,7 @@ def _fold_part(source: RowSource, length: int, segment: int, start: int) -> list
 def triangle_of(rows: Array) -> Array:
     """Return the square upper triangular factor R of rows, padded with zeros if m < k.
 
-    Args:
-        rows: Rows, shape (m, k).
+    rows (m, k).
     """
     k = rows.shape[1]
     if len(rows) == 0:

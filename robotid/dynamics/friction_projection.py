@@ -29,15 +29,6 @@ from robotid.robot.drives import (
 )
 from robotid.robot.model import RobotModel
 
-__all__ = [
-    "DriveMoments",
-    "ProjectedDrive",
-    "Projection",
-    "drive_moments",
-    "project_friction",
-    "projected_pinocchio_model",
-]
-
 #: The terms that friction is projected on. The offset is always one of them, so that it does not
 #: become friction in a format without offset.
 _SIMPLE: dict[str, DriveTerm] = {
@@ -70,14 +61,7 @@ class DriveMoments:
 
     @classmethod
     def from_dict(cls, table: Mapping[str, Any]) -> "DriveMoments":
-        """Return the moments from plain values.
-
-        Args:
-            table: As of ``to_dict``.
-
-        Raises:
-            DataError: If the products are not a finite matrix over the terms.
-        """
+        """Return the moments from plain values."""
         terms, products = tuple(table["terms"]), np.array(table["products"], dtype=float)
         if products.shape != (len(terms), len(terms)) or not np.isfinite(products).all():
             raise DataError(
@@ -89,12 +73,7 @@ class DriveMoments:
     def transfer(self, own: Sequence[str], onto: Sequence[str]) -> Array:
         """Return the linear map from a drive's parameters to those of its projection.
 
-        Args:
-            own: The drive's terms, in the order of its parameters.
-            onto: Names of the terms of the projection.
-
-        Returns:
-            Map T with z = T x, shape (len(onto), len(own)), without the bounds of z.
+        -> (len(onto), len(own)).
         """
         root = self._root()
         Y, X = (root[:, [self.terms.index(name) for name in names]] for names in (onto, own))
@@ -109,11 +88,7 @@ class DriveMoments:
         return root
 
     def rms(self, x: Mapping[str, float]) -> float:
-        """Return the RMS torque of a sum of terms over the rows [N m or N].
-
-        Args:
-            x: Parameters by name of the term.
-        """
+        """Return the RMS torque of a sum of terms over the rows [N m or N]."""
         weights = np.array([x.get(name, 0.0) for name in self.terms])
         return float(np.linalg.norm(self._root() @ weights))
 
@@ -184,9 +159,7 @@ def drive_moments(
 
     Friction is that of ``predict``: internal states are at their steady value, without a delay.
 
-    Args:
-        model: The robot.
-        recordings: Trajectories and their used rows, shape (N, n_rows), bool.
+    recordings (N, n_rows).
     """
     layout = model.layout
     sums: dict[str, tuple[tuple[str, ...], Array, float, int]] = {}
@@ -236,14 +209,7 @@ def project_friction(
     Drives whose terms the format has are unchanged. So are inertia and, in a format without them,
     offsets. Viscous and Coulomb friction and a spring are not negative.
 
-    Args:
-        model: The robot.
-        pi: Standard parameters, shape (p,), SI units, in ``layout.names`` order.
-        moments: Of the drives with further terms, as of ``drive_moments``.
-        onto: Names of the terms of the format.
-
-    Raises:
-        DataError: If the moments of a drive are missing.
+    pi (p,).
     """
     layout, projected = model.layout, []
     for d, drive in enumerate(layout.drives):
@@ -269,10 +235,7 @@ def projected_pinocchio_model(
 ) -> Any:  # noqa: ANN401
     """Return ``pinocchio_model`` of a robot with projected friction; a warning names its drives.
 
-    Args:
-        model: The robot.
-        pi: Standard parameters, shape (p,), SI units, in ``layout.names`` order.
-        moments: As of ``project_friction``.
+    pi (p,).
     """
     projection = project_friction(model, pi, moments, ("viscous", "coulomb", "offset"))
     if projection.drives:

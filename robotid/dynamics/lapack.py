@@ -15,8 +15,6 @@ import scipy.linalg.lapack
 
 from robotid.base.typing import Array
 
-__all__ = ["Triangle"]
-
 _PANEL = 8  # columns eliminated at a time: measured fastest for 20 to 70 columns ...
 _WIDE, _WIDE_PANEL = 200, 24  # ... and from so many columns on, which exceed a cache
 
@@ -43,21 +41,17 @@ class Triangle:
     def fold(self, rows: Array) -> None:
         """Replace R by the triangular factor of [R; rows].
 
-        Args:
-            rows: Rows to fold in, shape (m, c), column-major with any distance between columns;
-                destroyed.
-
         References:
             LAPACK Working Note 257; Golub, Van Loan (2013), Matrix Computations, section 6.5.3.
+
+        rows (m, c).
         """
         self._fold(rows, 0, 0)
 
     def fold_triangle(self, other: Array, places: Array) -> None:
         """Replace R by the triangular factor of [R; other], without computing with its zeros.
 
-        Args:
-            other: Upper triangular factor, shape (m, m).
-            places: Its columns among the c columns, shape (m,), ascending.
+        other (m, m), places (m,).
         """
         if len(places) == len(self.R):
             if self._is_empty:

@@ -14,30 +14,17 @@ from robotid.dynamics.prediction import predict
 from robotid.robot.drives import DriveMotion, Lag
 from robotid.robot.model import RobotModel
 
-__all__ = ["drive_motion_along", "is_loaded", "remember"]
-
 
 def is_loaded(model: RobotModel) -> bool:
     """Return whether these columns depend on the torque of a robot's reference.
 
     Those of bristles do not: they depend on the displacement only.
-
-    Args:
-        model: The robot.
     """
     return any(term.needs_load for _, term in model.layout.drive_parameters)
 
 
 def remember(model: RobotModel, trajectory: Trajectory) -> Trajectory:
-    """Return a trajectory with the columns of drive terms with internal state or load.
-
-    Args:
-        model: The robot; its reference determines the joint load torques.
-        trajectory: N samples in order of time.
-
-    Returns:
-        The trajectory with ``memory``; unchanged if no drive has such a term.
-    """
+    """Return a trajectory with the columns of drive terms with internal state or load."""
     if not model.layout.remembering:
         return trajectory
     is_lagging = any(isinstance(term, Lag) for _, term in model.layout.drive_parameters)
@@ -53,13 +40,7 @@ def drive_motion_along(
     The load is the torque of the bodies, and the rate that of the whole torque, by the model's
     reference; a delayed torque itself is not included.
 
-    Args:
-        model: The robot.
-        trajectory: N samples in order of time.
-        has_rate: Whether the rate is needed, as for a lag; it is 0 otherwise.
-
-    Returns:
-        Arrays of shape (d, N). The last ones are stored with the trajectory.
+    -> (d, N).
     """
     key, known = (model.pin_model, model.layout, has_rate), trajectory.derived.get("drive motion")
     if known is None or known[0] != key or not np.array_equal(known[1], model.carried_by):

@@ -22,16 +22,6 @@ from robotid.robot.model import RobotModel
 
 SlopesT = TypeVar("SlopesT", Array, TorqueSlopes)
 
-__all__ = [
-    "body_slopes",
-    "body_slopes_by_position",
-    "drive_torque",
-    "inverse_dynamics",
-    "predict",
-    "predict_instants",
-    "rigid_parts",
-]
-
 _START = 5  # constant work of one call of inverse dynamics, as of work_per_sample
 
 
@@ -49,17 +39,10 @@ def predict(
     It is computed by the rows of the regressor for all vectors together, or, if the rows are not
     compiled and the vectors are few, by inverse dynamics, once per vector.
 
-    Args:
-        model: The robot.
-        parameters: Vectors of standard parameters, each of shape (p,), consistent or not.
-        trajectory: N samples of q, v, a and, if the torque was filtered, direction.
-        compiled: As of ``build_problem``.
-
-    Raises:
-        DataError: If the trajectory's joints are not the model's.
-
     References:
         Luh, Walker, Paul (1980), On-Line Computational Scheme for Mechanical Manipulators.
+
+    parameters (p,).
     """
     if trajectory.basis is None:
         return _unconstrained(model, parameters, trajectory, compiled)
@@ -94,19 +77,7 @@ def predict_instants(
     bodies, and there is no delay. Velocities and accelerations of a robot whose ``dynamics`` is
     "static" affect only the sign of friction.
 
-    Args:
-        model: The robot; its reference determines the joint load torques.
-        pi: Standard parameters, shape (p,), SI units, in ``layout.names`` order.
-        q: Joint coordinates in the model's order, shape (n,) or (N, n) [rad, m]; with a floating
-            base, the seven of its pose before them.
-        v: Velocities, shape (n_rows,) or (N, n_rows) [rad/s, m/s]; None: at rest.
-        a: Accelerations, likewise [rad/s^2, m/s^2]; None: 0.
-
-    Returns:
-        Torques, shape (n_rows,) or (N, n_rows) [N m, N].
-
-    Raises:
-        DataError: If a shape is not the expected one, or a value is not finite.
+    pi (p,), q (n,) [rad, m], v (n_rows,) [rad/s, m/s] -> (n_rows,) [N m, N].
     """
     q = real_numbers(q, "q")
     wanted = (*q.shape[:-1], model.n_rows)
@@ -143,15 +114,7 @@ def rigid_parts(model: RobotModel, pi: Array, q: Array, v: Array, a: Array) -> l
     They are g(q) = tau(q, 0, 0), M(q) a = tau(q, 0, a) - g(q) and C(q, v) v = tau(q, v, a) -
     tau(q, 0, a). Their sum is the torque of the bodies.
 
-    Args:
-        model: The robot.
-        pi: Standard parameters, shape (p,), consistent or not; those of drives have no effect.
-        q: Joint coordinates, shape (N, n) or (N, 7 + n) [rad, m].
-        v: Velocities, shape (N, n_rows) [rad/s, m/s].
-        a: Accelerations, shape (N, n_rows) [rad/s^2, m/s^2].
-
-    Raises:
-        DataError: If the shape of q is not that of the model.
+    pi (p,), q (N, n) [rad, m], v (N, n_rows) [rad/s, m/s], a (N, n_rows) [rad/s^2, m/s^2].
     """
     bodies = np.where(np.arange(len(pi)) < model.layout.n_inertial, pi, 0.0)
     rigid = _newton_euler if _has_centres(model, pi) else _rows_by_pi
@@ -213,13 +176,7 @@ def inverse_dynamics(model: RobotModel, pi: Array, trajectory: Trajectory) -> Ar
     For inconsistent bodies, as of ordinary least squares, it is the difference of the torques of
     two sets of consistent bodies.
 
-    Args:
-        model: The robot.
-        pi: Standard parameters, shape (p,), consistent or not.
-        trajectory: N samples of q, v, a and, if the torque was filtered, direction.
-
-    Returns:
-        Torques, shape (N, n_rows) [N m, N].
+    pi (p,) -> (N, n_rows) [N m, N].
     """
     m, added = trajectory, _consistent_addition(model, pi)
     torque = _newton_euler(model, pi + added, m.q, m.v, m.a)
@@ -231,13 +188,7 @@ def inverse_dynamics(model: RobotModel, pi: Array, trajectory: Trajectory) -> Ar
 
 
 def drive_torque(model: RobotModel, pi: Array, trajectory: Trajectory) -> Array:
-    """Return the torque of the drives' terms, shape (N, n) [N m, N].
-
-    Args:
-        model: The robot.
-        pi: Standard parameters, shape (p,).
-        trajectory: N samples of q, v, a and, if the torque was filtered, direction.
-    """
+    """Return the torque of the drives' terms, shape (N, n) [N m, N]: pi (p,)."""
     layout, theta = model.layout, pi[model.layout.n_inertial :]
     torque: Array = trajectory_values(layout, trajectory).T @ (layout.drive_loads * theta).T
     return torque
@@ -246,22 +197,13 @@ def drive_torque(model: RobotModel, pi: Array, trajectory: Trajectory) -> Array:
 def body_slopes(model: RobotModel, pi: Array, trajectory: Trajectory) -> TorqueSlopes:
     """Return the derivatives of the bodies' torque by motion, gravity and origins of joints.
 
-    Args:
-        model: The robot, with a fixed base.
-        pi: Standard parameters, shape (p,), consistent or not.
-        trajectory: N samples of q, v and a.
+    pi (p,).
     """
     return _of_consistent(torque_slopes, model, pi, trajectory)
 
 
 def body_slopes_by_position(model: RobotModel, pi: Array, trajectory: Trajectory) -> Array:
-    """Return the derivatives of the bodies' torque by the positions, shape (N, n, n).
-
-    Args:
-        model: As of ``body_slopes``.
-        pi: Likewise.
-        trajectory: Likewise.
-    """
+    """Return the derivatives of the bodies' torque by the positions, shape (N, n, n)."""
     return _of_consistent(position_slopes, model, pi, trajectory)
 
 

@@ -11,8 +11,6 @@ import numpy as np
 from robotid.base.exceptions import DataError
 from robotid.base.typing import Array
 
-__all__ = ["Block", "Problem", "RowSource", "Sample", "concatenate", "shuffled"]
-
 _SHUFFLED = 8192  # samples in the buffer of the shuffle: all of a short log, 30 MB of a long one
 
 #: Rows of k samples: W (k n, c), tau (k n,), weight (k n,); row of sample k, joint j: k n + j.
@@ -51,12 +49,7 @@ class RowSource(ABC):
 
     @abstractmethod
     def rows(self, start: int, stop: int) -> Array:
-        """Return the number of rows with a positive weight per joint, shape (n,), int.
-
-        Args:
-            start: First sample.
-            stop: Sample after the last one.
-        """
+        """Return the number of rows with a positive weight per joint, shape (n,), int."""
 
     @property
     @abstractmethod
@@ -67,22 +60,14 @@ class RowSource(ABC):
     def blocks(self, start: int, stop: int, segment: int | None = None) -> Iterator[list[Array]]:
         """Yield the rows of samples start to stop, a few hundred samples at a time.
 
-        Args:
-            start: First sample.
-            stop: Sample after the last one.
-            segment: A block ends after each multiple of this number of samples; None: anywhere.
-
-        Yields:
-            Per joint j the rows sqrt(weight) [W_j tau_j], shape (k, c_j + 1), column-major. They
-            are valid until the next iteration.
+        -> (k, c_j + 1).
         """
 
     @abstractmethod
     def select(self, columns: Array) -> "RowSource":
         """Return the same rows with fewer columns, column k being ``columns[k]`` of this one.
 
-        Args:
-            columns: Indices of the selected columns, shape (b,), in the whole problem.
+        columns (b,).
         """
 
 
@@ -129,11 +114,7 @@ class Problem:
                 yield Sample(Y, torque, row_weight, M)
 
     def select(self, columns: Array) -> "Problem":
-        """Return the same rows with only the given columns.
-
-        Args:
-            columns: Indices of the selected columns, shape (b,).
-        """
+        """Return the same rows with only the given columns: columns (b,)."""
 
         def stream() -> Iterator[Block]:
             for W, tau, weight in self.blocks():
@@ -156,14 +137,7 @@ class Problem:
 
 
 def concatenate(problems: Sequence[Problem]) -> Problem:
-    """Return one problem with the rows of several in order, for several logs of one robot.
-
-    Args:
-        problems: At least one problem; all with the same columns and joints.
-
-    Raises:
-        DataError: If there is none, or their columns or joints differ.
-    """
+    """Return one problem with the rows of several in order, for several logs of one robot."""
     if not problems:
         raise DataError("there is no problem, wanted that of at least one log")
     first = problems[0]
@@ -187,15 +161,7 @@ def concatenate(problems: Sequence[Problem]) -> Problem:
 
 
 def shuffled(samples: Iterable[Sample], rng: np.random.Generator) -> Iterator[Sample]:
-    """Yield samples in random order; those of a long stream are drawn from a buffer of 8192.
-
-    Args:
-        samples: The samples.
-        rng: Random generator of the order.
-
-    Yields:
-        Each sample once.
-    """
+    """Yield samples in random order; those of a long stream are drawn from a buffer of 8192."""
     buffer: list[Sample] = []
     for sample in samples:
         buffer.append(sample)

@@ -24,7 +24,6 @@ from robotid.dynamics.kernels.lanes import (
     put_lane,
     scale,
     times,
-    work_space,
 )
 from robotid.dynamics.kernels.tree_lanes import (
     ACCELERATION,
@@ -47,28 +46,13 @@ from robotid.dynamics.kernels.tree_lanes import (
 )
 from robotid.dynamics.kernels.vector_lanes import LANES, lane_of, write
 
-__all__ = [
-    "LANES",
-    "finish_rows",
-    "inertial_rows",
-    "placements",
-    "pull_rows",
-    "rows_size",
-    "work_space",
-]
-
 # entries of one body: q, v, a of its joint; quantities common to its rows; ten columns. They are
 # not Python's int, for which Numba would compile a function once more for each value.
 _MOTION, _D, _X, _Y, _Z, _DW, _WW, _COLUMNS, _WORLD = np.array([0, 3, 6, 9, 12, 15, 18, 21, 31])
 
 
 def rows_size(bodies: int, depth: int) -> int:
-    """Return the number of entries of the work space of rows, and of their gradient.
-
-    Args:
-        bodies: Number of bodies.
-        depth: Largest number of rows that one body affects.
-    """
+    """Return the number of entries of the work space of rows, and of their gradient."""
     return int(_WORLD) + (bodies + 1) * (FRAME + 12 * depth + 12)
 
 
@@ -165,14 +149,7 @@ def _begin(work, tree):
 def inertial_rows(tree, places, motion, work, out, span):
     """Write the inertial columns of a block of samples, row by row.
 
-    Args:
-        tree: The robot.
-        places: Row of ``out`` for each body, row and parameter, shape (B, D, 10), int; -1: none.
-        motion: Coordinates, velocities and accelerations, shape (N, n_rows) each, and v, w, a, dw
-            of a floating base, minus gravity, shape (12, N).
-        work: Work space of ``rows_size``.
-        out: The columns, shape (columns, k); k a multiple of the lanes; written.
-        span: First sample, and the one after the last.
+    places (B, D, 10), motion (N, n_rows), out (columns, k).
     """
     size, stride = FRAME + 6 * places.shape[1], out.shape[1]
     columns = out.reshape(out.size)
@@ -191,14 +168,8 @@ def inertial_rows(tree, places, motion, work, out, span):
 def finish_rows(values, places, widths, weights, root, out, span):
     """Write drive columns and torques of a block, and scale its rows by their weights.
 
-    Args:
-        values: Drive columns and torques, shape (E, N).
-        places: Place of each, shape (E,), int.
-        widths: Number of columns of each row in ``out``, shape (n_rows,), int.
-        weights: Weights, shape (N, n_rows), or (0, 0) if all are 1.
-        root: Work space, shape (k,).
-        out: The columns, shape (columns, k); written.
-        span: First sample, and the one after the last.
+    values (E, N), places (E,), widths (n_rows,), weights (N, n_rows), root (k,), out (columns,
+    k).
     """
     first, count = span[0], span[1] - span[0]
     for e in range(len(places)):
@@ -269,13 +240,7 @@ def _pull_joint(work, own, joint, axes, pull, pulls, above):
 def pull_rows(tree, places, motion, weights, work, out):
     """Write the gradient of sum(weights * rows) by q, v and a of a robot with a fixed base.
 
-    Args:
-        tree: The robot.
-        places: Row of ``weights`` for each body, row and parameter, shape (B, D, 10); -1: none.
-        motion: As of ``inertial_rows``.
-        weights: Weight of each column at each sample, shape (columns, N).
-        work: Work space of ``rows_size``.
-        out: The gradient, shape (3, N, n_rows), 0 at first; written.
+    places (B, D, 10), weights (columns, N), out (3, N, n_rows).
     """
     bodies, depth, N = len(tree.parents), places.shape[1], weights.shape[1]
     axes, pulls = FRAME + 6 * depth, FRAME + 12 * depth
@@ -309,12 +274,7 @@ def pull_rows(tree, places, motion, weights, work, out):
 def placements(tree, q, work, R, p):
     """Write the poses of bodies in the frame of the root link.
 
-    Args:
-        tree: The robot, with a fixed base.
-        q: Coordinates, shape (N, n_rows).
-        work: Work space of ``rows_size``.
-        R: Rotations, shape (3, 3, B, N); written.
-        p: Origins of the joints, shape (3, B, N); written.
+    q (N, n_rows), R (3, 3, B, N), p (3, B, N).
     """
     N, size = len(q), FRAME
     for start in range(0, N, LANES):

@@ -26,17 +26,6 @@ from robotid.dynamics.drive_columns import RowPlan, plan_rows, trajectory_values
 from robotid.dynamics.problem import RowSource
 from robotid.robot.model import RobotModel
 
-__all__ = [
-    "BLOCK",
-    "COMPILED",
-    "InertialRows",
-    "TrajectoryRows",
-    "choose_engine",
-    "keep_inertial_rows",
-    "kept_rows",
-    "trajectory_rows",
-]
-
 BLOCK = 512  # samples per block: with 100 columns it fits in the cache
 COMPILED = "compiled by Numba"
 
@@ -49,16 +38,7 @@ _log = logging.getLogger(__name__)
 
 
 def choose_engine(model: RobotModel, samples: int, compiled: bool | None) -> str:
-    """Return the name of the code that computes the rows, and log it.
-
-    Args:
-        model: The robot.
-        samples: Number of samples.
-        compiled: Whether to use the compiled path; None: if it is faster.
-
-    Returns:
-        ``COMPILED``, or "Pinocchio" with the reason why the compiled path is not used.
-    """
+    """Return the name of the code that computes the rows, and log it."""
     enough = -(-LONG_ENOUGH // work_per_sample(model))
     engine = "Pinocchio"
     if compiled is None and samples < enough:
@@ -92,22 +72,13 @@ class InertialRows:
         return np.concatenate([[0], np.cumsum([len(own) for own in self.columns])])
 
     def write(self, samples: Array | slice, Y: Array) -> None:
-        """Write those of N samples into regressors, shape (N, n_rows, p).
-
-        Args:
-            samples: The samples.
-            Y: The regressors, 0 where nothing is written.
-        """
+        """Write those of N samples into regressors, shape (N, n_rows, p)."""
         rows = zip(self.columns, pairwise(self.first), strict=True)
         for j, (own, (first, stop)) in enumerate(rows):
             Y[:, j, _as_slice(own)] = self.values[first:stop, samples].T
 
     def torque(self, stacked: Array) -> Array:
-        """Return the torques of bodies, shape (k, N, n_rows) [N m, N].
-
-        Args:
-            stacked: Standard parameters, shape (p, k).
-        """
+        """Return the torques of bodies, shape (k, N, n_rows) [N m, N]: stacked (p, k)."""
         rows = zip(self.columns, pairwise(self.first), strict=True)
         return np.stack([stacked[own].T @ self.values[i:j] for own, (i, j) in rows], axis=-1)
 
@@ -117,10 +88,6 @@ def keep_inertial_rows(model: RobotModel, trajectory: Trajectory) -> None:
 
     They are not stored if they are too many, or if compiled code computes them faster than they can
     be read from memory.
-
-    Args:
-        model: The robot.
-        trajectory: N samples, which stay in memory.
     """
     size, samples = model.layout.n_inertial, len(trajectory.t)
     columns = tuple(np.flatnonzero(row[:size]) for row in model.support())
@@ -141,12 +108,7 @@ def keep_inertial_rows(model: RobotModel, trajectory: Trajectory) -> None:
 
 
 def kept_rows(model: RobotModel, trajectory: Trajectory) -> InertialRows | None:
-    """Return the inertial columns that are stored with a trajectory, None if of another robot.
-
-    Args:
-        model: The robot.
-        trajectory: The trajectory.
-    """
+    """Return the inertial columns that are stored with a trajectory, None if of another robot."""
     rows: InertialRows | None = trajectory.derived.get("inertial rows")
     return rows if rows is not None and rows.pin_model is model.pin_model else None
 
@@ -230,17 +192,7 @@ class TrajectoryRows(RowSource):
 def trajectory_rows(
     model: RobotModel, trajectory: Trajectory, weight: Array | None, compiled: bool | None
 ) -> TrajectoryRows:
-    """Return all rows of a trajectory with all standard parameters.
-
-    Args:
-        model: The robot; the trajectory's joints must be its joints, in its order.
-        trajectory: N samples.
-        weight: Weight of each row, shape (N, n_rows); None: all 1.
-        compiled: As of ``choose_engine``.
-
-    Raises:
-        DataError: If joints or shapes are not those of the model.
-    """
+    """Return all rows of a trajectory with all standard parameters: weight (N, n_rows)."""
     if trajectory.joints != model.joints:
         raise DataError(
             f"the trajectory has the joints {listed(trajectory.joints)}, wanted those of the "

@@ -20,16 +20,6 @@ from robotid.robot.closure import Chains
 from robotid.robot.drives import TERMS, DriveMotion
 from robotid.robot.model import RobotModel
 
-__all__ = [
-    "InstantRegressor",
-    "build_problem",
-    "carried_columns",
-    "joint_torque_regressor",
-    "mass_regressor",
-    "random_regressor",
-    "trajectory_regressor",
-]
-
 _DECADES = 3.0  # of speeds, at random states of a robot with nonlinear friction
 _INSTANTS = 32  # samples whose whole regressors are in memory together
 _BLOCK_SIZE = 2**19  # numbers per block of W, 4 MiB
@@ -48,25 +38,12 @@ def joint_torque_regressor(
     The columns are those of the ten inertial parameters of each body, from Pinocchio, and then of
     the drives: ``tau_j = Ia a_j + Fv v_j + Fc sign(v_j) + off``, likewise for couplings.
 
-    Args:
-        model: The robot.
-        q: Joint coordinates, shape (N, n) or (N, 7 + n) [rad, m].
-        v: Velocities, shape (N, n_rows) [rad/s, m/s].
-        a: Accelerations, shape (N, n_rows) [rad/s^2, m/s^2].
-        direction: Direction of friction in the c Coulomb columns, shape (N, c), as
-            ``Trajectory.direction``; None: the signs of the speeds.
-        memory: Columns with internal state or load, shape (N, m), as ``Trajectory.memory``; None:
-            internal states at their steady value, under the torque of the model's reference.
-
-    Returns:
-        Regressors, shape (N n_rows, p): row of sample k, joint j is k n_rows + j.
-
-    Raises:
-        DataError: If a shape is not that of the model, or a value is not finite.
-
     References:
         Atkeson, An, Hollerbach (1986), Estimation of Inertial Parameters of Manipulator Loads and
         Links; Carpentier et al. (2019), The Pinocchio C++ library.
+
+    q (N, n) [rad, m], v (N, n_rows) [rad/s, m/s], a (N, n_rows) [rad/s^2, m/s^2], direction (N,
+    c), memory (N, m) -> (N n_rows, p).
     """
     _check_motion(model, q, v, a)
     Y = np.empty((len(q), model.n_rows, len(model.layout.names)))
@@ -84,17 +61,8 @@ def carried_columns(model: RobotModel, q: Array, v: Array, a: Array) -> Array:
 
     For robots with many joints they are a tenth of the regressor.
 
-    Args:
-        model: The robot.
-        q: Joint coordinates, shape (N, n) or (N, 7 + n) [rad, m].
-        v: Velocities, shape (N, n_rows) [rad/s, m/s].
-        a: Accelerations, shape (N, n_rows) [rad/s^2, m/s^2].
-
-    Returns:
-        Columns, row by row, in the order of ``model.support()``, shape (N, columns).
-
-    Raises:
-        DataError: If a shape is not that of the model, or a value is not finite.
+    q (N, n) [rad, m], v (N, n_rows) [rad/s, m/s], a (N, n_rows) [rad/s^2, m/s^2] -> (N,
+    columns).
     """
     _check_motion(model, q, v, a)
     carried = model.support()[:, : model.layout.n_inertial]
@@ -121,11 +89,6 @@ def trajectory_regressor(
     """Return the regressor of N samples of a trajectory, shape (N n_rows, p).
 
     As ``joint_torque_regressor``; inertial columns stored with the trajectory are used.
-
-    Args:
-        model: The robot.
-        trajectory: The trajectory, with the internal states of the model's drives.
-        samples: Indices of the samples; None: all.
     """
     m = trajectory if samples is None else trajectory.at(samples)
     stored, layout = kept_rows(model, trajectory), model.layout
@@ -142,15 +105,10 @@ def mass_regressor(model: RobotModel, q: Array) -> Array:
 
     With drives, column j is W(q, 0, e_j) - W(q, 0, 0), where gravity and offsets cancel.
 
-    Args:
-        model: The robot.
-        q: Joint coordinates, shape (N, n) or (N, 7 + n) [rad, m].
-
-    Raises:
-        DataError: If the shape of q is not that of the model.
-
     References:
         Tzvetkova, Extracting Inertial Parameters from Robotic Manipulators Dynamics, (11), (13).
+
+    q (N, n) [rad, m].
     """
     N, n = len(q), model.n_rows
     still = np.zeros((N, n))
@@ -163,15 +121,7 @@ def mass_regressor(model: RobotModel, q: Array) -> Array:
 
 
 class InstantRegressor:
-    """The regressor of one sample at a time, without repeated initialisation.
-
-    Args:
-        model: The robot, with a fixed base.
-        columns: Indices of the wanted standard parameters, shape (c,).
-
-    Raises:
-        DataError: If the base floats.
-    """
+    """The regressor of one sample at a time, without repeated initialisation: columns (c,)."""
 
     def __init__(self, model: RobotModel, columns: Array) -> None:
         if model.free_flyer:
@@ -196,10 +146,7 @@ class InstantRegressor:
     def __call__(self, q: Array, v: Array, a: Array) -> Array:
         """Return the regressor of one sample, shape (n, c), as of ``joint_torque_regressor``.
 
-        Args:
-            q: Joint coordinates, shape (n,) [rad, m].
-            v: Velocities, shape (n,) [rad/s, m/s].
-            a: Accelerations, shape (n,) [rad/s^2, m/s^2].
+        q (n,) [rad, m], v (n,) [rad/s, m/s], a (n,) [rad/s^2, m/s^2].
         """
         model, layout, Y = self._model, self._model.layout, self._Y
         x = q if self._is_plain else model.configurations(q[None])[0]
@@ -223,8 +170,7 @@ class InstantRegressor:
     def mass(self, q: Array) -> Array:
         """Return the regressor of the mass matrix, shape (n, n, c); see ``mass_regressor``.
 
-        Args:
-            q: Joint coordinates, shape (n,) [rad, m].
+        q (n,) [rad, m].
         """
         still, unit = np.zeros(len(q)), np.eye(len(q))
         at_rest = self(q, still, still)
@@ -245,16 +191,7 @@ def build_problem(
     computed by Pinocchio or by the compiled path, equal to 1e-12; ``problem.sources[0].engine`` and
     the logger "robotid" state by which of them, and why.
 
-    Args:
-        model: The robot; the trajectory's joints must be its joints, in its order.
-        trajectory: N samples of q, v, a, tau.
-        weight: Weight of each row, shape (N, n_rows), 0 excludes it; all 1 if None.
-        with_mass: Whether each sample has the regressor of its mass matrix.
-        compiled: Whether to use the compiled path if it supports the robot; None: if the trajectory
-            is so long that it is faster.
-
-    Raises:
-        DataError: If joints or shapes are not those of the model.
+    weight (N, n_rows).
     """
     own = trajectory_rows(model, trajectory, weight, compiled)
     weights, used = own.weights, np.any(own.weights, axis=0, keepdims=True).T
@@ -300,11 +237,6 @@ def random_regressor(model: RobotModel, samples: int, rng: np.random.Generator) 
     The states are scaled to the robot: speeds sqrt(g / length), accelerations g / length, so that
     the ratio of gravity to inertia is the same for a finger and a crane. The loops of the robot are
     closed in them, and their forces eliminated from the rows.
-
-    Args:
-        model: The robot.
-        samples: Number N of states.
-        rng: Random generator of the states.
     """
     n = len(model.joints)
     rate = np.sqrt(9.81 / model.length)  # [1/s]

@@ -12,8 +12,6 @@ import pinocchio as pin
 from robotid.base.typing import Array
 from robotid.robot.model import RobotModel
 
-__all__ = ["TorqueSlopes", "position_slopes", "torque_slopes"]
-
 
 @dataclass(frozen=True, eq=False)
 class TorqueSlopes:
@@ -48,16 +46,6 @@ def position_slopes(model: RobotModel, pi: Array, q: Array, v: Array, a: Array) 
     """Return the derivatives of the bodies' torque by the positions, shape (N, n, n).
 
     ``torque_slopes`` computes other derivatives, too, and takes several times as long.
-
-    Args:
-        model: As of ``torque_slopes``.
-        pi: Likewise.
-        q: Likewise.
-        v: Likewise.
-        a: Likewise.
-
-    Raises:
-        DataError: If the shape of pi or q is not that of the model.
     """
     own, G = model.with_parameters(pi).pin_model, model.velocity_map
     found, data = np.empty((len(q), own.nv, own.nv)), own.createData()
@@ -71,18 +59,10 @@ def position_slopes(model: RobotModel, pi: Array, q: Array, v: Array, a: Array) 
 def torque_slopes(model: RobotModel, pi: Array, q: Array, v: Array, a: Array) -> TorqueSlopes:
     """Return the derivatives of the bodies' torque by motion, gravity and origins of joints.
 
-    Args:
-        model: The robot, with a fixed base.
-        pi: Standard parameters, shape (p,), physically consistent.
-        q: Joint coordinates, shape (N, n) [rad, m].
-        v: Velocities, shape (N, n) [rad/s, m/s].
-        a: Accelerations, shape (N, n) [rad/s^2, m/s^2].
-
-    Raises:
-        DataError: If the shape of pi or q is not that of the model.
-
     References:
         Carpentier, Mansard (2018), Analytical Derivatives of Rigid Body Dynamics Algorithms.
+
+    pi (p,), q (N, n) [rad, m], v (N, n) [rad/s, m/s], a (N, n) [rad/s^2, m/s^2].
     """
     plain, G = model.with_parameters(pi).pin_model, model.velocity_map
     extended, joints = _with_movable_origins(plain)

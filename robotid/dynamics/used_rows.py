@@ -14,20 +14,12 @@ from robotid.dynamics.problem import Problem
 from robotid.dynamics.torque import build_problem
 from robotid.robot.model import RobotModel
 
-__all__ = ["base_problem", "independent_share", "row_mask", "static_rows"]
-
 _MOVES = 2e-3  # [rad/s] mean speed of a segment of a slow log from which its sign is certain
 _NEGLECTED = 0.02  # largest inertial torque that is neglected, over gravity's torque on a link
 
 
 def row_mask(model: RobotModel, trajectory: Trajectory, min_velocity: float) -> Array:
-    """Return the used rows, (N, n_rows), bool: those where the sign of friction is certain.
-
-    Args:
-        model: The robot. If no Coulomb friction is identified, every row is used.
-        trajectory: N samples.
-        min_velocity: Bound on the speed of a joint or of a coupled drive, as of ``sure_rows``.
-    """
+    """Return the used rows, (N, n_rows), bool: those where the sign of friction is certain."""
     return sure_rows(model.layout, trajectory.v, min_velocity)
 
 
@@ -38,14 +30,7 @@ def static_rows(model: RobotModel, log: Log, signals: SignalSettings) -> tuple[T
     limits: rest phases are used without friction, which is part of the residual then, and only for
     joints that move in fewer samples of the log than there are rest phases.
 
-    Args:
-        model: The robot, static.
-        log: The log, with unwrapped positions.
-        signals: The settings, resolved; of these, gaps and the smallest speed are used.
-
-    Returns:
-        The samples, without velocities and accelerations, with directions of friction; and the
-        used rows, shape (N, n_rows), bool.
+    -> (N, n_rows).
     """
     layout, n = model.layout, len(model.joints)
     unit, least = layout.drive_speeds[:n], min(signals.min_velocity, _MOVES)
@@ -70,30 +55,14 @@ def base_problem(
     with_mass: bool = False,
     compiled: bool | None = None,
 ) -> Problem:
-    """Return the problem of a trajectory in base parameters.
-
-    Args:
-        model: The robot.
-        mapping: Standard to base parameters.
-        trajectory: N samples.
-        weight: Weight of each row, shape (N, n_rows); or the used rows, bool.
-        with_mass: As of ``build_problem``.
-        compiled: As of ``build_problem``.
-
-    Raises:
-        DataError: If the trajectory's joints are not the model's.
-    """
+    """Return the problem of a trajectory in base parameters: weight (N, n_rows)."""
     rows = weight.astype(float)
     problem = build_problem(model, trajectory, rows, with_mass=with_mass, compiled=compiled)
     return mapping.reduce(problem)
 
 
 def independent_share(signals: SignalSettings) -> float:
-    """Return the share of independent rows after the filter: its band over the Nyquist frequency.
-
-    Args:
-        signals: The settings, resolved.
-    """
+    """The share of independent rows after the filter: its band over the Nyquist frequency."""
     if signals.cutoff is None or signals.rate is None:
         return 1.0
     return min(1.0, 2.0 * signals.cutoff / signals.rate)

@@ -21,8 +21,6 @@ from robotid.dynamics.torque import joint_torque_regressor
 from robotid.dynamics.used_rows import row_mask
 from robotid.robot.model import RobotModel
 
-__all__ = ["prefers_measured"]
-
 _log = logging.getLogger(__name__)
 _ROWS = 1000  # largest number of samples of a log that are used
 _PARTS = 8  # of the log, every other one fitted
@@ -38,11 +36,6 @@ def prefers_measured(model: RobotModel, logs: Sequence[Log], settings: SignalSet
     Measured velocities that are coarsely quantised or inconsistent with the positions are not used.
     Others are used if they predict the torque about as well as differentiated velocities. If the
     log has too little motion for this comparison, they are used if they are not delayed.
-
-    Args:
-        model: The robot.
-        logs: Parts of the log, unwrapped.
-        settings: Settings of the processing to a trajectory.
     """
     if any(coarse_velocities(log) or unlike_velocities(log) for log in logs):
         return False

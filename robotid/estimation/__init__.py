@@ -1,3 +1,1 @@
 """From rows or factors to estimates, and from recordings to fits with standard errors."""
-
-__all__: list[str] = []

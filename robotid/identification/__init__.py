@@ -1,3 +1,1 @@
 """Model and logs -> Identification: priors, errors, determined parameters, verdict."""
-
-__all__: list[str] = []

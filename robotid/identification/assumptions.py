@@ -13,16 +13,6 @@ from robotid.data.log import suggestion
 from robotid.dynamics.prediction import predict_instants
 from robotid.robot.model import RobotModel
 
-__all__ = [
-    "CORRELATION",
-    "FAINTEST",
-    "TorqueNoise",
-    "assumed_noise",
-    "assumed_parameters",
-    "largest_gravity",
-    "largest_torques",
-]
-
 #: Assumed correlation time of noise [s].
 CORRELATION = 0.1
 _NOISE = 0.01  # assumed standard deviation of noise, as a share of the largest torque
@@ -47,19 +37,11 @@ class TorqueNoise:
     origins: tuple[str, ...]
 
     def last(self, count: int) -> "TorqueNoise":
-        """Return the noise of the last rows, those of the joints.
-
-        Args:
-            count: Number of joints.
-        """
+        """Return the noise of the last rows, those of the joints."""
         return TorqueNoise(self.std[-count:], self.correlation[-count:], self.origins[-count:])
 
     def density(self, step: float) -> Array:
-        """Return the density of each joint's noise at low frequency, shape (n,) [(N m)^2 s].
-
-        Args:
-            step: Time between independent samples, if it is white [s].
-        """
+        """Return the density of each joint's noise at low frequency, shape (n,) [(N m)^2 s]."""
         density: Array = self.std**2 * np.maximum(self.correlation, step)
         return density
 
@@ -75,15 +57,7 @@ def assumed_noise(
 
     The assumed noise is 1 % of the joint's largest torque.
 
-    Args:
-        model: The robot.
-        size: Largest torque of each joint, shape (n,) [N m or N].
-        stated: Standard deviation by joint [N m or N], for the joints with a stated one.
-        correlation: As of ``preview_logs``.
-        found: Noise of an earlier run, if there is one.
-
-    Raises:
-        SettingsError: If a joint is unknown, or a number is out of range.
+    size (n,) [N m or N].
     """
     for joint, value in stated.items():
         if joint not in model.joints:
@@ -107,11 +81,7 @@ def assumed_noise(
 
 
 def largest_gravity(model: RobotModel) -> Array:
-    """Return the largest gravity torque of each joint over random poses, shape (n,).
-
-    Args:
-        model: The robot.
-    """
+    """Return the largest gravity torque of each joint over random poses, shape (n,)."""
     ranges = [(j.lower, j.upper) if j.has_limits else (-np.pi, np.pi) for j in model.limits]
     low, high = np.array(ranges).T
     q = np.random.default_rng(0).uniform(low, high, (_POSES, len(ranges)))
@@ -122,9 +92,7 @@ def largest_gravity(model: RobotModel) -> Array:
 def largest_torques(model: RobotModel, peak: Array) -> Array:
     """Return the largest torque of each joint, shape (n,): the URDF's limit, or that of a motion.
 
-    Args:
-        model: The robot.
-        peak: Largest torque of a motion, used where the URDF has no limit, shape (n,) [N m or N].
+    peak (n,) [N m or N].
     """
     peak = np.maximum(peak, FAINTEST * max(float(peak.max()), 1e-300))
     limit = np.array([joint.effort for joint in model.limits])
@@ -134,11 +102,7 @@ def largest_torques(model: RobotModel, peak: Array) -> Array:
 def assumed_parameters(model: RobotModel, size: Array, fastest: Array) -> Array:
     """Return the URDF's bodies with friction of a typical size, shape (p,).
 
-    Args:
-        model: The robot.
-        size: Largest torque of each joint, shape (n,) [N m or N].
-        fastest: Largest speed of a motion, used where the URDF has no limit, shape (n,)
-            [rad/s or m/s].
+    size (n,) [N m or N], fastest (n,) [rad/s or m/s].
     """
     pi = model.standard_parameters()
     for j, limits in enumerate(model.limits):

@@ -11,8 +11,6 @@ from robotid.diagnosis.verdict.payload_check import PayloadCheck
 from robotid.estimation.estimators.segments import quantile
 from robotid.robot.model import RobotModel
 
-__all__ = ["Gain", "Payload", "PayloadFit", "payload_of"]
-
 _SIGNIFICANT = 3.0  # standard errors from which a mass differs from 0
 _COM = 0.05  # ... of a determined centre of mass, as a share of the robot's length
 _INERTIA = 0.3  # ... of a determined inertia about it, as a share of the mean principal moment
@@ -182,12 +180,7 @@ class PayloadFit:
 def payload_of(model: RobotModel, link: str, x: Array, C: Array, freedom: Array) -> Payload:
     """Return a payload from its ten parameters; first-order errors of derived quantities.
 
-    Args:
-        model: The robot.
-        link: The link that carries it.
-        x: Its ten inertial parameters in the frame of the link, shape (10,).
-        C: Their covariance, shape (10, 10).
-        freedom: Degrees of freedom of their errors, shape (10,).
+    x (10,), C (10, 10), freedom (10,).
     """
     step = 1e-20  # complex-step derivative: exact
     shown = _about_com(x)

@@ -32,8 +32,6 @@ from robotid.robot.model import RobotModel
 from robotid.robot.parameters import ParameterLayout
 from robotid.robot.prior import payload_spread, prior_spread
 
-__all__ = ["fit_payloads", "identify_payload", "mass_checks", "own_friction"]
-
 _SIGNIFICANT = 3.0  # standard errors from which a mass differs from 0
 _MASS = 0.3  # largest standard error of a determined mass, as a share of that mass,
 _SMALL = 0.05  # ... or of this share of the robot's mass
@@ -152,16 +150,7 @@ def _check_gains(model: RobotModel, unknown: Sequence[str]) -> None:
 def own_friction(
     reference: Recordings, friction: str | Mapping[str, str]
 ) -> Mapping[str, tuple[DriveTerm, ...]]:
-    """Return the friction terms of a reference in addition to the model's, by drive.
-
-    Args:
-        reference: Recordings without payloads, torques in N m or N.
-        friction: As of ``identify``.
-
-    Raises:
-        DataError, NotConvergedError, RankDeficientError: As of ``identify``.
-        SettingsError: If a name or a joint is unknown.
-    """
+    """Return the friction terms of a reference in addition to the model's, by drive."""
     wanted = wanted_families(friction, reference.model.joints)
     if all(names == () for names in wanted.values()):
         return {}
@@ -177,18 +166,7 @@ def mass_checks(
     masses: Mapping[str, float],
     links: Sequence[str] = (),
 ) -> dict[str, PayloadCheck]:
-    """Return known masses of payloads against those that torque alone determines, by link.
-
-    Args:
-        loaded: Recordings with the payloads.
-        reference: Recordings without them.
-        masses: Known masses, by link [kg].
-        links: All links with payloads; those of the masses if empty.
-
-    Raises:
-        DataError, ModelError, SettingsError, NotConvergedError: As of ``identify_payload``, except
-            the error of masses that the motion does not determine.
-    """
+    """Return known masses of payloads against those that torque alone determines, by link."""
     _check_known(loaded.model, links or tuple(masses), masses, ())
     try:
         found = fit_payloads(loaded, reference, links=links or tuple(masses), masses={})
@@ -210,18 +188,7 @@ def fit_payloads(
     masses: Mapping[str, float],
     unknown_gains: Sequence[str] = (),
 ) -> PayloadFit:
-    """Identify payloads from recordings, in memory or not; see ``identify_payload``.
-
-    Args:
-        loaded: Recordings with the payloads.
-        reference: Recordings without them.
-        links: Links with the payloads.
-        masses: Known masses, by link [kg].
-        unknown_gains: Joints whose torque column is a current of unknown gain.
-
-    Raises:
-        DataError, ModelError, SettingsError, NotConvergedError: As of ``identify_payload``.
-    """
+    """Identify payloads from recordings, in memory or not; see ``identify_payload``."""
     refuse_loops(loaded.model, "the identification of a payload")
     _check_gains(loaded.model, unknown_gains)
     if not loaded.model.layout.remembering:

@@ -16,16 +16,6 @@ from robotid.output.pages.charts import Chart, Series, broken
 if TYPE_CHECKING:
     from robotid.identification.result import Identification
 
-__all__ = [
-    "friction_chart",
-    "parameter_charts",
-    "residual_charts",
-    "shown_evaluation",
-    "singular_chart",
-    "torque_charts",
-    "unused_spans",
-]
-
 _DOTS = 800  # of one friction chart
 _LAGS = 400  # points of one autocorrelation
 _LONGEST_LAG = 2.0  # [s]
@@ -34,11 +24,7 @@ _PIXELS = 500  # spans closer than one of these pixels are merged
 
 
 def shown_evaluation(found: "Identification") -> Evaluation:
-    """Return the recording to show: the first validation recording, or the first fitted one.
-
-    Args:
-        found: The identification.
-    """
+    """Return the recording to show: the first validation recording, or the first fitted one."""
     return (found.validation or found.fitted)[0]
 
 
@@ -54,13 +40,6 @@ def torque_charts(
 
     Where samples were not used, the background is shaded and only the measured torque is drawn: the
     sign of friction is not known there. No line is drawn across a gap of the recording.
-
-    Args:
-        found: The identification.
-        evaluation: One of its recordings.
-        row: Index of the torque row.
-        band: Band of the predictions; computed if None.
-        link: The charts' link.
     """
     motion, used = evaluation.recording.trajectory, evaluation.recording.mask[:, row].astype(bool)
     name, unit = found.model.row_names[row], found.model.row_units[row]
@@ -115,9 +94,7 @@ def _dwarfs(y: Array, *others: Array) -> bool:
 def unused_spans(t: Array, used: NDArray[np.bool_]) -> tuple[tuple[float, float], ...]:
     """Return the time spans between used samples; those closer than a pixel are merged.
 
-    Args:
-        t: Times, shape (N,) [s].
-        used: Samples used, shape (N,), bool.
+    t (N,) [s], used (N,).
     """
     edges = np.flatnonzero(np.diff(np.r_[True, used, True].astype(int))).reshape(-1, 2)
     pixel = float(t[-1] - t[0]) / _PIXELS if len(t) else 0.0
@@ -134,13 +111,7 @@ def unused_spans(t: Array, used: NDArray[np.bool_]) -> tuple[tuple[float, float]
 def residual_charts(
     found: "Identification", evaluation: Evaluation, row: int
 ) -> tuple[Chart, Chart] | None:
-    """Return spectrum and autocorrelation of a joint's residual; None if no sample was used.
-
-    Args:
-        found: The identification.
-        evaluation: One of its recordings.
-        row: Number of the torque row.
-    """
+    """Return spectrum and autocorrelation of a joint's residual; None if no sample was used."""
     motion, used = evaluation.recording.trajectory, evaluation.recording.mask[:, row].astype(bool)
     name, unit = found.model.row_names[row], found.model.row_units[row]
     residual = motion.tau[:, row] - evaluation.torques["estimate"][:, row]
@@ -181,17 +152,7 @@ def residual_charts(
 def friction_chart(
     found: "Identification", joint: str, *, split: tuple[Array, Array] | None = None
 ) -> Chart | None:
-    """Return friction against speed: measured, identified, and at constant speed.
-
-    Args:
-        found: The identification.
-        joint: The joint, or a row of the base.
-        split: Measured and identified friction, as ``friction_split`` returns them for
-            ``shown_evaluation``; computed if None.
-
-    Returns:
-        The chart; None if no sample of the joint was used, or it has no drive and no friction.
-    """
+    """Return friction against speed: measured, identified, and at constant speed."""
     evaluation, model = shown_evaluation(found), found.model
     motion, row = evaluation.recording.trajectory, model.row_names.index(joint)
     left, friction = split or friction_split(model, evaluation, found.standard)
@@ -229,12 +190,7 @@ def friction_chart(
 
 
 def parameter_charts(found: "Identification", terms: Sequence[str]) -> tuple[Chart, ...]:
-    """Return charts of each term of all drives, with the value before the fit.
-
-    Args:
-        found: The identification.
-        terms: Terms, as "viscous"; there is one chart per unit.
-    """
+    """Return charts of each term of all drives, with the value before the fit."""
     layout = found.model.layout
     owners, ends = zip(*(name.rsplit(".", 1) for name in layout.names), strict=True)
     error = np.where(np.isfinite(found.standard_error), 2 * found.standard_error, np.nan)
@@ -267,12 +223,7 @@ def parameter_charts(found: "Identification", terms: Sequence[str]) -> tuple[Cha
 
 
 def singular_chart(values: Array, rank: int) -> Chart:
-    """Return the singular values of a regressor, largest first.
-
-    Args:
-        values: Singular values, shape (b,) [-].
-        rank: Number of directions that the data determine.
-    """
+    """Return the singular values of a regressor, largest first: values (b,) [-]."""
     number = np.arange(1, len(values) + 1)
     values = np.maximum(values, float(values.max()) * 1e-17)
     series = [Series("determined", np.where(number <= rank, values, np.nan), "predicted", "dots")]

@@ -48,8 +48,6 @@ from robotid.robot.assumed import with_assumed_inertials
 from robotid.robot.families import AUTO, wanted_families
 from robotid.robot.model import RobotModel
 
-__all__ = ["conclude", "identify", "robot_of", "with_drives"]
-
 _ROBOTS = (".urdf", ".xml", ".xacro")  # suffixes of files that describe robots
 _MOST_SHAPES = 2  # fits for the refinement of shapes together with the terms of all joints
 
@@ -66,32 +64,7 @@ def identify(
     ignore: Sequence[str] = (),
     progress: ProgressCallback | None = None,
 ) -> Identification:
-    """Identify a robot's parameters from motion logs, as the command line does.
-
-    Args:
-        model: The robot; or the path of its URDF, all of whose joints move.
-        logs: Recordings to fit: a ``Log`` that has the model's joints, the path of a file, a
-            DataFrame with the columns of such a file, or several of these. Files are read whole,
-            as by ``read_log``; ``robotid.run_job`` reads long ones in pieces.
-        validation: Validation recordings for the prediction error, in the same forms.
-        signals: How logs become trajectories; the defaults if None.
-        estimator: Name or settings of the estimator.
-        friction: Friction of joints in addition to viscous and Coulomb, as of
-            ``wanted_families``: "auto" selects it.
-        doctor: Whether the doctor checks the logs first; the verdict includes its findings.
-        ignore: Codes of errors and warnings that you state as wrong.
-        progress: Called at the start of each of ``STAGES`` with its name, the stages done, their
-            number and "stages"; and in between with the name of a task, the units done, their
-            number and their name.
-
-    Raises:
-        DataError: If a log cannot be read, does not fit the model or is too short.
-        ModelError: If the model is neither a model nor the path of a valid URDF.
-        RankDeficientError: If the estimator is "ols" or "wls" and the data do not determine all
-            parameters.
-        NotConvergedError: If a solver fails.
-        SettingsError: If a setting is out of range, or a code to ignore is unknown.
-    """
+    """Identify a robot's parameters from motion logs, as the command line does."""
     require_kind(signals, (SignalSettings, type(None)), "signals", "a robotid.SignalSettings")
     require_kind(
         estimator, (str, EstimatorSettings), "estimator", "a name or a robotid.EstimatorSettings"
@@ -125,15 +98,7 @@ def identify(
 
 
 def robot_of(model: RobotModel | str | Path, logs: object) -> RobotModel:
-    """Return the robot, read if it is given as the path of a URDF.
-
-    Args:
-        model: The robot; or the path of its URDF, all of whose joints move.
-        logs: The argument given as the logs, to check whether the two are swapped.
-
-    Raises:
-        ModelError: If it is no robot, or the two are swapped.
-    """
+    """Return the robot, read if it is given as the path of a URDF."""
     if isinstance(model, RobotModel):
         return with_assumed_inertials(model)
     kind, is_robot = type(model).__name__, isinstance(logs, RobotModel)
@@ -159,20 +124,7 @@ def conclude(
     friction: str | Mapping[str, str] = AUTO,
     progress: ProgressCallback | None = None,
 ) -> Identification:
-    """Identify a robot's parameters from recordings, in memory or not, and give a verdict.
-
-    Args:
-        recordings: The recordings.
-        choice: The estimator.
-        found: Findings about the recordings, as of the doctor.
-        ignore: Codes of findings that the verdict ignores.
-        friction: As of ``identify``.
-        progress: As of ``identify``.
-
-    Raises:
-        DataError: If a log cannot be used.
-        RankDeficientError, NotConvergedError: As of ``identify``.
-    """
+    """Identify a robot's parameters from recordings, in memory or not, and give a verdict."""
     model, is_robust = recordings.model, choice.is_robust
     wanted = wanted_families(friction, model.joints)
     if model.is_static and any(wanted.values()):
@@ -241,18 +193,7 @@ def with_drives(
     *,
     progress: ProgressCallback | None = None,
 ) -> Fit:
-    """Identify a robot's parameters, and the friction terms of its joints from the logs.
-
-    Args:
-        recordings: The recordings.
-        choice: The estimator.
-        wanted: Friction of each joint, as of ``wanted_families``.
-        balanced: As of ``choose_drives``.
-        progress: Called with "fits", the number done, the expected number, and "fits".
-
-    Raises:
-        DataError, RankDeficientError, NotConvergedError: As of ``identify``.
-    """
+    """Identify a robot's parameters, and the friction terms of its joints from the logs."""
     report, rough = progress or ignore_progress, rough_choice(choice)
     report("fits", 0, 1, "fits")
     solved = solve_recordings(recordings, choice)

@@ -56,8 +56,6 @@ from robotid.robot.constraints import Contact
 from robotid.robot.model import RobotModel
 from robotid.robot.prior import prior_spread
 
-__all__ = ["with_repeated_errors"]
-
 _LEAST, _MOST, _TRIED = 1e-6, 0.02, 40  # [m] bounds of s, values that are compared first
 _WIDER = 1e3  # factor of the prior standard deviations: wrong masses of a URDF are no offsets
 _RANK = 1e-6  # of the inertia of the whole robot: forces of all its axes are not always known
@@ -69,12 +67,6 @@ def with_repeated_errors(recordings: Recordings) -> Recordings:
 
     Surfaces have no errors of their points: their moments are measured, or unknown. The bias of
     accelerometers is subtracted. Errors of the motion count without torques of joints.
-
-    Args:
-        recordings: The recordings.
-
-    Raises:
-        DataError: If a row of a log cannot be used.
     """
     model, mapping = recordings.model, recordings.mapping
     points = [k for k, x in enumerate(model.contacts) if x.kind == "point"]
@@ -168,10 +160,7 @@ def _roots(fit: EstimatedErrors, sizes: Array, c: int) -> Array:
     Offsets of unknown size have the mean square along each axis of their links, pooled over the
     points.
 
-    Args:
-        fit: The estimated errors.
-        sizes: Known standard deviations, NaN if unknown, shape (d,) [m or m/s^2].
-        c: Number of offsets, the first of the errors.
+    sizes (d,) [m or m/s^2].
     """
     roots, is_open = np.diag(sizes), np.isnan(sizes)
     if is_open.any():
@@ -192,14 +181,7 @@ def estimated_errors(
     and errors of known size has the singular values z and the torque u along their directions:
     -2 log(evidence) is the sum of log(1 + s^2 z^2) + u^2 / (1 + s^2 z^2).
 
-    Args:
-        R: Triangular factor of the rows [W -D tau], shape (b + d + 1, b + d + 1).
-        L: Lower triangle, L L^T the prior covariance of the base parameters, shape (b, b).
-        mean: Their prior values, shape (b,).
-        share: Share of independent rows [-].
-        rows: Number of rows.
-        sizes: Prior standard deviation of the error of each column of D, shape (d,); NaN: it is s.
-        before: Prior means of these errors, shape (d,); 0 where the size is not known.
+    R (b + d + 1, b + d + 1), L (b, b), mean (b,), sizes (d,), before (d,).
     """
     b, is_open = len(mean), np.isnan(sizes)
     some = np.flatnonzero(sizes > 0.0)
@@ -248,11 +230,7 @@ def _largest(z2: Array, u2: Array) -> float:
 def _slopes(model: RobotModel, rows: Rows, pi: Array, points: Sequence[int]) -> Array:
     """Return D, the rows' torque per offset of a contact, shape (N n_rows, 3 len(points)) [N].
 
-    Args:
-        model: The robot.
-        rows: Its motion, and the rows used.
-        pi: Standard parameters that determine the forces, shape (p,).
-        points: Numbers of the contacts; their offsets have the axes of the links.
+    pi (p,).
     """
     motion = rows.trajectory
     (torque,) = predict(model, [pi], replace(motion, basis=None))
@@ -275,10 +253,7 @@ def _slopes(model: RobotModel, rows: Rows, pi: Array, points: Sequence[int]) -> 
 def _slopes_of_bias(model: RobotModel, rows: Rows, pi: Array) -> Array:
     """Return the rows' torque per acceleration of the base, shape (N n_rows, 3) [N s^2/m].
 
-    Args:
-        model: The robot.
-        rows: Its motion.
-        pi: Standard parameters, shape (p,).
+    pi (p,).
     """
     motion = replace(rows.trajectory, basis=None)
     (torque,) = predict(model, [pi], motion)
@@ -305,11 +280,7 @@ def _shift_of_motion(model: RobotModel, mapping: BaseMapping, rows: Rows, theta:
 
     The errors of the acceleration of the base are those that cause the residual, sample by sample.
 
-    Args:
-        model: The robot.
-        mapping: Standard to base parameters.
-        rows: Its motion, and the rows used.
-        theta: Base parameters, shape (b,).
+    theta (b,).
     """
     motion, shift = rows.trajectory, np.zeros(len(theta))
     pushed = [replace(motion, a=motion.a + np.eye(1, model.n_rows, k)) for k in range(6)]
@@ -329,9 +300,7 @@ def _shift_of_motion(model: RobotModel, mapping: BaseMapping, rows: Rows, theta:
 def _world_acceleration(motion: Trajectory, bias: Array) -> Array:
     """Return the acceleration of the base with the axes of the world, shape (N, 3) [m/s^2].
 
-    Args:
-        motion: Its motion, without the bias of the accelerometers.
-        bias: The bias, which is added, shape (3,) [m/s^2].
+    bias (3,) [m/s^2].
     """
     v, back = motion.v, motion.q[:, 3:7] * np.array([-1.0, -1.0, -1.0, 1.0])
     return in_base(back, motion.a[:, :3] + np.cross(v[:, 3:6], v[:, :3]) + bias)
@@ -344,9 +313,7 @@ def mean_drift(a: Array, segment: Array) -> float:
     that of w'' x: constant speeds have no effect, and those at the ends have none. The plain mean
     is their change over T, 0.05 m/s^2 for a robot that sways.
 
-    Args:
-        a: Acceleration of the base with the axes of the world, shape (N, 3) [m/s^2].
-        segment: Number of the segment without gaps of each row, shape (N,).
+    a (N, 3) [m/s^2], segment (N,).
     """
     counts = np.unique(segment, return_counts=True)[1]
     w = np.concatenate([np.hanning(count + 2)[1:-1] for count in counts])

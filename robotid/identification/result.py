@@ -31,8 +31,6 @@ from robotid.identification.why_pictures import why_charts
 from robotid.output.pages.plots import Plot
 from robotid.robot.families import AUTO
 
-__all__ = ["Asked", "Identification"]
-
 
 @dataclass(frozen=True)
 class Asked:

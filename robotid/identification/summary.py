@@ -16,20 +16,6 @@ if TYPE_CHECKING:
     from robotid.estimation.fitting.metrics import Metrics
     from robotid.identification.result import Identification
 
-__all__ = [
-    "cell",
-    "error_lines",
-    "identification_html",
-    "identification_line",
-    "identification_text",
-    "joint_reason",
-    "left_out_lines",
-    "one_more_gain",
-    "variation_lines",
-    "verdict_cell",
-    "verdict_lines",
-]
-
 #: Column heads of the errors of other predictions, by name: of torques, then of positions.
 _BESIDE = {
     "urdf_with_drives": "URDF +\ndrives %",
@@ -46,13 +32,7 @@ _SHOWN_SPREADS = ("coulomb", "viscous", "kp", "kd", "delay")
 
 
 def identification_line(found: Identified, estimator: str, status: str) -> str:
-    """Return an identification in one line.
-
-    Args:
-        found: The identification.
-        estimator: Name of its estimator.
-        status: Status of its verdict.
-    """
+    """Return an identification in one line."""
     return (
         f"<Identification of {found.model.name}: {len(found.base)} base parameters by "
         f"{estimator}, verdict {status}>"
@@ -60,11 +40,7 @@ def identification_line(found: Identified, estimator: str, status: str) -> str:
 
 
 def identification_text(found: Identification) -> str:
-    """Return an identification as text: verdict, reasons, errors by joint.
-
-    Args:
-        found: The identification.
-    """
+    """Return an identification as text: verdict, reasons, errors by joint."""
     line = identification_line(found, found.estimator.name, found.verdict.status)
     lines = [line[1:-1], *verdict_lines(found.verdict.to_dict())[1:]]
     for caption, ours, wls in _tables(found):
@@ -79,13 +55,7 @@ def identification_text(found: Identification) -> str:
 def error_lines(
     metrics: Mapping[str, Any], wls: Mapping[str, Any] | None = None, width: int | None = None
 ) -> list[str]:
-    """Return the errors of each joint as lines of text.
-
-    Args:
-        metrics: Metrics, as in result.json.
-        wls: Metrics of weighted least squares, or None.
-        width: Characters per line; further columns are left out and named.
-    """
+    """Return the errors of each joint as lines of text."""
     others = {} if wls is None else wls["per_joint"]
     joints = {
         joint: {**m, "wls_relative_error_pct": others.get(joint, {}).get("relative_error_pct")}
@@ -107,11 +77,7 @@ def error_lines(
 
 
 def friction_lines(friction: Mapping[str, Any]) -> list[str]:
-    """Return the friction of joints besides viscous and Coulomb, and its effect, as text.
-
-    Args:
-        friction: By joint, as in result.json.
-    """
+    """Return the friction of joints besides viscous and Coulomb, and its effect, as text."""
     lines = []
     for joint, found in friction.items():
         if found["families"]:
@@ -125,11 +91,7 @@ def friction_lines(friction: Mapping[str, Any]) -> list[str]:
 
 
 def left_out_lines(logs: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return the errors by joint of logs that a fit to the others predicts, as text.
-
-    Args:
-        logs: As "left_out" in result.json; no line if there are none.
-    """
+    """Return the errors by joint of logs that a fit to the others predicts, as text."""
     errors: dict[str, list[float]] = {}
     for each in logs:
         for joint, own in each["per_joint"].items():
@@ -145,9 +107,6 @@ def variation_lines(variation: Mapping[str, Any] | None) -> list[str]:
     """Return the spread of friction between logs, and what one more log would add, as text.
 
     There is no line for fewer than three logs.
-
-    Args:
-        variation: As in result.json; None for fewer than three logs.
     """
     if variation is None:
         return []
@@ -178,11 +137,7 @@ def variation_lines(variation: Mapping[str, Any] | None) -> list[str]:
 
 
 def one_more_gain(parameter: Mapping[str, Any]) -> tuple[float, float]:
-    """Return the shares by which the error of a mean and a prediction interval would decrease.
-
-    Args:
-        parameter: A parameter of the variation between logs, as in result.json.
-    """
+    """Return the shares by which the error of a mean and a prediction interval would decrease."""
     error, width = (parameter["one_more"][key] for key in ("std_error", "interval_width"))
     low, high = parameter["next_interval"]
     return 1.0 - error / parameter["std_error"], 1.0 - width / (high - low)
@@ -192,9 +147,6 @@ def verdict_lines(verdict: Mapping[str, Any]) -> list[str]:
     """Return a verdict as lines of text: status, reasons, verdict on the other joints, and uses.
 
     The order is that of the reasons. A reason of a joint is the line of that joint.
-
-    Args:
-        verdict: Status, reasons and joints, as in result.json.
     """
     by_cell: dict[str, list[str]] = {}
     for name, joint in verdict["per_joint"].items():
@@ -217,43 +169,25 @@ def verdict_lines(verdict: Mapping[str, Any]) -> list[str]:
 
 
 def verdict_cell(joint: str, verdict: Mapping[str, Any]) -> str:
-    """Return the verdict on a joint with its first reason, as in "usable: error 20 % on b.csv".
-
-    Args:
-        joint: The joint.
-        verdict: Its status and reasons, as in result.json.
-    """
+    """Return the verdict on a joint with its first reason, as in "usable: error 20 % on b.csv"."""
     status, why = verdict["status"], joint_reason(joint, verdict["reasons"])
     return str(status) if status == "good" or not why else f"{status}: {why}"
 
 
 def joint_reason(joint: str, reasons: Sequence[str]) -> str:
-    """Return the first reason of the verdict on a joint without its name; "" if there is none.
-
-    Args:
-        joint: The joint.
-        reasons: Reasons of the verdict, the worst first.
-    """
+    """Return the first reason of the verdict on a joint without its name; "" if there is none."""
     why = reasons[0] if reasons else ""
     about, _, words = why.partition(": ")
     return words if joint in about.split(", ") else why
 
 
 def cell(value: float | None) -> str:
-    """Return a percentage, or a dash.
-
-    Args:
-        value: The percentage, or None.
-    """
+    """Return a percentage, or a dash."""
     return "-" if value is None else f"{value:.1f}" if value < 1000 else f"{value:.0f}"
 
 
 def identification_html(found: Identification) -> str:
-    """Return an identification as HTML: verdict, reasons, errors by joint, link to the report.
-
-    Args:
-        found: The identification.
-    """
+    """Return an identification as HTML: verdict, reasons, errors by joint, link to the report."""
     reasons = "".join(f"<li>{escape(reason)}</li>" for reason in found.verdict.reasons)
     tables = "".join(_errors(caption, metrics) for caption, metrics, _ in _tables(found))
     report = escape(found.report)

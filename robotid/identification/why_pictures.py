@@ -9,8 +9,6 @@ from robotid.estimation.fitting.bands import QUANTILE
 from robotid.identification.pictures import unused_spans
 from robotid.output.pages.charts import Chart, Series, broken
 
-__all__ = ["why_charts"]
-
 _POINTS = 600  # of a chart
 _TONES = {
     "gravity": "tone-1",
@@ -33,11 +31,6 @@ def why_charts(
     They are "split", the parts of the torque stacked over time; one for each quantity that the
     residual may depend on, by its name; and "power", if there is a speed. Charts over time show the
     first recording.
-
-    Args:
-        torque: Torque of the joint, from ``joint_torques``.
-        link: Group of charts over time that share cursor and zoom.
-        points: Approximate number of samples in each.
     """
     charts = {"split": _split(torque, link, points)}
     for dependence in torque.follows:

@@ -13,22 +13,6 @@ from robotid.base.exceptions import DataError, RankDeficientError, SettingsError
 from robotid.base.typing import Array
 from robotid.paper import planar_2r
 
-__all__ = [
-    "Bounds",
-    "LinearDynamics",
-    "LinearPlant",
-    "PlanarDynamics",
-    "Plant",
-    "Sign",
-    "mass_matrix",
-    "one_shot",
-    "proximity",
-    "recursive_update",
-    "reference_acceleration",
-    "smallest_eigenvalue",
-    "torque",
-]
-
 #: Sign of the second term of (23): with minus it is a gradient, plus is printed in the paper.
 Sign: TypeAlias = Literal["corrected", "printed"]
 
@@ -59,14 +43,7 @@ class Bounds:
             )
 
     def project(self, P: Array) -> Array:
-        """Return the nearest parameters of the set.
-
-        Args:
-            P: Parameters, shape (..., c).
-
-        Returns:
-            Parameters, shape (..., c).
-        """
+        """Return the nearest parameters of the set: P (..., c) -> (..., c)."""
         return np.clip(P, self.lower, self.upper)
 
 
@@ -75,18 +52,11 @@ def reference_acceleration(
 ) -> Array:
     """Return q_* = a_pr - alpha (v - v_pr) - beta (q - q_pr).
 
-    Args:
-        q: Measured positions, shape (..., n) [rad or m].
-        v: Measured velocities, shape (..., n) [rad/s or m/s].
-        program: q_pr, v_pr and a_pr, each of shape (..., n).
-        alpha: Gain of the velocity, shape () or (..., 1) [1/s].
-        beta: Gain of the position, shape () or (..., 1) [1/s^2].
-
-    Returns:
-        The reference acceleration, which returns the robot to its program, shape (..., n).
-
     References:
         Tzvetkova, (15).
+
+    q (..., n) [rad or m], v (..., n) [rad/s or m/s], program (..., n), alpha () [1/s], beta ()
+    [1/s^2] -> (..., n).
     """
     q_pr, v_pr, a_pr = program
     q_star: Array = a_pr - alpha * (v - v_pr) - beta * (q - q_pr)
@@ -99,21 +69,10 @@ def proximity(Psi: Array, P: Array, u: Array, *, sign: Sign = "corrected") -> Ar
     With the minus it is the gradient (4) of the criterion (3), J = |u - Psi P|^2 / 2, and zero at
     the true parameters. With the plus it is 2 Psi^T u there.
 
-    Args:
-        Psi: Regressor of the motion caused by the torque u, G at the measured acceleration, shape
-            (..., n, c). With that of (22), at q_*, PRX is always 0: u is Psi P by (21).
-        P: Estimate, shape (..., c).
-        u: Torque, shape (..., n) [N m or N].
-        sign: ``"corrected"`` (minus) or ``"printed"`` (plus).
-
-    Returns:
-        The proximity function, shape (..., c).
-
-    Raises:
-        SettingsError: If there is no such sign.
-
     References:
         Tzvetkova, (23).
+
+    Psi (..., n, c), P (..., c), u (..., n) [N m or N] -> (..., c).
     """
     if sign not in ("corrected", "printed"):
         raise SettingsError(f"sign is {sign!r}, wanted 'corrected' or 'printed'")
@@ -128,20 +87,10 @@ def recursive_update(
 ) -> Array:
     """Return P - lambda sigma_D / |Psi|^2 Psi^T eta, with |Psi|^2 = Sp(Psi Psi^T).
 
-    Args:
-        P: Estimate, shape (..., c).
-        Psi: Gradient (22) of the control, shape (..., n, c).
-        eta: Deviation (20), shape (..., n).
-        sigma: sigma_D, the smallest eigenvalue of D(q, P), shape (...). If it is not positive, the
-            estimate is not physical, (24) would increase the error, and P is not changed.
-        is_open: lambda, True if PRX is not zero, shape (...).
-        eps2: If |Psi|^2 is not above it, P is not changed [1/s^4].
-
-    Returns:
-        The next estimate, shape (..., c).
-
     References:
         Tzvetkova, (24).
+
+    P (..., c), Psi (..., n, c), eta (..., n), sigma (...), is_open (...) -> (..., c).
     """
     size = np.einsum("...nc,...nc->...", Psi, Psi)
     moves = is_open & (size > eps2) & (sigma > 0.0)
@@ -156,21 +105,10 @@ def one_shot(G: Array, G_star: Array, P: Array, names: Sequence[str]) -> Array:
     The torque is G P, with the measured acceleration, and G_* P^, with the reference acceleration
     (15) from which it was computed.
 
-    Args:
-        G: Regressors G(q, v, a) of all samples, stacked, shape (N n, c).
-        G_star: Regressors G(q, v, q_*), stacked, shape (N n, c).
-        P: The current estimate P^, shape (c,).
-        names: Names of the c parameters.
-
-    Returns:
-        Parameters, shape (c,).
-
-    Raises:
-        RankDeficientError: If the columns of G are linearly dependent; the recursive update (24)
-            is for that case.
-
     References:
         Tzvetkova, (16)-(19).
+
+    G (N n, c), G_star (N n, c), P (c,) -> (c,).
     """
     U, s, Vt = np.linalg.svd(G, full_matrices=False)
     rank = int(np.sum(s > s[0] * 1e-10)) if s[0] > 0 else 0
@@ -198,13 +136,8 @@ class LinearDynamics(Protocol):
     def regressor(self, q: Array, v: Array, a: Array) -> Array:
         """Return the regressor of R states.
 
-        Args:
-            q: Positions, shape (R, n) [rad or m].
-            v: Velocities, shape (R, n) [rad/s or m/s].
-            a: Accelerations, shape (R, n) [rad/s^2 or m/s^2].
-
-        Returns:
-            G(q, v, a), shape (R, n, c).
+        q (R, n) [rad or m], v (R, n) [rad/s or m/s], a (R, n) [rad/s^2 or m/s^2] -> (R, n,
+        c).
         """
 
 
@@ -214,13 +147,8 @@ class Plant(Protocol):
     def acceleration(self, q: Array, v: Array, u: Array) -> Array:
         """Return the accelerations of R robots.
 
-        Args:
-            q: Positions, shape (R, n) [rad or m].
-            v: Velocities, shape (R, n) [rad/s or m/s].
-            u: Torques, shape (R, n) [N m or N].
-
-        Returns:
-            Accelerations, shape (R, n) [rad/s^2 or m/s^2].
+        q (R, n) [rad or m], v (R, n) [rad/s or m/s], u (R, n) [N m or N] -> (R, n) [rad/s^2
+        or m/s^2].
         """
 
 
@@ -268,18 +196,11 @@ class LinearPlant(Plant):
 def torque(dynamics: LinearDynamics, q: Array, v: Array, a: Array, P: Array) -> Array:
     """Return u = G(q, v, a) P.
 
-    Args:
-        dynamics: The model.
-        q: Positions, shape (R, n) [rad or m].
-        v: Velocities, shape (R, n) [rad/s or m/s].
-        a: Accelerations, shape (R, n) [rad/s^2 or m/s^2].
-        P: Parameters, shape (c,) or (R, c).
-
-    Returns:
-        Torques, shape (R, n) [N m or N].
-
     References:
         Tzvetkova, (13).
+
+    q (R, n) [rad or m], v (R, n) [rad/s or m/s], a (R, n) [rad/s^2 or m/s^2], P (c,) -> (R, n)
+    [N m or N].
     """
     G = dynamics.regressor(q, v, a)  # (R, n, c)
     u: Array = np.einsum("rnc,rc->rn", G, np.broadcast_to(P, (len(q), G.shape[-1])))
@@ -292,16 +213,10 @@ def mass_matrix(dynamics: LinearDynamics, q: Array, P: Array) -> Array:
     Column j is (G(q, 0, e_j) - G(q, 0, 0)) P: the torque of a unit acceleration without that of
     gravity and constant offsets.
 
-    Args:
-        dynamics: The model.
-        q: Positions, shape (R, n) [rad or m].
-        P: Parameters, shape (c,) or (R, c).
-
-    Returns:
-        Mass matrices, shape (R, n, n); positive definite if P is physically consistent.
-
     References:
         Tzvetkova, (11); sigma_D of (24) needs it.
+
+    q (R, n) [rad or m], P (c,) -> (R, n, n).
     """
     return _mass_and_bias(dynamics, q, np.zeros_like(q), P)[0]
 
@@ -309,14 +224,10 @@ def mass_matrix(dynamics: LinearDynamics, q: Array, P: Array) -> Array:
 def smallest_eigenvalue(D: Array) -> Array:
     """Return sigma_D, the smallest eigenvalue of each matrix.
 
-    Args:
-        D: Symmetric matrices, shape (R, n, n).
-
-    Returns:
-        Eigenvalues, shape (R,).
-
     References:
         Tzvetkova, (24).
+
+    D (R, n, n) -> (R,).
     """
     smallest: Array = np.linalg.eigvalsh((D + D.swapaxes(-1, -2)) / 2)[..., 0]
     return smallest

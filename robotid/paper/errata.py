@@ -16,8 +16,6 @@ from robotid.paper.planar_2r import (
 )
 from robotid.paper.study import DURATION, MODELS, PROGRAM, paper_arm
 
-__all__ = ["EnergyDrift", "Erratum", "energy_drift", "errata"]
-
 _STATES = 2000
 _RANGE = (np.pi, 10.0, 20.0)  # [rad], [rad/s], [rad/s^2] of the random states
 _FREE = (np.array([[0.0, 1.0]]), np.array([[1.0, 2.0]]))  # [rad], [rad/s] start of free motion
@@ -62,10 +60,6 @@ def errata(rng: np.random.Generator) -> list[Erratum]:
     The last one is that of (22) in (23). Proof: u of (21) is C(q, v, P^) + D(q, P^) q_*, linear in
     P^, so u = Psi P^ with its gradient Psi (22), and PRX = Psi^T (Psi P^ - u) = 0 for every P^.
 
-    Args:
-        rng: Random generator of the states: q within pi rad, v within 10 rad/s, a within
-            20 rad/s^2.
-
     References:
         Tzvetkova, (21)-(27).
     """
@@ -86,12 +80,7 @@ def errata(rng: np.random.Generator) -> list[Erratum]:
 
 
 def energy_drift(*, duration: float = 10.0, dt: float = 4e-3) -> EnergyDrift:
-    """Return the energy of each model in free motion; that of a rigid arm is constant.
-
-    Args:
-        duration: Length of the motion [s].
-        dt: Step of the integration, Runge-Kutta of order 4 [s].
-    """
+    """Return the energy of each model in free motion; that of a rigid arm is constant."""
     t = dt * np.arange(round(duration / dt) + 1)
     energy = {name: _free_energy(name, len(t), dt) for name in MODELS}
     return EnergyDrift(t, {name: E / E[0] - 1.0 for name, E in energy.items()})

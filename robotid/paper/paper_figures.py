@@ -10,8 +10,6 @@ from robotid.paper.errata import EnergyDrift
 from robotid.paper.study import CASES, DURATION, PROGRAM, ModelStudy, RandomRuns
 from robotid.paper.svg import INK, STYLE
 
-__all__ = ["paper_figures"]
-
 # readable on white and on black
 _COLOURS = ("#0b7fd1", "#d4622a", "#23985f", "#b08400", "#b5539c")
 _STYLES = ("-", "--", ":")  # of models with coincident curves
@@ -25,11 +23,6 @@ def paper_figures(
     studies: Sequence[ModelStudy], runs: Mapping[str, RandomRuns], drift: EnergyDrift
 ) -> dict[str, tuple[str, Any]]:
     """Return the caption and the Matplotlib figure of each figure, by the name of its file.
-
-    Args:
-        studies: The models.
-        runs: Random motions of each model.
-        drift: Energies over time.
 
     References:
         Tzvetkova, figures 3 to 5.

@@ -10,16 +10,9 @@ from robotid.base.versions import __version__
 from robotid.output.pages.html import Cell, code, figure, number, page, table, text
 from robotid.paper.study import CASES
 
-__all__ = ["paper_page"]
-
 
 def paper_page(content: Mapping[str, Any], figures: Mapping[str, tuple[str, str]]) -> str:
-    """Return the page.
-
-    Args:
-        content: The content of paper.json.
-        figures: Caption and ``<svg>`` element of each figure, by name.
-    """
+    """Return the page."""
     shown = {name: figure(escape(caption), svg) for name, (caption, svg) in figures.items()}
     first = [shown[name] for name in ("figure_3a", "figure_3b", "figure_4a", "figure_4b")]
     sections = {

@@ -19,18 +19,6 @@ from robotid.base.exceptions import DataError, ModelError, SettingsError
 from robotid.base.findings import listed
 from robotid.base.typing import Array
 
-__all__ = [
-    "PAPER_LINKS",
-    "PAPER_PARAMETERS",
-    "PARAMETER_NAMES",
-    "Form",
-    "PlanarLinks",
-    "parameters",
-    "printed_velocity_coefficient",
-    "regressor",
-    "urdf_text",
-]
-
 #: As printed; errata 1 to 3 corrected, with separate p3 and p4; with columns 3 and 4 added.
 Form: TypeAlias = Literal["printed", "corrected_five", "corrected"]
 #: Names of the c parameters of each form.
@@ -103,18 +91,10 @@ PAPER_LINKS = PlanarLinks(1.0, 1.0, 10.0, -0.5, 0.0, 20.1, 1.9, 1.1 / 1.9, 0.1 /
 def parameters(links: PlanarLinks, *, form: Form = "corrected") -> Array:
     """Return the parameters P of an arm.
 
-    Args:
-        links: Lengths and inertia of the links.
-        form: With ``"printed"`` p4 is that of (27), with ``"corrected_five"`` p4 = p3.
-
-    Returns:
-        Parameters, shape (c,) [kg m^2], in the order of ``PARAMETER_NAMES[form]``.
-
-    Raises:
-        SettingsError: If there is no such form.
-
     References:
         Tzvetkova, (27).
+
+    -> (c,) [kg m^2].
     """
     _check_form(form)
     L1, L2, m1, m2 = links.L1, links.L2, links.m1, links.m2
@@ -130,21 +110,10 @@ def parameters(links: PlanarLinks, *, form: Form = "corrected") -> Array:
 def regressor(q: Array, v: Array, a: Array, *, form: Form = "corrected") -> Array:
     """Return the regressor G(q, v, a), with which G P = u.
 
-    Args:
-        q: Joint angles, shape (..., 2) [rad].
-        v: Joint velocities, shape (..., 2) [rad/s].
-        a: Joint accelerations, shape (..., 2) [rad/s^2].
-        form: One of the three regressors.
-
-    Returns:
-        Regressor, shape (..., 2, c) [1/s^2].
-
-    Raises:
-        DataError: If q, v or a does not have two entries.
-        SettingsError: If there is no such form.
-
     References:
         Tzvetkova, (13) and the matrix G before (27).
+
+    q (..., 2) [rad], v (..., 2) [rad/s], a (..., 2) [rad/s^2] -> (..., 2, c) [1/s^2].
     """
     _check_form(form)
     (_, q2), (v1, v2), (a1, a2) = _pair("q", q), _pair("v", v), _pair("a", a)
@@ -164,18 +133,10 @@ def regressor(q: Array, v: Array, a: Array, *, form: Form = "corrected") -> Arra
 def printed_velocity_coefficient(q: Array, links: PlanarLinks) -> Array:
     """Return h of erratum 1, printed in (26) for both C122 and C211.
 
-    Args:
-        q: Joint angles, shape (..., 2) [rad].
-        links: Lengths and inertia of the links.
-
-    Returns:
-        The coefficient, shape (...) [kg m^2].
-
-    Raises:
-        DataError: If q does not have two entries.
-
     References:
         Tzvetkova, (26).
+
+    q (..., 2) [rad] -> (...) [kg m^2].
     """
     _, q2 = _pair("q", q)
     along, across = links.L2 * links.m2 + links.m2 * links.xbar2, links.m2 * links.ybar2  # [kg m]
@@ -185,12 +146,6 @@ def printed_velocity_coefficient(q: Array, links: PlanarLinks) -> Array:
 
 def urdf_text(links: PlanarLinks = PAPER_LINKS) -> str:
     """Return the arm as URDF, in the frames of the joints and with all digits.
-
-    Args:
-        links: Lengths and inertia of the links.
-
-    Returns:
-        XML with links base_link, link_1, link_2 and joints joint_1, joint_2.
 
     References:
         Tzvetkova, (9): centres of mass move from the distal to the proximal end of a link.

@@ -29,8 +29,6 @@ from robotid.paper.equations import (
     smallest_eigenvalue,
 )
 
-__all__ = ["History", "Influences", "LoopSettings", "random_torque", "run_procedure"]
-
 _DIVERGED = 1e3  # [rad or m; per s] deviation from the program beyond which a run is stopped
 
 
@@ -127,14 +125,7 @@ class History:
     torques: Array | None = field(default=None, repr=False)
 
     def relative_error(self, P: Array) -> Array:
-        """Return |P^ - P| / |P| before the first iteration and after each.
-
-        Args:
-            P: True parameters, shape (c,).
-
-        Returns:
-            Relative errors, shape (L + 1, R).
-        """
+        """Return |P^ - P| / |P| before the first iteration and after each: P (c,) -> (L + 1, R)."""
         error: Array = np.linalg.norm(self.estimates - P, axis=-1) / np.linalg.norm(P)
         return error
 
@@ -143,14 +134,6 @@ def random_torque(
     share: float | Array, rng: np.random.Generator
 ) -> Callable[[Array, Array], Array]:
     """Return a disturbance v(t), uniform within a share of the control at every update.
-
-    Args:
-        share: Largest disturbance over the control, a number or an array that broadcasts to (R, n)
-            [-].
-        rng: Random generator of the disturbance.
-
-    Returns:
-        A function for ``Influences``.
 
     References:
         Tzvetkova, (2) and (11).
@@ -179,24 +162,10 @@ def run_procedure(
 
     Each iteration starts at rest at the start of the program, or at an offset from it.
 
-    Args:
-        dynamics: The model whose parameters are identified.
-        plant: The true robot.
-        motion: The program (28), one for all runs or one each.
-        P0: Initial values of the parameters, shape (R, c).
-        settings: Gains, numbers of iterations and updates, bounds; the defaults if None.
-        offset: Start of the robot relative to the program, shape (n,) or (R, n).
-        influences: Disturbance and noise; none if None.
-        keep_torques: Whether the history contains the control.
-        progress: Called with the number of each completed iteration.
-
-    Raises:
-        DataError: If the shape of P0 is not that of the dynamics.
-        RankDeficientError: If the method is one-shot and the motion does not determine all
-            parameters.
-
     References:
         Tzvetkova, (14)-(25).
+
+    P0 (R, c), offset (n,).
     """
     if P0.ndim != 2 or P0.shape[1] != len(dynamics.names):
         raise DataError(f"P0 has shape {P0.shape}, wanted (R, {len(dynamics.names)})")

@@ -37,8 +37,6 @@ from robotid.paper.svg import STYLE, svg_element, svg_file
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import PAPER_TERMS, to_paper_order
 
-__all__ = ["run_paper"]
-
 _ENOUGH = 1e-4  # [-] relative error at which the simulation has converged
 _SAMPLES = 241  # of the replay
 
@@ -52,13 +50,6 @@ def run_paper(
     """Run the paper's simulation with its three models, write it and return paper.json's content.
 
     Every file is written in a temporary folder inside the target and then moved.
-
-    Args:
-        folder: Folder for paper.json, paper.html and the figures as PNG and SVG; created if it is
-            missing.
-        settings: Numbers of iterations and runs; the defaults if None.
-        progress: Called with the part of the work, completed iterations, their largest number, and
-            their name.
 
     References:
         Tzvetkova, section VI.

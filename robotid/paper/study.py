@@ -20,22 +20,6 @@ from robotid.paper.equations import LinearDynamics, LinearPlant, PlanarDynamics,
 from robotid.paper.planar_2r import PAPER_LINKS, PAPER_PARAMETERS, Form, parameters
 from robotid.paper.procedure import History, Influences, LoopSettings, random_torque, run_procedure
 
-__all__ = [
-    "AMPLITUDE",
-    "CASES",
-    "DURATION",
-    "MODELS",
-    "PROGRAM",
-    "TOLERANCE",
-    "Case",
-    "ModelStudy",
-    "PaperSettings",
-    "RandomRuns",
-    "paper_arm",
-    "random_runs",
-    "study_model",
-]
-
 #: The three models and the form of the regressor of each.
 MODELS: dict[str, Form] = {
     "printed": "printed",
@@ -127,46 +111,24 @@ class ModelStudy:
     one_shot_error: float
 
     def errors(self, case: str = "clean") -> Array:
-        """Return the relative error before the first iteration and after each.
-
-        Args:
-            case: Name in ``CASES``.
-
-        Returns:
-            Errors, shape (L + 1,).
-        """
+        """Return the relative error before the first iteration and after each: -> (L + 1,)."""
         column: Array = self.history.relative_error(self.P)[:, list(CASES).index(case)]
         return column
 
     def program_control(self, points: int) -> tuple[Array, Array]:
         """Return the control of the program motion, G(q_pr, v_pr, a_pr) P.
 
-        Args:
-            points: Number N of samples.
-
-        Returns:
-            Times, shape (N,) [s], and torques, shape (N, 2) [N m].
-
         References:
             Tzvetkova, (14); figure 4.
+
+        -> (N,) [s], (N, 2) [N m].
         """
         t = np.linspace(0.0, DURATION, points)
         return t, torque(self.dynamics, *PROGRAM.evaluate(t), self.P)
 
 
 def paper_arm(name: str) -> tuple[PlanarDynamics, Array]:
-    """Return one of the three models and its true parameters.
-
-    Args:
-        name: ``"printed"``, ``"corrected"`` (five columns) or ``"physical"`` (four parameters).
-
-    Returns:
-        Regressor and parameters, shape (c,) [kg m^2]. The five are the paper's steady state; the
-        physical arm has p4 = p3.
-
-    Raises:
-        SettingsError: If there is no such model.
-    """
+    """Return one of the three models and its true parameters: -> (c,) [kg m^2]."""
     if name not in MODELS:
         raise SettingsError(f"model is {name!r}, wanted one of {listed(MODELS)}")
     P = parameters(PAPER_LINKS) if name == "physical" else PAPER_PARAMETERS
@@ -177,11 +139,6 @@ def study_model(
     name: str, settings: PaperSettings, *, progress: Callable[[int], None] | None = None
 ) -> ModelStudy:
     """Run the paper's simulation of one model, in every case.
-
-    Args:
-        name: Name in ``MODELS``.
-        settings: Numbers of iterations and runs.
-        progress: Called with the number of each completed iteration.
 
     References:
         Tzvetkova, section VI.
@@ -306,14 +263,7 @@ def random_runs(
     Each joint moves by 0.5 to 2 rad in either direction in 1 to 3 s. The initial value of each
     parameter is 0.3 to 1.7 times its true value. The bandwidth is 5 to 20 1/s.
 
-    Args:
-        dynamics: The model.
-        P: Its true parameters, shape (c,).
-        runs: Number R of motions.
-        iterations: Largest number of iterations of each.
-        rng: Random generator.
-        largest_offset: Largest distance of the start from the program [rad].
-        progress: Called with the number of each completed iteration.
+    P (c,).
     """
     n = dynamics.n_joints
     amplitude = rng.uniform(0.5, 2.0, (runs, n)) * rng.choice([-1.0, 1.0], (runs, n))

@@ -5,13 +5,6 @@ from html import escape
 from io import StringIO
 from typing import Any
 
-__all__ = [
-    "INK",
-    "STYLE",
-    "svg_element",
-    "svg_file",
-]
-
 #: Colour of text and axes; in a page it becomes the colour of the page's text.
 INK = "#010101"
 _WHITE = "#ffffff"
@@ -39,11 +32,7 @@ STYLE: dict[Any, Any] = {
 
 
 def svg_file(figure: Any) -> str:  # noqa: ANN401
-    """Return a figure as an SVG file, with a white background behind transparent axes.
-
-    Args:
-        figure: A figure of Matplotlib, drawn in ``STYLE``.
-    """
+    """Return a figure as an SVG file, with a white background behind transparent axes."""
     import matplotlib
 
     stream = StringIO()
@@ -55,13 +44,7 @@ def svg_file(figure: Any) -> str:  # noqa: ANN401
 
 
 def svg_element(file: str, title: str, key: str) -> str:
-    """Return an SVG file of ``svg_file`` as an element of a page, without the background.
-
-    Args:
-        file: Its content.
-        title: Its description, for screen readers.
-        key: Prefix of its ids, unique on the page.
-    """
+    """Return an SVG file of ``svg_file`` as an element of a page, without the background."""
     svg = file[file.index("<svg") :].replace(f"fill: {_WHITE}", "fill: none", 1)
     svg = re.sub(r" <metadata>.*?</metadata>\n", "", svg, flags=re.DOTALL)
     svg = re.sub(r' xmlns(:\w+)?="[^"]*"', "", svg).replace("xlink:href", "href")

@@ -9,8 +9,6 @@ from robotid.base.findings import listed
 from robotid.base.typing import Array
 from robotid.robot.model import RobotModel
 
-__all__ = ["pinocchio_model"]
-
 
 def pinocchio_model(model: RobotModel, pi: Array) -> pin.Model:
     """Return Pinocchio's model with inertias, armature, damping and dry friction of parameters.
@@ -29,15 +27,7 @@ def pinocchio_model(model: RobotModel, pi: Array) -> pin.Model:
     couplings, and friction that depends on load, position or an internal state or, other than
     linearly, on speed.
 
-    Args:
-        model: The robot.
-        pi: Standard parameters, shape (p,), SI units, in ``layout.names`` order.
-
-    Returns:
-        A new model; the URDF's friction and damping are replaced.
-
-    Raises:
-        DataError: If pi has another length, or a value that is no finite number below 1e30.
+    pi (p,).
     """
     layout, made = model.layout, pin.Model(model.with_parameters(pi).pin_model)
     fields = {term: np.zeros(made.nv) for term in ("armature", "viscous", "coulomb", "offset")}

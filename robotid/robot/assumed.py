@@ -13,8 +13,6 @@ from robotid.robot.geometry import body_frames, body_points
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import inertial_from_pseudo_inertia, pseudo_inertia
 
-__all__ = ["REASONS", "assumed_masses", "with_assumed_inertials"]
-
 #: Why the inertial of a body is assumed, by the code of the finding.
 REASONS = MappingProxyType({
     "missing_inertial": "no <inertial> with a mass",
@@ -41,12 +39,6 @@ def with_assumed_inertials(model: RobotModel) -> RobotModel:
     its frames if it has none; its density is the median of the other bodies, or 1000 kg/m^3. A
     massless body without geometry that carries another one in the same place, as between the axes
     of a ball joint, remains as it is beside bodies with mass.
-
-    Args:
-        model: The robot.
-
-    Returns:
-        The robot, with the code of ``REASONS`` of each assumed body in ``assumed``.
     """
     size, bodies = model.layout.n_inertial, model.layout.bodies
     pi = model.standard_parameters()[:size]
@@ -96,11 +88,7 @@ def with_assumed_inertials(model: RobotModel) -> RobotModel:
 
 
 def assumed_masses(model: RobotModel) -> tuple[str, ...]:
-    """Return the bodies whose mass is assumed: the URDF's is no evidence.
-
-    Args:
-        model: The robot.
-    """
+    """Return the bodies whose mass is assumed: the URDF's is no evidence."""
     return tuple(x for x, code in model.assumed.items() if code != "not_positive_definite")
 
 

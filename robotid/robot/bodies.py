@@ -18,20 +18,6 @@ from robotid.robot.parameters import (
 )
 from robotid.robot.tree import Inertial
 
-__all__ = [
-    "LinkPlace",
-    "central_inertial",
-    "density_share",
-    "held_parameters",
-    "inertial_parameters",
-    "least_density",
-    "link_places",
-    "link_transfer",
-    "negligible_bodies",
-    "principal_moments",
-    "usual_links",
-]
-
 _NEGLIGIBLE = 1e-5  # of the mass of the robot
 _DRAWS = 2000  # bodies that an estimate allows
 
@@ -60,11 +46,7 @@ class LinkPlace:
 
 
 def link_places(model: RobotModel) -> tuple[LinkPlace, ...]:
-    """Return the body of each link of the URDF, in the order of the file.
-
-    Args:
-        model: The robot.
-    """
+    """Return the body of each link of the URDF, in the order of the file."""
     arriving = {joint.child: joint for joint in model.tree.joints}
     frames = {link: _frame(model, link) for link in model.tree.links}
     inertials = model.tree.inertials
@@ -89,16 +71,7 @@ def link_places(model: RobotModel) -> tuple[LinkPlace, ...]:
 def link_transfer(model: RobotModel, link: str) -> tuple[int, Array]:
     """Return the body of a link, and the map of parameters from its frame to the body's.
 
-    Args:
-        model: The robot.
-        link: Name of a link of its URDF.
-
-    Returns:
-        Index of its body in ``layout.bodies``, -1 if it is fixed to the world; and the map from
-        inertial parameters in the link's frame to those in the body's, shape (10, 10).
-
-    Raises:
-        ModelError: If the URDF has no such link.
+    -> (10, 10).
     """
     if link not in model.tree.links:
         raise ModelError(
@@ -126,9 +99,6 @@ def held_parameters(model: RobotModel) -> Array:
     """Return the share of each body of links behind locked joints, (10 bodies,).
 
     They keep the URDF's inertials, so the rest of the body must be physically consistent by itself.
-
-    Args:
-        model: The robot.
     """
     held = np.zeros((len(model.layout.bodies), 10))
     for place in link_places(model):
@@ -138,11 +108,7 @@ def held_parameters(model: RobotModel) -> Array:
 
 
 def inertial_parameters(inertial: Inertial) -> Array:
-    """Return the ten inertial parameters of a link about its own frame, shape (10,).
-
-    Args:
-        inertial: Its inertial in the URDF.
-    """
+    """Return the ten inertial parameters of a link about its own frame, shape (10,)."""
     ixx, ixy, ixz, iyy, iyz, izz = inertial.inertia
     moments = np.array([[ixx, ixy, ixz], [ixy, iyy, iyz], [ixz, iyz, izz]])
     R = pin.rpy.rpyToMatrix(*inertial.rpy)
@@ -156,9 +122,6 @@ def negligible_bodies(model: RobotModel) -> tuple[str, ...]:
     """Return the bodies whose mass in the URDF is negligible, as between the axes of a ball joint.
 
     Bodies without mass are not among them, nor inconsistent ones.
-
-    Args:
-        model: The robot.
     """
     J = pseudo_inertia(model.standard_parameters()[: model.layout.n_inertial])
     mass, least = J[:, 3, 3], np.linalg.eigvalsh(J)[:, 0]
@@ -169,8 +132,7 @@ def negligible_bodies(model: RobotModel) -> tuple[str, ...]:
 def central_inertial(parameters: Array) -> Inertial:
     """Return mass, centre of mass and inertia about it from ten parameters in the link's frame.
 
-    Args:
-        parameters: Inertial parameters of a body with mass, shape (10,).
+    parameters (10,).
     """
     m, c = float(parameters[0]), parameters[1:4] / parameters[0]
     xx, xy, yy, xz, yz, zz = parameters[4:]
@@ -186,11 +148,7 @@ def principal_moments(parameters: Array) -> tuple[Array, Array]:
     The body is physically consistent if none is negative. The moments of inertia are their sums by
     pairs.
 
-    Args:
-        parameters: Inertial parameters of a body with mass, shape (10,).
-
-    Returns:
-        Moments, shape (3,), ascending [kg m^2]; axes, right-handed, in columns, shape (3, 3).
+    parameters (10,) -> (3,) [kg m^2], (3, 3).
     """
     H = np.column_stack([np.eye(3), -parameters[1:4] / parameters[0]])  # to the centre
     moments, axes = np.linalg.eigh(H @ pseudo_inertia(parameters)[0] @ H.T)
@@ -204,11 +162,7 @@ def least_density(parameters: Array) -> float:
     Of all bodies with the same mass and the same largest density, a homogeneous ellipsoid has the
     smallest determinant of second moments; with semi-axes a these are m a^2 / 5.
 
-    Args:
-        parameters: Inertial parameters of the body, shape (10,).
-
-    Returns:
-        The density; inf for a body with mass and without extent, 0 for one without mass.
+    parameters (10,).
     """
     mass = float(parameters[0])
     if mass <= 0:
@@ -227,14 +181,7 @@ def density_share(
     has, with a pseudo-inertia that is not positive definite, are left out. With J the
     pseudo-inertia, ``least_density`` is m^3 / (4/3 pi 5^1.5 sqrt(det J)).
 
-    Args:
-        parameters: Inertial parameters of the body, shape (10,).
-        covariance: Their covariance, shape (10, 10).
-        density: The density [kg/m^3].
-        rng: Source of the draws.
-
-    Returns:
-        The share; 0 if no draw is a body.
+    parameters (10,), covariance (10, 10).
     """
     values, axes = np.linalg.eigh(covariance)
     root = axes * np.sqrt(np.maximum(values, 0.0))
@@ -247,9 +194,5 @@ def density_share(
 
 
 def usual_links(model: RobotModel) -> tuple[str, ...]:
-    """Return the link that has the payload unless stated: the last one, or a floating base.
-
-    Args:
-        model: The robot.
-    """
+    """Return the link that has the payload unless stated: the last one, or a floating base."""
     return model.layout.bodies[:1] if model.free_flyer else model.layout.bodies[-1:]

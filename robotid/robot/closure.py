@@ -10,8 +10,6 @@ from robotid.base.typing import Array
 from robotid.robot.constraints import frame_id
 from robotid.robot.model import RobotModel
 
-__all__ = ["Chains", "refuse_loops"]
-
 _CLOSED = 1e-6  # largest error of a closed loop, relative to the length of the robot
 _MOST = 30  # iterations of Newton's method
 _SETTLED = 1e-8  # [rad, m] step with which it ends: the error is about its square
@@ -25,15 +23,7 @@ _APART = 4  # steps of the walk between two states
 
 
 def refuse_loops(model: RobotModel, what: str) -> None:
-    """Refuse a robot with loops or passive joints.
-
-    Args:
-        model: The robot.
-        what: What needs a robot without, as "a preview".
-
-    Raises:
-        DataError: If it is such a robot.
-    """
+    """Refuse a robot with loops or passive joints."""
     if model.loops or model.passive:
         found = "loops" if model.loops else "passive joints"
         raise DataError(
@@ -42,11 +32,7 @@ def refuse_loops(model: RobotModel, what: str) -> None:
 
 
 class Chains:
-    """The loops of a robot as equations of its n joint coordinates; the base has no effect.
-
-    Args:
-        model: The robot, with at least one loop.
-    """
+    """The loops of a robot as equations of its n joint coordinates; the base has no effect."""
 
     def __init__(self, model: RobotModel) -> None:
         self._model, self._data = model, model.pin_model.createData()
@@ -63,8 +49,7 @@ class Chains:
 
         Angles are multiplied by the length of the robot.
 
-        Args:
-            q: Joint coordinates, shape (N, n) [rad, m].
+        q (N, n) [rad, m].
         """
         loops = range(len(self._ids))
         errors = np.array([self._equations(x)[0] for x in q]).reshape(len(q), -1)
@@ -80,13 +65,7 @@ class Chains:
         the chains are assembled; each of the others from the one before it. From the first sample
         at which the loops do not close, the coordinates are constant; see ``gaps``.
 
-        Args:
-            q: Joint coordinates, shape (N, n) [rad, m]; those of unknown joints are not used.
-            unknown: Which joints are computed, shape (n,), bool; the others remain.
-
-        Raises:
-            ModelError: If the loops do not close near the zero position, or do not determine the
-                unknown joints.
+        q (N, n) [rad, m], unknown (n,).
         """
         x, found = self._assembled(), q.copy()
         singular = np.linalg.svd(self._equations(x)[1][:, unknown], compute_uv=False)
@@ -111,8 +90,7 @@ class Chains:
     def is_closed(self, x: Array) -> bool:
         """Return whether the loops close at coordinates to the accuracy of the computation.
 
-        Args:
-            x: Joint coordinates, shape (n,) [rad, m].
+        x (n,) [rad, m].
         """
         return bool(self.gaps(x[None]).max() <= _CLOSED * self._model.length)
 
@@ -121,10 +99,6 @@ class Chains:
 
         A random walk keeps the chains assembled as in the zero position: it does not cross dead
         centres. Z v are speeds that the loops permit, Z is an orthogonal projector.
-
-        Args:
-            samples: Number N of states.
-            rng: Random generator.
         """
         n = len(self._model.joints)
         every, size = np.ones(n, dtype=bool), np.where(self._is_long, self._model.length, 1.0)
@@ -158,9 +132,7 @@ class Chains:
     def accelerations(self, q: Array, v: Array) -> Array:
         """Return accelerations that keep closed loops closed, the smallest ones, shape (N, n).
 
-        Args:
-            q: Joint coordinates at which the loops close, shape (N, n) [rad, m].
-            v: Speeds that the loops permit, shape (N, n) [rad/s, m/s].
+        q (N, n) [rad, m], v (N, n) [rad/s, m/s].
         """
         a = np.empty_like(v)
         for k, (q_k, v_k) in enumerate(zip(q, v, strict=True)):

@@ -20,16 +20,6 @@ from robotid.robot.drive_term import DriveTerm
 if TYPE_CHECKING:
     from robotid.robot.model import RobotModel
 
-__all__ = [
-    "Constraint",
-    "Contact",
-    "Loop",
-    "check_constraints",
-    "frame_id",
-    "link_positions",
-    "root_poses",
-]
-
 
 @dataclass(frozen=True)
 class Contact:
@@ -289,18 +279,7 @@ def check_constraints(
     file: str,
     own_terms: Mapping[str, Sequence[DriveTerm]] = MappingProxyType({}),
 ) -> None:
-    """Refuse constraints of links that are not in the URDF, or stated twice, and wrong terms.
-
-    Args:
-        constraints: The constraints.
-        links: Names of the URDF's links.
-        file: Name of the URDF.
-        own_terms: Drive terms by joint.
-
-    Raises:
-        ModelError: If a link is unknown or repeated.
-        SettingsError: If a drive term needs the load of a joint, of which unknown forces are part.
-    """
+    """Refuse constraints of links that are not in the URDF, or stated twice, and wrong terms."""
     require_each(constraints, (Contact, Loop), "constraints", "a list of Contact and Loop")
     for constraint in constraints:
         for frame in constraint.frames:
@@ -323,23 +302,12 @@ def check_constraints(
 
 
 def frame_id(pin_model: pin.Model, link: str) -> int:
-    """Return the number of a link's frame.
-
-    Args:
-        pin_model: The robot.
-        link: Name of the link.
-    """
+    """Return the number of a link's frame."""
     return int(pin_model.getFrameId(link, pin.FrameType.BODY))
 
 
 def link_positions(pin_model: pin.Model, configurations: Array, links: Sequence[str]) -> Array:
-    """Return the positions of links in the world, shape (N, k, 3) [m].
-
-    Args:
-        pin_model: The robot.
-        configurations: Pinocchio's configurations, shape (N, nq).
-        links: Names of the k links.
-    """
+    """Return the positions of links in the world, shape (N, k, 3) [m]: configurations (N, nq)."""
     data, ids = pin_model.createData(), [frame_id(pin_model, link) for link in links]
     found = np.empty((len(configurations), len(ids), 3))
     for k, q in enumerate(np.ascontiguousarray(configurations)):
@@ -351,11 +319,7 @@ def link_positions(pin_model: pin.Model, configurations: Array, links: Sequence[
 def root_poses(model: "RobotModel", q: Array, poses: Array, link: str) -> Array:
     """Return the poses of the root link from those of another link, x y z qx qy qz qw, (N, 7).
 
-    Args:
-        model: The robot, whose base floats.
-        q: Positions of its joints, shape (N, n) [rad or m].
-        poses: Poses of the link in the world, shape (N, 7) [m, -].
-        link: Name of the link.
+    q (N, n) [rad or m], poses (N, 7) [m, -].
     """
     pin_model, found = model.pin_model, np.empty_like(poses)
     data, frame = pin_model.createData(), frame_id(pin_model, link)

@@ -17,23 +17,6 @@ from robotid.base.exceptions import SettingsError
 from robotid.base.settings import is_number
 from robotid.base.typing import Array
 
-__all__ = [
-    "ANYWHERE",
-    "BRISTLES",
-    "DIRECTED",
-    "LOADED",
-    "PLAIN",
-    "DataRange",
-    "DriveMotion",
-    "DriveTerm",
-    "Family",
-    "Law",
-    "MemorylessTerm",
-    "Shape",
-    "Slope",
-    "linear",
-]
-
 #: A law's value and its derivative.
 Slope: TypeAlias = tuple[Array | float, Array | float]
 #: A law of the speed or the position, and of up to four shape parameters.
@@ -48,11 +31,7 @@ _ENDS = (-1e9, 1e9)  # of a term's shape parameters
 
 
 def linear(z: Array) -> Slope:
-    """Return a law y = z and its derivative.
-
-    Args:
-        z: Speeds or positions [rad/s or m/s; rad or m].
-    """
+    """Return a law y = z and its derivative."""
     return z, 1.0
 
 
@@ -80,11 +59,7 @@ class DriveMotion:
     begins: Array | None = None
 
     def of(self, drive: int | list[int]) -> "DriveMotion":
-        """Return the motion of one drive or of several, from arrays with a row for each drive.
-
-        Args:
-            drive: Index of the drive, or a list of them.
-        """
+        """Return the motion of one drive or of several, from arrays with a row for each drive."""
         q, v, a = self.q[drive], self.v[drive], self.a[drive]
         direction, load, rate = self.direction[drive], self.load[drive], self.rate[drive]
         return DriveMotion(q, v, a, direction, load, rate, self.begins)
@@ -161,11 +136,7 @@ class DriveTerm(ABC):
 
     @abstractmethod
     def column(self, motion: DriveMotion) -> Array:
-        """Return the factor of the parameter, element by element, within the range of the data.
-
-        Args:
-            motion: Motion of a drive.
-        """
+        """Return the factor of the parameter, element by element, within the range of the data."""
 
     def to_dict(self) -> dict[str, Any]:
         """Return the term as plain values for ``term_from_dict``."""
@@ -225,12 +196,7 @@ class MemorylessTerm(DriveTerm):
         return (fastest, *(self.data_range if self.guards == "q" else ANYWHERE))
 
     def amplitude(self, q: Array, v: Array) -> Array:
-        """Return a(v) b(q) within the range of the data: the column for direction and load 1.
-
-        Args:
-            q: Positions [rad or m].
-            v: Velocities, shape as q [rad/s or m/s].
-        """
+        """Return a(v) b(q) within the range of the data: the column for direction and load 1."""
         fastest, lowest, highest = self.ranges
         y: Array | float = 1.0
         if self.speed_law is not None:
@@ -242,11 +208,7 @@ class MemorylessTerm(DriveTerm):
         return y if isinstance(y, np.ndarray) else np.full_like(v, y)
 
     def column(self, motion: DriveMotion) -> Array:
-        """Return the factor of the parameter, element by element, within the range of the data.
-
-        Args:
-            motion: Motion of a drive.
-        """
+        """Return the factor of the parameter, element by element, within the range of the data."""
         column = self.amplitude(motion.q, motion.v)
         if self.follows_direction:
             column = motion.direction * column
@@ -280,11 +242,7 @@ class Shape:
     of: str = ""
 
     def within(self, data_range: DataRange) -> tuple[float, float]:
-        """Return the bounds in the shape's own unit.
-
-        Args:
-            data_range: Ranges of position "q" and of the absolute speed "v" in the data.
-        """
+        """Return the bounds in the shape's own unit."""
         low, high = self.bounds
         if not self.of:
             return low, high
@@ -327,11 +285,7 @@ class Family:
     is_imitated: bool = False
 
     def tested_terms(self, speed: float) -> tuple[DriveTerm, ...]:
-        """Return the terms for which the residual of a fit is tested, without a range.
-
-        Args:
-            speed: Root mean square of the speed [rad/s or m/s].
-        """
+        """Return the terms for which the residual of a fit is tested, without a range."""
         units = [speed if shape.of == "v" else 1.0 for shape in self.shapes]
         sizes = [[x * unit for x, unit in zip(own, units, strict=True)] for own in self.tested]
         anywhere = {"q": ANYWHERE, "v": ANYWHERE}

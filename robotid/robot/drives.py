@@ -28,22 +28,6 @@ from robotid.robot.drive_term import (
     linear,
 )
 
-__all__ = [
-    "COUNTERBALANCE",
-    "DRIVE_TERMS",
-    "FAMILIES",
-    "TERMS",
-    "TERM_CLASSES",
-    "Bristles",
-    "DataRange",
-    "DriveMotion",
-    "DriveTerm",
-    "Family",
-    "Lag",
-    "LoadFriction",
-    "MemorylessTerm",
-]
-
 _LEAST = 1e-12  # [rad/s or m/s] speed below which the slope of a power is constant
 _POSITIVE = (1e-9, 1e9)  # bounds of shape parameters that are divisors
 
@@ -61,11 +45,7 @@ class Armature(DriveTerm):
     part = "motor inertia"
 
     def column(self, motion: DriveMotion) -> Array:
-        """Return the acceleration of the drive.
-
-        Args:
-            motion: Motion of a drive.
-        """
+        """Return the acceleration of the drive."""
         return motion.a
 
 
@@ -301,14 +281,6 @@ class Bristles(DriveTerm):
 
         After a displacement in one direction, at one speed, z is sign(v) g + (z - sign(v) g) decay;
         its steady value is g(v) = 1 + c exp(-(v / w)^2).
-
-        Args:
-            x: s_0, w and c [rad or m; rad/s or m/s; -].
-            way: Displacement of the drive [rad or m].
-            v: Its speed meanwhile [rad/s or m/s].
-
-        Returns:
-            g, dg/dv, decay = exp(-|way| / (s_0 g)).
         """
         extra = x[2] * np.exp(-((v / x[1]) ** 2))
         g = 1.0 + extra
@@ -320,20 +292,13 @@ class Bristles(DriveTerm):
         return self.displacement, 1.0, 0.0
 
     def level(self, v: Array) -> Array:
-        """Return g, the steady value of abs(z), shape as v.
-
-        Args:
-            v: Speeds [rad/s or m/s].
-        """
+        """Return g, the steady value of abs(z), shape as v."""
         return self.law(self.numbers, np.zeros_like(v), v)[0]
 
     def column(self, motion: DriveMotion) -> Array:
         """Return z along segments, initialised with its steady value.
 
         It is exact between two samples if the sign of v and g are constant there.
-
-        Args:
-            motion: Motion of a drive; z has its steady value if the samples are not in a sequence.
         """
         if motion.begins is None:
             return motion.direction * self.level(motion.v)
@@ -465,11 +430,7 @@ class Lag(DriveTerm):
     part = "delay"
 
     def column(self, motion: DriveMotion) -> Array:
-        """Return minus the time derivative of the whole torque.
-
-        Args:
-            motion: Motion of a drive.
-        """
+        """Return minus the time derivative of the whole torque."""
         return -motion.rate
 
 

@@ -7,16 +7,10 @@ from pathlib import Path
 from robotid.base.exceptions import MissingDependencyError, ModelError
 from robotid.base.findings import listed
 
-__all__ = ["example_urdf", "example_urdfs"]
-
 
 @cache
 def example_urdfs() -> tuple[Path, ...]:
-    """Return the paths of every URDF of example-robot-data, sorted.
-
-    Raises:
-        MissingDependencyError: If example-robot-data is not installed.
-    """
+    """Return the paths of every URDF of example-robot-data, sorted."""
     # its wheel contains data without a Python loader, so its record lists the files
     try:
         found = distribution("example-robot-data")
@@ -29,18 +23,7 @@ def example_urdfs() -> tuple[Path, ...]:
 
 
 def example_urdf(name: str) -> Path:
-    """Return the path of one example robot.
-
-    Args:
-        name: File name, for example "ur5_robot.urdf".
-
-    Returns:
-        Its path.
-
-    Raises:
-        MissingDependencyError: If example-robot-data is not installed.
-        ModelError: If it has no such file.
-    """
+    """Return the path of one example robot."""
     urdfs = example_urdfs()
     for path in urdfs:
         if path.name == name:

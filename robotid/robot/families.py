@@ -12,15 +12,6 @@ from robotid.base.findings import listed, toml_key
 from robotid.base.settings import is_number, require_kind
 from robotid.robot.drives import FAMILIES, TERM_CLASSES, DriveTerm
 
-__all__ = [
-    "AUTO",
-    "drive_line",
-    "has_turned",
-    "spring_family",
-    "term_from_dict",
-    "wanted_families",
-]
-
 #: Value of ``friction`` with which the families of each joint are chosen.
 AUTO = "auto"
 _OF_MODEL = ("none", "viscous", "coulomb")  # allowed in ``friction``, and terms of the model
@@ -28,33 +19,17 @@ _SPARE = 1.1  # factor on the range that a family needs, from which it is advise
 
 
 def spring_family(turned: float, *families: str) -> str:
-    """Return the first spring family whose required range a joint covered.
-
-    Args:
-        turned: Range of its positions [rad].
-        families: Names of families, in descending order of the required range; "spring" requires
-            none.
-    """
+    """Return the first spring family whose required range a joint covered."""
     return next((name for name in families if has_turned(name, turned)), "spring")
 
 
 def has_turned(family: str, turned: float) -> bool:
-    """Return whether a joint covered 1.1 times the range of positions that a family needs.
-
-    Args:
-        family: Its name.
-        turned: Range of the joint's positions [rad]; 0 for a prismatic joint.
-    """
+    """Return whether a joint covered 1.1 times the range of positions that a family needs."""
     return _SPARE * FAMILIES[family].needs * 2 * np.pi <= turned
 
 
 def drive_line(joint: str, *entries: str | DriveTerm) -> str:
-    """Return the line of a job's [drives] with the families or terms of a joint.
-
-    Args:
-        joint: The joint.
-        entries: Names of families, or terms.
-    """
+    """Return the line of a job's [drives] with the families or terms of a joint."""
     return f"{toml_key(joint)} = [{', '.join(map(_toml_entry, entries))}]"
 
 
@@ -68,17 +43,7 @@ def _toml_entry(entry: str | DriveTerm) -> str:
 def wanted_families(
     friction: str | Mapping[str, str], joints: Sequence[str]
 ) -> dict[str, tuple[str, ...] | None]:
-    """Return the names of each joint's families; None where they are chosen from the data.
-
-    Args:
-        friction: "auto", or names of families joined by +; or these by joint, "*" for all joints
-            that are not named ("auto" if it is omitted). Viscous and Coulomb friction are terms of
-            the model.
-        joints: Names of the joints.
-
-    Raises:
-        SettingsError: If a name or a joint is unknown.
-    """
+    """Return the names of each joint's families; None where they are chosen from the data."""
     wanted_kind = "auto, names of families joined by +, or a table of these by joint"
     require_kind(friction, (str, Mapping), "friction", wanted_kind)
     for joint, names in friction.items() if isinstance(friction, Mapping) else ():
@@ -105,14 +70,7 @@ def wanted_families(
 
 
 def term_from_dict(table: Mapping[str, Any]) -> DriveTerm:
-    """Return a term from its plain values, as of ``DriveTerm.to_dict``.
-
-    Args:
-        table: Its class under "term", and the fields that differ from their defaults.
-
-    Raises:
-        SettingsError: If there is no such term, or a field is unknown or not a number.
-    """
+    """Return a term from its plain values, as of ``DriveTerm.to_dict``."""
     if not isinstance(table, Mapping):
         raise SettingsError(
             f"a drive term is {table!r}, wanted a table, for example "

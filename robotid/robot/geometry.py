@@ -15,17 +15,6 @@ from robotid.robot.meshes import Shape, find_mesh, read_shapes, read_surfaces
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
 
-__all__ = [
-    "body_boxes",
-    "body_frames",
-    "body_points",
-    "box_half_spaces",
-    "geometry_half_spaces",
-    "hull_half_spaces",
-    "kinematic_lengths",
-    "link_clouds",
-]
-
 _SIDES = 16  # of the prism around a cylinder
 _MOST_FACES = 100  # a hull with more is replaced by an outer polytope with this many faces
 _GROWN = 0.05  # enlargement on each side of the box of a body's geometry, over its diagonal
@@ -35,19 +24,7 @@ _HOUSINGS = 0.1  # of the robot's length, for the parts of a body beyond its joi
 
 
 def geometry_half_spaces(model: RobotModel, shape: str) -> dict[str, tuple[Array, Array]]:
-    """Return bounds on the centres of mass from the URDF's geometry.
-
-    Args:
-        model: The robot.
-        shape: "box" or "hull" of each body's geometry, or "none".
-
-    Returns:
-        Half-spaces A c <= b in the frame of each body's moved link, by its name; see
-        ``body_points`` for the bodies without bounds.
-
-    Raises:
-        SettingsError: If geometry is asked for and no body has any that can be read.
-    """
+    """Return bounds on the centres of mass from the URDF's geometry."""
     if shape == "none":
         return {}
     points = body_points(model)
@@ -67,13 +44,7 @@ def body_points(model: RobotModel, *, with_visual: bool = False) -> dict[str, Ar
     shapes are replaced by polyhedra around them. A body is omitted if one of its links with mass
     has no geometry, or a mesh that is not found: its mass has no bounds.
 
-    Args:
-        model: The robot.
-        with_visual: Whether a link's visual geometry that can be read is used beside its collision
-            geometry, which may be a small stand-in.
-
-    Returns:
-        Points by name of the body, shape (k, 3) [m].
+    -> (k, 3) [m].
     """
     clouds = _clouds(model.tree.robot, model.tree.path)
     if with_visual:
@@ -103,12 +74,7 @@ def link_clouds(model: RobotModel) -> tuple[list[tuple[str, int, Array]], list[s
 
     They are those of a link's collision geometry, or of its visual one if it has none.
 
-    Args:
-        model: The robot.
-
-    Returns:
-        Name of the link, its body (-1: it is fixed to the world) and the points, shape (k, 3) [m],
-        of each shape; and the links of which a shape cannot be read.
+    -> (k, 3) [m].
     """
     shapes = _clouds(model.tree.robot, model.tree.path)
     clouds, unread = [], []
@@ -131,11 +97,7 @@ def body_boxes(model: RobotModel) -> dict[str, Array]:
     at least 10 % of the robot's longest link. It also contains the URDF's body: the uniform box of
     equal mass, centre and second moments.
 
-    Args:
-        model: The robot.
-
-    Returns:
-        Lower and upper corner by name of each body, shape (2, 3) [m].
+    -> (2, 3) [m].
     """
     bodies, frames = model.layout.bodies, body_frames(model)
     shapes, boxes = body_points(model), {}
@@ -162,12 +124,6 @@ def kinematic_lengths(model: RobotModel) -> dict[str, float]:
     its joint to the one before it, and 10 % of the robot's length for housings beyond the joints.
     The travel of prismatic joints at the body is added; next to one without limits a body has no
     length here, and neither has a robot whose joints all coincide.
-
-    Args:
-        model: The robot.
-
-    Returns:
-        Length by name of the body [m].
     """
     pins, bodies, frames = model.pin_model, model.layout.bodies, body_frames(model)
     steps = [float(np.linalg.norm(place.translation)) for place in pins.jointPlacements]
@@ -191,26 +147,13 @@ def kinematic_lengths(model: RobotModel) -> dict[str, float]:
 
 
 def box_half_spaces(points: Array) -> tuple[Array, Array]:
-    """Return the axis-parallel box around points: A c <= b, A of shape (6, 3), b of (6,) [m].
-
-    Args:
-        points: Shape (k, 3) [m].
-    """
+    """Return the axis-parallel box around points: A c <= b, A of shape (6, 3), b of (6,) [m]."""
     A = np.vstack([np.eye(3), -np.eye(3)])
     return A, (A @ points.T).max(axis=1)
 
 
 def hull_half_spaces(points: Array) -> tuple[Array, Array]:
-    """Return the convex hull of points as half-spaces A c <= b.
-
-    Args:
-        points: Shape (k, 3) [m].
-
-    Returns:
-        A, unit rows, shape (f, 3), and b, shape (f,) [m]. A hull with more than 100 faces is
-        replaced by its outer polytope with 100 uniformly distributed normals, flat points by their
-        box.
-    """
+    """Return the convex hull of points as half-spaces A c <= b: -> (f, 3), (f,) [m]."""
     from scipy.spatial import ConvexHull, QhullError
 
     try:
@@ -230,11 +173,7 @@ def hull_half_spaces(points: Array) -> tuple[Array, Array]:
 def body_frames(model: RobotModel) -> dict[str, list[Array]]:
     """Return the origins of the frames of each body (its joints, links, tools), by its name.
 
-    Args:
-        model: The robot.
-
-    Returns:
-        Origins in the frame of the body's moved link, shape (3,) [m].
+    -> (3,) [m].
     """
     pins, bodies = model.pin_model, model.layout.bodies
     frames: dict[str, list[Array]] = {body: [np.zeros(3)] for body in bodies}

@@ -11,8 +11,6 @@ from robotid.base.findings import listed
 from robotid.robot.tree import Tree
 from robotid.robot.urdf_text import LARGEST
 
-__all__ = ["choose_joints", "mimic_followers"]
-
 _MOST_JOINTS = 300  # memory grows with their square, time with their cube: 2 GiB, 75 s
 
 
@@ -23,19 +21,7 @@ def choose_joints(
     locked: Mapping[str, float],
     followers: Mapping[str, tuple[str, float, float]],
 ) -> tuple[tuple[str, ...], dict[str, float]]:
-    """Return the joints that move, in order, and the positions of those that do not [rad or m].
-
-    Args:
-        tree: The URDF.
-        free: Names of the movable joints that follow no other, in Pinocchio's order.
-        joints: Names of the joints that move, in the wanted order; if None, all that are not
-            locked.
-        locked: Positions of locked joints [rad or m], "*" that of all others.
-        followers: As of ``mimic_followers``; empty if mimic joints are independent.
-
-    Raises:
-        ModelError: If a joint is not in the URDF, or is in both, or a position is not a number.
-    """
+    """Return the joints that move, in order, and the positions of those that do not [rad or m]."""
     _check_joints(tree, [*(joints or ()), *(name for name in locked if name != "*")], followers)
     if joints is None and "*" in locked:
         raise ModelError(
@@ -91,14 +77,7 @@ def _check_joints(tree: Tree, names: Sequence[str], followers: Mapping[str, obje
 
 
 def mimic_followers(tree: Tree) -> dict[str, tuple[str, float, float]]:
-    """Return each mimic joint with its leading joint, ratio and offset; chains are resolved.
-
-    Args:
-        tree: The URDF.
-
-    Raises:
-        ModelError: If a joint mimics itself or a joint that is not there.
-    """
+    """Return each mimic joint with its leading joint, ratio and offset; chains are resolved."""
     by_name = {joint.name: joint for joint in tree.movable}
     resolved = {}
     for joint in tree.movable:

@@ -10,15 +10,6 @@ from robotid.robot.closure import Chains
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import ParameterLayout
 
-__all__ = [
-    "MassMatrixCheck",
-    "carried_inertia",
-    "check_mass_matrix",
-    "drive_inertia",
-    "joint_mass_matrices",
-    "rigid_mass_matrices",
-]
-
 POSES = 10_000
 _CLOSED_POSES = 200
 _BLOCK = 200  # poses whose mass matrices are in memory together
@@ -43,13 +34,7 @@ def check_mass_matrix(
 ) -> MassMatrixCheck:
     """Return whether the mass matrix, armatures included, is positive definite at random poses.
 
-    Args:
-        model: The robot.
-        pi: Standard parameters, shape (p,).
-        poses: Number of poses, uniform within the joints' limits; a joint without limits has the
-            range +-pi rad or +-1 m. With closed chains, fewer poses at which they close, and the
-            mass matrix of the permitted motion.
-        seed: Seed of the poses.
+    pi (p,).
     """
     rng = np.random.default_rng(seed)
     if model.loops and not model.free_flyer:
@@ -88,10 +73,7 @@ def _are_above(M: Array, least: float) -> bool:
 def joint_mass_matrices(model: RobotModel, pi: Array, q: Array) -> Array:
     """Return the mass matrices of the joints, armatures included, shape (N, n_rows, n_rows).
 
-    Args:
-        model: The robot.
-        pi: Standard parameters, shape (p,).
-        q: Joint coordinates, shape (N, n), or (N, 7 + n) with a floating base [rad, m].
+    pi (p,), q (N, n) [rad, m].
     """
     return _mass_matrices(model.with_parameters(pi), pi, q)
 
@@ -109,10 +91,7 @@ def rigid_mass_matrices(
 ) -> Array:
     """Return the mass matrices of the bodies alone, without drives, shape (N, n_rows, n_rows).
 
-    Args:
-        model: The robot.
-        configurations: Pinocchio's configurations, shape (N, nq), as of ``model.configurations``.
-        data: Pinocchio's work space of the model; a new one if None.
+    configurations (N, nq).
     """
     data = model.pin_model.createData() if data is None else data
     M = np.empty((len(configurations), model.pin_model.nv, model.pin_model.nv))
@@ -128,9 +107,7 @@ def rigid_mass_matrices(
 def drive_inertia(layout: ParameterLayout, pi: Array) -> Array:
     """Return the drives' contribution to the mass matrix of the joints, (n, n) [kg m^2, or kg].
 
-    Args:
-        layout: The standard parameters of a robot with n joints.
-        pi: Their values, shape (p,).
+    pi (p,).
     """
     Ia = pi[layout.n_inertial :] * [term.is_inertia for _, term in layout.drive_parameters]
     added: Array = (layout.drive_loads * Ia) @ layout.drive_loads.T
@@ -138,10 +115,6 @@ def drive_inertia(layout: ParameterLayout, pi: Array) -> Array:
 
 
 def carried_inertia(model: RobotModel) -> Array:
-    """Return the diagonal of the bodies' mass matrix at the neutral pose, (n,) [kg m^2, or kg].
-
-    Args:
-        model: The robot.
-    """
+    """Return the diagonal of the bodies' mass matrix at the neutral pose, (n,) [kg m^2, or kg]."""
     (M,) = rigid_mass_matrices(model, pin.neutral(model.pin_model)[None])
     return np.maximum(np.diag(M)[model.n_rows - len(model.joints) :], 0.0)

@@ -16,8 +16,6 @@ from robotid.base.typing import Array
 from robotid.robot.examples import example_urdfs
 from robotid.robot.urdf_text import LARGEST, numbers
 
-__all__ = ["Shape", "Surface", "find_mesh", "joined", "read_shapes", "read_surfaces"]
-
 _FORMATS = (".stl", ".dae", ".obj", ".ply", ".off", ".glb", ".gltf")
 _MOST_BYTES = 2**28  # of a mesh; that of a link has about 2**20
 
@@ -64,12 +62,7 @@ class Shape:
 
 
 def read_shapes(robot: ET.Element, tag: str = "visual") -> tuple[Shape, ...]:
-    """Return the shapes in a URDF, in the order of the file.
-
-    Args:
-        robot: The ``<robot>`` of the file.
-        tag: "visual" or "collision".
-    """
+    """Return the shapes in a URDF, in the order of the file."""
     colours = {m.get("name"): _colour(m) for m in robot.findall("material")}
     found = []
     for link in robot.findall("link"):
@@ -90,10 +83,6 @@ def find_mesh(name: str, urdf: str | Path) -> Path | None:
     A relative path, or one with ``package://``, is searched in ROS_PACKAGE_PATH, in the URDF's
     folder and its parents, and in example-robot-data, with the name of its package and without it.
     A path in a package with ".." is not accepted. Folders, pipes and devices are not meshes.
-
-    Args:
-        name: Its name in the URDF.
-        urdf: The URDF file.
     """
     if name.startswith("file://"):
         path = Path(name.removeprefix("file://"))
@@ -116,18 +105,7 @@ def find_mesh(name: str, urdf: str | Path) -> Path | None:
 
 
 def read_surfaces(path: Path) -> tuple[Surface, ...]:
-    """Read a mesh: STL, DAE, OBJ, PLY, OFF or glTF.
-
-    Args:
-        path: The file.
-
-    Returns:
-        Its surfaces [m], none if it has no triangles.
-
-    Raises:
-        ValueError: If the file cannot be read, is larger than 256 MiB, or has a corner that is not
-            finite.
-    """
+    """Read a mesh: STL, DAE, OBJ, PLY, OFF or glTF."""
     if path.suffix.lower() not in _FORMATS:
         raise ValueError(f"{path.name} is not a mesh, wanted {', '.join(_FORMATS)}")
     # the readers of the formats raise errors of every kind
@@ -219,11 +197,7 @@ def _mesh_colour(visual: Any) -> tuple[float, ...] | None:  # noqa: ANN401
 
 
 def joined(surfaces: Sequence[Surface]) -> Surface:
-    """Return surfaces as one, of the first one's colour.
-
-    Args:
-        surfaces: At least one.
-    """
+    """Return surfaces as one, of the first one's colour."""
     starts = np.cumsum([0, *(len(s.vertices) for s in surfaces[:-1])])
     faces = [s.faces + start for s, start in zip(surfaces, starts, strict=True)]
     vertices = np.vstack([s.vertices for s in surfaces])

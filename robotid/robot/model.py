@@ -24,8 +24,6 @@ from robotid.robot.parameters import DYNAMICS, Coupling, ParameterLayout
 from robotid.robot.tree import Joint, Tree, read_tree
 from robotid.robot.urdf_text import LARGEST
 
-__all__ = ["GRAVITY", "RobotModel"]
-
 GRAVITY = (0.0, 0.0, -9.81)  # [m/s^2]
 _OFFSET = 0.01  # [m] axes that are nearer have no distance: 78 URDFs have 0.05 m or more, or 0.5 mm
 _STRONGEST = 100.0  # [m/s^2] with more, accelerations are negligible beside gravity

@@ -14,18 +14,6 @@ from robotid.base.typing import Array
 from robotid.robot.drives import DRIVE_TERMS, TERMS, DriveTerm
 from robotid.robot.urdf_text import LARGEST
 
-__all__ = [
-    "DYNAMICS",
-    "INERTIAL_TERMS",
-    "PAPER_TERMS",
-    "Coupling",
-    "ParameterLayout",
-    "inertial_from_pseudo_inertia",
-    "pseudo_inertia",
-    "pseudo_inertia_basis",
-    "to_paper_order",
-]
-
 #: The identified dynamics: all, or those of poses at rest and slow motion.
 DYNAMICS = ("full", "static")
 #: Inertial parameters of one body in Pinocchio's order; inertia about the joint frame.
@@ -241,22 +229,13 @@ class ParameterLayout:
         return tuple(inertial + drive)
 
     def owned_by(self, owners: Sequence[str]) -> Array:
-        """Return which parameters belong to some bodies or joints, flags, shape (p,), bool.
-
-        Args:
-            owners: Their names.
-        """
+        """Return which parameters belong to some bodies or joints, flags, shape (p,), bool."""
         return np.isin([name.rsplit(".", 1)[0] for name in self.names], list(owners))
 
     def scales(self, length: float) -> Array:
         """Return the scale 1 kg length^k of each parameter, with which columns are comparable.
 
-        Args:
-            length: A length of the robot [m].
-
-        Returns:
-            Scales, shape (p,): 1 for a mass, length for m c, length^2 for an inertia and for the
-            armature of a rotary joint, 1 for other drive terms.
+        -> (p,).
         """
         inertial = [1.0, *[length] * 3, *[length**2] * 6] * len(self.bodies)
         rotary = [t.is_inertia and not self._is_linear(d) for d, t in self.drive_parameters]
@@ -283,18 +262,10 @@ class ParameterLayout:
 def to_paper_order(pi: Array) -> Array:
     """Return inertial parameters in the order of the paper's vector (9), (10).
 
-    Args:
-        pi: Inertial parameters in Pinocchio's order, shape (10 n,).
-
-    Returns:
-        The same values, shape (10 n,), body by body as
-        [Ixx Ixy Ixz Iyy Iyz Izz mx my mz m], in the same frames.
-
-    Raises:
-        DataError: If the number of entries is not a multiple of 10.
-
     References:
         Tzvetkova, Extracting Inertial Parameters from Robotic Manipulators Dynamics, (9)-(10).
+
+    pi (10 n,) -> (10 n,) [Ixx Ixy Ixz Iyy Iyz Izz mx my mz m].
     """
     order = [INERTIAL_TERMS.index(term) for term in PAPER_TERMS]
     return _by_body(pi)[:, order].reshape(-1)
@@ -325,18 +296,11 @@ def pseudo_inertia(pi: Array) -> Array:
 
     A body is physically consistent if and only if J is positive semidefinite.
 
-    Args:
-        pi: Inertial parameters in Pinocchio's order, shape (10 n,).
-
-    Returns:
-        Pseudo-inertia matrices, shape (n, 4, 4) [kg m^2, kg m, kg].
-
-    Raises:
-        DataError: If the number of entries is not a multiple of 10.
-
     References:
         Wensing, Kim, Slotine (2018), Linear Matrix Inequalities for Physically Consistent
         Inertial Parameter Identification, (8).
+
+    pi (10 n,) -> (n, 4, 4) [kg m^2, kg m, kg].
     """
     J: Array = np.einsum("nk,kij->nij", _by_body(pi), pseudo_inertia_basis())
     return J
@@ -347,8 +311,7 @@ def inertial_from_pseudo_inertia(J: Array) -> Array:
 
     It is the inverse of ``pseudo_inertia``.
 
-    Args:
-        J: Pseudo-inertias, shape (..., 4, 4).
+    J (..., 4, 4).
     """
     trace = np.trace(J[..., :3, :3], axis1=-2, axis2=-1)[..., None, None]
     inertia = trace * np.eye(3) - J[..., :3, :3]

@@ -8,8 +8,6 @@ from robotid.robot.mass_matrix import carried_inertia
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
 
-__all__ = ["payload_spread", "prior_spread"]
-
 _SMALLEST_MASS = 0.1  # of the mean mass: deviation of a link's mass even if its URDF states 0
 _SMALLEST_RADIUS = 0.1  # of the robot's length: the same for a link's size
 _POSITIONS = 16  # of a revolution at which terms that depend on the position are evaluated
@@ -24,11 +22,7 @@ def prior_spread(model: RobotModel, squares: Array, samples: int) -> Array:
     have the RMS of the measured torque: rms(tau) over the RMS of its column; for an armature at
     least the inertia of the bodies about its joint.
 
-    Args:
-        model: The robot, with the URDF's parameters.
-        squares: Sums of tau^2, v^2 and a^2 over the samples, shape (3, n_rows), for the scale of
-            drive terms; see ``Trajectory.squares``.
-        samples: Number of samples.
+    squares (3, n_rows).
     """
     rms = np.sqrt(squares / max(samples, 1))
     return np.concatenate([_inertial_spread(model), _drive_spread(model, rms)])
@@ -38,9 +32,6 @@ def payload_spread(model: RobotModel) -> Array:
     """Return the prior standard deviations of a payload's parameters, shape (10,).
 
     They are those of the robot's mass at the distance of its longest link.
-
-    Args:
-        model: The robot, with the URDF's parameters.
     """
     masses = model.standard_parameters()[: model.layout.n_inertial : 10]
     mass, radius = max(float(np.abs(masses).sum()), 1e-3), model.length

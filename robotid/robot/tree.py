@@ -18,8 +18,6 @@ from robotid.base.exceptions import ModelError
 from robotid.base.findings import listed
 from robotid.robot.urdf_text import parse_urdf, read_numbers, write_exact_angles
 
-__all__ = ["MOMENTS", "MOVABLE", "Inertial", "Joint", "Tree", "read_tree"]
-
 #: The types of joint that have a degree of freedom.
 MOVABLE = ("revolute", "continuous", "prismatic")
 _ENDLESS = 200.0  # [rad or m] range that counts as no limit: no cable allows 30 revolutions
@@ -134,11 +132,7 @@ class Tree:
 
     @property
     def reductions(self) -> dict[str, float]:
-        """Gear ratios of the ``<transmission>`` elements with one joint and one actuator, by joint.
-
-        Raises:
-            ModelError: If one is not a number.
-        """
+        """Gear ratios of the ``<transmission>`` of one joint and one actuator, by joint."""
         found = {}
         for element in self.robot.findall("transmission"):
             joints, actuators = element.findall("joint"), element.findall("actuator")
@@ -175,15 +169,7 @@ class Tree:
 
 
 def read_tree(path: str | Path) -> Tree:
-    """Read the kinematic tree of a URDF file.
-
-    Args:
-        path: The URDF file. Meshes are not read.
-
-    Raises:
-        ModelError: If the file is missing, is not a URDF or not a tree, or if a number that the
-            dynamics use is missing, or is one that urdfdom would read differently.
-    """
+    """Read the kinematic tree of a URDF file."""
     return _tree(parse_urdf(path), str(path))
 
 

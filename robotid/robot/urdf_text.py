@@ -17,17 +17,6 @@ from xml.parsers import expat
 from robotid.base.exceptions import ModelError
 from robotid.base.files import missing_file
 
-__all__ = [
-    "LARGEST",
-    "exact_angle",
-    "number_fault",
-    "numbers",
-    "parse_urdf",
-    "read_numbers",
-    "read_with_yourdfpy",
-    "write_exact_angles",
-]
-
 #: Largest absolute value of numbers, SI units: squares and products of them stay finite.
 LARGEST = 1e9
 _BLANKS = " \t\n\r\f\v"  # that separate numbers
@@ -40,15 +29,7 @@ _NEAR = 2e-5  # [rad] one within this (0.001 degrees) counts as rounded, not as 
 
 
 def parse_urdf(path: str | Path) -> ET.Element:
-    """Return the ``<robot>`` of a URDF file, without checking its content.
-
-    Args:
-        path: The URDF file.
-
-    Raises:
-        ModelError: If the file is missing, cannot be read or is not XML of a ``<robot>``, or if
-            its size, nesting or attributes exceed the bounds.
-    """
+    """Return the ``<robot>`` of a URDF file, without checking its content."""
     path = Path(path)
     if path.suffix == ".xacro":
         raise ModelError(f"{path.name} is xacro, not URDF; expand it first: xacro {path.name}")
@@ -96,13 +77,7 @@ def _parsed(content: bytes) -> ET.Element:
 
 
 def numbers(text: str, count: int, most: float = LARGEST) -> tuple[float, ...]:
-    """Return the numbers of an attribute, none if it is not valid.
-
-    Args:
-        text: The attribute: decimal numbers, with blanks between and around them.
-        count: Required number of them.
-        most: Their largest absolute value.
-    """
+    """Return the numbers of an attribute, none if it is not valid."""
     words = re.findall(f"[^{_BLANKS}]+", text)
     if len(words) != count or not all(map(_NUMBER.fullmatch, words)):
         return ()
@@ -112,12 +87,7 @@ def numbers(text: str, count: int, most: float = LARGEST) -> tuple[float, ...]:
 
 
 def number_fault(element: ET.Element, key: str) -> str | None:
-    """Return the fault of an attribute that must be numbers, None if there is none.
-
-    Args:
-        element: The element.
-        key: Name of its attribute.
-    """
+    """Return the fault of an attribute that must be numbers, None if there is none."""
     text, (count, most) = element.get(key), _wanted(element, key)
     if text is not None and numbers(text, count, most):
         return None
@@ -131,17 +101,7 @@ def number_fault(element: ET.Element, key: str) -> str | None:
 def read_numbers(
     element: ET.Element | None, key: str, at: str, default: tuple[float, ...] = ()
 ) -> tuple[float, ...]:
-    """Return the numbers of an attribute.
-
-    Args:
-        element: The element; None if the file has none.
-        key: Name of its attribute.
-        at: Place of the element, for errors.
-        default: Value of an attribute that is not stated; it must be stated if empty.
-
-    Raises:
-        ModelError: If it is missing, or is one that urdfdom would read differently.
-    """
+    """Return the numbers of an attribute."""
     if default and (element is None or element.get(key) is None):
         return default
     if element is None:
@@ -158,9 +118,6 @@ def exact_angle(word: str) -> float | None:
     equal to it: 3.14, 3.1416 and 3.1415 for pi. Multiples of pi/2 need two decimals, others four.
     So is an angle within 2e-5 rad of a multiple: 3.14158. A calibrated angle, such as 1.570912,
     differs from pi/2 in its decimals, and is not a rounded one.
-
-    Args:
-        word: The angle as text [rad].
     """
     values = numbers(word, 1)
     twelfths = round(values[0] / (math.pi / 12)) if values else 0
@@ -175,11 +132,7 @@ def exact_angle(word: str) -> float | None:
 
 
 def write_exact_angles(robot: ET.Element) -> None:
-    """Replace each rounded angle in the joints' origins by the exact one.
-
-    Args:
-        robot: Root element of a URDF; it is changed.
-    """
+    """Replace each rounded angle in the joints' origins by the exact one."""
     for origin in robot.iterfind("joint/origin"):
         words = origin.get("rpy", "").split()
         exact = [exact_angle(word) for word in words]
@@ -189,17 +142,7 @@ def write_exact_angles(robot: ET.Element) -> None:
 
 
 def read_with_yourdfpy(path: str | Path) -> Any:  # noqa: ANN401
-    """Read a URDF with yourdfpy, a reader independent of this package's.
-
-    Args:
-        path: The URDF file. Meshes are not loaded.
-
-    Returns:
-        yourdfpy's ``Robot``: its damping and friction are text; None if not stated.
-
-    Raises:
-        ModelError: If yourdfpy cannot read the file.
-    """
+    """Read a URDF with yourdfpy, a reader independent of this package's."""
     import yourdfpy
 
     logging.getLogger("yourdfpy").addHandler(logging.NullHandler())  # its messages are not needed

@@ -7,7 +7,7 @@ from robotid.data.log import Trajectory
 from robotid.data.transmission import Transmission
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.problem import Sample, concatenate, shuffled
-from robotid.dynamics.simulation.closed_loop import another_robot
+from robotid.dynamics.simulation.truth import another_robot
 from robotid.dynamics.torque import (
     InstantRegressor,
     build_problem,

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from robotid.data.log import Log
-from robotid.dynamics.simulation.closed_loop import another_robot
 from robotid.dynamics.simulation.motions import random_fourier
+from robotid.dynamics.simulation.truth import another_robot
 from robotid.dynamics.torque import joint_torque_regressor
 from robotid.robot.parameters import Coupling
 

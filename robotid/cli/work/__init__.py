@@ -1,3 +1,1 @@
 """One module per command: from input files to output files."""
-
-__all__: list[str] = []

@@ -23,8 +23,6 @@ from robotid.identification.repeated_errors import with_repeated_errors
 from robotid.output.files.result_file import Result, stated_parameters
 from robotid.robot.model import RobotModel
 
-__all__ = ["AddedLogs", "add_logs", "check_update"]
-
 _ADVICE = "identify again from all logs"
 
 
@@ -46,27 +44,13 @@ class AddedLogs:
         return {key: x for key, x in self.content.items() if key != "sums"}
 
     def write(self, result: Result) -> None:
-        """Write the variation to the result.json.
-
-        Args:
-            result: The result.
-        """
+        """Write the variation to the result.json."""
         content = read_json(result.path, "result")  # with the keys as they are in the file
         write_json({**content, "variation": self.content}, result.path)
 
 
 def check_update(result: Result, job: Job, entries: Sequence[LogEntry]) -> None:
-    """Check that logs can be added to the variation of a result.
-
-    Args:
-        result: The result.
-        job: Its job.
-        entries: The logs.
-
-    Raises:
-        DataError: If the result has no sums, or a log is one of its logs.
-        SettingsError: If the robot of a log is missing.
-    """
+    """Check that logs can be added to the variation of a result."""
     stated = result.content.get("variation", {})
     if "sums" not in stated:
         raise DataError(
@@ -93,18 +77,6 @@ def add_logs(
 
     The sums of the new logs about the parameters of the fit are added to those of the others; the
     mixed-effects model is that of all. To first order it is the variation of a fit to all logs.
-
-    Args:
-        result: The result.
-        model: Its robot.
-        job: Its job.
-        logs: The new logs, of this robot.
-
-    Returns:
-        The variation; None if the result has no sums of its logs.
-
-    Raises:
-        DataError: If a row of a log cannot be used, or the sums are of another version.
     """
     stated = result.content.get("variation", {})
     if "sums" not in stated:

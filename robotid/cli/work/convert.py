@@ -16,8 +16,6 @@ from robotid.data.log import repeated, suggestion
 from robotid.data.signal_settings import LogSource
 from robotid.robot.constraints import Contact
 
-__all__ = ["Conversion", "convert"]
-
 _WHOLE = LogSource()
 _BASE = {f"base_{x}" for x in (*POSE, "roll", "pitch", "yaw", *TWIST, *ACCELERATION)}
 _SENSED = {*_BASE, *(f"imu_{x}" for x in IMU)}
@@ -46,19 +44,6 @@ def convert(
     """Write a log in another format, with standard column names; no robot model is required.
 
     Numbers and units are unchanged. They are checked when the log is read with a robot.
-
-    Args:
-        path: The log to read.
-        target: The file to write, .csv, .parquet, .npz, .h5, .hdf5 or .mat; an
-            existing one is replaced only if robotid wrote it.
-        joints: Names of the joints to write; all joints of the file if None. Columns of a base, of
-            an IMU, of contacts and of wrenches are always written.
-        source: Topic or group, names of joints in the file, meaning of effort, topics of sensors.
-
-    Raises:
-        DataError: If the file cannot be read, has no time, or lacks a joint.
-        MissingDependencyError: If a package that reads or writes a format is not installed.
-        SettingsError: If the target is a folder.
     """
     file = Path(path)
     check_file(Path(target), [file])

@@ -20,8 +20,6 @@ from robotid.identification.result import Identification
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 
-__all__ = ["run_demo"]
-
 _RATE = 200.0  # [Hz]
 _PERIOD = 10.0  # [s]
 _URDF = "z1.urdf"  # Unitree Z1
@@ -36,15 +34,7 @@ def run_demo(
 
     The simulated robot has other bodies than its URDF, and armature and friction in every joint.
 
-    Args:
-        folder: Folder of the files; created if it is missing.
-        progress: Called at the start of each stage of the identification, as of ``identify``.
-
-    Returns:
-        The identification, the content of result.json, and the true base parameters, shape (b,).
-
-    Raises:
-        RobotIdError: If a step fails.
+    -> (b,).
     """
     target = Path(folder)
     check_folder(target, ["identification.csv", "validation.csv", "result.json", "replay.html"])

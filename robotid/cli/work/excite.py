@@ -31,8 +31,6 @@ from robotid.robot.model import RobotModel
 if TYPE_CHECKING:
     from robotid.base.typing import ProgressCallback
 
-__all__ = ["design_motion"]
-
 
 def design_motion(
     job: Job,
@@ -43,25 +41,7 @@ def design_motion(
     report: str | Path | None = None,
     progress: "ProgressCallback | None" = None,
 ) -> dict[str, Any]:
-    """Design a motion for a robot and write it.
-
-    Args:
-        job: The robot.
-        settings: The settings of the motion.
-        target: The file, as of ``write_motion``.
-        given: A result.json, or its folder: the motion adds to the information of its logs.
-        report: The page to write about the motion, if any.
-        progress: Called with the index of each start.
-
-    Returns:
-        The output of ``robotid excite --json``.
-
-    Raises:
-        DataError: If collisions cannot be checked, the logs of the result are missing, or the
-            format of the target is not one for motions.
-        ModelError: If the URDF is not usable.
-        SettingsError: If a setting is not usable, or no motion satisfies the limits.
-    """
+    """Design a motion for a robot and write it."""
     for file in (target, *([] if report is None else [report])):
         check_file(Path(file), [job.urdf, given])
     check_motion_file(target)
@@ -158,11 +138,7 @@ def _designed(
 
 
 def _check_jerk(course: Course, joints: Sequence[str]) -> None:
-    """Refuse a motion between poses that exceeds the jerk limit; its design ignores that limit.
-
-    Raises:
-        SettingsError: If it does.
-    """
+    """Refuse a motion between poses that exceeds the jerk limit; its design ignores that limit."""
     used = course.largest[LIMITS.index("jerk")]
     joint = int(np.argmax(used))
     if used[joint] > 1.0:

@@ -11,8 +11,6 @@ from robotid.output.files.export_formats import FORMATS, options_of
 from robotid.output.files.exported import Written
 from robotid.output.files.result_file import load_result
 
-__all__ = ["export_result"]
-
 
 def export_result(
     path: str | Path, kind: str, target: str | Path, **options: float | str | None
@@ -21,23 +19,6 @@ def export_result(
 
     Friction terms that a format lacks are projected on those that it has, see
     ``project_friction``.
-
-    Args:
-        path: A result.json, or its folder, with the URDF and sidecar in the same folder.
-        kind: The format, one of ``FORMATS``.
-        target: The file to write.
-        options: Options of the format, by name; None: not stated.
-
-    Returns:
-        {"result", "format", "files", "not_stated": properties that the files lack, a sentence each,
-        "projected": {drive: {"replaced", the parameters written, "error", "torque"}}}.
-
-    Raises:
-        DataError: If the result has no URDF, or no ranges or gains that the format needs, or the
-            folder does not exist.
-        ModelError: If the URDF was changed, or one of its links is impossible.
-        SettingsError: If the target is a folder, an input of the result or a file that robotid did
-            not write, or the format or an option is unknown.
     """
     if kind not in FORMATS:
         raise SettingsError(f"format is {kind!r}, wanted one of {listed(FORMATS)}")

@@ -29,8 +29,6 @@ from robotid.estimation.workers.plan import WorkPlan
 from robotid.output.files.entries import build_result
 from robotid.output.report.fleet_page import fleet_page
 
-__all__ = ["COLUMNS", "FleetUnit", "UnitResult", "identify_unit", "read_fleet", "run_fleet"]
-
 #: Columns of the table.
 COLUMNS = {
     "unit": "name of the robot",
@@ -74,11 +72,7 @@ class FleetUnit(Workload):
         return len(self.logs)
 
     def stated(self) -> Job:
-        """Return the job of the unit.
-
-        Raises:
-            SettingsError: If the job file is not usable.
-        """
+        """Return the job of the unit."""
         job = Job(Path()) if self.job is None else read_job(self.job)
         if isinstance(job.estimator, SimulationSettings):
             raise SettingsError(
@@ -113,29 +107,14 @@ class UnitResult:
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, Array]) -> "UnitResult":
-        """Return the result from its arrays; see ``to_arrays``.
-
-        Args:
-            arrays: The arrays by name.
-        """
+        """Return the result from its arrays; see ``to_arrays``."""
         return cls(json.loads(arrays["content"].tobytes()))
 
 
 def read_fleet(
     path: str | Path, urdf: str | Path | None = None, job: str | Path | None = None
 ) -> list[FleetUnit]:
-    """Return the units of a table, in the order of their first rows.
-
-    Args:
-        path: The table, .csv or .parquet, with the columns "unit" and "log", and optionally those
-            of ``COLUMNS``. Paths in it are relative to its folder; ``$NAME`` in a path is replaced
-            by the variable of the environment.
-        urdf: URDF of units whose rows do not name one.
-        job: Job file of units whose rows do not name one.
-
-    Raises:
-        DataError: If the table is not usable; the message names row, column and value.
-    """
+    """Return the units of a table, in the order of their first rows."""
     source = Path(path)
     names, rows = read_text_table(source)
     for name in ("unit", "log"):
@@ -236,10 +215,6 @@ def identify_unit(unit: FleetUnit, threads: int | None) -> UnitResult:
     """Identify a unit; a failure is a row of its result.
 
     A log that cannot be read is a row, too; the unit is identified from its other logs.
-
-    Args:
-        unit: The unit.
-        threads: Ignored: a unit is identified in one thread.
     """
     del threads
     refused: dict[Path, str] = {}
@@ -302,24 +277,6 @@ def run_fleet(
     Finished units are stored in a checkpoint until all are, and are not repeated by a resumed run.
     A unit that ends its worker in every attempt is a failure in the table. Files of results are
     written when all units are finished, with the same bits.
-
-    Args:
-        units: The units.
-        folder: Folder of the results; created if it is missing.
-        plan: The workers; this process if None.
-        update: Whether units whose inputs are those of the results in the folder are taken from
-            these; units with a failure are identified again.
-
-    Returns:
-        The content of fleet.json: "units" (how many), "logs", "done", "verdicts" (how many of
-        each), "failures", "parameters" (variation between units), "unlike" and "inputs" (versions,
-        and a hash of the inputs of each unit).
-
-    Raises:
-        DataError: If the checkpoint to resume has other inputs, or results to update are missing
-            or of other versions.
-        SettingsError: If the folder is not writable.
-        WorkerError: If a cluster cannot be used.
     """
     chosen, target, inputs = plan or WorkPlan(1), Path(folder), _inputs(units)
     check_folder(target, _FILES)
@@ -361,11 +318,7 @@ def _inputs(units: Sequence[FleetUnit]) -> dict[str, Any]:
 
 
 def _known(folder: Path, inputs: Mapping[str, Any]) -> frozenset[str]:
-    """Return the units of the results in a folder that have the same inputs.
-
-    Raises:
-        DataError: If there are no results, or they are of other versions.
-    """
+    """Return the units of the results in a folder that have the same inputs."""
     stated = read_json(folder / "fleet.json", "fleet to update").get("inputs", {})
     if stated.get("versions") != inputs["versions"]:
         raise DataError(
@@ -398,11 +351,7 @@ class _Gathered:
         self._verdicts: dict[str, int] = {}
 
     def add(self, result: UnitResult) -> None:
-        """Add the result of a unit.
-
-        Args:
-            result: The result.
-        """
+        """Add the result of a unit."""
         for row in result.rows:
             if row["status"] == "failed":
                 shown = {"unit": row["unit"], "log": row.get("log", ""), "error": row["error"]}
@@ -416,11 +365,7 @@ class _Gathered:
             self._verdicts[verdict] = self._verdicts.get(verdict, 0) + 1
 
     def content(self, units: Sequence[FleetUnit]) -> dict[str, Any]:
-        """Return the content of fleet.json.
-
-        Args:
-            units: All units.
-        """
+        """Return the content of fleet.json."""
         several = {key: own for key, own in self._values.items() if len(own) >= FEWEST_RUNS}
         n_tests = sum(map(len, several.values()))
         parameters, unlike = [], []

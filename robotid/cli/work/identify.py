@@ -46,8 +46,6 @@ if TYPE_CHECKING:
     from robotid.identification.closed_loop.position_errors import OpenLoop
     from robotid.output.viewer.replays import Replay
 
-__all__ = ["identify_job", "run_job", "save_result"]
-
 _log = logging.getLogger(__name__)
 
 
@@ -265,18 +263,7 @@ def identify_job(
     *,
     refuse: Callable[[LogEntry, DataError], None] | None = None,
 ) -> Identification:
-    """Identify from a job's logs; nothing is written.
-
-    Args:
-        job: The job.
-        model: Its robot.
-        plan: Workers for long logs.
-        refuse: As of ``survey_logs``.
-
-    Raises:
-        DataError, ModelError, NotConvergedError, RankDeficientError, SettingsError, WorkerError:
-            As of ``run_job``.
-    """
+    """Identify from a job's logs; nothing is written."""
     check_ignored(job.ignore)
     groups = job.identification, job.validation
     fitted, validation = survey_logs(job, model, *groups, refuse=refuse)

@@ -22,8 +22,6 @@ from robotid.robot.model import RobotModel
 if TYPE_CHECKING:
     from robotid.identification.closed_loop.loop_result import LoopIdentification
 
-__all__ = ["identify"]
-
 
 @overload
 def identify(  # type: ignore[overload-overlap]

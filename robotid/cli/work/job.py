@@ -34,8 +34,6 @@ from robotid.robot.parameters import DYNAMICS, Coupling
 if TYPE_CHECKING:
     from robotid.robot.model import RobotModel
 
-__all__ = ["Job", "LogEntry", "PayloadEntry", "job_from_settings", "read_job", "stated_path"]
-
 _MODEL_KEYS: Mapping[str, tuple[type, ...]] = {
     "friction" if term.is_friction else name: (str,) if term.is_friction else (bool,)
     for name, term in TERMS.items()
@@ -348,11 +346,7 @@ class Job(Settings):
             )
 
     def model(self) -> "RobotModel":
-        """Return the robot, with the job's joints, gravity and drive terms.
-
-        Raises:
-            ModelError: If the URDF cannot be used, or a joint is not in it.
-        """
+        """Return the robot, with the job's joints, gravity and drive terms."""
         from robotid.robot.assumed import with_assumed_inertials
         from robotid.robot.model import RobotModel
 
@@ -379,11 +373,7 @@ class Job(Settings):
         return with_assumed_inertials(model)
 
     def placed(self, model: "RobotModel") -> tuple[str, ...]:
-        """Return the locked joints of the model whose position the job states.
-
-        Args:
-            model: The job's robot.
-        """
+        """Return the locked joints of the model whose position the job states."""
         if "*" in self.locked:
             return tuple(model.locked)
         leaders = {joint.name: joint.mimic[0] for joint in model.tree.movable if joint.mimic}
@@ -400,32 +390,14 @@ class Job(Settings):
         return {"*": everywhere, **stated}
 
     def read(self, entry: LogEntry, model: "RobotModel", *, needs: Needs = "torque") -> Log:
-        """Return one log of the job, of the model's joints in its order.
-
-        Args:
-            entry: The log.
-            model: The job's robot.
-            needs: Signals required in addition to positions, as of ``lay_out``.
-
-        Raises:
-            DataError: If the file is not usable.
-        """
+        """Return one log of the job, of the model's joints in its order."""
         stated = self._reading(model) | {"start": entry.start, "end": entry.end}
         return read_log(entry.path, needs=needs, **stated)
 
     def lay_out(
         self, entry: LogEntry, model: "RobotModel", *, needs: Needs = "torque"
     ) -> tuple[LogLayout, Table]:
-        """Return the columns of a log to read, and the opened file; no column is read yet.
-
-        Args:
-            entry: The log.
-            model: The job's robot.
-            needs: Signals required in addition to positions, as of ``lay_out``.
-
-        Raises:
-            DataError: If the file is not usable.
-        """
+        """Return the columns of a log to read, and the opened file; no column is read yet."""
         return lay_out(entry.path, needs=needs, **self._reading(model))
 
     def _reading(self, model: "RobotModel") -> dict[str, Any]:
@@ -475,17 +447,7 @@ def read_job(path: str | Path) -> Job:
 def job_from_settings(
     table: Mapping[str, Any], where: str, folder: Path, *, expand: bool = False
 ) -> Job:
-    """Return the job that a table states.
-
-    Args:
-        table: The keys of a job file.
-        where: Name of its source, for errors.
-        folder: Folder that paths in it are relative to.
-        expand: As of ``stated_path``.
-
-    Raises:
-        SettingsError: If a key or a value is wrong.
-    """
+    """Return the job that a table states."""
     check_keys(table, Job.schema(), where)
     if "urdf" not in table:
         raise SettingsError(f"{where} has no key 'urdf'; name the robot's URDF file")
@@ -503,18 +465,7 @@ def job_from_settings(
 
 
 def stated_path(text: str, where: str, folder: Path, *, expand: bool) -> Path:
-    """Return a path relative to a folder.
-
-    Args:
-        text: The path as stated.
-        where: Where it is stated, for errors.
-        folder: The folder.
-        expand: Whether $VARIABLES of the environment are replaced, as in files that a user writes;
-            the shell replaces those of a command line.
-
-    Raises:
-        SettingsError: If it is no path, or names a variable that is not set.
-    """
+    """Return a path relative to a folder."""
     is_unicode = not any("\ud800" <= character <= "\udfff" for character in text)
     if "\0" in text or len(text) > _LONGEST_PATH or not is_unicode:
         raise SettingsError(

@@ -31,19 +31,6 @@ from robotid.robot.model import RobotModel
 if TYPE_CHECKING:
     from robotid.design.previews import Run
 
-__all__ = [
-    "LockedLogs",
-    "examine",
-    "examine_logs",
-    "identity_of",
-    "job_of_result",
-    "locked_as_logged",
-    "log_of_commands",
-    "needed_of",
-    "survey_logs",
-    "units_of_logs",
-]
-
 _PIECES = 8  # pieces per rows in memory: the filter of a piece needs memory of its own
 _SHORTEST = 256  # rows of a piece
 
@@ -60,17 +47,6 @@ def survey_logs(
     The logs are in memory if all their files together have at most the permitted number of rows,
     or if the model is static. Files of formats that are only read whole do not count. Otherwise
     each log is divided into pieces of a fixed number of rows: an eighth of the permitted number.
-
-    Args:
-        job: The job.
-        model: The robot whose joints are read.
-        groups: The logs: those to fit, those for validation.
-        refuse: Called with a log that is not usable and its error; if None, the error is raised.
-        needs: Signals required in addition to positions, as of ``lay_out``.
-
-    Raises:
-        DataError: If a file is not usable.
-        SettingsError: If a setting does not fit a log.
     """
     paths = dict.fromkeys(entry.path for entry in chain(*groups))
     opened = {path: _open(job, model, path, needs) for path in paths}
@@ -99,14 +75,7 @@ def survey_logs(
 
 
 def units_of_logs(entries: Sequence[LogEntry]) -> list[str]:
-    """Return the unit (name of the robot) of each log; "" if none is stated.
-
-    Args:
-        entries: The logs.
-
-    Raises:
-        SettingsError: If only some state their robot.
-    """
+    """Return the unit (name of the robot) of each log; "" if none is stated."""
     unnamed = [entry for entry in entries if not entry.unit]
     if 0 < len(unnamed) < len(entries):
         named = next(entry for entry in entries if entry.unit)
@@ -120,17 +89,7 @@ def units_of_logs(entries: Sequence[LogEntry]) -> list[str]:
 def examine(
     job: Job, model: RobotModel | None = None, *, progress: ProgressCallback | None = None
 ) -> tuple[Finding, ...]:
-    """Examine the logs of a job; the findings have errors first.
-
-    Args:
-        job: The job. A log that cannot be read gives a finding, not an error.
-        model: Its robot; built from its URDF if None.
-        progress: Called at the start of each of the two stages.
-
-    Raises:
-        ModelError: If the URDF is not usable.
-        SettingsError: If a setting does not fit, or a code to ignore is unknown.
-    """
+    """Examine the logs of a job; the findings have errors first."""
     check_ignored(job.ignore)
     if not (job.identification or job.validation):
         raise SettingsError("the job has no log; state one: [[identification]] with log = FILE")
@@ -174,12 +133,6 @@ def locked_as_logged(
     """Return the job with joints locked at their positions in the logs, unless it states them.
 
     A joint that moves, or has another position in another log, is left to ``check_locked``.
-
-    Args:
-        job: The job.
-        model: Its robot.
-        fitted: Its logs to fit.
-        validation: Its validation logs.
     """
     logged, logs = {}, (*fitted, *validation)
     for joint in [joint for joint in model.locked if joint not in job.placed(model)]:
@@ -204,17 +157,7 @@ def locked_as_logged(
 def examine_logs(
     job: Job, model: RobotModel, fitted: Sequence[SurveyedLog], validation: Sequence[SurveyedLog]
 ) -> tuple[Finding, ...]:
-    """Examine surveyed logs: the locked joints of the job, then the windows of the logs.
-
-    Args:
-        job: The job.
-        model: Its robot.
-        fitted: Its logs to fit.
-        validation: Its validation logs.
-
-    Raises:
-        SettingsError: If a setting does not fit a log.
-    """
+    """Examine surveyed logs: the locked joints of the job, then the windows of the logs."""
     findings: list[Finding] = []
     for log in (*fitted, *validation):
         name = Path(log.path).name
@@ -226,17 +169,7 @@ def examine_logs(
 
 
 def job_of_result(job: Job, path: str | Path, advice: str) -> tuple[Job, list[LogEntry]]:
-    """Return a job with the settings of a result, and the logs that the result was fitted to.
-
-    Args:
-        job: The job that states the robot and the logs.
-        path: A result.json, or its folder.
-        advice: The remedy if a log is missing.
-
-    Raises:
-        DataError: If a fitted log is missing or was changed.
-        SettingsError: If the settings in the result are not usable.
-    """
+    """Return a job with the settings of a result, and the logs that the result was fitted to."""
     result = load_result(path).content
     settings = {key: value for key, value in result["settings"].items() if value != {}}
     stated = job_from_settings(settings, Path(path).name, Path())
@@ -251,20 +184,7 @@ def job_of_result(job: Job, path: str | Path, advice: str) -> tuple[Job, list[Lo
 
 
 def result_run(job: Job, path: str | Path) -> tuple[Job, list[LogEntry], RobotModel, "Run"]:
-    """Return the information of the logs of a result.
-
-    Args:
-        job: The job that states the robot and the logs.
-        path: A result.json, or its folder.
-
-    Returns:
-        The job with the settings of the result, the logs that the result was fitted to, the robot
-        with the identified friction terms, and the information of the logs.
-
-    Raises:
-        DataError: If a fitted log is missing or was changed.
-        SettingsError: If the settings in the result are not usable.
-    """
+    """Return the information of the logs of a result."""
     from robotid.design.previews import Run
 
     job, fitted = job_of_result(job, path, "give a result whose logs exist")
@@ -277,14 +197,7 @@ def result_run(job: Job, path: str | Path) -> tuple[Job, list[LogEntry], RobotMo
 
 
 def identity_of(path: Path) -> dict[str, Any]:
-    """Return size [bytes] and time of change [ns] of a file, or of each file of a folder.
-
-    Args:
-        path: The file or the folder.
-
-    Raises:
-        OSError: If it does not exist.
-    """
+    """Return size [bytes] and time of change [ns] of a file, or of each file of a folder."""
     whole = (dataset_of(path) or path).resolve()
     files = sorted(p for p in whole.rglob("*") if p.is_file()) if whole.is_dir() else [whole]
     found = {}
@@ -316,14 +229,6 @@ def log_of_commands(job: Job, entry: LogEntry, result: Result) -> Log:
     """Return a log with the inputs of the simulated robot, gravity compensation included.
 
     The input is the command; it is the torque where the logged torque drives the robot.
-
-    Args:
-        job: The job of the result.
-        entry: The log.
-        result: The result of the job.
-
-    Raises:
-        DataError: If the file is not usable, or has no commands.
     """
     log = job.read(entry, result.robot, needs=needed_of(job))
     if job.controller.kind == "torque":
@@ -338,9 +243,5 @@ def log_of_commands(job: Job, entry: LogEntry, result: Result) -> Log:
 
 
 def needed_of(job: Job) -> Needs:
-    """Return the signals that a simulation requires of a log in addition to positions.
-
-    Args:
-        job: The job.
-    """
+    """Return the signals that a simulation requires of a log in addition to positions."""
     return "torque" if job.controller.kind == "torque" else "commands"

@@ -20,30 +20,16 @@ from robotid.robot.bodies import usual_links
 from robotid.robot.drives import DriveTerm
 from robotid.robot.model import RobotModel
 
-__all__ = ["check_payloads", "is_result", "measure_payload", "stated_masses"]
-
 _STAGES = ("reading logs", "fitting")
 
 
 def is_result(path: str | Path) -> bool:
-    """Return whether a reference is a result or its folder, not a log.
-
-    Args:
-        path: The reference.
-    """
+    """Return whether a reference is a result or its folder, not a log."""
     return Path(path).suffix == ".json" or (Path(path) / "result.json").is_file()
 
 
 def stated_masses(words: Sequence[str], links: Sequence[str]) -> dict[str, float]:
-    """Return the known mass of each payload, by link [kg].
-
-    Args:
-        words: "2.8" for the only link, or "tool0=2.8".
-        links: The links that carry a payload.
-
-    Raises:
-        SettingsError: If a mass is not a number, or its link is ambiguous.
-    """
+    """Return the known mass of each payload, by link [kg]."""
     masses = {}
     for word in words:
         link, _, number = word.rpartition("=")
@@ -68,26 +54,7 @@ def measure_payload(
     find_gains: bool = False,
     progress: ProgressCallback | None = None,
 ) -> dict[str, Any]:
-    """Identify the payloads of the logs of a job, relative to references without payloads.
-
-    Args:
-        job: The logs with the payloads, and the settings for reading logs.
-        references: Logs without payloads; or one result, whose logs are read again with its
-            settings.
-        links: Links that carry the payloads; if empty, the last moving link, or a floating base.
-        masses: Known masses, as of ``stated_masses``.
-        find_gains: Whether gains that the job does not state are estimated, too.
-        progress: Called at the start of each of the two stages.
-
-    Returns:
-        The output of ``robotid payload --json``.
-
-    Raises:
-        DataError: If a log is not usable, a log of the result is missing, or the motion does not
-            determine a mass.
-        ModelError: If the URDF is not usable, or has no such link.
-        SettingsError: If settings are not usable.
-    """
+    """Identify the payloads of the logs of a job, relative to references without payloads."""
     entries = [LogEntry(Path(path)) for path in references]
     if any(map(is_result, references)):
         if len(references) > 1:
@@ -121,19 +88,7 @@ def measure_payload(
 def check_payloads(
     job: Job, model: RobotModel, reference: Sequence[SurveyedLog]
 ) -> tuple[PayloadCheck, ...]:
-    """Return the checks of the torque scale with the payloads that a job states.
-
-    Args:
-        job: The job.
-        model: Its robot with the identified friction terms.
-        reference: Its fitted logs, without payloads.
-
-    Returns:
-        The checks, that with the narrowest relative interval first.
-
-    Raises:
-        DataError, ModelError, SettingsError, NotConvergedError: As of ``measure_payload``.
-    """
+    """Return the checks of the torque scale with the payloads that a job states."""
     checks = []
     for entry in job.payload_checks:
         (logs,) = survey_logs(job, model, [LogEntry(entry.path, entry.start, entry.end)])

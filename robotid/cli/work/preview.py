@@ -17,8 +17,6 @@ from robotid.output.files.entries import build_preview
 from robotid.output.files.result_file import load_result, stated_between
 from robotid.robot.model import RobotModel
 
-__all__ = ["preview_job"]
-
 
 def preview_job(
     job: Job,
@@ -31,21 +29,6 @@ def preview_job(
 
     A given result adds the information of its logs, and its noise. If one of the motions is a log
     of that result, all logs of the result are previewed and compared with its standard errors.
-
-    Args:
-        job: The motions, and the settings for reading logs.
-        given: A result.json, or its folder; its settings for reading logs are then used.
-        noise: Standard deviation of the torque noise by joint [N m or N].
-        correlation: As of ``preview_logs``.
-
-    Returns:
-        The output of ``robotid preview --json``.
-
-    Raises:
-        DataError: If a motion is not usable, a log of the result is missing, or only some motions
-            are logs of the result.
-        ModelError: If the URDF is not usable.
-        SettingsError: If a setting is not usable.
     """
     stated: dict[str, Any] = {"noise": noise, "correlation": correlation}
     if not job.identification:

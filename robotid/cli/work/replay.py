@@ -36,9 +36,6 @@ from robotid.output.viewer.replays import Bands, Mark, Replay, Torques, replay
 from robotid.output.viewer.unexplained import find_unexplained
 from robotid.robot.model import RobotModel
 
-__all__ = ["Findings", "read_findings", "replay_files", "replay_identified", "stated_job"]
-
-
 #: Columns of the pose of a floating base in the world: position [m] and quaternion.
 _BASE = ("base_x", "base_y", "base_z", "base_qx", "base_qy", "base_qz", "base_qw")
 
@@ -73,14 +70,7 @@ class Findings:
 
 
 def read_findings(paths: Sequence[str | Path]) -> Findings:
-    """Read results to show; the label of a result is the name of its folder.
-
-    Args:
-        paths: Each a result.json, a track.json, or a folder with one or both.
-
-    Raises:
-        DataError: If a file is not usable, or there are two tracks.
-    """
+    """Read results to show; the label of a result is the name of its folder."""
     results: dict[str, Mapping[str, Any]] = {}
     commanded: dict[str, Result] = {}
     tracks: list[tuple[Path, Mapping[str, Any]]] = []
@@ -111,16 +101,7 @@ def read_findings(paths: Sequence[str | Path]) -> Findings:
 
 
 def stated_job(findings: Findings, urdf: str | Path, log: str | Path) -> Job:
-    """Return the job of the shown results, with another URDF and log.
-
-    Args:
-        findings: At least one result or track.
-        urdf: The URDF to show.
-        log: The log to play.
-
-    Raises:
-        SettingsError: If the settings in the file are not usable, or there is no result.
-    """
+    """Return the job of the shown results, with another URDF and log."""
     settings = findings.settings
     if settings is None:
         raise SettingsError("no result is given, wanted one for its settings")
@@ -130,18 +111,7 @@ def stated_job(findings: Findings, urdf: str | Path, log: str | Path) -> Job:
 
 
 def replay_files(job: Job, findings: Findings, *, ghost: str | Path | None = None) -> Replay:
-    """Return the replay of a log, a page to write.
-
-    Args:
-        job: The robot, its one log, and the settings for reading logs.
-        findings: Results to show with the log.
-        ghost: A second log, of a designed or a simulated motion, to show as a ghost.
-
-    Raises:
-        DataError: If a log or a result is not usable.
-        ModelError: If the URDF is not usable, or a result is of another robot.
-        SettingsError: If a setting is not usable.
-    """
+    """Return the replay of a log, a page to write."""
     model = job.model()
     (entry,) = job.identification
     if findings.commanded:
@@ -190,14 +160,7 @@ def replay_files(job: Job, findings: Findings, *, ghost: str | Path | None = Non
 
 
 def replay_identified(identification: Identification) -> Replay:
-    """Return the replay of an identification: its first validation log, or its first fitted one.
-
-    Args:
-        identification: The identification.
-
-    Returns:
-        The page: measured and predicted torques, masses before and after.
-    """
+    """Return the replay of an identification: its first validation log, or its first fitted one."""
     shown, model = shown_evaluation(identification), identification.model
     motion, mask = shown.recording.trajectory, shown.recording.mask
     wanted = {"identified": "estimate", _DRIVEN: "urdf_with_drives"}

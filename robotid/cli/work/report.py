@@ -21,8 +21,6 @@ from robotid.output.report.position_page import shown_positions
 from robotid.output.report.shown import page_of
 from robotid.output.report.steps import Origin
 
-__all__ = ["rewrite_report"]
-
 _SHARE = 1e-6  # permitted difference over a base parameter, for rounding ...
 _PART = 0.01  # ... or over its standard error, for the tolerance of solvers
 
@@ -34,20 +32,6 @@ def rewrite_report(
 
     The fit is repeated with the inputs and settings of the result. A result of the estimator
     "simulation" is simulated, not fitted.
-
-    Args:
-        path: A result.json, or its folder.
-        target: The page to write; report.html in the folder of the result if None. A file
-            that robotid did not write is not replaced.
-        progress: Called at the start of each stage, as by ``identify``.
-
-    Returns:
-        {"result", "report"}: the files that were read and written.
-
-    Raises:
-        DataError: If the result or an input is not usable, an input is missing or was changed, or
-            the fit gives other base parameters than those of the result.
-        SettingsError: If the settings are not usable, or robotid did not write an existing target.
     """
     loaded = load_result(path)
     content, folder = loaded.content, loaded.path.parent

@@ -9,8 +9,6 @@ from robotid.cli.work.job import Job, LogEntry, PayloadEntry
 from robotid.data.transmission import Transmission
 from robotid.estimation.fitting.estimator_settings import ESTIMATORS, ConstraintSettings
 
-__all__ = ["job_schema"]
-
 _DRAFT = "https://json-schema.org/draft/2020-12/schema"
 _NAMES = {str: "string", datetime: "string", bool: "boolean", int: "integer", float: "number"}
 _NAMES |= {list: "array", dict: "object"}

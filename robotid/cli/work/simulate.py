@@ -27,8 +27,6 @@ from robotid.dynamics.simulation.truth import draw_parameters
 from robotid.output.files.urdf import write_urdf
 from robotid.robot.model import RobotModel
 
-__all__ = ["SimulatedFiles", "simulate_log"]
-
 _SCHEMA_VERSION = 1
 
 

@@ -24,9 +24,6 @@ from robotid.output.viewer.scene import coordinates
 from robotid.output.viewer.server import LivePage
 from robotid.robot.model import RobotModel
 
-__all__ = ["run_track", "serve_track"]
-
-
 _SCHEMA = 1
 _RATE = 25.0  # [Hz] messages per second of the log
 _SLOWEST = 1e-3  # [-] smallest speed, relative to real time
@@ -35,18 +32,7 @@ _SLOWEST = 1e-3  # [-] smallest speed, relative to real time
 def run_track(
     job: Job, folder: str | Path | None, *, observer: Observer | None = None
 ) -> dict[str, Any]:
-    """Track the one log of a job, write the history and track.json, and return its content.
-
-    Args:
-        job: The robot, the log and the settings of the signals.
-        folder: Folder of the results; created if it is missing. Nothing is written if None.
-        observer: Called after each sample with its row of the log and the identifier.
-
-    Raises:
-        DataError: If the log is not usable.
-        ModelError: If the URDF is not usable.
-        SettingsError: If a setting is not usable.
-    """
+    """Track the one log of a job, write the history and track.json, and return its content."""
     model, history = job.model(), _history_name()
     if folder is not None:
         inputs = [job.urdf, *(entry.path for entry in job.identification)]
@@ -144,24 +130,7 @@ def serve_track(
     finished: Callable[[dict[str, Any]], None] | None = None,
     linger: bool = True,
 ) -> dict[str, Any]:
-    """Track the one log of a job, show it in a live page, and return as ``run_track``.
-
-    Args:
-        job: The robot, the log and the settings of the signals.
-        folder: Folder of the history; nothing is written if None.
-        port: Port of the page on 127.0.0.1; any free port if 0.
-        speed: Speed relative to real time; 0 is as fast as possible.
-        announce: Called with the address of the page.
-        finished: Called with the content of track.json at the end of the log.
-        linger: Whether the page remains available after the end, until KeyboardInterrupt.
-
-    Raises:
-        DataError: If the log is not usable.
-        KeyboardInterrupt: If the user stops it.
-        ModelError: If the URDF is not usable.
-        OSError: If the port is in use.
-        SettingsError: If a setting is not usable, or port or speed is out of its range.
-    """
+    """Track the one log of a job, show it in a live page, and return as ``run_track``."""
     if not (speed == 0 or speed >= _SLOWEST):
         raise SettingsError(f"speed is {speed}, wanted 0, or {_SLOWEST} or more")
     if not 0 <= port < 2**16:

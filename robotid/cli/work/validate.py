@@ -43,8 +43,6 @@ from robotid.output.files.result_file import (
 )
 from robotid.robot.model import RobotModel
 
-__all__ = ["validate_result"]
-
 
 def validate_result(
     path: str | Path, logs: Sequence[LogEntry | str | Path], *, update: bool = False
@@ -54,22 +52,6 @@ def validate_result(
     If the result has a URDF, the prediction uses that file and its sidecar, as a user does. The
     doctor examines the logs. Logs that contain fitted rows do not count as validation. If three or
     more logs were fitted, the drives in the new logs are compared with those in the fitted ones.
-
-    Args:
-        path: A result.json.
-        logs: Logs of the same robot; as entries with their unit.
-        update: Whether the logs are added to the variation between logs in the result.json. The
-            fitted logs are not read for it; links and drives of the result stay as they are.
-
-    Returns:
-        {"result", "predicted_with", "validation": [...], "verdict": {...}}, as in result.json,
-        "findings" about logs that differ from the fitted ones, and "variation" with the new logs,
-        if three or more were fitted.
-
-    Raises:
-        DataError: If the result or a log is not usable, or a log is to be added twice.
-        ModelError: If the URDF is missing or was changed.
-        SettingsError: If the settings in the result are not usable.
     """
     loaded = load_result(path)
     result = loaded.content

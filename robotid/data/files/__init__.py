@@ -1,3 +1,1 @@
 """Files of recordings: tables, arrays, bags and data sets, read into logs."""
-
-__all__: list[str] = []

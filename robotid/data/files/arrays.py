@@ -21,8 +21,6 @@ from robotid.data.files.table import Table, WritableFormat, choose, parsing
 from robotid.data.log import suggestion
 from robotid.data.signal_settings import LogSource
 
-__all__ = ["Hdf5Format", "MatFormat", "NpzFormat"]
-
 _CLOCKS = ("time", "t")
 _LISTS = ("joints", "joint_names")  # entries that name the columns of wide arrays
 _MAT73 = b"MATLAB 7.3"  # first bytes of a MAT file in HDF5 format

@@ -18,8 +18,6 @@ from robotid.data.imu_frame import IMU
 from robotid.data.log import suggestion
 from robotid.data.signal_settings import LogSource
 
-__all__ = ["Sensor", "first_of", "is_low_state", "sensors_of", "with_sensors"]
-
 _WRENCH = ("fx", "fy", "fz", "mx", "my", "mz")
 _PACKAGES = ("unitree_go", "unitree_hg", "unitree_legged_msgs")
 
@@ -34,39 +32,20 @@ class Sensor:
 
 
 def is_low_state(kind: str) -> bool:
-    """Return whether messages of a type are the low-level states of a robot of Unitree.
-
-    Args:
-        kind: Name of the type in ROS 2.
-    """
+    """Return whether messages of a type are the low-level states of a robot of Unitree."""
     package, _, name = kind.partition("/msg/")
     return name == "LowState" and package in _PACKAGES
 
 
 def first_of(message: Any, *names: str) -> Any:  # noqa: ANN401
-    """Return the first of some fields that a message has, None without any.
-
-    Args:
-        message: The message.
-        names: Names of the field, in the versions of its type.
-    """
+    """Return the first of some fields that a message has, None without any."""
     return next((getattr(message, name) for name in names if hasattr(message, name)), None)
 
 
 def sensors_of(
     where: str, types: Mapping[str, str], first: Callable[[str], Any], source: LogSource
 ) -> list[Sensor]:
-    """Return the topics with columns of sensors.
-
-    Args:
-        where: Name of the bag.
-        types: Type of each topic with messages, by its name in ROS 2.
-        first: Returns the first message of a topic.
-        source: The topics to read, if stated.
-
-    Raises:
-        DataError: If a stated topic is not in the bag, or of another type.
-    """
+    """Return the topics with columns of sensors."""
     for topic in source.sensors:
         if topic not in types:
             raise DataError(
@@ -92,12 +71,6 @@ def with_sensors(
     """Return a table with the columns of sensors, interpolated at its time stamps.
 
     Rows before the first or after the last message of a topic that is read are left out.
-
-    Args:
-        states: The table of the joints.
-        where: Name of the bag.
-        sensors: The topics with columns of sensors.
-        load: Returns stamps (N,) [s], sorted, and values (N, k) of a topic.
     """
     by_column: dict[str, list[Sensor]] = {}
     for sensor in sensors:

@@ -22,8 +22,6 @@ from robotid.data.files.table import Format, Table, choose
 from robotid.data.log import repeated, suggestion
 from robotid.data.signal_settings import LogSource
 
-__all__ = ["BagFormat"]
-
 _STATE = "sensor_msgs/msg/JointState"
 _CONTROLLER = "control_msgs/msg/JointTrajectoryControllerState"
 _MEASURED = ("position", "velocity", "effort")

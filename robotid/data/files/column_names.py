@@ -9,18 +9,6 @@ from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 
-__all__ = [
-    "KINDS",
-    "Reading",
-    "by_number",
-    "is_clock",
-    "is_commanded",
-    "is_quantity",
-    "named_by_row",
-    "quantity_of",
-    "read_names",
-]
-
 _QUANTITIES = {
     "q": ("q", "pos", "position", "positions", "angle"),
     "dq": ("dq", "qd", "qdot", "vel", "velocity", "velocities", "speed"),
@@ -73,14 +61,7 @@ def read_names(
     effort: str = "torque",
     orders: Sequence[Sequence[str]] = (),
 ) -> Reading:
-    """Return the columns of each joint.
-
-    Args:
-        names: Names of the columns in the file.
-        places: Names of joints and motors in the file, by joint or motor.
-        effort: Quantity of effort columns: "torque" or "current".
-        orders: Joints in the order of numbered columns, one for each number that is possible.
-    """
+    """Return the columns of each joint."""
     joints = {label: place for place, label in places.items()}
     read = [(name, found) for name in names if (found := quantity_of(name, effort, joints))]
     if numbered := _numbered(read, joints, orders):
@@ -137,13 +118,7 @@ def _consecutive(names: Sequence[str]) -> list[int]:
 def quantity_of(
     name: str, effort: str = "torque", joints: Iterable[str] = ()
 ) -> tuple[str, str] | None:
-    """Return quantity and joint of a column, or None: "q_des_elbow" is qref of elbow.
-
-    Args:
-        name: The column.
-        effort: Quantity of effort columns: "torque" or "current".
-        joints: Names of joints; another name is found between or beside the words of the quantity.
-    """
+    """Return quantity and joint of a column, or None: "q_des_elbow" is qref of elbow."""
     for joint, rest in _around(name, sorted(joints, key=len, reverse=True)):
         if kind := _kind(rest, effort):
             return kind, joint
@@ -160,11 +135,7 @@ def quantity_of(
 
 
 def named_by_row(row: Mapping[str, object]) -> dict[str, str]:
-    """Return new names of columns whose joint is a text in a row: field.position0 by field.name0.
-
-    Args:
-        row: The first row of a table, by column.
-    """
+    """New names of columns whose joint is a text in a row: field.position0 by field.name0."""
     found = {match: cell for x, cell in row.items() if (match := _NAME.fullmatch(x))}
     return {
         x: f"{x.removesuffix(match[2])}_{str(joint).strip()}"
@@ -175,29 +146,17 @@ def named_by_row(row: Mapping[str, object]) -> dict[str, str]:
 
 
 def is_quantity(name: str) -> bool:
-    """Return whether a name is that of a quantity, of no joint.
-
-    Args:
-        name: A name, as of an array.
-    """
+    """Return whether a name is that of a quantity, of no joint."""
     return bool(_kind(_words(name), "torque"))
 
 
 def is_clock(name: str) -> bool:
-    """Return whether a column has time stamps: time, t, timestamp, stamp, header.stamp.
-
-    Args:
-        name: The column.
-    """
+    """Return whether a column has time stamps: time, t, timestamp, stamp, header.stamp."""
     return tuple(word for word in _words(name) if word not in _NO_MEANING) in _CLOCKS
 
 
 def is_commanded(name: str) -> bool:
-    """Return whether a column has a word for a command, or for the error of following one.
-
-    Args:
-        name: The column.
-    """
+    """Return whether a column has a word for a command, or for the error of following one."""
     ends = (*_COMMANDED, "demand", "err")
     return any(word.startswith(ends) or word.endswith(ends) for word in _words(name))
 
@@ -235,11 +194,7 @@ def _kind(words: tuple[str, ...], effort: str) -> str | None:
 
 
 def by_number(names: Sequence[str]) -> Sequence[str]:
-    """Return names in the order of their numbers if they differ by these alone, else as they are.
-
-    Args:
-        names: Names of joints.
-    """
+    """Names in the order of their numbers if they differ by these alone, else as they are."""
     return sorted(names, key=_numbers) if _differ_by_number(names) else names
 
 

@@ -17,8 +17,6 @@ from robotid.data.signal_settings import LogSource
 from robotid.data.transmission import Transmission
 from robotid.robot.tree import Joint
 
-__all__ = ["NOUNS", "TORQUES", "Finder", "Needs", "without_torque"]
-
 #: Quantities that are read besides the positions, as of ``lay_out``.
 Needs: TypeAlias = Literal["torque", "motion", "commands", "any"]
 
@@ -36,12 +34,7 @@ kp = N_M_PER_RAD  # position gain, if you know it"""
 
 
 def without_torque(is_commanded: bool, remedy: str = _SIMULATION) -> str:
-    """Return the remedy for a log without torques.
-
-    Args:
-        is_commanded: Whether it has commands.
-        remedy: What to state for an identification from commands.
-    """
+    """Return the remedy for a log without torques."""
     if is_commanded:
         return (
             "All estimators but the simulation need tau_<joint> or current_<joint>. The log has "
@@ -115,11 +108,7 @@ class Finder:
         return found
 
     def factors(self, torques: Sequence[str]) -> tuple[float, ...]:
-        """Return the factor that converts each of n columns to a torque: a current's gain, or 1.
-
-        Args:
-            torques: Names of the columns.
-        """
+        """Return the factor that converts each of n columns to a torque: a current's gain, or 1."""
         currents = {
             self._find_of(kind, name): name
             for kind, names in (("current", self.joints), ("currentm", self.motors.values()))
@@ -150,14 +139,7 @@ class Finder:
         }
 
     def of_motors(self, kind: str) -> tuple[bool, ...]:
-        """Return for which joints a quantity is read from the corresponding motor.
-
-        Args:
-            kind: "q", "dq", "ddq" or "tau".
-
-        Raises:
-            DataError: If joints of one transmission have it at the motors and at the joints.
-        """
+        """Return for which joints a quantity is read from the corresponding motor."""
         kinds = ("tau", "current") if kind == "tau" else (kind,)
         driven = set[str]()
         for gear in self.gears:
@@ -430,19 +412,11 @@ class Finder:
         return f"If {listed(at_rest)} {how}, as {locks}, or locked = {{ {locked} }} in the job file"
 
     def has_torque(self, joint: str) -> bool:
-        """Return whether the file has a torque or a current of a joint.
-
-        Args:
-            joint: The joint.
-        """
+        """Return whether the file has a torque or a current of a joint."""
         return self._has("tau", joint) or self._has("current", joint)
 
     def has_position(self, joint: str) -> bool:
-        """Return whether the file has the position of a joint.
-
-        Args:
-            joint: The joint.
-        """
+        """Return whether the file has the position of a joint."""
         return self._has("q", joint)
 
     def _has(self, kind: str, joint: str) -> bool:

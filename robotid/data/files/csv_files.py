@@ -19,8 +19,6 @@ from robotid.data.files.column_names import named_by_row
 from robotid.data.files.table import Place, RowReader, Table, WritableFormat
 from robotid.data.signal_settings import LogSource
 
-__all__ = ["CsvFormat"]
-
 _BLOCK = 4096  # lines read at a time
 _SENSED = ("base_", "imu_", "contact_", "wrench_")  # columns that other devices record
 

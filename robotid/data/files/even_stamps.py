@@ -9,17 +9,9 @@ import numpy as np
 from robotid.base.typing import Array
 from robotid.data.files.table import Place, RowReader, Table
 
-__all__ = ["with_even_stamps"]
-
 
 def with_even_stamps(table: Table, column: str, stamp: str = "even") -> Table:
-    """Return a table whose rows have equal time steps: the straight line through its stamps.
-
-    Args:
-        table: The table of a file.
-        column: Name of its time column.
-        stamp: As of ``LogSource``; the table stays as it is if it is not "even".
-    """
+    """Return a table whose rows have equal time steps: the straight line through its stamps."""
     if stamp != "even":
         return table
 

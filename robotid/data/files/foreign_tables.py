@@ -15,16 +15,6 @@ from robotid.data.files.table import Place, RowReader, Table, choose
 from robotid.data.log import suggestion
 from robotid.data.signal_settings import LogSource
 
-__all__ = [
-    "Frame",
-    "is_frame",
-    "open_frame",
-    "renamed",
-    "with_own_names",
-    "with_stated_names",
-    "with_time",
-]
-
 _CLOCK = "__time"  # PlotJuggler's
 _COLUMNS = "its columns have names as <topic>/<joint>/position"
 _SECONDS = re.compile(r"(.*)(?<![a-z])(secs?|n(?:ano)?secs?)")  # of a stamp in two columns
@@ -41,20 +31,12 @@ class Frame(Protocol):
 
 
 def is_frame(thing: object) -> TypeGuard[Frame]:
-    """Return whether an object has named columns, as a DataFrame.
-
-    Args:
-        thing: Any object.
-    """
+    """Return whether an object has named columns, as a DataFrame."""
     return hasattr(thing, "columns") and hasattr(thing, "__getitem__")
 
 
 def open_frame(frame: Frame) -> Table:
-    """Return the table in a DataFrame; an index with a name becomes a column.
-
-    Args:
-        frame: The DataFrame.
-    """
+    """Return the table in a DataFrame; an index with a name becomes a column."""
     if getattr(getattr(frame, "index", None), "name", None) is not None:
         frame = frame.reset_index()  # type: ignore[attr-defined]
     keys = {str(key): key for key in frame.columns}
@@ -82,15 +64,6 @@ def with_own_names(table: Table, where: str, kind: str, source: LogSource) -> Ta
 
     ``/joint_states/elbow/position`` becomes ``position_elbow``, likewise velocity, acceleration and
     effort, and ``__time`` becomes ``time``. A table with standard columns is not changed.
-
-    Args:
-        table: The table.
-        where: Name of its file, for errors.
-        kind: Noun for its format, as ".csv files".
-        source: Its topic, if it has joint states of several topics.
-
-    Raises:
-        DataError: If it has joint states of several topics and no topic, or another one, is stated.
     """
     topics: dict[str, dict[str, str]] = {}  # names in the file, by topic and own name
     standard = [name for name in table.names if name.startswith(("q_", "position_"))]
@@ -108,16 +81,7 @@ def with_own_names(table: Table, where: str, kind: str, source: LogSource) -> Ta
 
 
 def with_stated_names(table: Table, where: str, names: Sequence[str]) -> Table:
-    """Return a table with the names that a job states for all columns, in their order.
-
-    Args:
-        table: The table.
-        where: Name of its file, for errors.
-        names: The names; none: the table stays as it is.
-
-    Raises:
-        DataError: If their number is another one.
-    """
+    """Return a table with the names that a job states for all columns, in their order."""
     if not names:
         return table
     if len(names) != len(table.names):
@@ -129,12 +93,7 @@ def with_stated_names(table: Table, where: str, names: Sequence[str]) -> Table:
 
 
 def with_time(table: Table, rate: float | None) -> Table:
-    """Return a table with a column "time" from seconds and nanoseconds, or from a stated rate.
-
-    Args:
-        table: A table; it stays as it is if it has time stamps.
-        rate: Rate of the rows [Hz], if stated.
-    """
+    """Return a table with a column "time" from seconds and nanoseconds, or from a stated rate."""
     if any(is_clock(name) for name in table.names):
         note = "log.rate is not used: the log has time stamps"
         return table if rate is None else replace(table, notes=(*table.notes, note))
@@ -165,12 +124,7 @@ def _timed(table: Table, sources: tuple[str, ...], stamps: Callable[..., Array])
 
 
 def renamed(table: Table, theirs: Mapping[str, str]) -> Table:
-    """Return a table with other names of columns.
-
-    Args:
-        table: The table.
-        theirs: The new names by those in the file.
-    """
+    """Return a table with other names of columns."""
     own = {name: old for old, name in theirs.items()}
     if not own:
         return table

@@ -18,8 +18,6 @@ from robotid.data.files.table import Format, Table, choose, parsing
 from robotid.data.log import suggestion
 from robotid.data.signal_settings import LogSource
 
-__all__ = ["LeRobotFormat"]
-
 #: Prefixes of the columns of each feature, by the endings of the names in it.
 _FEATURES: Mapping[str, Mapping[str, str]] = {
     "observation.state": {"": "q", "pos": "q", "q": "q", "vel": "dq", "dq": "dq",

@@ -8,8 +8,6 @@ from robotid.base.findings import listed, quoted, toml_key
 from robotid.data.files.column_names import by_number, is_commanded, quantity_of
 from robotid.data.signal_settings import LogSource
 
-__all__ = ["NOUNS", "SIZES", "Missing"]
-
 #: Nouns for the columns of each kind.
 NOUNS = {
     "q": "position",
@@ -46,11 +44,7 @@ class Missing:
     found: Mapping[str, str]
 
     def error(self, remedy: str) -> DataError:
-        """Return the error.
-
-        Args:
-            remedy: What to do if the log has no other columns.
-        """
+        """Return the error."""
         named = self.source.joints
         sought = [f"{kind}_{named.get(place, place)}" for kind, place in self.absent]
         sizes = [name for name in self.names if name.startswith(SIZES)]

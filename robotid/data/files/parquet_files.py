@@ -17,8 +17,6 @@ from robotid.data.files.foreign_tables import renamed
 from robotid.data.files.table import Place, RowReader, Table, WritableFormat, parsing
 from robotid.data.signal_settings import LogSource
 
-__all__ = ["ParquetFormat", "load_pyarrow"]
-
 _TEXTS = ("string", "large_string")  # types of columns
 _BATCH = 16384  # rows decoded together, if not all are required
 _BUFFER = 2**16  # bytes of each column read together in this case, not whole row groups
@@ -42,14 +40,7 @@ class ParquetFormat(WritableFormat):
 
 
 def load_pyarrow(purpose: str) -> ModuleType:
-    """Return pyarrow, with pyarrow.parquet imported.
-
-    Args:
-        purpose: Its purpose, for the error, as "reading Parquet".
-
-    Raises:
-        MissingDependencyError: If it is not installed.
-    """
+    """Return pyarrow, with pyarrow.parquet imported."""
     try:
         import pyarrow
         import pyarrow.parquet

@@ -45,8 +45,6 @@ from robotid.data.transmission import Transmission, check_transmissions
 from robotid.data.units import check_units, turned
 from robotid.robot.tree import Joint
 
-__all__ = ["LogLayout", "Readable", "lay_out", "read_log", "read_logs", "write_log"]
-
 #: A log, or a file or a DataFrame with the columns of a log.
 Readable = Log | str | Path | Frame
 
@@ -123,20 +121,7 @@ def read_logs(
     passive: Collection[str] = (),
     robot: Sequence[Joint] = (),
 ) -> tuple[Log, ...]:
-    """Return the logs of a user, one or several; files and DataFrames are read.
-
-    Args:
-        given: A log with these joints, a path, a DataFrame, or a sequence of these.
-        joints: Names of the required joints, in the required order.
-        prismatic: Names of prismatic joints; the others are revolute.
-        needs: Quantities that are required besides positions, as of ``lay_out``.
-        base: As of ``read_log``.
-        passive: As of ``read_log``.
-        robot: As of ``read_log``.
-
-    Raises:
-        DataError: If it is no log, or a required quantity is missing.
-    """
+    """Return the logs of a user, one or several; files and DataFrames are read."""
     logs: list[Any]
     if isinstance(given, Log | str | Path | Mapping) or is_frame(given):
         logs = [given]
@@ -218,23 +203,11 @@ class LogLayout:
         return [name for names in self.columns.values() for name in names if name]
 
     def stamps(self, values: Array) -> Array:
-        """Return time stamps in seconds, same shape.
-
-        Args:
-            values: The time column.
-        """
+        """Return time stamps in seconds, same shape."""
         return values / PER_SECOND[self.units.time or "s"]
 
     def to_log(self, table: Mapping[str, Array], first: int = 0) -> Log:
-        """Return the log in SI units, from columns of the file.
-
-        Args:
-            table: The required columns by name.
-            first: Number of their first row in the file.
-
-        Raises:
-            DataError: If a value is not finite, or time does not increase.
-        """
+        """Return the log in SI units, from columns of the file."""
         nothing = np.zeros(len(table[self.columns["time"][0]]))  # torque of a passive joint
         values = {
             kind: np.stack([table[name] if name else nothing for name in names], axis=1)
@@ -334,30 +307,7 @@ def lay_out(
     passive: Collection[str] = (),
     robot: Sequence[Joint] = (),
 ) -> tuple[LogLayout, Table]:
-    """Return the layout of a log in a file, before its columns are read, and its open table.
-
-    Args:
-        path: The file, or a DataFrame.
-        joints: Names of the required joints, in the required order.
-        gains: As of ``read_log``.
-        columns: As of ``read_log``.
-        units: As of ``read_log``.
-        prismatic: As of ``read_log``.
-        source: As of ``read_log``.
-        transmissions: As of ``read_log``.
-        needs: Quantities that are required besides positions: "torque", of every joint;
-            "motion", none; "commands", a commanded position of every joint, and torques and other
-            commands if every joint has them; "any", torques or commands, and both if every joint
-            has them. Other quantities are ignored; torques that are not read are 0.
-        base: As of ``read_log``.
-        passive: As of ``read_log``.
-        robot: As of ``read_log``.
-
-    Raises:
-        DataError: If a required column is missing.
-        SettingsError: If gains, columns or the source have names that are not read.
-        MissingDependencyError: If a package that reads the file is not installed.
-    """
+    """Return the layout of a log in a file, before its columns are read, and its open table."""
     require_kind(needs, str, "needs", f"one of {listed(get_args(Needs))}")
     if needs not in get_args(Needs):
         raise SettingsError(f"needs is {needs!r}, wanted one of {listed(get_args(Needs))}")

@@ -10,8 +10,6 @@ from robotid.base.typing import Array
 from robotid.data.base_motion import ACCELERATION, POSE, TWIST, in_base
 from robotid.data.files.table import Table
 
-__all__ = ["ARRAYS", "with_simulator_arrays"]
-
 #: Prefixes of columns by array with one value per joint; before these, MuJoCo's has the base's.
 ARRAYS = {
     "qpos": "q", "qvel": "dq", "qacc": "ddq", "qfrc_actuator": "tau",
@@ -41,14 +39,6 @@ def with_simulator_arrays(where: str, table: Table, joints: Sequence[str]) -> Ta
     joints. Isaac Lab: ``joint_pos``, ``joint_vel``, ``joint_acc``, ``applied_torque``, and
     ``root_link_state_w`` or ``root_state_w``, with w first in the quaternion. The velocities of the
     base get the axes of the base. A table without such arrays is not changed.
-
-    Args:
-        where: Name of the file.
-        table: Its table, with a column for each value of an array.
-        joints: Names of the joints in the file.
-
-    Raises:
-        DataError: If an array has another width.
     """
     widths = {name: _width(table.names, name, joints) for name in (*ARRAYS, *_ROOTS)}
     widths = {name: width for name, width in widths.items() if width}

@@ -12,16 +12,6 @@ from robotid.base.findings import listed
 from robotid.base.typing import Array
 from robotid.data.signal_settings import LogSource
 
-__all__ = [
-    "Format",
-    "Place",
-    "RowReader",
-    "Table",
-    "WritableFormat",
-    "choose",
-    "parsing",
-]
-
 
 @dataclass(frozen=True)
 class Place:
@@ -41,25 +31,11 @@ class RowReader(ABC):
 
     @abstractmethod
     def scan(self, name: str) -> Iterator[tuple[Array, Place]]:
-        """Yield one column, a block of rows at a time.
-
-        Args:
-            name: The column.
-
-        Yields:
-            Its values, a missing one as NaN, and the place of the first.
-        """
+        """Yield one column, a block of rows at a time."""
 
     @abstractmethod
     def read(self, wanted: Sequence[str], first: int, stop: int, near: Place) -> dict[str, Array]:
-        """Return the columns of some rows by name, each (stop - first,); a missing value is NaN.
-
-        Args:
-            wanted: Names of the columns.
-            first: First row.
-            stop: Row after the last one.
-            near: A place that ``scan`` returned, at or before the first row.
-        """
+        """Return the columns of some rows by name, each (stop - first,); a missing value is NaN."""
 
 
 @dataclass(frozen=True)
@@ -76,11 +52,7 @@ class Table:
     axes: Mapping[str, str] = field(default_factory=dict)  # of "twist" and "wrench", if known
 
     def reader(self, wanted: Sequence[str]) -> RowReader:
-        """Return the reader of the rows; of a format that is read as a whole, of wanted columns.
-
-        Args:
-            wanted: Names of the columns.
-        """
+        """Return the reader of the rows; of a format that is read as a whole, of wanted columns."""
         return self.rows or _WholeTable(self, wanted)
 
 
@@ -110,16 +82,7 @@ class Format(ABC):
 
     @abstractmethod
     def open(self, path: Path, source: LogSource) -> Table:
-        """Return the table in a file; faults of a column are reported when it is read.
-
-        Args:
-            path: The file.
-            source: The topic, group or struct of it, and the clock.
-
-        Raises:
-            DataError: If the file is broken, or its table is missing or one of several.
-            MissingDependencyError: If a package that reads it is not installed.
-        """
+        """Return the table in a file; faults of a column are reported when it is read."""
 
 
 class WritableFormat(Format):
@@ -127,30 +90,11 @@ class WritableFormat(Format):
 
     @abstractmethod
     def write(self, table: Mapping[str, Array], path: Path) -> None:
-        """Write columns to a file.
-
-        Args:
-            table: Arrays of shape (N,) by name.
-            path: The file.
-
-        Raises:
-            DataError: If a name is not valid in this format.
-            MissingDependencyError: If a package that writes it is not installed.
-        """
+        """Write columns to a file: table (N,)."""
 
 
 def choose(where: str, found: Sequence[str], noun: str, listing: str) -> str:
-    """Return the only one of the possible places of a log in a file.
-
-    Args:
-        where: Name of the file, for errors.
-        found: The possible places, at least one.
-        noun: A noun for them, as "topics of ...".
-        listing: Content of the file, for the error.
-
-    Raises:
-        DataError: If there are several.
-    """
+    """Return the only one of the possible places of a log in a file."""
     if len(found) == 1:
         return found[0]
     names = sorted(found)
@@ -162,15 +106,7 @@ def choose(where: str, found: Sequence[str], noun: str, listing: str) -> str:
 
 @contextmanager
 def parsing(path: Path, kind: str) -> Iterator[None]:
-    """Convert the exceptions of a parser to a DataError.
-
-    Args:
-        path: The file.
-        kind: Name of its format.
-
-    Raises:
-        DataError: Instead of any exception of the parser.
-    """
+    """Convert the exceptions of a parser to a DataError."""
     try:
         yield
     except RobotIdError:

@@ -16,8 +16,6 @@ from robotid.data.files.parquet_files import ParquetFormat
 from robotid.data.files.table import Format, Table, WritableFormat
 from robotid.data.signal_settings import LogSource
 
-__all__ = ["check_suffix", "open_table", "write_columns"]
-
 _FORMATS: dict[str, Format] = {
     ".csv": CsvFormat(),
     ".dat": CsvFormat(),
@@ -41,19 +39,7 @@ _LONGEST_NAME = 1000  # characters of a column
 
 
 def open_table(path: Path, source: LogSource) -> Table:
-    """Return the table in a file; faults of a column are reported when it is read.
-
-    Args:
-        path: A file of a known suffix, the folder of a ROS 2 bag or of a LeRobot dataset, or an
-            episode of a dataset, as ``dataset/episode_3``.
-        source: Place of the log in the file.
-
-    Raises:
-        DataError: If the file is missing, of another suffix or broken, or its table is not found.
-        MissingDependencyError: If a package that reads it is not installed.
-        SettingsError: If the source has a topic of the commands, and the file is no bag, or a topic
-            and the path is an episode.
-    """
+    """Return the table in a file; faults of a column are reported when it is read."""
     if (dataset := dataset_of(path)) is not None:
         if source.topic not in (None, path.name):
             raise SettingsError(
@@ -104,14 +90,7 @@ def write_columns(table: Mapping[str, Array], path: Path) -> None:
 
     A temporary file in the same folder is written and then renamed, so the file is always complete.
 
-    Args:
-        table: Arrays of shape (N,) by name.
-        path: A file with the suffix of a writable format; an existing one is replaced.
-
-    Raises:
-        DataError: If the suffix is another one, or a name is not valid in the format.
-        MissingDependencyError: If a package that writes it is not installed.
-        OSError: If the folder cannot be written to.
+    table (N,).
     """
     form = _WRITTEN[check_suffix(path)]
     with written_whole(path) as temporary:
@@ -119,16 +98,7 @@ def write_columns(table: Mapping[str, Array], path: Path) -> None:
 
 
 def check_suffix(path: Path, what: str = "logs", *, also: Sequence[str] = ()) -> str:
-    """Return the suffix of a file to write; used before its content is computed.
-
-    Args:
-        path: The file.
-        what: Noun for the content, for errors.
-        also: Suffixes of further formats, for errors.
-
-    Raises:
-        DataError: If files with this suffix are not written.
-    """
+    """Return the suffix of a file to write; used before its content is computed."""
     suffix = path.suffix.lower()
     if suffix not in _WRITTEN:
         raise DataError(

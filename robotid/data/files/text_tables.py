@@ -11,21 +11,11 @@ from robotid.base.files import missing_file
 from robotid.data.files.parquet_files import load_pyarrow
 from robotid.data.files.table import parsing
 
-__all__ = ["ParquetRows", "parquet_rows", "parquet_values", "read_text_table"]
-
 _GROUP = 10_000  # rows of a row group, which are in memory before it is written
 
 
 def read_text_table(path: str | Path) -> tuple[list[str], list[dict[str, str]]]:
-    """Return the names of the columns and the rows of a table; a missing value is "".
-
-    Args:
-        path: A file of type .csv, with commas and a row of names, or .parquet.
-
-    Raises:
-        DataError: If it is missing, of another type or broken.
-        MissingDependencyError: If pyarrow is required and not installed.
-    """
+    """Return the names of the columns and the rows of a table; a missing value is ""."""
     source = Path(path)
     if not source.is_file():
         raise DataError(missing_file(source, "table"))
@@ -70,12 +60,7 @@ def _read_parquet(path: Path) -> tuple[list[str], list[list[str]]]:
 
 
 class ParquetRows:
-    """Writes rows to a Parquet file; at most one row group of them is in memory.
-
-    Args:
-        writer: The open writer of pyarrow.
-        schema: Its schema.
-    """
+    """Writes rows to a Parquet file; at most one row group of them is in memory."""
 
     def __init__(self, writer: Any, schema: Any) -> None:  # noqa: ANN401
         self._writer, self._schema = writer, schema
@@ -83,11 +68,7 @@ class ParquetRows:
         self.count = 0  # rows so far
 
     def add(self, rows: Sequence[Mapping[str, str | float | None]]) -> None:
-        """Add rows.
-
-        Args:
-            rows: Values by name of the column; a missing name is null.
-        """
+        """Add rows."""
         self.count += len(rows)
         self._waiting += rows
         while len(self._waiting) >= _GROUP:
@@ -108,15 +89,7 @@ class ParquetRows:
 
 @contextmanager
 def parquet_rows(path: Path, columns: Mapping[str, type]) -> Iterator[ParquetRows]:
-    """Write a Parquet file row by row; equal rows make equal files.
-
-    Args:
-        path: The file; use a temporary one, since it is incomplete until the context ends.
-        columns: Type of each column: str or float.
-
-    Raises:
-        MissingDependencyError: If pyarrow is not installed.
-    """
+    """Write a Parquet file row by row; equal rows make equal files."""
     pa = load_pyarrow("writing Parquet")
     kinds = {str: pa.string(), float: pa.float64()}
     schema = pa.schema([(name, kinds[kind]) for name, kind in columns.items()])
@@ -127,15 +100,7 @@ def parquet_rows(path: Path, columns: Mapping[str, type]) -> Iterator[ParquetRow
 
 
 def parquet_values(path: Path) -> Iterator[dict[str, Any]]:
-    """Yield the rows of a Parquet file, without their nulls; a row group of them is in memory.
-
-    Args:
-        path: The file.
-
-    Raises:
-        DataError: If it cannot be read.
-        MissingDependencyError: If pyarrow is not installed.
-    """
+    """Yield the rows of a Parquet file, without their nulls; a row group of them is in memory."""
     pa = load_pyarrow("reading Parquet")
     with parsing(path, "Parquet"), pa.parquet.ParquetFile(path) as file:
         for batch in file.iter_batches(_GROUP):

@@ -18,8 +18,6 @@ from robotid.diagnosis.logs.slips import rms
 from robotid.robot.constraints import link_positions
 from robotid.robot.model import RobotModel
 
-__all__ = ["check_order", "check_pose", "check_twist", "check_unit", "orientation_readings"]
-
 _MOVES = 5e-3  # [m/s] mean speed of feet on the ground below which no other pose is tried
 _SLOWER = 0.65  # ratio of the speeds below which another pose is found ...
 _BETTER = 0.5  # ... and of the differences below which another twist is
@@ -37,11 +35,7 @@ _ALONG = 0.8  # component of the unit vector from the feet to the base that may 
 
 
 def check_pose(log: Log) -> Iterator[Finding]:
-    """Yield findings on the logged pose of a base: jumps from one row to the next.
-
-    Args:
-        log: The log, with a base.
-    """
+    """Yield findings on the logged pose of a base: jumps from one row to the next."""
     if log.base is None:
         return
     rows, *sizes = pose_jumps(log.t, log.base.pose)
@@ -60,11 +54,7 @@ def check_pose(log: Log) -> Iterator[Finding]:
 
 
 def check_unit(log: Log) -> Iterator[Finding]:
-    """Yield a finding if the position of a base is in mm: it moves too fast, averaged over time.
-
-    Args:
-        log: The log, with a base.
-    """
+    """Yield a finding if the position of a base is in mm: it moves too fast, averaged over time."""
     if log.base is None or not log.base.has_position:
         return
     t = np.arange(log.t[0], log.t[-1], _STRIDE)
@@ -88,10 +78,6 @@ def check_twist(log: Log, signals: SignalSettings) -> Iterator[Finding]:
 
     Both pass the filter of the motion. If another reading of the quaternion explains the twist, the
     quaternion is wrong.
-
-    Args:
-        log: The log.
-        signals: How the log becomes a trajectory.
     """
     base = log.base
     if base is None or base.twist is None or base.imu is not None:
@@ -159,8 +145,7 @@ def _turned(quaternion: Array, twist: Array) -> Array:
 def orientation_readings(quaternion: Array) -> dict[str, Array]:
     """Return a quaternion (N, 4) as it is if its columns are wrong, by what is wrong with them.
 
-    Args:
-        quaternion: As logged, shape (N, 4).
+    quaternion (N, 4).
     """
     order, inverse = np.roll(quaternion, -1, axis=1), "the orientation of the world in the base"
     return {
@@ -192,10 +177,7 @@ class _Feet:
 
         Without a place of the base it is that of the slowest pair, relative to each other.
 
-        Args:
-            pose: As of ``turned``.
-            body: Axes of the base link in those of the log, shape (3, 3).
-            world: Axes of the logged position in those of the orientation, shape (3, 3).
+        body (3, 3), world (3, 3).
         """
         R, dR = (x @ body for x in pose)
         v = self.x @ dR.swapaxes(1, 2) + self.dx @ R.swapaxes(1, 2)  # (n, k, 3)
@@ -223,11 +205,6 @@ def check_order(model: RobotModel, log: Log, motion: Trajectory) -> Iterator[Fin
     only quaternions are tried: other axes are those of its IMU. A world with another vertical axis
     is found, too: the base is above the feet along it. A tilt that is constant moves no foot, and
     is not found: it looks like a slope.
-
-    Args:
-        model: The robot, with contacts.
-        log: The log.
-        motion: Its smoothed motion.
     """
     if log.base is None or not model.contacts or len(motion.t) < 3:
         return

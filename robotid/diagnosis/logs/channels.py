@@ -18,8 +18,6 @@ from robotid.data.measured_velocity import (
 )
 from robotid.data.signal_settings import SignalSettings
 
-__all__ = ["check_channels"]
-
 _SPIKE = 15.0  # smallest distance of a spike from its neighbours, over the typical distance
 _BEYOND = 1.5  # ... and over the amplitude of the channel
 _RESTING = 3.0  # [standard deviations of the noise] within which a channel is constant
@@ -37,25 +35,7 @@ _DEAD = 1e-3  # velocity over d(q)/dt below which the channel is constant
 
 
 def check_channels(log: Log, signals: SignalSettings) -> Iterator[Finding]:
-    """Yield the findings on the sensors behind the channels of a log.
-
-    Args:
-        log: The log.
-        signals: Source of the velocities, and the delay of measured ones that is corrected.
-
-    Yields:
-        "quantised" per kind of channel: a warning for torques of few steps, and for velocities of
-        few steps unless they are differentiated; else a note.
-        "spikes" per channel: an error if they are absurd and large enough to ruin a fit, and the
-        channel is used.
-        "noise" per kind of channel and "noisy_torque" per joint: notes.
-        "velocity_order" per joint: an error if a measured velocity is the derivative of another
-        joint's position.
-        "velocity_mismatch" for each other measured velocity that is not the derivative of its own
-        position: an error if it is used, a warning if "auto" rejects it, else a note.
-        "velocity_delay", at most one, with the scatter over the joints as its uncertainty.
-        "velocity_scale" per joint: an error if the velocity is used, else a note.
-    """
+    """Yield the findings on the sensors behind the channels of a log."""
     channels = dict(_channels(log))
     noise = {kind: _white_noise(log.t, values) for kind, values in channels.items()}
     for kind, values in channels.items():
@@ -195,12 +175,7 @@ def _unlike_velocity(log: Log, velocity: str) -> Iterator[Finding]:
 
 
 def _velocity_delay(log: Log, stated: float) -> Iterator[Finding]:
-    """Yield the delay of the measured velocity relative to the position, beyond the stated one.
-
-    Args:
-        log: The log.
-        stated: The delay that the settings correct [s].
-    """
+    """Yield the delay of the measured velocity relative to the position, beyond the stated one."""
     common, single = velocity_lags(log)
     lag, used = common - stated, single[single != 0.0] - stated
     scatter = float(np.median(np.abs(used - lag))) * 1.48 if len(used) else 0.0

@@ -31,8 +31,6 @@ from robotid.dynamics.constraint_rows import logged_base
 from robotid.robot.assumed import with_assumed_inertials
 from robotid.robot.model import RobotModel
 
-__all__ = ["CODES", "check_logs", "diagnose", "findings_to_dict"]
-
 #: Codes of the doctor's errors, which can be ignored.
 CODES = (
     "base_orientation", "base_twist", "gravity", "gravity_compensated", "imu_axes", "imu_gravity",
@@ -87,20 +85,7 @@ def check_logs(
 def diagnose(
     model: RobotModel, fitted: Sequence[Log], validation: Sequence[Log], signals: SignalSettings
 ) -> tuple[Finding, ...]:
-    """Check logs that are in memory, as ``check_logs`` does.
-
-    Args:
-        model: The robot.
-        fitted: Logs to fit, of the model's joints in its order.
-        validation: Validation logs.
-        signals: How the logs become trajectories.
-
-    Returns:
-        The findings, errors first.
-
-    Raises:
-        SettingsError: If a setting does not fit a log.
-    """
+    """Check logs that are in memory, as ``check_logs`` does."""
     # friction with an internal state is not examined here
     model = with_assumed_inertials(model.with_terms({}))
     findings = assumed_inertials(model)
@@ -124,14 +109,7 @@ def diagnose(
 
 
 def findings_to_dict(findings: Sequence[Finding]) -> dict[str, Any]:
-    """Return findings as plain values, as ``robotid doctor --json`` prints them.
-
-    Args:
-        findings: The findings.
-
-    Returns:
-        {"findings": [{"code", "severity", "where", "message", "evidence"}]}.
-    """
+    """Return findings as plain values, as ``robotid doctor --json`` prints them."""
     plain = [
         vars(finding) | {"evidence": {key: float(x) for key, x in finding.evidence.items()}}
         for finding in findings

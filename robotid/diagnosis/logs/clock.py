@@ -11,8 +11,6 @@ from robotid.data.log import Log, Trajectory
 from robotid.data.measured_velocity import quantum
 from robotid.robot.parameters import ParameterLayout
 
-__all__ = ["check_clock", "check_rest", "runs_of"]
-
 _JITTER = 0.05  # spread of the time steps over their median from which jitter is reported
 _GAP = 2.5  # [median steps] a longer step is a gap
 _LONG = 0.05  # [s] ... a longer gap is a warning
@@ -33,17 +31,7 @@ _MOVING = 0.1  # share of the log in which a joint must move
 
 
 def check_clock(log: Log) -> Iterator[Finding]:
-    """Yield the findings on the logger behind a log's time stamps and rows.
-
-    Args:
-        log: The log.
-
-    Yields:
-        Notes "rate" and "jitter"; at most one "gap", a warning if a gap is long; one warning
-        "bunched_stamps" if rows were stamped together, but not recorded together; one warning
-        "clock_step" if the clock was set during the recording; and one "stale_rows" of rows that
-        repeat the row before in every channel.
-    """
+    """Yield the findings on the logger behind a log's time stamps and rows."""
     step = np.diff(log.t)
     median = float(np.median(step))
     yield from _rate(log, step, median)
@@ -53,16 +41,7 @@ def check_clock(log: Log) -> Iterator[Finding]:
 
 
 def check_rest(log: Log, motion: Trajectory, layout: ParameterLayout) -> Iterator[Finding]:
-    """Yield the rests at the ends of a log, and the joints that do not move or hardly move.
-
-    Args:
-        log: The log.
-        motion: Its smooth motion, positions without full turns.
-        layout: Which joints are prismatic, and their ranges.
-
-    Yields:
-        At most one note "standstill"; a warning "static_joint" or a note "hardly_moves" per joint.
-    """
+    """Yield the rests at the ends of a log, and the joints that do not move or hardly move."""
     speed = np.abs(motion.v) / layout.drive_speeds[: len(log.joints)]
     # a prismatic joint that moves by a millimetre is at rest, too
     yield from _standstill(log, motion.t[(np.abs(motion.v) > _STILL).any(axis=1)])
@@ -92,11 +71,7 @@ def check_rest(log: Log, motion: Trajectory, layout: ParameterLayout) -> Iterato
 
 
 def runs_of(flags: Array) -> list[tuple[int, int]]:
-    """Return the first row, and the row after the last one, of each run of true flags.
-
-    Args:
-        flags: Shape (N,), bool.
-    """
+    """Return the first row, and the row after the last one, of each run of true flags."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(int)))
     return [(int(start), int(stop)) for start, stop in edges.reshape(-1, 2)]
 
@@ -213,10 +188,6 @@ def _in_motion(log: Log, runs: list[tuple[int, int]]) -> list[tuple[int, int]]:
 
     A robot that holds a position starts again from rest, and without further channels, a single
     step of the encoder is that of a slow motion.
-
-    Args:
-        log: The log.
-        runs: First and last row of each run.
     """
     t, q, last_row = log.t, log.q, len(log.t) - 1
     first, last = np.array([run for run in runs if run[1] < last_row], dtype=int).reshape(-1, 2).T

@@ -15,8 +15,6 @@ from robotid.data.measured_velocity import quantum
 from robotid.diagnosis.logs.clock import runs_of
 from robotid.diagnosis.logs.command_lead import find_lead
 
-__all__ = ["check_commands", "largest_speeds"]
-
 _SECONDS = 5.0  # [s] length of the segments whose spectra are averaged
 _GAP = 5  # [median steps] a longer step ends the segment that is examined
 _COHERENT = 0.8  # least coherence of command and position at a frequency that is used
@@ -52,19 +50,7 @@ _PULSES = 3  # least number of movements that end at one speed
 
 
 def check_commands(log: Log, prismatic: Collection[str] = ()) -> Iterator[Finding]:
-    """Yield the findings on the position loops of the joints.
-
-    Args:
-        log: The log; without commands, only "no_torque" is yielded.
-        prismatic: Names of the prismatic joints, whose positions are in m.
-
-    Yields:
-        Notes "no_torque", "loops" (bandwidth and lag of each joint) and "repeated_command"; a
-        warning "proportional_commands" per group of joints with proportional commands; an error
-        "delayed_command" per joint that moves before its command; warnings "slow_command",
-        "small_command", "saturated" and "slow_sampling"; and a warning "moved_by_others" per joint
-        that moves although its command is constant.
-    """
+    """Yield the findings on the position loops of the joints."""
     if not log.has_torque:
         yield _without_torque(log)
     if log.q_ref is None:
@@ -87,11 +73,7 @@ def check_commands(log: Log, prismatic: Collection[str] = ()) -> Iterator[Findin
 
 
 def largest_speeds(log: Log) -> dict[str, float]:
-    """Return the speeds of the joints that run at their largest speed for any position error.
-
-    Args:
-        log: The log, with commands.
-    """
+    """Return the speeds of the joints that run at their largest speed for any position error."""
     moved = [loop for j in range(len(log.joints)) if (loop := _Loop(log, j)).is_commanded]
     return {name: float(found.evidence["speed"]) for name, found in _saturated(log, moved)}
 

@@ -7,8 +7,6 @@ import numpy as np
 
 from robotid.base.typing import Array
 
-__all__ = ["Lead", "find_lead"]
-
 _WINDOW = 1.25  # [s] length of the windows whose scatter gives the standard error
 _FEWEST = 3  # windows
 _PART = 10.0  # [s] least length of a part that is tested by itself
@@ -51,15 +49,7 @@ def find_lead(
     the number of these tests and of the joints. A lead must also reduce the squared residual by a
     fifth: one that explains nothing of the position error is a model error.
 
-    Args:
-        command: Commanded positions, shape (N,), rad or m.
-        q: Positions, shape (N,), rad or m.
-        step: Time step [s].
-        bandwidth: Frequency above which the joint does not follow [Hz]; nan if it is not known.
-        joints: Number of the joints that are tested.
-
-    Returns:
-        The lead; None if no lead is significant.
+    command (N,), q (N,).
     """
     from scipy.stats import t as student
 

@@ -23,8 +23,6 @@ from robotid.dynamics.constraints.found_contacts import with_contacts
 from robotid.robot.constraints import Contact
 from robotid.robot.model import RobotModel
 
-__all__ = ["check_base", "flag_delay"]
-
 _LONGEST = 0.15  # [s] delay of contact flags that is searched for
 _NEAR = 0.075  # [s] distance of a change of motion from the delay of most changes
 _STOPS = 1e-3  # of the largest speed: smaller ones are alike
@@ -41,13 +39,7 @@ _CREEPS = 2e-3  # [m/s] ... if the frame is faster than this
 
 
 def check_base(model: RobotModel, log: Log, signals: SignalSettings) -> Iterator[Finding]:
-    """Yield findings on the base and the contacts of one log.
-
-    Args:
-        model: The robot, whose base floats.
-        log: The log.
-        signals: How the log becomes a trajectory.
-    """
+    """Yield findings on the base and the contacts of one log."""
     imu = None if log.base is None else log.base.imu
     if wrong := list(check_unit(log)):
         yield from wrong
@@ -178,10 +170,7 @@ def _relative(velocity: Array, flags: Array) -> Array:
 def _of_pairs(J: Array, flags: Array, v: Array) -> tuple[Array, Array]:
     """Return D and d of the relative velocities D w + d of pairs of links in contact.
 
-    Args:
-        J: Jacobians of the links, shape (N, k, 3, n_rows).
-        flags: Whether they are in contact, shape (N, k).
-        v: Velocities, shape (N, n_rows).
+    J (N, k, 3, n_rows), flags (N, k), v (N, n_rows).
     """
     D, d = np.zeros((len(J), 0, 3)), np.zeros((len(J), 0))
     for i, j in combinations(range(J.shape[1]), 2):
@@ -218,14 +207,7 @@ def _check_flags(
 ) -> Iterator[Finding]:
     """Yield findings on one contact: its flags have a delay, or the link moves in contact.
 
-    Args:
-        link: The link.
-        log: The log.
-        flags: Whether it touches the ground, by row of the log.
-        motion: The smoothed motion.
-        squares: Square of the link's speed along it, shape (N,) [m^2/s^2].
-        signals: Settings of the filter.
-        has_ground: Whether the speed does not depend on the flags of other links.
+    squares (N,) [m^2/s^2].
     """
 
     def mean_square(delay: float) -> float:
@@ -270,11 +252,7 @@ def flag_delay(t: Array, flags: Array, speed: Array, spread: float) -> tuple[flo
     is added, and half the spread of the filter: rows of that time beside a contact have no force
     anyway. A link sliding at more than half of its speed in the air shows no delay.
 
-    Args:
-        t: Time stamps, shape (N,) [s].
-        flags: Whether the link is in contact, shape (N,).
-        speed: Its speed, shape (N,) [m/s].
-        spread: Time over which the filter spreads motion; shorter contacts are ignored [s].
+    t (N,) [s], flags (N,), speed (N,) [m/s].
     """
     step = float(np.median(np.diff(t)))
     width = 2 * round(spread / step) + 1
@@ -311,10 +289,7 @@ def flag_delay(t: Array, flags: Array, speed: Array, spread: float) -> tuple[flo
 def _best_shift(flags: Array, speed: Array, reach: int) -> int:
     """Return the delay of flags with the smallest sum of log(speed / mean) in contact [rows].
 
-    Args:
-        flags: Whether the link is in contact, shape (N,).
-        speed: Its speed, shape (N,) [m/s].
-        reach: Longest delay in either direction [rows].
+    flags (N,), speed (N,) [m/s].
     """
     size = np.log(np.maximum(speed, _STOPS * speed.max()))
     total = np.concatenate([[0.0], np.cumsum(size - size.mean())])
@@ -328,14 +303,7 @@ def _best_shift(flags: Array, speed: Array, reach: int) -> int:
 def _radius(contact: Contact, v: Array, rolls: Array) -> tuple[float, str, float, float] | None:
     """Return the radius of a foot in contact that rolls as a ball of another one than stated.
 
-    Args:
-        contact: The contact.
-        v: Velocity at the contact with the stated radius, shape (N, 3) [m/s].
-        rolls: Change of the centre's velocity per radius of a ball that rolls, shape (N, 3) [1/s].
-
-    Returns:
-        The radius [m], the link, and the median speed at the contact with the stated and with this
-        radius [m/s]; None if the foot does not roll.
+    v (N, 3) [m/s], rolls (N, 3) [1/s].
     """
     pace = np.linalg.norm(rolls, axis=1)
     if not np.any(pace > 0.0):
@@ -356,12 +324,7 @@ def _radius(contact: Contact, v: Array, rolls: Array) -> tuple[float, str, float
 
 
 def _rolling(log: str, feet: Sequence[tuple[float, str, float, float]]) -> Iterator[Finding]:
-    """Yield a finding for the feet of about one radius.
-
-    Args:
-        log: Name of the log.
-        feet: Radius, link, speeds before and after of each, as of ``_radius``, in ascending order.
-    """
+    """Yield a finding for the feet of about one radius."""
     while feet:
         alike = [foot for foot in feet if foot[0] < _ALIKE * feet[0][0]]
         feet = feet[len(alike) :]

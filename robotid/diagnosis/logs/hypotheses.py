@@ -15,8 +15,6 @@ import numpy as np
 from robotid.base.typing import Array
 from robotid.diagnosis.logs.torque_sample import Probe
 
-__all__ = ["HINT", "Explanation", "compensated", "explanations", "own_share", "unexplained"]
-
 #: Decrease of the misfit from which another gravity is reported.
 HINT = 0.7
 
@@ -59,11 +57,7 @@ class Explanation:
 def compensated(probe: Probe) -> tuple[Probe, Array]:
     """Return a motion with the URDF's gravity added to its torques, and its unexplained shares.
 
-    Args:
-        probe: The motion.
-
-    Returns:
-        The motion, and the unexplained shares of the variance of the torques as logged, shape (n,).
+    -> (n,).
     """
     gravity = probe.loads() - probe.loads(np.zeros(3))
     whole = replace(probe, tau=probe.tau + gravity.sum(axis=2))
@@ -74,12 +68,7 @@ def compensated(probe: Probe) -> tuple[Probe, Array]:
 def unexplained(probe: Probe) -> Array:
     """Return the share of each torque column that the model of each joint does not explain.
 
-    Args:
-        probe: The motion.
-
-    Returns:
-        Shares of variance, shape (n, n, 2): torque column i, model of joint k, with the stated and
-        the reversed sign of the column. 0 for a constant column.
+    -> (n, n, 2).
     """
     N, n = probe.tau.shape
     every = np.hstack([probe.tau, -probe.tau])
@@ -88,14 +77,7 @@ def unexplained(probe: Probe) -> Array:
 
 
 def explanations(probe: Probe) -> tuple[Explanation, Explanation, list[Explanation]]:
-    """Return how well the torques are explained as stated, and under each other hypothesis.
-
-    Args:
-        probe: The motion.
-
-    Returns:
-        The stated reading; the same with any load on the last link; and the others.
-    """
+    """Return how well the torques are explained as stated, and under each other hypothesis."""
     share = unexplained(probe)
     own = np.diagonal(share).T  # (n, 2)
     stated = Explanation("stated", own[:, 0])
@@ -135,11 +117,7 @@ def _unsigned(probe: Probe, own: Array) -> Explanation:
 
 
 def _folded_misfit(X: Array, tau: Array, sign: Array) -> tuple[float, float]:
-    """Return the unexplained shares of a torque whose signs are iterated from initial ones.
-
-    Returns:
-        The share of the variance of the torque as logged, and of the torque with signs.
-    """
+    """Return the unexplained shares of a torque whose signs are iterated from initial ones."""
     for _ in range(_ITERATIONS):
         sign = np.where(_nonnegative_prediction(X, sign * tau) < 0, -1.0, 1.0)
     signed = sign * tau
@@ -304,14 +282,7 @@ def _moved(probe: Probe, j: int, sign: float, offset: float) -> tuple[Array, Arr
 
 
 def own_share(probe: Probe, gravity: Array | None = None, any_load: bool = False) -> Array:
-    """Return the unexplained share of each joint's torque, shape (n,).
-
-    Args:
-        probe: The motion.
-        gravity: Gravity, shape (3,) [m/s^2]; the model's if None.
-        any_load: Whether the last link may have an additional load with any mass and any centre of
-            mass, in the model's gravity.
-    """
+    """Return the unexplained share of each joint's torque, shape (n,): gravity (3,) [m/s^2]."""
     return _shares(probe, probe.tau.T[:, :, None], gravity, any_load)[:, 0]
 
 

@@ -12,8 +12,6 @@ from robotid.data.log import Log, Trajectory
 from robotid.diagnosis.logs.base_pose import orientation_readings
 from robotid.diagnosis.logs.slips import rms
 
-__all__ = ["check_imu"]
-
 _UNLIKE = 0.3  # of the motion: an angular velocity that differs by more is wrong
 _BETTER = 0.5  # ... and has other axes if these reduce the difference below this share
 _MOVES = 0.1  # [rad/s] RMS from which angular velocities are compared
@@ -27,14 +25,7 @@ _BY_ORIENTATION = "from the orientation"
 
 
 def check_imu(log: Log, motion: Trajectory, legs: tuple[Array, Array]) -> Iterator[Finding]:
-    """Yield findings on the IMU of one log.
-
-    Args:
-        log: The log, whose base has an IMU.
-        motion: Its smoothed motion.
-        legs: Relative velocity of pairs of links in contact, D w + d, with the angular velocity w
-            of the base: D of shape (N, m, 3), 0 for pairs without contact, and d of shape (N, m).
-    """
+    """Yield findings on the IMU of one log: legs (N, m, 3)."""
     if log.base is None or log.base.imu is None or motion.t[-1] - motion.t[0] < _SHORTEST:
         return
     frame, w = log.base.imu.frame, motion.v[:, 3:6]

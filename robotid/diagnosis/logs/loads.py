@@ -17,15 +17,6 @@ from robotid.diagnosis.logs.torque_sample import Probe
 from robotid.robot.drives import COUNTERBALANCE
 from robotid.robot.families import drive_line, spring_family
 
-__all__ = [
-    "NO_GRAVITY",
-    "LoadModel",
-    "check_loads",
-    "counterbalance",
-    "holds_gravity",
-    "load_model",
-]
-
 #: Message on torques without gravity.
 NO_GRAVITY = (
     "the torques contain no gravity: they fit the URDF with its gravity added, and do not fit it "
@@ -78,8 +69,7 @@ class LoadModel:
     def misfits(self, scales: Array) -> Array:
         """Return the misfits of scaled torques: chi-squares, prior included, shape (T,).
 
-        Args:
-            scales: T sets of factors of the torque columns, shape (T, n).
+        scales (T, n).
         """
         R = np.asarray(np.linalg.qr(self._rows(scales), mode="r"))  # (T, c+1, c+1)
         chi: Array = R[:, -1, -1] ** 2
@@ -88,11 +78,7 @@ class LoadModel:
     def fit(self, scale: Array) -> tuple[float, Array, Array]:
         """Fit with the torque columns multiplied by a scale, without negative masses of links.
 
-        Args:
-            scale: Factor of each torque column, shape (n,).
-
-        Returns:
-            The misfit (chi-square, prior included), the parameters and their standard errors.
+        scale (n,).
         """
         from scipy.optimize import lsq_linear
 
@@ -116,16 +102,7 @@ class LoadModel:
 
 
 def load_model(probe: Probe, share: Array, level: Array | None = None) -> LoadModel:
-    """Return the load model of a motion.
-
-    Args:
-        probe: The motion.
-        share: Share of each torque's variance that the model does not explain, shape (n,).
-        level: Standard deviation of each torque as logged, shape (n,); the motion's if None.
-
-    Returns:
-        The load model; a torque that is constant or unexplained is ignored.
-    """
+    """Return the load model of a motion: share (n,), level (n,)."""
     N, n = probe.tau.shape
     duration = float(np.ptp(probe.motion.t[probe.rows]))
     independent = min(_INDEPENDENT, _PER_SECOND * duration)
@@ -155,15 +132,7 @@ def check_loads(probe: Probe, share: Array, name: str) -> Iterator[Finding]:
     Another scale is accepted if the torques then fit with about the URDF's masses; else the URDF
     is of another robot.
 
-    Args:
-        probe: The motion; signs, order and gravity must be right.
-        share: Share of each torque's variance that the model does not explain, shape (n,).
-        name: Name of the log.
-
-    Yields:
-        The first that applies: warnings "current_for_torque" per joint, or one for all joints with
-        the same factor (an error if it is the factor of another unit in all joints); an error
-        "gravity_compensated"; a warning "urdf_mismatch"; a warning or note "payload".
+    share (n,).
     """
     model = load_model(probe, share)
     bodies = len(probe.model.layout.bodies)
@@ -204,11 +173,7 @@ def _holds_no_gravity(probe: Probe) -> bool:
 
 
 def holds_gravity(probe: Probe) -> bool:
-    """Return whether the torque of a joint contains its gravity torque by the URDF.
-
-    Args:
-        probe: The motion.
-    """
+    """Return whether the torque of a joint contains its gravity torque by the URDF."""
     with_gravity, without = own_share(probe), own_share(probe, np.zeros(3))
     followed = (with_gravity + _FLOOR < _FOLLOWED * (without + _FLOOR)) & (without < 1.0)
     return bool(followed.any())
@@ -220,10 +185,6 @@ def counterbalance(probe: Probe, name: str) -> tuple[Probe, tuple[Finding, ...]]
     A joint is counterbalanced if the torques do not fit the URDF's masses as they are, but fit with
     an additional torque, a cosine and a sine of its position, that opposes gravity. If a smaller
     mass of one link explains the torques as well, the finding is "link_mass".
-
-    Args:
-        probe: The motion; signs and order must be right.
-        name: Name of the log.
     """
     if not probe.gravity.any():
         return probe, ()
@@ -277,15 +238,7 @@ def _scaled_fit(model: LoadModel) -> float:
 
 
 def _lighter(model: LoadModel, chi: float) -> tuple[float, int, float] | None:
-    """Return the misfit, number and factor of a link whose mass explains torques as well as a term.
-
-    Args:
-        model: The load model without the term.
-        chi: Misfit with the term.
-
-    Returns:
-        None if no link with a smaller mass, the others near the URDF's, explains them.
-    """
+    """The misfit, number and factor of a link whose mass explains torques as well as a term."""
     ones, found = np.ones(len(model.R)), []
     for k in range(len(model.mean) - 4):
         spread = model.spread.copy()

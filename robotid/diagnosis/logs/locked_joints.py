@@ -9,8 +9,6 @@ from robotid.base.typing import Array
 from robotid.data.signal_settings import LogUnits
 from robotid.robot.model import RobotModel
 
-__all__ = ["STILL", "check_locked", "percent_hint"]
-
 #: Largest range of a locked joint, and largest difference from its stated position [rad or m].
 STILL = 0.02
 _FAR = 2 * np.pi  # number in a log above which a position may be a percentage
@@ -25,12 +23,7 @@ def check_locked(
 ) -> Iterator[Finding]:
     """Yield an error "locked_position" per locked joint that moves or has another position.
 
-    Args:
-        model: The robot.
-        positions: Logged positions of the locked joints by name, shape (N,) [rad or m].
-        log: Name of the log.
-        asked: Joints that the user asked to lock.
-        units: Units of the log.
+    positions (N,) [rad or m].
     """
     prismatic = {joint.name for joint in model.tree.movable if joint.type == "prismatic"}
     for joint, q in positions.items():
@@ -53,14 +46,7 @@ def check_locked(
 
 
 def percent_hint(model: RobotModel, name: str, position: float, units: LogUnits) -> str:
-    """Return what to state if the position of a gripper is a percentage; "" if it cannot be one.
-
-    Args:
-        model: The robot.
-        name: The joint; one that moves other joints is no gripper.
-        position: Its position [rad or m].
-        units: Units of the log.
-    """
+    """Return what to state if the position of a gripper is a percentage; "" if it cannot be one."""
     joint = next(joint for joint in model.tree.movable if joint.name == name)
     first, scale = units.scale(name, is_angle=joint.type != "prismatic")
     logged = (position - first) / scale

@@ -18,14 +18,6 @@ from robotid.estimation.estimators.determination import Determination, base_spre
 from robotid.robot.model import RobotModel
 from robotid.robot.prior import prior_spread
 
-__all__ = [
-    "alike_motions",
-    "check_excitation",
-    "check_repeated_motion",
-    "excitation_finding",
-    "is_poorly_excited",
-]
-
 _AHEAD = (0.0, 0.25, 0.5, 0.75, 1.0)  # [s] after an instant, positions that are compared
 _NEAR = 0.02  # of the range of each joint: closer positions are equal
 _SHARE = 0.3  # of the validation motion that is in a fitted log, too
@@ -40,13 +32,7 @@ _LOST = "the excitation is good, but these parameters are not identifiable above
 def check_repeated_motion(
     fitted: Sequence[Trajectory], validation: Trajectory, name: str
 ) -> Iterator[Finding]:
-    """Yield a warning "repeated_motion" if a validation log repeats motion that is fitted.
-
-    Args:
-        fitted: Smooth motions that are fitted.
-        validation: Smooth motion of the validation log.
-        name: Name of the validation log.
-    """
+    """Yield a warning "repeated_motion" if a validation log repeats motion that is fitted."""
     from scipy.spatial import cKDTree
 
     size = np.maximum(np.ptp(validation.q, axis=0), 1e-3)
@@ -66,14 +52,7 @@ def check_repeated_motion(
 
 
 def alike_motions(motions: Sequence[Trajectory]) -> list[list[int]]:
-    """Return the motions in groups: one that repeats another one is in its group.
-
-    Args:
-        motions: Smooth motions.
-
-    Returns:
-        Indices of the motions of each group, the groups in the order of their first motions.
-    """
+    """Return the motions in groups: one that repeats another one is in its group."""
     from scipy.spatial import cKDTree
 
     low, high = (np.array([f(x.q, axis=0) for x in motions]) for f in (np.min, np.max))
@@ -102,17 +81,6 @@ def check_excitation(
     """Yield which base parameters the fitted motions determine, by ``determine``.
 
     Of long logs every n-th row is used.
-
-    Args:
-        model: The robot.
-        mapping: Its structural base parameters.
-        motions: Smooth motions that are fitted.
-        signals: The filter, and the rows that are left out.
-        name: Names of the logs.
-
-    Yields:
-        One "excitation": a warning if the motion does not determine some parameters; a note if all
-        are determined, or if the excitation is good and the noise leaves some undetermined.
     """
     prior, step = model.standard_parameters(), -(-max(len(m.t) for m in motions) // _ROWS)
     thinned = [motion.every(step) for motion in motions]
@@ -136,13 +104,7 @@ def check_excitation(
 
 
 def excitation_finding(wls: Estimate, known: Determination, name: str) -> Finding:
-    """Return the finding on which base parameters a motion determines.
-
-    Args:
-        wls: Weighted least squares on the motion.
-        known: Which parameters it determines.
-        name: Names of its logs.
-    """
+    """Return the finding on which base parameters a motion determines."""
     count = len(known.names)
     evidence = {"rank": known.rank, "base": count, "weakest": known.shrinkage[-1]}
     if np.isfinite(wls.condition):
@@ -166,12 +128,7 @@ def excitation_finding(wls: Estimate, known: Determination, name: str) -> Findin
 
 
 def is_poorly_excited(wls: Estimate, count: int) -> bool:
-    """Return whether the motion, not the noise, leaves base parameters undetermined.
-
-    Args:
-        wls: Weighted least squares on the motion.
-        count: Number of base parameters.
-    """
+    """Return whether the motion, not the noise, leaves base parameters undetermined."""
     return wls.rank < count or wls.condition > _ILL_CONDITIONED
 
 

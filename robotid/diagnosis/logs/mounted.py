@@ -22,8 +22,6 @@ from robotid.robot.bodies import link_places
 from robotid.robot.model import RobotModel
 from robotid.robot.prior import payload_spread, prior_spread
 
-__all__ = ["Segments", "check_payload_change", "check_unmounted_parts"]
-
 _LIGHTER = 4.0  # decrease of the misfit, a likelihood ratio of 7, from which a part is not mounted
 _ALIKE = 2.0  # smallest significant difference of misfits
 _LIGHT = 0.02  # of the arm's mass, below which a part is not checked
@@ -42,10 +40,7 @@ def check_unmounted_parts(probe: Probe, share: Array, name: str) -> Iterator[Fin
     Parts are links that fixed or locked joints attach to the link of the last moving joint, with
     all links that they carry.
 
-    Args:
-        probe: The motion; signs, order, scale and gravity must be right.
-        share: Share of each torque's variance that the model does not explain, shape (n,).
-        name: Name of the log.
+    share (n,).
     """
     model = load_model(probe, share)
     whole, loaded = _misfit_without_load(model), model.fit(np.ones(len(share)))[0]
@@ -119,12 +114,6 @@ def check_payload_change(
 
     Both are fitted together, with free parameters of all links and a load in the last link of the
     validation log only. The load is reported if the same robot with it fits both.
-
-    Args:
-        fitted: Motions that are fitted.
-        validation: The motion of the validation log.
-        signals: How logs become trajectories.
-        name: Name of the validation log.
     """
     model, mapping = fitted.model, fitted.mapping
     first, second, layout = fitted.reductions, validation.reductions, model.layout

@@ -9,8 +9,6 @@ from robotid.base.typing import Array
 from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
 
-__all__ = ["check_slip", "rms", "without_zeros"]
-
 _MARGIN = 0.03  # [s] after and before a change of contact in which a slip is not examined
 _SLIPS = 0.03  # share of the time in contact with a slip that is reported
 _BEYOND = 3.0  # standard errors that a slip must exceed
@@ -27,11 +25,7 @@ def without_zeros(t: Array, v: Array, J: Array, flags: Array) -> Array:
     with the posture, and d is the same in all contacts. It is estimated from all of them, without
     samples of more than three times the median speed.
 
-    Args:
-        t: Time stamps, shape (N,) [s].
-        v: Velocity of the point, shape (N, 3) [m/s].
-        J: Its Jacobian, shape (N, 3, n_rows); the first six columns are those of the base.
-        flags: Whether it touches the ground, shape (N,).
+    t (N,) [s], v (N, 3) [m/s], J (N, 3, n_rows), flags (N,).
     """
     if not flags.any():
         return v
@@ -54,14 +48,7 @@ def check_slip(
     Contacts are cut into windows of 0.2 s, and of 1 s. A slip is a mean velocity of a window by
     which the link moves 1 cm, and that its scatter does not explain: vibrations and noise are none.
 
-    Args:
-        link: The link.
-        log: The log.
-        flags: Whether it is in contact, shape (N,).
-        t: Time stamps, shape (N,) [s].
-        ways: Velocities of the link, shape (N, 3) [m/s]: that in the world, and that relative to
-            all links in contact. The slowest one counts.
-        signals: Settings of the filter, which spreads the motion beyond a contact.
+    flags (N,), t (N,) [s], ways (N, 3) [m/s].
     """
     step = float(np.median(np.diff(t)))
     spread = 1.0 / signals.cutoff if signals.cutoff else 0.0
@@ -101,9 +88,5 @@ def check_slip(
 
 
 def rms(values: Array) -> float:
-    """Return the root mean square of the lengths of vectors.
-
-    Args:
-        values: The vectors, shape (N, 3).
-    """
+    """Return the root mean square of the lengths of vectors: values (N, 3)."""
     return float(np.sqrt(np.mean(np.sum(values**2, axis=1))))

@@ -11,8 +11,6 @@ from robotid.data.measured_velocity import COARSE, quantum
 from robotid.diagnosis.logs.clock import runs_of
 from robotid.diagnosis.logs.locked_joints import STILL
 
-__all__ = ["check_torque_channels"]
-
 _PLATEAU = 5  # consecutive rows at the limit of a clipped channel, at least
 _CLIPPED = 0.01  # share of the rows at the limit from which a channel is clipped
 _ZERO = 0.05  # of its largest value, below which a torque that is never negative is 0
@@ -23,16 +21,7 @@ _REGULAR = 0.8  # share of holds of about one length that a quantised torque doe
 
 
 def check_torque_channels(log: Log) -> Iterator[Finding]:
-    """Yield the findings on the torque sensors behind a log.
-
-    Args:
-        log: The log.
-
-    Yields:
-        Warnings "clipped" per joint and limit, or "constant_torque" per joint; one error
-        "unsigned_torque" if no torque has a sign; one warning "repeated_torque" for the joints
-        whose torque is updated less often than it is logged.
-    """
+    """Yield the findings on the torque sensors behind a log."""
     moving = np.append((np.diff(log.q, axis=0) != 0).any(axis=1), False)
     for joint, x in zip(log.joints, log.tau.T, strict=True):
         own = bool(np.ptp(log.q[:, log.joints.index(joint)]) > STILL)

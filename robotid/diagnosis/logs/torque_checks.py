@@ -12,8 +12,6 @@ from robotid.diagnosis.logs.loads import NO_GRAVITY, check_loads, counterbalance
 from robotid.diagnosis.logs.mounted import check_unmounted_parts
 from robotid.diagnosis.logs.torque_sample import Probe
 
-__all__ = ["check_torques"]
-
 _CERTAIN = 2.5  # significant decrease of the logarithm of the unexplained share, a factor 12
 _EXPLAINED = 0.2  # largest unexplained share of a reading that is accepted
 _WRONG = 0.5  # largest unexplained share of a torque with the right sign
@@ -60,16 +58,6 @@ def check_torques(probe: Probe, name: str) -> Iterator[Finding]:
 
     Only the reading that explains the torques best is reported; if it is the stated one, the
     URDF's masses are checked.
-
-    Args:
-        probe: The motion.
-        name: Name of the log.
-
-    Yields:
-        Errors "torque_sign", "unsigned_torque", "torque_order", "joint_order", "joint_axis",
-        "position_order", "position_sign", "position_offset", "gravity" or "gravity_compensated";
-        without these, the findings of ``check_unmounted_parts`` or ``check_loads`` and
-        "unexplained_torque"; in addition a warning "counterbalance" or "link_mass".
     """
     probe, balanced = counterbalance(probe, name)
     yield from balanced

@@ -20,8 +20,6 @@ from robotid.diagnosis.logs.torque_sample import coupled_columns, smooth_motion
 from robotid.dynamics.torque import carried_columns
 from robotid.robot.model import RobotModel
 
-__all__ = ["check_torque_delay"]
-
 _LONGEST = 0.1  # [s] largest delay of the grid
 _ROUNDING = 1e-10  # of the longest column: shorter columns are 0 except for rounding
 _DEPENDENT = 1e-5  # of the largest singular value: smaller ones are of dependent columns
@@ -87,11 +85,7 @@ class _Misfit:
         return self.loaded is not None and self.gain() < float(self.by_load(0.0).mean())
 
     def by_load(self, delay: float) -> Array:
-        """Return the share of the unexplained torque that friction by load explains, shape (n,).
-
-        Args:
-            delay: The delay of the torque [s].
-        """
+        """Return the share of the unexplained torque that friction by load explains, shape (n,)."""
         if self.loaded is None:
             return np.zeros(len(self.squares))
         now, then = (_at(delay, squares) for squares in (self.squares, self.loaded))
@@ -245,16 +239,6 @@ def check_torque_delay(
     the joints and over blocks of the log. The finding is a warning from three standard errors, if
     the delay of the other blocks explains each block better. A delay of more than 40 ms must
     explain at least 15 % of the unexplained torque.
-
-    Args:
-        model: The robot, with a fixed base.
-        log: The log, of the model's joints in its order.
-        signals: How it becomes a trajectory.
-        name: Name of the log.
-
-    Raises:
-        DataError: If the log is too short.
-        SettingsError: If a setting does not fit the log.
     """
     step = float(np.median(np.diff(log.t)))
     rate = min(1 / step, signals.rate or np.inf)

@@ -13,8 +13,6 @@ from robotid.dynamics.drive_columns import drive_values, friction_directions, fr
 from robotid.dynamics.torque import carried_columns
 from robotid.robot.model import RobotModel
 
-__all__ = ["Probe", "coupled_columns", "smooth_motion", "take_probe"]
-
 _MARGIN = 0.15  # [s] rows closer to the end of a segment are not used: the filter has not settled
 _STILL = 0.02  # [rad/s] slower, the sign of a friction torque is unknown
 _SLOW = 0.05  # ... for a slow joint: share of its largest speed
@@ -110,8 +108,7 @@ class Probe:
     def loads(self, gravity: Array | None = None) -> Array:
         """Return the torque of each link on each joint by the URDF, shape (N, n, bodies).
 
-        Args:
-            gravity: Gravity, shape (3,) [m/s^2]; the model's if None.
+        gravity (3,) [m/s^2].
         """
         links = self.parts.moving[0]
         if gravity is None:
@@ -136,35 +133,19 @@ class Probe:
         return np.concatenate([np.stack(own, axis=2), self.parts.coupled, swings], axis=2)
 
     def swing(self, j: int) -> Array:
-        """Return the columns of a counterbalance, cos q and sin q, shape (N, 2).
-
-        Args:
-            j: Index of a revolute joint.
-        """
+        """Return the columns of a counterbalance, cos q and sin q, shape (N, 2)."""
         return np.column_stack([np.cos(self.q[:, j]), np.sin(self.q[:, j])])
 
     def of(self, model: RobotModel) -> "Probe":
-        """Return the same motion of another robot.
-
-        Args:
-            model: The robot, of the same joints and bodies.
-        """
+        """Return the same motion of another robot."""
         return replace(self, model=model, parts=replace(self.parts, model=model))
 
     def at(self, rows: Array) -> "Probe":
-        """Return the probe at other rows of the same motion.
-
-        Args:
-            rows: Rows of the motion, shape (N,), int.
-        """
+        """Return the probe at other rows of the same motion: rows (N,)."""
         return replace(_probe_at(self.model, self.motion, rows), balanced=self.balanced)
 
     def with_motion(self, state: tuple[Array, Array, Array]) -> "Probe":
-        """Return the probe with another motion and the same torques.
-
-        Args:
-            state: Positions, velocities and accelerations, each of shape (N, n).
-        """
+        """Return the probe with another motion and the same torques: state (N, n)."""
         moved = _probe(self.model, self.motion, self.rows, state)
         return replace(moved, balanced=self.balanced)
 
@@ -172,11 +153,7 @@ class Probe:
 def coupled_columns(model: RobotModel, q: Array, v: Array, a: Array) -> Array:
     """Return the regressor's columns of coupled drives, shape (N, n, k).
 
-    Args:
-        model: The robot, with a fixed base and no drive with an internal state.
-        q: Joint positions, shape (N, n) [rad or m].
-        v: Velocities, shape (N, n).
-        a: Accelerations, shape (N, n).
+    q (N, n) [rad or m], v (N, n), a (N, n).
     """
     layout, coupled = model.layout, np.flatnonzero(model.layout.is_coupled)
     if not len(coupled):
@@ -187,17 +164,7 @@ def coupled_columns(model: RobotModel, q: Array, v: Array, a: Array) -> Array:
 
 
 def smooth_motion(model: RobotModel, log: Log, settings: SignalSettings) -> Trajectory:
-    """Return the motion of a log with velocities and accelerations derived from its positions.
-
-    Args:
-        model: The robot.
-        log: The log, of the model's joints in its order.
-        settings: The filter; the settings of velocity and acceleration are not used.
-
-    Raises:
-        DataError: If the log is too short or an angle jumps.
-        SettingsError: If a setting does not fit the log.
-    """
+    """Return the motion of a log with velocities and accelerations derived from its positions."""
     free = np.array([joint.turns_freely for joint in model.limits])
     log = unwrap(log, free)
     own = replace(settings, velocity="differentiated", acceleration="differentiated")
@@ -205,13 +172,7 @@ def smooth_motion(model: RobotModel, log: Log, settings: SignalSettings) -> Traj
 
 
 def take_probe(model: RobotModel, motion: Trajectory, *, samples: int = 500) -> Probe | None:
-    """Return a probe of a motion, None if the motion is too small for any check.
-
-    Args:
-        model: The robot, with a fixed base.
-        motion: The smooth motion.
-        samples: Number of instants, at equal distances over the rows in which a joint moves.
-    """
+    """Return a probe of a motion, None if the motion is too small for any check."""
     slow = _STILL * model.layout.drive_speeds[: len(model.joints)]
     rows = np.flatnonzero((np.abs(motion.v) > slow).any(axis=1) & _inner(motion))
     if len(rows) < 50:

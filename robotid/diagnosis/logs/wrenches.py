@@ -24,8 +24,6 @@ from robotid.dynamics.prediction import predict
 from robotid.robot.constraints import Contact, link_positions
 from robotid.robot.model import RobotModel
 
-__all__ = ["check_wrenches"]
-
 _MOST = 400  # samples that are examined
 _BETTER = 0.5  # ratio of the residuals of force or moment below which another reading is found ...
 _FORCE, _MOMENT = 0.3, 0.05  # ... of the weight, and of it at the feet's distance: masses may be it
@@ -61,13 +59,7 @@ class _Reading:
 
 
 def check_wrenches(model: RobotModel, log: Log, motion: Trajectory) -> Iterator[Finding]:
-    """Yield findings on the measured wrenches of one log.
-
-    Args:
-        model: The robot, whose base floats.
-        log: The log.
-        motion: Its smoothed motion.
-    """
+    """Yield findings on the measured wrenches of one log."""
     measured = [x for x in model.contacts if x.measured]
     if motion.wrenches is None or not measured:
         return

@@ -1,3 +1,1 @@
 """Analysis of the residual of a fit: missing drive terms, faults of recordings and of the URDF."""
-
-__all__: list[str] = []

@@ -11,8 +11,6 @@ from robotid.base.typing import Array
 from robotid.estimation.fitting.joint_motion import JointMotion
 from robotid.robot.drives import FAMILIES, DriveMotion, DriveTerm, Family, Harmonic
 
-__all__ = ["CANDIDATES", "Candidate", "couplings", "ripples"]
-
 _RIPPLES = np.arange(5, 241)  # periods per revolution tested: 200 of a gear of 100 : 1
 _PEAKS = 6  # of them are tested: those with the largest periodic residual
 _STEEP = 8  # twice the order of the filter, which is applied in both directions
@@ -99,10 +97,7 @@ def _passed(m: JointMotion, counts: Array) -> Array:
 def ripples(m: JointMotion, weight: Array, r: Array) -> tuple[Candidate, ...]:
     """Return candidates of a torque periodic in the position, from the residual's spectrum.
 
-    Args:
-        m: The joint's motion, N samples.
-        weight: Weights of the torques, 0 where a sample is not used, shape (N,).
-        r: The weighted residual, shape (N,).
+    weight (N,), r (N,).
     """
     first = np.exp(1j * m.q)
     wave = first ** _RIPPLES[0]  # e^(i count q)
@@ -172,11 +167,7 @@ CANDIDATES = (
 
 
 def couplings(motion: JointMotion) -> tuple[Candidate, ...]:
-    """Return candidates of a drive coupled to a joint and to the joint before or after it.
-
-    Args:
-        motion: The joint's motion.
-    """
+    """Return candidates of a drive coupled to a joint and to the joint before or after it."""
     return tuple(
         Candidate(
             f"coupling {ratio:+g} {name}", "coupling",

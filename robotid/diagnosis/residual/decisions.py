@@ -5,32 +5,6 @@ Each group names the benchmark that measures its correct and false detections.
 
 from robotid.diagnosis.residual.selection import Rule
 
-__all__ = [
-    "ALTERATION",
-    "ALTERATION_P_VALUE",
-    "ALTERATION_SHARE",
-    "AT_BOUND",
-    "CONFIRMED",
-    "DEPENDENCE_P_VALUE",
-    "DEPENDENCE_SHARE",
-    "FAMILY",
-    "FAMILY_LEAST",
-    "FAMILY_P_VALUE",
-    "GROWN",
-    "MAIN",
-    "MISFIT",
-    "MISFIT_MATTERS",
-    "MISFIT_REPORTED",
-    "MISFIT_WARNS",
-    "ONE_SIDED",
-    "SIGNIFICANT",
-    "TENFOLD",
-    "UNDECIDED_P_VALUE",
-    "WEAK",
-    "WEAK_P_VALUE",
-    "WEAK_SIZE",
-]
-
 _ALIKE = 0.02  # of the squared residual: within this difference the simpler option is selected
 
 # Families selected for a joint's drive: benchmarks/bench_friction.py

@@ -12,8 +12,6 @@ from robotid.base.typing import Array
 from robotid.diagnosis.residual.decisions import DEPENDENCE_P_VALUE, DEPENDENCE_SHARE
 from robotid.diagnosis.residual.selection import p_value
 
-__all__ = ["FEWEST", "Dependence", "even_bins", "follow"]
-
 #: Smallest number of segments for a test.
 FEWEST = 6
 
@@ -63,8 +61,7 @@ class Dependence:
     def at(self, x: Array) -> tuple[Array, Array]:
         """Return the mean residual and its standard error, linear between bins, shape (N,) each.
 
-        Args:
-            x: Values of the quantity, shape (N,); the result is NaN outside the bins.
+        x (N,).
         """
         curves = (np.interp(x, self.centres, y, np.nan, np.nan) for y in (self.means, self.errors))
         mean, error = curves
@@ -81,13 +78,7 @@ def follow(
     clusters (Liang, Zeger 1986). The squared residual of segment k after the means of the other
     segments is compared with that after their common mean; for a single bin, with that around 0.
 
-    Args:
-        name: Name of the quantity.
-        unit: Its unit.
-        x: Its values in the samples, shape (N,).
-        r: The residual, shape (N,).
-        bins: Bin of each sample, shape (N,), int, from 0 on without gaps.
-        segments: Segment of each sample, shape (N,), int; None if the log is too short.
+    x (N,), r (N,), bins (N,), segments (N,).
     """
     n = np.bincount(bins).astype(float)
     centres, means = np.bincount(bins, x) / n, np.bincount(bins, r) / n
@@ -118,11 +109,7 @@ def follow(
 def even_bins(x: Array) -> Array:
     """Return the bin of each value: ten bins with equal numbers of samples, also split at 0.
 
-    Args:
-        x: Values of a quantity, shape (N,).
-
-    Returns:
-        Index of the bin, none of which is empty, shape (N,), int.
+    x (N,) -> (N,).
     """
     edges = np.unique(np.append(np.quantile(x, np.arange(1, _BINS) / _BINS), 0.0))
     return np.unique(np.searchsorted(edges, x, side="right"), return_inverse=True)[1]

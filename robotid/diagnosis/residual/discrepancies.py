@@ -36,8 +36,6 @@ from robotid.dynamics.prediction import body_slopes, drive_torque, inverse_dynam
 from robotid.estimation.fitting.fitted import Fit
 from robotid.robot.model import RobotModel
 
-__all__ = ["explain_residual"]
-
 _Applied = Callable[[Array], tuple[RobotModel, Sequence[Trajectory]]]
 
 _STEP = 1e-5  # step of a finite difference [-, rad or m]
@@ -81,16 +79,6 @@ def explain_residual(
 
     A spring and a position offset imitate each other: what explains more of the residual of all
     joints together is accepted first, and the other hypotheses are tested again together with it.
-
-    Args:
-        fit: The fit.
-        sample: Samples of its recordings; None if there are too few for a test.
-
-    Returns:
-        For a robot with a fixed base, without loops and passive joints, else nothing: terms that
-        drive models lack, the largest first, and warnings "position_offset",
-        "lost_motion", "angle_scale", "torque_scale", "time_scale", "gravity" and "joint_origin",
-        the one that explains most of the residual first.
     """
     model = fit.model
     if sample is None or model.free_flyer or model.constraints or model.passive:
@@ -135,11 +123,7 @@ def _refined(applied: _Applied, x: Array, pi: Array, sample: Sample) -> tuple[Ar
     Torques are nonlinear over a tenth of a radian: Gauss-Newton steps are repeated until the sizes
     converge.
 
-    Args:
-        applied: Returns the robot and its motions with sizes (c,).
-        x: The sizes to first order, shape (c,).
-        pi: Standard parameters of the estimate, shape (p,).
-        sample: Samples of the recordings.
+    x (c,), pi (p,).
     """
     every, error = list(range(len(x))), np.full(len(x), np.inf)
     for _ in range(_STEPS):

@@ -38,8 +38,6 @@ from robotid.estimation.fitting.fitted import Solution
 from robotid.estimation.fitting.selected_drives import DriveChoice, FoundShape, Tried, with_shapes
 from robotid.robot.drives import FAMILIES, DataRange, DriveMotion, DriveTerm, Family, MemorylessTerm
 
-__all__ = ["choose_drives"]
-
 _GRID = 6  # values of a shape tested between its bounds
 _SPAN = 100.0  # largest over smallest of them; an upper bound beyond is also tested
 _SLOWEST = 0.0  # share of samples slower than the data range
@@ -81,19 +79,7 @@ def choose_drives(
     wanted: Mapping[str, Sequence[str] | None],
     balanced: Mapping[str, str] | None = None,
 ) -> tuple[DriveChoice, ...]:
-    """Return the terms of each joint's drive.
-
-    Args:
-        fit: The fit with viscous and Coulomb friction only.
-        wanted: Families stated for each joint, by name; None: those that held-out segments of the
-            fitted logs require; see ``wanted_families``.
-        balanced: Family of a suspected counterbalance of joints whose families are selected. It is
-            selected as any other, or if no standard error increases: where only the URDF's masses
-            distinguish it from gravity, it has no gain.
-
-    Returns:
-        A choice per joint; none for a joint that hardly moved, or if the logs are too short.
-    """
+    """Return the terms of each joint's drive."""
     sample = take_sample(fit, for_drives=True, is_free=True)
     if sample is None:
         return ()

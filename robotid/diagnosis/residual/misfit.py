@@ -23,8 +23,6 @@ from robotid.estimation.fitting.joint_motion import JointMotion
 from robotid.robot.drives import DriveTerm
 from robotid.robot.families import has_turned
 
-__all__ = ["Misfit", "find_misfits"]
-
 
 @dataclass(frozen=True)
 class Misfit:
@@ -65,11 +63,7 @@ class Misfit:
     trend: tuple[float, float] = (math.nan, math.nan)
 
     def torque(self, motion: JointMotion) -> Array:
-        """Return the torque of the term along a motion of the joint, shape (N,) [N m or N].
-
-        Args:
-            motion: The motion, N samples.
-        """
+        """Return the torque of the term along a motion of the joint, shape (N,) [N m or N]."""
         torque: Array = self.term.columns(replace(motion, scale=self.scale)) @ self.theta
         return torque
 
@@ -83,11 +77,7 @@ class Misfit:
 
 
 def find_misfits(sample: "Sample | None") -> tuple[Misfit, ...]:
-    """Return the terms that would explain a part of the residual of a fit, the largest first.
-
-    Args:
-        sample: Samples of the recordings; None if there are too few for a test.
-    """
+    """Return the terms that would explain a part of the residual of a fit, the largest first."""
     if sample is None:
         return ()
     found = [misfit for j in range(len(sample.joints)) for misfit in _of_joint(sample, j)]

@@ -13,15 +13,6 @@ from robotid.estimation.fitting.fitted import Fit
 from robotid.robot.drives import COUNTERBALANCE, DriveTerm
 from robotid.robot.families import drive_line, spring_family
 
-__all__ = [
-    "counterbalanced",
-    "misfit_findings",
-    "setting_of",
-    "settled",
-    "with_entries",
-    "with_known_springs",
-]
-
 _OF_POSITION = ("position_periodic", "spring", "position_offset")
 _BALANCES = ("counterbalance", "link_mass")
 _OF_MASSES = (*_BALANCES, "current_for_torque", "urdf_mismatch")
@@ -30,13 +21,7 @@ _DIGITS = "0123456789"
 
 
 def misfit_findings(fit: Fit, misfits: Sequence[Misfit], on_misfit: Sequence[str]) -> list[Finding]:
-    """Return a finding for each term that a drive model lacks.
-
-    Args:
-        fit: The fit.
-        misfits: The terms.
-        on_misfit: Names of the drive parameters whose errors increased for them.
-    """
+    """Return a finding for each term that a drive model lacks."""
     return [_finding(misfit, fit, on_misfit) for misfit in misfits]
 
 
@@ -44,10 +29,6 @@ def setting_of(misfit: Misfit, fit: Fit) -> str:
     """Return the entry of a job file that adds a term to the model; empty if there is none.
 
     It is a line of [drives] that includes the present terms of the joint, or a table [[coupling]].
-
-    Args:
-        misfit: The term.
-        fit: The fit without it.
     """
     joint, other = misfit.joint, misfit.term.coupled
     if other:
@@ -59,13 +40,7 @@ def setting_of(misfit: Misfit, fit: Fit) -> str:
 
 
 def with_entries(fit: Fit, joint: str, entries: Sequence[str | DriveTerm]) -> str:
-    """Return the line of a job's [drives] that adds entries to the present ones of a joint.
-
-    Args:
-        fit: The fit without them.
-        joint: The joint.
-        entries: Names of families, or terms.
-    """
+    """Return the line of a job's [drives] that adds entries to the present ones of a joint."""
     (families, chosen), *_ = [
         *((c.families, c.terms) for c in fit.drives if c.joint == joint),
         ((), ()),
@@ -77,12 +52,7 @@ def with_entries(fit: Fit, joint: str, entries: Sequence[str | DriveTerm]) -> st
 
 
 def counterbalanced(found: Sequence[Finding], logs: Sequence[str]) -> dict[str, str]:
-    """Return the family of the counterbalance of each joint with one in the fitted logs.
-
-    Args:
-        found: Findings before the fit.
-        logs: Names of the fitted logs.
-    """
+    """Return the family of the counterbalance of each joint with one in the fitted logs."""
     joints = {}
     for finding in found:
         log, _, joint = finding.where.rpartition(": ")
@@ -97,11 +67,6 @@ def with_known_springs(
     """Return the findings before a fit; a counterbalance that its model includes becomes a note.
 
     A spring that a wrong mass would imitate becomes a note only if it was stated, not selected.
-
-    Args:
-        found: Findings before the fit.
-        fit: The fit, with the terms of its drives.
-        wanted: Families stated for each joint; None: selected.
     """
     own = fit.model.layout.own
     springs = {joint for joint, terms in own.items() if any(t.part in _SPRINGS for t in terms)}
@@ -126,10 +91,6 @@ def settled(found: Sequence[Finding], of_fit: Sequence[Finding]) -> list[Finding
 
     The doctor's model has no springs: it attributes a torque that depends on the position to wrong
     masses, or to nothing. The term that explains it is then a warning, even if it is small.
-
-    Args:
-        found: Findings before the fit.
-        of_fit: Findings of the fit.
     """
     rest, terms = list(found), []
     for term in of_fit:

@@ -31,8 +31,6 @@ from robotid.robot.drives import DriveMotion, DriveTerm
 if TYPE_CHECKING:
     from robotid.estimation.fitting.selected_drives import DriveChoice
 
-__all__ = ["settled_shapes", "with_model_error"]
-
 _STEP = 1e-3  # relative step of a finite difference
 _ROUNDING = 1e-10  # share of a column below which it is rounding
 _MOVES = 0.2  # change of a shape in standard errors above which the fit is repeated
@@ -42,16 +40,7 @@ _PINNED = 1e-6  # of the smallest prior spread: spread of a parameter that is fi
 def with_model_error(
     found: Fit, sample: Sample | None, misfits: Sequence[Misfit]
 ) -> tuple[Fit, tuple[str, ...]]:
-    """Return a fit whose standard errors include the errors of its drive model.
-
-    Args:
-        found: The fit.
-        sample: Samples of its recordings; None if there are too few for a test.
-        misfits: Terms that its drive models lack.
-
-    Returns:
-        The fit, and names of the drive parameters whose errors increased for the misfits.
-    """
+    """Return a fit whose standard errors include the errors of its drive model."""
     if sample is None:
         return found, ()
     motions = _motions(found, sample) if found.drives else []
@@ -150,12 +139,6 @@ def settled_shapes(found: Solution) -> "tuple[DriveChoice, ...] | None":
     """Return choices with shapes refitted now that all joints have their terms.
 
     One Gauss-Newton step: the step of a shape is the parameter of its column.
-
-    Args:
-        found: The fit with the present shapes.
-
-    Returns:
-        The choices; None if no shape changes by more than 0.2 of its standard error.
     """
     sample = take_sample(found, for_drives=True)
     if sample is None or not any(choice.shapes for choice in found.drives):
@@ -208,11 +191,7 @@ def _motions(found: Solution, sample: Sample) -> list[DriveMotion]:
 def shape_slope(found: Solution, choice: "DriveChoice", which: int, motion: DriveMotion) -> Array:
     """Return the derivative of a drive's torque with respect to one of its shapes, shape (N,).
 
-    Args:
-        found: The fit.
-        choice: The joint's terms.
-        which: Index of the shape.
-        motion: Motion of the drive, arrays of shape (N,).
+    motion (N,).
     """
     layout = found.model.layout
     theta = dict(zip(layout.names, found.standard, strict=True))

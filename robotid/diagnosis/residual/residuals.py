@@ -9,8 +9,6 @@ from robotid.base.typing import Array
 from robotid.estimation.fitting.evaluation import Evaluation, predict
 from robotid.robot.model import RobotModel
 
-__all__ = ["autocorrelation", "friction_split", "spectrum"]
-
 
 def spectrum(
     x: Array, used: NDArray[np.bool_], segment: Array, dt: float, *, length: float = 5.0
@@ -21,20 +19,11 @@ def spectrum(
     count as zero, and a window is normalised by its used samples:
     S(f) = 2 dt sum |FFT(w m x)|^2 / sum w^2 m, with m = 1 where a sample is used.
 
-    Args:
-        x: The signal, shape (N,) [unit].
-        used: Samples used, shape (N,), bool.
-        segment: Number of the uninterrupted segment of each sample, shape (N,).
-        dt: Sample period [s].
-        length: Length of a window [s]; that of the longest segment where it is shorter.
-
-    Returns:
-        Frequencies, shape (F,) [Hz], and the one-sided density, shape (F,) [unit^2/Hz]. Its
-        integral is the mean square of the used samples. Both are empty if no window has one.
-
     References:
         Welch (1967), The use of fast Fourier transform for the estimation of power spectra.
         Parzen (1963), On spectral analysis with missing observations.
+
+    x (N,) [unit], used (N,), segment (N,) -> (F,) [Hz], (F,) [unit^2/Hz].
     """
     bounds = np.flatnonzero(np.r_[True, np.diff(segment) != 0, True])
     size = min(max(round(length / dt), 8), int(np.diff(bounds).max()))
@@ -60,17 +49,10 @@ def autocorrelation(x: Array, used: NDArray[np.bool_], segment: Array, lags: int
     r(k) = sum x(i) x(i + k) / sqrt(sum x(i)^2 sum x(i + k)^2), summed over pairs of used samples in
     one segment: by Cauchy and Schwarz it is at most 1, however few pairs have this lag.
 
-    Args:
-        x: The signal, shape (N,); its mean is not subtracted.
-        used: Samples used, shape (N,), bool.
-        segment: Number of the uninterrupted segment of each sample, shape (N,).
-        lags: Longest lag [samples].
-
-    Returns:
-        Autocorrelation at lags 0 to ``lags``, shape (lags + 1,); NaN without a pair of samples.
-
     References:
         Parzen (1963), On spectral analysis with missing observations.
+
+    x (N,), used (N,), segment (N,) -> (lags + 1,).
     """
     products, earlier, later, pairs = np.zeros((4, lags + 1))
     bounds = np.flatnonzero(np.r_[True, np.diff(segment) != 0, True])
@@ -92,13 +74,7 @@ def friction_split(model: RobotModel, evaluation: Evaluation, pi: Array) -> tupl
 
     The first is tau - Y pi with pi without friction and offset, the second their torque.
 
-    Args:
-        model: The robot.
-        evaluation: A recording.
-        pi: Standard parameters, shape (p,).
-
-    Returns:
-        Both torques, shape (N, n) each [N m or N]; an offset counts as friction.
+    pi (p,) -> (N, n) [N m or N].
     """
     layout = model.layout
     inertial = [True] * layout.n_inertial

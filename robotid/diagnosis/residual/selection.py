@@ -16,8 +16,6 @@ from scipy.special import stdtr
 
 from robotid.base.typing import Array
 
-__all__ = ["Round", "Rule", "p_value", "select"]
-
 _STILL = 1e-9  # of the largest squared residual of a segment: below, the joint is at rest in it
 _FEWEST = 3  # segments for a test
 _NOTHING = 1e-300
@@ -61,37 +59,19 @@ class Round(Generic[Option]):
     least: float = -np.inf
 
     def gain(self, option: Option) -> float:
-        """Return the reduction of the squared residual of fitted logs by an option.
-
-        Args:
-            option: The option.
-        """
+        """Return the reduction of the squared residual of fitted logs by an option."""
         return float((self.before - self.left[option])[: self.fitted].sum())
 
     def share(self, option: Option) -> float:
-        """Return the share of the squared residual of fitted logs that an option removes [-].
-
-        Args:
-            option: The option.
-        """
+        """Return the share of the squared residual of fitted logs that an option removes [-]."""
         return self.gain(option) / max(self.whole, _NOTHING)
 
     def p_value(self, option: Option) -> float:
-        """Return the p-value of the reduction by an option [-].
-
-        Args:
-            option: The option.
-        """
+        """Return the p-value of the reduction by an option [-]."""
         return p_value(self.before, self.left[option], self.fitted)
 
     def alike(self, rule: Rule, tried: Callable[[Option], int] = lambda option: 1) -> list[Option]:
-        """Return the options that may be selected and explain as much as the best of them.
-
-        Args:
-            rule: The conditions.
-            tried: Number of options among which the same data selected each: a factor on its
-                p-value.
-        """
+        """Return the options that may be selected and explain as much as the best of them."""
         shares = {
             option: share
             for option in self.left
@@ -109,13 +89,7 @@ class Round(Generic[Option]):
         cost: Callable[[Option], Any] = lambda option: 0,
         tried: Callable[[Option], int] = lambda option: 1,
     ) -> Option | None:
-        """Return the simplest of the options that explain as much as the best; None without one.
-
-        Args:
-            rule: The conditions.
-            cost: Complexity of each, compared first; of equal ones the one that explains more wins.
-            tried: As of ``alike``.
-        """
+        """Return the simplest of the options that explain as much as the best; None without one."""
         alike = self.alike(rule, tried)
         return min(alike, key=lambda option: (cost(option), -self.share(option)), default=None)
 
@@ -126,14 +100,7 @@ def select(
     cost: Callable[[Option], Any] = lambda option: 0,
     tried: Callable[[Option], int] = lambda option: 1,
 ) -> Iterator[tuple[Round[Option], Option | None]]:
-    """Yield each round with the option selected in it; None in a last round without one.
-
-    Args:
-        offered: Returns the round of the options together with those selected before.
-        rule: The conditions.
-        cost: As of ``Round.best``.
-        tried: As of ``Round.best``.
-    """
+    """Yield each round with the option selected in it; None in a last round without one."""
     for _ in range(rule.most):
         this = offered()
         best = this.best(rule, cost, tried)
@@ -148,10 +115,7 @@ def p_value(before: Array, after: Array, fitted: int) -> float:
     Student's test of the mean of their shares, each between -1 and 1, over the segments of fitted
     logs or over all, whichever p-value is smaller. Segments with the joint at rest do not count.
 
-    Args:
-        before: Squared residual of each segment, shape (K,).
-        after: Squared residuals with an option, shape (K,).
-        fitted: Number of segments of fitted logs, which come first.
+    before (K,), after (K,).
     """
     return min(_student(before[:k], after[:k]) for k in {fitted, len(before)})
 

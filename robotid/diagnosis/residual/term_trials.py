@@ -33,8 +33,6 @@ from robotid.estimation.fitting.fitted import Solution
 from robotid.estimation.fitting.joint_motion import JointMotion, joint_motions, travelled
 from robotid.robot.model import RobotModel
 
-__all__ = ["RIDGE", "Normal", "Sample", "Trial", "Trials", "along", "take_sample"]
-
 #: Smallest share of a column that the regressor must not explain.
 RIDGE = 1e-4
 _ROWS = 3000  # samples of all fitted logs together, and of all validation logs
@@ -67,14 +65,7 @@ class Normal:
 
     @classmethod
     def of(cls, W: Array, r: Array, segments: Sequence[slice], fitted: int) -> "Normal":
-        """Return the normal equations of samples.
-
-        Args:
-            W: Regressor, shape (N, n, b).
-            r: Residual, shape (N, n).
-            segments: Samples of each segment.
-            fitted: Number of segments of fitted logs.
-        """
+        """Return the normal equations of samples: W (N, n, b), r (N, n)."""
         rows = [(W[k].reshape(-1, W.shape[2]), r[k].ravel()) for k in segments]
         A, B = (np.array(x) for x in zip(*[(w.T @ w, w.T @ e) for w, e in rows], strict=True))
         return cls(A, B, fitted)
@@ -157,8 +148,7 @@ class Sample:
     def with_columns(self, Z: Array) -> "Sample":
         """Return the same samples with more columns that are refitted with the base parameters.
 
-        Args:
-            Z: Torques of parameters of 1, shape (N, n_rows, c) [N m or N].
+        Z (N, n_rows, c) [N m or N].
         """
         left = Z if self.basis is None else without_forces(self.basis, Z)
         columns = self.weight[:, :, None] * left
@@ -168,20 +158,12 @@ class Sample:
         return replace(self, W=W, normal=Normal.of(W, self.r, self.segments, self.fitted))
 
     def with_some_columns(self, which: Array) -> "Sample":
-        """Return the same samples with fewer columns.
-
-        Args:
-            which: The columns of W, shape (c,), int.
-        """
+        """Return the same samples with fewer columns: which (c,)."""
         A, B = self.normal.A[:, which[:, None], which], self.normal.B[:, which]
         return replace(self, W=self.W[..., which], normal=Normal(A, B, self.fitted))
 
     def of_joint(self, j: int) -> "Sample":
-        """Return the samples of one joint; other joints count only in the normal equations.
-
-        Args:
-            j: Index of the joint.
-        """
+        """Return the samples of one joint; other joints count only in the normal equations."""
         row = self.weight.shape[1] - len(self.joints) + j
         own, joint = slice(row, row + 1), slice(j, j + 1)
         alone = replace(
@@ -213,11 +195,7 @@ class Sample:
         return Normal.of(self.W, self.r, self.segments, self.fitted)
 
     def reweighted(self, factor: float) -> "Sample":
-        """Return the samples of one joint with other weights.
-
-        Args:
-            factor: Factor on the weights.
-        """
+        """Return the samples of one joint with other weights."""
         normal, more = self.normal, factor**2 - 1.0
         return replace(
             self,
@@ -243,15 +221,7 @@ class Sample:
 
 
 def take_sample(fit: Solution, *, for_drives: bool = False, is_free: bool = False) -> Sample | None:
-    """Return samples spread over the recordings; None if there are too few, or static ones.
-
-    Args:
-        fit: The fit.
-        for_drives: Whether drive terms are selected with them: only samples of fitted logs, also
-            those near reversals, where the filter smears stiction.
-        is_free: Whether the bodies are those of least squares if these predict held-out segments
-            better than bodies bound to the prior.
-    """
+    """Return samples spread over the recordings; None if there are too few, or static ones."""
     model, mapping = fit.model, fit.mapping
     if model.is_static:
         return None
@@ -312,9 +282,7 @@ def _free(sample: Sample, X: Array) -> Sample:
 
     A prior that is wrong binds the bodies, and its error looks like friction.
 
-    Args:
-        sample: The samples.
-        X: Regressor of the base parameters, shape (N, n_rows, b).
+    X (N, n_rows, b).
     """
     W = sample.weight[..., None] * X
     size = np.linalg.norm(W[: sample.rows], axis=(0, 1))
@@ -345,11 +313,7 @@ def _free(sample: Sample, X: Array) -> Sample:
 def along(sample: Sample, model: RobotModel, at: Sequence[Trajectory], tau: Array) -> Sample:
     """Return the same samples for another robot, or with changed positions.
 
-    Args:
-        sample: The samples.
-        model: The robot, with the same parameters.
-        at: The motions, as of ``Sample.at``.
-        tau: Torques of the estimate along them, shape (N, n) [N m or N].
+    tau (N, n) [N m or N].
     """
     Y = np.concatenate([_regressor(model, motion) for motion in at])
     W = sample.weight[:, :, None] * _in_units(Y, sample.independent, sample.U)
@@ -469,11 +433,7 @@ class Trial:
         return np.array([E.T @ E for E in left])
 
     def parameters(self, which: Sequence[int] | Array) -> Array:
-        """Return the parameters of some columns, shape (..., k).
-
-        Args:
-            which: The k columns; or m choices of k, shape (m, k), for parameters (..., m, k).
-        """
+        """Return the parameters of some columns, shape (..., k): which (m, k)."""
         S, k = self.S, np.asarray(which, dtype=int)
         theta: Array = np.linalg.solve(
             S[..., k[..., :, None], k[..., None, :]], S[..., k, -1][..., None]
@@ -485,10 +445,6 @@ class Trial:
 
         Of a fit to all samples. The covariance is that of clusters: from the scatter of the scores
         between segments, valid for noise of any colour.
-
-        Args:
-            which: The k columns.
-            fitted: Number of segments of fitted logs.
         """
         theta, S = self.parameters(which), self.S[which][:, which]
         H = self.H[:fitted, which]
@@ -500,8 +456,7 @@ class Trial:
     def left(self, which: Sequence[int] | Array) -> Array:
         """Return the squared residual of each segment with some columns fitted, shape (K,).
 
-        Args:
-            which: The k columns; or m choices of k, shape (m, k), for residuals (K, m).
+        which (m, k).
         """
         k = np.asarray(which, dtype=int)
         theta = self.parameters(k)
@@ -512,19 +467,11 @@ class Trial:
         return left
 
     def left_each(self, choices: Mapping[OptionT, Sequence[int]]) -> dict[OptionT, Array]:
-        """Return the squared residual of each segment with columns of each option, shapes (K,).
-
-        Args:
-            choices: Columns of each option.
-        """
+        """Return the squared residual of each segment with columns of each option, shapes (K,)."""
         return _each(choices, lambda which: self.left(which).T)
 
     def parameters_each(self, choices: Mapping[OptionT, Sequence[int]]) -> dict[OptionT, Array]:
-        """Return the parameters of columns of each option, shapes (k,), of a fit to all samples.
-
-        Args:
-            choices: Columns of each option.
-        """
+        """Return the parameters of columns of each option, shapes (k,), of a fit to all samples."""
         return _each(choices, self.parameters)
 
 
@@ -533,9 +480,7 @@ def _each(
 ) -> dict[OptionT, Array]:
     """Evaluate a function of the columns of each option, all options of one size together.
 
-    Args:
-        choices: Columns of each option.
-        of: Returns one entry for each of m choices of k columns, shape (m, k).
+    of (m, k).
     """
     found: dict[OptionT, Array] = {}
     for size in {len(which) for which in choices.values()}:

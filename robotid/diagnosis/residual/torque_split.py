@@ -23,8 +23,6 @@ from robotid.estimation.fitting.evaluation import Evaluation
 from robotid.estimation.fitting.fitted import Fit
 from robotid.robot.model import RobotModel
 
-__all__ = ["JointTorque", "Rows", "TorqueSplit", "joint_torques", "split_torque", "spread_rows"]
-
 _RIGID = ("gravity", "inertia", "Coriolis")
 _ROWS = 4000  # samples of all recordings together that are split
 _SEGMENTS = 16  # held out in turn
@@ -78,11 +76,7 @@ class TorqueSplit:
         return np.asarray(sum(self.parts[name] for name in _RIGID if name in self.parts))
 
     def terms_of(self, row: int) -> dict[str, dict[str, Array]]:
-        """Return the torque (N,) of each drive parameter in a row, by part and name.
-
-        Args:
-            row: Index of the row.
-        """
+        """Return the torque (N,) of each drive parameter in a row, by part and name."""
         terms: dict[str, dict[str, Array]] = {}
         for name, kind, ratio, torque in zip(
             self.names, self.kinds, self.loads[row], self.terms, strict=True
@@ -105,17 +99,7 @@ def split_torque(
 
     A static model has no torques of motion: gravity is the only part of the bodies.
 
-    Args:
-        model: The robot.
-        pi: Standard parameters, shape (p,).
-        q: Joint coordinates, shape (N, n) or (N, 7 + n) [rad, m].
-        v: Velocities, shape (N, n_rows) [rad/s, m/s].
-        a: Accelerations, shape (N, n_rows) [rad/s^2, m/s^2].
-        direction: As of ``joint_torque_regressor``.
-        memory: As of ``Trajectory.memory``; needed if drive terms have internal states.
-
-    Raises:
-        DataError: If a shape does not fit the model.
+    pi (p,), q (N, n) [rad, m], v (N, n_rows) [rad/s, m/s], a (N, n_rows) [rad/s^2, m/s^2].
     """
     layout, first = model.layout, model.n_rows - len(model.joints)
     wanted = (len(q), model.n_rows)
@@ -230,11 +214,7 @@ class JointTorque:
         return {name: self.size(x) for name, x in every.items()}
 
     def size(self, x: Array) -> float:
-        """Return the RMS value of a signal over the used samples; NaN without one.
-
-        Args:
-            x: The signal, shape (N,).
-        """
+        """Return the RMS value of a signal over the used samples; NaN without one: x (N,)."""
         return float(np.sqrt(np.mean(x[self.used] ** 2))) if self.used.any() else float("nan")
 
     @cached_property
@@ -326,9 +306,6 @@ def joint_torques(found: Fit) -> tuple[JointTorque, ...]:
 
     The samples, at most 4000, are spread over the validation recordings, or over the fitted ones if
     there are none.
-
-    Args:
-        found: The fit.
     """
     validation = [e for e in found.validation if not e.is_refitted]
     fitted = _torques_of(found, found.fitted)
@@ -385,12 +362,7 @@ def _torques_of(found: Fit, evaluations: Sequence[Evaluation]) -> tuple[JointTor
 
 
 def spread_rows(count: int, most: int) -> Array:
-    """Return the indices of selected samples, spread evenly over all.
-
-    Args:
-        count: Number of samples.
-        most: Largest number of selected samples.
-    """
+    """Return the indices of selected samples, spread evenly over all."""
     return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int))
 
 

@@ -1,3 +1,1 @@
 """Audit of a URDF: what is missing, impossible or implausible in it."""
-
-__all__: list[str] = []

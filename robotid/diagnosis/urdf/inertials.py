@@ -13,14 +13,6 @@ from robotid.robot.model import RobotModel
 from robotid.robot.tree import Inertial
 from robotid.robot.urdf_text import numbers
 
-__all__ = [
-    "assumed_inertials",
-    "explained_by_assumed",
-    "impossible_inertial",
-    "impossible_inertials",
-    "negative_masses",
-]
-
 #: Findings that take the URDF's masses as evidence.
 _OF_MASSES = (
     "current_for_torque", "joint_origin", "link_mass", "payload", "torque_scale", "total_mass",
@@ -30,11 +22,7 @@ _SLACK = 1e-9  # relative violation of the triangle inequality that is rounding
 
 
 def negative_masses(robot: ET.Element) -> Iterator[Finding]:
-    """Yield the negative masses of a file, from which no model can be built.
-
-    Args:
-        robot: Root element of a URDF.
-    """
+    """Yield the negative masses of a file, from which no model can be built."""
     for link in robot.findall("link"):
         mass = link.find("inertial/mass")
         text = "" if mass is None else mass.get("value", "")
@@ -48,11 +36,7 @@ def negative_masses(robot: ET.Element) -> Iterator[Finding]:
 
 
 def assumed_inertials(model: RobotModel) -> list[Finding]:
-    """Return a finding for each reason of the inertials that are assumed.
-
-    Args:
-        model: The robot; see ``with_assumed_inertials``.
-    """
+    """Return a finding for each reason of the inertials that are assumed."""
     pi = model.standard_parameters()
     findings = []
     for code, reason in REASONS.items():
@@ -72,12 +56,7 @@ def assumed_inertials(model: RobotModel) -> list[Finding]:
 
 
 def explained_by_assumed(model: RobotModel, finding: Finding) -> bool:
-    """Return whether a finding compares the torque of a joint with inertials that are assumed.
-
-    Args:
-        model: The robot.
-        finding: The finding.
-    """
+    """Return whether a finding compares the torque of a joint with inertials that are assumed."""
     if finding.code not in _OF_MASSES:
         return False
     named = finding.where.rpartition(": ")[2].split(", ")
@@ -87,11 +66,7 @@ def explained_by_assumed(model: RobotModel, finding: Finding) -> bool:
 
 
 def impossible_inertials(model: RobotModel) -> list[Finding]:
-    """Return the impossible inertials of links that are not assumed, as warnings on a fit.
-
-    Args:
-        model: The robot.
-    """
+    """Return the impossible inertials of links that are not assumed, as warnings on a fit."""
     inertials = model.tree.inertials
     effect = "; a consistent fit uses the nearest possible body instead"
     return [
@@ -105,13 +80,7 @@ def impossible_inertials(model: RobotModel) -> list[Finding]:
 
 
 def impossible_inertial(link: str, inertial: Inertial, matters: bool) -> Iterator[Finding]:
-    """Yield the findings on an inertial that is impossible for any body.
-
-    Args:
-        link: Name of the link.
-        inertial: Its inertial in the URDF.
-        matters: Whether a mass of 0 is a warning, because its body has no other mass.
-    """
+    """Yield the findings on an inertial that is impossible for any body."""
     at, mass = f"link {link}", inertial.mass
     if mass == 0:
         message = (

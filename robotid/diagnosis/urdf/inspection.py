@@ -27,8 +27,6 @@ from robotid.robot.model import RobotModel
 from robotid.robot.tree import MOVABLE
 from robotid.robot.urdf_text import number_fault, numbers, parse_urdf, read_with_yourdfpy
 
-__all__ = ["Inspection", "Structure", "inspect_urdf"]
-
 # the attributes that hold numbers, by the element they are in
 _NUMBERS = {
     ("link", "inertial/mass"): ("value",),
@@ -82,11 +80,7 @@ class Inspection:
     findings: tuple[Finding, ...]
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the inspection as plain values, as ``robotid inspect --json`` prints it.
-
-        Returns:
-            {"robot", "joints", "structure", "base_groups", "findings"}; finite numbers only.
-        """
+        """Return the inspection as plain values, as ``robotid inspect --json`` prints it."""
         found = self.structure
         return {
             "robot": self.robot,

@@ -12,8 +12,6 @@ from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
 from robotid.robot.tree import Inertial
 
-__all__ = ["audit_bodies", "audit_links"]
-
 _DENSEST, _LIGHTEST = 20_000.0, 10.0  # [kg/m^3] over the box: about solid tungsten, and foam
 _MARGIN = 0.1  # of the box's diagonal, by which a centre of mass may lie outside
 _LONGEST = 5.0**0.5  # ellipsoid of a body with half of its mass on each of two sides, over the box
@@ -30,16 +28,6 @@ def audit_links(model: RobotModel) -> Iterator[Finding]:
 
     A body is a moving link with all links that are fixed to it. The collision geometry is used,
     or the visual one; a body whose geometry cannot be read is not checked.
-
-    Args:
-        model: The robot.
-
-    Yields:
-        "com_outside", "density", "gyration", "ellipsoid": a body that does not fit the box around
-        its geometry;
-        "copied_inertial": links of different size with the same inertial; "default_inertial":
-        numbers of a template; "geometry_unread": one note if bodies of a file with meshes were not
-        checked.
     """
     yield from _templates(model)
     points = body_points(model)
@@ -60,15 +48,7 @@ def audit_bodies(model: RobotModel, pi: Array, points: Mapping[str, Array]) -> I
 
     A body without geometry is compared with the length that the kinematics give it.
 
-    Args:
-        model: The robot.
-        pi: Standard parameters, shape (p,), of the URDF or identified.
-        points: Points of the geometry of each body that has one, shape (k, 3) [m].
-
-    Yields:
-        "com_outside", "density", "gyration"; notes for a body of negligible mass. "ellipsoid", a
-        note, without "gyration"; a warning for a body without geometry that carries a joint, if it
-        would be too long even with all mass at its ends.
+    pi (p,), points (k, 3) [m].
     """
     J = pseudo_inertia(pi[: model.layout.n_inertial])
     lengths = kinematic_lengths(model) if set(model.layout.bodies) - points.keys() else {}

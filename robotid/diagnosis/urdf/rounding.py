@@ -11,25 +11,13 @@ from robotid.robot.model import RobotModel
 from robotid.robot.tree import Joint, Tree
 from robotid.robot.urdf_text import exact_angle
 
-__all__ = ["rounded_angles", "rounded_robot", "weak_parameters"]
-
 _NOISE = 1e-10  # smaller pivots, over the largest, are rounding errors
 _HARMLESS = "The identifiable parameters do not change"
 _ADVICE = "snap_angles = true (--snap-angles) takes the exact angles"
 
 
 def rounded_angles(model: RobotModel, mapping: BaseMapping) -> Iterator[Finding]:
-    """Yield the angles of joints that a URDF rounds.
-
-    Args:
-        model: The robot as its file has it.
-        mapping: Its base parameters.
-
-    Yields:
-        "rounded_rpy" for the joints whose angles change the number of parameters that are, or
-        seem, identifiable, and for the others, with the exact angles: a warning if the number
-        increases, which the user can undo, else a note.
-    """
+    """Yield the angles of joints that a URDF rounds."""
     rounded = _rounded(model.tree)
     more, effect = _effect(model, mapping) if rounded else (0, "")
     felt = _carrying(model.tree) if effect else set()
@@ -52,15 +40,7 @@ def rounded_angles(model: RobotModel, mapping: BaseMapping) -> Iterator[Finding]
 
 
 def rounded_robot(model: RobotModel, mapping: BaseMapping) -> Iterator[Finding]:
-    """Yield one finding if the angles that a URDF rounds change the identifiable parameters.
-
-    Args:
-        model: The robot as its file has it.
-        mapping: Its base parameters.
-
-    Yields:
-        "rounded_rpy" of the file, with the joints; a note if robotid leaves these parameters out.
-    """
+    """Yield one finding if the angles that a URDF rounds change the identifiable parameters."""
     joints = [name for name in _rounded(model.tree) if name in _carrying(model.tree)]
     more, effect = _effect(model, mapping) if joints else (0, "")
     if effect:
@@ -70,15 +50,7 @@ def rounded_robot(model: RobotModel, mapping: BaseMapping) -> Iterator[Finding]:
 
 
 def weak_parameters(model: RobotModel, mapping: BaseMapping) -> Iterator[Finding]:
-    """Yield a warning if parameters are at the limit between identifiable and unidentifiable.
-
-    Args:
-        model: The robot.
-        mapping: Its base parameters.
-
-    Yields:
-        "weak_parameters" of the file.
-    """
+    """Yield a warning if parameters are at the limit between identifiable and unidentifiable."""
     if weak := _between(mapping):
         where = Path(model.tree.path).name
         message = (

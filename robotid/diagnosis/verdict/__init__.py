@@ -1,3 +1,1 @@
 """Conclusions from a fit: findings, the scale check and the verdict."""
-
-__all__: list[str] = []

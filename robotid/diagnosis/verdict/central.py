@@ -8,8 +8,6 @@ from robotid.base.typing import Array
 from robotid.estimation.fitting.fitted import Fit
 from robotid.estimation.fitting.identified import FROM_DATA, FROM_PRIOR, sources_of
 
-__all__ = ["CENTRAL_TERMS", "CentralParameters", "central_parameters"]
-
 #: Mass [kg], centre of mass [m], inertia about it [kg m^2], in the axes of the joint frame.
 CENTRAL_TERMS = ("m", "cx", "cy", "cz", "Ixx", "Iyy", "Izz", "Ixy", "Ixz", "Iyz")
 _PAIRS = ((0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 2))  # axes of Pinocchio's six inertias
@@ -38,9 +36,6 @@ def central_parameters(found: Fit) -> CentralParameters:
     """Return the parameters of each body about its centre of mass.
 
     Standard errors are those of the standard parameters, propagated to first order.
-
-    Args:
-        found: The fit.
     """
     n, size = len(found.model.layout.bodies), found.model.layout.n_inertial
     pi, before = (x[:size].reshape(n, 10) for x in (found.standard, found.prior))

@@ -7,8 +7,6 @@ import numpy as np
 from robotid.base.typing import Array
 from robotid.estimation.fitting.identified import Identified
 
-__all__ = ["CORRELATED", "correlated_parameters", "correlated_sets"]
-
 #: Size of the correlation from which two parameters are strongly correlated: if one were known,
 #: the error of the other would be less than a third of what it is, sqrt(1 - r^2) = 0.31.
 CORRELATED = 0.95
@@ -22,12 +20,7 @@ def _correlations(C: Array, own: Sequence[int]) -> Array:
 
 
 def correlated_sets(C: Array, own: Sequence[int]) -> list[list[int]]:
-    """Return the sets of parameters that strong correlations connect.
-
-    Args:
-        C: Covariance, shape (p, p).
-        own: Indices of the parameters to compare, each with a variance above 0.
-    """
+    """Return the sets of parameters that strong correlations connect: C (p, p)."""
     sets: list[set[int]] = []
     for pair in np.argwhere(np.triu(np.abs(_correlations(C, own)) > CORRELATED, 1)).tolist():
         joined = [s for s in sets if s.intersection(pair)]
@@ -36,15 +29,7 @@ def correlated_sets(C: Array, own: Sequence[int]) -> list[list[int]]:
 
 
 def correlated_parameters(found: Identified) -> dict[int, tuple[int, float]]:
-    """Return drive parameters strongly correlated with another parameter of the same drive.
-
-    Args:
-        found: The identification.
-
-    Returns:
-        By index of the standard parameter: the index of the parameter with the largest correlation
-        with it, and that correlation.
-    """
+    """Return drive parameters strongly correlated with another parameter of the same drive."""
     layout, C, at_bound = found.model.layout, found.standard_covariance, found.at_bound
     pairs = {}
     for drive in range(len(layout.drives)):

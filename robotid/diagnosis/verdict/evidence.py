@@ -9,18 +9,6 @@ import numpy as np
 from robotid.base.findings import listed, quoted
 from robotid.estimation.fitting.metrics import JointMetrics, Metrics
 
-__all__ = [
-    "BEATEN",
-    "COSTLY",
-    "GOOD",
-    "POOR",
-    "Determined",
-    "Predictions",
-    "error_of",
-    "is_beaten",
-    "is_harmless_cost",
-]
-
 #: [%] largest torque prediction error on validation logs of a joint that is "good".
 GOOD = 15.0
 #: [%] a joint with a larger torque prediction error is not usable.
@@ -113,11 +101,7 @@ class Predictions:
         return [f"prediction of unseen motion not evaluated: {why}"]
 
     def better_by_urdf(self, rescaled: Collection[str] = ()) -> list[str]:
-        """Return the joints that the URDF with fitted drives predicts better, and the remedy.
-
-        Args:
-            rescaled: Joints whose gain differs between the logs: that is the cause.
-        """
+        """Return the joints that the URDF with fitted drives predicts better, and the remedy."""
         worse = [j for own in self.tested.values() for j, m in own.items() if is_beaten(m)]
         worse = [joint for joint in worse if joint not in rescaled]
         if not worse:
@@ -148,11 +132,7 @@ class Predictions:
         return reasons
 
     def why_untested(self, joint: str) -> str:
-        """Return why a joint was evaluated on no validation log.
-
-        Args:
-            joint: The joint.
-        """
+        """Return why a joint was evaluated on no validation log."""
         if joint not in self.fitted:
             return "it does not move in any recording"
         if self.validation:
@@ -213,31 +193,18 @@ class Determined:
 
 
 def is_beaten(measured: JointMetrics) -> bool:
-    """Return whether the URDF with fitted drives predicts a joint clearly better.
-
-    Args:
-        measured: Prediction errors of the joint.
-    """
+    """Return whether the URDF with fitted drives predicts a joint clearly better."""
     driven = measured.baselines.get("urdf_with_drives")
     return driven is not None and error_of(measured) > max(BEATEN * driven, driven + _TIE)
 
 
 def is_harmless_cost(error: float, wls_error: float) -> bool:
-    """Return whether constraints cost so little torque error that the verdict does not count it.
-
-    Args:
-        error: Torque error with them [%].
-        wls_error: Torque error of unconstrained WLS [%].
-    """
+    """Return whether constraints cost so little torque error that the verdict does not count it."""
     return error < max(_WRONG * wls_error, _HARMLESS)
 
 
 def error_of(measured: JointMetrics) -> float:
-    """Return the relative error of a joint [%], inf where nothing was measured.
-
-    Args:
-        measured: Prediction errors of the joint.
-    """
+    """Return the relative error of a joint [%], inf where nothing was measured."""
     value = measured.relative_error_pct
     return float("inf") if value is None else value
 

@@ -26,14 +26,6 @@ from robotid.robot.geometry import body_boxes, body_points
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
 
-__all__ = [
-    "consistency_findings",
-    "fit_findings",
-    "locked_findings",
-    "log_findings",
-    "not_written",
-]
-
 _SAME = 1e-3  # relative gap of the objective above which it is not the optimum
 _COSTS = 1.05  # residual over that of WLS above which bounds increase the torque error
 _FAR = 3.0  # a total mass differs from the URDF's at most by this factor
@@ -58,14 +50,7 @@ def fit_findings(
     on_misfit: Sequence[str] = (),
     discrepancies: Sequence[Finding] = (),
 ) -> list[Finding]:
-    """Return the findings about a fit: undetermined parameters, outliers, costs of constraints.
-
-    Args:
-        fit: The fit.
-        misfits: Terms that its drive models lack.
-        on_misfit: Names of the drive parameters whose errors increased for these.
-        discrepancies: Findings of recordings or a URDF that differ from what was stated.
-    """
+    """Return the findings about a fit: undetermined parameters, outliers, costs of constraints."""
     findings = _static_findings(fit)
     determined = fit.determination
     if determined.groups:
@@ -241,12 +226,7 @@ def _grown(found: Fit, reported: Collection[str]) -> list[Finding]:
 
 
 def not_written(log_errors: Sequence[Finding], inconsistent: str = "") -> list[Finding]:
-    """Return a warning that the URDF is not written, with the reason; nothing if it is written.
-
-    Args:
-        log_errors: Faults of the logs that make the result wrong.
-        inconsistent: The estimator of a result that is not physically consistent.
-    """
+    """Return a warning that the URDF is not written, with the reason; nothing if it is written."""
     if log_errors:
         codes = listed(dict.fromkeys(finding.code for finding in log_errors))
         message = (
@@ -268,10 +248,6 @@ def locked_findings(model: RobotModel, stated: Collection[str]) -> list[Finding]
 
     A position matters if the locked joint is on a chain with an identified joint: the pose of the
     legs does not change the torques of an arm. On a floating base all positions matter.
-
-    Args:
-        model: The robot.
-        stated: Names of the locked joints with a stated position, or that follow others.
     """
     relevant = set(model.locked) if model.free_flyer else _in_line(model)
     assumed = [name for name in model.locked if name not in stated and name in relevant]
@@ -302,11 +278,7 @@ def _in_line(model: RobotModel) -> set[str]:
 
 
 def log_findings(logs: Sequence[Log]) -> list[Finding]:
-    """Return what was noted and assumed of logs, each once, with the names of its logs.
-
-    Args:
-        logs: The logs.
-    """
+    """Return what was noted and assumed of logs, each once, with the names of its logs."""
     logs_of: dict[tuple[str, str, str], list[str]] = {}
     for log in logs:
         for note in log.notes:
@@ -320,11 +292,7 @@ def log_findings(logs: Sequence[Log]) -> list[Finding]:
 
 
 def consistency_findings(fit: Fit) -> list[Finding]:
-    """Return findings about the consistency of a fit.
-
-    Args:
-        fit: The fit.
-    """
+    """Return findings about the consistency of a fit."""
     findings = []
     check, details = fit.mass_matrix, fit.estimate.details
     if not check.is_positive:
@@ -460,13 +428,7 @@ def _dense_bodies(fit: Fit) -> list[Finding]:
 
 
 def _remedy(fit: Fit, body: str, excess: float = 0.0) -> str:
-    """Return what to correct for an impossible body, and what remains valid.
-
-    Args:
-        fit: The fit.
-        body: The body.
-        excess: Mass that it has beyond the largest possible one [kg]; 0 if that is unknown.
-    """
+    """Return what to correct for an impossible body, and what remains valid."""
     cure = "Record motion about more axes, or pin it to the URDF"
     for stated, mass in _stated_of(fit, body).items():
         limit = f" (possible: up to about {mass - excess:.3g} kg)" if excess > 0 else ""

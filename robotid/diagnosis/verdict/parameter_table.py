@@ -10,13 +10,6 @@ from robotid.diagnosis.verdict.correlation import correlated_parameters
 from robotid.estimation.fitting.identified import Identified
 from robotid.output.pages.html import code, number, table, text
 
-__all__ = [
-    "HEADERS",
-    "ParameterRows",
-    "parameter_entries",
-    "parameter_table",
-]
-
 #: Columns of a row: link or drive, parameter, the URDF's value, the identified one, its standard
 #: error, its 95 % interval, what determined it, unit.
 HEADERS = ("part", "parameter", "urdf", "value", "std_error", "low", "high", "source", "unit")
@@ -41,11 +34,7 @@ class ParameterRows(list[dict[str, Any]]):
 
 
 def parameter_entries(found: Identified) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-    """Return the parameters of the bodies and of the drives, as in result.json.
-
-    Args:
-        found: The identification.
-    """
+    """Return the parameters of the bodies and of the drives, as in result.json."""
     layout, sources, at_bound = found.model.layout, found.sources, found.at_bound
     errors, ends, quantile = found.standard_error, found.standard_interval, found.standard_quantile
     pairs = correlated_parameters(found)
@@ -74,17 +63,7 @@ def _partner(name: str, correlation: float) -> dict[str, Any]:
 def parameter_table(
     bodies: Iterable[Mapping[str, Any]], drives: Iterable[Mapping[str, Any]]
 ) -> Any:  # noqa: ANN401
-    """Return the parameters of a result as a table, links first, then drives.
-
-    Args:
-        bodies: Parameters of the bodies, as of ``parameter_entries``.
-        drives: Parameters of the drives. Their ``urdf`` column is empty.
-
-    Returns:
-        A pandas DataFrame if pandas is installed, else a list of dictionaries; of ``HEADERS``.
-        A missing value, such as the standard error of a parameter at its bound, is None; NaN in a
-        DataFrame.
-    """
+    """Return the parameters of a result as a table, links first, then drives."""
     entries = [*bodies, *({**entry, "prior": None} for entry in drives)]
     rows = ParameterRows()
     for entry in entries:

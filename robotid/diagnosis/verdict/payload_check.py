@@ -8,8 +8,6 @@ from typing import Any
 
 from robotid.diagnosis.verdict.stated_mass import AGREES
 
-__all__ = ["PayloadCheck"]
-
 
 @dataclass(frozen=True)
 class PayloadCheck:
@@ -97,11 +95,7 @@ class PayloadCheck:
 
     @classmethod
     def from_dict(cls, stated: Mapping[str, Any]) -> PayloadCheck:
-        """Return the check that a result.json has.
-
-        Args:
-            stated: Its figures, by attribute.
-        """
+        """Return the check that a result.json has."""
         own = {key: value for key, value in stated.items() if key != "message"}
         low, high = stated["interval"]
         return cls(**own | {"interval": (low, high)})

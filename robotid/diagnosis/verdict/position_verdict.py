@@ -9,8 +9,6 @@ from robotid.diagnosis.verdict.uses import uses_of_motion
 from robotid.diagnosis.verdict.verdict import JointVerdict, Verdict, concluded, on_joint
 from robotid.estimation.fitting.metrics import JointMetrics, Metrics
 
-__all__ = ["GOOD", "HARDLY", "POOR", "judge_positions"]
-
 #: [%] simulated position error of a joint on validation logs: limits of "good" and "usable".
 GOOD, POOR = 5.0, 30.0
 #: Error over that of the second-order model from which it is hardly smaller: half the squares.
@@ -39,19 +37,7 @@ def judge_positions(
     scale: str = "",
     knows_torques: bool = False,
 ) -> Verdict:
-    """Return the verdict on simulated positions.
-
-    Args:
-        metrics: Position errors over all logs together, of the joints commanded to move.
-        joints: Names of the model's joints; one without metrics is not evaluated.
-        fitted: Position errors over the fitted logs; None if not compared.
-        is_validation: Whether the logs are validation logs: not fitted.
-        is_settled: Whether the fit has converged.
-        log_errors: Faults of the logs that make the result wrong.
-        cautions: Why the result is at best usable, whatever its errors are.
-        scale: What the scale of all parameters depends on, if no measurement verifies it.
-        knows_torques: Whether measured torques were fitted: they determine the scale.
-    """
+    """Return the verdict on simulated positions."""
     own = {} if fitted is None else fitted.per_joint
     found = {
         joint: _judge_joint(joint, metrics.per_joint.get(joint), own.get(joint), is_validation)

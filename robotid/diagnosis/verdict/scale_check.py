@@ -25,8 +25,6 @@ from robotid.estimation.fitting.fitted import Fit
 from robotid.robot.assumed import assumed_masses
 from robotid.robot.parameters import pseudo_inertia
 
-__all__ = ["ScaleCheck", "check_scale", "common_factor", "friction_shares"]
-
 _POSES = 300  # at which gravity is compared
 _LOADED = 0.02  # share of the largest gravity torque above which a joint is compared
 _KNOWN = 0.1  # standard error of a ratio below which it is used
@@ -252,9 +250,6 @@ class ScaleCheck:
         """Return the relative difference, less a payload if it explains it [-].
 
         A payload without mass is ignored: it does not determine the scale.
-
-        Args:
-            has_mass: Whether the total mass counts, not gravity alone.
         """
         before, after, payload = self.masses
         ratios = {k: x for k, x in self._ratios_whole.items() if has_mass or k != _TOTAL}
@@ -290,9 +285,6 @@ def check_scale(found: Fit) -> ScaleCheck:
     With g_u and g the gravity torques of the URDF and of the result over the fitted poses, a
     joint's ratio is g_u . g / g_u . g_u. It is linear in the base parameters: the covariance of the
     result gives its standard error.
-
-    Args:
-        found: The identification.
     """
     model, size = found.model, found.model.layout.n_inertial
     before, after = (float(pi[:size:10].sum()) for pi in (found.prior, found.standard))
@@ -363,10 +355,7 @@ def common_factor(ratios: Array, sensitivity: Array, inertial: Array) -> tuple[f
     the residual gives the deviation, Student's t with one degree of freedom less than joints the
     interval. Errors of the data spread the ratios, too, and are included so.
 
-    Args:
-        ratios: Identified over URDF's gravity torque of at least two joints, shape (k,).
-        sensitivity: Derivatives of the URDF's ratios by its parameters, shape (k, 10 b).
-        inertial: The URDF's inertial parameters, shape (10 b,).
+    ratios (k,), sensitivity (k, 10 b), inertial (10 b,).
     """
     A, pi = sensitivity.reshape(len(ratios), -1, 10), inertial.reshape(-1, 10)
     J = pseudo_inertia(inertial)
@@ -386,11 +375,7 @@ def common_factor(ratios: Array, sensitivity: Array, inertial: Array) -> tuple[f
 
 
 def friction_shares(found: Fit) -> dict[str, float]:
-    """Return the share of friction in the RMS torque of each joint [-]; 0 of a torque that is 0.
-
-    Args:
-        found: The fit.
-    """
+    """Return the share of friction in the RMS torque of each joint [-]; 0 of a torque that is 0."""
     layout = found.model.layout
     is_friction = [name.endswith((".viscous", ".coulomb")) for name in layout.names]
     pi = np.where(is_friction, found.standard, 0.0)
@@ -405,10 +390,7 @@ def friction_shares(found: Fit) -> dict[str, float]:
 def _with_payload(of_urdf: Array, of_result: Array, last: Array) -> tuple[float, float, float]:
     """Return scale and mass of a payload, and the share that a payload alone leaves unexplained.
 
-    Args:
-        of_urdf: Gravity torque of the URDF, shape (N, n).
-        of_result: The same as identified.
-        last: Gravity torque of m, mcx, mcy and mcz of the last body, shape (N, n, 4).
+    of_urdf (N, n), last (N, n, 4).
     """
     P, u, g = last.reshape(-1, 4), of_urdf.reshape(-1), of_result.reshape(-1)
     alone = np.linalg.lstsq(P, g - u)[0]

@@ -13,8 +13,6 @@ from robotid.base.typing import Array
 from robotid.estimation.fitting.bands import QUANTILE
 from robotid.estimation.fitting.fitted import Fit
 
-__all__ = ["AGREES", "StatedMass", "determines_total_mass", "stated_mass"]
-
 #: Relative difference up to which a mass or a gravity torque confirms the torque scale [-].
 AGREES = 0.05
 _SAME = 1e-6  # share of a claim that changes no torque, below which it is rounding
@@ -78,11 +76,7 @@ class StatedMass:
 
     @classmethod
     def from_dict(cls, stated: Mapping[str, Any]) -> StatedMass:
-        """Return the figures that a result.json has.
-
-        Args:
-            stated: They, by attribute.
-        """
+        """Return the figures that a result.json has."""
         return cls(**(dict(stated) | {key: tuple(stated[key]) for key in _LISTS}))
 
 
@@ -90,9 +84,6 @@ def stated_mass(found: Fit) -> StatedMass | None:
     """Return the check of the masses that the user states; None without one.
 
     A range wider than +- 5 % is a bound, not a statement. So is the mass of a pinned link.
-
-    Args:
-        found: The fit.
     """
     layout, bounds = found.model.layout, found.estimator.bounds
     stated = {f"mass of {link}": (link, pair) for link, pair in bounds.masses.items()}
@@ -110,11 +101,7 @@ def stated_mass(found: Fit) -> StatedMass | None:
 
 
 def determines_total_mass(found: Fit) -> bool:
-    """Return whether torque alone determines the total mass within 5 %.
-
-    Args:
-        found: The fit.
-    """
+    """Return whether torque alone determines the total mass within 5 %."""
     masses = _are_masses(found).astype(float)
     if not masses @ found.standard > 0:
         return False
@@ -133,11 +120,7 @@ def _checked(found: Fit, names: Sequence[str], C: Array, widths: Array) -> State
     Torque alone determines K pi = beta. Sums Z^T C of the claims that are sums M K of base
     parameters have no free part; with o = Z^T 1, r = o . M beta / o . o. In units of the spread.
 
-    Args:
-        found: The fit.
-        names: Names of the k claims.
-        C: Masses over the stated ones, shape (k, p) [1/kg].
-        widths: Half-widths of the stated ranges [-], shape (k,).
+    C (k, p) [1/kg], widths (k,).
     """
     model, wls = found.model, found.wls
     is_pinned = model.layout.owned_by(found.estimator.bounds.pinned)

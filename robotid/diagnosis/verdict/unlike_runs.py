@@ -11,19 +11,13 @@ from robotid.diagnosis.verdict.scale_check import friction_shares
 from robotid.estimation.fitting.fitted import Fit
 from robotid.estimation.variation.variation import UnlikeRun, Variation
 
-__all__ = ["rescaled_findings", "unlike_findings"]
-
 _RESCALED = 0.1  # least difference from 1 of a factor between measured and predicted torque
 _LEFT = 1 / 3  # ... and the largest share of the squared error that it leaves
 _MOSTLY = 0.6  # share of friction in a torque from which friction may have changed, too
 
 
 def unlike_findings(variation: Variation | None) -> Iterator[Finding]:
-    """Yield a finding for each unit and log that differs from what the others predict.
-
-    Args:
-        variation: The variation between the fitted logs; None if there are too few.
-    """
+    """Yield a finding for each unit and log that differs from what the others predict."""
     if variation is None:
         return
     for found in variation.unlike_units:
@@ -57,10 +51,6 @@ def rescaled_findings(fit: Fit, loaded: Collection[str] = ()) -> Iterator[Findin
 
     The factor c minimises |tau - c tau_predicted| over the rows used. It is reported if the torque
     error is above the limit of a good prediction, and the factor removes most of its square.
-
-    Args:
-        fit: The fit.
-        loaded: Names of logs with another payload, which changes the torques, too.
     """
     if fit.model.constraints:  # the rows are projected, and mix the joints
         return

@@ -10,8 +10,6 @@ from robotid.base.findings import listed
 if TYPE_CHECKING:
     from robotid.diagnosis.verdict.scale_check import ScaleCheck
 
-__all__ = ["uses_line", "uses_of_motion", "uses_of_torques"]
-
 _NAMED = 3  # joints that the line names
 _NOT_VERIFIED = "not verified, no validation log"
 _UNSCALED = "torque scale not verified"
@@ -30,13 +28,6 @@ def uses_of_torques(
     Torque feed-forward needs the predicted torque of its joints. Inertials in a simulation need
     physical consistency and the torque scale, too. The mass of a payload is that of the gravity
     torque: it needs the joints that gravity loads, and the torque scale.
-
-    Args:
-        joints: Status of the verdict on each joint, "not evaluated" without a validation log.
-        is_consistent: Whether all bodies are physically consistent.
-        is_static: Whether only gravity, offsets and Coulomb friction were identified.
-        log_errors: Faults of the recordings.
-        scale_check: The scale check; None if there is none, which verifies nothing.
     """
     predicted = _predicted(joints)
     loaded = (
@@ -68,13 +59,7 @@ def uses_of_torques(
 def uses_of_motion(
     joints: Mapping[str, str], *, log_errors: Sequence[str], is_scaled: bool
 ) -> dict[str, str]:
-    """Return what a result with simulated positions can be used for: "yes" or "no", and why.
-
-    Args:
-        joints: Status of the verdict on each joint.
-        log_errors: Faults of the recordings.
-        is_scaled: Whether a measured torque determines the scale of all parameters.
-    """
+    """Return what a result with simulated positions can be used for: "yes" or "no", and why."""
     simulated = "no, errors of the recordings" if log_errors else _predicted(joints)
     torque = simulated if is_scaled else _with(simulated, "scale not verified by a torque")
     return {
@@ -85,11 +70,7 @@ def uses_of_motion(
 
 
 def uses_line(uses: Mapping[str, str]) -> str:
-    """Return the uses as one line of text; "" if there are none.
-
-    Args:
-        uses: "yes" or "no", and why, by use.
-    """
+    """Return the uses as one line of text; "" if there are none."""
     return f"use for: {'; '.join(f'{what}: {is_so}' for what, is_so in uses.items())}" * bool(uses)
 
 

@@ -23,22 +23,6 @@ from robotid.diagnosis.verdict.uses import uses_of_torques
 from robotid.estimation.fitting.left_out import logs_that_test
 from robotid.estimation.fitting.metrics import Metrics
 
-__all__ = [
-    "WARNING_CODES",
-    "JointVerdict",
-    "Verdict",
-    "VerdictWarning",
-    "blocking",
-    "check_ignored",
-    "concluded",
-    "is_downweighted",
-    "judge",
-    "on_joint",
-    "rejected",
-    "warnings_of",
-]
-
-
 _REJECTED = 5.0  # [%] a smaller prediction error rejects a hypothesis on columns or masses
 _SCALED = 2.0  # a gravity torque within this factor of the URDF's contradicts a wrong unit
 _SMALL = 5.0  # [%] of the torque: a missing drive term below this gives no warning
@@ -206,22 +190,7 @@ def judge(
     scale_check: ScaleCheck | None = None,
     cause_of: Callable[[str], str] | None = None,
 ) -> Verdict:
-    """Return the verdict on a result.
-
-    Args:
-        predictions: Its torque prediction errors.
-        determined: Which of its parameters the data determine.
-        log_errors: Faults of the recordings that make every result of them wrong.
-        warnings: Why the result may be wrong although it predicts well.
-        scale_check: The scale check against the URDF's gravity and masses.
-        cause_of: Returns the cause of the residual of a joint. The good joint with the largest
-            error gets this reason, too.
-
-    Returns:
-        The verdict. Without a log that tests it, or with a warning, it is at most "usable". So is
-        the verdict on a joint with a warning, and on all joints if a warning concerns the result.
-        An impossible body concerns the result, but not the torque of its joint.
-    """
+    """Return the verdict on a result."""
     found, hidden = predictions.on_each(), predictions.hidden
     costly = [w for w in warnings if w.effect == "poor" and w.joint in found]
     for warning in costly:
@@ -308,18 +277,7 @@ def concluded(
     log_errors: Sequence[str] = (),
     is_tested: bool = True,
 ) -> Verdict:
-    """Return the verdict that follows from reasons.
-
-    Args:
-        joints: The verdict on each joint.
-        poor: What makes the result poor.
-        warnings: What makes it at most usable.
-        good: What was checked, if it is good.
-        notes: Sentences after the reasons that do not change the verdict.
-        log_errors: Faults of the recordings, which make it poor.
-        is_tested: Whether anything was evaluated; if not, a result that is not poor is "not
-            evaluated".
-    """
+    """Return the verdict that follows from reasons."""
     status = "usable" if warnings else "good"
     status = "poor" if poor or log_errors else status if is_tested else "not evaluated"
     reasons = (*log_errors, *poor, *warnings) or (good,)
@@ -329,14 +287,7 @@ def concluded(
 def on_joint(
     poor: Sequence[str], warnings: Sequence[str], *, is_tested: bool, checked: str
 ) -> JointVerdict:
-    """Return the verdict on a joint.
-
-    Args:
-        poor: What makes it poor.
-        warnings: What makes it at most usable.
-        is_tested: Whether a validation log tests it.
-        checked: What was checked if it is good; why nothing was checked if it is not tested.
-    """
+    """Return the verdict on a joint."""
     if not is_tested:  # never a pass
         return JointVerdict("not evaluated", (checked, *warnings))
     if poor or warnings:
@@ -345,14 +296,7 @@ def on_joint(
 
 
 def check_ignored(ignore: Sequence[str]) -> None:
-    """Check that every code to ignore is the code of an error or a warning.
-
-    Args:
-        ignore: The codes.
-
-    Raises:
-        SettingsError: If a code is unknown.
-    """
+    """Check that every code to ignore is the code of an error or a warning."""
     known = sorted({*CODES, *WARNING_CODES, *_OF_RESULTS})
     require_kind(ignore, (list, tuple, set, frozenset), "ignore", "a list of codes")
     for code in ignore:
@@ -369,13 +313,7 @@ def check_ignored(ignore: Sequence[str]) -> None:
 def blocking(
     findings: Sequence[Finding], ignore: Sequence[str], *, is_robust: bool = False
 ) -> tuple[Finding, ...]:
-    """Return the errors that make an identification wrong, except those that the user ignores.
-
-    Args:
-        findings: The findings.
-        ignore: Codes of errors that the user states as wrong.
-        is_robust: Whether a robust loss was set, which downweights jumps of the torque.
-    """
+    """Return the errors that make an identification wrong, except those that the user ignores."""
     errors = (f for f in not_ignored(findings, ignore) if f.severity == "error")
     return tuple(f for f in errors if not (is_robust and is_downweighted(f)))
 
@@ -389,11 +327,6 @@ def rejected(
     these torques is below 5 % on every validation log. Another unit of the torque, or a torque
     without gravity, is rejected if the identified gravity torque is also within a factor of two
     of the URDF's.
-
-    Args:
-        findings: The findings.
-        validation: Metrics of each validation log.
-        scale_check: The identified gravity torque against the URDF's.
     """
     errors: dict[str, float] = {}
     for metrics in validation.values():
@@ -432,14 +365,7 @@ def warnings_of(
     *,
     is_robust: bool = False,
 ) -> tuple[VerdictWarning, ...]:
-    """Return the warnings of a verdict that follow from findings, each once.
-
-    Args:
-        findings: Findings of the doctor and of the fit; notes and errors are left out.
-        joints: The model's joints. A finding whose place names some concerns only these.
-        validation: Names of the validation logs.
-        is_robust: Whether a robust loss was set.
-    """
+    """Return the warnings of a verdict that follow from findings, each once."""
     # places of jumps of a torque in the form of other findings: log and joint
     downweighted = {
         f.where.replace(": tau_", ": ") for f in findings if is_robust and is_downweighted(f)
@@ -461,11 +387,7 @@ def warnings_of(
 
 
 def is_downweighted(finding: Finding) -> bool:
-    """Return whether a robust loss makes a finding harmless: it concerns jumps of the torque only.
-
-    Args:
-        finding: The finding. Jumps of a position are never harmless: they enter the regressor.
-    """
+    """Whether a robust loss makes a finding harmless: it concerns jumps of the torque only."""
     return finding.code == "spikes" and finding.where.rsplit(": ", 1)[-1].startswith("tau_")
 
 

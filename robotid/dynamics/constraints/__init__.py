@@ -1,3 +1,1 @@
 """Motions and contact forces that constraints determine."""
-
-__all__: list[str] = []

@@ -13,8 +13,6 @@ from robotid.robot.closure import Chains
 from robotid.robot.constraints import root_poses
 from robotid.robot.model import RobotModel
 
-__all__ = ["closed_log"]
-
 _OPEN = 0.02  # largest error of a loop at logged positions, relative to the length of the robot
 _COMPUTED = 1e-5  # ... at computed ones
 
@@ -24,13 +22,6 @@ def closed_log(model: RobotModel, log: Log) -> Log:
 
     The torques of passive joints are 0. Velocities, accelerations and commands of a log without the
     position of a passive joint are not used. The pose of the base becomes that of the root link.
-
-    Args:
-        model: The robot.
-        log: The log; positions of passive joints may be missing.
-
-    Raises:
-        DataError: If the loops do not close, or do not determine a missing position.
     """
     if model.passive or model.loops:
         log = _with_passive(model, log)

@@ -23,8 +23,6 @@ from robotid.dynamics.prediction import predict
 from robotid.robot.constraints import Contact, link_positions
 from robotid.robot.model import RobotModel
 
-__all__ = ["FoundContact", "find_contacts", "with_contacts"]
-
 _SURE = 0.98  # probability from which a sample is decided
 _FEWEST = 0.5  # share of decided samples of a contact below which it is not found
 _LOAD = 0.4  # of the mean force of all feet on the ground: initial limit of a contact
@@ -65,14 +63,6 @@ def with_contacts(model: RobotModel, log: Log, signals: SignalSettings) -> Log:
 
     An undecided sample counts as contact: the force of the link is then eliminated. A note states
     the shares.
-
-    Args:
-        model: The robot.
-        log: Its log; contacts that are not in ``log.contacts`` are found.
-        signals: How the log becomes a trajectory.
-
-    Raises:
-        DataError: If a contact cannot be found.
     """
     flagged = [x.frame for x in model.contacts if not x.always]
     missing = [frame for frame in flagged if frame not in log.contacts]
@@ -102,16 +92,7 @@ def with_contacts(model: RobotModel, log: Log, signals: SignalSettings) -> Log:
 def find_contacts(
     model: RobotModel, log: Log, signals: SignalSettings
 ) -> tuple[Array, tuple[FoundContact, ...]]:
-    """Return times (N,) [s] and the contacts of a robot that its log does not state.
-
-    Args:
-        model: The robot.
-        log: Its log.
-        signals: How the log becomes a trajectory.
-
-    Raises:
-        DataError: If the log has no torques or no base, or a force at such a contact is measured.
-    """
+    """Return times (N,) [s] and the contacts of a robot that its log does not state."""
     wanted = [x for x in model.contacts if not x.always and x.frame not in log.contacts]
     if log.base is None or not log.has_torque:
         raise _unknown(log, [x.frame for x in wanted], "it has no torque or no motion of the base")
@@ -209,13 +190,10 @@ def _noise_of_groups(J: Array, b: Array, size: float) -> Array:
     Fisher scoring). Reweighting by residuals over leverages has the same solution, but with levels
     that differ by a factor of 10 it takes tens of rounds.
 
-    Args:
-        J: Jacobian of the contacts, shape (N, m, n_rows).
-        b: Torques J^T f of their forces with noise, shape (N, n_rows).
-        size: Prior standard deviation of a force [N].
-
     References:
         Searle, Casella, McCulloch (1992), Variance Components, section 8.3.
+
+    J (N, m, n_rows), b (N, n_rows).
     """
     step, n = max(1, len(b) // _SAMPLES), b.shape[1]
     J, b, weak = J[::step], b[::step], np.eye(J.shape[1]) / (_WIDER * size) ** 2
@@ -241,12 +219,7 @@ def _noise_of_groups(J: Array, b: Array, size: float) -> Array:
 def _probabilities(force: Array, heights: Array | None, velocity: Array, feet: int) -> Array:
     """Return the probabilities of contact, shape (N, k).
 
-    Args:
-        force: Force upwards over the weight, shape (N, k).
-        heights: Heights, shape (N, k) [m]; None if the base has no position: then velocities are
-            those relative to the links in contact.
-        velocity: Velocities, shape (N, k, 3) [m/s].
-        feet: Number of contacts of the robot.
+    force (N, k), heights (N, k) [m], velocity (N, k, 3) [m/s].
     """
     p = (force > _LOAD / feet).astype(float)
     for _ in range(_ROUNDS):
@@ -269,11 +242,7 @@ def _probabilities(force: Array, heights: Array | None, velocity: Array, feet: i
 def _evidence(x: Array, p: Array, narrow: float, off: float | None) -> Array:
     """Return the logarithm of the ratio of the densities of a value with and without contact.
 
-    Args:
-        x: The value, shape (N, k).
-        p: Probability of contact, shape (N, k).
-        narrow: Smallest standard deviation.
-        off: Mean value without contact; None to estimate it.
+    x (N, k), p (N, k).
     """
     on, is_fixed = float(np.average(x, weights=p)), off is not None
     off = float(np.average(x, weights=1.0 - p)) if off is None else off

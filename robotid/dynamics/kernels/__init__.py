@@ -1,3 +1,1 @@
 """Vectors and rigid-body kernels in compiled code."""
-
-__all__: list[str] = []

@@ -22,37 +22,13 @@ from numba.extending import intrinsic
 from robotid.base.typing import Array
 from robotid.dynamics.kernels.vector_lanes import LANES, read, where, write
 
-__all__ = [
-    "add",
-    "applied",
-    "compiled",
-    "cos_sin",
-    "cross",
-    "dot",
-    "factor",
-    "get",
-    "get3",
-    "pointed",
-    "put",
-    "put3",
-    "put_lane",
-    "scale",
-    "solve",
-    "times",
-    "work_space",
-]
-
 _PAIR = types.UniTuple(types.float64, 2)
 _HALF_PI = (1.57079632673412561417, 6.07710050630396597660e-11, 2.02226624879595063154e-21)
 _ROUND = 6755399441055744.0  # 1.5 2^52: adding and subtracting it rounds to the nearest integer
 
 
 def work_space(entries: int) -> Array:
-    """Return a work space of zeros, shape (entries LANES,), each entry in one line of the cache.
-
-    Args:
-        entries: Number of entries.
-    """
+    """Return a work space of zeros, shape (entries LANES,), each entry in one line of the cache."""
     numbers = np.zeros((entries + 1) * LANES)
     first = -(numbers.ctypes.data // numbers.itemsize) % LANES
     return numbers[first : first + entries * LANES]
@@ -63,9 +39,6 @@ def compiled(function: Any) -> Any:
 
     Only compiled code may call a function whose name begins with an underscore: it has no entry for
     the interpreter. These entries, and those for C, take a fifth of the time of compilation.
-
-    Args:
-        function: The function.
     """
     is_private = function.__name__.startswith("_")
     entries = {"no_cfunc_wrapper": True, "no_cpython_wrapper": is_private}
@@ -73,12 +46,7 @@ def compiled(function: Any) -> Any:
 
 
 def pointed(function: Callable[..., Any], arguments: int) -> Any:
-    """Compile a function of numbers that returns two, for ``applied``, which uses its address.
-
-    Args:
-        function: The function.
-        arguments: Number of its arguments.
-    """
+    """Compile a function of numbers that returns two, for ``applied``, which uses its address."""
     return _cached(partial(cfunc, _PAIR(*[types.float64] * arguments)), function)
 
 

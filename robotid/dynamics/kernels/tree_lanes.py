@@ -36,31 +36,6 @@ from robotid.dynamics.kernels.lanes import (
     times,
 )
 
-__all__ = [
-    "ACCELERATION",
-    "BODY",
-    "FRAME",
-    "VELOCITY",
-    "along",
-    "axis",
-    "carry",
-    "derivatives",
-    "gather",
-    "get6",
-    "inertial_column",
-    "inverse_dynamics",
-    "joined",
-    "mass_matrix",
-    "motion_cross",
-    "move",
-    "pass_up",
-    "place",
-    "placement",
-    "put6",
-    "times6",
-    "turned",
-]
-
 _R, _P, VELOCITY, ACCELERATION, FRAME = 0, 9, 12, 18, 24
 _F, _C, _TV, _TA, _TF, BODY = 24, 30, 40, 46, 52, 58  # of derivatives, T: changes
 

@@ -18,18 +18,6 @@ from numba.core.typing.templates import ConcreteTemplate, Signature, infer_globa
 from numba.extending import intrinsic, models, register_model
 from numba.np.arrayobj import make_array
 
-__all__ = [
-    "LANES",
-    "copysign",
-    "is_any",
-    "lane_of",
-    "read",
-    "where",
-    "wide",
-    "with_lane",
-    "write",
-]
-
 LANES = 8
 _CODE = ir.VectorType(ir.DoubleType(), LANES)
 _CONTRACT = ("contract",)  # a b + c may be rounded once
@@ -74,14 +62,7 @@ def _wide(builder: Any, value: Any) -> Any:
 def _define(
     function: Any, result: types.Type, arguments: tuple[types.Type, ...], code: Any
 ) -> None:
-    """Define a function or operator of vectors; numbers among them become vectors.
-
-    Args:
-        function: The function of Python.
-        result: Type of its result.
-        arguments: Types of its arguments; a vector may be a number instead, but not each one.
-        code: Returns the result, from the builder and the arguments.
-    """
+    """Define a function or operator of vectors; numbers among them become vectors."""
     cases = [arguments]
     if arguments == (_vector, _vector):
         cases += [(_vector, types.float64), (types.float64, _vector)]

@@ -1,3 +1,1 @@
 """Simulation: plants, controllers, motions, sensors and closed loops."""
-
-__all__: list[str] = []

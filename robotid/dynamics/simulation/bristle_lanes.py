@@ -9,8 +9,6 @@ from robotid.dynamics.kernels.vector_lanes import wide
 from robotid.dynamics.simulation.law_lanes import deflection_by_lane, initial_deflection_by_lane
 from robotid.robot.drive_term import BRISTLES
 
-__all__ = ["advance_bristles", "bristle_column", "initialise_bristles", "presliding"]
-
 _MOVED_BEFORE = 0.1  # assumed time of motion before the simulation, for initial deflections [s]
 
 

@@ -23,13 +23,10 @@ from robotid.dynamics.simulation.simulation_settings import (
     by_joint,
 )
 from robotid.dynamics.simulation.stand import Stand, supported
-from robotid.dynamics.simulation.truth import another_robot
 from robotid.robot.bodies import link_transfer
 from robotid.robot.drives import Lag
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
-
-__all__ = ["Noise", "Run", "another_robot", "carried", "delay", "follow", "simulate"]
 
 _LONGEST_STEP = 2.5e-3  # largest step of the integration, at any rate of the log [s]
 _ELASTIC_STEP = 0.3  # largest step, relative to 1 / w of the fastest elastic gear
@@ -78,24 +75,7 @@ def simulate(
     noise: Noise | None = None,
     settings: Simulation | None = None,
 ) -> Log:
-    """Return the log of a simulated robot that tracks a motion.
-
-    Args:
-        model: The controller's model of the robot; if its base floats, with contacts.
-        pi: The true standard parameters, shape (p,), drive terms included.
-        motion: The motion to track; a ``FloatingMotion`` if the base floats.
-        rate: Sample rate of the log [Hz].
-        duration: Length of the log [s].
-        rng: Source of the noise.
-        noise: Sensor noise, instead of that of the settings.
-        settings: Controller, actuators, sensors and payload; if None, the URDF's inverse dynamics
-            and PD without limits, and ideal sensors.
-
-    Raises:
-        DataError: If contacts cannot cause the motion of a floating base, the robot has a fixed
-            base and contacts or loops, or the simulation diverges.
-        SettingsError: If a setting does not fit the robot.
-    """
+    """Return the log of a simulated robot that tracks a motion: pi (p,)."""
     chosen = settings or Simulation()
     sensors = chosen.sensors if noise is None else replace(chosen.sensors, noise=noise)
     run = follow(model, pi, motion, rate=rate, duration=duration, settings=chosen)
@@ -118,23 +98,11 @@ def follow(
     the torque tau = k dead(th - q) + d (w - v); rotor and friction are then on the motor's side.
     The integrator is a Rosenbrock W-method of order 3, which is stable with stiction.
 
-    Args:
-        model: The controller's model of the robot; if its base floats, with contacts.
-        pi: The true standard parameters, shape (p,), drive terms included.
-        motion: The motion to track; a ``FloatingMotion`` if the base floats.
-        rate: Sample rate of the run [Hz].
-        duration: Length of the run [s].
-        settings: Controller, actuators and payload, and the measured side of elastic gears.
-        progress: Called with the number of simulated seconds.
-
-    Raises:
-        DataError: If contacts cannot cause the motion of a floating base, the robot has a fixed
-            base and contacts or loops, or the simulation diverges.
-        SettingsError: If a setting does not fit the robot.
-
     References:
         Rang, Angermann (2005), New Rosenbrock W-methods of order 3 for partial differential
         algebraic equations of index 1.
+
+    pi (p,).
     """
     _check_size(duration * rate, 1)
     t = np.arange(round(duration * rate) + 1) / rate
@@ -206,17 +174,7 @@ def _wanted(
 
 
 def carried(model: RobotModel, pi: Array, payload: Payload) -> Array:
-    """Return the parameters of a robot with a payload, shape (p,).
-
-    Args:
-        model: The robot.
-        pi: Its parameters without the payload, shape (p,).
-        payload: The payload.
-
-    Raises:
-        ModelError: If the URDF has no such link.
-        SettingsError: If the payload is physically inconsistent, or its link is fixed to the world.
-    """
+    """Return the parameters of a robot with a payload, shape (p,): pi (p,)."""
     if payload.mass == 0.0:
         return pi
     link = payload.link or model.layout.bodies[-1]
@@ -263,13 +221,7 @@ def _perfect(
 def delay(model: RobotModel, pi: Array, settings: Simulation) -> Array:
     """Return the delay of each logged torque by the terms of the drives, shape (n,) [s].
 
-    Args:
-        model: The robot.
-        pi: Its true standard parameters, shape (p,).
-        settings: Settings of the run; with a perfect controller the torques include the delay.
-
-    Raises:
-        SettingsError: If a drive that couples several joints has a delay.
+    pi (p,).
     """
     delays = np.zeros(len(model.joints))
     if settings.controller.kind == "perfect":  # its inverse dynamics include the delay
@@ -411,16 +363,7 @@ class _Loop:
 
 
 def _advance(loop: _Loop, y: Array, wanted: Array, h: float, F: Friction, f: Array) -> Array:
-    """Return the state one step later.
-
-    Args:
-        loop: The robot.
-        y: The state.
-        wanted: Reference of each stage as in ``_Loop.rate``, shape (4, 4, n).
-        h: The step [s].
-        F: Friction of the state.
-        f: Rate of the state.
-    """
+    """Return the state one step later: wanted (4, 4, n)."""
     solve = loop.damped(y, h, F)
     K = np.zeros((4, len(y)))
     K[0] = solve(f, K[0])

@@ -7,20 +7,12 @@ import numpy as np
 
 from robotid.dynamics.kernels.lanes import compiled
 
-__all__ = ["average_command", "divide_rows"]
-
 
 @compiled
 def average_command(stamps, values, times, delay, mean, change):
     """Write the mean command over each step, and its derivative by the delay.
 
-    Args:
-        stamps: Times of the values, shape (N,) [s]; each is constant until the next.
-        values: Values of the command, shape (N,).
-        times: Ends of the steps, shape (K + 1,) [s].
-        delay: Delay of the command [s].
-        mean: Shape (K,); written.
-        change: Derivative of the mean by the delay, shape (K,); written.
+    stamps (N,) [s], values (N,), times (K + 1,) [s], change (K,).
     """
     last, i = len(stamps) - 1, 0
     start = times[0] - delay
@@ -45,11 +37,7 @@ def divide_rows(stamps, ticks, times, is_tick):
     Ticks divide a row. The longest steps are divided further, into two, three and so on, until the
     row has the required number.
 
-    Args:
-        stamps: Times of the rows, shape (N,) [s].
-        ticks: Ticks after the first row, ascending; a tick at a row has the time of the row [s].
-        times: Shape ((N - 1) every + 1,); written.
-        is_tick: Whether a step starts at a tick, or is the first, shape ((N - 1) every,); written.
+    stamps (N,) [s], is_tick ((N - 1) every,).
     """
     every, i = len(is_tick) // (len(stamps) - 1), 0
     edges, shares = np.empty(every + 1), np.empty(every, np.int64)

@@ -13,21 +13,13 @@ from robotid.robot.model import RobotModel
 if TYPE_CHECKING:
     from robotid.dynamics.simulation.loops import Loops
 
-__all__ = ["friction_at_rest", "why_no_solution"]
-
 
 def why_no_solution(
     model: RobotModel, loops: "Loops", joints: Array, q: Array, last: int, step: float
 ) -> str:
     """Return why the joints of a part have no roll-out beyond their positions.
 
-    Args:
-        model: The robot.
-        loops: Bodies, drives and loops.
-        joints: Indices of the joints, shape (k,).
-        q: Their positions, shape (k,) [rad or m].
-        last: Index in ``joints`` of the one of which the last speed is the least certain.
-        step: Longest step of the integration [s].
+    joints (k,), q (k,) [rad or m].
     """
     M = _mass_matrix(model, loops, joints, q)
     if loops.rate is not None:
@@ -71,10 +63,7 @@ def _wrong_friction(model: RobotModel, loops: "Loops", j: int, angle: float) -> 
 def friction_at_rest(loops: "Loops", j: int, q: Array) -> Array:
     """Return the friction of a joint without load that opposes the start of a motion, shape (N,).
 
-    Args:
-        loops: Drives.
-        j: Index of the joint.
-        q: Its positions, shape (N,) [rad or m].
+    q (N,) [rad or m].
     """
     friction = np.zeros(len(q))
     for term in loops.terms[j]:

@@ -13,19 +13,6 @@ from robotid.dynamics.kernels.vector_lanes import LANES, copysign, lane_of, wher
 from robotid.robot.drive_term import BRISTLES, PLAIN, DriveTerm, Law, MemorylessTerm
 from robotid.robot.drives import Bristles
 
-__all__ = [
-    "affine_term",
-    "coded_term",
-    "deflection",
-    "deflection_by_lane",
-    "direction",
-    "initial_deflection",
-    "initial_deflection_by_lane",
-    "loop_torque",
-    "term",
-    "term_by_lane",
-]
-
 _SIGN = 1e-5  # speed over which friction reverses [rad/s or m/s]
 
 _bristles = compiled(Bristles.law)
@@ -38,12 +25,6 @@ def coded_term(term: DriveTerm) -> tuple[tuple[int, ...], tuple[float, ...]]:
     The codes are the addresses of its laws of speed and position (0 without one), its kind, and the
     number of shape parameters of each law. The numbers are four shape parameters of each law, and
     the ranges.
-
-    Args:
-        term: The term.
-
-    Raises:
-        SettingsError: If the simulation has no such term.
     """
     if isinstance(term, Bristles):
         return (0, 0, BRISTLES, 0, 0), (*term.numbers, *[0.0] * 8)

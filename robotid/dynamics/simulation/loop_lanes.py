@@ -46,30 +46,11 @@ from robotid.dynamics.simulation.bristle_lanes import (
 )
 from robotid.dynamics.simulation.law_lanes import (
     affine_term,
-    coded_term,
     direction,
     loop_torque,
     term_by_lane,
 )
 from robotid.robot.drive_term import BRISTLES, LOADED
-
-__all__ = [
-    "ARMATURE",
-    "DELAY",
-    "INERTIAL",
-    "KD",
-    "KP",
-    "LANES",
-    "LIMIT",
-    "SPEED",
-    "START",
-    "TERM",
-    "ZERO",
-    "coded_term",
-    "last_step",
-    "roll_out",
-    "work_of",
-]
 
 THETA = 0.5  # instant of the forces, relative to the step: exact to second order
 _NEWTON = 60  # largest number of steps; three or four are typical
@@ -148,25 +129,14 @@ class Motion(NamedTuple):
 
 
 def work_of(joints: int, columns: int, n_bristles: int) -> Array:
-    """Return a new work space.
-
-    Args:
-        joints: Number of joints.
-        columns: Number of sensitivities.
-        n_bristles: Number of terms with a bristle deflection.
-    """
+    """Return a new work space."""
     n = joints
     own = (n + 1) * BODY + 4 * n * n + 16 * n + 3 * n * columns
     return work_space(own + n_bristles * (5 + columns))
 
 
 def last_step(work: Array, joints: int) -> tuple[Array, Array]:
-    """Return the positions before the last step and its last correction of speeds, (n, LANES).
-
-    Args:
-        work: Work space after ``roll_out``.
-        joints: Number of joints n.
-    """
+    """Return the positions before the last step and its last correction of speeds, (n, LANES)."""
     rows, q = work.reshape(-1, LANES), (joints + 1) * BODY
     return rows[q : q + joints], rows[q + 6 * joints : q + 7 * joints]
 
@@ -486,18 +456,7 @@ def _initialise(work, n, at, sensitivities, columns, terms, gravity, start, out_
 def roll_out(tree, zeros, bodies, drives, terms, columns, course, out, work, corrects):
     """Simulate a block of lanes; return the first step without a solution, or -1.
 
-    Args:
-        tree: The n joints, in the order of their bodies.
-        zeros: Position of the URDF where an encoder reads 0, shape (n,) [rad or m].
-        bodies: Ten inertial parameters of each joint's body, shape (n, 10).
-        drives: Armature, kp, kd and torque limit of each joint, and the sums of its affine
-            parameters: constant, by the speed, and by its direction, shape (n, 7).
-        terms: ``Terms`` of the drives.
-        columns: ``Columns`` of sensitivities.
-        course: ``Course`` with the inputs.
-        out: ``Motion``; written.
-        work: Work space of ``work_of``.
-        corrects: Whether each step is solved a second time, at its midpoint; only without columns.
+    zeros (n,) [rad or m], bodies (n, 10), drives (n, 7).
     """
     command, steps, ticks, every, start = course
     out_q, out_v, out_S = (

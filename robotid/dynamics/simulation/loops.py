@@ -28,16 +28,6 @@ from robotid.robot.model import RobotModel
 if TYPE_CHECKING:
     from robotid.dynamics.simulation.loop_lanes import Course
 
-__all__ = [
-    "ClosedLoopRobot",
-    "Column",
-    "Loops",
-    "RollOut",
-    "Window",
-    "cut_windows",
-    "open_loops",
-]
-
 #: Kind, joint and index of a parameter of the sensitivities; see ``loop_lanes``.
 Column: TypeAlias = tuple[int, int, int]
 
@@ -84,21 +74,14 @@ class Loops:
     rate: float | None = None
 
     def place(self, joint: int, term: DriveTerm) -> int:
-        """Return the index of the parameter of a joint's term in ``values``.
-
-        Args:
-            joint: Index of the joint.
-            term: One of its terms.
-        """
+        """Return the index of the parameter of a joint's term in ``values``."""
         return sum(map(len, self.terms[:joint])) + self.terms[joint].index(term)
 
 
 def open_loops(model: RobotModel, pi: Array) -> Loops:
     """Return bodies and drives of standard parameters without control: no gain, no delay.
 
-    Args:
-        model: The robot.
-        pi: Standard parameters, shape (p,), SI units, in ``layout.names`` order.
+    pi (p,).
     """
     layout, n = model.layout, len(model.joints)
     terms: list[list[DriveTerm]] = [[] for _ in range(n)]
@@ -171,13 +154,7 @@ class Window:
 
 
 def cut_windows(log: Log, length: float, lead: float) -> tuple[Window, ...]:
-    """Return the windows of a log, segment by segment between its gaps.
-
-    Args:
-        log: The log, with commands.
-        length: Their length [s]; infinite for whole segments.
-        lead: Simulated time before the counted samples, where the segment has it [s].
-    """
+    """Return the windows of a log, segment by segment between its gaps."""
     steps = np.diff(log.t)
     dt = float(np.median(steps))
     edges = [0, *(np.flatnonzero(steps > _GAP * dt) + 1), len(log.t)]
@@ -229,19 +206,7 @@ class ClosedLoopRobot:
     """Simulator of a robot with closed-loop drives."""
 
     def __init__(self, model: RobotModel, *, step: float = 2e-3, corrects: bool = False) -> None:
-        """Flatten a robot.
-
-        Args:
-            model: The robot.
-            step: Longest step of the integration [s].
-            corrects: Whether each step is solved a second time, at its midpoint; such roll-outs
-                have no derivatives.
-
-        Raises:
-            DataError: If the base floats, or the robot has contacts or loops.
-            SettingsError: If a drive couples several joints, or the compiled code has no joint of
-                some type.
-        """
+        """Flatten a robot."""
         model.require_fixed("the estimator 'simulation', which simulates the controlled joints,")
         if model.layout.couplings or model.mimic == "coupled":
             raise SettingsError(
@@ -295,21 +260,7 @@ class ClosedLoopRobot:
         owners: Sequence[int] | None = None,
         with_speeds: bool = False,
     ) -> list[RollOut]:
-        """Return the simulated motion of windows.
-
-        Args:
-            loops: Bodies, drives and loops.
-            windows: The windows.
-            columns: Parameters of the sensitivities: kind, joint, and index of a term or direction.
-            directions: Directions in a body's ten parameters, shape (D, 10).
-            owners: Index of the sensitivity of each column. A sensitivity is the sum of its
-                columns, for a parameter that joints share; with None, and for initial states, each
-                column is a sensitivity.
-            with_speeds: Whether speeds are differentiated, too.
-
-        Raises:
-            NotConvergedError: If a step has no solution, for example with negative friction.
-        """
+        """Return the simulated motion of windows: directions (D, 10)."""
         wanted = np.array(columns, dtype=np.int64).reshape(-1, 3)
         numbers = np.arange(len(wanted)) if owners is None else np.array(owners, dtype=np.int64)
         wanted = np.column_stack([wanted, numbers])[np.argsort(numbers, kind="stable")]
@@ -494,12 +445,7 @@ def _failed_at(
 
     The positions of an unstable one are the initial ones.
 
-    Args:
-        row: Row of the step without a solution.
-        last: Positions before this step and the last correction of speeds; None if every step has
-            one, but speeds are too large.
-        q: Positions, shape (N, n, LANES).
-        v: Speeds, shape (N, n, LANES).
+    q (N, n, LANES), v (N, n, LANES).
     """
     if last is None:
         is_fast = ~(np.abs(v) < _FASTEST)

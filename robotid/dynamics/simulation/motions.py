@@ -11,15 +11,6 @@ from robotid.base.typing import Array
 from robotid.data.base_motion import in_base
 from robotid.robot.model import RobotModel
 
-__all__ = [
-    "FloatingMotion",
-    "FourierTrajectory",
-    "Motion",
-    "ProgramMotion",
-    "SampledMotion",
-    "random_fourier",
-]
-
 _ORDER = 5  # of the polynomials through samples
 _HARMONICS = 5  # of a random motion
 _ROTARY_AMPLITUDE = 1.2  # largest amplitude of a revolute joint [rad]
@@ -34,8 +25,7 @@ class Motion(Protocol):
     def evaluate(self, t: Array) -> tuple[Array, Array, Array]:
         """Return q, v, a, each of shape (N, n) [rad, rad/s, rad/s^2 or m, m/s, m/s^2].
 
-        Args:
-            t: Times, shape (N,) [s].
+        t (N,) [s].
         """
 
 
@@ -95,8 +85,7 @@ class ProgramMotion(Motion):
     def evaluate(self, t: Array | float) -> tuple[Array, Array, Array]:
         """Return q, v and a as in ``Motion``, each of shape t.shape + (n,), or (R, n).
 
-        Args:
-            t: Times of one motion, any shape, or one per motion, shape (R,) [s].
+        t (R,) [s].
         """
         A, T = np.asarray(self.amplitude, dtype=float), np.asarray(self.duration)[..., None]
         s = np.clip(np.asarray(t, dtype=float)[..., None] / T, 0.0, 1.0)  # t / T
@@ -170,11 +159,7 @@ class FloatingMotion(Motion):
         return SampledMotion(self.t, np.hstack([self.pose, self.q]))
 
     def touching(self, t: Array) -> Array:
-        """Return which contacts touch the ground, shape (N, k), bool.
-
-        Args:
-            t: Times since the first sample, shape (N,) [s].
-        """
+        """Return which contacts touch the ground, shape (N, k), bool: t (N,) [s]."""
         rows = np.searchsorted(self.t - self.t[0], t + 1e-9, side="right") - 1
         flags: Array = self.contacts[np.clip(rows, 0, len(self.t) - 1)]
         return flags
@@ -184,8 +169,7 @@ class FloatingMotion(Motion):
 
         With the unit quaternion p / |p| of the spline p, w = 2 p* dp/dt / |p|^2 (vector part).
 
-        Args:
-            t: Times since the first sample, shape (N,) [s].
+        t (N,) [s].
         """
         x, rate, change = self._samples.evaluate(t)
         p, dp, ddp = x[:, 3:7], rate[:, 3:7], change[:, 3:7]

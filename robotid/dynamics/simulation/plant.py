@@ -12,8 +12,6 @@ from robotid.robot.drives import Bristles, Coulomb, DriveTerm, MemorylessTerm, O
 from robotid.robot.mass_matrix import drive_inertia, rigid_mass_matrices
 from robotid.robot.model import RobotModel
 
-__all__ = ["Friction", "RobotPlant", "rk4"]
-
 _ITERATIONS = 200  # of the fixed point of load and load-dependent friction
 _SETTLED = 1e-12  # relative change of the load at convergence
 _SIMPLE = (Coulomb, Viscous, Offset)
@@ -55,12 +53,7 @@ class RobotPlant:
     the rate of ``bristle_rate``; if it is not given, sliding is steady. A delay of the torque
     (``Lag``) is one of the measurement, not of the plant.
 
-    Args:
-        model: The robot, with a fixed base.
-        pi: Its true standard parameters, shape (p,), drive terms included.
-
-    Raises:
-        DataError: If the base floats, or pi does not have p entries.
+    pi (p,).
     """
 
     def __init__(self, model: RobotModel, pi: Array) -> None:
@@ -93,8 +86,7 @@ class RobotPlant:
     def mass_matrix(self, q: Array) -> Array:
         """Return D(q), the mass matrix with the drives' armature, shape (n, n).
 
-        Args:
-            q: Joint coordinates, shape (n,) [rad or m].
+        q (n,) [rad or m].
         """
         if self._is_plain:
             mass: Array = pin.crba(self._driven, self._data, self._configuration(q))
@@ -106,9 +98,7 @@ class RobotPlant:
     def bias(self, q: Array, v: Array) -> Array:
         """Return C(q, v), Coriolis, centrifugal, gravity and friction torque, (n,) [N m or N].
 
-        Args:
-            q: Joint coordinates, shape (n,) [rad or m].
-            v: Joint velocities, shape (n,) [rad/s or m/s].
+        q (n,) [rad or m], v (n,) [rad/s or m/s].
         """
         rigid = self.bodies_torque(q, v, 0.0 * v)
         return rigid + self.friction_torque(self.friction(q, v), v, rigid)
@@ -116,10 +106,7 @@ class RobotPlant:
     def bodies_torque(self, q: Array, v: Array, a: Array) -> Array:
         """Return the inverse dynamics of the bodies alone, shape (n,) [N m or N].
 
-        Args:
-            q: Joint coordinates, shape (n,) [rad or m].
-            v: Joint velocities, shape (n,) [rad/s or m/s].
-            a: Joint accelerations, shape (n,) [rad/s^2 or m/s^2].
+        q (n,) [rad or m], v (n,) [rad/s or m/s], a (n,) [rad/s^2 or m/s^2].
         """
         G, x = self.model.velocity_map, self._configuration(q)
         rigid: Array = G.T @ pin.rnea(self._bodies.pin_model, self._data, x, G @ v, G @ a)
@@ -128,10 +115,7 @@ class RobotPlant:
     def friction(self, q: Array, v: Array, z: Array | None = None) -> Friction:
         """Return the friction of the drives, without inertia and the sign of the speed.
 
-        Args:
-            q: Coordinates on the drives' side, shape (n,) [rad or m].
-            v: Velocities on the drives' side, shape (n,) [rad/s or m/s].
-            z: Bristle deflections, shape (n_states,) [-]; None: steady sliding.
+        q (n,) [rad or m], v (n,) [rad/s or m/s], z (n_states,) [-].
         """
         angle, w = self.ratios @ q, self.ratios @ v
         coulomb, viscous, offset = self._simple
@@ -151,10 +135,7 @@ class RobotPlant:
     def friction_torque(self, F: Friction, v: Array, load: Array) -> Array:
         """Return the friction torque of the drives, shape (n,) [N m or N].
 
-        Args:
-            F: Friction, from ``friction``.
-            v: Velocities on the drives' side, shape (n,) [rad/s or m/s].
-            load: Torque of the bodies, shape (n,) [N m or N].
+        v (n,) [rad/s or m/s], load (n,) [N m or N].
         """
         along = F.along + F.loaded * np.abs(self._share @ load) if self.is_loaded else F.along
         torque: Array = self.ratios.T @ (along * np.tanh(self.ratios @ v / _SIGN_SPEED) + F.rest)
@@ -163,10 +144,7 @@ class RobotPlant:
     def chord(self, F: Friction, v: Array, load: Array) -> Array:
         """Return the friction with the sign of the speed, divided by the speed, shape (n, n).
 
-        Args:
-            F: Friction, from ``friction``.
-            v: Velocities on the drives' side, shape (n,) [rad/s or m/s].
-            load: Torque of the bodies, shape (n,) [N m or N].
+        v (n,) [rad/s or m/s], load (n,) [N m or N].
         """
         along = F.along + F.loaded * np.abs(self._share @ load) if self.is_loaded else F.along
         x = np.maximum(np.abs(self.ratios @ v) / _SIGN_SPEED, 1e-6)  # tanh(x) / x is 1 at 0
@@ -177,8 +155,7 @@ class RobotPlant:
     def bristle_rate(self, v: Array) -> tuple[Array, Array]:
         """Return r [1/s] and g sign(w) of the bristle deflection, dz/dt = r (g sign(w) - z).
 
-        Args:
-            v: Velocities on the drives' side, shape (n,) [rad/s or m/s].
+        v (n,) [rad/s or m/s].
         """
         w = self.ratios @ v
         rate, end = np.zeros((2, self.n_states))
@@ -193,20 +170,10 @@ class RobotPlant:
     def acceleration(self, q: Array, v: Array, u: Array, F: Friction | None = None) -> Array:
         """Return the acceleration D(q)^-1 (u - C(q, v)) of a torque, shape as q.
 
-        Args:
-            q: Joint coordinates, shape (n,), or (R, n) for R robots [rad or m].
-            v: Joint velocities, shape as q [rad/s or m/s].
-            u: Torque, shape as q [N m or N].
-            F: Friction of one robot, if it is known.
-
-        Returns:
-            The acceleration [rad/s^2 or m/s^2].
-
-        Raises:
-            NotConvergedError: If load-dependent friction is so large that it locks the drives.
-
         References:
             Tzvetkova, (11).
+
+        q (n,) [rad or m].
         """
         if q.ndim == 2:
             return np.stack([self.acceleration(*one) for one in zip(q, v, u, strict=True)])
@@ -219,11 +186,7 @@ class RobotPlant:
     def free_acceleration(self, q: Array, v: Array, tau: Array, *, rotors: bool = True) -> Array:
         """Return the acceleration of bodies and rotors without friction, shape (n,).
 
-        Args:
-            q: Joint coordinates, shape (n,) [rad or m].
-            v: Joint velocities, shape (n,) [rad/s or m/s].
-            tau: Torque after subtraction of friction, shape (n,) [N m or N].
-            rotors: Whether the inertia of the drives' rotors is included.
+        q (n,) [rad or m], v (n,) [rad/s or m/s], tau (n,) [N m or N].
         """
         x, G = self._configuration(q), self.model.velocity_map
         if self._is_plain:
@@ -303,15 +266,7 @@ def rk4(
     h: float | Array,
     a: Array | None = None,
 ) -> tuple[Array, Array]:
-    """Return positions and velocities one step later, by the Runge-Kutta method of order 4.
-
-    Args:
-        acceleration: Acceleration of a state q, v at a fraction of the step, 0, 0.5 or 1.
-        q: Positions, any shape [rad or m].
-        v: Velocities, shape as q.
-        h: Length of the step, a number or a shape that multiplies q [s].
-        a: Accelerations at the start of the step, if known.
-    """
+    """Return positions and velocities one step later, by the Runge-Kutta method of order 4."""
     a1 = acceleration(q, v, 0.0) if a is None else a
     v2 = v + h / 2 * a1
     a2 = acceleration(q + h / 2 * v, v2, 0.5)

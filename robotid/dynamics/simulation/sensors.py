@@ -12,8 +12,6 @@ from robotid.dynamics.simulation.simulation_settings import PerJoint, Sensors, b
 if TYPE_CHECKING:
     from robotid.dynamics.simulation.closed_loop import Run
 
-__all__ = ["measure"]
-
 _TICK = 1e-6  # smallest step between time stamps [s]
 
 
@@ -29,16 +27,7 @@ def measure(
 
     Delay, noise and rounding are applied in this order. Jitter changes only the time stamps.
 
-    Args:
-        run: The motion of the robot.
-        sensors: Logged signals and sensor errors.
-        joints: Names of the n joints.
-        rng: Source of noise, jitter and dropped samples.
-        delay: Delay of each torque by its drive, in addition to the sensors', shape (n,) [s].
-
-    Raises:
-        DataError: If fewer than two samples remain.
-        SettingsError: If a setting names an unknown joint.
+    delay (n,) [s].
     """
 
     def of(value: PerJoint, name: str) -> Array:

@@ -15,22 +15,6 @@ from robotid.base.settings import NOT_NEGATIVE, POSITIVE, Range, Settings, check
 from robotid.base.typing import Array
 from robotid.data.log import suggestion
 
-__all__ = [
-    "DELAY",
-    "GAIN",
-    "LEVEL",
-    "Actuator",
-    "Controller",
-    "Noise",
-    "Payload",
-    "PerJoint",
-    "Sensors",
-    "Simulation",
-    "Truth",
-    "by_joint",
-    "read_simulation",
-]
-
 #: A number for every joint, or numbers by joint; other joints have the default.
 PerJoint: TypeAlias = float | Mapping[str, float]
 
@@ -283,17 +267,7 @@ class Simulation(Settings):
 
 
 def by_joint(value: PerJoint | None, joints: Sequence[str], name: str, other: float = 0.0) -> Array:
-    """Return a setting of each joint, shape (n,).
-
-    Args:
-        value: A number for all, or numbers by joint; None: the default.
-        joints: Names of the n joints.
-        name: Name of the setting, for errors.
-        other: Default of joints that are not named.
-
-    Raises:
-        SettingsError: If the setting names an unknown joint.
-    """
+    """Return a setting of each joint, shape (n,)."""
     if not isinstance(value, Mapping):
         return np.full(len(joints), other if value is None else float(value))
     for joint in value:
@@ -308,15 +282,7 @@ def by_joint(value: PerJoint | None, joints: Sequence[str], name: str, other: fl
 def read_simulation(
     path: str | Path | None, given: Mapping[str, Any]
 ) -> tuple[Simulation, dict[str, Any]]:
-    """Return the settings in a TOML file, and its table of further drive terms by joint.
-
-    Args:
-        path: The file; its table ``drives`` has the form of a job file's. None: the defaults.
-        given: Settings that replace those of the file, in the same structure.
-
-    Raises:
-        SettingsError: If the file is missing or not TOML, or a key or a value is invalid.
-    """
+    """Return the settings in a TOML file, and its table of further drive terms by joint."""
     table: dict[str, Any] = {}
     if path is not None:
         if not Path(path).is_file():

@@ -16,8 +16,6 @@ from robotid.dynamics.simulation.simulation_settings import Sensors
 from robotid.robot.constraints import frame_id
 from robotid.robot.model import RobotModel
 
-__all__ = ["Stand", "contact_forces", "on_feet", "supported"]
-
 _LEFT = 1e-6  # largest part of the wrench on the base that contacts cannot cause [-]
 _RANK = 1e-8  # singular values below this share of the largest are of dependent forces
 _CLOSED = 1e-10  # [m, rad] largest motion of a foot on the ground
@@ -43,12 +41,7 @@ class Stand:
     wrenches: Mapping[str, Array]
 
     def logged(self, sensors: Sensors, rows: Array) -> dict[str, Any]:
-        """Return base, contacts and wrenches of a log.
-
-        Args:
-            sensors: Which signals are logged.
-            rows: Which samples are logged, shape (N,), bool.
-        """
+        """Return base, contacts and wrenches of a log: rows (N,)."""
         return {
             "base": BaseMotion(
                 self.pose[rows],
@@ -63,9 +56,7 @@ class Stand:
 def contact_forces(J: Array, wrench: Array) -> tuple[Array, Array]:
     """Return the smallest forces with J^T f = w, shape (N, m), and what they leave, (N, 6).
 
-    Args:
-        J: The part of the constraints' Jacobian for the base, shape (N, m, 6).
-        wrench: The wrench w that the base needs, shape (N, 6) [N, N m].
+    J (N, m, 6), wrench (N, 6) [N, N m].
     """
     f = np.einsum("kmi,ki->km", np.linalg.pinv(J.swapaxes(1, 2), rcond=_RANK), wrench)
     return f, wrench - np.einsum("kmi,km->ki", J, f)
@@ -83,16 +74,7 @@ def supported(
     The forces of the ground f are the smallest ones that cause the motion of the base: of W pi =
     tau + J^T f the first six rows, where tau is 0. The other rows give tau.
 
-    Args:
-        model: The robot, with contacts.
-        motion: The motion.
-        t: Times, shape (N,) [s].
-        state: q, v and a at these times.
-        torque: The torque W pi, shape (N, 6 + n) [N m, N].
-
-    Raises:
-        DataError: If forces at the contacts cannot cause the motion of the base.
-        SettingsError: If the robot has loops, or no contacts.
+    t (N,) [s], torque (N, 6 + n) [N m, N].
     """
     if model.loops or not model.contacts:
         found = "loops" if model.loops else "no contacts"
@@ -127,14 +109,7 @@ def on_feet(model: RobotModel, pose: Array, q: Array, contacts: Array) -> Array:
 
     A foot remains where it is at the first sample of its contact.
 
-    Args:
-        model: The robot, whose base floats.
-        pose: Pose of the base, shape (N, 7) [m, -].
-        q: Wanted joint positions, shape (N, n) [rad or m].
-        contacts: Which contacts touch the ground, shape (N, k), bool.
-
-    Raises:
-        DataError: If a foot cannot remain where it is.
+    pose (N, 7) [m, -], q (N, n) [rad or m], contacts (N, k).
     """
     feet, found, change = _Feet(model), np.empty_like(q), np.zeros(q.shape[1])
     places: dict[int, pin.SE3] = {}

@@ -11,24 +11,12 @@ from robotid.robot.drives import MemorylessTerm
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import inertial_from_pseudo_inertia, pseudo_inertia
 
-__all__ = ["another_robot", "draw_parameters", "perturbed_bodies"]
-
 _TYPICAL_EFFORT = 50.0  # effort limit of a drive with typical parameters [N m or N]
 _IMPOSSIBLE = -1e-9  # smallest eigenvalue of a body's pseudo-inertia over the largest
 
 
 def draw_parameters(model: RobotModel, settings: Truth, rng: np.random.Generator) -> Array:
-    """Return the true standard parameters of a robot near the model, shape (p,).
-
-    Args:
-        model: The robot of the URDF.
-        settings: Size of the differences, and stated values.
-        rng: Source of the differences.
-
-    Raises:
-        ModelError: If a body of the URDF is physically inconsistent.
-        SettingsError: If a stated parameter is unknown, or physically inconsistent.
-    """
+    """Return the true standard parameters of a robot near the model, shape (p,)."""
     layout = model.layout
     pi = model.standard_parameters()
     pi[: layout.n_inertial] = perturbed_bodies(model, settings.inertials, rng)
@@ -58,14 +46,6 @@ def perturbed_bodies(model: RobotModel, size: float, rng: np.random.Generator) -
     coordinates of equal standard deviation in the metric d^2 = 1/2 tr(log(J^-1 J')^2). The
     distribution does not depend on frame, units or body, and J' is positive definite if J is.
 
-    Args:
-        model: The robot of the URDF.
-        size: Standard deviation of each coordinate [-].
-        rng: Source of the differences.
-
-    Raises:
-        ModelError: If a body of the URDF is physically inconsistent.
-
     References:
         Wensing, Kim, Slotine (2018), Linear Matrix Inequalities for Physically Consistent
         Inertial Parameter Identification; Lee, Park (2018), A Geometric Algorithm for Robust
@@ -93,10 +73,6 @@ def another_robot(model: RobotModel, rng: np.random.Generator) -> Array:
 
     Masses differ by 10 to 30 % in either direction, the last link has an additional mass of 1.2 kg
     at 10 cm from its joint, and the drives have armature and friction.
-
-    Args:
-        model: The robot of the URDF.
-        rng: Source of the differences.
     """
     size = model.layout.n_inertial
     pi = model.standard_parameters()

@@ -13,8 +13,6 @@ from robotid.dynamics.factors import Factors
 from robotid.estimation.estimators.estimator import BatchEstimator, Estimate, Weighing
 from robotid.estimation.estimators.segments import sandwich
 
-__all__ = ["OLS", "TLS", "WLS", "Solution", "mixed_tls", "solve_factor"]
-
 _RANK = 1e-7  # relative singular value below which the rank is reduced, columns of unit norm
 _SILENT = 1e-6  # relative norm below which a column has no information
 _OPEN = 1e-2  # share in undetermined directions above which a parameter is undetermined
@@ -212,12 +210,7 @@ class Solution:
     ) -> Estimate:
         """Return the estimate; parameters that are not identifiable have infinite variance.
 
-        Args:
-            names: Names of the parameters.
-            covariance: Covariance of the parameters, shape (c, c).
-            sigma: Standard deviation of the torque residual per joint, shape (n,) [N m or N].
-            n_iter: Number of iterations.
-            message: Summary of the run of the estimator.
+        covariance (c, c), sigma (n,) [N m or N].
         """
         is_open = np.isin(names, self.undetermined)
         covariance = covariance.copy()
@@ -239,14 +232,7 @@ class Solution:
 def solve_factor(factors: Factors, sigma: Array, prior: Array | None) -> Solution:
     """Solve the weighted problem; directions that are not identifiable have the prior's values.
 
-    Args:
-        factors: The factors.
-        sigma: Noise level per joint, shape (n,) [N m or N].
-        prior: Parameter values for directions that are not identifiable, shape (c,); None: an error
-            is raised if there are any.
-
-    Raises:
-        RankDeficientError: If parameters are not identifiable and there is no prior.
+    sigma (n,) [N m or N], prior (c,).
     """
     R = factors.weighted(sigma)
     c = len(factors.names)
@@ -287,12 +273,7 @@ def _noise(factors: Factors, theta: Array, used: Array) -> Array:
 def mixed_tls(rows: Array, noise: Array) -> Array:
     """Return the parameters of mixed total least squares, shape (c,).
 
-    Args:
-        rows: Rows [W tau] in units of the torque's noise, or their factor, shape (k, c + 1).
-        noise: Noise of each column in the same units, shape (c,); 0 for columns without noise.
-
-    Raises:
-        DataError: If the smallest solution is not unique.
+    rows (k, c + 1), noise (c,).
     """
     c = len(noise)
     exact, noisy = np.flatnonzero(noise == 0), np.flatnonzero(noise > 0)

@@ -14,8 +14,6 @@ import scipy.linalg
 from robotid.base.exceptions import RankDeficientError
 from robotid.base.typing import Array
 
-__all__ = ["Combination", "Determination", "Group", "base_spread", "determine"]
-
 _PRIOR_LED = 0.9  # ratio of the spreads after and before the data above which a direction is weak
 _LED_IN_PART = 0.3  # share of a parameter's spread in weak directions that makes it a group member
 _COUPLED = 0.5  # ... or its coefficient relative to another member, in units of the spreads
@@ -118,11 +116,7 @@ class Determination:
         return (*sums, Group(tuple(alone), ())) if alone else sums
 
     def described(self) -> str:
-        """Return a description of the groups, as "a and b are identifiable only as a + b".
-
-        Returns:
-            One line with the first groups; empty if every parameter is identifiable.
-        """
+        """Return a description of the groups, as "a and b are identifiable only as a + b"."""
         sums = [str(group) for group in self.merged if group.combinations]
         texts = sums[:_GROUPS]
         if len(sums) > _GROUPS:
@@ -131,22 +125,13 @@ class Determination:
         return "; ".join(texts + [str(group) for group in self.merged if not group.combinations])
 
     def refusal(self, error: RankDeficientError) -> RankDeficientError:
-        """Return the error of least squares with the groups of this criterion.
-
-        Args:
-            error: Error by the numerical rank of least squares; returned if there are no groups.
-        """
+        """Return the error of least squares with the groups of this criterion."""
         if not self.groups:
             return error
         return RankDeficientError(self.rank, self.undetermined, len(self.names), self.described())
 
     def to_list(self) -> list[dict[str, Any]]:
-        """Return the groups as plain values, as they are written to result.json.
-
-        Returns:
-            Per group {"parameters": [names], "determined": [{"text", "terms": {name: coefficient}}]
-            }, coefficients in SI units.
-        """
+        """Return the groups as plain values, as they are written to result.json."""
         return [
             {
                 "parameters": list(group.names),
@@ -162,10 +147,7 @@ class Determination:
 def base_spread(K: Array, spread: Array, known: Sequence[bool] | Array = ()) -> Array:
     """Return the prior standard deviation of each base parameter, shape (b,); 0 if known.
 
-    Args:
-        K: Map to the base parameters, shape (b, p).
-        spread: Prior standard deviation of each standard parameter, shape (p,), SI units.
-        known: Whether each standard parameter is known, shape (p,); none if empty.
+    K (b, p), spread (p,), known (p,).
     """
     free = spread * ~np.asarray(known, dtype=bool) if len(known) else spread
     size: Array = np.linalg.norm(K * free, axis=1)
@@ -180,11 +162,7 @@ def determine(names: Sequence[str], rows: Array, spread: Array) -> Determination
     the space that is not identifiable. Solved for as many base parameters f, x_p = V_p V_f^-1 x_f
     along them, so that each x_p - V_p V_f^-1 x_f is identifiable.
 
-    Args:
-        names: Names of the base parameters.
-        rows: A, where A^T A is the inverse covariance of the base parameters by the data alone at
-            their noise level, shape (k, b), in inverse SI units.
-        spread: Prior standard deviation of each, shape (b,), SI units; 0 if known.
+    rows (k, b), spread (b,).
     """
     free = np.flatnonzero(spread > 0)
     weak, shrinkage = np.zeros((len(spread), 0)), np.zeros(len(spread))

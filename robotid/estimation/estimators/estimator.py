@@ -18,8 +18,6 @@ from robotid.output.pages.html import code, number, table
 if TYPE_CHECKING:
     from robotid.estimation.estimators.consistent.consistent_fit import Consistent
 
-__all__ = ["BatchEstimator", "Estimate", "Estimator", "Weighing", "require_rows"]
-
 DataT = TypeVar("DataT", contravariant=True)
 
 #: Weights of rows: "alike", all equal; "by joint", by the noise level; "by age", of a filter with
@@ -164,16 +162,7 @@ class BatchEstimator(Estimator[Problem | Factors]):
 
 
 def require_rows(rows: int, columns: int, n_joints: int) -> None:
-    """Raise an error if there are fewer rows than parameters.
-
-    Args:
-        rows: Number of rows used.
-        columns: Number of parameters.
-        n_joints: Rows per sample.
-
-    Raises:
-        DataError: If there are fewer rows than parameters.
-    """
+    """Raise an error if there are fewer rows than parameters."""
     if rows == 0:
         raise DataError(
             f"0 torque rows for {columns} parameters: no joint moves faster than min_velocity, or "

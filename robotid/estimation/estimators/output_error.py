@@ -21,8 +21,6 @@ from robotid.estimation.estimators.estimator import Estimate, Estimator
 from robotid.estimation.estimators.segments import FEWEST_SEGMENTS, at_least, sandwich, scatter
 from robotid.estimation.estimators.simulator import Residual, Simulator
 
-__all__ = ["OutputError", "is_at_bound", "linearised", "segment_scores"]
-
 _CAUTIOUS = 1e-3  # damping of a step: parameters that are not identifiable do not move
 _NEARLY_FREE = 1e-6  # damping of the last step, near the minimum
 _STEPS = 25  # largest number of damped Gauss-Newton steps in a round
@@ -413,14 +411,7 @@ def _rho_change(before: _Weights, after: _Weights) -> float:
 def linearised(
     simulator: Simulator, weights: _Weights, theta: Array, *, frees: bool = False
 ) -> Iterable[tuple[Array, Array, Array]]:
-    """Yield whitened rows A, b and the indices of their columns, window by window.
-
-    Args:
-        simulator: The simulator.
-        weights: As from ``OutputError.weights``.
-        theta: Parameters, shape (c,).
-        frees: Whether the effect of a window's initial state is projected out of its rows.
-    """
+    """Yield whitened rows A, b and the indices of their columns, window by window: theta (c,)."""
     found = simulator.residuals(theta, with_slopes=True, with_starts=frees)
     yield from _whitened(found, weights, frees=frees)
 
@@ -429,10 +420,6 @@ def segment_scores(simulator: Simulator, estimate: Estimate) -> tuple[Array, Arr
     """Return A'A (s, c, c) and A'b (s, c) of whitened residuals, window by window.
 
     The effect of the windows' initial states is projected out.
-
-    Args:
-        simulator: The simulator, with s windows and parts of robots that are simulated together.
-        estimate: Result of ``OutputError.fit``: its parameters, correlation and noise level.
     """
     weights = _Weights(estimate.details["correlation"], estimate.sigma)
     parts = list(linearised(simulator, weights, estimate.theta, frees=True))
@@ -495,12 +482,7 @@ def _given(r: Residual) -> Array:
 
 
 def is_at_bound(simulator: Simulator, theta: Array) -> Array:
-    """Return which parameters are at a bound, shape (c,), bool.
-
-    Args:
-        simulator: The simulator.
-        theta: Parameters, shape (c,).
-    """
+    """Return which parameters are at a bound, shape (c,), bool: theta (c,)."""
     lowest, highest = simulator.bounds
     at_bound: Array = (theta <= lowest) | (theta >= highest)
     return at_bound

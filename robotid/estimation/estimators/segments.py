@@ -14,8 +14,6 @@ from robotid.base.exceptions import DataError
 from robotid.base.typing import Array
 from robotid.dynamics.factors import Factors
 
-__all__ = ["FEWEST_SEGMENTS", "Scatter", "at_least", "quantile", "sandwich", "scatter"]
-
 #: Smallest number of segments for an estimate of the scatter.
 FEWEST_SEGMENTS = 12
 _OWN = 0.95  # leverage above which a segment determines a direction alone, without scatter
@@ -75,19 +73,11 @@ def scatter(segments: Sequence[Factors], theta: Array, sigma: Array, bread: Arra
     (I - leverage)^-1/2, which is exact for independent rows (CR2). Directions that one segment
     alone determines have no scatter; the mean scatter of all others is used for them.
 
-    Args:
-        segments: Factors of contiguous segments, at least 12, each longer than the correlation of
-            the residuals.
-        theta: Estimate, shape (c,).
-        sigma: Noise level per joint that weighted the rows, shape (n,) [N m or N].
-        bread: Covariance of the parameters if rows were independent, shape (c, c).
-
-    Raises:
-        DataError: If there are fewer than 12 segments.
-
     References:
         Bell, McCaffrey (2002), as above; Liang, Zeger (1986), Longitudinal data analysis using
         generalized linear models.
+
+    theta (c,), sigma (n,) [N m or N], bread (c, c).
     """
     if len(segments) < FEWEST_SEGMENTS:
         raise DataError(
@@ -132,9 +122,7 @@ def _root(covariance: Array) -> Array:
 def sandwich(bread: Array, meat: Array) -> Array:
     """Return the covariance bread meat bread^T of parameters (sandwich estimate).
 
-    Args:
-        bread: Derivative of the parameters with respect to the score, shape (c, c).
-        meat: Covariance of the score, shape (c, c).
+    bread (c, c), meat (c, c).
     """
     covariance: Array = bread @ meat @ bread.T
     return covariance
@@ -143,9 +131,7 @@ def sandwich(bread: Array, meat: Array) -> Array:
 def at_least(covariance: Array, variance: Array) -> Array:
     """Return a covariance with lower bounds on its variances; correlations are unchanged.
 
-    Args:
-        covariance: Covariance, shape (c, c).
-        variance: Lower bounds of the variances, shape (c,).
+    covariance (c, c), variance (c,).
     """
     own = np.sqrt(np.diag(covariance))
     wider = np.maximum(own, np.sqrt(variance)) / own
@@ -156,8 +142,7 @@ def at_least(covariance: Array, variance: Array) -> Array:
 def quantile(freedom: Array) -> Array:
     """Return the half-width of two-sided 95 % intervals in standard errors, shape (c,).
 
-    Args:
-        freedom: Degrees of freedom of each standard error (Student's distribution), shape (c,).
+    freedom (c,).
     """
     quantiles: Array = scipy.special.stdtrit(freedom, 0.975)
     return quantiles

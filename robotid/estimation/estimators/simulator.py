@@ -6,8 +6,6 @@ from typing import Protocol
 
 from robotid.base.typing import Array
 
-__all__ = ["Residual", "Simulator"]
-
 
 @dataclass(frozen=True, eq=False)
 class Residual:
@@ -52,23 +50,10 @@ class Simulator(Protocol):
     def residuals(
         self, theta: Array, *, with_slopes: bool, with_starts: bool = False
     ) -> Sequence[Residual]:
-        """Return measured minus simulated outputs, window by window.
-
-        Args:
-            theta: Parameters, shape (c,).
-            with_slopes: Whether derivatives by the parameters are computed.
-            with_starts: Whether derivatives by the initial states of windows are computed.
-
-        Raises:
-            NotConvergedError: If the simulation with these parameters fails.
-        """
+        """Return measured minus simulated outputs, window by window: theta (c,)."""
 
     def rows(self, theta: Array) -> tuple[Array, Array]:
         """Return additional linearised residuals of unit weight, as those of torques.
 
-        Args:
-            theta: Parameters, shape (c,).
-
-        Returns:
-            A, shape (m, c), and b, shape (m,): the residuals of theta + x are b - A x.
+        theta (c,) -> (m, c), (m,).
         """

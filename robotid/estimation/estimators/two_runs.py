@@ -23,8 +23,6 @@ from robotid.dynamics.factors import Factors, Reduction, merge, triangle_of
 from robotid.estimation.estimators.segments import FEWEST_SEGMENTS, at_least, sandwich, scatter
 from robotid.robot.parameters import ParameterLayout
 
-__all__ = ["Compared", "TwoRuns", "payload_runs"]
-
 _WIDE = 10.0  # factor of the prior standard deviations about the URDF's values
 _FLOOR = 1e-7  # smallest noise level over the torque, for noise-free data
 _LEAST_FREEDOM = 0.1  # smallest degrees of freedom of a noise level, as a share of the rows
@@ -85,12 +83,6 @@ class TwoRuns:
         least those for a ``share`` of independent rows. With fewer than 12 segments the latter are
         used.
 
-        Args:
-            by_joint: Whether standard errors include the scatter between joints of each run.
-
-        Raises:
-            NotConvergedError: If the gains do not converge.
-
         References:
             Gautier, Briot (2014), Global identification of joint drive gains and dynamic parameters
             of robots, Journal of Dynamic Systems, Measurement, and Control 136, section 3, which
@@ -119,27 +111,14 @@ class TwoRuns:
         return Compared(theta, gain, covariance, freedom, np.sqrt(squares) / torque)
 
     def alike(self, gain: Array | None = None) -> tuple[Array, Array]:
-        """Return beta and x for a ``share`` of independent rows.
-
-        Args:
-            gain: Gains, shape (n,); None: 1.
-
-        Returns:
-            beta and x, shape (b + d,), and their covariance; its variances are at most those of
-            ``compare``.
-        """
+        """Return beta and x for a ``share`` of independent rows: gain (n,) -> (b + d,)."""
         gain = np.ones(len(self._logged.rows)) if gain is None else gain
         return self._minimum(self._both(gain), self._level(gain))
 
     def residual_ratios(self, theta: Array) -> Array:
         """Return the joint residual of both runs over that of separate fits, shape (n,) [-].
 
-        Args:
-            theta: beta and x, shape (b + d,), of runs without unknown gains.
-
-        Returns:
-            Ratios of sums of squares, at least 1. They are large if the runs differ by something
-            other than x.
+        theta (b + d,).
         """
         b = len(self.known)
         without, loaded = self._whole
@@ -149,15 +128,7 @@ class TwoRuns:
         return ratio
 
     def residual_ratios_by_scales(self, free: int) -> Array:
-        """Return these ratios if the runs differ by the scale of torques instead of x.
-
-        Args:
-            free: Number of the first elements of x that may differ in addition.
-
-        Returns:
-            The ratios with one scale for all torques or with one per joint, whichever have the
-            smaller mean.
-        """
+        """Return these ratios if the runs differ by the scale of torques instead of x."""
         (without, loaded), size = self._whole, len(self.known)
         one = np.ones(len(without.rows))
         beta = self._minimum(self._extended(without, 0, one, None), self._level(one))[0][:size]
@@ -245,13 +216,7 @@ class TwoRuns:
     ) -> Factors:
         """Return factors with the columns of beta, x and the unknown gains.
 
-        Args:
-            run: Factors of rows of one run, base parameters.
-            loaded: 1 of the loaded run, 0 of the reference.
-            gain: Gains, shape (n,).
-            at: Parameters beta and x of the gains' columns -W (beta + c + D x), shape (b + d,);
-                None: no such columns.
-            is_start: Whether the gains' columns are -i instead.
+        gain (n,), at (b + d,).
         """
         S, c = np.hstack([np.eye(len(self.known)), loaded * self.D]), loaded * self.known
         unknown = self.unknown.tolist() if at is not None or is_start else []
@@ -351,18 +316,7 @@ def payload_runs(
     The robot's inertias are the same in both runs. Friction and offsets of the drives differ,
     because they change with load and temperature.
 
-    Args:
-        reference: The segments of the run without payloads.
-        loaded: The segments of the run with payloads.
-        layout: The robot's standard parameters.
-        K: Map to the base parameters, shape (b, p).
-        urdf: Standard parameters of the URDF, shape (p,).
-        spread: Their prior standard deviations, shape (p,).
-        payloads: Map from the payloads' parameters to the base parameters, shape (b, c); known
-            values of the parameters, NaN if unknown, shape (c,); and their plausible sizes, shape
-            (c,).
-        share: Share of independent rows [-].
-        unknown: Joints whose torque is a current of unknown gain.
+    K (b, p), urdf (p,), spread (p,), payloads (b, c).
     """
     columns, known, size = payloads
     changing = [not term.is_inertia for _, term in layout.drive_parameters]

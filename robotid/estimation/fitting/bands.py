@@ -26,20 +26,6 @@ if TYPE_CHECKING:
     from robotid.estimation.fitting.evaluation import Evaluation
     from robotid.estimation.fitting.fitted import Fit
 
-__all__ = [
-    "QUANTILE",
-    "FrictionCurve",
-    "TorqueBand",
-    "expected_band",
-    "fitted_moments",
-    "friction_curve",
-    "next_errors",
-    "recording_bands",
-    "rms_error",
-    "torque_band",
-    "typical_friction",
-]
-
 #: Half-width of a 95 % band in standard deviations.
 QUANTILE = 1.96
 _COVERAGE = 0.95
@@ -70,13 +56,7 @@ class TorqueBand:
     def coverage(self, tau: Array, prediction: Array, mask: Array) -> Array:
         """Return the share of each joint's torques in the 95 % band, shape (n_rows,) [-].
 
-        Args:
-            tau: Measured torques of the whole trajectory, shape (N, n_rows) [N m, N].
-            prediction: Predicted torques, shape (N, n_rows) [N m, N].
-            mask: Rows used, shape (N, n_rows), bool.
-
-        Returns:
-            The shares; NaN for a joint without rows.
+        tau (N, n_rows) [N m, N], prediction (N, n_rows) [N m, N], mask (N, n_rows).
         """
         used = mask[self.samples]
         error = np.abs(tau[self.samples] - prediction[self.samples])
@@ -99,14 +79,7 @@ def torque_band(
     Its variance is diag(W C W^T) + sum (W x + z)^2. Each pair (x, z) is an error that changes the
     base parameters by x and, together with them, the torque by z.
 
-    Args:
-        model: The robot.
-        mapping: Standard to base parameters.
-        trajectory: N samples.
-        covariance: Covariance of the base parameters, shape (b, b), finite.
-        noise: Standard deviation of the torque residual, shape (n_rows,) [N m, N].
-        errors: Function of k sample indices that returns the pairs x, shape (b,), and z, shape
-            (k, n_rows).
+    covariance (b, b), noise (n_rows,) [N m, N], errors (b,).
     """
     count = len(trajectory.t)
     samples = np.unique(np.linspace(0, count - 1, min(count, _MOST)).round().astype(int))
@@ -124,11 +97,7 @@ def expected_band(
 ) -> TorqueBand:
     """Return the torque band of a recording by the fit's noise level, not by its own residual.
 
-    Args:
-        found: The fit.
-        evaluation: The recording.
-        between: Covariance of the standard parameters in another log, in addition to that of the
-            fit, shape (p, p); None: 0.
+    between (p, p).
     """
     K, motion = found.mapping.K, evaluation.recording.trajectory
     moves = np.array([term.moves for term in found.open_terms]).reshape(-1, K.shape[1])
@@ -146,20 +115,13 @@ def next_errors(found: "Fit") -> Array:
     """Return the expected RMS torque error of the next log, shape (n_rows,) [N m, N].
 
     Its motion is like that of the fitted logs, and its drives vary like theirs.
-
-    Args:
-        found: A fit of three or more logs.
     """
     bands = [expected_band(found, evaluation, found.between) for evaluation in found.fitted]
     return rms_error(bands)
 
 
 def rms_error(bands: Sequence[TorqueBand]) -> Array:
-    """Return the expected RMS error of predicted torques, shape (n_rows,) [N m, N].
-
-    Args:
-        bands: Bands of one or more recordings.
-    """
+    """Return the expected RMS error of predicted torques, shape (n_rows,) [N m, N]."""
     return np.asarray(np.sqrt(np.mean(np.vstack([b.total for b in bands]) ** 2, axis=0)))
 
 
@@ -170,9 +132,6 @@ def recording_bands(found: "Fit") -> tuple[TorqueBand, ...]:
     same kind, fitted or validation. For validation recordings it is the prediction error on new
     motion, and the band covers further motions as it covers these (split conformal prediction, Lei
     et al. 2018, doi:10.1080/01621459.2017.1307116, with the parameters' part as the lower bound).
-
-    Args:
-        found: The fit.
     """
     evaluations = (*found.fitted, *found.validation)
     is_fitted = [k < len(found.fitted) or e.is_refitted for k, e in enumerate(evaluations)]
@@ -261,16 +220,7 @@ def typical_friction(
 
     See ``friction_curve``.
 
-    Args:
-        found: The fit.
-        joint: The joint of the drive, or the name of a coupling.
-        v: Speeds, shape (k,) [rad/s or m/s]; None: 20 in each direction, from the slowest to the
-            fastest speed of the fitted rows.
-        q: Position [rad or m]; None: the median.
-        load: Joint load torque [N m or N]; None: its RMS if the friction depends on it, else 0.
-
-    Raises:
-        DataError: If there is no such drive, or no speeds are given and the drive was at rest.
+    v (k,) [rad/s or m/s].
     """
     layout, d = found.model.layout, _drive_number(found, joint)
     ratios, first = layout.drive_ratios[d], found.model.n_rows - len(found.model.joints)
@@ -305,11 +255,7 @@ def typical_friction(
 
 
 def fitted_moments(found: "Fit") -> dict[str, DriveMoments]:
-    """Return the moments that project drive friction on simpler terms, from the fitted rows.
-
-    Args:
-        found: The fit.
-    """
+    """Return the moments that project drive friction on simpler terms, from the fitted rows."""
     rows = ((e.recording.trajectory, e.recording.mask) for e in found.fitted)
     return drive_moments(found.model, rows)
 
@@ -321,15 +267,7 @@ def friction_curve(
 
     Friction terms with an internal state have their value after long motion in one direction.
 
-    Args:
-        found: The fit.
-        joint: The joint of the drive, or the name of a coupling.
-        v: Speeds, shape (k,) [rad/s or m/s].
-        q: Position, for friction that depends on it [rad or m].
-        load: Joint load torque, for friction that depends on it [N m or N].
-
-    Raises:
-        DataError: If there is no such drive.
+    v (k,) [rad/s or m/s].
     """
     layout, d = found.model.layout, _drive_number(found, joint)
     none = np.zeros_like(v)

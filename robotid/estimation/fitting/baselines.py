@@ -7,8 +7,6 @@ from robotid.dynamics.base_parameters import BaseMapping
 from robotid.dynamics.factors import Factors
 from robotid.robot.model import RobotModel
 
-__all__ = ["urdf_with_drives"]
-
 
 def urdf_with_drives(
     model: RobotModel, mapping: BaseMapping, factors: Factors, sigma: Array, spread: Array
@@ -18,12 +16,7 @@ def urdf_with_drives(
     Weighted least squares of the drive terms d >= 0 (offsets of either sign) with the bodies' pi_I
     as in the URDF: min sum_j |R_j K_I pi_I + R_j K_D d - tau_j|^2 / sigma_j^2.
 
-    Args:
-        model: The robot, with the URDF's parameters.
-        mapping: Standard to base parameters.
-        factors: Triangular factors of the fitted rows, base parameters.
-        sigma: Noise level per joint, shape (n,) [N m or N].
-        spread: Prior standard deviation of each standard parameter, shape (p,); its scale.
+    sigma (n,) [N m or N], spread (p,).
     """
     from scipy.optimize import lsq_linear
 

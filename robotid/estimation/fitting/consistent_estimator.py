@@ -22,8 +22,6 @@ from robotid.robot.bodies import held_parameters, negligible_bodies
 from robotid.robot.geometry import body_boxes, geometry_half_spaces
 from robotid.robot.model import RobotModel
 
-__all__ = ["Known", "consistent_fit", "make_constraints", "pinned_links"]
-
 _FOLDS = 6  # of the cross-validation, prior_weight = "cv"
 
 
@@ -56,16 +54,7 @@ class Known:
 def consistent_fit(
     settings: BoundedSettings, known: Known, *, pins_negligible: bool = True
 ) -> Consistent:
-    """Return the physically consistent estimator, which can also project an estimate.
-
-    Args:
-        settings: The settings.
-        known: The robot and its prior.
-        pins_negligible: Whether links of negligible mass keep the URDF's values.
-
-    Raises:
-        SettingsError: If constraints contradict each other or do not match the robot.
-    """
+    """Return the physically consistent estimator, which can also project an estimate."""
     bounds, weight, model = settings.bounds, settings.prior_weight, known.model
     geometry = geometry_half_spaces(model, bounds.com_within)
     extent = body_boxes(model) if bounds.extent == "box" else {}
@@ -108,12 +97,7 @@ def consistent_fit(
 
 
 def pinned_links(bounds: ConstraintSettings, model: RobotModel) -> tuple[str, ...]:
-    """Return the links that keep the URDF's values: those stated, and those of negligible mass.
-
-    Args:
-        bounds: The constraints of the job; a link with bounds of its own is free.
-        model: The robot.
-    """
+    """Return the links that keep the URDF's values: those stated, and those of negligible mass."""
     bounded = {*bounds.pinned, *bounds.mass, *bounds.com}
     return (*bounds.pinned, *(x for x in negligible_bodies(model) if x not in bounded))
 
@@ -123,14 +107,7 @@ def make_constraints(
     geometry: Mapping[str, tuple[Array, Array]],
     extent: Mapping[str, Array] = MappingProxyType({}),
 ) -> Constraints:
-    """Return the constraints in the form that the estimator needs.
-
-    Args:
-        bounds: The constraints of the job.
-        geometry: Half-spaces A c <= b of the centres of mass from the URDF's geometry, by name of
-            the body; boxes in ``com`` replace them.
-        extent: Box that contains all mass of each body, by name of the body.
-    """
+    """Return the constraints in the form that the estimator needs."""
     A = np.vstack([np.eye(3), -np.eye(3)])
     com, extents = dict(geometry), dict(extent)
     for name, (low, high) in bounds.boxes.items():

@@ -15,25 +15,6 @@ if TYPE_CHECKING:
     from robotid.estimation.estimators import BatchEstimator, RecursiveEstimator
     from robotid.estimation.fitting.consistent_estimator import Known
 
-__all__ = [
-    "ESTIMATORS",
-    "BoundedSettings",
-    "ConsistentSettings",
-    "ConstraintSettings",
-    "DescentSettings",
-    "EstimatorSettings",
-    "GradientSettings",
-    "KalmanSettings",
-    "LogCholeskySettings",
-    "OLSSettings",
-    "PRXSettings",
-    "RLSSettings",
-    "RecursiveSettings",
-    "SimulationSettings",
-    "TLSSettings",
-    "WLSSettings",
-]
-
 _NOT_NEGATIVE = Range("x >= 0", lambda x: x >= 0)
 _COUNT = Range("1 to 10000", lambda x: 1 <= x <= 10_000)
 _LARGEST = 1e9  # [kg] or [m] of bounds, as of numbers in a URDF

@@ -20,17 +20,6 @@ from robotid.estimation.fitting.survey import PieceTask, SurveyedLog
 from robotid.estimation.workers.plan import WorkPlan
 from robotid.robot.model import RobotModel
 
-__all__ = [
-    "Evaluation",
-    "Extent",
-    "Recording",
-    "evaluate_logs",
-    "hidden_joints",
-    "pool",
-    "predict",
-    "shares_rows",
-]
-
 _SHOWN = 10_000  # samples at the start, in the middle and at the end that are stored for plots
 _SAMPLED = 200  # rows spread over a log that are searched for in other logs
 _SHARED = 0.02  # share of them that another log may contain: adjacent windows share a row
@@ -121,22 +110,7 @@ def evaluate_logs(
 ) -> tuple[tuple[Evaluation, ...], tuple[Evaluation, ...]]:
     """Return the torques that parameters predict for logs, and their metrics.
 
-    Args:
-        fitted: Logs that were fitted, surveyed with the model that predicts.
-        validation: Validation logs.
-        parameters: Standard parameters by name, each of shape (p,).
-        prior: Parameters of the URDF, shape (p,): the baselines are its torque with and without
-            motion; None: no baselines.
-        driven: Parameters of the URDF with drives fitted to the logs, shape (p,), a baseline;
-            None: no such baseline.
-        plan: Processes that work on the pieces of logs in files; None: this process.
-
-    Returns:
-        Evaluations of the fitted logs and of the validation logs. For logs in files the torques
-        are those of the segments stored for plots.
-
-    Raises:
-        DataError: If no row of a log is used.
+    parameters (p,), prior (p,), driven (p,).
     """
     work = partial(_score, parameters=parameters, prior=prior, driven=driven)
     other = _score_logs(validation, work, plan)
@@ -147,31 +121,13 @@ def evaluate_logs(
 
 
 def shares_rows(one: Log, other: Log) -> bool:
-    """Return whether two logs contain the same recorded rows, whatever the names of their files.
-
-    Args:
-        one: A log.
-        other: Another log of the same joints.
-
-    Returns:
-        Whether the second log contains more than 2 % of 200 rows of positions and torques spread
-        over the first. The common row of two adjacent windows does not count.
-    """
+    """Return whether two logs contain the same recorded rows, whatever the names of their files."""
     rows, others = (np.hstack([log.q, log.tau]) for log in (one, other))
     return _is_shared(_rows_in(rows[:: _sampled_every(len(rows))], others))
 
 
 def pool(model: RobotModel, evaluations: Sequence[Evaluation], name: str) -> Metrics:
-    """Return the metrics over several recordings together.
-
-    Args:
-        model: The robot.
-        evaluations: The recordings, at least one.
-        name: Which parameters predict.
-
-    Raises:
-        DataError: If no row of any recording is used.
-    """
+    """Return the metrics over several recordings together."""
     together = reduce(TorqueSums.merge, [evaluation.sums[name] for evaluation in evaluations])
     return together.metrics(model.row_names, model.row_units)
 
@@ -180,10 +136,6 @@ def hidden_joints(model: RobotModel, evaluations: Sequence[Evaluation]) -> tuple
     """Return the joints of a static model whose gravity torque is smaller than their residual.
 
     Stiction at rest hides small changes of the gravity torque of these joints.
-
-    Args:
-        model: The robot.
-        evaluations: The recordings.
     """
     if not model.is_static or not evaluations:
         return ()

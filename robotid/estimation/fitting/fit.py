@@ -39,25 +39,13 @@ from robotid.estimation.fitting.zeros import sums_with_zeros
 from robotid.estimation.variation.groups import FEWEST_RUNS, RunSums, runs_of, sums_of
 from robotid.robot.prior import prior_spread
 
-__all__ = [
-    "Solved",
-    "fit_recordings",
-    "rough_choice",
-    "solve_recordings",
-    "sums_of_logs",
-]
-
 _MOST_LOADS = 20  # largest number of fits until the joint load torque has converged
 _DAMPED = 3  # number of fits after which only half of each change is applied
 _SETTLED = 1e-3  # change of the torque, relative to it, at which the fits have converged
 
 
 def rough_choice(choice: EstimatorSettings) -> EstimatorSettings:
-    """Return faster settings of the estimator, for fits whose residual only is used.
-
-    Args:
-        choice: The settings of the estimator.
-    """
+    """Return faster settings of the estimator, for fits whose residual only is used."""
     if not isinstance(choice, BoundedSettings):
         return choice
     weight = 1.0 if isinstance(choice.prior_weight, str) else choice.prior_weight
@@ -65,34 +53,14 @@ def rough_choice(choice: EstimatorSettings) -> EstimatorSettings:
 
 
 def fit_recordings(recordings: Recordings, choice: EstimatorSettings) -> Fit:
-    """Return the fit of a robot's parameters to recordings.
-
-    Args:
-        recordings: The recordings.
-        choice: Settings of the estimator.
-
-    Raises:
-        DataError: If a row of a log cannot be used.
-        RankDeficientError: If the estimator is "ols" or "wls" and parameters are not identifiable.
-        NotConvergedError: If a solver fails.
-    """
+    """Return the fit of a robot's parameters to recordings."""
     return solve_recordings(recordings, choice).with_errors()
 
 
 def solve_recordings(
     recordings: Recordings, choice: EstimatorSettings, *, is_last: bool = True
 ) -> "Solved":
-    """Return the parameters fitted to recordings, before their standard errors are computed.
-
-    Args:
-        recordings: The recordings.
-        choice: Settings of the estimator.
-        is_last: Whether the bias due to position quantisation is corrected and bounds that the
-            data contradict are tested on held-out segments; False for intermediate fits.
-
-    Raises:
-        DataError, RankDeficientError, NotConvergedError: As in ``fit_recordings``.
-    """
+    """Return the parameters fitted to recordings, before their standard errors are computed."""
     recordings = _under_own_load(recordings, choice)
     ground = _ground(recordings, choice, is_last=is_last)
     if is_last:
@@ -247,16 +215,7 @@ def sums_of_logs(
 ) -> RunSums:
     """Return the sums of logs that are not fitted, about the parameters of a fit to others.
 
-    Args:
-        recordings: The logs, in the place of fitted ones, of the robot of the fit.
-        choice: Settings of the estimator.
-        standard: Standard parameters of the fit, shape (p,).
-        sigma: Its noise level per joint, shape (n,) [N m or N].
-        shift: Bias of the base parameters that it corrects, shape (b,).
-
-    Raises:
-        DataError: If a row of a log cannot be used.
-        NotConvergedError, SettingsError: As of ``reweigh``.
+    standard (p,), sigma (n,) [N m or N], shift (b,).
     """
     model, mapping = recordings.model, recordings.mapping
     if choice.is_robust:

@@ -40,8 +40,6 @@ from robotid.robot.mass_matrix import MassMatrixCheck, check_mass_matrix
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
 
-__all__ = ["Fit", "Solution"]
-
 _KNOWN = 1e-300  # smallest prior standard deviation, of fixed parameters
 _STAYED = 0.3  # change in prior standard deviations up to which the source may be the prior
 _WORSE = 1.2  # error of WLS over that of the estimate above which it is clearly worse

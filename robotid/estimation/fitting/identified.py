@@ -14,8 +14,6 @@ from robotid.dynamics.friction_projection import DriveMoments, projected_pinocch
 from robotid.dynamics.prediction import predict_instants
 from robotid.robot.model import RobotModel
 
-__all__ = ["FROM_DATA", "FROM_PRIOR", "SOURCES", "Identified", "sources_of"]
-
 #: The possible sources of the value of a standard parameter.
 SOURCES = ("data", "mixed", "prior", "bound")
 FROM_DATA = 0.3  # standard error over prior standard deviation below which the source is the data
@@ -25,10 +23,7 @@ FROM_PRIOR = 0.9  # ... and above which it is the prior
 def sources_of(share: Array, is_prior: Array, is_bound: Array) -> tuple[str, ...]:
     """Return the source of the value of each parameter, of ``SOURCES``.
 
-    Args:
-        share: Standard error over prior standard deviation, shape (p,) [-].
-        is_prior: Which parameters keep the prior's value, shape (p,), bool.
-        is_bound: Which of the others are at a bound, shape (p,), bool.
+    share (p,) [-], is_prior (p,), is_bound (p,).
     """
     names = np.select([is_prior, is_bound, share < FROM_DATA], ["prior", "bound", "data"], "mixed")
     return tuple(names.tolist())

@@ -14,8 +14,6 @@ from robotid.estimation.fitting.evaluation import Recording
 from robotid.robot.drives import DriveMotion
 from robotid.robot.model import RobotModel
 
-__all__ = ["JointMotion", "joint_motions", "travelled"]
-
 
 @dataclass(frozen=True, eq=False)
 class JointMotion:
@@ -51,19 +49,14 @@ class JointMotion:
     def steady(cls, motion: DriveMotion) -> "JointMotion":
         """Return the motion of a joint after long motion at constant speed, the others at rest.
 
-        Args:
-            motion: Motion of its drive, arrays of shape (N,).
+        motion (N,).
         """
         none, far = np.zeros_like(motion.v), np.full_like(motion.v, np.inf)
         m = motion
         return cls(m.q, m.v, m.a, m.direction, m.load, travelled=far, time=none)
 
     def at(self, rows: slice) -> "JointMotion":
-        """Return the motion in some of the rows, without the other joints.
-
-        Args:
-            rows: The rows.
-        """
+        """Return the motion in some of the rows, without the other joints."""
         q, v, a, direction, load = (
             x[rows] for x in (self.q, self.v, self.a, self.direction, self.load)
         )
@@ -76,11 +69,7 @@ def joint_motions(
 ) -> tuple[JointMotion, ...]:
     """Return the motion of each joint and its neighbours in some rows of recordings.
 
-    Args:
-        recordings: The recordings.
-        rows: Indices of the rows of each recording, N in total.
-        load: Torque of the bodies in these rows, shape (N, n) [N m or N].
-        model: The robot.
+    load (N, n) [N m or N].
     """
     motions = [recording.trajectory for recording in recordings]
     passes = max(recording.signals.cutoff or np.inf for recording in recordings)
@@ -114,11 +103,7 @@ def _directions(model: RobotModel, motion: Trajectory) -> Array:
 
 
 def travelled(motion: Trajectory) -> Array:
-    """Return the distance of each joint since its last reversal, shape (N, n) [rad or m].
-
-    Args:
-        motion: The motion, N rows.
-    """
+    """Return the distance of each joint since its last reversal, shape (N, n) [rad or m]."""
     is_first = np.diff(motion.segment, prepend=motion.segment[0] - 1) != 0
     n = len(motion.joints)
     q, v = (x[:, x.shape[1] - n :] for x in (motion.q, motion.v))

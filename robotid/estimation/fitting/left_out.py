@@ -11,8 +11,6 @@ from robotid.estimation.fitting.evaluation import Evaluation
 from robotid.estimation.fitting.metrics import Metrics, TorqueSums
 from robotid.robot.model import RobotModel
 
-__all__ = ["FEWEST_LEFT_OUT", "LEFT_OUT", "left_out_metrics", "logs_that_test"]
-
 #: End of the name of a log that a fit to the others predicts.
 LEFT_OUT = ", left out of the fit"
 
@@ -31,16 +29,7 @@ def left_out_metrics(
 
     Logs that repeat the motion of one another are left out together.
 
-    Args:
-        model: The robot.
-        logs: Factors of the segments of each log, base parameters.
-        fitted: The logs in the same order, in memory.
-        fit: Returns standard parameters fitted to the rows of some logs, shape (p,), and those of
-            the URDF with drives fitted to them.
-
-    Returns:
-        The metrics. None for fewer than three different motions, for logs of which only parts are
-        in memory, and for a log whose motion alone determines a parameter that the fit needs.
+    fit (p,).
     """
     if any(e.recording.is_partial for e in fitted):
         return {}
@@ -68,10 +57,6 @@ def left_out_metrics(
 
 
 def logs_that_test(names: Collection[str]) -> str:
-    """Return what the logs are that test a prediction, as text.
-
-    Args:
-        names: Their names.
-    """
+    """Return what the logs are that test a prediction, as text."""
     is_left_out = bool(names) and all(name.endswith(LEFT_OUT) for name in names)
     return "logs left out of the fit in turn" if is_left_out else "validation logs"

@@ -9,8 +9,6 @@ import numpy as np
 from robotid.base.exceptions import DataError
 from robotid.base.typing import Array
 
-__all__ = ["JointMetrics", "Metrics", "TorqueSums"]
-
 
 @dataclass(frozen=True)
 class JointMetrics:
@@ -93,11 +91,7 @@ class TorqueSums:
     ) -> "TorqueSums":
         """Return the sums over the rows used.
 
-        Args:
-            tau: Measured torque, shape (N, n) [N m, N].
-            prediction: Predicted torque, shape (N, n) [N m, N].
-            mask: Rows used, shape (N, n), bool.
-            baselines: Other predictions to compare with, by name, each of shape (N, n).
+        tau (N, n) [N m, N], prediction (N, n) [N m, N], mask (N, n), baselines (N, n).
         """
         rows = mask.sum(axis=0)
         mean = np.sum(tau, axis=0, where=mask) / np.maximum(rows, 1)
@@ -117,9 +111,6 @@ class TorqueSums:
     def merge(self, other: "TorqueSums") -> "TorqueSums":
         """Return the sums over the rows of both.
 
-        Args:
-            other: Sums over other rows of the same joints, with the same baselines.
-
         References:
             Chan, Golub, LeVeque (1983), Algorithms for Computing the Sample Variance, (2.1).
         """
@@ -136,15 +127,7 @@ class TorqueSums:
         )
 
     def metrics(self, names: Sequence[str], units: Sequence[str]) -> Metrics:
-        """Return the metrics computed from the sums.
-
-        Args:
-            names: Names of the n joints.
-            units: Units of their torques.
-
-        Raises:
-            DataError: If no row is used at all.
-        """
+        """Return the metrics computed from the sums."""
         if not self.rows.any():
             raise DataError(
                 "the prediction error cannot be computed, 0 torque rows are used: no joint moves "

@@ -16,8 +16,6 @@ from robotid.robot.drives import DriveMotion
 if TYPE_CHECKING:
     from robotid.estimation.fitting.fitted import Fit
 
-__all__ = ["OpenTerm", "open_torques"]
-
 
 @dataclass(frozen=True, eq=False)
 class OpenTerm:
@@ -38,13 +36,7 @@ class OpenTerm:
 def open_torques(found: "Fit", evaluation: "Evaluation", rows: Array) -> list[Array]:
     """Return the torque of each open term of the drives along a recording.
 
-    Args:
-        found: The fit.
-        evaluation: The recording.
-        rows: Indices of its samples, shape (k,), int.
-
-    Returns:
-        The torque of each of ``open_terms``, shape (k, n_rows) [N m or N].
+    rows (k,) -> (k, n_rows) [N m or N].
     """
     if not found.open_terms:
         return []

@@ -17,8 +17,6 @@ from robotid.estimation.fitting.survey import ReducedPiece, SurveyedLog
 from robotid.estimation.workers.plan import WorkPlan
 from robotid.robot.model import RobotModel
 
-__all__ = ["Recordings", "RepeatedErrors"]
-
 _SEGMENTS = 48  # of all logs in memory: enough to estimate the scatter of their scores
 _CORRELATIONS = 10  # shortest segment, in correlation times of filtered noise
 _SEGMENTS_IN_FILE = 64  # largest number of segments of a log in a file
@@ -93,11 +91,7 @@ class Recordings:
         return [ReducedPiece(piece, self.mapping) for log in self.fitted for piece in log.pieces]
 
     def with_model(self, model: RobotModel) -> "Recordings":
-        """Return the same logs for a robot whose drives have other terms or another load.
-
-        Args:
-            model: The robot, with the same bodies, joints and couplings.
-        """
+        """Return the same logs for a robot whose drives have other terms or another load."""
         is_same = model.layout == self.model.layout
         plain = None if self.model.layout.own else self.mapping
         return replace(
@@ -109,27 +103,11 @@ class Recordings:
         )
 
     def reduce(self, *, is_cut: bool = True) -> tuple[Reduction, ...]:
-        """Return the reductions of all logs to fit, in one sequence.
-
-        Args:
-            is_cut: As of ``reduce_logs``.
-        """
+        """Return the reductions of all logs to fit, in one sequence."""
         return tuple(chain.from_iterable(self.reduce_logs(is_cut=is_cut)))
 
     def reduce_logs(self, *, is_cut: bool = True) -> tuple[tuple[Reduction, ...], ...]:
-        """Reduce the logs to fit.
-
-        Args:
-            is_cut: Whether logs in memory are cut into segments, which standard errors need.
-
-        Returns:
-            Per log one reduction per segment, in order of time. A segment of a log in memory is
-            longer than the correlation time of filtered noise; a segment of a log in a file
-            consists of neighbouring pieces.
-
-        Raises:
-            DataError: If a row cannot be used, or no segment of a log is long enough.
-        """
+        """Reduce the logs to fit."""
         if self.is_in_memory:
             for log in (*self.fitted, *self.validation):  # raises errors before any fit
                 keep_inertial_rows(self.model, log.whole.trajectory)
@@ -149,14 +127,7 @@ class Recordings:
         return tuple(reductions)
 
     def problem(self, *, with_mass: bool = False) -> Problem:
-        """Return the rows of the logs to fit, for estimators that read them in order of time.
-
-        Args:
-            with_mass: Whether each sample also has the regressor of its mass matrix.
-
-        Returns:
-            The base problem. Logs in files are read again, in blocks, in each pass.
-        """
+        """Return the rows of the logs to fit, for estimators that read them in order of time."""
         if self.is_in_memory:
             motions = [log.whole.trajectory for log in self.fitted]
             return concatenate([self.problem_of(k, x, with_mass) for k, x in enumerate(motions)])
@@ -188,34 +159,17 @@ class Recordings:
         )
 
     def segments(self, k: int, motion: Trajectory, joined: int = 1) -> tuple[Factors, ...]:
-        """Return the factors of each segment of a log in memory, with the segments of ``reduce``.
-
-        Args:
-            k: Index of the log in ``fitted``.
-            motion: Its smoothed motion, or another motion with the same number of samples; the
-                rows used and their weights are those of the log.
-            joined: Number of segments that are joined into one.
-        """
+        """The factors of each segment of a log in memory, with the segments of ``reduce``."""
         return compress_segments(self.problem_of(k, motion), joined * self.segment_length(k))
 
     def problem_of(self, k: int, motion: Trajectory, with_mass: bool = False) -> Problem:
-        """Return the weighted rows of a log in memory for a motion of the same length.
-
-        Args:
-            k: Index of the log in ``fitted``.
-            motion: Its motion, or another one of the same length.
-            with_mass: As of ``problem``.
-        """
+        """Return the weighted rows of a log in memory for a motion of the same length."""
         mask = self.fitted[k].whole.mask
         weight = mask if self.weights is None else mask * self.weights[k]
         return base_problem(self.model, self.mapping, motion, weight, with_mass=with_mass)
 
     def segment_length(self, k: int) -> int:
-        """Return the samples of each segment of a log in memory.
-
-        Args:
-            k: Index of the log in ``fitted``.
-        """
+        """Return the samples of each segment of a log in memory."""
         samples, count = len(self.fitted[k].whole.trajectory.t), -(-_SEGMENTS // len(self.fitted))
         shortest = round(_CORRELATIONS / independent_share(self.fitted[k].signals))
         if self.model.is_static:  # means of segments, not filtered

@@ -47,16 +47,6 @@ from robotid.estimation.fitting.survey import SurveyedLog, hold_log
 if TYPE_CHECKING:
     from robotid.estimation.fitting.fitted import Fit
 
-__all__ = [
-    "RegressorNoise",
-    "acceleration_noise",
-    "encoder_findings",
-    "find_regressor_noise",
-    "rounding_errors",
-    "smoothed",
-    "without_noise",
-]
-
 _FEWEST, _MOST = 4, 6  # pairs of rounding errors
 _PRECISE = 0.2  # uncertainty of the shift in standard errors at which no more pairs are drawn
 _WORST = 0.8  # largest share of noise in a direction that is corrected
@@ -98,8 +88,7 @@ class RegressorNoise:
     def uncorrected(self, information: Array) -> "RegressorNoise":
         """Return the same with the shift counted as an error instead of corrected.
 
-        Args:
-            information: H = W^T S^-1 W of all rows, shape (b, b).
+        information (b, b).
         """
         score = information @ self.shift
         return replace(self, meat=self.meat + np.outer(score, score), is_corrected=False)
@@ -110,12 +99,7 @@ def find_regressor_noise(
 ) -> RegressorNoise | None:
     """Return the effect of position quantisation on least squares; None if it is negligible.
 
-    Args:
-        recordings: The recordings. Logs in files are represented by their windows in memory.
-        whole: Reduction of all of their rows, base parameters.
-        theta: Base parameters by least squares, shape (b,).
-        sigma: Noise level per joint that weighted the rows, shape (n_rows,) [N m or N].
-        level: Noise level per joint of the residual, shape (n_rows,) [N m or N].
+    theta (b,), sigma (n_rows,) [N m or N], level (n_rows,) [N m or N].
     """
     model, factors, weights = recordings.model, whole.factors, 1.0 / sigma**2
     if model.is_static or model.free_flyer:
@@ -155,11 +139,7 @@ def find_regressor_noise(
 
 
 def encoder_findings(fit: "Fit") -> list[Finding]:
-    """Return a finding if encoder quantisation biases inertial parameters.
-
-    Args:
-        fit: The fit.
-    """
+    """Return a finding if encoder quantisation biases inertial parameters."""
     noise, model = fit.regressor_noise, fit.model
     if noise is None:
         return []
@@ -200,10 +180,7 @@ def smoothed(q: Array, steps: Array, width: int) -> Array:
 
     A cubic polynomial is fitted to the rows around each sample; the change is at most one step.
 
-    Args:
-        q: Unwrapped positions, shape (N, n) [rad or m].
-        steps: Quantisation steps of the encoders, shape (n,) [rad or m]; 0: none.
-        width: Number of rows over which the motion is approximated by a cubic, not even.
+    q (N, n) [rad or m], steps (n,) [rad or m].
     """
     rows = (len(q) - 1) // 2 * 2 + 1
     smooth = local_polynomial(q, min(width, rows), min(3, rows - 1))
@@ -214,10 +191,7 @@ def smoothed(q: Array, steps: Array, width: int) -> Array:
 def rounding_errors(q: Array, steps: Array, rng: np.random.Generator) -> Array:
     """Return rounding errors of encoders with random zeros, shape (N, n) [rad or m].
 
-    Args:
-        q: Positions before quantisation, shape (N, n) [rad or m].
-        steps: Quantisation steps of the encoders, shape (n,) [rad or m]; 0: none.
-        rng: Random generator of the zeros.
+    q (N, n) [rad or m], steps (n,) [rad or m].
     """
     count = q / np.where(steps > 0, steps, 1.0) + rng.random(q.shape[1])
     errors: Array = (np.round(count) - count) * steps
@@ -227,15 +201,7 @@ def rounding_errors(q: Array, steps: Array, rng: np.random.Generator) -> Array:
 def without_noise(bread: Array, D: Array, D_theta: Array) -> tuple[Array, Array, Array]:
     """Return (H - D)^-1 D theta along directions in which H and D are diagonal.
 
-    Args:
-        bread: Inverse of the information H, shape (b, b); 0 for parameters not identifiable.
-        D: Noise of H, shape (b, b).
-        D_theta: D theta, shape (b,).
-
-    Returns:
-        The directions, columns X with X X^T = H^-1 and X^T D X diagonal, shape (b, b); the step
-        along each, with a share of noise of at most 80 %, shape (b,); and the uncertainty of the
-        step due to that of D, shape (b,).
+    bread (b, b), D (b, b), D_theta (b,) -> (b, b), (b,), (b,).
     """
     size, axes = np.linalg.eigh(bread)
     root = axes * np.sqrt(np.maximum(size, 0.0))
@@ -252,10 +218,6 @@ def acceleration_noise(step: float, signals: SignalSettings) -> float:
     differences:
 
     1 / (1 + (tan(pi f step) / tan(pi cutoff step))^(2 order)) and (sin(2 pi f step) / step)^2.
-
-    Args:
-        step: Time step of the rows [s].
-        signals: The settings, resolved.
     """
     f = (np.arange(_FREQUENCIES) + 0.5) / (2 * _FREQUENCIES * step)
     gain = (np.sin(2 * np.pi * f * step) / step) ** 2
@@ -283,8 +245,7 @@ class _Sums:
 def _is_enough(moves: Array) -> bool:
     """Return whether the shift of the parameters is known precisely, or is negligible.
 
-    Args:
-        moves: Shift in standard errors by each of k draws, shape (k, b).
+    moves (k, b).
     """
     count = len(moves)
     if count < _FEWEST:
@@ -350,9 +311,7 @@ def _repeated(linear: Array) -> Array:
 
     Segments with the same rounding errors do not scatter, but their errors add up.
 
-    Args:
-        linear: Part of the score linear in the rounding errors, of k draws, s segments and b
-            directions, shape (k, s, b).
+    linear (k, s, b).
     """
     total, scattered = linear.sum(axis=1) ** 2, (linear**2).sum(axis=1)
     more: Array = np.maximum(np.mean(total - scattered, axis=0), 0.0)

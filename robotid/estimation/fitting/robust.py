@@ -18,8 +18,6 @@ from robotid.estimation.fitting.recorded import Recordings
 from robotid.robot.drives import DriveMotion
 from robotid.robot.model import RobotModel
 
-__all__ = ["LOSSES", "Outlier", "find_outliers", "loss_slope", "loss_weight", "reweigh"]
-
 #: Losses with a bounded influence of each row, and their tuning constants in standard deviations,
 #: for an efficiency of 95 % under normal noise.
 LOSSES = {"huber": 1.345, "tukey": 4.685}
@@ -57,10 +55,6 @@ class Outlier:
 def loss_weight(loss: str, r: Array) -> Array:
     """Return the weights psi(r) / r of rows in the equivalent least squares problem, 0 to 1.
 
-    Args:
-        loss: "huber" or "tukey".
-        r: Residuals in standard deviations, any shape.
-
     References:
         Huber (1964), Robust estimation of a location parameter; Beaton, Tukey (1974), The fitting
         of power series.
@@ -74,12 +68,7 @@ def loss_weight(loss: str, r: Array) -> Array:
 
 
 def loss_slope(loss: str, r: Array) -> Array:
-    """Return psi'(r), the derivative of the loss's influence function, at most 1.
-
-    Args:
-        loss: "huber" or "tukey".
-        r: Residuals in standard deviations, any shape.
-    """
+    """Return psi'(r), the derivative of the loss's influence function, at most 1."""
     u = (r / LOSSES[loss]) ** 2
     slope: Array = np.where(u < 1.0, 1.0 if loss == "huber" else (1.0 - u) * (1.0 - 5.0 * u), 0.0)
     return slope
@@ -92,18 +81,7 @@ def reweigh(recordings: Recordings, loss: str, prior: Array) -> tuple[Recordings
     change. "tukey", which gives outliers a weight of 0, starts from the result of "huber", whose
     minimum is unique.
 
-    Args:
-        recordings: The recordings, in memory.
-        loss: "huber" or "tukey".
-        prior: Standard parameters of the URDF, shape (p,), for directions not identifiable.
-
-    Returns:
-        The recordings with their rows' weights, and the factor by which the weighted rows
-        underestimate standard errors [-].
-
-    Raises:
-        NotConvergedError: If the weights do not converge.
-        SettingsError: If the recordings are not in memory.
+    prior (p,).
     """
     if not recordings.is_in_memory:
         raise SettingsError(
@@ -147,14 +125,7 @@ def find_outliers(
     reverses in the filtered motion. A reversal is near if the filtered velocity has it within
     1 / cutoff [s], or would have it at the sample's acceleration.
 
-    Args:
-        model: The robot.
-        evaluations: Recordings with predicted torques "estimate".
-        standard: The estimate, shape (p,).
-
-    Returns:
-        Outliers of at least 12 times the joint's typical residual and 10 % of its RMS torque. Rows
-        within half a second of each other are one outlier.
+    standard (p,).
     """
     found: list[Outlier] = []
     step = _friction_step(model, standard)
@@ -178,15 +149,7 @@ def find_outliers(
 
 
 def _is_reversed(motion: Trajectory, near: float) -> Array:
-    """Return whether each velocity changes its sign within a time, before or after a sample.
-
-    Args:
-        motion: The motion, N samples.
-        near: The time [s].
-
-    Returns:
-        Shape (N, n_rows), bool. A change of sign between two segments is none.
-    """
+    """Return whether each velocity changes its sign within a time, before or after a sample."""
     t, found = motion.t, np.zeros(motion.v.shape, dtype=bool)
     within = (np.diff(motion.segment) == 0)[:, None]
     for j, changes in enumerate((within & (motion.v[1:] * motion.v[:-1] < 0.0)).T):

@@ -9,8 +9,6 @@ import numpy as np
 from robotid.base.typing import Array
 from robotid.robot.drives import FAMILIES, DriveTerm, Family
 
-__all__ = ["DriveChoice", "FoundShape", "Tried", "with_shapes"]
-
 _FARTHEST = 1.33  # largest factor by which a shape parameter changes in one step
 
 
@@ -94,9 +92,7 @@ class DriveChoice:
 
         No shape changes by more than a third.
 
-        Args:
-            step: Change of each shape, shape (k,).
-            covariance: Covariance of the changed shapes, shape (k, k).
+        step (k,), covariance (k, k).
         """
         flat = np.array([size for own in self.sizes for size in own])
         families = [FAMILIES[name] for name in self.families]
@@ -117,12 +113,7 @@ class DriveChoice:
         )
 
     def altered(self, which: int, share: float) -> tuple[DriveTerm, ...]:
-        """Return the terms with one of the shapes increased.
-
-        Args:
-            which: Index in ``shapes``.
-            share: Relative increase [-].
-        """
+        """Return the terms with one of the shapes increased."""
         flat = [(at, k) for at, own in enumerate(self.sizes) for k in range(len(own))]
         sizes = [list(own) for own in self.sizes]
         at, k = flat[which]
@@ -134,11 +125,6 @@ class DriveChoice:
 
 
 def with_shapes(families: Sequence[Family], flat: Array) -> list[tuple[Family, list[float]]]:
-    """Return each family with its shapes, from one array of all shapes.
-
-    Args:
-        families: The families.
-        flat: Shapes of all families in order, shape (k,).
-    """
+    """Return each family with its shapes, from one array of all shapes: flat (k,)."""
     sizes = iter(flat.tolist())
     return [(family, [next(sizes) for _ in family.shapes]) for family in families]

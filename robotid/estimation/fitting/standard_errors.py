@@ -19,15 +19,6 @@ from robotid.estimation.estimators import Consistent, Estimate
 from robotid.estimation.estimators.batch import solve_factor
 from robotid.estimation.estimators.segments import FEWEST_SEGMENTS, quantile, scatter
 
-__all__ = [
-    "Redraws",
-    "StandardErrors",
-    "about_prior",
-    "measured_errors",
-    "standard_of",
-    "with_wls_errors",
-]
-
 _LEAST_SOLVED = 0.8  # smallest share of the resampled fits that must be solved
 
 
@@ -91,25 +82,7 @@ def measured_errors(
       are neglected;
     * a filter with forgetting: its own covariance times the mean inflation.
 
-    Args:
-        estimate: Base parameters, shape (b,), or standard ones, shape (p,), with the covariance
-            for a ``share`` of independent rows.
-        segments: Factors of the segments, base parameters.
-        factors: Factors of all segments together.
-        share: Share of the rows that the covariance assumes to be independent [-].
-        K: Map to the base parameters, shape (b, p).
-        sigma: Noise level per joint that weighted the rows, shape (n,) [N m or N].
-        is_filter: Whether the estimator weights rows in another way, by forgetting or a gate.
-        weight_ratio: Weight of the prior over its plausible weight [-].
-        redraws: Resampling, for an estimate whose details name active bounds.
-        more: Covariance of the score in addition to the scatter, shape (b, b); None: 0.
-
-    Returns:
-        The estimate, and how its standard errors were computed. With fewer than 12 segments, the
-        given share of the rows is assumed to be independent.
-
-    Raises:
-        NotConvergedError: If more than a fifth of the resampled fits are not solved.
+    estimate (b,), K (b, p), sigma (n,) [N m or N], more (b, b).
     """
     b = len(factors.names)
     if not (estimate.details.get("active") and redraws is not None and redraws.draws > 0):
@@ -164,9 +137,7 @@ def with_wls_errors(estimate: Estimate, wls: Estimate) -> Estimate:
     A gradient method ends near the minimum of least squares. Its mean square error is the
     covariance of that minimum plus the square of the distance to it.
 
-    Args:
-        estimate: Base parameters, shape (b,).
-        wls: Weighted least squares of the same rows.
+    estimate (b,).
     """
     distance = estimate.theta - wls.theta
     covariance = wls.covariance + np.outer(distance, distance)
@@ -186,11 +157,7 @@ def standard_of(
 ) -> tuple[Array, Array]:
     """Return the standard parameters of an estimate and their covariance, prior included.
 
-    Args:
-        estimate: Base parameters, shape (b,), or standard ones, shape (p,).
-        mapping: Standard to base parameters.
-        prior: Standard parameters of the URDF, shape (p,).
-        spread: Their prior standard deviations, shape (p,).
+    estimate (b,), prior (p,), spread (p,).
     """
     if estimate.names == mapping.names:
         return estimate.theta, estimate.covariance
@@ -207,13 +174,7 @@ def about_prior(
 ) -> Array:
     """Return C (K^T meat K + weight_ratio L) C with L = C^-1 - share K^T R^T R K, shape (p, p).
 
-    Args:
-        C: Covariance of the standard parameters if a share of the rows is independent, (p, p).
-        K: Map to the base parameters, shape (b, p).
-        meat: Covariance of the score of these rows, shape (b, b).
-        R: Weighted factor of all rows, base parameters, shape (b, b).
-        share: Share of the rows that the covariance assumes to be independent [-].
-        weight_ratio: Weight of the prior over its plausible weight [-].
+    K (b, p), meat (b, b), R (b, b).
     """
     KC = K @ C
     RKC = R @ KC

@@ -41,17 +41,6 @@ from robotid.dynamics.velocity_choice import prefers_measured
 from robotid.estimation.workers.pieces import Piece, Workload
 from robotid.robot.model import RobotModel
 
-__all__ = [
-    "PIECE",
-    "LogPiece",
-    "PieceTask",
-    "ReducedPiece",
-    "Rows",
-    "SurveyedLog",
-    "hold_log",
-    "survey_log",
-]
-
 #: Default number of rows of a piece.
 PIECE = 16384
 _WINDOW = 20_000  # rows of each window that is checked
@@ -116,20 +105,11 @@ class LogPiece:
         return self.stop - self.first
 
     def read(self) -> Rows:
-        """Return its rows and its smoothed motion; for a log in memory they are cached.
-
-        Raises:
-            DataError: If a row cannot be used.
-        """
+        """Return its rows and its smoothed motion; for a log in memory they are cached."""
         return self._cached if isinstance(self.header.source, Log) else self._read()
 
     def take(self, rows: Rows, before: RobotModel) -> None:
-        """Store rows that were smoothed before.
-
-        Args:
-            rows: The rows.
-            before: The robot for which they were smoothed, with the same friction speeds.
-        """
+        """Store rows that were smoothed before."""
         model, motion, mask = self.header.model, rows.trajectory, rows.mask
         if model.layout != before.layout or is_loaded(model):
             motion = remember(model, motion.with_states(None))
@@ -264,12 +244,7 @@ class SurveyedLog:
 
     @cached_property
     def signals(self) -> SignalSettings:
-        """Settings of the processing to a trajectory, automatic ones resolved for the whole log.
-
-        Raises:
-            DataError: If measured velocity or acceleration is required and the log has none.
-            SettingsError: If a setting cannot be applied to the log.
-        """
+        """Settings of the processing to a trajectory, automatic ones resolved for the whole log."""
 
         def is_trusted() -> bool:
             return prefers_measured(
@@ -299,11 +274,7 @@ class SurveyedLog:
         )
 
     def with_model(self, model: RobotModel) -> "SurveyedLog":
-        """Return the log for a robot whose drives have other terms or another load.
-
-        Args:
-            model: The robot, with the same bodies, joints and couplings.
-        """
+        """Return the log for a robot whose drives have other terms or another load."""
         other = replace(self, model=model, asked=self.signals)
         if self.is_in_memory and np.array_equal(
             friction_speeds(model.layout), friction_speeds(self.model.layout)
@@ -313,11 +284,7 @@ class SurveyedLog:
         return other
 
     def with_accelerometer_bias(self, bias: Array) -> "SurveyedLog":
-        """Return the log with another bias of the accelerometers of its IMU.
-
-        Args:
-            bias: The bias with the axes of the base, shape (3,) [m/s^2].
-        """
+        """Return the log with another bias of the accelerometers of its IMU: bias (3,) [m/s^2]."""
 
         def changed(log: Log) -> Log:
             if log.base is None or log.base.imu is None:
@@ -335,11 +302,7 @@ class SurveyedLog:
 
     @property
     def whole(self) -> Rows:
-        """All rows of a log in memory, and their smoothed motion.
-
-        Raises:
-            DataError: If no segment is long enough, or an angle jumps.
-        """
+        """All rows of a log in memory, and their smoothed motion."""
         (piece,) = self.pieces
         rows = piece.read()
         if not len(rows.trajectory.t):
@@ -399,14 +362,7 @@ def _check_base(model: RobotModel, log: Log) -> None:
 def hold_log(
     model: RobotModel, log: Log, signals: SignalSettings, locked: Mapping[str, Array] | None = None
 ) -> SurveyedLog:
-    """Return a log in memory as one piece; errors of its data are raised when it is read.
-
-    Args:
-        model: The robot.
-        log: The log, with the model's joints in its order; passive ones may be missing.
-        signals: Settings of the processing to a trajectory.
-        locked: Positions of locked joints, if the log has them, by name [rad or m].
-    """
+    """Return a log in memory as one piece; errors of its data are raised when it is read."""
     count = len(log.t)
     _check_base(model, log)
     log = with_contacts(model, closed_log(model, log), signals)
@@ -431,19 +387,6 @@ def survey_log(
 
     Every time stamp is checked. Units and the delay of the measured velocity are checked in the
     windows; the values of each piece are checked when it is read.
-
-    Args:
-        layout: Assignment of the file's columns.
-        table: The opened file.
-        model: The robot.
-        signals: Settings of the processing to a trajectory.
-        window: First and last time stamp used, on the log's own clock [s]; None: the ends.
-        length: Rows per piece; None: the log is read completely into memory. A file of a format
-            that cannot be read in parts is one piece.
-
-    Raises:
-        DataError: If time does not increase, the window contains fewer than two rows, or units are
-            implausible.
     """
     locked = {x: layout.positions[x] for x in model.locked if x in layout.positions}
     wanted = list(dict.fromkeys([*layout.wanted, *locked.values()]))

@@ -7,8 +7,6 @@ from robotid.dynamics.prediction import body_slopes_by_position
 from robotid.estimation.fitting.recorded import Recordings
 from robotid.estimation.variation.groups import RunSums, columns_of, groups_at, with_zeros
 
-__all__ = ["sums_with_zeros"]
-
 
 def sums_with_zeros(
     sums: RunSums, recordings: Recordings, standard: Array, shift: Array
@@ -18,11 +16,7 @@ def sums_with_zeros(
     The torque of a log whose positions are x too large is tau(q - x) = tau(q) - d tau / dq x. Logs
     in files, and robots with a floating base or constraints, have no such rows.
 
-    Args:
-        sums: The sums of the logs to fit.
-        recordings: The recordings.
-        standard: Standard parameters of the residual, shape (p,).
-        shift: Bias of the base parameters that the fit corrects, shape (b,).
+    standard (p,), shift (b,).
     """
     model, mapping = recordings.model, recordings.mapping
     groups = [group for group, _ in groups_at(model, mapping, standard)]

@@ -1,3 +1,1 @@
 """Variation of parameters between recordings and between robots of one kind."""
-
-__all__: list[str] = []

@@ -19,8 +19,6 @@ from robotid.base.typing import Array
 from robotid.estimation.variation.groups import RunsOf
 from robotid.estimation.variation.mixed_effects import covariance_of
 
-__all__ = ["evidence_by_group"]
-
 _PENALTY = 2.0  # evidence that each parameter of a group must add (Akaike)
 _RANK = 1e-9  # eigenvalue over the largest below which a direction is not determined
 
@@ -30,18 +28,10 @@ def evidence_by_group(
 ) -> list[float]:
     """Return what a difference of each group explains of the residual of a run or unit.
 
-    Args:
-        groups: Information of all runs on each group.
-        deviations: Standard deviations of the parameters of each group between runs, and between
-            units if there are several, shape (levels, q); those of drives are used.
-        is_own: The runs that are compared with the others, shape (k,), bool.
-        is_unit: Whether they are a unit.
-
-    Returns:
-        Twice the log likelihood of each group, less 2 for each determined parameter (Akaike).
-
     References:
         Akaike (1974), A new look at the statistical model identification.
+
+    deviations (levels, q), is_own (k,).
     """
     H, h, scale, places = _together(groups)
     S = np.hstack([x * (group.group.kind == "drive")

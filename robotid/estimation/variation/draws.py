@@ -7,18 +7,12 @@ import scipy.special
 
 from robotid.base.typing import Array
 
-__all__ = ["correlated_scores", "possible_draws", "root_of", "scores_to_values"]
-
 _STEPS = 60  # of each chain; with a possible proposal, one step is an independent draw
 _SMALLEST = 1e-12  # eigenvalue over the largest that counts as 0
 
 
 def root_of(covariance: Array) -> Array:
-    """Return L with L L^T = C, lower triangular, shape (p, p).
-
-    Args:
-        covariance: C, shape (p, p), symmetric; eigenvalues below rounding count as 0.
-    """
+    """Return L with L L^T = C, lower triangular, shape (p, p): covariance (p, p)."""
     scale = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     inverse = np.where(scale > 0.0, 1.0 / np.where(scale > 0.0, scale, 1.0), 0.0)
     w, V = np.linalg.eigh(inverse[:, None] * covariance * inverse)
@@ -40,14 +34,10 @@ def possible_draws(
     Each draw is the end of its own chain of elliptical slice sampling from x = 0, which must be
     possible.
 
-    Args:
-        root: L, shape (p, r).
-        is_possible: Function of k values, shape (k, p), that returns which are possible, (k,).
-        count: Number of draws.
-        rng: Source of the draws.
-
     References:
         Murray, Adams, MacKay (2010), Elliptical slice sampling, figure 2.
+
+    root (p, r), is_possible (k, p).
     """
     x = np.zeros((count, len(root)))
     for _ in range(_STEPS):
@@ -73,11 +63,7 @@ def correlated_scores(scores: Array, share: Array, correlation: Array, drawn: Ar
 
     z = sqrt(share) * scores + sqrt(1 - share) * w with w ~ N(0, R).
 
-    Args:
-        scores: Scores of the error of the fit, shape (k, m).
-        share: Its share of the variance of the prediction, shape (m,), 0 to 1.
-        correlation: R, shape (m, m), positive definite.
-        drawn: Independent standard normal numbers, shape (k, m).
+    scores (k, m), share (m,), correlation (m, m), drawn (k, m).
     """
     w = drawn @ np.linalg.cholesky(correlation).T
     found: Array = np.sqrt(share) * scores + np.sqrt(1.0 - share) * w
@@ -87,11 +73,7 @@ def correlated_scores(scores: Array, share: Array, correlation: Array, drawn: Ar
 def scores_to_values(z: Array, scores: Array, quantiles: Array, least: float) -> Array:
     """Return the values at standard normal scores of a predictive distribution, shape (k,).
 
-    Args:
-        z: The scores, shape (k,).
-        scores: Scores at which the quantiles are known, shape (s,), increasing.
-        quantiles: The quantiles, shape (s,), increasing; linear in between and beyond.
-        least: Smallest possible value: the distribution is given that values are above.
+    z (k,), scores (s,), quantiles (s,).
     """
     slope = np.diff(quantiles) / np.diff(scores)
     if least > quantiles[0]:

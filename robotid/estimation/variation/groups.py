@@ -19,19 +19,6 @@ from robotid.dynamics.factors import Factors
 from robotid.estimation.variation.mixed_effects import Runs
 from robotid.robot.model import RobotModel
 
-__all__ = [
-    "FEWEST_RUNS",
-    "Group",
-    "RunSums",
-    "RunsOf",
-    "columns_of",
-    "groups_at",
-    "inflation_of",
-    "runs_of",
-    "sums_of",
-    "with_zeros",
-]
-
 #: Smallest number of runs whose scatter is estimated.
 FEWEST_RUNS = 3
 _DRIVE = 0.1  # plausible standard deviation of a drive term, over the drive's torque
@@ -108,11 +95,7 @@ class RunSums:
     sigma: Array
 
     def joined(self, new: "RunSums") -> "RunSums":
-        """Return the sums of these runs and of new ones.
-
-        Args:
-            new: Sums of the new runs, of the same groups, theta and noise levels.
-        """
+        """Return the sums of these runs and of new ones."""
         H, h = np.concatenate([self.H, new.H]), np.concatenate([self.h, new.h])
         return RunSums(H, h, self.scatter + new.scatter, self.sigma)
 
@@ -128,11 +111,7 @@ class RunSums:
 
     @classmethod
     def from_dict(cls, stated: Mapping[str, Any]) -> "RunSums":
-        """Return the sums from plain values; see ``to_dict``.
-
-        Args:
-            stated: The values.
-        """
+        """Return the sums from plain values; see ``to_dict``."""
         h = np.array(stated["h"])
         H = np.zeros((*h.shape, h.shape[1]))
         rows, columns = np.triu_indices(h.shape[1])
@@ -149,12 +128,7 @@ def sums_of(
 ) -> RunSums:
     """Return the sums of runs over all groups of parameters.
 
-    Args:
-        model: The robot.
-        mapping: Standard to base parameters.
-        segments: Factors of the segments of each run, base parameters; k items.
-        standard: Standard parameters of the residual, shape (p,).
-        sigma: Noise level per joint, shape (n,) [N m or N].
+    standard (p,), sigma (n,) [N m or N].
     """
     theta, groups = mapping.to_base(standard), [g for g, _ in groups_at(model, mapping, standard)]
     products = [_products(run, groups, theta, sigma) for run in segments]
@@ -168,14 +142,7 @@ def sums_of(
 def with_zeros(
     sums: RunSums, groups: Sequence[Group], rows: Sequence[Sequence[tuple[Array, Array, Array]]]
 ) -> RunSums:
-    """Return sums with those over the rows of the zeros of the positions.
-
-    Args:
-        sums: The sums of k runs, in which they are 0.
-        groups: All groups, as of ``groups_at``, those of the zeros last.
-        rows: Of each run and segment, over N samples with n rows each, divided by the noise level:
-            A of the other groups, shape (N n, Q - z), that of the z zeros, (N n, z), and r, (N n,).
-    """
+    """Return sums with those over the rows of the zeros of the positions: rows (N n, Q - z)."""
     H, h, scatter = sums.H.copy(), sums.h.copy(), sums.scatter.copy()
     z = sum(group.kind == "zero" for group in groups)
     own, others = slice(H.shape[1] - z, None), slice(0, H.shape[1] - z)
@@ -198,15 +165,7 @@ def runs_of(
     sums: RunSums,
     unit: Array,
 ) -> tuple[RunsOf, ...]:
-    """Return the information of each run on each group of parameters.
-
-    Args:
-        model: The robot.
-        mapping: Standard to base parameters.
-        standard: As of ``sums_of``.
-        sums: The sums of k runs.
-        unit: Index of the robot of each run, shape (k,), int, from 0.
-    """
+    """Return the information of each run on each group of parameters: unit (k,)."""
     every = groups_at(model, mapping, standard)
     places = _places([group for group, _ in every])
     kept = [k for k, own in enumerate(places) if sums.H[:, own, own].any()]  # some run has effects
@@ -238,13 +197,7 @@ def _places(groups: Sequence[Group]) -> list[slice]:
 def groups_at(
     model: RobotModel, mapping: BaseMapping, standard: Array
 ) -> list[tuple[Group, Array]]:
-    """Return the groups and their values in the fit.
-
-    Args:
-        model: The robot.
-        mapping: Standard to base parameters.
-        standard: Standard parameters of the fit, shape (p,).
-    """
+    """Return the groups and their values in the fit: standard (p,)."""
     layout, base = model.layout, mapping.base_names
     rows = tuple(range(model.n_rows))
     eye, found = np.eye(len(base)), []
@@ -297,12 +250,7 @@ def _products(
 
 
 def columns_of(groups: Sequence[Group], n_rows: int) -> tuple[Array, Array]:
-    """Return B of all groups, shape (b, Q), and in which of a sample's rows each acts, (n_rows, Q).
-
-    Args:
-        groups: The groups.
-        n_rows: Number of rows of a sample.
-    """
+    """B of all groups, shape (b, Q), and in which of a sample's rows each acts, (n_rows, Q)."""
     sizes = [group.columns.shape[1] for group in groups]
     acts = np.array([[j in group.rows for group in groups] for j in range(n_rows)])
     return np.hstack([group.columns for group in groups]), np.repeat(acts, sizes, axis=1)
@@ -313,9 +261,6 @@ def inflation_of(runs: Sequence[tuple[Array, Array]]) -> float:
 
     It is relative to that of independent rows of the stated noise level, and common to all runs: a
     run alone has too few segments.
-
-    Args:
-        runs: Of each run, A^T A (s, q, q) and A^T r (s, q) of its s segments.
     """
     return _ratio(*_scatter(runs))
 

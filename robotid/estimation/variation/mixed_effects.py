@@ -28,8 +28,6 @@ from robotid.estimation.variation.restricted_likelihood import (
     prior_of,
 )
 
-__all__ = ["Compared", "MixedEffects", "Prediction", "Runs", "covariance_of"]
-
 _FIRST = -1.0  # logarithm of the standard deviations over their plausible size, at the start
 _NEAR = 2.0  # ... and largest distance of a stated start: the slope is small beyond
 _TAIL = 0.025  # probability beyond each end of an interval
@@ -57,27 +55,15 @@ class Runs:
     scale: Array
 
     def without(self, run: int) -> "Runs":
-        """Return the runs except one.
-
-        Args:
-            run: Index of the run.
-        """
+        """Return the runs except one."""
         return self._only(np.arange(len(self.h)) != run)
 
     def without_unit(self, unit: int) -> "Runs":
-        """Return the runs of the other units.
-
-        Args:
-            unit: Index of the unit.
-        """
+        """Return the runs of the other units."""
         return self._only(self.unit != unit)
 
     def of_unit(self, unit: int) -> "Runs":
-        """Return the runs of one unit.
-
-        Args:
-            unit: Index of the unit.
-        """
+        """Return the runs of one unit."""
         return self._only(self.unit == unit)
 
     def _only(self, left: Array) -> "Runs":
@@ -113,23 +99,12 @@ class Prediction:
     after: tuple[float, float] = (math.nan, math.nan)
 
     def shifted(self, centre: float) -> "Prediction":
-        """Return the prediction of the parameter plus a constant.
-
-        Args:
-            centre: The constant.
-        """
+        """Return the prediction of the parameter plus a constant."""
         moved = self.mixture + np.array([[0.0], [centre], [0.0]])
         return replace(self, mean=self.mean + centre, ends=self.ends + centre, mixture=moved)
 
     def quantiles(self, scores: Array) -> Array:
-        """Return quantiles of the predictive distribution.
-
-        Args:
-            scores: Standard normal scores of their probabilities, shape (k,): 1.96 for 97.5 %.
-
-        Returns:
-            The quantiles, shape (k,).
-        """
+        """Return quantiles of the predictive distribution: scores (k,) -> (k,)."""
         return _mixture_quantiles(scipy.special.ndtr(scores), *self.mixture)
 
 
@@ -211,11 +186,6 @@ class MixedEffects:
 
         With one unit it is that of a new run. The standard deviation of the highest level is
         integrated, parameter by parameter; all others have their most probable values.
-
-        Args:
-            own: Variance of the estimates of the new run, of these parameters; 0 if None.
-            value: Estimates of the new run, whose probability is computed; or None.
-            is_unit: Whether the mean of a new unit is predicted, without a deviation of its run.
         """
         q = len(self.runs.scale)
         own = np.zeros(q) if own is None else own
@@ -264,12 +234,7 @@ class MixedEffects:
         return tuple(found)
 
     def against_others(self, which: Array, *, is_unit: bool) -> Compared:
-        """Compare runs, or units, each with the prediction of all others.
-
-        Args:
-            which: Indices of the runs or units, shape (m,), int, at least one.
-            is_unit: Whether they are units.
-        """
+        """Compare runs, or units, each with the prediction of all others: which (m,)."""
         unit = self.runs.unit
         own = which[:, None] == (unit if is_unit else np.arange(len(unit)))  # (m, k)
         found: list[tuple[Array, tuple[Array, ...]]] = []
@@ -286,13 +251,7 @@ class MixedEffects:
     def _compared(
         self, own: Array, levels: int, *, is_unit: bool
     ) -> tuple[Array, Array, Array, Array]:
-        """Return the arrays of ``Compared`` for b runs or units.
-
-        Args:
-            own: Whether a run is left out, shape (b, k).
-            levels: Levels of the model of the others.
-            is_unit: Whether they are units.
-        """
+        """Return the arrays of ``Compared`` for b runs or units: own (b, k)."""
         scale, (H, h, _) = self.runs.scale, self._members
         unit = self.runs.unit if levels == 2 else None
         rest = H * ~own, h * ~own, unit
@@ -334,9 +293,7 @@ class MixedEffects:
 def covariance_of(H: Array, scale: Array) -> Array:
     """Return the covariance of parameters from their information, with almost no prior.
 
-    Args:
-        H: Information, shape (..., q, q).
-        scale: Plausible standard deviation of each parameter, shape (q,).
+    H (..., q, q), scale (q,).
     """
     covariance: Array = np.linalg.inv(H + np.diag(prior_of(scale)))
     return covariance
@@ -349,12 +306,7 @@ def _predicted(
 
     The deviation of a member is U (h - H centre) with U = (H + D^-1)^-1.
 
-    Args:
-        deviation: Standard deviations of the level, shape (q,).
-        H: Information of the members, shape (k, q, q).
-        h: Information times estimate, shape (k, q).
-        centre: Mean of each member before its own information, shape (k, q).
-        covariance: Its covariance, shape (k, q, q) or (q, q).
+    deviation (q,), H (k, q, q), h (k, q), centre (k, q), covariance (k, q, q).
     """
     U = _posterior(H, deviation)
     left = np.eye(h.shape[1]) - U @ H
@@ -381,11 +333,7 @@ def _mixture_quantiles(wanted: Array, weight: Array, means: Array, std: Array) -
 
     Newton's method within the quantiles of the normal distributions, halved where it leaves them.
 
-    Args:
-        wanted: The probabilities, shape (n,).
-        weight: Weights of the normal distributions, shape (g,).
-        means: Their means, shape (g,).
-        std: Their standard deviations, shape (g,).
+    wanted (n,), weight (g,), means (g,), std (g,).
     """
     each = means + std * scipy.special.ndtri(wanted)[:, None]  # (n, g)
     low, high = each.min(axis=1), each.max(axis=1)

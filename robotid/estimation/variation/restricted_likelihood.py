@@ -18,19 +18,6 @@ import numpy as np
 from robotid.base.exceptions import NotConvergedError
 from robotid.base.typing import Array
 
-__all__ = [
-    "GRID",
-    "Evidence",
-    "Grid",
-    "by_unit",
-    "evidence",
-    "integrated",
-    "log_prior",
-    "most_probable",
-    "on_grid",
-    "prior_of",
-]
-
 _UNKNOWN = 100.0  # standard deviation of a parameter before the data, in plausible sizes
 _FREEDOM = 4.0  # degrees of freedom of the half Student prior of a standard deviation
 _LEAST, _MOST = -6.0, 5.0  # logarithm of the standard deviations over their plausible size
@@ -86,14 +73,7 @@ class Grid:
 def integrated(W: Array, w: Array, variance: Array) -> tuple[Array, Array, Array]:
     """Integrate the deviations of one level out of its members' information.
 
-    Args:
-        W: Information of the members, shape (q, q, b, k).
-        w: Information times estimate, shape (q, b, k).
-        variance: Variances of the deviations, shape (q, b).
-
-    Returns:
-        (W^-1 + D)^-1 and its product with the estimate, shapes as given, and the logarithm of the
-        likelihood of each model, shape (b,), without the part that depends on the mean.
+    W (q, q, b, k), w (q, b, k), variance (q, b) -> (b,).
     """
     shape = np.broadcast_shapes(W.shape[2:], (*variance.shape[1:], 1))
     W, w = (np.array(np.broadcast_to(x, (*x.shape[:-2], *shape))) for x in (W, w))
@@ -115,16 +95,11 @@ def evidence(H: Array, h: Array, unit: Array | None, scale: Array, variance: Arr
     its members with r = x - c, and c and C the mean of the member before its own deviation and
     its covariance.
 
-    Args:
-        H: Information of the runs, shape (q, q, b or 1, k).
-        h: Information times estimate, shape (q, b or 1, k).
-        unit: Index of the unit of each run, shape (k,), with two levels; None with one.
-        scale: Plausible standard deviation of each parameter, shape (q,).
-        variance: Variances of the deviations, shape (levels, q, b).
-
     References:
         Patterson, Thompson (1971), Recovery of inter-block information when block sizes are
         unequal (restricted likelihood).
+
+    H (q, q, b or 1, k), h (q, b or 1, k), unit (k,), scale (q,), variance (levels, q, b).
     """
     W, w, total = integrated(H, h, variance[0])
     levels = [(W, w)]
@@ -161,19 +136,11 @@ def most_probable(H: Array, h: Array, unit: Array | None, scale: Array, first: A
 
     Newton's method from the start; the density never falls.
 
-    Args:
-        H: As in ``evidence``.
-        h: As in ``evidence``.
-        unit: As in ``evidence``.
-        scale: Plausible standard deviation of each parameter, shape (q,).
-        first: Logarithm of the deviations over the scale at the start, shape (levels, q, b).
-
-    Raises:
-        NotConvergedError: If the search does not end.
-
     References:
         Gelman (2006), Prior distributions for variance parameters in hierarchical models, section
         2.2 (half Student prior).
+
+    scale (q,), first (levels, q, b).
     """
     shape = first.shape
 
@@ -221,14 +188,7 @@ def on_grid(
 ) -> Grid:
     """Return b models for standard deviations of parameter p at the highest level.
 
-    Args:
-        H: As in ``evidence``.
-        h: As in ``evidence``.
-        unit: As in ``evidence``.
-        scale: Plausible standard deviation of each parameter, shape (q,).
-        deviation: All other standard deviations, shape (levels, q, b).
-        p: The parameter.
-        members: Number of members of the highest level.
+    scale (q,), deviation (levels, q, b).
     """
     q, d = len(scale), (scale[p] * np.exp(GRID)) ** 2
     W, w, total = H, h, np.zeros(1)
@@ -264,31 +224,20 @@ def on_grid(
 def by_unit(W: Array, w: Array, unit: Array) -> tuple[Array, Array]:
     """Return the sums of the information W and W x over the runs of each unit.
 
-    Args:
-        W: Information of the runs, shape (q, q, b, k).
-        w: Information times estimate, shape (q, b, k).
-        unit: Index of the unit of each run, shape (k,).
+    W (q, q, b, k), w (q, b, k), unit (k,).
     """
     member = 1.0 * (unit[:, None] == np.arange(unit.max() + 1))
     return W @ member, w @ member
 
 
 def log_prior(z: Array) -> Array:
-    """Return the log density of z = log(deviation / scale), half Student's distribution.
-
-    Args:
-        z: Logarithm of the deviation over its scale, any shape.
-    """
+    """Return the log density of z = log(deviation / scale), half Student's distribution."""
     log_density: Array = z - 0.5 * (_FREEDOM + 1.0) * np.log1p(np.exp(2.0 * z) / _FREEDOM)
     return log_density
 
 
 def prior_of(scale: Array) -> Array:
-    """Return the information about the mean before the data, shape (q,).
-
-    Args:
-        scale: Plausible standard deviation of each parameter, shape (q,).
-    """
+    """Return the information about the mean before the data, shape (q,): scale (q,)."""
     information: Array = (_UNKNOWN * scale) ** -2.0
     return information
 
@@ -296,10 +245,7 @@ def prior_of(scale: Array) -> Array:
 def _solved(information: Array, score: Array, p: int) -> tuple[Array, Array, Array]:
     """Return (s^T C s - log det I) / 2 and mean and variance of parameter p, shape (b, g) each.
 
-    Args:
-        information: I of the mean, shape (q, q, b, g).
-        score: s, shape (q, b, g).
-        p: The parameter; the others are eliminated before it.
+    information (q, q, b, g), score (q, b, g).
     """
     left, s, total = information.copy(), score.copy(), np.zeros(score.shape[1:])
     for o in [*(o for o in range(len(s)) if o != p), p]:

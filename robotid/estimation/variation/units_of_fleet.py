@@ -10,8 +10,6 @@ from robotid.base.typing import Array
 from robotid.estimation.variation.groups import FEWEST_RUNS
 from robotid.estimation.variation.mixed_effects import MixedEffects, Prediction, Runs
 
-__all__ = ["FALSE_ALARMS", "UnlikeUnit", "between_units"]
-
 #: Probability that one of all alike units is named.
 FALSE_ALARMS = 0.02
 _SCALE = 0.1  # smallest plausible standard deviation between units, over the parameter's size
@@ -40,14 +38,7 @@ def between_units(
     The unit farthest from the others is tested against them; if it differs, it is left out, and the
     next one is tested. Prediction and spread are of the units that are alike.
 
-    Args:
-        values: The parameter of each unit, shape (u,).
-        std_errors: Its standard errors, shape (u,), positive.
-        level: Probability of a difference without a cause, for each unit, below which it is unlike.
-
-    Returns:
-        The prediction, and the units that are unlike, the most unlikely first; None for fewer than
-        three units.
+    values (u,), std_errors (u,).
     """
     left, unlike = list(range(len(values))), list[UnlikeUnit]()
     while len(left) > FEWEST_RUNS:

@@ -12,16 +12,6 @@ from robotid.estimation.variation.causes import evidence_by_group
 from robotid.estimation.variation.groups import FEWEST_RUNS, RunsOf
 from robotid.estimation.variation.mixed_effects import MixedEffects, Prediction, covariance_of
 
-__all__ = [
-    "SCORES",
-    "UnlikeRun",
-    "Variation",
-    "VaryingParameter",
-    "between_covariance",
-    "shrunk_correlation",
-    "vary",
-]
-
 #: Standard normal scores at which result.json has the quantiles of the predictive distribution.
 SCORES = np.linspace(-3.5, 3.5, 15)
 _FALSE_ALARMS = 0.02  # probability that one of alike runs or units is named
@@ -160,11 +150,6 @@ def vary(
     A run is compared with the prediction of the other runs, and a unit with that of the other
     units, group by group. If a group differs, the cause named is the one that explains most of the
     residual, see ``evidence_by_group``.
-
-    Args:
-        names: Names of the k runs.
-        groups: Information of the runs on each group of parameters.
-        units: Names of the units in the order of their indices; their numbers if empty.
     """
     if len(names) < FEWEST_RUNS or not groups:
         return None
@@ -195,13 +180,6 @@ def between_covariance(variation: Mapping[str, Any], names: Sequence[str]) -> Ar
 
     Standard deviations are the medians of the spreads: between runs, or between units and between
     the runs of a unit.
-
-    Args:
-        variation: As of ``Variation.to_dict``.
-        names: Names of p parameters.
-
-    Returns:
-        Shape (p, p); 0 for parameters that do not vary.
     """
     at = {name: k for k, name in enumerate(names)}
     parameters = variation["parameters"]
@@ -225,17 +203,13 @@ def shrunk_correlation(values: Array) -> Array:
     Var(r) is that of normal values, (1 - r^2)^2 / (k - 1), times (k^2 - 1) / (k^2 - 2 k): its mean
     is then 1 / (k - 1), as it is, for independent parameters. Two runs determine no correlation.
 
-    Args:
-        values: Values in k runs, shape (k, m).
-
-    Returns:
-        Shape (m, m), positive definite.
-
     References:
         Schaefer, Strimmer (2005), A shrinkage approach to large-scale covariance matrix
         estimation, doi:10.2202/1544-6115.1175, section 2.4 (target D), there with one factor for
         all parameters. Hotelling (1953), New light on the correlation coefficient and its
         transforms (variance of r).
+
+    values (k, m).
     """
     k, m = values.shape
     if k < FEWEST_RUNS:

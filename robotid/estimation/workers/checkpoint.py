@@ -20,8 +20,6 @@ from robotid.base.files import written_whole
 from robotid.base.typing import Array
 from robotid.estimation.workers.pieces import Workload
 
-__all__ = ["FOLDER", "Checkpoint", "released_on_error"]
-
 FOLDER = ".robotid-checkpoint"
 
 _SHOWN = 5  # largest number of differences that a message names
@@ -33,12 +31,6 @@ class _Lock:
     """An exclusive lock of a folder for one run; it ends with the process.
 
     Without locks in the system or the file system (Windows, some network drives) there is none.
-
-    Args:
-        folder: The folder; it must exist.
-
-    Raises:
-        DataError: If another run has the lock.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -94,19 +86,7 @@ class Checkpoint:
         *,
         resume: bool = False,
     ) -> "Checkpoint":
-        """Open the checkpoint of work on pieces; an old one is replaced unless it is resumed.
-
-        Args:
-            parent: Folder of the results; created if it does not exist.
-            inputs: All inputs of the work, as JSON values.
-            pieces: The pieces.
-            kind: Type of the results, with ``to_arrays`` and ``from_arrays``.
-            resume: Whether finished pieces of an interrupted run are used.
-
-        Raises:
-            DataError: If the checkpoint to resume has other inputs or cannot be read, or another
-                run is using the folder.
-        """
+        """Open the checkpoint of work on pieces; an old one is replaced unless it is resumed."""
         folder = Path(parent) / FOLDER
         stated = {**inputs, "pieces": [piece.name for piece in pieces]}
         text = json.dumps(stated, sort_keys=True, indent=1)
@@ -143,14 +123,7 @@ class Checkpoint:
         return frozenset(int(path.stem.split("-")[1]) for path in found)
 
     def load(self, index: int) -> Any:  # noqa: ANN401
-        """Return a stored result, with the same bits.
-
-        Args:
-            index: Index of the piece.
-
-        Raises:
-            DataError: If the file cannot be read or has other inputs.
-        """
+        """Return a stored result, with the same bits."""
         path = self._path(index)
         try:
             with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
@@ -165,13 +138,7 @@ class Checkpoint:
         return self.kind.from_arrays(content)
 
     def save(self, index: int, name: str, result: _Stored) -> None:
-        """Store the result of a piece; the file is written completely or not at all.
-
-        Args:
-            index: Index of the piece.
-            name: Name of the piece.
-            result: Its result.
-        """
+        """Store the result of a piece; the file is written completely or not at all."""
         content: dict[str, Any] = result.to_arrays()
         content |= {"key": self.key, "piece": name}
         with written_whole(self._path(index)) as beside, beside.open("wb") as file:
@@ -211,11 +178,7 @@ class Checkpoint:
 
 @contextmanager
 def released_on_error(checkpoint: Checkpoint) -> Iterator[None]:
-    """Release a checkpoint if the work in the context fails, so that it can be resumed.
-
-    Args:
-        checkpoint: The checkpoint.
-    """
+    """Release a checkpoint if the work in the context fails, so that it can be resumed."""
     try:
         yield
     except BaseException:

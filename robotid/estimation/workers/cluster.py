@@ -17,8 +17,6 @@ from robotid.estimation.workers.processes import Backend, named
 if TYPE_CHECKING:
     from distributed import Client, Future, as_completed
 
-__all__ = ["ClusterBackend"]
-
 _log = logging.getLogger(__name__)
 _POLL = 0.01  # [s] between two looks for a finished piece
 _LOOK = 1.0  # [s] between two looks for workers
@@ -32,11 +30,6 @@ class ClusterBackend(Backend):
     thread of the cluster are submitted. It raises ``WorkerError`` without a cluster, with workers
     of another version of robotid, if every worker that processes a piece ends, and if no worker is
     left.
-
-    Args:
-        address: Address of the scheduler, such as ``tcp://host:8786``.
-        patience: Time to wait for the scheduler, for its first worker, and for another one when
-            none is left [s].
     """
 
     def __init__(self, address: str, *, patience: float = 30.0) -> None:

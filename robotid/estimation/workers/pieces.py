@@ -15,8 +15,6 @@ from threadpoolctl import threadpool_limits
 from robotid.base.exceptions import WorkerError
 from robotid.dynamics.factors import Reduction
 
-__all__ = ["Lost", "Outcome", "Piece", "Work", "Workload", "reduce_piece", "run_task"]
-
 
 class Workload(Protocol):
     """A unit of work, such as a piece of a log; can be pickled."""
@@ -37,14 +35,7 @@ class Piece(Workload):
 
     @abstractmethod
     def reduce(self, *, threads: int | None = None) -> Reduction:
-        """Return the factors of the piece's base problem; of no samples if none are usable.
-
-        Args:
-            threads: As in ``compress``; they do not change the result.
-
-        Raises:
-            DataError: If a row cannot be used.
-        """
+        """Return the factors of the piece's base problem; of no samples if none are usable."""
 
 
 #: Work on a piece, with the number of threads or None for any; can be pickled.
@@ -79,29 +70,12 @@ class _Recorder(logging.Handler):
 
 
 def reduce_piece(piece: Piece, threads: int | None) -> Reduction:
-    """Return the reduction of a piece.
-
-    Args:
-        piece: The piece.
-        threads: As in ``Piece.reduce``.
-
-    Raises:
-        DataError: If a row cannot be used.
-    """
+    """Return the reduction of a piece."""
     return piece.reduce(threads=threads)
 
 
 def run_task(work: Work, piece: Workload, level: int) -> Outcome:
-    """Process a piece with one thread; return the result and the logged messages.
-
-    Args:
-        work: The work on the piece.
-        piece: The piece.
-        level: Lowest level of the returned messages.
-
-    Raises:
-        DataError: If a row cannot be used.
-    """
+    """Process a piece with one thread; return the result and the logged messages."""
     logger, recorder = logging.getLogger("robotid"), _Recorder(level)
     before = logger.level
     logger.addHandler(recorder)

@@ -18,8 +18,6 @@ from robotid.estimation.workers.processes import (
     require_workers,
 )
 
-__all__ = ["WorkPlan", "choose_workers", "map_pieces"]
-
 _WORTH_WORKERS = 500_000  # smallest number of samples for workers; their start takes about 1 s
 
 _log = logging.getLogger(__name__)
@@ -76,11 +74,7 @@ class WorkPlan:
         return ProcessBackend(workers) if workers > 1 else SerialBackend()
 
     def reduce(self, pieces: Sequence[Piece]) -> Iterator[Reduction]:
-        """Yield one reduction per piece, in order, as ``map`` does; ``join`` combines them.
-
-        Args:
-            pieces: The pieces.
-        """
+        """Yield one reduction per piece, in order, as ``map`` does; ``join`` combines them."""
         return self.map(reduce_piece, pieces, "reducing")
 
     def map(
@@ -93,16 +87,7 @@ class WorkPlan:
         counted: str = "samples",
         lost: Lost | None = None,
     ) -> Iterator[Any]:
-        """Process every piece by the chosen workers; yields results as ``map_pieces`` does.
-
-        Args:
-            work: The work on a piece.
-            pieces: The pieces.
-            what: Name of the work.
-            checkpoint: As in ``map_pieces``.
-            counted: As in ``map_pieces``.
-            lost: As in ``Backend.run``.
-        """
+        """Process every piece by the chosen workers; yields results as ``map_pieces`` does."""
         with self._backend(pieces) as backend:
             yield from map_pieces(
                 work, pieces, what, backend=backend, progress=self.progress,
@@ -121,25 +106,7 @@ def map_pieces(
     counted: str = "samples",
     lost: Lost | None = None,
 ) -> Iterator[Any]:
-    """Process every piece; only results that are ahead of their order are in memory.
-
-    Args:
-        work: The work on a piece.
-        pieces: The pieces.
-        what: Name of the work.
-        backend: The backend; this process if None.
-        progress: Called with (what, samples done, samples in total, counted).
-        checkpoint: Stores the results, of its kind; a resumed one provides them.
-        counted: What the samples of the pieces are.
-        lost: As in ``Backend.run``.
-
-    Yields:
-        One result per piece, in order, with the same bits for any backend.
-
-    Raises:
-        DataError: If a row cannot be used.
-        WorkerError: If a piece ends its worker in every attempt.
-    """
+    """Process every piece; only results that are ahead of their order are in memory."""
     chosen, report = backend or SerialBackend(), progress or ignore_progress
     stored = frozenset() if checkpoint is None else checkpoint.finished()
     missing = [(k, piece) for k, piece in enumerate(pieces) if k not in stored]
@@ -171,13 +138,6 @@ def choose_workers(pieces: Sequence[Workload], workers: int | None = None) -> in
     """Return the number of worker processes, at most that of the pieces.
 
     It is the given number; else one per core if the work is long, otherwise 1.
-
-    Args:
-        pieces: The work.
-        workers: The number set by the user, or None.
-
-    Raises:
-        SettingsError: If the number is less than 1.
     """
     if workers is None:
         is_long = sum(piece.samples for piece in pieces) >= _WORTH_WORKERS

@@ -27,9 +27,6 @@ from robotid.estimation.workers.pieces import Lost, Outcome, Work, Workload, run
 if TYPE_CHECKING:
     from loky import ProcessPoolExecutor
 
-__all__ = ["Backend", "ProcessBackend", "SerialBackend", "named", "require_workers"]
-
-
 _log = logging.getLogger(__name__)
 _ATTEMPTS = 3  # to process a piece whose worker ends
 
@@ -61,21 +58,7 @@ class Backend(ABC):
     def run(
         self, work: Work, pieces: Sequence[tuple[int, Workload]], lost: Lost | None = None
     ) -> Iterator[tuple[int, Any]]:
-        """Process pieces; closing the iterator ends the work.
-
-        Args:
-            work: The work on a piece.
-            pieces: Index and piece.
-            lost: Called with a piece that ended its worker in every attempt and the error, returns
-                the result; None: the error is raised.
-
-        Yields:
-            Index and result of each piece once, in any order.
-
-        Raises:
-            DataError: If a row cannot be used.
-            WorkerError: If a piece ends its worker in every attempt.
-        """
+        """Process pieces; closing the iterator ends the work."""
 
 
 class SerialBackend(Backend):
@@ -102,12 +85,6 @@ class ProcessBackend(Backend):
 
     The workers wait for more work until ``close``. An error, or any end of the process that started
     them, stops them immediately.
-
-    Args:
-        workers: Number of processes, at least 1.
-
-    Raises:
-        SettingsError: If the number is less than 1.
     """
 
     def __init__(self, workers: int) -> None:
@@ -214,14 +191,7 @@ class ProcessBackend(Backend):
 
 
 def require_workers(workers: int) -> int:
-    """Return a number of workers, which must be at least 1.
-
-    Args:
-        workers: The number.
-
-    Raises:
-        SettingsError: If it is less than 1.
-    """
+    """Return a number of workers, which must be at least 1."""
     if workers < 1:
         raise SettingsError(f"workers is {workers}, wanted at least 1")
     return workers
@@ -229,11 +199,7 @@ def require_workers(workers: int) -> int:
 
 @contextmanager
 def named(piece: Workload) -> Iterator[None]:
-    """Add a note with the name of the piece to an error.
-
-    Args:
-        piece: The piece that is processed.
-    """
+    """Add a note with the name of the piece to an error."""
     try:
         yield
     except Exception as error:

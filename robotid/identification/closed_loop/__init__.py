@@ -1,3 +1,1 @@
 """Closed-loop identification: drives, loops and bodies by simulation, compared with positions."""
-
-__all__: list[str] = []

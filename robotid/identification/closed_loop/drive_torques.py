@@ -9,8 +9,6 @@ from robotid.base.typing import Array
 from robotid.data.signal_filters import local_polynomial
 from robotid.dynamics.simulation.loops import Column, Loops, RollOut, Window
 
-__all__ = ["DriveTorques", "drive_torques", "find_gains", "measured_motion"]
-
 _AROUND = (0, -1, 1)  # lags that are tried about the known delay [samples]
 _LATEST = 0.1  # largest lag that is tried [s]
 _CLEAR = 9.0  # improvement that a fractional lag needs [variances of one row]
@@ -52,12 +50,7 @@ class DriveTorques:
 
         The command is constant over a row, so a delay changes only the motion.
 
-        Args:
-            joints: The joints of the drives, shape (k,).
-            columns: The parameters: columns as in ``ClosedLoopRobot.roll_out``, each with the
-                index, of c, of its sensitivity.
-            motion: Derivatives of their positions, then of their speeds, shape (N, 2k, c).
-            kinds: Numbers of the columns' kinds.
+        joints (k,), motion (N, 2k, c).
         """
         k, loops = len(joints), self.loops
         change: Array = (
@@ -77,14 +70,7 @@ class DriveTorques:
 
 
 def drive_torques(out: RollOut, loops: Loops, lag: Array) -> DriveTorques:
-    """Return the torques of the drives along a roll-out.
-
-    Args:
-        out: The roll-out.
-        loops: The loops that it was simulated with.
-        lag: Lag of each torque after its command, shape (n,) [samples]; a fractional lag
-            interpolates between two samples of the command.
-    """
+    """Return the torques of the drives along a roll-out: lag (n,) [samples]."""
     log, rows = out.window.log, np.arange(out.window.first, out.window.stop)
     sent = rows[:, None] - np.ceil(lag).astype(int)  # before the log: its first command
     later = np.ceil(lag) - lag
@@ -103,11 +89,7 @@ def drive_torques(out: RollOut, loops: Loops, lag: Array) -> DriveTorques:
 
 
 def measured_motion(window: Window) -> RollOut:
-    """Return a window's measured motion in the form of a roll-out.
-
-    Args:
-        window: The window.
-    """
+    """Return a window's measured motion in the form of a roll-out."""
     q, t = (x[window.counted] for x in (window.log.q, window.log.t))
     dt = float(np.median(np.diff(t)))
     wide = min(2 * max(2, round(_SMOOTH / dt)) + 1, len(t) - 1 + len(t) % 2)
@@ -124,15 +106,7 @@ def find_gains(
     loop. The lag of least squared error is taken; a fractional one, as of torques averaged over a
     row, only where the improvement is significant. Gains whose estimate is negative do not change.
 
-    Args:
-        outs: Motion in windows with measured torques.
-        loops: The loops, as far as they are known.
-        is_free: Whether gains of position and of speed are fitted, shape (2, n), bool.
-        knows_delay: Whether the loops' delay is known to within one row.
-        is_whole: Whether lags are whole, as long as motion and gains are inaccurate.
-
-    Returns:
-        Lag of each torque after its command, shape (n,) [samples]; and the loops.
+    is_free (2, n) -> (n,) [samples].
     """
     dt = float(np.median(np.diff(outs[0].window.log.t)))
     delayed = np.ceil(loops.delay / dt - 1e-6)

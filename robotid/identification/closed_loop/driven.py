@@ -19,22 +19,12 @@ from robotid.identification.pipeline import identify
 from robotid.identification.result import Identification
 from robotid.robot.model import RobotModel
 
-__all__ = ["driven_log", "identified_rows", "torque_rows"]
-
 
 def driven_log(model: RobotModel, log: Log, signals: SignalSettings) -> Log:
     """Return a log whose feed-forward torque is the measured one.
 
     The feed-forward torque is constant between two rows: the mean of the two, which avoids a delay
     of half a row. The command is the measured position; its gain is 0.
-
-    Args:
-        model: The robot.
-        log: The log, of its joints in its order.
-        signals: Signal settings, with the delay of the torque.
-
-    Raises:
-        DataError: If the log has no torque, or a joint with limits jumps by a full turn.
     """
     if not log.has_torque:
         raise DataError(
@@ -53,13 +43,7 @@ def driven_log(model: RobotModel, log: Log, signals: SignalSettings) -> Log:
 def identified_rows(
     model: RobotModel, logs: Sequence[Log], signals: SignalSettings | None
 ) -> Identification:
-    """Return the identification from the torques of logs alone, with the model's friction terms.
-
-    Args:
-        model: The robot.
-        logs: The logs, with torques.
-        signals: Processing of the logs into trajectories.
-    """
+    """Return the identification from the torques of logs alone, with the model's friction terms."""
     return identify(model, logs, signals=signals, friction="none", doctor=False)
 
 
@@ -67,10 +51,6 @@ def torque_rows(found: Identification, inflation: float = 1.0) -> TorqueRows:
     """Return an identification's rows reduced to a triangular factor.
 
     The weights include the variance inflation by correlated rows, from the scatter of segments.
-
-    Args:
-        found: The identification.
-        inflation: Further factor of their variance.
     """
     weight = found.wls.sigma * np.sqrt(inflation * max(found.errors.inflation, 1.0))
     return TorqueRows(found.model, found.factors.weighted(weight), found.mapping.K)

@@ -20,8 +20,6 @@ from robotid.dynamics.compiled import flatten
 from robotid.dynamics.prediction import predict_instants
 from robotid.robot.model import RobotModel
 
-__all__ = ["CLEAR", "Encoders", "find_encoders", "parallel_axes", "same_encoders"]
-
 #: Smallest relative increase of the squared error: by the URDF's zero and sign, for the best ones
 #: to replace them; by the next best ones, for the best ones to be identified.
 CLEAR = 0.2
@@ -64,11 +62,7 @@ class Encoders:
 
 
 def same_encoders(model: RobotModel) -> Encoders:
-    """Return encoders with the URDF's zeros and signs.
-
-    Args:
-        model: The robot.
-    """
+    """Return encoders with the URDF's zeros and signs."""
     n = len(model.joints)
     none = np.zeros(n)
     return Encoders(
@@ -77,11 +71,7 @@ def same_encoders(model: RobotModel) -> Encoders:
 
 
 def parallel_axes(model: RobotModel) -> list[tuple[str, ...]]:
-    """Return the successive joints of each chain that have parallel axes.
-
-    Args:
-        model: The robot.
-    """
+    """Return the successive joints of each chain that have parallel axes."""
     tree = flatten(model)
     joined: dict[int, list[int]] = {}
     for body in range(len(tree.parents)):
@@ -96,12 +86,7 @@ def parallel_axes(model: RobotModel) -> list[tuple[str, ...]]:
 
 
 def find_encoders(model: RobotModel, logs: Sequence[Log]) -> Encoders:
-    """Find zeros and signs of encoders from the position errors that gravity causes.
-
-    Args:
-        model: The robot.
-        logs: Logs with commands, of its joints in its order.
-    """
+    """Find zeros and signs of encoders from the position errors that gravity causes."""
     length = sum(float(log.t[-1] - log.t[0]) for log in logs)
     cutoff = min(max(_SLOW, _PERIODS / length), _FAST)
     samples = [_smooth(log, max(_SAMPLES // len(logs), 50), cutoff) for log in logs]

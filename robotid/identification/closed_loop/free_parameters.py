@@ -19,8 +19,6 @@ from robotid.robot.drives import DriveTerm
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import inertial_from_pseudo_inertia, pseudo_inertia
 
-__all__ = ["FreeParameter", "LoopSimulator", "TorqueRows", "free_body_parameters", "with_terms"]
-
 _STARTS = 2  # steps of the initial states of windows
 _SHARES = (1.0, 0.3, 0.1)  # step lengths that are tried
 _NEAR = 3.0  # prior of an initial position about the measured one [RMS position errors]
@@ -60,15 +58,7 @@ class FreeParameter:
     def of_term(
         cls, owner: str, term: DriveTerm, joints: tuple[int, ...], prior: float, spread: float
     ) -> "FreeParameter":
-        """Return the parameter of a friction term, with the bounds of the term.
-
-        Args:
-            owner: The joint, or the group of joints that share it.
-            term: The term.
-            joints: Indices of the joints.
-            prior: Prior value.
-            spread: Prior standard deviation.
-        """
+        """Return the parameter of a friction term, with the bounds of the term."""
         lowest = 0.0 if term.is_nonnegative else -np.inf
         name = f"{owner}.{term.name}"
         return cls(name, "term", joints, prior, spread, lowest, term.highest, term)
@@ -80,11 +70,6 @@ def free_body_parameters(robot: ClosedLoopRobot, spread: float) -> list[FreePara
     J' = U T T' U' with U U' the URDF's pseudo-inertia, and T the unit matrix except its last
     column, (c, exp m). Mass, centre of mass and the moments about the joint change; the
     distribution about the centre does not. Every value is a physically consistent body.
-
-    Args:
-        robot: The robot.
-        spread: Prior standard deviation of each coordinate [-]; 0.1 is about 20 % of the mass, and
-            a tenth of the radius of gyration for the centre of mass.
 
     References:
         Rucker, Wensing (2022), Smooth parameterization of rigid-body inertia, (12)-(14).
@@ -167,11 +152,7 @@ class LoopSimulator:
         return np.array(bounds).reshape(-1, 2).T
 
     def loops(self, theta: Array) -> Loops:
-        """Return bodies, drives and loops at given values of the free parameters.
-
-        Args:
-            theta: Values of the free parameters, shape (c,).
-        """
+        """Return bodies, drives and loops at given values of the free parameters: theta (c,)."""
         base = self.base
         changed = {
             name: getattr(base, name).copy()
@@ -186,15 +167,7 @@ class LoopSimulator:
         return replace(base, bodies=self._bodies(theta)[0], **changed)
 
     def roll_out(self, theta: Array, windows: Sequence[Window] | None = None) -> list[RollOut]:
-        """Return the roll-outs of windows.
-
-        Args:
-            theta: Values of the free parameters, shape (c,).
-            windows: The windows; all if None.
-
-        Raises:
-            NotConvergedError: If a step has no solution.
-        """
+        """Return the roll-outs of windows: theta (c,)."""
         return self.robot.roll_out(self.loops(theta), self.windows if windows is None else windows)
 
     def with_better_start(self, theta: Array) -> "LoopSimulator":
@@ -202,11 +175,7 @@ class LoopSimulator:
 
         With friction an initial error may persist, so that a lead before the window is not enough.
 
-        Args:
-            theta: Values of the free parameters, shape (c,).
-
-        Raises:
-            NotConvergedError: If a step has no solution.
+        theta (c,).
         """
         n, loops, columns = len(self.base.kp), self.loops(theta), self._starts()
         windows = [replace(window, first=window.start_row) for window in self.windows]
@@ -238,8 +207,7 @@ class LoopSimulator:
     def rows(self, theta: Array) -> tuple[Array, Array]:
         """Return the derivatives and residuals of the torque rows; see ``Simulator``.
 
-        Args:
-            theta: Values of the free parameters, shape (c,).
+        theta (c,).
         """
         if self.torque is None:
             return np.zeros((0, len(theta))), np.zeros(0)
@@ -252,11 +220,7 @@ class LoopSimulator:
 
         It is relative to the logged torque or that of the roll-outs, whichever is larger.
 
-        Args:
-            theta: Values of the free parameters, shape (c,).
-
-        Raises:
-            NotConvergedError: If a step has no solution.
+        theta (c,).
         """
         torques = replace(self, error="input").residuals(theta, with_slopes=False)
         error = np.concatenate([part.e for part in torques])
@@ -268,9 +232,7 @@ class LoopSimulator:
     def standard(self, model: RobotModel, theta: Array) -> tuple[Array, Array]:
         """Return a robot's standard parameters, shape (p,), and their derivatives, shape (p, c).
 
-        Args:
-            model: The robot, with the terms of the loops; a term that the loops lack is 0.
-            theta: Values of the free parameters, shape (c,).
+        theta (c,).
         """
         layout, loops = model.layout, self.loops(theta)
         place, pi = {}, np.zeros(len(layout.names))
@@ -303,17 +265,11 @@ class LoopSimulator:
 
         With ``error`` "direct", derivatives are those of inverse dynamics along the roll-out.
 
-        Args:
-            theta: Values of the free parameters, shape (c,).
-            with_slopes: Whether derivatives are returned.
-            with_starts: Whether derivatives with respect to initial states are.
-
-        Raises:
-            NotConvergedError: If a step has no solution.
-
         References:
             Gautier, Janot, Vandanjon (2013), A new closed-loop output error method for parameter
             identification of robot dynamics, IEEE TCST 21(2): DIDIM.
+
+        theta (c,).
         """
         loops, (_, directions) = self.loops(theta), self._bodies(theta)
         columns = self._columns(loops) if with_slopes else []
@@ -466,12 +422,7 @@ class LoopSimulator:
 
 
 def with_terms(model: RobotModel, loops: Loops) -> RobotModel:
-    """Return the model extended by the terms of loops that it lacks.
-
-    Args:
-        model: The robot.
-        loops: Its loops.
-    """
+    """Return the model extended by the terms of loops that it lacks."""
     own = {
         joint: [
             *model.layout.own.get(joint, ()),

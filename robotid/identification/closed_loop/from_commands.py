@@ -27,8 +27,6 @@ from robotid.identification.closed_loop.stages import STAGES, Fitted, fit_loops,
 from robotid.identification.result import Asked
 from robotid.robot.model import RobotModel
 
-__all__ = ["identify_loops", "with_gravity"]
-
 
 def identify_loops(
     model: RobotModel,
@@ -44,28 +42,7 @@ def identify_loops(
     units: Sequence[str] = (),
     progress: ProgressCallback = ignore_progress,
 ) -> LoopIdentification:
-    """Identify drives, loops and bodies from logs of commands and positions.
-
-    Args:
-        model: The robot.
-        logs: Logs to fit, of its joints in its order, with commands, or with torques if these
-            drive the robot.
-        validation: Validation logs.
-        loop: What is known of the loops.
-        settings: Settings of the estimator.
-        signals: Processing of the torques into rows, and their delay.
-        chooses: Whether further friction terms are tried.
-        examined: The doctor's findings of the logs.
-        ignore: Codes of its errors to ignore.
-        units: Name of the robot of each log to fit; one robot if empty.
-        progress: Called with the stages.
-
-    Raises:
-        DataError: If no log is given, or one has no commands.
-        MissingDependencyError: If Numba is not installed.
-        NotConvergedError: If it cannot be simulated.
-        SettingsError: If a setting does not fit the robot.
-    """
+    """Identify drives, loops and bodies from logs of commands and positions."""
     if not logs:
         raise DataError("no log was given. An identification needs at least one log")
     used = signals or SignalSettings()
@@ -132,12 +109,7 @@ def _others(model: RobotModel, loop: LoopSettings, fitted: Fitted) -> dict[str, 
 
 
 def with_gravity(model: RobotModel, log: Log) -> Log:
-    """Return a log with the URDF's gravity torque at the measured position added to tau_ref.
-
-    Args:
-        model: The robot of the URDF.
-        log: The log, of its joints in its order, with commands.
-    """
+    """Return a log with the URDF's gravity torque at the measured position added to tau_ref."""
     torque = predict_instants(model, model.standard_parameters(), log.q)
     fed = torque if log.tau_ref is None else log.tau_ref + torque
     return replace(log, tau_ref=fed)

@@ -11,8 +11,6 @@ from robotid.estimation.estimators.estimator import Estimate
 from robotid.estimation.estimators.output_error import OutputError, is_at_bound
 from robotid.identification.closed_loop.free_parameters import FreeParameter, LoopSimulator
 
-__all__ = ["GainScale", "gain_scale"]
-
 _GAINS = ("kp", "kd")
 _DIFFERS = 3.0  # smallest significant difference of a scale [standard errors]
 _LARGE = 0.05  # smallest relevant difference of a scale; missing friction terms cause smaller ones
@@ -52,14 +50,6 @@ def gain_scale(simulator: LoopSimulator, estimator: OutputError, estimate: Estim
 
     All drive parameters scale with the gains; weight and inertia of the bodies do not, within their
     prior. The scale is of first order: one Gauss-Newton step of gains and all free parameters.
-
-    Args:
-        simulator: The fitted simulator, with stated gains.
-        estimator: The estimator, with the weights of residuals.
-        estimate: The estimate.
-
-    Raises:
-        NotConvergedError: If the robot cannot be simulated.
     """
     n, c = len(simulator.base.kp), len(estimate.theta)
     gains = tuple(_gains(simulator))

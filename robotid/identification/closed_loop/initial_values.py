@@ -16,17 +16,6 @@ from robotid.robot.drives import DriveTerm, Viscous
 from robotid.robot.mass_matrix import joint_mass_matrices
 from robotid.robot.model import RobotModel
 
-__all__ = [
-    "TypicalSizes",
-    "first_loops",
-    "free_drive_parameters",
-    "free_zeros",
-    "is_stated",
-    "likeness",
-    "typical_sizes",
-    "typical_sizes_of_torques",
-]
-
 _WIDE = 10.0  # prior spread of drive parameters over their typical size: a weak prior
 _SHARE = 0.5  # initial share of the bodies in a joint's inertia, where its gain is unknown
 _DELAY_SPREAD = 0.1  # prior spread of a delay [s]
@@ -76,14 +65,7 @@ def typical_sizes(
 
     At its largest speed, ``top`` if more than 0, the limit of a drive is the friction torque.
 
-    Args:
-        robot: The robot, which can be simulated.
-        plain: Second-order model of each joint.
-        windows: Windows of the logs.
-        has_gain: Whether the gain of a joint is known, shape (n,), bool.
-        top: Speeds of joints that run at their largest speed, else 0, shape (n,) [rad/s or m/s].
-        groups: Name of the group of each joint.
-        factor: Factor of the scale where the gain is unknown, shape (n,) [-].
+    has_gain (n,), top (n,) [rad/s or m/s], factor (n,) [-].
     """
     model = robot.model
     q = np.concatenate([w.log.q[w.counted] for w in windows])
@@ -111,11 +93,7 @@ def typical_sizes_of_torques(
 ) -> TypicalSizes:
     """Return typical sizes from logged torques, without a closed loop.
 
-    Args:
-        model: The robot.
-        pi: Standard parameters, shape (p,).
-        armature: Inertia of the motors, shape (n,) [kg m^2 or kg].
-        windows: Windows of the logs.
+    pi (p,), armature (n,) [kg m^2 or kg].
     """
     tau = np.concatenate([w.log.tau[w.counted] for w in windows])
     torque = np.maximum(np.sqrt(np.mean(tau**2, axis=0)), 1e-6)
@@ -146,15 +124,7 @@ def _period(window: Window) -> float:
 def first_loops(
     model: RobotModel, stated: Loops, plain: SecondOrder, typical: TypicalSizes, finds_limit: Array
 ) -> Loops:
-    """Return the initial loops of the fit.
-
-    Args:
-        model: The robot.
-        stated: The loops as stated.
-        plain: Second-order model of each joint.
-        typical: Typical sizes.
-        finds_limit: Whether the limit of a joint is fitted, shape (n,), bool.
-    """
+    """Return the initial loops of the fit: finds_limit (n,)."""
     friction = {name: plain.friction(name) * typical.scale for name in ("viscous", "coulomb")}
     none = np.zeros(len(typical.scale))
     terms = tuple(
@@ -189,14 +159,7 @@ def free_drive_parameters(
 ) -> list[FreeParameter]:
     """Return the free parameters of drives and loops, with initial values from ``base``.
 
-    Args:
-        model: The robot.
-        loop: What is known of the loops.
-        groups: Name of the group of each joint.
-        base: The initial loops.
-        typical: Typical sizes.
-        finds_kd: Whether the logs determine the gain of the speed of a joint, shape (n,), bool.
-        finds_limit: Whether the limit of a joint is fitted, shape (n,), bool.
+    finds_kd (n,), finds_limit (n,).
     """
     members: dict[str, list[int]] = {}
     for j, group in enumerate(groups):
@@ -252,12 +215,7 @@ def _term(
 
 
 def free_zeros(model: RobotModel, encoders: Encoders) -> list[FreeParameter]:
-    """Return free parameters for the encoder zeros that differ from the URDF's.
-
-    Args:
-        model: The robot.
-        encoders: Signs and zeros of the encoders: the initial values.
-    """
+    """Return free parameters for the encoder zeros that differ from the URDF's."""
     return [
         FreeParameter(
             f"{model.joints[j]}.zero", "zero", (int(j),), float(encoders.zero[j]), _ZERO_SPREAD
@@ -267,11 +225,7 @@ def free_zeros(model: RobotModel, encoders: Encoders) -> list[FreeParameter]:
 
 
 def likeness(model: RobotModel) -> list[tuple[object, ...]]:
-    """Return the properties in which equal joints agree: limits, mass and moments of the body.
-
-    Args:
-        model: The robot.
-    """
+    """Return the properties in which equal joints agree: limits, mass and moments of the body."""
     bodies = model.standard_parameters()[: model.layout.n_inertial].reshape(-1, 10)
     sizes = np.column_stack([bodies[:, 0], bodies[:, [4, 6, 9]]])
     found: list[tuple[object, ...]] = []
@@ -282,12 +236,7 @@ def likeness(model: RobotModel) -> list[tuple[object, ...]]:
 
 
 def is_stated(value: PerJoint | str | None, model: RobotModel) -> Array:
-    """Return whether a number is stated for each joint, shape (n,), bool.
-
-    Args:
-        value: A number, or numbers by joint.
-        model: The robot.
-    """
+    """Return whether a number is stated for each joint, shape (n,), bool."""
     named = [
         value is not None and (not isinstance(value, Mapping) or joint in value)
         for joint in model.joints

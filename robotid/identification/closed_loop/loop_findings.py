@@ -11,8 +11,6 @@ from robotid.identification.closed_loop.encoder_zeros import CLEAR, parallel_axe
 from robotid.identification.closed_loop.loop_result import STATED_SCALE, LoopIdentification
 from robotid.identification.closed_loop.term_choice import Tried
 
-__all__ = ["loop_findings"]
-
 _SOFT = 0.5  # share of the residual that remains after a step; a larger one shows a soft loop
 _MISMATCH = 0.5  # largest relative error of a torque that the loop of its joint gives
 _CHANGE = 0.2  # largest change of a parameter by halving the steps [standard errors]
@@ -23,12 +21,7 @@ _NAMED = 8  # largest number of parameters that a sentence names
 
 
 def loop_findings(found: LoopIdentification, examined: Sequence[Finding]) -> tuple[Finding, ...]:
-    """Return the findings of logs and fit, the most severe first.
-
-    Args:
-        found: The identification.
-        examined: The doctor's findings of the logs.
-    """
+    """Return the findings of logs and fit, the most severe first."""
     settled = [_settled_delay(finding, found) for finding in examined]
     return by_severity([*settled, *_of_fit(found)])
 

@@ -28,8 +28,6 @@ from robotid.identification.summary import identification_line
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
 
-__all__ = ["STATED_SCALE", "LoopIdentification", "identified_loops", "logged_motion"]
-
 #: The limit of an identification from positions and stated gains.
 STATED_SCALE = (
     "positions do not determine the scale: all drive and inertial parameters scale with kp as "
@@ -199,16 +197,7 @@ def identified_loops(
     fitted: tuple[OpenLoop, ...],
     validation: tuple[OpenLoop, ...],
 ) -> LoopIdentification:
-    """Return the result of a fit, without findings.
-
-    Args:
-        model: The robot of URDF and job.
-        loop: What is known of the loops.
-        estimator: The estimator's settings.
-        fit: The fit.
-        fitted: The fitted logs, with their simulated positions.
-        validation: The validation logs, with their simulated positions.
-    """
+    """Return the result of a fit, without findings."""
     model = with_terms(model, fit.loops)
     standard, slopes = fit.simulator.standard(model, fit.estimate.theta)
     covariance, mapping = slopes @ fit.estimate.covariance @ slopes.T, structural_mapping(model)
@@ -235,11 +224,7 @@ def _errors(covariance: Array) -> Array:
 
 
 def logged_motion(log: Log) -> Trajectory:
-    """Return the motion of a log of commands: positions and their numerical derivatives.
-
-    Args:
-        log: The log, of N samples; accelerations and torques of its motion are 0.
-    """
+    """Return the motion of a log of commands: positions and their numerical derivatives."""
     still = np.zeros_like(log.q)
     dt = np.diff(log.t)
     gaps = dt > _GAP * np.median(dt)

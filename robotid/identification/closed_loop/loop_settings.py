@@ -10,8 +10,6 @@ from robotid.base.settings import Entries, Range, Settings, setting
 from robotid.data.log import suggestion
 from robotid.dynamics.simulation.simulation_settings import DELAY, GAIN, LEVEL, PerJoint
 
-__all__ = ["LoopSettings", "groups_of"]
-
 _CLOCK = Range("1 to 2e4 Hz", lambda x: 1.0 <= x <= 2e4)
 #: Settings that do not apply where the logged torque drives the robot.
 _OF_LOOPS = ("kp", "kd", "limit", "delay", "delays", "rate", "gravity_compensation", "zeros")
@@ -91,16 +89,7 @@ class LoopSettings(Settings):
 
 
 def groups_of(settings: LoopSettings, joints: Sequence[str], alike: Sequence[Any]) -> list[str]:
-    """Return the group of each joint.
-
-    Args:
-        settings: The stated groups; if none, equal joints form a group.
-        joints: Names of the n joints.
-        alike: Properties in which joints of a group agree, n entries.
-
-    Raises:
-        SettingsError: If a group names an unknown joint, or two groups name the same joint.
-    """
+    """Return the group of each joint."""
     found: dict[str, str] = {}
     for group, members in settings.groups.items():
         if isinstance(members, str) or not isinstance(members, Sequence):

@@ -13,8 +13,6 @@ from robotid.dynamics.simulation.loops import ClosedLoopRobot, Loops, cut_window
 from robotid.estimation.fitting.metrics import JointMetrics, Metrics
 from robotid.robot.model import RobotModel
 
-__all__ = ["DRIFTS", "HORIZONS", "OpenLoop", "position_metrics", "position_units", "run_open_loop"]
-
 #: Horizons after which a simulation restarts from the measured state [s].
 HORIZONS = (0.1, 0.5, 2.0)
 #: Horizon of simulations driven by the logged torque: without feedback they drift.
@@ -76,18 +74,7 @@ def run_open_loop(
     *,
     horizons: Sequence[float] = HORIZONS,
 ) -> OpenLoop:
-    """Simulate a log from its commands alone and return the position errors.
-
-    Args:
-        robot: The robot.
-        loops: Its identified loops; without gains, the logged torque drives it.
-        log: The log, with commands, with the joint signs of the URDF.
-        others: Simpler models, by name of the baseline: "urdf", "second_order", "rows".
-        horizons: Further horizons after which the simulation restarts from the log [s].
-
-    Raises:
-        NotConvergedError: If the identified robot cannot be simulated.
-    """
+    """Simulate a log from its commands alone and return the position errors."""
     q, is_driven = np.full_like(log.q, np.nan), not loops.kp.any()
     length = DRIFTS if is_driven else np.inf
     windows = cut_windows(log, length, 0.0)
@@ -124,12 +111,6 @@ def position_metrics(
 
     Relative errors are 100 rmse / spread of the motion, of joints that a log commands to move; all
     logs have equal weight.
-
-    Args:
-        model: The robot.
-        runs: The simulations of the logs.
-        moving: Whether only the logs that move a joint count for it; the metrics then lack a joint
-            that no log moves.
     """
     found: dict[str, JointMetrics] = {}
     units = position_units(model)
@@ -141,11 +122,7 @@ def position_metrics(
 
 
 def position_units(model: RobotModel) -> tuple[str, ...]:
-    """Return the unit of the position of each joint.
-
-    Args:
-        model: The robot.
-    """
+    """Return the unit of the position of each joint."""
     return tuple("m" if joint in model.layout.prismatic else "rad" for joint in model.joints)
 
 

@@ -19,8 +19,6 @@ from robotid.identification.closed_loop.free_parameters import FreeParameter, Lo
 from robotid.robot.drives import TERMS
 from robotid.robot.model import RobotModel
 
-__all__ = ["loop_runs", "units_of"]
-
 _CHANGE = 0.1  # plausible standard deviation of a parameter between logs, over its value
 _LEAST = 0.01  # ... at least, over its prior standard deviation
 _LEAST_INFORMATION = 1e-12
@@ -29,19 +27,7 @@ _LEAST_INFORMATION = 1e-12
 def loop_runs(
     model: RobotModel, simulator: LoopSimulator, estimate: Estimate, unit: Sequence[str] = ()
 ) -> tuple[RunsOf, ...]:
-    """Return the information of each log about the parameters of each joint, or of shared ones.
-
-    Args:
-        model: The robot.
-        simulator: The simulator of the fit, with the windows of all logs.
-        estimate: The estimate.
-        unit: Name of the robot of each log; one robot if empty.
-
-    Returns:
-        A group for each set of joints with free parameters of loops and drives that all logs
-        together determine; none for fewer than three logs, and where the logged torque drives the
-        robot.
-    """
+    """Return the information of each log about the parameters of each joint, or of shared ones."""
     logs = list(dict.fromkeys(id(window.log) for window in simulator.windows))
     if len(logs) < FEWEST_RUNS or simulator.torque is not None:
         return ()
@@ -82,12 +68,7 @@ def loop_runs(
 
 
 def units_of(model: RobotModel, free: FreeParameter) -> str:
-    """Return the unit of a free parameter of a loop or drive.
-
-    Args:
-        model: The robot.
-        free: The parameter.
-    """
+    """Return the unit of a free parameter of a loop or drive."""
     is_linear = model.joints[free.joints[0]] in model.layout.prismatic
     if free.term is not None:
         return free.term.units[is_linear]

@@ -17,8 +17,6 @@ from robotid.estimation.estimators.output_error import OutputError
 from robotid.identification.closed_loop.free_parameters import FreeParameter, LoopSimulator
 from robotid.robot.drives import TERMS
 
-__all__ = ["SecondOrder", "fit_second_order"]
-
 _FREQUENCIES = (6.0, 12.0, 24.0, 48.0, 96.0)  # natural frequencies that are tried [rad/s]
 _DAMPINGS = (0.5, 1.5)  # damping ratios that are tried
 _FRICTIONS = (0.05, 0.5)  # Coulomb friction that is tried, over the typical torque
@@ -79,12 +77,7 @@ class SecondOrder:
         return slow
 
     def replaced(self, other: "SecondOrder", joints: Array) -> "SecondOrder":
-        """Return the model with the values of another one for some joints.
-
-        Args:
-            other: The other model of the same robot.
-            joints: Which joints, shape (n,), bool.
-        """
+        """Return the model with the values of another one for some joints: joints (n,)."""
         each = np.repeat(joints, len(_TERMS))
         changed = {
             name: np.where(joints, getattr(other.loops, name), getattr(self.loops, name))
@@ -96,11 +89,7 @@ class SecondOrder:
         return replace(self, loops=loops, inertia_error=error)
 
     def friction(self, name: str) -> Array:
-        """Return the values of one friction term, shape (n,).
-
-        Args:
-            name: Name of the term: "viscous", "coulomb" or "offset".
-        """
+        """Return the values of one friction term, shape (n,)."""
         which = [term.name for term in _TERMS].index(name)
         found: Array = self.loops.values[which :: len(_TERMS)]
         return found
@@ -114,18 +103,7 @@ def fit_second_order(
     finds_delay: bool,
     finds_limit: bool = False,
 ) -> SecondOrder:
-    """Fit the second-order model to windows: a coarse grid for every joint, then least squares.
-
-    Args:
-        robot: The robot; its bodies are not used.
-        windows: Windows of its logs.
-        stated: Gains and delay, as far as they are known; kp is 1 where it is not.
-        finds_delay: Whether the delay of each joint is fitted.
-        finds_limit: Whether the torque limit of each joint is fitted; else there is none.
-
-    Raises:
-        NotConvergedError: If no trial can be simulated.
-    """
+    """Fit the second-order model to windows: a coarse grid for every joint, then least squares."""
     n = len(stated.kp)
     error = np.concatenate([w.log.q_ref[w.counted] - w.log.q[w.counted] for w in windows])  # type: ignore[index]
     torque = stated.kp * np.maximum(np.sqrt(np.mean(error**2, axis=0)), 1e-6)

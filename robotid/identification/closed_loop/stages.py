@@ -54,8 +54,6 @@ from robotid.identification.closed_loop.term_choice import Tried, candidates, ch
 from robotid.identification.result import Identification
 from robotid.robot.model import RobotModel
 
-__all__ = ["STAGES", "Fitted", "fit_loops", "stated_loops"]
-
 #: The stages of a job's fit, from reading logs to writing files.
 STAGES = (
     "reading logs", "fitting torques", "trying second-order models", "fitting loops",
@@ -116,22 +114,7 @@ def fit_loops(
     chooses: bool = True,
     progress: ProgressCallback = ignore_progress,
 ) -> Fitted:
-    """Fit drives, loops and bodies to logs of commands and positions.
-
-    Args:
-        model: The robot; its drive terms are the fitted ones.
-        logs: The logs, of its joints in its order, with commands.
-        loop: What is known of the loops.
-        settings: Windows, spread of bodies, whitening.
-        signals: Processing of the logs' torques into rows.
-        chooses: Whether further friction terms are tried.
-        progress: Called with the stages.
-
-    Raises:
-        DataError: If a log lacks a signal that is compared.
-        NotConvergedError: If no trial can be simulated.
-        SettingsError: If a setting does not fit the robot.
-    """
+    """Fit drives, loops and bodies to logs of commands and positions."""
     _check_settings(model, logs, loop, settings)
     initialise = _initialise_from_torque if loop.kind == "torque" else _initialise_from_commands
     initialised = initialise(model, logs, loop, settings, signals, progress)
@@ -476,14 +459,6 @@ def refine_steps(
     Steps are halved until this changes no parameter by more than 0.2 standard errors. Derivatives
     stay those of the larger steps: they do not change the minimum. The change by the last halving
     is added to the covariance, since all further halvings together would change as much again.
-
-    Args:
-        simulator: The simulator.
-        estimator: The estimator.
-        estimate: The estimate at the steps of ``simulator``.
-
-    Raises:
-        NotConvergedError: If a step has no solution.
     """
     model, theta = simulator.robot.model, estimate.theta
     dt = float(np.median(np.diff(simulator.windows[0].log.t)))
@@ -512,11 +487,6 @@ def _settled(
     alternate without end: the change by the last one is then added to the covariance. If such a
     step raises the residual or cannot be simulated, as may happen far from the minimum, or
     derivatives are not exact, the parameters are fitted from the best initial states.
-
-    Args:
-        simulator: The simulator.
-        estimator: The estimator.
-        estimate: The estimate with earlier initial states, or larger steps.
     """
     if simulator.exact is not None:
         simulator = simulator.with_better_start(estimate.theta)
@@ -607,15 +577,7 @@ def _largest_speeds(model: RobotModel, loop: LoopSettings, logs: Sequence[Log]) 
 
 
 def stated_loops(model: RobotModel, loop: LoopSettings) -> Loops:
-    """Return the loops as stated, with the URDF's bodies; kp is 1 where it is not stated.
-
-    Args:
-        model: The robot.
-        loop: What is known of the loops.
-
-    Raises:
-        SettingsError: If the robot lacks a named joint.
-    """
+    """Return the loops as stated, with the URDF's bodies; kp is 1 where it is not stated."""
     n, joints = len(model.joints), model.joints
     limit = None if isinstance(loop.limit, str) else loop.limit  # "find": fitted
     bodies = model.standard_parameters()[: model.layout.n_inertial].reshape(-1, 10)

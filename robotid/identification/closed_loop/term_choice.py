@@ -19,8 +19,6 @@ from robotid.identification.closed_loop.free_parameters import FreeParameter, Lo
 from robotid.robot.drive_term import ANYWHERE
 from robotid.robot.drives import FAMILIES, LoadFriction, PositionCoulomb
 
-__all__ = ["Tried", "candidates", "choose", "impossible"]
-
 _OFFERED = ("stribeck", "load", "position")  # candidate families
 # share: of a joint's squared residual in held-out windows, with unit noise; bench_commands.py
 _RULE = Rule(most=len(_OFFERED), share=0.02, p_value=None, alike=0.0)
@@ -53,12 +51,7 @@ class Tried:
 
 
 def candidates(simulator: LoopSimulator, torque: Array) -> list[tuple[FreeParameter, ...]]:
-    """Return the candidate friction terms of each joint.
-
-    Args:
-        simulator: The fitted simulator without them.
-        torque: Typical torque of each joint, for the prior spreads, shape (n,) [N m or N].
-    """
+    """Return the candidate friction terms of each joint: torque (n,) [N m or N]."""
     model = simulator.robot.model
     q = np.concatenate([w.log.q[w.counted] for w in simulator.windows])
     dt = float(np.median(np.diff(simulator.windows[0].log.t)))
@@ -94,11 +87,7 @@ def choose(
 
     Selection is greedy: each pass adds the best candidate of each joint.
 
-    Args:
-        simulator: The simulator with all candidates among its free parameters, at 0.
-        theta: Values of its free parameters, shape (c,).
-        offered: The candidates.
-        estimator: The estimator, with the weights of residuals.
+    theta (c,).
     """
     joints = simulator.robot.model.joints
     if len(simulator.windows) < _FEWEST:
@@ -144,10 +133,7 @@ def impossible(simulator: LoopSimulator, theta: Array, tried: Sequence[Tried]) -
     Negative friction at some position would drive the joint: no simulation that comes to rest there
     has a solution. Beyond the range of the data, terms of the position are constant.
 
-    Args:
-        simulator: The fitted simulator with the terms.
-        theta: Values of its free parameters, shape (c,).
-        tried: The candidates.
+    theta (c,).
     """
     weakest = {t.joint: t for t in sorted(tried, key=lambda t: -t.gain) if t.is_chosen}
     found = {}

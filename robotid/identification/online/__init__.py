@@ -1,3 +1,1 @@
 """Online identification."""
-
-__all__: list[str] = []

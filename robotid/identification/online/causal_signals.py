@@ -12,8 +12,6 @@ import numpy as np
 from robotid.base.exceptions import DataError, SettingsError
 from robotid.base.typing import Array
 
-__all__ = ["Instant", "LiveSignals"]
-
 #: One instant of smooth motion: t [s], then q, v, a, tau, each of shape (n,).
 Instant = tuple[float, Array, Array, Array, Array]
 
@@ -25,19 +23,10 @@ _SETTLE = 4.0  # time after a start or a gap before the first instant [delays]
 class LiveSignals:
     """Converts samples of q and tau online into instants of q, v, a, tau.
 
-    Args:
-        n: Number of joints.
-        rate: Rate of the uniform grid, about that of the samples [Hz].
-        cutoff: Cut-off of the filter [Hz].
-        order: Order of the filter, even.
-        is_continuous: Which joints have no limits, shape (n,), bool: jumps of their positions by a
-            full turn are removed.
-
     Attributes:
         delay: Delay of the instants after the samples [s].
 
-    Raises:
-        SettingsError: If the cut-off is not below half the rate, or the order is not even.
+    is_continuous (n,).
     """
 
     def __init__(
@@ -71,14 +60,7 @@ class LiveSignals:
     def push(self, t: float, q: Array, tau: Array) -> Iterator[Instant]:
         """Process a sample and return the delayed instants that it completes; typically one.
 
-        Args:
-            t: Time stamp [s].
-            q: Joint positions, shape (n,) [rad or m].
-            tau: Joint torques, shape (n,) [N m or N].
-
-        Raises:
-            DataError: If a number is not finite or time does not increase; the state does not
-                change then.
+        q (n,) [rad or m], tau (n,) [N m or N].
         """
         if q.shape != (self._n,) or tau.shape != (self._n,):
             raise DataError(f"q has shape {q.shape} and tau {tau.shape}, wanted ({self._n},) each")

@@ -7,8 +7,6 @@ import scipy.linalg
 
 from robotid.base.typing import Array
 
-__all__ = ["ChangeDetector", "Innovations", "Payload", "load_spread", "payload_of"]
-
 _LARGEST = 25.0  # largest squared innovation in the evidence [variances]
 _FIRST_NOISE = 0.1  # initial noise level, relative to the RMS torque of each row
 _SMALLEST_NOISE = 1e-4  # smallest noise level, relative to the RMS torque of each row
@@ -47,11 +45,6 @@ class ChangeDetector:
     g_j <- max(0, g_j + share (min(d_j^2, 25) - drift)), and a change is flagged when one g_j
     reaches the threshold. The onset of the change is the time at which that g_j last left 0.
 
-    Args:
-        n: Number of rows.
-        threshold: Evidence at which a change is flagged [-].
-        drift: Mean of d_j^2 without a change; 1 for noise alone [-].
-
     References:
         Page (1954), Continuous Inspection Schemes.
     """
@@ -64,10 +57,7 @@ class ChangeDetector:
     def push(self, t: float, squares: Array, share: float) -> float | None:
         """Process one sample; return the onset of a change flagged now [s], else None.
 
-        Args:
-            t: Its time [s].
-            squares: Squared innovations in variances, shape (n,); 0 for rows that are not used.
-            share: Its weight relative to an independent sample [-].
+        squares (n,).
         """
         evidence = self.evidence + share * (np.minimum(squares, _LARGEST) - self.drift)
         evidence[squares == 0.0] = self.evidence[squares == 0.0]
@@ -88,17 +78,12 @@ class Innovations:
     parameters. For the detection of changes, ``model_error`` times each row's torque is added to
     its noise, since no model is exact.
 
-    Args:
-        rms: RMS torque of each row, shape (n,) [N m or N].
-        dt: Time between two samples [s].
-        memory: Time over which noise and torque are averaged [s].
-        model_error: Error of the model without a change, relative to the torque [-].
-        detector: Detector of changes.
-
     Attributes:
         variance: Noise variance of each row, shape (n,) [(N m)^2 or N^2].
         ratio: Mean variance of the prediction, from the parameters' uncertainty, over that of the
             noise, shape (n,); inf before the first sample.
+
+    rms (n,) [N m or N].
     """
 
     def __init__(
@@ -129,15 +114,8 @@ class Innovations:
     ) -> float | None:
         """Process one sample; return the onset of a change flagged now [s], else None.
 
-        Args:
-            t: Its time [s].
-            tau: Torque, shape (n,) [N m or N].
-            e: Innovation tau - Y theta before the update, shape (n,) [N m or N].
-            residual: tau - Y theta after the update, shape (n,) [N m or N].
-            uncertainty: Variance of the prediction by that of the parameters, shape (n,)
-                [(N m)^2 or N^2].
-            used: Which rows are used, shape (n,), bool.
-            share: Its weight relative to an independent sample [-].
+        tau (n,) [N m or N], e (n,) [N m or N], residual (n,) [N m or N], uncertainty (n,)
+        [(N m)^2 or N^2], used (n,).
         """
         expected = uncertainty + self.variance + self._model_error**2 * self._torque
         # before convergence, innovations do not indicate a change
@@ -168,11 +146,7 @@ def payload_of(difference: Array, covariance: Array, columns: Array, spread: Arr
 
     Minimises (d - K_L phi)^T C^-1 (d - K_L phi) + |phi / spread|^2.
 
-    Args:
-        difference: Change d of the base parameters, shape (b,).
-        covariance: Its covariance C, shape (b, b).
-        columns: Columns K_L of the base mapping that belong to the body, shape (b, 10).
-        spread: Prior standard deviation of each parameter of the payload, shape (10,).
+    difference (b,), covariance (b, b), columns (b, 10), spread (10,).
     """
     scale = np.sqrt(np.diag(covariance))
     L = scale[:, None] * np.linalg.cholesky(covariance / np.outer(scale, scale))
@@ -187,8 +161,7 @@ def payload_of(difference: Array, covariance: Array, columns: Array, spread: Arr
 def load_spread(spread: Array) -> Array:
     """Return the prior standard deviations of a payload, (10,): a mean link's mass, twice its size.
 
-    Args:
-        spread: Prior standard deviations of all bodies' parameters, shape (10 bodies,).
+    spread (10 bodies,).
     """
     by_body = spread.reshape(-1, 10)
     mass = max(float(by_body[:, 0].mean()), float(by_body[-1, 0]))

@@ -28,8 +28,6 @@ from robotid.identification.online.online_settings import Change, OnlineSettings
 from robotid.robot.model import RobotModel
 from robotid.robot.prior import prior_spread
 
-__all__ = ["OnlineIdentifier"]
-
 _ARRAYS = {1: ("q", "tau"), 3: ("q", "v", "a", "tau")}  # by the number of arrays after t and q
 _OVERSAMPLED = 12.0  # estimator updates per period of the cut-off
 _STORED_EVERY = 0.1  # time between stored states, for the reset after a change [s]

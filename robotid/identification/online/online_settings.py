@@ -5,8 +5,6 @@ from dataclasses import dataclass
 from robotid.base.settings import NOT_NEGATIVE, POSITIVE, Settings, setting
 from robotid.base.typing import Array
 
-__all__ = ["Change", "OnlineSettings", "Reading"]
-
 
 @dataclass(frozen=True)
 class OnlineSettings(Settings):

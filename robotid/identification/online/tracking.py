@@ -12,8 +12,6 @@ from robotid.identification.online.identifier import OnlineIdentifier
 from robotid.identification.online.online_settings import OnlineSettings, Reading
 from robotid.robot.model import RobotModel
 
-__all__ = ["Observer", "Track", "track"]
-
 Observer = Callable[[int, OnlineIdentifier], None]
 
 _ROWS = 20.0  # rate of the rows of the history [Hz]
@@ -51,18 +49,7 @@ class Track:
 def track(
     model: RobotModel, log: Log, settings: OnlineSettings, *, observer: Observer | None = None
 ) -> Track:
-    """Run an online identification over a log, sample by sample.
-
-    Args:
-        model: The robot, with a fixed base.
-        log: The log, of the model's joints in its order; its q and tau are used.
-        settings: Settings of the online identification.
-        observer: Called after each sample with the index of its row and the identifier.
-
-    Raises:
-        DataError: If the log is too short for a first estimate, or the base floats.
-        SettingsError: If a setting does not fit the log.
-    """
+    """Run an online identification over a log, sample by sample."""
     identifier = OnlineIdentifier(model, settings)
     times: list[float] = []
     readings: list[Reading] = []

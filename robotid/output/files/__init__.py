@@ -1,3 +1,1 @@
 """Files for other programs: the URDF with its sidecar, result.json, and models of simulators."""
-
-__all__: list[str] = []

@@ -15,13 +15,6 @@ from robotid.robot.tree import Joint
 if TYPE_CHECKING:
     from robotid.dynamics.simulation.loops import Loops
 
-__all__ = [
-    "CommandedDrive",
-    "commanded_drives",
-    "limit_of",
-    "loops_of",
-]
-
 #: Parameters of a joint's controller, 0 if a result lacks them.
 _OF_CONTROLLER = ("kd", "delay", "zero")
 _OF_DRIVE = ("armature", "viscous", "coulomb", "offset")
@@ -65,14 +58,7 @@ def commanded_drives(
 ) -> tuple[CommandedDrive, ...]:
     """Return the drives of a result with gains, in the order of the joints; none without gains.
 
-    Args:
-        model: The identified robot.
-        pi: Its standard parameters, shape (p,), SI units, in ``layout.names`` order.
-        content: Content of its result.json.
-        name: The file, for messages.
-
-    Raises:
-        DataError: If some joints have gains and others none, or a gain or a delay is impossible.
+    pi (p,).
     """
     stated = {entry["name"]: float(entry["value"]) for entry in content["drive_parameters"]}
     if not any(f"{joint}.kp" in stated for joint in model.joints):
@@ -110,14 +96,7 @@ def commanded_drives(
 def loops_of(
     model: RobotModel, pi: Array, drives: Sequence[CommandedDrive], rate: float | None = None
 ) -> "Loops":
-    """Return bodies, drives and controllers for simulation.
-
-    Args:
-        model: The identified robot.
-        pi: Its standard parameters, shape (p,), SI units, in ``layout.names`` order.
-        drives: Its drives; armature, friction and offset are those of pi.
-        rate: Sampling rate of a discrete-time controller [Hz]; None: continuous time.
-    """
+    """Return bodies, drives and controllers for simulation: pi (p,)."""
     from robotid.dynamics.simulation.loops import open_loops
 
     kp, kd, delay, zero, limit = (
@@ -129,11 +108,6 @@ def loops_of(
 
 
 def limit_of(drive: CommandedDrive, joint: Joint) -> float:
-    """Return the torque limit of a drive; the URDF's where none was stated or found, else inf.
-
-    Args:
-        drive: The drive.
-        joint: Its joint in the URDF.
-    """
+    """Return the torque limit of a drive; the URDF's where none was stated or found, else inf."""
     stated = joint.effort if joint.effort > 0 else np.inf
     return drive.effort_limit if np.isfinite(drive.effort_limit) else stated

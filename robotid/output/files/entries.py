@@ -26,14 +26,6 @@ if TYPE_CHECKING:
     from robotid.design.previews import Preview
     from robotid.identification.closed_loop.loop_result import LoopIdentification
 
-__all__ = [
-    "SCHEMA_VERSION",
-    "build_preview",
-    "build_result",
-    "input_entries",
-    "recording_metrics",
-]
-
 SCHEMA_VERSION = 1
 
 _EXTENT = ("samples", "rate", "start", "end", "rows_used", "segments")
@@ -44,13 +36,7 @@ def build_result(
     settings: Mapping[str, Any],
     outputs: Mapping[str, str] | None = None,
 ) -> dict[str, Any]:
-    """Return the content of result.json: plain values, all numbers finite.
-
-    Args:
-        found: The identification.
-        settings: The job, in the form of its file.
-        outputs: Further files in the same folder, by kind.
-    """
+    """Return the content of result.json: plain values, all numbers finite."""
     model, (bodies, drives) = found.model, parameter_entries(found)
     if isinstance(found, Identification):
         own = _torque_entries(found, settings)
@@ -148,11 +134,7 @@ def _variation(found: Identification) -> dict[str, Any]:
 
 
 def build_preview(preview: "Preview") -> dict[str, Any]:
-    """Return the content of a preview: plain values, all numbers finite.
-
-    Args:
-        preview: The preview.
-    """
+    """Return the content of a preview: plain values, all numbers finite."""
     found, noise = preview.expected, preview.noise
     bodies, drives = parameter_entries(found)
     keys = ("name", "expression", "std_error", "unit")
@@ -189,12 +171,7 @@ def build_preview(preview: "Preview") -> dict[str, Any]:
 
 
 def recording_metrics(evaluation: Evaluation, name: str) -> dict[str, Any]:
-    """Return the metrics of one recording for result.json.
-
-    Args:
-        evaluation: The recording.
-        name: Name of the parameters of the prediction.
-    """
+    """Return the metrics of one recording for result.json."""
     recording = evaluation.recording
     return {"log": recording.log.path, "name": recording.name, **evaluation.metrics[name].to_dict()}
 
@@ -269,11 +246,7 @@ def _expected_torque(preview: "Preview") -> dict[str, dict[str, Any]]:
 
 
 def input_entries(found: "Identification | LoopIdentification") -> list[dict[str, Any]]:
-    """Return the files that were read, for result.json, the URDF first.
-
-    Args:
-        found: The identification.
-    """
+    """Return the files that were read, for result.json, the URDF first."""
     inputs = [{"role": "urdf", **source_entry(found.model.tree.path)}]
     if not isinstance(found, Identification):
         from robotid.output.files.loop_export import loop_inputs

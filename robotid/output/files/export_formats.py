@@ -3,8 +3,6 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-__all__ = ["DELAYS", "FORMATS", "Format", "Option", "options_of"]
-
 
 @dataclass(frozen=True)
 class Option:
@@ -79,11 +77,7 @@ FORMATS: dict[str, Format] = {
 
 
 def options_of(formats: Mapping[str, Format]) -> dict[str, dict[str, Option]]:
-    """Return the options of formats, by name: the formats that have it, with its description.
-
-    Args:
-        formats: The formats by name.
-    """
+    """Return the options of formats, by name: the formats that have it, with its description."""
     found: dict[str, dict[str, Option]] = {}
     for kind, form in formats.items():
         for name, option in form.options.items():

@@ -15,8 +15,6 @@ from robotid.robot.model import RobotModel
 if TYPE_CHECKING:
     from robotid.output.files.result_file import Result
 
-__all__ = ["Exported", "Written", "unstated_terms"]
-
 _GRAVITY = (
     "the controller compensates gravity with the URDF's model, which the file cannot state; add "
     "this torque to that of the actuators (in MuJoCo, gravcomp = 1 of each body is close to it)"
@@ -41,16 +39,7 @@ class Exported:
 
     @classmethod
     def of(cls, result: "Result", terms: Collection[str]) -> "Exported":
-        """Return a result in the drive terms of a format.
-
-        Args:
-            result: The result.
-            terms: The terms.
-
-        Raises:
-            DataError: If the result has no URDF.
-            ModelError: If its URDF was changed.
-        """
+        """Return a result in the drive terms of a format."""
         return cls(result, project_friction(*result.identified, result.drive_moments, terms))
 
     @property
@@ -86,12 +75,7 @@ class Exported:
         return notes
 
     def written(self, *files: Path, notes: Sequence[str] = ()) -> "Written":
-        """Return the written files with their notes.
-
-        Args:
-            files: The files.
-            notes: Properties that the files do not state, a sentence each.
-        """
+        """Return the written files with their notes."""
         drives = {drive.name: drive.to_dict() for drive in self.projection.drives}
         return Written(files, notes, drives)
 
@@ -116,12 +100,7 @@ def unstated_terms(
 ) -> list[str]:
     """Return a sentence on drive parameters and loops that a format cannot state, if any.
 
-    Args:
-        model: The robot.
-        pi: Standard parameters, shape (p,), SI units, in ``layout.names`` order.
-        name: The format.
-        terms: The drive terms of the format.
-        has_couplings: Whether it states drives that move several joints, and loops.
+    pi (p,).
     """
     layout = model.layout
     drives = zip(layout.drive_parameters, layout.drive_names, pi[layout.n_inertial :], strict=True)

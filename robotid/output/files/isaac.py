@@ -19,8 +19,6 @@ from robotid.output.files.yaml_text import yaml_text
 from robotid.robot.model import RobotModel
 from robotid.robot.tree import Joint
 
-__all__ = ["export", "isaac_actuators", "write_isaac"]
-
 # drive terms of Isaac Lab's actuators; a note of its own states the offset
 _TERMS = ("armature", "viscous", "coulomb", "offset")
 _STEP = 0.005  # [s]
@@ -40,16 +38,7 @@ rest and in motion.
 
 
 def export(result: Result, target: Path, *, step: float = _STEP) -> Written:
-    """Write the drives of a result as the YAML of Isaac Lab's actuators.
-
-    Args:
-        result: The result.
-        target: The file to write.
-        step: As of ``write_isaac``.
-
-    Raises:
-        DataError, SettingsError: As of ``write_isaac``; also if it has no URDF.
-    """
+    """Write the drives of a result as the YAML of Isaac Lab's actuators."""
     of = Exported.of(result, _TERMS)
     notes = write_isaac(of.model, of.pi, of.commanded, target, step=step, notes=of.notes)
     return of.written(target, notes=notes)
@@ -58,21 +47,7 @@ def export(result: Result, target: Path, *, step: float = _STEP) -> Written:
 def isaac_actuators(
     model: RobotModel, commanded: Sequence[CommandedDrive], physics_dt: float
 ) -> dict[str, Any]:
-    """Return the groups of joints with equal drives, with the names of Isaac Lab's fields.
-
-    Args:
-        model: The robot; its URDF has the speed limits, and torque limits of drives without one.
-        commanded: The drives of its joints.
-        physics_dt: Time step of the simulator, the unit of delays [s].
-
-    Returns:
-        {"physics_dt", "actuators": {group: fields of ``DelayedPDActuatorCfg``}}; a limit that is
-        not stated is None. Isaac Lab then uses the limit of its own model of the robot.
-
-    Raises:
-        DataError: If there are no drives with position controllers.
-        SettingsError: If physics_dt is not positive.
-    """
+    """Return the groups of joints with equal drives, with the names of Isaac Lab's fields."""
     if not 0 < physics_dt < math.inf:
         raise SettingsError(f"step is {physics_dt:g} s, wanted a positive time")
     if not commanded:
@@ -102,23 +77,7 @@ def write_isaac(
     step: float = _STEP,
     notes: Sequence[str] = (),
 ) -> tuple[str, ...]:
-    """Write drives with position controllers as the YAML of Isaac Lab's actuators.
-
-    Args:
-        model: The robot.
-        pi: Standard parameters, shape (p,), SI units, in ``layout.names`` order.
-        commanded: Its drives.
-        target: The file to write.
-        step: Time step of the simulator, the unit of delays [s].
-        notes: Further notes on the file.
-
-    Returns:
-        Properties that the file does not state, a sentence each; its head has them, too.
-
-    Raises:
-        DataError: If there are no drives with position controllers, or the folder does not exist.
-        SettingsError: If step is not positive, or the target is a folder.
-    """
+    """Write drives with position controllers as the YAML of Isaac Lab's actuators: pi (p,)."""
     content = isaac_actuators(model, commanded, step)
     every = [*notes, *unstated_terms(model, pi, "Isaac Lab", _TERMS)]
     for key, words, remedy in (

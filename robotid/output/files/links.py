@@ -22,8 +22,6 @@ from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
 from robotid.robot.tree import Joint
 
-__all__ = ["WORLD", "SimulatedLink", "XmlFormat", "own_drives", "write_model"]
-
 #: Name of the fixed frame in simulators.
 WORLD = "world"
 _NAMED = 6  # missing meshes that are listed
@@ -85,25 +83,7 @@ def write_model(
     build: Callable[[Sequence[SimulatedLink], dict[str, float]], ET.Element],
     notes: Sequence[str] = (),
 ) -> tuple[str, ...]:
-    """Write a robot in the format of a simulator.
-
-    Args:
-        model: The robot.
-        pi: Standard parameters, shape (p,), SI units, in ``layout.names`` order.
-        target: The file to write.
-        original: A further URDF to which paths of meshes may be relative.
-        to: The format.
-        build: Returns the file's content from links, parents first, and parameters by name.
-        notes: Further notes on the file.
-
-    Returns:
-        Properties that the file does not state, a sentence each; its head has them, too.
-
-    Raises:
-        DataError: If pi does not have p finite entries, or the folder does not exist.
-        ModelError: If a link or a drive would be physically impossible, or is named "world".
-        SettingsError: If the target is a folder.
-    """
+    """Write a robot in the format of a simulator: pi (p,)."""
     require_kind(target, (str, Path), "target", "the path of a file to write")
     require_kind(original, (str, Path, type(None)), "original", "the path of a URDF, or none")
     inertials, meshes = _inertials(model, pi), set[str]()
@@ -127,12 +107,7 @@ def write_model(
 
 
 def own_drives(model: RobotModel, values: Mapping[str, float]) -> dict[str, float]:
-    """Return parameters without those of drives that move several joints.
-
-    Args:
-        model: The robot.
-        values: Parameters by name.
-    """
+    """Return parameters without those of drives that move several joints."""
     shared = {coupling.name for coupling in model.layout.couplings}
     return {name: x for name, x in values.items() if name.rpartition(".")[0] not in shared}
 

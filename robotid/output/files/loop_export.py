@@ -16,17 +16,11 @@ from robotid.identification.closed_loop.position_errors import (
 from robotid.output.files.samples import covariance_entry
 from robotid.robot.model import RobotModel
 
-__all__ = ["loop_entries", "loop_inputs", "open_loop_entry"]
-
 _LOOP_TERMS = ("kp", "kd", "delay", "limit", "zero")
 
 
 def loop_entries(found: LoopIdentification) -> dict[str, Any]:
-    """Return the entries of result.json that only an identification by simulation has.
-
-    Args:
-        found: The identification.
-    """
+    """Return the entries of result.json that only an identification by simulation has."""
     model, estimate = found.model, found.estimate
     runs = {"identification": found.fitted, "validation": found.validation}
     bodies = zip(found.mapping.base_names, found.mapping.independent, found.base_error, strict=True)
@@ -67,11 +61,7 @@ def loop_entries(found: LoopIdentification) -> dict[str, Any]:
 
 
 def loop_inputs(found: LoopIdentification) -> list[dict[str, Any]]:
-    """Return the logs that were read, for result.json.
-
-    Args:
-        found: The identification.
-    """
+    """Return the logs that were read, for result.json."""
     every = {"identification": found.fitted, "validation": found.validation}
     return [
         {
@@ -144,10 +134,6 @@ def open_loop_entry(model: RobotModel, run: OpenLoop) -> dict[str, Any]:
 
     If the logged torque drives the robot, the errors of two baselines are included: constant speed,
     and the fit of torques alone.
-
-    Args:
-        model: The robot.
-        run: The open-loop simulation of the log.
     """
     units = position_units(model)
     return {

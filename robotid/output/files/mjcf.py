@@ -24,8 +24,6 @@ from robotid.robot.bodies import principal_moments
 from robotid.robot.model import RobotModel
 from robotid.robot.tree import Joint
 
-__all__ = ["export", "write_mjcf"]
-
 #: Attribute of a joint, or of a tendon over several joints, for each term of a drive.
 _ATTRIBUTES = {
     "armature": "armature",
@@ -60,17 +58,7 @@ _STL_HEAD, _STL_FACE = 84, 50  # bytes; MuJoCo does not read STL in text form
 
 
 def export(result: Result, target: Path, *, step: float = _STEP, delay: str = "history") -> Written:
-    """Write a result as MJCF.
-
-    Args:
-        result: The result.
-        target: The file to write.
-        step: As of ``write_mjcf``.
-        delay: As of ``write_mjcf``.
-
-    Raises:
-        DataError, ModelError, SettingsError: As of ``write_mjcf``; also if it has no URDF.
-    """
+    """Write a result as MJCF."""
     of = Exported.of(result, _TERMS)
     notes = write_mjcf(
         of.model, of.pi, target, original=of.original, commanded=of.commanded, step=step,

@@ -35,17 +35,6 @@ from robotid.robot.parameters import pseudo_inertia_basis
 if TYPE_CHECKING:
     from robotid.output.files.result_file import Result
 
-__all__ = [
-    "body_ranges",
-    "export",
-    "parameter_ranges",
-    "projected_ranges",
-    "ranges_text",
-    "source_of",
-    "stated_ranges",
-    "write_ranges",
-]
-
 #: Parameters of drives that cannot be negative.
 _NOT_NEGATIVE = {"kd", "delay", *(name for name, term in TERMS.items() if term.is_nonnegative)}
 _HEAD = """\
@@ -81,20 +70,7 @@ def export(
     samples: int | None = None,
     seed: int | None = None,
 ) -> Written:
-    """Write the ranges that a result states, as YAML, and samples beside it, as JSON.
-
-    Args:
-        result: The result.
-        target: The file to write; samples are in the file with ``.samples.json`` in place of its
-            suffix.
-        samples: Number of samples of the joint distribution; None: no samples.
-        seed: Seed of the samples; 0 if None.
-
-    Raises:
-        DataError: If the result has no URDF, because it is wrong, or no ranges, or no covariance
-            for samples.
-        SettingsError: If the target is a folder, or an option is out of range.
-    """
+    """Write the ranges that a result states, as YAML, and samples beside it, as JSON."""
     if samples is None and seed is not None:
         raise SettingsError("seed is an option of samples; state their number, samples, too")
     model, pi = result.identified  # raises for a result without URDF
@@ -113,17 +89,6 @@ def parameter_ranges(found: Identified) -> dict[str, Any]:
     """Return the ranges of the parameters of links and drives, as plain values.
 
     The intervals of centre and moments are first-order functions of those of the parameters.
-
-    Args:
-        found: The identification.
-
-    Returns:
-        {"robot", "confidence", "bodies": {link: {"mass", "com", "principal_axes",
-        "second_moments", "principal_moments"}}, "drives": {drive: {term: ...}}, "undetermined"};
-        each figure as {"nominal", "low", "high", "source"}.
-
-    Raises:
-        ModelError: If a link or a drive would be physically impossible.
     """
     layout, sources = found.model.layout, found.sources
     errors, covariance = found.standard_error, found.standard_covariance
@@ -157,15 +122,7 @@ def body_ranges(
 ) -> dict[str, dict[str, Any]]:
     """Return the ranges of links; a link that was not identified has no ends.
 
-    Args:
-        model: The robot.
-        standard: Standard parameters, shape (p,), SI units.
-        covariance: Their covariance, shape (p, p); 0 for parameters that were not identified.
-        sources: The source of each.
-        quantile: Half width of each interval in standard errors, shape (p,).
-
-    Raises:
-        ModelError: If a link or a drive would be physically impossible.
+    standard (p,), covariance (p, p), quantile (p,).
     """
     own, bodies = link_parameters(model, standard), {}
     for i, body in enumerate(model.layout.bodies):
@@ -177,14 +134,7 @@ def body_ranges(
 
 
 def projected_ranges(found: Identified) -> dict[str, Any]:
-    """Return the ranges of projected friction, as in exports for MuJoCo, of drives with more terms.
-
-    Args:
-        found: The identification.
-
-    Returns:
-        {"projected_drives": {drive: {term: range}}}, or nothing without such drives.
-    """
+    """The ranges of projected friction, as in exports for MuJoCo, of drives with more terms."""
     moments = found.moments if found.model.layout.own else {}
     drives = project_friction(found.model, found.standard, moments, SIMULATED).drives
     ranges: dict[str, dict[str, Any]] = {}
@@ -207,14 +157,7 @@ def projected_ranges(found: Identified) -> dict[str, Any]:
 
 
 def stated_ranges(content: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the ranges of a result, including gains, delays and zeros of its drives.
-
-    Args:
-        content: Content of a result.json.
-
-    Returns:
-        As of ``parameter_ranges``; a stated parameter has only "nominal" and "source".
-    """
+    """Return the ranges of a result, including gains, delays and zeros of its drives."""
     drives: dict[str, dict[str, Any]] = {}
     for entry in content["drive_parameters"]:
         drive, _, term = entry["name"].rpartition(".")
@@ -260,11 +203,7 @@ def write_ranges(found: Identification, target: str | Path) -> None:
 
 
 def ranges_text(ranges: Mapping[str, Any]) -> str:
-    """Return ranges as YAML, with an explanation in the head.
-
-    Args:
-        ranges: As of ``parameter_ranges`` and in result.json.
-    """
+    """Return ranges as YAML, with an explanation in the head."""
     head = _HEAD.format(robot=json.dumps(ranges["robot"]), version=__version__)
     return yaml_text(ranges, head)
 
@@ -304,11 +243,7 @@ def _joint_source(sources: Sequence[str]) -> str:
 
 
 def source_of(entry: Mapping[str, Any]) -> str:
-    """Return the source of a parameter of a result, also for results that do not state it.
-
-    Args:
-        entry: The parameter, as in result.json.
-    """
+    """Return the source of a parameter of a result, also for results that do not state it."""
     found = "stated" if entry.get("std_error") is None else "data"
     return "bound" if entry.get("at_bound") else str(entry.get("source", found))
 

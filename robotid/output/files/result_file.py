@@ -51,18 +51,6 @@ from robotid.robot.model import RobotModel
 if TYPE_CHECKING:
     from robotid.identification.closed_loop.position_errors import OpenLoop
 
-__all__ = [
-    "Result",
-    "load_result",
-    "read_result",
-    "stated_between",
-    "stated_covariance",
-    "stated_model",
-    "stated_parameters",
-    "stated_scale_check",
-    "stated_urdf_with_drives",
-]
-
 _STATUSES = ("good", "usable", "poor", "not evaluated")
 _STATUS = Range("good, usable, poor or not evaluated", _STATUSES.__contains__)
 _METRICS = {"per_joint": {...: {"relative_error_pct": MAYBE, "rmse": MAYBE, "unit": TEXT}}}
@@ -396,14 +384,7 @@ def _with_moved_inputs(result: dict[str, Any], path: Path) -> dict[str, Any]:
 
 
 def read_result(path: str | Path) -> dict[str, Any]:
-    """Read the content of a result.json; inputs in a moved folder have their present paths.
-
-    Args:
-        path: The file.
-
-    Raises:
-        DataError: If it is missing, not JSON, or not of the schema of a result.
-    """
+    """Read the content of a result.json; inputs in a moved folder have their present paths."""
     name, result = Path(path).name, read_json(path, "result")
     version = result.get("schema_version") if isinstance(result, dict) else None
     if version != SCHEMA_VERSION or "verdict" not in result:
@@ -462,14 +443,7 @@ def _check_definite(matrices: ArrayLike, at: str, least: float = 0.0) -> None:
 
 
 def stated_scale_check(result: Mapping[str, Any]) -> ScaleCheck | None:
-    """Return the scale check of a result, if it has one.
-
-    Args:
-        result: Content of a result.json.
-
-    Raises:
-        DataError: If a list of it has the wrong length.
-    """
+    """Return the scale check of a result, if it has one."""
     stated = result.get("scale_check")
     if stated is None:
         return None
@@ -491,15 +465,7 @@ def stated_scale_check(result: Mapping[str, Any]) -> ScaleCheck | None:
 
 
 def stated_urdf_with_drives(result: Mapping[str, Any], model: RobotModel) -> Array | None:
-    """Return the URDF's bodies with the drives fitted to them, if a result states them.
-
-    Args:
-        result: Content of a result.json.
-        model: The robot.
-
-    Raises:
-        DataError: If their number differs from that of the robot.
-    """
+    """Return the URDF's bodies with the drives fitted to them, if a result states them."""
     drives = [entry.get("with_urdf") for entry in result["drive_parameters"]]
     if None in drives:
         return None
@@ -514,18 +480,7 @@ def stated_urdf_with_drives(result: Mapping[str, Any], model: RobotModel) -> Arr
 
 
 def stated_parameters(result: Mapping[str, Any], model: RobotModel) -> Array:
-    """Return the standard parameters that a result states.
-
-    Args:
-        result: Content of a result.json.
-        model: Its robot.
-
-    Returns:
-        Parameters, shape (p,), SI units, in ``layout.names`` order.
-
-    Raises:
-        ModelError: If a parameter of the robot is not in it.
-    """
+    """Return the standard parameters that a result states: -> (p,)."""
     stated = {
         entry["name"]: entry["value"]
         for entry in (*result["standard_parameters"], *result["drive_parameters"])
@@ -539,18 +494,7 @@ def stated_parameters(result: Mapping[str, Any], model: RobotModel) -> Array:
 
 
 def stated_covariance(result: Mapping[str, Any], names: Sequence[str]) -> Array | None:
-    """Return the covariance of parameters of a result; None if an earlier version wrote it.
-
-    Args:
-        result: Content of a result.json.
-        names: Names of k parameters.
-
-    Returns:
-        Shape (k, k); 0 for a parameter that was not identified.
-
-    Raises:
-        DataError: If the covariance has not a row for each name.
-    """
+    """Return the covariance of parameters of a result; None if an earlier version wrote it."""
     if "covariance" not in result:
         return None
     stated, rows = result["covariance"]["names"], result["covariance"]["root"]
@@ -567,15 +511,7 @@ def stated_covariance(result: Mapping[str, Any], names: Sequence[str]) -> Array 
 
 
 def stated_between(result: Mapping[str, Any], model: RobotModel) -> Array | None:
-    """Return the covariance of a robot's parameters in another log, in addition to that of the fit.
-
-    Args:
-        result: Content of a result.json.
-        model: The robot.
-
-    Returns:
-        Shape (p, p); None for fewer than three fitted logs, or if an earlier version wrote it.
-    """
+    """The covariance of a robot's parameters in another log, in addition to that of the fit."""
     variation = result.get("variation")
     if variation is None or "correlation" not in variation:
         return None
@@ -583,15 +519,6 @@ def stated_between(result: Mapping[str, Any], model: RobotModel) -> Array | None
 
 
 def stated_model(result: Mapping[str, Any], model: RobotModel) -> RobotModel:
-    """Return the robot with the friction terms and parameters of a result.
-
-    Args:
-        result: Content of a result.json.
-        model: Its robot, as its job states it.
-
-    Raises:
-        ModelError: If a parameter of the robot is not in it.
-        SettingsError: If a term of it is unknown.
-    """
+    """Return the robot with the friction terms and parameters of a result."""
     found = model.with_terms(terms_from_facts(result.get("own_terms", {})))
     return found.with_reference(stated_parameters(result, found))

@@ -28,8 +28,6 @@ from robotid.robot.parameters import pseudo_inertia
 if TYPE_CHECKING:
     from robotid.output.files.result_file import Result
 
-__all__ = ["covariance_entry", "sample", "write_samples"]
-
 _DIGITS = 9  # significant digits of the root in result.json
 _MOST = 1_000_000
 _POSITIVE = ("kp", "limit")
@@ -41,14 +39,7 @@ SIMULATED = ("viscous", "coulomb", "offset")
 def covariance_entry(names: Sequence[str], covariance: Array, is_fixed: Array) -> dict[str, Any]:
     """Return the covariance of parameters for result.json, as its root.
 
-    Args:
-        names: Names of p parameters, standard ones first.
-        covariance: C, shape (p, p); not finite where unknown.
-        is_fixed: Which of them are at a bound, shape (p,), bool.
-
-    Returns:
-        {"names", "root"}: the rows of L with C = L L^T, each without the zeros at its end. A
-        parameter at its bound, or one that was not identified, has an empty row.
+    covariance (p, p), is_fixed (p,).
     """
     is_known = ~(is_fixed | is_fixed[:, None]) & np.isfinite(covariance)
     L = root_of(np.where(is_known, covariance, 0.0))
@@ -57,18 +48,7 @@ def covariance_entry(names: Sequence[str], covariance: Array, is_fixed: Array) -
 
 
 def write_samples(result: "Result", target: Path, count: int, seed: int) -> None:
-    """Write samples of the parameters of a result as JSON.
-
-    Args:
-        result: The result.
-        target: The file to write.
-        count: Number of samples.
-        seed: Seed of the random numbers.
-
-    Raises:
-        DataError: If the result has no URDF, or no covariance.
-        SettingsError: If a number is out of range, or the target is a folder.
-    """
+    """Write samples of the parameters of a result as JSON."""
     if not 1 <= count <= _MOST:
         raise SettingsError(f"samples is {count}, wanted a whole number from 1 to {_MOST}")
     if seed < 0:
@@ -103,16 +83,7 @@ def sample(result: "Result", count: int, rng: np.random.Generator) -> tuple[list
     robot. Their correlation is that of the error of the fit, with all its parameters, and that of
     their values in the logs, among each other.
 
-    Args:
-        result: The result.
-        count: Number of samples.
-        rng: Source of the draws.
-
-    Returns:
-        Names of the p parameters; samples, shape (count, p).
-
-    Raises:
-        DataError: If the result has no URDF, or no covariance.
+    -> (count, p).
     """
     model, pi = result.identified
     stated = result.content.get("covariance")

@@ -18,8 +18,6 @@ from robotid.robot.meshes import Shape
 from robotid.robot.model import RobotModel
 from robotid.robot.tree import MOMENTS, Joint
 
-__all__ = ["export", "write_sdf"]
-
 _VERSION, _VERSION_OF_MIMIC = "1.9", "1.11"
 #: Element of a joint's ``<dynamics>`` that states a term of its drive.
 _DYNAMICS = {"viscous": "damping", "coulomb": "friction"}
@@ -30,15 +28,7 @@ _SIZES = {"sphere": ("radius",), "cylinder": ("radius", "length")}
 
 
 def export(result: Result, target: Path) -> Written:
-    """Write a result as SDF.
-
-    Args:
-        result: The result.
-        target: The file to write.
-
-    Raises:
-        DataError, ModelError, SettingsError: As of ``write_sdf``; also if it has no URDF.
-    """
+    """Write a result as SDF."""
     of = Exported.of(result, _TERMS)
     notes = write_sdf(of.model, of.pi, target, original=of.original, notes=of.notes)
     return of.written(target, notes=notes)

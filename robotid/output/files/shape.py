@@ -12,8 +12,6 @@ from typing import Any
 from robotid.base.exceptions import DataError
 from robotid.base.settings import Range
 
-__all__ = ["FILE", "FLAG", "MAYBE", "NUMBER", "TABLE", "TEXT", "check_shape", "require_lengths"]
-
 TEXT, NUMBER, FLAG, TABLE = (str,), (int, float), (bool,), (dict,)
 FILE = Range("the name of a file in the same folder", lambda x: Path(x).name == x and "\0" not in x)
 MAYBE = (int, float, type(None))
@@ -22,16 +20,7 @@ _NAMES = {str: "text", int: "a number", bool: "true or false", dict: "a table", 
 
 
 def check_shape(value: Any, wanted: Any, at: str) -> None:  # noqa: ANN401
-    """Refuse a value that does not match a schema.
-
-    Args:
-        value: The content of JSON.
-        wanted: The schema.
-        at: Name of the value, for errors.
-
-    Raises:
-        DataError: If a key is missing, or a value has another type or is out of its range.
-    """
+    """Refuse a value that does not match a schema."""
     if isinstance(wanted, Mapping):
         _check_type(value, (dict,), at)
         if ... in wanted:
@@ -57,16 +46,7 @@ def check_shape(value: Any, wanted: Any, at: str) -> None:  # noqa: ANN401
 
 
 def require_lengths(value: Any, shape: Sequence[int], at: str) -> None:  # noqa: ANN401
-    """Refuse nested lists of other lengths.
-
-    Args:
-        value: The lists.
-        shape: The lengths, level by level.
-        at: Name of the value, for errors.
-
-    Raises:
-        DataError: If a length differs.
-    """
+    """Refuse nested lists of other lengths."""
     if shape and len(value) != shape[0]:
         raise DataError(f"{at} has {len(value)} entries, wanted {shape[0]}")
     for k, entry in enumerate(value if shape[1:] else ()):

@@ -46,18 +46,6 @@ from robotid.robot.tree import MOMENTS, Inertial
 if TYPE_CHECKING:
     from robotid.output.files.result_file import Result
 
-__all__ = [
-    "DYNAMICS_TERMS",
-    "export",
-    "link_parameters",
-    "load_identified",
-    "numbers_text",
-    "read_sidecar",
-    "terms_from_facts",
-    "urdf_changes",
-    "write_urdf",
-]
-
 #: The drive terms of ``<dynamics>``.
 DYNAMICS_TERMS = tuple(name for name, term in TERMS.items() if term.dynamics)
 _SCHEMA_VERSION = 1
@@ -139,15 +127,7 @@ def write_urdf(
 
 
 def export(result: "Result", target: Path) -> Written:
-    """Write the URDF of a result with ``<dynamics>``, and its sidecar.
-
-    Args:
-        result: The result.
-        target: The URDF to write.
-
-    Raises:
-        DataError, ModelError: As of ``write_urdf``; also if the result has no URDF.
-    """
+    """Write the URDF of a result with ``<dynamics>``, and its sidecar."""
     of = Exported.of(result, DYNAMICS_TERMS)
     sidecar = write_urdf(*result.identified, target, dynamics=of.projection)
     unstated = unstated_terms(of.model, of.pi, "URDF", DYNAMICS_TERMS)
@@ -157,19 +137,7 @@ def export(result: "Result", target: Path) -> Written:
 def urdf_changes(model: RobotModel, pi: Array, *, dynamics: Projection | bool = False) -> list[str]:
     """Return the differences of the URDF of ``write_urdf`` from the original, line by line.
 
-    Args:
-        model: The robot; its file is compared.
-        pi: Standard parameters, shape (p,), SI units, in ``layout.names`` order.
-        dynamics: As of ``write_urdf``.
-
-    Returns:
-        A unified diff without context, each segment with the name of its link or joint; empty if
-        the original is missing.
-
-    Raises:
-        DataError: If pi does not have p finite entries.
-        ModelError: If a link or a drive would be physically impossible, or the original cannot be
-            edited.
+    pi (p,).
     """
     source = Path(model.tree.path)
     if not source.is_file():
@@ -188,14 +156,7 @@ def urdf_changes(model: RobotModel, pi: Array, *, dynamics: Projection | bool = 
 
 
 def read_sidecar(path: str | Path) -> dict[str, Any]:
-    """Return the content of the sidecar of a written URDF, schema_version 1.
-
-    Args:
-        path: The ``.drive.json`` file.
-
-    Raises:
-        DataError: If it is missing, not JSON, or not of the schema of a sidecar.
-    """
+    """Return the content of the sidecar of a written URDF, schema_version 1."""
     source, content = Path(path), read_json(path, "drive parameters file")
     version = content.get("schema_version") if isinstance(content, dict) else None
     if version != _SCHEMA_VERSION:
@@ -208,17 +169,7 @@ def read_sidecar(path: str | Path) -> dict[str, Any]:
 
 
 def load_identified(urdf: str | Path, sidecar: str | Path) -> tuple[RobotModel, Array]:
-    """Return the model and the standard parameters, shape (p,), of a URDF with its sidecar.
-
-    Args:
-        urdf: The written URDF.
-        sidecar: Its ``.drive.json``.
-
-    Raises:
-        DataError: If the sidecar is not usable.
-        ModelError: If the URDF is missing, is not the one of the sidecar, or lacks a joint of the
-            sidecar.
-    """
+    """Return the model and the standard parameters, shape (p,), of a URDF with its sidecar."""
     facts, path = read_sidecar(sidecar), Path(urdf)
     if not path.is_file():
         raise ModelError(f"there is no URDF file {str(path)!r}")
@@ -252,14 +203,7 @@ def load_identified(urdf: str | Path, sidecar: str | Path) -> tuple[RobotModel, 
 
 
 def terms_from_facts(tables: Mapping[str, Sequence[Mapping[str, Any]]]) -> dict[str, Any]:
-    """Return the further terms of single drives, by name, from their plain values.
-
-    Args:
-        tables: Their values, as of ``RobotModel.options``.
-
-    Raises:
-        SettingsError: If a term is unknown.
-    """
+    """Return the further terms of single drives, by name, from their plain values."""
     return {name: [term_from_dict(term) for term in terms] for name, terms in tables.items()}
 
 
@@ -361,16 +305,7 @@ def _check_target(source: Path, target: Path) -> None:
 def link_parameters(model: RobotModel, pi: Array) -> dict[str, Array]:
     """Return the ten parameters of each moving link in its frame, without locked links.
 
-    Args:
-        model: The robot.
-        pi: Standard parameters, shape (p,), SI units, in ``layout.names`` order.
-
-    Returns:
-        Parameters by name of the link, shape (10,).
-
-    Raises:
-        DataError: If pi does not have p finite entries.
-        ModelError: If a link or a drive would be physically impossible.
+    pi (p,) -> (10,).
     """
     _check_parameters(model, pi)
     layout = model.layout
@@ -461,11 +396,7 @@ def _inertial(parameters: Array) -> list[str]:
 
 
 def numbers_text(values: Iterable[float]) -> str:
-    """Return numbers as the value of an XML attribute, exact to the last bit.
-
-    Args:
-        values: The numbers.
-    """
+    """Return numbers as the value of an XML attribute, exact to the last bit."""
     return " ".join(repr(float(value) + 0.0) for value in values)  # no "-0.0"
 
 

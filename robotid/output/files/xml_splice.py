@@ -12,8 +12,6 @@ from xml.parsers import expat
 
 from robotid.base.exceptions import ModelError
 
-__all__ = ["Document", "Edit", "apply", "insert", "parse", "remove", "replace", "set_attributes"]
-
 # the tag at the start of an element; the value of an attribute may contain ">"
 _TAG = re.compile(rb"<[^\s/>]+(?:[^>\"']|\"[^\"]*\"|'[^']*')*>")
 _ATTRIBUTE = re.compile(rb"\s([^\s=/>]+)\s*=\s*(\"[^\"]*\"|'[^']*')")
@@ -37,11 +35,7 @@ class Element:
         return self.inside == self.end
 
     def find_all(self, tag: str) -> tuple["Element", ...]:
-        """Return the elements of one name directly inside, in the order of the file.
-
-        Args:
-            tag: Their name.
-        """
+        """Return the elements of one name directly inside, in the order of the file."""
         return tuple(child for child in self.children if child.tag == tag)
 
 
@@ -64,15 +58,7 @@ class Edit:
 
 
 def parse(data: bytes, where: str) -> Document:
-    """Locate the elements of an XML file.
-
-    Args:
-        data: Content of the file, in any encoding of XML.
-        where: Name of the file, for errors.
-
-    Raises:
-        ModelError: If it is not well-formed, or an element is inside an entity.
-    """
+    """Locate the elements of an XML file."""
     codec = _codec(data, where)
     try:
         text = data.decode(codec).encode("utf-8")
@@ -82,15 +68,7 @@ def parse(data: bytes, where: str) -> Document:
 
 
 def apply(document: Document, edits: Iterable[Edit]) -> bytes:
-    """Return the file with its edits, in its own encoding.
-
-    Args:
-        document: The file.
-        edits: The edits; their ranges must not overlap.
-
-    Raises:
-        ModelError: If two ranges overlap.
-    """
+    """Return the file with its edits, in its own encoding."""
     pieces, at = [], 0
     for edit in sorted(edits, key=lambda e: (e.start, e.stop)):
         if edit.start < at:
@@ -102,25 +80,13 @@ def apply(document: Document, edits: Iterable[Edit]) -> bytes:
 
 
 def replace(document: Document, element: Element, lines: Sequence[str]) -> Edit:
-    """Return the edit that replaces an element.
-
-    Args:
-        document: The file.
-        element: The element to replace.
-        lines: The new element, line by line: first, inner ones, last. They are indented as the
-            file if the element starts a line, and joined to one line otherwise.
-    """
+    """Return the edit that replaces an element."""
     text = _layout(document, lines, _indent(document, element))
     return Edit(element.start, element.end, text)
 
 
 def remove(document: Document, element: Element) -> Edit:
-    """Return the edit that removes an element, with its lines if they have no other content.
-
-    Args:
-        document: The file.
-        element: The element to remove.
-    """
+    """Return the edit that removes an element, with its lines if they have no other content."""
     indent = _indent(document, element)
     rest = re.compile(rb"[ \t]*(\r\n|\n|\r)").match(document.data, element.end)
     if indent is None or rest is None:
@@ -129,13 +95,7 @@ def remove(document: Document, element: Element) -> Edit:
 
 
 def insert(document: Document, parent: Element, lines: Sequence[str]) -> Edit:
-    """Return the edit that inserts a new element as the last child of another.
-
-    Args:
-        document: The file.
-        parent: The parent element.
-        lines: The new element, as for ``replace``.
-    """
+    """Return the edit that inserts a new element as the last child of another."""
     outer = _indent(document, parent)
     if parent.children:
         at, indent = parent.children[-1].end, _indent(document, parent.children[-1])
@@ -149,13 +109,7 @@ def insert(document: Document, parent: Element, lines: Sequence[str]) -> Edit:
 
 
 def set_attributes(document: Document, element: Element, values: Mapping[str, str]) -> list[Edit]:
-    """Return the edits that set attributes of an element.
-
-    Args:
-        document: The file.
-        element: The element.
-        values: New values by attribute; a missing attribute is added after the others.
-    """
+    """Return the edits that set attributes of an element."""
     edits, missing = [], dict(values)
     for match in _ATTRIBUTE.finditer(document.data, element.start, element.inside):
         value = missing.pop(match[1].decode(), None)

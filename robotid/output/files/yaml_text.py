@@ -5,18 +5,11 @@ from typing import Any
 
 from robotid.base.text import yaml_name, yaml_plain
 
-__all__ = ["yaml_text"]
-
 _WIDEST = 120  # characters of a table in one line
 
 
 def yaml_text(table: Mapping[str, Any], head: str) -> str:
-    """Return a table as YAML after a comment.
-
-    Args:
-        table: Tables, lists, text, numbers, booleans and None.
-        head: The lines of the comment.
-    """
+    """Return a table as YAML after a comment."""
     lines = [f"# {line}".rstrip() for line in head.splitlines()]
     return "\n".join([*lines, *_lines(table, "")]) + "\n"
 

@@ -1,3 +1,1 @@
 """What every page is made of: the document, its style, tables and charts."""
-
-__all__: list[str] = []

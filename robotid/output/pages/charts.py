@@ -14,8 +14,6 @@ from numpy.typing import NDArray
 from robotid.base.exceptions import DataError
 from robotid.base.typing import Array
 
-__all__ = ["Chart", "Series", "broken", "chart_html", "thin"]
-
 _KINDS = ("line", "dots", "bars", "area")
 _POINTS = 2000  # rows of a chart's data
 _STILL = 200  # points of a line in the static picture
@@ -66,9 +64,6 @@ class Chart:
         height: Height of the plot [px].
         width: Width of the static picture [px], about that of the chart on a page.
         x_names: Names at x = 0, 1, ... in place of numbers, if any.
-
-    Raises:
-        DataError: If the lengths of a series and of x differ, or the kind of a series is unknown.
     """
 
     title: str
@@ -104,12 +99,6 @@ def chart_html(chart: Chart, caption: str, *, points: int = _POINTS, still: int 
 
     It contains a static picture, for print and without scripts, and the data that charts.js
     draws: numbers of 16 bits, exact to 1/65,000 of their range.
-
-    Args:
-        chart: The chart.
-        caption: HTML of the caption; none if empty.
-        points: Approximate number of points in the page; extremes and breaks are retained.
-        still: Approximate number of points in the static picture.
     """
     order = np.argsort(chart.x, kind="stable")
     x = np.asarray(chart.x, dtype=float)[order]
@@ -152,12 +141,7 @@ def chart_html(chart: Chart, caption: str, *, points: int = _POINTS, still: int 
 def thin(y: Array, points: int) -> NDArray[np.int_]:
     """Return the points of a line that are sufficient to draw it: its extremes and its breaks.
 
-    Args:
-        y: Values, shape (N,), NaN where the line breaks.
-        points: Approximate number of points to retain.
-
-    Returns:
-        Indices of the points, in order: all if there are no more than ``points``.
+    y (N,).
     """
     count = len(y)
     if count <= points:
@@ -179,10 +163,7 @@ def thin(y: Array, points: int) -> NDArray[np.int_]:
 def broken(segment: Array, x: Array, *lines: Array) -> tuple[Array, ...]:
     """Return x and lines with a row of NaN between the segments of a recording.
 
-    Args:
-        segment: Number of the uninterrupted segment of each sample, shape (N,).
-        x: Times, shape (N,).
-        *lines: Values over it, shape (N,) each.
+    segment (N,), x (N,), *lines (N,).
     """
     ends = np.flatnonzero(np.diff(segment)) + 1
     between = (x[ends - 1] + x[ends]) / 2

@@ -13,26 +13,6 @@ from typing import NamedTuple
 
 from robotid.base.text import arguments
 
-__all__ = [
-    "Cell",
-    "Section",
-    "asset",
-    "code",
-    "command_html",
-    "facts_html",
-    "figure",
-    "folded",
-    "number",
-    "page",
-    "percent",
-    "scaffold",
-    "steps_html",
-    "table",
-    "text",
-    "verdict_html",
-    "with_error",
-]
-
 _ASSETS = Path(__file__).parent / "assets"
 _FIRST = 3  # reasons of a verdict that are visible without unfolding
 #: Scripts, and the pattern of pages that need them.
@@ -47,11 +27,7 @@ _SCRIPTS = {
 
 @cache
 def asset(name: str) -> str:
-    """Return the text of an asset file.
-
-    Args:
-        name: Its name in the folder of assets.
-    """
+    """Return the text of an asset file."""
     return (_ASSETS / name).read_text(encoding="utf-8")
 
 
@@ -81,21 +57,12 @@ class Section(NamedTuple):
 
 
 def text(value: str, *, flag: bool = False) -> Cell:
-    """Return a cell of text.
-
-    Args:
-        value: The text, not escaped; a short one stays on one line.
-        flag: Whether it is marked as a fault.
-    """
+    """Return a cell of text."""
     return Cell(escape(value), "flag" if flag else "text" if len(value) < 24 else "")
 
 
 def code(value: str) -> Cell:
-    """Return a cell for names, hashes and formulas.
-
-    Args:
-        value: The text, not escaped.
-    """
+    """Return a cell for names, hashes and formulas."""
     # long names and formulas may break after a dot, an underscore or a slash only
     html = escape(value)
     for mark in (".", "_", "/"):
@@ -104,36 +71,21 @@ def code(value: str) -> Cell:
 
 
 def number(value: float | None, spec: str = ".4g") -> Cell:
-    """Return a cell for a number.
-
-    Args:
-        value: The number; None and non-finite values are shown as a dash.
-        spec: Its format.
-    """
+    """Return a cell for a number."""
     if value is None or not math.isfinite(value):
         return Cell("–", "number")
     return Cell(format(value, spec).replace("-", "−"), "number", float(value))
 
 
 def percent(value: float | None) -> Cell:
-    """Return a cell for a percentage.
-
-    Args:
-        value: The percentage; None and non-finite values are shown as a dash.
-    """
+    """Return a cell for a percentage."""
     if value is not None and value >= 1000:
         return number(value, ".0f")
     return number(value, ".1f" if value is None or value >= 0.995 else ".2f")
 
 
 def with_error(value: float, error: float, *, sign: str = "") -> tuple[Cell, Cell]:
-    """Return cells for a number and its error, the error with two digits, both to the same place.
-
-    Args:
-        value: The number.
-        error: Its error; a non-finite one is shown as a dash.
-        sign: "+" to write positive numbers with their sign.
-    """
+    """Cells for a number and its error, the error with two digits, both to the same place."""
     if not (math.isfinite(error) and error > 0 and math.isfinite(value)):
         return number(value, f"{sign}.4g"), number(None)
     exponent = math.floor(
@@ -155,15 +107,7 @@ def table(
     *,
     is_data: bool = False,
 ) -> str:
-    """Return the HTML of a table in a box that scrolls on narrow pages.
-
-    Args:
-        caption: Its caption.
-        headers: Heads of the columns.
-        rows: Cells; the first of each row is its head.
-        foot: Cells of a last row with totals, if any.
-        is_data: Whether tables.js can sort, filter and export its rows.
-    """
+    """Return the HTML of a table in a box that scrolls on narrow pages."""
     first = rows[0] if rows else [Cell("")] * len(headers)
     kinds = ["number" if cell.kind == "number" else "text" for cell in first]
     head = "".join(
@@ -181,39 +125,19 @@ def table(
 
 
 def figure(caption: str, svg: str, *, single: bool = False) -> str:
-    """Return the HTML of a figure, which scrolls on narrow pages, also by keyboard.
-
-    Args:
-        caption: Its caption, HTML.
-        svg: The ``<svg>`` element.
-        single: Whether its width is limited, as of a figure alone in its row.
-    """
+    """Return the HTML of a figure, which scrolls on narrow pages, also by keyboard."""
     kind = ' class="single"' if single else ""
     return f'<figure{kind} tabindex="0"><figcaption>{caption}</figcaption>{svg}</figure>\n'
 
 
 def folded(key: str, summary: str, html: str, *, is_open: bool = False) -> str:
-    """Return the HTML of foldable content, which is open in print.
-
-    Args:
-        key: Its id; links to it open it.
-        summary: Its visible summary, HTML.
-        html: Its content.
-        is_open: Whether it is open initially.
-    """
+    """Return the HTML of foldable content, which is open in print."""
     opened = " open" if is_open else ""
     return f'<details id="{key}"{opened}><summary>{summary}</summary>\n{html}</details>\n'
 
 
 def verdict_html(robot: str, status: str, reasons: Sequence[str], uses: str = "") -> str:
-    """Return the heading of a result: robot, verdict and the first reasons.
-
-    Args:
-        robot: Name of the robot, not escaped.
-        status: The verdict.
-        reasons: Its reasons, not escaped, the most severe first.
-        uses: What the result can be used for, not escaped.
-    """
+    """Return the heading of a result: robot, verdict and the first reasons."""
     items = [f"<li>{escape(reason)}</li>" for reason in reasons]
     more = "".join(items[_FIRST:])
     if more:
@@ -229,12 +153,7 @@ def verdict_html(robot: str, status: str, reasons: Sequence[str], uses: str = ""
 
 
 def facts_html(facts: Mapping[str, str], files: Mapping[str, str] | None = None) -> str:
-    """Return the HTML of figures with their names.
-
-    Args:
-        facts: Figures by their names, both HTML.
-        files: Files to link to, by their kind; they come last.
-    """
+    """Return the HTML of figures with their names."""
     links = ", ".join(
         f'<a href="{escape(path)}">{escape(_KINDS.get(kind, kind))}</a>'
         for kind, path in (files or {}).items()
@@ -245,11 +164,7 @@ def facts_html(facts: Mapping[str, str], files: Mapping[str, str] | None = None)
 
 
 def steps_html(steps: Iterable[tuple[str, Sequence[str]]]) -> str:
-    """Return the HTML of the next steps; nothing if there are none.
-
-    Args:
-        steps: Each action, and its commands or lines to copy, not escaped.
-    """
+    """Return the HTML of the next steps; nothing if there are none."""
     items = "".join(
         f"<li><p>{escape(action)}</p>"
         + "".join(f'<div class="copy">{command_html(block)}</div>' for block in blocks)
@@ -260,11 +175,7 @@ def steps_html(steps: Iterable[tuple[str, Sequence[str]]]) -> str:
 
 
 def command_html(block: str) -> str:
-    """Return the HTML of a command, or of lines of a job file; lines break between arguments.
-
-    Args:
-        block: The text to copy, not escaped.
-    """
+    """Return the HTML of a command, or of lines of a job file; lines break between arguments."""
     html = escape(block)
     if block.startswith("robotid ") and "\n" not in block:  # an argument does not end at a hyphen
         html = " ".join(f"<span>{escape(argument)}</span>" for argument in arguments(block))
@@ -272,13 +183,7 @@ def command_html(block: str) -> str:
 
 
 def page(title: str, header: str, sections: Mapping[str, Section | tuple[str, str]]) -> str:
-    """Return the HTML of a page: links to its sections, its header, the sections.
-
-    Args:
-        title: Title of the window, not escaped.
-        header: HTML of the header.
-        sections: The sections by their ids, or title and HTML of each.
-    """
+    """Return the HTML of a page: links to its sections, its header, the sections."""
     shown = {key: Section(*section) for key, section in sections.items()}
     links = "".join(f'<a href="#{key}">{x.title}</a> ' for key, x in shown.items())
     body = "".join(_section(key, section) for key, section in shown.items())
@@ -312,13 +217,6 @@ def scaffold(
     """Return the HTML of a document, which loads only what its policy allows.
 
     A body with charts gets the scripts that draw them. Only these and the named scripts may run.
-
-    Args:
-        title: Title of the window, not escaped.
-        head: HTML of the head: style, icon; ``/*tones*/`` in it becomes the pages' colours.
-        body: HTML of the body.
-        policy: Additional permissions of the page, as a content security policy.
-        scripts: Names of the assets that it runs.
     """
     style, run = "", [asset(name) for name in scripts]
     if '<figure class="chart"' in body:

@@ -8,8 +8,6 @@ from robotid.base.files import write_text
 from robotid.output.pages.charts import Chart, chart_html
 from robotid.output.pages.html import asset, scaffold
 
-__all__ = ["Plot"]
-
 _AROUND = 112  # [px] of caption, axis and legend of each chart
 _STYLE = "main { padding: .5rem 1rem; } h1 { font-size: 1.125rem; margin: 0 0 .5rem; }"
 _HIGHEST = 900  # [px] of a notebook cell
@@ -47,15 +45,5 @@ class Plot:
         )
 
     def write(self, path: str | Path) -> Path:
-        """Write the page, atomically.
-
-        Args:
-            path: The file, as "plot.html".
-
-        Returns:
-            Its path.
-
-        Raises:
-            DataError: If its folder does not exist.
-        """
+        """Write the page, atomically."""
         return write_text(self.html(), path)

@@ -1,3 +1,1 @@
 """What people read: the report and comparisons."""
-
-__all__: list[str] = []

@@ -11,8 +11,6 @@ from robotid.diagnosis.verdict.verdict import JointVerdict
 from robotid.identification.summary import joint_reason
 from robotid.output.pages.html import code, percent
 
-__all__ = ["Bar", "Mark", "bars_html"]
-
 _ROWS = 10  # joints that are visible without unfolding
 _WIDEST = 150.0  # [%] end of the scale; larger errors end there, too
 
@@ -61,15 +59,7 @@ def bars_html(
     marks: Mapping[str, Mark],
     limits: tuple[float, float],
 ) -> str:
-    """Return a bar for each joint on a common square-root scale in percent.
-
-    Args:
-        title: Name of the error.
-        note: Its definition, HTML.
-        bars: The joints, the worst first.
-        marks: Markers of other predictions, by name.
-        limits: Largest error that is good, and largest that is usable [%].
-    """
+    """Return a bar for each joint on a common square-root scale in percent."""
     common = _common(bars)
     named = {bar.joint for own in common for bar in own}
     rows = [_row(bar, marks, limits, is_named=bar.joint in named) for bar in bars]
@@ -114,14 +104,7 @@ def _at(value: float) -> str:
 def _row(
     bar: Bar, marks: Mapping[str, Mark], limits: tuple[float, float], *, is_named: bool
 ) -> str:
-    """Return the row of a joint with its own reason.
-
-    Args:
-        bar: The joint.
-        marks: As of ``bars_html``.
-        limits: As of ``bars_html``.
-        is_named: Whether its first reason is that of other joints, too, and stands below the bars.
-    """
+    """Return the row of a joint with its own reason."""
     status, kind = bar.verdict.status, bar.verdict.status.replace(" ", "-")
     own = bar.verdict.reasons[-1:] if status == "good" else bar.verdict.reasons
     own = bar.verdict.reasons[1:] if is_named else own

@@ -11,8 +11,6 @@ from robotid.estimation.fitting.fitted import Fit
 from robotid.output.pages.html import folded, number, with_error
 from robotid.output.report.tables import SOURCE_NAMES
 
-__all__ = ["parameter_picture"]
-
 _ROW = 22  # [px] of a link
 _LINKS = 12  # more are folded
 _ROOM = 0.06  # of the range, beyond the largest and the smallest value
@@ -39,9 +37,6 @@ def parameter_picture(found: Fit) -> str:
 
     Each value has a mark for the URDF, one for the identified value, coloured by what determined
     it, and its 95 % interval. More than 12 links are folded.
-
-    Args:
-        found: The fit.
     """
     central, bodies = central_parameters(found), found.model.layout.bodies
     names = "".join(f"<span>{escape(body)}</span>" for body in bodies)

@@ -6,17 +6,9 @@ from html import escape
 from robotid.base.findings import Cause, Finding, grouped, number_of
 from robotid.output.pages.html import Cell, code, table
 
-__all__ = ["findings_line", "findings_section"]
-
 
 def findings_line(findings: Sequence[Finding], joints: Sequence[str], worst: str = "") -> str:
-    """Return the number of findings and causes, and the worst joint.
-
-    Args:
-        findings: The findings.
-        joints: Names of the robot's joints.
-        worst: The joint with the largest error; "" if there is none.
-    """
+    """Return the number of findings and causes, and the worst joint."""
     causes, notes = (
         grouped([f for f in findings if (f.severity == "note") == is_note], joints)
         for is_note in (False, True)
@@ -31,13 +23,7 @@ def findings_line(findings: Sequence[Finding], joints: Sequence[str], worst: str
 def findings_section(
     findings: Sequence[Finding], joints: Sequence[str], shown: Sequence[str]
 ) -> str:
-    """Return the causes with their messages, by severity, and the causes of each joint.
-
-    Args:
-        findings: The findings.
-        joints: Names of the robot's joints.
-        shown: The joints that have errors, the worst first.
-    """
+    """Return the causes with their messages, by severity, and the causes of each joint."""
     causes = grouped(findings, joints)
     return _by_joint(shown, causes) + ("".join(map(_cause, causes)) or "<p>None.</p>\n")
 

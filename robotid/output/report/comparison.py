@@ -16,30 +16,12 @@ from robotid.output.files.urdf import terms_from_facts
 from robotid.output.report.comparison_page import comparison_page
 from robotid.robot.drives import TERMS, DriveMotion
 
-__all__ = ["compare_results", "write_comparison"]
-
 _SPEEDS = 40  # of a friction curve, in each direction
 _FILES = ("urdf", "identification", "validation")  # settings that are shown as inputs
 
 
 def compare_results(paths: Sequence[str | Path]) -> dict[str, Any]:
-    """Compare results of the same robot and the same base parameters.
-
-    Args:
-        paths: At least two result.json files.
-
-    Returns:
-        Plain values: "results" (label, name, path, robot, estimator, verdict; the name is the
-        unique part of the path), "validation" and "fitted" (errors by joint, one column per
-        result), "fitted_alike" and "notes" (what is not comparable, and the reason),
-        "friction" (curves by joint), "base_parameters" (values, standard errors, and the difference
-        to the first result over the combined standard error), "settings", "inputs" and "versions"
-        that differ. The largest difference comes first.
-
-    Raises:
-        DataError: If there are fewer than two results, one is not readable, or their base
-            parameters differ; the message names the differences.
-    """
+    """Compare results of the same robot and the same base parameters."""
     if len(paths) < 2:
         raise DataError(f"compare takes at least two results, found {len(paths)}")
     results = [load_result(path).content for path in paths]
@@ -82,16 +64,7 @@ def compare_results(paths: Sequence[str | Path]) -> dict[str, Any]:
 
 
 def write_comparison(paths: Sequence[str | Path], target: str | Path) -> dict[str, Any]:
-    """Compare results, write the page, and return the content of ``compare_results``.
-
-    Args:
-        paths: At least two result.json files.
-        target: The HTML file to write, atomically.
-
-    Raises:
-        DataError: If the results cannot be compared, or the folder of the target is missing.
-        SettingsError: If the target is a folder.
-    """
+    """Compare results, write the page, and return the content of ``compare_results``."""
     check_file(Path(target), paths)
     content = compare_results(paths)
     write_text(comparison_page(content), target)

@@ -13,8 +13,6 @@ from robotid.base.typing import Array
 from robotid.output.pages.charts import Chart, Series, chart_html
 from robotid.output.pages.html import Cell, code, number, page, percent, table, text, with_error
 
-__all__ = ["comparison_page"]
-
 _FAR = 3.0  # combined standard errors beyond which a difference is in bold
 _WIDEST = 6.0  # combined standard errors at the end of a bar
 _BAR, _HIGH = 160, 9  # [px] of an error's bar: the longest, and its height
@@ -23,11 +21,7 @@ _TONES = 8
 
 
 def comparison_page(content: Mapping[str, Any]) -> str:
-    """Return the HTML of the page.
-
-    Args:
-        content: The value of ``compare_results``.
-    """
+    """Return the HTML of the page."""
     sections = {
         "errors": ("Prediction errors", _errors_section(content)),
         "friction": ("Friction", _friction_section(content)),

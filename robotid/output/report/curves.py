@@ -7,8 +7,6 @@ from typing import Any, TypeVar
 from robotid.identification.summary import verdict_cell
 from robotid.output.pages.html import code, folded
 
-__all__ = ["curves_section", "drawn"]
-
 _ROWS = 24_000  # of all charts: about half a MB
 _LONGEST = 2000  # rows of one chart
 _OPEN = 2  # joints that are open at most
@@ -18,12 +16,7 @@ RunT = TypeVar("RunT")
 
 
 def drawn(runs: Sequence[RunT], rows: Sequence[str]) -> Sequence[RunT]:
-    """Return the recordings that are drawn: the first ones, to limit the page's size.
-
-    Args:
-        runs: All recordings.
-        rows: Names of the joints.
-    """
+    """Return the recordings that are drawn: the first ones, to limit the page's size."""
     return runs[: max(1, _MOST_PLOTS // len(rows))]
 
 
@@ -37,19 +30,7 @@ def curves_section(
     note: Callable[[int], str],
     most: int = _OPEN,
 ) -> str:
-    """Return a part for each joint; the worst joint and the worst ones that are not good are open.
-
-    Args:
-        intro: Description of the charts, HTML.
-        runs: The recordings, by the name that links their charts.
-        rows: Names of the joints.
-        verdicts: The verdict on each joint, as in result.json.
-        worst: Joints that have errors, the worst first.
-        charts: Returns the charts of a recording, given the number of a joint, the name that
-            links the charts, and the number of points.
-        note: Returns the HTML above the charts of the joint with a number.
-        most: Number of joints that are open at most.
-    """
+    """A part for each joint; the worst joint and the worst ones that are not good are open."""
     points = min(_LONGEST, max(200, _ROWS // (2 * len(rows) * max(1, len(runs)))))
     parts, first = [intro], [*worst][:most]
     for row, name in enumerate(rows):

@@ -15,8 +15,6 @@ from urllib.parse import quote, urlencode
 from robotid.output.pages.html import command_html
 from robotid.output.report.steps import Origin
 
-__all__ = ["Clip", "Dock"]
-
 _WORDS = "shows the robot in motion, on the clock of these charts"
 
 
@@ -63,14 +61,7 @@ class Dock:
         return "".join(words) if clip.log else ""
 
     def link(self, words: str, start: float, joint: str, log: str) -> str:
-        """Return the HTML of a link to a time of the replay; "" without replay.
-
-        Args:
-            words: Its text, HTML.
-            start: The time [s].
-            joint: The joint to select.
-            log: Name of the file of the recording.
-        """
+        """Return the HTML of a link to a time of the replay; "" without replay."""
         if not self.file:
             return ""
         there = urlencode({"t": f"{start:.3f}", "joint": joint, "log": log}, quote_via=quote)

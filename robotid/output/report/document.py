@@ -17,8 +17,6 @@ from robotid.output.report.variation_section import variation_section
 if TYPE_CHECKING:
     from robotid.identification.closed_loop.loop_result import LoopIdentification
 
-__all__ = ["write_report"]
-
 
 def write_report(
     identification: "Identification | LoopIdentification",

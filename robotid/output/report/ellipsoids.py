@@ -11,8 +11,6 @@ from robotid.output.pages.html import folded
 from robotid.output.viewer.scene import Ellipsoid, ellipsoids
 from robotid.robot.geometry import body_points
 
-__all__ = ["ellipsoid_pictures"]
-
 _WIDTH, _HEIGHT, _MARGIN = 160.0, 104.0, 8.0  # [px] of a picture
 _DOT = 3.0  # [px] radius of a centre of mass
 _AXES = "xyz"
@@ -24,9 +22,6 @@ def ellipsoid_pictures(found: Fit) -> str:
 
     An equivalent ellipsoid has uniform density, and mass, centre of mass and inertia of its link.
     More than 12 links are folded.
-
-    Args:
-        found: The fit.
     """
     size, points = found.model.layout.n_inertial, body_points(found.model)
     before, after = (ellipsoids(pi[:size]) for pi in (found.prior, found.standard))
@@ -49,11 +44,7 @@ def ellipsoid_pictures(found: Fit) -> str:
 def _picture(body: str, urdf: Ellipsoid, identified: Ellipsoid, points: Array | None) -> str:
     """Return a link with its name and sizes, seen along the axis of its frame that it is thin in.
 
-    Args:
-        body: Its name.
-        urdf: Its ellipsoid in the URDF.
-        identified: As identified.
-        points: Points of its geometry in its frame, shape (k, 3) [m], if it has any.
+    points (k, 3) [m].
     """
     boxes = [np.array(span) for k in (urdf, identified) if (span := _span(k)) is not None]
     box = None if points is None else np.array([points.min(axis=0), points.max(axis=0)])

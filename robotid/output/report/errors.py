@@ -11,8 +11,6 @@ from robotid.identification.summary import verdict_cell
 from robotid.output.pages.html import code, number, percent, table, text
 from robotid.output.report.bars import Bar, Mark, bars_html
 
-__all__ = ["POSITION", "TORQUE", "Errors", "Quantity", "error_bars", "error_table", "worst_errors"]
-
 _SMALL = 1e-3  # [rad or m] unit of position errors
 
 
@@ -87,11 +85,7 @@ class Errors:
 
 
 def worst_errors(recordings: Sequence[Errors]) -> dict[str, Mapping[str, Any]]:
-    """Return the metrics of each joint on its worst recording, the worst joint first.
-
-    Args:
-        recordings: The recordings.
-    """
+    """Return the metrics of each joint on its worst recording, the worst joint first."""
     worst: dict[str, Mapping[str, Any]] = {}
     for errors in recordings:
         for joint, measured in errors.joints.items():
@@ -114,15 +108,7 @@ def error_bars(
     *,
     has_why: bool = False,
 ) -> str:
-    """Return the errors of the joints on their worst recordings as bars, the worst joint first.
-
-    Args:
-        quantity: The predicted quantity.
-        recordings: The recordings that the verdict uses.
-        rows: Names of the joints, whose order numbers the ids of the page.
-        verdicts: The verdict on each joint, as in result.json.
-        has_why: Whether the page has a residual analysis of each joint.
-    """
+    """Return the errors of the joints on their worst recordings as bars, the worst joint first."""
     worst, bars = worst_errors(recordings), []
     # the only validation recording need not be named
     is_alone = len(recordings) == 1 and not recordings[0].is_fitted
@@ -149,14 +135,7 @@ def error_table(
     rows: Sequence[str],
     verdicts: Mapping[str, Mapping[str, Any]],
 ) -> str:
-    """Return the table of the errors on a recording.
-
-    Args:
-        quantity: The predicted quantity.
-        errors: The errors.
-        rows: Names of all joints.
-        verdicts: The verdict on each joint, as in result.json.
-    """
+    """Return the table of the errors on a recording."""
     keys = {f"{key}_relative_error_pct": mark.words for key, mark in quantity.marks.items()}
     shown = [key for key in keys if any(m.get(key) is not None for m in errors.joints.values())]
     headers = ["joint", "error %", "verdict", "RMSE", "unit", "R²", "samples"]

@@ -11,19 +11,13 @@ import numpy as np
 from robotid.output.pages.charts import Chart, Series, chart_html
 from robotid.output.pages.html import code, facts_html, number, page, table, text, with_error
 
-__all__ = ["fleet_page"]
-
 _BINS = 24  # of a distribution, at most
 _CHARTS = 12  # distributions on the page, those with the largest spread
 _ROWS = 20  # failures on the page, and units that differ; all are in the files of results
 
 
 def fleet_page(content: Mapping[str, Any]) -> str:
-    """Return the HTML of the page.
-
-    Args:
-        content: The value of ``run_fleet``.
-    """
+    """Return the HTML of the page."""
     failures, unlike = content["failures"], content["unlike"]
     facts = {
         "Units": f"{content['done']} of {content['units']} identified",

@@ -8,8 +8,6 @@ from robotid.base.typing import Array
 from robotid.estimation.estimators.batch import solve_factor
 from robotid.estimation.fitting.fitted import Fit
 
-__all__ = ["Information", "information"]
-
 
 @dataclass(frozen=True, eq=False)
 class Information:
@@ -32,11 +30,7 @@ class Information:
 
 
 def information(found: Fit) -> Information:
-    """Return the information about the base parameters in the fitted recordings.
-
-    Args:
-        found: The fit.
-    """
+    """Return the information about the base parameters in the fitted recordings."""
     A = found.factors.weighted(found.wls.sigma)[:, :-1]
     norms = np.linalg.norm(A, axis=0)
     singular_values = np.linalg.svd(A / np.where(norms > 0, norms, 1.0), compute_uv=False)

@@ -7,17 +7,11 @@ from typing import Any
 from robotid.base.findings import Finding, grouped, listed
 from robotid.output.report.steps import MOST, NAMED, Origin, Step, exports_of, sentence_of
 
-__all__ = ["loop_steps"]
-
 
 def loop_steps(content: Mapping[str, Any], origin: Origin) -> tuple[Step, ...]:
     """Return the next steps for a result of closed-loop identification.
 
     They are its uses, if it was written; of a poor result, what to correct, three at most.
-
-    Args:
-        content: Content of its result.json.
-        origin: The source of the result, and its folder.
     """
     if content["verdict"]["status"] == "poor":
         return _loop_repairs(content, origin)[:MOST]

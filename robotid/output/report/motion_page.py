@@ -19,8 +19,6 @@ from robotid.output.pages.charts import Chart, Series, chart_html
 from robotid.output.pages.html import Section, code, facts_html, number, page, percent, table, text
 from robotid.robot.model import RobotModel
 
-__all__ = ["write_motion_page"]
-
 _UNITS = ("rad", "rad/s", "rad/s²", "rad/s³", "N m", "W")
 _PRISMATIC = ("m", "m/s", "m/s²", "m/s³", "N", "W")
 _TONES = 8  # distinguishable colours of lines in one chart
@@ -54,19 +52,6 @@ def write_motion_page(
     """Write a designed motion's use of the limits and its expected errors, as one HTML file.
 
     The file loads nothing from the network. It is written under a temporary name, then renamed.
-
-    Args:
-        target: The file to write.
-        model: The robot.
-        content: What ``robotid excite --json`` prints of the motion.
-        course: The motion over time.
-        expected: The standard errors expected of it; or sentences that state them.
-
-    Returns:
-        Path of the file.
-
-    Raises:
-        DataError: If the folder of the target does not exist.
     """
     errors = _expected(expected) if isinstance(expected, Preview) else _paragraphs(expected)
     sections = {

@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from robotid.diagnosis.verdict.payload_check import PayloadCheck
     from robotid.identification.result import Identification
 
-__all__ = ["next_steps"]
-
 _NEW = "NEW.csv"
 _LOADED = "LOADED.csv"
 _PLAIN = "viscous+coulomb"
@@ -32,10 +30,6 @@ def next_steps(found: Identification, origin: Origin) -> tuple[Step, ...]:
     """Return the next steps, the most urgent first: three at most.
 
     Steps for errors come first, then steps for warnings, then uses of the result.
-
-    Args:
-        found: The result.
-        origin: The source of the result.
     """
     asked: dict[int, list[Cause]] = {}
     findings = [finding for finding in found.findings if finding.severity != "note"]

@@ -23,8 +23,6 @@ from robotid.output.pages.charts import Chart, chart_html
 from robotid.output.pages.html import code, figure, folded, number, table, text
 from robotid.output.report.information_section import Information, information
 
-__all__ = ["drive_figures", "friction_section", "information_section", "residual_section"]
-
 _PAIRS = 15  # strongest correlations that are listed
 _STRONG = 0.8  # smallest correlation that is listed
 _CELL = 11  # [px] of the correlation matrix
@@ -36,11 +34,7 @@ _CURVES = 8  # friction charts that are not folded
 
 
 def residual_section(found: Identification) -> str:
-    """Return spectrum and autocorrelation of each joint's residual.
-
-    Args:
-        found: The identification.
-    """
+    """Return spectrum and autocorrelation of each joint's residual."""
     if found.model.is_static:
         return "<p>Static poses and slow segments have no spectrum.</p>\n"
     figures = "".join(_residual_figures(found, row) for row in range(found.model.n_rows))
@@ -56,15 +50,7 @@ def residual_section(found: Identification) -> str:
 
 
 def friction_section(found: Identification, worst: Sequence[str]) -> str:
-    """Return friction against speed of each joint, measured and identified.
-
-    Args:
-        found: The identification.
-        worst: Joints that have errors, the worst first; of more than 8, others are folded.
-
-    Returns:
-        HTML; nothing without speeds or friction terms.
-    """
+    """Return friction against speed of each joint, measured and identified."""
     names, layout = found.model.row_names, found.model.layout
     if found.model.is_static or all(term.is_inertia for _, term in layout.drive_parameters):
         return ""
@@ -87,14 +73,7 @@ def friction_section(found: Identification, worst: Sequence[str]) -> str:
 
 
 def drive_figures(found: Identification) -> str:
-    """Return the selection of friction terms and bars of the drive parameters.
-
-    Args:
-        found: The identification.
-
-    Returns:
-        HTML; nothing if no drive parameter was identified.
-    """
+    """Return the selection of friction terms and bars of the drive parameters."""
     layout = found.model.layout
     if not layout.drive_names:
         return ""
@@ -111,11 +90,7 @@ def drive_figures(found: Identification) -> str:
 
 
 def information_section(found: Identification) -> str:
-    """Return the information in the data: singular values, shares, correlations.
-
-    Args:
-        found: The identification.
-    """
+    """Return the information in the data: singular values, shares, correlations."""
     info, names = information(found), found.mapping.base_names
     shares = np.round(100 * info.data_share).astype(int)
     weak = [

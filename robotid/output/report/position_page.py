@@ -26,8 +26,6 @@ from robotid.output.report.tables import input_table, parameter_section, version
 from robotid.output.report.worst_second import Residual, worst_html, worst_second
 from robotid.robot.model import RobotModel
 
-__all__ = ["shown_positions"]
-
 _NAMED = 7  # joints in the chart of errors over the horizon
 _ROLES = {"validation": "not fitted", "identification": "fitted"}
 _ERRORS = (
@@ -60,20 +58,7 @@ def shown_positions(
     changed: tuple[RobotModel, Array] | None = None,
     replay: str = "",
 ) -> Shown:
-    """Return the content of a report on a result.
-
-    Args:
-        content: Content of the result.json.
-        fitted: The fitted logs with their simulated positions.
-        validation: The validation logs with their simulated positions.
-        origin: The folder of the result, for commands.
-        changed: The robot of the URDF and its identified standard parameters, shape (p,), SI
-            units; None if the URDF is not available.
-        replay: File of the replay in the report's folder; "" if there is none.
-
-    Raises:
-        DataError: If the joints of a log and of the result differ.
-    """
+    """Return the content of a report on a result: changed (p,)."""
     joints, is_driven = content["joints"], _is_driven(content)
     for run in (*validation, *fitted):
         if run.q.shape[1] != len(joints):

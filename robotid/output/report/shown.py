@@ -13,8 +13,6 @@ from robotid.output.report.errors import Errors, Quantity, error_bars, error_tab
 from robotid.output.report.steps import Step
 from robotid.output.report.tables import sources_fact
 
-__all__ = ["Shown", "first_screen", "page_of"]
-
 _WRITTEN = (
     f"Written by robotid {__version__}. SI units throughout; inertial parameters in Pinocchio's "
     "order, inertias about the joint frame."
@@ -77,12 +75,7 @@ class Shown:
 
 
 def first_screen(shown: Shown, files: Mapping[str, str]) -> str:
-    """Return the HTML of the first screen: verdict, figures, errors of joints, next steps.
-
-    Args:
-        shown: The content.
-        files: Files of the report's folder, by their kind.
-    """
+    """Return the HTML of the first screen: verdict, figures, errors of joints, next steps."""
     facts = {**shown.facts, **sources_fact(shown.entries)}
     bars = error_bars(
         shown.quantity, shown.counted, shown.rows, shown.verdicts, has_why=bool(shown.why)
@@ -99,12 +92,7 @@ def first_screen(shown: Shown, files: Mapping[str, str]) -> str:
 
 
 def page_of(shown: Shown, files: Mapping[str, str]) -> str:
-    """Return the HTML of the report.
-
-    Args:
-        shown: The content.
-        files: Files of its folder to link to, by their kind.
-    """
+    """Return the HTML of the report."""
     worst = list(worst_errors(shown.counted))
     definition, after = shown.errors
     tables = "".join(

@@ -7,8 +7,6 @@ from itertools import pairwise
 
 from robotid.output.files.export_formats import FORMATS
 
-__all__ = ["MOST", "NAMED", "Origin", "Step", "exports_of", "sentence_of"]
-
 MOST = 3
 NAMED = 4  # joints that a step names
 _APPENDED = ("--validate",)  # flags that add to what was stated before
@@ -48,33 +46,18 @@ class Origin:
         return self.source[0] if self.source and self.source[0].endswith(".toml") else ""
 
     def again(self, *flags: str) -> str:
-        """Return the command that repeats the identification.
-
-        Args:
-            flags: Flags to append.
-        """
+        """Return the command that repeats the identification."""
         out = ["--out", self.folder] if self.folder else []
         return shlex.join(["robotid", "identify", *_without(self.source, flags), *flags, *out])
 
     def stating(self, table: str, line: str, *flags: str) -> tuple[str, ...]:
-        """Return the blocks that repeat the identification with another setting.
-
-        Args:
-            table: Table of the job file that has the setting.
-            line: Line of the setting in that table.
-            flags: The equivalent flags of the command line, if there are any.
-        """
+        """Return the blocks that repeat the identification with another setting."""
         if flags and self.source and not self.job:
             return (self.again(*flags),)
         return (f"{table}\n{line}", *([self.again()] if self.job else []))
 
     def using(self, command: str, *words: str) -> tuple[str, ...]:
-        """Return a command that reads the results; nothing if they were not written.
-
-        Args:
-            command: Name of the command.
-            words: Its arguments.
-        """
+        """Return a command that reads the results; nothing if they were not written."""
         return (shlex.join(["robotid", command, *words]),) if self.folder else ()
 
 
@@ -100,13 +83,7 @@ def _key(flag: str, value: str) -> tuple[str, str]:
 
 
 def exports_of(robot: str, origin: Origin, *, has_gains: bool = False) -> list[Step]:
-    """Return the exports of a result to the formats that can use it.
-
-    Args:
-        robot: Name of the robot.
-        origin: The source of the result, and its folder.
-        has_gains: Whether the result has gains of controllers.
-    """
+    """Return the exports of a result to the formats that can use it."""
     steps = []
     for name, form in FORMATS.items():
         if words := form.use_of_gains if has_gains else form.use:
@@ -117,10 +94,6 @@ def exports_of(robot: str, origin: Origin, *, has_gains: bool = False) -> list[S
 
 
 def sentence_of(message: str) -> str:
-    """Return a message as a sentence; the name of a file at its start stays as it is.
-
-    Args:
-        message: The message of a finding.
-    """
+    """Return a message as a sentence; the name of a file at its start stays as it is."""
     first = message.partition(" ")[0].rstrip(":,")
     return message if "." in first else f"{message[0].upper()}{message[1:]}"

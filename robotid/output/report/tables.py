@@ -18,18 +18,6 @@ from robotid.output.pages.html import Cell, code, folded, number, percent, table
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import INERTIAL_TERMS, pseudo_inertia
 
-__all__ = [
-    "SOURCE_NAMES",
-    "base_table",
-    "consistency_section",
-    "input_table",
-    "open_section",
-    "parameter_section",
-    "settings_tables",
-    "sources_fact",
-    "version_table",
-]
-
 #: What determined a parameter, by its source.
 SOURCE_NAMES = {
     "data": "data",
@@ -61,15 +49,7 @@ def parameter_section(
     words: str,
     on_misfit: Collection[str] = (),
 ) -> str:
-    """Return all parameters of the links and drives, and the changes of the URDF.
-
-    Args:
-        model: The robot; None if its URDF is not available.
-        standard: Its identified standard parameters, shape (p,), SI units; None without a URDF.
-        entries: The parameters, as in result.json.
-        words: Introduction, HTML.
-        on_misfit: Names of parameters that depend on a misfit of the model.
-    """
+    """Return all parameters of the links and drives, and the changes of the URDF: standard (p,)."""
     return (
         f"<p>{words} ±: one standard error; low and high: the 95 % interval. Determined by data: "
         "the standard error is below 30 % of the prior's spread. By prior: it is above 90 %, and "
@@ -165,11 +145,7 @@ def _short(entry: Mapping[str, Any] | None) -> Cell:
 
 
 def sources_fact(entries: Sequence[Mapping[str, Any]]) -> dict[str, str]:
-    """Return the number of parameters by source, HTML by its name.
-
-    Args:
-        entries: The parameters, as in result.json.
-    """
+    """Return the number of parameters by source, HTML by its name."""
     counts = {kind: sum(entry["source"] == kind for entry in entries) for kind in SOURCE_NAMES}
     there = {kind: count for kind, count in counts.items() if count}
     shares = "".join(
@@ -201,11 +177,7 @@ def _change_section(model: RobotModel | None, standard: Array | None) -> str:
 
 
 def base_table(found: Identification) -> str:
-    """Return the table of the base parameters.
-
-    Args:
-        found: The identification.
-    """
+    """Return the table of the base parameters."""
     mapping, units = found.mapping, found.model.layout.units
     open_ = set(found.determination.undetermined)
     rows = []
@@ -226,11 +198,7 @@ def base_table(found: Identification) -> str:
 
 
 def consistency_section(found: Identification) -> str:
-    """Return masses and pseudo-inertias, of the URDF and identified; prior, bounds, mass matrix.
-
-    Args:
-        found: The identification.
-    """
+    """Return masses and pseudo-inertias, of the URDF and identified; prior, bounds, mass matrix."""
     layout = found.model.layout
     before, after = (
         pseudo_inertia(pi[: layout.n_inertial]) for pi in (found.prior, found.standard)
@@ -261,11 +229,7 @@ def consistency_section(found: Identification) -> str:
 
 
 def open_section(found: Identification) -> str:
-    """Return the parameters that the data do not determine.
-
-    Args:
-        found: The identification.
-    """
+    """Return the parameters that the data do not determine."""
     wls, layout = found.wls, found.model.layout
     fixed = [n for n, source in zip(layout.names, found.sources, strict=True) if source == "prior"]
     return (
@@ -318,11 +282,7 @@ def _combinations(found: Identification) -> str:
 
 
 def settings_tables(found: Identification) -> str:
-    """Return the tables of the settings, as used.
-
-    Args:
-        found: The identification.
-    """
+    """Return the tables of the settings, as used."""
     model = found.model
     settings = found.estimator.to_dict()
     pairs = {
@@ -347,11 +307,7 @@ def settings_tables(found: Identification) -> str:
 
 
 def input_table(inputs: Iterable[Mapping[str, Any]]) -> str:
-    """Return the table of the input files.
-
-    Args:
-        inputs: As in result.json.
-    """
+    """Return the table of the input files."""
     rows = [
         [
             text(_ROLES[entry["role"]]),
@@ -370,11 +326,7 @@ def input_table(inputs: Iterable[Mapping[str, Any]]) -> str:
 
 
 def version_table(ran: Mapping[str, str]) -> str:
-    """Return the table of the versions that ran.
-
-    Args:
-        ran: The versions, by package.
-    """
+    """Return the table of the versions that ran."""
     rows = [[text(name), code(version)] for name, version in ran.items()]
     return table("Versions that ran", ["what", "version"], rows)
 

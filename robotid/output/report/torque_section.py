@@ -47,8 +47,6 @@ from robotid.output.report.variation_section import variation_section
 from robotid.output.report.why import why_section
 from robotid.output.report.worst_second import Residual, worst_html, worst_second
 
-__all__ = ["shown_torques", "torques_section"]
-
 _ERRORS = (
     "<p>error = 100 |τ − prediction| / |τ| over the samples used; a prediction of zero has 100 %. "
     "For comparison: the error of unconstrained weighted least squares (WLS), of the "
@@ -62,13 +60,7 @@ _PARAMETERS = (
 
 
 def shown_torques(found: Identification, origin: Origin, replay: str = "") -> Shown:
-    """Return the content of a report on an identification.
-
-    Args:
-        found: The identification.
-        origin: Its source and folder, for commands.
-        replay: File of the replay in the report's folder; "" if there is none.
-    """
+    """Return the content of a report on an identification."""
     count = len(found.fitted)
     fitted = Errors(
         "" if count > 1 else _names(found.fitted),
@@ -211,15 +203,7 @@ def torques_section(
     origin: Origin,
     replay: str = "",
 ) -> str:
-    """Return charts of torques and residuals over time.
-
-    Args:
-        found: The identification.
-        verdicts: The verdict on each joint, as in result.json.
-        worst: Joints that have errors, the worst first.
-        origin: Folder of the results, for commands.
-        replay: File of the replay in the page's folder; "" if there is none.
-    """
+    """Return charts of torques and residuals over time."""
     evaluations, rows = found.validation or found.fitted, found.model.row_names
     shown = drawn(evaluations, rows)
     runs = {f"recording {k}": (e, found.band(e)) for k, e in enumerate(shown)}

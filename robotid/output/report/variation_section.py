@@ -8,22 +8,11 @@ import numpy as np
 from robotid.estimation.variation.variation import Variation, VaryingParameter
 from robotid.output.pages.html import Cell, code, table, text, with_error
 
-__all__ = ["variation_section"]
-
 _ROOM = 0.15  # of the prediction interval, beyond the farthest mark
 
 
 def variation_section(variation: Variation | None, torques: Mapping[str, str]) -> str:
-    """Return the values of drive parameters in each log, and the prediction of the next log.
-
-    Args:
-        variation: The variation between logs.
-        torques: Expected RMS torque error of the next log with its unit, by joint; none for a
-            result from commands.
-
-    Returns:
-        HTML; "" for fewer than three logs.
-    """
+    """Return the values of drive parameters in each log, and the prediction of the next log."""
     if variation is None:
         return ""
     different = {(each.run, each.name) for each in variation.unlike}

@@ -9,8 +9,6 @@ from robotid.identification.why_pictures import why_charts
 from robotid.output.pages.charts import Chart, chart_html
 from robotid.output.pages.html import Cell, code, folded, number, percent, table, text
 
-__all__ = ["why_section"]
-
 _POINTS = 300  # of a chart
 _ALL_POINTS = 1800  # of one chart, summed over the joints
 _FEWEST_POINTS = 100
@@ -19,11 +17,7 @@ _MOST = 12  # joints with all charts; others have charts of significant dependen
 
 
 def why_section(found: Identification) -> str:
-    """Return the HTML of the section: a part for each joint, the worst joint first and open.
-
-    Args:
-        found: The identification.
-    """
+    """Return the HTML of the section: a part for each joint, the worst joint first and open."""
     torques = sorted(found.joint_torques, key=_error, reverse=True)
     shown = ", ".join(torques[0].rows.recordings)
     kind = "Validation logs" if torques[0].fitted is not None else "Fitted logs, without validation"

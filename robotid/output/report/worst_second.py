@@ -10,8 +10,6 @@ import numpy as np
 from robotid.base.typing import Array
 from robotid.output.report.dock import Dock
 
-__all__ = ["Residual", "WorstSecond", "worst_html", "worst_second"]
-
 _WINDOW = 1.0  # [s]
 _USED = 0.5  # smallest share of a window's samples that are used
 
@@ -56,9 +54,6 @@ def worst_second(residuals: Iterable[Residual]) -> WorstSecond | None:
 
     Windows with less than half of their samples used are ignored, as those across gaps. A
     recording shorter than 1 s is one window.
-
-    Args:
-        residuals: The recordings; None is returned if no window of them has enough samples.
     """
     found = [worst for residual in residuals if (worst := _worst(residual)) is not None]
     return max(found, key=lambda worst: worst.rms, default=None)
@@ -88,15 +83,7 @@ def _worst(of: Residual) -> WorstSecond | None:
 def worst_html(
     worst: WorstSecond | None, joint: str, unit: str, dock: Dock, scale: float = 1.0
 ) -> str:
-    """Return a paragraph on the worst second of a joint; nothing without one.
-
-    Args:
-        worst: The window.
-        joint: Name of the joint.
-        unit: Unit of the residual shown.
-        dock: The replay of the page.
-        scale: Unit shown, in units of the residual.
-    """
+    """Return a paragraph on the worst second of a joint; nothing without one."""
     if worst is None:
         return ""
     link = dock.link("Show this second in the replay", worst.start, joint, worst.of.file)

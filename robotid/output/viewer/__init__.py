@@ -1,3 +1,1 @@
 """The replay in a browser, of a log or live."""
-
-__all__: list[str] = []

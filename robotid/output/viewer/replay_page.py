@@ -9,8 +9,6 @@ from typing import Any
 
 from robotid.output.pages.html import asset, scaffold
 
-__all__ = ["page"]
-
 _ASSETS = Path(__file__).parent / "assets"
 _SCRIPTS = (
     *("data", "scene", "masses", "arcs", "strip", "choice", "plots"),
@@ -19,12 +17,7 @@ _SCRIPTS = (
 
 
 def page(data: Mapping[str, Any]) -> str:
-    """Return the page of a replay. It loads nothing, except events if it is live.
-
-    Args:
-        data: ``title``, ``notes``, ``live`` and the data that the script draws, in plain finite
-            values.
-    """
+    """Return the page of a replay. It loads nothing, except events if it is live."""
     title = f"{data['title']}: {'live' if data['live'] else 'replay'}"
     notes = " ".join(f"<p>{escape(note)}</p>" for note in data["notes"])
     policy = "; script-src 'unsafe-inline'; img-src data: blob:"

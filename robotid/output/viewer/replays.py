@@ -25,8 +25,6 @@ from robotid.output.viewer.scene import Scene, coordinates, mass_marks, packed, 
 from robotid.output.viewer.unexplained import residual_levels
 from robotid.robot.model import RobotModel
 
-__all__ = ["Bands", "Mark", "Replay", "Torques", "gap_marks", "live_page", "replay"]
-
 _KEYS = 500_000  # numbers of a motion: about 3 MB
 _POINTS = 1_000_000  # numbers of all plots: about 6 MB
 _BINS = 480  # columns of the heat strip
@@ -112,17 +110,7 @@ class Replay:
         return page(self.data)
 
     def write(self, target: str | Path) -> Path:
-        """Write the page.
-
-        Args:
-            target: The HTML file.
-
-        Returns:
-            Path of the file.
-
-        Raises:
-            DataError: If its folder does not exist.
-        """
+        """Write the page."""
         return write_text(self.html, target)
 
     def _repr_html_(self) -> str:
@@ -224,17 +212,7 @@ def live_page(
 ) -> str:
     """Return a page that receives events from the relative address ``events``, and draws them.
 
-    Args:
-        model: The robot, with a fixed base.
-        names: Names of the estimated parameters.
-        units: Their units.
-        q: Joint coordinates that determine the camera's view, shape (N, n) [rad or m].
-        masses: Standard parameters of the URDF, shape (p,).
-
-    Returns:
-        The HTML. An event is a JSON list of objects with ``t``, ``q`` as of ``coordinates``,
-        ``at``, ``tau``, ``predicted`` (null at rest), ``theta``, ``std_error``, or with
-        ``mark``. Times are the log's own.
+    q (N, n) [rad or m], masses (p,).
     """
     empty = np.zeros((0, 0))
     return page(
@@ -311,11 +289,7 @@ def _keyframes(t: Array, rate: float, most: int) -> Array:
 
 
 def gap_marks(t: Array) -> list[Mark]:
-    """Return a mark for each gap of a recording, at the last sample before it.
-
-    Args:
-        t: Times of its samples, shape (N,) [s].
-    """
+    """Return a mark for each gap of a recording, at the last sample before it: t (N,) [s]."""
     return [Mark(float(t[k]), f"gap of {t[k + 1] - t[k]:.2f} s", "gap") for k in _gaps(t)]
 
 

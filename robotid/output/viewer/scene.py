@@ -19,8 +19,6 @@ from robotid.robot.meshes import Shape, Surface, find_mesh, read_shapes, read_su
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
 
-__all__ = ["Ellipsoid", "Scene", "coordinates", "ellipsoids", "mass_marks", "packed", "robot_scene"]
-
 _TRIANGLES = 20_000  # of all meshes as they are drawn: at most 0.9 MB in the page
 _LINK, _JOINT, _BASE = "#9aa7b4", "#e07b1f", "#4a5560"
 _THICKNESS = 0.035  # radius of a link over the robot's reach
@@ -71,9 +69,6 @@ def robot_scene(model: RobotModel) -> Scene:
 
     A body is drawn with the visual shapes of its links if they are found, otherwise as a
     skeleton: capsules from its joint to the next ones, and a drum along the joint's axis.
-
-    Args:
-        model: The robot.
     """
     tree = model.pin_model
     library, notes = _Library(model), []
@@ -98,16 +93,7 @@ def robot_scene(model: RobotModel) -> Scene:
 
 
 def coordinates(model: RobotModel, q: Array) -> Array:
-    """Return the displacements of the nodes of a scene.
-
-    Args:
-        model: The robot.
-        q: Joint coordinates, shape (N, n), or (N, 7 + n) with a floating base [rad, m].
-
-    Returns:
-        Angles and lengths in Pinocchio's order, shape (N, nv), or (N, 7 + nv - 6) with a
-        floating base [rad, m]; ``column`` of a node is the index of its own.
-    """
+    """Return the displacements of the nodes of a scene: q (N, n) [rad, m] -> (N, nv) [rad, m]."""
     base, first = (7, 6) if model.free_flyer else (0, 0)
     G = model.velocity_map[first:, first:]
     moved: Array = np.hstack([q[:, :base], q[:, base:] @ G.T + model.position_offset[first:]])
@@ -117,14 +103,7 @@ def coordinates(model: RobotModel, q: Array) -> Array:
 def mass_marks(model: RobotModel, pi: Array, label: str) -> dict[str, Any]:
     """Return the centre of mass and the equimomental ellipsoid of each body, for the viewer.
 
-    Args:
-        model: The robot.
-        pi: Its standard parameters, shape (p,), or the inertial ones alone.
-        label: Their label.
-
-    Returns:
-        Plain values: the label, and per body its node, name, mass [kg], centre of mass [m],
-        semi-axes [m] and their direction, or the reason for no ellipsoid.
+    pi (p,).
     """
     found = ellipsoids(pi[: model.layout.n_inertial])
     return {
@@ -151,26 +130,17 @@ def ellipsoids(pi: Array) -> tuple[Ellipsoid, ...]:
     ellipsoid of uniform density whose semi-axes have the lengths sqrt(5 s_i / m), s_i the
     eigenvalues of Sigma_c.
 
-    Args:
-        pi: Inertial parameters of the bodies, shape (10 bodies,), SI units.
-
     References:
         Wensing, Kim, Slotine (2018), Linear matrix inequalities for physically consistent
         inertial parameter identification, section IV.
+
+    pi (10 bodies,).
     """
     return tuple(_ellipsoid(J) for J in pseudo_inertia(pi))
 
 
 def packed(values: Array, kind: str = "<f4") -> dict[str, Any]:
-    """Return an array for the page: base64 of little-endian numbers.
-
-    Args:
-        values: The array.
-        kind: "<f4", "<u4" or "<u2".
-
-    Returns:
-        {"kind", "shape", "data"}.
-    """
+    """Return an array for the page: base64 of little-endian numbers."""
     array = np.ascontiguousarray(values, dtype=kind)
     data = base64.b64encode(array.tobytes()).decode("ascii")
     return {"kind": kind, "shape": list(array.shape), "data": data}

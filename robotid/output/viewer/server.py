@@ -9,8 +9,6 @@ from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any, Self
 
-__all__ = ["LivePage"]
-
 _HISTORY = 20_000  # last messages, which pages opened later receive
 _ALIVE = 10.0  # [s] between keep-alive comments
 
@@ -18,16 +16,9 @@ _ALIVE = 10.0  # [s] between keep-alive comments
 class LivePage:
     """Serves a page and a stream of messages (server-sent events) on 127.0.0.1.
 
-    Args:
-        html: The page.
-        port: Port to listen on; any free one if 0.
-
     Attributes:
         url: Address of the page.
         page: The page, encoded.
-
-    Raises:
-        OSError: If the port is in use.
     """
 
     def __init__(self, html: str, port: int = 0) -> None:
@@ -52,11 +43,7 @@ class LivePage:
         self.close()
 
     def send(self, message: Mapping[str, Any]) -> None:
-        """Send a message to all pages, including pages opened later.
-
-        Args:
-            message: Plain finite values, as ``live_page`` documents.
-        """
+        """Send a message to all pages, including pages opened later."""
         text = json.dumps(message, allow_nan=False)
         with self._news:
             self._messages.append(text)
@@ -77,15 +64,7 @@ class LivePage:
         self._thread.join()
 
     def after(self, count: int) -> tuple[list[str], int, bool]:
-        """Wait for messages.
-
-        Args:
-            count: Number of messages already received.
-
-        Returns:
-            The messages after them, empty after a timeout; the number of messages so far; and
-            whether these are the last.
-        """
+        """Wait for messages."""
         with self._news:
             self._news.wait_for(lambda: self._sent > count or self._over, _ALIVE)
             new = min(self._sent - count, len(self._messages))

@@ -8,8 +8,6 @@ import numpy as np
 from robotid.base.typing import Array
 from robotid.robot.meshes import Surface, joined
 
-__all__ = ["thin"]
-
 _CREASE = np.radians(30.0)  # angle between two faces beyond which their edge is sharp
 _WELD = 1e-6  # distance of corners that are merged, over the size of the largest surface
 # whether rims are preserved, and growth rate of the error bound, until few enough remain
@@ -23,11 +21,6 @@ def thin(solids: Sequence[Sequence[Surface]], most: int) -> list[list[Surface]]:
     fast-simplification collapses edges in the order of the change of shape; a collapsed edge opens
     no hole. The triangles of a surface have one orientation, outwards if it is closed. Each side of
     a sharp edge has its own corners, so the edge stays sharp.
-
-    Args:
-        solids: The surfaces of each file of a robot, all in one scale; those of one file are
-            patches of one surface.
-        most: Largest total number of triangles.
 
     References:
         Garland, Heckbert (1997), Surface simplification using quadric error metrics.

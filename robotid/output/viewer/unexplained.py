@@ -7,8 +7,6 @@ import numpy as np
 
 from robotid.base.typing import Array
 
-__all__ = ["Unexplained", "find_unexplained", "residual_levels"]
-
 _WINDOW = 0.2  # [s] averaging window of a residual
 _TIMES = 6.0  # unexplained: a mean residual above this multiple of its median ...
 _SHARE = 0.3  # ... and above this share of the joint's torque
@@ -41,14 +39,7 @@ def find_unexplained(
     The RMS residual of a joint over 0.2 s is unexplained if it is above six times its median over
     the motion and above 0.3 of the RMS torque, for 0.05 s or longer.
 
-    Args:
-        t: Times, shape (N,) [s].
-        tau: Measured torques, shape (N, n) [N m or N].
-        predicted: Predicted torques, shape (N, n), NaN without prediction.
-        joints: Names of the n joints.
-
-    Returns:
-        The segments, ordered by time.
+    t (N,) [s], tau (N, n) [N m or N], predicted (N, n).
     """
     if len(t) < 2:
         return ()
@@ -77,13 +68,7 @@ def find_unexplained(
 def residual_levels(edges: Array, t: Array, residual: Array) -> Array:
     """Return the RMS residual of each joint in each segment of time.
 
-    Args:
-        edges: Starts of the segments, and the end of the last one, shape (B + 1,) [s].
-        t: Times, shape (N,) [s].
-        residual: Measured minus predicted torque, shape (N, n), NaN without prediction.
-
-    Returns:
-        RMS residuals, shape (B, n); -1 for samples without prediction, NaN without samples.
+    edges (B + 1,) [s], t (N,) [s], residual (N, n) -> (B, n).
     """
     bins = len(edges) - 1
     which = np.clip(np.searchsorted(edges, t, side="right") - 1, 0, bins - 1)

@@ -28,9 +28,9 @@ from robotid.data.files.table_files import write_columns
 from robotid.data.signal_settings import SignalSettings
 from robotid.diagnosis.logs.check_logs import check_logs, diagnose, findings_to_dict
 from robotid.diagnosis.verdict.verdict import blocking, check_ignored
-from robotid.dynamics.simulation.closed_loop import another_robot
 from robotid.dynamics.simulation.motions import random_fourier
 from robotid.dynamics.simulation.simulation_settings import Sensors
+from robotid.dynamics.simulation.truth import another_robot
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 

@@ -14,9 +14,9 @@ from robotid.diagnosis.logs.check_logs import diagnose
 from robotid.diagnosis.logs.mounted import Segments, check_payload_change
 from robotid.diagnosis.logs.torque_sample import smooth_motion
 from robotid.dynamics.base_parameters import structural_mapping
-from robotid.dynamics.simulation.closed_loop import another_robot
 from robotid.dynamics.simulation.motions import random_fourier
 from robotid.dynamics.simulation.simulation_settings import Sensors
+from robotid.dynamics.simulation.truth import another_robot
 from robotid.robot.bodies import link_places
 from robotid.robot.drives import FAMILIES
 from robotid.robot.prior import payload_spread

@@ -36,7 +36,7 @@ from robotid.diagnosis.residual.term_trials import RIDGE, Normal, Sample, Trials
 from robotid.diagnosis.verdict.fit_findings import fit_findings
 from robotid.diagnosis.verdict.verdict import warnings_of
 from robotid.dynamics.base_parameters import structural_mapping
-from robotid.dynamics.simulation.closed_loop import another_robot
+from robotid.dynamics.simulation.truth import another_robot
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
 from robotid.estimation.fitting.joint_motion import JointMotion
 from robotid.estimation.fitting.recorded import Recordings

@@ -11,8 +11,6 @@ from robotid.base.typing import Array
 from robotid.estimation.estimators.consistent.cones import Cone, svec
 from robotid.robot.parameters import ParameterLayout, pseudo_inertia, pseudo_inertia_basis
 
-__all__ = ["SIGN_MARGIN", "Constraints", "slabs"]
-
 #: Lower bound of drive terms relative to their scale: rounding cannot make them negative.
 SIGN_MARGIN = 1e-9
 _OPEN = (0.0, np.inf)  # [kg]
@@ -238,12 +236,11 @@ def slabs(box: Array) -> Array:
     integral over the body is tr(J Q_k). Together with J >= 0 it bounds the centre of mass and the
     radii of gyration by the box.
 
-    Args:
-        box: Lower and upper corner, shape (2, 3) [m].
-
     References:
         Wensing, Kim, Slotine (2018), Linear Matrix Inequalities for Physically Consistent Inertial
         Parameter Identification, (12), with an ellipsoid that is a slab.
+
+    box (2, 3) [m].
     """
     Q = np.zeros((3, 4, 4))
     for k, (low, high) in enumerate(box.T.tolist()):

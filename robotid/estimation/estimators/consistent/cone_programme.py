@@ -19,8 +19,6 @@ from robotid.estimation.estimators.consistent.cones import (
 from robotid.estimation.estimators.consistent.interior_point import EntropicProblem
 from robotid.estimation.estimators.consistent.penalties import Entropic, Penalty
 
-__all__ = ["Programme"]
-
 _EXACT = 1e-12  # relative decrease of the objective per step at which a fit is exact
 _ROUGH = 1e-6  # ... and at which it is sufficient for a prediction
 _TOGETHER = 2**17  # entries of the data sets that are fitted in one pass: they fit into a cache
@@ -64,14 +62,7 @@ class Programme:
         With a quadratic penalty the cone solver is used; with the entropic penalty the
         interior-point method of ``EntropicProblem``.
 
-        Args:
-            rows: Rows of the data in base parameters, shape (k, b + 1).
-            weight: Weight of the penalty [-].
-            is_exact: Whether to solve more precisely than 1e-3 standard deviations.
-            start: Initial value: minimum of nearly the same rows, or at another weight.
-
-        Raises:
-            NotConvergedError: If the solver fails.
+        rows (k, b + 1).
         """
         starts = None if start is None else [start]
         return self.minimise_each(rows[None], weight, is_exact=is_exact, starts=starts)[0]
@@ -86,14 +77,7 @@ class Programme:
     ) -> list[ConeSolution]:
         """Return the minimum of each of f data sets, as ``minimise``, in one pass.
 
-        Args:
-            rows: Rows of the data in base parameters, shape (f, k, b + 1).
-            weight: Weight of the penalty [-].
-            is_exact: Whether to solve more precisely than 1e-3 standard deviations.
-            starts: Initial values: minima of nearly the same rows, or at another weight.
-
-        Raises:
-            NotConvergedError: If the solver fails for a data set.
+        rows (f, k, b + 1).
         """
         if not isinstance(self.penalty, Entropic):
             centre = self.penalty.centre
@@ -149,22 +133,11 @@ class Programme:
         the cone, in the metric of the fit, is the minimum with them. A penalty that is not
         quadratic is expanded at the fit.
 
-        Args:
-            rows: Rows of the data in base parameters, shape (k, b + 1).
-            weight: Weight of the penalty [-].
-            pi: The fit, shape (p,).
-            meat: Covariance of the score of the rows, shape (b, b).
-            weight_ratio: Weight of the penalty over its plausible weight [-].
-            draws: Number of fits.
-            rng: Random generator of the noise.
-
-        Returns:
-            Distances of the m solved fits from pi, shape (m, p), and the solver's status of each of
-            the draws - m others.
-
         References:
             Bardsley, Fox (2012), An MCMC method for uncertainty quantification in nonnegativity
             constrained inverse problems, section 3.
+
+        rows (k, b + 1), pi (p,), meat (b, b) -> (m, p).
         """
         triangle, cone = self._system(rows, weight, pi, self.binding)
         # signs of rows depend on rounding: make the diagonal positive
@@ -189,10 +162,7 @@ class Programme:
     def objective(self, rows: Array, pi: Array, weight: float) -> float:
         """Return the objective: the squared residual plus the weighted penalty [-].
 
-        Args:
-            rows: Rows of the data in base parameters, shape (k, b + 1).
-            pi: Standard parameters, shape (p,).
-            weight: Weight of the penalty [-].
+        rows (k, b + 1), pi (p,).
         """
         residual = rows[:, :-1] @ (self.K @ pi) - rows[:, -1]
         return float(residual @ residual + weight * self.penalty.value(pi))
@@ -200,12 +170,7 @@ class Programme:
     def whitened(self, rows: Array) -> tuple[Array, Array]:
         """Return A, r with r = A x + noise, for coordinates x whose prior is N(0, 1).
 
-        Args:
-            rows: Rows of the data in base parameters, shape (k, b + 1).
-
-        Returns:
-            A, shape (k, m), and r, shape (k,), at a weight of 1, with the penalty expanded at its
-            centre and m directions that are free under the equalities.
+        rows (k, b + 1) -> (k, m), (k,).
         """
         beta, M = self._plausible
         return rows[:, :-1] @ M, rows[:, -1] - rows[:, :-1] @ beta
@@ -227,10 +192,7 @@ class Programme:
     ) -> Array:
         """Return the covariance without the inequalities, shape (p, p).
 
-        Args:
-            weight: Weight of the penalty [-].
-            rows: Rows of the data in base parameters, shape (k, b + 1); None: the prior only.
-            pi: Point at which the penalty is expanded, shape (p,); None: its centre.
+        rows (k, b + 1), pi (p,).
         """
         S = np.sqrt(weight) * self._scaled_root(self.penalty.centre if pi is None else pi)
         data = [] if rows is None else [rows[:, :-1] @ self.K * self.scale]
@@ -252,15 +214,7 @@ class Programme:
     ) -> ConeSolution:
         """Return the minimum with the penalty expanded at a point, by the cone solver.
 
-        Args:
-            rows: Rows of the data in base parameters, shape (k, b + 1).
-            weight: Weight of the penalty [-].
-            pi: The point, shape (p,).
-            is_exact: As in ``minimise``.
-            within: The inequalities; None: those that can be active.
-
-        Raises:
-            NotConvergedError: If the cone solver fails.
+        rows (k, b + 1), pi (p,).
         """
         triangle, cone = self._system(rows, weight, pi, self.binding if within is None else within)
         solution = least_squares(

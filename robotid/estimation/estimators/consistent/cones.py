@@ -17,16 +17,6 @@ from robotid.base.typing import Array
 if TYPE_CHECKING:
     import clarabel
 
-__all__ = [
-    "Cone",
-    "ConeSolution",
-    "Subspace",
-    "least_squares",
-    "nearest",
-    "svec",
-    "unsvec",
-]
-
 _SIZE = 4  # of a pseudo-inertia
 _ENTRIES = _SIZE * (_SIZE + 1) // 2
 _UNITS = (1.0, 1e-3, 1e-5)  # units of the first solution and of its corrections
@@ -52,9 +42,7 @@ class Subspace:
     def of(cls, E: Array, e: Array) -> "Subspace":
         """Return the points with E x = e, in the least squares sense if they contradict.
 
-        Args:
-            E: Coefficients, shape (k, p).
-            e: Right-hand side, shape (k,).
+        E (k, p), e (k,).
         """
         p = E.shape[1]
         if not len(E):
@@ -115,36 +103,23 @@ class Cone:
         return Cone(self.G, self.h, self.S[:0], self.s[:0], self.labels[: len(self.h)])
 
     def matrices(self, x: Array) -> Array:
-        """Return the matrices S_i(x), shape (m, 4, 4).
-
-        Args:
-            x: A point, shape (p,).
-        """
+        """Return the matrices S_i(x), shape (m, 4, 4): x (p,)."""
         return unsvec(self.S @ x + self.s)
 
     def slack(self, x: Array) -> Array:
         """Return values of rows, then smallest eigenvalues, shape (k + m,); negative if violated.
 
-        Args:
-            x: A point, shape (p,).
+        x (p,).
         """
         eigenvalues = np.linalg.eigvalsh(self.matrices(x))[:, 0]
         return np.concatenate([self.G @ x + self.h, eigenvalues])
 
     def holds(self, x: Array) -> bool:
-        """Return whether the cone contains a point.
-
-        Args:
-            x: A point, shape (p,).
-        """
+        """Return whether the cone contains a point: x (p,)."""
         return bool((self.slack(x) >= 0).all())
 
     def restrict(self, space: Subspace) -> "Cone":
-        """Return the cone in coordinates y of a subspace: the y whose x is in this cone.
-
-        Args:
-            space: The subspace.
-        """
+        """Return the cone in coordinates y of a subspace: the y whose x is in this cone."""
         return Cone(
             self.G @ space.basis,
             self.h + self.G @ space.origin,
@@ -159,12 +134,7 @@ class Cone:
         A matrix with r eigenvalues at 0, with eigenvectors V, gives r (r + 1) / 2 constraints
         V^T dS V = 0, because its rank does not change on the boundary.
 
-        Args:
-            x: A point, shape (p,).
-            tolerance: Slack below which a constraint is active.
-
-        Returns:
-            Gradients of the functions that are 0, shape (a, p), and the label of each.
+        x (p,) -> (a, p).
         """
         gradients, labels = [np.zeros((0, len(x)))], []
         for row, constant, label in zip(self.G, self.h, self.labels, strict=False):
@@ -188,8 +158,7 @@ class Cone:
 def svec(S: Array) -> Array:
     """Return upper triangles by columns, shape (..., k (k + 1) / 2), off-diagonals times sqrt 2.
 
-    Args:
-        S: Symmetric matrices, shape (..., k, k).
+    S (..., k, k).
     """
     rows, columns, weight = _upper(S.shape[-1])
     return S[..., rows, columns] * weight
@@ -205,8 +174,7 @@ def _upper(k: int) -> tuple[Array, Array, Array]:
 def unsvec(vector: Array) -> Array:
     """Return the matrices, shape (m, 4, 4), of stacked vectors; the inverse of ``svec``.
 
-    Args:
-        vector: Vectors of 10 entries, one after the other, shape (10 m,).
+    vector (10 m,).
     """
     rows, columns, weight = _upper(_SIZE)
     entries = vector.reshape(-1, _ENTRIES) / weight
@@ -246,17 +214,7 @@ def least_squares(
     corrections in units of 1e-3 and 1e-5, which reduces the error accordingly (measured on exact
     data: 2e-7, 5e-14, 2e-15).
 
-    Args:
-        A: Upper triangular factor, shape (p, p), not singular.
-        d: Right-hand side, shape (p,).
-        cone: Feasible set of x.
-        max_iterations: Largest number of Clarabel's iterations.
-        is_exact: Whether to solve for the corrections, too. If not, the error is about 1e-3 in
-            units of A x, which are standard deviations for weighted rows. This takes half the time,
-            and for a cone of linear rows a fiftieth.
-
-    Raises:
-        NotConvergedError: If the solver fails, or no point meets the constraints.
+    A (p, p), d (p,).
     """
     x = scipy.linalg.solve_triangular(A, d)
     if cone.holds(x):
@@ -299,13 +257,7 @@ def nearest(points: Array, cone: Cone, *, max_iterations: int = 200) -> tuple[Ar
     Clarabel is used, with an error of about 1e-3: the unit of the coordinates should be a standard
     deviation.
 
-    Args:
-        points: The points, shape (k, p).
-        cone: The cone.
-        max_iterations: Largest number of Clarabel's iterations for one point.
-
-    Returns:
-        The nearest points found, shape (m, p), and the solver's status of each of the k - m others.
+    points (k, p) -> (m, p).
     """
     G, h = cone.rows
     # normalise rows and matrices: in units of a standard deviation their sizes differ widely

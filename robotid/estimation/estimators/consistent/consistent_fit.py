@@ -27,8 +27,6 @@ from robotid.estimation.estimators.determination import base_spread, determine
 from robotid.estimation.estimators.estimator import BatchEstimator, Estimate
 from robotid.robot.parameters import ParameterLayout
 
-__all__ = ["Consistent"]
-
 _FLOOR = 1e-6  # smallest noise level over the torque, for noise-free data
 _LEAST_FREEDOM = 0.1  # smallest degrees of freedom of a noise level, as a share of the rows
 _ACTIVE = 1e-5  # slack below which a constraint is active, dimensionless

@@ -30,8 +30,6 @@ from robotid.base.typing import Array
 from robotid.estimation.estimators.consistent.cones import ConeSolution, svec, unsvec
 from robotid.robot.parameters import pseudo_inertia_basis
 
-__all__ = ["EntropicProblem"]
-
 _SIZE, _ENTRIES = 4, 10  # of a pseudo-inertia, and of its upper triangle
 _EYE = np.arange(_SIZE)
 _BASIS = pseudo_inertia_basis().reshape(_ENTRIES, _SIZE * _SIZE)  # J = sum_k pi_k B_k
@@ -80,19 +78,7 @@ class EntropicProblem:
         tolerance: float,
         starts: Sequence[ConeSolution] | None = None,
     ) -> list[ConeSolution]:
-        """Return the minimum of each data set.
-
-        Args:
-            A: Coefficients of the data, shape (f, m, p).
-            d: Their right-hand sides, shape (f, m).
-            weight: Weight w of the prior [-].
-            tolerance: Largest relative decrease of the objective by a further step [-].
-            starts: Initial values: minima of nearly the same data, or at another weight.
-
-        Raises:
-            NotConvergedError: If a minimum is not found in 100 steps, for example because
-                inequalities contradict each other.
-        """
+        """Return the minimum of each data set: A (f, m, p), d (f, m)."""
         point = self._first(A, d, weight) if starts is None else self._near(starts, weight)
         found: dict[int, ConeSolution] = {}
         left = np.arange(len(A))  # data sets that have not converged
@@ -131,11 +117,7 @@ class EntropicProblem:
         return np.asarray(np.linalg.inv(self.P))
 
     def bodies(self, x: Array) -> Array:
-        """Return the pseudo-inertias without the known parts, shape (f, n, 4, 4).
-
-        Args:
-            x: Points, shape (f, p).
-        """
+        """Return the pseudo-inertias without the known parts, shape (f, n, 4, 4): x (f, p)."""
         own = (x[:, : self.inertial] - self.held) * self.scale[: self.inertial]
         J: Array = own.reshape(len(x), -1, _ENTRIES) @ _BASIS
         return J.reshape(*J.shape[:2], _SIZE, _SIZE)
@@ -277,11 +259,7 @@ class _System:
     ) -> _Direction:
         """Return the steps to the point with Z J = t 1 and lambda s = mu.
 
-        Args:
-            t: Target of the product of the bodies, shape (f, 1).
-            mu: Target of the product of the inequalities, shape (f, 1).
-            cross: Expected products of the changes of J and Z, shape (f, n, 4, 4); None: 0.
-            pairs: Expected products of the changes of s and lambda, shape (f, k).
+        t (f, 1), mu (f, 1), cross (f, n, 4, 4), pairs (f, k).
         """
         point, length, size = self.point, self.length, self.problem.inertial
         bodies = np.zeros_like(self.R_inverse)  # sum of the changes of J and Z, plus diag(l)
@@ -318,9 +296,7 @@ class _System:
     def corrected(self, ahead: _Direction, share: Array) -> _Point:
         """Return the points after a corrected step (Mehrotra's predictor and corrector).
 
-        Args:
-            ahead: The steps to the minima (predictor).
-            share: Feasible share of these steps, shape (f,).
+        share (f,).
         """
         point, share = self.point, share[:, None]
         mean = (self.length**2).mean(axis=(1, 2))[:, None]
@@ -360,13 +336,7 @@ class _System:
         return _to_zero(np.ones_like(lowest), lowest)
 
     def is_settled(self, ahead: _Direction, share: Array, tolerance: float) -> Array:
-        """Return whether the step to each minimum is negligible, shape (f,), bool.
-
-        Args:
-            ahead: The steps.
-            share: Feasible share of these steps, shape (f,).
-            tolerance: Largest relative decrease of the objective [-].
-        """
+        """Return whether the step to each minimum is negligible, shape (f,), bool: share (f,)."""
         nothing = tolerance * (1.0 + self.value)
         decrease = (_times(self.A, ahead.z) ** 2).sum(axis=1) + (ahead.z**2).sum(axis=1)
         settled: Array = (share > 0.5) & (decrease <= nothing)

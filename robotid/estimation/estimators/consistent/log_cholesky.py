@@ -16,8 +16,6 @@ from robotid.estimation.estimators.consistent.penalties import body_units
 from robotid.estimation.estimators.estimator import BatchEstimator, Estimate
 from robotid.robot.parameters import pseudo_inertia, pseudo_inertia_basis
 
-__all__ = ["LogCholesky", "from_log_cholesky"]
-
 _INSIDE = 1e-6  # distance by which an initial value is moved off the boundary, dimensionless
 _STEPS = 500
 _SETTLED = 1e-14  # predicted decrease at which it has converged, relative to the objective
@@ -227,8 +225,7 @@ def from_log_cholesky(z: Array) -> Array:
 
     U = exp(alpha) [[exp d1, s12, s13, t1], [0, exp d2, s23, t2], [0, 0, exp d3, t3], [0, 0, 0, 1]].
 
-    Args:
-        z: alpha d1 d2 d3 s12 s23 s13 t1 t2 t3 of each matrix, shape (n, 10).
+    z (n, 10).
     """
     U = _factor(z)
     return U @ U.transpose(0, 2, 1)

@@ -20,17 +20,6 @@ from robotid.robot.parameters import (
     pseudo_inertia_basis,
 )
 
-__all__ = [
-    "METRICS",
-    "Entropic",
-    "Penalty",
-    "Quadratic",
-    "WeightChoice",
-    "body_units",
-    "make_penalty",
-    "pull_back_metric",
-]
-
 METRICS = ("euclidean", "entropic", "riemannian")
 _SINGULAR = 1e-12  # ratio of the axes of a body, squared, below which it is singular
 _THINNEST = 0.01  # smallest relative thickness of a prior's pseudo-inertia
@@ -71,19 +60,11 @@ class Penalty(ABC):
 
     @abstractmethod
     def value(self, pi: Array) -> float:
-        """Return the penalty, at least 0; infinite if the metric is not defined.
-
-        Args:
-            pi: Standard parameters, shape (p,).
-        """
+        """Return the penalty, at least 0; infinite if the metric is not defined: pi (p,)."""
 
     @abstractmethod
     def gradient(self, pi: Array) -> Array:
-        """Return its gradient, shape (p,).
-
-        Args:
-            pi: Standard parameters, shape (p,).
-        """
+        """Return its gradient, shape (p,): pi (p,)."""
 
     @abstractmethod
     def root(self, pi: Array) -> Array:
@@ -92,16 +73,11 @@ class Penalty(ABC):
         For a thin body the root is computed directly: its second derivative has a condition number
         too large to be factorised.
 
-        Args:
-            pi: Standard parameters, shape (p,).
+        pi (p,).
         """
 
     def hessian(self, pi: Array) -> Array:
-        """Return its second derivative, shape (p, p), positive definite.
-
-        Args:
-            pi: Standard parameters, shape (p,).
-        """
+        """Return its second derivative, shape (p, p), positive definite: pi (p,)."""
         S = self.root(pi)
         H: Array = 2.0 * S.T @ S
         return H
@@ -203,16 +179,11 @@ def make_penalty(
     pseudo-inertia of a prior is not physically consistent or its relative thickness is below 1 %,
     its eigenvalues are increased to 1 % first.
 
-    Args:
-        metric: One of ``METRICS``.
-        layout: The standard parameters.
-        prior: Prior values, shape (p,).
-        prior_std: Prior standard deviations, shape (p,).
-        held: Known part of each body, shape (10 bodies,).
-
     References:
         Lee, Wensing, Park (2019), Geometric robot dynamic identification: a convex programming
         approach, (24), (32).
+
+    prior (p,), prior_std (p,), held (10 bodies,).
     """
     if metric == "euclidean":
         return Quadratic(prior, np.diag(prior_std**-2.0))
@@ -229,11 +200,10 @@ def make_penalty(
 def pull_back_metric(J: Array) -> Array:
     """Return the affine-invariant metrics g_kl = tr(J^-1 B_k J^-1 B_l), shape (n, 10, 10).
 
-    Args:
-        J: Pseudo-inertias, shape (n, 4, 4), positive definite.
-
     References:
         Lee, Wensing, Park (2019), cited in ``make_penalty``, (22).
+
+    J (n, 4, 4).
     """
     S = metric_root(np.linalg.cholesky(J))
     metric: Array = S.transpose(0, 2, 1) @ S
@@ -245,8 +215,7 @@ def metric_root(L: Array) -> Array:
 
     With J = L L^T, g_kl = tr(C_k C_l) of the symmetric C_k = L^-1 B_k L^-T.
 
-    Args:
-        L: Factors of the pseudo-inertias, shape (n, 4, 4).
+    L (n, 4, 4).
     """
     C = _whitened(pseudo_inertia_basis()[None], L[:, None])  # (n, 10, 4, 4)
     S: Array = np.asarray(np.linalg.qr(svec(C).transpose(0, 2, 1), mode="r"))
@@ -256,9 +225,7 @@ def metric_root(L: Array) -> Array:
 def body_units(spread: Array) -> Array:
     """Return diagonal T^-1/2, which make pseudo-inertias dimensionless, shape (bodies, 4, 4).
 
-    Args:
-        spread: Prior standard deviations of the inertial parameters, shape (10 bodies,). Mass m and
-            radius r of a body's size are taken from those of m and m r.
+    spread (10 bodies,).
     """
     by_body = spread.reshape(-1, 10)
     mass, radius = by_body[:, 0], by_body[:, 1] / by_body[:, 0]

@@ -14,16 +14,6 @@ from robotid.estimation.estimators.consistent.cones import ConeSolution
 from robotid.estimation.estimators.consistent.consistent_fit import Consistent
 from robotid.estimation.estimators.consistent.penalties import WeightChoice
 
-__all__ = [
-    "AS_GOOD",
-    "Segments",
-    "choose_weight",
-    "contradicted_extents",
-    "held_out_errors",
-    "log_evidence",
-    "loss_of",
-]
-
 _SMALLEST, _LARGEST = -4.0, 2.0  # decades of the weights tried
 _USUAL = -1.0  # at smaller entropic weights bodies become thin, and fits converge slowly
 _PATIENCE = 2  # decades without a better score after which the search ends
@@ -60,13 +50,7 @@ class Segments:
     def of(
         cls, fit: Consistent, segments: Sequence[Factors], sigma: Array | None = None
     ) -> "Segments":
-        """Return segments with the noise level of a fit to all of them.
-
-        Args:
-            fit: The fit; its constraints are not used.
-            segments: Factors of contiguous segments of the fitted data.
-            sigma: The noise level, shape (n,) [N m or N]; None: it is computed.
-        """
+        """Return segments with the noise level of a fit to all of them: sigma (n,) [N m or N]."""
         whole = merge(segments)
         level = fit.noise(whole) if sigma is None else sigma
         return cls(tuple(segments), level, fit.rows(whole, level), fit.independent_share)
@@ -97,8 +81,7 @@ class Segments:
     def errors(self, squares: Array) -> Array:
         """Return squared errors over the square of the noise level and the number of rows.
 
-        Args:
-            squares: Sums by segment and joint, shape (segments, n) [N^2 m^2 or N^2].
+        squares (segments, n) [N^2 m^2 or N^2].
         """
         squares = squares / self.sigma**2
         rows = np.sum([fold.rows for fold in self.folds], axis=0)  # (n,)
@@ -130,16 +113,6 @@ def choose_weight(
     one. A weight above 1 shifts the estimate towards the prior, but does not reduce the standard
     errors; see ``Consistent.weight_ratio``. A weight at which the fit does not converge, because
     bodies shrink to points, has an infinite error.
-
-    Args:
-        fit: The fit; its own weight is not used.
-        segments: The fitted data.
-        how: "cv" or "evidence".
-        repeated: Share of errors that repeat in all segments in the squared residual [-].
-
-    Raises:
-        DataError: If "cv" has fewer than two segments.
-        NotConvergedError: If the fit does not converge at any weight.
     """
     evidence = log_evidence(fit, segments.rows)
     by_evidence = _search(lambda w: (-evidence(w), np.zeros(0)), "evidence", 0.0)
@@ -167,16 +140,7 @@ def choose_weight(
 
 
 def loss_of(fit: Consistent, segments: Segments, weight: float) -> float:
-    """Return the largest ratio of the held-out error of a joint to that of least squares [-].
-
-    Args:
-        fit: The fit; its own weight is not used.
-        segments: The fitted data, at least two segments.
-        weight: Weight of the prior [-].
-
-    Returns:
-        The ratio; inf if a fit does not converge.
-    """
+    """Return the largest ratio of the held-out error of a joint to that of least squares [-]."""
     try:
         errors, _ = held_out_errors(fit, segments, weight)
     except NotConvergedError:
@@ -211,13 +175,10 @@ def plausible_weight(fit: Consistent, rows: Array, weight: float) -> float:
     of the weights tried: a larger disagreement is not due to the expansion, but to errors of the
     model. The steps end before a weight at which the fit does not converge.
 
-    Args:
-        fit: The fit; its own weight is not used.
-        rows: Rows of the data, shape (k, b + 1), from ``Consistent.rows``.
-        weight: The weight with the largest ``log_evidence`` [-].
-
     References:
         MacKay (1992), Bayesian interpolation, section 4.
+
+    rows (k, b + 1).
     """
     programme, solution, found = fit.programme, None, weight
     least = weight * 10.0**-_STEP
@@ -243,10 +204,6 @@ def contradicted_extents(fit: Consistent, segments: Segments) -> tuple[str, ...]
     These are the bodies that are outside their box by more than four standard errors in a fit
     without extents, at a weight of 1. That fit must also predict held-out segments better than the
     fit with extents, by more than two standard errors and 2 % of the mean square error.
-
-    Args:
-        fit: The fit; its own weight is not used.
-        segments: The fitted data; with one segment the prediction is not tested.
     """
     cone, rows, count = fit.programme.cone.linear, segments.rows, len(segments.folds)
     free = replace(fit, constraints=fit.constraints.without_extent(fit.constraints.extent))
@@ -281,21 +238,7 @@ def held_out_errors(
 ) -> tuple[Array, list[ConeSolution]]:
     """Return the prediction errors of each segment by the fit to all others, with constraints.
 
-    Args:
-        fit: The fit; its own weight is not used.
-        segments: The fitted data, at least two segments.
-        weight: Weight of the prior [-].
-        starts: Initial values, one fit without each segment.
-
-    Returns:
-        Sums of squared prediction errors by segment and joint, over the square of the joint's noise
-        level and its number of rows in all segments, shape (segments, n) [-]: the sum over segments
-        is the mean square of each joint. Rows that are projected together count as one joint. And
-        the fits, as initial values of other fits.
-
-    Raises:
-        DataError: If there are fewer than two segments.
-        NotConvergedError: If a fit does not converge.
+    -> (segments, n) [-].
     """
     if len(segments.folds) < 2:
         raise DataError(
@@ -315,15 +258,10 @@ def log_evidence(fit: Consistent, rows: Array) -> Callable[[float], float]:
     r ~ N(0, I + A A^T / weight). A penalty that is not quadratic is expanded at its centre. The
     inequalities are neglected, and a constant is omitted.
 
-    Args:
-        fit: The fit; its own weight is not used.
-        rows: Rows of the data, shape (k, b + 1), from ``Consistent.rows``.
-
-    Returns:
-        The function of the weight [-].
-
     References:
         MacKay (1992), Bayesian interpolation, section 4.
+
+    rows (k, b + 1).
     """
     A, r = fit.programme.whitened(rows)
     U, s, _ = np.linalg.svd(A, full_matrices=False)

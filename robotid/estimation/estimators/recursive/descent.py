@@ -21,8 +21,6 @@ from robotid.estimation.estimators.recursive.recursive import (
     scaled_rows,
 )
 
-__all__ = ["PRX", "DescentState", "NormalisedGradient", "column_scale"]
-
 #: Rows of a sample: all, or the indices of the rows of positive weight.
 Rows: TypeAlias = slice | Array
 
@@ -350,12 +348,7 @@ def column_scale(problem: Problem, sigma: Array) -> Array:
 
     Scaled by it, all columns have the same norm. The value of a column without data is 1.
 
-    Args:
-        problem: The rows.
-        sigma: Noise level of each joint, shape (n,) [N m or N].
-
-    Raises:
-        DataError: If a row is not finite.
+    sigma (n,) [N m or N].
     """
     n, c = problem.n_joints, len(problem.names)
     squares, count = np.zeros(c), 0

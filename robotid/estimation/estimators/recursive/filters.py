@@ -21,8 +21,6 @@ from robotid.estimation.estimators.recursive.recursive import (
     scaled_rows,
 )
 
-__all__ = ["RLS", "Kalman", "KalmanState", "RLSState"]
-
 _BLOCK = 8  # block size of LAPACK
 _TINY = 1e-12  # smallest noise over sigma, for noise-free data
 _PATIENCE = 50  # largest number of successive rows of a joint that the gate rejects

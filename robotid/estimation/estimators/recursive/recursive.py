@@ -16,15 +16,6 @@ from robotid.base.typing import Array
 from robotid.dynamics.problem import Problem, Sample
 from robotid.estimation.estimators.estimator import Estimate, Estimator
 
-__all__ = [
-    "RecursiveEstimator",
-    "fold",
-    "load_state",
-    "require_samples",
-    "save_state",
-    "scaled_rows",
-]
-
 StateT = TypeVar("StateT")
 
 
@@ -86,13 +77,7 @@ def fold(estimator: RecursiveEstimator[StateT], samples: Iterable[Sample], state
 def scaled_rows(sample: Sample, sigma: Array, c: int) -> Array:
     """Return rows sqrt(weight_j) / sigma_j [Y_j tau_j] of nonzero weight, shape (k, c + 1).
 
-    Args:
-        sample: One sample.
-        sigma: Noise level of each joint, shape (n,) [N m or N].
-        c: Number of parameters.
-
-    Raises:
-        DataError: If the sample is not finite or has a wrong shape.
+    sigma (n,) [N m or N].
     """
     n = len(sigma)
     if sample.Y.shape != (n, c) or sample.tau.shape != (n,) or sample.weight.shape != (n,):
@@ -155,14 +140,7 @@ def load_state(path: str | Path, kind: type[StateT]) -> StateT:
 
 
 def require_samples(data: object) -> None:
-    """Raise an error if data for ``fit`` have no samples.
-
-    Args:
-        data: The data for ``fit``.
-
-    Raises:
-        DataError: If the data are not a problem; factors have no samples.
-    """
+    """Raise an error if data for ``fit`` have no samples."""
     if not isinstance(data, Problem):
         raise DataError(
             "a recursive estimator needs samples, but factors have none; call fit with the problem"
