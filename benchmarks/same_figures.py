@@ -1,18 +1,16 @@
 """Do two trees of robotid give the same figures?
 
-Runs every command and every estimator with each of two trees: the job files of tests/jobs, logs
-simulated with a small arm, some of them with faults, and the recordings found by ROBOTID_DATA.
-Compares every number of every file written, and of what is printed: of JSON (that of the charts of
-pages included) and Parquet by its place, of other text (CSV, XML, YAML, pages) by its order.
-Times, dates, versions and digests are left out.
+Runs every command and estimator with each: the job files of tests/jobs, logs simulated with a small
+arm, some with faults, and the recordings found by ROBOTID_DATA. Compares every number of every file
+written, and of what is printed: of JSON (that of the charts of pages included) and Parquet by its
+place, of other text (CSV, XML, YAML, pages) by its order; no times, dates, versions and digests.
 
     python benchmarks/same_figures.py BEFORE [AFTER] [--jobs 2] [--only RUN ...] [--tolerance 1e-12]
     python benchmarks/same_figures.py BEFORE --keep FOLDER
 
 BEFORE and AFTER are folders of two checkouts, or kept ones; AFTER: this one. --keep runs BEFORE and
-keeps what it writes, and compares nothing. Exits with 1 if a figure differs by more than the
-tolerance of its size or is gone, or if a run ends otherwise. --only takes patterns of names; a run
-that reads what others write needs these, too.
+keeps what it writes. Exits with 1 if a figure differs by more than the tolerance of its size, is
+gone or new, or if a run ends otherwise.
 """
 
 import argparse
@@ -27,15 +25,17 @@ import tempfile
 import time
 import tomllib
 from concurrent.futures import ThreadPoolExecutor
-from fnmatch import fnmatch
 from importlib.metadata import distribution
+from itertools import product
 from pathlib import Path
 
 import numpy as np
 from pyarrow import parquet
 
 HERE = Path(__file__).parents[1]
-TEXTS = (".csv", ".xml", ".urdf", ".sdf", ".py", ".yaml", ".toml", ".script", ".html", ".txt")
+FORMATS = ("urdf", "mjcf", "sdf", "isaac", "ranges")
+TEXTS = (".csv", ".xml", ".html", ".txt", ".svg", *(f".{form}" for form in FORMATS))
+READ = (".json", ".parquet", *TEXTS)
 NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 DATA = re.compile(r'<script type="application/json"[^>]*>(.*?)</script>', re.DOTALL)
 CODE = re.compile(r"<script.*?</script>|<style.*?</style>", re.DOTALL)
@@ -50,19 +50,18 @@ BOX = '<collision><geometry><box size="0.2 0.1 0.1"/></geometry></collision>'
 def prepare(tree, data):
     """Write the inputs of the first stage into the working folder."""
     planar = (tree / "urdf/planar_2r.urdf").read_text().replace('xyz="0 0 1"', 'xyz="0 1 0"')
-    planar = planar.replace('"500.0"', '"2000.0"').replace("</inertial>", f"</inertial>{BOX}")
-    Path("arm.urdf").write_text(planar)
+    planar = planar.replace("</inertial>", f"</inertial>{BOX}")
+    Path("arm.urdf").write_text(planar.replace('"500.0"', '"2000.0"'))
     rows = ["time,q_joint_1,q_joint_2"]
     for t in (i / 1000 for i in range(8001)):
-        first = 0.8 * math.sin(1.3 * t) + 0.4 * math.sin(4.1 * t)
-        rows.append(f"{t},{first!r},{0.9 * math.sin(1.9 * t) + 0.3 * math.sin(5.3 * t)!r}")
+        one, two = math.sin(1.3 * t) + math.sin(4.1 * t), math.sin(1.9 * t) + math.sin(5.3 * t)
+        rows.append(f"{t},{0.5 * one},{0.5 * two}")
     Path("motion.csv").write_text("\n".join(rows) + "\n")
     for job in (tree / "tests/jobs").rglob("*.toml"):
         Path(job.name).write_text(job.read_text())
-    for name in ("panda_inria", "ur10e"):
-        for estimator in ESTIMATORS[1:]:
-            text = Path(f"{name}.toml").read_text() + f'[estimator]\nname = "{estimator}"\n'
-            Path(f"{name}-{estimator}.toml").write_text(text)
+    for name, estimator in product(("panda_inria", "ur10e"), ESTIMATORS[1:]):
+        text = Path(f"{name}.toml").read_text() + f'[estimator]\nname = "{estimator}"\n'
+        Path(f"{name}-{estimator}.toml").write_text(text)
     log, files = data / "commands/go2/chirp.parquet", distribution("example-robot-data").files
     urdf = next(file.locate() for file in files if file.name == "go2.urdf")
     Path("go2.toml").write_text(
@@ -74,17 +73,16 @@ def prepare(tree, data):
 
 def spoil():
     """Write logs with faults, and one with commands, from the simulated log."""
-    file = Path("simulate/log.csv")
-    if not file.is_file():
+    if not (file := Path("simulate/log.csv")).is_file():  # not among the wanted runs
         return
     names = file.read_text().partition("\n")[0].split(",")
     log, motion = (np.loadtxt(f, delimiter=",", skiprows=1) for f in (file, "motion.csv"))
-    first, second = names.index("tau_joint_1"), names.index("tau_joint_2")
+    one, two = names.index("tau_joint_1"), names.index("tau_joint_2")
     logs = {fault: log.copy() for fault in FAULTS}
-    logs["sign"][:, second] *= -1.0
-    logs["scale"][:, first] *= 1.6
-    logs["delay"][20:, second] = log[:-20, second]
-    logs["swap"][:, [first, second]] = log[:, [second, first]]
+    logs["sign"][:, two] *= -1.0
+    logs["scale"][:, one] *= 1.6
+    logs["delay"][20:, two] = log[:-20, two]
+    logs["swap"][:, [one, two]] = log[:, [two, one]]
     logs["told"] = np.column_stack([log, motion[: len(log), 1:]])
     for fault, rows in logs.items():
         head = ",".join([*names, "qref_joint_1", "qref_joint_2"][: rows.shape[1]])
@@ -98,14 +96,14 @@ def stages(data):
     """Return what is run: by stage, each name of a run and its words; OUT is its folder."""
     panda, ur10e = data / "panda", data / "ur10e"
     urdf, log, result = "arm.urdf", "simulate/log.csv", "small-consistent"
-    loads = ("ident_20200219_14harm.parquet", "ident_20200219_14harm_load.parquet")
-    free, loaded = (ur10e / file for file in loads)
+    free, loaded = (ur10e / f"ident_20200219_14harm{end}.parquet" for end in ("", "_load"))
     gains = tomllib.loads(Path("ur10e.toml").read_text())["torque"]["gains"]
     stated = [word for joint, gain in gains.items() for word in ("--gain", f"{joint}={gain}")]
     robot, noise = ur10e / "robot.urdf", ("--torque-noise", "0.02")
     first = {
         "simulate": ["simulate", urdf, "motion.csv", "--out", "OUT/log.csv", *noise],
         "excite": ["excite", urdf, "--out", "OUT/m.csv", "--duration", "5"],
+        "sweeps": ["excite", urdf, "--out", "OUT/m.csv", "--kind", "sweeps"],
         "go2": ["identify", "go2.toml", "--out", "OUT"],
         "demo": ["demo", "--out", "OUT"],
         "paper": ["paper", "--quick", "--out", "OUT"],
@@ -117,8 +115,6 @@ def stages(data):
         "payload": ["payload", robot, loaded, "--reference", free, "--json", *stated],
         "doctor": ["doctor", robot, free, "--json", *stated],
     }
-    for kind in ("sweeps", "stands"):
-        first[f"excite-{kind}"] = ["excite", urdf, "--out", "OUT/m.csv", "--kind", kind]
     for job in sorted(Path().glob("*.toml")):
         first.setdefault(job.stem, ["identify", job.name, "--out", "OUT"])
     second = {
@@ -137,19 +133,15 @@ def stages(data):
         "report": ["report", result, "--out", "OUT/report.html"],
         "replay": ["replay", urdf, log, result, "--html", "OUT/page.html"],
         "preview-given": ["preview", urdf, "motion.csv", "--given", result, "--json"],
-        "validate-small": ["validate", result, "scale.csv", "--json"],
         "payload-small": ["payload", urdf, "scale.csv", "--reference", result, "--json"],
     }
-    files = {"urdf": "urdf", "mjcf": "xml", "sdf": "sdf", "isaac": "yaml", "ranges": "yaml"}
-    for form, end in files.items():
-        for name in ("ur10e", "go2", result):
-            words = ["export", name, "--format", form, "--out", f"OUT/x.{end}"]
-            third[f"export-{form}-{name}"] = words
+    for form, name in product(FORMATS, ("ur10e", "go2", result)):
+        third[f"{form}-{name}"] = ["export", name, "--format", form, "--out", f"OUT/x.{form}"]
     return first, second, third
 
 
-def run(tree, folder, patterns, jobs):
-    """Write what a tree writes into a folder."""
+def run(tree, folder, only, jobs):
+    """Write into a folder what a tree writes, one folder per run."""
     env = {**os.environ, "PYTHONPATH": str(tree), "OPENBLAS_NUM_THREADS": "1", "COLUMNS": "100"}
     data, begun = Path(os.environ["ROBOTID_DATA"]), time.monotonic()
     folder.mkdir(parents=True)
@@ -159,21 +151,19 @@ def run(tree, folder, patterns, jobs):
     def one(name, words):
         own = folder / name
         own.mkdir()
-        line = [str(word).replace("OUT", name) for word in words]
-        done = subprocess.run(
-            [sys.executable, "-m", "robotid", *line], env=env, capture_output=True, text=True
-        )
+        line = [sys.executable, "-m", "robotid", *(str(w).replace("OUT", name) for w in words)]
+        done = subprocess.run(line, env=env, capture_output=True, text=True)
         is_json = "--json" in words or name == "schema"
         (own / ("printed.json" if is_json else "printed.txt")).write_text(done.stdout)
-        error = "" if done.returncode in (0, 1) else done.stderr[-600:]  # 1: not usable
-        ended = {"code": done.returncode, "error": error}
-        (own / "exit.json").write_text(json.dumps(ended))
+        (own / "exit.json").write_text(json.dumps({"code": done.returncode}))
+        if done.returncode not in (0, 1):  # 1: of a result that is not usable
+            print(f"{tree}: {name} fails: {done.stderr[-600:]}")
 
-    with ThreadPoolExecutor(jobs) as pool:
-        for stage in stages(data):
-            wanted = {n: w for n, w in stage.items() if any(fnmatch(n, p) for p in patterns)}
-            list(pool.map(one, wanted, wanted.values()))
-            spoil()
+    for stage in stages(data):
+        with ThreadPoolExecutor(jobs) as pool:
+            wanted = [name for name in stage if only.fullmatch(name)]
+            list(pool.map(one, wanted, map(stage.get, wanted)))
+        spoil()
     for file in (f for f in folder.glob("*/**/*") if f.suffix in (".json", *TEXTS)):
         file.write_text(file.read_text().replace(str(folder), "").replace(str(tree), ""))
     print(f"{tree}: {time.monotonic() - begun:.0f} s")
@@ -189,10 +179,10 @@ def figures(value, at=""):
         for key, inner in value.items() if isinstance(value, dict) else enumerate(value):
             yield from figures(inner, f"{at}/{key}")
     elif isinstance(value, str) and not at.endswith("version"):
+        numbers = enumerate(NUMBER.findall(SPENT.sub("", value)))
+        yield from ((f"{at}#{i}", float(x)) for i, x in numbers)
         if value.isidentifier():
             yield at, value
-        for i, x in enumerate(NUMBER.findall(SPENT.sub("", value))):
-            yield f"{at}#{i}", float(x)
     elif isinstance(value, int | float):
         yield at, value
 
@@ -205,39 +195,31 @@ def read(file):
     if file.suffix == ".json" and text:
         return dict(figures(json.loads(text)))
     found = dict(figures([json.loads(inner) for inner in DATA.findall(text)]))
-    words = SPENT.sub("", CODE.sub("", text))
-    return found | {str(i): float(x) for i, x in enumerate(NUMBER.findall(words))}
+    return found | dict(figures(CODE.sub("", text)))
 
 
 def difference(x, y):
     if x == y or (x != x and y != y):
         return 0.0
-    return math.inf if str in (type(x), type(y)) else abs(x - y) / max(abs(x), abs(y))
+    gap = math.nan if str in (type(x), type(y)) else abs(x - y) / max(abs(x), abs(y))
+    return gap if gap == gap else math.inf
 
 
-def compare(folders, patterns, tolerance, most):
-    """Print the differences of two folders; return the largest, and the number of gone figures."""
+def compare(folders, only, tolerance, most):
+    """Print the differences of two folders; return the largest, and how many are gone or new."""
     largest, gone, same = 0.0, 0, 0
     files = {f.relative_to(folder) for folder in folders for f in folder.glob("*/**/*")}
-    for file in sorted(f for f in files if f.suffix in (".json", ".parquet", *TEXTS)):
-        if not any(fnmatch(file.parts[0], p) for p in patterns):
-            continue
-        there = [(folder / file).is_file() for folder in folders]
-        if not all(there):
-            print(f"{file}: only in {'BEFORE' if there[0] else 'AFTER'}")
+    for file in sorted(f for f in files if f.suffix in READ and only.fullmatch(f.parts[0])):
+        if missing := [str(folder) for folder in folders if not (folder / file).is_file()]:
+            print(f"{file}: not in", *missing)
             gone += 1
             continue
-        if file.name == "exit.json":
-            ends = [json.loads((folder / file).read_text()) for folder in folders]
-            for side, end in zip(("BEFORE", "AFTER"), ends, strict=True):
-                if end["error"]:
-                    print(f"{file.parent} fails in {side}: {end['error']}")
         old, new = (read(folder / file) for folder in folders)
         changes = {k: difference(old[k], new[k]) for k in old.keys() & new.keys()}
         worst = max(changes.values(), default=0.0)
         odd, added = sorted(old.keys() - new.keys()), len(new.keys() - old.keys())
         other = sorted((k for k in changes if changes[k] > tolerance), key=changes.get)
-        largest, gone, same = max(largest, worst), gone + len(odd), same + len(changes)
+        largest, gone, same = max(largest, worst), gone + len(odd) + added, same + len(changes)
         if other or odd or added:
             print(
                 f"{file}: {len(new)} figures, {added} of them new, "
@@ -245,7 +227,7 @@ def compare(folders, patterns, tolerance, most):
                 *odd[:most],
                 *(f"\n  {k}: {old[k]} -> {new[k]}" for k in other[::-1][:most]),
             )
-    print(f"{same} figures; largest relative difference {largest:.1g}; missing: {gone}")
+    print(f"{same} figures; largest relative difference {largest:.1g}; missing or new: {gone}")
     return largest, gone
 
 
@@ -255,24 +237,23 @@ def main():
     parser.add_argument("after", type=Path, nargs="?", default=HERE)
     parser.add_argument("--keep", type=Path, metavar="FOLDER", help="only keep what BEFORE writes")
     parser.add_argument("--jobs", type=int, default=1, help="runs at a time")
-    parser.add_argument("--only", nargs="+", default=["*"], help="patterns of names of runs")
+    parser.add_argument("--only", nargs="+", default=[".*"], help="runs, and those they read")
     parser.add_argument("--tolerance", type=float, default=1e-12, help="relative")
-    parser.add_argument(
-        "--most", type=int, default=9, help="maximum number of listed differences per file"
-    )
+    parser.add_argument("--most", type=int, default=9, help="listed differences per file")
     options = parser.parse_args()
+    only = re.compile("|".join(options.only))
     trees = [tree.resolve() for tree in (options.before, options.after)]
     if options.keep:
-        run(trees[0], options.keep.resolve(), options.only, options.jobs)
+        run(trees[0], options.keep.resolve(), only, options.jobs)
         return 0
     with tempfile.TemporaryDirectory() as made:
         folders = []
         for name, tree in zip(("before", "after"), trees, strict=True):
-            is_kept = not (tree / "robotid").is_dir()
-            folders.append(tree if is_kept else Path(made).resolve() / name)
-            if not is_kept:
-                run(tree, folders[-1], options.only, options.jobs)
-        largest, gone = compare(folders, options.only, options.tolerance, options.most)
+            folders.append(tree)  # a kept one, unless it has the package
+            if (tree / "robotid").is_dir():
+                folders[-1] = Path(made).resolve() / name
+                run(tree, folders[-1], only, options.jobs)
+        largest, gone = compare(folders, only, options.tolerance, options.most)
     return int(largest > options.tolerance or gone > 0)
 
 
