@@ -136,7 +136,14 @@ def stages(data):
         "payload-small": ["payload", urdf, "scale.csv", "--reference", result, "--json"],
     }
     for form, name in product(FORMATS, ("ur10e", "go2", result)):
-        third[f"{form}-{name}"] = ["export", name, "--format", form, "--out", f"OUT/x.{form}"]
+        third[f"export-{form}-{name}"] = [
+            "export",
+            name,
+            "--format",
+            form,
+            "--out",
+            f"OUT/x.{form}",
+        ]
     return first, second, third
 
 
@@ -206,7 +213,7 @@ def difference(x, y):
 
 
 def compare(folders, only, tolerance, most):
-    """Print the differences of two folders; return the largest, and how many are gone or new."""
+    """Print the differences of two folders; return 1 if there are any, else 0."""
     largest, gone, same = 0.0, 0, 0
     files = {f.relative_to(folder) for folder in folders for f in folder.glob("*/**/*")}
     for file in sorted(f for f in files if f.suffix in READ and only.fullmatch(f.parts[0])):
@@ -228,7 +235,7 @@ def compare(folders, only, tolerance, most):
                 *(f"\n  {k}: {old[k]} -> {new[k]}" for k in other[::-1][:most]),
             )
     print(f"{same} figures; largest relative difference {largest:.1g}; missing or new: {gone}")
-    return largest, gone
+    return int(largest > tolerance or gone > 0)
 
 
 def main():
@@ -253,8 +260,7 @@ def main():
             if (tree / "robotid").is_dir():
                 folders[-1] = Path(made).resolve() / name
                 run(tree, folders[-1], only, options.jobs)
-        largest, gone = compare(folders, only, options.tolerance, options.most)
-    return int(largest > options.tolerance or gone > 0)
+        return compare(folders, only, options.tolerance, options.most)
 
 
 if __name__ == "__main__":
