@@ -136,14 +136,8 @@ def stages(data):
         "payload-small": ["payload", urdf, "scale.csv", "--reference", result, "--json"],
     }
     for form, name in product(FORMATS, ("ur10e", "go2", result)):
-        third[f"export-{form}-{name}"] = [
-            "export",
-            name,
-            "--format",
-            form,
-            "--out",
-            f"OUT/x.{form}",
-        ]
+        words = ["export", name, "--format", form, "--out", f"OUT/x.{form}"]
+        third[f"export-{form}-{name}"] = words
     return first, second, third
 
 
@@ -251,8 +245,7 @@ def main():
     only = re.compile("|".join(options.only))
     trees = [tree.resolve() for tree in (options.before, options.after)]
     if options.keep:
-        run(trees[0], options.keep.resolve(), only, options.jobs)
-        return 0
+        return run(trees[0], options.keep.resolve(), only, options.jobs)
     with tempfile.TemporaryDirectory() as made:
         folders = []
         for name, tree in zip(("before", "after"), trees, strict=True):
