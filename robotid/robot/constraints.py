@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import pinocchio as pin
@@ -16,9 +16,6 @@ from robotid.base.findings import listed
 from robotid.base.settings import is_number, require_each, require_flag, require_kind
 from robotid.base.typing import Array
 from robotid.robot.drive_term import DriveTerm
-
-if TYPE_CHECKING:
-    from robotid.robot.model import RobotModel
 
 
 @dataclass(frozen=True)
@@ -313,19 +310,4 @@ def link_positions(pin_model: pin.Model, configurations: Array, links: Sequence[
     for k, q in enumerate(np.ascontiguousarray(configurations)):
         pin.framesForwardKinematics(pin_model, data, q)
         found[k] = [data.oMf[i].translation for i in ids]
-    return found
-
-
-def root_poses(model: "RobotModel", q: Array, poses: Array, link: str) -> Array:
-    """Return the poses of the root link from those of another link, x y z qx qy qz qw, (N, 7).
-
-    q (N, n) [rad or m], poses (N, 7) [m, -].
-    """
-    pin_model, found = model.pin_model, np.empty_like(poses)
-    data, frame = pin_model.createData(), frame_id(pin_model, link)
-    still = np.hstack([np.tile([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0], (len(q), 1)), q])
-    for k, q_k in enumerate(np.ascontiguousarray(model.configurations(still))):
-        pin.forwardKinematics(pin_model, data, q_k)
-        place = pin.updateFramePlacement(pin_model, data, frame)
-        found[k] = pin.SE3ToXYZQUAT(pin.XYZQUATToSE3(poses[k]) * place.inverse())
     return found

@@ -3,14 +3,16 @@
 from dataclasses import replace
 
 import numpy as np
+import pinocchio as pin
 
 from robotid.base.exceptions import DataError
 from robotid.base.findings import listed
 from robotid.base.text import seconds
+from robotid.base.typing import Array
 from robotid.data.base_motion import BaseMotion
 from robotid.data.log import Log
 from robotid.robot.closure import Chains
-from robotid.robot.constraints import root_poses
+from robotid.robot.constraints import frame_id
 from robotid.robot.model import RobotModel
 
 _OPEN = 0.02  # largest error of a loop at logged positions, relative to the length of the robot
@@ -27,7 +29,7 @@ def closed_log(model: RobotModel, log: Log) -> Log:
         log = _with_passive(model, log)
     if log.base is None or not log.base.link:
         return log
-    pose = root_poses(model, log.q, log.base.pose, log.base.link)
+    pose = _root_poses(model, log.q, log.base.pose, log.base.link)
     if not log.base.has_position:
         pose[:, :3] = 0.0
     note = f"the pose of the base is computed from that of {log.base.link}"
@@ -84,3 +86,18 @@ def _closed(model: RobotModel, log: Log, q: np.ndarray, missing: np.ndarray) -> 
         "or signs of the logged joints, or the frames of the loop",
         code="open_loop",
     )
+
+
+def _root_poses(model: RobotModel, q: Array, poses: Array, link: str) -> Array:
+    """Return the poses of the root link from those of another link, x y z qx qy qz qw, (N, 7).
+
+    q (N, n) [rad or m], poses (N, 7) [m, -].
+    """
+    pin_model, root = model.pin_model, np.empty_like(poses)
+    data, frame = pin_model.createData(), frame_id(pin_model, link)
+    still = np.hstack([np.tile([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0], (len(q), 1)), q])
+    for k, q_k in enumerate(np.ascontiguousarray(model.configurations(still))):
+        pin.forwardKinematics(pin_model, data, q_k)
+        place = pin.updateFramePlacement(pin_model, data, frame)
+        root[k] = pin.SE3ToXYZQUAT(pin.XYZQUATToSE3(poses[k]) * place.inverse())
+    return root
