@@ -253,7 +253,7 @@ def preview(
     model = model if isinstance(model, RobotModel) else RobotModel.from_urdf(model)
     model = with_assumed_inertials(model)
     if given is not None:
-        model, settings = given.model, signals or given.asked.signals
+        model, settings = given.model, signals or given.stated.signals
         logs = [hold_log(model, e.recording.log, e.recording.signals) for e in given.fitted]
         recordings = Recordings(model, given.mapping, logs)
         run = Run.of(recordings, given.standard, given.estimate.details)

@@ -31,6 +31,7 @@ from robotid.diagnosis.urdf.inertials import (
     impossible_inertials,
 )
 from robotid.diagnosis.verdict.fit_findings import fit_findings, log_findings, not_written
+from robotid.diagnosis.verdict.scale_check import check_scale
 from robotid.diagnosis.verdict.unlike_runs import rescaled_findings, unlike_findings
 from robotid.diagnosis.verdict.verdict import blocking, check_ignored, rejected, warnings_of
 from robotid.dynamics.base_parameters import structural_mapping
@@ -43,7 +44,7 @@ from robotid.estimation.fitting.selected_drives import DriveChoice
 from robotid.estimation.fitting.survey import hold_log
 from robotid.estimation.variation.variation import vary
 from robotid.identification.repeated_errors import with_repeated_errors
-from robotid.identification.result import Asked, Identification
+from robotid.identification.result import Identification, StatedSettings
 from robotid.robot.assumed import with_assumed_inertials
 from robotid.robot.families import AUTO, wanted_families
 from robotid.robot.model import RobotModel
@@ -145,8 +146,9 @@ def conclude(
     units = sorted({log.unit for log in recordings.fitted})
     fit = replace(fit, variation=vary(names, fit.runs, units))
     own = {field.name: getattr(fit, field.name) for field in fields(fit)}
-    asked = Asked(recordings.fitted[0].asked, friction, tuple(ignore))
-    result = Identification(**own, misfits=misfits, on_misfit=on_misfit, asked=asked)
+    stated = StatedSettings(recordings.fitted[0].asked, friction, tuple(ignore))
+    result = Identification(**own, misfits=misfits, on_misfit=on_misfit, stated=stated)
+    result = replace(result, scale=check_scale(result))
     # the fit reports the excitation over all samples, see finding "undetermined"; logs follow below
     repeated = ("excitation", "log_assumption")
     before = [f for f in found if f.severity != "note" and f.code not in repeated]
@@ -164,13 +166,12 @@ def conclude(
     findings += not_written(log_errors, "" if fit.is_consistent else fit.estimator.name)
     counted = not_ignored(findings, ignore)
     names = [Path(e.recording.log.path).name for e in fit.validation if not e.is_refitted]
-    concluded = replace(
+    return replace(
         result,
         findings=tuple(findings),
         log_errors=tuple(finding.message for finding in log_errors),
         warnings=warnings_of(counted, model.joints, names, is_robust=is_robust),
     )
-    return concluded.with_scale_of(result)
 
 
 @contextmanager

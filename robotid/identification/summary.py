@@ -1,20 +1,12 @@
-"""Summaries of results: a line, a text, and HTML for a notebook."""
-
-from __future__ import annotations
+"""Summaries of results as lines of text."""
 
 from collections.abc import Mapping, Sequence
-from html import escape
 from statistics import median
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from robotid.base.text import columns
 from robotid.diagnosis.verdict.uses import uses_line
-from robotid.output.pages.html import code, number, percent, table, text
-
-if TYPE_CHECKING:
-    from robotid.estimation.fitting.identified import Identified
-    from robotid.estimation.fitting.metrics import Metrics
-    from robotid.identification.result import Identification
+from robotid.estimation.fitting.identified import Identified
 
 #: Column heads of the errors of other predictions, by name: of torques, then of positions.
 _BESIDE = {
@@ -27,7 +19,6 @@ _BESIDE = {
     "command": "command\n%",
     "steady": "constant\nspeed %",
 }
-_NO_REPORT = "robotid.write_report(found, 'report.html') writes the whole report"
 _SHOWN_SPREADS = ("coulomb", "viscous", "kp", "kd", "delay")
 
 
@@ -37,19 +28,6 @@ def identification_line(found: Identified, estimator: str, status: str) -> str:
         f"<Identification of {found.model.name}: {len(found.base)} base parameters by "
         f"{estimator}, verdict {status}>"
     )
-
-
-def identification_text(found: Identification) -> str:
-    """Return an identification as text: verdict, reasons, errors by joint."""
-    line = identification_line(found, found.estimator.name, found.verdict.status)
-    lines = [line[1:-1], *verdict_lines(found.verdict.to_dict())[1:]]
-    for caption, ours, wls in _tables(found):
-        lines += [caption, *error_lines(ours.to_dict(), wls.to_dict())]
-    lines += friction_lines({drive.joint: drive.to_dict() for drive in found.drives})
-    lines += variation_lines(None if found.variation is None else found.variation.to_dict())
-    if found.report:
-        lines.append(f"report: {found.report}")
-    return "\n".join(lines)
 
 
 def error_lines(
@@ -184,33 +162,3 @@ def joint_reason(joint: str, reasons: Sequence[str]) -> str:
 def cell(value: float | None) -> str:
     """Return a percentage, or a dash."""
     return "-" if value is None else f"{value:.1f}" if value < 1000 else f"{value:.0f}"
-
-
-def identification_html(found: Identification) -> str:
-    """Return an identification as HTML: verdict, reasons, errors by joint, link to the report."""
-    reasons = "".join(f"<li>{escape(reason)}</li>" for reason in found.verdict.reasons)
-    tables = "".join(_errors(caption, metrics) for caption, metrics, _ in _tables(found))
-    report = escape(found.report)
-    link = f'<a href="{report}">{report}</a>' if report else _NO_REPORT
-    return (
-        f"<p><strong>{escape(found.model.name)}</strong>: {len(found.base)} base parameters by "
-        f"{found.estimator.name}; verdict <strong>{found.verdict.status}</strong></p>\n"
-        f"<ul>{reasons}</ul>\n{tables}<p>{link}</p>\n"
-    )
-
-
-def _tables(found: Identification) -> list[tuple[str, Metrics, Metrics]]:
-    """Return the metrics of each validation log and of the fitted logs, and those of WLS."""
-    validation = [
-        (f"{e.recording.name}: not fitted", e.metrics["estimate"], e.metrics["wls"])
-        for e in found.validation
-    ]
-    return [*validation, ("fitted rows", found.metrics(), found.metrics("wls"))]
-
-
-def _errors(caption: str, metrics: Metrics) -> str:
-    rows = []
-    for joint, m in metrics.per_joint.items():
-        error, urdf = percent(m.relative_error_pct), percent(m.baselines["urdf"])
-        rows.append([code(joint), error, number(m.rmse, ".3g"), text(m.unit), urdf])
-    return table(caption, ["joint", "error %", "RMSE", "unit", "URDF %"], rows)

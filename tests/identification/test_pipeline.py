@@ -22,7 +22,7 @@ from robotid.estimation.fitting.survey import hold_log
 from robotid.identification import pipeline
 from robotid.identification import result as result_module
 from robotid.identification.pipeline import conclude
-from robotid.identification.result import Asked, Identification
+from robotid.identification.result import Identification, StatedSettings
 from robotid.robot.drives import Harmonic, LoadFriction
 from robotid.robot.examples import example_urdf
 from robotid.robot.mass_matrix import MassMatrixCheck
@@ -313,7 +313,7 @@ def test_what_is_concluded_counts_all_findings_but_the_ignored_ones(
     assert ("unmounted_part" in {w.code for w in result.warnings}) is (
         "unmounted_part" not in ignore
     )
-    assert result.asked == Asked(SignalSettings(cutoff=3.0), "none", ignore)
+    assert result.stated == StatedSettings(SignalSettings(cutoff=3.0), "none", ignore)
     assert result.on_misfit == ("a.viscous",)
     ((_, asked, wanted, balanced),) = given
     assert (asked, set(wanted.values())) == (choice, {()})

@@ -64,7 +64,7 @@ def test_the_files_are_those_of_the_command_line_and_hold_what_was_found(saved, 
 def test_the_settings_are_a_job_that_finds_the_same_again(saved, found, logs, tmp_path):
     settings = json.loads(saved.read_text())["settings"]
     job = job_from_settings(settings, "result.json", Path())
-    assert job.signals == found.asked.signals
+    assert job.signals == found.stated.signals
     assert job.estimator == found.estimator
     assert job.drives == {"joint_2": ("cubic",)}
     assert job.ignore == ("torque_sign",)

@@ -2,22 +2,17 @@
 
 from dataclasses import replace
 from html.parser import HTMLParser
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from helpers.pages import tables
 from helpers.paths import ROOT
 from helpers.synthetic import exact_log, truth
 
 from robotid.cli.work.identify import run_job
 from robotid.cli.work.job import Job, LogEntry
 from robotid.data.files.read import write_log
-from robotid.estimation.fitting.metrics import JointMetrics, Metrics
 from robotid.identification.pipeline import identify
 from robotid.identification.summary import (
-    _errors,
-    _tables,
     cell,
     error_lines,
     friction_lines,
@@ -175,22 +170,6 @@ def test_friction_is_said_from_the_first_step_to_the_last_that_was_taken():
     assert friction_lines({"b": joints["b"]}) == []
 
 
-def test_its_html_has_verdict_and_tables_and_nothing_that_runs(found):
-    page = Words(found._repr_html_())
-    assert found.verdict.status in page.words
-    for joint in found.model.joints:
-        assert "".join(page.words).count(joint) >= 2
-    assert not {"script", "style", "link", "img"} & {tag for tag, _ in page.tags}
-    assert "writes the whole report" in " ".join(page.words)
-
-
-def test_names_and_the_link_to_the_report_are_escaped(arm, logs):
-    found = identify(arm, logs[:1], validation=[replace(logs[1], path="<i>.csv")])
-    html = replace(found, report='a"b<c>/report.html')._repr_html_()
-    assert "<i>" not in html
-    assert ("a", {"href": 'a"b<c>/report.html'}) in Words(html).tags
-
-
 def test_a_job_s_identification_links_to_its_report(arm, logs, tmp_path):
     write_log(logs[0], tmp_path / "log.csv")
     job = Job(
@@ -198,7 +177,6 @@ def test_a_job_s_identification_links_to_its_report(arm, logs, tmp_path):
     )
     found, _ = run_job(job, tmp_path / "out")
     assert found.report == str(tmp_path / "out" / "report.html")
-    assert f'href="{found.report}"' in found._repr_html_()
     assert f"report: {found.report}" in str(found)
 
 
@@ -208,26 +186,6 @@ def test_an_estimate_lists_every_parameter(found):
         (line,) = [line for line in text.splitlines() if line.split()[0] == name]
         assert float(line.split()[1]) == pytest.approx(value, rel=1e-3)
         assert name in "".join(Words(html).words)
-
-
-def test_each_validation_log_has_errors_of_its_own_and_a_reason_loses_its_joint_only():
-    logs = [
-        SimpleNamespace(
-            recording=SimpleNamespace(name=name),
-            metrics={"estimate": f"{name} ours", "wls": f"{name} wls"},
-        )
-        for name in ("a.csv", "b.csv")
-    ]
-    found = SimpleNamespace(validation=logs, metrics=lambda name="estimate": f"fitted {name}")
-    assert _tables(found) == [
-        ("a.csv: not fitted", "a.csv ours", "a.csv wls"),
-        ("b.csv: not fitted", "b.csv ours", "b.csv wls"),
-        ("fitted rows", "fitted estimate", "fitted wls"),
-    ]
-    assert joint_reason("b", ["a, b: too slow", "b: no"]) == "too slow"
-    assert joint_reason("bb", ["a, b: too slow"]) == "a, b: too slow"
-    assert joint_reason("b", ["the whole: is wrong"]) == "the whole: is wrong"
-    assert joint_reason("b", []) == ""
 
 
 def test_a_reason_of_a_joint_is_shown_once():
@@ -249,9 +207,8 @@ def test_a_reason_of_a_joint_is_shown_once():
     assert verdict_lines(alone) == ["verdict: good", "  - fine", "  every joint: good"]
 
 
-def test_a_notebook_shows_each_joint_s_error_before_that_of_the_urdf():
-    one = JointMetrics(0.125, "N m", 2.5, 0.9, 7, {"urdf": 41.5}, True)
-    other = JointMetrics(3.0, "N", 7.5, 0.9, 7, {"urdf": None}, True)
-    metrics = Metrics({"a": one, "b": other}, 1.0)
-    rows = tables(_errors("log.csv: not fitted", metrics))["log.csv: not fitted"].rows
-    assert rows == [["a", "2.5", "0.125", "N m", "41.5"], ["b", "7.5", "3", "N", "–"]]
+def test_a_reason_loses_the_name_of_its_joint_only():
+    assert joint_reason("b", ["a, b: too slow", "b: no"]) == "too slow"
+    assert joint_reason("bb", ["a, b: too slow"]) == "a, b: too slow"
+    assert joint_reason("b", ["the whole: is wrong"]) == "the whole: is wrong"
+    assert joint_reason("b", []) == ""

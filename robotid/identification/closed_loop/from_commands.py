@@ -24,7 +24,7 @@ from robotid.identification.closed_loop.loop_settings import LoopSettings
 from robotid.identification.closed_loop.position_errors import run_open_loop
 from robotid.identification.closed_loop.runs import loop_runs
 from robotid.identification.closed_loop.stages import STAGES, Fitted, fit_loops, stated_loops
-from robotid.identification.result import Asked
+from robotid.identification.result import StatedSettings
 from robotid.robot.model import RobotModel
 
 
@@ -81,7 +81,7 @@ def identify_loops(
     found = replace(
         found,
         log_errors=tuple(finding.message for finding in errors),
-        asked=Asked(used, ignore=tuple(ignore)),
+        stated=StatedSettings(used, ignore=tuple(ignore)),
         variation=vary(
             [log.name for log in logs],
             loop_runs(model, simulator, fitted.estimate, units),

@@ -23,7 +23,7 @@ from robotid.identification.closed_loop.free_parameters import with_terms
 from robotid.identification.closed_loop.loop_settings import LoopSettings
 from robotid.identification.closed_loop.position_errors import OpenLoop, position_metrics
 from robotid.identification.closed_loop.stages import Fitted
-from robotid.identification.result import Asked
+from robotid.identification.result import StatedSettings
 from robotid.identification.summary import identification_line
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
@@ -51,7 +51,7 @@ class LoopIdentification(Identified):
         findings: Findings of logs and fit.
         log_errors: Errors in the logs that invalidate the result, found by the doctor.
         report: File of the report, if one was written with the result.
-        asked: Signal settings and ignored findings of the request.
+        stated: Signal settings and ignored findings of the request.
         variation: Variation of the parameters of loops and drives between three or more fitted
             logs of commands.
     """
@@ -64,7 +64,7 @@ class LoopIdentification(Identified):
     findings: tuple[Finding, ...] = ()
     log_errors: tuple[str, ...] = ()
     report: str = ""
-    asked: Asked = field(default_factory=Asked)
+    stated: StatedSettings = field(default_factory=StatedSettings)
     variation: Variation | None = None
 
     def __repr__(self) -> str:
