@@ -7,8 +7,7 @@ import numpy as np
 
 from robotid.base.typing import Array
 from robotid.design.clearance import Clearance, Contact
-from robotid.design.design import Designer
-from robotid.design.designed import Design
+from robotid.design.design import Design, Designer
 from robotid.design.limits import LIMITS, MotionLimits
 
 _MOST = 1000  # samples at which distances are computed
@@ -19,19 +18,13 @@ _WITHIN = 0.02  # [m] distances that are computed first; then up to twice as far
 
 @dataclass(frozen=True, eq=False)
 class Course:
-    """A motion at N samples, and its use of each limit.
+    """A motion at N samples, and its use of each limit."""
 
-    Attributes:
-        t: Times, shape (N,) [s].
-        values: Position, velocity, acceleration, jerk, torque and power, shape (6, N, n), SI units.
-        limits: The robot's limits.
-        clearance: The distances to collisions; None: they are not checked.
-    """
-
-    t: Array
+    t: Array  # times, shape (N,) [s]
+    #: Position, velocity, acceleration, jerk, torque and power, shape (6, N, n), SI units.
     values: Array
-    limits: MotionLimits
-    clearance: Clearance | None = None
+    limits: MotionLimits  # the robot's limits
+    clearance: Clearance | None = None  # the distances to collisions; None: they are not checked
 
     @classmethod
     def of_design(cls, designer: Designer, design: Design) -> "Course":

@@ -145,33 +145,47 @@ def conclude(
     names = [Path(e.recording.log.path).name for e in fit.fitted]
     units = sorted({log.unit for log in recordings.fitted})
     fit = replace(fit, variation=vary(names, fit.runs, units))
-    own = {field.name: getattr(fit, field.name) for field in fields(fit)}
-    stated = StatedSettings(recordings.fitted[0].asked, friction, tuple(ignore))
-    result = Identification(**own, misfits=misfits, on_misfit=on_misfit, stated=stated)
+    result = Identification(
+        **{field.name: getattr(fit, field.name) for field in fields(fit)},
+        misfits=misfits,
+        on_misfit=on_misfit,
+        stated=StatedSettings(recordings.fitted[0].asked, friction, tuple(ignore)),
+    )
     result = replace(result, scale=check_scale(result))
-    # the fit reports the excitation over all samples, see finding "undetermined"; logs follow below
-    repeated = ("excitation", "log_assumption")
-    before = [f for f in found if f.severity != "note" and f.code not in repeated]
-    of_fit = fit_findings(fit, misfits, on_misfit, discrepancies)
-    loads = {f.where.rpartition(": ")[0] or f.where for f in found if f.code == "payload_change"}
-    of_fit += [*unlike_findings(fit.variation), *rescaled_findings(fit, loads)]
-    merged = settled(with_known_springs(before, fit, wanted), of_fit)
-    merged = [f for f in merged if not explained_by_assumed(model, f)]
+    of_fit = [
+        *fit_findings(fit, misfits, on_misfit, discrepancies),
+        *unlike_findings(fit.variation),
+        *rescaled_findings(fit, _loaded(found)),
+    ]
+    merged = settled(with_known_springs(_kept(found), fit, wanted), of_fit)
+    merged = [finding for finding in merged if not explained_by_assumed(model, finding)]
     merged = rejected(merged, result.predictions, result.scale_check)
     log_errors = blocking(merged, ignore, is_robust=is_robust)
     heads = [log.head for log in (*recordings.fitted, *recordings.validation)]
-    findings = [*log_findings(heads), *impossible_inertials(model), *merged]
-    if not any(finding in merged for finding in assumed_inertials(model)):  # without the doctor
-        findings = [*assumed_inertials(model), *findings]
+    assumed = assumed_inertials(model)  # which the doctor finds, too, if it has run
+    assumed = [] if any(finding in merged for finding in assumed) else assumed
+    findings = [*assumed, *log_findings(heads), *impossible_inertials(model), *merged]
     findings += not_written(log_errors, "" if fit.is_consistent else fit.estimator.name)
-    counted = not_ignored(findings, ignore)
     names = [Path(e.recording.log.path).name for e in fit.validation if not e.is_refitted]
+    counted = not_ignored(findings, ignore)
     return replace(
         result,
         findings=tuple(findings),
         log_errors=tuple(finding.message for finding in log_errors),
         warnings=warnings_of(counted, model.joints, names, is_robust=is_robust),
     )
+
+
+def _kept(found: Sequence[Finding]) -> list[Finding]:
+    """Return the doctor's findings but notes and what the fit says of the excitation and logs."""
+    replaced = ("excitation", "log_assumption")
+    return [f for f in found if f.severity != "note" and f.code not in replaced]
+
+
+def _loaded(found: Sequence[Finding]) -> set[str]:
+    """Return the logs of which the doctor found another payload."""
+    changes = (f.where for f in found if f.code == "payload_change")
+    return {where.rpartition(": ")[0] or where for where in changes}
 
 
 @contextmanager
@@ -203,9 +217,9 @@ def with_drives(
         return replace(solved.with_errors(), drives=drives)
 
     def changed() -> Recordings:
-        own = replace(recordings, levels=solved.ground.rough.sigma)
-        own = _with_own(own, solved.solution, drives)
-        return own if recordings.repeated is None else with_repeated_errors(own)  # of its terms
+        levelled = replace(recordings, levels=solved.ground.rough.sigma)
+        extended = _with_terms(levelled, solved.solution, drives)
+        return extended if recordings.repeated is None else with_repeated_errors(extended)
 
     most = _MOST_SHAPES if any(drive.shapes for drive in drives) else 0
     for done in range(most):
@@ -219,13 +233,12 @@ def with_drives(
     return replace(fit_recordings(changed(), choice), drives=drives)
 
 
-def _with_own(recordings: Recordings, fit: Solution, drives: Sequence[DriveChoice]) -> Recordings:
+def _with_terms(recordings: Recordings, fit: Solution, drives: Sequence[DriveChoice]) -> Recordings:
     """Return recordings of the robot with the selected drive terms, under the load of a fit."""
-    plain, own = recordings.model, {drive.joint: drive.terms for drive in drives}
-    model = plain.with_terms(
-        {d.name: (*plain.layout.own.get(d.name, ()), *own.get(d.name, ()))
-         for d in plain.layout.drives}
-    )  # fmt: skip
+    layout, selected = recordings.model.layout, {drive.joint: drive.terms for drive in drives}
+    model = recordings.model.with_terms(
+        {d.name: (*layout.own.get(d.name, ()), *selected.get(d.name, ())) for d in layout.drives}
+    )
     fitted = dict(zip(fit.mapping.names, fit.standard, strict=True))
     start = np.array([fitted.get(name, 0.0) for name in model.layout.names])
     return recordings.with_model(model.with_reference(start))

@@ -1,5 +1,6 @@
 """An identification: a fit with findings and a verdict."""
 
+from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -15,12 +16,14 @@ from robotid.diagnosis.verdict.parameter_table import parameter_entries, paramet
 from robotid.diagnosis.verdict.payload_check import PayloadCheck
 from robotid.diagnosis.verdict.scale_check import ScaleCheck, check_scale
 from robotid.diagnosis.verdict.verdict import Verdict, VerdictWarning, judge
+from robotid.estimation.fitting.estimator_settings import EstimatorSettings
 from robotid.estimation.fitting.evaluation import hidden_joints
 from robotid.estimation.fitting.fitted import Fit
+from robotid.estimation.fitting.identified import Identified
+from robotid.estimation.variation.variation import Variation
 from robotid.identification.summary import (
     error_lines,
     friction_lines,
-    identification_line,
     variation_lines,
     verdict_lines,
 )
@@ -29,23 +32,44 @@ from robotid.robot.families import AUTO
 
 @dataclass(frozen=True)
 class StatedSettings:
-    """Settings of an identification other than robot, logs and estimator.
+    """Settings of an identification other than robot, logs and estimator."""
 
-    Attributes:
-        signals: How logs become trajectories.
-        friction: As of ``identify``.
-        ignore: As of ``identify``.
-        job: The job that was run; None if there was none.
-    """
-
-    signals: SignalSettings = field(default_factory=SignalSettings)
-    friction: str | Mapping[str, str] = AUTO
-    ignore: tuple[str, ...] = ()
-    job: Settings | None = None
+    signals: SignalSettings = field(default_factory=SignalSettings)  # how logs become trajectories
+    friction: str | Mapping[str, str] = AUTO  # as of ``identify``
+    ignore: tuple[str, ...] = ()  # as of ``identify``
+    job: Settings | None = None  # the job that was run; None if there was none
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class Identification(Fit):
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
+class Concluded(Identified):
+    """Identified parameters with findings and a verdict, from torques or from positions."""
+
+    estimator: EstimatorSettings
+    findings: tuple[Finding, ...] = ()  # about the robot, the logs and the fit
+    log_errors: tuple[str, ...] = ()  # faults of the recordings that make the result wrong
+    report: str = ""  # file of the report, if one was written with the result
+    stated: StatedSettings = field(default_factory=StatedSettings)
+    variation: Variation | None = None  # of the drives' parameters between the fitted logs
+
+    def __repr__(self) -> str:
+        return (
+            f"<Identification of {self.model.name}: {len(self.base)} base parameters by "
+            f"{self.estimator.name}, verdict {self.verdict.status}>"
+        )
+
+    @property
+    def has_urdf(self) -> bool:
+        """Whether a URDF may be written: no fault of the logs makes it wrong."""
+        return not self.log_errors
+
+    @cached_property
+    @abstractmethod
+    def verdict(self) -> Verdict:
+        """The verdict on the result, with reasons."""
+
+
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
+class Identification(Concluded, Fit):
     """Complete result of an identification.
 
     Attributes:
@@ -61,23 +85,15 @@ class Identification(Fit):
             narrowest interval first.
     """
 
-    findings: tuple[Finding, ...] = ()
-    log_errors: tuple[str, ...] = ()
     warnings: tuple[VerdictWarning, ...] = ()
-    report: str = ""
     misfits: tuple[Misfit, ...] = ()
     on_misfit: tuple[str, ...] = ()
-    stated: StatedSettings = field(default_factory=StatedSettings)
     scale: ScaleCheck | None = None
     payload_checks: tuple[PayloadCheck, ...] = ()
 
-    def __repr__(self) -> str:
-        return identification_line(self, self.estimator.name, self.verdict.status)
-
     def summary(self) -> str:
         """Return verdict, reasons and errors by joint as text."""
-        line = identification_line(self, self.estimator.name, self.verdict.status)
-        lines = [line[1:-1], *verdict_lines(self.verdict.to_dict())[1:]]
+        lines = [repr(self)[1:-1], *verdict_lines(self.verdict.to_dict())[1:]]
         compared = [
             (f"{e.recording.name}: not fitted", e.metrics["estimate"], e.metrics["wls"])
             for e in self.validation

@@ -6,7 +6,6 @@ from typing import Any
 
 from robotid.base.text import columns
 from robotid.diagnosis.verdict.uses import uses_line
-from robotid.estimation.fitting.identified import Identified
 
 #: Column heads of the errors of other predictions, by name: of torques, then of positions.
 _BESIDE = {
@@ -20,14 +19,6 @@ _BESIDE = {
     "steady": "constant\nspeed %",
 }
 _SHOWN_SPREADS = ("coulomb", "viscous", "kp", "kd", "delay")
-
-
-def identification_line(found: Identified, estimator: str, status: str) -> str:
-    """Return an identification in one line."""
-    return (
-        f"<Identification of {found.model.name}: {len(found.base)} base parameters by "
-        f"{estimator}, verdict {status}>"
-    )
 
 
 def error_lines(

@@ -5,7 +5,7 @@ from helpers.paths import URDF
 from helpers.robots import ROBOTS, mimicking
 
 from robotid.base.exceptions import DataError, SettingsError
-from robotid.design.along import MotionRegressor, Placements, fixed_tree
+from robotid.design.information import MotionRegressor, Placements, fixed_tree
 from robotid.dynamics import compiled
 from robotid.dynamics.torque import joint_torque_regressor
 from robotid.robot.examples import example_urdf

@@ -8,13 +8,12 @@ import pytest
 from robotid.base.exceptions import NotConvergedError, SettingsError
 from robotid.design.basis import BSplineBasis, FourierBasis
 from robotid.design.clearance import Box, Clearance, Contact
-from robotid.design.design import Designer, State
+from robotid.design.design import SOFT, Designer, Multipliers, State
 from robotid.design.limits import LIMITS, MotionLimits
-from robotid.design.multipliers import SOFT, Multipliers
+from robotid.design.previews import TorqueNoise
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.simulation.motions import ProgramMotion
 from robotid.dynamics.torque import joint_torque_regressor
-from robotid.identification.assumptions import TorqueNoise
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 from robotid.robot.prior import prior_spread

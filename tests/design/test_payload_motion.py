@@ -6,10 +6,9 @@ import pytest
 
 from robotid.base.exceptions import NotConvergedError, SettingsError
 from robotid.design.basis import FourierBasis
-from robotid.design.design import Designer
+from robotid.design.design import Designer, Multipliers
 from robotid.design.information import Aim
 from robotid.design.limits import MotionLimits
-from robotid.design.multipliers import Multipliers
 from robotid.design.payload_motion import _check_bare, design_payload
 from robotid.dynamics.simulation.simulation_settings import Payload
 from robotid.dynamics.torque import joint_torque_regressor

@@ -23,8 +23,15 @@ from robotid.estimation.estimators.segments import quantile
 from robotid.estimation.fitting.recorded import Recordings
 from robotid.estimation.fitting.survey import hold_log
 from robotid.identification import payload_fit
-from robotid.identification.payload_estimate import Gain, Payload, PayloadFit, payload_of
-from robotid.identification.payload_fit import _check_gains, _gains, identify_payload
+from robotid.identification.payload_fit import (
+    Gain,
+    Payload,
+    PayloadFit,
+    _check_gains,
+    _gains,
+    identify_payload,
+    payload_of,
+)
 from robotid.robot.drives import FAMILIES
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel

@@ -19,10 +19,15 @@ from robotid.design import previews
 from robotid.design.previews import (
     Preview,
     Run,
+    TorqueNoise,
     _band,
     _Information,
     _largest,
     _white_step,
+    assumed_noise,
+    assumed_parameters,
+    largest_gravity,
+    largest_torques,
     preview,
 )
 from robotid.dynamics.base_parameters import structural_mapping
@@ -35,13 +40,6 @@ from robotid.estimation.estimators.segments import scatter
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
 from robotid.estimation.fitting.recorded import Recordings
 from robotid.estimation.fitting.survey import hold_log
-from robotid.identification.assumptions import (
-    TorqueNoise,
-    assumed_noise,
-    assumed_parameters,
-    largest_gravity,
-    largest_torques,
-)
 from robotid.output.files.entries import build_preview
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel

@@ -16,8 +16,7 @@ from robotid.data.log import Log
 from robotid.design.basis import Basis, BSplineBasis, FourierBasis
 from robotid.design.clearance import Clearance
 from robotid.design.course import Course
-from robotid.design.design import Designer
-from robotid.design.designed import Design
+from robotid.design.design import Design, Designer
 from robotid.design.excitation_settings import ROUTES, MotionSettings
 from robotid.design.limits import LIMITS, MotionLimits
 from robotid.design.motion_files import check_motion_file, write_motion

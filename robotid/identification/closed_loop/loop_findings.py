@@ -8,8 +8,8 @@ import numpy as np
 
 from robotid.base.findings import Finding, by_severity, listed, quoted
 from robotid.identification.closed_loop.encoder_zeros import CLEAR, parallel_axes
+from robotid.identification.closed_loop.further_parameters import Tried
 from robotid.identification.closed_loop.loop_result import STATED_SCALE, LoopIdentification
-from robotid.identification.closed_loop.term_choice import Tried
 
 _SOFT = 0.5  # share of the residual that remains after a step; a larger one shows a soft loop
 _MISMATCH = 0.5  # largest relative error of a torque that the loop of its joint gives

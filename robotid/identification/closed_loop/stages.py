@@ -28,18 +28,19 @@ from robotid.dynamics.simulation.simulation_settings import by_joint
 from robotid.estimation.estimators.estimator import Estimate
 from robotid.estimation.estimators.output_error import OutputError
 from robotid.estimation.fitting.estimator_settings import SimulationSettings
-from robotid.identification.closed_loop.drive_torques import find_gains, measured_motion
-from robotid.identification.closed_loop.driven import identified_rows, torque_rows
 from robotid.identification.closed_loop.encoder_zeros import Encoders, find_encoders, same_encoders
-from robotid.identification.closed_loop.free_parameters import (
-    FreeParameter,
-    LoopSimulator,
-    free_body_parameters,
-    with_terms,
+from robotid.identification.closed_loop.further_parameters import (
+    GainScale,
+    Tried,
+    candidates,
+    choose,
+    gain_scale,
+    impossible,
 )
-from robotid.identification.closed_loop.gain_check import GainScale, gain_scale
 from robotid.identification.closed_loop.initial_values import (
+    SecondOrder,
     first_loops,
+    fit_second_order,
     free_drive_parameters,
     free_zeros,
     is_stated,
@@ -48,9 +49,17 @@ from robotid.identification.closed_loop.initial_values import (
     typical_sizes_of_torques,
 )
 from robotid.identification.closed_loop.loop_settings import LoopSettings, groups_of
+from robotid.identification.closed_loop.loop_simulator import (
+    FreeParameter,
+    LoopSimulator,
+    TorqueRows,
+    find_gains,
+    free_body_parameters,
+    measured_motion,
+    with_terms,
+)
 from robotid.identification.closed_loop.position_errors import DRIFTS
-from robotid.identification.closed_loop.second_order import SecondOrder, fit_second_order
-from robotid.identification.closed_loop.term_choice import Tried, candidates, choose, impossible
+from robotid.identification.pipeline import identify
 from robotid.identification.result import Identification
 from robotid.robot.model import RobotModel
 
@@ -78,24 +87,17 @@ _PASSES = 2  # of choosing terms and fitting again
 
 @dataclass(frozen=True, eq=False)
 class Fitted:
-    """Result of the fit.
+    """Result of the fit."""
 
-    Attributes:
-        simulator: The robot with its free parameters, and the windows.
-        estimate: The estimate of the free parameters.
-        plain: The second-order model of each joint; None where the logged torque drives the robot.
-        encoders: Zeros and signs of the encoders relative to the URDF's joints.
-        tried: The friction terms that were tried, with their gains.
-        linear: The identification from the torque rows alone, where the torque drives the robot.
-        scale: Scale of the stated gains by bodies and torques; None where gains are fitted.
-    """
-
-    simulator: LoopSimulator
-    estimate: Estimate
+    simulator: LoopSimulator  # the robot with its free parameters, and the windows
+    estimate: Estimate  # the estimate of the free parameters
+    #: The second-order model of each joint; None where the logged torque drives the robot.
     plain: SecondOrder | None
-    encoders: Encoders
-    tried: tuple[Tried, ...]
+    encoders: Encoders  # zeros and signs of the encoders relative to the URDF's joints
+    tried: tuple[Tried, ...]  # the friction terms that were tried, with their gains
+    #: The identification from the torque rows alone, where the torque drives the robot.
     linear: Identification | None = None
+    #: Scale of the stated gains by bodies and torques; None where gains are fitted.
     scale: GainScale | None = None
 
     @property
@@ -623,3 +625,19 @@ def _with(
     base = replace(loops, terms=tuple(map(tuple, terms)), values=np.array(values))
     wide = replace(simulator, base=base, free_parameters=(*simulator.free_parameters, *further))
     return wide, np.concatenate([theta, np.zeros(len(further))])
+
+
+def identified_rows(
+    model: RobotModel, logs: Sequence[Log], signals: SignalSettings | None
+) -> Identification:
+    """Return the identification from the torques of logs alone, with the model's friction terms."""
+    return identify(model, logs, signals=signals, friction="none", doctor=False)
+
+
+def torque_rows(found: Identification, inflation: float = 1.0) -> TorqueRows:
+    """Return an identification's rows reduced to a triangular factor.
+
+    The weights include the variance inflation by correlated rows, from the scatter of segments.
+    """
+    weight = found.wls.sigma * np.sqrt(inflation * max(found.errors.inflation, 1.0))
+    return TorqueRows(found.model, found.factors.weighted(weight), found.mapping.K)

@@ -11,11 +11,10 @@ from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
 from robotid.dynamics.simulation.loops import ClosedLoopRobot, cut_windows, open_loops
 from robotid.estimation.fitting.estimator_settings import SimulationSettings
-from robotid.identification.closed_loop.driven import driven_log, torque_rows
-from robotid.identification.closed_loop.from_commands import identify_loops
+from robotid.identification.closed_loop.from_commands import driven_log, identify_loops
 from robotid.identification.closed_loop.loop_settings import LoopSettings
 from robotid.identification.closed_loop.position_errors import DRIFTS, run_open_loop
-from robotid.identification.closed_loop.stages import _initialise_from_torque
+from robotid.identification.closed_loop.stages import _initialise_from_torque, torque_rows
 from robotid.robot.model import RobotModel
 
 SIGNALS = SignalSettings(cutoff=30.0)

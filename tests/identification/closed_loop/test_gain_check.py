@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from helpers.crane import identified_crane
 
-from robotid.identification.closed_loop.gain_check import GainScale, _last, gain_scale
+from robotid.identification.closed_loop.further_parameters import GainScale, _last, gain_scale
 
 
 @pytest.mark.parametrize(

@@ -16,13 +16,12 @@ from robotid.estimation.estimators.output_error import OutputError
 from robotid.estimation.fitting.estimator_settings import SimulationSettings
 from robotid.identification.closed_loop import from_commands as identify
 from robotid.identification.closed_loop.from_commands import identify_loops, with_gravity
-from robotid.identification.closed_loop.gain_check import gain_scale
+from robotid.identification.closed_loop.further_parameters import _Fold, _gains, gain_scale
+from robotid.identification.closed_loop.initial_values import SecondOrder
 from robotid.identification.closed_loop.loop_findings import loop_findings
 from robotid.identification.closed_loop.loop_settings import LoopSettings
 from robotid.identification.closed_loop.position_errors import position_metrics, run_open_loop
-from robotid.identification.closed_loop.second_order import SecondOrder
 from robotid.identification.closed_loop.stages import fit_loops, stated_loops
-from robotid.identification.closed_loop.term_choice import _Fold, _gains
 from robotid.output.files.entries import build_result
 from robotid.output.report.document import write_report
 from robotid.robot.drives import Coulomb, Offset, PositionCoulomb, Presliding, Viscous

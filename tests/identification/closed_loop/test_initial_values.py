@@ -12,10 +12,13 @@ from robotid.data.log import Log
 from robotid.dynamics.prediction import predict_instants
 from robotid.dynamics.simulation.loops import ClosedLoopRobot, cut_windows
 from robotid.estimation.fitting.estimator_settings import SimulationSettings
-from robotid.identification.closed_loop import second_order
+from robotid.identification.closed_loop import initial_values as second_order
 from robotid.identification.closed_loop import stages as fit
 from robotid.identification.closed_loop.encoder_zeros import _Motion, same_encoders
 from robotid.identification.closed_loop.initial_values import (
+    _FREQUENCIES,
+    SecondOrder,
+    _better,
     first_loops,
     free_drive_parameters,
     free_zeros,
@@ -25,7 +28,6 @@ from robotid.identification.closed_loop.initial_values import (
     typical_sizes_of_torques,
 )
 from robotid.identification.closed_loop.loop_settings import LoopSettings
-from robotid.identification.closed_loop.second_order import _FREQUENCIES, SecondOrder, _better
 from robotid.identification.closed_loop.stages import stated_loops
 from robotid.robot.model import RobotModel
 

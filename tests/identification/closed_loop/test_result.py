@@ -15,13 +15,15 @@ from robotid.estimation.fitting.bands import QUANTILE
 from robotid.identification.closed_loop import loop_findings as findings
 from robotid.identification.closed_loop import loop_result as result
 from robotid.identification.closed_loop.encoder_zeros import Encoders
-from robotid.identification.closed_loop.gain_check import GainScale
+from robotid.identification.closed_loop.further_parameters import GainScale, Tried
 from robotid.identification.closed_loop.initial_values import _speed
 from robotid.identification.closed_loop.loop_findings import loop_findings
-from robotid.identification.closed_loop.loop_result import LoopIdentification, logged_motion
+from robotid.identification.closed_loop.loop_result import (
+    LoopIdentification,
+    logged_motion,
+    units_of,
+)
 from robotid.identification.closed_loop.loop_settings import LoopSettings
-from robotid.identification.closed_loop.runs import units_of
-from robotid.identification.closed_loop.term_choice import Tried
 
 #: Names of the unknowns, in the order of the fit.
 NAMES = ("rail.armature", "turn.armature", "robot.delay", "rail.viscous", "turn.viscous")

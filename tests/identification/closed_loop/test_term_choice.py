@@ -7,8 +7,8 @@ import pytest
 from helpers.crane import identified_crane
 
 from robotid.estimation.estimators.output_error import OutputError, linearised
-from robotid.identification.closed_loop import term_choice
-from robotid.identification.closed_loop.term_choice import _Fold, _folds, _gains, candidates
+from robotid.identification.closed_loop import further_parameters as term_choice
+from robotid.identification.closed_loop.further_parameters import _Fold, _folds, _gains, candidates
 from robotid.robot.drives import LoadFriction
 
 

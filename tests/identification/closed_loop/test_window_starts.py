@@ -5,7 +5,7 @@ from helpers.mujoco_plant import multisine, plant
 
 from robotid.data.log import Log
 from robotid.dynamics.simulation.loops import ClosedLoopRobot, RollOut, Window, cut_windows
-from robotid.identification.closed_loop.free_parameters import (
+from robotid.identification.closed_loop.loop_simulator import (
     FreeParameter,
     LoopSimulator,
     _better_start,

@@ -13,10 +13,10 @@ from robotid.identification.closed_loop.encoder_zeros import (
     find_encoders,
     parallel_axes,
 )
-from robotid.identification.closed_loop.free_parameters import LoopSimulator, free_body_parameters
 from robotid.identification.closed_loop.from_commands import identify_loops
 from robotid.identification.closed_loop.loop_findings import _undetermined_encoders
 from robotid.identification.closed_loop.loop_settings import LoopSettings
+from robotid.identification.closed_loop.loop_simulator import LoopSimulator, free_body_parameters
 from robotid.identification.closed_loop.stages import stated_loops
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel

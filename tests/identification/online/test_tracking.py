@@ -12,8 +12,8 @@ from robotid.cli import track as command
 from robotid.cli.work.job import read_job
 from robotid.data.files import parquet_files
 from robotid.data.files.read import write_log
+from robotid.identification.online.identifier import track
 from robotid.identification.online.online_settings import OnlineSettings
-from robotid.identification.online.tracking import track
 
 ARM = [f"panda_joint{i}" for i in range(1, 8)]
 
