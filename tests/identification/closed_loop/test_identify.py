@@ -14,7 +14,6 @@ from robotid.diagnosis.verdict.position_verdict import judge_positions
 from robotid.dynamics.simulation.loops import ClosedLoopRobot, cut_windows
 from robotid.estimation.estimators.output_error import OutputError
 from robotid.estimation.fitting.estimator_settings import SimulationSettings
-from robotid.identification.closed_loop import from_commands as identify
 from robotid.identification.closed_loop.from_commands import identify_loops, with_gravity
 from robotid.identification.closed_loop.further_parameters import _Fold, _gains, gain_scale
 from robotid.identification.closed_loop.initial_values import SecondOrder
@@ -233,17 +232,6 @@ def test_friction_of_joints_that_no_log_moves_is_reported(leg, found):
     found = replace(found, fit=replace(found.fit, simulator=simulator))
     [where] = undetermined([[False, True, True], [False, True, True]])
     assert where == f"{hip}.coulomb, {hip}.offset"
-
-
-def test_robots_of_logs_are_those_of_their_variation(leg, found, monkeypatch):
-    given, log = [], leg[1]
-    monkeypatch.setattr(identify, "fit_loops", lambda *_, **__: found.fit)
-    monkeypatch.setattr(identify, "run_open_loop", lambda *_: found.fitted[0])
-    monkeypatch.setattr(identify, "loop_runs", lambda *args: given.append(args[3]) or ())
-    monkeypatch.setattr(identify, "vary", lambda names, _, units: given.append((names, units)))
-    logs = [replace(log, path=f"{k}.csv") for k in range(3)]
-    identify_loops(leg[0].model, logs, [], stated(leg[0]), SETTINGS, units=["go", "arm", "go"])
-    assert given == [["go", "arm", "go"], (["0.csv", "1.csv", "2.csv"], ["arm", "go"])]
 
 
 def test_a_second_order_model_has_the_standard_error_of_each_inertia(found):

@@ -46,21 +46,6 @@ def test_starts_that_fit_are_nearer_to_the_truth_than_those_measured(rng):
     ]
 
 
-def test_shorter_corrections_are_tried_only_where_the_whole_one_is_not_better(rng, monkeypatch):
-    measured, _ = simulator(rng)
-    tried, roll_out = [], ClosedLoopRobot.roll_out
-
-    def counted(self, loops, windows, columns=(), *args, **options):
-        tried.append((len(windows), len(columns)))
-        return roll_out(self, loops, windows, columns, *args, **options)
-
-    monkeypatch.setattr(ClosedLoopRobot, "roll_out", counted)
-    measured.with_better_start(measured.prior)
-    n = len(measured.windows)
-    assert tried[:3] == [(n, 4), (n, 0), (n, 0)], "sensitivities, at rest, the whole correction"
-    assert all(size < n for size, columns in tried[3:5] if not columns)
-
-
 def test_a_corrected_start_is_regularised_by_position_errors_and_the_typical_speed(rng):
     """Two parts of one and two joints; sensitivities are of positions, then of speeds."""
     t, n, sigma = 5.0 + 0.02 * np.arange(40), 3, np.array([0.01, 0.03, 0.002])
