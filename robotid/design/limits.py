@@ -115,12 +115,12 @@ class Postures:
     def resting(self, rng: np.random.Generator, tried: int = _TRIED) -> Array:
         """Return the random postures that satisfy limits and distances at rest, shape (k, n)."""
         q = self._drawn(rng, tried)
-        found: Array = q[self.can_rest(q)]
-        if not len(found):
-            found = self._repaired(q[:_AT_ONCE], rng)
-        if not len(found):
+        possible: Array = q[self.can_rest(q)]
+        if not len(possible):
+            possible = self._repaired(q[:_AT_ONCE], rng)
+        if not len(possible):
             raise SettingsError(self._why_not(*self._at_rest(q)))
-        return found
+        return possible
 
     def _repaired(self, q: Array, rng: np.random.Generator) -> Array:
         """Return the postures that satisfy all limits after joints with violations are redrawn."""
@@ -136,30 +136,30 @@ class Postures:
             now = self._broken_by_joint(other)
             is_better = now.sum(axis=1) <= total
             q[is_better], broken[is_better] = other[is_better], now[is_better]
-        found: Array = q[self.can_rest(q)]
-        return found
+        possible: Array = q[self.can_rest(q)]
+        return possible
 
     def _broken_by_joint(self, q: Array) -> Array:
         """Return each joint's share in the violations of postures, shape (N, n)."""
         used, margins = self._at_rest(q)
-        found = np.maximum(used - 1.0, 0.0).sum(axis=0) @ self.information.chains
+        violation = np.maximum(used - 1.0, 0.0).sum(axis=0) @ self.information.chains
         if self.clearance is not None:
             movers = self.clearance.movers
             movers = movers / np.maximum(movers.sum(axis=1, keepdims=True), 1)
-            found += np.maximum(-margins.T, 0.0) / SOFT @ movers
-        by_joint: Array = found
+            violation += np.maximum(-margins.T, 0.0) / SOFT @ movers
+        by_joint: Array = violation
         return by_joint
 
     def one(self, rng: np.random.Generator) -> Array:
         """Return the first of ``resting``, which are tried a few at a time, shape (n,)."""
         for _ in range(_TRIED // _AT_ONCE):
             q = self._drawn(rng, _AT_ONCE)
-            found: Array = q[self.can_rest(q)]
-            if len(found):
+            possible: Array = q[self.can_rest(q)]
+            if len(possible):
                 break
         else:
-            found = self.resting(rng)
-        first: Array = found[0]
+            possible = self.resting(rng)
+        first: Array = possible[0]
         return first
 
     def _drawn(self, rng: np.random.Generator, count: int) -> Array:

@@ -26,13 +26,12 @@ from robotid.base.exceptions import DataError, SettingsError
 from robotid.base.findings import listed
 from robotid.base.settings import SIZE, is_number, require_kind
 from robotid.base.typing import Array
-from robotid.data.files.read import Readable, read_logs
+from robotid.data.files.read import Readable
 from robotid.data.log import Log, suggestion
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.smoothing import low_pass
 from robotid.diagnosis.logs.motion_checks import excitation_finding
 from robotid.dynamics.base_parameters import BaseMapping, structural_mapping
-from robotid.dynamics.constraint_rows import logged_base
 from robotid.dynamics.factors import Factors, compress, join, merge
 from robotid.dynamics.prediction import predict, predict_instants
 from robotid.dynamics.used_rows import base_problem, independent_share
@@ -47,6 +46,7 @@ from robotid.estimation.fitting.evaluation import evaluate_logs
 from robotid.estimation.fitting.recorded import Recordings
 from robotid.estimation.fitting.standard_errors import StandardErrors, about_prior, standard_of
 from robotid.estimation.fitting.survey import SurveyedLog, hold_log
+from robotid.identification.pipeline import logs_of
 from robotid.identification.result import Identification
 from robotid.robot.assumed import with_assumed_inertials
 from robotid.robot.closure import refuse_loops
@@ -97,7 +97,7 @@ def assumed_noise(
     size: Array,
     stated: Mapping[str, float],
     correlation: float | None = None,
-    found: TorqueNoise | None = None,
+    earlier: TorqueNoise | None = None,
 ) -> TorqueNoise:
     """Return the noise of each joint: stated, or of an earlier run, or assumed.
 
@@ -117,12 +117,12 @@ def assumed_noise(
         raise SettingsError(f"correlation is {correlation:g} s, wanted 0 (white noise) or more")
     is_stated = np.isin(model.joints, list(stated))
     values = np.array([stated.get(joint, np.nan) for joint in model.joints])
-    std = _NOISE * size if found is None else found.std
-    time = np.full(len(size), CORRELATION) if found is None else found.correlation
+    std = _NOISE * size if earlier is None else earlier.std
+    time = np.full(len(size), CORRELATION) if earlier is None else earlier.correlation
     if correlation is not None:
-        time = np.where(is_stated | (found is None), correlation, time)
-    other = "assumed" if found is None else "found"
-    origins = tuple("stated" if own else other for own in is_stated)
+        time = np.where(is_stated | (earlier is None), correlation, time)
+    other = "assumed" if earlier is None else "found"
+    origins = tuple("stated" if is_known else other for is_known in is_stated)
     return TorqueNoise(np.where(is_stated, values, std), time, origins)
 
 
@@ -250,10 +250,10 @@ class Preview:
     between: tuple[Array | None, ...] = ()
 
     def __repr__(self) -> str:
-        determined, found = self.expected.determination, self.expected
+        determined, expected = self.expected.determination, self.expected
         return (
-            f"<Preview of {found.model.name}: {determined.rank} of {len(determined.names)} base "
-            f"parameters determined by {len(found.fitted)} motions>"
+            f"<Preview of {expected.model.name}: {determined.rank} of {len(determined.names)} base "
+            f"parameters determined by {len(expected.fitted)} motions>"
         )
 
     @property
@@ -283,16 +283,16 @@ class Preview:
     @property
     def bands(self) -> tuple[TorqueBand, ...]:
         """Expected band of each motion's predicted torques."""
-        found = self.expected
-        between = self.between or (None,) * len(found.fitted)
-        return tuple(map(expected_band, repeat(found), found.fitted, between))
+        expected = self.expected
+        between = self.between or (None,) * len(expected.fitted)
+        return tuple(map(expected_band, repeat(expected), expected.fitted, between))
 
     @property
     def words(self) -> str:
         """What the motions determine, and what they do not determine, as text."""
-        found = self.expected
-        names = listed(dict.fromkeys(e.recording.log.name for e in found.fitted))
-        return excitation_finding(found.wls, found.determination, names).message
+        expected = self.expected
+        names = listed(dict.fromkeys(e.recording.log.name for e in expected.fitted))
+        return excitation_finding(expected.wls, expected.determination, names).message
 
 
 def preview(
@@ -340,13 +340,10 @@ def preview(
         logs = [hold_log(model, e.recording.log, e.recording.signals) for e in given.fitted]
         recordings = Recordings(model, given.mapping, logs)
         run = Run.of(recordings, given.standard, given.estimate.details)
-    read = read_logs(
-        motions, model.joints, prismatic=model.layout.prismatic, needs="motion",
-        base=logged_base(model), passive=model.passive, robot=model.tree.movable,
-    )  # fmt: skip
+    read = logs_of(model, motions, "motion")
     in_memory = [hold_log(model, motion, settings) for motion in read]
-    found = preview_logs(model, in_memory, choice, noise=noise, run=run)
-    return found if given is None else replace(found, between=(given.between,) * len(in_memory))
+    ahead = preview_logs(model, in_memory, choice, noise=noise, run=run)
+    return ahead if given is None else replace(ahead, between=(given.between,) * len(in_memory))
 
 
 def preview_logs(
@@ -377,8 +374,10 @@ def preview_logs(
     for motion in motions:
         _expect(motion, pi)
     if not isinstance(noise, TorqueNoise):
-        found = None if earlier is None else earlier.noise(mapping.K).last(len(model.joints))
-        noise = assumed_noise(model, size, noise or {}, correlation, found)
+        residual_noise = (
+            None if earlier is None else earlier.noise(mapping.K).last(len(model.joints))
+        )
+        noise = assumed_noise(model, size, noise or {}, correlation, residual_noise)
     information = _Information.of(model, mapping, motions, noise)
     information = information if run is None else information.added_to(run)
     prior, spread = (
@@ -550,10 +549,10 @@ def _least_squares(information: _Information, known: Known, sigma: Array) -> Est
     solution = solve_factor(information.factors, sigma, known.beta)
     bread = solution.covariance
     covariance = bread @ information.meat(known.mapping.K, sigma) @ bread
-    found = solution.estimate(
+    least_squares = solution.estimate(
         information.factors.names, covariance, information.sigma, 0, "expected"
     )
-    return replace(found, theta=known.beta)
+    return replace(least_squares, theta=known.beta)
 
 
 def _expected(

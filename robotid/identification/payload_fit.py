@@ -11,11 +11,10 @@ from robotid.base.exceptions import DataError, NotConvergedError, SettingsError
 from robotid.base.findings import listed
 from robotid.base.settings import is_number, require_each, require_kind
 from robotid.base.typing import Array
-from robotid.data.files.read import Readable, read_logs
+from robotid.data.files.read import Readable
 from robotid.data.signal_settings import SignalSettings
 from robotid.diagnosis.verdict.payload_check import PayloadCheck
 from robotid.dynamics.base_parameters import structural_mapping
-from robotid.dynamics.constraint_rows import logged_base
 from robotid.dynamics.factors import join
 from robotid.estimation.estimators import Consistent, Constraints, Estimate
 from robotid.estimation.estimators.segments import quantile
@@ -23,7 +22,7 @@ from robotid.estimation.estimators.two_runs import Compared, TwoRuns, payload_ru
 from robotid.estimation.fitting.estimator_settings import ConsistentSettings
 from robotid.estimation.fitting.recorded import Recordings
 from robotid.estimation.fitting.survey import hold_log
-from robotid.identification.pipeline import robot_of, with_drives
+from robotid.identification.pipeline import logs_of, robot_of, with_drives
 from robotid.robot.bodies import link_transfer, usual_links
 from robotid.robot.closure import refuse_loops
 from robotid.robot.drives import DriveTerm
@@ -316,17 +315,7 @@ def identify_payload(
     _check_gains(model, unknown_gains)
     settings, mapping = signals or SignalSettings(), structural_mapping(model)
     wanted_families(friction, model.joints)
-    read = [
-        read_logs(
-            given,
-            model.joints,
-            prismatic=model.layout.prismatic,
-            base=logged_base(model),
-            passive=model.passive,
-            robot=model.tree.movable,
-        )
-        for given in (logs, reference)
-    ]
+    read = [logs_of(model, given) for given in (logs, reference)]
     loaded, without = (
         Recordings(model, mapping, [hold_log(model, log, settings) for log in some])
         for some in read
@@ -342,19 +331,19 @@ def identify_payload(
     def fitted(runs: Sequence[Recordings]) -> PayloadFit:
         return fit_payloads(*runs, links=links, masses=masses or {}, unknown_gains=unknown_gains)
 
-    found = fitted((loaded, without))
-    gain = np.array([found.gains[j].value if j in found.gains else 1.0 for j in model.joints])
+    fit = fitted((loaded, without))
+    gain = np.array([fit.gains[j].value if j in fit.gains else 1.0 for j in model.joints])
     judged = without
-    if found.gains:  # friction is a torque, not a current
+    if fit.gains:  # friction is a torque, not a current
         torques = [replace(log, tau=gain * log.tau) for log in read[1]]
         judged = replace(without, fitted=[hold_log(model, log, settings) for log in torques])
     own = own_friction(judged, friction)
     if own:
         loaded, without = (run.with_model(model.with_terms(own)) for run in (loaded, without))
-        found = fitted((loaded, without))
+        fit = fitted((loaded, without))
     if masses and not unknown_gains:
-        found = replace(found, checks=mass_checks(loaded, without, masses=masses, links=links))
-    return found
+        fit = replace(fit, checks=mass_checks(loaded, without, masses=masses, links=links))
+    return fit
 
 
 def _check_gains(model: RobotModel, unknown: Sequence[str]) -> None:
@@ -388,14 +377,14 @@ def mass_checks(
     """Return known masses of payloads against those that torque alone determines, by link."""
     _check_known(loaded.model, links or tuple(masses), masses, ())
     try:
-        found = fit_payloads(loaded, reference, links=links or tuple(masses), masses={})
+        free = fit_payloads(loaded, reference, links=links or tuple(masses), masses={})
     except UndeterminedMassError:
         return {link: PayloadCheck(link, mass) for link, mass in masses.items()}
     checks = {}
     for link, mass in masses.items():
-        own = found[link]
-        low, high = own.mass_interval.tolist()
-        checks[link] = PayloadCheck(link, mass, own.mass, own.mass_std_error, (low, high))
+        payload = free[link]
+        low, high = payload.mass_interval.tolist()
+        checks[link] = PayloadCheck(link, mass, payload.mass, payload.mass_std_error, (low, high))
     return checks
 
 
@@ -420,11 +409,11 @@ def fit_payloads(
             run.with_model(run.model.with_reference(pi))
             for run, pi in ((reference, bodies), (loaded, bodies + payload))
         )
-        found = _fit(other, ground, links, masses, unknown_gains)
-        size = float(np.linalg.norm(found.base))
+        fit = _fit(other, ground, links, masses, unknown_gains)
+        size = float(np.linalg.norm(fit.base))
         if abs(size - before) < _CONVERGED * size:
-            return found
-        bodies, payload = _loads(found, ground)
+            return fit
+        bodies, payload = _loads(fit, ground)
         before = size
     raise NotConvergedError(
         f"the joint load torque has not converged after {_MOST_LOADS} fits; use friction = "
@@ -459,8 +448,8 @@ def _fit(
         share=min(loaded.share, reference.share),
         unknown=[model.joints.index(joint) for joint in unknown_gains],
     )
-    found = runs.compare()
-    x, C, freedom = _payload_parameters(found, known)
+    compared = runs.compare()
+    x, C, freedom = _payload_parameters(compared, known)
     for k, link in enumerate(links):
         _check_mass(model, link, x[10 * k], np.sqrt(C[10 * k, 10 * k]), link in masses)
     possible = _possible(model, links, x, C, masses)
@@ -473,20 +462,20 @@ def _fit(
     return PayloadFit(
         model,
         payloads,
-        _gains(model, runs, found),
+        _gains(model, runs, compared),
         loaded.mapping.base_names,
-        found.theta[:b],
-        np.sqrt(np.diag(found.covariance)[:b]),
-        found.unexplained,
+        compared.theta[:b],
+        np.sqrt(np.diag(compared.covariance)[:b]),
+        compared.unexplained,
     )
 
 
-def _loads(found: PayloadFit, reference: Recordings) -> tuple[Array, Array]:
+def _loads(fit: PayloadFit, reference: Recordings) -> tuple[Array, Array]:
     """Return the standard parameters that load the gears, and the part of the payloads."""
     model = reference.model
-    bodies = reference.mapping.to_standard(found.base, model.standard_parameters())
+    bodies = reference.mapping.to_standard(fit.base, model.standard_parameters())
     added = np.zeros_like(bodies)
-    for payload in found.payloads:
+    for payload in fit.payloads:
         body, transfer = link_transfer(model, payload.link)
         added[10 * body : 10 * body + 10] += transfer @ payload.parameters
     return bodies, added
@@ -542,13 +531,13 @@ def _check_known(
         )
 
 
-def _payload_parameters(found: Compared, known: Array) -> tuple[Array, Array, Array]:
+def _payload_parameters(compared: Compared, known: Array) -> tuple[Array, Array, Array]:
     """Return all ten parameters of each payload, their covariance and degrees of freedom."""
     x, C = np.nan_to_num(known), np.zeros((len(known), len(known)))
     freedom, free = np.full(len(known), np.inf), np.flatnonzero(np.isnan(known))
-    at = slice(len(found.theta) - len(free), len(found.theta))
-    x[free], freedom[free] = found.theta[at], found.freedom[at]
-    C[np.ix_(free, free)] = found.covariance[at, at]
+    at = slice(len(compared.theta) - len(free), len(compared.theta))
+    x[free], freedom[free] = compared.theta[at], compared.freedom[at]
+    C[np.ix_(free, free)] = compared.covariance[at, at]
     return x, C, freedom
 
 
@@ -597,13 +586,13 @@ def _possible(
     return fit.project(start).theta
 
 
-def _gains(model: RobotModel, runs: TwoRuns, found: Compared) -> dict[str, Gain]:
-    first = len(found.theta)
-    error = np.sqrt(np.diag(found.covariance)[first:])  # of the logarithm
-    half_width = quantile(found.freedom[first:]) * error
+def _gains(model: RobotModel, runs: TwoRuns, compared: Compared) -> dict[str, Gain]:
+    first = len(compared.theta)
+    error = np.sqrt(np.diag(compared.covariance)[first:])  # of the logarithm
+    half_width = quantile(compared.freedom[first:]) * error
     gains = {}
     for k, j in enumerate(runs.unknown):
-        value = float(found.gain[j])
+        value = float(compared.gain[j])
         ends = sorted((value * np.exp([-half_width[k], half_width[k]])).tolist())
         gains[model.joints[j]] = Gain(value, abs(value) * float(error[k]), (ends[0], ends[1]))
     return gains

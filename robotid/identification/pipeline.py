@@ -17,7 +17,8 @@ from robotid.base.exceptions import (
 from robotid.base.findings import Finding, not_ignored
 from robotid.base.settings import require_flag, require_kind
 from robotid.base.typing import ProgressCallback, ignore_progress, report_stage
-from robotid.data.files.read import Readable, read_logs
+from robotid.data.files.read import Needs, Readable, read_logs
+from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
 from robotid.diagnosis.logs.check_logs import diagnose
 from robotid.diagnosis.residual.discrepancies import explain_residual
@@ -76,26 +77,28 @@ def identify(
     settings = signals or SignalSettings()
     report_stage(progress, "reading logs")
     model = robot_of(model, logs)
-    first, second = (
-        read_logs(
-            some,
-            model.joints,
-            prismatic=model.layout.prismatic,
-            base=logged_base(model),
-            passive=model.passive,
-            robot=model.tree.movable,
-        )
-        for some in (logs, validation)
-    )
+    first, second = (logs_of(model, given) for given in (logs, validation))
     if not first:
         raise DataError("no log was given; at least one is needed to identify anything")
     fitted, held_out = (
         [hold_log(model, log, settings) for log in some] for some in (first, second)
     )
     report_stage(progress, "checking logs")
-    found = diagnose(model, first, second, settings) if doctor else ()
+    doctor_findings = diagnose(model, first, second, settings) if doctor else ()
     recordings = Recordings(model, structural_mapping(model), fitted, held_out)
-    return conclude(recordings, choice, found, ignore, friction=friction, progress=progress)
+    return conclude(
+        recordings, choice, doctor_findings, ignore, friction=friction, progress=progress
+    )
+
+
+def logs_of(
+    model: RobotModel, given: Readable | Sequence[Readable], needs: Needs = "torque"
+) -> tuple[Log, ...]:
+    """Return the logs of a robot, read if they are files or DataFrames."""
+    return read_logs(
+        given, model.joints, prismatic=model.layout.prismatic, needs=needs,
+        base=logged_base(model), passive=model.passive, robot=model.tree.movable,
+    )  # fmt: skip
 
 
 def robot_of(model: RobotModel | str | Path, logs: object) -> RobotModel:
@@ -119,7 +122,7 @@ def robot_of(model: RobotModel | str | Path, logs: object) -> RobotModel:
 def conclude(
     recordings: Recordings,
     choice: EstimatorSettings,
-    found: Sequence[Finding] = (),
+    doctor_findings: Sequence[Finding] = (),
     ignore: Sequence[str] = (),
     *,
     friction: str | Mapping[str, str] = AUTO,
@@ -134,9 +137,9 @@ def conclude(
             "the viscous term), but more is stated; remove it, or set dynamics = 'full'"
         )
     report_stage(progress, "fitting")
-    with _explained(found):
+    with _explained(doctor_findings):
         recordings = with_repeated_errors(recordings)
-        balanced = counterbalanced(found, [log.head.name for log in recordings.fitted])
+        balanced = counterbalanced(doctor_findings, [log.head.name for log in recordings.fitted])
         fit = with_drives(recordings, choice, wanted, balanced, progress=progress)
     report_stage(progress, "errors and intervals")
     sample = take_sample(fit)
@@ -155,9 +158,9 @@ def conclude(
     of_fit = [
         *fit_findings(fit, misfits, on_misfit, discrepancies),
         *unlike_findings(fit.variation),
-        *rescaled_findings(fit, _loaded(found)),
+        *rescaled_findings(fit, _loaded(doctor_findings)),
     ]
-    merged = settled(with_known_springs(_kept(found), fit, wanted), of_fit)
+    merged = settled(with_known_springs(_kept(doctor_findings), fit, wanted), of_fit)
     merged = [finding for finding in merged if not explained_by_assumed(model, finding)]
     merged = rejected(merged, result.predictions, result.scale_check)
     log_errors = blocking(merged, ignore, is_robust=is_robust)
@@ -176,25 +179,25 @@ def conclude(
     )
 
 
-def _kept(found: Sequence[Finding]) -> list[Finding]:
+def _kept(findings: Sequence[Finding]) -> list[Finding]:
     """Return the doctor's findings but notes and what the fit says of the excitation and logs."""
     replaced = ("excitation", "log_assumption")
-    return [f for f in found if f.severity != "note" and f.code not in replaced]
+    return [f for f in findings if f.severity != "note" and f.code not in replaced]
 
 
-def _loaded(found: Sequence[Finding]) -> set[str]:
+def _loaded(findings: Sequence[Finding]) -> set[str]:
     """Return the logs of which the doctor found another payload."""
-    changes = (f.where for f in found if f.code == "payload_change")
+    changes = (f.where for f in findings if f.code == "payload_change")
     return {where.rpartition(": ")[0] or where for where in changes}
 
 
 @contextmanager
-def _explained(found: Sequence[Finding]) -> Iterator[None]:
+def _explained(findings: Sequence[Finding]) -> Iterator[None]:
     """Add the findings of the doctor to the error of a fit that fails."""
     try:
         yield
     except (DataError, NotConvergedError, RankDeficientError) as error:
-        for finding in found:
+        for finding in findings:
             if finding.severity != "note" and finding.message != str(error):
                 error.add_note(f"doctor: {finding.severity}: {finding.code}: {finding.message}")
         raise

@@ -48,14 +48,17 @@ def error_lines(
 def friction_lines(friction: Mapping[str, Any]) -> list[str]:
     """Return the friction of joints besides viscous and Coulomb, and its effect, as text."""
     lines = []
-    for joint, found in friction.items():
-        if found["families"]:
+    for joint, choice in friction.items():
+        if choice["families"]:
             before, after = (
                 step["held_out_error_pct"]
-                for step in (found["tried"][0], [s for s in found["tried"] if s["is_selected"]][-1])
+                for step in (
+                    choice["tried"][0],
+                    [s for s in choice["tried"] if s["is_selected"]][-1],
+                )
             )
             gain = f"held-out error {before:.1f} -> {after:.1f} %"
-            lines.append(f"  {joint}: {' + '.join(found['families'])} ({gain})")
+            lines.append(f"  {joint}: {' + '.join(choice['families'])} ({gain})")
     return ["friction besides viscous and Coulomb:", *lines] if lines else []
 
 
@@ -80,18 +83,18 @@ def variation_lines(variation: Mapping[str, Any] | None) -> list[str]:
     if variation is None:
         return []
     shares: dict[str, list[float]] = {}
-    for name, found in variation["parameters"].items():
+    for name, parameter in variation["parameters"].items():
         term = name.rpartition(".")[2]
-        if term in _SHOWN_SPREADS and abs(found["mean"]) > found["std_error"]:
-            shares.setdefault(term, []).append(100 * found["spread"] / abs(found["mean"]))
+        if term in _SHOWN_SPREADS and abs(parameter["mean"]) > parameter["std_error"]:
+            shares.setdefault(term, []).append(100 * parameter["spread"] / abs(parameter["mean"]))
     if not shares:
         return []
     words = [f"{term} {min(x):.2g} to {max(x):.2g} %" for term, x in sorted(shares.items())]
     lines = [f"spread between {len(variation['logs'])} logs, by joint: {', '.join(words)}"]
     gains = {
-        name: one_more_gain(found)
-        for name, found in variation["parameters"].items()
-        if "one_more" in found
+        name: one_more_gain(parameter)
+        for name, parameter in variation["parameters"].items()
+        if "one_more" in parameter
     }
     if gains:
         member = "robot" if variation["units"] > 1 else "log"

@@ -1,6 +1,4 @@
-import re
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,8 +8,6 @@ from robotid.design.basis import BSplineBasis, FourierBasis
 from robotid.design.clearance import Box, Clearance
 from robotid.design.design import Designer, Multipliers
 from robotid.design.limits import LIMITS, MotionLimits
-from robotid.design.previews import TorqueNoise
-from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.torque import joint_torque_regressor
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
@@ -213,86 +209,3 @@ def test_distances_without_a_cost_are_not_looked_at_and_change_nothing(wrist, de
     np.testing.assert_allclose(some[1], every[1], atol=1e-12)
     looked_at = len(around.near(placed, held.distance_without_cost(aim)).pairs)
     assert 0 < looked_at < len(around.near(placed, np.inf).pairs) / 2
-
-
-def test_a_posture_in_collision_counts_by_what_its_distances_are_short_of(wrist, designer):
-    inside = Clearance(wrist, least=0.01, boxes=[Box("room", (-3.0, -3.0, -3.0), (3.0, 3.0, 3.0))])
-    near = replace(designer, clearance=inside).postures
-    q = near._drawn(np.random.default_rng(0), 20)
-    distance = inside.near(inside.placed(q), np.inf, inside.everything).distance
-    short = np.maximum(inside.required[:, None] + inside.spare - distance, 0.0)
-    limits = replace(near, clearance=None)._broken_by_joint(q)
-    of_pairs = (near._broken_by_joint(q) - limits).sum(axis=1)
-    np.testing.assert_allclose(of_pairs, short.sum(axis=0) / 0.05, rtol=1e-6)
-    text = near._why_not(*near._at_rest(q))
-    found, wanted = re.search(r"room is (\S+) mm at most, wanted (\S+) mm", text).groups()
-    assert float(found) in [pytest.approx(1e3 * own.max(), abs=0.06) for own in distance]
-    assert float(wanted) == pytest.approx(1e3 * (0.01 + inside.spare.max()), abs=0.06)
-
-
-def test_what_a_joint_needs_to_rest_is_the_least_of_what_postures_need(wrist, designer):
-    q = designer.postures._drawn(np.random.default_rng(3), 10)
-    none, pi = np.zeros_like(q), wrist.standard_parameters()
-    tau = np.abs((joint_torque_regressor(wrist, q, none, none) @ pi).reshape(10, 3)[:, 0])
-    assert tau.max() > 1.5 * tau.min() > 0.0
-    weak = designer.limits.sizes.copy()
-    weak[4, 0] = tau.min() / 3
-    postures = replace(designer.postures, limits=replace(designer.limits, sizes=weak))
-    words = postures._why_not(*postures._at_rest(q))
-    assert "wrist_1_joint needs at least 300 % of its torque limit; state" in words
-
-
-def test_an_examined_motion_is_judged_with_what_is_known_and_its_condition_without(designer, rng):
-    """Of 5.02 s in 100 steps, about 20 Hz; the second joint rests and contributes nothing."""
-    size = len(designer.spread)
-    A = rng.standard_normal((size, size))
-    given = np.eye(size) + 0.3 * A @ A.T
-    some = replace(
-        designer, given=given, moving=np.array([True, False, True]), name="widest",
-        noise=np.array([0.01, 0.4, 0.09]),
-    )  # fmt: skip
-    motion = some.checked(some.random(rng)).motion
-    found = some.examined(motion, 5.02, 20.0)
-    t = np.linspace(0.0, 5.02, 101)
-    q, v, a = motion.evaluate(t)
-    rows = some.information.rows(q, v, a)
-    F = given.copy()
-    for j, noise in ((0, 0.01), (2, 0.09)):
-        W = rows.W[j].T * some.spread
-        F += 0.0502 / noise * W.T @ W
-    variance = np.diag(np.linalg.inv(F))
-    widest = np.argsort(np.diag(np.linalg.inv(given)))[-round(size / 4) :]
-    assert sorted(some.widest) == sorted(widest)
-    assert found.objective == pytest.approx(np.log(variance[widest]).mean())
-    used = some.limits.used(q, v, a, 0.0 * a, some.information.torque(rows))
-    np.testing.assert_allclose(found.used, np.abs(used).max(axis=1))
-    assert (found.intervals, found.duration) == (100, 5.02)
-    whole = designer.checked(designer.random(rng)).motion  # all joints move
-    alone = designer.examined(whole, 5.02, 20.0)
-    rows = designer.information.rows(*whole.evaluate(t))
-    W = np.concatenate(
-        [np.sqrt(0.0502 / n) * w.T * designer.spread
-         for n, w in zip(designer.noise, rows.W, strict=True)]
-    )  # fmt: skip
-    assert alone.condition == pytest.approx(np.linalg.cond(W), rel=1e-4)
-    assert alone.objective == pytest.approx(-np.linalg.slogdet(W.T @ W + np.eye(size))[1] / size)
-
-
-def test_a_motion_after_a_run_has_its_noise_its_parameters_and_its_information(wrist, rng):
-    mapping, heard = structural_mapping(wrist), []
-    A = rng.standard_normal(2 * (len(mapping.K),))
-    noise = TorqueNoise(np.array([0.3, 0.5, 0.2]), np.array([0.02, 0.04, 0.05]), 3 * ("found",))
-    pi = wrist.standard_parameters()
-    pi[wrist.layout.n_inertial :] = rng.uniform(0.1, 0.3, len(pi) - wrist.layout.n_inertial)
-    factors = SimpleNamespace(information=lambda weights: heard.append(weights) or A @ A.T)
-    run = SimpleNamespace(standard=pi, noise=lambda K: noise, step=0.01, factors=factors)
-    found = Designer.of_model(
-        wrist, FourierBasis(4.0, 3), MotionLimits.of_model(wrist), run=run, noise={WRIST[1]: 0.9}
-    )
-    density = np.array([0.3, 0.9, 0.2]) ** 2 * [0.02, 0.1, 0.05]  # one is stated, over 0.1 s
-    np.testing.assert_allclose(found.noise, density)
-    np.testing.assert_allclose(heard, [0.01 / density])
-    S = found.spread
-    np.testing.assert_allclose(found.given, np.eye(len(A)) + S[:, None] * (A @ A.T) * S)
-    np.testing.assert_allclose(found.known, found.given)
-    np.testing.assert_allclose(found.information.beta, mapping.to_base(pi))

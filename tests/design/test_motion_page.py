@@ -1,6 +1,4 @@
-import re
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,9 +12,6 @@ from robotid.design.limits import LIMITS, MotionLimits
 from robotid.dynamics.prediction import predict_instants
 from robotid.output.report.motion_page import (
     _distance_chart,
-    _free_chart,
-    _limit_table,
-    _share_chart,
 )
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
@@ -115,39 +110,3 @@ def test_distances_that_do_not_change_are_not_drawn(course):
     assert list(shown) == list(wanted)
     for label, own in wanted.items():
         np.testing.assert_allclose(shown[label], 1e3 * exact[own].min(axis=0), rtol=2e-3)
-
-
-def test_the_page_states_use_margin_joint_time_value_and_unit_of_each_limit():
-    """A rail, which is prismatic, carries an elbow."""
-    t = 3.0 + 0.25 * np.arange(9)
-    used = np.zeros((6, 9, 2))
-    used[0, 2, 1], used[1, 7, 0], used[4, 4, 0], used[2, 1, 1] = -0.8, 0.613, -0.475, 0.25
-    sizes = np.array([[0.5, 2.9], [0.4, 3.15], [7.0, 11.0], [np.inf] * 2, [900.0, 150.0],
-                      [np.inf] * 2])  # fmt: skip
-    model = SimpleNamespace(joints=("rail", "elbow"), layout=SimpleNamespace(prismatic=("rail",)))
-    course = Course(t, used, MotionLimits(np.zeros(2), sizes))
-    course.__dict__["used"] = used
-    entries = {"position": ("elbow", 0.2), "velocity": ("rail", 0.387), "torque": ("rail", 0.525),
-               "acceleration": ("elbow", 0.75)}  # fmt: skip
-    content = {"limits": {k: {"where": x, "margin": y} for k, (x, y) in entries.items()},
-               "share": 0.85}  # fmt: skip
-    found = _limit_table(model, content, course)
-    rows = [re.sub(r"<[^>]+>", "|", row) for row in found.split("<tr>")]
-    texts = ([y.strip() for y in row.split("|") if y.strip()] for row in rows)
-    cells = {x[0]: x[1:7] for x in texts if len(x) > 4}
-    assert cells["position"] == ["80.0", "20.0", "elbow", "3.50", "2.9", "rad"]
-    assert cells["velocity"] == ["61.3", "38.7", "rail", "4.75", "0.4", "m/s"]
-    assert cells["torque"] == ["47.5", "52.5", "rail", "4.00", "900", "N"]
-    assert cells["acceleration"] == ["25.0", "75.0", "elbow", "3.25", "11", "rad/s²"]
-    assert "100 % of position, velocity and torque is 85 % of the URDF's limit" in found
-    assert "Collisions were not checked" in found
-    assert "torque [N m or N]" in _free_chart(model, course, "torque", np.array([0, 1]))
-    assert "torque [N]" in _free_chart(model, course, "torque", np.array([0]))
-    assert "acceleration [rad/s²]" in _free_chart(model, course, "acceleration", np.array([1]))
-    used[4, 5, 1], used[4, 6, 0] = 0.3, 0.35
-    shares = chart(_share_chart(model, course, "torque", np.array([1, 0])), "torque of each joint")
-    shown = {series["label"]: series["y"] for series in shares["series"]}
-    assert list(shown) == ["limit", "−limit", "elbow", "rail"]
-    np.testing.assert_allclose(shares["x"], t, rtol=1e-3)
-    wanted = [np.full(9, 100.0), np.full(9, -100.0), 100 * used[4, :, 1], 100 * used[4, :, 0]]
-    np.testing.assert_allclose([*shown.values()], wanted, atol=0.01)

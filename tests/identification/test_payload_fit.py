@@ -7,7 +7,6 @@ from types import SimpleNamespace
 import numpy as np
 import pinocchio as pin
 import pytest
-import scipy.signal
 from helpers.driven import arm
 from helpers.synthetic import exact_log, truth
 from scipy.stats import t as t_of
@@ -20,7 +19,6 @@ from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.torque import joint_torque_regressor
 from robotid.estimation.estimators.segments import quantile
 from robotid.identification.payload_fit import (
-    _gains,
     identify_payload,
     payload_of,
 )
@@ -196,27 +194,6 @@ def test_gains_are_exact_without_noise_and_some_may_be_known(hand, rng):
     assert found.gains["wrist_2_joint"].value == pytest.approx(GAINS[4], rel=1e-6)
 
 
-def test_a_gain_has_the_interval_of_its_logarithm(rng):
-    """Of the first and the third joint; the last rows of the covariance are theirs."""
-    root = 0.1 * rng.standard_normal((5, 5))
-    found = SimpleNamespace(
-        theta=np.zeros(3),
-        gain=np.array([5.0, 1.0, -8.0]),
-        covariance=root @ root.T,
-        freedom=np.array([3.0, 4.0, 5.0, 7.0, 11.0]),
-    )
-    model = SimpleNamespace(joints=("a", "b", "c"))
-    gains = _gains(model, SimpleNamespace(unknown=[2, 0]), found)
-    assert list(gains) == ["c", "a"]
-    for joint, k, value in (("c", 3, -8.0), ("a", 4, 5.0)):
-        error = np.sqrt(found.covariance[k, k])
-        reach = t_of(found.freedom[k]).ppf(0.975) * error
-        assert gains[joint].value == value
-        assert gains[joint].std_error == pytest.approx(abs(value) * error)
-        ends = sorted([value * np.exp(-reach), value * np.exp(reach)])
-        assert gains[joint].interval == pytest.approx(tuple(ends))
-
-
 def test_errors_about_the_centre_of_mass_are_those_of_first_order(rng):
     """By finite differences of the ten parameters in the frame of the link."""
 
@@ -368,25 +345,6 @@ def test_a_joint_that_rests_but_for_a_few_rows_does_not_outweigh_the_others(ur5,
     assert found.mass_std_error < 0.1
     assert abs(found.mass - MASS) < 3 * found.mass_std_error
     assert (np.abs(found.com - COM) < 3 * found.com_std_error).all()
-
-
-def test_errors_grow_with_the_correlation_of_the_noise(hand):
-    rng, rho = np.random.default_rng(5), 0.9
-    white, coloured = [], []
-    for log in recorded(hand, rng, friction=1.2):
-        e = LEVEL[2:] * rng.standard_normal(log.tau.shape)
-        correlated = scipy.signal.lfilter([np.sqrt(1 - rho**2)], [1.0, -rho], e, axis=0)
-        white.append(replace(log, tau=log.tau + e))
-        coloured.append(replace(log, tau=log.tau + correlated))
-    errors = [
-        with_known_friction(hand, [one], [other], links=["tool0"], signals=EXACT)[
-            "tool0"
-        ].mass_std_error
-        for one, other in (white, coloured)
-    ]
-    # of a motion that is slow beside the noise; of this one, less
-    most = np.sqrt((1 + rho) / (1 - rho))
-    assert 0.4 * most < errors[1] / errors[0] < most
 
 
 def test_friction_of_the_reference_is_chosen_and_counts_in_both_runs(rng):

@@ -4,7 +4,6 @@ import re
 from dataclasses import replace
 
 import numpy as np
-import pinocchio as pin
 import pytest
 import scipy.signal
 from helpers.driven import arm
@@ -19,14 +18,11 @@ from robotid.design.previews import (
     TorqueNoise,
     _band,
     _Information,
-    _largest,
     assumed_noise,
-    largest_gravity,
     preview,
 )
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.factors import Factors, compress
-from robotid.dynamics.prediction import predict
 from robotid.dynamics.simulation.motions import random_fourier
 from robotid.dynamics.torque import joint_torque_regressor, trajectory_regressor
 from robotid.dynamics.used_rows import base_problem
@@ -169,20 +165,6 @@ def test_the_noise_of_a_short_run_counts_the_parameters_that_its_rows_pay_for(rn
     assert noise.origins == ("found",) * 3
 
 
-def test_the_largest_of_several_motions_is_seen(rng):
-    model = arm()
-    logs = [moved(model, rng)[0] for _ in range(2)]
-    fast = replace(logs[0], t=0.5 * logs[0].t)
-    held = [hold_log(model, log, SignalSettings()) for log in (logs[1], fast, logs[1])]
-    bodies = model.standard_parameters()
-    peak, fastest = _largest(model, held)
-    for j in range(3):
-        v = max(np.abs(log.whole.trajectory.v[:, j]).max() for log in held)
-        torques = [predict(model, [bodies], log.whole.trajectory)[0] for log in held]
-        assert fastest[j] == v
-        assert peak[j] == pytest.approx(max(np.abs(tau[:, j]).max() for tau in torques))
-
-
 def test_torques_that_a_log_has_are_ignored(ur5, motion, recorded):
     first, second = (preview(ur5, [log], noise=white()) for log in (motion[0], recorded))
     np.testing.assert_array_equal(first.standard_error, second.standard_error)
@@ -209,18 +191,6 @@ def test_errors_are_in_proportion_to_the_noise_and_fall_with_the_root_of_the_len
     np.testing.assert_allclose(thrice, 3 * once, rtol=1e-8)
     four = preview(ur5, [log] * 4, noise=white(), estimator=estimator).base_error
     np.testing.assert_allclose(four, once / 2, rtol=1e-8)
-
-
-def test_the_density_of_noise_counts_and_not_the_rate_of_the_rows(ur5, motion):
-    log, noise = motion[0], white()
-    base = preview(ur5, [log], noise=noise, estimator="wls").base_error
-    thinned = SignalSettings(rate=50.0)
-    half = preview(ur5, [log], noise=noise, estimator="wls", signals=thinned).base_error
-    np.testing.assert_allclose(half, base, rtol=0.05)
-    # the same noise over 0.1 s has ten times the density of 0.01 s
-    slow = TorqueNoise(STD, np.full(6, 0.1), ("stated",) * 6)
-    slower = preview(ur5, [log], noise=slow, estimator="wls").base_error
-    np.testing.assert_allclose(slower, np.sqrt(10.0) * base, rtol=1e-8)
 
 
 def test_the_prior_only_helps_and_bands_are_of_the_motion(ur5, motion):
@@ -323,17 +293,6 @@ def test_noise_is_stated_or_a_hundredth_of_the_largest_torque(ur5):
         assumed_noise(ur5, size, {}, -1.0)
 
 
-def test_the_largest_gravity_is_of_either_sign():
-    model = arm()
-    found = largest_gravity(model)
-    low, high = np.array([(j.lower, j.upper) for j in model.limits]).T
-    q = np.random.default_rng(0).uniform(low, high, (200, 3))
-    data = model.pin_model.createData()
-    g = np.array([pin.computeGeneralizedGravity(model.pin_model, data, x) for x in q])
-    np.testing.assert_allclose(found, np.abs(g).max(axis=0), atol=1e-12)
-    assert (np.abs(g.max(axis=0)) < found - 1e-3).any()
-
-
 def test_a_joint_without_an_effort_limit_has_the_torque_of_its_bodies(ur5, motion, tmp_path):
     text = example_urdf("ur5_robot.urdf").read_text()
     (tmp_path / "bare.urdf").write_text(re.sub(r'effort="[^"]*"', "", text))
@@ -399,21 +358,3 @@ def test_noise_of_a_long_run_has_the_scatter_of_each_joint_s_own_scores(rng):
     short = replace(run, segments=segments[:11])
     X = [W[:11, j].reshape(-1, 3) / level[j] for j in (0, 1)]
     np.testing.assert_allclose(short.meat(K, level), (X[0].T @ X[0] + X[1].T @ X[1]) / 0.2)
-
-
-def test_a_joint_that_fits_exactly_has_a_billionth_of_the_largest_noise():
-    """Of two joints with one parameter, which the second determines; and of two that fit exactly.
-
-    R holds the rows of the parameter, 3, and below them the root of the sum of residual squares.
-    """
-
-    def noise(residual):
-        R = np.array([[2.0, 6.0], [0.0, residual]]), np.array([[4.0, 12.0], [0.0, 0.0]])
-        part = Factors(R, (np.array([0]),) * 2, np.array([25, 16]), ("a",))
-        return Run((part,), np.array([3.0]), np.zeros(1), 25, 0.5, 0.01).noise(np.eye(1))
-
-    found, free = noise(10.0), np.array([1.0, 15 / 16])
-    np.testing.assert_allclose(found.std, [2.0, 2e-9] / np.sqrt(free), rtol=1e-12)
-    np.testing.assert_allclose(found.correlation, free * 0.01 / 0.5, rtol=1e-12)
-    free = 1.0 - np.array([2.0, 4.0]) ** 2 / (2.0**2 + 4.0**2) / [25, 16]
-    np.testing.assert_allclose(noise(0.0).std, 1e-18 / np.sqrt(free), rtol=1e-12)

@@ -17,7 +17,6 @@ from robotid.dynamics.prediction import predict
 from robotid.dynamics.used_rows import base_problem
 from robotid.estimation.fitting.recorded import Recordings
 from robotid.estimation.fitting.survey import hold_log
-from robotid.identification import repeated_errors
 from robotid.identification.repeated_errors import (
     _shift,
     _shift_of_motion,
@@ -227,47 +226,6 @@ def test_offsets_without_torques_of_joints_are_two_centimetres_if_not_stated(log
     still = log.q.copy()
     still[:, 4] = 0.1  # a joint at rest: with Coulomb friction, its rows are not used
     assert size(replace(log, q=still), None, has_torque=True, terms=("coulomb",)).points != 0.02
-
-
-def test_only_logs_with_an_imu_have_a_bias(log, rng, monkeypatch):
-    """The effect of a bias is that of the first log's rows alone; the second has no IMU."""
-    model = robot(0.0)
-    mapping = structural_mapping(model)
-    values = rng.standard_normal((len(log.t), 6)) + np.array([0, 0, 0, 0, 0, 9.81])
-    frame = ImuFrame(np.eye(4)[3], np.zeros(3), np.array([0, 0, -9.81]), np.zeros(3))
-    moved = replace(log, base=replace(log.base, imu=ImuMotion(values, frame)))
-    with_imu, without = (hold_log(model, x, RAW) for x in (moved, log))
-
-    def slopes(model, rows, pi):
-        return np.random.default_rng(7).standard_normal((rows.trajectory.tau.size, 3))
-
-    monkeypatch.setattr(repeated_errors, "_slopes_of_bias", slopes)
-    alone, both = (
-        with_repeated_errors(Recordings(model, mapping, logs, validation=(without, with_imu)))
-        for logs in ((with_imu,), (with_imu, without))
-    )
-    assert alone.repeated.root.shape[1] == 3
-    frames = [x.head.base.imu and x.head.base.imu.frame for x in both.fitted]
-    assert frames[1] is None
-    np.testing.assert_array_equal(frames[0].offset, both.repeated.bias)
-    unfitted = [x.head.base.imu and x.head.base.imu.frame for x in both.validation]
-    assert unfitted[0] is None
-    np.testing.assert_array_equal(unfitted[1].offset, both.repeated.bias)
-    assert np.linalg.norm(both.repeated.bias) > 0.0
-    # what is subtracted from the specific force is missing in the acceleration
-    before, after = (
-        x.fitted[0].whole.trajectory.a for x in (Recordings(model, mapping, (with_imu,)), both)
-    )
-    np.testing.assert_allclose(
-        before[:, :3] - after[:, :3], np.tile(both.repeated.bias, (60, 1)), atol=1e-12
-    )
-    np.testing.assert_array_equal(before[:, 3:], after[:, 3:])
-    assert with_repeated_errors(Recordings(model, mapping, (without,))).repeated is None
-    # with slopes that do not depend on the parameters, those of the second log have no effect
-    one, two = alone.repeated.root, both.repeated.root
-    np.testing.assert_allclose(
-        one @ np.linalg.lstsq(one, two, rcond=None)[0], two, atol=1e-9 * np.abs(two).max()
-    )
 
 
 def test_a_bias_of_the_accelerometer_acts_on_the_mass_of_the_robot(log):

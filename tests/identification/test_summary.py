@@ -1,8 +1,5 @@
 """What a notebook and print() show of a result."""
 
-from dataclasses import replace
-from html.parser import HTMLParser
-
 import numpy as np
 import pytest
 from helpers.paths import ROOT
@@ -20,19 +17,6 @@ from robotid.identification.summary import (
     verdict_lines,
 )
 from robotid.robot.model import RobotModel
-
-
-class Words(HTMLParser):
-    def __init__(self, html):
-        super().__init__()
-        self.words, self.tags = [], []
-        self.feed(html)
-
-    def handle_starttag(self, tag, attrs):
-        self.tags.append((tag, dict(attrs)))
-
-    def handle_data(self, data):
-        self.words.append(data)
 
 
 @pytest.fixture(scope="module")
@@ -54,11 +38,6 @@ def reported():
 @pytest.fixture(scope="module")
 def found(arm, logs, reported):
     return identify(arm, logs[:1], validation=logs[1:], progress=lambda *x: reported.append(x))
-
-
-def test_each_drive_has_its_choice_of_friction_though_none_is_added(found):
-    assert [drive.joint for drive in found.drives] == list(found.model.joints)
-    assert not any(drive.terms for drive in found.drives)
 
 
 def test_the_start_of_each_stage_is_reported(found, reported):
@@ -91,39 +70,6 @@ def test_its_text_has_verdict_reasons_and_every_joint(found):
         (first, _) = [line.split() for line in text.splitlines() if line.split()[0] == joint]
         assert first[1] == f"{error:.1f}"
         assert text.count(f"  {joint} ") == 2  # kept and fitted rows
-
-
-def test_its_tables_have_the_errors_of_plainer_predictions(found):
-    """Those of weighted least squares made worse than they are, to be another figure."""
-    (kept,), (fitted,) = found.validation, found.fitted
-    metrics = kept.metrics["wls"].per_joint.items()
-    others = {
-        joint: replace(m, relative_error_pct=3.0 * m.relative_error_pct) for joint, m in metrics
-    }
-    worse = {**kept.metrics, "wls": replace(kept.metrics["wls"], per_joint=others)}
-    sums = fitted.sums["wls"]
-    sums = {**fitted.sums, "wls": replace(sums, residual=4.0 * sums.residual)}
-    found = replace(
-        found, validation=(replace(kept, metrics=worse),), fitted=(replace(fitted, sums=sums),)
-    )
-    lines = [line.split() for line in str(found).splitlines()]
-    tables = (
-        (found.validation[0].metrics["estimate"], found.validation[0].metrics["wls"]),
-        (
-            found.metrics(),
-            found.metrics("wls"),
-        ),
-    )
-    for place, (ours, wls) in enumerate(tables):
-        for joint, m in ours.per_joint.items():
-            own = [words for words in lines if words and words[0] == joint][place]
-            others = [
-                m.baselines["urdf_with_drives"], wls.per_joint[joint].relative_error_pct,
-                m.baselines["urdf"], m.baselines["gravity_only"],
-            ]  # fmt: skip
-            assert own[1:] == [
-                f"{m.relative_error_pct:.1f}", f"{m.rmse:#.3g}", "N", "m", *map(cell, others),
-            ]  # fmt: skip
 
 
 def test_figures_above_a_thousand_have_no_decimals():
@@ -178,14 +124,6 @@ def test_a_job_s_identification_links_to_its_report(arm, logs, tmp_path):
     found, _ = run_job(job, tmp_path / "out")
     assert found.report == str(tmp_path / "out" / "report.html")
     assert f"report: {found.report}" in str(found)
-
-
-def test_an_estimate_lists_every_parameter(found):
-    text, html = str(found.wls), found.wls._repr_html_()
-    for name, value in zip(found.wls.names, found.wls.theta, strict=True):
-        (line,) = [line for line in text.splitlines() if line.split()[0] == name]
-        assert float(line.split()[1]) == pytest.approx(value, rel=1e-3)
-        assert name in "".join(Words(html).words)
 
 
 def test_a_reason_of_a_joint_is_shown_once():

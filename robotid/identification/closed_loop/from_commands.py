@@ -79,10 +79,10 @@ def identify_loops(
         ]
         for part in (logs, validation)
     ]  # fmt: skip
-    found = identified_loops(model, loop, settings, fitted, *map(tuple, runs))
+    result = identified_loops(model, loop, settings, fitted, *map(tuple, runs))
     errors = blocking(examined, ignore)
-    found = replace(
-        found,
+    result = replace(
+        result,
         log_errors=tuple(finding.message for finding in errors),
         stated=StatedSettings(used, ignore=tuple(ignore)),
         variation=vary(
@@ -91,8 +91,8 @@ def identify_loops(
             sorted(set(units)),
         ),
     )
-    examined = [*examined, *unlike_findings(found.variation)]
-    return replace(found, findings=(*loop_findings(found, examined), *not_written(errors)))
+    examined = [*examined, *unlike_findings(result.variation)]
+    return replace(result, findings=(*loop_findings(result, examined), *not_written(errors)))
 
 
 def _others(model: RobotModel, loop: LoopSettings, fitted: Fitted) -> dict[str, Loops]:
@@ -101,8 +101,8 @@ def _others(model: RobotModel, loop: LoopSettings, fitted: Fitted) -> dict[str, 
     The URDF with the stated gains has no friction and no rotor inertia.
     """
     if fitted.linear is not None:
-        driven, found = fitted.linear.urdf_with_drives, fitted.linear.standard
-        return {"urdf": open_loops(model, driven), "rows": open_loops(model, found)}
+        driven, from_rows = fitted.linear.urdf_with_drives, fitted.linear.standard
+        return {"urdf": open_loops(model, driven), "rows": open_loops(model, from_rows)}
     others = {} if fitted.plain is None else {"second_order": fitted.plain.loops}
     if loop.kp is not None and not any(u.what == "kp" for u in fitted.simulator.free_parameters):
         n, stated = len(model.joints), stated_loops(model, loop)

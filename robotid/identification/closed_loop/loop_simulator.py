@@ -143,9 +143,9 @@ def _fit_gains(
     outs: Sequence[RollOut], loops: Loops, is_free: Array, lag: Array
 ) -> tuple[Array, Array]:
     """Return the squared torque residuals, (n,), and the gains of least squares, (2, n)."""
-    found = [drive_torques(out, loops, lag) for out in outs]
+    torques = [drive_torques(out, loops, lag) for out in outs]
     unlimited, error, speed_error = (
-        np.concatenate([getattr(own, name) for own in found])
+        np.concatenate([getattr(own, name) for own in torques])
         for name in ("unlimited", "position_error", "speed_error")
     )
     tau = np.concatenate([out.window.log.tau[out.window.counted] for out in outs])
@@ -199,16 +199,16 @@ def free_body_parameters(robot: ClosedLoopRobot, spread: float) -> list[FreePara
     model = robot.model
     J = pseudo_inertia(model.standard_parameters()[: model.layout.n_inertial])
     values = np.linalg.eigvalsh(J)
-    found = []
+    parameters = []
     for body, joint in enumerate(robot.joint_of_body):
         if values[body, 0] <= _POSSIBLE * values[body, -1]:
             continue  # a massless frame or an inconsistent body of the URDF stays fixed
         name = model.layout.bodies[body]
-        found += [
+        parameters += [
             FreeParameter(f"{name}.{what}", "body", (joint,), 0.0, spread, coordinate=k)
             for k, what in enumerate(("mass", "cx", "cy", "cz"))
         ]
-    return found
+    return parameters
 
 
 @dataclass(frozen=True, eq=False)
@@ -463,15 +463,15 @@ class LoopSimulator:
     def _inverse_dynamics(self, outs: Sequence[RollOut], theta: Array) -> list[Array]:
         """Return Y(q, v, a) d pi along roll-outs, window by window, shape (N, n, c)."""
         model, (_, slopes) = self._full_model, self.standard(self._full_model, theta)
-        found = []
+        slopes_of_windows = []
         for out in outs:
             t = out.window.log.t[out.window.counted]
             a, none = np.gradient(out.v, t, axis=0), np.zeros_like(out.q)
             segment = np.zeros(len(t), dtype=int)
             motion = Trajectory(t, out.q, out.v, a, none, model.joints, None, segment)
             torques = predict(model, list(slopes.T), remember(model, motion))
-            found.append(np.stack(torques, axis=-1))
-        return found
+            slopes_of_windows.append(np.stack(torques, axis=-1))
+        return slopes_of_windows
 
     @cached_property
     def _full_model(self) -> RobotModel:

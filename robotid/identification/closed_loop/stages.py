@@ -201,18 +201,18 @@ def _with_chosen_terms(
             for set_ in candidates(simulator, initialised.torque)
             if set_[0].name not in simulator.names and set_[0].name not in dropped
         ]
-        found = choose(
+        judged = choose(
             *_with(simulator, theta, offered), offered, replace(estimator, inflation=1.0)
         )
-        tried = [*(t for t in tried if t.is_chosen), *found]
-        chosen = [set_ for set_, t in zip(offered, found, strict=True) if t.is_chosen]
+        tried = [*(t for t in tried if t.is_chosen), *judged]
+        chosen = [set_ for set_, t in zip(offered, judged, strict=True) if t.is_chosen]
         if not chosen and estimate is not None:
             break
         report_stage(progress, "fitting loops", STAGES)
         simulator, theta = _with(simulator, theta, chosen)
         if simulator.torque is not None:
-            own = with_terms(model, simulator.base)
-            rows = torque_rows(identified_rows(own, logs, signals), initialised.share)
+            extended = with_terms(model, simulator.base)
+            rows = torque_rows(identified_rows(extended, logs, signals), initialised.share)
             simulator = replace(simulator, torque=rows)
         estimate = estimator.fit(simulator, theta, exact=simulator.exact)
         theta = estimate.theta
@@ -240,9 +240,9 @@ def _best_start(initial: "_Initial") -> tuple["_Initial", Array]:
             failures.append(failure)
             continue
         error = fits[-1][2]
-        for own in (groups == group for group in dict.fromkeys(initial.groups)):
-            if np.mean(error[own] / best[own]) < 1.0 / BEATEN:
-                factor[own], limited[own], best[own] = scale, has_limit, error[own]
+        for members in (groups == group for group in dict.fromkeys(initial.groups)):
+            if np.mean(error[members] / best[members]) < 1.0 / BEATEN:
+                factor[members], limited[members], best[members] = scale, has_limit, error[members]
         if not ((best > GOOD) & (best > HARDLY * second_order)).any():
             break
     if not fits:
@@ -251,8 +251,8 @@ def _best_start(initial: "_Initial") -> tuple["_Initial", Array]:
     if chosen is None:  # several groups, each from its best
         with suppress(NotConvergedError):
             chosen = _first_fit(initial.vary(factor, limited))
-    found, theta, _ = chosen or min(fits, key=lambda fit: float(fit[2].max()))
-    return found, theta
+    initialised, theta, _ = chosen or min(fits, key=lambda fit: float(fit[2].max()))
+    return initialised, theta
 
 
 def _with_limits_reached(
@@ -364,10 +364,10 @@ def _initialise_from_commands(
     if uses_torques and loop.rate is None:
         is_free = _free_gains(loop, model)
         moved = [measured_motion(window) for window in _few(windows)]
-        lag, found = find_gains(
+        lag, matched = find_gains(
             moved, stated, is_free, knows_delay=loop.delay is not None, is_whole=True
         )
-        has_gain, stated = has_gain | (found.kp != stated.kp), found
+        has_gain, stated = has_gain | (matched.kp != stated.kp), matched
     report_stage(progress, "trying second-order models", STAGES)
     second_order = cache(
         lambda finds_limit: fit_second_order(
@@ -428,14 +428,14 @@ def _initialise_from_torque(
     that of the URDF.
     """
     report_stage(progress, "fitting torques", STAGES)
-    found = identified_rows(model, logs, signals)
-    linear = open_loops(model, found.standard)
+    from_rows = identified_rows(model, logs, signals)
+    linear = open_loops(model, from_rows.standard)
     is_urdf = not (settings.torques and settings.bodies)
     base = replace(linear, bodies=stated_loops(model, loop).bodies) if is_urdf else linear
     robot = ClosedLoopRobot(model, step=settings.step)
     length, lead = settings.window or DRIFTS, settings.lead or 0.0
     windows = tuple(w for log in logs for w in cut_windows(log, length, lead))
-    typical = typical_sizes_of_torques(model, found.standard, base.armature, windows)
+    typical = typical_sizes_of_torques(model, from_rows.standard, base.armature, windows)
     groups = groups_of(loop, model.joints, range(len(model.joints)))
     none = np.zeros(len(groups), dtype=bool)
     free_parameters = free_drive_parameters(
@@ -447,10 +447,10 @@ def _initialise_from_torque(
     )
     report_stage(progress, "fitting loops", STAGES)
     if settings.torques:
-        simulator = replace(simulator, torque=torque_rows(found, _BOTH))
+        simulator = replace(simulator, torque=torque_rows(from_rows, _BOTH))
     estimator = OutputError(whitens=settings.whiten, frees=True, progress=progress)
     encoders = same_encoders(model)
-    return _Initial(simulator, estimator, typical.torque, encoders, linear=found)
+    return _Initial(simulator, estimator, typical.torque, encoders, linear=from_rows)
 
 
 def refine_steps(
@@ -497,16 +497,16 @@ def _settled(
     for _ in range(_SETTLING):
         try:
             initialised = simulator.with_better_start(estimate.theta)
-            found = estimator.settle(initialised, estimate)
+            settled = estimator.settle(initialised, estimate)
         except NotConvergedError:
-            found = None
-        before, level = level, np.inf if found is None else float(np.mean(np.log(found.sigma)))
-        if found is None or level > before + _RAISED:
+            settled = None
+        before, level = level, np.inf if settled is None else float(np.mean(np.log(settled.sigma)))
+        if settled is None or level > before + _RAISED:
             simulator = simulator.with_better_start(first)
             return simulator, estimator.fit(simulator, first)
-        change = found.theta - estimate.theta
-        simulator, estimate = initialised, found
-        if (np.abs(change) <= _CHANGE * found.std_error).all():
+        change = settled.theta - estimate.theta
+        simulator, estimate = initialised, settled
+        if (np.abs(change) <= _CHANGE * settled.std_error).all():
             return simulator, estimate
     return simulator, replace(estimate, covariance=estimate.covariance + np.outer(change, change))
 
@@ -524,13 +524,13 @@ def _check_settings(
         )
     for log in logs:
         if settings.velocities and (log.v is None or not is_trustworthy(log)):
-            found = (
+            lack = (
                 "has no velocities"
                 if log.v is None
                 else "has velocities that are delayed, coarse, or inconsistent with the positions"
             )
             raise DataError(
-                f"estimator: velocities is true, but {log.name} {found}. Record columns dq_ of "
+                f"estimator: velocities is true, but {log.name} {lack}. Record columns dq_ of "
                 "each joint, or leave velocities out"
             )
         if settings.error != "output" and not log.has_torque:
@@ -572,8 +572,8 @@ def _largest_speeds(model: RobotModel, loop: LoopSettings, logs: Sequence[Log]) 
     """Return the speed of joints that run at their largest speed without a stated limit; else 0."""
     speed = np.zeros(len(model.joints))
     for log in logs:
-        found = largest_speeds(log)
-        speed = np.maximum(speed, [found.get(joint, 0.0) for joint in model.joints])
+        saturated = largest_speeds(log)
+        speed = np.maximum(speed, [saturated.get(joint, 0.0) for joint in model.joints])
     is_free = ~is_stated(None if loop.limit == "find" else loop.limit, model)
     return np.where(is_free, speed, 0.0)
 
@@ -613,14 +613,14 @@ def _with(
     """Return the simulator with further terms at 0, and its parameters."""
     further = [free for free_parameters in sets for free in free_parameters]
     loops = simulator.base
-    terms = [list(own) for own in loops.terms]
+    terms = [list(joint_terms) for joint_terms in loops.terms]
     for free in further:
         if free.term is not None:
             terms[free.joints[0]].append(free.term)
     values = [
         loops.values[loops.place(j, term)] if term in loops.terms[j] else 0.0
-        for j, own in enumerate(terms)
-        for term in own
+        for j, joint_terms in enumerate(terms)
+        for term in joint_terms
     ]
     base = replace(loops, terms=tuple(map(tuple, terms)), values=np.array(values))
     wide = replace(simulator, base=base, free_parameters=(*simulator.free_parameters, *further))
@@ -634,10 +634,12 @@ def identified_rows(
     return identify(model, logs, signals=signals, friction="none", doctor=False)
 
 
-def torque_rows(found: Identification, inflation: float = 1.0) -> TorqueRows:
+def torque_rows(from_torques: Identification, inflation: float = 1.0) -> TorqueRows:
     """Return an identification's rows reduced to a triangular factor.
 
     The weights include the variance inflation by correlated rows, from the scatter of segments.
     """
-    weight = found.wls.sigma * np.sqrt(inflation * max(found.errors.inflation, 1.0))
-    return TorqueRows(found.model, found.factors.weighted(weight), found.mapping.K)
+    weight = from_torques.wls.sigma * np.sqrt(inflation * max(from_torques.errors.inflation, 1.0))
+    return TorqueRows(
+        from_torques.model, from_torques.factors.weighted(weight), from_torques.mapping.K
+    )

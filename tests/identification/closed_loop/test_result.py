@@ -16,7 +16,6 @@ from robotid.identification.closed_loop.loop_result import (
     logged_motion,
     units_of,
 )
-from robotid.identification.closed_loop.loop_settings import LoopSettings
 
 #: Names of the unknowns, in the order of the fit.
 NAMES = ("rail.armature", "turn.armature", "robot.delay", "rail.viscous", "turn.viscous")
@@ -148,26 +147,6 @@ def test_a_limit_and_a_gain_at_their_lower_bound_are_findings(found):
     first = replace(limit, joints=(1,))
     (other,) = [f for f in loop_findings(at_limit(found, first, theta), ()) if f.code == "limit"]
     assert f"0.25 +- {error:.2g} N m; at the limit" in other.message
-
-
-@pytest.mark.parametrize(
-    ("stated", "cause", "remedy"),
-    [
-        ({}, "excite it. ", "Command a motion that depends more on rail.armature"),
-        ({"delay": 0.01}, "excite it, or delay in [controller] is wrong. ",
-         "Leave the delay out of [controller], so that it is fitted; command a motion"),
-        ({"kp": 9.0, "kd": 1.0}, "excite it, or kp or kd in [controller] is wrong. ",
-         "Compare kp and kd with the gains of the drive; command a motion"),
-    ],
-)  # fmt: skip
-def test_remedies_of_a_parameter_at_its_bound_name_only_what_is_stated(
-    found, stated, cause, remedy
-):
-    loop = LoopSettings(**stated)
-    at_bound = of(found, details={**found.estimate.details, "at_bound": ("rail.armature",)})
-    [finding] = (x for x in loop_findings(replace(at_bound, loop=loop), ()) if x.code == "at_bound")
-    assert f"{cause}{remedy}" in finding.message
-    assert ("delay" in finding.message) == ("delay" in stated)
 
 
 def test_encoders_are_told_with_the_figures_of_their_own_joint(found):
