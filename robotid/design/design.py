@@ -18,7 +18,7 @@ from robotid.base.typing import Array
 from robotid.design.basis import Basis, DesignedMotion
 from robotid.design.clearance import SOFT, Clearance, Contact, Nearness
 from robotid.design.information import Aim, MotionInformation, MotionRows, criterion
-from robotid.design.limits import MotionLimits, Postures
+from robotid.design.limits import Course, MotionLimits, Postures
 from robotid.design.previews import (
     CORRELATION,
     Run,
@@ -52,7 +52,8 @@ _TRIALS = 10  # shares of a motion tried for the largest that satisfies the limi
 _SHARE = 1e-3  # ... to this accuracy, or as near to a limit
 _TYPICAL = 0.3  # of the largest torque, speed and acceleration: about the RMS of a motion
 _WIDEST = 0.25  # share of the base parameters in the criterion "widest"
-_STARTED = 10  # random motions of which the best is a start
+#: Random motions of which the best is a start.
+STARTED = 10
 
 
 @dataclass(frozen=True, eq=False)
@@ -238,7 +239,7 @@ class Designer:
             return state
 
         while len(followed) < starts and not is_over():
-            random = [self.random(rng) for _ in range(_STARTED)]
+            random = [self.random(rng) for _ in range(STARTED)]
             objective, k = min((self._objective(C), k) for k, C in enumerate(random))
             multipliers = Multipliers(_WEIGHT / self._functions.shape[1])
             initial = State(random[k], objective, random[k], multipliers)
@@ -275,6 +276,16 @@ class Designer:
         if self.clearance is not None:
             contact = self.clearance.nearest(motion, duration)
         return self._assessed(motion, duration, information, used, contact)
+
+    def course(self, design: Design) -> Course:
+        """Return the course of a design at the samples at which its limits were checked.
+
+        The torque is the one that its design assumes.
+        """
+        t = np.linspace(0.0, design.duration, design.intervals + 1)
+        q, v, a = design.motion.evaluate(t)
+        torque = self.information.torque(self.information.rows(q, v, a))
+        return Course.of_motion(t, (q, v, a, torque), self.limits, self.clearance)
 
     def used_and_informed(
         self, motion: Motion, duration: float, rate: float

@@ -16,7 +16,7 @@ from robotid.base.exceptions import NotConvergedError, SettingsError
 from robotid.base.findings import listed
 from robotid.base.typing import Array
 from robotid.design.basis import DesignedMotion
-from robotid.design.design import Design, Designer
+from robotid.design.design import STARTED, Design, Designer
 from robotid.design.information import Aim
 from robotid.design.limits import LIMITS
 from robotid.dynamics.simulation.closed_loop import carried
@@ -30,7 +30,6 @@ from robotid.robot.prior import payload_spread
 _PARAMETERS = len(INERTIAL_TERMS)
 _RUNS = 2.0  # of the same noise: with the payload and without it
 _CHANGE = 10.0  # prior deviations by which friction and offsets may change between the runs
-_TRIED = 10  # random motions, of which the best shows what the joints can determine
 _OVER = 1.001  # share of a limit above which it is exceeded
 _RATE = 200.0  # [Hz] of the samples at which motions are evaluated
 
@@ -134,7 +133,7 @@ def design_payload(
 
 def _best_of_some(designer: Designer, rng: np.random.Generator) -> Array:
     """Return the information of the best of ten random motions, shape (b, b)."""
-    motions = [DesignedMotion(designer.basis, designer.random(rng)) for _ in range(_TRIED)]
+    motions = [DesignedMotion(designer.basis, designer.random(rng)) for _ in range(STARTED)]
     length = designer.basis.duration
     information = [designer.used_and_informed(motion, length, _RATE)[1] for motion in motions]
     return min(information, key=lambda F: designer.judged(F)[0])

@@ -32,9 +32,6 @@ from robotid.robot.parameters import ParameterLayout
 from robotid.robot.prior import payload_spread, prior_spread
 
 _SIGNIFICANT = 3.0  # standard errors from which a mass differs from 0
-_COM = 0.05  # ... of a determined centre of mass, as a share of the robot's length
-_INERTIA = 0.3  # ... of a determined inertia about it, as a share of the mean principal moment
-_SIGNIFICANT = 3.0  # standard errors from which a mass differs from 0
 _MASS = 0.3  # largest standard error of a determined mass, as a share of that mass,
 _SMALL = 0.05  # ... or of this share of the robot's mass
 _COM = 0.05  # ... of a determined centre of mass, as a share of the robot's length

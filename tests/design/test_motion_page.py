@@ -6,7 +6,6 @@ from helpers.pages import chart
 
 from robotid.design.basis import FourierBasis
 from robotid.design.clearance import Box, Clearance
-from robotid.design.course import Course
 from robotid.design.design import Designer
 from robotid.design.limits import LIMITS, MotionLimits
 from robotid.dynamics.prediction import predict_instants
@@ -29,7 +28,7 @@ def course():
     designer = Designer.of_model(model, FourierBasis(4.0, 3), limits)
     fine = replace(designer, finer=10)
     design = fine.checked(designer.random(np.random.default_rng(0)))
-    return model, designer, design, Course.of_design(replace(designer, clearance=around), design)
+    return model, designer, design, replace(designer, clearance=around).course(design)
 
 
 def test_a_course_has_the_values_of_the_motion_and_shares_of_its_limits(course):

@@ -6,7 +6,6 @@ import pytest
 from robotid.design import routes
 from robotid.design.basis import FourierBasis
 from robotid.design.clearance import Clearance
-from robotid.design.course import Course
 from robotid.design.design import Designer
 from robotid.design.limits import LIMITS, MotionLimits
 from robotid.design.routes import (
@@ -86,7 +85,7 @@ def test_sweeps_go_both_ways_at_each_speed_while_the_others_rest(designer, rng):
     design = design_sweeps(designer, rng, speeds=(0.1, 0.4))
     # the page shows what was checked, at the same instants
     kinds = [k for k, kind in enumerate(LIMITS) if kind != "jerk"]
-    shown = Course.of_design(designer, design)
+    shown = designer.course(design)
     np.testing.assert_allclose(shown.largest[kinds], design.used[kinds], rtol=1e-9)
     assert len(shown.t) - 1 == round(100 * design.duration)
     assert design.used.max() <= 1.0

@@ -17,8 +17,7 @@ from robotid.data.files.table_files import open_table
 from robotid.data.log import Log
 from robotid.data.signal_settings import LogSource
 from robotid.design.clearance import Clearance
-from robotid.design.course import Course
-from robotid.design.limits import LIMITS, MotionLimits
+from robotid.design.limits import LIMITS, Course, MotionLimits
 from robotid.dynamics.constraints.closed_log import closed_log
 from robotid.dynamics.prediction import predict_instants
 from robotid.estimation.fitting.evaluation import predict

@@ -10,10 +10,10 @@ from robotid.base.findings import Finding, by_severity, listed, quoted
 from robotid.identification.closed_loop.encoder_zeros import CLEAR, parallel_axes
 from robotid.identification.closed_loop.further_parameters import Tried
 from robotid.identification.closed_loop.loop_result import STATED_SCALE, LoopIdentification
+from robotid.identification.closed_loop.stages import CHANGE
 
 _SOFT = 0.5  # share of the residual that remains after a step; a larger one shows a soft loop
 _MISMATCH = 0.5  # largest relative error of a torque that the loop of its joint gives
-_CHANGE = 0.2  # largest change of a parameter by halving the steps [standard errors]
 _KNOWN = 0.1  # standard error of a known delay, relative to the range found from one response
 _POSITIVE = ("kp", "limit")  # parameters whose lower bound is more than 0
 _UNEQUAL = 3.0  # ratio of the gains of equal drives from which on they are reported
@@ -140,7 +140,7 @@ def _coarse_steps(details: Mapping[str, Any]) -> Iterator[Finding]:
     if halving > 1.0:
         message = (
             f"halving the steps of {1e3 * details['step']:.2g} ms changes a parameter by "
-            f"{halving:.1f} standard errors, wanted at most {_CHANGE}; the standard errors include "
+            f"{halving:.1f} standard errors, wanted at most {CHANGE}; the standard errors include "
             "this. Set a smaller step in [estimator]"
         )
         yield Finding("coarse_steps", "warning", "fit", message, {"halving": halving})

@@ -63,6 +63,8 @@ from robotid.identification.pipeline import identify
 from robotid.identification.result import Identification
 from robotid.robot.model import RobotModel
 
+#: Largest change of a parameter by halving the steps [standard errors].
+CHANGE = 0.2
 #: The stages of a job's fit, from reading logs to writing files.
 STAGES = (
     "reading logs", "fitting torques", "trying second-order models", "fitting loops",
@@ -78,7 +80,6 @@ _SOME = 48  # number of windows of the fits before the last improvement of initi
 _STARTS = 3  # number of fits with improved initial states of the windows
 _WINDOW, _LEAD = 2.5, 0.6  # default window and lead of closed-loop simulations [s]
 _BOTH = 2.0  # variance factor: the noise of a torque is in its rows and in the simulation it drives
-_CHANGE = 0.2  # largest change of a parameter by halving the steps [standard errors]
 _FINEST = 16.0  # largest reduction of the step
 _SETTLING = 4  # largest number of steps of parameters and initial states together
 _RAISED = 1e-2  # largest increase of the mean log residual in such a step
@@ -470,7 +471,7 @@ def refine_steps(
         half = replace(simulator, fine=ClosedLoopRobot(model, step=0.5 * step, corrects=True))
         change, error = estimator.moved(now, half, theta)
         share = float(np.max(np.abs(change) / np.maximum(error, 1e-300), initial=0.0))
-        if share <= _CHANGE or 0.5 * step < finest:
+        if share <= CHANGE or 0.5 * step < finest:
             break
         step, now = 0.5 * step, half
     now, estimate = _settled(now, estimator, estimate)
@@ -506,7 +507,7 @@ def _settled(
             return simulator, estimator.fit(simulator, first)
         change = settled.theta - estimate.theta
         simulator, estimate = initialised, settled
-        if (np.abs(change) <= _CHANGE * settled.std_error).all():
+        if (np.abs(change) <= CHANGE * settled.std_error).all():
             return simulator, estimate
     return simulator, replace(estimate, covariance=estimate.covariance + np.outer(change, change))
 
