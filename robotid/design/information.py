@@ -11,7 +11,7 @@ from robotid.base.typing import Array
 from robotid.dynamics.base_parameters import BaseMapping
 from robotid.dynamics.compiled import Tree, flatten, own_motion, row_lanes, why_not
 from robotid.dynamics.drive_columns import drive_motion
-from robotid.robot.drives import DriveMotion, DriveTerm
+from robotid.robot.drive_term import DriveMotion, DriveTerm
 from robotid.robot.model import RobotModel
 
 #: The optimality criteria.

@@ -18,7 +18,8 @@ from robotid.estimation.estimators.output_error import OutputError
 from robotid.identification.closed_loop.encoder_zeros import Encoders
 from robotid.identification.closed_loop.loop_settings import LoopSettings
 from robotid.identification.closed_loop.loop_simulator import FreeParameter, LoopSimulator
-from robotid.robot.drives import TERMS, DriveTerm, Viscous
+from robotid.robot.drive_term import DriveTerm
+from robotid.robot.drives import TERMS, Viscous
 from robotid.robot.mass_matrix import joint_mass_matrices
 from robotid.robot.model import RobotModel
 

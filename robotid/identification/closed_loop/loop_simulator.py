@@ -15,7 +15,7 @@ from robotid.dynamics.prediction import predict
 from robotid.dynamics.simulation.loops import ClosedLoopRobot, Column, Loops, RollOut, Window
 from robotid.estimation.estimators.simulator import Residual
 from robotid.robot.assumed import with_assumed_inertials
-from robotid.robot.drives import DriveTerm
+from robotid.robot.drive_term import DriveTerm
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import inertial_from_pseudo_inertia, pseudo_inertia
 
