@@ -47,10 +47,9 @@ from robotid.dynamics.simulation.loops import ClosedLoopRobot, Window, open_loop
 from robotid.estimation.fitting.estimator_settings import SimulationSettings
 from robotid.estimation.fitting.evaluation import evaluate_logs
 from robotid.estimation.fitting.survey import hold_log
-from robotid.identification.closed_loop.driven import driven_log
-from robotid.identification.closed_loop.free_parameters import LoopSimulator, free_body_parameters
-from robotid.identification.closed_loop.from_commands import identify_loops
+from robotid.identification.closed_loop.from_commands import driven_log, identify_loops
 from robotid.identification.closed_loop.loop_settings import LoopSettings
+from robotid.identification.closed_loop.loop_simulator import LoopSimulator, free_body_parameters
 from robotid.identification.closed_loop.position_errors import run_open_loop
 from robotid.identification.closed_loop.stages import stated_loops
 from robotid.identification.pipeline import identify

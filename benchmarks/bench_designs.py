@@ -17,7 +17,7 @@ from unittest import mock
 import numpy as np
 from bench_excitation import CASES, DURATION, designer
 
-from robotid.design.multipliers import Multipliers
+from robotid.design.design import Multipliers
 from robotid.design.information import criterion
 from robotid.design.limits import LIMITS
 from robotid.data.log import Trajectory

@@ -28,7 +28,7 @@ import scipy.signal
 
 from robotid.cli.work.job import read_job
 from robotid.identification.pipeline import identify
-from robotid.identification.assumptions import TorqueNoise
+from robotid.design.previews import TorqueNoise
 from robotid.design.previews import preview
 from robotid.data.log import Log
 from robotid.dynamics.torque import joint_torque_regressor

@@ -46,7 +46,7 @@ from robotid.estimation.variation.draws import scores_to_values
 from robotid.estimation.variation.groups import Group, RunsOf, runs_of, sums_of
 from robotid.estimation.variation.mixed_effects import MixedEffects, Runs, covariance_of
 from robotid.estimation.variation.variation import SCORES, Variation, _parameters, vary
-from robotid.identification.closed_loop.runs import loop_runs
+from robotid.identification.closed_loop.loop_result import loop_runs
 from robotid.identification.pipeline import identify, with_drives
 from robotid.robot.examples import example_urdf
 from robotid.robot.families import wanted_families

@@ -170,7 +170,7 @@ def test_the_notebook_of_first_steps_runs_and_shows_what_it_says(tmp_path, monke
     np.testing.assert_array_equal(ours, pinocchios)
     np.testing.assert_allclose(ours, truths, atol=0.1)
     rich = [thing for thing in shown if hasattr(thing, "_repr_html_")]
-    assert len(rich) == 5  # the identification, its table and three plots
+    assert len(rich) == 4  # the table of the identification and three plots
     assert all("<table" in x._repr_html_() or "<iframe" in x._repr_html_() for x in rich)
     assert repr(shown[-1]).startswith("<Result of ur5: 58 base parameters")
     written = {path.name for path in tmp_path.iterdir()}

@@ -14,6 +14,7 @@ from helpers.synthetic import exact_log, truth
 import robotid
 from robotid import Log, RobotModel, SignalSettings, identify, identify_payload
 from robotid.base.exceptions import DataError, RobotIdError, SettingsError
+from robotid.output.report import pictures
 
 URDF = FOLDER / "planar_2r.urdf"
 
@@ -179,8 +180,10 @@ CALLS_OF_A_RESULT = {
     "v has shape (3, 2), wanted finite speeds": lambda found, q: found.friction("joint_1", q),
     "q is 'x', wanted a finite number": lambda found, q: found.friction("joint_1", q="x"),
     "load is 'nan', wanted a finite": lambda found, q: found.friction("joint_1", load=np.nan),
-    "joint is None, a NoneType, wanted the name": lambda found, q: found.plot_why(None),
-    "recording is 5, a int, wanted": lambda found, q: found.plot_torques("joint_1", recording=5),
+    "joint is None, a NoneType, wanted the name": lambda found, q: pictures.plot_why(found, None),
+    "recording is 5, a int, wanted": lambda found, q: pictures.plot_torques(
+        found, "joint_1", recording=5
+    ),
     "name is ['wls'], wanted 'estimate' or 'wls'": lambda found, q: found.metrics(["wls"]),
     "'a\\x00b' is not a valid path": lambda found, q: robotid.save_result(found, "a\0b"),
     "'\\ud800' is not a valid path": lambda found, q: robotid.write_report(found, "\ud800"),
@@ -329,7 +332,6 @@ def test_each_public_boundary_names_the_argument_and_its_type(model, log, junk, 
         "base": lambda: robotid.read_log(path, log.joints, base=junk),
         "log": lambda: result.open_loop(junk),
         "evaluation": lambda: found.band(junk),
-        "fit": lambda: found.with_scale_of(junk),
         "own": lambda: model.with_terms(junk),
         "gravity": lambda: model.with_gravity(junk),
         "pi": lambda: model.with_parameters(junk),

@@ -113,15 +113,10 @@ class BSplineBasis(Basis):
 
 @dataclass(frozen=True, eq=False)
 class DesignedMotion(Motion):
-    """A motion q(t) = Phi(t) C.
+    """A motion q(t) = Phi(t) C."""
 
-    Attributes:
-        basis: The functions Phi of time.
-        coefficients: C, shape (size, n) [rad or m].
-    """
-
-    basis: Basis
-    coefficients: Array
+    basis: Basis  # the functions Phi of time
+    coefficients: Array  # C, shape (size, n) [rad or m]
 
     def evaluate(self, t: Array) -> tuple[Array, Array, Array]:
         q, v, a = self.basis.derivatives(t, 2) @ self.coefficients

@@ -15,11 +15,13 @@ import numpy as np
 from robotid.base.exceptions import DataError, SettingsError
 from robotid.base.findings import listed
 from robotid.base.typing import Array
-from robotid.design.along import Placements, fixed_tree
+from robotid.design.information import Placements, fixed_tree
 from robotid.dynamics.simulation.motions import Motion
 from robotid.robot.geometry import link_clouds
 from robotid.robot.model import RobotModel
 
+#: Distance whose violation has the cost of a whole limit of the motion [m].
+SOFT = 0.05
 _TRIED = 400  # random poses by which the pairs of links that may meet are found
 _DISTANT = 0.05  # [m] links whose distance is larger at all of them are checked in the end only
 _ALMOST_ALL = 0.95  # share of the poses
@@ -38,36 +40,22 @@ _SIGNS = np.array(np.meshgrid(*[[-1.0, 1.0]] * 3)).reshape(3, -1).T  # corners o
 
 @dataclass(frozen=True)
 class Box:
-    """A box at rest beside the robot, in the frame of the root link.
-
-    Attributes:
-        name: Its name.
-        low: Its lower corner [m].
-        high: Its upper corner [m].
-    """
+    """A box at rest beside the robot, in the frame of the root link."""
 
     name: str
-    low: tuple[float, float, float]
-    high: tuple[float, float, float]
+    low: tuple[float, float, float]  # its lower corner [m]
+    high: tuple[float, float, float]  # its upper corner [m]
 
 
 @dataclass(frozen=True)
 class Contact:
-    """The smallest distance between two shapes.
+    """The smallest distance between two shapes."""
 
-    Attributes:
-        first: Name of one.
-        second: Name of the other.
-        distance: Between their hulls, below 0 if they overlap [m].
-        time: Time [s].
-        required: Required distance between them [m].
-    """
-
-    first: str
-    second: str
-    distance: float
-    time: float
-    required: float = 0.0
+    first: str  # name of one
+    second: str  # name of the other
+    distance: float  # between their hulls, below 0 if they overlap [m]
+    time: float  # time [s]
+    required: float = 0.0  # required distance between them [m]
 
     @property
     def margin(self) -> float:
@@ -82,19 +70,12 @@ class Contact:
 
 @dataclass(frozen=True, eq=False)
 class Nearness:
-    """Distances of near pairs along a motion.
+    """Distances of near pairs along a motion."""
 
-    Attributes:
-        distance: Shape (pairs, N) [m]; a lower bound beyond the distance asked for.
-        pairs: Pair of each of k distances that have a gradient, shape (k,).
-        samples: Sample of each, shape (k,).
-        gradient: Of each by the n joints, shape (k, n) [m/rad or 1].
-    """
-
-    distance: Array
-    pairs: Array
-    samples: Array
-    gradient: Array
+    distance: Array  # shape (pairs, N) [m]; a lower bound beyond the distance asked for
+    pairs: Array  # pair of each of k distances that have a gradient, shape (k,)
+    samples: Array  # sample of each, shape (k,)
+    gradient: Array  # of each by the n joints, shape (k, n) [m/rad or 1]
 
 
 @dataclass(frozen=True, eq=False)

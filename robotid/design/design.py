@@ -16,26 +16,26 @@ import numpy as np
 from robotid.base.exceptions import NotConvergedError
 from robotid.base.typing import Array
 from robotid.design.basis import Basis, DesignedMotion
-from robotid.design.clearance import Clearance, Contact, Nearness
-from robotid.design.designed import Design, State
+from robotid.design.clearance import SOFT, Clearance, Contact, Nearness
 from robotid.design.information import Aim, MotionInformation, MotionRows, criterion
-from robotid.design.limits import MotionLimits
-from robotid.design.multipliers import SOFT, SPARE, Multipliers
-from robotid.design.postures import Postures
-from robotid.design.previews import Run
-from robotid.dynamics.base_parameters import structural_mapping
-from robotid.dynamics.simulation.motions import Motion
-from robotid.estimation.estimators.determination import base_spread
-from robotid.identification.assumptions import (
+from robotid.design.limits import Course, MotionLimits, Postures
+from robotid.design.previews import (
     CORRELATION,
+    Run,
     assumed_noise,
     assumed_parameters,
     largest_gravity,
     largest_torques,
 )
+from robotid.dynamics.base_parameters import structural_mapping
+from robotid.dynamics.simulation.motions import Motion
+from robotid.estimation.estimators.determination import base_spread
 from robotid.robot.model import RobotModel
 from robotid.robot.prior import prior_spread
 
+#: Share of limits reserved for the motion between the samples of a design.
+SPARE = 0.003
+_GROWTH = 3.0  # of the weight from one round to the next
 _PER_PERIOD = 14  # samples of the grid within the shortest period of a basis
 _POLISHED = 3  # times as many in the last rounds ...
 _FINER = 15  # ... and in the final check of the limits
@@ -52,41 +52,125 @@ _TRIALS = 10  # shares of a motion tried for the largest that satisfies the limi
 _SHARE = 1e-3  # ... to this accuracy, or as near to a limit
 _TYPICAL = 0.3  # of the largest torque, speed and acceleration: about the RMS of a motion
 _WIDEST = 0.25  # share of the base parameters in the criterion "widest"
-_STARTED = 10  # random motions of which the best is a start
+#: Random motions of which the best is a start.
+STARTED = 10
+
+
+@dataclass(frozen=True, eq=False)
+class Multipliers:
+    """Multipliers of the limits at each sample, and of distances."""
+
+    weight: float  # weight of the violations
+    limits: Array | float = 0.0  # shape (6, N, n); 0 at first
+    distances: Array | float = 0.0  # shape (pairs, N)
+
+    def finer(self, times: int) -> "Multipliers":
+        """Return the same on a finer grid."""
+        limits, distances = _between(self.limits, times), _between(self.distances, times)
+        return Multipliers(self.weight / times, limits, distances)
+
+    def increased(self) -> "Multipliers":
+        """Return the same with a larger weight."""
+        return replace(self, weight=_GROWTH * self.weight)
+
+    def raised(self, used: Array, distance: Array | None, aim: Array) -> "Multipliers":
+        """Return the slopes as the new multipliers.
+
+        used (6, N, n), distance (pairs, N) [m], aim (pairs, 1) [m].
+        """
+        distances = 0.0 if distance is None else self.of_distances(distance, aim)[1]
+        return replace(self, limits=self.of_limits(used)[1], distances=distances)
+
+    def of_limits(self, used: Array) -> tuple[float, Array]:
+        """Return the cost of limits and its derivative by their violations, shape (6, N, n).
+
+        used (6, N, n).
+        """
+        return self._cost(used**2 / (1.0 - SPARE) ** 2 - 1.0, self.limits)
+
+    def of_distances(self, distance: Array, aim: Array) -> tuple[float, Array]:
+        """Return the cost of distances and its derivative by their deficits, shape (pairs, N).
+
+        distance (pairs, N) [m], aim (pairs, 1) [m].
+        """
+        return self._cost((aim - distance) / SOFT, self.distances)
+
+    def distance_without_cost(self, aim: Array) -> Array:
+        """Return the distances from which there is no cost, shape (pairs, N) or (pairs, 1) [m].
+
+        aim (pairs, 1) [m].
+        """
+        return aim + SOFT / self.weight * self.distances
+
+    def _cost(self, over: Array, multipliers: Array | float) -> tuple[float, Array]:
+        pushed = np.maximum(0.0, multipliers + self.weight * over)
+        cost = float(np.sum(pushed**2 - np.square(multipliers))) / (2 * self.weight)
+        return cost, pushed
+
+
+def _between(values: Array | float, times: int) -> Array | float:
+    """Return multipliers of samples, axis 1, interpolated on as many times the intervals."""
+    if isinstance(values, float):
+        return values
+    share = np.arange(times).reshape(-1, *[1] * (values.ndim - 2)) / times
+    steps = np.diff(values, axis=1)[:, :, None]
+    shape = len(values), times * (values.shape[1] - 1), *values.shape[2:]  # maybe of no pair
+    between = (values[:, :-1, None] + share * steps).reshape(shape)
+    fine: Array = np.concatenate([between, values[:, -1:]], axis=1) / times
+    return fine
+
+
+@dataclass(frozen=True, eq=False)
+class Design:
+    """A motion, its criterion and its use of the limits."""
+
+    motion: Motion
+    duration: float  # its length [s]
+    intervals: int  # number of equal intervals between the samples at which its limits were checked
+    objective: float  # its criterion, the smaller the better
+    #: Condition number of the base problem, columns in units of the prior deviations.
+    condition: float
+    #: Largest used share of each limit, by joint, shape (6, n); 0 where there is no limit.
+    used: Array
+    contact: Contact | None = None  # where the smallest distance is; None if no pair comes near
+    seconds: float = 0.0  # computing time [s]
+    starts: int = 0  # number of completed starts
+    is_converged: bool = False  # whether the best of them has converged
+    #: Computing time [s] and criterion of each better motion.
+    history: tuple[tuple[float, float], ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """The state of a search."""
+
+    feasible: Array  # coefficients of the best motion that satisfies the limits, shape (h, n)
+    objective: float  # its criterion
+    iterate: Array  # coefficients at which the search continues; they may violate limits
+    multipliers: Multipliers  # those of the limits
+    is_settled: bool = False  # whether the search has converged
 
 
 @dataclass(frozen=True, eq=False)
 class Designer:
-    """Optimises a motion for the information about the parameters.
+    """Optimises a motion for the information about the parameters."""
 
-    Attributes:
-        information: The rows of the base problem, and their gradient.
-        limits: The robot's limits.
-        basis: Basis functions of the motion.
-        noise: Density of each joint's noise, variance times the time over which it is correlated,
-            shape (n,) [(N m)^2 s or N^2 s].
-        spread: Prior deviations of the base parameters, shape (b,).
-        standard_spread: Prior deviations of the standard parameters, shape (p,).
-        given: Prior information, shape (b, b), in units of the spread; 1 if None.
-        name: The criterion, as of ``criterion``.
-        clearance: The distances to collisions; None: they are not checked.
-        finer: Number of samples of the grid relative to a coarse one.
-        aim: The parameters of interest, if not the base parameters; there is no prior then.
-        moving: Which joints move, shape (n,), bool; all if None. The others rest where the motion
-            starts and contribute no information, since static friction may carry any load.
-    """
-
-    information: MotionInformation
-    limits: MotionLimits
-    basis: Basis
+    information: MotionInformation  # the rows of the base problem, and their gradient
+    limits: MotionLimits  # the robot's limits
+    basis: Basis  # basis functions of the motion
+    #: Density of each joint's noise, variance times the time over which it is correlated,
+    #: shape (n,) [(N m)^2 s or N^2 s].
     noise: Array
-    spread: Array
-    standard_spread: Array
-    given: Array | None = None
-    name: str = "D"
-    clearance: Clearance | None = None
-    finer: int = 1
+    spread: Array  # prior deviations of the base parameters, shape (b,)
+    standard_spread: Array  # prior deviations of the standard parameters, shape (p,)
+    given: Array | None = None  # prior information, shape (b, b), in units of the spread; 1 if None
+    name: str = "D"  # the criterion, as of ``criterion``
+    clearance: Clearance | None = None  # the distances to collisions; None: they are not checked
+    finer: int = 1  # number of samples of the grid relative to a coarse one
+    #: The parameters of interest, if not the base parameters; there is no prior then.
     aim: Aim | None = None
+    #: Which joints move, shape (n,), bool; all if None. The others rest where the motion
+    #: starts and contribute no information, since static friction may carry any load.
     moving: Array | None = None
 
     @classmethod
@@ -155,7 +239,7 @@ class Designer:
             return state
 
         while len(followed) < starts and not is_over():
-            random = [self.random(rng) for _ in range(_STARTED)]
+            random = [self.random(rng) for _ in range(STARTED)]
             objective, k = min((self._objective(C), k) for k, C in enumerate(random))
             multipliers = Multipliers(_WEIGHT / self._functions.shape[1])
             initial = State(random[k], objective, random[k], multipliers)
@@ -192,6 +276,16 @@ class Designer:
         if self.clearance is not None:
             contact = self.clearance.nearest(motion, duration)
         return self._assessed(motion, duration, information, used, contact)
+
+    def course(self, design: Design) -> Course:
+        """Return the course of a design at the samples at which its limits were checked.
+
+        The torque is the one that its design assumes.
+        """
+        t = np.linspace(0.0, design.duration, design.intervals + 1)
+        q, v, a = design.motion.evaluate(t)
+        torque = self.information.torque(self.information.rows(q, v, a))
+        return Course.of_motion(t, (q, v, a, torque), self.limits, self.clearance)
 
     def used_and_informed(
         self, motion: Motion, duration: float, rate: float

@@ -8,10 +8,10 @@ import scipy.linalg
 
 from robotid.base.exceptions import DataError, SettingsError
 from robotid.base.typing import Array
-from robotid.design.along import MotionRegressor
 from robotid.dynamics.base_parameters import BaseMapping
+from robotid.dynamics.compiled import Tree, flatten, own_motion, row_lanes, why_not
 from robotid.dynamics.drive_columns import drive_motion
-from robotid.robot.drives import DriveMotion, DriveTerm
+from robotid.robot.drive_term import DriveMotion, DriveTerm
 from robotid.robot.model import RobotModel
 
 #: The optimality criteria.
@@ -20,15 +20,75 @@ _STEP = 1e-6  # of the finite differences of drive columns, in their argument's 
 _REVERSAL = 0.01  # [rad/s or m/s] speed over which the sign of friction changes
 
 
-@dataclass(frozen=True, eq=False)
-class MotionRows:
-    """The regressor's base columns along a motion, and the quantities that their gradient needs.
+def fixed_tree(model: RobotModel) -> Tree:
+    """Return a robot with a fixed base as arrays."""
+    model.require_fixed("motion design")
+    if (why := why_not(model)) is not None:
+        raise SettingsError(f"{model.name}: no motion can be designed: {why}")
+    return flatten(model)
 
-    Attributes:
-        W: Row r, base column c at each of N samples, shape (n, b, N).
+
+class MotionRegressor:
+    """Columns of the torque regressor of a robot's bodies along motions, and their gradient.
+
+    columns (b,).
     """
 
-    W: Array
+    def __init__(self, model: RobotModel, columns: Array) -> None:
+        self._tree = fixed_tree(model)
+        self._shape = model.n_rows, len(columns)
+        wanted = np.full((model.n_rows, model.layout.n_inertial), -1)
+        is_inertial = columns < model.layout.n_inertial
+        places = np.arange(model.n_rows * len(columns)).reshape(self._shape)
+        wanted[:, columns[is_inertial]] = places[:, is_inertial]
+        self._places = self._tree.places(wanted)
+        self._work = self._tree.work_space()
+
+    def __call__(self, q: Array, v: Array, a: Array) -> Array:
+        """Return the columns at N samples, shape (n, b, N).
+
+        q (N, n) [rad, m], v (N, n) [rad/s, m/s], a (N, n) [rad/s^2, m/s^2].
+        """
+        N, lanes = len(q), row_lanes()
+        block = lanes.LANES
+        out = np.zeros((self._shape[0] * self._shape[1], -(-N // block) * block))
+        motion = own_motion(q, v, a)
+        lanes.inertial_rows(self._tree, self._places, motion, self._work, out, (0, N))
+        return out.reshape(*self._shape, -1)[..., :N]
+
+    def pull(self, q: Array, v: Array, a: Array, weights: Array) -> Array:
+        """Return the gradient of sum(weights * columns) by q, v and a, shape (3, N, n).
+
+        q (N, n) [rad, m], v (N, n) [rad/s, m/s], a (N, n) [rad/s^2, m/s^2], weights (n, b,
+        N).
+        """
+        by_column = np.array(weights.reshape(-1, len(q)), order="C")
+        motion, out = own_motion(q, v, a), np.zeros((3, *q.shape))
+        row_lanes().pull_rows(self._tree, self._places, motion, by_column, self._work, out)
+        return out
+
+
+@dataclass(frozen=True, eq=False)
+class Placements:
+    """Poses of the m bodies of a robot at N samples, in the frame of its root link."""
+
+    R: Array  # their rotations, shape (3, 3, m, N)
+    p: Array  # the origins of their joints, shape (3, m, N) [m]
+
+    @classmethod
+    def along(cls, tree: Tree, q: Array) -> "Placements":
+        """Return the poses of the bodies: q (N, n) [rad, m]."""
+        R = np.empty((3, 3, len(tree.parents), len(q)))
+        p = np.empty(R.shape[1:])
+        row_lanes().placements(tree, np.array(q, order="C"), tree.work_space(), R, p)
+        return cls(R, p)
+
+
+@dataclass(frozen=True, eq=False)
+class MotionRows:
+    """The regressor's base columns along a motion, and the quantities that their gradient needs."""
+
+    W: Array  # row r, base column c at each of N samples, shape (n, b, N)
     motion: tuple[Array, Array, Array]  # q, v, a, shape (N, n) each
     load: Array  # torque of the bodies, (N, n)
 
@@ -39,16 +99,11 @@ class MotionInformation:
 
     Drive terms depend on the current motion only: internal states are at their steady value. The
     sign of friction is tanh(w / 0.01 rad/s), so that it has a gradient.
-
-    Attributes:
-        model: The robot, with a fixed base.
-        mapping: Its base parameters.
-        beta: Base parameters by which torques are computed, shape (b,).
     """
 
-    model: RobotModel
-    mapping: BaseMapping
-    beta: Array
+    model: RobotModel  # the robot, with a fixed base
+    mapping: BaseMapping  # its base parameters
+    beta: Array  # base parameters by which torques are computed, shape (b,)
     _regressor: MotionRegressor = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -166,15 +221,12 @@ class MotionInformation:
 
 @dataclass(frozen=True, eq=False)
 class Aim:
-    """Parameters of interest other than the base parameters: some of u that determine these.
+    """Parameters of interest other than the base parameters: some of u that determine these."""
 
-    Attributes:
-        columns: Derivatives of the base parameters by each parameter, both in units of their
-            spreads, shape (b, u).
-        asked: Number of parameters of interest, the last ones; the others are nuisance parameters.
-    """
-
+    #: Derivatives of the base parameters by each parameter, both in units of their spreads,
+    #: shape (b, u).
     columns: Array
+    #: Number of parameters of interest, the last ones; the others are nuisance parameters.
     asked: int
 
     def information(self, F: Array) -> tuple[Array, Array]:

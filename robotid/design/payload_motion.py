@@ -16,8 +16,7 @@ from robotid.base.exceptions import NotConvergedError, SettingsError
 from robotid.base.findings import listed
 from robotid.base.typing import Array
 from robotid.design.basis import DesignedMotion
-from robotid.design.design import Designer
-from robotid.design.designed import Design
+from robotid.design.design import STARTED, Design, Designer
 from robotid.design.information import Aim
 from robotid.design.limits import LIMITS
 from robotid.dynamics.simulation.closed_loop import carried
@@ -31,32 +30,23 @@ from robotid.robot.prior import payload_spread
 _PARAMETERS = len(INERTIAL_TERMS)
 _RUNS = 2.0  # of the same noise: with the payload and without it
 _CHANGE = 10.0  # prior deviations by which friction and offsets may change between the runs
-_TRIED = 10  # random motions, of which the best shows what the joints can determine
 _OVER = 1.001  # share of a limit above which it is exceeded
 _RATE = 200.0  # [Hz] of the samples at which motions are evaluated
 
 
 @dataclass(frozen=True, eq=False)
 class PayloadDesign:
-    """A motion for payload identification and its expected standard errors.
+    """A motion for payload identification and its expected standard errors."""
 
-    Attributes:
-        design: The motion.
-        designer: What it was designed for, with the payload.
-        payload: The payload; a mass of 0 where none is stated.
-        moving: The joints that move.
-        std_error: Expected standard errors of its ten parameters in the link's frame by
-            ``robotid payload``, shape (10,), SI units.
-        determination: Which of them the motion determines.
-        fewer: Which the best of ten random motions of fewer joints would determine, by the joints.
-    """
-
-    design: Design
-    designer: Designer
-    payload: Payload
-    moving: tuple[str, ...]
+    design: Design  # the motion
+    designer: Designer  # what it was designed for, with the payload
+    payload: Payload  # the payload; a mass of 0 where none is stated
+    moving: tuple[str, ...]  # the joints that move
+    #: Expected standard errors of its ten parameters in the link's frame by ``robotid
+    #: payload``, shape (10,), SI units.
     std_error: Array
-    determination: Determination
+    determination: Determination  # which of them the motion determines
+    #: Which the best of ten random motions of fewer joints would determine, by the joints.
     fewer: dict[tuple[str, ...], Determination]
 
     def described(self) -> list[str]:
@@ -143,7 +133,7 @@ def design_payload(
 
 def _best_of_some(designer: Designer, rng: np.random.Generator) -> Array:
     """Return the information of the best of ten random motions, shape (b, b)."""
-    motions = [DesignedMotion(designer.basis, designer.random(rng)) for _ in range(_TRIED)]
+    motions = [DesignedMotion(designer.basis, designer.random(rng)) for _ in range(STARTED)]
     length = designer.basis.duration
     information = [designer.used_and_informed(motion, length, _RATE)[1] for motion in motions]
     return min(information, key=lambda F: designer.judged(F)[0])

@@ -22,19 +22,18 @@ from typing import Any
 
 import numpy as np
 
-from robotid.base.exceptions import DataError
+from robotid.base.exceptions import DataError, SettingsError
 from robotid.base.findings import listed
-from robotid.base.settings import require_kind
+from robotid.base.settings import SIZE, is_number, require_kind
 from robotid.base.typing import Array
-from robotid.data.files.read import Readable, read_logs
-from robotid.data.log import Log
+from robotid.data.files.read import Readable
+from robotid.data.log import Log, suggestion
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.smoothing import low_pass
 from robotid.diagnosis.logs.motion_checks import excitation_finding
 from robotid.dynamics.base_parameters import BaseMapping, structural_mapping
-from robotid.dynamics.constraint_rows import logged_base
 from robotid.dynamics.factors import Factors, compress, join, merge
-from robotid.dynamics.prediction import predict
+from robotid.dynamics.prediction import predict, predict_instants
 from robotid.dynamics.used_rows import base_problem, independent_share
 from robotid.estimation.estimators import Estimate
 from robotid.estimation.estimators.batch import solve_factor
@@ -47,19 +46,20 @@ from robotid.estimation.fitting.evaluation import evaluate_logs
 from robotid.estimation.fitting.recorded import Recordings
 from robotid.estimation.fitting.standard_errors import StandardErrors, about_prior, standard_of
 from robotid.estimation.fitting.survey import SurveyedLog, hold_log
-from robotid.identification.assumptions import (
-    FAINTEST,
-    TorqueNoise,
-    assumed_noise,
-    assumed_parameters,
-    largest_torques,
-)
+from robotid.identification.pipeline import logs_of
 from robotid.identification.result import Identification
 from robotid.robot.assumed import with_assumed_inertials
 from robotid.robot.closure import refuse_loops
 from robotid.robot.model import RobotModel
 from robotid.robot.prior import prior_spread
 
+#: Assumed correlation time of noise [s].
+CORRELATION = 0.1
+_NOISE = 0.01  # assumed standard deviation of noise, as a share of the largest torque
+_FRICTION = 0.05  # assumed Coulomb friction, and viscous at full speed, as such a share
+_POSES = 200  # random poses at which gravity is evaluated
+#: Smallest largest torque of a joint, as a share of that of all joints.
+FAINTEST = 1e-3
 #: Typical weight of a consistent fit's prior with "auto", and the plausible weight: the largest one
 #: that held-out segments do not reject, for robots that differ from their URDF as much.
 _WEIGHT = (10.0, 1.0)
@@ -69,26 +69,109 @@ _IMPULSE = 40.0  # periods of the filter after which its impulse response is 0
 
 
 @dataclass(frozen=True, eq=False)
-class Run:
-    """An earlier recording and its identification.
+class TorqueNoise:
+    """Noise of the torque of each joint.
 
     Attributes:
-        segments: Factors of its segments, for base parameters.
-        standard: The identified parameters, shape (p,).
-        squares: As of ``Reduction``.
-        samples: As of ``Reduction``.
-        share: Share of its samples that count as independent [-].
-        step: Time between two samples [s].
-        weight: Weight of the prior selected by its fit, and the plausible one; None if its fit
-            selected none.
+        std: Standard deviation of each joint, shape (n,) [N m or N].
+        correlation: Time over which it is correlated, shape (n,) [s]; 0 for white noise.
+        origins: Origin for each joint: "stated", "assumed", or "found" in an earlier run.
     """
 
-    segments: tuple[Factors, ...]
-    standard: Array
-    squares: Array
-    samples: int
-    share: float
-    step: float
+    std: Array
+    correlation: Array
+    origins: tuple[str, ...]
+
+    def last(self, count: int) -> "TorqueNoise":
+        """Return the noise of the last rows, those of the joints."""
+        return TorqueNoise(self.std[-count:], self.correlation[-count:], self.origins[-count:])
+
+    def density(self, step: float) -> Array:
+        """Return the density of each joint's noise at low frequency, shape (n,) [(N m)^2 s]."""
+        density: Array = self.std**2 * np.maximum(self.correlation, step)
+        return density
+
+
+def assumed_noise(
+    model: RobotModel,
+    size: Array,
+    stated: Mapping[str, float],
+    correlation: float | None = None,
+    earlier: TorqueNoise | None = None,
+) -> TorqueNoise:
+    """Return the noise of each joint: stated, or of an earlier run, or assumed.
+
+    The assumed noise is 1 % of the joint's largest torque.
+
+    size (n,) [N m or N].
+    """
+    for joint, value in stated.items():
+        if joint not in model.joints:
+            raise SettingsError(
+                f"noise is stated for {joint!r}, which is not among the joints "
+                f"{listed(model.joints)}{suggestion(str(joint), model.joints)}"
+            )
+        if not (is_number(value) and SIZE.holds(value)):
+            raise SettingsError(f"noise of {joint!r} is {value!r}, wanted {SIZE.words}")
+    if correlation is not None and not 0 <= correlation < np.inf:
+        raise SettingsError(f"correlation is {correlation:g} s, wanted 0 (white noise) or more")
+    is_stated = np.isin(model.joints, list(stated))
+    values = np.array([stated.get(joint, np.nan) for joint in model.joints])
+    std = _NOISE * size if earlier is None else earlier.std
+    time = np.full(len(size), CORRELATION) if earlier is None else earlier.correlation
+    if correlation is not None:
+        time = np.where(is_stated | (earlier is None), correlation, time)
+    other = "assumed" if earlier is None else "found"
+    origins = tuple("stated" if is_known else other for is_known in is_stated)
+    return TorqueNoise(np.where(is_stated, values, std), time, origins)
+
+
+def largest_gravity(model: RobotModel) -> Array:
+    """Return the largest gravity torque of each joint over random poses, shape (n,)."""
+    ranges = [(j.lower, j.upper) if j.has_limits else (-np.pi, np.pi) for j in model.limits]
+    low, high = np.array(ranges).T
+    q = np.random.default_rng(0).uniform(low, high, (_POSES, len(ranges)))
+    torque: Array = np.abs(predict_instants(model, model.standard_parameters(), q)).max(axis=0)
+    return torque
+
+
+def largest_torques(model: RobotModel, peak: Array) -> Array:
+    """Return the largest torque of each joint, shape (n,): the URDF's limit, or that of a motion.
+
+    peak (n,) [N m or N].
+    """
+    peak = np.maximum(peak, FAINTEST * max(float(peak.max()), 1e-300))
+    limit = np.array([joint.effort for joint in model.limits])
+    return np.where(np.isfinite(limit) & (limit > 0), limit, peak)
+
+
+def assumed_parameters(model: RobotModel, size: Array, fastest: Array) -> Array:
+    """Return the URDF's bodies with friction of a typical size, shape (p,).
+
+    size (n,) [N m or N], fastest (n,) [rad/s or m/s].
+    """
+    pi = model.standard_parameters()
+    for j, limits in enumerate(model.limits):
+        speed = limits.velocity if 0 < limits.velocity < np.inf else max(float(fastest[j]), 1e-3)
+        for term, value in (("coulomb", 1.0), ("viscous", 1.0 / speed)):
+            name = f"{model.joints[j]}.{term}"
+            if name in model.layout.names:
+                pi[model.layout.names.index(name)] = _FRICTION * size[j] * value
+    return pi
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """An earlier recording and its identification."""
+
+    segments: tuple[Factors, ...]  # factors of its segments, for base parameters
+    standard: Array  # the identified parameters, shape (p,)
+    squares: Array  # as of ``Reduction``
+    samples: int  # as of ``Reduction``
+    share: float  # share of its samples that count as independent [-]
+    step: float  # time between two samples [s]
+    #: Weight of the prior selected by its fit, and the plausible one; None if its fit
+    #: selected none.
     weight: tuple[float, float] | None = None
 
     @classmethod
@@ -167,10 +250,10 @@ class Preview:
     between: tuple[Array | None, ...] = ()
 
     def __repr__(self) -> str:
-        determined, found = self.expected.determination, self.expected
+        determined, expected = self.expected.determination, self.expected
         return (
-            f"<Preview of {found.model.name}: {determined.rank} of {len(determined.names)} base "
-            f"parameters determined by {len(found.fitted)} motions>"
+            f"<Preview of {expected.model.name}: {determined.rank} of {len(determined.names)} base "
+            f"parameters determined by {len(expected.fitted)} motions>"
         )
 
     @property
@@ -200,16 +283,16 @@ class Preview:
     @property
     def bands(self) -> tuple[TorqueBand, ...]:
         """Expected band of each motion's predicted torques."""
-        found = self.expected
-        between = self.between or (None,) * len(found.fitted)
-        return tuple(map(expected_band, repeat(found), found.fitted, between))
+        expected = self.expected
+        between = self.between or (None,) * len(expected.fitted)
+        return tuple(map(expected_band, repeat(expected), expected.fitted, between))
 
     @property
     def words(self) -> str:
         """What the motions determine, and what they do not determine, as text."""
-        found = self.expected
-        names = listed(dict.fromkeys(e.recording.log.name for e in found.fitted))
-        return excitation_finding(found.wls, found.determination, names).message
+        expected = self.expected
+        names = listed(dict.fromkeys(e.recording.log.name for e in expected.fitted))
+        return excitation_finding(expected.wls, expected.determination, names).message
 
 
 def preview(
@@ -253,17 +336,14 @@ def preview(
     model = model if isinstance(model, RobotModel) else RobotModel.from_urdf(model)
     model = with_assumed_inertials(model)
     if given is not None:
-        model, settings = given.model, signals or given.asked.signals
+        model, settings = given.model, signals or given.stated.signals
         logs = [hold_log(model, e.recording.log, e.recording.signals) for e in given.fitted]
         recordings = Recordings(model, given.mapping, logs)
         run = Run.of(recordings, given.standard, given.estimate.details)
-    read = read_logs(
-        motions, model.joints, prismatic=model.layout.prismatic, needs="motion",
-        base=logged_base(model), passive=model.passive, robot=model.tree.movable,
-    )  # fmt: skip
+    read = logs_of(model, motions, "motion")
     in_memory = [hold_log(model, motion, settings) for motion in read]
-    found = preview_logs(model, in_memory, choice, noise=noise, run=run)
-    return found if given is None else replace(found, between=(given.between,) * len(in_memory))
+    ahead = preview_logs(model, in_memory, choice, noise=noise, run=run)
+    return ahead if given is None else replace(ahead, between=(given.between,) * len(in_memory))
 
 
 def preview_logs(
@@ -294,8 +374,10 @@ def preview_logs(
     for motion in motions:
         _expect(motion, pi)
     if not isinstance(noise, TorqueNoise):
-        found = None if earlier is None else earlier.noise(mapping.K).last(len(model.joints))
-        noise = assumed_noise(model, size, noise or {}, correlation, found)
+        residual_noise = (
+            None if earlier is None else earlier.noise(mapping.K).last(len(model.joints))
+        )
+        noise = assumed_noise(model, size, noise or {}, correlation, residual_noise)
     information = _Information.of(model, mapping, motions, noise)
     information = information if run is None else information.added_to(run)
     prior, spread = (
@@ -467,10 +549,10 @@ def _least_squares(information: _Information, known: Known, sigma: Array) -> Est
     solution = solve_factor(information.factors, sigma, known.beta)
     bread = solution.covariance
     covariance = bread @ information.meat(known.mapping.K, sigma) @ bread
-    found = solution.estimate(
+    least_squares = solution.estimate(
         information.factors.names, covariance, information.sigma, 0, "expected"
     )
-    return replace(found, theta=known.beta)
+    return replace(least_squares, theta=known.beta)
 
 
 def _expected(

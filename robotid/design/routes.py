@@ -9,8 +9,7 @@ import numpy as np
 from robotid.base.exceptions import SettingsError
 from robotid.base.typing import Array
 from robotid.design.clearance import Contact
-from robotid.design.design import Designer
-from robotid.design.designed import Design
+from robotid.design.design import Design, Designer
 from robotid.dynamics.simulation.motions import Motion
 
 _RAMP = 0.25  # [s] until a sweep has its speed
@@ -33,18 +32,12 @@ class Route(Motion):
     On a line the speed rises smoothly, is constant and falls: the path parameter s of duration 1
     has the speed V (10 x^3 - 15 x^4 + 6 x^5) with x = u / r while u < r, then V = 1 / (1 - r), and
     falls symmetrically.
-
-    Attributes:
-        places: The postures, shape (K, n) [rad or m].
-        times: Duration of each line, shape (K - 1,) [s].
-        ramps: Share r of it in which the speed rises, shape (K - 1,), at most 0.5.
-        holds: Time at rest at each posture, shape (K,) [s].
     """
 
-    places: Array
-    times: Array
-    ramps: Array
-    holds: Array
+    places: Array  # the postures, shape (K, n) [rad or m]
+    times: Array  # duration of each line, shape (K - 1,) [s]
+    ramps: Array  # share r of it in which the speed rises, shape (K - 1,), at most 0.5
+    holds: Array  # time at rest at each posture, shape (K,) [s]
 
     @cached_property
     def _starts(self) -> Array:

@@ -123,8 +123,9 @@ class Tree(NamedTuple):
 
     def work_space(self) -> Array:
         """Return a new work space for ``row_lanes``."""
-        lanes = row_lanes()
-        work: Array = lanes.work_space(lanes.rows_size(*self.rows.shape))
+        from robotid.dynamics.kernels.lanes import work_space  # imports Numba
+
+        work: Array = work_space(row_lanes().rows_size(*self.rows.shape))
         return work
 
     def places(self, wanted: Array) -> Array:

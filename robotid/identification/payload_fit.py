@@ -1,8 +1,9 @@
-"""Payload identification from a run with and a run without it, and gains from a known mass."""
+"""Payloads of links from a run with and a run without them, and gains from a known mass."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -10,11 +11,10 @@ from robotid.base.exceptions import DataError, NotConvergedError, SettingsError
 from robotid.base.findings import listed
 from robotid.base.settings import is_number, require_each, require_kind
 from robotid.base.typing import Array
-from robotid.data.files.read import Readable, read_logs
+from robotid.data.files.read import Readable
 from robotid.data.signal_settings import SignalSettings
 from robotid.diagnosis.verdict.payload_check import PayloadCheck
 from robotid.dynamics.base_parameters import structural_mapping
-from robotid.dynamics.constraint_rows import logged_base
 from robotid.dynamics.factors import join
 from robotid.estimation.estimators import Consistent, Constraints, Estimate
 from robotid.estimation.estimators.segments import quantile
@@ -22,11 +22,10 @@ from robotid.estimation.estimators.two_runs import Compared, TwoRuns, payload_ru
 from robotid.estimation.fitting.estimator_settings import ConsistentSettings
 from robotid.estimation.fitting.recorded import Recordings
 from robotid.estimation.fitting.survey import hold_log
-from robotid.identification.payload_estimate import Gain, PayloadFit, payload_of
-from robotid.identification.pipeline import robot_of, with_drives
+from robotid.identification.pipeline import logs_of, robot_of, with_drives
 from robotid.robot.bodies import link_transfer, usual_links
 from robotid.robot.closure import refuse_loops
-from robotid.robot.drives import DriveTerm
+from robotid.robot.drive_term import DriveTerm
 from robotid.robot.families import AUTO, wanted_families
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import ParameterLayout
@@ -41,6 +40,222 @@ _SAME = 1e-3  # of the largest column of a link: below, motion does not determin
 _MOST_LOADS = 20  # fits until the joint load torque is that of the identified bodies
 _CONVERGED = 1e-4  # relative change of the parameters at convergence
 _FREE = 1e-9  # weight of the prior in the fit that makes a payload consistent: none
+
+
+@dataclass(frozen=True, eq=False)
+class Payload:
+    """Payload of a link, in the frame of the link.
+
+    Attributes:
+        link: The link.
+        mass: Mass [kg].
+        mass_std_error: Its standard error [kg]; 0 if the mass was stated.
+        mass_interval: 95 % interval of it, shape (2,) [kg].
+        com: Centre of mass, shape (3,) [m].
+        com_std_error: Its standard errors, shape (3,) [m].
+        inertia: Inertia about the centre of mass, axes of the link, shape (3, 3) [kg m^2].
+        inertia_std_error: Its standard errors, shape (3, 3) [kg m^2].
+        reasons: Why some of "com" and "inertia" are not determined, by name.
+    """
+
+    link: str
+    mass: float
+    mass_std_error: float
+    mass_interval: Array
+    com: Array
+    com_std_error: Array
+    inertia: Array
+    inertia_std_error: Array
+    reasons: Mapping[str, str]
+
+    @property
+    def determined(self) -> tuple[str, ...]:
+        """Those of "mass", "com" and "inertia" that the motion determines."""
+        return tuple(name for name in ("mass", "com", "inertia") if name not in self.reasons)
+
+    @property
+    def inertia_at_link(self) -> Array:
+        """Inertia about the origin of the link's frame, shape (3, 3) [kg m^2]."""
+        c = self.com
+        inertia: Array = self.inertia + self.mass * (c @ c * np.eye(3) - np.outer(c, c))
+        return inertia
+
+    @property
+    def parameters(self) -> Array:
+        """The ten inertial parameters in the link's frame, shape (10,)."""
+        (xx, xy, xz), (_, yy, yz), (_, _, zz) = self.inertia_at_link.tolist()
+        return np.array([self.mass, *(self.mass * self.com), xx, xy, yy, xz, yz, zz])
+
+    def lines(self) -> list[str]:
+        """Return mass, centre of mass and inertia as text, or why they are not determined."""
+        low, high = self.mass_interval.tolist()
+        known = "known" if self.mass_std_error == 0 else f"95 %: [{low:.4g}, {high:.4g}]"
+        lines = [f"{self.link}: {self.mass:.4g} +- {self.mass_std_error:.2g} kg, {known}"]
+        shown = (
+            ("com", "centre of mass", "m", self.com, self.com_std_error),
+            ("inertia", "inertia about it, diagonal", "kg m^2",
+             np.diag(self.inertia), np.diag(self.inertia_std_error)),
+        )  # fmt: skip
+        for key, words, unit, values, errors in shown:
+            pairs = zip(values.tolist(), errors.tolist(), strict=True)
+            figures = ", ".join(f"{x:.3g} +- {error:.2g}" for x, error in pairs)
+            why = self.reasons.get(key)
+            lines.append(f"  {words}: {f'{figures} {unit}' if why is None else why}")
+        return lines
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain values, None for what is not determined."""
+        values = {
+            "mass": self.mass,
+            "mass_std_error": self.mass_std_error,
+            "mass_interval": self.mass_interval.tolist(),
+        }
+        for name in ("com", "inertia"):
+            for key in (name, f"{name}_std_error"):
+                values[key] = getattr(self, key).tolist() if name in self.determined else None
+        if "inertia" in self.determined:
+            values["inertia_at_link"] = self.inertia_at_link.tolist()
+        return {
+            "link": self.link,
+            **values,
+            "determined": list(self.determined),
+            "reasons": dict(self.reasons),
+        }
+
+
+@dataclass(frozen=True)
+class Gain:
+    """Torque per current of a joint.
+
+    Attributes:
+        value: The gain [N m/A or N/A].
+        std_error: Its standard error [same].
+        interval: 95 % interval [same].
+    """
+
+    value: float
+    std_error: float
+    interval: tuple[float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class PayloadFit:
+    """Identified payloads, and gains identified from a known payload.
+
+    Attributes:
+        model: The robot.
+        payloads: One per link.
+        gains: Identified gains, by joint.
+        names: Names of the base parameters of the robot without payloads.
+        base: Base parameters, shape (b,), SI units.
+        base_error: Their standard errors, shape (b,), including the uncertainty of the gains.
+        unexplained: Relative torque error of each joint, shape (n,) [-].
+        checks: Known masses against those that torque alone determines, by link.
+    """
+
+    model: RobotModel
+    payloads: tuple[Payload, ...]
+    gains: Mapping[str, Gain]
+    names: tuple[str, ...]
+    base: Array
+    base_error: Array
+    unexplained: Array
+    checks: Mapping[str, PayloadCheck] = field(default_factory=dict)
+
+    def __str__(self) -> str:
+        every = [line for payload in self.payloads for line in payload.lines()]
+        every += [check.message for check in self.checks.values()]
+        every += [
+            f"gain of {joint}: {gain.value:.4g} +- {gain.std_error:.2g} "
+            f"[{gain.interval[0]:.4g}, {gain.interval[1]:.4g}]"
+            for joint, gain in self.gains.items()
+        ]
+        left = zip(self.model.row_names, 100 * self.unexplained, strict=True)
+        every.append(f"torque error [%]: {', '.join(f'{j} {x:.1f}' for j, x in left)}")
+        return "\n".join(every)
+
+    def __repr__(self) -> str:
+        every = (f"{p.link} {p.mass:.4g} +- {p.mass_std_error:.2g} kg" for p in self.payloads)
+        return f"<PayloadFit of {self.model.name}: {', '.join(every)}>"
+
+    def __getitem__(self, link: str) -> Payload:
+        return next(payload for payload in self.payloads if payload.link == link)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain values, as ``robotid payload --json`` prints them."""
+        content: dict[str, Any] = {
+            "robot": self.model.name,
+            "payloads": [payload.to_dict() for payload in self.payloads],
+            "mass_checks": [check.to_dict() for check in self.checks.values()],
+            "relative_error_pct": dict(
+                zip(self.model.row_names, (100 * self.unexplained).tolist(), strict=True)
+            ),
+        }
+        if self.gains:
+            rows = zip(self.names, self.base.tolist(), self.base_error.tolist(), strict=True)
+            content["gains"] = {
+                j: {"gain": g.value, "std_error": g.std_error, "interval": list(g.interval)}
+                for j, g in self.gains.items()
+            }
+            content["base_parameters"] = [
+                {"name": name, "value": value, "std_error": error} for name, value, error in rows
+            ]
+        return content
+
+
+def payload_of(model: RobotModel, link: str, x: Array, C: Array, freedom: Array) -> Payload:
+    """Return a payload from its ten parameters; first-order errors of derived quantities.
+
+    x (10,), C (10, 10), freedom (10,).
+    """
+    step = 1e-20  # complex-step derivative: exact
+    shown = _about_com(x)
+    J = np.column_stack([_about_com(x + 1j * step * e).imag / step for e in np.eye(10)])
+    errors = np.sqrt(np.maximum(np.diag(J @ C @ J.T), 0.0))
+    mass, error, t = float(x[0]), float(np.sqrt(C[0, 0])), float(quantile(freedom[:1])[0])
+    com, com_error = shown[:3], errors[:3]
+    inertia, inertia_error = _matrix(shown[3:]), _matrix(errors[3:])
+    moment, largest = float(np.trace(inertia)) / 3, float(inertia_error.max())
+    reasons = {}
+    if com_error.max() > _COM * model.length:
+        reasons["com"] = (
+            f"its standard error of {com_error.max():.2g} m is too large; record poses of {link} "
+            "about all axes"
+        )
+    if largest > _INERTIA * moment:
+        reasons["inertia"] = (
+            f"{link} rotates too little: an inertia about the centre of mass of about "
+            f"{moment:.2g} kg m^2 would have a standard error of {largest:.2g}; record fast motion "
+            "of the joints next to it, about all axes"
+        )
+    if error > 0 and mass < _SIGNIFICANT * error:
+        words = f"the payload on {link} does not differ significantly from 0 kg"
+        reasons = dict.fromkeys(("com", "inertia"), words)
+    return Payload(
+        link,
+        mass,
+        error,
+        np.array([mass - t * error, mass + t * error]),
+        com.real,
+        com_error,
+        inertia,
+        inertia_error,
+        reasons,
+    )
+
+
+def _about_com(x: Array) -> Array:
+    """Return centre of mass and inertia about it, xx xy yy xz yz zz, of ten parameters, (9,)."""
+    m, mc = x[0], x[1:4]
+    steiner = (mc @ mc * np.eye(3) - np.outer(mc, mc)) / m
+    i, j = (0, 0, 1, 0, 1, 2), (0, 1, 1, 2, 2, 2)
+    return np.concatenate([mc / m, x[4:] - steiner[i, j]])
+
+
+def _matrix(entries: Array) -> Array:
+    """Return the symmetric matrix of xx xy yy xz yz zz, shape (3, 3)."""
+    xx, xy, yy, xz, yz, zz = entries.tolist()
+    return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
 
 
 class UndeterminedMassError(DataError):
@@ -97,17 +312,7 @@ def identify_payload(
     _check_gains(model, unknown_gains)
     settings, mapping = signals or SignalSettings(), structural_mapping(model)
     wanted_families(friction, model.joints)
-    read = [
-        read_logs(
-            given,
-            model.joints,
-            prismatic=model.layout.prismatic,
-            base=logged_base(model),
-            passive=model.passive,
-            robot=model.tree.movable,
-        )
-        for given in (logs, reference)
-    ]
+    read = [logs_of(model, given) for given in (logs, reference)]
     loaded, without = (
         Recordings(model, mapping, [hold_log(model, log, settings) for log in some])
         for some in read
@@ -123,19 +328,19 @@ def identify_payload(
     def fitted(runs: Sequence[Recordings]) -> PayloadFit:
         return fit_payloads(*runs, links=links, masses=masses or {}, unknown_gains=unknown_gains)
 
-    found = fitted((loaded, without))
-    gain = np.array([found.gains[j].value if j in found.gains else 1.0 for j in model.joints])
+    fit = fitted((loaded, without))
+    gain = np.array([fit.gains[j].value if j in fit.gains else 1.0 for j in model.joints])
     judged = without
-    if found.gains:  # friction is a torque, not a current
+    if fit.gains:  # friction is a torque, not a current
         torques = [replace(log, tau=gain * log.tau) for log in read[1]]
         judged = replace(without, fitted=[hold_log(model, log, settings) for log in torques])
     own = own_friction(judged, friction)
     if own:
         loaded, without = (run.with_model(model.with_terms(own)) for run in (loaded, without))
-        found = fitted((loaded, without))
+        fit = fitted((loaded, without))
     if masses and not unknown_gains:
-        found = replace(found, checks=mass_checks(loaded, without, masses=masses, links=links))
-    return found
+        fit = replace(fit, checks=mass_checks(loaded, without, masses=masses, links=links))
+    return fit
 
 
 def _check_gains(model: RobotModel, unknown: Sequence[str]) -> None:
@@ -169,14 +374,14 @@ def mass_checks(
     """Return known masses of payloads against those that torque alone determines, by link."""
     _check_known(loaded.model, links or tuple(masses), masses, ())
     try:
-        found = fit_payloads(loaded, reference, links=links or tuple(masses), masses={})
+        free = fit_payloads(loaded, reference, links=links or tuple(masses), masses={})
     except UndeterminedMassError:
         return {link: PayloadCheck(link, mass) for link, mass in masses.items()}
     checks = {}
     for link, mass in masses.items():
-        own = found[link]
-        low, high = own.mass_interval.tolist()
-        checks[link] = PayloadCheck(link, mass, own.mass, own.mass_std_error, (low, high))
+        payload = free[link]
+        low, high = payload.mass_interval.tolist()
+        checks[link] = PayloadCheck(link, mass, payload.mass, payload.mass_std_error, (low, high))
     return checks
 
 
@@ -201,11 +406,11 @@ def fit_payloads(
             run.with_model(run.model.with_reference(pi))
             for run, pi in ((reference, bodies), (loaded, bodies + payload))
         )
-        found = _fit(other, ground, links, masses, unknown_gains)
-        size = float(np.linalg.norm(found.base))
+        fit = _fit(other, ground, links, masses, unknown_gains)
+        size = float(np.linalg.norm(fit.base))
         if abs(size - before) < _CONVERGED * size:
-            return found
-        bodies, payload = _loads(found, ground)
+            return fit
+        bodies, payload = _loads(fit, ground)
         before = size
     raise NotConvergedError(
         f"the joint load torque has not converged after {_MOST_LOADS} fits; use friction = "
@@ -240,8 +445,8 @@ def _fit(
         share=min(loaded.share, reference.share),
         unknown=[model.joints.index(joint) for joint in unknown_gains],
     )
-    found = runs.compare()
-    x, C, freedom = _payload_parameters(found, known)
+    compared = runs.compare()
+    x, C, freedom = _payload_parameters(compared, known)
     for k, link in enumerate(links):
         _check_mass(model, link, x[10 * k], np.sqrt(C[10 * k, 10 * k]), link in masses)
     possible = _possible(model, links, x, C, masses)
@@ -254,20 +459,20 @@ def _fit(
     return PayloadFit(
         model,
         payloads,
-        _gains(model, runs, found),
+        _gains(model, runs, compared),
         loaded.mapping.base_names,
-        found.theta[:b],
-        np.sqrt(np.diag(found.covariance)[:b]),
-        found.unexplained,
+        compared.theta[:b],
+        np.sqrt(np.diag(compared.covariance)[:b]),
+        compared.unexplained,
     )
 
 
-def _loads(found: PayloadFit, reference: Recordings) -> tuple[Array, Array]:
+def _loads(fit: PayloadFit, reference: Recordings) -> tuple[Array, Array]:
     """Return the standard parameters that load the gears, and the part of the payloads."""
     model = reference.model
-    bodies = reference.mapping.to_standard(found.base, model.standard_parameters())
+    bodies = reference.mapping.to_standard(fit.base, model.standard_parameters())
     added = np.zeros_like(bodies)
-    for payload in found.payloads:
+    for payload in fit.payloads:
         body, transfer = link_transfer(model, payload.link)
         added[10 * body : 10 * body + 10] += transfer @ payload.parameters
     return bodies, added
@@ -323,13 +528,13 @@ def _check_known(
         )
 
 
-def _payload_parameters(found: Compared, known: Array) -> tuple[Array, Array, Array]:
+def _payload_parameters(compared: Compared, known: Array) -> tuple[Array, Array, Array]:
     """Return all ten parameters of each payload, their covariance and degrees of freedom."""
     x, C = np.nan_to_num(known), np.zeros((len(known), len(known)))
     freedom, free = np.full(len(known), np.inf), np.flatnonzero(np.isnan(known))
-    at = slice(len(found.theta) - len(free), len(found.theta))
-    x[free], freedom[free] = found.theta[at], found.freedom[at]
-    C[np.ix_(free, free)] = found.covariance[at, at]
+    at = slice(len(compared.theta) - len(free), len(compared.theta))
+    x[free], freedom[free] = compared.theta[at], compared.freedom[at]
+    C[np.ix_(free, free)] = compared.covariance[at, at]
     return x, C, freedom
 
 
@@ -378,13 +583,13 @@ def _possible(
     return fit.project(start).theta
 
 
-def _gains(model: RobotModel, runs: TwoRuns, found: Compared) -> dict[str, Gain]:
-    first = len(found.theta)
-    error = np.sqrt(np.diag(found.covariance)[first:])  # of the logarithm
-    half_width = quantile(found.freedom[first:]) * error
+def _gains(model: RobotModel, runs: TwoRuns, compared: Compared) -> dict[str, Gain]:
+    first = len(compared.theta)
+    error = np.sqrt(np.diag(compared.covariance)[first:])  # of the logarithm
+    half_width = quantile(compared.freedom[first:]) * error
     gains = {}
     for k, j in enumerate(runs.unknown):
-        value = float(found.gain[j])
+        value = float(compared.gain[j])
         ends = sorted((value * np.exp([-half_width[k], half_width[k]])).tolist())
         gains[model.joints[j]] = Gain(value, abs(value) * float(error[k]), (ends[0], ends[1]))
     return gains

@@ -17,7 +17,8 @@ from robotid.base.exceptions import (
 from robotid.base.findings import Finding, not_ignored
 from robotid.base.settings import require_flag, require_kind
 from robotid.base.typing import ProgressCallback, ignore_progress, report_stage
-from robotid.data.files.read import Readable, read_logs
+from robotid.data.files.read import Needs, Readable, read_logs
+from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
 from robotid.diagnosis.logs.check_logs import diagnose
 from robotid.diagnosis.residual.discrepancies import explain_residual
@@ -31,6 +32,7 @@ from robotid.diagnosis.urdf.inertials import (
     impossible_inertials,
 )
 from robotid.diagnosis.verdict.fit_findings import fit_findings, log_findings, not_written
+from robotid.diagnosis.verdict.scale_check import check_scale
 from robotid.diagnosis.verdict.unlike_runs import rescaled_findings, unlike_findings
 from robotid.diagnosis.verdict.verdict import blocking, check_ignored, rejected, warnings_of
 from robotid.dynamics.base_parameters import structural_mapping
@@ -43,7 +45,7 @@ from robotid.estimation.fitting.selected_drives import DriveChoice
 from robotid.estimation.fitting.survey import hold_log
 from robotid.estimation.variation.variation import vary
 from robotid.identification.repeated_errors import with_repeated_errors
-from robotid.identification.result import Asked, Identification
+from robotid.identification.result import Identification, StatedSettings
 from robotid.robot.assumed import with_assumed_inertials
 from robotid.robot.families import AUTO, wanted_families
 from robotid.robot.model import RobotModel
@@ -75,26 +77,28 @@ def identify(
     settings = signals or SignalSettings()
     report_stage(progress, "reading logs")
     model = robot_of(model, logs)
-    first, second = (
-        read_logs(
-            some,
-            model.joints,
-            prismatic=model.layout.prismatic,
-            base=logged_base(model),
-            passive=model.passive,
-            robot=model.tree.movable,
-        )
-        for some in (logs, validation)
-    )
+    first, second = (logs_of(model, given) for given in (logs, validation))
     if not first:
         raise DataError("no log was given; at least one is needed to identify anything")
     fitted, held_out = (
         [hold_log(model, log, settings) for log in some] for some in (first, second)
     )
     report_stage(progress, "checking logs")
-    found = diagnose(model, first, second, settings) if doctor else ()
+    doctor_findings = diagnose(model, first, second, settings) if doctor else ()
     recordings = Recordings(model, structural_mapping(model), fitted, held_out)
-    return conclude(recordings, choice, found, ignore, friction=friction, progress=progress)
+    return conclude(
+        recordings, choice, doctor_findings, ignore, friction=friction, progress=progress
+    )
+
+
+def logs_of(
+    model: RobotModel, given: Readable | Sequence[Readable], needs: Needs = "torque"
+) -> tuple[Log, ...]:
+    """Return the logs of a robot, read if they are files or DataFrames."""
+    return read_logs(
+        given, model.joints, prismatic=model.layout.prismatic, needs=needs,
+        base=logged_base(model), passive=model.passive, robot=model.tree.movable,
+    )  # fmt: skip
 
 
 def robot_of(model: RobotModel | str | Path, logs: object) -> RobotModel:
@@ -118,7 +122,7 @@ def robot_of(model: RobotModel | str | Path, logs: object) -> RobotModel:
 def conclude(
     recordings: Recordings,
     choice: EstimatorSettings,
-    found: Sequence[Finding] = (),
+    doctor_findings: Sequence[Finding] = (),
     ignore: Sequence[str] = (),
     *,
     friction: str | Mapping[str, str] = AUTO,
@@ -133,9 +137,9 @@ def conclude(
             "the viscous term), but more is stated; remove it, or set dynamics = 'full'"
         )
     report_stage(progress, "fitting")
-    with _explained(found):
+    with _explained(doctor_findings):
         recordings = with_repeated_errors(recordings)
-        balanced = counterbalanced(found, [log.head.name for log in recordings.fitted])
+        balanced = counterbalanced(doctor_findings, [log.head.name for log in recordings.fitted])
         fit = with_drives(recordings, choice, wanted, balanced, progress=progress)
     report_stage(progress, "errors and intervals")
     sample = take_sample(fit)
@@ -144,42 +148,56 @@ def conclude(
     names = [Path(e.recording.log.path).name for e in fit.fitted]
     units = sorted({log.unit for log in recordings.fitted})
     fit = replace(fit, variation=vary(names, fit.runs, units))
-    own = {field.name: getattr(fit, field.name) for field in fields(fit)}
-    asked = Asked(recordings.fitted[0].asked, friction, tuple(ignore))
-    result = Identification(**own, misfits=misfits, on_misfit=on_misfit, asked=asked)
-    # the fit reports the excitation over all samples, see finding "undetermined"; logs follow below
-    repeated = ("excitation", "log_assumption")
-    before = [f for f in found if f.severity != "note" and f.code not in repeated]
-    of_fit = fit_findings(fit, misfits, on_misfit, discrepancies)
-    loads = {f.where.rpartition(": ")[0] or f.where for f in found if f.code == "payload_change"}
-    of_fit += [*unlike_findings(fit.variation), *rescaled_findings(fit, loads)]
-    merged = settled(with_known_springs(before, fit, wanted), of_fit)
-    merged = [f for f in merged if not explained_by_assumed(model, f)]
+    result = Identification(
+        **{field.name: getattr(fit, field.name) for field in fields(fit)},
+        misfits=misfits,
+        on_misfit=on_misfit,
+        stated=StatedSettings(recordings.fitted[0].asked, friction, tuple(ignore)),
+    )
+    result = replace(result, scale=check_scale(result))
+    of_fit = [
+        *fit_findings(fit, misfits, on_misfit, discrepancies),
+        *unlike_findings(fit.variation),
+        *rescaled_findings(fit, _loaded(doctor_findings)),
+    ]
+    merged = settled(with_known_springs(_kept(doctor_findings), fit, wanted), of_fit)
+    merged = [finding for finding in merged if not explained_by_assumed(model, finding)]
     merged = rejected(merged, result.predictions, result.scale_check)
     log_errors = blocking(merged, ignore, is_robust=is_robust)
     heads = [log.head for log in (*recordings.fitted, *recordings.validation)]
-    findings = [*log_findings(heads), *impossible_inertials(model), *merged]
-    if not any(finding in merged for finding in assumed_inertials(model)):  # without the doctor
-        findings = [*assumed_inertials(model), *findings]
+    assumed = assumed_inertials(model)  # which the doctor finds, too, if it has run
+    assumed = [] if any(finding in merged for finding in assumed) else assumed
+    findings = [*assumed, *log_findings(heads), *impossible_inertials(model), *merged]
     findings += not_written(log_errors, "" if fit.is_consistent else fit.estimator.name)
-    counted = not_ignored(findings, ignore)
     names = [Path(e.recording.log.path).name for e in fit.validation if not e.is_refitted]
-    concluded = replace(
+    counted = not_ignored(findings, ignore)
+    return replace(
         result,
         findings=tuple(findings),
         log_errors=tuple(finding.message for finding in log_errors),
         warnings=warnings_of(counted, model.joints, names, is_robust=is_robust),
     )
-    return concluded.with_scale_of(result)
+
+
+def _kept(findings: Sequence[Finding]) -> list[Finding]:
+    """Return the doctor's findings but notes and what the fit says of the excitation and logs."""
+    replaced = ("excitation", "log_assumption")
+    return [f for f in findings if f.severity != "note" and f.code not in replaced]
+
+
+def _loaded(findings: Sequence[Finding]) -> set[str]:
+    """Return the logs of which the doctor found another payload."""
+    changes = (f.where for f in findings if f.code == "payload_change")
+    return {where.rpartition(": ")[0] or where for where in changes}
 
 
 @contextmanager
-def _explained(found: Sequence[Finding]) -> Iterator[None]:
+def _explained(findings: Sequence[Finding]) -> Iterator[None]:
     """Add the findings of the doctor to the error of a fit that fails."""
     try:
         yield
     except (DataError, NotConvergedError, RankDeficientError) as error:
-        for finding in found:
+        for finding in findings:
             if finding.severity != "note" and finding.message != str(error):
                 error.add_note(f"doctor: {finding.severity}: {finding.code}: {finding.message}")
         raise
@@ -202,9 +220,9 @@ def with_drives(
         return replace(solved.with_errors(), drives=drives)
 
     def changed() -> Recordings:
-        own = replace(recordings, levels=solved.ground.rough.sigma)
-        own = _with_own(own, solved.solution, drives)
-        return own if recordings.repeated is None else with_repeated_errors(own)  # of its terms
+        levelled = replace(recordings, levels=solved.ground.rough.sigma)
+        extended = _with_terms(levelled, solved.solution, drives)
+        return extended if recordings.repeated is None else with_repeated_errors(extended)
 
     most = _MOST_SHAPES if any(drive.shapes for drive in drives) else 0
     for done in range(most):
@@ -218,13 +236,12 @@ def with_drives(
     return replace(fit_recordings(changed(), choice), drives=drives)
 
 
-def _with_own(recordings: Recordings, fit: Solution, drives: Sequence[DriveChoice]) -> Recordings:
+def _with_terms(recordings: Recordings, fit: Solution, drives: Sequence[DriveChoice]) -> Recordings:
     """Return recordings of the robot with the selected drive terms, under the load of a fit."""
-    plain, own = recordings.model, {drive.joint: drive.terms for drive in drives}
-    model = plain.with_terms(
-        {d.name: (*plain.layout.own.get(d.name, ()), *own.get(d.name, ()))
-         for d in plain.layout.drives}
-    )  # fmt: skip
+    layout, selected = recordings.model.layout, {drive.joint: drive.terms for drive in drives}
+    model = recordings.model.with_terms(
+        {d.name: (*layout.own.get(d.name, ()), *selected.get(d.name, ())) for d in layout.drives}
+    )
     fitted = dict(zip(fit.mapping.names, fit.standard, strict=True))
     start = np.array([fitted.get(name, 0.0) for name in model.layout.names])
     return recordings.with_model(model.with_reference(start))

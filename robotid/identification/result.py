@@ -1,16 +1,13 @@
 """An identification: a fit with findings and a verdict."""
 
+from abc import abstractmethod
 from collections.abc import Mapping
-from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
-from robotid.base.arguments import checked
-from robotid.base.exceptions import DataError
-from robotid.base.findings import Finding, listed
-from robotid.base.settings import Settings, require_kind
-from robotid.data.log import suggestion
+from robotid.base.findings import Finding
+from robotid.base.settings import Settings
 from robotid.data.signal_settings import SignalSettings
 from robotid.diagnosis.residual.misfit import Misfit
 from robotid.diagnosis.residual.torque_split import JointTorque, joint_torques
@@ -19,38 +16,60 @@ from robotid.diagnosis.verdict.parameter_table import parameter_entries, paramet
 from robotid.diagnosis.verdict.payload_check import PayloadCheck
 from robotid.diagnosis.verdict.scale_check import ScaleCheck, check_scale
 from robotid.diagnosis.verdict.verdict import Verdict, VerdictWarning, judge
-from robotid.estimation.fitting.evaluation import Evaluation, hidden_joints
+from robotid.estimation.fitting.estimator_settings import EstimatorSettings
+from robotid.estimation.fitting.evaluation import hidden_joints
 from robotid.estimation.fitting.fitted import Fit
-from robotid.identification.pictures import friction_chart, shown_evaluation, torque_charts
+from robotid.estimation.fitting.identified import Identified
+from robotid.estimation.variation.variation import Variation
 from robotid.identification.summary import (
-    identification_html,
-    identification_line,
-    identification_text,
+    error_lines,
+    friction_lines,
+    variation_lines,
+    verdict_lines,
 )
-from robotid.identification.why_pictures import why_charts
-from robotid.output.pages.plots import Plot
 from robotid.robot.families import AUTO
 
 
 @dataclass(frozen=True)
-class Asked:
-    """Settings of an identification other than robot, logs and estimator.
+class StatedSettings:
+    """Settings of an identification other than robot, logs and estimator."""
 
-    Attributes:
-        signals: How logs become trajectories.
-        friction: As of ``identify``.
-        ignore: As of ``identify``.
-        job: The job that was run; None if there was none.
-    """
-
-    signals: SignalSettings = field(default_factory=SignalSettings)
-    friction: str | Mapping[str, str] = AUTO
-    ignore: tuple[str, ...] = ()
-    job: Settings | None = None
+    signals: SignalSettings = field(default_factory=SignalSettings)  # how logs become trajectories
+    friction: str | Mapping[str, str] = AUTO  # as of ``identify``
+    ignore: tuple[str, ...] = ()  # as of ``identify``
+    job: Settings | None = None  # the job that was run; None if there was none
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class Identification(Fit):
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
+class Concluded(Identified):
+    """Identified parameters with findings and a verdict, from torques or from positions."""
+
+    estimator: EstimatorSettings
+    findings: tuple[Finding, ...] = ()  # about the robot, the logs and the fit
+    log_errors: tuple[str, ...] = ()  # faults of the recordings that make the result wrong
+    report: str = ""  # file of the report, if one was written with the result
+    stated: StatedSettings = field(default_factory=StatedSettings)
+    variation: Variation | None = None  # of the drives' parameters between the fitted logs
+
+    def __repr__(self) -> str:
+        return (
+            f"<Identification of {self.model.name}: {len(self.base)} base parameters by "
+            f"{self.estimator.name}, verdict {self.verdict.status}>"
+        )
+
+    @property
+    def has_urdf(self) -> bool:
+        """Whether a URDF may be written: no fault of the logs makes it wrong."""
+        return not self.log_errors
+
+    @cached_property
+    @abstractmethod
+    def verdict(self) -> Verdict:
+        """The verdict on the result, with reasons."""
+
+
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
+class Identification(Concluded, Fit):
     """Complete result of an identification.
 
     Attributes:
@@ -60,29 +79,32 @@ class Identification(Fit):
         report: File of the report, if one was written with the result.
         misfits: Terms that its drive models lack.
         on_misfit: Names of drive parameters whose errors increased for these.
-        asked: Stated signals, friction and findings to ignore.
+        stated: Signals, friction and findings to ignore, as stated, and the job.
+        scale: Scale check without payloads, as it was computed; None: not yet.
         payload_checks: Checks of the torque scale with payloads of known mass, that with the
             narrowest interval first.
     """
 
-    findings: tuple[Finding, ...] = ()
-    log_errors: tuple[str, ...] = ()
     warnings: tuple[VerdictWarning, ...] = ()
-    report: str = ""
     misfits: tuple[Misfit, ...] = ()
     on_misfit: tuple[str, ...] = ()
-    asked: Asked = field(default_factory=Asked)
+    scale: ScaleCheck | None = None
     payload_checks: tuple[PayloadCheck, ...] = ()
-
-    def __repr__(self) -> str:
-        return identification_line(self, self.estimator.name, self.verdict.status)
-
-    def _repr_html_(self) -> str:
-        return identification_html(self)
 
     def summary(self) -> str:
         """Return verdict, reasons and errors by joint as text."""
-        return identification_text(self)
+        lines = [repr(self)[1:-1], *verdict_lines(self.verdict.to_dict())[1:]]
+        compared = [
+            (f"{e.recording.name}: not fitted", e.metrics["estimate"], e.metrics["wls"])
+            for e in self.validation
+        ]
+        for caption, ours, wls in [*compared, ("fitted rows", self.metrics(), self.metrics("wls"))]:
+            lines += [caption, *error_lines(ours.to_dict(), wls.to_dict())]
+        lines += friction_lines({drive.joint: drive.to_dict() for drive in self.drives})
+        lines += variation_lines(None if self.variation is None else self.variation.to_dict())
+        if self.report:
+            lines.append(f"report: {self.report}")
+        return "\n".join(lines)
 
     __str__ = summary
 
@@ -97,87 +119,9 @@ class Identification(Fit):
         """
         return parameter_table(*parameter_entries(self))
 
-    def plot_torques(self, *joints: str, recording: Evaluation | None = None) -> Plot:
-        """Return charts of measured and identified torque over time, and of the residual.
-
-        Args:
-            joints: The joints; all if none is named.
-            recording: One of ``fitted`` or ``validation``; None: the first validation recording,
-                or the first fitted one.
-
-        Returns:
-            Charts that a notebook shows and ``.write("torques.html")`` saves.
-
-        Raises:
-            DataError: If there is no such joint.
-        """
-        require_kind(
-            recording, (Evaluation, type(None)), "recording", "one of fitted or validation, or none"
-        )
-        shown = shown_evaluation(self) if recording is None else recording
-        band, rows = (
-            self.band(shown),
-            [self._row(joint) for joint in joints or self.model.row_names],
-        )
-        charts = []
-        for row in rows:
-            torque, residual = torque_charts(self, shown, row, band=band)
-            name = self.model.row_names[row]
-            charts += [(torque, f"{name}: torque"), (residual, f"{name}: residual")]
-        return Plot(f"Torques of {shown.recording.name}", tuple(charts))
-
-    def plot_friction(self, *joints: str) -> Plot:
-        """Return charts of friction against speed, measured and identified, with its band.
-
-        Args:
-            joints: The joints; all if none is named.
-
-        Returns:
-            Charts that a notebook shows and ``.write("friction.html")`` saves.
-
-        Raises:
-            DataError: If there is no such joint, or none that moved.
-        """
-        names = [self.model.row_names[self._row(joint)] for joint in joints or self.model.joints]
-        charts = [(friction_chart(self, name), f"{name}: friction and offset") for name in names]
-        shown = tuple((chart, caption) for chart, caption in charts if chart is not None)
-        if not shown:
-            raise DataError(f"{listed(names)}: no samples used, so there is no friction to show")
-        return Plot(f"Friction of {listed(names)} against speed", shown)
-
-    def plot_why(self, joint: str) -> Plot:
-        """Return charts of the parts of a joint's torque, and of its residual's dependences.
-
-        Args:
-            joint: The joint.
-
-        Returns:
-            Charts that a notebook shows and ``.write("why.html")`` saves.
-
-        Raises:
-            DataError: If there is no such joint.
-        """
-        torque = self.joint_torques[self._row(joint)]
-        charts = why_charts(torque)
-        about = {name: f"residual against {name}" for name in charts}
-        about |= {"split": torque.sentence, "power": "mechanical power"}
-        shown = tuple((chart, f"{joint}: {about[name]}") for name, chart in charts.items())
-        return Plot(f"Torque parts and residual of {joint}", shown)
-
     def _cause_of(self, joint: str) -> str:
         """Return the cause of a joint's residual, as a sentence."""
-        return self.joint_torques[self._row(joint)].sentence
-
-    def _row(self, joint: str) -> int:
-        """Return the index of a joint's torque row."""
-        require_kind(joint, str, "joint", "the name of a joint")
-        names = self.model.row_names
-        if joint not in names:
-            raise DataError(
-                f"joint {joint!r} is not among the identified joints: {listed(names)}"
-                f"{suggestion(joint, names)}"
-            )
-        return names.index(joint)
+        return self.joint_torques[self.model.row_names.index(joint)].sentence
 
     @cached_property
     def joint_torques(self) -> tuple[JointTorque, ...]:
@@ -192,22 +136,8 @@ class Identification(Fit):
     @property
     def scale_check(self) -> ScaleCheck:
         """Scale check: identified gravity and masses against the URDF's."""
-        return replace(self._scale, payloads=self.payload_checks)
-
-    @cached_property
-    def _scale(self) -> ScaleCheck:
-        return check_scale(self)
-
-    @checked()
-    def with_scale_of(self, fit: "Identification") -> "Identification":
-        """Return the result with the scale check of the same fit, which is not computed again.
-
-        Args:
-            fit: A result of the same fit, with other findings or payload checks.
-        """
-        same = copy(self)
-        vars(same)["_scale"] = fit._scale
-        return same
+        scale = check_scale(self) if self.scale is None else self.scale
+        return replace(scale, payloads=self.payload_checks)
 
     @property
     def _uncertain_drives(self) -> list[str]:

@@ -1,20 +1,11 @@
-"""Summaries of results: a line, a text, and HTML for a notebook."""
-
-from __future__ import annotations
+"""Summaries of results as lines of text."""
 
 from collections.abc import Mapping, Sequence
-from html import escape
 from statistics import median
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from robotid.base.text import columns
 from robotid.diagnosis.verdict.uses import uses_line
-from robotid.output.pages.html import code, number, percent, table, text
-
-if TYPE_CHECKING:
-    from robotid.estimation.fitting.identified import Identified
-    from robotid.estimation.fitting.metrics import Metrics
-    from robotid.identification.result import Identification
 
 #: Column heads of the errors of other predictions, by name: of torques, then of positions.
 _BESIDE = {
@@ -27,29 +18,7 @@ _BESIDE = {
     "command": "command\n%",
     "steady": "constant\nspeed %",
 }
-_NO_REPORT = "robotid.write_report(found, 'report.html') writes the whole report"
 _SHOWN_SPREADS = ("coulomb", "viscous", "kp", "kd", "delay")
-
-
-def identification_line(found: Identified, estimator: str, status: str) -> str:
-    """Return an identification in one line."""
-    return (
-        f"<Identification of {found.model.name}: {len(found.base)} base parameters by "
-        f"{estimator}, verdict {status}>"
-    )
-
-
-def identification_text(found: Identification) -> str:
-    """Return an identification as text: verdict, reasons, errors by joint."""
-    line = identification_line(found, found.estimator.name, found.verdict.status)
-    lines = [line[1:-1], *verdict_lines(found.verdict.to_dict())[1:]]
-    for caption, ours, wls in _tables(found):
-        lines += [caption, *error_lines(ours.to_dict(), wls.to_dict())]
-    lines += friction_lines({drive.joint: drive.to_dict() for drive in found.drives})
-    lines += variation_lines(None if found.variation is None else found.variation.to_dict())
-    if found.report:
-        lines.append(f"report: {found.report}")
-    return "\n".join(lines)
 
 
 def error_lines(
@@ -79,14 +48,17 @@ def error_lines(
 def friction_lines(friction: Mapping[str, Any]) -> list[str]:
     """Return the friction of joints besides viscous and Coulomb, and its effect, as text."""
     lines = []
-    for joint, found in friction.items():
-        if found["families"]:
+    for joint, choice in friction.items():
+        if choice["families"]:
             before, after = (
                 step["held_out_error_pct"]
-                for step in (found["tried"][0], [s for s in found["tried"] if s["is_selected"]][-1])
+                for step in (
+                    choice["tried"][0],
+                    [s for s in choice["tried"] if s["is_selected"]][-1],
+                )
             )
             gain = f"held-out error {before:.1f} -> {after:.1f} %"
-            lines.append(f"  {joint}: {' + '.join(found['families'])} ({gain})")
+            lines.append(f"  {joint}: {' + '.join(choice['families'])} ({gain})")
     return ["friction besides viscous and Coulomb:", *lines] if lines else []
 
 
@@ -111,18 +83,18 @@ def variation_lines(variation: Mapping[str, Any] | None) -> list[str]:
     if variation is None:
         return []
     shares: dict[str, list[float]] = {}
-    for name, found in variation["parameters"].items():
+    for name, parameter in variation["parameters"].items():
         term = name.rpartition(".")[2]
-        if term in _SHOWN_SPREADS and abs(found["mean"]) > found["std_error"]:
-            shares.setdefault(term, []).append(100 * found["spread"] / abs(found["mean"]))
+        if term in _SHOWN_SPREADS and abs(parameter["mean"]) > parameter["std_error"]:
+            shares.setdefault(term, []).append(100 * parameter["spread"] / abs(parameter["mean"]))
     if not shares:
         return []
     words = [f"{term} {min(x):.2g} to {max(x):.2g} %" for term, x in sorted(shares.items())]
     lines = [f"spread between {len(variation['logs'])} logs, by joint: {', '.join(words)}"]
     gains = {
-        name: one_more_gain(found)
-        for name, found in variation["parameters"].items()
-        if "one_more" in found
+        name: one_more_gain(parameter)
+        for name, parameter in variation["parameters"].items()
+        if "one_more" in parameter
     }
     if gains:
         member = "robot" if variation["units"] > 1 else "log"
@@ -184,33 +156,3 @@ def joint_reason(joint: str, reasons: Sequence[str]) -> str:
 def cell(value: float | None) -> str:
     """Return a percentage, or a dash."""
     return "-" if value is None else f"{value:.1f}" if value < 1000 else f"{value:.0f}"
-
-
-def identification_html(found: Identification) -> str:
-    """Return an identification as HTML: verdict, reasons, errors by joint, link to the report."""
-    reasons = "".join(f"<li>{escape(reason)}</li>" for reason in found.verdict.reasons)
-    tables = "".join(_errors(caption, metrics) for caption, metrics, _ in _tables(found))
-    report = escape(found.report)
-    link = f'<a href="{report}">{report}</a>' if report else _NO_REPORT
-    return (
-        f"<p><strong>{escape(found.model.name)}</strong>: {len(found.base)} base parameters by "
-        f"{found.estimator.name}; verdict <strong>{found.verdict.status}</strong></p>\n"
-        f"<ul>{reasons}</ul>\n{tables}<p>{link}</p>\n"
-    )
-
-
-def _tables(found: Identification) -> list[tuple[str, Metrics, Metrics]]:
-    """Return the metrics of each validation log and of the fitted logs, and those of WLS."""
-    validation = [
-        (f"{e.recording.name}: not fitted", e.metrics["estimate"], e.metrics["wls"])
-        for e in found.validation
-    ]
-    return [*validation, ("fitted rows", found.metrics(), found.metrics("wls"))]
-
-
-def _errors(caption: str, metrics: Metrics) -> str:
-    rows = []
-    for joint, m in metrics.per_joint.items():
-        error, urdf = percent(m.relative_error_pct), percent(m.baselines["urdf"])
-        rows.append([code(joint), error, number(m.rmse, ".3g"), text(m.unit), urdf])
-    return table(caption, ["joint", "error %", "RMSE", "unit", "URDF %"], rows)

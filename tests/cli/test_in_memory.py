@@ -50,7 +50,7 @@ def test_it_finds_what_a_job_finds_of_the_same_logs(arm, found, tmp_path):
     np.testing.assert_allclose(found.standard, again.standard, rtol=1e-6, atol=1e-9)
     assert len(found.validation) == 1
     assert found.verdict.status == again.verdict.status
-    alone = replace(again, asked=replace(again.asked, job=None))  # as if it came of these files
+    alone = replace(again, stated=replace(again.stated, job=None))  # as if it came of these files
     saved = robotid.load_result(robotid.save_result(alone, tmp_path / "alone", report=False))
     for role, log in zip(("identification", "validation"), logs, strict=True):
         (entry,) = saved.content["settings"][role]

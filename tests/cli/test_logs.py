@@ -216,7 +216,7 @@ def test_a_robot_hears_commands_the_gravity_of_its_urdf_or_torques(hand, monkeyp
         Job, "read", lambda self, entry, model, needs: f"log of {needs}" * (model == "the result's")
     )
     monkeypatch.setattr(
-        "robotid.identification.closed_loop.driven.driven_log",
+        "robotid.identification.closed_loop.from_commands.driven_log",
         lambda robot, log, _: f"{log} driven by {robot}",
     )
     monkeypatch.setattr(

@@ -130,7 +130,7 @@ def test_a_job_states_a_check_of_the_scale_which_its_result_has(files):
     whole = load_result(files / "checked").content
     assert stated_scale_check(whole).payloads == (check, other)
     assert job_from_settings(whole["settings"], "x", files).payload_checks == (
-        found.asked.job.payload_checks
+        found.stated.job.payload_checks
     )
     (step,) = [
         s for s in next_steps(found, Origin(("job.toml",), "out")) if "torque scale" in s.words

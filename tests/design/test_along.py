@@ -4,9 +4,8 @@ import pytest
 from helpers.paths import URDF
 from helpers.robots import ROBOTS, mimicking
 
-from robotid.base.exceptions import DataError, SettingsError
-from robotid.design.along import MotionRegressor, Placements, fixed_tree
-from robotid.dynamics import compiled
+from robotid.base.exceptions import DataError
+from robotid.design.information import MotionRegressor, Placements, fixed_tree
 from robotid.dynamics.torque import joint_torque_regressor
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
@@ -74,13 +73,3 @@ def test_a_floating_base_is_refused():
     model = RobotModel.from_urdf(URDF / "planar_2r.urdf", free_flyer=True)
     with pytest.raises(DataError, match="the base floats"):
         MotionRegressor(model, np.arange(3))
-
-
-def test_a_joint_that_is_not_compiled_is_refused(monkeypatch):
-    monkeypatch.setattr(compiled, "_is_simple", lambda axis: False)
-    model = RobotModel.from_urdf(URDF / "planar_2r.urdf")
-    with pytest.raises(
-        SettingsError,
-        match=r"no motion can be designed: the compiled code does not support joint '\w+'",
-    ):
-        fixed_tree(model)

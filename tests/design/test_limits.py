@@ -2,9 +2,8 @@ import numpy as np
 import pytest
 
 from robotid.base.exceptions import SettingsError
-from robotid.design.course import Course
 from robotid.design.excitation_settings import MotionSettings
-from robotid.design.limits import MotionLimits
+from robotid.design.limits import Course, MotionLimits
 from robotid.dynamics.simulation.simulation_settings import Payload
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from robotid.design.multipliers import SOFT, SPARE, Multipliers
+from robotid.design.design import SOFT, SPARE, Multipliers
 
 
 def test_costs_are_those_of_the_augmented_lagrangian_and_slopes_their_derivatives(rng):

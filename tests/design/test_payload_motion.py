@@ -4,13 +4,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from robotid.base.exceptions import NotConvergedError, SettingsError
+from robotid.base.exceptions import SettingsError
 from robotid.design.basis import FourierBasis
-from robotid.design.design import Designer
+from robotid.design.design import Designer, Multipliers
 from robotid.design.information import Aim
 from robotid.design.limits import MotionLimits
-from robotid.design.multipliers import Multipliers
-from robotid.design.payload_motion import _check_bare, design_payload
+from robotid.design.payload_motion import design_payload
 from robotid.dynamics.simulation.simulation_settings import Payload
 from robotid.dynamics.torque import joint_torque_regressor
 from robotid.robot.bodies import link_transfer
@@ -147,20 +146,3 @@ def test_what_cannot_be_asked_for_is_refused(designer):
         SettingsError, match="wrist_3_joint cannot move forearm_link, wanted joints"
     ):
         design_payload(designer, RNG(0), Payload(link="forearm_link"), moving=WRIST[-1:])
-
-
-def test_a_payload_that_holds_a_limit_up_is_not_counted_on(designer, found, monkeypatch):
-    # gravity of the load lowers what the wrist bears where its offset points upwards
-    sizes = designer.limits.sizes.copy()
-    bare = designer.used_and_informed(found.design.motion, 5.0, 200.0)[0]
-    sizes[4] *= 0.99 * np.abs(bare[4]).max(axis=0)
-    limits = replace(designer.limits, sizes=sizes)
-    with pytest.raises(
-        NotConvergedError, match=r"without the payload \w+ needs 101.0 % of its torq"
-    ):
-        _check_bare(replace(designer, limits=limits), found.design)
-    monkeypatch.setattr(Designer, "design", lambda *_, **__: found.design)
-    with pytest.raises(
-        NotConvergedError, match=r"without the payload \w+ needs 101.0 % of its torq"
-    ):
-        design_payload(replace(designer, limits=limits), RNG(0), LOAD, moving=found.moving)

@@ -3,11 +3,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from robotid.base.exceptions import SettingsError
 from robotid.design import routes
 from robotid.design.basis import FourierBasis
-from robotid.design.clearance import Clearance, Contact
-from robotid.design.course import Course
+from robotid.design.clearance import Clearance
 from robotid.design.design import Designer
 from robotid.design.limits import LIMITS, MotionLimits
 from robotid.design.routes import (
@@ -16,7 +14,6 @@ from robotid.design.routes import (
     _free_range,
     _legs,
     _sweeps,
-    _visited,
     design_stands,
     design_sweeps,
 )
@@ -88,7 +85,7 @@ def test_sweeps_go_both_ways_at_each_speed_while_the_others_rest(designer, rng):
     design = design_sweeps(designer, rng, speeds=(0.1, 0.4))
     # the page shows what was checked, at the same instants
     kinds = [k for k, kind in enumerate(LIMITS) if kind != "jerk"]
-    shown = Course.of_design(designer, design)
+    shown = designer.course(design)
     np.testing.assert_allclose(shown.largest[kinds], design.used[kinds], rtol=1e-9)
     assert len(shown.t) - 1 == round(100 * design.duration)
     assert design.used.max() <= 1.0
@@ -99,57 +96,6 @@ def test_sweeps_go_both_ways_at_each_speed_while_the_others_rest(designer, rng):
         steady = v[(np.abs(a).max(axis=1) < 1e-9) & (np.abs(v[:, j]) > 1e-6)]
         assert set(np.round(steady[:, j] / fastest, 6)) == {-0.4, -0.1, 0.1, 0.4}
         assert np.abs(np.delete(steady, j, axis=1)).max() == 0.0
-
-
-def test_sweeps_are_about_the_posture_whose_worst_joint_has_the_largest_share(monkeypatch):
-    """Of half ranges of 2 and 1 rad, shares of the worst joints are 0.1, 0.5 and 0.4."""
-    free = np.array([[[2.0, 2.0], [0.0, 0.1]], [[0.5, 0.5], [0.7, 0.1]], [[1.8, 0.6], [0.2, 0.2]]])
-    about = SimpleNamespace(
-        postures=SimpleNamespace(resting=lambda rng, count: np.arange(6.0).reshape(3, 2)),
-        limits=SimpleNamespace(sizes=np.array([[2.0, 1.0]])),
-        examined=lambda *_: SimpleNamespace(contact=None, used=np.zeros((6, 2))),
-    )
-    told = []
-    monkeypatch.setattr(routes, "_free_range", lambda designer, posture: free[int(posture[0]) // 2])
-    monkeypatch.setattr(
-        routes, "_sweeps", lambda *asked: told.append(asked[1:]) or SimpleNamespace(duration=1.0)
-    )
-    design_sweeps(about, None, speeds=(0.1,))
-    [(posture, room, speeds)] = told
-    np.testing.assert_array_equal(posture, [2.0, 3.0])
-    np.testing.assert_allclose(room, 0.8 * free[1])
-    assert speeds == (0.1,)
-
-
-@pytest.mark.parametrize("feasible", [8, 9])
-def test_sweeps_are_shortened_by_a_fifth_seven_times_at_most(monkeypatch, feasible):
-    shares, joints = [], ("a", "b")
-
-    def examined(*_):
-        used = np.full((6, 2), 0.5)
-        used[4, 1] = 0.9 if len(shares) == feasible else 3.5
-        return SimpleNamespace(contact=None, used=used, number=len(shares))
-
-    about = SimpleNamespace(
-        postures=SimpleNamespace(resting=lambda rng, count: np.zeros((30, 2))),
-        limits=SimpleNamespace(sizes=np.array([[2.0, 1.0]])), examined=examined,
-        information=SimpleNamespace(model=SimpleNamespace(joints=joints)),
-    )  # fmt: skip
-    monkeypatch.setattr(routes, "_free_range", lambda *_: np.array([[1.0, 2.0], [0.5, 0.5]]))
-    monkeypatch.setattr(
-        routes, "_sweeps",
-        lambda designer, posture, free, _: shares.append(free[0]) or SimpleNamespace(duration=1.0),
-    )  # fmt: skip
-    contact = Contact("arm", "post", -0.01, 2.0)
-    stuck = SimpleNamespace(contact=contact, used=np.zeros((6, 2)))
-    assert routes._why(stuck, about) == "arm and post overlap at 2.00 s"
-    if feasible == 8:
-        assert design_sweeps(about, None).number == 8
-    else:
-        wanted = r"about none of 20 random .* can sweep: b needs 350 %; lower"
-        with pytest.raises(SettingsError, match=wanted):
-            design_sweeps(about, None)
-    np.testing.assert_allclose(shares, 0.8 ** np.arange(1, 9)[:, None] * [1.0, 2.0])
 
 
 def test_stands_weigh_torques_by_their_noise_over_two_seconds(monkeypatch):
@@ -204,17 +150,3 @@ def test_a_leg_has_half_the_speed_limit_of_the_slowest_joint_and_at_least_a_seco
     t = np.linspace(2.0, 8.0, 601)  # the first leg, after 2 s at rest
     v = np.abs(route.evaluate(t)[1]).max(axis=0)
     np.testing.assert_allclose(v, 0.5 * np.abs(way) / 1.5, rtol=1e-9)
-
-
-def test_a_posture_is_reached_from_the_last_one_visited_or_left_out(monkeypatch):
-    def examined(leg, *_):
-        is_blocked = leg.places[:, 0].tolist() == [1.0, 2.0]  # the line from 1 to 2
-        return SimpleNamespace(contact=None, used=np.full((6, 1), 0.5 + is_blocked), leg=leg)
-
-    monkeypatch.setattr(
-        routes, "_legs", lambda designer, places: SimpleNamespace(places=places, duration=1.0)
-    )
-    found = _visited(SimpleNamespace(examined=examined), np.arange(5.0)[:, None])
-    assert found.leg.places[:, 0].tolist() == [0.0, 1.0, 3.0, 4.0]
-    with pytest.raises(SettingsError, match="every line between two postures has a collision"):
-        _visited(SimpleNamespace(examined=examined), np.array([[1.0], [2.0], [2.0]]))

@@ -18,6 +18,7 @@ import robotid
 from helpers.hostile_inputs import JOINTS, URDF, good_log, good_result
 from robotid import Log, LogSource, LogUnits, RobotModel, SignalSettings, Trajectory
 from robotid.base.exceptions import RobotIdError
+from robotid.output.report import pictures
 
 __all__ = ["ARGUMENT_KINDS"]
 
@@ -134,13 +135,14 @@ CALLS = {
         lambda **given: robot().result.follow_commands(**given), lambda c, _: {"log": c.log}
     ),
     "plot_torques": (
-        lambda joint, recording: robot().found.plot_torques(joint, recording=recording),
+        lambda joint, recording: pictures.plot_torques(robot().found, joint, recording=recording),
         lambda c, _: {"joint": "joint_1", "recording": None},
     ),
     "plot_friction": (
-        lambda joint: robot().found.plot_friction(joint), lambda c, _: {"joint": "joint_1"}
+        lambda joint: pictures.plot_friction(robot().found, joint),
+        lambda c, _: {"joint": "joint_1"},
     ),
-    "plot_why": (lambda **given: robot().found.plot_why(**given),
+    "plot_why": (lambda **given: pictures.plot_why(robot().found, **given),
                  lambda c, _: {"joint": "joint_1"}),
     "metrics": (lambda **given: robot().found.metrics(**given), lambda c, _: {"name": "wls"}),
     "save": (

@@ -1,7 +1,6 @@
 """Segment masses of a human from motion and forces of the ground, without torques."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
@@ -10,15 +9,9 @@ from helpers.humans import FEET, PARTS, human_urdf, logged, walk, with_other_seg
 
 from robotid import identify
 from robotid.base.exceptions import SettingsError
-from robotid.cli.work.job import Job, LogEntry
-from robotid.cli.work.replay import Findings, replay_files
 from robotid.data.base_motion import BaseMotion
-from robotid.data.files.read import write_log
 from robotid.data.signal_settings import SignalSettings
-from robotid.estimation.fitting.consistent_estimator import pinned_links
-from robotid.estimation.fitting.estimator_settings import ConsistentSettings, ConstraintSettings
-from robotid.output.report.next_steps import _watch
-from robotid.output.report.steps import Origin
+from robotid.estimation.fitting.estimator_settings import ConsistentSettings
 from robotid.robot.bodies import negligible_bodies
 from robotid.robot.constraints import Contact
 from robotid.robot.model import RobotModel
@@ -47,19 +40,6 @@ def found(human):
     settings = ConsistentSettings(prior_weight=1.0)
     signals = SignalSettings(cutoff=4.0)
     return true, identify(human, log, estimator=settings, friction="none", signals=signals)
-
-
-def test_links_between_the_axes_of_a_joint_are_negligible(human):
-    fakes = negligible_bodies(human)
-    assert fakes == tuple(x for x in human.layout.bodies if "_f" in x)
-    assert len(fakes) == 2 + 2 * (2 + 1 + 2)
-    bounds = ConstraintSettings(mass={"T8_f1": [0.0, 1.0]}, pinned=["Pelvis"])
-    assert pinned_links(bounds, human) == ("Pelvis", *(x for x in fakes if x != "T8_f1"))
-    heavy = human.standard_parameters()
-    heavy[10 * human.layout.bodies.index("T8_f1")] = 2e-5 * 70.0
-    heavy[10 * human.layout.bodies.index("T8_f2") : 10 * human.layout.bodies.index("T8")] = 0.0
-    other = human.with_parameters(heavy)
-    assert negligible_bodies(other) == fakes[2:]  # one has a mass, the other none at all
 
 
 def test_masses_follow_from_forces_and_motion(human, found):
@@ -104,21 +84,6 @@ def test_vertical_forces_of_a_walk_weigh_in_spite_of_drift(human):
     assert not [x for x in result.findings if x.severity == "error"]
 
 
-def test_links_of_negligible_mass_cause_no_finding(found):
-    _, result = found
-    assert not [x for x in result.findings if "_f1" in x.where or "_f2" in x.where]
-    codes = {x.code for x in result.findings}
-    assert not codes & {"dense_body", "density", "gyration", "moving_contact", "measured_wrench"}
-    assert not [x for x in result.determination.undetermined if x.startswith("T8_f")]
-
-
-def test_the_next_step_names_the_base_and_no_joint(found):
-    _, result = found
-    words = _watch(result, Origin(("human.urdf", "log.csv"), ""), ()).words
-    assert "Examine the residual of the base" in words
-    assert "a force that is not measured" in words
-
-
 def test_a_plate_refuses_axes_and_points():
     plate = Contact("foot", "surface", PARTS, plate=(0.1, 0.2, 0.0))
     assert plate.always
@@ -130,15 +95,3 @@ def test_a_plate_refuses_axes_and_points():
     ):
         with pytest.raises(SettingsError, match=words):
             replace(plate, **change)
-
-
-def test_a_motion_without_torques_is_replayed_with_its_base(human, tmp_path):
-    rng = np.random.default_rng(1)
-    log = logged(human, walk(human, human, rng, duration=2.0), rng)
-    write_log(log, tmp_path / "log.csv")
-    job = Job(
-        urdf=Path(human.tree.path), joints=human.joints, free_flyer=True, terms=(),
-        contacts=human.contacts, identification=(LogEntry(tmp_path / "log.csv"),),
-    )  # fmt: skip
-    html = replay_files(job, Findings({})).html
-    assert "Motion: log.csv." in html

@@ -13,7 +13,7 @@ from helpers.synthetic import exact_log, truth
 from robotid.base.exceptions import DataError, SettingsError
 from robotid.cli.work.identify import run_job
 from robotid.cli.work.job import Job, LogEntry, job_from_settings, read_job
-from robotid.cli.work.logs import examine, survey_logs
+from robotid.cli.work.logs import survey_logs
 from robotid.cli.work.validate import validate_result
 from robotid.data.files.read import read_log, write_log
 from robotid.data.log import Log
@@ -174,33 +174,6 @@ def test_a_fitted_recording_is_no_validation_in_pieces_either(noisy_job, tmp_pat
     job = replace(noisy_job, validation=(apart, again), rows_in_memory=HELD)
     identification, _ = run_job(job, tmp_path / "out")
     assert [e.is_refitted for e in identification.validation] == [False, True]
-
-
-def test_only_stretches_of_a_long_log_are_drawn_and_examined(noisy_job, tmp_path, monkeypatch):
-    monkeypatch.setattr("robotid.estimation.fitting.evaluation._SHOWN", 100)
-    monkeypatch.setattr("robotid.estimation.fitting.survey._WINDOW", 400)
-    job = replace(noisy_job, rows_in_memory=HELD, validation=(), report=True)
-    identification, result = run_job(job, tmp_path)
-    (evaluation,) = identification.fitted
-    recording = evaluation.recording
-    assert recording.is_partial
-    assert len(recording.trajectory.t) == 300
-    assert recording.trajectory.t[0] == pytest.approx(0.22)
-    assert recording.trajectory.t[-1] == pytest.approx(29.98 - 0.22)
-    assert recording.trajectory.segment.tolist() == [0] * 100 + [1] * 100 + [2] * 100
-    assert recording.trajectory.direction.shape == (300, 3)
-    rows = evaluation.metrics["estimate"].per_joint["elbow_joint"].rows
-    assert 1000 < rows <= recording.extent.smooth == 1478
-    page = (tmp_path / "report.html").read_text()
-    assert "is long: 300 of its 1478 samples are drawn, from its start" in page
-    notes = [w["message"] for w in result["warnings"] if w["code"] == "log_note"]
-    assert any("checked rows 0-400, 550-950, 1100-1500 only" in note for note in notes)
-    found = [f for f in examine(job) if f.code == "rate"]
-    assert [f.where for f in found] == [
-        "fit.csv rows 0-400",
-        "fit.csv rows 550-950",
-        "fit.csv rows 1100-1500",
-    ]
 
 
 def test_a_log_with_samples_in_no_usual_piece_is_drawn_all_the_same(rng, tmp_path):

@@ -7,8 +7,6 @@ from types import SimpleNamespace
 import numpy as np
 import pinocchio as pin
 import pytest
-import scipy.signal
-from helpers.closed_chains import four_bar
 from helpers.driven import arm
 from helpers.synthetic import exact_log, truth
 from scipy.stats import t as t_of
@@ -20,15 +18,13 @@ from robotid.data.signal_settings import SignalSettings
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.torque import joint_torque_regressor
 from robotid.estimation.estimators.segments import quantile
-from robotid.estimation.fitting.recorded import Recordings
-from robotid.estimation.fitting.survey import hold_log
-from robotid.identification import payload_fit
-from robotid.identification.payload_estimate import Gain, Payload, PayloadFit, payload_of
-from robotid.identification.payload_fit import _check_gains, _gains, identify_payload
+from robotid.identification.payload_fit import (
+    identify_payload,
+    payload_of,
+)
 from robotid.robot.drives import FAMILIES
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
-from robotid.robot.prior import payload_spread
 
 #: Friction is chosen where the test is about that.
 with_known_friction = partial(identify_payload, friction="viscous+coulomb")
@@ -198,72 +194,6 @@ def test_gains_are_exact_without_noise_and_some_may_be_known(hand, rng):
     assert found.gains["wrist_2_joint"].value == pytest.approx(GAINS[4], rel=1e-6)
 
 
-def test_a_fit_is_said_and_written_with_its_figures():
-    one, two = (
-        Payload(
-            link, mass, error, mass + 2 * np.array([-error, error]), COM, COM / 10,
-            INERTIA, INERTIA / 20, reasons,
-        )
-        for link, mass, error, reasons in (
-            ("tool", MASS, 0.125, {}), ("elbow", 3.0, 0.0, {"inertia": "it turns too little"}),
-        )
-    )  # fmt: skip
-    found = PayloadFit(
-        SimpleNamespace(name="arm", row_names=("a", "b")), (one, two),
-        {"b": Gain(7.25, 0.5, (6.25, 8.25))}, ("x", "y"), np.array([1.5, 2.5]),
-        np.array([0.25, 0.75]), np.array([0.0625, 0.5]),
-    )  # fmt: skip
-    assert str(found).splitlines() == [
-        "tool: 2 +- 0.12 kg, 95 %: [1.75, 2.25]",
-        "  centre of mass: 0.02 +- 0.002, 0.03 +- 0.003, 0.08 +- 0.008 m",
-        "  inertia about it, diagonal: 0.03 +- 0.0015, 0.025 +- 0.0013, 0.02 +- 0.001 kg m^2",
-        "elbow: 3 +- 0 kg, known",
-        "  centre of mass: 0.02 +- 0.002, 0.03 +- 0.003, 0.08 +- 0.008 m",
-        "  inertia about it, diagonal: it turns too little",
-        "gain of b: 7.25 +- 0.5 [6.25, 8.25]",
-        "torque error [%]: a 6.2, b 50.0",
-    ]
-    assert repr(found) == "<PayloadFit of arm: tool 2 +- 0.12 kg, elbow 3 +- 0 kg>"
-    assert (found["tool"], found["elbow"]) == (one, two)
-    content = found.to_dict()
-    assert content["relative_error_pct"] == {"a": 6.25, "b": 50.0}
-    assert content["gains"] == {"b": {"gain": 7.25, "std_error": 0.5, "interval": [6.25, 8.25]}}
-    assert content["base_parameters"] == [
-        {"name": "x", "value": 1.5, "std_error": 0.25},
-        {"name": "y", "value": 2.5, "std_error": 0.75},
-    ]
-    written, other = content["payloads"]
-    at_link = INERTIA + MASS * (COM @ COM * np.eye(3) - np.outer(COM, COM))
-    np.testing.assert_allclose(written["inertia_at_link"], at_link)
-    assert written["inertia_std_error"] == (INERTIA / 20).tolist()
-    assert [written[key] for key in ("mass", "mass_std_error")] == [2.0, one.mass_std_error]
-    assert written["mass_interval"] == [1.75, 2.25]
-    assert (other["inertia"], other["inertia_std_error"]) == (None, None)
-    assert "inertia_at_link" not in other
-    assert other["determined"] == ["mass", "com"]
-
-
-def test_a_gain_has_the_interval_of_its_logarithm(rng):
-    """Of the first and the third joint; the last rows of the covariance are theirs."""
-    root = 0.1 * rng.standard_normal((5, 5))
-    found = SimpleNamespace(
-        theta=np.zeros(3),
-        gain=np.array([5.0, 1.0, -8.0]),
-        covariance=root @ root.T,
-        freedom=np.array([3.0, 4.0, 5.0, 7.0, 11.0]),
-    )
-    model = SimpleNamespace(joints=("a", "b", "c"))
-    gains = _gains(model, SimpleNamespace(unknown=[2, 0]), found)
-    assert list(gains) == ["c", "a"]
-    for joint, k, value in (("c", 3, -8.0), ("a", 4, 5.0)):
-        error = np.sqrt(found.covariance[k, k])
-        reach = t_of(found.freedom[k]).ppf(0.975) * error
-        assert gains[joint].value == value
-        assert gains[joint].std_error == pytest.approx(abs(value) * error)
-        ends = sorted([value * np.exp(-reach), value * np.exp(reach)])
-        assert gains[joint].interval == pytest.approx(tuple(ends))
-
-
 def test_errors_about_the_centre_of_mass_are_those_of_first_order(rng):
     """By finite differences of the ten parameters in the frame of the link."""
 
@@ -417,25 +347,6 @@ def test_a_joint_that_rests_but_for_a_few_rows_does_not_outweigh_the_others(ur5,
     assert (np.abs(found.com - COM) < 3 * found.com_std_error).all()
 
 
-def test_errors_grow_with_the_correlation_of_the_noise(hand):
-    rng, rho = np.random.default_rng(5), 0.9
-    white, coloured = [], []
-    for log in recorded(hand, rng, friction=1.2):
-        e = LEVEL[2:] * rng.standard_normal(log.tau.shape)
-        correlated = scipy.signal.lfilter([np.sqrt(1 - rho**2)], [1.0, -rho], e, axis=0)
-        white.append(replace(log, tau=log.tau + e))
-        coloured.append(replace(log, tau=log.tau + correlated))
-    errors = [
-        with_known_friction(hand, [one], [other], links=["tool0"], signals=EXACT)[
-            "tool0"
-        ].mass_std_error
-        for one, other in (white, coloured)
-    ]
-    # of a motion that is slow beside the noise; of this one, less
-    most = np.sqrt((1 + rho) / (1 - rho))
-    assert 0.4 * most < errors[1] / errors[0] < most
-
-
 def test_friction_of_the_reference_is_chosen_and_counts_in_both_runs(rng):
     model = arm()
     log, without = recorded(model, rng, samples=500)
@@ -494,76 +405,6 @@ def test_joints_that_disagree_widen_the_interval(ur5):
     assert (high - unsure.mass) / unsure.mass_std_error > 2.3
 
 
-def test_two_runs_are_compared_with_what_is_known_of_each_payload(rng, monkeypatch):
-    """The reference first, the fewest independent rows of both, one plausible size per payload."""
-    model, links = arm(), ("tool0", "forearm_link")
-    logs = [exact_log(model, truth(model), rng, samples=n) for n in (160, 130)]
-    filters = SignalSettings(cutoff=10.0), SignalSettings(cutoff=4.0)
-    mapping = structural_mapping(model)
-    loaded, reference = (
-        Recordings(model, mapping, [hold_log(model, log, own)])
-        for log, own in zip(logs, filters, strict=True)
-    )
-
-    class Stopped(Exception):
-        pass
-
-    def stop(*arguments, **named):
-        raise Stopped(arguments, named)
-
-    monkeypatch.setattr(payload_fit, "payload_runs", stop)
-    with pytest.raises(Stopped) as given:
-        payload_fit.fit_payloads(
-            loaded, reference, links=links, masses={"forearm_link": 2.5},
-            unknown_gains=[model.joints[2], model.joints[0]],
-        )  # fmt: skip
-    (first, second, _, K, urdf, _, (columns, known, size)), named = given.value.args
-    rows = [sum(part.factors.rows.sum() for part in run) for run in (first, second)]
-    assert rows == [run.fitted[0].whole.mask.sum() for run in (reference, loaded)]
-    np.testing.assert_array_equal(K, mapping.K)
-    np.testing.assert_array_equal(urdf, model.standard_parameters())
-    assert columns.shape == (len(K), 20)
-    np.testing.assert_array_equal(known, [*[np.nan] * 10, 2.5, *[np.nan] * 9])
-    np.testing.assert_array_equal(size, np.tile(payload_spread(model), 2))
-    assert named == {"share": pytest.approx(2 * 4.0 / 50.0), "unknown": [2, 0]}
-
-
-def test_payloads_load_the_gears_as_bodies_at_their_links(rng):
-    model = arm()
-    log = exact_log(model, truth(model), rng, samples=20)
-    loads = {"tool0": (1.5, COM, INERTIA), "forearm_link": (3.0, -COM, 2 * INERTIA)}
-    payloads = [
-        Payload(link, m, 0.1, np.zeros(2), c, COM, x, INERTIA, {})
-        for link, (m, c, x) in loads.items()
-    ]
-    mapping = structural_mapping(model)
-    base = mapping.to_base(truth(model))
-    found = SimpleNamespace(base=base, payloads=payloads)
-    bodies, added = payload_fit._loads(found, SimpleNamespace(model=model, mapping=mapping))
-    np.testing.assert_allclose(mapping.to_base(bodies), base, atol=1e-9)
-    Y = joint_torque_regressor(model, log.q, log.v, log.a)
-    wanted = sum(load_torque(model, log, link, *own) for link, own in loads.items())
-    np.testing.assert_allclose((Y @ added).reshape(wanted.shape), wanted, atol=1e-9)
-
-
-def test_known_and_fitted_parameters_of_payloads_are_put_in_their_places(rng):
-    """Of twelve parameters the first, the fifth and the last are known."""
-    known = np.full(12, np.nan)
-    known[[0, 4, 11]] = 2.0, 3.0, 5.0
-    free = [1, 2, 3, 5, 6, 7, 8, 9, 10]
-    theta, freedom, root = rng.random(13), rng.random(15), rng.standard_normal((15, 15))
-    found = SimpleNamespace(theta=theta, freedom=freedom, covariance=root @ root.T)
-    x, C, own = payload_fit._payload_parameters(found, known)
-    wanted = np.zeros(12)
-    wanted[[0, 4, 11]], wanted[free] = (2.0, 3.0, 5.0), theta[4:]  # four of the robot before
-    np.testing.assert_array_equal(x, wanted)
-    np.testing.assert_array_equal(own[free], freedom[4:13])
-    assert np.isinf(own[[0, 4, 11]]).all()
-    np.testing.assert_array_equal(C[np.ix_(free, free)], found.covariance[4:13, 4:13])
-    assert not C[[0, 4, 11]].any()
-    assert not C[:, [0, 4, 11]].any()
-
-
 def test_a_payload_of_no_significant_mass_has_nothing_else():
     x = np.array([0.29, 0.0, 0.0, 0.01, 1e-3, 0.0, 1e-3, 0.0, 0.0, 1e-3])
     C = np.diag([0.01, *[1e-8] * 9])
@@ -573,55 +414,3 @@ def test_a_payload_of_no_significant_mass_has_nothing_else():
         own = payload_of(model, "tool", np.append(mass, x[1:]), C, np.full(10, np.inf)).reasons
         assert {key: own[key] for key in reasons} == reasons
         assert (why in own.values()) is bool(reasons)
-
-
-def test_the_nearest_possible_payload_is_that_of_the_covariance(monkeypatch):
-    """Of the first of two bodies Izz exceeds Ixx + Iyy; their errors share the excess."""
-
-    def body(mass, xx, zz):
-        return np.array([mass, 0, 0, 0, xx, 0, xx, 0, 0, zz])
-
-    monkeypatch.setattr(payload_fit, "payload_spread", lambda model: np.array([5.0]))
-    model = SimpleNamespace(length=1.5)
-    x = np.concatenate([body(2.0, 0.03, 0.08), body(3.0, 0.05, 0.04)])
-    xx, zz = 0.01**2, 0.02**2  # variances
-    variance = np.tile([0.01, *[4e-4] * 3, xx, 1e-4, xx, 1e-4, 1e-4, zz], 2)
-    share = 0.02 / (2 * xx + zz)
-    wanted = np.concatenate([body(2.0, 0.03 + share * xx, 0.08 - share * zz), x[10:]])
-    for masses in ({}, {"a": 2.0}):
-        C = np.diag(np.where(np.arange(20) == 0, 0.0, variance) if masses else variance)
-        found = payload_fit._possible(model, ["a", "b"], x, C, masses)
-        np.testing.assert_allclose(found, wanted, atol=1e-7)
-    C = np.diag(np.where(np.arange(20) == 10, 0.0, variance))
-    assert payload_fit._possible(model, ["a", "b"], x, C, {"b": 3.0})[10] == pytest.approx(3.0)
-
-
-def test_a_robot_with_loops_is_refused_before_its_logs_are_read(tmp_path):
-    chain = four_bar(tmp_path)
-    words = "four_bar has loops; the identification of a payload needs a robot without loops"
-    with pytest.raises(DataError, match=words):
-        identify_payload(chain, [], [])
-    with pytest.raises(DataError, match=words):
-        payload_fit.fit_payloads(SimpleNamespace(model=chain), None, links=(), masses={})
-
-
-def test_a_mass_is_undetermined_by_its_share_of_the_payload_s_columns(ur5):
-    """In other units of the base parameters it is the same."""
-    K = structural_mapping(ur5).K
-    columns = payload_fit._payload_columns(ur5, K, ["tool0", "forearm_link"])
-    assert columns.shape == (len(K), 20)
-    small = payload_fit._payload_columns(ur5, 1e-5 * K, ["tool0", "forearm_link"])
-    np.testing.assert_allclose(small, 1e-5 * columns, rtol=1e-12)
-
-
-@pytest.mark.parametrize(("floats", "constraints"), [(True, ()), (False, ("a loop",))])
-def test_gains_are_refused_of_a_floating_base_and_of_a_fixed_one_with_constraints(
-    floats, constraints
-):
-    def check(unknown, **about):
-        _check_gains(SimpleNamespace(**about), unknown)
-
-    with pytest.raises(SettingsError, match="unknown gains are stated for knee; gains are iden"):
-        check(["knee"], free_flyer=floats, constraints=constraints)
-    check([], free_flyer=floats, constraints=constraints)
-    check(["knee"], free_flyer=False, constraints=())

@@ -1,31 +1,21 @@
-from dataclasses import dataclass, fields, replace
-from types import SimpleNamespace
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.driven import JOINTS
 from helpers.fitting import fit, identify
 from helpers.paths import ROOT
 from helpers.synthetic import exact_log, truth
 
-from robotid.base.exceptions import DataError, NotConvergedError, RankDeficientError, SettingsError
+from robotid.base.exceptions import DataError, RankDeficientError, SettingsError
 from robotid.base.findings import Finding
 from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
-from robotid.diagnosis.verdict.evidence import Determined, Predictions
 from robotid.dynamics.base_parameters import structural_mapping
-from robotid.estimation.estimators import batch
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
-from robotid.estimation.fitting.fitted import Fit
 from robotid.estimation.fitting.recorded import Recordings
 from robotid.estimation.fitting.survey import hold_log
-from robotid.identification import pipeline
-from robotid.identification import result as result_module
 from robotid.identification.pipeline import conclude
-from robotid.identification.result import Asked, Identification
-from robotid.robot.drives import Harmonic, LoadFriction
 from robotid.robot.examples import example_urdf
-from robotid.robot.mass_matrix import MassMatrixCheck
 from robotid.robot.model import RobotModel
 
 EXACT = SignalSettings(cutoff=None, trim=0.0, min_velocity=0.0, velocity="measured")
@@ -189,34 +179,6 @@ def test_parameters_with_an_indefinite_mass_matrix_are_not_consistent(ur5, rng):
     assert not other.is_consistent
 
 
-def test_noise_levels_that_settle_slowly_on_few_rows_do_not_stop_it(ur5, monkeypatch):
-    """Their change halves every two iterations: 3e-4 after 20, 2.5e-7 after 40, on any machine."""
-    log = exact_log(ur5, truth(ur5), np.random.default_rng(0), samples=60, noise=0.5)
-    monkeypatch.setattr(batch, "_MAX_ITERATIONS", 40)
-    found = fit(ur5, [log], estimator="wls")
-    assert "after 40 iterations, remaining relative change" in found.estimate.message
-    assert found.errors.segments < 12
-    monkeypatch.setattr(batch, "_MAX_ITERATIONS", 20)
-    with pytest.raises(NotConvergedError, match=r"relative change 3\.\de-04 after 20 iterations"):
-        fit(ur5, [log], estimator="wls")
-
-
-def test_the_mass_matrix_is_checked_once_and_again_for_other_parameters(ur5, rng, monkeypatch):
-    asked = []
-
-    def check(model, pi):
-        asked.append(pi)
-        return MassMatrixCheck(1, 1.0, 1.0)
-
-    monkeypatch.setattr("robotid.estimation.fitting.fitted.check_mass_matrix", check)
-    found = fit(ur5, [exact_log(ur5, truth(ur5), rng)], signals=EXACT, estimator="wls")
-    assert found.mass_matrix is replace(found, drives=()).mass_matrix is found.mass_matrix
-    assert len(asked) == 1
-    other = replace(found, standard=found.prior)
-    assert other.mass_matrix.is_positive
-    assert [pi is found.prior for pi in asked] == [False, True]
-
-
 def test_a_drive_term_at_its_bound_has_no_error_and_what_stands_moved_little(ur5, rng):
     pi = truth(ur5)
     names = ur5.layout.names
@@ -268,156 +230,3 @@ def test_links_on_locked_joints_that_weigh_less_than_the_urdf_says_are_named():
     assert costs[1] == []
     assert "the URDF's inertials of the links on locked joints, 1.41 kg of the " in costs[0][0]
     assert "kg of wrist_1_link (identify their joints, too" in costs[0][0]
-
-
-@pytest.mark.parametrize("ignore", [(), ("unmounted_part",), ("unsigned_torque", "mass_matrix")])
-def test_what_is_concluded_counts_all_findings_but_the_ignored_ones(
-    identified, monkeypatch, ignore
-):
-    """Of a fit that is given: notes of all logs, errors and warnings of the doctor."""
-    fit = Fit(**{f.name: getattr(identified, f.name) for f in fields(Fit) if f.init})
-    given, springs = [], []
-    monkeypatch.setattr(pipeline, "with_repeated_errors", lambda recordings: recordings)
-    monkeypatch.setattr(pipeline, "with_drives", lambda *x, **_: (given.append(x), fit)[1])
-    monkeypatch.setattr(pipeline, "counterbalanced", lambda *x: x)
-    monkeypatch.setattr(pipeline, "with_known_springs", lambda *x: (springs.append(x), x[0])[1])
-    monkeypatch.setattr(pipeline, "take_sample", lambda fit: None)
-    monkeypatch.setattr(pipeline, "explain_residual", lambda fit, sample: ((), ()))
-    monkeypatch.setattr(pipeline, "with_model_error", lambda fit, *_: (fit, ("a.viscous",)))
-    logs = [
-        SimpleNamespace(head=SimpleNamespace(name=name, path=name, assumed=(),
-                                             notes=(f"note {k}",)),
-                        asked=SignalSettings(cutoff=3.0 + k), unit=None)
-        for k, name in enumerate(("a.csv", "b.csv", "c.csv"))
-    ]  # fmt: skip
-    recordings = SimpleNamespace(model=fit.model, fitted=logs[:2], validation=logs[2:])
-    found = [
-        Finding(
-            "unmounted_part", "warning", "a.csv: wrist_3_link", "x", {"mass": 2.0, "gain": 9.0}
-        ),
-        Finding("unsigned_torque", "error", "b.csv", "all absolute", {"joints": 6.0}),
-        Finding("excitation", "warning", "a.csv", "left out"),
-        Finding("rate", "note", "a.csv", "left out"),
-    ]
-    choice = EstimatorSettings("consistent")
-    result = pipeline.conclude(recordings, choice, found, ignore, friction="none")
-    codes = [f.code for f in result.findings]
-    assert codes.count("log_note") == 3
-    assert {f.where for f in result.findings if f.code == "log_note"} == {"a.csv", "b.csv", "c.csv"}
-    assert ("excitation" in codes, "rate" in codes) == (False, False)
-    assert "unmounted_part" in codes  # it is shown whatever is ignored
-    is_wrong = "unsigned_torque" not in ignore
-    assert result.log_errors == (("all absolute",) if is_wrong else ())
-    assert ("urdf_not_written" in codes) is is_wrong
-    assert result.has_urdf is not is_wrong
-    assert ("unmounted_part" in {w.code for w in result.warnings}) is (
-        "unmounted_part" not in ignore
-    )
-    assert result.asked == Asked(SignalSettings(cutoff=3.0), "none", ignore)
-    assert result.on_misfit == ("a.viscous",)
-    ((_, asked, wanted, balanced),) = given
-    assert (asked, set(wanted.values())) == (choice, {()})
-    assert balanced == (found, ["a.csv", "b.csv"])  # of the fitted logs
-    ((before, of_fit, asked_terms),) = springs
-    assert (before, asked_terms) == (found[:2], wanted)
-    assert of_fit.estimate is fit.estimate
-
-
-def test_a_verdict_is_given_all_that_is_known_of_a_result(monkeypatch):
-    monkeypatch.setattr(result_module, "hidden_joints", lambda model, fitted: ("hidden", fitted))
-    monkeypatch.setattr(result_module, "judge", lambda *x, **named: (*x, named))
-    log = SimpleNamespace(has_torque=True)
-    fit = SimpleNamespace(recording=SimpleNamespace(log=log, is_partial=False))
-    refitted = [SimpleNamespace(recording=SimpleNamespace(name=name)) for name in ("a", "b")]
-    own = {
-        "metrics": lambda: "fitted", "predictions": {"c": 1}, "fitted": (fit,),
-        "validation": (),
-        "model": SimpleNamespace(
-            joints=("x", "y", "free"), passive=("free",), is_static=True, constraints=()
-        ),
-        "refitted": refitted,
-        "determination": SimpleNamespace(undetermined=("u",)), "is_consistent": False,
-        "_uncertain_drives": ["d"], "is_poorly_excited": "poorly", "log_errors": ("e",),
-        "warnings": ("w",), "scale_check": "s", "_cause_of": "cause of a joint",
-    }  # fmt: skip
-    predictions, determined, named = Identification.verdict.func(SimpleNamespace(**own))
-    assert predictions == Predictions(
-        "fitted", {"c": 1}, ("x", "y"), ["a", "b"], ("hidden", (fit,))
-    )
-    assert determined == Determined(("u",), False, "poorly", True, ["d"])
-    assert named.pop("cause_of") == "cause of a joint"
-    assert named == {"log_errors": ("e",), "warnings": ("w",), "scale_check": "s"}
-
-
-def test_drive_terms_that_were_selected_join_those_of_the_model():
-    model = RobotModel.from_urdf(example_urdf("ur5_robot.urdf"), joints=JOINTS[:2])
-    lift, elbow = JOINTS[:2]
-    first, second, third = (LoadFriction(), Harmonic(order=3.0), Harmonic(order=5.0))
-    plain = model.with_terms({lift: [first]})
-    given = []
-    recordings = SimpleNamespace(model=plain, with_model=lambda robot: given.append(robot))
-    fit = SimpleNamespace(
-        mapping=SimpleNamespace(names=plain.layout.names),
-        standard=np.arange(len(plain.layout.names)) + 1.0,
-    )
-    drives = [
-        SimpleNamespace(joint=lift, terms=(second,)),
-        SimpleNamespace(joint=elbow, terms=(third,)),
-    ]
-    pipeline._with_own(recordings, fit, drives)
-    (robot,) = given
-    assert robot.layout.own == {lift: (first, second), elbow: (third,)}
-    values = dict(zip(plain.layout.names, fit.standard, strict=True))
-    wanted = [values.get(name, 0.0) for name in robot.layout.names]
-    assert len(wanted) == len(values) + 2
-    np.testing.assert_array_equal(robot.carried_by, wanted)
-
-
-@pytest.mark.parametrize("settles", [(), (2,)])
-def test_fits_are_counted_and_end_with_the_shapes_that_settled(monkeypatch, settles):
-    """A first fit, two with shapes, a last one; shapes that do not move end it earlier."""
-    reported, solved = [], []
-    drives = [(SimpleNamespace(terms=("x",), shapes=("s",), k=k),) for k in range(4)]
-
-    def solve(recordings, choice, is_last=True):
-        solved.append((recordings, choice, is_last))
-        ground = SimpleNamespace(rough=SimpleNamespace(sigma=10 * len(solved)))
-        return SimpleNamespace(solution=Solved(len(solved)), ground=ground)
-
-    moved = iter([*(drives[k] for k in range(1, 3) if k not in settles), None])
-    monkeypatch.setattr(pipeline, "solve_recordings", solve)
-    monkeypatch.setattr(pipeline, "rough_choice", lambda choice: "rough")
-    monkeypatch.setattr(pipeline, "choose_drives", lambda *_: drives[0])
-    monkeypatch.setattr(
-        pipeline, "_with_own", lambda own, fit, drives: (own.levels, fit.k, drives[0].k)
-    )
-    monkeypatch.setattr(pipeline, "settled_shapes", lambda fit: next(moved))
-    monkeypatch.setattr(pipeline, "fit_recordings", lambda own, choice: Solved(own))
-    everything = Everything()
-    found = pipeline.with_drives(everything, "exact", {}, progress=lambda *x: reported.append(x))
-    last = reported.pop()
-    assert last == ("fits", 3, 4, "fits")
-    assert reported == [("fits", 0, 1, "fits"), ("fits", 1, 4, "fits"), ("fits", 2, 4, "fits")]
-    assert solved == [
-        (everything, "exact", True),
-        ((10, 1, 0), "rough", False),
-        ((20, 2, 1), "rough", False),
-    ]
-    final = 1 if settles else 2
-    assert (found.k, found.drives) == ((30, 3, final), drives[final])
-
-
-@dataclass(frozen=True)
-class Everything:
-    """All logs, and the noise levels at which their fit starts."""
-
-    repeated: None = None
-    levels: object = None
-
-
-@dataclass(frozen=True)
-class Solved:
-    """What a fit is here: its number, or what was fitted."""
-
-    k: object
-    drives: tuple = ()

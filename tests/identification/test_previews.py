@@ -2,10 +2,8 @@
 
 import re
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
-import pinocchio as pin
 import pytest
 import scipy.signal
 from helpers.driven import arm
@@ -15,33 +13,22 @@ from helpers.synthetic import truth
 from robotid.base.exceptions import DataError, SettingsError
 from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
-from robotid.design import previews
 from robotid.design.previews import (
-    Preview,
     Run,
+    TorqueNoise,
     _band,
     _Information,
-    _largest,
-    _white_step,
+    assumed_noise,
     preview,
 )
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.factors import Factors, compress
-from robotid.dynamics.prediction import predict
 from robotid.dynamics.simulation.motions import random_fourier
 from robotid.dynamics.torque import joint_torque_regressor, trajectory_regressor
 from robotid.dynamics.used_rows import base_problem
 from robotid.estimation.estimators.segments import scatter
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
-from robotid.estimation.fitting.recorded import Recordings
 from robotid.estimation.fitting.survey import hold_log
-from robotid.identification.assumptions import (
-    TorqueNoise,
-    assumed_noise,
-    assumed_parameters,
-    largest_gravity,
-    largest_torques,
-)
 from robotid.output.files.entries import build_preview
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
@@ -178,33 +165,6 @@ def test_the_noise_of_a_short_run_counts_the_parameters_that_its_rows_pay_for(rn
     assert noise.origins == ("found",) * 3
 
 
-@pytest.mark.parametrize(
-    ("cutoff", "rate", "is_static", "wanted"),
-    [(5.0, None, False, 0.01), (None, None, False, 0.01), (5.0, 25.0, False, 0.01),
-     (None, 25.0, False, 0.04), (None, 25.0, True, 1.0)],
-)  # fmt: skip
-def test_white_noise_is_as_dense_as_the_samples_or_the_rows_of_no_filter(
-    cutoff, rate, is_static, wanted
-):
-    signals = SignalSettings(cutoff=cutoff, rate=rate)
-    log = SimpleNamespace(step=0.01, signals=signals, model=SimpleNamespace(is_static=is_static))
-    assert _white_step(log) == pytest.approx(wanted)
-
-
-def test_the_largest_of_several_motions_is_seen(rng):
-    model = arm()
-    logs = [moved(model, rng)[0] for _ in range(2)]
-    fast = replace(logs[0], t=0.5 * logs[0].t)
-    held = [hold_log(model, log, SignalSettings()) for log in (logs[1], fast, logs[1])]
-    bodies = model.standard_parameters()
-    peak, fastest = _largest(model, held)
-    for j in range(3):
-        v = max(np.abs(log.whole.trajectory.v[:, j]).max() for log in held)
-        torques = [predict(model, [bodies], log.whole.trajectory)[0] for log in held]
-        assert fastest[j] == v
-        assert peak[j] == pytest.approx(max(np.abs(tau[:, j]).max() for tau in torques))
-
-
 def test_torques_that_a_log_has_are_ignored(ur5, motion, recorded):
     first, second = (preview(ur5, [log], noise=white()) for log in (motion[0], recorded))
     np.testing.assert_array_equal(first.standard_error, second.standard_error)
@@ -231,18 +191,6 @@ def test_errors_are_in_proportion_to_the_noise_and_fall_with_the_root_of_the_len
     np.testing.assert_allclose(thrice, 3 * once, rtol=1e-8)
     four = preview(ur5, [log] * 4, noise=white(), estimator=estimator).base_error
     np.testing.assert_allclose(four, once / 2, rtol=1e-8)
-
-
-def test_the_density_of_noise_counts_and_not_the_rate_of_the_rows(ur5, motion):
-    log, noise = motion[0], white()
-    base = preview(ur5, [log], noise=noise, estimator="wls").base_error
-    thinned = SignalSettings(rate=50.0)
-    half = preview(ur5, [log], noise=noise, estimator="wls", signals=thinned).base_error
-    np.testing.assert_allclose(half, base, rtol=0.05)
-    # the same noise over 0.1 s has ten times the density of 0.01 s
-    slow = TorqueNoise(STD, np.full(6, 0.1), ("stated",) * 6)
-    slower = preview(ur5, [log], noise=slow, estimator="wls").base_error
-    np.testing.assert_allclose(slower, np.sqrt(10.0) * base, rtol=1e-8)
 
 
 def test_the_prior_only_helps_and_bands_are_of_the_motion(ur5, motion):
@@ -345,59 +293,6 @@ def test_noise_is_stated_or_a_hundredth_of_the_largest_torque(ur5):
         assumed_noise(ur5, size, {}, -1.0)
 
 
-def test_what_a_run_before_left_open_was_not_wider_than_is_plausible():
-    K, spread = np.array([[1.0, 0.0], [2.0, 1.0], [0.0, 3.0]]), np.array([2.0, 3.0])
-    error, before = np.array([0.5, np.inf, 2.0]), np.array([np.inf, 1.0, 30.0])
-    expected = SimpleNamespace(
-        mapping=SimpleNamespace(K=K), prior_std=spread, base_error=error, standard_error=spread
-    )
-    found = Preview(expected, white(), before)
-    np.testing.assert_allclose(found.plausible, [2.0, 5.0, 9.0])
-    np.testing.assert_allclose(found.gain, [4.0, 0.2, 4.5])
-    np.testing.assert_array_equal(found.base_error, error)
-    np.testing.assert_array_equal(found.standard_error, spread)
-    assert Preview(expected, white()).gain is None
-
-
-def test_the_largest_gravity_is_of_either_sign():
-    model = arm()
-    found = largest_gravity(model)
-    low, high = np.array([(j.lower, j.upper) for j in model.limits]).T
-    q = np.random.default_rng(0).uniform(low, high, (200, 3))
-    data = model.pin_model.createData()
-    g = np.array([pin.computeGeneralizedGravity(model.pin_model, data, x) for x in q])
-    np.testing.assert_allclose(found, np.abs(g).max(axis=0), atol=1e-12)
-    assert (np.abs(g.max(axis=0)) < found - 1e-3).any()
-
-
-def test_friction_of_a_usual_size_is_a_twentieth_of_each_joints_torque_at_its_own_speed(ur5):
-    speeds = (3.0, np.inf, 0.0, 2.0, np.inf, np.inf)
-    limits = tuple(replace(x, velocity=v) for x, v in zip(ur5.limits, speeds, strict=True))
-    model = SimpleNamespace(
-        joints=ur5.joints,
-        layout=ur5.layout,
-        limits=limits,
-        standard_parameters=ur5.standard_parameters,
-    )
-    size, fastest = np.array([80.0, 70.0, 50.0, 9.0, 8.0, 7.0]), np.array([9, 5, 0.5, 9, 1e-6, 4.0])
-    pi = assumed_parameters(model, size, fastest)
-    names, given = list(model.layout.names), ur5.standard_parameters()
-    counted = []
-    for joint, torque, speed in zip(ur5.joints, size, (3.0, 5.0, 0.5, 2.0, 1e-3, 4.0), strict=True):
-        own = {f"{joint}.coulomb": 0.05 * torque, f"{joint}.viscous": 0.05 * torque / speed}
-        for name, value in own.items():
-            counted.append(names.index(name))
-            assert pi[counted[-1]] == pytest.approx(value), name
-    others = np.delete(np.arange(len(pi)), counted)
-    np.testing.assert_array_equal(pi[others], given[others])
-    # a limit that is stated is the largest torque, but not one of 0; what carries nothing has some
-    efforts = (90.0, np.inf, 0.0, np.inf, 6.0, np.inf)
-    limits = tuple(replace(x, effort=e) for x, e in zip(ur5.limits, efforts, strict=True))
-    peak = np.array([1.0, 2.0, 40.0, 0.0, 50.0, 0.3])
-    found = largest_torques(SimpleNamespace(limits=limits), peak)
-    np.testing.assert_allclose(found, [90.0, 2.0, 40.0, 0.05, 6.0, 0.3])
-
-
 def test_a_joint_without_an_effort_limit_has_the_torque_of_its_bodies(ur5, motion, tmp_path):
     text = example_urdf("ur5_robot.urdf").read_text()
     (tmp_path / "bare.urdf").write_text(re.sub(r'effort="[^"]*"', "", text))
@@ -463,79 +358,3 @@ def test_noise_of_a_long_run_has_the_scatter_of_each_joint_s_own_scores(rng):
     short = replace(run, segments=segments[:11])
     X = [W[:11, j].reshape(-1, 3) / level[j] for j in (0, 1)]
     np.testing.assert_allclose(short.meat(K, level), (X[0].T @ X[0] + X[1].T @ X[1]) / 0.2)
-
-
-def test_a_run_of_two_logs_has_their_mean_step_and_the_weights_of_its_fit(rng):
-    model = arm()
-    logs = [moved(model, rng, rate=rate)[0].window(0.0, 2.5) for rate in (100.0, 40.0)]
-    held = [hold_log(model, log, SignalSettings(cutoff=5.0)) for log in logs]
-    recordings = Recordings(model, structural_mapping(model), held)
-    details = {"prior": {"weight": 30.0, "plausible_weight": 2.0}}
-    run = Run.of(recordings, truth(model), details)
-    assert run.step == pytest.approx((0.01 + 0.025) / 2)
-    assert run.share == pytest.approx(2 * 5.0 / 100.0)
-    assert run.samples == sum(len(log.whole.trajectory.t) for log in held)
-    assert run.weight == (30.0, 2.0)
-    np.testing.assert_allclose(run.squares, sum(log.whole.trajectory.squares for log in held))
-    assert Run.of(recordings, truth(model), {"prior": {"weight": 3.0}}).weight == (3.0, 1.0)
-    assert Run.of(recordings, truth(model), {}).weight is None
-
-
-def test_the_run_alone_is_judged_with_its_own_weight_of_the_prior(rng, monkeypatch):
-    model = arm()
-    held = hold_log(model, moved(model, rng)[0].window(0.0, 3.0), SignalSettings())
-    given, errors = [], previews._errors
-    monkeypatch.setattr(previews, "_errors", lambda *x: (given.append(x), errors(*x))[1])
-    part = compress(
-        base_problem(model, structural_mapping(model), held.whole.trajectory, held.whole.mask)
-    )
-    motion = held.whole.trajectory
-    run = Run((part,), truth(model), motion.squares, len(motion.t), 0.2, 0.01, (30.0, 2.0))
-    noise = TorqueNoise(STD[:3], np.array([0.0, 0.02, 0.5]), ("stated",) * 3)
-    choice = EstimatorSettings("consistent", draws=0)
-    found = previews.preview_logs(model, [held], choice, noise=noise, run=run)
-    (both, *_, weight), (alone, *_, other) = given
-    assert weight == other == (30.0, 2.0)
-    np.testing.assert_array_equal(both.factors.rows, 2 * part.rows)
-    np.testing.assert_array_equal(alone.factors.rows, part.rows)
-    # the density in each row over the variance behind the filter
-    ((_, level),) = both.levels
-    np.testing.assert_allclose(level, STD[:3] ** 2 * [1.0, 2.0, 50.0])
-    expected = found.expected
-    assert expected.errors.inflation == pytest.approx(np.mean(level / both.sigma**2))
-    assert np.ptp(level / both.sigma**2) > 1e-3
-    np.testing.assert_array_equal(expected.standard, truth(model))
-    np.testing.assert_array_equal(expected.prior, model.standard_parameters())
-    np.testing.assert_allclose(expected.base, expected.mapping.K @ truth(model))
-    C = expected.mapping.K @ expected.standard_covariance @ expected.mapping.K.T
-    np.testing.assert_allclose(expected.base_error, np.sqrt(np.diag(C)), rtol=1e-6)
-
-
-def test_words_of_a_preview_are_of_all_motions_each_named_once(monkeypatch):
-    monkeypatch.setattr(
-        previews, "excitation_finding", lambda *given: SimpleNamespace(message=given)
-    )
-    fitted = [
-        SimpleNamespace(recording=SimpleNamespace(log=SimpleNamespace(name=name)))
-        for name in ("a.csv", "b.csv", "a.csv")
-    ]
-    expected = SimpleNamespace(fitted=fitted, wls="wls", determination="determined")
-    assert Preview(expected, white()).words == ("wls", "determined", "a.csv, b.csv")
-
-
-def test_a_joint_that_fits_exactly_has_a_billionth_of_the_largest_noise():
-    """Of two joints with one parameter, which the second determines; and of two that fit exactly.
-
-    R holds the rows of the parameter, 3, and below them the root of the sum of residual squares.
-    """
-
-    def noise(residual):
-        R = np.array([[2.0, 6.0], [0.0, residual]]), np.array([[4.0, 12.0], [0.0, 0.0]])
-        part = Factors(R, (np.array([0]),) * 2, np.array([25, 16]), ("a",))
-        return Run((part,), np.array([3.0]), np.zeros(1), 25, 0.5, 0.01).noise(np.eye(1))
-
-    found, free = noise(10.0), np.array([1.0, 15 / 16])
-    np.testing.assert_allclose(found.std, [2.0, 2e-9] / np.sqrt(free), rtol=1e-12)
-    np.testing.assert_allclose(found.correlation, free * 0.01 / 0.5, rtol=1e-12)
-    free = 1.0 - np.array([2.0, 4.0]) ** 2 / (2.0**2 + 4.0**2) / [25, 16]
-    np.testing.assert_allclose(noise(0.0).std, 1e-18 / np.sqrt(free), rtol=1e-12)

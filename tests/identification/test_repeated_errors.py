@@ -1,7 +1,6 @@
 """Errors of points of contact in the intervals."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pinocchio as pin
@@ -17,11 +16,8 @@ from robotid.dynamics.factors import triangle_of
 from robotid.dynamics.prediction import predict
 from robotid.dynamics.used_rows import base_problem
 from robotid.estimation.fitting.recorded import Recordings
-from robotid.estimation.fitting.selected_drives import DriveChoice
 from robotid.estimation.fitting.survey import hold_log
-from robotid.identification import pipeline, repeated_errors
 from robotid.identification.repeated_errors import (
-    EstimatedErrors,
     _shift,
     _shift_of_motion,
     _slopes,
@@ -32,7 +28,6 @@ from robotid.identification.repeated_errors import (
     with_repeated_errors,
 )
 from robotid.robot.constraints import Contact, frame_id
-from robotid.robot.drives import Cubic, Viscous
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 
@@ -216,39 +211,6 @@ def test_the_covariance_of_the_score_is_that_of_the_stated_uncertainty(log):
     assert 0.0 < np.abs(errors(None).root).max() < np.inf
 
 
-@pytest.mark.parametrize("stated", [None, 2e-3])
-def test_points_of_unknown_uncertainty_have_the_mean_square_of_their_offsets(
-    log, monkeypatch, stated
-):
-    """Two offsets of unequal size along three axes; the uncertainty of the first may be stated."""
-    first, *others = (x for x in robot(None).constraints if x.kind == "point")
-    constraints = [replace(first, uncertainty=stated), *others]
-    model = replace(robot(None), constraints=tuple(constraints))
-    mapping = structural_mapping(model)
-    recordings = Recordings(model, mapping, (hold_log(model, log, RAW),))
-    rows = recordings.fitted[0].whole
-    some = base_problem(model, mapping, rows.trajectory, rows.mask)
-    W, weight = (np.concatenate([block[k] for block in some.blocks()]) for k in (0, 2))
-    D = np.random.default_rng(2).standard_normal((len(W), 6))
-    x = 1e-4 * np.array([3.0, 2.0, 0.1, -9.0, 4.0, 0.2][0 if stated is None else 3 :])
-    squares = np.outer(x, x) + np.diag(np.arange(1.0, len(x) + 1.0)) * 1e-9
-    found = EstimatedErrors(5e-4, np.zeros(6), np.zeros((6, 6)), squares)
-    monkeypatch.setattr(repeated_errors, "_slopes", lambda *_: D)
-    monkeypatch.setattr(repeated_errors, "estimated_errors", lambda *_: found)
-    errors = with_repeated_errors(recordings).repeated
-    E = np.zeros((6, 6))
-    if stated is None:
-        E[:3, :3] = E[3:, 3:] = 0.5 * (squares[:3, :3] + squares[3:, 3:])
-    else:
-        E[:3, :3], E[3:, 3:] = stated**2 * np.eye(3), squares
-    score = W.T @ (weight[:, None] * D)
-    wanted = score @ E @ score.T
-    np.testing.assert_allclose(
-        errors.root @ errors.root.T, wanted, atol=1e-9 * np.abs(wanted).max()
-    )
-    assert errors.points == (5e-4 if stated is None else stated)
-
-
 def test_offsets_without_torques_of_joints_are_two_centimetres_if_not_stated(log):
     def size(log, uncertainty, has_torque, terms=()):
         model = robot(uncertainty, terms, measured=("fz",))
@@ -264,103 +226,6 @@ def test_offsets_without_torques_of_joints_are_two_centimetres_if_not_stated(log
     still = log.q.copy()
     still[:, 4] = 0.1  # a joint at rest: with Coulomb friction, its rows are not used
     assert size(replace(log, q=still), None, has_torque=True, terms=("coulomb",)).points != 0.02
-
-
-def test_contact_errors_follow_the_selected_drive_terms(log, monkeypatch):
-    """Errors of the points are those of a robot that had these terms from the start."""
-    model, fits = robot(2e-3), []
-    plain = with_repeated_errors(
-        Recordings(model, structural_mapping(model), (hold_log(model, log, RAW),))
-    )
-    found = SimpleNamespace(mapping=plain.mapping, standard=model.standard_parameters())
-    drives = [
-        DriveChoice("FR_KFE", ("cubic",), (Viscous(), Cubic())),
-        DriveChoice("HL_HFE", (), (Viscous(),)),
-    ]
-    solved = SimpleNamespace(
-        solution=found, ground=SimpleNamespace(rough=SimpleNamespace(sigma=None))
-    )
-    monkeypatch.setattr(pipeline, "solve_recordings", lambda *x, **_: solved)
-    monkeypatch.setattr(pipeline, "choose_drives", lambda *x: drives)
-    monkeypatch.setattr(pipeline, "rough_choice", lambda choice: choice)
-    monkeypatch.setattr(
-        pipeline, "replace",
-        lambda x, **new: fits.append(x) if "drives" in new else replace(x, **new),
-    )  # fmt: skip
-    monkeypatch.setattr(pipeline, "fit_recordings", lambda recordings, choice: recordings)
-    pipeline.with_drives(plain, None, {})
-    (changed,) = fits
-    assert len(changed.mapping.base_names) == len(plain.mapping.base_names) + 3
-    assert changed.repeated.root.shape == (len(changed.mapping.base_names), 6)
-    fresh = with_repeated_errors(
-        Recordings(changed.model, changed.mapping, (hold_log(changed.model, log, RAW),))
-    )
-    np.testing.assert_allclose(changed.repeated.root, fresh.repeated.root, rtol=1e-9, atol=1e-15)
-    k = [changed.mapping.base_names.index(f"{x}.viscous") for x in ("FR_KFE", "HL_HFE")]
-    assert (np.abs(changed.repeated.root[k]).max(axis=1) > 0.0).all()
-
-
-@pytest.mark.parametrize(("cutoff", "step"), [(None, 1), (10.0, 2)])
-def test_errors_are_those_of_all_rows_though_only_some_are_used(log, monkeypatch, cutoff, step):
-    """Of rows filtered to a fifth of their band every second is used, with twice the weight."""
-    model = robot(2e-3)
-    mapping = structural_mapping(model)
-    settings = replace(RAW, cutoff=cutoff)
-    recordings = Recordings(model, mapping, (hold_log(model, log, settings),))
-    rows = recordings.fitted[0].whole
-    some = base_problem(model, mapping, rows.trajectory.every(step), rows.mask[::step])
-    W, weight = (np.concatenate([block[k] for block in some.blocks()]) for k in (0, 2))
-    D = np.random.default_rng(2).standard_normal((len(W), 6))
-    monkeypatch.setattr(repeated_errors, "_slopes", lambda *_: D)
-    found = with_repeated_errors(recordings).repeated
-    root = np.sqrt(weight)[:, None]
-    W, D = root * W, root * D
-    np.testing.assert_allclose(found.root, -2e-3 * step * W.T @ D, atol=1e-9 * np.abs(W).max())
-    left = D - W @ np.linalg.lstsq(W, D, rcond=None)[0]  # of D, what parameters cannot explain
-    count = recordings.reduce(is_cut=False)[0].factors.rows.sum()
-    # W has dependent columns here, whose places in the triangle hold a hundredth of D
-    assert found.variance == pytest.approx(4e-6 * step * np.sum(left**2) / count, rel=0.03)
-
-
-def test_only_logs_with_an_imu_have_a_bias(log, rng, monkeypatch):
-    """The effect of a bias is that of the first log's rows alone; the second has no IMU."""
-    model = robot(0.0)
-    mapping = structural_mapping(model)
-    values = rng.standard_normal((len(log.t), 6)) + np.array([0, 0, 0, 0, 0, 9.81])
-    frame = ImuFrame(np.eye(4)[3], np.zeros(3), np.array([0, 0, -9.81]), np.zeros(3))
-    moved = replace(log, base=replace(log.base, imu=ImuMotion(values, frame)))
-    with_imu, without = (hold_log(model, x, RAW) for x in (moved, log))
-
-    def slopes(model, rows, pi):
-        return np.random.default_rng(7).standard_normal((rows.trajectory.tau.size, 3))
-
-    monkeypatch.setattr(repeated_errors, "_slopes_of_bias", slopes)
-    alone, both = (
-        with_repeated_errors(Recordings(model, mapping, logs, validation=(without, with_imu)))
-        for logs in ((with_imu,), (with_imu, without))
-    )
-    assert alone.repeated.root.shape[1] == 3
-    frames = [x.head.base.imu and x.head.base.imu.frame for x in both.fitted]
-    assert frames[1] is None
-    np.testing.assert_array_equal(frames[0].offset, both.repeated.bias)
-    unfitted = [x.head.base.imu and x.head.base.imu.frame for x in both.validation]
-    assert unfitted[0] is None
-    np.testing.assert_array_equal(unfitted[1].offset, both.repeated.bias)
-    assert np.linalg.norm(both.repeated.bias) > 0.0
-    # what is subtracted from the specific force is missing in the acceleration
-    before, after = (
-        x.fitted[0].whole.trajectory.a for x in (Recordings(model, mapping, (with_imu,)), both)
-    )
-    np.testing.assert_allclose(
-        before[:, :3] - after[:, :3], np.tile(both.repeated.bias, (60, 1)), atol=1e-12
-    )
-    np.testing.assert_array_equal(before[:, 3:], after[:, 3:])
-    assert with_repeated_errors(Recordings(model, mapping, (without,))).repeated is None
-    # with slopes that do not depend on the parameters, those of the second log have no effect
-    one, two = alone.repeated.root, both.repeated.root
-    np.testing.assert_allclose(
-        one @ np.linalg.lstsq(one, two, rcond=None)[0], two, atol=1e-9 * np.abs(two).max()
-    )
 
 
 def test_a_bias_of_the_accelerometer_acts_on_the_mass_of_the_robot(log):

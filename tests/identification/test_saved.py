@@ -3,7 +3,6 @@
 import json
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,9 +12,7 @@ from helpers.synthetic import exact_log, truth
 import robotid
 from robotid.base.exceptions import SettingsError
 from robotid.cli import main
-from robotid.cli.work.identify import _entries
-from robotid.cli.work.job import LogEntry, job_from_settings
-from robotid.estimation.fitting.evaluation import Evaluation
+from robotid.cli.work.job import job_from_settings
 
 URDF = ROOT / "urdf" / "planar_2r.urdf"
 
@@ -64,7 +61,7 @@ def test_the_files_are_those_of_the_command_line_and_hold_what_was_found(saved, 
 def test_the_settings_are_a_job_that_finds_the_same_again(saved, found, logs, tmp_path):
     settings = json.loads(saved.read_text())["settings"]
     job = job_from_settings(settings, "result.json", Path())
-    assert job.signals == found.asked.signals
+    assert job.signals == found.stated.signals
     assert job.estimator == found.estimator
     assert job.drives == {"joint_2": ("cubic",)}
     assert job.ignore == ("torque_sign",)
@@ -117,13 +114,3 @@ def test_a_result_is_written_whole_or_not_at_all(found, tmp_path, monkeypatch):
     with pytest.raises(ValueError, match="JSON"):
         robotid.save_result(found, tmp_path / "out", report=False)
     assert list((tmp_path / "out").iterdir()) == []
-
-
-def test_the_windows_of_logs_in_files_are_those_of_the_job():
-    def evaluation(path, start, end):
-        log, extent = SimpleNamespace(path=path), SimpleNamespace(start=start, end=end)
-        return Evaluation(SimpleNamespace(log=log, extent=extent), {}, {}, {})
-
-    logs = [("a/one.csv", 1.5, 4.0), ("", 0.0, 9.0), ("b/two.csv", -2.0, 3.25)]
-    found = _entries([evaluation(*log) for log in logs])
-    assert found == (LogEntry(Path("a/one.csv"), 1.5, 4.0), LogEntry(Path("b/two.csv"), -2.0, 3.25))

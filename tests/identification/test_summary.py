@@ -1,23 +1,15 @@
 """What a notebook and print() show of a result."""
 
-from dataclasses import replace
-from html.parser import HTMLParser
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
-from helpers.pages import tables
 from helpers.paths import ROOT
 from helpers.synthetic import exact_log, truth
 
 from robotid.cli.work.identify import run_job
 from robotid.cli.work.job import Job, LogEntry
 from robotid.data.files.read import write_log
-from robotid.estimation.fitting.metrics import JointMetrics, Metrics
 from robotid.identification.pipeline import identify
 from robotid.identification.summary import (
-    _errors,
-    _tables,
     cell,
     error_lines,
     friction_lines,
@@ -25,19 +17,6 @@ from robotid.identification.summary import (
     verdict_lines,
 )
 from robotid.robot.model import RobotModel
-
-
-class Words(HTMLParser):
-    def __init__(self, html):
-        super().__init__()
-        self.words, self.tags = [], []
-        self.feed(html)
-
-    def handle_starttag(self, tag, attrs):
-        self.tags.append((tag, dict(attrs)))
-
-    def handle_data(self, data):
-        self.words.append(data)
 
 
 @pytest.fixture(scope="module")
@@ -59,11 +38,6 @@ def reported():
 @pytest.fixture(scope="module")
 def found(arm, logs, reported):
     return identify(arm, logs[:1], validation=logs[1:], progress=lambda *x: reported.append(x))
-
-
-def test_each_drive_has_its_choice_of_friction_though_none_is_added(found):
-    assert [drive.joint for drive in found.drives] == list(found.model.joints)
-    assert not any(drive.terms for drive in found.drives)
 
 
 def test_the_start_of_each_stage_is_reported(found, reported):
@@ -96,39 +70,6 @@ def test_its_text_has_verdict_reasons_and_every_joint(found):
         (first, _) = [line.split() for line in text.splitlines() if line.split()[0] == joint]
         assert first[1] == f"{error:.1f}"
         assert text.count(f"  {joint} ") == 2  # kept and fitted rows
-
-
-def test_its_tables_have_the_errors_of_plainer_predictions(found):
-    """Those of weighted least squares made worse than they are, to be another figure."""
-    (kept,), (fitted,) = found.validation, found.fitted
-    metrics = kept.metrics["wls"].per_joint.items()
-    others = {
-        joint: replace(m, relative_error_pct=3.0 * m.relative_error_pct) for joint, m in metrics
-    }
-    worse = {**kept.metrics, "wls": replace(kept.metrics["wls"], per_joint=others)}
-    sums = fitted.sums["wls"]
-    sums = {**fitted.sums, "wls": replace(sums, residual=4.0 * sums.residual)}
-    found = replace(
-        found, validation=(replace(kept, metrics=worse),), fitted=(replace(fitted, sums=sums),)
-    )
-    lines = [line.split() for line in str(found).splitlines()]
-    tables = (
-        (found.validation[0].metrics["estimate"], found.validation[0].metrics["wls"]),
-        (
-            found.metrics(),
-            found.metrics("wls"),
-        ),
-    )
-    for place, (ours, wls) in enumerate(tables):
-        for joint, m in ours.per_joint.items():
-            own = [words for words in lines if words and words[0] == joint][place]
-            others = [
-                m.baselines["urdf_with_drives"], wls.per_joint[joint].relative_error_pct,
-                m.baselines["urdf"], m.baselines["gravity_only"],
-            ]  # fmt: skip
-            assert own[1:] == [
-                f"{m.relative_error_pct:.1f}", f"{m.rmse:#.3g}", "N", "m", *map(cell, others),
-            ]  # fmt: skip
 
 
 def test_figures_above_a_thousand_have_no_decimals():
@@ -175,22 +116,6 @@ def test_friction_is_said_from_the_first_step_to_the_last_that_was_taken():
     assert friction_lines({"b": joints["b"]}) == []
 
 
-def test_its_html_has_verdict_and_tables_and_nothing_that_runs(found):
-    page = Words(found._repr_html_())
-    assert found.verdict.status in page.words
-    for joint in found.model.joints:
-        assert "".join(page.words).count(joint) >= 2
-    assert not {"script", "style", "link", "img"} & {tag for tag, _ in page.tags}
-    assert "writes the whole report" in " ".join(page.words)
-
-
-def test_names_and_the_link_to_the_report_are_escaped(arm, logs):
-    found = identify(arm, logs[:1], validation=[replace(logs[1], path="<i>.csv")])
-    html = replace(found, report='a"b<c>/report.html')._repr_html_()
-    assert "<i>" not in html
-    assert ("a", {"href": 'a"b<c>/report.html'}) in Words(html).tags
-
-
 def test_a_job_s_identification_links_to_its_report(arm, logs, tmp_path):
     write_log(logs[0], tmp_path / "log.csv")
     job = Job(
@@ -198,36 +123,7 @@ def test_a_job_s_identification_links_to_its_report(arm, logs, tmp_path):
     )
     found, _ = run_job(job, tmp_path / "out")
     assert found.report == str(tmp_path / "out" / "report.html")
-    assert f'href="{found.report}"' in found._repr_html_()
     assert f"report: {found.report}" in str(found)
-
-
-def test_an_estimate_lists_every_parameter(found):
-    text, html = str(found.wls), found.wls._repr_html_()
-    for name, value in zip(found.wls.names, found.wls.theta, strict=True):
-        (line,) = [line for line in text.splitlines() if line.split()[0] == name]
-        assert float(line.split()[1]) == pytest.approx(value, rel=1e-3)
-        assert name in "".join(Words(html).words)
-
-
-def test_each_validation_log_has_errors_of_its_own_and_a_reason_loses_its_joint_only():
-    logs = [
-        SimpleNamespace(
-            recording=SimpleNamespace(name=name),
-            metrics={"estimate": f"{name} ours", "wls": f"{name} wls"},
-        )
-        for name in ("a.csv", "b.csv")
-    ]
-    found = SimpleNamespace(validation=logs, metrics=lambda name="estimate": f"fitted {name}")
-    assert _tables(found) == [
-        ("a.csv: not fitted", "a.csv ours", "a.csv wls"),
-        ("b.csv: not fitted", "b.csv ours", "b.csv wls"),
-        ("fitted rows", "fitted estimate", "fitted wls"),
-    ]
-    assert joint_reason("b", ["a, b: too slow", "b: no"]) == "too slow"
-    assert joint_reason("bb", ["a, b: too slow"]) == "a, b: too slow"
-    assert joint_reason("b", ["the whole: is wrong"]) == "the whole: is wrong"
-    assert joint_reason("b", []) == ""
 
 
 def test_a_reason_of_a_joint_is_shown_once():
@@ -249,9 +145,8 @@ def test_a_reason_of_a_joint_is_shown_once():
     assert verdict_lines(alone) == ["verdict: good", "  - fine", "  every joint: good"]
 
 
-def test_a_notebook_shows_each_joint_s_error_before_that_of_the_urdf():
-    one = JointMetrics(0.125, "N m", 2.5, 0.9, 7, {"urdf": 41.5}, True)
-    other = JointMetrics(3.0, "N", 7.5, 0.9, 7, {"urdf": None}, True)
-    metrics = Metrics({"a": one, "b": other}, 1.0)
-    rows = tables(_errors("log.csv: not fitted", metrics))["log.csv: not fitted"].rows
-    assert rows == [["a", "2.5", "0.125", "N m", "41.5"], ["b", "7.5", "3", "N", "–"]]
+def test_a_reason_loses_the_name_of_its_joint_only():
+    assert joint_reason("b", ["a, b: too slow", "b: no"]) == "too slow"
+    assert joint_reason("bb", ["a, b: too slow"]) == "a, b: too slow"
+    assert joint_reason("b", ["the whole: is wrong"]) == "the whole: is wrong"
+    assert joint_reason("b", []) == ""

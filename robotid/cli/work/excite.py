@@ -15,11 +15,9 @@ from robotid.cli.work.logs import result_run
 from robotid.data.log import Log
 from robotid.design.basis import Basis, BSplineBasis, FourierBasis
 from robotid.design.clearance import Clearance
-from robotid.design.course import Course
-from robotid.design.design import Designer
-from robotid.design.designed import Design
+from robotid.design.design import Design, Designer
 from robotid.design.excitation_settings import ROUTES, MotionSettings
-from robotid.design.limits import LIMITS, MotionLimits
+from robotid.design.limits import LIMITS, Course, MotionLimits
 from robotid.design.motion_files import check_motion_file, write_motion
 from robotid.design.payload_motion import design_payload
 from robotid.design.previews import Preview, Run, preview_logs
@@ -63,7 +61,7 @@ def design_motion(
     else:
         design = _designed(designer, settings, show_start)
     design = replace(design, seconds=time.monotonic() - initialised)
-    course = Course.of_design(designer, design)
+    course = designer.course(design)
     if settings.kind in ROUTES:
         _check_jerk(course, model.joints)
     expected: Preview | list[str] | None = None

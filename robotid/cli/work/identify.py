@@ -158,9 +158,7 @@ def _write(
         played = {"replay": replay} if job.replay else {}
         written = {"urdf": name, "sidecar": sidecar} if found.has_urdf else {}
         if job.report:
-            before, found = found, replace(found, report=str(target / report))
-            if isinstance(before, Identification) and isinstance(found, Identification):
-                found = found.with_scale_of(before)
+            found = replace(found, report=str(target / report))
             links = {"result": "result.json", **written, **played}
             origin = Origin(tuple(source), str(target), replay)
             write_report(found, partial / report, files=links, origin=origin)
@@ -203,7 +201,7 @@ def _job_of(identification: "Identification | LoopIdentification") -> Job:
 
     Logs in memory have no file, and a ``Log`` has no gains, units or names of columns.
     """
-    model, asked = identification.model, identification.asked
+    model, asked = identification.model, identification.stated
     if isinstance(asked.job, Job):
         return asked.job
     if isinstance(identification, Identification):
@@ -293,11 +291,12 @@ def identify_job(
             friction=job.friction,
             progress=plan.progress,
         )
-    asked = replace(concluded.asked, job=job)
-    findings = (*placed.notes, *concluded.findings)
-    checks = check_payloads(job, concluded.model, fitted)
-    stated = replace(concluded, asked=asked, findings=findings, payload_checks=checks)
-    return stated.with_scale_of(concluded)
+    return replace(
+        concluded,
+        stated=replace(concluded.stated, job=job),
+        findings=(*placed.notes, *concluded.findings),
+        payload_checks=check_payloads(job, concluded.model, fitted),
+    )
 
 
 def _loop_stages() -> Sequence[str]:
@@ -325,4 +324,4 @@ def _identify_loops(
         ignore=job.ignore, units=units_of_logs(job.identification),
         progress=progress or ignore_progress,
     )  # fmt: skip
-    return replace(found, asked=replace(found.asked, job=job))
+    return replace(found, stated=replace(found.stated, job=job))

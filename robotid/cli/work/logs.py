@@ -232,7 +232,7 @@ def log_of_commands(job: Job, entry: LogEntry, result: Result) -> Log:
     """
     log = job.read(entry, result.robot, needs=needed_of(job))
     if job.controller.kind == "torque":
-        from robotid.identification.closed_loop.driven import driven_log
+        from robotid.identification.closed_loop.from_commands import driven_log
 
         return driven_log(result.robot, log, job.signals)
     if not job.controller.gravity_compensation:

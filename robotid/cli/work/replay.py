@@ -17,13 +17,11 @@ from robotid.data.files.table_files import open_table
 from robotid.data.log import Log
 from robotid.data.signal_settings import LogSource
 from robotid.design.clearance import Clearance
-from robotid.design.course import Course
-from robotid.design.limits import LIMITS, MotionLimits
+from robotid.design.limits import LIMITS, Course, MotionLimits
 from robotid.dynamics.constraints.closed_log import closed_log
 from robotid.dynamics.prediction import predict_instants
 from robotid.estimation.fitting.evaluation import predict
 from robotid.estimation.fitting.survey import hold_log
-from robotid.identification.pictures import shown_evaluation
 from robotid.identification.result import Identification
 from robotid.output.files.result_file import (
     Result,
@@ -32,6 +30,7 @@ from robotid.output.files.result_file import (
     stated_urdf_with_drives,
 )
 from robotid.output.files.shape import FILE, NUMBER, TABLE, TEXT, check_shape
+from robotid.output.report.pictures import shown_evaluation
 from robotid.output.viewer.replays import Bands, Mark, Replay, Torques, replay
 from robotid.output.viewer.unexplained import find_unexplained
 from robotid.robot.model import RobotModel

@@ -302,6 +302,8 @@ class ClosedLoopRobot:
 
         ``wanted`` has a row for each column: kind, joint, index, and index of the sensitivity.
         """
+        from robotid.dynamics.simulation.law_lanes import coded_term  # imports Numba
+
         lanes = _lanes()
         own, n = part.joints, len(part.joints)
         columns = wanted[np.isin(wanted[:, 1], own)]
@@ -313,7 +315,7 @@ class ClosedLoopRobot:
         is_term = columns[:, 0] == lanes.TERM
         columns[is_term, 2] = [np.flatnonzero(places == k)[0] for k in columns[is_term, 2]]
         every_term = [term for terms in loops.terms for term in terms]
-        coded = [lanes.coded_term(every_term[k]) for k in places]
+        coded = [coded_term(every_term[k]) for k in places]
         codes = np.array([code for code, _ in coded], dtype=np.int64).reshape(-1, 5)
         shapes = np.array([numbers for _, numbers in coded]).reshape(-1, 11)
         has_state = codes[:, 2] == BRISTLES

@@ -8,109 +8,101 @@ import numpy as np
 
 from robotid.base.findings import Finding, by_severity, listed, quoted
 from robotid.identification.closed_loop.encoder_zeros import CLEAR, parallel_axes
+from robotid.identification.closed_loop.further_parameters import Tried
 from robotid.identification.closed_loop.loop_result import STATED_SCALE, LoopIdentification
-from robotid.identification.closed_loop.term_choice import Tried
+from robotid.identification.closed_loop.stages import CHANGE
 
 _SOFT = 0.5  # share of the residual that remains after a step; a larger one shows a soft loop
 _MISMATCH = 0.5  # largest relative error of a torque that the loop of its joint gives
-_CHANGE = 0.2  # largest change of a parameter by halving the steps [standard errors]
 _KNOWN = 0.1  # standard error of a known delay, relative to the range found from one response
 _POSITIVE = ("kp", "limit")  # parameters whose lower bound is more than 0
 _UNEQUAL = 3.0  # ratio of the gains of equal drives from which on they are reported
 _NAMED = 8  # largest number of parameters that a sentence names
 
 
-def loop_findings(found: LoopIdentification, examined: Sequence[Finding]) -> tuple[Finding, ...]:
+def loop_findings(result: LoopIdentification, examined: Sequence[Finding]) -> tuple[Finding, ...]:
     """Return the findings of logs and fit, the most severe first."""
-    settled = [_settled_delay(finding, found) for finding in examined]
-    return by_severity([*settled, *_of_fit(found)])
+    settled = [_settled_delay(finding, result) for finding in examined]
+    return by_severity([*settled, *_of_fit(result)])
 
 
-def _of_fit(found: LoopIdentification) -> Iterator[Finding]:
+def _of_fit(result: LoopIdentification) -> Iterator[Finding]:
     """Yield the findings of the fit."""
-    estimate = found.estimate
+    estimate = result.estimate
     if not estimate.converged:
-        yield Finding(
-            "not_settled",
-            "warning",
-            "fit",
+        message = (
             f"the fit has not converged after {estimate.n_iter} steps: its parameters may still "
-            "change. State the known gains and delays in [controller], or use shorter windows",
+            "change. State the known gains and delays in [controller], or use shorter windows"
         )
+        yield Finding("not_settled", "warning", "fit", message)
     yield from _soft_loop(estimate.details["left"])
-    if not found.has_gains and not found.fit.simulator.knows_torques:
-        yield Finding(
-            "scale",
-            "warning",
-            "controller",
+    if not result.has_gains and not result.fit.simulator.knows_torques:
+        message = (
             "commands and positions determine gains, friction and inertia up to a common factor; "
             "here the masses of the URDF and gravity determine it. Ratios such as kp / armature "
             "do not depend on it. To determine the factor, state kp in [controller] or log a "
-            "torque",
+            "torque"
         )
-    yield from _torque_mismatches(found)
-    if found.is_scaled_by_gain:
+        yield Finding("scale", "warning", "controller", message)
+    yield from _torque_mismatches(result)
+    if result.is_scaled_by_gain:
         yield Finding("scale", "note", "controller", STATED_SCALE)
-    yield from _gains_contradicted(found)
+    yield from _gains_contradicted(result)
     yield from _coarse_steps(estimate.details)
-    yield from _at_bound(found)
-    for together in found.correlated:
+    yield from _at_bound(result)
+    for together in result.correlated:
         names = listed(together, _NAMED)
         message = (
             f"{names} are strongly correlated: their ratios are more accurate than their values"
         )
         yield Finding("correlated_terms", "note", names, message)
-    if found.undetermined:
-        names = listed(found.undetermined, _NAMED)
-        has_gains = any(name.endswith((".kp", ".kd")) for name in found.undetermined)
+    if result.undetermined:
+        names = listed(result.undetermined, _NAMED)
+        has_gains = any(name.endswith((".kp", ".kd")) for name in result.undetermined)
         known = (
             ", or state the gains, or groups of joints with equal drives, in [controller]"
             if has_gains
             else ""
         )
-        yield Finding(
-            "undetermined",
-            "warning",
-            names,
+        message = (
             f"the logs do not determine {names}: the prior values remain. Command a motion that "
-            f"depends on these parameters{known}",
+            f"depends on these parameters{known}"
         )
-    yield from _at_rest(found)
-    yield from _limits_found(found)
-    yield from _unequal_gains(found)
-    yield from _encoder_findings(found)
-    yield from map(_friction_found, (t for t in found.fit.tried if t.is_chosen or t.dropped))
+        yield Finding("undetermined", "warning", names, message)
+    yield from _at_rest(result)
+    yield from _limits_found(result)
+    yield from _unequal_gains(result)
+    yield from _encoder_findings(result)
+    yield from map(_friction_found, (t for t in result.fit.tried if t.is_chosen or t.dropped))
 
 
-def _at_rest(found: LoopIdentification) -> Iterator[Finding]:
+def _at_rest(result: LoopIdentification) -> Iterator[Finding]:
     """Yield which friction terms and offsets are of joints that no fitted log commands to move."""
-    moves = np.any([run.moves for run in found.fitted], axis=0)
-    undetermined = set(found.undetermined)
+    moves = np.any([run.moves for run in result.fitted], axis=0)
+    undetermined = set(result.undetermined)
     own = [
         free.name
-        for free in found.fit.simulator.free_parameters
+        for free in result.fit.simulator.free_parameters
         if free.what == "term" and not moves[list(free.joints)].any()
     ]
     if left := [name for name in own if name not in undetermined]:
         names = listed(left, _NAMED)
-        yield Finding(
-            "undetermined",
-            "warning",
-            names,
+        message = (
             f"no log commands the joints of {names} to move: these parameters explain where the "
             "joints rest, not how they move, and their standard errors are too small. Command a "
-            "motion of these joints",
+            "motion of these joints"
         )
+        yield Finding("undetermined", "warning", names, message)
 
 
-def _settled_delay(finding: Finding, found: LoopIdentification) -> Finding:
+def _settled_delay(finding: Finding, result: LoopIdentification) -> Finding:
     """Return a finding of the logs; "slow_command" is a note if the fit determines the delay.
 
     A delay at its bound of 0 is not determined: the data would fit a negative one better.
     """
     if finding.code != "slow_command":
         return finding
-    estimate, free_parameters = found.estimate, found.fit.simulator.free_parameters
+    estimate, free_parameters = result.estimate, result.fit.simulator.free_parameters
     errors = [
         float(error)
         for free, error in zip(free_parameters, estimate.std_error, strict=True)
@@ -146,42 +138,42 @@ def _coarse_steps(details: Mapping[str, Any]) -> Iterator[Finding]:
     """Yield a finding if smaller steps of the integration would still change the estimate."""
     halving = float(details.get("halving", 0.0))
     if halving > 1.0:
-        yield Finding(
-            "coarse_steps",
-            "warning",
-            "fit",
+        message = (
             f"halving the steps of {1e3 * details['step']:.2g} ms changes a parameter by "
-            f"{halving:.1f} standard errors, wanted at most {_CHANGE}; the standard errors include "
-            "this. Set a smaller step in [estimator]",
-            {"halving": halving},
+            f"{halving:.1f} standard errors, wanted at most {CHANGE}; the standard errors include "
+            "this. Set a smaller step in [estimator]"
         )
+        yield Finding("coarse_steps", "warning", "fit", message, {"halving": halving})
 
 
-def _gains_contradicted(found: LoopIdentification) -> Iterator[Finding]:
+def _gains_contradicted(result: LoopIdentification) -> Iterator[Finding]:
     """Yield a finding if bodies or logged torques indicate gains other than those stated."""
-    scale, joints = found.fit.scale, found.model.joints
+    scale, joints = result.fit.scale, result.model.joints
     if scale is None or not scale.is_wrong:
         return
-    source = "the logged torques" if found.fit.simulator.knows_torques else "weight and inertia"
+    source = "the logged torques" if result.fit.simulator.knows_torques else "weight and inertia"
     factor, error = 1.0 + scale.common, scale.common_error
-    kp = zip(joints, (factor * found.fit.loops.kp).tolist(), strict=True)
+    kp = zip(joints, (factor * result.fit.loops.kp).tolist(), strict=True)
     agreeing = listed([f"{joint} = {value:.3g}" for joint, value in kp], _NAMED)
+    message = (
+        f"{source} indicate gains of {factor:.2f} +- {error:.2g} times those stated, wanted 1. "
+        f"Consistent values of kp: {agreeing}; kd likewise. Compare kp and kd in [controller] "
+        "with those of the drives (units, gear ratio), and the masses of the URDF with the robot; "
+        "all drive parameters scale with the gains"
+    )
     yield Finding(
         "gains_contradicted",
         "warning",
         "controller",
-        f"{source} indicate gains of {factor:.2f} +- {error:.2g} times those stated, wanted 1. "
-        f"Consistent values of kp: {agreeing}; kd likewise. Compare kp and kd in [controller] "
-        "with those of the drives (units, gear ratio), and the masses of the URDF with the robot; "
-        "all drive parameters scale with the gains",
+        message,
         {"scale": factor, "std_error": error},
     )
 
 
-def _at_bound(found: LoopIdentification) -> Iterator[Finding]:
+def _at_bound(result: LoopIdentification) -> Iterator[Finding]:
     """Yield which parameters are estimated as 0, or as the largest value of a drive that moves."""
-    loop = found.loop
-    estimate, free_parameters = found.estimate, found.fit.simulator.free_parameters
+    loop = result.loop
+    estimate, free_parameters = result.estimate, result.fit.simulator.free_parameters
     largest = [
         free
         for free, value in zip(free_parameters, estimate.theta.tolist(), strict=True)
@@ -189,15 +181,13 @@ def _at_bound(found: LoopIdentification) -> Iterator[Finding]:
     ]
     if largest:
         names = listed([f"{free.name} = {free.highest:g}" for free in largest], _NAMED)
-        yield Finding(
-            "at_bound",
-            "warning",
-            names,
+        message = (
             f"{names}: the estimate is the upper bound; with more, the gear is self-locking. The "
             "motion hardly separates it from Coulomb friction and gravity, or another term is "
             "missing. Record slow motion at several loads, or set friction = 'viscous+coulomb' in "
-            "[model]",
+            "[model]"
         )
+        yield Finding("at_bound", "warning", names, message)
     others = {free.name for free in largest}
     at_zero = [
         name
@@ -215,89 +205,89 @@ def _at_bound(found: LoopIdentification) -> Iterator[Finding]:
         if gains:
             remedies.insert(0, f"compare {' and '.join(gains)} with the gains of the drive")
         todo = "; ".join(remedies)
-        yield Finding(
-            "at_bound",
-            "warning",
-            subject,
+        message = (
             f"{subject}: the estimate is 0, the lower bound. The motion does not excite "
-            f"{'them' if len(at_zero) > 1 else 'it'}{wrong}. {todo[0].upper()}{todo[1:]}",
+            f"{'them' if len(at_zero) > 1 else 'it'}{wrong}. {todo[0].upper()}{todo[1:]}"
         )
-    yield from _at_least(found)
+        yield Finding("at_bound", "warning", subject, message)
+    yield from _at_least(result)
     if any(name.endswith("delay") for name in at_zero):
-        yield Finding(
-            "no_delay",
-            "warning",
-            "delay",
+        message = (
             "the estimated delay is 0, its lower bound: the data do not determine it. The motion "
             "is too slow, the model lacks a drive term, or commands and positions have different "
-            "clocks. Command a faster motion",
+            "clocks. Command a faster motion"
         )
+        yield Finding("no_delay", "warning", "delay", message)
 
 
-def _at_least(found: LoopIdentification) -> Iterator[Finding]:
+def _at_least(result: LoopIdentification) -> Iterator[Finding]:
     """Yield which gains and torque limits are estimated at their lower bound, which is not 0."""
-    at_bound = found.estimate.details["at_bound"]
+    at_bound = result.estimate.details["at_bound"]
     least = [
         f"{free.name} = {free.lowest:.3g}"
-        for free in found.fit.simulator.free_parameters
+        for free in result.fit.simulator.free_parameters
         if free.what in _POSITIVE and free.name in at_bound
     ]
     if least:
         names = listed(least, _NAMED)
-        yield Finding(
-            "at_bound",
-            "warning",
-            names,
+        message = (
             f"{names}: the estimate is the lower bound, a small share of the initial value. The "
             "joint hardly follows its command, or the model lacks a drive term. Check that command "
-            "and position belong to this joint, and state the value in [controller] if it is known",
+            "and position belong to this joint, and state the value in [controller] if it is known"
         )
+        yield Finding("at_bound", "warning", names, message)
 
 
-def _unequal_gains(found: LoopIdentification) -> Iterator[Finding]:
+def _unequal_gains(result: LoopIdentification) -> Iterator[Finding]:
     """Yield which joints with equal limits in the URDF have gains that differ, each fitted alone.
 
     Equal drives have equal gains: a large difference is an error of one of them.
     """
-    free = [x for x in found.fit.simulator.free_parameters if x.what == "kp"]
+    free = [x for x in result.fit.simulator.free_parameters if x.what == "kp"]
     alike: dict[tuple[str, float, float], list[int]] = {}
     for j in (x.joints[0] for x in free if len(x.joints) == 1):
-        limit = found.model.limits[j]
+        limit = result.model.limits[j]
         alike.setdefault((limit.type, limit.effort, limit.velocity), []).append(j)
     for (_, effort, _), joints in alike.items():
-        kp = found.fit.loops.kp[joints]
+        kp = result.fit.loops.kp[joints]
         if kp.max() > _UNEQUAL * kp.min() > 0 and np.isfinite(effort):
-            names = [found.model.joints[j] for j in joints]
+            names = [result.model.joints[j] for j in joints]
             group = listed(map(quoted, names))
+            message = (
+                f"{listed(names, _NAMED)} have equal limits of effort and velocity in the URDF, as "
+                f"equal drives have, but kp from {kp.min():.3g} to {kp.max():.3g}. If the drives "
+                "are equal, fit their gains, armature and friction together: "
+                f"groups = {{ NAME = [{group}] }} in [controller]"
+            )
             yield Finding(
                 "unequal_gains",
                 "note",
                 listed(names, _NAMED),
-                f"{listed(names, _NAMED)} have equal limits of effort and velocity in the URDF, as "
-                f"equal drives have, but kp from {kp.min():.3g} to {kp.max():.3g}. If the drives "
-                "are equal, fit their gains, armature and friction together: "
-                f"groups = {{ NAME = [{group}] }} in [controller]",
+                message,
                 {"lowest": float(kp.min()), "highest": float(kp.max())},
             )
 
 
-def _limits_found(found: LoopIdentification) -> Iterator[Finding]:
+def _limits_found(result: LoopIdentification) -> Iterator[Finding]:
     """Yield the estimated torque limits of the drives, except those at a bound."""
-    estimate = found.estimate
-    is_expected = found.loop.limit == "find"
+    estimate = result.estimate
+    is_expected = result.loop.limit == "find"
     for free, value, error in zip(
-        found.fit.simulator.free_parameters, estimate.theta, estimate.std_error, strict=True
+        result.fit.simulator.free_parameters, estimate.theta, estimate.std_error, strict=True
     ):
         if free.what == "limit" and free.name not in estimate.details["at_bound"]:
-            joint = found.model.limits[free.joints[0]]
+            joint = result.model.limits[free.joints[0]]
             unit = "N" if joint.type == "prismatic" else "N m"
+            message = (
+                f"{joint.name}: its drive saturates. The torque limit of the drive is estimated as "
+                f"{value:.3g} +- {error:.2g} {unit}; at the limit the joint does not follow its "
+                "command. If you know the limit, state it in [controller]"
+            )
             yield Finding(
                 "limit",
                 "note" if is_expected else "warning",
                 joint.name,
-                f"{joint.name}: its drive saturates. The torque limit of the drive is estimated as "
-                f"{value:.3g} +- {error:.2g} {unit}; at the limit the joint does not follow its "
-                "command. If you know the limit, state it in [controller]",
+                message,
                 {"limit": float(value), "std_error": float(error)},
             )
 
@@ -305,35 +295,29 @@ def _limits_found(found: LoopIdentification) -> Iterator[Finding]:
 def _soft_loop(left: float) -> Iterator[Finding]:
     """Yield a finding if a step of the direct method leaves much of the residual."""
     if left > _SOFT:
-        yield Finding(
-            "soft_loop",
-            "warning",
-            "fit",
+        message = (
             f"a step of error = 'direct' leaves {100 * left:.0f} % of the residual that it should "
             f"remove, wanted at most {100 * _SOFT:.0f} %: it neglects that the motion changes with "
-            "the parameters, and this loop is soft. Set error = 'input'",
-            {"left": left},
+            "the parameters, and this loop is soft. Set error = 'input'"
         )
+        yield Finding("soft_loop", "warning", "fit", message, {"left": left})
 
 
-def _torque_mismatches(found: LoopIdentification) -> Iterator[Finding]:
+def _torque_mismatches(result: LoopIdentification) -> Iterator[Finding]:
     """Yield which logged torques differ from those of the loops, where the fit uses them."""
-    simulator = found.fit.simulator
+    simulator = result.fit.simulator
     if simulator.lag is None:
         return
-    mismatch = simulator.torque_mismatch(found.estimate.theta)
-    for joint, share in zip(found.model.joints, mismatch.tolist(), strict=True):
+    mismatch = simulator.torque_mismatch(result.estimate.theta)
+    for joint, share in zip(result.model.joints, mismatch.tolist(), strict=True):
         if share > _MISMATCH:
-            yield Finding(
-                "torque_mismatch",
-                "warning",
-                joint,
+            message = (
                 f"{joint}: the torque of its loop and the logged torque differ by "
                 f"{100 * share:.0f} % of the larger (RMS); gains and friction are scaled by the "
                 "logged one. Check that the column belongs to this joint and this controller, and "
-                "is the joint torque in N m, or set torques = false",
-                {"missed_pct": 100 * share},
+                "is the joint torque in N m, or set torques = false"
             )
+            yield Finding("torque_mismatch", "warning", joint, message, {"missed_pct": 100 * share})
 
 
 def _friction_found(tried: Tried) -> Finding:
@@ -352,13 +336,13 @@ def _friction_found(tried: Tried) -> Finding:
     return Finding("friction_dropped", "warning", tried.joint, message, figures)
 
 
-def _encoder_findings(found: LoopIdentification) -> Iterator[Finding]:
+def _encoder_findings(result: LoopIdentification) -> Iterator[Finding]:
     """Yield zero and sign of each encoder relative to the URDF, with the evidence for them."""
-    encoders, undetermined = found.fit.encoders, []
-    if found.loop.zeros != "find":
+    encoders, undetermined = result.fit.encoders, []
+    if result.loop.zeros != "find":
         return
-    for j, joint in enumerate(found.model.joints):
-        zero, margin = float(found.fit.loops.zero[j]), float(encoders.margin[j])
+    for j, joint in enumerate(result.model.joints):
+        zero, margin = float(result.fit.loops.zero[j]), float(encoders.margin[j])
         evidence = {
             "zero": zero, "sign": float(encoders.sign[j]), "gain": float(encoders.gain[j]),
             "explained": float(encoders.explained[j]), "margin": margin,
@@ -371,55 +355,44 @@ def _encoder_findings(found: LoopIdentification) -> Iterator[Finding]:
         )
         if encoders.gain[j] > 0:
             sense = "has the opposite sign and " if encoders.sign[j] < 0 else ""
-            yield Finding(
-                "encoder",
-                "warning",
-                joint,
+            message = (
                 f"{joint}: its encoder {sense}reads 0 where the URDF has {zero:+.3g} rad. With "
                 f"gravity this explains {100 * encoders.gain[j]:.0f} % of the squared position "
-                f"error. {next_best}. Calibrate the encoder, or change the zero in the URDF",
-                evidence,
+                f"error. {next_best}. Calibrate the encoder, or change the zero in the URDF"
             )
+            yield Finding("encoder", "warning", joint, message, evidence)
         elif margin > CLEAR:
-            yield Finding(
-                "encoder_uncorrected",
-                "note",
-                joint,
+            message = (
                 f"{joint}: its encoder has the zero and sign of the URDF. Gravity explains "
                 f"{100 * encoders.explained[j]:.0f} % of the slow part of the squared position "
-                f"error. {next_best}",
-                evidence,
+                f"error. {next_best}"
             )
+            yield Finding("encoder_uncorrected", "note", joint, message, evidence)
         else:
             undetermined.append(joint)
-    yield from _undetermined_encoders(found, undetermined)
+    yield from _undetermined_encoders(result, undetermined)
 
 
 def _undetermined_encoders(
-    found: LoopIdentification, undetermined: Sequence[str]
+    result: LoopIdentification, undetermined: Sequence[str]
 ) -> Iterator[Finding]:
     """Yield which encoder zeros and signs gravity does not determine, of joints and of chains."""
     if undetermined:
-        margins = [found.fit.encoders.margin[found.model.joints.index(j)] for j in undetermined]
+        margins = [result.fit.encoders.margin[result.model.joints.index(j)] for j in undetermined]
         margin = max(0.0, *margins)
         names = listed(undetermined, _NAMED)
-        yield Finding(
-            "encoder_undetermined",
-            "note",
-            names,
+        message = (
             f"gravity does not determine the encoder zeros and signs of {names}: the joints move "
             "little or gravity hardly loads them, and another zero or sign leaves at most "
             f"{100 * margin:.0f} % more squared position error. The URDF's values are assumed; "
-            "check them at a known pose",
-            {"margin": float(margin)},
+            "check them at a known pose"
         )
-    for chain in parallel_axes(found.model):
+        yield Finding("encoder_undetermined", "note", names, message, {"margin": float(margin)})
+    for chain in parallel_axes(result.model):
         names = listed(chain, _NAMED)
-        yield Finding(
-            "mirror_image",
-            "note",
-            names,
+        message = (
             f"{names} have parallel axes: with all their signs reversed, the gravity torques are "
             "almost the same, so that gravity does not determine their common sign. Check the "
-            "direction of rotation of one of them",
+            "direction of rotation of one of them"
         )
+        yield Finding("mirror_image", "note", names, message)

@@ -1,11 +1,11 @@
-"""Results of identification by simulation, from commands and positions or logged torques."""
+"""Results of identification by simulation, and the information of each of their logs."""
 
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
-from robotid.base.findings import Finding
 from robotid.base.typing import Array
 from robotid.data.log import Log, Trajectory
 from robotid.diagnosis.verdict.correlation import correlated_sets
@@ -14,20 +14,29 @@ from robotid.diagnosis.verdict.verdict import Verdict
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.friction_projection import DriveMoments, drive_moments
 from robotid.estimation.estimators.estimator import Estimate
+from robotid.estimation.estimators.output_error import segment_scores
 from robotid.estimation.fitting.bands import QUANTILE
 from robotid.estimation.fitting.estimator_settings import SimulationSettings
-from robotid.estimation.fitting.identified import FROM_PRIOR, Identified, sources_of
+from robotid.estimation.fitting.identified import FROM_PRIOR, sources_of
 from robotid.estimation.fitting.metrics import Metrics
-from robotid.estimation.variation.variation import Variation
-from robotid.identification.closed_loop.free_parameters import with_terms
+from robotid.estimation.variation.groups import FEWEST_RUNS, Group, RunsOf, inflation_of
+from robotid.estimation.variation.mixed_effects import Runs
 from robotid.identification.closed_loop.loop_settings import LoopSettings
+from robotid.identification.closed_loop.loop_simulator import (
+    FreeParameter,
+    LoopSimulator,
+    with_terms,
+)
 from robotid.identification.closed_loop.position_errors import OpenLoop, position_metrics
 from robotid.identification.closed_loop.stages import Fitted
-from robotid.identification.result import Asked
-from robotid.identification.summary import identification_line
+from robotid.identification.result import Concluded
+from robotid.robot.drives import TERMS
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
 
+_CHANGE = 0.1  # plausible standard deviation of a parameter between logs, over its value
+_LEAST = 0.01  # ... at least, over its prior standard deviation
+_LEAST_INFORMATION = 1e-12
 #: The limit of an identification from positions and stated gains.
 STATED_SCALE = (
     "positions do not determine the scale: all drive and inertial parameters scale with kp as "
@@ -38,37 +47,72 @@ _GAP = 3.0  # step in time above which no speed is computed [median steps]
 _MOVING = 0.05  # smallest speed above the noise, relative to the largest speed of a joint
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class LoopIdentification(Identified):
-    """Result of an identification by simulation.
+def loop_runs(
+    model: RobotModel, simulator: LoopSimulator, estimate: Estimate, unit: Sequence[str] = ()
+) -> tuple[RunsOf, ...]:
+    """Return the information of each log about the parameters of each joint, or of shared ones."""
+    logs = list(dict.fromkeys(id(window.log) for window in simulator.windows))
+    if len(logs) < FEWEST_RUNS or simulator.torque is not None:
+        return ()
+    scores = []
+    for log in logs:
+        windows = tuple(window for window in simulator.windows if id(window.log) == log)
+        scores.append(segment_scores(replace(simulator, windows=windows), estimate))
+    _, units = np.unique(unit or [""] * len(logs), return_inverse=True)
+    groups: dict[tuple[int, ...], list[int]] = {}
+    is_prior = estimate.std_error > FROM_PRIOR * simulator.prior_std
+    for k, free in enumerate(simulator.free_parameters):
+        is_open = is_prior[k] or free.name in estimate.details["at_bound"]
+        if free.what != "body" and not is_open:
+            groups.setdefault(free.joints, []).append(k)
+    found = []
+    for places in groups.values():
+        own = [(H[:, places][:, :, places], g[:, places]) for H, g in scores]
+        H, h = (np.array([each[k].sum(axis=0) for each in own]) for k in (0, 1))
+        if not H.any():
+            continue
+        members = [simulator.free_parameters[k] for k in places]
+        centre = estimate.theta[places]
+        spread = np.where(np.isfinite(simulator.prior_std), simulator.prior_std, 0.0)[places]
+        scale = np.maximum(_CHANGE * np.abs(centre), _LEAST * spread)
+        scale = np.maximum(scale, _LEAST_INFORMATION)
+        group = Group(
+            "drive",
+            members[0].name.rpartition(".")[0],
+            tuple(each.name for each in members),
+            tuple(units_of(model, each) for each in members),
+            np.zeros((0, len(members))),
+            members[0].joints,
+        )
+        inflation = inflation_of(own)
+        runs = Runs(H / inflation, h / inflation, units, scale)
+        found.append(RunsOf(group, centre, runs, inflation))
+    return tuple(found)
 
-    Attributes:
-        loop: What is known of the loops.
-        estimator: The estimator's settings.
-        fit: The fit.
-        fitted: The fitted logs, with their simulated positions.
-        validation: The validation logs, with their simulated positions.
-        findings: Findings of logs and fit.
-        log_errors: Errors in the logs that invalidate the result, found by the doctor.
-        report: File of the report, if one was written with the result.
-        asked: Signal settings and ignored findings of the request.
-        variation: Variation of the parameters of loops and drives between three or more fitted
-            logs of commands.
-    """
 
-    loop: LoopSettings
-    estimator: SimulationSettings
+def units_of(model: RobotModel, free: FreeParameter) -> str:
+    """Return the unit of a free parameter of a loop or drive."""
+    is_linear = model.joints[free.joints[0]] in model.layout.prismatic
+    if free.term is not None:
+        return free.term.units[is_linear]
+    if free.what == "armature":
+        return TERMS["armature"].units[is_linear]
+    force, length = ("N", "m") if is_linear else ("N m", "rad")
+    return {
+        "kp": f"{force}/{length}", "kd": f"{force} s/{length}", "delay": "s", "limit": force,
+        "zero": length,
+    }[free.what]  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
+class LoopIdentification(Concluded):
+    """Result of an identification by simulation."""
+
+    loop: LoopSettings  # what is known of the loops
+    estimator: SimulationSettings  # the estimator's settings
     fit: Fitted
-    fitted: tuple[OpenLoop, ...]
-    validation: tuple[OpenLoop, ...]
-    findings: tuple[Finding, ...] = ()
-    log_errors: tuple[str, ...] = ()
-    report: str = ""
-    asked: Asked = field(default_factory=Asked)
-    variation: Variation | None = None
-
-    def __repr__(self) -> str:
-        return identification_line(self, self.estimator.name, self.verdict.status)
+    fitted: tuple[OpenLoop, ...]  # the fitted logs, with their simulated positions
+    validation: tuple[OpenLoop, ...]  # the validation logs, with their simulated positions
 
     @property
     def estimate(self) -> Estimate:
@@ -152,11 +196,6 @@ class LoopIdentification(Identified):
         """Whether every body is physically consistent."""
         bodies = pseudo_inertia(self.standard[: self.model.layout.n_inertial])
         return bool((np.linalg.eigvalsh(bodies) >= 0).all())
-
-    @property
-    def has_urdf(self) -> bool:
-        """Whether a URDF may be written: no fault of the logs makes it wrong."""
-        return not self.log_errors
 
     @property
     def has_gains(self) -> bool:

@@ -26,27 +26,21 @@ class OpenLoop:
     """A log and its simulation from the commands alone; errors are RMS values of shape (n,).
 
     A simulation driven by the logged torque restarts from the log every ``DRIFTS``.
-
-    Attributes:
-        log: The log.
-        q: Simulated positions of the identified robot, started once, shape (N, n) [rad or m]; NaN
-            at a single sample between gaps.
-        rmse: Error of the simulated positions.
-        baselines: Errors of simpler models, by name; None if unknown or unstable. "command": the
-            command as the position; "urdf": the URDF with the stated gains, or with drives fitted
-            to the torques; "second_order": a second-order model of each joint. With the logged
-            torque as input also "rows": the estimate from the torque rows alone, and "steady": the
-            initial speed held constant.
-        horizons: Error over short horizons, by their length [s].
-        spread: RMS motion about its mean, or about the last restart.
     """
 
     log: Log
+    #: Simulated positions of the identified robot, started once, shape (N, n) [rad or m];
+    #: NaN at a single sample between gaps.
     q: Array
-    rmse: Array
+    rmse: Array  # error of the simulated positions
+    #: Errors of simpler models, by name; None if unknown or unstable. "command": the command
+    #: as the position; "urdf": the URDF with the stated gains, or with drives fitted to the
+    #: torques; "second_order": a second-order model of each joint. With the logged torque as
+    #: input also "rows": the estimate from the torque rows alone, and "steady": the initial
+    #: speed held constant.
     baselines: Mapping[str, Array | None]
-    horizons: Mapping[float, Array]
-    spread: Array
+    horizons: Mapping[float, Array]  # error over short horizons, by their length [s]
+    spread: Array  # RMS motion about its mean, or about the last restart
 
     @property
     def name(self) -> str:

@@ -28,18 +28,19 @@ from robotid.dynamics.simulation.simulation_settings import by_joint
 from robotid.estimation.estimators.estimator import Estimate
 from robotid.estimation.estimators.output_error import OutputError
 from robotid.estimation.fitting.estimator_settings import SimulationSettings
-from robotid.identification.closed_loop.drive_torques import find_gains, measured_motion
-from robotid.identification.closed_loop.driven import identified_rows, torque_rows
 from robotid.identification.closed_loop.encoder_zeros import Encoders, find_encoders, same_encoders
-from robotid.identification.closed_loop.free_parameters import (
-    FreeParameter,
-    LoopSimulator,
-    free_body_parameters,
-    with_terms,
+from robotid.identification.closed_loop.further_parameters import (
+    GainScale,
+    Tried,
+    candidates,
+    choose,
+    gain_scale,
+    impossible,
 )
-from robotid.identification.closed_loop.gain_check import GainScale, gain_scale
 from robotid.identification.closed_loop.initial_values import (
+    SecondOrder,
     first_loops,
+    fit_second_order,
     free_drive_parameters,
     free_zeros,
     is_stated,
@@ -48,12 +49,22 @@ from robotid.identification.closed_loop.initial_values import (
     typical_sizes_of_torques,
 )
 from robotid.identification.closed_loop.loop_settings import LoopSettings, groups_of
+from robotid.identification.closed_loop.loop_simulator import (
+    FreeParameter,
+    LoopSimulator,
+    TorqueRows,
+    find_gains,
+    free_body_parameters,
+    measured_motion,
+    with_terms,
+)
 from robotid.identification.closed_loop.position_errors import DRIFTS
-from robotid.identification.closed_loop.second_order import SecondOrder, fit_second_order
-from robotid.identification.closed_loop.term_choice import Tried, candidates, choose, impossible
+from robotid.identification.pipeline import identify
 from robotid.identification.result import Identification
 from robotid.robot.model import RobotModel
 
+#: Largest change of a parameter by halving the steps [standard errors].
+CHANGE = 0.2
 #: The stages of a job's fit, from reading logs to writing files.
 STAGES = (
     "reading logs", "fitting torques", "trying second-order models", "fitting loops",
@@ -69,7 +80,6 @@ _SOME = 48  # number of windows of the fits before the last improvement of initi
 _STARTS = 3  # number of fits with improved initial states of the windows
 _WINDOW, _LEAD = 2.5, 0.6  # default window and lead of closed-loop simulations [s]
 _BOTH = 2.0  # variance factor: the noise of a torque is in its rows and in the simulation it drives
-_CHANGE = 0.2  # largest change of a parameter by halving the steps [standard errors]
 _FINEST = 16.0  # largest reduction of the step
 _SETTLING = 4  # largest number of steps of parameters and initial states together
 _RAISED = 1e-2  # largest increase of the mean log residual in such a step
@@ -78,24 +88,17 @@ _PASSES = 2  # of choosing terms and fitting again
 
 @dataclass(frozen=True, eq=False)
 class Fitted:
-    """Result of the fit.
+    """Result of the fit."""
 
-    Attributes:
-        simulator: The robot with its free parameters, and the windows.
-        estimate: The estimate of the free parameters.
-        plain: The second-order model of each joint; None where the logged torque drives the robot.
-        encoders: Zeros and signs of the encoders relative to the URDF's joints.
-        tried: The friction terms that were tried, with their gains.
-        linear: The identification from the torque rows alone, where the torque drives the robot.
-        scale: Scale of the stated gains by bodies and torques; None where gains are fitted.
-    """
-
-    simulator: LoopSimulator
-    estimate: Estimate
+    simulator: LoopSimulator  # the robot with its free parameters, and the windows
+    estimate: Estimate  # the estimate of the free parameters
+    #: The second-order model of each joint; None where the logged torque drives the robot.
     plain: SecondOrder | None
-    encoders: Encoders
-    tried: tuple[Tried, ...]
+    encoders: Encoders  # zeros and signs of the encoders relative to the URDF's joints
+    tried: tuple[Tried, ...]  # the friction terms that were tried, with their gains
+    #: The identification from the torque rows alone, where the torque drives the robot.
     linear: Identification | None = None
+    #: Scale of the stated gains by bodies and torques; None where gains are fitted.
     scale: GainScale | None = None
 
     @property
@@ -199,18 +202,18 @@ def _with_chosen_terms(
             for set_ in candidates(simulator, initialised.torque)
             if set_[0].name not in simulator.names and set_[0].name not in dropped
         ]
-        found = choose(
+        judged = choose(
             *_with(simulator, theta, offered), offered, replace(estimator, inflation=1.0)
         )
-        tried = [*(t for t in tried if t.is_chosen), *found]
-        chosen = [set_ for set_, t in zip(offered, found, strict=True) if t.is_chosen]
+        tried = [*(t for t in tried if t.is_chosen), *judged]
+        chosen = [set_ for set_, t in zip(offered, judged, strict=True) if t.is_chosen]
         if not chosen and estimate is not None:
             break
         report_stage(progress, "fitting loops", STAGES)
         simulator, theta = _with(simulator, theta, chosen)
         if simulator.torque is not None:
-            own = with_terms(model, simulator.base)
-            rows = torque_rows(identified_rows(own, logs, signals), initialised.share)
+            extended = with_terms(model, simulator.base)
+            rows = torque_rows(identified_rows(extended, logs, signals), initialised.share)
             simulator = replace(simulator, torque=rows)
         estimate = estimator.fit(simulator, theta, exact=simulator.exact)
         theta = estimate.theta
@@ -238,9 +241,9 @@ def _best_start(initial: "_Initial") -> tuple["_Initial", Array]:
             failures.append(failure)
             continue
         error = fits[-1][2]
-        for own in (groups == group for group in dict.fromkeys(initial.groups)):
-            if np.mean(error[own] / best[own]) < 1.0 / BEATEN:
-                factor[own], limited[own], best[own] = scale, has_limit, error[own]
+        for members in (groups == group for group in dict.fromkeys(initial.groups)):
+            if np.mean(error[members] / best[members]) < 1.0 / BEATEN:
+                factor[members], limited[members], best[members] = scale, has_limit, error[members]
         if not ((best > GOOD) & (best > HARDLY * second_order)).any():
             break
     if not fits:
@@ -249,8 +252,8 @@ def _best_start(initial: "_Initial") -> tuple["_Initial", Array]:
     if chosen is None:  # several groups, each from its best
         with suppress(NotConvergedError):
             chosen = _first_fit(initial.vary(factor, limited))
-    found, theta, _ = chosen or min(fits, key=lambda fit: float(fit[2].max()))
-    return found, theta
+    initialised, theta, _ = chosen or min(fits, key=lambda fit: float(fit[2].max()))
+    return initialised, theta
 
 
 def _with_limits_reached(
@@ -362,10 +365,10 @@ def _initialise_from_commands(
     if uses_torques and loop.rate is None:
         is_free = _free_gains(loop, model)
         moved = [measured_motion(window) for window in _few(windows)]
-        lag, found = find_gains(
+        lag, matched = find_gains(
             moved, stated, is_free, knows_delay=loop.delay is not None, is_whole=True
         )
-        has_gain, stated = has_gain | (found.kp != stated.kp), found
+        has_gain, stated = has_gain | (matched.kp != stated.kp), matched
     report_stage(progress, "trying second-order models", STAGES)
     second_order = cache(
         lambda finds_limit: fit_second_order(
@@ -426,14 +429,14 @@ def _initialise_from_torque(
     that of the URDF.
     """
     report_stage(progress, "fitting torques", STAGES)
-    found = identified_rows(model, logs, signals)
-    linear = open_loops(model, found.standard)
+    from_rows = identified_rows(model, logs, signals)
+    linear = open_loops(model, from_rows.standard)
     is_urdf = not (settings.torques and settings.bodies)
     base = replace(linear, bodies=stated_loops(model, loop).bodies) if is_urdf else linear
     robot = ClosedLoopRobot(model, step=settings.step)
     length, lead = settings.window or DRIFTS, settings.lead or 0.0
     windows = tuple(w for log in logs for w in cut_windows(log, length, lead))
-    typical = typical_sizes_of_torques(model, found.standard, base.armature, windows)
+    typical = typical_sizes_of_torques(model, from_rows.standard, base.armature, windows)
     groups = groups_of(loop, model.joints, range(len(model.joints)))
     none = np.zeros(len(groups), dtype=bool)
     free_parameters = free_drive_parameters(
@@ -445,10 +448,10 @@ def _initialise_from_torque(
     )
     report_stage(progress, "fitting loops", STAGES)
     if settings.torques:
-        simulator = replace(simulator, torque=torque_rows(found, _BOTH))
+        simulator = replace(simulator, torque=torque_rows(from_rows, _BOTH))
     estimator = OutputError(whitens=settings.whiten, frees=True, progress=progress)
     encoders = same_encoders(model)
-    return _Initial(simulator, estimator, typical.torque, encoders, linear=found)
+    return _Initial(simulator, estimator, typical.torque, encoders, linear=from_rows)
 
 
 def refine_steps(
@@ -468,7 +471,7 @@ def refine_steps(
         half = replace(simulator, fine=ClosedLoopRobot(model, step=0.5 * step, corrects=True))
         change, error = estimator.moved(now, half, theta)
         share = float(np.max(np.abs(change) / np.maximum(error, 1e-300), initial=0.0))
-        if share <= _CHANGE or 0.5 * step < finest:
+        if share <= CHANGE or 0.5 * step < finest:
             break
         step, now = 0.5 * step, half
     now, estimate = _settled(now, estimator, estimate)
@@ -495,16 +498,16 @@ def _settled(
     for _ in range(_SETTLING):
         try:
             initialised = simulator.with_better_start(estimate.theta)
-            found = estimator.settle(initialised, estimate)
+            settled = estimator.settle(initialised, estimate)
         except NotConvergedError:
-            found = None
-        before, level = level, np.inf if found is None else float(np.mean(np.log(found.sigma)))
-        if found is None or level > before + _RAISED:
+            settled = None
+        before, level = level, np.inf if settled is None else float(np.mean(np.log(settled.sigma)))
+        if settled is None or level > before + _RAISED:
             simulator = simulator.with_better_start(first)
             return simulator, estimator.fit(simulator, first)
-        change = found.theta - estimate.theta
-        simulator, estimate = initialised, found
-        if (np.abs(change) <= _CHANGE * found.std_error).all():
+        change = settled.theta - estimate.theta
+        simulator, estimate = initialised, settled
+        if (np.abs(change) <= CHANGE * settled.std_error).all():
             return simulator, estimate
     return simulator, replace(estimate, covariance=estimate.covariance + np.outer(change, change))
 
@@ -522,13 +525,13 @@ def _check_settings(
         )
     for log in logs:
         if settings.velocities and (log.v is None or not is_trustworthy(log)):
-            found = (
+            lack = (
                 "has no velocities"
                 if log.v is None
                 else "has velocities that are delayed, coarse, or inconsistent with the positions"
             )
             raise DataError(
-                f"estimator: velocities is true, but {log.name} {found}. Record columns dq_ of "
+                f"estimator: velocities is true, but {log.name} {lack}. Record columns dq_ of "
                 "each joint, or leave velocities out"
             )
         if settings.error != "output" and not log.has_torque:
@@ -570,8 +573,8 @@ def _largest_speeds(model: RobotModel, loop: LoopSettings, logs: Sequence[Log]) 
     """Return the speed of joints that run at their largest speed without a stated limit; else 0."""
     speed = np.zeros(len(model.joints))
     for log in logs:
-        found = largest_speeds(log)
-        speed = np.maximum(speed, [found.get(joint, 0.0) for joint in model.joints])
+        saturated = largest_speeds(log)
+        speed = np.maximum(speed, [saturated.get(joint, 0.0) for joint in model.joints])
     is_free = ~is_stated(None if loop.limit == "find" else loop.limit, model)
     return np.where(is_free, speed, 0.0)
 
@@ -611,15 +614,33 @@ def _with(
     """Return the simulator with further terms at 0, and its parameters."""
     further = [free for free_parameters in sets for free in free_parameters]
     loops = simulator.base
-    terms = [list(own) for own in loops.terms]
+    terms = [list(joint_terms) for joint_terms in loops.terms]
     for free in further:
         if free.term is not None:
             terms[free.joints[0]].append(free.term)
     values = [
         loops.values[loops.place(j, term)] if term in loops.terms[j] else 0.0
-        for j, own in enumerate(terms)
-        for term in own
+        for j, joint_terms in enumerate(terms)
+        for term in joint_terms
     ]
     base = replace(loops, terms=tuple(map(tuple, terms)), values=np.array(values))
     wide = replace(simulator, base=base, free_parameters=(*simulator.free_parameters, *further))
     return wide, np.concatenate([theta, np.zeros(len(further))])
+
+
+def identified_rows(
+    model: RobotModel, logs: Sequence[Log], signals: SignalSettings | None
+) -> Identification:
+    """Return the identification from the torques of logs alone, with the model's friction terms."""
+    return identify(model, logs, signals=signals, friction="none", doctor=False)
+
+
+def torque_rows(from_torques: Identification, inflation: float = 1.0) -> TorqueRows:
+    """Return an identification's rows reduced to a triangular factor.
+
+    The weights include the variance inflation by correlated rows, from the scatter of segments.
+    """
+    weight = from_torques.wls.sigma * np.sqrt(inflation * max(from_torques.errors.inflation, 1.0))
+    return TorqueRows(
+        from_torques.model, from_torques.factors.weighted(weight), from_torques.mapping.K
+    )

@@ -1,7 +1,8 @@
 """Online identification: samples as input, an estimate at any time as output."""
 
 from collections import deque
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import overload
 
 import numpy as np
@@ -10,7 +11,7 @@ from robotid.base.arguments import real_numbers
 from robotid.base.exceptions import DataError
 from robotid.base.settings import is_number, require_kind
 from robotid.base.typing import Array
-from robotid.data.log import Trajectory
+from robotid.data.log import Log, Trajectory
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.drive_columns import sure_rows
 from robotid.dynamics.problem import Sample
@@ -33,6 +34,9 @@ _OVERSAMPLED = 12.0  # estimator updates per period of the cut-off
 _STORED_EVERY = 0.1  # time between stored states, for the reset after a change [s]
 _STORED = 30  # number of stored states
 _REOPENED = 0.1  # change of every parameter after a change, relative to its prior spread
+Observer = Callable[[int, "OnlineIdentifier"], None]
+
+_ROWS = 20.0  # rate of the rows of the history [Hz]
 
 
 class OnlineIdentifier:
@@ -273,3 +277,48 @@ class OnlineIdentifier:
         """Store the state every tenth of a second."""
         if not self._recent or t >= self._recent[-1][0] + _STORED_EVERY:
             self._recent.append((t, self._state))
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """The history of an online identification."""
+
+    identifier: OnlineIdentifier  # the identifier after the last sample
+    t: Array  # times of the newest sample, shape (N,) [s]
+    theta: Array  # base parameters, shape (N, b)
+    std_error: Array  # their standard errors, shape (N, b)
+    excitation: Array  # reduction of the prior variance, shape (N,) [-]
+    converged: Array  # whether the estimate has converged, shape (N,), bool
+
+    def columns(self) -> dict[str, Array]:
+        """Return the columns of the history, (N,) each: time, base parameters, standard errors."""
+        table = {"time": self.t}
+        for i, name in enumerate(self.identifier.names):
+            table[name] = self.theta[:, i]
+            table[f"{name}.std_error"] = self.std_error[:, i]
+        return table | {"excitation": self.excitation, "converged": self.converged.astype(float)}
+
+
+def track(
+    model: RobotModel, log: Log, settings: OnlineSettings, *, observer: Observer | None = None
+) -> Track:
+    """Run an online identification over a log, sample by sample."""
+    identifier = OnlineIdentifier(model, settings)
+    times: list[float] = []
+    readings: list[Reading] = []
+    for k, t in enumerate(log.t.tolist()):
+        identifier.update(t, log.q[k], log.tau[k])
+        if observer is not None:
+            observer(k, identifier)
+        is_due = not times or t > times[-1] + 0.999 / _ROWS
+        if identifier.is_ready and (is_due or k == len(log.t) - 1):
+            times.append(t)
+            readings.append(identifier.reading)
+    if not readings:
+        raise DataError(
+            f"{log.path or 'log'}: the robot moves for less than the warm-up of "
+            f"{settings.warmup:g} s, so there is no estimate. Use a longer log with motion"
+        )
+    keys = ("theta", "std_error", "excitation", "converged")
+    history = {key: np.array([getattr(reading, key) for reading in readings]) for key in keys}
+    return Track(identifier, np.array(times), **history)

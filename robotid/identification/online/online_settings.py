@@ -37,9 +37,7 @@ class OnlineSettings(Settings):
         40.0, "evidence at which a change is flagged; see ``ChangeDetector``", within=POSITIVE
     )
     drift: float = setting(
-        4.0,
-        "mean squared innovation without a change, in variances [-]",
-        within=POSITIVE,
+        4.0, "mean squared innovation without a change, in variances [-]", within=POSITIVE
     )
     model_error: float = setting(
         0.05,

@@ -12,8 +12,7 @@ from robotid.base.findings import listed
 from robotid.base.typing import Array
 from robotid.base.versions import __version__
 from robotid.design.clearance import Clearance
-from robotid.design.course import Course
-from robotid.design.limits import LIMITS
+from robotid.design.limits import LIMITS, Course
 from robotid.design.previews import Preview
 from robotid.output.pages.charts import Chart, Series, chart_html
 from robotid.output.pages.html import Section, code, facts_html, number, page, percent, table, text

@@ -11,17 +11,17 @@ from robotid.base.findings import listed
 from robotid.base.typing import Array
 from robotid.diagnosis.residual.residuals import friction_split
 from robotid.estimation.fitting.selected_drives import DriveChoice
-from robotid.identification.pictures import (
+from robotid.identification.result import Identification
+from robotid.output.pages.charts import Chart, chart_html
+from robotid.output.pages.html import code, figure, folded, number, table, text
+from robotid.output.report.information_section import Information, information
+from robotid.output.report.pictures import (
     friction_chart,
     parameter_charts,
     residual_charts,
     shown_evaluation,
     singular_chart,
 )
-from robotid.identification.result import Identification
-from robotid.output.pages.charts import Chart, chart_html
-from robotid.output.pages.html import code, figure, folded, number, table, text
-from robotid.output.report.information_section import Information, information
 
 _PAIRS = 15  # strongest correlations that are listed
 _STRONG = 0.8  # smallest correlation that is listed

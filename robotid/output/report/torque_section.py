@@ -14,7 +14,6 @@ from robotid.diagnosis.verdict.parameter_table import parameter_entries
 from robotid.estimation.fitting.bands import TorqueBand, next_errors
 from robotid.estimation.fitting.evaluation import Evaluation
 from robotid.estimation.fitting.metrics import Metrics
-from robotid.identification.pictures import torque_charts
 from robotid.identification.result import Identification
 from robotid.identification.summary import left_out_lines
 from robotid.output.files.entries import input_entries
@@ -26,6 +25,7 @@ from robotid.output.report.dock import Clip, Dock
 from robotid.output.report.ellipsoids import ellipsoid_pictures
 from robotid.output.report.errors import TORQUE, Errors, worst_errors
 from robotid.output.report.next_steps import next_steps
+from robotid.output.report.pictures import torque_charts
 from robotid.output.report.plot_sections import (
     drive_figures,
     friction_section,

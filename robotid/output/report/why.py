@@ -5,9 +5,9 @@ from html import escape
 from robotid.diagnosis.residual.decisions import DEPENDENCE_SHARE
 from robotid.diagnosis.residual.torque_split import JointTorque
 from robotid.identification.result import Identification
-from robotid.identification.why_pictures import why_charts
 from robotid.output.pages.charts import Chart, chart_html
 from robotid.output.pages.html import Cell, code, folded, number, percent, table, text
+from robotid.output.report.pictures import why_charts
 
 _POINTS = 300  # of a chart
 _ALL_POINTS = 1800  # of one chart, summed over the joints

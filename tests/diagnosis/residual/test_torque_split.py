@@ -27,7 +27,7 @@ from robotid.diagnosis.residual.torque_split import (
 from robotid.dynamics.memory import remember
 from robotid.dynamics.prediction import predict
 from robotid.dynamics.torque import joint_torque_regressor
-from robotid.identification.why_pictures import why_charts
+from robotid.output.report.pictures import why_charts
 from robotid.robot.drives import Harmonic, Hat, Lag, LoadFriction, Presliding, Spring, Stribeck
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel

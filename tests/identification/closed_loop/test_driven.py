@@ -1,21 +1,18 @@
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from helpers.mujoco_plant import plant, torque_log
 
 from robotid.base.exceptions import DataError
-from robotid.base.typing import ignore_progress
 from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
 from robotid.dynamics.simulation.loops import ClosedLoopRobot, cut_windows, open_loops
 from robotid.estimation.fitting.estimator_settings import SimulationSettings
-from robotid.identification.closed_loop.driven import driven_log, torque_rows
-from robotid.identification.closed_loop.from_commands import identify_loops
+from robotid.identification.closed_loop.from_commands import driven_log, identify_loops
 from robotid.identification.closed_loop.loop_settings import LoopSettings
 from robotid.identification.closed_loop.position_errors import DRIFTS, run_open_loop
-from robotid.identification.closed_loop.stages import _initialise_from_torque
+from robotid.identification.closed_loop.stages import torque_rows
 from robotid.robot.model import RobotModel
 
 SIGNALS = SignalSettings(cutoff=30.0)
@@ -136,17 +133,6 @@ def test_open_loops_of_torques_are_put_back_and_beside_plainer_models(arm, both)
     assert both.verdict.status in ("good", "usable")
 
 
-def test_windows_have_the_stated_length_and_lead(arm):
-    robot, *logs = arm
-    logs = [driven_log(robot.model, log.window(0.5, 2.0), SIGNALS) for log in logs]
-    stated = SimulationSettings(bodies=0.0, torques=False, window=0.4, lead=0.1)
-    found = _initialise_from_torque(robot.model, logs, DRIVEN, stated, SIGNALS, ignore_progress)
-    wanted = [(x.first, x.start_row, x.stop) for log in logs for x in cut_windows(log, 0.4, 0.1)]
-    windows = found.simulator.windows
-    assert [(x.first, x.start_row, x.stop) for x in windows] == wanted
-    assert wanted[1][0] - wanted[1][1] == 25  # rows of 4 ms
-
-
 def test_full_turns_are_taken_out_of_joints_that_turn_freely(tmp_path):
     tree = plant("planar", np.random.default_rng(0)).model.tree
     path = tmp_path / "free.urdf"
@@ -167,17 +153,3 @@ def test_a_log_without_torque_drives_nothing(arm):
         DataError, match=r"has no torque, which \[controller\] kind = 'torque' needs"
     ):
         identify_loops(robot.model, [bare], [], DRIVEN, SimulationSettings())
-
-
-@pytest.mark.parametrize(("scatter", "counted", "variance"), [(4.0, 2.0, 8.0), (0.3, 2.0, 2.0)])
-def test_rows_of_torque_weigh_as_independent_as_their_scatter_shows(scatter, counted, variance):
-    found = SimpleNamespace(
-        model="the model", mapping=SimpleNamespace(K=np.eye(2)),
-        wls=SimpleNamespace(sigma=np.array([0.5, 2.0])),
-        errors=SimpleNamespace(inflation=scatter),
-        factors=SimpleNamespace(weighted=lambda sigma: np.diag(1.0 / sigma)),
-    )  # fmt: skip
-    rows = torque_rows(found, counted)
-    np.testing.assert_allclose(np.diag(rows.R), np.array([2.0, 0.5]) / np.sqrt(variance))
-    np.testing.assert_array_equal(rows.K, np.eye(2))
-    assert rows.model == "the model"

@@ -8,17 +8,15 @@ from helpers.mujoco_plant import multisine, plant, recorded
 from robotid.data.log import Log
 from robotid.dynamics.simulation.loops import ClosedLoopRobot, RollOut, Window, cut_windows
 from robotid.estimation.estimators.output_error import OutputError
-from robotid.identification.closed_loop.drive_torques import (
-    drive_torques,
-    find_gains,
-    measured_motion,
-)
-from robotid.identification.closed_loop.free_parameters import (
+from robotid.identification.closed_loop.loop_settings import LoopSettings
+from robotid.identification.closed_loop.loop_simulator import (
     FreeParameter,
     LoopSimulator,
+    drive_torques,
+    find_gains,
     free_body_parameters,
+    measured_motion,
 )
-from robotid.identification.closed_loop.loop_settings import LoopSettings
 from robotid.identification.closed_loop.stages import stated_loops
 from robotid.output.files.commanded import loops_of
 from robotid.robot.drives import Coulomb, Viscous

@@ -12,17 +12,13 @@ from robotid.cli.work.identify import save_result
 from robotid.data.log import Log
 from robotid.diagnosis.verdict.position_verdict import judge_positions
 from robotid.dynamics.simulation.loops import ClosedLoopRobot, cut_windows
-from robotid.estimation.estimators.output_error import OutputError
 from robotid.estimation.fitting.estimator_settings import SimulationSettings
-from robotid.identification.closed_loop import from_commands as identify
 from robotid.identification.closed_loop.from_commands import identify_loops, with_gravity
-from robotid.identification.closed_loop.gain_check import gain_scale
+from robotid.identification.closed_loop.initial_values import SecondOrder
 from robotid.identification.closed_loop.loop_findings import loop_findings
 from robotid.identification.closed_loop.loop_settings import LoopSettings
 from robotid.identification.closed_loop.position_errors import position_metrics, run_open_loop
-from robotid.identification.closed_loop.second_order import SecondOrder
 from robotid.identification.closed_loop.stages import fit_loops, stated_loops
-from robotid.identification.closed_loop.term_choice import _Fold, _gains
 from robotid.output.files.entries import build_result
 from robotid.output.report.document import write_report
 from robotid.robot.drives import Coulomb, Offset, PositionCoulomb, Presliding, Viscous
@@ -236,25 +232,6 @@ def test_friction_of_joints_that_no_log_moves_is_reported(leg, found):
     assert where == f"{hip}.coulomb, {hip}.offset"
 
 
-def test_robots_of_logs_are_those_of_their_variation(leg, found, monkeypatch):
-    given, log = [], leg[1]
-    monkeypatch.setattr(identify, "fit_loops", lambda *_, **__: found.fit)
-    monkeypatch.setattr(identify, "run_open_loop", lambda *_: found.fitted[0])
-    monkeypatch.setattr(identify, "loop_runs", lambda *args: given.append(args[3]) or ())
-    monkeypatch.setattr(identify, "vary", lambda names, _, units: given.append((names, units)))
-    logs = [replace(log, path=f"{k}.csv") for k in range(3)]
-    identify_loops(leg[0].model, logs, [], stated(leg[0]), SETTINGS, units=["go", "arm", "go"])
-    assert given == [["go", "arm", "go"], (["0.csv", "1.csv", "2.csv"], ["arm", "go"])]
-
-
-def test_a_second_order_model_has_the_standard_error_of_each_inertia(found):
-    plain = found.fit.plain
-    again = OutputError(whitens=False).fit(plain.simulator, plain.theta)
-    wanted = [again.std_error[again.names.index(f"{j}.armature")] for j in found.model.joints]
-    np.testing.assert_allclose(plain.inertia_error, wanted, rtol=0.1)
-    assert plain.shows_inertia.all()
-
-
 def test_each_kept_log_is_judged(leg, found):
     _, log, kept = leg
     robot, loops = found.fit.simulator.robot, found.fit.loops
@@ -465,16 +442,6 @@ def test_a_log_without_commands_is_refused(leg):
         identify_loops(robot.model, [], [], stated(robot), SETTINGS)
 
 
-def test_terms_that_no_other_window_judges_gain_nothing():
-    """Of one window the others are none; of two, one alone may leave a parameter open."""
-    alone = _Fold(np.eye(3), np.ones(3), 10)
-    assert _gains([alone], [0, 1], {5: [2]})[5].tolist() == [0.0]
-    blind = _Fold(np.diag([1.0, 0.0, 1.0]), np.ones(3), 10)
-    assert _gains([blind, blind], [0, 1], {5: [2]})[5].tolist() == [0.0, 0.0]
-    known = _gains([alone, alone], [0, 1], {5: [2]})[5]
-    assert known == pytest.approx([1.0, 1.0])  # of each fold 2 y - y^2, y = 1
-
-
 def test_gravity_that_a_controller_compensates_is_fed_forward(leg):
     robot, log, _ = leg
     pin_model, data = robot.model.pin_model, robot.model.pin_model.createData()
@@ -485,18 +452,6 @@ def test_gravity_that_a_controller_compensates_is_fed_forward(leg):
     np.testing.assert_allclose(
         with_gravity(robot.model, more).tau_ref - more.tau_ref, weight, atol=1e-10
     )
-
-
-def test_what_whitening_leaves_correlated_widens_the_scale_of_gains(found):
-    simulator, estimate = found.fit.simulator, found.fit.estimate
-    plain, twice, less = (
-        gain_scale(simulator, OutputError(), replace(estimate, details={"inflation": inflation}))
-        for inflation in (1.0, 4.0, 0.25)
-    )
-    np.testing.assert_allclose(twice.change, plain.change)
-    np.testing.assert_allclose(twice.error, 2.0 * plain.error)
-    assert twice.common_error == pytest.approx(2.0 * plain.common_error)
-    np.testing.assert_allclose(less.error, plain.error)
 
 
 def test_a_replay_of_logs_in_memory_is_refused(found, tmp_path):

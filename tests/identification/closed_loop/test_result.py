@@ -1,27 +1,21 @@
 """Figures that are derived of a fit of loops, with errors that are given."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import scipy.stats
 from helpers.crane import identified_crane
 
-from robotid.base.findings import Finding
 from robotid.data.log import Log
-from robotid.dynamics.simulation.loops import cut_windows
 from robotid.estimation.fitting.bands import QUANTILE
-from robotid.identification.closed_loop import loop_findings as findings
-from robotid.identification.closed_loop import loop_result as result
 from robotid.identification.closed_loop.encoder_zeros import Encoders
-from robotid.identification.closed_loop.gain_check import GainScale
-from robotid.identification.closed_loop.initial_values import _speed
+from robotid.identification.closed_loop.further_parameters import GainScale, Tried
 from robotid.identification.closed_loop.loop_findings import loop_findings
-from robotid.identification.closed_loop.loop_result import LoopIdentification, logged_motion
-from robotid.identification.closed_loop.loop_settings import LoopSettings
-from robotid.identification.closed_loop.runs import units_of
-from robotid.identification.closed_loop.term_choice import Tried
+from robotid.identification.closed_loop.loop_result import (
+    logged_motion,
+    units_of,
+)
 
 #: Names of the unknowns, in the order of the fit.
 NAMES = ("rail.armature", "turn.armature", "robot.delay", "rail.viscous", "turn.viscous")
@@ -155,90 +149,6 @@ def test_a_limit_and_a_gain_at_their_lower_bound_are_findings(found):
     assert f"0.25 +- {error:.2g} N m; at the limit" in other.message
 
 
-def test_gains_of_joints_with_equal_limits_that_differ_are_a_note(found):
-    simulator = found.fit.simulator
-    first, second, *others = simulator.free_parameters
-    gains = tuple(
-        replace(x, name=f"{joint}.kp", what="kp", joints=(j,), lowest=0.0)
-        for j, (x, joint) in enumerate(zip((first, second), ("rail", "turn"), strict=True))
-    )
-    estimate = replace(found.estimate, names=("rail.kp", "turn.kp", *NAMES[2:]))
-
-    def said(kp, **limit):
-        loops = replace(found.fit.loops, kp=np.array(kp))
-        own = replace(simulator, free_parameters=(*gains, *others))
-        model = SimpleNamespace(
-            joints=("rail", "turn"),
-            limits=[
-                SimpleNamespace(
-                    name=name, type="revolute", **({"effort": 9.0, "velocity": 4.0} | x)
-                )
-                for name, x in (("rail", {}), ("turn", limit))
-            ],
-        )
-        fit = SimpleNamespace(simulator=own, loops=loops, estimate=estimate)
-        return list(findings._unequal_gains(SimpleNamespace(fit=fit, model=model)))
-
-    [note] = said([6.0, 75.0])
-    assert (note.code, note.severity, note.where) == ("unequal_gains", "note", "rail, turn")
-    assert note.evidence == {"lowest": 6.0, "highest": 75.0}
-    assert "kp from 6 to 75" in note.message
-    assert 'groups = { NAME = ["rail", "turn"] } in [controller]' in note.message
-    assert said([25.0, 75.0]) == []
-    [note] = said([75.0, 6.0])  # in any order
-    assert note.evidence == {"lowest": 6.0, "highest": 75.0}
-    assert said([6.0, 75.0], effort=8.0) == []
-    assert said([6.0, 75.0], velocity=3.0) == []
-
-
-def test_two_sets_that_a_third_pair_joins_are_one(found):
-    R = np.eye(5)
-    for a, b in ((0, 3), (1, 2), (2, 3)):
-        R[a, b] = R[b, a] = 0.99
-    [names] = of(found, covariance=R).correlated
-    assert names == ("rail.armature", "turn.armature", "robot.delay", "rail.viscous")
-
-
-def test_friction_is_projected_where_a_joint_moves_by_its_own_largest_speed(monkeypatch):
-    seen = []
-    monkeypatch.setattr(result, "drive_moments", lambda _, motions: seen.extend(motions))
-    t = 2.0 + np.arange(200) / 100.0
-    logs = [
-        Log(t, q, 0 * q, ("a", "b"), q_ref=q, has_torque=False)
-        for q in (np.sin(6.0 * t)[:, None] * size for size in ([1.0, 0.01], [0.02, 3.0]))
-    ]
-    model = SimpleNamespace(layout=SimpleNamespace(own={"a": ()}))
-    model.with_reference = lambda standard: model
-    runs = [SimpleNamespace(log=log) for log in logs]
-    stub = SimpleNamespace(model=model, standard=None, fitted=runs)
-    LoopIdentification.moments.fget(stub)
-    assert len(seen) == 2
-    for motion, moving in seen:
-        speed = np.abs(motion.v)
-        np.testing.assert_array_equal(moving, speed > 0.05 * speed.max(axis=0))
-        assert moving.mean(axis=0) == pytest.approx(0.97, abs=0.01)  # |cos| > 0.05
-
-
-@pytest.mark.parametrize(
-    ("stated", "cause", "remedy"),
-    [
-        ({}, "excite it. ", "Command a motion that depends more on rail.armature"),
-        ({"delay": 0.01}, "excite it, or delay in [controller] is wrong. ",
-         "Leave the delay out of [controller], so that it is fitted; command a motion"),
-        ({"kp": 9.0, "kd": 1.0}, "excite it, or kp or kd in [controller] is wrong. ",
-         "Compare kp and kd with the gains of the drive; command a motion"),
-    ],
-)  # fmt: skip
-def test_remedies_of_a_parameter_at_its_bound_name_only_what_is_stated(
-    found, stated, cause, remedy
-):
-    loop = LoopSettings(**stated)
-    at_bound = of(found, details={**found.estimate.details, "at_bound": ("rail.armature",)})
-    [finding] = (x for x in loop_findings(replace(at_bound, loop=loop), ()) if x.code == "at_bound")
-    assert f"{cause}{remedy}" in finding.message
-    assert ("delay" in finding.message) == ("delay" in stated)
-
-
 def test_encoders_are_told_with_the_figures_of_their_own_joint(found):
     def told(**changes):
         both = dict.fromkeys(Encoders.__dataclass_fields__, np.zeros(2))
@@ -280,17 +190,6 @@ def test_speeds_of_a_log_are_those_between_its_gaps():
     np.testing.assert_allclose(motion.v[inner, 1], -t[inner])
     np.testing.assert_allclose(motion.v[:, 1], -t, atol=0.0051)
     assert not motion.a.any()
-
-
-def test_the_usual_speed_of_a_joint_is_the_root_of_its_mean_square():
-    t = 3.0 + np.arange(200) / 100.0
-    q = np.sin(20.0 * t)[:, None] * [1.0, 0.5]
-    windows = cut_windows(Log(t, q, 0 * q, ("a", "b"), q_ref=q, has_torque=False), 0.5, 0.0)
-    rms = np.sqrt(np.mean((20.0 * np.cos(20.0 * t)) ** 2))
-    np.testing.assert_allclose(_speed(windows), [rms, 0.5 * rms], rtol=0.02)
-    seldom = Log(t[::2], q[::2], 0 * q[::2], ("a", "b"), q_ref=q[::2], has_torque=False)
-    both = [*windows, *cut_windows(seldom, 0.5, 0.0)]  # each log has a rate of its own
-    np.testing.assert_allclose(_speed(both), [rms, 0.5 * rms], rtol=0.02)
 
 
 def test_a_result_is_consistent_if_every_body_is(found):
@@ -339,40 +238,6 @@ def test_findings_of_the_fit_have_its_figures(found):
     quiet = of(found, details={**details, "left": 0.49, "halving": 0.99})
     codes = {f.code for f in loop_findings(quiet, ())}
     assert not codes & {"not_settled", "soft_loop", "coarse_steps", "gains_contradicted"}
-
-
-def test_a_delay_that_the_fit_determines_is_a_note(found):
-    """Within a tenth of the 30 ms that one response leaves open."""
-    evidence = {"shortest": 0.01, "longest": 0.04, "frequency": 3.46}
-    slow = Finding("slow_command", "warning", "a.csv", "a.csv: slow", evidence)
-    delay, std = NAMES.index("robot.delay"), found.estimate.std_error.copy()
-
-    def settled(error, **changes):
-        std[delay] = error
-        details = {**found.estimate.details, **changes}
-        own = of(found, covariance=np.diag(std**2), details=details)
-        return next(f for f in loop_findings(own, (slow,)) if f.code == "slow_command")
-
-    note = settled(2.9e-3)
-    assert (note.severity, note.evidence) == ("note", {**evidence, "std_error": 2.9e-3})
-    assert "the fit determines it to +- 2.9 ms" in note.message
-    assert "power only up to 3.5 Hz" in note.message
-    assert settled(3.1e-3) == slow
-    bound = settled(1e-4, at_bound=("robot.delay",))
-    assert bound.severity == "warning"
-    assert bound.message.startswith("a.csv: slow. The delay of the fit is 0, its lower bound")
-    fixed = tuple(x for x in found.fit.simulator.free_parameters if x.what != "delay")
-    keep = [k for k in range(5) if k != delay]
-    estimate = replace(
-        found.estimate, theta=found.estimate.theta[keep],
-        covariance=found.estimate.covariance[np.ix_(keep, keep)],
-        names=tuple(np.array(NAMES)[keep].tolist()),
-    )  # fmt: skip
-    simulator = replace(found.fit.simulator, free_parameters=fixed)
-    fit = SimpleNamespace(simulator=simulator)
-    stated = findings._settled_delay(slow, SimpleNamespace(fit=fit, estimate=estimate))
-    assert "[controller] states it" in stated.message
-    assert stated.evidence["std_error"] == 0.0
 
 
 def test_units_of_a_rail_and_of_a_joint_that_turns(found):

@@ -5,7 +5,7 @@ from helpers.mujoco_plant import multisine, plant
 
 from robotid.data.log import Log
 from robotid.dynamics.simulation.loops import ClosedLoopRobot, RollOut, Window, cut_windows
-from robotid.identification.closed_loop.free_parameters import (
+from robotid.identification.closed_loop.loop_simulator import (
     FreeParameter,
     LoopSimulator,
     _better_start,
@@ -44,21 +44,6 @@ def test_starts_that_fit_are_nearer_to_the_truth_than_those_measured(rng):
     assert [(w.start_row, w.first, w.stop) for w in better.windows] == [
         (w.start_row, w.first, w.stop) for w in measured.windows
     ]
-
-
-def test_shorter_corrections_are_tried_only_where_the_whole_one_is_not_better(rng, monkeypatch):
-    measured, _ = simulator(rng)
-    tried, roll_out = [], ClosedLoopRobot.roll_out
-
-    def counted(self, loops, windows, columns=(), *args, **options):
-        tried.append((len(windows), len(columns)))
-        return roll_out(self, loops, windows, columns, *args, **options)
-
-    monkeypatch.setattr(ClosedLoopRobot, "roll_out", counted)
-    measured.with_better_start(measured.prior)
-    n = len(measured.windows)
-    assert tried[:3] == [(n, 4), (n, 0), (n, 0)], "sensitivities, at rest, the whole correction"
-    assert all(size < n for size, columns in tried[3:5] if not columns)
 
 
 def test_a_corrected_start_is_regularised_by_position_errors_and_the_typical_speed(rng):

@@ -1,5 +1,4 @@
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,14 +8,12 @@ from robotid.dynamics.simulation.loops import ClosedLoopRobot
 from robotid.estimation.fitting.estimator_settings import SimulationSettings
 from robotid.identification.closed_loop.encoder_zeros import (
     CLEAR,
-    _descend,
     find_encoders,
     parallel_axes,
 )
-from robotid.identification.closed_loop.free_parameters import LoopSimulator, free_body_parameters
 from robotid.identification.closed_loop.from_commands import identify_loops
-from robotid.identification.closed_loop.loop_findings import _undetermined_encoders
 from robotid.identification.closed_loop.loop_settings import LoopSettings
+from robotid.identification.closed_loop.loop_simulator import LoopSimulator, free_body_parameters
 from robotid.identification.closed_loop.stages import stated_loops
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
@@ -83,18 +80,6 @@ def test_a_zero_is_found_to_the_grid_and_then_by_the_fit(moved):
     assert mirror.where == "FL_thigh_joint, FL_calf_joint"
 
 
-def test_joints_that_gravity_leaves_open_are_named_with_the_largest_margin(leg):
-    margin = np.array([0.01, 0.02, 0.04])
-    found = SimpleNamespace(
-        model=leg[0].model, fit=SimpleNamespace(encoders=SimpleNamespace(margin=margin))
-    )
-    joints = leg[0].model.joints
-    for which, most in (([0, 1], 0.02), ([2, 0], 0.04), ([1], 0.02)):
-        open_, _ = _undetermined_encoders(found, [joints[k] for k in which])
-        assert open_.evidence == {"margin": most}
-        assert f"at most {100 * most:.0f} % more" in open_.message
-
-
 def test_parallel_axes_are_found_chain_by_chain(leg):
     assert parallel_axes(leg[0].model) == [("FL_thigh_joint", "FL_calf_joint")]
     arm = RobotModel.from_urdf(example_urdf("ur5_robot.urdf"))
@@ -110,23 +95,6 @@ def test_an_encoder_that_counts_the_other_way_is_turned(leg):
     # a chain with parallel axes is its mirror image: thigh or calf
     assert sorted(sign[1:].tolist()) == [-1.0, 1.0]
     assert sign[0] == 1.0
-
-
-def test_the_gain_of_an_encoder_is_that_of_all_passes():
-    """The squared error is 1 with the URDF's zeros, 0.5 and 0.3 after the first pass, then 0.2."""
-    least = {(0, 0): 1.0, (15, 0): 0.5, (15, 30): 0.3, (45, 30): 0.2, (45, -90): 0.19}
-
-    def cost(model, sign, zero):
-        degrees = tuple(round(float(x)) for x in np.rad2deg(zero))
-        return 7 * np.log(least.get(degrees, 1.0) if (sign == 1.0).all() else 1.0)
-
-    motion = SimpleNamespace(q=np.zeros((7, 2)), cost=cost)
-    sign, zero, gain, left, costs = _descend(None, motion, np.array([0, 1]), [0, 1])
-    np.testing.assert_array_equal(sign, 1.0)
-    np.testing.assert_allclose(np.rad2deg(zero), [45.0, 30.0])
-    np.testing.assert_allclose(gain, [(1.0 - 0.5) + (0.3 - 0.2), 0.5 - 0.3])
-    assert left == pytest.approx(7 * np.log(0.2))
-    assert costs.min(axis=1) == pytest.approx(7 * np.log([0.2, 0.19]))
 
 
 def test_torques_tell_the_gains_that_positions_leave_open():

@@ -1,7 +1,5 @@
 import copy
-from collections import deque
 from dataclasses import fields, replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -74,27 +72,6 @@ def test_what_the_data_leave_of_the_prior_is_the_mean_share_of_variances(picked_
     s = identifier.settings
     step = max(1, int(s.rate / (12.0 * s.cutoff))) / s.rate
     assert identifier._share == pytest.approx(min(1.0, 2.0 * s.cutoff * step))
-
-
-def test_a_change_goes_back_to_the_last_state_a_delay_before_it_began(picked_up):
-    again = copy.copy(picked_up[1])
-    again._innovations = SimpleNamespace(forget_convergence=lambda: None)
-    state, size = again._state, len(again._state.theta)
-    states = [replace(state, theta=np.full(size, k), P=(1.0 + k) * np.eye(size)) for k in range(4)]
-    onset = 3.0 + again.delay
-    for times, wanted in (((2.0, 2.9, 3.0 + 0.5 * again.delay, 3.5), 1), ((3.1, 3.2, 3.3, 3.4), 0)):
-        again._recent = deque(zip(times, states, strict=True))
-        again._reopen(3.6, onset)
-        change = again.changes[-1]
-        assert (change.flagged, change.onset) == (3.6, onset)
-        np.testing.assert_array_equal(change.theta, states[wanted].theta)
-        np.testing.assert_array_equal(change.covariance, states[wanted].P)
-        np.testing.assert_array_equal(again._state.theta, states[wanted].theta)
-        np.testing.assert_array_equal(again._state.P, states[wanted].P + again._reopening)
-        assert not again._recent
-    s = again.settings
-    step = max(1, int(s.rate / (12.0 * s.cutoff))) / s.rate
-    assert again._kalman.walk == pytest.approx(s.walk * np.sqrt(step))
 
 
 def test_a_change_starts_from_what_was_known_before_it(panda, picked_up):

@@ -6,14 +6,13 @@ import pyarrow.parquet as pq
 import pytest
 from helpers.synthetic import payload_log
 
-from robotid.base.exceptions import DataError, MissingDependencyError
+from robotid.base.exceptions import DataError
 from robotid.cli import main
 from robotid.cli import track as command
 from robotid.cli.work.job import read_job
-from robotid.data.files import parquet_files
 from robotid.data.files.read import write_log
+from robotid.identification.online.identifier import track
 from robotid.identification.online.online_settings import OnlineSettings
-from robotid.identification.online.tracking import track
 
 ARM = [f"panda_joint{i}" for i in range(1, 8)]
 
@@ -58,21 +57,6 @@ def test_track_writes_the_history_and_says_when_the_load_came(panda, log_file, t
     assert history.num_rows == pytest.approx(20 * (15 - printed["first_estimate"]), abs=5)
 
 
-def test_without_pyarrow_the_history_is_csv(panda, log_file, tmp_path, monkeypatch, capsys):
-    log = payload_log(panda, np.random.default_rng(0), duration=3.0, at=99.0)
-    write_log(log, tmp_path / "short.csv")
-
-    def missing(purpose):
-        raise MissingDependencyError(purpose, "pyarrow", "parquet")
-
-    monkeypatch.setattr("robotid.cli.work.track.load_pyarrow", missing)
-    monkeypatch.setattr(parquet_files, "load_pyarrow", missing)
-    assert main(words(panda, tmp_path / "short.csv", str(tmp_path / "out"))) == 0
-    lines = (tmp_path / "out" / "track.csv").read_text().splitlines()
-    assert lines[0].startswith("time,panda_link1.Izz,panda_link1.Izz.std_error,")
-    assert len(lines) > 20
-
-
 def test_a_history_has_twenty_rows_a_second_and_the_last_sample(panda):
     log = payload_log(panda, np.random.default_rng(0), duration=1.83, at=99.0)
     seen = []
@@ -98,11 +82,6 @@ def test_a_log_without_motion_is_refused(panda, tmp_path):
     still = replace(log, q=np.zeros(log.q.shape))
     with pytest.raises(DataError, match="moves for less than the warm-up of 1 s"):
         track(panda, still, OnlineSettings())
-
-
-def test_a_filter_is_needed(panda, log_file, tmp_path, capsys):
-    assert main([*words(panda, log_file, str(tmp_path)), "--cutoff", "false"]) == 2
-    assert "state a cutoff in Hz" in capsys.readouterr().err
 
 
 def test_real_recordings_are_tracked_without_a_false_alarm(recordings, monkeypatch):

@@ -6,8 +6,8 @@ import re
 import numpy as np
 import pytest
 
-from robotid.identification.why_pictures import why_charts
 from robotid.output.pages.html import asset
+from robotid.output.report.pictures import why_charts
 
 #: Linear RGB as seen with protanopia and deuteranopia; Machado, Oliveira, Fernandes (2009).
 SEEN = {

@@ -10,10 +10,10 @@ from helpers.pages import charts, tables
 
 from robotid.data.signal_settings import SignalSettings
 from robotid.diagnosis.verdict.scale_check import ScaleCheck
-from robotid.identification.pictures import residual_charts
 from robotid.output.pages.charts import Chart, Series
 from robotid.output.report.errors import _notes
 from robotid.output.report.information_section import information
+from robotid.output.report.pictures import residual_charts
 from robotid.output.report.plot_sections import (
     _choice,
     _correlation_map,

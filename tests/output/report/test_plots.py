@@ -13,9 +13,9 @@ from helpers.figures import torques
 from helpers.pages import chart, percent
 
 from robotid.diagnosis.residual.residuals import autocorrelation, spectrum
-from robotid.identification.pictures import QUANTILE, torque_charts
 from robotid.output.report import torque_section as torques_module
 from robotid.output.report.information_section import information
+from robotid.output.report.pictures import QUANTILE, torque_charts
 from robotid.output.report.steps import Origin
 from robotid.output.report.torque_section import torques_section
 

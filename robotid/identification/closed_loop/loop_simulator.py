@@ -1,6 +1,6 @@
-"""Free parameters of drives, loops and bodies, and the simulator that an estimator calls."""
+"""Free parameters of drives, loops and bodies, their simulator, and the torques of its drives."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -9,16 +9,22 @@ import numpy as np
 from robotid.base.exceptions import NotConvergedError
 from robotid.base.typing import Array
 from robotid.data.log import Trajectory
+from robotid.data.signal_filters import local_polynomial
 from robotid.dynamics.memory import remember
 from robotid.dynamics.prediction import predict
 from robotid.dynamics.simulation.loops import ClosedLoopRobot, Column, Loops, RollOut, Window
 from robotid.estimation.estimators.simulator import Residual
-from robotid.identification.closed_loop.drive_torques import drive_torques
 from robotid.robot.assumed import with_assumed_inertials
-from robotid.robot.drives import DriveTerm
+from robotid.robot.drive_term import DriveTerm
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import inertial_from_pseudo_inertia, pseudo_inertia
 
+_AROUND = (0, -1, 1)  # lags that are tried about the known delay [samples]
+_LATEST = 0.1  # largest lag that is tried [s]
+_CLEAR = 9.0  # improvement that a fractional lag needs [variances of one row]
+_WHOLE = 0.15  # distance from a whole lag below which the lag is whole [samples]
+_SMOOTH = 0.02  # half-width of the differentiating filter [s]
+_FREE = 0.95  # torque relative to the limit, below which the drive is not saturated
 _STARTS = 2  # steps of the initial states of windows
 _SHARES = (1.0, 0.3, 0.1)  # step lengths that are tried
 _NEAR = 3.0  # prior of an initial position about the measured one [RMS position errors]
@@ -28,31 +34,147 @@ _ENTRIES = ((3, 3), (0, 3), (1, 3), (2, 3))
 
 
 @dataclass(frozen=True, eq=False)
-class FreeParameter:
-    """A free parameter of one joint, or of several joints that share it.
+class DriveTorques:
+    """Torques of drives at the counted samples of a roll-out; arrays of shape (N, n)."""
 
-    Attributes:
-        name: Such as ``"elbow.armature"``; of several joints, ``"calf.armature"``.
-        what: "armature", "kp", "kd", "limit", "delay", "zero", "term", or "body": a coordinate of
-            the difference between a body and the URDF's.
-        joints: Indices of the joints.
-        prior: Prior value.
-        spread: Prior standard deviation; inf without a prior.
-        lowest: Lower bound.
-        highest: Upper bound.
-        term: The friction term.
-        coordinate: Number of a body's coordinate, 0 to 3.
+    unlimited: Array  # kp position_error + kd speed_error + tau_ref [N m or N]
+    position_error: Array  # q_ref - q [rad or m]
+    speed_error: Array  # v_ref - v [rad/s or m/s]
+    loops: Loops  # the loops, with the torque limits
+
+    @property
+    def limited(self) -> Array:
+        """The torque within the limits of the drives [N m or N]."""
+        limited: Array = np.clip(self.unlimited, -self.loops.limit, self.loops.limit)
+        return limited
+
+    def slopes(
+        self,
+        joints: Array,
+        columns: Sequence[tuple[int, Column]],
+        motion: Array,
+        kinds: Mapping[str, int],
+    ) -> Array:
+        """Return the derivatives of the torques of some drives, shape (N, k, c).
+
+        The command is constant over a row, so a delay changes only the motion.
+
+        joints (k,), motion (N, 2k, c).
+        """
+        k, loops = len(joints), self.loops
+        change: Array = (
+            -loops.kp[joints, None] * motion[:, :k] - loops.kd[joints, None] * motion[:, k:]
+        )
+        own = {kinds["kp"]: self.position_error, kinds["kd"]: self.speed_error}
+        at_limit = (np.abs(self.unlimited) >= loops.limit)[:, joints]
+        for c, (kind, joint, _) in columns:
+            if kind in own:
+                change[:, joints == joint, c] += own[kind][:, [joint]]
+        change[at_limit] = 0.0
+        for c, (kind, joint, _) in columns:
+            if kind == kinds["limit"]:
+                side = np.sign(self.unlimited[:, [joint]])
+                change[:, joints == joint, c] += at_limit[:, joints == joint] * side
+        return change
+
+
+def drive_torques(out: RollOut, loops: Loops, lag: Array) -> DriveTorques:
+    """Return the torques of the drives along a roll-out: lag (n,) [samples]."""
+    log, rows = out.window.log, np.arange(out.window.first, out.window.stop)
+    sent = rows[:, None] - np.ceil(lag).astype(int)  # before the log: its first command
+    later = np.ceil(lag) - lag
+    q_ref, v_ref, tau_ref = (
+        np.zeros(out.q.shape)
+        if x is None
+        else sum(
+            share * np.take_along_axis(x, np.clip(row, 0, len(x) - 1), axis=0)
+            for share, row in ((1.0 - later, sent), (later, sent + 1))
+        )
+        for x in (log.q_ref, log.v_ref, log.tau_ref)
+    )
+    error, speed_error = q_ref - out.q, v_ref - out.v
+    unlimited = loops.kp * error + loops.kd * speed_error + tau_ref
+    return DriveTorques(unlimited, error, speed_error, loops)
+
+
+def measured_motion(window: Window) -> RollOut:
+    """Return a window's measured motion in the form of a roll-out."""
+    q, t = (x[window.counted] for x in (window.log.q, window.log.t))
+    dt = float(np.median(np.diff(t)))
+    wide = min(2 * max(2, round(_SMOOTH / dt)) + 1, len(t) - 1 + len(t) % 2)
+    v = local_polynomial(q, wide, min(2, wide - 1), derivative=1, step=dt)
+    return RollOut(window, q, v)
+
+
+def find_gains(
+    outs: Sequence[RollOut], loops: Loops, is_free: Array, *, knows_delay: bool, is_whole: bool
+) -> tuple[Array, Loops]:
+    """Return the lag of measured torques, and the loops with gains fitted to these torques.
+
+    A command that is constant over a row jumps between rows, and with it the torque of a stiff
+    loop. The lag of least squared error is taken; a fractional one, as of torques averaged over a
+    row, only where the improvement is significant. Gains whose estimate is negative do not change.
+
+    is_free (2, n) -> (n,) [samples].
     """
+    dt = float(np.median(np.diff(outs[0].window.log.t)))
+    delayed = np.ceil(loops.delay / dt - 1e-6)
+    around = _AROUND if knows_delay else range(-int(delayed.min()), 1 + round(_LATEST / dt))
+    tries = np.array([np.maximum(delayed + rows, 0.0) for rows in around])
+    costs = np.array([_fit_gains(outs, loops, is_free, lag)[0] for lag in tries])
+    lag, least = tries[np.argmin(costs, axis=0), np.arange(len(delayed))], costs.min(axis=0)
+    rows, whole = sum(len(out.q) for out in outs), lag.copy()
+    for side in () if is_whole else (-1.0, 1.0):  # the cost is a parabola towards the next row
+        half, next_ = (
+            _fit_gains(outs, loops, is_free, np.maximum(whole + side * x, 0.0))[0]
+            for x in (0.5, 1.0)
+        )
+        bend, slope = 2 * (least + next_ - 2 * half), 4 * half - 3 * least - next_
+        share = np.clip(-slope / np.maximum(2 * bend, 1e-300), 0.0, 1.0)
+        gain = -(slope + bend * share) * share
+        is_between = (gain > _CLEAR * least / rows) & (share > _WHOLE)
+        lag = np.where(is_between, whole + side * share, lag)
+    gains = _fit_gains(outs, loops, is_free, lag)[1]
+    kp, kd = np.where(gains > 0, gains, [loops.kp, loops.kd])
+    return lag, replace(loops, kp=kp, kd=kd)
 
-    name: str
+
+def _fit_gains(
+    outs: Sequence[RollOut], loops: Loops, is_free: Array, lag: Array
+) -> tuple[Array, Array]:
+    """Return the squared torque residuals, (n,), and the gains of least squares, (2, n)."""
+    torques = [drive_torques(out, loops, lag) for out in outs]
+    unlimited, error, speed_error = (
+        np.concatenate([getattr(own, name) for own in torques])
+        for name in ("unlimited", "position_error", "speed_error")
+    )
+    tau = np.concatenate([out.window.log.tau[out.window.counted] for out in outs])
+    squares, gains = np.zeros(len(lag)), np.stack([loops.kp, loops.kd])
+    for j, is_own in enumerate(is_free.T):
+        free = np.abs(tau[:, j]) < _FREE * loops.limit[j]
+        A = np.column_stack([error[free, j], speed_error[free, j]])[:, is_own]
+        b = (tau - unlimited)[free, j]
+        more = np.linalg.lstsq(A, b, rcond=None)[0] if is_own.any() else np.zeros(0)
+        gains[is_own, j] += more
+        squares[j] = np.sum((b - A @ more) ** 2)
+    return squares, gains
+
+
+@dataclass(frozen=True, eq=False)
+class FreeParameter:
+    """A free parameter of one joint, or of several joints that share it."""
+
+    name: str  # such as ``"elbow.armature"``; of several joints, ``"calf.armature"``
+    #: "armature", "kp", "kd", "limit", "delay", "zero", "term", or "body": a coordinate of
+    #: the difference between a body and the URDF's.
     what: str
-    joints: tuple[int, ...]
-    prior: float
-    spread: float
-    lowest: float = -np.inf
-    highest: float = np.inf
-    term: DriveTerm | None = None
-    coordinate: int = 0
+    joints: tuple[int, ...]  # indices of the joints
+    prior: float  # prior value
+    spread: float  # prior standard deviation; inf without a prior
+    lowest: float = -np.inf  # lower bound
+    highest: float = np.inf  # upper bound
+    term: DriveTerm | None = None  # the friction term
+    coordinate: int = 0  # number of a body's coordinate, 0 to 3
 
     @classmethod
     def of_term(
@@ -77,61 +199,47 @@ def free_body_parameters(robot: ClosedLoopRobot, spread: float) -> list[FreePara
     model = robot.model
     J = pseudo_inertia(model.standard_parameters()[: model.layout.n_inertial])
     values = np.linalg.eigvalsh(J)
-    found = []
+    parameters = []
     for body, joint in enumerate(robot.joint_of_body):
         if values[body, 0] <= _POSSIBLE * values[body, -1]:
             continue  # a massless frame or an inconsistent body of the URDF stays fixed
         name = model.layout.bodies[body]
-        found += [
+        parameters += [
             FreeParameter(f"{name}.{what}", "body", (joint,), 0.0, spread, coordinate=k)
             for k, what in enumerate(("mass", "cx", "cy", "cz"))
         ]
-    return found
+    return parameters
 
 
 @dataclass(frozen=True, eq=False)
 class TorqueRows:
-    """Torque rows of logs, reduced: R [K pi, 1] is their residual, weighted to unit noise.
+    """Torque rows of logs, reduced: R [K pi, 1] is their residual, weighted to unit noise."""
 
-    Attributes:
-        model: The robot with the standard parameters pi.
-        R: Triangular factor, shape (b + 1, b + 1).
-        K: Base parameters of standard ones, shape (b, p).
-    """
-
-    model: RobotModel
-    R: Array
-    K: Array
+    model: RobotModel  # the robot with the standard parameters pi
+    R: Array  # triangular factor, shape (b + 1, b + 1)
+    K: Array  # base parameters of standard ones, shape (b, p)
 
 
 @dataclass(frozen=True, eq=False)
 class LoopSimulator:
-    """A robot in closed loop with free parameters and windows of logs, for an estimator.
-
-    Attributes:
-        robot: The robot.
-        windows: Windows of its logs.
-        base: Values of the loops; the free parameters replace theirs.
-        free_parameters: The free parameters.
-        torque: Rows of measured torques along the measured motion; None if not used.
-        velocities: Whether measured velocities are compared in addition to positions.
-        error: The compared signals. "output": positions, and torques of the drives if ``lag`` is
-            given; "input": only these torques; "direct": the same, with derivatives that neglect
-            the change of the motion.
-        lag: Lag of each torque after its command, shape (n,) [samples], as in ``drive_torques``;
-            None if torques of roll-outs are not compared.
-        fine: The robot with smaller steps, whose roll-outs are compared; derivatives are those of
-            ``robot``. None: ``robot`` itself.
-    """
+    """A robot in closed loop with free parameters and windows of logs, for an estimator."""
 
     robot: ClosedLoopRobot
-    windows: tuple[Window, ...]
-    base: Loops
-    free_parameters: tuple[FreeParameter, ...]
+    windows: tuple[Window, ...]  # windows of its logs
+    base: Loops  # values of the loops; the free parameters replace theirs
+    free_parameters: tuple[FreeParameter, ...]  # the free parameters
+    #: Rows of measured torques along the measured motion; None if not used.
     torque: "TorqueRows | None" = None
-    velocities: bool = False
+    velocities: bool = False  # whether measured velocities are compared in addition to positions
+    #: The compared signals. "output": positions, and torques of the drives if ``lag`` is
+    #: given; "input": only these torques; "direct": the same, with derivatives that neglect
+    #: the change of the motion.
     error: str = "output"
+    #: Lag of each torque after its command, shape (n,) [samples], as in ``drive_torques``;
+    #: None if torques of roll-outs are not compared.
     lag: Array | None = None
+    #: The robot with smaller steps, whose roll-outs are compared; derivatives are those of
+    #: ``robot``. None: ``robot`` itself.
     fine: ClosedLoopRobot | None = None
 
     @cached_property
@@ -355,15 +463,15 @@ class LoopSimulator:
     def _inverse_dynamics(self, outs: Sequence[RollOut], theta: Array) -> list[Array]:
         """Return Y(q, v, a) d pi along roll-outs, window by window, shape (N, n, c)."""
         model, (_, slopes) = self._full_model, self.standard(self._full_model, theta)
-        found = []
+        slopes_of_windows = []
         for out in outs:
             t = out.window.log.t[out.window.counted]
             a, none = np.gradient(out.v, t, axis=0), np.zeros_like(out.q)
             segment = np.zeros(len(t), dtype=int)
             motion = Trajectory(t, out.q, out.v, a, none, model.joints, None, segment)
             torques = predict(model, list(slopes.T), remember(model, motion))
-            found.append(np.stack(torques, axis=-1))
-        return found
+            slopes_of_windows.append(np.stack(torques, axis=-1))
+        return slopes_of_windows
 
     @cached_property
     def _full_model(self) -> RobotModel:

@@ -14,10 +14,8 @@ from robotid.base.exceptions import DataError
 from robotid.data.log import Trajectory
 from robotid.data.signal_settings import SignalSettings
 from robotid.diagnosis.residual.torque_split import joint_torques
-from robotid.identification import pictures
-from robotid.identification import result as result_module
-from robotid.identification.pictures import residual_charts
-from robotid.identification.why_pictures import why_charts
+from robotid.output.report import pictures
+from robotid.output.report.pictures import residual_charts, why_charts
 
 
 def series(chart, label):
@@ -31,7 +29,7 @@ def test_torques_are_those_of_the_recording_kept_apart_or_of_the_one_asked_for(i
         (identified.validation[0], None),
         (identified.fitted[1], identified.fitted[1]),
     ):
-        plot = identified.plot_torques("elbow_joint", recording=asked)
+        plot = pictures.plot_torques(identified, "elbow_joint", recording=asked)
         assert plot.title == f"Torques of {recording.recording.name}"
         (torque, _), (residual, _) = plot.charts
         t, tau = recording.recording.trajectory.t, recording.recording.trajectory.tau[:, j]
@@ -40,15 +38,15 @@ def test_torques_are_those_of_the_recording_kept_apart_or_of_the_one_asked_for(i
         left = (tau - recording.torques["estimate"][:, j])[recording.recording.mask[:, j]]
         drawn = series(residual, "residual").y
         np.testing.assert_allclose(drawn[np.isfinite(drawn)], left, atol=1e-12)
-    assert len(identified.plot_torques().charts) == 2 * len(identified.model.joints)
+    assert len(pictures.plot_torques(identified).charts) == 2 * len(identified.model.joints)
 
 
 def test_friction_and_reasons_are_of_the_joint_named(identified):
-    plot = identified.plot_friction("elbow_joint", "wrist_1_joint")
+    plot = pictures.plot_friction(identified, "elbow_joint", "wrist_1_joint")
     captions = [caption for _, caption in plot.charts]
     assert captions == ["elbow_joint: friction and offset", "wrist_1_joint: friction and offset"]
-    assert len(identified.plot_friction().charts) == 6
-    why = identified.plot_why("wrist_2_joint")
+    assert len(pictures.plot_friction(identified).charts) == 6
+    why = pictures.plot_why(identified, "wrist_2_joint")
     assert all(caption.startswith("wrist_2_joint") for _, caption in why.charts)
     split = why.charts[0][0]
     parts = [s for s in split.series if s.kind == "area"]
@@ -122,11 +120,11 @@ def test_another_joint_is_refused_by_name(identified, plot):
         r"joint 'elbow_joind' is not among the identified joints: .*Did you mean 'elbow_joint'\?"
     )
     with pytest.raises(DataError, match=words):
-        getattr(identified, plot)("elbow_joind")
+        getattr(pictures, plot)(identified, "elbow_joind")
 
 
 def test_a_notebook_shows_the_page_that_is_written(identified, tmp_path):
-    plot = identified.plot_friction("elbow_joint")
+    plot = pictures.plot_friction(identified, "elbow_joint")
     path = plot.write(tmp_path / "friction.html")
     page = path.read_text()
     assert page.count('<figure class="chart"') == 1
@@ -284,29 +282,10 @@ def test_singular_values_are_split_at_the_rank(rank):
     assert chart.x.tolist() == [1, 2, 3, 4, 5]
 
 
-def test_plots_of_torques_are_of_each_joint_in_turn(identified, monkeypatch):
-    given = []
-
-    def charts(found, evaluation, row, *, band):
-        given.append((evaluation, row, band))
-        return f"torque {row}", f"residual {row}"
-
-    monkeypatch.setattr(result_module, "torque_charts", charts)
-    e = identified.fitted[1]
-    plot = identified.plot_torques("wrist_1_joint", "shoulder_lift_joint", recording=e)
-    assert plot.charts == (
-        ("torque 3", "wrist_1_joint: torque"), ("residual 3", "wrist_1_joint: residual"),
-        ("torque 1", "shoulder_lift_joint: torque"),
-        ("residual 1", "shoulder_lift_joint: residual"),
-    )  # fmt: skip
-    assert [row for _, row, _ in given] == [3, 1]
-    assert all(shown is e and band is identified.band(e) for shown, _, band in given)
-
-
 def test_charts_of_reasons_are_named_by_what_they_show(identified):
     (j,) = (k for k, n in enumerate(identified.model.joints) if n == "wrist_2_joint")
     torque = joint_torques(identified)[j]
-    plot = identified.plot_why("wrist_2_joint")
+    plot = pictures.plot_why(identified, "wrist_2_joint")
     names = [f"residual against {x}" for x in ("position", "speed", "acceleration", "load", "time")]
     wanted = [torque.sentence, *names, "mechanical power"]
     assert [caption for _, caption in plot.charts] == [f"wrist_2_joint: {x}" for x in wanted]

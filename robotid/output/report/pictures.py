@@ -1,35 +1,137 @@
-"""Charts of an identification: torques, residuals, friction, parameters, excitation."""
+"""Charts of an identification: torques, residuals and their causes, friction, parameters."""
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from robotid.base.exceptions import DataError
+from robotid.base.findings import listed
+from robotid.base.settings import require_kind
 from robotid.base.typing import Array
+from robotid.data.log import suggestion
+from robotid.diagnosis.residual.dependence import Dependence
 from robotid.diagnosis.residual.residuals import autocorrelation, friction_split, spectrum
+from robotid.diagnosis.residual.torque_split import JointTorque, spread_rows
 from robotid.dynamics.memory import drive_motion_along
 from robotid.estimation.fitting.bands import QUANTILE, TorqueBand, friction_curve
 from robotid.estimation.fitting.evaluation import Evaluation
+from robotid.identification.result import Identification
 from robotid.output.pages.charts import Chart, Series, broken
-
-if TYPE_CHECKING:
-    from robotid.identification.result import Identification
+from robotid.output.pages.plots import Plot
 
 _DOTS = 800  # of one friction chart
 _LAGS = 400  # points of one autocorrelation
 _LONGEST_LAG = 2.0  # [s]
 _DWARFED = 4.0  # times the height of the measured torque above which the URDF's is hidden
 _PIXELS = 500  # spans closer than one of these pixels are merged
+_POINTS = 600  # of a chart
+_TONES = {
+    "gravity": "tone-1",
+    "inertia": "tone-4",
+    "Coriolis": "tone-7",
+    "friction": "tone-3",
+    "motor inertia": "tone-6",
+    "offset": "tone-8",
+    "spring": "tone-5",
+    "ripple": "urdf",
+    "delay": "quiet",
+}
 
 
-def shown_evaluation(found: "Identification") -> Evaluation:
+def plot_torques(
+    identification: Identification, *joints: str, recording: Evaluation | None = None
+) -> Plot:
+    """Return charts of measured and identified torque over time, and of the residual.
+
+    Args:
+        identification: The result.
+        joints: The joints; all if none is named.
+        recording: One of ``fitted`` or ``validation``; None: the first validation recording, or
+            the first fitted one.
+
+    Returns:
+        Charts that a notebook shows and ``.write("torques.html")`` saves.
+
+    Raises:
+        DataError: If there is no such joint.
+    """
+    require_kind(
+        recording, (Evaluation, type(None)), "recording", "one of fitted or validation, or none"
+    )
+    shown = shown_evaluation(identification) if recording is None else recording
+    names = joints or identification.model.row_names
+    rows, band = [_row_of(identification, joint) for joint in names], identification.band(shown)
+    charts = []
+    for name, row in zip(names, rows, strict=True):
+        torque, residual = torque_charts(identification, shown, row, band=band)
+        charts += [(torque, f"{name}: torque"), (residual, f"{name}: residual")]
+    return Plot(f"Torques of {shown.recording.name}", tuple(charts))
+
+
+def plot_friction(identification: Identification, *joints: str) -> Plot:
+    """Return charts of friction against speed, measured and identified, with its band.
+
+    Args:
+        identification: The result.
+        joints: The joints; all if none is named.
+
+    Returns:
+        Charts that a notebook shows and ``.write("friction.html")`` saves.
+
+    Raises:
+        DataError: If there is no such joint, or none that moved.
+    """
+    names = joints or identification.model.joints
+    for name in names:
+        _row_of(identification, name)
+    charts = [(friction_chart(identification, name), name) for name in names]
+    shown = tuple((x, f"{name}: friction and offset") for x, name in charts if x is not None)
+    if not shown:
+        raise DataError(f"{listed(names)}: no samples used, so there is no friction to show")
+    return Plot(f"Friction of {listed(names)} against speed", shown)
+
+
+def plot_why(identification: Identification, joint: str) -> Plot:
+    """Return charts of the parts of a joint's torque, and of its residual's dependences.
+
+    Args:
+        identification: The result.
+        joint: The joint.
+
+    Returns:
+        Charts that a notebook shows and ``.write("why.html")`` saves.
+
+    Raises:
+        DataError: If there is no such joint.
+    """
+    torque = identification.joint_torques[_row_of(identification, joint)]
+    charts = why_charts(torque)
+    about = {name: f"residual against {name}" for name in charts}
+    about |= {"split": torque.sentence, "power": "mechanical power"}
+    shown = tuple((chart, f"{joint}: {about[name]}") for name, chart in charts.items())
+    return Plot(f"Torque parts and residual of {joint}", shown)
+
+
+def shown_evaluation(found: Identification) -> Evaluation:
     """Return the recording to show: the first validation recording, or the first fitted one."""
     return (found.validation or found.fitted)[0]
 
 
+def _row_of(identification: Identification, joint: str) -> int:
+    """Return the index of a joint's torque row."""
+    require_kind(joint, str, "joint", "the name of a joint")
+    names = identification.model.row_names
+    if joint not in names:
+        raise DataError(
+            f"joint {joint!r} is not among the identified joints: {listed(names)}"
+            f"{suggestion(joint, names)}"
+        )
+    return names.index(joint)
+
+
 def torque_charts(
-    found: "Identification",
+    found: Identification,
     evaluation: Evaluation,
     row: int,
     *,
@@ -109,7 +211,7 @@ def unused_spans(t: Array, used: NDArray[np.bool_]) -> tuple[tuple[float, float]
 
 
 def residual_charts(
-    found: "Identification", evaluation: Evaluation, row: int
+    found: Identification, evaluation: Evaluation, row: int
 ) -> tuple[Chart, Chart] | None:
     """Return spectrum and autocorrelation of a joint's residual; None if no sample was used."""
     motion, used = evaluation.recording.trajectory, evaluation.recording.mask[:, row].astype(bool)
@@ -150,7 +252,7 @@ def residual_charts(
 
 
 def friction_chart(
-    found: "Identification", joint: str, *, split: tuple[Array, Array] | None = None
+    found: Identification, joint: str, *, split: tuple[Array, Array] | None = None
 ) -> Chart | None:
     """Return friction against speed: measured, identified, and at constant speed."""
     evaluation, model = shown_evaluation(found), found.model
@@ -189,7 +291,7 @@ def friction_chart(
     )
 
 
-def parameter_charts(found: "Identification", terms: Sequence[str]) -> tuple[Chart, ...]:
+def parameter_charts(found: Identification, terms: Sequence[str]) -> tuple[Chart, ...]:
     """Return charts of each term of all drives, with the value before the fit."""
     layout = found.model.layout
     owners, ends = zip(*(name.rsplit(".", 1) for name in layout.names), strict=True)
@@ -239,3 +341,91 @@ def singular_chart(values: Array, rank: int) -> Chart:
         "singular value [-]",
         logarithmic="y",
     )
+
+
+def why_charts(
+    torque: JointTorque, *, link: str = "time", points: int = _POINTS
+) -> dict[str, Chart]:
+    """Return the charts of a joint by name.
+
+    They are "split", the parts of the torque stacked over time; one for each quantity that the
+    residual may depend on, by its name; and "power", if there is a speed. Charts over time show the
+    first recording.
+    """
+    charts = {"split": _split(torque, link, points)}
+    for dependence in torque.follows:
+        if dependence.name in (*torque.quantities, "time"):
+            charts[dependence.name] = _residual(torque, dependence, link, points)
+    if torque.power is not None:
+        charts["power"] = _power(torque, torque.power, link, points)
+    return charts
+
+
+def _split(torque: JointTorque, link: str, points: int) -> Chart:
+    k = _first(torque, points)
+    parts = {name: torque.parts[name][k] for name in torque.present}
+    lines = [*parts.values(), torque.residual[k], torque.tau[k]]
+    t, *lines = broken(torque.rows.segment[k], torque.rows.t[k], *lines)
+    *stacked, residual, tau = lines
+    areas = [Series(name, y, _TONES[name], "area") for name, y in zip(parts, stacked, strict=True)]
+    return Chart(
+        title=f"Torque of {torque.joint} over time, the sum of {', '.join(parts)} and residual",
+        x=t,
+        series=(
+            *areas,
+            Series("residual", residual, "residual", "area"),
+            Series("measured", tau, "text"),
+        ),
+        x_label="time [s]",
+        y_label=f"torque [{torque.unit}]",
+        link=link,
+        spans=unused_spans(torque.rows.t[k], torque.used[k]),
+        height=240,
+    )
+
+
+def _power(torque: JointTorque, power: Array, link: str, points: int) -> Chart:
+    k = _first(torque, points)
+    speed = torque.quantities["speed"][1]
+    dissipated = torque.parts.get("friction", np.zeros_like(speed)) * speed
+    t, whole, heat = broken(torque.rows.segment[k], torque.rows.t[k], power[k], dissipated[k])
+    return Chart(
+        title=f"Mechanical power of {torque.joint} over time, and that of its friction",
+        x=t,
+        series=(Series("into friction", heat, "tone-3"), Series("torque × speed", whole, "text")),
+        x_label="time [s]",
+        y_label="power [W]",
+        link=link,
+        height=120,
+    )
+
+
+def _residual(torque: JointTorque, dependence: Dependence, link: str, points: int) -> Chart:
+    name, unit = dependence.name, dependence.unit
+    x = torque.rows.time if name == "time" else torque.quantities[name][1]
+    rows = np.flatnonzero(torque.used)
+    rows = rows[np.argsort(x[rows])]
+    k = rows[spread_rows(len(rows), points)]
+    mean, error = dependence.at(x[k])
+    is_one = name == "time" and len(torque.rows.recordings) == 1
+    residual, less = torque.against_time if name == "time" else (torque.residual, "")
+    explained = f" minus its mean over {less}" if less else ""
+    return Chart(
+        title=f"Residual of {torque.joint}{explained} against {name}, with its mean and 95 % "
+        "interval",
+        x=x[k],
+        series=(
+            Series("residual", residual[k], "residual", "dots", is_weak=True),
+            Series("mean", mean, "text", half=QUANTILE * error),
+        ),
+        x_label=f"{name} [{unit}]",
+        y_label=f"residual [{torque.unit}]",
+        link=link if is_one else "",
+        height=120,
+    )
+
+
+def _first(torque: JointTorque, points: int) -> Array:
+    """Return samples spread evenly over the first recording."""
+    own = np.flatnonzero(torque.rows.recording == 0)
+    return own[spread_rows(len(own), points)]
