@@ -40,7 +40,7 @@ _INERTIA = 0.3  # ... of a determined inertia about it, as a share of the mean p
 _SAME = 1e-3  # of the largest column of a link: below, motion does not determine a parameter
 _MOST_LOADS = 20  # fits until the joint load torque is that of the identified bodies
 _CONVERGED = 1e-4  # relative change of the parameters at convergence
-_FREE = 1e-9  # weight of the prior in the fit that makes a payload consistent: none
+_FREE = 1e-6  # weight of the prior in the fit that makes a payload consistent: none
 
 
 class UndeterminedMassError(DataError):
@@ -154,9 +154,7 @@ def own_friction(
     wanted = wanted_families(friction, reference.model.joints)
     if all(names == () for names in wanted.values()):
         return {}
-    # the selection of friction needs no consistent bodies, and a quadratic fit always converges
-    choice = ConsistentSettings(prior="euclidean", prior_weight=1.0, draws=0)
-    return with_drives(reference, choice, wanted).model.layout.own
+    return with_drives(reference, ConsistentSettings(draws=0), wanted).model.layout.own
 
 
 def mass_checks(
@@ -367,7 +365,6 @@ def _possible(
         K=np.eye(count),
         prior=ball.reshape(-1),
         prior_std=scale,
-        margin=_FREE,
         prior_weight=_FREE,
         constraints=Constraints(mass=stated),
     )
