@@ -41,6 +41,7 @@ _SAME = 1e-3  # of the largest column of a link: below, motion does not determin
 _MOST_LOADS = 20  # fits until the joint load torque is that of the identified bodies
 _CONVERGED = 1e-4  # relative change of the parameters at convergence
 _FREE = 1e-6  # weight of the prior in the fit that makes a payload consistent: none
+_EXACT = 1e-6  # smallest standard error in that fit, as a share of a parameter's size
 
 
 class UndeterminedMassError(DataError):
@@ -368,8 +369,8 @@ def _possible(
         prior_weight=_FREE,
         constraints=Constraints(mass=stated),
     )
-    # a stated mass has no covariance; its constraint fixes it
-    exact = np.diag(np.where(np.diag(C) == 0, scale**2, 0.0))
+    # a stated mass has no covariance; its constraint fixes it. Data without noise have almost none
+    exact = np.diag(np.where(np.diag(C) == 0, scale, _EXACT * scale) ** 2)
     names = fit.layout.names
     start = Estimate(x, C + exact, names, np.ones(1), count, 1.0, (), True, 0, "two runs")
     return fit.project(start).theta
