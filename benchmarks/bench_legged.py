@@ -65,7 +65,7 @@ SIGNALS = SignalSettings(cutoff=25.0, velocity="differentiated")
 ARMATURE, DAMPING = 0.01, 0.2
 PRIOR = ConsistentSettings(prior_weight=1.0, draws=0)
 AUTO_PRIOR = ConsistentSettings(draws=0)
-NO_PRIOR = ConsistentSettings(prior="euclidean", prior_weight=1e-6, draws=0)
+WEAK_PRIOR = ConsistentSettings(prior_weight=1e-4, draws=0)
 
 
 def robot():
@@ -282,7 +282,7 @@ def unseen(name, seed, duration):
     truth = plant.truth(model)[:n]
     print(f"{name}, run {seed}: joint torque of unseen motion, trunk's mass and Ixx / truth")
     for label, settings in (
-        ("wls", "wls"), ("LMI, no prior", NO_PRIOR), ("consistent", PRIOR)
+        ("wls", "wls"), ("weak prior", WEAK_PRIOR), ("consistent", PRIOR)
     ):  # fmt: skip
         try:
             found = identify(

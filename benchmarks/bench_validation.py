@@ -53,7 +53,7 @@ def main():
         )
     print(
         f"\nPython {platform.python_version()}, pin {version('pin')}, numpy {version('numpy')}, "
-        f"scipy {version('scipy')}, clarabel {version('clarabel')}, {platform.machine()}, "
+        f"scipy {version('scipy')}, {platform.machine()}, "
         f"{os.cpu_count()} cores, BLAS threads {os.environ['OPENBLAS_NUM_THREADS']}"
     )
 

@@ -46,7 +46,6 @@ INSIDE_FUNCTIONS = {
     "rich": {"cli"},
     "coal": {"design"},
     "matplotlib": {"paper"},
-    "clarabel": {"estimation/estimators"},
 }
 
 

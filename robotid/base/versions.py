@@ -10,7 +10,6 @@ _PACKAGES = {
     "numpy": "numpy",
     "scipy": "scipy",
     "numba": "numba",
-    "clarabel": "clarabel",
 }
 
 

@@ -39,7 +39,8 @@ _INERTIA = 0.3  # ... of a determined inertia about it, as a share of the mean p
 _SAME = 1e-3  # of the largest column of a link: below, motion does not determine a parameter
 _MOST_LOADS = 20  # fits until the joint load torque is that of the identified bodies
 _CONVERGED = 1e-4  # relative change of the parameters at convergence
-_FREE = 1e-9  # weight of the prior in the fit that makes a payload consistent: none
+_FREE = 1e-6  # weight of the prior in the fit that makes a payload consistent: none
+_EXACT = 1e-6  # smallest standard error in that fit, as a share of a parameter's size
 
 
 @dataclass(frozen=True, eq=False)
@@ -359,9 +360,7 @@ def own_friction(
     wanted = wanted_families(friction, reference.model.joints)
     if all(names == () for names in wanted.values()):
         return {}
-    # the selection of friction needs no consistent bodies, and a quadratic fit always converges
-    choice = ConsistentSettings(prior="euclidean", prior_weight=1.0, draws=0)
-    return with_drives(reference, choice, wanted).model.layout.own
+    return with_drives(reference, ConsistentSettings(draws=0), wanted).model.layout.own
 
 
 def mass_checks(
@@ -572,12 +571,11 @@ def _possible(
         K=np.eye(count),
         prior=ball.reshape(-1),
         prior_std=scale,
-        margin=_FREE,
         prior_weight=_FREE,
         constraints=Constraints(mass=stated),
     )
-    # a stated mass has no covariance; its constraint fixes it
-    exact = np.diag(np.where(np.diag(C) == 0, scale**2, 0.0))
+    # a stated mass has no covariance; its constraint fixes it. Data without noise have almost none
+    exact = np.diag(np.where(np.diag(C) == 0, scale, _EXACT * scale) ** 2)
     names = fit.layout.names
     start = Estimate(x, C + exact, names, np.ones(1), count, 1.0, (), True, 0, "two runs")
     return fit.project(start).theta

@@ -19,7 +19,6 @@ from robotid.estimation.estimators import (
     WLS,
     Consistent,
     Kalman,
-    LogCholesky,
     NormalisedGradient,
 )
 from robotid.robot.prior import prior_spread
@@ -103,12 +102,10 @@ def _kalman(case):
 
 #: How each is made for a case, and how near it comes to the truth without noise, relative.
 ESTIMATORS = {
-    # 1e-8: rounding of some thousand rows and, for the cone solver, its own tolerance
     "ols": (lambda case: OLS(), 1e-8),
     "wls": (lambda case: WLS(), 1e-8),
     "tls": (lambda case: TLS(regressor_noise=1e-9), 1e-8),
     "consistent": (consistent, 1e-8),
-    "log_cholesky": (lambda case: LogCholesky(consistent(case)), 1e-8),
     "rls": (lambda case: RLS(case.sigma), 1e-9),
     # the covariance form keeps half the digits of P / sigma^2, which starts at 1e8 here
     "kalman": (_kalman, 1e-6),

@@ -290,9 +290,6 @@ ESTIMATORS = {
     "huber": 'name = "wls"\nrobust = "huber"',
     "tls": 'name = "tls"\nregressor_noise = 0.02',
     "tukey": 'name = "consistent"\nrobust = "tukey"\nprior_weight = "evidence"\ndraws = 12',
-    "euclidean": 'name = "consistent"\nprior = "euclidean"\nprior_weight = "cv"\ndraws = 0',
-    "riemannian": 'name = "log_cholesky"\nprior = "riemannian"\nprior_weight = 0.7\nstarts = 0\n'
-    "seed = 3\ndraws = 10",
     "rls": 'name = "rls"\nforgetting = 0.9995\nprior_weight = 0.5\nphysical = true\ndraws = 0',
     "kalman": 'name = "kalman"\nwalk = 1e-4\ngate = 0.999\nprior_weight = 2.0',
     "prx": 'name = "prx"\npasses = 2\nmetric = "rows"\nseed = 4\nprior_weight = 0.5',

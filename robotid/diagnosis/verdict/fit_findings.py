@@ -26,12 +26,10 @@ from robotid.robot.geometry import body_boxes, body_points
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
 
-_SAME = 1e-3  # relative gap of the objective above which it is not the optimum
 _COSTS = 1.05  # residual over that of WLS above which bounds increase the torque error
 _FAR = 3.0  # a total mass differs from the URDF's at most by this factor
 _ROUNDING = 1e-6  # [m^2] tolerance of a body that touches its box
 _NAMED = 5  # outliers that a finding names
-_WIDE = 1e-2  # margin of a pseudo-inertia above which it may restrict a fit
 _DIFFERS = 1.2  # residual of a consistent fit over that of WLS above which it is reported
 _LITTLE = 5.0  # [%] ... as a note if the constraints add less to the torque error
 _SHRUNK = 0.1  # of the URDF's smallest eigenvalue: below, a body is barely possible
@@ -297,7 +295,9 @@ def consistency_findings(fit: Fit) -> list[Finding]:
     check, details = fit.mass_matrix, fit.estimate.details
     if not check.is_positive:
         is_consistent = isinstance(fit.estimator, ConsistentSettings)
-        advice = "raise [estimator] margin" if is_consistent else "use the 'consistent' estimator"
+        advice = (
+            "raise [estimator] prior_weight" if is_consistent else "use the 'consistent' estimator"
+        )
         message = (
             f"the mass matrix is not positive definite at {100 * (1 - check.positive_share):.3g} % "
             f"of {check.poses} random poses (smallest eigenvalue {check.smallest_eigenvalue:.3g}): "
@@ -316,13 +316,6 @@ def consistency_findings(fit: Fit) -> list[Finding]:
         severity = "warning" if against and is_stated else "note"
         message = f"the bounds {listed(bounds)} are active: {why}"
         findings.append(Finding("active_bound", severity, ", ".join(bounds), message))
-    gap = min(details.get("gaps", [0.0]))
-    if gap > _SAME:
-        message = (
-            f"the objective of log-Cholesky is {100 * gap:.2g} % above the optimum of the cone "
-            "programme; use the 'consistent' estimator, or more starts"
-        )
-        findings.append(Finding("optimum_gap", "warning", "estimator", message))
     return findings
 
 
@@ -496,8 +489,6 @@ def _asked(fit: Fit) -> str:
     if not isinstance(settings, BoundedSettings):
         return ""
     asked = [key for key, value in settings.constraints.items() if value]
-    if settings.margin > _WIDE:
-        asked.append(f"margin = {settings.margin:g}")
     return f"the constraints in [estimator] ({listed(asked)}), " if asked else ""
 
 

@@ -9,7 +9,6 @@ from robotid.estimation.estimators.consistent.consistent_fit import Consistent
 from robotid.estimation.estimators.estimator import BatchEstimator, Estimate, Estimator
 
 if TYPE_CHECKING:
-    from robotid.estimation.estimators.consistent.log_cholesky import LogCholesky
     from robotid.estimation.estimators.output_error import OutputError
     from robotid.estimation.estimators.recursive.descent import (
         PRX,
@@ -38,7 +37,6 @@ __all__ = [
     "Estimator",
     "Kalman",
     "KalmanState",
-    "LogCholesky",
     "NormalisedGradient",
     "OutputError",
     "RLSState",
@@ -49,7 +47,6 @@ __all__ = [
 ]
 
 _MODULES = {
-    "consistent.log_cholesky": ["LogCholesky"],
     "output_error": ["OutputError"],
     "recursive.recursive": ["RecursiveEstimator", "fold", "load_state", "save_state"],
     "recursive.descent": ["PRX", "DescentState", "NormalisedGradient"],

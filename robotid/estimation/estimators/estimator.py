@@ -1,10 +1,9 @@
 """The interface of estimators and their result."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from html import escape
-from typing import TYPE_CHECKING, Any, ClassVar, Generic, Literal, TypeAlias, TypeVar
+from typing import Any, ClassVar, Generic, Literal, TypeAlias, TypeVar
 
 import numpy as np
 
@@ -13,10 +12,6 @@ from robotid.base.typing import Array
 from robotid.dynamics.factors import Factors, compress
 from robotid.dynamics.problem import Problem
 from robotid.estimation.estimators.segments import quantile
-from robotid.output.pages.html import code, number, table
-
-if TYPE_CHECKING:
-    from robotid.estimation.estimators.consistent.consistent_fit import Consistent
 
 DataT = TypeVar("DataT", contravariant=True)
 
@@ -61,18 +56,13 @@ class Estimate:
     def __repr__(self) -> str:
         return f"<{self._line}>"
 
-    def _repr_html_(self) -> str:
-        rows = [
-            [code(name), number(float(value)), number(float(error), ".2g")]
-            for name, value, error in self._rows
-        ]
-        head = escape(f"{self._line}; {self.message}")
-        return f"<p>{head}</p>\n" + table("Parameters", ["name", "value", "standard error"], rows)
-
     def summary(self) -> str:
         """Return the parameters with their standard errors as text, one per line."""
         width = max(len(name) for name in self.names)
-        rows = [f"  {name:{width}} {x:12.4g} +- {error:.2g}" for name, x, error in self._rows]
+        rows = [
+            f"  {name:{width}} {value:12.4g} +- {error:.2g}"
+            for name, value, error in zip(self.names, self.theta, self.std_error, strict=True)
+        ]
         return "\n".join([self._line, self.message, *rows])
 
     __str__ = summary
@@ -101,10 +91,6 @@ class Estimate:
             f"{self.condition:.3g}, {state}"
         )
 
-    @property
-    def _rows(self) -> Iterator[tuple[str, float, float]]:
-        return zip(self.names, self.theta, self.std_error, strict=True)
-
 
 class Estimator(ABC, Generic[DataT]):
     """Interface of estimators: settings are constructor arguments, data arguments of ``fit``.
@@ -125,11 +111,6 @@ class Estimator(ABC, Generic[DataT]):
     def weighing(self) -> Weighing:
         """Weights of the rows, which determine how standard errors follow from their scatter."""
         return "by joint"
-
-    @property
-    def in_cone(self) -> "Consistent | None":
-        """The physically consistent fit whose constraints the estimate meets; None without."""
-        return None
 
     @abstractmethod
     def fit(self, data: DataT) -> Estimate:

@@ -51,25 +51,20 @@ class Known:
         return covariance
 
 
-def consistent_fit(
-    settings: BoundedSettings, known: Known, *, pins_negligible: bool = True
-) -> Consistent:
+def consistent_fit(settings: BoundedSettings, known: Known) -> Consistent:
     """Return the physically consistent estimator, which can also project an estimate."""
     bounds, weight, model = settings.bounds, settings.prior_weight, known.model
     geometry = geometry_half_spaces(model, bounds.com_within)
     extent = body_boxes(model) if bounds.extent == "box" else {}
-    if pins_negligible:
-        bounds = replace(bounds, pinned=pinned_links(bounds, model))
+    bounds = replace(bounds, pinned=pinned_links(bounds, model))
     fit = Consistent(
         layout=model.layout,
         K=known.mapping.K,
         prior=known.pi,
         prior_std=known.spread,
         held=held_parameters(model),
-        margin=settings.margin,
         prior_weight=1.0 if isinstance(weight, str) else weight,
         independent_share=known.share,
-        metric=settings.prior,
         constraints=make_constraints(bounds, geometry, extent),
         wls_noise=known.sigma,
     )

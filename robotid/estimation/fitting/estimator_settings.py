@@ -209,16 +209,6 @@ class RobustSettings(EstimatorSettings):
 class BoundedSettings(EstimatorSettings):
     """Settings of fits whose result is physically consistent."""
 
-    margin: float = setting(
-        1e-4,
-        "smallest eigenvalue of a body's pseudo-inertia relative to its prior size [-]",
-        within=_FINITE,
-    )
-    prior: str = setting(
-        "entropic",
-        "metric of the distance from the URDF's values (the prior)",
-        among=("entropic", "euclidean", "riemannian"),
-    )
     prior_weight: float | str = setting(
         "auto",
         "weight of the URDF's values [-], or the method that chooses it from the fitted logs: cv "
@@ -331,29 +321,6 @@ class ConsistentSettings(RobustSettings, BoundedSettings):
         from robotid.estimation.fitting.consistent_estimator import consistent_fit
 
         return consistent_fit(self, known)
-
-
-@dataclass(frozen=True)
-class LogCholeskySettings(ConsistentSettings):
-    """Settings of the physically consistent fit in log-Cholesky parameters."""
-
-    name: str = _called(
-        "log_cholesky", "physically consistent fit in log-Cholesky parameters, without a cone"
-    )
-    starts: int = setting(
-        0,
-        "number of random initial values in addition to the solution of the cone programme",
-        within=Range("0 to 1000", lambda x: 0 <= x <= 1000),
-    )
-    seed: int = setting(0, "seed of the random initial values", within=_NOT_NEGATIVE)
-
-    def make(self, known: "Known") -> "BatchEstimator":
-        from robotid.estimation.estimators import LogCholesky
-        from robotid.estimation.fitting.consistent_estimator import consistent_fit
-
-        rng = np.random.default_rng(self.seed)
-        fit = consistent_fit(self, known, pins_negligible=False)
-        return LogCholesky(fit, starts=self.starts, rng=rng)
 
 
 @dataclass(frozen=True)
@@ -510,7 +477,6 @@ ESTIMATORS: Mapping[str, type[EstimatorSettings]] = {
         WLSSettings,
         TLSSettings,
         ConsistentSettings,
-        LogCholeskySettings,
         RLSSettings,
         KalmanSettings,
         PRXSettings,

@@ -382,7 +382,8 @@ def _run(
             "not identify; use another estimator, or set dynamics = 'full'"
         )
     if estimator.reads == "factors":
-        return estimator.fit(ground.factors), estimator.in_cone, estimator.weighing
+        in_cone = estimator if isinstance(estimator, Consistent) else None
+        return estimator.fit(ground.factors), in_cone, estimator.weighing
     estimate = estimator.fit(recordings.problem(with_mass=estimator.needs_mass))
     if not (isinstance(choice, RecursiveSettings) and choice.physical):
         return estimate, None, estimator.weighing

@@ -201,9 +201,9 @@ def _bounded(
     )
     if len(found) < _LEAST_SOLVED * redraws.draws:
         raise NotConvergedError(
-            f"standard errors with active bounds cannot be computed: Clarabel solved {len(found)} "
-            f"of {redraws.draws} fits to resampled data; set draws = 0 for standard errors without "
-            "the bounds",
+            "standard errors with active bounds cannot be computed: only "
+            f"{len(found)} of {redraws.draws} fits to resampled data were solved; set draws = 0 "
+            "for standard errors without the bounds",
             failures[0],
         )
     unsolved = f" ({len(failures)} more not solved: {failures[0]})" if failures else ""

@@ -30,11 +30,6 @@ SOURCE_NAMES = {
 _COLUMNS = 7  # drive terms that a page shows side by side
 _FIRST_TERMS = ("kp", "kd", "delay", "limit", "zero")  # of a drive, before all others
 _MILLI = {"s": "ms"}  # units in the table of drives
-_METRICS = {
-    "euclidean": "the parameters' differences over their spreads (euclidean)",
-    "riemannian": "the pull-back metric at the URDF's pseudo-inertias (riemannian)",
-    "entropic": "the divergence of the pseudo-inertias (entropic)",
-}
 _ROLES = {"urdf": "URDF", "identification": "fitted", "validation": "validation"}
 _CHOSEN = {
     "cv": "selected by cross-validation on the fitted logs",
@@ -364,8 +359,8 @@ def _consistency_notes(found: Identification) -> str:
         prior = details["prior"]
         chosen = _CHOSEN.get(prior.get("chosen_by", ""), "as set")
         notes.append(
-            f"The prior is the distance from the URDF's values by {_METRICS[prior['metric']]}; its "
-            f"weight is {prior['weight']:.3g}, {chosen}."
+            "The prior is the distance from the URDF's values by the divergence of the "
+            f"pseudo-inertias (entropic); its weight is {prior['weight']:.3g}, {chosen}."
         )
         active = ", ".join(details["active"])
         notes.append(f"Active constraints: {active}." if active else "No constraint is active.")
@@ -373,9 +368,6 @@ def _consistency_notes(found: Identification) -> str:
             notes.append(f"Extents that contradict the data: {', '.join(details['relaxed'])}.")
         if details["pinned"]:
             notes.append(f"Fixed at the URDF's values: {', '.join(details['pinned'])}.")
-    if "gaps" in details:
-        gaps = ", ".join(f"{gap:.1e}" for gap in details["gaps"])
-        notes.append(f"Gap of the log-Cholesky solution to the cone programme, per start: {gaps}.")
     return "".join(f"<p>{escape(text)}</p>\n" for text in notes)
 
 

@@ -61,14 +61,6 @@ def solved(**details):
     return SimpleNamespace(mass_matrix=check, estimate=estimate, estimator=EstimatorSettings())
 
 
-def test_of_several_starts_the_best_is_above_the_optimum_by_its_own_gap():
-    for gaps in ([0.3, 0.9e-3, 0.5], [0.0]):
-        assert consistency_findings(solved(gaps=gaps)) == []
-    (finding,) = consistency_findings(solved(gaps=[0.3, 0.0123, 0.5]))
-    assert (finding.code, finding.severity) == ("optimum_gap", "warning")
-    assert finding.message.startswith("the objective of log-Cholesky is 1.2 % above the optimum")
-
-
 def test_the_share_of_poses_with_a_mass_matrix_that_is_none_is_said():
     fit = solved()
     fit.mass_matrix = SimpleNamespace(
@@ -339,16 +331,12 @@ def test_links_on_locked_joints_are_named_if_they_leave_their_body_hardly_possib
 
 
 def test_what_the_user_asks_of_the_fit_is_named():
-    asked = EstimatorSettings(
-        "consistent", margin=0.02, constraints={"mass": {"a": 2.0}, "total_mass": 9.0}
-    )
+    asked = EstimatorSettings(constraints={"mass": {"a": 2.0}, "total_mass": 9.0})
     words = findings._asked(SimpleNamespace(estimator=asked))
     assert words.startswith("the constraints in [estimator] (")
-    assert words.endswith(", margin = 0.02), ")
     assert "mass" in words
     assert "pinned" not in words
-    plain = EstimatorSettings("consistent", margin=0.009)
-    assert "margin" not in findings._asked(SimpleNamespace(estimator=plain))
+    assert findings._asked(SimpleNamespace(estimator=EstimatorSettings())) == ""
     assert findings._asked(SimpleNamespace(estimator=EstimatorSettings("wls"))) == ""
 
 

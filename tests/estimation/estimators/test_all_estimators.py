@@ -29,7 +29,7 @@ from robotid.estimation.estimators import (
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 
-BATCH = ("ols", "wls", "tls", "consistent", "log_cholesky")
+BATCH = ("ols", "wls", "tls", "consistent")
 RECURSIVE = tuple(name for name in ESTIMATORS if name not in BATCH)
 STATES = {RLS: RLSState, Kalman: KalmanState, PRX: DescentState, NormalisedGradient: DescentState}
 EXACT_COVARIANCE = ("ols", "wls", "consistent", "rls", "kalman")

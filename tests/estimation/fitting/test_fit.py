@@ -11,7 +11,7 @@ from robotid.data.signal_settings import SignalSettings
 from robotid.dynamics.base_parameters import BaseMapping, structural_mapping
 from robotid.dynamics.factors import Factors
 from robotid.estimation.estimators import Consistent
-from robotid.estimation.estimators.consistent.penalties import WeightChoice
+from robotid.estimation.estimators.consistent.consistent_fit import WeightChoice
 from robotid.estimation.fitting import consistent_estimator as estimators
 from robotid.estimation.fitting.consistent_estimator import Known, consistent_fit
 from robotid.estimation.fitting.estimator_settings import ConsistentSettings, EstimatorSettings
@@ -24,7 +24,7 @@ from robotid.robot.prior import prior_spread
 
 @pytest.mark.parametrize(("weight", "rough"), [("auto", 1.0), ("evidence", 1.0), (2.5, 2.5)])
 def test_rough_settings_keep_a_stated_weight_and_draw_nothing(weight, rough):
-    choice = EstimatorSettings("consistent", prior_weight=weight, draws=40, margin=1e-3)
+    choice = EstimatorSettings("consistent", prior_weight=weight, draws=40)
     assert rough_choice(choice) == replace(choice, prior_weight=rough, draws=0)
     least_squares = EstimatorSettings("wls", robust="huber")
     assert rough_choice(least_squares) is least_squares
@@ -95,12 +95,10 @@ def test_a_consistent_fit_has_every_setting_and_the_weight_of_its_choice(monkeyp
     monkeypatch.setattr(estimators, "choose_weight", chosen)
     monkeypatch.setattr(Consistent, "noise", lambda fit, factors: sigma)
     settings = ConsistentSettings(
-        prior="riemannian", prior_weight=weight, margin=3e-3,
-        constraints={"extent": "none", "total_mass": [1.0, 9.0]},
+        prior_weight=weight, constraints={"extent": "none", "total_mass": [1.0, 9.0]},
     )  # fmt: skip
     known = Known(model, mapping, pi, spread, 0.3, sigma, tuple(folds), 0.25)
     fit = consistent_fit(settings, known)
-    assert (fit.metric, fit.margin) == ("riemannian", 3e-3)
     assert fit.independent_share == 0.3
     assert fit.constraints.total_mass == (1.0, 9.0)
     held = held_parameters(model)

@@ -20,7 +20,6 @@ from robotid.data.files.read import write_log
 from robotid.data.signal_settings import SignalSettings
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.estimation.estimators import WLS, BatchEstimator
-from robotid.estimation.estimators.consistent.penalties import METRICS
 from robotid.estimation.fitting.estimator_settings import (
     ESTIMATORS,
     EstimatorSettings,
@@ -112,8 +111,6 @@ def test_a_job_with_a_recursive_estimator_runs_from_file_to_report(rng, tmp_path
         "walk": 1e-6,
         "gate": 0.999999,
         "physical": True,
-        "margin": 1e-4,
-        "prior": "entropic",
         "prior_weight": "auto",
         "draws": 64,
         "constraints": {},
@@ -149,7 +146,6 @@ def test_a_setting_that_does_not_fit_is_refused(options, text):
 
 def test_words_of_the_settings_are_those_that_the_estimators_know():
     keys = EstimatorSettings("consistent").paths()
-    assert set(keys["prior"].among) == set(METRICS)
     assert set(keys["robust"].among) == {"none", *LOSSES}
 
 

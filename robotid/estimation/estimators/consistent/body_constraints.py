@@ -1,20 +1,73 @@
 """Constraints on bodies beyond physical consistency: mass, centre of mass, extent, pinned links."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
+import scipy.linalg
 
 from robotid.base.exceptions import SettingsError
 from robotid.base.findings import listed
 from robotid.base.typing import Array
-from robotid.estimation.estimators.consistent.cones import Cone, svec
 from robotid.robot.parameters import ParameterLayout, pseudo_inertia, pseudo_inertia_basis
 
-#: Lower bound of drive terms relative to their scale: rounding cannot make them negative.
-SIGN_MARGIN = 1e-9
+_SIGN_MARGIN = 1e-9  # lower bound of drive terms over their scale, as rounding must not negate them
 _OPEN = (0.0, np.inf)  # [kg]
 _ROUNDING = 1e-9  # [kg], [m]: tolerance for a pinned body outside its bounds
+
+
+@dataclass(frozen=True, eq=False)
+class Bounds:
+    """The points x with G x + h >= 0.
+
+    Attributes:
+        G: Coefficients, shape (k, p).
+        h: Constants, shape (k,).
+        labels: Family and owner of each row, as "mass forearm".
+    """
+
+    G: Array
+    h: Array
+    labels: tuple[str, ...]
+
+    def active(self, x: Array, tolerance: float) -> tuple[Array, tuple[str, ...]]:
+        """Return coefficients (a, p) and labels of the rows that are active at x (p,)."""
+        rows = np.flatnonzero(self.G @ x + self.h < tolerance)
+        return self.G[rows], tuple(self.labels[k] for k in rows)
+
+
+@dataclass(frozen=True, eq=False)
+class Subspace:
+    """The subspace x = origin + basis y of the points that meet equalities.
+
+    Attributes:
+        origin: A point that meets them, shape (p,).
+        basis: Free directions, shape (p, r), orthonormal.
+    """
+
+    origin: Array
+    basis: Array
+
+    @classmethod
+    def of(cls, E: Array, e: Array) -> "Subspace":
+        """Return the points with E x = e, in the least squares sense: E (k, p), e (k,)."""
+        p = E.shape[1]
+        if not len(E):
+            return cls(np.zeros(p), np.eye(p))
+        is_free = ~E.any(axis=0)
+        inner = scipy.linalg.null_space(E[:, ~is_free])
+        basis = np.zeros((p, is_free.sum() + inner.shape[1]))
+        basis[is_free, : is_free.sum()] = np.eye(is_free.sum())
+        basis[~is_free, is_free.sum() :] = inner
+        return cls(np.linalg.lstsq(E, e, rcond=None)[0], basis)
+
+    @cached_property
+    def fixed(self) -> Array:
+        """Fixed directions, shape (p, p - r), orthonormal."""
+        p, r = self.basis.shape
+        fixed: Array = np.zeros((p, 0)) if r == p else scipy.linalg.null_space(self.basis.T)
+        return fixed
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,54 +124,37 @@ class Constraints:
             )
         values = prior[: layout.n_inertial].reshape(-1, 10)
         parts = held.reshape(-1, 10)
-        for body, (low, high) in self.mass.items():
-            i = layout.bodies.index(body)
-            _check_range(f"mass of {body}", low, high)
-            if high < parts[i, 0]:
+        for body, bounds in self.mass.items():
+            _check_range(f"mass of {body}", *bounds)
+            part = parts[layout.bodies.index(body), 0]
+            if bounds[1] < part:
                 raise SettingsError(
-                    f"mass of {body} is at most {high:g} kg by its bound, but its links on locked "
-                    f"joints alone have {parts[i, 0]:g} kg; increase the bound"
+                    f"mass of {body} is at most {bounds[1]:g} kg by its bound, but its links on "
+                    f"locked joints alone have {part:g} kg; increase the bound"
                 )
         for body in self.pinned:
             i = layout.bodies.index(body)
             self._check_pinned(body, values[i], parts[i])
         if self.total_mass is not None:
-            self._check_total(layout, values)
+            self._check_total(self.total_mass, dict(zip(layout.bodies, values[:, 0], strict=True)))
 
-    def cone(
-        self, layout: ParameterLayout, scale: Array, held: Array, shrink: Array, margin: float
-    ) -> Cone:
-        """Return the cone of consistent parameters x = pi / scale, without pinned bodies.
+    def bounds(self, layout: ParameterLayout, scale: Array) -> Bounds:
+        """Return signs of drives and ranges as rows of x = pi / scale, without pinned bodies.
 
         Args:
             layout: The standard parameters.
             scale: Unit of each parameter, shape (p,).
-            held: Known part of each body, shape (10 bodies,).
-            shrink: Matrices T^-1/2 that make pseudo-inertias dimensionless, shape (bodies, 4, 4).
-            margin: Smallest eigenvalue of T^-1/2 J T^-1/2 of a body without its known part [-].
         """
         p = len(layout.names)
         signs = np.flatnonzero(layout.is_nonnegative())
-        G, h = [np.eye(p)[signs]], [np.full(len(signs), -SIGN_MARGIN)]
         labels = [f"drive_signs {layout.names[i]}" for i in signs]
-        C, c, named = self._bounds(layout)
-        C = C * scale
-        norms = np.linalg.norm(C, axis=1)
-        G.append(C / norms[:, None])
-        h.append(c / norms)
-        labels += named
-        basis = pseudo_inertia_basis()
-        S, s = [np.zeros((0, p))], [np.zeros(0)]
-        for i, J_held in enumerate(pseudo_inertia(held)):
-            if layout.bodies[i] in self.pinned:
-                continue
-            part = slice(10 * i, 10 * i + 10)
-            block = np.zeros((10, p))
-            block[:, part] = svec(shrink[i] @ basis @ shrink[i]).T * scale[part]
-            S.append(block)
-            s.append(-svec(shrink[i] @ J_held @ shrink[i] + margin * np.eye(4)))
-            labels.append(f"pseudo_inertia {layout.bodies[i]}")
-        return Cone(np.vstack(G), np.concatenate(h), np.vstack(S), np.concatenate(s), tuple(labels))
+        G, h = [np.eye(p)[signs]], [np.full(len(signs), -_SIGN_MARGIN)]
+        for row, constant, label in self._ranges(layout):
+            norm = np.linalg.norm(row * scale)
+            G.append((row * scale / norm)[None])
+            h.append(np.array([constant / norm]))
+            labels.append(label)
+        return Bounds(np.vstack(G), np.concatenate(h), tuple(labels))
 
     def equalities(self, layout: ParameterLayout, prior: Array) -> tuple[Array, Array]:
         """Return the equalities E pi = e: pinned bodies, and masses given as one value.
@@ -131,62 +167,39 @@ class Constraints:
             E, shape (k, p), and e, shape (k,).
         """
         p = len(layout.names)
-        pinned = [i for i, body in enumerate(layout.bodies) if body in self.pinned]
-        fixed = [10 * i + k for i in pinned for k in range(10)]
-        E, e = [np.eye(p)[fixed]], [prior[fixed]]
-        for body, (low, high) in self.mass.items():
-            i = layout.bodies.index(body)
-            if low == high and i not in pinned:
-                E.append(np.eye(p)[[10 * i]])
+        pinned = np.flatnonzero(np.repeat(np.isin(layout.bodies, self.pinned), 10))
+        E, e = [np.eye(p)[pinned]], [prior[pinned]]
+        for row, (low, high), _ in self._masses(layout):
+            if low == high:
+                E.append(row[None])
                 e.append(np.array([low]))
-        if self.total_mass is not None and np.ptp(self.total_mass) == 0:
-            E.append(_all_masses(layout)[None])
-            e.append(np.array([self.total_mass[0]]))
         return np.vstack(E), np.concatenate(e)
 
-    def _bounds(self, layout: ParameterLayout) -> tuple[Array, Array, list[str]]:
-        """Return C, c and labels of the rows C pi + c >= 0 of bounds that are ranges."""
-        p = len(layout.names)
-        rows: list[Array] = []
-        constants: list[float] = []
-        labels: list[str] = []
-
-        def add(row: Array, low: float, high: float, label: str) -> None:
-            if low == high:
-                return
-            for sign, bound in ((1.0, low), (-1.0, high)):
-                if np.isfinite(bound):
-                    rows.append(sign * row)
-                    constants.append(-sign * bound)
-                    labels.append(label)
-
-        for body, (low, high) in self.mass.items():
+    def _masses(self, layout: ParameterLayout) -> Iterator[tuple[Array, tuple[float, float], str]]:
+        """Yield the rows of masses, (p,), with their bounds and labels."""
+        for body, bounds in self.mass.items():
             if body not in self.pinned:
-                add(np.eye(p)[10 * layout.bodies.index(body)], low, high, f"mass {body}")
+                yield _row(layout, body, np.eye(10)[0]), bounds, f"mass {body}"
         if self.total_mass is not None:
-            add(_all_masses(layout), *self.total_mass, "total_mass all")
+            row = np.zeros(len(layout.names))
+            row[: layout.n_inertial : 10] = 1.0
+            yield row, self.total_mass, "total_mass all"
+
+    def _ranges(self, layout: ParameterLayout) -> Iterator[tuple[Array, float, str]]:
+        """Yield c (p,), c0 and label of each row c pi + c0 >= 0 of a bound that is a range."""
+        for row, (low, high), label in self._masses(layout):
+            for sign, bound in ((1.0, low), (-1.0, high)):
+                if low != high and np.isfinite(bound):
+                    yield sign * row, -sign * bound, label
         for body, (A, b) in self.com.items():
-            if body in self.pinned:
-                continue
-            i = layout.bodies.index(body)
             for normal, distance in zip(A, b, strict=True):
-                row = np.zeros(p)
-                row[10 * i] = distance
-                row[10 * i + 1 : 10 * i + 4] = -normal
-                rows.append(row)
-                constants.append(0.0)
-                labels.append(f"centre_of_mass {body}")
+                if body not in self.pinned:
+                    c = np.concatenate([[distance], -normal, np.zeros(6)])
+                    yield _row(layout, body, c), 0.0, f"centre_of_mass {body}"
         for body, box in self.extent.items():
-            if body in self.pinned:
-                continue
-            i = layout.bodies.index(body)
-            for Q in slabs(box):
-                row = np.zeros(p)
-                row[10 * i : 10 * i + 10] = np.einsum("kij,ij->k", pseudo_inertia_basis(), Q)
-                rows.append(row)
-                constants.append(0.0)
-                labels.append(f"extent {body}")
-        return np.array(rows).reshape(-1, p), np.array(constants), labels
+            if body not in self.pinned:
+                for c in np.einsum("kij,mij->mk", pseudo_inertia_basis(), slabs(box)):
+                    yield _row(layout, body, c), 0.0, f"extent {body}"
 
     def _check_pinned(self, body: str, values: Array, held: Array) -> None:
         (J,) = pseudo_inertia(values - held)
@@ -212,16 +225,14 @@ class Constraints:
                     "bounds; remove the link from 'pinned' or widen the bounds"
                 )
 
-    def _check_total(self, layout: ParameterLayout, values: Array) -> None:
-        low, high = self.total_mass or _OPEN
+    def _check_total(self, total: tuple[float, float], masses: dict[str, float]) -> None:
+        low, high = total
         _check_range("total_mass", low, high)
-        bounds = np.array(
-            [
-                [values[i, 0]] * 2 if body in self.pinned else self.mass.get(body, _OPEN)
-                for i, body in enumerate(layout.bodies)
-            ]
-        )
-        least, most = bounds.sum(axis=0)
+        bounds = [
+            (mass, mass) if body in self.pinned else self.mass.get(body, _OPEN)
+            for body, mass in masses.items()
+        ]
+        least, most = np.sum(bounds, axis=0)
         if high < least - _ROUNDING or low > most + _ROUNDING:
             raise SettingsError(
                 f"total_mass is bounded by [{low:g}, {high:g}] kg, but the bounds of the bodies "
@@ -250,9 +261,11 @@ def slabs(box: Array) -> Array:
     return Q
 
 
-def _all_masses(layout: ParameterLayout) -> Array:
+def _row(layout: ParameterLayout, body: str, c: Array) -> Array:
+    """Return coefficients of all parameters, (p,), from those of one body, (10,)."""
     row = np.zeros(len(layout.names))
-    row[: layout.n_inertial : 10] = 1.0
+    first = 10 * layout.bodies.index(body)
+    row[first : first + 10] = c
     return row
 
 

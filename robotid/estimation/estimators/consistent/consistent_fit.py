@@ -1,4 +1,4 @@
-"""Physically consistent fit: a convex cone programme on the triangular factors."""
+"""Physically consistent fit: a convex programme on the triangular factors."""
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -8,21 +8,11 @@ import numpy as np
 import scipy.linalg
 
 from robotid.base.exceptions import DataError
-from robotid.base.findings import listed
 from robotid.base.typing import Array
 from robotid.dynamics.factors import Factors
 from robotid.estimation.estimators.batch import WLS, solve_factor
-from robotid.estimation.estimators.consistent.body_constraints import Constraints
-from robotid.estimation.estimators.consistent.cone_programme import Programme
-from robotid.estimation.estimators.consistent.cones import Subspace
-from robotid.estimation.estimators.consistent.penalties import (
-    METRICS,
-    Entropic,
-    Penalty,
-    WeightChoice,
-    body_units,
-    make_penalty,
-)
+from robotid.estimation.estimators.consistent.body_constraints import Constraints, Subspace
+from robotid.estimation.estimators.consistent.programme import Entropic, Programme
 from robotid.estimation.estimators.determination import base_spread, determine
 from robotid.estimation.estimators.estimator import BatchEstimator, Estimate
 from robotid.robot.parameters import ParameterLayout
@@ -30,6 +20,26 @@ from robotid.robot.parameters import ParameterLayout
 _FLOOR = 1e-6  # smallest noise level over the torque, for noise-free data
 _LEAST_FREEDOM = 0.1  # smallest degrees of freedom of a noise level, as a share of the rows
 _ACTIVE = 1e-5  # slack below which a constraint is active, dimensionless
+
+
+@dataclass(frozen=True)
+class WeightChoice:
+    """How the weight of the prior was chosen.
+
+    Attributes:
+        weight: The weight [-].
+        how: "cv" or "evidence".
+        curve: Pairs of weight and score, by ascending weight. The score is the prediction error of
+            held-out segments over the noise level ("cv"), or minus the log evidence.
+        plausible: The weight with the largest log evidence [-].
+        loss: Largest ratio of the held-out error of a joint to that of least squares [-].
+    """
+
+    weight: float
+    how: str
+    curve: tuple[tuple[float, float], ...]
+    plausible: float
+    loss: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,9 +50,10 @@ class Consistent(BatchEstimator):
 
         sum_j |tau_j - W_b,j K pi|^2 / sigma_j^2 + prior_weight penalty(pi)
 
-    subject to J(pi_i) - J(held_i) >= margin T_i for each body i, armature, viscous and Coulomb
-    coefficients >= 0, and the other constraints. The noise levels sigma_j are those of weighted
-    least squares.
+    subject to armature, viscous and Coulomb coefficients >= 0, and the other constraints. The
+    penalty, twice the Bregman divergence of -log det from the prior's pseudo-inertias, is infinite
+    unless each J(pi_i) - J(held_i) is positive definite; for the drives it is quadratic. The noise
+    levels sigma_j are those of weighted least squares.
 
     The estimate contains the p standard parameters. Its covariance is that of the fit without the
     inequalities; see ``Programme.redrawn`` for the covariance with them. Its rank, condition number
@@ -55,23 +66,20 @@ class Consistent(BatchEstimator):
         prior_std: Prior standard deviation of each parameter, shape (p,), positive.
         held: Known part of each body, as the links on locked joints, shape (10 bodies,); the rest
             of the body must be physically consistent. None: no known parts.
-        margin: Smallest eigenvalue of a body's pseudo-inertia relative to its prior size [-].
         prior_weight: Weight of the prior [-].
         plausible_weight: Weight at which the prior has the plausible spread of the true parameters
             [-].
         independent_share: Share of independent rows, 2 cutoff / rate [-].
-        max_iterations: Largest number of iterations of the cone solver.
-        metric: Metric of the distance from the prior: "euclidean", "riemannian" or "entropic"; see
-            ``make_penalty``.
         constraints: Bounds in addition to physical consistency.
-        choice: How ``prior_weight`` was chosen; None: it was given.
         wls_noise: Noise levels of weighted least squares of the fitted rows, shape (n,) [N m or N];
             None: they are computed.
+        choice: How ``prior_weight`` was chosen; None: it was given.
 
     References:
         Sousa, Cortesao (2014), Physical feasibility of robot base inertial parameter
         identification: a linear matrix inequality approach; Wensing, Kim, Slotine (2018), Linear
-        Matrix Inequalities for Physically Consistent Inertial Parameter Identification, (8).
+        Matrix Inequalities for Physically Consistent Inertial Parameter Identification, (8); Lee,
+        Wensing, Park (2019), Geometric robot dynamic identification: a convex programming approach.
     """
 
     layout: ParameterLayout
@@ -79,12 +87,9 @@ class Consistent(BatchEstimator):
     prior: Array
     prior_std: Array
     held: Array | None = None
-    margin: float = 1e-4
     prior_weight: float = 1.0
     plausible_weight: float = 1.0
     independent_share: float = 1.0
-    max_iterations: int = 200
-    metric: str = "euclidean"
     constraints: Constraints = field(default_factory=Constraints)
     wls_noise: Array | None = None
     choice: WeightChoice | None = None
@@ -96,40 +101,30 @@ class Consistent(BatchEstimator):
                 raise DataError(f"{name} has shape {getattr(self, name).shape}, wanted {shape}")
         if not (np.isfinite(self.prior_std) & (self.prior_std > 0)).all():
             raise DataError("prior_std must be positive and finite for every parameter")
-        if not np.isfinite(self.prior).all() or not np.isfinite(self.known_share).all():
+        if not np.isfinite(self.prior).all() or not np.isfinite(self._held).all():
             raise DataError("prior and held must be finite for every parameter")
-        if not (self.margin > 0 and self.prior_weight > 0):
-            raise DataError(
-                f"margin {self.margin} and prior_weight {self.prior_weight} must be positive"
-            )
-        if self.metric not in METRICS:
-            raise DataError(f"metric is {self.metric!r}, wanted one of {listed(METRICS)}")
-        self.constraints.check(self.layout, self.prior, self.known_share)
-
-    @property
-    def in_cone(self) -> "Consistent":
-        return self
+        if not self.prior_weight > 0:
+            raise DataError(f"prior_weight is {self.prior_weight}, wanted a positive number")
+        self.constraints.check(self.layout, self.prior, self._held)
 
     def _fit(self, factors: Factors) -> Estimate:
         sigma = self.noise(factors)
         wls = solve_factor(factors, sigma, self.K @ self.prior)
         rows = self.rows(factors, sigma)
-        solution = self.programme.minimise(rows, self.prior_weight)
-        covariance = self.programme.covariance(self.prior_weight, rows, solution.x)
-        details = self._details(solution.x)
+        minimum = self.programme.minimise(rows, self.prior_weight)
         return Estimate(
-            theta=solution.x,
-            covariance=covariance,
+            theta=minimum.x,
+            covariance=self.programme.covariance(self.prior_weight, rows, minimum.x),
             names=self.layout.names,
             sigma=sigma,
             rank=wls.rank,
             condition=wls.condition,
             undetermined=self.undetermined(rows, factors.names),
             converged=True,
-            n_iter=solution.n_iter,
-            message=solution.message,
+            n_iter=minimum.n_iter,
+            message=minimum.message,
             prior_std=self.spread_before,
-            details=details,
+            details=self._details(minimum.x),
         )
 
     def project(self, estimate: Estimate) -> Estimate:
@@ -153,18 +148,18 @@ class Consistent(BatchEstimator):
                 "consistent parameters; use the estimator 'rls' or 'kalman', which have one"
             )
         rows = _information_rows(estimate, known)  # (k, b + 1)
-        solution = self.programme.minimise(rows, self.prior_weight)
+        minimum = self.programme.minimise(rows, self.prior_weight)
         return replace(
             estimate,
-            theta=solution.x,
-            covariance=self.programme.covariance(self.prior_weight, rows, solution.x),
+            theta=minimum.x,
+            covariance=self.programme.covariance(self.prior_weight, rows, minimum.x),
             names=self.layout.names,
             undetermined=self.undetermined(rows, estimate.names),
-            n_iter=estimate.n_iter + solution.n_iter,
+            n_iter=estimate.n_iter + minimum.n_iter,
             message=f"{estimate.message}; projected onto physically consistent parameters, "
-            f"{solution.message}",
+            f"{minimum.message}",
             prior_std=self.spread_before,
-            details=self._details(solution.x),
+            details=self._details(minimum.x),
         )
 
     def noise(self, factors: Factors) -> Array:
@@ -196,17 +191,8 @@ class Consistent(BatchEstimator):
         """
         return factors.weighted(sigma / np.sqrt(self.independent_share))
 
-    def objective(self, rows: Array, pi: Array) -> float:
-        """Return the objective of the fit; see ``Programme.objective``.
-
-        Args:
-            rows: Rows of the data, shape (k, b + 1), from ``rows``.
-            pi: Standard parameters, shape (p,).
-        """
-        return self.programme.objective(rows, pi, self.prior_weight)
-
     def active(self, pi: Array, tolerance: float = _ACTIVE) -> tuple[Array, tuple[str, ...]]:
-        """Return the inequalities that are active at given parameters, linearised there.
+        """Return the inequalities that are active at given parameters.
 
         Args:
             pi: Standard parameters, shape (p,).
@@ -214,26 +200,22 @@ class Consistent(BatchEstimator):
 
         Returns:
             Gradients with respect to pi of the constraint functions at 0, shape (a, p), and the
-            family and owner of each constraint, as "pseudo_inertia forearm".
+            family and owner of each constraint, as "extent forearm".
         """
-        gradients, labels = self.programme.binding.active(pi / self.prior_std, tolerance)
+        gradients, labels = self.programme.bounds.active(pi / self.prior_std, tolerance)
         return gradients / self.prior_std, labels
 
     @cached_property
     def programme(self) -> Programme:
         """The convex programme, for any data and weight."""
-        scale, held = self.prior_std, self.known_share
-        units = body_units(scale[: self.layout.n_inertial])
         E, e = self.constraints.equalities(self.layout, self.prior)
-        cone = self.constraints.cone(self.layout, scale, held, units, self.margin)
-        penalty = make_penalty(self.metric, self.layout, self.prior, scale, held)
-        space = Subspace.of(E * scale, e)
-        return Programme(self.K, scale, penalty, cone, space, self.max_iterations)
-
-    @property
-    def penalty(self) -> Penalty:
-        """The penalty on the distance from the prior."""
-        return self.programme.penalty
+        return Programme(
+            self.K,
+            self.prior_std,
+            Entropic.of(self.layout, self.prior, self.prior_std, self._held),
+            self.constraints.bounds(self.layout, self.prior_std),
+            Subspace.of(E * self.prior_std, e),
+        )
 
     @property
     def weight_ratio(self) -> float:
@@ -253,14 +235,14 @@ class Consistent(BatchEstimator):
         return spread
 
     @property
-    def known_share(self) -> Array:
+    def _held(self) -> Array:
         """The known part of each body, shape (10 bodies,); 0 without one."""
         return np.zeros(self.layout.n_inertial) if self.held is None else self.held
 
     def undetermined(self, rows: Array, base_names: tuple[str, ...]) -> tuple[str, ...]:
         """Return the names of the base parameters that the data do not determine individually.
 
-        See ``determine``. The metric and the weight of the prior have no effect.
+        See ``determine``. The weight of the prior has no effect.
 
         Args:
             rows: Rows of the data, shape (k, b + 1), from ``rows``.
@@ -272,9 +254,14 @@ class Consistent(BatchEstimator):
 
     def _details(self, pi: Array) -> dict[str, Any]:
         """Return the settings of the fit and its active constraints, as plain values."""
-        is_bound = self.programme.space.basis.shape[1] < len(pi)
+        programme, pinned = self.programme, self.constraints.pinned
+        families = [label.split(" ", 1)[0] for label in programme.bounds.labels]
+        if set(self.layout.bodies) - set(pinned):
+            families.append("pseudo_inertia")
+        if programme.space.basis.shape[1] < len(pi):
+            families.append("equalities")
         prior: dict[str, Any] = {
-            "metric": self.metric,
+            "metric": "entropic",
             "weight": self.prior_weight,
             "plausible_weight": self.prior_weight / self.weight_ratio,
         }
@@ -283,10 +270,10 @@ class Consistent(BatchEstimator):
             prior["curve"] = [list(pair) for pair in self.choice.curve]
         return {
             "prior": prior,
-            "solver": "interior point" if isinstance(self.penalty, Entropic) else "clarabel",
-            "constraints": [*self.programme.cone.families, *(["equalities"] if is_bound else [])],
+            "solver": "interior point",
+            "constraints": list(dict.fromkeys(families)),
             "active": sorted(set(self.active(pi)[1])),
-            "pinned": list(self.constraints.pinned),
+            "pinned": list(pinned),
             "relaxed": list(self.constraints.relaxed),
         }
 

@@ -27,14 +27,9 @@ import scipy.linalg
 
 from robotid.base.exceptions import NotConvergedError
 from robotid.base.typing import Array
-from robotid.estimation.estimators.consistent.cones import ConeSolution, svec, unsvec
 from robotid.robot.parameters import pseudo_inertia_basis
 
 _SIZE, _ENTRIES = 4, 10  # of a pseudo-inertia, and of its upper triangle
-_EYE = np.arange(_SIZE)
-_BASIS = pseudo_inertia_basis().reshape(_ENTRIES, _SIZE * _SIZE)  # J = sum_k pi_k B_k
-_TO_PARAMETERS = np.linalg.inv(svec(pseudo_inertia_basis()))  # pi = svec(J) @ .
-_UNITS = unsvec(np.eye(_ENTRIES).reshape(-1))  # (10, 4, 4), whose svec are unit vectors
 _MOST = 100  # steps; 8 to 20 are typical
 _BACK = 0.995  # largest step as a share of the step length to the boundary
 _FIRST = 1e-2  # initial t over the squared torque error of the prior, per eigenvalue
@@ -42,6 +37,40 @@ _WARM = 0.1  # initial mu near the minimum, over the weight
 _SHORT = 0.3  # step length below which the correction is omitted, and mu is reduced to ...
 _CENTRED = 0.3
 _LEAST = 1e-10  # smallest slack of an active inequality, in prior standard deviations
+_EYE = np.arange(_SIZE)
+_COLUMNS, _ROWS = np.tril_indices(_SIZE)  # of an upper triangle by columns
+_FACTORS = np.where(_ROWS == _COLUMNS, 1.0, np.sqrt(2.0))
+
+
+def svec(S: Array) -> Array:
+    """Return upper triangles by columns, shape (..., 10), off-diagonals times sqrt 2.
+
+    S (..., 4, 4).
+    """
+    return S[..., _ROWS, _COLUMNS] * _FACTORS
+
+
+def unsvec(vectors: Array) -> Array:
+    """Return the matrices (m, 4, 4) of stacked vectors (10 m,); the inverse of ``svec``."""
+    entries = vectors.reshape(-1, _ENTRIES) / _FACTORS
+    S = np.zeros((len(entries), _SIZE, _SIZE))
+    S[:, _ROWS, _COLUMNS] = S[:, _COLUMNS, _ROWS] = entries
+    return S
+
+
+_BASIS = pseudo_inertia_basis().reshape(_ENTRIES, _SIZE * _SIZE)  # J = sum_k pi_k B_k
+_TO_PARAMETERS = np.linalg.inv(svec(pseudo_inertia_basis()))  # pi = svec(J) @ .
+_UNITS = unsvec(np.eye(_ENTRIES))  # (10, 4, 4), whose svec are unit vectors
+
+
+@dataclass(frozen=True, eq=False)
+class Minimum:
+    """A minimum x (p,) with the multipliers of the inequalities (k,)."""
+
+    x: Array
+    multipliers: Array
+    n_iter: int
+    message: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,11 +105,11 @@ class EntropicProblem:
         d: Array,
         weight: float,
         tolerance: float,
-        starts: Sequence[ConeSolution] | None = None,
-    ) -> list[ConeSolution]:
+        starts: Sequence[Minimum] | None = None,
+    ) -> list[Minimum]:
         """Return the minimum of each data set: A (f, m, p), d (f, m)."""
         point = self._first(A, d, weight) if starts is None else self._near(starts, weight)
-        found: dict[int, ConeSolution] = {}
+        found: dict[int, Minimum] = {}
         left = np.arange(len(A))  # data sets that have not converged
         for step in range(1, _MOST + 1):
             try:
@@ -94,15 +123,15 @@ class EntropicProblem:
                 length = np.minimum(share, _BACK * system.bodies_to_boundary(ahead))
                 x, name = point.x + length[:, None] * ahead.x, f"interior point, {step} steps"
                 for k in np.flatnonzero(settled):
-                    found[left[k]] = ConeSolution(x[k], step, name, point.multipliers[k])
+                    found[left[k]] = Minimum(x[k], point.multipliers[k], step, name)
             if settled.all():
                 return [found[k] for k in range(len(found))]
             point = system.corrected(ahead, share)
             if settled.any():
                 A, d, left, point = A[~settled], d[~settled], left[~settled], point.of(~settled)
         raise NotConvergedError(
-            f"the fit has not converged after {step} steps at prior_weight = {weight:g}; set "
-            "prior = 'euclidean', or a larger prior_weight",
+            f"the fit has not converged after {step} steps at prior_weight = {weight:g}; set a "
+            "larger prior_weight, or widen the bounds in [estimator.constraints]",
             "max_iterations",
         )
 
@@ -129,12 +158,13 @@ class EntropicProblem:
         x = np.broadcast_to(self.centre, (len(A), len(self.centre)))
         return self._centred(x, np.zeros((len(A), len(self.h))), t, t, weight)
 
-    def _near(self, starts: Sequence[ConeSolution], weight: float) -> "_Point":
+    def _near(self, starts: Sequence[Minimum], weight: float) -> "_Point":
         """Return points near minima."""
-        none, x = np.zeros(len(self.h)), np.array([start.x for start in starts])
-        multipliers = [none if s.multipliers is None else s.multipliers for s in starts]
+        x, multipliers = (
+            np.array([getattr(s, key) for s in starts]) for key in ("x", "multipliers")
+        )
         t = np.full((len(x), 1), weight)
-        return self._centred(x, np.array(multipliers), t, _WARM * t, weight)
+        return self._centred(x, multipliers, t, _WARM * t, weight)
 
     def _centred(
         self, x: Array, multipliers: Array, t: Array, mu: Array, weight: float

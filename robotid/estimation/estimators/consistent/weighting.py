@@ -10,9 +10,8 @@ from robotid.base.exceptions import DataError, NotConvergedError
 from robotid.base.typing import Array
 from robotid.dynamics.factors import Factors, merge
 from robotid.dynamics.lapack import Triangle
-from robotid.estimation.estimators.consistent.cones import ConeSolution
-from robotid.estimation.estimators.consistent.consistent_fit import Consistent
-from robotid.estimation.estimators.consistent.penalties import WeightChoice
+from robotid.estimation.estimators.consistent.consistent_fit import Consistent, WeightChoice
+from robotid.estimation.estimators.consistent.interior_point import Minimum
 
 _SMALLEST, _LARGEST = -4.0, 2.0  # decades of the weights tried
 _USUAL = -1.0  # at smaller entropic weights bodies become thin, and fits converge slowly
@@ -120,7 +119,7 @@ def choose_weight(
     if how == "evidence":
         return replace(by_evidence, plausible=plausible)
 
-    fits: dict[float, list[ConeSolution]] = {}  # by weight, one without each segment
+    fits: dict[float, list[Minimum]] = {}  # by weight, one without each segment
     least = np.sqrt(_by_joint(segments.least_squares_errors))  # (n,)
 
     def score(weight: float) -> tuple[float, Array]:
@@ -133,8 +132,7 @@ def choose_weight(
 
     # a residual without the repeated error is smaller by this log ratio
     excess = -0.5 * np.log1p(-min(repeated, _MOST_REPEATED))
-    usual = _SMALLEST if fit.penalty.is_quadratic else _USUAL
-    choice = replace(_search(score, how, excess, least, usual), plausible=plausible)
+    choice = replace(_search(score, how, excess, least, _USUAL), plausible=plausible)
     larger = [weight for weight, _ in choice.curve if weight >= choice.weight]
     return replace(choice, weight=_converging(fit, segments.rows, larger, fits))
 
@@ -152,7 +150,7 @@ def _converging(
     fit: Consistent,
     rows: Array,
     weights: Sequence[float],
-    fits: Mapping[float, Sequence[ConeSolution]],
+    fits: Mapping[float, Sequence[Minimum]],
 ) -> float:
     """Return the first weight at which the fit to all rows converges, from fits to most of them."""
     for weight in weights[:-1]:
@@ -192,7 +190,8 @@ def plausible_weight(fit: Consistent, rows: Array, weight: float) -> float:
         determined = programme.space.basis.shape[1] - 0.5 * weight * float(np.sum(H * C))
         distance = weight * programme.penalty.value(solution.x)
         low, high = np.multiply(_EXPECTED, determined)
-        if low <= distance <= high or (distance > high and weight == least):
+        is_least = distance > high and weight == least
+        if low <= distance <= high or is_least or distance == 0.0:
             break
         weight = max(least, weight * determined / distance)
     return found
@@ -205,16 +204,16 @@ def contradicted_extents(fit: Consistent, segments: Segments) -> tuple[str, ...]
     without extents, at a weight of 1. That fit must also predict held-out segments better than the
     fit with extents, by more than two standard errors and 2 % of the mean square error.
     """
-    cone, rows, count = fit.programme.cone.linear, segments.rows, len(segments.folds)
+    bounds, rows, count = fit.programme.bounds, segments.rows, len(segments.folds)
     free = replace(fit, constraints=fit.constraints.without_extent(fit.constraints.extent))
     try:
         solution = free.programme.minimise(rows, 1.0, is_exact=False)
     except NotConvergedError:  # bodies diverge: this contradicts no extent
         return ()
-    G, covariance = cone.G / fit.prior_std, free.programme.covariance(1.0, rows, solution.x)
+    G, covariance = bounds.G / fit.prior_std, free.programme.covariance(1.0, rows, solution.x)
     error = np.sqrt(np.maximum(np.einsum("ki,ij,kj->k", G, covariance, G), 0.0))
-    beyond = G @ solution.x + cone.h < -_BEYOND * error
-    outside = [label for label, is_out in zip(cone.labels, beyond, strict=True) if is_out]
+    beyond = G @ solution.x + bounds.h < -_BEYOND * error
+    outside = [label for label, is_out in zip(bounds.labels, beyond, strict=True) if is_out]
     bodies = tuple(body for body in fit.layout.bodies if f"extent {body}" in outside)
     if not bodies or count < 2:
         return bodies
@@ -234,8 +233,8 @@ def held_out_errors(
     fit: Consistent,
     segments: Segments,
     weight: float,
-    starts: Sequence[ConeSolution] | None = None,
-) -> tuple[Array, list[ConeSolution]]:
+    starts: Sequence[Minimum] | None = None,
+) -> tuple[Array, list[Minimum]]:
     """Return the prediction errors of each segment by the fit to all others, with constraints.
 
     -> (segments, n) [-].

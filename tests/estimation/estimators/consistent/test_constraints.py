@@ -8,7 +8,7 @@ from helpers.estimation import EXACT, NOISE, Case, consistent
 from helpers.fitting import identify
 from helpers.synthetic import exact_log, truth
 
-from robotid.base.exceptions import DataError, NotConvergedError, SettingsError
+from robotid.base.exceptions import SettingsError
 from robotid.dynamics.factors import compress
 from robotid.estimation.estimators import Consistent
 from robotid.estimation.estimators.consistent.body_constraints import Constraints, slabs
@@ -38,10 +38,8 @@ def centre(estimate, body):
     return values[1:] / values[0]
 
 
-@pytest.mark.parametrize("metric", ["euclidean", "riemannian", "entropic"])
-def test_bounds_of_mass_are_kept_and_reached(case, metric):
+def test_bounds_of_mass_are_kept_and_reached(case):
     fit, factors = case
-    fit = replace(fit, metric=metric)
     free = masses(fit.fit(factors))
     low, high = 1.2 * free[2], 0.7 * free[3]
     mass = {"forearm_link": (low, np.inf), "wrist_1_link": (0.0, high)}
@@ -78,23 +76,18 @@ def test_pinned_bodies_keep_the_urdf_and_the_rest_is_the_constrained_least_squar
     estimate = constrained(fit, pinned=("forearm_link", "wrist_1_link")).fit(factors)
     np.testing.assert_allclose(estimate.theta[20:40], fit.prior[20:40], rtol=1e-12, atol=1e-14)
     assert not estimate.std_error[20:40].any()
-    # oracle: the same quadratic without those columns, where no inequality binds
-    fit = replace(fit, prior=truth(ur5), prior_weight=10.0, metric="riemannian")
+    # all others are at a minimum, where no inequality binds
+    fit = replace(fit, prior=truth(ur5), prior_weight=10.0)
     pinned = constrained(fit, pinned=("forearm_link", "wrist_1_link"))
     estimate = pinned.fit(factors)
-    assert estimate.message == "no constraint is active"
+    assert estimate.details["active"] == []
     rows = pinned.rows(factors, estimate.sigma)
     D = rows[:, :-1] @ fit.K
-    H = D.T @ D + 0.5 * fit.prior_weight * fit.penalty.hessian(fit.prior)
-    slope = D.T @ (D @ fit.prior - rows[:, -1])
-    slope += 0.5 * fit.prior_weight * fit.penalty.gradient(fit.prior)
+    slope = D.T @ (D @ estimate.theta - rows[:, -1])
+    slope += 0.5 * fit.prior_weight * fit.programme.penalty.gradient(estimate.theta)
     kept = np.setdiff1d(np.arange(len(fit.prior)), np.arange(20, 40))
-    step = np.linalg.solve(H[np.ix_(kept, kept)], -slope[kept])
-    np.testing.assert_allclose(
-        (estimate.theta - fit.prior)[kept] / fit.prior_std[kept],
-        step / fit.prior_std[kept],
-        atol=1e-8,
-    )
+    slope *= fit.prior_std
+    assert np.abs(slope[kept]).max() < 1e-5 * np.abs(slope).max()
 
 
 def test_a_centre_of_mass_stays_in_its_box(case):
@@ -122,7 +115,7 @@ def test_gradients_of_active_constraints_are_those_of_their_slack(case):
     rows = fit.rows(factors, estimate.sigma)
     D = rows[:, :-1] @ fit.K
     slope = 2 * D.T @ (D @ estimate.theta - rows[:, -1])
-    slope += fit.prior_weight * fit.penalty.gradient(estimate.theta)
+    slope += fit.prior_weight * fit.programme.penalty.gradient(estimate.theta)
     slope, gradients = slope * fit.prior_std, gradients * fit.prior_std
     left = slope - gradients.T @ np.linalg.lstsq(gradients.T, slope, rcond=None)[0]
     assert np.linalg.norm(left) < 1e-4 * np.linalg.norm(slope)
@@ -160,16 +153,6 @@ def test_links_on_locked_joints_count_in_the_bounds(case):
         constrained(replace(case[0], held=held), mass={"forearm_link": (0.5, 1.0)})
 
 
-def test_bounds_that_no_body_meets_are_named(case):
-    # the centre of mass above one plane and below another one under it
-    A = np.array([[1.0, 0, 0], [-1.0, 0, 0]])
-    fit = constrained(case[0], com={"forearm_link": (A, np.array([-0.2, 0.1]))})
-    with pytest.raises(NotConvergedError, match="no parameters meet all constraints") as caught:
-        fit.fit(case[1])
-    assert "centre_of_mass" in str(caught.value)
-    assert caught.value.status == "PrimalInfeasible"
-
-
 @pytest.mark.parametrize(
     ("options", "text"),
     [
@@ -202,11 +185,6 @@ def test_a_job_states_its_constraints(ur5, rng):
     assert found.is_consistent
 
 
-def test_an_unknown_metric_is_refused(case):
-    with pytest.raises(DataError, match="metric is 'manhattan', wanted one of"):
-        replace(case[0], metric="manhattan")
-
-
 def test_the_slabs_of_a_box_hold_for_grains_inside_and_fail_for_one_outside(rng):
     box = np.array([[-0.1, -0.2, 0.0], [0.3, 0.2, 0.5]])
     grains = rng.uniform(*box, size=(50, 3))
@@ -221,11 +199,9 @@ def test_the_slabs_of_a_box_hold_for_grains_inside_and_fail_for_one_outside(rng)
     np.testing.assert_array_equal(np.sign(np.einsum("kij,i,j->k", slabs(box), x, x)), [-1, 1, 1])
 
 
-@pytest.mark.parametrize("metric", ["euclidean", "entropic"])
-def test_extents_keep_the_mass_of_each_body_in_its_box(case, ur5, metric):
+def test_extents_keep_the_mass_of_each_body_in_its_box(case, ur5):
     boxes = {b: 0.2 * box + 0.8 * box.mean(axis=0) for b, box in body_boxes(ur5).items()}
-    fit, factors = case
-    loose = replace(fit, metric=metric)
+    loose, factors = case
     tight = replace(loose, constraints=Constraints(extent=boxes))
     free, kept = (one.fit(factors) for one in (loose, tight))
 
@@ -295,15 +271,20 @@ def test_rows_of_bounds_are_those_of_their_body_and_sign(two_bodies):
         com={"two": (normal, np.array([0.3, 0.7]))},
         extent={"one": np.array([[-0.5, -0.4, -0.9], [0.6, 0.7, 0.2]])},
     )  # fmt: skip
-    C, c, labels = bounds._bounds(layout)
+    rows = bounds.bounds(layout, np.linspace(0.5, 2.4, 20))
     mx = prior[11:14]
     J = pseudo_inertia(prior[:10])[0]
     wanted = [5 - 2.0, 9.0 - 5, 7.0 - 3, 8 - 4.0, 8.5 - 8]
     wanted += [5 * b - n @ mx for n, b in zip(normal, (0.3, 0.7), strict=True)]
     for k, (low, high) in enumerate(((-0.5, 0.6), (-0.4, 0.7), (-0.9, 0.2))):
         wanted.append(-J[k, k] + (low + high) * J[k, 3] - low * high * J[3, 3])
-    np.testing.assert_allclose(C @ prior + c, wanted)
-    assert labels == [
+    size = np.linalg.norm(rows.G, axis=1)
+    np.testing.assert_allclose(size, 1.0)
+    slack = rows.G @ (prior / np.linspace(0.5, 2.4, 20)) + rows.h
+    np.testing.assert_allclose(np.sign(slack), np.sign(wanted))
+    mass = np.array([0, 1, 2])  # of 0.5 and 1.5 per unit of the rows
+    np.testing.assert_allclose(slack[mass], np.array(wanted)[mass] / [1.5, 1.5, 0.5])
+    assert list(rows.labels) == [
         "mass two", "mass two", "mass one", "total_mass all", "total_mass all",
         "centre_of_mass two", "centre_of_mass two", *["extent one"] * 3,
     ]  # fmt: skip
@@ -311,7 +292,7 @@ def test_rows_of_bounds_are_those_of_their_body_and_sign(two_bodies):
     E, e = fixed.equalities(layout, prior)
     np.testing.assert_array_equal(E @ prior, [*prior[10:], 3.0, 8.0])
     np.testing.assert_array_equal(e, [*prior[10:], 2.5, 7.5])
-    assert fixed._bounds(layout)[2] == []
+    assert fixed.bounds(layout, np.ones(20)).labels == ()
 
 
 def test_the_spread_before_the_data_is_that_of_the_plausible_weight(two_bodies):
@@ -321,5 +302,8 @@ def test_the_spread_before_the_data_is_that_of_the_plausible_weight(two_bodies):
         fit = Consistent(
             layout, np.eye(20), prior, std, held, prior_weight=weight, plausible_weight=plausible
         )
-        np.testing.assert_allclose(fit.spread_before, std / np.sqrt(factor), rtol=1e-9)
+        spread = np.sqrt(
+            np.diag(np.linalg.inv(0.5 * factor * fit.programme.penalty.hessian(prior)))
+        )
+        np.testing.assert_allclose(fit.spread_before, spread, rtol=1e-9)
         assert fit.weight_ratio == max(weight / plausible, 1.0)
