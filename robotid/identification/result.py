@@ -119,9 +119,9 @@ class Identification(Concluded, Fit):
         """
         return parameter_table(*parameter_entries(self))
 
-    def _cause_of(self, joint: str) -> str:
+    def _cause_of(self, joint: str) -> tuple[str, str]:
         """Return the cause of a joint's residual, as a sentence."""
-        return self.joint_torques[self.model.row_names.index(joint)].sentence
+        return self.joint_torques[self.model.row_names.index(joint)].cause
 
     @cached_property
     def joint_torques(self) -> tuple[JointTorque, ...]:

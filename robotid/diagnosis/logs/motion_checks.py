@@ -6,10 +6,11 @@ from dataclasses import replace
 import numpy as np
 
 from robotid.base.exceptions import RobotIdError
-from robotid.base.findings import Finding, log_finding
+from robotid.base.findings import Finding
 from robotid.base.typing import Array
 from robotid.data.log import Trajectory
 from robotid.data.signal_settings import SignalSettings
+from robotid.diagnosis.catalogue import finding
 from robotid.dynamics.base_parameters import BaseMapping
 from robotid.dynamics.factors import compress, merge
 from robotid.dynamics.used_rows import base_problem, independent_share, row_mask
@@ -25,8 +26,6 @@ _INSTANTS = 300
 _FEW = 60  # ... of each of many motions
 _ROWS = 5000  # of a log, from which its excitation is computed
 _ILL_CONDITIONED = 1e3  # condition number of unit columns above which a motion is poor
-_RICHER = "a motion of all joints together, in both directions and as fast as permitted"
-_LOST = "the excitation is good, but these parameters are not identifiable above the noise"
 
 
 def check_repeated_motion(
@@ -42,13 +41,8 @@ def check_repeated_motion(
         if len(known):
             distance, _ = cKDTree(known).query(own, p=np.inf, distance_upper_bound=_NEAR)
             share = max(share, float(np.mean(np.isfinite(distance))))
-    if share < _SHARE:
-        return
-    message = (
-        f"{100 * share:.0f} % of this validation motion is in a fitted log, too: its torque "
-        "prediction error is too optimistic; record another motion to validate with"
-    )
-    yield log_finding(name, "repeated_motion", "warning", message, share=share)
+    if share >= _SHARE:
+        yield finding("repeated_motion", name, share=share)
 
 
 def alike_motions(motions: Sequence[Trajectory]) -> list[list[int]]:
@@ -92,8 +86,10 @@ def check_excitation(
         factors = merge([compress(problem) for problem in problems])
         found = WLS(prior=mapping.to_base(prior)).fit(factors)
     except RobotIdError as error:
-        message = f"the excitation was not checked: {error}"
-        yield log_finding(name, "excitation", "warning", message)
+        yield finding(
+            "excitation", name, severity="warning", what="unchecked", todo="unchecked",
+            text=str(error),
+        )  # fmt: skip
         return
     share = step * min(independent_share(replace(signals, rate=m.rate)) for m in motions)
     squares = np.sum([motion.squares for motion in thinned], axis=0)
@@ -109,22 +105,15 @@ def excitation_finding(wls: Estimate, known: Determination, name: str) -> Findin
     evidence = {"rank": known.rank, "base": count, "weakest": known.shrinkage[-1]}
     if np.isfinite(wls.condition):
         evidence["condition"] = wls.condition
-    message = (
-        f"the motion determines {known.rank} of {count} base parameters "
-        f"(condition number {wls.condition:.3g} of the regressor, unit columns)"
-    )
     is_poor = is_poorly_excited(wls, count)
-    if known.groups:
-        advice = f"record {_RICHER}" if is_poor else f"{_LOST}; a faster motion determines more"
-        message += f": {known.described()}; {advice}"
-    elif is_poor:
-        left = 100 * known.shrinkage[-1]
-        message += f". The standard error of the least determined one is {left:.2g} % of its prior"
-        message += f" standard deviation; to determine it better, record {_RICHER}"
-    else:
-        message += "; no action needed"
-    severity = "warning" if known.groups and is_poor else "note"
-    return log_finding(name, "excitation", severity, message, **evidence)
+    todo = "poor" if is_poor else "lost"
+    if not known.groups:
+        todo = "weak" if is_poor else "good"
+    return finding(
+        "excitation", name, severity="warning" if todo == "poor" else "note", what="rank",
+        todo=todo, described=known.described() if known.groups else "",
+        condition_number=f"{wls.condition:.3g}", **evidence,
+    )  # fmt: skip
 
 
 def is_poorly_excited(wls: Estimate, count: int) -> bool:

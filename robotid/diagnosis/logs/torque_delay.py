@@ -10,12 +10,13 @@ from itertools import pairwise
 
 import numpy as np
 
-from robotid.base.findings import Finding, log_finding
+from robotid.base.findings import Finding
 from robotid.base.typing import Array
 from robotid.data.log import Log, Trajectory
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.smoothing import low_pass
 from robotid.data.splines import cubic_spline
+from robotid.diagnosis.catalogue import finding
 from robotid.diagnosis.logs.torque_sample import coupled_columns, smooth_motion
 from robotid.dynamics.torque import carried_columns
 from robotid.robot.model import RobotModel
@@ -192,18 +193,12 @@ class _OwnDelay:
 
     def finding(self, joint: str, log: str) -> Finding:
         """Return the finding that the torque of a joint has another delay."""
-        size = 1e3 * abs(self.delay)
         is_end = abs(self.delay) >= _LONGEST - 1e-9
-        value = f"{size:.0f} ms or more" if is_end else f"{size:.0f} +- {1e3 * self.error:.0f} ms"
-        message = (
-            f"the torque of {joint} {'lags' if self.delay > 0 else 'leads'} the position by "
-            f"{value}, the torques of the other joints lag it by {1e3 * self.common:.0f} ms. The "
-            f"delay explains {100 * self.explained:.0f} % of the torque that the model does not "
-            f"explain; correct the time stamps or the filter of tau_{joint} in the logger, "
-            "because torque_delay shifts all joints"
-        )
-        evidence = {"delay": self.delay, "std_error": self.error, "gain": self.explained}
-        return log_finding(log, "joint_torque_delay", "warning", message, joint, **evidence)
+        return finding(
+            "joint_torque_delay", log, joint, sense=self.delay > 0,
+            value="end" if is_end else "exact", delay=self.delay, std_error=self.error,
+            common=self.common, gain=self.explained,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -268,34 +263,14 @@ def _common(misfit: _Misfit, step: float, signals: SignalSettings, name: str) ->
     is_significant = abs(delay) > _SIGNIFICANT * error and gain > (
         _HELPS if abs(delay) > _DELAYED else 0.0
     )
-    is_of_load = is_significant and misfit.is_of_load
-    is_significant = is_significant and not is_of_load
-    total = delay + signals.torque_delay
-    if is_of_load:
-        todo = (
-            ", but friction that grows with the load explains the torques better; no action needed"
-        )
-    elif not is_significant:
-        todo = ", which is not significant; no action needed"
-    elif gain > _HELPS:
-        todo = (
-            f". The delay explains {100 * gain:.0f} % of the torque that the model does not "
-            "explain; correct the logger's clock, or set "
-            f"torque_delay = {total:.4f} (--torque-delay {total:.4f})"
-        )
-    else:
-        todo = (
-            ". Unmodelled friction can look like this; if the drive filters its torque, "
-            f"set torque_delay = {total:.4f} (--torque-delay {total:.4f})"
-        )
-    message = (
-        f"the torque {'lags' if delay > 0 else 'leads'} the position by {1e3 * abs(delay):.1f} "
-        f"+- {1e3 * error:.1f} ms{todo}"
-    )
-    evidence = {"delay": delay, "std_error": error, "gain": gain}
-    yield log_finding(
-        name, "torque_delay", "warning" if is_significant else "note", message, **evidence
-    )
+    todo = "none"
+    if is_significant:
+        todo = "of_load" if misfit.is_of_load else "clear" if gain > _HELPS else "filter"
+    yield finding(
+        "torque_delay", name, severity="note" if todo in ("none", "of_load") else "warning",
+        todo=todo, sense=delay > 0, delay=delay, std_error=error, gain=gain,
+        total=delay + signals.torque_delay,
+    )  # fmt: skip
 
 
 def _misfit(

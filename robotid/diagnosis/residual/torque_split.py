@@ -261,26 +261,32 @@ class JointTorque:
 
     @property
     def sentence(self) -> str:
-        """The cause of the residual, as text."""
+        """The cause of the residual and what to do, as text."""
+        return ". ".join(filter(None, self.cause))
+
+    @property
+    def cause(self) -> tuple[str, str]:
+        """The cause of the residual, and what to do."""
         rms, best = self.rms, self._best(self.follows)
         if np.isnan(rms["measured"]):
-            return "no sample is used: the joint does not move"
+            return "no sample is used: the joint does not move", ""
         if rms["measured"] == 0:
-            return "the measured torque is 0 throughout"
+            return "the measured torque is 0 throughout", ""
         left = f"the residual is {_percent(rms['residual'] / rms['measured'])} of the torque"
         if best is not None:
             advice = _CHANGED if self._has_changed(best.name) else _ADVICE[best.name]
-            return f"{left} and {self._described(best)}. {advice}"
+            return f"{left} and {self._described(best)}", advice
         if self.broadband is None or self.rows.segments is None:
-            return f"{left}; the recordings are too short to determine its cause"
+            return f"{left}; the recordings are too short to determine its cause", ""
         if self.broadband >= _NOISY:
             share = _percent(self.broadband)
-            return f"{left}; {share} of its power is broadband (above the cut-off): noise"
+            return f"{left}; {share} of its power is broadband (above the cut-off): noise", ""
         names = [d.name for d in self.follows if d.name != "constant"]
+        share = _percent(1.0 - self.broadband)
         return (
-            f"{left}; neither a constant nor {', '.join(names)} explain it, but "
-            f"{_percent(1.0 - self.broadband)} of its power is below the cut-off: systematic. "
-            "Check the motion of other joints, and elasticity"
+            f"{left}; neither a constant nor {', '.join(names)} explain it, but {share} of its "
+            "power is below the cut-off: systematic",
+            "Check the motion of other joints, and elasticity",
         )
 
     def _described(self, best: Dependence) -> str:
