@@ -18,7 +18,7 @@ from robotid.base.versions import __version__, code_versions
 from robotid.cli.work.identify import identify_job
 from robotid.cli.work.job import Job, LogEntry, PayloadEntry, read_job, stated_path
 from robotid.cli.work.logs import identity_of
-from robotid.data.files.text_tables import parquet_rows, parquet_values, read_text_table
+from robotid.data.files.parquet_files import parquet_rows, parquet_values, read_text_table
 from robotid.data.log import suggestion
 from robotid.estimation.fitting.estimator_settings import SimulationSettings
 from robotid.estimation.variation.groups import FEWEST_RUNS

@@ -13,7 +13,7 @@ from robotid.base.findings import listed
 from robotid.base.typing import Array
 from robotid.cli.work.job import Job, LogEntry, job_from_settings
 from robotid.cli.work.logs import log_of_commands
-from robotid.data.files.table_files import open_table
+from robotid.data.files.formats import open_table
 from robotid.data.log import Log
 from robotid.data.signal_settings import LogSource
 from robotid.design.clearance import Clearance

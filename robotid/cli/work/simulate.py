@@ -13,8 +13,8 @@ from robotid.base.files import check_file, file_sha256, write_json
 from robotid.base.typing import Array, ProgressCallback, ignore_progress
 from robotid.base.versions import __version__
 from robotid.cli.work.job import Job, LogEntry
+from robotid.data.files.formats import check_suffix
 from robotid.data.files.read import write_log
-from robotid.data.files.table_files import check_suffix
 from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import process

@@ -12,8 +12,8 @@ from robotid.base.exceptions import MissingDependencyError, SettingsError
 from robotid.base.files import check_folder, file_sha256, folder_beside, write_json
 from robotid.base.versions import __version__
 from robotid.cli.work.job import Job
+from robotid.data.files.formats import write_columns
 from robotid.data.files.parquet_files import load_pyarrow
-from robotid.data.files.table_files import write_columns
 from robotid.data.log import Log
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.identification.online.identifier import Observer, OnlineIdentifier, Track, track
