@@ -44,8 +44,6 @@ def run(options: argparse.Namespace) -> int:
         report_stage(progress, "reading logs")  # before what takes the first second: its modules
         from robotid.cli.work.identify import run_job
         from robotid.estimation.workers.plan import WorkPlan
-        from robotid.identification.result import Identification
-        from robotid.output.report.loop_steps import loop_steps
         from robotid.output.report.next_steps import next_steps
         from robotid.output.report.steps import Origin
 
@@ -61,11 +59,7 @@ def run(options: argparse.Namespace) -> int:
         [*result["outputs"].values(), "result.json"],
     )
     if not options.json:
-        origin = Origin(source, options.out)
-        if isinstance(found, Identification):
-            print_steps(next_steps(found, origin))
-        else:
-            print_steps(loop_steps(result, origin))
+        print_steps(next_steps(found, Origin(source, options.out)))
     return 1 if result["verdict"]["log_errors"] else 0
 
 

@@ -26,12 +26,12 @@ from robotid.diagnosis.verdict.verdict import check_ignored
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.friction_projection import project_friction
 from robotid.estimation.fitting.estimator_settings import SimulationSettings
-from robotid.estimation.fitting.evaluation import Evaluation
+from robotid.estimation.fitting.evaluation import Evaluated
 from robotid.estimation.fitting.recorded import Recordings
 from robotid.estimation.workers.plan import WorkPlan
 from robotid.identification.closed_loop.loop_settings import LoopSettings
 from robotid.identification.pipeline import conclude
-from robotid.identification.result import Identification
+from robotid.identification.result import Identification, TorqueIdentification
 from robotid.output.files.entries import build_result
 from robotid.output.files.urdf import DYNAMICS_TERMS, write_urdf
 from robotid.output.report.document import write_report
@@ -42,8 +42,6 @@ from robotid.robot.model import RobotModel
 from robotid.robot.tree import read_tree
 
 if TYPE_CHECKING:
-    from robotid.identification.closed_loop.loop_result import LoopIdentification
-    from robotid.identification.closed_loop.position_errors import OpenLoop
     from robotid.output.viewer.replays import Replay
 
 _log = logging.getLogger(__name__)
@@ -55,7 +53,7 @@ def run_job(
     *,
     plan: WorkPlan | None = None,
     source: Sequence[str] = (),
-) -> tuple["Identification | LoopIdentification", dict[str, Any]]:
+) -> tuple[Identification, dict[str, Any]]:
     """Run an identification and write result.json, report.html and the URDF with its sidecar.
 
     The settings may exclude the report and add replay.html; an impossible result has no URDF. All
@@ -83,24 +81,18 @@ def run_job(
     require_kind(job, Job, "job", "a Job, as robotid.read_job returns it")
     require_kind(folder, (str, Path), "folder", "the path of a folder")
     chosen = plan or WorkPlan(job.workers or 1)
-    is_simulated = isinstance(job.estimator, SimulationSettings)
-    stages = _loop_stages() if is_simulated else STAGES
+    stages = _loop_stages() if isinstance(job.estimator, SimulationSettings) else STAGES
     report_stage(chosen.progress, "reading logs", stages)
     model, target = job.model(), Path(folder)
     check_folder(target, ["result.json", *_names(model)])
-    found: Identification | LoopIdentification
-    if is_simulated:
-        found, used = _identify_loops(job, model, chosen.progress), job
-    else:
-        found = identify_job(job, model, chosen)
-        used = _job_of(found)
+    found = identify_job(job, model, chosen)
     report_stage(chosen.progress, "writing", stages)
-    return _write(found, used, target, source=source)
+    return _write(found, _job_of(found), target, source=source)
 
 
 @checked("identification")
 def save_result(
-    identification: "Identification | LoopIdentification",
+    identification: Identification,
     folder: str | Path,
     *,
     report: bool = True,
@@ -144,12 +136,12 @@ def _names(model: RobotModel) -> tuple[str, str, str, str]:
 
 
 def _write(
-    found: "Identification | LoopIdentification",
+    found: Identification,
     job: Job,
     target: Path,
     *,
     source: Sequence[str] = (),
-) -> tuple["Identification | LoopIdentification", dict[str, Any]]:
+) -> tuple[Identification, dict[str, Any]]:
     """Write all files of a result; return the identification with its report, and result.json."""
     names = report, replay, name, sidecar = _names(found.model)
     target.mkdir(parents=True, exist_ok=True)
@@ -179,11 +171,11 @@ def _write(
     return found, result
 
 
-def _replay_of(found: "Identification | LoopIdentification", job: Job, folder: Path) -> "Replay":
+def _replay_of(found: Identification, job: Job, folder: Path) -> "Replay":
     """Return the replay of a result that is written in a folder; its modules are imported here."""
     from robotid.cli.work.replay import read_findings, replay_files, replay_identified, stated_job
 
-    if isinstance(found, Identification):
+    if isinstance(found, TorqueIdentification):
         return replay_identified(found)
     entries = (*job.validation, *job.identification)
     if not entries:
@@ -196,7 +188,7 @@ def _replay_of(found: "Identification | LoopIdentification", job: Job, folder: P
     return replay_files(replace(stated, identification=entries[:1]), findings)
 
 
-def _job_of(identification: "Identification | LoopIdentification") -> Job:
+def _job_of(identification: Identification) -> Job:
     """Return the job of an identification; one made in Python gets an equivalent job.
 
     Logs in memory have no file, and a ``Log`` has no gains, units or names of columns.
@@ -204,10 +196,11 @@ def _job_of(identification: "Identification | LoopIdentification") -> Job:
     model, asked = identification.model, identification.stated
     if isinstance(asked.job, Job):
         return asked.job
-    if isinstance(identification, Identification):
-        chosen, loop = {drive.joint: drive for drive in identification.drives}, LoopSettings()
+    chosen, loop = {}, LoopSettings()
+    if isinstance(identification, TorqueIdentification):
+        chosen = {drive.joint: drive for drive in identification.drives}
     else:
-        chosen, loop = {}, identification.loop
+        loop = getattr(identification, "loop", loop)
     wanted = wanted_families(asked.friction, model.joints)
     is_auto = all(names is None for names in wanted.values())
     drives: dict[str, tuple[str | DriveTerm, ...]] = {}
@@ -243,15 +236,11 @@ def _job_of(identification: "Identification | LoopIdentification") -> Job:
     )
 
 
-def _entries(runs: "Sequence[Evaluation | OpenLoop]") -> tuple[LogEntry, ...]:
+def _entries(evaluations: Sequence[Evaluated]) -> tuple[LogEntry, ...]:
     """Return the windows of the logs that are in files."""
-    windows = [
-        (run.recording.log.path, run.recording.extent.start, run.recording.extent.end)
-        if isinstance(run, Evaluation)
-        else (run.log.path, float(run.log.t[0]), float(run.log.t[-1]))
-        for run in runs
-    ]
-    return tuple(LogEntry(Path(path), start, end) for path, start, end in windows if path)
+    return tuple(
+        LogEntry(Path(e.log.path), e.extent.start, e.extent.end) for e in evaluations if e.log.path
+    )
 
 
 def identify_job(
@@ -263,6 +252,8 @@ def identify_job(
 ) -> Identification:
     """Identify from a job's logs; nothing is written."""
     check_ignored(job.ignore)
+    if isinstance(job.estimator, SimulationSettings):
+        return _identify_loops(job, model, plan.progress)
     groups = job.identification, job.validation
     fitted, validation = survey_logs(job, model, *groups, refuse=refuse)
     if not fitted:
@@ -308,12 +299,11 @@ def _loop_stages() -> Sequence[str]:
 
 def _identify_loops(
     job: Job, model: RobotModel, progress: ProgressCallback | None
-) -> "LoopIdentification":
+) -> Identification:
     """Identify by simulation, from commands or logged torques; no file is written."""
     from robotid.identification.closed_loop.from_commands import identify_loops
 
     assert isinstance(job.estimator, SimulationSettings)
-    check_ignored(job.ignore)
     logs, validation = (
         [job.read(entry, model, needs=needed_of(job)) for entry in entries]
         for entries in (job.identification, job.validation)

@@ -15,12 +15,12 @@ from robotid.diagnosis.verdict.verdict import check_ignored
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings, SimulationSettings
 from robotid.identification import pipeline
 from robotid.identification.pipeline import robot_of
-from robotid.identification.result import Identification
+from robotid.identification.result import Identification, TorqueIdentification
 from robotid.robot.families import AUTO, wanted_families
 from robotid.robot.model import RobotModel
 
 if TYPE_CHECKING:
-    from robotid.identification.closed_loop.loop_result import LoopIdentification
+    from robotid.identification.closed_loop.loop_result import PositionIdentification
 
 
 @overload
@@ -36,7 +36,7 @@ def identify(  # type: ignore[overload-overlap]
     doctor: bool = ...,
     ignore: Sequence[str] = ...,
     progress: ProgressCallback | None = ...,
-) -> "LoopIdentification": ...
+) -> "PositionIdentification": ...
 
 
 @overload
@@ -52,7 +52,7 @@ def identify(
     doctor: bool = ...,
     ignore: Sequence[str] = ...,
     progress: ProgressCallback | None = ...,
-) -> Identification: ...
+) -> TorqueIdentification: ...
 
 
 @checked("progress")
@@ -68,7 +68,7 @@ def identify(
     doctor: bool = True,
     ignore: Sequence[str] = (),
     progress: ProgressCallback | None = None,
-) -> "Identification | LoopIdentification":
+) -> Identification:
     """Identify a robot's parameters from motion logs, as the command line does.
 
     Args:
@@ -92,7 +92,8 @@ def identify(
             their name.
 
     Returns:
-        The identification; for the estimator "simulation" a ``LoopIdentification``.
+        The identification; for the estimator "simulation" its
+            evaluations are of positions, else of torques.
 
     Raises:
         DataError: If a log cannot be read, does not match the model or is too short.
