@@ -181,7 +181,6 @@ JOB = Flags(
         "--max-gap": ("signals.max_gap", "S"),
         "--torque-delay": ("signals.torque_delay", "S"),
         "--velocity-delay": ("signals.velocity_delay", "S"),
-        "--wrench-delay": ("signals.wrench_delay", "S"),
         "--friction": ("model.friction", "MODEL"),
         "--dynamics": ("output.dynamics", ""),
         "--no-report": ("output.report", "write no report.html"),

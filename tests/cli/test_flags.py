@@ -31,7 +31,6 @@ def test_every_setting_of_the_signals_has_a_flag():
         "rate": "200", "cutoff": "5", "order": "2", "velocity": "differentiated",
         "acceleration": "measured", "trim": "0.5", "min_velocity": "0.1", "friction_band": "0.05",
         "max_gap": "0.3", "torque_delay": "-0.005", "velocity_delay": "0.01",
-        "wrench_delay": "0.02",
     }  # fmt: skip
     flags = [x for name, word in words.items() for x in (f"--{name.replace('_', '-')}", word)]
     stated = {name: type(getattr(SignalSettings(), name))(word) for name, word in words.items()
