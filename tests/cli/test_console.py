@@ -19,7 +19,8 @@ from helpers.paths import ROOT
 from helpers.synthetic import exact_log, truth
 
 from robotid.base.typing import STAGES
-from robotid.cli import compare, doctor, main, printing
+from robotid.cli import compare, doctor, main
+from robotid.cli import console as printing
 from robotid.cli.console import terminal_progress
 from robotid.cli.job import LogEntry
 from robotid.data.files.read import write_log
