@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from helpers.synthetic import exact_log, truth
 
-from robotid.cli.work import validate
-from robotid.cli.work.identify import run_job
-from robotid.cli.work.job import job_from_settings
-from robotid.cli.work.validate import validate_result
+from robotid.cli import validate
+from robotid.cli.identify import run_job
+from robotid.cli.job import job_from_settings
+from robotid.cli.validate import validate_result
 from robotid.data.files.read import write_log
 from robotid.data.log import Log, Trajectory
 from robotid.dynamics.torque import joint_torque_regressor
