@@ -8,7 +8,7 @@ import pinocchio as pin
 import pytest
 from helpers.paths import JOBS
 
-from robotid.cli.work.job import read_job
+from robotid.cli.job import read_job
 from robotid.data.base_motion import (
     BaseMotion,
     ImuFrame,

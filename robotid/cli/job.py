@@ -34,6 +34,7 @@ from robotid.robot.parameters import DYNAMICS, Coupling
 if TYPE_CHECKING:
     from robotid.robot.model import RobotModel
 
+
 _MODEL_KEYS: Mapping[str, tuple[type, ...]] = {
     "friction" if term.is_friction else name: (str,) if term.is_friction else (bool,)
     for name, term in TERMS.items()
