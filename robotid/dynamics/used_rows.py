@@ -7,7 +7,7 @@ import numpy as np
 from robotid.base.typing import Array
 from robotid.data.log import Log, Trajectory
 from robotid.data.signal_settings import SignalSettings
-from robotid.data.standing import standing_motion
+from robotid.data.signals import standing_motion
 from robotid.dynamics.base_parameters import BaseMapping
 from robotid.dynamics.drive_columns import friction_directions, sure_rows
 from robotid.dynamics.problem import Problem
