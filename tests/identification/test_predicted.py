@@ -12,7 +12,7 @@ from robotid.base.exceptions import DataError, SettingsError
 from robotid.cli.work.export import export_result
 from robotid.cli.work.identify import save_result
 from robotid.dynamics.friction_projection import project_friction
-from robotid.dynamics.memory import drive_motion_along
+from robotid.dynamics.prediction import drive_motion_along
 from robotid.estimation.fitting.bands import QUANTILE, friction_curve
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
 from robotid.output.files.ranges import parameter_ranges
