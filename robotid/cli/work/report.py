@@ -18,7 +18,7 @@ from robotid.identification.result import Identification
 from robotid.output.files.result_file import load_result
 from robotid.output.report.document import write_report
 from robotid.output.report.position_page import shown_positions
-from robotid.output.report.shown import page_of
+from robotid.output.report.report_page import page_of
 from robotid.output.report.steps import Origin
 
 _SHARE = 1e-6  # permitted difference over a base parameter, for rounding ...

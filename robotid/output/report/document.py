@@ -9,10 +9,10 @@ from robotid.base.files import write_text
 from robotid.base.settings import require_each, require_kind
 from robotid.identification.result import Identification
 from robotid.output.files.entries import build_result
-from robotid.output.report.shown import Shown, page_of
+from robotid.output.report.report_page import Report, page_of
 from robotid.output.report.steps import Origin
-from robotid.output.report.torque_section import shown_torques
-from robotid.output.report.variation_section import variation_section
+from robotid.output.report.tables import variation_section
+from robotid.output.report.torque_report import torque_report
 
 if TYPE_CHECKING:
     from robotid.identification.closed_loop.loop_result import LoopIdentification
@@ -49,20 +49,20 @@ def write_report(
     require_kind(origin, (Origin, type(None)), "origin", "an Origin")
     at = origin or Origin()
     if isinstance(identification, Identification):
-        shown = shown_torques(identification, at, (files or {}).get("replay", ""))
+        report = torque_report(identification, at, (files or {}).get("replay", ""))
     else:
-        shown = _of_loops(identification, at, (files or {}).get("replay", ""))
-    return write_text(page_of(shown, files or {}), target)
+        report = _of_loops(identification, at, (files or {}).get("replay", ""))
+    return write_text(page_of(report, files or {}), target)
 
 
-def _of_loops(found: "LoopIdentification", at: Origin, replay: str) -> Shown:
+def _of_loops(found: "LoopIdentification", at: Origin, replay: str) -> Report:
     """Return the content of a report on a closed-loop identification; imported when needed."""
     from robotid.identification.closed_loop.loop_result import LoopIdentification
     from robotid.output.report.position_page import shown_positions
 
     require_kind(found, LoopIdentification, "identification", "a robotid.Identification")
     result = build_result(found, {"estimator": found.estimator.to_dict()})
-    shown = shown_positions(
+    report = shown_positions(
         result, found.fitted, found.validation, at, (found.model, found.standard), replay
     )
-    return replace(shown, variation=variation_section(found.variation, {}))
+    return replace(report, variation=variation_section(found.variation, {}))

@@ -16,14 +16,12 @@ from robotid.identification.closed_loop.position_errors import DRIFTS, OpenLoop,
 from robotid.output.files.ranges import source_of
 from robotid.output.pages.charts import Chart, Series, chart_html
 from robotid.output.pages.html import code, number, table, text
-from robotid.output.report.curves import curves_section, drawn
-from robotid.output.report.dock import Clip, Dock
+from robotid.output.report.dock import Clip, Dock, Residual, worst_html, worst_second
 from robotid.output.report.errors import POSITION, Errors, worst_errors
 from robotid.output.report.loop_steps import loop_steps
-from robotid.output.report.shown import Shown
+from robotid.output.report.report_page import Report, cause_links, curves_section, drawn
 from robotid.output.report.steps import Origin
 from robotid.output.report.tables import input_table, parameter_section, version_table
-from robotid.output.report.worst_second import Residual, worst_html, worst_second
 from robotid.robot.model import RobotModel
 
 _NAMED = 7  # joints in the chart of errors over the horizon
@@ -57,7 +55,7 @@ def shown_positions(
     origin: Origin,
     changed: tuple[RobotModel, Array] | None = None,
     replay: str = "",
-) -> Shown:
+) -> Report:
     """Return the content of a report on a result: changed (p,)."""
     joints, is_driven = content["joints"], _is_driven(content)
     for run in (*validation, *fitted):
@@ -89,7 +87,7 @@ def shown_positions(
         Finding(entry["code"], entry["severity"], entry["where"], entry["message"])
         for entry in content.get("warnings", [])
     ]
-    return Shown(
+    return Report(
         title=f"{content['robot']}: drives from {source}",
         robot=content["robot"],
         rows=joints,
@@ -134,8 +132,7 @@ def _counted(
 def _warned(findings: Sequence[Finding], joints: Sequence[str]) -> dict[str, str]:
     """Return links to the errors and warnings, for the figures beside the verdict."""
     causes = grouped([f for f in findings if f.severity != "note"], joints)
-    links = [f'<a href="#cause-{escape(c.code)}">{escape(c.code)}</a>' for c in causes]
-    return {"Errors and warnings": ", ".join(links)} if links else {}
+    return {"Errors and warnings": cause_links(causes)} if causes else {}
 
 
 def _is_driven(content: Mapping[str, Any]) -> bool:

@@ -8,6 +8,7 @@ import pytest
 from helpers.commanded_results import by_position, written_result
 from helpers.mujoco_plant import LEG, plant
 from helpers.pages import bars, chart, charts, tables
+from robotid.output.report.report_page import page_of
 
 from robotid.base.exceptions import DataError
 from robotid.data.log import Log
@@ -22,7 +23,6 @@ from robotid.output.report.position_page import (
     _undetermined,
     shown_positions,
 )
-from robotid.output.report.shown import page_of
 from robotid.output.report.steps import Origin
 
 ERRORS = {"rmse": (2e-3, 4e-3, 8e-3), "command_rmse": (0.02, 0.05, 0.08), "urdf_rmse": (0.01,) * 3}
