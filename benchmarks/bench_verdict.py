@@ -29,7 +29,7 @@ import numpy as np
 from verdict_cases import CASES, GOOD, ROBOTS, make
 
 from robotid import identify
-from robotid.cli.work.job import Job, LogEntry
+from robotid.cli.job import Job, LogEntry
 from robotid.base.exceptions import RobotIdError
 from robotid.data.files.table_files import write_columns
 

@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 from helpers.mujoco_plant import plant, torque_log
 
-from robotid.cli import main
-from robotid.cli.work import identify
-from robotid.cli.work.job import read_job
+from robotid.cli import identify, main
+from robotid.cli.job import read_job
 from robotid.data.files.read import write_log
 from robotid.robot.families import AUTO
 

@@ -16,8 +16,8 @@ from helpers.synthetic import exact_log, truth
 from robotid.base.exceptions import DataError, SettingsError
 from robotid.base.files import file_sha256
 from robotid.cli import main
-from robotid.cli.work.identify import _job_of, run_job
-from robotid.cli.work.job import Job, LogEntry
+from robotid.cli.identify import _job_of, run_job
+from robotid.cli.job import Job, LogEntry
 from robotid.data.files.read import write_log
 from robotid.data.signal_settings import SignalSettings
 from robotid.dynamics.friction_projection import project_friction

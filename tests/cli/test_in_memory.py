@@ -10,8 +10,8 @@ from helpers.mujoco_plant import plant, torque_log
 
 import robotid
 from robotid.base.exceptions import DataError, SettingsError
-from robotid.cli.work.identify import _entries
-from robotid.cli.work.job import LogEntry
+from robotid.cli.identify import _entries
+from robotid.cli.job import LogEntry
 from robotid.identification.closed_loop.loop_result import LoopIdentification
 
 SETTINGS = {"bodies": 0.0, "step": 4e-3, "torques": False}
@@ -82,7 +82,7 @@ def test_what_is_stated_reaches_the_simulation(arm, monkeypatch):
         "robotid.identification.closed_loop.from_commands.identify_loops",
         lambda *words, **options: asked.append((words, options)),
     )
-    monkeypatch.setattr("robotid.cli.work.in_memory.diagnose", lambda *words: words)
+    monkeypatch.setattr("robotid.cli.identify.diagnose", lambda *words: words)
     choice = robotid.EstimatorSettings("simulation", **SETTINGS)
     signals, told = robotid.SignalSettings(cutoff=7.0), []
 

@@ -11,10 +11,10 @@ from helpers.synthetic import exact_log, truth
 
 from robotid.base.files import file_sha256
 from robotid.base.findings import Finding
-from robotid.cli.work import validate
-from robotid.cli.work.identify import run_job
-from robotid.cli.work.job import LogEntry, job_from_settings
-from robotid.cli.work.validate import validate_result
+from robotid.cli import validate
+from robotid.cli.identify import run_job
+from robotid.cli.job import LogEntry, job_from_settings
+from robotid.cli.validate import validate_result
 from robotid.data.files.read import write_log
 from robotid.data.log import Log, Trajectory
 from robotid.dynamics.torque import joint_torque_regressor

@@ -9,8 +9,8 @@ from helpers.legged import recorded, with_other_bodies
 from helpers.paths import JOBS
 
 import robotid
-from robotid.cli.work.identify import run_job
-from robotid.cli.work.job import read_job
+from robotid.cli.identify import run_job
+from robotid.cli.job import read_job
 from robotid.data.base_motion import BaseMotion, in_base
 from robotid.data.signal_settings import BaseSource
 from robotid.dynamics.base_parameters import structural_mapping

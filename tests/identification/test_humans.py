@@ -8,7 +8,6 @@ import pytest
 from helpers.humans import FEET, PARTS, human_urdf, logged, walk, with_other_segments
 
 from robotid import identify
-from robotid.base.exceptions import SettingsError
 from robotid.data.base_motion import BaseMotion
 from robotid.data.signal_settings import SignalSettings
 from robotid.estimation.fitting.estimator_settings import ConsistentSettings
@@ -82,16 +81,3 @@ def test_vertical_forces_of_a_walk_weigh_in_spite_of_drift(human):
     assert result.standard[masses].sum() == pytest.approx(truth, rel=0.01)
     assert abs(truth / human.standard_parameters()[masses].sum() - 1) > 0.02
     assert not [x for x in result.findings if x.severity == "error"]
-
-
-def test_a_plate_refuses_axes_and_points():
-    plate = Contact("foot", "surface", PARTS, plate=(0.1, 0.2, 0.0))
-    assert plate.always
-    assert not replace(plate, measured=("fz",), always=False).always
-    for change, words in (
-        ({"kind": "point", "measured": ("fz",)}, "kind 'point' and axes 'world'"),
-        ({"axes": "link"}, "kind 'surface' and axes 'link'"),
-        ({"plate": (0.1, 0.2)}, r"plate of the contact 'foot' is 0.1, 0.2, wanted x, y, z"),
-    ):
-        with pytest.raises(SettingsError, match=words):
-            replace(plate, **change)

@@ -11,10 +11,10 @@ from helpers.driven import arm
 from helpers.synthetic import exact_log, truth
 
 from robotid.base.exceptions import DataError, SettingsError
-from robotid.cli.work.identify import run_job
-from robotid.cli.work.job import Job, LogEntry, job_from_settings, read_job
-from robotid.cli.work.logs import survey_logs
-from robotid.cli.work.validate import validate_result
+from robotid.cli.identify import run_job
+from robotid.cli.job import Job, LogEntry, job_from_settings, read_job
+from robotid.cli.logs import survey_logs
+from robotid.cli.validate import validate_result
 from robotid.data.files.read import read_log, write_log
 from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
@@ -46,7 +46,7 @@ def noisy_job(tmp_path_factory):
 
 @pytest.fixture
 def without_doctor(monkeypatch):
-    monkeypatch.setattr("robotid.cli.work.identify.examine_logs", lambda *_: ())
+    monkeypatch.setattr("robotid.cli.identify.examine_logs", lambda *_: ())
 
 
 def _reasons(content):

@@ -12,7 +12,7 @@ from helpers.synthetic import exact_log, truth
 from scipy.stats import t as t_of
 
 from robotid.base.exceptions import DataError, ModelError, SettingsError
-from robotid.cli.work.job import LogEntry, read_job
+from robotid.cli.job import LogEntry, read_job
 from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
 from robotid.dynamics.base_parameters import structural_mapping

@@ -9,8 +9,8 @@ import pytest
 from helpers.driven import ELBOW, LIFT, arm, driven, driven_log, found_in
 
 from robotid.base.exceptions import DataError, SettingsError
-from robotid.cli.work.export import export_result
-from robotid.cli.work.identify import save_result
+from robotid.cli.export import export_result
+from robotid.cli.identify import save_result
 from robotid.dynamics.friction_projection import project_friction
 from robotid.dynamics.memory import drive_motion_along
 from robotid.estimation.fitting.bands import QUANTILE, friction_curve

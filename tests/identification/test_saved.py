@@ -12,7 +12,7 @@ from helpers.synthetic import exact_log, truth
 import robotid
 from robotid.base.exceptions import SettingsError
 from robotid.cli import main
-from robotid.cli.work.job import job_from_settings
+from robotid.cli.job import job_from_settings
 
 URDF = ROOT / "urdf" / "planar_2r.urdf"
 
@@ -110,7 +110,7 @@ def test_a_result_is_written_whole_or_not_at_all(found, tmp_path, monkeypatch):
     (tmp_path / "file").write_text("")
     with pytest.raises(SettingsError, match="file' is a file, wanted a folder for the results"):
         robotid.save_result(found, tmp_path / "file")
-    monkeypatch.setattr("robotid.cli.work.identify.build_result", lambda *a, **k: {"x": np.inf})
+    monkeypatch.setattr("robotid.cli.identify.build_result", lambda *a, **k: {"x": np.inf})
     with pytest.raises(ValueError, match="JSON"):
         robotid.save_result(found, tmp_path / "out", report=False)
     assert list((tmp_path / "out").iterdir()) == []

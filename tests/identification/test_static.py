@@ -9,9 +9,9 @@ import pytest
 from helpers.synthetic import truth
 
 from robotid.base.exceptions import DataError, ModelError, SettingsError
-from robotid.cli.work.identify import run_job
-from robotid.cli.work.job import read_job
-from robotid.cli.work.validate import validate_result
+from robotid.cli.identify import run_job
+from robotid.cli.job import read_job
+from robotid.cli.validate import validate_result
 from robotid.data.files.read import write_log
 from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings

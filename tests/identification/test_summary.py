@@ -5,8 +5,8 @@ import pytest
 from helpers.paths import ROOT
 from helpers.synthetic import exact_log, truth
 
-from robotid.cli.work.identify import run_job
-from robotid.cli.work.job import Job, LogEntry
+from robotid.cli.identify import run_job
+from robotid.cli.job import Job, LogEntry
 from robotid.data.files.read import write_log
 from robotid.identification.pipeline import identify
 from robotid.identification.summary import (

@@ -4,7 +4,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from robotid.cli.work.convert import convert
+from robotid.cli.convert import convert
 from robotid.data.files.even_stamps import with_even_stamps
 from robotid.data.files.read import lay_out, read_log
 from robotid.data.files.table import RowReader, Table

@@ -8,7 +8,7 @@ import pinocchio as pin
 import pytest
 from helpers.paths import JOBS
 
-from robotid.cli.work.job import read_job
+from robotid.cli.job import read_job
 from robotid.data.base_motion import BaseMotion, base_state, in_base, quaternions_of_angles
 from robotid.data.imu_frame import ImuFrame, ImuMotion
 from robotid.data.log import Log

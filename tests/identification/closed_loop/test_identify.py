@@ -8,7 +8,7 @@ from helpers.single_joint import slider
 
 from robotid.base.exceptions import DataError
 from robotid.base.findings import Finding
-from robotid.cli.work.identify import save_result
+from robotid.cli.identify import save_result
 from robotid.data.log import Log
 from robotid.diagnosis.verdict.position_verdict import judge_positions
 from robotid.dynamics.simulation.loops import ClosedLoopRobot, cut_windows

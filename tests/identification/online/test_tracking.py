@@ -9,7 +9,7 @@ from helpers.synthetic import payload_log
 from robotid.base.exceptions import DataError
 from robotid.cli import main
 from robotid.cli import track as command
-from robotid.cli.work.job import read_job
+from robotid.cli.job import read_job
 from robotid.data.files.read import write_log
 from robotid.identification.online.identifier import track
 from robotid.identification.online.online_settings import OnlineSettings

@@ -16,7 +16,7 @@ from helpers.paths import DOCS, ROOT
 
 from robotid.base.exceptions import SettingsError
 from robotid.cli import main
-from robotid.cli.work.export import export_result
+from robotid.cli.export import export_result
 from robotid.output.files.export_formats import FORMATS, Format, Option
 from robotid.output.files.exported import Written
 from robotid.output.files.result_file import load_result

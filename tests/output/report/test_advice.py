@@ -10,7 +10,7 @@ import pytest
 
 from robotid.base.findings import Finding
 from robotid.cli import _parser
-from robotid.cli.work.job import job_from_settings
+from robotid.cli.job import job_from_settings
 from robotid.diagnosis.residual.candidates import CANDIDATES, couplings, ripples
 from robotid.diagnosis.residual.misfit import Misfit
 from robotid.diagnosis.residual.misfit_findings import misfit_findings, setting_of
