@@ -42,13 +42,13 @@ from robotid.diagnosis.verdict.verdict import check_ignored
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.friction_projection import project_friction
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings, SimulationSettings
-from robotid.estimation.fitting.evaluation import Evaluation
+from robotid.estimation.fitting.evaluation import Evaluated
 from robotid.estimation.fitting.recorded import Recordings
 from robotid.estimation.workers.plan import WorkPlan
 from robotid.identification import pipeline
 from robotid.identification.closed_loop.loop_settings import LoopSettings
 from robotid.identification.pipeline import conclude, robot_of
-from robotid.identification.result import Identification
+from robotid.identification.result import Identification, TorqueIdentification
 from robotid.identification.summary import (
     error_lines,
     friction_lines,
@@ -58,7 +58,6 @@ from robotid.identification.summary import (
 from robotid.output.files.entries import build_result
 from robotid.output.files.urdf import DYNAMICS_TERMS, write_urdf
 from robotid.output.report.document import write_report
-from robotid.output.report.loop_steps import loop_steps
 from robotid.output.report.next_steps import next_steps
 from robotid.output.report.steps import Origin
 from robotid.robot.drives import DriveTerm
@@ -67,8 +66,7 @@ from robotid.robot.model import RobotModel
 from robotid.robot.tree import read_tree
 
 if TYPE_CHECKING:
-    from robotid.identification.closed_loop.loop_result import LoopIdentification
-    from robotid.identification.closed_loop.position_errors import OpenLoop
+    from robotid.identification.closed_loop.loop_result import PositionIdentification
     from robotid.output.viewer.replays import Replay
 
 
@@ -85,7 +83,7 @@ def identify(  # type: ignore[overload-overlap]
     doctor: bool = ...,
     ignore: Sequence[str] = ...,
     progress: ProgressCallback | None = ...,
-) -> "LoopIdentification": ...
+) -> "PositionIdentification": ...
 
 
 @overload
@@ -101,7 +99,7 @@ def identify(
     doctor: bool = ...,
     ignore: Sequence[str] = ...,
     progress: ProgressCallback | None = ...,
-) -> Identification: ...
+) -> TorqueIdentification: ...
 
 
 @checked("progress")
@@ -117,7 +115,7 @@ def identify(
     doctor: bool = True,
     ignore: Sequence[str] = (),
     progress: ProgressCallback | None = None,
-) -> "Identification | LoopIdentification":
+) -> Identification:
     """Identify a robot's parameters from motion logs, as the command line does.
 
     Args:
@@ -141,7 +139,8 @@ def identify(
             their name.
 
     Returns:
-        The identification; for the estimator "simulation" a ``LoopIdentification``.
+        The identification; its evaluations are of torques, or for the estimator "simulation" of
+            positions.
 
     Raises:
         DataError: If a log cannot be read, does not match the model or is too short.
@@ -209,7 +208,7 @@ def run_job(
     *,
     plan: WorkPlan | None = None,
     source: Sequence[str] = (),
-) -> tuple["Identification | LoopIdentification", dict[str, Any]]:
+) -> tuple[Identification, dict[str, Any]]:
     """Run an identification and write result.json, report.html and the URDF with its sidecar.
 
     The settings may exclude the report and add replay.html; an impossible result has no URDF. All
@@ -237,24 +236,18 @@ def run_job(
     require_kind(job, Job, "job", "a Job, as robotid.read_job returns it")
     require_kind(folder, (str, Path), "folder", "the path of a folder")
     chosen = plan or WorkPlan(job.workers or 1)
-    is_simulated = isinstance(job.estimator, SimulationSettings)
-    stages = _loop_stages() if is_simulated else STAGES
+    stages = _loop_stages() if isinstance(job.estimator, SimulationSettings) else STAGES
     report_stage(chosen.progress, "reading logs", stages)
     model, target = job.model(), Path(folder)
     check_folder(target, ["result.json", *_names(model)])
-    found: Identification | LoopIdentification
-    if is_simulated:
-        found, used = _identify_loops(job, model, chosen.progress), job
-    else:
-        found = identify_job(job, model, chosen)
-        used = _job_of(found)
+    found = identify_job(job, model, chosen)
     report_stage(chosen.progress, "writing", stages)
-    return _write(found, used, target, source=source)
+    return _write(found, _job_of(found), target, source=source)
 
 
 @checked("identification")
 def save_result(
-    identification: "Identification | LoopIdentification",
+    identification: Identification,
     folder: str | Path,
     *,
     report: bool = True,
@@ -298,12 +291,12 @@ def _names(model: RobotModel) -> tuple[str, str, str, str]:
 
 
 def _write(
-    found: "Identification | LoopIdentification",
+    found: Identification,
     job: Job,
     target: Path,
     *,
     source: Sequence[str] = (),
-) -> tuple["Identification | LoopIdentification", dict[str, Any]]:
+) -> tuple[Identification, dict[str, Any]]:
     """Write all files of a result; return the identification with its report, and result.json."""
     names = report, replay, name, sidecar = _names(found.model)
     target.mkdir(parents=True, exist_ok=True)
@@ -333,11 +326,11 @@ def _write(
     return found, result
 
 
-def _replay_of(found: "Identification | LoopIdentification", job: Job, folder: Path) -> "Replay":
+def _replay_of(found: Identification, job: Job, folder: Path) -> "Replay":
     """Return the replay of a result that is written in a folder; its modules are imported here."""
     from robotid.cli.replay import read_findings, replay_files, replay_identified, stated_job
 
-    if isinstance(found, Identification):
+    if isinstance(found, TorqueIdentification):
         return replay_identified(found)
     entries = (*job.validation, *job.identification)
     if not entries:
@@ -350,7 +343,7 @@ def _replay_of(found: "Identification | LoopIdentification", job: Job, folder: P
     return replay_files(replace(stated, identification=entries[:1]), findings)
 
 
-def _job_of(identification: "Identification | LoopIdentification") -> Job:
+def _job_of(identification: Identification) -> Job:
     """Return the job of an identification; one made in Python gets an equivalent job.
 
     Logs in memory have no file, and a ``Log`` has no gains, units or names of columns.
@@ -358,10 +351,9 @@ def _job_of(identification: "Identification | LoopIdentification") -> Job:
     model, asked = identification.model, identification.stated
     if isinstance(asked.job, Job):
         return asked.job
-    if isinstance(identification, Identification):
-        chosen, loop = {drive.joint: drive for drive in identification.drives}, LoopSettings()
-    else:
-        chosen, loop = {}, identification.loop
+    chosen, loop = {}, getattr(identification, "loop", LoopSettings())
+    if isinstance(identification, TorqueIdentification):
+        chosen = {drive.joint: drive for drive in identification.drives}
     wanted = wanted_families(asked.friction, model.joints)
     is_auto = all(names is None for names in wanted.values())
     drives: dict[str, tuple[str | DriveTerm, ...]] = {}
@@ -397,15 +389,11 @@ def _job_of(identification: "Identification | LoopIdentification") -> Job:
     )
 
 
-def _entries(runs: "Sequence[Evaluation | OpenLoop]") -> tuple[LogEntry, ...]:
+def _entries(evaluations: Sequence[Evaluated]) -> tuple[LogEntry, ...]:
     """Return the windows of the logs that are in files."""
-    windows = [
-        (run.recording.log.path, run.recording.extent.start, run.recording.extent.end)
-        if isinstance(run, Evaluation)
-        else (run.log.path, float(run.log.t[0]), float(run.log.t[-1]))
-        for run in runs
-    ]
-    return tuple(LogEntry(Path(path), start, end) for path, start, end in windows if path)
+    return tuple(
+        LogEntry(Path(e.log.path), e.extent.start, e.extent.end) for e in evaluations if e.log.path
+    )
 
 
 def identify_job(
@@ -417,6 +405,8 @@ def identify_job(
 ) -> Identification:
     """Identify from a job's logs; nothing is written."""
     check_ignored(job.ignore)
+    if isinstance(job.estimator, SimulationSettings):
+        return _identify_loops(job, model, plan.progress)
     groups = job.identification, job.validation
     fitted, validation = survey_logs(job, model, *groups, refuse=refuse)
     if not fitted:
@@ -462,12 +452,11 @@ def _loop_stages() -> Sequence[str]:
 
 def _identify_loops(
     job: Job, model: RobotModel, progress: ProgressCallback | None
-) -> "LoopIdentification":
+) -> Identification:
     """Identify by simulation, from commands or logged torques; no file is written."""
     from robotid.identification.closed_loop.from_commands import identify_loops
 
     assert isinstance(job.estimator, SimulationSettings)
-    check_ignored(job.ignore)
     logs, validation = (
         [job.read(entry, model, needs=needed_of(job)) for entry in entries]
         for entries in (job.identification, job.validation)
@@ -516,11 +505,7 @@ def run(options: argparse.Namespace) -> int:
         [*result["outputs"].values(), "result.json"],
     )
     if not options.json:
-        origin = Origin(source, options.out)
-        if isinstance(found, Identification):
-            print_steps(next_steps(found, origin))
-        else:
-            print_steps(loop_steps(result, origin))
+        print_steps(next_steps(found, Origin(source, options.out)))
     return 1 if result["verdict"]["log_errors"] else 0
 
 

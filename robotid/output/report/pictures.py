@@ -1,6 +1,5 @@
 """Charts of an identification: torques, residuals and their causes, friction, parameters."""
 
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,7 +14,7 @@ from robotid.diagnosis.residual.torque_split import JointTorque, spread_rows
 from robotid.dynamics.memory import drive_motion_along
 from robotid.estimation.fitting.bands import QUANTILE, TorqueBand, friction_curve
 from robotid.estimation.fitting.evaluation import Evaluation
-from robotid.identification.result import Identification
+from robotid.identification.result import TorqueIdentification
 from robotid.output.pages.charts import Chart, Plot, Series, broken
 
 _DOTS = 800  # of one friction chart
@@ -36,7 +35,7 @@ _TONES = {
 
 
 def plot_torques(
-    identification: Identification, *joints: str, recording: Evaluation | None = None
+    identification: TorqueIdentification, *joints: str, recording: Evaluation | None = None
 ) -> Plot:
     """Return charts of measured and identified torque over time, and of the residual.
 
@@ -62,10 +61,10 @@ def plot_torques(
     for name, row in zip(names, rows, strict=True):
         torque, residual = torque_charts(identification, shown, row, band=band)
         charts += [(torque, f"{name}: torque"), (residual, f"{name}: residual")]
-    return Plot(f"Torques of {shown.recording.name}", tuple(charts))
+    return Plot(f"Torques of {shown.name}", tuple(charts))
 
 
-def plot_friction(identification: Identification, *joints: str) -> Plot:
+def plot_friction(identification: TorqueIdentification, *joints: str) -> Plot:
     """Return charts of friction against speed, measured and identified, with its band.
 
     Args:
@@ -88,7 +87,7 @@ def plot_friction(identification: Identification, *joints: str) -> Plot:
     return Plot(f"Friction of {listed(names)} against speed", shown)
 
 
-def plot_why(identification: Identification, joint: str) -> Plot:
+def plot_why(identification: TorqueIdentification, joint: str) -> Plot:
     """Return charts of the parts of a joint's torque, and of its residual's dependences.
 
     Args:
@@ -109,12 +108,12 @@ def plot_why(identification: Identification, joint: str) -> Plot:
     return Plot(f"Torque parts and residual of {joint}", shown)
 
 
-def shown_evaluation(found: Identification) -> Evaluation:
+def shown_evaluation(found: TorqueIdentification) -> Evaluation:
     """Return the recording to show: the first validation recording, or the first fitted one."""
     return (found.validation or found.fitted)[0]
 
 
-def _row_of(identification: Identification, joint: str) -> int:
+def _row_of(identification: TorqueIdentification, joint: str) -> int:
     """Return the index of a joint's torque row."""
     require_kind(joint, str, "joint", "the name of a joint")
     names = identification.model.row_names
@@ -127,7 +126,7 @@ def _row_of(identification: Identification, joint: str) -> int:
 
 
 def torque_charts(
-    found: Identification,
+    found: TorqueIdentification,
     evaluation: Evaluation,
     row: int,
     *,
@@ -206,7 +205,7 @@ def unused_spans(t: Array, used: NDArray[np.bool_]) -> tuple[tuple[float, float]
     return tuple(spans)
 
 
-def spectrum_chart(found: Identification, evaluation: Evaluation, row: int) -> Chart | None:
+def spectrum_chart(found: TorqueIdentification, evaluation: Evaluation, row: int) -> Chart | None:
     """Return the spectrum of a joint's torque and residual; None if no sample was used."""
     motion, used = evaluation.recording.trajectory, evaluation.recording.mask[:, row].astype(bool)
     name, unit = found.model.row_names[row], found.model.row_units[row]
@@ -234,7 +233,7 @@ def spectrum_chart(found: Identification, evaluation: Evaluation, row: int) -> C
 
 
 def friction_chart(
-    found: Identification, joint: str, *, split: tuple[Array, Array] | None = None
+    found: TorqueIdentification, joint: str, *, split: tuple[Array, Array] | None = None
 ) -> Chart | None:
     """Return friction against speed: measured, identified, and at constant speed."""
     evaluation, model = shown_evaluation(found), found.model

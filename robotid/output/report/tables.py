@@ -12,7 +12,7 @@ from robotid.base.findings import listed
 from robotid.base.typing import Array
 from robotid.diagnosis.verdict.central import CENTRAL_TERMS, central_parameters
 from robotid.estimation.variation.variation import Variation, VaryingParameter
-from robotid.identification.result import Identification
+from robotid.identification.result import TorqueIdentification
 from robotid.output.files.urdf import urdf_changes
 from robotid.output.pages.html import (
     Cell,
@@ -195,7 +195,7 @@ def _changes(model: RobotModel | None, standard: Array | None) -> str:
     return block("report.changes", title=escape(title), lines=html)
 
 
-def body_table(identification: Identification) -> str:
+def body_table(identification: TorqueIdentification) -> str:
     """Return mass, centre of mass and inertia about it of each link, below them those of the URDF.
 
     A value that the data do not determine is the URDF's, and stands without interval.
@@ -217,7 +217,7 @@ def body_table(identification: Identification) -> str:
     return block("report.central") + table("Links", headers, rows, is_data=True)
 
 
-def base_table(identification: Identification) -> str:
+def base_table(identification: TorqueIdentification) -> str:
     """Return the table of the base parameters."""
     mapping, units = identification.mapping, identification.model.layout.units
     undetermined, rows = set(identification.determination.undetermined), []
@@ -236,7 +236,7 @@ def base_table(identification: Identification) -> str:
     return block("report.base", method=escape(identification.errors.method), table=parameters)
 
 
-def consistency_section(identification: Identification) -> str:
+def consistency_section(identification: TorqueIdentification) -> str:
     """Return masses and pseudo-inertias, of the URDF and identified; prior, bounds, mass matrix."""
     layout = identification.model.layout
     before, after = (
@@ -259,7 +259,7 @@ def consistency_section(identification: Identification) -> str:
     return block("report.consistency", all=every, table=masses, notes=notes)
 
 
-def _consistency_notes(identification: Identification) -> list[str]:
+def _consistency_notes(identification: TorqueIdentification) -> list[str]:
     """Return sentences on mass matrix, prior and bounds of the fit."""
     check, details = identification.mass_matrix, identification.estimate.details
     share = "at all" if check.is_positive else f"at {100 * check.positive_share:.3g} % of"
@@ -283,7 +283,7 @@ def _consistency_notes(identification: Identification) -> list[str]:
     return notes
 
 
-def open_section(identification: Identification) -> str:
+def open_section(identification: TorqueIdentification) -> str:
     """Return the parameters that the data do not determine."""
     names, sources = identification.model.layout.names, identification.sources
     fixed = [name for name, source in zip(names, sources, strict=True) if source == "prior"]
@@ -298,7 +298,7 @@ def open_section(identification: Identification) -> str:
     )
 
 
-def _indistinguishable(identification: Identification) -> str:
+def _indistinguishable(identification: TorqueIdentification) -> str:
     """Return indistinguishable base parameters, and their identifiable combinations."""
     groups = identification.determination.merged
     html = block("report.indistinguishable") if groups else ""
@@ -314,7 +314,7 @@ def _names(title: str, names: Sequence[str]) -> str:
     return f'<h3>{title}</h3>\n<p class="code">{words}</p>\n'
 
 
-def settings_tables(identification: Identification) -> str:
+def settings_tables(identification: TorqueIdentification) -> str:
     """Return the tables of the settings, as used."""
     model, estimate = identification.model, identification.estimate
     settings = identification.estimator.to_dict()

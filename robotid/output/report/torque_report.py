@@ -1,10 +1,9 @@
 """The report on an identification from torques: its sections, and the content of its page."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from html import escape
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -20,16 +19,15 @@ from robotid.estimation.estimators.batch import solve_factor
 from robotid.estimation.fitting.bands import TorqueBand, next_errors
 from robotid.estimation.fitting.evaluation import Evaluation
 from robotid.estimation.fitting.fitted import Fit
-from robotid.estimation.fitting.metrics import Metrics
 from robotid.estimation.fitting.selected_drives import DriveChoice
-from robotid.identification.result import Identification
+from robotid.identification.result import TorqueIdentification
 from robotid.identification.summary import left_out_lines
 from robotid.output.files.entries import input_entries
 from robotid.output.pages.charts import Chart, chart_html
 from robotid.output.pages.html import Cell, block, cell, code, folded, listing, percent, table, text
-from robotid.output.report.dock import Clip, Dock, Residual, worst_html, worst_second
+from robotid.output.report.dock import Residual
 from robotid.output.report.ellipsoids import ellipsoid_pictures
-from robotid.output.report.errors import TORQUE, Errors, worst_errors
+from robotid.output.report.errors import TORQUE, errors_of, worst_errors
 from robotid.output.report.next_steps import next_steps
 from robotid.output.report.pictures import (
     friction_chart,
@@ -69,18 +67,9 @@ _TRIED = (
 )  # fmt: skip
 
 
-def torque_report(found: Identification, origin: Origin, replay: str = "") -> Report:
+def torque_report(found: TorqueIdentification, origin: Origin, replay: str = "") -> Report:
     """Return the content of a report on an identification."""
-    count = len(found.fitted)
-    fitted = Errors(
-        "" if count > 1 else _names(found.fitted),
-        _joints(found.metrics(), found.metrics("wls")),
-        is_fitted=True,
-    )
-    validation = [
-        Errors(e.recording.name, _joints(e.metrics["estimate"], e.metrics["wls"]))
-        for e in found.validation
-    ]
+    *validation, fitted = recordings = errors_of(found)
     counted = [errors for errors, e in zip(validation, found.validation, strict=True)
                if not e.is_refitted] or [fitted]  # fmt: skip
     entries = [entry for part in parameter_entries(found) for entry in part]
@@ -93,12 +82,12 @@ def torque_report(found: Identification, origin: Origin, replay: str = "") -> Re
         findings=found.findings,
         quantity=TORQUE,
         counted=counted,
-        recordings=[*validation, fitted],
+        recordings=recordings,
         facts=_facts(found),
         steps=next_steps(found, origin),
         made=block("report.made", method=escape(_method(found)), totals=escape(_totals(found))),
         errors=(block("report.torque_errors"), ""),
-        curves=("Torques", torques_section(found, verdict["per_joint"], worst, origin, replay)),
+        curves=("Torques", torques_section(found, worst, origin, replay)),
         friction=friction_section(found, worst),
         bodies=body_table(found) + ellipsoid_pictures(found),
         why=why_section(found),
@@ -125,7 +114,7 @@ def torque_report(found: Identification, origin: Origin, replay: str = "") -> Re
     )
 
 
-def _next_errors(found: Identification) -> dict[str, str]:
+def _next_errors(found: TorqueIdentification) -> dict[str, str]:
     """Return the expected RMS torque error of the next log with its unit, by row."""
     if found.variation is None:
         return {}
@@ -133,19 +122,11 @@ def _next_errors(found: Identification) -> dict[str, str]:
     return {row: f"{error:.3g} {unit}" for row, unit, error in rows}
 
 
-def _joints(metrics: Metrics, wls: Metrics) -> dict[str, dict[str, Any]]:
-    """Return the metrics of the joints as in result.json, with WLS as a baseline."""
-    joints: dict[str, dict[str, Any]] = metrics.to_dict()["per_joint"]
-    for joint, measured in joints.items():
-        measured["wls_relative_error_pct"] = wls.per_joint[joint].relative_error_pct
-    return joints
-
-
 def _names(evaluations: Sequence[Evaluation]) -> str:
-    return ", ".join(e.recording.name for e in evaluations)
+    return ", ".join(e.name for e in evaluations)
 
 
-def _facts(found: Identification) -> dict[str, str]:
+def _facts(found: TorqueIdentification) -> dict[str, str]:
     before, after, _ = found.scale_check.masses
     is_assumed = found.scale_check.assumed > 0
     is_compared = before > 0 and not is_assumed
@@ -162,7 +143,7 @@ def _facts(found: Identification) -> dict[str, str]:
     }
 
 
-def _method(found: Identification) -> str:
+def _method(found: TorqueIdentification) -> str:
     """Return a description of the fit and its logs."""
     fitted, validation = found.fitted, found.validation
     samples = sum(e.recording.extent.smooth for e in fitted)
@@ -177,13 +158,13 @@ def _method(found: Identification) -> str:
     )
 
 
-def _others(found: Identification) -> str:
+def _others(found: TorqueIdentification) -> str:
     """Return that there is no validation log, and the errors of logs left out, as text."""
     lines = left_out_lines([metrics.to_dict() for metrics in found.left_out.values()])
     return "There is no validation log" + "".join(f"; {line}" for line in lines)
 
 
-def _totals(found: Identification) -> str:
+def _totals(found: TorqueIdentification) -> str:
     """Return total mass, gravity torque and friction, for comparison with the verdict."""
     scale_check = found.scale_check
     shares = [f"{joint} {100 * share:.0f} %" for joint, share in scale_check.friction.items()]
@@ -207,31 +188,22 @@ def _chain(signals: SignalSettings) -> str:
 
 
 def torques_section(
-    found: Identification,
-    verdicts: Mapping[str, Mapping[str, Any]],
-    worst: Sequence[str],
-    origin: Origin,
-    replay: str = "",
+    found: TorqueIdentification, worst: Sequence[str], origin: Origin, replay: str = ""
 ) -> str:
     """Return charts of torques and residuals over time."""
-    evaluations, rows = found.validation or found.fitted, found.model.row_names
-    shown = drawn(evaluations, rows)
-    runs = {f"recording {k}": (e, found.band(e)) for k, e in enumerate(shown)}
+    evaluations, model = found.validation or found.fitted, found.model
+    intro = _intro(found, drawn(evaluations, model.row_names))
 
-    clips = [Clip(link, str(e.recording.log.path), e.recording.extent.start, e.recording.extent.end)
-             for link, (e, _) in runs.items()]  # fmt: skip
-    dock = Dock(replay, origin, str(found.model.tree.path), clips)
+    def charts(e: Evaluation, row: int, link: str, points: int) -> str:
+        return _charts(found, e, found.band(e), row, link=link, points=points)
 
-    def charts(run: tuple[Evaluation, TorqueBand], row: int, link: str, points: int) -> str:
-        return _charts(found, *run, row, link=link, points=points)
+    def residuals(row: int) -> Iterator[Residual]:
+        return _residuals(() if model.is_static else evaluations, row)
 
-    def note(row: int) -> str:
-        name, unit = rows[row], found.model.row_units[row]
-        seconds = None if found.model.is_static else worst_second(_residuals(evaluations, row))
-        return worst_html(seconds, name, unit, dock)
-
-    intro = dock.html + _intro(found, shown, evaluations[len(shown) :])
-    return curves_section(intro, runs, rows, verdicts, worst, charts, note)
+    return curves_section(
+        found, evaluations, worst, (replay, origin), intro, charts, residuals, TORQUE,
+        model.row_units,
+    )  # fmt: skip
 
 
 def _residuals(evaluations: Sequence[Evaluation], row: int) -> Iterator[Residual]:
@@ -239,10 +211,10 @@ def _residuals(evaluations: Sequence[Evaluation], row: int) -> Iterator[Residual
     for e in evaluations:
         motion, used = e.recording.trajectory, e.recording.mask[:, row].astype(bool)
         left = np.where(used, motion.tau[:, row] - e.torques["estimate"][:, row], np.nan)
-        yield Residual(e.recording.name, Path(e.recording.log.path).name, motion.t, left)
+        yield Residual(e.name, Path(e.recording.log.path).name, motion.t, left)
 
 
-def _intro(found: Identification, shown: Sequence[Evaluation], left: Sequence[Evaluation]) -> str:
+def _intro(found: TorqueIdentification, shown: Sequence[Evaluation]) -> str:
     """Return the description of the charts and their recordings."""
     band = "95 % band" if found.between is not None else "95 % band (for logs of the same day)"
     html = block("report.torques", band=band)
@@ -251,11 +223,17 @@ def _intro(found: Identification, shown: Sequence[Evaluation], left: Sequence[Ev
         if recording.is_partial:
             count, samples = len(recording.trajectory.t), recording.extent.smooth
             html += block("report.long", name=escape(recording.name), count=count, all=samples)
-    return html + (block("report.not_drawn", names=escape(_names(left))) if left else "")
+    return html
 
 
 def _charts(
-    found: Identification, e: Evaluation, band: TorqueBand, row: int, *, link: str, points: int
+    found: TorqueIdentification,
+    e: Evaluation,
+    band: TorqueBand,
+    row: int,
+    *,
+    link: str,
+    points: int,
 ) -> str:
     """Return torque and residual of a joint in a recording."""
     name, unit = found.model.row_names[row], found.model.row_units[row]
@@ -274,7 +252,7 @@ def _charts(
     return chart_html(torque, caption, points=points) + chart_html(residual, "", points=points)
 
 
-def friction_section(found: Identification, worst: Sequence[str]) -> str:
+def friction_section(found: TorqueIdentification, worst: Sequence[str]) -> str:
     """Return friction against speed of each joint, measured and identified."""
     model, layout = found.model, found.model.layout
     if model.is_static or all(term.is_inertia for _, term in layout.drive_parameters):
@@ -296,12 +274,12 @@ def friction_section(found: Identification, worst: Sequence[str]) -> str:
     if more:
         title = f"{len(figures) - len(first)} more joints with smaller errors"
         more = folded("friction-more", title, f'<div class="plots small">\n{more}</div>\n')
-    name = escape(shown_evaluation(found).recording.name)
+    name = escape(shown_evaluation(found).name)
     shown = "".join(figures[joint] for joint in first)
     return block("report.friction", log=name, figures=shown, more=more)
 
 
-def residual_section(found: Identification) -> str:
+def residual_section(found: TorqueIdentification) -> str:
     """Return the spectrum of each joint's residual."""
     if found.model.is_static:
         return "<p>Static poses and slow segments have no spectrum.</p>\n"
@@ -310,10 +288,10 @@ def residual_section(found: Identification) -> str:
         chart, name = spectrum_chart(found, evaluation, row), escape(joint)
         caption = f"<strong>{name}</strong>"
         figures += chart_html(chart, caption) if chart else f"<p>{name}: no samples used.</p>\n"
-    return block("report.residuals", name=escape(evaluation.recording.name), figures=figures)
+    return block("report.residuals", name=escape(evaluation.name), figures=figures)
 
 
-def drive_choices(found: Identification) -> str:
+def drive_choices(found: TorqueIdentification) -> str:
     """Return the selection of friction terms of each joint; "" if there is none."""
     choices = "".join(_choice(drive) for drive in found.drives)
     return block("report.terms", choices=choices) if choices else ""
@@ -358,7 +336,7 @@ def information(found: Fit) -> tuple[Array, Array]:
     return bread / np.outer(std, std), share
 
 
-def information_section(found: Identification) -> str:
+def information_section(found: TorqueIdentification) -> str:
     """Return the information in the data: shares of the data, correlations."""
     (correlation, share), names = information(found), found.mapping.base_names
     weak = [
@@ -386,13 +364,13 @@ def information_section(found: Identification) -> str:
     )
 
 
-def why_section(found: Identification) -> str:
+def why_section(found: TorqueIdentification) -> str:
     """Return the residual analysis: a part for each joint, the worst joint first and open."""
     torques = sorted(found.joint_torques, key=_relative_residual, reverse=True)
     logs = torques[0].rows.recordings
     kind = "Validation logs" if torques[0].fitted is not None else "Fitted logs, without validation"
     points = max(_FEWEST_POINTS, min(_POINTS, _ALL_POINTS // len(torques)))
-    names = [e.recording.name for e in found.validation or found.fitted]
+    names = [e.name for e in found.validation or found.fitted]
     link = f"recording {names.index(logs[0])}" if logs[0] in names else "fitted"  # as the torques
     joints = "".join(
         folded(

@@ -42,7 +42,9 @@ def test_the_tables_hold_the_root_mean_squares(section, identified):
         assert rows["residual"]["RMS N m"] == number(measured.rmse, ".3g")
         assert rows["residual"]["% of torque"] == percent(measured.relative_error_pct)
         mask, motion = kept.recording.mask[:, j], kept.recording.trajectory
-        assert rows["measured"]["RMS N m"] == number(np.sqrt(np.mean(motion.tau[mask, j] ** 2)), ".3g")
+        assert rows["measured"]["RMS N m"] == number(
+            np.sqrt(np.mean(motion.tau[mask, j] ** 2)), ".3g"
+        )
         theta = dict(zip(identified.model.layout.names, identified.standard, strict=True))
         inertia = theta[f"{joint}.armature"] * np.sqrt(np.mean(motion.a[mask, j] ** 2))
         if "motor inertia" in rows:
