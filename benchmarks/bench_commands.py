@@ -40,7 +40,7 @@ from helpers import mujoco_plant
 from mujoco import rollout
 
 from robotid.base.exceptions import SettingsError
-from robotid.cli.work.job import read_job
+from robotid.cli.job import read_job
 from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
 from robotid.dynamics.simulation.loops import ClosedLoopRobot, Window, open_loops

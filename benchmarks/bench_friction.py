@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 from scipy.signal import lfilter
 
-from robotid.cli.work.job import read_job
+from robotid.cli.job import read_job
 from robotid.estimation.fitting.bands import QUANTILE, friction_curve
 from robotid.identification.pipeline import identify
 from robotid.data.log import Log

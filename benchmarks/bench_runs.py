@@ -30,9 +30,9 @@ import numpy as np
 import pinocchio as pin
 from scipy.linalg import block_diag
 
-from robotid.cli.work.identify import run_job
-from robotid.cli.work.job import LogEntry, job_from_settings, read_job
-from robotid.cli.work.logs import survey_logs
+from robotid.cli.identify import run_job
+from robotid.cli.job import LogEntry, job_from_settings, read_job
+from robotid.cli.logs import survey_logs
 from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
 from robotid.dynamics.base_parameters import structural_mapping

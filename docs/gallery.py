@@ -20,7 +20,7 @@ import pinocchio as pin
 from scipy.spatial import ConvexHull
 
 import robotid
-from robotid.cli.work.demo import run_demo
+from robotid.cli.demo import run_demo
 from robotid.dynamics.simulation.motions import random_fourier
 from robotid.dynamics.simulation.simulator import Noise, simulate
 from robotid.dynamics.simulation.truth import another_robot

@@ -7,7 +7,7 @@ import math
 from dataclasses import MISSING
 from pathlib import Path
 
-from robotid.cli.work.job import Job, LogEntry, PayloadEntry
+from robotid.cli.job import Job, LogEntry, PayloadEntry
 from robotid.data.signal_settings import BaseSource, LogSource, LogUnits, SignalSettings
 from robotid.data.transmission import Transmission
 from robotid.dynamics.simulation.simulation_settings import Simulation

@@ -29,7 +29,7 @@ PACKAGES = {
     "design": ["."],
     "output": ["pages", "files", "viewer", "report"],
     "paper": ["."],
-    "cli": ["work", "."],
+    "cli": ["."],
 }
 PLACES = [(package, part) for package, parts in PACKAGES.items() for part in parts]
 PINOCCHIO = {"robot", "dynamics", "output/viewer"}
@@ -165,7 +165,7 @@ def test_importing_the_package_is_light():
 
 def test_logs_and_results_are_handled_without_the_simulator():
     code = (
-        "import sys, robotid.cli.work.logs, robotid.output.files.entries\n"
+        "import sys, robotid.cli.logs, robotid.output.files.entries\n"
         "import robotid.estimation.fitting.survey\n"
         "slow = ('robotid.identification.closed_loop.stages', 'scipy.interpolate',\n"
         "        'robotid.dynamics.simulation.loops')\n"

@@ -1,4 +1,4 @@
-"""robotid doctor: check logs for faults: JOB.toml, or URDF LOG ...."""
+"""robotid doctor: check logs for faults: JOB.toml, or URDF LOG [LOG ...]."""
 
 import argparse
 from collections.abc import Mapping, Sequence
@@ -6,11 +6,11 @@ from functools import partial
 from typing import Any
 
 from robotid.base.findings import Finding, grouped
+from robotid.cli.console import as_finding, echo, print_causes, progress_of, show_found
 from robotid.cli.flags import add_job, job_from_flags
-from robotid.cli.printing import as_finding, echo, print_causes
-from robotid.cli.running import progress_of, show_found
-
-SUMMARY = "check logs for faults: JOB.toml, or URDF LOG ..."
+from robotid.cli.logs import examine
+from robotid.diagnosis.logs.check_logs import findings_to_dict
+from robotid.diagnosis.verdict.verdict import blocking
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
@@ -20,10 +20,6 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Run the command."""
-    from robotid.cli.work.logs import examine
-    from robotid.diagnosis.logs.check_logs import findings_to_dict
-    from robotid.diagnosis.verdict.verdict import blocking
-
     with progress_of(options) as progress:
         job = job_from_flags(options)
         model = job.model()

@@ -127,7 +127,7 @@ def filter_reach(settings: SignalSettings) -> float:
     It is more than twice the settling time of one filter: the sign of a smooth speed depends on
     the longest time of stiction, and is filtered a second time.
     """
-    delay = max(map(abs, (settings.torque_delay, settings.velocity_delay, settings.wrench_delay)))
+    delay = max(abs(settings.torque_delay), abs(settings.velocity_delay))
     if settings.cutoff is None or settings.rate is None:
         return delay
     return delay + 2.0 * _SETTLED * _time_constant(settings) + _LONGEST / settings.cutoff
@@ -194,11 +194,7 @@ def _process_part(
         channels |= _base_channels(log.base, settings)
     if log.wrenches:
         channels["wrenches"] = np.column_stack([*log.wrenches.values()])
-    delay = {
-        "tau": settings.torque_delay,
-        "v": settings.velocity_delay,
-        "wrenches": settings.wrench_delay,
-    }
+    delay = {"tau": settings.torque_delay, "v": settings.velocity_delay}
     smooth = {}
     for name, x in channels.items():
         late = delay.get(name, 0.0)

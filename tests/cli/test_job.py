@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from robotid.base.exceptions import SettingsError
-from robotid.cli.work.job import Job, _motors, job_from_settings, read_job
+from robotid.cli.job import Job, _motors, job_from_settings, read_job
 from robotid.data.files.read import write_log
 from robotid.data.log import Log
 from robotid.data.signal_settings import LogSource

@@ -144,7 +144,7 @@ def test_a_filter_reaches_until_nothing_is_left_of_its_slowest_pole(order, cutof
     )
     wanted = 0.03 + 2 * 42.0 * max(slowest(rate), slowest(1e3 * rate)) + 8.0 / cutoff
     assert filter_reach(settings) == pytest.approx(wanted, rel=1e-5)
-    more = replace(settings, wrench_delay=-0.25)
+    more = replace(settings, velocity_delay=-0.25)
     assert filter_reach(more) == pytest.approx(wanted + 0.22, rel=1e-5)
 
 

@@ -8,7 +8,7 @@ import scipy.stats
 from helpers.paths import JOBS
 
 from robotid.base.exceptions import DataError
-from robotid.cli.work.job import read_job
+from robotid.cli.job import read_job
 from robotid.data.base_motion import BaseMotion, quaternions_of_angles
 from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings

@@ -21,8 +21,8 @@ from helpers.driven import (
 )
 
 from robotid.base.exceptions import NotConvergedError, SettingsError
-from robotid.cli.work.job import job_from_settings
-from robotid.cli.work.logs import survey_logs
+from robotid.cli.job import job_from_settings
+from robotid.cli.logs import survey_logs
 from robotid.data.files.read import write_log
 from robotid.data.signals import process
 from robotid.diagnosis.residual import drive_choice

@@ -13,9 +13,9 @@ from helpers.misfits import EFFECTS
 from helpers.paths import ROOT
 
 from robotid.base.findings import Finding
-from robotid.cli.work.identify import run_job
-from robotid.cli.work.job import job_from_settings, read_job
-from robotid.cli.work.logs import survey_logs
+from robotid.cli.identify import run_job
+from robotid.cli.job import job_from_settings, read_job
+from robotid.cli.logs import survey_logs
 from robotid.data.files.read import write_log
 from robotid.data.signal_settings import SignalSettings
 from robotid.diagnosis.logs.check_logs import check_logs

@@ -34,6 +34,7 @@ from robotid.robot.parameters import DYNAMICS, Coupling
 if TYPE_CHECKING:
     from robotid.robot.model import RobotModel
 
+
 _MODEL_KEYS: Mapping[str, tuple[type, ...]] = {
     "friction" if term.is_friction else name: (str,) if term.is_friction else (bool,)
     for name, term in TERMS.items()
@@ -110,18 +111,14 @@ def _dump_couplings(couplings: Sequence[Coupling]) -> list[dict[str, Any]]:
 
 
 def _load_contacts(tables: Sequence[Mapping[str, Any]]) -> tuple[Contact, ...]:
-    lists = ("measured", "plate")
     return tuple(
-        Contact(**{**table, **{key: tuple(table.get(key, ())) for key in lists}})
-        for table in tables
+        Contact(**{**table, "measured": tuple(table.get("measured", ()))}) for table in tables
     )
 
 
 def _dump_contact(contact: Contact) -> dict[str, Any]:
-    table = asdict(contact) | {"measured": list(contact.measured), "plate": list(contact.plate)}
-    unstated: dict[str, Any] = {
-        "axes": "world", "plate": [], "threshold": None, "uncertainty": None,
-    }  # fmt: skip
+    table = asdict(contact) | {"measured": list(contact.measured)}
+    unstated: dict[str, Any] = {"axes": "world", "threshold": None, "uncertainty": None}
     return {key: x for key, x in table.items() if key not in unstated or x != unstated[key]}
 
 
@@ -237,8 +234,7 @@ class Job(Settings):
         (),
         "links that may touch the ground: frame, the link; kind, point or surface; measured, "
         "components of the wrench that logs have as wrench_fz_<link>, of fx to mz, the others are "
-        "unknown; axes of these, world or link; plate, x, y, z [m] and roll, pitch, yaw [rad] "
-        "of the force plate whose origin and axes they have; always, whether it always touches the "
+        "unknown; axes of these, world or link; always, whether it always touches the "
         "ground (true if all components are measured), else logs have contact_<link>, 1 or 0, or "
         "it is found; threshold, for a column that is a force "
         "instead [N]; radius of a ball-shaped foot, below whose frame the ground is [m]; "
@@ -255,7 +251,6 @@ class Job(Settings):
                 "uncertainty": (int, float),
                 "axes": (str,),
                 "threshold": (int, float),
-                "plate": Entries(list, (int, float)),
             }
         ],
         load=_load_contacts,
