@@ -7,9 +7,9 @@ import numpy as np
 from helpers.synthetic import perfect
 from robotid.data.signal_settings import SignalSettings
 from robotid.dynamics.base_parameters import structural_mapping
-from robotid.dynamics.simulation.closed_loop import Noise
 from robotid.dynamics.simulation.motions import random_fourier
 from robotid.dynamics.simulation.simulation_settings import Sensors
+from robotid.dynamics.simulation.simulator import Noise
 from robotid.dynamics.simulation.truth import another_robot
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
 from robotid.estimation.fitting.recorded import Recordings

@@ -35,15 +35,13 @@ from robotid.data.signals import (
 )
 from robotid.data.units import check_reach, check_units
 from robotid.dynamics.base_parameters import BaseMapping
+from robotid.dynamics.completed_logs import closed_log, with_contacts
 from robotid.dynamics.constraint_rows import constrained, logged_base
-from robotid.dynamics.constraints.closed_log import closed_log
-from robotid.dynamics.constraints.found_contacts import with_contacts
 from robotid.dynamics.drive_columns import friction_speeds
 from robotid.dynamics.factors import Reduction
-from robotid.dynamics.memory import is_loaded, remember
+from robotid.dynamics.prediction import is_loaded, remember
 from robotid.dynamics.rows import COMPILED, choose_engine
-from robotid.dynamics.used_rows import base_problem, row_mask, static_rows
-from robotid.dynamics.velocity_choice import prefers_measured
+from robotid.dynamics.used_rows import base_problem, prefers_measured, row_mask, static_rows
 from robotid.estimation.workers.pieces import Piece, Workload
 from robotid.robot.model import RobotModel
 

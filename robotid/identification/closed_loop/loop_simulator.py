@@ -10,8 +10,7 @@ from robotid.base.exceptions import NotConvergedError
 from robotid.base.typing import Array
 from robotid.data.filters import local_polynomial
 from robotid.data.log import Trajectory
-from robotid.dynamics.memory import remember
-from robotid.dynamics.prediction import predict
+from robotid.dynamics.prediction import predict, remember
 from robotid.dynamics.simulation.loops import ClosedLoopRobot, Column, Loops, RollOut, Window
 from robotid.estimation.estimators.simulator import Residual
 from robotid.robot.drive_term import DriveTerm

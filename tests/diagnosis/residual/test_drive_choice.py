@@ -30,8 +30,7 @@ from robotid.diagnosis.residual.drive_choice import choose_drives
 from robotid.diagnosis.residual.term_trials import Normal, Sample, Trials, take_sample
 from robotid.diagnosis.verdict.parameter_table import parameter_entries
 from robotid.dynamics.base_parameters import structural_mapping
-from robotid.dynamics.memory import drive_motion_along, remember
-from robotid.dynamics.prediction import predict
+from robotid.dynamics.prediction import drive_motion_along, predict, remember
 from robotid.estimation.fitting.bands import friction_curve
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
 from robotid.estimation.fitting.recorded import Recordings
