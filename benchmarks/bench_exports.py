@@ -23,9 +23,9 @@ import numpy as np
 import scipy.optimize
 from setting import machine
 
-from robotid.cli.work.export import export_result
-from robotid.cli.work.identify import run_job
-from robotid.cli.work.job import read_job
+from robotid.cli.export import export_result
+from robotid.cli.identify import run_job
+from robotid.cli.job import read_job
 from robotid.output.files.result_file import load_result
 
 JOBS = Path(__file__).parents[1] / "tests" / "jobs"

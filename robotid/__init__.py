@@ -6,9 +6,8 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from robotid.base.exceptions import RobotIdError
     from robotid.base.versions import __version__
-    from robotid.cli.work.identify import run_job, save_result
-    from robotid.cli.work.in_memory import identify
-    from robotid.cli.work.job import read_job
+    from robotid.cli.identify import identify, run_job, save_result
+    from robotid.cli.job import read_job
     from robotid.data.base_motion import BaseColumns, BaseMotion
     from robotid.data.files.read import read_log, write_log
     from robotid.data.log import Log, Trajectory
@@ -68,9 +67,8 @@ __all__ = [
 ]
 
 _MODULES = {
-    "cli.work.identify": ["run_job", "save_result"],
-    "cli.work.in_memory": ["identify"],
-    "cli.work.job": ["read_job"],
+    "cli.identify": ["identify", "run_job", "save_result"],
+    "cli.job": ["read_job"],
     "diagnosis.logs.check_logs": ["check_logs"],
     "diagnosis.urdf.inspection": ["inspect_urdf"],
     "base.exceptions": ["RobotIdError"],

@@ -22,14 +22,14 @@ PACKAGES = {
     "base": ["."],
     "robot": ["."],
     "data": [".", "files"],
-    "dynamics": ["kernels", ".", "constraints", "simulation"],
+    "dynamics": ["kernels", ".", "simulation"],
     "estimation": ["workers", "estimators", "variation", "fitting"],
     "diagnosis": ["urdf", "logs", "residual", "verdict"],
     "identification": [".", "closed_loop", "online"],
     "design": ["."],
     "output": ["pages", "files", "viewer", "report"],
     "paper": ["."],
-    "cli": ["work", "."],
+    "cli": ["."],
 }
 PLACES = [(package, part) for package, parts in PACKAGES.items() for part in parts]
 PINOCCHIO = {"robot", "dynamics", "output/viewer"}
@@ -139,7 +139,7 @@ def test_third_parties_stay_in_their_rooms():
         for name, at_top, typing_only in imports(path)
         for first in [name.split(".")[0]]
         if (first == "pinocchio" and not PINOCCHIO & {room(path), place(path)[0]})
-        or (first == "numba" and path.name not in ("lanes.py", "vector_lanes.py"))
+        or (first == "numba" and path.name != "lanes.py")
         or (name.endswith("lanes") and at_top and not (typing_only or path.stem.endswith("lanes")))
         or (first in INSIDE_FUNCTIONS and room(path) not in INSIDE_FUNCTIONS[first])
         or (first in INSIDE_FUNCTIONS and at_top and not typing_only)
@@ -165,7 +165,7 @@ def test_importing_the_package_is_light():
 
 def test_logs_and_results_are_handled_without_the_simulator():
     code = (
-        "import sys, robotid.cli.work.logs, robotid.output.files.entries\n"
+        "import sys, robotid.cli.logs, robotid.output.files.entries\n"
         "import robotid.estimation.fitting.survey\n"
         "slow = ('robotid.identification.closed_loop.stages', 'scipy.interpolate',\n"
         "        'robotid.dynamics.simulation.loops')\n"

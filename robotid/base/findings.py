@@ -121,9 +121,10 @@ def sentence(findings: Sequence[Finding]) -> str:
     """Return the message of findings with one template.
 
     A slot has a format, and may end in " %" or " ms", which scale its number, or in " %~" if the
-    unit is not written; "|" is its absolute value. Of several findings it is the range of their numbers, or by its conversion the middle one
-    (!t, which a user types), the smallest (!l), the largest (!h), or that of the finding with the
-    largest last of such slots (!w).
+    unit is not written; "|" is its absolute value. Of several findings it is the range of their
+    numbers, or by its conversion the middle one (!t, which a user types), the smallest (!l), the
+    largest (!h), or that of the finding with the largest last of such slots (!w). Names are joined,
+    in quotes by !q.
     """
     first = findings[0]
     if not first.fault:
@@ -148,7 +149,7 @@ def _filled(values: Sequence[str | float], spec: str, how: str) -> str:
     """Return names with commas, or the range of numbers, or one of them."""
     numbers = sorted(value for value in values if not isinstance(value, str))
     if not numbers:
-        names = list(dict.fromkeys(map(str, values)))
+        names = list(dict.fromkeys(f"'{x}'" if how == "q" else str(x) for x in values))
         return (" " if names[0].startswith("--") else ", ").join(names)
     bare = spec.removesuffix("~")
     unit = next((unit for unit in _FACTORS if bare.endswith(unit)), "")

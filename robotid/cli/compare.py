@@ -7,11 +7,11 @@ from typing import Any
 
 from robotid.base.findings import listed
 from robotid.base.text import columns, in_digits_of
+from robotid.cli.console import echo, show_found, window_name
 from robotid.cli.flags import add_json, add_verbose
-from robotid.cli.printing import echo, window_name
-from robotid.cli.running import show_found
+from robotid.identification.summary import cell
+from robotid.output.report.comparison import compare_results, write_comparison
 
-SUMMARY = "compare several results"
 _SHOWN = 12  # base parameters in the table, so that two results fit a screen
 
 
@@ -26,8 +26,6 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Run the command."""
-    from robotid.output.report.comparison import compare_results, write_comparison
-
     if options.out:
         content = write_comparison(options.results, options.out)
     else:
@@ -38,7 +36,6 @@ def run(options: argparse.Namespace) -> None:
 
 
 def _show(content: dict[str, Any], *, is_verbose: bool = False) -> None:
-    from robotid.identification.summary import cell
 
     results = content["results"]
     labels = [result["label"] for result in results]

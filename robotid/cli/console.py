@@ -1,24 +1,165 @@
 """Errors and progress on a terminal, and the end of a command after a signal."""
 
+import argparse
 import errno
+import json
 import logging
 import os
 import re
 import signal
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, TextIO
+from typing import TYPE_CHECKING, Any, TextIO
 
-from robotid.base.text import terminal_width, tinted, wrapped
+from robotid.base.findings import Finding, grouped, number_of
+from robotid.base.text import command_lines, period, terminal_width, tinted, wrapped
 
 if TYPE_CHECKING:
+    from contextlib import AbstractContextManager
+
     from rich.progress import TaskID
 
     from robotid.base.typing import ProgressCallback
+    from robotid.cli.job import Job
+    from robotid.output.report.steps import Step
+
+
+def echo(text: str, indent: str = "", tone: str = "") -> None:
+    """Print text in lines that fit the terminal."""
+    print(tinted(wrapped(text, terminal_width(), indent), tone, tone, sys.stdout))
+
+
+def print_files(folder: str, names: Sequence[str]) -> None:
+    """Print the files that were written, one per line."""
+    print("\nwritten:")
+    for name in names:
+        print(f"  {Path(folder) / name}")
+
+
+def print_steps(steps: "Sequence[Step]") -> None:
+    """Print the next steps, each with its commands on separate lines, for copying."""
+    print("\nnext steps:")
+    for number, step in enumerate(steps, start=1):
+        echo(f"  {number}. {step.words}", "   ")
+        for block in step.blocks:
+            lines = block.split("\n")
+            if sys.stdout.isatty() and len(lines) == 1 and block.startswith("robotid "):
+                lines = command_lines(block, terminal_width() - 7)
+            print("\n".join(f"       {line}" for line in lines))
+
+
+def print_block(*lines: str) -> None:
+    """Print lines after an empty line."""
+    print("\n" + "\n".join(lines))
+
+
+def print_causes(
+    findings: Sequence[Finding],
+    joints: Sequence[str],
+    *,
+    is_verbose: bool,
+    worst: str = "",
+    printed: Sequence[str] = (),
+    none: str = "no findings",
+) -> None:
+    """Print findings by cause, then their number."""
+    shown = [f for f in findings if is_verbose or f.severity != "note"]
+    notes_hidden = [f for f in findings if f not in shown]
+    causes, others = grouped(shown, joints), grouped(notes_hidden, joints)
+    for cause in causes:
+        for message in cause.messages:
+            if message not in printed:
+                echo(f"{cause.severity}: {cause.code}: {message}", "  ", cause.severity)
+    hidden = number_of(others)
+    notes = f"{_some(hidden, 'note')} hidden (--verbose)" if hidden else ""
+    if shown:
+        count = f"{_some(number_of(causes), 'finding')}, {_some(len(causes), 'cause')}"
+        notes = count + (f"; worst: {worst}" if worst else "") + (f"; {notes}" if notes else "")
+    if summary := notes or none:
+        echo(summary)
+
+
+def _some(count: int, what: str) -> str:
+    return f"{count} {what}{'' if count == 1 else 's'}"
+
+
+def recordings_of(inputs: Sequence[Mapping[str, Any]], role: str) -> list[str]:
+    """Return the file of each recording of a role, with its path if names occur more than once."""
+    paths = {Path(entry["path"]) for entry in inputs}
+    names = [path.name for path in paths]
+    files = {str(path): path.name if names.count(path.name) == 1 else str(path) for path in paths}
+    return [
+        window_name(files[str(Path(entry["path"]))] or "log", entry)
+        for entry in inputs
+        if entry["role"] == role
+    ]
+
+
+def window_name(name: str, entry: Mapping[str, Any]) -> str:
+    """Return the name of a recording with its window of the log."""
+    return f"{name} {period(entry['start'], entry['end'])}"
+
+
+def print_verdict(verdict: Mapping[str, Any]) -> None:
+    """Print a verdict."""
+    from robotid.identification.summary import verdict_lines
+
+    first, *others = verdict_lines(verdict)
+    echo(f"\n{first}", tone=verdict["status"])
+    for line in others:
+        status = line.partition(": ")[2].partition(":")[0]
+        echo(line, "  ", "" if line.startswith("  - ") else status)
+
+
+def progress_of(options: argparse.Namespace) -> "AbstractContextManager[ProgressCallback | None]":
+    """Return the progress display that the flags of a command select."""
+    return terminal_progress(
+        quiet=options.json,
+        force=getattr(options, "progress", False),
+        is_verbose=getattr(options, "verbose", False),
+    )
+
+
+def show_found(
+    content: dict[str, Any],
+    options: argparse.Namespace,
+    show: Callable[[dict[str, Any]], None],
+    files: Sequence[str] = (),
+) -> None:
+    """Print the result of a command and the files that it wrote, or the JSON alone."""
+    with closed_output_ignored():
+        if options.json:
+            print(json.dumps(content, allow_nan=False))
+            return
+        show(content)
+        if files:
+            print_files(options.out, files)
+
+
+def serve(
+    job: "Job",
+    folder: str | None,
+    options: argparse.Namespace,
+    finished: Callable[[dict[str, Any]], None],
+) -> None:
+    """Show a log in the browser while an estimator runs over it, until it is interrupted."""
+    from robotid.cli.track import serve_track
+
+    def announce(url: str) -> None:
+        print(f"live: {url}  (stop with Ctrl-C)", file=sys.stderr, flush=True)
+
+    settings = {"port": options.serve, "speed": options.speed}
+    try:
+        serve_track(job, folder, **settings, announce=announce, finished=finished)
+    except Terminated:
+        raise
+    except KeyboardInterrupt:
+        print("\nstopped", file=sys.stderr)
+
 
 _LAST_STREAM = 2  # the number of the standard error stream
 _ENDS = tuple(getattr(signal, n) for n in ("SIGTERM", "SIGHUP") if hasattr(signal, n))

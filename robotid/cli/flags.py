@@ -11,7 +11,7 @@ from robotid.base.findings import listed
 from robotid.base.settings import Entries, Settings, table_in
 
 if TYPE_CHECKING:
-    from robotid.cli.work.job import Job
+    from robotid.cli.job import Job
 
 
 def pairs(words: Sequence[str], flag: str) -> dict[str, float]:
@@ -153,7 +153,7 @@ def _listed(words: Sequence[str], _: str) -> list[str]:
 
 
 def _job() -> Settings:
-    from robotid.cli.work.job import Job
+    from robotid.cli.job import Job
 
     return Job(Path())
 
@@ -181,7 +181,6 @@ JOB = Flags(
         "--max-gap": ("signals.max_gap", "S"),
         "--torque-delay": ("signals.torque_delay", "S"),
         "--velocity-delay": ("signals.velocity_delay", "S"),
-        "--wrench-delay": ("signals.wrench_delay", "S"),
         "--friction": ("model.friction", "MODEL"),
         "--dynamics": ("output.dynamics", ""),
         "--no-report": ("output.report", "write no report.html"),
@@ -277,7 +276,7 @@ def add_job(
 
 def job_from_flags(options: argparse.Namespace, *, needs_logs: bool = True) -> "Job":
     """Return the job that a command line names or states."""
-    from robotid.cli.work.job import job_from_settings, read_job
+    from robotid.cli.job import job_from_settings, read_job
 
     if Path(options.source).suffix == ".toml":
         given = _given(options)

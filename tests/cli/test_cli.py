@@ -17,7 +17,7 @@ from helpers.replay_data import leave_out_meshes
 from helpers.synthetic import exact_log, truth
 
 from robotid.cli import main
-from robotid.cli.work.demo import run_demo
+from robotid.cli.demo import run_demo
 from robotid.data.files.read import read_log, write_log
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.torque import joint_torque_regressor
@@ -424,7 +424,7 @@ def test_inspect_of_an_unusable_urdf_says_why(capsys, tmp_path):
 
 def test_demo_runs_from_nothing_and_finds_the_truth(tmp_path, capsys, monkeypatch):
     out, stages = tmp_path / "demo", []
-    monkeypatch.setattr("robotid.cli.work.demo._PERIOD", 7.0)
+    monkeypatch.setattr("robotid.cli.demo._PERIOD", 7.0)
     leave_out_meshes(monkeypatch)
     shown = nullcontext(lambda *stage: stages.append(stage))
     monkeypatch.setattr("robotid.cli.demo.terminal_progress", lambda: shown)
@@ -444,14 +444,12 @@ def test_demo_runs_from_nothing_and_finds_the_truth(tmp_path, capsys, monkeypatc
 
 def test_a_term_that_the_demo_finds_and_did_not_simulate_is_truly_0(tmp_path, monkeypatch):
     """As the friction of a drive that seems to grow with its load."""
-    monkeypatch.setattr("robotid.cli.work.demo._PERIOD", 0.25)
+    monkeypatch.setattr("robotid.cli.demo._PERIOD", 0.25)
     whole = RobotModel.from_urdf(example_urdf("z1.urdf"), locked={"jointGripper": 0.0})
     bases = []
     for model in (whole, whole.with_terms({"joint2": (LoadFriction(),)})):
         found = SimpleNamespace(model=model, mapping=structural_mapping(model))
-        monkeypatch.setattr(
-            "robotid.cli.work.demo.run_job", lambda *_, found=found, **__: (found, {})
-        )
+        monkeypatch.setattr("robotid.cli.demo.run_job", lambda *_, found=found, **__: (found, {}))
         *_, true = run_demo(tmp_path / "demo")
         bases.append(dict(zip(found.mapping.base_names, true, strict=True)))
     plain, more = bases
@@ -459,12 +457,12 @@ def test_a_term_that_the_demo_finds_and_did_not_simulate_is_truly_0(tmp_path, mo
 
 
 def test_nothing_stays_behind_when_a_run_fails_late(arm_logs, tmp_path, monkeypatch):
-    import robotid.cli.work.identify
+    import robotid.cli.identify
 
     def broken(*_args, **_options):
         raise OSError("disk full")
 
-    monkeypatch.setattr(robotid.cli.work.identify, "write_json", broken)
+    monkeypatch.setattr(robotid.cli.identify, "write_json", broken)
     out = tmp_path / "out"
     words = [
         "identify",

@@ -100,7 +100,7 @@ def test_drives_of_a_real_leg_are_as_large_as_they_can_be(result):
 
 
 def test_the_kept_window_is_followed_better_than_by_the_command(result):
-    [run] = result["simulation"]["validation"]
+    [run] = result["validation"]
     for own in run["per_joint"].values():
         assert own["rmse"] < 0.015  # [rad]
         assert own["rmse"] < 0.3 * own["command_rmse"]

@@ -19,9 +19,10 @@ from helpers.paths import ROOT
 from helpers.synthetic import exact_log, truth
 
 from robotid.base.typing import STAGES
-from robotid.cli import compare, doctor, main, printing
+from robotid.cli import compare, doctor, main
+from robotid.cli import console as printing
 from robotid.cli.console import terminal_progress
-from robotid.cli.work.job import LogEntry
+from robotid.cli.job import LogEntry
 from robotid.data.files.read import write_log
 from robotid.identification.pipeline import identify
 from robotid.robot.model import RobotModel
@@ -264,7 +265,7 @@ def test_the_doctor_counts_each_file_of_fitted_and_other_logs_once(monkeypatch, 
     model = SimpleNamespace(joints=("a",))
     job = SimpleNamespace(identification=windows, validation=others, ignore=(), model=lambda: model)
     monkeypatch.setattr(doctor, "job_from_flags", lambda options: job)
-    monkeypatch.setattr("robotid.cli.work.logs.examine", lambda *_, progress: [])
+    monkeypatch.setattr("robotid.cli.logs.examine", lambda *_, progress: [])
     assert doctor.run(SimpleNamespace(json=False, verbose=False)) == 0
     assert capsys.readouterr().out == "no fault found in 3 logs\n"
 
@@ -326,7 +327,7 @@ def test_too_little_memory_is_said(log, tmp_path, monkeypatch, capsys):
     def ask(*_, **__):
         raise MemoryError("Unable to allocate 9.1 TiB")
 
-    monkeypatch.setattr("robotid.cli.work.convert.convert", ask)
+    monkeypatch.setattr("robotid.cli.convert.convert", ask)
     assert main(["convert", str(tmp_path / "a.csv"), str(tmp_path / "b.csv")]) == 1
     said = capsys.readouterr().err
     assert said == (

@@ -13,10 +13,10 @@ from helpers.synthetic import exact_log, truth
 from robotid.base.exceptions import DataError
 from robotid.base.files import write_text
 from robotid.cli import main
-from robotid.cli.work.convert import convert
-from robotid.cli.work.job import job_from_settings
+from robotid.cli.convert import convert
+from robotid.cli.job import job_from_settings
+from robotid.data.files.formats import open_table, write_columns
 from robotid.data.files.read import read_log
-from robotid.data.files.table_files import open_table, write_columns
 from robotid.data.log import Log
 from robotid.data.signal_settings import LogSource
 from robotid.robot.examples import example_urdf

@@ -48,7 +48,7 @@ def test_a_folder_in_the_place_of_an_output_is_refused_before_the_work(
     assert sorted(before) == sorted(OUTPUTS)
     (tmp_path / name).unlink()
     (tmp_path / name).mkdir()
-    monkeypatch.setattr("robotid.cli.work.identify.identify_job", None)  # is not come to
+    monkeypatch.setattr("robotid.cli.identify.identify_job", None)  # is not come to
     assert main(["identify", URDF, log, "--out", str(tmp_path), "--cutoff", "5"]) == 2
     assert f"{name}' is a folder, wanted a file to write" in capsys.readouterr().err
     assert {p.name: p.read_bytes() for p in tmp_path.iterdir() if p.is_file()} == {

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from robotid.cli import excite, main
-from robotid.cli.work.excite import _designer, _expected
-from robotid.cli.work.job import Job
-from robotid.data.files.table_files import open_table
+from robotid.cli.excite import _designer, _expected
+from robotid.cli.job import Job
+from robotid.data.files.formats import open_table
 from robotid.data.signal_settings import LogSource, SignalSettings
 from robotid.design.clearance import Box
 from robotid.design.design import Designer

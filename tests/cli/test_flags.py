@@ -12,8 +12,8 @@ import pytest
 from robotid.base.exceptions import SettingsError
 from robotid.cli import doctor, excite, identify, main, preview, track
 from robotid.cli.flags import job_from_flags, source_words
+from robotid.cli.job import LogEntry, job_from_settings
 from robotid.cli.parser import CommandParser
-from robotid.cli.work.job import LogEntry, job_from_settings
 from robotid.data.signal_settings import LogSource, SignalSettings
 from robotid.estimation.fitting.estimator_settings import ESTIMATORS
 from robotid.estimation.workers.plan import WorkPlan
@@ -31,7 +31,6 @@ def test_every_setting_of_the_signals_has_a_flag():
         "rate": "200", "cutoff": "5", "order": "2", "velocity": "differentiated",
         "acceleration": "measured", "trim": "0.5", "min_velocity": "0.1", "friction_band": "0.05",
         "max_gap": "0.3", "torque_delay": "-0.005", "velocity_delay": "0.01",
-        "wrench_delay": "0.02",
     }  # fmt: skip
     flags = [x for name, word in words.items() for x in (f"--{name.replace('_', '-')}", word)]
     stated = {name: type(getattr(SignalSettings(), name))(word) for name, word in words.items()
@@ -239,7 +238,7 @@ def test_every_flag_reaches_the_function_that_does_the_work(words, monkeypatch):
     def heard(*asked, **stated):
         raise Heard(asked, stated)
 
-    monkeypatch.setattr(f"robotid.cli.work.{place}", heard)
+    monkeypatch.setattr(f"robotid.cli.{place}", heard)
     command = import_module(f"robotid.cli.{words.split()[0]}")
     if hasattr(command, "job_from_flags"):
         monkeypatch.setattr(command, "job_from_flags", lambda options: JOB_OF_FLAGS)
@@ -255,7 +254,7 @@ def test_progress_of_a_design_is_shown_if_asked(words, quiet, force, monkeypatch
     def heard(*_, **stated):
         raise Heard(stated["progress"])
 
-    monkeypatch.setattr("robotid.cli.work.excite.design_motion", heard)
+    monkeypatch.setattr("robotid.cli.excite.design_motion", heard)
     monkeypatch.setattr(excite, "job_from_flags", lambda options, needs_logs: JOB_OF_FLAGS)
     monkeypatch.setattr(excite, "terminal_progress", lambda **stated: nullcontext(stated))
     with pytest.raises(Heard) as caught:

@@ -14,9 +14,8 @@ from helpers.paths import ROOT
 from helpers.synthetic import exact_log, truth
 
 from robotid.base.exceptions import DataError, WorkerError
-from robotid.cli import main
-from robotid.cli.work import fleet
-from robotid.cli.work.fleet import UnitResult, _Gathered, read_fleet, run_fleet
+from robotid.cli import fleet, main
+from robotid.cli.fleet import UnitResult, _Gathered, read_fleet, run_fleet
 from robotid.data.files.read import write_log
 from robotid.estimation.variation.units_of_fleet import between_units
 from robotid.estimation.workers.checkpoint import FOLDER
@@ -351,7 +350,7 @@ def test_units_are_compared_by_parameter_robot_and_expression(monkeypatch):
     gathered.add(UnitResult([{"unit": "u7", "status": "failed", "error": "bad"}]))
     levels = []
     monkeypatch.setattr(
-        "robotid.cli.work.fleet.between_units",
+        "robotid.cli.fleet.between_units",
         lambda values, errors, level: levels.append(level) or between_units(values, errors, level),
     )
     found = gathered.content(units)

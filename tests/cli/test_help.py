@@ -53,7 +53,7 @@ def test_help_has_no_words_of_python_or_markdown(capsys, command):
 def test_a_word_that_is_near_to_none_is_answered_with_all(capsys):
     code, said = printed(capsys, "zzz")
     assert code == 2
-    assert "'zzz' is unknown. Known: demo, paper, inspect, identify, " in said
+    assert "'zzz' is unknown. Known: compare, convert, demo, " in said
 
 
 @pytest.mark.parametrize("module", [identify, excite], ids=["identify", "excite"])

@@ -16,15 +16,15 @@ from helpers.synthetic import exact_log, truth
 from robotid.base.exceptions import DataError, SettingsError
 from robotid.base.files import file_sha256
 from robotid.cli import main
-from robotid.cli.work.identify import _job_of, run_job
-from robotid.cli.work.job import Job, LogEntry
+from robotid.cli.identify import _job_of, run_job
+from robotid.cli.job import Job, LogEntry
 from robotid.data.files.read import write_log
 from robotid.data.signal_settings import SignalSettings
 from robotid.dynamics.friction_projection import project_friction
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
 from robotid.identification.closed_loop.loop_settings import LoopSettings
 from robotid.identification.pipeline import identify
-from robotid.identification.result import Identification
+from robotid.identification.result import TorqueIdentification
 from robotid.output.files.urdf import DYNAMICS_TERMS
 from robotid.robot.drives import Stribeck
 from robotid.robot.examples import example_urdf
@@ -235,7 +235,7 @@ def test_the_robot_of_a_result_is_that_of_the_job_that_is_saved_with_it(arm):
         job=None, friction={"*": ""}, signals=SignalSettings(cutoff=5.0), ignore=("late",)
     )
     estimator = EstimatorSettings(draws=17)
-    found = object.__new__(Identification)
+    found = object.__new__(TorqueIdentification)
     vars(found).update(
         model=model, asked=asked, drives=(), estimator=estimator, fitted=(), validation=()
     )

@@ -5,13 +5,12 @@ import numpy as np
 import pytest
 
 from robotid.base.exceptions import SettingsError
-from robotid.cli.work.job import Job, _motors, job_from_settings, read_job
+from robotid.cli.job import Job, _motors, job_from_settings, read_job
 from robotid.data.files.read import write_log
 from robotid.data.log import Log
 from robotid.data.signal_settings import LogSource
 from robotid.robot.constraints import Loop
-from robotid.robot.drives import DRIVE_TERMS
-from robotid.robot.families import AUTO
+from robotid.robot.drives import AUTO, DRIVE_TERMS
 from robotid.robot.model import GRAVITY
 from robotid.robot.parameters import Coupling
 from tests.helpers.closed_chains import FOUR_BAR, FOUR_BAR_LOOP

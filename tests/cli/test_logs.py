@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from robotid.base.exceptions import DataError, SettingsError
-from robotid.cli.work import logs as module
-from robotid.cli.work.job import Job, LogEntry
-from robotid.cli.work.logs import (
+from robotid.cli import logs as module
+from robotid.cli.job import Job, LogEntry
+from robotid.cli.logs import (
     examine_logs,
     locked_as_logged,
     log_of_commands,
@@ -52,7 +52,7 @@ def test_joints_stand_where_the_job_says_or_their_leader_does(hand, locked, want
 def test_what_is_read_is_what_the_job_says_of_windows_and_of_joints_that_slide(hand, monkeypatch):
     told = {}
     monkeypatch.setattr(
-        "robotid.cli.work.job.read_log", lambda path, **stated: told.update(stated, path=path)
+        "robotid.cli.job.read_log", lambda path, **stated: told.update(stated, path=path)
     )
     job = replace(hand, gains={"ja": 2.0}, columns={"q_ja": "angle"})
     job.read(LogEntry(Path("a.csv"), 1.5, 7.25), job.model(), needs="motion")

@@ -10,13 +10,12 @@ from helpers.synthetic import exact_log, truth
 
 from robotid.base.exceptions import SettingsError
 from robotid.base.files import file_sha256
-from robotid.cli import main
-from robotid.cli.work import payload
-from robotid.cli.work.identify import run_job
-from robotid.cli.work.job import job_from_settings
-from robotid.cli.work.payload import stated_masses
+from robotid.cli import main, payload
+from robotid.cli.identify import run_job
+from robotid.cli.job import job_from_settings
+from robotid.cli.payload import stated_masses
+from robotid.data.files.formats import write_columns
 from robotid.data.files.read import write_log
-from robotid.data.files.table_files import write_columns
 from robotid.diagnosis.verdict.payload_check import PayloadCheck
 from robotid.output.files.result_file import load_result, stated_scale_check
 from robotid.output.report.next_steps import next_steps
@@ -212,7 +211,7 @@ def test_friction_is_chosen_of_torques_in_the_gains_that_were_found(
         asked_of.append(job.gains)
         return {}
 
-    monkeypatch.setattr("robotid.cli.work.payload._chosen_terms", no_terms)
+    monkeypatch.setattr("robotid.cli.payload._chosen_terms", no_terms)
     words = [files / "loaded_currents.csv", "--reference", files / "bare_currents.csv", "--link",
              "tool0", "--mass", "2", "--gains", "--gain", "elbow_joint=11", "--json"]  # fmt: skip
     found = json.loads(asked(capsys, *words))["gains"]

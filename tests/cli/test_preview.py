@@ -9,13 +9,12 @@ import pytest
 from helpers.synthetic import exact_log, truth
 
 from robotid.base.exceptions import DataError
-from robotid.cli import main
-from robotid.cli.work import preview
-from robotid.cli.work.identify import run_job
-from robotid.cli.work.job import LogEntry, job_from_settings
-from robotid.cli.work.preview import _motions
+from robotid.cli import main, preview
+from robotid.cli.identify import run_job
+from robotid.cli.job import LogEntry, job_from_settings
+from robotid.cli.preview import _motions
+from robotid.data.files.formats import write_columns
 from robotid.data.files.read import read_log, write_log
-from robotid.data.files.table_files import write_columns
 from robotid.robot.examples import example_urdf
 
 NOISE = np.array([2.0, 3.0, 1.0, 0.3, 0.2, 0.1])  # [N m]

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from robotid.cli.work.identify import run_job
-from robotid.cli.work.job import read_job
+from robotid.cli.identify import run_job
+from robotid.cli.job import read_job
 from robotid.estimation.fitting.evaluation import predict
 from robotid.output.files.result_file import read_result
 from robotid.output.files.urdf import load_identified

@@ -16,12 +16,11 @@ from helpers.replay_data import leave_out_meshes, shown
 from helpers.synthetic import exact_log, payload_log, truth
 
 from robotid.base.exceptions import DataError
-from robotid.cli import main
-from robotid.cli.work import replay
-from robotid.cli.work.job import Job, LogEntry
-from robotid.cli.work.replay import _base_poses, read_findings, replay_identified
+from robotid.cli import main, replay
+from robotid.cli.job import Job, LogEntry
+from robotid.cli.replay import _base_poses, read_findings, replay_identified
+from robotid.data.files.formats import write_columns
 from robotid.data.files.read import write_log
-from robotid.data.files.table_files import write_columns
 from robotid.data.log import Log
 from robotid.output.files.result_file import load_result
 from robotid.robot.examples import example_urdf

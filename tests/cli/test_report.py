@@ -16,10 +16,10 @@ from robotid.base.exceptions import DataError
 from robotid.base.files import file_sha256
 from robotid.base.versions import versions
 from robotid.cli import main
-from robotid.cli.work.identify import run_job
-from robotid.cli.work.job import Job, LogEntry
-from robotid.cli.work.logs import log_of_commands
-from robotid.cli.work.report import _require_same
+from robotid.cli.identify import run_job
+from robotid.cli.job import Job, LogEntry
+from robotid.cli.logs import log_of_commands
+from robotid.cli.report import _require_same
 from robotid.data.files.read import write_log
 from robotid.dynamics.prediction import predict_instants
 from robotid.estimation.fitting.estimator_settings import SimulationSettings

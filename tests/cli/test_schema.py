@@ -13,8 +13,8 @@ from helpers.paths import ROOT
 
 from robotid.base.exceptions import SettingsError
 from robotid.cli import main
-from robotid.cli.work.job import Job, job_from_settings
-from robotid.cli.work.schema import job_schema
+from robotid.cli.job import Job, job_from_settings
+from robotid.cli.schema import job_schema
 from robotid.estimation.fitting.estimator_settings import ESTIMATORS
 
 JOBS = sorted((ROOT / "tests/jobs").rglob("*.toml"))

@@ -9,12 +9,10 @@ import numpy as np
 import pytest
 from helpers.synthetic import exact_log, truth
 
-from robotid.base.files import file_sha256
-from robotid.base.findings import Finding
-from robotid.cli.work import validate
-from robotid.cli.work.identify import run_job
-from robotid.cli.work.job import LogEntry, job_from_settings
-from robotid.cli.work.validate import validate_result
+from robotid.cli import validate
+from robotid.cli.identify import run_job
+from robotid.cli.job import job_from_settings
+from robotid.cli.validate import validate_result
 from robotid.data.files.read import write_log
 from robotid.data.log import Log, Trajectory
 from robotid.dynamics.torque import joint_torque_regressor
@@ -275,51 +273,3 @@ def test_the_expected_error_has_the_parts_of_fit_spread_and_residual(arm, rng, m
             assert own["rmse"] == pytest.approx(np.sqrt(np.mean(total[:, j] ** 2)), rel=1e-9)
             inside = np.abs(z[mask[:, j], j]) <= 1.96
             assert own["within_95_pct"] == pytest.approx(100 * inside.mean(), abs=0.5)
-
-
-@pytest.mark.parametrize("is_known", [True, False])
-def test_logs_of_commands_are_judged_by_the_joints_that_they_move(tmp_path, monkeypatch, is_known):
-    """A log that was fitted among two makes them no validation; what blocks goes to the verdict."""
-    paths = [tmp_path / "a.csv", tmp_path / "b.csv"]
-    for path in paths:
-        path.write_text(path.name)
-    inputs = [
-        {"role": "identification" if is_known else "payload", "sha256": file_sha256(paths[1])},
-        {"role": "validation", "sha256": file_sha256(paths[0])},
-    ]
-    content = {"inputs": inputs, "outputs": {"urdf": "found.urdf"}}
-    loaded = SimpleNamespace(
-        robot=SimpleNamespace(joints=("one", "two")), open_loop=lambda log: f"run of {log}",
-        content=content, path=tmp_path / "result.json",
-    )  # fmt: skip
-    found = [Finding("clock", "error", "a.csv", "jumps", {})]
-    asked = {}
-
-    def judged(metrics, joints, **options):
-        asked.update(options, metrics=metrics, joints=joints)
-        return SimpleNamespace(to_dict=lambda: {"status": "usable"})
-
-    for name, function in {
-        "log_of_commands": lambda job, entry, loaded: entry.path.name,
-        "diagnose": lambda model, shown, logs, signals: found if logs == ["a.csv", "b.csv"] else [],
-        "blocking": lambda found, ignore: [f for f in found if f.code not in ignore],
-        "position_metrics": lambda model, runs, moving=False: (runs, moving),
-        "judge_positions": judged,
-        "_errors_of": lambda model, run: {"of": run},
-    }.items():
-        monkeypatch.setattr(validate, name, function)
-    job = SimpleNamespace(signals=None, ignore=())
-    entries = [LogEntry(path) for path in paths]
-    content = validate._validate_commands(loaded, job, entries)
-    runs = ["run of a.csv", "run of b.csv"]
-    assert asked == {
-        "metrics": (runs, True), "joints": ("one", "two"), "is_validation": not is_known,
-        "log_errors": ["jumps"],
-    }  # fmt: skip
-    assert content == {
-        "result": str(loaded.path), "predicted_with": "found.urdf",
-        "validation": [{"of": run} for run in runs], "verdict": {"status": "usable"},
-    }  # fmt: skip
-    job.ignore = ("clock",)
-    validate._validate_commands(loaded, job, entries)
-    assert asked["log_errors"] == []

@@ -12,13 +12,12 @@ from helpers.synthetic import truth
 
 from robotid.base.exceptions import DataError, SettingsError
 from robotid.cli import main
-from robotid.cli.identify import show_result
+from robotid.cli.identify import run_job, show_result
+from robotid.cli.job import LogEntry, job_from_settings
+from robotid.cli.logs import survey_logs
+from robotid.cli.preview import preview_job
 from robotid.cli.validate import _show as show_validation
-from robotid.cli.work.identify import run_job
-from robotid.cli.work.job import LogEntry, job_from_settings
-from robotid.cli.work.logs import survey_logs
-from robotid.cli.work.preview import preview_job
-from robotid.cli.work.validate import validate_result
+from robotid.cli.validate import validate_result
 from robotid.data.files.read import write_log
 from robotid.dynamics.torque import joint_torque_regressor
 from robotid.estimation.fitting.recorded import Recordings
@@ -280,7 +279,7 @@ def changed_log(found, seed, **factors):
 @pytest.fixture
 def written(result, folder, tmp_path, monkeypatch):
     """A copy of the result, two new logs, and the fitted ones out of reach; no doctor."""
-    monkeypatch.setattr("robotid.cli.work.validate.diagnose", lambda *_: [])
+    monkeypatch.setattr("robotid.cli.validate.diagnose", lambda *_: [])
     found, _ = result
     for file in (folder / "out").glob("*.*"):
         if file.suffix in (".urdf", ".json"):

@@ -32,8 +32,8 @@ from robotid.diagnosis.urdf.inertials import (
 )
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.constraint_rows import logged_base
-from robotid.robot.assumed import with_assumed_inertials
 from robotid.robot.model import RobotModel
+from robotid.robot.prior import with_assumed_inertials
 
 
 def check_logs(

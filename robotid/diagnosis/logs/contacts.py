@@ -15,14 +15,13 @@ from robotid.data.signals import process
 from robotid.diagnosis.catalogue import finding
 from robotid.diagnosis.logs.base_pose import check_order, check_pose, check_twist, check_unit, rms
 from robotid.diagnosis.logs.imu import check_imu
+from robotid.dynamics.completed_logs import closed_log, with_contacts
 from robotid.dynamics.constraint_rows import (
     constraint_jacobian,
     force_basis,
     touching,
     without_forces,
 )
-from robotid.dynamics.constraints.closed_log import closed_log
-from robotid.dynamics.constraints.found_contacts import with_contacts
 from robotid.dynamics.prediction import predict
 from robotid.robot.constraints import Contact
 from robotid.robot.model import RobotModel

@@ -15,8 +15,7 @@ from robotid.base.typing import Array
 from robotid.diagnosis.catalogue import finding
 from robotid.diagnosis.logs.hypotheses import compensated, own_share
 from robotid.diagnosis.logs.torque_sample import Probe
-from robotid.robot.drives import COUNTERBALANCE
-from robotid.robot.families import drive_line, spring_family
+from robotid.robot.drives import COUNTERBALANCE, drive_line, spring_family
 
 _SPREAD = 0.3  # prior standard deviation of a link's mass, relative to the URDF's
 _PRECISION = 0.05  # of a torque, model errors included

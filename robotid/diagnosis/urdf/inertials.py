@@ -9,9 +9,9 @@ import numpy as np
 from robotid.base.findings import Finding, listed
 from robotid.diagnosis.catalogue import finding
 from robotid.dynamics.base_parameters import BaseMapping, structural_mapping
-from robotid.robot.assumed import REASONS, assumed_masses
 from robotid.robot.bodies import link_places
 from robotid.robot.model import RobotModel
+from robotid.robot.prior import REASONS, assumed_masses
 from robotid.robot.tree import Inertial, Joint, Tree
 from robotid.robot.urdf_text import exact_angle, numbers
 

@@ -4,22 +4,22 @@ from __future__ import annotations
 
 import json
 import shlex
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from typing import TYPE_CHECKING, TypeAlias
 
 from robotid.base.findings import Cause, grouped, listed, toml_key
 from robotid.base.settings import is_number
+from robotid.diagnosis.catalogue import entries, step_of
 from robotid.diagnosis.residual.misfit_findings import setting_of, with_entries
 from robotid.diagnosis.verdict.evidence import GOOD, is_beaten
+from robotid.identification.result import Identification, TorqueIdentification
 from robotid.output.report.steps import MOST, NAMED, Origin, Step, exports_of, sentence_of
-from robotid.robot.drives import COUNTERBALANCE, DriveTerm
-from robotid.robot.families import spring_family
+from robotid.robot.drives import COUNTERBALANCE, DriveTerm, spring_family
 
 if TYPE_CHECKING:
     from robotid.diagnosis.verdict.payload_check import PayloadCheck
-    from robotid.identification.result import Identification
 
 _NEW = "NEW.csv"
 _LOADED = "LOADED.csv"
@@ -31,24 +31,51 @@ def next_steps(found: Identification, origin: Origin) -> tuple[Step, ...]:
 
     Steps for errors come first, then steps for warnings, then uses of the result.
     """
-    asked: dict[int, list[Cause]] = {}
+    if not isinstance(found, TorqueIdentification):
+        return _steps_of_motion(found, origin)
+    asked: dict[str, list[Cause]] = {}
     findings = [finding for finding in found.findings if finding.severity != "note"]
     causes = (*grouped(findings, found.model.joints), *_of_verdict(found))
-    named = {
-        j for c in causes if c.severity != "note" and c.code in _NAMED_CAUSES for j in c.joints
-    }
+    named = {j for c in causes if c.severity != "note" and _names_cause(c) for j in c.joints}
     for cause in causes:
         if cause.code in _UNNAMED and named.intersection(cause.joints):
             # the named cause of these joints has a step of its own
             cause = replace(cause, joints=tuple(j for j in cause.joints if j not in named))
             if not cause.joints:
                 continue
-        number = _step_for(cause)
-        if cause.severity != "note" and number is not None:
-            asked.setdefault(number, []).append(cause)
-    urgent = sorted(asked, key=lambda k: (all(c.severity != "error" for c in asked[k]), k))
-    steps = [_STEPS[number][0](found, origin, asked[number]) for number in urgent]
+        step = _step_for(cause)
+        if cause.severity != "note" and step:
+            asked.setdefault(step, []).append(cause)
+    in_order = [name for name in _STEPS if name in asked]
+    urgent = sorted(in_order, key=lambda name: all(c.severity != "error" for c in asked[name]))
+    steps = [_STEPS[name](found, origin, asked[name]) for name in urgent]
     return _once([*steps, *_uses(found, origin, steps)][:MOST])
+
+
+def _steps_of_motion(found: Identification, origin: Origin) -> tuple[Step, ...]:
+    """Return the uses of a result that predicts positions; of a poor one, what to correct."""
+    words = "Compare measured and predicted torque in the replay."
+    if found.has_gains:
+        words = "Compare the commanded, measured and simulated robot in the replay."
+    verdict, replay = found.verdict, Step(words, _replay(found, origin))
+    if verdict.status != "poor":
+        exports = exports_of(found.model.name, origin, has_gains=found.has_gains)
+        return (replay, *exports) if origin.folder else ()
+    again = (origin.again(),) if origin.source else ()
+    if errors := verdict.log_errors:
+        doctor = (shlex.join(["robotid", "doctor", *origin.source]),) if origin.source else ()
+        correct = f"Correct the logs, then repeat the identification: {errors[0]}."
+        return (Step(correct, (*doctor, *again)),)
+    poor = [name for name, joint in verdict.joints.items() if joint.status == "poor"]
+    causes = grouped([f for f in found.findings if f.severity == "warning"], found.model.joints)
+    urgent = sorted(causes, key=lambda cause: not set(poor).intersection(cause.joints))
+    words = (
+        f"Do not use the result: the simulated position of {listed(poor, NAMED)} is wrong. Find "
+        "out in the replay when, correct gains, limits, encoder zeros or the motion, and repeat "
+        "the identification."
+    )
+    steps = [Step(f"{sentence_of(cause.messages[0])}.") for cause in urgent[: MOST - 1]]
+    return (*steps, Step(words, (*replay.blocks, *again)))
 
 
 def _once(steps: Sequence[Step]) -> tuple[Step, ...]:
@@ -61,14 +88,14 @@ def _once(steps: Sequence[Step]) -> tuple[Step, ...]:
     return tuple(unique)
 
 
-_Maker: TypeAlias = "Callable[[Identification, Origin, Sequence[Cause]], Step]"
+_Maker: TypeAlias = "Callable[[TorqueIdentification, Origin, Sequence[Cause]], Step]"
 
 
-def _of_verdict(found: Identification) -> list[Cause]:
+def _of_verdict(found: TorqueIdentification) -> list[Cause]:
     """Return the causes of a verdict that no finding names."""
     causes, predictions = [], found.predictions
     measured = [(j, m) for metrics in predictions.values() for j, m in metrics.per_joint.items()]
-    rescaled = {f.where.rpartition(": ")[2] for f in found.findings if f.code == "gain_change"}
+    rescaled = {joint for f in found.findings if f.code == "gain_change" for joint in f.joints}
     beaten = {joint for joint, m in measured if is_beaten(m)} - rescaled
     poor = {j for j, m in measured if m.relative_error_pct and m.relative_error_pct > GOOD}
     for code, joints in (("beaten", beaten), ("poor_prediction", poor)):
@@ -85,10 +112,16 @@ def _of_verdict(found: Identification) -> list[Cause]:
     return causes
 
 
-def _step_for(cause: Cause) -> int | None:
-    """Return the number of the step that removes a cause; None if there is none."""
-    last = 0 if cause.severity == "error" else None  # doctor explains all other errors
-    return next((k for k, (_, codes) in enumerate(_STEPS) if cause.code in codes), last)
+def _step_for(cause: Cause) -> str:
+    """Return the name of the step that removes a cause; empty if there is none."""
+    last = "doctor" if cause.severity == "error" else ""  # doctor explains all other errors
+    return _OF_VERDICT.get(cause.code) or step_of(cause.code) or last
+
+
+def _names_cause(cause: Cause) -> bool:
+    """Whether a cause names why the error of its joints is large."""
+    names_cause = entries().get(cause.code, {}).get("names_cause", False)
+    return names_cause or step_of(cause.code) in ("terms", "as_found")
 
 
 def _named(causes: Sequence[Cause], wanted: Sequence[str] = ()) -> str:
@@ -96,7 +129,7 @@ def _named(causes: Sequence[Cause], wanted: Sequence[str] = ()) -> str:
     return listed(dict.fromkeys(j for cause in causes for j in cause.joints) or wanted, NAMED)
 
 
-def _scale(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:
+def _scale(found: TorqueIdentification, origin: Origin, causes: Sequence[Cause]) -> Step:
     before, after, _ = found.scale_check.masses
     check = ""
     if any(cause.code in ("total_mass", "urdf_mismatch") for cause in causes):
@@ -141,7 +174,7 @@ def _gain_flags(origin: Origin) -> list[tuple[str, str]]:
     return [(joint, value) for joint, _, value in (text.partition("=") for text in stated)]
 
 
-def _payload_gains(found: Identification, payload: PayloadCheck | None = None) -> list[str]:
+def _payload_gains(found: TorqueIdentification, payload: PayloadCheck | None = None) -> list[str]:
     """Return the command that identifies the gains of currents; nothing without files."""
     urdf, log = str(found.model.tree.path), str(found.fitted[0].recording.log.path)
     if not log:
@@ -153,7 +186,7 @@ def _payload_gains(found: Identification, payload: PayloadCheck | None = None) -
     return [shlex.join(["robotid", "payload", urdf, loaded, *flags])]
 
 
-def _gains(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:
+def _gains(found: TorqueIdentification, origin: Origin, causes: Sequence[Cause]) -> Step:
     joints = list(dict.fromkeys(j for cause in causes for j in cause.joints))
     words = (
         f"If the column is a current, state the gain of {listed(joints or ['the joints'], NAMED)} "
@@ -165,7 +198,7 @@ def _gains(found: Identification, origin: Origin, causes: Sequence[Cause]) -> St
     return Step(words, (*origin.stating("[torque.gains]", line, *flags), *_payload_gains(found)))
 
 
-def _delay(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:
+def _delay(found: TorqueIdentification, origin: Origin, causes: Sequence[Cause]) -> Step:
     delays = [finding.evidence["delay"] for cause in causes for finding in cause.findings]
     delay = f"{sum(delays) / len(delays):.4f}"
     words = (
@@ -176,10 +209,10 @@ def _delay(found: Identification, origin: Origin, causes: Sequence[Cause]) -> St
     return Step(words, origin.stating("[signals]", line, "--torque-delay", delay))
 
 
-def _locks(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:
+def _locks(found: TorqueIdentification, origin: Origin, causes: Sequence[Cause]) -> Step:
     joints = list(found.model.locked)
     places = {
-        finding.where.rpartition(": ")[2]: f"{finding.evidence['median']:.4g}"
+        finding.joints[0]: f"{finding.evidence['median']:.4g}"
         for cause in causes
         for finding in cause.findings
         if "median" in finding.evidence
@@ -191,7 +224,7 @@ def _locks(found: Identification, origin: Origin, causes: Sequence[Cause]) -> St
     return Step(words, origin.stating("[locked]", line, *flags))
 
 
-def _validate(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:
+def _validate(found: TorqueIdentification, origin: Origin, causes: Sequence[Cause]) -> Step:
     words = (
         "Record another motion and use it as validation log: the prediction of other motions is "
         "not verified."
@@ -200,7 +233,7 @@ def _validate(found: Identification, origin: Origin, causes: Sequence[Cause]) ->
     return Step(words, origin.stating("[[validation]]", line, "--validate", _NEW))
 
 
-def _pin(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:
+def _pin(found: TorqueIdentification, origin: Origin, causes: Sequence[Cause]) -> Step:
     joints = {joint for cause in causes for joint in cause.joints}
     links = [joint.child for joint in found.model.tree.movable if joint.name in joints]
     words = (
@@ -211,7 +244,7 @@ def _pin(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step
     return Step(words, origin.stating("[estimator.constraints]", line))
 
 
-def _terms(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:
+def _terms(found: TorqueIdentification, origin: Origin, causes: Sequence[Cause]) -> Step:
     """Return the step that adds missing drive terms to the model."""
     codes = {cause.code for cause in causes}
     entries: dict[str, list[str | DriveTerm]] = {}
@@ -227,7 +260,7 @@ def _terms(found: Identification, origin: Origin, causes: Sequence[Cause]) -> St
             own += [entry for entry in misfit.entries if entry not in own]
     lines = [with_entries(found, joint, own) for joint, own in entries.items()]
     blocks = [*couplings.values(), *(["\n".join(["[drives]", *lines])] if lines else [])]
-    what = listed(dict.fromkeys(_CAUSES[cause.code] for cause in causes))
+    what = listed(dict.fromkeys(entries()[cause.code]["cause"] for cause in causes))
     words = f"Add the missing drive terms to the model of {_named(causes)}: {what}."
     if not blocks and any(m.term.name == "coulomb" and m.term.code in codes for m in found.misfits):
         return Step(
@@ -245,13 +278,13 @@ def _balanced(causes: Sequence[Cause]) -> list[tuple[str, float]]:
     """Return the joints with a counterbalance, and the rotation of each [rad]."""
     found = [finding for cause in causes for finding in cause.findings]
     return [
-        (finding.where.rpartition(": ")[2], finding.evidence["turned"])
+        (finding.joints[0], finding.evidence["turned"])
         for finding in found
         if finding.code == "counterbalance" and "turned" in finding.evidence
     ]
 
 
-def _payload(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:
+def _payload(found: TorqueIdentification, origin: Origin, causes: Sequence[Cause]) -> Step:
     logs = [x for x in found.validation if not x.is_refitted] or list(found.fitted)
     log, urdf = str(logs[0].recording.log.path), str(found.model.tree.path)
     words = (
@@ -267,7 +300,7 @@ def _payload(found: Identification, origin: Origin, causes: Sequence[Cause]) -> 
     return Step(words, origin.using("payload", *words_of))
 
 
-def _unclipped(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:
+def _unclipped(found: TorqueIdentification, origin: Origin, causes: Sequence[Cause]) -> Step:
     words = (
         f"Record a slower motion, or one with less load: the torque of {_named(causes)} is clipped "
         "at its limit."
@@ -275,7 +308,7 @@ def _unclipped(found: Identification, origin: Origin, causes: Sequence[Cause]) -
     return Step(words, _another_log(origin))
 
 
-def _zeros(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:
+def _zeros(found: TorqueIdentification, origin: Origin, causes: Sequence[Cause]) -> Step:
     sizes = [f for cause in causes for f in cause.findings if "size" in f.evidence]
     by = "".join(f"; of {f.where} by {-f.evidence['size']:.3g}" for f in sizes)
     words = (
@@ -285,12 +318,12 @@ def _zeros(found: Identification, origin: Origin, causes: Sequence[Cause]) -> St
     return Step(words, (shlex.join(["robotid", "inspect", str(found.model.tree.path)]),))
 
 
-def _as_found(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:
+def _as_found(found: TorqueIdentification, origin: Origin, causes: Sequence[Cause]) -> Step:
     """Return the messages of the findings, which name a cause and its remedy."""
     return Step(" ".join(f"{sentence_of(m)}." for cause in causes for m in cause.messages[:1]))
 
 
-def _possible(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:
+def _possible(found: TorqueIdentification, origin: Origin, causes: Sequence[Cause]) -> Step:
     words = (
         f"Identify with the consistent estimator: the result of {found.estimator.name} is not "
         "physically consistent, and no URDF was written."
@@ -299,7 +332,7 @@ def _possible(found: Identification, origin: Origin, causes: Sequence[Cause]) ->
     return Step(words, origin.stating("[estimator]", 'name = "consistent"', *flags))
 
 
-def _watch(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:
+def _watch(found: TorqueIdentification, origin: Origin, causes: Sequence[Cause]) -> Step:
     rows = found.metrics().per_joint
     where, why = _named(causes, found.model.joints), "a wrong torque channel, a spring, gear ripple"
     if not any(joint in rows for joint in found.model.joints):  # no torques were measured
@@ -315,7 +348,7 @@ def _watch(found: Identification, origin: Origin, causes: Sequence[Cause]) -> St
     return Step(words, _replay(found, origin))
 
 
-def _richer(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:
+def _richer(found: TorqueIdentification, origin: Origin, causes: Sequence[Cause]) -> Step:
     count = len(found.determination.undetermined)
     words = (
         f"Record another motion with higher speeds and wider poses, and add it to the fitted logs: "
@@ -333,19 +366,19 @@ def _another_log(origin: Origin) -> tuple[str, ...]:
     return (f'[[identification]]\nlog = "{_NEW}"', *logs)
 
 
-def _inspect(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:
+def _inspect(found: TorqueIdentification, origin: Origin, causes: Sequence[Cause]) -> Step:
     words = "Correct the inertials of the URDF that its inspection rejects: they are the prior."
     return Step(words, (shlex.join(["robotid", "inspect", str(found.model.tree.path)]),))
 
 
-def _doctor(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:
+def _doctor(found: TorqueIdentification, origin: Origin, causes: Sequence[Cause]) -> Step:
     words = f"{sentence_of(causes[0].messages[0])}."
     return Step(
         words, (shlex.join(["robotid", "doctor", *origin.source]),) if origin.source else ()
     )
 
 
-def _uses(found: Identification, origin: Origin, asked: Sequence[Step]) -> list[Step]:
+def _uses(found: TorqueIdentification, origin: Origin, asked: Sequence[Step]) -> list[Step]:
     """Return the uses of a result, without commands that other steps have.
 
     A poor result is only examined.
@@ -372,86 +405,21 @@ def _uses(found: Identification, origin: Origin, asked: Sequence[Step]) -> list[
 
 
 def _replay(found: Identification, origin: Origin) -> tuple[str, ...]:
-    log = str((found.validation or found.fitted)[0].recording.log.path)
+    log = str((found.validation or found.fitted)[0].log.path)
     return origin.using("replay", str(found.model.tree.path), log, origin.folder)
 
 
-#: Drive terms that the model may lack, by the code of the finding.
-_CAUSES = {
-    "backlash": "backlash or windup",
-    "counterbalance": "a counterbalance",
-    "coupling": "a coupling to another joint",
-    "friction_shape": "another friction curve",
-    "load_friction": "load-dependent friction",
-    "position_periodic": "a torque that is periodic in the position",
-    "spring": "a spring",
-}
-#: Findings that name a cause but have no command: their messages state the remedy.
-_AS_FOUND = (
-    "angle_scale",
-    "active_bound",
-    "base_jump",
-    "base_orientation",
-    "base_unit",
-    "bunched_stamps",
-    "com_outside",
-    "constant_torque",
-    "contact_delay",
-    "dense_body",
-    "density",
-    "drift",
-    "ellipsoid",
-    "gain_change",
-    "gravity",
-    "gravity_compensated",
-    "gyration",
-    "repeated_torque",
-    "joint_axis",
-    "joint_order",
-    "joint_origin",
-    "joint_torque_delay",
-    "link_mass",
-    "lost_motion",
-    "mass_matrix",
-    "measured_wrench",
-    "moving_contact",
-    "payload",
-    "position_order",
-    "position_sign",
-    "rolling_contact",
-    "time_scale",
-    "torque_order",
-    "torque_sign",
-    "unlike_run",
-    "unlike_unit",
-    "unmounted_part",
-    "unsigned_torque",
-)
-#: Codes that name the cause of an error of a joint, and codes that state the error only.
-_NAMED_CAUSES = (*_CAUSES, *_AS_FOUND, "clipped", "payload_change", "position_offset")
+#: The steps, the most informative first, by the name that the catalogue of findings gives them.
+_STEPS: Mapping[str, _Maker] = {
+    "doctor": _doctor, "scale": _scale, "gains": _gains, "delay": _delay, "locks": _locks,
+    "zeros": _zeros, "payload": _payload, "unclipped": _unclipped, "terms": _terms,
+    "as_found": _as_found, "validate": _validate, "possible": _possible, "watch": _watch,
+    "pin": _pin, "richer": _richer, "inspect": _inspect,
+}  # fmt: skip
+#: Those of causes of a verdict that no finding names.
+_OF_VERDICT = {
+    "scale_unchecked": "scale", "not_validated": "validate", "impossible": "possible",
+    "poor_prediction": "watch", "beaten": "pin",
+}  # fmt: skip
+#: Codes that state the error of a joint only, not its cause.
 _UNNAMED = ("poor_prediction", "unexplained_torque", "constraint_costs")
-#: The steps, the most informative first, each with the codes that it removes.
-_STEPS: Sequence[tuple[_Maker, tuple[str, ...]]] = (
-    (_doctor, ()),
-    (_scale, ("total_mass", "urdf_mismatch", "scale_unchecked")),
-    (_gains, ("current_for_torque", "torque_scale")),
-    (_delay, ("torque_delay",)),
-    (_locks, ("locked_at_zero", "locked_position")),
-    (_zeros, ("position_offset",)),
-    (_payload, ("payload_change",)),
-    (_unclipped, ("clipped",)),
-    (_terms, tuple(_CAUSES)),
-    (_as_found, _AS_FOUND),
-    (_validate, ("not_validated", "repeated_motion", "validation_was_fitted")),
-    (_possible, ("impossible",)),
-    (_watch, (*_UNNAMED, "outliers", "spikes")),
-    (_pin, ("beaten",)),
-    (_richer, ("undetermined", "excitation", "weak_parameters", "no_motion")),
-    (
-        _inspect,
-        (
-            "copied_inertial", "default_inertial", "missing_inertial", "negative_mass",
-            "not_positive_definite", "zero_mass",
-        ),
-    ),
-)  # fmt: skip

@@ -27,12 +27,12 @@ from robotid.estimation.fitting.estimator_settings import (
 )
 from robotid.identification.closed_loop.loop_settings import LoopSettings
 from robotid.robot.constraints import Contact, Loop
-from robotid.robot.drives import DRIVE_TERMS, FAMILIES, TERMS, DriveTerm
-from robotid.robot.families import AUTO, term_from_dict
+from robotid.robot.drives import AUTO, DRIVE_TERMS, FAMILIES, TERMS, DriveTerm, term_from_dict
 from robotid.robot.parameters import DYNAMICS, Coupling
 
 if TYPE_CHECKING:
     from robotid.robot.model import RobotModel
+
 
 _MODEL_KEYS: Mapping[str, tuple[type, ...]] = {
     "friction" if term.is_friction else name: (str,) if term.is_friction else (bool,)
@@ -110,18 +110,14 @@ def _dump_couplings(couplings: Sequence[Coupling]) -> list[dict[str, Any]]:
 
 
 def _load_contacts(tables: Sequence[Mapping[str, Any]]) -> tuple[Contact, ...]:
-    lists = ("measured", "plate")
     return tuple(
-        Contact(**{**table, **{key: tuple(table.get(key, ())) for key in lists}})
-        for table in tables
+        Contact(**{**table, "measured": tuple(table.get("measured", ()))}) for table in tables
     )
 
 
 def _dump_contact(contact: Contact) -> dict[str, Any]:
-    table = asdict(contact) | {"measured": list(contact.measured), "plate": list(contact.plate)}
-    unstated: dict[str, Any] = {
-        "axes": "world", "plate": [], "threshold": None, "uncertainty": None,
-    }  # fmt: skip
+    table = asdict(contact) | {"measured": list(contact.measured)}
+    unstated: dict[str, Any] = {"axes": "world", "threshold": None, "uncertainty": None}
     return {key: x for key, x in table.items() if key not in unstated or x != unstated[key]}
 
 
@@ -237,8 +233,7 @@ class Job(Settings):
         (),
         "links that may touch the ground: frame, the link; kind, point or surface; measured, "
         "components of the wrench that logs have as wrench_fz_<link>, of fx to mz, the others are "
-        "unknown; axes of these, world or link; plate, x, y, z [m] and roll, pitch, yaw [rad] "
-        "of the force plate whose origin and axes they have; always, whether it always touches the "
+        "unknown; axes of these, world or link; always, whether it always touches the "
         "ground (true if all components are measured), else logs have contact_<link>, 1 or 0, or "
         "it is found; threshold, for a column that is a force "
         "instead [N]; radius of a ball-shaped foot, below whose frame the ground is [m]; "
@@ -255,7 +250,6 @@ class Job(Settings):
                 "uncertainty": (int, float),
                 "axes": (str,),
                 "threshold": (int, float),
-                "plate": Entries(list, (int, float)),
             }
         ],
         load=_load_contacts,
@@ -347,8 +341,8 @@ class Job(Settings):
 
     def model(self) -> "RobotModel":
         """Return the robot, with the job's joints, gravity and drive terms."""
-        from robotid.robot.assumed import with_assumed_inertials
         from robotid.robot.model import RobotModel
+        from robotid.robot.prior import with_assumed_inertials
 
         gears = [gear for gear in self.transmissions if gear.matrix != "urdf"]
         motors = [motor for gear in gears for motor in _motors(gear)]

@@ -13,7 +13,7 @@ from robotid.base.exceptions import DataError, SettingsError
 from robotid.base.files import dataset_of, file_sha256, log_exists
 from robotid.base.findings import Finding, by_severity
 from robotid.base.typing import STAGES, ProgressCallback, report_stage
-from robotid.cli.work.job import Job, LogEntry, job_from_settings
+from robotid.cli.job import Job, LogEntry, job_from_settings
 from robotid.data.files.columns import Needs
 from robotid.data.files.read import LogLayout
 from robotid.data.files.table import Table
@@ -30,6 +30,7 @@ from robotid.robot.model import RobotModel
 
 if TYPE_CHECKING:
     from robotid.design.previews import Run
+
 
 _PIECES = 8  # pieces per rows in memory: the filter of a piece needs memory of its own
 _SHORTEST = 256  # rows of a piece
