@@ -24,7 +24,7 @@ PACKAGES = {
     "data": [".", "files"],
     "dynamics": ["kernels", ".", "simulation"],
     "estimation": ["workers", "estimators", "variation", "fitting"],
-    "diagnosis": ["urdf", "logs", "residual", "verdict"],
+    "diagnosis": [".", "urdf", "logs", "residual", "verdict"],
     "identification": [".", "closed_loop", "online"],
     "design": ["."],
     "output": ["pages", "files", "viewer", "report"],

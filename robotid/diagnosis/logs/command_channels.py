@@ -8,13 +8,11 @@ from itertools import pairwise
 import numpy as np
 
 from robotid.base.findings import Finding, listed
-from robotid.base.text import period
 from robotid.base.typing import Array
 from robotid.data.log import Log
 from robotid.data.measured_velocity import quantum
 from robotid.diagnosis.catalogue import finding
 from robotid.diagnosis.logs.clock import runs_of
-from robotid.diagnosis.logs.command_lead import find_lead
 
 _SECONDS = 5.0  # [s] length of the segments whose spectra are averaged
 _GAP = 5  # [median steps] a longer step ends the segment that is examined
@@ -47,6 +45,7 @@ _TOP = 0.1  # relative distance from the largest speed within which a joint runs
 _FLAT = 0.6  # least share at the largest speed, of the rows above half of it; a sine has 0.43
 _OFTEN = 0.02  # share of the rows at the largest speed from which it is reported
 _UNLIKE = 0.2  # least relative difference between this speed and the speed of the command
+_LEADS = 5.0  # standard errors by which a joint moves before its command
 _PULSES = 3  # least number of movements that end at one speed
 
 
@@ -305,16 +304,10 @@ def _alike(log: Log, loops: Sequence[_Loop]) -> Iterator[Finding]:
 def _early(log: Log, loops: Sequence[_Loop]) -> Iterator[Finding]:
     """Yield joints that move before their command, which is impossible."""
     for loop in loops:
-        found = find_lead(loop.command, loop.q, loop.step, loop.bandwidth, len(loops))
-        if found is None:
-            continue
-        t = log.t[loop.rows]
-        is_whole = found.stop - found.start == len(t)
-        part = "" if is_whole else f" in {period(float(t[found.start]), float(t[found.stop - 1]))}"
-        yield finding(
-            "delayed_command", log.name, loop.name, part=part, lag=-found.lead, lead=found.lead,
-            std_error=found.std_error,
-        )  # fmt: skip
+        lag, error = loop.lag
+        if lag < -max(_LEADS * error, loop.step):
+            yield finding("delayed_command", log.name, loop.name, lag=lag, lead=-lag,
+                          std_error=error)  # fmt: skip
 
 
 def _slow(log: Log, loops: Sequence[_Loop]) -> Iterator[Finding]:

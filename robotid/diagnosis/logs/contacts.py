@@ -193,10 +193,7 @@ def _relative(velocity: Array, flags: Array) -> Array:
 
 
 def _of_pairs(J: Array, flags: Array, v: Array) -> tuple[Array, Array]:
-    """Return D and d of the relative velocities D w + d of pairs of links in contact.
-
-    J (N, k, 3, n_rows), flags (N, k), v (N, n_rows).
-    """
+    """Return D and d of the relative velocities D w + d of pairs of links in contact."""
     D, d = np.zeros((len(J), 0, 3)), np.zeros((len(J), 0))
     for i, j in combinations(range(J.shape[1]), 2):
         both = flags[:, i] & flags[:, j]
@@ -225,8 +222,6 @@ def _radius(stated: float, v: Array, rolls: Array) -> tuple[float, float, float]
     """Return the radius of a foot in contact that rolls as a ball of another one than stated.
 
     With it are the median speeds with the stated radius and with this one.
-
-    v (N, 3) [m/s], rolls (N, 3) [1/s].
     """
     pace = np.linalg.norm(rolls, axis=1)
     if not np.any(pace > 0.0):

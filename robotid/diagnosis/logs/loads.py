@@ -42,38 +42,26 @@ _MISMATCH = 7.5  # largest sum of squared errors of the links, in standard devia
 
 @dataclass(frozen=True, eq=False)
 class LoadModel:
-    """The whitened torques of each joint, projected orthogonally to the columns of its drive.
+    """The whitened torques of each joint, projected orthogonally to the columns of its drive."""
 
-    Attributes:
-        R: Triangular factor of the c free parameters and the torque of each joint, shape
-            (n, c+1, c+1); 0 of joints that are ignored.
-        mean: Prior mean of the free parameters: factors of the URDF's links, and m, mcx, mcy, mcz
-            of a payload.
-        spread: Prior standard deviation, shape (c,).
-        expected: Misfit of torques that fit as well as with separate parameters for each joint.
-        independent: Number of independent torques.
-    """
-
+    #: Triangular factor of the c free parameters and the torque of each joint, shape (n, c+1, c+1);
+    #: 0 of joints that are ignored
     R: Array
+    #: Prior mean of the free parameters: factors of the URDF's links, and m, mcx, mcy, mcz of a
+    #: payload
     mean: Array
-    spread: Array
-    expected: float
-    independent: float
+    spread: Array  # Prior standard deviation, shape (c,)
+    expected: float  # Misfit of torques that fit as well as with separate parameters for each joint
+    independent: float  # Number of independent torques
 
     def misfits(self, scales: Array) -> Array:
-        """Return the misfits of scaled torques: chi-squares, prior included, shape (T,).
-
-        scales (T, n).
-        """
+        """Return the misfits of scaled torques: chi-squares, prior included, shape (T,)."""
         R = np.asarray(np.linalg.qr(self._rows(scales), mode="r"))  # (T, c+1, c+1)
         chi: Array = R[:, -1, -1] ** 2
         return chi
 
     def fit(self, scale: Array) -> tuple[float, Array, Array]:
-        """Fit with the torque columns multiplied by a scale, without negative masses of links.
-
-        scale (n,).
-        """
+        """Fit with the torque columns multiplied by a scale, without negative masses of links."""
         from scipy.optimize import lsq_linear
 
         rows = self._rows(scale[None])[0]
@@ -125,8 +113,6 @@ def check_loads(probe: Probe, share: Array, name: str) -> Iterator[Finding]:
 
     Another scale is accepted if the torques then fit with about the URDF's masses; else the URDF
     is of another robot.
-
-    share (n,).
     """
     model = load_model(probe, share)
     bodies = len(probe.model.layout.bodies)

@@ -22,10 +22,7 @@ def check_locked(
     asked: Collection[str],
     units: LogUnits,
 ) -> Iterator[Finding]:
-    """Yield an error "locked_position" per locked joint that moves or has another position.
-
-    positions (N,) [rad or m].
-    """
+    """Yield an error "locked_position" per locked joint that moves or has another position."""
     prismatic = {joint.name for joint in model.tree.movable if joint.type == "prismatic"}
     for joint, q in positions.items():
         stated = model.locked[joint]

@@ -40,8 +40,6 @@ def check_unmounted_parts(probe: Probe, share: Array, name: str) -> Iterator[Fin
 
     Parts are links that fixed or locked joints attach to the link of the last moving joint, with
     all links that they carry.
-
-    share (n,).
     """
     model = load_model(probe, share)
     whole, loaded = _misfit_without_load(model), model.fit(np.ones(len(share)))[0]
@@ -67,19 +65,12 @@ def check_unmounted_parts(probe: Probe, share: Array, name: str) -> Iterator[Fin
 
 @dataclass(frozen=True, eq=False)
 class Segments:
-    """Motions of a robot, and the reduced least-squares problems of their segments.
+    """Motions of a robot, and the reduced least-squares problems of their segments."""
 
-    Attributes:
-        model: The robot.
-        mapping: Standard to base parameters.
-        motions: The motions.
-        min_velocity: Lower bound on the speed of the rows that are used.
-    """
-
-    model: RobotModel
-    mapping: BaseMapping
-    motions: Sequence[Trajectory]
-    min_velocity: float
+    model: RobotModel  # The robot
+    mapping: BaseMapping  # Standard to base parameters
+    motions: Sequence[Trajectory]  # The motions
+    min_velocity: float  # Lower bound on the speed of the rows that are used
 
     @property
     def seconds(self) -> float:

@@ -115,8 +115,6 @@ def _refined(applied: _Applied, x: Array, pi: Array, sample: Sample) -> tuple[Ar
 
     Torques are nonlinear over a tenth of a radian: Gauss-Newton steps are repeated until the sizes
     converge.
-
-    x (c,), pi (p,).
     """
     every, error = list(range(len(x))), np.full(len(x), np.inf)
     for _ in range(_STEPS):

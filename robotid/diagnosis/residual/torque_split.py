@@ -98,8 +98,6 @@ def split_torque(
     """Return the parts of the torques that parameters predict.
 
     A static model has no torques of motion: gravity is the only part of the bodies.
-
-    pi (p,), q (N, n) [rad, m], v (N, n_rows) [rad/s, m/s], a (N, n_rows) [rad/s^2, m/s^2].
     """
     layout, first = model.layout, model.n_rows - len(model.joints)
     wanted = (len(q), model.n_rows)
@@ -123,21 +121,14 @@ def split_torque(
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """Samples of recordings, one after the other.
+    """Samples of recordings, one after the other."""
 
-    Attributes:
-        recordings: Names of the recordings.
-        t: Time stamps, shape (N,) [s].
-        recording: Recording of each sample, shape (N,), int.
-        segment: Uninterrupted segment of it, shape (N,), int.
-        segments: Segment that is held out in turn, shape (N,), int; None if the recordings are too
-            short for six.
-    """
-
-    recordings: tuple[str, ...]
-    t: Array
-    recording: Array
-    segment: Array
+    recordings: tuple[str, ...]  # Names of the recordings
+    t: Array  # Time stamps, shape (N,) [s]
+    recording: Array  # Recording of each sample, shape (N,), int
+    segment: Array  # Uninterrupted segment of it, shape (N,), int
+    #: Segment that is held out in turn, shape (N,), int; None if the recordings are too short for
+    #: six
     segments: Array | None
 
     @property

@@ -44,8 +44,6 @@ def audit_bodies(model: RobotModel, pi: Array, points: Mapping[str, Array]) -> I
     """Yield the bodies whose parameters are impossible in the box around their geometry.
 
     A body without geometry is compared with the length that the kinematics give it.
-
-    pi (p,), points (k, 3) [m].
     """
     J = pseudo_inertia(pi[: model.layout.n_inertial])
     lengths = kinematic_lengths(model) if set(model.layout.bodies) - points.keys() else {}

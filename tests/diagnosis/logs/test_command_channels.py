@@ -3,7 +3,6 @@
 import os
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -17,7 +16,7 @@ from robotid.data.files.read import read_log, write_log
 from robotid.data.log import Log
 from robotid.data.signal_settings import LogSource, SignalSettings
 from robotid.diagnosis.logs.check_logs import check_logs
-from robotid.diagnosis.logs.command_channels import _sampled, check_commands
+from robotid.diagnosis.logs.command_channels import check_commands
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 
@@ -349,20 +348,3 @@ def test_velocities_of_a_log_without_torque_are_judged_without_it(ur5, of_ur5):
         findings = check_logs(ur5, scaled, signals=SignalSettings(velocity=velocity))
         (finding,) = [f for f in findings if f.code == "velocity_scale"]
         assert finding.severity == severity
-
-
-def test_the_rate_that_is_wanted_is_that_of_the_widest_loop():
-    log = SimpleNamespace(name="run", joints=("a", "b", "c", "d"))
-    widths = {"a": 4.0, "b": 7.0, "c": 2.9, "d": np.nan}  # of d all that is excited is followed
-    loops = [
-        SimpleNamespace(
-            name=name, bandwidth=width, step=1 / 30, response=(np.array([1.0, 5.5]), None, None)
-        )
-        for name, width in widths.items()
-    ]
-    (found,) = _sampled(log, loops)
-    assert found.where == "run: a, b, d"
-    assert found.evidence == {"rate": pytest.approx(30.0), "bandwidth": 7.0}
-    assert "up to 7 Hz and are logged at 30 Hz, 4.3 rows per period" in found.message
-    assert "log at 70 Hz or more" in found.message
-    assert list(_sampled(log, loops[2:3])) == []

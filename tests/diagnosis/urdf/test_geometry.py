@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from robotid.diagnosis.urdf.inspection import inspect_urdf
-from robotid.diagnosis.urdf.mesh_check import _against_kinematics, audit_bodies, audit_links
+from robotid.diagnosis.urdf.mesh_check import audit_bodies, audit_links
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 
@@ -141,17 +141,6 @@ def test_a_link_without_geometry_is_compared_with_the_distance_of_its_joints(tmp
     assert [(f.where, f.severity) for f in slender(tmp_path, 0.1, com=0, offset=0)] == [
         ("link fore", "note")
     ]
-
-
-def test_joints_that_are_close_do_not_show_how_wide_a_body_is():
-    for axis, at, severities in (
-        (0.88, 0.0, ["note"]), (0.9, 0.0, ["warning"]), (0.1, 0.39, []), (0.1, 0.41, ["warning"]),
-    ):  # fmt: skip
-        second = np.diag([axis**2 / 20.0, 1e-3, 1e-3]) + np.diag([at**2, 0.0, 0.0])  # [m^2]
-        J = 2.0 * np.block([[second, np.array([[at], [0.0], [0.0]])], [at, 0.0, 0.0, 1.0]])
-        # its joints are 0.1 m apart, the longest distance of all is 0.4 m
-        found = list(_against_kinematics("a", J, 0.1, 0.4))
-        assert [finding.severity for finding in found] == severities
 
 
 def test_a_copied_inertial_is_told_by_the_other_size(tmp_path):
