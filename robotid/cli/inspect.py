@@ -29,13 +29,13 @@ def run(options: argparse.Namespace) -> None:
     content = inspection.to_dict()
     if not (content["robot"] or options.json):
         raise ModelError(content["findings"][0]["message"])
-    show_found(content, options, partial(_show, inspection.findings, options=options))
+    show_found(content, options, partial(_show, options=options, findings=inspection.findings))
     if content["structure"] is None:
         raise ModelError(f"{options.urdf} does not give a valid model; see the findings")
 
 
 def _show(
-    findings: Sequence[Finding], content: dict[str, Any], *, options: argparse.Namespace
+    content: dict[str, Any], *, options: argparse.Namespace, findings: Sequence[Finding]
 ) -> None:
     structure, joints = content["structure"], content["joints"]
     if content["robot"]:

@@ -5,6 +5,7 @@ from functools import partial
 
 import pytest
 
+from robotid.base.findings import Finding
 from robotid.cli import (
     compare,
     convert,
@@ -375,13 +376,14 @@ def test_inspect(shown):
         "robot": "arm", "joints": ["one", "two"],
         "structure": {"standard": 20, "base_inertial": 8, "base": 16},
         "base_groups": ["one.Izz + two.m", "two.mcx"],
-        "findings": [
-            {"code": "light", "severity": "warning", "link": "hand", "message": "hand: 1 g"},
-            {"code": "bare", "severity": "note", "joint": "two", "message": "two: no limits"},
-        ],
     }  # fmt: skip
+    findings = [
+        Finding("light", "warning", "link hand", "hand: 1 g"),
+        Finding("bare", "note", "joint two", "two: no limits"),
+    ]
     options = partial(Namespace, urdf="my arm.urdf", free_flyer=True)
-    assert shown(inspect._show, content, options=options(base=False, verbose=False)) == [
+    show = partial(inspect._show, findings=findings)
+    assert shown(show, content, options=options(base=False, verbose=False)) == [
         "arm: 2 joints: one, two",
         "20 standard inertial parameters, 8 base; with drives 16",
         "warning: light: hand: 1 g",
@@ -389,7 +391,7 @@ def test_inspect(shown):
         "list of base parameters:",
         "  robotid inspect 'my arm.urdf' --free-flyer --base",
     ]
-    assert shown(inspect._show, content, options=options(base=True, verbose=True)) == [
+    assert shown(show, content, options=options(base=True, verbose=True)) == [
         "arm: 2 joints: one, two",
         "20 standard inertial parameters, 8 base; with drives 16",
         "warning: light: hand: 1 g",

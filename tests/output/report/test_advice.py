@@ -33,7 +33,8 @@ def told(identified, *findings, **others):
 
 
 def warning(code, where="elbow_joint", severity="warning", **evidence):
-    return Finding(code, severity, where, f"{code} is so; do something", evidence)
+    joints = tuple(where.rpartition(": ")[2].split(", "))
+    return Finding(code, severity, where, f"{code} is so; do something", evidence, joints=joints)
 
 
 def files_of(identified):
