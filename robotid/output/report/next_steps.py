@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, TypeAlias
 
 from robotid.base.findings import Cause, grouped, listed, toml_key
 from robotid.base.settings import is_number
-from robotid.diagnosis.catalogue import entries, step_of
+from robotid.diagnosis.catalogue import entries as catalogue_entries
+from robotid.diagnosis.catalogue import step_of
 from robotid.diagnosis.residual.misfit_findings import setting_of, with_entries
 from robotid.diagnosis.verdict.evidence import GOOD, is_beaten
 from robotid.identification.result import Identification, TorqueIdentification
@@ -120,7 +121,7 @@ def _step_for(cause: Cause) -> str:
 
 def _names_cause(cause: Cause) -> bool:
     """Whether a cause names why the error of its joints is large."""
-    names_cause = entries().get(cause.code, {}).get("names_cause", False)
+    names_cause = catalogue_entries().get(cause.code, {}).get("names_cause", False)
     return names_cause or step_of(cause.code) in ("terms", "as_found")
 
 
@@ -260,7 +261,7 @@ def _terms(found: TorqueIdentification, origin: Origin, causes: Sequence[Cause])
             own += [entry for entry in misfit.entries if entry not in own]
     lines = [with_entries(found, joint, own) for joint, own in entries.items()]
     blocks = [*couplings.values(), *(["\n".join(["[drives]", *lines])] if lines else [])]
-    what = listed(dict.fromkeys(entries()[cause.code]["cause"] for cause in causes))
+    what = listed(dict.fromkeys(catalogue_entries()[cause.code]["cause"] for cause in causes))
     words = f"Add the missing drive terms to the model of {_named(causes)}: {what}."
     if not blocks and any(m.term.name == "coulomb" and m.term.code in codes for m in found.misfits):
         return Step(

@@ -31,7 +31,14 @@ JOINTS = ("a", "b", "c")
 
 
 def finding(code, where, severity="warning", **evidence):
-    return Finding(code, severity, where, "what was found", evidence)
+    log, _, part = where.rpartition(": ")
+    channel, _, joint = part.rpartition("_")
+    is_of_log = not log and part.endswith(".csv")
+    joints = () if is_of_log or part == "all joints" else tuple(joint.split(", "))
+    return Finding(
+        code, severity, where, "what was found", evidence, log=part if is_of_log else log,
+        joints=joints, words={"channel": channel}, fault="what was found",
+    )  # fmt: skip
 
 
 def joint(error, *, urdf=100.0, constant=True, **others):
@@ -670,7 +677,7 @@ def test_joints_better_by_the_urdf_are_those_of_all_logs():
         "the joints e do not move in any recording: not evaluated",
         "the joints d do not move in any validation log: not evaluated",
     ]
-    errors = {name: own for name, (_, _, own) in found.on_each().items()}
+    errors = {name: one.errors for name, one in found.on_each().items()}
     assert errors == {"a": [4.0, 4.0], "b": [4.0, 4.0], "c": [4.0], "d": [], "e": []}
     part = replace(found, hidden=("b", "e"))  # their metrics are ignored
     assert part.fitted.keys() == {"a", "c", "d"}
