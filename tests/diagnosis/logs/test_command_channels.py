@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from helpers.findings import Figures
 from helpers.servos import Servo, chirps, record
 
 from robotid.base.exceptions import DataError
@@ -198,7 +199,7 @@ def test_joints_that_are_told_the_same_are_named_in_groups():
         ("proportional_commands", "warning", "log: joint_0, joint_1"),
         ("proportional_commands", "warning", "log: joint_2, joint_3"),
     ]
-    assert codes[0].evidence == {"correlation": pytest.approx(1.0), "joints": 2.0}
+    assert Figures(codes[0]) == {"correlation": pytest.approx(1.0), "joints": 2.0}
 
 
 def test_rows_that_are_too_few_for_the_bandwidth_are_named():
@@ -232,7 +233,7 @@ def test_a_command_that_is_held_is_noted():
     held = found(record(chirps([0.3, 0.3], 8.0), GOOD, hold=4))
     assert list(held) == ["repeated_command"]
     assert held["repeated_command"].severity == "note"
-    assert held["repeated_command"].evidence == {"rows": 4.0, "period": pytest.approx(0.02)}
+    assert Figures(held["repeated_command"]) == {"rows": 4.0, "period": pytest.approx(0.02)}
     assert "at 50 Hz on average, and is constant for 20 ms" in held["repeated_command"].message
 
 

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers.findings import Figures
 from helpers.paths import ROOT
 from helpers.synthetic import exact_log, truth
 
@@ -42,7 +43,7 @@ def test_spikes_are_counted_by_their_share_of_what_varies():
     height = np.array([120.0, -70.0, 90.0])
     share = np.sum(height**2) / np.sum((x - np.median(x)) ** 2)
     assert (found.where, found.severity) == ("run.csv: tau_b", "error")
-    assert found.evidence == {
+    assert Figures(found) == {
         "rows": 3.0, "largest": pytest.approx(120.0, abs=0.2), "first": pytest.approx(6.1),
         "energy_share": pytest.approx(share, rel=0.01),
     }  # fmt: skip
@@ -58,7 +59,7 @@ def test_a_held_torque_is_late_by_half_of_what_it_is_held_less_a_row(rows):
     own = (np.arange(2000) - held)[: 2000 // rows * rows]  # rows since each was new
     late = own.mean() * 0.01
     assert found.where == "run.csv: b"
-    assert found.evidence == {"rows": rows, "delay": pytest.approx(late)}
+    assert Figures(found) == {"rows": rows, "delay": pytest.approx(late)}
     told = f"is constant for {rows} rows: it is updated at {100 / rows:.3g} Hz and logged at 100 Hz"
     assert told in found.message
     assert f"mean delay of {1e3 * late:.2g} ms" in found.message
@@ -73,10 +74,10 @@ def test_clocks_that_were_set_are_told_from_gaps():
     log = replace(log, t=log.t[kept], q=log.q[kept], tau=log.tau[kept])
     found = list(check_clock(log))
     step = one(found, "clock_step")
-    assert step.evidence == {"jump": pytest.approx(7.0), "at": pytest.approx(8.0), "steps": 2.0}
+    assert Figures(step) == {"jump": pytest.approx(7.0), "at": pytest.approx(8.0), "steps": 2.0}
     assert "the clock jumps by 7 s at t = 8 s" in step.message
     gap = one(found, "gap")
-    assert gap.evidence == {
+    assert Figures(gap) == {
         "gaps": 2.0, "longest": pytest.approx(0.61), "at": pytest.approx(14.99 + 10.0)
     }  # fmt: skip
     assert "2 gaps, the longest of 0.61 s at t = 24.99 s" in gap.message
@@ -92,7 +93,7 @@ def test_impossible_inertias_are_told_with_their_moments():
 
     [broken] = found(4.0, 0.0, 0.0, 1.0, 0.0, 2.5)
     assert broken.severity == "error"
-    assert broken.evidence == pytest.approx(
+    assert Figures(broken) == pytest.approx(
         {"smallest": 1.0, "middle": 2.5, "largest": 4.0, "triangle": -0.5}
     )
     assert "the sum of the two smaller ones is 3.5, wanted more than 4" in broken.message
@@ -133,7 +134,7 @@ def test_a_torque_is_clipped_at_either_limit_and_held_by_groups():
     clipped = [f for f in found if f.code == "clipped" and f.where == "run.csv: a"]
     for finding, limit in zip(clipped, (3.0, -4.0), strict=True):
         share = np.mean(tau[:-1, 0] == limit) * 1999 / 2000
-        assert finding.evidence == pytest.approx({"limit": limit, "share": share})
+        assert Figures(finding) == pytest.approx({"limit": limit, "share": share})
         assert f"at its limit {limit:g} in {100 * share:.3g} % of the rows" in finding.message
     repeated = {f.where: f.evidence for f in found if f.code == "repeated_torque"}
     assert repeated == {

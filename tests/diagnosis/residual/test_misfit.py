@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from helpers import misfits as helper
+from helpers.findings import Figures
 from helpers.fitting import fit
 from helpers.misfits import EFFECTS
 from helpers.paths import ROOT
@@ -544,7 +545,7 @@ def test_a_misfit_is_reported_with_the_intervals_of_its_own_joint():
         in reported.message
     )
     assert "(0 % on the validation logs); the residual is 4.0 % of the torque" in reported.message
-    assert reported.evidence == pytest.approx({
+    assert Figures(reported) == pytest.approx({
         "share_pct": 36, "error_pct": 4, "size": 0.125, "std_error": 0.01, "p_value": 1e-9,
         "validation_share_pct": -20,
     })  # fmt: skip

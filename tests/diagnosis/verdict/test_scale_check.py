@@ -3,6 +3,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers.findings import Figures
 from helpers.fitting import identify
 from helpers.synthetic import exact_log, truth
 
@@ -160,7 +161,7 @@ def test_a_needle_denser_than_any_material_is_named_unless_the_urdf_has_it(ur5, 
     assert finding.severity == "warning"
     assert finding.where == f"link {ur5.layout.bodies[1]}"
     density = 7.6 / (4.0 / 3.0 * np.pi * 0.006 * 0.006 * 0.225)
-    assert finding.evidence == {"mass": 7.6, "density": pytest.approx(density)}
+    assert Figures(finding) == {"mass": 7.6, "density": pytest.approx(density)}
     assert finding.message == (
         "as identified, the mass of upper_arm_link is 7.6 kg and its inertia needs a density of at "
         "least 220000 kg/m^3 (wanted: at most 12000, steel has 7900): such a body is not "

@@ -136,7 +136,7 @@ def test_each_joint_has_a_verdict_of_its_own():
 def test_the_good_joint_with_the_largest_error_has_the_cause_of_its_residual():
     logs = {"val.csv": Metrics({"a": joint(4.0), "b": joint(6.0), "c": joint(20.0)}, 1.0)}
     fit = Metrics({name: joint(5.0) for name in "abc"}, 1.0)
-    causes = {"b": "it is noise. Do this"}  # of no other joint is the cause computed
+    causes = {"b": ("it is noise", "Do this")}  # of no other joint is the cause computed
     found = judge(Predictions(fit, logs), Determined(), cause_of=causes.__getitem__)
     assert found.joints["b"].reasons[1:] == (
         "largest error of the good joints: it is noise. Do this",
