@@ -41,8 +41,10 @@ def run(options: argparse.Namespace) -> int:
 
         units = read_fleet(options.table, options.urdf, options.job)
         workers = available_cores() if options.workers is None else options.workers
-        plan = WorkPlan(workers, options.scheduler, options.resume, progress)
-        content = run_fleet(units, options.out, plan=plan, update=options.update)
+        plan = WorkPlan(workers, options.scheduler, progress)
+        content = run_fleet(
+            units, options.out, plan=plan, resume=options.resume, update=options.update
+        )
     show_found(content, options, _show, ["fleet.parquet", "fleet.html", "fleet.json"])
     return 0 if content["done"] else 1
 

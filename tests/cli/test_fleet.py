@@ -16,12 +16,10 @@ from helpers.synthetic import exact_log, truth
 from robotid.base.exceptions import DataError, WorkerError
 from robotid.cli import main
 from robotid.cli.work import fleet
-from robotid.cli.work.fleet import UnitResult, _Gathered, read_fleet, run_fleet
+from robotid.cli.work.fleet import _Gathered, read_fleet, run_fleet
 from robotid.data.files.read import write_log
 from robotid.estimation.variation.units_of_fleet import between_units
-from robotid.estimation.workers.checkpoint import FOLDER
 from robotid.estimation.workers.plan import WorkPlan
-from robotid.estimation.workers.processes import SerialBackend
 from robotid.output.report.fleet_page import fleet_page
 from robotid.robot.model import RobotModel
 
@@ -100,15 +98,15 @@ def test_a_failure_is_a_row_and_the_others_are_identified(done, table):
     assert sum(content["verdicts"].values()) == 3
 
 
-class Killed(SerialBackend):
+class Killed(WorkPlan):
     """Has a worker that one unit ends in every attempt."""
 
-    def run(self, work, pieces, lost=None):
-        for index, piece in pieces:
+    def as_finished(self, work, pieces, what, *, counted, lost):
+        for index, piece in enumerate(pieces):
             if piece.unit == "killer":
                 yield index, lost(piece, WorkerError(f"the worker of {piece.name} ended"))
             else:
-                yield from super().run(work, [(index, piece)])
+                yield index, work(piece, None)
 
 
 def test_broken_files_and_a_unit_that_ends_its_workers_are_failed_rows(table, done, tmp_path):
@@ -125,9 +123,7 @@ def test_broken_files_and_a_unit_that_ends_its_workers_are_failed_rows(table, do
         f"b,{table.parent / 'b0.csv'},{URDF}",
     ]
     (tmp_path / "t.csv").write_text("\n".join(["unit,log,urdf", *rows]) + "\n")
-    plan = WorkPlan(1)
-    plan._choose = lambda pieces: Killed()
-    content = run_fleet(read_fleet(tmp_path / "t.csv"), tmp_path / "out", plan=plan)
+    content = run_fleet(read_fleet(tmp_path / "t.csv"), tmp_path / "out", plan=Killed())
     failed = {(Path(e["log"]).name, e["unit"]): e["error"] for e in content["failures"]}
     assert set(failed) == {
         ("empty.csv", "e"), ("header.csv", "e"), ("cut.parquet", "e"), ("", "f"), ("", "killer"),
@@ -202,29 +198,33 @@ def test_an_interrupted_run_is_resumed_with_the_same_bits(table, done, tmp_path,
     monkeypatch.setattr(fleet, "identify_unit", interrupted)
     with pytest.raises(KeyboardInterrupt):
         run_fleet(units, tmp_path)
-    assert {path.name for path in tmp_path.iterdir()} == {FOLDER}
+    assert {path.name for path in tmp_path.iterdir()} == {fleet.UNITS}
     repeated = []
     monkeypatch.setattr(
         fleet, "identify_unit", lambda unit, threads: repeated.append(unit.unit) or first(unit, 1)
     )
-    run_fleet(units, tmp_path, plan=WorkPlan(1, resume=True))
+    run_fleet(units, tmp_path, resume=True)
     assert repeated == ["c", "d"]
     for name in FILES:
         assert (tmp_path / name).read_bytes() == (done[0] / name).read_bytes()
     assert {path.name for path in tmp_path.iterdir()} == set(FILES)
 
 
-def test_another_table_does_not_resume(table, tmp_path, monkeypatch):
+def test_only_units_with_the_same_inputs_are_resumed(table, tmp_path, monkeypatch):
+    units, seen = read_fleet(table), []
+
     def interrupted(unit, threads):
-        raise KeyboardInterrupt
+        seen.append(unit.unit)
+        if unit.unit == "c":
+            raise KeyboardInterrupt
+        return [fleet._failure(unit, DataError("no"))]
 
     monkeypatch.setattr(fleet, "identify_unit", interrupted)
-    units = read_fleet(table)
-    with pytest.raises(KeyboardInterrupt):
-        run_fleet(units, tmp_path)
     other = [replace(units[0], logs=units[0].logs[:1]), *units[1:]]
-    with pytest.raises(DataError, match=r"checkpoint of other inputs: units\.a was"):
-        run_fleet(other, tmp_path, plan=WorkPlan(1, resume=True))
+    for resumed, options in ((units, {}), (other, {"resume": True}), (other, {})):
+        with pytest.raises(KeyboardInterrupt):
+            run_fleet(resumed, tmp_path, **options)
+    assert seen == ["a", "b", "c", "a", "c", "a", "b", "c"]
 
 
 def test_units_with_the_same_inputs_are_kept_and_new_logs_added(
@@ -342,13 +342,13 @@ def test_units_are_compared_by_parameter_robot_and_expression(monkeypatch):
         ]  # fmt: skip
         rows.append(rows[0] | {"log": "x.csv", "value": 99.0})  # of one log: not compared
         rows.append({"unit": f"u{k}", "status": "failed", "log": f"{k}.csv", "error": "lost"})
-        gathered.add(UnitResult(rows))
+        gathered.add(rows)
     for k in (5, 6):
         row = {"unit": f"u{k}", "status": "done", "verdict": "good", "parameter": "b.m",
                "parameter_unit": "kg", "value": 1.0, "std_error": 0.1, "robot": "leg",
                "expression": "b.m"}  # fmt: skip
-        gathered.add(UnitResult([row]))
-    gathered.add(UnitResult([{"unit": "u7", "status": "failed", "error": "bad"}]))
+        gathered.add([row])
+    gathered.add([{"unit": "u7", "status": "failed", "error": "bad"}])
     levels = []
     monkeypatch.setattr(
         "robotid.cli.work.fleet.between_units",
@@ -385,13 +385,6 @@ def test_units_are_compared_by_parameter_robot_and_expression(monkeypatch):
         assert entry["others"] == found["parameters"][p]["next_interval"]
 
 
-def test_rows_of_a_checkpoint_have_no_value_that_is_none():
-    rows = [{"unit": "a", "value": 1.5}, {"unit": "b"}]
-    assert UnitResult.from_arrays(UnitResult(rows).to_arrays()).rows == rows
-    with pytest.raises(ValueError, match="not JSON compliant"):
-        UnitResult([{"unit": "a", "value": np.nan}]).to_arrays()
-
-
 def test_a_distribution_is_of_the_values_with_the_interval_of_the_next_unit():
     values = [1.0, 1.1, 1.15, 1.2, 3.0, 3.1]
     entry = {"name": "a.coulomb", "robot": "arm", "expression": "a.coulomb", "unit": "N m",
@@ -416,8 +409,8 @@ def test_a_distribution_is_of_the_values_with_the_interval_of_the_next_unit():
 def test_every_flag_reaches_the_units_and_their_workers(monkeypatch, capsys):
     heard = {}
 
-    def run(units, folder, *, plan, update):
-        heard.update(units=units, folder=folder, plan=plan, update=update)
+    def run(units, folder, **options):
+        heard.update(units=units, folder=folder, **options)
         return {"done": 1}
 
     monkeypatch.setattr(fleet, "read_fleet", lambda *words: words)
@@ -427,9 +420,9 @@ def test_every_flag_reaches_the_units_and_their_workers(monkeypatch, capsys):
     assert main(words.split()) == 0
     assert heard["units"] == ("t.csv", "arm.urdf", "all.toml")
     assert heard["folder"] == "there"
-    assert (heard["plan"].workers, heard["plan"].resume, heard["update"]) == (3, True, True)
+    assert (heard["plan"].workers, heard["resume"], heard["update"]) == (3, True, True)
     assert main(["fleet", "t.csv", "--scheduler", "tcp://host:8786", "--json"]) == 0
     assert heard["units"] == ("t.csv", None, None)
     assert heard["plan"].scheduler == "tcp://host:8786"
-    assert (heard["plan"].resume, heard["update"]) == (False, False)
+    assert (heard["resume"], heard["update"]) == (False, False)
     assert capsys.readouterr().out == '{"done": 1}\n' * 2

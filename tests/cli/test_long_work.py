@@ -19,8 +19,8 @@ from robotid.base.exceptions import SettingsError
 from robotid.cli import main
 from robotid.cli.console import terminal_progress
 from robotid.data.files.read import write_log
-from robotid.estimation.workers.cluster import ClusterBackend
 from robotid.estimation.workers.plan import WorkPlan
+from robotid.estimation.workers.pools import Pool
 from robotid.robot.model import RobotModel
 
 URDF = str(ROOT / "urdf" / "planar_2r.urdf")
@@ -141,10 +141,12 @@ def test_no_workers_are_wrong_usage(job, tmp_path, capsys):
 
 def test_an_address_where_nobody_listens_is_said(job, tmp_path, capsys, monkeypatch):
     pytest.importorskip("distributed")
-    monkeypatch.setattr(ClusterBackend.__init__, "__kwdefaults__", {"patience": 0.2})
+    monkeypatch.setattr(Pool.__init__, "__defaults__", (1, None, 0.2))
     words = ["identify", job, "--out", str(tmp_path), "--scheduler", "tcp://127.0.0.1:9"]
     assert main(words) == 1
-    assert "no Dask scheduler answers at 'tcp://127.0.0.1:9'" in capsys.readouterr().err
+    assert (
+        "workers answers at 'tcp://127.0.0.1:9'" in capsys.readouterr().err
+    )
 
 
 @pytest.mark.parametrize(("quiet", "force"), [(False, False), (True, False)])
