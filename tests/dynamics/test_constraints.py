@@ -24,7 +24,7 @@ from robotid.dynamics.constraint_rows import (
 from robotid.dynamics.factors import Factors, compress, compress_segments, merge
 from robotid.dynamics.prediction import predict
 from robotid.dynamics.torque import build_problem, joint_torque_regressor
-from robotid.estimation.estimators.consistent.weighting import Segments, held_out_errors
+from robotid.estimation.estimators.prior_weight import Segments, held_out_errors
 from robotid.robot.constraints import Contact, Loop
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel

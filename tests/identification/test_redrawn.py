@@ -14,7 +14,7 @@ from robotid.base.exceptions import NotConvergedError, SettingsError
 from robotid.data.signals import process
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.estimation.estimators import Consistent
-from robotid.estimation.estimators.consistent.programme import Programme, nearest
+from robotid.estimation.estimators.consistent.consistent_fit import Programme, nearest
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
 from robotid.robot.prior import prior_spread
 

@@ -13,7 +13,7 @@ from robotid.data.signal_filters import local_polynomial
 from robotid.dynamics.memory import remember
 from robotid.dynamics.prediction import predict
 from robotid.dynamics.simulation.loops import ClosedLoopRobot, Column, Loops, RollOut, Window
-from robotid.estimation.estimators.simulator import Residual
+from robotid.estimation.estimators.output_error import Residual
 from robotid.robot.assumed import with_assumed_inertials
 from robotid.robot.drive_term import DriveTerm
 from robotid.robot.model import RobotModel

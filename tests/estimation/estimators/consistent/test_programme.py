@@ -5,8 +5,8 @@ import pytest
 import scipy.stats
 
 from robotid.estimation.estimators.consistent.body_constraints import Bounds, Subspace
+from robotid.estimation.estimators.consistent.consistent_fit import Entropic
 from robotid.estimation.estimators.consistent.interior_point import svec, unsvec
-from robotid.estimation.estimators.consistent.programme import Entropic
 from robotid.robot.parameters import (
     ParameterLayout,
     inertial_from_pseudo_inertia,
