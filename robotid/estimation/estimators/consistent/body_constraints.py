@@ -115,7 +115,7 @@ class Constraints:
             self._check_total(self.total_mass, dict(zip(layout.bodies, values[:, 0], strict=True)))
 
     def bounds(self, layout: ParameterLayout, scale: Array) -> Bounds:
-        """Return signs of drives and ranges as rows of x = pi / scale (p,), except pinned bodies."""
+        """Return signs of drives and ranges as rows of x = pi / scale, without pinned bodies."""
         p = len(layout.names)
         signs = np.flatnonzero(layout.is_nonnegative())
         labels = [f"drive_signs {layout.names[i]}" for i in signs]

@@ -272,7 +272,7 @@ class _System:
         cross: Array | None = None,
         pairs: Array | float = 0.0,
     ) -> _Direction:
-        """Return the steps to Z J = t 1, lambda s = mu: t, mu (f, 1), cross like J, pairs like s."""
+        """Return the steps to Z J = t 1, lambda s = mu: t, mu (f, 1), cross as J, pairs as s."""
         point, length, size = self.point, self.length, self.problem.inertial
         bodies = np.zeros_like(self.R_inverse)  # sum of the changes of J and Z, plus diag(l)
         if cross is not None:

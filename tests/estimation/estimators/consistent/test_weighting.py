@@ -18,7 +18,7 @@ from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.factors import compress, compress_segments, gather, merge
 from robotid.dynamics.torque import build_problem
 from robotid.estimation.estimators import Consistent
-from robotid.estimation.estimators.consistent import weighting
+from robotid.estimation.estimators import prior_weight as weighting
 from robotid.estimation.estimators.prior_weight import (
     Segments,
     _is_as_good,
