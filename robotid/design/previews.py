@@ -136,7 +136,7 @@ def largest_gravity(model: RobotModel) -> Array:
 
 
 def largest_torques(model: RobotModel, peak: Array) -> Array:
-    """Return the largest torque of each joint, shape (n,): the URDF's limit, or that of a motion."""
+    """Return the largest torque of each joint, (n,): the URDF's limit, or that of a motion."""
     # peak (n,) [N m or N]
     peak = np.maximum(peak, FAINTEST * max(float(peak.max()), 1e-300))
     limit = np.array([joint.effort for joint in model.limits])

@@ -156,7 +156,7 @@ def payload_of(difference: Array, covariance: Array, columns: Array, spread: Arr
 
 
 def load_spread(spread: Array) -> Array:
-    """Return the prior standard deviations of a payload, (10,): a mean link's mass, twice its size."""
+    """Return the prior standard deviations of a payload, (10,): of a mean link, twice its size."""
     # spread (10 bodies,)
     by_body = spread.reshape(-1, 10)
     mass = max(float(by_body[:, 0].mean()), float(by_body[-1, 0]))
