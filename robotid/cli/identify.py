@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, overload
+from typing import TYPE_CHECKING, Any, Literal
 
 from robotid.base.arguments import checked
 from robotid.base.exceptions import DataError, SettingsError
@@ -25,7 +25,7 @@ from robotid.cli.console import (
     show_found,
 )
 from robotid.cli.flags import OUTPUT, add_job, add_out, add_progress, job_from_flags, source_words
-from robotid.cli.job import Job, LogEntry
+from robotid.cli.job import Job, LogEntry, job_file
 from robotid.cli.logs import (
     examine_logs,
     locked_as_logged,
@@ -72,42 +72,10 @@ if TYPE_CHECKING:
     from robotid.output.viewer.replays import Replay
 
 
-@overload
-def identify(  # type: ignore[overload-overlap]
-    model: RobotModel | str | Path,
-    logs: Readable | Sequence[Readable],
-    *,
-    estimator: Literal["simulation"] | SimulationSettings,
-    validation: Readable | Sequence[Readable] = ...,
-    signals: SignalSettings | None = ...,
-    controller: Mapping[str, Any] | None = ...,
-    friction: str | Mapping[str, str] = ...,
-    doctor: bool = ...,
-    ignore: Sequence[str] = ...,
-    progress: ProgressCallback | None = ...,
-) -> "LoopIdentification": ...
-
-
-@overload
-def identify(
-    model: RobotModel | str | Path,
-    logs: Readable | Sequence[Readable],
-    *,
-    estimator: str | EstimatorSettings = ...,
-    validation: Readable | Sequence[Readable] = ...,
-    signals: SignalSettings | None = ...,
-    controller: Mapping[str, Any] | None = ...,
-    friction: str | Mapping[str, str] = ...,
-    doctor: bool = ...,
-    ignore: Sequence[str] = ...,
-    progress: ProgressCallback | None = ...,
-) -> Identification: ...
-
-
 @checked("progress")
 def identify(
     model: RobotModel | str | Path,
-    logs: Readable | Sequence[Readable],
+    logs: Readable | Sequence[Readable] | None = None,
     *,
     validation: Readable | Sequence[Readable] = (),
     signals: SignalSettings | None = None,
@@ -121,10 +89,11 @@ def identify(
     """Identify a robot's parameters from motion logs, as the command line does.
 
     Args:
-        model: The robot, or the path of its URDF with all joints free.
+        model: The robot, or the path of its URDF with all joints free; or a job file, alone, which
+            states logs and settings, and whose long logs are read in pieces.
         logs: Logs to fit: a ``Log`` with the model's joints, the path of a file, a DataFrame with
             the columns of such a file, or several of these. Files are read whole, as by
-            ``read_log``; ``robotid.run_job`` reads long files in pieces.
+            ``read_log``.
         validation: Logs for validation, of the same types.
         signals: Settings of the signal processing; the defaults if None.
         estimator: Name or settings of the estimator. "simulation" simulates the robot on the
@@ -151,6 +120,9 @@ def identify(
         NotConvergedError: If a solver fails, or the closed loop cannot be simulated.
         SettingsError: If a setting is out of range, or a code to ignore is unknown.
     """
+    if logs is None:
+        job = job_file(model)
+        return identified(job, WorkPlan(job.workers or 1, progress=progress))[0]
     require_kind(
         estimator, (str, EstimatorSettings), "estimator", "a name or a robotid.EstimatorSettings"
     )
@@ -204,52 +176,35 @@ _log = logging.getLogger(__name__)
 
 
 def run_job(
-    job: Job,
-    folder: str | Path,
-    *,
-    plan: WorkPlan | None = None,
-    source: Sequence[str] = (),
+    job: Job, folder: str | Path, *, plan: WorkPlan | None = None, source: Sequence[str] = ()
 ) -> tuple["Identification | LoopIdentification", dict[str, Any]]:
-    """Run an identification and write result.json, report.html and the URDF with its sidecar.
+    """Identify and write result.json, report and URDF; return the result and result.json.
 
-    The settings may exclude the report and add replay.html; an impossible result has no URDF. All
-    files are first written to a temporary folder and moved when they are complete.
-
-    Args:
-        job: The job.
-        folder: Folder of the results; created if it is missing.
-        plan: Workers for long logs; if None those of the job, in this process.
-        source: The words after ``robotid identify`` that repeat the run, for the report.
-
-    Returns:
-        The identification and the content of result.json.
-
-    Raises:
-        DataError: If a log cannot be used.
-        MissingDependencyError: If the estimator is "simulation" and Numba is not installed.
-        ModelError: If the URDF is not usable.
-        NotConvergedError: If a solver fails, or the closed loop cannot be simulated.
-        RankDeficientError: If the estimator is "ols" or "wls" and the data do not determine all
-            base parameters.
-        SettingsError: If a setting is not usable.
-        WorkerError: If a worker ends before its work is done.
+    The words of the source, after ``robotid identify``, repeat the run.
     """
-    require_kind(job, Job, "job", "a Job, as robotid.read_job returns it")
-    require_kind(folder, (str, Path), "folder", "the path of a folder")
-    chosen = plan or WorkPlan(job.workers or 1)
+    chosen, target = plan or WorkPlan(job.workers or 1), Path(folder)
+    found, used = identified(job, chosen, target)
     is_simulated = isinstance(job.estimator, SimulationSettings)
-    stages = _loop_stages() if is_simulated else STAGES
-    report_stage(chosen.progress, "reading logs", stages)
-    model, target = job.model(), Path(folder)
-    check_folder(target, ["result.json", *_names(model)])
-    found: Identification | LoopIdentification
-    if is_simulated:
-        found, used = _identify_loops(job, model, chosen.progress), job
-    else:
-        found = identify_job(job, model, chosen)
-        used = _job_of(found)
-    report_stage(chosen.progress, "writing", stages)
+    report_stage(chosen.progress, "writing", _loop_stages() if is_simulated else STAGES)
     return _write(found, used, target, source=source)
+
+
+def identified(
+    job: Job, plan: WorkPlan, target: Path | None = None
+) -> tuple["Identification | LoopIdentification", Job]:
+    """Return the identification of a job and the job with the choices; nothing is written.
+
+    A folder where its results cannot be written is refused first.
+    """
+    is_simulated = isinstance(job.estimator, SimulationSettings)
+    report_stage(plan.progress, "reading logs", _loop_stages() if is_simulated else STAGES)
+    model = job.model()
+    if target is not None:
+        check_folder(target, ["result.json", *_names(model)])
+    if is_simulated:
+        return _identify_loops(job, model, plan.progress), job
+    found = identify_job(job, model, plan)
+    return found, _job_of(found)
 
 
 @checked("identification")

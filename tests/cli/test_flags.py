@@ -1,7 +1,6 @@
 """Flags state what the keys of a job file state."""
 
 import argparse
-from contextlib import nullcontext
 from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
@@ -10,7 +9,7 @@ from unittest.mock import ANY
 import pytest
 
 from robotid.base.exceptions import SettingsError
-from robotid.cli import doctor, excite, identify, main, preview, track
+from robotid.cli import doctor, identify, main, preview, track
 from robotid.cli.flags import job_from_flags, source_words
 from robotid.cli.job import LogEntry, job_from_settings
 from robotid.cli.parser import CommandParser
@@ -188,16 +187,16 @@ JOB_OF_FLAGS = SimpleNamespace(workers=2)
 UNSTATED = dict.fromkeys(("step", "delay", "samples", "seed"))
 FORWARDED = {
     "validate out a.csv b.csv --unit x --update": (
-        "validate.validate_result",
+        "validate.validate",
         ("out", [LogEntry(Path(x), unit="x") for x in ("a.csv", "b.csv")]), {"update": True},
     ),
     "report out --out p.html": ("report.rewrite_report", ("out", "p.html"), {"progress": ANY}),
     "export out --format mjcf --out a.xml --step 0.002 --delay filter": (
-        "export.export_result", ("out", "mjcf", "a.xml"),
+        "export.export", ("out", "mjcf", "a.xml"),
         UNSTATED | {"step": 0.002, "delay": "filter"},
     ),
     "export out --format ranges --out a.yaml --samples 5 --seed 3": (
-        "export.export_result", ("out", "ranges", "a.yaml"),
+        "export.export", ("out", "ranges", "a.yaml"),
         UNSTATED | {"samples": 5, "seed": 3},
     ),
     "payload u a.csv --reference c --reference d --link x --link y --mass x=2 --gains": (
@@ -245,18 +244,3 @@ def test_every_flag_reaches_the_function_that_does_the_work(words, monkeypatch):
     with pytest.raises(Heard) as caught:
         main(words.split())
     assert caught.value.args == (wanted, options)
-
-
-@pytest.mark.parametrize(
-    ("words", "quiet", "force"), [("--progress", False, True), ("--json", True, False)]
-)
-def test_progress_of_a_design_is_shown_if_asked(words, quiet, force, monkeypatch):
-    def heard(*_, **stated):
-        raise Heard(stated["progress"])
-
-    monkeypatch.setattr("robotid.cli.excite.design_motion", heard)
-    monkeypatch.setattr(excite, "job_from_flags", lambda options, needs_logs: JOB_OF_FLAGS)
-    monkeypatch.setattr(excite, "terminal_progress", lambda **stated: nullcontext(stated))
-    with pytest.raises(Heard) as caught:
-        main(["excite", "u", "--out", "m.csv", words])
-    assert caught.value.args == ({"quiet": quiet, "force": force},)

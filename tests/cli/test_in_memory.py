@@ -10,8 +10,8 @@ from helpers.mujoco_plant import plant, torque_log
 
 import robotid
 from robotid.base.exceptions import DataError, SettingsError
-from robotid.cli.identify import _entries
-from robotid.cli.job import LogEntry
+from robotid.cli.identify import _entries, run_job
+from robotid.cli.job import LogEntry, read_job
 from robotid.identification.closed_loop.loop_result import LoopIdentification
 
 SETTINGS = {"bodies": 0.0, "step": 4e-3, "torques": False}
@@ -45,7 +45,7 @@ def test_it_finds_what_a_job_finds_of_the_same_logs(arm, found, tmp_path):
         "[controller]\nkind = 'torque'\n[[identification]]\nlog = 'log.csv'\n"
         "[[validation]]\nlog = 'kept.csv'\n[output]\nreport = false\n"
     )
-    again, _ = robotid.run_job(robotid.read_job(tmp_path / "job.toml"), tmp_path / "out")
+    again, _ = run_job(read_job(tmp_path / "job.toml"), tmp_path / "out")
     assert isinstance(found, LoopIdentification)
     np.testing.assert_allclose(found.standard, again.standard, rtol=1e-6, atol=1e-9)
     assert len(found.validation) == 1

@@ -10,7 +10,7 @@ import pytest
 from robotid.base.files import file_sha256
 from robotid.cli import main, simulate
 from robotid.cli.job import Job
-from robotid.cli.simulate import SimulatedFiles, _motion
+from robotid.cli.simulate import _motion
 from robotid.data.files.read import read_log
 from robotid.data.files.table_files import write_columns
 from robotid.dynamics.base_parameters import structural_mapping
@@ -291,8 +291,7 @@ def test_a_motion_passes_its_rows_with_their_speeds_and_accelerations(tmp_path, 
         columns |= {f"{key}_{joint}": values[:, j] for j, joint in enumerate(ur5.joints)}
     write_columns(columns, tmp_path / "motion.csv")
     job = Job(urdf=URDF)
-    files = SimulatedFiles(tmp_path / "motion.csv", tmp_path / "log.csv")
-    found = _motion(job, ur5, files).evaluate(t - 3.0)
+    found = _motion(job, ur5, tmp_path / "motion.csv", None).evaluate(t - 3.0)
     for one, stated in zip(found, (q, v, a), strict=True):
         np.testing.assert_allclose(one, stated, atol=1e-9)
 

@@ -11,10 +11,10 @@ from helpers.synthetic import exact_log, truth
 
 from robotid.base.files import file_sha256
 from robotid.base.findings import Finding
-from robotid.cli import validate
+from robotid.cli import validate as command
 from robotid.cli.identify import run_job
 from robotid.cli.job import LogEntry, job_from_settings
-from robotid.cli.validate import validate_result
+from robotid.cli.validate import validate
 from robotid.data.files.read import write_log
 from robotid.data.log import Log, Trajectory
 from robotid.dynamics.torque import joint_torque_regressor
@@ -54,7 +54,7 @@ def here(made, tmp_path):
 
 def verdict(folder, log):
     write_log(log, folder / "again.csv")
-    return validate_result(folder / "out" / "result.json", [folder / "again.csv"])["verdict"]
+    return validate(folder / "out" / "result.json", [folder / "again.csv"])["verdict"]
 
 
 def rows(log, chosen):
@@ -69,7 +69,7 @@ def test_another_motion_is_a_prediction(here):
 
 def test_figures_of_the_fitted_log_are_those_of_the_result(here):
     path = here[0] / "out" / "result.json"
-    [found] = validate_result(path, [here[0] / "run.csv"])["validation"]
+    [found] = validate(path, [here[0] / "run.csv"])["validation"]
     stated = json.loads(path.read_text())["identification"]["per_joint"]
     assert found["per_joint"].keys() == stated.keys()
     for joint, own in stated.items():
@@ -160,9 +160,9 @@ def test_of_two_logs_the_one_that_was_fitted_shows_no_prediction_and_the_other_d
     for name, log in (("new", other), ("old", first)):
         write_log(log, folder / f"{name}.csv")
     result = folder / "out" / "result.json"
-    alone = validate_result(result, [folder / "new.csv"])
+    alone = validate(result, [folder / "new.csv"])
     for names in (("new", "old"), ("old", "new")):
-        found = validate_result(result, [folder / f"{name}.csv" for name in names])
+        found = validate(result, [folder / f"{name}.csv" for name in names])
         assert [entry["log"] for entry in found["validation"]] == [
             str(folder / f"{name}.csv") for name in names
         ]
@@ -170,7 +170,7 @@ def test_of_two_logs_the_one_that_was_fitted_shows_no_prediction_and_the_other_d
         assert own["per_joint"] == alone["validation"][0]["per_joint"]
         assert found["verdict"] == alone["verdict"]
     write_log(rows(first, slice(0, 700)), folder / "cut.csv")
-    found = validate_result(result, [folder / "old.csv", folder / "cut.csv"])
+    found = validate(result, [folder / "old.csv", folder / "cut.csv"])
     assert (
         "old.csv 0-9.99 s, cut.csv 0-6.99 s contain fitted samples"
         in found["verdict"]["reasons"][0]
@@ -201,13 +201,13 @@ def test_a_fault_of_the_second_of_two_new_logs_is_one_of_the_verdict(here, monke
         judged.update(stated, predictions=predictions, determined=determined)
         return judge(predictions, determined, **stated)
 
-    judge = validate.judge
+    judge = command.judge
     monkeypatch.setattr(validate, "judge", noted)
     monkeypatch.setattr(
         validate, "hidden_joints", lambda model, some: tuple(e.recording.name for e in some)
     )
     logs = [folder / f"{name}.csv" for name in halves]
-    found = validate_result(folder / "out" / "result.json", logs)
+    found = validate(folder / "out" / "result.json", logs)
     assert found["verdict"]["status"] == "poor"
     assert any(
         "dq_joint_2 is 0.5 times d(q)/dt" in words for words in found["verdict"]["log_errors"]
@@ -223,7 +223,7 @@ def test_a_fault_of_the_second_of_two_new_logs_is_one_of_the_verdict(here, monke
     assert predictions.joints == ("joint_1", "joint_2")
     del stated["structure"]["poorly_excited"]  # as of an older result
     (folder / "out" / "older.json").write_text(json.dumps(stated))
-    validate_result(folder / "out" / "older.json", logs)
+    validate(folder / "out" / "older.json", logs)
     assert judged["determined"].is_poorly_excited is True
 
 
@@ -235,11 +235,11 @@ def test_few_fitted_rows_in_a_long_log_and_a_few_of_it_in_a_long_fitted_one_are_
     short, long = log(30), log(9000)
     q, tau = long.q.copy(), long.tau.copy()
     q[4321:4351], tau[4321:4351] = short.q, short.tau
-    assert not validate._share(short, long)
-    assert not validate._share(long, short)
+    assert not command._share(short, long)
+    assert not command._share(long, short)
     holder = replace(long, q=q, tau=tau)
-    assert validate._share(short, holder)
-    assert validate._share(holder, short)
+    assert command._share(short, holder)
+    assert command._share(holder, short)
 
 
 def test_the_expected_error_has_the_parts_of_fit_spread_and_residual(arm, rng, monkeypatch):
@@ -269,7 +269,7 @@ def test_the_expected_error_has_the_parts_of_fit_spread_and_residual(arm, rng, m
             recording=SimpleNamespace(trajectory=motion, mask=mask),
             torques={"estimate": tau - z * total},
         )
-        found = validate._expected(result, arm, evaluation)["expected"]
+        found = command._expected(result, arm, evaluation)["expected"]
         assert found["with_spread"] is (spread is not None)
         for j, own in enumerate(found["per_joint"].values()):
             assert own["rmse"] == pytest.approx(np.sqrt(np.mean(total[:, j] ** 2)), rel=1e-9)
@@ -310,7 +310,7 @@ def test_logs_of_commands_are_judged_by_the_joints_that_they_move(tmp_path, monk
         monkeypatch.setattr(validate, name, function)
     job = SimpleNamespace(signals=None, ignore=())
     entries = [LogEntry(path) for path in paths]
-    content = validate._validate_commands(loaded, job, entries)
+    content = command._validate_commands(loaded, job, entries)
     runs = ["run of a.csv", "run of b.csv"]
     assert asked == {
         "metrics": (runs, True), "joints": ("one", "two"), "is_validation": not is_known,
@@ -321,5 +321,5 @@ def test_logs_of_commands_are_judged_by_the_joints_that_they_move(tmp_path, monk
         "validation": [{"of": run} for run in runs], "verdict": {"status": "usable"},
     }  # fmt: skip
     job.ignore = ("clock",)
-    validate._validate_commands(loaded, job, entries)
+    command._validate_commands(loaded, job, entries)
     assert asked["log_errors"] == []

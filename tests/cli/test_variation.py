@@ -17,7 +17,7 @@ from robotid.cli.job import LogEntry, job_from_settings
 from robotid.cli.logs import survey_logs
 from robotid.cli.preview import preview_job
 from robotid.cli.validate import _show as show_validation
-from robotid.cli.validate import validate_result
+from robotid.cli.validate import validate
 from robotid.data.files.read import write_log
 from robotid.dynamics.torque import joint_torque_regressor
 from robotid.estimation.fitting.recorded import Recordings
@@ -164,7 +164,7 @@ def test_validation_expects_the_error_of_the_next_log(result, folder, capsys):
     found, content = result
     log = driven_log(found.model, truth(found.model), 9, duration=6.0)
     write_log(log, folder / "next.csv")
-    done = validate_result(folder / "out" / "result.json", [folder / "next.csv"])
+    done = validate(folder / "out" / "result.json", [folder / "next.csv"])
     expected = done["validation"][0]["expected"]
     assert expected["with_spread"] is True
     noise = [content["identification"]["per_joint"][joint]["rmse"] for joint in JOINTS]
@@ -320,7 +320,7 @@ def test_logs_are_added_to_the_variation_without_the_others(result, folder, writ
     (folder / "run_2.csv").rename(hidden)
     try:
         for k in range(2):  # one after the other
-            done = validate_result(file, [written / f"more_{k}.csv"], update=True)
+            done = validate(file, [written / f"more_{k}.csv"], update=True)
     finally:
         hidden.rename(folder / "run_2.csv")
     after = json.loads(file.read_text())
@@ -339,9 +339,9 @@ def test_logs_are_added_to_the_variation_without_the_others(result, folder, writ
     ranges = stated_ranges(after)["drives"]["shoulder_lift_joint"]["coulomb"]
     assert ranges["high"] == variation["parameters"][COULOMB]["next_interval"][1]
     with pytest.raises(DataError, match=r"more_0.csv is .*more_0.csv, which result.json has alre"):
-        validate_result(file, [written / "more_0.csv"], update=True)
+        validate(file, [written / "more_0.csv"], update=True)
     with pytest.raises(DataError, match=r"run_3.csv, which result.json has already; leave it out"):
-        validate_result(file, [folder / "run_3.csv"], update=True)
+        validate(file, [folder / "run_3.csv"], update=True)
 
 
 def test_added_logs_are_those_of_a_fit_to_all(folder, written):
@@ -351,7 +351,7 @@ def test_added_logs_are_those_of_a_fit_to_all(folder, written):
     job = job_from_settings({**settings(folder), **all_logs}, "job.toml", folder)
     _, content = run_job(job, written / "all")
     more = [written / "more_0.csv", written / "more_1.csv"]
-    own = validate_result(written / "result.json", more)["variation"]["parameters"]
+    own = validate(written / "result.json", more)["variation"]["parameters"]
     of_fit = {each["name"]: each["std_error"] for each in content["drive_parameters"]}
     for name, entry in content["variation"]["parameters"].items():
         error = 1.5 * np.hypot(of_fit[name], entry["std_error"])  # links are those of four logs
@@ -365,7 +365,7 @@ def test_a_new_log_that_differs_is_named_with_its_cause(result, folder, written,
     log = changed_log(found, 13, shoulder_lift_joint__coulomb=5.0)
     write_log(log, written / "worn.csv")
     before = (written / "result.json").read_bytes()
-    done = validate_result(written / "result.json", [written / "worn.csv", written / "more_0.csv"])
+    done = validate(written / "result.json", [written / "worn.csv", written / "more_0.csv"])
     assert (written / "result.json").read_bytes() == before
     (finding,) = done["findings"]
     assert finding["code"] == "unlike_run"
@@ -383,16 +383,14 @@ def test_a_new_log_that_differs_is_named_with_its_cause(result, folder, written,
     assert f"worn.csv: {COULOMB} is " in " ".join(capsys.readouterr().out.split())
     log = changed_log(found, 15)
     write_log(replace(log, q=log.q + np.array([0.0, 0.2, 0.0])), written / "slipped.csv")
-    done = validate_result(
-        written / "result.json", [written / "more_0.csv", written / "slipped.csv"]
-    )
+    done = validate(written / "result.json", [written / "more_0.csv", written / "slipped.csv"])
     (finding,) = done["findings"]
     assert finding["message"].startswith("slipped.csv: the positions of elbow_joint differ by +0.")
     assert finding["evidence"]["value"] == pytest.approx(0.2, abs=0.05)  # first order
     content = json.loads(before)
     content["variation"]["sums"]["unit"] = ["a", "b", "c", "d"]  # of another robot
     (written / "result.json").write_text(json.dumps(content))
-    done = validate_result(written / "result.json", [written / "worn.csv"])
+    done = validate(written / "result.json", [written / "worn.csv"])
     (finding,) = done["findings"]
     assert finding["message"].startswith(f"unit worn.csv: {COULOMB} is ")
 
@@ -406,10 +404,10 @@ def test_the_robot_of_added_logs_is_stated_if_that_of_others_is(written, capsys)
     for entry, unit in zip(content["settings"]["identification"], sums["unit"], strict=True):
         entry["unit"] = unit
     file.write_text(json.dumps(content))
-    done = validate_result(file, [log])["variation"]  # of an unknown robot
+    done = validate(file, [log])["variation"]  # of an unknown robot
     assert done["units"] == 3
     with pytest.raises(SettingsError, match=r"more_0.csv has no unit, but run_0.csv has unit = .a"):
-        validate_result(file, [log], update=True)
+        validate(file, [log], update=True)
     assert json.loads(file.read_text()) == content
     assert main(["validate", str(file), log, "--update", "--unit", "b"]) == 0
     printed = " ".join(capsys.readouterr().out.split())
@@ -429,7 +427,7 @@ def test_rows_of_added_logs_are_downweighted_as_those_of_the_fit(result, written
     for loss in ("none", "tukey"):
         content["settings"]["estimator"]["robust"] = loss
         file.write_text(json.dumps(content))
-        own = validate_result(file, [written / "jumps.csv"])["variation"]["parameters"][COULOMB]
+        own = validate(file, [written / "jumps.csv"])["variation"]["parameters"][COULOMB]
         values.append(own["by_log"][-1])
     true = truth(found.model)[found.model.layout.names.index(COULOMB)]
     assert abs(values[1] - true) < 0.3 * abs(values[0] - true)
@@ -440,6 +438,6 @@ def test_results_without_sums_cannot_be_updated(written):
     content = json.loads(file.read_text())
     del content["variation"]["sums"]
     file.write_text(json.dumps(content))
-    assert "variation" not in validate_result(file, [written / "more_0.csv"])
+    assert "variation" not in validate(file, [written / "more_0.csv"])
     with pytest.raises(DataError, match="wanted a result of three or more logs with torques; id"):
-        validate_result(file, [written / "more_0.csv"], update=True)
+        validate(file, [written / "more_0.csv"], update=True)

@@ -9,7 +9,7 @@ import pytest
 from helpers.driven import ELBOW, LIFT, arm, driven, driven_log, found_in
 
 from robotid.base.exceptions import DataError, SettingsError
-from robotid.cli.export import export_result
+from robotid.cli.export import export
 from robotid.cli.identify import save_result
 from robotid.dynamics.friction_projection import project_friction
 from robotid.dynamics.memory import drive_motion_along
@@ -159,7 +159,7 @@ def test_mujocos_inverse_dynamics_of_an_export_are_as_near_as_its_friction_can_b
     found, loaded, tmp_path
 ):
     """Over the fitted rows: the prediction less the best viscous, Coulomb friction and offset."""
-    done = export_result(loaded.path, "mjcf", tmp_path / "a.xml")
+    done = export(loaded.path, "mjcf", tmp_path / "a.xml")
     stated = done["projected"][ELBOW]
     assert stated["replaced"] == ["load"]
     assert "load projected on viscous" in " ".join((tmp_path / "a.xml").read_text().split())
@@ -185,7 +185,7 @@ def test_mujocos_inverse_dynamics_of_an_export_are_as_near_as_its_friction_can_b
 
 
 def test_urdf_dynamics_and_ranges_have_the_projected_friction(found, loaded, tmp_path):
-    done = export_result(loaded.path, "urdf", tmp_path / "a.urdf")
+    done = export(loaded.path, "urdf", tmp_path / "a.urdf")
     drive = done["projected"][ELBOW]
     (joint,) = [
         joint
