@@ -16,7 +16,7 @@ from robotid.cli.identify import run_job
 from robotid.cli.job import LogEntry, job_from_settings
 from robotid.cli.validate import validate
 from robotid.data.files.read import write_log
-from robotid.data.log import Log, Trajectory
+from robotid.data.log import Trajectory
 from robotid.dynamics.torque import joint_torque_regressor
 
 NOISE = np.array([0.2, 0.05])  # [N m]
@@ -91,14 +91,6 @@ def test_fitted_rows_show_no_prediction(here, part):
     assert {joint["status"] for joint in found["per_joint"].values()} == {"not evaluated"}
 
 
-def test_the_same_motion_measured_again_is_no_new_one(here, rng):
-    folder, first, _ = here
-    tau = first.tau + 0.01 * NOISE * rng.standard_normal(first.tau.shape)
-    found = verdict(folder, replace(first, tau=tau))
-    assert found["status"] == "usable"
-    assert [doubt["code"] for doubt in found["warnings"]] == ["repeated_motion"]
-
-
 def test_faults_of_the_new_log_lead_its_verdict(here):
     folder, _, other = here
     v = other.v.copy()
@@ -106,53 +98,6 @@ def test_faults_of_the_new_log_lead_its_verdict(here):
     found = verdict(folder, replace(other, v=v))
     assert found["status"] == "poor"
     assert "dq_joint_2 is 0.5 times d(q)/dt" in found["reasons"][0]
-
-
-def test_without_the_fitted_logs_nobody_knows(here):
-    folder, first, other = here
-    (folder / "run.csv").unlink()
-    found = verdict(folder, other)
-    assert found["status"] == "usable"
-    assert "the fitted logs run.csv are missing or were changed" in found["reasons"][0]
-    # the file itself is known by its hash
-    assert "contain fitted samples" in verdict(folder, first)["reasons"][0]
-
-
-def test_an_alarm_of_the_result_stays_one_whatever_the_new_log(here):
-    folder, _, other = here
-    path = folder / "out" / "result.json"
-    result = json.loads(path.read_text())
-    result["verdict"]["log_errors"] = ["torque columns are exchanged"]
-    path.write_text(json.dumps(result))
-    found = verdict(folder, other)
-    assert found["status"] == "poor"
-    assert found["reasons"][0] == "torque columns are exchanged"
-    assert found["log_errors"] == ["torque columns are exchanged"]
-
-
-def test_a_doubt_about_the_old_validation_is_not_one_about_the_new(here):
-    folder, _, other = here
-    path = folder / "out" / "result.json"
-    result = json.loads(path.read_text())
-    result["verdict"]["warnings"] = [
-        {"code": code, "joint": "", "message": code} for code in ("repeated_motion", "clipped")
-    ]
-    path.write_text(json.dumps(result))
-    found = verdict(folder, other)
-    assert [doubt["code"] for doubt in found["warnings"]] == ["clipped"]
-    assert found["status"] == "usable"
-
-
-def test_a_longer_log_that_holds_the_fitted_rows_is_no_new_one(here):
-    folder, first, other = here
-    longer = replace(
-        first,
-        t=np.concatenate([first.t, first.t[-1] + 0.01 + other.t]),
-        **{k: np.vstack([getattr(first, k), getattr(other, k)]) for k in ("q", "v", "a", "tau")},
-    )
-    for log in (longer, rows(first, slice(0, 60))):
-        found = verdict(folder, log)
-        assert "contain fitted samples" in found["reasons"][0]
 
 
 def test_of_two_logs_the_one_that_was_fitted_shows_no_prediction_and_the_other_does(here):
@@ -175,16 +120,6 @@ def test_of_two_logs_the_one_that_was_fitted_shows_no_prediction_and_the_other_d
         "old.csv 0-9.99 s, cut.csv 0-6.99 s contain fitted samples"
         in found["verdict"]["reasons"][0]
     )
-
-
-def test_what_the_result_ignores_is_no_doubt(here, rng):
-    folder, first, _ = here
-    path = folder / "out" / "result.json"
-    result = json.loads(path.read_text())
-    result["settings"]["doctor"] = {"ignore": ["repeated_motion"]}
-    path.write_text(json.dumps(result))
-    tau = first.tau + 0.01 * NOISE * rng.standard_normal(first.tau.shape)
-    assert verdict(folder, replace(first, tau=tau))["warnings"] == []
 
 
 def test_a_fault_of_the_second_of_two_new_logs_is_one_of_the_verdict(here, monkeypatch):
@@ -225,21 +160,6 @@ def test_a_fault_of_the_second_of_two_new_logs_is_one_of_the_verdict(here, monke
     (folder / "out" / "older.json").write_text(json.dumps(stated))
     validate(folder / "out" / "older.json", logs)
     assert judged["determined"].is_poorly_excited is True
-
-
-def test_few_fitted_rows_in_a_long_log_and_a_few_of_it_in_a_long_fitted_one_are_shared(rng):
-    def log(count):
-        q, tau = rng.standard_normal((2, count, 2))
-        return Log(np.arange(count) / 100.0, q, tau, ("a", "b"))
-
-    short, long = log(30), log(9000)
-    q, tau = long.q.copy(), long.tau.copy()
-    q[4321:4351], tau[4321:4351] = short.q, short.tau
-    assert not command._share(short, long)
-    assert not command._share(long, short)
-    holder = replace(long, q=q, tau=tau)
-    assert command._share(short, holder)
-    assert command._share(holder, short)
 
 
 def test_the_expected_error_has_the_parts_of_fit_spread_and_residual(arm, rng, monkeypatch):
