@@ -16,7 +16,6 @@ from robotid.base.text import columns, terminal_width, wrapped
 from robotid.base.typing import STAGES, ProgressCallback, ignore_progress, report_stage
 from robotid.cli.console import (
     echo,
-    print_block,
     print_causes,
     print_steps,
     print_verdict,
@@ -491,7 +490,7 @@ def show_result(result: dict[str, Any], *, is_verbose: bool = False) -> None:
         echo(f"\nnot fitted: {name}", "  ")
         print("\n".join(error_lines(ours, wls and wls["validation"][k], width)))
     if lines := _drive_lines(result):
-        print_block(*(wrapped(line, width, "  ") for line in lines))
+        print("\n" + "\n".join(wrapped(line, width, "  ") for line in lines))
     print()
     verdict = result["verdict"]
     print_causes(

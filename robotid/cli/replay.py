@@ -13,7 +13,6 @@ from robotid.base.exceptions import DataError, SettingsError
 from robotid.base.files import check_file, read_json
 from robotid.base.findings import listed
 from robotid.base.typing import Array
-from robotid.cli.console import serve
 from robotid.cli.flags import (
     JOB,
     ONLINE,
@@ -24,6 +23,7 @@ from robotid.cli.flags import (
 )
 from robotid.cli.job import Job, LogEntry, written_job
 from robotid.cli.logs import log_of_commands
+from robotid.cli.track import serve
 from robotid.data.files.table_files import open_table
 from robotid.data.log import Log
 from robotid.data.signal_settings import LogSource

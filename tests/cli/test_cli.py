@@ -296,7 +296,7 @@ def test_demo_runs_from_nothing_and_finds_the_truth(tmp_path, capsys, monkeypatc
     monkeypatch.setattr("robotid.cli.demo._PERIOD", 7.0)
     leave_out_meshes(monkeypatch)
     shown = nullcontext(lambda *stage: stages.append(stage))
-    monkeypatch.setattr("robotid.cli.demo.terminal_progress", lambda: shown)
+    monkeypatch.setattr("robotid.cli.demo.progress_of", lambda options: shown)
     assert main(["demo", "--out", str(out)]) == 0
     printed = capsys.readouterr().out
     assert stages, "the stages of the identification are shown"
