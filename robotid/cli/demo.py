@@ -19,7 +19,7 @@ from robotid.dynamics.simulation.motions import random_fourier
 from robotid.dynamics.simulation.simulation_settings import Truth
 from robotid.dynamics.simulation.truth import draw_parameters
 from robotid.estimation.workers.plan import WorkPlan
-from robotid.identification.result import Identification
+from robotid.identification.result import TorqueIdentification
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 
@@ -32,7 +32,7 @@ _NOISE = Noise(q=2e-5, v=2e-4, tau=0.02)  # encoder [rad], its rate [rad/s], 2 %
 
 def run_demo(
     folder: str | Path, *, progress: ProgressCallback | None = None
-) -> tuple[Identification, dict[str, Any], Array]:
+) -> tuple[TorqueIdentification, dict[str, Any], Array]:
     """Simulate, identify, validate, and write all files.
 
     The simulated robot has other bodies than its URDF, and armature and friction in every joint.
@@ -60,7 +60,7 @@ def run_demo(
         replay=True,
     )
     found, result = run_job(job, target, plan=WorkPlan(progress=progress))
-    identification = cast(Identification, found)  # of the default estimator
+    identification = cast(TorqueIdentification, found)  # of the default estimator
     true = dict(zip(model.layout.names, truth, strict=True))
     # a drive term that the data shows, and the simulated robot does not have, is truly 0
     pi = np.array([true.get(name, 0.0) for name in identification.model.layout.names])

@@ -34,6 +34,7 @@ from robotid.cli.logs import (
 )
 from robotid.cli.payload import check_payloads
 from robotid.data.files.read import Readable, read_logs
+from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
 from robotid.diagnosis.logs.check_logs import diagnose
 from robotid.diagnosis.verdict.fit_findings import locked_findings
@@ -41,13 +42,13 @@ from robotid.diagnosis.verdict.verdict import check_ignored
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.friction_projection import project_friction
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings, SimulationSettings
-from robotid.estimation.fitting.evaluation import Evaluation
+from robotid.estimation.fitting.evaluation import Evaluated
 from robotid.estimation.fitting.recorded import Recordings
 from robotid.estimation.workers.plan import WorkPlan
 from robotid.identification import pipeline
 from robotid.identification.closed_loop.loop_settings import LoopSettings
 from robotid.identification.pipeline import conclude, robot_of
-from robotid.identification.result import Identification
+from robotid.identification.result import Identification, TorqueIdentification
 from robotid.identification.summary import (
     error_lines,
     friction_lines,
@@ -57,7 +58,6 @@ from robotid.identification.summary import (
 from robotid.output.files.entries import build_result
 from robotid.output.files.urdf import DYNAMICS_TERMS, write_urdf
 from robotid.output.report.document import write_report
-from robotid.output.report.loop_steps import loop_steps
 from robotid.output.report.next_steps import next_steps
 from robotid.output.report.steps import Origin
 from robotid.robot.drives import DriveTerm
@@ -66,9 +66,11 @@ from robotid.robot.model import RobotModel
 from robotid.robot.tree import read_tree
 
 if TYPE_CHECKING:
-    from robotid.identification.closed_loop.loop_result import LoopIdentification
-    from robotid.identification.closed_loop.position_errors import OpenLoop
     from robotid.output.viewer.replays import Replay
+
+
+_log = logging.getLogger(__name__)
+_NO_LOGS: tuple[Log, ...] = ()
 
 
 @checked("progress")
@@ -76,7 +78,7 @@ def identify(
     model: RobotModel | str | Path,
     logs: Readable | Sequence[Readable] | None = None,
     *,
-    validation: Readable | Sequence[Readable] = (),
+    validation: Readable | Sequence[Readable] = _NO_LOGS,
     signals: SignalSettings | None = None,
     estimator: EstimatorSettings | str = "consistent",
     controller: Mapping[str, Any] | None = None,
@@ -84,7 +86,7 @@ def identify(
     doctor: bool = True,
     ignore: Sequence[str] = (),
     progress: ProgressCallback | None = None,
-) -> "Identification | LoopIdentification":
+) -> Identification:
     """Identify a robot's parameters from motion logs, as the command line does.
 
     Args:
@@ -109,7 +111,8 @@ def identify(
             their name.
 
     Returns:
-        The identification; for the estimator "simulation" a ``LoopIdentification``.
+        The identification; its evaluations are of torques, or for the estimator "simulation" of
+            positions.
 
     Raises:
         DataError: If a log cannot be read, does not match the model or is too short.
@@ -121,7 +124,12 @@ def identify(
     """
     if logs is None:
         job = job_file(model)
-        return identified(job, WorkPlan(job.workers or 1, progress=progress))[0]
+        if not (validation is _NO_LOGS and signals is controller is None and not ignore):
+            raise SettingsError(
+                f"{job.urdf.name} is identified by a job file, which states logs and settings; "
+                "state validation, signals, controller and ignore there"
+            )
+        return identify_job(job, job.model(), WorkPlan(job.workers or 1, progress=progress))
     require_kind(
         estimator, (str, EstimatorSettings), "estimator", "a name or a robotid.EstimatorSettings"
     )
@@ -171,44 +179,24 @@ def identify(
     )  # fmt: skip
 
 
-_log = logging.getLogger(__name__)
-
-
 def run_job(
     job: Job, folder: str | Path, *, plan: WorkPlan | None = None, source: Sequence[str] = ()
-) -> tuple["Identification | LoopIdentification", dict[str, Any]]:
+) -> tuple[Identification, dict[str, Any]]:
     """Identify and write result.json, report and URDF; return the result and result.json.
 
     The words of the source, after ``robotid identify``, repeat the run.
     """
     chosen, target = plan or WorkPlan(job.workers or 1), Path(folder)
-    found, used = identified(job, chosen, target)
-    is_simulated = isinstance(job.estimator, SimulationSettings)
-    report_stage(chosen.progress, "writing", _loop_stages() if is_simulated else STAGES)
-    return _write(found, used, target, source=source)
-
-
-def identified(
-    job: Job, plan: WorkPlan, target: Path | None = None
-) -> tuple["Identification | LoopIdentification", Job]:
-    """Return the identification of a job and the job with the choices; nothing is written.
-
-    A folder where its results cannot be written is refused first.
-    """
-    is_simulated = isinstance(job.estimator, SimulationSettings)
-    report_stage(plan.progress, "reading logs", _loop_stages() if is_simulated else STAGES)
     model = job.model()
-    if target is not None:
-        check_folder(target, ["result.json", *_names(model)])
-    if is_simulated:
-        return _identify_loops(job, model, plan.progress), job
-    found = identify_job(job, model, plan)
-    return found, _job_of(found)
+    check_folder(target, ["result.json", *_names(model)])
+    found = identify_job(job, model, chosen)
+    report_stage(chosen.progress, "writing", _stages(job))
+    return _write(found, _job_of(found), target, source=source)
 
 
 @checked("identification")
 def save_result(
-    identification: "Identification | LoopIdentification",
+    identification: Identification,
     folder: str | Path,
     *,
     report: bool = True,
@@ -252,12 +240,12 @@ def _names(model: RobotModel) -> tuple[str, str, str, str]:
 
 
 def _write(
-    found: "Identification | LoopIdentification",
+    found: Identification,
     job: Job,
     target: Path,
     *,
     source: Sequence[str] = (),
-) -> tuple["Identification | LoopIdentification", dict[str, Any]]:
+) -> tuple[Identification, dict[str, Any]]:
     """Write all files of a result; return the identification with its report, and result.json."""
     names = report, replay, name, sidecar = _names(found.model)
     target.mkdir(parents=True, exist_ok=True)
@@ -287,11 +275,11 @@ def _write(
     return found, result
 
 
-def _replay_of(found: "Identification | LoopIdentification", job: Job, folder: Path) -> "Replay":
+def _replay_of(found: Identification, job: Job, folder: Path) -> "Replay":
     """Return the replay of a result that is written in a folder; its modules are imported here."""
     from robotid.cli.replay import read_findings, replay_files, replay_identified, stated_job
 
-    if isinstance(found, Identification):
+    if isinstance(found, TorqueIdentification):
         return replay_identified(found)
     entries = (*job.validation, *job.identification)
     if not entries:
@@ -304,7 +292,7 @@ def _replay_of(found: "Identification | LoopIdentification", job: Job, folder: P
     return replay_files(replace(stated, identification=entries[:1]), findings)
 
 
-def _job_of(identification: "Identification | LoopIdentification") -> Job:
+def _job_of(identification: Identification) -> Job:
     """Return the job of an identification; one made in Python gets an equivalent job.
 
     Logs in memory have no file, and a ``Log`` has no gains, units or names of columns.
@@ -312,10 +300,9 @@ def _job_of(identification: "Identification | LoopIdentification") -> Job:
     model, asked = identification.model, identification.stated
     if isinstance(asked.job, Job):
         return asked.job
-    if isinstance(identification, Identification):
-        chosen, loop = {drive.joint: drive for drive in identification.drives}, LoopSettings()
-    else:
-        chosen, loop = {}, identification.loop
+    chosen, loop = {}, getattr(identification, "loop", LoopSettings())
+    if isinstance(identification, TorqueIdentification):
+        chosen = {drive.joint: drive for drive in identification.drives}
     wanted = wanted_families(asked.friction, model.joints)
     is_auto = all(names is None for names in wanted.values())
     drives: dict[str, tuple[str | DriveTerm, ...]] = {}
@@ -351,15 +338,11 @@ def _job_of(identification: "Identification | LoopIdentification") -> Job:
     )
 
 
-def _entries(runs: "Sequence[Evaluation | OpenLoop]") -> tuple[LogEntry, ...]:
+def _entries(evaluations: Sequence[Evaluated]) -> tuple[LogEntry, ...]:
     """Return the windows of the logs that are in files."""
-    windows = [
-        (run.recording.log.path, run.recording.extent.start, run.recording.extent.end)
-        if isinstance(run, Evaluation)
-        else (run.log.path, float(run.log.t[0]), float(run.log.t[-1]))
-        for run in runs
-    ]
-    return tuple(LogEntry(Path(path), start, end) for path, start, end in windows if path)
+    return tuple(
+        LogEntry(Path(e.log.path), e.extent.start, e.extent.end) for e in evaluations if e.log.path
+    )
 
 
 def identify_job(
@@ -371,6 +354,9 @@ def identify_job(
 ) -> Identification:
     """Identify from a job's logs; nothing is written."""
     check_ignored(job.ignore)
+    report_stage(plan.progress, "reading logs", _stages(job))
+    if isinstance(job.estimator, SimulationSettings):
+        return _identify_loops(job, model, plan.progress)
     groups = job.identification, job.validation
     fitted, validation = survey_logs(job, model, *groups, refuse=refuse)
     if not fitted:
@@ -407,8 +393,10 @@ def identify_job(
     )
 
 
-def _loop_stages() -> Sequence[str]:
-    """Return the stages of a simulation; other jobs do not import its modules."""
+def _stages(job: Job) -> Sequence[str]:
+    """Return the stages of a job; the modules of a simulation are imported only for one."""
+    if not isinstance(job.estimator, SimulationSettings):
+        return STAGES
     from robotid.identification.closed_loop.stages import STAGES as stages
 
     return stages
@@ -416,12 +404,11 @@ def _loop_stages() -> Sequence[str]:
 
 def _identify_loops(
     job: Job, model: RobotModel, progress: ProgressCallback | None
-) -> "LoopIdentification":
+) -> Identification:
     """Identify by simulation, from commands or logged torques; no file is written."""
     from robotid.identification.closed_loop.from_commands import identify_loops
 
     assert isinstance(job.estimator, SimulationSettings)
-    check_ignored(job.ignore)
     logs, validation = (
         [job.read(entry, model, needs=needed_of(job)) for entry in entries]
         for entries in (job.identification, job.validation)
@@ -470,11 +457,7 @@ def run(options: argparse.Namespace) -> int:
         [*result["outputs"].values(), "result.json"],
     )
     if not options.json:
-        origin = Origin(source, options.out)
-        if isinstance(found, Identification):
-            print_steps(next_steps(found, origin))
-        else:
-            print_steps(loop_steps(result, origin))
+        print_steps(next_steps(found, Origin(source, options.out)))
     return 1 if result["verdict"]["log_errors"] else 0
 
 

@@ -33,7 +33,7 @@ from robotid.dynamics.constraints.closed_log import closed_log
 from robotid.dynamics.prediction import predict_instants
 from robotid.estimation.fitting.evaluation import predict
 from robotid.estimation.fitting.survey import hold_log
-from robotid.identification.result import Identification
+from robotid.identification.result import TorqueIdentification
 from robotid.output.files.result_file import (
     Result,
     load_result,
@@ -168,7 +168,7 @@ def replay_files(job: Job, findings: Findings, *, ghost: str | Path | None = Non
     )
 
 
-def replay_identified(identification: Identification) -> Replay:
+def replay_identified(identification: TorqueIdentification) -> Replay:
     """Return the replay of an identification: its first validation log, or its first fitted one."""
     shown, model = shown_evaluation(identification), identification.model
     motion, mask = shown.recording.trajectory, shown.recording.mask

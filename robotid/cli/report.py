@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from robotid.base.exceptions import DataError
-from robotid.base.files import check_file, file_sha256, log_exists, write_text
+from robotid.base.files import check_file, file_sha256, log_exists
 from robotid.base.findings import listed
 from robotid.base.typing import ProgressCallback, report_stage
 from robotid.base.versions import versions
@@ -15,13 +15,10 @@ from robotid.cli.console import progress_of, show_found
 from robotid.cli.flags import add_json, add_progress, add_verbose
 from robotid.cli.identify import identify_job
 from robotid.cli.job import Job, written_job
-from robotid.cli.logs import log_of_commands
 from robotid.estimation.workers.plan import WorkPlan
 from robotid.identification.result import Identification
 from robotid.output.files.result_file import load_result
 from robotid.output.report.document import write_report
-from robotid.output.report.position_page import shown_positions
-from robotid.output.report.shown import page_of
 from robotid.output.report.steps import Origin
 
 _SHARE = 1e-6  # permitted difference over a base parameter, for rounding ...
@@ -33,8 +30,7 @@ def rewrite_report(
 ) -> dict[str, Any]:
     """Write the report of a result again, in the form of this version of robotid.
 
-    The fit is repeated with the inputs and settings of the result. A result of the estimator
-    "simulation" is simulated, not fitted.
+    The fit is repeated with the inputs and settings of the result.
     """
     loaded = load_result(path)
     content, folder = loaded.content, loaded.path.parent
@@ -43,10 +39,8 @@ def rewrite_report(
     report_stage(progress, "reading logs")
     job = written_job(content["settings"], loaded.path.name)
     _check_inputs(job, content, loaded.path.name)
-    found = None
-    if "simulation" not in content:
-        found = identify_job(job, job.model(), WorkPlan(job.workers or 1, progress=progress))
-        _require_same(found, content, loaded.path.name)
+    found = identify_job(job, job.model(), WorkPlan(job.workers or 1, progress=progress))
+    _require_same(found, content, loaded.path.name)
     report_stage(progress, "writing")
     beside = {"result": loaded.path.name, **content["outputs"], "replay": "replay.html"}
     files = {
@@ -57,20 +51,7 @@ def rewrite_report(
     }
     is_beside = goal.resolve().parent == folder.resolve()
     origin = Origin((), str(folder), "replay.html" if is_beside else "")
-    if found is None:
-        validation, fitted = (
-            [loaded.open_loop(log_of_commands(job, entry, loaded)) for entry in entries]
-            for entries in (job.validation, job.identification)
-        )
-        model = job.model()
-        pi, bodies = model.standard_parameters(), slice(model.layout.n_inertial)
-        pi[bodies] = loaded.parameters[bodies]
-        shown = shown_positions(
-            content, fitted, validation, origin, (model, pi), files.get("replay", "")
-        )
-        write_text(page_of(shown, files), goal)
-    else:
-        write_report(found, goal, files=files, origin=origin)
+    write_report(found, goal, files=files, origin=origin)
     return {"result": str(loaded.path), "report": str(goal)}
 
 

@@ -46,11 +46,9 @@ from robotid.estimation.fitting.recorded import Recordings
 from robotid.estimation.fitting.survey import SurveyedLog
 from robotid.estimation.variation.groups import RunSums, runs_of
 from robotid.estimation.variation.variation import vary
-from robotid.identification.closed_loop.position_errors import OpenLoop, position_metrics
+from robotid.identification.closed_loop.position_errors import pool_positions
 from robotid.identification.repeated_errors import with_repeated_errors
 from robotid.identification.summary import error_lines, variation_lines
-from robotid.output.files.entries import recording_metrics
-from robotid.output.files.loop_export import open_loop_entry
 from robotid.output.files.result_file import (
     Result,
     load_result,
@@ -218,9 +216,7 @@ def validate(
     return {
         "result": str(result),
         "predicted_with": content["outputs"].get("urdf", "base parameters of result.json"),
-        "validation": [
-            recording_metrics(e, "estimate") | _expected(content, model, e) for e in evaluations
-        ],
+        "validation": [e.to_dict() | _expected(content, model, e) for e in evaluations],
         "verdict": verdict.to_dict(),
         **({} if added is None else {"variation": added.shown}),
         "findings": [asdict(finding) for finding in unlike],
@@ -268,7 +264,7 @@ def _validate_commands(loaded: Result, job: Job, entries: Sequence[LogEntry]) ->
     is_validation = not any(file_sha256(entry.path) in hashes for entry in entries)
     log_errors = blocking(diagnose(model, (), logs, job.signals), job.ignore)
     verdict = judge_positions(
-        position_metrics(model, runs, moving=True),
+        pool_positions(runs, moving=True),
         model.joints,
         is_validation=is_validation,
         log_errors=[finding.message for finding in log_errors],
@@ -276,16 +272,9 @@ def _validate_commands(loaded: Result, job: Job, entries: Sequence[LogEntry]) ->
     return {
         "result": str(loaded.path),
         "predicted_with": loaded.content["outputs"]["urdf"],
-        "validation": [_errors_of(model, run) for run in runs],
+        "validation": [run.to_dict() for run in runs],
         "verdict": verdict.to_dict(),
     }
-
-
-def _errors_of(model: RobotModel, run: OpenLoop) -> dict[str, Any]:
-    """Return metrics and errors of a log of commands, joint by joint."""
-    metrics, errors = position_metrics(model, (run,)).to_dict(), open_loop_entry(model, run)
-    per_joint = {joint: m | errors["per_joint"][joint] for joint, m in metrics["per_joint"].items()}
-    return {"name": run.name, **metrics, **errors, "per_joint": per_joint}
 
 
 def _fitted_logs(

@@ -1,16 +1,13 @@
 import json
 from contextlib import redirect_stdout
-from dataclasses import replace
 from io import StringIO
 
 import numpy as np
 import pytest
 from helpers.mujoco_plant import plant, torque_log
 
-from robotid.cli import identify, main
-from robotid.cli.job import read_job
+from robotid.cli import main
 from robotid.data.files.read import write_log
-from robotid.robot.families import AUTO
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +65,7 @@ def result(folder):
 
 def test_a_job_driven_by_its_torque_writes_errors_beside_those_of_its_rows(folder, result):
     assert result["settings"]["controller"]["kind"] == "torque"
-    [run] = result["simulation"]["validation"]
+    [run] = result["validation"]
     assert list(run["horizons"]) == ["0.1", "0.5", "2"]
     for joint, own in run["per_joint"].items():
         assert own["command_rmse"] is None
@@ -81,7 +78,7 @@ def test_a_job_driven_by_its_torque_writes_errors_beside_those_of_its_rows(folde
 def test_its_result_is_validated_on_another_log(folder, job, result, capsys):
     assert main(["validate", str(folder), str(job.parent / "second.csv"), "--json"]) == 0
     again = json.loads(capsys.readouterr().out)
-    [run], [before] = again["validation"], result["simulation"]["validation"]
+    [run], [before] = again["validation"], result["validation"]
     for joint, own in run["per_joint"].items():
         assert own["rmse"] == pytest.approx(before["per_joint"][joint]["rmse"], rel=1e-6)
     assert again["verdict"]["status"] != "not evaluated"
@@ -90,28 +87,3 @@ def test_its_result_is_validated_on_another_log(folder, job, result, capsys):
     both = json.loads(capsys.readouterr().out)
     assert both["verdict"]["status"] == "not evaluated", "one of the two was fitted"
     assert both["validation"][0] == run
-
-
-@pytest.mark.parametrize("is_auto", [False, True])
-def test_what_a_job_says_reaches_the_fit_of_roll_outs(job, monkeypatch, is_auto):
-    class Told(Exception):
-        pass
-
-    def told(*stated, **options):
-        raise Told(stated, options)
-
-    monkeypatch.setattr("robotid.identification.closed_loop.from_commands.identify_loops", told)
-    asked = replace(read_job(job), ignore=("spikes",))
-    logs = tuple(replace(entry, unit="third arm") for entry in asked.identification)
-    asked = replace(asked, identification=logs)
-    asked = replace(asked, terms=(*asked.terms, *([AUTO] if is_auto else [])))
-    with pytest.raises(Told) as error:
-        identify._identify_loops(asked, asked.model(), None)
-    (_, fitted, kept, loop, estimator), options = error.value.args
-    for logs, name in ((fitted, "first.csv"), (kept, "second.csv")):
-        assert [log.name for log in logs] == [name]
-    assert (loop, estimator) == (asked.controller, asked.estimator)
-    assert options["signals"].cutoff == 30.0
-    assert options["ignore"] == ("spikes",)
-    assert options["chooses"] is is_auto
-    assert options["units"] == ["third arm"]

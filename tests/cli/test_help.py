@@ -1,6 +1,5 @@
 """The command line's help, and its answer to a misspelt word."""
 
-
 import pytest
 
 from robotid.cli import excite, identify, main

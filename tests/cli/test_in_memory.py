@@ -9,7 +9,7 @@ from helpers.mujoco_plant import plant, torque_log
 import robotid
 from robotid.cli.identify import run_job
 from robotid.cli.job import read_job
-from robotid.identification.closed_loop.loop_result import LoopIdentification
+from robotid.identification.closed_loop.loop_result import PositionIdentification
 
 SETTINGS = {"bodies": 0.0, "step": 4e-3, "torques": False}
 
@@ -43,7 +43,7 @@ def test_it_finds_what_a_job_finds_of_the_same_logs(arm, found, tmp_path):
         "[[validation]]\nlog = 'kept.csv'\n[output]\nreport = false\n"
     )
     again, _ = run_job(read_job(tmp_path / "job.toml"), tmp_path / "out")
-    assert isinstance(found, LoopIdentification)
+    assert isinstance(found, PositionIdentification)
     np.testing.assert_allclose(found.standard, again.standard, rtol=1e-6, atol=1e-9)
     assert len(found.validation) == 1
     assert found.verdict.status == again.verdict.status

@@ -21,7 +21,7 @@ from robotid.base.versions import __version__
 from robotid.dynamics.friction_projection import project_friction
 from robotid.estimation.fitting.bands import QUANTILE
 from robotid.estimation.fitting.identified import Identified
-from robotid.identification.result import Identification
+from robotid.identification.result import TorqueIdentification
 from robotid.output.files.commanded import commanded_drives
 from robotid.output.files.exported import Written
 from robotid.output.files.samples import SIMULATED, write_samples
@@ -185,7 +185,7 @@ def stated_ranges(content: Mapping[str, Any]) -> dict[str, Any]:
     return {"undetermined": content["structure"]["undetermined"], **ranges, "drives": merged}
 
 
-def write_ranges(found: Identification, target: str | Path) -> None:
+def write_ranges(found: TorqueIdentification, target: str | Path) -> None:
     """Write the ranges of an identification as YAML.
 
     Args:
@@ -197,7 +197,7 @@ def write_ranges(found: Identification, target: str | Path) -> None:
         ModelError: If a link or a drive would be physically impossible.
         SettingsError: If the target is a folder.
     """
-    require_kind(found, Identification, "found", "a robotid.Identification")
+    require_kind(found, TorqueIdentification, "found", "a robotid.Identification")
     require_kind(target, (str, Path), "target", "the path of a file to write")
     write_text(ranges_text(parameter_ranges(found)), target)
 

@@ -49,7 +49,7 @@ from robotid.output.files.urdf import load_identified, terms_from_facts
 from robotid.robot.model import RobotModel
 
 if TYPE_CHECKING:
-    from robotid.identification.closed_loop.position_errors import OpenLoop
+    from robotid.identification.closed_loop.position_errors import PositionEvaluation
 
 _STATUSES = ("good", "usable", "poor", "not evaluated")
 _STATUS = Range("good, usable, poor or not evaluated", _STATUSES.__contains__)
@@ -230,7 +230,9 @@ class Result:
         return self._signs * self.open_loop(log, horizons=()).q
 
     @checked()
-    def open_loop(self, log: Log, *, horizons: Sequence[float] | None = None) -> "OpenLoop":
+    def open_loop(
+        self, log: Log, *, horizons: Sequence[float] | None = None
+    ) -> "PositionEvaluation":
         """Return a log with the positions simulated for it, in the URDF's sense of the joints.
 
         The inputs are its commands; for a result without gains, its feed-forward torques.

@@ -7,6 +7,8 @@ from typing import Any
 from robotid.diagnosis.verdict import evidence
 from robotid.diagnosis.verdict import position_verdict as positions
 from robotid.diagnosis.verdict.verdict import JointVerdict
+from robotid.estimation.fitting.metrics import Metrics
+from robotid.identification.result import Identification
 from robotid.identification.summary import verdict_cell
 from robotid.output.pages.html import code, number, percent, table, text
 from robotid.output.report.bars import Bar, Mark, bars_html
@@ -82,6 +84,22 @@ class Errors:
         if self.is_fitted and not self.name:
             return "All fitted samples together"
         return f"{self.name}: {'fitted' if self.is_fitted else 'not fitted'}"
+
+
+def errors_of(found: Identification) -> tuple[Errors, ...]:
+    """Return the errors on the validation recordings, then on all fitted ones together."""
+
+    def joints(metrics: Metrics, wls: Metrics | None) -> dict[str, Any]:
+        content: dict[str, Any] = metrics.to_dict()["per_joint"]
+        for joint in content if wls is not None else ():
+            content[joint]["wls_relative_error_pct"] = wls.per_joint[joint].relative_error_pct
+        return content
+
+    name = found.fitted[0].name if len(found.fitted) == 1 else ""
+    return (
+        *(Errors(e.name, joints(e.metrics["estimate"], found.beside(e))) for e in found.validation),
+        Errors(name, joints(found.metrics(), found.beside()), is_fitted=True),
+    )
 
 
 def worst_errors(recordings: Sequence[Errors]) -> dict[str, Mapping[str, Any]]:

@@ -16,7 +16,7 @@ from robotid.diagnosis.residual.torque_split import JointTorque, spread_rows
 from robotid.dynamics.memory import drive_motion_along
 from robotid.estimation.fitting.bands import QUANTILE, TorqueBand, friction_curve
 from robotid.estimation.fitting.evaluation import Evaluation
-from robotid.identification.result import Identification
+from robotid.identification.result import TorqueIdentification
 from robotid.output.pages.charts import Chart, Series, broken
 from robotid.output.pages.plots import Plot
 
@@ -40,7 +40,7 @@ _TONES = {
 
 
 def plot_torques(
-    identification: Identification, *joints: str, recording: Evaluation | None = None
+    identification: TorqueIdentification, *joints: str, recording: Evaluation | None = None
 ) -> Plot:
     """Return charts of measured and identified torque over time, and of the residual.
 
@@ -66,10 +66,10 @@ def plot_torques(
     for name, row in zip(names, rows, strict=True):
         torque, residual = torque_charts(identification, shown, row, band=band)
         charts += [(torque, f"{name}: torque"), (residual, f"{name}: residual")]
-    return Plot(f"Torques of {shown.recording.name}", tuple(charts))
+    return Plot(f"Torques of {shown.name}", tuple(charts))
 
 
-def plot_friction(identification: Identification, *joints: str) -> Plot:
+def plot_friction(identification: TorqueIdentification, *joints: str) -> Plot:
     """Return charts of friction against speed, measured and identified, with its band.
 
     Args:
@@ -92,7 +92,7 @@ def plot_friction(identification: Identification, *joints: str) -> Plot:
     return Plot(f"Friction of {listed(names)} against speed", shown)
 
 
-def plot_why(identification: Identification, joint: str) -> Plot:
+def plot_why(identification: TorqueIdentification, joint: str) -> Plot:
     """Return charts of the parts of a joint's torque, and of its residual's dependences.
 
     Args:
@@ -113,12 +113,12 @@ def plot_why(identification: Identification, joint: str) -> Plot:
     return Plot(f"Torque parts and residual of {joint}", shown)
 
 
-def shown_evaluation(found: Identification) -> Evaluation:
+def shown_evaluation(found: TorqueIdentification) -> Evaluation:
     """Return the recording to show: the first validation recording, or the first fitted one."""
     return (found.validation or found.fitted)[0]
 
 
-def _row_of(identification: Identification, joint: str) -> int:
+def _row_of(identification: TorqueIdentification, joint: str) -> int:
     """Return the index of a joint's torque row."""
     require_kind(joint, str, "joint", "the name of a joint")
     names = identification.model.row_names
@@ -131,7 +131,7 @@ def _row_of(identification: Identification, joint: str) -> int:
 
 
 def torque_charts(
-    found: Identification,
+    found: TorqueIdentification,
     evaluation: Evaluation,
     row: int,
     *,
@@ -211,7 +211,7 @@ def unused_spans(t: Array, used: NDArray[np.bool_]) -> tuple[tuple[float, float]
 
 
 def residual_charts(
-    found: Identification, evaluation: Evaluation, row: int
+    found: TorqueIdentification, evaluation: Evaluation, row: int
 ) -> tuple[Chart, Chart] | None:
     """Return spectrum and autocorrelation of a joint's residual; None if no sample was used."""
     motion, used = evaluation.recording.trajectory, evaluation.recording.mask[:, row].astype(bool)
@@ -252,7 +252,7 @@ def residual_charts(
 
 
 def friction_chart(
-    found: Identification, joint: str, *, split: tuple[Array, Array] | None = None
+    found: TorqueIdentification, joint: str, *, split: tuple[Array, Array] | None = None
 ) -> Chart | None:
     """Return friction against speed: measured, identified, and at constant speed."""
     evaluation, model = shown_evaluation(found), found.model
@@ -291,7 +291,7 @@ def friction_chart(
     )
 
 
-def parameter_charts(found: Identification, terms: Sequence[str]) -> tuple[Chart, ...]:
+def parameter_charts(found: TorqueIdentification, terms: Sequence[str]) -> tuple[Chart, ...]:
     """Return charts of each term of all drives, with the value before the fit."""
     layout = found.model.layout
     owners, ends = zip(*(name.rsplit(".", 1) for name in layout.names), strict=True)

@@ -11,7 +11,7 @@ from robotid.base.findings import listed
 from robotid.base.typing import Array
 from robotid.diagnosis.residual.residuals import friction_split
 from robotid.estimation.fitting.selected_drives import DriveChoice
-from robotid.identification.result import Identification
+from robotid.identification.result import TorqueIdentification
 from robotid.output.pages.charts import Chart, chart_html
 from robotid.output.pages.html import code, figure, folded, number, table, text
 from robotid.output.report.information_section import Information, information
@@ -33,12 +33,12 @@ _NARROW = 300  # [px] width of its static picture
 _CURVES = 8  # friction charts that are not folded
 
 
-def residual_section(found: Identification) -> str:
+def residual_section(found: TorqueIdentification) -> str:
     """Return spectrum and autocorrelation of each joint's residual."""
     if found.model.is_static:
         return "<p>Static poses and slow segments have no spectrum.</p>\n"
     figures = "".join(_residual_figures(found, row) for row in range(found.model.n_rows))
-    name = escape(shown_evaluation(found).recording.name)
+    name = escape(shown_evaluation(found).name)
     return (
         f"<p>Samples of {name} that are used. Left: spectra of residual and torque. A peak is a "
         "vibration or a ripple that the model does not contain. The dotted line is the filter's "
@@ -49,7 +49,7 @@ def residual_section(found: Identification) -> str:
     )
 
 
-def friction_section(found: Identification, worst: Sequence[str]) -> str:
+def friction_section(found: TorqueIdentification, worst: Sequence[str]) -> str:
     """Return friction against speed of each joint, measured and identified."""
     names, layout = found.model.row_names, found.model.layout
     if found.model.is_static or all(term.is_inertia for _, term in layout.drive_parameters):
@@ -62,7 +62,7 @@ def friction_section(found: Identification, worst: Sequence[str]) -> str:
         rest = f'<div class="plots small">\n{rest}</div>\n'
         count = len(names) - len(first)
         rest = folded("friction-more", f"{count} more joints with smaller errors", rest)
-    log = escape(shown_evaluation(found).recording.name)
+    log = escape(shown_evaluation(found).name)
     return (
         f"<p>Measured: torque minus inertia, gravity and armature, on {log}. Identified: friction "
         "and offset. Line: the friction at constant speed, with the 95 % band of its parameters. "
@@ -72,7 +72,7 @@ def friction_section(found: Identification, worst: Sequence[str]) -> str:
     )
 
 
-def drive_figures(found: Identification) -> str:
+def drive_figures(found: TorqueIdentification) -> str:
     """Return the selection of friction terms and bars of the drive parameters."""
     layout = found.model.layout
     if not layout.drive_names:
@@ -89,7 +89,7 @@ def drive_figures(found: Identification) -> str:
     return f'{choice}<h3>Values</h3>\n<div class="plots">\n{bars}</div>\n'
 
 
-def information_section(found: Identification) -> str:
+def information_section(found: TorqueIdentification) -> str:
     """Return the information in the data: singular values, shares, correlations."""
     info, names = information(found), found.mapping.base_names
     shares = np.round(100 * info.data_share).astype(int)
@@ -118,7 +118,7 @@ def information_section(found: Identification) -> str:
     )
 
 
-def _residual_figures(found: Identification, row: int) -> str:
+def _residual_figures(found: TorqueIdentification, row: int) -> str:
     name = escape(found.model.row_names[row])
     charts = residual_charts(found, shown_evaluation(found), row)
     if charts is None:
@@ -132,7 +132,7 @@ def _residual_figures(found: Identification, row: int) -> str:
     return "".join(chart_html(*each) for each in zip(charts, captions, strict=True))
 
 
-def _friction_figures(found: Identification) -> dict[str, str]:
+def _friction_figures(found: TorqueIdentification) -> dict[str, str]:
     """Return the friction chart of each joint."""
     split = friction_split(found.model, shown_evaluation(found), found.standard)
     figures = {}
@@ -153,7 +153,7 @@ def _parameter_figure(chart: Chart) -> str:
     return chart_html(chart, f"<strong>{escape(chart.y_label.partition(' [')[0])}</strong>")
 
 
-def _choice(found: Identification, drive: DriveChoice) -> str:
+def _choice(found: TorqueIdentification, drive: DriveChoice) -> str:
     """Return the candidate friction terms of a joint, the selection, and its shape parameters."""
     selected = " + ".join(drive.families) or "no additional term"
     shapes = [

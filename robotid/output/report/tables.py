@@ -12,7 +12,7 @@ from robotid.base.findings import listed
 from robotid.base.typing import Array
 from robotid.estimation.fitting.evaluation import Recording
 from robotid.estimation.fitting.identified import SOURCES
-from robotid.identification.result import Identification
+from robotid.identification.result import TorqueIdentification
 from robotid.output.files.urdf import urdf_changes
 from robotid.output.pages.html import Cell, code, folded, number, percent, table, text, with_error
 from robotid.robot.model import RobotModel
@@ -171,7 +171,7 @@ def _change_section(model: RobotModel | None, standard: Array | None) -> str:
     )
 
 
-def base_table(found: Identification) -> str:
+def base_table(found: TorqueIdentification) -> str:
     """Return the table of the base parameters."""
     mapping, units = found.mapping, found.model.layout.units
     open_ = set(found.determination.undetermined)
@@ -192,7 +192,7 @@ def base_table(found: Identification) -> str:
     )
 
 
-def consistency_section(found: Identification) -> str:
+def consistency_section(found: TorqueIdentification) -> str:
     """Return masses and pseudo-inertias, of the URDF and identified; prior, bounds, mass matrix."""
     layout = found.model.layout
     before, after = (
@@ -223,7 +223,7 @@ def consistency_section(found: Identification) -> str:
     )
 
 
-def open_section(found: Identification) -> str:
+def open_section(found: TorqueIdentification) -> str:
     """Return the parameters that the data do not determine."""
     wls, layout = found.wls, found.model.layout
     fixed = [n for n, source in zip(layout.names, found.sources, strict=True) if source == "prior"]
@@ -237,7 +237,7 @@ def open_section(found: Identification) -> str:
     )
 
 
-def _indistinguishable(found: Identification) -> str:
+def _indistinguishable(found: TorqueIdentification) -> str:
     """Return indistinguishable base parameters, and their identifiable combinations."""
     groups = found.determination.merged
     title = "Base parameters that are not identifiable alone"
@@ -260,7 +260,7 @@ def _indistinguishable(found: Identification) -> str:
     return "".join(parts)
 
 
-def _combinations(found: Identification) -> str:
+def _combinations(found: TorqueIdentification) -> str:
     """Return the identifiability of each body's parameters: alone, in sums only, or never."""
     layout = found.model.layout
     rows = []
@@ -276,7 +276,7 @@ def _combinations(found: Identification) -> str:
     )
 
 
-def settings_tables(found: Identification) -> str:
+def settings_tables(found: TorqueIdentification) -> str:
     """Return the tables of the settings, as used."""
     model = found.model
     settings = found.estimator.to_dict()
@@ -351,7 +351,7 @@ def _signal_row(recording: Recording) -> list[Cell]:
     ]
 
 
-def _consistency_notes(found: Identification) -> str:
+def _consistency_notes(found: TorqueIdentification) -> str:
     """Return paragraphs on data coverage, mass matrix, prior and bounds of the fit."""
     notes = [_coverage(found), _mass_matrix(found)]
     details = found.estimate.details
@@ -371,7 +371,7 @@ def _consistency_notes(found: Identification) -> str:
     return "".join(f"<p>{escape(text)}</p>\n" for text in notes)
 
 
-def _coverage(found: Identification) -> str:
+def _coverage(found: TorqueIdentification) -> str:
     counts = {kind: found.sources.count(kind) for kind in SOURCES}
     carried = [
         body
@@ -392,7 +392,7 @@ def _coverage(found: Identification) -> str:
     )
 
 
-def _mass_matrix(found: Identification) -> str:
+def _mass_matrix(found: TorqueIdentification) -> str:
     check = found.mass_matrix
     where = "at all" if check.is_positive else f"at {100 * check.positive_share:.3g} % of"
     return (

@@ -1,9 +1,8 @@
 """The content of a report on an identification from torques."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from html import escape
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -13,17 +12,15 @@ from robotid.data.signal_settings import SignalSettings
 from robotid.diagnosis.verdict.parameter_table import parameter_entries
 from robotid.estimation.fitting.bands import TorqueBand, next_errors
 from robotid.estimation.fitting.evaluation import Evaluation
-from robotid.estimation.fitting.metrics import Metrics
-from robotid.identification.result import Identification
+from robotid.identification.result import TorqueIdentification
 from robotid.identification.summary import left_out_lines
 from robotid.output.files.entries import input_entries
 from robotid.output.pages.charts import chart_html
 from robotid.output.pages.html import percent
 from robotid.output.report.body_table import parameter_picture
 from robotid.output.report.curves import curves_section, drawn
-from robotid.output.report.dock import Clip, Dock
 from robotid.output.report.ellipsoids import ellipsoid_pictures
-from robotid.output.report.errors import TORQUE, Errors, worst_errors
+from robotid.output.report.errors import TORQUE, errors_of, worst_errors
 from robotid.output.report.next_steps import next_steps
 from robotid.output.report.pictures import torque_charts
 from robotid.output.report.plot_sections import (
@@ -45,7 +42,7 @@ from robotid.output.report.tables import (
 )
 from robotid.output.report.variation_section import variation_section
 from robotid.output.report.why import why_section
-from robotid.output.report.worst_second import Residual, worst_html, worst_second
+from robotid.output.report.worst_second import Residual
 
 _ERRORS = (
     "<p>error = 100 |τ − prediction| / |τ| over the samples used; a prediction of zero has 100 %. "
@@ -59,18 +56,9 @@ _PARAMETERS = (
 )
 
 
-def shown_torques(found: Identification, origin: Origin, replay: str = "") -> Shown:
+def shown_torques(found: TorqueIdentification, origin: Origin, replay: str = "") -> Shown:
     """Return the content of a report on an identification."""
-    count = len(found.fitted)
-    fitted = Errors(
-        "" if count > 1 else _names(found.fitted),
-        _joints(found.metrics(), found.metrics("wls")),
-        is_fitted=True,
-    )
-    validation = [
-        Errors(e.recording.name, _joints(e.metrics["estimate"], e.metrics["wls"]))
-        for e in found.validation
-    ]
+    *validation, fitted = recordings = errors_of(found)
     counted = [errors for errors, e in zip(validation, found.validation, strict=True)
                if not e.is_refitted] or [fitted]  # fmt: skip
     entries = [entry for part in parameter_entries(found) for entry in part]
@@ -83,12 +71,12 @@ def shown_torques(found: Identification, origin: Origin, replay: str = "") -> Sh
         findings=found.findings,
         quantity=TORQUE,
         counted=counted,
-        recordings=[*validation, fitted],
+        recordings=recordings,
         facts=_facts(found),
         steps=next_steps(found, origin),
         made="".join(f"<p>{escape(text)}</p>\n" for text in (_method(found), _totals(found))),
         errors=(_ERRORS, ""),
-        curves=("Torques", torques_section(found, verdict["per_joint"], worst, origin, replay)),
+        curves=("Torques", torques_section(found, worst, origin, replay)),
         friction=friction_section(found, worst),
         bodies=parameter_picture(found) + ellipsoid_pictures(found),
         why=why_section(found),
@@ -115,7 +103,7 @@ def shown_torques(found: Identification, origin: Origin, replay: str = "") -> Sh
     )
 
 
-def _next_errors(found: Identification) -> dict[str, str]:
+def _next_errors(found: TorqueIdentification) -> dict[str, str]:
     """Return the expected RMS torque error of the next log with its unit, by row."""
     if found.variation is None:
         return {}
@@ -123,19 +111,11 @@ def _next_errors(found: Identification) -> dict[str, str]:
     return {row: f"{error:.3g} {unit}" for row, unit, error in rows}
 
 
-def _joints(metrics: Metrics, wls: Metrics) -> dict[str, dict[str, Any]]:
-    """Return the metrics of the joints as in result.json, with WLS as a baseline."""
-    joints: dict[str, dict[str, Any]] = metrics.to_dict()["per_joint"]
-    for joint, measured in joints.items():
-        measured["wls_relative_error_pct"] = wls.per_joint[joint].relative_error_pct
-    return joints
-
-
 def _names(evaluations: Sequence[Evaluation]) -> str:
-    return ", ".join(e.recording.name for e in evaluations)
+    return ", ".join(e.name for e in evaluations)
 
 
-def _facts(found: Identification) -> dict[str, str]:
+def _facts(found: TorqueIdentification) -> dict[str, str]:
     before, after, _ = found.scale_check.masses
     is_assumed = found.scale_check.assumed > 0
     is_compared = before > 0 and not is_assumed
@@ -152,7 +132,7 @@ def _facts(found: Identification) -> dict[str, str]:
     }
 
 
-def _method(found: Identification) -> str:
+def _method(found: TorqueIdentification) -> str:
     """Return a description of the fit and its logs."""
     fitted, validation = found.fitted, found.validation
     samples = sum(e.recording.extent.smooth for e in fitted)
@@ -167,13 +147,13 @@ def _method(found: Identification) -> str:
     )
 
 
-def _others(found: Identification) -> str:
+def _others(found: TorqueIdentification) -> str:
     """Return that there is no validation log, and the errors of logs left out, as text."""
     lines = left_out_lines([metrics.to_dict() for metrics in found.left_out.values()])
     return "There is no validation log" + "".join(f"; {line}" for line in lines)
 
 
-def _totals(found: Identification) -> str:
+def _totals(found: TorqueIdentification) -> str:
     """Return total mass, gravity torque and friction, for comparison with the verdict."""
     scale_check = found.scale_check
     shares = [f"{joint} {100 * share:.0f} %" for joint, share in scale_check.friction.items()]
@@ -197,31 +177,22 @@ def _chain(signals: SignalSettings) -> str:
 
 
 def torques_section(
-    found: Identification,
-    verdicts: Mapping[str, Mapping[str, Any]],
-    worst: Sequence[str],
-    origin: Origin,
-    replay: str = "",
+    found: TorqueIdentification, worst: Sequence[str], origin: Origin, replay: str = ""
 ) -> str:
     """Return charts of torques and residuals over time."""
-    evaluations, rows = found.validation or found.fitted, found.model.row_names
-    shown = drawn(evaluations, rows)
-    runs = {f"recording {k}": (e, found.band(e)) for k, e in enumerate(shown)}
+    evaluations, model = found.validation or found.fitted, found.model
+    intro = _intro(found, drawn(evaluations, model.row_names))
 
-    clips = [Clip(link, str(e.recording.log.path), e.recording.extent.start, e.recording.extent.end)
-             for link, (e, _) in runs.items()]  # fmt: skip
-    dock = Dock(replay, origin, str(found.model.tree.path), clips)
+    def charts(e: Evaluation, row: int, link: str, points: int) -> str:
+        return _charts(found, e, found.band(e), row, link=link, points=points)
 
-    def charts(run: tuple[Evaluation, TorqueBand], row: int, link: str, points: int) -> str:
-        return _charts(found, *run, row, link=link, points=points)
+    def residuals(row: int) -> Iterator[Residual]:
+        return _residuals(() if model.is_static else evaluations, row)
 
-    def note(row: int) -> str:
-        name, unit = rows[row], found.model.row_units[row]
-        seconds = None if found.model.is_static else worst_second(_residuals(evaluations, row))
-        return worst_html(seconds, name, unit, dock)
-
-    intro = dock.html + _intro(found, shown, evaluations[len(shown) :])
-    return curves_section(intro, runs, rows, verdicts, worst, charts, note)
+    return curves_section(
+        found, evaluations, worst, (replay, origin), intro, charts, residuals, TORQUE,
+        model.row_units,
+    )  # fmt: skip
 
 
 def _residuals(evaluations: Sequence[Evaluation], row: int) -> Iterator[Residual]:
@@ -229,10 +200,10 @@ def _residuals(evaluations: Sequence[Evaluation], row: int) -> Iterator[Residual
     for e in evaluations:
         motion, used = e.recording.trajectory, e.recording.mask[:, row].astype(bool)
         left = np.where(used, motion.tau[:, row] - e.torques["estimate"][:, row], np.nan)
-        yield Residual(e.recording.name, Path(e.recording.log.path).name, motion.t, left)
+        yield Residual(e.name, Path(e.recording.log.path).name, motion.t, left)
 
 
-def _intro(found: Identification, shown: Sequence[Evaluation], left: Sequence[Evaluation]) -> str:
+def _intro(found: TorqueIdentification, shown: Sequence[Evaluation]) -> str:
     """Return the description of the charts and their recordings."""
     band = "95 % band" if found.between is not None else "95 % band (for logs of the same day)"
     parts = [
@@ -250,14 +221,17 @@ def _intro(found: Identification, shown: Sequence[Evaluation], left: Sequence[Ev
                 f"<p>{escape(recording.name)} is long: {count} of its {whole} samples are drawn, "
                 "from its start, middle and end. Errors are computed from all.</p>\n"
             )
-    if left:
-        names = ", ".join(evaluation.recording.name for evaluation in left)
-        parts.append(f"<p>Not drawn, to limit the file size: {escape(names)}.</p>\n")
     return "".join(parts)
 
 
 def _charts(
-    found: Identification, e: Evaluation, band: TorqueBand, row: int, *, link: str, points: int
+    found: TorqueIdentification,
+    e: Evaluation,
+    band: TorqueBand,
+    row: int,
+    *,
+    link: str,
+    points: int,
 ) -> str:
     """Return torque and residual of a joint in a recording."""
     name, unit = found.model.row_names[row], found.model.row_units[row]

@@ -4,7 +4,7 @@ from html import escape
 
 from robotid.diagnosis.residual.decisions import DEPENDENCE_SHARE
 from robotid.diagnosis.residual.torque_split import JointTorque
-from robotid.identification.result import Identification
+from robotid.identification.result import TorqueIdentification
 from robotid.output.pages.charts import Chart, chart_html
 from robotid.output.pages.html import Cell, code, folded, number, percent, table, text
 from robotid.output.report.pictures import why_charts
@@ -16,13 +16,13 @@ _STILL, _STILL_SPLIT = 30, 80  # points in print
 _MOST = 12  # joints with all charts; others have charts of significant dependences only
 
 
-def why_section(found: Identification) -> str:
+def why_section(found: TorqueIdentification) -> str:
     """Return the HTML of the section: a part for each joint, the worst joint first and open."""
     torques = sorted(found.joint_torques, key=_error, reverse=True)
     shown = ", ".join(torques[0].rows.recordings)
     kind = "Validation logs" if torques[0].fitted is not None else "Fitted logs, without validation"
     points = max(_FEWEST_POINTS, min(_POINTS, _ALL_POINTS // len(torques)))
-    names = [e.recording.name for e in found.validation or found.fitted]
+    names = [e.name for e in found.validation or found.fitted]
     first = torques[0].rows.recordings[0]
     link = f"recording {names.index(first)}" if first in names else "fitted"  # as torques_section
     joints = "".join(

@@ -17,7 +17,7 @@ from robotid.identification.closed_loop.from_commands import identify_loops, wit
 from robotid.identification.closed_loop.initial_values import SecondOrder
 from robotid.identification.closed_loop.loop_findings import loop_findings
 from robotid.identification.closed_loop.loop_settings import LoopSettings
-from robotid.identification.closed_loop.position_errors import position_metrics, run_open_loop
+from robotid.identification.closed_loop.position_errors import pool_positions, run_open_loop
 from robotid.identification.closed_loop.stages import fit_loops, stated_loops
 from robotid.output.files.entries import build_result
 from robotid.output.report.document import write_report
@@ -254,9 +254,7 @@ def test_a_joint_that_is_told_to_stand_is_not_evaluated(leg, found):
     joints = model.joints
 
     def judged(runs):
-        return judge_positions(
-            position_metrics(model, runs, moving=True), joints, is_validation=True
-        )
+        return judge_positions(pool_positions(runs, moving=True), joints, is_validation=True)
 
     still = replace(run.log, q_ref=np.where([True, True, False], run.log.q_ref, run.log.q_ref[0]))
     stands = replace(run, log=still, spread=np.array([*run.spread[:2], 1e-4]))
@@ -270,7 +268,7 @@ def test_a_joint_that_is_told_to_stand_is_not_evaluated(leg, found):
 
 
 def test_without_gains_the_scale_is_said_to_rest_on_the_urdf(scaleless):
-    assert not scaleless.has_gains
+    assert not scaleless.has_stated_gains
     [scale] = [f for f in scaleless.findings if f.code == "scale"]
     assert scale.severity == "warning"
     assert "state kp in [controller]" in scale.message

@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scipy.stats
-from helpers.crane import identified_crane
 
 from robotid.data.log import Log
 from robotid.estimation.fitting.bands import QUANTILE
@@ -21,9 +20,9 @@ from robotid.identification.closed_loop.loop_result import (
 NAMES = ("rail.armature", "turn.armature", "robot.delay", "rail.viscous", "turn.viscous")
 
 
-@pytest.fixture(scope="module")
-def found(tmp_path_factory):
-    return identified_crane(tmp_path_factory.mktemp("crane"))
+@pytest.fixture
+def found(crane):
+    return crane
 
 
 def of(found, **changes):

@@ -1,6 +1,5 @@
 """The formats of robotid export: each is written and read back, and stands wherever formats do."""
 
-import json
 import re
 import sys
 import xml.etree.ElementTree as ET
@@ -20,8 +19,7 @@ from robotid.cli.export import export
 from robotid.output.files.export_formats import FORMATS, Format, Option
 from robotid.output.files.exported import Written
 from robotid.output.files.result_file import load_result
-from robotid.output.report.loop_steps import loop_steps
-from robotid.output.report.steps import Origin
+from robotid.output.report.steps import Origin, exports_of
 from robotid.robot.urdf_text import read_with_yourdfpy
 
 #: How the consumer of each format reads the stiffness or the Coulomb friction of a joint.
@@ -111,6 +109,6 @@ def test_a_new_format_is_a_module_and_its_entry(result, tmp_path, capsys, monkey
     assert main([*words, "--grain", "coarse"]) == 0
     assert "no place for gears" in capsys.readouterr().out
     assert (tmp_path / "a.toy").read_text().endswith(" coarse")
-    last = loop_steps(json.loads((result / "result.json").read_text()), Origin((), "out"))[-1]
+    last = exports_of("go2", Origin((), "out"), has_gains=True)[-1]
     assert last.words == "Play with it."
     assert last.blocks[0].endswith(".toy")
