@@ -17,7 +17,7 @@ from helpers.paths import DOCS, ROOT
 
 from robotid.cli import COMMANDS, main
 from robotid.cli.job import Job, LogEntry, job_from_settings
-from robotid.data.files.table_files import write_columns
+from robotid.data.files.formats import write_columns
 from robotid.diagnosis.logs.check_logs import CODES
 from robotid.diagnosis.verdict.verdict import WARNING_CODES
 from robotid.dynamics.simulation.motions import random_fourier

@@ -21,7 +21,7 @@ from robotid.cli.flags import add_json, add_out, add_progress
 from robotid.cli.identify import identify_job
 from robotid.cli.job import Job, LogEntry, PayloadEntry, read_job, stated_path
 from robotid.cli.logs import identity_of
-from robotid.data.files.text_tables import parquet_rows, parquet_values, read_text_table
+from robotid.data.files.parquet_files import parquet_rows, parquet_values, read_text_table
 from robotid.data.log import suggestion
 from robotid.dynamics.factors import available_cores
 from robotid.estimation.fitting.estimator_settings import SimulationSettings

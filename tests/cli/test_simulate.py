@@ -11,8 +11,8 @@ from robotid.base.files import file_sha256
 from robotid.cli import main, simulate
 from robotid.cli.job import Job
 from robotid.cli.simulate import _motion
+from robotid.data.files.formats import write_columns
 from robotid.data.files.read import read_log
-from robotid.data.files.table_files import write_columns
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.simulation.motions import SampledMotion, random_fourier
 from robotid.dynamics.simulation.simulation_settings import (

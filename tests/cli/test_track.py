@@ -8,8 +8,8 @@ from helpers.synthetic import exact_log, truth
 from robotid.cli import track as module
 from robotid.cli.job import Job, LogEntry
 from robotid.cli.track import run_track, serve_track
+from robotid.data.files.formats import open_table
 from robotid.data.files.read import read_log, write_log
-from robotid.data.files.table_files import open_table
 from robotid.data.signal_settings import LogSource, SignalSettings
 from robotid.output.viewer.scene import coordinates
 

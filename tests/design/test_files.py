@@ -5,7 +5,7 @@ import pytest
 import yaml
 
 from robotid.base.exceptions import SettingsError
-from robotid.data.files.table_files import open_table
+from robotid.data.files.formats import open_table
 from robotid.data.signal_settings import LogSource
 from robotid.design.basis import DesignedMotion, FourierBasis
 from robotid.design.motion_files import write_motion

@@ -6,8 +6,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from robotid.data.base_motion import BaseMotion
-from robotid.data.imu_frame import ImuFrame, ImuMotion
+from robotid.data.base_motion import BaseMotion, ImuFrame, ImuMotion
 from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
 from robotid.dynamics.base_parameters import structural_mapping

@@ -18,10 +18,10 @@ from robotid.base.exceptions import DataError
 from robotid.base.findings import listed
 from robotid.base.text import seconds
 from robotid.base.typing import Array
+from robotid.data.base_motion import bias_at_rest
+from robotid.data.files.formats import open_table
 from robotid.data.files.read import LogLayout
 from robotid.data.files.table import Place, RowReader, Table
-from robotid.data.files.table_files import open_table
-from robotid.data.imu_frame import bias_at_rest
 from robotid.data.log import Log, Trajectory
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import decide, unwrap

@@ -8,8 +8,8 @@ import pinocchio as pin
 import pytest
 
 from robotid.base.exceptions import ModelError
+from robotid.data.base_motion import ImuFrame, ImuMotion
 from robotid.data.files.read import read_log
-from robotid.data.imu_frame import ImuFrame, ImuMotion
 from robotid.data.signal_settings import BaseSource
 from robotid.dynamics.constraint_rows import logged_base
 from robotid.dynamics.constraints.closed_log import closed_log

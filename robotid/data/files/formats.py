@@ -1,4 +1,4 @@
-"""Tables in files: named columns of numbers in any format that is known by its suffix."""
+"""The formats of log files: a format is known by its entry in one table."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -7,34 +7,24 @@ from pathlib import Path
 from robotid.base.exceptions import DataError, SettingsError
 from robotid.base.files import DATASET, dataset_of, missing_file, written_whole
 from robotid.base.typing import Array
-from robotid.data.files.arrays import Hdf5Format, MatFormat, NpzFormat
-from robotid.data.files.bags import BagFormat
-from robotid.data.files.csv_files import CsvFormat
-from robotid.data.files.foreign_tables import with_own_names, with_stated_names, with_time
-from robotid.data.files.lerobot import LeRobotFormat
-from robotid.data.files.parquet_files import ParquetFormat
-from robotid.data.files.table import Format, Table, WritableFormat
+from robotid.data.files.arrays import HDF5, MAT, NPZ
+from robotid.data.files.bags import BAG
+from robotid.data.files.csv_files import CSV
+from robotid.data.files.lerobot import LEROBOT
+from robotid.data.files.parquet_files import PARQUET
+from robotid.data.files.table import (
+    Format,
+    Table,
+    with_standard_names,
+    with_stated_names,
+    with_time,
+)
 from robotid.data.signal_settings import LogSource
 
-_FORMATS: dict[str, Format] = {
-    ".csv": CsvFormat(),
-    ".dat": CsvFormat(),
-    ".txt": CsvFormat(),
-    ".parquet": ParquetFormat(),
-    ".npz": NpzFormat(),
-    ".h5": Hdf5Format(),
-    ".hdf5": Hdf5Format(),
-    ".mat": MatFormat(),
-    ".mcap": BagFormat(),
-    ".db3": BagFormat(),
-    ".bag": BagFormat(),
-}
-_READ_ONLY = (".dat", ".txt")
-_WRITTEN = {
-    suffix: f
-    for suffix, f in _FORMATS.items()
-    if isinstance(f, WritableFormat) and suffix not in _READ_ONLY
-}
+#: All formats of files; BAG and LEROBOT are folders, too.
+FORMATS = (CSV, PARQUET, NPZ, HDF5, MAT, BAG)
+_READ = {suffix: form for form in FORMATS for suffix in form.suffixes}
+_WRITTEN = {suffix: form.write for form in FORMATS for suffix in form.written if form.write}
 _LONGEST_NAME = 1000  # characters of a column
 
 
@@ -48,14 +38,14 @@ def open_table(path: Path, source: LogSource) -> Table:
             )
         path, source = dataset, replace(source, topic=path.name)
     form = _format_of(path)
-    if source.command is not None and not isinstance(form, BagFormat):
+    if source.command is not None and form is not BAG:
         raise SettingsError(
             f"log.command is {source.command!r}, the topic of a bag, but {path.name} is no bag; "
             "write the commands to columns, as qref_<joint>"
         )
     table = with_stated_names(form.open(path, source), path.name, source.names)
-    if isinstance(form, CsvFormat | ParquetFormat):  # with one table per file
-        table = with_own_names(table, path.name, f"{path.suffix} files", source)
+    if not form.topics:
+        table = with_standard_names(table, path.name, f"{path.suffix} files", source)
     table = with_time(table, source.rate)
     for name in table.names:
         if len(name) > _LONGEST_NAME:
@@ -69,20 +59,17 @@ def open_table(path: Path, source: LogSource) -> Table:
 def _format_of(path: Path) -> Format:
     """Return the format of a log that exists."""
     if path.is_dir():
-        is_dataset = (path / DATASET).is_file()
-        return LeRobotFormat() if is_dataset else BagFormat()
+        return LEROBOT if (path / DATASET).is_file() else BAG
     suffix = path.suffix.lower()
-    if not path.exists():
-        raise DataError(missing_file(path, "log file"))
-    if suffix not in _FORMATS:
+    if path.exists() and suffix not in _READ:
         raise DataError(
             f"{path.name}: the suffix is {suffix!r}, wanted a log file of type "
-            f"{_listed(list(_FORMATS))}, or the folder of a ROS 2 bag or of a LeRobot dataset; "
+            f"{_alternatives(list(_READ))}, or the folder of a ROS 2 bag or of a LeRobot dataset; "
             "convert it"
         )
     if not path.is_file():
         raise DataError(missing_file(path, "log file"))
-    return _FORMATS[suffix]
+    return _READ[suffix]
 
 
 def write_columns(table: Mapping[str, Array], path: Path) -> None:
@@ -92,9 +79,9 @@ def write_columns(table: Mapping[str, Array], path: Path) -> None:
 
     table (N,).
     """
-    form = _WRITTEN[check_suffix(path)]
+    write = _WRITTEN[check_suffix(path)]
     with written_whole(path) as temporary:
-        form.write(table, temporary)
+        write(table, temporary)
 
 
 def check_suffix(path: Path, what: str = "logs", *, also: Sequence[str] = ()) -> str:
@@ -102,12 +89,12 @@ def check_suffix(path: Path, what: str = "logs", *, also: Sequence[str] = ()) ->
     suffix = path.suffix.lower()
     if suffix not in _WRITTEN:
         raise DataError(
-            f"{path.name}: {what} are written as {_listed([*_WRITTEN, *also])} files, not "
+            f"{path.name}: {what} are written as {_alternatives([*_WRITTEN, *also])} files, not "
             f"{suffix!r}"
         )
     return suffix
 
 
-def _listed(words: list[str]) -> str:
+def _alternatives(words: list[str]) -> str:
     """Return words with commas, and "or" before the last."""
     return f"{', '.join(words[:-1])} or {words[-1]}"
