@@ -14,7 +14,6 @@ from helpers.synthetic import exact_log, truth
 import robotid
 from robotid import Log, RobotModel, SignalSettings, identify, payload
 from robotid.base.exceptions import DataError, RobotIdError, SettingsError
-from robotid.cli.identify import run_job
 from robotid.cli.job import read_job
 from robotid.data.base_motion import BaseMotion
 from robotid.data.signal_settings import LogSource
@@ -95,7 +94,6 @@ CALLS = {
     "noise": lambda m, log: robotid.preview(m, log, noise=5),
     "given": lambda m, log: robotid.preview(m, log, given=5),
     "signals  ": lambda m, log: robotid.doctor(m, log, signals="x"),
-    "model": lambda m, log: robotid.doctor(5, log),
     "joints": lambda m, log: robotid.read_log("x.csv", 5),
     "columns": lambda m, log: robotid.read_log("x.csv", ["a"], columns=5),
     "gains": lambda m, log: robotid.read_log("x.csv", ["a"], gains=5),
@@ -109,7 +107,6 @@ CALLS = {
     "path  ": lambda m, log: robotid.load_result(5),
     "path   ": lambda m, log: read_job(5),
     "path    ": lambda m, log: robotid.inspect(5),
-    "job": lambda m, log: run_job(5, "x"),
     "model ": lambda m, log: robotid.OnlineIdentifier(5),
     "settings": lambda m, log: robotid.OnlineIdentifier(m, 5),
     "identification": lambda m, log: write_report(5, "x.html"),

@@ -293,6 +293,7 @@ def _bars(*, force: bool) -> "Iterator[ProgressCallback]":
             if unit == "stages":
                 bars.update(stage, description=f"{done + 1}/{total} {what}")
                 bars.update(work, visible=False)
+                bars.refresh()
             elif what == current:
                 bars.update(work, completed=done, total=total, visible=True)
             else:

@@ -131,14 +131,14 @@ def test_findings_are_told_by_cause_and_the_worst_joint_is_named(capsys):
         finding("arm_1", "noise", 1, "note"),
     ]
     content = {"findings": findings, "joints": joints}
-    doctor.show(content, is_verbose=False, logs=2)
+    doctor._show(content, is_verbose=False, count=2)
     assert capsys.readouterr().out.splitlines() == [
         "warning: stepped: run.csv: 20 % of arm_6, arm_7's torque is odd",
         "warning: odd: run.csv: 37 to 68 % of arm_6, arm_7's torque is odd",
         "2 findings, 2 causes; worst: arm_7; 1 note hidden (--verbose)",
     ]
     findings.append(finding("arm_1", "reversed", 1, "error"))  # graver than any two warnings
-    doctor.show(content, is_verbose=True, logs=2)
+    doctor._show(content, is_verbose=True, count=2)
     lines = capsys.readouterr().out.splitlines()
     assert lines[0] == "error: reversed: run.csv: 1 % of arm_1's torque is odd"
     assert lines[-2:] == [
@@ -148,7 +148,7 @@ def test_findings_are_told_by_cause_and_the_worst_joint_is_named(capsys):
     wrong = [finding("arm_6", code, 1, "error") for code in ("one", "two")]
     wrong += [finding("arm_7", code, 9) for code in ("three", "four")]
     wrong.append(finding("arm_7", "five", 9, "error"))
-    doctor.show({"findings": wrong, "joints": joints}, is_verbose=False, logs=2)
+    doctor._show({"findings": wrong, "joints": joints}, is_verbose=False, count=2)
     assert capsys.readouterr().out.splitlines()[-1].endswith("worst: arm_6"), "two errors"
 
 

@@ -164,7 +164,22 @@ def test_after_a_result_a_motion_is_made_for_what_it_knows_the_least(tmp_path, c
     assert "widest" not in content
 
 
+PAN_TILT = """<robot name="pan_tilt"><link name="base"/><link name="pan"><inertial><mass value="1"/>
+<inertia ixx=".01" iyy=".01" izz=".01" ixy="0" ixz="0" iyz="0"/></inertial></link><link name="tilt">
+<inertial><origin xyz=".05 0 0"/><mass value="1"/>
+<inertia ixx=".01" iyy=".01" izz=".01" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<joint name="a" type="revolute"><parent link="base"/><child link="pan"/><axis xyz="0 0 1"/>
+<limit lower="-2" upper="2" velocity="2" effort="10"/></joint>
+<joint name="b" type="revolute"><parent link="pan"/><child link="tilt"/><axis xyz="0 1 0"/>
+<limit lower="-1" upper="1" velocity="2" effort="10"/></joint></robot>"""
 SHAPE = '<collision><geometry><box size=".05 .05 .05"/></geometry></collision></link>'
+
+
+@pytest.fixture
+def pan_tilt(tmp_path):
+    urdf = tmp_path / "pan_tilt.urdf"
+    urdf.write_text(PAN_TILT.replace("</link>", SHAPE))
+    return urdf
 
 
 def test_a_box_is_kept_away_from_and_a_seed_makes_the_same_motion_again(pan_tilt, capsys):

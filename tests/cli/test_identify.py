@@ -103,7 +103,7 @@ def test_the_job_of_what_was_found_in_memory_builds_the_same_robot():
     )  # fmt: skip
     asked = SimpleNamespace(job=None, friction="none", signals=SignalSettings(), ignore=("spikes",))
     found = SimpleNamespace(
-        model=model, asked=asked, loop=LoopSettings(), fitted=(), validation=(),
+        model=model, stated=asked, loop=LoopSettings(), fitted=(), validation=(),
         estimator=EstimatorSettings("simulation"),
     )  # fmt: skip
     job = _job_of(found)
@@ -120,7 +120,7 @@ def test_the_job_of_a_closed_chain_in_memory_closes_it(tmp_path):
     model = four_bar(tmp_path)
     asked = SimpleNamespace(job=None, friction="none", signals=SignalSettings(), ignore=())
     found = SimpleNamespace(
-        model=model, asked=asked, loop=LoopSettings(), fitted=(), validation=(),
+        model=model, stated=asked, loop=LoopSettings(), fitted=(), validation=(),
         estimator=EstimatorSettings("simulation"),
     )  # fmt: skip
     again = _job_of(found).model()
