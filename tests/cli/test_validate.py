@@ -9,12 +9,9 @@ import numpy as np
 import pytest
 from helpers.synthetic import exact_log, truth
 
-from robotid.base.files import file_sha256
-from robotid.base.findings import Finding
-from robotid.cli import validate as command
 from robotid.cli.identify import run_job
-from robotid.cli.job import LogEntry, job_from_settings
-from robotid.cli.validate import validate
+from robotid.cli.job import job_from_settings
+from robotid.cli.validate import _expected, validate
 from robotid.data.files.read import write_log
 from robotid.data.log import Trajectory
 from robotid.dynamics.torque import joint_torque_regressor
@@ -122,46 +119,6 @@ def test_of_two_logs_the_one_that_was_fitted_shows_no_prediction_and_the_other_d
     )
 
 
-def test_a_fault_of_the_second_of_two_new_logs_is_one_of_the_verdict(here, monkeypatch):
-    folder, _, other = here
-    v = other.v[500:].copy()
-    v[:, 1] *= 0.5
-    halves = {"sound": rows(other, slice(0, 500)), "spoilt": rows(other, slice(500, None))}
-    halves["spoilt"] = replace(halves["spoilt"], v=v)
-    for name, log in halves.items():
-        write_log(log, folder / f"{name}.csv")
-    judged = {}
-
-    def noted(predictions, determined, **stated):
-        judged.update(stated, predictions=predictions, determined=determined)
-        return judge(predictions, determined, **stated)
-
-    judge = command.judge
-    monkeypatch.setattr(validate, "judge", noted)
-    monkeypatch.setattr(
-        validate, "hidden_joints", lambda model, some: tuple(e.recording.name for e in some)
-    )
-    logs = [folder / f"{name}.csv" for name in halves]
-    found = validate(folder / "out" / "result.json", logs)
-    assert found["verdict"]["status"] == "poor"
-    assert any(
-        "dq_joint_2 is 0.5 times d(q)/dt" in words for words in found["verdict"]["log_errors"]
-    )
-    names = ["sound.csv 0-4.99 s", "spoilt.csv 5-9.99 s"]
-    predictions, determined = judged["predictions"], judged["determined"]
-    assert list(predictions.validation) == list(predictions.hidden) == names
-    stated = json.loads((folder / "out" / "result.json").read_text())
-    assert determined.undetermined == stated["structure"]["undetermined"]
-    assert determined.is_poorly_excited is stated["structure"]["poorly_excited"]
-    assert judged["scale_check"].to_dict() == stated["scale_check"]
-    assert predictions.refitted == []
-    assert predictions.joints == ("joint_1", "joint_2")
-    del stated["structure"]["poorly_excited"]  # as of an older result
-    (folder / "out" / "older.json").write_text(json.dumps(stated))
-    validate(folder / "out" / "older.json", logs)
-    assert judged["determined"].is_poorly_excited is True
-
-
 def test_the_expected_error_has_the_parts_of_fit_spread_and_residual(arm, rng, monkeypatch):
     """The true errors have 1.2 times the deviation, joint by joint; some samples are not used."""
     size, count, noise = len(arm.layout.names), 300, np.array([0.3, 0.1])
@@ -189,57 +146,9 @@ def test_the_expected_error_has_the_parts_of_fit_spread_and_residual(arm, rng, m
             recording=SimpleNamespace(trajectory=motion, mask=mask),
             torques={"estimate": tau - z * total},
         )
-        found = command._expected(result, arm, evaluation)["expected"]
+        found = _expected(result, arm, evaluation)["expected"]
         assert found["with_spread"] is (spread is not None)
         for j, own in enumerate(found["per_joint"].values()):
             assert own["rmse"] == pytest.approx(np.sqrt(np.mean(total[:, j] ** 2)), rel=1e-9)
             inside = np.abs(z[mask[:, j], j]) <= 1.96
             assert own["within_95_pct"] == pytest.approx(100 * inside.mean(), abs=0.5)
-
-
-@pytest.mark.parametrize("is_known", [True, False])
-def test_logs_of_commands_are_judged_by_the_joints_that_they_move(tmp_path, monkeypatch, is_known):
-    """A log that was fitted among two makes them no validation; what blocks goes to the verdict."""
-    paths = [tmp_path / "a.csv", tmp_path / "b.csv"]
-    for path in paths:
-        path.write_text(path.name)
-    inputs = [
-        {"role": "identification" if is_known else "payload", "sha256": file_sha256(paths[1])},
-        {"role": "validation", "sha256": file_sha256(paths[0])},
-    ]
-    content = {"inputs": inputs, "outputs": {"urdf": "found.urdf"}}
-    loaded = SimpleNamespace(
-        robot=SimpleNamespace(joints=("one", "two")), open_loop=lambda log: f"run of {log}",
-        content=content, path=tmp_path / "result.json",
-    )  # fmt: skip
-    found = [Finding("clock", "error", "a.csv", "jumps", {})]
-    asked = {}
-
-    def judged(metrics, joints, **options):
-        asked.update(options, metrics=metrics, joints=joints)
-        return SimpleNamespace(to_dict=lambda: {"status": "usable"})
-
-    for name, function in {
-        "log_of_commands": lambda job, entry, loaded: entry.path.name,
-        "diagnose": lambda model, shown, logs, signals: found if logs == ["a.csv", "b.csv"] else [],
-        "blocking": lambda found, ignore: [f for f in found if f.code not in ignore],
-        "position_metrics": lambda model, runs, moving=False: (runs, moving),
-        "judge_positions": judged,
-        "_errors_of": lambda model, run: {"of": run},
-    }.items():
-        monkeypatch.setattr(validate, name, function)
-    job = SimpleNamespace(signals=None, ignore=())
-    entries = [LogEntry(path) for path in paths]
-    content = command._validate_commands(loaded, job, entries)
-    runs = ["run of a.csv", "run of b.csv"]
-    assert asked == {
-        "metrics": (runs, True), "joints": ("one", "two"), "is_validation": not is_known,
-        "log_errors": ["jumps"],
-    }  # fmt: skip
-    assert content == {
-        "result": str(loaded.path), "predicted_with": "found.urdf",
-        "validation": [{"of": run} for run in runs], "verdict": {"status": "usable"},
-    }  # fmt: skip
-    job.ignore = ("clock",)
-    command._validate_commands(loaded, job, entries)
-    assert asked["log_errors"] == []
