@@ -3,7 +3,6 @@
 import json
 import shutil
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,10 +10,8 @@ from helpers.synthetic import exact_log, truth
 
 from robotid.cli.identify import run_job
 from robotid.cli.job import job_from_settings
-from robotid.cli.validate import _expected, validate
+from robotid.cli.validate import validate
 from robotid.data.files.read import write_log
-from robotid.data.log import Trajectory
-from robotid.dynamics.torque import joint_torque_regressor
 
 NOISE = np.array([0.2, 0.05])  # [N m]
 
@@ -117,38 +114,3 @@ def test_of_two_logs_the_one_that_was_fitted_shows_no_prediction_and_the_other_d
         "old.csv 0-9.99 s, cut.csv 0-6.99 s contain fitted samples"
         in found["verdict"]["reasons"][0]
     )
-
-
-def test_the_expected_error_has_the_parts_of_fit_spread_and_residual(arm, rng, monkeypatch):
-    """The true errors have 1.2 times the deviation, joint by joint; some samples are not used."""
-    size, count, noise = len(arm.layout.names), 300, np.array([0.3, 0.1])
-    q, v, a = rng.uniform(-2.0, 2.0, (3, count, 2))
-    of_fit, of_logs = (x @ x.T for x in 0.05 * rng.standard_normal((2, size, size)))
-    monkeypatch.setattr(validate, "stated_covariance", lambda result, names: of_fit)
-    Y = joint_torque_regressor(arm, q, v, a).reshape(count, 2, size)
-    mask = rng.random((count, 2)) > 0.3
-    result = {
-        "identification": {
-            "per_joint": {
-                joint: {"rmse": x} for joint, x in zip(arm.joints, noise.tolist(), strict=True)
-            }
-        }
-    }
-    for spread in (None, of_logs):
-        monkeypatch.setattr(validate, "stated_between", lambda *_, own=spread: own)
-        C = of_fit if spread is None else of_fit + spread
-        total = np.sqrt(np.einsum("kjp,pq,kjq->kj", Y, C, Y) + noise**2)
-        z = 1.2 * rng.standard_normal((count, 2))
-        tau = rng.standard_normal((count, 2))
-        segment = np.zeros(count, dtype=int)
-        motion = Trajectory(np.arange(count) / 100.0, q, v, a, tau, arm.joints, None, segment)
-        evaluation = SimpleNamespace(
-            recording=SimpleNamespace(trajectory=motion, mask=mask),
-            torques={"estimate": tau - z * total},
-        )
-        found = _expected(result, arm, evaluation)["expected"]
-        assert found["with_spread"] is (spread is not None)
-        for j, own in enumerate(found["per_joint"].values()):
-            assert own["rmse"] == pytest.approx(np.sqrt(np.mean(total[:, j] ** 2)), rel=1e-9)
-            inside = np.abs(z[mask[:, j], j]) <= 1.96
-            assert own["within_95_pct"] == pytest.approx(100 * inside.mean(), abs=0.5)

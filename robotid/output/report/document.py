@@ -6,9 +6,9 @@ from pathlib import Path
 from robotid.base.files import write_text
 from robotid.base.settings import require_each, require_kind
 from robotid.identification.result import Identification, TorqueIdentification
-from robotid.output.report.shown import Shown, page_of
+from robotid.output.report.report_page import Report, page_of
 from robotid.output.report.steps import Origin
-from robotid.output.report.torque_section import shown_torques
+from robotid.output.report.torque_report import torque_report
 
 
 def write_report(
@@ -44,16 +44,16 @@ def write_report(
     require_kind(identification, Identification, "identification", "a robotid.Identification")
     replay = (files or {}).get("replay", "")
     if isinstance(identification, TorqueIdentification):
-        shown = shown_torques(identification, at, replay)
+        report = torque_report(identification, at, replay)
     else:
-        shown = _shown_positions(identification, at, replay)
-    return write_text(page_of(shown, files or {}), target)
+        report = _of_positions(identification, at, replay)
+    return write_text(page_of(report, files or {}), target)
 
 
-def _shown_positions(found: Identification, origin: Origin, replay: str) -> Shown:
+def _of_positions(found: Identification, origin: Origin, replay: str) -> Report:
     """Return the content of a report on positions; modules of the simulation are imported here."""
     from robotid.identification.closed_loop.loop_result import PositionIdentification
-    from robotid.output.report.position_page import shown_positions
+    from robotid.output.report.position_page import position_report
 
     assert isinstance(found, PositionIdentification)
-    return shown_positions(found, origin, replay)
+    return position_report(found, origin, replay)

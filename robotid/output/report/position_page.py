@@ -19,39 +19,24 @@ from robotid.identification.closed_loop.position_errors import (
 from robotid.output.files.entries import input_entries
 from robotid.output.files.loop_export import loop_parameters
 from robotid.output.pages.charts import Chart, Series, chart_html
-from robotid.output.pages.html import code, number, table, text
-from robotid.output.report.curves import curves_section
+from robotid.output.pages.html import block, code, number, table, text
+from robotid.output.report.dock import Residual
 from robotid.output.report.errors import POSITION, Errors, errors_of, worst_errors
 from robotid.output.report.next_steps import next_steps
-from robotid.output.report.shown import Shown
+from robotid.output.report.report_page import Report, curves_section
 from robotid.output.report.steps import Origin
-from robotid.output.report.tables import input_table, parameter_section, version_table
-from robotid.output.report.variation_section import variation_section
-from robotid.output.report.worst_second import Residual
+from robotid.output.report.tables import (
+    input_table,
+    pairs_table,
+    parameter_section,
+    variation_section,
+    version_table,
+)
 
 _NAMED = 7  # joints in the chart of errors over the horizon
-_ERRORS = (
-    "<p>error = 100 |q − simulated| / |motion|, with the motion about its mean. The simulation "
-    "starts at the log's first sample and has the commands as its only input; errors over "
-    "horizons are of simulations that restart from the measurement after each horizon. For "
-    "comparison: the error of the command as position, of the URDF with the stated gains, and of a "
-    "second-order model of each joint alone.</p>\n"
-)
-_DRIVEN_ERRORS = (
-    "<p>error = 100 |q − simulated| / |motion|. The simulation has the logged torque as its only "
-    f"input and restarts from the measurement every {DRIFTS:g} s, or after another horizon. "
-    "For comparison: the error of the parameters fitted to torques only, of the URDF with "
-    "drives fitted to torques, and of a motion at constant speed.</p>\n"
-)
-_PARAMETERS = (
-    "Motor torque: τ = kp (q<sub>ref</sub>(t − delay) − q) + kd (v<sub>ref</sub> − v). It moves "
-    "armature, links, friction and offset. zero: position of the joint in the URDF where its "
-    "encoder reads 0."
-)
-_DRIVEN = "The logged torque moves armature, links, friction and offset."
 
 
-def shown_positions(found: PositionIdentification, origin: Origin, replay: str = "") -> Shown:
+def position_report(found: PositionIdentification, origin: Origin, replay: str = "") -> Report:
     """Return the content of a report on an identification that predicts positions."""
     is_driven, validation = found.loop.kind == "torque", found.validation
     runs = validation or found.fitted
@@ -60,9 +45,10 @@ def shown_positions(found: PositionIdentification, origin: Origin, replay: str =
     counted = [Errors(together, moving, is_fitted=not validation)]
     entries = [x for part in parameter_entries(found) for x in part] + loop_parameters(found)
     verdict, worst = found.verdict.to_dict(), [*worst_errors(counted)]
-    source = "torque-driven simulation" if is_driven else "commands"
-    controller = {"kind": found.loop.kind, "rate": found.loop.rate}
-    return Shown(
+    source, kind = ("torque-driven simulation", "driven") if is_driven else ("commands", "position")
+    rate = "none" if found.loop.rate is None else f"{found.loop.rate}"
+    controller = {"kind": found.loop.kind, "rate": rate}
+    return Report(
         title=f"{found.model.name}: drives from {source}",
         robot=found.model.name,
         rows=found.model.joints,
@@ -74,22 +60,20 @@ def shown_positions(found: PositionIdentification, origin: Origin, replay: str =
         facts=_facts(found),
         steps=next_steps(found, origin),
         made=f"<p>{escape(_method(found))}</p>\n",
-        errors=(_DRIVEN_ERRORS if is_driven else _ERRORS, _horizons(runs)),
+        errors=(block(f"report.{kind}_errors", drift=f"{DRIFTS:g}"), _horizons(runs)),
         curves=("Positions", _positions(found, worst, origin, replay)),
         why="",
         parameters=parameter_section(
             found.model,
             found.standard if found.has_urdf else None,
             entries,
-            _DRIVEN if is_driven else _PARAMETERS,
+            block(f"report.{kind}_parameters"),
         ),
         entries=entries,
         variation=variation_section(found.variation, {}),
         appendix={
             "open": ("Parameters not identifiable", _open_section(found)),
-            "settings": ("Controller", table("Controller", ["setting", "value"], [
-                [text(key), text("none" if x is None else f"{x}")] for key, x in controller.items()
-            ])),
+            "settings": ("Controller", pairs_table("Controller", controller)),
             "inputs": ("Inputs", input_table(input_entries(found))),
             "versions": ("Versions", version_table(versions())),
         },
@@ -169,14 +153,8 @@ def _positions(
     found: PositionIdentification, worst: Sequence[str], origin: Origin, replay: str
 ) -> str:
     """Return charts of each joint in every log."""
-    words = (
-        f"Measured and simulated position; the simulation restarts every {DRIFTS:g} s"
-        if found.loop.kind == "torque"
-        else "Commanded, measured and simulated position; the simulation starts at the first "
-        "sample and has the commands as its only input"
-    )
-    zoom = "Drag to zoom; double-click or Escape shows all."
-    intro = f"<p>{words}. Below: the position error. {zoom}</p>\n"
+    kind = "driven" if found.loop.kind == "torque" else "position"
+    intro = block(f"report.{kind}s", drift=f"{DRIFTS:g}")
 
     def charts(run: PositionEvaluation, row: int, link: str, points: int) -> str:
         kind = "not fitted" if run in found.validation else "fitted"
@@ -195,13 +173,8 @@ def _positions(
 
 def _charts(run: PositionEvaluation, kind: str, j: int, *, link: str, points: int) -> str:
     """Return charts of positions and position errors of a joint in a log."""
-    log, q, q_sim, joint, unit = (
-        run.log,
-        run.log.q[:, j],
-        run.q[:, j],
-        run.log.joints[j],
-        run.units[j],
-    )
+    log, joint, unit = run.log, run.log.joints[j], run.units[j]
+    q, q_sim = log.q[:, j], run.q[:, j]
     positions = [Series("measured", q, "text"), Series("simulated", q_sim, "predicted")]
     left = [Series("measured − simulated", (q - q_sim) / POSITION.scale, "residual")]
     if log.q_ref is not None and not run.is_driven:
