@@ -2,7 +2,6 @@
 
 import argparse
 from collections.abc import Mapping
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +10,7 @@ from robotid.base.files import check_file
 from robotid.base.findings import listed
 from robotid.cli.console import echo, show_found
 from robotid.cli.flags import add_json
-from robotid.output.files.export_formats import FORMATS, options_of
-from robotid.output.files.exported import Written
+from robotid.output.files.exports import Written, formats, options_of, writers
 from robotid.output.files.result_file import load_result
 
 
@@ -24,17 +22,17 @@ def export_result(
     Friction terms that a format lacks are projected on those that it has, see
     ``project_friction``.
     """
-    if kind not in FORMATS:
-        raise SettingsError(f"format is {kind!r}, wanted one of {listed(FORMATS)}")
+    if kind not in formats():
+        raise SettingsError(f"format is {kind!r}, wanted one of {listed(formats())}")
     stated = {name: value for name, value in options.items() if value is not None}
-    having = options_of(FORMATS)
+    having = options_of(formats())
     for name in stated:
         if kind not in having.get(name, {}):
             raise SettingsError(
                 f"--{name.replace('_', '-')} is an option of {listed(having.get(name, {}))}, "
                 f"not of {kind}; remove it"
             )
-    result, module = load_result(path), import_module(f"robotid.output.files.{kind}")
+    result, module = load_result(path), writers()[kind]
     check_file(Path(target), result.files)
     written: Written = module.export(result, Path(target), **stated)
     return {
@@ -47,10 +45,10 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     """Add the flags of the command."""
     add = parser.add_argument
     add("result", metavar="RESULT", help="result.json or its folder")
-    words = {kind: form.words for kind, form in FORMATS.items()}
-    add("--format", required=True, choices=[*FORMATS], help=_by_format(words))
+    words = {kind: form.words for kind, form in formats().items()}
+    add("--format", required=True, choices=[*formats()], help=_by_format(words))
     add("--out", required=True, metavar="FILE", help="file to write")
-    for name, having in options_of(FORMATS).items():
+    for name, having in options_of(formats()).items():
         words = {kind: option.words for kind, option in having.items()}
         first = next(iter(having.values()))
         about: dict[str, Any] = {"type": first.kind, "metavar": first.metavar}
@@ -67,7 +65,7 @@ def _by_format(words: Mapping[str, str]) -> str:
 
 def run(options: argparse.Namespace) -> None:
     """Run the command."""
-    chosen = {name: getattr(options, name) for name in options_of(FORMATS)}
+    chosen = {name: getattr(options, name) for name in options_of(formats())}
     done = export_result(options.result, options.format, options.out, **chosen)
     show_found(done, options, _show)
 

@@ -104,7 +104,7 @@ def test_unseen_motion_is_predicted_and_judged_by_the_joints(found):
 
 
 def test_a_report_has_the_friction_of_joints_and_none_of_the_base(found):
-    from robotid.output.report.plot_sections import friction_section
+    from robotid.output.report.torque_report import friction_section
 
     from robotid.output.report.pictures import friction_chart
 
