@@ -21,8 +21,8 @@ from scipy.spatial import ConvexHull
 
 import robotid
 from robotid.cli.demo import run_demo
-from robotid.dynamics.simulation.closed_loop import Noise, simulate
 from robotid.dynamics.simulation.motions import random_fourier
+from robotid.dynamics.simulation.simulator import Noise, simulate
 from robotid.dynamics.simulation.truth import another_robot
 from robotid.robot.examples import example_urdf
 from robotid.robot.geometry import link_clouds

@@ -22,7 +22,7 @@ PACKAGES = {
     "base": ["."],
     "robot": ["."],
     "data": [".", "files"],
-    "dynamics": ["kernels", ".", "constraints", "simulation"],
+    "dynamics": ["kernels", ".", "simulation"],
     "estimation": ["workers", "estimators", "variation", "fitting"],
     "diagnosis": ["urdf", "logs", "residual", "verdict"],
     "identification": [".", "closed_loop", "online"],
@@ -139,7 +139,7 @@ def test_third_parties_stay_in_their_rooms():
         for name, at_top, typing_only in imports(path)
         for first in [name.split(".")[0]]
         if (first == "pinocchio" and not PINOCCHIO & {room(path), place(path)[0]})
-        or (first == "numba" and path.name not in ("lanes.py", "vector_lanes.py"))
+        or (first == "numba" and path.name != "lanes.py")
         or (name.endswith("lanes") and at_top and not (typing_only or path.stem.endswith("lanes")))
         or (first in INSIDE_FUNCTIONS and room(path) not in INSIDE_FUNCTIONS[first])
         or (first in INSIDE_FUNCTIONS and at_top and not typing_only)

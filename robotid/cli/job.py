@@ -27,8 +27,7 @@ from robotid.estimation.fitting.estimator_settings import (
 )
 from robotid.identification.closed_loop.loop_settings import LoopSettings
 from robotid.robot.constraints import Contact, Loop
-from robotid.robot.drives import DRIVE_TERMS, FAMILIES, TERMS, DriveTerm
-from robotid.robot.families import AUTO, term_from_dict
+from robotid.robot.drives import AUTO, DRIVE_TERMS, FAMILIES, TERMS, DriveTerm, term_from_dict
 from robotid.robot.parameters import DYNAMICS, Coupling
 
 if TYPE_CHECKING:
@@ -342,8 +341,8 @@ class Job(Settings):
 
     def model(self) -> "RobotModel":
         """Return the robot, with the job's joints, gravity and drive terms."""
-        from robotid.robot.assumed import with_assumed_inertials
         from robotid.robot.model import RobotModel
+        from robotid.robot.prior import with_assumed_inertials
 
         gears = [gear for gear in self.transmissions if gear.matrix != "urdf"]
         motors = [motor for gear in gears for motor in _motors(gear)]

@@ -29,7 +29,7 @@ from robotid.data.log import Log
 from robotid.data.signal_settings import LogSource
 from robotid.design.clearance import Clearance
 from robotid.design.limits import LIMITS, Course, MotionLimits
-from robotid.dynamics.constraints.closed_log import closed_log
+from robotid.dynamics.completed_logs import closed_log
 from robotid.dynamics.prediction import predict_instants
 from robotid.estimation.fitting.evaluation import predict
 from robotid.estimation.fitting.survey import hold_log

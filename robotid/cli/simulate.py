@@ -24,10 +24,10 @@ from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import process
 from robotid.dynamics.base_parameters import structural_mapping
-from robotid.dynamics.simulation.closed_loop import Run, carried, delay, follow
 from robotid.dynamics.simulation.motions import FloatingMotion, SampledMotion
-from robotid.dynamics.simulation.sensors import measure
+from robotid.dynamics.simulation.sensors import Run, measure
 from robotid.dynamics.simulation.simulation_settings import Simulation, read_simulation
+from robotid.dynamics.simulation.simulator import carried, delay, follow
 from robotid.dynamics.simulation.truth import draw_parameters
 from robotid.output.files.urdf import write_urdf
 from robotid.robot.model import RobotModel

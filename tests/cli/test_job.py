@@ -10,8 +10,7 @@ from robotid.data.files.read import write_log
 from robotid.data.log import Log
 from robotid.data.signal_settings import LogSource
 from robotid.robot.constraints import Loop
-from robotid.robot.drives import DRIVE_TERMS
-from robotid.robot.families import AUTO
+from robotid.robot.drives import AUTO, DRIVE_TERMS
 from robotid.robot.model import GRAVITY
 from robotid.robot.parameters import Coupling
 from tests.helpers.closed_chains import FOUR_BAR, FOUR_BAR_LOOP

@@ -6,7 +6,7 @@ from helpers.synthetic import exact_log, truth
 from robotid.base.exceptions import DataError
 from robotid.data.log import Trajectory
 from robotid.data.signal_settings import SignalSettings
-from robotid.dynamics import lapack
+from robotid.dynamics import factors
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.factors import (
     Reduction,
@@ -143,12 +143,12 @@ def test_many_blocks_keep_the_digits_of_one_full_qr_on_poor_excitation(rng):
 def test_scipys_wrapper_gives_the_same_factors(rng, monkeypatch):
     problem = make(rng, weight=rng.choice([0.0, 1.0], 900))[0]
     R = compress(problem).R
-    monkeypatch.setattr(lapack, "_dtpqrt", lambda: None)
+    monkeypatch.setattr(factors, "_dtpqrt", lambda: None)
     np.testing.assert_allclose(compress(problem).R, R, atol=1e-13)
 
 
 def test_lapack_is_called_by_address():
-    assert lapack._dtpqrt() is not None
+    assert factors._dtpqrt() is not None
 
 
 def test_a_row_that_is_not_finite_is_refused(rng):

@@ -13,13 +13,13 @@ from robotid.data.files.read import lay_out, read_log, write_log
 from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
 from robotid.dynamics.base_parameters import structural_mapping
+from robotid.dynamics.completed_logs import closed_log
 from robotid.dynamics.constraint_rows import (
     constraint_jacobian,
     force_basis,
     loop_basis,
     without_forces,
 )
-from robotid.dynamics.constraints.closed_log import closed_log
 from robotid.dynamics.torque import InstantRegressor, joint_torque_regressor, random_regressor
 from robotid.estimation.fitting.survey import hold_log, survey_log
 from robotid.identification.pipeline import identify

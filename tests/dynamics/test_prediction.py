@@ -1,10 +1,13 @@
-"""Predicted torques against the regressor times the parameters."""
+"""Predicted torques against the regressor times the parameters, slopes against differences."""
 
 import numpy as np
+import pinocchio as pin
 import pytest
 from helpers.robots import ROBOTS, motion
+from helpers.synthetic import truth
 
 from robotid.base.exceptions import DataError
+from robotid.data.log import Trajectory
 from robotid.dynamics import prediction
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.drive_columns import friction_speeds
@@ -159,3 +162,95 @@ def test_instants_of_another_shape_are_refused(ur5):
         predict_instants(ur5, pi, np.zeros(5), np.zeros(6))
     with pytest.raises(DataError, match=r"q has shape \(1, 2, 6\), wanted \(6,\) or \(N, 6\)"):
         predict_instants(ur5, pi, np.zeros((1, 2, 6)))
+
+
+SLOPED = {
+    "in another order": (
+        "ur5_robot.urdf",
+        {"joints": ["wrist_1_joint", "shoulder_lift_joint", "elbow_joint"],
+         "locked": {"wrist_2_joint": 0.7}, "gravity": (1.0, -2.0, -9.0)},
+    ),
+    "fingers that slide together": (
+        "panda.urdf",
+        {"joints": ["panda_finger_joint1", "panda_joint6", "panda_joint4"], "mimic": "coupled"},
+    ),
+    "two legs": (
+        "solo12.urdf",
+        {"joints": ["HR_HFE", "FL_HAA", "FL_KFE"], "locked": {"FL_HFE": 0.4, "HR_HAA": -0.3}},
+    ),
+}  # fmt: skip
+H = 1e-6
+
+
+@pytest.fixture(params=SLOPED)
+def case(request):
+    file, options = SLOPED[request.param]
+    model = RobotModel.from_urdf(example_urdf(file), **options)
+    q, v, a = np.random.default_rng(3).uniform(-1.2, 1.2, (3, 4, len(model.joints)))
+    rows = Trajectory(
+        np.arange(4.0), q, v, a, np.zeros_like(q), model.joints, None, np.zeros(4, dtype=int)
+    )
+    return model, truth(model), rows
+
+
+def torque(model, pi, q, v, a, change=lambda engine: None):
+    """Return the torques in the rows of the joints, of a robot that is changed first."""
+    engine, G = model.with_parameters(pi).pin_model.copy(), model.velocity_map
+    change(engine)
+    data = engine.createData()
+    rows = zip(model.configurations(q), v @ G.T, a @ G.T, strict=True)
+    return np.array([G.T @ pin.rnea(engine, data, *row) for row in rows])
+
+
+def test_slopes_are_those_of_differences_by_motion_and_gravity(case):
+    model, pi, m = case
+    q, v, a = m.q, m.v, m.a
+    found = body_slopes(model, pi, m)
+    n = len(model.joints)
+    np.testing.assert_allclose(body_slopes_by_position(model, pi, m), found.by_q, atol=1e-10)
+    assert [x.shape for x in found] == [(4, n, n)] * 3 + [(4, n, 3), (4, n, n, 3)]
+
+    def close(slope, up, down):
+        exact = (up - down) / (2 * H)
+        np.testing.assert_allclose(slope, exact, atol=1e-6 * max(1.0, np.abs(exact).max()))
+
+    for kind, slopes in enumerate((found.by_q, found.by_v, found.by_a)):
+        for j in range(n):
+            ends = []
+            for side in (H, -H):
+                x = [q.copy(), v.copy(), a.copy()]
+                x[kind][:, j] += side
+                ends.append(torque(model, pi, *x))
+            close(slopes[:, :, j], *ends)
+    for axis in np.eye(3):
+
+        def pulled(side, axis=axis):
+            def change(engine):
+                engine.gravity.linear = engine.gravity.linear + side * axis
+
+            return torque(model, pi, q, v, a, change)
+
+        close(found.by_gravity @ axis, pulled(H), pulled(-H))
+
+
+def test_slopes_by_the_origin_of_each_joint_are_those_of_differences(case):
+    model, pi, m = case
+    q, v, a = m.q, m.v, m.a
+    found = body_slopes(model, pi, m).by_origin
+    for j, joint in enumerate(model.joints):
+        for k in range(3):
+
+            def moved(side, joint=joint, k=k):
+                def change(engine):
+                    i = engine.getJointId(joint)
+                    place = engine.jointPlacements[i].copy()
+                    shift = np.zeros(3)
+                    shift[k] = side
+                    place.translation = place.translation + shift
+                    engine.jointPlacements[i] = place
+
+                return torque(model, pi, q, v, a, change)
+
+            exact = (moved(H) - moved(-H)) / (2 * H)
+            np.testing.assert_allclose(found[:, :, j, k], exact, atol=1e-6)
+    assert np.abs(found).max() > 0.1

@@ -10,7 +10,7 @@ from helpers.driven import arm
 
 from robotid.data.log import Trajectory
 from robotid.data.signal_settings import SignalSettings
-from robotid.dynamics import velocity_choice
+from robotid.dynamics import used_rows
 from robotid.dynamics.torque import joint_torque_regressor
 from robotid.estimation.fitting.survey import hold_log
 
@@ -71,7 +71,7 @@ def test_a_part_is_predicted_by_the_fit_to_the_others_joint_by_joint(rng):
     motion = Trajectory(np.arange(n) / 50, q, v, a, tau, model.joints, 50.0, np.zeros(n, dtype=int))
     mask = rng.random((n, 3)) < 0.8
     mask[:, 2] &= np.arange(n) % 3 == 1
-    error = velocity_choice._held_out_error(model, motion, mask, 3)
+    error = used_rows._held_out_error(model, motion, mask, 3)
     Y = joint_torque_regressor(model, q, v, a).reshape(n, 3, -1)
     folds = [np.concatenate(np.array_split(np.arange(0, n, 3), 8)[k::2]) for k in (0, 1)]
     for j in (0, 1):
@@ -93,13 +93,13 @@ def test_columns_that_hardly_differ_share_their_parameter(rng, monkeypatch):
     """Relative to the largest singular value, theirs is 5e-4; the torque is of their difference."""
     x, y = rng.standard_normal((2, 800))
     W = np.column_stack([x, x + 1e-3 * y])
-    monkeypatch.setattr(velocity_choice, "joint_torque_regressor", lambda *_: W[:, None])
+    monkeypatch.setattr(used_rows, "joint_torque_regressor", lambda *_: W[:, None])
     model = SimpleNamespace(joints=("a",), support=lambda: np.ones((1, 2), dtype=bool))
     q = np.zeros((800, 1))
     motion = Trajectory(
         np.arange(800) / 50, q, q, q, y[:, None], ("a",), 50.0, np.zeros(800, dtype=int)
     )
-    (error,) = velocity_choice._held_out_error(model, motion, np.ones((800, 1), dtype=bool), 1)
+    (error,) = used_rows._held_out_error(model, motion, np.ones((800, 1), dtype=bool), 1)
     assert error == pytest.approx(np.linalg.norm(y), rel=0.01)  # nothing of it is predicted
 
 
@@ -113,18 +113,18 @@ def test_both_velocities_are_compared_on_the_rows_that_both_have(monkeypatch):
         return np.array([2.0, 3.0]) if motion == "measured" else np.array([5.0, 7.0])
 
     model = SimpleNamespace(joints=("a", "b"), layout=None, free_flyer=False, constraints=())
-    monkeypatch.setattr(velocity_choice, "friction_speeds", lambda layout: None)
-    monkeypatch.setattr(velocity_choice, "process", lambda log, chosen, speeds: chosen.velocity)
-    monkeypatch.setattr(velocity_choice, "row_mask", lambda model, motion, least: masks[motion])
-    monkeypatch.setattr(velocity_choice, "_held_out_error", held_out)
+    monkeypatch.setattr(used_rows, "friction_speeds", lambda layout: None)
+    monkeypatch.setattr(used_rows, "process", lambda log, chosen, speeds: chosen.velocity)
+    monkeypatch.setattr(used_rows, "row_mask", lambda model, motion, least: masks[motion])
+    monkeypatch.setattr(used_rows, "_held_out_error", held_out)
     log = SimpleNamespace(has_torque=True)
-    found = velocity_choice._errors(model, log, SignalSettings())
+    found = used_rows._errors(model, log, SignalSettings())
     np.testing.assert_array_equal(found, [[2.0, 5.0], [3.0, 7.0]])
     assert [motion for motion, *_ in given] == ["measured", "differentiated"]
     for _, mask, every in given:  # at most 1000 of 2100
         np.testing.assert_array_equal(mask, masks["measured"] & masks["differentiated"])
         assert every == 3
-    assert np.isnan(velocity_choice._errors(model, SimpleNamespace(has_torque=False), None)).all()
+    assert np.isnan(used_rows._errors(model, SimpleNamespace(has_torque=False), None)).all()
 
 
 @pytest.mark.parametrize(("last", "wanted"), [(0.84, False), (0.86, True)])
@@ -134,16 +134,16 @@ def test_the_median_joint_of_all_logs_decides(monkeypatch, caplog, last, wanted)
         "b": np.array([[4.0, 3.2], [5.0, 5 * last]]),
     }
     for name in ("coarse_velocities", "unlike_velocities"):
-        monkeypatch.setattr(velocity_choice, name, lambda log: False)
-    monkeypatch.setattr(velocity_choice, "_errors", lambda model, log, settings: errors[log.name])
+        monkeypatch.setattr(used_rows, name, lambda log: False)
+    monkeypatch.setattr(used_rows, "_errors", lambda model, log, settings: errors[log.name])
     logs = [SimpleNamespace(name=name) for name in "ab"]
     with caplog.at_level("INFO", "robotid"):
-        assert velocity_choice.prefers_measured(None, logs, SignalSettings()) is wanted
+        assert used_rows.prefers_measured(None, logs, SignalSettings()) is wanted
     chosen = "measured" if wanted else "differentiated"
     (said,) = caplog.messages
     assert said.startswith(f"a: velocity = 'auto' uses {chosen} velocities: the torque prediction")
     assert f" is {last:.2f} times that with measured velocities" in said
     errors["a"], errors["b"] = np.full((2, 2, 2), np.nan)
     timely = {"a": True, "b": wanted}
-    monkeypatch.setattr(velocity_choice, "is_timely", lambda log, delay: timely[log.name])
-    assert velocity_choice.prefers_measured(None, logs, SignalSettings()) is wanted
+    monkeypatch.setattr(used_rows, "is_timely", lambda log, delay: timely[log.name])
+    assert used_rows.prefers_measured(None, logs, SignalSettings()) is wanted

@@ -10,9 +10,9 @@ import pytest
 from helpers.driven import arm
 from helpers.synthetic import exact_log, truth
 
-from robotid.base.exceptions import DataError, SettingsError
+from robotid.base.exceptions import SettingsError
 from robotid.cli.identify import run_job
-from robotid.cli.job import Job, LogEntry, job_from_settings, read_job
+from robotid.cli.job import Job, LogEntry, job_from_settings
 from robotid.cli.logs import survey_logs
 from robotid.cli.validate import validate_result
 from robotid.data.files.read import read_log, write_log
@@ -139,20 +139,6 @@ def test_a_job_in_pieces_ends_where_it_ends_in_memory(noisy_job, tmp_path):
     assert_close(other, one, 1e-5)
 
 
-def test_a_real_recording_in_pieces_ends_where_it_ends_in_memory(recordings, tmp_path, monkeypatch):
-    monkeypatch.setenv("ROBOTID_DATA", str(recordings))
-    # of a log in pieces, what drives lack is judged by the segments at hand: here 1 s of 5 s
-    monkeypatch.setattr(
-        "robotid.identification.pipeline.explain_residual", lambda _, sample: ((), ())
-    )
-    job = read_job(Path(__file__).parents[1] / "jobs" / "tx40.toml")
-    # its segments are cut elsewhere, so that held-out errors may choose another prior weight
-    estimator = replace(job.estimator, prior_weight=100.0)
-    job = replace(job, report=False, terms=DRIVE_TERMS, estimator=estimator)
-    job = replace(job, validation=(replace(job.validation[0], end=6.5),))
-    compare(job, tmp_path, held=16_000)
-
-
 @pytest.mark.parametrize("name", ["rls", "prx"])  # one and several passes
 def test_recursive_estimators_read_pieces_in_the_order_of_time(
     noisy_job, name, tmp_path, without_doctor
@@ -210,16 +196,3 @@ def test_a_job_is_long_by_the_rows_of_all_its_files(noisy_job):
         replace(noisy_job, rows_in_memory=0)
     given = job_from_settings({"urdf": "x", "reduction": {"rows_in_memory": 7}}, "job", Path())
     assert given.rows_in_memory == 7
-
-
-def test_a_long_log_without_motion_long_enough_is_refused_as_in_memory(
-    noisy_job, tmp_path, without_doctor
-):
-    job = replace(noisy_job, signals=SignalSettings(trim=20.0))
-    messages = []
-    for held in (10**9, HELD):
-        with pytest.raises(DataError) as found:
-            run_job(replace(job, rows_in_memory=held), tmp_path)
-        messages.append(str(found.value))
-    assert messages[0] == messages[1]
-    assert "none of its 1 segments without gaps is long enough" in messages[0]

@@ -6,7 +6,7 @@ from helpers.synthetic import truth
 
 from robotid.base.exceptions import DataError, RankDeficientError, SettingsError
 from robotid.dynamics.base_parameters import structural_mapping
-from robotid.dynamics.simulation.plant import RobotPlant
+from robotid.dynamics.simulation.simulator import RobotPlant
 from robotid.paper import planar_2r
 from robotid.paper.equations import (
     Bounds,

@@ -14,7 +14,7 @@ from robotid.output.files.links import WORLD, SimulatedLink, XmlFormat, write_mo
 from robotid.output.files.result_file import Result
 from robotid.output.files.urdf import numbers_text
 from robotid.robot.bodies import central_inertial
-from robotid.robot.meshes import Shape
+from robotid.robot.geometry import Shape
 from robotid.robot.model import RobotModel
 from robotid.robot.tree import MOMENTS, Joint
 

@@ -36,8 +36,7 @@ from robotid.robot.bodies import (
     link_places,
 )
 from robotid.robot.constraints import Loop
-from robotid.robot.drives import TERMS
-from robotid.robot.families import term_from_dict
+from robotid.robot.drives import TERMS, term_from_dict
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import Coupling, pseudo_inertia
 from robotid.robot.tree import MOMENTS, Inertial

@@ -6,7 +6,7 @@ import pytest
 
 from robotid.dynamics.compiled import flatten
 from robotid.dynamics.kernels import lanes, tree_lanes
-from robotid.dynamics.kernels.vector_lanes import LANES
+from robotid.dynamics.kernels.lanes import LANES
 from robotid.robot.model import RobotModel
 
 LINK = (

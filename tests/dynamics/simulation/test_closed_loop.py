@@ -6,8 +6,7 @@ import pytest
 from helpers.synthetic import truth
 
 from robotid.base.exceptions import DataError, SettingsError
-from robotid.dynamics.simulation import closed_loop
-from robotid.dynamics.simulation.closed_loop import Noise, carried, follow, simulate
+from robotid.dynamics.simulation import simulator
 from robotid.dynamics.simulation.motions import FourierTrajectory, random_fourier
 from robotid.dynamics.simulation.simulation_settings import (
     Actuator,
@@ -16,6 +15,7 @@ from robotid.dynamics.simulation.simulation_settings import (
     Simulation,
     Truth,
 )
+from robotid.dynamics.simulation.simulator import Noise, carried, follow, simulate
 from robotid.dynamics.torque import joint_torque_regressor
 from robotid.robot.drives import Lag, LoadFriction, Presliding
 from robotid.robot.examples import example_urdf
@@ -246,7 +246,7 @@ def test_more_steps_than_a_computer_makes_are_refused_before_the_first(ur5, monk
         with pytest.raises(SettingsError, match=r"has .* samples of 1 steps each, wanted at most"):
             follow(ur5, ur5.standard_parameters(), motion, rate=rate, duration=duration,
                    settings=Simulation())  # fmt: skip
-    monkeypatch.setattr(closed_loop, "_wanted", None)  # nothing is simulated
+    monkeypatch.setattr(simulator, "_wanted", None)  # nothing is simulated
     with pytest.raises(
         SettingsError, match=r"has 6 samples of \d{6,} steps each, wanted at most 2e"
     ):
@@ -256,12 +256,12 @@ def test_more_steps_than_a_computer_makes_are_refused_before_the_first(ur5, monk
         (1, 100_001, False),
     ):  # fmt: skip
         if is_possible:
-            closed_loop._check_size(samples, steps)
+            simulator._check_size(samples, steps)
             continue
         with pytest.raises(
             SettingsError, match="wanted at most 2e\\+07 steps in total and 1e\\+05 per"
         ):
-            closed_loop._check_size(samples, steps)
+            simulator._check_size(samples, steps)
     with pytest.raises(SettingsError, match=r"rate is 1000000000\.0, wanted 1e-3 to 1e5"):
         Simulation(rate=1e9)
     with pytest.raises(SettingsError, match="inertials is 1000, wanted 0 to 5"):

@@ -7,9 +7,9 @@ import pinocchio as pin
 import pytest
 
 from robotid.base.exceptions import SettingsError
-from robotid.dynamics.simulation.closed_loop import _Gear, _limits, _Torque, carried
 from robotid.dynamics.simulation.loops import _failed_at
 from robotid.dynamics.simulation.simulation_settings import Actuator, Controller, Payload, Truth
+from robotid.dynamics.simulation.simulator import _Gear, _limits, _Torque, carried
 from robotid.dynamics.simulation.truth import draw_parameters
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel

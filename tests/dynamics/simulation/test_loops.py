@@ -13,9 +13,15 @@ from scipy.linalg import expm
 
 from robotid.base.exceptions import DataError, NotConvergedError, SettingsError
 from robotid.data.log import Log
-from robotid.dynamics.simulation.course_lanes import divide_rows
-from robotid.dynamics.simulation.failures import why_no_solution
-from robotid.dynamics.simulation.loops import ClosedLoopRobot, Loops, Window, _Grid, cut_windows
+from robotid.dynamics.simulation.law_lanes import divide_rows
+from robotid.dynamics.simulation.loops import (
+    ClosedLoopRobot,
+    Loops,
+    Window,
+    _Grid,
+    cut_windows,
+    why_no_solution,
+)
 from robotid.robot.drives import (
     Asymmetric,
     Coulomb,

@@ -2,7 +2,8 @@ import numpy as np
 import pytest
 from helpers.paths import URDF
 
-from robotid.dynamics.simulation.plant import RobotPlant, rk4
+from robotid.dynamics.simulation.simulator import RobotPlant
+from robotid.paper.equations import rk4
 from robotid.robot.drives import LoadFriction, LuGre, Presliding
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import Coupling
