@@ -2,10 +2,9 @@
 
 import argparse
 from collections.abc import Mapping
-from importlib import import_module
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from robotid.base.exceptions import SettingsError
 from robotid.base.files import check_file
@@ -14,11 +13,8 @@ from robotid.cli.console import echo, show_found
 from robotid.cli.flags import add_json
 from robotid.cli.identify import save_result
 from robotid.identification.result import Identification
-from robotid.output.files.export_formats import FORMATS, options_of
+from robotid.output.files.exports import formats, options_of, writers
 from robotid.output.files.result_file import load_result
-
-if TYPE_CHECKING:
-    from robotid.output.files.exported import Written
 
 
 def export(
@@ -45,10 +41,10 @@ def export(
         ModelError: If a link or a drive would be physically impossible.
         SettingsError: If the format, an option or the target is not usable.
     """
-    if format not in FORMATS:
-        raise SettingsError(f"format is {format!r}, wanted one of {listed(FORMATS)}")
+    if format not in formats():
+        raise SettingsError(f"format is {format!r}, wanted one of {listed(formats())}")
     stated = {name: value for name, value in options.items() if value is not None}
-    having = options_of(FORMATS)
+    having = options_of(formats())
     for name in stated:
         if format not in having.get(name, {}):
             raise SettingsError(
@@ -56,13 +52,11 @@ def export(
                 f"not of {format}; remove it"
             )
     with TemporaryDirectory(prefix="robotid-") as folder:
-        path = (
-            result if isinstance(result, str | Path) else save_result(result, folder, report=False)
-        )
+        is_path = isinstance(result, str | Path)
+        path = result if is_path else save_result(result, folder, report=False)
         loaded = load_result(path)
         check_file(Path(target), loaded.files)
-        module = import_module(f"robotid.output.files.{format}")
-        written: Written = module.export(loaded, Path(target), **stated)
+        written = writers()[format].export(loaded, Path(target), **stated)
     return {
         "result": str(path), "format": format, "files": [*map(str, written.files)],
         "not_stated": list(written.notes), "projected": dict(written.projected),
@@ -73,10 +67,10 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     """Add the flags of the command."""
     add = parser.add_argument
     add("result", metavar="RESULT", help="result.json or its folder")
-    words = {kind: form.words for kind, form in FORMATS.items()}
-    add("--format", required=True, choices=[*FORMATS], help=_by_format(words))
+    words = {kind: form.words for kind, form in formats().items()}
+    add("--format", required=True, choices=[*formats()], help=_by_format(words))
     add("--out", required=True, metavar="FILE", help="file to write")
-    for name, having in options_of(FORMATS).items():
+    for name, having in options_of(formats()).items():
         words = {kind: option.words for kind, option in having.items()}
         first = next(iter(having.values()))
         about: dict[str, Any] = {"type": first.kind, "metavar": first.metavar}
@@ -92,7 +86,7 @@ def _by_format(words: Mapping[str, str]) -> str:
 
 def run(options: argparse.Namespace) -> None:
     """Run the command."""
-    chosen = {name: getattr(options, name) for name in options_of(FORMATS)}
+    chosen = {name: getattr(options, name) for name in options_of(formats())}
     show_found(export(options.result, options.format, options.out, **chosen), options, _show)
 
 
