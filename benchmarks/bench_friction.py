@@ -29,7 +29,7 @@ from robotid.data.signals import process
 from robotid.dynamics.prediction import remember
 from robotid.dynamics.prediction import predict
 from robotid.robot.drives import DriveMotion, LoadFriction, Stribeck
-from robotid.robot.families import AUTO
+from robotid.robot.drives import AUTO
 from robotid.dynamics.simulation.truth import another_robot
 from robotid.dynamics.simulation.motions import random_fourier
 

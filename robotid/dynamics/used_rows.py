@@ -16,8 +16,7 @@ from robotid.base.typing import Array
 from robotid.data.log import Log, Trajectory
 from robotid.data.measured_velocity import coarse_velocities, is_timely, unlike_velocities
 from robotid.data.signal_settings import SignalSettings
-from robotid.data.signals import process
-from robotid.data.standing import standing_motion
+from robotid.data.signals import process, standing_motion
 from robotid.dynamics.base_parameters import BaseMapping
 from robotid.dynamics.drive_columns import friction_directions, friction_speeds, sure_rows
 from robotid.dynamics.problem import Problem

@@ -48,9 +48,9 @@ from robotid.robot.drives import (
     Spring,
     Stribeck,
     Tanh,
+    term_from_dict,
 )
 from robotid.robot.examples import example_urdf
-from robotid.robot.families import term_from_dict
 from robotid.robot.mass_matrix import joint_mass_matrices
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import Coupling

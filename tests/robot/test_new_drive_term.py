@@ -17,8 +17,7 @@ from robotid.output.files.mjcf import write_mjcf
 from robotid.output.report.pictures import friction_chart
 from robotid.paper.equations import rk4
 from robotid.robot.drive_term import Family, MemorylessTerm, Shape
-from robotid.robot.drives import FAMILIES, TERM_CLASSES
-from robotid.robot.families import term_from_dict
+from robotid.robot.drives import FAMILIES, TERM_CLASSES, term_from_dict
 from robotid.robot.model import RobotModel
 
 JOINT = "joint_1"

@@ -22,11 +22,17 @@ from robotid.data.base_motion import bias_at_rest
 from robotid.data.files.formats import open_table
 from robotid.data.files.read import LogLayout
 from robotid.data.files.table import Place, RowReader, Table
-from robotid.data.log import Log, Trajectory
+from robotid.data.log import Log, Trajectory, blocks_of, map_stamps, median_step
 from robotid.data.signal_settings import SignalSettings
-from robotid.data.signals import decide, unwrap
-from robotid.data.smoothing import SPLINE, Segment, filter_reach, process_segments, too_short
-from robotid.data.time_stamps import blocks_of, map_stamps, median_step
+from robotid.data.signals import (
+    SPLINE,
+    Segment,
+    decide,
+    filter_reach,
+    process_segments,
+    too_short,
+    unwrap,
+)
 from robotid.data.units import check_reach, check_units
 from robotid.dynamics.base_parameters import BaseMapping
 from robotid.dynamics.completed_logs import closed_log, with_contacts

@@ -37,8 +37,16 @@ from robotid.estimation.fitting.recorded import Recordings
 from robotid.estimation.fitting.selected_drives import DriveChoice
 from robotid.identification.pipeline import identify, with_drives
 from robotid.output.files.urdf import load_identified, write_urdf
-from robotid.robot.drives import FAMILIES, DriveMotion, Harmonic, LoadFriction, Stribeck, Tanh
-from robotid.robot.families import AUTO, wanted_families
+from robotid.robot.drives import (
+    AUTO,
+    FAMILIES,
+    DriveMotion,
+    Harmonic,
+    LoadFriction,
+    Stribeck,
+    Tanh,
+    wanted_families,
+)
 
 found_in, fitted_in = (partial(f, estimator="wls") for f in (helper.found_in, helper.fitted_in))
 SEED, QUANTILE = 3, 1.5  # of the motion: the elbow turns more than half a turn
