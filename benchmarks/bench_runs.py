@@ -48,8 +48,8 @@ from robotid.estimation.variation.mixed_effects import MixedEffects, Runs, covar
 from robotid.estimation.variation.variation import SCORES, Variation, _parameters, vary
 from robotid.identification.closed_loop.loop_result import loop_runs
 from robotid.identification.pipeline import identify, with_drives
+from robotid.robot.drives import wanted_families
 from robotid.robot.examples import example_urdf
-from robotid.robot.families import wanted_families
 from robotid.robot.model import RobotModel
 
 JOBS = Path(__file__).parents[1] / "tests" / "jobs"

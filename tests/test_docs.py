@@ -23,9 +23,9 @@ from robotid.diagnosis.verdict.verdict import WARNING_CODES
 from robotid.dynamics.simulation.motions import random_fourier
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
 from robotid.robot import examples
-from robotid.robot.assumed import REASONS
 from robotid.robot.drives import TERM_CLASSES, TERMS
 from robotid.robot.examples import example_urdf
+from robotid.robot.prior import REASONS
 
 sys.path.append(str(ROOT / "benchmarks"))
 from write_tables import BLOCK, PAGES, digest

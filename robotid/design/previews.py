@@ -29,7 +29,7 @@ from robotid.base.typing import Array
 from robotid.data.files.read import Readable
 from robotid.data.log import Log, suggestion
 from robotid.data.signal_settings import SignalSettings
-from robotid.data.smoothing import low_pass
+from robotid.data.signals import low_pass
 from robotid.diagnosis.logs.motion_checks import excitation_finding
 from robotid.dynamics.base_parameters import BaseMapping, structural_mapping
 from robotid.dynamics.factors import Factors, compress, join, merge
@@ -48,10 +48,9 @@ from robotid.estimation.fitting.standard_errors import StandardErrors, about_pri
 from robotid.estimation.fitting.survey import SurveyedLog, hold_log
 from robotid.identification.pipeline import logs_of
 from robotid.identification.result import TorqueIdentification
-from robotid.robot.assumed import with_assumed_inertials
 from robotid.robot.closure import refuse_loops
 from robotid.robot.model import RobotModel
-from robotid.robot.prior import prior_spread
+from robotid.robot.prior import prior_spread, with_assumed_inertials
 
 #: Assumed correlation time of noise [s].
 CORRELATION = 0.1

@@ -46,9 +46,9 @@ from robotid.estimation.fitting.survey import hold_log
 from robotid.estimation.variation.variation import vary
 from robotid.identification.repeated_errors import with_repeated_errors
 from robotid.identification.result import StatedSettings, TorqueIdentification
-from robotid.robot.assumed import with_assumed_inertials
-from robotid.robot.families import AUTO, wanted_families
+from robotid.robot.drives import AUTO, wanted_families
 from robotid.robot.model import RobotModel
+from robotid.robot.prior import with_assumed_inertials
 
 _ROBOTS = (".urdf", ".xml", ".xacro")  # suffixes of files that describe robots
 _MOST_SHAPES = 2  # fits for the refinement of shapes together with the terms of all joints

@@ -28,7 +28,7 @@ from robotid.identification.summary import (
     variation_lines,
     verdict_lines,
 )
-from robotid.robot.families import AUTO
+from robotid.robot.drives import AUTO
 
 
 @dataclass(frozen=True)

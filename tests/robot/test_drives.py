@@ -15,12 +15,10 @@ from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import process
 from robotid.dynamics import prediction
 from robotid.dynamics.base_parameters import structural_mapping
-from robotid.dynamics.memory import drive_motion_along, remember
-from robotid.dynamics.prediction import predict
+from robotid.dynamics.prediction import drive_motion_along, predict, remember
 from robotid.dynamics.rows import COMPILED, TrajectoryRows
-from robotid.dynamics.simulation.closed_loop import simulate
 from robotid.dynamics.simulation.motions import random_fourier
-from robotid.dynamics.simulation.plant import RobotPlant
+from robotid.dynamics.simulation.simulator import RobotPlant, simulate
 from robotid.dynamics.torque import (
     InstantRegressor,
     joint_torque_regressor,
@@ -50,9 +48,9 @@ from robotid.robot.drives import (
     Spring,
     Stribeck,
     Tanh,
+    term_from_dict,
 )
 from robotid.robot.examples import example_urdf
-from robotid.robot.families import term_from_dict
 from robotid.robot.mass_matrix import joint_mass_matrices
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import Coupling

@@ -11,7 +11,7 @@ from robotid.data.log import suggestion
 from robotid.diagnosis.residual.dependence import Dependence
 from robotid.diagnosis.residual.residuals import friction_split, spectrum
 from robotid.diagnosis.residual.torque_split import JointTorque, spread_rows
-from robotid.dynamics.memory import drive_motion_along
+from robotid.dynamics.prediction import drive_motion_along
 from robotid.estimation.fitting.bands import QUANTILE, TorqueBand, friction_curve
 from robotid.estimation.fitting.evaluation import Evaluation
 from robotid.identification.result import TorqueIdentification

@@ -42,8 +42,7 @@ from robotid.estimation.fitting.joint_motion import JointMotion
 from robotid.estimation.fitting.recorded import Recordings
 from robotid.estimation.fitting.survey import hold_log
 from robotid.identification.pipeline import conclude, identify
-from robotid.robot.drives import Harmonic, Viscous
-from robotid.robot.families import AUTO, drive_line
+from robotid.robot.drives import AUTO, Harmonic, Viscous, drive_line
 from robotid.robot.model import RobotModel
 
 log_with = partial(helper.log_with, rate=50.0)  # [Hz]: the effects are slower than 10 Hz

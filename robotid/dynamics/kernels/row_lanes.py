@@ -13,17 +13,20 @@ They are spatial forces and are transformed like these.
 import numpy as np
 
 from robotid.dynamics.kernels.lanes import (
+    LANES,
     add,
     compiled,
     cross,
     dot,
     get,
     get3,
+    lane_of,
     put,
     put3,
     put_lane,
     scale,
     times,
+    write,
 )
 from robotid.dynamics.kernels.tree_lanes import (
     ACCELERATION,
@@ -44,7 +47,6 @@ from robotid.dynamics.kernels.tree_lanes import (
     times6,
     turned,
 )
-from robotid.dynamics.kernels.vector_lanes import LANES, lane_of, write
 
 # entries of one body: q, v, a of its joint; quantities common to its rows; ten columns. They are
 # not Python's int, for which Numba would compile a function once more for each value.

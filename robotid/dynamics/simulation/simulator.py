@@ -1,19 +1,18 @@
-"""The simulated robot: a plant with a controller that tracks a motion, and its log."""
+"""The simulated robot: a plant by Pinocchio's forward dynamics, a controller, and its log."""
 
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
+import pinocchio as pin
 
-from robotid.base.exceptions import DataError, SettingsError
+from robotid.base.exceptions import DataError, NotConvergedError, SettingsError
 from robotid.base.typing import Array, ProgressCallback, ignore_progress
 from robotid.data.log import Log, Trajectory
-from robotid.dynamics.memory import remember
-from robotid.dynamics.prediction import predict
+from robotid.dynamics.prediction import predict, remember
 from robotid.dynamics.simulation.motions import FloatingMotion, Motion
-from robotid.dynamics.simulation.plant import Friction, RobotPlant
-from robotid.dynamics.simulation.sensors import measure
+from robotid.dynamics.simulation.sensors import Run, measure
 from robotid.dynamics.simulation.simulation_settings import (
     Actuator,
     Controller,
@@ -22,9 +21,18 @@ from robotid.dynamics.simulation.simulation_settings import (
     Simulation,
     by_joint,
 )
-from robotid.dynamics.simulation.stand import Stand, supported
+from robotid.dynamics.simulation.stand import supported
 from robotid.robot.bodies import link_transfer
-from robotid.robot.drives import Lag
+from robotid.robot.drives import (
+    Bristles,
+    Coulomb,
+    DriveTerm,
+    Lag,
+    MemorylessTerm,
+    Offset,
+    Viscous,
+)
+from robotid.robot.mass_matrix import drive_inertia, rigid_mass_matrices
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
 
@@ -35,6 +43,10 @@ _MOST = 2e7  # largest number of steps of a simulation: half an hour ...
 _MOST_EACH = 100_000  # ... and between two samples
 _CHUNK = 1024  # number of steps for which a motion is evaluated together
 _LEAST_INERTIA = 0.02  # smallest inertia in the computation of PD gains [kg m^2 or kg]
+_ITERATIONS = 200  # of the fixed point of load and load-dependent friction
+_SETTLED = 1e-12  # relative change of the load at convergence
+_SIMPLE = (Coulomb, Viscous, Offset)
+_SIGN_SPEED = 2e-4  # speed over which the plant's Coulomb friction reverses [rad/s or m/s]
 
 # ROS34PW2, a Rosenbrock W-method: order 3 for any Jacobian approximation, L-stable
 _GAMMA = 4.3586652150845900e-01
@@ -48,20 +60,6 @@ _BELOW[2, :2] = -9.0338057013044082e-01, 5.4180672388095326e-02
 _BELOW[3, :3] = 2.4212380706095346e-01, -1.2232505839045147e00, 5.4526025533510214e-01
 _WEIGHTS = np.array([*_BELOW[3, :2], 1.5452602553351020e00, _GAMMA])
 _STAGES = _ALPHA.sum(axis=1)  # times of the stages [steps]
-
-
-@dataclass(frozen=True, eq=False)
-class Run:
-    """The exact motion of a robot; arrays of shape (N, n)."""
-
-    t: Array  # shape (N,) [s]
-    q: Array  # [rad or m]
-    v: Array  # [rad/s or m/s]
-    a: Array  # [rad/s^2 or m/s^2]
-    tau: Array  # [N m or N]
-    reference: Array  # reference position [rad or m]
-    saturated: Array  # share of the time at the torque limit of each drive, shape (n,) [-]
-    stand: Stand | None = None  # of a robot whose base floats
 
 
 def simulate(
@@ -186,15 +184,15 @@ def carried(model: RobotModel, pi: Array, payload: Payload) -> Array:
     central = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
     about_link = central + m * (c @ c * np.eye(3) - np.outer(c, c))
     (xx, xy, xz), (_, yy, yz), (_, _, zz) = about_link.tolist()
-    own = np.array([m, *(m * c), xx, xy, yy, xz, yz, zz])
-    if np.linalg.eigvalsh(pseudo_inertia(own)[0])[0] < -1e-9 * m:
+    added = np.array([m, *(m * c), xx, xy, yy, xz, yz, zz])
+    if np.linalg.eigvalsh(pseudo_inertia(added)[0])[0] < -1e-9 * m:
         raise SettingsError(
             f"payload: inertia is {list(payload.inertia)}, which is physically inconsistent. Each "
             "principal moment must be 0 or more, and at most the sum of the other two"
         )
-    found = pi.copy()
-    found[10 * body : 10 * body + 10] += transfer @ own
-    return found
+    loaded = pi.copy()
+    loaded[10 * body : 10 * body + 10] += transfer @ added
+    return loaded
 
 
 def _perfect(
@@ -202,8 +200,7 @@ def _perfect(
 ) -> Run:
     """Return the run of a robot that tracks exactly, by inverse dynamics."""
     q, v, a = motion.evaluate(t)
-    none = np.zeros_like(v)
-    segment = np.zeros(len(t), dtype=int)
+    none, segment = np.zeros_like(v), np.zeros(len(t), dtype=int)
     rows = Trajectory(t, q, v, a, none, model.joints, None, segment)
     torques = []
     for x in [pi] if loaded is pi else [pi, loaded]:
@@ -219,10 +216,7 @@ def _perfect(
 
 
 def delay(model: RobotModel, pi: Array, settings: Simulation) -> Array:
-    """Return the delay of each logged torque by the terms of the drives, shape (n,) [s].
-
-    pi (p,).
-    """
+    """Return the delay of each logged torque by the terms of the drives, shape (n,) [s]."""
     delays = np.zeros(len(model.joints))
     if settings.controller.kind == "perfect":  # its inverse dynamics include the delay
         return delays
@@ -237,6 +231,206 @@ def delay(model: RobotModel, pi: Array, settings: Simulation) -> Array:
                 )
             delays[d] += value
     return delays
+
+
+@dataclass(frozen=True)
+class _Group:
+    """The k drives that have a common term."""
+
+    term: Bristles | MemorylessTerm
+    drives: Array | slice  # their indices
+    theta: Array  # its parameters, shape (k,)
+    states: slice  # their bristle states; empty without any
+
+
+@dataclass(frozen=True)
+class Friction:
+    """Friction torque of drives, ``(along + loaded |load|) sign(w) + rest``, all of shape (d,)."""
+
+    along: Array
+    rest: Array
+    loaded: Array
+
+
+class RobotPlant:
+    """The plant M(q) a + b(q, v) + Ia a + Fv v + Fc sign(v) + off = u of a robot.
+
+    The drives have the terms of the model. sign(v) is tanh(v / 0.2 mm/s), so that it can be
+    integrated. Drives that couple several joints load all of them. Load-dependent friction uses the
+    load of the same instant. The bristle deflection z of presliding is a state of the plant with
+    the rate of ``bristle_rate``; if it is not given, sliding is steady. A delay of the torque
+    (``Lag``) is one of the measurement, not of the plant. q, v, u are of shape (n,), pi (p,).
+    """
+
+    def __init__(self, model: RobotModel, pi: Array) -> None:
+        if model.free_flyer:
+            raise DataError("the base floats; forward dynamics need a robot with a fixed base")
+        model.require_fixed("simulation")
+        if pi.shape != (len(model.layout.names),):
+            raise DataError(f"pi has shape {pi.shape}, wanted ({len(model.layout.names)},)")
+        self.model, self.pi = model, pi
+        self._bodies = model.with_parameters(pi)
+        self._data = self._bodies.pin_model.createData()
+        self.armature = drive_inertia(model.layout, pi)  # (n, n)
+        self.ratios = model.layout.drive_ratios  # (d, n)
+        self._share = self.ratios / np.sum(self.ratios**2, axis=1, keepdims=True).clip(min=1e-300)
+        self._simple, self._groups = _grouped(model, pi)
+        self.n_states = sum(g.states.stop - g.states.start for g in self._groups)
+        self.is_loaded = any(_is_loaded(g.term) for g in self._groups)
+        G, A = model.velocity_map, self.armature
+        # Pinocchio's own joints, each with its own rotor: its ABA is sufficient
+        self._is_plain = np.array_equal(G, np.eye(len(G))) and np.array_equal(
+            A, np.diag(A.diagonal())
+        )
+        self._is_angle = (
+            model.pin_model.nq == model.pin_model.nv and not model.position_offset.any()
+        )
+        self._driven = pin.Model(self._bodies.pin_model)
+        if self._is_plain:
+            self._driven.armature = A.diagonal().copy()
+
+    def mass_matrix(self, q: Array) -> Array:
+        """Return D(q), the mass matrix with the drives' armature, shape (n, n)."""
+        if self._is_plain:
+            mass: Array = pin.crba(self._driven, self._data, self._configuration(q))
+            return mass.copy()
+        x = self.model.configurations(q[None])
+        mass = rigid_mass_matrices(self._bodies, x, self._data)[0] + self.armature
+        return mass
+
+    def bodies_torque(self, q: Array, v: Array, a: Array) -> Array:
+        """Return the inverse dynamics of the bodies alone, shape (n,) [N m or N]."""
+        G, x = self.model.velocity_map, self._configuration(q)
+        rigid: Array = G.T @ pin.rnea(self._bodies.pin_model, self._data, x, G @ v, G @ a)
+        return rigid
+
+    def friction(self, q: Array, v: Array, z: Array | None = None) -> Friction:
+        """Return the friction of the drives, without inertia and the sign of the speed."""
+        angle, w = self.ratios @ q, self.ratios @ v
+        coulomb, viscous, offset = self._simple
+        along, rest, loaded = coulomb.copy(), viscous * w + offset, np.zeros(len(w))
+        for group in self._groups:
+            term, drives, theta = group.term, group.drives, group.theta
+            if isinstance(term, Bristles):
+                if z is not None:
+                    rest[drives] += theta * z[group.states]
+                    continue
+                torque = theta * term.level(w[drives])
+            else:
+                torque = theta * term.amplitude(angle[drives], w[drives])
+            part = loaded if _is_loaded(term) else along if term.follows_direction else rest
+            part[drives] += torque
+        return Friction(along, rest, loaded)
+
+    def friction_torque(self, F: Friction, v: Array, load: Array) -> Array:
+        """Return the friction torque of the drives under a load (n,), shape (n,) [N m or N]."""
+        sign = np.tanh(self.ratios @ v / _SIGN_SPEED)
+        torque: Array = self.ratios.T @ (self._along(F, load) * sign + F.rest)
+        return torque
+
+    def chord(self, F: Friction, v: Array, load: Array) -> Array:
+        """Return the friction with the sign of the speed, divided by the speed, shape (n, n)."""
+        x = np.maximum(np.abs(self.ratios @ v) / _SIGN_SPEED, 1e-6)  # tanh(x) / x is 1 at 0
+        slope = np.maximum(self._along(F, load), 0.0) * np.tanh(x) / (x * _SIGN_SPEED)
+        over: Array = (self.ratios.T * slope) @ self.ratios
+        return over
+
+    def _along(self, F: Friction, load: Array) -> Array:
+        """Return the friction that has the sign of the speed, shape (d,)."""
+        return F.along + F.loaded * np.abs(self._share @ load) if self.is_loaded else F.along
+
+    def bristle_rate(self, v: Array) -> tuple[Array, Array]:
+        """Return r [1/s] and g sign(w) of the bristle deflection, dz/dt = r (g sign(w) - z)."""
+        w = self.ratios @ v
+        rate, end = np.zeros((2, self.n_states))
+        for group in self._groups:
+            if isinstance(group.term, Bristles):
+                speed = w[group.drives]
+                level = group.term.level(speed)
+                rate[group.states] = np.abs(speed) / (group.term.displacement * level)
+                end[group.states] = np.sign(speed) * level
+        return rate, end
+
+    def acceleration(self, q: Array, v: Array, u: Array, F: Friction | None = None) -> Array:
+        """Return the acceleration D(q)^-1 (u - C(q, v)) of a torque, shape as q, (n,) or (N, n).
+
+        References:
+            Tzvetkova, (11).
+        """
+        if q.ndim == 2:
+            return np.stack([self.acceleration(*one) for one in zip(q, v, u, strict=True)])
+        F = self.friction(q, v) if F is None else F
+        sign = np.tanh(self.ratios @ v / _SIGN_SPEED)
+        free = u - self.ratios.T @ (F.along * sign + F.rest)
+        a = self.free_acceleration(q, v, free)
+        return self._loaded(q, free, a, F.loaded * sign) if self.is_loaded else a
+
+    def free_acceleration(self, q: Array, v: Array, tau: Array, *, rotors: bool = True) -> Array:
+        """Return the acceleration of bodies and rotors without friction, shape (n,)."""
+        x, G = self._configuration(q), self.model.velocity_map
+        if self._is_plain:
+            robot = self._driven if rotors else self._bodies.pin_model
+            a: Array = pin.aba(robot, self._data, x, v, tau)
+            return a.copy()
+        D = rigid_mass_matrices(self._bodies, x[None], self._data)[0] + rotors * self.armature
+        bias = G.T @ pin.nonLinearEffects(self._bodies.pin_model, self._data, x, G @ v)
+        return np.linalg.solve(D, tau - bias)
+
+    def _loaded(self, q: Array, free: Array, a: Array, coefficient: Array) -> Array:
+        """Return the acceleration consistent with load-dependent friction, by iteration."""
+        D = self.mass_matrix(q)
+        per_load = np.linalg.solve(D, self.ratios.T * coefficient)  # acceleration per load, (n, d)
+        bare = self._share @ (free - self.armature @ a)  # load of the drives without it
+        slope = self._share @ (self.ratios.T * coefficient - self.armature @ per_load)
+        load = bare
+        if not np.isfinite(bare).all():  # the state has diverged
+            return a
+        for _ in range(_ITERATIONS):
+            before, load = load, bare - slope @ np.abs(load)
+            if np.abs(load - before).max() <= _SETTLED * (1.0 + np.abs(load).max()):
+                settled: Array = a - per_load @ np.abs(load)
+                return settled
+        raise NotConvergedError(
+            f"load-dependent friction does not converge in {_ITERATIONS} steps: its parameters are "
+            "so large that the drives lock. Set smaller parameters",
+            "max_iterations",
+        )
+
+    def _configuration(self, q: Array) -> Array:
+        """Return Pinocchio's configuration, shape (nq,)."""
+        if self._is_plain and self._is_angle:
+            return q
+        x: Array = self.model.configurations(q[None])[0]
+        return x
+
+
+def _grouped(model: RobotModel, pi: Array) -> tuple[Array, tuple[_Group, ...]]:
+    """Return the friction terms of the drives, without inertia and terms of the measurement.
+
+    First Coulomb friction, viscous friction and offset of each drive, shape (3, d), which depend
+    only on the speed; then the others.
+    """
+    layout = model.layout
+    theta, simple = pi[layout.n_inertial :], np.zeros((3, len(layout.drives)))
+    terms: dict[Bristles | MemorylessTerm, list[int]] = {}
+    for k, (d, term) in enumerate(layout.drive_parameters):
+        if type(term) in _SIMPLE:
+            simple[_SIMPLE.index(type(term)), d] += theta[k]
+        elif theta[k] != 0.0 and isinstance(term, Bristles | MemorylessTerm):
+            terms.setdefault(term, []).append(k)
+    groups, states = [], 0
+    for term, numbers in terms.items():
+        drives = [layout.drive_parameters[k][0] for k in numbers]
+        is_all = drives == list(range(len(layout.drives)))
+        own = slice(states, states + len(numbers) * isinstance(term, Bristles))
+        chosen = slice(None) if is_all else np.array(drives)
+        groups.append(_Group(term, chosen, theta[numbers], own))
+        states = own.stop
+    return simple, tuple(groups)
+
+
+def _is_loaded(term: DriveTerm) -> bool:
+    return isinstance(term, MemorylessTerm) and term.is_loaded
 
 
 class _Loop:
@@ -302,13 +496,12 @@ class _Loop:
     def measured(self, y: Array, f: Array, wanted: Array) -> Array:
         """Return q, v, a and tau on the side of the sensors, shape (4, n)."""
         q, v, motor, w, _ = self._parts(y)
-        n = self.n
-        if self.gear is None or not self.is_at_motor:
-            load = None if self.gear is None else self.gear.torque(q, v, motor, w)
-            return np.stack(
-                [q, v, f[n : 2 * n], self.torque(q, v, wanted) if load is None else load]
-            )
-        return np.stack([motor, w, f[3 * n : 4 * n], self.torque(motor, w, wanted)])
+        if self.gear is not None and not self.is_at_motor:
+            tau, side = self.gear.torque(q, v, motor, w), 0
+        else:
+            tau, q, v = self.torque(motor, w, wanted), motor, w
+            side = 0 if self.gear is None else 2
+        return np.stack([q, v, f[(side + 1) * self.n : (side + 2) * self.n], tau])
 
     def damped(self, y: Array, h: float, F: Friction) -> Callable[[Array, Array], Array]:
         """Return (f, s) -> (1 - g h J)^-1 (f + h J s), with g of the method and J of friction.
@@ -316,24 +509,21 @@ class _Loop:
         J uses the chord of friction over speed, F(w) / w, and the rate of presliding.
         """
         q, v, motor, w, z = self._parts(y)
-        load = np.zeros(self.n)
-        if self.plant.is_loaded:
-            still = np.zeros(self.n)
-            load = (
-                self.plant.bodies_torque(q, v, still)
-                if self.gear is None
-                else self.gear.torque(q, v, motor, w)
-            )
+        n, load = self.n, np.zeros(self.n)
+        if self.plant.is_loaded and self.gear is None:
+            load = self.plant.bodies_torque(q, v, np.zeros(n))
+        elif self.gear is not None:
+            load = self.gear.torque(q, v, motor, w)
         r, _ = self.plant.bristle_rate(w) if len(z) else (z, z)
         B = h * self.plant.chord(F, w, load)  # (n, n)
         inertia = self.plant.mass_matrix(q) if self.gear is None else self.plant.armature
         inverse = np.linalg.inv(inertia + _GAMMA * B)
-        keep, lose, n = inverse @ inertia, inverse @ B, self.n
-        own = slice(n, 2 * n) if self.gear is None else slice(3 * n, 4 * n)
+        keep, lose = inverse @ inertia, inverse @ B
+        speeds = slice(n, 2 * n) if self.gear is None else slice(3 * n, 4 * n)
 
         def solve(f: Array, s: Array) -> Array:
             k = f.copy()
-            k[own] = keep @ f[own] - lose @ s[own]
+            k[speeds] = keep @ f[speeds] - lose @ s[speeds]
             if len(r):
                 k[-len(r) :] = (f[-len(r) :] - h * r * s[-len(r) :]) / (1.0 + _GAMMA * h * r)
             return k
