@@ -18,7 +18,7 @@ from robotid.cli import main
 from robotid.cli.work import fleet
 from robotid.cli.work.fleet import UnitResult, _Gathered, read_fleet, run_fleet
 from robotid.data.files.read import write_log
-from robotid.estimation.variation.units_of_fleet import between_units
+from robotid.estimation.variation.variation import between_units
 from robotid.estimation.workers.checkpoint import FOLDER
 from robotid.estimation.workers.plan import WorkPlan
 from robotid.estimation.workers.processes import SerialBackend
