@@ -374,7 +374,7 @@ def test_units_are_compared_by_parameter_robot_and_expression(monkeypatch):
         assert entry["next_interval"] == prediction.ends.tolist()
         figures = entry["mean"], entry["std_error"], entry["spread"]
         assert figures == (prediction.mean, prediction.std_error, prediction.spread)
-        unlike += [(each.probability, f"u{each.unit + p}", p) for each in different]
+        unlike += [(probability, f"u{k + p}", p) for k, probability in different]
     assert len(found["parameters"]) == 2
     assert [each[1] for each in unlike] == ["u1", "u3"]
     for entry, (probability, unit, p) in zip(found["unlike"], sorted(unlike), strict=True):
