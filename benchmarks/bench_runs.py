@@ -31,9 +31,9 @@ import pinocchio as pin
 from scipy.linalg import block_diag
 from scipy.special import ndtr
 
-from robotid.cli.work.identify import run_job
-from robotid.cli.work.job import LogEntry, job_from_settings, read_job
-from robotid.cli.work.logs import survey_logs
+from robotid.cli.identify import run_job
+from robotid.cli.job import LogEntry, job_from_settings, read_job
+from robotid.cli.logs import survey_logs
 from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
 from robotid.dynamics.base_parameters import structural_mapping
@@ -49,8 +49,8 @@ from robotid.estimation.variation.spread import Runs, SpreadModel, covariance_of
 from robotid.estimation.variation.variation import SCORES, Variation, _parameters, vary
 from robotid.identification.closed_loop.loop_result import loop_runs
 from robotid.identification.pipeline import identify, with_drives
+from robotid.robot.drives import wanted_families
 from robotid.robot.examples import example_urdf
-from robotid.robot.families import wanted_families
 from robotid.robot.model import RobotModel
 
 JOBS = Path(__file__).parents[1] / "tests" / "jobs"

@@ -26,7 +26,7 @@ from robotid.identification.pipeline import logs_of, robot_of, with_drives
 from robotid.robot.bodies import link_transfer, usual_links
 from robotid.robot.closure import refuse_loops
 from robotid.robot.drive_term import DriveTerm
-from robotid.robot.families import AUTO, wanted_families
+from robotid.robot.drives import AUTO, wanted_families
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import ParameterLayout
 from robotid.robot.prior import payload_spread, prior_spread

@@ -40,13 +40,11 @@ import scipy.linalg
 from scipy.optimize import minimize_scalar
 
 from robotid.base.typing import Array
-from robotid.data.base_motion import in_base
-from robotid.data.imu_frame import ImuFrame
+from robotid.data.base_motion import ImuFrame, in_base
 from robotid.data.log import Trajectory
 from robotid.dynamics.base_parameters import BaseMapping
 from robotid.dynamics.constraint_rows import constraint_forces, contact_links, without_forces
-from robotid.dynamics.factors import join, triangle_of
-from robotid.dynamics.lapack import Triangle
+from robotid.dynamics.factors import Triangle, join, triangle_of
 from robotid.dynamics.prediction import predict
 from robotid.dynamics.used_rows import base_problem
 from robotid.estimation.estimators import WLS

@@ -14,7 +14,7 @@ import scipy.linalg
 
 from robotid.base.typing import Array
 from robotid.diagnosis.residual.selection import Round, Rule
-from robotid.dynamics.simulation.failures import friction_at_rest
+from robotid.dynamics.simulation.loops import friction_at_rest
 from robotid.estimation.estimators.estimator import Estimate
 from robotid.estimation.estimators.output_error import OutputError, is_at_bound, linearised
 from robotid.identification.closed_loop.loop_simulator import FreeParameter, LoopSimulator

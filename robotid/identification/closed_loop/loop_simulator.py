@@ -8,16 +8,15 @@ import numpy as np
 
 from robotid.base.exceptions import NotConvergedError
 from robotid.base.typing import Array
+from robotid.data.filters import local_polynomial
 from robotid.data.log import Trajectory
-from robotid.data.signal_filters import local_polynomial
-from robotid.dynamics.memory import remember
-from robotid.dynamics.prediction import predict
+from robotid.dynamics.prediction import predict, remember
 from robotid.dynamics.simulation.loops import ClosedLoopRobot, Column, Loops, RollOut, Window
 from robotid.estimation.estimators.simulator import Residual
-from robotid.robot.assumed import with_assumed_inertials
 from robotid.robot.drive_term import DriveTerm
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import inertial_from_pseudo_inertia, pseudo_inertia
+from robotid.robot.prior import with_assumed_inertials
 
 _AROUND = (0, -1, 1)  # lags that are tried about the known delay [samples]
 _LATEST = 0.1  # largest lag that is tried [s]

@@ -60,7 +60,7 @@ from robotid.identification.closed_loop.loop_simulator import (
 )
 from robotid.identification.closed_loop.position_errors import DRIFTS
 from robotid.identification.pipeline import identify
-from robotid.identification.result import Identification
+from robotid.identification.result import TorqueIdentification
 from robotid.robot.model import RobotModel
 
 #: Largest change of a parameter by halving the steps [standard errors].
@@ -97,7 +97,7 @@ class Fitted:
     encoders: Encoders  # zeros and signs of the encoders relative to the URDF's joints
     tried: tuple[Tried, ...]  # the friction terms that were tried, with their gains
     #: The identification from the torque rows alone, where the torque drives the robot.
-    linear: Identification | None = None
+    linear: TorqueIdentification | None = None
     #: Scale of the stated gains by bodies and torques; None where gains are fitted.
     scale: GainScale | None = None
 
@@ -326,7 +326,7 @@ class _Initial:
     torque: Array  # typical torques, shape (n,) [N m or N]
     encoders: Encoders
     plain: SecondOrder | None = None
-    linear: Identification | None = None
+    linear: TorqueIdentification | None = None
     groups: tuple[str, ...] = ()  # of joints with one gain
     scales: tuple[float, ...] = (1.0,)  # of the torques, from which fits may start
     factor: Array = field(default_factory=lambda: np.ones(1))  # of the scale of torques, (n,)
@@ -630,12 +630,12 @@ def _with(
 
 def identified_rows(
     model: RobotModel, logs: Sequence[Log], signals: SignalSettings | None
-) -> Identification:
+) -> TorqueIdentification:
     """Return the identification from the torques of logs alone, with the model's friction terms."""
     return identify(model, logs, signals=signals, friction="none", doctor=False)
 
 
-def torque_rows(from_torques: Identification, inflation: float = 1.0) -> TorqueRows:
+def torque_rows(from_torques: TorqueIdentification, inflation: float = 1.0) -> TorqueRows:
     """Return an identification's rows reduced to a triangular factor.
 
     The weights include the variance inflation by correlated rows, from the scatter of segments.

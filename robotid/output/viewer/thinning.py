@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from robotid.base.typing import Array
-from robotid.robot.meshes import Surface, joined
+from robotid.robot.geometry import Surface, joined
 
 _CREASE = np.radians(30.0)  # angle between two faces beyond which their edge is sharp
 _WELD = 1e-6  # distance of corners that are merged, over the size of the largest surface

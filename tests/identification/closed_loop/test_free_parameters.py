@@ -108,17 +108,6 @@ def test_slopes_of_residuals_are_those_of_differences(simulator, rng, compared):
         assert 0.02 < at_limit[:, 1:].mean() < 0.9, "drives are at their limit, and are not"
 
 
-def test_unknowns_stand_over_what_is_known(simulator):
-    theta = simulator.prior.copy()
-    theta[:4] = 0.3, 0.05, 0.4, 0.01
-    loops = simulator.loops(theta)
-    np.testing.assert_array_equal(loops.armature, [0.05, 0.05, 0.02])
-    np.testing.assert_array_equal(loops.values, [0.4, 0.2, 0.4, 0.2, 0.1, 0.3])
-    np.testing.assert_array_equal(loops.delay, np.full(3, 0.01))
-    np.testing.assert_allclose(loops.bodies, simulator.base.bodies, atol=1e-12)
-    np.testing.assert_array_equal(simulator.base.armature, np.full(3, 0.02))
-
-
 def test_every_value_is_a_body_that_can_be(simulator, rng):
     is_body = np.array([u.what == "body" for u in simulator.free_parameters])
     for _ in range(20):
@@ -131,26 +120,6 @@ def test_every_value_is_a_body_that_can_be(simulator, rng):
     body = simulator.robot.joint_of_body.index(simulator.free_parameters[k].joints[0])
     ratio = simulator.loops(theta).bodies[body, 0] / simulator.base.bodies[body, 0]
     assert ratio == pytest.approx(np.exp(0.2), rel=1e-9)
-
-
-def test_what_is_compared_is_what_was_logged(simulator):
-    theta = simulator.prior
-    log, n = simulator.windows[0].log, 3
-    outs = simulator.roll_out(theta)
-    both = replace(simulator, velocities=True).residuals(theta, with_slopes=False)
-    lag = np.array([0, 3, 2.25])
-    torques = replace(simulator, error="input", lag=lag).residuals(theta, with_slopes=False)
-    all_ = replace(simulator, velocities=True, lag=lag).residuals(theta, with_slopes=False)
-    for out, moved, given, whole in zip(outs, both, torques, all_, strict=True):
-        np.testing.assert_array_equal(whole.e, np.hstack([moved.e, given.e]))
-        k = out.window.counted
-        np.testing.assert_array_equal(moved.e[:, :n], log.q[k] - out.q)
-        np.testing.assert_array_equal(moved.e[:, n:], log.v[k] - out.v)
-        rows = np.arange(k.start, k.stop)
-        for j in range(n):
-            told = np.interp(rows - lag[j], np.arange(len(log.t)), log.q_ref[:, j])
-            tau = 20.0 * (told - out.q[:, j]) - 1.5 * out.v[:, j]
-            np.testing.assert_allclose(given.e[:, j], log.tau[k, j] - tau, atol=1e-12)
 
 
 def test_direct_slopes_are_those_of_inverse_dynamics_along_the_roll_out(simulator, rng):

@@ -19,9 +19,9 @@ from PIL import Image
 
 from robotid.data.files.read import write_log
 from robotid.data.log import Log
-from robotid.dynamics.simulation.closed_loop import Noise
 from robotid.dynamics.simulation.motions import random_fourier
 from robotid.dynamics.simulation.simulation_settings import Payload, Sensors
+from robotid.dynamics.simulation.simulator import Noise
 from robotid.output.viewer.replays import Bands, Mark, Torques, replay
 from robotid.robot.model import RobotModel
 

@@ -13,8 +13,8 @@ from helpers.synthetic import payload_log
 
 from robotid.base.exceptions import SettingsError
 from robotid.cli import main
-from robotid.cli.work.job import job_from_settings
-from robotid.cli.work.track import serve_track
+from robotid.cli.job import job_from_settings
+from robotid.cli.track import serve_track
 from robotid.data.files.read import write_log
 from robotid.output.viewer import server as live_module
 from robotid.output.viewer.scene import coordinates

@@ -3,7 +3,7 @@ import pytest
 import trimesh
 
 from robotid.output.viewer.thinning import thin
-from robotid.robot.meshes import Surface
+from robotid.robot.geometry import Surface
 
 
 def surface_of(mesh, rgba=None):
