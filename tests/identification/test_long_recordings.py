@@ -14,7 +14,7 @@ from robotid.base.exceptions import SettingsError
 from robotid.cli.identify import run_job
 from robotid.cli.job import Job, LogEntry, job_from_settings
 from robotid.cli.logs import survey_logs
-from robotid.cli.validate import validate_result
+from robotid.cli.validate import validate
 from robotid.data.files.read import read_log, write_log
 from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
@@ -134,7 +134,7 @@ def test_a_job_in_pieces_ends_where_it_ends_in_memory(noisy_job, tmp_path):
     result = json.loads((tmp_path / "pieces" / "result.json").read_text())
     assert result["settings"]["reduction"] == {"rows_in_memory": HELD}
     kept = noisy_job.validation[0].path
-    again = [validate_result(tmp_path / w / "result.json", [kept]) for w in ("memory", "pieces")]
+    again = [validate(tmp_path / w / "result.json", [kept]) for w in ("memory", "pieces")]
     one, other = (without_bands(x["validation"]) for x in again)
     assert_close(other, one, 1e-5)
 

@@ -10,6 +10,7 @@ from helpers.paths import ROOT
 from helpers.synthetic import exact_log, truth
 
 import robotid
+from robotid.cli.identify import run_job
 from robotid.cli.job import job_from_settings
 
 URDF = ROOT / "urdf" / "planar_2r.urdf"
@@ -65,7 +66,7 @@ def test_the_settings_are_a_job_that_finds_the_same_again(saved, found, logs, tm
     assert job.ignore == ("torque_sign",)
     (entry,) = job.identification
     assert (entry.path, entry.end) == (logs / "first.csv", 12.0)
-    again, _ = robotid.run_job(replace(job, report=False), tmp_path)
+    again, _ = run_job(replace(job, report=False), tmp_path)
     assert again.model.layout == found.model.layout
     np.testing.assert_allclose(again.standard, found.standard, rtol=1e-9)
 
@@ -78,7 +79,7 @@ def test_what_a_job_found_is_saved_with_the_job_that_was_run(logs, tmp_path):
         "output": {"report": False},
         "identification": [{"log": str(logs / "first.csv")}],
     }
-    found, result = robotid.run_job(job_from_settings(table, "job.toml", logs), tmp_path / "one")
+    found, result = run_job(job_from_settings(table, "job.toml", logs), tmp_path / "one")
     path = robotid.save_result(found, tmp_path / "two", report=False)
     assert json.loads(path.read_text())["settings"] == result["settings"]
     assert result["settings"]["torque"]["gains"] == {"joint_1": 3.0}

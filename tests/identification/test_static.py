@@ -11,7 +11,7 @@ from helpers.synthetic import truth
 from robotid.base.exceptions import DataError, ModelError, SettingsError
 from robotid.cli.identify import run_job
 from robotid.cli.job import read_job
-from robotid.cli.validate import validate_result
+from robotid.cli.validate import validate
 from robotid.data.files.read import write_log
 from robotid.data.log import Log
 from robotid.dynamics.base_parameters import structural_mapping
@@ -148,7 +148,7 @@ def test_a_job_writes_a_urdf_of_its_gravity_that_other_logs_validate(tmp_path, r
     wanted = gravity(full, pi, q)
     given = gravity(written, written.standard_parameters(), q)
     np.testing.assert_allclose(given, wanted, atol=0.03 * np.abs(wanted).max())
-    checked = validate_result(tmp_path / "out" / "result.json", [tmp_path / "kept.csv"])
+    checked = validate(tmp_path / "out" / "result.json", [tmp_path / "kept.csv"])
     verdict = checked["verdict"]
     assert verdict["per_joint"]["shoulder_lift_joint"]["status"] == "good"
     assert verdict["per_joint"]["shoulder_pan_joint"]["status"] == "not evaluated"

@@ -15,7 +15,7 @@ from helpers.paths import DOCS, ROOT
 
 from robotid.base.exceptions import SettingsError
 from robotid.cli import main
-from robotid.cli.export import export_result
+from robotid.cli.export import export
 from robotid.output.files import exports
 from robotid.output.files.exports import Format, Option, Written, formats, writers
 from robotid.output.files.result_file import load_result
@@ -57,7 +57,7 @@ def result(tmp_path_factory):
 @pytest.mark.parametrize("kind", formats())
 def test_each_format_is_read_back_by_its_consumer(kind, result, tmp_path):
     target = tmp_path / f"robot{formats()[kind].suffix}"
-    done = export_result(result, kind, target)
+    done = export(result, kind, target)
     assert done["files"][0] == str(target)
     loaded = load_result(result)
     for drive in loaded.commanded:
@@ -83,9 +83,9 @@ def test_each_option_goes_to_the_formats_that_have_it_alone(result, tmp_path):
     assert {kind for kind, _ in refused} == {"urdf", "sdf", "isaac", "ranges"}
     for kind, name in refused:
         with pytest.raises(SettingsError, match=rf"--{name} is an option of .*mjcf.*, not of"):
-            export_result(result, kind, tmp_path / "a", **{name: 1})
+            export(result, kind, tmp_path / "a", **{name: 1})
     with pytest.raises(SettingsError, match="format is 'obj', wanted one of urdf, isaac, mjcf"):
-        export_result(result, "obj", tmp_path / "a")
+        export(result, "obj", tmp_path / "a")
     assert not list(tmp_path.iterdir())
 
 
