@@ -40,7 +40,7 @@ from helpers import mujoco_plant
 from mujoco import rollout
 
 from robotid.base.exceptions import SettingsError
-from robotid.cli.work.job import read_job
+from robotid.cli.job import read_job
 from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
 from robotid.dynamics.simulation.loops import ClosedLoopRobot, Window, open_loops
@@ -54,8 +54,8 @@ from robotid.identification.closed_loop.position_errors import run_open_loop
 from robotid.identification.closed_loop.stages import stated_loops
 from robotid.identification.pipeline import identify
 from robotid.output.files.commanded import CommandedDrive, loops_of
+from robotid.robot.drives import AUTO
 from robotid.robot.examples import example_urdf
-from robotid.robot.families import AUTO
 from robotid.robot.model import RobotModel
 
 FINE = 5e-5  # [s] step of the plant

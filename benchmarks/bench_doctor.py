@@ -28,9 +28,9 @@ import numpy as np
 from helpers.corruptions import CASES, ROBOTS, clean_log, robot, table_of
 from helpers.servos import bandwidth, faulty_logs, good_commands, record, some_servos
 
-from robotid.cli.work.job import Job, LogEntry, read_job
-from robotid.cli.work.logs import examine
-from robotid.data.files.table_files import write_columns
+from robotid.cli.job import Job, LogEntry, read_job
+from robotid.cli.logs import examine
+from robotid.data.files.formats import write_columns
 from robotid.data.signal_settings import SignalSettings
 from robotid.diagnosis.logs.check_logs import diagnose
 from robotid.diagnosis.logs.command_channels import check_commands

@@ -29,7 +29,7 @@ import pyarrow.parquet
 from distributed import Client, LocalCluster
 from setting import PLANAR, machine
 
-from robotid.cli.work.fleet import UNITS
+from robotid.cli.fleet import UNITS
 from robotid.data.files.read import write_log
 from robotid.data.log import Log
 from robotid.dynamics.simulation.motions import random_fourier

@@ -20,16 +20,16 @@ from pathlib import Path
 import numpy as np
 from scipy.signal import lfilter
 
-from robotid.cli.work.job import read_job
+from robotid.cli.job import read_job
 from robotid.estimation.fitting.bands import QUANTILE, friction_curve
 from robotid.identification.pipeline import identify
 from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import process
-from robotid.dynamics.memory import remember
+from robotid.dynamics.prediction import remember
 from robotid.dynamics.prediction import predict
 from robotid.robot.drives import DriveMotion, LoadFriction, Stribeck
-from robotid.robot.families import AUTO
+from robotid.robot.drives import AUTO
 from robotid.dynamics.simulation.truth import another_robot
 from robotid.dynamics.simulation.motions import random_fourier
 

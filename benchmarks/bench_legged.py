@@ -45,8 +45,8 @@ from helpers.paths import JOBS
 from helpers.walkers import G1, ICUB, TALOS, planned, waves
 
 from robotid.base.exceptions import NotConvergedError, RankDeficientError
-from robotid.cli.work.identify import run_job
-from robotid.cli.work.job import read_job
+from robotid.cli.identify import run_job
+from robotid.cli.job import read_job
 from robotid.data.signal_settings import SignalSettings
 from robotid.diagnosis.logs.contacts import check_base
 from robotid.dynamics.base_parameters import structural_mapping

@@ -23,7 +23,7 @@ import numpy as np
 from helpers.corruptions import robot
 from helpers.misfits import EFFECTS, log_with
 
-from robotid.cli.work.job import read_job
+from robotid.cli.job import read_job
 from robotid.diagnosis.residual.misfit import find_misfits
 from robotid.diagnosis.residual.term_trials import take_sample
 from robotid.identification.pipeline import identify

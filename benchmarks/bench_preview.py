@@ -26,7 +26,7 @@ import numpy as np
 import scipy.linalg
 import scipy.signal
 
-from robotid.cli.work.job import read_job
+from robotid.cli.job import read_job
 from robotid.identification.pipeline import identify
 from robotid.design.previews import TorqueNoise
 from robotid.design.previews import preview

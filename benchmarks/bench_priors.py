@@ -22,7 +22,7 @@ import pinocchio as pin
 from setting import machine
 
 from robotid.base.exceptions import RobotIdError
-from robotid.cli.work.job import read_job
+from robotid.cli.job import read_job
 from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
 from robotid.dynamics.simulation.motions import random_fourier

@@ -15,7 +15,7 @@ import scipy.linalg
 from setting import ROBOTS, machine, motion, robot, rows_of, side_by_side
 
 from robotid.dynamics.base_parameters import structural_mapping
-from robotid.dynamics.lapack import Triangle
+from robotid.dynamics.factors import Triangle
 from robotid.dynamics.torque import build_problem
 
 

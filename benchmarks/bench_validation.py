@@ -19,8 +19,8 @@ from pathlib import Path
 for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
     os.environ.setdefault(variable, "1")
 
-from robotid.cli.work.identify import run_job
-from robotid.cli.work.job import read_job
+from robotid.cli.identify import run_job
+from robotid.cli.job import read_job
 
 JOBS = Path(__file__).parents[1] / "tests" / "jobs"
 PLAIN_NUMPY = {

@@ -21,8 +21,8 @@ from pathlib import Path
 import bench_memory
 from setting import ROBOTS, machine
 
-from robotid.cli.work.job import Job, LogEntry
-from robotid.cli.work.logs import survey_logs
+from robotid.cli.job import Job, LogEntry
+from robotid.cli.logs import survey_logs
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.factors import join
 from robotid.estimation.fitting.recorded import Recordings

@@ -17,7 +17,7 @@ HERE = ROOT / "docs" / "pictures"
 sys.path.insert(0, str(ROOT / "tests"))
 from helpers.browsing import launch, visit
 
-from robotid.cli.work.demo import run_demo
+from robotid.cli.demo import run_demo
 
 #: Replaces absolute paths in the texts of a page.
 SHORTEN = """paths => {

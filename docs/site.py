@@ -103,7 +103,7 @@ def command_page(name):
     module = import_module(f"robotid.cli.{name}")
     parser = argparse.ArgumentParser(prog=f"robotid {name}")
     module.add_flags(parser)
-    parts = [f"# robotid {name}\n", f"{module.SUMMARY[:1].upper()}{module.SUMMARY[1:]}.\n"]
+    parts = [f"# robotid {name}\n", f"{COMMANDS[name][:1].upper()}{COMMANDS[name][1:]}.\n"]
     usage = [a.metavar or a.dest for a in parser._actions if not a.option_strings]
     parts += [f"```text\nrobotid {' '.join([name, *map(shown, usage)])} [flags]\n```\n"]
     for group in parser._action_groups:

@@ -7,14 +7,13 @@ import math
 from dataclasses import MISSING
 from pathlib import Path
 
-from robotid.cli.work.job import Job, LogEntry, PayloadEntry
+from robotid.cli.job import Job, LogEntry, PayloadEntry
 from robotid.data.signal_settings import BaseSource, LogSource, LogUnits, SignalSettings
 from robotid.data.transmission import Transmission
 from robotid.dynamics.simulation.simulation_settings import Simulation
 from robotid.estimation.fitting.estimator_settings import ESTIMATORS, ConstraintSettings
 from robotid.identification.closed_loop.loop_settings import LoopSettings
-from robotid.robot.drives import TERMS
-from robotid.robot.families import AUTO
+from robotid.robot.drives import AUTO, TERMS
 
 REFERENCE = Path(__file__).with_name("reference")
 PLANT = """# Keys of a plant

@@ -13,6 +13,7 @@ gc.disable()  # until the tests begin: nothing that is imported is garbage
 import numpy as np
 import pytest
 from helpers.browsing import launch
+from helpers.crane import identified_crane
 from helpers.paths import IN_CI, ROOT
 from helpers.synthetic import exact_log, truth
 
@@ -107,3 +108,9 @@ def identified(ur5, tmp_path_factory):
         validation=[logs["kept"]],
         signals=SignalSettings(cutoff=12.0, min_velocity=0.05),
     )
+
+
+@pytest.fixture(scope="session")
+def crane(tmp_path_factory):
+    """A crane of which drives and delay are identified from commands: two logs, one held out."""
+    return identified_crane(tmp_path_factory.mktemp("crane"))

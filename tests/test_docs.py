@@ -16,16 +16,16 @@ from helpers.corruptions import CASES
 from helpers.paths import DOCS, ROOT
 
 from robotid.cli import COMMANDS, main
-from robotid.cli.work.job import Job, LogEntry, job_from_settings
-from robotid.data.files.table_files import write_columns
+from robotid.cli.job import Job, LogEntry, job_from_settings
+from robotid.data.files.formats import write_columns
 from robotid.diagnosis.logs.check_logs import CODES
 from robotid.diagnosis.verdict.verdict import WARNING_CODES
 from robotid.dynamics.simulation.motions import random_fourier
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
 from robotid.robot import examples
-from robotid.robot.assumed import REASONS
 from robotid.robot.drives import TERM_CLASSES, TERMS
 from robotid.robot.examples import example_urdf
+from robotid.robot.prior import REASONS
 
 sys.path.append(str(ROOT / "benchmarks"))
 from write_tables import BLOCK, PAGES, digest

@@ -20,7 +20,7 @@ from helpers.synthetic import exact_log, truth
 
 import robotid
 from robotid.cli import COMMANDS, main
-from robotid.cli.work.job import job_from_settings
+from robotid.cli.job import job_from_settings
 from robotid.data.files.read import write_log
 from robotid.design.motion_files import write_motion
 from robotid.dynamics.prediction import predict_instants

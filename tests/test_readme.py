@@ -10,7 +10,7 @@ from helpers.synthetic import exact_log, truth
 
 import robotid
 from robotid.cli import main
-from robotid.cli.work.job import job_from_settings
+from robotid.cli.job import job_from_settings
 from robotid.data.files.read import write_log
 from robotid.robot.examples import example_urdf
 

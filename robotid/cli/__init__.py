@@ -1,4 +1,4 @@
-"""The command line: flags to arguments, results to text; nothing is computed here."""
+"""The command line: one file a command, with its settings, its work and what it prints."""
 
 import argparse
 import atexit
@@ -6,9 +6,11 @@ import ctypes
 import gc
 import io
 import os
+import re
 import sys
 from collections.abc import Sequence
 from importlib import import_module
+from pathlib import Path
 
 from robotid.base.exceptions import RobotIdError, SettingsError
 from robotid.base.versions import __version__
@@ -34,12 +36,23 @@ _THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 _MMAP_THRESHOLD, _LARGE = -3, 2**25  # [bytes], the maximum that glibc accepts
 _TRIM_THRESHOLD, _SPARE = -1, 2**26  # [bytes]
 
-#: The commands in the order of the help. Each is a module with SUMMARY, add_flags and run; one with
+_FIRST_LINE = re.compile(r'"""robotid ([a-z]+): (.+)\."""')
+
+
+def _commands() -> dict[str, str]:
+    """Return the help line of each command by name: the first line of its file, unimported."""
+    commands = {}
+    for path in sorted(Path(__file__).parent.glob("[a-z]*.py")):
+        with path.open(encoding="utf-8") as file:
+            first = _FIRST_LINE.match(file.readline())
+        if first:
+            commands[first[1]] = first[2]
+    return commands
+
+
+#: The help line of each command by name. A command is a module with add_flags and run; one with
 #: many flags also has MAIN_FLAGS and EXAMPLES, for its short help.
-COMMANDS = (
-    "demo", "paper", "inspect", "identify", "fleet", "track", "excite", "preview", "replay",
-    "doctor", "validate", "payload", "report", "compare", "export", "simulate", "convert", "schema",
-)  # fmt: skip
+COMMANDS = _commands()
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -118,10 +131,10 @@ def _parser(words: Sequence[str]) -> argparse.ArgumentParser:
     first = [word for word in words[:1] if word in COMMANDS]
     chosen = next((word for word in words if not word.startswith("-")), None)
     for name in first or COMMANDS:
-        module = import_module(f"robotid.cli.{name}")
-        command = commands.add_parser(name, help=module.SUMMARY)
-        command.set_defaults(run=module.run)
+        command = commands.add_parser(name, help=COMMANDS[name])
         if name == chosen:
+            module = import_module(f"robotid.cli.{name}")
+            command.set_defaults(run=module.run)
             module.add_flags(command)
             if hasattr(module, "MAIN_FLAGS"):
                 command.shorten_help(module.MAIN_FLAGS, module.EXAMPLES)

@@ -3,16 +3,34 @@
 import argparse
 from collections.abc import Mapping, Sequence
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 from robotid.base.findings import listed
 from robotid.base.text import columns, in_digits_of
+from robotid.cli.console import echo, show_found, window_name
 from robotid.cli.flags import add_json, add_verbose
-from robotid.cli.printing import echo, window_name
-from robotid.cli.running import show_found
+from robotid.identification.summary import cell
+from robotid.output.report.comparison import compare_results, write_comparison
 
-SUMMARY = "compare several results"
 _SHOWN = 12  # base parameters in the table, so that two results fit a screen
+
+
+def compare(results: Sequence[str | Path], page: str | Path | None = None) -> dict[str, Any]:
+    """Compare results of one robot: errors, parameters, settings, inputs.
+
+    Args:
+        results: At least two, each a result.json or its folder.
+        page: HTML page to write; none if None.
+
+    Returns:
+        The comparison, as ``robotid compare --json``.
+
+    Raises:
+        DataError: If a result is missing, or the robots or their base parameters differ.
+        SettingsError: If the page cannot be written.
+    """
+    return compare_results(results) if page is None else write_comparison(results, page)
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
@@ -26,19 +44,13 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Run the command."""
-    from robotid.output.report.comparison import compare_results, write_comparison
-
-    if options.out:
-        content = write_comparison(options.results, options.out)
-    else:
-        content = compare_results(options.results)
+    content = compare(options.results, options.out)
     show_found(content, options, partial(_show, is_verbose=options.verbose))
     if options.out and not options.json:
         print(f"\nwritten to {options.out}")
 
 
 def _show(content: dict[str, Any], *, is_verbose: bool = False) -> None:
-    from robotid.identification.summary import cell
 
     results = content["results"]
     labels = [result["label"] for result in results]

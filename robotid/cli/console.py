@@ -1,27 +1,132 @@
-"""Errors and progress on a terminal, and the end of a command after a signal."""
+"""What commands print: results, findings, errors, progress; and their end after a signal."""
 
+import argparse
 import errno
+import json
 import logging
 import os
 import re
 import signal
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, TextIO
+from typing import TYPE_CHECKING, Any, TextIO
 
-from robotid.base.text import terminal_width, tinted, wrapped
+from robotid.base.findings import Finding, grouped, number_of
+from robotid.base.text import command_lines, period, terminal_width, tinted, wrapped
 
 if TYPE_CHECKING:
-    from rich.progress import TaskID
-
     from robotid.base.typing import ProgressCallback
+    from robotid.output.report.steps import Step
 
 _LAST_STREAM = 2  # the number of the standard error stream
 _ENDS = tuple(getattr(signal, n) for n in ("SIGTERM", "SIGHUP") if hasattr(signal, n))
+
+
+def echo(text: str, indent: str = "", tone: str = "") -> None:
+    """Print text in lines that fit the terminal."""
+    print(tinted(wrapped(text, terminal_width(), indent), tone, tone, sys.stdout))
+
+
+def print_files(folder: str, names: Sequence[str]) -> None:
+    """Print the files that were written, one per line."""
+    print("\nwritten:")
+    for name in names:
+        print(f"  {Path(folder) / name}")
+
+
+def print_steps(steps: "Sequence[Step]") -> None:
+    """Print the next steps, each with its commands on separate lines, for copying."""
+    print("\nnext steps:")
+    for number, step in enumerate(steps, start=1):
+        echo(f"  {number}. {step.words}", "   ")
+        for block in step.blocks:
+            lines = block.split("\n")
+            if sys.stdout.isatty() and len(lines) == 1 and block.startswith("robotid "):
+                lines = command_lines(block, terminal_width() - 7)
+            print("\n".join(f"       {line}" for line in lines))
+
+
+def print_causes(
+    findings: Sequence[Mapping[str, Any]],
+    joints: Sequence[str],
+    *,
+    is_verbose: bool,
+    worst: str = "",
+    printed: Sequence[str] = (),
+    none: str = "no findings",
+) -> None:
+    """Print findings by cause, then their number."""
+    every = [Finding(**as_finding(f)) for f in findings]
+    shown = [f for f in every if is_verbose or f.severity != "note"]
+    causes, others = grouped(shown, joints), grouped([f for f in every if f not in shown], joints)
+    for cause in causes:
+        for message in cause.messages:
+            if message not in printed:
+                echo(f"{cause.severity}: {cause.code}: {message}", "  ", cause.severity)
+    hidden = number_of(others)
+    notes = f"{_some(hidden, 'note')} hidden (--verbose)" if hidden else ""
+    if shown:
+        count = f"{_some(number_of(causes), 'finding')}, {_some(len(causes), 'cause')}"
+        notes = count + (f"; worst: {worst}" if worst else "") + (f"; {notes}" if notes else "")
+    if summary := notes or none:
+        echo(summary)
+
+
+def as_finding(found: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the attributes of a ``Finding`` from a finding in JSON."""
+    return {key: found[key] for key in ("code", "severity", "where", "message")}
+
+
+def _some(count: int, what: str) -> str:
+    return f"{count} {what}{'' if count == 1 else 's'}"
+
+
+def recordings_of(inputs: Sequence[Mapping[str, Any]], role: str) -> list[str]:
+    """Return the file of each recording of a role, with its path if names occur more than once."""
+    paths = {Path(entry["path"]) for entry in inputs}
+    names = [path.name for path in paths]
+    files = {str(path): path.name if names.count(path.name) == 1 else str(path) for path in paths}
+    return [
+        window_name(files[str(Path(entry["path"]))] or "log", entry)
+        for entry in inputs
+        if entry["role"] == role
+    ]
+
+
+def window_name(name: str, entry: Mapping[str, Any]) -> str:
+    """Return the name of a recording with its window of the log."""
+    return f"{name} {period(entry['start'], entry['end'])}"
+
+
+def print_verdict(verdict: Mapping[str, Any]) -> None:
+    """Print a verdict."""
+    from robotid.identification.summary import verdict_lines
+
+    first, *others = verdict_lines(verdict)
+    echo(f"\n{first}", tone=verdict["status"])
+    for line in others:
+        status = line.partition(": ")[2].partition(":")[0]
+        echo(line, "  ", "" if line.startswith("  - ") else status)
+
+
+def show_found(
+    content: dict[str, Any],
+    options: argparse.Namespace,
+    show: Callable[[dict[str, Any]], None],
+    files: Sequence[str] = (),
+) -> None:
+    """Print the result of a command and the files that it wrote, or the JSON alone."""
+    with closed_output_ignored():
+        if options.json:
+            print(json.dumps(content, allow_nan=False))
+            return
+        show(content)
+        if files:
+            print_files(options.out, files)
 
 
 class Terminated(KeyboardInterrupt):
@@ -116,7 +221,7 @@ def print_error(error: BaseException, words: str = "") -> None:
 
 @contextmanager
 def shown_log(*, is_verbose: bool) -> Iterator[None]:
-    """Show warnings of the logger "robotid" on the standard error stream in the context."""
+    """Show warnings of the logger "robotid" on the standard error stream."""
     logger, handler = logging.getLogger("robotid"), _EachOnce()
     level = logger.level
     logger.addHandler(handler)
@@ -148,15 +253,15 @@ class _EachOnce(logging.Handler):
 
 
 @contextmanager
-def terminal_progress(
-    *, quiet: bool = False, force: bool = False, is_verbose: bool = False
-) -> "Iterator[ProgressCallback | None]":
-    """Show progress on the standard error stream in the context, if it is a terminal."""
-    if force or not (quiet or not sys.stderr.isatty()):
-        with _bars(force=force) as show:
+def progress_of(options: argparse.Namespace) -> "Iterator[ProgressCallback | None]":
+    """Show progress on the standard error stream, if it is a terminal or a flag asks for it."""
+    is_forced, is_verbose = (getattr(options, x, False) for x in ("progress", "verbose"))
+    is_quiet = getattr(options, "json", False)
+    if is_forced or (sys.stderr.isatty() and not is_quiet):
+        with _bars(force=is_forced) as show:
             yield show
     else:
-        yield _stage_lines() if is_verbose and not quiet else None
+        yield _stage_lines() if is_verbose and not is_quiet else None
 
 
 def _stage_lines() -> "ProgressCallback":
@@ -174,47 +279,26 @@ def _stage_lines() -> "ProgressCallback":
 
 @contextmanager
 def _bars(*, force: bool) -> "Iterator[ProgressCallback]":
-    """Show a bar of the stage and below it a bar of its work; both are removed at the end."""
+    """Show the stage and a bar of its work; both are removed at the end."""
     from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn
-    from rich.progress import TimeElapsedColumn as Elapsed
-    from rich.progress import TimeRemainingColumn as Remaining
+    from rich.progress import Progress
 
     console = Console(stderr=True, force_terminal=True if force else None)
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(bar_width=20),
-        Elapsed(),
-        TextColumn("{task.fields[state]}"),
-        Remaining(),
-    )
-    tasks: dict[str, TaskID] = {}
-    first: dict[str, int] = {}
-    stage = ""
-    with Progress(*columns, console=console, transient=True) as bars:
+    with Progress(console=console, transient=True) as bars:
+        stage, work = bars.add_task("", total=None), bars.add_task("", visible=False)
+        current = ""
 
         def show(what: str, done: int, total: int, unit: str) -> None:
-            nonlocal stage
-            if what not in tasks:
-                for name in [name for name in tasks if unit == "stages" or name != stage]:
-                    bars.remove_task(tasks.pop(name))
-                words = f"    {what}" if stage else what
-                if unit == "stages":
-                    stage, words = what, f"{done + 1}/{total} {what}"
-                tasks[what] = bars.add_task(words, total=None, state="")
-                first[what] = done
-            if unit != "stages":
-                elapsed = next(t for t in bars.tasks if t.id == tasks[what]).elapsed or 0.0
-                state = _share_and_rate(done, total, done - first[what], elapsed, unit)
-                bars.update(tasks[what], completed=done, total=total, state=state)
+            nonlocal current
+            if unit == "stages":
+                bars.update(stage, description=f"{done + 1}/{total} {what}")
+                bars.update(work, visible=False)
+                bars.refresh()
+            elif what == current:
+                bars.update(work, completed=done, total=total, visible=True)
+            else:
+                current = what
+                label = f"    {what} [{unit}]"
+                bars.reset(work, description=label, completed=done, total=total, visible=True)
 
         yield show
-
-
-def _share_and_rate(done: int, total: int, made: int, elapsed: float, unit: str) -> str:
-    """Return the share of the work that is done and its rate, as "50 %  1,200 samples/s"."""
-    share = f"{100 * done / max(total, 1):3.0f} %"
-    if not (made and elapsed > 0):
-        return share
-    rate = made / elapsed
-    return f"{share}  {f'{rate:,.0f}' if rate >= 10 else f'{rate:.2g}'} {unit}/s"

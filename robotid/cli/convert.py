@@ -1,13 +1,111 @@
 """robotid convert: write a log as CSV, Parquet, NPZ, HDF5 or MAT, with standard column names."""
 
 import argparse
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any
 
+from robotid.base.exceptions import DataError
+from robotid.base.files import check_file
+from robotid.base.findings import listed
+from robotid.cli.console import echo, show_found
 from robotid.cli.flags import JOB, SOURCE, add_json
-from robotid.cli.printing import echo
-from robotid.cli.running import show_found
+from robotid.data.base_motion import ACCELERATION, IMU, POSE, TWIST
+from robotid.data.files.column_names import KINDS, is_clock, quantity_of
+from robotid.data.files.formats import open_table, write_columns
+from robotid.data.files.table import with_even_stamps
+from robotid.data.log import repeated, suggestion
+from robotid.data.signal_settings import LogSource
+from robotid.robot.constraints import Contact
 
-SUMMARY = "write a log as CSV, Parquet, NPZ, HDF5 or MAT, with standard column names"
+_WHOLE = LogSource()
+_BASE = {f"base_{x}" for x in (*POSE, "roll", "pitch", "yaw", *TWIST, *ACCELERATION)}
+_SENSED = {*_BASE, *(f"imu_{x}" for x in IMU)}
+_OF_LINKS = ("contact_", "foot_force_", *(f"wrench_{x}_" for x in Contact.components))
+
+
+@dataclass(frozen=True)
+class Conversion:
+    """The content of a converted file."""
+
+    path: str
+    samples: int
+    columns: tuple[str, ...]  # with standard names
+    joints: tuple[str, ...]
+    ignored: tuple[str, ...]  # columns of the source file that are of no joint, base or contact
+    local: bool = False  # whether it has wrenches with the axes of their links
+
+
+def convert(
+    path: str | Path,
+    target: str | Path,
+    *,
+    joints: Sequence[str] | None = None,
+    source: LogSource = _WHOLE,
+) -> Conversion:
+    """Write a log in another format, with standard column names; no robot model is required.
+
+    Numbers and units are unchanged. They are checked when the log is read with a robot.
+    """
+    file = Path(path)
+    check_file(Path(target), [file])
+    opened = open_table(file, source)
+    found, by_joint = _standard_names(file.name, opened.names, source)
+    for joint in joints or ():
+        if joint not in by_joint:
+            raise DataError(
+                f"{file.name} has no joint {joint!r}; joints found: {listed(by_joint)}"
+                f"{suggestion(joint, by_joint)}"
+            )
+    wanted = tuple(by_joint) if joints is None else tuple(joints)
+    others = [x for x in opened.names if x in _SENSED or x.startswith(_OF_LINKS)]
+    found |= {name: name for name in others}
+    chosen = ["time", *(name for joint in wanted for name in by_joint[joint]), *others]
+    columns = [name for name in found if name in chosen]
+    even = with_even_stamps(opened, found["time"], source.stamp)
+    table = even.read([found[name] for name in columns])
+    write_columns({name: table[found[name]] for name in columns}, Path(target))
+    return Conversion(
+        path=str(target),
+        samples=len(table[found["time"]]),
+        columns=tuple(columns),
+        joints=wanted,
+        ignored=tuple(name for name in opened.names if name not in found.values()),
+        local=opened.axes.get("wrench") == "link" and any(x.startswith("wrench_") for x in others),
+    )
+
+
+def _standard_names(
+    where: str, names: Sequence[str], source: LogSource
+) -> tuple[dict[str, str], dict[str, list[str]]]:
+    """Return the columns by standard name, ordered by quantity, and the standard names by joint."""
+    joint_of = {name: joint for joint, name in source.joints.items()}
+    pairs = [("time", name) for name in names if is_clock(name)]
+    by_joint: dict[str, list[str]] = {}
+    quantities = [(name, quantity_of(name, source.effort, joint_of)) for name in names]
+    for kind in KINDS:
+        for name, found in quantities:
+            if found and found[0] == kind:
+                joint = joint_of.get(found[1], found[1])
+                pairs.append((f"{kind}_{joint}", name))
+                by_joint.setdefault(joint, []).append(f"{kind}_{joint}")
+    if twice := repeated([key for key, _ in pairs]):
+        both = [name for key, name in pairs if key == twice[0]]
+        raise DataError(
+            f"{where} has several columns for {twice[0]!r}: {listed(both)}; keep one of them"
+        )
+    standard = dict(pairs)
+    if "time" not in standard:
+        raise DataError(
+            f"{where} has no column 'time'; columns found: {listed(names)}. Rename the time column"
+        )
+    if not by_joint:
+        raise DataError(
+            f"{where} has no column of a joint, as 'q_<joint>'; columns found: {listed(names)}. "
+            "Rename the columns of the joints"
+        )
+    return standard, by_joint
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
@@ -23,11 +121,6 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Run the command."""
-    from dataclasses import asdict
-
-    from robotid.cli.work.convert import convert
-    from robotid.data.signal_settings import LogSource
-
     joints = options.joints.split(",") if options.joints else None
     topics = tuple(options.sensors.split(",")) if options.sensors else ()
     source = LogSource(**source_settings(options), sensors=topics)

@@ -1,25 +1,76 @@
-"""robotid export: write a result in the formats that other programs read."""
+"""robotid export: write a result for other programs: urdf, mjcf, sdf, isaac, ranges."""
 
 import argparse
 from collections.abc import Mapping
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
+from robotid.base.exceptions import SettingsError
+from robotid.base.files import check_file
+from robotid.base.findings import listed
+from robotid.cli.console import echo, show_found
 from robotid.cli.flags import add_json
-from robotid.cli.printing import echo
-from robotid.cli.running import show_found
-from robotid.output.files.export_formats import FORMATS, options_of
+from robotid.cli.identify import save_result
+from robotid.identification.result import Identification
+from robotid.output.files.exports import formats, options_of, writers
+from robotid.output.files.result_file import load_result
 
-SUMMARY = f"write a result for other programs: {', '.join(FORMATS)}"
+
+def export(
+    result: Identification | str | Path,
+    format: str,
+    target: str | Path,
+    **options: float | str | None,
+) -> dict[str, Any]:
+    """Write a result in a format of other programs.
+
+    Friction terms that the format lacks are projected on those that it has.
+
+    Args:
+        result: An identification; or its result.json or the folder of it.
+        format: "urdf", "mjcf", "sdf", "isaac" or "ranges".
+        target: The file to write.
+        options: Options of the format, as the flags of ``robotid export``.
+
+    Returns:
+        The files, what they do not state ("not_stated"), and the projected terms ("projected").
+
+    Raises:
+        DataError: If the result lacks what the format states.
+        ModelError: If a link or a drive would be physically impossible.
+        SettingsError: If the format, an option or the target is not usable.
+    """
+    if format not in formats():
+        raise SettingsError(f"format is {format!r}, wanted one of {listed(formats())}")
+    stated = {name: value for name, value in options.items() if value is not None}
+    having = options_of(formats())
+    for name in stated:
+        if format not in having.get(name, {}):
+            raise SettingsError(
+                f"--{name.replace('_', '-')} is an option of {listed(having.get(name, {}))}, "
+                f"not of {format}; remove it"
+            )
+    with TemporaryDirectory(prefix="robotid-") as folder:
+        is_path = isinstance(result, str | Path)
+        path = result if is_path else save_result(result, folder, report=False)
+        loaded = load_result(path)
+        check_file(Path(target), loaded.files)
+        written = writers()[format].export(loaded, Path(target), **stated)
+    return {
+        "result": str(path), "format": format, "files": [*map(str, written.files)],
+        "not_stated": list(written.notes), "projected": dict(written.projected),
+    }  # fmt: skip
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
     """Add the flags of the command."""
     add = parser.add_argument
     add("result", metavar="RESULT", help="result.json or its folder")
-    words = {kind: form.words for kind, form in FORMATS.items()}
-    add("--format", required=True, choices=[*FORMATS], help=_by_format(words))
+    words = {kind: form.words for kind, form in formats().items()}
+    add("--format", required=True, choices=[*formats()], help=_by_format(words))
     add("--out", required=True, metavar="FILE", help="file to write")
-    for name, having in options_of(FORMATS).items():
+    for name, having in options_of(formats()).items():
         words = {kind: option.words for kind, option in having.items()}
         first = next(iter(having.values()))
         about: dict[str, Any] = {"type": first.kind, "metavar": first.metavar}
@@ -30,20 +81,16 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
 
 
 def _by_format(words: Mapping[str, str]) -> str:
-    """Return the help text of a flag, format by format."""
     return "; ".join(f"{kind}: {text}" for kind, text in words.items()).replace("%", "%%")
 
 
 def run(options: argparse.Namespace) -> None:
     """Run the command."""
-    from robotid.cli.work.export import export_result
-
-    chosen = {name: getattr(options, name) for name in options_of(FORMATS)}
-    done = export_result(options.result, options.format, options.out, **chosen)
-    show_found(done, options, _show)
+    chosen = {name: getattr(options, name) for name in options_of(formats())}
+    show_found(export(options.result, options.format, options.out, **chosen), options, _show)
 
 
-def _show(done: dict[str, Any]) -> None:
-    print(f"written: {', '.join(done['files'])}")
-    for note in done["not_stated"]:
+def _show(content: dict[str, Any]) -> None:
+    print(f"written: {', '.join(content['files'])}")
+    for note in content["not_stated"]:
         echo(f"  {note}", "  ")

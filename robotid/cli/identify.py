@@ -1,23 +1,426 @@
 """robotid identify: identify a robot: JOB.toml, or URDF LOG [LOG ...]."""
 
 import argparse
-from collections.abc import Mapping
+import logging
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
 
+from robotid.base.arguments import checked
+from robotid.base.exceptions import DataError, SettingsError
+from robotid.base.files import check_folder, folder_beside, remove_written, write_json
+from robotid.base.settings import require_flag, require_kind
 from robotid.base.text import columns, terminal_width, wrapped
-from robotid.cli.flags import OUTPUT, add_job, add_out, add_progress, job_from_flags, source_words
-from robotid.cli.printing import (
+from robotid.base.typing import STAGES, ProgressCallback, ignore_progress, report_stage
+from robotid.cli.console import (
     echo,
-    print_block,
     print_causes,
     print_steps,
     print_verdict,
+    progress_of,
     recordings_of,
+    show_found,
 )
-from robotid.cli.running import progress_of, show_found
+from robotid.cli.flags import OUTPUT, add_job, add_out, add_progress, job_from_flags, source_words
+from robotid.cli.job import Job, LogEntry, job_file
+from robotid.cli.logs import (
+    examine_logs,
+    locked_as_logged,
+    needed_of,
+    survey_logs,
+    units_of_logs,
+)
+from robotid.cli.payload import check_payloads
+from robotid.data.files.read import Readable, read_logs
+from robotid.data.log import Log
+from robotid.data.signal_settings import SignalSettings
+from robotid.diagnosis.logs.check_logs import diagnose
+from robotid.diagnosis.verdict.fit_findings import locked_findings
+from robotid.diagnosis.verdict.verdict import check_ignored
+from robotid.dynamics.base_parameters import structural_mapping
+from robotid.dynamics.friction_projection import project_friction
+from robotid.estimation.fitting.estimator_settings import EstimatorSettings, SimulationSettings
+from robotid.estimation.fitting.evaluation import Evaluated
+from robotid.estimation.fitting.recorded import Recordings
+from robotid.estimation.workers.plan import WorkPlan
+from robotid.identification import pipeline
+from robotid.identification.closed_loop.loop_settings import LoopSettings
+from robotid.identification.pipeline import conclude, robot_of
+from robotid.identification.result import Identification, TorqueIdentification
+from robotid.identification.summary import (
+    error_lines,
+    friction_lines,
+    left_out_lines,
+    variation_lines,
+)
+from robotid.output.files.entries import build_result
+from robotid.output.files.urdf import DYNAMICS_TERMS, write_urdf
+from robotid.output.report.document import write_report
+from robotid.output.report.next_steps import next_steps
+from robotid.output.report.steps import Origin
+from robotid.robot.drives import AUTO, DriveTerm, wanted_families
+from robotid.robot.model import RobotModel
+from robotid.robot.tree import read_tree
 
-SUMMARY = "identify a robot: JOB.toml, or URDF LOG [LOG ...]"
+if TYPE_CHECKING:
+    from robotid.output.viewer.replays import Replay
+
+
+_log = logging.getLogger(__name__)
+_NO_LOGS: tuple[Log, ...] = ()
+
+
+@checked("progress")
+def identify(
+    model: RobotModel | str | Path,
+    logs: Readable | Sequence[Readable] | None = None,
+    *,
+    validation: Readable | Sequence[Readable] = _NO_LOGS,
+    signals: SignalSettings | None = None,
+    estimator: EstimatorSettings | str = "consistent",
+    controller: Mapping[str, Any] | None = None,
+    friction: str | Mapping[str, str] = AUTO,
+    doctor: bool = True,
+    ignore: Sequence[str] = (),
+    progress: ProgressCallback | None = None,
+) -> Identification:
+    """Identify a robot's parameters from motion logs, as the command line does.
+
+    Args:
+        model: The robot, or the path of its URDF with all joints free; or a job file, alone, which
+            states logs and settings, and whose long logs are read in pieces.
+        logs: Logs to fit: a ``Log`` with the model's joints, the path of a file, a DataFrame with
+            the columns of such a file, or several of these. Files are read whole, as by
+            ``read_log``.
+        validation: Logs for validation, of the same types.
+        signals: Settings of the signal processing; the defaults if None.
+        estimator: Name or settings of the estimator. "simulation" simulates the robot on the
+            commands, or on the torques, of the logs.
+        controller: Known properties of the position controllers, with the keys of the table
+            ``[controller]`` of a job file; only for the estimator "simulation".
+        friction: Friction terms in addition to viscous and Coulomb friction, as of
+            ``wanted_families``; "auto" selects them. Simulation selects those of all joints, or
+            of none.
+        doctor: Whether the doctor checks the logs first; its findings count in the verdict.
+        ignore: Codes of errors and warnings to ignore.
+        progress: Called at the start of each stage with its name, the stages done, their number
+            and "stages"; in between with the name of a work, the units done, their number and
+            their name.
+
+    Returns:
+        The identification; its evaluations are of torques, or for the estimator "simulation" of
+            positions.
+
+    Raises:
+        DataError: If a log cannot be read, does not match the model or is too short.
+        ModelError: If the model is neither a model nor the path of a usable URDF.
+        RankDeficientError: If the estimator is "ols" or "wls" and the data do not determine all
+            base parameters.
+        NotConvergedError: If a solver fails, or the closed loop cannot be simulated.
+        SettingsError: If a setting is out of range, or a code to ignore is unknown.
+    """
+    if logs is None:
+        job = job_file(model)
+        if not (validation is _NO_LOGS and signals is controller is None and not ignore):
+            raise SettingsError(
+                f"{job.urdf.name} is identified by a job file, which states logs and settings; "
+                "state validation, signals, controller and ignore there"
+            )
+        return identify_job(job, job.model(), WorkPlan(job.workers or 1, progress=progress))
+    require_kind(
+        estimator, (str, EstimatorSettings), "estimator", "a name or a robotid.EstimatorSettings"
+    )
+    choice = EstimatorSettings(estimator) if isinstance(estimator, str) else estimator
+    if not isinstance(choice, SimulationSettings):
+        if controller is not None:
+            raise SettingsError(
+                f"controller is given, but the estimator is {choice.name!r}, wanted 'simulation'; "
+                "remove controller, or set estimator='simulation'"
+            )
+        return pipeline.identify(
+            model, logs, validation=validation, signals=signals, estimator=choice,
+            friction=friction, doctor=doctor, ignore=ignore, progress=progress,
+        )  # fmt: skip
+    from robotid.identification.closed_loop.from_commands import identify_loops
+    from robotid.identification.closed_loop.loop_settings import LoopSettings
+    from robotid.identification.closed_loop.stages import STAGES
+
+    require_kind(signals, (SignalSettings, type(None)), "signals", "a robotid.SignalSettings")
+    require_kind(controller, (Mapping, type(None)), "controller", "a table of its settings")
+    require_flag(doctor, "doctor")
+    check_ignored(ignore)
+    loop, settings = LoopSettings.from_dict(controller or {}), signals or SignalSettings()
+    report_stage(progress, "reading logs", STAGES)
+    model = robot_of(model, logs)
+    wanted = wanted_families(friction, model.joints).values()
+    if any(wanted) or len({names is None for names in wanted}) > 1:
+        raise SettingsError(
+            "friction is stated by joint or with families, but simulation selects the terms of all "
+            "joints, or of none; wanted 'auto' or 'viscous+coulomb'. State terms in the model"
+        )
+    needs: Literal["torque", "commands"] = "torque" if loop.kind == "torque" else "commands"
+    fitted, held_out = (
+        read_logs(
+            some,
+            model.joints,
+            prismatic=model.layout.prismatic,
+            needs=needs,
+            robot=model.tree.movable,
+        )
+        for some in (logs, validation)
+    )
+    return identify_loops(
+        model, fitted, held_out, loop, choice, signals=settings, chooses=None in wanted,
+        examined=diagnose(model, fitted, held_out, settings) if doctor else (), ignore=ignore,
+        progress=progress or ignore_progress,
+    )  # fmt: skip
+
+
+def run_job(
+    job: Job, folder: str | Path, *, plan: WorkPlan | None = None, source: Sequence[str] = ()
+) -> tuple[Identification, dict[str, Any]]:
+    """Identify and write result.json, report and URDF; return the result and result.json.
+
+    The words of the source, after ``robotid identify``, repeat the run.
+    """
+    chosen, target = plan or WorkPlan(job.workers or 1), Path(folder)
+    model = job.model()
+    check_folder(target, ["result.json", *_names(model)])
+    found = identify_job(job, model, chosen)
+    report_stage(chosen.progress, "writing", _stages(job))
+    return _write(found, _job_of(found), target, source=source)
+
+
+@checked("identification")
+def save_result(
+    identification: Identification,
+    folder: str | Path,
+    *,
+    report: bool = True,
+    replay: bool = False,
+) -> Path:
+    """Write the files of ``robotid identify``: result.json, report, URDF with its sidecar.
+
+    ``robotid.load_result(folder)``, ``robotid validate`` and ``robotid replay`` read them. All
+    files are first written to a temporary folder and moved when they are complete. An impossible
+    result has no URDF. Logs in files are listed with their hashes. Gains, units and column names
+    with which the logs were read in Python are not recorded.
+
+    Args:
+        identification: The identification.
+        folder: Folder of the results; created if it is missing.
+        report: Whether report.html is written.
+        replay: Whether replay.html is written: the first validation log, or the first fitted log.
+
+    Returns:
+        Path of the result.json.
+
+    Raises:
+        DataError: If a replay is wanted of position-controlled drives whose logs are in memory.
+        ModelError: If the URDF of the robot no longer exists.
+        SettingsError: If the folder is a file, or is not writable.
+    """
+    require_kind(folder, (str, Path), "folder", "the path of a folder")
+    require_kind(report, bool, "report", "True or False")
+    require_kind(replay, bool, "replay", "True or False")
+    target = Path(folder)
+    check_folder(target, ["result.json", *_names(identification.model)])
+    job = replace(_job_of(identification), report=report, replay=replay)
+    _write(identification, job, target)
+    return target / "result.json"
+
+
+def _names(model: RobotModel) -> tuple[str, str, str, str]:
+    """Return the names of report, replay, URDF and sidecar."""
+    name = f"{Path(model.tree.path).stem}.identified.urdf"
+    return "report.html", "replay.html", name, str(Path(name).with_suffix(".drive.json"))
+
+
+def _write(
+    found: Identification,
+    job: Job,
+    target: Path,
+    *,
+    source: Sequence[str] = (),
+) -> tuple[Identification, dict[str, Any]]:
+    """Write all files of a result; return the identification with its report, and result.json."""
+    names = report, replay, name, sidecar = _names(found.model)
+    target.mkdir(parents=True, exist_ok=True)
+    with folder_beside(target) as partial:
+        outputs = {}
+        played = {"replay": replay} if job.replay else {}
+        written = {"urdf": name, "sidecar": sidecar} if found.has_urdf else {}
+        if job.report:
+            found = replace(found, report=str(target / report))
+            links = {"result": "result.json", **written, **played}
+            origin = Origin(tuple(source), str(target), replay)
+            write_report(found, partial / report, files=links, origin=origin)
+            outputs["report"] = report
+        if written:
+            model, pi = found.model, found.standard
+            moments = found.moments if job.dynamics else {}
+            dynamics = job.dynamics and project_friction(model, pi, moments, DYNAMICS_TERMS)
+            write_urdf(model, pi, partial / name, dynamics=dynamics)
+            outputs |= written
+        outputs |= played
+        result = build_result(found, job.to_dict(), outputs=outputs)
+        write_json(result, partial / "result.json")
+        if job.replay:
+            _replay_of(found, job, partial).write(partial / replay)
+    others = {*names} - set(outputs.values())
+    remove_written(target / other for other in sorted(others))
+    return found, result
+
+
+def _replay_of(found: Identification, job: Job, folder: Path) -> "Replay":
+    """Return the replay of a result that is written in a folder; its modules are imported here."""
+    from robotid.cli.replay import read_findings, replay_files, replay_identified, stated_job
+
+    if isinstance(found, TorqueIdentification):
+        return replay_identified(found)
+    entries = (*job.validation, *job.identification)
+    if not entries:
+        raise DataError(
+            "the logs are in memory, and a replay of position-controlled drives reads them from "
+            "their files; write the logs with robotid.write_log and identify from these files"
+        )
+    findings = read_findings([folder])
+    stated = stated_job(findings, job.urdf, entries[0].path)
+    return replay_files(replace(stated, identification=entries[:1]), findings)
+
+
+def _job_of(identification: Identification) -> Job:
+    """Return the job of an identification; one made in Python gets an equivalent job.
+
+    Logs in memory have no file, and a ``Log`` has no gains, units or names of columns.
+    """
+    model, asked = identification.model, identification.stated
+    if isinstance(asked.job, Job):
+        return asked.job
+    chosen, loop = {}, getattr(identification, "loop", LoopSettings())
+    if isinstance(identification, TorqueIdentification):
+        chosen = {drive.joint: drive for drive in identification.drives}
+    wanted = wanted_families(asked.friction, model.joints)
+    is_auto = all(names is None for names in wanted.values())
+    drives: dict[str, tuple[str | DriveTerm, ...]] = {}
+    for drive in model.layout.drives:
+        name, own = drive.name, model.layout.own.get(drive.name, ())
+        found = chosen.get(name)
+        stated = [term for term in own if found is None or term not in found.terms]
+        families = (wanted.get(name) or ()) if found is None else found.families
+        entries: tuple[str | DriveTerm, ...] = (*(() if is_auto else families), *stated)
+        if entries:
+            drives[name] = entries
+    options = model.options
+    return Job(
+        urdf=Path(model.tree.path),
+        joints=model.joints,
+        locked=options["locked"],
+        gravity=tuple(options["gravity"]),
+        mimic=model.mimic,
+        snap_angles=read_tree(model.tree.path).joints != model.tree.joints,
+        signals=asked.signals,
+        terms=(*model.layout.terms, *([AUTO] if is_auto else [])),
+        model_dynamics=model.dynamics,
+        drives=drives,
+        couplings=model.layout.couplings,
+        contacts=model.contacts,
+        loops=model.loops,
+        passive=model.passive,
+        estimator=identification.estimator,
+        identification=_entries(identification.fitted),
+        validation=_entries(identification.validation),
+        ignore=asked.ignore,
+        controller=loop,
+    )
+
+
+def _entries(evaluations: Sequence[Evaluated]) -> tuple[LogEntry, ...]:
+    """Return the windows of the logs that are in files."""
+    return tuple(
+        LogEntry(Path(e.log.path), e.extent.start, e.extent.end) for e in evaluations if e.log.path
+    )
+
+
+def identify_job(
+    job: Job,
+    model: RobotModel,
+    plan: WorkPlan,
+    *,
+    refuse: Callable[[LogEntry, DataError], None] | None = None,
+) -> Identification:
+    """Identify from a job's logs; nothing is written."""
+    check_ignored(job.ignore)
+    report_stage(plan.progress, "reading logs", _stages(job))
+    if isinstance(job.estimator, SimulationSettings):
+        return _identify_loops(job, model, plan.progress)
+    groups = job.identification, job.validation
+    fitted, validation = survey_logs(job, model, *groups, refuse=refuse)
+    if not fitted:
+        which = "no log is usable" if job.identification else "no log is given"
+        raise DataError(f"{which}, wanted at least one to identify from")
+    report_stage(plan.progress, "checking logs")
+    placed = locked_as_logged(job, model, fitted, validation)
+    job, model, fitted, validation = placed.job, placed.model, placed.fitted, placed.validation
+    locked = locked_findings(model, job.placed(model))
+    found = [*locked, *examine_logs(job, model, fitted, validation)]
+    recordings = Recordings(model, structural_mapping(model), fitted, validation)
+    if not recordings.is_in_memory:
+        recordings = replace(recordings, plan=plan)
+    elif plan.is_asked_for:
+        _log.warning(
+            "the logs have at most %d rows and are read whole: workers and scheduler have no "
+            "effect. Reduce rows_in_memory in [reduction] to read the logs in pieces",
+            job.rows_in_memory,
+        )
+    with plan:
+        concluded = conclude(
+            recordings,
+            job.estimator,
+            found,
+            job.ignore,
+            friction=job.friction,
+            progress=plan.progress,
+        )
+    return replace(
+        concluded,
+        stated=replace(concluded.stated, job=job),
+        findings=(*placed.notes, *concluded.findings),
+        payload_checks=check_payloads(job, concluded.model, fitted),
+    )
+
+
+def _stages(job: Job) -> Sequence[str]:
+    """Return the stages of a job; the modules of a simulation are imported only for one."""
+    if not isinstance(job.estimator, SimulationSettings):
+        return STAGES
+    from robotid.identification.closed_loop.stages import STAGES as stages
+
+    return stages
+
+
+def _identify_loops(
+    job: Job, model: RobotModel, progress: ProgressCallback | None
+) -> Identification:
+    """Identify by simulation, from commands or logged torques; no file is written."""
+    from robotid.identification.closed_loop.from_commands import identify_loops
+
+    assert isinstance(job.estimator, SimulationSettings)
+    logs, validation = (
+        [job.read(entry, model, needs=needed_of(job)) for entry in entries]
+        for entries in (job.identification, job.validation)
+    )
+    found = identify_loops(
+        model, logs, validation, job.controller, job.estimator, signals=job.signals,
+        chooses=AUTO in job.terms, examined=diagnose(model, logs, validation, job.signals),
+        ignore=job.ignore, units=units_of_logs(job.identification),
+        progress=progress or ignore_progress,
+    )  # fmt: skip
+    return replace(found, stated=replace(found.stated, job=job))
+
+
 MAIN_FLAGS = (
     "--validate", "--out", "--estimator", "--friction", "--gain", "--joints", "--lock", "--cutoff",
     "--verbose", "--json",
@@ -38,16 +441,8 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Run the command."""
-    from robotid.base.typing import report_stage
-
     with progress_of(options) as progress:
         report_stage(progress, "reading logs")  # before what takes the first second: its modules
-        from robotid.cli.work.identify import run_job
-        from robotid.estimation.workers.plan import WorkPlan
-        from robotid.identification.result import Identification
-        from robotid.output.report.loop_steps import loop_steps
-        from robotid.output.report.next_steps import next_steps
-        from robotid.output.report.steps import Origin
 
         job = job_from_flags(options)
         workers = job.workers if options.workers is None else options.workers
@@ -61,18 +456,12 @@ def run(options: argparse.Namespace) -> int:
         [*result["outputs"].values(), "result.json"],
     )
     if not options.json:
-        origin = Origin(source, options.out)
-        if isinstance(found, Identification):
-            print_steps(next_steps(found, origin))
-        else:
-            print_steps(loop_steps(result, origin))
+        print_steps(next_steps(found, Origin(source, options.out)))
     return 1 if result["verdict"]["log_errors"] else 0
 
 
 def show_result(result: dict[str, Any], *, is_verbose: bool = False) -> None:
     """Print an identification."""
-    from robotid.identification.summary import error_lines
-
     width, wls = terminal_width(), result.get("wls")
     echo(f"\n{result['robot']}: {len(result['joints'])} joints, {_found(result)}")
     roles = ("identification", "validation")
@@ -83,7 +472,7 @@ def show_result(result: dict[str, Any], *, is_verbose: bool = False) -> None:
         echo(f"\nnot fitted: {name}", "  ")
         print("\n".join(error_lines(ours, wls and wls["validation"][k], width)))
     if lines := _drive_lines(result):
-        print_block(*(wrapped(line, width, "  ") for line in lines))
+        print("\n" + "\n".join(wrapped(line, width, "  ") for line in lines))
     print()
     verdict = result["verdict"]
     print_causes(
@@ -116,8 +505,6 @@ def _found(result: Mapping[str, Any]) -> str:
 
 def _drive_lines(result: Mapping[str, Any]) -> list[str]:
     """Return the friction terms, or all parameters of drives and controllers of a simulation."""
-    from robotid.identification.summary import friction_lines, left_out_lines, variation_lines
-
     if "simulation" not in result:
         lines = friction_lines(result["friction"]) + left_out_lines(result.get("left_out", ()))
         return lines + variation_lines(result.get("variation"))

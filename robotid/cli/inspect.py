@@ -5,12 +5,11 @@ import shlex
 from functools import partial
 from typing import Any
 
+from robotid.base.exceptions import ModelError
 from robotid.base.findings import listed
+from robotid.cli.console import echo, print_causes, show_found
 from robotid.cli.flags import add_json, add_verbose
-from robotid.cli.printing import echo, print_causes
-from robotid.cli.running import show_found
-
-SUMMARY = "list joints, parameters and faults of a URDF"
+from robotid.diagnosis.urdf.inspection import inspect_urdf
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
@@ -25,9 +24,6 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Run the command."""
-    from robotid.base.exceptions import ModelError
-    from robotid.diagnosis.urdf.inspection import inspect_urdf
-
     content = inspect_urdf(options.urdf, free_flyer=options.free_flyer).to_dict()
     if not (content["robot"] or options.json):
         raise ModelError(content["findings"][0]["message"])

@@ -3,10 +3,8 @@
 import argparse
 from typing import Any
 
+from robotid.cli.console import progress_of, show_found
 from robotid.cli.flags import add_json, add_out, add_progress
-from robotid.cli.running import progress_of, show_found
-
-SUMMARY = "repeat the simulation of the paper: figures, tables, numbers"
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:

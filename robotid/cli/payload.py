@@ -2,15 +2,111 @@
 
 import argparse
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
+from robotid.base.exceptions import SettingsError
+from robotid.base.files import file_sha256
 from robotid.base.findings import listed
 from robotid.base.text import columns, in_digits_of
+from robotid.base.typing import ProgressCallback, report_stage
+from robotid.cli.console import echo, progress_of, show_found
 from robotid.cli.flags import JOB, LOG, add_json, job_from_flags, refuse_log_flags
-from robotid.cli.printing import echo
-from robotid.cli.running import progress_of, show_found
+from robotid.cli.job import Job, LogEntry
+from robotid.cli.logs import job_of_result, survey_logs
+from robotid.diagnosis.verdict.payload_check import PayloadCheck
+from robotid.dynamics.base_parameters import structural_mapping
+from robotid.estimation.fitting.recorded import Recordings
+from robotid.estimation.fitting.survey import SurveyedLog
+from robotid.identification.payload_fit import fit_with_friction, mass_checks
+from robotid.identification.summary import cell
+from robotid.robot.bodies import usual_links
+from robotid.robot.model import RobotModel
 
-SUMMARY = "identify a payload from a log with it and a log without it"
+_STAGES = ("reading logs", "fitting")
+
+
+def is_result(path: str | Path) -> bool:
+    """Return whether a reference is a result or its folder, not a log."""
+    return Path(path).suffix == ".json" or (Path(path) / "result.json").is_file()
+
+
+def stated_masses(words: Sequence[str], links: Sequence[str]) -> dict[str, float]:
+    """Return the known mass of each payload, by link [kg]."""
+    masses = {}
+    for word in words:
+        link, _, number = word.rpartition("=")
+        if not link and len(links) > 1:
+            raise SettingsError(
+                f"--mass {word}: the link is ambiguous, wanted one of {listed(links)}. "
+                "Write --mass LINK=KG"
+            )
+        try:
+            masses[link or next(iter(links), "")] = float(number)
+        except ValueError as error:
+            raise SettingsError(f"--mass {word!r}: wanted KG or LINK=KG") from error
+    return masses
+
+
+def measure_payload(
+    job: Job,
+    references: Sequence[str],
+    *,
+    links: Sequence[str] = (),
+    masses: Sequence[str] = (),
+    find_gains: bool = False,
+    progress: ProgressCallback | None = None,
+) -> dict[str, Any]:
+    """Identify the payloads of the logs of a job, relative to references without payloads."""
+    entries = [LogEntry(Path(path)) for path in references]
+    if any(map(is_result, references)):
+        if len(references) > 1:
+            raise SettingsError(
+                f"references are {listed(references)}, wanted one result alone, or logs"
+            )
+        job, entries = job_of_result(
+            job, references[0], "give a log without the payload: --reference LOG"
+        )
+    report_stage(progress, "reading logs", _STAGES)
+    model = job.model()
+    unknown = [joint for joint in model.joints if joint not in job.gains] if find_gains else []
+    job = replace(job, gains={**job.gains, **dict.fromkeys(unknown, 1.0)})
+    links = tuple(links) or usual_links(model)
+    surveyed = survey_logs(job, model, job.identification, entries)
+    mapping = structural_mapping(model)
+    loaded, reference = (Recordings(model, mapping, logs) for logs in surveyed)
+    known = stated_masses(masses, links)
+    report_stage(progress, "fitting", _STAGES)
+
+    def rescaled(gains: Mapping[str, float]) -> Recordings:
+        (runs,) = survey_logs(replace(job, gains={**job.gains, **gains}), model, entries)
+        return Recordings(model, mapping, runs)
+
+    found = fit_with_friction(
+        loaded, reference, job.friction, rescaled, links=links, masses=known, unknown_gains=unknown
+    )
+    return found.to_dict()
+
+
+def check_payloads(
+    job: Job, model: RobotModel, reference: Sequence[SurveyedLog]
+) -> tuple[PayloadCheck, ...]:
+    """Return the checks of the torque scale with the payloads that a job states."""
+    checks = []
+    for entry in job.payload_checks:
+        (logs,) = survey_logs(job, model, [LogEntry(entry.path, entry.start, entry.end)])
+        runs = [Recordings(model, structural_mapping(model), run) for run in (logs, reference)]
+        link = entry.link or model.layout.bodies[-1]
+        check = mass_checks(*runs, masses={link: entry.mass})[link]
+        checks.append(replace(check, log=str(entry.path), sha256=file_sha256(entry.path)))
+    return tuple(sorted(checks, key=_width))
+
+
+def _width(check: PayloadCheck) -> float:
+    """Return the relative width of the interval of an identified mass; inf without one."""
+    low, high = check.interval
+    return (high - low) / check.known if check.identified is not None else float("inf")
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
@@ -34,8 +130,6 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Run the command."""
-    from robotid.cli.work.payload import is_result, measure_payload
-
     if any(map(is_result, options.reference)):
         refuse_log_flags(options, "a RESULT states how its logs are read")
     with progress_of(options) as progress:
@@ -51,7 +145,6 @@ def run(options: argparse.Namespace) -> None:
 
 
 def _show(content: dict[str, Any]) -> None:
-    from robotid.identification.summary import cell
 
     checks = {check["link"]: check for check in content.get("mass_checks", ())}
     for found in content["payloads"]:

@@ -2,9 +2,17 @@
 
 import argparse
 import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
-from robotid.base.files import check_file
+import numpy as np
+
+from robotid.base.exceptions import DataError, SettingsError
+from robotid.base.files import check_file, read_json
+from robotid.base.findings import listed
+from robotid.base.typing import Array
 from robotid.cli.flags import (
     JOB,
     ONLINE,
@@ -13,9 +21,385 @@ from robotid.cli.flags import (
     job_from_flags,
     refuse_log_flags,
 )
-from robotid.cli.running import serve
+from robotid.cli.job import Job, LogEntry, written_job
+from robotid.cli.logs import log_of_commands
+from robotid.cli.track import serve
+from robotid.data.files.formats import open_table
+from robotid.data.log import Log
+from robotid.data.signal_settings import LogSource
+from robotid.design.clearance import Clearance
+from robotid.design.limits import LIMITS, Course, MotionLimits
+from robotid.dynamics.completed_logs import closed_log
+from robotid.dynamics.prediction import predict_instants
+from robotid.estimation.fitting.evaluation import predict
+from robotid.estimation.fitting.survey import hold_log
+from robotid.identification.result import TorqueIdentification
+from robotid.output.files.result_file import (
+    Result,
+    load_result,
+    stated_model,
+    stated_urdf_with_drives,
+)
+from robotid.output.files.shape import FILE, NUMBER, TABLE, TEXT, check_shape
+from robotid.output.report.pictures import shown_evaluation
+from robotid.output.viewer.replays import Bands, Mark, Replay, Torques, replay
+from robotid.output.viewer.unexplained import find_unexplained
+from robotid.robot.model import RobotModel
 
-SUMMARY = "play a log in the browser: robot, torques, identified parameters"
+#: Columns of the pose of a floating base in the world: position [m] and quaternion.
+_BASE = ("base_x", "base_y", "base_z", "base_qx", "base_qy", "base_qz", "base_qw")
+
+#: Label of the torque of the URDF's bodies with identified drives.
+_PROJECTED = "Torques: the part that contact forces cannot cause."
+_DRIVEN = "URDF + drives"
+
+#: The entries of a track.json that are read.
+_TRACK = {
+    "settings": TABLE,
+    "history": FILE,
+    "changes": [{"onset": NUMBER, "payload": {"mass": NUMBER, "std_error": NUMBER, "body": TEXT}}],
+    "base_parameters": [{"name": TEXT, "unit": TEXT}],
+}
+
+
+@dataclass(frozen=True)
+class Findings:
+    """Results of identifications and of a tracker, as read from their files."""
+
+    results: Mapping[str, Mapping[str, Any]]  # contents of result.json, by label
+    commanded: Mapping[str, Result] = field(default_factory=dict)  # results with gains of drives
+    track: Mapping[str, Any] | None = None  # content of a track.json
+    folder: Path = Path()  # of the track.json and its history
+    beside: Path = Path()  # folder of the first file
+
+    @property
+    def settings(self) -> Mapping[str, Any] | None:
+        """The settings of the first of them, None if there is none."""
+        found = [content for content in (*self.results.values(), self.track) if content]
+        return dict(found[0]["settings"]) if found else None
+
+
+def read_findings(paths: Sequence[str | Path]) -> Findings:
+    """Read results to show; the label of a result is the name of its folder."""
+    results: dict[str, Mapping[str, Any]] = {}
+    commanded: dict[str, Result] = {}
+    tracks: list[tuple[Path, Mapping[str, Any]]] = []
+    beside: list[Path] = []
+    for path in map(Path, paths):
+        files = [path]
+        if path.is_dir():
+            files = [path / name for name in ("result.json", "track.json")]
+            files = [file for file in files if file.is_file()]
+            if not files:
+                raise DataError(f"{str(path)!r} has no result.json and no track.json")
+        beside.append(files[0].parent)
+        for file in files:
+            track = _track(file)
+            if track is not None:
+                tracks.append((file.parent, track))
+                continue
+            name = file.resolve().parent.name if len(paths) > 1 else "identified"
+            label = name if name not in results else f"{name} {len(results) + 1}"
+            loaded = load_result(file)
+            results[label] = loaded.content
+            if loaded.commanded:
+                commanded[label] = loaded
+    if len(tracks) > 1:
+        raise DataError(f"{len(tracks)} tracks are given, wanted at most one")
+    folder, content = tracks[0] if tracks else (Path(), None)
+    return Findings(results, commanded, content, folder, (beside or [Path()])[0])
+
+
+def stated_job(findings: Findings, urdf: str | Path, log: str | Path) -> Job:
+    """Return the job of the shown results, with another URDF and log."""
+    settings = findings.settings
+    if settings is None:
+        raise SettingsError("no result is given, wanted one for its settings")
+    job = written_job(settings, "settings of the result")
+    return replace(job, urdf=Path(urdf), identification=(LogEntry(Path(log)),), validation=())
+
+
+def replay_files(job: Job, findings: Findings, *, ghost: str | Path | None = None) -> Replay:
+    """Return the replay of a log, a page to write."""
+    model = job.model()
+    (entry,) = job.identification
+    if findings.commanded:
+        return _replay_commanded(job, findings.commanded, ghost)
+    is_motion = not job.lay_out(entry, model, needs="motion")[0].has_torque
+    motion = closed_log(model, job.read(entry, model, needs="motion" if is_motion else "torque"))
+    robots = {label: stated_model(r, model) for label, r in findings.results.items()}
+    bodies = {label: robot.carried_by for label, robot in robots.items()}
+    ghosts = {}
+    if ghost is not None:
+        shadow = closed_log(model, job.read(LogEntry(Path(ghost)), model, needs="motion"))
+        ghosts[Path(ghost).name] = (shadow.t, shadow.q)
+    torques, marks, notes = None, _payloads(findings.track), [f"Motion: {entry.path.name}."]
+    if is_motion:
+        if not model.free_flyer:  # else the forces of the ground are part of the torques
+            used, further = _limits_used(job, motion, model)
+            marks, notes = [*marks, *used], [*notes, *further]
+    else:
+        torques = _torques(job, motion, model, robots, findings.results)
+        torques = replace(torques, noise=_noise(findings, model))
+        marks += _contacts(torques, model)
+        notes += [_PROJECTED] if model.constraints else []
+    n = model.layout.n_inertial  # drives of the result may have further terms
+    masses = {"URDF": model.standard_parameters(), **bodies} if bodies else {}
+    masses = {label: pi[:n] for label, pi in masses.items()}
+    shown, q = model, motion.q
+    if motion.base is not None:
+        q = np.hstack([motion.base.pose, q])
+    base = None if ghosts or model.free_flyer else _base_poses(job, entry, motion)
+    if base is not None:  # the same robot with the trunk as first body
+        shown, q = _floating(job, model), np.hstack([base, q])
+        trunk = shown.standard_parameters()[:10]
+        masses = {label: np.r_[trunk, pi] for label, pi in masses.items()}
+    return replay(
+        shown,
+        motion.t,
+        q,
+        torques=torques,
+        masses=masses or None,
+        ghosts=ghosts,
+        bands=None if findings.track is None else _bands(findings.track, findings.folder),
+        marks=marks,
+        notes=notes,
+        log=entry.path.name,
+    )
+
+
+def replay_identified(identification: TorqueIdentification) -> Replay:
+    """Return the replay of an identification: its first validation log, or its first fitted one."""
+    shown, model = shown_evaluation(identification), identification.model
+    motion, mask = shown.recording.trajectory, shown.recording.mask
+    wanted = {"identified": "estimate", _DRIVEN: "urdf_with_drives"}
+    if not model.layout.drive_names:
+        del wanted[_DRIVEN]
+    predicted = {label: _of_moving(shown.torques[key], mask) for label, key in wanted.items()}
+    predicted["URDF"] = shown.torques["urdf"]
+    sigma = identification.estimate.sigma[model.n_rows - len(model.joints) :]
+    torques = _of_joints(Torques(motion.t, motion.tau, predicted, sigma), model)
+    return replay(
+        model,
+        motion.t,
+        motion.q,
+        torques=torques,
+        masses={"URDF": identification.prior, "identified": identification.standard},
+        marks=_contacts(torques, model),
+        notes=[f"Motion: {shown.recording.name}.", *([_PROJECTED] if model.constraints else [])],
+        log=Path(shown.recording.log.path).name,
+    )
+
+
+def _replay_commanded(job: Job, results: Mapping[str, Result], ghost: str | Path | None) -> Replay:
+    """Return the replay of a log of commands: measured, commanded and simulated robot.
+
+    Poses are those of the URDF's joints, whose zero may differ from that of the encoders.
+    """
+    (entry,) = job.identification
+    first = next(iter(results.values()))
+    model, zero = first.robot, np.array([drive.zero for drive in first.commanded])
+    log = log_of_commands(job, entry, first)
+    q_ref = np.asarray(log.q_ref)
+    simulated = {label: result.follow_commands(log) for label, result in results.items()}
+    names = ["simulated"] if len(simulated) == 1 else [f"simulated: {x}" for x in simulated]
+    shown = dict(zip(names, simulated.values(), strict=True)) | {"commanded": q_ref}
+    ghosts = {label: _finite_rows(log.t, q + zero) for label, q in shown.items()}
+    if ghost is not None:
+        other = job.read(LogEntry(Path(ghost)), model, needs="motion")
+        ghosts[Path(ghost).name] = (other.t, other.q + zero)
+    error = np.sqrt(np.mean((q_ref - log.q) ** 2, axis=0))
+    left = np.sqrt(np.nanmean((shown[names[0]] - log.q) ** 2, axis=0))
+    worst = [f"{model.joints[j]} {1e3 * left[j]:.2g}" for j in np.argsort(-left).tolist()]
+    return replay(
+        model,
+        log.t,
+        log.q + zero,
+        torques=Torques(log.t, log.q, shown, error, "position"),
+        ghosts=ghosts,
+        notes=[
+            f"Motion: {entry.path.name}, as measured; ghosts: command and simulation.",
+            f"Simulated position error, RMS [mrad or mm]: {listed(worst, 3)}.",
+        ],
+        log=entry.path.name,
+    )
+
+
+def _finite_rows(t: Array, q: Array) -> tuple[Array, Array]:
+    """Return the rows without NaN."""
+    rows = np.isfinite(q).all(axis=1)
+    return t[rows], q[rows]
+
+
+def _floating(job: Job, model: RobotModel) -> RobotModel:
+    """Return a job's robot with a floating base."""
+    return RobotModel.from_urdf(
+        job.urdf,
+        joints=model.joints,
+        locked=job.locked,
+        free_flyer=True,
+        mimic=job.mimic,
+        snap_angles=job.snap_angles,
+    )
+
+
+def _base_poses(job: Job, entry: LogEntry, log: Log) -> Array | None:
+    """Return the poses of a floating base, (N, 7) as x y z qx qy qz qw; None without columns."""
+    table = open_table(entry.path, job.source)
+    time = [name for name in ("time", "t") if name in table.names]
+    if not time or not {*_BASE} <= {*table.names}:
+        return None
+    columns = table.read([time[0], *_BASE])
+    pose = np.column_stack([columns[name] for name in _BASE])
+    known = np.isfinite(pose).all(axis=1)
+    length = np.linalg.norm(pose[:, 3:], axis=1)
+    if not known.any() or np.abs(length[known] - 1.0).max() > 0.01:
+        raise DataError(
+            f"{entry.path.name}: {_BASE[3]} to {_BASE[6]} is not a unit quaternion, wanted a norm "
+            "of 1; remove these columns for a fixed base"
+        )
+    pose = pose[known]
+    flips = (pose[1:, 3:] * pose[:-1, 3:]).sum(axis=1) < 0  # q and -q are the same rotation
+    pose[1:, 3:] *= np.where(np.cumsum(flips) % 2, -1.0, 1.0)[:, None]
+    t = columns[time[0]][known]
+    at = np.column_stack([np.interp(log.t, t, column) for column in pose.T])
+    at[:, 3:] /= np.linalg.norm(at[:, 3:], axis=1, keepdims=True)
+    return at
+
+
+def _noise(findings: Findings, model: RobotModel) -> Array | None:
+    """Return the RMS residual of each joint on the fitted logs of the first result."""
+    for result in findings.results.values():
+        fitted = result["identification"]["per_joint"]
+        if all(fitted.get(joint, {}).get("rmse") for joint in model.joints):
+            return np.array([fitted[joint]["rmse"] for joint in model.joints])
+        break
+    return None
+
+
+def _track(path: Path) -> Mapping[str, Any] | None:
+    """Return the content of a track.json; None for another file."""
+    content = read_json(path, "result")
+    if not (isinstance(content, dict) and {"history", "changes"} <= set(content)):
+        return None
+    check_shape(content, _TRACK, path.name)
+    return content
+
+
+def _torques(
+    job: Job,
+    log: Log,
+    model: RobotModel,
+    robots: Mapping[str, RobotModel],
+    results: Mapping[str, Mapping[str, Any]],
+) -> Torques:
+    """Return measured torques, and those predicted by each result and by the URDF.
+
+    "URDF + drives" has the bodies of the URDF, and the drives that the first result fits to them.
+    """
+    shown: dict[str, Array] = {}
+    driven: dict[str, Array] = {}
+    motion = None
+    for label, robot in robots.items():
+        rows = hold_log(robot, log, job.signals).whole
+        motion = rows.trajectory
+        is_driven = not driven and robot.layout.drive_names
+        beside = stated_urdf_with_drives(results[label], robot) if is_driven else None
+        own = [robot.carried_by] if beside is None else [robot.carried_by, beside]
+        predicted = [_of_moving(torque, rows.mask) for torque in predict(robot, own, motion)]
+        shown[label] = predicted[0]
+        driven |= dict(zip([_DRIVEN], predicted[1:], strict=False))
+    if motion is None:
+        return Torques(log.t, log.tau)
+    alone = {"URDF": predict(model, [model.standard_parameters()], motion)[0]}
+    return _of_joints(Torques(motion.t, motion.tau, shown | driven | alone), model)
+
+
+def _of_joints(torques: Torques, model: RobotModel) -> Torques:
+    """Return torques without the rows of a floating base."""
+    first = model.n_rows - len(model.joints)
+    predicted = {label: torque[:, first:] for label, torque in torques.predicted.items()}
+    return replace(torques, measured=torques.measured[:, first:], predicted=predicted)
+
+
+def _of_moving(torque: Array, mask: Array) -> Array:
+    """Return a prediction without the rows of joints at rest: friction has no sign there."""
+    return np.where(mask, torque, np.nan)
+
+
+def _bands(track: Mapping[str, Any], folder: Path) -> Bands:
+    table = open_table(folder / track["history"], LogSource())
+    entries = track["base_parameters"]
+    names = [entry["name"] for entry in entries]
+    errors = [f"{name}.std_error" for name in names]
+    wanted = ["time", *names, *errors]
+    missing = [name for name in wanted if name not in table.names]
+    if missing:
+        raise DataError(f"{track['history']} has no column {missing[0]!r}; run robotid track again")
+    columns = table.read(wanted)
+    return Bands(
+        t=columns["time"],
+        names=names,
+        units=[entry["unit"] for entry in entries],
+        theta=np.column_stack([columns[name] for name in names]),
+        std_error=np.column_stack([columns[name] for name in errors]),
+    )
+
+
+def _payloads(track: Mapping[str, Any] | None) -> list[Mark]:
+    marks = []
+    for change in [] if track is None else track["changes"]:
+        load = change["payload"]
+        label = f"payload {load['mass']:.2f} ± {load['std_error']:.2f} kg on {load['body']}"
+        marks.append(Mark(change["onset"], label, "payload"))
+    return marks
+
+
+def _limits_used(job: Job, motion: Log, model: RobotModel) -> tuple[list[Mark], list[str]]:
+    """Return marks at the smallest margin to each limit and at the smallest distance, and notes.
+
+    The notes state what cannot be marked and why: the URDF may lack limits or shapes.
+    """
+    v = np.gradient(motion.q, motion.t, axis=0) if motion.v is None else motion.v
+    a = np.gradient(v, motion.t, axis=0) if motion.a is None else motion.a
+    torque = predict_instants(model, model.standard_parameters(), motion.q, v, a)
+    marks, notes = [], ["The motion has no torques. Marks: largest use of each limit of the URDF."]
+    try:
+        limits = MotionLimits.of_model(model, share=1.0)
+    except SettingsError as error:
+        return [], [f"The motion has no torques. Limits are not marked: {error}."]
+    course = Course.of_motion(motion.t, (motion.q, v, a, torque), limits)
+    for kind, used in zip(LIMITS, course.largest, strict=True):
+        joint = int(np.argmax(used))
+        if used[joint] > 0:
+            name = model.joints[joint]
+            label = f"{name} at {100 * used[joint]:.0f} % of its {kind} limit"
+            marks.append(Mark(course.peak(kind, joint), label, "note", name))
+    try:
+        course = replace(course, clearance=Clearance(model))
+    except DataError as error:
+        return marks, [*notes, f"Collisions are not checked: {error}."]
+    if course.nearest is not None:
+        near = course.nearest
+        gap = f"smallest distance {1e3 * near.distance:.0f} mm"
+        text = gap if near.distance > 0 else "convex hulls overlap"
+        marks.append(Mark(near.time, f"{near.first} and {near.second}: {text}"))
+    return marks, notes
+
+
+def _contacts(torques: Torques, model: RobotModel) -> list[Mark]:
+    """Return marks at large torque residuals of the first result."""
+    if not torques.predicted or model.constraints:
+        return []
+    predicted = next(iter(torques.predicted.values()))
+    units = dict(zip(model.row_names, model.row_units, strict=True))
+    marks = []
+    for found in find_unexplained(torques.t, torques.measured, predicted, model.joints):
+        size = f"mean {found.residual:.2g} {units[found.joint]}"
+        label = f"unexplained torque, largest at {found.joint} ({size}, for "
+        label += f"{found.end - found.start:.1f} s): contact or load?"
+        marks.append(Mark(found.start, label, "contact", found.joint))
+    return marks
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
@@ -33,8 +417,6 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Run the command."""
-    from robotid.cli.work.replay import read_findings, replay_files, stated_job
-
     findings = read_findings(options.results)
     if findings.settings is None:
         job = job_from_flags(options)

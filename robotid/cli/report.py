@@ -1,12 +1,128 @@
 """robotid report: write the report of a result again from its inputs."""
 
 import argparse
+from collections.abc import Mapping, Sequence
+from itertools import chain
+from pathlib import Path
 from typing import Any
 
+from robotid.base.exceptions import DataError
+from robotid.base.files import check_file, file_sha256, log_exists
+from robotid.base.findings import listed
+from robotid.base.typing import ProgressCallback, report_stage
+from robotid.base.versions import versions
+from robotid.cli.console import progress_of, show_found
 from robotid.cli.flags import add_json, add_progress, add_verbose
-from robotid.cli.running import progress_of, show_found
+from robotid.cli.identify import identify_job
+from robotid.cli.job import Job, written_job
+from robotid.estimation.workers.plan import WorkPlan
+from robotid.identification.result import Identification
+from robotid.output.files.result_file import load_result
+from robotid.output.report.document import write_report
+from robotid.output.report.steps import Origin
 
-SUMMARY = "write the report of a result again from its inputs"
+_SHARE = 1e-6  # permitted difference over a base parameter, for rounding ...
+_PART = 0.01  # ... or over its standard error, for the tolerance of solvers
+
+
+def rewrite_report(
+    path: str | Path, target: str | Path | None = None, *, progress: ProgressCallback | None = None
+) -> dict[str, Any]:
+    """Write the report of a result again, in the form of this version of robotid.
+
+    The fit is repeated with the inputs and settings of the result.
+    """
+    loaded = load_result(path)
+    content, folder = loaded.content, loaded.path.parent
+    goal = folder / "report.html" if target is None else Path(target)
+    check_file(goal, loaded.files)
+    report_stage(progress, "reading logs")
+    job = written_job(content["settings"], loaded.path.name)
+    _check_inputs(job, content, loaded.path.name)
+    found = identify_job(job, job.model(), WorkPlan(job.workers or 1, progress=progress))
+    _require_same(found, content, loaded.path.name)
+    report_stage(progress, "writing")
+    beside = {"result": loaded.path.name, **content["outputs"], "replay": "replay.html"}
+    files = {
+        what: name
+        for what, name in beside.items()
+        if what != "report" and goal.resolve().with_name(name) == (folder / name).resolve()
+        if (folder / name).is_file()
+    }
+    is_beside = goal.resolve().parent == folder.resolve()
+    origin = Origin((), str(folder), "replay.html" if is_beside else "")
+    write_report(found, goal, files=files, origin=origin)
+    return {"result": str(loaded.path), "report": str(goal)}
+
+
+def _check_inputs(job: Job, content: Mapping[str, Any], name: str) -> None:
+    """Refuse inputs that differ from those of the result."""
+    inputs = {
+        role: [entry for entry in content["inputs"] if entry["role"] == role]
+        for role in ("urdf", "identification", "validation")
+    }
+    if not all(entry["path"] for entries in inputs.values() for entry in entries):
+        raise DataError(
+            f"{name} has a log in memory as input, which no longer exists; write the report in "
+            "Python, robotid.write_report(found, ...)"
+        )
+    logs = [entry.path for entry in (*job.identification, *job.validation)]
+    _check_counts(inputs, job, name)
+    for path, entry in zip([job.urdf, *logs], chain(*inputs.values()), strict=True):
+        what, wanted = "URDF" if entry["role"] == "urdf" else "log", entry["sha256"]
+        if not log_exists(path):
+            raise DataError(
+                f"the {what} {str(path)!r}, an input of {name}, does not exist; restore it, or "
+                "identify again"
+            )
+        if not wanted:
+            raise DataError(
+                f"{name} states no SHA-256 of its input, the {what} {str(path)!r}; changes of the "
+                "file cannot be detected. Identify again"
+            )
+        if (found := file_sha256(path)) != wanted:
+            raise DataError(
+                f"the {what} {str(path)!r} has changed since {name} was written: its SHA-256 "
+                f"starts with {found[:12]}, wanted {wanted[:12]}; restore the file, or identify "
+                "again"
+            )
+
+
+def _check_counts(inputs: Mapping[str, Sequence[Any]], job: Job, name: str) -> None:
+    """Refuse a result with another number of inputs than its settings state."""
+    stated = {"urdf": [job.urdf], "identification": job.identification}
+    for role, entries in (stated | {"validation": job.validation}).items():
+        if len(inputs[role]) != len(entries):
+            raise DataError(
+                f"{name} has {len(inputs[role])} inputs of the role {role!r}, but its settings "
+                f"name {len(entries)}: the file was edited. Identify again"
+            )
+
+
+def _require_same(found: Identification, content: Mapping[str, Any], name: str) -> None:
+    """Refuse a fit whose base parameters differ from those of the result."""
+    stated = {entry["name"]: entry for entry in content["base_parameters"]}
+    fitted = dict(zip(found.mapping.base_names, found.base.tolist(), strict=True))
+    if lacking := sorted(stated.keys() ^ fitted.keys()):
+        text = f"only one of the two has the parameters {listed(lacking, 5)}"
+    else:
+        pairs = [(stated[key], value) for key, value in fitted.items()]
+        other = [
+            f"{entry['name']} is {value:.6g}, {entry['value']:.6g} before"
+            for entry, value in pairs
+            if abs(value - entry["value"])
+            > max(_SHARE * abs(entry["value"]), _PART * (entry["std_error"] or 0.0))
+        ]
+        if not other:
+            return
+        text = f"{len(other)} of {len(pairs)} base parameters differ: {listed(other, 3)}"
+    now = {"robotid": content["robotid"], **content.get("versions", {})}
+    changed = [f"{k} {now[k]} -> {v}" for k, v in versions().items() if now.get(k, v) != v]
+    why = f"; changed versions: {listed(changed)}" if changed else ""
+    raise DataError(
+        f"the repeated fit differs from {name}: {text}{why}. No report is written; identify again "
+        "to get result and report of one fit"
+    )
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
@@ -21,11 +137,8 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Run the command."""
-    from robotid.base.typing import report_stage
-
     with progress_of(options) as progress:
         report_stage(progress, "reading logs")
-        from robotid.cli.work.report import rewrite_report
 
         written = rewrite_report(options.result, options.out, progress=progress)
     show_found(written, options, _show)

@@ -1,37 +1,195 @@
 """robotid simulate: simulate a log of a motion with a robot of known parameters."""
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
 
 from robotid.base.exceptions import SettingsError
+from robotid.base.files import check_file, file_sha256, write_json
 from robotid.base.findings import listed
-from robotid.base.settings import Settings
-from robotid.cli.console import terminal_progress
+from robotid.base.typing import Array, ProgressCallback, ignore_progress
+from robotid.base.versions import __version__
+from robotid.cli.console import echo, print_files, progress_of, show_found
 from robotid.cli.flags import JOB, ROBOT, Flags, add_json
-from robotid.cli.printing import echo, print_files
-from robotid.cli.running import show_found
+from robotid.cli.job import Job, LogEntry, as_job, job_from_settings, read_job
+from robotid.data.files.formats import check_suffix
+from robotid.data.files.read import write_log
+from robotid.data.log import Log
+from robotid.data.signal_settings import SignalSettings
+from robotid.data.signals import process
+from robotid.dynamics.base_parameters import structural_mapping
+from robotid.dynamics.simulation.motions import FloatingMotion, SampledMotion
+from robotid.dynamics.simulation.sensors import Run, measure
+from robotid.dynamics.simulation.simulation_settings import Simulation, read_simulation
+from robotid.dynamics.simulation.simulator import carried, delay, follow
+from robotid.dynamics.simulation.truth import draw_parameters
+from robotid.output.files.urdf import write_urdf
+from robotid.robot.model import RobotModel
 
-if TYPE_CHECKING:
-    from robotid.cli.work.job import Job
-    from robotid.dynamics.simulation.simulation_settings import Simulation
+_SCHEMA_VERSION = 1
 
 
-SUMMARY = "simulate a log of a motion with a robot of known parameters"
+def simulate(
+    robot: Job | str | Path,
+    motion: str | Path,
+    log: str | Path,
+    settings: Simulation | None = None,
+    *,
+    urdf: str | Path | None = None,
+    cutoff: float | None = None,
+    progress: ProgressCallback | None = None,
+) -> dict[str, Any]:
+    """Simulate a robot that follows a motion; write its log and its true parameters.
+
+    Args:
+        robot: A URDF, all of whose joints move, or a job file.
+        motion: The motion to follow: a table of time and positions.
+        log: The log to write; the true parameters are in ``<log stem>.truth.json``.
+        settings: Differences from the URDF, controller, actuators and sensors; none if None.
+        urdf: File for the URDF of the true robot; none if None.
+        cutoff: Cutoff frequency of the low-pass filter of a recorded motion [Hz]; None: no filter.
+        progress: Called with the simulated seconds.
+
+    Returns:
+        The content of the file of the true parameters.
+
+    Raises:
+        DataError: If the motion or a file to write is not usable.
+        ModelError: If the URDF is not usable.
+        SettingsError: If a setting does not fit the robot or the motion.
+    """
+    settings, job, target = settings or Simulation(), as_job(robot), Path(log)
+    truth = target.with_name(f"{target.stem}.truth.json")
+    for path in (log, truth, urdf):
+        if path is not None:
+            check_file(Path(path), [motion, job.urdf])
+    check_suffix(target)
+    model = job.model()
+    course = _motion(job, model, Path(motion), cutoff)
+    duration = course.duration if settings.duration is None else settings.duration
+    if duration > course.duration + 1e-9:
+        raise SettingsError(
+            f"duration is {duration:g} s, wanted at most the {course.duration:g} s of the motion; "
+            "reduce it, or give a longer motion"
+        )
+    rng = np.random.default_rng(settings.seed)
+    pi = draw_parameters(model, settings.truth, rng)
+    run = follow(
+        model, pi, course, rate=settings.rate, duration=duration, settings=settings,
+        progress=progress or ignore_progress,
+    )  # fmt: skip
+    measured = measure(run, settings.sensors, model.joints, rng, delay=delay(model, pi, settings))
+    content = _truth(model, pi, settings, run, measured) | {
+        "urdf": str(job.urdf),
+        "motion": {"path": str(motion), "sha256": file_sha256(motion)},
+        "outputs": [str(path) for path in (log, truth, urdf) if path],
+    }
+    if urdf:  # an impossible URDF is refused before any file is written
+        with TemporaryDirectory(prefix="robotid-") as folder:
+            write_urdf(model, pi, Path(folder, Path(urdf).name), dynamics=True)
+    write_log(measured, target)
+    if urdf:
+        write_urdf(model, pi, urdf, dynamics=True)
+    write_json(content | {"log_sha256": file_sha256(target)}, truth)
+    return content
+
+
+def _motion(
+    job: Job, model: RobotModel, path: Path, cutoff: float | None
+) -> SampledMotion | FloatingMotion:
+    table = job.read(LogEntry(path), model, needs="motion")
+    smooth = None
+    if cutoff is not None:
+        smooth = process(table, SignalSettings(cutoff=cutoff, velocity="differentiated", trim=0.0))
+    if table.base is None:
+        course = smooth or table
+        return SampledMotion(course.t, course.q, course.v, course.a)
+    flags = [
+        np.ones(len(table.t), dtype=bool) if x.always else table.contacts[x.frame]
+        for x in model.contacts
+    ]
+    touching = np.reshape(flags, (len(flags), len(table.t))).T
+    if smooth is None:
+        return FloatingMotion(table.t, table.base.pose, table.q, touching)
+    rows = np.clip(np.searchsorted(table.t, smooth.t), 0, len(table.t) - 1)
+    return FloatingMotion(smooth.t, smooth.q[:, :7], smooth.q[:, 7:], touching[rows])
+
+
+def _truth(
+    model: RobotModel, pi: Array, settings: Simulation, run: Run, log: Log
+) -> dict[str, Any]:
+    """Return the true parameters and settings of the log, and the tracking errors."""
+    layout, size = model.layout, model.layout.n_inertial
+    urdf = model.standard_parameters()
+    mapping = structural_mapping(model)
+    units = [layout.units[i] for i in mapping.independent]
+
+    def base(parameters: Array) -> list[dict[str, Any]]:
+        entries = _entries(mapping.base_names, units, mapping.to_base(parameters))
+        words = zip(entries, mapping.expressions, strict=True)
+        return [entry | {"expression": expression} for entry, expression in words]
+
+    loaded = carried(model, pi, settings.payload)
+    standard = _entries(layout.names, layout.units, pi)
+    for entry, value in zip(standard[:size], urdf.tolist(), strict=False):
+        entry["urdf"] = value
+    error = run.q - run.reference
+    content: dict[str, Any] = {
+        "schema_version": _SCHEMA_VERSION,
+        "robotid": __version__,
+        "robot": model.name,
+        "joints": list(model.joints),
+        "settings": settings.to_dict(),
+        "model": model.options,
+        "samples": len(log.t),
+        "duration": float(run.t[-1]),
+        "standard_parameters": standard[:size],
+        "drive_parameters": standard[size:],
+        "base_parameters": base(pi),
+        "following": [
+            {
+                "joint": joint,
+                "rms": rms,
+                "largest": largest,
+                "range": moved,
+                "commanded": commanded,
+                "unit": unit,
+                "at_limit": share,
+            }
+            for joint, rms, largest, moved, commanded, unit, share in zip(
+                model.joints,
+                np.sqrt(np.mean(error**2, axis=0)).tolist(),
+                np.abs(error).max(axis=0).tolist(),
+                np.ptp(run.q, axis=0).tolist(),
+                np.ptp(run.reference, axis=0).tolist(),
+                ["m" if joint in layout.prismatic else "rad" for joint in model.joints],
+                run.saturated.tolist(),
+                strict=True,
+            )
+        ],
+    }
+    if settings.payload.mass > 0:
+        content["base_parameters_with_payload"] = base(loaded)
+    return content
+
+
+def _entries(names: Sequence[str], units: Sequence[str], values: Array) -> list[dict[str, Any]]:
+    return [
+        {"name": name, "value": value, "unit": unit}
+        for name, unit, value in zip(names, units, values.tolist(), strict=True)
+    ]
 
 
 _HALF = 0.5  # of the commanded range: a joint that moves less does not follow
 
 
-def _simulation() -> Settings:
-    from robotid.dynamics.simulation.simulation_settings import Simulation
-
-    return Simulation()
-
-
 #: Flags of the keys of a plant's file.
 _PLANT = Flags(
-    _simulation,
+    Simulation(),
     {
         "--seed": ("seed", "N"),
         "--rate": ("rate", "HZ"),
@@ -64,13 +222,12 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Run the command."""
-    from robotid.cli.work.simulate import SimulatedFiles, simulate_log
-
     job, settings = simulation_from_flags(options)
-    urdf = Path(options.urdf) if options.urdf else None
-    files = SimulatedFiles(Path(options.motion), Path(options.out), urdf, options.cutoff)
-    with terminal_progress(quiet=options.json) as progress:
-        content = simulate_log(job, files, settings, progress=progress)
+    with progress_of(options) as progress:
+        content = simulate(
+            job, options.motion, options.out, settings,
+            urdf=options.urdf, cutoff=options.cutoff, progress=progress,
+        )  # fmt: skip
     show_found(content, options, _show)
     if not options.json:
         print_files("", content["outputs"])
@@ -78,9 +235,6 @@ def run(options: argparse.Namespace) -> None:
 
 def simulation_from_flags(options: argparse.Namespace) -> "tuple[Job, Simulation]":
     """Return the robot and the settings of a simulation."""
-    from robotid.cli.work.job import job_from_settings, read_job
-    from robotid.dynamics.simulation.simulation_settings import read_simulation
-
     settings, drives = read_simulation(options.plant, _PLANT.stated(options))
     for joint, entries in drives.items():
         if named := [entry for entry in entries if isinstance(entry, str)]:

@@ -2,9 +2,19 @@
 
 import argparse
 import sys
+import time
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from robotid.base.exceptions import MissingDependencyError, SettingsError
+from robotid.base.files import check_folder, file_sha256, folder_beside, write_json
 from robotid.base.text import columns, in_digits_of
+from robotid.base.versions import __version__
+from robotid.cli.console import Terminated, echo, show_found
 from robotid.cli.flags import (
     JOB,
     ONLINE,
@@ -15,10 +25,203 @@ from robotid.cli.flags import (
     add_verbose,
     job_from_flags,
 )
-from robotid.cli.printing import echo
-from robotid.cli.running import serve, show_found
+from robotid.cli.job import Job
+from robotid.data.files.formats import write_columns
+from robotid.data.files.parquet_files import load_pyarrow
+from robotid.data.log import Log
+from robotid.dynamics.base_parameters import structural_mapping
+from robotid.identification.online.identifier import Observer, OnlineIdentifier, Track, track
+from robotid.identification.online.online_settings import OnlineSettings
+from robotid.output.viewer.replays import gap_marks, live_page
+from robotid.output.viewer.scene import coordinates
+from robotid.output.viewer.server import LivePage
+from robotid.robot.model import RobotModel
 
-SUMMARY = "run the online estimator over a log: history, step changes"
+_SCHEMA = 1
+_RATE = 25.0  # [Hz] messages per second of the log
+_SLOWEST = 1e-3  # [-] smallest speed, relative to real time
+
+
+def run_track(
+    job: Job, folder: str | Path | None, *, observer: Observer | None = None
+) -> dict[str, Any]:
+    """Track the one log of a job, write the history and track.json, and return its content."""
+    model, history = job.model(), _history_name()
+    if folder is not None:
+        inputs = [job.urdf, *(entry.path for entry in job.identification)]
+        check_folder(Path(folder), [history, "track.json"], inputs)
+    if len(job.identification) != 1:
+        raise SettingsError(f"{len(job.identification)} logs are given, wanted one to track")
+    log = job.read(job.identification[0], model)
+    if job.signals.cutoff is None:
+        raise SettingsError(
+            "the cutoff is disabled, but the online estimator differentiates positions; state a "
+            "cutoff in Hz"
+        )
+    step = float(np.median(np.diff(log.t)))
+    settings = OnlineSettings(
+        rate=job.signals.rate or 1.0 / step,
+        cutoff=job.signals.cutoff,
+        min_velocity=job.signals.min_velocity,
+    )
+    found = track(model, log, settings, observer=observer)
+    content = _summary(found, job, log, history)
+    if folder is not None:
+        target = Path(folder)
+        target.mkdir(parents=True, exist_ok=True)
+        with folder_beside(target) as partial:
+            write_columns(found.columns(), partial / history)
+            write_json(content, partial / "track.json")
+    return content
+
+
+def _history_name() -> str:
+    try:
+        load_pyarrow("writing Parquet")
+    except MissingDependencyError:
+        return "track.csv"
+    return "track.parquet"
+
+
+def _summary(found: Track, job: Job, log: Log, history: str) -> dict[str, Any]:
+    identifier = found.identifier
+    model, mapping = identifier.model, identifier.mapping
+    converged = np.flatnonzero(found.converged)
+    last = identifier.reading
+    columns = {
+        "name": mapping.base_names,
+        "expression": mapping.expressions,
+        "value": last.theta.tolist(),
+        "std_error": last.std_error.tolist(),
+        "unit": [model.layout.units[i] for i in mapping.independent],
+    }
+    return {
+        "schema_version": _SCHEMA,
+        "robotid": __version__,
+        "robot": model.name,
+        "joints": list(model.joints),
+        "settings": job.to_dict(),
+        "inputs": [
+            {"role": "urdf", "path": str(job.urdf), "sha256": file_sha256(job.urdf)},
+            {"role": "log", "path": log.path, "sha256": file_sha256(log.path)},
+        ],
+        "samples": len(log.t),
+        "delay": identifier.delay,
+        "first_estimate": float(found.t[0]),
+        "converged_at": float(found.t[converged[0]]) if len(converged) else None,
+        "excitation": last.excitation,
+        "sigma": dict(zip(model.row_names, last.sigma.tolist(), strict=True)),
+        "base_parameters": [
+            dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)
+        ],
+        "changes": [_change(identifier, index) for index in range(len(identifier.changes))],
+        "history": history,
+    }
+
+
+def _change(identifier: OnlineIdentifier, index: int) -> dict[str, Any]:
+    """Return a change with its equivalent payload, estimated up to the end of the log."""
+    change, load = identifier.changes[index], identifier.payload(index)
+    return {
+        "flagged": change.flagged,
+        "onset": change.onset,
+        "payload": {
+            "body": identifier.model.layout.bodies[-1],
+            "mass": load.mass,
+            "std_error": load.mass_std_error,
+        },
+    }
+
+
+def serve(
+    job: Job,
+    folder: str | None,
+    options: argparse.Namespace,
+    finished: Callable[[dict[str, Any]], None],
+) -> None:
+    """Show a log in the browser while the estimator runs over it, until it is interrupted."""
+
+    def announce(url: str) -> None:
+        print(f"live: {url}  (stop with Ctrl-C)", file=sys.stderr, flush=True)
+
+    try:
+        serve_track(job, folder, port=options.serve, speed=options.speed, announce=announce,
+                    finished=finished)  # fmt: skip
+    except Terminated:
+        raise
+    except KeyboardInterrupt:
+        print("\nstopped", file=sys.stderr)
+
+
+def serve_track(
+    job: Job,
+    folder: str | None,
+    *,
+    port: int = 0,
+    speed: float = 1.0,
+    announce: Callable[[str], None],
+    finished: Callable[[dict[str, Any]], None] | None = None,
+    linger: bool = True,
+) -> dict[str, Any]:
+    """Track the one log of a job, show it in a live page, and return as ``run_track``."""
+    if not (speed == 0 or speed >= _SLOWEST):
+        raise SettingsError(f"speed is {speed}, wanted 0, or {_SLOWEST} or more")
+    if not 0 <= port < 2**16:
+        raise SettingsError(f"port is {port}, wanted 1 to 65535, or 0 for any free port")
+    model = job.model()
+    log = job.read(job.identification[0], model)
+    mapping = structural_mapping(model)
+    units = [model.layout.units[i] for i in mapping.independent]
+    html = live_page(model, mapping.base_names, units, log.q, model.standard_parameters())
+    with LivePage(html, port) as live:
+        announce(live.url)
+        content = run_track(job, folder, observer=_LiveFeed(live, model, log, speed))
+        live.finish()
+        if finished is not None:
+            finished(content)
+        while linger:
+            time.sleep(3600.0)
+    return content
+
+
+class _LiveFeed:
+    """Sends the estimates of a tracker to a live page, no faster than the time of the log."""
+
+    def __init__(self, live: LivePage, model: RobotModel, log: Log, speed: float) -> None:
+        self._live, self._model, self._log, self._speed = live, model, log, speed
+        self._due, self._marks = -np.inf, 0
+        self._gaps = gap_marks(log.t)  # those that are not sent yet
+        self._started = time.monotonic()
+
+    def __call__(self, k: int, identifier: OnlineIdentifier) -> None:
+        t, start = float(self._log.t[k]), float(self._log.t[0])
+        if t < self._due and k < len(self._log.t) - 1:  # the page ends at the last pose
+            return
+        self._due = t + 1.0 / _RATE
+        while self._gaps and self._gaps[0].t < t:
+            self._live.send({"mark": asdict(self._gaps.pop(0))})
+        if self._speed > 0:
+            ahead = (t - start) / self._speed - (time.monotonic() - self._started)
+            time.sleep(max(ahead, 0.0))
+        message = {
+            "t": t,
+            "q": coordinates(self._model, self._log.q[k : k + 1])[0].tolist(),
+        }
+        if identifier.is_ready:
+            reading, (tau, predicted) = identifier.reading, identifier.compared
+            message |= {
+                "at": reading.t,
+                "tau": tau.tolist(),
+                "predicted": [x if np.isfinite(x) else None for x in predicted.tolist()],
+                "theta": reading.theta.tolist(),
+                "std_error": reading.std_error.tolist(),
+            }
+        self._live.send(message)
+        for change in identifier.changes[self._marks :]:
+            label = f"step change, detected at {change.flagged:.2f} s"
+            mark = {"t": change.onset, "label": label, "kind": "payload"}
+            self._live.send({"mark": mark})
+        self._marks = len(identifier.changes)
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
@@ -33,8 +236,6 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Run the command."""
-    from robotid.cli.work.track import run_track
-
     job = job_from_flags(options)
 
     def finished(found: dict[str, Any]) -> None:

@@ -4,8 +4,9 @@ Files are read and written by `robotid.data.files.read`.
 """
 
 import difflib
+import tempfile
 from collections import Counter
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -40,6 +41,7 @@ _BY_SAMPLE = (
     "wrenches", "switching", "basis", "loaded",
 )  # fmt: skip
 _LARGEST = 1e30  # in any unit, so that squares and products are finite
+_BLOCK = 2**17  # stamps processed together
 
 
 @dataclass(frozen=True, eq=False)
@@ -469,3 +471,36 @@ def _extent(motion: Log | Trajectory, rate: float | None = None) -> str:
         f"{len(t)} samples of {len(joints)} joints ({', '.join(joints)}) over "
         f"{t[-1] - t[0] if len(t) else 0.0:.6g} s at {rate:.4g} Hz"
     )
+
+
+def map_stamps(blocks: Iterable[Array], where: str) -> Array:
+    """Time stamps of a log, shape (N,) [s], in a file that exists as long as the array."""
+    count, last = 0, np.empty(0)
+    with tempfile.TemporaryFile() as file:
+        for block in blocks:
+            require_finite(block[:, None], block, ["time"], where, count)
+            require_increasing(np.append(last, block), where, count - len(last))
+            np.ascontiguousarray(block, dtype=np.float64).tofile(file)
+            count, last = count + len(block), block[-1:]
+        file.flush()
+        return np.memmap(file, np.float64, "r", shape=(count,)) if count else last
+
+
+def blocks_of(t: Array) -> Iterator[tuple[int, Array]]:
+    """Yield time stamps in blocks; each block shares a stamp with the block before: t (N,) [s]."""
+    for row in range(0, len(t) - 1, _BLOCK):
+        yield row, t[row : row + _BLOCK + 1]
+
+
+def median_step(t: Array) -> float:
+    """Return the median time step [s]; those of a long log are sorted in a temporary file.
+
+    t (N,) [s].
+    """
+    if len(t) <= _BLOCK:
+        return float(np.median(np.diff(t)))
+    with tempfile.TemporaryFile() as file:
+        steps = np.memmap(file, np.float64, "w+", shape=(len(t) - 1,))
+        for row, block in blocks_of(t):
+            steps[row : row + len(block) - 1] = np.diff(block)
+        return float(np.median(steps, overwrite_input=True))

@@ -97,9 +97,6 @@ class SignalSettings(Settings):
     velocity_delay: float = setting(
         0.0, "delay of the measured velocity, likewise [s]", within=_DELAY
     )
-    wrench_delay: float = setting(
-        0.0, "delay of the measured wrenches of contacts, likewise [s]", within=_DELAY
-    )
 
 
 @dataclass(frozen=True)

@@ -19,8 +19,8 @@ from robotid.design.basis import DesignedMotion
 from robotid.design.design import STARTED, Design, Designer
 from robotid.design.information import Aim
 from robotid.design.limits import LIMITS
-from robotid.dynamics.simulation.closed_loop import carried
 from robotid.dynamics.simulation.simulation_settings import Payload
+from robotid.dynamics.simulation.simulator import carried
 from robotid.estimation.estimators.determination import Determination, determine
 from robotid.robot.bodies import link_transfer
 from robotid.robot.model import RobotModel

@@ -29,7 +29,7 @@ from robotid.base.typing import Array
 from robotid.data.files.read import Readable
 from robotid.data.log import Log, suggestion
 from robotid.data.signal_settings import SignalSettings
-from robotid.data.smoothing import low_pass
+from robotid.data.signals import low_pass
 from robotid.diagnosis.logs.motion_checks import excitation_finding
 from robotid.dynamics.base_parameters import BaseMapping, structural_mapping
 from robotid.dynamics.factors import Factors, compress, join, merge
@@ -47,11 +47,10 @@ from robotid.estimation.fitting.recorded import Recordings
 from robotid.estimation.fitting.standard_errors import StandardErrors, about_prior, standard_of
 from robotid.estimation.fitting.survey import SurveyedLog, hold_log
 from robotid.identification.pipeline import logs_of
-from robotid.identification.result import Identification
-from robotid.robot.assumed import with_assumed_inertials
+from robotid.identification.result import TorqueIdentification
 from robotid.robot.closure import refuse_loops
 from robotid.robot.model import RobotModel
-from robotid.robot.prior import prior_spread
+from robotid.robot.prior import prior_spread, with_assumed_inertials
 
 #: Assumed correlation time of noise [s].
 CORRELATION = 0.1
@@ -136,20 +135,16 @@ def largest_gravity(model: RobotModel) -> Array:
 
 
 def largest_torques(model: RobotModel, peak: Array) -> Array:
-    """Return the largest torque of each joint, shape (n,): the URDF's limit, or that of a motion.
-
-    peak (n,) [N m or N].
-    """
+    """Return the largest torque of each joint, (n,): the URDF's limit, or that of a motion."""
+    # peak (n,) [N m or N]
     peak = np.maximum(peak, FAINTEST * max(float(peak.max()), 1e-300))
     limit = np.array([joint.effort for joint in model.limits])
     return np.where(np.isfinite(limit) & (limit > 0), limit, peak)
 
 
 def assumed_parameters(model: RobotModel, size: Array, fastest: Array) -> Array:
-    """Return the URDF's bodies with friction of a typical size, shape (p,).
-
-    size (n,) [N m or N], fastest (n,) [rad/s or m/s].
-    """
+    """Return the URDF's bodies with friction of a typical size, shape (p,)."""
+    # size (n,) [N m or N], fastest (n,) [rad/s or m/s]
     pi = model.standard_parameters()
     for j, limits in enumerate(model.limits):
         speed = limits.velocity if 0 < limits.velocity < np.inf else max(float(fastest[j]), 1e-3)
@@ -244,7 +239,7 @@ class Preview:
         between: As of ``Fit.between`` of an earlier result, of each motion, which widens the bands.
     """
 
-    expected: Identification
+    expected: TorqueIdentification
     noise: TorqueNoise
     before: Array | None = None
     between: tuple[Array | None, ...] = ()
@@ -302,7 +297,7 @@ def preview(
     noise: TorqueNoise | Mapping[str, float] | None = None,
     signals: SignalSettings | None = None,
     estimator: EstimatorSettings | str = "consistent",
-    given: Identification | None = None,
+    given: TorqueIdentification | None = None,
 ) -> Preview:
     """Return the expected standard errors of motions before they are recorded.
 
@@ -330,7 +325,9 @@ def preview(
     require_kind(
         noise, (TorqueNoise, Mapping, type(None)), "noise", "a TorqueNoise, or numbers by joint"
     )
-    require_kind(given, (Identification, type(None)), "given", "a robotid.Identification, or none")
+    require_kind(
+        given, (TorqueIdentification, type(None)), "given", "a robotid.Identification, or none"
+    )
     choice = EstimatorSettings(estimator) if isinstance(estimator, str) else estimator
     settings, run = signals or SignalSettings(), None
     model = model if isinstance(model, RobotModel) else RobotModel.from_urdf(model)
@@ -563,7 +560,7 @@ def _expected(
     choice: EstimatorSettings,
     estimate: Estimate,
     wls: Estimate,
-) -> Identification:
+) -> TorqueIdentification:
     """Return the expected identification."""
     model, mapping = known.model, known.mapping
     standard = known.pi if information.run is None else pi
@@ -573,7 +570,7 @@ def _expected(
     fitted, _ = evaluate_logs(motions, (), {"estimate": pi, "wls": pi}, known.pi)
     inflation = np.mean([level / information.sigma**2 for _, level in information.levels])
     errors = StandardErrors("noise expected", 0, float(inflation), np.full(len(mapping.K), np.inf))
-    return Identification(
+    return TorqueIdentification(
         model=model,
         mapping=mapping,
         estimator=choice,

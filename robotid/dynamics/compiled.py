@@ -234,6 +234,6 @@ def _base_state(model: "RobotModel", q: Array, v: Array, a: Array) -> Array:
 @cache
 def row_lanes() -> ModuleType:
     """Return the compiled code of rows; it imports Numba."""
-    import robotid.dynamics.row_lanes
+    import robotid.dynamics.kernels.row_lanes
 
-    return robotid.dynamics.row_lanes
+    return robotid.dynamics.kernels.row_lanes

@@ -16,8 +16,7 @@ import pinocchio as pin
 from robotid.base.exceptions import DataError, ModelError
 from robotid.base.findings import listed
 from robotid.base.typing import Array
-from robotid.data.base_motion import BaseColumns
-from robotid.data.imu_frame import ImuFrame
+from robotid.data.base_motion import BaseColumns, ImuFrame
 from robotid.data.log import Trajectory, suggestion
 from robotid.data.signal_settings import BaseSource
 from robotid.dynamics.problem import RowSource

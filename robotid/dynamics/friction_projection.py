@@ -16,7 +16,7 @@ import numpy as np
 from robotid.base.exceptions import DataError
 from robotid.base.typing import Array
 from robotid.data.log import Trajectory
-from robotid.dynamics.memory import drive_motion_along
+from robotid.dynamics.prediction import drive_motion_along
 from robotid.robot.as_pinocchio import pinocchio_model
 from robotid.robot.drives import (
     TERMS,

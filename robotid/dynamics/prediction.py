@@ -1,7 +1,11 @@
-"""Torques predicted from parameter vectors, without the whole regressor in memory."""
+"""Torques predicted from parameter vectors, their derivatives, and drive terms that depend on them.
+
+Derivatives are Pinocchio's of inverse dynamics. Three prismatic joints at position 0 are added
+before each joint: their displacements are those of the joint's origin.
+"""
 
 from collections.abc import Callable, Sequence
-from typing import TypeVar
+from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -14,15 +18,37 @@ from robotid.base.typing import Array
 from robotid.data.log import Trajectory
 from robotid.dynamics.compiled import work_per_sample
 from robotid.dynamics.constraint_rows import without_forces
-from robotid.dynamics.drive_columns import friction_directions, trajectory_values
+from robotid.dynamics.drive_columns import (
+    drive_motion,
+    friction_directions,
+    remembered,
+    trajectory_values,
+)
 from robotid.dynamics.rows import BLOCK, COMPILED, InertialRows, TrajectoryRows, trajectory_rows
 from robotid.dynamics.torque import joint_torque_regressor
-from robotid.dynamics.torque_slopes import TorqueSlopes, position_slopes, torque_slopes
+from robotid.robot.drives import DriveMotion, Lag
 from robotid.robot.model import RobotModel
 
-SlopesT = TypeVar("SlopesT", Array, TorqueSlopes)
-
 _START = 5  # constant work of one call of inverse dynamics, as of work_per_sample
+
+
+class TorqueSlopes(NamedTuple):
+    """Derivatives of the torque of the bodies at N samples, of a robot with n joints.
+
+    Attributes:
+        by_q: By the positions, shape (N, n, n).
+        by_v: By the velocities, likewise.
+        by_a: By the accelerations, likewise: the mass matrix of the bodies.
+        by_gravity: By gravity, along the axes of the world, shape (N, n, 3).
+        by_origin: By the origin of each joint in the frame of the body before, shape (N, n, n, 3):
+            torque, joint, axis.
+    """
+
+    by_q: Array
+    by_v: Array
+    by_a: Array
+    by_gravity: Array
+    by_origin: Array
 
 
 def predict(
@@ -44,23 +70,18 @@ def predict(
 
     parameters (p,).
     """
-    if trajectory.basis is None:
-        return _unconstrained(model, parameters, trajectory, compiled)
-    torques = _unconstrained(model, parameters, trajectory, compiled)
-    return [without_forces(trajectory.basis, torque) for torque in torques]
-
-
-def _unconstrained(
-    model: RobotModel, parameters: Sequence[Array], trajectory: Trajectory, compiled: bool | None
-) -> list[Array]:
-    """Return the torques with those that constraint forces cause; see ``predict``."""
     source = trajectory_rows(model, trajectory, None, compiled)
-    if source.inertial is not None:
-        return _from_kept(source, source.inertial, np.column_stack(list(parameters)))
+    stacked = np.column_stack(list(parameters))
     few = len(parameters) * (_START + model.pin_model.nv) <= work_per_sample(model)
-    if source.engine != COMPILED and few and all(_has_centres(model, pi) for pi in parameters):
-        return [inverse_dynamics(model, pi, trajectory) for pi in parameters]
-    return _from_rows(source, np.column_stack(list(parameters)))
+    if source.inertial is not None:
+        torques = _from_kept(source, source.inertial, stacked)
+    elif source.engine != COMPILED and few and all(_has_centres(model, pi) for pi in parameters):
+        torques = [inverse_dynamics(model, pi, trajectory) for pi in parameters]
+    else:
+        torques = _from_rows(source, stacked)
+    if trajectory.basis is None:
+        return torques
+    return [without_forces(trajectory.basis, torque) for torque in torques]
 
 
 def predict_instants(
@@ -195,26 +216,29 @@ def drive_torque(model: RobotModel, pi: Array, trajectory: Trajectory) -> Array:
 
 
 def body_slopes(model: RobotModel, pi: Array, trajectory: Trajectory) -> TorqueSlopes:
-    """Return the derivatives of the bodies' torque by motion, gravity and origins of joints.
-
-    pi (p,).
-    """
-    return _of_consistent(torque_slopes, model, pi, trajectory)
+    """Return the derivatives of the bodies' torque by motion, gravity and origins of joints."""
+    return TorqueSlopes(*_of_consistent(_torque_slopes, model, pi, trajectory))
 
 
 def body_slopes_by_position(model: RobotModel, pi: Array, trajectory: Trajectory) -> Array:
-    """Return the derivatives of the bodies' torque by the positions, shape (N, n, n)."""
-    return _of_consistent(position_slopes, model, pi, trajectory)
+    """Return the derivatives of the bodies' torque by the positions alone, shape (N, n, n).
+
+    The others of ``body_slopes`` take several times as long.
+    """
+    (by_q,) = _of_consistent(_position_slopes, model, pi, trajectory)
+    return by_q
 
 
 def _of_consistent(
-    slopes: Callable[..., SlopesT], model: RobotModel, pi: Array, trajectory: Trajectory
-) -> SlopesT:
+    slopes: Callable[..., Sequence[Array]], model: RobotModel, pi: Array, trajectory: Trajectory
+) -> Sequence[Array]:
     """Return derivatives for consistent bodies, or the difference of those of two sets of these."""
     added = _consistent_addition(model, pi)
     state = trajectory.q, trajectory.v, trajectory.a
-    found = slopes(model, pi + added, *state)
-    return found - slopes(model, added, *state) if added.any() else found
+    total = slopes(model, pi + added, *state)
+    if not added.any():
+        return total
+    return [x - y for x, y in zip(total, slopes(model, added, *state), strict=True)]
 
 
 def _consistent_addition(model: RobotModel, pi: Array) -> Array:
@@ -245,3 +269,144 @@ def _newton_euler(model: RobotModel, pi: Array, q: Array, v: Array, a: Array) ->
         for torque_k, q_k in zip(torque, configurations, strict=True):
             torque_k[:] = pin.computeGeneralizedGravity(pin_model, data, q_k)
     return torque if is_plain else torque @ G  # tau = G^T tau_pinocchio
+
+
+def _position_slopes(model: RobotModel, pi: Array, q: Array, v: Array, a: Array) -> tuple[Array]:
+    """Return the derivatives of the bodies' torque by the positions, shape (N, n, n)."""
+    own, G = model.with_parameters(pi).pin_model, model.velocity_map
+    slopes, data = np.empty((len(q), own.nv, own.nv)), own.createData()
+    states = zip(model.configurations(q), v @ G.T, a @ G.T, strict=True)
+    for D, state in zip(slopes, states, strict=True):
+        D[:] = pin.computeRNEADerivatives(own, data, *state)[0]
+    return (G.T @ slopes @ G,)
+
+
+def _torque_slopes(model: RobotModel, pi: Array, q: Array, v: Array, a: Array) -> tuple[Array, ...]:
+    """Return the arrays of ``TorqueSlopes``.
+
+    References:
+        Carpentier, Mansard (2018), Analytical Derivatives of Rigid Body Dynamics Algorithms.
+    """
+    plain, G = model.with_parameters(pi).pin_model, model.velocity_map
+    extended, joints = _with_movable_origins(plain)
+    own = np.array([extended.joints[k].idx_v for k in joints])  # rows of the robot's own joints
+    before = np.array([extended.joints[k - 1].idx_v for k in joints])  # and of their origins
+    first_q = [(extended.joints[k].idx_q, plain.joints[i].idx_q, plain.joints[i].nq)
+               for i, k in enumerate(joints, start=1)]  # fmt: skip
+    configurations = np.zeros((len(q), extended.nq))
+    known = model.configurations(q)
+    for to, here, size in first_q:
+        configurations[:, to : to + size] = known[:, here : here + size]
+    velocities, accelerations = np.zeros((2, len(v), extended.nv))
+    velocities[:, own], accelerations[:, own] = v @ G.T, a @ G.T
+    slopes = np.empty((3, len(q), len(own), extended.nv))
+    derive, data = pin.computeRNEADerivatives, extended.createData()
+    states = zip(configurations, velocities, accelerations, strict=True)
+    for D_q, D_v, D_a, state in zip(*slopes, states, strict=True):
+        by_q, by_v, by_a = derive(extended, data, *state)
+        by_q.take(own, 0, D_q, "clip")  # without bound checks
+        by_v.take(own, 0, D_v, "clip")
+        by_a.take(own, 0, D_a, "clip")
+    D: Array = G.T @ slopes  # tau = G^T tau_pinocchio
+    by_q, by_v, by_a = D[..., own] @ G
+    leaders = np.array([plain.getJointId(name) - 1 for name in model.joints])
+    axes = before[leaders][:, None] + np.arange(3)
+    roots = before[[plain.parents[i] == 0 for i in range(1, plain.njoints)]]
+    falling = sum(D[2][..., root : root + 3] for root in roots)  # as the base is accelerated
+    return by_q, by_v, by_a, -falling, D[0][..., axes]
+
+
+def _with_movable_origins(model: pin.Model) -> tuple[pin.Model, list[int]]:
+    """Return a robot with a 3-axis prismatic joint before each joint, and its own joints in it."""
+    extended, joints = pin.Model(), [0]
+    extended.gravity = model.gravity
+    for i in range(1, model.njoints):
+        place, name = model.jointPlacements[i], model.names[i]
+        there = pin.SE3(np.eye(3), place.translation)
+        origin = extended.addJoint(
+            joints[model.parents[i]], pin.JointModelTranslation(), there, f"{name} origin"
+        )
+        rotated = pin.SE3(place.rotation, np.zeros(3))
+        joints.append(extended.addJoint(origin, model.joints[i], rotated, name))
+        extended.appendBodyToJoint(joints[-1], model.inertias[i], pin.SE3.Identity())
+    return extended, joints[1:]
+
+
+def is_loaded(model: RobotModel) -> bool:
+    """Return whether these columns depend on the torque of a robot's reference.
+
+    Those of bristles do not: they depend on the displacement only.
+    """
+    return any(term.needs_load for _, term in model.layout.drive_parameters)
+
+
+def remember(model: RobotModel, trajectory: Trajectory) -> Trajectory:
+    """Return a trajectory with the columns of drive terms with internal state or load."""
+    if not model.layout.remembering:
+        return trajectory
+    is_lagging = any(isinstance(term, Lag) for _, term in model.layout.drive_parameters)
+    motion = drive_motion_along(model, trajectory, has_rate=is_lagging)
+    return trajectory.with_states(remembered(model.layout, motion))
+
+
+def drive_motion_along(
+    model: RobotModel, trajectory: Trajectory, *, has_rate: bool = True
+) -> DriveMotion:
+    """Return the motion and load of the drives of a robot along a trajectory.
+
+    The load is the torque of the bodies, and the rate that of the whole torque, by the model's
+    reference; a delayed torque itself is not included.
+
+    -> (d, N).
+    """
+    key, known = (model.pin_model, model.layout, has_rate), trajectory.derived.get("drive motion")
+    if known is None or known[0] != key or not np.array_equal(known[1], model.carried_by):
+        found = _drive_motion(model, trajectory, has_rate)
+        trajectory.derived["drive motion"] = known = key, model.carried_by, found
+    motion: DriveMotion = known[2]
+    return motion
+
+
+def _load_torque(model: RobotModel, trajectory: Trajectory) -> Array:
+    """Return the torque of the bodies by the model's reference, shape (N, n_rows) [N m, N].
+
+    The last one is stored with the trajectory: it is that of any terms of the drives.
+    """
+    pi = model.carried_by[: model.layout.n_inertial]
+    known = trajectory.derived.get("load torque")
+    if known is None or known[0] is not model.pin_model or not np.array_equal(known[1], pi):
+        plain = model.with_terms({})
+        bodies = np.zeros(len(plain.layout.names))
+        bodies[: len(pi)] = pi
+        (load,) = predict(plain, [bodies], trajectory)
+        trajectory.derived["load torque"] = known = model.pin_model, pi, load
+    torque: Array = known[2]
+    return torque
+
+
+def _drive_motion(model: RobotModel, trajectory: Trajectory, has_rate: bool) -> DriveMotion:
+    """Return the motion and load of drives as of ``drive_motion_along``."""
+    layout, pi = model.layout, model.carried_by
+    m = trajectory.with_states(None)  # that of another reference, if it has one
+    first = model.n_rows - len(model.joints)
+    signs = friction_directions(layout, m.v, m.direction)
+    begins = np.diff(m.segment, prepend=m.segment[:1] - 1) != 0
+    load = _load_torque(model, m)[:, first:]
+    motion = drive_motion(layout, m.q, m.v, m.a, signs, load, None, begins)
+    if not has_rate:
+        return motion
+    if layout.remembering:
+        m = m.with_states(remembered(layout, motion))
+    drives = trajectory_values(layout, m).T @ (layout.drive_loads * pi[layout.n_inertial :]).T
+    rate = _rate(load + drives, m)
+    return drive_motion(layout, m.q, m.v, m.a, signs, load, rate, begins)
+
+
+def _rate(torque: Array, motion: Trajectory) -> Array:
+    """Return the change of torques within each segment, shape (N, n) [N m/s, N/s]."""
+    rate = np.zeros_like(torque)
+    edges = np.flatnonzero(np.diff(motion.segment)) + 1
+    for part in np.split(np.arange(len(motion.t)), edges):
+        if len(part) > 1:
+            rate[part] = np.gradient(torque[part], motion.t[part], axis=0)
+    return rate

@@ -45,10 +45,10 @@ from robotid.estimation.fitting.selected_drives import DriveChoice
 from robotid.estimation.fitting.survey import hold_log
 from robotid.estimation.variation.variation import vary
 from robotid.identification.repeated_errors import with_repeated_errors
-from robotid.identification.result import Identification, StatedSettings
-from robotid.robot.assumed import with_assumed_inertials
-from robotid.robot.families import AUTO, wanted_families
+from robotid.identification.result import StatedSettings, TorqueIdentification
+from robotid.robot.drives import AUTO, wanted_families
 from robotid.robot.model import RobotModel
+from robotid.robot.prior import with_assumed_inertials
 
 _ROBOTS = (".urdf", ".xml", ".xacro")  # suffixes of files that describe robots
 _MOST_SHAPES = 2  # fits for the refinement of shapes together with the terms of all joints
@@ -65,7 +65,7 @@ def identify(
     doctor: bool = True,
     ignore: Sequence[str] = (),
     progress: ProgressCallback | None = None,
-) -> Identification:
+) -> TorqueIdentification:
     """Identify a robot's parameters from motion logs, as the command line does."""
     require_kind(signals, (SignalSettings, type(None)), "signals", "a robotid.SignalSettings")
     require_kind(
@@ -127,7 +127,7 @@ def conclude(
     *,
     friction: str | Mapping[str, str] = AUTO,
     progress: ProgressCallback | None = None,
-) -> Identification:
+) -> TorqueIdentification:
     """Identify a robot's parameters from recordings, in memory or not, and give a verdict."""
     model, is_robust = recordings.model, choice.is_robust
     wanted = wanted_families(friction, model.joints)
@@ -148,7 +148,7 @@ def conclude(
     names = [Path(e.recording.log.path).name for e in fit.fitted]
     units = sorted({log.unit for log in recordings.fitted})
     fit = replace(fit, variation=vary(names, fit.runs, units))
-    result = Identification(
+    result = TorqueIdentification(
         **{field.name: getattr(fit, field.name) for field in fields(fit)},
         misfits=misfits,
         on_misfit=on_misfit,

@@ -1,4 +1,4 @@
-"""An identification: a fit with findings and a verdict."""
+"""An identification: parameters with the errors of their predictions, findings and a verdict."""
 
 from abc import abstractmethod
 from collections.abc import Mapping
@@ -17,9 +17,10 @@ from robotid.diagnosis.verdict.payload_check import PayloadCheck
 from robotid.diagnosis.verdict.scale_check import ScaleCheck, check_scale
 from robotid.diagnosis.verdict.verdict import Verdict, VerdictWarning, judge
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
-from robotid.estimation.fitting.evaluation import hidden_joints
+from robotid.estimation.fitting.evaluation import Evaluated, Evaluation, hidden_joints
 from robotid.estimation.fitting.fitted import Fit
 from robotid.estimation.fitting.identified import Identified
+from robotid.estimation.fitting.metrics import Metrics
 from robotid.estimation.variation.variation import Variation
 from robotid.identification.summary import (
     error_lines,
@@ -27,7 +28,7 @@ from robotid.identification.summary import (
     variation_lines,
     verdict_lines,
 )
-from robotid.robot.families import AUTO
+from robotid.robot.drives import AUTO
 
 
 @dataclass(frozen=True)
@@ -41,15 +42,31 @@ class StatedSettings:
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
-class Concluded(Identified):
-    """Identified parameters with findings and a verdict, from torques or from positions."""
+class Identification(Identified):
+    """Identified parameters, the errors of their predictions, findings and a verdict.
+
+    Predictions are torques, or positions simulated from commands or torques: the metrics of each
+    evaluation state the unit of its error.
+
+    Attributes:
+        estimator: The estimator's settings.
+        fitted: The fitted recordings, with predictions and their errors.
+        validation: The validation recordings, likewise.
+        findings: Findings about the robot, the logs and the fit.
+        log_errors: Faults of the recordings that make the result wrong, found by the doctor.
+        report: File of the report, if one was written with the result.
+        stated: Signals, friction and findings to ignore, as stated, and the job.
+        variation: Variation of the drives' parameters between the fitted logs.
+    """
 
     estimator: EstimatorSettings
-    findings: tuple[Finding, ...] = ()  # about the robot, the logs and the fit
-    log_errors: tuple[str, ...] = ()  # faults of the recordings that make the result wrong
-    report: str = ""  # file of the report, if one was written with the result
+    fitted: tuple[Evaluated, ...]
+    validation: tuple[Evaluated, ...]
+    findings: tuple[Finding, ...] = ()
+    log_errors: tuple[str, ...] = ()
+    report: str = ""
     stated: StatedSettings = field(default_factory=StatedSettings)
-    variation: Variation | None = None  # of the drives' parameters between the fitted logs
+    variation: Variation | None = None
 
     def __repr__(self) -> str:
         return (
@@ -62,45 +79,46 @@ class Concluded(Identified):
         """Whether a URDF may be written: no fault of the logs makes it wrong."""
         return not self.log_errors
 
+    @property
+    def has_gains(self) -> bool:
+        """Whether it has gains of position controllers."""
+        return False
+
     @cached_property
     @abstractmethod
     def verdict(self) -> Verdict:
         """The verdict on the result, with reasons."""
 
+    @abstractmethod
+    def metrics(self, name: str = "estimate") -> Metrics:
+        """Return the metrics over all fitted recordings.
 
-@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
-class Identification(Concluded, Fit):
-    """Complete result of an identification.
+        Args:
+            name: "estimate"; of torques also "wls".
+        """
 
-    Attributes:
-        findings: Findings about the robot, the logs and the fit.
-        log_errors: Faults of the recordings that make the result wrong, found by the doctor.
-        warnings: Why it may be wrong although it predicts well, from the doctor and the fit.
-        report: File of the report, if one was written with the result.
-        misfits: Terms that its drive models lack.
-        on_misfit: Names of drive parameters whose errors increased for these.
-        stated: Signals, friction and findings to ignore, as stated, and the job.
-        scale: Scale check without payloads, as it was computed; None: not yet.
-        payload_checks: Checks of the torque scale with payloads of known mass, that with the
-            narrowest interval first.
-    """
+    def beside(self, evaluation: Evaluated | None = None) -> Metrics | None:
+        """Return the metrics of WLS, None if there are none.
 
-    warnings: tuple[VerdictWarning, ...] = ()
-    misfits: tuple[Misfit, ...] = ()
-    on_misfit: tuple[str, ...] = ()
-    scale: ScaleCheck | None = None
-    payload_checks: tuple[PayloadCheck, ...] = ()
+        Args:
+            evaluation: A recording; None: all fitted ones together.
+        """
+        return None
+
+    def _friction_lines(self) -> list[str]:
+        """Return the selected friction terms as text."""
+        return []
 
     def summary(self) -> str:
         """Return verdict, reasons and errors by joint as text."""
         lines = [repr(self)[1:-1], *verdict_lines(self.verdict.to_dict())[1:]]
-        compared = [
-            (f"{e.recording.name}: not fitted", e.metrics["estimate"], e.metrics["wls"])
-            for e in self.validation
+        compared: list[tuple[str, Metrics, Evaluated | None]] = [
+            (f"{e.name}: not fitted", e.metrics["estimate"], e) for e in self.validation
         ]
-        for caption, ours, wls in [*compared, ("fitted rows", self.metrics(), self.metrics("wls"))]:
-            lines += [caption, *error_lines(ours.to_dict(), wls.to_dict())]
-        lines += friction_lines({drive.joint: drive.to_dict() for drive in self.drives})
+        for caption, metrics, evaluation in [*compared, ("fitted rows", self.metrics(), None)]:
+            wls = self.beside(evaluation)
+            lines += [caption, *error_lines(metrics.to_dict(), wls and wls.to_dict())]
+        lines += self._friction_lines()
         lines += variation_lines(None if self.variation is None else self.variation.to_dict())
         if self.report:
             lines.append(f"report: {self.report}")
@@ -118,6 +136,36 @@ class Identification(Concluded, Fit):
             in a DataFrame: "urdf" of drives, "std_error" of a parameter at its bound.
         """
         return parameter_table(*parameter_entries(self))
+
+
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
+class TorqueIdentification(Identification, Fit):
+    """Identification that predicts torques.
+
+    Attributes:
+        warnings: Why it may be wrong although it predicts well, from the doctor and the fit.
+        misfits: Terms that its drive models lack.
+        on_misfit: Names of drive parameters whose errors increased for these.
+        scale: Scale check without payloads, as it was computed; None: not yet.
+        payload_checks: Checks of the torque scale with payloads of known mass, that with the
+            narrowest interval first.
+    """
+
+    fitted: tuple[Evaluation, ...]
+    validation: tuple[Evaluation, ...]
+    warnings: tuple[VerdictWarning, ...] = ()
+    misfits: tuple[Misfit, ...] = ()
+    on_misfit: tuple[str, ...] = ()
+    scale: ScaleCheck | None = None
+    payload_checks: tuple[PayloadCheck, ...] = ()
+
+    metrics = Fit.metrics
+
+    def beside(self, evaluation: Evaluated | None = None) -> Metrics:
+        return self.metrics("wls") if evaluation is None else evaluation.metrics["wls"]
+
+    def _friction_lines(self) -> list[str]:
+        return friction_lines({drive.joint: drive.to_dict() for drive in self.drives})
 
     def _cause_of(self, joint: str) -> str:
         """Return the cause of a joint's residual, as a sentence."""
@@ -155,7 +203,7 @@ class Identification(Concluded, Fit):
             self.metrics(),
             self.predictions,
             driven if any(log.has_torque for log in logs) else (),
-            refitted=[e.recording.name for e in self.refitted],
+            refitted=[e.name for e in self.refitted],
             hidden=hidden_joints(self.model, self.fitted),
         )
         determined = Determined(

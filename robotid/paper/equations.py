@@ -3,7 +3,7 @@
 The formulas accept leading axes for several runs together: "..." stands for () or (R,).
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal, Protocol, TypeAlias
 
@@ -244,3 +244,21 @@ def _mass_and_bias(dynamics: LinearDynamics, q: Array, v: Array, P: Array) -> tu
     parameters = np.broadcast_to(P, (R, G.shape[-1]))
     u = np.einsum("krnc,rc->krn", G.reshape(n + 2, R, n, -1), parameters)
     return (u[:n] - u[n]).transpose(1, 2, 0), u[n + 1]
+
+
+def rk4(
+    acceleration: Callable[[Array, Array, float], Array],
+    q: Array,
+    v: Array,
+    h: float | Array,
+    a: Array | None = None,
+) -> tuple[Array, Array]:
+    """Return positions and velocities one step later, by the Runge-Kutta method of order 4."""
+    a1 = acceleration(q, v, 0.0) if a is None else a
+    v2 = v + h / 2 * a1
+    a2 = acceleration(q + h / 2 * v, v2, 0.5)
+    v3 = v + h / 2 * a2
+    a3 = acceleration(q + h / 2 * v2, v3, 0.5)
+    v4 = v + h * a3
+    a4 = acceleration(q + h * v3, v4, 1.0)
+    return q + h / 6 * (v + 2 * v2 + 2 * v3 + v4), v + h / 6 * (a1 + 2 * a2 + 2 * a3 + a4)

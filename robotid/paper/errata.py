@@ -5,8 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from robotid.base.typing import Array
-from robotid.dynamics.simulation.plant import rk4
-from robotid.paper.equations import LinearPlant, PlanarDynamics, mass_matrix, torque
+from robotid.paper.equations import LinearPlant, PlanarDynamics, mass_matrix, rk4, torque
 from robotid.paper.planar_2r import (
     PAPER_LINKS,
     PAPER_PARAMETERS,

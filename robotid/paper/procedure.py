@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from robotid.base.exceptions import DataError, SettingsError
 from robotid.base.typing import Array
 from robotid.dynamics.simulation.motions import ProgramMotion
-from robotid.dynamics.simulation.plant import rk4
 from robotid.paper.equations import (
     Bounds,
     LinearDynamics,
@@ -26,6 +25,7 @@ from robotid.paper.equations import (
     proximity,
     recursive_update,
     reference_acceleration,
+    rk4,
     smallest_eigenvalue,
 )
 

@@ -39,9 +39,6 @@ class Contact:
             measures.
         threshold: Force above which it touches the ground [N], if the log's column of the contact
             is a force; None for a column of 0 and 1.
-        plate: Force plate whose origin and axes the measured components have: x, y, z [m] and, if
-            they are not 0, roll, pitch, yaw [rad] of the plate in the world; empty for the origin
-            of the link.
     """
 
     frame: str
@@ -52,7 +49,6 @@ class Contact:
     uncertainty: float | None = None
     axes: str = "world"
     threshold: float | None = None
-    plate: tuple[float, ...] = ()
 
     sizes: ClassVar[dict[str, int]] = {"point": 3, "surface": 6}
     components: ClassVar[tuple[str, ...]] = ("fx", "fy", "fz", "mx", "my", "mz")
@@ -89,23 +85,8 @@ class Contact:
             raise SettingsError(
                 f"threshold of the contact {self.frame!r} is {self.threshold!r}, wanted a force [N]"
             )
-        self._check_plate()
         if self.is_measured:
             object.__setattr__(self, "always", True)
-
-    def _check_plate(self) -> None:
-        wanted = "x, y, z [m] and roll, pitch, yaw [rad]"
-        numbers = require_each(self.plate, (int, float), "plate of a contact", wanted)
-        if len(numbers) not in (0, 3, 6) or not np.isfinite(np.array(numbers, dtype=float)).all():
-            raise SettingsError(
-                f"plate of the contact {self.frame!r} is {listed(numbers)}, wanted {wanted}, or "
-                "x, y, z"
-            )
-        if numbers and (self.kind, self.axes) != ("surface", "world"):
-            raise SettingsError(
-                f"the contact {self.frame!r} has a plate, and kind {self.kind!r} and axes "
-                f"{self.axes!r}; wanted kind 'surface', and no axes: they are those of the plate"
-            )
 
     @property
     def rows_measured(self) -> list[int]:
@@ -138,11 +119,6 @@ class Contact:
         axes = placement.rotation if self.axes == "link" else np.eye(3)
         rows[0] -= self.radius * jacobians[0][4]  # v + w x (0, 0, -radius)
         rows[1] += self.radius * jacobians[0][3]
-        if self.plate:  # at its origin, v + w x d
-            angles = np.array([*self.plate[3:], 0.0, 0.0, 0.0][:3], dtype=float)
-            axes = pin.rpy.rpyToMatrix(angles)
-            d = np.array(self.plate[:3], dtype=float) - placement.translation
-            rows[:3] -= pin.skew(d) @ rows[3:]
         turned: Array = (axes.T @ rows.reshape(-1, 3, rows.shape[1])).reshape(rows.shape)
         return turned
 

@@ -19,9 +19,8 @@ from robotid.base.settings import require_each, require_flag, require_kind
 from robotid.base.typing import Array
 from robotid.robot.constraints import Constraint, Contact, Loop, check_constraints
 from robotid.robot.drives import DRIVE_TERMS, TERMS, DriveMotion, DriveTerm
-from robotid.robot.joint_choice import choose_joints, mimic_followers
 from robotid.robot.parameters import DYNAMICS, Coupling, ParameterLayout
-from robotid.robot.tree import Joint, Tree, read_tree
+from robotid.robot.tree import Joint, Tree, choose_joints, mimic_followers, read_tree
 from robotid.robot.urdf_text import LARGEST
 
 GRAVITY = (0.0, 0.0, -9.81)  # [m/s^2]

@@ -1,17 +1,43 @@
-"""The prior: the URDF's parameters and their plausible deviations."""
+"""What is assumed of a robot before its logs: boxes for missing inertials, plausible deviations.
+
+A uniform box is assumed for a body whose inertial the URDF does not state in a usable way. The
+prior is the URDF's parameters and their plausible deviations.
+"""
+
+from collections import Counter
+from dataclasses import replace
+from itertools import compress
+from types import MappingProxyType
 
 import numpy as np
 
 from robotid.base.typing import Array
+from robotid.robot.bodies import held_parameters, link_places, negligible_bodies
 from robotid.robot.drives import DriveMotion
+from robotid.robot.geometry import body_frames, body_points
 from robotid.robot.mass_matrix import carried_inertia
 from robotid.robot.model import RobotModel
-from robotid.robot.parameters import pseudo_inertia
+from robotid.robot.parameters import inertial_from_pseudo_inertia, pseudo_inertia
 
 _SMALLEST_MASS = 0.1  # of the mean mass: deviation of a link's mass even if its URDF states 0
 _SMALLEST_RADIUS = 0.1  # of the robot's length: the same for a link's size
 _POSITIONS = 16  # of a revolution at which terms that depend on the position are evaluated
 _FAINTEST = 1e-6  # smallest RMS of a column
+#: Why the inertial of a body is assumed, by the code of the finding.
+REASONS = MappingProxyType({
+    "missing_inertial": "no <inertial> with a mass",
+    "not_positive_definite": "an inertia that no body can have",
+    "default_inertial": "the placeholder that other links have, too",
+    "inertial_units": "masses or lengths in another unit than kg and m",
+})  # fmt: skip
+_DENSITY = 1000.0  # [kg/m^3] without a body to take it from
+_HALF_WIDTH = 0.1  # of the robot's length: of a body without geometry, around its frames
+_LEAST_SIDE = 0.01  # [m] thin sheets have a volume
+_SLACK = 1e-9  # relative violation of positive definiteness that is rounding
+_COPIES = 3  # identical isotropic inertials are placeholders
+# medians over the bodies of all robots in example-robot-data: at most 2e4 kg/m^3 and 7
+_DENSEST = 5e4  # [kg/m^3] over the box of a body's frames; with masses in g 1e5 and more
+_FARTHEST = 30.0  # RMS distance of the mass from the joint over that box; in mm 160 and more
 
 
 def prior_spread(model: RobotModel, squares: Array, samples: int) -> Array:
@@ -71,3 +97,116 @@ def _drive_spread(model: RobotModel, rms: Array) -> Array:
 def _positive(rms: Array) -> Array:
     """Return the root mean square of each column, never 0."""
     return np.maximum(rms, 1e-3 * rms.max() if rms.max() > 0 else 1.0)
+
+
+def with_assumed_inertials(model: RobotModel) -> RobotModel:
+    """Return the robot with uniform boxes for the bodies that the URDF states in no usable way.
+
+    These are bodies without mass, with an inertia that no body can have (they keep mass and centre
+    of mass), with an isotropic inertial that three or more links share, and all bodies if the
+    masses or lengths of the robot have a wrong unit. The box is that of the body's geometry, or of
+    its frames if it has none; its density is the median of the other bodies, or 1000 kg/m^3. A
+    massless body without geometry that carries another one in the same place, as between the axes
+    of a ball joint, remains as it is beside bodies with mass.
+    """
+    size, bodies = model.layout.n_inertial, model.layout.bodies
+    pi = model.standard_parameters()[:size]
+    held = held_parameters(model)  # of links behind locked joints
+    J = pseudo_inertia(pi - held)
+    frames = body_frames(model)
+    points = {body: np.array(frames[body]) for body in bodies}
+    half_width = _HALF_WIDTH * model.length
+    boxes = {body: _grown(points[body], half_width) for body in bodies}
+    # the frames of a few bodies do not indicate their size
+    size_of = {body: boxes[body][1] for body in bodies}
+    if len(bodies) < _COPIES:
+        shapes = body_points(model)
+        size_of = {x: np.maximum(size_of[x], np.ptp(shapes[x], axis=0)) for x in shapes}
+    reasons = _reasons(model, J, size_of)
+    if not reasons:
+        return model
+    if "inertial_units" in reasons.values():
+        model = replace(model, assumed=reasons)
+        held = held_parameters(model)
+    geometry = body_points(model)
+    boxes |= {body: _grown(geometry[body], 0.0) for body in bodies if body in geometry}
+    volumes = np.array([np.prod(boxes[body][1]) for body in bodies])
+    trusted = np.array([body not in reasons for body in bodies]) & (J[:, 3, 3] > 0)
+    density = np.median((J[:, 3, 3] / volumes)[trusted]) if trusted.any() else _DENSITY
+    for k, body in enumerate(bodies):
+        if body not in reasons:
+            continue
+        is_axis = body not in geometry and not np.ptp(points[body], axis=0).any()
+        is_axis &= k + 1 in list(model.pin_model.parents)  # it carries another body
+        if reasons[body] == "missing_inertial" and is_axis and trusted.any():
+            del reasons[body]
+            continue
+        centre, sides = boxes[body]
+        mass = float(density * volumes[k])
+        if reasons[body] == "not_positive_definite":
+            mass = float(J[k, 3, 3])
+            stated = J[k, :3, 3] / mass
+            centre = stated if (np.abs(stated - centre) <= sides).all() else centre
+        J[k, :3, :3] = mass * (np.diag(sides**2) / 12.0 + np.outer(centre, centre))
+        J[k, :3, 3] = J[k, 3, :3] = mass * centre
+        J[k, 3, 3] = mass
+    if not reasons:
+        return model
+    filled = model.with_parameters(inertial_from_pseudo_inertia(J).reshape(-1) + held)
+    return replace(filled, assumed=reasons)
+
+
+def assumed_masses(model: RobotModel) -> tuple[str, ...]:
+    """Return the bodies whose mass is assumed: the URDF's is no evidence."""
+    return tuple(x for x, code in model.assumed.items() if code != "not_positive_definite")
+
+
+def _reasons(model: RobotModel, J: Array, sides: dict[str, Array]) -> dict[str, str]:
+    """Return the code of each body that is not stated in a usable way.
+
+    The pseudo-inertias have shape (n, 4, 4), the sides of a body's box (3,) [m].
+    """
+    bodies = model.layout.bodies
+    mass, least = J[:, 3, 3], np.linalg.eigvalsh(J)[:, 0]
+    scale = np.trace(J, axis1=1, axis2=2)
+    codes = dict.fromkeys(bodies, "")
+    codes |= {body: "default_inertial" for body in _placeholders(model)}
+    is_impossible, has_mass = least < -_SLACK * scale, mass > 0
+    codes |= dict.fromkeys(compress(bodies, is_impossible), "not_positive_definite")
+    codes |= dict.fromkeys(compress(bodies, ~has_mass), "missing_inertial")
+    sized = [k for k, body in enumerate(bodies) if mass[k] > 0 and body in sides]
+    if sized:
+        size = np.array([sides[bodies[k]] for k in sized])
+        density = np.median(mass[sized] / size.prod(axis=1))
+        second = np.abs(np.trace(J[sized, :3, :3], axis1=1, axis2=2)) / mass[sized]
+        distance = np.median(np.sqrt(second) / np.linalg.norm(size, axis=1))
+        if density > _DENSEST or distance > _FARTHEST:
+            codes |= dict.fromkeys(compress(bodies, has_mass), "inertial_units")
+    negligible = negligible_bodies(model)  # as between the axes of a ball joint
+    return {body: code for body, code in codes.items() if code and body not in negligible}
+
+
+def _placeholders(model: RobotModel) -> set[str]:
+    """Return the bodies all of whose links with mass have an isotropic inertial of many links."""
+    values = {
+        link: (inertial.mass, inertial.inertia[0])
+        for link, inertial in model.tree.inertials.items()
+        if inertial.inertia == tuple(inertial.inertia[0] * x for x in (1, 0, 0, 1, 0, 1))
+    }
+    by_body: dict[int, list[str]] = {}
+    for place in link_places(model):
+        if place.body >= 0 and place.role != "held" and place.parameters[0] > 0:
+            by_body.setdefault(place.body, []).append(place.link)
+    moving = {link for links in by_body.values() for link in links}
+    shared = Counter(value for link, value in values.items() if link in moving)
+    return {
+        model.layout.bodies[k]
+        for k, links in by_body.items()
+        if all(link in values and shared[values[link]] >= _COPIES for link in links)
+    }
+
+
+def _grown(points: Array, half_width: float) -> tuple[Array, Array]:
+    """Return centre and sides of the box around points, enlarged on each side [m]."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    return 0.5 * (low + high), np.maximum(high - low + 2.0 * half_width, _LEAST_SIDE)

@@ -1,6 +1,5 @@
 import json
 from contextlib import redirect_stdout
-from dataclasses import replace
 from io import StringIO
 
 import numpy as np
@@ -8,10 +7,7 @@ import pytest
 from helpers.mujoco_plant import plant, torque_log
 
 from robotid.cli import main
-from robotid.cli.work import identify
-from robotid.cli.work.job import read_job
 from robotid.data.files.read import write_log
-from robotid.robot.families import AUTO
 
 
 @pytest.fixture(scope="module")
@@ -69,7 +65,7 @@ def result(folder):
 
 def test_a_job_driven_by_its_torque_writes_errors_beside_those_of_its_rows(folder, result):
     assert result["settings"]["controller"]["kind"] == "torque"
-    [run] = result["simulation"]["validation"]
+    [run] = result["validation"]
     assert list(run["horizons"]) == ["0.1", "0.5", "2"]
     for joint, own in run["per_joint"].items():
         assert own["command_rmse"] is None
@@ -79,26 +75,10 @@ def test_a_job_driven_by_its_torque_writes_errors_beside_those_of_its_rows(folde
     assert names == {"armature", "viscous", "coulomb", "offset"}
 
 
-def test_its_report_tells_of_torques_and_not_of_commands(folder):
-    page = (folder / "report.html").read_text()
-    assert "drives from torque-driven simulation" in page
-    assert "torque fit" in page
-    assert "q<sub>ref</sub>" not in page
-    assert "commanded" not in page.split("<h2")[1]
-
-
-def test_what_was_found_is_printed_beside_the_rows(found):
-    said = found[1]
-    assert "errors are position errors over 0.5 s" in " ".join(said.split())
-    heads = said[said.index("not fitted:") :].split("\n")[1:3]
-    assert heads[0].split() == ["joint", "error", "rmse", "torques", "URDF", "constant"]
-    assert heads[1].split() == ["%", "alone", "%", "%", "speed", "%"]
-
-
 def test_its_result_is_validated_on_another_log(folder, job, result, capsys):
     assert main(["validate", str(folder), str(job.parent / "second.csv"), "--json"]) == 0
     again = json.loads(capsys.readouterr().out)
-    [run], [before] = again["validation"], result["simulation"]["validation"]
+    [run], [before] = again["validation"], result["validation"]
     for joint, own in run["per_joint"].items():
         assert own["rmse"] == pytest.approx(before["per_joint"][joint]["rmse"], rel=1e-6)
     assert again["verdict"]["status"] != "not evaluated"
@@ -107,46 +87,3 @@ def test_its_result_is_validated_on_another_log(folder, job, result, capsys):
     both = json.loads(capsys.readouterr().out)
     assert both["verdict"]["status"] == "not evaluated", "one of the two was fitted"
     assert both["validation"][0] == run
-
-
-@pytest.mark.parametrize("is_auto", [False, True])
-def test_what_a_job_says_reaches_the_fit_of_roll_outs(job, monkeypatch, is_auto):
-    class Told(Exception):
-        pass
-
-    def told(*stated, **options):
-        raise Told(stated, options)
-
-    monkeypatch.setattr("robotid.identification.closed_loop.from_commands.identify_loops", told)
-    asked = replace(read_job(job), ignore=("spikes",))
-    logs = tuple(replace(entry, unit="third arm") for entry in asked.identification)
-    asked = replace(asked, identification=logs)
-    asked = replace(asked, terms=(*asked.terms, *([AUTO] if is_auto else [])))
-    with pytest.raises(Told) as error:
-        identify._identify_loops(asked, asked.model(), None)
-    (_, fitted, kept, loop, estimator), options = error.value.args
-    for logs, name in ((fitted, "first.csv"), (kept, "second.csv")):
-        assert [log.name for log in logs] == [name]
-    assert (loop, estimator) == (asked.controller, asked.estimator)
-    assert options["signals"].cutoff == 30.0
-    assert options["ignore"] == ("spikes",)
-    assert options["chooses"] is is_auto
-    assert options["units"] == ["third arm"]
-
-
-def test_its_report_is_made_anew_and_its_replay_shows_torques(folder, job, tmp_path):
-    assert main(["report", str(folder)]) == 0
-    log, page = job.parent / "second.csv", tmp_path / "replay.html"
-    urdf = folder / "planar_2r.identified.urdf"
-    assert main(["replay", str(urdf), str(log), str(folder), "--html", str(page)]) == 0
-    assert page.is_file()
-
-
-def test_gains_beside_a_torque_end_with_one_sentence(job, tmp_path, capsys):
-    text = job.read_text().replace('kind = "torque"', 'kind = "torque"\nkp = 20.0')
-    other = job.parent / "gains.toml"
-    other.write_text(text)
-    assert main(["identify", str(other), "--out", str(tmp_path / "out")]) == 2
-    said = capsys.readouterr().err
-    assert "kp is 20.0, but with kind = 'torque'" in " ".join(said.split())
-    assert not (tmp_path / "out").exists()

@@ -1,18 +1,15 @@
 """robotid.identify by simulation: what run_job finds of the same logs, without files."""
 
 from dataclasses import replace
-from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from helpers.mujoco_plant import plant, torque_log
 
 import robotid
-from robotid.base.exceptions import DataError, SettingsError
-from robotid.cli.work.identify import _entries
-from robotid.cli.work.job import LogEntry
-from robotid.identification.closed_loop.loop_result import LoopIdentification
+from robotid.cli.identify import run_job
+from robotid.cli.job import read_job
+from robotid.identification.closed_loop.loop_result import PositionIdentification
 
 SETTINGS = {"bodies": 0.0, "step": 4e-3, "torques": False}
 
@@ -45,8 +42,8 @@ def test_it_finds_what_a_job_finds_of_the_same_logs(arm, found, tmp_path):
         "[controller]\nkind = 'torque'\n[[identification]]\nlog = 'log.csv'\n"
         "[[validation]]\nlog = 'kept.csv'\n[output]\nreport = false\n"
     )
-    again, _ = robotid.run_job(robotid.read_job(tmp_path / "job.toml"), tmp_path / "out")
-    assert isinstance(found, LoopIdentification)
+    again, _ = run_job(read_job(tmp_path / "job.toml"), tmp_path / "out")
+    assert isinstance(found, PositionIdentification)
     np.testing.assert_allclose(found.standard, again.standard, rtol=1e-6, atol=1e-9)
     assert len(found.validation) == 1
     assert found.verdict.status == again.verdict.status
@@ -57,24 +54,6 @@ def test_it_finds_what_a_job_finds_of_the_same_logs(arm, found, tmp_path):
         assert (entry["start"], entry["end"]) == pytest.approx((log.t[0], log.t[-1]), abs=1e-6)
 
 
-def test_a_saved_result_names_the_windows_of_its_logs_in_files():
-    files = (("a.csv", 2.5, 7.25), ("", 0.0, 3.0), ("b.csv", -1.0, 4.0))
-    runs = [
-        SimpleNamespace(log=SimpleNamespace(path=path, t=np.linspace(start, end, 5)))
-        for path, start, end in files
-    ]
-    wanted = [LogEntry(Path(path), start, end) for path, start, end in files if path]
-    assert list(_entries(runs)) == wanted
-
-
-def test_it_is_saved_and_loaded(found, tmp_path):
-    path = robotid.save_result(found, tmp_path / "out", report=False)
-    loaded = robotid.load_result(path)
-    np.testing.assert_allclose(loaded.parameters, found.standard, rtol=1e-9, atol=1e-12)
-    assert loaded.content["settings"]["controller"]["kind"] == "torque"
-    assert loaded.content["settings"]["estimator"]["step"] == 4e-3
-
-
 def test_what_is_stated_reaches_the_simulation(arm, monkeypatch):
     model, log, kept = arm
     asked = []
@@ -82,7 +61,7 @@ def test_what_is_stated_reaches_the_simulation(arm, monkeypatch):
         "robotid.identification.closed_loop.from_commands.identify_loops",
         lambda *words, **options: asked.append((words, options)),
     )
-    monkeypatch.setattr("robotid.cli.work.in_memory.diagnose", lambda *words: words)
+    monkeypatch.setattr("robotid.cli.identify.diagnose", lambda *words: words)
     choice = robotid.EstimatorSettings("simulation", **SETTINGS)
     signals, told = robotid.SignalSettings(cutoff=7.0), []
 
@@ -111,34 +90,3 @@ def test_what_is_stated_reaches_the_simulation(arm, monkeypatch):
     assert plain[4] == robotid.EstimatorSettings("simulation")
     assert (blind["examined"], blind["chooses"], blind["ignore"]) == ((), True, ())
     assert blind["signals"] == robotid.SignalSettings()
-
-
-def test_what_is_stated_reaches_the_fit(monkeypatch):
-    asked = []
-    monkeypatch.setattr(
-        "robotid.identification.pipeline.identify",
-        lambda *words, **named: asked.append((words, named)),
-    )
-    stated = {
-        "validation": "kept.csv", "signals": robotid.SignalSettings(cutoff=7.0),
-        "estimator": robotid.EstimatorSettings("wls"), "friction": "viscous", "doctor": False,
-        "ignore": ("spikes",), "progress": print,
-    }  # fmt: skip
-    robotid.identify("arm.urdf", "fit.csv", **stated)
-    assert asked == [(("arm.urdf", "fit.csv"), stated)]
-
-
-def test_what_does_not_fit_it_is_refused(arm):
-    model, log, _ = arm
-    with pytest.raises(
-        SettingsError, match="controller is given, but the estimator is 'consistent', wanted 'sim"
-    ):
-        robotid.identify(model, log, controller={"kp": 20.0})
-    with pytest.raises(
-        SettingsError, match="simulation selects the terms of all joints, or of none"
-    ):
-        robotid.identify(model, log, estimator="simulation", friction="stribeck")
-    with pytest.raises(SettingsError, match="controller: kind"):
-        robotid.identify(model, log, estimator="simulation", controller={"kind": "none"})
-    with pytest.raises(DataError, match="has no commanded positions"):
-        robotid.identify(model, log, estimator="simulation", doctor=False)

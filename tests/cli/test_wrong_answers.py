@@ -10,8 +10,8 @@ import pytest
 from helpers.synthetic import exact_log, truth
 
 from robotid.cli import main
-from robotid.cli.work.identify import run_job
-from robotid.cli.work.job import job_from_settings, read_job
+from robotid.cli.identify import run_job
+from robotid.cli.job import job_from_settings, read_job
 from robotid.data.files.read import read_log, write_log
 from robotid.dynamics.prediction import predict
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings

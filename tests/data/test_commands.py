@@ -20,10 +20,10 @@ from helpers.recorders import (
 
 from robotid.base.exceptions import DataError, SettingsError
 from robotid.base.files import file_sha256, log_exists, source_entry
-from robotid.cli.work.convert import convert
+from robotid.cli.convert import convert
 from robotid.data.files.column_names import quantity_of
+from robotid.data.files.formats import write_columns
 from robotid.data.files.read import lay_out, read_log, read_logs, write_log
-from robotid.data.files.table_files import write_columns
 from robotid.data.log import COLUMNS, Log
 from robotid.data.signal_settings import LogSource, LogUnits, SignalSettings
 from robotid.data.transmission import Transmission

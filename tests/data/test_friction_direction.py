@@ -9,11 +9,9 @@ from helpers.synthetic import exact_log, truth
 from scipy.signal import butter, sosfiltfilt
 
 from robotid.base.exceptions import DataError
-from robotid.data.friction_direction import acting_directions
 from robotid.data.log import Log, Trajectory
 from robotid.data.signal_settings import SignalSettings
-from robotid.data.signals import process
-from robotid.data.smoothing import _acting
+from robotid.data.signals import _acting, acting_directions, process
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.drive_columns import friction_directions, friction_speeds
 from robotid.dynamics.factors import join

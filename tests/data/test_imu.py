@@ -8,16 +8,18 @@ import pinocchio as pin
 import pytest
 
 from robotid.base.exceptions import DataError
-from robotid.data.base_motion import BaseColumns, BaseMotion, base_state
-from robotid.data.files.read import read_log, write_log
-from robotid.data.imu_frame import (
+from robotid.data.base_motion import (
+    BaseColumns,
+    BaseMotion,
     ImuFrame,
     ImuMotion,
+    base_state,
     bias_at_rest,
     inertial_state,
     motion_of_imu,
     orientation_of_imu,
 )
+from robotid.data.files.read import read_log, write_log
 from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import process

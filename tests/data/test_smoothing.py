@@ -10,8 +10,15 @@ from scipy.signal import butter
 from robotid.data.base_motion import BaseMotion
 from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
-from robotid.data.signals import process, resolve
-from robotid.data.smoothing import SPLINE, Segment, _Grid, filter_reach, process_segments
+from robotid.data.signals import (
+    SPLINE,
+    Segment,
+    _Grid,
+    filter_reach,
+    process,
+    process_segments,
+    resolve,
+)
 
 RATE = 200.0  # [Hz]
 PART = 700  # rows
@@ -144,7 +151,7 @@ def test_a_filter_reaches_until_nothing_is_left_of_its_slowest_pole(order, cutof
     )
     wanted = 0.03 + 2 * 42.0 * max(slowest(rate), slowest(1e3 * rate)) + 8.0 / cutoff
     assert filter_reach(settings) == pytest.approx(wanted, rel=1e-5)
-    more = replace(settings, wrench_delay=-0.25)
+    more = replace(settings, velocity_delay=-0.25)
     assert filter_reach(more) == pytest.approx(wanted + 0.22, rel=1e-5)
 
 

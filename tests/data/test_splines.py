@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
 
-from robotid.data.splines import cubic_spline
+from robotid.data.filters import cubic_spline
 
 
 @pytest.mark.parametrize("rows", [2, 3, 4, 5, 60])

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from robotid.data.log import Log
-from robotid.data.standing import standing_motion
+from robotid.data.signals import standing_motion
 
 LEAST, FASTEST, HARDEST = np.full(2, 2e-3), np.full(2, 0.4), np.full(2, 0.3)
 

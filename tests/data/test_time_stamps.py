@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from robotid.base.exceptions import DataError
-from robotid.data import time_stamps
-from robotid.data.time_stamps import blocks_of, map_stamps, median_step
+from robotid.data import log
+from robotid.data.log import blocks_of, map_stamps, median_step
 
 
 def test_time_stamps_are_checked_where_blocks_meet():
@@ -32,7 +32,7 @@ def test_the_median_step_is_exact(rng, count):
 
 
 def test_blocks_share_the_stamp_where_they_meet(monkeypatch):
-    monkeypatch.setattr(time_stamps, "_BLOCK", 4)
+    monkeypatch.setattr(log, "_BLOCK", 4)
     t = np.arange(10.0) ** 2
     assert [(row, block.tolist()) for row, block in blocks_of(t)] == [
         (0, t[:5].tolist()),

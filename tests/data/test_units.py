@@ -8,8 +8,8 @@ import pytest
 
 import robotid
 from robotid.base.exceptions import DataError
+from robotid.data.files.formats import write_columns
 from robotid.data.files.read import read_log
-from robotid.data.files.table_files import write_columns
 from robotid.data.log import Log
 from robotid.data.signal_settings import LogUnits
 from robotid.data.units import _velocity_factor, check_units

@@ -1,7 +1,6 @@
 import numpy as np
 import pytest
 
-from robotid.base.exceptions import DataError, SettingsError
 from robotid.design.clearance import _FIRST, Box, Clearance
 from robotid.dynamics.simulation.motions import ProgramMotion, random_fourier
 from robotid.robot.examples import example_urdf
@@ -86,17 +85,6 @@ def test_the_nearest_place_is_a_lower_bound_within_a_millimetre(panda, seed):
     assert margins[pair] < margins.min() + 1e-4  # it is that pair, not one that has a lower bound
 
 
-def test_bad_surroundings_are_refused(slider, tmp_path):
-    with pytest.raises(SettingsError, match="clearance is -1, wanted 0 m or more"):
-        Clearance(slider, least=-1)
-    with pytest.raises(SettingsError, match="box 'post' reaches from 1, 0, 0 to 0, 1, 1"):
-        Clearance(slider, boxes=[Box("post", (1, 0, 0), (0, 1, 1))])
-    bare = SLIDER.replace("collision", "nothing")
-    (tmp_path / "bare.urdf").write_text(bare)
-    with pytest.raises(DataError, match="has no shape that can be read"):
-        Clearance(RobotModel.from_urdf(tmp_path / "bare.urdf"))
-
-
 # a plate that tilts 15 mm above the base: nearer than the clearance in every pose, and its edge
 # hits the base if it tilts far; a pin of the plate goes through the base
 TILTED = """
@@ -145,27 +133,6 @@ def test_links_that_are_built_near_each_other_are_watched_and_those_that_touch_a
     assert far.required == clearance.required[0]
 
 
-def test_links_that_stay_at_their_distance_are_kept_at_half_of_it():
-    # pairs of links of the SO-101 are 9 to 16 mm apart in almost every posture
-    model = RobotModel.from_urdf(example_urdf("so101.urdf"))
-    clearance = Clearance(model, least=0.02)
-    assert not clearance.made_to
-    assert len(clearance.built_near) == 1  # two hulls of one link
-    q = np.random.default_rng(0).uniform(
-        [j.lower for j in model.limits], [j.upper for j in model.limits], (100, 6)
-    )
-    near = np.isfinite(clearance.slack)
-    distance = clearance.near(clearance.placed(q), 0.05, clearance.everything).distance
-    assert near.sum() == 2
-    np.testing.assert_allclose(
-        clearance.required[near], np.median(distance[near], axis=1) / 2, rtol=0.1
-    )
-    assert (clearance.required[~near] == 0.02).all()
-    assert (
-        (distance >= clearance.required[:, None]).all(axis=0)
-    ).any()  # there are postures to be in
-
-
 @pytest.fixture(scope="module", params=["panda", "ur10_robot"])
 def scattered(request):
     """A robot at random, its distances, and how far they are looked at."""
@@ -188,60 +155,6 @@ def test_margins_leave_what_is_kept_and_spared(scattered, spare):
     assert near.any()
     np.testing.assert_allclose(found[near], exactly[near], atol=1e-9)
     assert (found <= exactly + 1e-9).all()  # farther ones have a lower bound
-
-
-def test_hulls_that_are_far_apart_are_left_out(scattered):
-    _, clearance, placed, exact = scattered
-    found = clearance.near(placed, 0.05, clearance.everything)
-    np.testing.assert_array_equal(found.distance[exact < 0.05], exact[exact < 0.05])
-    assert (found.distance[exact >= 0.05] >= 0.05).all()
-    assert (found.distance <= exact + 1e-6).all()
-    assert len(found.pairs) < 1.3 * int((exact < 0.05).sum())
-
-
-def test_directions_that_parted_hulls_before_spare_their_distances(scattered):
-    _, clearance, poses, exact = scattered
-    hints = np.zeros((*exact.shape, 3))
-    first, again = (clearance.near(poses, 0.05, clearance.everything, hints) for _ in range(2))
-    needed = int((exact < 0.05).sum())
-    assert len(first.pairs) > needed + 1
-    assert len(again.pairs) <= needed + 1
-    for found in (first, again):
-        np.testing.assert_array_equal(found.distance[exact < 0.05], exact[exact < 0.05])
-        assert (found.distance <= exact + 1e-6).all()
-    wrong = np.random.default_rng(0).standard_normal(hints.shape)
-    wrong /= np.linalg.norm(wrong, axis=2, keepdims=True)
-    found = clearance.near(poses, 0.05, clearance.everything, wrong)
-    np.testing.assert_array_equal(found.distance[exact < 0.05], exact[exact < 0.05])
-
-
-# an arm that a turning base carries out, farther to one side than to the other
-TURRET = """
-<robot name="turret">
-  <link name="base"/>
-  <link name="arm"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0"
-    iyz="0"/></inertial></link>
-  <link name="ball"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0"
-    iyz="0"/></inertial>
-    <collision><geometry><box size="0.1 0.1 0.1"/></geometry></collision></link>
-  <joint name="turn" type="revolute"><parent link="base"/><child link="arm"/>
-    <axis xyz="0 0 1"/><limit lower="-3" upper="3" velocity="2" effort="100"/></joint>
-  <joint name="reach" type="prismatic"><parent link="arm"/><child link="ball"/>
-    <origin xyz="0 0.3 0"/>
-    <axis xyz="1 0 0"/><limit lower="-1.5" upper="0.2" velocity="2" effort="100"/></joint>
-</robot>"""
-
-
-def test_a_joint_can_move_a_hull_as_far_as_what_slides_beyond_it_reaches(tmp_path):
-    (tmp_path / "turret.urdf").write_text(TURRET)
-    model = RobotModel.from_urdf(tmp_path / "turret.urdf")
-    clearance = Clearance(model, boxes=[Box("post", (2.0, 0.0, -0.2), (2.1, 0.2, 0.2))])
-    (levers,) = clearance._levers
-    # radius of the ball, its way to the joint, the joint's way
-    assert levers == pytest.approx([0.05 * np.sqrt(3) + 0.3 + 1.5, 1.0])
-    # a turn by 1e-3 rad moves the farthest corner by less than that, but hardly so
-    corner = np.hypot(1.5 + 0.05, 0.3 + 0.05)
-    assert 0.8 * levers[0] < corner < levers[0]
 
 
 def test_a_motion_that_swings_between_the_first_samples_is_followed_by_its_acceleration(slider):

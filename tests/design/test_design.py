@@ -11,7 +11,6 @@ from robotid.design.limits import LIMITS, MotionLimits
 from robotid.dynamics.torque import joint_torque_regressor
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
-from robotid.robot.prior import prior_spread
 
 WRIST = ["wrist_1_joint", "wrist_2_joint", "wrist_3_joint"]
 
@@ -60,17 +59,6 @@ def test_the_gradient_of_the_lagrangian_is_that_of_differences(designer, wrist, 
     up, down = (designer._lagrangian(C + s * h * D, multipliers)[0] for s in (1, -1))
     slope = np.sum(designer._lagrangian(C, multipliers)[1] * D)
     assert slope == pytest.approx((up - down) / (2 * h), rel=1e-4)
-
-
-def test_a_design_tells_more_than_random_motions_within_the_same_limits(designer, design):
-    rng = np.random.default_rng(1)
-    random = [designer._objective(designer.random(rng)) for _ in range(100)]
-    assert design.objective < min(random) - 0.2
-    assert design.used.max() <= 1.0
-    assert (design.used.max(axis=1) > 0.9).sum() >= 2  # it goes to its limits
-    times, objectives = zip(*design.history, strict=True)
-    assert list(times) == sorted(times)
-    assert min(objectives) < objectives[0]
 
 
 def test_a_design_keeps_its_limits_between_its_instants(wrist, designer, design):
@@ -156,14 +144,6 @@ def test_what_keeps_a_robot_from_resting_is_named(wrist, designer):
         replace(designer, clearance=inside).design(np.random.default_rng(0), starts=1)
 
 
-def test_spread_and_noise_are_those_of_a_preview(wrist, designer):
-    speed = designer.limits.sizes[1]
-    usual = 0.3 * np.array([[54.0] * 3, speed, speed * 2 * np.pi / (4.0 / 3)])
-    K = designer.information.mapping.K
-    expected = np.linalg.norm(K * prior_spread(wrist, usual**2, 1), axis=1)
-    np.testing.assert_allclose(designer.spread, expected)
-
-
 def test_a_motion_whose_middle_collides_is_mixed_with_one_that_keeps_the_limits(wrist, designer):
     wall = Box("wall", (-2.0, 0.35, -2.0), (2.0, 0.40, 2.0))
     near = replace(designer, clearance=Clearance(wrist, least=0.01, boxes=[wall]))
@@ -179,33 +159,3 @@ def test_a_motion_whose_middle_collides_is_mixed_with_one_that_keeps_the_limits(
     assert margin >= 0.0
     used, margin, _ = near._constraints(mixed + 2e-3 * (C - kept), 1.0)
     assert np.abs(used).max() > 0.995 or margin < 1e-3  # it can hardly go farther
-
-
-def test_multipliers_push_as_hard_on_a_finer_grid():
-    limits = np.random.default_rng(0).uniform(0.0, 0.1, (6, 61, 3))
-    distances = np.random.default_rng(1).uniform(0.0, 0.1, (4, 61))
-    fine = Multipliers(0.2, limits, distances).finer(3)
-    assert fine.limits.shape == (6, 181, 3)
-    np.testing.assert_allclose(fine.limits[:, ::3], limits / 3)
-    between = (2 * distances[:, :-1] + distances[:, 1:]) / 9
-    np.testing.assert_allclose(fine.distances[:, 1::3], between)
-    assert fine.weight == pytest.approx(0.2 / 3)
-
-
-def test_distances_without_a_cost_are_not_looked_at_and_change_nothing(wrist, designer):
-    wall = Box("wall", (-2.0, 0.35, -2.0), (2.0, 0.40, 2.0))
-    around = Clearance(wrist, least=0.01, boxes=[wall])
-    near, rng = replace(designer, clearance=around), np.random.default_rng(2)
-    C = near.random(rng)
-    placed = around.placed((designer._functions @ C)[0])
-    pairs = len(around.pairs), 43
-    held = Multipliers(0.2, 0.0, rng.uniform(0.0, 0.05, pairs) * (rng.random(pairs) < 0.5))
-    aim = near._required
-    some, every = (
-        held.of_distances(around.near(placed, within).distance, aim)
-        for within in (held.distance_without_cost(aim), np.inf)
-    )
-    assert some[0] == pytest.approx(every[0], rel=1e-12)
-    np.testing.assert_allclose(some[1], every[1], atol=1e-12)
-    looked_at = len(around.near(placed, held.distance_without_cost(aim)).pairs)
-    assert 0 < looked_at < len(around.near(placed, np.inf).pairs) / 2

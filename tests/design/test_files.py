@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 import yaml
 
-from robotid.base.exceptions import SettingsError
-from robotid.data.files.table_files import open_table
+from robotid.data.files.formats import open_table
 from robotid.data.signal_settings import LogSource
 from robotid.design.basis import DesignedMotion, FourierBasis
 from robotid.design.motion_files import write_motion
@@ -56,14 +55,6 @@ def test_ros_reads_it_as_a_joint_trajectory(motion, tmp_path):
             np.testing.assert_allclose(point[name], values[0], atol=1e-6)
 
 
-def test_joints_of_any_name_are_names_in_yaml(motion, tmp_path):
-    names = ("yes", "12", "a, b", '"]: {', "axis \u2028 \U0001f916", "elbow_joint")
-    path = write_motion(motion, names, 2.0, 10.0, tmp_path / "m.yaml")
-    text = path.read_text(encoding="utf-8")
-    assert yaml.safe_load(text)["joint_names"] == list(names)
-    assert text.splitlines()[0].endswith(", elbow_joint]")
-
-
 def test_a_ur_is_told_every_8_ms(motion, tmp_path):
     lines = write_motion(motion, JOINTS, 2.0, 10.0, tmp_path / "m.script").read_text().splitlines()
     moves = [line for line in lines if "servoj" in line]
@@ -72,11 +63,3 @@ def test_a_ur_is_told_every_8_ms(motion, tmp_path):
     q = motion.evaluate(np.array([1.0]))[0][0]
     np.testing.assert_allclose(np.array(numbers.split(","), dtype=float), q, atol=1e-6)
     assert lines[1].startswith(f"  movej([{motion.evaluate(np.zeros(1))[0][0, 0]:.6f}, ")
-
-
-def test_what_cannot_be_written_is_refused(motion, tmp_path):
-    with pytest.raises(SettingsError, match="this robot has 2 joints, wanted 6"):
-        write_motion(motion, JOINTS[:2], 2.0, 10.0, tmp_path / "m.script")
-    with pytest.raises(SettingsError, match="rate is 0, wanted a positive number"):
-        write_motion(motion, JOINTS, 2.0, 0.0, tmp_path / "m.csv")
-    assert not list(tmp_path.iterdir())

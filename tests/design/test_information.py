@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from helpers.robots import ROBOTS, WRIST
 
-from robotid.base.exceptions import DataError, SettingsError
+from robotid.base.exceptions import DataError
 from robotid.design.information import CRITERIA, MotionInformation, criterion
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.drive_columns import friction_speeds
@@ -92,11 +92,6 @@ def test_a_singular_matrix_has_the_determinant_of_rounding_errors():
     value, gradient = criterion("D", np.diag([1.0, 0.0, 4.0]))
     assert value == pytest.approx(-np.log(4.0 * eps) / 3)
     np.testing.assert_allclose(gradient, np.diag([-1.0, -1.0 / eps, -0.25]) / 3)
-
-
-def test_a_criterion_that_there_is_not_is_refused():
-    with pytest.raises(SettingsError, match="criterion is 'F', wanted one of D, A, E, condition"):
-        criterion("F", np.eye(2))
 
 
 def test_gravity_at_a_joint_is_shared_by_the_joints_of_its_chain():

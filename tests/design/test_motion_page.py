@@ -2,16 +2,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.pages import chart
 
 from robotid.design.basis import FourierBasis
 from robotid.design.clearance import Box, Clearance
 from robotid.design.design import Designer
 from robotid.design.limits import LIMITS, MotionLimits
-from robotid.dynamics.prediction import predict_instants
-from robotid.output.report.motion_page import (
-    _distance_chart,
-)
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 
@@ -56,16 +51,6 @@ def test_a_course_has_the_values_of_the_motion_and_shares_of_its_limits(course):
     assert {-1.0, 1.0} <= signs
 
 
-def test_torques_of_a_course_are_those_of_the_bodies_and_the_friction_assumed(course):
-    model, designer, _, found = course
-    q, v, a = found.values[:3]
-    still = found.values[4] - predict_instants(model, model.standard_parameters(), q, v, a)
-    size = np.abs(still).max(axis=0)
-    assert (size > 0.02 * 54.0).all()  # friction of 5 %, at each joint, for 54 N m
-    assert (size < 0.15 * 54.0).all()
-    assert designer.limits.sizes[4] == pytest.approx(0.9 * np.array([54.0, 54.0, 54.0]))
-
-
 def test_the_distance_of_a_course_is_that_of_all_pairs(course):
     *_, found = course
     around = found.clearance
@@ -89,23 +74,3 @@ def test_the_distance_of_a_course_is_that_of_all_pairs(course):
     assert not changes[~np.array(last)].any()
     nothing = np.zeros(len(around.pairs), dtype=bool)
     assert np.isinf(found.nearness(nothing)[0]).all()
-
-
-def test_distances_that_do_not_change_are_not_drawn(course):
-    model, *_, found = course
-    around, values = found.clearance, found.values[:, ::10].copy()
-    values[0, :, :2] = values[0, 0, :2]  # the last joint moves alone
-    turned = replace(found, t=found.t[::10], values=values)
-    what = chart(_distance_chart(model, turned, around), "distance of the two nearest hulls")
-    changes = turned.changes(around)
-    exact = around.near(around.placed(values[0]), np.inf, around.everything).distance
-    links = np.array([set(pair) <= set(model.tree.links) for pair in around.named])
-    near = np.isfinite(around.slack)
-    assert (~changes & ~links).any()
-    shown = {series["label"]: series["y"] for series in what["series"]}
-    np.testing.assert_allclose(shown.pop("clearance"), 30.0, rtol=1e-3)
-    wanted = {"links": links & ~near, "floor and boxes": ~links, "links close by design": near}
-    wanted = {label: own & changes for label, own in wanted.items() if (own & changes).any()}
-    assert list(shown) == list(wanted)
-    for label, own in wanted.items():
-        np.testing.assert_allclose(shown[label], 1e3 * exact[own].min(axis=0), rtol=2e-3)

@@ -120,25 +120,6 @@ def test_standard_errors_are_those_of_both_runs_fitted_at_once(designer, found):
     np.testing.assert_allclose(numbers, [mass, centre, inertia], rtol=0.12)  # of two digits
 
 
-@pytest.mark.parametrize("k", range(10))
-def test_the_largest_of_the_errors_of_centre_and_inertia_are_said(found, k):
-    error = np.full(10, 0.01)
-    error[k] = 0.5
-    wanted = [error[0], 0.5 if 1 <= k < 4 else 0.01, 0.5 if k >= 4 else 0.01]
-    [said] = [x for x in replace(found, std_error=error).described() if "standard errors" in x]
-    assert [float(x) for x in re.findall(r" ([\d.e-]+) kg", said)] == wanted
-
-
-def test_a_motion_of_stated_joints_says_what_it_leaves_open(designer):
-    few = design_payload(designer, RNG(0), LOAD, moving=WRIST[-1:], starts=1, seconds=0.01)
-    assert few.moving == WRIST[-1:]
-    assert few.determination.rank == 3
-    assert not few.fewer
-    words = " ".join(few.described())
-    assert "Not determined completely: tool0.m, tool0.mcz, " in words
-    assert "standard errors" not in words
-
-
 def test_what_cannot_be_asked_for_is_refused(designer):
     with pytest.raises(SettingsError, match="base_link does not move: no torque depends"):
         design_payload(designer, RNG(0), Payload(link="base_link"))

@@ -1,22 +1,11 @@
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 
-from robotid.design import routes
 from robotid.design.basis import FourierBasis
 from robotid.design.clearance import Clearance
 from robotid.design.design import Designer
 from robotid.design.limits import LIMITS, MotionLimits
-from robotid.design.routes import (
-    _PLACES,
-    Route,
-    _free_range,
-    _legs,
-    _sweeps,
-    design_stands,
-    design_sweeps,
-)
+from robotid.design.routes import _PLACES, Route, _free_range, _sweeps, design_stands, design_sweeps
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 
@@ -98,30 +87,6 @@ def test_sweeps_go_both_ways_at_each_speed_while_the_others_rest(designer, rng):
         assert np.abs(np.delete(steady, j, axis=1)).max() == 0.0
 
 
-def test_stands_weigh_torques_by_their_noise_over_two_seconds(monkeypatch):
-    """Six of nine postures, one by one: each adds most to log det of the information."""
-    rng = np.random.default_rng(3)
-    q, W = rng.uniform(-3.0, 3.0, (9, 2)), rng.standard_normal((2, 3, 9))
-    noise, spread = np.array([4.0, 0.01]), np.array([1.0, 2.0, 0.5])  # [(N m)^2 s]
-    W[1] *= 0.05
-    about = SimpleNamespace(
-        postures=SimpleNamespace(resting=lambda rng, count: q), noise=noise, spread=spread,
-        information=SimpleNamespace(rows=lambda *_: SimpleNamespace(W=W)), known=np.eye(3),
-    )  # fmt: skip
-    monkeypatch.setattr(routes, "_visited", lambda designer, places: places)
-    F, wanted = np.eye(3), []
-    of = [(W[..., k] * spread).T @ np.diag(2.0 / noise) @ (W[..., k] * spread) for k in range(9)]
-    for _ in range(6):
-        left = [k for k in range(9) if k not in wanted]
-        wanted.append(max(left, key=lambda k: np.linalg.det(F + of[k])))
-        F = F + of[wanted[-1]]
-    places = design_stands(about, None, count=6)
-    np.testing.assert_array_equal(places[0], q[wanted[0]])
-    assert sorted(places[:, 0]) == sorted(q[wanted, 0])
-    for k in range(1, 6):  # from each to the nearest that is left
-        assert np.abs(places[k:] - places[k - 1]).max(axis=1).argmin() == 0
-
-
 def test_stands_tell_more_of_gravity_than_random_ones(designer):
     design = design_stands(designer, np.random.default_rng(0), count=6)
     assert design.used.max() <= 1.0
@@ -139,14 +104,3 @@ def test_stands_tell_more_of_gravity_than_random_ones(designer):
     some = designer.postures.resting(rng)
     random = [told(rng.choice(some, len(places), replace=False)) for _ in range(50)]
     assert told(places) > max(random)
-
-
-def test_a_leg_has_half_the_speed_limit_of_the_slowest_joint_and_at_least_a_second(designer):
-    fastest = designer.limits.sizes[1]
-    way = np.array([0.4, -1.5, 0.9]) * fastest
-    route = _legs(designer, np.array([0.0 * way, way, 1.01 * way]))
-    np.testing.assert_allclose(route.times, [2.0 * 1.5 / 0.5, 1.0])
-    np.testing.assert_array_equal(route.holds, 2.0)
-    t = np.linspace(2.0, 8.0, 601)  # the first leg, after 2 s at rest
-    v = np.abs(route.evaluate(t)[1]).max(axis=0)
-    np.testing.assert_allclose(v, 0.5 * np.abs(way) / 1.5, rtol=1e-9)

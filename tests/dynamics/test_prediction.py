@@ -1,11 +1,13 @@
-"""Predicted torques against the regressor times the parameters."""
+"""Predicted torques against the regressor times the parameters, slopes against differences."""
 
 import numpy as np
+import pinocchio as pin
 import pytest
 from helpers.robots import ROBOTS, motion
+from helpers.synthetic import truth
 
 from robotid.base.exceptions import DataError
-from robotid.dynamics import prediction
+from robotid.data.log import Trajectory
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.drive_columns import friction_speeds
 from robotid.dynamics.prediction import (
@@ -54,21 +56,6 @@ def test_predicted_torque_is_the_regressor_times_the_parameters(case, rng):
     assert_is_regressor_times(model, [possible, base_only], trajectory, compiled=True)
 
 
-def test_inverse_dynamics_takes_few_possible_robots_and_rows_the_rest(panda, rng, monkeypatch):
-    calls = []
-    real = prediction.inverse_dynamics
-    monkeypatch.setattr(
-        prediction, "inverse_dynamics", lambda *args: calls.append(args) or real(*args)
-    )
-    trajectory = motion(panda, rng, 5)
-    possible, heavier, base_only = vectors(panda, rng)
-    predict(panda, [possible, heavier, possible], trajectory)
-    assert len(calls) == 3
-    predict(panda, [possible] * 4, trajectory)
-    predict(panda, [possible, base_only], trajectory)
-    assert len(calls) == 3
-
-
 @pytest.mark.parametrize("mass", [0.0, -0.5, 1e-9])
 def test_bodies_that_are_none_keep_their_digits(mass, ur5, rng):
     trajectory = motion(ur5, rng, 20)
@@ -77,35 +64,6 @@ def test_bodies_that_are_none_keep_their_digits(mass, ur5, rng):
     assert_is_regressor_times(ur5, [pi], trajectory, compiled=False)
     pi[11:14] = 0.0
     assert_is_regressor_times(ur5, [pi], trajectory, compiled=False)
-
-
-def test_slopes_of_bodies_that_are_none_are_those_of_differences(ur5, rng):
-    m, h, n = motion(ur5, rng, 3), 1e-6, len(ur5.joints)
-    pi = ur5.standard_parameters()
-    pi[10:20] = [-0.5, 0.3, -0.2, 0.5, 0.1, 0.0, 0.2, 0.0, 0.0, 0.1]
-    found = body_slopes(ur5, pi, m)
-    np.testing.assert_allclose(body_slopes_by_position(ur5, pi, m), found.by_q, atol=1e-9)
-    state = (m.q, m.v, m.a)
-    for k, slope in enumerate((found.by_q, found.by_v, found.by_a)):
-        for j in range(n):
-            up, down = ([x + s * h * (i == k) * np.eye(n)[j] for i, x in enumerate(state)]
-                        for s in (1, -1))  # fmt: skip
-            rows = [joint_torque_regressor(ur5, *moved) @ pi for moved in (up, down)]
-            wanted = ((rows[0] - rows[1]) / (2 * h)).reshape(-1, n)
-            np.testing.assert_allclose(slope[:, :, j], wanted, atol=1e-6 * np.abs(wanted).max())
-    for axis in range(3):
-        g = np.array([0.0, 0.0, -9.81]) + np.eye(3)[axis]
-        other = RobotModel.from_urdf(example_urdf("ur5_robot.urdf"), gravity=tuple(g))
-        rows = [joint_torque_regressor(robot, *state) @ pi for robot in (other, ur5)]
-        wanted = (rows[0] - rows[1]).reshape(-1, n)
-        np.testing.assert_allclose(
-            found.by_gravity[:, :, axis], wanted, atol=1e-9 * np.abs(wanted).max()
-        )
-
-
-def test_other_joints_are_refused(ur5, panda, rng):
-    with pytest.raises(DataError, match="the trajectory has the joints"):
-        predict(ur5, [ur5.standard_parameters()], motion(panda, rng, 5))
 
 
 def test_an_instant_is_predicted_as_by_inverse_dynamics_and_the_formulas_of_friction(ur5, rng):
@@ -159,3 +117,104 @@ def test_instants_of_another_shape_are_refused(ur5):
         predict_instants(ur5, pi, np.zeros(5), np.zeros(6))
     with pytest.raises(DataError, match=r"q has shape \(1, 2, 6\), wanted \(6,\) or \(N, 6\)"):
         predict_instants(ur5, pi, np.zeros((1, 2, 6)))
+
+
+SLOPED = {
+    "in another order": (
+        "ur5_robot.urdf",
+        {"joints": ["wrist_1_joint", "shoulder_lift_joint", "elbow_joint"],
+         "locked": {"wrist_2_joint": 0.7}, "gravity": (1.0, -2.0, -9.0)},
+    ),
+    "fingers that slide together": (
+        "panda.urdf",
+        {"joints": ["panda_finger_joint1", "panda_joint6", "panda_joint4"], "mimic": "coupled"},
+    ),
+    "two legs": (
+        "solo12.urdf",
+        {"joints": ["HR_HFE", "FL_HAA", "FL_KFE"], "locked": {"FL_HFE": 0.4, "HR_HAA": -0.3}},
+    ),
+}  # fmt: skip
+H = 1e-6
+
+
+@pytest.fixture(params=SLOPED)
+def case(request):
+    file, options = SLOPED[request.param]
+    model = RobotModel.from_urdf(example_urdf(file), **options)
+    q, v, a = np.random.default_rng(3).uniform(-1.2, 1.2, (3, 4, len(model.joints)))
+    rows = Trajectory(
+        np.arange(4.0), q, v, a, np.zeros_like(q), model.joints, None, np.zeros(4, dtype=int)
+    )
+    return model, truth(model), rows
+
+
+def torque(model, pi, q, v, a, change=lambda engine: None):
+    """Return the torques in the rows of the joints, of a robot that is changed first."""
+    engine, G = model.with_parameters(pi).pin_model.copy(), model.velocity_map
+    change(engine)
+    data = engine.createData()
+    rows = zip(model.configurations(q), v @ G.T, a @ G.T, strict=True)
+    return np.array([G.T @ pin.rnea(engine, data, *row) for row in rows])
+
+
+def test_slopes_are_those_of_differences_by_motion_and_gravity(case):
+    model, pi, m = case
+    q, v, a = m.q, m.v, m.a
+    found = body_slopes(model, pi, m)
+    n = len(model.joints)
+    np.testing.assert_allclose(body_slopes_by_position(model, pi, m), found.by_q, atol=1e-10)
+    assert [x.shape for x in found] == [(4, n, n)] * 3 + [(4, n, 3), (4, n, n, 3)]
+
+    def close(slope, up, down):
+        exact = (up - down) / (2 * H)
+        np.testing.assert_allclose(slope, exact, atol=1e-6 * max(1.0, np.abs(exact).max()))
+
+    for kind, slopes in enumerate((found.by_q, found.by_v, found.by_a)):
+        for j in range(n):
+            ends = []
+            for side in (H, -H):
+                x = [q.copy(), v.copy(), a.copy()]
+                x[kind][:, j] += side
+                ends.append(torque(model, pi, *x))
+            close(slopes[:, :, j], *ends)
+    for axis in np.eye(3):
+
+        def pulled(side, axis=axis):
+            def change(engine):
+                engine.gravity.linear = engine.gravity.linear + side * axis
+
+            return torque(model, pi, q, v, a, change)
+
+        close(found.by_gravity @ axis, pulled(H), pulled(-H))
+
+
+def test_slopes_by_the_origin_of_each_joint_are_those_of_differences(case):
+    model, pi, m = case
+    q, v, a = m.q, m.v, m.a
+    found = body_slopes(model, pi, m).by_origin
+    for j, joint in enumerate(model.joints):
+        for k in range(3):
+
+            def moved(side, joint=joint, k=k):
+                def change(engine):
+                    i = engine.getJointId(joint)
+                    place = engine.jointPlacements[i].copy()
+                    shift = np.zeros(3)
+                    shift[k] = side
+                    place.translation = place.translation + shift
+                    engine.jointPlacements[i] = place
+
+                return torque(model, pi, q, v, a, change)
+
+            exact = (moved(H) - moved(-H)) / (2 * H)
+            np.testing.assert_allclose(found[:, :, j, k], exact, atol=1e-6)
+    assert np.abs(found).max() > 0.1
+
+
+def test_slopes_are_linear_in_bodies_that_may_be_none(ur5, rng):
+    m, pi = motion(ur5, rng, 3), ur5.standard_parameters()
+    none = np.zeros_like(pi)
+    none[10:20] = [-0.5, 0.3, -0.2, 0.5, 0.1, 0.0, 0.2, 0.0, 0.0, 0.1]
+    found, parts = body_slopes(ur5, pi + none, m), (body_slopes(ur5, x, m) for x in (pi, none))
+    for slope, one, other in zip(found, *parts, strict=True):
+        np.testing.assert_allclose(slope, one + other, atol=1e-9)

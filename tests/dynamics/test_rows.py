@@ -7,8 +7,7 @@ import pytest
 from helpers.robots import ROBOTS, motion, possible_parameters
 
 from robotid.dynamics import rows
-from robotid.dynamics.memory import remember
-from robotid.dynamics.prediction import predict
+from robotid.dynamics.prediction import predict, remember
 from robotid.dynamics.rows import keep_inertial_rows, kept_rows
 from robotid.dynamics.torque import build_problem, trajectory_regressor
 from robotid.robot.drives import LoadFriction

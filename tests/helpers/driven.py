@@ -7,16 +7,16 @@ import numpy as np
 from helpers.synthetic import perfect
 from robotid.data.signal_settings import SignalSettings
 from robotid.dynamics.base_parameters import structural_mapping
-from robotid.dynamics.simulation.closed_loop import Noise
 from robotid.dynamics.simulation.motions import random_fourier
 from robotid.dynamics.simulation.simulation_settings import Sensors
+from robotid.dynamics.simulation.simulator import Noise
 from robotid.dynamics.simulation.truth import another_robot
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
 from robotid.estimation.fitting.recorded import Recordings
 from robotid.estimation.fitting.survey import hold_log
 from robotid.identification.pipeline import identify, with_drives
+from robotid.robot.drives import AUTO, wanted_families
 from robotid.robot.examples import example_urdf
-from robotid.robot.families import AUTO, wanted_families
 from robotid.robot.model import RobotModel
 
 EXACT = SignalSettings(cutoff=None, trim=0.0)

@@ -48,7 +48,6 @@ ignore = ["payload_change"]
 [estimator]
 name = "consistent"
 prior_weight = 0.4
-margin = 2e-4
 draws = 20
 [estimator.constraints]
 mass = { hand = [1.0, 1.65] }

@@ -26,7 +26,7 @@ from helpers.paths import URDF as URDF_FOLDER
 from helpers.recorders import messages_of, write_bag1, write_bag2, write_mcap
 from helpers.synthetic import exact_log, truth
 from robotid.cli import main
-from robotid.cli.work.job import Job
+from robotid.cli.job import Job
 from robotid.data.files.read import write_log
 from robotid.estimation.fitting.estimator_settings import ESTIMATORS
 from robotid.robot.model import RobotModel

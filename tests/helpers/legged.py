@@ -6,8 +6,7 @@ import mujoco
 import numpy as np
 import pinocchio as pin
 
-from robotid.data.base_motion import BaseMotion
-from robotid.data.imu_frame import ImuFrame, motion_of_imu
+from robotid.data.base_motion import BaseMotion, ImuFrame, motion_of_imu
 from robotid.data.log import Log
 from robotid.robot.constraints import Contact, frame_id
 from robotid.robot.parameters import pseudo_inertia

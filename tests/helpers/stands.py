@@ -1,10 +1,11 @@
 """Motions of a robot on its feet: the trunk sways, single legs swing."""
 
 import numpy as np
+import pinocchio as pin
 
 from robotid.data.base_motion import quaternions_of_angles
 from robotid.dynamics.simulation.motions import FloatingMotion
-from robotid.dynamics.simulation.stand import on_feet
+from robotid.robot.constraints import frame_id
 
 
 def stand(model, middle, height, rng, *, parts=4, length=3.0, rate=100.0, size=1.0):
@@ -41,3 +42,36 @@ def stand(model, middle, height, rng, *, parts=4, length=3.0, rate=100.0, size=1
             q[k, own] += 0.2 * wave[:, 6:][:, own]
     pose = np.hstack([pose[:, :3] + [0, 0, height], quaternions_of_angles(pose[:, 3:])])
     return FloatingMotion(t, pose, on_feet(model, pose, q, touching), touching)
+
+
+def on_feet(model, pose, q, contacts):
+    """Return the joint positions nearest to q with which feet on the ground do not move, (N, n).
+
+    A foot remains where it is at the first sample of its contact.
+    """
+    pin_model, data = model.pin_model, model.pin_model.createData()
+    ids = [frame_id(pin_model, x.frame) for x in model.contacts]
+    found, change, places = np.empty_like(q), np.zeros(q.shape[1]), {}
+
+    def placed(base, x):
+        (configuration,) = model.configurations(np.append(base, x)[None])
+        pin.computeJointJacobians(pin_model, data, configuration)
+        pin.updateFramePlacements(pin_model, data)
+        return {i: data.oMf[at].translation.copy() for i, at in enumerate(ids)}
+
+    for k, (base, wanted, touching) in enumerate(zip(pose, q, contacts, strict=True)):
+        x = wanted + change
+        places = {i: at for i, at in (placed(base, x) | places).items() if touching[i]}
+        for _ in range(30):
+            now = placed(base, x)
+            error = np.concatenate([np.empty(0), *(now[i] - at for i, at in places.items())])
+            if np.abs(error).max(initial=0.0) < 1e-10:
+                break
+            axes = pin.LOCAL_WORLD_ALIGNED
+            rows = [pin.getFrameJacobian(pin_model, data, ids[i], axes)[:3] for i in places]
+            J = (np.vstack(rows) @ model.velocity_map)[:, 6:]
+            x = x - np.linalg.lstsq(J, error, rcond=1e-8)[0]
+        else:
+            raise ValueError(f"sample {k}: the feet on the ground cannot remain where they are")
+        found[k], change = x, x - wanted
+    return found

@@ -9,10 +9,9 @@ from helpers.legged import recorded, with_other_bodies
 from helpers.paths import JOBS
 
 import robotid
-from robotid.cli.work.identify import run_job
-from robotid.cli.work.job import read_job
-from robotid.data.base_motion import BaseMotion, in_base
-from robotid.data.signal_settings import BaseSource
+from robotid.cli.identify import run_job
+from robotid.cli.job import read_job
+from robotid.data.base_motion import BaseMotion
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.estimation.estimators import WLS
 from robotid.estimation.fitting.estimator_settings import ConsistentSettings
@@ -101,23 +100,6 @@ def test_unseen_motion_is_predicted_and_judged_by_the_joints(found):
     ratio = result.standard[masses].sum() / before[masses].sum()
     assert [check.scale, check.factor] == pytest.approx([ratio, ratio])
     assert check.is_total_determined
-
-
-def test_a_report_has_the_friction_of_joints_and_none_of_the_base(found):
-    from robotid.output.report.pictures import friction_chart
-    from robotid.output.report.plot_sections import friction_section
-
-    result, _, _ = found
-    assert friction_chart(result, "base.mz") is None
-    shown = friction_section(result, ["base.mz"])
-    assert "base.mz: no drive." in str(shown)
-    joint = result.model.joints[-1]
-    curve = friction_chart(result, joint)
-    fitted = dict(zip(result.model.layout.names, result.standard, strict=True))
-    steady = curve.series[2].y
-    line = fitted[f"{joint}.viscous"] * curve.x
-    is_shown = np.isfinite(steady)
-    np.testing.assert_allclose(steady[is_shown], line[is_shown], atol=1e-9)
 
 
 def test_the_residual_at_the_truth_is_the_noise(found):
@@ -232,33 +214,3 @@ def test_a_trotting_quadruped_with_unknown_forces(recordings, monkeypatch, tmp_p
     assert "points of contact uncertain by 0.0022 m" in result.errors.method
     assert covered.mean() > 0.88  # 0.4 without the errors of the points of contact
     assert result.verdict.status == "good"
-
-
-def rough(job):
-    return replace(job, estimator=ConsistentSettings(prior_weight=1.0, draws=0), report=False)
-
-
-def test_a_humanoid_is_weighed_by_its_feet(recordings, monkeypatch, tmp_path):
-    monkeypatch.setenv("ROBOTID_DATA", str(recordings))
-    job = rough(read_job(JOBS / "legged" / "icub.toml"))
-    fitted, kept = replace(job.identification[0], end=7.0), replace(job.validation[0], end=16.0)
-    job = replace(job, identification=(fitted,), validation=(kept,))
-    result, content = run_job(job, tmp_path)
-    (recording,) = (e.recording for e in result.fitted)
-    force = sum(recording.log.wrenches.values()).mean() / 9.81
-    assert content["consistency"]["total_mass"] == pytest.approx(force, rel=0.01)
-    assert recording.mask[:, :6].mean() > 0.9  # in some poses a row is all force
-    assert not recording.mask[:, 6:].any()
-    assert set(result.verdict.joints) == set(result.model.row_names[:6])
-
-
-def test_a_job_states_the_axes_of_the_velocities(recordings, monkeypatch):
-    monkeypatch.setenv("ROBOTID_DATA", str(recordings))
-    job = read_job(JOBS / "legged" / "solo12.toml")
-    world = replace(job, base=BaseSource(twist="world"))
-    entry = replace(job.identification[0], end=2.0)
-    one, other = (own.read(entry, own.model()).base for own in (job, world))
-    for part in (slice(0, 3), slice(3, 6)):
-        turned = in_base(one.pose[:, 3:], one.twist[:, part])
-        np.testing.assert_allclose(other.twist[:, part], turned)
-    assert not np.allclose(other.twist, one.twist)

@@ -6,7 +6,6 @@ from helpers.stands import stand
 
 from robotid.base.exceptions import SettingsError
 from robotid.data.signal_settings import SignalSettings
-from robotid.dynamics.simulation.closed_loop import simulate
 from robotid.dynamics.simulation.simulation_settings import (
     Controller,
     Noise,
@@ -14,6 +13,7 @@ from robotid.dynamics.simulation.simulation_settings import (
     Sensors,
     Simulation,
 )
+from robotid.dynamics.simulation.simulator import simulate
 from robotid.estimation.estimators import two_runs
 from robotid.identification.payload_fit import identify_payload
 from robotid.robot.constraints import Contact

@@ -13,7 +13,6 @@ from robotid.data.signal_settings import SignalSettings
 from robotid.design.previews import preview
 from robotid.dynamics.constraint_rows import constraint_jacobian
 from robotid.dynamics.torque import joint_torque_regressor
-from robotid.output.files.entries import build_preview
 from robotid.robot.constraints import Contact
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
@@ -69,14 +68,6 @@ def test_the_errors_are_those_of_least_squares_with_noise_in_the_joints(planned)
     np.testing.assert_allclose(found_white.base_error, wanted, rtol=1e-5)
     level = np.einsum("kjj,j->", P[:, 6:, 6:], size**2) / np.trace(P, axis1=1, axis2=2).sum()
     np.testing.assert_allclose(found.expected.estimate.sigma, np.sqrt(level), rtol=0.01)
-
-
-def test_the_content_has_the_joints_alone(planned):
-    model, log = planned
-    content = build_preview(preview(model, log, signals=RAW, estimator="wls"))
-    assert [*content["torque"]] == [*content["noise"]] == list(model.joints)
-    assert content["structure"]["base"] == len(content["base_parameters"])
-    assert all(entry["std_error"] > 0 for entry in content["base_parameters"])
 
 
 def test_a_floating_base_needs_contacts(planned):

@@ -10,11 +10,11 @@ import pytest
 from helpers.driven import arm
 from helpers.synthetic import exact_log, truth
 
-from robotid.base.exceptions import DataError, SettingsError
-from robotid.cli.work.identify import run_job
-from robotid.cli.work.job import Job, LogEntry, job_from_settings, read_job
-from robotid.cli.work.logs import survey_logs
-from robotid.cli.work.validate import validate_result
+from robotid.base.exceptions import SettingsError
+from robotid.cli.identify import run_job
+from robotid.cli.job import Job, LogEntry, job_from_settings
+from robotid.cli.logs import survey_logs
+from robotid.cli.validate import validate
 from robotid.data.files.read import read_log, write_log
 from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
@@ -46,7 +46,7 @@ def noisy_job(tmp_path_factory):
 
 @pytest.fixture
 def without_doctor(monkeypatch):
-    monkeypatch.setattr("robotid.cli.work.identify.examine_logs", lambda *_: ())
+    monkeypatch.setattr("robotid.cli.identify.examine_logs", lambda *_: ())
 
 
 def _reasons(content):
@@ -134,23 +134,9 @@ def test_a_job_in_pieces_ends_where_it_ends_in_memory(noisy_job, tmp_path):
     result = json.loads((tmp_path / "pieces" / "result.json").read_text())
     assert result["settings"]["reduction"] == {"rows_in_memory": HELD}
     kept = noisy_job.validation[0].path
-    again = [validate_result(tmp_path / w / "result.json", [kept]) for w in ("memory", "pieces")]
+    again = [validate(tmp_path / w / "result.json", [kept]) for w in ("memory", "pieces")]
     one, other = (without_bands(x["validation"]) for x in again)
     assert_close(other, one, 1e-5)
-
-
-def test_a_real_recording_in_pieces_ends_where_it_ends_in_memory(recordings, tmp_path, monkeypatch):
-    monkeypatch.setenv("ROBOTID_DATA", str(recordings))
-    # of a log in pieces, what drives lack is judged by the segments at hand: here 1 s of 5 s
-    monkeypatch.setattr(
-        "robotid.identification.pipeline.explain_residual", lambda _, sample: ((), ())
-    )
-    job = read_job(Path(__file__).parents[1] / "jobs" / "tx40.toml")
-    # its segments are cut elsewhere, so that held-out errors may choose another prior weight
-    estimator = replace(job.estimator, prior_weight=100.0)
-    job = replace(job, report=False, terms=DRIVE_TERMS, estimator=estimator)
-    job = replace(job, validation=(replace(job.validation[0], end=6.5),))
-    compare(job, tmp_path, held=16_000)
 
 
 @pytest.mark.parametrize("name", ["rls", "prx"])  # one and several passes
@@ -210,16 +196,3 @@ def test_a_job_is_long_by_the_rows_of_all_its_files(noisy_job):
         replace(noisy_job, rows_in_memory=0)
     given = job_from_settings({"urdf": "x", "reduction": {"rows_in_memory": 7}}, "job", Path())
     assert given.rows_in_memory == 7
-
-
-def test_a_long_log_without_motion_long_enough_is_refused_as_in_memory(
-    noisy_job, tmp_path, without_doctor
-):
-    job = replace(noisy_job, signals=SignalSettings(trim=20.0))
-    messages = []
-    for held in (10**9, HELD):
-        with pytest.raises(DataError) as found:
-            run_job(replace(job, rows_in_memory=held), tmp_path)
-        messages.append(str(found.value))
-    assert messages[0] == messages[1]
-    assert "none of its 1 segments without gaps is long enough" in messages[0]

@@ -12,16 +12,10 @@ from helpers.synthetic import exact_log, truth
 from scipy.stats import t as t_of
 
 from robotid.base.exceptions import DataError, ModelError, SettingsError
-from robotid.cli.work.job import LogEntry, read_job
-from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.torque import joint_torque_regressor
-from robotid.estimation.estimators.segments import quantile
-from robotid.identification.payload_fit import (
-    identify_payload,
-    payload_of,
-)
+from robotid.identification.payload_fit import identify_payload, payload_of
 from robotid.robot.drives import FAMILIES
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
@@ -146,14 +140,6 @@ def test_a_known_mass_is_checked_by_the_torque_that_does_not_know_it(hand, rng):
     assert gains.checks == {}  # the mass determines the gains
 
 
-def test_a_mass_that_the_motion_does_not_determine_is_no_check(hand, rng):
-    _, still = recorded(hand, rng, noise=LEVEL[2:])
-    light = {"masses": {"tool0": 0.01}, "links": ["tool0"], "signals": EXACT}
-    log = replace(still, tau=still.tau + 400 * LEVEL[2:] * rng.standard_normal(still.tau.shape))
-    found = with_known_friction(hand, [log], [still], **light)
-    assert found.checks["tool0"].identified is None
-
-
 def test_intervals_hold_the_truth_of_payload_gains_and_robot(ur5):
     beta = structural_mapping(ur5).to_base(truth(ur5))
     outside = []
@@ -271,13 +257,6 @@ def test_an_inertia_that_the_motion_does_not_show_is_refused(hand, rng):
     assert moments[2] <= moments[0] + moments[1] + 1e-9
 
 
-def test_nothing_is_told_from_nothing(hand, rng):
-    log, without = recorded(hand, rng, links=[], noise=LEVEL[2:])
-    payload = with_known_friction(hand, [log], [without], signals=EXACT)["wrist_3_link"]
-    assert abs(payload.mass) < 4 * payload.mass_std_error
-    assert payload.determined == ("mass",)
-
-
 def test_what_cannot_be_asked_is_refused_by_name(ur5, rng):
     log, without = recorded(ur5, rng, noise=LEVEL)
 
@@ -301,67 +280,6 @@ def test_what_cannot_be_asked_is_refused_by_name(ur5, rng):
     refused(
         DataError, "the motion does not determine the mass of the payload on wrist_3_link", short
     )
-
-
-def test_the_load_of_a_ur10e_and_what_it_says_of_its_gains(recordings, monkeypatch):
-    """2.805 kg were mounted: with de Luca's gains they weigh 8 % more, so these are too large."""
-    monkeypatch.setenv("ROBOTID_DATA", str(recordings))
-    job = read_job("tests/jobs/ur10e.toml")
-    model, stated = job.model(), np.array([*job.gains.values()])
-    files = [recordings / f"ur10e/ident_20200219_14harm{end}.parquet" for end in ("_load", "")]
-    logs = [job.read(LogEntry(file), model) for file in files]
-    found = with_known_friction(model, logs[:1], logs[1:], links=["tool0"], signals=job.signals)
-    payload = found["tool0"]
-    # what joints say of it differs more than segments show: gains are not known to 1 %
-    assert 2.8 < payload.mass_interval[0] < 3.0 < payload.mass < 3.1
-    assert 3.1 < payload.mass_interval[1] < 3.3
-    currents = [replace(log, tau=log.tau / stated) for log in logs]
-    found = with_known_friction(
-        model, currents[:1], currents[1:], links=["tool0"], masses={"tool0": 2.805},
-        unknown_gains=model.joints, signals=job.signals,
-    )  # fmt: skip
-    gains = np.array([gain.value for gain in found.gains.values()])
-    others = np.array([10.0, 10.6956, 8.4566, 9.0029, 9.48, 10.1232])  # the authors' own set
-    assert ((others < gains) & (gains < stated)).all()
-    lift = found.gains["shoulder_lift_joint"].interval
-    assert 11.5 < lift[0] < 12.3 < lift[1] < 13.26
-    assert quantile(np.array([np.inf]))[0] == pytest.approx(1.96, abs=0.01)
-
-
-def test_a_joint_that_rests_but_for_a_few_rows_does_not_outweigh_the_others(ur5, rng):
-    # what its few rows leave is nothing, for they are fewer than the parameters
-    t = np.arange(1000) / 100.0
-    w = 2 * np.pi / 10.0 * np.array([1, 1, 1, 3, 4, 5])
-    bump = np.exp(-(((t - 5.0) / 0.1) ** 2))
-    place = np.array([0.3, -1.0, 1.2, 0.2, 0.5, 0.1])
-    q = place + 1.2 * np.sin(np.outer(t, w) + np.arange(6)) * (np.arange(6) > 2)
-    q[:, 2] += 0.01 * bump
-    v, a = (np.gradient(x, t, axis=0, edge_order=2) for x in (q, np.gradient(q, t, axis=0)))
-    tau = joint_torque_regressor(ur5, q, v, a) @ truth(ur5)
-    without = Log(t, q, tau.reshape(q.shape), ur5.joints, v, a)
-    loaded = replace(without, tau=without.tau + load_torque(ur5, without, "tool0"))
-    runs = [replace(x, tau=x.tau + LEVEL * rng.standard_normal(q.shape)) for x in (loaded, without)]
-    found = with_known_friction(ur5, runs[:1], runs[1:], links=["tool0"])["tool0"]
-    assert found.mass_std_error < 0.1
-    assert abs(found.mass - MASS) < 3 * found.mass_std_error
-    assert (np.abs(found.com - COM) < 3 * found.com_std_error).all()
-
-
-def test_friction_of_the_reference_is_chosen_and_counts_in_both_runs(rng):
-    model = arm()
-    log, without = recorded(model, rng, samples=500)
-    pi = truth(model) * (np.arange(len(model.layout.names)) < model.layout.n_inertial)
-
-    def with_friction(x, extra=0.0):
-        rigid = (joint_torque_regressor(model, x.q, x.v, x.a) @ pi).reshape(x.tau.shape) + extra
-        return replace(x, tau=x.tau + 0.08 * np.sign(x.v) * np.abs(rigid))
-
-    logs = with_friction(log, load_torque(model, log, "tool0")), with_friction(without)
-    found = identify_payload(model, logs[:1], logs[1:], links=["tool0"], signals=EXACT)
-    assert {"shoulder_lift_joint", "elbow_joint"} <= found.model.layout.own.keys()
-    plain = with_known_friction(model, logs[:1], logs[1:], links=["tool0"], signals=EXACT)
-    errors = [abs(fit["tool0"].mass - MASS) for fit in (plain, found)]
-    assert errors[0] > 0.001 > 2 * errors[1]
 
 
 def test_friction_of_currents_is_chosen_on_the_torques_that_the_gains_make(rng):

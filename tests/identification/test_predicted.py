@@ -1,23 +1,18 @@
 """What Python asks of a result: torques, friction curves, Pinocchio's model; found or loaded."""
 
-import xml.etree.ElementTree as ET
-
 import mujoco
 import numpy as np
 import pinocchio as pin
 import pytest
 from helpers.driven import ELBOW, LIFT, arm, driven, driven_log, found_in
 
-from robotid.base.exceptions import DataError, SettingsError
-from robotid.cli.work.export import export_result
-from robotid.cli.work.identify import save_result
+from robotid.cli.export import export
+from robotid.cli.identify import save_result
 from robotid.dynamics.friction_projection import project_friction
-from robotid.dynamics.memory import drive_motion_along
+from robotid.dynamics.prediction import drive_motion_along
 from robotid.estimation.fitting.bands import QUANTILE, friction_curve
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
-from robotid.output.files.ranges import parameter_ranges
 from robotid.output.files.result_file import load_result
-from robotid.output.files.urdf import read_sidecar
 from robotid.robot.drives import LoadFriction
 
 
@@ -84,37 +79,6 @@ def test_a_friction_curve_is_that_of_the_speeds_fitted_under_the_usual_load(foun
         np.testing.assert_array_equal(getattr(again, name), getattr(curve, name))
 
 
-def test_positions_of_other_joints_are_refused_with_their_own_shape(found):
-    with pytest.raises(
-        DataError, match=r"q has shape \(4000, 2\), wanted \(3,\) or \(N, 3\): a col"
-    ):
-        found.predict(np.zeros((4000, 2)))
-    with pytest.raises(DataError, match=r"q has shape \(5,\), wanted \(3,\) or"):
-        found.predict(np.zeros(5))
-
-
-def test_a_curve_shows_its_speeds_torques_and_band(found):
-    curve = found.friction(ELBOW, [0.5, 1.0], load=2.0)
-    head, _, *rows = str(curve).splitlines()
-    assert "joint load torque 2" in head
-    for k, row in enumerate(rows):
-        v, torque, half = row.replace("+-", " ").split()
-        assert float(v) == pytest.approx(curve.v[k])
-        assert float(torque) == pytest.approx(curve.torque[k], rel=1e-3)
-        assert float(half) == pytest.approx(curve.half_width[k], rel=0.06)
-    assert len(rows) == 2
-    assert repr(curve) == "<FrictionCurve: 2 speeds, 0.5 to 1>"
-
-
-def test_another_joint_is_refused_by_name(found, loaded):
-    with pytest.raises(DataError, match=r"'elbow' is no drive of ur5.*; drives: shoulder_lift_joi"):
-        found.friction("elbow")
-    with pytest.raises(DataError, match="has no friction curve of 'elbow_joint '; joints with"):
-        loaded.friction("elbow_joint ")
-    with pytest.raises(SettingsError, match=r"^joint is 5, a int, wanted the name of a joint"):
-        loaded.friction(5)
-
-
 def test_pinocchios_model_has_the_nearest_friction_and_says_so(found, loaded):
     motion, predicted = moving_rows(found)
     place = list(found.model.layout.names).index(f"{ELBOW}.load")
@@ -159,7 +123,7 @@ def test_mujocos_inverse_dynamics_of_an_export_are_as_near_as_its_friction_can_b
     found, loaded, tmp_path
 ):
     """Over the fitted rows: the prediction less the best viscous, Coulomb friction and offset."""
-    done = export_result(loaded.path, "mjcf", tmp_path / "a.xml")
+    done = export(loaded.path, "mjcf", tmp_path / "a.xml")
     stated = done["projected"][ELBOW]
     assert stated["replaced"] == ["load"]
     assert "load projected on viscous" in " ".join((tmp_path / "a.xml").read_text().split())
@@ -182,31 +146,3 @@ def test_mujocos_inverse_dynamics_of_an_export_are_as_near_as_its_friction_can_b
     best = left[:, j] - A @ np.linalg.lstsq(A, left[:, j], rcond=None)[0]
     assert np.linalg.norm(left[:, j]) <= 1.02 * np.linalg.norm(best)
     assert stated["error"] == pytest.approx(np.sqrt(np.mean(left[:, j] ** 2)), rel=0.1)
-
-
-def test_urdf_dynamics_and_ranges_have_the_projected_friction(found, loaded, tmp_path):
-    done = export_result(loaded.path, "urdf", tmp_path / "a.urdf")
-    drive = done["projected"][ELBOW]
-    (joint,) = [
-        joint
-        for joint in ET.parse(tmp_path / "a.urdf").getroot().findall("joint")
-        if joint.get("name") == ELBOW
-    ]
-    stated = {key: float(value) for key, value in joint.find("dynamics").items()}
-    assert stated == {"damping": drive["viscous"], "friction": drive["coulomb"]}
-    facts = read_sidecar(tmp_path / "a.drive.json")
-    assert facts["projected_dynamics"][ELBOW] == drive
-    assert facts["drives"][ELBOW]["load"] == pytest.approx(
-        found.standard[found.model.layout.names.index(f"{ELBOW}.load")]
-    )
-    ranges = parameter_ranges(found)["projected_drives"]
-    assert list(ranges) == [ELBOW]
-    (projected,) = project_friction(
-        found.model, found.standard, loaded.drive_moments, ("viscous", "coulomb", "offset")
-    ).drives
-    C = found.standard_covariance[np.ix_(projected.own, projected.own)]
-    for row, (term, value) in zip(projected.transfer, projected.values.items(), strict=True):
-        half = found.standard_quantile[list(projected.own)].max() * np.sqrt(row @ C @ row)
-        assert ranges[ELBOW][term]["nominal"] == pytest.approx(value)
-        assert ranges[ELBOW][term]["high"] == pytest.approx(value + half)
-    assert set(ranges[ELBOW]) == {"viscous", "coulomb", "offset"}

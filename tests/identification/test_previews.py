@@ -10,17 +10,10 @@ from helpers.driven import arm
 from helpers.fitting import identify
 from helpers.synthetic import truth
 
-from robotid.base.exceptions import DataError, SettingsError
+from robotid.base.exceptions import SettingsError
 from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
-from robotid.design.previews import (
-    Run,
-    TorqueNoise,
-    _band,
-    _Information,
-    assumed_noise,
-    preview,
-)
+from robotid.design.previews import Run, TorqueNoise, _band, _Information, assumed_noise, preview
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.factors import Factors, compress
 from robotid.dynamics.simulation.motions import random_fourier
@@ -141,58 +134,6 @@ def test_motions_of_two_lengths_and_filters_tell_as_much_as_their_rows(rng):
     np.testing.assert_array_equal(alone.factors.rows, said.factors.rows)
 
 
-def test_the_noise_of_a_short_run_counts_the_parameters_that_its_rows_pay_for(rng):
-    model = arm()
-    mapping = structural_mapping(model)
-    log = moved(model, rng, period=4.0)[0].window(0.0, 2.0)
-    held = hold_log(model, log, SignalSettings())
-    motion, mask = held.whole.trajectory, held.whole.mask
-    W = trajectory_regressor(model, motion).reshape(*motion.v.shape, -1)
-    pi = truth(model)
-    r = rng.standard_normal(motion.v.shape) * [2.0, 0.5, 0.1]
-    noisy = replace(motion, tau=W @ pi + r)
-    part = compress(base_problem(model, mapping, noisy, mask))
-    run = Run((part,), pi, motion.squares, len(motion.t), 0.2, 0.03)
-    noise = run.noise(mapping.K)
-    rows = mask.sum(axis=0)
-    sigma = np.sqrt(np.sum(np.where(mask, r, 0.0) ** 2, axis=0) / rows)
-    X = [W[mask[:, j], j][:, mapping.independent] / sigma[j] for j in range(3)]
-    bread = np.linalg.inv(sum(x.T @ x for x in X))
-    free = 1.0 - np.array([np.trace(x @ bread @ x.T) for x in X]) / rows
-    assert (free < 0.98).all()
-    np.testing.assert_allclose(noise.std, sigma / np.sqrt(free), rtol=1e-6)
-    np.testing.assert_allclose(noise.correlation, free * 0.03 / 0.2, rtol=1e-6)
-    assert noise.origins == ("found",) * 3
-
-
-def test_torques_that_a_log_has_are_ignored(ur5, motion, recorded):
-    first, second = (preview(ur5, [log], noise=white()) for log in (motion[0], recorded))
-    np.testing.assert_array_equal(first.standard_error, second.standard_error)
-    np.testing.assert_array_equal(first.bands[0].total, second.bands[0].total)
-
-
-def test_velocities_of_a_motion_are_taken_if_they_are_those_of_its_positions(ur5, motion):
-    log, (_, v, a) = motion
-    with_rates = preview(ur5, [replace(log, v=v, a=a)], noise=white(), estimator="wls")
-    assert with_rates.expected.fitted[0].recording.signals.velocity == "measured"
-    wrong = preview(ur5, [replace(log, v=np.roll(v, 3, axis=1))], noise=white(), estimator="wls")
-    assert wrong.expected.fitted[0].recording.signals.velocity == "differentiated"
-    without = preview(ur5, [log], noise=white(), estimator="wls")
-    np.testing.assert_allclose(with_rates.base_error, without.base_error, rtol=0.1)
-
-
-@pytest.mark.parametrize("estimator", ["wls", "ols"])
-def test_errors_are_in_proportion_to_the_noise_and_fall_with_the_root_of_the_length(
-    ur5, motion, estimator
-):
-    log = motion[0]
-    once = preview(ur5, [log], noise=white(), estimator=estimator).base_error
-    thrice = preview(ur5, [log], noise=white(3 * STD), estimator=estimator).base_error
-    np.testing.assert_allclose(thrice, 3 * once, rtol=1e-8)
-    four = preview(ur5, [log] * 4, noise=white(), estimator=estimator).base_error
-    np.testing.assert_allclose(four, once / 2, rtol=1e-8)
-
-
 def test_the_prior_only_helps_and_bands_are_of_the_motion(ur5, motion):
     log = motion[0]
     free = preview(ur5, [log], noise=white(), estimator="wls")
@@ -233,21 +174,6 @@ def test_bands_of_torques_are_root_mean_squares_over_all_motions(ur5):
         assert told["rms"] == pytest.approx(rms[j])
 
 
-def test_a_joint_that_stands_still_is_named(ur5, motion):
-    log = motion[0]
-    q = log.q.copy()
-    q[:, 2] = 0.5
-    ahead = preview(ur5, [replace(log, q=q)], noise=white())
-    assert {"elbow_joint.viscous", "elbow_joint.coulomb"} <= set(
-        ahead.expected.determination.undetermined
-    )
-    assert ahead.words.startswith("log: the motion determines ")
-    assert "elbow_joint.viscous" in ahead.words
-    known = dict(zip(ahead.expected.mapping.names, ahead.expected.sources, strict=True))
-    assert known["elbow_joint.viscous"] == "prior"
-    assert np.isinf(preview(ur5, [replace(log, q=q)], estimator="wls").base_error).any()
-
-
 def test_a_run_before_adds_what_it_said_and_its_noise(ur5, motion, found):
     log = motion[0]
     ahead = preview(ur5, [log], given=found, estimator="wls")
@@ -262,13 +188,6 @@ def test_a_run_before_adds_what_it_said_and_its_noise(ur5, motion, found):
     alone = preview(ur5, [log], noise=ahead.noise, estimator="wls").base_error
     together = 1.0 / np.sqrt(ahead.before**-2 + alone**-2)
     np.testing.assert_allclose(ahead.base_error, together, rtol=0.25)
-
-
-def test_a_short_run_before_counts_by_the_band_of_its_filter(ur5, recorded):
-    short = identify(ur5, [recorded.window(0.0, 3.0)], friction="none", estimator="consistent")
-    assert short.errors.segments < 12
-    ahead = preview(ur5, [recorded], given=short)
-    assert (ahead.base_error <= ahead.before * 1.001).all()
 
 
 def test_noise_is_stated_or_a_hundredth_of_the_largest_torque(ur5):
@@ -303,22 +222,6 @@ def test_a_joint_without_an_effort_limit_has_the_torque_of_its_bodies(ur5, motio
     std = preview(bare, [log]).noise.std
     np.testing.assert_allclose(std[:4], 0.01 * largest[:4], rtol=0.1)
     assert std[1] < 0.01 * 150.0 == preview(ur5, [log]).noise.std[1]
-
-
-def test_a_static_model_is_previewed_too(motion):
-    urdf = example_urdf("ur5_robot.urdf")
-    model = RobotModel.from_urdf(urdf, dynamics="static")
-    t = np.arange(0.0, 100.0, 0.02)
-    q = motion[0].q[(len(motion[0].q) * t / 100.0).astype(int)]
-    smooth = scipy.signal.savgol_filter(q, 201, 3, axis=0)
-    ahead = preview(model, [Log(t, smooth, 0.0 * q, model.joints)], noise=white())
-    assert np.isfinite(ahead.standard_error).all()
-    assert any(source == "data" for source in ahead.expected.sources)
-
-
-def test_nothing_to_preview_is_refused(ur5):
-    with pytest.raises(DataError, match="no motion was given"):
-        preview(ur5, [])
 
 
 def test_noise_of_a_long_run_has_the_scatter_of_each_joint_s_own_scores(rng):

@@ -10,11 +10,10 @@ from helpers.estimation import EXACT, NOISE
 from helpers.fitting import fit
 from helpers.synthetic import exact_log, truth
 
-from robotid.base.exceptions import NotConvergedError, SettingsError
 from robotid.data.signals import process
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.estimation.estimators import Consistent
-from robotid.estimation.estimators.consistent.consistent_fit import Programme, nearest
+from robotid.estimation.estimators.consistent.consistent_fit import nearest
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
 from robotid.robot.prior import prior_spread
 
@@ -45,12 +44,6 @@ def information(fit, rng, strength):
     unit = np.sqrt(np.sum((fit.K * fit.prior_std) ** 2, axis=1))
     R = strength * np.triu(rng.standard_normal((b, b)) + 3.0 * np.eye(b)) / unit
     return np.column_stack([R, R @ (fit.K @ fit.prior)])
-
-
-def test_the_nearest_point_of_the_orthant_is_the_positive_part(rng):
-    for point in rng.standard_normal((20, 6)):
-        found = nearest(np.eye(6), np.zeros(6), point)
-        np.testing.assert_allclose(found, np.maximum(point, 0.0), rtol=1e-14, atol=1e-14)
 
 
 def test_the_nearest_point_is_that_of_a_quadratic_programme(rng):
@@ -87,18 +80,6 @@ def test_where_no_bound_binds_it_is_the_covariance(inside, rng, meat_over_bread,
     assert np.sqrt(np.mean(difference**2)) < 0.03
 
 
-def test_rounding_does_not_change_what_is_drawn(inside, rng):
-    # rows of opposite sign, in another order, say the same; their factor has other signs
-    rows = information(inside, rng, 1.0)
-    turned = -rows[::-1]
-    meat = rows[:, :-1].T @ rows[:, :-1]
-    one, other = (
-        inside.programme.redrawn(x, 1.0, inside.prior, meat, 1.0, 20, np.random.default_rng(0))[0]
-        for x in (rows, turned)
-    )
-    np.testing.assert_allclose(other / inside.prior_std, one / inside.prior_std, atol=1e-6)
-
-
 def test_on_a_bound_half_of_the_fits_stay_there(inside, rng):
     # prior and data put a friction coefficient at its bound, and tell nothing else of it
     i = inside.layout.names.index("elbow_joint.viscous")
@@ -128,38 +109,3 @@ def test_bounds_make_intervals_narrower_and_are_named(rng):
     assert 0.4 < np.median(ratio) < 1.0
     assert ratio.max() < 1.4
     assert found.errors.freedom.max() < 64
-
-
-def test_fits_that_are_not_solved_are_counted_and_many_are_refused(rng, monkeypatch):
-    model = arm()
-    log = exact_log(model, truth(model), rng, samples=1000, noise=NOISE[1:4])
-    solve = Programme.redrawn
-
-    def some_fail(self, *arguments):
-        found, _ = solve(self, *arguments)
-        return found[:-lost], ["InsufficientProgress"] * lost
-
-    monkeypatch.setattr(Programme, "redrawn", some_fail)
-    lost = 3
-    found = fit(model, [log], signals=EXACT, estimator=EstimatorSettings(**BOUND))
-    assert "61 fits" in found.errors.method
-    assert "(3 more not solved: InsufficientProgress)" in found.errors.method
-    lost = 20
-    with pytest.raises(
-        NotConvergedError, match="44 of 64 fits to resampled data were solved; set draws"
-    ):
-        fit(model, [log], signals=EXACT, estimator=EstimatorSettings(**BOUND))
-
-
-def test_a_log_of_few_stretches_is_redrawn_by_the_filters_share(rng):
-    model = arm()
-    log = exact_log(model, truth(model), rng, samples=300, noise=NOISE[1:4])
-    found, again = (fit(model, [log], estimator=EstimatorSettings(**BOUND)) for _ in range(2))
-    assert "only" in found.errors.method
-    assert "fits to resampled data" in found.errors.method
-    np.testing.assert_array_equal(again.standard_error, found.standard_error)
-
-
-def test_a_handful_of_draws_is_refused():
-    with pytest.raises(SettingsError, match="draws is 3, wanted 0, or 10 to 10000"):
-        EstimatorSettings(draws=3)

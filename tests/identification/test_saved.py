@@ -10,9 +10,8 @@ from helpers.paths import ROOT
 from helpers.synthetic import exact_log, truth
 
 import robotid
-from robotid.base.exceptions import SettingsError
-from robotid.cli import main
-from robotid.cli.work.job import job_from_settings
+from robotid.cli.identify import run_job
+from robotid.cli.job import job_from_settings
 
 URDF = ROOT / "urdf" / "planar_2r.urdf"
 
@@ -67,17 +66,9 @@ def test_the_settings_are_a_job_that_finds_the_same_again(saved, found, logs, tm
     assert job.ignore == ("torque_sign",)
     (entry,) = job.identification
     assert (entry.path, entry.end) == (logs / "first.csv", 12.0)
-    again, _ = robotid.run_job(replace(job, report=False), tmp_path)
+    again, _ = run_job(replace(job, report=False), tmp_path)
     assert again.model.layout == found.model.layout
     np.testing.assert_allclose(again.standard, found.standard, rtol=1e-9)
-
-
-def test_it_is_validated_as_one_of_the_command_line(saved, logs, capsys):
-    assert main(["validate", str(saved), str(logs / "second.csv"), "--json"]) == 0
-    printed = json.loads(capsys.readouterr().out)
-    kept = json.loads(saved.read_text())["validation"][0]["per_joint"]
-    for joint, errors in printed["validation"][0]["per_joint"].items():
-        assert errors["rmse"] == pytest.approx(kept[joint]["rmse"], rel=1e-6)
 
 
 def test_what_a_job_found_is_saved_with_the_job_that_was_run(logs, tmp_path):
@@ -88,29 +79,7 @@ def test_what_a_job_found_is_saved_with_the_job_that_was_run(logs, tmp_path):
         "output": {"report": False},
         "identification": [{"log": str(logs / "first.csv")}],
     }
-    found, result = robotid.run_job(job_from_settings(table, "job.toml", logs), tmp_path / "one")
+    found, result = run_job(job_from_settings(table, "job.toml", logs), tmp_path / "one")
     path = robotid.save_result(found, tmp_path / "two", report=False)
     assert json.loads(path.read_text())["settings"] == result["settings"]
     assert result["settings"]["torque"]["gains"] == {"joint_1": 3.0}
-
-
-def test_logs_in_memory_have_no_file_to_name(ur5, found, tmp_path):
-    evaluations = [
-        replace(e, recording=replace(e.recording, log=replace(e.recording.log, path="")))
-        for e in found.fitted
-    ]
-    found = replace(found, fitted=tuple(evaluations), validation=())
-    path = robotid.save_result(found, tmp_path, report=False)
-    content = json.loads(path.read_text())
-    assert "identification" not in content["settings"] or not content["settings"]["identification"]
-    assert [entry["path"] for entry in content["inputs"][1:]] == [""]
-
-
-def test_a_result_is_written_whole_or_not_at_all(found, tmp_path, monkeypatch):
-    (tmp_path / "file").write_text("")
-    with pytest.raises(SettingsError, match="file' is a file, wanted a folder for the results"):
-        robotid.save_result(found, tmp_path / "file")
-    monkeypatch.setattr("robotid.cli.work.identify.build_result", lambda *a, **k: {"x": np.inf})
-    with pytest.raises(ValueError, match="JSON"):
-        robotid.save_result(found, tmp_path / "out", report=False)
-    assert list((tmp_path / "out").iterdir()) == []

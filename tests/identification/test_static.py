@@ -9,16 +9,13 @@ import pytest
 from helpers.synthetic import truth
 
 from robotid.base.exceptions import DataError, ModelError, SettingsError
-from robotid.cli.work.identify import run_job
-from robotid.cli.work.job import read_job
-from robotid.cli.work.validate import validate_result
+from robotid.cli.identify import run_job
+from robotid.cli.job import read_job
+from robotid.cli.validate import validate
 from robotid.data.files.read import write_log
 from robotid.data.log import Log
-from robotid.data.signal_settings import SignalSettings
-from robotid.data.signals import resolve
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.torque import joint_torque_regressor
-from robotid.dynamics.used_rows import static_rows
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
 from robotid.identification.online.identifier import OnlineIdentifier
 from robotid.identification.pipeline import identify
@@ -129,19 +126,6 @@ def test_inertias_about_the_centres_of_mass_are_the_urdfs(rng):
         np.testing.assert_allclose(a.inertia, b.inertia, atol=0.05 * np.trace(b.inertia))
 
 
-def test_poses_leave_coulomb_friction_open_and_say_so(rng):
-    full, static = robot("panda"), robot("panda", dynamics="static")
-    found = identify(static, [poses(full, truth(full), rng)])
-    open_ = set(found.determination.undetermined)
-    assert open_ == {f"{joint}.coulomb" for joint in static.joints}
-    (note,) = [f for f in found.findings if f.code == "static"]
-    assert (
-        "Poses at rest do not determine the Coulomb friction of panda_joint1, panda_joint2"
-        in note.message
-    )
-    assert "not evaluated" in found.verdict.joints["panda_joint1"].status  # gravity turns it not
-
-
 def test_a_job_writes_a_urdf_of_its_gravity_that_other_logs_validate(tmp_path, rng):
     full = robot("ur10_robot")
     pi = truth(full)
@@ -164,26 +148,11 @@ def test_a_job_writes_a_urdf_of_its_gravity_that_other_logs_validate(tmp_path, r
     wanted = gravity(full, pi, q)
     given = gravity(written, written.standard_parameters(), q)
     np.testing.assert_allclose(given, wanted, atol=0.03 * np.abs(wanted).max())
-    checked = validate_result(tmp_path / "out" / "result.json", [tmp_path / "kept.csv"])
+    checked = validate(tmp_path / "out" / "result.json", [tmp_path / "kept.csv"])
     verdict = checked["verdict"]
     assert verdict["per_joint"]["shoulder_lift_joint"]["status"] == "good"
     assert verdict["per_joint"]["shoulder_pan_joint"]["status"] == "not evaluated"
     assert verdict["reasons"][-1].startswith("static model: ")
-
-
-def test_stands_of_a_joint_that_moves_more_elsewhere_are_left_out():
-    static = robot("panda", dynamics="static")
-    t = np.arange(3000) / 100
-    q = np.zeros((3000, 7))
-    q[:, 1] = 0.05 * np.clip(t, 5, 25)  # 20 s of motion between two stands
-    log = Log(t=t, q=q, tau=q, joints=static.joints)
-    motion, used = static_rows(static, log, resolve(log, SignalSettings(cutoff=None)))
-    moves = motion.direction[:, 1] == 1
-    assert moves.sum() == len(moves) - 4  # two stands, and where it sets out and stops
-    assert (used[:, 1] == moves).all()
-    assert used[:, 2].sum() == 2  # of the others, the two stands are all there is
-    assert not motion.v.any()
-    assert not motion.direction[:, 2].any()
 
 
 def test_what_static_models_cannot_do_is_refused(rng):

@@ -5,17 +5,8 @@ import pytest
 from helpers.paths import ROOT
 from helpers.synthetic import exact_log, truth
 
-from robotid.cli.work.identify import run_job
-from robotid.cli.work.job import Job, LogEntry
-from robotid.data.files.read import write_log
 from robotid.identification.pipeline import identify
-from robotid.identification.summary import (
-    cell,
-    error_lines,
-    friction_lines,
-    joint_reason,
-    verdict_lines,
-)
+from robotid.identification.summary import error_lines, friction_lines, verdict_lines
 from robotid.robot.model import RobotModel
 
 
@@ -49,16 +40,6 @@ def test_the_start_of_each_stage_is_reported(found, reported):
     ]
 
 
-def test_an_identification_is_one_short_line(found):
-    status = found.verdict.status
-    assert repr(found) == (
-        f"<Identification of {found.model.name}: {len(found.base)} base parameters by consistent, "
-        f"verdict {status}>"
-    )
-    assert "array(" not in repr(found.estimate)
-    assert repr(found.estimate).startswith(f"<Estimate: {len(found.estimate.names)} parameters")
-
-
 def test_its_text_has_verdict_reasons_and_every_joint(found):
     text = str(found)
     assert text == found.summary()
@@ -70,12 +51,6 @@ def test_its_text_has_verdict_reasons_and_every_joint(found):
         (first, _) = [line.split() for line in text.splitlines() if line.split()[0] == joint]
         assert first[1] == f"{error:.1f}"
         assert text.count(f"  {joint} ") == 2  # kept and fitted rows
-
-
-def test_figures_above_a_thousand_have_no_decimals():
-    assert [cell(x) for x in (None, 0.04, 99.96, 123.45, 999.94, 1234.5)] == [
-        "-", "0.0", "100.0", "123.5", "999.9", "1234",
-    ]  # fmt: skip
 
 
 def test_joints_worse_than_a_constant_are_marked_wherever_they_stand():
@@ -116,16 +91,6 @@ def test_friction_is_said_from_the_first_step_to_the_last_that_was_taken():
     assert friction_lines({"b": joints["b"]}) == []
 
 
-def test_a_job_s_identification_links_to_its_report(arm, logs, tmp_path):
-    write_log(logs[0], tmp_path / "log.csv")
-    job = Job(
-        urdf=ROOT / "urdf" / "planar_2r.urdf", identification=(LogEntry(tmp_path / "log.csv"),)
-    )
-    found, _ = run_job(job, tmp_path / "out")
-    assert found.report == str(tmp_path / "out" / "report.html")
-    assert f"report: {found.report}" in str(found)
-
-
 def test_a_reason_of_a_joint_is_shown_once():
     verdict = {
         "status": "poor",
@@ -143,10 +108,3 @@ def test_a_reason_of_a_joint_is_shown_once():
     ]  # fmt: skip
     alone = {"status": "good", "reasons": ["fine"], "per_joint": {"b": verdict["per_joint"]["b"]}}
     assert verdict_lines(alone) == ["verdict: good", "  - fine", "  every joint: good"]
-
-
-def test_a_reason_loses_the_name_of_its_joint_only():
-    assert joint_reason("b", ["a, b: too slow", "b: no"]) == "too slow"
-    assert joint_reason("bb", ["a, b: too slow"]) == "a, b: too slow"
-    assert joint_reason("b", ["the whole: is wrong"]) == "the whole: is wrong"
-    assert joint_reason("b", []) == ""

@@ -11,7 +11,7 @@ from scipy.integrate import solve_ivp
 from robotid.base.exceptions import DataError, RankDeficientError, SettingsError
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.simulation.motions import ProgramMotion
-from robotid.dynamics.simulation.plant import RobotPlant
+from robotid.dynamics.simulation.simulator import RobotPlant
 from robotid.paper import planar_2r
 from robotid.paper.equations import (
     Bounds,

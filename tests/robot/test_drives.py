@@ -15,12 +15,10 @@ from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import process
 from robotid.dynamics import prediction
 from robotid.dynamics.base_parameters import structural_mapping
-from robotid.dynamics.memory import drive_motion_along, remember
-from robotid.dynamics.prediction import predict
+from robotid.dynamics.prediction import drive_motion_along, predict, remember
 from robotid.dynamics.rows import COMPILED, TrajectoryRows
-from robotid.dynamics.simulation.closed_loop import simulate
 from robotid.dynamics.simulation.motions import random_fourier
-from robotid.dynamics.simulation.plant import RobotPlant
+from robotid.dynamics.simulation.simulator import RobotPlant, simulate
 from robotid.dynamics.torque import (
     InstantRegressor,
     joint_torque_regressor,
@@ -29,7 +27,7 @@ from robotid.dynamics.torque import (
 from robotid.identification.pipeline import identify
 from robotid.output.files.urdf import load_identified, read_sidecar, write_urdf
 from robotid.output.report.steps import Origin
-from robotid.output.report.torque_section import shown_torques
+from robotid.output.report.torque_report import torque_report
 from robotid.robot.drives import (
     DRIVE_TERMS,
     FAMILIES,
@@ -50,9 +48,9 @@ from robotid.robot.drives import (
     Spring,
     Stribeck,
     Tanh,
+    term_from_dict,
 )
 from robotid.robot.examples import example_urdf
-from robotid.robot.families import term_from_dict
 from robotid.robot.mass_matrix import joint_mass_matrices
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import Coupling
@@ -222,7 +220,7 @@ def test_identification_recovers_it_and_the_table_shows_it(model, term, rng):
     drives = drive_part(model)
     if not (term.is_inertia or term.name.startswith("sin")):  # those may come in a group
         np.testing.assert_allclose(found.standard[drives], pi[drives], atol=1e-6)
-    html = shown_torques(found, Origin()).parameters.replace("<wbr>", "").replace("−", "-")
+    html = torque_report(found, Origin()).parameters.replace("<wbr>", "").replace("−", "-")
     lines = [re.sub(r"<[^>]*>", " ", row).split() for row in html.split("</tr>")[1:]]
     known = zip(
         model.layout.drive_names, found.standard[drives], found.standard_error[drives], strict=True

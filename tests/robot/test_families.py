@@ -4,8 +4,15 @@ import tomllib
 
 import numpy as np
 
-from robotid.robot.drives import FAMILIES, Harmonic, Spring
-from robotid.robot.families import drive_line, has_turned, spring_family, term_from_dict
+from robotid.robot.drives import (
+    FAMILIES,
+    Harmonic,
+    Spring,
+    drive_line,
+    has_turned,
+    spring_family,
+    term_from_dict,
+)
 
 
 def test_a_family_is_advised_a_tenth_beyond_the_turns_that_it_needs():

@@ -9,6 +9,7 @@ from robotid.data.signal_settings import SignalSettings
 from robotid.diagnosis.urdf.inspection import inspect_urdf
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
 from robotid.robot.geometry import (
+    Surface,
     body_boxes,
     body_points,
     box_half_spaces,
@@ -17,7 +18,6 @@ from robotid.robot.geometry import (
     kinematic_lengths,
     link_clouds,
 )
-from robotid.robot.meshes import Surface
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
 

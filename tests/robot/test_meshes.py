@@ -7,7 +7,7 @@ from robotid.output.viewer import scene
 from robotid.output.viewer.scene import robot_scene
 from robotid.output.viewer.thinning import thin
 from robotid.robot.examples import example_urdfs
-from robotid.robot.meshes import find_mesh, read_shapes, read_surfaces
+from robotid.robot.geometry import find_mesh, read_shapes, read_surfaces
 from robotid.robot.model import RobotModel
 from robotid.robot.urdf_text import parse_urdf
 

@@ -12,12 +12,12 @@ from helpers.paths import URDF
 from robotid.data.log import Log
 from robotid.dynamics.friction_projection import drive_moments, project_friction
 from robotid.dynamics.simulation.loops import ClosedLoopRobot, cut_windows, open_loops
-from robotid.dynamics.simulation.plant import RobotPlant, rk4
+from robotid.dynamics.simulation.simulator import RobotPlant
 from robotid.output.files.mjcf import write_mjcf
 from robotid.output.report.pictures import friction_chart
+from robotid.paper.equations import rk4
 from robotid.robot.drive_term import Family, MemorylessTerm, Shape
-from robotid.robot.drives import FAMILIES, TERM_CLASSES
-from robotid.robot.families import term_from_dict
+from robotid.robot.drives import FAMILIES, TERM_CLASSES, term_from_dict
 from robotid.robot.model import RobotModel
 
 JOINT = "joint_1"

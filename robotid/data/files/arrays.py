@@ -1,4 +1,7 @@
-"""NPZ, HDF5 and MATLAB files, which contain arrays at paths, as tables of named columns."""
+"""NPZ, HDF5 and MATLAB files, which contain arrays at paths, as tables of named columns.
+
+Arrays of MuJoCo and Isaac Lab (generalised coordinates, states of the root) are standard columns.
+"""
 
 import math
 import zipfile
@@ -15,9 +18,9 @@ import numpy as np
 from robotid.base.exceptions import DataError, MissingDependencyError
 from robotid.base.findings import listed
 from robotid.base.typing import Array
+from robotid.data.base_motion import ACCELERATION, POSE, TWIST, in_base
 from robotid.data.files.column_names import is_quantity
-from robotid.data.files.simulator_arrays import ARRAYS, with_simulator_arrays
-from robotid.data.files.table import Table, WritableFormat, choose, parsing
+from robotid.data.files.table import Format, Table, choose, parsing
 from robotid.data.log import suggestion
 from robotid.data.signal_settings import LogSource
 
@@ -26,66 +29,18 @@ _LISTS = ("joints", "joint_names")  # entries that name the columns of wide arra
 _MAT73 = b"MATLAB 7.3"  # first bytes of a MAT file in HDF5 format
 _LARGEST_RATIO = 1032  # of the sizes before and after compression by deflate
 _MAT_NAME = 63  # largest number of characters of a name in MATLAB
-
-
-class NpzFormat(WritableFormat):
-    """NPZ files, whose names may contain slashes; pickled objects are not read."""
-
-    def open(self, path: Path, source: LogSource) -> Table:
-        arrays: dict[str, Array] = {}
-        with parsing(path, "NPZ"), zipfile.ZipFile(path) as file:
-            for member in file.namelist():
-                name = member.removesuffix(".npy")
-                with file.open(member) as stream:
-                    shape, dtype = _npy_header(stream)
-                    _require_plausible_size(path, name, shape)
-                if not dtype.hasobject:
-                    with file.open(member) as stream:
-                        arrays[name] = np.lib.format.read_array(stream)
-        return _table_of_arrays(path, {n: _entry(a) for n, a in arrays.items()}, source)
-
-    def write(self, table: Mapping[str, Array], path: Path) -> None:
-        columns: dict[str, Any] = dict(table)
-        with path.open("wb") as file:
-            np.savez_compressed(file, **columns)
-
-
-class Hdf5Format(WritableFormat):
-    """HDF5 files, written with compression; only the required columns are loaded."""
-
-    def open(self, path: Path, source: LogSource) -> Table:
-        return _table_of_arrays(path, _datasets(path, is_matlab=False), source)
-
-    def write(self, table: Mapping[str, Array], path: Path) -> None:
-        h5py = _h5py("writing HDF5")
-        # first in memory: HDF5 ends the process if the disk is full
-        with h5py.File(path, "w", driver="core", backing_store=False) as file:
-            for name, values in table.items():
-                file.create_dataset(name, data=values, compression="gzip", shuffle=True)
-            file.flush()
-            path.write_bytes(file.id.get_file_image())
-
-
-class MatFormat(WritableFormat):
-    """MATLAB files of any version including v7.3; written as column vectors in version 7."""
-
-    def open(self, path: Path, source: LogSource) -> Table:
-        with path.open("rb") as file:
-            is_hdf5 = file.read(len(_MAT73)) == _MAT73
-        entries = _datasets(path, is_matlab=True) if is_hdf5 else _mat_variables(path)
-        return _table_of_arrays(path, entries, source)
-
-    def write(self, table: Mapping[str, Array], path: Path) -> None:
-        from scipy.io import savemat
-
-        for name in table:
-            if not (name.isidentifier() and name.isascii() and len(name) <= _MAT_NAME):
-                raise DataError(
-                    f"{name!r} is not a valid name of a MATLAB variable (letters, digits and _, at "
-                    f"most {_MAT_NAME} characters); write another format"
-                )
-        with path.open("wb") as file:
-            savemat(file, dict(table), oned_as="column", do_compression=True)
+#: Arrays of simulators: quantity of the joints, and values of a free joint before them.
+_SIMULATED = {
+    "qpos": ("q", 7), "qvel": ("dq", 6), "qacc": ("ddq", 6), "qfrc_actuator": ("tau", 6),
+    "joint_pos": ("q", 0), "joint_vel": ("dq", 0), "joint_acc": ("ddq", 0),
+    "applied_torque": ("tau", 0),
+}  # fmt: skip
+_ROOTS = ("root_link_state_w", "root_state_w")
+_ROOT = 13  # values of a root state: position, quaternion, linear and angular velocity
+_OF_MASS = (
+    "root_state_w has the velocity of the centre of mass, which is not used; export "
+    "root_link_state_w to use it"
+)
 
 
 @dataclass(frozen=True)
@@ -96,9 +51,89 @@ class _Entry:
     is_number: bool
     load: Callable[[], Any]
 
+    @property
+    def width(self) -> int:
+        """Number of its columns; samples are along its longer side. 0 if it has no columns."""
+        if not self.is_number or len(self.shape) not in (1, 2):
+            return 0
+        return 1 if len(self.shape) == 1 else min(self.shape)
 
-#: Place of a column: the path of an array and the index in it, None if the array is one column.
-_Column: TypeAlias = tuple[str, int | None]
+    def columns(self) -> Array:
+        """Return its columns, shape (N, width)."""
+        values = np.asarray(self.load())
+        if values.size == max(values.shape):
+            return values.reshape(-1, 1)
+        return values if values.shape[0] >= values.shape[1] else values.T
+
+
+#: Place of a column: an array, and the index in it.
+_Column: TypeAlias = tuple[_Entry, int]
+
+
+def _open_npz(path: Path, source: LogSource) -> Table:
+    """Pickled objects are not read."""
+    arrays: dict[str, Array] = {}
+    with parsing(path, "NPZ"), zipfile.ZipFile(path) as file:
+        for member in file.namelist():
+            name = member.removesuffix(".npy")
+            with file.open(member) as stream:
+                version = np.lib.format.read_magic(stream)
+                read = np.lib.format.read_array_header_1_0
+                if version != (1, 0):
+                    read = np.lib.format.read_array_header_2_0  # also of version 3
+                shape, _, dtype = read(stream)
+                _require_plausible_size(path, name, shape)
+            if not dtype.hasobject:
+                with file.open(member) as stream:
+                    arrays[name] = np.lib.format.read_array(stream)
+    return _table_of_arrays(path, {n: _entry(a) for n, a in arrays.items()}, source)
+
+
+def _write_npz(table: Mapping[str, Array], path: Path) -> None:
+    columns: dict[str, Any] = dict(table)
+    with path.open("wb") as file:
+        np.savez_compressed(file, **columns)
+
+
+def _open_hdf5(path: Path, source: LogSource) -> Table:
+    return _table_of_arrays(path, _datasets(path, is_matlab=False), source)
+
+
+def _write_hdf5(table: Mapping[str, Array], path: Path) -> None:
+    h5py = _h5py("writing HDF5")
+    # first in memory: HDF5 ends the process if the disk is full
+    with h5py.File(path, "w", driver="core", backing_store=False) as file:
+        for name, values in table.items():
+            file.create_dataset(name, data=values, compression="gzip", shuffle=True)
+        file.flush()
+        path.write_bytes(file.id.get_file_image())
+
+
+def _open_mat(path: Path, source: LogSource) -> Table:
+    """Any version, including v7.3."""
+    with path.open("rb") as file:
+        is_hdf5 = file.read(len(_MAT73)) == _MAT73
+    entries = _datasets(path, is_matlab=True) if is_hdf5 else _mat_variables(path)
+    return _table_of_arrays(path, entries, source)
+
+
+def _write_mat(table: Mapping[str, Array], path: Path) -> None:
+    """Column vectors in version 7."""
+    from scipy.io import savemat
+
+    for name in table:
+        if not (name.isidentifier() and name.isascii() and len(name) <= _MAT_NAME):
+            raise DataError(
+                f"{name!r} is not a valid name of a MATLAB variable (letters, digits and _, at "
+                f"most {_MAT_NAME} characters); write another format"
+            )
+    with path.open("wb") as file:
+        savemat(file, dict(table), oned_as="column", do_compression=True)
+
+
+NPZ = Format((".npz",), _open_npz, _write_npz, written=(".npz",), topics="group")
+HDF5 = Format((".h5", ".hdf5"), _open_hdf5, _write_hdf5, written=(".h5", ".hdf5"), topics="group")
+MAT = Format((".mat",), _open_mat, _write_mat, written=(".mat",), topics="group")
 
 
 def _table_of_arrays(path: Path, entries: Mapping[str, _Entry], source: LogSource) -> Table:
@@ -109,17 +144,30 @@ def _table_of_arrays(path: Path, entries: Mapping[str, _Entry], source: LogSourc
     """
     where = path.name
     group = _group(where, list(entries), source.topic)
-    inside = {at[len(group) :]: at for at in entries if at.startswith(group)}
-    lists = [(name, entries[inside[name]]) for name in _LISTS if name in inside]
-    texts = [(name, entry) for name, entry in lists if not entry.is_number]
-    joints = _joint_names(where, *texts[0]) if texts else []
+    inside = {at[len(group) :]: x for at, x in entries.items() if at.startswith(group)}
+    texts = [name for name in _LISTS if name in inside and not inside[name].is_number]
+    joints = _joint_names(where, texts[0], inside[texts[0]]) if texts else []
+    for name, entry in inside.items():
+        if entry.is_number:
+            _require_plausible_size(path, name, entry.shape)
+    simulated: dict[str, _Entry] = {}
+    if not any(name == "q" or name.startswith("q_") for name in inside):
+        simulated = {
+            name: entry
+            for name, entry in inside.items()
+            if name in (*_SIMULATED, *_ROOTS) and entry.width > 1
+        }
     columns: dict[str, _Column] = {}
-    for name, at in inside.items():
-        if entries[at].is_number:
-            _require_plausible_size(path, name, entries[at].shape)
-            columns |= _columns_of(where, name, at, entries[at].shape, joints)
-    table = Table(list(columns), partial(_read, where, entries, columns))
-    return with_simulator_arrays(where, table, joints)
+    for name, entry in inside.items():
+        if name not in simulated:
+            columns |= _columns_of(where, name, entry, joints)
+    for name, entry in simulated.items():
+        columns |= _joint_columns(where, name, entry, joints) if name in _SIMULATED else {}
+    columns |= _base_columns(where, simulated, len(joints))
+    is_of_mass = "root_state_w" in simulated and "root_link_state_w" not in simulated
+    notes = (_OF_MASS,) if is_of_mass and simulated.get("qpos") is None else ()
+    axes = {"twist": "base"} if simulated else {}
+    return Table(list(columns), partial(_read, where, columns), notes, axes=axes)
 
 
 def _group(where: str, paths: Sequence[str], topic: str | None) -> str:
@@ -151,16 +199,6 @@ def _require_plausible_size(path: Path, name: str, shape: tuple[int, ...]) -> No
         )
 
 
-def _npy_header(stream: Any) -> tuple[tuple[int, ...], np.dtype[Any]]:  # noqa: ANN401
-    """Return shape and type of an array in NumPy's format."""
-    version = np.lib.format.read_magic(stream)
-    read = np.lib.format.read_array_header_1_0
-    if version != (1, 0):
-        read = np.lib.format.read_array_header_2_0  # also of version 3, except its encoding
-    shape, _, dtype = read(stream)
-    return shape, dtype
-
-
 def _joint_names(where: str, list_name: str, entry: _Entry) -> list[str]:
     """Return the names in an array of text."""
     names = np.ravel(entry.load()).tolist()
@@ -172,43 +210,82 @@ def _joint_names(where: str, list_name: str, entry: _Entry) -> list[str]:
         ) from error
 
 
-def _columns_of(
-    where: str, name: str, path: str, shape: tuple[int, ...], joints: Sequence[str]
-) -> dict[str, _Column]:
+def _columns_of(where: str, name: str, entry: _Entry, joints: Sequence[str]) -> dict[str, _Column]:
     """Return the columns of one array, by name."""
-    slim = len(shape) == 1 or (len(shape) == 2 and 1 in shape)
-    is_wide = is_quantity(name.rpartition("/")[2]) and name not in ARRAYS
-    if len(shape) not in (1, 2) or (len(shape) == 2 and 0 in shape):
-        return {}
-    if slim and not is_wide:
-        return {name: (path, None)}
-    count = 1 if slim else min(shape)
-    if joints and is_wide and len(joints) != count:
+    is_wide = is_quantity(name.rpartition("/")[2]) and name not in _SIMULATED
+    if entry.width == 1 and not is_wide:
+        return {name: (entry, 0)}
+    if joints and is_wide and len(joints) != entry.width > 0:
         raise DataError(
-            f"{where}: {name} has the shape {shape}, but the file names {len(joints)} joints: "
-            f"{listed(joints)}; write one column per joint"
+            f"{where}: {name} has the shape {entry.shape}, but the file names {len(joints)} "
+            f"joints: {listed(joints)}; write one column per joint"
         )
-    names = joints if joints and len(joints) == count else [str(j) for j in range(count)]
-    return {f"{name}_{names[j]}": (path, j) for j in range(count)}
+    names = joints if len(joints) == entry.width else list(map(str, range(entry.width)))
+    return {f"{name}_{names[j]}": (entry, j) for j in range(entry.width)}
 
 
-def _read(
-    where: str,
-    entries: Mapping[str, _Entry],
-    columns: Mapping[str, _Column],
-    wanted: Sequence[str],
-) -> dict[str, Array]:
+def _joint_columns(
+    where: str, name: str, entry: _Entry, joints: Sequence[str]
+) -> dict[str, _Column]:
+    """Return the columns of the joints in an array of a simulator."""
+    kind, of_base = _SIMULATED[name]
+    before = entry.width - len(joints) if joints else 0
+    if before not in (0, of_base):
+        raise DataError(
+            f"{where}: {name} has {entry.width} columns, wanted {len(joints)}, one for each joint "
+            "that the file names" + f", or {of_base} more with a free joint" * bool(of_base)
+        )
+    ends = joints or list(map(str, range(entry.width)))
+    return {f"{kind}_{end}": (entry, before + k) for k, end in enumerate(ends)}
+
+
+def _base_columns(where: str, arrays: Mapping[str, _Entry], joints: int) -> dict[str, _Column]:
+    """Return the columns of a floating base in arrays of a simulator.
+
+    MuJoCo's free joint has its linear velocity v with the world's axes, its angular velocity w with
+    the base's: the rate of v with the base's axes is R^T dv/dt - w x v. Isaac Lab's state of the
+    root has both with the world's axes; that of the centre of mass is not used.
+    """
+    root = next((name for name in _ROOTS if name in arrays), "")
+    if joints and "qpos" in arrays and arrays["qpos"].width == joints + 7:
+        names = [name for name in ("qpos", "qvel", "qacc") if name in arrays]
+        names = names if "qvel" in names else ["qpos"]
+        kinds = (POSE, TWIST, ACCELERATION)[: len(names)]
+    elif root:
+        if arrays[root].width != _ROOT:
+            raise DataError(f"{where}: {root} has {arrays[root].width} columns, wanted {_ROOT}")
+        names, kinds = [root], (POSE, TWIST) if root == "root_link_state_w" else (POSE,)
+    else:
+        return {}
+
+    def load() -> Array:
+        states = [arrays[name].columns() for name in names]
+        pose = states[0][:, [0, 1, 2, 4, 5, 6, 3]]  # the quaternion starts with w
+        parts, quaternion = [pose], pose[:, 3:]
+        if root in names:
+            parts += [in_base(quaternion, states[0][:, k : k + 3]) for k in (7, 10)]
+        elif len(states) > 1:
+            v, w = in_base(quaternion, states[1][:, :3]), states[1][:, 3:6]
+            parts += [v, w]
+            for rates in states[2:]:
+                dv = in_base(quaternion, rates[:, :3]) - np.cross(w, v)
+                parts += [dv, rates[:, 3:6]]
+        return np.hstack(parts)
+
+    ends = [end for kind in kinds for end in kind]
+    entry = _Entry((len(ends) + 1, len(ends)), True, load)
+    return {f"base_{end}": (entry, k) for k, end in enumerate(ends)}
+
+
+def _read(where: str, columns: Mapping[str, _Column], wanted: Sequence[str]) -> dict[str, Array]:
     """Return columns; each array is loaded once, and all must have the same length."""
     chosen = {name: columns[name] for name in wanted}
-    loaded = {path: np.asarray(entries[path].load()) for path in {p for p, _ in chosen.values()}}
-    table: dict[str, Array] = {}
-    for name, (path, index) in chosen.items():
-        values = loaded[path]
-        if index is None or values.size == max(values.shape):
-            values = values.ravel()
-        else:
-            values = (values if values.shape[0] >= values.shape[1] else values.T)[:, index]
-        table[name] = values.astype(np.float64)
+    entries = {id(entry): entry for entry, _ in chosen.values()}
+    loaded = {key: entry.columns() for key, entry in entries.items()}
+    table = {
+        name: loaded[id(entry)][:, index].astype(np.float64)
+        for name, (entry, index) in chosen.items()
+    }
     first = next(iter(table))
     for name, values in table.items():
         if len(values) != len(table[first]):
@@ -236,7 +313,7 @@ def _h5py(purpose: str) -> ModuleType:
 
 
 @contextmanager
-def _open_hdf5(path: Path) -> Iterator[Any]:
+def _hdf5_file(path: Path) -> Iterator[Any]:
     h5py = _h5py("reading HDF5 and MATLAB v7.3")
     with parsing(path, "HDF5"), h5py.File(path, "r") as file:
         yield file
@@ -247,24 +324,20 @@ def _datasets(path: Path, *, is_matlab: bool) -> dict[str, _Entry]:
     entries: dict[str, _Entry] = {}
 
     def visit(name: str, item: Any) -> None:  # noqa: ANN401
-        if not hasattr(item, "shape") or item.shape is None or name.startswith("#"):
-            return
-        shape = item.shape[::-1] if is_matlab else item.shape  # MATLAB stores columns first
-        is_text = item.attrs.get("MATLAB_class") == b"char"
-        entries[name] = _Entry(
-            shape,
-            item.dtype.kind in "iuf" and not is_text,
-            lambda: _load_dataset(path, name, is_matlab=is_matlab),
-        )
+        if hasattr(item, "shape") and item.shape is not None and not name.startswith("#"):
+            shape = item.shape[::-1] if is_matlab else item.shape  # MATLAB stores columns first
+            is_text = item.attrs.get("MATLAB_class") == b"char"
+            is_number = item.dtype.kind in "iuf" and not is_text
+            entries[name] = _Entry(shape, is_number, partial(_dataset, path, name, is_matlab))
 
-    with _open_hdf5(path) as file:
+    with _hdf5_file(path) as file:
         file.visititems(visit)
     return entries
 
 
-def _load_dataset(path: Path, name: str, *, is_matlab: bool) -> Any:  # noqa: ANN401
+def _dataset(path: Path, name: str, is_matlab: bool) -> Any:  # noqa: ANN401
     """Return one dataset; characters and cell arrays of MATLAB become a list of texts."""
-    with _open_hdf5(path) as file:
+    with _hdf5_file(path) as file:
         dataset = file[name]
         if not is_matlab:
             return dataset[()]

@@ -1,6 +1,7 @@
 """Bags of ROS 1 and ROS 2, including MCAP: joints, commands and sensors as a table of columns.
 
-The library rosbags reads all of them; ROS need not be installed.
+A row is a message of the joints; columns of sensors are interpolated. The library rosbags reads all
+bags; ROS need not be installed.
 """
 
 import re
@@ -17,16 +18,18 @@ import numpy as np
 from robotid.base.exceptions import DataError, MissingDependencyError
 from robotid.base.findings import listed
 from robotid.base.typing import Array
-from robotid.data.files.bag_sensors import Sensor, first_of, is_low_state, sensors_of, with_sensors
+from robotid.data.base_motion import IMU, POSE, TWIST
 from robotid.data.files.table import Format, Table, choose
 from robotid.data.log import repeated, suggestion
 from robotid.data.signal_settings import LogSource
 
 _STATE = "sensor_msgs/msg/JointState"
 _CONTROLLER = "control_msgs/msg/JointTrajectoryControllerState"
+_PACKAGES = ("unitree_go", "unitree_hg", "unitree_legged_msgs")  # with LowState
 _MEASURED = ("position", "velocity", "effort")
 _COMMANDED = ("qref", "dqref", "tauref")
 _FIELDS = (*_MEASURED, *_COMMANDED)
+_WRENCH = ("fx", "fy", "fz", "mx", "my", "mz")
 
 Layout = tuple[tuple[str, ...], tuple[str, ...]]  # names of joints, and the fields with values
 
@@ -40,8 +43,55 @@ class _Block:
     values: "array[float]" = field(default_factory=lambda: array("d"))  # field by field
 
 
-class BagFormat(Format):
-    """Bags: .mcap, .db3 or .bag files, or the folder of a ROS 2 bag. A row is a message.
+@dataclass(frozen=True)
+class _Bag:
+    """An open bag."""
+
+    path: Path
+    source: LogSource
+    reader: Any
+    decode: Callable[[bytes, str], Any]
+
+    @property
+    def types(self) -> dict[str, str]:
+        """The type of each topic."""
+        return {c.topic: _full_name(c.msgtype) for c in self.reader.connections}
+
+    @property
+    def filled(self) -> dict[str, str]:
+        """The type of each topic with messages."""
+        filled = {c.topic for c in self.reader.connections if c.msgcount}
+        return {topic: kind for topic, kind in self.types.items() if topic in filled}
+
+    def messages(self, topic: str) -> Iterator[tuple[int, Any]]:
+        """Yield stamp [ns] and message; errors of the library become a DataError.
+
+        The stamp is that of the header, if there is one.
+        """
+        chosen, is_stamped = [c for c in self.reader.connections if c.topic == topic], False
+        count = 0
+        try:
+            for connection, logged, raw in self.reader.messages(chosen):
+                message = self.decode(raw, _full_name(connection.msgtype))
+                stamp = logged
+                if self.source.stamp != "log" and hasattr(message, "header"):
+                    stamp = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
+                is_stamped, count = is_stamped or stamp != 0, count + 1
+                yield stamp, message
+        except DataError:
+            raise
+        except Exception as error:  # a parser of foreign bytes fails in many ways
+            raise _broken(self.path, error) from error
+        if count and not is_stamped:
+            raise DataError(
+                f"{self.path.name}, topic {topic!r}: the header stamps of all {count} messages are "
+                '0. To use the time of recording, state stamp = "log" (job file table [log], CLI '
+                '--stamp log, Python source=LogSource(stamp="log"))'
+            )
+
+
+def _open(path: Path, source: LogSource) -> Table:
+    """Return the table of a .mcap, .db3 or .bag file, or of the folder of a ROS 2 bag.
 
     The columns are ``time`` [s] since the epoch, ``position_<joint>``, ``velocity_<joint>`` and
     ``effort_<joint>``. The order of the joints may differ between messages. Messages without any
@@ -54,143 +104,34 @@ class BagFormat(Format):
     zero-order hold brings them to the time stamps of the states.
 
     A LowState of Unitree contains its motors, by number: ``position_0``. Columns of sensors are of
-    further topics, as of ``with_sensors``.
+    further topics, as of ``_with_sensors``.
     """
-
-    def open(self, path: Path, source: LogSource) -> Table:
-        with _open(path) as (reader, decode):
-            types = {c.topic: _full_name(c.msgtype) for c in reader.connections}
-            filled = {c.topic: types[c.topic] for c in reader.connections if c.msgcount}
-
-            def first(topic: str) -> Any:  # noqa: ANN401
-                return next(_messages(path, reader, decode, topic))[1]
-
-            sensors = sensors_of(path.name, filled, first, source)
-            topic = _choose_topic(path.name, reader, types, source)
-            blocks = _blocks(path, reader, decode, topic, source, _MEASURED)
-            others: dict[Layout, _Block] = {}
-            if source.command is not None:
-                others = _blocks(path, reader, decode, source.command, source, _COMMANDED)
-        table = _table(f"{path.name}, topic {topic!r}", blocks)
+    with _opened(path, source) as bag:
+        sensors = _sensors_of(bag)
+        topic, types = _choose_topic(bag), bag.types
+        blocks, commands = _blocks(bag, topic, _MEASURED), dict[Layout, _Block]()
         if source.command is not None:
-            commands = _table(f"{path.name}, topic {source.command!r}", others)
-            stamps = _stamps(blocks), _stamps(others)
-            table = _with_commands(table, commands, stamps, source.command)
-        elif unread := _unread_commands(types, topic):
-            note = (
-                f"commands are in topics that are not read: {listed(unread)}; topic = "
-                f'"{unread[0]}" reads them and their measured positions'
-            )
-            table = replace(table, notes=(note,))
-        return with_sensors(table, path.name, sensors, partial(_load, path, source))
-
-
-def _unread_commands(types: Mapping[str, str], topic: str) -> list[str]:
-    """Return the topics of controllers, if the joints are read from another topic."""
-    found = sorted(x for x, kind in types.items() if kind == _CONTROLLER)
-    return [] if types[topic] == _CONTROLLER else found
-
-
-def _load(path: Path, source: LogSource, sensor: Sensor) -> tuple[Array, Array]:
-    """Return stamps (N,) [s], sorted, and values (N, k) of a topic of a sensor."""
-    stamps, rows = array("q"), []
-    with _open(path) as (reader, decode):
-        for logged, message in _messages(path, reader, decode, sensor.topic):
-            stamps.append(_stamp(message, logged, source))
-            rows.append(sensor.values(message))
-    _require_stamped(path.name, sensor.topic, stamps, source)
-    t, values = np.array(stamps) / 1e9, np.array(rows, dtype=np.float64)
-    order = np.argsort(t, kind="stable")
-    return t[order], values[order]
-
-
-def _stamp(message: Any, logged: int, source: LogSource) -> int:  # noqa: ANN401
-    """Return the stamp of a message [ns]; without a header, the time of recording."""
-    if source.stamp == "log" or not hasattr(message, "header"):
-        return logged
-    clock = message.header.stamp
-    stamp: int = clock.sec * 10**9 + clock.nanosec
-    return stamp
-
-
-def _require_stamped(where: str, topic: str, stamps: Sequence[int], source: LogSource) -> None:
-    """Reject messages whose header stamps are all 0."""
-    if source.stamp != "log" and not any(stamps):
-        raise DataError(
-            f"{where}, topic {topic!r}: the header stamps of all {len(stamps)} messages are 0. To "
-            'use the time of recording, state stamp = "log" (job file table [log], CLI --stamp '
-            'log, Python source=LogSource(stamp="log"))'
+            commands = _blocks(bag, source.command, _COMMANDED)
+    table = _table(f"{path.name}, topic {topic!r}", blocks)
+    others = sorted(x for x, kind in types.items() if kind == _CONTROLLER)
+    if source.command is not None:
+        where = f"{path.name}, topic {source.command!r}"
+        stamps = _stamps(blocks), _stamps(commands)
+        table = _with_commands(table, _table(where, commands), stamps, source.command)
+    elif others and types[topic] != _CONTROLLER:
+        note = (
+            f"commands are in topics that are not read: {listed(others)}; topic = "
+            f'"{others[0]}" reads them and their measured positions'
         )
+        table = replace(table, notes=(note,))
+    return _with_sensors(table, path, sensors, source)
 
 
-def _stamps(blocks: dict[Layout, _Block]) -> Array:
-    """Return the stamps of all messages of a topic, sorted [s]."""
-    return np.sort(np.concatenate([block.stamp for block in blocks.values()])) / 1e9
-
-
-def _table(where: str, blocks: dict[Layout, _Block]) -> Table:
-    """Return the table of the messages of a topic."""
-    names = list(dict.fromkeys(n for layout in blocks for n in _columns(layout)))
-    names.sort(key=lambda name: _FIELDS.index(name.partition("_")[0]))
-    return Table(["time", *names], partial(_read, where, blocks))
-
-
-def _blocks(
-    path: Path,
-    reader: Any,  # noqa: ANN401
-    decode: Callable[[bytes, str], Any],
-    topic: str,
-    source: LogSource,
-    fields: Sequence[str],
-) -> dict[Layout, _Block]:
-    """Return the messages of a topic; fields are the names of position, velocity and effort."""
-    blocks: dict[Layout, _Block] = {}
-    stamps = array("q")
-    for number, (logged, message) in enumerate(_messages(path, reader, decode, topic)):
-        layout, values = _content(path.name, topic, number, message, fields)
-        block = blocks.setdefault(layout, _Block())
-        block.number.append(number)
-        stamps.append(_stamp(message, logged, source))
-        block.stamp.append(stamps[-1])
-        for part in values:
-            block.values.frombytes(np.asarray(part, dtype=np.float64).tobytes())
-    _require_stamped(path.name, topic, stamps, source)
-    return blocks
-
-
-def _with_commands(
-    states: Table, commands: Table, stamps: tuple[Array, Array], topic: str
-) -> Table:
-    """Return states with the last command before each; rows before the first one are left out."""
-    measured, sent = stamps
-    note = f"a zero-order hold is applied to the commands of topic {topic!r}"
-    if len(sent) > 1:
-        note += f", with a median interval of {1e3 * float(np.median(np.diff(sent))):.3g} ms"
-    if before := int(np.sum(measured < sent[0])):
-        note += f"; messages before the first command, left out: {before}"
-    if after := int(np.sum(measured > sent[-1])):
-        note += f"; messages after the last command: {after}"
-    command_names = commands.names[1:]  # used instead of those of a controller's state
-    own_names = [name for name in states.names if name not in command_names]
-
-    def read(wanted: Sequence[str]) -> dict[str, Array]:
-        mine = [name for name in wanted if name in own_names and name != "time"]
-        theirs = [name for name in wanted if name in command_names]
-        rows = states.read(["time", *mine])
-        rows = {name: values[rows["time"] >= sent[0]] for name, values in rows.items()}
-        for name in theirs:  # one by one: the commands of joints may be in different messages
-            own = commands.read(["time", name])
-            order = np.argsort(own["time"], kind="stable")
-            last = np.searchsorted(own["time"][order], rows["time"], side="right") - 1
-            rows[name] = np.where(last >= 0, own[name][order][np.maximum(last, 0)], np.nan)
-        return {name: rows[name] for name in wanted}
-
-    return Table([*own_names, *command_names], read, (*states.notes, note))
+BAG = Format((".mcap", ".db3", ".bag"), _open, topics="topic")
 
 
 @contextmanager
-def _open(path: Path) -> Iterator[tuple[Any, Callable[[bytes, str], Any]]]:
-    """Open a bag: its reader, and a function that decodes a message."""
+def _opened(path: Path, source: LogSource) -> Iterator[_Bag]:
     try:
         from rosbags.rosbag1 import Reader as Reader1
         from rosbags.rosbag2 import Reader as Reader2
@@ -215,7 +156,7 @@ def _open(path: Path) -> Iterator[tuple[Any, Callable[[bytes, str], Any]]]:
     with closing(reader):
         for connection in reader.connections:
             kind = _full_name(connection.msgtype)
-            if (kind == _CONTROLLER or is_low_state(kind)) and kind not in types.types:
+            if (kind == _CONTROLLER or _is_low_state(kind)) and kind not in types.types:
                 types.register(_definitions(path, kind, connection.msgdef, types.types))
 
         def decode(raw: bytes, kind: str) -> Any:  # noqa: ANN401
@@ -227,7 +168,7 @@ def _open(path: Path) -> Iterator[tuple[Any, Callable[[bytes, str], Any]]]:
                 )
             return deserialize(raw, kind)
 
-        yield reader, decode
+        yield _Bag(path, source, reader, decode)
 
 
 def _definitions(
@@ -239,16 +180,16 @@ def _definitions(
     """Return the unknown types that a bag defines for messages of a type."""
     from rosbags.typesys import get_types_from_idl, get_types_from_msg
 
-    found: dict[str, Any] = {}
+    types: dict[str, Any] = {}
     try:
         if definition.format.name == "MSG":
-            found = dict(get_types_from_msg(definition.data, kind))
+            types = dict(get_types_from_msg(definition.data, kind))
         elif definition.format.name == "IDL":
             for text in definition.data.split("=" * 80 + "\n"):
-                found |= get_types_from_idl(re.sub(r"^IDL: .*\n", "", text)) if text else {}
+                types |= get_types_from_idl(re.sub(r"^IDL: .*\n", "", text)) if text else {}
     except Exception as error:  # a parser of foreign text fails in many ways
         raise _broken(path, error) from error
-    return {name: fields for name, fields in found.items() if name not in known}
+    return {name: fields for name, fields in types.items() if name not in known}
 
 
 def _broken(path: Path, error: Exception) -> DataError:
@@ -260,53 +201,40 @@ def _broken(path: Path, error: Exception) -> DataError:
     )
 
 
-def _messages(
-    path: Path,
-    reader: Any,  # noqa: ANN401
-    decode: Callable[[bytes, str], Any],
-    topic: str,
-) -> Iterator[tuple[int, Any]]:
-    """Yield time of recording [ns] and message; errors of the library become a DataError."""
-    chosen = [c for c in reader.connections if c.topic == topic]
-    try:
-        for connection, logged, raw in reader.messages(chosen):
-            yield logged, decode(raw, _full_name(connection.msgtype))
-    except DataError:
-        raise
-    except Exception as error:  # a parser of foreign bytes fails in many ways
-        raise _broken(path, error) from error
+def _full_name(msgtype: str) -> str:
+    """Return the name of a type in ROS 2, with "/msg/"."""
+    package, _, name = msgtype.rpartition("/")
+    return f"{package.removesuffix('/msg')}/msg/{name}"
 
 
-def _choose_topic(
-    where: str,
-    reader: Any,  # noqa: ANN401
-    types: Mapping[str, str],
-    source: LogSource,
-) -> str:
+def _is_low_state(kind: str) -> bool:
+    """Return whether messages of a type are the low-level states of a robot of Unitree."""
+    package, _, name = kind.partition("/msg/")
+    return name == "LowState" and package in _PACKAGES
+
+
+def _choose_topic(bag: _Bag) -> str:
     """Return the topic to read: the stated one, or the only one of joint states or a controller.
 
     The topic of the commands must be another one, of joint states.
     """
-    filled = {c.topic for c in reader.connections if c.msgcount}
+    where, source, types, filled = bag.path.name, bag.source, bag.types, bag.filled
     listing = f"topics: {dict(sorted(types.items()))}"
-    low = [kind for kind in types.values() if is_low_state(kind)]
-    for wanted, kinds in (
-        (source.topic, (_STATE, _CONTROLLER, *low)),
-        (source.command, (_STATE,)),
-    ):
+    low = [kind for kind in types.values() if _is_low_state(kind)]
+    kinds = (_STATE, _CONTROLLER, *low)
+    for wanted, allowed in ((source.topic, kinds), (source.command, (_STATE,))):
         if wanted is None:
             continue
         if wanted not in types:
-            raise DataError(
-                f"{where} has no topic {wanted!r}; {listing}{suggestion(wanted, types)}"
-            )
-        if types[wanted] not in kinds:
-            raise DataError(
-                f"{where}: topic {wanted!r} has messages of {types[wanted]}, wanted "
-                f"{' or '.join(kinds)}; {listing}"
-            )
-        if wanted not in filled:
-            raise DataError(f"{where}: topic {wanted!r} has no message; {listing}")
+            fault, near = f" has no topic {wanted!r}", suggestion(wanted, types)
+        elif types[wanted] not in allowed:
+            fault = f": topic {wanted!r} has messages of {types[wanted]}, wanted "
+            fault, near = fault + " or ".join(allowed), ""
+        elif wanted not in filled:
+            fault, near = f": topic {wanted!r} has no message", ""
+        else:
+            continue
+        raise DataError(f"{where}{fault}; {listing}{near}")
     if source.command is not None and source.command == source.topic:
         raise DataError(
             f"{where}: topic and command are both {source.topic!r}; give the topic of the "
@@ -314,51 +242,54 @@ def _choose_topic(
         )
     if source.topic is not None:
         return source.topic
-    for kind in (_STATE, _CONTROLLER, *low):
-        found = sorted(x for x in filled if types[x] == kind and x != source.command)
-        if found:
-            return choose(where, found, f"topics of {kind}", listing)
+    for kind in kinds:
+        topics = sorted(x for x in filled if types[x] == kind and x != source.command)
+        if topics:
+            return choose(where, topics, f"topics of {kind}", listing)
     raise DataError(f"{where} has no message of {_STATE}; {listing}")
 
 
-def _full_name(msgtype: str) -> str:
-    """Return the name of a type in ROS 2, with "/msg/"."""
-    package, _, name = msgtype.rpartition("/")
-    return f"{package.removesuffix('/msg')}/msg/{name}"
+def _blocks(bag: _Bag, topic: str, fields: Sequence[str]) -> dict[Layout, _Block]:
+    """Return the messages of a topic; fields are the names of position, velocity and effort."""
+    blocks: dict[Layout, _Block] = {}
+    for number, (stamp, message) in enumerate(bag.messages(topic)):
+        where = f"{bag.path.name}: message {number} on {topic!r} names"
+        layout, values = _content(where, message, fields)
+        block = blocks.setdefault(layout, _Block())
+        block.number.append(number)
+        block.stamp.append(stamp)
+        for part in values:
+            block.values.frombytes(np.asarray(part, dtype=np.float64).tobytes())
+    return blocks
 
 
 def _content(
     where: str,
-    topic: str,
-    number: int,
     message: Any,  # noqa: ANN401
     fields: Sequence[str],
 ) -> tuple[Layout, list[Array]]:
     """Return the joints of a message, and its fields with values."""
-    motors = first_of(message, "motor_state", "motorState")
+    motors = _first_of(message, "motor_state", "motorState")
     if hasattr(message, "joint_names"):
         names, content = tuple(message.joint_names), _controlled(message)
     elif motors is not None:
         names = tuple(str(k) for k in range(len(motors)))
-        torques = [first_of(motor, "tau_est", "tauEst") for motor in motors]
+        torques = [_first_of(motor, "tau_est", "tauEst") for motor in motors]
         values = [motor.q for motor in motors], [motor.dq for motor in motors], torques
         content = dict(zip(fields, values, strict=True))
     else:
         names = tuple(message.name)
         values = (message.position, message.velocity, message.effort)
         content = dict(zip(fields, values, strict=True))
-    for name, values in content.items():
-        if len(values) not in (0, len(names)):
+    for name, own in content.items():
+        if len(own) not in (0, len(names)):
             raise DataError(
-                f"{where}: message {number} on {topic!r} names {len(names)} joints but has "
-                f"{len(values)} values of {name}; correct the recording"
+                f"{where} {len(names)} joints but has {len(own)} values of {name}; correct the "
+                "recording"
             )
-    if len(set(names)) < len(names):
-        raise DataError(
-            f"{where}: message {number} on {topic!r} names {listed(repeated(names))} twice; "
-            "correct the recording"
-        )
-    filled = {name: values for name, values in content.items() if len(values)}
+    if twice := repeated(names):
+        raise DataError(f"{where} {listed(twice)} twice; correct the recording")
+    filled = {name: own for name, own in content.items() if len(own)}
     return (names, tuple(filled)), list(filled.values())
 
 
@@ -368,9 +299,9 @@ def _controlled(message: Any) -> dict[str, Any]:  # noqa: ANN401
     Up to control_msgs 4 its points were called desired and actual.
     """
 
-    def first(field: str, *points: str) -> Any:  # noqa: ANN401
-        found = (getattr(getattr(message, point, None), field, ()) for point in points)
-        return next((x for x in found if len(x) and not np.isnan(x).all()), ())
+    def first(name: str, *points: str) -> Any:  # noqa: ANN401
+        candidates = (getattr(getattr(message, point, None), name, ()) for point in points)
+        return next((x for x in candidates if len(x) and not np.isnan(x).all()), ())
 
     measured, wanted = ("feedback", "actual"), ("reference", "desired")
     return {
@@ -387,6 +318,13 @@ def _columns(layout: Layout) -> list[str]:
     """Return the columns of messages of a layout, in the order of their values."""
     joints, filled = layout
     return [f"{name}_{joint}" for name in filled for joint in joints]
+
+
+def _table(where: str, blocks: dict[Layout, _Block]) -> Table:
+    """Return the table of the messages of a topic."""
+    names = list(dict.fromkeys(n for layout in blocks for n in _columns(layout)))
+    names.sort(key=lambda name: _FIELDS.index(name.partition("_")[0]))
+    return Table(["time", *names], partial(_read, where, blocks))
 
 
 def _read(where: str, blocks: dict[Layout, _Block], wanted: Sequence[str]) -> dict[str, Array]:
@@ -409,18 +347,237 @@ def _read(where: str, blocks: dict[Layout, _Block], wanted: Sequence[str]) -> di
 
 def _require_whole(where: str, blocks: dict[Layout, _Block], columns: Sequence[str]) -> None:
     """Reject messages that have only some of the columns."""
-    total = sum(len(block.number) for block in blocks.values())
-    lacking: dict[int, list[str]] = {}  # by number of the first message
-    count = 0
-    for layout, block in blocks.items():
-        own = set(_columns(layout))
-        if missing := [name for name in columns if name not in own]:
-            lacking[block.number[0]] = missing
-            count += len(block.number)
+    lacking = {
+        block.number[0]: (missing, len(block.number))
+        for layout, block in blocks.items()
+        if (missing := [name for name in columns if name not in _columns(layout)])
+    }
     if lacking:
-        first = min(lacking)
+        first, total = min(lacking), sum(len(block.number) for block in blocks.values())
         raise DataError(
-            f"{where}: {count} of {total} messages lack some of the required values, the first "
-            f"(message {first}) lacks {listed(lacking[first])}. A row is one message; read only "
-            "joints that are always published together, and leave out the others"
+            f"{where}: {sum(n for _, n in lacking.values())} of {total} messages lack some of the "
+            f"required values, the first (message {first}) lacks {listed(lacking[first][0])}. A "
+            "row is one message; read only joints that are always published together, and leave "
+            "out the others"
         )
+
+
+def _stamps(blocks: dict[Layout, _Block]) -> Array:
+    """Return the stamps of all messages of a topic, sorted [s]."""
+    return np.sort(np.concatenate([block.stamp for block in blocks.values()])) / 1e9
+
+
+def _with_commands(
+    states: Table, commands: Table, stamps: tuple[Array, Array], topic: str
+) -> Table:
+    """Return states with the last command before each; rows before the first one are left out."""
+    measured, sent = stamps
+    note = f"a zero-order hold is applied to the commands of topic {topic!r}"
+    if len(sent) > 1:
+        note += f", with a median interval of {1e3 * float(np.median(np.diff(sent))):.3g} ms"
+    if before := int(np.sum(measured < sent[0])):
+        note += f"; messages before the first command, left out: {before}"
+    if after := int(np.sum(measured > sent[-1])):
+        note += f"; messages after the last command: {after}"
+    command_names = commands.names[1:]  # used instead of those of a controller's state
+    state_names = [name for name in states.names if name not in command_names]
+
+    def read(wanted: Sequence[str]) -> dict[str, Array]:
+        rows = states.read(["time", *(x for x in wanted if x in state_names and x != "time")])
+        rows = {name: values[rows["time"] >= sent[0]] for name, values in rows.items()}
+        for name in filter(command_names.__contains__, wanted):
+            own = commands.read(["time", name])  # the commands of joints may be in other messages
+            order = np.argsort(own["time"], kind="stable")
+            last = np.searchsorted(own["time"][order], rows["time"], side="right") - 1
+            rows[name] = np.where(last >= 0, own[name][order][np.maximum(last, 0)], np.nan)
+        return {name: rows[name] for name in wanted}
+
+    return Table([*state_names, *command_names], read, (*states.notes, note))
+
+
+# --- topics of sensors ----------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Sensor:
+    """A topic whose messages are values of columns."""
+
+    topic: str
+    columns: tuple[str, ...]
+    values: Callable[[Any], Sequence[float]]  # of a message, in the order of the columns
+
+    def load(self, path: Path, source: LogSource) -> tuple[Array, Array]:
+        """Return stamps (N,) [s], sorted, and values (N, k)."""
+        with _opened(path, source) as bag:
+            rows = [(stamp, self.values(message)) for stamp, message in bag.messages(self.topic)]
+        t = np.array([stamp for stamp, _ in rows]) / 1e9
+        order = np.argsort(t, kind="stable")
+        return t[order], np.array([values for _, values in rows], dtype=np.float64)[order]
+
+
+def _sensors_of(bag: _Bag) -> list[_Sensor]:
+    """Return the topics with columns of sensors."""
+    where, types, stated = bag.path.name, bag.filled, bag.source.sensors
+    for topic in stated:
+        if topic not in types:
+            raise DataError(
+                f"{where} has no message of a topic {topic!r}, which sensors states; topics: "
+                f"{dict(sorted(types.items()))}{suggestion(topic, types)}"
+            )
+        if types[topic] not in _SENSORS and not _is_low_state(types[topic]):
+            raise DataError(
+                f"{where}: topic {topic!r}, which sensors states, has messages of {types[topic]}, "
+                f"wanted one of {listed([*_SENSORS, 'unitree_go/msg/LowState'])}"
+            )
+    sensors = []
+    for topic in stated or sorted(types):
+        make = _low_state if _is_low_state(types[topic]) else _SENSORS.get(types[topic])
+        if make is not None:
+            columns, values = make(next(bag.messages(topic))[1])
+            sensors.append(_Sensor(topic, tuple(columns), values))
+    return sensors
+
+
+def _with_sensors(
+    states: Table, path: Path, sensors: Sequence[_Sensor], source: LogSource
+) -> Table:
+    """Return a table with the columns of sensors, interpolated linearly at its time stamps.
+
+    Rows before the first or after the last message of a topic that is read are left out.
+    """
+    by_column: dict[str, list[_Sensor]] = {}
+    for sensor in sensors:
+        for name in sensor.columns:
+            by_column.setdefault(name, []).append(sensor)
+
+    def read(wanted: Sequence[str]) -> dict[str, Array]:
+        sensed = [name for name in wanted if name in by_column]
+        used = {by_column[name][0].topic: by_column[name][0] for name in sensed}
+        for name in sensed:
+            _require_one(path.name, name, by_column[name])
+        others = [name for name in wanted if name not in by_column and name != "time"]
+        rows = states.read(["time", *others])
+        loaded = {topic: sensor.load(path, source) for topic, sensor in used.items()}
+        inside = np.ones(len(rows["time"]), dtype=bool)
+        for topic, (t, _) in loaded.items():
+            inside &= (rows["time"] >= t[0]) & (rows["time"] <= t[-1])
+            if not inside.any():
+                raise DataError(
+                    f"{path.name}: no message of the joints lies between the first and the last "
+                    f"message of topic {topic!r}, {t[0]:.3f} s to {t[-1]:.3f} s; the joints have "
+                    f"{rows['time'][0]:.3f} s to {rows['time'][-1]:.3f} s. If the stamps are of "
+                    'different clocks, state stamp = "log"'
+                )
+        rows = {name: values[inside] for name, values in rows.items()}
+        for topic, (t, values) in loaded.items():
+            columns = dict(zip(used[topic].columns, values.T, strict=True))
+            rows |= _interpolated(t, columns, rows["time"])
+        return {name: rows[name] for name in wanted}
+
+    topics = {name: f"topic {own[0].topic!r}" for name, own in by_column.items()}
+    axes = {"wrench": "link"}
+    return replace(states, names=[*states.names, *topics], read=read, sensors=topics, axes=axes)
+
+
+def _require_one(where: str, name: str, sensors: Sequence[_Sensor]) -> None:
+    """Reject a column that several topics have."""
+    topics = [sensor.topic for sensor in sensors]
+    if len(topics) > 1:
+        raise DataError(
+            f"{where} has {len(topics)} topics with {name}: {listed(topics)}. State all topics of "
+            f'sensors to read: sensors = ["{topics[0]}"] (job file table [log], Python '
+            "source=LogSource(sensors=...))"
+        )
+
+
+def _interpolated(t: Array, columns: Mapping[str, Array], at: Array) -> dict[str, Array]:
+    """Return columns at other times, linear between messages; quaternions of length 1."""
+    columns = dict(columns)
+    starts = [name.removesuffix("qx") for name in columns if name.endswith("_qx")]
+    quaternions = [[f"{start}{end}" for end in ("qx", "qy", "qz", "qw")] for start in starts]
+    for names in quaternions:
+        q = np.column_stack([columns[name] for name in names])
+        is_opposite = np.sum(q[1:] * q[:-1], axis=1) < 0
+        q *= np.where(np.append(0, np.cumsum(is_opposite)) % 2, -1.0, 1.0)[:, None]
+        columns |= dict(zip(names, q.T, strict=True))
+    values = {name: np.interp(at, t, x) for name, x in columns.items()}
+    for names in quaternions:
+        size = np.linalg.norm(np.column_stack([values[name] for name in names]), axis=1)
+        values |= {name: values[name] / size for name in names}
+    return values
+
+
+def _first_of(message: Any, *names: str) -> Any:  # noqa: ANN401
+    """Return the first of some fields that a message has, None without any."""
+    return next((getattr(message, name) for name in names if hasattr(message, name)), None)
+
+
+def _xyz(vector: Any) -> list[float]:  # noqa: ANN401
+    return [vector.x, vector.y, vector.z]
+
+
+def _xyzw(quaternion: Any) -> list[float]:  # noqa: ANN401
+    return [*_xyz(quaternion), quaternion.w]
+
+
+#: Columns of the messages of a topic, and their values in a message.
+_Values = tuple[list[str], Callable[[Any], Sequence[float]]]
+
+
+def _odometry(first: Any) -> _Values:  # noqa: ANN401
+    """Return pose in the frame of the header, and twist with the axes of the child frame."""
+
+    def values(message: Any) -> list[float]:  # noqa: ANN401
+        pose, twist = message.pose.pose, message.twist.twist
+        place = [*_xyz(pose.position), *_xyzw(pose.orientation)]
+        return [*place, *_xyz(twist.linear), *_xyz(twist.angular)]
+
+    return [f"base_{end}" for end in (*POSE, *TWIST)], values
+
+
+def _imu(first: Any) -> _Values:  # noqa: ANN401
+    """Return orientation, angular velocity and specific force; -1 marks what is not measured."""
+    parts = {
+        "orientation": (IMU[:4], _xyzw),
+        "angular_velocity": (IMU[4:7], _xyz),
+        "linear_acceleration": (IMU[7:], _xyz),
+    }
+    known = [name for name in parts if getattr(first, f"{name}_covariance")[0] != -1.0]
+
+    def values(message: Any) -> list[float]:  # noqa: ANN401
+        return [x for name in known for x in parts[name][1](getattr(message, name))]
+
+    return [f"imu_{end}" for name in known for end in parts[name][0]], values
+
+
+def _wrench(first: Any) -> _Values:  # noqa: ANN401
+    """Return force and moment with the axes and the origin of the frame of the header."""
+    frame = first.header.frame_id.lstrip("/")
+
+    def values(message: Any) -> list[float]:  # noqa: ANN401
+        return [*_xyz(message.wrench.force), *_xyz(message.wrench.torque)]
+
+    return [f"wrench_{part}_{frame}" for part in _WRENCH], values
+
+
+def _low_state(first: Any) -> _Values:  # noqa: ANN401
+    """Return the IMU, whose quaternion starts with w, and the forces of the feet, if any."""
+
+    def feet(message: Any) -> list[float]:  # noqa: ANN401
+        forces = _first_of(message, "foot_force", "footForce")
+        return [] if forces is None else list(forces)
+
+    def values(message: Any) -> list[float]:  # noqa: ANN401
+        imu = _first_of(message, "imu_state", "imu")
+        w, *xyz = imu.quaternion
+        return [*xyz, w, *imu.gyroscope, *imu.accelerometer, *feet(message)]
+
+    forces = [f"foot_force_{k}" for k in range(len(feet(first)))]
+    return [*(f"imu_{end}" for end in IMU), *forces], values
+
+
+_SENSORS: dict[str, Callable[[Any], _Values]] = {
+    "nav_msgs/msg/Odometry": _odometry,
+    "sensor_msgs/msg/Imu": _imu,
+    "geometry_msgs/msg/WrenchStamped": _wrench,
+}

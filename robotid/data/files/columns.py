@@ -10,8 +10,15 @@ import numpy as np
 from robotid.base.exceptions import DataError, SettingsError
 from robotid.base.findings import listed, quoted, toml_key
 from robotid.base.settings import is_number
-from robotid.data.files.column_names import KINDS, Reading, by_number, is_clock, read_names
-from robotid.data.files.missing import NOUNS, SIZES, Missing
+from robotid.data.files.column_names import (
+    KINDS,
+    Reading,
+    by_number,
+    is_clock,
+    is_commanded,
+    quantity_of,
+    read_names,
+)
 from robotid.data.log import repeated, suggestion
 from robotid.data.signal_settings import LogSource
 from robotid.data.transmission import Transmission
@@ -20,8 +27,21 @@ from robotid.robot.tree import Joint
 #: Quantities that are read besides the positions, as of ``lay_out``.
 Needs: TypeAlias = Literal["torque", "motion", "commands", "any"]
 
+#: Nouns for the columns of each kind.
+NOUNS = {
+    "q": "position",
+    "dq": "velocity",
+    "ddq": "acceleration",
+    "tau": "torque or current",
+    "qref": "commanded position",
+    "dqref": "commanded velocity",
+    "tauref": "commanded torque",
+}
 #: Kinds of columns with torques.
 TORQUES = ("tau", "tauref")
+_SIZES = ("loadsize_", "load_size_")  # absolute values of loads, as bus servos report them
+_OF_JOINTS = (*NOUNS, "current")  # kinds that are not of motors
+_SHOWN = 12  # names in a list
 _SIMULATION = (  # from commands, on the command line and in a job file
     "by --estimator simulation --kp N_M_PER_RAD or in the job file; without kp, the masses of the "
     """URDF determine the scale
@@ -48,37 +68,21 @@ def without_torque(is_commanded: bool, remedy: str = _SIMULATION) -> str:
 
 @dataclass(frozen=True)
 class Finder:
-    """Finds the columns of the wanted joints among the names in a file.
+    """Finds the columns of the wanted joints among the names in a file."""
 
-    Attributes:
-        where: Name of the file.
-        names: Names of its columns.
-        columns: Names in the file by standard name, as the user stated them.
-        joints: The wanted joints.
-        gains: Gains of currents by joint.
-        source: Place of the log in the file, and names of its joints.
-        gears: Transmissions between motors and joints.
-        needs: Quantities that are read besides the positions.
-        notes: Notes for the user.
-        seen: Columns that are read or named in a note.
-        passive: Joints without a drive, which need no torque.
-        robot: All movable joints of the robot, in the order of the URDF.
-        moves: Returns whether the position of a joint, in a column, changes; None if unknown.
-    """
-
-    where: str
-    names: list[str]
-    columns: Mapping[str, str]
-    joints: tuple[str, ...]
-    gains: Mapping[str, float]
+    where: str  # name of the file
+    names: list[str]  # of its columns
+    columns: Mapping[str, str]  # names in the file by standard name, as the user stated them
+    joints: tuple[str, ...]  # the wanted ones
+    gains: Mapping[str, float]  # of currents, by joint
     source: LogSource
     gears: tuple[Transmission, ...]
     needs: Needs = "torque"
-    notes: list[str] = field(default_factory=list)
-    seen: set[str] = field(default_factory=set)
-    passive: Collection[str] = ()
-    robot: Sequence[Joint] = ()
-    moves: Callable[[str, str], bool] | None = None
+    notes: list[str] = field(default_factory=list)  # for the user
+    seen: set[str] = field(default_factory=set)  # columns that are read or named in a note
+    passive: Collection[str] = ()  # joints without a drive, which need no torque
+    robot: Sequence[Joint] = ()  # all movable joints, in the order of the URDF
+    moves: Callable[[str, str], bool] | None = None  # whether a joint moves, by its column
 
     def find_all(self) -> dict[str, list[str]]:
         """Return the columns to read: time, q, required quantities, complete optional ones."""
@@ -87,18 +91,22 @@ class Finder:
         found = {"time": [self._find("time", self._clocks()) or self._no_time()]}
         optional, wanted = ["dq", "ddq"], self._wanted()
         self._require(wanted)
-        found["q"] = [column for _, column in self._each("q") if column]
+        found["q"] = list(filter(None, map(self._find_of, *self._places("q"))))
         if "commands" in wanted:
-            found["qref"] = [column for _, column in self._each("qref") if column]
+            found["qref"] = list(filter(None, map(self._find_of, *self._places("qref"))))
             optional += ["dqref", "tauref"]
-        if "torque" in wanted or ("commands" in wanted and self._is_torque_whole()):
-            found["tau"] = [
-                self._find_torque(self.joints[j], is_motor)
-                for j, is_motor in enumerate(self.of_motors("tau"))
-            ]
+        if "torque" in wanted or ("commands" in wanted and self._has_all_torques()):
+            places = zip(self.joints, *self._places("tau"), strict=True)
+            found["tau"] = ["" if joint in self.passive else self._find_torque(kind, name)
+                            for joint, kind, name in places]  # fmt: skip
         found |= {kind: names for kind in optional if (names := self._find_optional(kind))}
-        self._note_sizes()
-        extra = [name for name in self.names if name not in self.seen]
+        sizes = [name for name in self.names if name.startswith(_SIZES) and name not in self.seen]
+        if sizes:
+            self.notes.append(
+                f"{listed(sizes)} ignored: the absolute value of a load does not determine the "
+                "direction of the torque"
+            )
+        extra = [name for name in self.names if name not in {*self.seen, *sizes}]
         if extra:
             self.notes.append(f"columns ignored: {listed(extra)}")
         if twice := repeated([name for names in found.values() for name in names if name]):
@@ -144,7 +152,7 @@ class Finder:
         driven = set[str]()
         for gear in self.gears:
             at_motors, at_joints = (
-                [found for name in names for k in kinds if (found := self._find_of(k + m, name))]
+                [column for name in names for k in kinds if (column := self._find_of(k + m, name))]
                 for m, names in (("m", gear.names), ("", gear.joints))
             )
             if at_motors and at_joints:
@@ -157,16 +165,19 @@ class Finder:
             driven.update(gear.joints if at_motors else ())
         return tuple(joint in driven for joint in self.joints)
 
-    def _each(self, kind: str) -> list[tuple[tuple[str, str], str | None]]:
-        """Return the column of one quantity of each joint, or of its motor.
+    def has_torque(self, joint: str) -> bool:
+        """Return whether the file has a torque or a current of a joint."""
+        return self._has("tau", joint) or self._has("current", joint)
 
-        Each entry starts with the kind, "q" or "qm", and the name of joint or motor.
-        """
-        places = [
-            (f"{kind}m", self.motors[joint]) if is_motor else (kind, joint)
-            for joint, is_motor in zip(self.joints, self.of_motors(kind), strict=True)
-        ]
-        return [(at, self._find_of(*at)) for at in places]
+    def has_position(self, joint: str) -> bool:
+        """Return whether the file has the position of a joint."""
+        return self._has("q", joint)
+
+    def _places(self, kind: str) -> tuple[list[str], list[str]]:
+        """Return the kinds and names of the columns of each joint: its own, or its motor's."""
+        is_motor = self.of_motors(kind)
+        names = [self.motors[x] if m else x for x, m in zip(self.joints, is_motor, strict=True)]
+        return [kind + "m" * m for m in is_motor], names
 
     def _check_arguments(self) -> None:
         """Reject repeated names in the file, and gains and columns of joints that are not read."""
@@ -174,12 +185,17 @@ class Finder:
             raise DataError(
                 f"{self.where} has more than one column {listed(twice)}; rename or remove one"
             )
+        stated = dict.fromkeys(self.gains, "a gain is given for")
+        stated |= dict.fromkeys(self.source.joints, "log.joints renames")
+        for joint, what in stated.items():
+            if joint not in (*self.joints, *self.motors.values()):
+                raise SettingsError(
+                    f"{self.where}: {what} {joint!r}, which is not among the joints read: "
+                    f"{listed(self.joints)}{suggestion(str(joint), self.joints)}"
+                )
         for joint, gain in self.gains.items():
-            self._require_read(joint, "a gain is given for")
             if not (is_number(gain) and np.isfinite(gain)) or gain == 0:
                 raise SettingsError(f"gain of {joint!r} is {gain}, wanted a number other than 0")
-        for joint in self.source.joints:
-            self._require_read(joint, "log.joints renames")
         self._check_names()
         names = dict.fromkeys([*self.joints, *self.motors.values()])
         known = ["time", *(f"{kind}_{name}" for kind in KINDS for name in names)]
@@ -200,22 +216,15 @@ class Finder:
         if twice := repeated(self.joints):
             raise SettingsError(f"joints has {listed(twice)} more than once; name each joint once")
         for places in (self.joints, tuple(dict.fromkeys(self.motors.values()))):
-            own: dict[str, str] = {}
+            by_name: dict[str, str] = {}
             for place in places:
-                other = own.setdefault(self._named(place), place)
+                other = by_name.setdefault(self._named(place), place)
                 if other != place:
                     raise SettingsError(
                         f"{self.where}: joints {other} and {place} have the same name "
                         f"{self._named(place)!r} in the log; state another one in [log.joints], "
                         f"or by --rename {place}=NAME"
                     )
-
-    def _require_read(self, joint: str, what: str) -> None:
-        if joint not in (*self.joints, *self.motors.values()):
-            raise SettingsError(
-                f"{self.where}: {what} {joint!r}, which is not among the joints read: "
-                f"{listed(self.joints)}{suggestion(str(joint), self.joints)}"
-            )
 
     def _find(self, standard: str, aliases: Sequence[str]) -> str | None:
         """Return the column of one quantity, or None."""
@@ -239,16 +248,10 @@ class Finder:
         """Return the name of a joint in the file."""
         return self.source.joints.get(joint, joint)
 
-    def _find_torque(self, joint: str, is_motor: bool) -> str:
-        """Return the torque column of a joint or its motor, or its current column with a gain.
-
-        It is empty for a passive joint.
-        """
-        if joint in self.passive:
-            return ""
-        m, joint = ("m", self.motors[joint]) if is_motor else ("", joint)
-        tau, current = self._find_of(f"tau{m}", joint), self._find_of(f"current{m}", joint)
-        has_gain = joint in self.gains
+    def _find_torque(self, kind: str, name: str) -> str:
+        """Return the torque column of a joint or motor, or its current column with a gain."""
+        tau, current = self._find_of(kind, name), self._find_of(f"current{kind[3:]}", name)
+        has_gain = name in self.gains
         if tau and current:
             used, unused = (current, tau) if has_gain else (tau, current)
             self.notes.append(
@@ -256,77 +259,66 @@ class Finder:
             )
             return used
         if tau and has_gain:
-            self.notes.append(f"the gain of {joint!r} is not used: {tau} is a torque")
+            self.notes.append(f"the gain of {name!r} is not used: {tau} is a torque")
         if current and not has_gain:
-            raise self._no_gain(joint, current)
+            raise self._no_gain(name, current)
         return tau or current or ""
 
     def _wanted(self) -> set[str]:
         """Return which of torque and commands are required of every joint."""
         if self.needs != "any":
             return {self.needs}
-        has_torque = any(self.has_torque(joint) for joint in self.joints)
+        has_torque = any(map(self.has_torque, self.joints))
         has_command = [self._has("qref", joint) for joint in self.joints]
         is_commanded = all(has_command) or (any(has_command) and not has_torque)
         wanted = {"commands"} if is_commanded else set[str]()
         return wanted | ({"torque"} if has_torque or not wanted else set())
 
-    def _is_torque_whole(self) -> bool:
+    def _has_all_torques(self) -> bool:
         """Return whether every joint has a torque, or a current with a gain; add a note if not."""
-        without = []
-        for joint, is_motor in zip(self.joints, self.of_motors("tau"), strict=True):
-            m, name = ("m", self.motors[joint]) if is_motor else ("", joint)
-            has_gain = name in self.gains
-            has_torque = self._has(f"tau{m}", name) or (has_gain and self._has(f"current{m}", name))
-            if not (has_torque or joint in self.passive):
-                without.append(joint)
-        if without and any(self.has_torque(joint) for joint in self.joints):
+        without = [
+            joint
+            for joint, kind, name in zip(self.joints, *self._places("tau"), strict=True)
+            if joint not in self.passive and not self._has(kind, name)
+            and not (name in self.gains and self._has(f"current{kind[3:]}", name))
+        ]  # fmt: skip
+        if without and any(map(self.has_torque, self.joints)):
             self.notes.append(
                 f"torques ignored: {listed(without)} have no torque, and no current with a gain"
             )
         return not without
 
-    def _note_sizes(self) -> None:
-        """Add a note on loads without sign, which are not used."""
-        sizes = [name for name in self.names if name.startswith(SIZES) and name not in self.seen]
-        self.seen.update(sizes)
-        if sizes:
-            self.notes.append(
-                f"{listed(sizes)} ignored: the absolute value of a load does not determine the "
-                "direction of the torque"
-            )
-
     def _no_gain(self, joint: str, current: str) -> DataError:
         """Return the error of a current without a gain, with the missing columns of all joints."""
-        without = [joint]
+        without, absent = [joint], list[str]()
         if joint in self.joints:
             logged = [other for other in self.joints if self._has("current", other)]
             without = [x for x in logged if not self._has("tau", x) and x not in self.gains]
+            absent = [x for x in self.joints if not self.has_torque(x)]
         has = f"joint {joint!r} has the current {current!r}"
         if len(without) > 1:
             has = f"joints {listed(without)} have currents"
         gains = ", ".join(f"{toml_key(name)} = ..." for name in without)
         flags = " ".join(f"--gain {name}=..." for name in without)
-        absent = [x for x in self.joints if not (self._has("tau", x) or self._has("current", x))]
-        also = ""
-        if absent and joint in self.joints:
-            locks = " ".join(f"--lock {name}=0" for name in absent)
-            also = (
-                f". No torque of {listed(absent)} was found; if at rest, lock them at their "
-                f"positions, as with {locks}"
-            )
+        locks = " ".join(f"--lock {name}=0" for name in absent)
+        also = (
+            f". No torque of {listed(absent)} was found; if at rest, lock them at their "
+            f"positions, as with {locks}"
+        )
         return DataError(
             f"{self.where}: {has} but no gain; state it in N m/A: {flags}, or in the job file "
-            f"[torque] gains = {{ {gains} }}{also}. A payload of known mass determines unknown "
-            "gains: robotid payload URDF LOADED --reference BARE --mass KG --gains",
+            f"[torque] gains = {{ {gains} }}{also if absent else ''}. A payload of known mass "
+            "determines unknown gains: robotid payload URDF LOADED --reference BARE --mass KG "
+            "--gains",
             code="missing_gain",
         )
 
     def _find_optional(self, kind: str) -> list[str]:
         """Return the columns of an optional quantity; none if a joint does not have it."""
-        found = self._each(kind)
-        names = [name for _, name in found if name]
-        without = [joint for (_, joint), name in found if not name]
+        kinds, joints = self._places(kind)
+        columns = list(map(self._find_of, kinds, joints))
+        names = [name for name in columns if name]
+        without = [joint for joint, name in zip(joints, columns, strict=True) if not name]
         if names and without:
             self.notes.append(f"{listed(names)} ignored: {listed(without)} have no {NOUNS[kind]}")
         return [] if without else names
@@ -346,33 +338,104 @@ class Finder:
             code="missing_column",
         )
 
+    def _has(self, kind: str, joint: str) -> bool:
+        """Return whether the file has a quantity of a joint or of its motor."""
+        return (
+            f"{kind}_{joint}" in self.columns
+            or (kind, joint) in self.reading.columns
+            or (
+                (kind in _OF_JOINTS and joint in self.motors)
+                and self._has(f"{kind}m", self.motors[joint])
+            )
+        )
+
+    # --- a log that lacks required columns --------------------------------------------------------
+
     def _require(self, wanted: Collection[str]) -> None:
         """Reject a log without a required column of any joint."""
-        kinds = ["q", *(["qref"] if "commands" in wanted else [])]
-        absent = [at for kind in kinds for at, column in self._each(kind) if column is None]
+        absent = [
+            place
+            for kind in ("q", *(["qref"] if "commands" in wanted else []))
+            for place in zip(*self._places(kind), strict=True)
+            if self._find_of(*place) is None
+        ]
         if "torque" in wanted:
             absent += [
-                (f"tau{m}", name)
-                for joint, is_motor in zip(self.joints, self.of_motors("tau"), strict=True)
+                (kind, name)
+                for joint, kind, name in zip(self.joints, *self._places("tau"), strict=True)
                 if joint not in self.passive
-                for m, name in [("m", self.motors[joint]) if is_motor else ("", joint)]
-                if not (self._has(f"tau{m}", name) or self._has(f"current{m}", name))
+                and not (self._has(kind, name) or self._has(f"current{kind[3:]}", name))
             ]
-        if not absent:
-            return
         has_no_gain = any(self._has("current", x) and x not in self.gains for x in self.joints)
-        if has_no_gain and all(kind == "tau" for kind, _ in absent):
-            return  # that error names these joints, too
+        if not absent or (has_no_gain and all(kind == "tau" for kind, _ in absent)):
+            return  # the error of a missing gain names these joints, too
         clock = self._find("time", self._clocks())
-        found = {"time": clock} if clock else {}
         read = {*self.joints, *self.motors.values()}
         columns = self.reading.columns.items()
+        found = {"time": clock} if clock else {}
         found |= {f"{kind}_{x}": own for (kind, x), (own, *_) in columns if x in read}
         found |= self.columns
         of_others = {name for (_, x), own in columns if x not in read for name in own}
         names = [name for name in self.names if name not in of_others]
-        missing = Missing(self.where, names, absent, self.joints, self.source, found)
-        raise missing.error(self._remedy(absent))
+        raise self._missing(names, absent, found)
+
+    def _missing(
+        self, names: Sequence[str], absent: Sequence[tuple[str, str]], found: Mapping[str, str]
+    ) -> DataError:
+        """Return the error of missing columns: what was found, and a table to complete.
+
+        ``absent`` has quantity and joint, or motor; ``found`` the columns by standard name.
+        """
+        sought = [f"{kind}_{self._named(place)}" for kind, place in absent]
+        sizes = [name for name in names if name.startswith(_SIZES)]
+        left = [x for x in names if x not in {*found.values(), *sizes}]
+        nouns = dict.fromkeys(NOUNS[kind.removesuffix("m")] for kind, _ in absent)
+        ends = tuple(kind.replace("tau", t) + "_" for kind, _ in absent for t in ("tau", "current"))
+        of_kind = [column for key, column in found.items() if key.startswith(ends)]
+        references = tuple(f"{kind.removesuffix('ref')}ref_" for kind, _ in absent)
+        read = [x for key, x in found.items() if key.startswith(references)]
+        commanded = [x for x in names if is_commanded(x) and x in {*left, *read}]
+        others = [name for name in left if name not in commanded]
+        text = (
+            f"{self.where} has no column{'s' * (len(sought) > 1)} {listed(map(repr, sought), 6)}; "
+            f"{' and '.join(nouns)} columns found: {listed(of_kind, _SHOWN)}."
+        )
+        for label, some in (
+            ("Commanded, not measured", [name for name in commanded if name not in of_kind]),
+            ("Loads without sign, which are no torques", sizes),
+            ("Other columns", others),
+        ):
+            text += f" {label}: {listed(some, _SHOWN)}." if some else ""
+        by_order, remedy = self._by_order(left, absent), self._remedy(absent)
+        if not (by_order or others):
+            return DataError(f"{text} {remedy}", code="missing_column")
+        lines = [f"{toml_key(key)} = {quoted(x)}" for key, x in found.items()]
+        lines += [f"{toml_key(key)} = {quoted(x)}  # by order" for key, x in by_order.items()]
+        lines += [f'# {toml_key(key)} = "NAME"' for key in map("_".join, absent)
+                  if key not in by_order]  # fmt: skip
+        if by_order:
+            remedy += (
+                ". If joints have other names in the log, this table pairs them by order: check "
+                "each line, an exchange of joints gives wrong parameters"
+            )
+        return DataError(
+            f"{text} {remedy}. Rename the columns, or state them in the job file:\n[columns]\n"
+            + "\n".join(lines),
+            code="missing_column",
+        )
+
+    def _by_order(self, names: Sequence[str], absent: Sequence[tuple[str, str]]) -> dict[str, str]:
+        """Return the columns of joints with other names by standard name, in their order."""
+        read = [(name, quantity_of(name, self.source.effort)) for name in names]
+        known = [(name, *quantity) for name, quantity in read if quantity]
+        without = by_number([joint for joint in self.joints if ("q", joint) in absent])
+        labels = by_number([label for _, kind, label in known if kind == "q"])
+        if not without or len(labels) != len(without):
+            return {}
+        joint_of = dict(zip(labels, without, strict=True))
+        return {
+            f"{kind}_{joint_of[label]}": name for name, kind, label in known if label in joint_of
+        }
 
     def _remedy(self, absent: Sequence[tuple[str, str]]) -> str:
         """Return what to do if no column is similar to a missing one."""
@@ -400,29 +463,12 @@ class Finder:
             columns = {joint: self._find_of("q", joint) for joint in at_rest}
             moving = [joint for joint, column in columns.items() if column and moves(joint, column)]
         if moving:
-            names = ", ".join(map(quoted, moving))
             return (
                 f"If {listed(moving)}, which moves in the log, has no drive, state passive = "
-                f"[{names}] in the job file; else record its torque"
+                f"[{', '.join(map(quoted, moving))}] in the job file; else record its torque"
             )
         locks = " ".join(f"--lock {joint}=0" for joint in at_rest)
         locked = ", ".join(f"{toml_key(joint)} = 0" for joint in at_rest)
         one = len(at_rest) == 1
         how = "was at rest, lock it at its position" if one else "were at rest, lock them there"
         return f"If {listed(at_rest)} {how}, as {locks}, or locked = {{ {locked} }} in the job file"
-
-    def has_torque(self, joint: str) -> bool:
-        """Return whether the file has a torque or a current of a joint."""
-        return self._has("tau", joint) or self._has("current", joint)
-
-    def has_position(self, joint: str) -> bool:
-        """Return whether the file has the position of a joint."""
-        return self._has("q", joint)
-
-    def _has(self, kind: str, joint: str) -> bool:
-        """Return whether the file has a quantity of a joint or of its motor."""
-        return (
-            f"{kind}_{joint}" in self.columns
-            or (kind, joint) in self.reading.columns
-            or (joint in self.motors and self._has(f"{kind}m", self.motors[joint]))
-        )

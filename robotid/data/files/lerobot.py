@@ -1,8 +1,10 @@
-"""LeRobot datasets, folders of version 2 or 3: an episode as a table of named columns."""
+"""LeRobot datasets, folders of version 2 or 3: an episode as a table of named columns.
+
+Positions are in ``observation.state``, commanded positions in ``action``.
+"""
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -35,40 +37,32 @@ _NORMALISED = (
     'they are angles, state the unit: angle = "deg" or "rad" (job file table [units], CLI '
     '--angle-unit deg, Python units=LogUnits(angle="deg"))'
 )
+_Place = tuple[str, int]  # a feature, and the number of a value in its vectors
 
 
-class LeRobotFormat(Format):
-    """LeRobot datasets: positions in ``observation.state``, commanded positions in ``action``.
+def _open(path: Path, source: LogSource) -> Table:
+    """Return the table of an episode: the topic, as ``episode_3``, or the only one.
 
-    LeRobot computes the time stamps of an episode from the numbers of the frames. The topic of the
-    source is the episode, as ``episode_3``, if there are several.
+    LeRobot computes the time stamps of an episode from the numbers of the frames.
     """
-
-    def open(self, path: Path, source: LogSource) -> Table:
-        pa = load_pyarrow("reading LeRobot datasets")
-        columns = _columns(path, _features(path))
-        parts: dict[int, list[Path]] = {}  # files that hold an episode, by its number
-        with parsing(path, "LeRobot"):
-            for file in sorted(path.glob("data/**/*.parquet")):
-                numbers = pa.parquet.read_table(file, columns=["episode_index"])
-                for number in np.unique(numbers.column(0).to_numpy()):
-                    parts.setdefault(int(number), []).append(file)
-        number = _episode(path, sorted(parts), source.topic)
-        return Table(
-            ["time", *columns],
-            partial(_read, path, parts[number], number, columns),
-            notes=(
-                f"episode {number}: its time stamps are frame numbers over the frame rate, so the "
-                "delay between commands and positions has an error of up to one frame",
-            ),
-            angle_unit=_NORMALISED,
-        )
+    pa = load_pyarrow("reading LeRobot datasets")
+    columns = _columns(path, _features(path))
+    parts: dict[int, list[Path]] = {}  # files with rows of an episode, by its number
+    with parsing(path, "LeRobot"):
+        for file in sorted(path.glob("data/**/*.parquet")):
+            numbers = pa.parquet.read_table(file, columns=["episode_index"])
+            for number in np.unique(numbers.column(0).to_numpy()):
+                parts.setdefault(int(number), []).append(file)
+    number = _episode(path, sorted(parts), source.topic)
+    note = (
+        f"episode {number}: its time stamps are frame numbers over the frame rate, so the "
+        "delay between commands and positions has an error of up to one frame"
+    )
+    read = partial(_read, path, parts[number], number, columns)
+    return Table(["time", *columns], read, notes=(note,), angle_unit=_NORMALISED)
 
 
-@dataclass(frozen=True)
-class _Column:
-    feature: str
-    place: int  # in its vectors
+LEROBOT = Format((), _open, topics="episode")
 
 
 def _features(path: Path) -> dict[str, Any]:
@@ -83,12 +77,10 @@ def _features(path: Path) -> dict[str, Any]:
     return features
 
 
-def _columns(path: Path, features: Mapping[str, Any]) -> dict[str, _Column]:
+def _columns(path: Path, features: Mapping[str, Any]) -> dict[str, _Place]:
     """Return the columns of the motors of the dataset, by standard name."""
-    columns: dict[str, _Column] = {}
-    for feature, starts in _FEATURES.items():
-        if feature not in features:
-            continue
+    columns: dict[str, _Place] = {}
+    for feature in filter(features.__contains__, _FEATURES):
         names = _names(features[feature].get("names"))
         if not names:
             raise DataError(
@@ -96,18 +88,17 @@ def _columns(path: Path, features: Mapping[str, Any]) -> dict[str, _Column]:
                 f"their names, in the order of its {features[feature].get('shape')} values"
             )
         for place, name in enumerate(names):
-            joint, dot, end = str(name).rpartition(".")
-            if not dot or end not in starts:
-                joint, end = str(name), ""
-            column = f"{starts[end]}_{joint}"
+            joint, dot, end = name.rpartition(".")
+            if not dot or end not in _FEATURES[feature]:
+                joint, end = name, ""
+            column = f"{_FEATURES[feature][end]}_{joint}"
             if column in columns:
-                first = columns[column]
+                other, number = columns[column]
                 raise DataError(
-                    f"{path.name}: meta/info.json has the same name for {str(name)!r} of "
-                    f"{feature}, number {place}, and number {first.place} of {first.feature}; give "
-                    "each motor another name"
+                    f"{path.name}: meta/info.json has the same name for {name!r} of {feature}, "
+                    f"number {place}, and number {number} of {other}; give each motor another name"
                 )
-            columns[column] = _Column(feature, place)
+            columns[column] = feature, place
     if not columns:
         raise DataError(
             f"{path.name} has neither observation.state nor action, wanted one of them; features: "
@@ -119,10 +110,9 @@ def _columns(path: Path, features: Mapping[str, Any]) -> dict[str, _Column]:
 def _names(stated: object) -> list[str]:
     """Return the names of a feature's values; none if their form is unknown."""
     groups = list(stated.values()) if isinstance(stated, dict) else [stated]
-    lists = [group for group in groups if isinstance(group, list)]
-    if len(lists) < len(groups):  # neither {"motors": [...]} nor a list
+    if not all(isinstance(group, list) for group in groups):  # neither {"motors": [...]} nor a list
         return []
-    names = [name for group in lists for name in group]
+    names = [name for group in groups for name in group]
     return names if all(isinstance(name, str) for name in names) else []
 
 
@@ -132,11 +122,10 @@ def _episode(path: Path, numbers: Sequence[int], wanted: str | None) -> int:
     if not names:
         raise DataError(f"{path.name} has no episode: its files data/**/*.parquet have no rows")
     if wanted is None:
-        listing = "each episode is a separate log"
-        chosen = names[0] if len(names) == 1 else choose(path.name, names, "episodes", listing)
+        chosen = choose(path.name, names, "episodes", "each episode is a separate log")
         return numbers[names.index(chosen)]
-    found = re.fullmatch(r"(?:episode_)?0*([0-9]+)", wanted)
-    chosen = f"episode_{found[1]}" if found else wanted
+    digits = re.fullmatch(r"(?:episode_)?0*([0-9]+)", wanted)
+    chosen = f"episode_{digits[1]}" if digits else wanted
     if chosen not in names:
         shown = wanted if len(wanted) <= 40 else f"{wanted[:40]}..."
         raise DataError(
@@ -150,33 +139,30 @@ def _read(
     path: Path,
     files: Sequence[Path],
     number: int,
-    columns: Mapping[str, _Column],
+    columns: Mapping[str, _Place],
     wanted: Sequence[str],
 ) -> dict[str, Array]:
     """Return columns of an episode, in the order of its frames."""
     pa = load_pyarrow("reading LeRobot datasets")
-    used = {columns[name].feature for name in wanted if name != "time"}
-    names = ["timestamp", "episode_index", "frame_index", *sorted(used)]
+    places = {name: columns[name] for name in wanted if name != "time"}
+    features = sorted({feature for feature, _ in places.values()})
+    names = ["timestamp", "episode_index", "frame_index", *features]
     with parsing(path, "LeRobot"):
-        parts = [pa.parquet.read_table(file, columns=names) for file in files]
-        table = pa.concat_tables(parts)
+        table = pa.concat_tables([pa.parquet.read_table(file, columns=names) for file in files])
         rows = np.flatnonzero(table.column("episode_index").to_numpy() == number)
         rows = rows[np.argsort(table.column("frame_index").to_numpy()[rows], kind="stable")]
         vectors = {
             feature: np.array(table.column(feature).take(rows).to_pylist(), dtype=np.float64)
-            for feature in used
+            for feature in features
         }
         t = table.column("timestamp").to_numpy()[rows].astype(np.float64).ravel()
-    found: dict[str, Array] = {"time": t}
-    for name in wanted:
-        if name == "time":
-            continue
-        column = columns[name]
-        values = vectors[column.feature]
-        if values.ndim != 2 or column.place >= values.shape[1]:
+    values: dict[str, Array] = {"time": t}
+    for name, (feature, place) in places.items():
+        vector = vectors[feature]
+        if vector.ndim != 2 or place >= vector.shape[1]:
             raise DataError(
-                f"{path.name}: {column.feature} has vectors of shape {values.shape[1:]}, but "
-                f"meta/info.json has at least {column.place + 1} names of motors for it"
+                f"{path.name}: {feature} has vectors of shape {vector.shape[1:]}, but "
+                f"meta/info.json has at least {place + 1} names of motors for it"
             )
-        found[name] = values[:, column.place]
-    return {name: found[name] for name in wanted}
+        values[name] = vector[:, place]
+    return {name: values[name] for name in wanted}

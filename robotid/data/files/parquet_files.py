@@ -1,5 +1,9 @@
-"""Parquet files as tables of named columns; pyarrow is imported when one is opened."""
+"""Parquet files as tables of columns, and tables of texts and numbers that are no logs.
 
+pyarrow is imported when a file is opened.
+"""
+
+import csv
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -11,32 +15,36 @@ from typing import Any
 import numpy as np
 
 from robotid.base.exceptions import DataError, MissingDependencyError
+from robotid.base.files import missing_file
 from robotid.base.typing import Array
 from robotid.data.files.column_names import named_by_row
-from robotid.data.files.foreign_tables import renamed
-from robotid.data.files.table import Place, RowReader, Table, WritableFormat, parsing
+from robotid.data.files.table import Format, Place, RowReader, Table, parsing
+from robotid.data.log import repeated
 from robotid.data.signal_settings import LogSource
 
 _TEXTS = ("string", "large_string")  # types of columns
 _BATCH = 16384  # rows decoded together, if not all are required
 _BUFFER = 2**16  # bytes of each column read together in this case, not whole row groups
+_GROUP = 10_000  # rows of a row group, which are in memory before it is written
 
 
-class ParquetFormat(WritableFormat):
-    """Parquet files; null becomes NaN."""
+def _open(path: Path, source: LogSource) -> Table:
+    with _opened(path) as file:
+        names = list(file.schema_arrow.names)
+        texts = [x for x in names if str(file.schema_arrow.field(x).type) in _TEXTS]
+        rows = next(file.iter_batches(1, columns=texts), None) if texts else None
+    first = rows.to_pylist()[0] if rows is not None and len(rows) else {}
+    table = Table(names, partial(_read, path), (), _ParquetRows(path))
+    return table.with_names(named_by_row(dict.fromkeys(names, "") | first))
 
-    def open(self, path: Path, source: LogSource) -> Table:
-        with _open(path) as file:
-            names = list(file.schema_arrow.names)
-            texts = [x for x in names if str(file.schema_arrow.field(x).type) in _TEXTS]
-            rows = next(file.iter_batches(1, columns=texts), None) if texts else None
-        first = rows.to_pylist()[0] if rows is not None and len(rows) else {}
-        table = Table(names, partial(_read, path), (), _ParquetRows(path))
-        return renamed(table, named_by_row(dict.fromkeys(names, "") | first))
 
-    def write(self, table: Mapping[str, Array], path: Path) -> None:
-        pa = load_pyarrow("writing Parquet")
-        pa.parquet.write_table(pa.table(dict(table)), path)
+def _write(table: Mapping[str, Array], path: Path) -> None:
+    pa = load_pyarrow("writing Parquet")
+    pa.parquet.write_table(pa.table(dict(table)), path)
+
+
+#: Parquet files; null becomes NaN.
+PARQUET = Format((".parquet",), _open, _write, written=(".parquet",))
 
 
 def load_pyarrow(purpose: str) -> ModuleType:
@@ -55,26 +63,26 @@ class _ParquetRows(RowReader):
     path: Path
 
     def count(self) -> int:
-        with _open(self.path) as file:
+        with _opened(self.path) as file:
             return int(file.metadata.num_rows)
 
     def scan(self, name: str) -> Iterator[tuple[Array, Place]]:
         row = 0
-        with _open(self.path, [name], _BUFFER) as file:
+        with _opened(self.path, [name], _BUFFER) as file:
             for group in range(file.num_row_groups):  # one by one: groups stay in memory
-                for batch in self._batches(file, name, [group]):
+                for batch in _batches(file, name, [group]):
                     yield _to_numpy(batch.column(0)), Place(row)
                     row += batch.num_rows
 
     def read(self, wanted: Sequence[str], first: int, stop: int, near: Place) -> dict[str, Array]:
         values = {name: np.empty(stop - first) for name in wanted}
-        with _open(self.path, wanted, _BUFFER) as file:
+        with _opened(self.path, wanted, _BUFFER) as file:
             sizes = [file.metadata.row_group(k).num_rows for k in range(file.num_row_groups)]
             edges = np.cumsum([0, *sizes])
             groups = np.flatnonzero((edges[:-1] < stop) & (edges[1:] > first)).tolist()
             for name in wanted:  # one by one: each column needs memory for some pages
                 row = int(edges[groups[0]])
-                for batch in self._batches(file, name, groups):
+                for batch in _batches(file, name, groups):
                     start, end = max(first - row, 0), min(stop - row, batch.num_rows)
                     if start < end:
                         part = slice(row + start - first, row + end - first)
@@ -84,33 +92,30 @@ class _ParquetRows(RowReader):
                         break
         return values
 
-    def _batches(self, file: Any, name: str, groups: Sequence[int]) -> Iterator[Any]:  # noqa: ANN401
-        """Yield batches of rows of one column."""
-        how = {"columns": [name], "row_groups": groups, "use_threads": False}
-        batches: Iterator[Any] = file.iter_batches(_BATCH, **how)
-        return batches
+
+def _batches(file: Any, name: str, groups: Sequence[int]) -> Iterator[Any]:  # noqa: ANN401
+    """Yield batches of rows of one column."""
+    how = {"columns": [name], "row_groups": groups, "use_threads": False}
+    batches: Iterator[Any] = file.iter_batches(_BATCH, **how)
+    return batches
 
 
 @contextmanager
-def _open(path: Path, wanted: Sequence[str] = (), buffer: int = 0) -> Iterator[Any]:
+def _opened(path: Path, wanted: Sequence[str] = (), buffer: int = 0) -> Iterator[Any]:
     """Open a Parquet file; the wanted columns must contain numbers."""
     pa = load_pyarrow("reading Parquet")
-    with (
-        parsing(path, "Parquet"),
-        pa.parquet.ParquetFile(path, buffer_size=buffer) as file,
-    ):
+    with parsing(path, "Parquet"), pa.parquet.ParquetFile(path, buffer_size=buffer) as file:
         for name in wanted:
             kind = file.schema_arrow.field(name).type
             if not (pa.types.is_integer(kind) or pa.types.is_floating(kind)):
-                todo = "write one column per value, or their sum" * pa.types.is_nested(kind)
-                raise DataError(
-                    f"{path.name}: {name} contains {kind}, wanted numbers; {todo or 'convert it'}"
-                )
+                is_nested = pa.types.is_nested(kind)
+                remedy = "write one column per value, or their sum" if is_nested else "convert it"
+                raise DataError(f"{path.name}: {name} contains {kind}, wanted numbers; {remedy}")
         yield file
 
 
 def _read(path: Path, wanted: Sequence[str]) -> dict[str, Array]:
-    with _open(path, wanted) as file:
+    with _opened(path, wanted) as file:
         table = file.read(columns=list(wanted))
     return {name: _to_numpy(table.column(name)) for name in wanted}
 
@@ -124,3 +129,88 @@ def _to_numpy(column: Any) -> Array:  # noqa: ANN401
         for chunk in chunks
     ]
     return np.concatenate([np.empty(0), *parts], dtype=np.float64)
+
+
+def read_text_table(path: str | Path) -> tuple[list[str], list[dict[str, str]]]:
+    """Return the names of the columns and the rows of a CSV or Parquet table; missing: ""."""
+    source = Path(path)
+    if not source.is_file():
+        raise DataError(missing_file(source, "table"))
+    match source.suffix.lower():
+        case ".csv":
+            names, rows = _csv_texts(source)
+        case ".parquet":
+            with _opened(source) as file:
+                table = file.read()
+            columns = [column.to_pylist() for column in table.columns]
+            cells = [["" if x is None else str(x).strip() for x in column] for column in columns]
+            names, rows = list(table.column_names), list(map(list, zip(*cells, strict=True)))
+        case suffix:
+            raise DataError(
+                f"{source.name}: the suffix is {suffix!r}, wanted a table of type .csv or "
+                ".parquet; convert it"
+            )
+    if twice := repeated(names):
+        raise DataError(f"{source.name} has several columns {twice[0]!r}; rename all but one")
+    return names, [dict(zip(names, row, strict=True)) for row in rows]
+
+
+def _csv_texts(path: Path) -> tuple[list[str], list[list[str]]]:
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            lines = [line for line in csv.reader(file, strict=True) if line]
+    except (csv.Error, UnicodeDecodeError) as error:
+        raise DataError(f"{path.name} is not a CSV table: {error}; wanted UTF-8 text") from error
+    if not lines:
+        raise DataError(f"{path.name} is empty, wanted a row of names and rows of values")
+    names, *rows = [[cell.strip() for cell in line] for line in lines]
+    for number, row in enumerate(rows, start=1):
+        if len(row) != len(names):
+            raise DataError(
+                f"{path.name} row {number} has {len(row)} values, wanted {len(names)}, as many as "
+                "columns; put values that contain a comma in double quotes"
+            )
+    return names, rows
+
+
+class ParquetRows:
+    """Writes rows to a Parquet file; at most one row group of them is in memory."""
+
+    def __init__(self, writer: Any, schema: Any) -> None:  # noqa: ANN401
+        self._writer, self._schema = writer, schema
+        self._waiting: list[Mapping[str, str | float | None]] = []
+
+    def add(self, rows: Sequence[Mapping[str, str | float | None]]) -> None:
+        """Add rows."""
+        self._waiting += rows
+        while len(self._waiting) >= _GROUP:
+            self.write(_GROUP)
+
+    def write(self, count: int | None = None) -> None:
+        """Write some of the waiting rows, or all, as a row group."""
+        import pyarrow
+
+        rows, self._waiting = self._waiting[:count], self._waiting[count:] if count else []
+        if rows:
+            columns = {name: [row.get(name) for row in rows] for name in self._schema.names}
+            self._writer.write_table(pyarrow.table(columns, schema=self._schema))
+
+
+@contextmanager
+def parquet_rows(path: Path, columns: Mapping[str, type]) -> Iterator[ParquetRows]:
+    """Write a Parquet file row by row; equal rows make equal files."""
+    pa = load_pyarrow("writing Parquet")
+    kinds = {str: pa.string(), float: pa.float64()}
+    schema = pa.schema([(name, kinds[kind]) for name, kind in columns.items()])
+    with pa.parquet.ParquetWriter(path, schema) as writer:
+        rows = ParquetRows(writer, schema)
+        yield rows
+        rows.write()
+
+
+def parquet_values(path: Path) -> Iterator[dict[str, Any]]:
+    """Yield the rows of a Parquet file, without their nulls; a row group of them is in memory."""
+    with _opened(path) as file:
+        for batch in file.iter_batches(_GROUP):
+            for row in batch.to_pylist():
+                yield {name: value for name, value in row.items() if value is not None}

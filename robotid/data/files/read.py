@@ -23,23 +23,18 @@ from robotid.base.settings import require_each, require_kind
 from robotid.base.typing import Array
 from robotid.data.base_motion import BaseColumns, base_columns, base_of, contacts_of, table_of_base
 from robotid.data.files.columns import NOUNS, TORQUES, Finder, Needs, without_torque
-from robotid.data.files.even_stamps import with_even_stamps
-from robotid.data.files.foreign_tables import (
+from robotid.data.files.formats import open_table, write_columns
+from robotid.data.files.table import (
     Frame,
+    Table,
     is_frame,
     open_frame,
-    with_own_names,
+    with_even_stamps,
+    with_standard_names,
     with_stated_names,
     with_time,
 )
-from robotid.data.files.table import Table
-from robotid.data.files.table_files import open_table, write_columns
-from robotid.data.log import (
-    COLUMNS,
-    Log,
-    require_finite,
-    require_increasing,
-)
+from robotid.data.log import COLUMNS, Log, require_finite, require_increasing
 from robotid.data.signal_settings import PER_SECOND, LogSource, LogUnits
 from robotid.data.transmission import Transmission, check_transmissions
 from robotid.data.units import check_units, turned
@@ -374,7 +369,7 @@ def _opened(path: str | Path | Frame, source: LogSource) -> tuple[str, Table]:
     if not is_frame(path):
         raise _no_log(path)
     table = with_stated_names(open_frame(path), "log", source.names)
-    return "log", with_time(with_own_names(table, "log", "DataFrames", source), source.rate)
+    return "log", with_time(with_standard_names(table, "log", "DataFrames", source), source.rate)
 
 
 def _moves(

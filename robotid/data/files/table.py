@@ -1,16 +1,31 @@
-"""The common form of all file formats: named columns, read as a whole or row by row."""
+"""The common form of all file formats: named columns, read as a whole or row by row.
 
+Columns with names of other programs (PlotJuggler, rostopic, DataFrames), stamps in two columns and
+stamps with equal steps are columns that are computed from others.
+"""
+
+import re
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
-from functools import cached_property
+from dataclasses import dataclass, field, replace
+from functools import cache, cached_property
+from itertools import chain
 from pathlib import Path
+from typing import Any, Protocol, TypeGuard
+
+import numpy as np
 
 from robotid.base.exceptions import DataError, RobotIdError
 from robotid.base.findings import listed
 from robotid.base.typing import Array
+from robotid.data.files.column_names import is_clock, named_by_row, quantity_of
+from robotid.data.log import suggestion
 from robotid.data.signal_settings import LogSource
+
+_CLOCK = "__time"  # PlotJuggler's
+_SECONDS = re.compile(r"(.*)(?<![a-z])(secs?|n(?:ano)?secs?)")  # of a stamp in two columns
+_NAMED = re.compile(r"(.*)/([^/]+)/(position|velocity|acceleration|effort)")  # topic, joint, kind
 
 
 @dataclass(frozen=True)
@@ -39,6 +54,14 @@ class RowReader(ABC):
 
 
 @dataclass(frozen=True)
+class Column:
+    """A column that is computed from others, row by row."""
+
+    sources: tuple[str, ...]
+    values: Callable[..., Array] = lambda _, x: x  # of the first row's number and the sources
+
+
+@dataclass(frozen=True)
 class Table:
     """The columns of one file."""
 
@@ -54,6 +77,23 @@ class Table:
     def reader(self, wanted: Sequence[str]) -> RowReader:
         """Return the reader of the rows; of a format that is read as a whole, of wanted columns."""
         return self.rows or _WholeTable(self, wanted)
+
+    def with_columns(self, columns: Mapping[str, Column], names: Sequence[str]) -> "Table":
+        """Return a table in which some columns are computed, and the names of all its columns."""
+
+        def read(wanted: Sequence[str]) -> dict[str, Array]:
+            return _computed(columns, wanted, 0, self.read)
+
+        rows = None if self.rows is None else _ComputedRows(self.rows, columns)
+        return replace(self, names=list(names), read=read, rows=rows)
+
+    def with_names(self, names: Mapping[str, str]) -> "Table":
+        """Return a table with other names of columns, by their name in it."""
+        if not names:
+            return self
+        columns = {name: Column((old,)) for old, name in names.items()}
+        table = self.with_columns(columns, [names.get(name, name) for name in self.names])
+        return replace(table, renamed={**self.renamed, **names})
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,27 +117,199 @@ class _WholeTable(RowReader):
         return self.table.read(self.wanted)
 
 
-class Format(ABC):
-    """Reader of one file format."""
+@dataclass(frozen=True)
+class _ComputedRows(RowReader):
+    """Rows of a file with columns that are computed from others."""
 
-    @abstractmethod
-    def open(self, path: Path, source: LogSource) -> Table:
-        """Return the table in a file; faults of a column are reported when it is read."""
+    rows: RowReader
+    columns: Mapping[str, Column]
+
+    def count(self) -> int:
+        return self.rows.count()
+
+    def scan(self, name: str) -> Iterator[tuple[Array, Place]]:
+        column, row = self.columns.get(name, Column((name,))), 0
+        for blocks in zip(*map(self.rows.scan, column.sources), strict=True):
+            yield column.values(row, *(values for values, _ in blocks)), blocks[0][1]
+            row += len(blocks[0][0])
+
+    def read(self, wanted: Sequence[str], first: int, stop: int, near: Place) -> dict[str, Array]:
+        def read(names: Sequence[str]) -> dict[str, Array]:
+            return self.rows.read(names, first, stop, near)
+
+        return _computed(self.columns, wanted, first, read)
 
 
-class WritableFormat(Format):
-    """A format that is also written."""
+def _computed(
+    columns: Mapping[str, Column],
+    wanted: Sequence[str],
+    first: int,
+    read: Callable[[Sequence[str]], dict[str, Array]],
+) -> dict[str, Array]:
+    """Return wanted columns from those that a reader returns."""
+    used = {name: columns.get(name, Column((name,))) for name in wanted}
+    values = read(list(dict.fromkeys(chain.from_iterable(x.sources for x in used.values()))))
+    return {
+        name: column.values(first, *(values[x] for x in column.sources))
+        for name, column in used.items()
+    }
 
-    @abstractmethod
-    def write(self, table: Mapping[str, Array], path: Path) -> None:
-        """Write columns to a file: table (N,)."""
+
+@dataclass(frozen=True)
+class Format:
+    """One file format; to add one, write its module and enter it in ``formats``."""
+
+    suffixes: tuple[str, ...]
+    open: Callable[[Path, LogSource], Table]  # faults of a column are reported when it is read
+    write: Callable[[Mapping[str, Array], Path], None] | None = None  # of columns (N,)
+    written: tuple[str, ...] = ()  # suffixes with which it is written
+    topics: str = ""  # what contains a log: "topic", "group"; "": there is one log per file
 
 
-def choose(where: str, found: Sequence[str], noun: str, listing: str) -> str:
+class Frame(Protocol):
+    """A DataFrame, of pandas, polars or another library."""
+
+    @property
+    def columns(self) -> Any: ...  # noqa: ANN401
+
+    def __getitem__(self, name: Any, /) -> Any: ...  # noqa: ANN401
+
+
+def is_frame(thing: object) -> TypeGuard[Frame]:
+    """Return whether an object has named columns, as a DataFrame."""
+    return hasattr(thing, "columns") and hasattr(thing, "__getitem__")
+
+
+def open_frame(frame: Frame) -> Table:
+    """Return the table in a DataFrame; an index with a name becomes a column."""
+    if getattr(getattr(frame, "index", None), "name", None) is not None:
+        frame = frame.reset_index()  # type: ignore[attr-defined]
+    keys = {str(key): key for key in frame.columns}
+    named = named_by_row({x: next(iter(frame[key]), "") for x, key in keys.items()})
+
+    def read(wanted: Sequence[str]) -> dict[str, Array]:
+        return {name: _numbers(frame[keys[name]], named.get(name, name)) for name in wanted}
+
+    return Table(list(keys), read).with_names(named)
+
+
+def _numbers(values: Any, name: str) -> Array:  # noqa: ANN401
+    try:
+        return np.asarray(values, dtype=float)
+    except (TypeError, ValueError) as error:
+        kind = getattr(values, "dtype", type(values).__name__)
+        raise DataError(
+            f"log: column {name!r} contains {kind}, wanted numbers ({error}); convert it"
+        ) from error
+
+
+def with_standard_names(table: Table, where: str, kind: str, source: LogSource) -> Table:
+    """Return a table with the columns of PlotJuggler renamed to standard names.
+
+    ``/joint_states/elbow/position`` becomes ``position_elbow``, likewise velocity, acceleration and
+    effort, and ``__time`` becomes ``time``. A table with standard columns is not changed.
+    """
+    topics: dict[str, dict[str, str]] = {}  # standard names by name in the file, by topic
+    is_standard = any(name.startswith(("q_", "position_")) for name in table.names)
+    for name in table.names if _CLOCK in table.names or not is_standard else ():
+        if match := _NAMED.fullmatch(name):
+            topic, joint, quantity = match.groups()
+            topics.setdefault(topic, {})[name] = f"{quantity}_{joint}"
+    if source.topic is not None and not topics:
+        note = f"the topic {source.topic!r} is not used: {kind} have none"
+        table = replace(table, notes=(*table.notes, note))
+    names = {_CLOCK: "time"} if _CLOCK in table.names and "time" not in table.names else {}
+    return table.with_names(names | (topics[_topic(topics, where, source)] if topics else {}))
+
+
+def _topic(topics: Mapping[str, Mapping[str, str]], where: str, source: LogSource) -> str:
+    """Return the stated topic, or the only one (with efforts, if any topic has efforts)."""
+    if source.topic is None:
+        moved = [x for x, names in topics.items() if any("effort_" in y for y in names.values())]
+        words = "its columns have names as <topic>/<joint>/position"
+        return choose(where, moved or list(topics), "topics of joint states", words)
+    if source.topic not in topics:
+        raise DataError(
+            f"{where} has no topic {source.topic!r}; topics: {listed(topics)}"
+            f"{suggestion(source.topic, topics)}"
+        )
+    return source.topic
+
+
+def with_stated_names(table: Table, where: str, names: Sequence[str]) -> Table:
+    """Return a table with the names that a job states for all columns, in their order."""
+    if names and len(names) != len(table.names):
+        raise DataError(
+            f"{where} has {len(table.names)} columns, but log.names states {len(names)}; name "
+            "each column, in their order"
+        )
+    return table.with_names(dict(zip(table.names, names, strict=True))) if names else table
+
+
+def with_time(table: Table, rate: float | None) -> Table:
+    """Return a table with a column "time" from seconds and nanoseconds, or from a stated rate."""
+    if any(is_clock(name) for name in table.names):
+        note = "log.rate is not used: the log has time stamps"
+        return table if rate is None else replace(table, notes=(*table.notes, note))
+    if rate is not None:
+        any_column = next((x for x in table.names if quantity_of(x)), table.names[0])
+        time = Column((any_column,), lambda row, x: (row + np.arange(len(x))) / rate)
+        return table.with_columns({"time": time}, ["time", *table.names])
+    parts: dict[str, list[str]] = {}
+    for name in table.names:
+        if match := _SECONDS.fullmatch(name):
+            parts.setdefault(match[1], []).append(name)
+    pairs = [
+        sorted(names, key=lambda x: x.endswith(("nsec", "nsecs", "nanosec", "nanosecs")))
+        for names in parts.values()
+        if len(names) == 2
+    ]
+    if len(pairs) != 1:
+        return table
+    time = Column(tuple(pairs[0]), lambda _, sec, nanosec: sec + 1e-9 * nanosec)
+    others = [name for name in table.names if name not in pairs[0]]
+    return table.with_columns({"time": time}, ["time", *others])
+
+
+def with_even_stamps(table: Table, column: str, stamp: str = "even") -> Table:
+    """Return a table whose rows have equal time steps: the straight line through its stamps."""
+    if stamp != "even":
+        return table
+
+    @cache
+    def line() -> tuple[float, float]:
+        return _line(values for values, _ in table.reader([column]).scan(column))
+
+    def stamps(row: int, t: Array) -> Array:
+        start, step = line()
+        even: Array = start + step * np.arange(row, row + len(t))
+        return even
+
+    return table.with_columns({column: Column((column,), stamps)}, table.names)
+
+
+def _line(blocks: Iterable[Array]) -> tuple[float, float]:
+    """Return the first value and the step of the least-squares line through values by row."""
+    count, first = 0, 0.0
+    sums = np.zeros(4)  # of row, value, row * value, row^2
+    for block in blocks:
+        if not count and len(block):
+            first = float(block[0])
+        row, t = np.arange(count, count + len(block), dtype=float), block - first
+        sums += row.sum(), t.sum(), row @ t, row @ row
+        count += len(block)
+    if count < 2:
+        return first, 0.0
+    row, t, both, square = sums / count
+    step = float((both - row * t) / (square - row**2))
+    return first + float(t - step * row), step
+
+
+def choose(where: str, candidates: Sequence[str], noun: str, listing: str) -> str:
     """Return the only one of the possible places of a log in a file."""
-    if len(found) == 1:
-        return found[0]
-    names = sorted(found)
+    if len(candidates) == 1:
+        return candidates[0]
+    names = sorted(candidates)
     raise DataError(
         f"{where} has {len(names)} {noun}: {listed(names)}; {listing}. State one: topic = "
         f'"{names[0]}" (job file table [log], CLI --topic, Python source=LogSource(topic=...))'

@@ -28,8 +28,8 @@ from robotid.diagnosis.urdf.inertials import assumed_inertials, explained_by_ass
 from robotid.diagnosis.urdf.rounding import rounded_robot
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.constraint_rows import logged_base
-from robotid.robot.assumed import with_assumed_inertials
 from robotid.robot.model import RobotModel
+from robotid.robot.prior import with_assumed_inertials
 
 #: Codes of the doctor's errors, which can be ignored.
 CODES = (

@@ -17,9 +17,8 @@ from robotid.diagnosis.logs.base_pose import check_order, check_pose, check_twis
 from robotid.diagnosis.logs.imu import check_imu
 from robotid.diagnosis.logs.slips import check_slip, without_zeros
 from robotid.diagnosis.logs.wrenches import check_wrenches
+from robotid.dynamics.completed_logs import closed_log, with_contacts
 from robotid.dynamics.constraint_rows import constraint_jacobian
-from robotid.dynamics.constraints.closed_log import closed_log
-from robotid.dynamics.constraints.found_contacts import with_contacts
 from robotid.robot.constraints import Contact
 from robotid.robot.model import RobotModel
 

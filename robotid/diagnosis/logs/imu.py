@@ -6,8 +6,7 @@ import numpy as np
 
 from robotid.base.findings import Finding, log_finding
 from robotid.base.typing import Array
-from robotid.data.base_motion import base_state, in_base
-from robotid.data.imu_frame import ImuFrame
+from robotid.data.base_motion import ImuFrame, base_state, in_base
 from robotid.data.log import Log, Trajectory
 from robotid.diagnosis.logs.base_pose import orientation_readings
 from robotid.diagnosis.logs.slips import rms

@@ -14,8 +14,7 @@ from robotid.base.findings import Finding, listed, log_finding
 from robotid.base.typing import Array
 from robotid.diagnosis.logs.hypotheses import compensated, own_share
 from robotid.diagnosis.logs.torque_sample import Probe
-from robotid.robot.drives import COUNTERBALANCE
-from robotid.robot.families import drive_line, spring_family
+from robotid.robot.drives import COUNTERBALANCE, drive_line, spring_family
 
 #: Message on torques without gravity.
 NO_GRAVITY = (

@@ -12,10 +12,10 @@ import numpy as np
 
 from robotid.base.findings import Finding, log_finding
 from robotid.base.typing import Array
+from robotid.data.filters import cubic_spline
 from robotid.data.log import Log, Trajectory
 from robotid.data.signal_settings import SignalSettings
-from robotid.data.smoothing import low_pass
-from robotid.data.splines import cubic_spline
+from robotid.data.signals import low_pass
 from robotid.diagnosis.logs.torque_sample import coupled_columns, smooth_motion
 from robotid.dynamics.torque import carried_columns
 from robotid.robot.model import RobotModel

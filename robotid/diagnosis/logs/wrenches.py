@@ -87,7 +87,6 @@ def check_wrenches(model: RobotModel, log: Log, motion: Trajectory) -> Iterator[
     ]  # and not because all forces are unknown in them
     best = min(better, key=size, default=stated)
     remain = best.sizes[1] > _BETTER * stated.sizes[1] and best.sizes[0] < _BETTER * stated.sizes[0]
-    has_plates = all(x.is_measured and x.kind == "surface" for x in measured)
     if remain:  # the force alone does not show which foot it acts on
         best = min([x for x in better if not x.is_exchanged], key=size, default=best)
     if best is stated:
@@ -97,11 +96,6 @@ def check_wrenches(model: RobotModel, log: Log, motion: Trajectory) -> Iterator[
         f"(RMS) of the base unexplained, but only {_size(best)} if {' and '.join(best.changes)}"
         ". Correct the columns wrench_..., or [[contact]]"
     )
-    if remain and has_plates:
-        message += (
-            ". The moments remain: state the plate of each foot, plate = [x, y, z, roll, "
-            "pitch, yaw]"
-        )
     evidence = {"force": stated.sizes[0], "best": best.sizes[0], "factor": best.factor}
     yield log_finding(log.name, "measured_wrench", "error", message, **evidence)
 
@@ -136,22 +130,16 @@ def _readings(model: RobotModel, motion: Trajectory, torque: Array) -> Iterator[
 
 
 def _places(model: RobotModel) -> Iterator[tuple[tuple[str, ...], RobotModel]]:
-    """Yield the robot with other axes and origins of the measured forces, and what differs."""
+    """Yield the robot with other axes of the measured forces, and what differs."""
     yield (), model
-    read: dict[str, tuple[str, tuple[float, ...]]] = {
-        "their axes are those of the link (axes = 'link')": ("link", ()),
-        "their axes are those of the world (axes = 'world')": ("world", ()),
-    }
-    if all(x.is_measured and x.kind == "surface" for x in model.contacts if x.measured):
-        zero = ("world", (0.0, 0.0, 0.0))
-        read["their origin is that of the world (plate = [0, 0, 0])"] = zero
-    for words, (axes, plate) in read.items():
+    for axes in ("link", "world"):
         contacts = tuple(
-            replace(x, axes=axes, plate=plate) if isinstance(x, Contact) and x.measured else x
+            replace(x, axes=axes) if isinstance(x, Contact) and x.measured else x
             for x in model.constraints
         )
         if contacts != model.constraints:
-            yield (words,), replace(model, constraints=contacts)
+            words = (f"their axes are those of the {axes} (axes = '{axes}')",)
+            yield words, replace(model, constraints=contacts)
 
 
 def _fitted(

@@ -144,7 +144,7 @@ def _alterations(model: RobotModel, pi: Array, sample: Sample) -> Iterator[_Alte
     """Yield the possible differences, with their effect on the torques of the sample."""
     n = len(model.joints)
     tau, of_drives = _torques(model, pi, sample.at), _drives(model, pi, sample.at)
-    of_motions = [body_slopes(model, pi, motion).arrays for motion in sample.at]
+    of_motions = [body_slopes(model, pi, motion) for motion in sample.at]
     *by_motion, by_gravity, by_origin = map(np.concatenate, zip(*of_motions, strict=True))
     q, v, a = (np.concatenate([getattr(m, key) for m in sample.at]) for key in "qva")
 

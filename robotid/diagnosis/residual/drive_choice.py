@@ -33,7 +33,7 @@ from robotid.diagnosis.residual.decisions import (
 )
 from robotid.diagnosis.residual.selection import Round, select
 from robotid.diagnosis.residual.term_trials import RIDGE, Sample, Trial, Trials, take_sample
-from robotid.dynamics.memory import drive_motion_along
+from robotid.dynamics.prediction import drive_motion_along
 from robotid.estimation.fitting.fitted import Solution
 from robotid.estimation.fitting.selected_drives import DriveChoice, FoundShape, Tried, with_shapes
 from robotid.robot.drives import FAMILIES, DataRange, DriveMotion, DriveTerm, Family, MemorylessTerm

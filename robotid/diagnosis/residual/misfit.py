@@ -20,8 +20,7 @@ from robotid.diagnosis.residual.decisions import (
 from robotid.diagnosis.residual.selection import Round, select
 from robotid.diagnosis.residual.term_trials import Sample, Trial, Trials
 from robotid.estimation.fitting.joint_motion import JointMotion
-from robotid.robot.drives import DriveTerm
-from robotid.robot.families import has_turned
+from robotid.robot.drives import DriveTerm, has_turned
 
 
 @dataclass(frozen=True)

@@ -10,8 +10,7 @@ from robotid.diagnosis.residual.candidates import Candidate
 from robotid.diagnosis.residual.decisions import MAIN
 from robotid.diagnosis.residual.misfit import Misfit
 from robotid.estimation.fitting.fitted import Fit
-from robotid.robot.drives import COUNTERBALANCE, DriveTerm
-from robotid.robot.families import drive_line, spring_family
+from robotid.robot.drives import COUNTERBALANCE, DriveTerm, drive_line, spring_family
 
 _OF_POSITION = ("position_periodic", "spring", "position_offset")
 _BALANCES = ("counterbalance", "link_mass")

@@ -22,7 +22,7 @@ from robotid.base.typing import Array
 from robotid.diagnosis.residual.decisions import GROWN
 from robotid.diagnosis.residual.misfit import Misfit
 from robotid.diagnosis.residual.term_trials import Sample, Trial, Trials, take_sample
-from robotid.dynamics.memory import drive_motion_along
+from robotid.dynamics.prediction import drive_motion_along
 from robotid.estimation.fitting.fitted import Fit, Solution
 from robotid.estimation.fitting.joint_motion import JointMotion
 from robotid.estimation.fitting.open_terms import OpenTerm

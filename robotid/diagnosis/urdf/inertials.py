@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 
 from robotid.base.findings import Finding, listed
-from robotid.robot.assumed import REASONS, assumed_masses
 from robotid.robot.bodies import link_places
 from robotid.robot.model import RobotModel
+from robotid.robot.prior import REASONS, assumed_masses
 from robotid.robot.tree import Inertial
 from robotid.robot.urdf_text import numbers
 

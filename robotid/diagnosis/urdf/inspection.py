@@ -21,9 +21,9 @@ from robotid.dynamics.base_parameters import (
     structural_mapping,
 )
 from robotid.dynamics.torque import random_regressor
-from robotid.robot.assumed import with_assumed_inertials
 from robotid.robot.bodies import LinkPlace, link_places
 from robotid.robot.model import RobotModel
+from robotid.robot.prior import with_assumed_inertials
 from robotid.robot.tree import MOVABLE
 from robotid.robot.urdf_text import number_fault, numbers, parse_urdf, read_with_yourdfpy
 

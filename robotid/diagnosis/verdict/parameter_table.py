@@ -2,13 +2,13 @@
 
 import math
 from collections.abc import Iterable, Mapping
+from html import escape
 from importlib.util import find_spec
 from typing import Any
 
 from robotid.base.files import finite
 from robotid.diagnosis.verdict.correlation import correlated_parameters
 from robotid.estimation.fitting.identified import Identified
-from robotid.output.pages.html import code, number, table, text
 
 #: Columns of a row: link or drive, parameter, the URDF's value, the identified one, its standard
 #: error, its 95 % interval, what determined it, unit.
@@ -20,17 +20,14 @@ class ParameterRows(list[dict[str, Any]]):
     """The rows if pandas is not installed: dictionaries, which a notebook shows as a table."""
 
     def _repr_html_(self) -> str:
-        cells = [
-            [
-                code(row["part"]),
-                code(row["parameter"]),
-                *(number(row[key]) for key in _NUMBERS),
-                text(row["source"]),
-                text(row["unit"]),
-            ]
-            for row in self
-        ]
-        return table("Parameters", HEADERS, cells)
+        rows = [HEADERS, *(tuple("" if x is None else x for x in row.values()) for row in self)]
+        html = "".join(f"<tr>{''.join(map(_cell, row))}</tr>" for row in rows)
+        return f"<table>{html}</table>"
+
+
+def _cell(value: object) -> str:
+    words = f"{value:.4g}" if isinstance(value, float) else str(value)
+    return f"<td>{escape(words)}</td>"
 
 
 def parameter_entries(found: Identified) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:

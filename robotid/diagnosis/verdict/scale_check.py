@@ -22,8 +22,8 @@ from robotid.dynamics.constraint_rows import loop_basis, without_forces
 from robotid.dynamics.prediction import predict
 from robotid.dynamics.torque import joint_torque_regressor
 from robotid.estimation.fitting.fitted import Fit
-from robotid.robot.assumed import assumed_masses
 from robotid.robot.parameters import pseudo_inertia
+from robotid.robot.prior import assumed_masses
 
 _POSES = 300  # at which gravity is compared
 _LOADED = 0.02  # share of the largest gravity torque above which a joint is compared

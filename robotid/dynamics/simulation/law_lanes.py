@@ -1,19 +1,35 @@
-"""Laws of drives in closed-loop simulations, with derivatives, in Numba: friction and control.
+"""Laws of drives in closed-loop simulations, in Numba: friction, control, and averaged commands.
 
-Imported only for closed-loop simulations. The laws are those of the terms of ``drives``, compiled
-one by one; the code here calls a law by its address.
+Imported only for closed-loop simulations. Friction has the laws of the terms of ``drives``,
+compiled one by one; the code here calls a law by its address. ``drive`` has armature, kp, kd and
+torque limit.
 """
 
 import math
 from functools import cache
 
+import numpy as np
+
 from robotid.base.exceptions import SettingsError
-from robotid.dynamics.kernels.lanes import applied, compiled, pointed
-from robotid.dynamics.kernels.vector_lanes import LANES, copysign, lane_of, where, wide, with_lane
+from robotid.dynamics.kernels.lanes import (
+    LANES,
+    applied,
+    compiled,
+    copysign,
+    lane_of,
+    pointed,
+    read,
+    where,
+    wide,
+    with_lane,
+)
 from robotid.robot.drive_term import BRISTLES, PLAIN, DriveTerm, Law, MemorylessTerm
 from robotid.robot.drives import Bristles
 
 _SIGN = 1e-5  # speed over which friction reverses [rad/s or m/s]
+
+# kinds of sensitivities
+ARMATURE, KP, KD, LIMIT, TERM, DELAY, ZERO, INERTIAL, START, SPEED = range(10)
 
 _bristles = compiled(Bristles.law)
 _pointed = cache(pointed)
@@ -123,11 +139,8 @@ def deflection_by_lane(x, before, u, span):
     z, z_u, decay = wide(0.0), wide(0.0), wide(0.0)
     for lane in range(LANES):
         y, y_u, left = deflection(x, lane_of(before, lane), lane_of(u, lane), lane_of(span, lane))
-        z, z_u, decay = (
-            with_lane(z, lane, y),
-            with_lane(z_u, lane, y_u),
-            with_lane(decay, lane, left),
-        )
+        z, z_u = with_lane(z, lane, y), with_lane(z_u, lane, y_u)
+        decay = with_lane(decay, lane, left)
     return z, z_u, decay
 
 
@@ -156,9 +169,96 @@ def initial_deflection_by_lane(x, v, time):
 def loop_torque(drive, error, speed_error, forward):
     """Return the torque that a loop commands, and 1 below its limit, else 0.
 
-    ``drive`` has armature, kp, kd and torque limit; ``error`` and ``speed_error`` are the errors of
-    position and speed, ``forward`` is the feed-forward torque.
+    ``error`` and ``speed_error`` are those of position and speed, ``forward`` is the feed-forward
+    torque.
     """
     unlimited, limit = drive[1] * error + drive[2] * speed_error + forward, drive[3]
     is_free = abs(unlimited) < limit
     return where(is_free, unlimited, copysign(limit, unlimited)), where(is_free, 1.0, 0.0)
+
+
+@compiled
+def read_command(now, i, kind):
+    """Return an input of joint i over a step; ``now`` has all inputs and the step's first."""
+    inputs, first = now
+    return read(inputs, (first + 6 * i + kind) * LANES)
+
+
+@compiled
+def by_delay(drive, now, i):
+    """Return the derivative of a loop's torque by the delay of its commands, below its limit."""
+    by_position = drive[1] * read_command(now, i, 1)
+    return by_position + drive[2] * read_command(now, i, 4) + read_command(now, i, 5)
+
+
+@compiled
+def by_loop(kind, is_on, error, speed_error, by_delay, torque):
+    """Return the derivative of a loop's torque by a gain, its delay or its limit."""
+    if kind == KP:
+        return is_on * error
+    if kind == KD:
+        return is_on * speed_error
+    if kind == DELAY:
+        return is_on * by_delay
+    return (1.0 - is_on) * copysign(1.0, torque) if kind == LIMIT else wide(0.0)
+
+
+@compiled
+def average_command(stamps, values, times, delay, mean, change):
+    """Write the mean command over each step, and its derivative by the delay.
+
+    stamps (N,) [s], values (N,), times (K + 1,) [s], change (K,).
+    """
+    last, i = len(stamps) - 1, 0
+    start = times[0] - delay
+    while i < last and stamps[i + 1] <= start:
+        i += 1
+    for k in range(len(mean)):
+        end, before, at, total = times[k + 1] - delay, values[i], start, 0.0
+        while i < last and stamps[i + 1] <= end:
+            total += values[i] * (stamps[i + 1] - at) if stamps[i + 1] > at else 0.0
+            at = max(at, stamps[i + 1])
+            i += 1
+        total += values[i] * (end - at)
+        mean[k] = total / (end - start)
+        change[k] = (before - values[i]) / (end - start)
+        start = end
+
+
+@compiled
+def divide_rows(stamps, ticks, times, is_tick):
+    """Write the ends of the steps: an equal number in each row, and none across a tick.
+
+    Ticks divide a row. The longest steps are divided further, into two, three and so on, until the
+    row has the required number.
+
+    stamps (N,) [s], is_tick ((N - 1) every,).
+    """
+    every, i = len(is_tick) // (len(stamps) - 1), 0
+    edges, shares = np.empty(every + 1), np.empty(every, np.int64)
+    is_tick[:], is_tick[0] = False, True
+    for k in range(len(stamps) - 1):
+        edges[0], count = stamps[k], 1
+        while i < len(ticks) and ticks[i] < stamps[k + 1]:
+            if ticks[i] > stamps[k]:
+                edges[count] = ticks[i]
+                count += 1
+            else:
+                is_tick[k * every] = True
+            i += 1
+        edges[count] = stamps[k + 1]
+        shares[:count] = 1
+        for _ in range(every - count):
+            longest, length = 0, 0.0  # np.argmax and np.diff take three seconds to compile
+            for j in range(count):
+                step = (edges[j + 1] - edges[j]) / shares[j]
+                if step > length:
+                    longest, length = j, step
+            shares[longest] += 1
+        at = k * every
+        for j in range(count):
+            is_tick[at] = is_tick[at] or j > 0
+            for part in range(shares[j]):
+                times[at] = edges[j] + (edges[j + 1] - edges[j]) * part / shares[j]
+                at += 1
+    times[-1] = stamps[-1]

@@ -27,7 +27,23 @@ ticks.
 from typing import NamedTuple
 
 from robotid.base.typing import Array
-from robotid.dynamics.kernels.lanes import compiled, factor, get, put, solve, work_space
+from robotid.dynamics.compiled import Tree
+from robotid.dynamics.kernels.lanes import (
+    LANES,
+    compiled,
+    copysign,
+    factor,
+    get,
+    is_any,
+    put,
+    put3,
+    read,
+    solve,
+    where,
+    wide,
+    work_space,
+    write,
+)
 from robotid.dynamics.kernels.tree_lanes import (
     ACCELERATION,
     BODY,
@@ -37,17 +53,21 @@ from robotid.dynamics.kernels.tree_lanes import (
     mass_matrix,
     place,
 )
-from robotid.dynamics.kernels.vector_lanes import LANES, copysign, is_any, read, where, wide, write
-from robotid.dynamics.simulation.bristle_lanes import (
-    advance_bristles,
-    bristle_column,
-    initialise_bristles,
-    presliding,
-)
 from robotid.dynamics.simulation.law_lanes import (
+    ARMATURE,
+    INERTIAL,
+    SPEED,
+    START,
+    TERM,
+    ZERO,
     affine_term,
+    by_delay,
+    by_loop,
+    deflection_by_lane,
     direction,
+    initial_deflection_by_lane,
     loop_torque,
+    read_command,
     term_by_lane,
 )
 from robotid.robot.drive_term import BRISTLES, LOADED
@@ -55,9 +75,7 @@ from robotid.robot.drive_term import BRISTLES, LOADED
 THETA = 0.5  # instant of the forces, relative to the step: exact to second order
 _NEWTON = 60  # largest number of steps; three or four are typical
 _CLOSE = 1e-12  # of the speed, relative to 1 + its size
-
-# kinds of sensitivities
-ARMATURE, KP, KD, LIMIT, TERM, DELAY, ZERO, INERTIAL, START, SPEED = range(10)
+_MOVED_BEFORE = 0.1  # assumed time of motion before the simulation, for initial deflections [s]
 
 
 class Terms(NamedTuple):
@@ -75,6 +93,25 @@ class Terms(NamedTuple):
     shapes: Array
     values: Array
     spans: Array
+
+
+class Robot(NamedTuple):
+    """The part of a robot that is simulated, with n joints.
+
+    Attributes:
+        tree: Its bodies and joints.
+        zeros: Position of the URDF at position 0 of each encoder, shape (n,) [rad or m].
+        bodies: Inertial parameters, shape (n, 10).
+        drives: Armature, kp, kd, torque limit, and the sums of affine terms: constant, by the
+            speed, and by its direction, shape (n, 7).
+        terms: Friction and offset.
+    """
+
+    tree: Tree
+    zeros: Array
+    bodies: Array
+    drives: Array
+    terms: Terms
 
 
 class Columns(NamedTuple):
@@ -128,8 +165,55 @@ class Motion(NamedTuple):
     S: Array
 
 
+class Places(NamedTuple):
+    """Sizes, and the places of a step's quantities in the work space after those of the bodies."""
+
+    n: int  # joints
+    P: int  # sensitivities
+    q: int
+    v: int
+    u: int  # speed at the instant of the forces
+    middle: int  # position at that instant
+    h: int  # torque of gravity and speeds
+    a: int  # acceleration
+    M: int  # mass matrix of the bodies, (n, n)
+    G: int  # residual of the step's equation, then the correction of u
+    H: int  # derivative of G by u, then its factor, (n, n)
+    by_q: int  # derivative of friction by the position
+    gains: int  # 1 for a loop below its torque limit, else 0
+    load: int  # torque of the bodies
+    loss: int  # factor of the load in a gear with friction
+    held: int  # torque until the next tick; -1 in continuous time
+    grip: int  # friction of bristles, then its derivative by the speed
+    bristles: int  # of each: z, the acting z, and three derivatives; -1 without any
+    T_q: int  # derivative of the equation by positions before the step, (n, n)
+    T_v: int  # and by speeds, (n, n)
+    S: int  # sensitivities of positions and speeds, (2n, P)
+    own: int  # derivative of the equation by one parameter
+    change: int  # of u by one parameter
+    by_hold: int  # sensitivities of the held torques, (n, P)
+    by_state: int  # sensitivities of the bristles, (bristles, P)
+
+
+@compiled
+def _places(n, P, n_bristles, is_held):
+    q = (n + 1) * BODY
+    M = q + 13 * n
+    S = M + 4 * n * n
+    held = S + 3 * n * P
+    grip = held + n
+    bristles = grip + 2 * n
+    return Places(
+        n, P, q, q + n, q + 2 * n, q + 3 * n, q + 4 * n, q + 5 * n,
+        M, q + 6 * n, M + n * n, q + 7 * n, q + 8 * n, q + 11 * n, q + 12 * n,
+        held if is_held else -1, grip, bristles if n_bristles else -1,
+        M + 2 * n * n, M + 3 * n * n, S, q + 9 * n, q + 10 * n,
+        S + 2 * n * P, bristles + 5 * n_bristles,
+    )  # fmt: skip
+
+
 def work_of(joints: int, columns: int, n_bristles: int) -> Array:
-    """Return a new work space."""
+    """Return a new work space for ``_places``."""
     n = joints
     own = (n + 1) * BODY + 4 * n * n + 16 * n + 3 * n * columns
     return work_space(own + n_bristles * (5 + columns))
@@ -142,38 +226,31 @@ def last_step(work: Array, joints: int) -> tuple[Array, Array]:
 
 
 @compiled
-def _command(command, i, kind):
-    """Return an input of joint i over a step; ``command`` is all inputs and the step's first."""
-    inputs, first = command
-    return read(inputs, (first + 6 * i + kind) * LANES)
-
-
-@compiled
-def _balance(work, n, at, drives, terms, step, command):
+def _balance(work, at, robot, step, now):
     """Write the residual G of a step's equation for the speeds u, and its derivative H.
 
     Row i is divided by e = 1 + mu s(u) sign(tau), the factor of the bodies' torque tau in a gear
     with friction mu |tau|, so that H is symmetric.
     """
-    q, v, u, middle, h, M, G, H, by_q, gains, load, loss, held, bristles, grip = at
+    n, drives, terms = at.n, robot.drives, robot.terms
     codes, shapes, values, spans = terms
-    if bristles >= 0:
-        presliding(work, n, at, terms, THETA * step)
+    if at.bristles >= 0:
+        _presliding(work, at, terms, THETA * step)
     rate = 1.0 / (THETA * step)
     for i in range(n):
-        tau = get(work, h + i)
+        tau = get(work, at.h + i)
         for j in range(n):
-            m = get(work, M + i * n + j) * rate
-            tau += m * (get(work, u + j) - get(work, v + j))
-            put(work, H + i * n + j, m)
-        put(work, load + i, tau)
+            m = get(work, at.M + i * n + j) * rate
+            tau += m * (get(work, at.u + j) - get(work, at.v + j))
+            put(work, at.H + i * n + j, m)
+        put(work, at.load + i, tau)
         armature, kp, kd = drives[i, 0], drives[i, 1], drives[i, 2]
         offset, viscous, coulomb = drives[i, 4], drives[i, 5], drives[i, 6]
         span = THETA * step
-        speed, angle = get(work, u + i), get(work, middle + i)
+        speed, angle = get(work, at.u + i), get(work, at.middle + i)
         s, s_u = direction(speed)
-        f = get(work, grip + i) + offset + viscous * speed + coulomb * s
-        f_u = get(work, grip + n + i) + viscous + coulomb * s_u
+        f = get(work, at.grip + i) + offset + viscous * speed + coulomb * s
+        f_u = get(work, at.grip + n + i) + viscous + coulomb * s_u
         f_q, e, e_u = wide(0.0), wide(1.0), wide(0.0)
         for k in range(spans[i, 0], spans[i, 1]):
             y, y_u, y_q = term_by_lane(codes, shapes, k, angle, speed, s, s_u)
@@ -186,331 +263,354 @@ def _balance(work, n, at, drives, terms, step, command):
                 f += values[k] * y
                 f_u += values[k] * y_u
                 f_q += values[k] * y_q
-        if held >= 0:  # constant until the next tick
-            torque, is_on = get(work, held + i), wide(0.0)
+        if at.held >= 0:  # constant until the next tick
+            torque, is_on = get(work, at.held + i), wide(0.0)
         else:
-            error = _command(command, i, 0) - get(work, q + i) - span * speed
-            speed_error, forward = _command(command, i, 2) - speed, _command(command, i, 3)
+            error = read_command(now, i, 0) - get(work, at.q + i) - span * speed
+            speed_error, forward = read_command(now, i, 2) - speed, read_command(now, i, 3)
             torque, is_on = loop_torque(drives[i], error, speed_error, forward)
-        rest = armature * rate * (speed - get(work, v + i)) + f - torque
+        rest = armature * rate * (speed - get(work, at.v + i)) + f - torque
         slope = armature * rate + f_u + is_on * (kd + span * kp)
-        put(work, G + i, tau + rest / e)
-        own = get(work, H + i * n + i) + (slope + tau * e_u) / e
-        put(work, H + i * n + i, own)
-        put(work, by_q + i, f_q)
-        put(work, gains + i, is_on)
-        put(work, loss + i, e)
+        put(work, at.G + i, tau + rest / e)
+        put(work, at.H + i * n + i, get(work, at.H + i * n + i) + (slope + tau * e_u) / e)
+        put(work, at.by_q + i, f_q)
+        put(work, at.gains + i, is_on)
+        put(work, at.loss + i, e)
 
 
 @compiled
-def _solve(work, n, at, drives, terms, step, command):
+def _solve(work, at, robot, step, now):
     """Solve a step for its speeds u and leave the factor of H; return whether it converged.
 
     Friction that falls with speed faster than the inertia of a step allows makes H indefinite and
     several speeds possible. Steps without this fall then lead to the one next to the speed before.
     """
-    if _newton(work, n, at, drives, terms, step, command, False):
+    if _newton(work, at, robot, step, now, False):
         return True
-    v, u = at[1], at[2]
-    for i in range(n):
-        put(work, u + i, get(work, v + i))
-    _newton(work, n, at, drives, terms, step, command, True)
-    return _newton(work, n, at, drives, terms, step, command, False)
+    for i in range(at.n):
+        put(work, at.u + i, get(work, at.v + i))
+    _newton(work, at, robot, step, now, True)
+    return _newton(work, at, robot, step, now, False)
 
 
 @compiled
-def _add_fall(work, n, at, terms):
+def _add_fall(work, at, terms):
     """Add to H the slopes of friction that falls with speed, so that it is positive definite."""
-    u, middle, H, loss = at[2], at[3], at[7], at[11]
     codes, shapes, values, spans = terms
-    for i in range(n):
+    for i in range(at.n):
         for k in range(spans[i, 0], spans[i, 1]):
             if codes[k, 2] == LOADED:
                 continue
-            speed, angle = get(work, u + i), get(work, middle + i)
-            _, y_u, _ = term_by_lane(codes, shapes, k, angle, speed, direction(speed)[0], wide(0.0))
-            fall = where(values[k] * y_u < 0.0, -values[k] * y_u, 0.0) / get(work, loss + i)
-            put(work, H + i * n + i, get(work, H + i * n + i) + fall)
+            speed, angle, diagonal = get(work, at.u + i), get(work, at.middle + i), i * at.n + i
+            s, _ = direction(speed)
+            _, y_u, _ = term_by_lane(codes, shapes, k, angle, speed, s, wide(0.0))
+            fall = where(values[k] * y_u < 0.0, -values[k] * y_u, 0.0) / get(work, at.loss + i)
+            put(work, at.H + diagonal, get(work, at.H + diagonal) + fall)
 
 
 @compiled
-def _newton(work, n, at, drives, terms, step, command, is_cautious):
+def _newton(work, at, robot, step, now, is_cautious):
     """Iterate Newton's method for ``_solve``, without falling friction in H if cautious.
 
     Friction is nonlinear at speed 0, so a Newton step that would cross it ends there.
     """
-    u, G, H = at[2], at[6], at[7]
     for k in range(_NEWTON):
         share = 1.0 if k < _NEWTON // 4 else 0.5  # against cycles of several joints' friction
-        _balance(work, n, at, drives, terms, step, command)
+        _balance(work, at, robot, step, now)
         if is_cautious:
-            _add_fall(work, n, at, terms)
-        factor(work, n, H)
-        solve(work, n, H, G)
+            _add_fall(work, at, robot.terms)
+        factor(work, at.n, at.H)
+        solve(work, at.n, at.H, at.G)
         is_found = True
-        for i in range(n):
-            before = get(work, u + i)
-            after = before - share * get(work, G + i)
+        for i in range(at.n):
+            before = get(work, at.u + i)
+            after = before - share * get(work, at.G + i)
             halts = after * before < 0.0
             after = where(halts, 0.0, after)
             is_close = abs(after - before) <= _CLOSE * (1.0 + abs(after))
             is_found = is_found and not is_any(halts | ~is_close)
-            put(work, u + i, after)
+            put(work, at.u + i, after)
         if is_found:  # H changes by rounding only
             return True
     return False
 
 
 @compiled
-def _advance(work, n, at, step):
+def _advance(work, at, step):
     """Advance positions and speeds over a solved step."""
-    q, v, u = at[0], at[1], at[2]
-    for i in range(n):
-        speed, before = get(work, u + i), get(work, v + i)
-        put(work, q + i, get(work, q + i) + step * speed)
-        put(work, v + i, before + (speed - before) / THETA)
+    for i in range(at.n):
+        speed, before = get(work, at.u + i), get(work, at.v + i)
+        put(work, at.q + i, get(work, at.q + i) + step * speed)
+        put(work, at.v + i, before + (speed - before) / THETA)
 
 
 @compiled
-def _centre(work, n, at, step, tree, bodies, zeros, speeds, a):
+def _centre(work, at, robot, step, speeds):
     """Write M and h at the midpoint of the step that results from the given speeds."""
-    q, middle, h, M = at[0], at[3], at[4], at[5]
-    for i in range(n):
+    for i in range(at.n):
         ahead = THETA * step * get(work, speeds + i)
-        put(work, middle + i, get(work, q + i) + ahead)
-        put(work, a + i, 0.0)
-        place(work, (i + 1) * BODY, tree.joints[i], middle + i, zeros[i])
-    inverse_dynamics(work, tree, bodies, speeds, a, h)
-    mass_matrix(work, tree, bodies, M)
+        put(work, at.middle + i, get(work, at.q + i) + ahead)
+        put(work, at.a + i, 0.0)
+        place(work, (i + 1) * BODY, robot.tree.joints[i], at.middle + i, robot.zeros[i])
+    inverse_dynamics(work, robot.tree, robot.bodies, speeds, at.a, at.h)
+    mass_matrix(work, robot.tree, robot.bodies, at.M)
 
 
 @compiled
-def _propagate(work, n, at, sensitivities, columns, drives, terms, step, command, tree):
-    """Advance the sensitivities S of q and v, shape (2n, P), over a solved step."""
-    q, v, u, middle, h, M, G, H, by_q, gains, load, loss, held, bristles, grip = at
-    T_q, T_v, S, own, change, by_hold, by_state = sensitivities
+def _hold(work, at, columns, drives, now, is_tick):
+    """Write the held torques and their sensitivities in lanes whose controllers have a tick."""
+    n, P, kinds, sums = at.n, at.P, columns.kinds, columns.sums
+    for i in range(n):
+        error = read_command(now, i, 0) - get(work, at.q + i)
+        speed_error = read_command(now, i, 2) - get(work, at.v + i)
+        torque, is_on = loop_torque(drives[i], error, speed_error, read_command(now, i, 3))
+        late = by_delay(drives[i], now, i)
+        put(work, at.held + i, where(is_tick, torque, get(work, at.held + i)))
+        for p in range(P):
+            x = drives[i, 1] * get(work, at.S + i * P + p)
+            x = x + drives[i, 2] * get(work, at.S + (n + i) * P + p)
+            own = wide(0.0)
+            for c in range(sums[p], sums[p + 1]):
+                if kinds[c, 1] == i:
+                    own += by_loop(kinds[c, 0], is_on, error, speed_error, late, torque)
+            own = where(is_tick, own - is_on * x, get(work, at.by_hold + i * P + p))
+            put(work, at.by_hold + i * P + p, own)
+
+
+@compiled
+def _presliding(work, at, terms, span):
+    """Write the presliding friction after a time at the speeds u, and its derivative."""
     codes, shapes, values, spans = terms
+    for i in range(at.n):
+        speed, f, f_u = get(work, at.u + i), wide(0.0), wide(0.0)
+        for k in range(spans[i, 0], spans[i, 2]):
+            if codes[k, 2] == BRISTLES:
+                before = get(work, at.bristles + 5 * int(shapes[k, 3]))
+                z, z_u, _ = deflection_by_lane(shapes[k], before, speed, span)
+                f += values[k] * z
+                f_u += values[k] * z_u
+        put(work, at.grip + i, f)
+        put(work, at.grip + at.n + i, f_u)
+
+
+@compiled
+def _advance_bristles(work, at, terms, span, step):
+    """Write z after a step, the acting z a time after its start, and derivatives of both.
+
+    The derivatives are: of the acting z by z before; of z after by the speed u, and by z before.
+    """
+    codes, shapes, _, spans = terms
+    for i in range(at.n):
+        for k in range(spans[i, 0], spans[i, 2]):
+            if codes[k, 2] == BRISTLES:
+                z = at.bristles + 5 * int(shapes[k, 3])
+                speed, before = get(work, at.u + i), get(work, z)
+                acts, _, share = deflection_by_lane(shapes[k], before, speed, span)
+                after, by_speed, by_before = deflection_by_lane(shapes[k], before, speed, step)
+                put(work, z, after)
+                put(work, z + 1, acts)
+                put3(work, z + 2, (share, by_speed, by_before))
+
+
+@compiled
+def _initialise_bristles(work, at, columns, terms):
+    """Write the initial z and its derivative by the initial speed v.
+
+    It is that of steady sliding, unless the joint needs more than ``_MOVED_BEFORE`` for it.
+    """
+    codes, shapes, _, spans = terms
+    kinds, sums, P = columns.kinds, columns.sums, at.P
+    for i in range(at.n):
+        for k in range(spans[i, 0], spans[i, 2]):
+            if codes[k, 2] != BRISTLES:
+                continue
+            slot, v = int(shapes[k, 3]), get(work, at.v + i)
+            z, z_v = initial_deflection_by_lane(shapes[k], v, _MOVED_BEFORE)
+            put(work, at.bristles + 5 * slot, z)
+            for p in range(P):
+                if kinds[sums[p], 0] == SPEED and kinds[sums[p], 1] == i:
+                    put(work, at.by_state + slot * P + p, z_v)
+
+
+@compiled
+def _bristle_column(work, at, terms, p, is_after):
+    """Add the effect of bristle states to one column; after the step, advance their columns."""
+    codes, shapes, values, spans = terms
+    for i in range(at.n):
+        for k in range(spans[i, 0], spans[i, 2]):
+            if codes[k, 2] != BRISTLES:
+                continue
+            slot = int(shapes[k, 3])
+            z, Z = at.bristles + 5 * slot, at.by_state + slot * at.P + p
+            x = get(work, Z)
+            if is_after:
+                x *= get(work, z + 4)
+                put(work, Z, x + get(work, z + 3) * get(work, at.change + i))
+            else:
+                x *= values[k] * get(work, z + 2) / get(work, at.loss + i)
+                put(work, at.own + i, get(work, at.own + i) + x)
+
+
+@compiled
+def _propagate(work, at, robot, columns, step, now):
+    """Advance the sensitivities S of q and v, shape (2n, P), over a solved step."""
+    n, P, drives, own = at.n, at.P, robot.drives, at.own
     kinds, sums, directions = columns
-    P = len(sums) - 1
-    _combine(work, n, at, sensitivities, drives, step)
+    _combine(work, at, drives, step)
     for p in range(P):
         for i in range(n):
             put(work, own + i, 0.0)
         for c in range(sums[p], sums[p + 1]):
             kind, j, index = kinds[c, 0], kinds[c, 1], kinds[c, 2]
             if kind == INERTIAL:
-                inertial_column(work, tree, directions[index], j, own)
+                inertial_column(work, robot.tree, directions[index], j, own)
             elif kind == ZERO:  # like the position, without gain and friction
                 for i in range(n):
-                    x = get(work, T_q + i * n + j)
+                    x = get(work, at.T_q + i * n + j)
                     put(work, own + i, get(work, own + i) + x)
-                kp = get(work, gains + j) * drives[j, 1]
-                x = (get(work, by_q + j) + kp) / get(work, loss + j)
+                kp = get(work, at.gains + j) * drives[j, 1]
+                x = (get(work, at.by_q + j) + kp) / get(work, at.loss + j)
                 put(work, own + j, get(work, own + j) - x)
             elif kind != START and kind != SPEED:
-                _drive_column(work, at, drives, terms, step, command, kinds[c], own)
-        if held >= 0:
+                _drive_column(work, at, robot, step, now, kinds[c])
+        if at.held >= 0:
             for i in range(n):
-                x = get(work, by_hold + i * P + p) / get(work, loss + i)
+                x = get(work, at.by_hold + i * P + p) / get(work, at.loss + i)
                 put(work, own + i, get(work, own + i) - x)
-        if bristles >= 0:
-            bristle_column(work, n, at, sensitivities, terms, p, P, False)
-        _advance_column(work, n, at, sensitivities, step, p, P)
-        if bristles >= 0:
-            bristle_column(work, n, at, sensitivities, terms, p, P, True)
+        if at.bristles >= 0:
+            _bristle_column(work, at, robot.terms, p, False)
+        _advance_column(work, at, step, p)
+        if at.bristles >= 0:
+            _bristle_column(work, at, robot.terms, p, True)
 
 
 @compiled
-def _drive_column(work, at, drives, terms, step, command, column, own):
+def _drive_column(work, at, robot, step, now, column):
     """Add the derivative of a step's equation by a parameter of a drive."""
-    q, v, u, middle, load, loss, held, bristles = (
-        at[0], at[1], at[2], at[3], at[10], at[11], at[12], at[13]
-    )  # fmt: skip
-    codes, shapes = terms.codes, terms.shapes
+    drives, (codes, shapes, _, spans) = robot.drives, robot.terms
     kind, j, index = column
-    kp, kd = drives[j, 1], drives[j, 2]
-    span, speed, x = THETA * step, get(work, u + j), wide(0.0)
+    span, speed, x = THETA * step, get(work, at.u + j), wide(0.0)
     if kind == ARMATURE:
-        x = (speed - get(work, v + j)) / span
+        x = (speed - get(work, at.v + j)) / span
     elif kind == TERM and codes[index, 2] == BRISTLES:
-        x = get(work, bristles + 5 * int(shapes[index, 3]) + 1)
-    elif kind == TERM and index >= terms.spans[j, 1]:
+        x = get(work, at.bristles + 5 * int(shapes[index, 3]) + 1)
+    elif kind == TERM and index >= spans[j, 1]:
         x = affine_term(codes, index, speed)
     elif kind == TERM:
-        angle, (s, s_u) = get(work, middle + j), direction(speed)
+        angle, (s, s_u) = get(work, at.middle + j), direction(speed)
         x, _, _ = term_by_lane(codes, shapes, index, angle, speed, s, s_u)
         if codes[index, 2] == LOADED:
-            x *= abs(get(work, load + j))
-    elif held < 0:
-        error = _command(command, j, 0) - get(work, q + j) - span * speed
-        speed_error = _command(command, j, 2) - speed
-        torque, is_on = loop_torque(drives[j], error, speed_error, _command(command, j, 3))
-        by_delay = (
-            kp * _command(command, j, 1) + kd * _command(command, j, 4) + _command(command, j, 5)
-        )
-        x = -_by_loop(kind, is_on, error, speed_error, by_delay, torque)
-    put(work, own + j, get(work, own + j) + x / get(work, loss + j))
+            x *= abs(get(work, at.load + j))
+    elif at.held < 0:
+        error = read_command(now, j, 0) - get(work, at.q + j) - span * speed
+        speed_error = read_command(now, j, 2) - speed
+        torque, is_on = loop_torque(drives[j], error, speed_error, read_command(now, j, 3))
+        late = by_delay(drives[j], now, j)
+        x = -by_loop(kind, is_on, error, speed_error, late, torque)
+    put(work, at.own + j, get(work, at.own + j) + x / get(work, at.loss + j))
 
 
 @compiled
-def _by_loop(kind, is_on, error, speed_error, by_delay, torque):
-    """Return the derivative of a loop's torque by a gain, its delay or its limit."""
-    if kind == KP:
-        return is_on * error
-    if kind == KD:
-        return is_on * speed_error
-    if kind == DELAY:
-        return is_on * by_delay
-    return (1.0 - is_on) * copysign(1.0, torque) if kind == LIMIT else wide(0.0)
-
-
-@compiled
-def _hold(work, n, at, sensitivities, columns, drives, command, is_tick):
-    """Write the held torques and their sensitivities in lanes whose controllers have a tick."""
-    q, v, held = at[0], at[1], at[12]
-    kinds, sums = columns.kinds, columns.sums
-    S, by_hold, P = sensitivities[2], sensitivities[5], len(sums) - 1
-    for i in range(n):
-        kp, kd = drives[i, 1], drives[i, 2]
-        error = _command(command, i, 0) - get(work, q + i)
-        speed_error = _command(command, i, 2) - get(work, v + i)
-        torque, is_on = loop_torque(drives[i], error, speed_error, _command(command, i, 3))
-        by_delay = (
-            kp * _command(command, i, 1) + kd * _command(command, i, 4) + _command(command, i, 5)
-        )
-        put(work, held + i, where(is_tick, torque, get(work, held + i)))
-        for p in range(P):
-            x = kp * get(work, S + i * P + p) + kd * get(work, S + (n + i) * P + p)
-            own = wide(0.0)
-            for c in range(sums[p], sums[p + 1]):
-                if kinds[c, 1] == i:
-                    own += _by_loop(kinds[c, 0], is_on, error, speed_error, by_delay, torque)
-            own = where(is_tick, own - is_on * x, get(work, by_hold + i * P + p))
-            put(work, by_hold + i * P + p, own)
-
-
-@compiled
-def _combine(work, n, at, sensitivities, drives, step):
+def _combine(work, at, drives, step):
     """Write the derivatives of a step's equation by position and speed before it: T_q and T_v.
 
     H du = T_v dv - T_q dq - own, each row divided by its e.
     """
-    M, by_q, gains, loss = at[5], at[8], at[9], at[11]
-    T_q, T_v = sensitivities[0], sensitivities[1]
+    n, T_q, T_v = at.n, at.T_q, at.T_v
     span, rate = THETA * step, 1.0 / (THETA * step)
     for i in range(n):
         for k in range(i * n, i * n + n):
-            m, bent = get(work, M + k) * rate, get(work, T_q + k)
+            m, bent = get(work, at.M + k) * rate, get(work, T_q + k)
             put(work, T_v + k, m - span * bent - get(work, T_v + k))
         armature, kp, d = drives[i, 0], drives[i, 1], i * n + i
-        bent, e = get(work, by_q + i), get(work, loss + i)
+        bent, e = get(work, at.by_q + i), get(work, at.loss + i)
         by_speed = (armature * rate - span * bent) / e
-        by_position = (bent + get(work, gains + i) * kp) / e
+        by_position = (bent + get(work, at.gains + i) * kp) / e
         put(work, T_v + d, get(work, T_v + d) + by_speed)
         put(work, T_q + d, get(work, T_q + d) + by_position)
 
 
 @compiled
-def _advance_column(work, n, at, sensitivities, step, p, P):
+def _advance_column(work, at, step, p):
     """Advance one sensitivity of position and speed over a step."""
-    H = at[7]
-    T_q, T_v, S, own, change = sensitivities[:5]
+    n, P, S = at.n, at.P, at.S
     for i in range(n):
-        moved = -get(work, own + i)
+        moved = -get(work, at.own + i)
         for j in range(n):
-            moved += get(work, T_v + i * n + j) * get(work, S + (n + j) * P + p)
-            moved -= get(work, T_q + i * n + j) * get(work, S + j * P + p)
-        put(work, change + i, moved)
-    solve(work, n, H, change)
+            moved += get(work, at.T_v + i * n + j) * get(work, S + (n + j) * P + p)
+            moved -= get(work, at.T_q + i * n + j) * get(work, S + j * P + p)
+        put(work, at.change + i, moved)
+    solve(work, n, at.H, at.change)
     for i in range(n):
-        du, dv = get(work, change + i), get(work, S + (n + i) * P + p)
+        du, dv = get(work, at.change + i), get(work, S + (n + i) * P + p)
         dq = get(work, S + i * P + p) + step * du
         put(work, S + i * P + p, dq)
         put(work, S + (n + i) * P + p, dv + (du - dv) / THETA)
 
 
 @compiled
-def _initialise(work, n, at, sensitivities, columns, terms, gravity, start, out_S):
+def _initialise(work, at, robot, columns, start, out_S):
     """Write the initial states of roll-outs and their sensitivities."""
-    q, v, u, S = at[0], at[1], at[2], sensitivities[2]
-    kinds, sums, P = columns.kinds, columns.sums, len(columns.sums) - 1
+    n, P, kinds, sums = at.n, at.P, columns.kinds, columns.sums
     first = start.reshape(start.size)
     for k in range(3):
-        put(work, ACCELERATION + k, -gravity[k])
+        put(work, ACCELERATION + k, -robot.tree.gravity[k])
     for i in range(n):
-        put(work, q + i, read(first, i * LANES))
-        put(work, v + i, read(first, (n + i) * LANES))
-        put(work, u + i, read(first, (n + i) * LANES))
+        put(work, at.q + i, read(first, i * LANES))
+        put(work, at.v + i, read(first, (n + i) * LANES))
+        put(work, at.u + i, read(first, (n + i) * LANES))
     for p in range(P):
         kind, joint = kinds[sums[p], 0], kinds[sums[p], 1]
         if kind in (START, SPEED):  # of one joint alone
             row = joint + (n if kind == SPEED else 0)
-            put(work, S + row * P + p, 1.0)
+            put(work, at.S + row * P + p, 1.0)
             if row < out_S.shape[1]:
                 out_S[0, row, p] = 1.0
-    if at[13] >= 0:
-        initialise_bristles(work, n, at, sensitivities[6], kinds, sums, terms, SPEED)
+    if at.bristles >= 0:
+        _initialise_bristles(work, at, columns, robot.terms)
 
 
 @compiled
-def roll_out(tree, zeros, bodies, drives, terms, columns, course, out, work, corrects):
-    """Simulate a block of lanes; return the first step without a solution, or -1.
-
-    zeros (n,) [rad or m], bodies (n, 10), drives (n, 7).
-    """
+def roll_out(robot, columns, course, out, work, corrects):
+    """Simulate a block of lanes; return the first step without a solution, or -1."""
     command, steps, ticks, every, start = course
-    out_q, out_v, out_S = (
-        out.q.reshape(out.q.size),
-        out.v.reshape(out.v.size),
-        out.S.reshape(out.S.size),
-    )
-    codes = terms.codes
+    out_q, out_v = out.q.reshape(out.q.size), out.v.reshape(out.v.size)
+    out_S, rows = out.S.reshape(out.S.size), out.S.shape[1]
+    tree, bodies, terms = robot.tree, robot.bodies, robot.terms
     n, P = len(tree.parents), len(columns.sums) - 1
-    q = (n + 1) * BODY
-    v, u, middle, h, a = q + n, q + 2 * n, q + 3 * n, q + 4 * n, q + 5 * n
-    G, by_q, gains, own, change = a + n, a + 2 * n, a + 3 * n, a + 4 * n, a + 5 * n
-    load, loss, M = change + n, change + 2 * n, change + 3 * n
-    H, T_q, T_v, S = M + n * n, M + 2 * n * n, M + 3 * n * n, M + 4 * n * n
-    by_hold, held = S + 2 * n * P, S + 3 * n * P if len(ticks) else -1
-    n_bristles = (codes[:, 2] == BRISTLES).sum()
-    grip = S + (3 * P + 1) * n
-    bristles, by_state = grip + 2 * n if n_bristles else -1, grip + 2 * n + 5 * n_bristles
-    at = (q, v, u, middle, h, M, G, H, by_q, gains, load, loss, held, bristles, grip)
-    sensitivities = (T_q, T_v, S, own, change, by_hold, by_state)
+    at = _places(n, P, (terms.codes[:, 2] == BRISTLES).sum(), len(ticks) > 0)
     work[:] = 0.0
-    _initialise(work, n, at, sensitivities, columns, terms, tree.gravity, start, out.S)
-    commands, lengths, starts = (
-        command.reshape(command.size), steps.reshape(steps.size), ticks.reshape(ticks.size)
-    )  # fmt: skip
-    outputs = out.S.shape[1]
+    _initialise(work, at, robot, columns, start, out.S)
+    commands, starts = command.reshape(command.size), ticks.reshape(ticks.size)
+    lengths = steps.reshape(steps.size)
     for k in range(len(steps)):
         step, now = read(lengths, k * LANES), (commands, 6 * n * k)
-        if held >= 0:
+        if at.held >= 0:
             is_tick = read(starts, k * LANES) > 0.0
             if is_any(is_tick):
-                _hold(work, n, at, sensitivities, columns, drives, now, is_tick)
-        _centre(work, n, at, step, tree, bodies, zeros, v, a)
-        if not _solve(work, n, at, drives, terms, step, now):
+                _hold(work, at, columns, robot.drives, now, is_tick)
+        _centre(work, at, robot, step, at.v)
+        if not _solve(work, at, robot, step, now):
             return k
         if corrects:
-            _centre(work, n, at, step, tree, bodies, zeros, u, a)
-            if not _solve(work, n, at, drives, terms, step, now):
+            _centre(work, at, robot, step, at.u)
+            if not _solve(work, at, robot, step, now):
                 return k
-        if bristles >= 0:
-            advance_bristles(work, n, at, terms, THETA * step, step)
+        if at.bristles >= 0:
+            _advance_bristles(work, at, terms, THETA * step, step)
         if P:
             for i in range(n):
-                moved = get(work, u + i) - get(work, v + i)
-                put(work, a + i, moved / (THETA * step))
-            inverse_dynamics(work, tree, bodies, v, a, h)
-            derivatives(work, tree, bodies, v, T_q)  # T_q, followed by T_v
-            _propagate(work, n, at, sensitivities, columns, drives, terms, step, now, tree)
-        _advance(work, n, at, step)
+                moved = get(work, at.u + i) - get(work, at.v + i)
+                put(work, at.a + i, moved / (THETA * step))
+            inverse_dynamics(work, tree, bodies, at.v, at.a, at.h)
+            derivatives(work, tree, bodies, at.v, at.T_q)  # T_q, followed by T_v
+            _propagate(work, at, robot, columns, step, now)
+        _advance(work, at, step)
         if (k + 1) % every == 0:
             sample = (k + 1) // every
             for i in range(n):
-                write(out_q, (sample * n + i) * LANES, get(work, q + i))
-                write(out_v, (sample * n + i) * LANES, get(work, v + i))
-            for row in range(outputs * P):
-                write(out_S, (sample * outputs * P + row) * LANES, get(work, S + row))
+                write(out_q, (sample * n + i) * LANES, get(work, at.q + i))
+                write(out_v, (sample * n + i) * LANES, get(work, at.v + i))
+            for row in range(rows * P):
+                write(out_S, (sample * rows * P + row) * LANES, get(work, at.S + row))
     return -1

@@ -9,28 +9,30 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import pairwise
+from itertools import islice, pairwise
 from types import ModuleType
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, ClassVar, NamedTuple, TypeAlias
 
 import numpy as np
 
 from robotid.base.exceptions import NotConvergedError, SettingsError
+from robotid.base.findings import listed
 from robotid.base.typing import Array
 from robotid.data.log import Log
 from robotid.dynamics.compiled import Tree, flatten, why_not
 from robotid.dynamics.factors import in_order
-from robotid.dynamics.simulation.failures import why_no_solution
-from robotid.robot.drive_term import BRISTLES
+from robotid.robot.drive_term import BRISTLES, DIRECTED
 from robotid.robot.drives import Bristles, DriveTerm, MemorylessTerm
+from robotid.robot.mass_matrix import rigid_mass_matrices
 from robotid.robot.model import RobotModel
 
 if TYPE_CHECKING:
     from robotid.dynamics.simulation.loop_lanes import Course
 
-#: Kind, joint and index of a parameter of the sensitivities; see ``loop_lanes``.
+#: Kind, joint and index of a parameter of the sensitivities; see ``law_lanes``.
 Column: TypeAlias = tuple[int, int, int]
 
+_KINDS = ("armature", "kp", "kd", "limit", "term", "delay", "zero", "body", "start", "speed")
 _GAP = 3.0  # step in time above which a segment ends [median steps]
 _AROUND = 0.03  # half-width of the fit for the initial speed [s]
 _FEWEST = 2  # smallest number of samples on each side of that fit
@@ -146,8 +148,7 @@ class Window:
         """Initial position and speed, shape (2, n)."""
         if self.given is not None:
             return self.given
-        t, q, k = self.log.t, self.log.q, self.start_row
-        near = self._near
+        t, q, k, near = self.log.t, self.log.q, self.start_row, self._near
         along, order = t[near] - t[k], min(2, len(t[near]) - 1)
         fit = np.polynomial.polynomial.polyfit(along, q[near], order)
         return np.stack([q[k], fit[1]])
@@ -193,8 +194,7 @@ class RollOut:
     slopes: tuple[tuple[Array, Array, Array], ...] = ()
 
 
-@dataclass(frozen=True, eq=False)
-class _Part:
+class _Part(NamedTuple):
     """A part of the robot that only the base joins to others, for the compiled code."""
 
     joints: Array  # indices of its joints in the model, (k,)
@@ -204,6 +204,9 @@ class _Part:
 
 class ClosedLoopRobot:
     """Simulator of a robot with closed-loop drives."""
+
+    #: Numbers of the kinds of sensitivities, by name, as of ``law_lanes``.
+    kinds: ClassVar[dict[str, int]] = {name: k for k, name in enumerate(_KINDS)}
 
     def __init__(self, model: RobotModel, *, step: float = 2e-3, corrects: bool = False) -> None:
         """Flatten a robot."""
@@ -219,23 +222,6 @@ class ClosedLoopRobot:
         self._parts = _parts(flatten(model))
 
     @property
-    def kinds(self) -> dict[str, int]:
-        """Numbers of the kinds of sensitivities, by name."""
-        lanes = _lanes()
-        return {
-            "armature": lanes.ARMATURE,
-            "kp": lanes.KP,
-            "kd": lanes.KD,
-            "limit": lanes.LIMIT,
-            "term": lanes.TERM,
-            "delay": lanes.DELAY,
-            "zero": lanes.ZERO,
-            "body": lanes.INERTIAL,
-            "start": lanes.START,
-            "speed": lanes.SPEED,
-        }
-
-    @property
     def parts(self) -> tuple[Array, ...]:
         """The joints of each independent part."""
         return tuple(part.joints for part in self._parts)
@@ -243,12 +229,8 @@ class ClosedLoopRobot:
     @property
     def joint_of_body(self) -> tuple[int, ...]:
         """The joint that moves each body of the layout."""
-        found = {
-            int(body): int(joint)
-            for part in self._parts
-            for body, joint in zip(part.bodies, part.joints, strict=True)
-        }
-        return tuple(found[body] for body in range(len(found)))
+        bodies, joints = (np.concatenate([part[k] for part in self._parts]) for k in (1, 0))
+        return tuple(joints[np.argsort(bodies)].tolist())
 
     def roll_out(
         self,
@@ -260,34 +242,31 @@ class ClosedLoopRobot:
         owners: Sequence[int] | None = None,
         with_speeds: bool = False,
     ) -> list[RollOut]:
-        """Return the simulated motion of windows: directions (D, 10)."""
-        wanted = np.array(columns, dtype=np.int64).reshape(-1, 3)
-        numbers = np.arange(len(wanted)) if owners is None else np.array(owners, dtype=np.int64)
-        wanted = np.column_stack([wanted, numbers])[np.argsort(numbers, kind="stable")]
+        """Return the simulated motion of windows: directions (D, 10).
+
+        Columns with one owner are added to one sensitivity, that of their owner.
+        """
+        kinds = np.array(columns, dtype=np.int64).reshape(-1, 3)
+        numbers = np.arange(len(kinds)) if owners is None else np.array(owners, dtype=np.int64)
+        wanted = np.column_stack([kinds, numbers])[np.argsort(numbers, kind="stable")]
         along = np.zeros((0, 10)) if directions is None else np.array(directions, order="C")
-        lanes = _lanes()
-        blocks = [windows[k : k + lanes.LANES] for k in range(0, len(windows), lanes.LANES)]
+        size, outputs = _lanes()[0].LANES, 2 if with_speeds else 1
+        blocks = [windows[k : k + size] for k in range(0, len(windows), size)]
         pieces = [(part, block) for block in blocks for part in self._parts]
-        outputs = 2 if with_speeds else 1
-        done = list(
-            in_order(lambda p: self._block(p[0], p[1], loops, wanted, along, outputs), pieces)
-        )
-        n, each = len(self.model.joints), len(self._parts)
-        found = []
-        for b, block in enumerate(blocks):
-            parts = list(zip(self._parts, done[b * each : (b + 1) * each], strict=True))
+        done = in_order(lambda p: self._block(p[0], p[1], loops, wanted, along, outputs), pieces)
+        rolled: list[RollOut] = []
+        for block in blocks:
+            parts = list(zip(self._parts, islice(done, len(self._parts)), strict=True))
             for lane, window in enumerate(block):
                 counted = slice(window.first - window.start_row, window.stop - window.start_row)
-                q, v = np.empty((2, counted.stop - counted.start, n))
+                q, v = np.empty((2, window.stop - window.first, len(self.model.joints)))
                 slopes = []
                 for part, (numbers_of, q_part, v_part, S) in parts:
-                    q[:, part.joints], v[:, part.joints] = (
-                        q_part[counted, :, lane],
-                        v_part[counted, :, lane],
-                    )
+                    q[:, part.joints] = q_part[counted, :, lane]
+                    v[:, part.joints] = v_part[counted, :, lane]
                     slopes.append((part.joints, numbers_of, S[counted, :, :, lane]))
-                found.append(RollOut(window, q, v, tuple(slopes) if len(wanted) else ()))
-        return found
+                rolled.append(RollOut(window, q, v, tuple(slopes) if len(wanted) else ()))
+        return rolled
 
     def _block(
         self,
@@ -302,39 +281,34 @@ class ClosedLoopRobot:
 
         ``wanted`` has a row for each column: kind, joint, index, and index of the sensitivity.
         """
-        from robotid.dynamics.simulation.law_lanes import coded_term  # imports Numba
-
-        lanes = _lanes()
-        own, n = part.joints, len(part.joints)
+        (lanes, laws), own, n = _lanes(), part.joints, len(part.joints)
         columns = wanted[np.isin(wanted[:, 1], own)]
         numbers, first = np.unique(columns[:, 3], return_index=True)
         sums = np.append(first, len(columns)).astype(np.int64)
         columns = np.ascontiguousarray(columns[:, :3])
         columns[:, 1] = [np.flatnonzero(own == j)[0] for j in columns[:, 1]]
         places, spans, affine = _arranged(loops, own)
-        is_term = columns[:, 0] == lanes.TERM
+        is_term = columns[:, 0] == self.kinds["term"]
         columns[is_term, 2] = [np.flatnonzero(places == k)[0] for k in columns[is_term, 2]]
         every_term = [term for terms in loops.terms for term in terms]
-        coded = [coded_term(every_term[k]) for k in places]
+        coded = [laws.coded_term(every_term[k]) for k in places]
         codes = np.array([code for code, _ in coded], dtype=np.int64).reshape(-1, 5)
         shapes = np.array([numbers for _, numbers in coded]).reshape(-1, 11)
         has_state = codes[:, 2] == BRISTLES
         shapes[has_state, 3] = np.arange(has_state.sum())
+        terms = lanes.Terms(codes, shapes, loops.values[places], spans)
         drives = np.column_stack(
             [x[own] for x in (loops.armature, loops.kp, loops.kd, loops.limit)] + [affine]
         )
+        robot = lanes.Robot(part.tree, loops.zero[own], loops.bodies[part.bodies], drives, terms)
         course = self._course(part, windows, loops)
         samples = len(course.steps) // course.every + 1
         q, v = np.zeros((2, samples, n, lanes.LANES))
         S = np.zeros((samples, outputs * n, len(numbers), lanes.LANES))
         q[0], v[0] = course.start
         work = lanes.work_of(n, len(numbers), int(has_state.sum()))
-        failed = lanes.roll_out(
-            part.tree, loops.zero[own], loops.bodies[part.bodies], drives,
-            lanes.Terms(codes, shapes, loops.values[places], spans),
-            lanes.Columns(columns, sums, along), course, lanes.Motion(q, v, S),
-            work, self.corrects,
-        )  # fmt: skip
+        kinds, motion = lanes.Columns(columns, sums, along), lanes.Motion(q, v, S)
+        failed = lanes.roll_out(robot, kinds, course, motion, work, self.corrects)
         if failed >= 0 or not (np.abs(v) < _FASTEST).all():
             last = lanes.last_step(work, n) if failed >= 0 else None
             at, lane, i, angles = _failed_at(failed // course.every, last, q, v)
@@ -346,9 +320,7 @@ class ClosedLoopRobot:
 
     def _course(self, part: _Part, windows: Sequence[Window], loops: Loops) -> "Course":
         """Return the commands of a part's joints in a block of windows."""
-        from robotid.dynamics.simulation.course_lanes import average_command  # imports Numba
-
-        lanes = _lanes()
+        lanes, laws = _lanes()
         samples = max(window.stop - window.start_row for window in windows)
         grids = [_Grid.of(window, samples, loops.rate) for window in windows]
         every = max(grid.least_steps(self.step, loops.rate) for grid in grids)
@@ -373,7 +345,7 @@ class ClosedLoopRobot:
                     continue
                 for i, j in enumerate(part.joints):
                     x = values[:, j].copy()  # contiguous and writable: else Numba compiles again
-                    average_command(log.t, x, edges, loops.delay[j], mean, change)
+                    laws.average_command(log.t, x, edges, loops.delay[j], mean, change)
                     command[:, i, k, own] = mean[of_step, None]
                     command[:, i, by_delay, own] = change[of_step, None]
         course: Course = lanes.Course(command, steps, ticks, every, start)
@@ -422,9 +394,7 @@ class _Grid:
         """Return the ends of all steps, and which steps start with a tick."""
         size = (len(self.stamps) - 1) * every
         times, is_tick = np.empty(size + 1), np.empty(size, dtype=bool)
-        from robotid.dynamics.simulation.course_lanes import divide_rows  # imports Numba
-
-        divide_rows(self.stamps, self.ticks, times, is_tick)
+        _lanes()[1].divide_rows(self.stamps, self.ticks, times, is_tick)
         return times, is_tick
 
 
@@ -433,30 +403,8 @@ def _parts(tree: Tree) -> list[_Part]:
     root: list[int] = []
     for i, parent in enumerate(tree.parents):
         root.append(i if parent < 0 else root[parent])
-    parts = []
-    for r in sorted(set(root)):
-        bodies = np.flatnonzero(np.array(root) == r)
-        parts.append(_Part(tree.leaders[bodies], bodies, tree.part(bodies)))
-    return parts
-
-
-def _failed_at(
-    row: int, last: tuple[Array, Array] | None, q: Array, v: Array
-) -> tuple[int, int, int, Array]:
-    """Return row, lane and joint of a failed roll-out, and the positions in this lane, shape (n,).
-
-    The positions of an unstable one are the initial ones.
-
-    q (N, n, LANES), v (N, n, LANES).
-    """
-    if last is None:
-        is_fast = ~(np.abs(v) < _FASTEST)
-        row, i, lane = (int(k) for k in np.unravel_index(np.argmax(is_fast), v.shape))
-        return row, lane, i, q[0, :, lane]
-    before, change = last
-    size = np.where(np.isfinite(change), np.abs(change), np.inf)
-    i, lane = (int(k) for k in np.unravel_index(np.argmax(size), size.shape))
-    return row, lane, i, np.clip(np.nan_to_num(before[:, lane]), -_FASTEST, _FASTEST)
+    bodies = [np.flatnonzero(np.array(root) == r) for r in sorted(set(root))]
+    return [_Part(tree.leaders[own], own, tree.part(own)) for own in bodies]
 
 
 def _arranged(loops: Loops, joints: Array) -> tuple[Array, Array, Array]:
@@ -476,13 +424,107 @@ def _arranged(loops: Loops, joints: Array) -> tuple[Array, Array, Array]:
                 rest.append(k)
             else:
                 (rest if isinstance(term, Bristles) else others).append(k)
-        spans.append([len(places), len(places) + len(others)])
+        middle = len(places) + len(others)
+        spans.append([len(places), middle, middle + len(rest)])
         places += [*others, *rest]
-        spans[-1].append(len(places))
     return np.array(places, dtype=int), np.array(spans, dtype=np.int64), affine
 
 
-def _lanes() -> ModuleType:
-    import robotid.dynamics.simulation.loop_lanes  # imports Numba
+def _lanes() -> tuple[ModuleType, ModuleType]:
+    """Return the compiled code of roll-outs and of laws, which imports Numba."""
+    from robotid.dynamics.simulation import law_lanes, loop_lanes
 
-    return robotid.dynamics.simulation.loop_lanes
+    return loop_lanes, law_lanes
+
+
+def _failed_at(
+    row: int, last: tuple[Array, Array] | None, q: Array, v: Array
+) -> tuple[int, int, int, Array]:
+    """Return row, lane and joint of a failed roll-out, and the positions in this lane, shape (n,).
+
+    The positions of an unstable one are the initial ones: q and v (N, n, LANES).
+    """
+    if last is None:
+        is_fast = ~(np.abs(v) < _FASTEST)
+        row, i, lane = (int(k) for k in np.unravel_index(np.argmax(is_fast), v.shape))
+        return row, lane, i, q[0, :, lane]
+    before, change = last
+    size = np.where(np.isfinite(change), np.abs(change), np.inf)
+    i, lane = (int(k) for k in np.unravel_index(np.argmax(size), size.shape))
+    return row, lane, i, np.clip(np.nan_to_num(before[:, lane]), -_FASTEST, _FASTEST)
+
+
+def why_no_solution(
+    model: RobotModel, loops: Loops, joints: Array, q: Array, last: int, step: float
+) -> str:
+    """Return why the joints (k,) of a part have no roll-out beyond their positions q (k,)."""
+    M = _mass_matrix(model, loops, joints, q)
+    if loops.rate is not None:
+        return _slow_rate(loops, loops.rate, [model.joints[j] for j in joints], joints, M)
+    for j, angle in zip(joints, q, strict=True):
+        if why := _wrong_friction(model, loops, j, angle):
+            return why
+    name, kp, inertia = model.joints[joints[last]], float(loops.kp[joints[last]]), M[last, last]
+    return (
+        f"the simulation of {name} has no solution in steps of {step:g} s: its gain kp is {kp:.3g} "
+        f"and its inertia {inertia:.3g}, wanted kp below {inertia / step**2:.3g} (inertia / "
+        "step^2) and friction that opposes motion. State gains in [controller] that are closer to "
+        "those of the drive, or a smaller step in [estimator]"
+    )
+
+
+def _wrong_friction(model: RobotModel, loops: Loops, j: int, angle: float) -> str:
+    """Return which friction of a joint makes its motion impossible or ambiguous; else ""."""
+    name = model.joints[j]
+    for term in loops.terms[j]:
+        value, wanted = float(loops.values[loops.place(j, term)]), ""
+        if term.is_nonnegative and value < 0.0:
+            wanted = "0 or more"
+        elif value > term.highest:
+            wanted = f"at most {term.highest:g}"
+        if wanted:
+            return (
+                f"the simulation of {name} has no solution: {name}.{term.name} is {value:.3g}, "
+                f"wanted {wanted}. Set other friction terms of {name} in [drives]"
+            )
+    at_rest = float(friction_at_rest(loops, j, np.array([angle]))[0])
+    if at_rest >= 0.0:
+        return ""
+    unit, force = ("m", "N") if model.limits[j].type == "prismatic" else ("rad", "N m")
+    return (
+        f"the simulation of {name} has no solution: its Coulomb friction is {at_rest:.3g} {force} "
+        f"at {angle:.3g} {unit}, wanted 0 or more. Set other friction terms of {name} in [drives]"
+    )
+
+
+def friction_at_rest(loops: Loops, j: int, q: Array) -> Array:
+    """Return the friction of a joint without load that opposes the start of a motion: q (N,)."""
+    friction = np.zeros(len(q))
+    for term in loops.terms[j]:
+        if isinstance(term, MemorylessTerm) and term.kind == DIRECTED:
+            friction += loops.values[loops.place(j, term)] * term.amplitude(q, np.zeros(len(q)))
+    return friction
+
+
+def _slow_rate(loops: Loops, rate: float, names: list[str], joints: Array, M: Array) -> str:
+    """Return the least rate of a discrete-time controller with inertias M, shape (k, k)."""
+    kp, kd = loops.kp[joints], loops.kd[joints]
+    least = 0.5 * np.linalg.eigvals(np.linalg.solve(M, np.diag(kd))).real.max()
+    least = max([least, *(0.5 * kp[kd > 0] / kd[kd > 0])])
+    return (
+        f"the simulation of {listed(names)} is unstable: the controller's rate of {rate:g} Hz is "
+        f"too low. Gains kp {listed(f'{x:.3g}' for x in kp)} and kd "
+        f"{listed(f'{x:.3g}' for x in kd)} need about {least:.3g} Hz with these inertias. "
+        "State the sampling rate of the drives' controllers in [controller], or leave it out"
+    )
+
+
+def _mass_matrix(model: RobotModel, loops: Loops, joints: Array, q: Array) -> Array:
+    """Return the mass matrix of joints at their positions, with armature, shape (k, k)."""
+    pi = model.standard_parameters()
+    pi[: model.layout.n_inertial] = loops.bodies.reshape(-1)
+    bodies, every = model.with_parameters(pi), loops.zero.copy()
+    every[joints] += q
+    (M,) = rigid_mass_matrices(bodies, bodies.configurations(every[None]))
+    mass: Array = (M + np.diag(loops.armature))[np.ix_(joints, joints)]
+    return mass

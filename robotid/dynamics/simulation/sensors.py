@@ -1,6 +1,6 @@
 """Sensor models: noise, resolution, delay, jitter, and dropped samples."""
 
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -8,26 +8,36 @@ from robotid.base.exceptions import DataError
 from robotid.base.typing import Array
 from robotid.data.log import Log
 from robotid.dynamics.simulation.simulation_settings import PerJoint, Sensors, by_joint
-
-if TYPE_CHECKING:
-    from robotid.dynamics.simulation.closed_loop import Run
+from robotid.dynamics.simulation.stand import Stand
 
 _TICK = 1e-6  # smallest step between time stamps [s]
 
 
+@dataclass(frozen=True, eq=False)
+class Run:
+    """The exact motion of a robot; arrays of shape (N, n)."""
+
+    t: Array  # shape (N,) [s]
+    q: Array  # [rad or m]
+    v: Array  # [rad/s or m/s]
+    a: Array  # [rad/s^2 or m/s^2]
+    tau: Array  # [N m or N]
+    reference: Array  # reference position [rad or m]
+    saturated: Array  # share of the time at the torque limit of each drive, shape (n,) [-]
+    stand: Stand | None = None  # of a robot whose base floats
+
+
 def measure(
-    run: "Run",
+    run: Run,
     sensors: Sensors,
     joints: tuple[str, ...],
     rng: np.random.Generator,
     *,
     delay: Array | float = 0.0,
 ) -> Log:
-    """Return the log of a robot's motion by sensors.
+    """Return the log of a robot's motion by sensors, its torques with a delay (n,) [s].
 
     Delay, noise and rounding are applied in this order. Jitter changes only the time stamps.
-
-    delay (n,) [s].
     """
 
     def of(value: PerJoint, name: str) -> Array:

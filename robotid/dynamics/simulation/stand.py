@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import pinocchio as pin
 
 from robotid.base.exceptions import DataError, SettingsError
 from robotid.base.typing import Array
@@ -13,7 +12,6 @@ from robotid.data.base_motion import BaseMotion
 from robotid.dynamics.constraint_rows import constraint_jacobian, logged_base
 from robotid.dynamics.simulation.motions import FloatingMotion
 from robotid.dynamics.simulation.simulation_settings import Sensors
-from robotid.robot.constraints import frame_id
 from robotid.robot.model import RobotModel
 
 _LEFT = 1e-6  # largest part of the wrench on the base that contacts cannot cause [-]
@@ -102,59 +100,3 @@ def supported(
     contacts = {link: flags[:, names.index(link)] for link in wanted.contacts}
     wrenches = {name: f[:, parts.index(name)] for name in wanted.wrenches}
     return tau, Stand(q[:, :7], v[:, :6], a[:, :6], contacts, wrenches)
-
-
-def on_feet(model: RobotModel, pose: Array, q: Array, contacts: Array) -> Array:
-    """Return the joint positions nearest to q with which feet on the ground do not move, (N, n).
-
-    A foot remains where it is at the first sample of its contact.
-
-    pose (N, 7) [m, -], q (N, n) [rad or m], contacts (N, k).
-    """
-    feet, found, change = _Feet(model), np.empty_like(q), np.zeros(q.shape[1])
-    places: dict[int, pin.SE3] = {}
-    for k, (base, wanted, touching) in enumerate(zip(pose, q, contacts, strict=True)):
-        x = wanted + change
-        places = feet.places(base, x) | places
-        places = {i: place for i, place in places.items() if touching[i]}
-        for _ in range(_MOST):
-            error, J = feet.moved(base, x, places)
-            if np.abs(error).max(initial=0.0) < _CLOSED:
-                break
-            x = x - np.linalg.lstsq(J, error, rcond=_RANK)[0]
-        else:
-            raise DataError(
-                f"sample {k}: the feet on the ground cannot remain where they are; "
-                f"{np.abs(error).max():.3g} m remain. Move the base less"
-            )
-        found[k], change = x, x - wanted
-    return found
-
-
-class _Feet:
-    """The contacts of a robot as equations of its joint coordinates."""
-
-    def __init__(self, model: RobotModel) -> None:
-        self._model, self._data = model, model.pin_model.createData()
-        self._ids = [frame_id(model.pin_model, x.frame) for x in model.contacts]
-        self._sizes = [x.sizes[x.kind] for x in model.contacts]
-
-    def places(self, base: Array, x: Array) -> dict[int, pin.SE3]:
-        """Return the placement of each contact in the world, and compute all Jacobians."""
-        pin_model, data = self._model.pin_model, self._data
-        (configuration,) = self._model.configurations(np.append(base, x)[None])
-        pin.computeJointJacobians(pin_model, data, configuration)
-        pin.updateFramePlacements(pin_model, data)
-        return {i: data.oMf[at].copy() for i, at in enumerate(self._ids)}
-
-    def moved(self, base: Array, x: Array, places: Mapping[int, pin.SE3]) -> tuple[Array, Array]:
-        """Return how far contacts are from places, (m,) [m, rad], and its slopes, (m, n)."""
-        now, axes = self.places(base, x), pin.LOCAL_WORLD_ALIGNED
-        errors, rows = [np.empty(0)], [np.empty((0, self._model.n_rows))]
-        for i, place in places.items():
-            turned = pin.log3(now[i].rotation @ place.rotation.T)
-            moved = np.append(now[i].translation - place.translation, turned)
-            J = pin.getFrameJacobian(self._model.pin_model, self._data, self._ids[i], axes)
-            errors.append(moved[: self._sizes[i]])
-            rows.append(J[: self._sizes[i]] @ self._model.velocity_map)
-        return np.concatenate(errors), np.vstack(rows)[:, 6:]

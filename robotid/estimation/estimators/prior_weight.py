@@ -8,8 +8,7 @@ import numpy as np
 
 from robotid.base.exceptions import DataError, NotConvergedError
 from robotid.base.typing import Array
-from robotid.dynamics.factors import Factors, merge
-from robotid.dynamics.lapack import Triangle
+from robotid.dynamics.factors import Factors, Triangle, merge
 from robotid.estimation.estimators.consistent.consistent_fit import Consistent, WeightChoice
 from robotid.estimation.estimators.consistent.interior_point import Minimum
 

@@ -15,7 +15,7 @@ from robotid.base.typing import Array
 from robotid.data.log import Trajectory, suggestion
 from robotid.dynamics.base_parameters import BaseMapping
 from robotid.dynamics.friction_projection import DriveMoments, drive_moments
-from robotid.dynamics.memory import drive_motion_along
+from robotid.dynamics.prediction import drive_motion_along
 from robotid.dynamics.torque import trajectory_regressor
 from robotid.estimation.fitting.joint_motion import JointMotion
 from robotid.estimation.fitting.open_terms import open_torques

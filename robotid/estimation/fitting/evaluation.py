@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from functools import partial, reduce
 from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -78,6 +78,29 @@ class Recording:
         return len(self.trajectory.t) < self.extent.smooth
 
 
+class Evaluated(Protocol):
+    """A recording with predictions and their errors: of torques, or of simulated positions."""
+
+    @property
+    def log(self) -> Log:
+        """The log, or its first rows."""
+
+    @property
+    def extent(self) -> Extent:
+        """Size of the whole log."""
+
+    @property
+    def metrics(self) -> Mapping[str, Metrics]:
+        """Metrics over the whole log, by name of the parameters; they state the unit."""
+
+    @property
+    def name(self) -> str:
+        """Name of the log's file and its time range, as ``run3.parquet 5-7.4 s``."""
+
+    def to_dict(self, name: str = "estimate") -> dict[str, Any]:
+        """Return the log and its metrics as plain values, as result.json has them."""
+
+
 @dataclass(frozen=True, eq=False)
 class Evaluation:
     """A recording with its predicted torques.
@@ -97,6 +120,22 @@ class Evaluation:
     sums: Mapping[str, TorqueSums]
     metrics: Mapping[str, Metrics]
     is_refitted: bool = False
+
+    @property
+    def log(self) -> Log:
+        return self.recording.log
+
+    @property
+    def extent(self) -> Extent:
+        return self.recording.extent
+
+    @property
+    def name(self) -> str:
+        return self.recording.name
+
+    def to_dict(self, name: str = "estimate") -> dict[str, Any]:
+        """Return the log and its metrics as plain values, as result.json has them."""
+        return {"log": self.log.path, "name": self.name, **self.metrics[name].to_dict()}
 
 
 def evaluate_logs(

@@ -10,7 +10,7 @@ import numpy as np
 from robotid.base.exceptions import NotConvergedError, RankDeficientError, SettingsError
 from robotid.base.typing import Array
 from robotid.dynamics.factors import Factors, Reduction, join
-from robotid.dynamics.memory import is_loaded
+from robotid.dynamics.prediction import is_loaded
 from robotid.estimation.estimators import WLS, Consistent, Estimate
 from robotid.estimation.estimators.determination import Determination, base_spread, determine
 from robotid.estimation.estimators.estimator import Weighing

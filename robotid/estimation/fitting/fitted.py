@@ -281,7 +281,7 @@ class Fit(Identified, Solution):
         if not self.validation:
             return dict(self.left_out)
         new = (e for e in self.validation if not e.is_refitted)
-        return {e.recording.name: e.metrics["estimate"] for e in new}
+        return {e.name: e.metrics["estimate"] for e in new}
 
     @cached_property
     def overfitted(self) -> frozenset[str]:

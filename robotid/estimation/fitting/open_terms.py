@@ -8,7 +8,7 @@ import numpy as np
 
 from robotid.base.typing import Array
 from robotid.dynamics.constraint_rows import without_forces
-from robotid.dynamics.memory import drive_motion_along
+from robotid.dynamics.prediction import drive_motion_along
 from robotid.estimation.fitting.evaluation import Evaluation
 from robotid.estimation.fitting.joint_motion import JointMotion, joint_motions
 from robotid.robot.drives import DriveMotion

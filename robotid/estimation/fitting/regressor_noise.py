@@ -35,9 +35,9 @@ import numpy as np
 
 from robotid.base.findings import Finding, listed
 from robotid.base.typing import Array
+from robotid.data.filters import local_polynomial
 from robotid.data.log import Trajectory
 from robotid.data.measured_velocity import quantum
-from robotid.data.signal_filters import local_polynomial
 from robotid.data.signal_settings import SignalSettings
 from robotid.dynamics.factors import Factors, Reduction
 from robotid.estimation.estimators.batch import solve_factor

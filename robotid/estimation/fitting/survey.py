@@ -18,26 +18,30 @@ from robotid.base.exceptions import DataError
 from robotid.base.findings import listed
 from robotid.base.text import seconds
 from robotid.base.typing import Array
+from robotid.data.base_motion import bias_at_rest
+from robotid.data.files.formats import open_table
 from robotid.data.files.read import LogLayout
 from robotid.data.files.table import Place, RowReader, Table
-from robotid.data.files.table_files import open_table
-from robotid.data.imu_frame import bias_at_rest
-from robotid.data.log import Log, Trajectory
+from robotid.data.log import Log, Trajectory, blocks_of, map_stamps, median_step
 from robotid.data.signal_settings import SignalSettings
-from robotid.data.signals import decide, unwrap
-from robotid.data.smoothing import SPLINE, Segment, filter_reach, process_segments, too_short
-from robotid.data.time_stamps import blocks_of, map_stamps, median_step
+from robotid.data.signals import (
+    SPLINE,
+    Segment,
+    decide,
+    filter_reach,
+    process_segments,
+    too_short,
+    unwrap,
+)
 from robotid.data.units import check_reach, check_units
 from robotid.dynamics.base_parameters import BaseMapping
+from robotid.dynamics.completed_logs import closed_log, with_contacts
 from robotid.dynamics.constraint_rows import constrained, logged_base
-from robotid.dynamics.constraints.closed_log import closed_log
-from robotid.dynamics.constraints.found_contacts import with_contacts
 from robotid.dynamics.drive_columns import friction_speeds
 from robotid.dynamics.factors import Reduction
-from robotid.dynamics.memory import is_loaded, remember
+from robotid.dynamics.prediction import is_loaded, remember
 from robotid.dynamics.rows import COMPILED, choose_engine
-from robotid.dynamics.used_rows import base_problem, row_mask, static_rows
-from robotid.dynamics.velocity_choice import prefers_measured
+from robotid.dynamics.used_rows import base_problem, prefers_measured, row_mask, static_rows
 from robotid.estimation.workers.pools import Workload
 from robotid.robot.model import RobotModel
 

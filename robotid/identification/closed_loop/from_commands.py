@@ -20,7 +20,7 @@ from robotid.estimation.fitting.estimator_settings import SimulationSettings
 from robotid.estimation.variation.variation import vary
 from robotid.identification.closed_loop.loop_findings import loop_findings
 from robotid.identification.closed_loop.loop_result import (
-    LoopIdentification,
+    PositionIdentification,
     identified_loops,
     loop_runs,
 )
@@ -44,7 +44,7 @@ def identify_loops(
     ignore: Sequence[str] = (),
     units: Sequence[str] = (),
     progress: ProgressCallback = ignore_progress,
-) -> LoopIdentification:
+) -> PositionIdentification:
     """Identify drives, loops and bodies from logs of commands and positions."""
     if not logs:
         raise DataError("no log was given. An identification needs at least one log")

@@ -14,7 +14,7 @@ import scipy.linalg
 
 from robotid.base.typing import Array
 from robotid.diagnosis.residual.selection import Round, Rule
-from robotid.dynamics.simulation.failures import friction_at_rest
+from robotid.dynamics.simulation.loops import friction_at_rest
 from robotid.estimation.estimators.estimator import Estimate
 from robotid.estimation.estimators.output_error import OutputError, is_at_bound, linearised
 from robotid.identification.closed_loop.loop_simulator import FreeParameter, LoopSimulator
@@ -129,9 +129,8 @@ def impossible(simulator: LoopSimulator, theta: Array, tried: Sequence[Tried]) -
 
     Negative friction at some position would drive the joint: no simulation that comes to rest there
     has a solution. Beyond the range of the data, terms of the position are constant.
-
-    theta (c,).
     """
+    # theta (c,)
     weakest = {t.joint: t for t in sorted(tried, key=lambda t: -t.gain) if t.is_chosen}
     found = {}
     for t in weakest.values():

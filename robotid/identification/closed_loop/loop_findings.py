@@ -9,10 +9,9 @@ import numpy as np
 from robotid.base.findings import Finding, by_severity, listed, quoted
 from robotid.identification.closed_loop.encoder_zeros import CLEAR, parallel_axes
 from robotid.identification.closed_loop.further_parameters import Tried
-from robotid.identification.closed_loop.loop_result import STATED_SCALE, LoopIdentification
+from robotid.identification.closed_loop.loop_result import STATED_SCALE, PositionIdentification
 from robotid.identification.closed_loop.stages import CHANGE
 
-_SOFT = 0.5  # share of the residual that remains after a step; a larger one shows a soft loop
 _MISMATCH = 0.5  # largest relative error of a torque that the loop of its joint gives
 _KNOWN = 0.1  # standard error of a known delay, relative to the range found from one response
 _POSITIVE = ("kp", "limit")  # parameters whose lower bound is more than 0
@@ -20,13 +19,15 @@ _UNEQUAL = 3.0  # ratio of the gains of equal drives from which on they are repo
 _NAMED = 8  # largest number of parameters that a sentence names
 
 
-def loop_findings(result: LoopIdentification, examined: Sequence[Finding]) -> tuple[Finding, ...]:
+def loop_findings(
+    result: PositionIdentification, examined: Sequence[Finding]
+) -> tuple[Finding, ...]:
     """Return the findings of logs and fit, the most severe first."""
     settled = [_settled_delay(finding, result) for finding in examined]
     return by_severity([*settled, *_of_fit(result)])
 
 
-def _of_fit(result: LoopIdentification) -> Iterator[Finding]:
+def _of_fit(result: PositionIdentification) -> Iterator[Finding]:
     """Yield the findings of the fit."""
     estimate = result.estimate
     if not estimate.converged:
@@ -35,8 +36,7 @@ def _of_fit(result: LoopIdentification) -> Iterator[Finding]:
             "change. State the known gains and delays in [controller], or use shorter windows"
         )
         yield Finding("not_settled", "warning", "fit", message)
-    yield from _soft_loop(estimate.details["left"])
-    if not result.has_gains and not result.fit.simulator.knows_torques:
+    if not result.has_stated_gains and not result.fit.simulator.knows_torques:
         message = (
             "commands and positions determine gains, friction and inertia up to a common factor; "
             "here the masses of the URDF and gravity determine it. Ratios such as kp / armature "
@@ -76,7 +76,7 @@ def _of_fit(result: LoopIdentification) -> Iterator[Finding]:
     yield from map(_friction_found, (t for t in result.fit.tried if t.is_chosen or t.dropped))
 
 
-def _at_rest(result: LoopIdentification) -> Iterator[Finding]:
+def _at_rest(result: PositionIdentification) -> Iterator[Finding]:
     """Yield which friction terms and offsets are of joints that no fitted log commands to move."""
     moves = np.any([run.moves for run in result.fitted], axis=0)
     undetermined = set(result.undetermined)
@@ -95,7 +95,7 @@ def _at_rest(result: LoopIdentification) -> Iterator[Finding]:
         yield Finding("undetermined", "warning", names, message)
 
 
-def _settled_delay(finding: Finding, result: LoopIdentification) -> Finding:
+def _settled_delay(finding: Finding, result: PositionIdentification) -> Finding:
     """Return a finding of the logs; "slow_command" is a note if the fit determines the delay.
 
     A delay at its bound of 0 is not determined: the data would fit a negative one better.
@@ -146,7 +146,7 @@ def _coarse_steps(details: Mapping[str, Any]) -> Iterator[Finding]:
         yield Finding("coarse_steps", "warning", "fit", message, {"halving": halving})
 
 
-def _gains_contradicted(result: LoopIdentification) -> Iterator[Finding]:
+def _gains_contradicted(result: PositionIdentification) -> Iterator[Finding]:
     """Yield a finding if bodies or logged torques indicate gains other than those stated."""
     scale, joints = result.fit.scale, result.model.joints
     if scale is None or not scale.is_wrong:
@@ -170,7 +170,7 @@ def _gains_contradicted(result: LoopIdentification) -> Iterator[Finding]:
     )
 
 
-def _at_bound(result: LoopIdentification) -> Iterator[Finding]:
+def _at_bound(result: PositionIdentification) -> Iterator[Finding]:
     """Yield which parameters are estimated as 0, or as the largest value of a drive that moves."""
     loop = result.loop
     estimate, free_parameters = result.estimate, result.fit.simulator.free_parameters
@@ -220,7 +220,7 @@ def _at_bound(result: LoopIdentification) -> Iterator[Finding]:
         yield Finding("no_delay", "warning", "delay", message)
 
 
-def _at_least(result: LoopIdentification) -> Iterator[Finding]:
+def _at_least(result: PositionIdentification) -> Iterator[Finding]:
     """Yield which gains and torque limits are estimated at their lower bound, which is not 0."""
     at_bound = result.estimate.details["at_bound"]
     least = [
@@ -238,7 +238,7 @@ def _at_least(result: LoopIdentification) -> Iterator[Finding]:
         yield Finding("at_bound", "warning", names, message)
 
 
-def _unequal_gains(result: LoopIdentification) -> Iterator[Finding]:
+def _unequal_gains(result: PositionIdentification) -> Iterator[Finding]:
     """Yield which joints with equal limits in the URDF have gains that differ, each fitted alone.
 
     Equal drives have equal gains: a large difference is an error of one of them.
@@ -268,7 +268,7 @@ def _unequal_gains(result: LoopIdentification) -> Iterator[Finding]:
             )
 
 
-def _limits_found(result: LoopIdentification) -> Iterator[Finding]:
+def _limits_found(result: PositionIdentification) -> Iterator[Finding]:
     """Yield the estimated torque limits of the drives, except those at a bound."""
     estimate = result.estimate
     is_expected = result.loop.limit == "find"
@@ -292,23 +292,9 @@ def _limits_found(result: LoopIdentification) -> Iterator[Finding]:
             )
 
 
-def _soft_loop(left: float) -> Iterator[Finding]:
-    """Yield a finding if a step of the direct method leaves much of the residual."""
-    if left > _SOFT:
-        message = (
-            f"a step of error = 'direct' leaves {100 * left:.0f} % of the residual that it should "
-            f"remove, wanted at most {100 * _SOFT:.0f} %: it neglects that the motion changes with "
-            "the parameters, and this loop is soft. Set error = 'input'"
-        )
-        yield Finding("soft_loop", "warning", "fit", message, {"left": left})
-
-
-def _torque_mismatches(result: LoopIdentification) -> Iterator[Finding]:
+def _torque_mismatches(result: PositionIdentification) -> Iterator[Finding]:
     """Yield which logged torques differ from those of the loops, where the fit uses them."""
-    simulator = result.fit.simulator
-    if simulator.lag is None:
-        return
-    mismatch = simulator.torque_mismatch(result.estimate.theta)
+    mismatch = result.fit.simulator.torque_mismatch(result.estimate.theta)
     for joint, share in zip(result.model.joints, mismatch.tolist(), strict=True):
         if share > _MISMATCH:
             message = (
@@ -336,7 +322,7 @@ def _friction_found(tried: Tried) -> Finding:
     return Finding("friction_dropped", "warning", tried.joint, message, figures)
 
 
-def _encoder_findings(result: LoopIdentification) -> Iterator[Finding]:
+def _encoder_findings(result: PositionIdentification) -> Iterator[Finding]:
     """Yield zero and sign of each encoder relative to the URDF, with the evidence for them."""
     encoders, undetermined = result.fit.encoders, []
     if result.loop.zeros != "find":
@@ -374,7 +360,7 @@ def _encoder_findings(result: LoopIdentification) -> Iterator[Finding]:
 
 
 def _undetermined_encoders(
-    result: LoopIdentification, undetermined: Sequence[str]
+    result: PositionIdentification, undetermined: Sequence[str]
 ) -> Iterator[Finding]:
     """Yield which encoder zeros and signs gravity does not determine, of joints and of chains."""
     if undetermined:

@@ -1,4 +1,4 @@
-"""Results of identification by simulation, and the information of each of their logs."""
+"""Identifications that predict positions, and the information of each of their logs."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -6,6 +6,7 @@ from functools import cached_property
 
 import numpy as np
 
+from robotid.base.exceptions import SettingsError
 from robotid.base.typing import Array
 from robotid.data.log import Log, Trajectory
 from robotid.diagnosis.verdict.correlation import correlated_sets
@@ -20,16 +21,16 @@ from robotid.estimation.fitting.estimator_settings import SimulationSettings
 from robotid.estimation.fitting.identified import FROM_PRIOR, sources_of
 from robotid.estimation.fitting.metrics import Metrics
 from robotid.estimation.variation.groups import FEWEST_RUNS, Group, RunsOf, inflation_of
-from robotid.estimation.variation.mixed_effects import Runs
+from robotid.estimation.variation.spread import Runs
 from robotid.identification.closed_loop.loop_settings import LoopSettings
 from robotid.identification.closed_loop.loop_simulator import (
     FreeParameter,
     LoopSimulator,
     with_terms,
 )
-from robotid.identification.closed_loop.position_errors import OpenLoop, position_metrics
+from robotid.identification.closed_loop.position_errors import PositionEvaluation, pool_positions
 from robotid.identification.closed_loop.stages import Fitted
-from robotid.identification.result import Concluded
+from robotid.identification.result import Identification
 from robotid.robot.drives import TERMS
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
@@ -105,14 +106,16 @@ def units_of(model: RobotModel, free: FreeParameter) -> str:
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
-class LoopIdentification(Concluded):
-    """Result of an identification by simulation."""
+class PositionIdentification(Identification):
+    """Identification that predicts positions, by simulation from commands or torques."""
 
     loop: LoopSettings  # what is known of the loops
     estimator: SimulationSettings  # the estimator's settings
     fit: Fitted
-    fitted: tuple[OpenLoop, ...]  # the fitted logs, with their simulated positions
-    validation: tuple[OpenLoop, ...]  # the validation logs, with their simulated positions
+    fitted: tuple[PositionEvaluation, ...]  # the fitted logs, with their simulated positions
+    validation: tuple[
+        PositionEvaluation, ...
+    ]  # the validation logs, with their simulated positions
 
     @property
     def estimate(self) -> Estimate:
@@ -199,6 +202,11 @@ class LoopIdentification(Concluded):
 
     @property
     def has_gains(self) -> bool:
+        """Whether the robot has position controllers: no logged torque drives it."""
+        return self.loop.kind != "torque"
+
+    @property
+    def has_stated_gains(self) -> bool:
         """Whether the position gain of every joint was stated."""
         return not any(free.what == "kp" for free in self.fit.simulator.free_parameters)
 
@@ -206,19 +214,21 @@ class LoopIdentification(Concluded):
     def is_scaled_by_gain(self) -> bool:
         """Whether only the stated gains determine the scale: no torque was fitted."""
         simulator = self.fit.simulator
-        return self.loop.kind != "torque" and self.has_gains and not simulator.knows_torques
+        return self.has_gains and self.has_stated_gains and not simulator.knows_torques
 
-    def metrics(self) -> Metrics:
+    def metrics(self, name: str = "estimate") -> Metrics:
         """Return the metrics of positions over all fitted logs."""
-        return position_metrics(self.model, self.fitted)
+        if name != "estimate":
+            raise SettingsError(f"name is {name!r}, wanted 'estimate'")
+        return pool_positions(self.fitted)
 
     @cached_property
     def verdict(self) -> Verdict:
         """The verdict on the result."""
         return judge_positions(
-            position_metrics(self.model, self.validation or self.fitted, moving=True),
+            pool_positions(self.validation or self.fitted, moving=True),
             self.model.joints,
-            fitted=position_metrics(self.model, self.fitted, moving=True),
+            fitted=pool_positions(self.fitted, moving=True),
             is_validation=bool(self.validation),
             is_settled=self.estimate.converged,
             log_errors=self.log_errors,
@@ -233,14 +243,14 @@ def identified_loops(
     loop: LoopSettings,
     estimator: SimulationSettings,
     fit: Fitted,
-    fitted: tuple[OpenLoop, ...],
-    validation: tuple[OpenLoop, ...],
-) -> LoopIdentification:
+    fitted: tuple[PositionEvaluation, ...],
+    validation: tuple[PositionEvaluation, ...],
+) -> PositionIdentification:
     """Return the result of a fit, without findings."""
     model = with_terms(model, fit.loops)
     standard, slopes = fit.simulator.standard(model, fit.estimate.theta)
     covariance, mapping = slopes @ fit.estimate.covariance @ slopes.T, structural_mapping(model)
-    return LoopIdentification(
+    return PositionIdentification(
         model=model,
         mapping=mapping,
         prior=model.standard_parameters(),

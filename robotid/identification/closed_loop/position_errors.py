@@ -1,7 +1,9 @@
-"""Errors of simulated positions against validation logs, with simpler models as baselines."""
+"""Positions simulated from the commands or torques of logs, their errors, and simpler models."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -10,6 +12,7 @@ from robotid.base.text import period
 from robotid.base.typing import Array
 from robotid.data.log import Log
 from robotid.dynamics.simulation.loops import ClosedLoopRobot, Loops, cut_windows
+from robotid.estimation.fitting.evaluation import Extent
 from robotid.estimation.fitting.metrics import JointMetrics, Metrics
 from robotid.robot.model import RobotModel
 
@@ -22,13 +25,14 @@ _DRIVEN = (*_COMMANDED, "rows", "steady")  # ... and of those driven by the logg
 
 
 @dataclass(frozen=True, eq=False)
-class OpenLoop:
+class PositionEvaluation:
     """A log and its simulation from the commands alone; errors are RMS values of shape (n,).
 
     A simulation driven by the logged torque restarts from the log every ``DRIFTS``.
     """
 
     log: Log
+    units: tuple[str, ...]  # of the positions, by joint
     #: Simulated positions of the identified robot, started once, shape (N, n) [rad or m];
     #: NaN at a single sample between gaps.
     q: Array
@@ -45,7 +49,19 @@ class OpenLoop:
     @property
     def name(self) -> str:
         """Name of the log's file with its time range, as ``run3.parquet 5-7.4 s``."""
-        return f"{self.log.name} {period(float(self.log.t[0]), float(self.log.t[-1]))}"
+        return f"{self.log.name} {period(self.extent.start, self.extent.end)}"
+
+    @property
+    def extent(self) -> Extent:
+        """Size of the log."""
+        t, rows = self.log.t, len(self.log.t)
+        rate = 1.0 / float(np.median(np.diff(t)))
+        return Extent(rows, rate, float(t[0]), float(t[-1]), rows, rows, 1)
+
+    @cached_property
+    def metrics(self) -> Mapping[str, Metrics]:
+        """Metrics of the simulated positions."""
+        return {"estimate": pool_positions((self,))}
 
     @property
     def is_driven(self) -> bool:
@@ -59,6 +75,24 @@ class OpenLoop:
             return np.ones(len(self.rmse), dtype=bool)
         return np.asarray(np.ptp(self.log.q_ref, axis=0) > 0)
 
+    def to_dict(self, name: str = "estimate") -> dict[str, Any]:
+        """Return the log and its errors as plain values, as result.json has them."""
+        content = self.metrics[name].to_dict()
+        for j, errors in enumerate(content["per_joint"].values()):
+            for key, x in self.baselines.items():
+                errors[f"{key}_rmse"] = None if x is None else float(x[j])
+        return {
+            "log": self.log.path,
+            "name": self.name,
+            "start": self.extent.start,
+            "end": self.extent.end,
+            **content,
+            "horizons": {
+                f"{h:g}": dict(zip(self.log.joints, map(float, errors), strict=True))
+                for h, errors in self.horizons.items()
+            },
+        }
+
 
 def run_open_loop(
     robot: ClosedLoopRobot,
@@ -67,25 +101,24 @@ def run_open_loop(
     others: Mapping[str, Loops] | None = None,
     *,
     horizons: Sequence[float] = HORIZONS,
-) -> OpenLoop:
+) -> PositionEvaluation:
     """Simulate a log from its commands alone and return the position errors."""
     q, is_driven = np.full_like(log.q, np.nan), not loops.kp.any()
     length = DRIFTS if is_driven else np.inf
     windows = cut_windows(log, length, 0.0)
     for out in robot.roll_out(loops, windows):
         q[out.window.counted] = out.q
-    lag_error = log.q_ref - log.q
     moved = [w.log.q[w.counted] - w.start[0] for w in windows]
-    steady = [
-        own - np.outer(w.log.t[w.counted] - w.log.t[w.start_row], w.start[1])
-        for own, w in zip(moved, windows, strict=True)
-    ]
     baselines: dict[str, Array | None] = dict.fromkeys(_DRIVEN if is_driven else _COMMANDED)
     baselines |= {key: _error(robot, plain, log, length) for key, plain in (others or {}).items()}
-    own = {"steady": np.concatenate(steady)} if is_driven else {"command": lag_error}
-    baselines |= {key: _size(e) for key, e in own.items()}
-    return OpenLoop(
+    if is_driven:
+        drifts = [np.outer(w.log.t[w.counted] - w.log.t[w.start_row], w.start[1]) for w in windows]
+        baselines["steady"] = _size(np.concatenate(moved) - np.concatenate(drifts))
+    else:
+        baselines["command"] = _size(log.q_ref - log.q)
+    return PositionEvaluation(
         log=log,
+        units=_position_units(robot.model),
         q=q,
         rmse=np.sqrt(np.nanmean((log.q - q) ** 2, axis=0)),
         baselines=baselines,
@@ -98,40 +131,35 @@ def run_open_loop(
     )
 
 
-def position_metrics(
-    model: RobotModel, runs: Sequence[OpenLoop], *, moving: bool = False
-) -> Metrics:
-    """Return the metrics of simulated positions over all logs.
+def pool_positions(runs: Sequence[PositionEvaluation], *, moving: bool = False) -> Metrics:
+    """Return the metrics of simulated positions over all logs; joints that move, if ``moving``.
 
     Relative errors are 100 rmse / spread of the motion, of joints that a log commands to move; all
     logs have equal weight.
     """
-    found: dict[str, JointMetrics] = {}
-    units = position_units(model)
-    for j, joint in enumerate(model.joints):
-        own = [run for run in runs if not moving or run.moves[j]]
-        if own:
-            found[joint] = _joint_metrics(own, j, units[j])
-    return Metrics(found, _mean(rmse for run in runs for rmse in run.rmse))
+    per_joint: dict[str, JointMetrics] = {}
+    for j, joint in enumerate(runs[0].log.joints):
+        if of_joint := [run for run in runs if not moving or run.moves[j]]:
+            per_joint[joint] = _joint_metrics(of_joint, j)
+    return Metrics(per_joint, _mean(rmse for run in runs for rmse in run.rmse))
 
 
-def position_units(model: RobotModel) -> tuple[str, ...]:
-    """Return the unit of the position of each joint."""
+def _position_units(model: RobotModel) -> tuple[str, ...]:
     return tuple("m" if joint in model.layout.prismatic else "rad" for joint in model.joints)
 
 
-def _joint_metrics(runs: Sequence[OpenLoop], j: int, unit: str) -> JointMetrics:
+def _joint_metrics(runs: Sequence[PositionEvaluation], j: int) -> JointMetrics:
     rmse, size = (_mean(getattr(run, key)[j] for run in runs) for key in ("rmse", "spread"))
     moves = size > 0 and any(run.moves[j] for run in runs)
 
     def share(errors: Sequence[Array | None]) -> float | None:
-        own = [error[j] for error in errors if error is not None]
-        return 100.0 * _mean(own) / size if moves and len(own) == len(runs) else None
+        known = [error[j] for error in errors if error is not None]
+        return 100.0 * _mean(known) / size if moves and len(known) == len(runs) else None
 
     left = (rmse / size) ** 2 if size > 0 else 1.0
     return JointMetrics(
         rmse=rmse,
-        unit=unit,
+        unit=runs[0].units[j],
         relative_error_pct=share([run.rmse for run in runs]),
         r2=1.0 - left,
         rows=sum(len(run.log.t) for run in runs),

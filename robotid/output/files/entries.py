@@ -1,50 +1,53 @@
 """Content of result.json for an identification and for a preview."""
 
 import dataclasses
+import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from robotid.base.files import finite, source_entry
+from robotid.base.settings import require_kind
 from robotid.base.versions import __version__, versions
 from robotid.data.transmission import Transmission
 from robotid.diagnosis.verdict.parameter_table import parameter_entries
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.estimation.fitting.bands import QUANTILE, next_errors, typical_friction
-from robotid.estimation.fitting.evaluation import Evaluation
+from robotid.estimation.fitting.evaluation import Evaluated, Evaluation
 from robotid.estimation.fitting.identified import SOURCES, Identified
 from robotid.estimation.fitting.left_out import LEFT_OUT
 from robotid.estimation.fitting.selected_drives import DriveChoice
-from robotid.identification.result import Identification
+from robotid.identification.result import Identification, TorqueIdentification
 from robotid.output.files.ranges import parameter_ranges
+from robotid.output.files.result_file import SCHEMA_VERSION
 from robotid.output.files.samples import covariance_entry
 from robotid.robot.drives import TERMS
 from robotid.robot.parameters import pseudo_inertia
 
 if TYPE_CHECKING:
     from robotid.design.previews import Preview
-    from robotid.identification.closed_loop.loop_result import LoopIdentification
+    from robotid.identification.closed_loop.loop_result import PositionIdentification
 
-SCHEMA_VERSION = 1
-
+_LOOP_TERMS = ("kp", "kd", "delay", "limit", "zero")
 _EXTENT = ("samples", "rate", "start", "end", "rows_used", "segments")
 
 
 def build_result(
-    found: "Identification | LoopIdentification",
+    found: Identification,
     settings: Mapping[str, Any],
     outputs: Mapping[str, str] | None = None,
 ) -> dict[str, Any]:
     """Return the content of result.json: plain values, all numbers finite."""
     model, (bodies, drives) = found.model, parameter_entries(found)
-    if isinstance(found, Identification):
+    if isinstance(found, TorqueIdentification):
         own = _torque_entries(found, settings)
         beside = found.urdf_with_drives[len(bodies) :].tolist()
         drives = [x | {"with_urdf": value} for x, value in zip(drives, beside, strict=True)]
     else:
-        from robotid.output.files.loop_export import loop_entries
+        from robotid.identification.closed_loop.loop_result import PositionIdentification
 
+        require_kind(found, PositionIdentification, "identification", "a robotid.Identification")
         own = loop_entries(found)
     common = {
         "schema_version": SCHEMA_VERSION,
@@ -63,6 +66,7 @@ def build_result(
         "drive_moments": {name: moments.to_dict() for name, moments in found.moments.items()},
         "consistency": _consistency(found) | own.pop("consistency", {}),
         "identification": found.metrics().to_dict(),
+        "validation": [e.to_dict() for e in found.validation],
         "warnings": [
             {"code": f.code, "severity": f.severity, "message": f.message, "where": f.where}
             for f in found.findings
@@ -74,7 +78,7 @@ def build_result(
     return common | own
 
 
-def _torque_entries(found: Identification, settings: Mapping[str, Any]) -> dict[str, Any]:
+def _torque_entries(found: TorqueIdentification, settings: Mapping[str, Any]) -> dict[str, Any]:
     """Return the entries of result.json that only an identification from torques has."""
     return {
         "structure": _determined(found),
@@ -93,14 +97,12 @@ def _torque_entries(found: Identification, settings: Mapping[str, Any]) -> dict[
             "fit": dict(found.estimate.details),
             "sources": {kind: found.sources.count(kind) for kind in SOURCES},
         },
-        "validation": [
-            recording_metrics(e, "estimate") | {"band": _band(found, e)} for e in found.validation
-        ],
+        "validation": [e.to_dict() | {"band": _band(found, e)} for e in found.validation],
         "wls": {
             "base_values": found.wls.theta.tolist(),
             "base_std_errors": [finite(error) for error in found.wls.std_error],
             "identification": found.metrics("wls").to_dict(),
-            "validation": [recording_metrics(e, "wls") for e in found.validation],
+            "validation": [e.to_dict("wls") for e in found.validation],
         },
         "scale_check": found.scale_check.to_dict(),
         **_left_out(found),
@@ -108,14 +110,14 @@ def _torque_entries(found: Identification, settings: Mapping[str, Any]) -> dict[
     }
 
 
-def _left_out(found: Identification) -> dict[str, Any]:
+def _left_out(found: TorqueIdentification) -> dict[str, Any]:
     """Return the metrics of each log as a fit to the others predicts it."""
     logs = [{"log": name.removesuffix(LEFT_OUT), **metrics.to_dict()}
             for name, metrics in found.left_out.items()]  # fmt: skip
     return {"left_out": logs} if logs else {}
 
 
-def _variation(found: Identification) -> dict[str, Any]:
+def _variation(found: TorqueIdentification) -> dict[str, Any]:
     """Return the variation between three or more logs, with the torque error of the next log.
 
     Sums over the rows of each log are those to which the next logs are added.
@@ -170,13 +172,7 @@ def build_preview(preview: "Preview") -> dict[str, Any]:
     }
 
 
-def recording_metrics(evaluation: Evaluation, name: str) -> dict[str, Any]:
-    """Return the metrics of one recording for result.json."""
-    recording = evaluation.recording
-    return {"log": recording.log.path, "name": recording.name, **evaluation.metrics[name].to_dict()}
-
-
-def _friction(found: Identification, drive: DriveChoice) -> dict[str, Any]:
+def _friction(found: TorqueIdentification, drive: DriveChoice) -> dict[str, Any]:
     """Return the friction terms of a joint, and the terms that were tried."""
     own = [term for term in found.model.layout.terms if TERMS[term].is_friction]
     choice = drive.to_dict()
@@ -189,7 +185,7 @@ def _friction(found: Identification, drive: DriveChoice) -> dict[str, Any]:
     }
 
 
-def _curve(found: Identification, joint: str) -> dict[str, Any]:
+def _curve(found: TorqueIdentification, joint: str) -> dict[str, Any]:
     """Return the friction of a joint over its speed; nothing if no log moves it."""
     row = found.model.row_names.index(joint)
     speeds = [e.recording.trajectory.v[e.recording.mask[:, row], row] for e in found.fitted]
@@ -208,7 +204,7 @@ def _structure(found: Identified) -> dict[str, Any]:
     }
 
 
-def _determined(found: Identification) -> dict[str, Any]:
+def _determined(found: TorqueIdentification) -> dict[str, Any]:
     """Return the number of base parameters that torques determine, and indistinguishable ones."""
     return {
         "rank": found.determination.rank,
@@ -245,27 +241,19 @@ def _expected_torque(preview: "Preview") -> dict[str, dict[str, Any]]:
     }
 
 
-def input_entries(found: "Identification | LoopIdentification") -> list[dict[str, Any]]:
+def input_entries(found: Identification) -> list[dict[str, Any]]:
     """Return the files that were read, for result.json, the URDF first."""
     inputs = [{"role": "urdf", **source_entry(found.model.tree.path)}]
-    if not isinstance(found, Identification):
-        from robotid.output.files.loop_export import loop_inputs
-
-        return [*inputs, *loop_inputs(found)]
-    for role, evaluations in (
-        ("identification", found.fitted),
-        ("validation", found.validation),
-    ):
-        for evaluation in evaluations:
-            recording = evaluation.recording
-            signals = {"signals": dataclasses.asdict(recording.signals)}
-            source = source_entry(recording.log.path)
-            inputs.append({"role": role, **source, **_extent(evaluation), **signals})
+    for role, evaluations in (("identification", found.fitted), ("validation", found.validation)):
+        for e in evaluations:
+            signals = dataclasses.asdict(e.recording.signals) if isinstance(e, Evaluation) else {}
+            source = source_entry(e.log.path)
+            inputs.append({"role": role, **source, **_extent(e), "signals": signals})
     return inputs
 
 
-def _extent(evaluation: Evaluation) -> dict[str, Any]:
-    return {key: getattr(evaluation.recording.extent, key) for key in _EXTENT}
+def _extent(evaluation: Evaluated) -> dict[str, Any]:
+    return {key: getattr(evaluation.extent, key) for key in _EXTENT}
 
 
 def _base_parameters(found: Identified) -> list[dict[str, Any]]:
@@ -283,7 +271,9 @@ def _base_parameters(found: Identified) -> list[dict[str, Any]]:
     ]
 
 
-def _motors(found: Identification, settings: Mapping[str, Any]) -> dict[str, dict[str, float]]:
+def _motors(
+    found: TorqueIdentification, settings: Mapping[str, Any]
+) -> dict[str, dict[str, float]]:
     """Return gear ratio and motor inertia, armature / ratio^2, of geared drives."""
     model, gears = found.model, dict[str, float]()
     for table in settings.get("transmission", ()):
@@ -317,7 +307,7 @@ def _consistency(found: Identified) -> dict[str, Any]:
     }
 
 
-def _band(identification: Identification, evaluation: Evaluation) -> dict[str, Any]:
+def _band(identification: TorqueIdentification, evaluation: Evaluation) -> dict[str, Any]:
     """Return the 95 % band of the predicted torque: its half width, and its coverage."""
     recording, band = evaluation.recording, identification.band(evaluation)
     covered = band.coverage(
@@ -333,3 +323,95 @@ def _band(identification: Identification, evaluation: Evaluation) -> dict[str, A
             identification.model.row_names, band.total.T, band.parameters.T, covered, strict=True
         )
     }
+
+
+def loop_entries(found: "PositionIdentification") -> dict[str, Any]:
+    """Return the entries of result.json that only an identification by simulation has."""
+    model, estimate = found.model, found.estimate
+    bodies = zip(found.mapping.base_names, found.mapping.independent, found.base_error, strict=True)
+    unfitted = [
+        name for name, i, error in bodies if i < model.layout.n_inertial and math.isinf(error)
+    ]
+    return {
+        "structure": {
+            "rank": estimate.rank,
+            "condition": finite(estimate.condition),
+            "indistinguishable": [{"names": list(names)} for names in found.correlated],
+        },
+        "uncertainty": {
+            "method": "scatter of the scores of segments of the whitened residual",
+            "inflation": estimate.details["inflation"],
+        },
+        "ranges": {"undetermined": [*unfitted, *found.undetermined]},
+        "loop_parameters": loop_parameters(found),
+        "covariance": _covariance(found),
+        **({} if found.variation is None else {"variation": found.variation.to_dict()}),
+        "simulation": {
+            "controller": _controller(found),
+            "signs": dict(zip(model.joints, found.fit.encoders.sign.tolist(), strict=True)),
+            "fit": {
+                "message": estimate.message,
+                "converged": estimate.converged,
+                "parameters": len(estimate.theta),
+                "correlation": [float(rho) for rho in estimate.details["correlation"]],
+            },
+            "friction_tried": [dataclasses.asdict(tried) for tried in found.fit.tried],
+            "identification": [e.to_dict() for e in found.fitted],
+        },
+    }
+
+
+def loop_parameters(found: "PositionIdentification") -> list[dict[str, Any]]:
+    """Return gains, delay, limit and zero of each joint; stated ones have no standard error."""
+    if found.loop.kind == "torque":
+        return []
+    loops, estimate = found.fit.loops, found.fit.estimate
+    errors = {
+        (unknown.what, j): (
+            float(error),
+            float(quantile),
+            "bound" if unknown.name in estimate.details["at_bound"] else "data",
+        )
+        for unknown, error, quantile in zip(
+            found.fit.simulator.free_parameters, estimate.std_error, estimate.quantile, strict=True
+        )
+        for j in unknown.joints
+    }
+    entries = []
+    for j, joint in enumerate(found.model.limits):
+        force, length = ("N", "m") if joint.type == "prismatic" else ("N m", "rad")
+        units = {
+            "kp": f"{force}/{length}", "kd": f"{force} s/{length}", "delay": "s", "limit": force,
+            "zero": length,
+        }  # fmt: skip
+        for what, unit in units.items():
+            value = float(getattr(loops, what)[j])
+            if math.isfinite(value):
+                error, quantile, source = errors.get((what, j), (None, None, "stated"))
+                entries.append(
+                    {"name": f"{joint.name}.{what}", "value": value, "std_error": error,
+                     "quantile": quantile,
+                     "unit": unit, "source": source}
+                )  # fmt: skip
+    return entries
+
+
+def _covariance(found: "PositionIdentification") -> dict[str, Any]:
+    """Return the root of the covariance of standard parameters, then gains, delays and zeros."""
+    simulator, estimate, model = found.fit.simulator, found.estimate, found.model
+    names, slopes = list(model.layout.names), [simulator.standard(model, estimate.theta)[1]]
+    free = simulator.free_parameters
+    for k, parameter in enumerate(free):
+        if parameter.what in _LOOP_TERMS:
+            names += [f"{model.joints[j]}.{parameter.what}" for j in parameter.joints]
+            slopes += [np.eye(len(free))[k : k + 1]] * len(parameter.joints)
+    S = np.vstack(slopes) * ~np.isin(simulator.names, estimate.details["at_bound"])
+    C = S @ estimate.covariance @ S.T
+    return covariance_entry(names, C, np.zeros(len(names), dtype=bool))
+
+
+def _controller(found: "PositionIdentification") -> dict[str, Any]:
+    """Return kind, torque limits and sampling rate of the controller."""
+    limits = dict(zip(found.model.joints, found.fit.loops.limit.tolist(), strict=True))
+    stated = {joint: x for joint, x in limits.items() if math.isfinite(x)} or None
+    return {"kind": found.loop.kind, "effort_limit": stated, "rate": found.loop.rate}

@@ -8,7 +8,7 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -21,22 +21,31 @@ from robotid.base.versions import __version__
 from robotid.dynamics.friction_projection import project_friction
 from robotid.estimation.fitting.bands import QUANTILE
 from robotid.estimation.fitting.identified import Identified
-from robotid.identification.result import Identification
+from robotid.identification.result import TorqueIdentification
 from robotid.output.files.commanded import commanded_drives
-from robotid.output.files.exported import Written
+from robotid.output.files.exports import Format, Option, Written, yaml_text
+from robotid.output.files.result_file import Result
 from robotid.output.files.samples import SIMULATED, write_samples
 from robotid.output.files.urdf import link_parameters
-from robotid.output.files.yaml_text import yaml_text
 from robotid.robot.bodies import principal_moments
 from robotid.robot.drives import TERMS
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia_basis
 
-if TYPE_CHECKING:
-    from robotid.output.files.result_file import Result
-
 #: Parameters of drives that cannot be negative.
 _NOT_NEGATIVE = {"kd", "delay", *(name for name, term in TERMS.items() if term.is_nonnegative)}
+FORMAT = Format(
+    "ranges",
+    "YAML of 95 % intervals, for domain randomisation",
+    "_ranges.yaml",
+    use_of_gains="Randomise the drives within their intervals.",
+    options={
+        "samples": Option(
+            "also FILE.samples.json with N samples of the joint distribution", "N", int
+        ),
+        "seed": Option("seed of these samples, default 0", "K", int),
+    },
+)
 _HEAD = """\
 Ranges for domain randomisation of {robot}, by robotid {version}. kg, m, kg m^2, in a link's frame.
 
@@ -64,7 +73,7 @@ gains kp and kd, the delay of commands and the zero of the encoder.
 
 
 def export(
-    result: "Result",
+    result: Result,
     target: Path,
     *,
     samples: int | None = None,
@@ -185,7 +194,7 @@ def stated_ranges(content: Mapping[str, Any]) -> dict[str, Any]:
     return {"undetermined": content["structure"]["undetermined"], **ranges, "drives": merged}
 
 
-def write_ranges(found: Identification, target: str | Path) -> None:
+def write_ranges(found: TorqueIdentification, target: str | Path) -> None:
     """Write the ranges of an identification as YAML.
 
     Args:
@@ -197,7 +206,7 @@ def write_ranges(found: Identification, target: str | Path) -> None:
         ModelError: If a link or a drive would be physically impossible.
         SettingsError: If the target is a folder.
     """
-    require_kind(found, Identification, "found", "a robotid.Identification")
+    require_kind(found, TorqueIdentification, "found", "a robotid.Identification")
     require_kind(target, (str, Path), "target", "the path of a file to write")
     write_text(ranges_text(parameter_ranges(found)), target)
 

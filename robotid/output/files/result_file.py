@@ -34,7 +34,6 @@ from robotid.output.files.commanded import (
     commanded_drives,
     loops_of,
 )
-from robotid.output.files.entries import SCHEMA_VERSION
 from robotid.output.files.shape import (
     FILE,
     FLAG,
@@ -49,8 +48,9 @@ from robotid.output.files.urdf import load_identified, terms_from_facts
 from robotid.robot.model import RobotModel
 
 if TYPE_CHECKING:
-    from robotid.identification.closed_loop.position_errors import OpenLoop
+    from robotid.identification.closed_loop.position_errors import PositionEvaluation
 
+SCHEMA_VERSION = 1
 _STATUSES = ("good", "usable", "poor", "not evaluated")
 _STATUS = Range("good, usable, poor or not evaluated", _STATUSES.__contains__)
 _METRICS = {"per_joint": {...: {"relative_error_pct": MAYBE, "rmse": MAYBE, "unit": TEXT}}}
@@ -230,7 +230,9 @@ class Result:
         return self._signs * self.open_loop(log, horizons=()).q
 
     @checked()
-    def open_loop(self, log: Log, *, horizons: Sequence[float] | None = None) -> "OpenLoop":
+    def open_loop(
+        self, log: Log, *, horizons: Sequence[float] | None = None
+    ) -> "PositionEvaluation":
         """Return a log with the positions simulated for it, in the URDF's sense of the joints.
 
         The inputs are its commands; for a result without gains, its feed-forward torques.

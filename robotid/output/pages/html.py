@@ -1,4 +1,4 @@
-"""HTML of the pages: scaffold, style, sections, tables. All parts are inline."""
+"""HTML of the pages: scaffold, blocks of templates, sections, tables. All parts are inline."""
 
 import base64
 import hashlib
@@ -9,15 +9,16 @@ from dataclasses import dataclass
 from functools import cache
 from html import escape
 from pathlib import Path
-from typing import NamedTuple
+from string import Template
+from typing import Any, NamedTuple
 
 from robotid.base.text import arguments
 
 _ASSETS = Path(__file__).parent / "assets"
 _FIRST = 3  # reasons of a verdict that are visible without unfolding
-#: Scripts, and the pattern of pages that need them.
 _KINDS = {"urdf": "URDF", "sidecar": "drive parameters"}  # of files, by key of result.json
 _DOCK = '<div id="replay" class="dock"'
+#: Scripts, and the pattern of pages that need them.
 _SCRIPTS = {
     "page.js": '<details|<table class="data"',
     "tables.js": '<table class="data"',
@@ -25,10 +26,29 @@ _SCRIPTS = {
 }
 
 
+#: A column of a table: its heading, the form of its cells (``cell``), its key in an entry.
+Column = tuple[str, str, str]
+
+
 @cache
 def asset(name: str) -> str:
     """Return the text of an asset file."""
     return (_ASSETS / name).read_text(encoding="utf-8")
+
+
+def block(key: str, /, **values: object) -> str:
+    """Return a block of a template: of "report.fit", the part of report.html after "<!-- fit -->".
+
+    ``$name`` in it stands for a value, which is HTML.
+    """
+    file, _, name = key.partition(".")
+    return _blocks(file)[name].substitute(values)
+
+
+@cache
+def _blocks(file: str) -> dict[str, Template]:
+    parts = re.split(r"<!-- (\w+) -->\n", asset(f"{file}.html"))
+    return dict(zip(parts[1::2], map(Template, parts[2::2]), strict=True))
 
 
 @dataclass(frozen=True)
@@ -99,6 +119,28 @@ def with_error(value: float, error: float, *, sign: str = "") -> tuple[Cell, Cel
     return number(value, f"{sign}z.{decimals}f"), number(error, f".{decimals}f")
 
 
+def cell(value: Any, form: str) -> Cell:  # noqa: ANN401
+    """Return a value as a cell: its form is "text", "code", "%" or the format of a number."""
+    if isinstance(value, Cell):
+        return value
+    if form in ("text", "code"):
+        return (text if form == "text" else code)("" if value is None else str(value))
+    return percent(value) if form == "%" else number(value, form)
+
+
+def listing(
+    caption: str,
+    columns: Sequence[Column],
+    entries: Iterable[Mapping[str, Any]],
+    *,
+    is_data: bool = False,
+) -> str:
+    """Return a table with a row for each entry; "" without entries."""
+    rows = [[cell(entry.get(key), form) for _, form, key in columns] for entry in entries]
+    heads = [head for head, *_ in columns]
+    return table(caption, heads, rows, is_data=is_data) if rows else ""
+
+
 def table(
     caption: str,
     headers: Sequence[str],
@@ -124,10 +166,9 @@ def table(
     )
 
 
-def figure(caption: str, svg: str, *, single: bool = False) -> str:
+def figure(caption: str, svg: str) -> str:
     """Return the HTML of a figure, which scrolls on narrow pages, also by keyboard."""
-    kind = ' class="single"' if single else ""
-    return f'<figure{kind} tabindex="0"><figcaption>{caption}</figcaption>{svg}</figure>\n'
+    return f'<figure tabindex="0"><figcaption>{caption}</figcaption>{svg}</figure>\n'
 
 
 def folded(key: str, summary: str, html: str, *, is_open: bool = False) -> str:
@@ -163,17 +204,6 @@ def facts_html(facts: Mapping[str, str], files: Mapping[str, str] | None = None)
     return f'<dl class="facts">{cells}</dl>\n'
 
 
-def steps_html(steps: Iterable[tuple[str, Sequence[str]]]) -> str:
-    """Return the HTML of the next steps; nothing if there are none."""
-    items = "".join(
-        f"<li><p>{escape(action)}</p>"
-        + "".join(f'<div class="copy">{command_html(block)}</div>' for block in blocks)
-        + "</li>\n"
-        for action, blocks in steps
-    )
-    return f'<h2 id="next">Do next</h2>\n<ol class="next">{items}</ol>\n' if items else ""
-
-
 def command_html(block: str) -> str:
     """Return the HTML of a command, or of lines of a job file; lines break between arguments."""
     html = escape(block)
@@ -189,13 +219,11 @@ def page(title: str, header: str, sections: Mapping[str, Section | tuple[str, st
     body = "".join(_section(key, section) for key, section in shown.items())
     named = [name for name, mark in _SCRIPTS.items() if re.search(mark, header + body)]
     has_dock = _DOCK in body
+    style = asset("page.css") + (asset("dock.css") if has_dock else "")
     return scaffold(
         title,
-        f"<style>/*tones*/{asset('page.css')}{asset('dock.css') if has_dock else ''}</style>\n",
-        '<a class="skip" href="#content">Skip to the content</a>\n'
-        f'<nav aria-label="Sections"><div><a href="#content">{escape(title)}</a> {links}'
-        f'</div></nav>\n<main id="content" tabindex="-1">\n<header>\n{header}</header>\n'
-        f"{body}</main>\n",
+        f"<style>/*tones*/{style}</style>\n",
+        block("page.body", title=escape(title), links=links, header=header, sections=body),
         policy="; frame-src 'self'" if has_dock else "",
         scripts=named,
     )
@@ -225,16 +253,8 @@ def scaffold(
     if run:
         policy += "; script-src " + " ".join(map(_allowed, run))
     inline = "".join(f"<script>{script}</script>\n" for script in run)
-    # with this policy the page stays offline, whatever names it contains
-    return (
-        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        '<meta http-equiv="Content-Security-Policy" '
-        f"content=\"default-src 'none'; style-src 'unsafe-inline'{policy}\">\n"
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        '<meta name="color-scheme" content="light dark">\n'
-        f"<title>{escape(title)}</title>\n{_toned(head)}{style}</head>\n"
-        f"<body>\n{body}{inline}</body>\n</html>\n"
-    )
+    page = {"title": escape(title), "head": _toned(head) + style, "body": body + inline}
+    return block("page.document", policy=policy, **page)
 
 
 @cache

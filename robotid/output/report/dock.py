@@ -1,32 +1,30 @@
 """The replay in a report: a frame at the lower edge of the window, on the clock of its charts.
 
 The frame is loaded when it is asked for. Its file may be written after the report: dock.js finds
-out whether it is there.
+out whether it is there. A link leads to the second with the largest residual.
 """
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from html import escape
 from pathlib import Path
 from typing import NamedTuple
 from urllib.parse import quote, urlencode
 
-from robotid.output.pages.html import command_html
+import numpy as np
+
+from robotid.base.typing import Array
+from robotid.output.pages.html import block, command_html
 from robotid.output.report.steps import Origin
 
 _WORDS = "shows the robot in motion, on the clock of these charts"
+_WINDOW = 1.0  # [s]
+_USED = 0.5  # smallest share of a window's samples that are used
 
 
 class Clip(NamedTuple):
-    """A recording with charts.
-
-    Attributes:
-        link: Name that links its charts.
-        log: Path of its file; "" if it is in memory.
-        start: Its first time [s].
-        end: Its last time [s].
-    """
+    """A recording with charts: the name that links them, its file or "", first and last time."""
 
     link: str
     log: str
@@ -77,22 +75,92 @@ class Dock:
         if not self.file:
             return ""
         clips = [
-            {
-                "link": clip.link,
-                "log": Path(clip.log).name,
-                "start": clip.start,
-                "end": clip.end,
-                "command": self._command(clip),
-            }
+            clip._asdict() | {"log": Path(clip.log).name, "command": self._command(clip)}
             for clip in self.clips
         ]
-        words, block = f'<a href="{escape(quote(self.replay))}">The replay</a> {_WORDS}.', ""
+        words, command = f'<a href="{escape(quote(self.replay))}">The replay</a> {_WORDS}.', ""
         if not self.replay:
             words = f"The replay {_WORDS}. This command writes it:"
-            command = next(filter(None, map(self._command, self.clips)))
-            block = f'<div class="copy">{command_html(command)}</div>'
-        return (
-            f'<div id="replay" class="dock" data-file="{escape(quote(self.file))}" '
-            f'data-clips="{escape(json.dumps(clips))}">'
-            f'<p><button type="button" hidden>Show the replay</button> {words}</p>{block}</div>\n'
+            command = command_html(next(filter(None, map(self._command, self.clips))))
+        return block(
+            "report.dock",
+            file=escape(quote(self.file)),
+            clips=escape(json.dumps(clips)),
+            words=words,
+            command=command and f'<div class="copy">{command}</div>',
         )
+
+
+class Residual(NamedTuple):
+    """The residual of a joint in a recording.
+
+    Attributes:
+        name: Name of the recording.
+        file: Name of its file, which the replay states.
+        t: Times, shape (N,), increasing [s].
+        values: Residuals, shape (N,), NaN for samples that are not used.
+    """
+
+    name: str
+    file: str
+    t: Array
+    values: Array
+
+
+@dataclass(frozen=True)
+class WorstSecond:
+    """The window of 1 s with the largest RMS residual, and its ratio to the RMS of the log."""
+
+    of: Residual
+    start: float
+    end: float
+    rms: float
+    ratio: float
+
+
+def worst_second(residuals: Iterable[Residual]) -> WorstSecond | None:
+    """Return the window of 1 s with the largest RMS residual of a joint in its recordings.
+
+    Windows with less than half of their samples used are ignored, as those across gaps. A
+    recording shorter than 1 s is one window.
+    """
+    windows = [worst for residual in residuals if (worst := _worst(residual)) is not None]
+    return max(windows, key=lambda worst: worst.rms, default=None)
+
+
+def _worst(of: Residual) -> WorstSecond | None:
+    t, used = of.t, np.isfinite(of.values)
+    if len(t) < 2 or not used.any():
+        return None
+    squares = np.append(0.0, np.cumsum(np.where(used, of.values, 0.0) ** 2))
+    counts = np.append(0, np.cumsum(used))
+    step = float(np.median(np.diff(t)))
+    first = np.arange(max(1, int(np.searchsorted(t, t[-1] - _WINDOW + 1.5 * step, side="right"))))
+    last = np.searchsorted(t, t[first] + _WINDOW - step / 2)  # exclusive
+    count = counts[last] - counts[first]
+    enough = count >= _USED * min(_WINDOW / step, len(t))
+    if not enough.any():
+        return None
+    mean = np.where(enough, (squares[last] - squares[first]) / np.maximum(count, 1), -1.0)
+    k = int(mean.argmax())
+    end = min(float(t[k]) + _WINDOW, float(t[-1]))
+    ratio = (mean[k] / (squares[-1] / counts[-1] or 1.0)) ** 0.5
+    return WorstSecond(of, float(t[k]), end, float(mean[k] ** 0.5), float(ratio))
+
+
+def worst_html(
+    worst: WorstSecond | None, joint: str, unit: str, dock: Dock, scale: float = 1.0
+) -> str:
+    """Return a paragraph on the worst second of a joint; nothing without one."""
+    if worst is None:
+        return ""
+    return block(
+        "report.worst",
+        name=escape(worst.of.name),
+        start=f"{worst.start:.2f}",
+        end=f"{worst.end:.2f}",
+        rms=f"{worst.rms / scale:.3g}",
+        unit=unit,
+        ratio=f"{worst.ratio:.2g}",
+        link=dock.link("Show this second in the replay", worst.start, joint, worst.of.file),
+    )

@@ -1,25 +1,18 @@
 """The report of an identification as one self-contained HTML file."""
 
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from robotid.base.files import write_text
 from robotid.base.settings import require_each, require_kind
-from robotid.identification.result import Identification
-from robotid.output.files.entries import build_result
-from robotid.output.report.shown import Shown, page_of
+from robotid.identification.result import Identification, TorqueIdentification
+from robotid.output.report.report_page import Report, page_of
 from robotid.output.report.steps import Origin
-from robotid.output.report.torque_section import shown_torques
-from robotid.output.report.variation_section import variation_section
-
-if TYPE_CHECKING:
-    from robotid.identification.closed_loop.loop_result import LoopIdentification
+from robotid.output.report.torque_report import torque_report
 
 
 def write_report(
-    identification: "Identification | LoopIdentification",
+    identification: Identification,
     target: str | Path,
     *,
     files: Mapping[str, str] | None = None,
@@ -48,21 +41,19 @@ def write_report(
         require_each([what, name], str, "an entry of files", "text, and the name of a file")
     require_kind(origin, (Origin, type(None)), "origin", "an Origin")
     at = origin or Origin()
-    if isinstance(identification, Identification):
-        shown = shown_torques(identification, at, (files or {}).get("replay", ""))
+    require_kind(identification, Identification, "identification", "a robotid.Identification")
+    replay = (files or {}).get("replay", "")
+    if isinstance(identification, TorqueIdentification):
+        report = torque_report(identification, at, replay)
     else:
-        shown = _of_loops(identification, at, (files or {}).get("replay", ""))
-    return write_text(page_of(shown, files or {}), target)
+        report = _of_positions(identification, at, replay)
+    return write_text(page_of(report, files or {}), target)
 
 
-def _of_loops(found: "LoopIdentification", at: Origin, replay: str) -> Shown:
-    """Return the content of a report on a closed-loop identification; imported when needed."""
-    from robotid.identification.closed_loop.loop_result import LoopIdentification
-    from robotid.output.report.position_page import shown_positions
+def _of_positions(found: Identification, origin: Origin, replay: str) -> Report:
+    """Return the content of a report on positions; modules of the simulation are imported here."""
+    from robotid.identification.closed_loop.loop_result import PositionIdentification
+    from robotid.output.report.position_page import position_report
 
-    require_kind(found, LoopIdentification, "identification", "a robotid.Identification")
-    result = build_result(found, {"estimator": found.estimator.to_dict()})
-    shown = shown_positions(
-        result, found.fitted, found.validation, at, (found.model, found.standard), replay
-    )
-    return replace(shown, variation=variation_section(found.variation, {}))
+    assert isinstance(found, PositionIdentification)
+    return position_report(found, origin, replay)

@@ -1,17 +1,41 @@
 """Torque or position errors of the joints: as bars, and as a table of each recording."""
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from html import escape
+from typing import Any, NamedTuple
 
+from robotid.base.findings import Finding, grouped, listed
 from robotid.diagnosis.verdict import evidence
 from robotid.diagnosis.verdict import position_verdict as positions
-from robotid.diagnosis.verdict.verdict import JointVerdict
-from robotid.identification.summary import verdict_cell
-from robotid.output.pages.html import code, number, percent, table, text
-from robotid.output.report.bars import Bar, Mark, bars_html
+from robotid.estimation.fitting.metrics import Metrics
+from robotid.identification.result import Identification
+from robotid.identification.summary import joint_reason, verdict_cell
+from robotid.output.pages.html import code, listing, percent, text
 
 _SMALL = 1e-3  # [rad or m] unit of position errors
+_ROWS = 10  # joints that are visible without unfolding
+_WIDEST = 150.0  # [%] end of the scale; larger errors end there, too
+_COLUMNS = (
+    ("joint", "code", "joint"), ("error %", "%", "relative_error_pct"),
+    ("verdict", "text", "verdict"), ("RMSE", ".3g", "rmse"), ("unit", "text", "unit"),
+    ("R²", ".3f", "r2"), ("samples", "d", "rows"),
+)  # fmt: skip
+_UNKNOWN = {"status": "not evaluated", "reasons": ()}
+
+
+class Mark(NamedTuple):
+    """Marker of another prediction: its name, its SVG path about (0, 9), "fill" or "line"."""
+
+    words: str
+    path: str
+    style: str
+
+    @property
+    def svg(self) -> str:
+        """The path in the style."""
+        return f'<path class="{self.style}" d="{self.path}"/>'
 
 
 @dataclass(frozen=True)
@@ -84,6 +108,22 @@ class Errors:
         return f"{self.name}: {'fitted' if self.is_fitted else 'not fitted'}"
 
 
+def errors_of(found: Identification) -> tuple[Errors, ...]:
+    """Return the errors on the validation recordings, then on all fitted ones together."""
+
+    def joints(metrics: Metrics, wls: Metrics | None) -> dict[str, Any]:
+        content: dict[str, Any] = metrics.to_dict()["per_joint"]
+        for joint in content if wls is not None else ():
+            content[joint]["wls_relative_error_pct"] = wls.per_joint[joint].relative_error_pct
+        return content
+
+    name = found.fitted[0].name if len(found.fitted) == 1 else ""
+    return (
+        *(Errors(e.name, joints(e.metrics["estimate"], found.beside(e))) for e in found.validation),
+        Errors(name, joints(found.metrics(), found.beside()), is_fitted=True),
+    )
+
+
 def worst_errors(recordings: Sequence[Errors]) -> dict[str, Mapping[str, Any]]:
     """Return the metrics of each joint on its worst recording, the worst joint first."""
     worst: dict[str, Mapping[str, Any]] = {}
@@ -100,6 +140,18 @@ def _share(measured: Mapping[str, Any]) -> float:
     return float("inf") if error is None else float(error)
 
 
+@dataclass(frozen=True)
+class _Bar:
+    """The error of one joint: number, name, error [%], those of other predictions, verdict."""
+
+    row: int
+    joint: str
+    error: float | None
+    others: Mapping[str, float]
+    status: str
+    reasons: Sequence[str]
+
+
 def error_bars(
     quantity: Quantity,
     recordings: Sequence[Errors],
@@ -114,19 +166,105 @@ def error_bars(
     is_alone = len(recordings) == 1 and not recordings[0].is_fitted
     alone = f" on {recordings[0].name}" if is_alone else ""
     for joint in [*worst, *(joint for joint in verdicts if joint not in worst)]:
-        measured, row = worst.get(joint, {}), rows.index(joint)
-        own = verdicts.get(joint, {"status": "not evaluated", "reasons": ()})
-        reasons = tuple(reason.replace(alone, "") if alone else reason for reason in own["reasons"])
-        others = {key: measured.get(f"{key}_relative_error_pct") for key in quantity.marks}
+        measured, verdict = worst.get(joint, {}), verdicts.get(joint, _UNKNOWN)
+        reasons = [reason.replace(alone, "") if alone else reason for reason in verdict["reasons"]]
+        errors = {key: measured.get(f"{key}_relative_error_pct") for key in quantity.marks}
+        others = {key: error for key, error in errors.items() if error is not None}
         error = _share(measured) if measured else None
-        why = f"why-{row}" if has_why and measured else ""
-        of_joint = JointVerdict(own["status"], reasons)
-        bars.append(Bar(row, joint, error, others, of_joint, f"joint-{row}", why))
-    known = {key for bar in bars for key, error in bar.others.items() if error is not None}
-    marks = {key: mark for key, mark in quantity.marks.items() if key in known}
-    kind = "fitted samples, without validation log"
-    kind = kind if recordings[0].is_fitted else "not fitted"
-    return bars_html(quantity.title, f"{quantity.share}, {kind}", bars, marks, quantity.limits)
+        bars.append(_Bar(rows.index(joint), joint, error, others, verdict["status"], reasons))
+    common = _common(bars)
+    named = {bar.joint for alike in common for bar in alike}
+    items = [_row(bar, quantity, is_named=bar.joint in named, has_why=has_why) for bar in bars]
+    more = "".join(items[_ROWS:])
+    if more:
+        words = f"{len(items) - _ROWS} more joints with smaller errors"
+        more = f"<details><summary>{words}</summary><ol>{more}</ol></details>\n"
+    kind = "not fitted"
+    if recordings[0].is_fitted:
+        kind = "fitted samples, without validation log"
+    return (
+        f'<h2 id="worst">{quantity.title}, worst joint first <span class="note">{quantity.share}, '
+        f"{kind}</span></h2>\n{_legend(quantity, {key for bar in bars for key in bar.others})}"
+        f'<ol class="bars">{"".join(items[:_ROWS])}</ol>\n{more}{"".join(map(_reason_of, common))}'
+    )
+
+
+def _common(bars: Sequence[_Bar]) -> list[list[_Bar]]:
+    """Return the joints that have one reason, apart from its numbers, if they are several."""
+    groups: dict[tuple[str, str], list[_Bar]] = {}
+    for bar in bars:
+        if why := joint_reason(bar.joint, bar.reasons):
+            groups.setdefault((bar.status, re.sub(r"[\d.]+", "", why)), []).append(bar)
+    return [alike for alike in groups.values() if len(alike) > 1]
+
+
+def _reason_of(bars: Sequence[_Bar]) -> str:
+    """Return the common reason of joints, with the range of its numbers, and their names."""
+    reasons = [Finding("", "note", b.joint, joint_reason(b.joint, b.reasons)) for b in bars]
+    (cause,) = grouped(reasons, [bar.joint for bar in bars])
+    status, names = bars[0].status, escape(listed(bar.joint for bar in bars))
+    return (
+        f'<p class="common {status.replace(" ", "-")}"><strong>{status}</strong>: {names}: '
+        f"{escape('; '.join(cause.messages))}</p>\n"
+    )
+
+
+def _at(value: float) -> str:
+    """Return the position of an error on the square-root scale."""
+    return f"{100 * (min(value, _WIDEST) / _WIDEST) ** 0.5:.2f}%"
+
+
+def _row(bar: _Bar, quantity: Quantity, *, is_named: bool, has_why: bool) -> str:
+    """Return the row of a joint with its own reason."""
+    reasons = bar.reasons[1:] if is_named else bar.reasons
+    if bar.status == "good" and not is_named:
+        reasons = bar.reasons[-1:]
+    why, link, picture = joint_reason(bar.joint, reasons), "", ""
+    if bar.error is not None:
+        picture = _picture(bar, bar.error, quantity)
+        if has_why and why:  # else the link would stand alone on a line
+            label = f"residual analysis of {escape(bar.joint)}"
+            link = f' <a href="#why-{bar.row}" aria-label="{label}">analysis</a>'
+    kind, error = bar.status.replace(" ", "-"), percent(bar.error).html
+    return (
+        f'<li class="{kind}"><a class="code" href="#joint-{bar.row}">{code(bar.joint).html}</a>'
+        f'{picture}<span class="number">{error} %</span>'
+        f'<strong>{bar.status}</strong><span class="why">{escape(why)}{link}</span></li>\n'
+    )
+
+
+def _picture(bar: _Bar, error: float, quantity: Quantity) -> str:
+    """Return the bar of a joint with the markers of other predictions."""
+    others, lines, words = "", "", []
+    for limit in quantity.limits:
+        lines += f'<line x1="{_at(limit)}" x2="{_at(limit)}" y1="-2" y2="18"/>'
+    for key, value in bar.others.items():
+        mark = quantity.marks[key]
+        others += f'<svg x="{_at(value)}" overflow="visible" aria-hidden="true">{mark.svg}</svg>'
+        words.append(f"{mark.words} {percent(value).html} %")
+    title = f"{bar.joint}: error {percent(error).html} %; for comparison {', '.join(words)}"
+    return (
+        f'<svg class="bar" height="18" role="img" aria-labelledby="bar{bar.row}-title">'
+        f'<title id="bar{bar.row}-title">{escape(title)}</title><g class="limits">{lines}</g>'
+        f'<rect y="4" width="{_at(error)}" height="10"/>{others}</svg>'
+    )
+
+
+def _legend(quantity: Quantity, known: set[str]) -> str:
+    keys = "".join(
+        f'<span><svg width="10" height="18" viewBox="-5 0 10 18" aria-hidden="true">{mark.svg}'
+        f"</svg>{mark.words}</span>"
+        for key, mark in quantity.marks.items()
+        if key in known
+    )
+    good, poor = quantity.limits
+    names = {good: f"{good:g} good", poor: f"{poor:g} usable", 100.0: "100", _WIDEST: "150 %"}
+    ticks = sorted({1.0, 5.0, *names})
+    scale = "".join(f'<span style="left: {_at(x)}">{names.get(x, f"{x:g}")}</span>' for x in ticks)
+    return (
+        f'<p class="legend">{keys}</p>\n<div class="scale" aria-hidden="true"><div>{scale}</div>'
+        "</div>\n"
+    )
 
 
 def error_table(
@@ -136,34 +274,25 @@ def error_table(
     verdicts: Mapping[str, Mapping[str, Any]],
 ) -> str:
     """Return the table of the errors on a recording."""
-    keys = {f"{key}_relative_error_pct": mark.words for key, mark in quantity.marks.items()}
-    shown = [key for key in keys if any(m.get(key) is not None for m in errors.joints.values())]
-    headers = ["joint", "error %", "verdict", "RMSE", "unit", "R²", "samples"]
-    headers += [f"{keys[key]} %" for key in shown]
-    cells = []
-    for name in rows:
-        m, status = errors.joints.get(name), "–"
-        if name in verdicts:
-            status = verdict_cell(name, verdicts[name])
-        if m is None:
-            dashes = [number(None)] * (3 + len(shown))
-            nothing = text(f"{status}; no samples used")
-            cells.append([code(name), number(None), nothing, number(None), text(""), *dashes[1:]])
-            continue
-        verdict = "; ".join([status, *(note for note in _notes(m) if note not in status)])
-        cells.append(
-            [
-                code(name),
-                percent(m["relative_error_pct"]),
-                text(verdict, flag=verdict != status or status.startswith("poor")),
-                number(m["rmse"] / quantity.scale, ".3g"),
-                text(f"{quantity.prefix}{m['unit']}"),
-                number(m.get("r2"), ".3f"),
-                number(m.get("rows"), "d"),
-                *(percent(m.get(key)) for key in shown),
-            ]
-        )
-    return table(errors.caption, headers, cells, is_data=True)
+    others = {f"{key}_relative_error_pct": mark.words for key, mark in quantity.marks.items()}
+    known = [key for key in others if any(m.get(key) is not None for m in errors.joints.values())]
+    entries = []
+    for joint in rows:
+        measured, status = errors.joints.get(joint), "–"
+        if joint in verdicts:
+            status = verdict_cell(joint, verdicts[joint])
+        entry: dict[str, Any] = {"joint": joint, "verdict": f"{status}; no samples used"}
+        if measured is not None:
+            notes = [note for note in _notes(measured) if note not in status]
+            is_flagged = bool(notes) or status.startswith("poor")
+            entry |= measured | {
+                "verdict": text("; ".join([status, *notes]), flag=is_flagged),
+                "rmse": measured["rmse"] / quantity.scale,
+                "unit": f"{quantity.prefix}{measured['unit']}",
+            }
+        entries.append(entry)
+    columns = [*_COLUMNS, *((f"{others[key]} %", "%", key) for key in known)]
+    return listing(errors.caption, columns, entries, is_data=True)
 
 
 def _notes(measured: Mapping[str, Any]) -> list[str]:

@@ -13,13 +13,12 @@ from robotid.base.findings import Cause, grouped, listed, toml_key
 from robotid.base.settings import is_number
 from robotid.diagnosis.residual.misfit_findings import setting_of, with_entries
 from robotid.diagnosis.verdict.evidence import GOOD, is_beaten
+from robotid.identification.result import Identification, TorqueIdentification
 from robotid.output.report.steps import MOST, NAMED, Origin, Step, exports_of, sentence_of
-from robotid.robot.drives import COUNTERBALANCE, DriveTerm
-from robotid.robot.families import spring_family
+from robotid.robot.drives import COUNTERBALANCE, DriveTerm, spring_family
 
 if TYPE_CHECKING:
     from robotid.diagnosis.verdict.payload_check import PayloadCheck
-    from robotid.identification.result import Identification
 
 _NEW = "NEW.csv"
 _LOADED = "LOADED.csv"
@@ -31,6 +30,8 @@ def next_steps(found: Identification, origin: Origin) -> tuple[Step, ...]:
 
     Steps for errors come first, then steps for warnings, then uses of the result.
     """
+    if not isinstance(found, TorqueIdentification):
+        return _steps_of_motion(found, origin)
     asked: dict[int, list[Cause]] = {}
     findings = [finding for finding in found.findings if finding.severity != "note"]
     causes = (*grouped(findings, found.model.joints), *_of_verdict(found))
@@ -51,6 +52,32 @@ def next_steps(found: Identification, origin: Origin) -> tuple[Step, ...]:
     return _once([*steps, *_uses(found, origin, steps)][:MOST])
 
 
+def _steps_of_motion(found: Identification, origin: Origin) -> tuple[Step, ...]:
+    """Return the uses of a result that predicts positions; of a poor one, what to correct."""
+    words = "Compare measured and predicted torque in the replay."
+    if found.has_gains:
+        words = "Compare the commanded, measured and simulated robot in the replay."
+    verdict, replay = found.verdict, Step(words, _replay(found, origin))
+    if verdict.status != "poor":
+        exports = exports_of(found.model.name, origin, has_gains=found.has_gains)
+        return (replay, *exports) if origin.folder else ()
+    again = (origin.again(),) if origin.source else ()
+    if errors := verdict.log_errors:
+        doctor = (shlex.join(["robotid", "doctor", *origin.source]),) if origin.source else ()
+        correct = f"Correct the logs, then repeat the identification: {errors[0]}."
+        return (Step(correct, (*doctor, *again)),)
+    poor = [name for name, joint in verdict.joints.items() if joint.status == "poor"]
+    causes = grouped([f for f in found.findings if f.severity == "warning"], found.model.joints)
+    urgent = sorted(causes, key=lambda cause: not set(poor).intersection(cause.joints))
+    words = (
+        f"Do not use the result: the simulated position of {listed(poor, NAMED)} is wrong. Find "
+        "out in the replay when, correct gains, limits, encoder zeros or the motion, and repeat "
+        "the identification."
+    )
+    steps = [Step(f"{sentence_of(cause.messages[0])}.") for cause in urgent[: MOST - 1]]
+    return (*steps, Step(words, (*replay.blocks, *again)))
+
+
 def _once(steps: Sequence[Step]) -> tuple[Step, ...]:
     """Return the steps; a block that several steps have is in the last of them only."""
     unique: list[Step] = []
@@ -61,10 +88,10 @@ def _once(steps: Sequence[Step]) -> tuple[Step, ...]:
     return tuple(unique)
 
 
-_Maker: TypeAlias = "Callable[[Identification, Origin, Sequence[Cause]], Step]"
+_Maker: TypeAlias = "Callable[[TorqueIdentification, Origin, Sequence[Cause]], Step]"
 
 
-def _of_verdict(found: Identification) -> list[Cause]:
+def _of_verdict(found: TorqueIdentification) -> list[Cause]:
     """Return the causes of a verdict that no finding names."""
     causes, predictions = [], found.predictions
     measured = [(j, m) for metrics in predictions.values() for j, m in metrics.per_joint.items()]
@@ -96,7 +123,7 @@ def _named(causes: Sequence[Cause], wanted: Sequence[str] = ()) -> str:
     return listed(dict.fromkeys(j for cause in causes for j in cause.joints) or wanted, NAMED)
 
 
-def _scale(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:
+def _scale(found: TorqueIdentification, origin: Origin, causes: Sequence[Cause]) -> Step:
     before, after, _ = found.scale_check.masses
     check = ""
     if any(cause.code in ("total_mass", "urdf_mismatch") for cause in causes):
@@ -141,7 +168,7 @@ def _gain_flags(origin: Origin) -> list[tuple[str, str]]:
     return [(joint, value) for joint, _, value in (text.partition("=") for text in stated)]
 
 
-def _payload_gains(found: Identification, payload: PayloadCheck | None = None) -> list[str]:
+def _payload_gains(found: TorqueIdentification, payload: PayloadCheck | None = None) -> list[str]:
     """Return the command that identifies the gains of currents; nothing without files."""
     urdf, log = str(found.model.tree.path), str(found.fitted[0].recording.log.path)
     if not log:
@@ -153,7 +180,7 @@ def _payload_gains(found: Identification, payload: PayloadCheck | None = None) -
     return [shlex.join(["robotid", "payload", urdf, loaded, *flags])]
 
 
-def _gains(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:
+def _gains(found: TorqueIdentification, origin: Origin, causes: Sequence[Cause]) -> Step:
     joints = list(dict.fromkeys(j for cause in causes for j in cause.joints))
     words = (
         f"If the column is a current, state the gain of {listed(joints or ['the joints'], NAMED)} "
@@ -165,7 +192,7 @@ def _gains(found: Identification, origin: Origin, causes: Sequence[Cause]) -> St
     return Step(words, (*origin.stating("[torque.gains]", line, *flags), *_payload_gains(found)))
 
 
-def _delay(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:
+def _delay(found: TorqueIdentification, origin: Origin, causes: Sequence[Cause]) -> Step:
     delays = [finding.evidence["delay"] for cause in causes for finding in cause.findings]
     delay = f"{sum(delays) / len(delays):.4f}"
     words = (
@@ -176,7 +203,7 @@ def _delay(found: Identification, origin: Origin, causes: Sequence[Cause]) -> St
     return Step(words, origin.stating("[signals]", line, "--torque-delay", delay))
 
 
-def _locks(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:
+def _locks(found: TorqueIdentification, origin: Origin, causes: Sequence[Cause]) -> Step:
     joints = list(found.model.locked)
     places = {
         finding.where.rpartition(": ")[2]: f"{finding.evidence['median']:.4g}"
@@ -191,7 +218,7 @@ def _locks(found: Identification, origin: Origin, causes: Sequence[Cause]) -> St
     return Step(words, origin.stating("[locked]", line, *flags))
 
 
-def _validate(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:
+def _validate(found: TorqueIdentification, origin: Origin, causes: Sequence[Cause]) -> Step:
     words = (
         "Record another motion and use it as validation log: the prediction of other motions is "
         "not verified."
@@ -200,7 +227,7 @@ def _validate(found: Identification, origin: Origin, causes: Sequence[Cause]) ->
     return Step(words, origin.stating("[[validation]]", line, "--validate", _NEW))
 
 
-def _pin(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:
+def _pin(found: TorqueIdentification, origin: Origin, causes: Sequence[Cause]) -> Step:
     joints = {joint for cause in causes for joint in cause.joints}
     links = [joint.child for joint in found.model.tree.movable if joint.name in joints]
     words = (
@@ -211,7 +238,7 @@ def _pin(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step
     return Step(words, origin.stating("[estimator.constraints]", line))
 
 
-def _terms(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:
+def _terms(found: TorqueIdentification, origin: Origin, causes: Sequence[Cause]) -> Step:
     """Return the step that adds missing drive terms to the model."""
     codes = {cause.code for cause in causes}
     entries: dict[str, list[str | DriveTerm]] = {}
@@ -251,7 +278,7 @@ def _balanced(causes: Sequence[Cause]) -> list[tuple[str, float]]:
     ]
 
 
-def _payload(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:
+def _payload(found: TorqueIdentification, origin: Origin, causes: Sequence[Cause]) -> Step:
     logs = [x for x in found.validation if not x.is_refitted] or list(found.fitted)
     log, urdf = str(logs[0].recording.log.path), str(found.model.tree.path)
     words = (
@@ -267,7 +294,7 @@ def _payload(found: Identification, origin: Origin, causes: Sequence[Cause]) -> 
     return Step(words, origin.using("payload", *words_of))
 
 
-def _unclipped(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:
+def _unclipped(found: TorqueIdentification, origin: Origin, causes: Sequence[Cause]) -> Step:
     words = (
         f"Record a slower motion, or one with less load: the torque of {_named(causes)} is clipped "
         "at its limit."
@@ -275,7 +302,7 @@ def _unclipped(found: Identification, origin: Origin, causes: Sequence[Cause]) -
     return Step(words, _another_log(origin))
 
 
-def _zeros(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:
+def _zeros(found: TorqueIdentification, origin: Origin, causes: Sequence[Cause]) -> Step:
     sizes = [f for cause in causes for f in cause.findings if "size" in f.evidence]
     by = "".join(f"; of {f.where} by {-f.evidence['size']:.3g}" for f in sizes)
     words = (
@@ -285,12 +312,12 @@ def _zeros(found: Identification, origin: Origin, causes: Sequence[Cause]) -> St
     return Step(words, (shlex.join(["robotid", "inspect", str(found.model.tree.path)]),))
 
 
-def _as_found(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:
+def _as_found(found: TorqueIdentification, origin: Origin, causes: Sequence[Cause]) -> Step:
     """Return the messages of the findings, which name a cause and its remedy."""
     return Step(" ".join(f"{sentence_of(m)}." for cause in causes for m in cause.messages[:1]))
 
 
-def _possible(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:
+def _possible(found: TorqueIdentification, origin: Origin, causes: Sequence[Cause]) -> Step:
     words = (
         f"Identify with the consistent estimator: the result of {found.estimator.name} is not "
         "physically consistent, and no URDF was written."
@@ -299,7 +326,7 @@ def _possible(found: Identification, origin: Origin, causes: Sequence[Cause]) ->
     return Step(words, origin.stating("[estimator]", 'name = "consistent"', *flags))
 
 
-def _watch(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:
+def _watch(found: TorqueIdentification, origin: Origin, causes: Sequence[Cause]) -> Step:
     rows = found.metrics().per_joint
     where, why = _named(causes, found.model.joints), "a wrong torque channel, a spring, gear ripple"
     if not any(joint in rows for joint in found.model.joints):  # no torques were measured
@@ -315,7 +342,7 @@ def _watch(found: Identification, origin: Origin, causes: Sequence[Cause]) -> St
     return Step(words, _replay(found, origin))
 
 
-def _richer(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:
+def _richer(found: TorqueIdentification, origin: Origin, causes: Sequence[Cause]) -> Step:
     count = len(found.determination.undetermined)
     words = (
         f"Record another motion with higher speeds and wider poses, and add it to the fitted logs: "
@@ -333,19 +360,19 @@ def _another_log(origin: Origin) -> tuple[str, ...]:
     return (f'[[identification]]\nlog = "{_NEW}"', *logs)
 
 
-def _inspect(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:
+def _inspect(found: TorqueIdentification, origin: Origin, causes: Sequence[Cause]) -> Step:
     words = "Correct the inertials of the URDF that its inspection rejects: they are the prior."
     return Step(words, (shlex.join(["robotid", "inspect", str(found.model.tree.path)]),))
 
 
-def _doctor(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:
+def _doctor(found: TorqueIdentification, origin: Origin, causes: Sequence[Cause]) -> Step:
     words = f"{sentence_of(causes[0].messages[0])}."
     return Step(
         words, (shlex.join(["robotid", "doctor", *origin.source]),) if origin.source else ()
     )
 
 
-def _uses(found: Identification, origin: Origin, asked: Sequence[Step]) -> list[Step]:
+def _uses(found: TorqueIdentification, origin: Origin, asked: Sequence[Step]) -> list[Step]:
     """Return the uses of a result, without commands that other steps have.
 
     A poor result is only examined.
@@ -372,7 +399,7 @@ def _uses(found: Identification, origin: Origin, asked: Sequence[Step]) -> list[
 
 
 def _replay(found: Identification, origin: Origin) -> tuple[str, ...]:
-    log = str((found.validation or found.fitted)[0].recording.log.path)
+    log = str((found.validation or found.fitted)[0].log.path)
     return origin.using("replay", str(found.model.tree.path), log, origin.folder)
 
 

@@ -1,7 +1,5 @@
 """Charts of an identification: torques, residuals and their causes, friction, parameters."""
 
-from collections.abc import Sequence
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -11,18 +9,15 @@ from robotid.base.settings import require_kind
 from robotid.base.typing import Array
 from robotid.data.log import suggestion
 from robotid.diagnosis.residual.dependence import Dependence
-from robotid.diagnosis.residual.residuals import autocorrelation, friction_split, spectrum
+from robotid.diagnosis.residual.residuals import friction_split, spectrum
 from robotid.diagnosis.residual.torque_split import JointTorque, spread_rows
-from robotid.dynamics.memory import drive_motion_along
+from robotid.dynamics.prediction import drive_motion_along
 from robotid.estimation.fitting.bands import QUANTILE, TorqueBand, friction_curve
 from robotid.estimation.fitting.evaluation import Evaluation
-from robotid.identification.result import Identification
-from robotid.output.pages.charts import Chart, Series, broken
-from robotid.output.pages.plots import Plot
+from robotid.identification.result import TorqueIdentification
+from robotid.output.pages.charts import Chart, Plot, Series, broken
 
 _DOTS = 800  # of one friction chart
-_LAGS = 400  # points of one autocorrelation
-_LONGEST_LAG = 2.0  # [s]
 _DWARFED = 4.0  # times the height of the measured torque above which the URDF's is hidden
 _PIXELS = 500  # spans closer than one of these pixels are merged
 _POINTS = 600  # of a chart
@@ -40,7 +35,7 @@ _TONES = {
 
 
 def plot_torques(
-    identification: Identification, *joints: str, recording: Evaluation | None = None
+    identification: TorqueIdentification, *joints: str, recording: Evaluation | None = None
 ) -> Plot:
     """Return charts of measured and identified torque over time, and of the residual.
 
@@ -66,10 +61,10 @@ def plot_torques(
     for name, row in zip(names, rows, strict=True):
         torque, residual = torque_charts(identification, shown, row, band=band)
         charts += [(torque, f"{name}: torque"), (residual, f"{name}: residual")]
-    return Plot(f"Torques of {shown.recording.name}", tuple(charts))
+    return Plot(f"Torques of {shown.name}", tuple(charts))
 
 
-def plot_friction(identification: Identification, *joints: str) -> Plot:
+def plot_friction(identification: TorqueIdentification, *joints: str) -> Plot:
     """Return charts of friction against speed, measured and identified, with its band.
 
     Args:
@@ -92,7 +87,7 @@ def plot_friction(identification: Identification, *joints: str) -> Plot:
     return Plot(f"Friction of {listed(names)} against speed", shown)
 
 
-def plot_why(identification: Identification, joint: str) -> Plot:
+def plot_why(identification: TorqueIdentification, joint: str) -> Plot:
     """Return charts of the parts of a joint's torque, and of its residual's dependences.
 
     Args:
@@ -113,12 +108,12 @@ def plot_why(identification: Identification, joint: str) -> Plot:
     return Plot(f"Torque parts and residual of {joint}", shown)
 
 
-def shown_evaluation(found: Identification) -> Evaluation:
+def shown_evaluation(found: TorqueIdentification) -> Evaluation:
     """Return the recording to show: the first validation recording, or the first fitted one."""
     return (found.validation or found.fitted)[0]
 
 
-def _row_of(identification: Identification, joint: str) -> int:
+def _row_of(identification: TorqueIdentification, joint: str) -> int:
     """Return the index of a joint's torque row."""
     require_kind(joint, str, "joint", "the name of a joint")
     names = identification.model.row_names
@@ -131,7 +126,7 @@ def _row_of(identification: Identification, joint: str) -> int:
 
 
 def torque_charts(
-    found: Identification,
+    found: TorqueIdentification,
     evaluation: Evaluation,
     row: int,
     *,
@@ -210,49 +205,35 @@ def unused_spans(t: Array, used: NDArray[np.bool_]) -> tuple[tuple[float, float]
     return tuple(spans)
 
 
-def residual_charts(
-    found: Identification, evaluation: Evaluation, row: int
-) -> tuple[Chart, Chart] | None:
-    """Return spectrum and autocorrelation of a joint's residual; None if no sample was used."""
+def spectrum_chart(found: TorqueIdentification, evaluation: Evaluation, row: int) -> Chart | None:
+    """Return the spectrum of a joint's torque and residual; None if no sample was used."""
     motion, used = evaluation.recording.trajectory, evaluation.recording.mask[:, row].astype(bool)
     name, unit = found.model.row_names[row], found.model.row_units[row]
-    residual = motion.tau[:, row] - evaluation.torques["estimate"][:, row]
     dt = float(np.median(np.diff(motion.t)[np.diff(motion.segment) == 0]))
-    f, density = spectrum(residual, used, motion.segment, dt)
+    residual = motion.tau[:, row] - evaluation.torques["estimate"][:, row]
+    (f, torque), (_, left) = (
+        spectrum(x, used, motion.segment, dt) for x in (motion.tau[:, row], residual)
+    )
     if not len(f):
         return None
-    torque = spectrum(motion.tau[:, row], used, motion.segment, dt)[1]
     cutoff = evaluation.recording.signals.cutoff
-    shown = (f > 0) & (f <= (np.inf if cutoff is None else 2.0 * cutoff))
-    lags = max(1, min(int(_LONGEST_LAG / dt), len(residual) // 2))
-    step = max(1, lags // _LAGS)
-    r = autocorrelation(residual, used, motion.segment, lags)[::step]
-    return (
-        Chart(
-            f"Spectrum of torque and residual of {name}",
-            f[shown],
-            (
-                Series("torque", np.sqrt(torque[shown]), "text", is_weak=True),
-                Series("residual", np.sqrt(density[shown]), "residual"),
-            ),
-            "frequency [Hz]",
-            f"density [{unit}/√Hz]",
-            marks=() if cutoff is None else (cutoff,),
-            logarithmic="y",
+    k = (f > 0) & (f <= (np.inf if cutoff is None else 2.0 * cutoff))
+    return Chart(
+        f"Spectrum of torque and residual of {name}",
+        f[k],
+        (
+            Series("torque", np.sqrt(torque[k]), "text", is_weak=True),
+            Series("residual", np.sqrt(left[k]), "residual"),
         ),
-        Chart(
-            f"Autocorrelation of the residual of {name}",
-            step * dt * np.arange(len(r)),
-            (Series("residual", r, "residual"),),
-            "lag [s]",
-            "autocorrelation [-]",
-            marks=() if cutoff is None else (1.0 / (2.0 * cutoff),),
-        ),
+        "frequency [Hz]",
+        f"density [{unit}/√Hz]",
+        marks=() if cutoff is None else (cutoff,),
+        logarithmic="y",
     )
 
 
 def friction_chart(
-    found: Identification, joint: str, *, split: tuple[Array, Array] | None = None
+    found: TorqueIdentification, joint: str, *, split: tuple[Array, Array] | None = None
 ) -> Chart | None:
     """Return friction against speed: measured, identified, and at constant speed."""
     evaluation, model = shown_evaluation(found), found.model
@@ -291,58 +272,6 @@ def friction_chart(
     )
 
 
-def parameter_charts(found: Identification, terms: Sequence[str]) -> tuple[Chart, ...]:
-    """Return charts of each term of all drives, with the value before the fit."""
-    layout = found.model.layout
-    owners, ends = zip(*(name.rsplit(".", 1) for name in layout.names), strict=True)
-    error = np.where(np.isfinite(found.standard_error), 2 * found.standard_error, np.nan)
-    charts = []
-    for term in terms:
-        chosen = [i for i, end in enumerate(ends) if end == term]
-        for unit in dict.fromkeys(layout.units[i] for i in chosen):
-            part = np.array([i for i in chosen if layout.units[i] == unit])
-            series = [
-                Series(
-                    "identified ± 2 s.e.", found.standard[part], "predicted", "bars", error[part]
-                )
-            ]
-            if found.prior[part].any():
-                series.insert(
-                    0, Series("before the fit", found.prior[part], "urdf", "bars", is_weak=True)
-                )
-            charts.append(
-                Chart(
-                    f"{term} of each drive, before the fit and identified with two standard errors",
-                    np.arange(len(part), dtype=float),
-                    tuple(series),
-                    "",
-                    f"{term} [{unit}]",
-                    height=140,
-                    x_names=tuple(owners[i] for i in part),
-                )
-            )
-    return tuple(charts)
-
-
-def singular_chart(values: Array, rank: int) -> Chart:
-    """Return the singular values of a regressor, largest first: values (b,) [-]."""
-    number = np.arange(1, len(values) + 1)
-    values = np.maximum(values, float(values.max()) * 1e-17)
-    series = [Series("determined", np.where(number <= rank, values, np.nan), "predicted", "dots")]
-    if rank < len(values):
-        series.append(
-            Series("not determined", np.where(number > rank, values, np.nan), "residual", "dots")
-        )
-    return Chart(
-        "Singular values of the regressor, columns scaled to unit norm",
-        number.astype(float),
-        tuple(series),
-        "number of the direction",
-        "singular value [-]",
-        logarithmic="y",
-    )
-
-
 def why_charts(
     torque: JointTorque, *, link: str = "time", points: int = _POINTS
 ) -> dict[str, Chart]:
@@ -368,18 +297,15 @@ def _split(torque: JointTorque, link: str, points: int) -> Chart:
     t, *lines = broken(torque.rows.segment[k], torque.rows.t[k], *lines)
     *stacked, residual, tau = lines
     areas = [Series(name, y, _TONES[name], "area") for name, y in zip(parts, stacked, strict=True)]
+    lines = [Series("residual", residual, "residual", "area"), Series("measured", tau, "text")]
     return Chart(
-        title=f"Torque of {torque.joint} over time, the sum of {', '.join(parts)} and residual",
-        x=t,
-        series=(
-            *areas,
-            Series("residual", residual, "residual", "area"),
-            Series("measured", tau, "text"),
-        ),
-        x_label="time [s]",
-        y_label=f"torque [{torque.unit}]",
-        link=link,
-        spans=unused_spans(torque.rows.t[k], torque.used[k]),
+        f"Torque of {torque.joint} over time, the sum of {', '.join(parts)} and residual",
+        t,
+        (*areas, *lines),
+        "time [s]",
+        f"torque [{torque.unit}]",
+        link,
+        unused_spans(torque.rows.t[k], torque.used[k]),
         height=240,
     )
 
@@ -389,15 +315,9 @@ def _power(torque: JointTorque, power: Array, link: str, points: int) -> Chart:
     speed = torque.quantities["speed"][1]
     dissipated = torque.parts.get("friction", np.zeros_like(speed)) * speed
     t, whole, heat = broken(torque.rows.segment[k], torque.rows.t[k], power[k], dissipated[k])
-    return Chart(
-        title=f"Mechanical power of {torque.joint} over time, and that of its friction",
-        x=t,
-        series=(Series("into friction", heat, "tone-3"), Series("torque × speed", whole, "text")),
-        x_label="time [s]",
-        y_label="power [W]",
-        link=link,
-        height=120,
-    )
+    title = f"Mechanical power of {torque.joint} over time, and that of its friction"
+    series = Series("into friction", heat, "tone-3"), Series("torque × speed", whole, "text")
+    return Chart(title, t, series, "time [s]", "power [W]", link, height=120)
 
 
 def _residual(torque: JointTorque, dependence: Dependence, link: str, points: int) -> Chart:

@@ -1,4 +1,4 @@
-"""The report's tables as HTML: parameters, changes, consistency, settings, inputs."""
+"""The report's tables: parameters, bodies, changes, consistency, settings, inputs."""
 
 import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -10,11 +10,21 @@ import numpy as np
 
 from robotid.base.findings import listed
 from robotid.base.typing import Array
-from robotid.estimation.fitting.evaluation import Recording
-from robotid.estimation.fitting.identified import SOURCES
-from robotid.identification.result import Identification
+from robotid.diagnosis.verdict.central import CENTRAL_TERMS, central_parameters
+from robotid.estimation.variation.variation import Variation, VaryingParameter
+from robotid.identification.result import TorqueIdentification
 from robotid.output.files.urdf import urdf_changes
-from robotid.output.pages.html import Cell, code, folded, number, percent, table, text, with_error
+from robotid.output.pages.html import (
+    Cell,
+    block,
+    code,
+    folded,
+    listing,
+    number,
+    table,
+    text,
+    with_error,
+)
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import INERTIAL_TERMS, pseudo_inertia
 
@@ -26,8 +36,7 @@ SOURCE_NAMES = {
     "bound": "at its bound",
     "stated": "stated",
 }
-
-_COLUMNS = 7  # drive terms that a page shows side by side
+_WIDEST = 7  # drive terms, or logs, that a page shows side by side
 _FIRST_TERMS = ("kp", "kd", "delay", "limit", "zero")  # of a drive, before all others
 _MILLI = {"s": "ms"}  # units in the table of drives
 _ROLES = {"urdf": "URDF", "identification": "fitted", "validation": "validation"}
@@ -35,6 +44,42 @@ _CHOSEN = {
     "cv": "selected by cross-validation on the fitted logs",
     "evidence": "selected by the evidence of the fitted logs",
 }
+#: Units of ``CENTRAL_TERMS``.
+_CENTRAL_UNITS = ("kg", "m", "m", "m", *["kg m²"] * 6)
+
+# columns: heading, form, key
+_PARAMETERS = (
+    ("link or drive", "code", "owner"), ("parameter", "text", "term"), ("URDF", ".4g", "prior"),
+    ("identified", ".4g", "value"), ("± error", ".4g", "error"), ("low", ".4g", "low"),
+    ("high", ".4g", "high"), ("change", ".4g", "change"), ("determined by", "text", "source"),
+    ("unit", "text", "unit"),
+)  # fmt: skip
+_BASE = (
+    ("parameter", "code", "name"), ("value", ".4g", "value"), ("± error", ".4g", "error"),
+    ("relative %", "%", "relative"), ("unit", "text", "unit"), ("expression", "code", "expression"),
+)  # fmt: skip
+_CONSISTENCY = (
+    ("body", "code", "body"), ("mass, URDF [kg]", ".4g", "before"), ("mass [kg]", ".4g", "after"),
+    ("smallest eigenvalue, URDF", ".3g", "low_before"), ("smallest eigenvalue", ".3g", "low_after"),
+    ("remark", "text", "remark"),
+)  # fmt: skip
+_SIGNALS = (
+    ("log", "code", "name"), ("filter", "text", "filter"), ("rate Hz", ".6g", "rate"),
+    ("velocity", "text", "velocity"), ("trim s", ".3g", "trim"),
+    ("minimum speed", ".3g", "min_velocity"), ("gap s", ".3g", "max_gap"),
+)  # fmt: skip
+_INPUTS = (
+    ("role", "text", "role"), ("file", "code", "path"), ("samples", "d", "samples"),
+    ("rate Hz", ".5g", "rate"), ("from s", ".6g", "start"), ("to s", ".6g", "end"),
+    ("segments", "d", "segments"), ("SHA-256", "code", "sha256"),
+)  # fmt: skip
+
+_VARYING = (
+    ("parameter", "code", "name"), ("mean", ".4g", "mean"), ("± error", ".4g", "error"),
+    ("spread", ".4g", "spread"), ("low", ".4g", "low"), ("high", ".4g", "high"),
+    ("unit", "text", "unit"), ("± error with one more, %", ".0f", "less"),
+    ("width with one more, %", ".0f", "narrower"),
+)  # fmt: skip
 
 
 def parameter_section(
@@ -45,53 +90,33 @@ def parameter_section(
     on_misfit: Collection[str] = (),
 ) -> str:
     """Return all parameters of the links and drives, and the changes of the URDF: standard (p,)."""
-    return (
-        f"<p>{words} ±: one standard error; low and high: the 95 % interval. Determined by data: "
-        "the standard error is below 30 % of the prior's spread. By prior: it is above 90 %, and "
-        "the value is the URDF's. At its bound: a physical constraint is active. "
-        "With another parameter (r): the errors are strongly correlated, and the joint effect of "
-        "both is determined far better than each parameter.</p>\n"
-        + _drive_table(entries)
-        + _parameter_table(entries, on_misfit)
-        + folded("changes", "Changes of the URDF", _change_section(model, standard))
-    )
+    rows = [_parameter(entry, on_misfit) for entry in entries]
+    parameters = listing("Parameters of links and drives", _PARAMETERS, rows, is_data=True)
+    changes = folded("changes", "Changes of the URDF", _changes(model, standard))
+    tables = _drive_table(entries) + parameters
+    return block("report.parameters", words=words, tables=tables, changes=changes)
 
 
-def _parameter_table(entries: Sequence[Mapping[str, Any]], on_misfit: Collection[str]) -> str:
-    """Return the table of parameters: the URDF's value, the identified value and its source."""
-    rows = []
-    for entry in entries:
-        owner, _, term = entry["name"].rpartition(".")
-        error, prior = _error(entry), entry.get("prior")
-        value, uncertain = with_error(entry["value"], error)
-        change = number(None)
-        if prior is not None:
-            change, _ = with_error(entry["value"] - prior, error, sign="+")
-            if not set("123456789") & set(change.html):
-                change = replace(change, html="0")
-        words = SOURCE_NAMES[entry["source"]]
-        words += ", model misfit" if entry["name"] in on_misfit else ""
-        if other := entry.get("correlated_with"):
-            words += f", with {other.rpartition('.')[2]} (r = {entry['correlation']:.3f})"
-        ends = entry.get("interval_95") or (None, None)
-        low, high = (number(x) if x is None else with_error(x, error)[0] for x in ends)
-        rows.append(
-            [
-                code(owner),
-                text(term),
-                number(prior),
-                value,
-                uncertain,
-                low,
-                high,
-                change,
-                text(words),
-                text(entry["unit"]),
-            ]
-        )
-    headers = ["link or drive", "parameter", "URDF", "identified", "± error", "low", "high"]
-    headers += ["change", "determined by", "unit"]
-    return table("Parameters of links and drives", headers, rows, is_data=True)
+def _parameter(entry: Mapping[str, Any], on_misfit: Collection[str]) -> dict[str, Any]:
+    """Return the row of a parameter: the URDF's value, the identified value and its source."""
+    owner, _, term = entry["name"].rpartition(".")
+    error, prior = _error(entry), entry.get("prior")
+    value, uncertainty = with_error(entry["value"], error)
+    change = number(None)
+    if prior is not None:
+        change, _ = with_error(entry["value"] - prior, error, sign="+")
+        if not set("123456789") & set(change.html):
+            change = replace(change, html="0")
+    source = SOURCE_NAMES[entry["source"]]
+    source += ", model misfit" if entry["name"] in on_misfit else ""
+    if other := entry.get("correlated_with"):
+        source += f", with {other.rpartition('.')[2]} (r = {entry['correlation']:.3f})"
+    ends = entry.get("interval_95") or (None, None)
+    low, high = (number(x) if x is None else with_error(x, error)[0] for x in ends)
+    return {
+        "owner": owner, "term": term, "prior": prior, "value": value, "error": uncertainty,
+        "low": low, "high": high, "change": change, "source": source, "unit": entry["unit"],
+    }  # fmt: skip
 
 
 def _drive_table(entries: Sequence[Mapping[str, Any]]) -> str:
@@ -101,25 +126,22 @@ def _drive_table(entries: Sequence[Mapping[str, Any]]) -> str:
         owner, _, term = entry["name"].rpartition(".")
         if term not in INERTIAL_TERMS:
             drives.setdefault(owner, {})[term] = entry
-    shown = {
+    known = {
         term: entry
-        for own in drives.values()
-        for term, entry in own.items()
+        for terms in drives.values()
+        for term, entry in terms.items()
         if entry["value"] or entry.get("std_error") is not None
     }  # all other terms are fixed at 0
-    terms = sorted(shown, key=lambda term: (*_FIRST_TERMS, term).index(term))
-    units = [_MILLI.get(shown[term]["unit"], shown[term]["unit"]) for term in terms]
+    terms = sorted(known, key=lambda term: (*_FIRST_TERMS, term).index(term))
+    units = [_MILLI.get(known[term]["unit"], known[term]["unit"]) for term in terms]
     names = [f"{term} [{unit}]" for term, unit in zip(terms, units, strict=True)]
     cells = [[_short(own.get(term)) for term in terms] for own in drives.values()]
-    headers, rows = (
-        ["joint", *names],
-        [[code(x), *own] for x, own in zip(drives, cells, strict=True)],
-    )
-    if len(terms) > max(len(drives), _COLUMNS):  # too wide for a page
+    headers = ["joint", *names]
+    rows = [[code(drive), *row] for drive, row in zip(drives, cells, strict=True)]
+    if len(terms) > max(len(drives), _WIDEST):  # too wide for a page
         headers = ["term", *drives]
-        rows = [
-            [text(name), *own] for name, own in zip(names, zip(*cells, strict=True), strict=True)
-        ]
+        columns = zip(*cells, strict=True)
+        rows = [[text(name), *row] for name, row in zip(names, columns, strict=True)]
     return table("Drives, by joint", headers, rows, is_data=True) if terms else ""
 
 
@@ -133,25 +155,30 @@ def _short(entry: Mapping[str, Any] | None) -> Cell:
     if entry is None:
         return number(None)
     scale = 1e3 if entry["unit"] in _MILLI else 1.0
-    value, error = with_error(scale * entry["value"], scale * _error(entry))
-    if error.value is None:
-        return value
-    return Cell(f"{value.html} ± {error.html}", "number", value.value)
+    return both(scale * entry["value"], scale * _error(entry))
+
+
+def both(value: float, error: float) -> Cell:
+    """Return a number and its error in one cell."""
+    cell, uncertainty = with_error(value, error)
+    if uncertainty.value is None:
+        return cell
+    return Cell(f"{cell.html} ± {uncertainty.html}", "number", cell.value)
 
 
 def sources_fact(entries: Sequence[Mapping[str, Any]]) -> dict[str, str]:
     """Return the number of parameters by source, HTML by its name."""
     counts = {kind: sum(entry["source"] == kind for entry in entries) for kind in SOURCE_NAMES}
-    there = {kind: count for kind, count in counts.items() if count}
+    known = {kind: count for kind, count in counts.items() if count}
     shares = "".join(
-        f'<i class="from-{kind}" style="flex: {count}"></i>' for kind, count in there.items()
+        f'<i class="from-{kind}" style="flex: {count}"></i>' for kind, count in known.items()
     )
-    words = ", ".join(f"{count} {SOURCE_NAMES[kind]}" for kind, count in there.items())
+    words = ", ".join(f"{count} {SOURCE_NAMES[kind]}" for kind, count in known.items())
     name = f"{len(entries)} parameters, determined by"
     return {name: f'<span class="shares">{shares}</span>{words}'}
 
 
-def _change_section(model: RobotModel | None, standard: Array | None) -> str:
+def _changes(model: RobotModel | None, standard: Array | None) -> str:
     """Return the changed lines of the URDF, each link's under its name."""
     if standard is None:
         return "<p>No URDF was written.</p>\n"
@@ -165,125 +192,136 @@ def _change_section(model: RobotModel | None, standard: Array | None) -> str:
         elif (name := line.rpartition("@@ ")[2]) != link:  # unchanged lines split a link's changes
             html, link = f"{html}<strong>{escape(name)}</strong>\n", name
     title = " and ".join(line.split(" ", 1)[1].strip() for line in lines[:2])
-    return (
-        f"<p>{escape(title)}; all other bytes are unchanged.</p>\n"
-        f'<pre class="diff" tabindex="0">{html}</pre>\n'
-    )
+    return block("report.changes", title=escape(title), lines=html)
 
 
-def base_table(found: Identification) -> str:
-    """Return the table of the base parameters."""
-    mapping, units = found.mapping, found.model.layout.units
-    open_ = set(found.determination.undetermined)
+def body_table(identification: TorqueIdentification) -> str:
+    """Return mass, centre of mass and inertia about it of each link, below them those of the URDF.
+
+    A value that the data do not determine is the URDF's, and stands without interval.
+    """
+    central = central_parameters(identification)
     rows = []
-    for k, (name, i, expression) in enumerate(
-        zip(mapping.base_names, mapping.independent, mapping.expressions, strict=True)
-    ):
-        error = math.inf if name in open_ else float(found.base_error[k])
-        value, uncertain = with_error(found.base[k], error)
-        share = _relative(found.base[k], error)
-        rows.append([code(name), value, uncertain, share, text(units[i]), code(expression)])
-    headers = ["parameter", "value", "± error", "relative %", "unit", "expression"]
-    return (
-        "<p>The combinations of standard parameters that the torque depends on. Each is named "
-        "after one of its terms. A dash as error: not identifiable alone from these data. Errors "
-        f"are standard errors from {escape(found.errors.method)}.</p>\n"
-        + table("Base parameters", headers, rows, is_data=True)
-    )
+    for i, body in enumerate(identification.model.layout.bodies):
+        cells = []
+        for value, half, urdf in zip(
+            central.values[i], central.half[i], central.urdf[i], strict=True
+        ):
+            identified = both(value, half)
+            prior = with_error(urdf, half)[0].html
+            html = f'{identified.html}<br><span class="note">{prior}</span>'
+            cells.append(Cell(html, "number", identified.value))
+        rows.append([code(body), *cells])
+    units = zip(CENTRAL_TERMS, _CENTRAL_UNITS, strict=True)
+    headers = ["link", *(f"{term} [{unit}]" for term, unit in units)]
+    return block("report.central") + table("Links", headers, rows, is_data=True)
 
 
-def consistency_section(found: Identification) -> str:
+def base_table(identification: TorqueIdentification) -> str:
+    """Return the table of the base parameters."""
+    mapping, units = identification.mapping, identification.model.layout.units
+    undetermined, rows = set(identification.determination.undetermined), []
+    for k, name in enumerate(mapping.base_names):
+        value = identification.base[k]
+        error = math.inf if name in undetermined else float(identification.base_error[k])
+        shown, uncertainty = with_error(value, error)
+        relative = 100 * error / abs(value) if value and math.isfinite(error) else None
+        if relative is not None and relative >= 1000:
+            relative = Cell("&gt; 999", "number", relative)
+        rows.append(
+            {"name": name, "value": shown, "error": uncertainty, "relative": relative,
+             "unit": units[mapping.independent[k]], "expression": mapping.expressions[k]}
+        )  # fmt: skip
+    parameters = listing("Base parameters", _BASE, rows, is_data=True)
+    return block("report.base", method=escape(identification.errors.method), table=parameters)
+
+
+def consistency_section(identification: TorqueIdentification) -> str:
     """Return masses and pseudo-inertias, of the URDF and identified; prior, bounds, mass matrix."""
-    layout = found.model.layout
+    layout = identification.model.layout
     before, after = (
-        pseudo_inertia(pi[: layout.n_inertial]) for pi in (found.prior, found.standard)
+        pseudo_inertia(pi[: layout.n_inertial])
+        for pi in (identification.prior, identification.standard)
     )
     low_before, low_after = (np.linalg.eigvalsh(J)[:, 0] for J in (before, after))
     rows = [
-        [
-            code(body),
-            number(before[i, 3, 3]),
-            number(after[i, 3, 3]),
-            number(low_before[i], ".3g"),
-            number(low_after[i], ".3g"),
-            text("" if low_after[i] > 0 else "inconsistent", flag=True),
-        ]
+        {"body": body, "before": before[i, 3, 3], "after": after[i, 3, 3],
+         "low_before": low_before[i], "low_after": low_after[i],
+         "remark": text("" if low_after[i] > 0 else "inconsistent", flag=True)}
         for i, body in enumerate(layout.bodies)
+    ]  # fmt: skip
+    totals = [float(J[:, 3, 3].sum()) for J in (before, after)]
+    rows.append({"body": "total", "before": totals[0], "after": totals[1], "remark": ""})
+    is_consistent = identification.is_consistent
+    every = "All bodies and drives are" if is_consistent else "Not all bodies and drives are"
+    masses = listing("Mass and pseudo-inertia of each body", _CONSISTENCY, rows)
+    notes = "".join(f"<p>{escape(note)}</p>\n" for note in _consistency_notes(identification))
+    return block("report.consistency", all=every, table=masses, notes=notes)
+
+
+def _consistency_notes(identification: TorqueIdentification) -> list[str]:
+    """Return sentences on mass matrix, prior and bounds of the fit."""
+    check, details = identification.mass_matrix, identification.estimate.details
+    share = "at all" if check.is_positive else f"at {100 * check.positive_share:.3g} % of"
+    notes = [
+        f"The mass matrix, armatures included, is positive definite {share} {check.poses} random "
+        f"poses (smallest eigenvalue {check.smallest_eigenvalue:.3g})."
     ]
-    totals = [number(float(J[:, 3, 3].sum())) for J in (before, after)]
-    foot = [text("total"), *totals, text(""), text(""), text("")]
-    headers = ["body", "mass, URDF [kg]", "mass [kg]", "smallest eigenvalue, URDF"]
-    headers += ["smallest eigenvalue", "remark"]
-    every = "All bodies and drives are" if found.is_consistent else "Not all bodies and drives are"
-    return (
-        f"<p>{every} physically consistent. A body is consistent if the smallest eigenvalue of its "
-        "pseudo-inertia is positive; a drive, if armature and friction are not negative.</p>\n"
-        + table("Mass and pseudo-inertia of each body", headers, rows, foot)
-        + _consistency_notes(found)
-    )
+    if "prior" in details:
+        prior = details["prior"]
+        chosen = _CHOSEN.get(prior.get("chosen_by", ""), "as set")
+        active = ", ".join(details["active"])
+        notes += [
+            "The prior is the distance from the URDF's values by the divergence of the "
+            f"pseudo-inertias (entropic); its weight is {prior['weight']:.3g}, {chosen}.",
+            f"Active constraints: {active}." if active else "No constraint is active.",
+        ]
+        if details["relaxed"]:
+            notes.append(f"Extents that contradict the data: {', '.join(details['relaxed'])}.")
+        if details["pinned"]:
+            notes.append(f"Fixed at the URDF's values: {', '.join(details['pinned'])}.")
+    return notes
 
 
-def open_section(found: Identification) -> str:
+def open_section(identification: TorqueIdentification) -> str:
     """Return the parameters that the data do not determine."""
-    wls, layout = found.wls, found.model.layout
-    fixed = [n for n, source in zip(layout.names, found.sources, strict=True) if source == "prior"]
-    return (
-        f"<p>The data determine {found.determination.rank} of {len(found.base)} base parameters; "
-        f"condition number {wls.condition:.3g} (regressor, unit columns).</p>\n"
-        + _indistinguishable(found)
-        + _listed("Parameters without effect on the torque", found.mapping.unidentifiable)
-        + _combinations(found)
-        + _listed("Standard parameters that remain at the URDF's values", fixed)
+    names, sources = identification.model.layout.names, identification.sources
+    fixed = [name for name, source in zip(names, sources, strict=True) if source == "prior"]
+    without_effect = identification.mapping.unidentifiable
+    return block(
+        "report.open",
+        rank=identification.determination.rank,
+        count=len(identification.base),
+        groups=_indistinguishable(identification),
+        lists=_names("Parameters without effect on the torque", without_effect)
+        + _names("Standard parameters that remain at the URDF's values", fixed),
     )
 
 
-def _indistinguishable(found: Identification) -> str:
+def _indistinguishable(identification: TorqueIdentification) -> str:
     """Return indistinguishable base parameters, and their identifiable combinations."""
-    groups = found.determination.merged
-    title = "Base parameters that are not identifiable alone"
-    if not groups:
-        return _listed(title, ())
-    parts = [
-        f"<h3>{title}</h3>\n<p>A combination counts as identifiable if the data reduce its prior "
-        "spread by 10 % or more. Factors are in SI units. Terms below 5 % of the largest one, each "
-        "times its spread, are left out. result.json has all.</p>\n"
-    ]
+    groups = identification.determination.merged
+    html = block("report.indistinguishable") if groups else ""
     for group in groups:
         names = ", ".join(code(name).html for name in group.names)
         sums = "<br>".join(code(str(combination)).html for combination in group.combinations)
-        parts.append(
-            f'<p>Parameters:</p>\n<p class="code">{names}</p>\n<p>Identifiable:</p>\n'
-            f'<p class="code">{sums}</p>\n'
-            if sums
-            else f'<p>Not identifiable:</p>\n<p class="code">{names}</p>\n'
-        )
-    return "".join(parts)
+        html += f'<p class="code">{names}</p>\n<p>Identifiable: {sums or "none"}</p>\n'
+    return html
 
 
-def _combinations(found: Identification) -> str:
-    """Return the identifiability of each body's parameters: alone, in sums only, or never."""
-    layout = found.model.layout
-    rows = []
-    for i, body in enumerate(layout.bodies):
-        names = layout.names[10 * i : 10 * i + 10]
-        kinds = found.mapping.described(names)
-        short = {key: ", ".join(n.rsplit(".", 1)[1] for n in kinds[key]) or "–" for key in kinds}
-        rows.append([code(body), *[text(short[key]) for key in ("alone", "in sums", "never")]])
-    return table(
-        "Structural identifiability of each body",
-        ["body", "alone", "only in sums with others (see base parameters)", "never"],
-        rows,
-    )
+def _names(title: str, names: Sequence[str]) -> str:
+    words = ", ".join(code(name).html for name in names) or "none"
+    return f'<h3>{title}</h3>\n<p class="code">{words}</p>\n'
 
 
-def settings_tables(found: Identification) -> str:
+def settings_tables(identification: TorqueIdentification) -> str:
     """Return the tables of the settings, as used."""
-    model = found.model
-    settings = found.estimator.to_dict()
+    model, estimate = identification.model, identification.estimate
+    settings = identification.estimator.to_dict()
     pairs = {
         "estimator": settings.pop("name"),
         **{key.replace("_", " "): str(value) for key, value in settings.items()},
-        "solver": f"{found.estimate.message} ({found.estimate.n_iter} iterations)",
+        "solver": f"{estimate.message} ({estimate.n_iter} iterations)",
         "drive terms": listed(model.layout.terms),
         "gravity [m/s²]": listed(f"{g:g}" for g in model.pin_model.gravity.linear.tolist()),
         "base": "floating" if model.free_flyer else "fixed",
@@ -293,109 +331,74 @@ def settings_tables(found: Identification) -> str:
     for coupling in model.layout.couplings:
         ratios = listed(f"{joint} × {ratio:g}" for joint, ratio in coupling.ratios)
         pairs[f"coupling {coupling.name}"] = ratios
+    signals = []
+    for evaluation in (*identification.fitted, *identification.validation):
+        own = evaluation.recording.signals
+        cutoff = "none" if own.cutoff is None else f"{own.cutoff:g} Hz, order {own.order}"
+        signals.append({**vars(own), "name": evaluation.recording.name, "filter": cutoff})
+    title = "Signals, as used for each log; minimum speed in rad/s or m/s"
+    return pairs_table("Model and estimator", pairs) + listing(title, _SIGNALS, signals)
+
+
+def pairs_table(caption: str, pairs: Mapping[str, str], heads: Sequence[str] = ()) -> str:
+    """Return a table of names and their values."""
     rows = [[text(key), text(value)] for key, value in pairs.items()]
-    headers = ["log", "filter", "rate Hz", "velocity", "trim s", "minimum speed", "gap s"]
-    signals = [_signal_row(e.recording) for e in (*found.fitted, *found.validation)]
-    return table("Model and estimator", ["setting", "value"], rows) + table(
-        "Signals, as used for each log; minimum speed in rad/s or m/s", headers, signals
-    )
+    return table(caption, heads or ["setting", "value"], rows)
 
 
 def input_table(inputs: Iterable[Mapping[str, Any]]) -> str:
     """Return the table of the input files."""
     rows = [
-        [
-            text(_ROLES[entry["role"]]),
-            code(entry["path"]),
-            number(entry.get("samples"), "d"),
-            number(entry.get("rate"), ".5g"),
-            number(entry.get("start"), ".6g"),
-            number(entry.get("end"), ".6g"),
-            number(entry.get("segments"), "d"),
-            code(entry["sha256"] or "not read from a file"),
-        ]
+        {
+            **entry,
+            "role": _ROLES[entry["role"]],
+            "sha256": entry["sha256"] or "not read from a file",
+        }
         for entry in inputs
     ]
-    headers = ["role", "file", "samples", "rate Hz", "from s", "to s", "segments", "SHA-256"]
-    return table("Files read", headers, rows)
+    return listing("Files read", _INPUTS, rows)
 
 
 def version_table(ran: Mapping[str, str]) -> str:
     """Return the table of the versions that ran."""
-    rows = [[text(name), code(version)] for name, version in ran.items()]
-    return table("Versions that ran", ["what", "version"], rows)
+    return pairs_table("Versions that ran", ran, ["what", "version"])
 
 
-def _relative(value: float, error: float) -> Cell:
-    relative = 100 * error / abs(value) if value and math.isfinite(error) else None
-    if relative is not None and relative >= 1000:
-        return Cell("&gt; 999", "number", relative)
-    return percent(relative)
+def variation_section(variation: Variation | None, torques: Mapping[str, str]) -> str:
+    """Return the values of drive parameters in each log, and the prediction of the next log."""
+    if variation is None:
+        return ""
+    new, members, one = ("log of this robot", "logs", "log")
+    if variation.units > 1:
+        new, members, one = (f"robot (after {variation.units})", "robots", "robot")
+    html = block("report.variation", members=members, new=new, one=one)
+    if torques:
+        errors = ", ".join(f"{escape(row)} {error}" for row, error in torques.items())
+        html += block("report.next_torque", one=one, errors=errors)
+    different = {(unlike.run, unlike.name) for unlike in variation.unlike}
+    rows = [_varying(parameter, different) for parameter in variation.parameters]
+    caption = f"Drive parameters in {len(variation.runs)} logs; low to high: 95 % of the next {new}"
+    runs = variation.runs if len(variation.runs) <= _WIDEST else ()
+    columns = [_VARYING[0], *((run, ".4g", f"run {k}") for k, run in enumerate(runs))]
+    return html + listing(caption, [*columns, *_VARYING[1:]], rows, is_data=True)
 
 
-def _listed(title: str, names: Sequence[str]) -> str:
-    listed = ", ".join(code(name).html for name in names) or "none"
-    return f'<h3>{title}</h3>\n<p class="code">{listed}</p>\n'
-
-
-def _signal_row(recording: Recording) -> list[Cell]:
-    s = recording.signals
-    return [
-        code(recording.name),
-        text("none" if s.cutoff is None else f"{s.cutoff:g} Hz, order {s.order}"),
-        number(s.rate, ".6g"),
-        text(s.velocity),
-        number(s.trim, ".3g"),
-        number(s.min_velocity, ".3g"),
-        number(s.max_gap, ".3g"),
-    ]
-
-
-def _consistency_notes(found: Identification) -> str:
-    """Return paragraphs on data coverage, mass matrix, prior and bounds of the fit."""
-    notes = [_coverage(found), _mass_matrix(found)]
-    details = found.estimate.details
-    if "prior" in details:
-        prior = details["prior"]
-        chosen = _CHOSEN.get(prior.get("chosen_by", ""), "as set")
-        notes.append(
-            "The prior is the distance from the URDF's values by the divergence of the "
-            f"pseudo-inertias (entropic); its weight is {prior['weight']:.3g}, {chosen}."
-        )
-        active = ", ".join(details["active"])
-        notes.append(f"Active constraints: {active}." if active else "No constraint is active.")
-        if details["relaxed"]:
-            notes.append(f"Extents that contradict the data: {', '.join(details['relaxed'])}.")
-        if details["pinned"]:
-            notes.append(f"Fixed at the URDF's values: {', '.join(details['pinned'])}.")
-    return "".join(f"<p>{escape(text)}</p>\n" for text in notes)
-
-
-def _coverage(found: Identification) -> str:
-    counts = {kind: found.sources.count(kind) for kind in SOURCES}
-    carried = [
-        body
-        for body in found.model.layout.bodies
-        if all(
-            source == "prior"
-            for name, source in zip(found.model.layout.names, found.sources, strict=True)
-            if name.rsplit(".", 1)[0] == body
-        )
-    ]
-    text = (
-        f"Sources of the {len(found.sources)} parameters: {counts['data']} the data, "
-        f"{counts['mixed']} data and URDF together, {counts['prior']} the URDF; {counts['bound']} "
-        "are at a physical bound."
-    )
-    return text + (
-        f" The data do not determine {', '.join(carried)}: URDF only." if carried else ""
-    )
-
-
-def _mass_matrix(found: Identification) -> str:
-    check = found.mass_matrix
-    where = "at all" if check.is_positive else f"at {100 * check.positive_share:.3g} % of"
-    return (
-        f"The mass matrix, armatures included, is positive definite {where} {check.poses} "
-        f"random poses (smallest eigenvalue {check.smallest_eigenvalue:.3g})."
-    )
+def _varying(parameter: VaryingParameter, different: Collection[tuple[int, str]]) -> dict[str, Any]:
+    """Return the row of a parameter: its value in each log, and the prediction of the next."""
+    prediction = parameter.prediction
+    mean, error = with_error(prediction.mean, prediction.std_error)
+    low, high = (with_error(float(x), prediction.std_error)[0] for x in prediction.ends)
+    less, width = prediction.after
+    row = {
+        "name": parameter.name, "mean": mean, "error": error, "low": low, "high": high,
+        "spread": with_error(prediction.spread, prediction.spread)[1], "unit": parameter.unit,
+        "less": 100 * less / prediction.std_error,
+        "narrower": 100 * width / float(np.ptp(prediction.ends)),
+    }  # fmt: skip
+    values = zip(parameter.values, parameter.std_errors, strict=True)
+    for k, (value, std_error) in enumerate(values):
+        shown = both(value, std_error)
+        is_different = (k, parameter.name) in different
+        bold = f"<strong>{shown.html}</strong>" if is_different else shown.html
+        row[f"run {k}"] = replace(shown, html=bold)
+    return row

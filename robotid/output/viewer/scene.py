@@ -15,7 +15,7 @@ import pinocchio as pin
 
 from robotid.base.typing import Array
 from robotid.output.viewer.thinning import thin
-from robotid.robot.meshes import Shape, Surface, find_mesh, read_shapes, read_surfaces
+from robotid.robot.geometry import Shape, Surface, find_mesh, read_shapes, read_surfaces
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
 

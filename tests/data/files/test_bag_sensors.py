@@ -21,12 +21,11 @@ from helpers.recorders import (
 
 from robotid.base.exceptions import DataError
 from robotid.cli import main
-from robotid.data.base_motion import BaseColumns, quaternions_of_angles
+from robotid.data.base_motion import BaseColumns, ImuFrame, quaternions_of_angles
 from robotid.data.files import bags
-from robotid.data.files.bag_sensors import Sensor, _interpolated
+from robotid.data.files.bags import _interpolated
 from robotid.data.files.read import read_log
 from robotid.data.files.table import Table
-from robotid.data.imu_frame import ImuFrame
 from robotid.data.signal_settings import LogSource
 
 ODOMETRY, IMU = "nav_msgs/msg/Odometry", "sensor_msgs/msg/Imu"
@@ -157,14 +156,6 @@ def test_measured_torques_of_a_controller_are_not_those_of_its_output():
             "position": [1.0], "velocity": [1.1], "effort": [1.2],
             "qref": [2.0], "dqref": [2.1], "tauref": [3.2],
         }  # fmt: skip
-
-
-def test_a_stamp_is_that_of_the_header_or_of_the_recording():
-    clock = SimpleNamespace(sec=1_700_000_000, nanosec=123_456_789)
-    message = SimpleNamespace(header=SimpleNamespace(stamp=clock))
-    for stamp, wanted in (("header", 1_700_000_000_123_456_789), ("log", 42)):
-        assert bags._stamp(message, 42, LogSource(stamp=stamp)) == wanted
-    assert bags._stamp(SimpleNamespace(), 42, LogSource()) == 42
 
 
 @pytest.mark.parametrize("name", ["log", "log.bag"])
@@ -328,16 +319,29 @@ def test_columns_between_messages_are_linear_and_quaternions_have_length_1():
     assert not found["imu_qx"].any()
 
 
-def test_messages_of_a_sensor_are_sorted_with_their_values(monkeypatch):
-    """Stamps of recording [ns], and values, in the order in which they arrived."""
-    arrived = [(7_200_000_000, (3.0, 30.0)), (7_000_000_000, (1.0, 10.0)),
-               (7_100_000_000, (2.0, 20.0))]  # fmt: skip
-    monkeypatch.setattr(bags, "_open", lambda path: nullcontext((None, None)))
-    monkeypatch.setattr(bags, "_messages", lambda *_: iter(arrived))
-    sensor = Sensor("imu", ("a", "b"), lambda message: message)
-    t, values = bags._load(Path("x.mcap"), LogSource(stamp="log"), sensor)
-    assert t.tolist() == [7.0, 7.1, 7.2]
-    assert values.tolist() == [[1.0, 10.0], [2.0, 20.0], [3.0, 30.0]]
+def test_messages_of_a_sensor_are_sorted_by_their_stamps(monkeypatch):
+    """Times of recording [s], stamps of the headers [s] and values, in the order of arrival."""
+    rows = [(9.2, 7.2, (3.0, 30.0)), (9.1, 7.0, (1.0, 10.0)), (9.3, 7.1, (2.0, 20.0))]
+
+    def messages(chosen):
+        for logged, stamp, values in rows:
+            clock = SimpleNamespace(sec=int(stamp), nanosec=round(stamp % 1 * 1e9))
+            header = SimpleNamespace(stamp=clock)
+            yield chosen[0], round(logged * 1e9), SimpleNamespace(header=header, values=values)
+
+    connection = SimpleNamespace(topic="imu", msgtype="sensor_msgs/Imu", msgcount=3)
+    reader = SimpleNamespace(connections=[connection], messages=messages)
+    sensor = bags._Sensor("imu", ("a", "b"), lambda message: message.values)
+    for stamp, order, t_wanted in (
+        ("header", [1.0, 2.0, 3.0], [7.0, 7.1, 7.2]),
+        ("log", [1.0, 3.0, 2.0], [9.1, 9.2, 9.3]),
+    ):
+        source = LogSource(stamp=stamp)
+        bag = bags._Bag(Path("x.mcap"), source, reader, lambda raw, kind: raw)
+        monkeypatch.setattr(bags, "_opened", lambda *_, bag=bag: nullcontext(bag))
+        t, values = sensor.load(Path("x.mcap"), source)
+        np.testing.assert_allclose(t, t_wanted, rtol=0, atol=1e-9)
+        assert values.tolist() == [[x, 10 * x] for x in order]
 
 
 def test_the_last_command_before_each_message_is_held():

@@ -4,10 +4,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from robotid.cli.work.convert import convert
-from robotid.data.files.even_stamps import with_even_stamps
+from robotid.cli.convert import convert
 from robotid.data.files.read import lay_out, read_log
-from robotid.data.files.table import RowReader, Table
+from robotid.data.files.table import RowReader, Table, with_even_stamps
 from robotid.data.signal_settings import LogSource, LogUnits
 
 EVEN = LogSource(stamp="even")

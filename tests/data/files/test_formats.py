@@ -21,8 +21,8 @@ from helpers.recorders import (
 from mcap.writer import Writer as McapLibraryWriter
 
 from robotid.base.exceptions import DataError, MissingDependencyError, SettingsError
+from robotid.data.files.formats import open_table, write_columns
 from robotid.data.files.read import read_log, write_log
-from robotid.data.files.table_files import open_table, write_columns
 from robotid.data.log import Log
 from robotid.data.signal_settings import LogSource
 

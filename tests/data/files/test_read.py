@@ -749,7 +749,7 @@ def test_rows_of_a_csv_file_are_read_from_any_place_before_them(tmp_path, monkey
     monkeypatch.setattr(csv_files, "_BLOCK", 3)
     lines = ["time,q", "0,10", "", "1,11", "2,12", "3,13", "", "", "4,14", "5,15", "6,16", "7,17"]
     (tmp_path / "run.csv").write_text("\n".join(lines) + "\n")
-    rows = csv_files.CsvFormat().open(tmp_path / "run.csv", LogSource()).rows
+    rows = csv_files.CSV.open(tmp_path / "run.csv", LogSource()).rows
     blocks = list(rows.scan("q"))
     assert [values.tolist() for values, _ in blocks] == [[10, 11], [12, 13], [14, 15], [16, 17]]
     places = [place for _, place in blocks]

@@ -7,8 +7,8 @@ from helpers.corruptions import NOISE, clean_log, controlled_log, late, robot, t
 from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
 from robotid.diagnosis.logs.check_logs import diagnose
-from robotid.dynamics.simulation.closed_loop import simulate
 from robotid.dynamics.simulation.motions import random_fourier
+from robotid.dynamics.simulation.simulator import simulate
 from robotid.dynamics.simulation.truth import another_robot
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from robotid.cli.work.job import LogEntry, read_job
+from robotid.cli.job import LogEntry, read_job
 from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
 from robotid.diagnosis.logs.channels import _noise, _velocity_scale, check_channels

@@ -12,8 +12,8 @@ from helpers.servos import Servo, chirps, record
 
 from robotid.base.exceptions import DataError
 from robotid.cli import main
+from robotid.data.files.formats import write_columns
 from robotid.data.files.read import read_log, write_log
-from robotid.data.files.table_files import write_columns
 from robotid.data.log import Log
 from robotid.data.signal_settings import LogSource, SignalSettings
 from robotid.diagnosis.logs.check_logs import check_logs

@@ -21,10 +21,10 @@ from helpers.synthetic import exact_log, perfect, truth
 from robotid.base.exceptions import SettingsError
 from robotid.base.findings import Finding
 from robotid.cli import main
-from robotid.cli.work.job import Job, LogEntry, read_job
-from robotid.cli.work.logs import examine
+from robotid.cli.job import Job, LogEntry, read_job
+from robotid.cli.logs import examine
+from robotid.data.files.formats import write_columns
 from robotid.data.files.read import write_log
-from robotid.data.files.table_files import write_columns
 from robotid.data.signal_settings import SignalSettings
 from robotid.diagnosis.logs.check_logs import check_logs, diagnose, findings_to_dict
 from robotid.diagnosis.verdict.verdict import blocking, check_ignored

@@ -8,14 +8,13 @@ import scipy.stats
 from helpers.paths import JOBS
 
 from robotid.base.exceptions import DataError
-from robotid.cli.work.job import read_job
+from robotid.cli.job import read_job
 from robotid.data.base_motion import BaseMotion, quaternions_of_angles
 from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import process
-from robotid.dynamics.constraint_rows import constraint_jacobian
-from robotid.dynamics.constraints import found_contacts
-from robotid.dynamics.constraints.found_contacts import (
+from robotid.dynamics import completed_logs
+from robotid.dynamics.completed_logs import (
     FoundContact,
     _forces,
     _noise_of_groups,
@@ -23,6 +22,7 @@ from robotid.dynamics.constraints.found_contacts import (
     find_contacts,
     with_contacts,
 )
+from robotid.dynamics.constraint_rows import constraint_jacobian
 from robotid.dynamics.prediction import predict, predict_instants
 from robotid.robot.constraints import Contact
 
@@ -92,7 +92,7 @@ def test_the_shares_are_of_all_samples_of_which_undecided_ones_count_as_contact(
     log, *_ = standing(robot, np.ones((200, 4), dtype=bool))
     touches = [np.repeat([1.0, 0.0, 0.5], n) for n in ([120, 50, 30], [40, 150, 10])]
     found = [FoundContact(FEET[k], x, 0.0 * x) for k, x in zip((1, 3), touches, strict=True)]
-    monkeypatch.setattr(found_contacts, "find_contacts", lambda *_: (log.t, found))
+    monkeypatch.setattr(completed_logs, "find_contacts", lambda *_: (log.t, found))
     stated = {foot: log.t >= 0.0 for foot in (FEET[0], FEET[2])}
     full = with_contacts(robot, replace(log, contacts=stated), RAW)
     assert full.notes == (
@@ -103,7 +103,7 @@ def test_the_shares_are_of_all_samples_of_which_undecided_ones_count_as_contact(
     for k, x in zip((1, 3), touches, strict=True):
         np.testing.assert_array_equal(full.contacts[FEET[k]], x > 0.0)
     part = [FoundContact(FEET[1], np.zeros(190), np.zeros(190))]  # rows beyond are undecided, too
-    monkeypatch.setattr(found_contacts, "find_contacts", lambda *_: (log.t[4:-6], part))
+    monkeypatch.setattr(completed_logs, "find_contacts", lambda *_: (log.t[4:-6], part))
     full = with_contacts(
         robot, replace(log, contacts={FEET[k]: log.t >= 0 for k in (0, 2, 3)}), RAW
     )

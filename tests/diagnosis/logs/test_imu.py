@@ -8,9 +8,15 @@ import pinocchio as pin
 import pytest
 from helpers.paths import JOBS
 
-from robotid.cli.work.job import read_job
-from robotid.data.base_motion import BaseMotion, base_state, in_base, quaternions_of_angles
-from robotid.data.imu_frame import ImuFrame, ImuMotion
+from robotid.cli.job import read_job
+from robotid.data.base_motion import (
+    BaseMotion,
+    ImuFrame,
+    ImuMotion,
+    base_state,
+    in_base,
+    quaternions_of_angles,
+)
 from robotid.data.log import Log
 from robotid.data.signal_settings import BaseSource, SignalSettings
 from robotid.diagnosis.logs.contacts import check_base

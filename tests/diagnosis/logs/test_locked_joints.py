@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from helpers.synthetic import exact_log, truth
 
-from robotid.cli.work.identify import run_job
-from robotid.cli.work.job import Job, LogEntry
-from robotid.cli.work.logs import examine
+from robotid.cli.identify import run_job
+from robotid.cli.job import Job, LogEntry
+from robotid.cli.logs import examine
 from robotid.data.files.read import read_log, write_log
 from robotid.data.signal_settings import LogUnits
 from robotid.diagnosis.logs.locked_joints import check_locked, percent_hint

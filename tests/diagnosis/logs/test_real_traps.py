@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from robotid.cli.work.job import LogEntry, read_job
+from robotid.cli.job import LogEntry, read_job
 from robotid.diagnosis.logs.check_logs import diagnose
 from robotid.diagnosis.urdf.inspection import inspect_urdf
 

@@ -1,10 +1,9 @@
-"""Findings on measured forces of the ground: sign, unit, foot, axes and origin."""
+"""Findings on measured forces of the ground: sign, unit, foot and axes."""
 
 from dataclasses import replace
 from functools import cache
 
 import numpy as np
-import pinocchio as pin
 import pytest
 from helpers.humans import FEET, PARTS, human_urdf, logged, walk, with_other_segments
 
@@ -19,10 +18,6 @@ from robotid.robot.constraints import Contact, link_positions
 from robotid.robot.model import RobotModel
 
 SLOW = SignalSettings(cutoff=4.0)
-PLATES = [
-    pin.SE3(pin.rpy.rpyToMatrix(np.pi, 0, yaw), np.array([0.1, y, -0.05]))  # z downwards
-    for yaw, y in ((0.3, 0.2), (0.0, -0.25))
-]
 
 
 @cache
@@ -30,17 +25,8 @@ def on_no_ground(urdf):
     return RobotModel.from_urdf(urdf, free_flyer=True, terms=())
 
 
-def human(urdf, *, plates=None, **options):
-    own = [{"axes": "link"}, {"axes": "link"}]
-    if plates:
-        angles = [pin.rpy.matrixToRpy(p.rotation) for p in plates]
-        own = [
-            {"plate": (*p.translation, *rpy)} for p, rpy in zip(plates, angles, strict=True)
-        ]  # fmt: skip
-    contacts = [
-        Contact(foot, "surface", **{"measured": PARTS, **x, **options})
-        for foot, x in zip(FEET, own, strict=True)
-    ]
+def human(urdf):
+    contacts = [Contact(foot, "surface", measured=PARTS, axes="link") for foot in FEET]
     return replace(on_no_ground(urdf), constraints=tuple(contacts))
 
 
@@ -138,26 +124,6 @@ def test_axes_in_which_the_vertical_force_is_unknown_explain_nothing(urdf, log):
     toes = replace(log, wrenches=values)
     (finding,) = found(model, toes)
     assert "axes" not in finding.message
-    assert "state the plate" not in finding.message  # moments are not measured
-
-
-def test_forces_of_plates_have_the_origin_and_axes_of_the_plates(urdf, motion):
-    rng = np.random.default_rng(5)
-    of_plates = logged(human(urdf), motion, rng, plates=PLATES)
-    assert not found(human(urdf, plates=PLATES), of_plates)
-    (finding,) = found(human(urdf), of_plates)  # read as those of shoes
-    assert "their sign is reversed" in finding.message  # the plates' z is downwards
-    assert "exchanged" not in finding.message
-    assert "state the plate of each foot" in finding.message
-
-
-def test_the_origin_of_the_world_is_named(urdf, motion):
-    at_zero = [pin.SE3.Identity()] * 2
-    of_world = logged(human(urdf), motion, np.random.default_rng(5), plates=at_zero)
-    assert not found(human(urdf, plates=at_zero), of_world)
-    for model in (human(urdf), human(urdf, plates=PLATES)):
-        (finding,) = found(model, of_world)
-        assert "plate = [0, 0, 0]" in finding.message
 
 
 def test_vertical_forces_alone_show_their_sign_and_foot(urdf, log):
@@ -234,13 +200,3 @@ def test_the_reading_with_the_smallest_force_and_moment_is_named(urdf, log, monk
         assert finding.evidence["best"] == pytest.approx(best.sizes[0])
         force, moment = best.sizes
         assert f"but only {force:.3g} N and {moment:.3g} N m if" in finding.message
-    # of b the moments remain, for which plates of whole wrenches can be stated
-    points = tuple(Contact(foot, "point", PARTS[:3]) for foot in FEET)
-    for own, is_asked in (
-        (model, True), (human(urdf, measured=PARTS[:3]), False),
-        (replace(model, constraints=points), False),
-    ):  # fmt: skip
-        every = [reading(*x) for x in [("", 0.8, 0.6, 1.0), ("b", 0.3, 0.4, 1.0)]]
-        monkeypatch.setattr(wrenches, "_readings", lambda *_, every=every: every)
-        (finding,) = check_wrenches(own, log, motion)
-        assert ("The moments remain: state the plate" in finding.message) == is_asked

@@ -24,8 +24,8 @@ from robotid.estimation.fitting.estimator_settings import EstimatorSettings
 from robotid.estimation.fitting.recorded import Recordings
 from robotid.estimation.fitting.survey import hold_log
 from robotid.identification.pipeline import with_drives
+from robotid.robot.drives import AUTO, wanted_families
 from robotid.robot.examples import example_urdf
-from robotid.robot.families import AUTO, wanted_families
 from robotid.robot.model import RobotModel
 
 sys.path.append(str(ROOT / "benchmarks"))

@@ -21,8 +21,8 @@ from helpers.driven import (
 )
 
 from robotid.base.exceptions import NotConvergedError, SettingsError
-from robotid.cli.work.job import job_from_settings
-from robotid.cli.work.logs import survey_logs
+from robotid.cli.job import job_from_settings
+from robotid.cli.logs import survey_logs
 from robotid.data.files.read import write_log
 from robotid.data.signals import process
 from robotid.diagnosis.residual import drive_choice
@@ -30,16 +30,23 @@ from robotid.diagnosis.residual.drive_choice import choose_drives
 from robotid.diagnosis.residual.term_trials import Normal, Sample, Trials, take_sample
 from robotid.diagnosis.verdict.parameter_table import parameter_entries
 from robotid.dynamics.base_parameters import structural_mapping
-from robotid.dynamics.memory import drive_motion_along, remember
-from robotid.dynamics.prediction import predict
+from robotid.dynamics.prediction import drive_motion_along, predict, remember
 from robotid.estimation.fitting.bands import friction_curve
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
 from robotid.estimation.fitting.recorded import Recordings
 from robotid.estimation.fitting.selected_drives import DriveChoice
 from robotid.identification.pipeline import identify, with_drives
 from robotid.output.files.urdf import load_identified, write_urdf
-from robotid.robot.drives import FAMILIES, DriveMotion, Harmonic, LoadFriction, Stribeck, Tanh
-from robotid.robot.families import AUTO, wanted_families
+from robotid.robot.drives import (
+    AUTO,
+    FAMILIES,
+    DriveMotion,
+    Harmonic,
+    LoadFriction,
+    Stribeck,
+    Tanh,
+    wanted_families,
+)
 
 found_in, fitted_in = (partial(f, estimator="wls") for f in (helper.found_in, helper.fitted_in))
 SEED, QUANTILE = 3, 1.5  # of the motion: the elbow turns more than half a turn

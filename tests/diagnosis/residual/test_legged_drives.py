@@ -11,8 +11,8 @@ from robotid.diagnosis.residual.drive_choice import choose_drives
 from robotid.diagnosis.residual.term_trials import Trials, take_sample
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.constraint_rows import without_forces
-from robotid.dynamics.simulation.closed_loop import simulate
 from robotid.dynamics.simulation.simulation_settings import Controller, Noise, Sensors, Simulation
+from robotid.dynamics.simulation.simulator import simulate
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
 from robotid.estimation.fitting.fit import solve_recordings
 from robotid.estimation.fitting.recorded import Recordings

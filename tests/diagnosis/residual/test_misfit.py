@@ -13,9 +13,9 @@ from helpers.misfits import EFFECTS
 from helpers.paths import ROOT
 
 from robotid.base.findings import Finding
-from robotid.cli.work.identify import run_job
-from robotid.cli.work.job import job_from_settings, read_job
-from robotid.cli.work.logs import survey_logs
+from robotid.cli.identify import run_job
+from robotid.cli.job import job_from_settings, read_job
+from robotid.cli.logs import survey_logs
 from robotid.data.files.read import write_log
 from robotid.data.signal_settings import SignalSettings
 from robotid.diagnosis.logs.check_logs import check_logs
@@ -42,8 +42,7 @@ from robotid.estimation.fitting.joint_motion import JointMotion
 from robotid.estimation.fitting.recorded import Recordings
 from robotid.estimation.fitting.survey import hold_log
 from robotid.identification.pipeline import conclude, identify
-from robotid.robot.drives import Harmonic, Viscous
-from robotid.robot.families import AUTO, drive_line
+from robotid.robot.drives import AUTO, Harmonic, Viscous, drive_line
 from robotid.robot.model import RobotModel
 
 log_with = partial(helper.log_with, rate=50.0)  # [Hz]: the effects are slower than 10 Hz

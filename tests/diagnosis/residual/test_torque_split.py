@@ -24,8 +24,7 @@ from robotid.diagnosis.residual.torque_split import (
     joint_torques,
     split_torque,
 )
-from robotid.dynamics.memory import remember
-from robotid.dynamics.prediction import predict
+from robotid.dynamics.prediction import predict, remember
 from robotid.dynamics.torque import joint_torque_regressor
 from robotid.output.report.pictures import why_charts
 from robotid.robot.drives import Harmonic, Hat, Lag, LoadFriction, Presliding, Spring, Stribeck

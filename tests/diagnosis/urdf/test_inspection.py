@@ -14,9 +14,9 @@ from robotid.diagnosis.urdf.inspection import inspect_urdf
 from robotid.diagnosis.urdf.rounding import rounded_robot
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.torque import random_regressor
-from robotid.robot.assumed import with_assumed_inertials
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
+from robotid.robot.prior import with_assumed_inertials
 from robotid.robot.urdf_text import read_with_yourdfpy
 
 CLEAN = """<robot name="two">

@@ -6,24 +6,22 @@ import numpy as np
 import pytest
 
 from robotid.dynamics.kernels.lanes import (
+    LANES,
     compiled,
+    copysign,
     cos_sin,
     factor,
     get,
-    put,
-    put_lane,
-    solve,
-    work_space,
-)
-from robotid.dynamics.kernels.vector_lanes import (
-    LANES,
-    copysign,
     is_any,
     lane_of,
+    put,
+    put_lane,
     read,
+    solve,
     where,
     wide,
     with_lane,
+    work_space,
     write,
 )
 

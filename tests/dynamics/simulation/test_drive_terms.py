@@ -11,7 +11,7 @@ from robotid.dynamics.simulation.law_lanes import (
     initial_deflection,
     term,
 )
-from robotid.dynamics.simulation.plant import RobotPlant
+from robotid.dynamics.simulation.simulator import RobotPlant
 from robotid.dynamics.torque import joint_torque_regressor
 from robotid.robot.drive_term import LOADED, DriveTerm
 from robotid.robot.drives import (

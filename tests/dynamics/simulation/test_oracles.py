@@ -8,13 +8,13 @@ from helpers.single_joint import FREE, Ask, one_joint, parameters, slider
 from helpers.synthetic import truth
 from scipy.special import ellipj, ellipk
 
-from robotid.dynamics.simulation.closed_loop import follow
 from robotid.dynamics.simulation.simulation_settings import (
     Actuator,
     Controller,
     Sensors,
     Simulation,
 )
+from robotid.dynamics.simulation.simulator import follow
 from robotid.output.files.mjcf import write_mjcf
 from robotid.robot.drives import LuGre, Presliding
 from robotid.robot.examples import example_urdf

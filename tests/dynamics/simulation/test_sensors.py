@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from robotid.base.exceptions import DataError, SettingsError
-from robotid.dynamics.simulation.closed_loop import Run
-from robotid.dynamics.simulation.sensors import measure
+from robotid.dynamics.simulation.sensors import Run, measure
 from robotid.dynamics.simulation.simulation_settings import Noise, Sensors, Steps
 
 JOINTS = ("a", "b")

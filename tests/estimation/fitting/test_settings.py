@@ -13,9 +13,9 @@ from helpers.synthetic import exact_log, truth
 from robotid.base.exceptions import SettingsError
 from robotid.base.settings import setting
 from robotid.cli import main
-from robotid.cli.work.identify import run_job
-from robotid.cli.work.job import LogEntry, job_from_settings, read_job
-from robotid.cli.work.schema import job_schema
+from robotid.cli.identify import run_job
+from robotid.cli.job import LogEntry, job_from_settings, read_job
+from robotid.cli.schema import job_schema
 from robotid.data.files.read import write_log
 from robotid.data.signal_settings import SignalSettings
 from robotid.dynamics.base_parameters import structural_mapping

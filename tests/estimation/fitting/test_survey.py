@@ -14,10 +14,9 @@ from helpers.driven import arm
 from helpers.synthetic import truth
 
 from robotid.base.exceptions import DataError
-from robotid.data.base_motion import BaseColumns, BaseMotion
+from robotid.data.base_motion import BaseColumns, BaseMotion, ImuFrame
+from robotid.data.files.formats import open_table, write_columns
 from robotid.data.files.read import lay_out, read_log, write_log
-from robotid.data.files.table_files import open_table, write_columns
-from robotid.data.imu_frame import ImuFrame
 from robotid.data.log import Log
 from robotid.data.signal_settings import LogUnits, SignalSettings
 from robotid.dynamics.base_parameters import structural_mapping

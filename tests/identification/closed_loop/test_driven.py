@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from helpers.mujoco_plant import plant, torque_log
 
-from robotid.base.exceptions import DataError
 from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
 from robotid.dynamics.simulation.loops import ClosedLoopRobot, cut_windows, open_loops
@@ -144,12 +143,3 @@ def test_full_turns_are_taken_out_of_joints_that_turn_freely(tmp_path):
     heard = driven_log(model, Log(t, q, 0 * q, model.joints), SignalSettings())
     np.testing.assert_allclose(heard.q[:, 0], angle)
     np.testing.assert_array_equal(heard.q_ref, heard.q)
-
-
-def test_a_log_without_torque_drives_nothing(arm):
-    robot, log, _ = arm
-    bare = Log(log.t, log.q, np.zeros_like(log.q), log.joints, has_torque=False)
-    with pytest.raises(
-        DataError, match=r"has no torque, which \[controller\] kind = 'torque' needs"
-    ):
-        identify_loops(robot.model, [bare], [], DRIVEN, SimulationSettings())

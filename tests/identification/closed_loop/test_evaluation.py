@@ -10,8 +10,8 @@ from robotid.data.log import Log
 from robotid.dynamics.simulation.loops import ClosedLoopRobot, cut_windows
 from robotid.identification.closed_loop.loop_settings import LoopSettings
 from robotid.identification.closed_loop.position_errors import (
-    OpenLoop,
-    position_metrics,
+    PositionEvaluation,
+    pool_positions,
     run_open_loop,
 )
 from robotid.identification.closed_loop.stages import stated_loops
@@ -24,7 +24,8 @@ def run(joints, rmse, spread, moves, n=50, **baselines):
     q_ref = np.outer(np.linspace(0.0, 1.0, n), moves)
     log = Log(np.arange(n) / 100.0, q_ref, 0.0 * q_ref, joints, q_ref=q_ref, has_torque=False)
     others = {key: None if x is None else np.array(x) for key, x in baselines.items()}
-    return OpenLoop(log, q_ref, np.array(rmse), others, {}, np.array(spread))
+    units = ("m",) if joints == ("j",) else ("rad",)
+    return PositionEvaluation(log, units, q_ref, np.array(rmse), others, {}, np.array(spread))
 
 
 @pytest.fixture(scope="module")
@@ -35,15 +36,15 @@ def arm():
 def test_logs_count_alike_and_errors_are_shares_of_the_motion(arm):
     one = run(arm.joints, [3e-3], [0.3], [1.0], n=50, command=[0.06], urdf=None)
     two = run(arm.joints, [4e-3], [0.4], [1.0], n=70, command=[0.08], urdf=[0.01])
-    [(joint, found)] = position_metrics(arm, [one, two]).per_joint.items()
+    [(joint, found)] = pool_positions([one, two]).per_joint.items()
     assert (joint, found.unit, found.rows) == ("elbow_joint", "rad", 120)
     assert found.rmse == pytest.approx(np.sqrt((3e-3**2 + 4e-3**2) / 2))
     assert found.relative_error_pct == pytest.approx(1.0)
     assert found.r2 == pytest.approx(1.0 - 1e-4)
     assert found.better_than_constant
     assert found.baselines == {"command": pytest.approx(20.0), "urdf": None}
-    assert position_metrics(arm, [one, two]).pooled_rmse == pytest.approx(found.rmse)
-    off = position_metrics(arm, [replace(one, rmse=np.array([0.31]))]).per_joint[joint]
+    assert pool_positions([one, two]).pooled_rmse == pytest.approx(found.rmse)
+    off = pool_positions([replace(one, rmse=np.array([0.31]))]).per_joint[joint]
     assert not off.better_than_constant
     assert off.r2 < 0
 
@@ -51,22 +52,22 @@ def test_logs_count_alike_and_errors_are_shares_of_the_motion(arm):
 def test_a_joint_that_no_log_moves_is_left_out_where_motion_is_wanted(arm):
     still = run(arm.joints, [3e-3], [1e-4], [0.0])
     moved = run(arm.joints, [4e-3], [0.4], [1.0])
-    assert position_metrics(arm, [still], moving=True).per_joint == {}
-    [found] = position_metrics(arm, [still, moved], moving=True).per_joint.values()
+    assert pool_positions([still], moving=True).per_joint == {}
+    [found] = pool_positions([still, moved], moving=True).per_joint.values()
     assert found.relative_error_pct == pytest.approx(1.0)
-    [both] = position_metrics(arm, [still, moved]).per_joint.values()
+    [both] = pool_positions([still, moved]).per_joint.values()
     assert both.relative_error_pct > 1.0
     aside = run(arm.joints, [3e-3], [1e-4], [0.0], command=[2e-3])
-    [at_rest] = position_metrics(arm, [aside]).per_joint.values()
+    [at_rest] = pool_positions([aside]).per_joint.values()
     assert (at_rest.relative_error_pct, at_rest.baselines) == (None, {"command": None})
     assert at_rest.rmse == pytest.approx(3e-3)
     driven = run(arm.joints, [3e-3], [1e-4], [0.0], steady=[0.1])
-    assert len(position_metrics(arm, [driven], moving=True).per_joint) == 1, "by its torque"
+    assert len(pool_positions([driven], moving=True).per_joint) == 1, "by its torque"
 
 
 def test_a_motion_of_no_size_has_no_share_and_a_rail_has_metres(tmp_path):
     rail = slider(tmp_path)
-    [found] = position_metrics(rail, [run(rail.joints, [1e-3], [0.0], [0.0])]).per_joint.values()
+    [found] = pool_positions([run(rail.joints, [1e-3], [0.0], [0.0])]).per_joint.values()
     assert found.unit == "m"
     assert found.relative_error_pct is None
     assert not found.better_than_constant

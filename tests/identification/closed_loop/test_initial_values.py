@@ -8,22 +8,13 @@ from helpers.paths import URDF
 
 from robotid.dynamics.prediction import predict_instants
 from robotid.identification.closed_loop.encoder_zeros import _Motion, same_encoders
-from robotid.identification.closed_loop.initial_values import (
-    free_zeros,
-    is_stated,
-)
+from robotid.identification.closed_loop.initial_values import free_zeros
 from robotid.robot.model import RobotModel
 
 
 @pytest.fixture(scope="module")
 def planar():
     return RobotModel.from_urdf(URDF / "planar_2r.urdf")
-
-
-def test_a_number_states_all_joints_and_a_table_those_it_names(planar):
-    a, b = planar.joints
-    for value, wanted in ((3.0, [1, 1]), (None, [0, 0]), ({b: 1.0}, [0, 1]), ({a: 0.0}, [1, 0])):
-        assert is_stated(value, planar).tolist() == [bool(x) for x in wanted]
 
 
 def test_zeros_other_than_the_urdfs_are_free_about_their_first_estimates(planar):

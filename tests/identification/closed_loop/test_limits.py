@@ -9,7 +9,6 @@ from robotid.diagnosis.logs.command_channels import largest_speeds
 from robotid.estimation.fitting.estimator_settings import SimulationSettings
 from robotid.identification.closed_loop.from_commands import identify_loops
 from robotid.identification.closed_loop.loop_settings import LoopSettings
-from robotid.identification.closed_loop.stages import fit_loops
 
 RATE, HELD, RAMP, STEPS = 250.0, 110, 20, 4  # [Hz], rows, of a leg that goes from pose to pose
 LIMIT, VISCOUS, KP = 9.0, 4.5, 200.0  # [N m], [N m s/rad], [N m/rad] of the calf
@@ -68,22 +67,6 @@ def test_a_drive_at_its_limit_has_it_found(limited):
     error = dict(zip(estimate.names, estimate.std_error, strict=True))[f"{calf}.limit"]
     assert said.evidence == {"limit": values[f"{calf}.limit"], "std_error": error}
     assert f"as {values[f'{calf}.limit']:.3g} +- {error:.2g} N m; at the limit" in said.message
-
-
-def test_a_limit_that_is_stated_is_taken(limited):
-    robot, log = limited
-    loop = gains(robot, delays="group", limit={robot.model.joints[2]: 20.0})
-    n = 300  # rows: what is taken does not depend on them
-    log = replace(log, t=log.t[:n], q=log.q[:n], tau=log.tau[:n], q_ref=log.q_ref[:n])
-    fitted = fit_loops(robot.model, [log], loop, SETTINGS, chooses=False)
-    np.testing.assert_array_equal(fitted.loops.limit, [np.inf, np.inf, 20.0])
-    assert not [name for name in fitted.estimate.names if name.endswith("limit")]
-    delays = [name for name in fitted.estimate.names if name.endswith("delay")]
-    assert delays == [f"{joint}.delay" for joint in robot.model.joints]
-
-
-def test_drives_below_their_limits_have_none():
-    assert largest_speeds(stepped(np.inf)[1]) == {}
 
 
 def test_a_drive_that_saturates_while_it_follows_has_its_limit_and_gain_found():

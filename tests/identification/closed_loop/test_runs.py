@@ -9,10 +9,10 @@ from helpers.mujoco_plant import plant, recorded
 from robotid.dynamics.simulation.loops import ClosedLoopRobot, cut_windows
 from robotid.estimation.estimators.estimator import Estimate
 from robotid.estimation.estimators.output_error import segment_scores
-from robotid.identification.closed_loop.loop_result import loop_runs, units_of
+from robotid.identification.closed_loop.loop_result import loop_runs
 from robotid.identification.closed_loop.loop_simulator import FreeParameter, LoopSimulator
 from robotid.output.files.commanded import loops_of
-from robotid.robot.drives import Coulomb, Viscous
+from robotid.robot.drives import Coulomb
 
 NOISE = 1e-4  # [rad]
 
@@ -97,12 +97,3 @@ def test_robots_bounds_and_two_logs(leg):
     logs = list(dict.fromkeys(window.log for window in simulator.windows))[:2]
     two = replace(simulator, windows=tuple(w for w in simulator.windows if w.log in logs))
     assert loop_runs(robot.model, two, estimate) == ()
-
-
-def test_units_are_those_of_the_drive(leg):
-    robot, _, _ = leg
-    for what, unit in (("armature", "kg m^2"), ("kd", "N m s/rad"), ("zero", "rad"),
-                       ("limit", "N m"), ("delay", "s")):  # fmt: skip
-        assert units_of(robot.model, FreeParameter("x", what, (1,), 0.0, 1.0)) == unit
-    viscous = FreeParameter("x", "term", (0,), 0.0, 1.0, term=Viscous())
-    assert units_of(robot.model, viscous) == "N m s/rad"

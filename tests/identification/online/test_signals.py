@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from robotid.base.exceptions import DataError, SettingsError
+from robotid.base.exceptions import DataError
 from robotid.identification.online.causal_signals import LiveSignals
 
 FIXED = np.array([False])
@@ -93,12 +93,3 @@ def test_a_bad_sample_is_refused_and_leaves_no_trace():
         shapes = rf"q has shape \({len(q)},\) and tau \({len(tau)},\), wanted \(1,\) each"
         with pytest.raises(DataError, match=shapes):
             clean.push(9.0, q, tau)
-
-
-def test_settings_that_cannot_be_are_refused():
-    with pytest.raises(SettingsError, match="cutoff 60 Hz is not between 0 and half the rate"):
-        LiveSignals(1, 100.0, 60.0, 4, FIXED)
-    with pytest.raises(SettingsError, match="order is 3, wanted an even number"):
-        LiveSignals(1, 100.0, 6.0, 3, FIXED)
-    with pytest.raises(SettingsError, match=r"cutoff 6 Hz is less than 1e-05 of the rate 1e\+06"):
-        LiveSignals(1, 1e6, 6.0, 4, FIXED)

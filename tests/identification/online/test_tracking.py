@@ -1,15 +1,12 @@
 import json
-from dataclasses import replace
 
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from helpers.synthetic import payload_log
 
-from robotid.base.exceptions import DataError
 from robotid.cli import main
 from robotid.cli import track as command
-from robotid.cli.work.job import read_job
 from robotid.data.files.read import write_log
 from robotid.identification.online.identifier import track
 from robotid.identification.online.online_settings import OnlineSettings
@@ -75,29 +72,3 @@ def test_a_history_has_twenty_rows_a_second_and_the_last_sample(panda):
     assert (np.diff(found.excitation) >= -1e-9).all()
     assert found.excitation[-1] == last.excitation
     np.testing.assert_array_equal(columns["converged"], found.converged)
-
-
-def test_a_log_without_motion_is_refused(panda, tmp_path):
-    log = payload_log(panda, np.random.default_rng(0), duration=3.0, at=99.0)
-    still = replace(log, q=np.zeros(log.q.shape))
-    with pytest.raises(DataError, match="moves for less than the warm-up of 1 s"):
-        track(panda, still, OnlineSettings())
-
-
-def test_real_recordings_are_tracked_without_a_false_alarm(recordings, monkeypatch):
-    monkeypatch.setenv("ROBOTID_DATA", str(recordings))
-    from pathlib import Path
-
-    for robot in ("ur10e", "panda_inria"):
-        job = read_job(Path(__file__).parents[2] / "jobs" / f"{robot}.toml")
-        model = job.model()
-        log = job.read(job.identification[-1], model)
-        log = log.window(log.t[0], log.t[0] + 10.0)
-        settings = OnlineSettings(
-            rate=1.0 / float(np.median(np.diff(log.t))),
-            cutoff=job.signals.cutoff,
-            min_velocity=job.signals.min_velocity,
-        )
-        found = track(model, log, settings)
-        assert found.identifier.changes == ()
-        assert found.excitation[-1] > 0.8

@@ -11,7 +11,7 @@ from robotid.output.files.commanded import CommandedDrive, limit_of
 from robotid.output.files.links import _pose, unstated_terms
 from robotid.output.files.mjcf import _Servos, write_mjcf
 from robotid.output.files.sdf import _add_geometry, write_sdf
-from robotid.robot.meshes import Shape
+from robotid.robot.geometry import Shape
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import Coupling
 from robotid.robot.tree import Joint

@@ -5,28 +5,23 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from helpers.crane import RATES, STARTS, identified_crane
+from helpers.crane import RATES, STARTS
 
-from robotid.output.files.loop_export import (
+from robotid.output.files.entries import (
     _covariance,
-    _loop_parameters,
+    input_entries,
     loop_entries,
-    loop_inputs,
+    loop_parameters,
 )
 
 
 @pytest.fixture(scope="module")
-def found(tmp_path_factory):
-    return identified_crane(tmp_path_factory.mktemp("crane"))
+def entries(crane):
+    return loop_entries(crane)
 
 
-@pytest.fixture(scope="module")
-def entries(found):
-    return loop_entries(found)
-
-
-def test_what_was_stated_has_no_error_and_what_was_found_has_its_own(found, entries):
-    estimate, loops = found.fit.estimate, found.fit.loops
+def test_what_was_stated_has_no_error_and_what_was_found_has_its_own(crane, entries):
+    estimate, loops = crane.fit.estimate, crane.fit.loops
     [k] = [k for k, name in enumerate(estimate.names) if name.endswith("delay")]
     units = {"kp": ("N/m", "N m/rad"), "kd": ("N s/m", "N m s/rad"), "delay": ("s", "s"),
              "limit": ("N", "N m"), "zero": ("m", "rad")}  # fmt: skip
@@ -35,12 +30,12 @@ def test_what_was_stated_has_no_error_and_what_was_found_has_its_own(found, entr
         for what, unit in units.items():
             if (joint, what) == ("turn", "limit"):
                 continue  # it has none
-            is_found = what == "delay"  # of all drives together
+            is_free = what == "delay"  # of all drives together
             wanted.append({
                 "name": f"{joint}.{what}", "value": getattr(loops, what)[j],
-                "std_error": estimate.std_error[k] if is_found else None,
-                "quantile": estimate.quantile[k] if is_found else None,
-                "unit": unit[j], "source": "data" if is_found else "stated",
+                "std_error": estimate.std_error[k] if is_free else None,
+                "quantile": estimate.quantile[k] if is_free else None,
+                "unit": unit[j], "source": "data" if is_free else "stated",
             })  # fmt: skip
     assert entries["loop_parameters"] == wanted
     assert loops.delay == pytest.approx(np.full(2, 0.006), abs=4 * estimate.std_error[k])
@@ -73,7 +68,7 @@ def test_each_joint_has_the_error_of_its_own_unknown():
     joints = [SimpleNamespace(name=name, type=kind) for name, kind in names]
     loop = SimpleNamespace(kind="pd")
     found = SimpleNamespace(loop=loop, fit=fit, model=SimpleNamespace(limits=joints))
-    shown = {entry["name"]: entry for entry in _loop_parameters(found)}
+    shown = {entry["name"]: entry for entry in loop_parameters(found)}
     errors = {"b.kp": (1.0, 2.1), "c.kp": (2.0, 2.2), "a.delay": (3.0, 2.3), "c.delay": (3.0, 2.3),
               "b.zero": (4.0, 2.4)}  # fmt: skip
     assert len(shown) == 13
@@ -92,23 +87,23 @@ def test_each_joint_has_the_error_of_its_own_unknown():
                 "name": name, "value": values[what][j], "std_error": error, "quantile": reach,
                 "unit": unit, "source": source if name in errors else "stated",
             }  # fmt: skip
-    assert _loop_parameters(SimpleNamespace(loop=SimpleNamespace(kind="torque"))) == []
+    assert loop_parameters(SimpleNamespace(loop=SimpleNamespace(kind="torque"))) == []
 
 
-def test_sums_of_bodies_that_were_not_fitted_are_named(found):
-    n, names = found.model.layout.n_inertial, np.array(found.mapping.base_names)
-    is_body = np.array(found.mapping.independent) < n
+def test_sums_of_bodies_that_were_not_fitted_are_named(crane):
+    n, names = crane.model.layout.n_inertial, np.array(crane.mapping.base_names)
+    is_body = np.array(crane.mapping.independent) < n
     assert is_body.sum() > 1
     assert (~is_body).sum() > 1
     error = np.ones(len(names))
     last, drive = np.flatnonzero(is_body)[-1], np.flatnonzero(~is_body)[0]
     error[[last, drive]] = np.inf
-    other = loop_entries(replace(found, base_error=error))
+    other = loop_entries(replace(crane, base_error=error))
     assert other["ranges"]["undetermined"] == [names[last]]
 
 
-def test_each_log_has_its_times_rate_and_role(found):
-    inputs = loop_inputs(found)
+def test_each_log_has_its_times_rate_and_role(crane):
+    inputs = input_entries(crane)[1:]
     assert [entry["role"] for entry in inputs] == ["identification"] * 2 + ["validation"]
     for entry, start, rate in zip(inputs, STARTS, RATES, strict=True):
         rows = round(1.5 * rate)
@@ -118,10 +113,12 @@ def test_each_log_has_its_times_rate_and_role(found):
         assert entry["end"] == pytest.approx(start + (rows - 1) / rate)
 
 
-def test_open_loops_have_the_errors_of_each_joint_and_horizon(found, entries):
-    for role, runs in (("identification", found.fitted), ("validation", found.validation)):
-        shown = entries["simulation"][role]
-        assert len(shown) == len(runs) == {"identification": 2, "validation": 1}[role]
+def test_open_loops_have_the_errors_of_each_joint_and_horizon(crane, entries):
+    for role, runs in (("identification", crane.fitted), ("validation", crane.validation)):
+        shown = [run.to_dict() for run in runs]
+        if role == "identification":
+            assert entries["simulation"][role] == shown
+        assert len(shown) == {"identification": 2, "validation": 1}[role]
         for entry, run in zip(shown, runs, strict=True):
             assert (entry["start"], entry["end"]) == (run.log.t[0], run.log.t[-1])
             error = np.sqrt(np.mean((run.log.q - run.q) ** 2, axis=0))
@@ -137,14 +134,14 @@ def test_open_loops_have_the_errors_of_each_joint_and_horizon(found, entries):
                 assert entry["horizons"][f"{horizon:g}"] == dict(
                     zip(("rail", "turn"), errors, strict=True)
                 )
-    [kept] = entries["validation"]
-    share = 100 * found.validation[0].rmse / found.validation[0].log.q.std(axis=0)
+    [kept] = [run.to_dict() for run in crane.validation]
+    share = 100 * crane.validation[0].rmse / crane.validation[0].log.q.std(axis=0)
     for joint, own in zip(("rail", "turn"), share, strict=True):
         assert kept["per_joint"][joint]["relative_error_pct"] == pytest.approx(own)
 
 
-def test_the_fit_says_what_it_is(found, entries):
-    fit, estimate = entries["simulation"]["fit"], found.fit.estimate
+def test_the_fit_says_what_it_is(crane, entries):
+    fit, estimate = entries["simulation"]["fit"], crane.fit.estimate
     assert fit["converged"] is True
     assert fit["parameters"] == len(estimate.names) == 5  # two armatures and frictions, one delay
     assert entries["structure"]["rank"] == estimate.rank == 5

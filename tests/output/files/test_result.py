@@ -13,7 +13,7 @@ from helpers.figures import figures
 from robotid import __version__
 from robotid.base.exceptions import DataError, ModelError
 from robotid.base.findings import Finding
-from robotid.output.files.entries import _curve, _expected_torque, build_result, recording_metrics
+from robotid.output.files.entries import _curve, _expected_torque, build_result
 from robotid.output.files.result_file import read_result, stated_parameters
 from robotid.robot.parameters import INERTIAL_TERMS
 
@@ -160,7 +160,7 @@ def test_metrics_are_those_of_the_prediction_they_name(result, identified, name)
     (kept,) = part["validation"]
     assert kept["log"] == identified.validation[0].recording.log.path
     assert_metrics(kept, figures(identified, identified.validation, name))
-    assert recording_metrics(identified.validation[0], name).items() <= kept.items()
+    assert identified.validation[0].to_dict(name).items() <= kept.items()
     other = result["wls"] if name == "estimate" else result
     joints = part["validation"][0]["per_joint"]
     for joint, row in other["validation"][0]["per_joint"].items():

@@ -10,13 +10,9 @@ from robotid.output.pages.html import (
     asset,
     code,
     command_html,
-    facts_html,
-    figure,
     number,
     page,
     percent,
-    steps_html,
-    table,
     text,
     verdict_html,
     with_error,
@@ -36,27 +32,6 @@ def test_a_verdict_shows_three_reasons_and_folds_all_others():
     assert verdict_html("arm", "good", [], "a < b").endswith(
         '<ul></ul><p class="uses">a &lt; b</p></div>\n'
     )
-
-
-def test_facts_end_with_links_to_the_files():
-    html = facts_html({"Mass": "<b>2 kg</b>"}, {"urdf": "a b.urdf", "result": 'r".json'})
-    assert html == (
-        '<dl class="facts"><div><dt>Mass</dt><dd><b>2 kg</b></dd></div>'
-        '<div><dt>Files</dt><dd><a href="a b.urdf">URDF</a>, '
-        '<a href="r&quot;.json">result</a></dd></div></dl>\n'
-    )
-    assert "Files" not in facts_html({"Mass": "2 kg"})
-
-
-def test_a_step_has_each_of_its_blocks_to_copy():
-    html = steps_html([("Try <it>.", ("one", "a & b")), ("Read.", ())])
-    assert html == (
-        '<h2 id="next">Do next</h2>\n<ol class="next"><li><p>Try &lt;it&gt;.</p>'
-        '<div class="copy"><pre class="command">one</pre></div>'
-        '<div class="copy"><pre class="command">a &amp; b</pre></div></li>\n'
-        "<li><p>Read.</p></li>\n</ol>\n"
-    )
-    assert steps_html([]) == ""
 
 
 def test_a_command_breaks_between_arguments_only():
@@ -107,32 +82,6 @@ def test_a_cell_has_the_style_of_its_content_and_its_number_in_full():
         (percent(-0.5), ("−0.50", "number", -0.5)), (percent(None), ("–", "number", None)),
     ):  # fmt: skip
         assert (cell.html, cell.kind, cell.value) == wanted
-
-
-def test_a_table_has_heads_by_its_first_row_and_numbers_for_its_scripts():
-    rows = [[text("one"), number(1.5), text("x")], [text("two"), number(None), number(1 / 3)]]
-    box = '<div class="scroll" tabindex="0" role="region" aria-label="&lt;t&gt;">'
-    head = (
-        '<thead><tr><th scope="col" class="text">a</th><th scope="col" class="number">b</th>'
-        '<th scope="col" class="text">&lt;c&gt;</th></tr></thead>'
-    )
-    first = '<tr><th scope="row" class="text">{}</th><td class="number"{}>{}</td><td class="{}"{}>'
-    one = first.format("one", "{}", "1.5", "text", "") + "x</td></tr>\n"
-    two = first.format("two", "", "–", "number", "{}") + "0.3333</td></tr>\n"
-    wanted = (
-        f"{box}<table><caption>&lt;t&gt;</caption>{head}<tbody>{one.format('')}{two.format('')}"
-        f"</tbody><tfoot>{one.format('')}</tfoot></table></div>\n"
-    )
-    assert table("<t>", ("a", "b", "<c>"), rows, rows[0]) == wanted
-    filled = one.format(' data-value="1.5"') + two.format(' data-value="0.3333333333"')
-    wanted = (
-        f'{box}<table class="data"><caption>&lt;t&gt;</caption>{head}<tbody>{filled}</tbody>'
-        "</table></div>\n"
-    )
-    assert table("<t>", ("a", "b", "<c>"), rows, is_data=True) == wanted
-    assert '<th scope="col" class="text">b</th>' in table("none", ("a", "b"), [])
-    assert figure("c", "<svg/>").startswith('<figure tabindex="0"><figcaption>c</figcaption><svg/>')
-    assert figure("c", "<svg/>", single=True).startswith('<figure class="single" tabindex="0">')
 
 
 def test_a_page_links_to_its_sections_and_runs_the_scripts_that_they_need():

@@ -10,15 +10,15 @@ import pytest
 
 from robotid.base.findings import Finding
 from robotid.cli import _parser
-from robotid.cli.work.job import job_from_settings
+from robotid.cli.job import job_from_settings
 from robotid.diagnosis.residual.candidates import CANDIDATES, couplings, ripples
 from robotid.diagnosis.residual.misfit import Misfit
 from robotid.diagnosis.residual.misfit_findings import misfit_findings, setting_of
 from robotid.diagnosis.verdict.payload_check import PayloadCheck
-from robotid.diagnosis.verdict.verdict import WARNING_CODES
+from robotid.diagnosis.verdict.verdict import WARNING_CODES, JointVerdict, Verdict
 from robotid.estimation.fitting.estimator_settings import ConsistentSettings
 from robotid.estimation.fitting.joint_motion import JointMotion
-from robotid.output.report.loop_steps import loop_steps
+from robotid.identification.closed_loop.loop_settings import LoopSettings
 from robotid.output.report.next_steps import _of_verdict, _once, next_steps
 from robotid.output.report.steps import Origin, Step
 from robotid.robot.examples import example_urdf
@@ -519,79 +519,41 @@ def test_joints_that_any_recording_misses_are_looked_at_and_the_first_is_played(
     assert " x.csv out" in played
 
 
-# --- results from commands and positions ----------------------------------------------------------
+# --- identifications that predict positions -------------------------------------------------------
 
 
-def loop_content(status, *, log_errors=(), warnings=()):
-    inputs = [{"role": "urdf", "path": "arm.urdf"}, {"role": "identification", "path": "a.csv"}]
-    per_joint = {joint: {"status": "good", "reasons": []} for joint in ("one", "two", "three")}
-    per_joint["two"] = {"status": status, "reasons": []}
-    return {
-        "robot": "arm", "joints": list(per_joint), "inputs": inputs,
-        "simulation": {"controller": {"kind": "pd"}}, "warnings": list(warnings),
-        "verdict": {"status": status, "log_errors": list(log_errors), "per_joint": per_joint},
-    }  # fmt: skip
+def judged(crane, status, findings=(), log_errors=()):
+    """Return the crane with a verdict: the rail is good, the turning joint as stated."""
+    found = replace(crane, findings=tuple(findings), log_errors=tuple(log_errors))
+    joints = {"rail": JointVerdict("good", ()), "turn": JointVerdict(status, ())}
+    vars(found)["verdict"] = Verdict(status, (), joints, tuple(log_errors))
+    return found
 
 
-def loop_warning(code, where):
-    message = f"{where} has {code}; do something"
-    return {"code": code, "severity": "warning", "where": where, "message": message}
-
-
-def test_a_usable_result_of_commands_is_exported():
-    content = loop_content("usable")
-    replay, *exports = loop_steps(content, JOB)
-    assert replay == Step(
-        "Compare the commanded, measured and simulated robot in the replay.",
-        ("robotid replay arm.urdf a.csv out/result.json",),
-    )
-    assert [step.blocks[0].split()[3:] for step in exports] == [
-        ["--format", "mjcf", "--out", "arm.xml"],
-        ["--format", "isaac", "--out", "arm_actuators.yaml"],
-        ["--format", "ranges", "--out", "arm_ranges.yaml"],
-    ]
-    assert exports[0].words == "Simulate it in MuJoCo, gains and delays included."
-    assert loop_steps(content, Origin()) == ()
-    content["simulation"]["controller"]["kind"] = "torque"
-    replay, *exports = loop_steps(content | {"robot": ""}, JOB)
+def test_a_usable_result_of_commands_is_exported(crane):
+    replay, *exports = next_steps(judged(crane, "usable"), JOB)
+    assert replay.words == "Compare the commanded, measured and simulated robot in the replay."
+    assert replay.blocks[0].startswith(f"robotid replay {crane.model.tree.path} ")
+    exported = {step.blocks[0].split()[4]: step.blocks[0].split()[6] for step in exports}
+    files = {"mjcf": "crane.xml", "isaac": "crane_actuators.yaml", "ranges": "crane_ranges.yaml"}
+    assert exported == files
+    assert next_steps(judged(crane, "usable"), Origin()) == ()
+    driven = judged(replace(crane, loop=LoopSettings(kind="torque")), "usable")
+    replay, export = next_steps(driven, JOB)
     assert replay.words == "Compare measured and predicted torque in the replay."
-    (export,) = exports
     assert export.words.startswith("Use the result: the identified URDF is written")
-    assert export.blocks == ("robotid export out/result.json --format mjcf --out robot.xml",)
 
 
-def test_the_replay_of_commands_shows_the_first_validation_log():
-    content = loop_content("usable")
-    assert " arm.urdf a.csv " in loop_steps(content, JOB)[0].blocks[0]
-    content["inputs"] += [{"role": "validation", "path": f"{name}.csv"} for name in "bc"]
-    assert " arm.urdf b.csv " in loop_steps(content, JOB)[0].blocks[0]
-
-
-def test_a_poor_result_of_commands_is_repaired_and_not_used():
-    warnings = [loop_warning("alike", "one"), loop_warning("small", "a.csv: two")]
-    steps = loop_steps(loop_content("poor", warnings=warnings), JOB)
-    assert [step.words.partition(":")[0] for step in steps] == [
-        "a.csv",  # of the poor joint
-        "One has alike; do something.",
-        "Do not use the result",
-    ]
-    assert "position of two is wrong" in steps[-1].words
+def test_a_poor_result_of_commands_is_corrected_and_not_used(crane):
+    findings = [warning("c0", "rail"), warning("c1", "a.csv: turn"), warning("c2", "rail")]
+    steps = next_steps(judged(crane, "poor", findings), JOB)
+    assert [step.words.split()[0] for step in steps] == ["C1", "C0", "Do"]  # of the poor joint
+    assert "position of turn is wrong" in steps[-1].words
     assert [block.split()[1] for step in steps for block in step.blocks] == ["replay", "identify"]
-
-
-def test_the_causes_of_poor_joints_come_first_and_three_steps_are_enough():
-    warnings = [loop_warning(f"c{k}", where) for k, where in enumerate(("one", "two", "three"))]
-    steps = loop_steps(loop_content("poor", warnings=warnings), JOB)
-    assert [step.words.split(";")[0] for step in steps[:2]] == ["Two has c1", "One has c0"]
-    assert len(steps) == 3
-    assert steps[-1].words.startswith("Do not use the result")
-
-
-def test_errors_of_a_log_of_commands_are_corrected_first():
-    content = loop_content("poor", log_errors=["a.csv: two moves before its command", "x"])
-    assert [step.blocks for step in loop_steps(content, Origin())] == [()]
-    (step,) = loop_steps(content, JOB)
-    assert "Correct the logs, then repeat the identification: a.csv: two moves" in step.words
+    wrong = judged(crane, "poor", log_errors=["a.csv: turn moves before its command", "x"])
+    assert [step.blocks for step in next_steps(wrong, Origin())] == [()]
+    (step,) = next_steps(wrong, JOB)
+    assert "Correct the logs, then repeat the identification: a.csv: turn moves" in step.words
     assert [block.split()[1] for block in step.blocks] == ["doctor", "identify"]
 
 

@@ -5,8 +5,8 @@ import re
 import pytest
 from helpers.pages import tables
 
-from robotid.base.findings import Finding
-from robotid.output.report.causes_section import findings_line, findings_section
+from robotid.base.findings import Finding, grouped
+from robotid.output.report.report_page import _by_joint, _cause, findings_line
 
 JOINTS = ("one", "two", "three")
 
@@ -38,7 +38,8 @@ def test_the_line_counts_what_is_grave_its_causes_and_notes(findings, worst, lin
 
 
 def test_each_joint_has_its_causes_the_worst_first_and_notes_apart():
-    html = findings_section(MANY, JOINTS, ["two", "three", "one"])
+    causes = grouped(MANY, JOINTS)
+    html = _by_joint(["two", "three", "one"], causes) + "".join(map(_cause, causes))
     assert tables(html)["Findings by joint, the worst first"].rows == [
         ["two", "spikes, late", "slow"], ["three", "–", "slow"], ["one", "late", "–"],
     ]  # fmt: skip
@@ -46,4 +47,3 @@ def test_each_joint_has_its_causes_the_worst_first_and_notes_apart():
         ("error", "spikes"), ("warning", "late"), ("note", "slow"), ("note", "gap"),
     ]  # fmt: skip
     assert set(re.findall(r'href="#cause-(\w+)"', html)) == {"spikes", "late", "slow"}
-    assert findings_section([], JOINTS, JOINTS) == "<p>None.</p>\n"

@@ -1,9 +1,7 @@
 """The replay in a report, from files: one clock, and what is said while there is no replay."""
 
-import json
 import re
 import shlex
-from html import unescape
 
 import numpy as np
 import pytest
@@ -13,8 +11,6 @@ from helpers.synthetic import exact_log, truth
 
 from robotid.cli import main
 from robotid.data.files.read import write_log
-from robotid.output.report.dock import Clip, Dock
-from robotid.output.report.steps import Origin
 from robotid.robot.model import RobotModel
 
 CURSOR = "charts.link('recording 0').shown"
@@ -120,57 +116,3 @@ def test_a_click_in_a_chart_sets_the_time_and_a_pointer_that_passes_restores_it(
     docked.page.mouse.move(box["x"] - 30, y)
     docked.page.wait_for_timeout(100)
     assert frame(docked).evaluate("replay.clock.time") == docked.page.evaluate(CURSOR) > 3
-
-
-def test_a_pointer_that_passes_does_not_stop_the_motion(docked):
-    chart = docked.page.locator("details[open] .u-over").first
-    box = chart.bounding_box()
-    frame(docked).evaluate("replay.seek(0.5); replay.play()")
-    docked.page.mouse.move(box["x"] + 0.8 * box["width"], box["y"] + 0.2 * box["height"])
-    docked.page.wait_for_timeout(200)
-    assert frame(docked).evaluate("replay.clock.playing")
-    assert frame(docked).evaluate("replay.clock.time") < 3.0
-    docked.page.mouse.move(box["x"] - 30, box["y"])
-    frame(docked).evaluate("replay.pause()")
-
-
-def test_a_replay_of_another_log_has_no_clock_and_the_command_for_this_one(browser, folder):
-    page, other = folder / "result" / "replay.html", str(folder / "first.csv")
-    words = [str(URDF / "planar_2r.urdf"), other, str(folder / "result")]
-    assert main(["replay", *words]) == 0
-    with visit(browser, folder / "result" / "report.html", reduced_motion="reduce") as seen:
-        seen.page.locator("details[open] a[data-at]").first.click()
-        until(seen, f"{STATE}.includes('first.csv')")
-        assert "second.csv" in seen.page.locator("#dock [role=status]").inner_text()
-        assert f"{folder / 'second.csv'}" in seen.page.locator("#dock pre").inner_text()
-        frame(seen).evaluate("replay.seek(2)")
-        seen.page.wait_for_timeout(200)
-        assert seen.page.evaluate(f"Number.isNaN({CURSOR})")
-    page.unlink()
-
-
-def test_without_folder_or_file_there_is_no_dock():
-    clip = Clip("recording 0", "a b.csv", 0.0, 1.0)
-    in_memory = clip._replace(log="")
-    origin = Origin((), "out", "replay.html")
-    for dock in (
-        Dock(),
-        Dock("", Origin(), "arm.urdf", [clip]),
-        Dock("", origin, "arm.urdf", [in_memory]),
-    ):
-        assert (dock.html, dock.link("Show", 1.0, "j", "a")) == ("", "")
-    html = Dock("", origin, "arm.urdf", [in_memory, clip]).html
-    assert "<span>arm.urdf</span> <span>&#x27;a b.csv&#x27;</span> <span>out</span></pre>" in html
-    clips = json.loads(unescape(re.search(r'data-clips="([^"]*)"', html)[1]))
-    assert [c["log"] for c in clips] == ["", "a b.csv"]
-    assert "<pre" not in Dock("replay.html", Origin(), "arm.urdf", [in_memory]).html
-
-
-def test_recordings_have_their_times_and_links_theirs():
-    clips = [Clip("recording 0", "day/a b.csv", 1.5, 9.25), Clip("recording 1", "c.csv", 3.0, 4.0)]
-    dock = Dock("replay.html", Origin((), "out"), "arm.urdf", clips)
-    found = json.loads(unescape(re.search(r'data-clips="([^"]*)"', dock.html)[1]))
-    shown = [tuple(clip[key] for key in ("link", "log", "start", "end")) for clip in found]
-    assert shown == [("recording 0", "a b.csv", 1.5, 9.25), ("recording 1", "c.csv", 3.0, 4.0)]
-    link = unescape(dock.link("Show", 2.34567, "joint 1", "a b.csv"))
-    assert 'href="replay.html#t=2.346&joint=joint%201&log=a%20b.csv" target="replay"' in link

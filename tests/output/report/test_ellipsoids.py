@@ -76,9 +76,3 @@ def test_a_link_without_ellipsoid_has_the_reason():
     nothing = _picture("arm", *ellipsoids(np.zeros(20)), None)
     assert "no mass<br>→ no mass" in nothing
     assert "<svg" not in nothing
-
-
-def test_many_links_are_folded(identified, monkeypatch):
-    assert ellipsoid_pictures(identified).startswith("<h3>")
-    monkeypatch.setattr("robotid.output.report.ellipsoids._LINKS", 5)
-    assert '<details id="solids"><summary>' in ellipsoid_pictures(identified)

@@ -4,23 +4,21 @@ import re
 from dataclasses import replace
 from html import unescape
 
-import numpy as np
 import pytest
 from helpers.pages import bars
 
 from robotid.diagnosis.verdict.evidence import GOOD, POOR
-from robotid.output.report import bars as errors
 from robotid.output.report.errors import TORQUE, Errors, error_bars, worst_errors
 from robotid.output.report.next_steps import next_steps
-from robotid.output.report.shown import first_screen
+from robotid.output.report.report_page import first_screen
 from robotid.output.report.steps import Origin
-from robotid.output.report.torque_section import shown_torques
+from robotid.output.report.torque_report import torque_report
 
 ORIGIN = Origin(("arm.toml",), "out")
 
 
 def screen_of(found, files=None):
-    return first_screen(shown_torques(found, ORIGIN), files or {})
+    return first_screen(torque_report(found, ORIGIN), files or {})
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +50,7 @@ def test_of_several_recordings_the_worst_counts(identified):
     better = {j: replace(m, relative_error_pct=0.1) for j, m in metrics.per_joint.items()}
     other = replace(metrics, per_joint=better | {joint: worse})
     second = replace(kept, metrics={**kept.metrics, "estimate": other})
-    shown = shown_torques(replace(identified, validation=(kept, second)), ORIGIN)
+    shown = torque_report(replace(identified, validation=(kept, second)), ORIGIN)
     errors = worst_errors(shown.counted)
     assert next(iter(errors)) == joint
     for name, measured in errors.items():
@@ -68,7 +66,7 @@ def test_a_recording_that_was_fitted_is_none_that_was_predicted(identified):
     again = replace(kept, metrics=changed, is_refitted=True)
 
     def counted(**changes):
-        return worst_errors(shown_torques(replace(identified, **changes), ORIGIN).counted)
+        return worst_errors(torque_report(replace(identified, **changes), ORIGIN).counted)
 
     for both in ((kept, again), (again, kept)):
         assert counted(validation=both) == counted()
@@ -118,17 +116,6 @@ def test_joints_that_differ_in_the_numbers_of_their_reasons_have_one_line():
     assert whys == ["", "", "error 51 %"]
 
 
-def test_a_recording_is_named_in_reasons_unless_it_is_the_only_one(screen, identified):
-    (kept,) = identified.validation
-    named = f" on {kept.recording.name}"
-    assert any(named in reason for v in identified.verdict.joints.values() for reason in v.reasons)
-    assert named not in screen[screen.index('id="worst"') :]
-    log = replace(kept.recording.log, path="other.csv")
-    second = replace(kept, recording=replace(kept.recording, log=log))
-    both = screen_of(replace(identified, validation=(kept, second)))
-    assert named in both[both.index('id="worst"') :]
-
-
 def test_masses_and_sources_are_those_of_the_result(screen, identified):
     before, after = (pi[:60:10].sum() for pi in (identified.prior, identified.standard))
     assert f"{before:.2f} → {after:.2f} kg" in screen
@@ -146,21 +133,3 @@ def test_the_steps_stand_in_order_with_what_to_copy(screen, identified):
     typed = [unescape(x.replace("<span>", "").replace("</span>", "")) for x in blocks]
     assert typed == [block for step in steps for block in step.blocks]
     assert typed
-
-
-def test_the_best_of_many_joints_are_folded_away(identified, screen, monkeypatch):
-    monkeypatch.setattr(errors, "_ROWS", 4)
-    html = screen_of(identified)
-    shown, folded = html.split("2 more joints with smaller errors")
-    assert [*bars(shown), *bars(folded)] == list(bars(screen))
-    assert len(bars(shown)) == 4
-
-
-def test_the_total_mass_changes_by_its_share(identified, report):
-    names = identified.model.layout.names
-    is_mass = np.array([name.endswith("_link.m") for name in names])
-    before, after = (pi[is_mass].sum() for pi in (identified.prior, identified.standard))
-    change = 100 * (after - before) / before
-    assert abs(change) > 1
-    said = f"<strong>{before:.2f} → {after:.2f} kg</strong> ({change:+.0f} %)"
-    assert said.replace("(-", "(−") in report

@@ -1,16 +1,13 @@
 """How much the data say, against the dense regressor."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 from helpers.fitting import fit
 from helpers.synthetic import exact_log, truth
 
 from robotid.data.signal_settings import SignalSettings
-from robotid.dynamics.factors import Factors
 from robotid.dynamics.torque import joint_torque_regressor
-from robotid.output.report.information_section import information
+from robotid.output.report.torque_report import information
 from robotid.robot.model import RobotModel
 
 
@@ -32,23 +29,15 @@ def dense(found):
     return np.concatenate(rows)
 
 
-def test_singular_values_are_those_of_the_scaled_regressor(found):
-    W = dense(found)
-    wanted = np.linalg.svd(W / np.linalg.norm(W, axis=0), compute_uv=False)
-    said = information(found).singular_values
-    np.testing.assert_allclose(said, wanted, rtol=1e-8)
-    assert said[0] / said[-1] == pytest.approx(found.wls.condition, rel=1e-8)
-
-
 def test_correlation_is_that_of_the_inverse_of_the_normal_matrix(found):
     W = dense(found)
     C = np.linalg.inv(W.T @ W)
     std = np.sqrt(np.diag(C))
-    np.testing.assert_allclose(information(found).correlation, C / np.outer(std, std), atol=1e-6)
+    np.testing.assert_allclose(information(found)[0], C / np.outer(std, std), atol=1e-6)
 
 
 def test_the_share_of_the_data_is_that_of_a_bayesian_update(found):
-    said = information(found).data_share
+    said = information(found)[1]
     K = found.mapping.K
     for b in (0, 7, 30):
         prior = float(K[b] ** 2 @ found.prior_std**2)
@@ -82,35 +71,9 @@ def test_what_the_data_leave_open_has_no_share_and_no_correlation(ur5, rng):
     one = type(log)(t=log.t, q=q, tau=tau + 0.1 * rng.standard_normal(q.shape), v=still, a=a,
                     joints=log.joints)  # fmt: skip
     found = fit(model, [one])
-    said = information(found)
+    correlation, share = information(found)
     open_ones = np.isin(found.mapping.base_names, found.wls.undetermined)
     assert open_ones.sum() > 20
-    assert (said.data_share[open_ones] == 0).all()
-    assert np.isnan(said.correlation[open_ones]).all()
-    assert (said.data_share[~open_ones] > 0).all()
-
-
-def test_information_is_that_of_dense_rows_of_two_joints_with_other_noise(rng):
-    sigma, W = np.array([0.3, 1.7]), rng.standard_normal((2, 9, 3)) * [1.0, 4.0, 0.2]
-    triangles = tuple(np.linalg.qr(np.column_stack([x, x[:, 0]]), mode="r") for x in W)
-    factors = Factors(triangles, (np.arange(3),) * 2, np.array([9, 9]), tuple("abc"))
-    K, prior_std = np.array([[1.0, 0.0, -2.5], [0.0, 3.0, 0.0], [0.5, 0.0, 0.2]]), [0.3, 0.7, 1.1]
-    C = np.diag([0.4, np.inf, 0.0])
-    wls = SimpleNamespace(sigma=sigma, theta=np.ones(3), covariance=C)
-    found = information(
-        SimpleNamespace(factors=factors, wls=wls, prior_std=np.array(prior_std),
-                        mapping=SimpleNamespace(K=K))
-    )  # fmt: skip
-    X = np.concatenate([W[0] / 0.3, W[1] / 1.7])
-    scaled = X / np.linalg.norm(X, axis=0)
-    np.testing.assert_allclose(found.singular_values, np.linalg.svd(scaled, compute_uv=False))
-    prior = (0.3**2 + 2.5**2 * 1.1**2, 9 * 0.7**2, 0.25 * 0.3**2 + 0.04 * 1.1**2)
-    np.testing.assert_allclose(found.data_share, [prior[0] / (prior[0] + 0.4), 0.0, 1.0])
-    B = np.linalg.inv(X.T @ X)
-    assert found.correlation[0, 0] == pytest.approx(1.0)
-    assert np.isnan(found.correlation[1:]).all()
-    wls.covariance = np.diag([0.4, 0.1, 0.2])
-    every = SimpleNamespace(factors=factors, wls=wls, prior_std=np.array(prior_std),
-                            mapping=SimpleNamespace(K=K))  # fmt: skip
-    size = np.sqrt(np.diag(B))
-    np.testing.assert_allclose(information(every).correlation, B / np.outer(size, size), atol=1e-9)
+    assert (share[open_ones] == 0).all()
+    assert np.isnan(correlation[open_ones]).all()
+    assert (share[~open_ones] > 0).all()

@@ -7,15 +7,12 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import scipy.signal
 from scipy.stats import norm
 
 from robotid.base.exceptions import DataError
-from robotid.data.log import Trajectory
-from robotid.data.signal_settings import SignalSettings
 from robotid.diagnosis.residual.torque_split import joint_torques
 from robotid.output.report import pictures
-from robotid.output.report.pictures import residual_charts, why_charts
+from robotid.output.report.pictures import why_charts
 
 
 def series(chart, label):
@@ -52,39 +49,6 @@ def test_friction_and_reasons_are_of_the_joint_named(identified):
     parts = [s for s in split.series if s.kind == "area"]
     whole = np.sum([s.y for s in parts], axis=0)
     np.testing.assert_allclose(whole, series(split, "measured").y, atol=1e-9)
-
-
-@pytest.mark.parametrize("cutoff", [30.0, None])
-def test_a_spectrum_goes_to_twice_the_cut_off_and_lags_to_two_seconds(rng, cutoff):
-    """Of a recording at 1024 Hz, of whose lags every fifth is shown."""
-    rate = 1024.0
-    t = 3.0 + np.arange(6000) / rate
-    tau, predicted = rng.standard_normal((2, len(t), 2)).cumsum(axis=1)
-    still = np.zeros_like(tau)
-    motion = Trajectory(t, still, still, still, tau, ("a", "b"), rate, np.zeros(len(t), dtype=int))
-    recording = SimpleNamespace(
-        trajectory=motion, mask=np.ones(tau.shape), signals=SignalSettings(cutoff=cutoff)
-    )
-    evaluation = SimpleNamespace(recording=recording, torques={"estimate": predicted})
-    found = SimpleNamespace(model=SimpleNamespace(row_names=("a", "b"), row_units=("N m", "N")))
-    power, lags = residual_charts(found, evaluation, 1)
-    residual = (tau - predicted)[:, 1]
-    for x, label in ((tau[:, 1], "torque"), (residual, "residual")):
-        window = np.hanning(5122)[1:-1]
-        f, density = scipy.signal.welch(x, rate, window, nperseg=5120, detrend=False)
-        shown = (f > 0) & (f <= (np.inf if cutoff is None else 60.0))
-        np.testing.assert_allclose(power.x, f[shown])
-        np.testing.assert_allclose(series(power, label).y, np.sqrt(density[shown]))
-    ks = np.arange(0, 2049, 5)
-    np.testing.assert_allclose(lags.x, ks / rate)
-    pairs = [(residual[: len(t) - k], residual[k:]) for k in ks]
-    wanted = [a @ b / np.sqrt((a @ a) * (b @ b)) for a, b in pairs]
-    np.testing.assert_allclose(series(lags, "residual").y, wanted, atol=1e-9)
-    marks = () if cutoff is None else (30.0,), () if cutoff is None else (1 / 60.0,)
-    assert (power.marks, lags.marks) == (marks[0], pytest.approx(marks[1]))
-    assert (power.y_label, lags.x_label) == ("density [N/√Hz]", "lag [s]")
-    recording.mask[:, 1] = 0.0
-    assert residual_charts(found, evaluation, 1) is None
 
 
 def test_what_a_residual_follows_is_drawn_with_its_interval_and_what_friction_takes(identified):
@@ -186,32 +150,6 @@ def test_friction_is_drawn_at_position_and_load_of_the_samples_used(rng, monkeyp
     assert pictures.friction_chart(found, "b", split=(left, friction)) is None
 
 
-def test_drives_are_drawn_beside_what_was_before():
-    layout = SimpleNamespace(
-        names=("a.armature", "a.mx", "b.armature", "j.viscous", "k.viscous"),
-        units=("kg m^2", "kg m", "kg m^2", "N m s/rad", "N s/m"), n_inertial=3,
-    )  # fmt: skip
-    found = SimpleNamespace(
-        model=SimpleNamespace(layout=layout), standard=np.arange(5.0) + 1,
-        standard_error=np.array([0.5, 0.1, np.inf, 0.25, 0.75]),
-        prior=np.array([3.0, 0.0, 4.0, 0.0, 7.0]),
-    )  # fmt: skip
-    mass, turn, slide = pictures.parameter_charts(found, ("armature", "viscous"))
-    assert mass.title.startswith("armature of each drive, before the fit and identified")
-    assert turn.title.startswith("viscous of each drive, before the fit and identified")
-    assert [s.label for s in mass.series] == ["before the fit", "identified ± 2 s.e."]
-    assert [s.label for s in turn.series] == ["identified ± 2 s.e."]  # nothing before
-    assert [s.label for s in slide.series] == ["before the fit", "identified ± 2 s.e."]
-    assert mass.series[0].y.tolist() == [3.0, 4.0]
-    assert mass.series[1].y.tolist() == [1.0, 3.0]
-    np.testing.assert_array_equal(mass.series[1].half, [1.0, np.nan])
-    assert (slide.series[1].y.tolist(), slide.series[1].half.tolist()) == ([5.0], [1.5])
-    assert [(c.x_names, c.y_label) for c in (mass, turn, slide)] == [
-        (("a", "b"), "armature [kg m^2]"), (("j",), "viscous [N m s/rad]"),
-        (("k",), "viscous [N s/m]"),
-    ]  # fmt: skip
-
-
 def test_a_line_hides_four_times_as_high_as_the_others_and_gaps_of_a_pixel_are_one():
     flat = np.array([0.0, np.nan, 1.0])
     assert not pictures._dwarfs(np.array([-1.9, 2.0]), flat, flat)
@@ -251,52 +189,3 @@ def test_reasons_of_two_recordings_show_the_first_over_time(identified):
         np.testing.assert_array_equal(series(chart, "mean").y, mean)
         np.testing.assert_allclose(series(chart, "mean").half, 1.96 * error)
     assert why_charts(torque, link="shared")["time"].link == "shared"
-
-
-def test_each_torque_has_the_band_of_its_own_row(identified):
-    e = identified.fitted[0]
-    band, motion = identified.band(e), e.recording.trajectory
-    for j in (1, 4):
-        torque, residual = pictures.torque_charts(identified, e, j)
-        used = e.recording.mask[:, j].astype(bool)
-        half = 1.96 * np.interp(np.arange(len(used)), band.samples, band.total[:, j])
-        drawn = np.isin(torque.x, motion.t) & np.isfinite(series(torque, "measured").y)
-        for chart, label in ((torque, "identified"), (residual, "95 % band")):
-            np.testing.assert_allclose(series(chart, label).half[drawn], half)
-        for label, key in (("identified", "estimate"), ("URDF", "urdf")):
-            y = series(torque, label).y[drawn]
-            np.testing.assert_allclose(y[used], e.torques[key][used, j])
-            assert np.isnan(y[~used]).all()
-
-
-@pytest.mark.parametrize("rank", [3, 5])
-def test_singular_values_are_split_at_the_rank(rank):
-    values = np.array([9.0, 4.0, 1.0, 1e-3, 0.0])
-    chart = pictures.singular_chart(values, rank)
-    shown = np.array([9.0, 4.0, 1.0, 1e-3, 9e-17])
-    assert len(chart.series) == (2 if rank < 5 else 1)
-    for part, is_shown in zip(
-        chart.series, (np.arange(5) < rank, np.arange(5) >= rank), strict=False
-    ):
-        np.testing.assert_allclose(part.y, np.where(is_shown, shown, np.nan))
-    assert chart.x.tolist() == [1, 2, 3, 4, 5]
-
-
-def test_charts_of_reasons_are_named_by_what_they_show(identified):
-    (j,) = (k for k, n in enumerate(identified.model.joints) if n == "wrist_2_joint")
-    torque = joint_torques(identified)[j]
-    plot = pictures.plot_why(identified, "wrist_2_joint")
-    names = [f"residual against {x}" for x in ("position", "speed", "acceleration", "load", "time")]
-    wanted = [torque.sentence, *names, "mechanical power"]
-    assert [caption for _, caption in plot.charts] == [f"wrist_2_joint: {x}" for x in wanted]
-    # a part that is 0 is not drawn
-    parts = {"gravity": 0.0 * torque.tau, **torque.parts, "ripple": 0.0 * torque.tau}
-    split = why_charts(replace(torque, parts=parts))["split"]
-    present = [name for name, x in torque.parts.items() if np.abs(x).max() > 1e-6]
-    assert [s.label for s in split.series] == [*present, "residual", "measured"]
-    for part in split.series[:-2]:
-        shown = np.isfinite(part.y)
-        np.testing.assert_allclose(part.y[shown], torque.parts[part.label])
-    assert split.title == (
-        f"Torque of wrist_2_joint over time, the sum of {', '.join(present)} and residual"
-    )

@@ -1,23 +1,14 @@
 """The report's charts: the data in the page against the series they claim."""
 
-import pickle
-import re
-import subprocess
-import sys
-import xml.etree.ElementTree as ET
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from helpers.figures import torques
-from helpers.pages import chart, percent
+from helpers.pages import chart
 
-from robotid.diagnosis.residual.residuals import autocorrelation, spectrum
-from robotid.output.report import torque_section as torques_module
-from robotid.output.report.information_section import information
-from robotid.output.report.pictures import QUANTILE, torque_charts
-from robotid.output.report.steps import Origin
-from robotid.output.report.torque_section import torques_section
+from robotid.diagnosis.residual.residuals import spectrum
+from robotid.output.report.pictures import torque_charts
 
 JOINTS = range(6)
 
@@ -126,77 +117,6 @@ def test_the_spectrum_is_that_of_torque_and_residual(report, identified, kept, p
     assert what["logarithmic"] == "y"
 
 
-@pytest.mark.parametrize("j", JOINTS)
-def test_the_autocorrelation_is_that_of_the_residual(report, identified, kept, predicted, j):
-    recording = kept.recording
-    motion, used = recording.trajectory, recording.mask[:, j].astype(bool)
-    r = autocorrelation((motion.tau - predicted)[:, j], used, motion.segment, 99)  # 2 s at 50 Hz
-    what = chart(report, f"Autocorrelation of the residual of {identified.model.joints[j]}")
-    np.testing.assert_allclose(what["x"], 0.02 * np.arange(100), atol=1e-6)
-    close(what["series"][0]["y"], r)
-
-
-@pytest.mark.parametrize("term", ["armature", "viscous", "coulomb", "offset"])
-def test_drives_show_their_values_with_two_standard_errors(report, identified, term):
-    joints, names = identified.model.joints, list(identified.model.layout.names)
-    part = [names.index(f"{joint}.{term}") for joint in joints]
-    what = chart(report, f"{term} of each drive")
-    assert what["x_names"] == list(joints)
-    (ours,) = what["series"]  # the URDF has no friction to stand beside it
-    error = identified.standard_error[part]
-    assert np.isinf(error).tolist() == [j == "elbow_joint" and term == "viscous" for j in joints]
-    close(ours["y"], identified.standard[part])
-    close(ours["half"], np.where(np.isinf(error), np.nan, 2 * error))  # at its bound: no bar
-
-
-def test_singular_values_are_those_of_the_regressor(report, identified):
-    values = information(identified).singular_values
-    what = chart(report, "Singular values")
-    np.testing.assert_allclose(what["x"], np.arange(1, len(values) + 1), atol=1e-6)
-    np.testing.assert_allclose(what["series"][0]["y"], values, rtol=1e-3)
-    assert identified.wls.rank == len(values)
-
-
-def test_a_report_needs_no_matplotlib(identified, tmp_path):
-    (tmp_path / "found.pickle").write_bytes(pickle.dumps(identified))
-    code = (
-        "import pickle, sys\nfrom pathlib import Path\nsys.modules['matplotlib'] = None\n"
-        "from robotid.output.report.document import write_report\n"
-        "found = pickle.loads(Path('found.pickle').read_bytes())\n"
-        "write_report(found, 'report.html')"
-    )
-    words = [sys.executable, "-c", code]
-    run = subprocess.run(words, capture_output=True, text=True, cwd=tmp_path)
-    assert run.returncode == 0, run.stderr
-    assert '<figure class="chart"' in (tmp_path / "report.html").read_text(encoding="utf-8")
-
-
-def test_correlations_are_drawn_in_their_cell_with_their_sign_and_strength(report, identified):
-    svg = re.search(r'<svg class="map".*?</svg>', report, re.DOTALL)[0]
-    r = information(identified).correlation
-    b = len(r)
-    root = ET.fromstring(svg)
-    corner = min(
-        float(text.get("x")) for text in root.iter("text") if text.get("text-anchor") is None
-    )
-    drawn = np.zeros((b, b))
-    for path in root.iter("path"):
-        sign = {"var(--predicted)": 1, "var(--residual)": -1}[path.get("fill")]
-        for x, y in re.findall(r"M(\d+) (\d+)h", path.get("d")):
-            i, j = round(int(y) / 11), round((int(x) - corner + 2) / 11)
-            drawn[i, j] = sign * float(path.get("fill-opacity"))
-    wanted = np.rint(8 * np.tril(r, -1)) / 8
-    np.testing.assert_allclose(drawn, wanted, atol=1e-3)
-    assert (wanted > 0).sum() != (wanted < 0).sum()
-
-
-def test_the_shares_of_the_data_are_said_in_the_mean_and_of_the_weakest(identified, report):
-    shares = [round(100 * share) for share in information(identified).data_share]
-    assert min(shares) < np.mean(shares) < 99.5
-    said = f"by {np.mean(shares):.0f} % on average and the weakest by {min(shares)} %"
-    assert said in report
-
-
 def test_captions_say_error_and_how_much_the_band_holds(identified, report):
     """Of each joint in the validation recording, by hand."""
     (kept,) = identified.validation
@@ -213,36 +133,3 @@ def test_captions_say_error_and_how_much_the_band_holds(identified, report):
         )
     assert all(words in report for words in said), said
     assert len(set(said)) == len(said)
-
-
-def test_each_recording_has_its_own_band_error_and_share_of_the_points(identified, monkeypatch):
-    drawn = []
-
-    def noted(chart, caption, points):
-        drawn.append((chart, caption, points))
-        return ""
-
-    monkeypatch.setattr(torques_module, "chart_html", noted)
-    monkeypatch.setattr("robotid.output.report.curves._ROWS", 9600)
-    verdicts = identified.verdict.to_dict()["per_joint"]
-    torques_section(replace(identified, validation=()), verdicts, identified.model.joints, Origin())
-    fitted, joints = identified.fitted, identified.model.joints
-    assert {points for *_, points in drawn} == {9600 // (2 * 6 * 2)}
-    above, below = drawn[::2], drawn[1::2]
-    assert [caption for _, caption, _ in below] == [""] * 12
-    pairs = [(j, k) for j in range(6) for k in range(2)]
-    for (j, k), (upper, caption, _) in zip(pairs, above, strict=True):
-        evaluation, name = fitted[k], joints[j]
-        band, motion = identified.band(evaluation), evaluation.recording.trajectory
-        used = evaluation.recording.mask[:, j].astype(bool)
-        half = QUANTILE * np.interp(np.arange(len(motion.t)), band.samples, band.total[:, j])
-        (series,) = [series for series in upper.series if series.half is not None]
-        np.testing.assert_allclose(series.half[np.isfinite(series.half)], half)
-        residual = motion.tau[used, j] - evaluation.torques["estimate"][used, j]
-        rmse, size = np.sqrt(np.mean(residual**2)), np.sqrt(np.mean(motion.tau[used, j] ** 2))
-        held = np.mean(np.abs(residual) <= half[used])
-        assert upper.link == f"recording {k}"
-        assert caption == (
-            f"{evaluation.recording.name}, fitted: error {percent(100 * rmse / size)} %, RMSE "
-            f"{rmse:.3g} N m; 95 % band contains {100 * held:.0f} %"
-        ), name

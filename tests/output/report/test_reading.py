@@ -7,7 +7,6 @@ from pathlib import Path
 
 import pytest
 from helpers.browsing import until, visit
-from helpers.pages import tables
 
 from robotid.output.pages.html import asset
 from robotid.output.report.document import write_report
@@ -111,21 +110,6 @@ def test_a_column_is_sorted_by_its_numbers_by_mouse_and_by_keys(seen, identified
     assert table.locator("thead th[aria-sort='none']").count() == 9
 
 
-def test_shown_rows_and_commands_are_copied(seen):
-    _, tools = table_of(seen)
-    tools.get_by_role("searchbox").fill("forearm_link mcx")
-    tools.get_by_role("button", name="Copy").click()
-    read = "navigator.clipboard.readText()"
-    head, row = seen.page.evaluate(read).split("\n")
-    assert head.split("\t")[:2] == ["link or drive", "parameter"]
-    assert row.split("\t")[:2] == ["forearm_link", "mcx"]
-    block = seen.page.locator("pre.command").first
-    block.locator("+ button").focus()
-    seen.page.keyboard.press("Enter")
-    until(seen, "document.querySelector('pre.command + button').textContent === 'Copied'")
-    assert seen.page.evaluate(read) == block.inner_text().strip()
-
-
 def test_a_link_opens_what_it_leads_to(seen):
     page = seen.page
     assert not page.locator("#errors-fold").evaluate("fold => fold.open")
@@ -138,12 +122,6 @@ def test_a_link_opens_what_it_leads_to(seen):
     top = page.locator(key).bounding_box()["y"]
     assert 30 < top < 400  # below the contents, which stay
     assert page.locator("nav").bounding_box()["y"] == 0
-
-
-def test_the_worst_joints_open_on_few_screens(seen):
-    screens = "document.documentElement.scrollHeight / innerHeight"
-    assert seen.page.evaluate(screens) <= 6.0
-    assert seen.page.locator(".next").bounding_box()["y"] < 800
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
@@ -164,18 +142,6 @@ def test_printing_opens_everything(seen):
     assert page.locator("details[open]").count() == count > 15
     page.evaluate("window.dispatchEvent(new Event('afterprint'))")
     assert page.locator("details[open]").count() < count
-
-
-def test_without_script_everything_can_be_read_and_is_printed(browser, path):
-    with visit(browser, path, java_script_enabled=False) as seen:
-        page = seen.page
-        assert page.locator("button").count() == 0
-        shown = tables(page.content())
-        assert len(shown[PARAMETERS].rows) == 84
-        page.locator("#parameters-fold > summary").click()
-        assert page.locator(f"caption:has-text('{PARAMETERS}')").is_visible()
-        page.emulate_media(media="print")
-        assert page.locator("caption:has-text('Versions that ran')").bounding_box()["height"] > 5
 
 
 def luminance(colour):

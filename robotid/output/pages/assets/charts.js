@@ -304,7 +304,6 @@ class Chart { // what: as charts.py says; x, y and half are arrays, NaN where th
     this.cursor = element("div", { class: "line", hidden: "" });
     this.plot.over.append(this.cursor);
     this.listen(this.plot.over);
-    this.live.classList.remove("waiting");
   }
 
   paint(u) { // what is under the lines
@@ -499,9 +498,7 @@ for (const figure of document.querySelectorAll("figure.chart")) {
     series.y = unpack(series.y);
     series.half = series.half && unpack(series.half);
   }
-  const { live } = new Chart(figure, what), picture = figure.querySelector("svg");
-  live.classList.add("waiting");
-  if (picture) live.append(picture); // on screen until the chart is drawn, and in print
+  new Chart(figure, what);
 }
 
 // charts out of sight are drawn when the browser is idle, one at a time; folded ones wait
@@ -513,6 +510,14 @@ function drawNext() {
 }
 idle(drawNext);
 document.addEventListener("toggle", () => idle(drawNext), true);
+
+function print(isPrinted) { // all charts, in the colours of paper
+  document.documentElement.classList.toggle("printing", isPrinted);
+  tones.clear();
+  for (const chart of all) if (chart.plot) chart.plot.redraw(false); else chart.draw();
+}
+addEventListener("beforeprint", () => print(true));
+addEventListener("afterprint", () => print(false));
 
 return { link, Chart, all };
 })();

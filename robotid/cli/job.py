@@ -1,0 +1,495 @@
+"""The job: robot, logs and settings, read from TOML; every key is checked."""
+
+import os
+import re
+import tomllib
+from collections.abc import Mapping, Sequence
+from dataclasses import MISSING, asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from robotid.base.exceptions import SettingsError
+from robotid.base.files import check_path, missing_file
+from robotid.base.findings import listed
+from robotid.base.settings import Entries, Key, Range, Settings, check_keys, require_kind, setting
+from robotid.data.files.columns import Needs
+from robotid.data.files.read import LogLayout, lay_out, read_log
+from robotid.data.files.table import Table
+from robotid.data.log import Log
+from robotid.data.signal_settings import BaseSource, LogSource, LogUnits, SignalSettings
+from robotid.data.transmission import Transmission, check_transmissions
+from robotid.dynamics.constraint_rows import logged_base
+from robotid.estimation.fitting.estimator_settings import (
+    ESTIMATORS,
+    ConsistentSettings,
+    EstimatorSettings,
+    SimulationSettings,
+)
+from robotid.identification.closed_loop.loop_settings import LoopSettings
+from robotid.robot.constraints import Contact, Loop
+from robotid.robot.drives import AUTO, DRIVE_TERMS, FAMILIES, TERMS, DriveTerm, term_from_dict
+from robotid.robot.parameters import DYNAMICS, Coupling
+
+if TYPE_CHECKING:
+    from robotid.robot.model import RobotModel
+
+
+_MODEL_KEYS: Mapping[str, tuple[type, ...]] = {
+    "friction" if term.is_friction else name: (str,) if term.is_friction else (bool,)
+    for name, term in TERMS.items()
+}
+_PLAIN = tuple(name for name, term in TERMS.items() if term.is_friction)
+_LONGEST_PATH = 4096  # characters
+_FILE: Mapping[str, Any] = {"reads": (str,), "load": Path, "dump": lambda path: str(path.resolve())}
+
+
+def _load_terms(table: Mapping[str, Any]) -> tuple[str, ...]:
+    friction = table.get("friction", AUTO)
+    names = {"none": [], AUTO: [*_PLAIN, AUTO]}.get(friction, friction.split("+"))
+    known = [*_PLAIN, *FAMILIES]
+    if friction != AUTO:
+        for name in names:
+            if name not in known:
+                raise SettingsError(
+                    f"friction is {friction!r}, wanted auto, none, or some of {listed(known)}, "
+                    "separated by +"
+                )
+    switched = [name for name in TERMS if name not in _PLAIN and table.get(name, True)]
+    common = [name for name in TERMS if name in (*names, *switched)]
+    return (*common, *(name for name in names if name not in TERMS))
+
+
+def _dump_terms(terms: Sequence[str]) -> dict[str, str | bool]:
+    friction = [term for term in terms if term in _PLAIN or term not in TERMS]
+    named = AUTO if AUTO in friction else "+".join(friction) or "none"
+    return {key: named if key == "friction" else key in terms for key in _MODEL_KEYS}
+
+
+def _load_drives(table: Mapping[str, Sequence[Any]]) -> dict[str, tuple[str | DriveTerm, ...]]:
+    for joint, entries in table.items():
+        for entry in entries:
+            if isinstance(entry, str) and entry not in FAMILIES:
+                raise SettingsError(
+                    f"drives.{joint} has {entry!r}, wanted some of {listed(FAMILIES)}, or a table "
+                    "with the shape of a term"
+                )
+    return {joint: tuple(_load_term(joint, e) for e in entries) for joint, entries in table.items()}
+
+
+def _load_term(joint: str, entry: Any) -> str | DriveTerm:  # noqa: ANN401
+    try:
+        return entry if isinstance(entry, str) else term_from_dict(entry)
+    except SettingsError as error:
+        raise SettingsError(f"drives.{joint}: {error}") from error
+
+
+def _dump_drives(drives: Mapping[str, Sequence[str | DriveTerm]]) -> dict[str, list[Any]]:
+    return {
+        joint: [e if isinstance(e, str) else e.to_dict() for e in entries]
+        for joint, entries in drives.items()
+    }
+
+
+def _load_couplings(tables: Sequence[Mapping[str, Any]]) -> tuple[Coupling, ...]:
+    return tuple(
+        Coupling(
+            table["name"],
+            tuple((j, float(r)) for j, r in table["ratios"].items()),
+            table.get("replaces", False),
+        )
+        for table in tables
+    )
+
+
+def _dump_couplings(couplings: Sequence[Coupling]) -> list[dict[str, Any]]:
+    return [
+        {"name": coupling.name, "ratios": dict(coupling.ratios)}
+        | ({"replaces": True} if coupling.replaces else {})
+        for coupling in couplings
+    ]
+
+
+def _load_contacts(tables: Sequence[Mapping[str, Any]]) -> tuple[Contact, ...]:
+    return tuple(
+        Contact(**{**table, "measured": tuple(table.get("measured", ()))}) for table in tables
+    )
+
+
+def _dump_contact(contact: Contact) -> dict[str, Any]:
+    table = asdict(contact) | {"measured": list(contact.measured)}
+    unstated: dict[str, Any] = {"axes": "world", "threshold": None, "uncertainty": None}
+    return {key: x for key, x in table.items() if key not in unstated or x != unstated[key]}
+
+
+def _load_loops(tables: Sequence[Mapping[str, Any]]) -> tuple[Loop, ...]:
+    return tuple(Loop.from_dict(table) for table in tables)
+
+
+def _motors(gear: Transmission) -> list[Coupling]:
+    """Return the drives of a transmission's motors that move several joints."""
+    return [Coupling(joint, ratios, replaces=True) for joint, ratios in gear.shared.items()]
+
+
+@dataclass(frozen=True)
+class LogEntry(Settings):
+    """One log of a job."""
+
+    path: Path = setting(MISSING, "the file", at="log", **_FILE)
+    start: float | None = setting(None, "start of the window in the log's own time [s]")
+    end: float | None = setting(None, "end of the window [s]")
+    unit: str | None = setting(
+        None, "name of the robot, if the logs are of several robots of one kind, as 'arm-07'"
+    )
+
+
+@dataclass(frozen=True)
+class PayloadEntry(Settings):
+    """A log with a payload of known mass, which checks the scale of the torques."""
+
+    path: Path = setting(MISSING, "the file, with the payload that the fitted logs lack",
+                         at="log", **_FILE)  # fmt: skip
+    mass: float = setting(
+        MISSING,
+        "known mass of the payload [kg]",
+        within=Range("more than 0 and less than 1e6", lambda x: 0 < x < 1e6),
+    )
+    link: str = setting("", "link that carries it; the last moving link if not stated")
+    start: float | None = setting(None, "start of the window in the log's own time [s]")
+    end: float | None = setting(None, "end of the window [s]")
+
+
+@dataclass(frozen=True)
+class Job(Settings):
+    """The robot, logs and settings of an identification."""
+
+    urdf: Path = setting(MISSING, "the URDF file", **_FILE)
+    joints: tuple[str, ...] | None = setting(
+        None, "joints to identify, in order; all movable joints if not stated"
+    )
+    locked: Mapping[str, float] = setting(
+        {}, 'positions of locked joints, "*" for all other joints [rad or m]'
+    )
+    gravity: tuple[float, float, float] = setting(
+        (0.0, 0.0, -9.81), "gravity in the root link's frame [m/s^2]"
+    )
+    free_flyer: bool = setting(
+        False, "whether the base floats; logs have its pose, base_x to base_qw"
+    )
+    mimic: str = setting(
+        "independent", "independent, or coupled: a mimic joint moves with its leader"
+    )
+    snap_angles: bool = setting(
+        False,
+        "whether rounded angles of the URDF's joints, as 3.1416, are replaced by the nearest "
+        "multiple of pi/12",
+    )
+    signals: SignalSettings = setting(SignalSettings(), "signal processing of the logs")
+    terms: tuple[str, ...] = setting(
+        (*DRIVE_TERMS, AUTO),
+        "drive terms to identify",
+        at="model",
+        reads=_MODEL_KEYS,
+        load=_load_terms,
+        dump=_dump_terms,
+    )
+    model_dynamics: str = setting(
+        "full",
+        "full; or static, for logs of poses and slow sweeps: velocities determine only the sign of "
+        "friction, accelerations are not used; gravity parameters (masses, first moments), Coulomb "
+        "friction and offsets are identified, the others have the URDF's values",
+        at="model.dynamics",
+        among=DYNAMICS,
+    )
+    drives: Mapping[str, tuple[str | DriveTerm, ...]] = setting(
+        {},
+        "further friction of single joints, by joint: names as of friction, whose shape is "
+        "identified, or a term with its shape, as { term = 'Harmonic', order = 101.0 }",
+        reads=Entries(dict, (list,)),
+        load=_load_drives,
+        dump=_dump_drives,
+    )
+    gains: Mapping[str, float] = setting(
+        {}, "torque per current of joints logged as current [N m/A or N/A]", at="torque.gains"
+    )
+    couplings: tuple[Coupling, ...] = setting(
+        (),
+        "drives that move several joints, each with a name and its ratios by joint [-]; with "
+        "replaces = true it replaces the drive of the joint of that name",
+        at="coupling",
+        reads=[{"name": (str,), "ratios": Entries(dict, (int, float)), "replaces": (bool,)}],
+        load=_load_couplings,
+        dump=_dump_couplings,
+    )
+    transmissions: tuple[Transmission, ...] = setting(
+        (), "motors and gears, where logs have columns of motors", at="transmission"
+    )
+    columns: Mapping[str, str] = setting(
+        {}, "column names in the logs that differ from the standard ones"
+    )
+    source: LogSource = setting(LogSource(), "location of the signals in the log files", at="log")
+    units: LogUnits = setting(LogUnits(), "units of the logs, if not SI")
+    base: BaseSource = setting(BaseSource(), "motion of a floating base in the logs")
+    contacts: tuple[Contact, ...] = setting(
+        (),
+        "links that may touch the ground: frame, the link; kind, point or surface; measured, "
+        "components of the wrench that logs have as wrench_fz_<link>, of fx to mz, the others are "
+        "unknown; axes of these, world or link; always, whether it always touches the "
+        "ground (true if all components are measured), else logs have contact_<link>, 1 or 0, or "
+        "it is found; threshold, for a column that is a force "
+        "instead [N]; radius of a ball-shaped foot, below whose frame the ground is [m]; "
+        "uncertainty, standard deviation of the point of contact [m], estimated if it is not "
+        "stated",
+        at="contact",
+        reads=[
+            {
+                "frame": (str,),
+                "kind": (str,),
+                "measured": Entries(list, (str,)),
+                "always": (bool,),
+                "radius": (int, float),
+                "uncertainty": (int, float),
+                "axes": (str,),
+                "threshold": (int, float),
+            }
+        ],
+        load=_load_contacts,
+        dump=lambda contacts: [_dump_contact(x) for x in contacts],
+    )
+    loops: tuple[Loop, ...] = setting(
+        (),
+        "connections that close kinematic chains: frames, the two links, whose origins coincide; "
+        "kind, hinge (default), point or rigid; axis of the hinge, the same in both frames",
+        at="loop",
+        reads=[
+            {
+                "frames": Entries(list, (str,)),
+                "kind": (str,),
+                "axis": Entries(list, (int, float)),
+            }
+        ],
+        load=_load_loops,
+        dump=lambda loops: [x.to_dict() for x in loops],
+    )
+    passive: tuple[str, ...] = setting(
+        (),
+        "joints without a drive: their torque is 0 and needs no column; positions that logs lack "
+        "are computed from the loops; no friction except that in [drives]",
+    )
+    estimator: EstimatorSettings = setting(ConsistentSettings(), "estimator and its settings")
+    controller: LoopSettings = setting(
+        LoopSettings(),
+        "position controller of the drives, for the estimator 'simulation'",
+        dump=lambda loop: None if loop == LoopSettings() else loop.to_dict(),
+    )
+    dynamics: bool = setting(
+        False,
+        "whether the identified friction is also written to <dynamics> of the URDF",
+        at="output.dynamics",
+    )
+    report: bool = setting(
+        True,
+        "whether report.html is written",
+        at="output.report",
+    )
+    replay: bool = setting(
+        False,
+        "whether replay.html is written: the first validation log, or the first fitted log",
+        at="output.replay",
+    )
+    identification: tuple[LogEntry, ...] = setting((), "logs to fit")
+    validation: tuple[LogEntry, ...] = setting((), "validation logs")
+    payload_checks: tuple[PayloadEntry, ...] = setting(
+        (), "logs with a payload of known mass, which check the scale of the torques",
+        at="payload_check",
+    )  # fmt: skip
+    ignore: tuple[str, ...] = setting(
+        (), "codes of the doctor's findings to ignore", at="doctor.ignore"
+    )
+    rows_in_memory: int = setting(
+        2**17,
+        "total number of rows of all logs above which they are read in pieces",
+        at="reduction.rows_in_memory",
+        within=Range("a positive number", lambda x: x >= 1),
+    )
+    workers: int | None = setting(
+        None,
+        "worker processes for the pieces; one per core for long logs if not stated",
+        at="reduction.workers",
+        within=Range("1 to 1024", lambda x: 1 <= x <= 1024),
+    )
+
+    @classmethod
+    def paths(cls) -> dict[str, Key]:
+        """Return the description of each key, also of keys without a field of their own."""
+        friction = Key(
+            "auto: selected per joint by the error on held-out segments of the fitted logs "
+            f"(default); none; or some of these, separated by +: {', '.join([*_PLAIN, *FAMILIES])}"
+        )
+        others = ", ".join(name for name in ESTIMATORS if name != "consistent")
+        name = Key(f"estimator: consistent (default), {others}", among=tuple(ESTIMATORS))
+        return super().paths() | {"model.friction": friction, "estimator.name": name}
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_transmissions(self.transmissions, self.joints)
+        is_looped = isinstance(self.estimator, SimulationSettings)
+        if self.controller != LoopSettings() and not is_looped:
+            raise SettingsError(
+                f"[controller] is stated, but the estimator is {self.estimator.name!r}, wanted "
+                "'simulation'; set [estimator] name = 'simulation', or remove [controller]"
+            )
+
+    def model(self) -> "RobotModel":
+        """Return the robot, with the job's joints, gravity and drive terms."""
+        from robotid.robot.model import RobotModel
+        from robotid.robot.prior import with_assumed_inertials
+
+        gears = [gear for gear in self.transmissions if gear.matrix != "urdf"]
+        motors = [motor for gear in gears for motor in _motors(gear)]
+        model = RobotModel.from_urdf(
+            self.urdf,
+            joints=self.joints,
+            locked=self.locked,
+            free_flyer=self.free_flyer,
+            mimic=self.mimic,
+            gravity=self.gravity,
+            terms=[term for term in self.terms if term in TERMS],
+            couplings=(*self.couplings, *motors),
+            own_terms={
+                joint: [entry for entry in entries if isinstance(entry, DriveTerm)]
+                for joint, entries in self.drives.items()
+            },
+            dynamics=self.model_dynamics,
+            snap_angles=self.snap_angles,
+            constraints=(*self.contacts, *self.loops),
+            passive=self.passive,
+        )
+        return with_assumed_inertials(model)
+
+    def placed(self, model: "RobotModel") -> tuple[str, ...]:
+        """Return the locked joints of the model whose position the job states."""
+        if "*" in self.locked:
+            return tuple(model.locked)
+        leaders = {joint.name: joint.mimic[0] for joint in model.tree.movable if joint.mimic}
+        return tuple(j for j in model.locked if {j, leaders.get(j)} & set(self.locked))
+
+    @property
+    def friction(self) -> dict[str, str]:
+        """Friction in addition to viscous and Coulomb, by joint, "*" for the others; or "auto"."""
+        everywhere = "+".join(term for term in self.terms if term not in TERMS)
+        stated = {
+            joint: "+".join(entry for entry in entries if isinstance(entry, str))
+            for joint, entries in self.drives.items()
+        }
+        return {"*": everywhere, **stated}
+
+    def read(self, entry: LogEntry, model: "RobotModel", *, needs: Needs = "torque") -> Log:
+        """Return one log of the job, of the model's joints in its order."""
+        stated = self._reading(model) | {"start": entry.start, "end": entry.end}
+        return read_log(entry.path, needs=needs, **stated)
+
+    def lay_out(
+        self, entry: LogEntry, model: "RobotModel", *, needs: Needs = "torque"
+    ) -> tuple[LogLayout, Table]:
+        """Return the columns of a log to read, and the opened file; no column is read yet."""
+        return lay_out(entry.path, needs=needs, **self._reading(model))
+
+    def _reading(self, model: "RobotModel") -> dict[str, Any]:
+        return {
+            "joints": model.joints,
+            "gains": self.gains,
+            "columns": self.columns,
+            "units": self.units,
+            "prismatic": tuple(model.layout.prismatic),
+            "source": self.source,
+            "base": logged_base(model, self.base),
+            "passive": model.passive,
+            "robot": model.tree.movable,
+            "transmissions": [gear.stated(model.tree.reductions) for gear in self.transmissions],
+        }
+
+
+def read_job(path: str | Path) -> Job:
+    """Read a job file.
+
+    Args:
+        path: The TOML file. Paths in it are relative to its folder; ``$NAME`` in a path is replaced
+            by the environment variable.
+
+    Raises:
+        SettingsError: If the file is missing, is not TOML, or a key or a value is wrong.
+    """
+    require_kind(path, (str, Path), "path", "the path of a job file")
+    check_path(path)
+    source = Path(path)
+    if not source.is_file():
+        raise SettingsError(missing_file(source, "job file"))
+    try:
+        table = tomllib.loads(text := source.read_text(encoding="utf-8-sig"))
+    except tomllib.TOMLDecodeError as error:
+        at = re.search(r"at line (\d+)", str(error))
+        line = ": " + text.split("\n")[int(at[1]) - 1].strip()[:80] if at else ""
+        raise SettingsError(
+            f"{source.name} is not valid TOML: {error}{line}. Text and paths need quotes; a key "
+            "or [table] occurs once"
+        ) from error
+    except (ValueError, RecursionError) as error:  # not UTF-8, numbers too long, tables too deep
+        raise SettingsError(f"{source.name} is not valid TOML: {error}") from error
+    return job_from_settings(table, source.name, source.parent, expand=True)
+
+
+def job_file(model: object) -> Job:
+    """Return the job of a file that is given in place of a robot and its logs."""
+    if not isinstance(model, str | Path) or Path(model).suffix != ".toml":
+        raise SettingsError(
+            "no log is given, wanted the robot and its logs, or a job file (.toml) alone"
+        )
+    return read_job(model)
+
+
+def as_job(robot: Job | str | Path) -> Job:
+    """Return the job of a robot: of a job file, or of a URDF all of whose joints move."""
+    if isinstance(robot, Job):
+        return robot
+    require_kind(robot, (str, Path), "robot", "the path of a URDF or of a job file")
+    return read_job(robot) if Path(robot).suffix == ".toml" else Job(Path(robot))
+
+
+def job_from_settings(
+    table: Mapping[str, Any], where: str, folder: Path, *, expand: bool = False
+) -> Job:
+    """Return the job that a table states."""
+    check_keys(table, Job.schema(), where)
+    if "urdf" not in table:
+        raise SettingsError(f"{where} has no key 'urdf'; name the robot's URDF file")
+    found = dict(table, urdf=stated_path(table["urdf"], where, folder, expand=expand))
+    for key in ("identification", "validation", "payload_check"):
+        entries = table.get(key, [])
+        found[key] = [
+            dict(entry, log=stated_path(entry["log"], where, folder, expand=expand))
+            for entry in entries
+        ]
+    try:
+        return Job.from_dict(found)
+    except SettingsError as error:
+        raise SettingsError(f"{where}: {error}") from error
+
+
+def written_job(settings: Mapping[str, Any], where: str) -> Job:
+    """Return the job whose settings a result states."""
+    table = {key: value for key, value in settings.items() if value != {}}
+    return job_from_settings(table, where, Path())
+
+
+def stated_path(text: str, where: str, folder: Path, *, expand: bool) -> Path:
+    """Return a path relative to a folder."""
+    is_unicode = not any("\ud800" <= character <= "\udfff" for character in text)
+    if "\0" in text or len(text) > _LONGEST_PATH or not is_unicode:
+        raise SettingsError(
+            f"{where}: {text[:80]!r} is not a valid path, wanted UTF-8 without NUL, at most "
+            f"{_LONGEST_PATH} characters"
+        )
+    expanded = os.path.expandvars(text) if expand else text
+    if expand and "$" in expanded:
+        raise SettingsError(f"{where}: path {text!r} names an environment variable that is not set")
+    return folder / expanded

@@ -1,0 +1,247 @@
+"""The logs of a job: opened once, examined, and identified by their inputs."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from itertools import chain
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from robotid.base.exceptions import DataError, SettingsError
+from robotid.base.files import dataset_of, file_sha256, log_exists
+from robotid.base.findings import Finding, by_severity
+from robotid.base.typing import STAGES, ProgressCallback, report_stage
+from robotid.cli.job import Job, LogEntry, written_job
+from robotid.data.files.columns import Needs
+from robotid.data.files.read import LogLayout
+from robotid.data.files.table import Table
+from robotid.data.log import Log
+from robotid.diagnosis.logs.check_logs import diagnose
+from robotid.diagnosis.logs.locked_joints import STILL, check_locked, percent_hint
+from robotid.diagnosis.verdict.fit_findings import log_findings
+from robotid.diagnosis.verdict.verdict import check_ignored
+from robotid.dynamics.base_parameters import structural_mapping
+from robotid.estimation.fitting.recorded import Recordings
+from robotid.estimation.fitting.survey import SurveyedLog, survey_log
+from robotid.output.files.result_file import Result, load_result, stated_model, stated_parameters
+from robotid.robot.model import RobotModel
+
+if TYPE_CHECKING:
+    from robotid.design.previews import Run
+
+
+_PIECES = 8  # pieces per rows in memory: the filter of a piece needs memory of its own
+_SHORTEST = 256  # rows of a piece
+
+
+def survey_logs(
+    job: Job,
+    model: RobotModel,
+    *groups: Sequence[LogEntry],
+    refuse: Callable[[LogEntry, DataError], None] | None = None,
+    needs: Needs = "torque",
+) -> tuple[tuple[SurveyedLog, ...], ...]:
+    """Return the logs of each group, ready to be read.
+
+    The logs are in memory if all their files together have at most the permitted number of rows,
+    or if the model is static. Files of formats that are only read whole do not count. Otherwise
+    each log is divided into pieces of a fixed number of rows: an eighth of the permitted number.
+    """
+    paths = dict.fromkeys(entry.path for entry in chain(*groups))
+    opened = {path: _open(job, model, path, needs) for path in paths}
+    rows = sum(_count(found) for found in opened.values())
+    is_long = rows > job.rows_in_memory and not model.is_static
+    length = max(job.rows_in_memory // _PIECES, _SHORTEST) if is_long else None
+
+    def survey(entries: Sequence[LogEntry]) -> tuple[SurveyedLog, ...]:
+        logs = []
+        units_of_logs(entries)
+        for entry in entries:
+            try:
+                found = opened[entry.path]
+                if isinstance(found, DataError):
+                    raise found
+                window = entry.start, entry.end
+                log = survey_log(*found, model, job.signals, window, length=length)
+                logs.append(replace(log, unit=entry.unit or ""))
+            except DataError as error:
+                if refuse is None:
+                    raise
+                refuse(entry, error)
+        return tuple(logs)
+
+    return tuple(survey(entries) for entries in groups)
+
+
+def units_of_logs(entries: Sequence[LogEntry]) -> list[str]:
+    """Return the unit (name of the robot) of each log; "" if none is stated."""
+    unnamed = [entry for entry in entries if not entry.unit]
+    if 0 < len(unnamed) < len(entries):
+        named = next(entry for entry in entries if entry.unit)
+        raise SettingsError(
+            f"{unnamed[0].path.name} has no unit, but {named.path.name} has unit = "
+            f"{named.unit!r}; state the unit (name of the robot) of each log, or of none"
+        )
+    return [entry.unit or "" for entry in entries]
+
+
+def examine(
+    job: Job, model: RobotModel | None = None, *, progress: ProgressCallback | None = None
+) -> tuple[Finding, ...]:
+    """Examine the logs of a job; the findings have errors first."""
+    check_ignored(job.ignore)
+    if not (job.identification or job.validation):
+        raise SettingsError("the job has no log; state one: [[identification]] with log = FILE")
+    model = model or job.model()
+    refused: list[Finding] = []
+
+    def refuse(entry: LogEntry, error: DataError) -> None:
+        refused.append(Finding(error.code, "error", entry.path.name, str(error)))
+
+    report_stage(progress, "reading logs", STAGES[:2])
+    groups = job.identification, job.validation
+    fitted, validation = survey_logs(job, model, *groups, refuse=refuse, needs="any")
+    report_stage(progress, "checking logs", STAGES[:2])
+    placed = locked_as_logged(job, model, fitted, validation)
+    found = examine_logs(placed.job, placed.model, placed.fitted, placed.validation)
+    return by_severity([*refused, *placed.notes, *found])
+
+
+@dataclass(frozen=True, eq=False)
+class LockedLogs:
+    """A job whose joints are locked at their positions in the logs.
+
+    Attributes:
+        job: The job.
+        model: Its robot.
+        fitted: Its logs to fit.
+        validation: Its validation logs.
+        notes: The joints that were locked so with their positions, if there are any.
+    """
+
+    job: Job
+    model: RobotModel
+    fitted: tuple[SurveyedLog, ...]
+    validation: tuple[SurveyedLog, ...]
+    notes: tuple[Finding, ...] = ()
+
+
+def locked_as_logged(
+    job: Job, model: RobotModel, fitted: Sequence[SurveyedLog], validation: Sequence[SurveyedLog]
+) -> LockedLogs:
+    """Return the job with joints locked at their positions in the logs, unless it states them.
+
+    A joint that moves, or has another position in another log, is left to ``check_locked``.
+    """
+    logged, logs = {}, (*fitted, *validation)
+    for joint in [joint for joint in model.locked if joint not in job.placed(model)]:
+        found = [log.locked[joint] for log in logs if joint in log.locked]
+        if found and np.ptp(np.concatenate(found)) <= STILL:
+            logged[joint] = float(np.median(np.concatenate(found)))
+    if not logged:
+        return LockedLogs(job, model, tuple(fitted), tuple(validation))
+    shown = ", ".join(f"{joint} = {position:.4g}" for joint, position in logged.items())
+    message = (
+        f"joints are locked at their positions in the logs: {shown}. State other positions with "
+        "locked = { joint = position }"
+    )
+    message += "".join(percent_hint(model, *place, job.units) for place in logged.items())
+    note = Finding("locked_as_logged", "note", ", ".join(logged), message, logged)
+    job = replace(job, locked={**job.locked, **logged})
+    model = job.model()
+    first, second = (tuple(replace(x, model=model) for x in logs) for logs in (fitted, validation))
+    return LockedLogs(job, model, first, second, notes=(note,))
+
+
+def examine_logs(
+    job: Job, model: RobotModel, fitted: Sequence[SurveyedLog], validation: Sequence[SurveyedLog]
+) -> tuple[Finding, ...]:
+    """Examine surveyed logs: the locked joints of the job, then the windows of the logs."""
+    findings: list[Finding] = []
+    for log in (*fitted, *validation):
+        name = Path(log.path).name
+        findings += check_locked(model, log.locked, name, job.placed(model), job.units)
+        if len(log.windows) > 1:  # the windows have no notes of their own
+            findings += log_findings([log.head])
+    first, second = ([look for log in logs for look in log.looks] for logs in (fitted, validation))
+    return (*findings, *diagnose(model, first, second, job.signals))
+
+
+def job_of_result(job: Job, path: str | Path, advice: str) -> tuple[Job, list[LogEntry]]:
+    """Return a job with the settings of a result, and the logs that the result was fitted to."""
+    result = load_result(path).content
+    stated = written_job(result["settings"], Path(path).name)
+    hashes = {i["sha256"] for i in result["inputs"] if i["role"] == "identification"}
+    for entry in stated.identification:
+        if not log_exists(entry.path) or file_sha256(entry.path) not in hashes:
+            raise DataError(
+                f"{entry.path}, a fitted log of {path}, is missing or was changed; {advice}"
+            )
+    wanted = replace(stated, urdf=job.urdf, identification=job.identification)
+    return wanted, list(stated.identification)
+
+
+def result_run(job: Job, path: str | Path) -> tuple[Job, list[LogEntry], RobotModel, "Run"]:
+    """Return the information of the logs of a result."""
+    from robotid.design.previews import Run
+
+    job, fitted = job_of_result(job, path, "give a result whose logs exist")
+    result = load_result(path).content
+    model = stated_model(result, job.model())
+    (logs,) = survey_logs(job, model, fitted)
+    recordings = Recordings(model, structural_mapping(model), logs)
+    details = result["consistency"].get("fit", {})
+    return job, fitted, model, Run.of(recordings, stated_parameters(result, model), details)
+
+
+def identity_of(path: Path) -> dict[str, Any]:
+    """Return size [bytes] and time of change [ns] of a file, or of each file of a folder."""
+    whole = (dataset_of(path) or path).resolve()
+    files = sorted(p for p in whole.rglob("*") if p.is_file()) if whole.is_dir() else [whole]
+    found = {}
+    for file in files:
+        about = file.stat()
+        found[str(file)] = {"size": about.st_size, "changed": about.st_mtime_ns}
+    return found
+
+
+def _open(
+    job: Job, model: RobotModel, path: Path, needs: Needs
+) -> tuple[LogLayout, Table] | DataError:
+    try:
+        layout, table = job.lay_out(LogEntry(path), model, needs=needs)
+    except DataError as error:
+        return error
+    read = cache(table.read)  # once for all windows of the file
+    return layout, replace(table, read=lambda wanted: read(tuple(wanted)))
+
+
+def _count(found: tuple[LogLayout, Table] | DataError) -> int:
+    """Return the approximate number of rows of a file, 0 if it is only read whole."""
+    if isinstance(found, DataError) or found[1].rows is None:
+        return 0
+    return found[1].rows.count()
+
+
+def log_of_commands(job: Job, entry: LogEntry, result: Result) -> Log:
+    """Return a log with the inputs of the simulated robot, gravity compensation included.
+
+    The input is the command; it is the torque where the logged torque drives the robot.
+    """
+    log = job.read(entry, result.robot, needs=needed_of(job))
+    if job.controller.kind == "torque":
+        from robotid.identification.closed_loop.from_commands import driven_log
+
+        return driven_log(result.robot, log, job.signals)
+    if not job.controller.gravity_compensation:
+        return log
+    from robotid.identification.closed_loop.from_commands import with_gravity
+
+    return with_gravity(job.model(), log)
+
+
+def needed_of(job: Job) -> Needs:
+    """Return the signals that a simulation requires of a log in addition to positions."""
+    return "torque" if job.controller.kind == "torque" else "commands"

@@ -1,1 +1,0 @@
-"""One module per command: from input files to output files."""

@@ -1,0 +1,356 @@
+"""Logs as a robot needs them: joints of closed chains, pose of the root, contacts that a log lacks.
+
+The force f of each contact that a log does not state is the least-squares solution of
+J^T f = W pi - tau with the bodies of the URDF, over the rows of base and joints. A link that
+touches the ground has a force upwards, is low and hardly moves. The three are values of two normal
+distributions, with and without contact, whose parameters are those of the log.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pinocchio as pin
+from scipy.special import expit
+
+from robotid.base.exceptions import DataError
+from robotid.base.findings import listed
+from robotid.base.text import seconds
+from robotid.base.typing import Array
+from robotid.data.base_motion import BaseMotion
+from robotid.data.log import Log, Trajectory
+from robotid.data.signal_settings import SignalSettings
+from robotid.data.signals import process
+from robotid.dynamics.constraint_rows import constraint_jacobian
+from robotid.dynamics.prediction import predict
+from robotid.robot.closure import Chains
+from robotid.robot.constraints import Contact, frame_id, link_positions
+from robotid.robot.model import RobotModel
+
+_OPEN = 0.02  # largest error of a loop at logged positions, relative to the length of the robot
+_COMPUTED = 1e-5  # ... at computed ones
+
+
+def closed_log(model: RobotModel, log: Log) -> Log:
+    """Return the log of all joints of a robot, with positions of passive joints from its loops.
+
+    The torques of passive joints are 0. Velocities, accelerations and commands of a log without the
+    position of a passive joint are not used. The pose of the base becomes that of the root link.
+    """
+    if model.passive or model.loops:
+        log = _with_passive(model, log)
+    if log.base is None or not log.base.link:
+        return log
+    pose = _root_poses(model, log.q, log.base.pose, log.base.link)
+    if not log.base.has_position:
+        pose[:, :3] = 0.0
+    note = f"the pose of the base is computed from that of {log.base.link}"
+    base = BaseMotion(pose, imu=log.base.imu)
+    return replace(log, base=base, notes=(*log.notes, note))
+
+
+def _with_passive(model: RobotModel, log: Log) -> Log:
+    """Return the log with the positions of all joints, and no torque of passive ones."""
+    missing = np.array([joint not in log.joints for joint in model.joints])
+    q, tau = np.zeros((2, len(log.t), len(missing)))
+    logged = np.flatnonzero(~missing)
+    places = [log.joints.index(model.joints[j]) for j in logged]
+    q[:, logged], tau[:, logged] = log.q[:, places], log.tau[:, places]
+    tau[:, np.isin(model.joints, model.passive)] = 0.0
+    absent = [joint for joint in model.joints if joint not in log.joints]
+    if absent and not model.loops:
+        raise DataError(
+            f"{log.name} has no position of {listed(absent)}, and no loop determines it; log it, "
+            "or state [[loop]]"
+        )
+    if model.loops:
+        q = _closed(model, log, q, missing)
+    if not absent:
+        return replace(log, tau=tau)
+    note = f"positions of {listed(absent)} are computed from the loops"
+    unused = {"v": "velocities", "a": "accelerations", "q_ref": "commands"}
+    unused = {name: noun for name, noun in unused.items() if getattr(log, name) is not None}
+    if unused:
+        note += f"; {listed(unused.values())} are not used, since these joints have none"
+    return replace(
+        log, joints=model.joints, q=q, tau=tau, v=None, a=None, q_ref=None, v_ref=None,
+        tau_ref=None, notes=(*log.notes, note),
+    )  # fmt: skip
+
+
+def _closed(model: RobotModel, log: Log, q: np.ndarray, missing: np.ndarray) -> np.ndarray:
+    """Return positions at which the loops close; refuse those at which they do not."""
+    chains = Chains(model)
+    if missing.any():
+        q = chains.closed(q, missing)
+    gaps = chains.gaps(q)
+    allowed = (_COMPUTED if missing.any() else _OPEN) * model.length
+    samples = np.flatnonzero(~(gaps.max(axis=1) <= allowed))
+    if not len(samples):
+        return q
+    k = int(samples[0])
+    loop = int(gaps[k].argmax())
+    joints = [joint for joint, is_missing in zip(model.joints, missing, strict=True) if is_missing]
+    what = f"no position of {listed(joints)} closes" if joints else "the positions do not close"
+    raise DataError(
+        f"{log.name}: {what} the loop {model.loops[loop].name} at t = {seconds(log.t[k])} s: "
+        f"{gaps[k, loop]:.3g} m remain, wanted at most {allowed:.2g} m. Correct the zero positions "
+        "or signs of the logged joints, or the frames of the loop",
+        code="open_loop",
+    )
+
+
+def _root_poses(model: RobotModel, q: Array, poses: Array, link: str) -> Array:
+    """Return the poses of the root link from those of another link, x y z qx qy qz qw, (N, 7).
+
+    q (N, n) [rad or m], poses (N, 7) [m, -].
+    """
+    pin_model, root = model.pin_model, np.empty_like(poses)
+    data, frame = pin_model.createData(), frame_id(pin_model, link)
+    still = np.hstack([np.tile([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0], (len(q), 1)), q])
+    for k, q_k in enumerate(np.ascontiguousarray(model.configurations(still))):
+        pin.forwardKinematics(pin_model, data, q_k)
+        place = pin.updateFramePlacement(pin_model, data, frame)
+        root[k] = pin.SE3ToXYZQUAT(pin.XYZQUATToSE3(poses[k]) * place.inverse())
+    return root
+
+
+_SURE = 0.98  # probability from which a sample is decided
+_FEWEST = 0.5  # share of decided samples of a contact below which it is not found
+_LOAD = 0.4  # of the mean force of all feet on the ground: initial limit of a contact
+_SOME = 20  # samples without which a distribution is not estimated
+_ROUNDS = 10
+_WEIGHING = 3  # rounds in which the noise of each row is estimated, after that of groups of rows
+_SCORINGS, _SETTLED, _SAMPLES = 30, 1e-3, 500  # of the latter: rounds, change at their end, samples
+_TINY = 1e-12  # smallest variance
+_WIDER = 30.0  # prior of the forces there: it must not explain residuals
+_LEAST, _NEGLIGIBLE = 0.2, 1e-4  # smallest ratios of a variance to the one before, to the largest
+_SLOWEST = 1e-3  # [m/s] speed below which speeds do not differ
+_NARROW = (0.02, 2e-3, 0.1)  # smallest deviations: force over weight, height [m], decades of speed
+
+
+@dataclass(frozen=True, eq=False)
+class FoundContact:
+    """Whether a link touches the ground, sample by sample.
+
+    Attributes:
+        frame: The link.
+        touches: Probability that it does, shape (N,).
+        force: Its estimated force upwards, shape (N,) [N].
+    """
+
+    frame: str
+    touches: Array
+    force: Array
+
+    @property
+    def shares(self) -> tuple[float, float, float]:
+        """Shares of samples in contact, without contact, and undecided."""
+        on, off = (float(np.mean(x > _SURE)) for x in (self.touches, 1.0 - self.touches))
+        return on, off, 1.0 - on - off
+
+
+def with_contacts(model: RobotModel, log: Log, signals: SignalSettings) -> Log:
+    """Return a log with all contacts of a robot; those that it does not state are found.
+
+    An undecided sample counts as contact: the force of the link is then eliminated. A note states
+    the shares.
+    """
+    flagged = [x.frame for x in model.contacts if not x.always]
+    missing = [frame for frame in flagged if frame not in log.contacts]
+    if not missing:
+        return log
+    t, found = find_contacts(model, log, signals)
+    flags, parts = dict(log.contacts), []
+    for contact in found:
+        on, off, open_ = contact.shares
+        if on + off < _FEWEST:
+            raise _unknown(log, [contact.frame], f"{100 * (on + off):.0f} % of samples are decided")
+        free = np.interp(log.t, t, contact.touches, left=1.0, right=1.0) < 1.0 - _SURE
+        flags[contact.frame] = ~free
+        parts.append(
+            f"{contact.frame} {100 * on:.0f} % in contact, {100 * off:.0f} % not, "
+            f"{100 * open_:.0f} % undecided"
+        )
+    note = (
+        f"contacts found from torques and motion: {'; '.join(parts)}. Undecided samples count as "
+        "contact"
+    )
+    return replace(
+        log, contacts={frame: flags[frame] for frame in flagged}, notes=(*log.notes, note)
+    )
+
+
+def find_contacts(
+    model: RobotModel, log: Log, signals: SignalSettings
+) -> tuple[Array, tuple[FoundContact, ...]]:
+    """Return times (N,) [s] and the contacts of a robot that its log does not state."""
+    wanted = [x for x in model.contacts if not x.always and x.frame not in log.contacts]
+    if log.base is None or not log.has_torque:
+        raise _unknown(log, [x.frame for x in wanted], "it has no torque or no motion of the base")
+    if forced := [x.frame for x in wanted if x.measured]:
+        raise DataError(
+            f"{log.name} has no column contact_{forced[0]}, but a measured force there. Name the "
+            "column of the force in [columns], and state threshold in [[contact]]",
+            code="missing_column",
+        )
+    stated = {x.frame: x for x in model.contacts if x not in wanted}
+    bare = replace(log, contacts={x: log.contacts[x] for x, y in stated.items() if not y.always})
+    motion = process(bare, replace(signals, trim=0.0))
+    if motion.contacts is None:
+        motion = replace(motion, contacts=np.empty((len(motion.t), 0), dtype=bool))
+    force, velocity = _forces(model, motion, wanted)
+    load = np.linalg.norm(model.pin_model.gravity.linear) * sum(
+        inertia.mass for inertia in model.pin_model.inertias
+    )
+    heights = None
+    if log.base.has_position:
+        frames = [x.frame for x in wanted]
+        positions = link_positions(model.pin_model, model.configurations(motion.q), frames)
+        heights = positions @ _up(model)
+    touches = _probabilities(force / load, heights, velocity, len(model.contacts))
+    return motion.t, tuple(
+        FoundContact(x.frame, touches[:, k], force[:, k]) for k, x in enumerate(wanted)
+    )
+
+
+def _up(model: RobotModel) -> Array:
+    """Return the direction against gravity, shape (3,)."""
+    gravity: Array = model.pin_model.gravity.linear
+    up: Array = -gravity / np.linalg.norm(gravity)
+    return up
+
+
+def _unknown(log: Log, frames: Sequence[str], why: str) -> DataError:
+    return DataError(
+        f"{log.name} has no column of the contact of {listed(frames)}, and the contact cannot be "
+        f"found from torques and motion: {why}. Record contact_{frames[0]}, 1 while the link "
+        "touches the ground, 0 otherwise; or the force of the foot, with threshold in "
+        "[[contact]]; or the torques of all joints and the pose of the base. If it always touches, "
+        "state always = true",
+        code="missing_column",
+    )
+
+
+def _forces(
+    model: RobotModel, motion: Trajectory, wanted: Sequence[Contact]
+) -> tuple[Array, Array]:
+    """Return forces upwards (N, k) [N] and velocities (N, k, 3) [m/s] of links, all touching.
+
+    The noise level of each row is that of its residuals.
+    """
+    turned = [
+        replace(x, axes="world") if isinstance(x, Contact) and x in wanted else x
+        for x in model.constraints
+    ]
+    model = replace(model.with_terms({}), constraints=tuple(turned))
+    flags = np.ones((len(motion.t), len(model.contacts)), dtype=bool)
+    names = [x.frame for x in wanted]
+    stated = [not (x.always or x.frame in names) for x in model.contacts]
+    flags[:, stated] = motion.contacts
+    J, first = constraint_jacobian(model, motion.q, flags), 0
+    (torque,) = predict(model, [model.standard_parameters()], motion)
+    b = torque - motion.tau
+    known, starts = [], []
+    for x in model.constraints:
+        if isinstance(x, Contact):
+            known += [first + k for k in x.rows_measured]
+            starts += [first] if x.frame in names else []
+        first += x.sizes[x.kind]
+    if motion.wrenches is not None:
+        b -= np.einsum("kmj,km->kj", J[:, known], motion.wrenches)
+    velocity = np.stack(
+        [np.einsum("kij,kj->ki", J[:, i : i + 3], motion.v) for i in starts], axis=1
+    )
+    J[:, known] = 0.0
+    size = np.sqrt(np.mean(torque[:, :3] ** 2)) + 1e-9  # of any force, so that f is determined
+    sigma = _noise_of_groups(J, b, size)
+    for _ in range(_WEIGHING):
+        A = J / sigma
+        N = A @ A.swapaxes(1, 2) + np.eye(J.shape[1]) / size**2
+        f = np.linalg.solve(N, A @ (b / sigma)[..., None])[..., 0]
+        left = 1.0 - np.einsum("kmj,kmj->kj", A, np.linalg.solve(N, A))  # 1 - leverage
+        residual = b - np.einsum("kmj,km->kj", J, f)
+        sigma = np.sqrt(np.mean(residual**2, axis=0) / np.mean(left, axis=0).clip(0.01)) + 1e-6
+    return np.stack([f[:, i : i + 3] @ _up(model) for i in starts], axis=1), velocity
+
+
+def _noise_of_groups(J: Array, b: Array, size: float) -> Array:
+    """Return the noise level of rows, shape (n_rows,): one for forces, moments and joints each.
+
+    The variances have the largest likelihood of the residuals (restricted maximum likelihood, by
+    Fisher scoring). Reweighting by residuals over leverages has the same solution, but with levels
+    that differ by a factor of 10 it takes tens of rounds.
+
+    References:
+        Searle, Casella, McCulloch (1992), Variance Components, section 8.3.
+
+    J (N, m, n_rows), b (N, n_rows).
+    """
+    step, n = max(1, len(b) // _SAMPLES), b.shape[1]
+    J, b, weak = J[::step], b[::step], np.eye(J.shape[1]) / (_WIDER * size) ** 2
+    group = np.repeat([0, 1, 2], [3, 3, n - 6])
+    member = (group == np.arange(3)[:, None]).astype(float)[: group.max() + 1]  # (groups, n)
+    variance, largest = np.full(len(member), np.mean(b**2) + _TINY), np.mean(b**2, axis=0).max()
+    for _ in range(_SCORINGS):
+        inverse = 1.0 / (variance @ member)
+        A = J * inverse
+        N = A @ J.swapaxes(1, 2) + weak
+        P = np.diag(inverse) - A.swapaxes(1, 2) @ np.linalg.solve(N, A)  # (N, n, n)
+        left = member @ np.mean(np.einsum("kij,kj->ki", P, b) ** 2, axis=0)
+        curvature = member @ np.mean(P**2, axis=0) @ member.T
+        found = np.linalg.lstsq(curvature, left, rcond=None)[0]  # contacts may explain a group
+        before, variance = variance, np.clip(found, _LEAST * variance, largest + _TINY)
+        variance = np.maximum(variance, _NEGLIGIBLE * variance.max()) + _TINY
+        if np.abs(np.log(variance / before)).max() < _SETTLED:
+            break
+    sigma: Array = np.sqrt(variance @ member)
+    return sigma
+
+
+def _probabilities(force: Array, heights: Array | None, velocity: Array, feet: int) -> Array:
+    """Return the probabilities of contact, shape (N, k).
+
+    force (N, k), heights (N, k) [m], velocity (N, k, 3) [m/s].
+    """
+    p = (force > _LOAD / feet).astype(float)
+    for _ in range(_ROUNDS):
+        if min(p.sum(), (1.0 - p).sum()) < _SOME:  # all or none touch: the force alone decides
+            alone: Array = expit((force - 0.25 * _LOAD / feet) / _NARROW[0])
+            return alone
+        moving = velocity
+        if heights is None:
+            ground = np.einsum("ki,kij->kj", p, velocity) / (p.sum(axis=1)[:, None] + 1e-9)
+            moving = velocity - ground[:, None]
+        speeds = np.log10(np.linalg.norm(moving, axis=2) + _SLOWEST)
+        odds = np.full_like(p, np.log(p.mean() / (1.0 - p.mean())))
+        for x, narrow in zip((force, heights, speeds), _NARROW, strict=True):
+            if x is not None:
+                odds += _evidence(x, p, narrow, 0.0 if x is force else None)
+        p = expit(odds)
+    return p
+
+
+def _evidence(x: Array, p: Array, narrow: float, off: float | None) -> Array:
+    """Return the logarithm of the ratio of the densities of a value with and without contact.
+
+    x (N, k), p (N, k).
+    """
+    on, is_fixed = float(np.average(x, weights=p)), off is not None
+    off = float(np.average(x, weights=1.0 - p)) if off is None else off
+    a = max(float(np.sqrt(np.average((x - on) ** 2, weights=p))), narrow)
+    b = np.sqrt(np.average((x - off) ** 2, weights=1.0 - p))
+    if is_fixed:  # its tails are links in contact
+        b = min(b, _spread(x - off, 1.0 - p))
+    b = max(float(b), narrow)
+    y = np.clip(x, min(on, off), max(on, off))  # values beyond both are no further evidence
+    ratio: Array = (((y - off) / b) ** 2 - ((y - on) / a) ** 2) / 2 - np.log(a / b)
+    return ratio
+
+
+def _spread(x: Array, weights: Array) -> float:
+    """Return the standard deviation of a normal distribution with the median of |x|."""
+    order = np.argsort(np.abs(x), axis=None)
+    total = np.cumsum(weights.ravel()[order])
+    middle = order[np.searchsorted(total, 0.5 * total[-1])]
+    return 1.4826 * float(np.abs(x.ravel()[middle]))

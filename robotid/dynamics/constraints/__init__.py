@@ -1,1 +1,0 @@
-"""Motions and contact forces that constraints determine."""

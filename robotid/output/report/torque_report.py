@@ -1,0 +1,440 @@
+"""The report on an identification from torques: its sections, and the content of its page."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from html import escape
+from pathlib import Path
+
+import numpy as np
+
+from robotid.base.findings import listed
+from robotid.base.typing import Array
+from robotid.base.versions import versions
+from robotid.data.signal_settings import SignalSettings
+from robotid.diagnosis.residual.decisions import DEPENDENCE_SHARE
+from robotid.diagnosis.residual.residuals import friction_split
+from robotid.diagnosis.residual.torque_split import JointTorque
+from robotid.diagnosis.verdict.parameter_table import parameter_entries
+from robotid.estimation.estimators.batch import solve_factor
+from robotid.estimation.fitting.bands import TorqueBand, next_errors
+from robotid.estimation.fitting.evaluation import Evaluation
+from robotid.estimation.fitting.fitted import Fit
+from robotid.estimation.fitting.selected_drives import DriveChoice
+from robotid.identification.result import TorqueIdentification
+from robotid.identification.summary import left_out_lines
+from robotid.output.files.entries import input_entries
+from robotid.output.pages.charts import Chart, chart_html
+from robotid.output.pages.html import Cell, block, cell, code, folded, listing, percent, table, text
+from robotid.output.report.dock import Residual
+from robotid.output.report.ellipsoids import ellipsoid_pictures
+from robotid.output.report.errors import TORQUE, errors_of, worst_errors
+from robotid.output.report.next_steps import next_steps
+from robotid.output.report.pictures import (
+    friction_chart,
+    shown_evaluation,
+    spectrum_chart,
+    torque_charts,
+    why_charts,
+)
+from robotid.output.report.report_page import Report, curves_section, drawn
+from robotid.output.report.steps import Origin
+from robotid.output.report.tables import (
+    base_table,
+    body_table,
+    consistency_section,
+    input_table,
+    open_section,
+    parameter_section,
+    settings_tables,
+    variation_section,
+    version_table,
+)
+
+_PAIRS = 15  # strongest correlations that are listed
+_STRONG = 0.8  # smallest correlation that is listed
+_KNOWN = 0.99  # share of the data from which a parameter is not listed
+_LOW = 130  # [px] height of a friction chart
+_CURVES = 8  # friction charts that are not folded
+_POINTS = 300  # of a chart of the residual analysis
+_ALL_POINTS = 1800  # of one chart, summed over the joints
+_FEWEST_POINTS = 100
+_MOST = 12  # joints with all charts; others have charts of significant dependences only
+_WEAK = (("parameter", "code", "name"), ("share of data %", ".1f", "share"))
+_CORRELATED = (("parameter", "code", "one"), ("and", "code", "other"), ("correlation", ".3f", "r"))
+_TRIED = (
+    ("terms", "text", "terms"), ("held-out error %", ".2f", "error"), ("p-value", ".1e", "p_value"),
+    ("", "text", "selected"),
+)  # fmt: skip
+
+
+def torque_report(found: TorqueIdentification, origin: Origin, replay: str = "") -> Report:
+    """Return the content of a report on an identification."""
+    *validation, fitted = recordings = errors_of(found)
+    counted = [errors for errors, e in zip(validation, found.validation, strict=True)
+               if not e.is_refitted] or [fitted]  # fmt: skip
+    entries = [entry for part in parameter_entries(found) for entry in part]
+    verdict, worst = found.verdict.to_dict(), [*worst_errors(counted)]
+    return Report(
+        title=f"{found.model.name}: identified parameters",
+        robot=found.model.name,
+        rows=found.model.row_names,
+        verdict=verdict,
+        findings=found.findings,
+        quantity=TORQUE,
+        counted=counted,
+        recordings=recordings,
+        facts=_facts(found),
+        steps=next_steps(found, origin),
+        made=block("report.made", method=escape(_method(found)), totals=escape(_totals(found))),
+        errors=(block("report.torque_errors"), ""),
+        curves=("Torques", torques_section(found, worst, origin, replay)),
+        friction=friction_section(found, worst),
+        bodies=body_table(found) + ellipsoid_pictures(found),
+        why=why_section(found),
+        variation=variation_section(found.variation, _next_errors(found)),
+        parameters=parameter_section(
+            found.model,
+            found.standard if found.has_urdf else None,
+            entries,
+            block("report.torque_parameters"),
+            found.on_misfit,
+        ),
+        entries=entries,
+        appendix={
+            "residuals": ("Residual spectra", residual_section(found)),
+            "drives": ("Selection of friction terms", drive_choices(found)),
+            "base": ("Base parameters", base_table(found)),
+            "consistency": ("Physical consistency", consistency_section(found)),
+            "information": ("Excitation and correlation", information_section(found)),
+            "open": ("Parameters not identifiable", open_section(found)),
+            "settings": ("Settings", settings_tables(found)),
+            "inputs": ("Inputs", input_table(input_entries(found))),
+            "versions": ("Versions", version_table(versions())),
+        },
+    )
+
+
+def _next_errors(found: TorqueIdentification) -> dict[str, str]:
+    """Return the expected RMS torque error of the next log with its unit, by row."""
+    if found.variation is None:
+        return {}
+    rows = zip(found.model.row_names, found.model.row_units, next_errors(found), strict=True)
+    return {row: f"{error:.3g} {unit}" for row, unit, error in rows}
+
+
+def _names(evaluations: Sequence[Evaluation]) -> str:
+    return ", ".join(e.name for e in evaluations)
+
+
+def _facts(found: TorqueIdentification) -> dict[str, str]:
+    before, after, _ = found.scale_check.masses
+    is_assumed = found.scale_check.assumed > 0
+    is_compared = before > 0 and not is_assumed
+    change = f" ({100 * (after / before - 1):+.0f} %)".replace("-", "−") if is_compared else ""
+    if not found.scale_check.is_total_determined:
+        change += ", not determined by torque alone"
+    masses = f"{before:.2f}{' assumed' * is_assumed} → {after:.2f}"
+    return {
+        "Total mass": f"<strong>{masses} kg</strong>{change}",
+        "Base parameters determined": (
+            f"<strong>{found.determination.rank} of {len(found.base)}</strong>, condition number "
+            f"{found.wls.condition:.3g} (regressor, unit columns)"
+        ),
+    }
+
+
+def _method(found: TorqueIdentification) -> str:
+    """Return a description of the fit and its logs."""
+    fitted, validation = found.fitted, found.validation
+    samples = sum(e.recording.extent.smooth for e in fitted)
+    rows = sum(e.recording.extent.rows_used for e in fitted)
+    chains = sorted({_chain(e.recording.signals) for e in (*fitted, *validation)})
+    return (
+        f"{len(found.base)} base parameters of {len(found.model.joints)} joints were fitted to "
+        f"{_names(fitted)} ({samples} samples after filtering, {rows} torque values used) by "
+        f"{found.estimator.words} ({found.estimator.name}). "
+        + (f"Validation: {_names(validation)}. " if validation else f"{_others(found)}. ")
+        + f"Signals: {'; or '.join(chains)}."
+    )
+
+
+def _others(found: TorqueIdentification) -> str:
+    """Return that there is no validation log, and the errors of logs left out, as text."""
+    lines = left_out_lines([metrics.to_dict() for metrics in found.left_out.values()])
+    return "There is no validation log" + "".join(f"; {line}" for line in lines)
+
+
+def _totals(found: TorqueIdentification) -> str:
+    """Return total mass, gravity torque and friction, for comparison with the verdict."""
+    scale_check = found.scale_check
+    shares = [f"{joint} {100 * share:.0f} %" for joint, share in scale_check.friction.items()]
+    before, after, _ = scale_check.masses
+    gravity = [f"{joint} {ratio:.2f}" for joint, ratio in scale_check.gravity.items()]
+    return (
+        f"Total mass {before:.2f} -> {after:.2f} kg. Gravity torque relative to the URDF: "
+        f"{listed(gravity)}. Friction relative to the torque: {listed(shares)}."
+    )
+
+
+def _chain(signals: SignalSettings) -> str:
+    cutoff = "no filter"
+    if signals.cutoff is not None:
+        cutoff = (
+            f"zero-phase Butterworth low-pass, cut-off {signals.cutoff:g} Hz, order "
+            f"{signals.order} run forward and backward"
+        )
+    rate = f"grid of {signals.rate:.6g} Hz" if signals.rate else "samples as recorded"
+    return f"{cutoff}, {rate}, velocity {signals.velocity}"
+
+
+def torques_section(
+    found: TorqueIdentification, worst: Sequence[str], origin: Origin, replay: str = ""
+) -> str:
+    """Return charts of torques and residuals over time."""
+    evaluations, model = found.validation or found.fitted, found.model
+    intro = _intro(found, drawn(evaluations, model.row_names))
+
+    def charts(e: Evaluation, row: int, link: str, points: int) -> str:
+        return _charts(found, e, found.band(e), row, link=link, points=points)
+
+    def residuals(row: int) -> Iterator[Residual]:
+        return _residuals(() if model.is_static else evaluations, row)
+
+    return curves_section(
+        found, evaluations, worst, (replay, origin), intro, charts, residuals, TORQUE,
+        model.row_units,
+    )  # fmt: skip
+
+
+def _residuals(evaluations: Sequence[Evaluation], row: int) -> Iterator[Residual]:
+    """Yield the residuals of a joint, of the samples used."""
+    for e in evaluations:
+        motion, used = e.recording.trajectory, e.recording.mask[:, row].astype(bool)
+        left = np.where(used, motion.tau[:, row] - e.torques["estimate"][:, row], np.nan)
+        yield Residual(e.name, Path(e.recording.log.path).name, motion.t, left)
+
+
+def _intro(found: TorqueIdentification, shown: Sequence[Evaluation]) -> str:
+    """Return the description of the charts and their recordings."""
+    band = "95 % band" if found.between is not None else "95 % band (for logs of the same day)"
+    html = block("report.torques", band=band)
+    html += "" if found.validation else block("report.no_validation")
+    for recording in (evaluation.recording for evaluation in shown):
+        if recording.is_partial:
+            count, samples = len(recording.trajectory.t), recording.extent.smooth
+            html += block("report.long", name=escape(recording.name), count=count, all=samples)
+    return html
+
+
+def _charts(
+    found: TorqueIdentification,
+    e: Evaluation,
+    band: TorqueBand,
+    row: int,
+    *,
+    link: str,
+    points: int,
+) -> str:
+    """Return torque and residual of a joint in a recording."""
+    name, unit = found.model.row_names[row], found.model.row_units[row]
+    measured, recording = e.metrics["estimate"].per_joint.get(name), e.recording
+    words = "no samples used"
+    if measured is not None:
+        error = percent(measured.relative_error_pct).html
+        inside = band.coverage(recording.trajectory.tau, e.torques["estimate"], recording.mask)[row]
+        words = (
+            f"error {error} %, RMSE {measured.rmse:.3g} {unit}; 95 % band contains "
+            f"{100 * inside:.0f} %"
+        )
+    kind = "not fitted" if found.validation else "fitted"
+    torque, residual = torque_charts(found, e, row, band=band, link=link)
+    caption = f"{escape(recording.name)}, {kind}: {words}"
+    return chart_html(torque, caption, points=points) + chart_html(residual, "", points=points)
+
+
+def friction_section(found: TorqueIdentification, worst: Sequence[str]) -> str:
+    """Return friction against speed of each joint, measured and identified."""
+    model, layout = found.model, found.model.layout
+    if model.is_static or all(term.is_inertia for _, term in layout.drive_parameters):
+        return ""
+    split = friction_split(model, shown_evaluation(found), found.standard)
+    figures = {}
+    for joint in model.row_names:
+        chart = friction_chart(found, joint, split=split)
+        if chart is None:
+            is_driven = joint in model.joints and joint not in model.passive
+            why = "no samples used" if is_driven else "no drive"
+            figures[joint] = f"<p>{escape(joint)}: {why}.</p>\n"
+        else:
+            caption = f"<strong>{escape(joint)}</strong>"
+            figures[joint] = chart_html(replace(chart, height=_LOW), caption)
+    is_few = len(figures) <= _CURVES
+    first = [joint for joint in figures if is_few or joint in worst[:_CURVES]]
+    more = "".join(html for joint, html in figures.items() if joint not in first)
+    if more:
+        title = f"{len(figures) - len(first)} more joints with smaller errors"
+        more = folded("friction-more", title, f'<div class="plots small">\n{more}</div>\n')
+    name = escape(shown_evaluation(found).name)
+    shown = "".join(figures[joint] for joint in first)
+    return block("report.friction", log=name, figures=shown, more=more)
+
+
+def residual_section(found: TorqueIdentification) -> str:
+    """Return the spectrum of each joint's residual."""
+    if found.model.is_static:
+        return "<p>Static poses and slow segments have no spectrum.</p>\n"
+    evaluation, figures = shown_evaluation(found), ""
+    for row, joint in enumerate(found.model.row_names):
+        chart, name = spectrum_chart(found, evaluation, row), escape(joint)
+        caption = f"<strong>{name}</strong>"
+        figures += chart_html(chart, caption) if chart else f"<p>{name}: no samples used.</p>\n"
+    return block("report.residuals", name=escape(evaluation.name), figures=figures)
+
+
+def drive_choices(found: TorqueIdentification) -> str:
+    """Return the selection of friction terms of each joint; "" if there is none."""
+    choices = "".join(_choice(drive) for drive in found.drives)
+    return block("report.terms", choices=choices) if choices else ""
+
+
+def _choice(drive: DriveChoice) -> str:
+    """Return the candidate friction terms of a joint, the selection, and its shape parameters."""
+    selected = " + ".join(drive.families) or "no additional term"
+    shapes = [
+        f"{shape.name} = {shape.value:.3g} ± {shape.std_error:.2g} {shape.unit}"
+        + (" (at its bound)" if shape.is_at_bound else "")
+        for shape in drive.shapes
+    ]
+    title = f"{drive.joint}: {selected}" + (f"; {listed(shapes)}" if shapes else "")
+    rows = [
+        {
+            "terms": " + ".join(tried.families) or "viscous and Coulomb",
+            "error": tried.held_out_error_pct,
+            "p_value": tried.p_value if tried.families else text(""),
+            "selected": "selected" if tried.is_selected else "",
+        }
+        for tried in drive.tried
+    ]
+    tried_terms = listing(title, _TRIED, rows)
+    return f"<details><summary>{escape(title)}</summary>{tried_terms}</details>\n"
+
+
+def information(found: Fit) -> tuple[Array, Array]:
+    """Return the correlation of base parameters, and the share of the data in each.
+
+    The correlation (b, b) is that of the errors of WLS if rows were independent; NaN for parameters
+    that are not identifiable. The share (b,), 0 to 1, is S^2 / (S^2 + s^2) with the prior standard
+    deviation S and the standard error s of WLS.
+    """
+    K = found.mapping.K
+    prior = np.einsum("bi,i,bi->b", K, found.prior_std**2, K)  # variances
+    error = np.diag(found.wls.covariance)
+    is_known = np.isfinite(error) & (error > 0)
+    bread = solve_factor(found.factors, found.wls.sigma, found.wls.theta).covariance
+    std = np.sqrt(np.where(is_known, np.diag(bread), np.nan))
+    share = np.where(np.isfinite(error), prior / (prior + error), 0.0)
+    return bread / np.outer(std, std), share
+
+
+def information_section(found: TorqueIdentification) -> str:
+    """Return the information in the data: shares of the data, correlations."""
+    (correlation, share), names = information(found), found.mapping.base_names
+    weak = [
+        {"name": names[i], "share": 100 * share[i]}
+        for i in np.argsort(share, kind="stable")
+        if share[i] < _KNOWN
+    ]
+    r = np.tril(np.where(np.isfinite(correlation), correlation, 0.0), -1)
+    count = int((np.abs(r) >= _STRONG).sum())
+    order = np.argsort(-np.abs(r), axis=None, kind="stable")[: min(count, _PAIRS)]
+    pairs = [
+        {"one": names[i], "other": names[j], "r": r[i, j]}
+        for i, j in zip(*np.unravel_index(order, r.shape), strict=True)
+    ]
+    title = f"The strongest of {count} correlations of {_STRONG:g} and more"
+    percents = np.round(100 * share).astype(int)
+    return block(
+        "report.information",
+        condition=f"{found.wls.condition:.3g}",
+        mean=f"{percents.mean():.0f}",
+        least=percents.min(),
+        weak=listing("Base parameters that the data determine by less than 99 %", _WEAK, weak),
+        pairs=listing(title, _CORRELATED, pairs)
+        or f"<p>No correlation is above {_STRONG:g}.</p>\n",
+    )
+
+
+def why_section(found: TorqueIdentification) -> str:
+    """Return the residual analysis: a part for each joint, the worst joint first and open."""
+    torques = sorted(found.joint_torques, key=_relative_residual, reverse=True)
+    logs = torques[0].rows.recordings
+    kind = "Validation logs" if torques[0].fitted is not None else "Fitted logs, without validation"
+    points = max(_FEWEST_POINTS, min(_POINTS, _ALL_POINTS // len(torques)))
+    names = [e.name for e in found.validation or found.fitted]
+    link = f"recording {names.index(logs[0])}" if logs[0] in names else "fitted"  # as the torques
+    joints = "".join(
+        folded(
+            f"why-{found.model.row_names.index(torque.joint)}",
+            f"<strong>{code(torque.joint).html}</strong>: {escape(torque.sentence)}",
+            _joint(torque, link, points, is_full=k < _MOST),
+            is_open=k == 0,
+        )
+        for k, torque in enumerate(torques)
+    )
+    return block("report.why", kind=kind, logs=escape(", ".join(logs)), joints=joints)
+
+
+def _relative_residual(torque: JointTorque) -> float:
+    """Return the RMS residual over the RMS torque; -1 if there is no torque."""
+    rms = torque.rms
+    return rms["residual"] / rms["measured"] if rms["measured"] > 0 else -1.0
+
+
+def _joint(torque: JointTorque, link: str, points: int, *, is_full: bool) -> str:
+    """Return table and charts of a joint: all charts, or those of significant dependences."""
+    if not torque.used.any():
+        return ""
+
+    def drawn_chart(chart: Chart, caption: str) -> str:
+        return chart_html(chart, caption, points=2 * len(chart.x))
+
+    charts = why_charts(torque, link=link, points=points)
+    caption = "Torque components, stacked; shaded: samples not used"
+    split = drawn_chart(charts.pop("split"), caption)
+    significant = {d.name for d in torque.follows if d.is_significant}
+    small = "".join(
+        drawn_chart(chart, _caption(torque, name))
+        for name, chart in charts.items()
+        if is_full or name in significant
+    )
+    return f'{_parts(torque)}{split}<div class="plots">\n{small}</div>\n'
+
+
+def _caption(torque: JointTorque, name: str) -> str:
+    if name == "power" and torque.power is not None:
+        used = torque.power[torque.used]
+        words = f"Mechanical power: mean {used.mean():.3g} W, peak {abs(used).max():.3g} W"
+        return words.replace("-", "−")
+    (dependence,) = (d for d in torque.follows if d.name == name)
+    share = percent(100 * (dependence.share or 0.0)).html
+    result = "no dependence"
+    if dependence.share is None:
+        result = "too few samples"
+    elif dependence.is_significant:
+        result = f"<strong>explains {share} % of the variance</strong>"
+    elif dependence.share >= DEPENDENCE_SHARE:
+        result = f"explains {share} % of the variance, not significant"
+    return f"Residual against {name}: {result}"
+
+
+def _parts(torque: JointTorque) -> str:
+    """Return the table of torque components, with the terms of those that have several."""
+    rms, rows = torque.rms, []
+    for name in (*sorted(torque.present, key=lambda name: -rms[name]), "residual", "measured"):
+        sizes = {term: torque.size(x) for term, x in torque.terms.get(name, {}).items()}
+        terms = [f"{term.removeprefix(f'{torque.joint}.')} {x:.3g}" for term, x in sizes.items()]
+        share = 100 * rms[name] / rms["measured"] if rms["measured"] else None
+        details = Cell(escape(", ".join(terms)) if len(terms) > 1 else "")
+        rows.append([cell(name, "text"), cell(rms[name], ".3g"), percent(share), details])
+    headers = ["component", f"RMS {torque.unit}", "% of torque", "terms, RMS"]
+    return table(f"{torque.joint}: torque components, which may cancel", headers, rows)

@@ -1,0 +1,209 @@
+import numpy as np
+import pinocchio as pin
+import pytest
+from helpers.synthetic import truth
+
+from robotid.base.exceptions import DataError, SettingsError
+from robotid.dynamics.simulation.motions import FourierTrajectory, random_fourier
+from robotid.dynamics.simulation.simulation_settings import (
+    Actuator,
+    Controller,
+    Payload,
+    Simulation,
+    Truth,
+)
+from robotid.dynamics.simulation.simulator import carried, follow, simulate
+from robotid.dynamics.simulation.truth import draw_parameters
+from robotid.dynamics.torque import joint_torque_regressor
+from robotid.robot.drives import Lag, LoadFriction, Presliding
+from robotid.robot.model import RobotModel
+from robotid.robot.parameters import Coupling
+
+
+def test_a_fourier_motion_keeps_its_derivatives(rng):
+    motion = FourierTrajectory(
+        np.ones(2), rng.standard_normal((3, 2)), rng.standard_normal((3, 2)), period=4.0
+    )
+    t, h = np.linspace(0, 4, 50), 1e-5
+    q, v, a = motion.evaluate(t)
+    before, after = motion.evaluate(t - h), motion.evaluate(t + h)
+    np.testing.assert_allclose(v, (after[0] - before[0]) / (2 * h), atol=1e-6)
+    np.testing.assert_allclose(a, (after[1] - before[1]) / (2 * h), atol=1e-6)
+    np.testing.assert_allclose(motion.evaluate(t + 4.0)[0], q, atol=1e-12)
+
+
+def test_a_centre_outside_the_limits_is_refused(panda, rng):
+    centre = np.zeros(7)
+    centre[3] = 0.5
+    with pytest.raises(DataError, match=r"the centre 0.5 of joint 'panda_joint4' is not inside"):
+        random_fourier(panda, rng, centre=centre)
+
+
+def test_the_log_of_the_plant_obeys_its_own_equation(ur5, rng):
+    pi = truth(ur5)
+    log = simulate(ur5, pi, random_fourier(ur5, rng), rate=1000.0, duration=1.0, rng=rng)
+    a = np.gradient(log.v, log.t, axis=0)
+    tau = (joint_torque_regressor(ur5, log.q, log.v, a) @ pi).reshape(log.tau.shape)
+    smooth = (np.abs(log.v) > 0.02).all(axis=1)  # the plant's friction is tanh(v / 0.2 mm/s)
+    smooth[[0, 1, -2, -1]] = False  # one-sided differences
+    error = np.abs(tau - log.tau)[smooth].max()
+    assert error < 2e-3 * np.abs(log.tau).max()
+    np.testing.assert_allclose(np.gradient(log.q, log.t, axis=0)[5:-5], log.v[5:-5], atol=1e-3)
+
+
+def test_the_plant_is_integrated_in_short_steps_whatever_the_rate_of_the_log(ur5):
+    motion = random_fourier(ur5, np.random.default_rng(0))
+    rare, often = (
+        simulate(ur5, truth(ur5), motion, rate=rate, duration=1.0, rng=np.random.default_rng(0))
+        for rate in (25.0, 200.0)
+    )
+    np.testing.assert_allclose(rare.q, often.q[::8], atol=1e-3)
+
+
+def followed(model, pi, settings, *, seed=1, rate=500.0, duration=2.0):
+    motion = random_fourier(model, np.random.default_rng(seed))
+    return follow(model, pi, motion, rate=rate, duration=duration, settings=settings)
+
+
+def error_of(run):
+    return np.abs(run.q - run.reference).max()
+
+
+def test_computed_torque_with_the_right_bodies_follows_all_but_exactly(ur5):
+    pi = ur5.standard_parameters()
+    kinds = {
+        kind: error_of(followed(ur5, pi, Simulation(controller=Controller(kind)), duration=1.0))
+        for kind in ("pd", "feedforward", "computed_torque", "perfect")
+    }
+    assert kinds["computed_torque"] < 1e-4
+    assert kinds["feedforward"] < 1e-4
+    assert kinds["pd"] > 0.02  # it knows no gravity
+    assert kinds["perfect"] == 0.0
+
+
+def test_a_perfect_log_is_inverse_dynamics_drives_that_remember_included(ur5):
+    own = {"elbow_joint": (LoadFriction(), Presliding(displacement=0.05))}
+    model = ur5.with_terms(own)
+    pi = truth(model)
+    run, loop = (  # the second is a plant with states that is made to do the same
+        followed(model, pi, Simulation(controller=controller), rate=1000.0, duration=1.5)
+        for controller in (Controller("perfect"), Controller(bandwidth=100.0))
+    )
+    late = run.t > 0.3
+    difference = (loop.tau - run.tau)[late][:, 2]
+    assert np.sqrt(np.mean(difference**2)) < 0.02 * np.sqrt(np.mean(run.tau[:, 2] ** 2))
+
+
+def test_drives_give_no_more_than_their_limits(ur5):
+    pi, most = truth(ur5), {"shoulder_pan_joint": 8.0}
+    free = followed(ur5, pi, Simulation())
+    held = followed(ur5, pi, Simulation(actuator=Actuator(effort=1.0, limits=most)))
+    assert free.tau[:, 0].min() < -9.0
+    assert free.tau[:, 0].max() > 9.0
+    assert (held.tau[:, 0].min(), held.tau[:, 0].max()) == (-8.0, 8.0)
+    assert (np.abs(held.tau) <= [j.effort for j in ur5.limits]).all()
+    assert held.saturated[0] == np.mean(np.abs(held.tau[:, 0]) == 8.0) > 0.0
+    assert (free.saturated == 0.0).all()
+
+
+def test_a_payload_is_taken_up_in_time(ur5):
+    load = Payload("ee_link", 2.0, com=(0.1, 0.0, 0.05), inertia=(0.01, 0, 0.01, 0, 0, 0.01),
+                   start=0.3)  # fmt: skip
+    pi = truth(ur5)
+    loaded = carried(ur5, pi, load)
+    assert loaded[50] - pi[50] == pytest.approx(2.0)
+    x, v = np.array([[0.3, -1.0, 0.7, 0.2, 0.4, 0.1]]), np.zeros((1, 6))
+    more = joint_torque_regressor(ur5, x, v, v) @ (loaded - pi)
+    robot = ur5.pin_model.copy()
+    hand = robot.frames[robot.getFrameId("ee_link")]
+    arm = pin.Inertia(2.0, np.array([0.1, 0.0, 0.05]), 0.01 * np.eye(3))
+    robot.appendBodyToJoint(hand.parentJoint, arm, hand.placement)
+    with_it = pin.rnea(robot, robot.createData(), x[0], v[0], v[0])
+    without = pin.rnea(ur5.pin_model, ur5.pin_model.createData(), x[0], v[0], v[0])
+    np.testing.assert_allclose(more, with_it - without, atol=1e-9)
+    for kind in ("perfect", "feedforward"):
+        run, empty = (
+            followed(ur5, pi, Simulation(controller=Controller(kind), payload=p), duration=0.4)
+            for p in (load, Payload())
+        )
+        first = int(np.argmax(np.abs(run.tau - empty.tau).max(axis=1) > 1e-9))
+        assert run.t[first] == 0.3
+
+
+def test_what_no_payload_can_be_is_refused(ur5):
+    flat = Payload("ee_link", 1.0, inertia=(1.0, 0.0, 0.1, 0.0, 0.0, 0.1))
+    with pytest.raises(
+        SettingsError, match=r"payload: inertia is \[1.0, 0.0, .* physically inconsistent"
+    ):
+        carried(ur5, truth(ur5), flat)
+    with pytest.raises(SettingsError, match="link 'base_link' is fixed to the world"):
+        carried(ur5, truth(ur5), Payload("base_link", 1.0))
+
+
+def test_a_torque_that_lags_is_late_in_the_log_of_its_joint(ur5, rng):
+    model = ur5.with_terms({"elbow_joint": (Lag(),)})
+    pi = truth(model)
+    pi[model.layout.names.index("elbow_joint.lag")] = 0.01
+    motion = random_fourier(model, np.random.default_rng(1))
+    log = simulate(model, pi, motion, rate=500.0, duration=1.0, rng=rng)
+    run = followed(model, pi, Simulation(), duration=1.0)
+    np.testing.assert_allclose(log.tau[5:, 2], run.tau[:-5, 2], atol=1e-9)
+    np.testing.assert_array_equal(log.tau[:, 3], run.tau[:, 3])
+
+
+def test_an_elastic_gear_needs_a_rotor_and_stiffness_for_every_joint(ur5):
+    soft = Actuator(stiffness={"elbow_joint": 1e4})
+    for actuator, words in (
+        (soft, "stiffness is not stated for 'shoulder_pan_joint'. State it for every joint"),
+        (Actuator(stiffness=1e4), "has no armature, which an elastic gear needs"),
+    ):
+        with pytest.raises(SettingsError, match=words):
+            followed(ur5, ur5.standard_parameters(), Simulation(actuator=actuator))
+    with pytest.raises(SettingsError, match=r"backlash applies only to elastic gears. State their"):
+        Actuator(backlash=0.01)
+    with pytest.raises(SettingsError, match="perfect, which has no limits and no elastic gears"):
+        Simulation(controller=Controller("perfect"), actuator=Actuator(effort=1.0))
+    with pytest.raises(SettingsError, match="kp and kd apply to kind pd or feedforward"):
+        Controller("computed_torque", kp=3.0)
+
+
+def test_gains_rates_and_durations_beyond_reason_are_told(ur5):
+    wild = Simulation(controller=Controller("pd", kp=1e7, kd=1e6))
+    with pytest.raises(DataError, match=r"the simulation diverged at t = .* lower gains"):
+        followed(ur5, truth(ur5), wild)
+    for rate, duration, steps in ((1e5, 3600.0, "1"), (1e-3, 5e3, r"\d{6,}")):
+        words = (
+            rf"has .* samples of {steps} steps each, wanted at most 2e\+07 steps in total and 1e"
+        )
+        with pytest.raises(SettingsError, match=words):
+            followed(ur5, truth(ur5), Simulation(), rate=rate, duration=duration)
+
+
+def test_a_payload_adds_what_pinocchio_says_of_its_body(ur5):
+    turned = pin.rpy.rpyToMatrix(0.3, -0.7, 1.1)
+    I = turned @ np.diag([0.03, 0.05, 0.06]) @ turned.T  # noqa: E741
+    xx, xy, xz, yy, yz, zz = I[np.triu_indices(3)]
+    load = Payload("forearm_link", 1.7, com=(0.1, -0.2, 0.05), inertia=(xx, xy, yy, xz, yz, zz))
+    pi = np.arange(float(len(ur5.layout.names)))
+    added = carried(ur5, pi, load) - pi
+    body = ur5.layout.bodies.index("forearm_link")
+    own = pin.Inertia(1.7, np.array(load.com), I).toDynamicParameters()
+    np.testing.assert_allclose(added[10 * body : 10 * body + 10], own, atol=1e-12)
+    assert np.count_nonzero(added) == 10
+    np.testing.assert_array_equal(pi, np.arange(float(len(pi))))  # as it was
+    assert carried(ur5, pi, Payload("forearm_link", 0.0)) is pi
+
+
+def test_a_drive_of_several_joints_is_as_small_as_the_weakest(panda):
+    for ratios in ((("panda_joint1", 1.0), ("panda_joint7", 2.0)),
+                   (("panda_joint7", 2.0), ("panda_joint1", 1.0))):  # fmt: skip
+        model = RobotModel.from_urdf(
+            panda.tree.path, joints=panda.joints, couplings=(Coupling("motor", ratios),)
+        )
+        pi = draw_parameters(model, Truth(inertials=0.0), np.random.default_rng(3))
+        drawn = dict(zip(model.layout.names, pi, strict=True))
+        for d, term in model.layout.drive_parameters:
+            drive = model.layout.drives[d].name
+            weak = 12.0 / 50.0 if drive == "motor" or drive[-1] in "567" else 1.0
+            low, high = (weak * x for x in term.typical)
+            assert low <= drawn[f"{drive}.{term.name}"] <= high, drive
