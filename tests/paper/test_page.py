@@ -44,7 +44,7 @@ def test_figure_4_is_the_control_of_its_joint_by_iterations(studies):
             for k in (0, 1):
                 close(upper["series"][k]["y"], u[k])
                 close(lower["series"][k]["y"], u[k] - u[-1])
-            t, program = study.program_control(101)
+            _, program = study.program_control(101)
             close(upper["series"][-1]["y"], program[:-1, joint])
 
 
