@@ -14,7 +14,7 @@ from robotid.base.findings import listed
 from robotid.base.settings import require_kind
 from robotid.base.typing import Array
 from robotid.base.versions import __version__
-from robotid.output.files.exported import unstated_terms
+from robotid.output.files.exports import unstated_terms
 from robotid.output.files.urdf import link_parameters
 from robotid.robot.bodies import inertial_parameters, link_places
 from robotid.robot.geometry import Shape, find_mesh, read_shapes

@@ -177,8 +177,8 @@ def test_identify_takes_paths_and_frames_and_finds_what_it_finds_in_logs(ur5, tm
     )
     np.testing.assert_array_equal(one.standard, other.standard)
     assert one.verdict.to_dict()["status"] == other.verdict.to_dict()["status"]
-    assert [f.code for f in robotid.check_logs(ur5, tmp_path / "first.csv")] == [
-        f.code for f in robotid.check_logs(ur5, [first])
+    assert [f.code for f in robotid.doctor(ur5, tmp_path / "first.csv")] == [
+        f.code for f in robotid.doctor(ur5, [first])
     ]
     with pytest.raises(DataError, match="no log was given; at least one is needed"):
         robotid.identify(ur5, [])
@@ -197,7 +197,7 @@ def test_swapped_arguments_are_named(ur5, rng, tmp_path):
         (table, ur5, "the file run.csv"),
         (str(table), str(urdf), "the file run.csv"),
     ):
-        for call in (robotid.identify, partial(robotid.identify_payload, reference=[log])):
+        for call in (robotid.identify, partial(robotid.payload, reference=[log])):
             with pytest.raises(ModelError, match=rf"model is {what}, and .*; swap the two"):
                 call(given, robot)
     with pytest.raises(ModelError, match="model is a Log, wanted a RobotModel or the path"):
