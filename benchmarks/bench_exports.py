@@ -23,7 +23,7 @@ import numpy as np
 import scipy.optimize
 from setting import machine
 
-from robotid.cli.export import export_result
+from robotid.cli.export import export
 from robotid.cli.identify import run_job
 from robotid.cli.job import read_job
 from robotid.output.files.result_file import load_result
@@ -52,7 +52,7 @@ def compare(name, folder):
     if "urdf" not in result.content["outputs"]:
         print(f"| {name} | - | no URDF: {result.verdict['status']} | - | - | - |")
         return
-    projected = export_result(folder / "out", "mjcf", folder / "a.xml")["projected"]
+    projected = export(folder / "out", "mjcf", folder / "a.xml")["projected"]
     model, _ = result.identified
     q, v, a = validation_rows(name, model)
     predicted, exported = result.predict(q, v, a), inverse(folder / "a.xml", model, q, v, a)

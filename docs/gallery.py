@@ -21,6 +21,8 @@ from scipy.spatial import ConvexHull
 
 import robotid
 from robotid.cli.demo import run_demo
+from robotid.cli.identify import run_job
+from robotid.cli.job import read_job
 from robotid.dynamics.simulation.motions import random_fourier
 from robotid.dynamics.simulation.simulator import Noise, simulate
 from robotid.dynamics.simulation.truth import another_robot
@@ -113,8 +115,8 @@ def build(name, folder):
             command = "robotid demo"
         elif name in RECORDED:
             title, lesson = RECORDED[name]
-            job = replace(robotid.read_job(ROOT / f"tests/jobs/{name}.toml"), replay=True)
-            found = robotid.run_job(job, written)[0]
+            job = replace(read_job(ROOT / f"tests/jobs/{name}.toml"), replay=True)
+            found = run_job(job, written)[0]
             command = f"robotid identify tests/jobs/{name}.toml --out {name}"
         else:
             title, lesson, urdf, locked = SIMULATED[name]

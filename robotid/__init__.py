@@ -6,101 +6,68 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from robotid.base.exceptions import RobotIdError
     from robotid.base.versions import __version__
-    from robotid.cli.identify import identify, run_job, save_result
-    from robotid.cli.job import read_job
-    from robotid.data.base_motion import BaseColumns, BaseMotion
+    from robotid.cli.compare import compare
+    from robotid.cli.doctor import doctor
+    from robotid.cli.excite import excite
+    from robotid.cli.export import export
+    from robotid.cli.identify import identify, save_result
+    from robotid.cli.simulate import simulate
+    from robotid.cli.validate import validate
     from robotid.data.files.read import read_log, write_log
     from robotid.data.log import Log, Trajectory
-    from robotid.data.signal_settings import LogSource, LogUnits, SignalSettings
+    from robotid.data.signal_settings import SignalSettings
     from robotid.design.previews import preview
-    from robotid.diagnosis.logs.check_logs import check_logs
-    from robotid.diagnosis.urdf.inspection import inspect_urdf
+    from robotid.diagnosis.urdf.inspection import inspect_urdf as inspect
     from robotid.estimation.fitting.estimator_settings import EstimatorSettings
     from robotid.identification.online.identifier import OnlineIdentifier
-    from robotid.identification.payload_fit import identify_payload
+    from robotid.identification.payload_fit import identify_payload as payload
     from robotid.identification.result import Identification
-    from robotid.output.files.mjcf import write_mjcf
-    from robotid.output.files.ranges import write_ranges
     from robotid.output.files.result_file import load_result
-    from robotid.output.files.sdf import write_sdf
-    from robotid.output.files.urdf import write_urdf
-    from robotid.output.report.document import write_report
     from robotid.output.viewer.replays import replay
-    from robotid.robot.constraints import Contact, Loop
     from robotid.robot.model import RobotModel
-    from robotid.robot.parameters import Coupling
 
-__all__ = [
-    "BaseColumns",
-    "BaseMotion",
-    "Contact",
-    "Coupling",
-    "EstimatorSettings",
-    "Identification",
-    "Log",
-    "LogSource",
-    "LogUnits",
-    "Loop",
-    "OnlineIdentifier",
-    "RobotIdError",
-    "RobotModel",
-    "SignalSettings",
-    "Trajectory",
-    "__version__",
-    "check_logs",
-    "identify",
-    "identify_payload",
-    "inspect_urdf",
-    "load_result",
-    "preview",
-    "read_job",
-    "read_log",
-    "replay",
-    "run_job",
-    "save_result",
-    "write_log",
-    "write_mjcf",
-    "write_ranges",
-    "write_report",
-    "write_sdf",
-    "write_urdf",
-]
-
-_MODULES = {
-    "cli.identify": ["identify", "run_job", "save_result"],
-    "cli.job": ["read_job"],
-    "diagnosis.logs.check_logs": ["check_logs"],
-    "diagnosis.urdf.inspection": ["inspect_urdf"],
-    "base.exceptions": ["RobotIdError"],
-    "output.files.mjcf": ["write_mjcf"],
-    "output.files.ranges": ["write_ranges"],
-    "output.files.result_file": ["load_result"],
-    "output.files.sdf": ["write_sdf"],
-    "output.files.urdf": ["write_urdf"],
-    "estimation.fitting.estimator_settings": ["EstimatorSettings"],
-    "identification.payload_fit": ["identify_payload"],
-    "design.previews": ["preview"],
-    "identification.result": ["Identification"],
-    "data.base_motion": ["BaseColumns", "BaseMotion"],
-    "data.log": ["Log", "Trajectory"],
-    "data.files.read": ["read_log", "write_log"],
-    "data.signal_settings": ["LogSource", "LogUnits", "SignalSettings"],
-    "identification.online.identifier": ["OnlineIdentifier"],
-    "output.report.document": ["write_report"],
-    "robot.constraints": ["Contact", "Loop"],
-    "robot.model": ["RobotModel"],
-    "robot.parameters": ["Coupling"],
-    "base.versions": ["__version__"],
-    "output.viewer.replays": ["replay"],
+#: The public names, the verbs first: a verb is named as its command.
+_PLACES = {
+    "identify": "cli.identify.identify",
+    "doctor": "cli.doctor.doctor",
+    "inspect": "diagnosis.urdf.inspection.inspect_urdf",
+    "excite": "cli.excite.excite",
+    "preview": "design.previews.preview",
+    "simulate": "cli.simulate.simulate",
+    "payload": "identification.payload_fit.identify_payload",
+    "validate": "cli.validate.validate",
+    "compare": "cli.compare.compare",
+    "replay": "output.viewer.replays.replay",
+    "export": "cli.export.export",
+    "load_result": "output.files.result_file.load_result",
+    "save_result": "cli.identify.save_result",
+    "read_log": "data.files.read.read_log",
+    "write_log": "data.files.read.write_log",
+    "RobotModel": "robot.model.RobotModel",
+    "Log": "data.log.Log",
+    "Trajectory": "data.log.Trajectory",
+    "Identification": "identification.result.Identification",
+    "OnlineIdentifier": "identification.online.identifier.OnlineIdentifier",
+    "EstimatorSettings": "estimation.fitting.estimator_settings.EstimatorSettings",
+    "SignalSettings": "data.signal_settings.SignalSettings",
+    "RobotIdError": "base.exceptions.RobotIdError",
+    "__version__": "base.versions.__version__",
 }
+
+__all__ = [  # noqa: RUF022 - the verbs first
+    "identify", "doctor", "inspect", "excite", "preview", "simulate", "payload", "validate",
+    "compare", "replay", "export", "load_result", "save_result", "read_log", "write_log",
+    "RobotModel", "Log", "Trajectory", "Identification", "OnlineIdentifier", "EstimatorSettings",
+    "SignalSettings", "RobotIdError", "__version__",
+]  # fmt: skip
 
 
 def __getattr__(name: str) -> Any:  # noqa: ANN401
     """Import a public name at its first use, because ``robotid --help`` needs none of them."""
-    for module, names in _MODULES.items():
-        if name in names:
-            return getattr(import_module(f"robotid.{module}"), name)
-    raise AttributeError(f"module 'robotid' has no attribute {name!r}")
+    if name not in _PLACES:
+        raise AttributeError(f"module 'robotid' has no attribute {name!r}")
+    module, _, last = _PLACES[name].rpartition(".")
+    return getattr(import_module(f"robotid.{module}"), last)
 
 
 def __dir__() -> list[str]:

@@ -12,9 +12,19 @@ from helpers.paths import URDF as FOLDER
 from helpers.synthetic import exact_log, truth
 
 import robotid
-from robotid import Log, RobotModel, SignalSettings, identify, identify_payload
+from robotid import Log, RobotModel, SignalSettings, identify, payload
 from robotid.base.exceptions import DataError, RobotIdError, SettingsError
+from robotid.cli.job import read_job
+from robotid.data.base_motion import BaseMotion
+from robotid.data.signal_settings import LogSource
+from robotid.output.files.mjcf import write_mjcf
+from robotid.output.files.ranges import write_ranges
+from robotid.output.files.sdf import write_sdf
+from robotid.output.files.urdf import write_urdf
 from robotid.output.report import pictures
+from robotid.output.report.document import write_report
+from robotid.robot.constraints import Contact, Loop
+from robotid.robot.parameters import Coupling
 
 URDF = FOLDER / "planar_2r.urdf"
 
@@ -77,14 +87,13 @@ CALLS = {
     "friction of joint_2": lambda m, log: identify(m, log, friction={"joint_2": 5}, doctor=False),
     "ignore": lambda m, log: identify(m, log, ignore=None),
     "a code in ignore": lambda m, log: identify(m, log, ignore=[5]),
-    "signals ": lambda m, log: identify_payload(m, log, log, signals=5),
-    "links": lambda m, log: identify_payload(m, log, log, links=5),
-    "masses": lambda m, log: identify_payload(m, log, log, masses=5),
-    "unknown_gains": lambda m, log: identify_payload(m, log, log, unknown_gains=None),
+    "signals ": lambda m, log: payload(m, log, log, signals=5),
+    "links": lambda m, log: payload(m, log, log, links=5),
+    "masses": lambda m, log: payload(m, log, log, masses=5),
+    "unknown_gains": lambda m, log: payload(m, log, log, unknown_gains=None),
     "noise": lambda m, log: robotid.preview(m, log, noise=5),
     "given": lambda m, log: robotid.preview(m, log, given=5),
-    "signals  ": lambda m, log: robotid.check_logs(m, log, signals="x"),
-    "model": lambda m, log: robotid.check_logs(5, log),
+    "signals  ": lambda m, log: robotid.doctor(m, log, signals="x"),
     "joints": lambda m, log: robotid.read_log("x.csv", 5),
     "columns": lambda m, log: robotid.read_log("x.csv", ["a"], columns=5),
     "gains": lambda m, log: robotid.read_log("x.csv", ["a"], gains=5),
@@ -96,30 +105,29 @@ CALLS = {
     "locked": lambda m, log: RobotModel.from_urdf(URDF, locked=5),
     "couplings": lambda m, log: RobotModel.from_urdf(URDF, couplings=5),
     "path  ": lambda m, log: robotid.load_result(5),
-    "path   ": lambda m, log: robotid.read_job(5),
-    "path    ": lambda m, log: robotid.inspect_urdf(5),
-    "job": lambda m, log: robotid.run_job(5, "x"),
+    "path   ": lambda m, log: read_job(5),
+    "path    ": lambda m, log: robotid.inspect(5),
     "model ": lambda m, log: robotid.OnlineIdentifier(5),
     "settings": lambda m, log: robotid.OnlineIdentifier(m, 5),
-    "identification": lambda m, log: robotid.write_report(5, "x.html"),
-    "found": lambda m, log: robotid.write_ranges(5, "x.yaml"),
-    "pi": lambda m, log: robotid.write_urdf(m, 5, "x.urdf"),
-    "target": lambda m, log: robotid.write_sdf(m, m.standard_parameters(), 5),
-    "model  ": lambda m, log: robotid.write_mjcf(5, m.standard_parameters(), "x.xml"),
+    "identification": lambda m, log: write_report(5, "x.html"),
+    "found": lambda m, log: write_ranges(5, "x.yaml"),
+    "pi": lambda m, log: write_urdf(m, 5, "x.urdf"),
+    "target": lambda m, log: write_sdf(m, m.standard_parameters(), 5),
+    "model  ": lambda m, log: write_mjcf(5, m.standard_parameters(), "x.xml"),
     "t": lambda m, log: robotid.replay(m, None, log.q),
     "path     ": lambda m, log: Log(**fields(log, path=5)),
     "has_torque": lambda m, log: Log(**fields(log, has_torque="x")),
     "notes": lambda m, log: Log(**fields(log, notes=[5])),
     "joints  ": lambda m, log: log.select(["joint_1", 5]),
-    "joints   ": lambda m, log: robotid.LogSource(joints=5),
-    "command": lambda m, log: robotid.LogSource(command=5),
+    "joints   ": lambda m, log: LogSource(joints=5),
+    "command": lambda m, log: LogSource(command=5),
     "estimator ": lambda m, log: robotid.EstimatorSettings(["ols"]),
     "constraints": lambda m, log: robotid.EstimatorSettings(constraints=5),
-    "name": lambda m, log: robotid.Coupling(5, (("joint_1", 1.0),)),
-    "ratios": lambda m, log: robotid.Coupling("c", "x"),
-    "replaces": lambda m, log: robotid.Coupling("c", (("joint_1", 1.0),), 1),
+    "name": lambda m, log: Coupling(5, (("joint_1", 1.0),)),
+    "ratios": lambda m, log: Coupling("c", "x"),
+    "replaces": lambda m, log: Coupling("c", (("joint_1", 1.0),), 1),
     "free_flyer": lambda m, log: RobotModel.from_urdf(URDF, free_flyer=np.zeros(2)),
-    "free_flyer ": lambda m, log: robotid.inspect_urdf(URDF, free_flyer="x"),
+    "free_flyer ": lambda m, log: robotid.inspect(URDF, free_flyer="x"),
     "snap_angles": lambda m, log: RobotModel.from_urdf(URDF, snap_angles=None),
     "terms": lambda m, log: RobotModel.from_urdf(URDF, terms=[5]),
     "couplings ": lambda m, log: RobotModel.from_urdf(URDF, couplings=np.array("x")),
@@ -129,12 +137,10 @@ CALLS = {
     "a key of columns": lambda m, log: robotid.read_log("x.csv", ["a"], columns={1: "t"}),
     "columns['tau_a']": lambda m, log: robotid.read_log("x.csv", ["a"], columns={"tau_a": 1}),
     "doctor": lambda m, log: identify(m, log, doctor="no"),
-    "links ": lambda m, log: identify_payload(m, log, log, links=[5]),
-    "unknown_gains ": lambda m, log: identify_payload(m, log, log, unknown_gains="joint_1"),
+    "links ": lambda m, log: payload(m, log, log, links=[5]),
+    "unknown_gains ": lambda m, log: payload(m, log, log, unknown_gains="joint_1"),
     "noise of 'joint_2'": lambda m, log: robotid.preview(m, log, noise={"joint_2": "x"}),
-    "commanded": lambda m, log: robotid.write_mjcf(
-        m, m.standard_parameters(), "x.xml", commanded=["x"]
-    ),
+    "commanded": lambda m, log: write_mjcf(m, m.standard_parameters(), "x.xml", commanded=["x"]),
     "marks": lambda m, log: robotid.replay(m, log.t, log.q, marks=["x"]),
     "notes ": lambda m, log: robotid.replay(m, log.t, log.q, notes=[5]),
     "masses of 'x'": lambda m, log: robotid.replay(m, log.t, log.q, masses={"x": 5}),
@@ -163,7 +169,7 @@ def test_a_payload_needs_logs_with_and_without_it(model, log, logs, reference):
     given = [log if some == "log" else some for some in (logs, reference)]
     name = "logs" if not given[0] else "reference"
     with pytest.raises(DataError, match=rf"^{name} has no log, wanted at least one"):
-        identify_payload(model, *given)
+        payload(model, *given)
 
 
 @pytest.fixture(scope="module")
@@ -186,7 +192,7 @@ CALLS_OF_A_RESULT = {
     ),
     "name is ['wls'], wanted 'estimate' or 'wls'": lambda found, q: found.metrics(["wls"]),
     "'a\\x00b' is not a valid path": lambda found, q: robotid.save_result(found, "a\0b"),
-    "'\\ud800' is not a valid path": lambda found, q: robotid.write_report(found, "\ud800"),
+    "'\\ud800' is not a valid path": lambda found, q: write_report(found, "\ud800"),
 }
 
 
@@ -216,7 +222,7 @@ def test_a_path_that_no_file_system_takes_is_refused(model, log, path):
         lambda: robotid.read_log(path, ["a"]),
         lambda: identify(model, path),
         lambda: robotid.load_result(path),
-        lambda: robotid.read_job(path),
+        lambda: read_job(path),
         lambda: robotid.write_log(log, f"{path}.csv"),
     ):
         with pytest.raises(SettingsError, match=r"is not a valid path|a file has .* bytes, wanted"):
@@ -254,10 +260,10 @@ REFUSED = {
     "joint 'joint_2' is locked at": lambda m, log: RobotModel.from_urdf(
         URDF, locked={"joint_2": "x"}
     ),
-    "ratios of 'c' has ('joint_2', 'x'), wanted pairs": lambda m, log: robotid.Coupling(
+    "ratios of 'c' has ('joint_2', 'x'), wanted pairs": lambda m, log: Coupling(
         "c", (("joint_1", 1.0), ("joint_2", "x"))
     ),
-    "the mass of the payload on link_2 is 'x' kg, wanted": lambda m, log: identify_payload(
+    "the mass of the payload on link_2 is 'x' kg, wanted": lambda m, log: payload(
         m, log, log, masses={"link_2": "x"}
     ),
     "masses of 'x' have shape (3,), wanted 20 or 28 finite": lambda m, log: robotid.replay(
@@ -266,7 +272,7 @@ REFUSED = {
     "ghost 'x' has 3 arrays, wanted two": lambda m, log: robotid.replay(
         m, log.t, log.q, ghosts=ghosts(log.t, log.q, log.q)
     ),
-    "log: joints.joint_2 is 5, wanted a name": lambda m, log: robotid.LogSource(
+    "log: joints.joint_2 is 5, wanted a name": lambda m, log: LogSource(
         joints={"joint_1": "a", "joint_2": 5}
     ),
     "gravity is ": lambda m, log: RobotModel.from_urdf(URDF, gravity=(0, 0, 10**400)),
@@ -303,7 +309,7 @@ def test_flags_and_numbers_of_numpy_are_flags_and_numbers(log):
 
 def test_files_of_a_page_are_named_by_text(found, tmp_path):
     with pytest.raises(SettingsError, match=r"an entry of files is \['result', 5\]"):
-        robotid.write_report(found, tmp_path / "page.html", files={"result": 5})
+        write_report(found, tmp_path / "page.html", files={"result": 5})
     assert not list(tmp_path.iterdir())
 
 
@@ -321,12 +327,12 @@ def test_each_public_boundary_names_the_argument_and_its_type(model, log, junk, 
     path = tmp_path / "log.csv"
     robotid.write_log(log, path)
     for name, call in {
-        "pose": lambda: robotid.BaseMotion(junk),
-        "twist": lambda: robotid.BaseMotion(pose, twist=junk),
+        "pose": lambda: BaseMotion(junk),
+        "twist": lambda: BaseMotion(pose, twist=junk),
         "contacts": lambda: Log(**fields(log, contacts=junk)),
         "wrenches": lambda: Log(**fields(log, wrenches=junk)),
-        "kind": lambda: robotid.Contact("x", kind=junk),
-        "frames": lambda: robotid.Loop(junk),
+        "kind": lambda: Contact("x", kind=junk),
+        "frames": lambda: Loop(junk),
         "progress": lambda: identify(model, log, progress=junk),
         "identification": lambda: robotid.save_result(junk, tmp_path / "other"),
         "base": lambda: robotid.read_log(path, log.joints, base=junk),

@@ -3,6 +3,7 @@
 import argparse
 from collections.abc import Mapping, Sequence
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 from robotid.base.findings import listed
@@ -13,6 +14,23 @@ from robotid.identification.summary import cell
 from robotid.output.report.comparison import compare_results, write_comparison
 
 _SHOWN = 12  # base parameters in the table, so that two results fit a screen
+
+
+def compare(results: Sequence[str | Path], page: str | Path | None = None) -> dict[str, Any]:
+    """Compare results of one robot: errors, parameters, settings, inputs.
+
+    Args:
+        results: At least two, each a result.json or its folder.
+        page: HTML page to write; none if None.
+
+    Returns:
+        The comparison, as ``robotid compare --json``.
+
+    Raises:
+        DataError: If a result is missing, or the robots or their base parameters differ.
+        SettingsError: If the page cannot be written.
+    """
+    return compare_results(results) if page is None else write_comparison(results, page)
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
@@ -26,10 +44,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Run the command."""
-    if options.out:
-        content = write_comparison(options.results, options.out)
-    else:
-        content = compare_results(options.results)
+    content = compare(options.results, options.out)
     show_found(content, options, partial(_show, is_verbose=options.verbose))
     if options.out and not options.json:
         print(f"\nwritten to {options.out}")

@@ -1,4 +1,4 @@
-"""Errors and progress on a terminal, and the end of a command after a signal."""
+"""What commands print: results, findings, errors, progress; and their end after a signal."""
 
 import argparse
 import errno
@@ -19,13 +19,11 @@ from robotid.base.findings import Finding, grouped, number_of
 from robotid.base.text import command_lines, period, terminal_width, tinted, wrapped
 
 if TYPE_CHECKING:
-    from contextlib import AbstractContextManager
-
-    from rich.progress import TaskID
-
     from robotid.base.typing import ProgressCallback
-    from robotid.cli.job import Job
     from robotid.output.report.steps import Step
+
+_LAST_STREAM = 2  # the number of the standard error stream
+_ENDS = tuple(getattr(signal, n) for n in ("SIGTERM", "SIGHUP") if hasattr(signal, n))
 
 
 def echo(text: str, indent: str = "", tone: str = "") -> None:
@@ -50,11 +48,6 @@ def print_steps(steps: "Sequence[Step]") -> None:
             if sys.stdout.isatty() and len(lines) == 1 and block.startswith("robotid "):
                 lines = command_lines(block, terminal_width() - 7)
             print("\n".join(f"       {line}" for line in lines))
-
-
-def print_block(*lines: str) -> None:
-    """Print lines after an empty line."""
-    print("\n" + "\n".join(lines))
 
 
 def print_causes(
@@ -115,15 +108,6 @@ def print_verdict(verdict: Mapping[str, Any]) -> None:
         echo(line, "  ", "" if line.startswith("  - ") else status)
 
 
-def progress_of(options: argparse.Namespace) -> "AbstractContextManager[ProgressCallback | None]":
-    """Return the progress display that the flags of a command select."""
-    return terminal_progress(
-        quiet=options.json,
-        force=getattr(options, "progress", False),
-        is_verbose=getattr(options, "verbose", False),
-    )
-
-
 def show_found(
     content: dict[str, Any],
     options: argparse.Namespace,
@@ -138,31 +122,6 @@ def show_found(
         show(content)
         if files:
             print_files(options.out, files)
-
-
-def serve(
-    job: "Job",
-    folder: str | None,
-    options: argparse.Namespace,
-    finished: Callable[[dict[str, Any]], None],
-) -> None:
-    """Show a log in the browser while an estimator runs over it, until it is interrupted."""
-    from robotid.cli.track import serve_track
-
-    def announce(url: str) -> None:
-        print(f"live: {url}  (stop with Ctrl-C)", file=sys.stderr, flush=True)
-
-    settings = {"port": options.serve, "speed": options.speed}
-    try:
-        serve_track(job, folder, **settings, announce=announce, finished=finished)
-    except Terminated:
-        raise
-    except KeyboardInterrupt:
-        print("\nstopped", file=sys.stderr)
-
-
-_LAST_STREAM = 2  # the number of the standard error stream
-_ENDS = tuple(getattr(signal, n) for n in ("SIGTERM", "SIGHUP") if hasattr(signal, n))
 
 
 class Terminated(KeyboardInterrupt):
@@ -257,7 +216,7 @@ def print_error(error: BaseException, words: str = "") -> None:
 
 @contextmanager
 def shown_log(*, is_verbose: bool) -> Iterator[None]:
-    """Show warnings of the logger "robotid" on the standard error stream in the context."""
+    """Show warnings of the logger "robotid" on the standard error stream."""
     logger, handler = logging.getLogger("robotid"), _EachOnce()
     level = logger.level
     logger.addHandler(handler)
@@ -289,15 +248,15 @@ class _EachOnce(logging.Handler):
 
 
 @contextmanager
-def terminal_progress(
-    *, quiet: bool = False, force: bool = False, is_verbose: bool = False
-) -> "Iterator[ProgressCallback | None]":
-    """Show progress on the standard error stream in the context, if it is a terminal."""
-    if force or not (quiet or not sys.stderr.isatty()):
-        with _bars(force=force) as show:
+def progress_of(options: argparse.Namespace) -> "Iterator[ProgressCallback | None]":
+    """Show progress on the standard error stream, if it is a terminal or a flag asks for it."""
+    is_forced, is_verbose = (getattr(options, x, False) for x in ("progress", "verbose"))
+    is_quiet = getattr(options, "json", False)
+    if is_forced or (sys.stderr.isatty() and not is_quiet):
+        with _bars(force=is_forced) as show:
             yield show
     else:
-        yield _stage_lines() if is_verbose and not quiet else None
+        yield _stage_lines() if is_verbose and not is_quiet else None
 
 
 def _stage_lines() -> "ProgressCallback":
@@ -315,47 +274,26 @@ def _stage_lines() -> "ProgressCallback":
 
 @contextmanager
 def _bars(*, force: bool) -> "Iterator[ProgressCallback]":
-    """Show a bar of the stage and below it a bar of its work; both are removed at the end."""
+    """Show the stage and a bar of its work; both are removed at the end."""
     from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn
-    from rich.progress import TimeElapsedColumn as Elapsed
-    from rich.progress import TimeRemainingColumn as Remaining
+    from rich.progress import Progress
 
     console = Console(stderr=True, force_terminal=True if force else None)
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(bar_width=20),
-        Elapsed(),
-        TextColumn("{task.fields[state]}"),
-        Remaining(),
-    )
-    tasks: dict[str, TaskID] = {}
-    first: dict[str, int] = {}
-    stage = ""
-    with Progress(*columns, console=console, transient=True) as bars:
+    with Progress(console=console, transient=True) as bars:
+        stage, work = bars.add_task("", total=None), bars.add_task("", visible=False)
+        current = ""
 
         def show(what: str, done: int, total: int, unit: str) -> None:
-            nonlocal stage
-            if what not in tasks:
-                for name in [name for name in tasks if unit == "stages" or name != stage]:
-                    bars.remove_task(tasks.pop(name))
-                words = f"    {what}" if stage else what
-                if unit == "stages":
-                    stage, words = what, f"{done + 1}/{total} {what}"
-                tasks[what] = bars.add_task(words, total=None, state="")
-                first[what] = done
-            if unit != "stages":
-                elapsed = next(t for t in bars.tasks if t.id == tasks[what]).elapsed or 0.0
-                state = _share_and_rate(done, total, done - first[what], elapsed, unit)
-                bars.update(tasks[what], completed=done, total=total, state=state)
+            nonlocal current
+            if unit == "stages":
+                bars.update(stage, description=f"{done + 1}/{total} {what}")
+                bars.update(work, visible=False)
+                bars.refresh()
+            elif what == current:
+                bars.update(work, completed=done, total=total, visible=True)
+            else:
+                current = what
+                label = f"    {what} [{unit}]"
+                bars.reset(work, description=label, completed=done, total=total, visible=True)
 
         yield show
-
-
-def _share_and_rate(done: int, total: int, made: int, elapsed: float, unit: str) -> str:
-    """Return the share of the work that is done and its rate, as "50 %  1,200 samples/s"."""
-    share = f"{100 * done / max(total, 1):3.0f} %"
-    if not (made and elapsed > 0):
-        return share
-    rate = made / elapsed
-    return f"{share}  {f'{rate:,.0f}' if rate >= 10 else f'{rate:.2g}'} {unit}/s"

@@ -8,7 +8,7 @@ import numpy as np
 
 from robotid.base.files import check_folder
 from robotid.base.typing import Array, ProgressCallback
-from robotid.cli.console import echo, print_files, terminal_progress
+from robotid.cli.console import echo, print_files, progress_of
 from robotid.cli.flags import add_out
 from robotid.cli.identify import run_job, show_result
 from robotid.cli.job import Job, LogEntry
@@ -75,7 +75,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """Run the command."""
     echo("simulating a Unitree Z1 arm whose masses, armature and friction differ from its URDF ...")
-    with terminal_progress() as progress:
+    with progress_of(options) as progress:
         identification, result, truth = run_demo(options.out, progress=progress)
     show_result(result)
     error = identification.base - truth

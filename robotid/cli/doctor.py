@@ -3,14 +3,47 @@
 import argparse
 from collections.abc import Sequence
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 from robotid.base.findings import Finding, grouped
 from robotid.cli.console import echo, print_causes, progress_of, show_found
 from robotid.cli.flags import add_job, job_from_flags
+from robotid.cli.job import job_file
 from robotid.cli.logs import examine
-from robotid.diagnosis.logs.check_logs import findings_to_dict
+from robotid.data.files.read import Readable
+from robotid.data.signal_settings import SignalSettings
+from robotid.diagnosis.logs.check_logs import check_logs, findings_to_dict
 from robotid.diagnosis.verdict.verdict import blocking
+from robotid.identification.pipeline import robot_of
+from robotid.robot.model import RobotModel
+
+
+def doctor(
+    model: RobotModel | str | Path,
+    logs: Readable | Sequence[Readable] | None = None,
+    *,
+    validation: Readable | Sequence[Readable] = (),
+    signals: SignalSettings | None = None,
+) -> tuple[Finding, ...]:
+    """Check logs for faults before an identification.
+
+    Args:
+        model: The robot, or the path of its URDF with all joints free; or a job file, alone.
+        logs: Logs to fit, one or several, as of ``identify``.
+        validation: Validation logs, likewise.
+        signals: How logs become trajectories; the defaults if None.
+
+    Returns:
+        The findings, errors first. Each has a code, a severity, a place and a message.
+
+    Raises:
+        DataError: If a file or a DataFrame is no log.
+        SettingsError: If a setting does not fit a log.
+    """
+    if logs is None:
+        return examine(job_file(model))
+    return check_logs(robot_of(model, logs), logs, validation=validation, signals=signals)
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
@@ -25,25 +58,24 @@ def run(options: argparse.Namespace) -> int:
         model = job.model()
         findings = examine(job, model, progress=progress)
     content = findings_to_dict(findings) | {"joints": list(model.joints)}
-    logs = len({entry.path for entry in (*job.identification, *job.validation)})
-    shown = partial(show, findings, model.joints, is_verbose=options.verbose, logs=logs)
+    count = len({entry.path for entry in (*job.identification, *job.validation)})
+    shown = partial(_show, findings, model.joints, is_verbose=options.verbose, count=count)
     show_found(content, options, shown)
     return 1 if blocking(findings, job.ignore) else 0
 
 
-def show(
+def _show(
     findings: Sequence[Finding],
     joints: Sequence[str],
-    content: dict[str, Any],
+    content: Mapping[str, Any],
     *,
     is_verbose: bool,
-    logs: int,
+    count: int,
 ) -> None:
-    """Print the findings of the doctor, or that there is no fault."""
     worst = _worst_of(findings, joints)
     print_causes(findings, joints, is_verbose=is_verbose, worst=worst, none="")
     if all(finding.severity == "note" for finding in findings):
-        echo(f"no fault found in {logs} {'log' if logs == 1 else 'logs'}")
+        echo(f"no fault found in {count} {'log' if count == 1 else 'logs'}")
 
 
 def _worst_of(findings: Sequence[Finding], joints: Sequence[str]) -> str:

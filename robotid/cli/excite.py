@@ -5,17 +5,17 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from robotid.base.exceptions import SettingsError
 from robotid.base.files import check_file
 from robotid.base.findings import listed
-from robotid.base.settings import Settings
-from robotid.cli.console import echo, print_files, show_found, terminal_progress
+from robotid.base.typing import ProgressCallback
+from robotid.cli.console import echo, print_files, progress_of, show_found
 from robotid.cli.flags import JOB, ROBOT, Flags, add_json, add_progress, job_from_flags
-from robotid.cli.job import Job
+from robotid.cli.job import Job, as_job
 from robotid.cli.logs import result_run
 from robotid.data.log import Log
 from robotid.design.basis import Basis, BSplineBasis, FourierBasis
@@ -31,22 +31,34 @@ from robotid.estimation.fitting.survey import hold_log
 from robotid.output.report.motion_page import write_motion_page
 from robotid.robot.model import RobotModel
 
-if TYPE_CHECKING:
-    from robotid.base.typing import ProgressCallback
-    from robotid.design.clearance import Box
-    from robotid.design.excitation_settings import MotionSettings
 
-
-def design_motion(
-    job: Job,
-    settings: MotionSettings,
+def excite(
+    robot: Job | str | Path,
     target: str | Path,
+    settings: MotionSettings | None = None,
     *,
-    given: str | None = None,
+    given: str | Path | None = None,
     report: str | Path | None = None,
-    progress: "ProgressCallback | None" = None,
+    progress: ProgressCallback | None = None,
 ) -> dict[str, Any]:
-    """Design a motion for a robot and write it."""
+    """Design a motion within a robot's limits and write it.
+
+    Args:
+        robot: A URDF, all of whose joints move, or a job file.
+        target: The motion to write: .csv, .parquet, .yaml (ROS 2 JointTrajectory) or .script (UR).
+        settings: Kind, length and limits of the motion; the defaults if None.
+        given: A result.json or its folder, whose logs the motion complements.
+        report: Page to write about the motion; none if None.
+        progress: Called at each start of the search.
+
+    Returns:
+        The margins to the limits and the course of the design, as ``robotid excite --json``.
+
+    Raises:
+        DataError: If a file cannot be written, or the logs of the result are missing.
+        SettingsError: If a setting does not fit the robot, or the limits allow no motion.
+    """
+    settings, job = settings or MotionSettings(), as_job(robot)
     for file in (target, *([] if report is None else [report])):
         check_file(Path(file), [job.urdf, given])
     check_motion_file(target)
@@ -95,7 +107,9 @@ def _basis(settings: MotionSettings) -> Basis:
     return FourierBasis(settings.duration, settings.harmonics)
 
 
-def _designer(job: Job, settings: MotionSettings, given: str | None) -> tuple[Designer, Run | None]:
+def _designer(
+    job: Job, settings: MotionSettings, given: str | Path | None
+) -> tuple[Designer, Run | None]:
     """Return the designer of the motion, and the logs of an earlier result."""
     model, run = job.model(), None
     if given is not None:
@@ -249,19 +263,19 @@ def run(options: argparse.Namespace) -> None:
     """Run the command."""
     options.logs = []
     job = job_from_flags(options, needs_logs=False)
-    with terminal_progress(quiet=options.json, force=options.progress) as progress:
-        settings = motion_settings(options)
-        found = design_motion(
-            job, settings, options.out,
+    settings = motion_settings(options)
+    with progress_of(options) as progress:
+        content = excite(
+            job, options.out, settings,
             given=options.given, report=options.report, progress=progress,
         )  # fmt: skip
-    show_found(found, options, _show)
+    show_found(content, options, _show)
     if not options.json:
-        print_files("", [options.out, *([found["report"]] if "report" in found else [])])
+        print_files("", [options.out, *([content["report"]] if "report" in content else [])])
 
 
-def motion_settings(options: argparse.Namespace) -> "MotionSettings":
-    """Return the settings of the motion."""
+def motion_settings(options: argparse.Namespace) -> MotionSettings:
+    """Return the settings of the motion that the flags state."""
     if options.com is not None and not options.mass:
         raise SettingsError(_COM.format(options.com))
     return MotionSettings.from_dict(_MOTION.stated(options))
@@ -306,15 +320,10 @@ def _clearance(word: str, flag: str) -> float | None:
         raise SettingsError(f"{flag} {word!r}: wanted metres, or none") from error
 
 
-def _motion() -> Settings:
-
-    return MotionSettings()
-
-
 _COM = "--com {!r}: wanted three numbers X,Y,Z [m], together with --mass"
 #: Flags of the settings of the motion.
 _MOTION = Flags(
-    _motion,
+    MotionSettings(),
     {
         "--kind": ("kind", ""),
         "--link": ("payload.link", "NAME"),

@@ -2,8 +2,8 @@
 
 import argparse
 from collections.abc import Mapping
-from importlib import import_module
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from robotid.base.exceptions import SettingsError
@@ -11,34 +11,54 @@ from robotid.base.files import check_file
 from robotid.base.findings import listed
 from robotid.cli.console import echo, show_found
 from robotid.cli.flags import add_json
-from robotid.output.files.export_formats import FORMATS, options_of
-from robotid.output.files.exported import Written
+from robotid.cli.identify import save_result
+from robotid.identification.result import Identification
+from robotid.output.files.exports import formats, options_of, writers
 from robotid.output.files.result_file import load_result
 
 
-def export_result(
-    path: str | Path, kind: str, target: str | Path, **options: float | str | None
+def export(
+    result: Identification | str | Path,
+    format: str,
+    target: str | Path,
+    **options: float | str | None,
 ) -> dict[str, Any]:
-    """Write a result in another format.
+    """Write a result in a format of other programs.
 
-    Friction terms that a format lacks are projected on those that it has, see
-    ``project_friction``.
+    Friction terms that the format lacks are projected on those that it has.
+
+    Args:
+        result: An identification; or its result.json or the folder of it.
+        format: "urdf", "mjcf", "sdf", "isaac" or "ranges".
+        target: The file to write.
+        options: Options of the format, as the flags of ``robotid export``.
+
+    Returns:
+        The files, what they do not state ("not_stated"), and the projected terms ("projected").
+
+    Raises:
+        DataError: If the result lacks what the format states.
+        ModelError: If a link or a drive would be physically impossible.
+        SettingsError: If the format, an option or the target is not usable.
     """
-    if kind not in FORMATS:
-        raise SettingsError(f"format is {kind!r}, wanted one of {listed(FORMATS)}")
+    if format not in formats():
+        raise SettingsError(f"format is {format!r}, wanted one of {listed(formats())}")
     stated = {name: value for name, value in options.items() if value is not None}
-    having = options_of(FORMATS)
+    having = options_of(formats())
     for name in stated:
-        if kind not in having.get(name, {}):
+        if format not in having.get(name, {}):
             raise SettingsError(
                 f"--{name.replace('_', '-')} is an option of {listed(having.get(name, {}))}, "
-                f"not of {kind}; remove it"
+                f"not of {format}; remove it"
             )
-    result, module = load_result(path), import_module(f"robotid.output.files.{kind}")
-    check_file(Path(target), result.files)
-    written: Written = module.export(result, Path(target), **stated)
+    with TemporaryDirectory(prefix="robotid-") as folder:
+        is_path = isinstance(result, str | Path)
+        path = result if is_path else save_result(result, folder, report=False)
+        loaded = load_result(path)
+        check_file(Path(target), loaded.files)
+        written = writers()[format].export(loaded, Path(target), **stated)
     return {
-        "result": str(path), "format": kind, "files": [*map(str, written.files)],
+        "result": str(path), "format": format, "files": [*map(str, written.files)],
         "not_stated": list(written.notes), "projected": dict(written.projected),
     }  # fmt: skip
 
@@ -47,10 +67,10 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     """Add the flags of the command."""
     add = parser.add_argument
     add("result", metavar="RESULT", help="result.json or its folder")
-    words = {kind: form.words for kind, form in FORMATS.items()}
-    add("--format", required=True, choices=[*FORMATS], help=_by_format(words))
+    words = {kind: form.words for kind, form in formats().items()}
+    add("--format", required=True, choices=[*formats()], help=_by_format(words))
     add("--out", required=True, metavar="FILE", help="file to write")
-    for name, having in options_of(FORMATS).items():
+    for name, having in options_of(formats()).items():
         words = {kind: option.words for kind, option in having.items()}
         first = next(iter(having.values()))
         about: dict[str, Any] = {"type": first.kind, "metavar": first.metavar}
@@ -61,18 +81,16 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
 
 
 def _by_format(words: Mapping[str, str]) -> str:
-    """Return the help text of a flag, format by format."""
     return "; ".join(f"{kind}: {text}" for kind, text in words.items()).replace("%", "%%")
 
 
 def run(options: argparse.Namespace) -> None:
     """Run the command."""
-    chosen = {name: getattr(options, name) for name in options_of(FORMATS)}
-    done = export_result(options.result, options.format, options.out, **chosen)
-    show_found(done, options, _show)
+    chosen = {name: getattr(options, name) for name in options_of(formats())}
+    show_found(export(options.result, options.format, options.out, **chosen), options, _show)
 
 
-def _show(done: dict[str, Any]) -> None:
-    print(f"written: {', '.join(done['files'])}")
-    for note in done["not_stated"]:
+def _show(content: dict[str, Any]) -> None:
+    print(f"written: {', '.join(content['files'])}")
+    for note in content["not_stated"]:
         echo(f"  {note}", "  ")

@@ -4,14 +4,12 @@ import argparse
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from robotid.base.exceptions import SettingsError
 from robotid.base.findings import listed
 from robotid.base.settings import Entries, Settings, table_in
-
-if TYPE_CHECKING:
-    from robotid.cli.job import Job
+from robotid.cli.job import Job, job_from_settings, read_job
 
 
 def pairs(words: Sequence[str], flag: str) -> dict[str, float]:
@@ -76,20 +74,20 @@ class Flags:
     """Flags that state settings; types, help and defaults come from the fields of the settings.
 
     Attributes:
-        defaults: Returns the default settings; it imports their module.
+        defaults: The default settings.
         keys: For each flag the key of the job file and the placeholder of its value in the help.
             A switch has its own help text in place of the placeholder, if it differs from that of
             the key. A flag with a list of permitted words has an empty placeholder.
         read: For flags whose value the type does not determine, the conversion of the words.
     """
 
-    defaults: Callable[[], Settings]
+    defaults: Settings
     keys: Mapping[str, tuple[str, str]]
     read: Mapping[str, Callable[[Any, str], Any]] = field(default_factory=dict)
 
     def add(self, parser: "argparse._ActionsContainer", wanted: Sequence[str] = ()) -> None:
         """Add flags."""
-        settings = self.defaults()
+        settings = self.defaults
         schema, about, values = settings.schema(), settings.paths(), settings.to_dict()
         for flag in wanted or self.keys:
             at, shown = self.keys[flag]
@@ -115,7 +113,7 @@ class Flags:
 
     def stated(self, options: argparse.Namespace, wanted: Sequence[str] = ()) -> dict[str, Any]:
         """Return the settings that flags state, as a table of a job file."""
-        schema, table = self.defaults().schema(), dict[str, Any]()
+        schema, table = self.defaults.schema(), dict[str, Any]()
         for flag in self.given(options):
             if wanted and flag not in wanted:
                 continue
@@ -152,15 +150,9 @@ def _listed(words: Sequence[str], _: str) -> list[str]:
     return [name for word in words for name in word.split(",")]
 
 
-def _job() -> Settings:
-    from robotid.cli.job import Job
-
-    return Job(Path())
-
-
 #: Flags of the keys of a job file.
 JOB = Flags(
-    _job,
+    Job(Path()),
     {
         "--estimator": ("estimator.name", "NAME"),
         "--kp": ("controller.kp", "[JOINT=]N_M_PER_RAD"),
@@ -276,8 +268,6 @@ def add_job(
 
 def job_from_flags(options: argparse.Namespace, *, needs_logs: bool = True) -> "Job":
     """Return the job that a command line names or states."""
-    from robotid.cli.job import job_from_settings, read_job
-
     if Path(options.source).suffix == ".toml":
         given = _given(options)
         if options.logs or given:

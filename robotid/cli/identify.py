@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, overload
+from typing import TYPE_CHECKING, Any, Literal
 
 from robotid.base.arguments import checked
 from robotid.base.exceptions import DataError, SettingsError
@@ -17,7 +17,6 @@ from robotid.base.text import columns, terminal_width, wrapped
 from robotid.base.typing import STAGES, ProgressCallback, ignore_progress, report_stage
 from robotid.cli.console import (
     echo,
-    print_block,
     print_causes,
     print_steps,
     print_verdict,
@@ -26,7 +25,7 @@ from robotid.cli.console import (
     show_found,
 )
 from robotid.cli.flags import OUTPUT, add_job, add_out, add_progress, job_from_flags, source_words
-from robotid.cli.job import Job, LogEntry
+from robotid.cli.job import Job, LogEntry, job_file
 from robotid.cli.logs import (
     examine_logs,
     locked_as_logged,
@@ -36,6 +35,7 @@ from robotid.cli.logs import (
 )
 from robotid.cli.payload import check_payloads
 from robotid.data.files.read import Readable, read_logs
+from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
 from robotid.diagnosis.logs.check_logs import diagnose
 from robotid.diagnosis.verdict.fit_findings import locked_findings
@@ -66,48 +66,19 @@ from robotid.robot.model import RobotModel
 from robotid.robot.tree import read_tree
 
 if TYPE_CHECKING:
-    from robotid.identification.closed_loop.loop_result import PositionIdentification
     from robotid.output.viewer.replays import Replay
 
 
-@overload
-def identify(  # type: ignore[overload-overlap]
-    model: RobotModel | str | Path,
-    logs: Readable | Sequence[Readable],
-    *,
-    estimator: Literal["simulation"] | SimulationSettings,
-    validation: Readable | Sequence[Readable] = ...,
-    signals: SignalSettings | None = ...,
-    controller: Mapping[str, Any] | None = ...,
-    friction: str | Mapping[str, str] = ...,
-    doctor: bool = ...,
-    ignore: Sequence[str] = ...,
-    progress: ProgressCallback | None = ...,
-) -> "PositionIdentification": ...
-
-
-@overload
-def identify(
-    model: RobotModel | str | Path,
-    logs: Readable | Sequence[Readable],
-    *,
-    estimator: str | EstimatorSettings = ...,
-    validation: Readable | Sequence[Readable] = ...,
-    signals: SignalSettings | None = ...,
-    controller: Mapping[str, Any] | None = ...,
-    friction: str | Mapping[str, str] = ...,
-    doctor: bool = ...,
-    ignore: Sequence[str] = ...,
-    progress: ProgressCallback | None = ...,
-) -> TorqueIdentification: ...
+_log = logging.getLogger(__name__)
+_NO_LOGS: tuple[Log, ...] = ()
 
 
 @checked("progress")
 def identify(
     model: RobotModel | str | Path,
-    logs: Readable | Sequence[Readable],
+    logs: Readable | Sequence[Readable] | None = None,
     *,
-    validation: Readable | Sequence[Readable] = (),
+    validation: Readable | Sequence[Readable] = _NO_LOGS,
     signals: SignalSettings | None = None,
     estimator: EstimatorSettings | str = "consistent",
     controller: Mapping[str, Any] | None = None,
@@ -119,10 +90,11 @@ def identify(
     """Identify a robot's parameters from motion logs, as the command line does.
 
     Args:
-        model: The robot, or the path of its URDF with all joints free.
+        model: The robot, or the path of its URDF with all joints free; or a job file, alone, which
+            states logs and settings, and whose long logs are read in pieces.
         logs: Logs to fit: a ``Log`` with the model's joints, the path of a file, a DataFrame with
             the columns of such a file, or several of these. Files are read whole, as by
-            ``read_log``; ``robotid.run_job`` reads long files in pieces.
+            ``read_log``.
         validation: Logs for validation, of the same types.
         signals: Settings of the signal processing; the defaults if None.
         estimator: Name or settings of the estimator. "simulation" simulates the robot on the
@@ -150,6 +122,14 @@ def identify(
         NotConvergedError: If a solver fails, or the closed loop cannot be simulated.
         SettingsError: If a setting is out of range, or a code to ignore is unknown.
     """
+    if logs is None:
+        job = job_file(model)
+        if not (validation is _NO_LOGS and signals is controller is None and not ignore):
+            raise SettingsError(
+                f"{job.urdf.name} is identified by a job file, which states logs and settings; "
+                "state validation, signals, controller and ignore there"
+            )
+        return identify_job(job, job.model(), WorkPlan(job.workers or 1, progress=progress))
     require_kind(
         estimator, (str, EstimatorSettings), "estimator", "a name or a robotid.EstimatorSettings"
     )
@@ -199,49 +179,18 @@ def identify(
     )  # fmt: skip
 
 
-_log = logging.getLogger(__name__)
-
-
 def run_job(
-    job: Job,
-    folder: str | Path,
-    *,
-    plan: WorkPlan | None = None,
-    source: Sequence[str] = (),
+    job: Job, folder: str | Path, *, plan: WorkPlan | None = None, source: Sequence[str] = ()
 ) -> tuple[Identification, dict[str, Any]]:
-    """Run an identification and write result.json, report.html and the URDF with its sidecar.
+    """Identify and write result.json, report and URDF; return the result and result.json.
 
-    The settings may exclude the report and add replay.html; an impossible result has no URDF. All
-    files are first written to a temporary folder and moved when they are complete.
-
-    Args:
-        job: The job.
-        folder: Folder of the results; created if it is missing.
-        plan: Workers for long logs; if None those of the job, in this process.
-        source: The words after ``robotid identify`` that repeat the run, for the report.
-
-    Returns:
-        The identification and the content of result.json.
-
-    Raises:
-        DataError: If a log cannot be used.
-        MissingDependencyError: If the estimator is "simulation" and Numba is not installed.
-        ModelError: If the URDF is not usable.
-        NotConvergedError: If a solver fails, or the closed loop cannot be simulated.
-        RankDeficientError: If the estimator is "ols" or "wls" and the data do not determine all
-            base parameters.
-        SettingsError: If a setting is not usable.
-        WorkerError: If a worker ends before its work is done.
+    The words of the source, after ``robotid identify``, repeat the run.
     """
-    require_kind(job, Job, "job", "a Job, as robotid.read_job returns it")
-    require_kind(folder, (str, Path), "folder", "the path of a folder")
-    chosen = plan or WorkPlan(job.workers or 1)
-    stages = _loop_stages() if isinstance(job.estimator, SimulationSettings) else STAGES
-    report_stage(chosen.progress, "reading logs", stages)
-    model, target = job.model(), Path(folder)
+    chosen, target = plan or WorkPlan(job.workers or 1), Path(folder)
+    model = job.model()
     check_folder(target, ["result.json", *_names(model)])
     found = identify_job(job, model, chosen)
-    report_stage(chosen.progress, "writing", stages)
+    report_stage(chosen.progress, "writing", _stages(job))
     return _write(found, _job_of(found), target, source=source)
 
 
@@ -405,6 +354,7 @@ def identify_job(
 ) -> Identification:
     """Identify from a job's logs; nothing is written."""
     check_ignored(job.ignore)
+    report_stage(plan.progress, "reading logs", _stages(job))
     if isinstance(job.estimator, SimulationSettings):
         return _identify_loops(job, model, plan.progress)
     groups = job.identification, job.validation
@@ -443,8 +393,10 @@ def identify_job(
     )
 
 
-def _loop_stages() -> Sequence[str]:
-    """Return the stages of a simulation; other jobs do not import its modules."""
+def _stages(job: Job) -> Sequence[str]:
+    """Return the stages of a job; the modules of a simulation are imported only for one."""
+    if not isinstance(job.estimator, SimulationSettings):
+        return STAGES
     from robotid.identification.closed_loop.stages import STAGES as stages
 
     return stages
@@ -523,7 +475,7 @@ def show_result(
         echo(f"\nnot fitted: {name}", "  ")
         print("\n".join(error_lines(ours, wls and wls["validation"][k], width)))
     if lines := _drive_lines(result):
-        print_block(*(wrapped(line, width, "  ") for line in lines))
+        print("\n" + "\n".join(wrapped(line, width, "  ") for line in lines))
     print()
     verdict = result["verdict"]
     print_causes(

@@ -438,6 +438,23 @@ def read_job(path: str | Path) -> Job:
     return job_from_settings(table, source.name, source.parent, expand=True)
 
 
+def job_file(model: object) -> Job:
+    """Return the job of a file that is given in place of a robot and its logs."""
+    if not isinstance(model, str | Path) or Path(model).suffix != ".toml":
+        raise SettingsError(
+            "no log is given, wanted the robot and its logs, or a job file (.toml) alone"
+        )
+    return read_job(model)
+
+
+def as_job(robot: Job | str | Path) -> Job:
+    """Return the job of a robot: of a job file, or of a URDF all of whose joints move."""
+    if isinstance(robot, Job):
+        return robot
+    require_kind(robot, (str, Path), "robot", "the path of a URDF or of a job file")
+    return read_job(robot) if Path(robot).suffix == ".toml" else Job(Path(robot))
+
+
 def job_from_settings(
     table: Mapping[str, Any], where: str, folder: Path, *, expand: bool = False
 ) -> Job:
@@ -456,6 +473,12 @@ def job_from_settings(
         return Job.from_dict(found)
     except SettingsError as error:
         raise SettingsError(f"{where}: {error}") from error
+
+
+def written_job(settings: Mapping[str, Any], where: str) -> Job:
+    """Return the job whose settings a result states."""
+    table = {key: value for key, value in settings.items() if value != {}}
+    return job_from_settings(table, where, Path())
 
 
 def stated_path(text: str, where: str, folder: Path, *, expand: bool) -> Path:

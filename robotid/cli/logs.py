@@ -13,7 +13,7 @@ from robotid.base.exceptions import DataError, SettingsError
 from robotid.base.files import dataset_of, file_sha256, log_exists
 from robotid.base.findings import Finding, by_severity
 from robotid.base.typing import STAGES, ProgressCallback, report_stage
-from robotid.cli.job import Job, LogEntry, job_from_settings
+from robotid.cli.job import Job, LogEntry, written_job
 from robotid.data.files.columns import Needs
 from robotid.data.files.read import LogLayout
 from robotid.data.files.table import Table
@@ -172,8 +172,7 @@ def examine_logs(
 def job_of_result(job: Job, path: str | Path, advice: str) -> tuple[Job, list[LogEntry]]:
     """Return a job with the settings of a result, and the logs that the result was fitted to."""
     result = load_result(path).content
-    settings = {key: value for key, value in result["settings"].items() if value != {}}
-    stated = job_from_settings(settings, Path(path).name, Path())
+    stated = written_job(result["settings"], Path(path).name)
     hashes = {i["sha256"] for i in result["inputs"] if i["role"] == "identification"}
     for entry in stated.identification:
         if not log_exists(entry.path) or file_sha256(entry.path) not in hashes:

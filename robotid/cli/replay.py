@@ -13,7 +13,6 @@ from robotid.base.exceptions import DataError, SettingsError
 from robotid.base.files import check_file, read_json
 from robotid.base.findings import listed
 from robotid.base.typing import Array
-from robotid.cli.console import serve
 from robotid.cli.flags import (
     JOB,
     ONLINE,
@@ -22,8 +21,9 @@ from robotid.cli.flags import (
     job_from_flags,
     refuse_log_flags,
 )
-from robotid.cli.job import Job, LogEntry, job_from_settings
+from robotid.cli.job import Job, LogEntry, written_job
 from robotid.cli.logs import log_of_commands
+from robotid.cli.track import serve
 from robotid.data.files.formats import open_table
 from robotid.data.log import Log
 from robotid.data.signal_settings import LogSource
@@ -115,8 +115,7 @@ def stated_job(findings: Findings, urdf: str | Path, log: str | Path) -> Job:
     settings = findings.settings
     if settings is None:
         raise SettingsError("no result is given, wanted one for its settings")
-    table = {key: value for key, value in settings.items() if value != {}}
-    job = job_from_settings(table, "settings of the result", Path())
+    job = written_job(settings, "settings of the result")
     return replace(job, urdf=Path(urdf), identification=(LogEntry(Path(log)),), validation=())
 
 

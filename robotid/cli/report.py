@@ -14,7 +14,7 @@ from robotid.base.versions import versions
 from robotid.cli.console import progress_of, show_found
 from robotid.cli.flags import add_json, add_progress, add_verbose
 from robotid.cli.identify import identify_job
-from robotid.cli.job import Job, job_from_settings
+from robotid.cli.job import Job, written_job
 from robotid.estimation.workers.plan import WorkPlan
 from robotid.identification.result import Identification
 from robotid.output.files.result_file import load_result
@@ -37,8 +37,7 @@ def rewrite_report(
     goal = folder / "report.html" if target is None else Path(target)
     check_file(goal, loaded.files)
     report_stage(progress, "reading logs")
-    settings = {key: value for key, value in content["settings"].items() if value != {}}
-    job = job_from_settings(settings, loaded.path.name, Path())
+    job = written_job(content["settings"], loaded.path.name)
     _check_inputs(job, content, loaded.path.name)
     found = identify_job(job, job.model(), WorkPlan(job.workers or 1, progress=progress))
     _require_same(found, content, loaded.path.name)

@@ -2,22 +2,20 @@
 
 import argparse
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from robotid.base.exceptions import SettingsError
 from robotid.base.files import check_file, file_sha256, write_json
 from robotid.base.findings import listed
-from robotid.base.settings import Settings
 from robotid.base.typing import Array, ProgressCallback, ignore_progress
 from robotid.base.versions import __version__
-from robotid.cli.console import echo, print_files, show_found, terminal_progress
+from robotid.cli.console import echo, print_files, progress_of, show_found
 from robotid.cli.flags import JOB, ROBOT, Flags, add_json
-from robotid.cli.job import Job, LogEntry, job_from_settings, read_job
+from robotid.cli.job import Job, LogEntry, as_job, job_from_settings, read_job
 from robotid.data.files.formats import check_suffix
 from robotid.data.files.read import write_log
 from robotid.data.log import Log
@@ -32,113 +30,93 @@ from robotid.dynamics.simulation.truth import draw_parameters
 from robotid.output.files.urdf import write_urdf
 from robotid.robot.model import RobotModel
 
-if TYPE_CHECKING:
-    from robotid.cli.job import Job
-    from robotid.dynamics.simulation.simulation_settings import Simulation
-
-
 _SCHEMA_VERSION = 1
 
 
-@dataclass(frozen=True)
-class SimulatedFiles:
-    """The files that a simulation reads and writes.
-
-    Attributes:
-        motion: The motion to follow: a table of time and positions.
-        log: The log to write; the true parameters are in ``<log stem>.truth.json``.
-        urdf: File for the URDF of the true robot, or None.
-        cutoff: Cutoff frequency of the low-pass filter of a recorded motion [Hz]; None: no filter.
-    """
-
-    motion: Path
-    log: Path
-    urdf: Path | None = None
-    cutoff: float | None = None
-
-    @property
-    def truth(self) -> Path:
-        """The file of the true parameters."""
-        return self.log.with_name(f"{self.log.stem}.truth.json")
-
-
-def simulate_log(
-    job: Job,
-    files: SimulatedFiles,
-    settings: Simulation,
+def simulate(
+    robot: Job | str | Path,
+    motion: str | Path,
+    log: str | Path,
+    settings: Simulation | None = None,
     *,
+    urdf: str | Path | None = None,
+    cutoff: float | None = None,
     progress: ProgressCallback | None = None,
 ) -> dict[str, Any]:
     """Simulate a robot that follows a motion; write its log and its true parameters.
 
     Args:
-        job: The robot: its URDF, its joints and the terms of its drives.
-        files: The files to read and write.
-        settings: Differences from the URDF, controller, actuators and sensors.
+        robot: A URDF, all of whose joints move, or a job file.
+        motion: The motion to follow: a table of time and positions.
+        log: The log to write; the true parameters are in ``<log stem>.truth.json``.
+        settings: Differences from the URDF, controller, actuators and sensors; none if None.
+        urdf: File for the URDF of the true robot; none if None.
+        cutoff: Cutoff frequency of the low-pass filter of a recorded motion [Hz]; None: no filter.
         progress: Called with the simulated seconds.
 
     Returns:
         The content of the file of the true parameters.
 
     Raises:
-        DataError: If a file is not usable, or the simulation diverges.
+        DataError: If the motion or a file to write is not usable.
         ModelError: If the URDF is not usable.
         SettingsError: If a setting does not fit the robot or the motion.
     """
-    for path in (files.log, files.truth, *([files.urdf] if files.urdf else [])):
-        check_file(path, [files.motion, job.urdf])
-    check_suffix(files.log)
+    settings, job, target = settings or Simulation(), as_job(robot), Path(log)
+    truth = target.with_name(f"{target.stem}.truth.json")
+    for path in (log, truth, urdf):
+        if path is not None:
+            check_file(Path(path), [motion, job.urdf])
+    check_suffix(target)
     model = job.model()
-    motion = _motion(job, model, files)
-    duration = motion.duration if settings.duration is None else settings.duration
-    if duration > motion.duration + 1e-9:
+    course = _motion(job, model, Path(motion), cutoff)
+    duration = course.duration if settings.duration is None else settings.duration
+    if duration > course.duration + 1e-9:
         raise SettingsError(
-            f"duration is {duration:g} s, wanted at most the {motion.duration:g} s of the motion; "
+            f"duration is {duration:g} s, wanted at most the {course.duration:g} s of the motion; "
             "reduce it, or give a longer motion"
         )
     rng = np.random.default_rng(settings.seed)
     pi = draw_parameters(model, settings.truth, rng)
     run = follow(
-        model, pi, motion, rate=settings.rate, duration=duration, settings=settings,
+        model, pi, course, rate=settings.rate, duration=duration, settings=settings,
         progress=progress or ignore_progress,
     )  # fmt: skip
-    log = measure(run, settings.sensors, model.joints, rng, delay=delay(model, pi, settings))
-    content = _truth(model, pi, settings, run, log) | {
+    measured = measure(run, settings.sensors, model.joints, rng, delay=delay(model, pi, settings))
+    content = _truth(model, pi, settings, run, measured) | {
         "urdf": str(job.urdf),
-        "motion": {"path": str(files.motion), "sha256": file_sha256(files.motion)},
-        "outputs": [str(path) for path in (files.log, files.truth, files.urdf) if path],
+        "motion": {"path": str(motion), "sha256": file_sha256(motion)},
+        "outputs": [str(path) for path in (log, truth, urdf) if path],
     }
-    if files.urdf:  # an impossible URDF is refused before any file is written
+    if urdf:  # an impossible URDF is refused before any file is written
         with TemporaryDirectory(prefix="robotid-") as folder:
-            write_urdf(model, pi, Path(folder, files.urdf.name), dynamics=True)
-    write_log(log, files.log)
-    if files.urdf:
-        write_urdf(model, pi, files.urdf, dynamics=True)
-    write_json(content | {"log_sha256": file_sha256(files.log)}, files.truth)
+            write_urdf(model, pi, Path(folder, Path(urdf).name), dynamics=True)
+    write_log(measured, target)
+    if urdf:
+        write_urdf(model, pi, urdf, dynamics=True)
+    write_json(content | {"log_sha256": file_sha256(target)}, truth)
     return content
 
 
-def _motion(job: Job, model: RobotModel, files: SimulatedFiles) -> SampledMotion | FloatingMotion:
-    table = job.read(LogEntry(files.motion), model, needs="motion")
-    if table.base is not None:
-        flags = [
-            np.ones(len(table.t), dtype=bool) if x.always else table.contacts[x.frame]
-            for x in model.contacts
-        ]
-        touching = np.reshape(flags, (len(flags), len(table.t))).T
-        t, pose, q = table.t, table.base.pose, table.q
-        if files.cutoff is not None:
-            signals = SignalSettings(cutoff=files.cutoff, velocity="differentiated", trim=0.0)
-            smooth = process(table, signals)
-            t, pose, q = smooth.t, smooth.q[:, :7], smooth.q[:, 7:]
-            touching = touching[np.clip(np.searchsorted(table.t, t), 0, len(table.t) - 1)]
-        return FloatingMotion(t, pose, q, touching)
-    if files.cutoff is None:
-        return SampledMotion(table.t, table.q, table.v, table.a)
-    smooth = process(
-        table, SignalSettings(cutoff=files.cutoff, velocity="differentiated", trim=0.0)
-    )
-    return SampledMotion(smooth.t, smooth.q, smooth.v, smooth.a)
+def _motion(
+    job: Job, model: RobotModel, path: Path, cutoff: float | None
+) -> SampledMotion | FloatingMotion:
+    table = job.read(LogEntry(path), model, needs="motion")
+    smooth = None
+    if cutoff is not None:
+        smooth = process(table, SignalSettings(cutoff=cutoff, velocity="differentiated", trim=0.0))
+    if table.base is None:
+        course = smooth or table
+        return SampledMotion(course.t, course.q, course.v, course.a)
+    flags = [
+        np.ones(len(table.t), dtype=bool) if x.always else table.contacts[x.frame]
+        for x in model.contacts
+    ]
+    touching = np.reshape(flags, (len(flags), len(table.t))).T
+    if smooth is None:
+        return FloatingMotion(table.t, table.base.pose, table.q, touching)
+    rows = np.clip(np.searchsorted(table.t, smooth.t), 0, len(table.t) - 1)
+    return FloatingMotion(smooth.t, smooth.q[:, :7], smooth.q[:, 7:], touching[rows])
 
 
 def _truth(
@@ -209,14 +187,9 @@ def _entries(names: Sequence[str], units: Sequence[str], values: Array) -> list[
 _HALF = 0.5  # of the commanded range: a joint that moves less does not follow
 
 
-def _simulation() -> Settings:
-
-    return Simulation()
-
-
 #: Flags of the keys of a plant's file.
 _PLANT = Flags(
-    _simulation,
+    Simulation(),
     {
         "--seed": ("seed", "N"),
         "--rate": ("rate", "HZ"),
@@ -250,10 +223,11 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """Run the command."""
     job, settings = simulation_from_flags(options)
-    urdf = Path(options.urdf) if options.urdf else None
-    files = SimulatedFiles(Path(options.motion), Path(options.out), urdf, options.cutoff)
-    with terminal_progress(quiet=options.json) as progress:
-        content = simulate_log(job, files, settings, progress=progress)
+    with progress_of(options) as progress:
+        content = simulate(
+            job, options.motion, options.out, settings,
+            urdf=options.urdf, cutoff=options.cutoff, progress=progress,
+        )  # fmt: skip
     show_found(content, options, _show)
     if not options.json:
         print_files("", content["outputs"])

@@ -14,7 +14,7 @@ from robotid.base.exceptions import MissingDependencyError, SettingsError
 from robotid.base.files import check_folder, file_sha256, folder_beside, write_json
 from robotid.base.text import columns, in_digits_of
 from robotid.base.versions import __version__
-from robotid.cli.console import echo, serve, show_found
+from robotid.cli.console import Terminated, echo, show_found
 from robotid.cli.flags import (
     JOB,
     ONLINE,
@@ -131,6 +131,26 @@ def _change(identifier: OnlineIdentifier, index: int) -> dict[str, Any]:
             "std_error": load.mass_std_error,
         },
     }
+
+
+def serve(
+    job: Job,
+    folder: str | None,
+    options: argparse.Namespace,
+    finished: Callable[[dict[str, Any]], None],
+) -> None:
+    """Show a log in the browser while the estimator runs over it, until it is interrupted."""
+
+    def announce(url: str) -> None:
+        print(f"live: {url}  (stop with Ctrl-C)", file=sys.stderr, flush=True)
+
+    try:
+        serve_track(job, folder, port=options.serve, speed=options.speed, announce=announce,
+                    finished=finished)  # fmt: skip
+    except Terminated:
+        raise
+    except KeyboardInterrupt:
+        print("\nstopped", file=sys.stderr)
 
 
 def serve_track(

@@ -24,7 +24,7 @@ from robotid.base.findings import Finding, listed
 from robotid.base.text import terminal_width
 from robotid.cli.console import echo, print_verdict, show_found
 from robotid.cli.flags import add_json
-from robotid.cli.job import Job, LogEntry, job_from_settings
+from robotid.cli.job import Job, LogEntry, written_job
 from robotid.cli.logs import log_of_commands, survey_logs, units_of_logs
 from robotid.data.log import Log
 from robotid.diagnosis.logs.check_logs import diagnose
@@ -168,45 +168,55 @@ def _require_shapes(
             )
 
 
-def validate_result(
-    path: str | Path, logs: Sequence[LogEntry | str | Path], *, update: bool = False
+def validate(
+    result: str | Path, logs: Sequence[LogEntry | str | Path], *, update: bool = False
 ) -> dict[str, Any]:
     """Compute the prediction error of a written result on other logs.
 
     If the result has a URDF, the prediction uses that file and its sidecar, as a user does. The
     doctor examines the logs. Logs that contain fitted rows do not count as validation. If three or
     more logs were fitted, the drives in the new logs are compared with those in the fitted ones.
+
+    Args:
+        result: A result.json or its folder.
+        logs: Files of logs, read with the settings of the result.
+        update: Whether the logs are added to the variation between logs in the result.json.
+
+    Returns:
+        The errors of each log and the verdict, as ``robotid validate --json``.
+
+    Raises:
+        DataError: If a log cannot be used.
+        SettingsError: If the result cannot be updated.
     """
-    loaded = load_result(path)
-    result = loaded.content
-    settings = {key: value for key, value in result["settings"].items() if value != {}}
-    job = job_from_settings(settings, Path(path).name, Path())
+    loaded = load_result(result)
+    content, job = loaded.content, written_job(loaded.content["settings"], loaded.path.name)
     entries = [log if isinstance(log, LogEntry) else LogEntry(Path(log)) for log in logs]
     if update:
         check_file(loaded.path)
         check_update(loaded, job, entries)
-    if "simulation" in result:
+    if "simulation" in content:
         return _validate_commands(loaded, job, entries)
-    source = stated_model(result, job.model())
+    source = stated_model(content, job.model())
     if loaded.has_urdf:
         model, pi = loaded.identified
         model = replace(model, constraints=source.constraints)  # the URDF does not state them
     else:
-        model, pi = source, stated_parameters(result, source)
+        model, pi = source, stated_parameters(content, source)
     prior = source.standard_parameters()
     (surveyed,) = survey_logs(job, model, entries)
-    driven = stated_urdf_with_drives(result, source)
+    driven = stated_urdf_with_drives(content, source)
     _, evaluations = evaluate_logs((), surveyed, {"estimate": pi}, prior, driven)
     own = [log.with_model(source) for log in surveyed]
     added = add_logs(loaded, source, job, own)
     unlike = () if added is None else added.findings
-    verdict = _verdict(job, source, result, evaluations, surveyed, unlike)
+    verdict = _verdict(job, source, content, evaluations, surveyed, unlike)
     if update and added is not None:
         added.write(loaded)
     return {
-        "result": str(path),
-        "predicted_with": result["outputs"].get("urdf", "base parameters of result.json"),
-        "validation": [e.to_dict() | _expected(result, model, e) for e in evaluations],
+        "result": str(result),
+        "predicted_with": content["outputs"].get("urdf", "base parameters of result.json"),
+        "validation": [e.to_dict() | _expected(content, model, e) for e in evaluations],
         "verdict": verdict.to_dict(),
         **({} if added is None else {"variation": added.shown}),
         "findings": [asdict(finding) for finding in unlike],
@@ -371,7 +381,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """Run the command."""
     entries = [_entry(log, options) for log in options.logs]
-    found = validate_result(options.result, entries, update=options.update)
+    found = validate(options.result, entries, update=options.update)
     show_found(found, options, partial(_show, is_update=options.update))
 
 

@@ -2,13 +2,8 @@
 
 import io
 import json
-import os
-import platform
 import re
-import subprocess
-import sys
 from contextlib import nullcontext, redirect_stderr, redirect_stdout
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,12 +12,9 @@ from helpers.replay_data import leave_out_meshes
 from helpers.synthetic import exact_log, truth
 
 from robotid.cli import main
-from robotid.cli.demo import run_demo
 from robotid.data.files.read import read_log, write_log
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.torque import joint_torque_regressor
-from robotid.output.files.urdf import load_identified
-from robotid.robot.drives import LoadFriction
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 
@@ -50,18 +42,6 @@ def identified(logs, tmp_path_factory):
     words = ["identify", URDF, str(logs / "fit.csv"), "--validate", str(logs / "keep.csv")]
     assert main([*words, "--out", str(out)]) == 0
     return out
-
-
-def test_identify_writes_everything_it_names(identified, capsys):
-    names = sorted(path.name for path in identified.iterdir())
-    assert names == [
-        "report.html",
-        "result.json",
-        "ur5_robot.identified.drive.json",
-        "ur5_robot.identified.urdf",
-    ]
-    result = json.loads((identified / "result.json").read_text())
-    assert all((identified / name).is_file() for name in result["outputs"].values())
 
 
 def test_result_json_has_the_promised_shape(identified, logs):
@@ -157,17 +137,6 @@ def test_a_result_that_was_changed_by_hand_is_refused_by_the_place(
     assert said in capsys.readouterr().err
 
 
-def test_the_written_urdf_holds_the_identified_masses(identified):
-    result = json.loads((identified / "result.json").read_text())
-    outputs = result["outputs"]
-    model, pi = load_identified(identified / outputs["urdf"], identified / outputs["sidecar"])
-    stated = {p["name"]: p["value"] for p in result["standard_parameters"]}
-    stated |= {p["name"]: p["value"] for p in result["drive_parameters"]}
-    np.testing.assert_allclose(
-        pi, [stated[name] for name in model.layout.names], rtol=1e-9, atol=1e-12
-    )
-
-
 @pytest.fixture(scope="module")
 def alone(arm_logs, tmp_path_factory):
     """What is printed of one log without another to validate on, and the folder written."""
@@ -201,12 +170,6 @@ def test_no_report_is_written_where_none_is_wanted(alone):
     assert written == {"result.json", *result["outputs"].values()}
 
 
-def test_without_validation_the_verdict_is_not_good(alone):
-    result, _ = alone
-    assert result["verdict"]["status"] == "usable"
-    assert "no validation log given" in str(result["verdict"]["reasons"])
-
-
 def test_wls_result_without_a_urdf_can_be_validated(arm, arm_logs, tmp_path, capsys):
     # noise as large as the torque on few rows: unconstrained parameters that cannot be
     out = tmp_path / "out"
@@ -230,29 +193,6 @@ def test_wls_result_without_a_urdf_can_be_validated(arm, arm_logs, tmp_path, cap
     wanted = np.linalg.norm(error, axis=0) / np.linalg.norm(log.tau[inside], axis=0)
     found = [again["validation"][0]["per_joint"][j]["relative_error_pct"] for j in arm.joints]
     assert found == pytest.approx(100 * wanted, rel=0.1)
-
-
-def test_a_log_validated_on_itself_is_named(arm_logs, tmp_path, capsys):
-    log = str(arm_logs / "fit.csv")
-    words = ["identify", ARM, log, "--validate", log, "--out", str(tmp_path), "--json"]
-    assert main([*words, *PLAIN]) == 0
-    result = json.loads(capsys.readouterr().out)
-    assert "validation_was_fitted" in [warning["code"] for warning in result["warnings"]]
-    assert result["verdict"]["status"] != "good"
-
-
-def test_joints_left_to_stand_at_zero_are_named(tmp_path, capsys):
-    model = RobotModel.from_urdf(ARM, joints=["joint_1"])
-    write_log(exact_log(model, truth(model), np.random.default_rng(0)), tmp_path / "log.csv")
-    words = ["identify", ARM, str(tmp_path / "log.csv"), "--joints", "joint_1"]
-    words += ["--estimator", "wls", *PLAIN, "--out", str(tmp_path / "out"), "--json"]
-    assert main(words) == 0
-    result = json.loads(capsys.readouterr().out)
-    (warning,) = [w for w in result["warnings"] if w["code"] == "locked_at_zero"]
-    assert "joint_2" in warning["message"]
-    assert main([*words, "--lock", "joint_2=0.0"]) == 0
-    codes = [w["code"] for w in json.loads(capsys.readouterr().out)["warnings"]]
-    assert "locked_at_zero" not in codes
 
 
 def spoil(logs, tmp_path, change):
@@ -351,83 +291,12 @@ def test_wrong_use_has_its_exit_code_and_message(arm_logs, tmp_path, capsys, fla
     assert message in capsys.readouterr().err
 
 
-def test_a_job_file_states_its_logs_itself(arm_logs, tmp_path, capsys):
-    job = tmp_path / "job.toml"
-    job.write_text(
-        f'urdf = "{ARM}"\n[[identification]]\nlog = "{arm_logs / "fit.csv"}"\n'
-        f'[[validation]]\nlog = "{arm_logs / "keep.csv"}"\n[output]\nreport = false\n'
-    )
-    assert main(["identify", str(job), "--out", str(tmp_path / "out")]) == 0
-    assert "verdict: good" in capsys.readouterr().out
-    assert main(["identify", str(job), "a.csv", "--cutoff", "5", "--lock", "a=0"]) == 2
-    assert capsys.readouterr().err.endswith(
-        "is a job file; it states the logs and settings. Remove a.csv, --lock, --cutoff, and state "
-        "in the job file: log in [[identification]], locked at the top, cutoff in [signals]\n"
-    )
-
-
-def test_rounded_angles_are_named_and_snapped_where_asked(tmp_path, rng, capsys):
-    source = tmp_path / "arm.urdf"
-    text = example_urdf("xarm7.urdf").read_text().replace("1.5708", "1.57")
-    source.write_text(re.sub(r"(?s)<(visual|collision)>.*?</\1>", "", text))
-    model = RobotModel.from_urdf(source, snap_angles=True)
-    pi = truth(model)
-    write_log(exact_log(model, pi, rng, samples=400), tmp_path / "log.csv")
-    words = [
-        "identify",
-        str(source),
-        str(tmp_path / "log.csv"),
-        "--estimator",
-        "wls",
-        "--json",
-        *PLAIN,
-    ]
-    # the directions that rounding adds carry WLS away, to links that weigh less than nothing
-    assert main([*words, "--out", str(tmp_path / "plain")]) == 1
-    plain = json.loads(capsys.readouterr().out)
-    assert "total_mass" in {f["code"] for f in plain["warnings"]}
-    (finding,) = [f for f in plain["warnings"] if f["code"] == "rounded_rpy"]
-    assert "--snap-angles" in finding["message"]
-    assert main([*words, "--out", str(tmp_path / "snapped"), "--snap-angles"]) == 0
-    snapped = json.loads(capsys.readouterr().out)
-    assert "rounded_rpy" not in {f["code"] for f in snapped["warnings"]}
-    assert snapped["settings"]["snap_angles"] is True
-    assert snapped["structure"]["base"] == len(structural_mapping(model).K)
-    assert plain["structure"]["base"] > snapped["structure"]["base"]
-
-
-def test_no_log_is_wrong_usage(capsys):
-    assert main(["identify", URDF]) == 2
-    assert "no log is given" in capsys.readouterr().err
-    with pytest.raises(SystemExit, match="2"):
-        main(["identfy"])
-
-
-def test_inspect_prints_what_a_urdf_holds(capsys):
-    assert main(["inspect", URDF, "--json"]) == 0
-    content = json.loads(capsys.readouterr().out)
-    assert content["robot"] == "ur5"
-    assert content["structure"]["base_inertial"] == 36
-    assert len(content["base_groups"]) == 36
-    assert main(["inspect", URDF]) == 0
-    assert "36 base" in capsys.readouterr().out
-    assert main(["inspect", str(example_urdf("solo12.urdf")), "--free-flyer", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["structure"]["base_inertial"] == 94
-
-
-def test_inspect_of_an_unusable_urdf_says_why(capsys, tmp_path):
-    assert main(["inspect", str(example_urdf("ur3.urdf")), "--json"]) == 1
-    printed = capsys.readouterr()
-    assert json.loads(printed.out)["structure"] is None
-    assert "does not give a valid model; see the findings" in printed.err
-
-
 def test_demo_runs_from_nothing_and_finds_the_truth(tmp_path, capsys, monkeypatch):
     out, stages = tmp_path / "demo", []
     monkeypatch.setattr("robotid.cli.demo._PERIOD", 7.0)
     leave_out_meshes(monkeypatch)
     shown = nullcontext(lambda *stage: stages.append(stage))
-    monkeypatch.setattr("robotid.cli.demo.terminal_progress", lambda: shown)
+    monkeypatch.setattr("robotid.cli.demo.progress_of", lambda options: shown)
     assert main(["demo", "--out", str(out)]) == 0
     printed = capsys.readouterr().out
     assert stages, "the stages of the identification are shown"
@@ -440,20 +309,6 @@ def test_demo_runs_from_nothing_and_finds_the_truth(tmp_path, capsys, monkeypatc
     assert len(set(links)) == 4
     assert {name for name in links if (out / name).is_file()} == set(links)
     assert str(out / "report.html") in printed
-
-
-def test_a_term_that_the_demo_finds_and_did_not_simulate_is_truly_0(tmp_path, monkeypatch):
-    """As the friction of a drive that seems to grow with its load."""
-    monkeypatch.setattr("robotid.cli.demo._PERIOD", 0.25)
-    whole = RobotModel.from_urdf(example_urdf("z1.urdf"), locked={"jointGripper": 0.0})
-    bases = []
-    for model in (whole, whole.with_terms({"joint2": (LoadFriction(),)})):
-        found = SimpleNamespace(model=model, mapping=structural_mapping(model))
-        monkeypatch.setattr("robotid.cli.demo.run_job", lambda *_, found=found, **__: (found, {}))
-        *_, true = run_demo(tmp_path / "demo")
-        bases.append(dict(zip(found.mapping.base_names, true, strict=True)))
-    plain, more = bases
-    assert more == pytest.approx(plain | {"joint2.load": 0.0})
 
 
 def test_nothing_stays_behind_when_a_run_fails_late(arm_logs, tmp_path, monkeypatch):
@@ -476,49 +331,3 @@ def test_nothing_stays_behind_when_a_run_fails_late(arm_logs, tmp_path, monkeypa
     ]
     assert main(words) == 1
     assert list(out.iterdir()) == []
-
-
-def test_a_result_can_be_validated_from_any_folder(arm_logs, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(arm_logs)
-    out = tmp_path / "out"
-    words = ["identify", ARM, "fit.csv", "--out", str(out), "--estimator", "wls", *PLAIN]
-    assert main(words) == 0
-    monkeypatch.chdir(tmp_path)
-    assert main(["validate", "out/result.json", str(arm_logs / "keep.csv")]) == 0
-    assert "predicted with" in capsys.readouterr().out
-
-
-@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="other C libraries have no mallopt")
-def test_the_pages_of_freed_arrays_are_kept_for_the_next_ones():
-    code = """
-import resource
-import numpy as np
-from robotid.cli import main
-
-def made_anew():
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
-    for _ in range(10):
-        arrays = [np.ones(10**6) for _ in range(3)]  # 8 MB each
-        del arrays
-    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
-
-main(["schema"])
-made_anew()
-print(made_anew())
-"""
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert int(done.stdout.split()[-1]) < 1000  # pages: 60,000 are in all of them
-
-
-@pytest.mark.parametrize("stated", ["", "3"])
-def test_blas_has_one_thread_unless_the_environment_states_another_number(stated):
-    code = (
-        "import os, sys; from robotid.cli import main\n"
-        "try: main(['--version'])\n"
-        "except SystemExit: pass\n"
-        "print('numpy' in sys.modules, os.environ['OPENBLAS_NUM_THREADS'])"
-    )
-    own = {k: x for k, x in os.environ.items() if k != "OPENBLAS_NUM_THREADS"}
-    own |= {"OPENBLAS_NUM_THREADS": stated} if stated else {}
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=own)
-    assert done.stdout.splitlines()[-1] == f"False {stated or '1'}"

@@ -6,9 +6,7 @@ import pytest
 from helpers.replay_data import leave_out_meshes, shown
 
 from robotid.cli import main
-from robotid.cli.identify import show_result
 from robotid.robot.examples import example_urdf
-from robotid.robot.tree import read_tree
 
 LEG = ("FL_hip_joint", "FL_thigh_joint", "FL_calf_joint")
 
@@ -97,63 +95,6 @@ def test_drives_of_a_real_leg_are_as_large_as_they_can_be(result):
         assert 0.0 <= delay["value"] < 0.01
         assert 0.0 < delay["std_error"] < 0.003
         assert 1.96 <= values[f"{joint}.delay"]["quantile"] < 2.3
-
-
-def test_the_kept_window_is_followed_better_than_by_the_command(result):
-    [run] = result["validation"]
-    for own in run["per_joint"].values():
-        assert own["rmse"] < 0.015  # [rad]
-        assert own["rmse"] < 0.3 * own["command_rmse"]
-    assert result["verdict"]["status"] in ("good", "usable")
-    assert set(result["verdict"]["per_joint"]) == set(LEG)
-
-
-def test_the_written_urdf_has_the_bodies_that_were_found(folder, result):
-    tree = read_tree(folder / "go2.identified.urdf")
-    masses = {link["name"]: link["mass"] for link in result["consistency"]["links"]}
-    assert result["consistency"]["is_consistent"]
-    for name, mass in masses.items():
-        assert mass > 0
-        assert name in tree.links
-
-
-def test_what_was_found_is_printed_with_its_values(folder, result, capsys, tmp_path):
-    assert main(["report", str(folder), "--out", str(tmp_path / "again.html")]) == 0
-    capsys.readouterr()
-    show_result(result)
-    printed = capsys.readouterr().out
-    for role, words in (("identification", "fitted"), ("validation", "not fitted")):
-        assert f"{words}: chirp.parquet" in printed
-        part = printed.partition(f"\n{words}: chirp.parquet")[2].partition("\n\n")[0]
-        measured = result[role] if role == "identification" else result[role][0]
-        for joint, own in measured["per_joint"].items():
-            [row] = [line.split() for line in part.splitlines() if line.split()[:1] == [joint]]
-            whose = ("", "second_order_", "urdf_", "command_")
-            keys = [f"{one}relative_error_pct" for one in whose]
-            error, *others = [f"{own[key]:.1f}" for key in keys]
-            assert row[1:] == [error, f"{own['rmse']:#.3g}", "rad", *others]
-    fit = result["simulation"]["fit"]
-    first = f"go2_description: 3 joints, {fit['parameters']} free parameters; "
-    assert first in " ".join(printed.split())
-    table = printed.partition("\n  parameter ")[2].partition("\n\n")[0].splitlines()[1:]
-    lines = {line.split()[0]: line.split()[1:] for line in table}
-    for entry in result["drive_parameters"]:
-        if entry["std_error"] is None:
-            assert entry["name"] not in lines
-            continue
-        value, error, *unit = lines[entry["name"]]
-        if entry["source"] == "bound":
-            assert " ".join([error, *unit]) == f"at bound {entry['unit']}"
-            continue
-        assert value == f"{entry['value']:.4g}"
-        assert error == f"{entry['std_error']:.2g}"
-        assert " ".join(unit) == entry["unit"]
-    assert len(lines) > 9
-    assert f"verdict: {result['verdict']['status']}" in printed
-
-
-def test_json_is_the_result(found, result):
-    assert json.loads(found[1]) == result
 
 
 def test_a_log_without_commands_ends_with_one_sentence(tmp_path, job, capsys, ur5):

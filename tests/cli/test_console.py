@@ -11,7 +11,6 @@ import subprocess
 import sys
 import termios
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -20,11 +19,7 @@ from helpers.synthetic import exact_log, truth
 
 from robotid.base.typing import STAGES
 from robotid.cli import compare, doctor, main
-from robotid.cli import console as printing
-from robotid.cli.console import terminal_progress
-from robotid.cli.job import LogEntry
 from robotid.data.files.read import write_log
-from robotid.identification.pipeline import identify
 from robotid.robot.model import RobotModel
 
 ARM = str(ROOT / "urdf" / "planar_2r.urdf")
@@ -34,48 +29,6 @@ ARM = str(ROOT / "urdf" / "planar_2r.urdf")
 def log():
     model, rng = RobotModel.from_urdf(ARM), np.random.default_rng(0)
     return exact_log(model, truth(model), rng, samples=900, rate=100.0, noise=0.1)
-
-
-def test_python_hears_of_each_stage_of_logs_in_memory(log):
-    heard = []
-    model = RobotModel.from_urdf(ARM)
-    identify(
-        model, [log], estimator="wls", friction="viscous", progress=lambda *told: heard.append(told)
-    )
-    stages = [(name, k, 5, "stages") for k, name in enumerate(STAGES) if k < 4]
-    assert heard == [*stages[:3], ("fits", 0, 1, "fits"), stages[3]]
-
-
-def test_verbose_says_the_stages_where_there_is_no_terminal(log, tmp_path, capsys):
-    write_log(log, tmp_path / "fit.csv")
-    words = ["identify", ARM, str(tmp_path / "fit.csv"), "--estimator", "wls", "--no-report"]
-    words += ["--friction", "viscous"]
-    assert main([*words, "--out", str(tmp_path / "out"), "--json", "--verbose"]) == 0
-    assert "1/5" not in capsys.readouterr().err, "beside JSON nothing is said"
-    assert main([*words, "--out", str(tmp_path / "out"), "--verbose"]) == 0
-    printed = capsys.readouterr()
-    said = re.findall(r"^robotid: (\d)/5 (.*)$", printed.err, re.MULTILINE)
-    assert said == [(str(k + 1), name) for k, name in enumerate(STAGES)]
-    assert "/5 " not in printed.out
-
-
-def test_a_stage_stays_above_the_work_it_consists_of(capsys):
-    with terminal_progress(force=True) as show:
-        show("fitting", 2, 5, "stages")
-        show("reducing", 50, 100, "samples")
-    assert re.search(r"3/5 fitting.*\n.*    reducing.*50 %", capsys.readouterr().err)
-    with terminal_progress(force=True) as show:
-        show("fitting", 2, 5, "stages")
-        show("reducing", 50, 100, "samples")
-        show("solving", 1, 4, "fits")
-    shown = capsys.readouterr().err
-    last = shown[shown.rindex("fitting") :]  # only the newest work stays below its stage
-    assert "solving" in last
-    assert "reducing" not in last
-    with terminal_progress(force=True) as show:
-        show("fitting", 2, 5, "stages")
-        show("writing", 4, 5, "stages")
-    assert not re.search(r"fitting.*\n.*writing", capsys.readouterr().err)
 
 
 def on_a_terminal(words, columns, **environment):
@@ -163,58 +116,6 @@ def test_inspect_says_what_it_found_first_and_a_missing_file_once(tmp_path, caps
     assert printed.err == f"robotid: {urdf} does not give a valid model; see the findings\n"
 
 
-def test_inspect_shows_base_parameters_where_they_are_asked_for(tmp_path, capsys):
-    urdf = tmp_path / "two.urdf"
-    inertia = 'ixx="0.02836842105263158"'
-    urdf.write_text(Path(ARM).read_text().replace(inertia, 'ixx="-1"'))
-    assert main(["inspect", str(urdf)]) == 0
-    short = capsys.readouterr().out
-    assert main(["inspect", str(urdf), "--base"]) == 0
-    long = capsys.readouterr().out
-    assert long.index("error: ") < long.index("base parameters, inertial")
-    assert short.endswith(f"list of base parameters:\n  robotid inspect {urdf} --base\n")
-    assert len(long.splitlines()) >= len(short.splitlines()) + 3
-
-
-def test_logs_of_one_name_are_named_by_their_paths(arm_logs, tmp_path, capsys):
-    other = tmp_path / "fit.csv"
-    other.write_bytes((arm_logs / "keep.csv").read_bytes())
-    words = ["identify", ARM, str(arm_logs / "fit.csv"), str(other), "--estimator", "wls"]
-    words += ["--friction", "viscous", "--no-report", "--out", str(tmp_path / "out")]
-    assert main(words) == 0
-    said = " ".join(capsys.readouterr().out.split())
-    assert re.search(rf"fitted: {arm_logs}/fit.csv 0-7.99 s, {other} 0-7.99 s", said)
-
-
-def test_compare_keeps_columns_apart_and_files_of_one_name_too(
-    arm_logs, tmp_path, capsys, monkeypatch
-):
-    words = ["identify", ARM, str(arm_logs / "fit.csv"), "--validate", str(arm_logs / "keep.csv")]
-    for cutoff in ("8", "9"):
-        out = ["--cutoff", cutoff, "--estimator", "wls", "--no-report", "--friction", "viscous"]
-        assert main([*words, *out, "--out", str(tmp_path / cutoff)]) == 0
-    capsys.readouterr()
-    monkeypatch.setenv("COLUMNS", "300")
-    results = [str(tmp_path / cutoff / "result.json") for cutoff in ("8", "9")]
-    assert main(["compare", *results]) == 0
-    lines = capsys.readouterr().out.splitlines()
-    assert [line.split()[-1] for line in lines[:2]] == results
-    assert "not fitted: keep.csv 0-7.99 s, error %" in lines
-    contents = [json.loads(Path(result).read_text()) for result in results]
-    by_name = [{e["name"]: e for e in content["base_parameters"]} for content in contents]
-    for name, entry in by_name[0].items():
-        (line,) = [line for line in lines if line.split()[:1] == [name]]
-        _, first, second, *unit, difference = line.split()
-        assert float(first) == pytest.approx(entry["value"], abs=0.06 * entry["std_error"])
-        found = by_name[1][name]
-        assert float(second) == pytest.approx(found["value"], abs=0.06 * found["std_error"])
-        assert " ".join(unit) == entry["unit"]
-        error = np.hypot(entry["std_error"], found["std_error"])
-        assert float(difference) == pytest.approx(
-            (found["value"] - entry["value"]) / error, abs=0.06
-        )
-
-
 def finding(joint, code, share, severity="warning"):
     message = f"run.csv: {share:g} % of {joint}'s torque is odd"
     evidence = {"share": share / 100}
@@ -230,14 +131,14 @@ def test_findings_are_told_by_cause_and_the_worst_joint_is_named(capsys):
         finding("arm_1", "noise", 1, "note"),
     ]
     content = {"findings": findings, "joints": joints}
-    doctor.show(content, is_verbose=False, logs=2)
+    doctor._show(content, is_verbose=False, count=2)
     assert capsys.readouterr().out.splitlines() == [
         "warning: stepped: run.csv: 20 % of arm_6, arm_7's torque is odd",
         "warning: odd: run.csv: 37 to 68 % of arm_6, arm_7's torque is odd",
         "2 findings, 2 causes; worst: arm_7; 1 note hidden (--verbose)",
     ]
     findings.append(finding("arm_1", "reversed", 1, "error"))  # graver than any two warnings
-    doctor.show(content, is_verbose=True, logs=2)
+    doctor._show(content, is_verbose=True, count=2)
     lines = capsys.readouterr().out.splitlines()
     assert lines[0] == "error: reversed: run.csv: 1 % of arm_1's torque is odd"
     assert lines[-2:] == [
@@ -247,39 +148,8 @@ def test_findings_are_told_by_cause_and_the_worst_joint_is_named(capsys):
     wrong = [finding("arm_6", code, 1, "error") for code in ("one", "two")]
     wrong += [finding("arm_7", code, 9) for code in ("three", "four")]
     wrong.append(finding("arm_7", "five", 9, "error"))
-    doctor.show({"findings": wrong, "joints": joints}, is_verbose=False, logs=2)
+    doctor._show({"findings": wrong, "joints": joints}, is_verbose=False, count=2)
     assert capsys.readouterr().out.splitlines()[-1].endswith("worst: arm_6"), "two errors"
-
-
-def test_a_clean_doctor_states_the_number_of_logs(capsys):
-    doctor.show({"findings": [], "joints": ["a"]}, is_verbose=False, logs=2)
-    assert capsys.readouterr().out == "no fault found in 2 logs\n"
-    notes = [finding(joint, "noise", 1, "note") for joint in ("a", "b")]  # one line of --verbose
-    doctor.show({"findings": notes, "joints": ["a", "b"]}, is_verbose=False, logs=1)
-    assert capsys.readouterr().out == "1 note hidden (--verbose)\nno fault found in 1 log\n"
-
-
-def test_the_doctor_counts_each_file_of_fitted_and_other_logs_once(monkeypatch, capsys):
-    windows = [LogEntry(Path("a.csv"), 0.0, 1.0), LogEntry(Path("a.csv"), 2.0, 3.0)]
-    others = [LogEntry(Path(name)) for name in ("b.csv", "c.csv", "a.csv")]
-    model = SimpleNamespace(joints=("a",))
-    job = SimpleNamespace(identification=windows, validation=others, ignore=(), model=lambda: model)
-    monkeypatch.setattr(doctor, "job_from_flags", lambda options: job)
-    monkeypatch.setattr("robotid.cli.logs.examine", lambda *_, progress: [])
-    assert doctor.run(SimpleNamespace(json=False, verbose=False)) == 0
-    assert capsys.readouterr().out == "no fault found in 3 logs\n"
-
-
-def test_the_verdict_has_its_colour_on_a_terminal_only(monkeypatch, capsys):
-    monkeypatch.setenv("TERM", "xterm")
-    monkeypatch.delenv("NO_COLOR", raising=False)
-    monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
-    verdict = {"status": "poor", "reasons": [], "per_joint": {"a": {"status": "poor"}}}
-    printing.print_verdict(verdict | {"per_joint": {}})
-    assert "verdict: \x1b[31mpoor\x1b[0m" in capsys.readouterr().out
-    monkeypatch.setenv("NO_COLOR", "1")
-    printing.print_verdict(verdict | {"per_joint": {}})
-    assert "\x1b" not in capsys.readouterr().out
 
 
 def test_compare_shows_the_largest_differences_and_fits_eighty_columns(monkeypatch, capsys):

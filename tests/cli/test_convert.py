@@ -7,19 +7,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.recorders import JOINT_STATE, messages_of, wide, write_bag2, write_mcap
-from helpers.synthetic import exact_log, truth
+from helpers.recorders import JOINT_STATE, messages_of, write_bag2
 
 from robotid.base.exceptions import DataError
 from robotid.base.files import write_text
 from robotid.cli import main
 from robotid.cli.convert import convert
-from robotid.cli.job import job_from_settings
 from robotid.data.files.formats import open_table, write_columns
 from robotid.data.files.read import read_log
 from robotid.data.log import Log
 from robotid.data.signal_settings import LogSource
-from robotid.robot.examples import example_urdf
 
 JOINTS = ("shoulder", "elbow")
 
@@ -68,13 +65,6 @@ def test_commands_are_kept_under_their_standard_names(tmp_path, log):
     np.testing.assert_array_equal(back.v_ref, log.v)
 
 
-def test_joints_without_torque_are_converted_too(tmp_path, log):
-    messages = [(*message[:4], []) for message in messages_of(log)]
-    path = write_mcap(tmp_path / "run.mcap", messages)
-    done = convert(path, tmp_path / "run.csv")
-    assert done.columns == ("time", "q_shoulder", "q_elbow", "dq_shoulder", "dq_elbow")
-
-
 def test_joints_are_chosen_renamed_and_effort_may_be_current(tmp_path, log, bag):
     source = LogSource(topic="/arm", joints={"joint_2": "elbow"}, effort="current")
     done = convert(bag, tmp_path / "run.csv", joints=["joint_2"], source=source)
@@ -82,15 +72,6 @@ def test_joints_are_chosen_renamed_and_effort_may_be_current(tmp_path, log, bag)
     back = read_log(tmp_path / "run.csv", ["joint_2"], gains={"joint_2": 2.0})
     np.testing.assert_array_equal(back.tau[:, 0], 2 * log.tau[:, 1])
     assert done.ignored == ()
-
-
-def test_columns_of_no_joint_are_left_out_and_named(tmp_path, log, capsys):
-    np.savez(tmp_path / "run.npz", **wide(log), temperature=np.zeros(60))
-    done = convert(tmp_path / "run.npz", tmp_path / "run.csv")
-    assert done.ignored == ("temperature",)
-    assert_same(read_log(tmp_path / "run.csv", JOINTS), log)
-    assert main(["convert", str(tmp_path / "run.npz"), str(tmp_path / "run.csv")]) == 0
-    assert capsys.readouterr().out.endswith("\n  not written, not of a joint: temperature\n")
 
 
 @pytest.mark.parametrize(
@@ -128,17 +109,6 @@ def test_columns_of_base_contacts_and_forces_are_kept(tmp_path, log):
     back = open_table(tmp_path / "run.csv", LogSource()).read(kept)
     for k, name in enumerate(kept):
         np.testing.assert_array_equal(back[name], k + log.t)
-
-
-def test_the_command_converts_and_names_what_it_wrote(tmp_path, log, bag, capsys):
-    target = str(tmp_path / "run.csv")
-    assert main(["convert", str(bag), target, "--topic", "/arm", "--joints", "elbow"]) == 0
-    assert capsys.readouterr().out == (
-        f"{target}: 60 samples of 1 joints\n  columns time, q_elbow, dq_elbow, tau_elbow\n"
-    )
-    assert main(["convert", str(bag), target, "--topic", "/arm", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["joints"] == list(JOINTS)
-    assert_same(read_log(target, JOINTS), log)
 
 
 def test_the_command_refuses_by_name_and_leaves_what_was_there(tmp_path, bag, capsys):
@@ -183,43 +153,3 @@ def test_on_a_full_disk_the_old_file_stays_and_no_part_of_the_new(tmp_path):
         assert target.read_text() == "precious"
     assert run.stderr == ""
     assert {*tmp_path.iterdir()} == {tmp_path / "in.npz", *targets}
-
-
-def test_a_job_reads_a_bag_and_its_result_validates_on_it(tmp_path, ur5, rng, capsys):
-    made = exact_log(ur5, truth(ur5), rng, noise=0.1)
-    names = tuple(f"M{j}" for j in range(6))
-    renamed = list(messages_of(replace(made, joints=names)))
-    still = messages_of(replace(made, joints=names, q=0 * made.q))
-    write_bag2(tmp_path / "bag", {"/arm": renamed, "/command": still})
-    mapping = ", ".join(f'{j} = "{m}"' for j, m in zip(ur5.joints, names, strict=True))
-    (tmp_path / "job.toml").write_text(
-        f'urdf = "{example_urdf("ur5_robot.urdf")}"\n'
-        f'[log]\ntopic = "/arm"\njoints = {{ {mapping} }}\nstamp = "header"\neffort = "torque"\n'
-        '[estimator]\nname = "wls"\n[output]\nreport = false\n'
-        '[[identification]]\nlog = "bag"\n'
-    )
-    out = tmp_path / "out"
-    assert main(["identify", str(tmp_path / "job.toml"), "--out", str(out)]) == 0
-    result = json.loads((out / "result.json").read_text())
-    assert result["settings"]["log"]["topic"] == "/arm"
-    assert len(result["inputs"][1]["sha256"]) == 64  # of the folder
-    assert main(["validate", str(out / "result.json"), str(tmp_path / "bag")]) == 0
-    again = job_from_settings(result["settings"], "result.json", tmp_path)
-    assert again.source.joints == dict(zip(ur5.joints, names, strict=True))
-    capsys.readouterr()
-
-
-def test_the_flags_of_identify_say_where_the_signals_are(tmp_path, ur5, rng, capsys):
-    made = exact_log(ur5, truth(ur5), rng, noise=0.1)
-    path = write_mcap(tmp_path / "run.mcap", messages_of(made), topic="/arm")
-    urdf = str(example_urdf("ur5_robot.urdf"))
-    words = ["identify", urdf, str(path), "--out", str(tmp_path / "out")]
-    assert main([*words, "--topic", "/leg"]) == 1
-    assert f"run.mcap has no topic '/leg'; topics: {{'/arm': '{JOINT_STATE}'}}" in (
-        capsys.readouterr().err
-    )
-    assert main([*words, "--stamp", "wall"]) == 2
-    assert main([*words, "--topic", "/arm", "--effort", "current"]) == 1
-    said = capsys.readouterr().err
-    assert f"joints {', '.join(ur5.joints)} have currents but no gain" in said
-    assert "--gain shoulder_pan_joint=... --gain shoulder_lift_joint=..." in said

@@ -75,22 +75,6 @@ def test_a_job_driven_by_its_torque_writes_errors_beside_those_of_its_rows(folde
     assert names == {"armature", "viscous", "coulomb", "offset"}
 
 
-def test_its_report_tells_of_torques_and_not_of_commands(folder):
-    page = (folder / "report.html").read_text()
-    assert "drives from torque-driven simulation" in page
-    assert "torque fit" in page
-    assert "q<sub>ref</sub>" not in page
-    assert "commanded" not in page.split("<h2")[1]
-
-
-def test_what_was_found_is_printed_beside_the_rows(found):
-    said = found[1]
-    assert "errors are position errors over 0.5 s" in " ".join(said.split())
-    heads = said[said.index("not fitted:") :].split("\n")[1:3]
-    assert heads[0].split() == ["joint", "error", "rmse", "torques", "URDF", "constant"]
-    assert heads[1].split() == ["%", "alone", "%", "%", "speed", "%"]
-
-
 def test_its_result_is_validated_on_another_log(folder, job, result, capsys):
     assert main(["validate", str(folder), str(job.parent / "second.csv"), "--json"]) == 0
     again = json.loads(capsys.readouterr().out)
@@ -103,21 +87,3 @@ def test_its_result_is_validated_on_another_log(folder, job, result, capsys):
     both = json.loads(capsys.readouterr().out)
     assert both["verdict"]["status"] == "not evaluated", "one of the two was fitted"
     assert both["validation"][0] == run
-
-
-def test_its_report_is_made_anew_and_its_replay_shows_torques(folder, job, tmp_path):
-    assert main(["report", str(folder)]) == 0
-    log, page = job.parent / "second.csv", tmp_path / "replay.html"
-    urdf = folder / "planar_2r.identified.urdf"
-    assert main(["replay", str(urdf), str(log), str(folder), "--html", str(page)]) == 0
-    assert page.is_file()
-
-
-def test_gains_beside_a_torque_end_with_one_sentence(job, tmp_path, capsys):
-    text = job.read_text().replace('kind = "torque"', 'kind = "torque"\nkp = 20.0')
-    other = job.parent / "gains.toml"
-    other.write_text(text)
-    assert main(["identify", str(other), "--out", str(tmp_path / "out")]) == 2
-    said = capsys.readouterr().err
-    assert "kp is 20.0, but with kind = 'torque'" in " ".join(said.split())
-    assert not (tmp_path / "out").exists()

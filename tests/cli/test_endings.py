@@ -56,13 +56,6 @@ def test_a_folder_in_the_place_of_an_output_is_refused_before_the_work(
     }
 
 
-def test_a_track_is_put_in_place_whole(log, tmp_path, capsys):
-    (tmp_path / "track.json").mkdir()
-    assert main(["track", URDF, log, "--out", str(tmp_path)]) == 2
-    assert "track.json' is a folder, wanted a file to write" in capsys.readouterr().err
-    assert [path.name for path in tmp_path.iterdir()] == ["track.json"]
-
-
 def test_a_page_that_cannot_be_written_is_refused_before_the_work(log, tmp_path, capsys):
     assert main(["replay", "none.urdf", log, "--html", str(tmp_path)]) == 2
     assert main(["compare", "none.json", "none.json", "--out", str(tmp_path)]) == 2
@@ -101,27 +94,6 @@ def test_a_standard_output_that_is_full_is_said():
     with open("/dev/full", "w") as full:
         run = robotid("inspect", URDF, stdout=full)
     assert (run.returncode, run.stderr) == (1, "robotid: [Errno 28] No space left on device\n")
-
-
-def test_a_warning_that_nobody_reads_does_not_end_the_work(log, tmp_path):
-    read, write = os.pipe()
-    os.close(read)
-    words = ["identify", URDF, log, "--workers", "2", "--friction", "viscous", "--no-report"]
-    words += ["--out", str(tmp_path)]
-    run = subprocess.run([sys.executable, "-m", "robotid", *words], stdout=write, stderr=write)
-    os.close(write)
-    assert run.returncode == 0
-    written = {path.name for path in tmp_path.iterdir()}
-    assert written == set(OUTPUTS) - {"report.html"}
-
-
-def test_names_that_the_standard_output_cannot_show_are_shown_otherwise(log, tmp_path):
-    here = tmp_path / "\u2713"
-    environment = {**os.environ, "PYTHONIOENCODING": "ascii"}
-    words = ["convert", log, str(tmp_path / "\u2713.csv")]
-    run = robotid(*words, stdout=subprocess.PIPE, env=environment)
-    assert (run.returncode, run.stderr) == (0, "")
-    assert run.stdout.startswith(str(here).replace("\u2713", "\\u2713") + ".csv: 1000 samples")
 
 
 @pytest.mark.parametrize("command", ["doctor", "validate", "compare", "replay"])

@@ -1,23 +1,16 @@
 import argparse
 import io
 import json
-import re
 from contextlib import redirect_stdout
-from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from robotid.cli import excite, main
-from robotid.cli.excite import _designer, _expected
-from robotid.cli.job import Job
 from robotid.data.files.formats import open_table
-from robotid.data.signal_settings import LogSource, SignalSettings
+from robotid.data.signal_settings import LogSource
 from robotid.design.clearance import Box
-from robotid.design.design import Designer
 from robotid.design.excitation_settings import MotionSettings
-from robotid.dynamics.simulation.motions import random_fourier
 from robotid.dynamics.simulation.simulation_settings import Payload
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
@@ -59,30 +52,6 @@ def test_a_motion_is_designed_written_and_told(designed):
     assert content["feasible"] is True
 
 
-def test_a_motion_beyond_a_limit_is_not_called_feasible(tmp_path, capsys, monkeypatch):
-    design = Designer.design
-
-    def beyond(*given, **stated):
-        found = design(*given, **stated)
-        return replace(found, used=1.2 * found.used)
-
-    monkeypatch.setattr(Designer, "design", beyond)
-    words = [*WORDS, "--out", str(tmp_path / "motion.csv"), "--json", "--clearance", "none"]
-    assert main(words) == 0
-    assert json.loads(capsys.readouterr().out)["feasible"] is False
-
-
-def test_the_terminal_says_what_is_left_of_each_limit(tmp_path, capsys):
-    assert main([*WORDS, "--out", str(tmp_path / "motion.yaml"), "--clearance", "none"]) == 0
-    said = capsys.readouterr().out
-    assert "a motion of 4 s for 3 joints, condition number" in said
-    assert "collision" not in said
-    assert "1 start in " in said
-    assert "not converged: increase --seconds" in " ".join(said.split())
-    assert said.endswith(f"\nwritten:\n  {tmp_path / 'motion.yaml'}\n")
-    assert (tmp_path / "motion.yaml").read_text().startswith("joint_names: [wrist_1_joint, ")
-
-
 @pytest.mark.parametrize(
     ("words", "message"),
     [
@@ -111,44 +80,6 @@ def test_bad_flags_are_refused_before_anything_is_written(tmp_path, capsys, word
     own = [*WORDS[:at], *words, *WORDS[at + 2 :]]
     assert main([*own, "--out", str(tmp_path / "m.csv")]) == 2
     assert message in capsys.readouterr().err
-    assert not list(tmp_path.iterdir())
-
-
-def test_the_page_says_what_is_used_of_each_limit_and_draws_it(designed):
-    content, columns, page = designed
-    assert content["report"] == str(page)
-    html = page.read_text()
-    shown = {
-        cells[0]: cells[1:]
-        for row in re.findall(r"<tr>(.*?)</tr>", html)
-        if (cells := re.findall(r"<t[hd][^>]*>(.*?)</t[hd]>", row))
-    }
-    for name, unit in (("velocity", "rad/s"), ("acceleration", "rad/s²")):
-        entry, cells = content["limits"][name], shown[name]
-        assert float(cells[0]) == pytest.approx(100 * (1 - entry["margin"]), abs=0.06)
-        assert cells[2].replace("<wbr>", "") == entry["where"]
-        assert cells[5] == unit
-        values = columns[{"velocity": "dq_", "acceleration": "ddq_"}[name] + entry["where"]]
-        at = columns["time"][int(np.argmax(np.abs(values)))]
-        assert float(cells[3]) == pytest.approx(at, abs=0.02)
-    charts = [
-        json.loads(text)
-        for text in re.findall(r'<script type="application/json">(.*?)</script>', html)
-    ]
-    drawn = {chart["title"]: [s["label"] for s in chart["series"]] for chart in charts}
-    assert drawn["acceleration of each joint relative to its limit"][2:] == ["wrist_2_joint"]
-    assert drawn["acceleration of each joint"] == ["wrist_1_joint", "wrist_3_joint"]
-    assert "floor and boxes" in drawn["distance of the two nearest hulls"]
-    velocity = next(c for c in charts if c["title"].startswith("velocity"))
-    assert velocity["link"] == "time"
-    assert [velocity["series"][k]["y"]["low"] for k in (0, 1)] == [100.0, -100.0]
-    assert "motion.parquet: the motion determines" in html
-
-
-def test_a_page_that_cannot_be_written_is_refused_before_the_design(tmp_path, capsys):
-    words = ["--out", str(tmp_path / "m.csv"), "--report", str(tmp_path / "none" / "m.html")]
-    assert main([*WORDS, *words]) == 1
-    assert f"{tmp_path / 'none'}" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
 
 
@@ -206,28 +137,6 @@ def test_a_payload_is_found_by_a_motion_of_the_few_joints_that_show_it(tmp_path,
     assert (np.abs(error) < 3 * np.array(found["com_std_error"])).all()
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["--mass", "2"], "a payload or moving joints are stated, but kind is 'fourier'"),
-        (
-            ["--kind", "payload", "--moving", "elbow"],
-            "elbow cannot move wrist_3_link, wanted joints that",
-        ),
-        (["--kind", "payload", "--mass", "-1"], "mass"),
-        (["--kind", "payload", "--com", "1,2,3"], "--com '1,2,3': wanted three numbers"),
-        (["--kind", "payload", "--mass", "1", "--com", "1,2"], "--com '1,2': wanted three"),
-        (["--kind", "payload", "--link", "tool"], "link 'tool' is not in ur10_robot.urdf"),
-    ],
-)
-def test_flags_of_a_payload_that_do_not_fit_are_refused(tmp_path, capsys, words, message):
-    assert main([*WORDS, "--out", str(tmp_path / "m.csv"), *words]) == (
-        1 if "--link" in words else 2
-    )
-    assert message in capsys.readouterr().err
-    assert not list(tmp_path.iterdir())
-
-
 def test_after_a_result_a_motion_is_made_for_what_it_knows_the_least(tmp_path, capsys):
     motion, log, out = (str(tmp_path / name) for name in ("m.parquet", "log.parquet", "out"))
     words = [*WORDS, "--clearance", "none", "--out", motion]
@@ -266,73 +175,11 @@ PAN_TILT = """<robot name="pan_tilt"><link name="base"/><link name="pan"><inerti
 SHAPE = '<collision><geometry><box size=".05 .05 .05"/></geometry></collision></link>'
 
 
-@pytest.mark.parametrize("kind", ["fourier", "stands"])
-def test_a_robot_without_links_to_keep_apart_moves_too(tmp_path, kind, capsys):
-    """Neighbours touch, so of three links in a row only the first and the last could collide."""
-    urdf, out = tmp_path / "pan_tilt.urdf", tmp_path / "motion.csv"
-    urdf.write_text(PAN_TILT.replace("</link>", SHAPE))
-    words = ["--duration", "2", "--seconds", "0.5", "--starts", "1", "--kind", kind]
-    assert main(["excite", str(urdf), "--out", str(out), *words]) == 0
-    assert "no pair of links or obstacles comes close" in " ".join(capsys.readouterr().out.split())
-    q = np.loadtxt(out, delimiter=",", skiprows=1)[:, 1:3]
-    assert (np.ptp(q, axis=0) > 0.2).all()
-    assert (np.abs(q) <= [2.0, 1.0]).all()
-
-
 @pytest.fixture
 def pan_tilt(tmp_path):
     urdf = tmp_path / "pan_tilt.urdf"
     urdf.write_text(PAN_TILT.replace("</link>", SHAPE))
     return urdf
-
-
-def test_every_setting_reaches_what_designs(pan_tilt):
-    each = {"a": 3.0, "b": 0.5}
-    settings = MotionSettings(
-        kind="bspline", duration=4.0, harmonics=3, criterion="E", share=0.5, clearance=0.1,
-        floor=-0.25, acceleration=each, jerk={"a": 40.0, "b": 50.0}, power={"a": 6.0, "b": 7.0},
-        noise={"a": 0.2, "b": 0.6}, seconds=1.0, boxes=(Box("post", (1, 1, 0), (2, 3, 4)),),
-    )  # fmt: skip
-    designer, run = _designer(Job(pan_tilt), settings, None)
-    assert run is None
-    assert designer.name == "E"
-    np.testing.assert_allclose(
-        designer.limits.sizes,
-        # half the range, speed and effort of the URDF, and what is stated
-        [[1.0, 0.5], [1.0, 1.0], [3.0, 0.5], [40.0, 50.0], [5.0, 5.0], [6.0, 7.0]],
-    )
-    assert (designer.basis.duration, designer.basis.pieces) == (4.0, 6)
-    assert designer.noise[1] / designer.noise[0] == pytest.approx(9.0)  # variances
-    clearance = designer.clearance
-    assert clearance.least == 0.1
-    post, floor = clearance._hulls[-2:]
-    assert (post.name, floor.name) == ("post", "the floor")
-    assert post.centre.tolist() == [1.5, 2.0, 2.0]
-    assert post.half.tolist() == [0.5, 1.0, 2.0]
-    assert floor.centre[2] + floor.half[2] == pytest.approx(-0.25)
-    basis = _designer(
-        Job(pan_tilt), MotionSettings(duration=4.0, harmonics=3, clearance=None), None
-    )
-    assert (basis[0].basis.duration, basis[0].basis.harmonics) == (4.0, 3)
-    assert (basis[0].name, basis[0].clearance) == ("D", None)
-
-
-def test_what_is_expected_of_a_motion_rests_on_the_noise_that_is_stated(pan_tilt, rng):
-    model = RobotModel.from_urdf(pan_tilt)
-    motion = random_fourier(model, rng, period=4.0)
-    settings = MotionSettings(points=50.0, noise={"a": 0.2, "b": 0.6})
-    job = Job(pan_tilt, signals=SignalSettings(cutoff=None, trim=0.0))
-    design = SimpleNamespace(motion=motion, duration=3.995)  # it ends before the last row
-    found = _expected(job, model, design, settings, None, "m.csv")
-    assert found.noise.std.tolist() == [0.2, 0.6]
-    (evaluation,) = found.expected.fitted
-    trajectory = evaluation.recording.trajectory
-    np.testing.assert_allclose(trajectory.t, np.arange(201) / 50.0)
-    rows = motion.evaluate(np.minimum(trajectory.t, 3.995))
-    for name, values in zip("qva", rows, strict=True):
-        np.testing.assert_allclose(getattr(trajectory, name), values, atol=1e-12)
-    assert evaluation.recording.log.path == "m.csv"
-    assert found.before is None
 
 
 def test_a_box_is_kept_away_from_and_a_seed_makes_the_same_motion_again(pan_tilt, capsys):
@@ -362,40 +209,12 @@ def test_a_box_is_kept_away_from_and_a_seed_makes_the_same_motion_again(pan_tilt
     assert made[0] == made[1] != made[2]
 
 
-def test_a_motion_too_short_for_its_page_is_not_written_either(tmp_path, capsys):
-    urdf, out, page = (tmp_path / name for name in ("pan_tilt.urdf", "motion.csv", "page.html"))
-    urdf.write_text(PAN_TILT)
-    words = ["--duration", "0.1", "--seconds", "0.1", "--starts", "1", "--clearance", "none"]
-    words = ["excite", str(urdf), "--out", str(out), *words]
-    assert main([*words, "--report", str(page)]) == 1
-    assert "is long enough for the filter" in " ".join(capsys.readouterr().err.split())
-    assert not out.exists()
-    assert not page.exists()
-    assert main(words) == 0
-    assert out.exists()
-
-
 def test_a_format_that_motions_are_not_written_in_is_refused_before_the_design(tmp_path, capsys):
     urdf = str(example_urdf("ur5_robot.urdf"))
     assert main(["excite", urdf, "--out", str(tmp_path / "motion.txt")]) == 1
     said = " ".join(capsys.readouterr().err.split())
     assert "motion.txt: motions are written as .csv, .parquet, " in said
     assert ".yaml or .script files, not '.txt'" in said
-
-
-def test_limits_that_the_urdf_states_as_zero_are_stated_by_flags(tmp_path):
-    text = example_urdf("ur10_robot.urdf").read_text()
-    zero = re.sub(r'effort="[^"]*"', 'effort="0"', text)
-    (tmp_path / "zero.urdf").write_text(re.sub(r'velocity="[^"]*"', 'velocity="0"', zero))
-    words = ["excite", str(tmp_path / "zero.urdf"), *WORDS[2:], "--clearance", "none"]
-    words += ["--out", str(tmp_path / "motion.csv")]
-    assert main(words) == 2
-    for joint in WRIST:
-        words += ["--max-velocity", f"{joint}=0.7", "--max-torque", f"{joint}=30"]
-    assert main(words) == 0
-    table = open_table(tmp_path / "motion.csv", LogSource())
-    speeds = table.read([f"dq_{joint}" for joint in WRIST]).values()
-    assert 0.3 < max(np.abs(speed).max() for speed in speeds) <= 0.7
 
 
 def test_every_flag_states_its_setting():

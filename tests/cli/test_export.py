@@ -12,6 +12,8 @@ from helpers.synthetic import exact_log, truth
 
 import robotid
 from robotid.cli import main
+from robotid.cli.identify import run_job
+from robotid.cli.job import read_job
 from robotid.output.files.urdf import load_identified
 from robotid.robot.model import RobotModel
 from robotid.robot.urdf_text import read_with_yourdfpy
@@ -35,7 +37,7 @@ def result(tmp_path_factory):
     (folder / "job.toml").write_text(
         f'urdf = "{urdf}"\n[estimator]\ndraws = 0\n[[identification]]\nlog = "first.csv"\n'
     )
-    robotid.run_job(robotid.read_job(folder / "job.toml"), folder / "out")
+    run_job(read_job(folder / "job.toml"), folder / "out")
     return folder / "out"
 
 

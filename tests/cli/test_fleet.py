@@ -3,25 +3,20 @@
 import json
 import shutil
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pyarrow.parquet
 import pytest
-from helpers.pages import charts, tables
+from helpers.pages import tables
 from helpers.paths import ROOT
 from helpers.synthetic import exact_log, truth
 
-from robotid.base.exceptions import DataError, WorkerError
+from robotid.base.exceptions import DataError
 from robotid.cli import fleet, main
-from robotid.cli.fleet import UnitResult, _Gathered, read_fleet, run_fleet
+from robotid.cli.fleet import _Gathered, read_fleet, run_fleet
 from robotid.data.files.read import write_log
-from robotid.estimation.variation.units_of_fleet import between_units
-from robotid.estimation.workers.checkpoint import FOLDER
-from robotid.estimation.workers.plan import WorkPlan
-from robotid.estimation.workers.processes import SerialBackend
-from robotid.output.report.fleet_page import fleet_page
+from robotid.estimation.variation.variation import between_units
 from robotid.robot.model import RobotModel
 
 URDF = ROOT / "urdf" / "planar_2r.urdf"
@@ -99,97 +94,6 @@ def test_a_failure_is_a_row_and_the_others_are_identified(done, table):
     assert sum(content["verdicts"].values()) == 3
 
 
-class Killed(SerialBackend):
-    """Has a worker that one unit ends in every attempt."""
-
-    def run(self, work, pieces, lost=None):
-        for index, piece in pieces:
-            if piece.unit == "killer":
-                yield index, lost(piece, WorkerError(f"the worker of {piece.name} ended"))
-            else:
-                yield from super().run(work, [(index, piece)])
-
-
-def test_broken_files_and_a_unit_that_ends_its_workers_are_failed_rows(table, done, tmp_path):
-    good = (table.parent / "b0.csv").read_text().splitlines()
-    (tmp_path / "empty.csv").write_text("")
-    (tmp_path / "header.csv").write_text(good[0] + "\n")
-    (tmp_path / "cut.parquet").write_bytes(b"PAR1 and no more")
-    (tmp_path / "broken.urdf").write_text("<robot><link")
-    rows = [
-        *(f"e,{name},{URDF}" for name in ("empty.csv", "header.csv", "cut.parquet")),
-        f"e,{table.parent / 'c0.csv'},{URDF}",
-        f"f,{table.parent / 'c0.csv'},broken.urdf",
-        f"killer,{table.parent / 'c0.csv'},{URDF}",
-        f"b,{table.parent / 'b0.csv'},{URDF}",
-    ]
-    (tmp_path / "t.csv").write_text("\n".join(["unit,log,urdf", *rows]) + "\n")
-    plan = WorkPlan(1)
-    plan._choose = lambda pieces: Killed()
-    content = run_fleet(read_fleet(tmp_path / "t.csv"), tmp_path / "out", plan=plan)
-    failed = {(Path(e["log"]).name, e["unit"]): e["error"] for e in content["failures"]}
-    assert set(failed) == {
-        ("empty.csv", "e"), ("header.csv", "e"), ("cut.parquet", "e"), ("", "f"), ("", "killer"),
-    }  # fmt: skip
-    assert failed["", "killer"] == "WorkerError: the worker of unit killer ended"
-    assert failed["", "f"].startswith("ModelError: ")
-    assert content["done"] == 2
-    for unit, other in (("b", "b"), ("e", "c")):  # as if the others had never been
-        wanted = rows_of(done[0], unit=other, status="done")
-        found = rows_of(tmp_path / "out", unit=unit, status="done")
-        assert [row["value"] for row in found] == [row["value"] for row in wanted]
-
-
-def test_variables_of_the_environment_are_replaced_or_refused(tmp_path, monkeypatch):
-    path = tmp_path / "t.csv"
-    path.write_text("unit,log,urdf\na,$DAY/x.csv,${ROBOTS}/arm.urdf\na,y.csv,${ROBOTS}/arm.urdf\n")
-    monkeypatch.setenv("ROBOTS", "/robots")
-    monkeypatch.delenv("DAY", raising=False)
-    with pytest.raises(DataError, match=r"t\.csv row 1, column 'log': path '\$DAY/x\.csv' names"):
-        read_fleet(path)
-    monkeypatch.setenv("DAY", "monday")
-    (unit,) = read_fleet(path)
-    assert [log for log, _ in unit.logs] == [tmp_path / "monday" / "x.csv", tmp_path / "y.csv"]
-    assert unit.urdf == Path("/robots/arm.urdf")
-
-
-def test_a_page_of_many_failures_and_units_shows_each_kind_and_few_of_them():
-    failures = [
-        {"unit": f"u{k:03d}", "log": f"u{k:03d}/{k}.csv", "error": f"there is no u{k:03d}/{k}.csv"}
-        for k in range(300)
-    ]
-    failures.append({"unit": "last", "log": "", "error": "the URDF of last is broken"})
-    unlike = [
-        {"unit": f"u{k // 3}", "parameter": "a.coulomb", "value": 1.0, "std_error": 0.1,
-         "parameter_unit": "N m", "others": [2.0, 3.0]} for k in range(45)
-    ]  # fmt: skip
-    content = {"units": 1000, "logs": 1000, "done": 699, "verdicts": {"usable": 699},
-               "failures": failures, "unlike": unlike, "parameters": []}  # fmt: skip
-    unlike[1] |= {"value": -1.25, "std_error": 0.5, "others": [0.75, 4.5]}
-    html = fleet_page(content)
-    differ = tables(html)["Units that differ from the others"].rows
-    assert differ[0] == ["u0", "a.coulomb", "1.00", "0.10", "2.00", "3.00", "N m"]
-    assert differ[1] == ["u0", "a.coulomb", "−1.25", "0.50", "0.75", "4.50", "N m"]
-    shown = tables(html)["Units and logs that were not identified"].rows
-    assert [row[0] for row in shown] == ["u000", "last", *(f"u{k:03d}" for k in range(1, 19))]
-    assert [row[2] for row in shown[:3]] == ["300", "1", "300"]
-    assert "281 more are in <code>fleet.parquet</code>" in html
-    assert len(tables(html)["Units that differ from the others"].rows) == 20
-    assert "25 more are in <code>fleet.json</code>" in html
-    assert "<dt>Failures</dt><dd>301</dd>" in html
-    assert "<dt>Units that differ</dt><dd>15</dd>" in html
-
-
-def test_variation_between_units_is_that_of_their_values(done):
-    folder, content = done
-    entry = next(e for e in content["parameters"] if e["name"] == "joint_2.coulomb")
-    rows = rows_of(folder, parameter="joint_2.coulomb", log=None)
-    assert entry["values"] == [row["value"] for row in rows]
-    low, high = entry["next_interval"]
-    assert low < min(entry["values"]) < entry["mean"] < max(entry["values"]) < high
-    assert entry["units"] == 3
-
-
 def test_an_interrupted_run_is_resumed_with_the_same_bits(table, done, tmp_path, monkeypatch):
     units, first = read_fleet(table), fleet.identify_unit
 
@@ -201,29 +105,33 @@ def test_an_interrupted_run_is_resumed_with_the_same_bits(table, done, tmp_path,
     monkeypatch.setattr(fleet, "identify_unit", interrupted)
     with pytest.raises(KeyboardInterrupt):
         run_fleet(units, tmp_path)
-    assert {path.name for path in tmp_path.iterdir()} == {FOLDER}
+    assert {path.name for path in tmp_path.iterdir()} == {fleet.UNITS}
     repeated = []
     monkeypatch.setattr(
         fleet, "identify_unit", lambda unit, threads: repeated.append(unit.unit) or first(unit, 1)
     )
-    run_fleet(units, tmp_path, plan=WorkPlan(1, resume=True))
+    run_fleet(units, tmp_path, resume=True)
     assert repeated == ["c", "d"]
     for name in FILES:
         assert (tmp_path / name).read_bytes() == (done[0] / name).read_bytes()
     assert {path.name for path in tmp_path.iterdir()} == set(FILES)
 
 
-def test_another_table_does_not_resume(table, tmp_path, monkeypatch):
+def test_only_units_with_the_same_inputs_are_resumed(table, tmp_path, monkeypatch):
+    units, seen = read_fleet(table), []
+
     def interrupted(unit, threads):
-        raise KeyboardInterrupt
+        seen.append(unit.unit)
+        if unit.unit == "c":
+            raise KeyboardInterrupt
+        return [fleet._failure(unit, DataError("no"))]
 
     monkeypatch.setattr(fleet, "identify_unit", interrupted)
-    units = read_fleet(table)
-    with pytest.raises(KeyboardInterrupt):
-        run_fleet(units, tmp_path)
     other = [replace(units[0], logs=units[0].logs[:1]), *units[1:]]
-    with pytest.raises(DataError, match=r"checkpoint of other inputs: units\.a was"):
-        run_fleet(other, tmp_path, plan=WorkPlan(1, resume=True))
+    for resumed, options in ((units, {}), (other, {"resume": True}), (other, {})):
+        with pytest.raises(KeyboardInterrupt):
+            run_fleet(resumed, tmp_path, **options)
+    assert seen == ["a", "b", "c", "a", "c", "a", "b", "c"]
 
 
 def test_units_with_the_same_inputs_are_kept_and_new_logs_added(
@@ -258,20 +166,6 @@ def test_units_with_the_same_inputs_are_kept_and_new_logs_added(
     assert main(words) == 1
     assert "fleet.json" in capsys.readouterr().err
     assert not (tmp_path / "none").exists()
-
-
-def test_a_unit_is_another_one_with_another_payload_job_or_file(table, tmp_path):
-    units = read_fleet(table)
-    first, *others = units[0].logs
-    (tmp_path / "job.toml").write_text("")
-    before = fleet._inputs(units)["units"]
-    for change in (
-        {"logs": ((first[0], 2.5), *others)},
-        {"job": tmp_path / "job.toml"},
-        {"logs": ((units[1].logs[0][0], None), *others)},
-    ):
-        after = fleet._inputs([replace(units[0], **change), *units[1:]])["units"]
-        assert [name for name in before if before[name] != after[name]] == ["a"]
 
 
 def test_rows_state_urdf_job_and_payload(tmp_path):
@@ -341,13 +235,13 @@ def test_units_are_compared_by_parameter_robot_and_expression(monkeypatch):
         ]  # fmt: skip
         rows.append(rows[0] | {"log": "x.csv", "value": 99.0})  # of one log: not compared
         rows.append({"unit": f"u{k}", "status": "failed", "log": f"{k}.csv", "error": "lost"})
-        gathered.add(UnitResult(rows))
+        gathered.add(rows)
     for k in (5, 6):
         row = {"unit": f"u{k}", "status": "done", "verdict": "good", "parameter": "b.m",
                "parameter_unit": "kg", "value": 1.0, "std_error": 0.1, "robot": "leg",
                "expression": "b.m"}  # fmt: skip
-        gathered.add(UnitResult([row]))
-    gathered.add(UnitResult([{"unit": "u7", "status": "failed", "error": "bad"}]))
+        gathered.add([row])
+    gathered.add([{"unit": "u7", "status": "failed", "error": "bad"}])
     levels = []
     monkeypatch.setattr(
         "robotid.cli.fleet.between_units",
@@ -373,7 +267,7 @@ def test_units_are_compared_by_parameter_robot_and_expression(monkeypatch):
         assert entry["next_interval"] == prediction.ends.tolist()
         figures = entry["mean"], entry["std_error"], entry["spread"]
         assert figures == (prediction.mean, prediction.std_error, prediction.spread)
-        unlike += [(each.probability, f"u{each.unit + p}", p) for each in different]
+        unlike += [(probability, f"u{k + p}", p) for k, probability in different]
     assert len(found["parameters"]) == 2
     assert [each[1] for each in unlike] == ["u1", "u3"]
     for entry, (probability, unit, p) in zip(found["unlike"], sorted(unlike), strict=True):
@@ -382,53 +276,3 @@ def test_units_are_compared_by_parameter_robot_and_expression(monkeypatch):
         assert entry["parameter"] == ("a.coulomb", "b.m")[p]
         assert (entry["value"], entry["std_error"]) == (x[k, p], errors[k, p])
         assert entry["others"] == found["parameters"][p]["next_interval"]
-
-
-def test_rows_of_a_checkpoint_have_no_value_that_is_none():
-    rows = [{"unit": "a", "value": 1.5}, {"unit": "b"}]
-    assert UnitResult.from_arrays(UnitResult(rows).to_arrays()).rows == rows
-    with pytest.raises(ValueError, match="not JSON compliant"):
-        UnitResult([{"unit": "a", "value": np.nan}]).to_arrays()
-
-
-def test_a_distribution_is_of_the_values_with_the_interval_of_the_next_unit():
-    values = [1.0, 1.1, 1.15, 1.2, 3.0, 3.1]
-    entry = {"name": "a.coulomb", "robot": "arm", "expression": "a.coulomb", "unit": "N m",
-             "units": 6, "mean": 1.759, "std_error": 0.4, "spread": 0.9123, "values": values,
-             "spread_interval": [0.5, 2.2], "next_interval": [-0.7, 4.25]}  # fmt: skip
-    even = entry | {"name": "b.coulomb", "mean": 200.0, "spread": 1.0}
-    content = {"units": 6, "logs": 6, "done": 6, "verdicts": {"good": 6}, "failures": [],
-               "unlike": [], "parameters": [even, entry]}  # fmt: skip
-    html = fleet_page(content)
-    first, second = charts(html)  # the larger relative spread comes first
-    assert first["title"] == "Distribution of a.coulomb over units"
-    assert second["title"] == "Distribution of b.coulomb over units"
-    assert (first["marks"], first["height"]) == ([-0.7, 4.25], 120)
-    width = (3.1 - 1.0) / 4
-    np.testing.assert_allclose(first["x"], 1.0 + width * (np.arange(4) + 0.5), rtol=1e-3)
-    np.testing.assert_allclose(first["series"][0]["y"], [4, 0, 0, 2], atol=1e-3)
-    row = tables(html)["Base parameters of the units"].by_name()["a.coulomb"]
-    shown = [row[head] for head in ("units", "mean", "± error", "spread", "low", "high", "unit")]
-    assert shown == ["6", "1.76", "0.40", "0.91", "−0.70", "4.25", "N m"]
-
-
-def test_every_flag_reaches_the_units_and_their_workers(monkeypatch, capsys):
-    heard = {}
-
-    def run(units, folder, *, plan, update):
-        heard.update(units=units, folder=folder, plan=plan, update=update)
-        return {"done": 1}
-
-    monkeypatch.setattr(fleet, "read_fleet", lambda *words: words)
-    monkeypatch.setattr(fleet, "run_fleet", run)
-    words = "fleet t.csv --urdf arm.urdf --job all.toml --out there --resume --json --workers 3"
-    words += " --update"
-    assert main(words.split()) == 0
-    assert heard["units"] == ("t.csv", "arm.urdf", "all.toml")
-    assert heard["folder"] == "there"
-    assert (heard["plan"].workers, heard["plan"].resume, heard["update"]) == (3, True, True)
-    assert main(["fleet", "t.csv", "--scheduler", "tcp://host:8786", "--json"]) == 0
-    assert heard["units"] == ("t.csv", None, None)
-    assert heard["plan"].scheduler == "tcp://host:8786"
-    assert (heard["plan"].resume, heard["update"]) == (False, False)
-    assert capsys.readouterr().out == '{"done": 1}\n' * 2

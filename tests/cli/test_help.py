@@ -1,12 +1,8 @@
 """The command line's help, and its answer to a misspelt word."""
 
-import argparse
-import re
-from importlib import import_module
-
 import pytest
 
-from robotid.cli import COMMANDS, excite, identify, main
+from robotid.cli import excite, identify, main
 
 
 def printed(capsys, *words):
@@ -36,26 +32,6 @@ def test_a_misspelt_word_is_answered_with_the_nearest_one(capsys, words, near):
     assert near in said
 
 
-@pytest.mark.parametrize("command", COMMANDS)
-def test_help_has_no_words_of_python_or_markdown(capsys, command):
-    words = "--help-all" if hasattr(import_module(f"robotid.cli.{command}"), "MAIN_FLAGS") else "-h"
-    code, said = printed(capsys, command, words)
-    assert code == 0
-    assert not re.search(r"`|\b(None|True|False|Python|sidecar)\b", said)
-    parser = argparse.ArgumentParser()
-    import_module(f"robotid.cli.{command}").add_flags(parser)
-    unsaid = {action.metavar for action in parser._actions if not (action.help or "").strip()}
-    assert unsaid <= {"JOB.toml | URDF", "URDF", "LOG", "RESULT.json"}  # these say what they are
-    needs_value = [action for action in parser._actions if action.nargs != 0 and not action.choices]
-    assert [action.dest for action in needs_value if action.metavar is None] == []
-
-
-def test_a_word_that_is_near_to_none_is_answered_with_all(capsys):
-    code, said = printed(capsys, "zzz")
-    assert code == 2
-    assert "'zzz' is unknown. Known: compare, convert, demo, " in said
-
-
 @pytest.mark.parametrize("module", [identify, excite], ids=["identify", "excite"])
 def test_the_help_of_large_commands_is_short_and_has_two_examples(capsys, monkeypatch, module):
     monkeypatch.setenv("COLUMNS", "80")
@@ -82,20 +58,3 @@ def test_the_examples_are_read_by_the_parser(module, tmp_path, monkeypatch):
     for example in module.EXAMPLES:
         assert main(example.split()[1:]) == 0
     assert len(run) == 2
-
-
-def test_a_missing_flag_is_in_the_usage(capsys):
-    code, said = printed(capsys, "excite", "robot.urdf")
-    assert code == 2
-    assert said.startswith("usage: robotid excite JOB.toml | URDF --out FILE [flags]\n")
-
-
-def test_a_word_too_many_is_answered_with_the_form_of_a_flag(capsys):
-    code, said = printed(capsys, "doctor", "r.urdf", "l.csv", "--gain", "elbow", "3")
-    assert code == 2
-    usage, message = said.splitlines()
-    assert usage == "usage: robotid doctor JOB.toml | URDF [LOG ...] [flags]"
-    assert message == (
-        "robotid doctor: error: '3' is one word too many; a flag takes one word, as JOINT=NUMBER "
-        "or A,B; see 'robotid doctor --help'"
-    )

@@ -7,7 +7,9 @@ import pytest
 from helpers.mujoco_plant import plant, torque_log
 
 import robotid
-from robotid.base.exceptions import DataError, SettingsError
+from robotid.cli.identify import run_job
+from robotid.cli.job import read_job
+from robotid.identification.closed_loop.loop_result import PositionIdentification
 
 SETTINGS = {"bodies": 0.0, "step": 4e-3, "torques": False}
 
@@ -40,8 +42,8 @@ def test_it_finds_what_a_job_finds_of_the_same_logs(arm, found, tmp_path):
         "[controller]\nkind = 'torque'\n[[identification]]\nlog = 'log.csv'\n"
         "[[validation]]\nlog = 'kept.csv'\n[output]\nreport = false\n"
     )
-    again, _ = robotid.run_job(robotid.read_job(tmp_path / "job.toml"), tmp_path / "out")
-    assert isinstance(found, robotid.Identification)
+    again, _ = run_job(read_job(tmp_path / "job.toml"), tmp_path / "out")
+    assert isinstance(found, PositionIdentification)
     np.testing.assert_allclose(found.standard, again.standard, rtol=1e-6, atol=1e-9)
     assert len(found.validation) == 1
     assert found.verdict.status == again.verdict.status
@@ -52,25 +54,39 @@ def test_it_finds_what_a_job_finds_of_the_same_logs(arm, found, tmp_path):
         assert (entry["start"], entry["end"]) == pytest.approx((log.t[0], log.t[-1]), abs=1e-6)
 
 
-def test_it_is_saved_and_loaded(found, tmp_path):
-    path = robotid.save_result(found, tmp_path / "out", report=False)
-    loaded = robotid.load_result(path)
-    np.testing.assert_allclose(loaded.parameters, found.standard, rtol=1e-9, atol=1e-12)
-    assert loaded.content["settings"]["controller"]["kind"] == "torque"
-    assert loaded.content["settings"]["estimator"]["step"] == 4e-3
+def test_what_is_stated_reaches_the_simulation(arm, monkeypatch):
+    model, log, kept = arm
+    asked = []
+    monkeypatch.setattr(
+        "robotid.identification.closed_loop.from_commands.identify_loops",
+        lambda *words, **options: asked.append((words, options)),
+    )
+    monkeypatch.setattr("robotid.cli.identify.diagnose", lambda *words: words)
+    choice = robotid.EstimatorSettings("simulation", **SETTINGS)
+    signals, told = robotid.SignalSettings(cutoff=7.0), []
 
+    def progress(*words):
+        told.append(words)
 
-def test_what_does_not_fit_it_is_refused(arm):
-    model, log, _ = arm
-    with pytest.raises(
-        SettingsError, match="controller is given, but the estimator is 'consistent', wanted 'sim"
-    ):
-        robotid.identify(model, log, controller={"kp": 20.0})
-    with pytest.raises(
-        SettingsError, match="simulation selects the terms of all joints, or of none"
-    ):
-        robotid.identify(model, log, estimator="simulation", friction="stribeck")
-    with pytest.raises(SettingsError, match="controller: kind"):
-        robotid.identify(model, log, estimator="simulation", controller={"kind": "none"})
-    with pytest.raises(DataError, match="has no commanded positions"):
-        robotid.identify(model, log, estimator="simulation", doctor=False)
+    robotid.identify(
+        model, [kept, log], validation=log, estimator=choice, signals=signals,
+        controller={"kind": "torque"}, friction="viscous+coulomb",
+        ignore=("spikes",), progress=progress,
+    )  # fmt: skip
+    robotid.identify(
+        model, log, estimator="simulation", controller={"kind": "torque"}, doctor=False
+    )
+    (words, stated), (plain, blind) = asked
+    assert words[0] is model
+    assert [len(x.t) for x in (*words[1], *words[2])] == [len(x.t) for x in (kept, log, log)]
+    assert words[3].kind == "torque"
+    assert words[4] is choice
+    assert stated.pop("examined") == (*words[:3], signals)
+    assert stated == {
+        "signals": signals, "chooses": False, "ignore": ("spikes",), "progress": progress,
+    }  # fmt: skip
+    assert told[0][0] == "reading logs"
+    assert [len(x) for x in plain[1:3]] == [1, 0]
+    assert plain[4] == robotid.EstimatorSettings("simulation")
+    assert (blind["examined"], blind["chooses"], blind["ignore"]) == ((), True, ())
+    assert blind["signals"] == robotid.SignalSettings()

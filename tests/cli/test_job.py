@@ -1,20 +1,13 @@
 from pathlib import Path
 from types import SimpleNamespace
 
-import numpy as np
 import pytest
 
 from robotid.base.exceptions import SettingsError
-from robotid.cli.job import Job, _motors, job_from_settings, read_job
-from robotid.data.files.read import write_log
-from robotid.data.log import Log
+from robotid.cli.job import _motors, job_from_settings, read_job
 from robotid.data.signal_settings import LogSource
 from robotid.robot.constraints import Loop
-from robotid.robot.drives import AUTO, DRIVE_TERMS
-from robotid.robot.model import GRAVITY
 from robotid.robot.parameters import Coupling
-from tests.helpers.closed_chains import FOUR_BAR, FOUR_BAR_LOOP
-from tests.helpers.paths import ROOT
 
 FULL = """
 urdf = "robot.urdf"
@@ -215,17 +208,6 @@ def test_a_wrong_job_names_what_is_wrong(tmp_path, old, new, message):
     assert "job.toml" in str(caught.value)
 
 
-def test_a_missing_job_file_is_named(tmp_path):
-    with pytest.raises(SettingsError, match=r"there is no job file '.*none.toml'"):
-        read_job(tmp_path / "none.toml")
-
-
-def test_gravity_and_drive_terms_default_to_those_of_the_model():
-    job = Job(urdf=Path("robot.urdf"))
-    assert job.gravity == GRAVITY
-    assert job.terms == (*DRIVE_TERMS, AUTO)
-
-
 def test_a_controller_that_the_estimator_does_not_read_is_refused(tmp_path):
     table = {"urdf": "arm.urdf", "controller": {"kp": 20.0}, "estimator": {"name": "wls"}}
     with pytest.raises(SettingsError, match=r"'wls', wanted 'simulation'; set \[estimator\] name"):
@@ -242,51 +224,3 @@ def test_the_motor_of_several_joints_replaces_the_drive_of_the_joint_with_its_na
     ratios = (("a", 60.0), ("b", -1.5))
     gear = SimpleNamespace(shared={"a": ratios})
     assert _motors(gear) == [Coupling("a", ratios, replaces=True)]
-
-
-def test_a_job_of_a_closed_chain_reads_the_log_of_its_driven_joint(tmp_path):
-    (tmp_path / "bars.urdf").write_text(FOUR_BAR)
-    t = np.linspace(0.0, 1.0, 20)
-    write_log(Log(t, t[:, None], t[:, None], ("drive",)), tmp_path / "log.csv")
-    table = {
-        "urdf": "bars.urdf",
-        "passive": ["elbow", "pivot"],
-        "loop": [{"frames": ["coupler_end", "rocker_end"]}],
-        "drives": {"pivot": [{"term": "Viscous"}]},
-        "identification": [{"log": "log.csv"}],
-    }
-    job = job_from_settings(table, "job.toml", tmp_path)
-    model = job.model()
-    assert model.loops == (FOUR_BAR_LOOP,)
-    assert model.passive == ("elbow", "pivot")
-    assert model.layout.drive_names[-1] == "pivot.viscous"
-    assert job.read(job.identification[0], model).joints == ("drive",)
-    assert job_from_settings(job.to_dict(), "result.json", Path()) == job
-
-
-def test_gear_ratios_of_the_urdf_need_no_matrix_and_shared_motors_are_couplings(tmp_path):
-    gears = "".join(
-        f"<transmission name='{joint}'><joint name='{joint}'/><actuator name='m'>"
-        f"<mechanicalReduction>{ratio}</mechanicalReduction></actuator></transmission>"
-        for joint, ratio in (("joint_1", 80), ("joint_2", -40))
-    )
-    text = (ROOT / "urdf" / "planar_2r.urdf").read_text()
-    (tmp_path / "arm.urdf").write_text(text.replace("</robot>", f"{gears}</robot>"))
-    t = np.linspace(0.0, 1.0, 20)
-    head = ",".join(f"{kind}_joint_{k}" for kind in ("qm", "taum") for k in (1, 2))
-    rows = np.column_stack([t, np.outer(t, [8.0, 4.0, 1.0, 2.0])])
-    np.savetxt(tmp_path / "log.csv", rows, delimiter=",", header=f"time,{head}", comments="")
-    table = {
-        "urdf": "arm.urdf",
-        "transmission": [{"joints": ["joint_1", "joint_2"], "matrix": "urdf"}],
-        "identification": [{"log": "log.csv"}],
-    }
-    job = job_from_settings(table, "job.toml", tmp_path)
-    model = job.model()
-    assert model.layout.couplings == ()
-    log = job.read(job.identification[0], model)
-    np.testing.assert_allclose(log.q, np.outer(t, [0.1, -0.1]), atol=1e-12)
-    np.testing.assert_allclose(log.tau, np.outer(t, [80.0, -80.0]), atol=1e-12)
-    table["transmission"][0]["matrix"] = [[80.0, 0.0], [60.0, -40.0]]
-    (shared,) = job_from_settings(table, "job.toml", tmp_path).model().layout.couplings
-    assert shared == Coupling("joint_2", (("joint_1", 1.0), ("joint_2", -2 / 3)), replaces=True)

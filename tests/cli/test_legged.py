@@ -62,25 +62,3 @@ def test_the_same_motion_with_the_usual_controller_is_refused(folder, capsys):
     job, motion = (str(folder / x) for x in ("job.toml", "motion.parquet"))
     assert main(["simulate", job, motion, "--out", str(folder / "other.csv")]) == 2
     assert "State --controller perfect" in capsys.readouterr().err
-
-
-def test_a_plant_with_drives_is_refused_beside_a_job(folder, capsys):
-    job, motion = (str(folder / x) for x in ("job.toml", "motion.parquet"))
-    plant = folder / "plant.toml"
-    plant.write_text('[drives]\nFL_HFE = [{ term = "Stribeck", speed = 0.1 }]\n')
-    out = str(folder / "other.csv")
-    assert main(["simulate", job, motion, "--out", out, "--plant", str(plant)]) == 2
-    assert "has drives; state them in" in " ".join(capsys.readouterr().err.split())
-    assert main(["simulate", job, motion, "--out", out, "--joints", "FL_HFE"]) == 2
-    assert "is a job file; state --joints in it" in " ".join(capsys.readouterr().err.split())
-
-
-def test_the_preview_of_the_motion_needs_no_torque(folder, capsys):
-    joints = [f"{leg}_{x}" for leg in ("FL", "FR", "HL", "HR") for x in ("HAA", "HFE", "KFE")]
-    noise = [word for joint in joints for word in ("--noise", f"{joint}=0.01")]
-    assert main(["preview", str(folder / "job.toml"), "--json", *noise]) == 0
-    content = json.loads(capsys.readouterr().out)
-    assert len(content["torque"]) == len(content["noise"]) == 12
-    assert content["structure"]["rank"] > 30
-    assert main(["preview", str(folder / "job.toml")]) == 0
-    assert "FL_HAA" in capsys.readouterr().out

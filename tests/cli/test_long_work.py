@@ -15,12 +15,9 @@ import pytest
 from helpers.paths import ROOT
 from helpers.synthetic import exact_log, truth
 
-from robotid.base.exceptions import SettingsError
 from robotid.cli import main
-from robotid.cli.console import terminal_progress
 from robotid.data.files.read import write_log
-from robotid.estimation.workers.cluster import ClusterBackend
-from robotid.estimation.workers.plan import WorkPlan
+from robotid.estimation.workers.pools import Pool
 from robotid.robot.model import RobotModel
 
 URDF = str(ROOT / "urdf" / "planar_2r.urdf")
@@ -126,44 +123,9 @@ def test_a_signal_ends_a_run_with_one_line_and_without_files(job, tmp_path, numb
         time.sleep(0.02)
 
 
-def test_short_logs_have_no_use_of_workers_and_it_is_said(logs, tmp_path, capsys):
-    words = ["identify", URDF, str(logs / "keep.csv"), "--out", str(tmp_path), "--workers", "2"]
-    assert main([*words, "--no-report"]) == 0
-    assert "read whole: workers and scheduler have no effect" in capsys.readouterr().err
-
-
-def test_no_workers_are_wrong_usage(job, tmp_path, capsys):
-    assert main(["identify", job, "--out", str(tmp_path), "--workers", "0"]) == 2
-    assert capsys.readouterr().err == "robotid: workers is 0, wanted at least 1\n"
-    with pytest.raises(SettingsError):
-        WorkPlan(0)
-
-
 def test_an_address_where_nobody_listens_is_said(job, tmp_path, capsys, monkeypatch):
     pytest.importorskip("distributed")
-    monkeypatch.setattr(ClusterBackend.__init__, "__kwdefaults__", {"patience": 0.2})
+    monkeypatch.setattr(Pool.__init__, "__defaults__", (1, None, 0.2))
     words = ["identify", job, "--out", str(tmp_path), "--scheduler", "tcp://127.0.0.1:9"]
     assert main(words) == 1
-    assert "no Dask scheduler answers at 'tcp://127.0.0.1:9'" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(("quiet", "force"), [(False, False), (True, False)])
-def test_no_progress_where_there_is_no_terminal(quiet, force, capsys):
-    with terminal_progress(quiet=quiet, force=force) as show:
-        assert show is None
-    assert capsys.readouterr().err == ""
-
-
-def test_forced_progress_shows_work_rate_and_time_left(capsys):
-    with terminal_progress(quiet=True, force=True) as show:
-        for done in (0, 1000, 2000):
-            show("reducing", done, 4000, "samples")
-            time.sleep(0.35)  # the time left is drawn twice a second
-        show("evaluating", 0, 100, "samples")
-    shown = capsys.readouterr()
-    assert shown.out == ""
-    assert "reducing" in shown.err
-    assert "50 %" in shown.err
-    assert "samples/s" in shown.err
-    assert re.search(r"\d:\d\d:\d\d", shown.err)  # time left
-    assert "evaluating" in shown.err
+    assert "workers answers at 'tcp://127.0.0.1:9'" in capsys.readouterr().err

@@ -1,7 +1,6 @@
 """`robotid payload`: from files to what controllers ask for."""
 
 import json
-import re
 from dataclasses import replace
 
 import numpy as np
@@ -10,13 +9,12 @@ from helpers.synthetic import exact_log, truth
 
 from robotid.base.exceptions import SettingsError
 from robotid.base.files import file_sha256
-from robotid.cli import main, payload
+from robotid.cli import main
 from robotid.cli.identify import run_job
 from robotid.cli.job import job_from_settings
 from robotid.cli.payload import stated_masses
 from robotid.data.files.formats import write_columns
 from robotid.data.files.read import write_log
-from robotid.diagnosis.verdict.payload_check import PayloadCheck
 from robotid.output.files.result_file import load_result, stated_scale_check
 from robotid.output.report.next_steps import next_steps
 from robotid.output.report.steps import Origin
@@ -78,33 +76,6 @@ def test_a_log_and_a_result_are_references_alike(files, capsys):
     assert "gains" not in found[0]
 
 
-def test_a_mass_is_said_to_be_in_the_scale_of_the_torques(files, capsys):
-    words = [files / "loaded.csv", "--reference", files / "bare.csv", "--link", "tool0", *STATED]
-    said = asked(capsys, *words)
-    mass, low, high = re.search(
-        r"mass ([.\d]+) kg \(95 % interval ([.\d]+) to ([.\d]+)\)\.", said
-    ).groups()
-    assert float(low) < float(mass) < float(high)
-    assert "It is proportional to the torque scale" in " ".join(said.split())
-
-
-def test_the_text_says_what_a_controller_asks_for(files, capsys):
-    said = asked(capsys, files / "loaded.csv", "--reference", files / "bare.csv", "--link", "tool0",
-                 "--mass", "2", *STATED)  # fmt: skip
-    assert said.startswith("payload on tool0\n  mass 2 kg, stated\n  scale of the torques: payload")
-    check = " ".join(said.split())
-    assert re.search(r"of 2 kg on tool0: torque alone determines [12][.\d]* kg \(95 % inter", check)
-    assert "wanted: at most 5 %" in check
-    assert re.search(r"centre of mass in the frame of tool0 \[m\]\n    x +0.0", said)
-    assert re.search(r"about the origin of tool0, axes of tool0 \[kg m\^2\]\n    Ixx +0.0", said)
-    assert "inertia about its centre of mass, axes of tool0" in said
-    # the last digit of a value is the second one of its error
-    figures = re.findall(r"-?\d\.(\d+)(e-..)? +\+- \d\.(\d+)(e-..)?\n", said)
-    assert len(figures) == 9
-    assert all((len(x), power) == (len(e), same) for x, power, e, same in figures)
-    assert max(map(len, said.splitlines())) <= 80
-
-
 def test_a_job_states_a_check_of_the_scale_which_its_result_has(files):
     table = {
         "urdf": ARM, "identification": [{"log": "bare.csv"}], "estimator": {"draws": 0},
@@ -155,35 +126,6 @@ def test_a_job_states_a_check_of_the_scale_which_its_result_has(files):
     assert not any("torque scale" in step.words for step in steps)
 
 
-def test_a_check_of_the_scale_reads_the_windows_that_a_job_states(files, monkeypatch):
-    windows = [(2.0, 5.0), (None, 3.0), (6.0, None)]
-    table = {
-        "urdf": ARM, "identification": [{"log": "bare.csv"}],
-        "payload_check": [
-            {k: x for k, x in (("start", a), ("end", b)) if x is not None}
-            | {"log": "loaded.csv", "mass": 1.8, "link": "tool0"}
-            for a, b in windows
-        ],
-    }  # fmt: skip
-    read = []
-
-    def checked(loaded, reference, *, masses):
-        assert reference == ("first", "second")
-        read.append([log.t[[0, -1]] for own in loaded for log in own.looks])
-        return {"tool0": PayloadCheck("tool0", masses["tool0"])}
-
-    monkeypatch.setattr(payload, "Recordings", lambda model, mapping, run: run)
-    monkeypatch.setattr(payload, "mass_checks", checked)
-    job = job_from_settings(table, "job.toml", files)
-    checks = payload.check_payloads(job, job.model(), ("first", "second"))
-    assert len(checks) == 3
-    for check in checks:
-        assert (check.known, check.sha256) == (1.8, file_sha256(files / "loaded.csv"))
-    first, last = 0.0, 9.99
-    wanted = [[[a or first, last if b is None else b]] for a, b in windows]
-    np.testing.assert_allclose(read, wanted, atol=0.011)
-
-
 def test_gains_come_from_a_known_mass(files, capsys, ur5):
     words = [files / "loaded_currents.csv", "--reference", files / "bare_currents.csv", "--link",
              "tool0", "--mass", "tool0=2", "--gains"]  # fmt: skip
@@ -200,24 +142,6 @@ def test_gains_come_from_a_known_mass(files, capsys, ur5):
     stated = f"{ur5.joints[0]}={GAINS[0]}"
     some = json.loads(asked(capsys, *words, "--gain", stated, *STATED, "--json"))
     assert list(some["gains"]) == list(ur5.joints[1:])
-
-
-def test_friction_is_chosen_of_torques_in_the_gains_that_were_found(
-    files, capsys, ur5, monkeypatch
-):
-    asked_of = []
-
-    def no_terms(job, *_):
-        asked_of.append(job.gains)
-        return {}
-
-    monkeypatch.setattr("robotid.cli.payload._chosen_terms", no_terms)
-    words = [files / "loaded_currents.csv", "--reference", files / "bare_currents.csv", "--link",
-             "tool0", "--mass", "2", "--gains", "--gain", "elbow_joint=11", "--json"]  # fmt: skip
-    found = json.loads(asked(capsys, *words))["gains"]
-    gains = {joint: gain["gain"] for joint, gain in found.items()} | {"elbow_joint": 11.0}
-    assert asked_of == [gains]
-    np.testing.assert_allclose([gains[joint] for joint in ur5.joints], GAINS, rtol=0.1)
 
 
 def test_what_is_missing_is_named(files, capsys):
@@ -275,13 +199,3 @@ def test_friction_that_the_reference_shows_is_that_of_the_payload_s_logs(upright
     for gain, true in ((scaled["joint_1"], 3.0), (scaled["joint_2"], 7.0), (one["joint_1"], 3.0)):
         assert gain["gain"] == pytest.approx(true, abs=4 * gain["std_error"])
         assert gain["std_error"] < 0.02 * true
-
-
-def test_the_narrowest_check_is_that_of_the_smallest_share_of_its_mass():
-    checks = [
-        PayloadCheck("tool", 1.0, interval=(0.9, 1.1), identified=1.0),
-        PayloadCheck("tool", 4.0, interval=(3.8, 4.2), identified=4.0),
-        PayloadCheck("tool", 2.0),
-    ]
-    widths = [payload._width(check) for check in checks]
-    assert widths == [pytest.approx(0.2), pytest.approx(0.1), np.inf]

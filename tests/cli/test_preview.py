@@ -1,20 +1,16 @@
 """`robotid preview`: from positions to what they will tell, and to what they told."""
 
 import json
-from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from helpers.synthetic import exact_log, truth
 
-from robotid.base.exceptions import DataError
-from robotid.cli import main, preview
+from robotid.cli import main
 from robotid.cli.identify import run_job
-from robotid.cli.job import LogEntry, job_from_settings
-from robotid.cli.preview import _motions
+from robotid.cli.job import job_from_settings
 from robotid.data.files.formats import write_columns
-from robotid.data.files.read import read_log, write_log
+from robotid.data.files.read import write_log
 from robotid.robot.examples import example_urdf
 
 NOISE = np.array([2.0, 3.0, 1.0, 0.3, 0.2, 0.1])  # [N m]
@@ -110,80 +106,6 @@ def test_what_was_achieved_stands_beside_what_was_expected(files, capsys):
     assert "times the expected ones" in " ".join(asked(capsys, *words).split())
 
 
-def test_of_each_motion_its_window_is_previewed(files):
-    job = job_from_settings(
-        {
-            "urdf": ARM,
-            "identification": [
-                {"log": "log_motion.csv", "start": 2.0, "end": 7.0},
-                {"log": "other_motion.csv", "start": 1.0, "end": 4.5},
-            ],
-            "signals": {"trim": 0.0},
-        },
-        "job.toml",
-        files,
-    )
-    first, second = _motions(job, job.model(), job.identification)
-    for motion, start, end in ((first, 2.0, 7.0), (second, 1.0, 4.5)):
-        (look,) = motion.looks
-        assert (look.t[0], look.t[-1]) == pytest.approx((start, end), abs=0.0101)
-    shown = preview.preview_job(job)["motions"]
-    assert [Path(motion["path"]).name for motion in shown] == ["log_motion.csv", "other_motion.csv"]
-    ends = [(motion["start"], motion["end"]) for motion in shown]
-    np.testing.assert_allclose(ends, [(2.0, 7.0), (1.0, 4.5)], atol=0.0101)
-
-
-@pytest.mark.parametrize(
-    ("given", "is_own", "beside"), [(None, False, None), ("r", False, "run"), ("r", True, "like")]
-)
-def test_noise_that_is_stated_is_that_of_every_preview(monkeypatch, given, is_own, beside):
-    heard = {}
-
-    def preview_logs(model, motions, estimator, **stated):
-        heard.update(stated, model=model, motions=motions, estimator=estimator)
-
-    entry, before = LogEntry(Path("new.csv")), LogEntry(Path("old.csv"))
-    job = SimpleNamespace(identification=(entry,), model=lambda: "bare", estimator="wls")
-    result = {
-        "inputs": [{"role": "identification", "sha256": "new.csv" if is_own else "old.csv"}],
-        "base_parameters": [],
-        "identification": {"per_joint": {}},
-    }
-    for name, stands_for in {
-        "preview_logs": preview_logs,
-        "build_preview": lambda _: {"base_parameters": [], "noise": {}},
-        "_motions": lambda job, model, entries: [str(entry.path) for entry in entries],
-        "result_run": lambda job, path: (job, [before], "found", "a run"),
-        "load_result": lambda path: SimpleNamespace(content=result),
-        "stated_between": lambda content, model: (content is result, model),
-        "replace": lambda found, **own: heard.update(own),
-        "file_sha256": str,
-    }.items():
-        monkeypatch.setattr(preview, name, stands_for)
-    preview.preview_job(job, given, noise={"a": 0.2}, correlation=0.3)
-    if given and not is_own:
-        assert heard.pop("between") == ((True, "found"),)
-    assert (heard.pop("noise"), heard.pop("correlation")) == ({"a": 0.2}, 0.3)
-    wanted = {"model": "found" if given else "bare", "estimator": "wls"}
-    wanted["motions"] = ["old.csv" if is_own else "new.csv"]
-    assert heard == wanted | ({beside: "a run"} if beside else {})
-    if is_own:
-        job.identification = (LogEntry(Path("a.csv")), entry, LogEntry(Path("b.csv")))
-        with pytest.raises(DataError, match=r"some of these motions, but not to a\.csv, b\.csv;"):
-            preview.preview_job(job, given)
-
-
-def test_the_text_says_what_it_rests_on(files, capsys):
-    text = " ".join(asked(capsys, files / "log_motion.csv").split())
-    assert "assumed noise: 1 % of the URDF's effort limit" in text
-    assert "log_motion.csv: the motion determines " in text
-    assert "standard parameters, given the URDF: by " in text
-    assert "shoulder_link.Izz + 13 more" in text
-    whole = " ".join(asked(capsys, files / "log_motion.csv", "--verbose").split())
-    assert "wrist_3_link.Iyz" in whole
-    assert "shoulder_link.Izz + 0.0" in whole
-
-
 def test_wrong_words_are_answered(files, capsys):
     motion = files / "log_motion.csv"
     error = asked(capsys, motion, "--noise", "elbow=1", code=2)
@@ -195,12 +117,3 @@ def test_wrong_words_are_answered(files, capsys):
     error = asked(capsys, files / "other_robot.csv", code=1)
     assert '# q_shoulder_pan_joint = "NAME"' in error
     assert "tau" not in error
-
-
-def test_a_motion_read_as_a_log_has_no_torque(files, ur5):
-    log = read_log(files / "log_motion.csv", ur5.joints, needs="motion")
-    assert not log.tau.any()
-    full = read_log(files / "log.csv", ur5.joints, needs="motion")
-    np.testing.assert_array_equal(log.q, full.q)
-    assert not full.tau.any()
-    assert any("columns ignored: tau_shoulder_pan_joint" in note for note in full.notes)

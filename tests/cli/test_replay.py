@@ -4,24 +4,20 @@ import json
 import re
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pinocchio as pin
 import pytest
 from helpers.commanded_results import drive_entries, written_result
 from helpers.mujoco_plant import plant, recorded
-from helpers.paths import ROOT
 from helpers.replay_data import leave_out_meshes, shown
 from helpers.synthetic import exact_log, payload_log, truth
 
 from robotid.base.exceptions import DataError
-from robotid.cli import main, replay
-from robotid.cli.job import Job, LogEntry
-from robotid.cli.replay import _base_poses, read_findings, replay_identified
+from robotid.cli import main
+from robotid.cli.replay import replay_identified
 from robotid.data.files.formats import write_columns
 from robotid.data.files.read import write_log
-from robotid.data.log import Log
 from robotid.output.files.result_file import load_result
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
@@ -95,43 +91,6 @@ def test_a_result_predicts_and_shows_masses_before_and_after(folder):
         assert body["mass"] == pytest.approx(stated[f"{body['name']}.m"])
 
 
-def test_the_page_is_beside_the_first_result_unless_stated(folder, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    log, out, other = str(folder / "log.csv"), folder / "out", tmp_path / "other"
-    other.mkdir()
-    (other / "result.json").write_bytes((out / "result.json").read_bytes())
-    one, both = [str(out / "result.json")], [str(x / "result.json") for x in (other, out)]
-    for words, page in ((one, out), (both, other), ([], tmp_path)):
-        assert main(["replay", str(folder / "ur5.urdf"), log, *words]) == 0
-        assert capsys.readouterr().err.startswith("written: ")
-        assert (page / "replay.html").is_file()
-        (page / "replay.html").unlink()
-
-
-def test_identify_writes_the_replay_that_its_report_links_to(tmp_path, capsys):
-    urdf, out = str(ROOT / "urdf" / "planar_2r.urdf"), tmp_path / "out"
-    model, rng = RobotModel.from_urdf(urdf), np.random.default_rng(0)
-    for name in ("log", "kept"):
-        log = exact_log(model, truth(model), rng, samples=300, rate=100.0)
-        write_log(log, tmp_path / f"{name}.csv")
-    words = [urdf, str(tmp_path / "log.csv"), "--validate", str(tmp_path / "kept.csv")]
-    words = ["identify", *words, "--estimator", "wls", "--friction", "none", "--out", str(out)]
-    assert main([*words, "--replay"]) == 0
-    assert f"  {out}/replay.html\n" in capsys.readouterr().out
-    data = shown((out / "replay.html").read_text(encoding="utf-8"))
-    assert data["log"] == "kept.csv"
-    assert data["torques"]["labels"] == ["measured", "identified", "URDF + drives", "URDF"]
-    report = (out / "report.html").read_text()
-    assert '<a href="replay.html">replay</a>' in report
-    assert 'href="replay.html#t=' in report
-    assert load_result(out).content["outputs"]["replay"] == "replay.html"
-    # the replay of an earlier result would be that of another robot
-    assert main(words) == 0
-    assert "/replay.html of an earlier run" in capsys.readouterr().err
-    assert not (out / "replay.html").exists()
-    assert 'href="#replay"' in (out / "report.html").read_text()
-
-
 def test_the_urdf_with_drives_is_rnea_and_drive_terms(identified, monkeypatch):
     leave_out_meshes(monkeypatch)
     data = shown(replay_identified(identified).html)
@@ -155,68 +114,6 @@ def test_the_urdf_with_drives_is_rnea_and_drive_terms(identified, monkeypatch):
         np.testing.assert_array_equal(np.isfinite(found), used)
         wanted = (np.array(bodies)[:, j] + drive)[used]
         np.testing.assert_allclose(found[used], wanted, atol=np.ptp(wanted) / 60_000)
-
-
-def test_masses_are_shown_of_a_result_whose_drives_have_more_terms(tmp_path):
-    urdf = ROOT / "urdf" / "planar_2r.urdf"
-    model, rng = RobotModel.from_urdf(urdf), np.random.default_rng(0)
-    write_log(exact_log(model, truth(model), rng, samples=600, rate=100.0), tmp_path / "log.csv")
-    job, page = tmp_path / "job.toml", tmp_path / "page.html"
-    job.write_text(
-        f'urdf = "{urdf}"\n[estimator]\nname = "wls"\n[drives]\njoint_2 = ["load"]\n'
-        '[output]\nreport = false\n[[identification]]\nlog = "log.csv"\n'
-    )
-    assert main(["identify", str(job), "--out", str(tmp_path / "out")]) == 0
-    words = ["replay", str(urdf), str(tmp_path / "log.csv"), str(tmp_path / "out")]
-    assert main([*words, "--html", str(page)]) == 0
-    result = json.loads((tmp_path / "out" / "result.json").read_text())
-    stated = {entry["name"]: entry["value"] for entry in result["standard_parameters"]}
-    assert "joint_2.load" in {entry["name"] for entry in result["drive_parameters"]}
-    _, after = shown(page.read_text(encoding="utf-8"))["masses"]
-    for body in after["bodies"]:
-        assert body["mass"] == pytest.approx(stated[f"{body['name']}.m"])
-
-
-def test_residuals_are_compared_to_those_of_the_identification(folder):
-    _, data = run(folder, folder / "log.csv", folder / "out")
-    result = json.loads((folder / "out" / "result.json").read_text())
-    fitted = result["identification"]["per_joint"]
-    scale = data["torques"]["scale"]
-    assert scale["unit"] == "RMS noise"
-    assert scale["of"] == [fitted[joint]["rmse"] for joint in result["joints"]]
-    # the log is that of the identification: its residual is the noise
-    codes = data["torques"]["strips"][0]
-    strip = np.where(codes < 65_000, codes / 100, np.nan)
-    assert np.sqrt(np.nanmean(strip**2, axis=0)) == pytest.approx(np.ones(6), abs=0.15)
-
-
-def test_two_results_are_called_by_their_folders(folder):
-    out = folder / "out" / "result.json"
-    _, data = run(folder, folder / "log.csv", out, folder / "out")
-    assert data["torques"]["labels"] == ["measured", "out", "out 2", "URDF + drives", "URDF"]
-    assert [m["label"] for m in data["masses"]] == ["URDF", "out", "out 2"]
-
-
-def test_a_ghost_starts_with_the_motion(folder):
-    _, data = run(folder, folder / "log.csv", "--ghost", folder / "log.csv")
-    assert data["ghosts"][0]["label"] == "log.csv"
-    np.testing.assert_array_equal(data["ghosts"][0]["q"], data["motion"]["q"])
-
-
-def test_a_designed_motion_without_torques_is_a_ghost_too(folder, capsys):
-    header, *rows = (folder / "log.csv").read_text().splitlines()
-    kept = [k for k, name in enumerate(header.split(",")) if name.startswith(("time", "q_"))]
-    cut = [",".join(line.split(",")[k] for k in kept) for line in (header, *rows)]
-    (folder / "design.csv").write_text("\n".join(cut) + "\n")
-    _, data = run(folder, folder / "log.csv", "--ghost", folder / "design.csv")
-    np.testing.assert_array_equal(data["ghosts"][0]["q"], data["motion"]["q"])
-    cut[0] = cut[0].replace("q_elbow", "x_elbow")
-    (folder / "design.csv").write_text("\n".join(cut) + "\n")
-    assert run(folder, folder / "log.csv", "--ghost", folder / "design.csv")[0] == 1
-    assert (
-        "design.csv has no column 'q_elbow_joint'; position columns found: "
-        in capsys.readouterr().err
-    )
 
 
 def test_a_joint_that_stands_still_has_no_prediction(folder):
@@ -273,12 +170,6 @@ def test_a_track_gives_parameters_over_time_and_marks_the_load(panda, tmp_path, 
     np.testing.assert_allclose(data["bands"]["values"][-1], wanted, rtol=1e-6)
 
 
-def test_flags_that_a_result_states_are_refused(folder, capsys):
-    code, _ = run(folder, folder / "log.csv", folder / "out", "--rate", "100")
-    assert code == 2
-    assert "a RESULT states how its logs are read; remove --rate" in capsys.readouterr().err
-
-
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
@@ -294,24 +185,6 @@ def test_what_is_no_result_is_refused(tmp_path, name, content, message, folder, 
     import re
 
     assert re.search(message, capsys.readouterr().err)
-
-
-def test_an_empty_folder_and_a_second_track_are_refused(tmp_path):
-    with pytest.raises(Exception, match=r"has no result\.json and no track\.json"):
-        read_findings([tmp_path])
-    for k in (1, 2):
-        content = {"history": "", "changes": [], "settings": {}, "base_parameters": []}
-        (tmp_path / f"{k}.json").write_text(json.dumps(content))
-    with pytest.raises(Exception, match="2 tracks are given, wanted at most one"):
-        read_findings([tmp_path / "1.json", tmp_path / "2.json"])
-
-
-def test_a_result_of_another_robot_is_refused(folder, capsys):
-    other = Path(example_urdf("panda.urdf"))
-    words = ["replay", str(other), str(folder / "log.csv"), str(folder / "out")]
-    assert main([*words, "--html", str(folder / "p.html")]) == 1
-    assert "panda" in capsys.readouterr().err
-    assert not (folder / "p.html").exists()
 
 
 def test_a_base_is_where_the_log_says_or_said_to_be_held(tmp_path, capsys):
@@ -355,36 +228,6 @@ def test_a_base_is_where_the_log_says_or_said_to_be_held(tmp_path, capsys):
     assert "log.csv: base_qx to base_qw is not a unit quaternion" in capsys.readouterr().err
 
 
-def test_between_the_poses_of_a_base_it_turns_the_short_way(tmp_path):
-    """Poses at 10 Hz, whose quaternions change their signs at will, asked for at other times."""
-    t = 4.0 + np.arange(21) / 10.0
-    half, sign = 0.4 * (t - 4.0), np.where(np.isin(np.arange(21), [3, 4, 9, 15, 16, 17]), -1.0, 1.0)
-    turn = sign[:, None] * np.column_stack([0 * t, np.sin(half), 0 * t, np.cos(half)])
-    table = np.column_stack([t, 2.0 * t, -t, 0.5 * t, 1.004 * turn])
-    table[7, 5] = np.nan
-    header = "time,base_x,base_y,base_z,base_qx,base_qy,base_qz,base_qw"
-    path = tmp_path / "log.csv"
-    np.savetxt(path, table, delimiter=",", header=header, comments="")
-    at = np.array([4.0, 4.25, 4.35, 4.45, 4.7, 4.85, 5.55, 6.0])
-    job = Job(Path(URDF))
-    found = _base_poses(job, LogEntry(path), SimpleNamespace(t=at))
-    np.testing.assert_allclose(found[:, :3], at[:, None] * [2.0, -1.0, 0.5])
-    wanted = np.column_stack([0 * at, np.sin(0.4 * (at - 4)), 0 * at, np.cos(0.4 * (at - 4))])
-    np.testing.assert_allclose(found[:, 3:], wanted, atol=1e-12)  # half-way, where it is exact
-    assert _base_poses(job, LogEntry(path), SimpleNamespace(t=at[:1])).shape == (1, 7)
-    for name, has_pose in (("t", True), ("clock", False)):  # of the time, without which is no pose
-        text = path.read_text().partition(",")[2]
-        path.write_text(f"{name},{text}")
-        again = _base_poses(job, LogEntry(path), SimpleNamespace(t=at))
-        assert (again is not None) == has_pose
-    np.savetxt(path, np.where(np.arange(8) == 4, np.nan, table), delimiter=",", header=header,
-               comments="")  # fmt: skip
-    with pytest.raises(DataError, match="base_qx to base_qw is not a unit quaternion"):
-        _base_poses(job, LogEntry(path), SimpleNamespace(t=at))
-    path.write_text(f"time,{text}".replace("base_qw", "other"))
-    assert _base_poses(job, LogEntry(path), SimpleNamespace(t=at)) is None
-
-
 def test_a_motion_without_torques_plays_and_marks_where_it_uses_the_most_of_limits(folder):
     model = RobotModel.from_urdf(URDF)
     t = np.arange(401) / 100.0
@@ -412,22 +255,6 @@ def test_a_motion_without_torques_plays_and_marks_where_it_uses_the_most_of_limi
     (nearest,) = (mark for mark in data["marks"] if "smallest distance" in mark["label"])
     assert re.fullmatch(r"\w+ and \w+: smallest distance \d+ mm", nearest["label"])
     assert data["notes"][1].startswith("The motion has no torques")
-
-
-def test_a_motion_of_a_robot_without_limits_plays_and_says_what_is_not_marked(folder, tmp_path):
-    text = re.sub(r'velocity="[^"]*"', 'velocity="0"', (folder / "ur5.urdf").read_text())
-    (tmp_path / "arm.urdf").write_text(text)
-    t = np.arange(50) / 100.0
-    write_columns(
-        {"time": t, **{f"q_{j}": 0.1 * t for j in RobotModel.from_urdf(URDF).joints}},
-        tmp_path / "motion.csv",
-    )
-    page = tmp_path / "page.html"
-    words = ["replay", str(tmp_path / "arm.urdf"), str(tmp_path / "motion.csv")]
-    assert main([*words, "--html", str(page)]) == 0
-    data = shown(page.read_text(encoding="utf-8"))
-    assert data["marks"] == []
-    assert "Limits are not marked: arm.urdf states no limit of" in data["notes"][1]
 
 
 def test_drives_that_follow_commands_are_played_with_their_ghosts(tmp_path):
@@ -470,36 +297,3 @@ def test_drives_that_follow_commands_are_played_with_their_ghosts(tmp_path):
         other.follow_commands(log)
     with pytest.raises(DataError, match="log has no commands, columns qref_ of each joint"):
         load_result(out).follow_commands(replace(log, q_ref=None))
-
-
-def test_of_two_results_both_are_shown_and_the_error_is_that_of_the_first(monkeypatch):
-    t = 3.0 + 0.01 * np.arange(50)
-    q = np.column_stack([np.sin(t), np.cos(t)])
-    log = Log(t, q, 0.0 * q, ("a", "b"), q_ref=q + np.array([0.04, 0.05]), has_torque=False)
-
-    def result(zeros, *errors):
-        drives = [SimpleNamespace(zero=zero) for zero in zeros]
-        robot = SimpleNamespace(joints=log.joints)
-        return SimpleNamespace(
-            robot=robot, commanded=drives, follow_commands=lambda log: log.q + errors
-        )
-
-    results = {"one": result((0.1, -0.2), 1e-3, 3e-3), "two": result((0.5, 0.5), 0.02, 0.01)}
-    heard = {}
-    monkeypatch.setattr(
-        replay, "replay", lambda model, t, q, **stated: heard.update(stated, q=q, model=model)
-    )
-    monkeypatch.setattr(replay, "log_of_commands", lambda job, entry, result: log)
-    job = SimpleNamespace(identification=(LogEntry(Path("day/log.csv")),))
-    replay._replay_commanded(job, results, None)
-    zero = [0.1, -0.2]  # of the first
-    assert heard["model"] is results["one"].robot
-    np.testing.assert_allclose(heard["q"], q + zero)
-    wanted = {"simulated: one": [1e-3, 3e-3], "simulated: two": [0.02, 0.01],
-              "commanded": [0.04, 0.05]}  # fmt: skip
-    assert list(heard["ghosts"]) == list(heard["torques"].predicted) == list(wanted)
-    for label, error in wanted.items():
-        np.testing.assert_allclose(heard["torques"].predicted[label], q + error)
-        np.testing.assert_allclose(heard["ghosts"][label][1], q + error + zero)
-    np.testing.assert_allclose(heard["torques"].noise, [0.04, 0.05])
-    assert heard["notes"][1] == "Simulated position error, RMS [mrad or mm]: b 3, a 1."

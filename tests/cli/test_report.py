@@ -2,7 +2,6 @@
 
 import json
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,19 +11,11 @@ from helpers.pages import chart
 from helpers.paths import ROOT
 from helpers.synthetic import exact_log, truth
 
-from robotid.base.exceptions import DataError
 from robotid.base.files import file_sha256
-from robotid.base.versions import versions
 from robotid.cli import main
 from robotid.cli.identify import run_job
 from robotid.cli.job import Job, LogEntry
-from robotid.cli.logs import log_of_commands
-from robotid.cli.report import _require_same
 from robotid.data.files.read import write_log
-from robotid.dynamics.prediction import predict_instants
-from robotid.estimation.fitting.estimator_settings import SimulationSettings
-from robotid.identification.closed_loop.loop_settings import LoopSettings
-from robotid.output.files.result_file import load_result
 from robotid.robot.model import RobotModel
 
 URDF = ROOT / "urdf" / "planar_2r.urdf"
@@ -89,55 +80,6 @@ def test_an_input_that_was_changed_or_is_gone_is_named(out, capsys, name, what):
     assert contents(out) == before
 
 
-def test_a_log_that_is_a_device_now_is_not_read(out, capsys):
-    path, before = out.parent / "fit.csv", contents(out)
-    path.unlink()
-    path.symlink_to("/dev/null")
-    assert main(["report", str(out)]) == 1
-    path.unlink()
-    assert f"'{path}' is a pipe or a device" in capsys.readouterr().err
-    assert contents(out) == before
-
-
-def test_an_input_without_a_hash_is_named(out, capsys):
-    path = out / "result.json"
-    content = json.loads(path.read_text())
-    content["inputs"][1]["sha256"] = None
-    path.write_text(json.dumps(content))
-    assert main(["report", str(out)]) == 1
-    said = f"result.json states no SHA-256 of its input, the log '{out.parent / 'fit.csv'}'"
-    assert said in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        (lambda inputs: inputs.pop(0), "has 0 inputs of the role 'urdf', but its settings name 1"),
-        (lambda inputs: inputs.pop(1), "has 0 inputs of the role 'identification', but its"),
-        (lambda inputs: inputs.append(inputs[1]), "has 2 inputs of the role 'identification', but"),
-    ],
-)
-def test_inputs_that_are_not_those_of_the_settings_are_named(out, capsys, change, words):
-    path = out / "result.json"
-    content = json.loads(path.read_text())
-    change(content["inputs"])
-    path.write_text(json.dumps(content))
-    before = contents(out)
-    assert main(["report", str(out)]) == 1
-    assert words in " ".join(capsys.readouterr().err.split())
-    assert contents(out) == before
-
-
-def test_a_recording_that_the_settings_lack_is_named(out, capsys):
-    path = out / "result.json"
-    content = json.loads(path.read_text())
-    content["settings"]["validation"] = []
-    path.write_text(json.dumps(content))
-    assert main(["report", str(out)]) == 1
-    said = "has 1 inputs of the role 'validation', but its settings name 0"
-    assert said in " ".join(capsys.readouterr().err.split())
-
-
 def test_a_result_that_the_fit_does_not_give_again_has_no_page(out, capsys):
     path = out / "result.json"
     content = json.loads(path.read_text())
@@ -193,50 +135,3 @@ def test_the_report_of_drives_that_follow_commands_rolls_the_result_out(tmp_path
     assert "log.csv 0-2.995 s, fitted: RMSE" in page
     (tmp_path / "log.csv").write_text("time\n")
     assert main(["report", str(out), "--out", str(tmp_path / "page.html")]) == 1
-
-
-def test_a_controller_that_carries_the_weight_does_so_in_the_report_too(tmp_path):
-    arm = plant("planar", np.random.default_rng(0))
-    log, _ = recorded(arm, np.random.default_rng(1), duration=0.5, rate=200.0)
-    write_log(log, tmp_path / "log.csv")
-    entry, result = LogEntry(tmp_path / "log.csv"), load_result(written_result(arm, tmp_path / "a"))
-    job = Job(
-        Path(arm.model.tree.path),
-        estimator=SimulationSettings(),
-        controller=LoopSettings(gravity_compensation=True),
-    )
-    heard = log_of_commands(job, entry, result)
-    pi, still = arm.model.standard_parameters(), np.zeros_like(log.q)
-    weight = predict_instants(arm.model, pi, log.q, still, still)
-    np.testing.assert_allclose(heard.tau_ref, weight, atol=1e-4)
-    plain = log_of_commands(Job(job.urdf), entry, result)
-    assert plain.tau_ref is None
-
-
-def test_the_fit_is_the_same_within_a_hundredth_of_each_error_or_a_millionth():
-    values = {"a": 2.0, "b": 300.0, "c": -4.0}
-    errors = {"a": 0.5, "b": None, "c": 1e-9}
-    content = {
-        "robotid": versions()["robotid"],
-        "versions": versions(),
-        "base_parameters": [
-            {"name": name, "value": x, "std_error": errors[name]} for name, x in values.items()
-        ],
-    }
-
-    def fitted(**changes):
-        now = values | changes
-        base = np.array([*now.values()])
-        mapping = SimpleNamespace(base_names=tuple(now))
-        _require_same(SimpleNamespace(mapping=mapping, base=base), content, "result.json")
-
-    fitted()
-    fitted(a=2.0049, b=300.00029, c=-4.0000039)
-    for name, x in (("a", 2.0051), ("b", 300.00031), ("c", -4.0000041)):
-        with pytest.raises(DataError, match=f"1 of 3 base parameters differ: {name} is "):
-            fitted(**{name: x})
-    with pytest.raises(DataError, match="only one of the two has the parameters d"):
-        fitted(d=1.0)
-    del content["base_parameters"][1]
-    with pytest.raises(DataError, match="only one of the two has the parameters b"):
-        fitted()

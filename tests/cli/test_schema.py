@@ -4,7 +4,6 @@ import json
 import os
 import subprocess
 import sys
-import tomllib
 from pathlib import Path
 
 import jsonschema
@@ -26,16 +25,6 @@ def check():
     schema = job_schema()
     jsonschema.Draft202012Validator.check_schema(schema)
     return jsonschema.Draft202012Validator(schema).validate
-
-
-@pytest.mark.parametrize("job", JOBS, ids=lambda job: job.stem)
-def test_job_files_of_real_robots_are_valid(check, job):
-    check(tomllib.loads(job.read_text()))
-
-
-def test_the_example_of_the_docs_is_valid(check):
-    page = (ROOT / "docs/reference/job_file.md").read_text()
-    check(tomllib.loads(page.split("```toml\n")[1].split("```")[0]))
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ import pytest
 from robotid.base.files import file_sha256
 from robotid.cli import main, simulate
 from robotid.cli.job import Job
-from robotid.cli.simulate import SimulatedFiles, _motion
+from robotid.cli.simulate import _motion
 from robotid.data.files.formats import write_columns
 from robotid.data.files.read import read_log
 from robotid.dynamics.base_parameters import structural_mapping
@@ -23,7 +23,6 @@ from robotid.dynamics.simulation.simulation_settings import (
     Sensors,
     Simulation,
     Truth,
-    read_simulation,
 )
 from robotid.identification.pipeline import identify
 from robotid.output.files.urdf import load_identified
@@ -132,12 +131,6 @@ def test_a_file_states_the_plant_and_flags_stand_over_it(folder, capsys):
     assert truth["following"][1]["rms"] > 0.01  # PD alone sags
 
 
-def test_a_log_with_noise_is_not_said_to_have_none(folder, capsys):
-    words = ["--rate", "50", "--controller", "perfect", "--duration", "1"]
-    assert simulated(folder, *words, "--torque-noise", "0.02", out="noisy.csv")[0] == 0
-    assert "no noise" not in capsys.readouterr().out
-
-
 def test_a_motion_of_positions_alone_is_splined_and_a_recorded_one_smoothed(folder, ur5):
     write_motion(folder / "plain.csv", ur5, 1, derivatives=False)
     words = ["--rate", "100", "--controller", "perfect", "--duration", "5", "--perturb", "0"]
@@ -156,17 +149,6 @@ def test_a_motion_of_positions_alone_is_splined_and_a_recorded_one_smoothed(fold
     smooth = read_log(folder / "z.csv", ur5.joints)
     error = np.sqrt(np.mean((smooth.tau - logs[0].tau)[inside] ** 2))
     assert error < 0.03 * np.sqrt(np.mean(logs[0].tau ** 2))
-
-
-def test_a_sampled_motion_is_the_one_it_was_sampled_from(ur5):
-    source = random_fourier(ur5, np.random.default_rng(2), period=6.0)
-    t, fine = np.arange(0, 6.001, 0.02), np.linspace(0.3, 5.7, 700)
-    sampled = SampledMotion(t + 5.0, *source.evaluate(t))
-    for found, wanted, atol in zip(
-        sampled.evaluate(fine), source.evaluate(fine), (1e-9, 1e-6, 1e-4), strict=True
-    ):
-        np.testing.assert_allclose(found, wanted, atol=atol)
-    assert sampled.duration == pytest.approx(6.0)
 
 
 ERRORS = {
@@ -189,20 +171,6 @@ def test_errors_say_what_to_do_and_nothing_is_written(folder, message, capsys):
     assert not list(folder.glob("never*"))
 
 
-def test_a_plant_file_is_checked_key_by_key(folder, capsys):
-    for text, words in (
-        ("[sensor]\nnoise = 1", "sensor is not a known key; did you mean 'sensors'?"),
-        ("[sensors.noise]\nq = 'much'", "sensors.noise.q is 'much', wanted a number"),
-        ("[actuator]\nbacklash = 0.1", "backlash applies only to elastic gears. State"),
-        ("[drives]\nelbow_joint = ['stribeck']", "wanted a term with its shape"),
-        ("rate = ", "is not valid TOML"),
-    ):
-        (folder / "wrong.toml").write_text(text)
-        code, _ = simulated(folder, "--plant", f"{folder}/wrong.toml", out="never.csv")
-        assert code == 2
-        assert words in capsys.readouterr().err
-
-
 def test_a_robot_that_cannot_be_a_urdf_leaves_no_file(folder, capsys):
     """A part of a link that was drawn as a whole with what is locked to it may be impossible."""
     words = ["--controller", "perfect", "--perturb", "5", "--lock", "elbow_joint=0.5"]
@@ -210,20 +178,6 @@ def test_a_robot_that_cannot_be_a_urdf_leaves_no_file(folder, capsys):
     assert code == 1
     assert "would be physically impossible" in " ".join(capsys.readouterr().err.split())
     assert not list(folder.glob("never*"))
-
-
-def test_a_flag_is_not_named_as_a_key_of_the_plants_file(folder, capsys):
-    (folder / "right.toml").write_text("rate = 100")
-    words = ["--plant", f"{folder}/right.toml", "--lock", "elbow_joint=1e300"]
-    assert simulated(folder, *words, out="never.csv")[0] == 2
-    said = capsys.readouterr().err
-    assert "command line: locked.elbow_joint is 1e+300, wanted a number" in said
-    (folder / "wrong.toml").write_text("[drives]\nelbow_joint = [{ term = 'Tanh', speed = 'x' }]")
-    assert simulated(folder, "--plant", f"{folder}/wrong.toml", out="never.csv")[0] == 2
-    assert (
-        "wrong.toml: drives.elbow_joint: Tanh: speed is 'x', wanted a finite number"
-        in capsys.readouterr().err
-    )
 
 
 def test_every_flag_states_its_setting():
@@ -291,37 +245,6 @@ def test_a_motion_passes_its_rows_with_their_speeds_and_accelerations(tmp_path, 
         columns |= {f"{key}_{joint}": values[:, j] for j, joint in enumerate(ur5.joints)}
     write_columns(columns, tmp_path / "motion.csv")
     job = Job(urdf=URDF)
-    files = SimulatedFiles(tmp_path / "motion.csv", tmp_path / "log.csv")
-    found = _motion(job, ur5, files).evaluate(t - 3.0)
+    found = _motion(job, ur5, tmp_path / "motion.csv", None).evaluate(t - 3.0)
     for one, stated in zip(found, (q, v, a), strict=True):
         np.testing.assert_allclose(one, stated, atol=1e-9)
-
-
-def test_a_flag_replaces_one_value_of_a_table_of_the_plants_file(tmp_path):
-    (tmp_path / "plant.toml").write_text(
-        "rate = 250.0\n[controller]\nkind = 'pd'\nbandwidth = 9.0\n[sensors]\njitter = 1e-4\n"
-        "[sensors.noise]\nq = 2e-5\ntau = 0.05\n"
-    )
-    given = {"seed": 3, "controller": {"kind": "feedforward"}, "sensors": {"noise": {"tau": 0.02}}}
-    found, drives = read_simulation(tmp_path / "plant.toml", given)
-    assert (found.seed, found.rate, drives) == (3, 250.0, {})
-    assert (found.controller.kind, found.controller.bandwidth) == ("feedforward", 9.0)
-    assert (found.sensors.jitter, found.sensors.noise.q, found.sensors.noise.tau) == (
-        1e-4, 2e-5, 0.02
-    )  # fmt: skip
-
-
-def test_a_joint_that_does_not_follow_its_command_is_named(arm, tmp_path, capsys):
-    t = np.arange(300) / 100
-    columns = {f"q_{j}": 0.2 * np.sin(3 * t) for j in arm.joints}
-    write_columns({"time": t, **columns}, tmp_path / "motion.csv")
-    stuck = f'[controller]\nkind = "pd"\n[truth.values]\n"{arm.joints[1]}.coulomb" = 1e4\n'
-    for text, count in (("", 0), (stuck, 1)):
-        (tmp_path / "plant.toml").write_text(text)
-        words = [str(arm.tree.path), str(tmp_path / "motion.csv"), "--out", str(tmp_path / "l.csv")]
-        assert main(["simulate", *words, "--plant", str(tmp_path / "plant.toml")]) == 0
-        assert capsys.readouterr().out.count(f"warning: {arm.joints[1]} moves ") == count
-    truth = json.loads((tmp_path / "l.truth.json").read_text())
-    entry = truth["following"][1]
-    assert entry["range"] < 0.01
-    assert entry["commanded"] == pytest.approx(0.4, rel=1e-3)

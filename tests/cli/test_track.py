@@ -1,10 +1,8 @@
 """`robotid track`: what of a job reaches the tracker, and what of its history is told."""
 
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
-import pytest
 from helpers.synthetic import exact_log, truth
 
 from robotid.cli import track as module
@@ -12,9 +10,7 @@ from robotid.cli.job import Job, LogEntry
 from robotid.cli.track import run_track, serve_track
 from robotid.data.files.formats import open_table
 from robotid.data.files.read import read_log, write_log
-from robotid.data.log import Log
 from robotid.data.signal_settings import LogSource, SignalSettings
-from robotid.identification.online.online_settings import OnlineSettings
 from robotid.output.viewer.scene import coordinates
 
 
@@ -27,35 +23,6 @@ def tracked(arm, log, folder=None, **signals):
     content = run_track(job, folder, observer=lambda k, identifier: used.append((k, identifier)))
     assert [k for k, _ in used] == list(range(content["samples"]))
     return content, used[-1][1]
-
-
-def test_the_settings_of_the_signals_reach_the_tracker(arm, arm_logs):
-    stated = {"rate": 50.0, "cutoff": 5.0, "min_velocity": 0.1}
-    _, identifier = tracked(arm, arm_logs / "fit.csv", **stated)
-    assert identifier.settings == OnlineSettings(**stated)
-    _, identifier = tracked(arm, arm_logs / "fit.csv")
-    usual = SignalSettings()
-    assert identifier.settings.rate == pytest.approx(100.0)  # the log's own
-    assert identifier.settings.cutoff == usual.cutoff
-    assert identifier.settings.min_velocity == usual.min_velocity
-
-
-def test_the_rate_is_that_of_most_samples(arm, monkeypatch):
-    """Of a log with a gap of 20 s."""
-    t = np.arange(200) / 100.0
-    zero = np.zeros((200, len(arm.joints)))
-    log = Log(np.where(t < 1.0, t, t + 20.0), zero, zero, arm.joints)
-
-    class Reached(Exception):
-        pass
-
-    def reached(model, log, settings, observer):
-        raise Reached(settings.rate)
-
-    monkeypatch.setattr(Job, "read", lambda self, entry, model: log)
-    monkeypatch.setattr(module, "track", reached)
-    with pytest.raises(Reached, match=r"^(100\.0|99\.99)"):
-        tracked(arm, "log.csv")
 
 
 def test_what_is_told_is_what_the_history_ends_with(arm, rng, tmp_path):
@@ -152,21 +119,3 @@ def test_a_live_page_is_told_what_is_known_at_each_moment_in_the_time_of_the_log
     monkeypatch.setattr(module, "run_track", lambda job, folder, observer: vars(observer))
     real = serve_track(job, None, port=7, announce=heard.append, linger=False)
     assert real["_speed"] == 1.0  # in real time
-
-
-def test_a_gap_is_told_between_the_samples_beside_it(arm):
-    t = 4.0 + 0.01 * np.arange(300)
-    t = t[(t < 5.0) | (t > 5.59)]
-    q = np.zeros((len(t), len(arm.joints)))
-    told = []
-    feed = module._LiveFeed(
-        SimpleNamespace(send=told.append), arm, Log(t, q, q, arm.joints), speed=0.0
-    )
-    for k in range(len(t)):
-        feed(k, SimpleNamespace(is_ready=False, changes=[]))
-    (place,) = (k for k, message in enumerate(told) if "mark" in message)
-    mark = told[place]["mark"]
-    before, after = told[place - 1]["t"], told[place + 1]["t"]
-    assert (mark["t"], after) == pytest.approx((4.99, 5.6))
-    assert before <= mark["t"] < after
-    assert (mark["kind"], mark["label"]) == ("gap", "gap of 0.61 s")

@@ -3,19 +3,15 @@
 import json
 import shutil
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from helpers.synthetic import exact_log, truth
 
-from robotid.cli import validate
 from robotid.cli.identify import run_job
 from robotid.cli.job import job_from_settings
-from robotid.cli.validate import validate_result
+from robotid.cli.validate import validate
 from robotid.data.files.read import write_log
-from robotid.data.log import Log, Trajectory
-from robotid.dynamics.torque import joint_torque_regressor
 
 NOISE = np.array([0.2, 0.05])  # [N m]
 
@@ -52,7 +48,7 @@ def here(made, tmp_path):
 
 def verdict(folder, log):
     write_log(log, folder / "again.csv")
-    return validate_result(folder / "out" / "result.json", [folder / "again.csv"])["verdict"]
+    return validate(folder / "out" / "result.json", [folder / "again.csv"])["verdict"]
 
 
 def rows(log, chosen):
@@ -67,7 +63,7 @@ def test_another_motion_is_a_prediction(here):
 
 def test_figures_of_the_fitted_log_are_those_of_the_result(here):
     path = here[0] / "out" / "result.json"
-    [found] = validate_result(path, [here[0] / "run.csv"])["validation"]
+    [found] = validate(path, [here[0] / "run.csv"])["validation"]
     stated = json.loads(path.read_text())["identification"]["per_joint"]
     assert found["per_joint"].keys() == stated.keys()
     for joint, own in stated.items():
@@ -89,14 +85,6 @@ def test_fitted_rows_show_no_prediction(here, part):
     assert {joint["status"] for joint in found["per_joint"].values()} == {"not evaluated"}
 
 
-def test_the_same_motion_measured_again_is_no_new_one(here, rng):
-    folder, first, _ = here
-    tau = first.tau + 0.01 * NOISE * rng.standard_normal(first.tau.shape)
-    found = verdict(folder, replace(first, tau=tau))
-    assert found["status"] == "usable"
-    assert [doubt["code"] for doubt in found["warnings"]] == ["repeated_motion"]
-
-
 def test_faults_of_the_new_log_lead_its_verdict(here):
     folder, _, other = here
     v = other.v.copy()
@@ -106,61 +94,14 @@ def test_faults_of_the_new_log_lead_its_verdict(here):
     assert "dq_joint_2 is 0.5 times d(q)/dt" in found["reasons"][0]
 
 
-def test_without_the_fitted_logs_nobody_knows(here):
-    folder, first, other = here
-    (folder / "run.csv").unlink()
-    found = verdict(folder, other)
-    assert found["status"] == "usable"
-    assert "the fitted logs run.csv are missing or were changed" in found["reasons"][0]
-    # the file itself is known by its hash
-    assert "contain fitted samples" in verdict(folder, first)["reasons"][0]
-
-
-def test_an_alarm_of_the_result_stays_one_whatever_the_new_log(here):
-    folder, _, other = here
-    path = folder / "out" / "result.json"
-    result = json.loads(path.read_text())
-    result["verdict"]["log_errors"] = ["torque columns are exchanged"]
-    path.write_text(json.dumps(result))
-    found = verdict(folder, other)
-    assert found["status"] == "poor"
-    assert found["reasons"][0] == "torque columns are exchanged"
-    assert found["log_errors"] == ["torque columns are exchanged"]
-
-
-def test_a_doubt_about_the_old_validation_is_not_one_about_the_new(here):
-    folder, _, other = here
-    path = folder / "out" / "result.json"
-    result = json.loads(path.read_text())
-    result["verdict"]["warnings"] = [
-        {"code": code, "joint": "", "message": code} for code in ("repeated_motion", "clipped")
-    ]
-    path.write_text(json.dumps(result))
-    found = verdict(folder, other)
-    assert [doubt["code"] for doubt in found["warnings"]] == ["clipped"]
-    assert found["status"] == "usable"
-
-
-def test_a_longer_log_that_holds_the_fitted_rows_is_no_new_one(here):
-    folder, first, other = here
-    longer = replace(
-        first,
-        t=np.concatenate([first.t, first.t[-1] + 0.01 + other.t]),
-        **{k: np.vstack([getattr(first, k), getattr(other, k)]) for k in ("q", "v", "a", "tau")},
-    )
-    for log in (longer, rows(first, slice(0, 60))):
-        found = verdict(folder, log)
-        assert "contain fitted samples" in found["reasons"][0]
-
-
 def test_of_two_logs_the_one_that_was_fitted_shows_no_prediction_and_the_other_does(here):
     folder, first, other = here
     for name, log in (("new", other), ("old", first)):
         write_log(log, folder / f"{name}.csv")
     result = folder / "out" / "result.json"
-    alone = validate_result(result, [folder / "new.csv"])
+    alone = validate(result, [folder / "new.csv"])
     for names in (("new", "old"), ("old", "new")):
-        found = validate_result(result, [folder / f"{name}.csv" for name in names])
+        found = validate(result, [folder / f"{name}.csv" for name in names])
         assert [entry["log"] for entry in found["validation"]] == [
             str(folder / f"{name}.csv") for name in names
         ]
@@ -168,108 +109,8 @@ def test_of_two_logs_the_one_that_was_fitted_shows_no_prediction_and_the_other_d
         assert own["per_joint"] == alone["validation"][0]["per_joint"]
         assert found["verdict"] == alone["verdict"]
     write_log(rows(first, slice(0, 700)), folder / "cut.csv")
-    found = validate_result(result, [folder / "old.csv", folder / "cut.csv"])
+    found = validate(result, [folder / "old.csv", folder / "cut.csv"])
     assert (
         "old.csv 0-9.99 s, cut.csv 0-6.99 s contain fitted samples"
         in found["verdict"]["reasons"][0]
     )
-
-
-def test_what_the_result_ignores_is_no_doubt(here, rng):
-    folder, first, _ = here
-    path = folder / "out" / "result.json"
-    result = json.loads(path.read_text())
-    result["settings"]["doctor"] = {"ignore": ["repeated_motion"]}
-    path.write_text(json.dumps(result))
-    tau = first.tau + 0.01 * NOISE * rng.standard_normal(first.tau.shape)
-    assert verdict(folder, replace(first, tau=tau))["warnings"] == []
-
-
-def test_a_fault_of_the_second_of_two_new_logs_is_one_of_the_verdict(here, monkeypatch):
-    folder, _, other = here
-    v = other.v[500:].copy()
-    v[:, 1] *= 0.5
-    halves = {"sound": rows(other, slice(0, 500)), "spoilt": rows(other, slice(500, None))}
-    halves["spoilt"] = replace(halves["spoilt"], v=v)
-    for name, log in halves.items():
-        write_log(log, folder / f"{name}.csv")
-    judged = {}
-
-    def noted(predictions, determined, **stated):
-        judged.update(stated, predictions=predictions, determined=determined)
-        return judge(predictions, determined, **stated)
-
-    judge = validate.judge
-    monkeypatch.setattr(validate, "judge", noted)
-    monkeypatch.setattr(
-        validate, "hidden_joints", lambda model, some: tuple(e.recording.name for e in some)
-    )
-    logs = [folder / f"{name}.csv" for name in halves]
-    found = validate_result(folder / "out" / "result.json", logs)
-    assert found["verdict"]["status"] == "poor"
-    assert any(
-        "dq_joint_2 is 0.5 times d(q)/dt" in words for words in found["verdict"]["log_errors"]
-    )
-    names = ["sound.csv 0-4.99 s", "spoilt.csv 5-9.99 s"]
-    predictions, determined = judged["predictions"], judged["determined"]
-    assert list(predictions.validation) == list(predictions.hidden) == names
-    stated = json.loads((folder / "out" / "result.json").read_text())
-    assert determined.undetermined == stated["structure"]["undetermined"]
-    assert determined.is_poorly_excited is stated["structure"]["poorly_excited"]
-    assert judged["scale_check"].to_dict() == stated["scale_check"]
-    assert predictions.refitted == []
-    assert predictions.joints == ("joint_1", "joint_2")
-    del stated["structure"]["poorly_excited"]  # as of an older result
-    (folder / "out" / "older.json").write_text(json.dumps(stated))
-    validate_result(folder / "out" / "older.json", logs)
-    assert judged["determined"].is_poorly_excited is True
-
-
-def test_few_fitted_rows_in_a_long_log_and_a_few_of_it_in_a_long_fitted_one_are_shared(rng):
-    def log(count):
-        q, tau = rng.standard_normal((2, count, 2))
-        return Log(np.arange(count) / 100.0, q, tau, ("a", "b"))
-
-    short, long = log(30), log(9000)
-    q, tau = long.q.copy(), long.tau.copy()
-    q[4321:4351], tau[4321:4351] = short.q, short.tau
-    assert not validate._share(short, long)
-    assert not validate._share(long, short)
-    holder = replace(long, q=q, tau=tau)
-    assert validate._share(short, holder)
-    assert validate._share(holder, short)
-
-
-def test_the_expected_error_has_the_parts_of_fit_spread_and_residual(arm, rng, monkeypatch):
-    """The true errors have 1.2 times the deviation, joint by joint; some samples are not used."""
-    size, count, noise = len(arm.layout.names), 300, np.array([0.3, 0.1])
-    q, v, a = rng.uniform(-2.0, 2.0, (3, count, 2))
-    of_fit, of_logs = (x @ x.T for x in 0.05 * rng.standard_normal((2, size, size)))
-    monkeypatch.setattr(validate, "stated_covariance", lambda result, names: of_fit)
-    Y = joint_torque_regressor(arm, q, v, a).reshape(count, 2, size)
-    mask = rng.random((count, 2)) > 0.3
-    result = {
-        "identification": {
-            "per_joint": {
-                joint: {"rmse": x} for joint, x in zip(arm.joints, noise.tolist(), strict=True)
-            }
-        }
-    }
-    for spread in (None, of_logs):
-        monkeypatch.setattr(validate, "stated_between", lambda *_, own=spread: own)
-        C = of_fit if spread is None else of_fit + spread
-        total = np.sqrt(np.einsum("kjp,pq,kjq->kj", Y, C, Y) + noise**2)
-        z = 1.2 * rng.standard_normal((count, 2))
-        tau = rng.standard_normal((count, 2))
-        segment = np.zeros(count, dtype=int)
-        motion = Trajectory(np.arange(count) / 100.0, q, v, a, tau, arm.joints, None, segment)
-        evaluation = SimpleNamespace(
-            recording=SimpleNamespace(trajectory=motion, mask=mask),
-            torques={"estimate": tau - z * total},
-        )
-        found = validate._expected(result, arm, evaluation)["expected"]
-        assert found["with_spread"] is (spread is not None)
-        for j, own in enumerate(found["per_joint"].values()):
-            assert own["rmse"] == pytest.approx(np.sqrt(np.mean(total[:, j] ** 2)), rel=1e-9)
-            inside = np.abs(z[mask[:, j], j]) <= 1.96
-            assert own["within_95_pct"] == pytest.approx(100 * inside.mean(), abs=0.5)

@@ -16,9 +16,17 @@ from hypothesis import strategies as st
 
 import robotid
 from helpers.hostile_inputs import JOINTS, URDF, good_log, good_result
-from robotid import Log, LogSource, LogUnits, RobotModel, SignalSettings, Trajectory
+from robotid import Log, RobotModel, SignalSettings, Trajectory
 from robotid.base.exceptions import RobotIdError
+from robotid.cli.job import read_job
+from robotid.data.signal_settings import LogSource, LogUnits
+from robotid.output.files.mjcf import write_mjcf
+from robotid.output.files.ranges import write_ranges
+from robotid.output.files.sdf import write_sdf
+from robotid.output.files.urdf import write_urdf
 from robotid.output.report import pictures
+from robotid.output.report.document import write_report
+from robotid.robot.parameters import Coupling
 
 __all__ = ["ARGUMENT_KINDS"]
 
@@ -84,12 +92,12 @@ CALLS = {
                       "couplings": (), "own_terms": {}, "dynamics": "full", "snap_angles": False},
     ),
     "Coupling": (
-        lambda **given: RobotModel.from_urdf(URDF, couplings=[robotid.Coupling(**given)]),
+        lambda **given: RobotModel.from_urdf(URDF, couplings=[Coupling(**given)]),
         lambda c, _: {"name": "c", "ratios": (("joint_1", 1.0),), "replaces": False},
     ),
-    "inspect_urdf": (robotid.inspect_urdf, lambda c, _: {"path": URDF, "free_flyer": False}),
+    "inspect_urdf": (robotid.inspect, lambda c, _: {"path": URDF, "free_flyer": False}),
     "check_logs": (
-        robotid.check_logs,
+        robotid.doctor,
         lambda c, _: {"model": c.model, "logs": c.log, "validation": (), "signals": None},
     ),
     "read_log": (
@@ -107,7 +115,7 @@ CALLS = {
                       "ignore": ()},
     ),
     "identify_payload": (
-        robotid.identify_payload,
+        robotid.payload,
         lambda c, _: {"model": c.model, "logs": c.log, "reference": c.log, "links": (),
                       "masses": None, "unknown_gains": (), "signals": None, "friction": "none"},
     ),
@@ -150,28 +158,28 @@ CALLS = {
         lambda c, f: {"folder": f / "saved", "report": False, "replay": False},
     ),
     "load_result": (robotid.load_result, lambda c, _: {"path": good_result()[0]}),
-    "read_job": (robotid.read_job, lambda c, _: {"path": "job.toml"}),
+    "read_job": (read_job, lambda c, _: {"path": "job.toml"}),
     "write_urdf": (
-        robotid.write_urdf,
+        write_urdf,
         lambda c, f: {"model": c.model, "pi": c.found.standard, "target": f / "x.urdf",
                       "dynamics": True},
     ),
     "write_sdf": (
-        robotid.write_sdf,
+        write_sdf,
         lambda c, f: {"model": c.model, "pi": c.found.standard, "target": f / "x.sdf",
                       "original": None, "notes": ()},
     ),
     "write_mjcf": (
-        robotid.write_mjcf,
+        write_mjcf,
         lambda c, f: {"model": c.model, "pi": c.found.standard, "target": f / "x.xml",
                       "original": None, "commanded": (), "step": 0.001, "delay": "history",
                       "notes": ()},
     ),
     "write_ranges": (
-        robotid.write_ranges, lambda c, f: {"found": c.found, "target": f / "x.yaml"}
+        write_ranges, lambda c, f: {"found": c.found, "target": f / "x.yaml"}
     ),
     "write_report": (
-        robotid.write_report,
+        write_report,
         lambda c, f: {"identification": c.found, "target": f / "x.html", "files": None},
     ),
     "replay": (

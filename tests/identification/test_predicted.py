@@ -6,7 +6,7 @@ import pinocchio as pin
 import pytest
 from helpers.driven import ELBOW, LIFT, arm, driven, driven_log, found_in
 
-from robotid.cli.export import export_result
+from robotid.cli.export import export
 from robotid.cli.identify import save_result
 from robotid.dynamics.friction_projection import project_friction
 from robotid.dynamics.prediction import drive_motion_along
@@ -123,7 +123,7 @@ def test_mujocos_inverse_dynamics_of_an_export_are_as_near_as_its_friction_can_b
     found, loaded, tmp_path
 ):
     """Over the fitted rows: the prediction less the best viscous, Coulomb friction and offset."""
-    done = export_result(loaded.path, "mjcf", tmp_path / "a.xml")
+    done = export(loaded.path, "mjcf", tmp_path / "a.xml")
     stated = done["projected"][ELBOW]
     assert stated["replaced"] == ["load"]
     assert "load projected on viscous" in " ".join((tmp_path / "a.xml").read_text().split())

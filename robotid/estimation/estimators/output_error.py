@@ -9,7 +9,7 @@ fast effects such as a delay.
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, Protocol
 
 import numpy as np
 import scipy.linalg
@@ -19,7 +19,6 @@ from robotid.base.typing import Array, ProgressCallback, ignore_progress
 from robotid.dynamics.factors import Factors, triangle_of
 from robotid.estimation.estimators.estimator import Estimate, Estimator
 from robotid.estimation.estimators.segments import FEWEST_SEGMENTS, at_least, sandwich, scatter
-from robotid.estimation.estimators.simulator import Residual, Simulator
 
 _CAUTIOUS = 1e-3  # damping of a step: parameters that are not identifiable do not move
 _NEARLY_FREE = 1e-6  # damping of the last step, near the minimum
@@ -28,14 +27,51 @@ _ROUNDS = 5  # largest number of updates of whitening and noise levels ...
 _SETTLED = 2e-2  # ... until their relative change is smaller
 _ROUGH, _CLOSE = 1e-3, 1e-5  # relative decrease that ends the first round, and the others
 _TOO_STIFF = 1e10  # damping at which no step reduces the cost any more
-_UPHILL = 1e-2  # largest relative increase of the cost by a step with inexact derivatives
-_NEAR = 1e-2  # step in standard errors, squared, at which such steps end
 _MOST_RHO = 0.95  # largest correlation: beyond it, whitening removes offsets and gains
 _NO_TRACE = 1e-3  # effect of an initial state in noise levels below which it is neglected
 #: Number of segments for the scatter of scores: few enough that each is longer than the time for
 #: which an encoder stays at one step while a joint reverses.
 _SEGMENTS = 48
 _LOST = 1e-6  # relative reduction of the prior variance below which a parameter is undetermined
+
+
+@dataclass(frozen=True, eq=False)
+class Residual:
+    """Measured minus simulated output over one window, for k joints simulated together."""
+
+    e: Array  # (N, k) [rad or m]
+    slopes: Array | None  # (N, k, c'), derivatives of the simulated output by the parameters
+    joints: Array  # (k,), indices
+    columns: Array  # (c',), indices of the parameters
+    by_start: Array | None = None  # (N, k, s), derivatives by the initial state of the window
+
+
+class Simulator(Protocol):
+    """Interface of a simulator whose outputs are compared with measured ones."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the c parameters."""
+
+    @property
+    def prior(self) -> Array:
+        """Prior values, shape (c,)."""
+
+    @property
+    def prior_std(self) -> Array:
+        """Prior standard deviations, shape (c,); infinite without prior knowledge."""
+
+    @property
+    def bounds(self) -> Array:
+        """Lower and upper bounds, shape (2, c); infinite without a bound."""
+
+    def residuals(
+        self, theta: Array, *, with_slopes: bool, with_starts: bool = False
+    ) -> Sequence[Residual]:
+        """Return measured minus simulated outputs, window by window: theta (c,)."""
+
+    def rows(self, theta: Array) -> tuple[Array, Array]:
+        """Return additional linearised residuals of unit weight: theta (c,) -> (m, c), (m,)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,8 +85,7 @@ class _Weights:
         rho, sigma = self.rho[joints], self.sigma[joints]
         if x.ndim == 3:
             rho, sigma = rho[:, None], sigma[:, None]
-        whitened: Array = (x[1:] - rho * x[:-1]) / sigma
-        return whitened
+        return np.asarray((x[1:] - rho * x[:-1]) / sigma)
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,73 +95,42 @@ class OutputError(Estimator[Simulator]):
     A damped Gauss-Newton method (Levenberg, Marquardt) in rounds. Each round computes the weights
     from the residuals, then the parameters with these weights, until both have converged.
 
-    Attributes:
-        name: Name of the method, by the compared signal.
-        whitens: Whether the residual is whitened by its estimated correlation.
-        most: Largest correlation of successive samples that is used, shape (n,): whitening with
-            more than the correlation of the loop removes the information. None: 0.95.
-        steps: Largest number of steps in a round.
-        rounds: Largest number of rounds.
-        inflation: Factor of the residuals' variance for the correlation that remains after
-            whitening. It determines the weight relative to additional rows.
-        frees: Whether the initial states of windows are fitted together with the parameters, to
-            first order, in each step; needed if the loop does not correct a wrong initial state.
-        progress: Callback for the progress of the steps.
-
     References:
         Ljung (1999), System identification, 4.3 and 10.2.
     """
 
     reads: ClassVar[Literal["simulator"]] = "simulator"
 
-    name: str = "output error"
-    whitens: bool = True
+    whitens: bool = True  # whether the residual is whitened by its estimated correlation
+    #: Largest correlation of successive samples that is used, shape (n,): whitening with more than
+    #: the correlation of the loop removes the information. None: 0.95.
     most: Array | None = None
-    steps: int = _STEPS
+    steps: int = _STEPS  # largest number in a round
     rounds: int = _ROUNDS
+    #: Factor of the residuals' variance for the correlation that remains after whitening. It
+    #: determines the weight relative to additional rows.
     inflation: float = 1.0
+    #: Whether the initial states of windows are fitted together with the parameters, to first
+    #: order, in each step; needed if the loop does not correct a wrong initial state.
     frees: bool = False
     progress: ProgressCallback = field(default=ignore_progress)
 
-    def fit(
-        self,
-        data: Simulator,
-        start: Array | None = None,
-        *,
-        exact: Simulator | None = None,
-    ) -> Estimate:
-        """Estimate the parameters.
-
-        If the simulator's derivatives A are approximate, with the exact ones S of its residuals e,
-        the steps converge to A'e = 0, and standard errors are those of (A'S)^-1 A'e. A step leaves
-        the share 1 - (A'A)^-1 A'S of the error; ``details["left"]`` has the largest one.
-
-        Args:
-            data: The simulator.
-            start: Initial values, shape (c,); the prior if None.
-            exact: The same simulator with exact derivatives, if its own are approximate.
+    def fit(self, data: Simulator, start: Array | None = None) -> Estimate:
+        """Estimate the parameters from initial values (c,), the prior if None.
 
         Raises:
             DataError: If there are fewer samples than parameters.
             NotConvergedError: If the simulation with the initial values fails.
         """
-        weights, theta, how = self._minimised(data, start, exact)
-        return self._estimate(data, weights, theta, how, exact=exact)
+        weights, theta, how = self._minimised(data, start)
+        return self._estimate(data, weights, theta, how)
 
     def minimise(self, data: Simulator, start: Array | None = None) -> Array:
-        """Return the parameters of ``fit`` alone, shape (c,), without their standard errors.
-
-        Args:
-            data: The simulator.
-            start: Initial values, shape (c,); the prior if None.
-
-        Raises:
-            NotConvergedError: If the simulation with the initial values fails.
-        """
-        return self._minimised(data, start, None)[1]
+        """Return the parameters of ``fit`` alone, shape (c,), without their standard errors."""
+        return self._minimised(data, start)[1]
 
     def _minimised(
-        self, simulator: Simulator, start: Array | None, exact: Simulator | None
+        self, simulator: Simulator, start: Array | None
     ) -> tuple[_Weights, Array, dict[str, Any]]:
         """Return the last weights, the parameters, and how they were found."""
         initial = simulator.prior if start is None else start
@@ -135,29 +139,20 @@ class OutputError(Estimator[Simulator]):
         weights, rounds, count, converged = self._weigh(found), 0, 0, False
         for rounds in range(1, self.rounds + 1):
             close = _ROUGH if rounds == 1 else _CLOSE
-            theta, found, steps, converged = self._descend(
-                simulator, weights, theta, found, close, is_exact=exact is None
-            )
+            theta, found, steps, converged = self._descend(simulator, weights, theta, found, close)
             count += steps
-            if exact is not None and not converged:
-                break  # other weights would not help
             before, weights = weights, self._weigh(found)
-            change = np.abs(weights.sigma / before.sigma - 1.0).max()
-            if rounds > 1 and converged and max(change, _rho_change(before, weights)) < _SETTLED:
+            changes = weights.sigma / before.sigma - 1.0, weights.rho - before.rho
+            if rounds > 1 and converged and np.abs(changes).max() < _SETTLED:
                 break
             converged = False
         state = "converged" if converged else "not converged"
-        message = f"{self.name}, {count} steps in {rounds} rounds, {state}"
+        message = f"output error, {count} steps in {rounds} rounds, {state}"
         how = {"converged": converged, "n_iter": count, "message": message}
         return weights, theta, how
 
     def weights(self, simulator: Simulator, theta: Array) -> "_Weights":
-        """Return correlation and noise level of the residuals, their weights.
-
-        Args:
-            simulator: The simulator.
-            theta: Parameters, shape (c,).
-        """
+        """Return correlation and noise level of the residuals at parameters (c,)."""
         return self._weigh(self._left(simulator, theta))
 
     def _left(self, simulator: Simulator, theta: Array) -> Sequence[Residual]:
@@ -195,13 +190,9 @@ class OutputError(Estimator[Simulator]):
         return cost if np.isfinite(cost) else np.inf
 
     def joint_step(self, simulator: Simulator, theta: Array) -> Array:
-        """Return the parameters after a step of them together with the windows' initial states.
+        """Return parameters (c,) after a step together with the windows' initial states.
 
         They do not change if the simulation after the step fails.
-
-        Args:
-            simulator: The simulator.
-            theta: Parameters of the best fit with fixed initial states, shape (c,).
         """
         H, g = self.normal(simulator, self.weights(simulator, theta), theta, frees=True)
         moved = _bounded_step(H, g, theta, simulator.bounds, _CAUTIOUS)
@@ -217,10 +208,6 @@ class OutputError(Estimator[Simulator]):
         With fixed initial states the fit is biased, because these were fitted with earlier
         parameters. The standard errors of an estimate assume free initial states.
 
-        Args:
-            simulator: The simulator, with initial states fitted for the estimate.
-            estimate: Result of ``fit``, with exact derivatives.
-
         Raises:
             NotConvergedError: If the simulation after the step fails.
         """
@@ -232,16 +219,10 @@ class OutputError(Estimator[Simulator]):
         return settled
 
     def moved(self, simulator: Simulator, other: Simulator, theta: Array) -> tuple[Array, Array]:
-        """Return the first-order change of the estimate for other residuals, and standard errors.
+        """Return the first-order change of an estimate for other residuals, and standard errors.
 
-        Args:
-            simulator: The simulator.
-            other: The same simulator with other residuals, as of a smaller integration step.
-            theta: Parameters near the estimate, shape (c,).
-
-        Returns:
-            Change of the parameters, and standard errors for independent whitened residuals of
-            ``other``, both of shape (c,).
+        The other residuals are as of a smaller integration step. Standard errors are those for
+        independent whitened residuals of ``other``; both have shape (c,).
         """
         weights = self.weights(other, theta)
         (H, g), (_, changed) = (
@@ -258,13 +239,9 @@ class OutputError(Estimator[Simulator]):
     def normal(
         self, simulator: Simulator, weights: _Weights, theta: Array, *, frees: bool = False
     ) -> tuple[Array, Array]:
-        """Return H = A'A and A'b of the linearised problem, prior included.
+        """Return H = A'A and A'b of the linearised problem at parameters (c,), prior included.
 
-        Args:
-            simulator: The simulator.
-            weights: As from ``weights``.
-            theta: Parameters, shape (c,).
-            frees: Whether the effect of the windows' initial states is projected out.
+        With ``frees`` the effect of the windows' initial states is projected out.
         """
         return _summed(simulator, theta, linearised(simulator, weights, theta, frees=frees))
 
@@ -275,8 +252,6 @@ class OutputError(Estimator[Simulator]):
         theta: Array,
         found: Sequence[Residual],
         close: float,
-        *,
-        is_exact: bool,
     ) -> tuple[Array, Sequence[Residual], int, bool]:
         """Minimise with fixed weights from parameters with the residuals ``found``.
 
@@ -289,7 +264,6 @@ class OutputError(Estimator[Simulator]):
                 "in [controller] that are closer to those of the drives",
                 "no start",
             )
-        highest = 1.0 if is_exact else 1.0 + _UPHILL
         for step in range(1, self.steps + 1):
             self.progress("fitting loops", step, self.steps, "steps")
             H, g = self.normal(simulator, weights, theta, frees=self.frees)
@@ -301,17 +275,16 @@ class OutputError(Estimator[Simulator]):
                     new = self._cost(simulator, weights, trial, left)
                 except NotConvergedError:
                     pass  # the step is too long
-                if new < highest * cost or damping > _TOO_STIFF:
+                if new < cost or damping > _TOO_STIFF:
                     break
-                if is_exact and float(g @ (trial - theta)) < close * cost:
+                if float(g @ (trial - theta)) < close * cost:
                     break  # the predicted decrease is negligible
                 damping *= 6.0
-            if not new < highest * cost:
+            if not new < cost:
                 return theta, found, step, True  # no step reduces the cost noticeably
-            is_near = float(g @ (trial - theta)) < _NEAR
             decrease, theta, found, cost = (cost - new) / cost, trial, left, new
             damping = max(damping / 6.0, 1e-9)
-            if decrease < close if is_exact else is_near:
+            if decrease < close:
                 return theta, found, step, True
         return theta, found, self.steps, False
 
@@ -322,7 +295,6 @@ class OutputError(Estimator[Simulator]):
         theta: Array,
         how: Mapping[str, Any],
         *,
-        exact: Simulator | None = None,
         found: Sequence[Residual] | None = None,
     ) -> Estimate:
         """Return the estimate with standard errors from the scatter of the scores of segments.
@@ -354,11 +326,6 @@ class OutputError(Estimator[Simulator]):
             meat, inflation, freedom = seen.meat, seen.inflation, seen.freedom()
             further = simulator.rows(theta)[0]
             meat = meat + further.T @ further
-        left = 0.0
-        if exact is not None:
-            C = _cross(simulator, exact, weights, theta) + np.diag(known)
-            left = float(np.abs(np.linalg.eigvals(np.eye(len(theta)) - bread @ C)).max())
-            bread = np.linalg.inv(C)
         # standard errors are at least those for independent rows
         independent = np.diag(bread @ H @ bread.T)
         gained = 1.0 - independent * known  # relative reduction of each prior variance
@@ -380,10 +347,9 @@ class OutputError(Estimator[Simulator]):
                 "correlation": weights.rho,
                 "inflation": inflation * self.inflation,
                 "freedom": freedom,
-                "left": left,
                 "at_bound": tuple(at_bound.tolist()),
             },
-            **{**how, "converged": how["converged"] and left < 1.0},
+            **how,
         )
 
 
@@ -402,10 +368,6 @@ def _summed(
 
 def _squares(arrays: Iterable[Array]) -> float:
     return float(sum((x * x).sum() for x in arrays))
-
-
-def _rho_change(before: _Weights, after: _Weights) -> float:
-    return float(np.abs(after.rho - before.rho).max())
 
 
 def linearised(
@@ -437,21 +399,14 @@ def _whitened(
     """Yield the whitened rows of residuals; see ``linearised``."""
     for r in found:
         b = weights.whiten(r.e, r.joints)
-        A = weights.whiten(_given(r), r.joints).reshape(b.size, -1)
+        if r.slopes is None:
+            raise DataError("the simulator returned no derivatives, wanted with_slopes=True")
+        A = weights.whiten(r.slopes, r.joints).reshape(b.size, -1)
         b = b.reshape(-1)
         if frees:
             U = _by_start(r, weights)
             A, b = A - U @ (U.T @ A), b - U @ (U.T @ b)
         yield A, b, r.columns
-
-
-def _cross(simulator: Simulator, exact: Simulator, weights: _Weights, theta: Array) -> Array:
-    """Return A'S of a simulator's derivatives A and the exact ones S, whitened, shape (c, c)."""
-    product = np.zeros((len(theta), len(theta)))
-    parts = (linearised(one, weights, theta) for one in (simulator, exact))
-    for (A, _, rows), (S, _, columns) in zip(*parts, strict=True):
-        product[np.ix_(rows, columns)] += A.T @ S
-    return product
 
 
 def _by_start(r: Residual, weights: _Weights) -> Array:
@@ -460,8 +415,7 @@ def _by_start(r: Residual, weights: _Weights) -> Array:
         return np.zeros((r.e[1:].size, 0))
     G = weights.whiten(r.by_start, r.joints).reshape(r.e[1:].size, -1)
     U, sizes, _ = np.linalg.svd(G, full_matrices=False)
-    basis: Array = U[:, sizes > _NO_TRACE]
-    return basis
+    return np.asarray(U[:, sizes > _NO_TRACE])
 
 
 def _freed(r: Residual) -> Array:
@@ -471,21 +425,13 @@ def _freed(r: Residual) -> Array:
     size = np.maximum(np.sqrt(np.mean(r.e**2, axis=0)), 1e-12)
     G = (r.by_start / size[:, None]).reshape(r.e.size, -1)
     moved = G @ np.linalg.lstsq(G, (r.e / size).reshape(-1), rcond=None)[0]
-    freed: Array = r.e - size * moved.reshape(r.e.shape)
-    return freed
-
-
-def _given(r: Residual) -> Array:
-    if r.slopes is None:
-        raise DataError("the simulator returned no derivatives, wanted with_slopes=True")
-    return r.slopes
+    return np.asarray(r.e - size * moved.reshape(r.e.shape))
 
 
 def is_at_bound(simulator: Simulator, theta: Array) -> Array:
     """Return which parameters are at a bound, shape (c,), bool: theta (c,)."""
     lowest, highest = simulator.bounds
-    at_bound: Array = (theta <= lowest) | (theta >= highest)
-    return at_bound
+    return np.asarray((theta <= lowest) | (theta >= highest))
 
 
 def _bounded_step(H: Array, g: Array, theta: Array, bounds: Array, damping: float) -> Array:
@@ -515,7 +461,7 @@ def _segments(
     With ``are_windows`` each window is about one segment: without feedback an early error persists
     until the end of the window.
     """
-    total = sum(len(b) for _, b, _ in found)
+    total, names = sum(len(b) for _, b, _ in found), tuple(map(str, range(c)))
     segments: list[Factors] = []
     for A, b, columns in found:
         cuts = max(1, round(_SEGMENTS * len(b) / total))
@@ -523,9 +469,5 @@ def _segments(
             cuts = math.ceil(FEWEST_SEGMENTS / len(found))
         for rows in np.array_split(np.arange(len(b)), cuts):
             triangle = triangle_of(np.column_stack([A[rows], b[rows]]))
-            segments.append(Factors((triangle,), (columns,), np.array([len(rows)]), _names(c)))
+            segments.append(Factors((triangle,), (columns,), np.array([len(rows)]), names))
     return segments
-
-
-def _names(count: int) -> tuple[str, ...]:
-    return tuple(map(str, range(count)))

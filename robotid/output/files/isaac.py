@@ -13,15 +13,28 @@ from robotid.base.findings import listed
 from robotid.base.typing import Array
 from robotid.base.versions import __version__
 from robotid.output.files.commanded import CommandedDrive, limit_of
-from robotid.output.files.exported import Exported, Written, unstated_terms
+from robotid.output.files.exports import (
+    Exported,
+    Format,
+    Option,
+    Written,
+    unstated_terms,
+    yaml_text,
+)
 from robotid.output.files.result_file import Result
-from robotid.output.files.yaml_text import yaml_text
 from robotid.robot.model import RobotModel
 from robotid.robot.tree import Joint
 
 # drive terms of Isaac Lab's actuators; a note of its own states the offset
 _TERMS = ("armature", "viscous", "coulomb", "offset")
 _STEP = 0.005  # [s]
+FORMAT = Format(
+    "isaac",
+    "YAML of Isaac Lab's actuators",
+    "_actuators.yaml",
+    use_of_gains="Use it for training in Isaac Lab.",
+    options={"step": Option("time step, the unit of delays [s], default 0.005", "S", float)},
+)
 _HEAD = """\
 Actuators of {robot} for Isaac Lab 2.2 or later (Isaac Sim 5, where friction is a torque), by
 robotid {version}. N m, N m s/rad, kg m^2, rad/s; N, N s/m, kg, m/s of prismatic joints.

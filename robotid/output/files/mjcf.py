@@ -15,8 +15,7 @@ from robotid.base.findings import listed
 from robotid.base.settings import require_each, require_kind
 from robotid.base.typing import Array
 from robotid.output.files.commanded import CommandedDrive, limit_of
-from robotid.output.files.export_formats import DELAYS
-from robotid.output.files.exported import Exported, Written
+from robotid.output.files.exports import Exported, Format, Option, Written
 from robotid.output.files.links import WORLD, SimulatedLink, XmlFormat, own_drives, write_model
 from robotid.output.files.result_file import Result
 from robotid.output.files.urdf import numbers_text
@@ -24,6 +23,22 @@ from robotid.robot.bodies import principal_moments
 from robotid.robot.model import RobotModel
 from robotid.robot.tree import Joint
 
+#: Models of the delay of a command.
+DELAYS = ("history", "filter")
+FORMAT = Format(
+    "mjcf",
+    "MuJoCo model",
+    ".xml",
+    use="Use the result: the identified URDF is written; this command writes a MuJoCo model.",
+    use_of_gains="Simulate it in MuJoCo, gains and delays included.",
+    options={
+        "step": Option("time step [s], default 0.001", "S", float),
+        "delay": Option(
+            "model of the command delay, default history, which needs MuJoCo 3.5", "HOW",
+            among=DELAYS,
+        ),
+    },
+)  # fmt: skip
 #: Attribute of a joint, or of a tendon over several joints, for each term of a drive.
 _ATTRIBUTES = {
     "armature": "armature",

@@ -8,7 +8,7 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -23,20 +23,29 @@ from robotid.estimation.fitting.bands import QUANTILE
 from robotid.estimation.fitting.identified import Identified
 from robotid.identification.result import TorqueIdentification
 from robotid.output.files.commanded import commanded_drives
-from robotid.output.files.exported import Written
+from robotid.output.files.exports import Format, Option, Written, yaml_text
+from robotid.output.files.result_file import Result
 from robotid.output.files.samples import SIMULATED, write_samples
 from robotid.output.files.urdf import link_parameters
-from robotid.output.files.yaml_text import yaml_text
 from robotid.robot.bodies import principal_moments
 from robotid.robot.drives import TERMS
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia_basis
 
-if TYPE_CHECKING:
-    from robotid.output.files.result_file import Result
-
 #: Parameters of drives that cannot be negative.
 _NOT_NEGATIVE = {"kd", "delay", *(name for name, term in TERMS.items() if term.is_nonnegative)}
+FORMAT = Format(
+    "ranges",
+    "YAML of 95 % intervals, for domain randomisation",
+    "_ranges.yaml",
+    use_of_gains="Randomise the drives within their intervals.",
+    options={
+        "samples": Option(
+            "also FILE.samples.json with N samples of the joint distribution", "N", int
+        ),
+        "seed": Option("seed of these samples, default 0", "K", int),
+    },
+)
 _HEAD = """\
 Ranges for domain randomisation of {robot}, by robotid {version}. kg, m, kg m^2, in a link's frame.
 
@@ -64,7 +73,7 @@ gains kp and kd, the delay of commands and the zero of the encoder.
 
 
 def export(
-    result: "Result",
+    result: Result,
     target: Path,
     *,
     samples: int | None = None,

@@ -34,7 +34,6 @@ from robotid.output.files.commanded import (
     commanded_drives,
     loops_of,
 )
-from robotid.output.files.entries import SCHEMA_VERSION
 from robotid.output.files.shape import (
     FILE,
     FLAG,
@@ -51,6 +50,7 @@ from robotid.robot.model import RobotModel
 if TYPE_CHECKING:
     from robotid.identification.closed_loop.position_errors import PositionEvaluation
 
+SCHEMA_VERSION = 1
 _STATUSES = ("good", "usable", "poor", "not evaluated")
 _STATUS = Range("good, usable, poor or not evaluated", _STATUSES.__contains__)
 _METRICS = {"per_joint": {...: {"relative_error_pct": MAYBE, "rmse": MAYBE, "unit": TEXT}}}

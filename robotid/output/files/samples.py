@@ -4,7 +4,7 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -20,13 +20,11 @@ from robotid.estimation.variation.draws import (
     scores_to_values,
 )
 from robotid.estimation.variation.variation import SCORES
+from robotid.output.files.result_file import Result
 from robotid.output.files.urdf import link_parameters
 from robotid.robot.bodies import held_parameters
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
-
-if TYPE_CHECKING:
-    from robotid.output.files.result_file import Result
 
 _DIGITS = 9  # significant digits of the root in result.json
 _MOST = 1_000_000
@@ -47,7 +45,7 @@ def covariance_entry(names: Sequence[str], covariance: Array, is_fixed: Array) -
     return {"names": list(names), "root": root}
 
 
-def write_samples(result: "Result", target: Path, count: int, seed: int) -> None:
+def write_samples(result: Result, target: Path, count: int, seed: int) -> None:
     """Write samples of the parameters of a result as JSON."""
     if not 1 <= count <= _MOST:
         raise SettingsError(f"samples is {count}, wanted a whole number from 1 to {_MOST}")
@@ -75,7 +73,7 @@ def write_samples(result: "Result", target: Path, count: int, seed: int) -> None
     write_text(json.dumps(content, allow_nan=False) + "\n", target)
 
 
-def sample(result: "Result", count: int, rng: np.random.Generator) -> tuple[list[str], Array]:
+def sample(result: Result, count: int, rng: np.random.Generator) -> tuple[list[str], Array]:
     """Return samples of all parameters from their joint distribution.
 
     Bodies are normal with the covariance of the fit, given that all are physically possible.
@@ -170,7 +168,7 @@ def _quantile(content: Mapping[str, Any]) -> float:
     return float(np.median(own)) if own else QUANTILE
 
 
-def _nominal(result: "Result", names: list[str]) -> list[float]:
+def _nominal(result: Result, names: list[str]) -> list[float]:
     """Return the identified values of gains, delays and zeros."""
     stated = {entry["name"]: float(entry["value"]) for entry in result.content["drive_parameters"]}
     return [stated[name] for name in names]
@@ -206,7 +204,7 @@ def _drives(model: RobotModel, names: list[str], values: Array) -> dict[str, dic
     return found
 
 
-def _projected(result: "Result", values: Array) -> dict[str, dict[str, Any]]:
+def _projected(result: Result, values: Array) -> dict[str, dict[str, Any]]:
     """Return viscous and Coulomb friction and offset in place of all friction of a drive."""
     model, pi = result.identified
     drives = project_friction(model, pi, result.drive_moments, SIMULATED).drives

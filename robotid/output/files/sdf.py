@@ -9,7 +9,7 @@ import numpy as np
 
 from robotid.base.settings import require_kind
 from robotid.base.typing import Array
-from robotid.output.files.exported import Exported, Written
+from robotid.output.files.exports import Exported, Format, Written
 from robotid.output.files.links import WORLD, SimulatedLink, XmlFormat, write_model
 from robotid.output.files.result_file import Result
 from robotid.output.files.urdf import numbers_text
@@ -25,6 +25,8 @@ _ROTOR = "armature"  # stated by an element of Drake
 _TERMS = (*_DYNAMICS, _ROTOR)
 _MESHES = (".dae", ".stl", ".obj", ".glb", ".gltf")
 _SIZES = {"sphere": ("radius",), "cylinder": ("radius", "length")}
+
+FORMAT = Format("sdf", "SDF 1.9, for Gazebo and Drake", ".sdf")
 
 
 def export(result: Result, target: Path) -> Written:

@@ -13,7 +13,7 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -26,7 +26,6 @@ from robotid.base.versions import __version__
 from robotid.dynamics.friction_projection import Projection
 from robotid.dynamics.torque import random_regressor
 from robotid.output.files import xml_splice
-from robotid.output.files.exported import Exported, Written, unstated_terms
 from robotid.output.files.shape import FLAG, NUMBER, TABLE, TEXT, check_shape
 from robotid.output.files.xml_splice import Document, Edit
 from robotid.robot.bodies import (
@@ -41,9 +40,6 @@ from robotid.robot.drives import TERMS, term_from_dict
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import Coupling, pseudo_inertia
 from robotid.robot.tree import MOMENTS, Inertial
-
-if TYPE_CHECKING:
-    from robotid.output.files.result_file import Result
 
 #: The drive terms of ``<dynamics>``.
 DYNAMICS_TERMS = tuple(name for name, term in TERMS.items() if term.dynamics)
@@ -123,14 +119,6 @@ def write_urdf(
         (partial / sidecar.name).write_text(text + "\n", encoding="utf-8")
         _check_torque(model, pi, partial / goal.name, partial / sidecar.name)
     return sidecar
-
-
-def export(result: "Result", target: Path) -> Written:
-    """Write the URDF of a result with ``<dynamics>``, and its sidecar."""
-    of = Exported.of(result, DYNAMICS_TERMS)
-    sidecar = write_urdf(*result.identified, target, dynamics=of.projection)
-    unstated = unstated_terms(of.model, of.pi, "URDF", DYNAMICS_TERMS)
-    return of.written(target, sidecar, notes=[*of.notes, *unstated])
 
 
 def urdf_changes(model: RobotModel, pi: Array, *, dynamics: Projection | bool = False) -> list[str]:

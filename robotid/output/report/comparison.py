@@ -1,7 +1,8 @@
-"""Comparison of results, from their result.json files only."""
+"""Comparison of results, from their result.json files only, and its page."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -10,13 +11,18 @@ import numpy as np
 from robotid.base.exceptions import DataError
 from robotid.base.files import check_file, write_text
 from robotid.base.findings import listed
+from robotid.base.text import period
 from robotid.base.typing import Array
 from robotid.output.files.result_file import load_result
 from robotid.output.files.urdf import terms_from_facts
-from robotid.output.report.comparison_page import comparison_page
+from robotid.output.pages.charts import Chart, Series, chart_html
+from robotid.output.pages.html import Cell, block, code, listing, number, page, percent, text
+from robotid.output.report.tables import both
 from robotid.robot.drives import TERMS, DriveMotion
 
 _SPEEDS = 40  # of a friction curve, in each direction
+_FAR = 3.0  # combined standard errors beyond which a difference is in bold
+_TONES = 8
 _FILES = ("urdf", "identification", "validation")  # settings that are shown as inputs
 
 
@@ -82,20 +88,18 @@ def _short_names(paths: Sequence[str | Path]) -> dict[str, str]:
     A common end of all paths is left out, as "result.json" of folders a and b.
     """
     parts = {str(path): Path(path).resolve().parts for path in paths}
-    every = set(parts.values())
-    common = 0
-    while len(every) > 1 and len({own[-common - 1 :][:1] for own in every}) == 1:
+    every, common = set(parts.values()), 0
+    while len(every) > 1 and len({names[-common - 1 :][:1] for names in every}) == 1:
         common += 1
-    cut = {own: own[: len(own) - common] for own in every}
-    return {path: _shortest(cut[own], set(cut.values())) for path, own in parts.items()}
+    cut = {names: names[: len(names) - common] for names in every}
+    return {path: _shortest(cut[names], set(cut.values())) for path, names in parts.items()}
 
 
-def _shortest(own: tuple[str, ...], every: set[tuple[str, ...]]) -> str:
+def _shortest(names: tuple[str, ...], every: set[tuple[str, ...]]) -> str:
     """Return the shortest end that only one path has."""
-    for size in range(1, len(own)):
-        if sum(other[-size:] == own[-size:] for other in every) == 1:
-            return str(Path(*own[-size:]))
-    return str(Path(*own))
+    ends = [names[-size:] for size in range(1, len(names) + 1)]
+    unique = [end for end in ends if sum(other[-len(end) :] == end for other in every) == 1]
+    return str(Path(*(unique or [names])[0]))
 
 
 def _require_same_mapping(
@@ -326,3 +330,194 @@ def _inputs(results: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
             what = (row["role"], row["sha256"] or row["path"], row["start"], row["end"])
             found.setdefault(what, row)["in"][k] = True
     return sorted(found.values(), key=lambda row: all(row["in"]))
+
+
+# ---- the page -------------------------------------------------------------------------------
+
+
+def comparison_page(content: Mapping[str, Any]) -> str:
+    """Return the HTML of the page."""
+    sections = {
+        "errors": ("Prediction errors", _errors_section(content)),
+        "friction": ("Friction", _friction_section(content)),
+        "settings": ("Different settings", _differing(content, "settings", "setting")),
+        "base": ("Base parameters", _base_section(content)),
+        "inputs": ("Inputs", _inputs_section(content)),
+        "versions": ("Different versions", _differing(content, "versions", "package")),
+    }
+    robots = ", ".join(dict.fromkeys(result["robot"] for result in content["results"]))
+    title = f"{robots}: {len(content['results'])} results compared"
+    verdicts = "".join(map(_verdict, range(len(content["results"])), content["results"]))
+    return page(title, f"<h1>{escape(title)}</h1>\n{verdicts}", sections)
+
+
+def _verdict(k: int, result: Mapping[str, Any]) -> str:
+    return block(
+        "comparison.verdict",
+        status=escape(result["verdict"]["status"]),
+        key=_key(k),
+        label=result["label"],
+        estimator=escape(result["estimator"]),
+        path=code(result["path"]).html,
+        reasons="".join(f"<li>{escape(reason)}</li>" for reason in result["verdict"]["reasons"]),
+    )
+
+
+def _tone(k: int) -> str:
+    return f"tone-{k % _TONES + 1}"
+
+
+def _key(k: int) -> str:
+    """Return a patch in a result's colour."""
+    return (
+        '<svg width="14" height="10" style="vertical-align: baseline" aria-hidden="true">'
+        f'<path d="M0 0h14v10h-14z" fill="var(--{_tone(k)})"/></svg>'
+    )
+
+
+def _legend(content: Mapping[str, Any]) -> str:
+    """Return the legend of colours and letters of the results."""
+    keys = "".join(
+        f"<span>{_key(k)} {result['label']} {escape(result['name'])}</span> "
+        for k, result in enumerate(content["results"])
+    )
+    return f'<p class="legend">{keys}</p>\n'
+
+
+def _columns(
+    content: Mapping[str, Any], key: str, form: str, words: str = "{}"
+) -> list[tuple[str, str, str]]:
+    """Return a column for each result: its heading, the form, and "key label" as its key."""
+    labels = [result["label"] for result in content["results"]]
+    return [(words.format(label), form, f"{key} {label}") for label in labels]
+
+
+def _cells(content: Mapping[str, Any], key: str, values: Sequence[Any]) -> dict[str, Any]:
+    """Return the values of the results by the keys of their columns."""
+    labels = [result["label"] for result in content["results"]]
+    return {f"{key} {label}": x for label, x in zip(labels, values, strict=True)}
+
+
+def _errors_section(content: Mapping[str, Any]) -> str:
+    notes = "".join(f"<li>{escape(note)}</li>" for note in content["notes"])
+    tables = ""
+    for entry in content["validation"]:
+        caption = f"{entry['name']} {period(entry['start'], entry['end'])}: not fitted"
+        tables += _error_table(caption, content, entry["per_joint"], are_alike=True)
+    are_alike = content["fitted_alike"]
+    tables += "" if are_alike else block("comparison.not_alike")
+    tables += _error_table("Fitted samples of each result", content, content["fitted"], are_alike)
+    notes = f"<ul>{notes}</ul>\n" if notes else ""
+    return block("comparison.errors", legend=_legend(content), notes=notes, tables=tables)
+
+
+def _error_table(
+    caption: str, content: Mapping[str, Any], rows: Sequence[Mapping[str, Any]], are_alike: bool
+) -> str:
+    columns = [
+        ("joint", "code", "joint"),
+        *_columns(content, "error", "%", "{} %"),
+        *_columns(content, "rmse", ".3g", "{} RMSE"),
+        ("unit", "text", "unit"),
+    ]
+    entries = [
+        entry
+        | _cells(content, "error", _percents(entry["relative_error_pct"], are_alike))
+        | _cells(content, "rmse", entry["rmse"])
+        for entry in map(dict, rows)
+    ]
+    return listing(caption, columns, entries)
+
+
+def _percents(errors: Sequence[float | None], are_alike: bool) -> list[Cell]:
+    """Return the errors, the smallest in bold if they are comparable and it is unique."""
+    cells = [percent(error) for error in errors]
+    known = [(error, cell.html) for error, cell in zip(errors, cells, strict=True) if error]
+    least = min(known)[1] if known and are_alike else ""
+    if len(known) < 2 or [html for _, html in known].count(least) != 1:
+        return cells
+    return [_bold(cell) if cell.html == least else cell for cell in cells]
+
+
+def _bold(cell: Cell) -> Cell:
+    return Cell(f"<strong>{cell.html}</strong>", "number", cell.value)
+
+
+def _friction_section(content: Mapping[str, Any]) -> str:
+    charts = "".join(_friction_figure(content["results"], entry) for entry in content["friction"])
+    if not charts:
+        return "<p>No result has friction curves with a range of speeds.</p>\n"
+    return block("comparison.friction", legend=_legend(content), charts=charts)
+
+
+def _friction_figure(results: Sequence[Mapping[str, Any]], entry: Mapping[str, Any]) -> str:
+    v, unit = np.array(entry["speeds"]), entry["unit"]
+    series = tuple(  # with a gap at speed 0, where the sign changes
+        Series(result["label"], np.where(v == 0, np.nan, np.array(torque)), _tone(k))
+        for k, (result, torque) in enumerate(zip(results, entry["torques"], strict=True))
+        if torque is not None
+    )
+    title = f"Friction of {entry['joint']} over its speed, by result"
+    speed = f"speed [{'rad/s' if unit == 'N m' else 'm/s'}]"
+    chart = Chart(title, v, series, speed, f"friction [{unit}]", height=150)
+    loads = ", ".join(
+        f"{result['label']} {load:.3g}"
+        for result, load in zip(results, entry["load"], strict=True)
+        if load is not None
+    )
+    of_load = f"; additional friction per {unit} of load: {loads}" if loads else ""
+    return chart_html(chart, f"<strong>{escape(entry['joint'])}</strong>{of_load}")
+
+
+def _base_section(content: Mapping[str, Any]) -> str:
+    _, *others = _columns(content, "difference", ".1f", "({} − A) / s")
+    columns = [
+        ("parameter", "code", "name"),
+        *others,
+        *_columns(content, "value", ".4g"),
+        ("unit", "text", "unit"),
+    ]
+    entries, different = [], 0
+    for entry in map(dict, content["base_parameters"]):
+        cells = [percent(None), *map(_far_in_bold, entry["differences"])]
+        different += any("strong" in cell.html for cell in cells)
+        values = list(_stated(entry))
+        rows = _cells(content, "difference", cells) | _cells(content, "value", values)
+        entries.append(entry | rows)
+    table = listing("Base parameters ± standard errors", columns, entries, is_data=True)
+    figures = {"different": different, "count": len(entries), "far": f"{_FAR:g}"}
+    return block("comparison.base", table=table, **figures)
+
+
+def _stated(entry: Mapping[str, Any]) -> Iterator[Cell]:
+    """Yield each value with its standard error, to the digits of the error."""
+    for value, error in zip(entry["values"], entry["std_errors"], strict=True):
+        yield both(math.nan if value is None else value, math.inf if error is None else error)
+
+
+def _far_in_bold(difference: float | None) -> Cell:
+    shown = number(difference, "z.1f")
+    return _bold(shown) if difference is not None and abs(difference) > _FAR else shown
+
+
+def _differing(content: Mapping[str, Any], key: str, head: str) -> str:
+    entries = [
+        {"name": row["name"], **_cells(content, "value", [value or "–" for value in row["values"]])}
+        for row in content[key]
+    ]
+    columns = [(head, "code", "name"), *_columns(content, "value", "text")]
+    return listing(f"Different {key}", columns, entries) or "<p>None.</p>\n"
+
+
+def _inputs_section(content: Mapping[str, Any]) -> str:
+    columns = [
+        ("role", "text", "role"), *_columns(content, "in", "text"), ("file", "code", "path"),
+        ("from s", ".6g", "start"), ("to s", ".6g", "end"), ("SHA-256", "code", "sha256"),
+    ]  # fmt: skip
+    entries = [
+        row
+        | _cells(content, "in", [text("yes" if x else "no", flag=not x) for x in row["in"]])
+        | {"sha256": row["sha256"] or "not read from a file"}
+        for row in map(dict, content["inputs"])
+    ]
+    return listing("Files read, different ones first", columns, entries)

@@ -9,11 +9,25 @@ from typing import Any
 import numpy as np
 
 from robotid.output.pages.charts import Chart, Series, chart_html
-from robotid.output.pages.html import code, facts_html, number, page, table, text, with_error
+from robotid.output.pages.html import block, facts_html, listing, page, with_error
 
 _BINS = 24  # of a distribution, at most
 _CHARTS = 12  # distributions on the page, those with the largest spread
 _ROWS = 20  # failures on the page, and units that differ; all are in the files of results
+_FAILURES = (
+    ("unit", "code", "unit"), ("log", "code", "log"), ("alike", "d", "alike"),
+    ("error", "text", "error"),
+)  # fmt: skip
+_UNLIKE = (
+    ("unit", "code", "unit"), ("parameter", "code", "parameter"), ("value", ".4g", "value"),
+    ("± error", ".4g", "std_error"), ("low", ".4g", "low"), ("high", ".4g", "high"),
+    ("unit of value", "text", "parameter_unit"),
+)  # fmt: skip
+_PARAMETERS = (
+    ("parameter", "code", "name"), ("robot", "text", "robot"), ("units", "d", "units"),
+    ("mean", ".4g", "mean"), ("± error", ".4g", "std_error"), ("spread", ".4g", "spread"),
+    ("low", ".4g", "low"), ("high", ".4g", "high"), ("unit", "text", "unit"),
+)  # fmt: skip
 
 
 def fleet_page(content: Mapping[str, Any]) -> str:
@@ -24,7 +38,7 @@ def fleet_page(content: Mapping[str, Any]) -> str:
         "Logs": str(content["logs"]),
         "Verdicts": ", ".join(f"{n} {escape(v)}" for v, n in content["verdicts"].items()) or "none",
         "Failures": str(len(failures)),
-        "Units that differ": str(len({each["unit"] for each in unlike})),
+        "Units that differ": str(len({entry["unit"] for entry in unlike})),
     }
     sections = {
         "failures": ("Failures", _failures(content)),
@@ -39,23 +53,15 @@ def fleet_page(content: Mapping[str, Any]) -> str:
 def _failures(content: Mapping[str, Any]) -> str:
     """Return the failures, the first of each kind first."""
     failures = content["failures"]
-    if not failures:
-        return "<p>None.</p>\n"
-    kinds = [_kind(each) for each in failures]
+    kinds = [_kind(failure) for failure in failures]
     count, first = Counter(kinds), {kind: k for k, kind in reversed([*enumerate(kinds)])}
     order = sorted(range(len(kinds)), key=lambda k: (first[kinds[k]] != k, k))
     rows = [
-        [
-            code(failures[k]["unit"]),
-            code(failures[k]["log"] or "all"),
-            number(count[kinds[k]], "d"),
-            text(failures[k]["error"]),
-        ]
+        failures[k] | {"log": failures[k]["log"] or "all", "alike": count[kinds[k]]}
         for k in order[:_ROWS]
     ]
-    headers = ["unit", "log", "alike", "error"]
-    shown = table("Units and logs that were not identified", headers, rows)
-    return shown + _more(len(failures), "fleet.parquet")
+    table = listing("Units and logs that were not identified", _FAILURES, rows)
+    return table + _more(len(failures), "fleet.parquet") if table else "<p>None.</p>\n"
 
 
 def _kind(failure: Mapping[str, str]) -> str:
@@ -68,71 +74,53 @@ def _kind(failure: Mapping[str, str]) -> str:
 
 def _more(count: int, file: str) -> str:
     """Return a note on the rows that are not shown."""
-    more = count - _ROWS
-    return f"<p>{more} more are in <code>{file}</code>.</p>\n" if more > 0 else ""
+    return block("fleet.more", count=count - _ROWS, file=file) if count > _ROWS else ""
+
+
+def _with_errors(entry: Mapping[str, Any], value: str, ends: str) -> dict[str, Any]:
+    """Return an entry with its value and ends to the digits of its standard error."""
+    error = entry["std_error"]
+    digits, std_error = with_error(entry[value], error)
+    low, high = (with_error(x, error)[0] for x in entry[ends])
+    return {**entry, value: digits, "std_error": std_error, "low": low, "high": high}
 
 
 def _unlike(content: Mapping[str, Any]) -> str:
-    rows = [
-        [
-            code(each["unit"]),
-            code(each["parameter"]),
-            *with_error(each["value"], each["std_error"]),
-            *(with_error(x, each["std_error"])[0] for x in each["others"]),
-            text(each["parameter_unit"]),
-        ]
-        for each in content["unlike"][:_ROWS]
-    ]
-    if not rows:
-        return "<p>None.</p>\n"
-    headers = ["unit", "parameter", "value", "± error", "low", "high", "unit of value"]
-    return (
-        "<p>Units outside what the others predict (low to high: 95 %), the least probable first. A "
-        "fleet of alike units has one with a probability of about 2 %. Look for a payload, a "
-        "changed gain, wear or a wrong URDF.</p>\n"
-        + table("Units that differ from the others", headers, rows, is_data=True)
-        + _more(len(content["unlike"]), "fleet.json")
-    )
+    rows = [_with_errors(entry, "value", "others") for entry in content["unlike"][:_ROWS]]
+    table = listing("Units that differ from the others", _UNLIKE, rows, is_data=True)
+    more = _more(len(content["unlike"]), "fleet.json")
+    return block("fleet.unlike") + table + more if table else "<p>None.</p>\n"
 
 
 def _parameters(content: Mapping[str, Any]) -> str:
-    rows = []
-    for each in content["parameters"]:
-        mean, error = with_error(each["mean"], each["std_error"])
-        low, high = (with_error(x, each["std_error"])[0] for x in each["next_interval"])
-        spread = with_error(each["spread"], each["spread"])[1]
-        rows.append(
-            [code(each["name"]), text(each["robot"]), number(each["units"], "d"), mean, error,
-             spread, low, high, text(each["unit"])]
-        )  # fmt: skip
-    if not rows:
+    rows = [
+        _with_errors(entry, "mean", "next_interval")
+        | {"spread": with_error(entry["spread"], entry["spread"])[1]}
+        for entry in content["parameters"]
+    ]
+    table = listing("Base parameters of the units", _PARAMETERS, rows, is_data=True)
+    if not table:
         return "<p>Fewer than three units of one robot were identified.</p>\n"
-    headers = ["parameter", "robot", "units", "mean", "± error", "spread", "low", "high", "unit"]
-    return (
-        "<p>Mean with its standard error, standard deviation between units (spread), and the 95 % "
-        "prediction interval of the next unit (low to high), without units that differ.</p>\n"
-        + table("Base parameters of the units", headers, rows, is_data=True)
-    )
+    return block("fleet.parameters") + table
 
 
 def _distributions(content: Mapping[str, Any]) -> str:
     """Return histograms, those with the largest spread relative to the mean's error first."""
     every = sorted(content["parameters"], key=lambda e: -e["spread"] / (abs(e["mean"]) or 1.0))
-    shown = every[:_CHARTS]
-    note = f"<p>{len(shown)} of {len(every)}, those with the largest relative spread.</p>\n"
-    charts = "".join(map(_histogram, shown))
-    return f'{note if len(every) > len(shown) else ""}<div class="plots">\n{charts}</div>\n'
+    first = every[:_CHARTS]
+    note = block("fleet.largest", shown=len(first), count=len(every)) if every[_CHARTS:] else ""
+    return f'{note}<div class="plots">\n{"".join(map(_histogram, first))}</div>\n'
 
 
 def _histogram(entry: Mapping[str, Any]) -> str:
     values = np.array(entry["values"])
     count, edges = np.histogram(values, bins=min(_BINS, max(4, len(values) // 2)))
     chart = Chart(
-        title=f"Distribution of {entry['name']} over units",
-        x=(edges[1:] + edges[:-1]) / 2,
-        series=(Series("units", count.astype(float), "tone-1", "bars"),),
-        x_label=f"{entry['name']} [{entry['unit']}]",
-        y_label="units",
+        f"Distribution of {entry['name']} over units",
+        (edges[1:] + edges[:-1]) / 2,
+        (Series("units", count.astype(float), "tone-1", "bars"),),
+        f"{entry['name']} [{entry['unit']}]",
+        "units",
         height=120,
         marks=tuple(entry["next_interval"]),
     )

@@ -16,8 +16,7 @@ from robotid.identification.closed_loop.position_errors import (
     PositionEvaluation,
     pool_positions,
 )
-from robotid.output.files.entries import input_entries
-from robotid.output.files.loop_export import loop_parameters
+from robotid.output.files.entries import input_entries, loop_parameters
 from robotid.output.pages.charts import Chart, Series, chart_html
 from robotid.output.pages.html import block, code, number, table, text
 from robotid.output.report.dock import Residual

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
-from robotid.output.files.export_formats import FORMATS
+from robotid.output.files.exports import formats
 
 MOST = 3
 NAMED = 4  # joints that a step names
@@ -85,7 +85,7 @@ def _key(flag: str, value: str) -> tuple[str, str]:
 def exports_of(robot: str, origin: Origin, *, has_gains: bool = False) -> list[Step]:
     """Return the exports of a result to the formats that can use it."""
     steps = []
-    for name, form in FORMATS.items():
+    for name, form in formats().items():
         if words := form.use_of_gains if has_gains else form.use:
             target = f"{robot or 'robot'}{form.suffix}"
             stated = (f"{origin.folder}/result.json", "--format", name, "--out", target)

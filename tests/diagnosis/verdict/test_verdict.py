@@ -7,7 +7,7 @@ from helpers.synthetic import exact_log, truth
 from robotid.base.findings import Finding
 from robotid.cli.identify import run_job
 from robotid.cli.job import job_from_settings
-from robotid.cli.validate import validate_result
+from robotid.cli.validate import validate
 from robotid.data.files.read import write_log
 from robotid.diagnosis.verdict.evidence import Determined, Predictions, is_beaten
 from robotid.diagnosis.verdict.scale_check import ScaleCheck
@@ -454,7 +454,7 @@ def run(arm, tmp_path):
         }
         out = tmp_path / "out"
         found, result = run_job(job_from_settings(table, "job.toml", tmp_path), out)
-        again = validate_result(out / "result.json", [tmp_path / "kept.csv"])
+        again = validate(out / "result.json", [tmp_path / "kept.csv"])
         return found, result, again["verdict"]
 
     return runner

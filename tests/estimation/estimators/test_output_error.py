@@ -7,8 +7,7 @@ from scipy.signal import lfilter
 
 from robotid.base.exceptions import DataError, NotConvergedError
 from robotid.estimation.estimators import Estimator, output_error
-from robotid.estimation.estimators.output_error import OutputError, _freed, linearised
-from robotid.estimation.estimators.simulator import Residual
+from robotid.estimation.estimators.output_error import OutputError, Residual, _freed, linearised
 
 DT, RHO, SIGMA = 0.02, 0.9, 0.02
 TRUTH = np.array([1.5, 0.3, 0.1])  # gain, time constant [s], offset
@@ -126,73 +125,6 @@ def test_standard_errors_are_the_scatter_of_many_noises():
     assert ((ratio > 0.8) & (ratio < 1.25)).all(), ratio
     bias = (theta.mean(axis=0) - TRUTH) / (theta.std(axis=0) / np.sqrt(60))
     assert np.abs(bias).max() < 4
-
-
-class Neglecting(Lagging):
-    """The same, whose derivatives of later samples are too small, the time's too large."""
-
-    def residuals(self, theta, *, with_slopes, with_starts=False):
-        found = super().residuals(theta, with_slopes=with_slopes)
-        if not with_slopes:
-            return found
-        fading = np.linspace(1.0, 0.4, self.told.shape[1])[:, None, None] * np.array(
-            [1.0, 2.0, 1.0]
-        )
-        return [replace(r, slopes=r.slopes * fading) for r in found]
-
-
-def neglecting(lag):
-    return Neglecting(**{name: getattr(lag, name) for name in lag.__dataclass_fields__})
-
-
-def test_inexact_slopes_end_where_they_see_no_residual(rng):
-    lag = lagging(rng, sigma=1e-9)
-    exact = OutputError().fit(neglecting(lag), START, exact=lag)
-    np.testing.assert_allclose(exact.theta, TRUTH, rtol=1e-6)
-    lag = lagging(rng, rho=0.0, windows=8)
-    own = neglecting(lag)
-    found = OutputError(whitens=False).fit(own, START, exact=lag)
-    A, e = (
-        np.concatenate([getattr(r, name) for r in own.residuals(found.theta, with_slopes=True)])
-        for name in ("slopes", "e")
-    )
-    assert found.converged
-    g = A[:, 0].T @ e[:, 0] / found.sigma[0] ** 2  # 0 but for a tenth of a standard error
-    assert g @ np.linalg.solve(A[:, 0].T @ A[:, 0] / found.sigma[0] ** 2, g) < 0.02
-    S = np.concatenate([r.slopes for r in lag.residuals(found.theta, with_slopes=True)])[:, 0]
-    left = np.eye(3) - np.linalg.solve(A[:, 0].T @ A[:, 0], A[:, 0].T @ S)
-    largest = np.abs(np.linalg.eigvals(left)).max()
-    assert found.details["left"] == pytest.approx(largest, rel=1e-3)
-    assert 0.2 < largest < 0.9
-    plain = OutputError(whitens=False).fit(lag, START)
-    assert np.abs(found.theta - plain.theta).max() > 1e-4, "another equation has another root"
-
-
-def test_errors_of_inexact_slopes_are_the_scatter_of_many_noises():
-    rng = np.random.default_rng(6)
-    draws = []
-    for _ in range(40):
-        lag = lagging(rng, rho=0.0, windows=8)
-        draws.append(OutputError(whitens=False).fit(neglecting(lag), TRUTH, exact=lag))
-    theta = np.array([d.theta for d in draws])
-    ratio = np.mean([d.std_error for d in draws], axis=0) / theta.std(axis=0)
-    assert ((ratio > 0.75) & (ratio < 1.35)).all(), ratio
-
-
-def test_slopes_that_are_far_too_small_never_settle(rng):
-    lag = lagging(rng, rho=0.0, windows=8)
-    own = neglecting(lag)
-
-    class Small(Neglecting):
-        def residuals(self, theta, *, with_slopes, with_starts=False):
-            found = super().residuals(theta, with_slopes=with_slopes)
-            return [replace(r, slopes=0.2 * r.slopes) for r in found] if with_slopes else found
-
-    small = Small(**{name: getattr(own, name) for name in own.__dataclass_fields__})
-    found = OutputError(whitens=False).fit(small, TRUTH, exact=lag)
-    assert found.details["left"] > 1
-    assert not found.converged
-    assert found.n_iter == 25, "one round"
 
 
 def test_correlated_noise_does_not_make_plain_squares_sure(rng):

@@ -15,9 +15,9 @@ from helpers.paths import DOCS, ROOT
 
 from robotid.base.exceptions import SettingsError
 from robotid.cli import main
-from robotid.cli.export import export_result
-from robotid.output.files.export_formats import FORMATS, Format, Option
-from robotid.output.files.exported import Written
+from robotid.cli.export import export
+from robotid.output.files import exports
+from robotid.output.files.exports import Format, Option, Written, formats, writers
 from robotid.output.files.result_file import load_result
 from robotid.output.report.steps import Origin, exports_of
 from robotid.robot.urdf_text import read_with_yourdfpy
@@ -54,10 +54,10 @@ def result(tmp_path_factory):
     return written_result(leg, tmp_path_factory.mktemp("formats") / "out")
 
 
-@pytest.mark.parametrize("kind", FORMATS)
+@pytest.mark.parametrize("kind", formats())
 def test_each_format_is_read_back_by_its_consumer(kind, result, tmp_path):
-    target = tmp_path / f"robot{FORMATS[kind].suffix}"
-    done = export_result(result, kind, target)
+    target = tmp_path / f"robot{formats()[kind].suffix}"
+    done = export(result, kind, target)
     assert done["files"][0] == str(target)
     loaded = load_result(result)
     for drive in loaded.commanded:
@@ -68,7 +68,7 @@ def test_the_pages_name_each_format():
     readme, page = (
         path.read_text() for path in (ROOT / "README.md", DOCS / "reference" / "export_formats.md")
     )
-    for kind in FORMATS:
+    for kind in formats():
         assert re.search(rf"`{kind}`|--format {kind} ", readme)
         assert f"--format {kind} --out" in page
 
@@ -76,33 +76,39 @@ def test_the_pages_name_each_format():
 def test_each_option_goes_to_the_formats_that_have_it_alone(result, tmp_path):
     refused = {
         (kind, name)
-        for kind in FORMATS
+        for kind in formats()
         for name in ("step", "delay")
-        if name not in FORMATS[kind].options
+        if name not in formats()[kind].options
     }
     assert {kind for kind, _ in refused} == {"urdf", "sdf", "isaac", "ranges"}
     for kind, name in refused:
         with pytest.raises(SettingsError, match=rf"--{name} is an option of .*mjcf.*, not of"):
-            export_result(result, kind, tmp_path / "a", **{name: 1})
-    with pytest.raises(SettingsError, match="format is 'obj', wanted one of urdf, mjcf"):
-        export_result(result, "obj", tmp_path / "a")
+            export(result, kind, tmp_path / "a", **{name: 1})
+    with pytest.raises(SettingsError, match="format is 'obj', wanted one of urdf, isaac, mjcf"):
+        export(result, "obj", tmp_path / "a")
     assert not list(tmp_path.iterdir())
 
 
-def test_a_new_format_is_a_module_and_its_entry(result, tmp_path, capsys, monkeypatch):
+def test_a_new_format_is_a_module(result, tmp_path, capsys, monkeypatch):
+    names = ["exports", "isaac", "mjcf", "ranges", "sdf", "toy"]
+
     def export(result, target, *, grain="fine"):
         target.write_text(f"{result.robot.name} {grain}")
         return Written((target,), ["no place for gears"], {})
 
-    toy = Format("a toy", ".toy", use_of_gains="Play with it.",
+    toy = Format("toy", "a toy", ".toy", use_of_gains="Play with it.",
                  options={"grain": Option("size of its grains", "G")})  # fmt: skip
-    monkeypatch.setitem(FORMATS, "toy", toy)
-    monkeypatch.setitem(sys.modules, "robotid.output.files.toy", SimpleNamespace(export=export))
+    monkeypatch.setattr(
+        exports.pkgutil, "iter_modules", lambda _: [SimpleNamespace(name=x) for x in names]
+    )
+    module = SimpleNamespace(export=export, FORMAT=toy)
+    monkeypatch.setitem(sys.modules, "robotid.output.files.toy", module)
+    writers.cache_clear()
 
     with pytest.raises(SystemExit):
         main(["export", "--help"])
     said = " ".join(capsys.readouterr().out.split())
-    assert "isaac,ranges,toy}" in said
+    assert ",sdf,toy}" in said
     assert "toy: a toy" in said
     assert "--grain G toy: size of its grains" in said
     words = ["export", str(result), "--format", "toy", "--out", str(tmp_path / "a.toy")]
@@ -112,3 +118,4 @@ def test_a_new_format_is_a_module_and_its_entry(result, tmp_path, capsys, monkey
     last = exports_of("go2", Origin((), "out"), has_gains=True)[-1]
     assert last.words == "Play with it."
     assert last.blocks[0].endswith(".toy")
+    writers.cache_clear()

@@ -10,6 +10,8 @@ from helpers.synthetic import exact_log, truth
 
 import robotid
 from robotid.base.exceptions import DataError
+from robotid.cli.identify import run_job
+from robotid.cli.job import read_job
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
 from robotid.robot.model import RobotModel
 
@@ -29,7 +31,7 @@ def written(tmp_path_factory):
         '[[identification]]\nlog = "first.csv"\n'
         '[[validation]]\nlog = "second.csv"\n'
     )
-    found, _ = robotid.run_job(robotid.read_job(folder / "job.toml"), folder / "out")
+    found, _ = run_job(read_job(folder / "job.toml"), folder / "out")
     return folder / "out", found
 
 

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from helpers.crane import RATES, STARTS
 
-from robotid.output.files.entries import input_entries
-from robotid.output.files.loop_export import (
+from robotid.output.files.entries import (
     _covariance,
+    input_entries,
     loop_entries,
     loop_parameters,
 )

@@ -13,7 +13,7 @@ from scipy.spatial.distance import pdist
 
 from robotid.base.exceptions import ModelError
 from robotid.output.files.commanded import CommandedDrive
-from robotid.output.files.exported import unstated_terms
+from robotid.output.files.exports import unstated_terms
 from robotid.output.files.mjcf import write_mjcf
 from robotid.robot.closure import Chains
 from robotid.robot.constraints import Loop

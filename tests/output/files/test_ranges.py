@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from robotid.data.log import Trajectory
 from robotid.dynamics.friction_projection import drive_moments, project_friction
 from robotid.output.files.entries import build_result
+from robotid.output.files.exports import yaml_text
 from robotid.output.files.ranges import (
     body_ranges,
     parameter_ranges,
@@ -20,7 +21,6 @@ from robotid.output.files.ranges import (
     stated_ranges,
     write_ranges,
 )
-from robotid.output.files.yaml_text import yaml_text
 from robotid.robot.drives import Stribeck
 from robotid.robot.parameters import pseudo_inertia
 
