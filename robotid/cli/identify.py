@@ -8,7 +8,6 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from robotid.base.arguments import checked
 from robotid.base.exceptions import DataError, SettingsError
 from robotid.base.files import check_folder, folder_beside, remove_written, write_json
 from robotid.base.settings import require_flag, require_kind
@@ -72,7 +71,6 @@ _log = logging.getLogger(__name__)
 _NO_LOGS: tuple[Log, ...] = ()
 
 
-@checked("progress")
 def identify(
     model: RobotModel | str | Path,
     logs: Readable | Sequence[Readable] | None = None,
@@ -121,6 +119,7 @@ def identify(
         NotConvergedError: If a solver fails, or the closed loop cannot be simulated.
         SettingsError: If a setting is out of range, or a code to ignore is unknown.
     """
+    require_kind(progress, (Callable, type(None)), "progress", "a function")  # type: ignore[arg-type]
     if logs is None:
         job = job_file(model)
         if not (validation is _NO_LOGS and signals is controller is None and not ignore):
@@ -193,7 +192,6 @@ def run_job(
     return _write(found, _job_of(found), target, source=source)
 
 
-@checked("identification")
 def save_result(
     identification: Identification,
     folder: str | Path,
@@ -222,6 +220,8 @@ def save_result(
         ModelError: If the URDF of the robot no longer exists.
         SettingsError: If the folder is a file, or is not writable.
     """
+    kind = "a robotid.Identification"
+    require_kind(identification, Identification, "identification", kind)
     require_kind(folder, (str, Path), "folder", "the path of a folder")
     require_kind(report, bool, "report", "True or False")
     require_kind(replay, bool, "replay", "True or False")
