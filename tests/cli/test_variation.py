@@ -16,6 +16,7 @@ from robotid.cli.logs import survey_logs
 from robotid.cli.validate import _show as show_validation
 from robotid.cli.validate import validate
 from robotid.data.files.read import write_log
+from robotid.dynamics.torque import joint_torque_regressor
 from robotid.estimation.fitting.recorded import Recordings
 from robotid.estimation.variation.groups import runs_of, sums_of
 from robotid.estimation.variation.variation import SCORES, vary
