@@ -36,7 +36,7 @@ PINOCCHIO = {"robot", "dynamics", "output/viewer"}
 INSIDE_FUNCTIONS = {
     "yourdfpy": {"robot"},
     "meshcat": {"output/viewer"},
-    "trimesh": {"robot"},
+    "trimesh": {"robot", "output/viewer"},
     "pandas": {"diagnosis/verdict"},
     "pyarrow": {"data/files"},
     "rosbags": {"data/files"},

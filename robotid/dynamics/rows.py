@@ -83,28 +83,38 @@ class InertialRows:
         return np.stack([stacked[own].T @ self.values[i:j] for own, (i, j) in rows], axis=-1)
 
 
+def inertial_columns(model: RobotModel, q: Array, v: Array, a: Array) -> Array:
+    """Return the inertial columns that affect each row, row by row, shape (sum of c_j, N)."""
+    columns = _inertial_support(model)
+    plan = plan_rows(model.layout, columns)
+    out = np.empty((plan.first[-1], min(BLOCK, len(q))))
+    writer, places = _PinocchioWriter(model, plan, out), np.concatenate(plan.places)
+    values = np.empty((len(places), len(q)))
+    for start in range(0, len(q), BLOCK):
+        k = slice(start, min(start + BLOCK, len(q)))
+        writer.write_inertial(q[k], v[k], a[k])
+        values[:, k] = out[places, : k.stop - k.start]
+    return values
+
+
 def keep_inertial_rows(model: RobotModel, trajectory: Trajectory) -> None:
     """Compute the inertial columns of a trajectory once and store them with it.
 
     They are not stored if they are too many, or if compiled code computes them faster than they can
     be read from memory.
     """
-    size, samples = model.layout.n_inertial, len(trajectory.t)
-    columns = tuple(np.flatnonzero(row[:size]) for row in model.support())
-    number = samples * sum(map(len, columns))
+    columns, samples = _inertial_support(model), len(trajectory.t)
+    is_large = 8 * samples * sum(map(len, columns)) > _MOST_BYTES
     is_stored = kept_rows(model, trajectory) is not None
-    if is_stored or 8 * number > _MOST_BYTES or choose_engine(model, samples, None) == COMPILED:
+    if is_stored or is_large or choose_engine(model, samples, None) == COMPILED:
         return
-    plan = plan_rows(model.layout, columns)
-    out = np.empty((plan.first[-1], samples))
-    writer, m = _PinocchioWriter(model, plan, out[:, :BLOCK]), trajectory
-    values = np.empty((sum(map(len, columns)), samples))
-    place = np.concatenate(plan.places)
-    for start in range(0, samples, BLOCK):
-        k = slice(start, min(start + BLOCK, samples))
-        writer.write_inertial(m.q[k], m.v[k], m.a[k])
-        values[:, k] = out[place, : k.stop - k.start]
+    values = inertial_columns(model, trajectory.q, trajectory.v, trajectory.a)
     trajectory.derived["inertial rows"] = InertialRows(model.pin_model, columns, values)
+
+
+def _inertial_support(model: RobotModel) -> tuple[Array, ...]:
+    """Return the indices of the inertial parameters of each row, n_rows arrays."""
+    return tuple(np.flatnonzero(row[: model.layout.n_inertial]) for row in model.support())
 
 
 def kept_rows(model: RobotModel, trajectory: Trajectory) -> InertialRows | None:
@@ -148,8 +158,7 @@ class TrajectoryRows(RowSource):
         return tuple(np.flatnonzero(row) for row in self.support[:, self.selected])
 
     def rows(self, start: int, stop: int) -> Array:
-        used: Array = np.count_nonzero(self.weights[start:stop] > 0, axis=0)
-        return used
+        return np.asarray(np.count_nonzero(self.weights[start:stop] > 0, axis=0))
 
     def select(self, columns: Array) -> "TrajectoryRows":
         return replace(self, selected=self.selected[columns])

@@ -15,7 +15,7 @@ from robotid.data.log import Trajectory
 from robotid.dynamics.constraint_rows import ProjectedRows, loop_basis, mixed_rows, without_forces
 from robotid.dynamics.drive_columns import drive_values, friction_directions, instant_state
 from robotid.dynamics.problem import Block, Problem, RowSource
-from robotid.dynamics.rows import BLOCK, kept_rows, trajectory_rows
+from robotid.dynamics.rows import BLOCK, inertial_columns, kept_rows, trajectory_rows
 from robotid.robot.closure import Chains
 from robotid.robot.drives import TERMS, DriveMotion
 from robotid.robot.model import RobotModel
@@ -38,12 +38,20 @@ def joint_torque_regressor(
     The columns are those of the ten inertial parameters of each body, from Pinocchio, and then of
     the drives: ``tau_j = Ia a_j + Fv v_j + Fc sign(v_j) + off``, likewise for couplings.
 
+    Args:
+        model: The robot.
+        q: Positions, shape (N, n) [rad, m].
+        v: Velocities, shape (N, n_rows) [rad/s, m/s].
+        a: Accelerations, shape (N, n_rows) [rad/s^2, m/s^2].
+        direction: Directions of friction, shape (N, c); the signs of the speeds if None.
+        memory: Columns with internal state or load, shape (N, m); steady ones if None.
+
+    Returns:
+        Y, shape (N n_rows, p).
+
     References:
         Atkeson, An, Hollerbach (1986), Estimation of Inertial Parameters of Manipulator Loads and
         Links; Carpentier et al. (2019), The Pinocchio C++ library.
-
-    q (N, n) [rad, m], v (N, n_rows) [rad/s, m/s], a (N, n_rows) [rad/s^2, m/s^2], direction (N,
-    c), memory (N, m) -> (N n_rows, p).
     """
     _check_motion(model, q, v, a)
     Y = np.empty((len(q), model.n_rows, len(model.layout.names)))
@@ -57,39 +65,18 @@ def joint_torque_regressor(
 
 
 def carried_columns(model: RobotModel, q: Array, v: Array, a: Array) -> Array:
-    """Return the inertial columns of the bodies that affect each row.
+    """Return the inertial columns of the bodies that affect each row, shape (N, columns).
 
     For robots with many joints they are a tenth of the regressor.
-
-    q (N, n) [rad, m], v (N, n_rows) [rad/s, m/s], a (N, n_rows) [rad/s^2, m/s^2] -> (N,
-    columns).
     """
     _check_motion(model, q, v, a)
-    carried = model.support()[:, : model.layout.n_inertial]
-    found = np.empty((len(q), int(carried.sum())))
-    G = model.velocity_map
-    if not np.array_equal(G, np.eye(len(G))):
-        for first in range(0, len(q), _INSTANTS):
-            part = slice(first, first + _INSTANTS)
-            Y = np.empty((len(q[part]), *carried.shape))
-            _write_inertial(model, q[part], v[part], a[part], Y)
-            found[part] = Y[:, carried]
-        return found
-    pin_model, wanted = model.pin_model, np.flatnonzero(carried)
-    data, regressor = pin_model.createData(), pin.computeJointTorqueRegressor
-    instants = zip(found, np.ascontiguousarray(model.configurations(q)), v, a, strict=True)
-    for found_k, q_k, v_k, a_k in instants:
-        regressor(pin_model, data, q_k, v_k, a_k).take(wanted, None, found_k, "clip")
-    return found
+    return np.ascontiguousarray(inertial_columns(model, q, v, a).T)
 
 
 def trajectory_regressor(
     model: RobotModel, trajectory: Trajectory, samples: Array | None = None
 ) -> Array:
-    """Return the regressor of N samples of a trajectory, shape (N n_rows, p).
-
-    As ``joint_torque_regressor``; inertial columns stored with the trajectory are used.
-    """
+    """Return the regressor of N samples of a trajectory, with stored inertial columns if any."""
     m = trajectory if samples is None else trajectory.at(samples)
     stored, layout = kept_rows(model, trajectory), model.layout
     if stored is None or (m.memory is None and layout.remembering):
@@ -107,8 +94,6 @@ def mass_regressor(model: RobotModel, q: Array) -> Array:
 
     References:
         Tzvetkova, Extracting Inertial Parameters from Robotic Manipulators Dynamics, (11), (13).
-
-    q (N, n) [rad, m].
     """
     N, n = len(q), model.n_rows
     still = np.zeros((N, n))
@@ -121,7 +106,7 @@ def mass_regressor(model: RobotModel, q: Array) -> Array:
 
 
 class InstantRegressor:
-    """The regressor of one sample at a time, without repeated initialisation: columns (c,)."""
+    """Some columns (c,) of the regressor, one sample at a time, without repeated initialisation."""
 
     def __init__(self, model: RobotModel, columns: Array) -> None:
         if model.free_flyer:
@@ -144,10 +129,7 @@ class InstantRegressor:
         self._is_uniform = not (layout.couplings or layout.own or layout.passive)
 
     def __call__(self, q: Array, v: Array, a: Array) -> Array:
-        """Return the regressor of one sample, shape (n, c), as of ``joint_torque_regressor``.
-
-        q (n,) [rad, m], v (n,) [rad/s, m/s], a (n,) [rad/s^2, m/s^2].
-        """
+        """Return the regressor of one sample, shape (n, c), as of ``joint_torque_regressor``."""
         model, layout, Y = self._model, self._model.layout, self._Y
         x = q if self._is_plain else model.configurations(q[None])[0]
         regressor, G = pin.computeJointTorqueRegressor, self._map
@@ -168,10 +150,7 @@ class InstantRegressor:
         return Y[:, self._columns]
 
     def mass(self, q: Array) -> Array:
-        """Return the regressor of the mass matrix, shape (n, n, c); see ``mass_regressor``.
-
-        q (n,) [rad, m].
-        """
+        """Return the regressor of the mass matrix, shape (n, n, c); see ``mass_regressor``."""
         still, unit = np.zeros(len(q)), np.eye(len(q))
         at_rest = self(q, still, still)
         return np.stack([self(q, still, a) - at_rest for a in unit], axis=1)
@@ -190,8 +169,6 @@ def build_problem(
     Its blocks are computed by Pinocchio. Its rows joint by joint, which the factors need, are
     computed by Pinocchio or by the compiled path, equal to 1e-12; ``problem.sources[0].engine`` and
     the logger "robotid" state by which of them, and why.
-
-    weight (N, n_rows).
     """
     own = trajectory_rows(model, trajectory, weight, compiled)
     weights, used = own.weights, np.any(own.weights, axis=0, keepdims=True).T
@@ -204,22 +181,22 @@ def build_problem(
         own = replace(own, support=own.support & mixed)
         source = ProjectedRows(own, trajectory.basis, weights)
         support = own.support.any(axis=0) & used
-    shape = weights.shape
+    samples = len(weights)
     length = max(1, min(BLOCK, _BLOCK_SIZE // (model.n_rows * len(model.layout.names))))
 
     def stream() -> Iterator[Block]:
-        for start in range(0, shape[0], length):
+        m = trajectory
+        for start in range(0, samples, length):
             part = slice(start, start + length)
-            m = trajectory
-            direction, memory = (None if x is None else x[part] for x in (m.direction, m.memory))
-            W = joint_torque_regressor(model, m.q[part], m.v[part], m.a[part], direction, memory)
+            known = (None if x is None else x[part] for x in (m.direction, m.memory))
+            W = joint_torque_regressor(model, m.q[part], m.v[part], m.a[part], *known)
             if m.basis is not None:
                 Y = W.reshape(-1, model.n_rows, W.shape[1])
                 W = without_forces(m.basis[part], Y).reshape(W.shape)
             yield W, trajectory.tau[part].reshape(-1), weights[part].reshape(-1)
 
     def mass_stream() -> Iterator[Array]:
-        for start in range(0, shape[0], length):
+        for start in range(0, samples, length):
             yield mass_regressor(model, trajectory.q[start : start + length])
 
     masses = mass_stream if with_mass else None
@@ -232,11 +209,10 @@ def build_problem(
 def random_regressor(model: RobotModel, samples: int, rng: np.random.Generator) -> Array:
     """Return the regressor at random states, shape (N n_rows, p), for structural properties.
 
-    For a static model, the speeds of the states affect only the direction of friction.
-
     The states are scaled to the robot: speeds sqrt(g / length), accelerations g / length, so that
     the ratio of gravity to inertia is the same for a finger and a crane. The loops of the robot are
-    closed in them, and their forces eliminated from the rows.
+    closed in them, and their forces eliminated from the rows. For a static model, speeds affect
+    only the direction of friction.
     """
     n = len(model.joints)
     rate = np.sqrt(9.81 / model.length)  # [1/s]
@@ -253,7 +229,7 @@ def random_regressor(model: RobotModel, samples: int, rng: np.random.Generator) 
         v, a = (np.einsum("kij,kj->ki", Z, x) for x in (v, a))
         a += chains.accelerations(q, v)
     if model.free_flyer:
-        linear = np.array([model.length] * 3 + [1.0] * 3)
+        linear = np.repeat([model.length, 1.0], 3)
         quaternions = rng.standard_normal((samples, 4))
         quaternions /= np.linalg.norm(quaternions, axis=1, keepdims=True)
         pose = np.column_stack([np.zeros((samples, 3)), quaternions])
@@ -268,9 +244,8 @@ def random_regressor(model: RobotModel, samples: int, rng: np.random.Generator) 
     W = joint_torque_regressor(model, q, v, a, signs, memory)
     if not model.loops:
         return W
-    return without_forces(loop_basis(model, q), W.reshape(samples, model.n_rows, -1)).reshape(
-        W.shape
-    )
+    Y = W.reshape(samples, model.n_rows, -1)
+    return without_forces(loop_basis(model, q), Y).reshape(W.shape)
 
 
 def _check_motion(model: RobotModel, q: Array, v: Array, a: Array) -> None:

@@ -72,7 +72,8 @@ def test_result_has_the_variation_of_each_drive_parameter(result, folder):
     assert entry["one_more"] == dict(
         zip(("std_error", "interval_width"), each.prediction.after, strict=True)
     )
-    assert entry["next_quantiles"][7] == pytest.approx(each.prediction.quantiles(np.zeros(1))[0])
+    middle = each.prediction.mixture.quantiles(np.full(1, 0.5))[0]
+    assert entry["next_quantiles"][7] == pytest.approx(middle)
     low, high = np.interp([-1.96, 1.96], SCORES, entry["next_quantiles"])
     assert [low, high] == pytest.approx(entry["next_interval"], rel=0.1)
     assert np.array(variation["correlation"]).shape == (len(own), len(own))

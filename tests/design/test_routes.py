@@ -5,14 +5,7 @@ from robotid.design.basis import FourierBasis
 from robotid.design.clearance import Clearance
 from robotid.design.design import Designer
 from robotid.design.limits import LIMITS, MotionLimits
-from robotid.design.routes import (
-    _PLACES,
-    Route,
-    _free_range,
-    _sweeps,
-    design_stands,
-    design_sweeps,
-)
+from robotid.design.routes import _PLACES, Route, _free_range, _sweeps, design_stands, design_sweeps
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 

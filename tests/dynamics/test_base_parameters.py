@@ -1,9 +1,7 @@
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import scipy.linalg
 
 from robotid.base.exceptions import DataError
 from robotid.dynamics.base_parameters import base_mapping, independent_factors, structural_mapping
@@ -14,7 +12,6 @@ from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import Coupling
 
-DOCS = Path(__file__).resolve().parents[2] / "docs" / "evidence/base_counts.md"
 ARM = {"panda.urdf": [f"panda_joint{i}" for i in range(1, 8)]}
 COUNTS = {
     "ur3_robot.urdf": (36, None),
@@ -127,17 +124,6 @@ def test_groups_read_like_formulas():
     assert mapping.expressions == ("a.Izz + 0.5 c.m", "b.m - c.m")
 
 
-def test_parameters_that_load_no_joint_are_named(ur5):
-    unidentifiable = structural_mapping(ur5, inertial_only=True).unidentifiable
-    assert "shoulder_link.m" in unidentifiable
-    assert "wrist_3_link.Izz" not in unidentifiable
-
-
-def test_a_regressor_of_another_width_is_refused():
-    with pytest.raises(DataError, match=r"W has shape \(5, 2\), wanted at least 3 rows of 3"):
-        base_mapping(np.ones((5, 2)), ("a", "b", "c"))
-
-
 def test_words_tell_what_stands_alone_in_sums_or_never():
     # columns a, 2 a + b, 0: of the first and second only sums, of the third nothing
     W = np.random.default_rng(0).standard_normal((40, 3))
@@ -217,31 +203,6 @@ def test_factors_of_parts_have_the_products_of_all_rows(rng, name):
     for own, R in parts:
         product[np.ix_(own, own)] = R.T @ R
     np.testing.assert_allclose(product, W.T @ W, rtol=1e-12, atol=1e-12)
-
-
-def test_equations_of_a_tree_are_factored_one_by_one(ur5, rng, monkeypatch):
-    W = random_regressor(ur5, 40, rng)
-    expected = W.T @ W
-    monkeypatch.setattr(scipy.linalg, "qr", lambda *_, **__: pytest.fail("factored as a whole"))
-    ((own, R),) = independent_factors(W, ur5.n_rows)
-    np.testing.assert_allclose(R.T @ R, expected[np.ix_(own, own)], rtol=1e-9, atol=1e-9)
-
-
-def test_arms_on_one_base_share_no_base_parameter(ur5, rng):
-    """A robot of two equal halves has the base parameters of each, by the same rule."""
-    W = random_regressor(ur5, 60, rng).reshape(60, 6, -1)
-    p = W.shape[2]
-    both = np.zeros((60, 12, 2 * p))
-    both[:, :6, :p], both[:, 6:, p:] = W, W
-    names = ur5.layout.names
-    alone = base_mapping(W.reshape(360, p), names, n_rows=6)
-    twice = [*names, *(f"other {name}" for name in names)]
-    found = base_mapping(both.reshape(720, 2 * p), twice, n_rows=12)
-    b = len(alone.K)
-    np.testing.assert_allclose(found.K[:b, :p], alone.K, atol=1e-9)
-    np.testing.assert_allclose(found.K[b:, p:], alone.K, atol=1e-9)
-    assert not found.K[:b, p:].any()
-    assert not found.K[b:, :p].any()
 
 
 def test_pivots_are_shares_of_the_largest_whatever_the_unit(rng):

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from robotid.dynamics.drive_columns import drive_motion, friction_speeds, plan_rows, sure_rows
-from robotid.robot.drives import Coulomb
+from robotid.dynamics.drive_columns import drive_motion, friction_speeds, sure_rows
 from robotid.robot.parameters import Coupling, ParameterLayout
 
 RATIOS = np.array([[1.0, 0, 0], [0, 1, 0], [0, 0, 1], [2.0, 0, -0.5]])  # drives over joints
@@ -68,19 +67,3 @@ def test_speeds_of_sliders_count_by_their_stroke():
     np.testing.assert_allclose(friction_speeds(sliding), wanted)
     unknown = layout(prismatic=frozenset({"c"}))
     np.testing.assert_allclose(unknown.drive_speeds[2], 1.0 / (2 * np.pi))
-
-
-def test_a_plan_puts_each_rows_columns_side_by_side_and_its_torque_last():
-    own = layout(terms=("viscous",), own={"b": (Coulomb(),)})
-    assert own.drive_names == ("a.viscous", "b.viscous", "b.coulomb", "c.viscous", "motor.viscous")
-    rows = [np.array([0, 4, 30, 34]), np.array([12, 31, 32]), np.array([34, 25, 33])]
-    plan = plan_rows(own, rows)
-    np.testing.assert_array_equal(plan.first, [0, 5, 9, 13])
-    assert plan.torques == (4, 8, 12)
-    for found, wanted in zip(plan.inertial, ([0, 4], [12], [25]), strict=True):
-        np.testing.assert_array_equal(found, wanted)
-    for found, wanted in zip(plan.places, ([0, 1], [5], [10]), strict=True):
-        np.testing.assert_array_equal(found, wanted)
-    assert plan.drives == (
-        ((2, 0, 1.0), (3, 4, 2.0)), ((6, 1, 1.0), (7, 2, 1.0)), ((9, 4, -0.5), (11, 3, 1.0)),
-    )  # fmt: skip

@@ -5,12 +5,10 @@ import pytest
 from helpers.robots import JOINT, LINK, ROBOTS, mimicking, motion
 
 from robotid.base.exceptions import DataError
-from robotid.data.log import Trajectory
 from robotid.dynamics import compiled, factors, rows
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.drive_columns import friction_speeds
 from robotid.dynamics.factors import compress
-from robotid.dynamics.problem import concatenate
 from robotid.dynamics.rows import COMPILED, TrajectoryRows
 from robotid.dynamics.torque import build_problem, joint_torque_regressor
 from robotid.estimation.estimators import WLS
@@ -87,15 +85,6 @@ def test_small_and_large_angles_keep_their_digits(reach, ur5, rng):
     assert_is_pinocchio(ur5, motion(ur5, rng, 100, reach))
 
 
-def test_quarter_turns_keep_their_digits(ur5, rng):
-    trajectory = motion(ur5, rng, 130)
-    quarters = np.arange(-65, 65) * np.pi / 4
-    trajectory = Trajectory(
-        **{**vars(trajectory), "q": np.tile(quarters[:, None], (1, 6)) + rng.choice([0, 1e-9], 6)}
-    )
-    assert_is_pinocchio(ur5, trajectory)
-
-
 @pytest.fixture
 def long_log(panda, monkeypatch):
     """Three parts, the last one short, weights of a mask."""
@@ -131,28 +120,6 @@ def test_estimates_are_the_same_on_both_paths_and_from_whole_blocks(panda, long_
     np.testing.assert_array_equal(counts[0], counts[2])
 
 
-def test_columns_may_be_chosen_in_any_order_and_twice(ur5, rng):
-    problem = build_problem(ur5, motion(ur5, rng, 200), compiled=True)
-    chosen = problem.select(np.array([70, 3, 9, 61, 12, 40])).select(np.array([4, 1, 0]))
-    (W, tau, _), *_ = problem.blocks()
-    for j, (columns, rows_j) in enumerate(
-        zip(chosen.sources[0].columns, stacked(chosen.sources[0]), strict=True)
-    ):
-        wanted = W[j::6][:, np.array([12, 3, 70])[columns]]
-        np.testing.assert_allclose(rows_j[:, :-1], wanted, atol=1e-12)
-        np.testing.assert_array_equal(rows_j[:, -1], tau[j::6])
-
-
-def test_several_logs_are_one_problem_whatever_computes_them(ur5, rng):
-    logs = [motion(ur5, rng, samples) for samples in (70, 600)]
-    mixed = concatenate([build_problem(ur5, log, compiled=k == 0) for k, log in enumerate(logs)])
-    plain = concatenate([build_problem(ur5, log, compiled=False) for log in logs])
-    assert len(mixed.sources) == 2
-    first, second = compress(mixed), compress(plain)
-    for a, b in zip(first.R, second.R, strict=True):
-        np.testing.assert_allclose(a.T @ a, b.T @ b, atol=1e-9)
-
-
 @pytest.mark.parametrize("flag", [True, False])
 def test_a_row_that_is_not_finite_is_refused_on_both_paths(flag, ur5, rng):
     weights = np.ones((200, 6))
@@ -170,31 +137,3 @@ def test_the_path_is_chosen_by_the_length_of_the_log_and_said(ur5, rng, monkeypa
     monkeypatch.setattr(rows, "LONG_ENOUGH", 200 * compiled.work_per_sample(ur5))
     assert build_problem(ur5, trajectory).sources[0].engine == COMPILED
     assert build_problem(ur5, trajectory, compiled=False).sources[0].engine == "Pinocchio"
-
-
-def test_where_numba_does_not_run_pinocchio_computes_the_rows(ur5, rng, monkeypatch):
-    def fail():
-        raise ImportError("Numba needs NumPy 2.4 or less")
-
-    monkeypatch.setattr(compiled, "row_lanes", fail)
-    found = build_problem(ur5, motion(ur5, rng, 200), compiled=True).sources[0]
-    assert found.engine == "Pinocchio (Numba cannot be imported: Numba needs NumPy 2.4 or less)"
-
-
-def test_a_joint_that_is_not_supported_falls_back_by_itself(ur5, rng, monkeypatch):
-    monkeypatch.setattr(compiled, "_is_simple", lambda axis: False)
-    found = build_problem(ur5, motion(ur5, rng, 200), compiled=True).sources[0]
-    assert found.engine.startswith(
-        "Pinocchio (the compiled code does not support joint 'shoulder_pan"
-    )
-    assert not found.is_parallel
-
-
-def test_without_a_folder_for_compiled_code_pinocchio_takes_over(ur5, rng, monkeypatch):
-    assert compiled.keeps_code()
-    monkeypatch.setattr(rows, "LONG_ENOUGH", 0)
-    monkeypatch.setattr(rows, "keeps_code", lambda: False)
-    engine = build_problem(ur5, motion(ur5, rng, 200)).sources[0].engine
-    assert engine.startswith("Pinocchio (no folder for compiled code; set one as NUMBA_")
-    asked = build_problem(ur5, motion(ur5, rng, 200), compiled=True).sources[0]
-    assert asked.engine == COMPILED

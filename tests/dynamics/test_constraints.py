@@ -1,7 +1,6 @@
 """Constraint forces eliminated from the rows, against Pinocchio's constraint dynamics."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pinocchio as pin
@@ -12,7 +11,6 @@ from robotid.data.base_motion import BaseColumns
 from robotid.data.log import Trajectory
 from robotid.data.signal_settings import BaseSource
 from robotid.dynamics.constraint_rows import (
-    _measured,
     constrained,
     constraint_forces,
     constraint_jacobian,
@@ -21,10 +19,9 @@ from robotid.dynamics.constraint_rows import (
     logged_base,
     without_forces,
 )
-from robotid.dynamics.factors import Factors, compress, compress_segments, merge
+from robotid.dynamics.factors import compress, compress_segments, merge
 from robotid.dynamics.prediction import predict
 from robotid.dynamics.torque import build_problem, joint_torque_regressor
-from robotid.estimation.estimators.consistent.weighting import Segments, held_out_errors
 from robotid.robot.constraints import Contact, Loop
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
@@ -181,30 +178,6 @@ def test_links_of_contacts_have_their_axes_and_turn_in_the_world(quadruped, rng)
             np.testing.assert_allclose(turning[k, i] @ v[k], w, atol=1e-7)
 
 
-def test_flags_belong_to_the_contacts_that_do_not_always_touch(rng):
-    """An always touching foot between two others: projectors against the touching feet alone."""
-    contacts = [Contact(foot, always=foot == FEET[1]) for foot in FEET[:3]]
-    model = RobotModel.from_urdf(
-        example_urdf("solo12.urdf"), free_flyer=True, constraints=contacts, terms=()
-    )
-    q, v, a = random_motion(model, rng, 4)
-    flags = np.array([[0, 0], [1, 0], [0, 1], [1, 1]], dtype=bool)
-    motion = Trajectory(
-        t=np.arange(4.0), q=q, v=v, a=a, tau=rng.standard_normal(v.shape), joints=model.joints,
-        rate=None, segment=np.zeros(4, dtype=int), contacts=flags,
-    )  # fmt: skip
-    found, _ = constrained(model, motion, np.ones((4, 18), dtype=bool))
-    for k, (first, last) in enumerate(flags.tolist()):
-        touching = [on for on, is_on in zip(contacts, (first, True, last), strict=True) if is_on]
-        alone = RobotModel.from_urdf(
-            example_urdf("solo12.urdf"), free_flyer=True, constraints=touching, terms=()
-        )
-        J = constraint_jacobian(alone, q[k : k + 1], np.ones((1, len(touching)), dtype=bool))[0]
-        B = found.basis[k]
-        np.testing.assert_allclose(B @ B.T, J.T @ np.linalg.pinv(J.T), atol=1e-10)
-        np.testing.assert_allclose(found.tau[k], motion.tau[k] - B @ B.T @ motion.tau[k])
-
-
 def test_without_torque_only_rows_of_the_base_are_used(quadruped, rng):
     q, v, a = random_motion(quadruped, rng, 2)
     motion = Trajectory(
@@ -222,6 +195,7 @@ def test_without_torque_only_rows_of_the_base_are_used(quadruped, rng):
 def test_rows_are_projected_and_counted(quadruped, rng):
     q, v, a = random_motion(quadruped, rng, 40)
     weight = rng.uniform(0.5, 2.0, (40, 18)) * (rng.random((40, 18)) < 0.9)
+    weight[:, 9] = 0.0  # its torque is projected into other rows
     motion = Trajectory(
         t=np.arange(40.0), q=q, v=v, a=a, tau=rng.standard_normal((40, 18)),
         joints=quadruped.joints, rate=None, segment=np.zeros(40, dtype=int),
@@ -236,6 +210,10 @@ def test_rows_are_projected_and_counted(quadruped, rng):
     dense *= np.sqrt(used * weight)[..., None]
     factors = compress(problem, threads=1)
     assert factors.is_projected
+    assert [len(own) for own in factors.columns] == [0 if j == 9 else Y.shape[2] for j in range(18)]
+    gram = np.einsum("kji,kjl->il", dense, dense)
+    R = factors.weighted(np.ones(18))
+    np.testing.assert_allclose(R.T @ R, gram, atol=1e-9 * np.abs(gram).max())
     assert all(own.is_projected for own in compress_segments(problem, 25))
     for j, R in enumerate(factors.R):
         rows = dense[:, j]
@@ -251,41 +229,6 @@ def test_rows_are_projected_and_counted(quadruped, rng):
     level = both.noise_levels(np.zeros(len(both.names)), np.full(18, 2.0))
     tau = (dense[..., -1] ** 2).sum()
     np.testing.assert_allclose(level, np.sqrt(2 * tau / 36.0))
-
-
-@pytest.mark.parametrize("compiled", [False, True])
-@pytest.mark.parametrize("has_torque", [False, True])
-def test_rows_without_weight_have_no_factor(quadruped, rng, has_torque, compiled):
-    q, v, a = random_motion(quadruped, rng, 40)
-    motion = Trajectory(
-        t=np.arange(40.0), q=q, v=v, a=a, tau=rng.standard_normal((40, 18)),
-        joints=quadruped.joints, rate=None, segment=np.zeros(40, dtype=int),
-        contacts=rng.random((40, 3)) < 0.5, wrenches=rng.standard_normal((40, 2)),
-    )  # fmt: skip
-    used = np.ones((40, 18), dtype=bool)
-    found, used = constrained(quadruped, motion, used, has_torque=has_torque)
-    used[:, 9] = False  # its torque is projected into other rows if it was measured
-    problem = build_problem(quadruped, found, used.astype(float), compiled=compiled)
-    idle = ~used.any(axis=0)
-    assert idle.sum() == (1 if has_torque else 12)
-    (source,) = problem.sources
-    assert [len(own) == 0 for own in source.columns] == idle.tolist()
-    is_read = [len(own) > 0 for own in source.own.columns]
-    assert is_read == [has_torque or j < 6 for j in range(18)]
-    dense = np.dstack(
-        [joint_torque_regressor(quadruped, q, v, a).reshape(40, 18, -1), found.loaded]
-    )
-    dense -= found.basis @ (found.basis.swapaxes(1, 2) @ dense)
-    dense *= used[..., None]
-    whole, segments = compress(problem), compress_segments(problem, 15)
-    for rows, factors in zip(np.split(dense, [15, 30]), segments, strict=True):
-        assert [len(R) == 1 for R in factors.triangles] == idle.tolist()
-        for j, R in enumerate(factors.R):
-            X = rows[:, j]
-            np.testing.assert_allclose(R.T @ R, X.T @ X, atol=1e-9 * np.abs(dense).max() ** 2)
-    gram = np.einsum("kji,kjl->il", dense, dense)
-    for R in (whole.weighted(np.ones(18)), merge(segments).weighted(np.ones(18))):
-        np.testing.assert_allclose(R.T @ R, gram, atol=1e-9 * np.abs(gram).max())
 
 
 def test_dependent_forces_are_counted_once(rng):
@@ -318,42 +261,6 @@ def test_feet_that_press_against_each_other_do_not_hide_their_share_of_the_weigh
     joints = np.concatenate([J, 0.1 * np.eye(4)[None]], axis=2)
     basis = force_basis(joints, np.ones((1, 10), dtype=bool), floats=True)
     assert round(np.sum(basis**2)) == 4
-
-
-@pytest.mark.parametrize(
-    ("kind", "axis", "equations"),
-    [("point", (0.0, 0.0, 1.0), 3), ("hinge", (0.3, -0.8, 0.2), 5), ("rigid", (1.0, 0, 0), 6)],
-)
-def test_a_loop_prevents_the_relative_motion(kind, axis, equations, rng):
-    loop = Loop(("FL_FOOT", "HR_FOOT"), kind, axis)
-    model = RobotModel.from_urdf(
-        example_urdf("solo12.urdf"), free_flyer=True, constraints=[loop], terms=()
-    )
-    q, _, _ = random_motion(model, rng, 1)
-    J = constraint_jacobian(model, q, np.ones((1, 0), dtype=bool))[0]
-    assert J.shape == (equations, 18)
-    data = model.pin_model.createData()
-    pin.computeJointJacobians(model.pin_model, data, model.configurations(q)[0])
-    pin.updateFramePlacements(model.pin_model, data)
-    one, two = (model.pin_model.getFrameId(x, pin.FrameType.BODY) for x in loop.frames)
-    axes = pin.LOCAL_WORLD_ALIGNED
-    difference = [
-        pin.getFrameJacobian(model.pin_model, data, i, axes) for i in (one, two)
-    ]  # fmt: skip
-    D = difference[0] - difference[1]
-    np.testing.assert_allclose(J[:3], D[:3])
-    if kind == "hinge":
-        free = data.oMf[one].rotation @ np.array(axis) / np.linalg.norm(axis)
-        rest = D[3:] - np.outer(free, free @ D[3:])
-        np.testing.assert_allclose(J[3:].T @ J[3:], rest.T @ rest, atol=1e-12)
-
-
-def test_measured_components_are_counted_over_loops_and_contacts_of_any_size():
-    every = (
-        Loop(("a", "b")), Contact("c", "surface", measured=("mx", "fz")), Contact("d"),
-        Loop(("e", "f"), "point"), Contact("g", measured=("fy",)),
-    )  # fmt: skip
-    assert _measured(SimpleNamespace(constraints=every)) == [5 + 3, 5 + 2, 5 + 6 + 3 + 3 + 1]
 
 
 def test_contacts_state_what_logs_have(quadruped):
@@ -400,24 +307,3 @@ def test_a_contact_of_an_unknown_link_is_refused():
         RobotModel.from_urdf(urdf, free_flyer=True, constraints=[Contact("FL_FOTO")])
     with pytest.raises(ModelError, match="the contact or loop at FL_FOOT is stated twice"):
         RobotModel.from_urdf(urdf, constraints=[Contact("FL_FOOT"), Contact("FL_FOOT", "surface")])
-
-
-def test_rows_that_are_projected_together_are_held_out_together(rng):
-    """The mean square of one joint: all squares over all rows."""
-    rows = [np.array([4, 2]), np.array([3, 5])]
-    R = rng.standard_normal((2, 2, 3, 3))
-    folds = tuple(
-        Factors(tuple(own), (np.arange(2),) * 2, count, ("a", "b"), is_projected=True)
-        for own, count in zip(R, rows, strict=True)
-    )
-    found = [SimpleNamespace(x=x) for x in rng.standard_normal((2, 2))]
-    programme = SimpleNamespace(minimise_each=lambda *_, **__: found)
-    fit = SimpleNamespace(programme=programme, K=np.eye(2))
-    segments = Segments(folds, np.array([2.0, 2.0]), np.zeros((3, 3)), 1.0)
-    errors, _ = held_out_errors(fit, segments, 1.0)
-    squares = [
-        sum(np.sum((own[:, 2] - own[:, :2] @ x.x) ** 2) for own in fold)
-        for fold, x in zip(R, found, strict=True)
-    ]
-    np.testing.assert_allclose(errors[:, 0], np.array(squares) / 4.0 / 14.0)
-    assert errors.shape == (2, 1)

@@ -1,27 +1,20 @@
 import numpy as np
 import pytest
 import scipy.linalg
-from helpers.synthetic import exact_log, truth
 
 from robotid.base.exceptions import DataError
 from robotid.data.log import Trajectory
-from robotid.data.signal_settings import SignalSettings
 from robotid.dynamics import factors
-from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.factors import (
     Reduction,
     compress,
     compress_segments,
     gather,
-    join,
     join_segments,
     merge,
 )
 from robotid.dynamics.problem import Problem, concatenate
 from robotid.dynamics.torque import build_problem
-from robotid.estimation.fitting.survey import hold_log
-
-EXACT = SignalSettings(cutoff=None, trim=0.0, min_velocity=0.0)
 
 
 def make(rng, samples=300, n=3, c=5, block=64, weight=None, support=None):
@@ -41,86 +34,6 @@ def make(rng, samples=300, n=3, c=5, block=64, weight=None, support=None):
 
 def gram(R):
     return R.T @ R
-
-
-def test_a_factor_has_the_gram_matrix_of_its_rows(rng):
-    problem, W, tau = make(rng)
-    factors = compress(problem)
-    for j in range(3):
-        A = np.column_stack([W, tau])[j::3]
-        np.testing.assert_allclose(gram(factors.R[j]), gram(A), atol=1e-11)
-        np.testing.assert_array_equal(factors.R[j], np.triu(factors.R[j]))
-    np.testing.assert_array_equal(factors.rows, [300, 300, 300])
-
-
-def test_columns_that_a_joint_never_sees_are_left_out(rng):
-    support = np.triu(np.ones((3, 5), dtype=bool))
-    problem, W, tau = make(rng, support=support)
-    factors = compress(problem)
-    for j in range(3):
-        A = np.column_stack([W, tau])[j::3]
-        np.testing.assert_allclose(gram(factors.R[j]), gram(A), atol=1e-11)
-        assert not factors.R[j][:, :5][:, ~support[j]].any()
-
-
-def test_factors_of_two_logs_merge_into_the_factor_of_both(rng):
-    first, second = make(rng)[0], make(rng)[0]
-    merged = merge([compress(first), compress(second)])
-    together = compress(concatenate([first, second]))
-    for a, b in zip(merged.R, together.R, strict=True):
-        np.testing.assert_allclose(gram(a), gram(b), atol=1e-11)
-    np.testing.assert_array_equal(merged.rows, together.rows)
-
-
-def test_selecting_columns_equals_reducing_the_problem(rng):
-    problem = make(rng)[0]
-    columns = np.array([0, 3])
-    selected = compress(problem).select(columns)
-    reduced = compress(problem.select(columns))
-    assert selected.names == reduced.names == ("a", "d")
-    for a, b in zip(selected.R, reduced.R, strict=True):
-        np.testing.assert_allclose(gram(a), gram(b), atol=1e-11)
-
-
-def test_rows_of_weight_zero_are_left_out_and_others_scaled(rng):
-    weight = rng.choice([0.0, 1.0, 4.0], 900)
-    problem, W, tau = make(rng, weight=weight)
-    factors = compress(problem)
-    A = np.column_stack([W, tau])
-    for j in range(3):
-        w = weight[j::3]
-        np.testing.assert_allclose(
-            gram(factors.R[j]), A[j::3].T @ (w[:, None] * A[j::3]), atol=1e-11
-        )
-        assert factors.rows[j] == np.sum(w > 0)
-
-
-def test_weighted_factor_divides_by_the_noise_of_each_joint(rng):
-    problem, W, tau = make(rng)
-    sigma = np.array([0.5, 2.0, 3.0])
-    A = np.column_stack([W, tau]) / np.tile(sigma, 300)[:, None]
-    np.testing.assert_allclose(gram(compress(problem).weighted(sigma)), gram(A), atol=1e-10)
-
-
-def test_residuals_need_no_second_pass(rng):
-    problem, W, tau = make(rng)
-    theta = rng.standard_normal(5)
-    squares = ((tau - W @ theta) ** 2).reshape(-1, 3).sum(axis=0)
-    np.testing.assert_allclose(compress(problem).residual_squares(theta), squares, rtol=1e-11)
-    np.testing.assert_allclose(
-        compress(problem).torque_squares(), (tau**2).reshape(-1, 3).sum(axis=0), rtol=1e-11
-    )
-
-
-def test_poor_excitation_keeps_its_digits(rng):
-    # columns that differ by 1e-7: a Gram matrix would lose their difference altogether
-    direction = rng.standard_normal(300)
-    A = np.column_stack([direction, direction + 1e-7 * rng.standard_normal(300)])
-    exact = Problem(
-        lambda: iter([(A, A @ [1.0, 2.0], np.ones(300))]), ("a", "b"), 1, np.ones((1, 2))
-    )
-    R = compress(exact).R[0]
-    np.testing.assert_allclose(np.linalg.solve(R[:2, :2], R[:2, 2]), [1.0, 2.0], rtol=1e-7)
 
 
 def test_many_blocks_keep_the_digits_of_one_full_qr_on_poor_excitation(rng):
@@ -168,14 +81,6 @@ def test_problems_with_other_columns_do_not_mix(rng):
         merge([])
     with pytest.raises(DataError, match="there is no problem, wanted"):
         concatenate([])
-
-
-def test_samples_are_the_rows_instant_by_instant(rng):
-    problem, W, tau = make(rng)
-    samples = list(problem.samples())
-    assert len(samples) == 300
-    np.testing.assert_array_equal(samples[7].Y, W[21:24])
-    np.testing.assert_array_equal(samples[7].tau, tau[21:24])
 
 
 def test_stretches_merge_into_the_factors_of_the_whole(ur5, rng):
@@ -257,46 +162,6 @@ def test_factors_with_other_columns_per_joint_merge(rng):
     for j in range(3):
         A = np.vstack([np.column_stack([W, tau])[j::3], np.column_stack([V, force])[j::3]])
         np.testing.assert_allclose(gram(merged.R[j]), gram(A), atol=1e-10)
-
-
-def reduction(model, log):
-    motion = hold_log(model, log, EXACT).whole.trajectory
-    problem = structural_mapping(model).reduce(build_problem(model, motion))
-    return Reduction.of(problem, motion), motion
-
-
-def test_reductions_of_the_parts_join_to_that_of_the_whole(ur5, rng):
-    log = exact_log(ur5, truth(ur5), rng)
-    whole, motion = reduction(ur5, log)
-    middle = float(log.t[len(log.t) // 3])
-    parts = [
-        reduction(ur5, log.window(None, middle - 1e-6))[0],
-        reduction(ur5, log.window(middle))[0],
-    ]
-    joined = join(parts)
-    assert joined.samples == whole.samples == len(log.t)
-    np.testing.assert_allclose(joined.squares, whole.squares, rtol=1e-13)
-    np.testing.assert_allclose(whole.squares[1], (motion.v**2).sum(axis=0), rtol=1e-13)
-    for one, other in zip(joined.factors.R, whole.factors.R, strict=True):
-        np.testing.assert_allclose(one.T @ one, other.T @ other, rtol=1e-10, atol=1e-10)
-
-
-def test_neighbours_are_joined_to_few_stretches(ur5, rng):
-    log = exact_log(ur5, truth(ur5), rng)
-    edges = np.linspace(0, 12, 11)
-    ends = np.nextafter(edges[1:], 0)
-    parts = [reduction(ur5, log.window(*x))[0] for x in zip(edges[:-1], ends, strict=True)]
-    found = join_segments(iter(parts), len(parts), 4)
-    assert [x.samples for x in found] == [180, 180, 180, 60]
-    again = join_segments(iter(parts), len(parts), 64)
-    assert [x.samples for x in again] == [60] * 10
-    for x in (found, again):
-        np.testing.assert_allclose(join(x).squares, join(parts).squares, rtol=1e-13)
-
-
-def test_nothing_cannot_be_joined():
-    with pytest.raises(DataError, match="there is no reduction, wanted that of at least one log"):
-        join([])
 
 
 def unlike(rng):

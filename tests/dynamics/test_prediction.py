@@ -8,7 +8,6 @@ from helpers.synthetic import truth
 
 from robotid.base.exceptions import DataError
 from robotid.data.log import Trajectory
-from robotid.dynamics import prediction
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.drive_columns import friction_speeds
 from robotid.dynamics.prediction import (
@@ -57,21 +56,6 @@ def test_predicted_torque_is_the_regressor_times_the_parameters(case, rng):
     assert_is_regressor_times(model, [possible, base_only], trajectory, compiled=True)
 
 
-def test_inverse_dynamics_takes_few_possible_robots_and_rows_the_rest(panda, rng, monkeypatch):
-    calls = []
-    real = prediction.inverse_dynamics
-    monkeypatch.setattr(
-        prediction, "inverse_dynamics", lambda *args: calls.append(args) or real(*args)
-    )
-    trajectory = motion(panda, rng, 5)
-    possible, heavier, base_only = vectors(panda, rng)
-    predict(panda, [possible, heavier, possible], trajectory)
-    assert len(calls) == 3
-    predict(panda, [possible] * 4, trajectory)
-    predict(panda, [possible, base_only], trajectory)
-    assert len(calls) == 3
-
-
 @pytest.mark.parametrize("mass", [0.0, -0.5, 1e-9])
 def test_bodies_that_are_none_keep_their_digits(mass, ur5, rng):
     trajectory = motion(ur5, rng, 20)
@@ -80,35 +64,6 @@ def test_bodies_that_are_none_keep_their_digits(mass, ur5, rng):
     assert_is_regressor_times(ur5, [pi], trajectory, compiled=False)
     pi[11:14] = 0.0
     assert_is_regressor_times(ur5, [pi], trajectory, compiled=False)
-
-
-def test_slopes_of_bodies_that_are_none_are_those_of_differences(ur5, rng):
-    m, h, n = motion(ur5, rng, 3), 1e-6, len(ur5.joints)
-    pi = ur5.standard_parameters()
-    pi[10:20] = [-0.5, 0.3, -0.2, 0.5, 0.1, 0.0, 0.2, 0.0, 0.0, 0.1]
-    found = body_slopes(ur5, pi, m)
-    np.testing.assert_allclose(body_slopes_by_position(ur5, pi, m), found.by_q, atol=1e-9)
-    state = (m.q, m.v, m.a)
-    for k, slope in enumerate((found.by_q, found.by_v, found.by_a)):
-        for j in range(n):
-            up, down = ([x + s * h * (i == k) * np.eye(n)[j] for i, x in enumerate(state)]
-                        for s in (1, -1))  # fmt: skip
-            rows = [joint_torque_regressor(ur5, *moved) @ pi for moved in (up, down)]
-            wanted = ((rows[0] - rows[1]) / (2 * h)).reshape(-1, n)
-            np.testing.assert_allclose(slope[:, :, j], wanted, atol=1e-6 * np.abs(wanted).max())
-    for axis in range(3):
-        g = np.array([0.0, 0.0, -9.81]) + np.eye(3)[axis]
-        other = RobotModel.from_urdf(example_urdf("ur5_robot.urdf"), gravity=tuple(g))
-        rows = [joint_torque_regressor(robot, *state) @ pi for robot in (other, ur5)]
-        wanted = (rows[0] - rows[1]).reshape(-1, n)
-        np.testing.assert_allclose(
-            found.by_gravity[:, :, axis], wanted, atol=1e-9 * np.abs(wanted).max()
-        )
-
-
-def test_other_joints_are_refused(ur5, panda, rng):
-    with pytest.raises(DataError, match="the trajectory has the joints"):
-        predict(ur5, [ur5.standard_parameters()], motion(panda, rng, 5))
 
 
 def test_an_instant_is_predicted_as_by_inverse_dynamics_and_the_formulas_of_friction(ur5, rng):
@@ -254,3 +209,12 @@ def test_slopes_by_the_origin_of_each_joint_are_those_of_differences(case):
             exact = (moved(H) - moved(-H)) / (2 * H)
             np.testing.assert_allclose(found[:, :, j, k], exact, atol=1e-6)
     assert np.abs(found).max() > 0.1
+
+
+def test_slopes_are_linear_in_bodies_that_may_be_none(ur5, rng):
+    m, pi = motion(ur5, rng, 3), ur5.standard_parameters()
+    none = np.zeros_like(pi)
+    none[10:20] = [-0.5, 0.3, -0.2, 0.5, 0.1, 0.0, 0.2, 0.0, 0.0, 0.1]
+    found, parts = body_slopes(ur5, pi + none, m), (body_slopes(ur5, x, m) for x in (pi, none))
+    for slope, one, other in zip(found, *parts, strict=True):
+        np.testing.assert_allclose(slope, one + other, atol=1e-9)

@@ -15,10 +15,7 @@ from robotid.base.exceptions import DataError, ModelError, SettingsError
 from robotid.data.signal_settings import SignalSettings
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.torque import joint_torque_regressor
-from robotid.identification.payload_fit import (
-    identify_payload,
-    payload_of,
-)
+from robotid.identification.payload_fit import identify_payload, payload_of
 from robotid.robot.drives import FAMILIES
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel

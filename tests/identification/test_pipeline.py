@@ -100,10 +100,7 @@ def test_a_recording_that_was_fitted_does_not_show_what_repeats(rng):
     ]
     own, kept = ([hold_log(arm, log, EXACT) for log in some] for some in (logs[:1], logs[1:]))
     mapping, choice = structural_mapping(arm), EstimatorSettings("wls")
-    for beside, repeated, is_doubted in (
-        ([kept[0], own[0]], "b", True),
-        (kept, "b", False),
-    ):
+    for beside, repeated, is_doubted in (([kept[0], own[0]], "b", True), (kept, "b", False)):
         guesses = [Finding("repeated_motion", "warning", f"{name}.csv", "") for name in repeated]
         recordings = Recordings(arm, mapping, own, beside)
         found = conclude(recordings, choice, guesses, friction="none")

@@ -13,14 +13,7 @@ from helpers.synthetic import truth
 from robotid.base.exceptions import SettingsError
 from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
-from robotid.design.previews import (
-    Run,
-    TorqueNoise,
-    _band,
-    _Information,
-    assumed_noise,
-    preview,
-)
+from robotid.design.previews import Run, TorqueNoise, _band, _Information, assumed_noise, preview
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.factors import Factors, compress
 from robotid.dynamics.simulation.motions import random_fourier

@@ -17,6 +17,7 @@ from robotid.paper.equations import (
     proximity,
     recursive_update,
     reference_acceleration,
+    rk4,
     smallest_eigenvalue,
     torque,
 )
@@ -205,3 +206,19 @@ def test_bounds_that_hold_nothing_are_refused():
 def test_an_unknown_sign_is_named():
     with pytest.raises(SettingsError, match=r"^sign is 'plus', wanted 'corrected' or 'printed'$"):
         proximity(np.ones((2, 3)), np.ones(3), np.ones(2), sign="plus")
+
+
+def swing(q, v, _):
+    return -4.0 * q - 0.2 * v
+
+
+def test_its_error_falls_with_the_fourth_power_of_the_step():
+    def end(steps):
+        q, v = np.array([1.0]), np.array([0.0])
+        for _ in range(steps):
+            q, v = rk4(swing, q, v, 2.0 / steps)
+        return float(q[0])
+
+    w = np.sqrt(4.0 - 0.01)
+    exact = np.exp(-0.2) * (np.cos(2 * w) + 0.1 / w * np.sin(2 * w))
+    assert (end(20) - exact) / (end(40) - exact) == pytest.approx(16.0, rel=0.1)

@@ -104,13 +104,3 @@ def test_a_change_of_a_body_makes_the_torques_of_its_columns(model, found):
         Y = pin.computeJointTorqueRegressor(model.pin_model, data, *state)
         expected = Y.reshape(len(PARENTS), -1, 10) @ np.cos(np.arange(10.0))
         assert_close(found[3][:, k].T, expected)
-
-
-def test_code_that_cannot_be_kept_is_compiled_all_the_same(monkeypatch):
-    def njit(**options):
-        if options.get("cache"):
-            raise RuntimeError("cannot cache function: no locator available for file")
-        return lambda function: (function, options["nogil"])
-
-    monkeypatch.setattr(lanes, "njit", njit)
-    assert lanes.compiled(abs) == (abs, True)

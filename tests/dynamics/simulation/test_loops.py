@@ -5,7 +5,7 @@ from itertools import pairwise
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.mujoco_plant import LEG, held, multisine, plant
+from helpers.mujoco_plant import LEG
 from helpers.paths import URDF
 from helpers.single_joint import slider
 from scipy.integrate import solve_ivp
@@ -13,14 +13,11 @@ from scipy.linalg import expm
 
 from robotid.base.exceptions import DataError, NotConvergedError, SettingsError
 from robotid.data.log import Log
-from robotid.dynamics.simulation.law_lanes import divide_rows
 from robotid.dynamics.simulation.loops import (
     ClosedLoopRobot,
     Loops,
     Window,
-    _Grid,
     cut_windows,
-    why_no_solution,
 )
 from robotid.robot.drives import (
     Asymmetric,
@@ -366,55 +363,6 @@ def test_a_held_loop_has_the_closed_form_of_its_ticks(tmp_path, rate, begin):
     assert np.abs(free.q[:, 0] - exact).max() > 3e-4
 
 
-def test_mujoco_moves_a_held_leg_alike():
-    rng, rate = np.random.default_rng(1), 125.0
-    leg = plant("leg", rng, coulomb=0.0, kd=0.8, delay=0.0, effort_limit=2.0)
-    t = np.arange(250) / RATE
-    q_ref = multisine(t, leg.middle, leg.reach, rng, lowest=2.0, highest=8.0)
-    q = held(leg, q_ref, RATE, rate)
-    log = Log(t, q, 0 * q, leg.model.joints, q_ref=q_ref)
-    of = {key: np.array([getattr(d, key) for d in leg.drives])
-          for key in ("kp", "kd", "armature", "viscous")}  # fmt: skip
-    values = of.pop("viscous")
-    loops = replace(loops_of(leg.model, (Viscous(),)), values=values, zero=np.zeros(3), **of)
-    window = Window(log, 0, 0, 250, given=np.array([q[0], np.zeros(3)]))
-    found = {}
-    for limit, ticks in ((2.0, rate), (2.0, None), (np.inf, rate)):
-        own = replace(loops, limit=np.full(3, limit), rate=ticks)
-        [out] = ClosedLoopRobot(leg.model, step=2.5e-4).roll_out(own, [window])
-        found[limit, ticks] = np.abs(out.q - q).max()
-    assert found.pop((2.0, rate)) < 2e-5
-    assert min(found.values()) > 5e-3, "hold and limit act"
-
-
-def test_a_tick_takes_the_command_of_its_own_time(planar):
-    """Of ticks of four rows, 1.5 rows late, each is told the mean of the two rows about that."""
-    log, rate = commanded(planar, 0.2), RATE / 4
-    late = rolled(planar, loops_of(planar, kp=60.0, rate=rate, delay=np.full(2, 1.5 / RATE)), log)
-
-    def between(x):
-        first = np.arange(len(x)) // 4 * 4  # row of the tick
-        return 0.5 * (x[np.maximum(first - 2, 0)] + x[np.maximum(first - 1, 0)])
-
-    told = {name: between(getattr(log, name)) for name in ("q_ref", "v_ref", "tau_ref")}
-    same = rolled(planar, loops_of(planar, kp=60.0, rate=rate), replace(log, **told))
-    np.testing.assert_allclose(late.q, same.q, atol=1e-12)
-
-
-def test_jittered_rows_do_not_move_ticks(planar, rng):
-    t = np.arange(100) / RATE
-    t[1:] += rng.uniform(-0.4, 0.4, 99) / RATE
-    log = commanded(planar, t=t)
-    log = replace(log, q_ref=0 * log.q + 0.2, v_ref=None, tau_ref=None)
-    even = replace(log, t=np.arange(100) / RATE)
-    jittered, exact = (
-        rolled(planar, loops_of(planar, kp=60.0, rate=90.0), x, 5e-4) for x in (log, even)
-    )
-    for j in range(2):
-        between = np.interp(t[1:-1], even.t, exact.q[:, j])
-        np.testing.assert_allclose(jittered.q[1:-1, j], between, atol=2e-4)
-
-
 def test_a_controller_too_slow_for_its_gains_is_told_the_rate_it_needs(tmp_path):
     model = slider(tmp_path)
     log = Log(
@@ -432,20 +380,6 @@ def test_a_controller_too_slow_for_its_gains_is_told_the_rate_it_needs(tmp_path)
         rolled(model, loops_of(model, (Viscous(),), zero=np.zeros(1), rate=40.0, **rail), log)
     settled = rolled(model, loops_of(model, (Viscous(),), zero=np.zeros(1), rate=85.0, **rail), log)
     assert np.abs(settled.q).max() < 0.5
-
-
-def test_no_drive_gives_more_than_its_limit(legs):
-    log, n = commanded(legs, 0.05), len(legs.joints)
-    far = replace(log, q_ref=log.q_ref + 100.0)
-    at_limit = rolled(legs, loops_of(legs, limit=np.full(n, 3.0)), far)
-    held = replace(log, q_ref=None, v_ref=None, tau_ref=np.full_like(log.q, 3.0))
-    free = rolled(legs, loops_of(legs, kp=0.0), held)
-    np.testing.assert_allclose(at_limit.q, free.q, atol=1e-12)
-    low = rolled(legs, loops_of(legs, limit=np.full(n, 3.0)), replace(log, q_ref=log.q_ref - 100.0))
-    np.testing.assert_allclose(
-        low.q, rolled(legs, loops_of(legs, kp=0.0), replace(held, tau_ref=-held.tau_ref)).q,
-        atol=1e-12,
-    )  # fmt: skip
 
 
 def test_windows_cover_each_sample_once_and_cross_no_gap(planar):
@@ -518,32 +452,6 @@ def test_lanes_know_nothing_of_each_other(legs):
             np.testing.assert_allclose(mine[2], other[2], atol=1e-12)
 
 
-def test_a_log_without_speeds_and_torques_has_none_of_the_log_beside_it(planar):
-    log, robot = commanded(planar, 0.2), ClosedLoopRobot(planar)
-    logs = log, replace(log, v_ref=None, tau_ref=None), replace(log, tau_ref=None)
-    windows = [Window(x, 5, 5, len(x.t)) for x in logs]
-    together = robot.roll_out(loops_of(planar), windows)
-    for window, out in zip(windows, together, strict=True):
-        [alone] = robot.roll_out(loops_of(planar), [window])
-        np.testing.assert_allclose(out.q, alone.q, atol=1e-13)
-    assert min(np.abs(together[k].q - together[k + 1].q).max() for k in (0, 1)) > 1e-3, "they act"
-
-
-def test_lanes_have_ticks_of_their_own(legs):
-    """Ticks of 73 Hz fall elsewhere in each window; the steps, too, are divided elsewhere."""
-    robot, windows = (
-        ClosedLoopRobot(legs, step=2e-4),
-        cut_windows(commanded(legs, 0.5), 0.042, 0.01),
-    )
-    column, loops = [(robot.kinds["kp"], 4, 0)], replace(loops_of(legs), rate=73.0)
-    together = robot.roll_out(loops, windows, column)
-    for window, out in zip(windows, together, strict=True):
-        [alone] = robot.roll_out(loops, [window], column)
-        np.testing.assert_allclose(alone.q, out.q, atol=1e-5)
-        for mine, other in zip(alone.slopes, out.slopes, strict=True):
-            np.testing.assert_allclose(mine[2], other[2], atol=1e-5)
-
-
 @pytest.mark.parametrize(
     "options",
     [
@@ -585,34 +493,6 @@ def test_friction_without_a_solution_is_named_with_joint_value_and_time(legs, te
     assert log.t[40] <= float(time) < log.t[50], "of the log, not of the window"
 
 
-def test_friction_of_a_rail_without_a_solution_has_its_units(tmp_path):
-    model = slider(tmp_path)
-    loops = loops_of(model, (Coulomb(), PositionCoulomb(order=1, centre=0.1)), (0.5, 2.0))
-    words = why_no_solution(model, loops, np.array([0]), np.array([-0.4]), 0, 2e-3)
-    assert "its Coulomb friction is -0.5 N at -0.4 m, wanted 0 or more" in words
-
-
-def test_of_a_simulation_without_another_reason_gain_and_inertia_are_named(planar):
-    loops = loops_of(planar, kp=1e9)
-    words = why_no_solution(planar, loops, np.array([0, 1]), np.zeros(2), 1, 2e-3)
-    assert re.search(
-        r"of joint_2 has no solution in steps of 0.002 s: its gain kp is 1e\+09", words
-    )
-    inertia, most = (
-        float(x) for x in re.findall(r"inertia (\S+), wanted kp below (\S+)", words)[0]
-    )
-    assert most == pytest.approx(inertia / 2e-3**2, rel=1e-2)
-    assert inertia > loops.armature[1]
-    # positions of the encoders, from their own zeros
-    q, zero = np.array([0.3, -0.9]), np.array([0.2, 0.5])
-    own, at_0 = (
-        why_no_solution(planar, replace(loops, zero=x), np.array([0, 1]), q + zero - x, 0, 2e-3)
-        for x in (zero, 0.0 * zero)
-    )
-    assert own == at_0
-    assert own != why_no_solution(planar, loops, np.array([0, 1]), q, 0, 2e-3)
-
-
 def test_friction_that_falls_faster_than_inertia_allows_slips_as_in_small_steps(tmp_path):
     """A light joint under a slow ramp sticks and slips: in one step many speeds are possible."""
     model, t = slider(tmp_path), np.arange(200) / RATE
@@ -628,16 +508,6 @@ def test_friction_that_falls_faster_than_inertia_allows_slips_as_in_small_steps(
     assert slips[1] > 50, "it sticks, and then slips"
     assert abs(slips[0] - slips[1]) <= 1
     assert np.sqrt(np.mean((coarse - fine) ** 2)) < 0.15 * np.ptp(fine)
-
-
-def test_the_longest_steps_of_a_row_are_divided_further():
-    ticks, every = np.array([6.0, 6.9, 8.0]), 5
-    times, is_tick = np.empty(11), np.empty(10, dtype=bool)
-    divide_rows(np.array([5.0, 6.0, 7.5]), ticks, times, is_tick)
-    first = 5.0 + np.arange(5) / 5  # no tick: five alike
-    second = [6.0, 6.3, 6.6, 6.9, 7.2, 7.5]  # three of 0.9 s, two of 0.6 s
-    np.testing.assert_allclose(times, [*first, *second])
-    assert np.flatnonzero(is_tick).tolist() == [0, every, 8]
 
 
 def test_ticks_between_rows_take_the_commands_of_their_own_half_row(planar):
@@ -658,23 +528,3 @@ def test_ticks_between_rows_take_the_commands_of_their_own_half_row(planar):
         replace(loops, delay=np.zeros(2)), cut_windows(fine, np.inf, 0.0)
     )
     np.testing.assert_allclose(late.q, same.q[::2], atol=1e-12)
-
-
-def test_the_command_of_the_last_tick_is_averaged_to_the_next_one():
-    """Two ticks in each row of 1 s, and some after the last row."""
-    grid = _Grid(np.arange(5.0, 9.0), np.arange(5.5, 9.1, 0.5), 1.0)
-    ticks = np.arange(5.0, 8.0, 0.5)
-    np.testing.assert_allclose(
-        grid.sampled(ticks).reshape(-1, 2), np.column_stack([ticks, ticks + 0.5])
-    )
-
-
-@pytest.mark.parametrize(
-    ("step", "rate", "count"),
-    [(0.25, 2.0, 4), (0.3, 2.0, 4), (0.13, 2.0, 8), (0.5, 2.0, 2), (0.25, None, 4), (0.3, None, 4),
-     (2.0, None, 1)],
-)  # fmt: skip
-def test_steps_divide_ticks_and_are_no_more_than_needed(step, rate, count):
-    """Two ticks in each row of 1 s: a tick of 0.5 s has two steps of 0.25 s, four of 0.13 s."""
-    grid = _Grid(np.arange(5.0, 9.0), np.arange(5.0, 9.1, 0.5), 1.0)
-    assert grid.least_steps(step, rate) == count

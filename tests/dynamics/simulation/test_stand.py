@@ -10,7 +10,7 @@ from helpers.stands import stand
 from robotid.base.exceptions import DataError, SettingsError
 from robotid.dynamics.simulation.simulation_settings import Controller, Sensors, Simulation
 from robotid.dynamics.simulation.simulator import follow, simulate
-from robotid.dynamics.simulation.stand import Stand, contact_forces
+from robotid.dynamics.simulation.stand import contact_forces
 from robotid.robot.constraints import Contact
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
@@ -31,27 +31,6 @@ def robot():
 @pytest.fixture(scope="module")
 def motion(robot):
     return stand(robot, MIDDLE, 0.25, np.random.default_rng(1), parts=2, length=1.0)
-
-
-def test_feet_on_the_ground_do_not_move(robot, motion):
-    t = np.linspace(0.0, 2.0, 41)
-    q, v, a = motion.evaluate(t)
-    model, data = robot.pin_model, robot.pin_model.createData()
-    ids = [model.getFrameId(foot, pin.FrameType.BODY) for foot in FEET]
-    touching, places = motion.touching(t), []
-    for q_k, v_k, a_k in zip(q, v, a, strict=True):
-        pin.forwardKinematics(model, data, q_k, v_k, a_k)
-        pin.updateFramePlacements(model, data)
-        places.append([data.oMf[i].translation.copy() for i in ids])
-        axes = pin.LOCAL_WORLD_ALIGNED
-        speed = [np.linalg.norm(pin.getFrameVelocity(model, data, i, axes).linear) for i in ids]
-        k = len(places) - 1
-        lands = touching[max(k - 1, 0) : k + 2].all(axis=0)  # not beside a change of contact
-        assert np.array(speed)[lands].max() < 1e-5
-    moved = np.abs(places - np.array(places[0])).max(axis=2)
-    assert moved[touching & (t < 1.9)[:, None]].max() < 1e-6
-    assert moved.max() > 0.01
-    assert not touching.all()
 
 
 def test_the_twist_and_its_derivative_are_those_of_the_pose(robot, motion):
@@ -127,24 +106,3 @@ def test_what_a_stand_cannot_do_is_refused(robot, motion):
     alone = RobotModel.from_urdf(example_urdf("solo12.urdf"), free_flyer=True, terms=())
     with pytest.raises(SettingsError, match="has no contacts"):
         follow(alone, pi, motion, settings=PERFECT, **rng)
-
-
-@pytest.mark.parametrize("velocity", [True, False])
-@pytest.mark.parametrize("acceleration", [True, False])
-def test_the_base_has_the_signals_that_are_logged(rng, velocity, acceleration):
-    pose, twist, change = rng.standard_normal((5, 7)), *rng.standard_normal((2, 5, 6))
-    pose[:, 3:] = [0.0, 0.6, 0.0, 0.8]
-    rows, flags, force = np.array([0, 1, 1, 0, 1]) > 0, np.arange(5) > 2, np.arange(5.0)
-    found = Stand(pose, twist, change, {"foot": flags}, {"fz foot": force}).logged(
-        Sensors(velocity=velocity, acceleration=acceleration), rows
-    )
-    np.testing.assert_allclose(found["base"].pose, pose[rows])
-    for values, is_logged, true in (
-        (found["base"].twist, velocity, twist), (found["base"].acceleration, acceleration, change)
-    ):  # fmt: skip
-        if is_logged:
-            np.testing.assert_array_equal(values, true[rows])
-        else:
-            assert values is None
-    assert found["contacts"]["foot"].tolist() == [False, False, True]
-    assert found["wrenches"]["fz foot"].tolist() == [1.0, 2.0, 4.0]

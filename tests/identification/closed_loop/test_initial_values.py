@@ -8,9 +8,7 @@ from helpers.paths import URDF
 
 from robotid.dynamics.prediction import predict_instants
 from robotid.identification.closed_loop.encoder_zeros import _Motion, same_encoders
-from robotid.identification.closed_loop.initial_values import (
-    free_zeros,
-)
+from robotid.identification.closed_loop.initial_values import free_zeros
 from robotid.robot.model import RobotModel
 
 

@@ -6,11 +6,7 @@ from helpers.mujoco_plant import plant, recorded
 
 from robotid.dynamics.simulation.loops import ClosedLoopRobot
 from robotid.estimation.fitting.estimator_settings import SimulationSettings
-from robotid.identification.closed_loop.encoder_zeros import (
-    CLEAR,
-    find_encoders,
-    parallel_axes,
-)
+from robotid.identification.closed_loop.encoder_zeros import CLEAR, find_encoders, parallel_axes
 from robotid.identification.closed_loop.from_commands import identify_loops
 from robotid.identification.closed_loop.loop_settings import LoopSettings
 from robotid.identification.closed_loop.loop_simulator import LoopSimulator, free_body_parameters

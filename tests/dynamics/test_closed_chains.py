@@ -7,7 +7,7 @@ import pandas as pd
 import pinocchio as pin
 import pytest
 
-from robotid.base.exceptions import DataError, ModelError, SettingsError
+from robotid.base.exceptions import DataError, ModelError
 from robotid.base.text import seconds
 from robotid.data.files.read import lay_out, read_log, write_log
 from robotid.data.log import Log
@@ -20,20 +20,15 @@ from robotid.dynamics.constraint_rows import (
     loop_basis,
     without_forces,
 )
-from robotid.dynamics.torque import InstantRegressor, joint_torque_regressor, random_regressor
+from robotid.dynamics.torque import joint_torque_regressor, random_regressor
 from robotid.estimation.fitting.survey import hold_log, survey_log
 from robotid.identification.pipeline import identify
 from robotid.robot.closure import Chains
 from robotid.robot.constraints import Loop
-from robotid.robot.drives import TERMS
-from robotid.robot.mass_matrix import check_mass_matrix
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import Coupling
 from tests.helpers.cassie import FEET, cassie, truth
 from tests.helpers.closed_chains import (
-    ANKLE,
-    ANKLE_LOOPS,
-    ANKLE_PASSIVE,
     FOUR_BAR,
     FOUR_BAR_LOOP,
     MOTORS,
@@ -293,20 +288,6 @@ def test_a_log_in_another_order_keeps_each_joint_and_names_the_loop_that_is_open
     assert [Chains(robot).is_closed(x) for x in moved[[12, 13]]] == [True, False]
 
 
-def test_the_error_of_a_rigid_loop_is_of_its_distance_and_its_angle(tmp_path, rng):
-    robot = four_bar(tmp_path, constraints=[replace(FOUR_BAR_LOOP, kind="rigid")])
-    q = rng.uniform(-1, 1, (3, 3))
-    wanted = []
-    for x in q:
-        data = robot.pin_model.createData()
-        pin.framesForwardKinematics(robot.pin_model, data, x)
-        one, two = (data.oMf[robot.pin_model.getFrameId(f)] for f in FOUR_BAR_LOOP.frames)
-        away = np.linalg.norm(one.translation - two.translation)
-        angle = np.linalg.norm(pin.log3(one.rotation.T @ two.rotation))
-        wanted.append([np.hypot(away, 0.35 * angle)])  # the longest link of the tree: 0.35 m
-    np.testing.assert_allclose(Chains(robot).gaps(q), wanted)
-
-
 def test_accelerations_that_keep_a_hinge_are_the_smallest_that_pinocchios_rows_permit(
     tmp_path, rng
 ):
@@ -334,19 +315,6 @@ def test_a_loop_that_never_closes_is_refused(tmp_path):
     robot = four_bar(tmp_path, constraints=[replace(FOUR_BAR_LOOP, kind="rigid")])
     with pytest.raises(ModelError, match=r"\(rigid\) does not close near the zero position: "):
         structural_mapping(robot)
-
-
-def test_of_two_loops_the_one_that_stays_open_is_named_with_its_error(tmp_path):
-    right = ANKLE.index("right_tip")  # its rod is too long
-    text = ANKLE[:right] + ANKLE[right:].replace('xyz="0 0 -0.21"', 'xyz="0 0 -0.9"', 1)
-    path = tmp_path / "ankle.urdf"
-    path.write_text(text)
-    robot = RobotModel.from_urdf(path, constraints=ANKLE_LOOPS, passive=ANKLE_PASSIVE)
-    with pytest.raises(ModelError) as error:
-        Chains(robot).random_states(1, np.random.default_rng(0))
-    name, left = str(error.value).split(" does not close near the zero position: ")
-    assert name == "loop right_rod_end - right_heel (point)"
-    assert float(left.split(" m remain")[0]) > 0.2
 
 
 @pytest.mark.parametrize("kind", ["point", "hinge", "rigid"])
@@ -379,37 +347,6 @@ def test_errors_change_as_rows_and_drift_state(kind, rng):
     h = 1e-4
     second = (error(h, twists) - 2 * error(0.0, twists) + error(-h, twists)) / h**2
     np.testing.assert_allclose(loop.drift(centripetal, turning, M.rotation), second, atol=1e-5)
-
-
-def test_the_mass_matrix_is_that_of_the_permitted_motion(bars):
-    pi = bars.standard_parameters()
-    same = bars.layout.names.index("rocker.Izz")
-    pi[same] -= 0.3**2 * 0.6  # the same closed chain with 0.6 kg moved to the coupler's end
-    pi[bars.layout.names.index("rocker.mcx")] -= 0.3 * 0.6
-    pi[bars.layout.names.index("coupler.mcx")] += 0.38 * 0.6
-    pi[bars.layout.names.index("coupler.m")] += 0.6
-    pi[bars.layout.names.index("coupler.Izz")] += 0.38**2 * 0.6
-    assert check_mass_matrix(bars, pi).is_positive
-    assert not check_mass_matrix(replace(bars, constraints=()), pi).is_positive
-
-
-def test_passive_joints_have_only_stated_terms(tmp_path):
-    assert four_bar(tmp_path).layout.drive_names == tuple(f"drive.{term}" for term in TERMS)
-    own = {"pivot": [TERMS["viscous"]]}
-    robot = four_bar(tmp_path, own_terms=own, terms=("viscous",))
-    assert robot.layout.drive_names == ("drive.viscous", "pivot.viscous")
-    assert "pivot.viscous" in structural_mapping(robot).base_names
-    for wrong, message in (
-        ({"passive": ("pivott",)}, "passive has pivott, wanted joints that are identified"),
-        ({"own_terms": {"drive": [TERMS["coulomb"]]}}, "drive.coulomb is stated twice for one"),
-    ):
-        with pytest.raises(SettingsError, match=message):
-            four_bar(tmp_path, **wrong)
-
-
-def test_online_identification_refuses_loops(bars):
-    with pytest.raises(DataError, match="loops; recursive identification needs a robot with a fix"):
-        InstantRegressor(bars, np.arange(3))
 
 
 def motion_of(bars, pi, duration, step):
