@@ -14,15 +14,7 @@ from robotid.base.files import check_file
 from robotid.base.findings import listed
 from robotid.base.typing import ProgressCallback
 from robotid.cli.console import echo, print_files, progress_of, show_found
-from robotid.cli.flags import (
-    JOB,
-    ROBOT,
-    Flags,
-    add_json,
-    add_progress,
-    job_from_flags,
-    number,
-)
+from robotid.cli.flags import JOB, ROBOT, Flags, add_json, add_progress, job_from_flags, number
 from robotid.cli.job import Job, as_job
 from robotid.cli.logs import result_run
 from robotid.data.log import Log

@@ -24,13 +24,7 @@ from robotid.cli.console import (
 )
 from robotid.cli.flags import OUTPUT, add_job, add_out, add_progress, job_from_flags, source_words
 from robotid.cli.job import Job, LogEntry, job_file
-from robotid.cli.logs import (
-    examine_logs,
-    locked_as_logged,
-    needed_of,
-    survey_logs,
-    units_of_logs,
-)
+from robotid.cli.logs import examine_logs, locked_as_logged, needed_of, survey_logs, units_of_logs
 from robotid.cli.payload import check_payloads
 from robotid.data.files.read import Readable, read_logs
 from robotid.data.log import Log
@@ -193,11 +187,7 @@ def run_job(
 
 
 def save_result(
-    identification: Identification,
-    folder: str | Path,
-    *,
-    report: bool = True,
-    replay: bool = False,
+    identification: Identification, folder: str | Path, *, report: bool = True, replay: bool = False
 ) -> Path:
     """Write the files of ``robotid identify``: result.json, report, URDF with its sidecar.
 
@@ -239,11 +229,7 @@ def _names(model: RobotModel) -> tuple[str, str, str, str]:
 
 
 def _write(
-    found: Identification,
-    job: Job,
-    target: Path,
-    *,
-    source: Sequence[str] = (),
+    found: Identification, job: Job, target: Path, *, source: Sequence[str] = ()
 ) -> tuple[Identification, dict[str, Any]]:
     """Write all files of a result; return the identification with its report, and result.json."""
     names = report, replay, name, sidecar = _names(found.model)

@@ -211,11 +211,7 @@ class Job(Settings):
         "whether the identified friction is also written to <dynamics> of the URDF",
         at="output.dynamics",
     )
-    report: bool = setting(
-        True,
-        "whether report.html is written",
-        at="output.report",
-    )
+    report: bool = setting(True, "whether report.html is written", at="output.report")
     replay: bool = setting(
         False,
         "whether replay.html is written: the first validation log, or the first fitted log",

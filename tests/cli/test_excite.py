@@ -67,10 +67,7 @@ def test_a_motion_is_designed_written_and_told(designed):
         (["--seconds", "0"], "seconds is 0.0, wanted 0.001 or more s"),
         (["--seed", "-1"], "seed is -1, wanted 0 or a positive whole number"),
         (["--floor", "1e300"], "floor is 1e+300, wanted at most 1000 m"),
-        (
-            ["--max-jerk", "wrist_1_joint=1e300"],
-            "jerk of 'wrist_1_joint' is 1e+300, wanted",
-        ),
+        (["--max-jerk", "wrist_1_joint=1e300"], "jerk of 'wrist_1_joint' is 1e+300, wanted"),
         (["--box", "post=0,0,0,1,1,nan"], "the lower and the upper corner [m], within 1000 m"),
         (["--criterion", "widest"], "criterion is widest, which needs an earlier result"),
     ],
