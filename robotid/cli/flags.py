@@ -17,7 +17,7 @@ def number(word: str, flag: str, wanted: str = "a number", shown: str = "") -> f
     try:
         return float(word)
     except ValueError as error:
-        raise SettingsError(f"{flag} {shown or word!r}: wanted {wanted}") from error
+        raise SettingsError(f"{flag} {shown or repr(word)}: wanted {wanted}") from error
 
 
 def pairs(words: Sequence[str], flag: str) -> dict[str, float]:

@@ -297,7 +297,11 @@ class RobotModel:
             SettingsError: If a name is not that of a drive.
         """
         require_kind(own, Mapping, "own", "a table of drive terms")
-        by_drive = {name: tuple(terms) for name, terms in own.items() if terms}
+        by_drive = {
+            name: tuple(require_each(terms, DriveTerm, f"own of {name!r}", "drive terms"))
+            for name, terms in own.items()
+            if terms
+        }
         return replace(self, layout=replace(self.layout, own=by_drive), reference=None)
 
     def with_gravity(self, gravity: Array) -> "RobotModel":
