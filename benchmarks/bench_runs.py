@@ -29,6 +29,7 @@ import mujoco
 import numpy as np
 import pinocchio as pin
 from scipy.linalg import block_diag
+from scipy.special import ndtr
 
 from robotid.cli.identify import run_job
 from robotid.cli.job import LogEntry, job_from_settings, read_job
@@ -44,7 +45,7 @@ from robotid.estimation.fitting.recorded import Recordings
 from robotid.estimation.fitting.survey import hold_log
 from robotid.estimation.variation.draws import scores_to_values
 from robotid.estimation.variation.groups import Group, RunsOf, runs_of, sums_of
-from robotid.estimation.variation.mixed_effects import MixedEffects, Runs, covariance_of
+from robotid.estimation.variation.spread import Runs, SpreadModel, covariance_of
 from robotid.estimation.variation.variation import SCORES, Variation, _parameters, vary
 from robotid.identification.closed_loop.loop_result import loop_runs
 from robotid.identification.pipeline import identify, with_drives
@@ -212,7 +213,7 @@ def drawn(variation, count, rng):
     found = [each.prediction for each in variation.parameters]
     z = rng.standard_normal((count, len(found))) @ np.linalg.cholesky(variation.correlation).T
     return np.column_stack([
-        scores_to_values(z[:, p], SCORES, each.quantiles(SCORES), -np.inf)
+        scores_to_values(z[:, p], SCORES, each.mixture.quantiles(ndtr(SCORES)), -np.inf)
         for p, each in enumerate(found)
     ])  # fmt: skip
 
@@ -253,8 +254,8 @@ def compared(runs, k):
     C = covariance_of(runs.H[k], runs.scale)
     x, others = C @ runs.h[k], runs.without(k)
     error, known = np.sqrt(np.diag(C)), np.sqrt(np.diag(C)) < runs.scale
-    found = MixedEffects(others).predict(np.diag(C))
-    ends = np.array([each.ends for each in found])
+    predicted = SpreadModel(runs).against_others(np.array([k]), is_unit=False).mixture
+    ends = np.array([predicted.at((0, p)).ends for p in range(len(x))])
     inside = (ends[:, 0] < x) & (x < ends[:, 1])
     P = covariance_of(others.H.sum(axis=0), runs.scale)
     alone = np.abs(x - P @ others.h.sum(axis=0)) < 1.96 * np.sqrt(np.diag(P) + error**2)
@@ -460,7 +461,7 @@ def estimates(rng, x, unit):
 def parameters_of(groups):
     """Return the variation of parameters, without a comparison of the runs."""
     unit = groups[0].runs.unit
-    own = [each for group in groups for each in _parameters(group, MixedEffects(group.runs))]
+    own = [each for group in groups for each in _parameters(group, SpreadModel(group.runs))]
     names = tuple(map(str, range(len(unit))))
     return Variation(names, int(unit.max()) + 1, tuple(own), (), of_runs=tuple(unit.tolist()))
 

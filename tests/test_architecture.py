@@ -36,7 +36,7 @@ PINOCCHIO = {"robot", "dynamics", "output/viewer"}
 INSIDE_FUNCTIONS = {
     "yourdfpy": {"robot"},
     "meshcat": {"output/viewer"},
-    "trimesh": {"robot"},
+    "trimesh": {"robot", "output/viewer"},
     "pandas": {"diagnosis/verdict"},
     "pyarrow": {"data/files"},
     "rosbags": {"data/files"},
@@ -45,7 +45,7 @@ INSIDE_FUNCTIONS = {
     "loky": {"estimation/workers"},
     "rich": {"cli"},
     "coal": {"design"},
-    "matplotlib": {"paper"},
+    "matplotlib": set(),
 }
 
 

@@ -26,7 +26,7 @@ from robotid.data.log import suggestion
 from robotid.dynamics.factors import available_cores
 from robotid.estimation.fitting.estimator_settings import SimulationSettings
 from robotid.estimation.variation.groups import FEWEST_RUNS
-from robotid.estimation.variation.units_of_fleet import FALSE_ALARMS, between_units
+from robotid.estimation.variation.variation import FALSE_ALARMS, between_units
 from robotid.estimation.workers.checkpoint import Checkpoint, released_on_error
 from robotid.estimation.workers.pieces import Workload
 from robotid.estimation.workers.plan import WorkPlan
@@ -389,11 +389,11 @@ class _Gathered:
             )  # fmt: skip
             unlike += [
                 {
-                    "unit": own[each.unit][0], "parameter": name, "value": own[each.unit][1],
-                    "std_error": own[each.unit][2], "parameter_unit": unit,
-                    "others": prediction.ends.tolist(), "probability": each.probability,
+                    "unit": own[k][0], "parameter": name, "value": own[k][1],
+                    "std_error": own[k][2], "parameter_unit": unit,
+                    "others": prediction.ends.tolist(), "probability": probability,
                 }
-                for each in different
+                for k, probability in different
             ]  # fmt: skip
         return {
             "units": len(units),

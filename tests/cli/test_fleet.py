@@ -16,7 +16,7 @@ from robotid.base.exceptions import DataError
 from robotid.cli import fleet, main
 from robotid.cli.fleet import UnitResult, _Gathered, read_fleet, run_fleet
 from robotid.data.files.read import write_log
-from robotid.estimation.variation.units_of_fleet import between_units
+from robotid.estimation.variation.variation import between_units
 from robotid.estimation.workers.checkpoint import FOLDER
 from robotid.estimation.workers.plan import WorkPlan
 from robotid.robot.model import RobotModel
@@ -265,7 +265,7 @@ def test_units_are_compared_by_parameter_robot_and_expression(monkeypatch):
         assert entry["next_interval"] == prediction.ends.tolist()
         figures = entry["mean"], entry["std_error"], entry["spread"]
         assert figures == (prediction.mean, prediction.std_error, prediction.spread)
-        unlike += [(each.probability, f"u{each.unit + p}", p) for each in different]
+        unlike += [(probability, f"u{k + p}", p) for k, probability in different]
     assert len(found["parameters"]) == 2
     assert [each[1] for each in unlike] == ["u1", "u3"]
     for entry, (probability, unit, p) in zip(found["unlike"], sorted(unlike), strict=True):

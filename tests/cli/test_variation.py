@@ -21,6 +21,7 @@ from robotid.data.files.read import write_log
 from robotid.dynamics.torque import joint_torque_regressor
 from robotid.estimation.fitting.recorded import Recordings
 from robotid.estimation.variation.groups import runs_of, sums_of
+from robotid.estimation.variation.spread import Mixture
 from robotid.estimation.variation.variation import SCORES, vary
 from robotid.output.files.ranges import parameter_ranges, stated_ranges
 from robotid.robot.examples import example_urdf
@@ -74,7 +75,8 @@ def test_result_has_the_variation_of_each_drive_parameter(result, folder):
     assert entry["one_more"] == dict(
         zip(("std_error", "interval_width"), each.prediction.after, strict=True)
     )
-    assert entry["next_quantiles"][7] == pytest.approx(each.prediction.quantiles(np.zeros(1))[0])
+    middle = each.prediction.mixture.quantiles(np.full(1, 0.5))[0]
+    assert entry["next_quantiles"][7] == pytest.approx(middle)
     low, high = np.interp([-1.96, 1.96], SCORES, entry["next_quantiles"])
     assert [low, high] == pytest.approx(entry["next_interval"], rel=0.1)
     assert np.array(variation["correlation"]).shape == (len(own), len(own))
@@ -89,12 +91,13 @@ def test_result_has_the_variation_of_each_drive_parameter(result, folder):
 def test_ranges_stay_possible_and_have_no_ends_at_a_bound(result):
     found, _ = result
     ends = np.array([-1.0, 5.0])
-    each = [replace(x, prediction=replace(x.prediction, ends=ends))
+    normal = Mixture(np.ones(1), ends.mean(keepdims=True), np.array([np.ptp(ends) / 3.919928]))
+    each = [replace(x, prediction=replace(x.prediction, mixture=normal))
             for x in found.variation.parameters]  # fmt: skip
     wide = replace(found, variation=replace(found.variation, parameters=tuple(each)))
     drives = parameter_ranges(wide)["drives"]["elbow_joint"]
-    assert (drives["coulomb"]["low"], drives["coulomb"]["high"]) == (0.0, 5.0)
-    assert (drives["offset"]["low"], drives["offset"]["high"]) == (-1.0, 5.0)
+    assert (drives["coulomb"]["low"], drives["coulomb"]["high"]) == (0.0, pytest.approx(5.0))
+    assert (drives["offset"]["low"], drives["offset"]["high"]) == pytest.approx((-1.0, 5.0))
     standard = found.standard.copy()
     standard[found.model.layout.names.index("elbow_joint.coulomb")] = 0.0
     drives = parameter_ranges(replace(wide, standard=standard))["drives"]["elbow_joint"]

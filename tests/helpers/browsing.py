@@ -74,9 +74,28 @@ def launch() -> Iterator[Any]:
 def visit(
     browser: Any, target: str | Path, *, size: tuple[int, int] = (1280, 800), **options: Any
 ) -> Iterator[Visit]:
-    """Open a file or an address in a window [px]; options are those of Playwright's new_context."""
+    """Open a file or an address in a window [px]; options are those of Playwright's new_context.
+
+    A page that is lost while it loads, as on a busy machine, is opened once more.
+    """
+    from playwright.sync_api import Error
+
     address = Path(target).resolve().as_uri() if isinstance(target, Path) else target
     context = browser.new_context(viewport={"width": size[0], "height": size[1]}, **options)
+    try:
+        seen = _opened(context, address)
+    except Error:
+        context.close()
+        context = browser.new_context(viewport={"width": size[0], "height": size[1]}, **options)
+        seen = _opened(context, address)
+    try:
+        yield seen
+    finally:
+        context.close()
+
+
+def _opened(context: Any, address: str) -> Visit:
+    """Open an address and note what goes wrong."""
     page = context.new_page()
     page.add_init_script(READS_PIXELS)
     seen = Visit(page)
@@ -93,7 +112,4 @@ def visit(
     page.on("console", hear)
     page.on("request", note)
     page.goto(address)
-    try:
-        yield seen
-    finally:
-        context.close()
+    return seen

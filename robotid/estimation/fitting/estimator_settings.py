@@ -433,14 +433,6 @@ class SimulationSettings(EstimatorSettings):
         "plausible relative error of the URDF's inertial parameters; 0: they are fixed",
         within=_NOT_NEGATIVE,
     )
-    error: str = setting(
-        "output",
-        "compared signal: output, positions (closed-loop output error, CLOE); input, simulated "
-        "and logged torques (closed-loop input error, CLIE); direct, as input, but with the "
-        "derivatives of inverse dynamics, which neglect the change of the motion (DIDIM; gains "
-        "and delay must be stated)",
-        among=("output", "input", "direct"),
-    )
     velocities: bool = setting(
         False,
         "whether logged velocities are fitted in addition to the positions; velocities that a "
@@ -452,21 +444,6 @@ class SimulationSettings(EstimatorSettings):
     whiten: bool = setting(
         True, "whether the residuals are whitened by their estimated correlation"
     )
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.error == "output":
-            return
-        compared = f"estimator: error = {self.error!r} compares torques"
-        if not self.torques:
-            raise SettingsError(
-                f"{compared}, but torques is false; remove torques = false, or set error = 'output'"
-            )
-        if self.velocities:
-            raise SettingsError(
-                f"{compared}, but velocities is true; remove velocities = true, or set "
-                "error = 'output'"
-            )
 
 
 #: The settings of each estimator, by its name.

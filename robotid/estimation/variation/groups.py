@@ -16,7 +16,7 @@ import numpy as np
 from robotid.base.typing import Array
 from robotid.dynamics.base_parameters import BaseMapping
 from robotid.dynamics.factors import Factors
-from robotid.estimation.variation.mixed_effects import Runs
+from robotid.estimation.variation.spread import Runs
 from robotid.robot.model import RobotModel
 
 #: Smallest number of runs whose scatter is estimated.
@@ -63,15 +63,12 @@ class RunsOf:
         centre: Its values in the fit, shape (q,): 0 for a payload, 1 for a gain.
         runs: Information about x, coloured noise included.
         inflation: Variance of coloured noise over that of independent rows [-].
-        across: Rows of the group in A^T A with A = W B of all Q parameters of all groups, in their
-            order, shape (k, q, Q); None: the other groups are independent of it.
     """
 
     group: Group
     centre: Array
     runs: Runs
     inflation: float
-    across: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,7 +166,6 @@ def runs_of(
     every = groups_at(model, mapping, standard)
     places = _places([group for group, _ in every])
     kept = [k for k, own in enumerate(places) if sums.H[:, own, own].any()]  # some run has effects
-    columns = np.concatenate([np.r_[places[k]] for k in kept]) if kept else np.empty(0, dtype=int)
     squares = np.einsum("kqq->q", sums.H)
     of_gains = {group.name: squares[own].item()
                 for (group, _), own in zip(every, places, strict=True)
@@ -184,7 +180,7 @@ def runs_of(
         else:
             scale = _scale(group, centre, H.sum(axis=0), model, standard)
         runs = Runs(H / inflation, sums.h[:, own] / inflation, unit, scale)
-        found.append(RunsOf(group, centre, runs, inflation, sums.H[:, own][:, :, columns]))
+        found.append(RunsOf(group, centre, runs, inflation))
     return tuple(found)
 
 

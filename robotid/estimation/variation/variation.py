@@ -6,16 +6,28 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+import scipy.special
 
 from robotid.base.typing import Array
-from robotid.estimation.variation.causes import evidence_by_group
 from robotid.estimation.variation.groups import FEWEST_RUNS, RunsOf
-from robotid.estimation.variation.mixed_effects import MixedEffects, Prediction, covariance_of
+from robotid.estimation.variation.spread import (
+    Compared,
+    Mixture,
+    Prediction,
+    Runs,
+    SpreadModel,
+    covariance_of,
+)
 
 #: Standard normal scores at which result.json has the quantiles of the predictive distribution.
 SCORES = np.linspace(-3.5, 3.5, 15)
-_FALSE_ALARMS = 0.02  # probability that one of alike runs or units is named
+#: Probability that one of alike runs or units is named.
+FALSE_ALARMS = 0.02
+_PENALTY = 2.0  # evidence that each parameter of a group must add (Akaike)
 _LEAST_SHRUNK = 1e-3  # smallest share of the shrinkage: the correlation has an inverse
+_SCALE = 0.1  # smallest plausible standard deviation between units, over the parameter's size
+_SPREADS = 32  # standard deviations between units over which a test is integrated
+_RANGE = 0.05, 30.0  # their range, over the smallest standard error, over the scatter
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,7 +39,6 @@ class VaryingParameter:
         unit: Its unit.
         prediction: Mean, spread between runs, and prediction interval of the next run; between
             units and of the next unit, if there are several.
-        within: Most probable spread between runs of one unit, if there are several units.
         values: Its value in each run, shape (k,): the run's own and the mean, weighted by their
             information.
         std_errors: Their standard errors, shape (k,).
@@ -38,24 +49,20 @@ class VaryingParameter:
     prediction: Prediction
     values: Array
     std_errors: Array
-    within: float | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values, as result.json has them."""
-        found = self.prediction
+        p = self.prediction
         return {
             "unit": self.unit,
-            "mean": found.mean,
-            "std_error": found.std_error,
-            "spread": found.spread,
-            "spread_interval": found.spread_ends.tolist(),
-            **({} if self.within is None else {"spread_within_units": self.within}),
-            "next_interval": found.ends.tolist(),
-            "next_quantiles": found.quantiles(SCORES).tolist(),
-            "one_more": {
-                "std_error": found.after[0],
-                "interval_width": found.after[1],
-            },
+            "mean": p.mean,
+            "std_error": p.std_error,
+            "spread": p.spread,
+            "spread_interval": p.spread_ends.tolist(),
+            **({} if p.within is None else {"spread_within_units": p.within}),
+            "next_interval": p.ends.tolist(),
+            "next_quantiles": p.mixture.quantiles(scipy.special.ndtr(SCORES)).tolist(),
+            "one_more": {"std_error": p.after[0], "interval_width": p.after[1]},
             "by_log": self.values.tolist(),
             "std_error_by_log": self.std_errors.tolist(),
         }
@@ -86,6 +93,10 @@ class UnlikeRun:
     std_error: float
     ends: Array
     probability: float
+
+    def to_dict(self, names: Sequence[str]) -> dict[str, Any]:
+        """Return plain values, as result.json has them."""
+        return asdict(self) | {"run": names[self.run], "ends": self.ends.tolist()}
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,7 +129,7 @@ class Variation:
         It is that of the values in the runs or units, shrunk to 0 by its own uncertainty; shape
         (m, m).
         """
-        values = np.array([each.values for each in self.parameters]).reshape(-1, len(self.runs))
+        values = np.array([x.values for x in self.parameters]).reshape(-1, len(self.runs))
         if self.units > 1:
             unit = np.array(self.of_runs)
             values = np.stack([values[:, unit == u].mean(axis=1) for u in range(self.units)], 1)
@@ -129,17 +140,15 @@ class Variation:
         return {
             "logs": list(self.runs),
             "units": self.units,
-            "parameters": {each.name: each.to_dict() for each in self.parameters},
+            "parameters": {x.name: x.to_dict() for x in self.parameters},
             "correlation": self.correlation.tolist(),
-            "unlike": [
-                asdict(each) | {"run": self.runs[each.run], "ends": each.ends.tolist()}
-                for each in self.unlike
-            ],
-            **({"unlike_units": [
-                asdict(each) | {"run": self.unit_names[each.run], "ends": each.ends.tolist()}
-                for each in self.unlike_units
-            ]} if self.units > 1 else {}),
-        }  # fmt: skip
+            "unlike": [run.to_dict(self.runs) for run in self.unlike],
+            **(
+                {"unlike_units": [unit.to_dict(self.unit_names) for unit in self.unlike_units]}
+                if self.units > 1
+                else {}
+            ),
+        }
 
 
 def vary(
@@ -148,16 +157,11 @@ def vary(
     """Return the variation between runs, or None for fewer than three runs.
 
     A run is compared with the prediction of the other runs, and a unit with that of the other
-    units, group by group. If a group differs, the cause named is the one that explains most of the
-    residual, see ``evidence_by_group``.
+    units, group by group. If a group differs, the cause named is the group that differs most.
     """
     if len(names) < FEWEST_RUNS or not groups:
         return None
-    parameters: list[VaryingParameter] = []
-    models = [MixedEffects(group.runs) for group in groups]
-    for group, model in zip(groups, models, strict=True):
-        if group.group.kind == "drive":
-            parameters += _parameters(group, model)
+    models = [SpreadModel(group.runs) for group in groups]
     pairs = list(zip(groups, models, strict=True))
     unit = groups[0].runs.unit
     n_units = int(unit.max()) + 1
@@ -166,13 +170,22 @@ def vary(
     size = sum(len(group.runs.scale) for group in groups)
     n_tests = size * (len(compared_units) + len(compared_runs))
     unlike_units = _unlike(pairs, compared_units, n_tests, is_unit=True)
-    different = [each.run for each in unlike_units]
+    different = [odd.run for odd in unlike_units]
     alike = compared_runs[~np.isin(unit[: len(compared_runs)], different)]
-    unlike = _unlike(pairs, alike, n_tests, is_unit=False)
     return Variation(
-        tuple(names), n_units, tuple(parameters), tuple(unlike),
-        tuple(units) or tuple(map(str, range(n_units))), tuple(unlike_units), tuple(unit.tolist()),
-    )  # fmt: skip
+        runs=tuple(names),
+        units=n_units,
+        parameters=tuple(
+            parameter
+            for group, model in pairs
+            if group.group.kind == "drive"
+            for parameter in _parameters(group, model)
+        ),
+        unlike=tuple(_unlike(pairs, alike, n_tests, is_unit=False)),
+        unit_names=tuple(units) or tuple(map(str, range(n_units))),
+        unlike_units=tuple(unlike_units),
+        of_runs=tuple(unit.tolist()),
+    )
 
 
 def between_covariance(variation: Mapping[str, Any], names: Sequence[str]) -> Array:
@@ -182,16 +195,13 @@ def between_covariance(variation: Mapping[str, Any], names: Sequence[str]) -> Ar
     the runs of a unit.
     """
     at = {name: k for k, name in enumerate(names)}
-    parameters = variation["parameters"]
-    own = [k for k, name in enumerate(parameters) if name in at]
-    places = [at[name] for name in parameters if name in at]
-    entries = [entry for name, entry in parameters.items() if name in at]
-    spreads = [(entry["spread"], entry.get("spread_within_units", 0.0)) for entry in entries]
-    std = np.hypot(*np.array(spreads).reshape(-1, 2).T)
-    found = np.zeros((len(names), len(names)))
-    R = np.array(variation["correlation"])[np.ix_(own, own)]
-    found[np.ix_(places, places)] = std[:, None] * R * std
-    return found
+    known = [(k, *x) for k, x in enumerate(variation["parameters"].items()) if x[0] in at]
+    varying, places = [k for k, *_ in known], [at[name] for _, name, _ in known]
+    std = np.array([np.hypot(x["spread"], x.get("spread_within_units", 0.0)) for *_, x in known])
+    covariance = np.zeros((len(names), len(names)))
+    R = np.array(variation["correlation"])[np.ix_(varying, varying)]
+    covariance[np.ix_(places, places)] = std[:, None] * R * std
+    return covariance
 
 
 def shrunk_correlation(values: Array) -> Array:
@@ -227,10 +237,61 @@ def shrunk_correlation(values: Array) -> Array:
     return np.where(off, left[:, None] * r * left, 1.0)
 
 
-def _parameters(group: RunsOf, model: MixedEffects) -> Iterator[VaryingParameter]:
+def between_units(
+    values: Array, std_errors: Array, level: float
+) -> tuple[Prediction, tuple[tuple[int, float], ...]] | None:
+    """Return spread and prediction of the next unit, and the units that differ from the others.
+
+    The unit farthest from the others is tested against them; if it differs, it is left out, and the
+    next one is tested. Prediction and spread are of the units that are alike. Units that differ
+    come with the two-sided probability of such a difference.
+
+    values (u,), std_errors (u,).
+    """
+    left, unlike = np.arange(len(values)), list[tuple[int, float]]()
+    while len(left) > FEWEST_RUNS:
+        away = np.abs(values[left] - np.median(values[left]))
+        k = int(np.argmax(away / np.hypot(std_errors[left], np.median(away))))
+        order = [*np.delete(left, k), left[k]]
+        probability = _probability_of_last(values[order], std_errors[order])
+        if probability >= level:
+            break
+        unlike.append((int(left[k]), probability))
+        left = np.delete(left, k)
+    if len(left) < FEWEST_RUNS:
+        return None
+    x, errors = values[left], std_errors[left]
+    scale = max(_SCALE * abs(np.median(x)), np.median(errors), np.std(x, ddof=1))
+    H = errors[:, None, None] ** -2.0
+    one = np.zeros(len(left), dtype=int)  # a unit has one estimate here: it is the lowest level
+    model = SpreadModel(Runs(H, H[:, 0] * x[:, None], one, np.array([scale])))
+    return next(model.predict()), tuple(sorted(unlike, key=lambda pair: pair[1]))
+
+
+def _probability_of_last(values: Array, std_errors: Array) -> float:
+    """Return the two-sided probability of the last value without a difference from the others.
+
+    The means of both, and the logarithm of the spread, have flat priors: without standard errors
+    this is the t-test, whose level holds for any spread.
+    """
+    x, error = values - np.median(values), float(std_errors.min())
+    low, high = (k * max(size, error) for k, size in zip(_RANGE, (0.0, np.std(x)), strict=True))
+    s = np.geomspace(low, high, _SPREADS)[:, None]
+    w = 1.0 / (s**2 + std_errors**2)  # (grid, u)
+    others, last = w[:, :-1], w[:, -1]
+    total = others.sum(axis=1)
+    mean = others @ x[:-1] / total
+    misfit = (others * (x[:-1] - mean[:, None]) ** 2).sum(axis=1)
+    density = 0.5 * (np.log(w).sum(axis=1) - misfit - np.log(total) - np.log(last))
+    weight = np.exp(density - density.max())
+    mixture = Mixture(weight / weight.sum(), mean, np.sqrt(1.0 / total + 1.0 / last))
+    return float(mixture.weight @ (2.0 * scipy.special.ndtr(-np.abs(x[-1] - mean) / mixture.std)))
+
+
+def _parameters(group: RunsOf, model: SpreadModel) -> Iterator[VaryingParameter]:
     """Yield the parameters of a group on which the runs have information."""
     known, (values, errors) = np.einsum("kpp->p", group.runs.H) > 0.0, model.values
-    for p, prediction in enumerate(model.with_one_more()):
+    for p, prediction in enumerate(model.predict()):
         if known[p]:
             centre = float(group.centre[p])
             yield VaryingParameter(
@@ -239,67 +300,74 @@ def _parameters(group: RunsOf, model: MixedEffects) -> Iterator[VaryingParameter
                 prediction.shifted(centre),
                 centre + values[:, p],
                 errors[:, p],
-                float(model.deviation[0, p]) if model.n_levels == 2 else None,
             )
 
 
 def _unlike(
-    pairs: Sequence[tuple[RunsOf, MixedEffects]], which: Array, n_tests: int, *, is_unit: bool
+    pairs: Sequence[tuple[RunsOf, SpreadModel]], which: Array, n_tests: int, *, is_unit: bool
 ) -> list[UnlikeRun]:
-    """Return the runs or units that differ from the others, in order.
-
-    The cause named is the group that explains most of the residual, the others as they vary.
-    """
-    groups, unit, unlike = [group for group, _ in pairs], pairs[0][0].runs.unit, []
-    found = [_probability(group, every, which, is_unit=is_unit) for group, every in pairs]
-    least = np.min(found, axis=0, initial=1.0)
-    for k in np.flatnonzero(least * n_tests < _FALSE_ALARMS):
-        at = int(which[k])
-        is_own = unit == at if is_unit else np.arange(len(unit)) == at
-        others = [
-            MixedEffects(
-                group.runs.without_unit(at) if is_unit else group.runs.without(at), every.deviation
-            )
-            for group, every in pairs
+    """Return the runs or units that differ from the others, in order."""
+    if not len(which):
+        return []
+    compared = [model.against_others(which, is_unit=is_unit) for _, model in pairs]
+    probability = np.array([
+        np.where(_is_compared(group, which, is_unit=is_unit)[:, None],
+                 c.mixture.beyond(c.values), np.inf).min(axis=1)
+        for (group, _), c in zip(pairs, compared, strict=True)
+    ])  # fmt: skip
+    noise = float(np.median([group.inflation for group, _ in pairs]))  # of a typical group
+    unlike = []
+    for k in np.flatnonzero(probability.min(axis=0) * n_tests < FALSE_ALARMS):
+        evidence = [
+            _explained(c, k, noise / group.inflation, is_drive=group.group.kind == "drive")
+            if p[k] * n_tests < FALSE_ALARMS
+            else -np.inf
+            for (group, _), c, p in zip(pairs, compared, probability, strict=True)
         ]
-        evidence = evidence_by_group(
-            groups, [each.deviation for each in others], is_own, is_unit=is_unit
-        )
-        known = [g for g, probability in enumerate(found) if np.isfinite(probability[k])]
-        best = max(known, key=lambda g: evidence[g])
-        own = pairs[best][1].against_others(which[k : k + 1], is_unit=is_unit)
-        x, variance = own.values[0], np.diag(own.covariance[0])
-        expected = others[best].predict(variance, x, is_unit=is_unit)
-        p, group = int(np.argmin([each.probability for each in expected])), groups[best]
+        best = int(np.argmax(evidence))
+        (group, _), c = pairs[best], compared[best]
+        p = int(np.argmin(c.mixture.beyond(c.values)[k]))
+        prediction = c.mixture.at((k, p))
         centre = float(group.centre[p])
         if group.group.kind in ("payload", "zero"):  # relative to the other runs
-            centre = -expected[p].mean
+            centre = -float(prediction.moments[0])
         unlike.append(UnlikeRun(
-            at, group.group.kind, group.group.name, group.group.parameters[p],
-            group.group.units[p], centre + float(x[p]), float(np.sqrt(variance[p])),
-            centre + expected[p].ends, float(least[k]),
+            int(which[k]), group.group.kind, group.group.name, group.group.parameters[p],
+            group.group.units[p], centre + float(c.values[k, p]),
+            float(np.sqrt(c.covariance[k, p, p])), centre + prediction.ends,
+            float(probability[:, k].min()),
         ))  # fmt: skip
     return unlike
 
 
-def _probability(group: RunsOf, every: MixedEffects, which: Array, *, is_unit: bool) -> Array:
-    """Return the smallest probability of the deviations of runs or units from the others, (m,).
+def _explained(compared: Compared, k: int, noise: float, *, is_drive: bool) -> float:
+    """Return what a difference of a group explains of a run or unit: chi^2 less 2 for each.
 
-    A payload is compared only if the run determines it, else its probability is infinite: a run in
-    which the last joints are at rest has a large moment and a wrong mass in place of any other
-    effect.
+    The run's own errors are those of a common noise. Only drive terms vary between alike runs:
+    gains, payloads and zeros need a cause.
     """
-    runs, found = group.runs, np.full(len(which), np.inf)
-    is_compared = np.ones(len(which), dtype=bool)
-    if group.group.kind == "payload" and len(which):
-        own = np.array([runs.of_unit(u).H.sum(axis=0) for u in which] if is_unit else runs.H[which])
-        alone, together = (
-            np.diagonal(covariance_of(H, runs.scale), axis1=-2, axis2=-1)
-            for H in (own, runs.H.sum(axis=0))
-        )
-        plausible = runs.scale**2  # what all runs do not determine, no motion does
-        is_compared = ~np.any((alone > plausible) & (together <= plausible), axis=1)
-    if is_compared.any():
-        compared = every.against_others(which[is_compared], is_unit=is_unit)
-        found[is_compared] = compared.probability.min(axis=1)
-    return found
+    mean, std = compared.mixture.at(k).moments
+    C = compared.covariance[k]
+    V = noise * C
+    if is_drive:
+        V = V + np.diag(np.maximum(std**2 - np.diag(C), 0.0))
+    away = compared.values[k] - mean
+    return float(away @ np.linalg.solve(V, away)) - _PENALTY * len(away)
+
+
+def _is_compared(group: RunsOf, which: Array, *, is_unit: bool) -> Array:
+    """Return which runs or units can be compared in a group, (m,).
+
+    A payload is compared only if the run determines it: a run in which the last joints are at rest
+    has a large moment and a wrong mass in place of any other effect.
+    """
+    runs = group.runs
+    if group.group.kind != "payload":
+        return np.ones(len(which), dtype=bool)
+    H = np.array([runs.H[runs.unit == u].sum(axis=0) for u in which]) if is_unit else runs.H[which]
+    alone, together = (
+        np.diagonal(covariance_of(x, runs.scale), axis1=-2, axis2=-1)
+        for x in (H, runs.H.sum(axis=0))
+    )
+    plausible = runs.scale**2  # what all runs do not determine, no motion does
+    return np.asarray(~np.any((alone > plausible) & (together <= plausible), axis=1))

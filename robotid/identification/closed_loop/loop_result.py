@@ -21,7 +21,7 @@ from robotid.estimation.fitting.estimator_settings import SimulationSettings
 from robotid.estimation.fitting.identified import FROM_PRIOR, sources_of
 from robotid.estimation.fitting.metrics import Metrics
 from robotid.estimation.variation.groups import FEWEST_RUNS, Group, RunsOf, inflation_of
-from robotid.estimation.variation.mixed_effects import Runs
+from robotid.estimation.variation.spread import Runs
 from robotid.identification.closed_loop.loop_settings import LoopSettings
 from robotid.identification.closed_loop.loop_simulator import (
     FreeParameter,

@@ -15,11 +15,21 @@ from robotid.design.clearance import Clearance
 from robotid.design.limits import LIMITS, Course
 from robotid.design.previews import Preview
 from robotid.output.pages.charts import Chart, Series, chart_html
-from robotid.output.pages.html import Section, code, facts_html, number, page, percent, table, text
+from robotid.output.pages.html import Section, block, facts_html, listing, page
 from robotid.robot.model import RobotModel
 
 _UNITS = ("rad", "rad/s", "rad/s²", "rad/s³", "N m", "W")
 _PRISMATIC = ("m", "m/s", "m/s²", "m/s³", "N", "W")
+_COLUMNS = (
+    ("limit", "text", "kind"), ("largest use %", "%", "use"), ("margin %", "%", "margin"),
+    ("joint", "code", "joint"), ("at [s]", ".2f", "time"), ("value of limit", ".4g", "limit"),
+    ("unit", "text", "unit"),
+)  # fmt: skip
+_UNCHECKED = {
+    "unread": "Not checked, since no shape can be read",
+    "left_alone": "Not checked, since in contact by design",
+    "built_near": "Close by design, with a smaller clearance",
+}
 _TONES = 8  # distinguishable colours of lines in one chart
 _NAMED = 5  # base parameters with the largest expected standard errors that are named
 _SHARP = 0.1  # share of the plausible range below which one is well determined ...
@@ -68,87 +78,66 @@ def write_motion_page(
 
 def _head(model: RobotModel, content: Mapping[str, Any]) -> str:
     """Return the heading, and the criterion and constraints of the design."""
-    condition = content["condition_number"]
-    how = f"{content['seconds']:.1f} s"
+    condition, how = content["condition_number"], f"{content['seconds']:.1f} s"
     if content["starts"]:
         settled = "converged" if content["converged"] else "not converged: allow more seconds"
         plural = "start" if content["starts"] == 1 else "starts"
         how += f", {content['starts']} {plural}, {settled}"
+    words = "infinite"
+    if condition is not None:
+        words = f"{condition:,.0f} (regressor, columns in units of the prior)"
     facts = {
         "motion": f"{content['kind']}, {content['duration']:.4g} s",
         "joints": f"{len(model.joints)}",
         "criterion": content["criterion"],
-        "condition number": (
-            "infinite"
-            if condition is None
-            else f"{condition:,.0f} (regressor, columns in units of the prior)"
-        ),
+        "condition number": words,
         "computing time": how,
     }
-    listing = facts_html({name: escape(value) for name, value in facts.items()})
-    return (
-        f"<h1>{escape(model.name)}: excitation trajectory</h1>\n"
-        f"<h2>Criterion and constraints</h2>\n{listing}"
-        "<p>The torques are computed from the URDF's masses and from assumed friction. Execute the "
-        f'motion slowly first.</p>\n<p class="note">Written by robotid {__version__}.</p>\n'
-    )
+    html = facts_html({name: escape(value) for name, value in facts.items()})
+    return block("motion.head", robot=escape(model.name), facts=html, version=__version__)
 
 
 def _limit_table(model: RobotModel, content: Mapping[str, Any], course: Course) -> str:
     """Return the largest used share of each limit, its joint and time, and the margin."""
     rows = []
-    for kind, entry in content["limits"].items():
-        if kind not in LIMITS:
-            continue
-        joint, k = model.joints.index(entry["where"]), LIMITS.index(kind)
-        unit = (_PRISMATIC if entry["where"] in model.layout.prismatic else _UNITS)[k]
-        rows.append(
-            [
-                text(kind),
-                percent(100 * (1.0 - entry["margin"])),
-                percent(100 * entry["margin"]),
-                code(entry["where"]),
-                number(course.peak(kind, joint), ".2f"),
-                number(float(course.limits.sizes[k, joint]), ".4g"),
-                text(unit),
-            ]
-        )
-    headers = ["limit", "largest use %", "margin %", "joint", "at [s]", "value of limit", "unit"]
-    note = (
-        f"<p>100 % of position, velocity and torque is {100 * content['share']:.0f} % of the "
-        "URDF's limit. 100 % of the others is the stated limit. Positions are measured from the "
-        "middle of their range.</p>\n"
+    for k, kind in enumerate(LIMITS):
+        if entry := content["limits"].get(kind):
+            joint = model.joints.index(entry["where"])
+            units = _PRISMATIC if entry["where"] in model.layout.prismatic else _UNITS
+            share = 100 * entry["margin"]
+            rows.append(
+                {"kind": kind, "use": 100 - share, "margin": share, "joint": entry["where"],
+                 "time": course.peak(kind, joint), "limit": course.limits.sizes[k, joint],
+                 "unit": units[k]}
+            )  # fmt: skip
+    table = listing("Largest use of each limit", _COLUMNS, rows)
+    return block("motion.limits", share=f"{100 * content['share']:.0f}", table=table) + _collisions(
+        content, course
     )
-    limits = table("Largest use of each limit", headers, rows)
-    return note + limits + _collisions(content, course)
 
 
 def _collisions(content: Mapping[str, Any], course: Course) -> str:
-    """Return the smallest margin of the motion to a collision, as a paragraph."""
+    """Return the smallest margin of the motion to a collision, and what was not checked."""
     entry, contact = content["limits"].get("collision"), course.nearest
     if entry is None or course.clearance is None:
         return "<p>Collisions were not checked.</p>\n"
-    words = "No two links can collide."
+    html = "<p>No two links can collide.</p>\n"
     if entry["margin"] is not None:
-        required = entry["kept"]
-        words = (
-            f"Smallest margin to a collision: {entry['where']}, distance "
-            f"{1e3 * (entry['margin'] + required):.0f} mm at {entry['time']:.2f} s. Required: "
-            f"{1e3 * required:.0f} mm, also between the samples."
-        )
+        where, time, required = entry["where"], entry["time"], entry["kept"]
+        html = _nearest(where, entry["margin"] + required, time, required, ", also between samples")
     elif contact is not None:
-        words = (
-            f"Smallest margin to a collision: {contact.first} and {contact.second}, distance "
-            f"{1e3 * contact.distance:.0f} mm at {contact.time:.2f} s. Required: "
-            f"{1e3 * contact.required:.0f} mm."
-        )
-    if entry["unread"]:
-        words += f" Not checked, since no shape can be read: {listed(entry['unread'])}."
-    if entry["left_alone"]:
-        words += f" Not checked, since in contact by design: {listed(entry['left_alone'])}."
-    if entry["built_near"]:
-        words += f" Close by design, with a smaller clearance: {listed(entry['built_near'])}."
-    return f"<p>{escape(words)}</p>\n"
+        where = f"{contact.first} and {contact.second}"
+        html = _nearest(where, contact.distance, contact.time, contact.required)
+    for key, words in _UNCHECKED.items():
+        html += f"<p>{words}: {escape(listed(entry[key]))}.</p>\n" if entry[key] else ""
+    return html
+
+
+def _nearest(where: str, distance: float, time: float, required: float, between: str = "") -> str:
+    millimetres = {"distance": f"{1e3 * distance:.0f}", "required": f"{1e3 * required:.0f}"}
+    return block(
+        "motion.collisions", where=escape(where), time=f"{time:.2f}", between=between, **millimetres
+    )
 
 
 def _over_time(model: RobotModel, content: Mapping[str, Any], course: Course) -> str:
@@ -156,39 +145,24 @@ def _over_time(model: RobotModel, content: Mapping[str, Any], course: Course) ->
     charts = []
     for k, kind in enumerate(LIMITS):
         is_limited = np.isfinite(course.limits.sizes[k])
-        if is_limited.any():
-            charts.append(_share_chart(model, course, kind, np.flatnonzero(is_limited)))
-        free = np.flatnonzero(~is_limited)
+        joints, free = np.flatnonzero(is_limited), np.flatnonzero(~is_limited)
+        if len(joints):
+            bound = np.full(len(course.t), 100.0)
+            edges = [Series("limit", bound, "text"), Series("−limit", -bound, "text")]
+            series = (*edges, *_lines(model, 100.0 * course.used[k], joints))
+            title = f"{kind} of each joint relative to its limit"
+            chart = Chart(title, course.t, series, "time [s]", "% of the limit", "time")
+            charts.append(chart_html(chart, f"{kind.capitalize()}, % of the limit"))
         if len(free) and kind in ("acceleration", "torque"):
-            charts.append(_free_chart(model, course, kind, free))
+            prismatic = [model.joints[j] in model.layout.prismatic for j in free]
+            units = [_UNITS[k]] * (not all(prismatic)) + [_PRISMATIC[k]] * any(prismatic)
+            lines = tuple(_lines(model, course.values[k], free))
+            name = f"{kind} [{' or '.join(units)}]"
+            chart = Chart(f"{kind} of each joint", course.t, lines, "time [s]", name, "time")
+            charts.append(chart_html(chart, f"{kind.capitalize()} without a stated limit"))
     if course.clearance is not None and course.nearest is not None:
         charts.append(_distance_chart(model, course, course.clearance))
     return f'<div class="plots">\n{"".join(charts)}</div>\n'
-
-
-def _share_chart(model: RobotModel, course: Course, kind: str, joints: Array) -> str:
-    """Return the chart of the joints' use of a limit."""
-    bound = np.full(len(course.t), 100.0)
-    lines = _lines(model, 100.0 * course.used[LIMITS.index(kind)], joints)
-    edges = [Series(label, sign * bound, "text") for label, sign in (("limit", 1), ("−limit", -1))]
-    chart = Chart(
-        f"{kind} of each joint relative to its limit", course.t, (*edges, *lines),
-        "time [s]", "% of the limit", link="time",
-    )  # fmt: skip
-    return chart_html(chart, f"{kind.capitalize()}, % of the limit")
-
-
-def _free_chart(model: RobotModel, course: Course, kind: str, joints: Array) -> str:
-    """Return the chart of a quantity without limit, in its unit."""
-    k = LIMITS.index(kind)
-    prismatic = [model.joints[j] in model.layout.prismatic for j in joints]
-    units = [_UNITS[k]] * (not all(prismatic)) + [_PRISMATIC[k]] * any(prismatic)
-    unit, lines = " or ".join(units), _lines(model, course.values[k], joints)
-    chart = Chart(
-        f"{kind} of each joint", course.t, tuple(lines), "time [s]", f"{kind} [{unit}]",
-        link="time",
-    )  # fmt: skip
-    return chart_html(chart, f"{kind.capitalize()} without a stated limit")
 
 
 def _lines(model: RobotModel, values: Array, joints: Array) -> list[Series]:

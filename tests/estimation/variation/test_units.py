@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from robotid.estimation.variation.mixed_effects import MixedEffects, Runs
-from robotid.estimation.variation.units_of_fleet import between_units
+from robotid.estimation.variation.spread import Runs, SpreadModel
+from robotid.estimation.variation.variation import between_units
 
 
 def test_mean_spread_and_next_interval_of_precise_values_are_those_of_the_sample():
@@ -26,9 +26,9 @@ def test_units_that_differ_are_named_and_left_out_of_the_prediction():
     alike, _ = between_units(x, np.full(30, 0.02), 1e-4)
     x[[7, 20]] += [-3.0, 1.5]
     prediction, unlike = between_units(x, np.full(30, 0.02), 1e-4)
-    assert [each.unit for each in unlike] == [20, 7]  # the most unlikely first, found last
-    assert unlike[0].probability < 1e-3 * unlike[1].probability
-    assert all(each.probability < 1e-4 for each in unlike)
+    assert [k for k, _ in unlike] == [20, 7]  # the most unlikely first, found last
+    assert unlike[0][1] < 1e-3 * unlike[1][1]
+    assert all(p < 1e-4 for _, p in unlike)
     assert prediction.mean == pytest.approx(alike.mean, abs=0.03)
     np.testing.assert_allclose(prediction.ends, alike.ends, atol=0.06)
 
@@ -38,7 +38,7 @@ def test_a_precise_value_within_the_spread_does_not_hide_one_that_differs():
     x[[2, 9]] = -1.9, -1.0
     errors = np.full(12, 0.02)
     errors[2] = 1e-3  # 100 standard errors from the median, and one spread
-    assert [each.unit for each in between_units(x, errors, 1e-3)[1]] == [9]
+    assert [k for k, _ in between_units(x, errors, 1e-3)[1]] == [9]
 
 
 def test_a_value_with_a_large_error_is_not_unlike():
@@ -46,7 +46,7 @@ def test_a_value_with_a_large_error_is_not_unlike():
     assert between_units(x, errors, 1e-3)[1] == ()
     assert between_units(x[:2], errors[:2], 1e-3) is None
     x, errors = np.append(x, 1.4), np.append(errors, 0.01)
-    assert [each.unit for each in between_units(x, errors, 1e-3)[1]] == [5]
+    assert [k for k, _ in between_units(x, errors, 1e-3)[1]] == [5]
 
 
 def test_a_unit_of_precise_values_has_the_probability_of_the_t_test():
@@ -56,7 +56,7 @@ def test_a_unit_of_precise_values_has_the_probability_of_the_t_test():
     errors = np.full(9, 1e-4)
     assert between_units(x, errors, 0.9 * p)[1] == ()
     (found,) = between_units(x, errors, 1.1 * p)[1]
-    assert (found.unit, found.probability) == (3, pytest.approx(p, rel=0.05))
+    assert found == (3, pytest.approx(p, rel=0.05))
 
 
 def test_the_probability_is_that_of_weighted_least_squares_over_all_spreads():
@@ -65,7 +65,7 @@ def test_the_probability_is_that_of_weighted_least_squares_over_all_spreads():
     e = 0.1 * np.exp(rng.normal(size=7))
     x = 5.0 + 0.2 * rng.normal(size=7)
     x[6], X = 9.0, np.column_stack([np.ones(7), np.arange(7) == 6])
-    unlike = {each.unit: each.probability for each in between_units(x, e, 0.05)[1]}
+    unlike = dict(between_units(x, e, 0.05)[1])
     found = []
     for s in np.geomspace(0.05 * e.min(), 30.0 * np.std(x), 32):
         W = np.diag(1.0 / (s**2 + e**2))
@@ -87,6 +87,6 @@ def test_the_probability_is_that_of_weighted_least_squares_over_all_spreads():
 def test_the_plausible_spread_is_the_largest_of_a_tenth_the_errors_and_the_scatter(x, error, scale):
     H = np.full((len(x), 1, 1), error**-2)
     runs = Runs(H, H[:, 0] * np.array(x)[:, None], np.zeros(len(x), int), np.array([scale]))
-    (wanted,) = MixedEffects(runs).predict()
+    (wanted,) = SpreadModel(runs).predict()
     found, _ = between_units(np.array(x), np.full(len(x), error), 1e-9)
     assert (found.spread, *found.ends) == pytest.approx((wanted.spread, *wanted.ends))

@@ -6,13 +6,15 @@ import numpy as np
 import pytest
 from helpers.pages import tables
 
-from robotid.estimation.variation.mixed_effects import Prediction
+from robotid.estimation.variation.spread import Mixture, Prediction
 from robotid.estimation.variation.variation import UnlikeRun, Variation, VaryingParameter
 from robotid.output.report.tables import variation_section
 
 
 def parameter(name, unit, values, std_errors, *, mean, error, spread, ends, after):
-    found = Prediction(mean, error, spread, np.array([0.0, 9.0]), np.array(ends), after=after)
+    std = np.array([np.ptp(ends) / (2 * 1.959964)])  # of one normal distribution
+    mixture = Mixture(np.ones(1), np.array([np.mean(ends)]), std)
+    found = Prediction(mean, error, spread, np.array([0.0, 9.0]), mixture, after)
     return VaryingParameter(name, unit, found, np.array(values), np.array(std_errors))
 
 

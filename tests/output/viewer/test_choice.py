@@ -75,12 +75,3 @@ def test_the_switch_is_reached_by_keys_and_the_address_has_it(browser, seen):
     with visit(browser, address, size=(900, 620), reduced_motion="reduce") as again:
         assert again.page.get_by_label("URDF + drives").is_checked()
         assert again.page.evaluate("replay.level(10, 0)") == pytest.approx(3.0, abs=0.02)
-
-
-def test_a_page_with_one_prediction_has_no_switch(browser, tmp_path):
-    model = RobotModel.from_urdf(URDF / "planar_2r.urdf")
-    q = np.column_stack([np.sin(T), np.cos(T)])
-    page = replay(model, T, q, torques=Torques(T, q, {"fit": q})).write(tmp_path / "one.html")
-    with visit(browser, page, reduced_motion="reduce") as one:
-        assert not one.page.locator("#models").is_visible()
-        assert one.errors == []

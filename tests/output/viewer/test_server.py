@@ -11,12 +11,9 @@ import numpy as np
 import pytest
 from helpers.synthetic import payload_log
 
-from robotid.base.exceptions import SettingsError
-from robotid.cli import main
 from robotid.cli.job import job_from_settings
 from robotid.cli.track import serve_track
 from robotid.data.files.read import write_log
-from robotid.output.viewer import server as live_module
 from robotid.output.viewer.scene import coordinates
 from robotid.output.viewer.server import LivePage
 
@@ -87,23 +84,6 @@ def test_a_client_that_breaks_off_leaves_no_trace(live, capfd, words):
     assert capfd.readouterr().err == ""
 
 
-def test_only_the_newest_messages_are_kept(monkeypatch):
-    monkeypatch.setattr(live_module, "_HISTORY", 5)
-    with LivePage("") as live:
-        for k in range(12):
-            live.send({"t": k})
-        live.finish()
-        assert told(live.url) == [{"t": k} for k in range(7, 12)]
-
-
-def test_closing_frees_the_port_and_a_taken_one_is_an_error(live):
-    port = int(live.url.rstrip("/").rsplit(":", 1)[1])
-    with pytest.raises(OSError, match=rf"port {port} of .* already in use; choose another port"):
-        LivePage("", port)
-    live.close()
-    LivePage("", port).close()
-
-
 @pytest.fixture(scope="module")
 def words(panda, tmp_path_factory):
     log = payload_log(panda, np.random.default_rng(0), duration=12.0, at=10.0)
@@ -153,13 +133,3 @@ def test_a_tracker_tells_motion_torque_parameters_and_changes(panda, words, tmp_
     assert known[np.abs(speed) > 0.05].all()
     assert not known[np.abs(speed) < 0.01].any()
     assert (np.abs(speed) < 0.01).any()
-
-
-def test_a_wrong_speed_is_refused(words, tmp_path, capsys):
-    assert main(["track", *words[1], "--out", str(tmp_path), "--serve", "--speed", "-1"]) == 2
-    assert "speed is -1.0, wanted 0, or 0.001 or more" in capsys.readouterr().err
-    assert main(["track", *words[1], "--out", str(tmp_path), "--serve", "--speed", "1e-300"]) == 2
-    assert main(["track", *words[1], "--out", str(tmp_path), "--serve", "99999"]) == 2
-    assert "port is 99999, wanted 1 to 65535" in capsys.readouterr().err
-    with pytest.raises(SettingsError, match="speed is nan"):
-        serve_track(None, None, speed=float("nan"), announce=print)

@@ -44,21 +44,6 @@ def test_what_is_closed_stays_closed_whatever_its_colours():
     assert areas[:2] == pytest.approx(areas[2:], rel=0.03)
 
 
-def test_far_too_many_triangles_are_thinned_too_without_holes():
-    ball = trimesh.creation.icosphere(subdivisions=6)  # 81,920 triangles
-    ((thinned,),) = thin([[surface_of(ball)]], 2000)
-    assert len(thinned.faces) <= 2000
-    corners = thinned.vertices[thinned.faces]  # what is seen from the middle is the whole sphere
-    r = np.linalg.norm(corners, axis=2)
-    A, B, C = corners.transpose(1, 0, 2)
-    below = r.prod(axis=1) + sum(
-        (X * Y).sum(axis=1) * r[:, k] for X, Y, k in ((A, B, 2), (B, C, 0), (C, A, 1))
-    )
-    seen = 2 * np.arctan2(np.linalg.det(corners), below)  # van Oosterom and Strackee (1983)
-    assert seen.sum() == pytest.approx(4 * np.pi, rel=0.01)
-    assert np.abs(np.linalg.norm(thinned.vertices, axis=1) - 1).max() < 0.01
-
-
 def test_triangles_are_turned_alike_and_outwards(rng):
     ball = trimesh.creation.icosphere(subdivisions=3)
     faces = ball.faces.copy()
@@ -115,24 +100,6 @@ def test_edges_stay_sharp_when_few_triangles_are_left():
     mesh = trimesh.Trimesh(thinned.vertices, thinned.faces)
     assert mesh.volume == pytest.approx(6.0, rel=1e-3)
     np.testing.assert_allclose(np.ptp(mesh.vertices, axis=0), [1, 2, 3], atol=1e-3)
-
-
-def test_patches_of_a_closed_solid_are_closed_beside_an_open_one():
-    box = trimesh.creation.box((1, 1, 1))
-    halves = [Surface(np.asarray(box.vertices), box.faces[part], None)
-              for part in (slice(5), slice(5, None))]  # fmt: skip
-    sheet = Surface(np.asarray(box.vertices) + 3.0, box.faces[:4], None)
-    closed, (opened,) = thin([halves, [sheet]], 100)
-    assert [s.is_closed for s in closed] == [True, True]
-    assert not opened.is_closed
-
-
-def test_a_robot_of_any_size_keeps_its_corners():
-    ball = trimesh.creation.icosphere(subdivisions=3)
-    for size in (1e-6, 1e5):
-        ((same,),) = thin([[Surface(size * ball.vertices, ball.faces, None)]], 10_000)
-        assert len(same.faces) == len(ball.faces)
-        assert len(same.vertices) == len(ball.vertices)
 
 
 def test_a_surface_without_an_outside_is_not_called_closed(rng):

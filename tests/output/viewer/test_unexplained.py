@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from robotid.output.viewer.unexplained import _running_mean, find_unexplained, residual_levels
+from robotid.output.viewer.unexplained import find_unexplained, residual_levels
 
 T = np.arange(2000) / 100.0  # [s]
 JOINTS = ("a", "b", "c")
@@ -46,16 +46,6 @@ def test_a_push_is_one_above_six_medians_and_0_3_of_the_torque(usual, limit):
         assert [x.residual for x in found] == pytest.approx([share * limit] * (share > 1))
 
 
-def test_two_pushes_far_apart_are_two_and_near_ones_are_one(torques):
-    tau, predicted = torques
-    tau = tau.copy()
-    for row in (500, 560, 1200):
-        tau[row : row + 30, 0] -= 9.0
-    first, second = find_unexplained(T, tau, predicted, JOINTS)
-    assert first.end - first.start == pytest.approx(0.9, abs=0.2)
-    assert second.start == pytest.approx(12.0, abs=0.11)
-
-
 def test_where_nothing_is_predicted_nothing_is_unexplained(torques):
     tau, predicted = torques
     tau, predicted = tau.copy(), predicted.copy()
@@ -71,37 +61,6 @@ def test_levels_are_root_mean_squares_and_say_where_there_is_nothing():
     levels = residual_levels(np.array([0.0, 0.5, 1.0, 2.0, 2.5, 3.0]), t, residual)
     wanted = [[np.sqrt(12.5), 1], [1, -1], [2, 5], [np.nan, np.nan], [7, 0]]
     np.testing.assert_allclose(levels, wanted)
-
-
-@pytest.mark.parametrize("width", [1, 4, 5])
-def test_a_running_mean_is_that_of_the_rows_about_each(rng, width):
-    values = rng.normal(size=(30, 2))
-    values[[3, 4, 5, 6, 17], 0] = np.nan
-    found = _running_mean(values, width)
-    for k in range(30):
-        about = values[max(k - width // 2, 0) : k + width // 2 + 1]
-        for j in range(2):
-            known = about[np.isfinite(about[:, j]), j]
-            wanted = known.mean() if len(known) > width / 2 else np.nan
-            np.testing.assert_allclose(found[k, j], wanted, atol=1e-12)
-
-
-def test_of_a_push_the_largest_mean_is_told_and_a_spike_is_none():
-    """Without noise: the mean square over 21 samples, wherever in the push it is the largest."""
-    tau = 10.0 * np.sin(T[:, None] * [1.0, 2.0, 0.5])
-    predicted = tau + 0.1
-    size = np.sqrt(np.mean(tau**2, axis=0))
-    tau[600:700, 2] += np.linspace(0.0, 20.0, 100)
-    tau[1500, 0] += 6.0  # its mean is large for 21 samples, 0.2 s, but below 0.3 of the torque
-    (found,) = find_unexplained(T, tau, predicted, JOINTS)
-    level = np.sqrt(
-        [np.mean((tau - predicted)[max(k - 10, 0) : k + 11] ** 2, axis=0) for k in range(2000)]
-    )
-    large = (level > 0.6 + 1e-9) & (level > 0.3 * np.sqrt(np.mean(tau**2, axis=0)))
-    rows = np.flatnonzero(large.any(axis=1))
-    assert size[2] > 1.0
-    assert (found.joint, found.start, found.end) == ("c", T[rows[0]], T[rows[-1]])
-    assert found.residual == pytest.approx(level[:, 2].max())
 
 
 @pytest.mark.parametrize(("seconds", "count"), [(0.04, 0), (0.06, 1), (0.3, 1)])

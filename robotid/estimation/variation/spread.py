@@ -1,0 +1,407 @@
+"""Spread of each parameter between runs, or between units (robots), integrated on a grid.
+
+    x_run = mu + u_unit + u_run + e_run,    u_unit ~ N(0, s_unit^2),  u_run ~ N(0, s_run^2)
+
+A run gives the information H about the parameters of its group and h = H x_hat; H may be singular.
+Parameters are treated one by one: the deviations of the others are integrated out of each run with
+the spread found for them, and their means add to the variance of its own. The standard deviations s
+are integrated on a grid with a half Student prior of a plausible scale: with few runs their
+uncertainty is the largest part of a prediction interval. With one unit there is one level, and the
+runs are its members.
+
+References:
+    Gelman (2006), Prior distributions for variance parameters in hierarchical models, section 2.2.
+"""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+import scipy.special
+
+from robotid.base.typing import Array
+
+_UNKNOWN = 100.0  # standard deviation of a mean before the data, in plausible sizes
+_FREEDOM = 4.0  # degrees of freedom of the half Student prior of a standard deviation
+_GRID = np.linspace(-6.0, 5.0, 45)  # log of standard deviations over their plausible size
+_SWEEPS = 2  # over the parameters of a group, each with the spread of the others
+_TAILS = np.array([0.025, 0.5, 0.975])
+_HALVINGS = 60  # of the range of a quantile
+
+
+@dataclass(frozen=True, eq=False)
+class Runs:
+    """Information of k runs about q parameters that may vary.
+
+    Attributes:
+        H: Information (inverse covariance) of each run, shape (k, q, q), symmetric; singular if
+            the run does not determine all.
+        h: H times the estimate of each run, shape (k, q).
+        unit: Index of the unit (robot) of each run, shape (k,), int, from 0.
+        scale: Plausible standard deviation of each parameter, shape (q,), positive.
+    """
+
+    H: Array
+    h: Array
+    unit: Array
+    scale: Array
+
+    def without(self, run: int) -> "Runs":
+        """Return the runs except one."""
+        left = np.arange(len(self.h)) != run
+        _, unit = np.unique(self.unit[left], return_inverse=True)
+        return replace(self, H=self.H[left], h=self.h[left], unit=unit)
+
+
+@dataclass(frozen=True, eq=False)
+class Mixture:
+    """Mixtures of g normal distributions.
+
+    Attributes:
+        weight: Weights, which sum to 1, shape (..., g).
+        mean: Means, shape (..., g).
+        std: Standard deviations, shape (..., g).
+    """
+
+    weight: Array
+    mean: Array
+    std: Array
+
+    def at(self, index: int | tuple[int, ...]) -> "Mixture":
+        """Return some of the mixtures."""
+        return Mixture(self.weight[index], self.mean[index], self.std[index])
+
+    @property
+    def ends(self) -> Array:
+        """Ends of the 95 % interval of one mixture, shape (2,)."""
+        return self.quantiles(_TAILS[[0, 2]])
+
+    @property
+    def moments(self) -> tuple[Array, Array]:
+        """Mean and standard deviation, shape (...)."""
+        mean = (self.weight * self.mean).sum(axis=-1)
+        square = (self.weight * (self.std**2 + (self.mean - mean[..., None]) ** 2)).sum(axis=-1)
+        return mean, np.sqrt(square)
+
+    def below(self, x: Array) -> Array:
+        """Return the probabilities of values below x, shape (...)."""
+        z = (x[..., None] - self.mean) / self.std
+        return np.asarray((self.weight * scipy.special.ndtr(z)).sum(axis=-1))
+
+    def beyond(self, x: Array) -> Array:
+        """Return the two-sided probabilities of values as far out as x, shape (...)."""
+        above = replace(self, mean=-self.mean).below(-x)
+        return np.asarray(np.minimum(2.0 * np.minimum(self.below(x), above), 1.0))
+
+    def quantiles(self, wanted: Array) -> Array:
+        """Return the values with given probabilities of smaller ones: wanted (n,), one mixture."""
+        ends = self.mean + self.std * scipy.special.ndtri(wanted)[:, None]
+        low, high = ends.min(axis=1), ends.max(axis=1)
+        for _ in range(_HALVINGS):
+            middle = 0.5 * (low + high)
+            is_low = self.below(middle) < wanted
+            low, high = np.where(is_low, middle, low), np.where(is_low, high, middle)
+        return np.asarray(0.5 * (low + high))
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """Mean and spread of one parameter, and prediction of a new run of a new unit.
+
+    Attributes:
+        mean: Mean over runs and units.
+        std_error: Its standard error.
+        spread: Standard deviation between runs, or units if there are several, median.
+        spread_ends: Ends of its 95 % interval, shape (2,).
+        mixture: Predictive distribution of a new run.
+        after: Expected standard error of the mean, and expected width of the prediction interval,
+            with one more run, or one more unit if there are several.
+        within: Median of the standard deviation between runs of a unit, if there are several units.
+    """
+
+    mean: float
+    std_error: float
+    spread: float
+    spread_ends: Array
+    mixture: Mixture
+    after: tuple[float, float] = (math.nan, math.nan)
+    within: float | None = None
+
+    @cached_property
+    def ends(self) -> Array:
+        """Ends of the 95 % prediction interval of a new run, shape (2,)."""
+        return self.mixture.ends
+
+    def shifted(self, centre: float) -> "Prediction":
+        """Return the prediction of the parameter plus a constant."""
+        moved = replace(self.mixture, mean=self.mixture.mean + centre)
+        return replace(self, mean=self.mean + centre, mixture=moved)
+
+
+@dataclass(frozen=True, eq=False)
+class Compared:
+    """Runs, or units, each compared with the prediction of all others.
+
+    Attributes:
+        values: Their own parameters, shape (m, q).
+        covariance: Covariance of these, shape (m, q, q).
+        mixture: Prediction of an estimate as uncertain as theirs, shapes (m, q, g).
+    """
+
+    values: Array
+    covariance: Array
+    mixture: Mixture
+
+
+@dataclass(frozen=True, eq=False)
+class _Grid:
+    """One parameter for standard deviations between members and within them; sums over members.
+
+    Members are units, or the runs of one unit. Arrays end with the axes (within, between).
+    """
+
+    between: Array  # (1, g), variance between members
+    within: Array  # (w, 1), variance between the runs of a member
+    members: Array  # (k,), member of each run
+    W: Array  # (k,), information of each run
+    w: Array  # (k,), score
+    prior: float  # information about the mean
+    others: float  # variance of the mean due to the means of the other parameters
+    log_prior: Array  # (w, g)
+
+    @cached_property
+    def of_runs(self) -> Array:
+        """Information, score and log likelihood of each run, shape (3, k, w, 1)."""
+        return _integrated(self.W[:, None, None], self.w[:, None, None], self.within)
+
+    @cached_property
+    def sums(self) -> Array:
+        """The same, summed over the runs of each member, shape (3, u, w, 1)."""
+        total = np.zeros((3, int(self.members.max()) + 1, *self.of_runs.shape[2:]))
+        for part, values in zip(total, self.of_runs, strict=True):
+            np.add.at(part, self.members, values)
+        return total
+
+    @cached_property
+    def of_members(self) -> Array:
+        """Information, score and log likelihood of each member, shape (3, u, w, g)."""
+        return self.lifted(self.sums)
+
+    def lifted(self, sums: Array) -> Array:
+        """Return the sums of members with the deviation of each integrated, (3, ..., w, g)."""
+        found = _integrated(sums[0], sums[1], self.between)
+        found[2] += sums[2]
+        return found
+
+    def mean(self, total: Array) -> tuple[Array, Array, Array]:
+        """Return weight, mean and variance of the mean from sums (3, ..., w, g) over members."""
+        information = total[0] + self.prior
+        mean = total[1] / information
+        log = total[2] + 0.5 * (total[1] * mean - np.log(information)) + self.log_prior
+        return _normed(log), mean, 1.0 / information + self.others
+
+    @cached_property
+    def all(self) -> tuple[Array, Array, Array]:
+        """Weight, mean and variance of the mean by all members, shape (w, g)."""
+        return self.mean(self.of_members.sum(axis=1))
+
+    def median(self, axis: int, wanted: Array = _TAILS[1:2]) -> Array:
+        """Return quantiles of the standard deviation within (axis 0) or between members (1)."""
+        weight = self.all[0].sum(axis=1 - axis)
+        variance = (self.within, self.between)[axis].ravel()
+        if len(variance) == 1:
+            return np.sqrt(np.repeat(variance, len(wanted)))
+        middle = weight.cumsum() - 0.5 * weight
+        return np.asarray(np.exp(np.interp(wanted, middle, 0.5 * np.log(variance))))
+
+    def prediction(self) -> Prediction:
+        """Return mean, spread, and prediction of a new run of a new member."""
+        weight, mean, variance = self.all
+        spread = self.between + self.within
+        centre, error = _flat(weight, mean, np.sqrt(variance)).moments
+        low, median, high = self.median(1, _TAILS).tolist()
+        n = len(self.of_members[0])
+        more = variance * n / (n + 1.0)
+        total = 1.0 / (self.of_members[0].sum(axis=0) / n + self.prior) + variance
+        at = int(np.argmin(np.abs(np.sqrt(self.between) - median)))
+        log = np.log(np.maximum(weight, 1e-300))
+        after = _normed(log - 0.5 * (np.log(total) + total[:, at : at + 1] / total))
+        width = _flat(after, mean, np.sqrt(more + spread)).ends
+        return Prediction(
+            float(centre),
+            float(error),
+            median,
+            np.array([low, high]),
+            _flat(weight, mean, np.sqrt(variance + spread)),
+            (float(_flat(after, mean, np.sqrt(more)).moments[1]), float(np.ptp(width))),
+            float(self.median(0)[0]) if len(self.within) > 1 else None,
+        )
+
+    def values(self) -> tuple[Array, Array]:
+        """Return the parameter in each run and its standard error, shape (k,)."""
+        weight, mean, variance = self.all
+        steps = (self.sums[:2], self.between), (np.array([self.W, self.w])[..., None, None],
+                                                self.within)  # fmt: skip
+        for number, ((W, w), d) in enumerate(steps):
+            if number:
+                mean, variance = mean[self.members], variance[self.members]
+            left = 1.0 / (1.0 + d * W)
+            mean = mean + d * left * (w - W * mean)
+            variance = d * left + left**2 * variance
+        return _flat(np.broadcast_to(weight, mean.shape), mean, np.sqrt(variance)).moments
+
+    def without(self, which: Array, *, is_member: bool, error: Array) -> Mixture:
+        """Return the predictions of estimates by all runs except theirs: which, error (m,)."""
+        total = self.of_members.sum(axis=1)[:, None]
+        if is_member:
+            left, spread = total - self.of_members[:, which], self.between
+        else:
+            member = self.members[which]
+            rest = self.lifted(self.sums[:, member] - self.of_runs[:, which])
+            left = total - self.of_members[:, member] + rest
+            spread = self.between + self.within
+        left[0] = np.maximum(left[0], 0.0)
+        weight, mean, variance = self.mean(left)
+        return _flat(weight, mean, np.sqrt(variance + spread + error[:, None, None] ** 2))
+
+
+@dataclass(frozen=True, eq=False)
+class SpreadModel:
+    """The spread of each parameter of a group between runs, or between units."""
+
+    runs: Runs
+
+    @cached_property
+    def centred(self) -> tuple[Array, list[_Grid]]:
+        """The mean of all parameters, shape (q,), and each parameter about it."""
+        runs, spread = self.runs, self.runs.scale
+        for _ in range(_SWEEPS):
+            H, h = lifted(runs.H, runs.h, np.diag(spread**2))
+            information = H.sum(axis=0) + _prior_of(runs.scale)
+            covariance = np.linalg.inv(information)
+            centre = covariance @ h.sum(axis=0)
+            more = np.diag(covariance) - 1.0 / np.diag(information)
+            h = runs.h - runs.H @ centre
+            grids = [
+                _grid_of(*_alone(runs.H, h, spread, p), runs.unit, float(scale), float(more[p]))
+                for p, scale in enumerate(runs.scale)
+            ]
+            spread = np.array([np.hypot(grid.median(0), grid.median(1))[0] for grid in grids])
+        return centre, grids
+
+    @property
+    def centre(self) -> Array:
+        """Mean of the parameters, shape (q,)."""
+        return self.centred[0]
+
+    @property
+    def grids(self) -> list[_Grid]:
+        """Each parameter about its mean."""
+        return self.centred[1]
+
+    @cached_property
+    def deviation(self) -> Array:
+        """Medians of the standard deviations of runs and units about the mean, shape (2, q)."""
+        return np.array([[grid.median(level)[0] for grid in self.grids] for level in (0, 1)])
+
+    def predict(self) -> Iterator[Prediction]:
+        """Yield the prediction of each parameter in a new run of a new unit."""
+        for centre, grid in zip(self.centre.tolist(), self.grids, strict=True):
+            yield grid.prediction().shifted(centre)
+
+    @cached_property
+    def values(self) -> tuple[Array, Array]:
+        """Parameters in each run and their standard errors, shapes (k, q).
+
+        They are means of the run's own estimate and of the others, weighted by information.
+        """
+        values, errors = zip(*(grid.values() for grid in self.grids), strict=True)
+        return self.centre + np.transpose(values), np.transpose(errors)
+
+    def against_others(self, which: Array, *, is_unit: bool) -> Compared:
+        """Compare runs, or units, each with the prediction of all others: which (m,)."""
+        H, h = self.runs.H, self.runs.h
+        if is_unit:
+            H, h = lifted(H, h, np.diag(self.deviation[0] ** 2))
+            H, h = (np.array([x[self.runs.unit == u].sum(axis=0) for u in which]) for x in (H, h))
+        else:
+            H, h = H[which], h[which]
+        covariance = covariance_of(H, self.runs.scale)
+        errors = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+        parts = [
+            grid.without(which, is_member=is_unit, error=error)
+            for grid, error in zip(self.grids, errors.T, strict=True)
+        ]
+        weight, mean, std = (
+            np.stack([getattr(part, name) for part in parts], axis=1)
+            for name in ("weight", "mean", "std")
+        )
+        mixture = Mixture(weight, mean + self.centre[:, None], std)
+        return Compared(np.einsum("mpi,mi->mp", covariance, h), covariance, mixture)
+
+
+def covariance_of(H: Array, scale: Array) -> Array:
+    """Return the covariance of parameters from their information, with almost no prior.
+
+    H (..., q, q), scale (q,).
+    """
+    return np.asarray(np.linalg.inv(H + _prior_of(scale)))
+
+
+def _prior_of(scale: Array) -> Array:
+    return np.diag((_UNKNOWN * scale) ** -2.0)
+
+
+def lifted(H: Array, h: Array, D: Array) -> tuple[Array, Array]:
+    """Return (H^-1 + D)^-1 and its product with x, of H and h = H x, for singular H, too."""
+    G = np.linalg.inv(np.eye(len(D)) + H @ D)
+    return G @ H, np.einsum("...ij,...j->...i", G, h)
+
+
+def _alone(H: Array, h: Array, spread: Array, p: int) -> tuple[Array, Array]:
+    """Return information and score of runs about one parameter, the others N(0, spread^2)."""
+    others = np.arange(len(spread)) != p
+    inverse = np.diag(np.maximum(spread[others], 1e-150) ** -2.0)
+    G = np.linalg.solve(H[:, others][:, :, others] + inverse, H[:, others, p, None])[..., 0]
+    W = H[:, p, p] - np.einsum("ko,ko->k", G, H[:, p, others])
+    return np.maximum(W, 0.0), h[:, p] - np.einsum("ko,ko->k", G, h[:, others])
+
+
+def _grid_of(W: Array, w: Array, unit: Array, scale: float, others: float) -> _Grid:
+    """Return the grid of a parameter from the information and scores of runs (k,)."""
+    several = bool(unit.max() > 0)
+    z = _GRID - 0.5 * (_FREEDOM + 1.0) * np.log1p(np.exp(2.0 * _GRID) / _FREEDOM)
+    variance, every = (scale * np.exp(_GRID)) ** 2, slice(None, None, 2)
+    return _Grid(
+        between=variance[None],
+        within=variance[every, None] if several else np.zeros((1, 1)),
+        members=unit if several else np.arange(len(unit)),
+        W=W,
+        w=w,
+        prior=(_UNKNOWN * scale) ** -2.0,
+        others=max(others, 0.0),
+        log_prior=z + (z[every, None] if several else 0.0),
+    )
+
+
+def _integrated(W: Array, w: Array, d: Array) -> Array:
+    """Return information, score and log likelihood without a deviation of variance d."""
+    t = 1.0 + d * W
+    return np.array([W / t, w / t, 0.5 * (d * w**2 / t - np.log(t))])
+
+
+def _normed(log: Array) -> Array:
+    """Return weights that sum to 1 over the last two axes, from the log of a density."""
+    weight = np.exp(log - log.max(axis=(-2, -1), keepdims=True))
+    return np.asarray(weight / weight.sum(axis=(-2, -1), keepdims=True))
+
+
+def _flat(weight: Array, mean: Array, std: Array) -> Mixture:
+    """Return the mixture over the last two axes."""
+    shape = np.broadcast_shapes(weight.shape, mean.shape, std.shape)
+    weight, mean, std = (
+        np.broadcast_to(x, shape).reshape(*shape[:-2], -1) for x in (weight, mean, std)
+    )
+    return Mixture(weight, mean, std)

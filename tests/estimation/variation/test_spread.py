@@ -1,0 +1,221 @@
+"""Spreads on a grid against dense matrices, Monte Carlo integration, and coverage."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scipy.optimize
+import scipy.stats
+
+from robotid.estimation.variation.spread import Mixture, Runs, SpreadModel
+
+Z = np.linspace(-6.0, 5.0, 45)
+
+
+def alone(x, error, unit=None, scale=0.3):
+    """Return runs of one parameter with estimates x and their standard errors."""
+    H = np.broadcast_to(np.asarray(error, float) ** -2.0, np.shape(x))
+    unit = np.zeros(len(x), int) if unit is None else np.asarray(unit)
+    return Runs(H[:, None, None], (H * x)[:, None], unit, np.array([scale]))
+
+
+def drawn(rng, unit, between, *, rows=12):
+    """Return runs of two correlated parameters, which vary by run and unit as ``between``."""
+    of_unit, H, h = between[1] * rng.normal(size=(max(unit) + 1, 2)), [], []
+    for u in unit:
+        A = rng.normal(size=(rows, 2)) @ np.array([[1.0, 0.7], [0.0, 0.6]])
+        x = np.array([2.0, -1.0]) + of_unit[u] + between[0] * rng.normal(size=2)
+        H.append(A.T @ A)
+        h.append(A.T @ (A @ x + rng.normal(size=rows)))
+    return Runs(np.array(H), np.array(h), np.asarray(unit), np.array([0.2, 0.5]))
+
+
+def dense(x, error, unit, new=0.0):
+    """Return the posterior by covariance matrices of all runs, at each spread of runs and units.
+
+    Weight, mean of mu, its variance, expected x and their variances (k,), variances of the spread.
+    """
+    several = max(unit) > 0
+    within = (0.3 * np.exp(Z[::2])) ** 2 if several else [0.0]
+    log, parts = [], []
+    for d_run in within:
+        for d_unit in (0.3 * np.exp(Z)) ** 2:
+            shared = np.equal.outer(unit, unit) if several else np.eye(len(x))
+            G = d_run * np.eye(len(x)) + d_unit * shared
+            W = np.linalg.inv(G + np.diag(error**2))
+            one = np.ones(len(x))
+            P = one @ W @ one + (100 * 0.3) ** -2.0
+            mean = one @ W @ x / P
+            size = np.linalg.slogdet(W)[1] - np.log(P) - x @ W @ x + P * mean**2
+            s = np.sqrt([d_unit, *([d_run] if several else [])]) / 0.3
+            log.append(0.5 * size + np.log(s * scipy.stats.t(4).pdf(s)).sum())
+            left = one - G @ W @ one
+            values = mean + G @ W @ (x - mean)
+            errors = np.diag(G - G @ W @ G) + left**2 / P
+            parts.append((mean, 1 / P, values, errors, d_run, d_unit))
+    weight = np.exp(np.array(log) - max(log))
+    return weight / weight.sum(), *map(np.array, zip(*parts, strict=True))
+
+
+@pytest.mark.parametrize("unit", [(0, 0, 0, 0, 0), (0, 0, 1, 1, 1, 2, 2, 3)])
+def test_one_parameter_is_integrated_as_by_dense_matrices(unit):
+    rng, unit = np.random.default_rng(4), np.array(unit)
+    x = 2.0 + 0.3 * rng.normal(size=len(unit)) + 0.5 * unit
+    error = np.array([0.2, 0.5, 0.3, 0.2, 0.4, 0.1, 0.3, 0.6])[: len(unit)]
+    model = SpreadModel(alone(x, error, unit))
+    (found,) = model.predict()
+    weight, mean, variance, values, errors, d_run, d_unit = dense(x, error, unit)
+    centre = weight @ mean
+    near = {"rel": 1e-3}  # the prior of the mean is about the centre of the runs, here about 0
+    assert found.mean == pytest.approx(centre, **near)
+    square = weight @ (variance + (mean - centre) ** 2)
+    assert found.std_error == pytest.approx(np.sqrt(square), **near)
+    std = np.sqrt(variance + d_run + d_unit)
+    for end, share in zip(found.ends, (0.025, 0.975), strict=True):
+        assert weight @ scipy.stats.norm.cdf((end - mean) / std) == pytest.approx(share, abs=1e-4)
+    expected = weight @ values
+    np.testing.assert_allclose(model.values[0][:, 0], expected, rtol=1e-3)
+    spread_of = np.sqrt(weight @ (errors + (values - expected) ** 2))
+    np.testing.assert_allclose(model.values[1][:, 0], spread_of, rtol=1e-3)
+    below = [weight[d_unit < s**2 * 1.0001].sum() for s in (*found.spread_ends, found.spread)]
+    np.testing.assert_allclose(below, [0.025, 0.975, 0.5], atol=0.1)  # a step of the grid
+    if max(unit):
+        assert weight[d_run < found.within**2 * 1.0001].sum() == pytest.approx(0.5, abs=0.12)
+
+
+def test_prediction_is_the_monte_carlo_integral_over_spreads_of_any_size():
+    rng = np.random.default_rng(4)
+    x, error = np.array([1.3, 2.1, 1.7, 2.6]), np.array([0.2, 0.5, 0.3, 0.2])
+    (found,) = SpreadModel(alone(x, error)).predict()
+    s = 0.3 * np.exp(rng.uniform(-6, 5, 200_000))  # density of log s is uniform here
+    weight = 1 / (error**2 + s[:, None] ** 2)
+    total = weight.sum(axis=1)
+    mean = weight @ x / total
+    log = 0.5 * np.log(weight).sum(axis=1) - 0.5 * np.log(total)
+    log -= 0.5 * (weight * (x - mean[:, None]) ** 2).sum(axis=1)
+    density = np.exp(log) * s / 0.3 * scipy.stats.t(4).pdf(s / 0.3)
+    draws = rng.choice(len(s), 200_000, p=density / density.sum())
+    new = mean[draws] + np.sqrt(1 / total[draws] + s[draws] ** 2) * rng.normal(size=200_000)
+    assert found.ends == pytest.approx(np.quantile(new, [0.025, 0.975]), abs=0.04)
+    assert found.spread == pytest.approx(np.quantile(s[draws], 0.5), rel=0.05)
+    assert found.spread_ends == pytest.approx(np.quantile(s[draws], [0.025, 0.975]), rel=0.1)
+
+
+@pytest.mark.parametrize("unit", [(0,) * 7, (0, 0, 0, 1), (0, 0, 1, 1, 1, 2, 3)])
+@pytest.mark.parametrize("is_unit", [False, True])
+def test_each_is_compared_with_the_others_as_if_it_had_never_been(unit, is_unit):
+    if is_unit and len(set(unit)) < 3:
+        return
+    rng, unit = np.random.default_rng(11), np.array(unit)
+    x, error = rng.normal(size=len(unit)), 0.2 + rng.random(len(unit))
+    count = max(unit) + 1 if is_unit else len(unit)
+    model = SpreadModel(alone(x, error, unit))
+    compared = model.against_others(np.arange(count)[::-1], is_unit=is_unit)
+    for k in range(count):
+        is_out = unit == k if is_unit else np.arange(len(unit)) == k
+        row = count - 1 - k
+        variance = 1 / (error[is_out] ** 2 + (model.deviation[0] ** 2 if is_unit else 0.0))
+        wanted = 1 / (variance.sum() + (100 * 0.3) ** -2.0)
+        assert compared.covariance[row] == pytest.approx(wanted)
+        assert compared.values[row] == pytest.approx(wanted * (variance @ x[is_out]))
+        left = np.unique(unit[~is_out], return_inverse=True)[1]
+        if max(unit) and not max(left):
+            continue  # one unit is left: the grid still has both levels
+        weight, mean, variance, *_, d_run, d_unit = dense(x[~is_out], error[~is_out], left)
+        spread = d_unit + (0.0 if is_unit else d_run)
+        expected = Mixture(weight, mean, np.sqrt(variance + spread + wanted))
+        for value in (-1.0, 0.4):
+            below = compared.mixture.at((row, 0)).below(np.array(value))
+            assert below == pytest.approx(expected.below(np.array(value)), abs=1e-4)
+
+
+def test_a_run_that_tells_nothing_of_a_parameter_changes_nothing():
+    runs = drawn(np.random.default_rng(5), [0] * 4, np.full((2, 2), 0.2))
+    H, h = np.append(runs.H, np.zeros((1, 2, 2)), axis=0), np.append(runs.h, [[0.0, 0.0]], axis=0)
+    more = Runs(H, h, np.zeros(5, int), runs.scale)
+    for one, two in zip(SpreadModel(runs).predict(), SpreadModel(more).predict(), strict=True):
+        assert one.ends == pytest.approx(two.ends)
+        assert (one.mean, one.spread) == pytest.approx((two.mean, two.spread))
+    assert SpreadModel(more.without(4)).runs.h.tolist() == runs.h.tolist()
+
+
+@pytest.mark.parametrize(("runs", "ratio", "next_run", "spread"), [
+    (3, 1.0, (0.93, 1.0), (0.93, 1.0)), (5, 0.0, (0.93, 1.0), None),
+    (10, 2.0, (0.90, 0.985), (0.93, 1.0)),
+])  # fmt: skip
+def test_intervals_of_the_next_run_and_of_the_spread_cover(runs, ratio, next_run, spread):
+    rng, inside, known, count = np.random.default_rng(6), 0, 0, 150
+    between = np.full((2, 2), 0.1) * [[ratio], [0.0]]
+    for _ in range(count):
+        every = drawn(rng, [0] * (runs + 1), between, rows=60)
+        x = np.linalg.solve(every.H[-1], every.h[-1])
+        error = np.linalg.inv(every.H[-1])
+        model = SpreadModel(every.without(runs))
+        for p, prediction in enumerate(model.predict()):
+            m = prediction.mixture
+            ends = Mixture(m.weight, m.mean, np.sqrt(m.std**2 + error[p, p])).ends
+            inside += ends[0] < x[p] < ends[1]
+            known += prediction.spread_ends[0] < between[0, p] < prediction.spread_ends[1]
+    assert next_run[0] <= inside / (2 * count) <= next_run[1]
+    if spread:
+        assert spread[0] <= known / (2 * count) <= spread[1]
+
+
+def test_intervals_of_the_next_robot_and_of_spreads_between_robots_cover():
+    rng, inside, spreads, count = np.random.default_rng(6), 0, 0, 40
+    between = np.array([[0.13, 0.4], [0.31, 0.2]])
+    for _ in range(count):
+        every = drawn(rng, np.repeat(np.arange(7), 3), between)
+        known = every.unit < 6
+        model = SpreadModel(Runs(every.H[known], every.h[known], every.unit[known], every.scale))
+        x, C = np.linalg.solve(every.H[-1], every.h[-1]), np.linalg.inv(every.H[-1])
+        for p, found in enumerate(model.predict()):
+            m = found.mixture
+            ends = Mixture(m.weight, m.mean, np.sqrt(m.std**2 + C[p, p])).ends
+            inside += ends[0] < x[p] < ends[1]
+            spreads += found.spread_ends[0] < between[1, p] < found.spread_ends[1]
+    assert 0.9 <= inside / (2 * count) <= 1.0
+    assert 0.9 <= spreads / (2 * count) <= 1.0
+
+
+def test_the_mean_of_alike_runs_has_the_error_of_their_joint_fit():
+    """Correlated parameters with a small spread: the means of the others count."""
+    runs = drawn(np.random.default_rng(3), [0] * 8, np.zeros((2, 2)))
+    runs = replace(runs, scale=np.full(2, 0.05))
+    C = np.linalg.inv(runs.H.sum(axis=0))
+    mean = C @ runs.h.sum(axis=0)
+    for p, found in enumerate(SpreadModel(runs).predict()):
+        assert found.std_error == pytest.approx(np.sqrt(C[p, p]), rel=0.1)
+        assert found.mean == pytest.approx(mean[p], abs=0.2 * np.sqrt(C[p, p]))
+
+
+def test_one_more_run_narrows_intervals_as_much_as_expected():
+    rng, expected, found = np.random.default_rng(5), [], []
+    for _ in range(40):
+        x = 0.4 * rng.normal(size=7) + 0.1 * rng.normal(size=7)
+        (before,) = SpreadModel(alone(x[:6], 0.1)).predict()
+        (after,) = SpreadModel(alone(x, 0.1)).predict()
+        expected.append((before.after[0] / before.std_error, before.after[1] / np.ptp(before.ends)))
+        found.append((after.std_error / before.std_error, np.ptp(after.ends) / np.ptp(before.ends)))
+    assert np.mean(np.log(found), axis=0) == pytest.approx(
+        np.mean(np.log(expected), axis=0), abs=0.05
+    )
+
+
+def test_quantiles_and_probabilities_are_those_of_the_mixture():
+    weight, mean, std = np.array([0.3, 0.7]), np.array([1.0, 2.0]), np.array([0.5, 3.0])
+    mixture = Mixture(weight, mean, std)
+    below = scipy.stats.norm.cdf([-2.0, 0.0, 1.5])
+    values = mixture.quantiles(below)
+    cdf = (weight * scipy.stats.norm.cdf((values[:, None] - mean) / std)).sum(axis=1)
+    assert cdf == pytest.approx(below)
+    share = weight @ scipy.stats.norm.sf((9.0 - mean) / std)
+    assert mixture.beyond(np.array(9.0)) == pytest.approx(2 * share)
+    assert mixture.beyond(mixture.quantiles(np.array([0.5]))) == pytest.approx(1.0)
+
+
+def test_runs_without_scatter_have_the_smallest_spread():
+    runs = Runs(np.full((5, 1, 1), 1e12), np.full((5, 1), 2e12), np.zeros(5, int), np.ones(1))
+    (found,) = SpreadModel(runs).predict()
+    assert found.spread < 0.01
+    assert found.mean == pytest.approx(2.0)
