@@ -188,9 +188,16 @@ def random_fourier(
     period: float = 10.0,
     centre: Array | None = None,
 ) -> FourierTrajectory:
-    """Return a random motion within the position and speed limits of a robot.
+    """Return a random motion within the limits of a robot.
 
-    Its mean position is the centre (n,), or else the middle of the limits, or 0; period in s.
+    Args:
+        model: The robot; the motion is within the position and speed limits of its URDF.
+        rng: Source of the coefficients.
+        period: Period [s].
+        centre: Mean position, shape (n,) [rad or m]; the middle of the limits, or 0, if None.
+
+    Raises:
+        DataError: If the centre lies outside the limits.
     """
     n = len(model.joints)
     sine, cosine = rng.standard_normal((2, _HARMONICS, n)) / np.arange(1, _HARMONICS + 1)[:, None]
