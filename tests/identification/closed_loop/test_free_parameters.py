@@ -225,23 +225,6 @@ def test_torques_tell_gains_before_anything_is_fitted(told):
         np.testing.assert_allclose(found.kp, loops.kp, rtol=0.02)
 
 
-def test_torques_are_missed_over_all_windows_by_the_larger_of_logged_and_given(simulator):
-    lag = np.array([3.0, 2.0, 2.5])
-    theta = simulator.prior.copy()
-    for share in ([0.5, 1.0, 4.0], [4.0, 0.2, 1.0]):
-        windows = [
-            replace(w, log=replace(w.log, tau=w.log.tau * own)) for w, own in zip(
-                simulator.windows, (1.0, np.array(share)), strict=True
-            )
-        ]  # fmt: skip
-        sim = replace(simulator, windows=tuple(windows), lag=lag)
-        outs, loops = sim.roll_out(theta), sim.loops(theta)
-        given = np.concatenate([drive_torques(out, loops, lag).limited for out in outs])
-        logged = np.concatenate([w.log.tau[w.counted] for w in windows])
-        rms = [np.sqrt(np.mean(x**2, axis=0)) for x in (logged - given, logged, given)]
-        np.testing.assert_allclose(sim.torque_mismatch(theta), rms[0] / np.maximum(*rms[1:]))
-
-
 def test_what_drives_give_follows_commands_whole_or_broken_rows_late():
     """Kinds, limits and delays of two joints, beside the equation row by row."""
     rng = np.random.default_rng(2)

@@ -57,29 +57,6 @@ def test_errors_of_sums_are_those_of_their_parameters(found):
         assert error == (pytest.approx(size) if size > 0 else np.inf)
 
 
-def test_what_the_data_hardly_shrink_is_undetermined(found):
-    spread = found.fit.simulator.prior_std
-    assert (found.shrunk < 0.3).all()
-    assert found.undetermined == ()
-    share = np.array([0.85, 0.95, 0.2, 0.92, 0.1])
-    other = of(found, covariance=np.diag((share * spread) ** 2))
-    np.testing.assert_allclose(other.shrunk, share)
-    assert other.undetermined == ("turn.armature", "rail.viscous")
-    said = [f.message for f in loop_findings(other, ()) if f.code == "undetermined"]
-    first, second, *others = other.fit.simulator.free_parameters
-    gain = (first, replace(second, name="turn.kp"), *others)
-    simulator = replace(other.fit.simulator, free_parameters=gain)
-    estimate = replace(other.estimate, names=tuple(free.name for free in gain))
-    gain = replace(other, fit=replace(other.fit, simulator=simulator, estimate=estimate))
-    said += [f.message for f in loop_findings(gain, ()) if f.code == "undetermined"]
-    assert ["groups of joints with equal drives" in words for words in said] == [False, True]
-    simulator = found.fit.simulator
-    body = replace(simulator.free_parameters[1], what="body")
-    free_parameters = (simulator.free_parameters[0], body, *simulator.free_parameters[2:])
-    fit = replace(other.fit, simulator=replace(simulator, free_parameters=free_parameters))
-    assert replace(other, fit=fit).undetermined == ("rail.viscous",), "bodies have a prior"
-
-
 def at_limit(found, limit, theta):
     """Return the same with a limit in place of the first parameter."""
     simulator = found.fit.simulator
