@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from robotid.base.exceptions import SettingsError
+from robotid.base.settings import require_kind
 from robotid.base.typing import Array
 from robotid.dynamics.base_parameters import BaseMapping
 from robotid.dynamics.factors import Factors
@@ -225,6 +226,7 @@ class Fit(Identified, Solution):
             evaluation: A recording; if it is not one of this fit, the band has the fit's noise,
                 and the spread of the drives between three or more fitted logs.
         """
+        require_kind(evaluation, Evaluation, "evaluation", "an evaluation of recordings")
         every = zip((*self.fitted, *self.validation), self._bands, strict=True)
         own = next((band for e, band in every if e is evaluation), None)
         return expected_band(self, evaluation, self.between) if own is None else own
