@@ -1,7 +1,7 @@
 """robotid doctor: check logs for faults: JOB.toml, or URDF LOG [LOG ...]."""
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
