@@ -157,12 +157,11 @@ def _alterations(model: RobotModel, pi: Array, sample: Sample) -> Iterator[_Alte
 
     for j, joint in enumerate(model.joints):
         only, one = np.eye(n)[j], (joint,)
-        unit = {"unit": "m" if joint in model.layout.prismatic else "rad"}
-        Z = moved(np.zeros(n), only)
-        zero = partial(_zero, unit=unit["unit"])
+        unit = "m" if joint in model.layout.prismatic else "rad"
+        Z, zero = moved(np.zeros(n), only), partial(_zero, unit=unit)
         yield _Alteration("position_offset", one, Z, 0.01, zero, partial(offset, j))
         backlash = 0.5 * Z * sample.motions[j].direction[:, None, None]
-        yield _Alteration("lost_motion", one, backlash, 0.005, lambda x, unit=unit: unit)
+        yield _Alteration("lost_motion", one, backlash, 0.005, partial(_named, unit=unit))
         scaled = partial(_factor, subject=f"q_{joint}")
         yield _Alteration("angle_scale", one, moved(only, np.zeros(n)), 0.02, scaled)
         if sample.torque[j]:  # a torque of 0 has no scale
@@ -190,11 +189,10 @@ def _alterations(model: RobotModel, pi: Array, sample: Sample) -> Iterator[_Alte
         Z = by_gravity @ (np.linalg.norm(down) * across).T
         yield _Alteration("gravity", (), Z, 0.05, tilt, tilted)
     for j, joint in enumerate(model.joints):
-        where = {"subject": joint}
-        Z = by_origin[:, :, j]
-        yield _Alteration("joint_origin", (joint,), Z, 0.01, lambda x, where=where: where)
+        named = partial(_named, subject=joint)
+        yield _Alteration("joint_origin", (joint,), by_origin[:, :, j], 0.01, named)
     anywhere = by_origin.reshape(len(tau), n, -1)
-    yield _Alteration("joint_origin", (), anywhere, 0.01, lambda x: {"subject": "a joint"})
+    yield _Alteration("joint_origin", (), anywhere, 0.01, partial(_named, subject="a joint"))
 
 
 def _torques(model: RobotModel, pi: Array, at: Sequence[Trajectory]) -> Array:
@@ -278,6 +276,10 @@ def _finding(
 
 def _zero(x: Array, unit: str) -> dict[str, float | str]:
     return {"correction": -x[0], "unit": unit, "what": "residual", "cure": "residual"}
+
+
+def _named(x: Array, **words: str) -> dict[str, float | str]:
+    return {**words}
 
 
 def _factor(x: Array, subject: str) -> dict[str, float | str]:

@@ -380,7 +380,7 @@ def test_a_hypothesis_is_refuted_by_the_worst_of_all_logs_of_its_joints():
     found = rejected([*guesses, finding("urdf_mismatch", "run.csv")], logs, ScaleCheck())
     assert [f.severity for f in found] == ["warning", "note", "warning", "warning"]
     assert found[1].message == (
-        "what was found; rejected: torque error on validation logs at most 3.0 %"
+        "run.csv: what was found; rejected: torque error on validation logs at most 3.0 %"
     )
     repeated = finding("repeated_motion", "one")
     assert rejected([repeated, guesses[1]], logs, ScaleCheck())[1].severity == "warning"
