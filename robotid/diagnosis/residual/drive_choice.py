@@ -30,8 +30,9 @@ from robotid.diagnosis.residual.decisions import (
     GROWN,
     TENFOLD,
     UNDECIDED_P_VALUE,
+    Round,
+    select,
 )
-from robotid.diagnosis.residual.selection import Round, select
 from robotid.diagnosis.residual.term_trials import RIDGE, Sample, Trial, Trials, take_sample
 from robotid.dynamics.prediction import drive_motion_along
 from robotid.estimation.fitting.fitted import Solution

@@ -23,8 +23,7 @@ import numpy as np
 
 from robotid.base.typing import Array
 from robotid.data.log import Trajectory
-from robotid.diagnosis.residual.decisions import FAMILY_P_VALUE
-from robotid.diagnosis.residual.selection import p_value
+from robotid.diagnosis.residual.decisions import FAMILY_P_VALUE, p_value
 from robotid.dynamics.constraint_rows import without_forces
 from robotid.dynamics.torque import trajectory_regressor
 from robotid.dynamics.used_rows import independent_share

@@ -18,9 +18,9 @@ from robotid.diagnosis.verdict.evidence import (
     Predictions,
     error_of,
     is_harmless_cost,
+    uses_of_torques,
 )
 from robotid.diagnosis.verdict.scale_check import ScaleCheck
-from robotid.diagnosis.verdict.uses import uses_of_torques
 from robotid.estimation.fitting.left_out import logs_that_test
 from robotid.estimation.fitting.metrics import Metrics
 

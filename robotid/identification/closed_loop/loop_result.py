@@ -9,7 +9,7 @@ import numpy as np
 from robotid.base.exceptions import SettingsError
 from robotid.base.typing import Array
 from robotid.data.log import Log, Trajectory
-from robotid.diagnosis.verdict.correlation import correlated_sets
+from robotid.diagnosis.verdict.parameter_table import correlated_sets
 from robotid.diagnosis.verdict.position_verdict import judge_positions
 from robotid.diagnosis.verdict.verdict import Verdict
 from robotid.dynamics.base_parameters import structural_mapping

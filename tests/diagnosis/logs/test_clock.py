@@ -7,7 +7,7 @@ import pytest
 from helpers.findings import Figures
 
 from robotid.data.log import Log, Trajectory
-from robotid.diagnosis.logs.clock import check_clock, check_rest
+from robotid.diagnosis.logs.channels import check_clock, check_rest
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 

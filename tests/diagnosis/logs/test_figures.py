@@ -11,10 +11,8 @@ from helpers.synthetic import exact_log, truth
 from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import process
-from robotid.diagnosis.logs.channels import check_channels
-from robotid.diagnosis.logs.clock import check_clock
+from robotid.diagnosis.logs.channels import check_channels, check_clock, check_torque_channels
 from robotid.diagnosis.logs.motion_checks import check_excitation
-from robotid.diagnosis.logs.torque_channels import check_torque_channels
 from robotid.diagnosis.urdf.inertials import impossible_inertial
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.robot.model import RobotModel

@@ -9,7 +9,7 @@ from helpers.synthetic import perfect
 
 from robotid.data.signal_settings import SignalSettings
 from robotid.diagnosis.logs.check_logs import diagnose
-from robotid.diagnosis.logs.mounted import Segments
+from robotid.diagnosis.logs.loads import Segments
 from robotid.diagnosis.logs.torque_sample import smooth_motion
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.simulation.motions import random_fourier

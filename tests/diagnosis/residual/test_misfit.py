@@ -20,18 +20,18 @@ from robotid.cli.logs import survey_logs
 from robotid.data.files.read import write_log
 from robotid.data.signal_settings import SignalSettings
 from robotid.diagnosis.logs.check_logs import check_logs
-from robotid.diagnosis.residual import candidates, misfit
-from robotid.diagnosis.residual.candidates import CANDIDATES
-from robotid.diagnosis.residual.candidates import couplings as couplings_of
-from robotid.diagnosis.residual.misfit import find_misfits
-from robotid.diagnosis.residual.misfit_findings import (
+from robotid.diagnosis.residual.misfit import (
+    CANDIDATES,
     counterbalanced,
+    find_misfits,
     misfit_findings,
+    ripples,
     setting_of,
     settled,
     with_entries,
     with_known_springs,
 )
+from robotid.diagnosis.residual.misfit import couplings as couplings_of
 from robotid.diagnosis.residual.term_trials import RIDGE, Trials, take_sample
 from robotid.diagnosis.verdict.fit_findings import fit_findings
 from robotid.diagnosis.verdict.verdict import warnings_of
@@ -488,7 +488,7 @@ def test_ripples_that_are_tried_explain_most_over_what_the_filter_lets_through(r
     motion = JointMotion(q, v, still, still, still, still, still, passes=20.0)
     weight, r = rng.uniform(0.5, 2.0, n) * (rng.random(n) < 0.8), rng.standard_normal(n)
     r += sum(0.4 * np.cos(k * q + k) for k in (9, 41, 230))
-    found = [int(c.name.split()[1]) for c in candidates.ripples(motion, weight, weight * r)]
+    found = [int(c.name.split()[1]) for c in ripples(motion, weight, weight * r)]
     explained = {}
     for k in range(5, 241):
         size = weight / (1 + (k * np.abs(v) / (2 * np.pi * 20.0)) ** 8)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from robotid.diagnosis.verdict import parameter_table
-from robotid.diagnosis.verdict.correlation import correlated_parameters
+from robotid.diagnosis.verdict.parameter_table import correlated_parameters
 from robotid.output.files.entries import build_result
 from robotid.output.files.result_file import Result
 

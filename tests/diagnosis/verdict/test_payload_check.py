@@ -4,9 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from robotid.diagnosis.verdict.payload_check import PayloadCheck
-from robotid.diagnosis.verdict.scale_check import ScaleCheck
-from robotid.diagnosis.verdict.stated_mass import StatedMass
+from robotid.diagnosis.verdict.scale_check import PayloadCheck, ScaleCheck, StatedMass
 
 SHARP = PayloadCheck("tool0", 2.0, 2.02, 0.01, (2.0, 2.04), "loaded.csv", "ab")
 

@@ -11,8 +11,13 @@ from helpers.fitting import fit
 from helpers.synthetic import exact_log, truth
 
 from robotid.data.signal_settings import SignalSettings
-from robotid.diagnosis.verdict.scale_check import ScaleCheck, check_scale
-from robotid.diagnosis.verdict.stated_mass import StatedMass, determines_total_mass, stated_mass
+from robotid.diagnosis.verdict.scale_check import (
+    ScaleCheck,
+    StatedMass,
+    check_scale,
+    determines_total_mass,
+    stated_mass,
+)
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
 from robotid.output.files.result_file import stated_scale_check

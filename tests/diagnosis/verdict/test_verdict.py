@@ -10,8 +10,7 @@ from robotid.cli.job import job_from_settings
 from robotid.cli.validate import validate
 from robotid.data.files.read import write_log
 from robotid.diagnosis.verdict.evidence import Determined, Predictions, is_beaten
-from robotid.diagnosis.verdict.scale_check import ScaleCheck
-from robotid.diagnosis.verdict.stated_mass import StatedMass
+from robotid.diagnosis.verdict.scale_check import ScaleCheck, StatedMass
 from robotid.diagnosis.verdict.verdict import (
     VerdictWarning,
     blocking,

@@ -7,7 +7,7 @@ import pytest
 from helpers.figures import torques
 from helpers.pages import chart
 
-from robotid.diagnosis.residual.residuals import spectrum
+from robotid.diagnosis.residual.torque_split import spectrum
 from robotid.output.report.pictures import torque_charts
 
 JOINTS = range(6)
