@@ -26,7 +26,6 @@ from robotid.output.files.entries import input_entries
 from robotid.output.pages.charts import Chart, chart_html
 from robotid.output.pages.html import Cell, block, cell, code, folded, listing, percent, table, text
 from robotid.output.report.dock import Residual
-from robotid.output.report.ellipsoids import ellipsoid_pictures
 from robotid.output.report.errors import TORQUE, errors_of, worst_errors
 from robotid.output.report.next_steps import next_steps
 from robotid.output.report.pictures import (
@@ -89,7 +88,7 @@ def torque_report(found: TorqueIdentification, origin: Origin, replay: str = "")
         errors=(block("report.torque_errors"), ""),
         curves=("Torques", torques_section(found, worst, origin, replay)),
         friction=friction_section(found, worst),
-        bodies=body_table(found) + ellipsoid_pictures(found),
+        bodies=body_table(found),
         why=why_section(found),
         variation=variation_section(found.variation, _next_errors(found)),
         parameters=parameter_section(
