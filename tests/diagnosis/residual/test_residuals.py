@@ -10,28 +10,6 @@ from robotid.estimation.fitting.evaluation import evaluate_logs
 from robotid.estimation.fitting.survey import hold_log
 
 
-def brute_force(x, used, segment, lags):
-    found = []
-    for k in range(lags + 1):
-        pairs = [
-            (x[i], x[i + k])
-            for i in range(len(x) - k)
-            if used[i] and used[i + k] and segment[i] == segment[i + k]
-        ]
-        one, other = np.array(pairs).T if pairs else np.full((2, 1), np.nan)
-        found.append(one @ other / np.sqrt(one @ one * (other @ other)))
-    return np.array(found)
-
-
-def test_autocorrelation_is_the_mean_of_products_of_used_pairs(rng):
-    x = np.cumsum(rng.standard_normal(120))
-    used = rng.random(120) > 0.3
-    segment = np.repeat([0, 1, 2], [50, 30, 40])
-    r = autocorrelation(x, used, segment, 60)
-    np.testing.assert_allclose(r, brute_force(x, used, segment, 60), atol=1e-10)
-    assert np.isnan(r[55:]).all()  # longer than every segment
-
-
 def test_no_correlation_exceeds_1_where_few_pairs_are_far_apart():
     # the largest values are one lag apart, and there is no other pair of that lag
     x = np.r_[5.0, np.full(60, 0.1), 5.0, np.full(20, 0.1)]
