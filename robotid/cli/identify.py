@@ -174,10 +174,7 @@ def identify(
 def run_job(
     job: Job, folder: str | Path, *, plan: WorkPlan | None = None, source: Sequence[str] = ()
 ) -> tuple[Identification, dict[str, Any]]:
-    """Identify and write result.json, report and URDF; return the result and result.json.
-
-    The words of the source, after ``robotid identify``, repeat the run.
-    """
+    """Identify and write result.json, report and URDF; return the result and result.json."""
     chosen, target = plan or WorkPlan(job.workers or 1), Path(folder)
     model = job.model()
     check_folder(target, ["result.json", *_names(model)])
@@ -278,10 +275,7 @@ def _replay_of(found: Identification, job: Job, folder: Path) -> "Replay":
 
 
 def _job_of(identification: Identification) -> Job:
-    """Return the job of an identification; one made in Python gets an equivalent job.
-
-    Logs in memory have no file, and a ``Log`` has no gains, units or names of columns.
-    """
+    """Return the job of an identification; one made in Python gets an equivalent job."""
     model, asked = identification.model, identification.stated
     if isinstance(asked.job, Job):
         return asked.job

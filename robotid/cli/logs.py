@@ -43,12 +43,7 @@ def survey_logs(
     refuse: Callable[[LogEntry, DataError], None] | None = None,
     needs: Needs = "torque",
 ) -> tuple[tuple[SurveyedLog, ...], ...]:
-    """Return the logs of each group, ready to be read.
-
-    The logs are in memory if all their files together have at most the permitted number of rows,
-    or if the model is static. Files of formats that are only read whole do not count. Otherwise
-    each log is divided into pieces of a fixed number of rows: an eighth of the permitted number.
-    """
+    """Return the logs of each group, ready to be read."""
     paths = dict.fromkeys(entry.path for entry in chain(*groups))
     opened = {path: _open(job, model, path, needs) for path in paths}
     rows = sum(_count(found) for found in opened.values())
@@ -131,10 +126,7 @@ class LockedLogs:
 def locked_as_logged(
     job: Job, model: RobotModel, fitted: Sequence[SurveyedLog], validation: Sequence[SurveyedLog]
 ) -> LockedLogs:
-    """Return the job with joints locked at their positions in the logs, unless it states them.
-
-    A joint that moves, or has another position in another log, is left to ``check_locked``.
-    """
+    """Return the job with joints locked at their positions in the logs, unless it states them."""
     logged, logs = {}, (*fitted, *validation)
     for joint in [joint for joint in model.locked if joint not in job.placed(model)]:
         found = [log.locked[joint] for log in logs if joint in log.locked]
@@ -226,10 +218,7 @@ def _count(found: tuple[LogLayout, Table] | DataError) -> int:
 
 
 def log_of_commands(job: Job, entry: LogEntry, result: Result) -> Log:
-    """Return a log with the inputs of the simulated robot, gravity compensation included.
-
-    The input is the command; it is the torque where the logged torque drives the robot.
-    """
+    """Return a log with the inputs of the simulated robot, gravity compensation included."""
     log = job.read(entry, result.robot, needs=needed_of(job))
     if job.controller.kind == "torque":
         from robotid.identification.closed_loop.from_commands import driven_log
