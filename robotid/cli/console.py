@@ -130,11 +130,7 @@ def show_found(
 
 
 class Terminated(KeyboardInterrupt):
-    """The process received SIGTERM or SIGHUP: it cleans up as after Ctrl-C.
-
-    Attributes:
-        number: The signal.
-    """
+    """The process received SIGTERM or SIGHUP: it cleans up as after Ctrl-C."""
 
     def __init__(self, number: int) -> None:
         self.number = number

@@ -12,13 +12,19 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from robotid.base.exceptions import DataError, SettingsError
-from robotid.base.files import check_folder, folder_beside, read_json, write_json, write_text
+from robotid.base.files import (
+    check_folder,
+    dataset_of,
+    folder_beside,
+    read_json,
+    write_json,
+    write_text,
+)
 from robotid.base.versions import __version__, code_versions
 from robotid.cli.console import echo, progress_of, show_found
 from robotid.cli.flags import add_json, add_out, add_progress
 from robotid.cli.identify import identify_job
 from robotid.cli.job import Job, LogEntry, PayloadEntry, read_job, stated_path
-from robotid.cli.logs import identity_of
 from robotid.data.files.parquet_files import parquet_rows, read_text_table
 from robotid.data.log import suggestion
 from robotid.dynamics.factors import available_cores
@@ -284,7 +290,13 @@ def run_fleet(
 def _key(unit: FleetUnit) -> str:
     """Return a hash of a unit and of all inputs of its result."""
     files = [path for path, _ in unit.logs] + [x for x in (unit.urdf, unit.job) if x]
-    states = [identity_of(path) if path.exists() else None for path in files]
+    states = [
+        [str(file), file.stat().st_size, file.stat().st_mtime_ns]
+        for path in files
+        for place in [(dataset_of(path) or path).resolve()]
+        for file in (sorted(place.rglob("*")) if place.is_dir() else [place])
+        if file.is_file()
+    ]
     stated = [unit.unit, [mass for _, mass in unit.logs], str(unit.urdf), str(unit.job)]
     return hashlib.sha256(json.dumps([code_versions(), states, stated]).encode()).hexdigest()
 

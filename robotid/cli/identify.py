@@ -342,8 +342,7 @@ def identify_job(
         which = "no log is usable" if job.identification else "no log is given"
         raise DataError(f"{which}, wanted at least one to identify from")
     report_stage(plan.progress, "checking logs")
-    placed = locked_as_logged(job, model, fitted, validation)
-    job, model, fitted, validation = placed.job, placed.model, placed.fitted, placed.validation
+    job, model, fitted, validation, notes = locked_as_logged(job, model, fitted, validation)
     locked = locked_findings(model, job.placed(model))
     found = [*locked, *examine_logs(job, model, fitted, validation)]
     recordings = Recordings(model, structural_mapping(model), fitted, validation)
@@ -367,7 +366,7 @@ def identify_job(
     return replace(
         concluded,
         stated=replace(concluded.stated, job=job),
-        findings=(*placed.notes, *concluded.findings),
+        findings=(*notes, *concluded.findings),
         payload_checks=check_payloads(job, concluded.model, fitted),
     )
 

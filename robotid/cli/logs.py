@@ -1,16 +1,16 @@
 """The logs of a job: opened once, examined, and identified by their inputs."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
 from robotid.base.exceptions import DataError, SettingsError
-from robotid.base.files import dataset_of, file_sha256, log_exists
+from robotid.base.files import file_sha256, log_exists
 from robotid.base.findings import Finding, by_severity
 from robotid.base.typing import STAGES, ProgressCallback, report_stage
 from robotid.cli.job import Job, LogEntry, written_job
@@ -99,28 +99,14 @@ def examine(
     groups = job.identification, job.validation
     fitted, validation = survey_logs(job, model, *groups, refuse=refuse, needs="any")
     report_stage(progress, "checking logs", STAGES[:2])
-    placed = locked_as_logged(job, model, fitted, validation)
-    found = examine_logs(placed.job, placed.model, placed.fitted, placed.validation)
-    return by_severity([*refused, *placed.notes, *found])
+    job, model, first, second, notes = locked_as_logged(job, model, fitted, validation)
+    return by_severity([*refused, *notes, *examine_logs(job, model, first, second)])
 
 
-@dataclass(frozen=True, eq=False)
-class LockedLogs:
-    """A job whose joints are locked at their positions in the logs.
-
-    Attributes:
-        job: The job.
-        model: Its robot.
-        fitted: Its logs to fit.
-        validation: Its validation logs.
-        notes: The joints that were locked so with their positions, if there are any.
-    """
-
-    job: Job
-    model: RobotModel
-    fitted: tuple[SurveyedLog, ...]
-    validation: tuple[SurveyedLog, ...]
-    notes: tuple[Finding, ...] = ()
+#: A job, its robot, its logs to fit, its validation logs, and notes on them.
+LockedLogs: TypeAlias = tuple[
+    Job, RobotModel, Sequence[SurveyedLog], Sequence[SurveyedLog], tuple[Finding, ...]
+]
 
 
 def locked_as_logged(
@@ -133,7 +119,7 @@ def locked_as_logged(
         if found and np.ptp(np.concatenate(found)) <= STILL:
             logged[joint] = float(np.median(np.concatenate(found)))
     if not logged:
-        return LockedLogs(job, model, tuple(fitted), tuple(validation))
+        return job, model, fitted, validation, ()
     shown = ", ".join(f"{joint} = {position:.4g}" for joint, position in logged.items())
     message = (
         f"joints are locked at their positions in the logs: {shown}. State other positions with "
@@ -144,7 +130,7 @@ def locked_as_logged(
     job = replace(job, locked={**job.locked, **logged})
     model = job.model()
     first, second = (tuple(replace(x, model=model) for x in logs) for logs in (fitted, validation))
-    return LockedLogs(job, model, first, second, notes=(note,))
+    return job, model, first, second, (note,)
 
 
 def examine_logs(
@@ -186,17 +172,6 @@ def result_run(job: Job, path: str | Path) -> tuple[Job, list[LogEntry], RobotMo
     recordings = Recordings(model, structural_mapping(model), logs)
     details = result["consistency"].get("fit", {})
     return job, fitted, model, Run.of(recordings, stated_parameters(result, model), details)
-
-
-def identity_of(path: Path) -> dict[str, Any]:
-    """Return size [bytes] and time of change [ns] of a file, or of each file of a folder."""
-    whole = (dataset_of(path) or path).resolve()
-    files = sorted(p for p in whole.rglob("*") if p.is_file()) if whole.is_dir() else [whole]
-    found = {}
-    for file in files:
-        about = file.stat()
-        found[str(file)] = {"size": about.st_size, "changed": about.st_mtime_ns}
-    return found
 
 
 def _open(
