@@ -150,25 +150,6 @@ def test_a_data_frame_may_have_time_as_its_index_or_come_from_another_library():
     assert_same(read_log(Other(), JOINTS))
 
 
-def test_what_is_wrong_with_a_data_frame_is_told():
-    frame = pd.DataFrame(juggled("/joint_states"))
-    with refused(
-        "log has no column 'time'; columns found: position_elbow, velocity_elbow, effort_elbow, "
-        "position_shoulder, velocity_shoulder, effort_shoulder. Rename it, or state in the job "
-        'file: columns = { time = "NAME" }, or without time stamps the rate of the rows [Hz]: log '
-        "= { rate = 100 }"
-    ):
-        order = [f"/joint_states/{j}/{w}" for j in ("elbow", "shoulder") for w in WORDS]
-        read_log(frame[order], JOINTS)
-    position = np.where(T.round(9) == 0.08, np.nan, T)
-    spoilt = frame.assign(**{"/joint_states/elbow/position": position})
-    with pytest.raises(DataError, match=r"log: q_elbow is NaN at row 4 \(t = 0.08 s\); remove"):
-        read_log(spoilt, JOINTS)
-    words = frame.assign(**{"/joint_states/elbow/effort": "much"})
-    with pytest.raises(DataError, match="log: column '/joint_states/elbow/effort' contains str"):
-        read_log(words, JOINTS)
-
-
 def test_logs_are_given_one_or_several_of_every_kind(ur5, tmp_path, rng):
     log = exact_log(ur5, truth(ur5), rng, samples=100)
     write_log(log, tmp_path / "run.csv")
@@ -182,27 +163,6 @@ def test_logs_are_given_one_or_several_of_every_kind(ur5, tmp_path, rng):
     for wrong, kind in cases:
         with pytest.raises(DataError, match=f"^a log is a {kind}, wanted a robotid.Log, the path"):
             read_logs(wrong, ur5.joints)
-
-
-def test_identify_takes_paths_and_frames_and_finds_what_it_finds_in_logs(ur5, tmp_path, rng):
-    first, second = (
-        exact_log(ur5, truth(ur5), rng, samples=200, rate=50.0, noise=0.1) for _ in range(2)
-    )
-    write_log(first, tmp_path / "first.csv")
-    settings = robotid.EstimatorSettings("wls")
-    one = robotid.identify(ur5, [first], validation=[second], estimator=settings)
-    other = robotid.identify(
-        ur5.tree.path, tmp_path / "first.csv", validation=frame_of(second), estimator=settings
-    )
-    np.testing.assert_array_equal(one.standard, other.standard)
-    assert one.verdict.to_dict()["status"] == other.verdict.to_dict()["status"]
-    assert [f.code for f in robotid.doctor(ur5, tmp_path / "first.csv")] == [
-        f.code for f in robotid.doctor(ur5, [first])
-    ]
-    with pytest.raises(DataError, match="no log was given; at least one is needed"):
-        robotid.identify(ur5, [])
-    with pytest.raises(ModelError, match="model is a NoneType, wanted a RobotModel or the path"):
-        robotid.identify(None, first)
 
 
 def test_swapped_arguments_are_named(ur5, rng, tmp_path):
