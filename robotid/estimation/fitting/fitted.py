@@ -10,12 +10,11 @@ from numpy.typing import ArrayLike
 from robotid.base.exceptions import SettingsError
 from robotid.base.settings import require_kind
 from robotid.base.typing import Array
-from robotid.diagnosis.logs.motion_checks import is_poorly_excited
 from robotid.dynamics.base_parameters import BaseMapping
 from robotid.dynamics.factors import Factors
 from robotid.dynamics.friction_projection import DriveMoments
 from robotid.estimation.estimators import Estimate
-from robotid.estimation.estimators.determination import Determination
+from robotid.estimation.estimators.determination import Determination, is_poorly_excited
 from robotid.estimation.fitting.bands import (
     QUANTILE,
     FrictionCurve,
