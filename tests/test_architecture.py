@@ -24,7 +24,7 @@ PACKAGES = {
     "data": [".", "files"],
     "dynamics": ["kernels", ".", "simulation"],
     "estimation": ["workers", "estimators", "variation", "fitting"],
-    "diagnosis": ["urdf", "logs", "residual", "verdict"],
+    "diagnosis": [".", "urdf", "logs", "residual", "verdict"],
     "identification": [".", "closed_loop", "online"],
     "design": ["."],
     "output": ["pages", "files", "viewer", "report"],
@@ -114,7 +114,6 @@ def test_every_file_is_in_one_of_the_eleven_packages():
     }  # fmt: skip
 
 
-@pytest.mark.xfail(strict=True, reason="the arrows that are left")
 def test_a_package_imports_only_those_before_it():
     upwards = [
         f"{path.relative_to(PACKAGE)} imports {other.relative_to(PACKAGE)}"
@@ -234,10 +233,13 @@ def public_functions():
 
 
 def test_every_public_argument_is_documented():
+    """Those of ``robotid`` one by one; what only the reference explains needs a text."""
     undocumented, count = [], 0
     for name, function, text in public_functions():
         count += 1
         arguments = [a for a in inspect.signature(function).parameters if a not in ("self", "cls")]
+        if name.split(".")[1] not in robotid.__all__:
+            arguments = []
         if not text or (arguments and "Args:" not in text):
             undocumented.append(name)
             continue

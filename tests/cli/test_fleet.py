@@ -14,11 +14,9 @@ from helpers.synthetic import exact_log, truth
 
 from robotid.base.exceptions import DataError
 from robotid.cli import fleet, main
-from robotid.cli.fleet import UnitResult, _Gathered, read_fleet, run_fleet
+from robotid.cli.fleet import _Gathered, read_fleet, run_fleet
 from robotid.data.files.read import write_log
 from robotid.estimation.variation.variation import between_units
-from robotid.estimation.workers.checkpoint import FOLDER
-from robotid.estimation.workers.plan import WorkPlan
 from robotid.robot.model import RobotModel
 
 URDF = ROOT / "urdf" / "planar_2r.urdf"
@@ -107,63 +105,47 @@ def test_an_interrupted_run_is_resumed_with_the_same_bits(table, done, tmp_path,
     monkeypatch.setattr(fleet, "identify_unit", interrupted)
     with pytest.raises(KeyboardInterrupt):
         run_fleet(units, tmp_path)
-    assert {path.name for path in tmp_path.iterdir()} == {FOLDER}
+    assert {path.name for path in tmp_path.iterdir()} == {fleet.UNITS}
     repeated = []
     monkeypatch.setattr(
         fleet, "identify_unit", lambda unit, threads: repeated.append(unit.unit) or first(unit, 1)
     )
-    run_fleet(units, tmp_path, plan=WorkPlan(1, resume=True))
-    assert repeated == ["c", "d"]
+    run_fleet(units, tmp_path, resume=True)
+    assert repeated == ["a", "c", "d"]  # a has a lost log
     for name in FILES:
         assert (tmp_path / name).read_bytes() == (done[0] / name).read_bytes()
-    assert {path.name for path in tmp_path.iterdir()} == set(FILES)
+    assert {path.name for path in tmp_path.iterdir()} == {fleet.UNITS, *FILES}
 
 
-def test_another_table_does_not_resume(table, tmp_path, monkeypatch):
-    def interrupted(unit, threads):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(fleet, "identify_unit", interrupted)
-    units = read_fleet(table)
-    with pytest.raises(KeyboardInterrupt):
-        run_fleet(units, tmp_path)
-    other = [replace(units[0], logs=units[0].logs[:1]), *units[1:]]
-    with pytest.raises(DataError, match=r"checkpoint of other inputs: units\.a was"):
-        run_fleet(other, tmp_path, plan=WorkPlan(1, resume=True))
-
-
-def test_units_with_the_same_inputs_are_kept_and_new_logs_added(
-    table, done, tmp_path, monkeypatch, capsys
-):
+def test_units_with_the_same_inputs_are_kept_and_new_logs_added(table, done, tmp_path, monkeypatch):
     units, first, repeated = read_fleet(table), fleet.identify_unit, []
     monkeypatch.setattr(
         fleet, "identify_unit", lambda unit, threads: repeated.append(unit.unit) or first(unit, 1)
     )
     shutil.copytree(done[0], tmp_path / "own")
-    same = run_fleet(units, tmp_path / "own", update=True)
+    same = run_fleet(units, tmp_path / "own", resume=True)
     assert same == done[1]
     assert repeated == ["a", "d"]  # with a failure
     for name in FILES:
         assert (tmp_path / "own" / name).read_bytes() == (done[0] / name).read_bytes()
     repeated.clear()
     extra = replace(units[2], logs=(*units[2].logs, units[1].logs[0]))
-    changed = [units[1], extra]
-    found = run_fleet(changed, tmp_path / "own", update=True)
-    assert repeated == ["c"]
-    assert found["logs"] == 3
+    changed = [
+        units[1],
+        extra,
+        replace(units[1], unit="loaded", logs=((units[1].logs[0][0], 2.0),)),
+    ]
+    found = run_fleet(changed, tmp_path / "own", resume=True)
+    assert repeated == ["c", "loaded"]
+    assert found["logs"] == 4
     run_fleet(changed, tmp_path / "whole")
     for name in FILES:
         own = (tmp_path / "own" / name).read_bytes()
         assert own == (tmp_path / "whole" / name).read_bytes()
-    stated = json.loads((tmp_path / "own" / "fleet.json").read_text())
-    stated["inputs"]["versions"]["numpy"] = "0.1"
-    (tmp_path / "own" / "fleet.json").write_text(json.dumps(stated))
-    with pytest.raises(DataError, match="are of other versions of robotid or its packages; run w"):
-        run_fleet(changed, tmp_path / "own", update=True)
-    words = ["fleet", str(table), "--out", str(tmp_path / "none"), "--update"]
-    assert main(words) == 1
-    assert "fleet.json" in capsys.readouterr().err
-    assert not (tmp_path / "none").exists()
+    repeated.clear()
+    monkeypatch.setattr(fleet, "code_versions", lambda: {"numpy": "0.1"})
+    run_fleet(units[1:2], tmp_path / "own", resume=True)
+    assert repeated == ["b"]
 
 
 def test_rows_state_urdf_job_and_payload(tmp_path):
@@ -233,13 +215,13 @@ def test_units_are_compared_by_parameter_robot_and_expression(monkeypatch):
         ]  # fmt: skip
         rows.append(rows[0] | {"log": "x.csv", "value": 99.0})  # of one log: not compared
         rows.append({"unit": f"u{k}", "status": "failed", "log": f"{k}.csv", "error": "lost"})
-        gathered.add(UnitResult(rows))
+        gathered.add(rows)
     for k in (5, 6):
         row = {"unit": f"u{k}", "status": "done", "verdict": "good", "parameter": "b.m",
                "parameter_unit": "kg", "value": 1.0, "std_error": 0.1, "robot": "leg",
                "expression": "b.m"}  # fmt: skip
-        gathered.add(UnitResult([row]))
-    gathered.add(UnitResult([{"unit": "u7", "status": "failed", "error": "bad"}]))
+        gathered.add([row])
+    gathered.add([{"unit": "u7", "status": "failed", "error": "bad"}])
     levels = []
     monkeypatch.setattr(
         "robotid.cli.fleet.between_units",

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from robotid.base.arguments import checked, real_numbers
+from robotid.base.arguments import real_numbers
 from robotid.base.exceptions import DataError
 from robotid.base.findings import listed
 from robotid.base.settings import is_number, require_kind
@@ -91,7 +91,6 @@ def torque_band(
     return TorqueBand(samples, std, np.asarray(noise))
 
 
-@checked("evaluation")
 def expected_band(
     found: "Fit", evaluation: "Evaluation", between: Array | None = None
 ) -> TorqueBand:

@@ -10,7 +10,7 @@ from robotid.base.typing import Array
 from robotid.dynamics.base_parameters import BaseMapping
 from robotid.dynamics.factors import Factors, gather
 from robotid.estimation.estimators import Consistent, Constraints
-from robotid.estimation.estimators.consistent.weighting import (
+from robotid.estimation.estimators.prior_weight import (
     AS_GOOD,
     Segments,
     choose_weight,

@@ -8,13 +8,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from robotid.base.exceptions import SettingsError
+from robotid.base.settings import require_kind
 from robotid.base.typing import Array
-from robotid.diagnosis.logs.motion_checks import is_poorly_excited
 from robotid.dynamics.base_parameters import BaseMapping
 from robotid.dynamics.factors import Factors
 from robotid.dynamics.friction_projection import DriveMoments
 from robotid.estimation.estimators import Estimate
-from robotid.estimation.estimators.determination import Determination
+from robotid.estimation.estimators.determination import Determination, is_poorly_excited
 from robotid.estimation.fitting.bands import (
     QUANTILE,
     FrictionCurve,
@@ -226,6 +226,7 @@ class Fit(Identified, Solution):
             evaluation: A recording; if it is not one of this fit, the band has the fit's noise,
                 and the spread of the drives between three or more fitted logs.
         """
+        require_kind(evaluation, Evaluation, "evaluation", "an evaluation of recordings")
         every = zip((*self.fitted, *self.validation), self._bands, strict=True)
         own = next((band for e, band in every if e is evaluation), None)
         return expected_band(self, evaluation, self.between) if own is None else own

@@ -85,7 +85,7 @@ def test_joints_that_differ_in_the_numbers_of_their_reasons_have_one_line():
     measured = {joint: {"relative_error_pct": 20.0} for joint in verdicts}
     html = error_bars(TORQUE, [Errors("y", measured)], list(verdicts), verdicts)
     (common,) = re.findall(r'<p class="common usable">(.*?)</p>', html)
-    assert common == "<strong>usable</strong>: a, b: error 16.2 to 17.4 % on x"
+    assert common == "<strong>usable</strong>: a, b: error 17.4 % on x (the worst)"
     whys = re.findall(r'<span class="why">(.*?)</span>', html)
     assert whys == ["", "", "error 51 %"]
 
