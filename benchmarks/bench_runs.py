@@ -38,9 +38,9 @@ from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.simulation.motions import random_fourier
-from robotid.estimation.fitting.bands import expected_band
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
 from robotid.estimation.fitting.fit import solve_recordings
+from robotid.estimation.fitting.fitted import expected_band
 from robotid.estimation.fitting.recorded import Recordings
 from robotid.estimation.fitting.survey import hold_log
 from robotid.estimation.variation.draws import scores_to_values

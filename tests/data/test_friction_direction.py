@@ -17,8 +17,8 @@ from robotid.dynamics.drive_columns import friction_directions, friction_speeds
 from robotid.dynamics.factors import join
 from robotid.dynamics.torque import build_problem, joint_torque_regressor
 from robotid.estimation.estimators import WLS
-from robotid.estimation.fitting.bands import torque_band
 from robotid.estimation.fitting.recorded import Recordings
+from robotid.estimation.fitting.standard_errors import torque_band
 from robotid.estimation.fitting.survey import hold_log
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel

@@ -7,24 +7,23 @@ import numpy as np
 
 from robotid.base.exceptions import RobotIdError
 from robotid.base.findings import Finding, log_finding
-from robotid.base.typing import Array
+from robotid.data.alike_motions import REPEATED, repeated_share
 from robotid.data.log import Trajectory
 from robotid.data.signal_settings import SignalSettings
 from robotid.dynamics.base_parameters import BaseMapping
 from robotid.dynamics.factors import compress, merge
 from robotid.dynamics.used_rows import base_problem, independent_share, row_mask
 from robotid.estimation.estimators import WLS, Estimate
-from robotid.estimation.estimators.determination import Determination, base_spread, determine
+from robotid.estimation.estimators.determination import (
+    Determination,
+    base_spread,
+    determine,
+    is_poorly_excited,
+)
 from robotid.robot.model import RobotModel
 from robotid.robot.prior import prior_spread
 
-_AHEAD = (0.0, 0.25, 0.5, 0.75, 1.0)  # [s] after an instant, positions that are compared
-_NEAR = 0.02  # of the range of each joint: closer positions are equal
-_SHARE = 0.3  # of the validation motion that is in a fitted log, too
-_INSTANTS = 300
-_FEW = 60  # ... of each of many motions
 _ROWS = 5000  # of a log, from which its excitation is computed
-_ILL_CONDITIONED = 1e3  # condition number of unit columns above which a motion is poor
 _RICHER = "a motion of all joints together, in both directions and as fast as permitted"
 _LOST = "the excitation is good, but these parameters are not identifiable above the noise"
 
@@ -33,42 +32,14 @@ def check_repeated_motion(
     fitted: Sequence[Trajectory], validation: Trajectory, name: str
 ) -> Iterator[Finding]:
     """Yield a warning "repeated_motion" if a validation log repeats motion that is fitted."""
-    from scipy.spatial import cKDTree
-
-    size = np.maximum(np.ptp(validation.q, axis=0), 1e-3)
-    own = _segments(validation, size, _INSTANTS)
-    share = 0.0
-    for known in [_segments(motion, size, None) for motion in fitted if len(own)]:
-        if len(known):
-            distance, _ = cKDTree(known).query(own, p=np.inf, distance_upper_bound=_NEAR)
-            share = max(share, float(np.mean(np.isfinite(distance))))
-    if share < _SHARE:
+    share = repeated_share(fitted, validation)
+    if share < REPEATED:
         return
     message = (
         f"{100 * share:.0f} % of this validation motion is in a fitted log, too: its torque "
         "prediction error is too optimistic; record another motion to validate with"
     )
     yield log_finding(name, "repeated_motion", "warning", message, share=share)
-
-
-def alike_motions(motions: Sequence[Trajectory]) -> list[list[int]]:
-    """Return the motions in groups: one that repeats another one is in its group."""
-    from scipy.spatial import cKDTree
-
-    low, high = (np.array([f(x.q, axis=0) for x in motions]) for f in (np.min, np.max))
-    size = np.maximum(high.max(axis=0) - low.min(axis=0), 1e-3)
-    trees = [cKDTree(known) if len(known := _segments(x, size, None)) else None for x in motions]
-    groups: list[list[int]] = []
-    for k, motion in enumerate(motions):
-        own, same = _segments(motion, size, _FEW), list[list[int]]()
-        for group in groups if len(own) else ():
-            others = [tree for j in group if (tree := trees[j]) is not None]
-            far = [x.query(own, p=np.inf, distance_upper_bound=_NEAR)[0] for x in others]
-            if any(np.mean(np.isfinite(distance)) >= _SHARE for distance in far):
-                same.append(group)
-        groups = [group for group in groups if group not in same]
-        groups.append([*(j for group in same for j in group), k])
-    return sorted(sorted(group) for group in groups)
 
 
 def check_excitation(
@@ -125,27 +96,3 @@ def excitation_finding(wls: Estimate, known: Determination, name: str) -> Findin
         message += "; no action needed"
     severity = "warning" if known.groups and is_poor else "note"
     return log_finding(name, "excitation", severity, message, **evidence)
-
-
-def is_poorly_excited(wls: Estimate, count: int) -> bool:
-    """Return whether the motion, not the noise, leaves base parameters undetermined."""
-    return wls.rank < count or wls.condition > _ILL_CONDITIONED
-
-
-def _segments(motion: Trajectory, size: Array, count: int | None) -> Array:
-    """Return positions at instants and up to a second after, over the size, where joints move."""
-    step = float(np.median(np.diff(motion.t)))
-    ahead = [round(s / step) for s in _AHEAD]
-    last = len(motion.t) - ahead[-1]
-    if last <= 0:
-        return np.empty((0, len(_AHEAD) * len(size)))
-    starts = np.arange(last)
-    whole = motion.segment[starts] == motion.segment[starts + ahead[-1]]
-    moved = np.abs(motion.q[starts + ahead[-1]] - motion.q[starts]) / size
-    starts = starts[whole & (moved.max(axis=1) > 2 * _NEAR)]
-    if count is not None and len(starts) > count:
-        starts = starts[np.linspace(0, len(starts) - 1, count).astype(int)]
-    else:
-        # instants so close that fast motion moves less than the bound between two of them
-        starts = starts[:: max(1, round(0.005 / step))]
-    return np.hstack([motion.q[starts + k] / size for k in ahead])

@@ -13,7 +13,9 @@ import scipy.linalg
 
 from robotid.base.exceptions import RankDeficientError
 from robotid.base.typing import Array
+from robotid.estimation.estimators.estimator import Estimate
 
+_ILL_CONDITIONED = 1e3  # condition number of unit columns above which a motion is poor
 _PRIOR_LED = 0.9  # ratio of the spreads after and before the data above which a direction is weak
 _LED_IN_PART = 0.3  # share of a parameter's spread in weak directions that makes it a group member
 _COUPLED = 0.5  # ... or its coefficient relative to another member, in units of the spreads
@@ -225,3 +227,8 @@ def _combination(
 
 def _and(words: Sequence[str]) -> str:
     return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
+
+
+def is_poorly_excited(wls: Estimate, count: int) -> bool:
+    """Return whether the motion, not the noise, leaves base parameters undetermined."""
+    return wls.rank < count or wls.condition > _ILL_CONDITIONED

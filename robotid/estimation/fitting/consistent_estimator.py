@@ -1,15 +1,29 @@
-"""Construction of the consistent estimator from a robot, its prior and the constraints."""
+"""The estimator of its settings, from a robot, its prior and the bounds of its bodies."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
+from robotid.base.exceptions import SettingsError
 from robotid.base.typing import Array
 from robotid.dynamics.base_parameters import BaseMapping
 from robotid.dynamics.factors import Factors, gather
-from robotid.estimation.estimators import Consistent, Constraints
+from robotid.estimation.estimators import (
+    OLS,
+    PRX,
+    RLS,
+    TLS,
+    WLS,
+    BatchEstimator,
+    Consistent,
+    Constraints,
+    Kalman,
+    NormalisedGradient,
+    RecursiveEstimator,
+)
 from robotid.estimation.estimators.consistent.weighting import (
     AS_GOOD,
     Segments,
@@ -17,7 +31,20 @@ from robotid.estimation.estimators.consistent.weighting import (
     contradicted_extents,
     loss_of,
 )
-from robotid.estimation.fitting.estimator_settings import BoundedSettings, ConstraintSettings
+from robotid.estimation.fitting.estimator_settings import (
+    BoundedSettings,
+    ConsistentSettings,
+    ConstraintSettings,
+    DescentSettings,
+    EstimatorSettings,
+    GradientSettings,
+    KalmanSettings,
+    OLSSettings,
+    PRXSettings,
+    RLSSettings,
+    TLSSettings,
+    WLSSettings,
+)
 from robotid.robot.bodies import held_parameters, negligible_bodies
 from robotid.robot.geometry import body_boxes, geometry_half_spaces
 from robotid.robot.model import RobotModel
@@ -49,6 +76,46 @@ class Known:
         KS = self.mapping.K * self.spread
         covariance: Array = KS @ KS.T
         return covariance
+
+
+def make_estimator(
+    settings: EstimatorSettings, known: Known
+) -> BatchEstimator | RecursiveEstimator[Any]:
+    """Return the estimator that reads rows or samples.
+
+    Raises:
+        SettingsError: If constraints contradict each other or do not match the robot, or the
+            estimator reads a simulator.
+    """
+    share = known.share
+    match settings:
+        case OLSSettings():
+            return OLS(independent_share=share)
+        case WLSSettings():
+            return WLS(independent_share=share)
+        case TLSSettings():
+            return TLS(settings.regressor_noise, independent_share=share)
+        case ConsistentSettings():
+            return consistent_fit(settings, known)
+        case RLSSettings():
+            # without forgetting the prior is not used: the result is that of batch least squares
+            std = np.sqrt(np.diag(known.covariance)) if settings.forgetting < 1 else None
+            return RLS(known.sigma, settings.forgetting, known.beta, std, share)
+        case KalmanSettings():
+            gate = None if settings.gate is False else float(settings.gate)
+            return Kalman(known.sigma, known.beta, known.covariance, settings.walk, gate, share)
+        case DescentSettings():
+            rng = np.random.default_rng(settings.seed) if settings.seed >= 0 else None
+            common: dict[str, Any] = {
+                "average": settings.average, "passes": settings.passes, "rng": rng,
+            }  # fmt: skip
+            if isinstance(settings, PRXSettings):
+                chosen = {"step": settings.step, "metric": settings.metric}
+                return PRX(known.sigma, known.beta, **chosen, **common)
+            if isinstance(settings, GradientSettings):
+                step_size = settings.step_size
+                return NormalisedGradient(known.sigma, known.beta, step_size=step_size, **common)
+    raise SettingsError(f"{settings!r} describes no estimator of rows; use EstimatorSettings(name)")
 
 
 def consistent_fit(settings: BoundedSettings, known: Known) -> Consistent:

@@ -3,17 +3,11 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Any, ClassVar, Self
-
-import numpy as np
+from typing import Any, ClassVar, Self
 
 from robotid.base.exceptions import SettingsError
 from robotid.base.findings import listed
 from robotid.base.settings import Range, Settings, require_kind, setting
-
-if TYPE_CHECKING:
-    from robotid.estimation.estimators import BatchEstimator, RecursiveEstimator
-    from robotid.estimation.fitting.consistent_estimator import Known
 
 _NOT_NEGATIVE = Range("x >= 0", lambda x: x >= 0)
 _COUNT = Range("1 to 10000", lambda x: 1 <= x <= 10_000)
@@ -159,18 +153,6 @@ class EstimatorSettings(Settings):
     def from_dict(cls, table: Mapping[str, Any]) -> Self:
         return cls(**table)
 
-    def make(self, known: "Known") -> "BatchEstimator | RecursiveEstimator[Any]":
-        """Return the estimator that reads rows or samples.
-
-        Args:
-            known: The robot and its prior.
-
-        Raises:
-            SettingsError: If constraints contradict each other or do not match the robot, or the
-                estimator reads a simulator.
-        """
-        raise SettingsError(f"{self!r} describes no estimator; use EstimatorSettings(name)")
-
     @property
     def words(self) -> str:
         """Description of the estimator."""
@@ -255,12 +237,6 @@ class DescentSettings(RecursiveSettings):
     passes: int = setting(4, "largest number of passes over the logs", within=_COUNT)
     seed: int = setting(0, "seed of the random order of the samples; negative: order of time")
 
-    @property
-    def _common(self) -> dict[str, Any]:
-        """Return the arguments common to these estimators."""
-        rng = np.random.default_rng(self.seed) if self.seed >= 0 else None
-        return {"average": self.average, "passes": self.passes, "rng": rng}
-
 
 @dataclass(frozen=True)
 class OLSSettings(EstimatorSettings):
@@ -270,22 +246,12 @@ class OLSSettings(EstimatorSettings):
 
     name: str = _called("ols", "ordinary least squares")
 
-    def make(self, known: "Known") -> "BatchEstimator":
-        from robotid.estimation.estimators import OLS
-
-        return OLS(independent_share=known.share)
-
 
 @dataclass(frozen=True)
 class WLSSettings(RobustSettings):
     """Settings of weighted least squares."""
 
     name: str = _called("wls", "weighted least squares, rows weighted by the noise of their joint")
-
-    def make(self, known: "Known") -> "BatchEstimator":
-        from robotid.estimation.estimators import WLS
-
-        return WLS(independent_share=known.share)
 
 
 @dataclass(frozen=True)
@@ -302,11 +268,6 @@ class TLSSettings(EstimatorSettings):
         within=Range("x > 0", lambda x: x > 0),
     )
 
-    def make(self, known: "Known") -> "BatchEstimator":
-        from robotid.estimation.estimators import TLS
-
-        return TLS(self.regressor_noise, independent_share=known.share)
-
 
 @dataclass(frozen=True)
 class ConsistentSettings(RobustSettings, BoundedSettings):
@@ -316,11 +277,6 @@ class ConsistentSettings(RobustSettings, BoundedSettings):
         "consistent",
         "weighted least squares with physically consistent bodies and the URDF's values as prior",
     )
-
-    def make(self, known: "Known") -> "BatchEstimator":
-        from robotid.estimation.fitting.consistent_estimator import consistent_fit
-
-        return consistent_fit(self, known)
 
 
 @dataclass(frozen=True)
@@ -333,13 +289,6 @@ class RLSSettings(RecursiveSettings):
         "forgetting factor: weight of a sample relative to the next one [-]",
         within=Range("0 < x <= 1", lambda x: 0 < x <= 1),
     )
-
-    def make(self, known: "Known") -> "RecursiveEstimator[Any]":
-        from robotid.estimation.estimators import RLS
-
-        # without forgetting the prior is not used: the result is that of batch least squares
-        std = np.sqrt(np.diag(known.covariance)) if self.forgetting < 1 else None
-        return RLS(known.sigma, self.forgetting, known.beta, std, known.share)
 
 
 @dataclass(frozen=True)
@@ -360,12 +309,6 @@ class KalmanSettings(RecursiveSettings):
         ),
     )
 
-    def make(self, known: "Known") -> "RecursiveEstimator[Any]":
-        from robotid.estimation.estimators import Kalman
-
-        gate = None if self.gate is False else float(self.gate)
-        return Kalman(known.sigma, known.beta, known.covariance, self.walk, gate, known.share)
-
 
 @dataclass(frozen=True)
 class PRXSettings(DescentSettings):
@@ -383,12 +326,6 @@ class PRXSettings(DescentSettings):
         among=("noise", "mass", "rows"),
     )
 
-    def make(self, known: "Known") -> "RecursiveEstimator[Any]":
-        from robotid.estimation.estimators import PRX
-
-        own = {"step": self.step, "metric": self.metric, **self._common}
-        return PRX(known.sigma, known.beta, **own)
-
 
 @dataclass(frozen=True)
 class GradientSettings(DescentSettings):
@@ -398,12 +335,6 @@ class GradientSettings(DescentSettings):
     step_size: float = setting(
         1.0, "relaxation factor [-]", within=Range("0 < x < 2", lambda x: 0 < x < 2)
     )
-
-    def make(self, known: "Known") -> "RecursiveEstimator[Any]":
-        from robotid.estimation.estimators import NormalisedGradient
-
-        own = {"step_size": self.step_size, **self._common}
-        return NormalisedGradient(known.sigma, known.beta, **own)
 
 
 @dataclass(frozen=True)

@@ -31,10 +31,10 @@ from robotid.diagnosis.residual.term_trials import Normal, Sample, Trials, take_
 from robotid.diagnosis.verdict.parameter_table import parameter_entries
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.prediction import drive_motion_along, predict, remember
-from robotid.estimation.fitting.bands import friction_curve
+from robotid.estimation.fitting.drive_terms import DriveChoice
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
+from robotid.estimation.fitting.fitted import friction_curve
 from robotid.estimation.fitting.recorded import Recordings
-from robotid.estimation.fitting.selected_drives import DriveChoice
 from robotid.identification.pipeline import identify, with_drives
 from robotid.output.files.urdf import load_identified, write_urdf
 from robotid.robot.drives import (

@@ -13,10 +13,10 @@ from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.constraint_rows import without_forces
 from robotid.dynamics.simulation.simulation_settings import Controller, Noise, Sensors, Simulation
 from robotid.dynamics.simulation.simulator import simulate
+from robotid.estimation.fitting.drive_terms import DriveChoice
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
 from robotid.estimation.fitting.fit import solve_recordings
 from robotid.estimation.fitting.recorded import Recordings
-from robotid.estimation.fitting.selected_drives import DriveChoice
 from robotid.estimation.fitting.survey import hold_log
 from robotid.robot.constraints import Contact
 from robotid.robot.drives import Lag, LoadFriction, Stribeck

@@ -37,8 +37,8 @@ from robotid.diagnosis.verdict.fit_findings import fit_findings
 from robotid.diagnosis.verdict.verdict import warnings_of
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.simulation.truth import another_robot
+from robotid.estimation.fitting.drive_terms import JointMotion
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
-from robotid.estimation.fitting.joint_motion import JointMotion
 from robotid.estimation.fitting.recorded import Recordings
 from robotid.estimation.fitting.survey import hold_log
 from robotid.identification.pipeline import conclude, identify

@@ -21,7 +21,7 @@ from robotid.diagnosis.verdict.verdict import (
     warnings_of,
 )
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
-from robotid.estimation.fitting.metrics import JointMetrics, Metrics
+from robotid.estimation.fitting.evaluation import JointMetrics, Metrics
 from robotid.identification.pipeline import identify
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel

@@ -269,7 +269,7 @@ def test_few_rows_of_a_long_motion_tell_the_doctor_the_same(ur5, monkeypatch):
 def test_an_ill_conditioned_motion_is_not_passed_over(ur5, monkeypatch):
     log = moved(ur5, lambda *motion: None)
     motion, mapping = process(log, resolve(log, EXACT)), structural_mapping(ur5)
-    monkeypatch.setattr("robotid.diagnosis.logs.motion_checks._ILL_CONDITIONED", 1.0)
+    monkeypatch.setattr("robotid.estimation.estimators.determination._ILL_CONDITIONED", 1.0)
     (finding,) = check_excitation(ur5, mapping, [motion], EXACT, "run.csv")
     assert "no action needed" not in finding.message
     assert finding.severity == "note"

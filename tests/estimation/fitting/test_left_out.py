@@ -7,14 +7,14 @@ import pytest
 from helpers.driven import EXACT, arm, driven_log
 from helpers.synthetic import truth
 
-from robotid.diagnosis.logs.motion_checks import alike_motions
+from robotid.data.alike_motions import alike_motions
 from robotid.diagnosis.verdict.evidence import Determined, Predictions
 from robotid.diagnosis.verdict.verdict import judge
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.estimation.fitting import left_out
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
+from robotid.estimation.fitting.evaluation import LEFT_OUT, logs_that_test
 from robotid.estimation.fitting.fit import solve_recordings
-from robotid.estimation.fitting.left_out import LEFT_OUT, logs_that_test
 from robotid.estimation.fitting.recorded import Recordings
 from robotid.estimation.fitting.survey import hold_log
 from robotid.identification.pipeline import conclude
