@@ -360,7 +360,7 @@ def own_friction(
     wanted = wanted_families(friction, reference.model.joints)
     if all(names == () for names in wanted.values()):
         return {}
-    return with_drives(reference, ConsistentSettings(draws=0), wanted).model.layout.own
+    return with_drives(reference, ConsistentSettings(), wanted).model.layout.own
 
 
 def mass_checks(

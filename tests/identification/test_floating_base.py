@@ -194,7 +194,7 @@ def test_a_bias_of_the_accelerometers_is_estimated(go1, trot):
 def test_a_trotting_quadruped_with_unknown_forces(recordings, monkeypatch, tmp_path):
     monkeypatch.setenv("ROBOTID_DATA", str(recordings))
     job = read_job(JOBS / "legged" / "solo12.toml")
-    job = replace(job, estimator=ConsistentSettings(draws=0), report=False)
+    job = replace(job, estimator=ConsistentSettings(), report=False)
     result, _ = run_job(job, tmp_path)
     (validation,) = result.validation
     tau, used = validation.recording.trajectory.tau, validation.recording.mask

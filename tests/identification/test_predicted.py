@@ -23,7 +23,7 @@ def found():
     model, pi = driven(arm(), {ELBOW: (LoadFriction(),)}, {f"{ELBOW}.load": 0.07})
     log = driven_log(model, pi, 3, reach=1.5, noise=0.01)
     friction = {"*": "", ELBOW: "load"}
-    return found_in(arm(), [log], friction=friction, estimator=EstimatorSettings(draws=0))
+    return found_in(arm(), [log], friction=friction, estimator=EstimatorSettings())
 
 
 @pytest.fixture(scope="module")

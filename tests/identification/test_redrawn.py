@@ -99,13 +99,9 @@ def test_bounds_make_intervals_narrower_and_are_named(rng):
     model = arm()
     log = exact_log(model, truth(model), rng, samples=2000, noise=NOISE[1:4])
     found = fit(model, [log], signals=EXACT, estimator=EstimatorSettings(**BOUND))
-    free = fit(model, [log], signals=EXACT, estimator=EstimatorSettings(draws=0, **BOUND))
     assert found.estimate.details["active"]
-    np.testing.assert_array_equal(found.standard, free.standard)
     assert "64 fits to resampled data and prior" in found.errors.method
-    assert "resampled" not in free.errors.method
-    np.testing.assert_allclose(found.errors.unbounded**2, np.diag(free.estimate.covariance))
-    ratio = np.sqrt(np.diag(found.estimate.covariance) / np.diag(free.estimate.covariance))
+    ratio = np.sqrt(np.diag(found.estimate.covariance)) / found.errors.unbounded
     assert 0.4 < np.median(ratio) < 1.0
     assert ratio.max() < 1.4
     assert found.errors.freedom.max() < 64

@@ -34,7 +34,7 @@ def found(logs):
         [robotid.read_log(logs / "first.csv", ("joint_1", "joint_2"), end=12.0)],
         validation=[robotid.read_log(logs / "second.csv", ("joint_1", "joint_2"))],
         signals=robotid.SignalSettings(cutoff=6.0),
-        estimator=robotid.EstimatorSettings(draws=0),
+        estimator=robotid.EstimatorSettings(),
         friction={"*": "", "joint_2": "cubic"},
         ignore=["torque_sign"],
     )
@@ -75,7 +75,6 @@ def test_what_a_job_found_is_saved_with_the_job_that_was_run(logs, tmp_path):
     table = {
         "urdf": str(URDF),
         "torque": {"gains": {"joint_1": 3.0}},
-        "estimator": {"draws": 0},
         "output": {"report": False},
         "identification": [{"log": str(logs / "first.csv")}],
     }

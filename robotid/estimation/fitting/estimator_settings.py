@@ -199,12 +199,6 @@ class BoundedSettings(EstimatorSettings):
         among=("auto", "cv", "evidence"),
         within=_FINITE,
     )
-    draws: int = setting(
-        64,
-        "number of fits to resampled data and prior, which give the standard errors if bounds are "
-        "active; 0: standard errors without the bounds",
-        within=Range("0, or 10 to 10000", lambda x: x == 0 or 10 <= x <= 10_000),
-    )
     constraints: Mapping[str, Any] = setting(
         {}, "bounds in addition to physical consistency", reads=ConstraintSettings
     )

@@ -38,7 +38,6 @@ from robotid.estimation.fitting.recorded import Recordings
 from robotid.estimation.fitting.regressor_noise import RegressorNoise, find_regressor_noise
 from robotid.estimation.fitting.robust import reweigh
 from robotid.estimation.fitting.standard_errors import (
-    Redraws,
     StandardErrors,
     measured_errors,
     standard_of,
@@ -66,7 +65,7 @@ def rough_choice(choice: EstimatorSettings) -> EstimatorSettings:
     if not isinstance(choice, BoundedSettings):
         return choice
     weight = 1.0 if isinstance(choice.prior_weight, str) else choice.prior_weight
-    return replace(choice, prior_weight=weight, draws=0)
+    return replace(choice, prior_weight=weight)
 
 
 def fit_recordings(recordings: Recordings, choice: EstimatorSettings) -> Fit:
@@ -197,7 +196,7 @@ class Solved:
 
     def _measured(self) -> tuple[Estimate, Estimate, StandardErrors]:
         """Return the estimate and that of WLS with standard errors, and how these were found."""
-        ground, choice, fit, estimate = self.ground, self.choice, self.in_cone, self.estimate
+        ground, fit, estimate = self.ground, self.in_cone, self.estimate
         factors, rough, mapping = ground.factors, ground.rough, ground.recordings.mapping
         segments, share, K = ground.segments, ground.before.share, mapping.K
         more = ground.more(rough.sigma)
@@ -210,14 +209,11 @@ class Solved:
             if estimate.names == mapping.names:
                 sigma = estimate.sigma
             more = ground.more(sigma)
-            redraws, ratio = None, 1.0  # without bounds
-            if fit is not None and isinstance(choice, BoundedSettings):
-                redraws = Redraws(fit, choice.draws, np.random.default_rng(0))
-                ratio = fit.weight_ratio
+            ratio = 1.0 if fit is None else fit.weight_ratio
             is_filter = self.weighing == "by age"
             estimate, errors = measured_errors(
                 estimate, segments, factors, share, K, sigma,
-                is_filter=is_filter, weight_ratio=ratio, redraws=redraws, more=more,
+                is_filter=is_filter, weight_ratio=ratio, bounded=fit, more=more,
             )  # fmt: skip
         if (repeated := ground.recordings.repeated) is not None:
             errors = replace(errors, method=f"{errors.method}; {repeated.described}")

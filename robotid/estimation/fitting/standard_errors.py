@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from robotid.base.exceptions import NotConvergedError
 from robotid.base.typing import Array
 from robotid.data.log import Trajectory
 from robotid.dynamics.base_parameters import BaseMapping
@@ -26,7 +25,8 @@ from robotid.robot.model import RobotModel
 if TYPE_CHECKING:
     pass
 
-_LEAST_SOLVED = 0.8  # smallest share of the resampled fits that must be solved
+_DRAWS = 64  # fits to resampled data and prior, for standard errors with active bounds
+_LEAST_SOLVED = 0.8  # smallest share of them that must be solved
 #: Half-width of a 95 % band in standard deviations.
 QUANTILE = 1.96
 _ROUNDING = 1e-9  # relative tolerance for a row on the edge of the band
@@ -58,15 +58,6 @@ class StandardErrors:
         return quantile(self.freedom)
 
 
-@dataclass(frozen=True, eq=False)
-class Redraws:
-    """Resampling of a physically consistent fit, for standard errors with active bounds."""
-
-    fit: Consistent
-    draws: int  # number of fits to resampled data and prior; 0: without the bounds
-    rng: np.random.Generator  # of the noise
-
-
 def measured_errors(
     estimate: Estimate,
     segments: Sequence[Factors],
@@ -77,7 +68,7 @@ def measured_errors(
     *,
     is_filter: bool = False,
     weight_ratio: float = 1.0,
-    redraws: Redraws | None = None,
+    bounded: Consistent | None = None,
     more: Array | None = None,
 ) -> tuple[Estimate, StandardErrors]:
     """Return an estimate with its covariance from the scatter of the segments.
@@ -89,15 +80,15 @@ def measured_errors(
     * standard parameters: B (K^T M K + g L) B with B = (K^T H K + L)^-1. L is the precision of the
       prior as it was weighted, g is its ratio to the precision L / g of the plausible prior; this
       is the mean square error if the true parameters have the plausible prior. If bounds are
-      active, it is computed from fits to resampled data and prior; without ``redraws`` the bounds
-      are neglected;
+      active, it is computed from fits to resampled data and prior; without the fit ``bounded``
+      they are neglected;
     * a filter with forgetting: its own covariance times the mean inflation.
 
     estimate (b,), K (b, p), sigma (n,) [N m or N], more (b, b).
     """
     b = len(factors.names)
-    if not (estimate.details.get("active") and redraws is not None and redraws.draws > 0):
-        redraws = None  # no bound is active, or bounds are neglected
+    if not estimate.details.get("active"):
+        bounded = None
     if len(segments) < FEWEST_SEGMENTS:
         method = (
             f"the bandwidth of the filter: a share of {share:.3g} of the rows is assumed to be "
@@ -107,8 +98,8 @@ def measured_errors(
         errors = StandardErrors(method, len(segments), 1 / share, np.full(b, np.inf))
         R = factors.weighted(sigma)[:b, :b]
         meat = share * R.T @ R + (0.0 if more is None else share**2 * more)
-        if redraws is not None:
-            return _bounded(estimate, errors, redraws, factors, sigma, meat)
+        if bounded is not None:
+            return _redrawn(estimate, errors, bounded, factors, sigma, meat)
         if len(estimate.theta) != b and (weight_ratio > 1.0 or more is not None):
             C = about_prior(estimate.covariance, K, meat, R, share, max(weight_ratio, 1.0))
             estimate = replace(estimate, covariance=C)
@@ -137,8 +128,8 @@ def measured_errors(
     estimate = replace(estimate, covariance=covariance)
     method = f"the scatter of the scores of {len(segments)} segments"
     errors = StandardErrors(method, len(segments), found.inflation, found.freedom())
-    if redraws is not None:
-        return _bounded(estimate, errors, redraws, factors, sigma, share**2 * found.meat)
+    if bounded is not None:
+        return _redrawn(estimate, errors, bounded, factors, sigma, share**2 * found.meat)
     return estimate, errors
 
 
@@ -193,10 +184,10 @@ def about_prior(
     return 0.5 * (covariance + covariance.T)
 
 
-def _bounded(
+def _redrawn(
     estimate: Estimate,
     errors: StandardErrors,
-    redraws: Redraws,
+    fit: Consistent,
     factors: Factors,
     sigma: Array,
     meat: Array,
@@ -205,18 +196,14 @@ def _bounded(
 
     The meat is the covariance of the score of the rows of ``Consistent.rows``.
     """
-    fit = redraws.fit
-    rows = fit.rows(factors, sigma)
+    rows, rng = fit.rows(factors, sigma), np.random.default_rng(0)
     found, failures = fit.programme.redrawn(
-        rows, fit.prior_weight, estimate.theta, meat, fit.weight_ratio, redraws.draws, redraws.rng
+        rows, fit.prior_weight, estimate.theta, meat, fit.weight_ratio, _DRAWS, rng
     )
-    if len(found) < _LEAST_SOLVED * redraws.draws:
-        raise NotConvergedError(
-            "standard errors with active bounds cannot be computed: only "
-            f"{len(found)} of {redraws.draws} fits to resampled data were solved; set draws = 0 "
-            "for standard errors without the bounds",
-            failures[0],
-        )
+    if len(found) < _LEAST_SOLVED * _DRAWS:
+        solved = f"only {len(found)} of {_DRAWS} fits to resampled data were solved: {failures[0]}"
+        method = f"{errors.method}; active bounds are neglected, {solved}"
+        return estimate, replace(errors, method=method)
     unsolved = f" ({len(failures)} more not solved: {failures[0]})" if failures else ""
     method = (
         f"{errors.method}; bounds are active: {len(found)} fits to resampled data and "

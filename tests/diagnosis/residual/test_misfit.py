@@ -46,7 +46,7 @@ from robotid.robot.drives import AUTO, Harmonic, Viscous, drive_line
 from robotid.robot.model import RobotModel
 
 log_with = partial(helper.log_with, rate=50.0)  # [Hz]: the effects are slower than 10 Hz
-FIT = EstimatorSettings(draws=0)  # bounds have no part in what is tested here
+FIT = EstimatorSettings()  # bounds have no part in what is tested here
 WLS = EstimatorSettings("wls")  # nor has the prior, where terms alone are read
 PAN, LIFT, ELBOW = "shoulder_pan_joint", "shoulder_lift_joint", "elbow_joint"
 
@@ -413,7 +413,6 @@ def test_a_hook_of_stribeck_makes_its_joint_usable(ur5, tmp_path):
     table = {
         "urdf": ur5.tree.path,
         "model": {"friction": "viscous+coulomb"},
-        "estimator": {"draws": 0},
         "identification": [{"log": str(paths[0])}],
         "validation": [{"log": str(paths[1])}],
         "output": {"report": False},

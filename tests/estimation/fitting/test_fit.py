@@ -24,8 +24,8 @@ from robotid.robot.prior import prior_spread
 
 @pytest.mark.parametrize(("weight", "rough"), [("auto", 1.0), ("evidence", 1.0), (2.5, 2.5)])
 def test_rough_settings_keep_a_stated_weight_and_draw_nothing(weight, rough):
-    choice = EstimatorSettings("consistent", prior_weight=weight, draws=40)
-    assert rough_choice(choice) == replace(choice, prior_weight=rough, draws=0)
+    choice = EstimatorSettings("consistent", prior_weight=weight)
+    assert rough_choice(choice) == replace(choice, prior_weight=rough)
     least_squares = EstimatorSettings("wls", robust="huber")
     assert rough_choice(least_squares) is least_squares
 
@@ -35,7 +35,7 @@ def test_a_base_parameter_of_terms_at_their_bound_alone_has_no_error(rng):
     joint = model.joints[1]
     log = exact_log(model, truth(model), rng, samples=250, noise=np.array([0.5, 0.1]))
     log = replace(log, tau=log.tau - [0.0, 9.0] * log.v)  # negative friction of the second joint
-    choice = EstimatorSettings("consistent", prior_weight=1.0, draws=0)
+    choice = EstimatorSettings("consistent", prior_weight=1.0)
     found = fit(model, [log], signals=SignalSettings(cutoff=None, trim=0.0), estimator=choice)
     K = found.mapping.K
     at_bound = set(np.flatnonzero(found.at_bound))

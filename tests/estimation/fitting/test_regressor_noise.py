@@ -181,7 +181,7 @@ def test_repeated_rounding_errors_count_as_often_as_they_are_repeated(planar):
 
 def test_a_finding_names_joints_step_and_parameter(planar, motion):
     log = recorded(planar, motion)
-    found = identify(planar, [log], signals=SIGNALS, estimator=EstimatorSettings(draws=0))
+    found = identify(planar, [log], signals=SIGNALS, estimator=EstimatorSettings())
     (finding,) = [f for f in found.findings if f.code == "encoder_noise"]
     assert finding.severity == "warning"
     assert "steps of up to 0.00307 rad (11.0 bits per revolution)" in finding.message

@@ -84,7 +84,7 @@ def test_a_recursive_estimate_is_made_physical_on_request(rng, name):
     log = exact_log(model, truth(model), rng, noise=20 * np.array([4.0, 2.0, 0.3]))
     free = fit(model, [log], signals=EXACT, estimator=name)
     assert not free.is_consistent
-    settings = EstimatorSettings(name, physical=True, draws=0)
+    settings = EstimatorSettings(name, physical=True)
     found = fit(model, [log], signals=EXACT, estimator=settings)
     assert found.is_consistent
     assert "projected onto physically consistent" in found.estimate.message
