@@ -45,7 +45,7 @@ INSIDE_FUNCTIONS = {
     "loky": {"estimation/workers"},
     "rich": {"cli"},
     "coal": {"design"},
-    "matplotlib": {"paper"},
+    "matplotlib": set(),
 }
 
 

@@ -12,7 +12,7 @@ from robotid.cli import COMMANDS, main
 
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 #: Names that differ on conda-forge.
-CONDA = {"pin": "pinocchio", "meshcat": "meshcat-python", "matplotlib": "matplotlib-base"}
+CONDA = {"pin": "pinocchio", "meshcat": "meshcat-python"}
 
 
 def test_the_conda_recipe_has_the_dependencies_and_version_of_the_package():

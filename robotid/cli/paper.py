@@ -26,7 +26,7 @@ def run(options: argparse.Namespace) -> None:
         result = run_paper(options.out, settings=few if options.quick else None, progress=progress)
     show_found(result, options, _show)
     if not options.json:
-        files = "paper.html, paper.json, replay.html, figures as PNG and SVG"
+        files = "paper.html, paper.json, replay.html"
         print(f"\nwritten to {options.out}: {files}")
 
 

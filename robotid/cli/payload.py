@@ -19,10 +19,9 @@ from robotid.diagnosis.verdict.payload_check import PayloadCheck
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.estimation.fitting.recorded import Recordings
 from robotid.estimation.fitting.survey import SurveyedLog
-from robotid.identification.payload_fit import fit_payloads, mass_checks, own_friction
+from robotid.identification.payload_fit import fit_with_friction, mass_checks
 from robotid.identification.summary import cell
 from robotid.robot.bodies import usual_links
-from robotid.robot.drives import DriveTerm
 from robotid.robot.model import RobotModel
 
 _STAGES = ("reading logs", "fitting")
@@ -79,14 +78,14 @@ def measure_payload(
     loaded, reference = (Recordings(model, mapping, logs) for logs in surveyed)
     known = stated_masses(masses, links)
     report_stage(progress, "fitting", _STAGES)
-    found = fit_payloads(loaded, reference, links=links, masses=known, unknown_gains=unknown)
-    gains = {joint: gain.value for joint, gain in found.gains.items()}
-    own = _chosen_terms(replace(job, gains={**job.gains, **gains}), model, entries)
-    if own:
-        loaded, reference = (run.with_model(model.with_terms(own)) for run in (loaded, reference))
-        found = fit_payloads(loaded, reference, links=links, masses=known, unknown_gains=unknown)
-    if known and not unknown:
-        found = replace(found, checks=mass_checks(loaded, reference, masses=known, links=links))
+
+    def rescaled(gains: Mapping[str, float]) -> Recordings:
+        (runs,) = survey_logs(replace(job, gains={**job.gains, **gains}), model, entries)
+        return Recordings(model, mapping, runs)
+
+    found = fit_with_friction(
+        loaded, reference, job.friction, rescaled, links=links, masses=known, unknown_gains=unknown
+    )
     return found.to_dict()
 
 
@@ -108,16 +107,6 @@ def _width(check: PayloadCheck) -> float:
     """Return the relative width of the interval of an identified mass; inf without one."""
     low, high = check.interval
     return (high - low) / check.known if check.identified is not None else float("inf")
-
-
-def _chosen_terms(
-    job: Job, model: RobotModel, entries: Sequence[LogEntry]
-) -> Mapping[str, tuple[DriveTerm, ...]]:
-    """Return the friction terms of the reference beyond viscous and Coulomb, by drive."""
-    if not any(job.friction.values()):
-        return {}
-    (surveyed,) = survey_logs(job, model, entries)
-    return own_friction(Recordings(model, structural_mapping(model), surveyed), job.friction)
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:

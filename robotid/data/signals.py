@@ -17,7 +17,7 @@ from robotid.base.exceptions import DataError, SettingsError
 from robotid.base.findings import listed
 from robotid.base.text import seconds
 from robotid.base.typing import Array
-from robotid.data.base_motion import BaseMotion, base_state, pose_jumps
+from robotid.data.base_motion import base_state, pose_jumps
 from robotid.data.filters import butterworth_poles, cubic_spline, zero_phase
 from robotid.data.log import Log, Trajectory
 from robotid.data.measured_velocity import is_trustworthy
@@ -186,52 +186,53 @@ def process_segments(
     is_sharp = settings.cutoff is None and settings.friction_band == 0
     ratios = np.empty((0, len(log.joints))) if speeds is None or is_sharp else speeds
     if len(log.t) > KEPT or first or own.indices(len(log.t)) != (0, len(log.t), 1):
-        return _process(log, segments, settings, first, own, ratios, {})
+        return _process(_Part(log, settings, first, own, ratios, {}), segments)
     known = _KNOWN.setdefault(log, {})
     key = settings, tuple(segments), ratios.shape, ratios.tobytes()
     if key not in known:
         channels = _CHANNELS.setdefault(log, {})
-        known[key] = _process(log, segments, settings, first, own, ratios, channels)
+        known[key] = _process(_Part(log, settings, first, own, ratios, channels), segments)
     return known[key].at(slice(None))  # with a cache of its own
 
 
-def _process(
-    log: Log,
-    segments: Sequence[Segment],
-    settings: SignalSettings,
-    first: int,
-    own: slice,
-    ratios: Array,
-    known: dict[object, Array],
-) -> Trajectory:
-    """Return the motion as of ``process_segments``, for the speeds of Coulomb friction.
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """Rows of a log that become a trajectory."""
 
-    The ``known`` channels of these rows are used; others are added to them.
-    """
-    n, base = len(log.joints), 0 if log.base is None else 6
-    parts, counts = [], []
-    for segment in segments:
-        rows = slice(max(segment.first - first, 0), min(segment.stop - first, len(log.t)))
-        part = _process_part(log, rows, segment, settings, first, own, ratios, known)
-        counts.append(0 if part is None else len(part[0]))
-        parts += [] if part is None else [part]
-    empty = np.empty((0, base + n))
-    q0 = np.empty((0, n + (base and 7)))
-    nothing = (
-        np.empty(0), q0, empty, empty, empty, np.empty((0, len(ratios))),
-        np.empty((0, len(log.wrenches))),
-    )  # fmt: skip
-    t, q, v, a, tau, direction, wrenches = (
-        np.concatenate(x) for x in zip(nothing, *parts, strict=True)
+    log: Log
+    settings: SignalSettings
+    first: int  # number of the first row of the log
+    own: slice  # the rows wanted; the others are beside them
+    speeds: Array  # of Coulomb friction over those of the joints, (c, n)
+    known: dict[object, Array]  # channels of these rows; others are added
+
+
+def _process(part: _Part, segments: Sequence[Segment]) -> Trajectory:
+    """Return the motion as of ``process_segments``."""
+    log, settings, n = part.log, part.settings, len(part.log.joints)
+    base = 0 if log.base is None else 6
+    motions = [_smooth(part, segment) for segment in segments]
+    widths = (
+        0,
+        n + (base and 7),
+        base + n,
+        base + n,
+        base + n,
+        len(part.speeds),
+        len(log.wrenches),
     )
+    nothing = [np.empty((0, width) if width or k else 0) for k, width in enumerate(widths)]
+    moving = [motion for motion in motions if motion]
+    t, q, v, a, tau, direction, wrenches = map(np.concatenate, zip(nothing, *moving, strict=True))
     contacts, switching = _contacts(log, t, settings) if log.contacts else (None, None)
     if log.base is not None and log.base.imu is None and len(t):
         jumping = _jumping(log.t, log.base.pose, t, settings)
         switching = jumping if switching is None else switching | jumping
+    counts = [len(motion[0]) if motion else 0 for motion in motions]
     return Trajectory(
         t=t, q=q, v=v, a=a, tau=tau, joints=log.joints, rate=settings.rate,
         segment=np.repeat([segment.number for segment in segments], counts),
-        direction=direction if len(ratios) else None,
+        direction=direction if len(part.speeds) else None,
         contacts=contacts,
         switching=switching,
         wrenches=wrenches if log.wrenches else None,
@@ -282,50 +283,23 @@ def too_short(where: str, segments: int, settings: SignalSettings) -> DataError:
     )
 
 
-def _process_part(
-    log: Log,
-    rows: slice,
-    segment: Segment,
-    settings: SignalSettings,
-    first: int,
-    own: slice,
-    speeds: Array,
-    known: dict[object, Array],
-) -> tuple[Array, Array, Array, Array, Array, Array, Array] | None:
-    """Return t, q, v, a, tau, direction and wrenches of the own rows, None if there are none."""
-    t = log.t[rows]
+def _smooth(part: _Part, segment: Segment) -> list[Array]:
+    """Return t, q, v, a, tau, direction and wrenches of the own rows of a segment, or nothing."""
+    log, settings, first, own = part.log, part.settings, part.first, part.own
     if segment.rows < 5 or segment.end - segment.start <= 2 * settings.trim:
-        return None
+        return []
     grid = _Grid.of(segment, settings)
     if grid.count < 5:
-        return None
-    local = rows.start + first - segment.first  # number of the first row in the segment
+        return []
+    rows = slice(max(segment.first - first, 0), min(segment.stop - first, len(log.t)))
+    t, local = log.t[rows], rows.start + first - segment.first  # number of the first row in it
     numbers = grid.numbers(t, local, is_last=rows.stop + first == segment.stop)
     times = t if grid.step is None else grid.at(numbers)
-    channels = {"q": log.q, "tau": log.tau}
-    if settings.velocity == "measured" and log.v is not None:
-        channels["v"] = log.v
-    if settings.acceleration == "measured" and log.a is not None:
-        channels["a"] = log.a
-    if log.base is not None:
-        channels |= _base_channels(log.base, settings)
-    if log.wrenches:
-        channels["wrenches"] = np.column_stack([*log.wrenches.values()])
-    delay = {"tau": settings.torque_delay, "v": settings.velocity_delay}
-    smooth = {}
-    for name, x in channels.items():
-        late = delay.get(name, 0.0)
-        on_grid = name, segment, grid, late
-        filtered = *on_grid, settings.cutoff, settings.order
-        if on_grid not in known:
-            known[on_grid] = _resample(t - late, x[rows], times)
-        if filtered not in known:
-            known[filtered] = low_pass(known[on_grid], grid.rate, settings)
-        smooth[name] = known[filtered]
+    smooth = _channels(part, segment, grid, rows, times)
     v = smooth["v"] if "v" in smooth else np.gradient(smooth["q"], times, axis=0)
     a = smooth["a"] if "a" in smooth else np.gradient(v, times, axis=0)
     # filtered as the torque, before rows are left out
-    direction = low_pass(_acting(times, v @ speeds.T, settings), grid.rate, settings)
+    direction = low_pass(_acting(times, v @ part.speeds.T, settings), grid.rate, settings)
     inside = (times >= grid.start + settings.trim) & (times <= grid.last - settings.trim)
     if grid.decimation > 1:
         inside &= (numbers - grid.number_of(grid.start + settings.trim)) % grid.decimation == 0
@@ -335,7 +309,7 @@ def _process_part(
         inside &= times < log.t[own.stop - first]
     chosen = np.flatnonzero(inside)
     if len(chosen) == 0:
-        return None
+        return []
     q, tau = smooth["q"], smooth["tau"]
     if log.base is not None:
         measured = smooth.get("twist"), smooth.get("base acceleration")
@@ -344,20 +318,39 @@ def _process_part(
         q, v, a = (np.hstack(pair) for pair in zip(state, (q, v, a), strict=True))
         tau = np.hstack([np.zeros((len(tau), 6)), tau])  # no torque acts on the base
     wrenches = smooth.get("wrenches", np.empty((len(times), 0)))
-    arrays = times, q, v, a, tau, direction, wrenches
-    return tuple(x[chosen] for x in arrays)  # type: ignore[return-value]
+    return [x[chosen] for x in (times, q, v, a, tau, direction, wrenches)]
 
 
-def _base_channels(base: BaseMotion, settings: SignalSettings) -> dict[str, Array]:
-    """Return the channels of a floating base by name, measured ones where the joints' are."""
-    channels = {"pose": base.pose}
-    if base.imu is not None:
-        return channels | {"imu": base.imu.values}
-    if settings.velocity == "measured" and base.twist is not None:
-        channels["twist"] = base.twist
-    if settings.acceleration == "measured" and base.acceleration is not None:
-        channels["base acceleration"] = base.acceleration
-    return channels
+def _channels(
+    part: _Part, segment: Segment, grid: "_Grid", rows: slice, times: Array
+) -> dict[str, Array]:
+    """Return the filtered channels at times, measured derivatives only where they are used."""
+    log, base, settings, known = part.log, part.log.base, part.settings, part.known
+    channels: dict[str, Array | None] = {"q": log.q, "tau": log.tau}
+    if log.wrenches:
+        channels["wrenches"] = np.column_stack([*log.wrenches.values()])
+    if base is not None:
+        channels["pose"] = base.pose
+        channels["imu"] = None if base.imu is None else base.imu.values
+    blind = base is not None and base.imu is None
+    if settings.velocity == "measured":
+        channels |= {"v": log.v, "twist": base.twist if base and blind else None}
+    if settings.acceleration == "measured":
+        channels |= {"a": log.a, "base acceleration": base.acceleration if base and blind else None}
+    delay = {"tau": settings.torque_delay, "v": settings.velocity_delay}
+    smooth = {}
+    for name, x in channels.items():
+        if x is None:
+            continue
+        late = delay.get(name, 0.0)
+        on_grid = name, segment, grid, late
+        filtered = *on_grid, settings.cutoff, settings.order
+        if on_grid not in known:
+            known[on_grid] = _resample(log.t[rows] - late, x[rows], times)
+        if filtered not in known:
+            known[filtered] = low_pass(known[on_grid], grid.rate, settings)
+        smooth[name] = known[filtered]
+    return smooth
 
 
 def _contacts(log: Log, t: Array, settings: SignalSettings) -> tuple[Array, Array]:

@@ -231,10 +231,8 @@ class Clearance:
         chosen: Array | None = None,
         hints: Array | None = None,
     ) -> Nearness:
-        """Return the distances of pairs along a motion, exact where they are near.
-
-        within (pairs, N) [m], chosen (pairs,), hints (pairs, N, 3).
-        """
+        """Return the distances of pairs along a motion, exact where they are near."""
+        # within (pairs, N) [m], chosen (pairs,), hints (pairs, N, 3)
         import coal
 
         from robotid.design.gap_lanes import lower_bounds  # imports Numba

@@ -74,32 +74,24 @@ class Multipliers:
         return replace(self, weight=_GROWTH * self.weight)
 
     def raised(self, used: Array, distance: Array | None, aim: Array) -> "Multipliers":
-        """Return the slopes as the new multipliers.
-
-        used (6, N, n), distance (pairs, N) [m], aim (pairs, 1) [m].
-        """
+        """Return the slopes as the new multipliers."""
+        # used (6, N, n), distance (pairs, N) [m], aim (pairs, 1) [m]
         distances = 0.0 if distance is None else self.of_distances(distance, aim)[1]
         return replace(self, limits=self.of_limits(used)[1], distances=distances)
 
     def of_limits(self, used: Array) -> tuple[float, Array]:
-        """Return the cost of limits and its derivative by their violations, shape (6, N, n).
-
-        used (6, N, n).
-        """
+        """Return the cost of limits and its derivative by their violations, shape (6, N, n)."""
+        # used (6, N, n)
         return self._cost(used**2 / (1.0 - SPARE) ** 2 - 1.0, self.limits)
 
     def of_distances(self, distance: Array, aim: Array) -> tuple[float, Array]:
-        """Return the cost of distances and its derivative by their deficits, shape (pairs, N).
-
-        distance (pairs, N) [m], aim (pairs, 1) [m].
-        """
+        """Return the cost of distances and its derivative by their deficits, shape (pairs, N)."""
+        # distance (pairs, N) [m], aim (pairs, 1) [m]
         return self._cost((aim - distance) / SOFT, self.distances)
 
     def distance_without_cost(self, aim: Array) -> Array:
-        """Return the distances from which there is no cost, shape (pairs, N) or (pairs, 1) [m].
-
-        aim (pairs, 1) [m].
-        """
+        """Return the distances from which there is no cost, shape (pairs, N) or (pairs, 1) [m]."""
+        # aim (pairs, 1) [m]
         return aim + SOFT / self.weight * self.distances
 
     def _cost(self, over: Array, multipliers: Array | float) -> tuple[float, Array]:
@@ -260,10 +252,8 @@ class Designer:
         )
 
     def checked(self, C: Array) -> Design:
-        """Return a motion, scaled down until it satisfies all limits, also between the samples.
-
-        C (h, n).
-        """
+        """Return a motion, scaled down until it satisfies all limits, also between the samples."""
+        # C (h, n)
         C, contact = self._clear(self._feasible(C, 1.0))
         used, _, rows = self._constraints(C)
         information = self.matrix(rows)
@@ -358,10 +348,8 @@ class Designer:
         return np.ones(len(self.limits.middle), dtype=bool) if self.moving is None else self.moving
 
     def judged(self, F: Array) -> tuple[float, Array]:
-        """Return the criterion of information about the base parameters, and its gradient.
-
-        F (b, b).
-        """
+        """Return the criterion of information about the base parameters, and its gradient."""
+        # F (b, b)
         if self.aim is None:
             return criterion(self.name, F, self.widest)
         own, L = self.aim.information(F)

@@ -29,10 +29,9 @@ def fixed_tree(model: RobotModel) -> Tree:
 
 
 class MotionRegressor:
-    """Columns of the torque regressor of a robot's bodies along motions, and their gradient.
+    """Columns of the torque regressor of a robot's bodies along motions, and their gradient."""
 
-    columns (b,).
-    """
+    # columns (b,)
 
     def __init__(self, model: RobotModel, columns: Array) -> None:
         self._tree = fixed_tree(model)
@@ -45,10 +44,8 @@ class MotionRegressor:
         self._work = self._tree.work_space()
 
     def __call__(self, q: Array, v: Array, a: Array) -> Array:
-        """Return the columns at N samples, shape (n, b, N).
-
-        q (N, n) [rad, m], v (N, n) [rad/s, m/s], a (N, n) [rad/s^2, m/s^2].
-        """
+        """Return the columns at N samples, shape (n, b, N)."""
+        # q (N, n) [rad, m], v (N, n) [rad/s, m/s], a (N, n) [rad/s^2, m/s^2]
         N, lanes = len(q), row_lanes()
         block = lanes.LANES
         out = np.zeros((self._shape[0] * self._shape[1], -(-N // block) * block))
@@ -57,11 +54,8 @@ class MotionRegressor:
         return out.reshape(*self._shape, -1)[..., :N]
 
     def pull(self, q: Array, v: Array, a: Array, weights: Array) -> Array:
-        """Return the gradient of sum(weights * columns) by q, v and a, shape (3, N, n).
-
-        q (N, n) [rad, m], v (N, n) [rad/s, m/s], a (N, n) [rad/s^2, m/s^2], weights (n, b,
-        N).
-        """
+        """Return the gradient of sum(weights * columns) by q, v and a, shape (3, N, n)."""
+        # q (N, n) [rad, m], v (N, n) [rad/s, m/s], a (N, n) [rad/s^2, m/s^2], weights (n, b, N)
         by_column = np.array(weights.reshape(-1, len(q)), order="C")
         motion, out = own_motion(q, v, a), np.zeros((3, *q.shape))
         row_lanes().pull_rows(self._tree, self._places, motion, by_column, self._work, out)
@@ -146,10 +140,8 @@ class MotionInformation:
         return share
 
     def rows(self, q: Array, v: Array, a: Array) -> MotionRows:
-        """Return the rows along a motion of N samples.
-
-        q (N, n) [rad or m], v (N, n) [rad/s or m/s], a (N, n) [rad/s^2 or m/s^2].
-        """
+        """Return the rows along a motion of N samples."""
+        # q (N, n) [rad or m], v (N, n) [rad/s or m/s], a (N, n) [rad/s^2 or m/s^2]
         W = self._regressor(q, v, a)
         load = (self.beta @ W).T  # drive columns are still 0
         columns, parameters = self._drives
@@ -181,10 +173,8 @@ class MotionInformation:
         return torque
 
     def pull(self, rows: MotionRows, weights: Array) -> tuple[Array, Array, Array]:
-        """Return the gradient of sum(weights * W) by q, v and a, shape (N, n) each.
-
-        weights (n, b, N).
-        """
+        """Return the gradient of sum(weights * W) by q, v and a, shape (N, n) each."""
+        # weights (n, b, N)
         columns, parameters = self._drives
         loads = self.model.layout.drive_loads[:, parameters]
         by_value = np.einsum("rk,rkn->kn", loads, weights[:, columns])
@@ -230,10 +220,8 @@ class Aim:
     asked: int
 
     def information(self, F: Array) -> tuple[Array, Array]:
-        """Return the information about those of interest, and L with d information = L^T dF L.
-
-        F (b, b).
-        """
+        """Return the information about those of interest, and L with d information = L^T dF L."""
+        # F (b, b)
         T, rest = self.columns, self.columns.shape[1] - self.asked
         N = T.T @ F @ T + np.eye(T.shape[1])
         others = np.linalg.solve(N[:rest, :rest], N[:rest, rest:])
@@ -246,9 +234,8 @@ def criterion(name: str, F: Array, widest: Array | None = None) -> tuple[float, 
 
     References:
         Pukelsheim (2006), Optimal Design of Experiments, chapter 6.
-
-    F (b, b).
     """
+    # F (b, b)
     if name not in CRITERIA:
         raise SettingsError(f"criterion is {name!r}, wanted one of {', '.join(CRITERIA)}")
     size = len(F)

@@ -78,10 +78,8 @@ class MotionLimits:
         return cls(np.array(middle), np.array(sizes))
 
     def used(self, q: Array, v: Array, a: Array, jerk: Array, torque: Array) -> Array:
-        """Return a motion's quantities divided by their limits, signed, shape (6, N, n).
-
-        q (N, n).
-        """
+        """Return a motion's quantities divided by their limits, signed, shape (6, N, n)."""
+        # q (N, n)
         values = np.array([q - self.middle, v, a, jerk, torque, torque * v])
         return values / self.sizes[:, None]
 
@@ -175,10 +173,8 @@ class Postures:
         return q
 
     def can_rest(self, q: Array) -> Array:
-        """Return whether postures satisfy limits and distances at rest, shape (N,), bool.
-
-        q (N, n) [rad or m].
-        """
+        """Return whether postures satisfy limits and distances at rest, shape (N,), bool."""
+        # q (N, n) [rad or m]
         used, margins = self._at_rest(q)
         is_clear = (margins >= 0.0).all(axis=0)
         can: Array = (used.max(axis=(0, 2)) <= 1.0) & is_clear
@@ -261,10 +257,8 @@ class Course:
         limits: MotionLimits,
         clearance: Clearance | None = None,
     ) -> "Course":
-        """Return the course of a sampled motion; its jerk by finite differences.
-
-        t (N,) [s], motion (N, n).
-        """
+        """Return the course of a sampled motion; its jerk by finite differences."""
+        # t (N,) [s], motion (N, n)
         q, v, a, torque = motion
         jerk = np.gradient(a, t, axis=0)
         return cls(t, np.array([q, v, a, jerk, torque, torque * v]), limits, clearance)
@@ -291,10 +285,8 @@ class Course:
         return replace(self, t=self.t[rows], values=self.values[:, rows])
 
     def nearness(self, chosen: Array) -> tuple[Array, Array]:
-        """Return the smallest distance at each sample, and its pair, shape (N,) each.
-
-        chosen (pairs,).
-        """
+        """Return the smallest distance at each sample, and its pair, shape (N,) each."""
+        # chosen (pairs,)
         distance, pairs = np.full(len(self.t), np.inf), np.zeros(len(self.t), dtype=int)
         left = np.arange(len(self.t) if chosen.any() else 0)
         within = _WITHIN

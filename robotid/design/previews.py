@@ -39,8 +39,13 @@ from robotid.estimation.estimators import Estimate
 from robotid.estimation.estimators.batch import solve_factor
 from robotid.estimation.estimators.determination import base_spread, determine
 from robotid.estimation.estimators.segments import FEWEST_SEGMENTS, scatter
-from robotid.estimation.fitting.consistent_estimator import Known, consistent_fit, pinned_links
-from robotid.estimation.fitting.estimator_settings import ConsistentSettings, EstimatorSettings
+from robotid.estimation.fitting.estimator_settings import (
+    ConsistentSettings,
+    EstimatorSettings,
+    Known,
+    consistent_fit,
+    pinned_links,
+)
 from robotid.estimation.fitting.evaluation import evaluate_logs
 from robotid.estimation.fitting.fitted import expected_band
 from robotid.estimation.fitting.recorded import Recordings
@@ -140,20 +145,16 @@ def largest_gravity(model: RobotModel) -> Array:
 
 
 def largest_torques(model: RobotModel, peak: Array) -> Array:
-    """Return the largest torque of each joint, shape (n,): the URDF's limit, or that of a motion.
-
-    peak (n,) [N m or N].
-    """
+    """Return the largest torque of each joint, (n,): the URDF's limit, or that of a motion."""
+    # peak (n,) [N m or N]
     peak = np.maximum(peak, FAINTEST * max(float(peak.max()), 1e-300))
     limit = np.array([joint.effort for joint in model.limits])
     return np.where(np.isfinite(limit) & (limit > 0), limit, peak)
 
 
 def assumed_parameters(model: RobotModel, size: Array, fastest: Array) -> Array:
-    """Return the URDF's bodies with friction of a typical size, shape (p,).
-
-    size (n,) [N m or N], fastest (n,) [rad/s or m/s].
-    """
+    """Return the URDF's bodies with friction of a typical size, shape (p,)."""
+    # size (n,) [N m or N], fastest (n,) [rad/s or m/s]
     pi = model.standard_parameters()
     for j, limits in enumerate(model.limits):
         speed = limits.velocity if 0 < limits.velocity < np.inf else max(float(fastest[j]), 1e-3)

@@ -1,6 +1,6 @@
 """Payloads of links from a run with and a run without them, and gains from a known mass."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -92,33 +92,28 @@ class Payload:
         low, high = self.mass_interval.tolist()
         known = "known" if self.mass_std_error == 0 else f"95 %: [{low:.4g}, {high:.4g}]"
         lines = [f"{self.link}: {self.mass:.4g} +- {self.mass_std_error:.2g} kg, {known}"]
-        shown = (
+        diagonals = np.diag(self.inertia), np.diag(self.inertia_std_error)
+        for key, words, unit, values, errors in (
             ("com", "centre of mass", "m", self.com, self.com_std_error),
-            ("inertia", "inertia about it, diagonal", "kg m^2",
-             np.diag(self.inertia), np.diag(self.inertia_std_error)),
-        )  # fmt: skip
-        for key, words, unit, values, errors in shown:
+            ("inertia", "inertia about it, diagonal", "kg m^2", *diagonals),
+        ):
             pairs = zip(values.tolist(), errors.tolist(), strict=True)
             figures = ", ".join(f"{x:.3g} +- {error:.2g}" for x, error in pairs)
-            why = self.reasons.get(key)
-            lines.append(f"  {words}: {f'{figures} {unit}' if why is None else why}")
+            lines.append(f"  {words}: {self.reasons.get(key, f'{figures} {unit}')}")
         return lines
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values, None for what is not determined."""
-        values = {
+        names = ("com", "com_std_error", "inertia", "inertia_std_error")
+        shown = {x: x.removesuffix("_std_error") in self.determined for x in names}
+        at_link = {"inertia_at_link": self.inertia_at_link.tolist()}
+        return {
+            "link": self.link,
             "mass": self.mass,
             "mass_std_error": self.mass_std_error,
             "mass_interval": self.mass_interval.tolist(),
-        }
-        for name in ("com", "inertia"):
-            for key in (name, f"{name}_std_error"):
-                values[key] = getattr(self, key).tolist() if name in self.determined else None
-        if "inertia" in self.determined:
-            values["inertia_at_link"] = self.inertia_at_link.tolist()
-        return {
-            "link": self.link,
-            **values,
+            **{name: getattr(self, name).tolist() if shown[name] else None for name in names},
+            **(at_link if shown["inertia"] else {}),
             "determined": list(self.determined),
             "reasons": dict(self.reasons),
         }
@@ -126,17 +121,11 @@ class Payload:
 
 @dataclass(frozen=True)
 class Gain:
-    """Torque per current of a joint.
-
-    Attributes:
-        value: The gain [N m/A or N/A].
-        std_error: Its standard error [same].
-        interval: 95 % interval [same].
-    """
+    """Torque per current of a joint [N m/A or N/A]."""
 
     value: float
     std_error: float
-    interval: tuple[float, float]
+    interval: tuple[float, float]  # 95 %
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,7 +203,7 @@ def payload_of(model: RobotModel, link: str, x: Array, C: Array, freedom: Array)
     J = np.column_stack([_about_com(x + 1j * step * e).imag / step for e in np.eye(10)])
     errors = np.sqrt(np.maximum(np.diag(J @ C @ J.T), 0.0))
     mass, error, t = float(x[0]), float(np.sqrt(C[0, 0])), float(quantile(freedom[:1])[0])
-    com, com_error = shown[:3], errors[:3]
+    com, com_error = shown[:3].real, errors[:3]
     inertia, inertia_error = _matrix(shown[3:]), _matrix(errors[3:])
     moment, largest = float(np.trace(inertia)) / 3, float(inertia_error.max())
     reasons = {}
@@ -232,17 +221,8 @@ def payload_of(model: RobotModel, link: str, x: Array, C: Array, freedom: Array)
     if error > 0 and mass < _SIGNIFICANT * error:
         words = f"the payload on {link} does not differ significantly from 0 kg"
         reasons = dict.fromkeys(("com", "inertia"), words)
-    return Payload(
-        link,
-        mass,
-        error,
-        np.array([mass - t * error, mass + t * error]),
-        com.real,
-        com_error,
-        inertia,
-        inertia_error,
-        reasons,
-    )
+    interval = np.array([mass - t * error, mass + t * error])
+    return Payload(link, mass, error, interval, com, com_error, inertia, inertia_error, reasons)
 
 
 def _about_com(x: Array) -> Array:
@@ -324,23 +304,46 @@ def identify_payload(
                 f"{what} has no log, wanted at least one: logs with the payload, and a reference "
                 "without it"
             )
-    links = tuple(links) or usual_links(model)
 
-    def fitted(runs: Sequence[Recordings]) -> PayloadFit:
-        return fit_payloads(*runs, links=links, masses=masses or {}, unknown_gains=unknown_gains)
+    def rescaled(gains: Mapping[str, float]) -> Recordings:
+        factor = np.array([gains.get(joint, 1.0) for joint in model.joints])
+        torques = [replace(log, tau=factor * log.tau) for log in read[1]]
+        return replace(without, fitted=[hold_log(model, log, settings) for log in torques])
 
-    fit = fitted((loaded, without))
-    gain = np.array([fit.gains[j].value if j in fit.gains else 1.0 for j in model.joints])
-    judged = without
-    if fit.gains:  # friction is a torque, not a current
-        torques = [replace(log, tau=gain * log.tau) for log in read[1]]
-        judged = replace(without, fitted=[hold_log(model, log, settings) for log in torques])
-    own = own_friction(judged, friction)
+    return fit_with_friction(
+        loaded, without, friction, rescaled, links=tuple(links) or usual_links(model),
+        masses=masses or {}, unknown_gains=unknown_gains,
+    )  # fmt: skip
+
+
+def fit_with_friction(
+    loaded: Recordings,
+    reference: Recordings,
+    friction: str | Mapping[str, str],
+    rescaled: Callable[[Mapping[str, float]], Recordings],
+    *,
+    links: Sequence[str],
+    masses: Mapping[str, float],
+    unknown_gains: Sequence[str] = (),
+) -> PayloadFit:
+    """Identify payloads with the friction that the reference shows, and check known masses.
+
+    Friction is a torque, not a current: ``rescaled`` returns the reference with identified gains.
+    """
+    asked = {"links": links, "masses": masses, "unknown_gains": unknown_gains}
+    fit = fit_payloads(loaded, reference, **asked)
+    gains = {joint: gain.value for joint, gain in fit.gains.items()}
+    wanted = wanted_families(friction, reference.model.joints)
+    own: Mapping[str, tuple[DriveTerm, ...]] = {}
+    if any(names != () for names in wanted.values()):
+        judged = rescaled(gains) if gains else reference
+        own = with_drives(judged, ConsistentSettings(), wanted).model.layout.own
     if own:
-        loaded, without = (run.with_model(model.with_terms(own)) for run in (loaded, without))
-        fit = fitted((loaded, without))
+        model = reference.model.with_terms(own)
+        loaded, reference = (run.with_model(model) for run in (loaded, reference))
+        fit = fit_payloads(loaded, reference, **asked)
     if masses and not unknown_gains:
-        fit = replace(fit, checks=mass_checks(loaded, without, masses=masses, links=links))
+        fit = replace(fit, checks=mass_checks(loaded, reference, masses=masses, links=links))
     return fit
 
 
@@ -351,16 +354,6 @@ def _check_gains(model: RobotModel, unknown: Sequence[str]) -> None:
             f"unknown gains are stated for {listed(unknown)}; gains are identified for a robot "
             "with a fixed base, without contacts and loops. State them"
         )
-
-
-def own_friction(
-    reference: Recordings, friction: str | Mapping[str, str]
-) -> Mapping[str, tuple[DriveTerm, ...]]:
-    """Return the friction terms of a reference in addition to the model's, by drive."""
-    wanted = wanted_families(friction, reference.model.joints)
-    if all(names == () for names in wanted.values()):
-        return {}
-    return with_drives(reference, ConsistentSettings(), wanted).model.layout.own
 
 
 def mass_checks(
@@ -434,16 +427,12 @@ def _fit(
     first, second = reference.reduce(), loaded.reduce()
     whole = join([*first, *second])
     runs = payload_runs(
-        first,
-        second,
-        model.layout,
-        loaded.mapping.K,
-        model.standard_parameters(),
+        first, second, model.layout, loaded.mapping.K, model.standard_parameters(),
         prior_spread(model, whole.squares, whole.samples),
         (columns, known, np.tile(payload_spread(model), len(links))),
         share=min(loaded.share, reference.share),
         unknown=[model.joints.index(joint) for joint in unknown_gains],
-    )
+    )  # fmt: skip
     compared = runs.compare()
     x, C, freedom = _payload_parameters(compared, known)
     for k, link in enumerate(links):
@@ -455,15 +444,11 @@ def _fit(
         for part in [slice(10 * k, 10 * k + 10)]
     )
     b = len(runs.known)
+    base_error = np.sqrt(np.diag(compared.covariance)[:b])
     return PayloadFit(
-        model,
-        payloads,
-        _gains(model, runs, compared),
-        loaded.mapping.base_names,
-        compared.theta[:b],
-        np.sqrt(np.diag(compared.covariance)[:b]),
-        compared.unexplained,
-    )
+        model, payloads, _gains(model, runs, compared), loaded.mapping.base_names,
+        compared.theta[:b], base_error, compared.unexplained,
+    )  # fmt: skip
 
 
 def _loads(fit: PayloadFit, reference: Recordings) -> tuple[Array, Array]:

@@ -157,9 +157,8 @@ def _roots(fit: EstimatedErrors, sizes: Array, c: int) -> Array:
 
     Offsets of unknown size have the mean square along each axis of their links, pooled over the
     points.
-
-    sizes (d,) [m or m/s^2].
     """
+    # sizes (d,) [m or m/s^2]
     roots, is_open = np.diag(sizes), np.isnan(sizes)
     if is_open.any():
         own = fit.squares.reshape(is_open.sum() // 3, 3, -1, 3)  # of each pair of points
@@ -178,9 +177,8 @@ def estimated_errors(
     explained by offsets. With the noise level sigma of the rows, their triangle without parameters
     and errors of known size has the singular values z and the torque u along their directions:
     -2 log(evidence) is the sum of log(1 + s^2 z^2) + u^2 / (1 + s^2 z^2).
-
-    R (b + d + 1, b + d + 1), L (b, b), mean (b,), sizes (d,), before (d,).
     """
+    # R (b + d + 1, b + d + 1), L (b, b), mean (b,), sizes (d,), before (d,)
     b, is_open = len(mean), np.isnan(sizes)
     some = np.flatnonzero(sizes > 0.0)
     k = b + len(some)
@@ -226,10 +224,8 @@ def _largest(z2: Array, u2: Array) -> float:
 
 
 def _slopes(model: RobotModel, rows: Rows, pi: Array, points: Sequence[int]) -> Array:
-    """Return D, the rows' torque per offset of a contact, shape (N n_rows, 3 len(points)) [N].
-
-    pi (p,).
-    """
+    """Return D, the rows' torque per offset of a contact, shape (N n_rows, 3 len(points)) [N]."""
+    # pi (p,)
     motion = rows.trajectory
     (torque,) = predict(model, [pi], replace(motion, basis=None))
     f = constraint_forces(model, motion, torque, rows.mask)
@@ -249,10 +245,8 @@ def _slopes(model: RobotModel, rows: Rows, pi: Array, points: Sequence[int]) -> 
 
 
 def _slopes_of_bias(model: RobotModel, rows: Rows, pi: Array) -> Array:
-    """Return the rows' torque per acceleration of the base, shape (N n_rows, 3) [N s^2/m].
-
-    pi (p,).
-    """
+    """Return the rows' torque per acceleration of the base, shape (N n_rows, 3) [N s^2/m]."""
+    # pi (p,)
     motion = replace(rows.trajectory, basis=None)
     (torque,) = predict(model, [pi], motion)
     pushed = [replace(motion, a=motion.a + np.eye(1, model.n_rows, k)) for k in range(3)]
@@ -277,9 +271,8 @@ def _shift_of_motion(model: RobotModel, mapping: BaseMapping, rows: Rows, theta:
     """Return E^T E theta, the mean of the score due to errors E of the regressor, shape (b,).
 
     The errors of the acceleration of the base are those that cause the residual, sample by sample.
-
-    theta (b,).
     """
+    # theta (b,)
     motion, shift = rows.trajectory, np.zeros(len(theta))
     pushed = [replace(motion, a=motion.a + np.eye(1, model.n_rows, k)) for k in range(6)]
     problems = [base_problem(model, mapping, x, rows.mask).blocks() for x in (motion, *pushed)]
@@ -296,10 +289,8 @@ def _shift_of_motion(model: RobotModel, mapping: BaseMapping, rows: Rows, theta:
 
 
 def _world_acceleration(motion: Trajectory, bias: Array) -> Array:
-    """Return the acceleration of the base with the axes of the world, shape (N, 3) [m/s^2].
-
-    bias (3,) [m/s^2].
-    """
+    """Return the acceleration of the base with the axes of the world, shape (N, 3) [m/s^2]."""
+    # bias (3,) [m/s^2]
     v, back = motion.v, motion.q[:, 3:7] * np.array([-1.0, -1.0, -1.0, 1.0])
     return in_base(back, motion.a[:, :3] + np.cross(v[:, 3:6], v[:, :3]) + bias)
 
@@ -310,9 +301,8 @@ def mean_drift(a: Array, segment: Array) -> float:
     The mean has the weight w(t) = sin^2(pi t / T) in each segment of duration T. By parts it is
     that of w'' x: constant speeds have no effect, and those at the ends have none. The plain mean
     is their change over T, 0.05 m/s^2 for a robot that sways.
-
-    a (N, 3) [m/s^2], segment (N,).
     """
+    # a (N, 3) [m/s^2], segment (N,)
     counts = np.unique(segment, return_counts=True)[1]
     w = np.concatenate([np.hanning(count + 2)[1:-1] for count in counts])
     return float(np.linalg.norm(w @ a / w.sum()) / np.sqrt(3.0))

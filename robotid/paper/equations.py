@@ -154,12 +154,9 @@ class Plant(Protocol):
 
 @dataclass(frozen=True)
 class PlanarDynamics(LinearDynamics):
-    """The paper's arm in closed form.
+    """The paper's arm in closed form."""
 
-    Attributes:
-        form: Its regressor: ``"printed"``, ``"corrected_five"`` or ``"corrected"``.
-    """
-
+    # its regressor: ``"printed"``, ``"corrected_five"`` or ``"corrected"``
     form: planar_2r.Form = "corrected"
 
     @property
@@ -176,15 +173,10 @@ class PlanarDynamics(LinearDynamics):
 
 @dataclass(frozen=True)
 class LinearPlant(Plant):
-    """A plant whose dynamics are linear in its parameters; it need not be a rigid body.
+    """A plant whose dynamics are linear in its parameters; it need not be a rigid body."""
 
-    Attributes:
-        dynamics: Its regressor.
-        P: Its true parameters, shape (c,).
-    """
-
-    dynamics: LinearDynamics
-    P: Array
+    dynamics: LinearDynamics  # its regressor
+    P: Array  # its true parameters, shape (c,)
 
     def acceleration(self, q: Array, v: Array, u: Array) -> Array:
         # a = D(q, P)^-1 (u - C(q, v, P)), (11)

@@ -22,34 +22,22 @@ _FREE = (np.array([[0.0, 1.0]]), np.array([[1.0, 2.0]]))  # [rad], [rad/s] start
 
 @dataclass(frozen=True)
 class Erratum:
-    """One error of the printed text.
+    """One error of the printed text."""
 
-    Attributes:
-        where: The equation.
-        printed: The printed text.
-        corrected: The corrected text.
-        max_torque_difference: The largest over random states [N m]; for (23) that of the residual
-            with the gradient PRX.
-        max_torque_difference_on_program: The largest along the program motion [N m].
-    """
-
-    where: str
-    printed: str
-    corrected: str
+    where: str  # the equation
+    printed: str  # the printed text
+    corrected: str  # the corrected text
+    # the largest over random states [N m]; for (23) that of the residual with the gradient PRX
     max_torque_difference: float
-    max_torque_difference_on_program: float
+    max_torque_difference_on_program: float  # the largest along the program motion [N m]
 
 
 @dataclass(frozen=True)
 class EnergyDrift:
-    """Kinetic energy of the arm without torque.
+    """Kinetic energy of the arm without torque."""
 
-    Attributes:
-        t: Times, shape (N,) [s].
-        gained: Per model, the energy gained since the start over the initial energy, shape (N,).
-    """
-
-    t: Array
+    t: Array  # times, shape (N,) [s]
+    # per model, the energy gained since the start over the initial energy, shape (N,)
     gained: dict[str, Array]
 
 

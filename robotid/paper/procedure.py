@@ -34,35 +34,23 @@ _DIVERGED = 1e3  # [rad or m; per s] deviation from the program beyond which a r
 
 @dataclass(frozen=True)
 class LoopSettings:
-    """Settings of the procedure; alpha, beta and eps2 may differ from run to run, shape (R,).
+    """Settings of the procedure; alpha, beta and eps2 may differ from run to run, shape (R,)."""
 
-    Attributes:
-        alpha: Gain of the velocity in (15) [1/s].
-        beta: Gain of the position in (15) [1/s^2].
-        iterations: Largest number of runs of the motion.
-        updates: Updates per run; the torque is constant between them (zero-order hold).
-        substeps: Runge-Kutta steps per update; stiff friction needs several.
-        method: ``"recursive"``, (24) at each update, or ``"one_shot"``, (18) after each run.
-        sign: Sign in (23); with the printed one the procedure never stops.
-        prx_acceleration: Acceleration of the regressor in (23): ``"measured"``, or ``"reference"``,
-            q_* (15), as printed in (22). Then Psi P^ = u by (21): with the corrected sign PRX is
-            zero for any estimate, so that the estimate never changes.
-        eps1: If no entry of PRX is larger, it counts as zero [N m / s^2].
-        eps2: If |Psi|^2 is not above it, there is no update [1/s^4].
-        bounds: Omega of (8), or None.
-    """
-
-    alpha: float | Array = 20.0
-    beta: float | Array = 100.0
-    iterations: int = 100
-    updates: int = 100
-    substeps: int = 1
+    alpha: float | Array = 20.0  # gain of the velocity in (15) [1/s]
+    beta: float | Array = 100.0  # gain of the position in (15) [1/s^2]
+    iterations: int = 100  # largest number of runs of the motion
+    updates: int = 100  # updates per run; the torque is constant between them (zero-order hold)
+    substeps: int = 1  # Runge-Kutta steps per update; stiff friction needs several
+    # ``"recursive"``, (24) at each update, or ``"one_shot"``, (18) after each run
     method: Literal["recursive", "one_shot"] = "recursive"
-    sign: Sign = "corrected"
+    sign: Sign = "corrected"  # sign in (23); with the printed one the procedure never stops
+    # acceleration of the regressor in (23): ``"measured"``, or ``"reference"``, q_* (15), as
+    # printed in (22). Then Psi P^ = u by (21): with the corrected sign PRX is zero for any
+    # estimate, so that the estimate never changes
     prx_acceleration: Literal["measured", "reference"] = "measured"
-    eps1: float = 1e-9
-    eps2: float | Array = 1e-12
-    bounds: Bounds | None = None
+    eps1: float = 1e-9  # if no entry of PRX is larger, it counts as zero [N m / s^2]
+    eps2: float | Array = 1e-12  # if |Psi|^2 is not above it, there is no update [1/s^4]
+    bounds: Bounds | None = None  # Omega of (8), or None
 
     def __post_init__(self) -> None:
         for name in ("alpha", "beta", "eps1", "eps2", "iterations", "updates", "substeps"):
@@ -102,26 +90,20 @@ class Influences:
 
 @dataclass(frozen=True)
 class History:
-    """The course of R runs over L iterations.
+    """The course of R runs over L iterations."""
 
-    Attributes:
-        estimates: P^ before the first iteration and after each, shape (L + 1, R, c).
-        prx: Largest entry of PRX (23) during each iteration, shape (L, R) [N m / s^2].
-        tracking: Largest distance from the program in each iteration, shape (L, R) [rad or m].
-        NA: The first iteration in which PRX was zero throughout (25), after which the estimate is
-            constant; 0 if there was none, shape (R,).
-        diverged: The iteration in which the robot diverged from its program, 0 if it did not, shape
-            (R,). Its estimate is constant afterwards.
-        skipped: Number of updates omitted since D(q, P^) was not positive definite, shape (R,).
-        torques: Control u (21), shape (L, updates, R, n) [N m or N], if requested.
-    """
-
-    estimates: Array
-    prx: Array
-    tracking: Array
+    estimates: Array  # P^ before the first iteration and after each, shape (L + 1, R, c)
+    prx: Array  # largest entry of PRX (23) during each iteration, shape (L, R) [N m / s^2]
+    tracking: Array  # largest distance from the program in each iteration, shape (L, R) [rad or m]
+    # the first iteration in which PRX was zero throughout (25), after which the estimate is
+    # constant; 0 if there was none, shape (R,)
     NA: NDArray[np.int_]
+    # the iteration in which the robot diverged from its program, 0 if it did not, shape (R,). Its
+    # estimate is constant afterwards
     diverged: NDArray[np.int_]
+    # number of updates omitted since D(q, P^) was not positive definite, shape (R,)
     skipped: NDArray[np.int_]
+    # control u (21), shape (L, updates, R, n) [N m or N], if requested
     torques: Array | None = field(default=None, repr=False)
 
     def relative_error(self, P: Array) -> Array:

@@ -1,4 +1,4 @@
-"""Run the paper's simulation and write its figures, tables and numerical results."""
+"""Run the paper's simulation and write its page and numerical results."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
@@ -16,8 +16,7 @@ from robotid.dynamics.torque import joint_torque_regressor
 from robotid.output.viewer.replays import Torques, replay
 from robotid.paper.equations import PlanarDynamics, torque
 from robotid.paper.errata import EnergyDrift, energy_drift, errata
-from robotid.paper.paper_figures import paper_figures
-from robotid.paper.paper_page import paper_page
+from robotid.paper.page import paper_page
 from robotid.paper.planar_2r import urdf_text
 from robotid.paper.procedure import LoopSettings
 from robotid.paper.study import (
@@ -33,7 +32,6 @@ from robotid.paper.study import (
     random_runs,
     study_model,
 )
-from robotid.paper.svg import STYLE, svg_element, svg_file
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import PAPER_TERMS, to_paper_order
 
@@ -70,7 +68,12 @@ def run_paper(
     content = _content(chosen, studies, near, exact, drift)
     content["inertial_vector"] = _inertial_vector(arm, physical)
     report("drawing", 0, 1, "pages")
-    _write(target, content, paper_figures(studies, near, drift), arm, physical)
+    with folder_beside(target) as beside:
+        (beside / "planar_2r.urdf").write_text(urdf_text(), encoding="utf-8")
+        _write_replay(arm, physical, beside / "replay.html")
+        html = paper_page(content, studies, near, drift)
+        (beside / "paper.html").write_text(html, encoding="utf-8")
+        write_json(content, beside / "paper.json")
     return content
 
 
@@ -191,32 +194,6 @@ def _inertial_vector(arm: RobotModel, study: ModelStudy) -> dict[str, Any]:
         "true": to_paper_order(pi).tolist(),
         "identified": to_paper_order(mapping.to_standard(beta, pi / 2)).tolist(),
     }
-
-
-def _write(
-    target: Path,
-    content: Mapping[str, Any],
-    figures: Mapping[str, tuple[str, Any]],
-    arm: RobotModel,
-    study: ModelStudy,
-) -> None:
-    """Write all files in a temporary folder, then move them."""
-    import matplotlib
-
-    with folder_beside(target) as beside:
-        shown = {}
-        with matplotlib.rc_context(STYLE):
-            for name, (caption, figure) in figures.items():
-                figure.get_layout_engine().execute(figure)
-                figure.set_layout_engine(None)  # no further draw before each file
-                figure.savefig(beside / f"{name}.png", facecolor="white")
-                svg = svg_file(figure)
-                (beside / f"{name}.svg").write_text(svg, encoding="utf-8")
-                shown[name] = (caption, svg_element(svg, caption, name))
-        (beside / "planar_2r.urdf").write_text(urdf_text(), encoding="utf-8")
-        _write_replay(arm, study, beside / "replay.html")
-        (beside / "paper.html").write_text(paper_page(content, shown), encoding="utf-8")
-        write_json(content, beside / "paper.json")
 
 
 def _write_replay(arm: RobotModel, study: ModelStudy, target: Path) -> None:

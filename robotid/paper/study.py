@@ -38,21 +38,13 @@ _STALLED = 1e-3  # [-] smallest relative decrease of the error over ten iteratio
 
 @dataclass(frozen=True)
 class Case:
-    """The conditions of a simulation.
+    """The conditions of a simulation."""
 
-    Attributes:
-        title: Description.
-        offset: Start of the robot relative to its program [rad].
-        torque: Disturbance as a share of the control [-].
-        noise: Whether the sensors are noisy.
-        eps2: Largest |Psi|^2 of samples that are not used [1/s^4].
-    """
-
-    title: str
-    offset: tuple[float, float] = _START
-    torque: float = 0.0
-    noise: bool = False
-    eps2: float = 1e-12
+    title: str  # Description
+    offset: tuple[float, float] = _START  # start of the robot relative to its program [rad]
+    torque: float = 0.0  # disturbance as a share of the control [-]
+    noise: bool = False  # whether the sensors are noisy
+    eps2: float = 1e-12  # largest |Psi|^2 of samples that are not used [1/s^4]
 
 
 #: Noise of the sensors: positions [rad], velocities [rad/s], accelerations [rad/s^2].
@@ -68,21 +60,13 @@ CASES = {
 
 @dataclass(frozen=True)
 class PaperSettings:
-    """Numbers of iterations and runs.
+    """Numbers of iterations and runs."""
 
-    Attributes:
-        iterations: Runs of the motion in the simulation of the figures.
-        longest: Largest number of iterations until PRX is zero.
-        runs: Random motions per model.
-        patience: Largest number of iterations for each random motion.
-        seed: Seed of the random numbers.
-    """
-
-    iterations: int = 100
-    longest: int = 500
-    runs: int = 120
-    patience: int = 300
-    seed: int = 0
+    iterations: int = 100  # runs of the motion in the simulation of the figures
+    longest: int = 500  # largest number of iterations until PRX is zero
+    runs: int = 120  # random motions per model
+    patience: int = 300  # largest number of iterations for each random motion
+    seed: int = 0  # seed of the random numbers
 
     def __post_init__(self) -> None:
         for name in ("iterations", "longest", "runs", "patience"):
@@ -92,23 +76,14 @@ class PaperSettings:
 
 @dataclass(frozen=True)
 class ModelStudy:
-    """The results of the simulation of one model.
+    """The results of the simulation of one model."""
 
-    Attributes:
-        name: Its name in ``MODELS``.
-        dynamics: Its regressor.
-        P: Its true parameters, shape (c,) [kg m^2].
-        history: One run per case, in the order of ``CASES``.
-        NA: First iteration in which PRX was zero without disturbance, or None.
-        one_shot_error: Relative error of (18) after one run of the motion.
-    """
-
-    name: str
-    dynamics: PlanarDynamics
-    P: Array
-    history: History
-    NA: int | None
-    one_shot_error: float
+    name: str  # its name in ``MODELS``
+    dynamics: PlanarDynamics  # its regressor
+    P: Array  # its true parameters, shape (c,) [kg m^2]
+    history: History  # one run per case, in the order of ``CASES``
+    NA: int | None  # first iteration in which PRX was zero without disturbance, or None
+    one_shot_error: float  # relative error of (18) after one run of the motion
 
     def errors(self, case: str = "clean") -> Array:
         """Return the relative error before the first iteration and after each: -> (L + 1,)."""
@@ -184,25 +159,15 @@ def _influences(cases: list[Case], rng: np.random.Generator) -> Influences:
 
 @dataclass(frozen=True)
 class RandomRuns:
-    """R random motions, and the course of the estimate on each.
+    """R random motions, and the course of the estimate on each."""
 
-    Attributes:
-        amplitude: Of each motion (28), shape (R, n) [rad].
-        duration: Of each motion, shape (R,) [s].
-        gain: Bandwidth w of the control, alpha = 2 w and beta = w^2, shape (R,) [1/s].
-        guess: Initial values, shape (R, c).
-        offset: Start of the robot relative to its program, shape (R, n) [rad].
-        errors: Relative error before the first iteration and after each, shape (L + 1, R).
-        history: The course of the runs.
-    """
-
-    amplitude: Array
-    duration: Array
-    gain: Array
-    guess: Array
-    offset: Array
-    errors: Array
-    history: History
+    amplitude: Array  # of each motion (28), shape (R, n) [rad]
+    duration: Array  # of each motion, shape (R,) [s]
+    gain: Array  # bandwidth w of the control, alpha = 2 w and beta = w^2, shape (R,) [1/s]
+    guess: Array  # initial values, shape (R, c)
+    offset: Array  # start of the robot relative to its program, shape (R, n) [rad]
+    errors: Array  # relative error before the first iteration and after each, shape (L + 1, R)
+    history: History  # the course of the runs
 
     @property
     def has_converged(self) -> NDArray[np.bool_]:

@@ -7,17 +7,14 @@ import pandas as pd
 import pytest
 
 import robotid
-from robotid.base.exceptions import DataError
-from robotid.data.files.formats import write_columns
-from robotid.data.files.read import read_log
+from robotid.base.exceptions import DataError, SettingsError
 from robotid.data.log import Log
 from robotid.data.signal_settings import LogUnits
 from robotid.data.units import _velocity_factor, check_units
 
-T = np.arange(400) * 0.01
+T = 5.0 + np.arange(400) * 0.01
 Q = np.column_stack([0.8 * np.sin(2 * T), 0.3 * np.cos(3 * T)])
 V = np.column_stack([1.6 * np.cos(2 * T), -0.9 * np.sin(3 * T)])
-A = np.column_stack([-3.2 * np.sin(2 * T), -2.7 * np.cos(3 * T)])
 TAU = np.column_stack([5 * Q[:, 0], 2 * Q[:, 1]])
 
 
@@ -25,47 +22,65 @@ def log(**changes):
     return Log(**{"t": T, "q": Q, "v": V, "tau": TAU, "joints": ("a", "b")} | changes)
 
 
-def table(t=T, scale=(1.0, 1.0)):
-    columns = {"time": t}
-    for kind, values in (("q", Q), ("dq", V), ("ddq", A)):
-        columns |= {f"{kind}_{j}": values[:, k] * scale[k] for k, j in enumerate("ab")}
-    return columns | {"tau_a": TAU[:, 0], "tau_b": TAU[:, 1]}
+#: Logs that look like another unit, the code and fragments of the error.
+SUSPECTED = [
+    (dict(q=Q * 180 / np.pi / 10, v=V / 10), "angle_unit", "dq_a is 0.0175 times d(q)/dt: the "
+     "position looks like degrees"),
+    (dict(v=V * 180 / np.pi), "angle_unit", "dq_a is 57.3 times d(q)/dt: the velocity looks like "
+     "degrees, the other like radians. Convert one of them in the recording. To read the values "
+     'without conversion, state units angle = "rad" (job file table [units], CLI --angle-unit rad'),
+    (dict(v=V * [1.0, -1.0]), "velocity_sign", "dq_b has the opposite sign of d(q)/dt of q_b. "
+     "Negate one of them in the recording, or leave the dq columns out"),
+    (dict(t=T * 1e3, v=None), "time_unit", "median step 10 looks like milliseconds (100 Hz); in "
+     'seconds it would be 0.1 Hz. State units time = "ms" (job file table [units], CLI --time-unit '
+     'ms, Python units=LogUnits(time="ms")), or "s" if this is the unit. To convert it, multiply'),
+    (dict(t=T * 200.0 / 10, v=None), "time_unit", "median step 0.2 looks like milliseconds (5000"),
+    (dict(t=T * 1e6, v=None), "time_unit", "median step 10000 looks like microseconds (100 Hz)"),
+    (dict(t=T * 1e9, v=None), "time_unit", "median step 1e+07 looks like nanoseconds (100 Hz)"),
+    *[(dict(t=T * 1e-4, v=V * 1e4 * factor), "time_unit", f"dq_a is {factor:.3g} times d(q)/dt"
+       f"; the time looks like {name}seconds. State units time")
+      for factor, name in ((1e3, "milli"), (1e6, "micro"), (1e9, "nano"))],
+    (dict(v=V / 1000), "time_unit", "dq_a is 0.001 times d(q)/dt. To read"),
+    (dict(q=Q * [1.0, 90.0 / 0.3], v=None), "angle_unit", "q_b reaches 90, which looks like "
+     "degrees (in radians 14.3 revolutions). State units angle = "),
+    (dict(q=Q * [-2.1 * 2 * np.pi / np.abs(Q[:, 0]).max(), 1.0], v=None), "angle_unit",
+     "q_a reaches 13.19, which looks like degrees (in radians 2.1 revolutions)"),
+    (dict(q_ref=Q * 57.3 * 2), "angle_unit", "qref_a reaches 91."),
+]  # fmt: skip
 
 
-@pytest.mark.parametrize(("unit", "per_second"), [("ms", 1e3), ("us", 1e6), ("ns", 1e9)])
-def test_stated_time_becomes_seconds_and_velocities_stay(tmp_path, unit, per_second):
-    write_columns(table(T * per_second), tmp_path / "run.csv")
-    found = read_log(tmp_path / "run.csv", ["a", "b"], units=LogUnits(time=unit))
-    np.testing.assert_allclose(found.t, T, rtol=1e-14)
-    np.testing.assert_array_equal(found.v, V)
-
-
-def test_stated_degrees_become_radians_but_of_joints_that_slide(tmp_path):
-    write_columns(table(scale=(180 / np.pi, 1.0)), tmp_path / "run.csv")
-    units = LogUnits(angle="deg")
-    found = read_log(tmp_path / "run.csv", ["a", "b"], units=units, prismatic=["b"])
-    for values, wanted in ((found.q, Q), (found.v, V), (found.a, A)):
-        np.testing.assert_allclose(values, wanted, rtol=1e-13, atol=1e-15)
-    np.testing.assert_array_equal(found.tau, TAU)
-
-
-@pytest.mark.parametrize(("turns", "is_refused"), [(1.9, False), (2.1, True)])
-def test_more_than_two_turns_look_like_degrees(turns, is_refused):
-    q = Q.copy()
-    q[200, 0] = 2 * np.pi * turns
-    far = log(q=q, v=None)
-    if is_refused:
-        with pytest.raises(DataError, match=r"q_a reaches .* looks like degrees"):
-            check_units(far, LogUnits())
+@pytest.mark.parametrize(("changes", "code", "fragment"), SUSPECTED)
+def test_a_log_in_another_unit_is_refused_unless_it_is_stated(changes, code, fragment):
+    with pytest.raises(DataError, match=re.escape(fragment)) as caught:
+        check_units(log(**changes), LogUnits())
+    assert caught.value.code == code
+    stated = LogUnits(time="s", angle="rad")
+    if code == "velocity_sign":  # whatever is stated
+        with pytest.raises(DataError, match="opposite sign"):
+            check_units(log(**changes), stated)
     else:
-        check_units(far, LogUnits())
-    if is_refused:
-        check_units(far, LogUnits(angle="rad"))
-        with pytest.raises(
-            DataError, match=rf"q_b reaches {2 * np.pi * turns:.4g}, .* {turns} rev"
-        ):
-            check_units(log(q=-q[:, ::-1], v=None), LogUnits())  # of either sign
-    check_units(far, LogUnits(), prismatic=["a"])
+        check_units(log(**changes), stated)
+
+
+def test_what_is_no_sign_of_another_unit_passes(rng):
+    for changes in (
+        {},
+        {"v": None},
+        {"t": np.arange(400) * 0.1, "v": None},  # 10 Hz
+        {"t": 1.7e9 + 0.01 * np.arange(400), "v": None},  # since 1970
+        {"q": np.full((400, 2), 12.5), "v": None},  # two revolutions
+        {"v": np.column_stack([np.interp(T - 0.19, T, x) for x in V.T])},  # as TIAGo's
+        {"v": V + rng.normal(0, 5, V.shape)},
+        {"q": np.round(rng.normal(0, 1e-5, Q.shape), 4), "v": rng.normal(0, 5e-4, Q.shape)},
+        {"q": 0 * Q, "v": 0 * V},
+        {"q": Q, "q_ref": -Q, "v": None},
+    ):
+        check_units(log(**changes), LogUnits())
+    check_units(log(q=Q * [1.0, 300.0], v=None), LogUnits(), prismatic=["b"])
+    check_units(log(v=np.degrees(V)), LogUnits(), prismatic=["a", "b"])
+    for name, unit, words in (("time", "min", "s, ms, us, ns"), ("angle", "grad", "rad, deg")):
+        with pytest.raises(SettingsError, match=f"{name} is '{unit}', wanted one of {words}"):
+            LogUnits(**{name: unit})
 
 
 PENDULUM = """<robot name="pendulum"><link name="base"/><link name="rod"><inertial>
@@ -144,35 +159,6 @@ def test_one_joint_in_degrees_is_converted_alone():
         assert "alone" not in str(caught.value)
 
 
-@pytest.mark.parametrize(("step", "unit"), [(0.2, "ms"), (10.0, "ms"), (1e4, "us"), (1e7, "ns")])
-def test_a_long_step_looks_like_another_unit(step, unit):
-    words = {"ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}
-    slow = log(t=np.arange(400) * step, v=None)
-    with pytest.raises(DataError, match=f"looks like {words[unit]}") as caught:
-        check_units(slow, LogUnits())
-    assert caught.value.code == "time_unit"
-    hertz = {"ms": 1e3, "us": 1e6, "ns": 1e9}[unit] / step
-    said = f"median step {step:.6g} looks like {words[unit]} ({hertz:.4g} Hz); in seconds it would "
-    assert f"{said}be {1 / step:.3g} Hz" in str(caught.value)
-    check_units(slow, LogUnits(time="s"))
-    check_units(log(t=np.arange(400) * 0.1, v=None), LogUnits())
-
-
-@pytest.mark.parametrize(
-    ("changes", "code", "said"),
-    [
-        ({"v": V * 180 / np.pi}, "angle_unit", "the velocity looks like degrees"),
-        ({"q": Q * 180 / np.pi / 10, "v": V / 10}, "angle_unit", "the position looks like degrees"),
-        ({"v": -V}, "velocity_sign", "has the opposite sign of"),
-        ({"v": V / 1000}, "time_unit", "dq_a is 0.001 times"),
-    ],
-)
-def test_a_velocity_that_does_not_go_with_its_position_is_refused(changes, code, said):
-    with pytest.raises(DataError, match=said) as caught:
-        check_units(log(**changes), LogUnits())
-    assert caught.value.code == code
-
-
 @pytest.mark.parametrize(
     ("step", "factor", "unit"),
     # 1 kHz, 5 Hz and 20 kHz since 1970: the step alone would say seconds, us, us
@@ -187,11 +173,6 @@ def test_a_date_tells_the_unit_of_the_time(step, factor, unit):
     assert caught.value.code == "time_unit"
     assert f'units time = "{unit}"' in str(caught.value)
     assert str(caught.value).endswith(f"multiply by {1 / factor:g}")
-
-
-def test_seconds_since_1970_are_seconds():
-    q = np.sin(np.arange(200) * 0.05)[:, None]
-    check_units(Log(1.7e9 + 0.01 * np.arange(200), q, q, ("a",)), LogUnits())
 
 
 @pytest.mark.parametrize("factor", [180 / np.pi, np.pi / 180])
@@ -222,7 +203,8 @@ def test_a_command_that_is_not_followed_shows_no_unit():
 @pytest.mark.parametrize(("turn", "unit"), [(2 * np.pi, 1.0), (360.0, 180 / np.pi)])
 def test_speeds_are_compared_beside_gaps_and_full_turns(turn, unit):
     """The factor of dq by d(q)/dt, of a log with jumps of a turn and a gap with a long way."""
-    t = 6.0 + np.where(T < 2.0, T, T + 9.0) + np.where(np.arange(400) < 250, 0.0, 0.1)
+    s = T - 5.0
+    t = 6.0 + np.where(s < 2.0, s, s + 9.0) + np.where(np.arange(400) < 250, 0.0, 0.1)
     q = unit * np.column_stack([0.7 * T + 0.02 * np.sin(5 * T), np.cos(3 * T)])
     v = unit * np.column_stack([0.7 + 0.1 * np.cos(5 * T), -3.0 * np.sin(3 * T)])
     q[200:] += [4.0 * unit, -2.0 * unit]  # while nothing was recorded
@@ -231,3 +213,11 @@ def test_speeds_are_compared_beside_gaps_and_full_turns(turn, unit):
     q[300:, 1] += turn
     found = _velocity_factor(log(t=t, q=q, v=[2.0, -0.5] * v))
     np.testing.assert_allclose(found, [2.0, -0.5], rtol=2e-3)
+
+
+def test_coarse_encoders_do_not_hide_degrees(rng):
+    t = np.arange(5000) / 1000
+    q = np.round(np.sin(t)[:, None] / 1e-2) * 1e-2  # [rad] moves in single steps at 1 kHz
+    v = np.degrees(np.cos(t)[:, None]) + rng.normal(0, 30, (5000, 1))
+    with pytest.raises(DataError, match=r"dq_elbow is 57.* times d\(q\)/dt: the velocity"):
+        check_units(Log(t=t, q=q, v=v, tau=q, joints=("elbow",)), LogUnits())

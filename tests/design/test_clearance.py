@@ -3,7 +3,6 @@ import pytest
 
 from robotid.design.clearance import _FIRST, Box, Clearance
 from robotid.dynamics.simulation.motions import ProgramMotion, random_fourier
-from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 
 # a slider that carries a ball past a post: distances are known by hand
@@ -131,30 +130,6 @@ def test_links_that_are_built_near_each_other_are_watched_and_those_that_touch_a
     assert {far.first, far.second} == {"base", "plate"}
     assert far.margin < 0.0 < less.margin
     assert far.required == clearance.required[0]
-
-
-@pytest.fixture(scope="module", params=["panda", "ur10_robot"])
-def scattered(request):
-    """A robot at random, its distances, and how far they are looked at."""
-    model = RobotModel.from_urdf(example_urdf(f"{request.param}.urdf"))
-    low, high = np.array([(j.lower, j.upper) for j in model.limits]).T
-    q = np.random.default_rng(2).uniform(low, high, (60, len(low)))
-    clearance = Clearance(model, floor=-0.05)
-    poses = clearance.placed(q)
-    return model, clearance, poses, clearance.near(poses, np.inf, clearance.everything).distance
-
-
-@pytest.mark.parametrize("spare", [0.0, 1.0, 2.0])
-def test_margins_leave_what_is_kept_and_spared(scattered, spare):
-    _, clearance, placed, _ = scattered
-    wanted = np.minimum(0.002, clearance.slack / 4)[:, None]  # 2 mm, or a quarter of the room
-    likely = clearance.near(placed, np.inf).distance
-    exactly = likely - clearance.required[:, None] - spare * wanted
-    found = clearance.margins(placed, spare)
-    near = exactly < np.minimum(0.01, clearance.slack / 4)[:, None]
-    assert near.any()
-    np.testing.assert_allclose(found[near], exactly[near], atol=1e-9)
-    assert (found <= exactly + 1e-9).all()  # farther ones have a lower bound
 
 
 def test_a_motion_that_swings_between_the_first_samples_is_followed_by_its_acceleration(slider):

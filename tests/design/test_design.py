@@ -3,7 +3,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from robotid.base.exceptions import SettingsError
 from robotid.design.basis import BSplineBasis, FourierBasis
 from robotid.design.clearance import Box, Clearance
 from robotid.design.design import Designer, Multipliers
@@ -131,31 +130,3 @@ def test_a_design_keeps_clear_of_what_stands_around(wrist, designer):
     t = np.linspace(0.0, 4.0, 4001)
     near = around.near(around.placed(found.motion.evaluate(t)[0]), 0.05, around.everything)
     assert (near.distance.min(axis=1) >= around.required).all()
-
-
-def test_what_keeps_a_robot_from_resting_is_named(wrist, designer):
-    weak = designer.limits.sizes.copy()
-    weak[4, 0] = 1e-3
-    limits = replace(designer.limits, sizes=weak)
-    with pytest.raises(SettingsError, match=r"wrist_1_joint needs at least \d+ % of its torque"):
-        replace(designer, limits=limits).design(np.random.default_rng(0), starts=1)
-    inside = Clearance(wrist, boxes=[Box("room", (-3.0, -3.0, -3.0), (3.0, 3.0, 3.0))])
-    with pytest.raises(SettingsError, match=r"the distance of \w+ and room is -\d+"):
-        replace(designer, clearance=inside).design(np.random.default_rng(0), starts=1)
-
-
-def test_a_motion_whose_middle_collides_is_mixed_with_one_that_keeps_the_limits(wrist, designer):
-    wall = Box("wall", (-2.0, 0.35, -2.0), (2.0, 0.40, 2.0))
-    near = replace(designer, clearance=Clearance(wrist, least=0.01, boxes=[wall]))
-    kept = near.random(np.random.default_rng(5))
-    C = kept.copy()
-    C[0] += np.pi / 2 * np.array([1.0, 1.0, 0.0])  # the middle, about which it would be scaled
-    assert not near.postures.can_rest(C[:1])[0]
-    mixed = near._towards(kept, C, 0.997)
-    used, margin, _ = near._constraints(mixed, 1.0)
-    share = np.linalg.norm(mixed - kept) / np.linalg.norm(C - kept)
-    assert 0.0 < share < 1.0
-    assert np.abs(used).max() <= 0.997
-    assert margin >= 0.0
-    used, margin, _ = near._constraints(mixed + 2e-3 * (C - kept), 1.0)
-    assert np.abs(used).max() > 0.995 or margin < 1e-3  # it can hardly go farther

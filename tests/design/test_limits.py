@@ -1,7 +1,6 @@
 import numpy as np
 import pytest
 
-from robotid.base.exceptions import SettingsError
 from robotid.design.limits import Course, MotionLimits
 
 
@@ -26,15 +25,6 @@ def test_shares_are_signed_and_power_is_torque_times_speed(panda):
     np.testing.assert_array_equal(used[2:4], 0.0)
     np.testing.assert_allclose(used[4], -6.0 / limits.sizes[4][None])
     np.testing.assert_allclose(used[5], -1.2)
-
-
-def test_bad_numbers_are_refused(panda):
-    with pytest.raises(SettingsError, match=r"share is 1\.2, wanted more than 0 and at most 1"):
-        MotionLimits.of_model(panda, share=1.2)
-    with pytest.raises(SettingsError, match="jerk of panda_joint1 is -1, wanted a positive number"):
-        MotionLimits.of_model(panda, jerk={"panda_joint1": -1})
-    with pytest.raises(SettingsError, match="power is stated for 'x', which is not a moving joint"):
-        MotionLimits.of_model(panda, power={"x": 1})
 
 
 def test_a_course_peaks_where_most_of_a_limit_is_used_either_way():

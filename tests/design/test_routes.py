@@ -5,14 +5,7 @@ from robotid.design.basis import FourierBasis
 from robotid.design.clearance import Clearance
 from robotid.design.design import Designer
 from robotid.design.limits import LIMITS, MotionLimits
-from robotid.design.routes import (
-    _PLACES,
-    Route,
-    _free_range,
-    _sweeps,
-    design_stands,
-    design_sweeps,
-)
+from robotid.design.routes import _PLACES, Route, _free_range, design_stands, design_sweeps
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 
@@ -57,24 +50,6 @@ def test_room_ends_at_the_nearest_place_where_the_robot_cannot_rest(designer):
                     assert not designer.postures.can_rest(q[:1])[0]
                     blocked += 1
     assert blocked > 10
-
-
-def test_a_sweep_lasts_three_seconds_if_there_is_room(designer):
-    posture, fastest = np.array([0.1, 0.2, 0.3]), designer.limits.sizes[1]
-    room = np.array([[0.2, 9.0], [9.0, 0.3], [9.0, 9.0]])
-    route = _sweeps(designer, posture, room, (0.1, 0.4))
-    k = 0
-    for j in range(3):
-        for share in (0.1, 0.4):
-            speed = share * fastest[j]
-            down, up = np.minimum(room[j], 1.5 * speed)  # half of it either way
-            wanted = np.array([posture[j], posture[j] + up, posture[j] - down, posture[j]])
-            np.testing.assert_allclose(route.places[k : k + 4, j], wanted)
-            way = np.abs(np.diff(wanted))
-            np.testing.assert_allclose(route.times[k : k + 3], way / speed + 0.25)
-            np.testing.assert_allclose(route.ramps[k : k + 3] * route.times[k : k + 3], 0.25)
-            k += 3
-    assert len(route.places) == k + 1
 
 
 def test_sweeps_go_both_ways_at_each_speed_while_the_others_rest(designer, rng):

@@ -6,15 +6,11 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from helpers.legged import recorded, with_other_bodies
-from helpers.paths import JOBS
 
 import robotid
-from robotid.cli.identify import run_job
-from robotid.cli.job import read_job
 from robotid.data.base_motion import BaseMotion
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.estimation.estimators import WLS
-from robotid.estimation.fitting.estimator_settings import ConsistentSettings
 from robotid.estimation.fitting.recorded import Recordings
 from robotid.estimation.fitting.survey import hold_log
 from robotid.identification.repeated_errors import with_repeated_errors
@@ -189,28 +185,3 @@ def test_a_bias_of_the_accelerometers_is_estimated(go1, trot):
     once = with_repeated_errors(Recordings(go1, structural_mapping(go1), [held]))
     again = with_repeated_errors(once).repeated  # of what is left: the whole bias is the same
     np.testing.assert_allclose(again.bias, once.repeated.bias, atol=0.4 * sure)
-
-
-def test_a_trotting_quadruped_with_unknown_forces(recordings, monkeypatch, tmp_path):
-    monkeypatch.setenv("ROBOTID_DATA", str(recordings))
-    job = read_job(JOBS / "legged" / "solo12.toml")
-    job = replace(job, estimator=ConsistentSettings(), report=False)
-    result, _ = run_job(job, tmp_path)
-    (validation,) = result.validation
-    tau, used = validation.recording.trajectory.tau, validation.recording.mask
-    errors = {
-        name: 100
-        * np.linalg.norm((tau - validation.torques[name])[used])
-        / np.linalg.norm(tau[used])
-        for name in ("estimate", "urdf")
-    }
-    assert errors["estimate"] < 1.4
-    assert errors["urdf"] == pytest.approx(2.2, abs=0.1)
-    masses = result.standard[: result.model.layout.n_inertial : 10]
-    assert masses.sum() == pytest.approx(2.501, rel=0.006)
-    assert masses[0] == pytest.approx(1.251, rel=0.05)  # the trunk
-    truth = result.mapping.K @ result.model.standard_parameters()  # the simulator used this URDF
-    covered = np.abs(result.base - truth) < result.errors.quantile * result.base_error
-    assert "points of contact uncertain by 0.0022 m" in result.errors.method
-    assert covered.mean() > 0.88  # 0.4 without the errors of the points of contact
-    assert result.verdict.status == "good"

@@ -10,16 +10,13 @@ import pytest
 from helpers.driven import arm
 from helpers.synthetic import exact_log, truth
 
-from robotid.base.exceptions import SettingsError
 from robotid.cli.identify import run_job
-from robotid.cli.job import Job, LogEntry, job_from_settings
-from robotid.cli.logs import survey_logs
+from robotid.cli.job import Job, LogEntry
 from robotid.cli.validate import validate
 from robotid.data.files.read import read_log, write_log
 from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
-from robotid.estimation.fitting.evaluation import evaluate_logs
 from robotid.robot.drives import DRIVE_TERMS
 
 HELD = 1024  # rows in memory, so that pieces have 256
@@ -160,39 +157,3 @@ def test_a_fitted_recording_is_no_validation_in_pieces_either(noisy_job, tmp_pat
     job = replace(noisy_job, validation=(apart, again), rows_in_memory=HELD)
     identification, _ = run_job(job, tmp_path / "out")
     assert [e.is_refitted for e in identification.validation] == [False, True]
-
-
-def test_a_log_with_samples_in_no_usual_piece_is_drawn_all_the_same(rng, tmp_path):
-    model = arm()
-    path, pi = tmp_path / "run.parquet", truth(model)
-    write_log(exact_log(model, pi, rng, samples=1010), path)
-    job = Job(
-        urdf=Path(model.tree.path),
-        joints=model.joints,
-        signals=SignalSettings(cutoff=10.0, trim=10.0),
-        rows_in_memory=HELD,
-    )
-    (log,) = survey_logs(replace(job, rows_in_memory=1009), model, [LogEntry(path)])[0]
-    assert [len(piece.read().trajectory.t) for piece in log.pieces] == [0, 8, 0, 0]
-    ((evaluation,), ()) = evaluate_logs([log], (), {"estimate": pi}, pi)
-    assert len(evaluation.recording.trajectory.t) == evaluation.recording.extent.smooth == 8
-    assert not evaluation.recording.is_partial
-
-
-def test_a_job_is_long_by_the_rows_of_all_its_files(noisy_job):
-    model, refused = noisy_job.model(), []
-    groups = noisy_job.identification, noisy_job.validation
-    for rows, is_in_memory in ((2199, False), (2200, True)):
-        fitted, kept = survey_logs(replace(noisy_job, rows_in_memory=rows), model, *groups)
-        assert [log.is_in_memory for log in (*fitted, *kept)] == [is_in_memory] * 3
-    missing = (LogEntry(Path("missing.csv")), noisy_job.identification[0])
-    (found,) = survey_logs(
-        replace(noisy_job, rows_in_memory=1500), model, missing, refuse=lambda *x: refused.append(x)
-    )
-    assert [log.is_in_memory for log in found] == [True]
-    ((entry, error),) = refused
-    assert (entry, str(error)) == (missing[0], "there is no log file 'missing.csv'")
-    with pytest.raises(SettingsError, match="rows_in_memory is 0, wanted a positive number"):
-        replace(noisy_job, rows_in_memory=0)
-    given = job_from_settings({"urdf": "x", "reduction": {"rows_in_memory": 7}}, "job", Path())
-    assert given.rows_in_memory == 7

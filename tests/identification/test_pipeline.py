@@ -15,7 +15,6 @@ from robotid.estimation.fitting.estimator_settings import EstimatorSettings
 from robotid.estimation.fitting.recorded import Recordings
 from robotid.estimation.fitting.survey import hold_log
 from robotid.identification.pipeline import conclude
-from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 
 EXACT = SignalSettings(cutoff=None, trim=0.0, min_velocity=0.0, velocity="measured")
@@ -33,50 +32,6 @@ def test_exact_data_give_exact_parameters(panda, rng, estimator):
         m.relative_error_pct for m in found.validation[0].metrics["estimate"].per_joint.values()
     ]
     assert max(errors) < 1e-5
-
-
-def test_the_consistent_result_is_possible_and_says_where_it_comes_from(ur5, rng):
-    pi = truth(ur5)
-    log = exact_log(ur5, pi, rng, samples=2000, noise=np.array([4, 4, 2, 0.5, 0.5, 0.2]))
-    found = identify(ur5, [log], signals=EXACT)
-    assert found.is_consistent
-    source = dict(zip(ur5.layout.names, found.sources, strict=True))
-    assert source["elbow_joint.viscous"] == "data"
-    assert source["shoulder_link.m"] == "prior"
-    assert set(found.sources) >= {"data", "mixed", "prior"}
-    i = ur5.layout.names.index("shoulder_link.m")
-    assert found.errors.unbounded[i] == pytest.approx(found.prior_std[i], rel=1e-6)
-    # 64 draws know a spread to 9 %; a body next to others cannot be lighter than nothing
-    assert 0.6 < found.standard_error[i] / found.prior_std[i] < 1.3
-
-
-def test_stand_still_rows_do_not_spoil_friction(ur5, rng):
-    pi = truth(ur5)
-    moving = exact_log(ur5, pi, rng, rate=100.0)
-    n = len(moving.t)
-    still_q = np.repeat(moving.q[-1:], n, axis=0)
-    jitter = 1e-4 * rng.standard_normal((n, 6))  # velocity noise at stand-still
-    brake = np.repeat(moving.tau[-1:], n, axis=0)
-    log = Log(
-        t=np.concatenate([moving.t, moving.t[-1] + 0.01 + moving.t]),
-        q=np.vstack([moving.q, still_q]),
-        v=np.vstack([moving.v, jitter]),
-        a=np.vstack([moving.a, np.zeros((n, 6))]),
-        tau=np.vstack([moving.tau, brake]),
-        joints=ur5.joints,
-    )
-    settings = SignalSettings(cutoff=None, trim=0.0, min_velocity=0.02)
-    found = fit(ur5, [log], signals=settings, estimator="wls")
-    names = list(found.mapping.base_names)
-    truth_base = found.mapping.to_base(pi)
-    for joint in ur5.joints:
-        i = names.index(f"{joint}.coulomb")
-        assert found.base[i] == pytest.approx(truth_base[i], rel=1e-6)
-    without = SignalSettings(cutoff=None, trim=0.0, min_velocity=0.0)
-    spoiled = fit(ur5, [log], signals=without, estimator="wls")
-    coulomb = [names.index(f"{joint}.coulomb") for joint in ur5.joints]
-    # what leaving the rows in costs: Coulomb friction comes out low
-    assert (spoiled.base[coulomb] < 0.8 * truth_base[coulomb]).any()
 
 
 def test_data_that_excite_too_little_are_refused_by_least_squares_only(ur5, rng):
@@ -100,10 +55,7 @@ def test_a_recording_that_was_fitted_does_not_show_what_repeats(rng):
     ]
     own, kept = ([hold_log(arm, log, EXACT) for log in some] for some in (logs[:1], logs[1:]))
     mapping, choice = structural_mapping(arm), EstimatorSettings("wls")
-    for beside, repeated, is_doubted in (
-        ([kept[0], own[0]], "b", True),
-        (kept, "b", False),
-    ):
+    for beside, repeated, is_doubted in (([kept[0], own[0]], "b", True), (kept, "b", False)):
         guesses = [Finding("repeated_motion", "warning", f"{name}.csv", "") for name in repeated]
         recordings = Recordings(arm, mapping, own, beside)
         found = conclude(recordings, choice, guesses, friction="none")
@@ -153,20 +105,3 @@ def test_a_drive_term_at_its_bound_has_no_error_and_what_stands_moved_little(ur5
     for i, source in enumerate(found.sources):
         if source == "prior":
             assert abs(found.standard[i] - found.prior[i]) <= 0.3 * found.prior_std[i]
-
-
-def test_links_on_locked_joints_that_weigh_less_than_the_urdf_says_are_named():
-    model = RobotModel.from_urdf(
-        example_urdf("ur5_robot.urdf"), joints=["elbow_joint", "wrist_1_joint"]
-    )
-    costs = []
-    for share in (0.45, 1.0):
-        pi = model.standard_parameters()
-        pi[10:20] *= share  # the hand alone has 0.53 of it by the URDF
-        pi[20:] = 0.5
-        log = exact_log(model, pi, np.random.default_rng(0), samples=400, rate=50.0, noise=0.02)
-        found = identify(model, [log])
-        costs.append([f.message for f in found.findings if f.code == "constraint_costs"])
-    assert costs[1] == []
-    assert "the URDF's inertials of the links on locked joints, 1.41 kg of the " in costs[0][0]
-    assert "kg of wrist_1_link (identify their joints, too" in costs[0][0]

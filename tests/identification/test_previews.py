@@ -13,25 +13,15 @@ from helpers.synthetic import truth
 from robotid.base.exceptions import SettingsError
 from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
-from robotid.design.previews import (
-    Run,
-    TorqueNoise,
-    _band,
-    _Information,
-    assumed_noise,
-    preview,
-)
+from robotid.design.previews import Run, TorqueNoise, _band, _Information, assumed_noise, preview
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.factors import Factors, compress
 from robotid.dynamics.simulation.motions import random_fourier
 from robotid.dynamics.torque import joint_torque_regressor, trajectory_regressor
 from robotid.dynamics.used_rows import base_problem
 from robotid.estimation.estimators.segments import scatter
-from robotid.estimation.fitting.estimator_settings import EstimatorSettings
 from robotid.estimation.fitting.survey import hold_log
 from robotid.output.files.entries import build_preview
-from robotid.robot.examples import example_urdf
-from robotid.robot.model import RobotModel
 
 STD = np.array([2.0, 3.0, 1.0, 0.3, 0.2, 0.1])  # [N m]
 RATE, DURATION = 100.0, 12.0
@@ -91,18 +81,6 @@ def test_the_errors_expected_are_the_scatter_of_many_recordings(ur5, motion, col
     assert ratio.max() < 1.6
 
 
-def test_what_is_expected_is_what_identify_then_reports(ur5, motion, found):
-    ahead = preview(ur5, [motion[0]], noise=white(), estimator="wls")
-    assert ahead.expected.mapping.base_names == found.mapping.base_names
-    ratio = ahead.base_error / found.wls.std_error
-    assert np.median(ratio) == pytest.approx(1.0, abs=0.1)
-    assert np.quantile(ratio, 0.1) > 0.65  # 18 segments of one run tell an error to 17 %
-    assert np.quantile(ratio, 0.9) < 1.6
-    # behind the filter the noise leaves what the fit leaves
-    np.testing.assert_allclose(ahead.expected.estimate.sigma, found.wls.sigma, rtol=0.15)
-    assert ahead.expected.determination.rank == found.determination.rank
-
-
 def test_motions_of_two_lengths_and_filters_tell_as_much_as_their_rows(rng):
     model = arm()
     mapping = structural_mapping(model)
@@ -139,25 +117,6 @@ def test_motions_of_two_lengths_and_filters_tell_as_much_as_their_rows(rng):
     alone = replace(both, share=1.0).without_motions()
     assert (alone.share, alone.levels) == (0.01, ())
     np.testing.assert_array_equal(alone.factors.rows, said.factors.rows)
-
-
-def test_the_prior_only_helps_and_bands_are_of_the_motion(ur5, motion):
-    log = motion[0]
-    free = preview(ur5, [log], noise=white(), estimator="wls")
-    kept = preview(ur5, [log], noise=white(), estimator=EstimatorSettings(prior_weight=1.0))
-    assert (kept.base_error <= free.base_error * 1.001).all()
-    assert (kept.base_error <= kept.plausible * 1.001).all()
-    light = preview(ur5, [log], noise=white(), estimator=EstimatorSettings(prior_weight=1e-9))
-    np.testing.assert_allclose(light.base_error, free.base_error, rtol=1e-3)
-    assert set(kept.expected.sources) == {"data", "mixed", "prior"}
-    (band,) = free.bands
-    mapping, covariance = free.expected.mapping, free.expected.wls.covariance
-    trajectory = free.expected.fitted[0].recording.trajectory
-    k = band.samples[123]
-    one = trajectory.at(np.array([k]))
-    W = joint_torque_regressor(ur5, one.q, one.v, one.a, one.direction)[:, mapping.independent]
-    std = np.sqrt(np.diag(W @ covariance @ W.T))
-    np.testing.assert_allclose(band.parameters[123], std, rtol=1e-8)
 
 
 def test_bands_of_torques_are_root_mean_squares_over_all_motions(ur5):
@@ -217,18 +176,6 @@ def test_noise_is_stated_or_a_hundredth_of_the_largest_torque(ur5):
             assumed_noise(ur5, size, {"elbow_joint": value})
     with pytest.raises(SettingsError, match="correlation is -1 s"):
         assumed_noise(ur5, size, {}, -1.0)
-
-
-def test_a_joint_without_an_effort_limit_has_the_torque_of_its_bodies(ur5, motion, tmp_path):
-    text = example_urdf("ur5_robot.urdf").read_text()
-    (tmp_path / "bare.urdf").write_text(re.sub(r'effort="[^"]*"', "", text))
-    bare = RobotModel.from_urdf(tmp_path / "bare.urdf")
-    log, (q, v, a) = motion
-    torque = joint_torque_regressor(ur5, q, v, a) @ ur5.standard_parameters()
-    largest = np.abs(torque.reshape(q.shape)).max(axis=0)
-    std = preview(bare, [log]).noise.std
-    np.testing.assert_allclose(std[:4], 0.01 * largest[:4], rtol=0.1)
-    assert std[1] < 0.01 * 150.0 == preview(ur5, [log]).noise.std[1]
 
 
 def test_noise_of_a_long_run_has_the_scatter_of_each_joint_s_own_scores(rng):

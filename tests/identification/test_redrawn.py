@@ -6,22 +6,14 @@ import numpy as np
 import pytest
 import scipy.optimize
 from helpers.driven import arm
-from helpers.estimation import EXACT, NOISE
-from helpers.fitting import fit
+from helpers.estimation import EXACT
 from helpers.synthetic import exact_log, truth
 
 from robotid.data.signals import process
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.estimation.estimators import Consistent
 from robotid.estimation.estimators.consistent.programme import nearest
-from robotid.estimation.fitting.estimator_settings import EstimatorSettings
 from robotid.robot.prior import prior_spread
-
-#: The true masses are 8.4, 2.3 and 2.6 kg.
-BOUND = {
-    "prior_weight": 1.0,
-    "constraints": {"mass": {"upper_arm_link": [9.0, 12.0], "forearm_link": [0.5, 2.0]}},
-}
 
 
 @pytest.fixture
@@ -93,15 +85,3 @@ def test_on_a_bound_half_of_the_fits_stay_there(inside, rng):
     assert away.min() > -2e-3
     assert np.mean(away < 2e-3) == pytest.approx(0.5, abs=0.04)
     assert np.mean(away**2) == pytest.approx(0.5, abs=0.06)  # E max(0, z)^2
-
-
-def test_bounds_make_intervals_narrower_and_are_named(rng):
-    model = arm()
-    log = exact_log(model, truth(model), rng, samples=2000, noise=NOISE[1:4])
-    found = fit(model, [log], signals=EXACT, estimator=EstimatorSettings(**BOUND))
-    assert found.estimate.details["active"]
-    assert "64 fits to resampled data and prior" in found.errors.method
-    ratio = np.sqrt(np.diag(found.estimate.covariance)) / found.errors.unbounded
-    assert 0.4 < np.median(ratio) < 1.0
-    assert ratio.max() < 1.4
-    assert found.errors.freedom.max() < 64

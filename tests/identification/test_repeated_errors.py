@@ -19,7 +19,6 @@ from robotid.identification.repeated_errors import (
     _shift,
     _shift_of_motion,
     _slopes,
-    _slopes_of_bias,
     _world_acceleration,
     estimated_errors,
     mean_drift,
@@ -95,25 +94,6 @@ def test_a_force_beside_its_point_leaves_the_torque_of_its_slope(log, rng, axes)
     left = left - np.einsum("kij,klj,kl->ki", B, B, left)
     np.testing.assert_allclose((D @ x)[rows.mask], left[rows.mask], atol=1e-7)
     assert np.abs(left).max() > 1e-5
-
-
-def size_of(R, L, mean, share, rows):
-    """Return the size of offsets, all of which are unknown."""
-    d = len(R) - 1 - len(mean)
-    return estimated_errors(R, L, mean, share, rows, np.full(d, np.nan), np.zeros(d)).size
-
-
-def test_the_size_of_offsets_is_found(rng):
-    """Offsets of 2 mm that the rows determine, beside parameters with a wide prior."""
-    W, D, x = rng.standard_normal((2000, 5)), rng.standard_normal((2000, 12)), np.zeros(12)
-    x = 2e-3 * rng.standard_normal(12)
-    tau = W @ np.ones(5) + D @ x + 1e-3 * rng.standard_normal(2000)
-    R = np.linalg.qr(np.column_stack([W, D, tau]), mode="r")
-    s = size_of(R, 10 * np.eye(5), np.zeros(5), 1.0, 2000)
-    assert s == pytest.approx(np.sqrt(np.mean(x**2)), rel=0.02)
-    tau = tau - D @ x
-    R = np.linalg.qr(np.column_stack([W, D, tau]), mode="r")
-    assert size_of(R, 10 * np.eye(5), np.zeros(5), 1.0, 2000) < 1e-4
 
 
 def test_the_size_of_offsets_is_that_of_the_density_of_the_rows(rng):
@@ -200,20 +180,6 @@ def test_offsets_without_torques_of_joints_are_two_centimetres_if_not_stated(log
     still = log.q.copy()
     still[:, 4] = 0.1  # a joint at rest: with Coulomb friction, its rows are not used
     assert size(replace(log, q=still), None, has_torque=True, terms=("coulomb",)).points != 0.02
-
-
-def test_a_bias_of_the_accelerometer_acts_on_the_mass_of_the_robot(log):
-    """The torque per acceleration of the base is three columns of the mass matrix, projected."""
-    model = robot(0.0)
-    rows = hold_log(model, log, RAW).whole
-    motion, pi, pin_model = rows.trajectory, model.standard_parameters(), model.pin_model
-    D = _slopes_of_bias(model, rows, pi).reshape(*motion.tau.shape, 3)
-    data = pin_model.createData()
-    for k, q in enumerate(model.configurations(motion.q)):
-        M = pin.crba(pin_model, data, q)
-        M = model.velocity_map.T @ (np.triu(M) + np.triu(M, 1).T) @ model.velocity_map
-        B = motion.basis[k]
-        np.testing.assert_allclose(D[k], M[:, :3] - B @ (B.T @ M[:, :3]), atol=1e-9)
 
 
 def test_the_acceleration_in_the_world_is_turned_and_has_the_bias_back(log, rng):

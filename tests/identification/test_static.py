@@ -1,6 +1,5 @@
 """Gravity, Coulomb friction and offsets of poses and slow sweeps."""
 
-import json
 from itertools import pairwise
 
 import numpy as np
@@ -8,18 +7,9 @@ import pinocchio as pin
 import pytest
 from helpers.synthetic import truth
 
-from robotid.base.exceptions import DataError, ModelError, SettingsError
-from robotid.cli.identify import run_job
-from robotid.cli.job import read_job
-from robotid.cli.validate import validate
-from robotid.data.files.read import write_log
 from robotid.data.log import Log
-from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.torque import joint_torque_regressor
-from robotid.estimation.fitting.estimator_settings import EstimatorSettings
-from robotid.identification.online.identifier import OnlineIdentifier
 from robotid.identification.pipeline import identify
-from robotid.output.files.result_file import load_result
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 
@@ -103,19 +93,6 @@ def test_gravity_is_found_with_true_intervals(name, kind, rng):
     assert count == 60 if kind == "poses" else count > 500
 
 
-def test_what_gravity_shows_is_what_stands_can_show():
-    full, static = robot("panda"), robot("panda", dynamics="static")
-    assert static.layout.terms == ("coulomb", "offset")
-    inertial = structural_mapping(static, inertial_only=True)
-    used = np.array(static.layout.inertial_names)[(inertial.K != 0).any(axis=0)]
-    assert {name.rsplit(".", 1)[1] for name in used} == {"m", "mcx", "mcy", "mcz"}
-    # as many as gravity's columns are independent at random poses
-    q = np.random.default_rng(0).uniform(-2, 2, (60, 7))
-    W = joint_torque_regressor(full, q, 0 * q, 0 * q)[:, : full.layout.n_inertial]
-    assert len(inertial.K) == np.linalg.matrix_rank(W, tol=1e-9)
-    assert len(structural_mapping(static).K) == len(inertial.K) + 2 * 7
-
-
 def test_inertias_about_the_centres_of_mass_are_the_urdfs(rng):
     full, static = robot("panda"), robot("panda", dynamics="static", terms=("offset",))
     found = identify(static, [poses(full, truth(full), rng)])
@@ -124,49 +101,3 @@ def test_inertias_about_the_centres_of_mass_are_the_urdfs(rng):
     assert max(abs(b.mass / a.mass - 1) for a, b in zip(after, before, strict=True)) > 0.03
     for a, b in zip(after, before, strict=True):
         np.testing.assert_allclose(a.inertia, b.inertia, atol=0.05 * np.trace(b.inertia))
-
-
-def test_a_job_writes_a_urdf_of_its_gravity_that_other_logs_validate(tmp_path, rng):
-    full = robot("ur10_robot")
-    pi = truth(full)
-    write_log(poses(full, pi, rng), tmp_path / "fit.csv")
-    write_log(poses(full, pi, rng, rows=1, count=30), tmp_path / "kept.csv")
-    (tmp_path / "job.toml").write_text(
-        f'urdf = "{full.tree.path}"\n[units]\ntime = "s"\n[reduction]\nrows_in_memory = 100\n'
-        '[model]\ndynamics = "static"\nfriction = "none"\n[[identification]]\nlog = "fit.csv"\n'
-    )
-    job = read_job(tmp_path / "job.toml")
-    found, result = run_job(job, tmp_path / "out")
-    assert result["settings"]["model"]["dynamics"] == "static"
-    loaded = load_result(tmp_path / "out")
-    assert loaded.robot.is_static
-    np.testing.assert_allclose(loaded.parameters, found.standard, atol=1e-9)
-    sidecar = json.loads((tmp_path / "out" / "ur10_robot.identified.drive.json").read_text())
-    assert sidecar["dynamics"] == "static"
-    q = pin.neutral(full.pin_model)[None] + rng.uniform(-2, 2, (20, 6))
-    written = RobotModel.from_urdf(tmp_path / "out" / "ur10_robot.identified.urdf")
-    wanted = gravity(full, pi, q)
-    given = gravity(written, written.standard_parameters(), q)
-    np.testing.assert_allclose(given, wanted, atol=0.03 * np.abs(wanted).max())
-    checked = validate(tmp_path / "out" / "result.json", [tmp_path / "kept.csv"])
-    verdict = checked["verdict"]
-    assert verdict["per_joint"]["shoulder_lift_joint"]["status"] == "good"
-    assert verdict["per_joint"]["shoulder_pan_joint"]["status"] == "not evaluated"
-    assert verdict["reasons"][-1].startswith("static model: ")
-
-
-def test_what_static_models_cannot_do_is_refused(rng):
-    full, static = robot("panda"), robot("panda", dynamics="static")
-    with pytest.raises(ModelError, match="dynamics is 'slow', wanted one of full, static"):
-        robot("panda", dynamics="slow")
-    with pytest.raises(SettingsError, match="dynamics is 'static', but gravity is 0"):
-        robot("panda", dynamics="static", gravity=(0, 0, 0))
-    with pytest.raises(DataError, match="online identification needs dynamics = 'full'"):
-        OnlineIdentifier(static)
-    log = poses(full, truth(full), rng)
-    with pytest.raises(SettingsError, match="'prx' needs the mass matrix, which dynamics"):
-        identify(static, [log], estimator=EstimatorSettings("prx", metric="mass"))
-    fast = Log(t=log.t[:20], q=log.q[:20] + 2.0 * log.t[:20, None], tau=log.tau[:20],
-               joints=log.joints)  # fmt: skip
-    with pytest.raises(DataError, match=r"no segment of 0\.25 s is slow enough for"):
-        identify(static, [fast])

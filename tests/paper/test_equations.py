@@ -4,7 +4,7 @@ import pytest
 from helpers.base_dynamics import BaseDynamics
 from helpers.synthetic import truth
 
-from robotid.base.exceptions import DataError, RankDeficientError, SettingsError
+from robotid.base.exceptions import RankDeficientError
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.simulation.simulator import RobotPlant
 from robotid.paper import planar_2r
@@ -18,10 +18,8 @@ from robotid.paper.equations import (
     recursive_update,
     reference_acceleration,
     rk4,
-    smallest_eigenvalue,
     torque,
 )
-from robotid.robot.model import RobotModel
 
 
 @pytest.fixture(scope="module")
@@ -72,38 +70,11 @@ def test_planar_dynamics_are_those_of_the_closed_form(form, rng):
         np.testing.assert_allclose(u[k], one, atol=1e-12)
 
 
-def test_each_run_may_have_its_own_parameters(rng):
-    dynamics, P = PlanarDynamics(), rng.normal(size=(3, 4))
-    q, v, a = states(rng, 3, 2)
-    together = torque(dynamics, q, v, a, P), mass_matrix(dynamics, q, P)
-    for r in range(3):
-        one = slice(r, r + 1)
-        alone = torque(dynamics, q[one], v[one], a[one], P[r]), mass_matrix(dynamics, q[one], P[r])
-        np.testing.assert_allclose(together[0][one], alone[0], atol=1e-13)
-        np.testing.assert_allclose(together[1][one], alone[1], atol=1e-13)
-
-
 def test_acceleration_solves_the_dynamics(rng):
     dynamics, P = PlanarDynamics("printed"), planar_2r.PAPER_PARAMETERS
     q, v, u = states(rng, 20, 2)
     a = LinearPlant(dynamics, P).acceleration(q, v, u)
     np.testing.assert_allclose(torque(dynamics, q, v, a, P), u, atol=1e-12)
-
-
-def test_smallest_eigenvalue_is_that_of_each_matrix():
-    D = np.array([np.diag([3.0, 2.0]), [[2.0, 1.0], [1.0, 2.0]]])
-    np.testing.assert_allclose(smallest_eigenvalue(D), [2.0, 1.0], rtol=1e-14)
-
-
-def test_a_floating_base_is_refused(ur5):
-    floating = RobotModel.from_urdf(ur5.tree.path, free_flyer=True, terms=())
-    with pytest.raises(DataError, match=r"^the base floats; forward dynamics need"):
-        RobotPlant(floating, floating.standard_parameters())
-
-
-def test_plant_parameters_of_another_length_are_named(ur5):
-    with pytest.raises(DataError, match=r"^pi has shape \(60,\), wanted \(84,\)$"):
-        RobotPlant(ur5, ur5.standard_parameters()[:60])
 
 
 # --- control, proximity, update ---------------------------------------------------------------
@@ -159,14 +130,6 @@ def test_an_update_is_left_out_where(change, why, rng):
     np.testing.assert_array_equal(found, P, err_msg=why)
 
 
-@pytest.mark.parametrize(("size", "moves"), [(1.1e-12, True), (0.9e-12, False), (0.0, False)])
-def test_a_sample_is_small_below_a_millionth(size, moves):
-    P, eta, Psi = np.array([2.0, -3.0]), np.array([0.5]), np.array([[0.6, 0.8]]) * size**0.5
-    found = recursive_update(P, Psi, eta, np.array(1.5), np.array(True))
-    wanted = P - 1.5 * Psi[0] * 0.5 / size if moves else P
-    np.testing.assert_allclose(found, wanted, rtol=1e-12)
-
-
 def test_one_shot_finds_the_truth_from_any_guess(rng):
     G, P, P_hat = rng.normal(size=(40, 5)), rng.normal(size=5), rng.normal(size=5)
     # G_* with G P = G_* P^: any matrix, moved along P^ so that the torques agree
@@ -186,26 +149,6 @@ def test_bounds_project_onto_their_box():
     bounds = Bounds(np.array([0.0, -1.0]), np.array([2.0, np.inf]))
     found = bounds.project(np.array([[3.0, -5.0], [1.0, 7.0]]))
     np.testing.assert_array_equal(found, [[2.0, -1.0], [1.0, 7.0]])
-
-
-def test_bounds_that_hold_nothing_are_refused():
-    with pytest.raises(
-        DataError, match=r"^bounds of parameter 1 are 2.0 to 1.0, wanted lower <= upper$"
-    ):
-        Bounds(np.array([0.0, 2.0]), np.array([1.0, 1.0]))
-    with pytest.raises(
-        DataError, match=r"^bounds of parameter 1 are 3.0 to nan, wanted lower <= upper$"
-    ):
-        Bounds(np.array([0.0, 3.0, 5.0]), np.array([1.0, np.nan, 1.0]))  # the first is named
-    with pytest.raises(
-        DataError, match=r"^bounds have shapes \(2,\) and \(3,\), wanted one \(c,\)"
-    ):
-        Bounds(np.zeros(2), np.ones(3))
-
-
-def test_an_unknown_sign_is_named():
-    with pytest.raises(SettingsError, match=r"^sign is 'plus', wanted 'corrected' or 'printed'$"):
-        proximity(np.ones((2, 3)), np.ones(3), np.ones(2), sign="plus")
 
 
 def swing(q, v, _):

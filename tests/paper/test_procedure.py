@@ -5,10 +5,9 @@ from functools import cache
 import numpy as np
 import pytest
 from helpers.base_dynamics import BaseDynamics
-from helpers.synthetic import truth
 from scipy.integrate import solve_ivp
 
-from robotid.base.exceptions import DataError, RankDeficientError, SettingsError
+from robotid.base.exceptions import SettingsError
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.simulation.motions import ProgramMotion
 from robotid.dynamics.simulation.simulator import RobotPlant
@@ -18,7 +17,6 @@ from robotid.paper.equations import (
     LinearPlant,
     PlanarDynamics,
     mass_matrix,
-    recursive_update,
     smallest_eigenvalue,
 )
 from robotid.paper.procedure import (
@@ -149,66 +147,9 @@ def test_the_error_never_grows_while_the_guarantee_holds(rng):
     assert (np.diff(history.relative_error(P4), axis=0) < 0).all()
 
 
-def test_one_update_never_raises_the_error(rng):
-    # the same law update by update, at states that no motion links
-    P_hat = P4 * rng.uniform(0.3, 1.3, (500, 4))
-    q, v, q_star = (bound * rng.uniform(-1, 1, (500, 2)) for bound in (np.pi, 5.0, 20.0))
-    Psi = ARM.regressor(q, v, q_star)
-    u = np.einsum("rnc,rc->rn", Psi, P_hat)
-    eta = PLANT.acceleration(q, v, u) - q_star
-    sigma = smallest_eigenvalue(mass_matrix(ARM, q, P_hat))
-    guaranteed = sigma <= 2 * smallest_eigenvalue(mass_matrix(ARM, q, P4))
-    assert guaranteed.sum() > 400
-    after = recursive_update(P_hat, Psi, eta, sigma, np.ones(500, dtype=bool))
-    ratio = np.linalg.norm(after - P4, axis=1) / np.linalg.norm(P_hat - P4, axis=1)
-    assert ratio[guaranteed].max() <= 1.0 + 1e-12
-
-
-def test_prx_falls_as_the_estimate_comes_near():
-    prx = twelve_iterations("corrected").prx[2:7, 0]
-    assert (np.diff(prx) < 0).all()
-
-
-def test_na_is_the_iteration_in_which_prx_is_zero():
-    history = run(settings=LoopSettings(iterations=20, eps1=25.0), offset=DEGREE)
-    NA = int(history.NA[0])
-    assert len(history.prx) == NA > 1
-    assert history.prx[NA - 1, 0] <= 25.0 < history.prx[NA - 2, 0]
-
-
 def test_one_shot_finds_the_parameters_after_one_run():
     history = run(settings=short(1, method="one_shot"), offset=DEGREE)
     np.testing.assert_allclose(history.estimates[-1], [P4], rtol=1e-11)
-
-
-def test_one_shot_takes_each_run_from_its_own_guess():
-    guess = P4 * np.array([[0.5], [0.8], [1.3]])
-    history = run(guess, settings=short(1, method="one_shot", updates=40), offset=DEGREE)
-    np.testing.assert_allclose(history.estimates[-1], np.tile(P4, (3, 1)), rtol=1e-10)
-
-
-def test_one_shot_says_what_the_motion_leaves_open():
-    still, settings = ProgramMotion(np.zeros(2), 2.0), short(1, method="one_shot")
-    with pytest.raises(RankDeficientError, match=r"^the data excite 0 of 4 base parameters"):
-        run_procedure(ARM, PLANT, still, P4[None], settings=settings)
-
-
-def test_a_ur5_under_gravity_comes_nearer_and_one_shot_arrives(gentle_ur5):
-    model, dynamics, motion = gentle_ur5
-    pi = model.standard_parameters()
-    beta = dynamics.mapping.to_base(pi)
-    plant, guess = RobotPlant(model, pi), 0.8 * beta[None]
-    recursive = run_procedure(
-        dynamics, plant, motion, guess, settings=short(2, updates=60), offset=0.05
-    )
-    error = recursive.relative_error(beta)[:, 0]
-    assert error[2] < error[1] < error[0]
-    once = run_procedure(
-        dynamics, plant, motion, guess,
-        settings=short(1, updates=60, method="one_shot"), offset=np.linspace(-0.2, 0.2, 6),
-    )  # fmt: skip
-    # the motion excites the weakest base parameter 1e4 times less than the strongest
-    np.testing.assert_allclose(once.estimates[-1, 0], beta, atol=1e-8)
 
 
 def test_the_closed_form_arm_and_its_urdf_are_one_plant(tmp_path):
@@ -281,21 +222,6 @@ def test_between_updates_the_torque_is_held_and_the_arm_moves_on(substeps, rng):
         np.testing.assert_allclose(found[r], exact.y[:, -1], atol=0.1 / substeps**4)
 
 
-def test_a_constant_torque_is_a_disturbance_too():
-    history = run(P4, settings=short(1), influences=Influences(lambda t, u: np.full_like(u, 5.0)))
-    # eta = D^-1 v; 5 N m on an inertia of about 3 kg m^2, held by beta = 100
-    assert 0.005 < history.tracking.max() < 0.1
-
-
-def test_noise_is_the_same_for_the_same_seed():
-    first, again, other = (
-        run(settings=short(2, updates=40, eps2=1.0), offset=DEGREE, influences=noise(seed))
-        for seed in (1, 1, 2)
-    )
-    np.testing.assert_array_equal(first.estimates, again.estimates)
-    assert np.abs(first.estimates - other.estimates).max() > 1e-6
-
-
 def test_noise_makes_the_smallest_samples_dangerous_and_eps2_leaves_them_out():
     # at depend on the program Psi is all noise, and (24) divides by its square
     bare, guarded = (
@@ -307,24 +233,6 @@ def test_noise_makes_the_smallest_samples_dangerous_and_eps2_leaves_them_out():
 
 def noise(seed):
     return Influences(q=1e-5, v=1e-4, a=1e-2, rng=np.random.default_rng(seed))
-
-
-def test_drives_are_part_of_the_plant_and_of_the_parameters(ur5):
-    # the last three joints of a UR5 with armature and friction in all of them
-    model = RobotModel.from_urdf(
-        ur5.tree.path, joints=ur5.joints[3:], terms=("armature", "viscous")
-    )
-    pi = truth(model)
-    dynamics = BaseDynamics(model, structural_mapping(model))
-    beta = dynamics.mapping.to_base(pi)
-    history = run_procedure(
-        dynamics,
-        RobotPlant(model, pi),
-        ProgramMotion(np.array([1.0, -0.7, 1.3]), 2.0),
-        beta[None],
-        settings=short(1, substeps=4),
-    )
-    assert history.prx.max() < 1e-9
 
 
 def test_runs_at_once_are_the_runs_one_by_one(rng):
@@ -350,25 +258,7 @@ def test_an_impossible_guess_is_not_updated_and_a_runaway_is_told():
     np.testing.assert_array_equal(history.estimates[:, 1], alone.estimates[:, 0])
 
 
-def test_a_run_that_is_lost_keeps_its_estimate():
-    history = run(settings=short(2), offset=np.array([2e3, 0.0]))  # [rad]
-    np.testing.assert_array_equal(history.diverged, [1])
-    assert len(history.estimates) == 2  # there was nothing left to do
-    np.testing.assert_array_equal(history.estimates[-1], [P4 / 2])
-
-
-def test_the_history_keeps_the_control_when_asked():
-    history = run(settings=short(2, updates=10), keep_torques=True)
-    assert history.torques.shape == (2, 10, 1, 2)
-    assert run(settings=short(1, updates=10)).torques is None
-
-
 # --- errors -----------------------------------------------------------------------------------
-
-
-def test_a_guess_of_another_shape_is_named():
-    with pytest.raises(DataError, match=r"^P0 has shape \(4,\), wanted \(R, 4\)$"):
-        run_procedure(ARM, PLANT, MOTION, P4)
 
 
 @pytest.mark.parametrize(

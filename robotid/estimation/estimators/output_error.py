@@ -28,8 +28,6 @@ _ROUNDS = 5  # largest number of updates of whitening and noise levels ...
 _SETTLED = 2e-2  # ... until their relative change is smaller
 _ROUGH, _CLOSE = 1e-3, 1e-5  # relative decrease that ends the first round, and the others
 _TOO_STIFF = 1e10  # damping at which no step reduces the cost any more
-_UPHILL = 1e-2  # largest relative increase of the cost by a step with inexact derivatives
-_NEAR = 1e-2  # step in standard errors, squared, at which such steps end
 _MOST_RHO = 0.95  # largest correlation: beyond it, whitening removes offsets and gains
 _NO_TRACE = 1e-3  # effect of an initial state in noise levels below which it is neglected
 #: Number of segments for the scatter of scores: few enough that each is longer than the time for
@@ -61,7 +59,6 @@ class OutputError(Estimator[Simulator]):
     from the residuals, then the parameters with these weights, until both have converged.
 
     Attributes:
-        name: Name of the method, by the compared signal.
         whitens: Whether the residual is whitened by its estimated correlation.
         most: Largest correlation of successive samples that is used, shape (n,): whitening with
             more than the correlation of the loop removes the information. None: 0.95.
@@ -79,7 +76,6 @@ class OutputError(Estimator[Simulator]):
 
     reads: ClassVar[Literal["simulator"]] = "simulator"
 
-    name: str = "output error"
     whitens: bool = True
     most: Array | None = None
     steps: int = _STEPS
@@ -88,30 +84,19 @@ class OutputError(Estimator[Simulator]):
     frees: bool = False
     progress: ProgressCallback = field(default=ignore_progress)
 
-    def fit(
-        self,
-        data: Simulator,
-        start: Array | None = None,
-        *,
-        exact: Simulator | None = None,
-    ) -> Estimate:
+    def fit(self, data: Simulator, start: Array | None = None) -> Estimate:
         """Estimate the parameters.
-
-        If the simulator's derivatives A are approximate, with the exact ones S of its residuals e,
-        the steps converge to A'e = 0, and standard errors are those of (A'S)^-1 A'e. A step leaves
-        the share 1 - (A'A)^-1 A'S of the error; ``details["left"]`` has the largest one.
 
         Args:
             data: The simulator.
             start: Initial values, shape (c,); the prior if None.
-            exact: The same simulator with exact derivatives, if its own are approximate.
 
         Raises:
             DataError: If there are fewer samples than parameters.
             NotConvergedError: If the simulation with the initial values fails.
         """
-        weights, theta, how = self._minimised(data, start, exact)
-        return self._estimate(data, weights, theta, how, exact=exact)
+        weights, theta, how = self._minimised(data, start)
+        return self._estimate(data, weights, theta, how)
 
     def minimise(self, data: Simulator, start: Array | None = None) -> Array:
         """Return the parameters of ``fit`` alone, shape (c,), without their standard errors.
@@ -123,10 +108,10 @@ class OutputError(Estimator[Simulator]):
         Raises:
             NotConvergedError: If the simulation with the initial values fails.
         """
-        return self._minimised(data, start, None)[1]
+        return self._minimised(data, start)[1]
 
     def _minimised(
-        self, simulator: Simulator, start: Array | None, exact: Simulator | None
+        self, simulator: Simulator, start: Array | None
     ) -> tuple[_Weights, Array, dict[str, Any]]:
         """Return the last weights, the parameters, and how they were found."""
         initial = simulator.prior if start is None else start
@@ -135,19 +120,15 @@ class OutputError(Estimator[Simulator]):
         weights, rounds, count, converged = self._weigh(found), 0, 0, False
         for rounds in range(1, self.rounds + 1):
             close = _ROUGH if rounds == 1 else _CLOSE
-            theta, found, steps, converged = self._descend(
-                simulator, weights, theta, found, close, is_exact=exact is None
-            )
+            theta, found, steps, converged = self._descend(simulator, weights, theta, found, close)
             count += steps
-            if exact is not None and not converged:
-                break  # other weights would not help
             before, weights = weights, self._weigh(found)
             change = np.abs(weights.sigma / before.sigma - 1.0).max()
             if rounds > 1 and converged and max(change, _rho_change(before, weights)) < _SETTLED:
                 break
             converged = False
         state = "converged" if converged else "not converged"
-        message = f"{self.name}, {count} steps in {rounds} rounds, {state}"
+        message = f"output error, {count} steps in {rounds} rounds, {state}"
         how = {"converged": converged, "n_iter": count, "message": message}
         return weights, theta, how
 
@@ -219,7 +200,7 @@ class OutputError(Estimator[Simulator]):
 
         Args:
             simulator: The simulator, with initial states fitted for the estimate.
-            estimate: Result of ``fit``, with exact derivatives.
+            estimate: Result of ``fit``.
 
         Raises:
             NotConvergedError: If the simulation after the step fails.
@@ -275,8 +256,6 @@ class OutputError(Estimator[Simulator]):
         theta: Array,
         found: Sequence[Residual],
         close: float,
-        *,
-        is_exact: bool,
     ) -> tuple[Array, Sequence[Residual], int, bool]:
         """Minimise with fixed weights from parameters with the residuals ``found``.
 
@@ -289,7 +268,6 @@ class OutputError(Estimator[Simulator]):
                 "in [controller] that are closer to those of the drives",
                 "no start",
             )
-        highest = 1.0 if is_exact else 1.0 + _UPHILL
         for step in range(1, self.steps + 1):
             self.progress("fitting loops", step, self.steps, "steps")
             H, g = self.normal(simulator, weights, theta, frees=self.frees)
@@ -301,17 +279,16 @@ class OutputError(Estimator[Simulator]):
                     new = self._cost(simulator, weights, trial, left)
                 except NotConvergedError:
                     pass  # the step is too long
-                if new < highest * cost or damping > _TOO_STIFF:
+                if new < cost or damping > _TOO_STIFF:
                     break
-                if is_exact and float(g @ (trial - theta)) < close * cost:
+                if float(g @ (trial - theta)) < close * cost:
                     break  # the predicted decrease is negligible
                 damping *= 6.0
-            if not new < highest * cost:
+            if not new < cost:
                 return theta, found, step, True  # no step reduces the cost noticeably
-            is_near = float(g @ (trial - theta)) < _NEAR
             decrease, theta, found, cost = (cost - new) / cost, trial, left, new
             damping = max(damping / 6.0, 1e-9)
-            if decrease < close if is_exact else is_near:
+            if decrease < close:
                 return theta, found, step, True
         return theta, found, self.steps, False
 
@@ -322,7 +299,6 @@ class OutputError(Estimator[Simulator]):
         theta: Array,
         how: Mapping[str, Any],
         *,
-        exact: Simulator | None = None,
         found: Sequence[Residual] | None = None,
     ) -> Estimate:
         """Return the estimate with standard errors from the scatter of the scores of segments.
@@ -354,11 +330,6 @@ class OutputError(Estimator[Simulator]):
             meat, inflation, freedom = seen.meat, seen.inflation, seen.freedom()
             further = simulator.rows(theta)[0]
             meat = meat + further.T @ further
-        left = 0.0
-        if exact is not None:
-            C = _cross(simulator, exact, weights, theta) + np.diag(known)
-            left = float(np.abs(np.linalg.eigvals(np.eye(len(theta)) - bread @ C)).max())
-            bread = np.linalg.inv(C)
         # standard errors are at least those for independent rows
         independent = np.diag(bread @ H @ bread.T)
         gained = 1.0 - independent * known  # relative reduction of each prior variance
@@ -380,10 +351,9 @@ class OutputError(Estimator[Simulator]):
                 "correlation": weights.rho,
                 "inflation": inflation * self.inflation,
                 "freedom": freedom,
-                "left": left,
                 "at_bound": tuple(at_bound.tolist()),
             },
-            **{**how, "converged": how["converged"] and left < 1.0},
+            **how,
         )
 
 
@@ -443,15 +413,6 @@ def _whitened(
             U = _by_start(r, weights)
             A, b = A - U @ (U.T @ A), b - U @ (U.T @ b)
         yield A, b, r.columns
-
-
-def _cross(simulator: Simulator, exact: Simulator, weights: _Weights, theta: Array) -> Array:
-    """Return A'S of a simulator's derivatives A and the exact ones S, whitened, shape (c, c)."""
-    product = np.zeros((len(theta), len(theta)))
-    parts = (linearised(one, weights, theta) for one in (simulator, exact))
-    for (A, _, rows), (S, _, columns) in zip(*parts, strict=True):
-        product[np.ix_(rows, columns)] += A.T @ S
-    return product
 
 
 def _by_start(r: Residual, weights: _Weights) -> Array:

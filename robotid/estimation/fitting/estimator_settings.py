@@ -1,18 +1,34 @@
-"""The choice of the estimator and its settings: one table of settings per estimator."""
+"""The estimators' settings, one table for each, and the estimators that they make."""
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
-from typing import Any, ClassVar, Self
+from dataclasses import dataclass, fields, replace
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, ClassVar, Self
+
+import numpy as np
 
 from robotid.base.exceptions import SettingsError
 from robotid.base.findings import listed
 from robotid.base.settings import Range, Settings, require_kind, setting
+from robotid.base.typing import Array
+
+if TYPE_CHECKING:
+    from robotid.dynamics.base_parameters import BaseMapping
+    from robotid.dynamics.factors import Factors
+    from robotid.estimation.estimators import (
+        BatchEstimator,
+        Consistent,
+        Constraints,
+        RecursiveEstimator,
+    )
+    from robotid.robot.model import RobotModel
 
 _NOT_NEGATIVE = Range("x >= 0", lambda x: x >= 0)
 _COUNT = Range("1 to 10000", lambda x: 1 <= x <= 10_000)
 _LARGEST = 1e9  # [kg] or [m] of bounds, as of numbers in a URDF
 _WINDOW = Range("0.05 s or more", lambda x: 0.05 <= x < math.inf)
+_FOLDS = 6  # of the cross-validation, prior_weight = "cv"
 _FINITE = Range("a positive, finite number", lambda x: 0 < x < math.inf)
 
 
@@ -111,6 +127,32 @@ def _is_number(value: object) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
+@dataclass(frozen=True, eq=False)
+class Known:
+    """A robot and the prior of its parameters."""
+
+    model: "RobotModel"
+    mapping: "BaseMapping"  # standard to base parameters
+    pi: Array  # (p,), standard parameters of the URDF
+    spread: Array  # (p,), prior standard deviations
+    share: float  # share of the rows that count as independent [-]
+    sigma: Array  # (n,), noise level of each joint [N m or N]
+    held_out: "tuple[Factors, ...]" = ()  # segments for choosing the weight and testing extents
+    repeated: float = 0.0  # share of errors of points of contact in the squared residual [-]
+
+    @property
+    def beta(self) -> Array:
+        """Base parameters of the URDF, shape (b,)."""
+        return self.mapping.to_base(self.pi)
+
+    @property
+    def covariance(self) -> Array:
+        """Prior covariance of the base parameters, shape (b, b)."""
+        KS = self.mapping.K * self.spread
+        covariance: Array = KS @ KS.T
+        return covariance
+
+
 @dataclass(frozen=True, init=False)
 class EstimatorSettings(Settings):
     """The estimator and its settings, as ``EstimatorSettings("wls", robust="huber")``.
@@ -152,6 +194,18 @@ class EstimatorSettings(Settings):
     @classmethod
     def from_dict(cls, table: Mapping[str, Any]) -> Self:
         return cls(**table)
+
+    def make(self, known: Known) -> "BatchEstimator | RecursiveEstimator[Any]":
+        """Return the estimator that reads rows or samples.
+
+        Args:
+            known: The robot and its prior.
+
+        Raises:
+            SettingsError: If constraints contradict each other or do not match the robot, or the
+                estimator reads a simulator.
+        """
+        raise SettingsError(f"{self!r} describes no estimator; use EstimatorSettings(name)")
 
     @property
     def words(self) -> str:
@@ -231,6 +285,12 @@ class DescentSettings(RecursiveSettings):
     passes: int = setting(4, "largest number of passes over the logs", within=_COUNT)
     seed: int = setting(0, "seed of the random order of the samples; negative: order of time")
 
+    @property
+    def _common(self) -> dict[str, Any]:
+        """Return the arguments common to these estimators."""
+        rng = np.random.default_rng(self.seed) if self.seed >= 0 else None
+        return {"average": self.average, "passes": self.passes, "rng": rng}
+
 
 @dataclass(frozen=True)
 class OLSSettings(EstimatorSettings):
@@ -240,12 +300,22 @@ class OLSSettings(EstimatorSettings):
 
     name: str = _called("ols", "ordinary least squares")
 
+    def make(self, known: Known) -> "BatchEstimator":
+        from robotid.estimation.estimators import OLS
+
+        return OLS(independent_share=known.share)
+
 
 @dataclass(frozen=True)
 class WLSSettings(RobustSettings):
     """Settings of weighted least squares."""
 
     name: str = _called("wls", "weighted least squares, rows weighted by the noise of their joint")
+
+    def make(self, known: Known) -> "BatchEstimator":
+        from robotid.estimation.estimators import WLS
+
+        return WLS(independent_share=known.share)
 
 
 @dataclass(frozen=True)
@@ -262,6 +332,11 @@ class TLSSettings(EstimatorSettings):
         within=Range("x > 0", lambda x: x > 0),
     )
 
+    def make(self, known: Known) -> "BatchEstimator":
+        from robotid.estimation.estimators import TLS
+
+        return TLS(self.regressor_noise, independent_share=known.share)
+
 
 @dataclass(frozen=True)
 class ConsistentSettings(RobustSettings, BoundedSettings):
@@ -271,6 +346,9 @@ class ConsistentSettings(RobustSettings, BoundedSettings):
         "consistent",
         "weighted least squares with physically consistent bodies and the URDF's values as prior",
     )
+
+    def make(self, known: Known) -> "BatchEstimator":
+        return consistent_fit(self, known)
 
 
 @dataclass(frozen=True)
@@ -283,6 +361,13 @@ class RLSSettings(RecursiveSettings):
         "forgetting factor: weight of a sample relative to the next one [-]",
         within=Range("0 < x <= 1", lambda x: 0 < x <= 1),
     )
+
+    def make(self, known: Known) -> "RecursiveEstimator[Any]":
+        from robotid.estimation.estimators import RLS
+
+        # without forgetting the prior is not used: the result is that of batch least squares
+        std = np.sqrt(np.diag(known.covariance)) if self.forgetting < 1 else None
+        return RLS(known.sigma, self.forgetting, known.beta, std, known.share)
 
 
 @dataclass(frozen=True)
@@ -303,6 +388,12 @@ class KalmanSettings(RecursiveSettings):
         ),
     )
 
+    def make(self, known: Known) -> "RecursiveEstimator[Any]":
+        from robotid.estimation.estimators import Kalman
+
+        gate = None if self.gate is False else float(self.gate)
+        return Kalman(known.sigma, known.beta, known.covariance, self.walk, gate, known.share)
+
 
 @dataclass(frozen=True)
 class PRXSettings(DescentSettings):
@@ -320,6 +411,12 @@ class PRXSettings(DescentSettings):
         among=("noise", "mass", "rows"),
     )
 
+    def make(self, known: Known) -> "RecursiveEstimator[Any]":
+        from robotid.estimation.estimators import PRX
+
+        own = {"step": self.step, "metric": self.metric, **self._common}
+        return PRX(known.sigma, known.beta, **own)
+
 
 @dataclass(frozen=True)
 class GradientSettings(DescentSettings):
@@ -329,6 +426,12 @@ class GradientSettings(DescentSettings):
     step_size: float = setting(
         1.0, "relaxation factor [-]", within=Range("0 < x < 2", lambda x: 0 < x < 2)
     )
+
+    def make(self, known: Known) -> "RecursiveEstimator[Any]":
+        from robotid.estimation.estimators import NormalisedGradient
+
+        own = {"step_size": self.step_size, **self._common}
+        return NormalisedGradient(known.sigma, known.beta, **own)
 
 
 @dataclass(frozen=True)
@@ -358,14 +461,6 @@ class SimulationSettings(EstimatorSettings):
         "plausible relative error of the URDF's inertial parameters; 0: they are fixed",
         within=_NOT_NEGATIVE,
     )
-    error: str = setting(
-        "output",
-        "compared signal: output, positions (closed-loop output error, CLOE); input, simulated "
-        "and logged torques (closed-loop input error, CLIE); direct, as input, but with the "
-        "derivatives of inverse dynamics, which neglect the change of the motion (DIDIM; gains "
-        "and delay must be stated)",
-        among=("output", "input", "direct"),
-    )
     velocities: bool = setting(
         False,
         "whether logged velocities are fitted in addition to the positions; velocities that a "
@@ -377,21 +472,6 @@ class SimulationSettings(EstimatorSettings):
     whiten: bool = setting(
         True, "whether the residuals are whitened by their estimated correlation"
     )
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.error == "output":
-            return
-        compared = f"estimator: error = {self.error!r} compares torques"
-        if not self.torques:
-            raise SettingsError(
-                f"{compared}, but torques is false; remove torques = false, or set error = 'output'"
-            )
-        if self.velocities:
-            raise SettingsError(
-                f"{compared}, but velocities is true; remove velocities = true, or set "
-                "error = 'output'"
-            )
 
 
 #: The settings of each estimator, by its name.
@@ -409,3 +489,81 @@ ESTIMATORS: Mapping[str, type[EstimatorSettings]] = {
         SimulationSettings,
     )
 }
+
+
+def consistent_fit(settings: BoundedSettings, known: Known) -> "Consistent":
+    """Return the physically consistent estimator, which can also project an estimate."""
+    from robotid.dynamics.factors import gather
+    from robotid.estimation.estimators import Consistent
+    from robotid.estimation.estimators.consistent.weighting import (
+        AS_GOOD,
+        Segments,
+        choose_weight,
+        contradicted_extents,
+        loss_of,
+    )
+    from robotid.robot.bodies import held_parameters
+    from robotid.robot.geometry import body_boxes, geometry_half_spaces
+
+    bounds, weight, model = settings.bounds, settings.prior_weight, known.model
+    geometry = geometry_half_spaces(model, bounds.com_within)
+    extent = body_boxes(model) if bounds.extent == "box" else {}
+    bounds = replace(bounds, pinned=pinned_links(bounds, model))
+    fit = Consistent(
+        layout=model.layout,
+        K=known.mapping.K,
+        prior=known.pi,
+        prior_std=known.spread,
+        held=held_parameters(model),
+        prior_weight=1.0 if isinstance(weight, str) else weight,
+        independent_share=known.share,
+        constraints=make_constraints(bounds, geometry, extent),
+        wls_noise=known.sigma,
+    )
+    folds = gather(known.held_out, _FOLDS)
+    how = "" if not isinstance(weight, str) else "cv" if weight == "auto" else weight
+    if how == "cv" and len(folds) < 2:
+        how = ""
+    if not extent and not how:
+        return fit
+    segments = Segments.of(fit, folds)
+    if extent:
+        beyond = contradicted_extents(fit, segments)
+        if beyond:  # else the programme that is set up already remains
+            fit = replace(fit, constraints=fit.constraints.without_extent(beyond))
+    if not how:
+        return fit
+    choice = choose_weight(fit, segments, how, known.repeated)
+    if fit.constraints.extent and choice.loss > AS_GOOD:
+        unbound = replace(fit, constraints=fit.constraints.without_extent(fit.constraints.extent))
+        if AS_GOOD * loss_of(unbound, segments, choice.weight) < choice.loss:
+            fit, choice = unbound, choose_weight(unbound, segments, how, known.repeated)
+    return replace(
+        fit, prior_weight=choice.weight, plausible_weight=choice.plausible, choice=choice
+    )
+
+
+def pinned_links(bounds: ConstraintSettings, model: "RobotModel") -> tuple[str, ...]:
+    """Return the links that keep the URDF's values: those stated, and those of negligible mass."""
+    from robotid.robot.bodies import negligible_bodies
+
+    bounded = {*bounds.pinned, *bounds.mass, *bounds.com}
+    return (*bounds.pinned, *(x for x in negligible_bodies(model) if x not in bounded))
+
+
+def make_constraints(
+    bounds: ConstraintSettings,
+    geometry: Mapping[str, tuple[Array, Array]],
+    extent: Mapping[str, Array] = MappingProxyType({}),
+) -> "Constraints":
+    """Return the constraints in the form that the estimator needs."""
+    from robotid.estimation.estimators import Constraints
+
+    A = np.vstack([np.eye(3), -np.eye(3)])
+    com, extents = dict(geometry), dict(extent)
+    for name, (low, high) in bounds.boxes.items():
+        com[name] = (A, np.concatenate([high, np.negative(low)]))
+        if name in extents:  # a stated box enlarges the box of the geometry
+            lower, upper = extents[name]
+            extents[name] = np.array([np.minimum(lower, low), np.maximum(upper, high)])
+    return Constraints(bounds.masses, bounds.total, com, tuple(bounds.pinned), extents)

@@ -129,9 +129,8 @@ def impossible(simulator: LoopSimulator, theta: Array, tried: Sequence[Tried]) -
 
     Negative friction at some position would drive the joint: no simulation that comes to rest there
     has a solution. Beyond the range of the data, terms of the position are constant.
-
-    theta (c,).
     """
+    # theta (c,)
     weakest = {t.joint: t for t in sorted(tried, key=lambda t: -t.gain) if t.is_chosen}
     found = {}
     for t in weakest.values():

@@ -265,10 +265,8 @@ def typical_sizes(
 def typical_sizes_of_torques(
     model: RobotModel, pi: Array, armature: Array, windows: Sequence[Window]
 ) -> TypicalSizes:
-    """Return typical sizes from logged torques, without a closed loop.
-
-    pi (p,), armature (n,) [kg m^2 or kg].
-    """
+    """Return typical sizes from logged torques, without a closed loop."""
+    # pi (p,), armature (n,) [kg m^2 or kg]
     tau = np.concatenate([w.log.tau[w.counted] for w in windows])
     torque = np.maximum(np.sqrt(np.mean(tau**2, axis=0)), 1e-6)
     inertia, one = _inertia(model, pi, windows), np.ones(len(armature))
@@ -331,10 +329,8 @@ def free_drive_parameters(
     finds_kd: Array | bool,
     finds_limit: Array,
 ) -> list[FreeParameter]:
-    """Return the free parameters of drives and loops, with initial values from ``base``.
-
-    finds_kd (n,), finds_limit (n,).
-    """
+    """Return the free parameters of drives and loops, with initial values from ``base``."""
+    # finds_kd (n,), finds_limit (n,)
     members: dict[str, list[int]] = {}
     for j, group in enumerate(groups):
         members.setdefault(group, []).append(j)

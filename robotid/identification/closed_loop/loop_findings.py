@@ -12,7 +12,6 @@ from robotid.identification.closed_loop.further_parameters import Tried
 from robotid.identification.closed_loop.loop_result import STATED_SCALE, PositionIdentification
 from robotid.identification.closed_loop.stages import CHANGE
 
-_SOFT = 0.5  # share of the residual that remains after a step; a larger one shows a soft loop
 _MISMATCH = 0.5  # largest relative error of a torque that the loop of its joint gives
 _KNOWN = 0.1  # standard error of a known delay, relative to the range found from one response
 _POSITIVE = ("kp", "limit")  # parameters whose lower bound is more than 0
@@ -37,7 +36,6 @@ def _of_fit(result: PositionIdentification) -> Iterator[Finding]:
             "change. State the known gains and delays in [controller], or use shorter windows"
         )
         yield Finding("not_settled", "warning", "fit", message)
-    yield from _soft_loop(estimate.details["left"])
     if not result.has_stated_gains and not result.fit.simulator.knows_torques:
         message = (
             "commands and positions determine gains, friction and inertia up to a common factor; "
@@ -294,23 +292,9 @@ def _limits_found(result: PositionIdentification) -> Iterator[Finding]:
             )
 
 
-def _soft_loop(left: float) -> Iterator[Finding]:
-    """Yield a finding if a step of the direct method leaves much of the residual."""
-    if left > _SOFT:
-        message = (
-            f"a step of error = 'direct' leaves {100 * left:.0f} % of the residual that it should "
-            f"remove, wanted at most {100 * _SOFT:.0f} %: it neglects that the motion changes with "
-            "the parameters, and this loop is soft. Set error = 'input'"
-        )
-        yield Finding("soft_loop", "warning", "fit", message, {"left": left})
-
-
 def _torque_mismatches(result: PositionIdentification) -> Iterator[Finding]:
     """Yield which logged torques differ from those of the loops, where the fit uses them."""
-    simulator = result.fit.simulator
-    if simulator.lag is None:
-        return
-    mismatch = simulator.torque_mismatch(result.estimate.theta)
+    mismatch = result.fit.simulator.torque_mismatch(result.estimate.theta)
     for joint, share in zip(result.model.joints, mismatch.tolist(), strict=True):
         if share > _MISMATCH:
             message = (

@@ -9,8 +9,6 @@ import numpy as np
 from robotid.base.exceptions import NotConvergedError
 from robotid.base.typing import Array
 from robotid.data.filters import local_polynomial
-from robotid.data.log import Trajectory
-from robotid.dynamics.prediction import predict, remember
 from robotid.dynamics.simulation.loops import ClosedLoopRobot, Column, Loops, RollOut, Window
 from robotid.estimation.estimators.simulator import Residual
 from robotid.robot.drive_term import DriveTerm
@@ -230,10 +228,6 @@ class LoopSimulator:
     #: Rows of measured torques along the measured motion; None if not used.
     torque: "TorqueRows | None" = None
     velocities: bool = False  # whether measured velocities are compared in addition to positions
-    #: The compared signals. "output": positions, and torques of the drives if ``lag`` is
-    #: given; "input": only these torques; "direct": the same, with derivatives that neglect
-    #: the change of the motion.
-    error: str = "output"
     #: Lag of each torque after its command, shape (n,) [samples], as in ``drive_torques``;
     #: None if torques of roll-outs are not compared.
     lag: Array | None = None
@@ -329,9 +323,12 @@ class LoopSimulator:
 
         theta (c,).
         """
-        torques = replace(self, error="input").residuals(theta, with_slopes=False)
-        error = np.concatenate([part.e for part in torques])
+        if self.lag is None:
+            return np.zeros(len(self.base.kp))
+        loops = self.loops(theta)
         logged = np.concatenate([w.log.tau[w.counted] for w in self.windows])
+        outs = (self.fine or self.robot).roll_out(loops, self.windows)
+        error = logged - np.concatenate([drive_torques(o, loops, self.lag).limited for o in outs])
         size = np.maximum(np.mean(logged**2, axis=0), np.mean((logged - error) ** 2, axis=0))
         share: Array = np.sqrt(np.mean(error**2, axis=0) / np.maximum(size, 1e-300))
         return share
@@ -368,52 +365,29 @@ class LoopSimulator:
     def residuals(
         self, theta: Array, *, with_slopes: bool, with_starts: bool = False
     ) -> list[Residual]:
-        """Return measured minus simulated outputs, window by window; see ``Simulator``.
-
-        With ``error`` "direct", derivatives are those of inverse dynamics along the roll-out.
-
-        References:
-            Gautier, Janot, Vandanjon (2013), A new closed-loop output error method for parameter
-            identification of robot dynamics, IEEE TCST 21(2): DIDIM.
-
-        theta (c,).
-        """
+        """Return measured minus simulated outputs, window by window; see ``Simulator``."""
+        # theta (c,)
         loops, (_, directions) = self.loops(theta), self._bodies(theta)
         columns = self._columns(loops) if with_slopes else []
         if with_starts:
             columns += [(len(theta) + k, column) for k, column in enumerate(self._starts())]
-        rolls = (with_slopes or with_starts) and self.error != "direct"
+        rolls = with_slopes or with_starts
         if not rolls or self.fine is not None:
             outs = (self.fine or self.robot).roll_out(loops, self.windows)
-        if rolls:
-            coarse = self.robot.roll_out(
-                loops,
-                self.windows,
-                [column for _, column in columns],
-                directions,
-                owners=[owner for owner, _ in columns],
-                with_speeds=self.velocities or self.lag is not None,
-            )
-            errors = [self._error(out, loops) for out in (coarse if self.fine is None else outs)]
-            return [
-                part
-                for out, error in zip(coarse, errors, strict=True)
-                for part in self._parts(out, error, loops, columns)
-            ]
-        everything, none = np.arange(self._outputs), np.array([], dtype=int)
-        if not with_slopes:
+        if not rolls:
+            everything, none = np.arange(self._outputs), np.array([], dtype=int)
             return [Residual(self._error(out, loops), None, everything, none) for out in outs]
-        slopes, own = self._inverse_dynamics(outs, theta), np.arange(len(theta))
+        coarse = self.robot.roll_out(
+            loops, self.windows, [column for _, column in columns], directions,
+            owners=[owner for owner, _ in columns],
+            with_speeds=self.velocities or self.lag is not None,
+        )  # fmt: skip
+        errors = [self._error(out, loops) for out in (coarse if self.fine is None else outs)]
         return [
-            Residual(self._error(out, loops)[:, joints], Y[:, joints], joints, own)
-            for out, Y in zip(outs, slopes, strict=True)
-            for joints in self.robot.parts
+            part
+            for out, error in zip(coarse, errors, strict=True)
+            for part in self._parts(out, error, loops, columns)
         ]
-
-    @property
-    def exact(self) -> "LoopSimulator | None":
-        """The simulator with exact derivatives, if its own neglect the change of the motion."""
-        return replace(self, error="input") if self.error == "direct" else None
 
     @property
     def knows_torques(self) -> bool:
@@ -423,16 +397,13 @@ class LoopSimulator:
     @property
     def _outputs(self) -> int:
         """Number of compared outputs: positions, speeds, torques, in this order."""
-        further = self.velocities + (self.lag is not None) if self.error == "output" else 0
-        return len(self.base.kp) * (1 + further)
+        return len(self.base.kp) * (1 + self.velocities + (self.lag is not None))
 
     def _error(self, out: RollOut, loops: Loops) -> Array:
         """Return measured minus simulated outputs, shape (N, outputs)."""
-        counted, parts = out.window.counted, []
-        if self.error == "output":
-            parts.append(_error(out))
-            if self.velocities:
-                parts.append(out.window.log.v[counted] - out.v)  # type: ignore[index]
+        counted, parts = out.window.counted, [_error(out)]
+        if self.velocities:
+            parts.append(out.window.log.v[counted] - out.v)  # type: ignore[index]
         if self.lag is not None:
             simulated = drive_torques(out, loops, self.lag).limited
             parts.append(out.window.log.tau[counted] - simulated)
@@ -447,8 +418,7 @@ class LoopSimulator:
         torques = None if self.lag is None else drive_torques(out, loops, self.lag)
         for joints, places, slopes in out.slopes:
             k = len(joints)
-            parts = [slopes[:, :k]] if self.error == "output" else []
-            parts += [slopes[:, k:]] if self.velocities else []
+            parts = [slopes[:, :k], *([slopes[:, k:]] if self.velocities else [])]
             if torques is not None:
                 place = {int(owner): c for c, owner in enumerate(places)}
                 by = [(place[owner], own) for owner, own in columns if owner in place]
@@ -458,24 +428,6 @@ class LoopSimulator:
             own = places[places < free_parameters]  # initial states follow
             by_start = slopes[:, :, len(own) :]
             yield Residual(error[:, outputs], slopes[:, :, : len(own)], outputs, own, by_start)
-
-    def _inverse_dynamics(self, outs: Sequence[RollOut], theta: Array) -> list[Array]:
-        """Return Y(q, v, a) d pi along roll-outs, window by window, shape (N, n, c)."""
-        model, (_, slopes) = self._full_model, self.standard(self._full_model, theta)
-        slopes_of_windows = []
-        for out in outs:
-            t = out.window.log.t[out.window.counted]
-            a, none = np.gradient(out.v, t, axis=0), np.zeros_like(out.q)
-            segment = np.zeros(len(t), dtype=int)
-            motion = Trajectory(t, out.q, out.v, a, none, model.joints, None, segment)
-            torques = predict(model, list(slopes.T), remember(model, motion))
-            slopes_of_windows.append(np.stack(torques, axis=-1))
-        return slopes_of_windows
-
-    @cached_property
-    def _full_model(self) -> RobotModel:
-        """The robot with the terms of its loops."""
-        return with_terms(self.robot.model, self.base)
 
     def _starts(self) -> list[Column]:
         """Return the columns of the initial positions and speeds of windows."""

@@ -8,7 +8,7 @@ from itertools import product
 
 import numpy as np
 
-from robotid.base.exceptions import DataError, NotConvergedError, SettingsError
+from robotid.base.exceptions import DataError, NotConvergedError
 from robotid.base.findings import listed
 from robotid.base.typing import Array, ProgressCallback, ignore_progress, report_stage
 from robotid.data.log import Log
@@ -72,7 +72,6 @@ STAGES = (
 )  # fmt: skip
 
 
-_NAMES = {"output": "output error", "input": "input error", "direct": "direct input error"}
 _WHITE = 2.0  # cut-off of the whitening, relative to 1 / time constant of the loop
 _SCALES = (1.0, 0.1, 10.0, 0.01, 1e3)  # of torques with unknown gains; at 1e3 bodies hardly count
 _FEW = 12  # number of windows of the first fit
@@ -123,8 +122,7 @@ def fit_loops(
     initialised = initialise(model, logs, loop, settings, signals, progress)
     initialised, theta = _best_start(initialised)
     simulator, estimator = initialised.simulator, initialised.estimator
-    simulator = replace(simulator, error=settings.error)
-    is_plain, every = settings.error == "output" and initialised.linear is None, simulator.windows
+    is_plain, every = initialised.linear is None, simulator.windows
     if is_plain:
         simulator = replace(simulator, windows=_few(every, _SOME))
     for left in reversed(range(_STARTS)):
@@ -143,7 +141,7 @@ def fit_loops(
         if is_rough:
             theta = replace(estimator, rounds=1).minimise(simulator, theta)
         else:
-            estimate = estimator.fit(simulator, theta, exact=simulator.exact)
+            estimate = estimator.fit(simulator, theta)
             theta = estimate.theta
         if left:
             theta = estimator.joint_step(simulator, theta)
@@ -169,8 +167,7 @@ def fit_loops(
         for t, why in failing.items():
             dropped[f"{t.joint}.{t.terms[0]}"] = replace(t, is_chosen=False, dropped=why)
     scale = None
-    is_loop = initialised.linear is None and simulator.error == "output"
-    if is_loop and is_stated(loop.kp, model).all():
+    if initialised.linear is None and is_stated(loop.kp, model).all():
         scale = gain_scale(simulator, estimator, estimate)
     others = (initialised.encoders, tuple(tried), initialised.linear, scale)
     return Fitted(simulator, estimate, initialised.plain, *others)
@@ -215,7 +212,7 @@ def _with_chosen_terms(
             extended = with_terms(model, simulator.base)
             rows = torque_rows(identified_rows(extended, logs, signals), initialised.share)
             simulator = replace(simulator, torque=rows)
-        estimate = estimator.fit(simulator, theta, exact=simulator.exact)
+        estimate = estimator.fit(simulator, theta)
         theta = estimate.theta
     assert estimate is not None  # of a rough fit, the first pass makes it
     return simulator, estimate, [*tried, *dropped.values()]
@@ -381,7 +378,7 @@ def _initialise_from_commands(
     finds_kd = uses_torques or all(log.v_ref is not None for log in logs)
     dt = max(float(np.median(np.diff(log.t))) for log in logs)
     most = np.tile(np.exp(-_WHITE * dt / plain.time_constant), 3)  # positions, speeds, torques
-    estimator = OutputError(_NAMES[settings.error], settings.whiten, most, progress=progress)
+    estimator = OutputError(settings.whiten, most, progress=progress)
     may_limit = ~is_stated(loop.limit, model) & (loop.limit != "find")
     scales = (1.0,) if has_gain.all() else _SCALES
 
@@ -488,12 +485,9 @@ def _settled(
     Fits of the initial states and joint steps of states and parameters alternate, until a step
     changes no parameter by more than 0.2 standard errors. Joints that stick may make the steps
     alternate without end: the change by the last one is then added to the covariance. If such a
-    step raises the residual or cannot be simulated, as may happen far from the minimum, or
-    derivatives are not exact, the parameters are fitted from the best initial states.
+    step raises the residual or cannot be simulated, as may happen far from the minimum, the
+    parameters are fitted from the best initial states.
     """
-    if simulator.exact is not None:
-        simulator = simulator.with_better_start(estimate.theta)
-        return simulator, estimator.fit(simulator, estimate.theta, exact=simulator.exact)
     level, first = np.inf, estimate.theta
     for _ in range(_SETTLING):
         try:
@@ -515,8 +509,7 @@ def _settled(
 def _check_settings(
     model: RobotModel, logs: Sequence[Log], loop: LoopSettings, settings: SimulationSettings
 ) -> None:
-    """Refuse logs without a compared signal, and free loop parameters where none may be free."""
-    error = f"estimator: error = {settings.error!r}"
+    """Refuse logs without a compared signal."""
     if loop.kind != "torque" and not any(map(_has_motion, logs)):
         raise DataError(
             f"{listed(sorted({log.name for log in logs}))}: the commands of all joints are "
@@ -534,33 +527,6 @@ def _check_settings(
                 f"estimator: velocities is true, but {log.name} {lack}. Record columns dq_ of "
                 "each joint, or leave velocities out"
             )
-        if settings.error != "output" and not log.has_torque:
-            raise DataError(
-                f"{error} compares torques, but {log.name} has no torques. Record columns tau_ of "
-                "each joint, or set error = 'output'"
-            )
-    if settings.error != "output" and loop.kind == "torque":
-        raise SettingsError(
-            f"{error} compares logged torques with those of a controller, but [controller] has "
-            "kind = 'torque', without a controller. Leave error out, or state the controller with "
-            "kind = 'pd'"
-        )
-    if settings.error != "output" and loop.rate is not None:
-        raise SettingsError(
-            f"{error} needs a controller in continuous time, but [controller] has rate = "
-            f"{loop.rate:g} (zero-order hold). Leave rate out, or set error = 'output'"
-        )
-    if settings.error != "direct":
-        return
-    free = [key for key in ("kp", "kd", "delay") if not is_stated(getattr(loop, key), model).all()]
-    finds_limit = loop.limit == "find" or bool(_largest_speeds(model, loop, logs).any())
-    free += ["limit"] * finds_limit + ["zeros"] * (loop.zeros == "find")
-    if free:
-        raise SettingsError(
-            f"{error} needs a known controller, but {listed(free)} would be fitted. State "
-            "values for every joint in [controller] (delay = 0 if there is none), or set "
-            "error = 'input'"
-        )
 
 
 def _has_motion(log: Log) -> bool:

@@ -58,10 +58,8 @@ class LiveSignals:
         self._next, self._count = 0.0, 0
 
     def push(self, t: float, q: Array, tau: Array) -> Iterator[Instant]:
-        """Process a sample and return the delayed instants that it completes; typically one.
-
-        q (n,) [rad or m], tau (n,) [N m or N].
-        """
+        """Process a sample and return the delayed instants that it completes; typically one."""
+        # q (n,) [rad or m], tau (n,) [N m or N]
         if q.shape != (self._n,) or tau.shape != (self._n,):
             raise DataError(f"q has shape {q.shape} and tau {tau.shape}, wanted ({self._n},) each")
         u = np.concatenate([q, tau])

@@ -55,10 +55,8 @@ class ChangeDetector:
         self._onset = np.full(n, np.nan)
 
     def push(self, t: float, squares: Array, share: float) -> float | None:
-        """Process one sample; return the onset of a change flagged now [s], else None.
-
-        squares (n,).
-        """
+        """Process one sample; return the onset of a change flagged now [s], else None."""
+        # squares (n,)
         evidence = self.evidence + share * (np.minimum(squares, _LARGEST) - self.drift)
         evidence[squares == 0.0] = self.evidence[squares == 0.0]
         starts = (self.evidence <= 0.0) & (evidence > 0.0)
@@ -145,9 +143,8 @@ def payload_of(difference: Array, covariance: Array, columns: Array, spread: Arr
     """Return the payload that explains a difference of the base parameters.
 
     Minimises (d - K_L phi)^T C^-1 (d - K_L phi) + |phi / spread|^2.
-
-    difference (b,), covariance (b, b), columns (b, 10), spread (10,).
     """
+    # difference (b,), covariance (b, b), columns (b, 10), spread (10,)
     scale = np.sqrt(np.diag(covariance))
     L = scale[:, None] * np.linalg.cholesky(covariance / np.outer(scale, scale))
     A = scipy.linalg.solve_triangular(L, columns * spread, lower=True)
@@ -159,10 +156,8 @@ def payload_of(difference: Array, covariance: Array, columns: Array, spread: Arr
 
 
 def load_spread(spread: Array) -> Array:
-    """Return the prior standard deviations of a payload, (10,): a mean link's mass, twice its size.
-
-    spread (10 bodies,).
-    """
+    """Return the prior standard deviations of a payload, (10,): of a mean link, twice its size."""
+    # spread (10 bodies,)
     by_body = spread.reshape(-1, 10)
     mass = max(float(by_body[:, 0].mean()), float(by_body[-1, 0]))
     radius = 2.0 * float(np.max(by_body[-1, 1:4]) / by_body[-1, 0])

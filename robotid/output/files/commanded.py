@@ -27,30 +27,18 @@ class CommandedDrive:
     The torque of the controller is tau = kp (q_ref(t - delay) - q) - kd v, within +-effort_limit.
     The torque on the bodies is tau - armature a - viscous v - coulomb sign(v) - offset. The
     encoder reads q = q_urdf - zero.
-
-    Attributes:
-        joint: Its name.
-        kp: Proportional gain [N m/rad or N/m].
-        kd: Derivative gain [N m s/rad or N s/m].
-        delay: Delay of the command [s].
-        zero: Position of the URDF's joint at which the encoder reads 0 [rad or m].
-        armature: Inertia of the rotor, reflected to the joint [kg m^2 or kg].
-        viscous: Viscous friction [N m s/rad or N s/m].
-        coulomb: Coulomb friction [N m or N].
-        offset: Constant torque [N m or N].
-        effort_limit: Torque limit of the controller, inf if it has none [N m or N].
     """
 
     joint: str
-    kp: float
-    kd: float
-    delay: float
-    zero: float
-    armature: float
-    viscous: float
-    coulomb: float
-    offset: float
-    effort_limit: float
+    kp: float  # proportional gain [N m/rad or N/m]
+    kd: float  # derivative gain [N m s/rad or N s/m]
+    delay: float  # delay of the command [s]
+    zero: float  # position of the URDF's joint at which the encoder reads 0 [rad or m]
+    armature: float  # inertia of the rotor, reflected to the joint [kg m^2 or kg]
+    viscous: float  # viscous friction [N m s/rad or N s/m]
+    coulomb: float  # Coulomb friction [N m or N]
+    offset: float  # constant torque [N m or N]
+    effort_limit: float  # torque limit of the controller, inf if it has none [N m or N]
 
 
 def commanded_drives(

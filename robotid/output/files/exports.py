@@ -43,23 +43,14 @@ class Option:
 
 @dataclass(frozen=True)
 class Format:
-    """A format, which the function ``export`` of its module writes.
-
-    Attributes:
-        name: Its name.
-        words: Its content.
-        suffix: Suffix after the robot's name in the name of its file.
-        use: The advice for any result; "" without advice.
-        use_of_gains: The advice for a result with gains of drives.
-        options: Its options, by name.
-    """
+    """A format, which the function ``export`` of its module writes."""
 
     name: str
     words: str
-    suffix: str
-    use: str = ""
-    use_of_gains: str = ""
-    options: Mapping[str, Option] = field(default_factory=dict)
+    suffix: str  # suffix after the robot's name in the name of its file
+    use: str = ""  # the advice for any result; "" without advice
+    use_of_gains: str = ""  # the advice for a result with gains of drives
+    options: Mapping[str, Option] = field(default_factory=dict)  # its options, by name
 
 
 FORMAT = Format("urdf", "URDF with <dynamics>, and its drive parameters file", ".urdf")
@@ -90,15 +81,10 @@ def options_of(kinds: Mapping[str, Format]) -> dict[str, dict[str, Option]]:
 
 @dataclass(frozen=True, eq=False)
 class Exported:
-    """A result with its drives in the terms of a format.
-
-    Attributes:
-        result: The result.
-        projection: Its robot and parameters, with friction projected on those terms.
-    """
+    """A result with its drives in the terms of a format."""
 
     result: Result
-    projection: Projection
+    projection: Projection  # its robot and parameters, with friction projected on those terms
 
     @classmethod
     def of(cls, result: Result, terms: Collection[str]) -> "Exported":
@@ -145,17 +131,11 @@ class Exported:
 
 @dataclass(frozen=True)
 class Written:
-    """The written files of a result.
-
-    Attributes:
-        files: The files.
-        notes: Properties that the files do not state, a sentence each.
-        projected: The projection of friction, by drive.
-    """
+    """The written files of a result."""
 
     files: Sequence[Path]
-    notes: Sequence[str]
-    projected: Mapping[str, Any]
+    notes: Sequence[str]  # properties that the files do not state, a sentence each
+    projected: Mapping[str, Any]  # the projection of friction, by drive
 
 
 def unstated_terms(

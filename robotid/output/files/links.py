@@ -30,47 +30,31 @@ _ROUNDING = 1e-12  # a negative eigenvalue of a pseudo-inertia below this share 
 
 @dataclass(frozen=True)
 class XmlFormat:
-    """The capabilities of a simulator's format.
-
-    Attributes:
-        name: Its name.
-        terms: Drive terms of a joint that it can state.
-        has_couplings: Whether it can state them for drives that move several joints, and loops.
-        is_readable: Whether the simulator reads a mesh.
-    """
+    """The capabilities of a simulator's format."""
 
     name: str
-    terms: Collection[str]
-    has_couplings: bool
-    is_readable: Callable[[Path], bool]
+    terms: Collection[str]  # drive terms of a joint that it can state
+    has_couplings: bool  # whether it can state them for drives that move several joints, and loops
+    is_readable: Callable[[Path], bool]  # whether the simulator reads a mesh
 
 
 @dataclass(frozen=True, eq=False)
 class SimulatedLink:
-    """One link. Poses are x y z [m] and a quaternion x y z w, shape (7,).
-
-    Attributes:
-        name: Its name.
-        parent: Its parent link, or "world".
-        pose: Its pose in the parent's frame, with all joints at 0 except locked ones.
-        joint: Its parent joint; None if it is the root.
-        moves: Whether that joint moves it; if not, it is fixed or locked.
-        leader: Joint that this one follows, ratio, offset; None if it is independent.
-        floats: Whether it is the floating base.
-        inertial: Its inertial parameters, shape (10,); None if it has none, as a link whose inertia
-            is included in that of the link that it is fixed to.
-        shapes: Its shapes of the kinds "visual" and "collision": kind, shape, pose in the link's
-            frame, path of the mesh.
-    """
+    """One link. Poses are x y z [m] and a quaternion x y z w, shape (7,)."""
 
     name: str
-    parent: str
-    pose: Array
-    joint: Joint | None
-    moves: bool
+    parent: str  # its parent link, or "world"
+    pose: Array  # its pose in the parent's frame, with all joints at 0 except locked ones
+    joint: Joint | None  # its parent joint; None if it is the root
+    moves: bool  # whether that joint moves it; if not, it is fixed or locked
+    # joint that this one follows, ratio, offset; None if it is independent
     leader: tuple[str, float, float] | None
-    floats: bool
+    floats: bool  # whether it is the floating base
+    # its inertial parameters, shape (10,); None if it has none, as a link whose inertia is
+    # included in that of the link that it is fixed to
     inertial: Array | None
+    # its shapes of the kinds "visual" and "collision": kind, shape, pose in the link's frame,
+    # path of the mesh
     shapes: Sequence[tuple[str, Shape, Array, Path | None]]
 
 

@@ -25,57 +25,36 @@ _STYLE = "main { padding: .5rem 1rem; } h1 { font-size: 1.125rem; margin: 0 0 .5
 
 @dataclass(frozen=True, eq=False)
 class Series:
-    """One line, cloud or set of bars of a chart.
+    """One line, cloud or set of bars of a chart."""
 
-    Attributes:
-        label: Its name in the legend.
-        y: Values, shape (N,), NaN where the line breaks.
-        tone: Its colour: a variable of tones.css without its dashes, as "predicted" or "tone-1".
-        kind: "line", "dots", "bars", which are side by side, or "area"; the areas of a chart
-            are stacked, positive values upwards and negative values downwards.
-        half: Half width of a band about a line, of error bars about dots and bars, shape (N,).
-        is_weak: Whether it is drawn faintly.
-        is_hidden: Whether it is hidden until its key in the legend is pressed.
-    """
-
-    label: str
-    y: Array
-    tone: str
+    label: str  # its name in the legend
+    y: Array  # values, shape (N,), NaN where the line breaks
+    tone: str  # its colour: a variable of tones.css without its dashes, as "predicted" or "tone-1"
+    # "line", "dots", "bars", which are side by side, or "area"; the areas of a chart are stacked,
+    # positive values upwards and negative values downwards
     kind: str = "line"
+    # half width of a band about a line, of error bars about dots and bars, shape (N,)
     half: Array | None = None
-    is_weak: bool = False
-    is_hidden: bool = False
+    is_weak: bool = False  # whether it is drawn faintly
+    is_hidden: bool = False  # whether it is hidden until its key in the legend is pressed
 
 
 @dataclass(frozen=True, eq=False)
 class Chart:
-    """A chart: series over a common x.
+    """A chart: series over a common x."""
 
-    Attributes:
-        title: Its description, for screen readers.
-        x: Shape (N,); the log's own time where it is time. Points are drawn in its order.
-        series: The series, the last one on top.
-        x_label: Its name and unit, as "time [s]".
-        y_label: Name and unit of the values, as "torque [N m]".
-        link: Charts of one link share the cursor and the zoom along x.
-        spans: Segments of x with a shaded background, as samples that are not used.
-        marks: Positions of dotted lines on x.
-        logarithmic: The logarithmic axes: "", "x", "y" or "xy".
-        height: Height of the plot [px].
-        x_names: Names at x = 0, 1, ... in place of numbers, if any.
-    """
-
-    title: str
-    x: Array
-    series: tuple[Series, ...]
-    x_label: str
-    y_label: str
-    link: str = ""
+    title: str  # its description, for screen readers
+    x: Array  # shape (N,); the log's own time where it is time. Points are drawn in its order
+    series: tuple[Series, ...]  # the series, the last one on top
+    x_label: str  # its name and unit, as "time [s]"
+    y_label: str  # name and unit of the values, as "torque [N m]"
+    link: str = ""  # charts of one link share the cursor and the zoom along x
+    # segments of x with a shaded background, as samples that are not used
     spans: tuple[tuple[float, float], ...] = ()
-    marks: tuple[float, ...] = ()
-    logarithmic: str = ""
-    height: int = 180
-    x_names: tuple[str, ...] = ()
+    marks: tuple[float, ...] = ()  # positions of dotted lines on x
+    logarithmic: str = ""  # the logarithmic axes: "", "x", "y" or "xy"
+    height: int = 180  # height of the plot [px]
+    x_names: tuple[str, ...] = ()  # names at x = 0, 1, ... in place of numbers, if any
 
     def __post_init__(self) -> None:
         for series in self.series:

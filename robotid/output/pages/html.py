@@ -61,19 +61,12 @@ class Cell:
 
 
 class Section(NamedTuple):
-    """A section of a page.
+    """A section of a page."""
 
-    Attributes:
-        title: Its heading, HTML.
-        html: Its content.
-        summary: Summary of its content, HTML, if it is folded.
-        is_open: Whether it is open initially; None if it cannot be folded.
-    """
-
-    title: str
+    title: str  # its heading, HTML
     html: str
-    summary: str = ""
-    is_open: bool | None = None
+    summary: str = ""  # summary of its content, HTML, if it is folded
+    is_open: bool | None = None  # whether it is open initially; None if it cannot be folded
 
 
 def text(value: str, *, flag: bool = False) -> Cell:

@@ -34,19 +34,13 @@ class Clip(NamedTuple):
 
 @dataclass(frozen=True)
 class Dock:
-    """The replay of a report.
+    """The replay of a report."""
 
-    Attributes:
-        replay: File of the replay in the report's folder; "" if it is not written yet.
-        origin: Folder of the results, for the command that writes the replay.
-        urdf: The URDF.
-        clips: The recordings with charts.
-    """
-
-    replay: str = ""
+    replay: str = ""  # file of the replay in the report's folder; "" if it is not written yet
+    # folder of the results, for the command that writes the replay
     origin: Origin = field(default_factory=Origin)
     urdf: str = ""
-    clips: Sequence[Clip] = ()
+    clips: Sequence[Clip] = ()  # the recordings with charts
 
     @property
     def file(self) -> str:
@@ -92,19 +86,12 @@ class Dock:
 
 
 class Residual(NamedTuple):
-    """The residual of a joint in a recording.
+    """The residual of a joint in a recording."""
 
-    Attributes:
-        name: Name of the recording.
-        file: Name of its file, which the replay states.
-        t: Times, shape (N,), increasing [s].
-        values: Residuals, shape (N,), NaN for samples that are not used.
-    """
-
-    name: str
-    file: str
-    t: Array
-    values: Array
+    name: str  # name of the recording
+    file: str  # name of its file, which the replay states
+    t: Array  # times, shape (N,), increasing [s]
+    values: Array  # residuals, shape (N,), NaN for samples that are not used
 
 
 @dataclass(frozen=True)

@@ -40,23 +40,14 @@ class Mark(NamedTuple):
 
 @dataclass(frozen=True)
 class Quantity:
-    """The predicted quantity, and the baselines of its error.
+    """The predicted quantity, and the baselines of its error."""
 
-    Attributes:
-        title: Name of its error.
-        share: Definition of the error, as a formula.
-        limits: Largest error that is good, and largest that is usable [%].
-        marks: Markers of the baselines, by name.
-        scale: Unit of the errors shown, in units of the quantity.
-        prefix: Prefix of that unit.
-    """
-
-    title: str
-    share: str
-    limits: tuple[float, float]
-    marks: Mapping[str, Mark]
-    scale: float = 1.0
-    prefix: str = ""
+    title: str  # name of its error
+    share: str  # definition of the error, as a formula
+    limits: tuple[float, float]  # largest error that is good, and largest that is usable [%]
+    marks: Mapping[str, Mark]  # markers of the baselines, by name
+    scale: float = 1.0  # unit of the errors shown, in units of the quantity
+    prefix: str = ""  # prefix of that unit
 
 
 TORQUE = Quantity(
@@ -88,17 +79,12 @@ POSITION = Quantity(
 
 @dataclass(frozen=True)
 class Errors:
-    """The errors of the joints on one recording, or on several together.
-
-    Attributes:
-        name: The recording.
-        joints: Metrics of each joint that has samples, as in result.json; WLS is a baseline.
-        is_fitted: Whether the recording was fitted.
-    """
+    """The errors of the joints on one recording, or on several together."""
 
     name: str
+    # metrics of each joint that has samples, as in result.json; WLS is a baseline
     joints: Mapping[str, Mapping[str, Any]]
-    is_fitted: bool = False
+    is_fitted: bool = False  # whether the recording was fitted
 
     @property
     def caption(self) -> str:

@@ -42,51 +42,29 @@ EvaluatedT = TypeVar("EvaluatedT", bound=Evaluated)
 
 @dataclass(frozen=True)
 class Report:
-    """The content of a report. Texts are HTML.
+    """The content of a report. Texts are HTML."""
 
-    Attributes:
-        title: Title of the page, not escaped.
-        robot: Name of the robot, not escaped.
-        rows: Names of its joints.
-        verdict: The verdict, as in result.json.
-        findings: The findings.
-        quantity: The predicted quantity.
-        counted: The recordings whose errors the verdict uses.
-        recordings: All recordings.
-        facts: Figures by their names.
-        steps: The next steps.
-        made: Description of the identification.
-        errors: Definition of the errors, and content after their tables.
-        curves: Title and content of the section of charts over time.
-        why: Residual analysis of each joint; "" if there is none.
-        parameters: Content of the section of parameters.
-        entries: The parameters, as in result.json.
-        appendix: Title and content of the parts of the appendix, by their keys.
-        friction: Friction against speed; "" if there is none.
-        bodies: Pictures of the links, URDF and identified; "" if there are none.
-        variation: Variation of drive parameters between logs; "" for fewer than three logs.
-    """
-
-    title: str
-    robot: str
-    rows: Sequence[str]
-    verdict: Mapping[str, Any]
+    title: str  # title of the page, not escaped
+    robot: str  # name of the robot, not escaped
+    rows: Sequence[str]  # names of its joints
+    verdict: Mapping[str, Any]  # the verdict, as in result.json
     findings: Sequence[Finding]
-    quantity: Quantity
-    counted: Sequence[Errors]
-    recordings: Sequence[Errors]
-    facts: Mapping[str, str]
-    steps: Sequence[Step]
-    made: str
-    errors: tuple[str, str]
-    curves: tuple[str, str]
-    why: str
-    parameters: str
-    entries: Sequence[Mapping[str, Any]]
+    quantity: Quantity  # the predicted quantity
+    counted: Sequence[Errors]  # the recordings whose errors the verdict uses
+    recordings: Sequence[Errors]  # all recordings
+    facts: Mapping[str, str]  # figures by their names
+    steps: Sequence[Step]  # the next steps
+    made: str  # description of the identification
+    errors: tuple[str, str]  # definition of the errors, and content after their tables
+    curves: tuple[str, str]  # title and content of the section of charts over time
+    why: str  # residual analysis of each joint; "" if there is none
+    parameters: str  # content of the section of parameters
+    entries: Sequence[Mapping[str, Any]]  # the parameters, as in result.json
+    # title and content of the parts of the appendix, by their keys
     appendix: Mapping[str, tuple[str, str]]
-    friction: str = ""
-    bodies: str = ""
-    variation: str = ""
+    friction: str = ""  # friction against speed; "" if there is none
+    bodies: str = ""  # pictures of the links, URDF and identified; "" if there are none
+    variation: str = ""  # variation of drive parameters between logs; "" for fewer than three logs
 
     @property
     def verdicts(self) -> Mapping[str, Mapping[str, Any]]:

@@ -30,38 +30,27 @@ _File = tuple[Path | None, tuple[float, ...], tuple[int, int] | None]
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """The scene, in plain values for JSON, lengths in m.
+    """The scene, in plain values for JSON, lengths in m."""
 
-    Attributes:
-        content: ``nodes``: one per joint, the first fixed to the world, each with its parent, its
-            pose at 0 and its kind of motion; ``parts``: shapes on nodes; ``meshes``: triangles
-            that parts share; ``reach``: the size of the robot.
-        notes: Shapes that are not drawn, as sentences.
-        corners: Points on each node whose hull contains its parts, shape (k, 3) each [m].
-    """
-
+    # ``nodes``: one per joint, the first fixed to the world, each with its parent, its pose at 0
+    # and its kind of motion; ``parts``: shapes on nodes; ``meshes``: triangles that parts share;
+    # ``reach``: the size of the robot
     content: dict[str, Any]
-    notes: tuple[str, ...]
+    notes: tuple[str, ...]  # shapes that are not drawn, as sentences
+    # points on each node whose hull contains its parts, shape (k, 3) each [m]
     corners: tuple[Array, ...]
 
 
 @dataclass(frozen=True, eq=False)
 class Ellipsoid:
-    """The mass distribution of a body as a solid.
+    """The mass distribution of a body as a solid."""
 
-    Attributes:
-        mass: Mass [kg].
-        com: Centre of mass in the body's frame, shape (3,) [m]; None without mass.
-        semi_axes: Lengths of the semi-axes, shape (3,) [m]; None if no solid has this inertia.
-        rotation: Directions of the axes as columns, a rotation, shape (3, 3).
-        fault: Reason for no solid; empty if there is one.
-    """
-
-    mass: float
-    com: Array | None
+    mass: float  # mass [kg]
+    com: Array | None  # centre of mass in the body's frame, shape (3,) [m]; None without mass
+    # lengths of the semi-axes, shape (3,) [m]; None if no solid has this inertia
     semi_axes: Array | None
-    rotation: Array
-    fault: str
+    rotation: Array  # directions of the axes as columns, a rotation, shape (3, 3)
+    fault: str  # reason for no solid; empty if there is one
 
 
 def robot_scene(model: RobotModel) -> Scene:

@@ -16,19 +16,12 @@ _SHORTEST = 0.05  # [s] shorter segments are spikes
 
 @dataclass(frozen=True)
 class Unexplained:
-    """A segment of unexplained torque.
+    """A segment of unexplained torque."""
 
-    Attributes:
-        start: Its start [s].
-        end: Its end [s].
-        joint: The joint with the largest residual relative to its torque.
-        residual: Largest mean residual of that joint [N m or N].
-    """
-
-    start: float
-    end: float
-    joint: str
-    residual: float
+    start: float  # its start [s]
+    end: float  # its end [s]
+    joint: str  # the joint with the largest residual relative to its torque
+    residual: float  # largest mean residual of that joint [N m or N]
 
 
 def find_unexplained(

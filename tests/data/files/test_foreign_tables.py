@@ -150,25 +150,6 @@ def test_a_data_frame_may_have_time_as_its_index_or_come_from_another_library():
     assert_same(read_log(Other(), JOINTS))
 
 
-def test_what_is_wrong_with_a_data_frame_is_told():
-    frame = pd.DataFrame(juggled("/joint_states"))
-    with refused(
-        "log has no column 'time'; columns found: position_elbow, velocity_elbow, effort_elbow, "
-        "position_shoulder, velocity_shoulder, effort_shoulder. Rename it, or state in the job "
-        'file: columns = { time = "NAME" }, or without time stamps the rate of the rows [Hz]: log '
-        "= { rate = 100 }"
-    ):
-        order = [f"/joint_states/{j}/{w}" for j in ("elbow", "shoulder") for w in WORDS]
-        read_log(frame[order], JOINTS)
-    position = np.where(T.round(9) == 0.08, np.nan, T)
-    spoilt = frame.assign(**{"/joint_states/elbow/position": position})
-    with pytest.raises(DataError, match=r"log: q_elbow is NaN at row 4 \(t = 0.08 s\); remove"):
-        read_log(spoilt, JOINTS)
-    words = frame.assign(**{"/joint_states/elbow/effort": "much"})
-    with pytest.raises(DataError, match="log: column '/joint_states/elbow/effort' contains str"):
-        read_log(words, JOINTS)
-
-
 def test_logs_are_given_one_or_several_of_every_kind(ur5, tmp_path, rng):
     log = exact_log(ur5, truth(ur5), rng, samples=100)
     write_log(log, tmp_path / "run.csv")

@@ -12,9 +12,13 @@ from robotid.dynamics.base_parameters import BaseMapping, structural_mapping
 from robotid.dynamics.factors import Factors
 from robotid.estimation.estimators import Consistent
 from robotid.estimation.estimators.consistent.consistent_fit import WeightChoice
-from robotid.estimation.fitting import consistent_estimator as estimators
-from robotid.estimation.fitting.consistent_estimator import Known, consistent_fit
-from robotid.estimation.fitting.estimator_settings import ConsistentSettings, EstimatorSettings
+from robotid.estimation.fitting import estimator_settings as estimators
+from robotid.estimation.fitting.estimator_settings import (
+    ConsistentSettings,
+    EstimatorSettings,
+    Known,
+    consistent_fit,
+)
 from robotid.estimation.fitting.fit import rough_choice
 from robotid.robot.bodies import held_parameters
 from robotid.robot.examples import example_urdf

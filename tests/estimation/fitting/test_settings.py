@@ -112,7 +112,6 @@ def test_a_job_with_a_recursive_estimator_runs_from_file_to_report(rng, tmp_path
         "gate": 0.999999,
         "physical": True,
         "prior_weight": "auto",
-        "draws": 64,
         "constraints": {},
     }
     assert "a Kalman filter" in (tmp_path / "out" / "report.html").read_text()

@@ -1,16 +1,14 @@
-from pathlib import Path
-
 import numpy as np
 import pytest
 from helpers.mujoco_plant import plant, torque_log
 
 from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
-from robotid.dynamics.simulation.loops import ClosedLoopRobot, cut_windows, open_loops
+from robotid.dynamics.simulation.loops import ClosedLoopRobot, open_loops
 from robotid.estimation.fitting.estimator_settings import SimulationSettings
 from robotid.identification.closed_loop.from_commands import driven_log, identify_loops
 from robotid.identification.closed_loop.loop_settings import LoopSettings
-from robotid.identification.closed_loop.position_errors import DRIFTS, run_open_loop
+from robotid.identification.closed_loop.position_errors import run_open_loop
 from robotid.identification.closed_loop.stages import torque_rows
 from robotid.robot.model import RobotModel
 
@@ -108,38 +106,3 @@ def test_rows_of_torque_and_roll_outs_weigh_in_one_estimate(arm, alone, both):
     rows = np.linalg.inv(2.0 * A.T @ A + np.diag(1.0 / simulator.prior_std**2))
     best = np.minimum(np.sqrt(np.diag(rows)), alone.fit.estimate.std_error)
     assert (estimate.std_error > 0.5 * best).all()
-
-
-def test_open_loops_of_torques_are_put_back_and_beside_plainer_models(arm, both):
-    [run] = both.validation
-    robot, loops = both.fit.simulator.robot, both.fit.loops
-    windows = cut_windows(run.log, DRIFTS, 0.0)
-    assert {round(w.log.t[w.stop - 1] - w.log.t[w.first], 2) for w in windows} == {0.5}
-    q = np.concatenate([out.q for out in robot.roll_out(loops, windows)])
-    np.testing.assert_allclose(run.rmse, np.sqrt(np.mean((run.log.q - q) ** 2, axis=0)))
-    assert run.baselines["command"] is None
-    assert run.baselines["second_order"] is None
-    start = np.concatenate([np.tile(w.start[0], (w.stop - w.first, 1)) for w in windows])
-    speed = np.concatenate([
-        np.outer(w.log.t[w.counted] - w.log.t[w.first], w.start[1]) for w in windows
-    ])  # fmt: skip
-    np.testing.assert_allclose(run.spread, np.sqrt(np.mean((run.log.q - start) ** 2, axis=0)))
-    on = np.sqrt(np.mean((run.log.q - start - speed) ** 2, axis=0))
-    np.testing.assert_allclose(run.baselines["steady"], on)
-    for other in map(run.baselines.get, ("steady", "urdf", "rows")):
-        assert (run.rmse < 1.05 * other).all()
-    assert (run.rmse < 0.02 * run.baselines["steady"]).all()
-    assert both.verdict.status in ("good", "usable")
-
-
-def test_full_turns_are_taken_out_of_joints_that_turn_freely(tmp_path):
-    tree = plant("planar", np.random.default_rng(0)).model.tree
-    path = tmp_path / "free.urdf"
-    path.write_text(Path(tree.path).read_text().replace('type="revolute"', 'type="continuous"'))
-    model = RobotModel.from_urdf(path)
-    t = np.arange(80) * 0.01
-    angle = 3.0 + 2.0 * t
-    q = np.column_stack([np.angle(np.exp(1j * angle)), 0 * t])
-    heard = driven_log(model, Log(t, q, 0 * q, model.joints), SignalSettings())
-    np.testing.assert_allclose(heard.q[:, 0], angle)
-    np.testing.assert_array_equal(heard.q_ref, heard.q)

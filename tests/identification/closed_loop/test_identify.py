@@ -7,13 +7,12 @@ from helpers.mujoco_plant import held, multisine, plant, recorded
 
 from robotid.base.findings import Finding
 from robotid.data.log import Log
-from robotid.diagnosis.verdict.position_verdict import judge_positions
 from robotid.dynamics.simulation.loops import ClosedLoopRobot, cut_windows
 from robotid.estimation.fitting.estimator_settings import SimulationSettings
 from robotid.identification.closed_loop.from_commands import identify_loops, with_gravity
 from robotid.identification.closed_loop.loop_findings import loop_findings
 from robotid.identification.closed_loop.loop_settings import LoopSettings
-from robotid.identification.closed_loop.position_errors import pool_positions, run_open_loop
+from robotid.identification.closed_loop.position_errors import run_open_loop
 from robotid.identification.closed_loop.stages import fit_loops, stated_loops
 from robotid.output.files.entries import build_result
 from robotid.output.report.document import write_report
@@ -161,60 +160,6 @@ def test_it_is_an_identification_as_others_are(found, tmp_path):
     assert f"{found.model.name}: drives from commands" in page
 
 
-def test_open_loops_beat_plainer_models(leg, found):
-    [run] = found.validation
-    assert found.verdict.status == "good"
-    assert (run.rmse < 1.2 * NOISE).all()
-    assert list(run.baselines) == ["command", "urdf", "second_order"]
-    for other in run.baselines.values():
-        assert (run.rmse < 0.9 * other).all()
-    np.testing.assert_allclose(
-        run.baselines["command"], np.sqrt(np.mean((run.log.q_ref - run.log.q) ** 2, 0))
-    )
-    np.testing.assert_allclose(run.rmse, np.sqrt(np.mean((run.log.q - run.q) ** 2, axis=0)))
-    middle = run.log.q.mean(axis=0)
-    np.testing.assert_allclose(run.spread, np.sqrt(np.mean((run.log.q - middle) ** 2, axis=0)))
-    assert list(run.horizons) == [0.1, 0.5, 2.0]
-    robot, loops = found.fit.simulator.robot, found.fit.loops
-    for horizon, error in run.horizons.items():
-        assert (error < 3 * NOISE).all()
-        outs = robot.roll_out(loops, cut_windows(run.log, horizon, 0.0))
-        missed = np.concatenate([out.window.log.q[out.window.counted] - out.q for out in outs])
-        np.testing.assert_allclose(error, np.sqrt(np.mean(missed**2, axis=0)))
-
-
-def test_friction_of_joints_that_no_log_moves_is_reported(leg, found):
-    hip, thigh, calf = leg[0].model.joints
-    [run] = found.fitted
-
-    def undetermined(rests):
-        logs = [run]
-        for moving in rests:
-            q_ref = np.where(moving, run.log.q_ref, run.log.q_ref[3])
-            logs.append(replace(run, log=replace(run.log, q_ref=q_ref)))
-        findings = loop_findings(replace(found, fitted=tuple(logs[1:])), [])
-        return [f.where for f in findings if f.code == "undetermined"]
-
-    assert undetermined([[True, True, True]]) == []
-    assert undetermined([[True, False, True], [False, True, True]]) == []
-    [where] = undetermined([[True, False, True], [True, False, False]])
-    assert where == f"{thigh}.viscous, {thigh}.coulomb, {thigh}.offset"
-    [where] = undetermined([[False, False, True]])
-    for joint in (hip, thigh):
-        assert f"{joint}.coulomb" in where
-    assert calf not in where
-    # a term that two joints share is of a joint that moves if one of them does
-    simulator = found.fit.simulator
-    shared = [
-        replace(x, name="upper.viscous", joints=(0, 1)) if x.name == f"{hip}.viscous" else x
-        for x in simulator.free_parameters
-    ]
-    simulator = replace(simulator, free_parameters=tuple(shared))
-    found = replace(found, fit=replace(found.fit, simulator=simulator))
-    [where] = undetermined([[False, True, True], [False, True, True]])
-    assert where == f"{hip}.coulomb, {hip}.offset"
-
-
 def test_each_kept_log_is_judged(leg, found):
     _, log, kept = leg
     robot, loops = found.fit.simulator.robot, found.fit.loops
@@ -230,24 +175,6 @@ def test_each_kept_log_is_judged(leg, found):
     verdict = replace(found, validation=()).verdict
     assert verdict.status == "not evaluated"
     assert verdict.reasons[0].endswith("no validation log given")
-
-
-def test_a_joint_that_is_told_to_stand_is_not_evaluated(leg, found):
-    model, [run] = leg[0].model, found.validation
-    joints = model.joints
-
-    def judged(runs):
-        return judge_positions(pool_positions(runs, moving=True), joints, is_validation=True)
-
-    still = replace(run.log, q_ref=np.where([True, True, False], run.log.q_ref, run.log.q_ref[0]))
-    stands = replace(run, log=still, spread=np.array([*run.spread[:2], 1e-4]))
-    verdict = judged([stands])
-    assert [verdict.joints[joint].status for joint in joints] == ["good", "good", "not evaluated"]
-    assert verdict.status == "usable"
-    assert verdict.reasons == (f"{joints[2]}: commanded to rest in all logs: not evaluated",)
-    assert judged([stands, run]).status == "good"
-    nobody = replace(run, log=replace(still, q_ref=np.tile(still.q_ref[0], (len(still.t), 1))))
-    assert judged([nobody]).status == "not evaluated"
 
 
 def test_without_gains_the_scale_is_said_to_rest_on_the_urdf(scaleless):

@@ -1,32 +1,12 @@
 """Where a fit begins: typical sizes, first loops and unknowns, by their equations."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from helpers.paths import URDF
 
 from robotid.dynamics.prediction import predict_instants
-from robotid.identification.closed_loop.encoder_zeros import _Motion, same_encoders
-from robotid.identification.closed_loop.initial_values import (
-    free_zeros,
-)
+from robotid.identification.closed_loop.encoder_zeros import _Motion
 from robotid.robot.model import RobotModel
-
-
-@pytest.fixture(scope="module")
-def planar():
-    return RobotModel.from_urdf(URDF / "planar_2r.urdf")
-
-
-def test_zeros_other_than_the_urdfs_are_free_about_their_first_estimates(planar):
-    """With a standard deviation of 0.3 rad; a sign alone has a gain, too."""
-    first = replace(same_encoders(planar), zero=np.array([0.4, -0.2]), gain=np.array([0.0, 0.7]))
-    (found,) = free_zeros(planar, first)
-    assert (found.name, found.what, found.joints) == (f"{planar.joints[1]}.zero", "zero", (1,))
-    assert (found.prior, found.spread, found.lowest) == (-0.2, 0.3, -np.inf)
-    both = free_zeros(planar, replace(first, gain=np.array([0.1, 0.7])))
-    assert [(x.joints, x.prior) for x in both] == [((0,), 0.4), ((1,), -0.2)]
 
 
 def test_a_load_that_would_push_a_loop_the_wrong_way_does_not_count(rng):

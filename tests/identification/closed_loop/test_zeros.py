@@ -4,17 +4,10 @@ import numpy as np
 import pytest
 from helpers.mujoco_plant import plant, recorded
 
-from robotid.dynamics.simulation.loops import ClosedLoopRobot
 from robotid.estimation.fitting.estimator_settings import SimulationSettings
-from robotid.identification.closed_loop.encoder_zeros import (
-    CLEAR,
-    find_encoders,
-    parallel_axes,
-)
+from robotid.identification.closed_loop.encoder_zeros import CLEAR, find_encoders, parallel_axes
 from robotid.identification.closed_loop.from_commands import identify_loops
 from robotid.identification.closed_loop.loop_settings import LoopSettings
-from robotid.identification.closed_loop.loop_simulator import LoopSimulator, free_body_parameters
-from robotid.identification.closed_loop.stages import stated_loops
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 
@@ -95,33 +88,3 @@ def test_an_encoder_that_counts_the_other_way_is_turned(leg):
     # a chain with parallel axes is its mirror image: thigh or calf
     assert sorted(sign[1:].tolist()) == [-1.0, 1.0]
     assert sign[0] == 1.0
-
-
-def test_torques_tell_the_gains_that_positions_leave_open():
-    rng = np.random.default_rng(3)
-    robot = plant("planar", rng)
-    looped = ClosedLoopRobot(robot.model)
-    free_parameters = tuple(free_body_parameters(looped, 0.1))
-    simulator = LoopSimulator(
-        looped, (), stated_loops(robot.model, LoopSettings()), free_parameters
-    )
-    lighter = [np.log(0.7) / 2 if u.name.endswith("mass") else 0.0 for u in free_parameters]
-    # by the URDF's masses positions take the scale, which the torques then have to move
-    robot = replace(robot, bodies=simulator.loops(np.array(lighter)).bodies.reshape(-1))
-    log, truth = recorded(robot, rng, duration=2.4, rate=250.0, noise=1e-4, torque=0.5, step=1e-4)
-    settings, loop = replace(SETTINGS, bodies=0.1), LoopSettings(delays="group")
-    told = identify_loops(robot.model, [log], [], loop, settings, chooses=False)
-    for joint in robot.model.joints:
-        name = f"{joint}.kp"
-        m = told.fit.estimate.names.index(name)
-        assert told.fit.estimate.theta[m] == pytest.approx(truth[name], rel=0.001)
-        assert told.fit.simulator.prior[m] == pytest.approx(truth[name], rel=0.01), "begins there"
-        # by positions alone a tenth at least: test_of_many_scales_that_suit_the_positions_...
-        assert told.fit.estimate.std_error[m] < 0.001 * truth[name]
-    estimate = told.fit.estimate
-    np.testing.assert_allclose(estimate.sigma[2:], 0.5, rtol=0.05)  # of torques: nothing is left
-    for name, value, std in zip(estimate.names, estimate.theta, estimate.std_error, strict=True):
-        if not name.endswith("offset") and name in truth:  # the plant's friction creeps
-            assert abs(value - truth[name]) < 4 * std, name
-    assert f"{robot.model.joints[0]}.kd" in told.fit.estimate.names
-    assert "scale" not in {f.code for f in told.findings}

@@ -59,49 +59,6 @@ def test_what_the_data_leave_of_the_prior_is_the_mean_share_of_variances(picked_
     assert identifier._share == pytest.approx(min(1.0, 2.0 * s.cutoff * step))
 
 
-def test_the_new_parameters_are_followed(panda, picked_up):
-    _, identifier = picked_up
-    pi = truth(panda)
-    last = slice(panda.layout.n_inertial - 10, panda.layout.n_inertial)
-    own = 0.4 * 2.0 * 0.05**2
-    loaded = pi.copy()
-    load = [2.0, 0, 0, 0.2, own + 0.02, 0, own + 0.02, 0, 0, own]
-    loaded[last] += load
-    reading = identifier.reading
-    beta, before = identifier.mapping.to_base(loaded), identifier.mapping.to_base(pi)
-    error = np.abs(reading.theta - beta) / reading.std_error
-    # filter and differentiation leave a little that is not noise
-    assert np.sqrt(np.mean(error**2)) < 2.5
-    miss = np.linalg.norm(reading.theta - beta)
-    assert miss < 0.5 * np.linalg.norm(before - beta)
-    assert identifier.estimate.names == identifier.names
-    np.testing.assert_array_equal(identifier.estimate.sigma, reading.sigma)
-    np.testing.assert_array_equal(identifier.estimate.std_error, reading.std_error)
-    assert identifier.estimate.converged == reading.converged
-    np.testing.assert_array_equal(identifier.estimate.theta, reading.theta)
-
-
-def test_without_a_change_none_is_flagged_and_it_converges(panda):
-    log = payload_log(panda, np.random.default_rng(1), mass=0.0, duration=15.0)
-    identifier = OnlineIdentifier(panda)
-    run(identifier, log, 0, 1000)
-    early = identifier.reading
-    run(identifier, log, 1000)
-    late = identifier.reading
-    assert identifier.changes == ()
-    assert len(identifier._recent) == 30  # states, one every tenth of a second
-    assert np.diff([t for t, _ in identifier._recent]) == pytest.approx(0.1, abs=0.011)
-    assert not early.converged
-    assert late.converged
-    assert 0.5 < early.excitation < late.excitation <= 1.0
-    assert (late.std_error < early.std_error * 1.001).all()
-    assert late.t == pytest.approx(log.t[-1] - identifier.delay, abs=0.011)
-    # the filter keeps 2 * 8 / 200 of the variance of white noise, and smears Coulomb friction
-    white = 0.02 * np.sqrt(np.mean(log.tau**2, axis=0) * 2 * 8 / 200)
-    assert (late.sigma < 6 * white).all()
-    assert (late.sigma > 0.5 * white).all()
-
-
 def test_smooth_motion_can_be_given_as_it_is(ur5, rng):
     noise = np.array([4.0, 2.0, 1.0, 0.3, 0.2, 0.1])
     log = exact_log(ur5, truth(ur5), rng, samples=2000, rate=50.0, noise=0.1 * noise)
