@@ -29,11 +29,11 @@ import pyarrow.parquet
 from distributed import Client, LocalCluster
 from setting import PLANAR, machine
 
+from robotid.cli.fleet import UNITS
 from robotid.data.files.read import write_log
 from robotid.data.log import Log
 from robotid.dynamics.simulation.motions import random_fourier
 from robotid.dynamics.torque import joint_torque_regressor
-from robotid.estimation.workers.checkpoint import FOLDER
 from robotid.robot.model import RobotModel
 
 BETWEEN, WITHIN, NOISE = 0.15, 0.05, 0.02
@@ -149,7 +149,7 @@ def peak():
 
 
 def finished(out):
-    return list((out / FOLDER).glob("piece-*.npz"))
+    return list((out / UNITS).glob("*.json"))
 
 
 def wait(out, count, run):

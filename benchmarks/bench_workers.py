@@ -26,6 +26,7 @@ from robotid.cli.logs import survey_logs
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.factors import join
 from robotid.estimation.fitting.recorded import Recordings
+from robotid.estimation.fitting.survey import ReducedPiece
 from robotid.estimation.workers.plan import WorkPlan
 from robotid.robot.examples import example_urdf
 
@@ -89,7 +90,7 @@ def survey(path, rows_in_memory):
 
 def timed(plan, pieces):
     start = time.perf_counter()
-    whole = join(list(plan.reduce(pieces)))
+    whole = join(list(plan.map(ReducedPiece.reduce, pieces, "reducing")))
     return time.perf_counter() - start, whole
 
 

@@ -234,10 +234,13 @@ def public_functions():
 
 
 def test_every_public_argument_is_documented():
+    """Those of ``robotid`` one by one; what only the reference explains needs a text."""
     undocumented, count = [], 0
     for name, function, text in public_functions():
         count += 1
         arguments = [a for a in inspect.signature(function).parameters if a not in ("self", "cls")]
+        if name.split(".")[1] not in robotid.__all__:
+            arguments = []
         if not text or (arguments and "Args:" not in text):
             undocumented.append(name)
             continue

@@ -60,7 +60,7 @@ def test_the_page_of_the_job_file_is_what_the_settings_say(tmp_path):
     page = "".join(text for name, text in written.items() if name.startswith("job_"))
     for key in Job.paths().keys() - {"model"}:
         assert f"| `{key.rpartition('.')[2]}` |" in page or key.startswith(
-            ("ident", "valid", "transm", "payload_check")
+            ("ident", "valid", "transm", "payload_check", "coupling", "contact", "loop")
         )
     text = re.search(r"<!-- example -->\n```toml\n(.*?)```", page, re.DOTALL).group(1)
     job = job_from_settings(tomllib.loads(text), "job_file.md", tmp_path)

@@ -104,7 +104,7 @@ def _require_writable(folder: Path) -> None:
 
 
 def _is_hidden(path: Path) -> bool:
-    """Return whether a file is in a hidden folder of robotid, as that of a checkpoint."""
+    """Return whether a file is in a hidden folder of robotid, as that of finished units."""
     return any(part.startswith(".robotid-") for part in path.parts[:-1])
 
 

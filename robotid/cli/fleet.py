@@ -3,18 +3,18 @@
 import argparse
 import hashlib
 import json
+import shutil
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
 from operator import itemgetter
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
 from robotid.base.exceptions import DataError, SettingsError
 from robotid.base.files import check_folder, folder_beside, read_json, write_json, write_text
-from robotid.base.typing import Array
 from robotid.base.versions import __version__, code_versions
 from robotid.cli.console import echo, progress_of, show_found
 from robotid.cli.flags import add_json, add_out, add_progress
@@ -27,9 +27,8 @@ from robotid.dynamics.factors import available_cores
 from robotid.estimation.fitting.estimator_settings import SimulationSettings
 from robotid.estimation.variation.groups import FEWEST_RUNS
 from robotid.estimation.variation.variation import FALSE_ALARMS, between_units
-from robotid.estimation.workers.checkpoint import Checkpoint, released_on_error
-from robotid.estimation.workers.pieces import Workload
 from robotid.estimation.workers.plan import WorkPlan
+from robotid.estimation.workers.pools import Workload
 from robotid.output.files.entries import build_result
 from robotid.output.report.fleet_page import fleet_page
 
@@ -42,6 +41,8 @@ COLUMNS = {
     "job": "job file with the settings",
 }
 _FILES = ("fleet.parquet", "fleet.json", "fleet.html")
+#: Folder of the units that are finished, until all are.
+UNITS = ".robotid-units"
 _RESULTS: Mapping[str, type] = {
     "unit": str, "log": str, "status": str, "verdict": str, "reasons": str, "parameter": str,
     "value": float, "std_error": float, "spread": float, "parameter_unit": str, "error": str,
@@ -94,25 +95,8 @@ class FleetUnit(Workload):
         )
 
 
-@dataclass(frozen=True)
-class UnitResult:
-    """The result of a unit.
-
-    Attributes:
-        rows: Its rows of the table of results; a missing value has no key.
-    """
-
-    rows: list[dict[str, Any]]
-
-    def to_arrays(self) -> dict[str, Array]:
-        """Return the result as arrays by name, for a checkpoint."""
-        content = json.dumps(self.rows, allow_nan=False)
-        return {"content": np.frombuffer(content.encode(), dtype=np.uint8)}
-
-    @classmethod
-    def from_arrays(cls, arrays: Mapping[str, Array]) -> "UnitResult":
-        """Return the result from its arrays; see ``to_arrays``."""
-        return cls(json.loads(arrays["content"].tobytes()))
+#: Rows of a unit in the table of results; a missing value has no key.
+UnitRows: TypeAlias = list[dict[str, Any]]
 
 
 def read_fleet(
@@ -215,14 +199,14 @@ def _mass(source: Path, number: int, text: str) -> float | None:
     return mass or None
 
 
-def identify_unit(unit: FleetUnit, threads: int | None) -> UnitResult:
+def identify_unit(unit: FleetUnit, threads: int | None) -> UnitRows:
     """Identify a unit; a failure is a row of its result.
 
     A log that cannot be read is a row, too; the unit is identified from its other logs.
     """
     del threads
     refused: dict[Path, str] = {}
-    rows: list[dict[str, Any]] = []
+    rows: UnitRows = []
     try:
         job = unit.stated()
         found = identify_job(
@@ -238,7 +222,7 @@ def identify_unit(unit: FleetUnit, threads: int | None) -> UnitResult:
         {"unit": unit.unit, "log": str(path), "status": "failed", "error": error}
         for path, error in refused.items()
     ]
-    return UnitResult(rows)
+    return rows
 
 
 def _failure(unit: FleetUnit, error: Exception) -> dict[str, Any]:
@@ -274,38 +258,43 @@ def run_fleet(
     folder: str | Path,
     *,
     plan: WorkPlan | None = None,
+    resume: bool = False,
     update: bool = False,
 ) -> dict[str, Any]:
     """Identify all units; write fleet.parquet, fleet.json and fleet.html.
 
-    Finished units are stored in a checkpoint until all are, and are not repeated by a resumed run.
-    A unit that ends its worker in every attempt is a failure in the table. Files of results are
-    written when all units are finished, with the same bits.
+    Finished units are stored until all are, and are not repeated by a resumed run, unless their
+    inputs have changed. A unit that ends its worker in every attempt is a failure in the table.
+    Files of results are written when all units are finished, with the same bits.
     """
     chosen, target, inputs = plan or WorkPlan(1), Path(folder), _inputs(units)
     check_folder(target, _FILES)
     known = _known(target, inputs) if update else frozenset()
-    checkpoint = Checkpoint.open(target, inputs, units, UnitResult, resume=chosen.resume)
-    with chosen, released_on_error(checkpoint):
-        if known:
-            _keep(target / "fleet.parquet", known, units, checkpoint)
-        for _ in chosen.map(
-            identify_unit, units, "identifying", checkpoint=checkpoint, counted="logs",
-            lost=lambda unit, error: UnitResult([_failure(unit, error)]),
+    if not resume:
+        shutil.rmtree(target / UNITS, ignore_errors=True)
+    (target / UNITS).mkdir(parents=True, exist_ok=True)
+    stored = {unit.unit: target / UNITS / f"{_key(inputs, unit)}.json" for unit in units}
+    if known:
+        _keep(target / "fleet.parquet", known, stored)
+    missing = [unit for unit in units if not stored[unit.unit].exists()]
+    with chosen:
+        for k, rows in chosen.as_finished(
+            identify_unit, missing, "identifying", counted="logs",
+            lost=lambda unit, error: [_failure(unit, error)],
         ):  # fmt: skip
-            pass
+            _store(rows, stored[missing[k].unit])
         with folder_beside(target) as partial:
             gathered = _Gathered()
             with parquet_rows(partial / "fleet.parquet", _RESULTS) as table:
-                for k in range(len(units)):  # one after the other: not all are in memory
-                    result = checkpoint.load(k)
-                    table.add(result.rows)
-                    gathered.add(result)
+                for unit in units:  # one after the other: not all are in memory
+                    rows = read_json(stored[unit.unit], "result of a unit")
+                    table.add(rows)
+                    gathered.add(rows)
             about = {"robotid": __version__, "outputs": dict(table=_FILES[0], page=_FILES[2])}
             content = about | gathered.content(units) | {"inputs": inputs}
             write_json(content, partial / "fleet.json")
             write_text(fleet_page(content), partial / "fleet.html")
-    checkpoint.remove()
+    shutil.rmtree(target / UNITS)
     return content
 
 
@@ -333,17 +322,22 @@ def _known(folder: Path, inputs: Mapping[str, Any]) -> frozenset[str]:
     return frozenset(name for name, key in own if stated["units"].get(name) == key)
 
 
-def _keep(
-    table: Path, known: Collection[str], units: Sequence[FleetUnit], checkpoint: Checkpoint
-) -> None:
+def _key(inputs: Mapping[str, Any], unit: FleetUnit) -> str:
+    """Return a hash of a unit and of all inputs of its result."""
+    text = json.dumps([inputs["versions"], unit.unit, inputs["units"][unit.unit]])
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _store(rows: UnitRows, path: Path) -> None:
+    write_text(json.dumps(rows, allow_nan=False), path)
+
+
+def _keep(table: Path, known: Collection[str], stored: Mapping[str, Path]) -> None:
     """Store the results of units in a table as finished, if nothing failed."""
-    places, finished = {unit.unit: k for k, unit in enumerate(units)}, checkpoint.finished()
     for name, rows in groupby(parquet_values(table), key=itemgetter("unit")):
-        own = list(rows)
-        is_new = name in known and places[name] not in finished
-        if is_new and all(row["status"] == "done" for row in own):
-            unit = units[places[name]]
-            checkpoint.save(places[name], unit.name, UnitResult(own))
+        of_unit = list(rows)
+        if name in known and all(row["status"] == "done" for row in of_unit):
+            _store(of_unit, stored[name])
 
 
 class _Gathered:
@@ -354,9 +348,9 @@ class _Gathered:
         self._failures: list[dict[str, str]] = []
         self._verdicts: dict[str, int] = {}
 
-    def add(self, result: UnitResult) -> None:
+    def add(self, rows: UnitRows) -> None:
         """Add the result of a unit."""
-        for row in result.rows:
+        for row in rows:
             if row["status"] == "failed":
                 shown = {"unit": row["unit"], "log": row.get("log", ""), "error": row["error"]}
                 self._failures.append(shown)
@@ -364,7 +358,7 @@ class _Gathered:
                 key = row["robot"], row["parameter"], row["expression"], row["parameter_unit"]
                 own = row["unit"], row["value"], row["std_error"]
                 self._values.setdefault(key, []).append(own)
-        verdict = next((row["verdict"] for row in result.rows if row.get("verdict")), None)
+        verdict = next((row["verdict"] for row in rows if row.get("verdict")), None)
         if verdict is not None:
             self._verdicts[verdict] = self._verdicts.get(verdict, 0) + 1
 
@@ -434,8 +428,10 @@ def run(options: argparse.Namespace) -> int:
     with progress_of(options) as progress:
         units = read_fleet(options.table, options.urdf, options.job)
         workers = available_cores() if options.workers is None else options.workers
-        plan = WorkPlan(workers, options.scheduler, options.resume, progress)
-        content = run_fleet(units, options.out, plan=plan, update=options.update)
+        plan = WorkPlan(workers, options.scheduler, progress)
+        content = run_fleet(
+            units, options.out, plan=plan, resume=options.resume, update=options.update
+        )
     show_found(content, options, _show, ["fleet.parquet", "fleet.html", "fleet.json"])
     return 0 if content["done"] else 1
 

@@ -8,7 +8,6 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from robotid.base.arguments import checked
 from robotid.base.exceptions import DataError, SettingsError
 from robotid.base.files import check_folder, folder_beside, remove_written, write_json
 from robotid.base.settings import require_flag, require_kind
@@ -25,13 +24,7 @@ from robotid.cli.console import (
 )
 from robotid.cli.flags import OUTPUT, add_job, add_out, add_progress, job_from_flags, source_words
 from robotid.cli.job import Job, LogEntry, job_file
-from robotid.cli.logs import (
-    examine_logs,
-    locked_as_logged,
-    needed_of,
-    survey_logs,
-    units_of_logs,
-)
+from robotid.cli.logs import examine_logs, locked_as_logged, needed_of, survey_logs, units_of_logs
 from robotid.cli.payload import check_payloads
 from robotid.data.files.read import Readable, read_logs
 from robotid.data.log import Log
@@ -72,7 +65,6 @@ _log = logging.getLogger(__name__)
 _NO_LOGS: tuple[Log, ...] = ()
 
 
-@checked("progress")
 def identify(
     model: RobotModel | str | Path,
     logs: Readable | Sequence[Readable] | None = None,
@@ -121,6 +113,7 @@ def identify(
         NotConvergedError: If a solver fails, or the closed loop cannot be simulated.
         SettingsError: If a setting is out of range, or a code to ignore is unknown.
     """
+    require_kind(progress, (Callable, type(None)), "progress", "a function")  # type: ignore[arg-type]
     if logs is None:
         job = job_file(model)
         if not (validation is _NO_LOGS and signals is controller is None and not ignore):
@@ -193,13 +186,8 @@ def run_job(
     return _write(found, _job_of(found), target, source=source)
 
 
-@checked("identification")
 def save_result(
-    identification: Identification,
-    folder: str | Path,
-    *,
-    report: bool = True,
-    replay: bool = False,
+    identification: Identification, folder: str | Path, *, report: bool = True, replay: bool = False
 ) -> Path:
     """Write the files of ``robotid identify``: result.json, report, URDF with its sidecar.
 
@@ -222,6 +210,8 @@ def save_result(
         ModelError: If the URDF of the robot no longer exists.
         SettingsError: If the folder is a file, or is not writable.
     """
+    kind = "a robotid.Identification"
+    require_kind(identification, Identification, "identification", kind)
     require_kind(folder, (str, Path), "folder", "the path of a folder")
     require_kind(report, bool, "report", "True or False")
     require_kind(replay, bool, "replay", "True or False")
@@ -239,11 +229,7 @@ def _names(model: RobotModel) -> tuple[str, str, str, str]:
 
 
 def _write(
-    found: Identification,
-    job: Job,
-    target: Path,
-    *,
-    source: Sequence[str] = (),
+    found: Identification, job: Job, target: Path, *, source: Sequence[str] = ()
 ) -> tuple[Identification, dict[str, Any]]:
     """Write all files of a result; return the identification with its report, and result.json."""
     names = report, replay, name, sidecar = _names(found.model)

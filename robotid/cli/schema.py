@@ -10,6 +10,8 @@ from robotid.base.settings import REQUIRED, Entries, Key, Settings
 from robotid.cli.job import Job, LogEntry, PayloadEntry
 from robotid.data.transmission import Transmission
 from robotid.estimation.fitting.estimator_settings import ESTIMATORS, ConstraintSettings
+from robotid.robot.constraints import Contact, Loop
+from robotid.robot.parameters import Coupling
 
 _DRAFT = "https://json-schema.org/draft/2020-12/schema"
 _NAMES = {str: "string", datetime: "string", bool: "boolean", int: "integer", float: "number"}
@@ -19,6 +21,9 @@ _TABLES: Mapping[str, type[Settings]] = {
     "validation": LogEntry,
     "payload_check": PayloadEntry,
     "transmission": Transmission,
+    "coupling": Coupling,
+    "contact": Contact,
+    "loop": Loop,
     "estimator.constraints": ConstraintSettings,
 }  # whose keys a job's own paths do not have
 

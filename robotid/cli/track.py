@@ -203,10 +203,7 @@ class _LiveFeed:
         if self._speed > 0:
             ahead = (t - start) / self._speed - (time.monotonic() - self._started)
             time.sleep(max(ahead, 0.0))
-        message = {
-            "t": t,
-            "q": coordinates(self._model, self._log.q[k : k + 1])[0].tolist(),
-        }
+        message = {"t": t, "q": coordinates(self._model, self._log.q[k : k + 1])[0].tolist()}
         if identifier.is_ready:
             reading, (tau, predicted) = identifier.reading, identifier.compared
             message |= {

@@ -18,7 +18,7 @@ from helpers.paths import ROOT
 from helpers.synthetic import exact_log, truth
 
 from robotid.base.typing import STAGES
-from robotid.cli import compare, doctor, main
+from robotid.cli import doctor, main
 from robotid.data.files.read import write_log
 from robotid.robot.model import RobotModel
 
@@ -150,28 +150,6 @@ def test_findings_are_told_by_cause_and_the_worst_joint_is_named(capsys):
     wrong.append(finding("arm_7", "five", 9, "error"))
     doctor._show({"findings": wrong, "joints": joints}, is_verbose=False, count=2)
     assert capsys.readouterr().out.splitlines()[-1].endswith("worst: arm_6"), "two errors"
-
-
-def test_compare_shows_the_largest_differences_and_fits_eighty_columns(monkeypatch, capsys):
-    monkeypatch.setenv("COLUMNS", "80")
-    entry = {"values": [-1.2345e-5, 1.3], "std_errors": [0.012, 0.12], "unit": "N m s/rad"}
-    name = "shoulder_lift_joint.harmonic2_cos"
-    result = {"label": "A", "verdict": {"status": "good"}, "estimator": "consistent"}
-    content = {
-        "results": [result | {"path": "folder/" * 12 + "result.json"}] * 2,
-        "notes": ["another robot"], "fitted_alike": True, "validation": [], "fitted": [],
-        "base_parameters": [
-            entry | {"name": f"{name}_{k}", "differences": [20.0 - k]} for k in range(15)
-        ],
-        "settings": [], "versions": [], "inputs": [], "changes": [], "findings": [],
-    }  # fmt: skip
-    compare._show(content)
-    lines = capsys.readouterr().out.splitlines()
-    assert max(len(line) for line in lines if "folder/" not in line) <= 80
-    assert [line.split()[0] for line in lines if name in line] == [f"{name}_{k}" for k in range(12)]
-    assert lines[-1] == "  3 more with smaller differences: --verbose"
-    compare._show(content, is_verbose=True)
-    assert f"{name}_14" in capsys.readouterr().out
 
 
 CLOSED = {"no output": ">&-", "no errors": "2>&-", "neither": ">&- 2>&-"}

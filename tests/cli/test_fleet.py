@@ -14,11 +14,9 @@ from helpers.synthetic import exact_log, truth
 
 from robotid.base.exceptions import DataError
 from robotid.cli import fleet, main
-from robotid.cli.fleet import UnitResult, _Gathered, read_fleet, run_fleet
+from robotid.cli.fleet import _Gathered, read_fleet, run_fleet
 from robotid.data.files.read import write_log
 from robotid.estimation.variation.variation import between_units
-from robotid.estimation.workers.checkpoint import FOLDER
-from robotid.estimation.workers.plan import WorkPlan
 from robotid.robot.model import RobotModel
 
 URDF = ROOT / "urdf" / "planar_2r.urdf"
@@ -107,29 +105,33 @@ def test_an_interrupted_run_is_resumed_with_the_same_bits(table, done, tmp_path,
     monkeypatch.setattr(fleet, "identify_unit", interrupted)
     with pytest.raises(KeyboardInterrupt):
         run_fleet(units, tmp_path)
-    assert {path.name for path in tmp_path.iterdir()} == {FOLDER}
+    assert {path.name for path in tmp_path.iterdir()} == {fleet.UNITS}
     repeated = []
     monkeypatch.setattr(
         fleet, "identify_unit", lambda unit, threads: repeated.append(unit.unit) or first(unit, 1)
     )
-    run_fleet(units, tmp_path, plan=WorkPlan(1, resume=True))
+    run_fleet(units, tmp_path, resume=True)
     assert repeated == ["c", "d"]
     for name in FILES:
         assert (tmp_path / name).read_bytes() == (done[0] / name).read_bytes()
     assert {path.name for path in tmp_path.iterdir()} == set(FILES)
 
 
-def test_another_table_does_not_resume(table, tmp_path, monkeypatch):
+def test_only_units_with_the_same_inputs_are_resumed(table, tmp_path, monkeypatch):
+    units, seen = read_fleet(table), []
+
     def interrupted(unit, threads):
-        raise KeyboardInterrupt
+        seen.append(unit.unit)
+        if unit.unit == "c":
+            raise KeyboardInterrupt
+        return [fleet._failure(unit, DataError("no"))]
 
     monkeypatch.setattr(fleet, "identify_unit", interrupted)
-    units = read_fleet(table)
-    with pytest.raises(KeyboardInterrupt):
-        run_fleet(units, tmp_path)
     other = [replace(units[0], logs=units[0].logs[:1]), *units[1:]]
-    with pytest.raises(DataError, match=r"checkpoint of other inputs: units\.a was"):
-        run_fleet(other, tmp_path, plan=WorkPlan(1, resume=True))
+    for resumed, options in ((units, {}), (other, {"resume": True}), (other, {})):
+        with pytest.raises(KeyboardInterrupt):
+            run_fleet(resumed, tmp_path, **options)
+    assert seen == ["a", "b", "c", "a", "c", "a", "b", "c"]
 
 
 def test_units_with_the_same_inputs_are_kept_and_new_logs_added(
@@ -233,13 +235,13 @@ def test_units_are_compared_by_parameter_robot_and_expression(monkeypatch):
         ]  # fmt: skip
         rows.append(rows[0] | {"log": "x.csv", "value": 99.0})  # of one log: not compared
         rows.append({"unit": f"u{k}", "status": "failed", "log": f"{k}.csv", "error": "lost"})
-        gathered.add(UnitResult(rows))
+        gathered.add(rows)
     for k in (5, 6):
         row = {"unit": f"u{k}", "status": "done", "verdict": "good", "parameter": "b.m",
                "parameter_unit": "kg", "value": 1.0, "std_error": 0.1, "robot": "leg",
                "expression": "b.m"}  # fmt: skip
-        gathered.add(UnitResult([row]))
-    gathered.add(UnitResult([{"unit": "u7", "status": "failed", "error": "bad"}]))
+        gathered.add([row])
+    gathered.add([{"unit": "u7", "status": "failed", "error": "bad"}])
     levels = []
     monkeypatch.setattr(
         "robotid.cli.fleet.between_units",

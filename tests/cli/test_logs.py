@@ -8,10 +8,7 @@ import pytest
 
 from robotid.base.exceptions import SettingsError
 from robotid.cli.job import Job, LogEntry
-from robotid.cli.logs import (
-    locked_as_logged,
-    units_of_logs,
-)
+from robotid.cli.logs import locked_as_logged, units_of_logs
 
 HAND = """<robot name="hand"><link name="base"/><link name="a"/><link name="b"/><link name="c"/>
 <link name="d"/>

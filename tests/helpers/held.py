@@ -9,14 +9,14 @@ import time
 from pathlib import Path
 
 from robotid.cli import main
-from robotid.estimation.workers import plan
+from robotid.estimation.workers.plan import WorkPlan
 
-_map_pieces = plan.map_pieces
+_map = WorkPlan.map
 
 
 def held(mark, count):
-    def map_pieces(*stated, **options):
-        for k, result in enumerate(_map_pieces(*stated, **options), start=1):
+    def map_pieces(*stated):
+        for k, result in enumerate(_map(*stated), start=1):
             if k == count:
                 mark.touch()
                 time.sleep(600)
@@ -30,5 +30,5 @@ if __name__ == "__main__":
     signal.signal(signal.SIGINT, signal.default_int_handler)
     for number in (signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_DFL)
-    plan.map_pieces = held(Path(sys.argv[1]), int(sys.argv[2]))
+    WorkPlan.map = held(Path(sys.argv[1]), int(sys.argv[2]))
     sys.exit(main(sys.argv[3:]))

@@ -39,9 +39,6 @@ class OLS(BatchEstimator):
             is raised if there are any.
         independent_share: Share of independent rows [-], 2 cutoff / rate for low-pass filtered
             rows. The covariance is divided by it.
-
-    References:
-        Gautier (1997), Dynamic identification of robots with power model, section II.
     """
 
     prior: Array | None = None
@@ -64,8 +61,7 @@ class WLS(BatchEstimator):
     """Weighted least squares: minimise sum_j |tau_j - W_j theta|^2 / sigma_j^2.
 
     The noise level sigma_j of each joint is computed from its residual and the effective degrees of
-    freedom of its rows, and is iterated to convergence. With few rows it may converge slowly; the
-    message of the estimate has the remaining change.
+    freedom of its rows, and is iterated to convergence, which may be slow with few rows.
 
     Attributes:
         prior: As in ``OLS``.
@@ -114,10 +110,8 @@ class TLS(BatchEstimator):
 
     Finds the smallest corrections E of the regressor and e of the torque with
     (W + E) theta = tau - e. The noise of a column is ``regressor_noise`` times its RMS; constant
-    columns have none. The method is appropriate if positions and their derivatives are noisy. It is
-    biased if the residual is a model error, which it attributes to noise of the regressor. For
-    ``regressor_noise`` towards 0 it is WLS, whose covariance it returns. A ``DataError`` is raised
-    if the smallest solution is not unique, or if the regressor's noise exceeds the residual.
+    columns have none. It is biased if the residual is a model error, which it attributes to noise
+    of the regressor. For ``regressor_noise`` towards 0 it is WLS, whose covariance it returns.
 
     Attributes:
         regressor_noise: RMS noise of the columns over their RMS [-]; None: 0.01, reduced if it
@@ -169,9 +163,8 @@ class TLS(BatchEstimator):
                     f"{np.sqrt(share):.3g} times the actual residual, wanted less than 1; reduce "
                     "regressor_noise"
                 )
-            found = mixed_tls(R, noise / np.sqrt(1.0 - share))
-            change = np.linalg.norm(R[:, :-1] @ (found - theta)) / np.linalg.norm(R[:, -1])
-            theta = found
+            before, theta = theta, mixed_tls(R, noise / np.sqrt(1.0 - share))
+            change = np.linalg.norm(R[:, :-1] @ (theta - before)) / np.linalg.norm(R[:, -1])
             if change < _TLS_TOLERANCE:
                 return theta, share
         raise NotConvergedError(
@@ -183,21 +176,13 @@ class TLS(BatchEstimator):
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """The minimiser of a weighted problem, with its covariance and rank.
+    """The minimiser of a weighted problem, with its covariance and rank."""
 
-    Attributes:
-        theta: Parameters, shape (c,).
-        covariance: (W^T S^-1 W)^+, shape (c, c).
-        rank: Number of identifiable directions.
-        columns: Factor of the columns scaled to unit norm, shape (c + 1, c).
-        undetermined: Names of the parameters that are not identifiable.
-    """
-
-    theta: Array
-    covariance: Array
+    theta: Array  # (c,)
+    covariance: Array  # (c, c), (W^T S^-1 W)^+
     rank: int
-    columns: Array
-    undetermined: tuple[str, ...]
+    columns: Array  # (c + 1, c), factor of the columns scaled to unit norm
+    undetermined: tuple[str, ...]  # names of the parameters that are not identifiable
 
     @cached_property
     def condition(self) -> float:
@@ -216,17 +201,9 @@ class Solution:
         covariance = covariance.copy()
         covariance[is_open, is_open] = np.inf
         return Estimate(
-            theta=self.theta,
-            covariance=covariance,
-            names=names,
-            sigma=sigma,
-            rank=self.rank,
-            condition=self.condition,
-            undetermined=self.undetermined,
-            converged=True,
-            n_iter=n_iter,
-            message=message,
-        )
+            self.theta, covariance, names, sigma, self.rank, self.condition, self.undetermined,
+            converged=True, n_iter=n_iter, message=message,
+        )  # fmt: skip
 
 
 def solve_factor(factors: Factors, sigma: Array, prior: Array | None) -> Solution:
@@ -266,8 +243,7 @@ def _noise(factors: Factors, theta: Array, used: Array) -> Array:
     sigma = factors.noise_levels(theta, np.maximum(factors.rows - used, 1.0))
     torque = np.sqrt(factors.torque_squares() / np.maximum(factors.rows, 1))
     floor = _FLOOR * np.where(torque > 0, torque, 1.0)
-    noise: Array = np.maximum(sigma, floor)
-    return noise
+    return np.asarray(np.maximum(sigma, floor))
 
 
 def mixed_tls(rows: Array, noise: Array) -> Array:

@@ -30,17 +30,11 @@ _GROUPS = 2  # largest number of groups whose sums are printed
 
 @dataclass(frozen=True)
 class Combination:
-    """A sum of base parameters that is identifiable, while its terms are not.
+    """A sum of base parameters that is identifiable, while its terms are not."""
 
-    Attributes:
-        names: Base parameters in the sum, in their order.
-        coefficients: Factor of each, SI units; that of the leading one is 1.
-        shares: The same in units of the spreads [-]; that of the leading one is the largest.
-    """
-
-    names: tuple[str, ...]
-    coefficients: tuple[float, ...]
-    shares: tuple[float, ...]
+    names: tuple[str, ...]  # of the terms, in the order of the base parameters
+    coefficients: tuple[float, ...]  # SI units; that of the leading term is 1
+    shares: tuple[float, ...]  # in units of the spreads [-]; the largest is that of the leading one
 
     def __str__(self) -> str:
         shares = np.abs(self.shares)
@@ -57,15 +51,10 @@ class Combination:
 
 @dataclass(frozen=True)
 class Group:
-    """Base parameters that cannot be distinguished from the data.
-
-    Attributes:
-        names: The base parameters.
-        combinations: Their identifiable sums, fewer than there are names.
-    """
+    """Base parameters that cannot be distinguished from the data."""
 
     names: tuple[str, ...]
-    combinations: tuple[Combination, ...]
+    combinations: tuple[Combination, ...]  # their identifiable sums, fewer than names
 
     def __str__(self) -> str:
         if not self.combinations:
@@ -82,21 +71,14 @@ class Group:
 
 @dataclass(frozen=True, eq=False)
 class Determination:
-    """Identifiability of the base parameters from data.
+    """Identifiability of the base parameters from data."""
 
-    Attributes:
-        names: Names of the b base parameters.
-        spread: Prior standard deviation (spread) of each, shape (b,), SI units; 0 for known ones.
-        shrinkage: Standard deviation after the data over that before them, for b orthogonal
-            directions in units of the spread, ascending, shape (b,) [-]; 0 for known ones.
-        weak: The weak directions, in units of the spread, orthonormal, shape (b, b - rank).
-        groups: Base parameters that cannot be distinguished from the data.
-    """
-
-    names: tuple[str, ...]
-    spread: Array
+    names: tuple[str, ...]  # of the b base parameters
+    spread: Array  # (b,), prior standard deviation; 0 for known ones
+    #: Standard deviation after the data over that before them, for b orthogonal directions in units
+    #: of the spread, ascending, shape (b,) [-]; 0 for known ones.
     shrinkage: Array
-    weak: Array
+    weak: Array  # (b, b - rank), the weak directions, in units of the spread, orthonormal
     groups: tuple[Group, ...]
 
     @property
@@ -107,8 +89,8 @@ class Determination:
     @property
     def undetermined(self) -> tuple[str, ...]:
         """Names of the base parameters that are not identifiable individually, in their order."""
-        listed = {name for group in self.groups for name in group.names}
-        return tuple(name for name in self.names if name in listed)
+        grouped = {name for group in self.groups for name in group.names}
+        return tuple(name for name in self.names if name in grouped)
 
     @property
     def merged(self) -> tuple[Group, ...]:
@@ -152,8 +134,7 @@ def base_spread(K: Array, spread: Array, known: Sequence[bool] | Array = ()) -> 
     K (b, p), spread (p,), known (p,).
     """
     free = spread * ~np.asarray(known, dtype=bool) if len(known) else spread
-    size: Array = np.linalg.norm(K * free, axis=1)
-    return size
+    return np.asarray(np.linalg.norm(K * free, axis=1))
 
 
 def determine(names: Sequence[str], rows: Array, spread: Array) -> Determination:

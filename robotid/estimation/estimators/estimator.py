@@ -22,39 +22,20 @@ Weighing: TypeAlias = Literal["alike", "by joint", "by age", "by step"]
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """Estimated parameters and their uncertainty.
+    """Estimated parameters and their uncertainty, in SI units."""
 
-    Attributes:
-        theta: Parameters, shape (c,), SI units.
-        covariance: Their covariance, shape (c, c); infinite variance if not identifiable.
-        names: Their names.
-        sigma: Standard deviation of the torque residual per joint, shape (n,) [N m or N].
-        rank: Number of identifiable directions.
-        condition: Condition number over those directions, columns scaled to unit norm.
-        undetermined: Names of the parameters that are not identifiable.
-        converged: Whether the iteration met its convergence criterion.
-        n_iter: Number of iterations.
-        message: Summary of the run of the estimator.
-        prior_std: Prior standard deviation of each parameter, shape (c,), or None.
-        details: Settings and results of the fit as plain values by name: prior, constraints,
-            solver.
-    """
-
-    theta: Array
-    covariance: Array
+    theta: Array  # (c,)
+    covariance: Array  # (c, c); infinite variance if not identifiable
     names: tuple[str, ...]
-    sigma: Array
-    rank: int
-    condition: float
-    undetermined: tuple[str, ...]
+    sigma: Array  # (n,), standard deviation of the residual per joint [N m or N]
+    rank: int  # number of identifiable directions
+    condition: float  # over those directions, columns scaled to unit norm
+    undetermined: tuple[str, ...]  # names of the parameters that are not identifiable
     converged: bool
     n_iter: int
-    message: str
-    prior_std: Array | None = None
-    details: Mapping[str, Any] = field(default_factory=dict)
-
-    def __repr__(self) -> str:
-        return f"<{self._line}>"
+    message: str  # summary of the run of the estimator
+    prior_std: Array | None = None  # (c,)
+    details: Mapping[str, Any] = field(default_factory=dict)  # plain values: prior, constraints
 
     def summary(self) -> str:
         """Return the parameters with their standard errors as text, one per line."""
@@ -63,9 +44,14 @@ class Estimate:
             f"  {name:{width}} {value:12.4g} +- {error:.2g}"
             for name, value, error in zip(self.names, self.theta, self.std_error, strict=True)
         ]
-        return "\n".join([self._line, self.message, *rows])
+        state = "converged" if self.converged else "not converged"
+        head = f"{len(self.names)} parameters, rank {self.rank}, condition {self.condition:.3g}"
+        return "\n".join([f"Estimate: {head}, {state}", self.message, *rows])
 
     __str__ = summary
+
+    def __repr__(self) -> str:
+        return f"<{self.summary().splitlines()[0]}>"
 
     @property
     def std_error(self) -> Array:
@@ -82,14 +68,6 @@ class Estimate:
         """
         freedom = self.details.get("freedom", np.inf)
         return quantile(np.broadcast_to(np.asarray(freedom, dtype=float), len(self.theta)))
-
-    @property
-    def _line(self) -> str:
-        state = "converged" if self.converged else "not converged"
-        return (
-            f"Estimate: {len(self.names)} parameters, rank {self.rank}, condition "
-            f"{self.condition:.3g}, {state}"
-        )
 
 
 class Estimator(ABC, Generic[DataT]):
@@ -114,11 +92,7 @@ class Estimator(ABC, Generic[DataT]):
 
     @abstractmethod
     def fit(self, data: DataT) -> Estimate:
-        """Estimate the parameters.
-
-        Args:
-            data: A problem in base parameters; for a batch estimator also its factors; for an
-                estimator that reads a simulator, the simulator.
+        """Estimate the parameters from a problem in base parameters, its factors or a simulator.
 
         Raises:
             DataError: If there are fewer rows than parameters, or a row cannot be used.

@@ -9,7 +9,7 @@ fast effects such as a delay.
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, Protocol
 
 import numpy as np
 import scipy.linalg
@@ -19,7 +19,6 @@ from robotid.base.typing import Array, ProgressCallback, ignore_progress
 from robotid.dynamics.factors import Factors, triangle_of
 from robotid.estimation.estimators.estimator import Estimate, Estimator
 from robotid.estimation.estimators.segments import FEWEST_SEGMENTS, at_least, sandwich, scatter
-from robotid.estimation.estimators.simulator import Residual, Simulator
 
 _CAUTIOUS = 1e-3  # damping of a step: parameters that are not identifiable do not move
 _NEARLY_FREE = 1e-6  # damping of the last step, near the minimum
@@ -37,6 +36,45 @@ _LOST = 1e-6  # relative reduction of the prior variance below which a parameter
 
 
 @dataclass(frozen=True, eq=False)
+class Residual:
+    """Measured minus simulated output over one window, for k joints simulated together."""
+
+    e: Array  # (N, k) [rad or m]
+    slopes: Array | None  # (N, k, c'), derivatives of the simulated output by the parameters
+    joints: Array  # (k,), indices
+    columns: Array  # (c',), indices of the parameters
+    by_start: Array | None = None  # (N, k, s), derivatives by the initial state of the window
+
+
+class Simulator(Protocol):
+    """Interface of a simulator whose outputs are compared with measured ones."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the c parameters."""
+
+    @property
+    def prior(self) -> Array:
+        """Prior values, shape (c,)."""
+
+    @property
+    def prior_std(self) -> Array:
+        """Prior standard deviations, shape (c,); infinite without prior knowledge."""
+
+    @property
+    def bounds(self) -> Array:
+        """Lower and upper bounds, shape (2, c); infinite without a bound."""
+
+    def residuals(
+        self, theta: Array, *, with_slopes: bool, with_starts: bool = False
+    ) -> Sequence[Residual]:
+        """Return measured minus simulated outputs, window by window: theta (c,)."""
+
+    def rows(self, theta: Array) -> tuple[Array, Array]:
+        """Return additional linearised residuals of unit weight: theta (c,) -> (m, c), (m,)."""
+
+
+@dataclass(frozen=True, eq=False)
 class _Weights:
     """Whitening and noise level of the residuals, by joint."""
 
@@ -47,8 +85,7 @@ class _Weights:
         rho, sigma = self.rho[joints], self.sigma[joints]
         if x.ndim == 3:
             rho, sigma = rho[:, None], sigma[:, None]
-        whitened: Array = (x[1:] - rho * x[:-1]) / sigma
-        return whitened
+        return np.asarray((x[1:] - rho * x[:-1]) / sigma)
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,38 +95,28 @@ class OutputError(Estimator[Simulator]):
     A damped Gauss-Newton method (Levenberg, Marquardt) in rounds. Each round computes the weights
     from the residuals, then the parameters with these weights, until both have converged.
 
-    Attributes:
-        whitens: Whether the residual is whitened by its estimated correlation.
-        most: Largest correlation of successive samples that is used, shape (n,): whitening with
-            more than the correlation of the loop removes the information. None: 0.95.
-        steps: Largest number of steps in a round.
-        rounds: Largest number of rounds.
-        inflation: Factor of the residuals' variance for the correlation that remains after
-            whitening. It determines the weight relative to additional rows.
-        frees: Whether the initial states of windows are fitted together with the parameters, to
-            first order, in each step; needed if the loop does not correct a wrong initial state.
-        progress: Callback for the progress of the steps.
-
     References:
         Ljung (1999), System identification, 4.3 and 10.2.
     """
 
     reads: ClassVar[Literal["simulator"]] = "simulator"
 
-    whitens: bool = True
+    whitens: bool = True  # whether the residual is whitened by its estimated correlation
+    #: Largest correlation of successive samples that is used, shape (n,): whitening with more than
+    #: the correlation of the loop removes the information. None: 0.95.
     most: Array | None = None
-    steps: int = _STEPS
+    steps: int = _STEPS  # largest number in a round
     rounds: int = _ROUNDS
+    #: Factor of the residuals' variance for the correlation that remains after whitening. It
+    #: determines the weight relative to additional rows.
     inflation: float = 1.0
+    #: Whether the initial states of windows are fitted together with the parameters, to first
+    #: order, in each step; needed if the loop does not correct a wrong initial state.
     frees: bool = False
     progress: ProgressCallback = field(default=ignore_progress)
 
     def fit(self, data: Simulator, start: Array | None = None) -> Estimate:
-        """Estimate the parameters.
-
-        Args:
-            data: The simulator.
-            start: Initial values, shape (c,); the prior if None.
+        """Estimate the parameters from initial values (c,), the prior if None.
 
         Raises:
             DataError: If there are fewer samples than parameters.
@@ -99,15 +126,7 @@ class OutputError(Estimator[Simulator]):
         return self._estimate(data, weights, theta, how)
 
     def minimise(self, data: Simulator, start: Array | None = None) -> Array:
-        """Return the parameters of ``fit`` alone, shape (c,), without their standard errors.
-
-        Args:
-            data: The simulator.
-            start: Initial values, shape (c,); the prior if None.
-
-        Raises:
-            NotConvergedError: If the simulation with the initial values fails.
-        """
+        """Return the parameters of ``fit`` alone, shape (c,), without their standard errors."""
         return self._minimised(data, start)[1]
 
     def _minimised(
@@ -123,8 +142,8 @@ class OutputError(Estimator[Simulator]):
             theta, found, steps, converged = self._descend(simulator, weights, theta, found, close)
             count += steps
             before, weights = weights, self._weigh(found)
-            change = np.abs(weights.sigma / before.sigma - 1.0).max()
-            if rounds > 1 and converged and max(change, _rho_change(before, weights)) < _SETTLED:
+            changes = weights.sigma / before.sigma - 1.0, weights.rho - before.rho
+            if rounds > 1 and converged and np.abs(changes).max() < _SETTLED:
                 break
             converged = False
         state = "converged" if converged else "not converged"
@@ -133,12 +152,7 @@ class OutputError(Estimator[Simulator]):
         return weights, theta, how
 
     def weights(self, simulator: Simulator, theta: Array) -> "_Weights":
-        """Return correlation and noise level of the residuals, their weights.
-
-        Args:
-            simulator: The simulator.
-            theta: Parameters, shape (c,).
-        """
+        """Return correlation and noise level of the residuals at parameters (c,)."""
         return self._weigh(self._left(simulator, theta))
 
     def _left(self, simulator: Simulator, theta: Array) -> Sequence[Residual]:
@@ -176,13 +190,9 @@ class OutputError(Estimator[Simulator]):
         return cost if np.isfinite(cost) else np.inf
 
     def joint_step(self, simulator: Simulator, theta: Array) -> Array:
-        """Return the parameters after a step of them together with the windows' initial states.
+        """Return parameters (c,) after a step together with the windows' initial states.
 
         They do not change if the simulation after the step fails.
-
-        Args:
-            simulator: The simulator.
-            theta: Parameters of the best fit with fixed initial states, shape (c,).
         """
         H, g = self.normal(simulator, self.weights(simulator, theta), theta, frees=True)
         moved = _bounded_step(H, g, theta, simulator.bounds, _CAUTIOUS)
@@ -198,10 +208,6 @@ class OutputError(Estimator[Simulator]):
         With fixed initial states the fit is biased, because these were fitted with earlier
         parameters. The standard errors of an estimate assume free initial states.
 
-        Args:
-            simulator: The simulator, with initial states fitted for the estimate.
-            estimate: Result of ``fit``.
-
         Raises:
             NotConvergedError: If the simulation after the step fails.
         """
@@ -213,16 +219,10 @@ class OutputError(Estimator[Simulator]):
         return settled
 
     def moved(self, simulator: Simulator, other: Simulator, theta: Array) -> tuple[Array, Array]:
-        """Return the first-order change of the estimate for other residuals, and standard errors.
+        """Return the first-order change of an estimate for other residuals, and standard errors.
 
-        Args:
-            simulator: The simulator.
-            other: The same simulator with other residuals, as of a smaller integration step.
-            theta: Parameters near the estimate, shape (c,).
-
-        Returns:
-            Change of the parameters, and standard errors for independent whitened residuals of
-            ``other``, both of shape (c,).
+        The other residuals are as of a smaller integration step. Standard errors are those for
+        independent whitened residuals of ``other``; both have shape (c,).
         """
         weights = self.weights(other, theta)
         (H, g), (_, changed) = (
@@ -239,13 +239,9 @@ class OutputError(Estimator[Simulator]):
     def normal(
         self, simulator: Simulator, weights: _Weights, theta: Array, *, frees: bool = False
     ) -> tuple[Array, Array]:
-        """Return H = A'A and A'b of the linearised problem, prior included.
+        """Return H = A'A and A'b of the linearised problem at parameters (c,), prior included.
 
-        Args:
-            simulator: The simulator.
-            weights: As from ``weights``.
-            theta: Parameters, shape (c,).
-            frees: Whether the effect of the windows' initial states is projected out.
+        With ``frees`` the effect of the windows' initial states is projected out.
         """
         return _summed(simulator, theta, linearised(simulator, weights, theta, frees=frees))
 
@@ -374,10 +370,6 @@ def _squares(arrays: Iterable[Array]) -> float:
     return float(sum((x * x).sum() for x in arrays))
 
 
-def _rho_change(before: _Weights, after: _Weights) -> float:
-    return float(np.abs(after.rho - before.rho).max())
-
-
 def linearised(
     simulator: Simulator, weights: _Weights, theta: Array, *, frees: bool = False
 ) -> Iterable[tuple[Array, Array, Array]]:
@@ -407,7 +399,9 @@ def _whitened(
     """Yield the whitened rows of residuals; see ``linearised``."""
     for r in found:
         b = weights.whiten(r.e, r.joints)
-        A = weights.whiten(_given(r), r.joints).reshape(b.size, -1)
+        if r.slopes is None:
+            raise DataError("the simulator returned no derivatives, wanted with_slopes=True")
+        A = weights.whiten(r.slopes, r.joints).reshape(b.size, -1)
         b = b.reshape(-1)
         if frees:
             U = _by_start(r, weights)
@@ -421,8 +415,7 @@ def _by_start(r: Residual, weights: _Weights) -> Array:
         return np.zeros((r.e[1:].size, 0))
     G = weights.whiten(r.by_start, r.joints).reshape(r.e[1:].size, -1)
     U, sizes, _ = np.linalg.svd(G, full_matrices=False)
-    basis: Array = U[:, sizes > _NO_TRACE]
-    return basis
+    return np.asarray(U[:, sizes > _NO_TRACE])
 
 
 def _freed(r: Residual) -> Array:
@@ -432,21 +425,13 @@ def _freed(r: Residual) -> Array:
     size = np.maximum(np.sqrt(np.mean(r.e**2, axis=0)), 1e-12)
     G = (r.by_start / size[:, None]).reshape(r.e.size, -1)
     moved = G @ np.linalg.lstsq(G, (r.e / size).reshape(-1), rcond=None)[0]
-    freed: Array = r.e - size * moved.reshape(r.e.shape)
-    return freed
-
-
-def _given(r: Residual) -> Array:
-    if r.slopes is None:
-        raise DataError("the simulator returned no derivatives, wanted with_slopes=True")
-    return r.slopes
+    return np.asarray(r.e - size * moved.reshape(r.e.shape))
 
 
 def is_at_bound(simulator: Simulator, theta: Array) -> Array:
     """Return which parameters are at a bound, shape (c,), bool: theta (c,)."""
     lowest, highest = simulator.bounds
-    at_bound: Array = (theta <= lowest) | (theta >= highest)
-    return at_bound
+    return np.asarray((theta <= lowest) | (theta >= highest))
 
 
 def _bounded_step(H: Array, g: Array, theta: Array, bounds: Array, damping: float) -> Array:
@@ -476,7 +461,7 @@ def _segments(
     With ``are_windows`` each window is about one segment: without feedback an early error persists
     until the end of the window.
     """
-    total = sum(len(b) for _, b, _ in found)
+    total, names = sum(len(b) for _, b, _ in found), tuple(map(str, range(c)))
     segments: list[Factors] = []
     for A, b, columns in found:
         cuts = max(1, round(_SEGMENTS * len(b) / total))
@@ -484,9 +469,5 @@ def _segments(
             cuts = math.ceil(FEWEST_SEGMENTS / len(found))
         for rows in np.array_split(np.arange(len(b)), cuts):
             triangle = triangle_of(np.column_stack([A[rows], b[rows]]))
-            segments.append(Factors((triangle,), (columns,), np.array([len(rows)]), _names(c)))
+            segments.append(Factors((triangle,), (columns,), np.array([len(rows)]), names))
     return segments
-
-
-def _names(count: int) -> tuple[str, ...]:
-    return tuple(map(str, range(count)))

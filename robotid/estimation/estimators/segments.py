@@ -24,8 +24,8 @@ _UNSEEN = 1e-12  # leverage of a direction, or share of a variance, that is roun
 class Scatter:
     """Scatter of the scores of s segments about 0, for c parameters.
 
-    With W the weighted rows of a segment and L L^T = bread, the leverages of the segment are the
-    eigenvalues of L^T W^T W L = Q diag(leverage) Q^T.
+    The leverages of a segment with weighted rows W are the eigenvalues of
+    L^T W^T W L = Q diag(leverage) Q^T.
     """
 
     meat: Array  # (c, c), covariance of the score W^T S^-1 (tau - W theta) of all segments
@@ -62,8 +62,7 @@ class Scatter:
             total = float(np.trace(gram))
             is_rounding = total <= _UNSEEN * float(squares[:, k].sum())  # of one segment alone
             freedom[k] = 1.0 if is_rounding else total**2 / float((gram**2).sum())
-        freedom = np.maximum(freedom, 1.0)
-        return freedom
+        return np.maximum(freedom, 1.0)
 
 
 def scatter(segments: Sequence[Factors], theta: Array, sigma: Array, bread: Array) -> Scatter:
@@ -72,10 +71,6 @@ def scatter(segments: Sequence[Factors], theta: Array, sigma: Array, bread: Arra
     The residual of a fitted segment is smaller than its noise. It is multiplied by
     (I - leverage)^-1/2, which is exact for independent rows (CR2). Directions that one segment
     alone determines have no scatter; the mean scatter of all others is used for them.
-
-    References:
-        Bell, McCaffrey (2002), as above; Liang, Zeger (1986), Longitudinal data analysis using
-        generalized linear models.
 
     theta (c,), sigma (n,) [N m or N], bread (c, c).
     """
@@ -115,34 +110,21 @@ def _root(covariance: Array) -> Array:
     deviation = np.sqrt(np.diag(covariance))
     scale = np.where(deviation > 0.0, deviation, 1.0)
     variances, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
-    root: Array = scale[:, None] * vectors * np.sqrt(np.maximum(variances, 0.0))
-    return root
+    return np.asarray(scale[:, None] * vectors * np.sqrt(np.maximum(variances, 0.0)))
 
 
 def sandwich(bread: Array, meat: Array) -> Array:
-    """Return the covariance bread meat bread^T of parameters (sandwich estimate).
-
-    bread (c, c), meat (c, c).
-    """
-    covariance: Array = bread @ meat @ bread.T
-    return covariance
+    """Return the covariance bread meat bread^T, (c, c), of parameters (sandwich estimate)."""
+    return np.asarray(bread @ meat @ bread.T)
 
 
 def at_least(covariance: Array, variance: Array) -> Array:
-    """Return a covariance with lower bounds on its variances; correlations are unchanged.
-
-    covariance (c, c), variance (c,).
-    """
-    own = np.sqrt(np.diag(covariance))
-    wider = np.maximum(own, np.sqrt(variance)) / own
-    grown: Array = covariance * np.outer(wider, wider)
-    return grown
+    """Return a covariance (c, c) with lower bounds (c,) on its variances, alike correlations."""
+    deviation = np.sqrt(np.diag(covariance))
+    wider = np.maximum(deviation, np.sqrt(variance)) / deviation
+    return np.asarray(covariance * np.outer(wider, wider))
 
 
 def quantile(freedom: Array) -> Array:
-    """Return the half-width of two-sided 95 % intervals in standard errors, shape (c,).
-
-    freedom (c,).
-    """
-    quantiles: Array = scipy.special.stdtrit(freedom, 0.975)
-    return quantiles
+    """Return the half-width of two-sided 95 % intervals in standard errors, shape (c,)."""
+    return np.asarray(scipy.special.stdtrit(freedom, 0.975))

@@ -34,47 +34,27 @@ _LONGEST = 1.0  # largest step of the logarithm of a gain
 
 @dataclass(frozen=True, eq=False)
 class Compared:
-    """Result of the comparison of two runs.
+    """Result of the comparison of two runs."""
 
-    Attributes:
-        theta: beta and x, shape (b + d,), SI units.
-        gain: Gain k of each joint's signal, shape (n,) [N m/A]; 1 for a torque.
-        covariance: Covariance of beta, x and the logarithms of the u unknown gains,
-            shape (b + d + u, b + d + u).
-        freedom: Degrees of freedom of their standard errors, shape (b + d + u,).
-        unexplained: Residual of each joint over its torque, shape (n,) [-].
-    """
-
-    theta: Array
-    gain: Array
-    covariance: Array
-    freedom: Array
-    unexplained: Array
+    theta: Array  # (b + d,), beta and x, SI units
+    gain: Array  # (n,), gain k of each joint's signal [N m/A]; 1 for a torque
+    covariance: Array  # (b + d + u, ...), of beta, x and the logarithms of the unknown gains
+    freedom: Array  # (b + d + u,), of their standard errors
+    unexplained: Array  # (n,), residual of each joint over its torque [-]
 
 
 @dataclass(frozen=True, eq=False)
 class TwoRuns:
-    """Factors of two runs, and the prior of their difference.
+    """Factors of two runs, and the prior of their difference."""
 
-    Attributes:
-        reference: Factors of the segments of the reference run, of b base parameters.
-        loaded: Factors of the segments of the loaded run.
-        D: Columns of the difference in base parameters, shape (b, d).
-        known: Known part c of the difference, shape (b,).
-        mean: Prior mean of beta and x, shape (b + d,).
-        precision: Prior precision (inverse covariance), shape (b + d, b + d), positive definite.
-        share: Share of independent rows [-].
-        unknown: Joints whose gain is unknown, shape (u,), int.
-    """
-
-    reference: tuple[Factors, ...]
-    loaded: tuple[Factors, ...]
-    D: Array
-    known: Array
-    mean: Array
-    precision: Array
-    share: float
-    unknown: Array
+    reference: tuple[Factors, ...]  # of the segments of the reference run, of b base parameters
+    loaded: tuple[Factors, ...]  # of those of the loaded run
+    D: Array  # (b, d), columns of the difference in base parameters
+    known: Array  # (b,), known part c of the difference
+    mean: Array  # (b + d,), prior mean of beta and x
+    precision: Array  # (b + d, b + d), prior precision (inverse covariance), positive definite
+    share: float  # of independent rows [-]
+    unknown: Array  # (u,), int: joints whose gain is unknown
 
     def compare(self, *, by_joint: bool = True) -> Compared:
         """Fit both runs and the unknown gains together.
@@ -116,16 +96,12 @@ class TwoRuns:
         return self._minimum(self._both(gain), self._level(gain))
 
     def residual_ratios(self, theta: Array) -> Array:
-        """Return the joint residual of both runs over that of separate fits, shape (n,) [-].
-
-        theta (b + d,).
-        """
+        """Return the joint residual of both runs over that of separate fits: (b + d,) -> (n,)."""
         b = len(self.known)
         without, loaded = self._whole
         other = theta[:b] + self.known + self.D @ theta[b:]
         together = without.residual_squares(theta[:b]) + loaded.residual_squares(other)
-        ratio: Array = together / np.maximum(self._own_squares, 1e-300)
-        return ratio
+        return np.asarray(together / np.maximum(self._own_squares, 1e-300))
 
     def residual_ratios_by_scales(self, free: int) -> Array:
         """Return these ratios if the runs differ by the scale of torques instead of x."""
@@ -146,8 +122,7 @@ class TwoRuns:
 
     def _level(self, gain: Array) -> Array:
         """Return noise levels for rows treated as independent, shape (n,) [N m or N]."""
-        level: Array = np.abs(gain) * self._noise / np.sqrt(self.share)
-        return level
+        return np.asarray(np.abs(gain) * self._noise / np.sqrt(self.share))
 
     @cached_property
     def _whole(self) -> tuple[Factors, Factors]:
@@ -162,37 +137,30 @@ class TwoRuns:
     @cached_property
     def _own_squares(self) -> Array:
         """Residual sums of squares of separate fits for each joint and run, shape (n,)."""
-        own: Array = np.sum(
-            [[R[-1, -1] ** 2 for R in run.triangles] for run in self._whole], axis=0
-        )
-        return own
+        squares = [[R[-1, -1] ** 2 for R in run.triangles] for run in self._whole]
+        return np.asarray(np.sum(squares, axis=0))
 
     @cached_property
     def _noise(self) -> Array:
-        """Noise level of each joint's signal, shape (n,), above 0.
+        """Noise level of each joint's signal from separate fits of the runs, shape (n,), above 0.
 
         If a joint moves in a few rows only, its residual is 0 whatever its noise; its RMS signal is
         used then. Rows that are projected together have one noise level.
         """
+        rows, squares = np.maximum(self._logged.rows, 1), self._own_squares
+        used = np.array([len(columns) for columns in self._logged.columns])
+        torque = self._logged.torque_squares()
         if self._logged.is_projected:
-            return self._common_noise
-        rows = np.maximum(self._logged.rows, 1)
-        used = len(self._whole) * np.array([len(own) for own in self._logged.columns])
+            one = np.ones(len(rows))
+            squares = sum(run.weighted(one)[-1, -1] ** 2 for run in self._whole) * one
+            rows, used = max(self._logged.rows.sum(), 1) * one, len(self.known) * one
+            torque = torque.sum() * one
+        used = len(self._whole) * used
         freedom = np.maximum(rows - used / self.share, _LEAST_FREEDOM * rows)
-        signal = np.sqrt(self._logged.torque_squares() / rows)
-        left = np.where(self.share * rows > used, np.sqrt(self._own_squares / freedom), signal)
-        noise: Array = np.maximum(left, _FLOOR * signal)
-        return np.where(noise > 0, noise, 1.0)
-
-    @cached_property
-    def _common_noise(self) -> Array:
-        """Noise level of all rows together from a separate fit of each run, shape (n,)."""
-        one, count = np.ones(len(self._logged.rows)), int(self._logged.rows.sum())
-        squares = sum(run.weighted(one)[-1, -1] ** 2 for run in self._whole)
-        used = len(self._whole) * len(self.known)
-        freedom = max(count - used / self.share, _LEAST_FREEDOM * count)
-        signal = np.sqrt(self._logged.torque_squares().sum() / max(count, 1))
-        noise: Array = max(np.sqrt(squares / max(freedom, 1.0)), _FLOOR * signal) * one
+        signal = np.sqrt(torque / rows)
+        is_seen = self._logged.is_projected | (self.share * rows > used)
+        noise = np.where(is_seen, np.sqrt(squares / freedom), signal)
+        noise = np.maximum(noise, _FLOOR * signal)
         return np.where(noise > 0, noise, 1.0)
 
     def _first_gains(self) -> Array:
@@ -214,10 +182,7 @@ class TwoRuns:
     def _extended(
         self, run: Factors, loaded: int, gain: Array, at: Array | None, is_start: bool = False
     ) -> Factors:
-        """Return factors with the columns of beta, x and the unknown gains.
-
-        gain (n,), at (b + d,).
-        """
+        """Return factors with the columns of beta, x and the gains: gain (n,), at (b + d,)."""
         S, c = np.hstack([np.eye(len(self.known)), loaded * self.D]), loaded * self.known
         unknown = self.unknown.tolist() if at is not None or is_start else []
         added = range(S.shape[1] - len(S) + len(unknown))
@@ -294,9 +259,9 @@ class TwoRuns:
 
 def _of_joint(factors: Factors, joint: int) -> Factors:
     """Return the factors with the rows of one joint only."""
-    triangles = [R if j == joint else 0.0 * R for j, R in enumerate(factors.triangles)]
+    triangles = tuple(R if j == joint else 0.0 * R for j, R in enumerate(factors.triangles))
     rows = np.where(np.arange(len(factors.rows)) == joint, factors.rows, 0)
-    return replace(factors, triangles=tuple(triangles), rows=rows)
+    return replace(factors, triangles=triangles, rows=rows)
 
 
 def payload_runs(
@@ -314,9 +279,8 @@ def payload_runs(
     """Return the comparison of a run without and a run with payloads.
 
     The robot's inertias are the same in both runs. Friction and offsets of the drives differ,
-    because they change with load and temperature.
-
-    K (b, p), urdf (p,), spread (p,), payloads (b, c).
+    because they change with load and temperature. K (b, p), urdf (p,), spread (p,); payloads are
+    columns (b, c), known values (c,), NaN for unknown ones, and their spread (c,).
     """
     columns, known, size = payloads
     changing = [not term.is_inertia for _, term in layout.drive_parameters]

@@ -495,7 +495,7 @@ def consistent_fit(settings: BoundedSettings, known: Known) -> "Consistent":
     """Return the physically consistent estimator, which can also project an estimate."""
     from robotid.dynamics.factors import gather
     from robotid.estimation.estimators import Consistent
-    from robotid.estimation.estimators.consistent.weighting import (
+    from robotid.estimation.estimators.prior_weight import (
         AS_GOOD,
         Segments,
         choose_weight,

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from robotid.base.arguments import checked, real_numbers
+from robotid.base.arguments import real_numbers
 from robotid.base.exceptions import DataError, SettingsError
 from robotid.base.findings import listed
 from robotid.base.settings import is_number, require_kind
@@ -368,6 +368,7 @@ class Fit(Identified, Solution):
             evaluation: A recording; if it is not one of this fit, the band has the fit's noise,
                 and the spread of the drives between three or more fitted logs.
         """
+        require_kind(evaluation, Evaluation, "evaluation", "an evaluation of recordings")
         every = zip((*self.fitted, *self.validation), self._bands, strict=True)
         own = next((band for e, band in every if e is evaluation), None)
         return expected_band(self, evaluation, self.between) if own is None else own
@@ -440,7 +441,6 @@ class Fit(Identified, Solution):
         )
 
 
-@checked("evaluation")
 def expected_band(found: Fit, evaluation: Evaluation, between: Array | None = None) -> TorqueBand:
     """Return the torque band of a recording by the fit's noise level, not by its own residual.
 

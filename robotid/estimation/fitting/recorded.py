@@ -114,7 +114,7 @@ class Recordings:
             reduced = self._segments if is_cut else self._whole
             return tuple(tuple(reduced(k)) for k in range(len(self.fitted)))
         plan = self.plan or WorkPlan()
-        found = iter(plan.reduce(self.pieces))
+        found = plan.map(ReducedPiece.reduce, self.pieces, "reducing")
         reductions = []
         size = 8 * self.model.n_rows * (len(self.mapping.independent) + 1) ** 2 * len(self.fitted)
         most = max(_FEW, min(_SEGMENTS_IN_FILE, _FACTORS // size))

@@ -42,7 +42,7 @@ from robotid.dynamics.factors import Reduction
 from robotid.dynamics.prediction import is_loaded, remember
 from robotid.dynamics.rows import COMPILED, choose_engine
 from robotid.dynamics.used_rows import base_problem, prefers_measured, row_mask, static_rows
-from robotid.estimation.workers.pieces import Piece, Workload
+from robotid.estimation.workers.pools import Workload
 from robotid.robot.model import RobotModel
 
 #: Default number of rows of a piece.
@@ -167,12 +167,13 @@ class PieceTask(Workload):
 
 
 @dataclass(frozen=True, eq=False)
-class ReducedPiece(PieceTask, Piece):
+class ReducedPiece(PieceTask):
     """The reduction of a piece to factors of base parameters."""
 
     mapping: BaseMapping
 
-    def reduce(self, *, threads: int | None = None) -> Reduction:
+    def reduce(self, threads: int | None = None) -> Reduction:
+        """Return the factors of the piece; of no samples if none are usable."""
         header, rows = self.piece.header, self.piece.read()
         motion, compiled = rows.trajectory, header.is_compiled
         problem = base_problem(header.model, self.mapping, motion, rows.mask, compiled=compiled)

@@ -1,20 +1,19 @@
-"""Distribution of work to workers, with progress and checkpoints."""
+"""Distribution of work to workers, with progress."""
 
 import logging
 from collections.abc import Iterator, Sequence
-from contextlib import closing, contextmanager
+from contextlib import closing
 from dataclasses import dataclass, field
 from typing import Any, Self
 
 from robotid.base.typing import ProgressCallback, ignore_progress
-from robotid.dynamics.factors import Reduction, available_cores
-from robotid.estimation.workers.checkpoint import Checkpoint
-from robotid.estimation.workers.cluster import ClusterBackend
-from robotid.estimation.workers.pieces import Lost, Piece, Work, Workload, reduce_piece
-from robotid.estimation.workers.processes import (
-    Backend,
-    ProcessBackend,
-    SerialBackend,
+from robotid.dynamics.factors import available_cores
+from robotid.estimation.workers.pools import (
+    Lost,
+    Pool,
+    Work,
+    Workload,
+    noted,
     require_workers,
 )
 
@@ -32,9 +31,8 @@ class WorkPlan:
 
     workers: int | None = 1  # worker processes; None: one per core for long work
     scheduler: str | None = None  # address of a Dask scheduler, whose workers are used instead
-    resume: bool = False  # whether an interrupted fleet continues from its checkpoint
     progress: ProgressCallback | None = None  # called with work, samples done, total, "samples"
-    _reused: Backend | None = field(default=None, init=False, repr=False)
+    _pool: Pool | None = field(default=None, init=False, repr=False)
     _reuses: bool = field(default=False, init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -52,86 +50,61 @@ class WorkPlan:
 
     def __exit__(self, *_: object) -> None:
         self._reuses = False
-        if self._reused is not None:
-            self._reused.close()
-            self._reused = None
+        self._close()
 
-    @contextmanager
-    def _backend(self, pieces: Sequence[Workload]) -> Iterator[Backend]:
-        """Yield the cluster, worker processes, or this process."""
-        backend = self._reused or self._choose(pieces)
-        if self._reuses and not isinstance(backend, SerialBackend):
-            self._reused = backend
-            yield backend
-            return
-        with backend:
-            yield backend
+    def map(self, work: Work, pieces: Sequence[Workload], what: str) -> Iterator[Any]:
+        """Process every piece and yield the results in order, in memory only if they are early."""
+        early: dict[int, Any] = {}
+        following = 0
+        for index, result in self.as_finished(work, pieces, what):
+            early[index] = result
+            while following in early:
+                yield early.pop(following)
+                following += 1
 
-    def _choose(self, pieces: Sequence[Workload]) -> Backend:
-        if self.scheduler is not None:
-            return ClusterBackend(self.scheduler)
-        workers = choose_workers(pieces, self.workers)
-        return ProcessBackend(workers) if workers > 1 else SerialBackend()
-
-    def reduce(self, pieces: Sequence[Piece]) -> Iterator[Reduction]:
-        """Yield one reduction per piece, in order, as ``map`` does; ``join`` combines them."""
-        return self.map(reduce_piece, pieces, "reducing")
-
-    def map(
+    def as_finished(
         self,
         work: Work,
         pieces: Sequence[Workload],
         what: str,
         *,
-        checkpoint: Checkpoint | None = None,
         counted: str = "samples",
         lost: Lost | None = None,
-    ) -> Iterator[Any]:
-        """Process every piece by the chosen workers; yields results as ``map_pieces`` does."""
-        with self._backend(pieces) as backend:
-            yield from map_pieces(
-                work, pieces, what, backend=backend, progress=self.progress,
-                checkpoint=checkpoint, counted=counted, lost=lost,
-            )  # fmt: skip
+    ) -> Iterator[tuple[int, Any]]:
+        """Process every piece; yield index and result of each as it is finished."""
+        report, done = self.progress or ignore_progress, 0
+        total = sum(piece.samples for piece in pieces)
+        pool = self._pool or self._choose(pieces)
+        how = "this process" if pool is None else pool.description
+        _log.info("%s %d pieces, %d %s in total: %s", what, len(pieces), total, counted, how)
+        report(what, done, total, counted)
+        every = enumerate(pieces)
+        results = _here(work, every) if pool is None else pool.run(work, every, lost)
+        self._pool = pool
+        try:
+            with closing(results):  # type: ignore[type-var]
+                for left in reversed(range(len(pieces))):
+                    index, result = next(results)
+                    if not left:
+                        next(results, None)  # ends the iterator: closing it would stop the workers
+                    done += pieces[index].samples
+                    report(what, done, total, counted)
+                    yield index, result
+        finally:
+            if not self._reuses:
+                self._close()
 
+    def _choose(self, pieces: Sequence[Workload]) -> Pool | None:
+        """Return the cluster, worker processes, or None for this process."""
+        if self.scheduler is not None:
+            return Pool(scheduler=self.scheduler)
+        workers = choose_workers(pieces, self.workers)
+        return Pool(workers) if workers > 1 else None
 
-def map_pieces(
-    work: Work,
-    pieces: Sequence[Workload],
-    what: str,
-    *,
-    backend: Backend | None = None,
-    progress: ProgressCallback | None = None,
-    checkpoint: Checkpoint | None = None,
-    counted: str = "samples",
-    lost: Lost | None = None,
-) -> Iterator[Any]:
-    """Process every piece; only results that are ahead of their order are in memory."""
-    chosen, report = backend or SerialBackend(), progress or ignore_progress
-    stored = frozenset() if checkpoint is None else checkpoint.finished()
-    missing = [(k, piece) for k, piece in enumerate(pieces) if k not in stored]
-    total = sum(piece.samples for piece in pieces)
-    done = total - sum(piece.samples for _, piece in missing)
-    _log.info(
-        "%s %d pieces, %d of them finished before, %d %s in total: %s",
-        what, len(pieces), len(stored), total, counted, chosen.description,
-    )  # fmt: skip
-    report(what, done, total, counted)
-    early: dict[int, Any] = {}
-    left = len(missing)
-    with _resumable(checkpoint), closing(chosen.run(work, missing, lost)) as finished:  # type: ignore[type-var]
-        for k in range(len(pieces)):
-            while k not in stored and k not in early:
-                index, result = next(finished)
-                early[index] = result
-                if checkpoint is not None:
-                    checkpoint.save(index, pieces[index].name, result)
-                done += pieces[index].samples
-                report(what, done, total, counted)
-                left -= 1
-                if not left:
-                    next(finished, None)  # ends the iterator, so that the work is not cancelled
-            yield early.pop(k) if checkpoint is None or k not in stored else checkpoint.load(k)
+    def _close(self) -> None:
+        pool, self._pool = self._pool, None
+        if pool is not None:
+            pool.close()
 
 
 def choose_workers(pieces: Sequence[Workload], workers: int | None = None) -> int:
@@ -145,16 +118,9 @@ def choose_workers(pieces: Sequence[Workload], workers: int | None = None) -> in
     return max(1, min(require_workers(workers), len(pieces)))
 
 
-@contextmanager
-def _resumable(checkpoint: Checkpoint | None) -> Iterator[None]:
-    """Add a note with the folder of the checkpoint to an error that stops the work."""
-    try:
-        yield
-    except GeneratorExit:
-        raise
-    except BaseException as error:
-        if checkpoint is not None and checkpoint.folder.is_dir():
-            error.add_note(
-                f"finished pieces are stored in {checkpoint.folder}. Continue with --resume"
-            )
-        raise
+def _here(work: Work, pieces: Iterator[tuple[int, Workload]]) -> Iterator[tuple[int, Any]]:
+    """Process the pieces one after the other in this process."""
+    for index, piece in pieces:
+        with noted(f"while processing {piece.name}"):
+            result = work(piece, None)
+        yield index, result

@@ -10,7 +10,7 @@ from robotid.base.exceptions import NotConvergedError
 from robotid.base.typing import Array
 from robotid.data.filters import local_polynomial
 from robotid.dynamics.simulation.loops import ClosedLoopRobot, Column, Loops, RollOut, Window
-from robotid.estimation.estimators.simulator import Residual
+from robotid.estimation.estimators.output_error import Residual
 from robotid.robot.drive_term import DriveTerm
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import inertial_from_pseudo_inertia, pseudo_inertia

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from robotid.base.arguments import checked
 from robotid.base.exceptions import DataError, ModelError
 from robotid.base.files import check_path, moved_file, read_json
 from robotid.base.findings import listed
@@ -229,7 +228,6 @@ class Result:
             raise DataError(f"{log.name} has no commands, columns qref_ of each joint")
         return self._signs * self.open_loop(log, horizons=()).q
 
-    @checked()
     def open_loop(
         self, log: Log, *, horizons: Sequence[float] | None = None
     ) -> "PositionEvaluation":
@@ -247,6 +245,7 @@ class Result:
             NotConvergedError: If a step has no solution.
             SettingsError: If a term of the drives cannot be simulated.
         """
+        require_kind(log, Log, "log", "a robotid.Log")
         from robotid.dynamics.simulation.loops import ClosedLoopRobot, open_loops
         from robotid.identification.closed_loop.position_errors import HORIZONS, run_open_loop
 

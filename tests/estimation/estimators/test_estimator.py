@@ -47,16 +47,6 @@ def test_text_states_value_and_error_of_each_parameter():
     assert repr(ESTIMATE) == f"<{head}>"
 
 
-def test_html_states_value_and_error_of_each_parameter():
-    rows = re.findall("<tr>(.*?)</tr>", ESTIMATE._repr_html_())[1:]
-    cells = [re.findall("<t[hd].*?>(.*?)</t[hd]>", row) for row in rows]
-    assert [[cell.replace("<wbr>", "") for cell in row] for row in cells] == [
-        ["a.m", "1.5", "0.1"],
-        ["b.viscous", "\N{MINUS SIGN}20", "3"],
-        ["c.offset", "0.25", "\N{EN DASH}"],
-    ]
-
-
 @pytest.mark.parametrize(
     ("estimator", "weighing"),
     [

@@ -7,8 +7,7 @@ from scipy.signal import lfilter
 
 from robotid.base.exceptions import DataError, NotConvergedError
 from robotid.estimation.estimators import Estimator, output_error
-from robotid.estimation.estimators.output_error import OutputError, _freed, linearised
-from robotid.estimation.estimators.simulator import Residual
+from robotid.estimation.estimators.output_error import OutputError, Residual, _freed, linearised
 
 DT, RHO, SIGMA = 0.02, 0.9, 0.02
 TRUTH = np.array([1.5, 0.3, 0.1])  # gain, time constant [s], offset

@@ -1,1 +1,1 @@
-"""The physically consistent fit: cone, prior, convex programme, log-Cholesky coordinates."""
+"""The physically consistent fit: constraints of bodies, interior-point method, estimator."""

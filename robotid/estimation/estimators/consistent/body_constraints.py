@@ -19,35 +19,23 @@ _ROUNDING = 1e-9  # [kg], [m]: tolerance for a pinned body outside its bounds
 
 @dataclass(frozen=True, eq=False)
 class Bounds:
-    """The points x with G x + h >= 0.
+    """The points x with G x + h >= 0."""
 
-    Attributes:
-        G: Coefficients, shape (k, p).
-        h: Constants, shape (k,).
-        labels: Family and owner of each row, as "mass forearm".
-    """
+    G: Array  # (k, p)
+    h: Array  # (k,)
+    labels: tuple[str, ...]  # family and owner of each row, as "mass forearm"
 
-    G: Array
-    h: Array
-    labels: tuple[str, ...]
-
-    def active(self, x: Array, tolerance: float) -> tuple[Array, tuple[str, ...]]:
-        """Return coefficients (a, p) and labels of the rows that are active at x (p,)."""
-        rows = np.flatnonzero(self.G @ x + self.h < tolerance)
-        return self.G[rows], tuple(self.labels[k] for k in rows)
+    def active(self, x: Array, tolerance: float) -> tuple[str, ...]:
+        """Return the labels of the rows that are active at x (p,)."""
+        return tuple(self.labels[k] for k in np.flatnonzero(self.G @ x + self.h < tolerance))
 
 
 @dataclass(frozen=True, eq=False)
 class Subspace:
-    """The subspace x = origin + basis y of the points that meet equalities.
+    """The subspace x = origin + basis y of the points that meet equalities."""
 
-    Attributes:
-        origin: A point that meets them, shape (p,).
-        basis: Free directions, shape (p, r), orthonormal.
-    """
-
-    origin: Array
-    basis: Array
+    origin: Array  # (p,), a point that meets them
+    basis: Array  # (p, r), free directions, orthonormal
 
     @classmethod
     def of(cls, E: Array, e: Array) -> "Subspace":
@@ -66,8 +54,7 @@ class Subspace:
     def fixed(self) -> Array:
         """Fixed directions, shape (p, p - r), orthonormal."""
         p, r = self.basis.shape
-        fixed: Array = np.zeros((p, 0)) if r == p else scipy.linalg.null_space(self.basis.T)
-        return fixed
+        return np.asarray(np.zeros((p, 0)) if r == p else scipy.linalg.null_space(self.basis.T))
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,26 +80,15 @@ class Constraints:
     relaxed: tuple[str, ...] = ()
 
     def without_extent(self, bodies: Iterable[str]) -> "Constraints":
-        """Return the same constraints without the extents of some bodies.
-
-        Args:
-            bodies: Names of the bodies.
-        """
+        """Return the same constraints without the extents of some bodies."""
         relaxed = tuple(body for body in self.extent if body in set(bodies))
         others = {body: box for body, box in self.extent.items() if body not in relaxed}
         return replace(self, extent=others, relaxed=(*self.relaxed, *relaxed))
 
     def check(self, layout: ParameterLayout, prior: Array, held: Array) -> None:
-        """Check that the bounds do not contradict each other, before a solver is called.
+        """Refuse unknown bodies and bounds that contradict each other, before the solver runs.
 
-        Args:
-            layout: The standard parameters.
-            prior: Their prior values, shape (p,).
-            held: Known part of each body, shape (10 bodies,).
-
-        Raises:
-            SettingsError: If a body is unknown, bounds contradict each other, or a pinned body is
-                outside its bounds or not physically consistent.
+        prior (p,), held (10 bodies,).
         """
         known = {*self.mass, *self.com, *self.extent, *self.pinned}
         unknown = sorted(known - set(layout.bodies))
@@ -139,12 +115,7 @@ class Constraints:
             self._check_total(self.total_mass, dict(zip(layout.bodies, values[:, 0], strict=True)))
 
     def bounds(self, layout: ParameterLayout, scale: Array) -> Bounds:
-        """Return signs of drives and ranges as rows of x = pi / scale, without pinned bodies.
-
-        Args:
-            layout: The standard parameters.
-            scale: Unit of each parameter, shape (p,).
-        """
+        """Return signs of drives and ranges as rows of x = pi / scale, without pinned bodies."""
         p = len(layout.names)
         signs = np.flatnonzero(layout.is_nonnegative())
         labels = [f"drive_signs {layout.names[i]}" for i in signs]
@@ -157,15 +128,7 @@ class Constraints:
         return Bounds(np.vstack(G), np.concatenate(h), tuple(labels))
 
     def equalities(self, layout: ParameterLayout, prior: Array) -> tuple[Array, Array]:
-        """Return the equalities E pi = e: pinned bodies, and masses given as one value.
-
-        Args:
-            layout: The standard parameters.
-            prior: Their prior values, shape (p,).
-
-        Returns:
-            E, shape (k, p), and e, shape (k,).
-        """
+        """Return the equalities E pi = e (k,): pinned bodies, and masses given as one value."""
         p = len(layout.names)
         pinned = np.flatnonzero(np.repeat(np.isin(layout.bodies, self.pinned), 10))
         E, e = [np.eye(p)[pinned]], [prior[pinned]]

@@ -43,10 +43,7 @@ _FACTORS = np.where(_ROWS == _COLUMNS, 1.0, np.sqrt(2.0))
 
 
 def svec(S: Array) -> Array:
-    """Return upper triangles by columns, shape (..., 10), off-diagonals times sqrt 2.
-
-    S (..., 4, 4).
-    """
+    """Return upper triangles of (..., 4, 4) by columns, (..., 10), off-diagonals times sqrt 2."""
     return S[..., _ROWS, _COLUMNS] * _FACTORS
 
 
@@ -75,29 +72,17 @@ class Minimum:
 
 @dataclass(frozen=True, eq=False)
 class EntropicProblem:
-    """The problem without its data and weight; x is in units of a scale.
+    """The problem without its data and weight; x is in units of a scale."""
 
-    Attributes:
-        scale: Unit of each parameter, shape (p,).
-        held: Known part of each body's parameters, shape (10 n,), in these units.
-        P: Pseudo-inertias of the prior without the known parts, shape (n, 4, 4), positive definite.
-        centre: c, where the penalty is 0, shape (p,).
-        stiffness: D of the drives, shape (p - 10 n,).
-        G: Coefficients of the inequalities, shape (k, p).
-        h: Their constants, shape (k,).
-        N: Directions fixed by equalities, shape (p, e), orthonormal.
-        origin: o, a point that meets the equalities, shape (p,).
-    """
-
-    scale: Array
-    held: Array
-    P: Array
-    centre: Array
-    stiffness: Array
-    G: Array
-    h: Array
-    N: Array
-    origin: Array
+    scale: Array  # (p,), unit of each parameter
+    held: Array  # (10 n,), known part of each body's parameters, in these units
+    P: Array  # (n, 4, 4), pseudo-inertias of the prior without the known parts
+    centre: Array  # (p,), c, where the penalty is 0
+    stiffness: Array  # (p - 10 n,), D of the drives
+    G: Array  # (k, p), coefficients of the inequalities
+    h: Array  # (k,), their constants
+    N: Array  # (p, e), directions fixed by equalities, orthonormal
+    origin: Array  # (p,), o, a point that meets the equalities
 
     def minimise(
         self,
@@ -190,7 +175,7 @@ class _Point:
 
     def of(self, which: Array) -> "_Point":
         """Return the points of some data sets."""
-        return _Point(self.x[which], self.Z[which], self.s[which], self.multipliers[which])
+        return _Point(*(getattr(self, key)[which] for key in ("x", "Z", "s", "multipliers")))
 
 
 @dataclass(frozen=True, eq=False)
@@ -287,10 +272,7 @@ class _System:
         cross: Array | None = None,
         pairs: Array | float = 0.0,
     ) -> _Direction:
-        """Return the steps to the point with Z J = t 1 and lambda s = mu.
-
-        t (f, 1), mu (f, 1), cross (f, n, 4, 4), pairs (f, k).
-        """
+        """Return the steps to Z J = t 1, lambda s = mu: t, mu (f, 1), cross as J, pairs as s."""
         point, length, size = self.point, self.length, self.problem.inertial
         bodies = np.zeros_like(self.R_inverse)  # sum of the changes of J and Z, plus diag(l)
         if cross is not None:
@@ -324,10 +306,7 @@ class _System:
         return np.array([scipy.linalg.lapack.dpotrs(L, b, lower=True)[0] for L, b in pairs])
 
     def corrected(self, ahead: _Direction, share: Array) -> _Point:
-        """Return the points after a corrected step (Mehrotra's predictor and corrector).
-
-        share (f,).
-        """
+        """Return the points after a corrected step (Mehrotra's predictor and corrector)."""
         point, share = self.point, share[:, None]
         mean = (self.length**2).mean(axis=(1, 2))[:, None]
         mu = _mean(point.multipliers * point.s)
@@ -369,8 +348,7 @@ class _System:
         """Return whether the step to each minimum is negligible, shape (f,), bool: share (f,)."""
         nothing = tolerance * (1.0 + self.value)
         decrease = (_times(self.A, ahead.z) ** 2).sum(axis=1) + (ahead.z**2).sum(axis=1)
-        settled: Array = (share > 0.5) & (decrease <= nothing)
-        return settled
+        return np.asarray((share > 0.5) & (decrease <= nothing))
 
 
 def _root(A: Array) -> Array:

@@ -5,8 +5,8 @@ import pytest
 import scipy.stats
 
 from robotid.estimation.estimators.consistent.body_constraints import Bounds, Subspace
+from robotid.estimation.estimators.consistent.consistent_fit import Entropic
 from robotid.estimation.estimators.consistent.interior_point import svec, unsvec
-from robotid.estimation.estimators.consistent.programme import Entropic
 from robotid.robot.parameters import (
     ParameterLayout,
     inertial_from_pseudo_inertia,
@@ -152,6 +152,4 @@ def test_a_subspace_holds_what_the_equalities_say(rng):
 
 def test_a_bound_is_active_at_its_face_only():
     bounds = Bounds(np.array([[2.0, 0.0], [0.0, 1.0]]), np.array([-2.0, 0.0]), ("a", "b"))
-    gradients, labels = bounds.active(np.array([1.0, 5.0]), 1e-6)
-    np.testing.assert_allclose(gradients, [[2.0, 0.0]])
-    assert labels == ("a",)
+    assert bounds.active(np.array([1.0, 5.0]), 1e-6) == ("a",)

@@ -18,8 +18,8 @@ from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.factors import compress, compress_segments, gather, merge
 from robotid.dynamics.torque import build_problem
 from robotid.estimation.estimators import Consistent
-from robotid.estimation.estimators.consistent import weighting
-from robotid.estimation.estimators.consistent.weighting import (
+from robotid.estimation.estimators import prior_weight as weighting
+from robotid.estimation.estimators.prior_weight import (
     Segments,
     _is_as_good,
     choose_weight,
@@ -171,9 +171,7 @@ def chosen(case, monkeypatch, excess):
     def errors(fit, segments, w, starts):
         return (1.0 + abs(np.log10(w)) * np.asarray(excess)) / 6.0, []
 
-    monkeypatch.setattr(
-        "robotid.estimation.estimators.consistent.weighting.held_out_errors", errors
-    )
+    monkeypatch.setattr("robotid.estimation.estimators.prior_weight.held_out_errors", errors)
     return choose_weight(fit, Segments.of(fit, cut(problem, 6)), "cv")
 
 
@@ -212,9 +210,7 @@ def test_a_joint_at_rest_is_left_out_of_the_choice(case, monkeypatch):
         squares = (1.0 + abs(np.log10(w) + 2.0) * (0.009 + CHANCE)) / 6.0
         return np.hstack([squares, np.zeros_like(squares)]), []
 
-    monkeypatch.setattr(
-        "robotid.estimation.estimators.consistent.weighting.held_out_errors", errors
-    )
+    monkeypatch.setattr("robotid.estimation.estimators.prior_weight.held_out_errors", errors)
     choice = choose_weight(fit, Segments.of(fit, cut(problem, 6)), "cv")
     assert choice.weight == pytest.approx(100.0)
     assert choice.curve[-1][1] == pytest.approx(np.sqrt(1.036))
@@ -402,9 +398,7 @@ def test_an_extent_is_contradicted_by_four_errors_two_percent_and_two_errors_of_
         left = np.ones((8, 1)) if fit.constraints == "free" else ratio + swing[:, None]
         return left, []
 
-    monkeypatch.setattr(
-        "robotid.estimation.estimators.consistent.weighting.held_out_errors", held_out
-    )
+    monkeypatch.setattr("robotid.estimation.estimators.prior_weight.held_out_errors", held_out)
     segments = SimpleNamespace(rows=None, folds=[None] * 8)
     assert contradicted_extents(fit, segments) == named
 

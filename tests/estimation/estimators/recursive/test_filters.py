@@ -9,8 +9,8 @@ from robotid.base.exceptions import DataError, RankDeficientError
 from robotid.dynamics.problem import Problem, Sample
 from robotid.dynamics.torque import build_problem, joint_torque_regressor
 from robotid.estimation.estimators import OLS, RLS, WLS, Kalman, fold
-from robotid.estimation.estimators.recursive import filters
-from robotid.estimation.estimators.recursive.filters import KalmanState
+from robotid.estimation.estimators import recursive as filters
+from robotid.estimation.estimators.recursive import KalmanState
 
 NAMES = ("a", "b", "c")
 
@@ -315,7 +315,8 @@ def test_a_walk_is_in_units_of_each_parameter_s_own_spread():
     P = np.array([[2.0, 0.5], [0.5, 3.0]])
     for spread in (np.array([0.3, 7.0]), np.array([[0.09, 0.2], [0.2, 49.0]])):
         kalman = Kalman(np.ones(2), np.zeros(2), spread, walk=0.1)
-        walked = kalman._walked(P)
+        still = Sample(np.zeros((2, 2)), np.zeros(2), np.zeros(2))
+        walked = kalman.update(replace(kalman.init(2), P=P), still).P
         np.testing.assert_allclose(walked, P + np.diag([0.0009, 0.49]))
     np.testing.assert_array_equal(P, [[2.0, 0.5], [0.5, 3.0]])
 

@@ -14,7 +14,7 @@ from robotid.base.exceptions import DataError
 from robotid.base.typing import Array
 from robotid.dynamics.problem import Problem, Sample, shuffled
 from robotid.estimation.estimators.estimator import Estimate, Weighing, require_rows
-from robotid.estimation.estimators.recursive.recursive import (
+from robotid.estimation.estimators.recursive import (
     RecursiveEstimator,
     fold,
     require_samples,
@@ -29,33 +29,23 @@ _MEMORY = 1000.0  # [samples] over which PRX and the residuals are averaged
 _SILENT = 1e-9  # relative norm below which columns are not scaled
 _SMALLEST = 1e-6  # lower bound of the eigenvalues of D(q, P^), relative to the largest
 _RIDGE = 1e-9  # relative regularisation for metric "rows", for dependent rows
+_REGULARISATION = 1e-9  # of the normalised gradient
 _GAIN = 0.01  # relative decrease of the squared residual per pass at convergence
 _ZERO = 2.0  # a mean PRX of fewer standard errors is 0
 
 
 @dataclass(frozen=True, eq=False)
 class DescentState:
-    """State of a gradient method.
+    """State of a gradient method."""
 
-    Attributes:
-        x: Scaled parameters, shape (c,).
-        mean: Average of the iterates, shape (c,).
-        prx: Moving average of PRX (23) at the estimate, shape (c,), in scaled parameters.
-        prx_square: Moving average of its squared norm.
-        squares: Moving average of the squared residual per joint, shape (n,) [(N m)^2 or N^2].
-        steps: Number of samples read.
-        skipped: Number of samples without information, |Psi|^2 <= eps2.
-        rows: Number of rows used.
-    """
-
-    x: Array
-    mean: Array
-    prx: Array
-    prx_square: float
-    squares: Array
-    steps: int
-    skipped: int
-    rows: int
+    x: Array  # (c,), scaled parameters
+    mean: Array  # (c,), average of the iterates
+    prx: Array  # (c,), moving average of PRX (23) at the estimate, in scaled parameters
+    prx_square: float  # moving average of its squared norm
+    squares: Array  # (n,), moving average of the squared residual [(N m)^2 or N^2]
+    steps: int  # samples read
+    skipped: int  # samples without information, |Psi|^2 <= eps2
+    rows: int  # rows used
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +80,9 @@ class Descent(RecursiveEstimator[DescentState]):
     eps2: float = 1e-12
 
     def __post_init__(self) -> None:
-        self._require_positive("passes", "eps1", "eps2")
+        for name in ("passes", "eps1", "eps2"):
+            if not getattr(self, name) > 0:
+                raise DataError(f"{name} is {getattr(self, name)}, wanted a positive number")
         self._check()
 
     @property
@@ -178,11 +170,6 @@ class Descent(RecursiveEstimator[DescentState]):
                 break
         return replace(estimator.estimate(state, data.names), converged=settled)
 
-    def _require_positive(self, *names: str) -> None:
-        for name in names:
-            if not getattr(self, name) > 0:
-                raise DataError(f"{name} is {getattr(self, name)}, wanted a positive number")
-
     @property
     def _unit(self) -> Array | float:
         return 1.0 if self.scale is None else self.scale
@@ -210,19 +197,17 @@ class Descent(RecursiveEstimator[DescentState]):
 class NormalisedGradient(Descent):
     """Normalised gradient (NLMS), the fastest recursive estimator.
 
-    theta <- theta - mu / (eps + |Psi|_F^2) Psi^T e, e = Psi theta - tau, rows in units of their
+    theta <- theta - mu / (1e-9 + |Psi|_F^2) Psi^T e, e = Psi theta - tau, rows in units of their
     noise. Without noise |theta~| does not increase for 0 < mu < 2.
 
     Attributes:
         step_size: The relaxation mu, above 0 and below 2 [-].
-        regularisation: The small number eps [-].
 
     References:
         Goodwin, Sin (1984), Adaptive Filtering, Prediction and Control, 3.3.
     """
 
     step_size: float = 1.0
-    regularisation: float = 1e-9
 
     @property
     def _takes_scale(self) -> bool:
@@ -231,10 +216,9 @@ class NormalisedGradient(Descent):
     def _check(self) -> None:
         if not 0 < self.step_size < 2:
             raise DataError(f"step_size is {self.step_size}, wanted above 0 and below 2")
-        self._require_positive("regularisation")
 
     def _moved(self, x: Array, Psi: Array, e: Array, used: Rows, sample: Sample) -> Array:
-        gamma = self.step_size / (self.regularisation + np.vdot(Psi, Psi))
+        gamma = self.step_size / (_REGULARISATION + np.vdot(Psi, Psi))
         return x - gamma * (e @ Psi)
 
 
@@ -250,20 +234,15 @@ class PRX(Descent):
     if sigma_min(D(q, P^)) <= 2 sigma_min(D(q, P)). With column scaling this is the norm of
     scale * P~.
 
-    With noise each iterate changes by about the noise of its sample. On recordings of a UR10e and a
+    With noise each iterate changes by about the noise of its sample: on recordings of a UR10e and a
     Panda the prediction error of the last iterate is 1.3 to 1.9 times that of weighted least
-    squares. With the average of the iterates, the k-th weighted by k^2, it is 1.03 to 1.05 times
-    after one pass. With step sizes proportional to 1/k it is 1.03 to 1.2 times, depending on their
-    rate, and with a dead zone of the size of the noise 1.1 to 1.7 times. The default is therefore
-    ``average``.
-
-    ``fit`` scales the columns for step "exact" only.
+    squares, and that of the average, the k-th iterate weighted by k^2, 1.03 to 1.05 times. ``fit``
+    scales the columns for step "exact" only.
 
     Attributes:
         step: "exact" or "printed".
         metric: For step "exact": "noise" for M = diag(sigma^-2); "mass" for M = D(q, P^)^-1, as
             printed; "rows" for M = (Psi Psi^T)^-1, which fits all rows of a sample together.
-        bounds: Radius of the set Omega (8) about the prior in scaled parameters; None: no bound.
 
     References:
         Tzvetkova, Extracting Inertial Parameters from Robotic Manipulators Dynamics, (20)-(25).
@@ -271,7 +250,6 @@ class PRX(Descent):
 
     step: str = "exact"
     metric: str = "noise"
-    bounds: float | None = None
 
     @property
     def needs_mass(self) -> bool:
@@ -286,20 +264,15 @@ class PRX(Descent):
             raise DataError(f"step is {self.step!r}, wanted 'exact' or 'printed'")
         if self.metric not in ("noise", "mass", "rows"):
             raise DataError(f"metric is {self.metric!r}, wanted 'noise', 'mass' or 'rows'")
-        if self.bounds is not None:
-            self._require_positive("bounds")
 
     def _moved(self, x: Array, Psi: Array, e: Array, used: Rows, sample: Sample) -> Array:
         if self.needs_mass:
-            step = self._massive_step(x, sample, used)
-        elif self.metric == "noise":
-            step = _exact(Psi, e, e)
-        else:
-            A = Psi @ Psi.T
-            A.flat[:: len(A) + 1] += _RIDGE * np.trace(A)
-            step = _exact(Psi, e, np.linalg.solve(A, e))
-        moved: Array = x - step
-        return moved if self.bounds is None else self._bounded(moved, self.bounds)
+            return x - self._massive_step(x, sample, used)
+        if self.metric == "noise":
+            return x - _exact(Psi, e, e)
+        A = Psi @ Psi.T
+        A.flat[:: len(A) + 1] += _RIDGE * np.trace(A)
+        return x - _exact(Psi, e, np.linalg.solve(A, e))
 
     def _massive_step(self, x: Array, sample: Sample, used: Rows) -> Array:
         """Return the step with eta = D^-1 e (20), rows as in the paper."""
@@ -327,20 +300,10 @@ class PRX(Descent):
             )
         D = sample.mass_regressor @ (x / self._unit)  # (n, n)
         if not np.isfinite(D).all():
-            raise DataError(
-                "the mass regressor of the sample has values that are not finite; the sample was "
-                "not used"
-            )
+            raise DataError("the mass regressor of the sample is not finite; it was not used")
         values, vectors = np.linalg.eigh((D + D.T) / 2)
         largest = float(np.abs(values).max())
         return np.maximum(values, _SMALLEST * largest if largest > 0 else 1.0), vectors
-
-    def _bounded(self, x: Array, radius: float) -> Array:
-        """Return P^ projected onto Omega (8), a ball about the prior."""
-        centre = self.init(len(x)).x
-        away = x - centre
-        distance = float(np.linalg.norm(away))
-        return x if distance <= radius else centre + away * (radius / distance)
 
 
 def column_scale(problem: Problem, sigma: Array) -> Array:

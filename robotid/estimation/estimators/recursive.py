@@ -1,30 +1,128 @@
-"""Recursive least squares in square-root information form, and a Kalman filter."""
+"""Recursive estimators: their interface, recursive least squares and a Kalman filter."""
 
+import json
+import math
 from abc import abstractmethod
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, fields
+from pathlib import Path
 from statistics import NormalDist
+from typing import Any, ClassVar, Generic, Literal, TypeVar
 
 import numpy as np
 from scipy.linalg.lapack import dtpqrt
 
 from robotid.base.exceptions import DataError, RankDeficientError
+from robotid.base.files import written_whole
 from robotid.base.typing import Array
 from robotid.dynamics.factors import Factors
 from robotid.dynamics.problem import Problem, Sample
 from robotid.estimation.estimators.batch import solve_factor
-from robotid.estimation.estimators.estimator import Estimate, Weighing, require_rows
-from robotid.estimation.estimators.recursive.recursive import (
-    RecursiveEstimator,
-    StateT,
-    fold,
-    require_samples,
-    scaled_rows,
-)
+from robotid.estimation.estimators.estimator import Estimate, Estimator, Weighing, require_rows
+
+StateT = TypeVar("StateT")
 
 _BLOCK = 8  # block size of LAPACK
 _TINY = 1e-12  # smallest noise over sigma, for noise-free data
 _PATIENCE = 50  # largest number of successive rows of a joint that the gate rejects
 _PRIOR_LED = 0.9  # ratio to the prior standard deviation above which a parameter is undetermined
+
+
+class RecursiveEstimator(Estimator[Problem], Generic[StateT]):
+    """Interface of recursive estimators: settings in the constructor, results in a state.
+
+    A state is an immutable dataclass of arrays and numbers. ``save_state`` and ``load_state``
+    preserve it exactly.
+    """
+
+    reads: ClassVar[Literal["samples"]] = "samples"
+
+    @abstractmethod
+    def init(self, c: int) -> StateT:
+        """Return the state of c parameters before any sample."""
+
+    @abstractmethod
+    def update(self, state: StateT, sample: Sample) -> StateT:
+        """Return the state after one more sample; rows of weight 0 are skipped.
+
+        Raises:
+            DataError: If the sample is not finite or has a wrong shape; the state remains valid.
+        """
+
+    @abstractmethod
+    def estimate(self, state: StateT, names: tuple[str, ...]) -> Estimate:
+        """Return the estimate of a state, with the names of its c parameters."""
+
+
+def fold(estimator: RecursiveEstimator[StateT], samples: Iterable[Sample], state: StateT) -> StateT:
+    """Return the state after all samples, in the order of the updates."""
+    for sample in samples:
+        state = estimator.update(state, sample)
+    return state
+
+
+def scaled_rows(sample: Sample, sigma: Array, c: int) -> Array:
+    """Return rows sqrt(weight_j) / sigma_j [Y_j tau_j] of nonzero weight, shape (k, c + 1).
+
+    sigma (n,) [N m or N].
+    """
+    n = len(sigma)
+    if sample.Y.shape != (n, c) or sample.tau.shape != (n,) or sample.weight.shape != (n,):
+        raise DataError(
+            f"the sample has Y {sample.Y.shape}, tau {sample.tau.shape}, weight "
+            f"{sample.weight.shape}, wanted {(n, c)}, {(n,)}, {(n,)}"
+        )
+    rows = np.empty((n, c + 1))
+    rows[:, :c] = sample.Y
+    rows[:, c] = sample.tau
+    rows *= (np.sqrt(sample.weight) / sigma)[:, None]
+    if not sample.weight.all():
+        rows = rows[sample.weight != 0]
+    # the sum is the fastest test: it is finite only if every entry is
+    if not math.isfinite(rows.sum()):
+        raise DataError(
+            "the sample has values that are not finite and was not used; the previous state "
+            "remains valid"
+        )
+    return rows
+
+
+def save_state(state: Any, path: str | Path) -> None:  # noqa: ANN401
+    """Write a state to an NPZ file, exactly, without pickle, completely or not at all."""
+    content = {f.name: np.asarray(getattr(state, f.name)) for f in fields(state)}
+    kind = np.frombuffer(json.dumps(type(state).__name__).encode(), dtype=np.uint8)
+    with written_whole(path) as beside, open(beside, "wb") as stream:
+        np.savez(stream, allow_pickle=False, __kind__=kind, **content)
+
+
+def load_state(path: str | Path, kind: type[StateT]) -> StateT:
+    """Return a state of a class, as ``RLSState``, from a file, with the same bits.
+
+    Raises:
+        DataError: If the file does not exist, is not NPZ, or contains another class of state.
+    """
+    source = Path(path)
+    if not source.is_file():
+        raise DataError(f"the file {str(source)!r} of the state does not exist")
+    try:
+        with np.load(source, allow_pickle=False) as archive:
+            content = dict(archive)
+    except (ValueError, OSError) as error:
+        raise DataError(f"{source.name} is not a file of a state: {error}") from error
+    stored = json.loads(bytes(content.pop("__kind__", np.frombuffer(b"null", np.uint8))))
+    if stored != kind.__name__:
+        raise DataError(f"{source.name} contains a state {stored!r}, wanted {kind.__name__!r}")
+    # LAPACK needs column order: NPZ preserves the memory order of arrays
+    plain = {key: x if x.ndim else x.item() for key, x in content.items()}
+    return kind(**plain)
+
+
+def require_samples(data: object) -> None:
+    """Raise an error if data for ``fit`` have no samples."""
+    if not isinstance(data, Problem):
+        raise DataError(
+            "a recursive estimator needs samples, but factors have none; call fit with the problem"
+        )
 
 
 class Filter(RecursiveEstimator[StateT]):
@@ -49,17 +147,11 @@ class Filter(RecursiveEstimator[StateT]):
 
 @dataclass(frozen=True, eq=False)
 class RLSState:
-    """State of recursive least squares.
+    """State of recursive least squares."""
 
-    Attributes:
-        R: Upper triangular factor of the weighted rows [Y tau], shape (c + 1, c + 1).
-        rows: Effective number of rows in it, with forgetting.
-        steps: Number of samples used.
-    """
-
-    R: Array
-    rows: float
-    steps: int
+    R: Array  # (c + 1, c + 1), upper triangular factor of the weighted rows [Y tau]
+    rows: float  # effective number of rows in it, with forgetting
+    steps: int  # samples used
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,8 +200,8 @@ class RLS(Filter[RLSState]):
             raise DataError("prior_std was given without prior; state both, or neither")
         if self.forgetting < 1 and self.prior_std is None:
             raise DataError(
-                f"forgetting is {self.forgetting}, which needs prior and prior_std: information "
-                "that is not updated by motion vanishes otherwise; state both"
+                f"forgetting is {self.forgetting}, which needs prior and prior_std, as information "
+                "that no motion updates vanishes; state both"
             )
 
     @property
@@ -128,12 +220,11 @@ class RLS(Filter[RLSState]):
         if not len(rows):
             return state
         count = self.forgetting * state.rows + len(rows)
-        if self.forgetting == 1:
-            R = dtpqrt(0, min(_BLOCK, len(state.R)), state.R, rows)[0]
-        else:
-            root = np.sqrt(self.forgetting)
+        before = state.R
+        if self.forgetting < 1:
+            before = np.sqrt(self.forgetting) * before
             rows = np.vstack([rows, self._prior_row(state)])
-            R = dtpqrt(0, min(_BLOCK, len(state.R)), root * state.R, rows)[0]
+        R = dtpqrt(0, min(_BLOCK, len(before)), before, rows)[0]
         return RLSState(R, count, state.steps + 1)
 
     def estimate(self, state: RLSState, names: tuple[str, ...]) -> Estimate:
@@ -167,25 +258,15 @@ class RLS(Filter[RLSState]):
 
 @dataclass(frozen=True, eq=False)
 class KalmanState:
-    """State of the Kalman filter.
+    """State of the Kalman filter."""
 
-    Attributes:
-        theta: Parameters, shape (c,).
-        P: Their covariance, shape (c, c).
-        products: Sum of innovation times residual per joint, shape (n,): rows times variance.
-        rows: Number of rows used per joint, shape (n,).
-        gated: Number of rows rejected by the gate per joint, shape (n,).
-        in_a_row: Number of rows rejected since the last one used, shape (n,).
-        steps: Number of samples read.
-    """
-
-    theta: Array
-    P: Array
-    products: Array
-    rows: Array
-    gated: Array
-    in_a_row: Array
-    steps: int
+    theta: Array  # (c,)
+    P: Array  # (c, c), its covariance
+    products: Array  # (n,), sum of innovation times residual: rows times variance
+    rows: Array  # (n,), rows used
+    gated: Array  # (n,), rows rejected by the gate
+    in_a_row: Array  # (n,), rows rejected since the last one used
+    steps: int  # samples read
 
 
 @dataclass(frozen=True, eq=False)
@@ -259,7 +340,10 @@ class Kalman(Filter[KalmanState]):
         scale = self.sigma / np.sqrt(self.independent_share)
         rows = scaled_rows(sample, scale, c)
         Y, e = rows[:, :c], rows[:, c] - rows[:, :c] @ state.theta  # (k, c), (k,)
-        P = self._walked(state.P)
+        P = state.P
+        if self.walk:
+            P = P.copy()
+            P.flat[:: len(P) + 1] += (self.walk * self._prior_spread()) ** 2
         PY = P @ Y.T  # (c, k)
         T = Y @ PY  # (k, k), covariance of the prediction, then of the innovation
         passed = self._passes(e, np.diag(T), state.in_a_row[used])
@@ -269,19 +353,12 @@ class Kalman(Filter[KalmanState]):
         solved = np.linalg.solve(T, np.column_stack([PY.T, e])) if len(T) else np.zeros((0, c + 1))
         K, residual = solved[:, :c].T, solved[:, c]  # (c, k), (k,): tau - Y theta afterwards
         A = K @ (PY - K @ T / 2).T
-        rows, gated, in_a_row = _count(state, used, passed)
         products = state.products.copy()
         k = used[passed]
         products[k] += scale[k] ** 2 / sample.weight[k] * e * residual
-        return KalmanState(
-            state.theta + K @ e,
-            P - (A + A.T),  # exactly symmetric
-            products,
-            rows,
-            gated,
-            in_a_row,
-            state.steps + 1,
-        )
+        P = P - (A + A.T)  # exactly symmetric
+        counts = _count(state, used, passed)
+        return KalmanState(state.theta + K @ e, P, products, *counts, state.steps + 1)
 
     def estimate(self, state: KalmanState, names: tuple[str, ...]) -> Estimate:
         std = self._prior_spread()
@@ -308,18 +385,8 @@ class Kalman(Filter[KalmanState]):
         return int(state.rows.sum())
 
     def _prior_spread(self) -> Array:
-        if self.prior_std.ndim == 1:
-            return self.prior_std
-        spread: Array = np.sqrt(np.diag(self.prior_std))
-        return spread
-
-    def _walked(self, P: Array) -> Array:
-        """Return the covariance after one step of the random walk."""
-        if self.walk == 0:
-            return P
-        P = P.copy()
-        P.flat[:: len(P) + 1] += (self.walk * self._prior_spread()) ** 2
-        return P
+        is_matrix = self.prior_std.ndim == 2
+        return np.asarray(np.sqrt(np.diag(self.prior_std)) if is_matrix else self.prior_std)
 
     def _passes(self, e: Array, variance: Array, in_a_row: Array) -> Array:
         """Return which rows pass the gate: e^2 / (variance + 1) below the chi-square quantile."""

@@ -30,19 +30,12 @@ _STEP = 0.5  # decades between the best weight and the refined ones
 
 @dataclass(frozen=True, eq=False)
 class Segments:
-    """Contiguous segments of the fitted data: the folds of a cross-validation.
-
-    Attributes:
-        folds: Factors of the K segments.
-        sigma: Noise level per joint, shape (n,) [N m or N].
-        rows: Rows of all segments, shape (b + 1, b + 1), from ``Consistent.rows``.
-        share: Share of independent rows [-].
-    """
+    """Contiguous segments of the fitted data: the folds of a cross-validation."""
 
     folds: tuple[Factors, ...]
-    sigma: Array
-    rows: Array
-    share: float
+    sigma: Array  # (n,), noise level per joint [N m or N]
+    rows: Array  # (b + 1, b + 1), rows of all segments, from ``Consistent.rows``
+    share: float  # of independent rows [-]
 
     @classmethod
     def of(
@@ -56,19 +49,16 @@ class Segments:
     @cached_property
     def others(self) -> Array:
         """Rows of all segments except one, for each segment, shape (K, b + 1, b + 1)."""
-        own = [factors.weighted(self.sigma / np.sqrt(self.share)) for factors in self.folds]
-        rest = [Triangle(len(self.rows)) for _ in own]
-        for k, total in enumerate(rest):
-            for R in (*own[:k], *own[k + 1 :]):
+        triangles = [factors.weighted(self.sigma / np.sqrt(self.share)) for factors in self.folds]
+        totals = [Triangle(len(self.rows)) for _ in triangles]
+        for k, total in enumerate(totals):
+            for R in (*triangles[:k], *triangles[k + 1 :]):
                 total.fold_triangle(R, np.arange(len(R)))
-        return np.array([total.R for total in rest])
+        return np.array([total.R for total in totals])
 
     @cached_property
     def least_squares_errors(self) -> Array:
-        """Prediction errors of each segment by least squares of all others.
-
-        They have the form and unit of ``held_out_errors``, shape (segments, n).
-        """
+        """Prediction errors of each segment by least squares of all others, (segments, n)."""
         errors = []
         for fold, rows in zip(self.folds, self.others, strict=True):
             size = np.maximum(np.linalg.norm(rows[:, :-1], axis=0), 1e-300)
@@ -77,16 +67,12 @@ class Segments:
         return self.errors(np.array(errors))
 
     def errors(self, squares: Array) -> Array:
-        """Return squared errors over the square of the noise level and the number of rows.
-
-        squares (segments, n) [N^2 m^2 or N^2].
-        """
+        """Return squared errors (segments, n) over the squared noise level and number of rows."""
         squares = squares / self.sigma**2
         rows = np.sum([fold.rows for fold in self.folds], axis=0)  # (n,)
         if self.folds[0].is_projected:
             squares, rows = squares.sum(axis=1, keepdims=True), rows.sum(keepdims=True)
-        errors: Array = squares / np.maximum(rows, 1)
-        return errors
+        return np.asarray(squares / np.maximum(rows, 1))
 
 
 def choose_weight(
@@ -98,19 +84,15 @@ def choose_weight(
       The error of a joint is the RMS over all segments, the error of a weight is the geometric mean
       over joints. A larger weight is accepted if its error is at most 2 % above the smallest one,
       at most 5 % for any joint, and the mean log ratio of the errors by segment is at most two
-      standard errors above 0. This test alone is not sufficient: with six segments it has little
-      power against one or two bad segments. An error that repeats in all segments has no scatter:
-      a smaller weight that only fits it is not better, so the mean log ratio may also be as large
-      as such an error makes it.
-      The error of no joint may be more than 10 % above that of least squares: where the prior
-      is wrong, as of a placeholder, the weight is smaller.
+      standard errors above 0, or as large as an error that repeats in all segments makes it: such
+      an error has no scatter, and a smaller weight that only fits it is not better. The error of no
+      joint may be more than 10 % above that of least squares: where the prior is wrong, as of a
+      placeholder, the weight is smaller.
     * "evidence": the weight with the largest ``log_evidence``.
 
-    Weights are tried from 100 down to 1e-4 (entropic: 0.1, and below where least squares is better)
-    in decades, until two weights in a row are worse than those before, and then around the best
-    one. A weight above 1 shifts the estimate towards the prior, but does not reduce the standard
-    errors; see ``Consistent.weight_ratio``. A weight at which the fit does not converge, because
-    bodies shrink to points, has an infinite error.
+    Weights are tried from 100 down to 0.1, and to 1e-4 where least squares is better, in decades,
+    until two weights in a row are worse than those before, and then around the best one. A weight
+    at which the fit does not converge, because bodies shrink to points, has an infinite error.
     """
     evidence = log_evidence(fit, segments.rows)
     by_evidence = _search(lambda w: (-evidence(w), np.zeros(0)), "evidence", 0.0)
@@ -166,25 +148,20 @@ def plausible_weight(fit: Consistent, rows: Array, weight: float) -> float:
 
     The evidence expands the penalty at its centre. At the minimum with a weight w that agrees with
     the data, w times the penalty is the number of parameters that the data determine, g = d -
-    trace(w H C / 2) of d free ones. If it is more, the prior is less certain than w states; if it
-    is less than half, more certain, as far from the centre the penalty is not quadratic: the next
-    weight is g over the penalty. The weight is reduced by half a decade at most, the distance
-    of the weights tried: a larger disagreement is not due to the expansion, but to errors of the
-    model. The steps end before a weight at which the fit does not converge.
-
-    References:
-        MacKay (1992), Bayesian interpolation, section 4.
-
-    rows (k, b + 1).
+    trace(w H C / 2) of d free ones (MacKay, 1992, Bayesian interpolation, section 4). If it is
+    more, or less than half, as far from the centre the penalty is not quadratic, the next weight is
+    g over the penalty. The weight is reduced by half a decade at most, the distance of the weights
+    tried: a larger disagreement is due to errors of the model. The steps end before a weight at
+    which the fit does not converge. rows (k, b + 1).
     """
-    programme, solution, found = fit.programme, None, weight
+    programme, solution, plausible = fit.programme, None, weight
     least = weight * 10.0**-_STEP
     for _ in range(_REESTIMATED):
         try:
             solution = programme.minimise(rows, weight, is_exact=False, start=solution)
         except NotConvergedError:  # bodies shrink to points
             break
-        found = weight
+        plausible = weight
         H, C = programme.penalty.hessian(solution.x), programme.covariance(weight, rows, solution.x)
         determined = programme.space.basis.shape[1] - 0.5 * weight * float(np.sum(H * C))
         distance = weight * programme.penalty.value(solution.x)
@@ -193,7 +170,7 @@ def plausible_weight(fit: Consistent, rows: Array, weight: float) -> float:
         if low <= distance <= high or is_least or distance == 0.0:
             break
         weight = max(least, weight * determined / distance)
-    return found
+    return plausible
 
 
 def contradicted_extents(fit: Consistent, segments: Segments) -> tuple[str, ...]:
@@ -234,10 +211,7 @@ def held_out_errors(
     weight: float,
     starts: Sequence[Minimum] | None = None,
 ) -> tuple[Array, list[Minimum]]:
-    """Return the prediction errors of each segment by the fit to all others, with constraints.
-
-    -> (segments, n) [-].
-    """
+    """Return the errors of each segment, (segments, n) [-], by the consistent fit to all others."""
     if len(segments.folds) < 2:
         raise DataError(
             f"prior_weight = 'cv' needs at least 2 segments, found {len(segments.folds)}; fit "
@@ -253,13 +227,8 @@ def log_evidence(fit: Consistent, rows: Array) -> Callable[[float], float]:
     """Return the log marginal likelihood of the data as a function of the prior's weight.
 
     With the prior x = L (pi - centre) ~ N(0, 1 / weight) and r = A x + noise of unit variance,
-    r ~ N(0, I + A A^T / weight). A penalty that is not quadratic is expanded at its centre. The
-    inequalities are neglected, and a constant is omitted.
-
-    References:
-        MacKay (1992), Bayesian interpolation, section 4.
-
-    rows (k, b + 1).
+    r ~ N(0, I + A A^T / weight). The penalty is expanded at its centre; the inequalities and a
+    constant are omitted. rows (k, b + 1).
     """
     A, r = fit.programme.whitened(rows)
     U, s, _ = np.linalg.svd(A, full_matrices=False)
@@ -341,8 +310,8 @@ def _is_accepted(parts: Array, best: Array, allowed: float) -> bool:
 
 def _by_joint(parts: Array) -> Array:
     """Return the mean squares of the joints with rows, shape (n,), from errors by segment."""
-    squares: Array = parts.sum(axis=0)
-    return squares[squares > 0]
+    squares = parts.sum(axis=0)
+    return np.asarray(squares[squares > 0])
 
 
 def _is_as_good(parts: Array, best: Array) -> bool:

@@ -1,1 +1,0 @@
-"""Recursive estimators: the samples are read one by one."""
