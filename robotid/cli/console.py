@@ -51,7 +51,7 @@ def print_steps(steps: "Sequence[Step]") -> None:
 
 
 def print_causes(
-    findings: Sequence[Mapping[str, Any]],
+    findings: Sequence[Finding],
     joints: Sequence[str],
     *,
     is_verbose: bool,
@@ -60,9 +60,9 @@ def print_causes(
     none: str = "no findings",
 ) -> None:
     """Print findings by cause, then their number."""
-    every = [Finding(**as_finding(f)) for f in findings]
-    shown = [f for f in every if is_verbose or f.severity != "note"]
-    causes, others = grouped(shown, joints), grouped([f for f in every if f not in shown], joints)
+    shown = [f for f in findings if is_verbose or f.severity != "note"]
+    notes_hidden = [f for f in findings if f not in shown]
+    causes, others = grouped(shown, joints), grouped(notes_hidden, joints)
     for cause in causes:
         for message in cause.messages:
             if message not in printed:
@@ -74,11 +74,6 @@ def print_causes(
         notes = count + (f"; worst: {worst}" if worst else "") + (f"; {notes}" if notes else "")
     if summary := notes or none:
         echo(summary)
-
-
-def as_finding(found: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the attributes of a ``Finding`` from a finding in JSON."""
-    return {key: found[key] for key in ("code", "severity", "where", "message")}
 
 
 def _some(count: int, what: str) -> str:

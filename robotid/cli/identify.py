@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from robotid.base.exceptions import DataError, SettingsError
 from robotid.base.files import check_folder, folder_beside, remove_written, write_json
+from robotid.base.findings import Finding
 from robotid.base.settings import require_flag, require_kind
 from robotid.base.text import columns, terminal_width, wrapped
 from robotid.base.typing import STAGES, ProgressCallback, ignore_progress, report_stage
@@ -438,7 +439,7 @@ def run(options: argparse.Namespace) -> int:
     show_found(
         result,
         options,
-        partial(show_result, is_verbose=options.verbose),
+        partial(show_result, findings=found.findings, is_verbose=options.verbose),
         [*result["outputs"].values(), "result.json"],
     )
     if not options.json:
@@ -446,7 +447,9 @@ def run(options: argparse.Namespace) -> int:
     return 1 if result["verdict"]["log_errors"] else 0
 
 
-def show_result(result: dict[str, Any], *, is_verbose: bool = False) -> None:
+def show_result(
+    result: dict[str, Any], *, findings: Sequence[Finding] = (), is_verbose: bool = False
+) -> None:
     """Print an identification."""
     width, wls = terminal_width(), result.get("wls")
     echo(f"\n{result['robot']}: {len(result['joints'])} joints, {_found(result)}")
@@ -462,7 +465,7 @@ def show_result(result: dict[str, Any], *, is_verbose: bool = False) -> None:
     print()
     verdict = result["verdict"]
     print_causes(
-        result["warnings"],
+        findings or [Finding(**entry) for entry in result["warnings"]],
         result["joints"],
         is_verbose=is_verbose,
         worst="" if verdict["status"] == "good" else _worst(result),

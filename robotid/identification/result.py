@@ -165,9 +165,9 @@ class TorqueIdentification(Identification, Fit):
     def _friction_lines(self) -> list[str]:
         return friction_lines({drive.joint: drive.to_dict() for drive in self.drives})
 
-    def _cause_of(self, joint: str) -> str:
-        """Return the cause of a joint's residual, as a sentence."""
-        return self.joint_torques[self.model.row_names.index(joint)].sentence
+    def _cause_of(self, joint: str) -> tuple[str, str]:
+        """Return the cause of a joint's residual, and what to do."""
+        return self.joint_torques[self.model.row_names.index(joint)].cause
 
     @cached_property
     def joint_torques(self) -> tuple[JointTorque, ...]:

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from robotid.base.findings import Finding, listed, log_finding
+from robotid.base.findings import Finding
 from robotid.base.text import seconds
 from robotid.base.typing import Array
 from robotid.data.log import Log
@@ -17,6 +17,7 @@ from robotid.data.measured_velocity import (
     velocity_lags,
 )
 from robotid.data.signal_settings import SignalSettings
+from robotid.diagnosis.catalogue import finding
 
 _SPIKE = 15.0  # smallest distance of a spike from its neighbours, over the typical distance
 _BEYOND = 1.5  # ... and over the amplitude of the channel
@@ -66,35 +67,20 @@ def _quantisation(log: Log, kind: str, values: Array, velocity: str) -> Iterator
         chosen = np.flatnonzero((steps > 0) & ((count < COARSE) == few))
         if len(chosen) == 0:
             continue
+        step = float(steps[chosen].max())
+        bits = float(np.log2(2 * np.pi / step))
+        todo = "few" if few else "more"
+        if kind == "dq" and few:
+            todo = "few_auto" if velocity == "auto" else "few_velocity"
+        elif kind == "q" and abs(bits - round(bits)) < _ENCODER and round(bits) in _BITS:
+            todo = "few_encoder" if few else "encoder"
         names = [log.joints[j] for j in chosen]
-        evidence = {f"steps_{log.joints[j]}": count[j] for j in chosen}
-        todo = _finer(kind, float(steps[chosen].max()), velocity, few=few)
-        message = (
-            f"{kind} of {listed(names)} is quantised in steps of {steps[chosen].max():.3g}, "
-            f"{count[chosen].min():.0f} steps over its range; {todo}"
-        )
-        severity = "warning" if few and is_used else "note"
-        yield log_finding(log.name, "quantised", severity, message, kind, **evidence)
-
-
-def _finer(kind: str, step: float, velocity: str, *, few: bool) -> str:
-    """Return what to do about steps of a channel."""
-    if kind == "dq" and few:
-        return (
-            "its resolution is too low. No action needed: velocity = 'auto' differentiates the "
-            "position instead"
-            if velocity == "auto"
-            else "its resolution is too low: set velocity = 'differentiated'"
-        )
-    bits = np.log2(2 * np.pi / step)
-    if kind == "q" and abs(bits - round(bits)) < _ENCODER and round(bits) in _BITS:
-        encoder = f"the step is that of an encoder of {round(bits)} bits, not of the digits"
-        return (
-            f"{encoder}: record a larger motion, of {COARSE} steps or more"
-            if few
-            else f"{encoder}, and small in the motion; no action needed"
-        )
-    return "its resolution is too low: log it with more digits" if few else "log more digits"
+        yield finding(
+            "quantised", log.name, names, subject=kind, todo=todo, channel=kind,
+            severity="warning" if few and is_used else "note", step=step, bits=round(bits),
+            coarse=COARSE, fewest=count[chosen].min(),
+            **{f"steps_{log.joints[j]}": count[j] for j in chosen},
+        )  # fmt: skip
 
 
 def _spikes(
@@ -102,42 +88,32 @@ def _spikes(
 ) -> Iterator[Finding]:
     """Yield rows that differ strongly from both neighbours."""
     smooth = _without_spikes(values)
-    amplitudes = [_amplitude(*own) for own in zip(values.T, smooth.T, noise, strict=True)]
+    amplitudes = [_amplitude(*of) for of in zip(values.T, smooth.T, noise, strict=True)]
     least = _LEAST.get(kind, _LEAST_TORQUE * float(np.median(amplitudes)))
     for j, (joint, x) in enumerate(zip(log.joints, values.T, strict=True)):
         amplitude = max(amplitudes[j], least)
         rows, height = _jumps(x - smooth[:, j], noise[j], amplitude)
         if len(rows) == 0:
             continue
-        largest, first = np.abs(height).max(), log.t[rows[0]]
+        largest, first = np.abs(height).max(), float(log.t[rows[0]])
         energy = np.sum(height**2) / np.sum((x - np.median(x)) ** 2)
-        message = (
-            f"{kind} of {joint} has spikes of up to {largest:.4g} in {len(rows)} rows, the first "
-            f"at t = {seconds(first)} s; remove these rows from the recording"
-        )
         is_harmful = is_used and largest > _ABSURD * amplitude and energy > _HARM
-        severity = "error" if is_harmful else "note"
-        evidence = {"rows": len(rows), "largest": largest, "energy_share": energy, "first": first}
-        yield log_finding(log.name, "spikes", severity, message, f"{kind}_{joint}", **evidence)
+        yield finding(
+            "spikes", log.name, joint, subject=f"{kind}_{joint}", channel=kind,
+            severity="error" if is_harmful else "note", rows=len(rows), largest=largest,
+            energy_share=energy, first=first, when=seconds(first),
+        )  # fmt: skip
 
 
 def _noise(log: Log, kind: str, values: Array, noise: Array) -> Iterator[Finding]:
     """Yield the noise level of a kind of channel, and the torques with too much noise."""
     size = values.std(axis=0)
     share = np.divide(noise, size, out=np.zeros_like(noise), where=size > 0)
-    message = (
-        f"white noise of {kind}: {', '.join(f'{level:.2g}' for level in noise)} (standard "
-        "deviation per joint, in the channel's unit); no action needed"
-    )
     evidence = dict(zip(log.joints, noise.tolist(), strict=True))
-    yield log_finding(log.name, "noise", "note", message, kind, **evidence)
+    levels = ", ".join(f"{level:.2g}" for level in noise)
+    yield finding("noise", log.name, subject=kind, channel=kind, levels=levels, **evidence)
     for j in np.flatnonzero(share > _NOISY) if kind == "tau" else ():
-        joint = log.joints[j]
-        message = (
-            f"noise is {100 * share[j]:.0f} % of the torque signal of {joint}; record a longer or "
-            "faster motion, or lower the cutoff"
-        )
-        yield log_finding(log.name, "noisy_torque", "note", message, joint, share=share[j])
+        yield finding("noisy_torque", log.name, log.joints[j], share=share[j])
 
 
 def _velocity_order(log: Log, alike: Array) -> Iterator[Finding]:
@@ -145,33 +121,19 @@ def _velocity_order(log: Log, alike: Array) -> Iterator[Finding]:
     for j, joint in enumerate(log.joints):
         k = int(np.argmax(alike[j]))
         found, own = alike[j, k], alike[j, j]
-        if k == j or found < _ALIKE or own > 0.5 * found:
-            continue
-        message = (
-            f"dq_{log.joints[k]} is d(q)/dt of q_{joint} (correlation {found:.2f}; with dq_{joint} "
-            f"{own:.2f}): the position or the velocity columns are in the wrong order; correct "
-            "their names"
-        )
-        evidence = {"correlation": found, "own_correlation": own}
-        yield log_finding(log.name, "velocity_order", "error", message, joint, **evidence)
+        if k != j and found >= _ALIKE and own <= 0.5 * found:
+            evidence = {"correlation": found, "own_correlation": own}
+            yield finding("velocity_order", log.name, joint, other=log.joints[k], **evidence)
 
 
 def _unlike_velocity(log: Log, velocity: str) -> Iterator[Finding]:
     """Yield measured velocities that are not the derivatives of their positions at any delay."""
     severity = {"measured": "error", "auto": "warning"}.get(velocity, "note")
-    todo = (
-        "or leave velocity = 'auto', which differentiates every position instead"
-        if velocity == "auto"
-        else "or set [signals] velocity = 'differentiated' (--velocity differentiated)"
-    )
     for joint, alike in unlike_velocities(log).items():
-        message = (
-            f"dq_{joint} is not d(q)/dt of q_{joint} (correlation {alike:.2f} at any lag up to "
-            f"0.3 s): the channel contains noise or another quantity; correct it, {todo}"
-        )
-        yield log_finding(
-            log.name, "velocity_mismatch", severity, message, f"dq_{joint}", correlation=alike
-        )
+        yield finding(
+            "velocity_mismatch", log.name, joint, subject=f"dq_{joint}", severity=severity,
+            todo=velocity == "auto", correlation=alike,
+        )  # fmt: skip
 
 
 def _velocity_delay(log: Log, stated: float) -> Iterator[Finding]:
@@ -184,17 +146,10 @@ def _velocity_delay(log: Log, stated: float) -> Iterator[Finding]:
     if abs(lag) < max(_LAG, 3 * error, 0.1 * step):
         return
     is_delayed = abs(lag) >= LARGEST_LAG
-    what = (
-        "velocity = 'auto' uses it only if it predicts torque as well as the differentiated one"
-        if is_delayed
-        else "use velocity = 'measured' if the torque has the same delay, else 'differentiated'"
-    )
-    message = (
-        f"the measured velocity has a delay of {1e3 * lag:.1f} +- {1e3 * error:.1f} ms relative "
-        f"to d(q)/dt; {what}, or set [signals] velocity_delay = {lag + stated:z.4f}"
-    )
-    severity = "warning" if is_delayed else "note"
-    yield log_finding(log.name, "velocity_delay", severity, message, delay=lag, std_error=error)
+    yield finding(
+        "velocity_delay", log.name, severity="warning" if is_delayed else "note", todo=is_delayed,
+        delay=lag, std_error=error, total=lag + stated,
+    )  # fmt: skip
 
 
 def _velocity_scale(
@@ -206,23 +161,17 @@ def _velocity_scale(
     slope of the regression of d(q)/dt on v, for any noise in the two.
     """
     slope, v = slope - slope.mean(axis=0), v - v.mean(axis=0)
+    severity = {"differentiated": "note", "auto": "error" if log.has_torque else "warning"}
     for j, joint in enumerate(log.joints):
         a, b, ab = slope[:, j] @ slope[:, j], v[:, j] @ v[:, j], slope[:, j] @ v[:, j]
         moves = np.ptp(log.q[:, j]) > _LEAST["q"] and np.sqrt(a / len(v)) > _LEAST["dq"]
         is_dead = bool(moves and b < _DEAD**2 * a)
         is_alike = bool(moves and not is_dead and alike[j] > _ALIKE)
-        if not is_dead and not (is_alike and (ab / a > _SCALE or b / ab < 1 / _SCALE)):
-            continue
-        factor = 0.0 if is_dead else float(np.sqrt(b / a))
-        what = "hardly changes while the position moves" if is_dead else "has another unit"
-        message = (
-            f"dq_{joint} is {factor:.3g} times d(q)/dt of q_{joint}: the measured velocity {what}. "
-            "Friction and inertia identified with it are wrong; correct the column, or set "
-            "[signals] velocity = 'differentiated'"
-        )
-        is_used = {"differentiated": "note", "auto": "error" if log.has_torque else "warning"}
-        severity = is_used.get(velocity, "error")
-        yield log_finding(log.name, "velocity_scale", severity, message, joint, factor=factor)
+        if is_dead or (is_alike and (ab / a > _SCALE or b / ab < 1 / _SCALE)):
+            yield finding(
+                "velocity_scale", log.name, joint, severity=severity.get(velocity, "error"),
+                what=is_dead, factor=0.0 if is_dead else float(np.sqrt(b / a)),
+            )  # fmt: skip
 
 
 def _slopes(log: Log, velocity: Array) -> tuple[Array, Array]:

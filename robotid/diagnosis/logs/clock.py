@@ -4,11 +4,12 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from robotid.base.findings import Finding, log_finding
+from robotid.base.findings import Finding
 from robotid.base.text import seconds
 from robotid.base.typing import Array
 from robotid.data.log import Log, Trajectory
 from robotid.data.measured_velocity import quantum
+from robotid.diagnosis.catalogue import finding
 from robotid.robot.parameters import ParameterLayout
 
 _JITTER = 0.05  # spread of the time steps over their median from which jitter is reported
@@ -49,25 +50,10 @@ def check_rest(log: Log, motion: Trajectory, layout: ParameterLayout) -> Iterato
         extent = float(np.ptp(motion.q[:, j]))
         share = float(np.mean(speed[:, j] > _STILL))
         is_prismatic = joint in layout.prismatic
-        size = f"range {extent:.2g} {'m' if is_prismatic else 'rad'}"
-        if extent < _STATIC:
-            code, severity = "static_joint", "warning"
-            message = (
-                f"{joint} at rest ({size}): this log does not determine friction and inertia of "
-                "the joint, nor most parameters of the links that it carries; move it, or lock it"
-            )
-        elif extent < (_HARDLY_PRISMATIC if is_prismatic else _HARDLY) or share < _MOVING:
-            code, severity = "hardly_moves", "note"
-            message = (
-                f"little motion of {joint} ({size}, moving {100 * share:.2g} % of the time): "
-                "parameters that only such a joint excites are poorly determined; move it farther "
-                "and longer"
-            )
-        else:
-            continue
-        yield log_finding(
-            log.name, code, severity, message, joint, range=extent, moving_share=share
-        )
+        unit, least = ("m", _HARDLY_PRISMATIC) if is_prismatic else ("rad", _HARDLY)
+        code = "static_joint" if extent < _STATIC else "hardly_moves"
+        if extent < least or share < _MOVING:
+            yield finding(code, log.name, joint, range=extent, moving_share=share, unit=unit)
 
 
 def runs_of(flags: Array) -> list[tuple[int, int]]:
@@ -79,21 +65,14 @@ def runs_of(flags: Array) -> list[tuple[int, int]]:
 def _rate(log: Log, step: Array, median: float) -> Iterator[Finding]:
     """Yield the rate of a log and the jitter of its time stamps."""
     rate, duration = 1 / median, float(log.t[-1] - log.t[0])
-    message = f"{len(log.t)} rows in {duration:.4g} s, median rate {rate:.4g} Hz; no action needed"
-    yield log_finding(
-        log.name, "rate", "note", message, rate=rate, samples=len(log.t), duration=duration
-    )
+    yield finding("rate", log.name, rate=rate, samples=len(log.t), duration=duration)
     regular = step[step < _GAP * median]
     spread = float(np.std(regular)) / median
     if spread > _JITTER:
-        low, high = 1e3 * float(step.min()), 1e3 * float(regular.max())
-        message = (
-            f"time steps vary from {low:.3g} to {high:.3g} ms about {1e3 * median:.3g} ms "
-            f"(standard deviation {100 * spread:.2g} %); no action needed: robotid uses the time "
-            "stamps, not row number / rate"
-        )
-        evidence = {"relative_spread": spread, "shortest": low / 1e3, "longest": high / 1e3}
-        yield log_finding(log.name, "jitter", "note", message, **evidence)
+        yield finding(
+            "jitter", log.name, relative_spread=spread, shortest=float(step.min()),
+            longest=float(regular.max()), median=median,
+        )  # fmt: skip
 
 
 def _gaps(log: Log, step: Array, median: float) -> Iterator[Finding]:
@@ -103,27 +82,18 @@ def _gaps(log: Log, step: Array, median: float) -> Iterator[Finding]:
     )
     if is_set.any():
         k = int(gaps[is_set][0])
-        jump = float(step[k]) - median
-        message = (
-            f"the clock jumps by {jump:.6g} s at t = {log.t[k]:.10g} s, but the position moves "
-            "only as in one step: the clock was set during the recording. The rows before and "
-            f"after the jump are separate segments; subtract {jump:.6g} s from the time stamps "
-            "after it, or log a monotonic clock"
-        )
-        evidence = {"jump": jump, "at": float(log.t[k]), "steps": float(is_set.sum())}
-        yield log_finding(log.name, "clock_step", "warning", message, **evidence)
+        jump, at = float(step[k]) - median, float(log.t[k])
+        yield finding("clock_step", log.name, jump=jump, at=at, steps=float(is_set.sum()))
         gaps = gaps[~is_set]
     if len(gaps) == 0:
         return
     at = int(gaps[np.argmax(step[gaps])])
     longest, start = float(step[at]), float(log.t[at])
     severity = "warning" if longest > max(_LONG, _GAP * median) else "note"
-    message = (
-        f"{len(gaps)} gaps, the longest of {longest:.3g} s at t = {seconds(start)} s. A long gap "
-        "ends a segment: the log is not filtered or differentiated across it, and the rows beside "
-        "it are not used; record without interruption if possible"
-    )
-    yield log_finding(log.name, "gap", severity, message, gaps=len(gaps), longest=longest, at=start)
+    yield finding(
+        "gap", log.name, severity=severity, gaps=len(gaps), longest=longest, at=start,
+        when=seconds(start),
+    )  # fmt: skip
 
 
 def _bunches(log: Log, step: Array) -> Iterator[Finding]:
@@ -132,27 +102,15 @@ def _bunches(log: Log, step: Array) -> Iterator[Finding]:
     is_bunched = step < _BUNCHED * mean
     share = float(np.mean(is_bunched))
     moved = np.abs(np.diff(log.q, axis=0)).mean(axis=0)
-    j = int(np.argmax(moved))  # the joint that shows most of the motion
-    own = np.abs(np.diff(log.q[:, j]))
-    if share < _BUNCHES or own[is_bunched].mean() <= _ALIKE * own.mean():
+    change = np.abs(np.diff(log.q[:, int(np.argmax(moved))]))  # of the joint that moves most
+    if share < _BUNCHES or change[is_bunched].mean() <= _ALIKE * change.mean():
         return
     usual = float(np.median(step[~is_bunched]))
-    is_even = abs(mean / usual - 1.0) < _EVEN
-    message = (
-        f"{is_bunched.sum()} of {len(log.t)} rows are stamped within "
-        f"{1e3 * _BUNCHED * mean:.2g} ms of the row before, after pauses of up to "
-        f"{step.max():.2g} s, but the joints move between them as between other rows: the stamps "
-        "are those of arrival, not of recording. Velocities and accelerations there are wrong; "
-    )
-    if is_even:
-        message += (
-            f"the mean step is {1e3 * mean:.4g} ms, the typical one {1e3 * usual:.4g} ms, so no "
-            'rows are missing: state stamp = "even" in [log], or log the time of recording'
-        )
-    else:
-        message += "log the time of recording"
-    evidence = {"rows": float(is_bunched.sum()), "share": share, "longest": float(step.max())}
-    yield log_finding(log.name, "bunched_stamps", "warning", message, **evidence)
+    yield finding(
+        "bunched_stamps", log.name, rows=float(is_bunched.sum()), share=share, of=len(log.t),
+        longest=float(step.max()), within=_BUNCHED * mean, mean=mean, usual=usual,
+        cure=abs(mean / usual - 1.0) < _EVEN,
+    )  # fmt: skip
 
 
 def _goes_on(q: Array, k: int) -> bool:
@@ -171,15 +129,10 @@ def _stale_rows(log: Log, step: Array) -> Iterator[Finding]:
     stale = sum(stop - start for start, stop in runs)
     if stale == 0:
         return
-    share = stale / len(log.t)
-    message = (
-        f"{stale} rows ({100 * share:.2g} %) repeat the row before in every channel while the "
-        "robot moves: the logger runs faster than the robot updates its state; log each state "
-        "once, with its own time stamp"
-    )
-    severity, longest = "warning" if share > _STALE else "note", max(b - a for a, b in runs)
-    yield log_finding(
-        log.name, "stale_rows", severity, message, rows=stale, share=share, longest_run=longest
+    share, longest = stale / len(log.t), max(b - a for a, b in runs)
+    severity = "warning" if share > _STALE else "note"
+    yield finding(
+        "stale_rows", log.name, severity=severity, rows=stale, share=share, longest_run=longest
     )
 
 
@@ -210,11 +163,8 @@ def _standstill(log: Log, moving: Array) -> Iterator[Finding]:
     if len(moving) == 0:
         return
     before, after = float(moving[0] - log.t[0]), float(log.t[-1] - moving[-1])
-    if max(before, after) < _REST:
-        return
-    message = (
-        f"the robot is at rest for the first {before:.3g} s and the last {after:.3g} s. Rows of "
-        "joints at rest are not used to identify friction; cut them with start = "
-        f"{seconds(moving[0])} and end = {seconds(moving[-1])}"
-    )
-    yield log_finding(log.name, "standstill", "note", message, before=before, after=after)
+    if max(before, after) >= _REST:
+        yield finding(
+            "standstill", log.name, before=before, after=after, start=seconds(moving[0]),
+            end=seconds(moving[-1]),
+        )  # fmt: skip

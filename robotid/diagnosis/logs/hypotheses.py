@@ -32,20 +32,15 @@ _CONSTANT = 1e-9  # relative variation of a torque that is rounding
 
 @dataclass(frozen=True)
 class Explanation:
-    """A hypothesis on the log, and how well the torques are explained under it.
+    """A hypothesis on the log, and how well the torques are explained under it."""
 
-    Attributes:
-        kind: "stated", "payload", "torque_sign", "unsigned_torque", "torque_order", "gravity",
-            "joint_order", "joint_axis", "position_order", "position_sign" or "position_offset".
-        share: Unexplained share of each torque's variance, shape (n,).
-        joints: Indices of the joints concerned.
-        values: "torque_order": the joint of each torque column; "gravity": the vector [m/s^2];
-            "position_offset": the offset [rad].
-    """
-
+    #: "stated", "payload", "torque_sign", "unsigned_torque", "torque_order", "gravity",
+    #: "joint_order", "joint_axis", "position_order", "position_sign" or "position_offset"
     kind: str
-    share: Array
-    joints: tuple[int, ...] = ()
+    share: Array  # Unexplained share of each torque's variance, shape (n,)
+    joints: tuple[int, ...] = ()  # Indices of the joints concerned
+    #: "torque_order": the joint of each torque column; "gravity": the vector [m/s^2];
+    #: "position_offset": the offset [rad]
     values: tuple[float, ...] = ()
 
     @property
@@ -55,10 +50,7 @@ class Explanation:
 
 
 def compensated(probe: Probe) -> tuple[Probe, Array]:
-    """Return a motion with the URDF's gravity added to its torques, and its unexplained shares.
-
-    -> (n,).
-    """
+    """Return a motion with the URDF's gravity added to its torques, and its unexplained shares."""
     gravity = probe.loads() - probe.loads(np.zeros(3))
     whole = replace(probe, tau=probe.tau + gravity.sum(axis=2))
     size, logged = _variation(whole.tau), _variation(probe.tau)
@@ -66,10 +58,7 @@ def compensated(probe: Probe) -> tuple[Probe, Array]:
 
 
 def unexplained(probe: Probe) -> Array:
-    """Return the share of each torque column that the model of each joint does not explain.
-
-    -> (n, n, 2).
-    """
+    """Return the share of each torque column that the model of each joint does not explain."""
     N, n = probe.tau.shape
     every = np.hstack([probe.tau, -probe.tau])
     share = _shares(probe, np.broadcast_to(every, (n, N, 2 * n)))

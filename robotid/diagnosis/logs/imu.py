@@ -1,15 +1,15 @@
 """Checks of an IMU on a floating base: axes, units, and gravity in the specific force."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 
 import numpy as np
 
-from robotid.base.findings import Finding, log_finding
+from robotid.base.findings import Finding
 from robotid.base.typing import Array
 from robotid.data.base_motion import ImuFrame, base_state, in_base
 from robotid.data.log import Log, Trajectory
-from robotid.diagnosis.logs.base_pose import orientation_readings
-from robotid.diagnosis.logs.slips import rms
+from robotid.diagnosis.catalogue import finding
+from robotid.diagnosis.logs.base_pose import orientation_readings, rms
 
 _UNLIKE = 0.3  # of the motion: an angular velocity that differs by more is wrong
 _BETTER = 0.5  # ... and has other axes if these reduce the difference below this share
@@ -20,7 +20,6 @@ _SHORTEST = 2.0  # [s] in which the mean acceleration of a robot is small
 _DEGREES = np.pi / 180
 _DRAWN = 1e-4  # weight of the stated axes, relative to the data
 _ALONG = 0.25  # largest difference of an axis from one of the link, of length 1
-_BY_ORIENTATION = "from the orientation"
 
 
 def check_imu(log: Log, motion: Trajectory, legs: tuple[Array, Array]) -> Iterator[Finding]:
@@ -31,8 +30,8 @@ def check_imu(log: Log, motion: Trajectory, legs: tuple[Array, Array]) -> Iterat
     turned = np.broadcast_to(np.eye(3), (len(w), 3, 3))
     own = base_state(motion.t, motion.q[:, :7], None, None)[1][:, 3:]
     found = list(_check_orientation(log, motion, own))
-    found = found or list(_check_axes(log, frame, w, turned, -own, _BY_ORIENTATION))
-    yield from found or _check_axes(log, frame, w, *legs, "from the links in contact")
+    found = found or list(_check_axes(log, frame, w, turned, -own, "orientation"))
+    yield from found or _check_axes(log, frame, w, *legs, "links")
     yield from _check_gravity(log, frame, motion)
 
 
@@ -46,18 +45,15 @@ def _check_orientation(log: Log, motion: Trajectory, own: Array) -> Iterator[Fin
     if rms(w) < _MOVES or now <= _UNLIKE * size:
         return
     readings = {
-        words: rms(w - base_state(motion.t, np.hstack([place, q]), None, None)[1][:, 3:])
-        for words, q in orientation_readings(motion.q[:, 3:7]).items()
+        key: rms(w - base_state(motion.t, np.hstack([place, q]), None, None)[1][:, 3:])
+        for key, q in orientation_readings(motion.q[:, 3:7]).items()
     }
-    words = min(readings, key=lambda x: readings[x])
-    if readings[words] > _UNLIKE * size:
-        return
-    message = (
-        f"the angular velocity of the IMU differs by {now:.2g} rad/s (RMS) from that of the "
-        f"quaternion of the base, with another one by {readings[words]:.2g} rad/s: {words}"
-    )
-    evidence = {"speed": now, "best": readings[words]}
-    yield log_finding(log.name, "base_orientation", "error", message, **evidence)
+    key = min(readings, key=lambda x: readings[x])
+    if readings[key] <= _UNLIKE * size:
+        yield finding(
+            "base_orientation", log.name, source="imu", reading=key, cure=key, turn=False,
+            speed=now, best=readings[key],
+        )  # fmt: skip
 
 
 def _check_axes(
@@ -69,23 +65,18 @@ def _check_axes(
         return float(np.sqrt(np.mean(np.sum((np.einsum("kij,kj->ki", D, w) + d) ** 2, axis=1))))
 
     size, now = off(0.0 * w), off(w)
-    if np.sqrt(np.mean(np.sum(w**2, axis=1))) < _MOVES or now <= _UNLIKE * size:
+    if rms(w) < _MOVES or now <= _UNLIKE * size:
         return
     M = _turn(w, D, d)
     best, degrees = off(w @ M.T), off(_DEGREES * w)
+    cure: dict[str, float | str] = {"cure": "unknown"}
     if best < _BETTER * now:
-        remedy = f"{_named(M, frame.rotation)}. Correct imu in [base], or the URDF"
+        cure = _named(M, frame.rotation)
     elif degrees < _BETTER * now:
-        best, remedy = degrees, "it is in deg/s. Convert imu_wx to imu_wz to rad/s"
-    elif source == _BY_ORIENTATION:
-        remedy = "neither other axes nor degrees explain it. Check the columns imu_wx to imu_wz"
-    else:  # feet that slip
+        best, cure = degrees, {"cure": "degrees"}
+    elif source == "links":  # feet that slip
         return
-    message = (
-        f"the angular velocity of the IMU does not agree with that {source}: the difference is "
-        f"{now / size:.0%} of the motion, {best / size:.0%} at best; {remedy}"
-    )
-    yield log_finding(log.name, "imu_axes", "error", message, off=now / size, best=best / size)
+    yield finding("imu_axes", log.name, source=source, off=now / size, best=best / size, **cure)
 
 
 def _turn(w: Array, D: Array, d: Array) -> Array:
@@ -102,16 +93,16 @@ def _turn(w: Array, D: Array, d: Array) -> Array:
     return turn
 
 
-def _named(M: Array, Q: Array) -> str:
+def _named(M: Array, Q: Array) -> dict[str, float | str]:
     """Return what a rotation M of measured vectors means, for an IMU with the axes Q."""
     own = Q.T @ M @ Q
     whole = np.rint(own)
     if np.abs(own - whole).max() < _ALONG:
         rows = np.abs(whole).argmax(axis=0)
         names = [("-" if whole[i, k] < 0 else "") + "xyz"[i] for k, i in enumerate(rows)]
-        return f"its axes x, y, z are {', '.join(names)} of the stated link"
+        return {"cure": "axes", "axes": ", ".join(names)}
     angle = np.degrees(np.arccos(np.clip((np.trace(M) - 1.0) / 2.0, -1.0, 1.0)))
-    return f"its axes are turned by {angle:.0f} deg relative to those of the stated link"
+    return {"cure": "turned", "angle": angle}
 
 
 def _check_gravity(log: Log, frame: ImuFrame, motion: Trajectory) -> Iterator[Finding]:
@@ -126,18 +117,12 @@ def _check_gravity(log: Log, frame: ImuFrame, motion: Trajectory) -> Iterator[Fi
     angle = float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
     if angle < _TILT and abs(size / g - 1.0) < _SIZE:
         return
-    causes: Sequence[tuple[bool, str]] = (
-        (abs(size - 1.0) < _SIZE, "it is in units of g. Multiply imu_ax to imu_az by 9.81"),
-        (size < 0.5 * g, "gravity was subtracted. Record the specific force, 9.81 m/s^2 at rest"),
-        (angle > 180.0 - _TILT, "its sign is reversed. Reverse imu_ax to imu_az"),
-        (angle < _TILT, "its scale is wrong. Check the unit of imu_ax to imu_az"),
-    )
-    cause = next(
-        (text for holds, text in causes if holds),
-        "its axes, or those of the orientation, are not those of the link that [base] states",
-    )
-    message = (
-        f"the specific force of the IMU is {size:.3g} m/s^2 on average, {angle:.0f} deg from the "
-        f"vertical of the orientation, wanted {g:.3g} m/s^2 upwards: {cause}"
-    )
-    yield log_finding(log.name, "imu_gravity", "error", message, angle=angle, size=size)
+    causes = {
+        "units": abs(size - 1.0) < _SIZE,
+        "subtracted": size < 0.5 * g,
+        "reversed": angle > 180.0 - _TILT,
+        "scale": angle < _TILT,
+        "axes": True,
+    }
+    cause = next(key for key, holds in causes.items() if holds)
+    yield finding("imu_gravity", log.name, cause_of=cause, angle=angle, size=size, wanted=g)

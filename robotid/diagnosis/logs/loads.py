@@ -10,18 +10,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from robotid.base.findings import Finding, listed, log_finding
+from robotid.base.findings import Finding, listed
 from robotid.base.typing import Array
+from robotid.diagnosis.catalogue import finding
 from robotid.diagnosis.logs.hypotheses import compensated, own_share
 from robotid.diagnosis.logs.torque_sample import Probe
 from robotid.robot.drives import COUNTERBALANCE, drive_line, spring_family
 
-#: Message on torques without gravity.
-NO_GRAVITY = (
-    "the torques contain no gravity: they fit the URDF with its gravity added, and do not fit it "
-    "as logged. If the controller compensates gravity before they are logged, log the total torque "
-    "of the motors; if the robot moves in a horizontal plane or floats, state gravity = [0, 0, 0]"
-)
 _SPREAD = 0.3  # prior standard deviation of a link's mass, relative to the URDF's
 _PRECISION = 0.05  # of a torque, model errors included
 _INDEPENDENT = 20.0  # number of independent instants of a log
@@ -47,38 +42,26 @@ _MISMATCH = 7.5  # largest sum of squared errors of the links, in standard devia
 
 @dataclass(frozen=True, eq=False)
 class LoadModel:
-    """The whitened torques of each joint, projected orthogonally to the columns of its drive.
+    """The whitened torques of each joint, projected orthogonally to the columns of its drive."""
 
-    Attributes:
-        R: Triangular factor of the c free parameters and the torque of each joint, shape
-            (n, c+1, c+1); 0 of joints that are ignored.
-        mean: Prior mean of the free parameters: factors of the URDF's links, and m, mcx, mcy, mcz
-            of a payload.
-        spread: Prior standard deviation, shape (c,).
-        expected: Misfit of torques that fit as well as with separate parameters for each joint.
-        independent: Number of independent torques.
-    """
-
+    #: Triangular factor of the c free parameters and the torque of each joint, shape (n, c+1, c+1);
+    #: 0 of joints that are ignored
     R: Array
+    #: Prior mean of the free parameters: factors of the URDF's links, and m, mcx, mcy, mcz of a
+    #: payload
     mean: Array
-    spread: Array
-    expected: float
-    independent: float
+    spread: Array  # Prior standard deviation, shape (c,)
+    expected: float  # Misfit of torques that fit as well as with separate parameters for each joint
+    independent: float  # Number of independent torques
 
     def misfits(self, scales: Array) -> Array:
-        """Return the misfits of scaled torques: chi-squares, prior included, shape (T,).
-
-        scales (T, n).
-        """
+        """Return the misfits of scaled torques: chi-squares, prior included, shape (T,)."""
         R = np.asarray(np.linalg.qr(self._rows(scales), mode="r"))  # (T, c+1, c+1)
         chi: Array = R[:, -1, -1] ** 2
         return chi
 
     def fit(self, scale: Array) -> tuple[float, Array, Array]:
-        """Fit with the torque columns multiplied by a scale, without negative masses of links.
-
-        scale (n,).
-        """
+        """Fit with the torque columns multiplied by a scale, without negative masses of links."""
         from scipy.optimize import lsq_linear
 
         rows = self._rows(scale[None])[0]
@@ -130,8 +113,6 @@ def check_loads(probe: Probe, share: Array, name: str) -> Iterator[Finding]:
 
     Another scale is accepted if the torques then fit with about the URDF's masses; else the URDF
     is of another robot.
-
-    share (n,).
     """
     model = load_model(probe, share)
     bodies = len(probe.model.layout.bodies)
@@ -143,7 +124,7 @@ def check_loads(probe: Probe, share: Array, name: str) -> Iterator[Finding]:
             yield from _scaled(probe, scale, _needed(model, scale, other), name)
             return
         if _holds_no_gravity(probe):
-            yield log_finding(name, "gravity_compensated", "error", NO_GRAVITY)
+            yield finding("gravity_compensated", name)
             return
         if len(other) or _error_of_links(theta) > _MISMATCH:
             yield _mismatch(probe, theta[:bodies], name)
@@ -254,25 +235,13 @@ def _balanced(
 ) -> Finding:
     joint, extent = probe.model.joints[j], float(np.ptp(probe.motion.q[:, j]))
     line = f"{drive_line(joint, spring_family(extent, COUNTERBALANCE))} in [drives]"
-    message = (
-        f"{joint}: a torque that depends on its position cancels {100 * cancelled:.0f} % of its "
-        "gravity torque by the URDF, and the other torques contain gravity: the joint has a "
-        "counterbalance or a spring"
-    )
     evidence = {"cancelled_pct": 100 * cancelled, "turned": extent}
     if lighter is None:
-        message = f"{message}. Add it to the model: {line}"
-        return log_finding(name, "counterbalance", "warning", message, joint, **evidence)
+        return finding("counterbalance", name, joint, setting=line, **evidence)
     _, k, factor = lighter
+    evidence |= {"mass": float(probe.model.standard_parameters()[10 * k]), "factor": factor}
     link = probe.model.layout.bodies[k]
-    mass = float(probe.model.standard_parameters()[10 * k])
-    message = (
-        f"{message}, or the URDF's mass of {link}, {mass:.3g} kg, is too large: {factor:.2g} times "
-        f"it explains the torques as well. Correct the mass, or, if the joint has a spring, state "
-        f"it: {line}"
-    )
-    evidence |= {"mass": mass, "factor": factor}
-    return log_finding(name, "link_mass", "warning", message, joint, **evidence)
+    return finding("link_mass", name, joint, setting=line, link=link, **evidence)
 
 
 def _error_of_links(theta: Array) -> float:
@@ -322,37 +291,24 @@ def _needed(model: LoadModel, scale: Array, other: Array) -> Array:
 
 def _scaled(probe: Probe, scale: Array, other: Array, name: str) -> Iterator[Finding]:
     joints, factors = [probe.model.joints[j] for j in other], scale[other].tolist()
-    code, todo = "current_for_torque", "with [torque] gains (--gain {0}=...), or correct the gain"
+    code = "current_for_torque"
     if len(other) > 1 and np.ptp(np.log(factors)) < np.log(_ALIKE):
         factor = float(np.exp(np.log(factors).mean()))
-        message = (
-            f"the torques of {listed(joints)} fit the URDF much better if multiplied by "
-            f"{factor:.3g}: they may be currents, or have another unit or gain; name the columns "
-            "current_<joint> " + todo.format("JOINT")
-        )
         is_all = len(other) == len(scale)
         is_unit = is_all and abs(np.log(factor)) > np.log(_OTHER_UNIT)
-        severity, part = "error" if is_unit else "warning", "" if is_all else listed(joints)
-        yield log_finding(name, code, severity, message, part, factor=factor, joints=len(other))
+        yield finding(
+            code, name, () if is_all else joints, severity="error" if is_unit else "warning",
+            factor=factor, joints=len(other), joint=listed(joints),
+        )  # fmt: skip
         return
     for joint, factor in zip(joints, factors, strict=True):
-        message = (
-            f"the torque of {joint} fits the URDF much better if multiplied by {factor:.3g}: it "
-            "may be a current, or have another unit or gain; name the column "
-            f"current_{joint} " + todo.format(joint)
-        )
-        yield log_finding(name, code, "warning", message, joint, factor=factor)
+        yield finding(code, name, joint, factor=factor)
 
 
 def _mismatch(probe: Probe, factors: Array, name: str) -> Finding:
     found = dict(zip(probe.model.layout.bodies, factors.tolist(), strict=True))
-    shown = ", ".join(f"{link} {factor:.2g}" for link, factor in found.items())
-    message = (
-        f"the torques fit only if the URDF's masses are multiplied by {shown}: the URDF may be of "
-        "another robot or without a load that is mounted, or the torques may be currents with "
-        "several gains; check the model and the unit. A prior from this URDF is not reliable"
-    )
-    return log_finding(name, "urdf_mismatch", "warning", message, **found)
+    words = ", ".join(f"{link} {factor:.2g}" for link, factor in found.items())
+    return finding("urdf_mismatch", name, factors=words, **found)
 
 
 def _payload(probe: Probe, load: Array, error: float, name: str) -> Iterator[Finding]:
@@ -361,12 +317,8 @@ def _payload(probe: Probe, load: Array, error: float, name: str) -> Iterator[Fin
     if abs(mass) < 3 * error:
         return
     link = probe.model.layout.bodies[-1]
-    message = (
-        f"{link} carries roughly {abs(mass):.2g} kg {'more' if mass > 0 else 'less'} than in the "
-        "URDF, if the URDF's other masses and the gains are right; if a tool or payload is "
-        "mounted, add it to the URDF, else it is identified as part of the last link. robotid "
-        "payload, with a log without it as --reference, identifies it with an interval"
-    )
     evidence = {"mass": mass, "std_error": error, "mcx": load[1], "mcy": load[2], "mcz": load[3]}
     severity = "warning" if abs(mass) - 2 * error > _LARGE * arm else "note"
-    yield log_finding(name, "payload", severity, message, link, **evidence)
+    yield finding(
+        "payload", name, subject=link, severity=severity, link=link, sense=mass > 0, **evidence
+    )

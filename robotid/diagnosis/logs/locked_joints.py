@@ -4,9 +4,10 @@ from collections.abc import Collection, Iterator, Mapping
 
 import numpy as np
 
-from robotid.base.findings import Finding, log_finding, toml_key
+from robotid.base.findings import Finding, toml_key
 from robotid.base.typing import Array
 from robotid.data.signal_settings import LogUnits
+from robotid.diagnosis.catalogue import finding
 from robotid.robot.model import RobotModel
 
 #: Largest range of a locked joint, and largest difference from its stated position [rad or m].
@@ -21,28 +22,20 @@ def check_locked(
     asked: Collection[str],
     units: LogUnits,
 ) -> Iterator[Finding]:
-    """Yield an error "locked_position" per locked joint that moves or has another position.
-
-    positions (N,) [rad or m].
-    """
+    """Yield an error "locked_position" per locked joint that moves or has another position."""
     prismatic = {joint.name for joint in model.tree.movable if joint.type == "prismatic"}
     for joint, q in positions.items():
-        unit = "m" if joint in prismatic else "rad"
         stated = model.locked[joint]
         middle, extent = float(np.median(q)), float(np.ptp(q))
         if extent <= STILL and abs(middle - stated) <= STILL:
             continue
-        default = "" if joint in asked else " by default"
-        if extent > STILL:
-            what = f"moves over a range of {extent:.3g} {unit} in the log"
-            todo = f"identify {joint}, too, or use only the part of the log in which it is at rest"
-        else:
-            what = f"is at {middle:.4g} {unit} in the log"
-            todo = f"state locked = {{ {joint} = {middle:.4g} }} (--lock {joint}={middle:.4g})"
-        message = f"{joint} is locked at {stated:.4g} {unit}{default} but {what}; {todo}"
-        message += percent_hint(model, joint, middle, units)
-        evidence = {"stated": stated, "median": middle, "range": extent}
-        yield log_finding(log, "locked_position", "error", message, joint, **evidence)
+        what = "moves" if extent > STILL else "stands"
+        yield finding(
+            "locked_position", log, joint, what=what, todo=what, default=joint in asked,
+            unit="m" if joint in prismatic else "rad", stated=stated, median=middle, range=extent,
+            setting=f"locked = {{ {joint} = {middle:.4g} }}", flag=f"--lock {joint}={middle:.4g}",
+            percent=percent_hint(model, joint, middle, units),
+        )  # fmt: skip
 
 
 def percent_hint(model: RobotModel, name: str, position: float, units: LogUnits) -> str:

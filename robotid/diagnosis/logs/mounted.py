@@ -7,10 +7,11 @@ from functools import cached_property
 import numpy as np
 import scipy.special
 
-from robotid.base.findings import Finding, listed, log_finding
+from robotid.base.findings import Finding, listed
 from robotid.base.typing import Array
 from robotid.data.log import Trajectory
 from robotid.data.signal_settings import SignalSettings
+from robotid.diagnosis.catalogue import finding
 from robotid.diagnosis.logs.loads import LoadModel, load_model
 from robotid.diagnosis.logs.torque_sample import Probe
 from robotid.dynamics.base_parameters import BaseMapping
@@ -39,8 +40,6 @@ def check_unmounted_parts(probe: Probe, share: Array, name: str) -> Iterator[Fin
 
     Parts are links that fixed or locked joints attach to the link of the last moving joint, with
     all links that they carry.
-
-    share (n,).
     """
     model = load_model(probe, share)
     whole, loaded = _misfit_without_load(model), model.fit(np.ones(len(share)))[0]
@@ -56,34 +55,22 @@ def check_unmounted_parts(probe: Probe, share: Array, name: str) -> Iterator[Fin
             trials.append((left, links, float(parameters[0])))
     left, links, mass = min(trials, default=(np.inf, [], 0.0))
     # a load of any mass, positive or negative, must not explain the torques much better
-    if left > min(whole - _LIGHTER, loaded + _ALIKE):
-        return
-    gain = whole - left
-    last = probe.model.layout.bodies[-1]
-    message = (
-        f"the torques fit the URDF better without {listed(links, 4)}, with a total mass of "
-        f"{mass:.3g} kg on {last}; if these parts were not mounted, remove them from the URDF, "
-        f"else correct the mass of {last}, which is too large"
-    )
-    evidence = {"mass": mass, "gain": gain}
-    yield log_finding(name, "unmounted_part", "warning", message, last, **evidence)
+    if left <= min(whole - _LIGHTER, loaded + _ALIKE):
+        last = probe.model.layout.bodies[-1]
+        yield finding(
+            "unmounted_part", name, subject=last, link=last, parts=listed(links, 4), mass=mass,
+            gain=whole - left,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
 class Segments:
-    """Motions of a robot, and the reduced least-squares problems of their segments.
+    """Motions of a robot, and the reduced least-squares problems of their segments."""
 
-    Attributes:
-        model: The robot.
-        mapping: Standard to base parameters.
-        motions: The motions.
-        min_velocity: Lower bound on the speed of the rows that are used.
-    """
-
-    model: RobotModel
-    mapping: BaseMapping
-    motions: Sequence[Trajectory]
-    min_velocity: float
+    model: RobotModel  # The robot
+    mapping: BaseMapping  # Standard to base parameters
+    motions: Sequence[Trajectory]  # The motions
+    min_velocity: float  # Lower bound on the speed of the rows that are used
 
     @property
     def seconds(self) -> float:
@@ -147,13 +134,9 @@ def check_payload_change(
     if _CLEARLY * left.mean() > by_scales.mean():
         return  # the logs differ by another effect
     link = layout.bodies[-1]
-    message = (
-        f"{link} carries {abs(mass):.2g} +- {error:.1g} kg {'more' if mass > 0 else 'less'} "
-        "than in the fitted logs: this log does not validate the same robot; record it with the "
-        "same load, fit it separately, or identify the load with robotid payload"
+    yield finding(
+        "payload_change", name, subject=link, link=link, sense=mass > 0, mass=mass, std_error=error
     )
-    evidence = {"mass": mass, "std_error": error}
-    yield log_finding(name, "payload_change", "warning", message, link, **evidence)
 
 
 def _misfit_without_load(model: LoadModel) -> float:

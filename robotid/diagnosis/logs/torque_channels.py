@@ -4,10 +4,11 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from robotid.base.findings import Finding, listed, log_finding, quoted
+from robotid.base.findings import Finding, listed, quoted
 from robotid.base.typing import Array
 from robotid.data.log import Log
 from robotid.data.measured_velocity import COARSE, quantum
+from robotid.diagnosis.catalogue import finding
 from robotid.diagnosis.logs.clock import runs_of
 from robotid.diagnosis.logs.locked_joints import STILL
 
@@ -34,18 +35,11 @@ def _clipping(log: Log, joint: str, x: Array, moving: Array, *, moves: bool) -> 
     """Yield a torque that is at a limit, or constant, in rows where the robot moves."""
     if moving.any() and np.ptp(x) == 0:
         value = float(x[0]) + 0.0  # no -0
-        message = (
-            f"the torque of {joint} is {value:.6g} in every row while the robot moves: the channel "
-            "is dead. The drive of this joint cannot be identified; log "
-            f"tau_{joint}, or leave the joint out"
+        kind = "undriven" if moves and value == 0.0 else "dead"
+        name = quoted(joint)
+        yield finding(
+            "constant_torque", log.name, joint, value=value, kind=kind, cure=kind, quoted=name
         )
-        if moves and value == 0.0:
-            message = (
-                f"the torque of {joint} is 0 in every row while the joint moves: it has no drive, "
-                f"or the channel is dead. If it has no drive, state passive = [{quoted(joint)}] in "
-                f"the job file; else log tau_{joint}"
-            )
-        yield log_finding(log.name, "constant_torque", "warning", message, joint, value=value)
         return
     step = quantum(x)
     for limit in (float(x.max()), float(x.min())):
@@ -53,14 +47,8 @@ def _clipping(log: Log, joint: str, x: Array, moving: Array, *, moves: bool) -> 
         share = float(at.mean())
         plateau = max((stop - start for start, stop in runs_of(at)), default=0)
         is_coarse = step > 0 and np.ptp(x) / step < COARSE
-        if share < _CLIPPED or plateau < _PLATEAU or is_coarse:
-            continue
-        message = (
-            f"the torque of {joint} is at its limit {limit:.6g} in {100 * share:.3g} % of the "
-            "rows while the robot moves: it is clipped, and these rows are wrong; record a slower "
-            "motion, or remove these rows"
-        )
-        yield log_finding(log.name, "clipped", "warning", message, joint, limit=limit, share=share)
+        if share >= _CLIPPED and plateau >= _PLATEAU and not is_coarse:
+            yield finding("clipped", log.name, joint, limit=limit, share=share)
 
 
 def _unsigned(log: Log) -> Iterator[Finding]:
@@ -69,14 +57,8 @@ def _unsigned(log: Log) -> Iterator[Finding]:
     A single such torque may belong to a joint that gravity loads in one direction only.
     """
     touching = sum(_touches(x) >= _TOUCHES for x in log.tau.T)
-    if log.tau.min() < 0 or touching < _ALL:
-        return
-    message = (
-        f"no torque is ever negative, although the torques of {touching} joints reach 0 "
-        "repeatedly: they are absolute values, as some servos report their load. An "
-        "identification from them is wrong; log torques with their signs"
-    )
-    yield log_finding(log.name, "unsigned_torque", "error", message, joints=touching)
+    if log.tau.min() >= 0 and touching >= _ALL:
+        yield finding("unsigned_torque", log.name, joints=touching, kind="all", cure="all")
 
 
 def _touches(x: Array) -> int:
@@ -93,23 +75,15 @@ def _held(log: Log) -> Iterator[Finding]:
     torque is constant for irregular times.
     """
     fresh = np.append(True, (np.diff(log.q, axis=0) != 0).any(axis=1))
-    tau = log.tau[fresh]
-    lengths = np.array([_hold(x) for x in tau.T])
+    lengths = np.array([_hold(x) for x in log.tau[fresh].T])
     for length in np.unique(lengths[lengths > 1]):
         names = [log.joints[j] for j in np.flatnonzero(lengths == length)]
         step = float(np.median(np.diff(log.t)))
-        delay = 0.5 * (length - 1) * step
-        message = (
-            f"the torque of {listed(names)} is constant for {length:.0f} rows: it is updated at "
-            f"{1 / (length * step):.3g} Hz and logged at {1 / step:.3g} Hz. This is a mean delay "
-            f"of {1e3 * delay:.2g} ms; log it at the rate of the position, or set "
-            f"[signals] torque_delay = {delay:.4f} (--torque-delay {delay:.4f}) and a cutoff below "
-            f"{0.25 / (length * step):.2g} Hz"
-        )
-        part = "" if len(names) == len(log.joints) else listed(names)
-        yield log_finding(
-            log.name, "repeated_torque", "warning", message, part, rows=length, delay=delay
-        )
+        yield finding(
+            "repeated_torque", log.name, () if len(names) == len(log.joints) else names,
+            rows=length, delay=0.5 * (length - 1) * step, updated=1 / (length * step),
+            logged=1 / step, below=0.25 / (length * step), joint=listed(names),
+        )  # fmt: skip
 
 
 def _hold(x: Array) -> int:

@@ -21,40 +21,28 @@ _LOADED = 0.05  # of the RMS rigid-body torque, over which the loaded side of a 
 
 @dataclass(frozen=True)
 class Candidate:
-    """A term that a drive's torque may have, linear in its parameters.
+    """A term that a drive's torque may have, linear in its parameters."""
 
-    Attributes:
-        name: Its name.
-        code: Code of the finding that reports it.
-        columns: Columns of its c parameters in N samples, shape (N, c). They are scaled by the
-            motion given, unless that names another motion.
-        meaning: Description of the term for a finding.
-        advice: Remedy other than adding it to the model; empty if none.
-        families: Friction families of a job that contain it, see ``FAMILIES``. The first one for
-            which the joint moved far enough is advised.
-        terms: Terms of a job's [drives] that are equal to it, if no family is.
-        units: Unit of the parameter of a revolute and of a prismatic joint; None: the size is the
-            RMS torque of the term.
-        revolute_only: Whether only a revolute joint has it.
-        coupled: The other joint of a coupling; empty if none.
-        ratio: Ratio of the other joint; that of the joint itself is 1.
-        tried: Number of such terms among which the residual selected it.
-        is_imitated: Whether stiction at reversals looks like it behind a filter: it is a note at
-            most.
-    """
-
-    name: str
-    code: str
+    name: str  # Its name
+    code: str  # Code of the finding that reports it
+    #: Columns of its c parameters in N samples, shape (N, c). They are scaled by the motion given,
+    #: unless that names another motion
     columns: Callable[[JointMotion], Array]
-    meaning: str
-    advice: str = ""
+    meaning: str  # Description of the term for a finding
+    advice: str = ""  # Remedy other than adding it to the model; empty if none
+    #: Unit of the parameter of a revolute and of a prismatic joint; None: the size is the RMS
+    #: torque of the term
     units: tuple[str, str] | None = None
-    revolute_only: bool = False
+    revolute_only: bool = False  # Whether only a revolute joint has it
+    #: Friction families of a job that contain it, see ``FAMILIES``. The first one for which the
+    #: joint moved far enough is advised
     families: tuple[str, ...] = ()
+    #: Terms of a job's [drives] that are equal to it, if no family is
     terms: tuple[DriveTerm, ...] = ()
-    tried: int = 1
-    coupled: str = ""
-    ratio: float = 0.0
+    tried: int = 1  # Number of such terms among which the residual selected it
+    coupled: str = ""  # The other joint of a coupling; empty if none
+    ratio: float = 0.0  # Ratio of the other joint; that of the joint itself is 1
+    #: Whether stiction at reversals looks like it behind a filter: it is a note at most
     is_imitated: bool = False
 
 
@@ -95,10 +83,7 @@ def _passed(m: JointMotion, counts: Array) -> Array:
 
 
 def ripples(m: JointMotion, weight: Array, r: Array) -> tuple[Candidate, ...]:
-    """Return candidates of a torque periodic in the position, from the residual's spectrum.
-
-    weight (N,), r (N,).
-    """
+    """Return candidates of a torque periodic in the position, from the residual's spectrum."""
     first = np.exp(1j * m.q)
     wave = first ** _RIPPLES[0]  # e^(i count q)
     explained = np.zeros(len(_RIPPLES))

@@ -21,27 +21,19 @@ _FEWEST_IN_BIN = 3  # segments from which the scatter of a bin's mean is determi
 
 @dataclass(frozen=True, eq=False)
 class Dependence:
-    """Dependence of the residual of a joint on a quantity.
+    """Dependence of the residual of a joint on a quantity."""
 
-    Attributes:
-        name: "constant", "position", "speed", "acceleration", "load" or "time".
-        unit: Unit of the quantity.
-        centres: Mean of the quantity in each bin, shape (B,).
-        means: Mean residual in each bin, shape (B,) [N m or N].
-        errors: Standard error of these means, from their scatter between segments, shape (B,); NaN
-            in bins of fewer than three segments.
-        share: Share of the residual's variance that the means of other segments explain; None if
-            there are too few segments. A negative share means that they explain nothing.
-        p_value: p-value of that share [-].
-    """
-
-    name: str
-    unit: str
-    centres: Array
-    means: Array
+    name: str  # "constant", "position", "speed", "acceleration", "load" or "time"
+    unit: str  # Unit of the quantity
+    centres: Array  # Mean of the quantity in each bin, shape (B,)
+    means: Array  # Mean residual in each bin, shape (B,) [N m or N]
+    #: Standard error of these means, from their scatter between segments, shape (B,); NaN in bins
+    #: of fewer than three segments
     errors: Array
+    #: Share of the residual's variance that the means of other segments explain; None if there are
+    #: too few segments. A negative share means that they explain nothing
     share: float | None
-    p_value: float
+    p_value: float  # p-value of that share [-]
 
     @property
     def is_significant(self) -> bool:
@@ -59,10 +51,7 @@ class Dependence:
         return float(self.centres[int(np.argmax(significance))])
 
     def at(self, x: Array) -> tuple[Array, Array]:
-        """Return the mean residual and its standard error, linear between bins, shape (N,) each.
-
-        x (N,).
-        """
+        """Return the mean residual and its standard error, linear between bins, shape (N,) each."""
         curves = (np.interp(x, self.centres, y, np.nan, np.nan) for y in (self.means, self.errors))
         mean, error = curves
         return mean, error
@@ -77,8 +66,6 @@ def follow(
     is m_b = sum_k S_kb / n_b. Its variance is sum_k (S_kb - N_kb m_b)^2 / n_b^2, for independent
     clusters (Liang, Zeger 1986). The squared residual of segment k after the means of the other
     segments is compared with that after their common mean; for a single bin, with that around 0.
-
-    x (N,), r (N,), bins (N,), segments (N,).
     """
     n = np.bincount(bins).astype(float)
     centres, means = np.bincount(bins, x) / n, np.bincount(bins, r) / n
@@ -107,9 +94,6 @@ def follow(
 
 
 def even_bins(x: Array) -> Array:
-    """Return the bin of each value: ten bins with equal numbers of samples, also split at 0.
-
-    x (N,) -> (N,).
-    """
+    """Return the bin of each value: ten bins with equal numbers of samples, also split at 0."""
     edges = np.unique(np.append(np.quantile(x, np.arange(1, _BINS) / _BINS), 0.0))
     return np.unique(np.searchsorted(edges, x, side="right"), return_inverse=True)[1]

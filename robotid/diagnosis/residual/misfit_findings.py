@@ -3,9 +3,9 @@
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 
 from robotid.base.findings import Finding, listed, toml_key
+from robotid.diagnosis.catalogue import finding
 from robotid.diagnosis.residual.candidates import Candidate
 from robotid.diagnosis.residual.decisions import MAIN
 from robotid.diagnosis.residual.misfit import Misfit
@@ -52,12 +52,12 @@ def with_entries(fit: Fit, joint: str, entries: Sequence[str | DriveTerm]) -> st
 
 def counterbalanced(found: Sequence[Finding], logs: Sequence[str]) -> dict[str, str]:
     """Return the family of the counterbalance of each joint with one in the fitted logs."""
-    joints = {}
-    for finding in found:
-        log, _, joint = finding.where.rpartition(": ")
-        if finding.code in _BALANCES and log in logs:
-            joints[joint] = spring_family(finding.evidence["turned"], COUNTERBALANCE)
-    return joints
+    return {
+        joint: spring_family(one.evidence["turned"], COUNTERBALANCE)
+        for one in found
+        for joint in one.joints
+        if one.code in _BALANCES and one.log in logs
+    }
 
 
 def with_known_springs(
@@ -73,16 +73,15 @@ def with_known_springs(
     selected = {c.joint for c in auto if any(t.part in _SPRINGS for t in c.terms)}
     known = {"counterbalance": springs, "link_mass": springs - selected}
 
-    def as_known(finding: Finding) -> Finding:
-        joint = finding.where.rpartition(": ")[2]
-        if joint not in known.get(finding.code, ()):
-            return finding
+    def as_known(one: Finding) -> Finding:
+        joint = one.joints[0] if one.joints else ""
+        if joint not in known.get(one.code, ()):
+            return one
         names = listed(term.name for term in own[joint] if term.part in _SPRINGS)
-        what, _, _ = finding.message.replace(". Correct the mass", ". Add it").partition(". Add it")
-        message = f"{what}. The model includes it: {names} of {joint}"
-        return replace(finding, severity="note", message=message)
+        remedy = f". The model includes it: {names} of {{joint}}"
+        return one.reworded(severity="note", remedy=remedy)
 
-    return [as_known(finding) for finding in found]
+    return [as_known(one) for one in found]
 
 
 def settled(found: Sequence[Finding], of_fit: Sequence[Finding]) -> list[Finding]:
@@ -97,9 +96,11 @@ def settled(found: Sequence[Finding], of_fit: Sequence[Finding]) -> list[Finding
         rest = [f for f in rest if f not in hypotheses]
         if hypotheses:
             codes = listed(dict.fromkeys(f.code for f in hypotheses))
-            message = f"{term.message}. It explains {codes} and may bias the masses"
-            evidence = {**term.evidence, "replaces": float(len(hypotheses))}
-            term = replace(term, severity="warning", message=message, evidence=evidence)
+            term = term.reworded(
+                severity="warning",
+                remedy=f"{term.remedy}. It explains {codes} and may bias the masses",
+                evidence={**term.evidence, "replaces": float(len(hypotheses))},
+            )
         terms.append(term)
     return rest + terms
 
@@ -109,7 +110,7 @@ def _explains(term: Finding, hypothesis: Finding) -> bool:
     if term.evidence.get("share_pct", 0.0) < MAIN:
         return False
     if hypothesis.code == "unexplained_torque":
-        return hypothesis.where.rpartition(": ")[2] == term.where
+        return bool(hypothesis.joints) and hypothesis.joints == term.joints
     return hypothesis.code in _OF_MASSES and term.code in _OF_POSITION
 
 
@@ -128,34 +129,24 @@ def _advice(term: Candidate, setting: str) -> str:
 def _finding(misfit: Misfit, found: Fit, on_misfit: Sequence[str]) -> Finding:
     term, validation = misfit.term, misfit.confirmed
     wide = [name for name in on_misfit if name.startswith(f"{misfit.joint}.")]
-    widened = f"; the intervals of {listed(wide)} include this misfit" if wide else ""
-    confirmed = ""
-    if validation is not None:
-        confirmed = f" ({100 * max(validation, 0.0):.0f} % on the validation logs)"
-    remedy = _advice(term, setting_of(misfit, found))
-    trend, unit = "", misfit.unit.removesuffix(" rms")
-    if not math.isnan(misfit.trend[0]):
-        change, error = misfit.trend
-        verb = "falls" if change < 0 else "rises"
-        trend = (
-            f"; friction at the RMS speed {verb} by {abs(change):.2g} +- {error:.1g} {unit} per min"
-        )
-    message = (
-        f"{misfit.joint}: {term.meaning}: {misfit.size:.3g} +- {misfit.std_error:.2g} "
-        f"{misfit.unit}{trend}. It would explain {100 * misfit.share:.0f} % of the squared residual"
-        f"{confirmed}; the residual is {100 * misfit.error:.1f} % of the torque. "
-        f"{remedy or 'The model has no such term'}{widened}"
-    )
-    evidence = {
+    figures = {
         "share_pct": 100 * misfit.share,
         "error_pct": 100 * misfit.error,
         "size": misfit.size,
         "std_error": misfit.std_error,
         "p_value": misfit.p_value,
     }
-    if trend:
-        evidence |= {"trend": misfit.trend[0], "trend_std_error": misfit.trend[1]}
+    change, error = misfit.trend
+    drifts = not math.isnan(change)
+    if drifts:
+        figures |= {"trend": change, "trend_std_error": error}
     if validation is not None:
-        evidence["validation_share_pct"] = 100 * validation
-    severity = "warning" if misfit.matters else "note"
-    return Finding(term.code, severity, misfit.joint, message, evidence)
+        percent = 100 * validation
+        figures |= {"validation_share_pct": percent, "validated_pct": max(percent, 0.0)}
+    cure = _advice(term, setting_of(misfit, found)) or "The model has no such term"
+    return finding(
+        term.code, "", misfit.joint, severity="warning" if misfit.matters else "note",
+        meaning=term.meaning, unit=misfit.unit, trend_unit=misfit.unit.removesuffix(" rms"),
+        change=drifts, sense=change < 0, confirmed=validation is not None, cure=cure,
+        widened=bool(wide), wide=listed(wide), **figures,
+    )  # fmt: skip

@@ -188,10 +188,7 @@ def _motions(found: Solution, sample: Sample) -> list[DriveMotion]:
 
 
 def shape_slope(found: Solution, choice: "DriveChoice", which: int, motion: DriveMotion) -> Array:
-    """Return the derivative of a drive's torque with respect to one of its shapes, shape (N,).
-
-    motion (N,).
-    """
+    """Return the derivative of a drive's torque with respect to one of its shapes, shape (N,)."""
     layout = found.model.layout
     theta = dict(zip(layout.names, found.standard, strict=True))
     size = choice.shapes[which].value * _STEP

@@ -20,10 +20,8 @@ def spectrum(
     S(f) = 2 dt sum |FFT(w m x)|^2 / sum w^2 m, with m = 1 where a sample is used.
 
     References:
-        Welch (1967), The use of fast Fourier transform for the estimation of power spectra.
-        Parzen (1963), On spectral analysis with missing observations.
-
-    x (N,) [unit], used (N,), segment (N,) -> (F,) [Hz], (F,) [unit^2/Hz].
+    Welch (1967), The use of fast Fourier transform for the estimation of power spectra.
+    Parzen (1963), On spectral analysis with missing observations.
     """
     bounds = np.flatnonzero(np.r_[True, np.diff(segment) != 0, True])
     size = min(max(round(length / dt), 8), int(np.diff(bounds).max()))
@@ -50,9 +48,7 @@ def autocorrelation(x: Array, used: NDArray[np.bool_], segment: Array, lags: int
     one segment: by Cauchy and Schwarz it is at most 1, however few pairs have this lag.
 
     References:
-        Parzen (1963), On spectral analysis with missing observations.
-
-    x (N,), used (N,), segment (N,) -> (lags + 1,).
+    Parzen (1963), On spectral analysis with missing observations.
     """
     products, earlier, later, pairs = np.zeros((4, lags + 1))
     bounds = np.flatnonzero(np.r_[True, np.diff(segment) != 0, True])
@@ -73,8 +69,6 @@ def friction_split(model: RobotModel, evaluation: Evaluation, pi: Array) -> tupl
     """Return the measured torque without rigid-body torques, and the identified friction.
 
     The first is tau - Y pi with pi without friction and offset, the second their torque.
-
-    pi (p,) -> (N, n) [N m or N].
     """
     layout = model.layout
     inertial = [True] * layout.n_inertial

@@ -25,38 +25,23 @@ Option = TypeVar("Option", bound=Hashable)
 
 @dataclass(frozen=True)
 class Rule:
-    """Conditions for the selection of an option.
+    """Conditions for the selection of an option."""
 
-    Attributes:
-        most: Largest number of options selected.
-        share: Smallest share of the squared residual of a selected option [-].
-        p_value: Largest p-value of a selected option [-]; None: it is not tested.
-        alike: Share of the squared residual within which options count as equal [-].
-    """
-
-    most: int
-    share: float
-    p_value: float | None
-    alike: float
+    most: int  # Largest number of options selected
+    share: float  # Smallest share of the squared residual of a selected option [-]
+    p_value: float | None  # Largest p-value of a selected option [-]; None: it is not tested
+    alike: float  # Share of the squared residual within which options count as equal [-]
 
 
 @dataclass(frozen=True, eq=False)
 class Round(Generic[Option]):
-    """Squared residuals of held-out segments with each option, together with those selected.
+    """Squared residuals of held-out segments with each option, together with those selected."""
 
-    Attributes:
-        before: Squared residual of each of K segments without any option, shape (K,).
-        left: Squared residuals with each option, shape (K,).
-        fitted: Number of segments of fitted logs, which come first; the others are validation.
-        whole: Squared residual to which shares refer.
-        least: Smallest reduction of the squared residual, whatever its share.
-    """
-
-    before: Array
-    left: Mapping[Option, Array]
-    fitted: int
-    whole: float
-    least: float = -np.inf
+    before: Array  # Squared residual of each of K segments without any option, shape (K,)
+    left: Mapping[Option, Array]  # Squared residuals with each option, shape (K,)
+    fitted: int  # Number of segments of fitted logs, which come first; the others are validation
+    whole: float  # Squared residual to which shares refer
+    least: float = -np.inf  # Smallest reduction of the squared residual, whatever its share
 
     def gain(self, option: Option) -> float:
         """Return the reduction of the squared residual of fitted logs by an option."""
@@ -114,8 +99,6 @@ def p_value(before: Array, after: Array, fitted: int) -> float:
 
     Student's test of the mean of their shares, each between -1 and 1, over the segments of fitted
     logs or over all, whichever p-value is smaller. Segments with the joint at rest do not count.
-
-    before (K,), after (K,).
     """
     return min(_student(before[:k], after[:k]) for k in {fitted, len(before)})
 

@@ -98,8 +98,6 @@ def split_torque(
     """Return the parts of the torques that parameters predict.
 
     A static model has no torques of motion: gravity is the only part of the bodies.
-
-    pi (p,), q (N, n) [rad, m], v (N, n_rows) [rad/s, m/s], a (N, n_rows) [rad/s^2, m/s^2].
     """
     layout, first = model.layout, model.n_rows - len(model.joints)
     wanted = (len(q), model.n_rows)
@@ -123,21 +121,14 @@ def split_torque(
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """Samples of recordings, one after the other.
+    """Samples of recordings, one after the other."""
 
-    Attributes:
-        recordings: Names of the recordings.
-        t: Time stamps, shape (N,) [s].
-        recording: Recording of each sample, shape (N,), int.
-        segment: Uninterrupted segment of it, shape (N,), int.
-        segments: Segment that is held out in turn, shape (N,), int; None if the recordings are too
-            short for six.
-    """
-
-    recordings: tuple[str, ...]
-    t: Array
-    recording: Array
-    segment: Array
+    recordings: tuple[str, ...]  # Names of the recordings
+    t: Array  # Time stamps, shape (N,) [s]
+    recording: Array  # Recording of each sample, shape (N,), int
+    segment: Array  # Uninterrupted segment of it, shape (N,), int
+    #: Segment that is held out in turn, shape (N,), int; None if the recordings are too short for
+    #: six
     segments: Array | None
 
     @property
@@ -261,26 +252,32 @@ class JointTorque:
 
     @property
     def sentence(self) -> str:
-        """The cause of the residual, as text."""
+        """The cause of the residual and what to do, as text."""
+        return ". ".join(filter(None, self.cause))
+
+    @property
+    def cause(self) -> tuple[str, str]:
+        """The cause of the residual, and what to do."""
         rms, best = self.rms, self._best(self.follows)
         if np.isnan(rms["measured"]):
-            return "no sample is used: the joint does not move"
+            return "no sample is used: the joint does not move", ""
         if rms["measured"] == 0:
-            return "the measured torque is 0 throughout"
+            return "the measured torque is 0 throughout", ""
         left = f"the residual is {_percent(rms['residual'] / rms['measured'])} of the torque"
         if best is not None:
             advice = _CHANGED if self._has_changed(best.name) else _ADVICE[best.name]
-            return f"{left} and {self._described(best)}. {advice}"
+            return f"{left} and {self._described(best)}", advice
         if self.broadband is None or self.rows.segments is None:
-            return f"{left}; the recordings are too short to determine its cause"
+            return f"{left}; the recordings are too short to determine its cause", ""
         if self.broadband >= _NOISY:
             share = _percent(self.broadband)
-            return f"{left}; {share} of its power is broadband (above the cut-off): noise"
+            return f"{left}; {share} of its power is broadband (above the cut-off): noise", ""
         names = [d.name for d in self.follows if d.name != "constant"]
+        share = _percent(1.0 - self.broadband)
         return (
-            f"{left}; neither a constant nor {', '.join(names)} explain it, but "
-            f"{_percent(1.0 - self.broadband)} of its power is below the cut-off: systematic. "
-            "Check the motion of other joints, and elasticity"
+            f"{left}; neither a constant nor {', '.join(names)} explain it, but {share} of its "
+            "power is below the cut-off: systematic",
+            "Check the motion of other joints, and elasticity",
         )
 
     def _described(self, best: Dependence) -> str:

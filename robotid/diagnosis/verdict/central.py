@@ -16,18 +16,12 @@ _STAYED = 0.3  # change in prior standard deviations up to which the source may 
 
 @dataclass(frozen=True, eq=False)
 class CentralParameters:
-    """Parameters of the n bodies in the order of ``CENTRAL_TERMS``, SI units.
+    """Parameters of the n bodies in the order of ``CENTRAL_TERMS``, SI units."""
 
-    Attributes:
-        urdf: Values of the URDF, shape (n, 10); NaN for the centre and inertia without mass.
-        values: Identified values, likewise.
-        half: Half-widths of their 95 % intervals, shape (n, 10); inf if there is none.
-        sources: What determined each value, of ``SOURCES``, shape (n, 10), text.
-    """
-
-    urdf: Array
-    values: Array
-    half: Array
+    urdf: Array  # Values of the URDF, shape (n, 10); NaN for the centre and inertia without mass
+    values: Array  # Identified values, likewise
+    half: Array  # Half-widths of their 95 % intervals, shape (n, 10); inf if there is none
+    #: What determined each value, of ``SOURCES``, shape (n, 10), text
     sources: np.ndarray[tuple[int, int], np.dtype[np.str_]]
 
 

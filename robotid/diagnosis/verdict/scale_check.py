@@ -354,8 +354,6 @@ def common_factor(ratios: Array, sensitivity: Array, inertial: Array) -> tuple[f
     of one unknown standard deviation. Generalised least squares with the covariance E E^T gives s;
     the residual gives the deviation, Student's t with one degree of freedom less than joints the
     interval. Errors of the data spread the ratios, too, and are included so.
-
-    ratios (k,), sensitivity (k, 10 b), inertial (10 b,).
     """
     A, pi = sensitivity.reshape(len(ratios), -1, 10), inertial.reshape(-1, 10)
     J = pseudo_inertia(inertial)
@@ -388,10 +386,7 @@ def friction_shares(found: Fit) -> dict[str, float]:
 
 
 def _with_payload(of_urdf: Array, of_result: Array, last: Array) -> tuple[float, float, float]:
-    """Return scale and mass of a payload, and the share that a payload alone leaves unexplained.
-
-    of_urdf (N, n), last (N, n, 4).
-    """
+    """Return scale and mass of a payload, and the share that a payload alone leaves unexplained."""
     P, u, g = last.reshape(-1, 4), of_urdf.reshape(-1), of_result.reshape(-1)
     alone = np.linalg.lstsq(P, g - u)[0]
     left = float(np.linalg.norm(g - u - P @ alone) / np.linalg.norm(g))

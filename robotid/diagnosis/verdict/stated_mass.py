@@ -119,8 +119,6 @@ def _checked(found: Fit, names: Sequence[str], C: Array, widths: Array) -> State
 
     Torque alone determines K pi = beta. Sums Z^T C of the claims that are sums M K of base
     parameters have no free part; with o = Z^T 1, r = o . M beta / o . o. In units of the spread.
-
-    C (k, p) [1/kg], widths (k,).
     """
     model, wls = found.model, found.wls
     is_pinned = model.layout.owned_by(found.estimator.bounds.pinned)

@@ -15,7 +15,6 @@ from robotid.base.exceptions import RankDeficientError
 from robotid.base.typing import Array
 from robotid.estimation.estimators.estimator import Estimate
 
-_ILL_CONDITIONED = 1e3  # condition number of unit columns above which a motion is poor
 _PRIOR_LED = 0.9  # ratio of the spreads after and before the data above which a direction is weak
 _LED_IN_PART = 0.3  # share of a parameter's spread in weak directions that makes it a group member
 _COUPLED = 0.5  # ... or its coefficient relative to another member, in units of the spreads
@@ -25,6 +24,7 @@ _TIE = 0.95  # coefficients above this share of the largest are equal to it: the
 _TERMS = 4  # largest number of printed terms of a sum
 _DIGITS = 3  # printed digits of a coefficient
 _NAMED = 5  # largest number of parameters of a group, and half as many sums, that are printed
+_ILL_CONDITIONED = 1e3  # condition number of unit columns above which a motion is poor
 _GROUPS = 2  # largest number of groups whose sums are printed
 
 
@@ -161,6 +161,11 @@ def determine(names: Sequence[str], rows: Array, spread: Array) -> Determination
     return Determination(tuple(names), spread, shrinkage, weak, groups)
 
 
+def is_poorly_excited(wls: Estimate, count: int) -> bool:
+    """Return whether the motion, not the noise, leaves base parameters undetermined."""
+    return wls.rank < count or wls.condition > _ILL_CONDITIONED
+
+
 def _groups(names: tuple[str, ...], weak: Array, spread: Array) -> tuple[Group, ...]:
     """Return the groups of base parameters that are coupled along the weak directions."""
     count = weak.shape[1]
@@ -208,8 +213,3 @@ def _combination(
 
 def _and(words: Sequence[str]) -> str:
     return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
-
-
-def is_poorly_excited(wls: Estimate, count: int) -> bool:
-    """Return whether the motion, not the noise, leaves base parameters undetermined."""
-    return wls.rank < count or wls.condition > _ILL_CONDITIONED

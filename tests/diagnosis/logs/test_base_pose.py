@@ -1,7 +1,6 @@
 """Findings on the pose of a floating base: jumps, and the order of its quaternion."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pinocchio as pin
@@ -12,13 +11,7 @@ from robotid.data.base_motion import BaseMotion, base_state, in_base, quaternion
 from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import process
-from robotid.diagnosis.logs import base_pose
 from robotid.diagnosis.logs.base_pose import (
-    _check_readings,
-    _check_vertical,
-    _Feet,
-    _names,
-    _vertical,
     check_pose,
     check_twist,
     check_unit,
@@ -76,21 +69,6 @@ def test_another_order_of_the_quaternion_is_named(robot, log, change, words):
     assert (found.code, found.severity) == ("base_orientation", "error")
     assert words in found.message
     assert found.evidence["best"] < 0.1  # [m/s], noise of the markers
-
-
-def test_gravity_is_stated_along_the_one_axis_that_may_be_the_vertical():
-    G = np.array([0.0, 0.0, -3.7])
-    for up, said in (
-        ([0.9, 0.1, -0.3], "[-3.7, 0, 0]"), ([0.2, -0.8, 0.1], "[0, 3.7, 0]"),
-        ([-0.1, 0.0, 0.4], "[0, 0, -3.7]"), ([0.02, 0.05, 0.29], None), ([0.7, 0.6, 0.0], None),
-    ):  # fmt: skip
-        assert _vertical(np.array(up), G) == (said and f"gravity = {said}")
-    turn = np.array([[0.1, 0.9, 0.0], [0.2, 0.1, -0.8], [0.7, -0.1, 0.3]])
-    assert _names(turn) == ["y", "-z", "x"]
-    lying = np.array([0.18, -0.72, 0.24])  # its length is 0.78
-    (found,) = _check_vertical(SimpleNamespace(name="run.csv"), lying, G)
-    assert "above them along -y of the world" in found.message
-    assert found.evidence == {"height": pytest.approx(4 / 13), "best": pytest.approx(12 / 13)}
 
 
 @pytest.mark.parametrize(("axis", "down"), [("y", -9.81), ("-y", 9.81)])
@@ -243,17 +221,6 @@ def test_contacts_need_not_be_known_to_name_another_order(robot, log):
     assert "its order is qw qx qy qz: state" in found.message
 
 
-def test_without_a_place_speeds_of_feet_are_relative_and_one_foot_has_none(rng):
-    x, dx = rng.standard_normal((2, 4, 3, 3))
-    R, dR = rng.standard_normal((2, 4, 3, 3))
-    v = [[dR[i] @ x[i, k] + R[i] @ dx[i, k] for k in range(3)] for i in range(4)]
-    pairs = [[np.linalg.norm(y[j] - y[k]) for j, k in ((0, 1), (0, 2), (1, 2))] for y in v]
-    one = np.eye(3)
-    found = _Feet(np.arange(4.0), 1, x, dx, None).speed((R, dR), one, one)
-    assert found == pytest.approx(np.mean(np.min(pairs, axis=1)))
-    assert _Feet(np.arange(4.0), 1, x[:, :1], dx[:, :1], None).speed((R, dR), one, one) == 0.0
-
-
 def test_the_speed_of_feet_is_the_mean_of_the_slower_one(robot, log):
     """With the inverse quaternion, by finite differences of the places of the feet."""
     wrong = with_quaternion(log, lambda q: q * [-1.0, -1.0, -1.0, 1.0])
@@ -267,67 +234,6 @@ def test_the_speed_of_feet_is_the_mean_of_the_slower_one(robot, log):
     assert [found.evidence[x] for x in ("speed", "best")] == pytest.approx(speeds, rel=0.02)
     low, high = sorted(f"{x:.2g} m/s" for x in speeds)
     assert f"move at {high} (mean) below the base, else at {low} below it" in found.message
-
-
-def test_of_readings_that_are_almost_as_slow_the_one_with_fewer_changes_is_named(
-    robot, log, monkeypatch
-):
-    as_logged = []
-
-    def speed(feet, pose, body, world):
-        as_logged.append(pose[0])  # the first one is asked first
-        if (pose[0] == as_logged[0]).all():
-            return 0.2
-        return 0.020 if (body == np.eye(3)).all() and (world == np.eye(3)).all() else 0.019
-
-    another = {"inverse": log.base.pose[:1, 3:] * [-1.0, -1.0, -1.0, 1.0]}
-    monkeypatch.setattr(
-        base_pose,
-        "orientation_readings",
-        lambda q: {words: np.tile(one, (len(q), 1)) for words, one in another.items()},
-    )
-    monkeypatch.setattr(base_pose._Feet, "speed", speed)
-    monkeypatch.setattr(base_pose._Feet, "upwards", lambda feet, R: np.array([0.0, 0.0, 1.0]))
-    (found,) = (x for x in check_base(robot, log, SLOW) if x.code == "base_orientation")
-    assert found.evidence["best"] == 0.020
-    assert found.message.endswith("below it: inverse")
-
-
-@pytest.mark.parametrize(
-    ("logged", "inverse", "both", "wanted"),
-    [
-        (4.9e-3, 1e-3, 1.0, None),  # feet that hardly move are not examined
-        (5.1e-3, 1e-3, 1.0, "inverse"),
-        (0.1, 0.0649, 1.0, "inverse"),  # 0.65 of the speed as logged
-        (0.1, 0.0651, 1.0, None),
-        (0.1, 0.05, 0.0416, "inverse"),  # (0.05 + 0.001) 1.2 = (0.0415 + 0.001) 1.2^2
-        (0.1, 0.05, 0.0414, "inverse; the axes x, y, z of the base"),
-    ],
-)
-def test_a_pose_is_another_one_if_its_feet_are_slower(
-    robot, monkeypatch, logged, inverse, both, wanted
-):
-    """Of the axes of the base, one other order is as slow as stated; ``both``: with the inverse."""
-    order = np.eye(3)[[1, 0, 2]]
-
-    def speed(pose, body, world):
-        if pose[0, 0, 0] == 1.0:
-            return logged if (body == np.eye(3)).all() else 1.0
-        if (world != np.eye(3)).any():
-            return 1.0
-        return {True: inverse}.get((body == np.eye(3)).all(), both if (body == order).all() else 1)
-
-    monkeypatch.setattr(base_pose, "orientation_readings", lambda q: {"inverse": 2.0 * q})
-    feet = SimpleNamespace(
-        turned=lambda q: q[:, 0, None, None] * np.eye(3), speed=speed, dp=0.0,
-        upwards=lambda R: np.array([0.0, 0.0, 1.0]),
-    )  # fmt: skip
-    found = list(_check_readings(robot, SimpleNamespace(name="log"), feet, np.ones((5, 4))))
-    assert len(found) == (wanted is not None)
-    for finding in found:
-        best = inverse if wanted == "inverse" else both
-        assert finding.evidence == pytest.approx({"speed": logged, "best": best})
-        assert f"below it: {wanted}" in finding.message
 
 
 def test_inverted_flags_are_no_error_of_the_pose(robot, log):

@@ -3,11 +3,11 @@
 import os
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from helpers.findings import Figures
 from helpers.servos import Servo, chirps, record
 
 from robotid.base.exceptions import DataError
@@ -17,7 +17,7 @@ from robotid.data.files.read import read_log, write_log
 from robotid.data.log import Log
 from robotid.data.signal_settings import LogSource, SignalSettings
 from robotid.diagnosis.logs.check_logs import check_logs
-from robotid.diagnosis.logs.command_channels import _sampled, check_commands
+from robotid.diagnosis.logs.command_channels import check_commands
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 
@@ -199,7 +199,7 @@ def test_joints_that_are_told_the_same_are_named_in_groups():
         ("proportional_commands", "warning", "log: joint_0, joint_1"),
         ("proportional_commands", "warning", "log: joint_2, joint_3"),
     ]
-    assert codes[0].evidence == {"correlation": pytest.approx(1.0), "joints": 2.0}
+    assert Figures(codes[0]) == {"correlation": pytest.approx(1.0), "joints": 2.0}
 
 
 def test_rows_that_are_too_few_for_the_bandwidth_are_named():
@@ -233,7 +233,7 @@ def test_a_command_that_is_held_is_noted():
     held = found(record(chirps([0.3, 0.3], 8.0), GOOD, hold=4))
     assert list(held) == ["repeated_command"]
     assert held["repeated_command"].severity == "note"
-    assert held["repeated_command"].evidence == {"rows": 4.0, "period": pytest.approx(0.02)}
+    assert Figures(held["repeated_command"]) == {"rows": 4.0, "period": pytest.approx(0.02)}
     assert "at 50 Hz on average, and is constant for 20 ms" in held["repeated_command"].message
 
 
@@ -349,20 +349,3 @@ def test_velocities_of_a_log_without_torque_are_judged_without_it(ur5, of_ur5):
         findings = check_logs(ur5, scaled, signals=SignalSettings(velocity=velocity))
         (finding,) = [f for f in findings if f.code == "velocity_scale"]
         assert finding.severity == severity
-
-
-def test_the_rate_that_is_wanted_is_that_of_the_widest_loop():
-    log = SimpleNamespace(name="run", joints=("a", "b", "c", "d"))
-    widths = {"a": 4.0, "b": 7.0, "c": 2.9, "d": np.nan}  # of d all that is excited is followed
-    loops = [
-        SimpleNamespace(
-            name=name, bandwidth=width, step=1 / 30, response=(np.array([1.0, 5.5]), None, None)
-        )
-        for name, width in widths.items()
-    ]
-    (found,) = _sampled(log, loops)
-    assert found.where == "run: a, b, d"
-    assert found.evidence == {"rate": pytest.approx(30.0), "bandwidth": 7.0}
-    assert "up to 7 Hz and are logged at 30 Hz, 4.3 rows per period" in found.message
-    assert "log at 70 Hz or more" in found.message
-    assert list(_sampled(log, loops[2:3])) == []

@@ -190,45 +190,12 @@ def examined(recordings, name, monkeypatch):
     return examine(read_job(JOBS / f"{name}.toml"))
 
 
-@pytest.mark.parametrize("name", TRAPS)
-def test_the_traps_of_a_recording_are_found_and_nothing_stops_it(recordings, name, monkeypatch):
-    findings = examined(recordings, name, monkeypatch)
-    assert TRAPS[name] <= {f.code for f in findings}
-    assert [f for f in findings if f.severity == "error"] == []
-
-
 def whole(recordings, monkeypatch, name, *files):
     monkeypatch.setenv("ROBOTID_DATA", str(recordings))
     job = read_job(JOBS / f"{name}.toml")
     folder = job.identification[0].path.parent
     entries = tuple(LogEntry(folder / f"{file}.parquet") for file in files)
     return replace(job, identification=entries[:1], validation=entries[1:])
-
-
-def test_ur10e_carries_a_load_and_moves_one_joint_at_a_time(recordings, monkeypatch):
-    job = whole(
-        recordings, monkeypatch, "ur10e", "ident_20200219_14harm_load", "ident_20200219_14harm"
-    )
-    findings = examine(job)
-    payload = {f.where.split(":")[0]: f for f in findings if f.code == "payload"}
-    loaded = payload["ident_20200219_14harm_load.parquet"]
-    assert loaded.severity == "warning"
-    assert loaded.evidence["mass"] == pytest.approx(2.805, abs=3 * loaded.evidence["std_error"])
-    assert "ident_20200219_14harm.parquet" not in payload
-    (change,) = [f for f in findings if f.code == "payload_change"]
-    # 2.805 kg; the stated gains make it 9 % more, as `robotid payload` weighs it
-    assert change.evidence["mass"] == pytest.approx(-3.06, abs=3 * change.evidence["std_error"])
-    assert change.evidence["std_error"] < 0.05
-    assert "repeated_motion" in loud(findings)  # the same motion with and without the load
-    single = examine(whole(recordings, monkeypatch, "ur10e", "jointwise_2"))
-    still = {f.where.split(": ")[1] for f in single if f.code in ("static_joint", "hardly_moves")}
-    assert "shoulder_lift_joint" not in still
-    assert len(still) >= 4
-
-
-def test_motor_side_columns_are_refused_by_name(recordings, monkeypatch):
-    job = whole(recordings, monkeypatch, "tx40", "motor_side")
-    assert [f.code for f in examine(job)] == ["missing_column"]
 
 
 # ---- command line and identify

@@ -116,21 +116,6 @@ def test_a_joint_that_stands_where_it_is_said_to_is_not_named(job):
     assert found(job(0.7)) == []
 
 
-def test_held_joints_are_checked_in_logs_read_in_pieces_too(job, tmp_path, monkeypatch):
-    monkeypatch.setattr("robotid.estimation.fitting.survey._WINDOW", 300)
-    short = job(0.5, samples=1000)
-    path = tmp_path / "run.parquet"
-    write_log(read_log(tmp_path / "run.csv", (*short.model().joints, HELD)), path)
-    short = replace(short, identification=(LogEntry(path),))
-    long = replace(short, rows_in_memory=512)
-    (one,), (other,) = found(short), found(long)
-    assert (other.message, other.evidence["median"]) == (one.message, one.evidence["median"])
-    assert any(f.code == "log_note" and "checked rows 0-300" in f.message for f in examine(long))
-    identification, _ = run_job(replace(long, estimator=EstimatorSettings("wls")), tmp_path / "out")
-    assert identification.verdict.reasons[0] == one.message
-    assert identification.log_errors[0] == one.message
-
-
 def test_degrees_of_the_log_are_degrees_here(job):
     (finding,) = found(job(0.7, units=LogUnits(angle="deg")))
     assert finding.evidence["median"] == pytest.approx(np.deg2rad(0.7))

@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from helpers import misfits as helper
+from helpers.findings import Figures
 from helpers.fitting import fit
 from helpers.misfits import EFFECTS
 from helpers.paths import ROOT
@@ -31,8 +32,7 @@ from robotid.diagnosis.residual.misfit_findings import (
     with_entries,
     with_known_springs,
 )
-from robotid.diagnosis.residual.selection import p_value
-from robotid.diagnosis.residual.term_trials import RIDGE, Normal, Sample, Trials, take_sample
+from robotid.diagnosis.residual.term_trials import RIDGE, Trials, take_sample
 from robotid.diagnosis.verdict.fit_findings import fit_findings
 from robotid.diagnosis.verdict.verdict import warnings_of
 from robotid.dynamics.base_parameters import structural_mapping
@@ -118,20 +118,6 @@ def test_a_missing_term_is_named_first_on_its_joint_with_its_share(three, clean,
     assert all(other.joint == name and other.share < 0.1 * first.share for other in others)
 
 
-def test_a_trend_is_that_of_the_friction_at_the_rms_speed_without_the_offset():
-    v = np.array([1.0, -3.0, 2.0, 50.0])  # the last one is of a validation log
-    motion = SimpleNamespace(at=lambda rows: SimpleNamespace(v=v[rows], longest=90.0))
-    sample = SimpleNamespace(motions=[None, motion], rows=3, fitted=8)
-    C = np.array([[9.0, 0, 0, 0], [0, 0.04, 0.01, 0.3], [0, 0.01, 0.09, 0.2], [0, 0.3, 0.2, 25.0]])
-    whole = SimpleNamespace(estimate=lambda which, fitted: (np.r_[7.0, 0.3, -0.2, 5.0], C))
-    (drift,) = [term for term in CANDIDATES if term.code == "drift"]
-    change, error = misfit._trend(sample, 1, drift, whole, [4], [0, 1, 2])
-    speed = np.sqrt(14.0 / 3.0)
-    assert change == pytest.approx((0.3 - 0.2 * speed) * 60.0 / 90.0)
-    square = 0.04 + 2 * 0.01 * speed + 0.09 * speed**2
-    assert error == pytest.approx(np.sqrt(square) * 60.0 / 90.0)
-
-
 def test_a_drift_has_the_trend_of_the_friction_per_minute(three):
     """Coulomb friction falls by 0.3 of the RMS torque in 30 s."""
     found = identified(three, 1, "drift", 2)
@@ -186,43 +172,6 @@ def test_the_size_of_several_columns_is_their_torque(four):
     assert (found.unit, found.std_error < 0.05 * added) == ("N m rms", True)
 
 
-def test_a_size_without_a_unit_is_that_of_the_torque_beside_base_parameters(rng):
-    """Of two columns found after another one; its error by finite differences."""
-    count, fitted = 80, 60  # the last two segments are validation
-    weight = rng.uniform(0.5, 2.0, (count, 2))
-    W, r = rng.standard_normal((count, 2, 3)), rng.standard_normal((count, 2))
-    segments = tuple(slice(k, k + 10) for k in range(0, count, 10))
-    sample = Sample(
-        joints=("a", "b"), is_prismatic=np.array([False, True]), motions=(), recordings=(), at=(),
-        taken=(), weight=weight, torque=np.ones(2), segments=segments, rows=fitted,
-        W=W, r=r, independent=np.arange(3), U=np.eye(3), normal=Normal.of(W, r, segments, 6),
-        standard=np.zeros(0),
-    )  # fmt: skip
-    Z = rng.standard_normal((count, 3)) + r[:, [1]]
-    whole = Trials(sample.of_joint(1), Z[:, None]).whole
-    found = misfit._size(sample, 1, SimpleNamespace(units=None), whole, [0], [1, 2])
-    theta, C = (x[1:] for x in whole.estimate([0, 1, 2], 6))
-    X, own = weight[:fitted, [1]] * Z[:fitted, 1:], W[:fitted].reshape(-1, 3)
-    B = W[:fitted, 1].T @ X
-    S = X.T @ X - B.T @ np.linalg.solve(own.T @ own + np.eye(3), B)
-    S += RIDGE * np.diag(np.sum(X**2, axis=0))
-
-    def size(theta):
-        return np.sqrt(theta @ S @ theta / np.sum(weight[:fitted, 1] ** 2))
-
-    step = 1e-6
-    slope = np.array([(size(theta + step * e) - size(theta - step * e)) for e in np.eye(2)])
-    slope /= 2 * step
-    wanted = size(theta), np.sqrt(slope @ C[:, 1:] @ slope)
-    assert found[:2] == pytest.approx(wanted, rel=1e-6)
-    assert found[2] == "N rms"
-    # one column with a unit has the size and the error of its parameter
-    units = SimpleNamespace(units=("N m/rad", "N/m"))
-    value, error, unit = misfit._size(sample, 1, units, whole, [0], [1])
-    theta, C = whole.estimate([0, 1], 6)
-    assert (value, error, unit) == (theta[1], np.sqrt(C[1, 1]), "N/m")
-
-
 def test_coulomb_friction_that_was_left_out_is_asked_for(three):
     terms = ("armature", "viscous", "offset")
     model = RobotModel.from_urdf(three.tree, joints=three.joints, terms=terms)
@@ -270,23 +219,6 @@ def test_a_setting_keeps_what_the_drive_has_already(three):
         {"term": "Harmonic", "order": 9.0, "is_sine": False}, "load", "harmonics2", "stribeck",
     ]  # fmt: skip
     assert with_entries(found, LIFT, ["load"]) == f'{LIFT} = ["load"]'
-
-
-def test_a_family_is_advised_only_where_the_joint_turned_far_enough_for_it(three):
-    sample = take_sample(identified(three, 1, "spring", 2, duration=12.0))
-    (candidate,) = (c for c in CANDIDATES if c.name == "harmonics2")
-
-    def advised(turned, term=candidate):
-        q = np.linspace(0.0, turned, sample.rows)
-        rows = np.append(q, np.full(len(sample.motions[2].q) - sample.rows, 99.0))  # of others
-        motions = (*sample.motions[:2], replace(sample.motions[2], q=rows), *sample.motions[3:])
-        return misfit._entries(replace(sample, motions=motions), 2, term)
-
-    assert [advised(x) for x in (3.5, 3.4, 0.7, 0.6)] == [
-        ("harmonics2",), ("harmonics1",), ("harmonics1",), ("spring",)
-    ]  # fmt: skip
-    (periodic,) = (c for c in CANDIDATES if c.name == "harmonics4")
-    assert (advised(3.5, periodic), advised(3.0, periodic)) == (("harmonics4",), ())
 
 
 @pytest.mark.parametrize("memory", [0, 50])
@@ -533,23 +465,6 @@ def test_a_coupled_drive_turns_by_the_ratio_of_the_other_joint(rng):
     assert [(c.coupled, c.ratio) for c in couplings_of(motion)] == [("b", 1.0), ("b", -1.0)]
 
 
-def test_a_coupling_is_shown_by_both_joints_or_by_most_of_the_residual_of_one(monkeypatch):
-    def term(joint, coupled, share):
-        return SimpleNamespace(joint=joint, term=SimpleNamespace(coupled=coupled), share=share)
-
-    each = (
-        [term("a", "b", 0.5), term("a", "", 0.1)],
-        [term("b", "a", 0.2), term("b", "c", 0.59)],
-        [term("c", "a", 0.61)],
-    )
-    monkeypatch.setattr(misfit, "_of_joint", lambda sample, j: iter(each[j]))
-    found = find_misfits(SimpleNamespace(joints=("a", "b", "c")))
-    assert [(m.joint, m.term.coupled) for m in found] == [
-        ("a", "b"), ("a", ""), ("b", "a"), ("c", "a"),
-    ]  # fmt: skip
-    assert find_misfits(None) == ()
-
-
 def test_a_misfit_matters_by_its_part_of_the_torque_if_nothing_denies_it():
     (load, tanh) = (c for c in CANDIDATES if c.name in ("load", "tanh"))
     still = np.zeros(3)
@@ -563,39 +478,6 @@ def test_a_misfit_matters_by_its_part_of_the_torque_if_nothing_denies_it():
     assert replace(usual, confirmed=None).matters
     assert not replace(usual, confirmed=0.08).matters  # less than a quarter of the share
     assert not replace(usual, term=tanh).matters
-
-
-def test_windup_drift_and_ripples_have_the_columns_that_they_are_named_by(rng):
-    q, v, a, load, way, time = rng.standard_normal((6, 40)) * [
-        [3.0],
-        [2.0],
-        [1.0],
-        [9.0],
-        [0.5],
-        [1],
-    ]
-    way = np.abs(way)
-    motion = JointMotion(q, v, a, np.sign(v), load, way, time, passes=0.9)
-
-    def rms(x):
-        return np.sqrt(np.mean(x**2))
-
-    columns = {c.name: c.columns for c in CANDIDATES}
-    bent = [np.sign(v) * np.exp(-way / (x * rms(way))) for x in (0.02, 0.1)]
-    wanted = np.column_stack([*bent, np.tanh(load / (0.05 * rms(load)))])
-    np.testing.assert_allclose(columns["windup"](motion), wanted)
-    drift = time[:, None] * np.column_stack([np.sign(v), v, np.ones(40)])
-    np.testing.assert_allclose(columns["drift"](motion), drift)
-    np.testing.assert_array_equal(columns["coulomb"](motion)[:, 0], np.sign(v))
-    passed = 1 / (1 + (7 * np.abs(v) / (2 * np.pi * 0.9)) ** 8)
-    waves = passed[:, None] * np.column_stack([np.cos(7 * q), np.sin(7 * q)])
-    np.testing.assert_allclose(candidates._ripple(motion, 7), waves)
-    # of another motion that sets the scale
-    other = replace(motion, travelled=3.0 * way, load=5.0 * load)
-    scaled = columns["windup"](replace(motion, scale=other))
-    bent = [np.sign(v) * np.exp(-way / (x * 3 * rms(way))) for x in (0.02, 0.1)]
-    wanted = np.column_stack([*bent, np.tanh(load / (0.25 * rms(load)))])
-    np.testing.assert_allclose(scaled, wanted)
 
 
 def test_ripples_that_are_tried_explain_most_over_what_the_filter_lets_through(rng):
@@ -612,65 +494,6 @@ def test_ripples_that_are_tried_explain_most_over_what_the_filter_lets_through(r
         explained[k] = np.abs(np.sum(weight * r * size * np.exp(1j * k * q))) ** 2 / (size @ size)
     assert found == sorted(sorted(explained, key=explained.get)[-6:])
     assert {9, 41} < set(found)
-
-
-def test_each_term_is_reported_with_what_it_adds_to_those_before(rng, monkeypatch):
-    """Two terms in eight segments of fitted logs, and two of validation, in which one is weaker."""
-    count, fitted = 200, 160
-    weight = rng.uniform(0.5, 2.0, (count, 2))
-    x, y = rng.standard_normal((2, count, 1)), rng.standard_normal((count, 2))
-    weak = np.where(np.arange(count) < fitted, 1.0, 0.3)
-    r = 0.3 * rng.standard_normal((count, 2))
-    r[:, 1] += x[1][:, 0] + weak * (0.8 * y[:, 0] - 0.5 * y[:, 1])
-    r *= weight
-    W = weight[:, :, None] * rng.standard_normal((count, 2, 3))
-    segments = tuple(slice(k, k + 20) for k in range(0, count, 20))
-    still = np.zeros(count)
-    sample = Sample(
-        joints=("a", "b"), is_prismatic=np.array([False, True]),
-        motions=(JointMotion(*7 * [still]),) * 2, recordings=(), at=(), taken=(), weight=weight,
-        torque=np.array([900.0, 1600.0]), segments=segments, rows=fitted, W=W, r=r,
-        independent=np.arange(3), U=np.eye(3), normal=Normal.of(W, r, segments, 8),
-        standard=np.zeros(0),
-    )  # fmt: skip
-    one = candidates.Candidate("one", "first", lambda m: x[1], "", units=("N m", "N"))
-    two = candidates.Candidate("two", "second", lambda m: y, "")
-    turning = candidates.Candidate("turn", "third", lambda m: r[:, [1]], "", revolute_only=True)
-    monkeypatch.setattr(misfit, "CANDIDATES", (two, turning, one))
-    monkeypatch.setattr(misfit, "couplings", lambda motion: ())
-    monkeypatch.setattr(misfit, "ripples", lambda *_: ())
-    first, second = misfit._of_joint(sample, 1)
-    trials = Trials(sample.of_joint(1), np.hstack([y, x[1]])[:, None])
-    left = [trials.held_out.left(which) for which in ([], [2], [2, 0, 1])]
-    whole = [trials.whole.left(which)[8:].sum() for which in ([], [2], [2, 0, 1])]
-    assert (first.term, second.term, first.joint) == (one, two, "b")
-    squares = left[0][:8].sum()
-    for k, found in enumerate((first, second)):
-        assert found.share == pytest.approx((left[k] - left[k + 1])[:8].sum() / squares)
-        assert found.p_value == pytest.approx(p_value(left[k], left[k + 1], 8))
-        assert found.confirmed == pytest.approx((whole[k] - whole[k + 1]) / whole[0])
-        assert found.error == pytest.approx(np.sqrt(squares / 1600.0))
-    assert second.confirmed < 0.6 * second.share
-    theta, C = trials.whole.estimate([2], 8)
-    assert (first.size, first.std_error, first.unit) == (
-        pytest.approx(theta[0]), pytest.approx(np.sqrt(C[0, 0])), "N",
-    )  # fmt: skip
-    np.testing.assert_allclose(first.theta, theta)
-    np.testing.assert_allclose(first.shift, -trials.whole.T[:, 2] * theta[0])
-    theta = trials.whole.parameters([2, 0, 1])[1:]
-    np.testing.assert_allclose(second.theta, theta)
-    np.testing.assert_allclose(second.shift, -trials.whole.T[:, :2] @ theta)
-    assert second.unit == "N rms"
-    # at the limits of p-value, share and size over the torque
-    limits = misfit.MISFIT.share, misfit.MISFIT.p_value, misfit.MISFIT_REPORTED
-    assert limits == (0.1, 3e-4, 0.005)
-    least = np.sqrt(first.share * squares) / 0.005
-    for scale, count in ((0.99, 1), (1.01, 0)):
-        weaker = replace(sample, torque=np.array([900.0, (scale * least) ** 2]))
-        assert len(list(misfit._of_joint(weaker, 1))) == count
-    for p, count in ((2.9e-4, 2), (3.1e-4, 0)):
-        monkeypatch.setattr(misfit.Round, "p_value", lambda self, option, p=p: p)
-        assert len(list(misfit._of_joint(sample, 1))) == count
 
 
 def test_entries_keep_other_families_and_a_term_replaces_all_that_it_explains():
@@ -721,7 +544,7 @@ def test_a_misfit_is_reported_with_the_intervals_of_its_own_joint():
         in reported.message
     )
     assert "(0 % on the validation logs); the residual is 4.0 % of the torque" in reported.message
-    assert reported.evidence == pytest.approx({
+    assert Figures(reported) == pytest.approx({
         "share_pct": 36, "error_pct": 4, "size": 0.125, "std_error": 0.01, "p_value": 1e-9,
         "validation_share_pct": -20,
     })  # fmt: skip

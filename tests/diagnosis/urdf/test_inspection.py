@@ -4,14 +4,18 @@ import re
 
 import numpy as np
 import pytest
+from helpers.findings import Figures
 from helpers.synthetic import exact_log, truth
 
 from robotid.base.exceptions import ModelError
 from robotid.base.findings import Finding
 from robotid.diagnosis.logs.check_logs import check_logs
-from robotid.diagnosis.urdf.inertials import explained_by_assumed, impossible_inertials
+from robotid.diagnosis.urdf.inertials import (
+    explained_by_assumed,
+    impossible_inertials,
+    rounded_robot,
+)
 from robotid.diagnosis.urdf.inspection import inspect_urdf
-from robotid.diagnosis.urdf.rounding import rounded_robot
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.torque import random_regressor
 from robotid.robot.examples import example_urdf
@@ -222,7 +226,7 @@ def test_a_rounded_angle_of_a_frame_is_a_note(tmp_path):
     model = RobotModel.from_urdf(tmp_path / "two.urdf")
     (finding,) = rounded_robot(model, structural_mapping(model))  # of those that move or carry
     assert finding.message.startswith("two.urdf rounds angles of the joints elbow. ")
-    assert finding.evidence == {"joints": 1.0}
+    assert Figures(finding) == {"joints": 1.0}
 
 
 def test_rounded_angles_of_several_joints_are_one_note():

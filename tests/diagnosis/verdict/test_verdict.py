@@ -31,7 +31,14 @@ JOINTS = ("a", "b", "c")
 
 
 def finding(code, where, severity="warning", **evidence):
-    return Finding(code, severity, where, "what was found", evidence)
+    log, _, part = where.rpartition(": ")
+    channel, _, joint = part.rpartition("_")
+    is_of_log = not log and part.endswith(".csv")
+    joints = () if is_of_log or part == "all joints" else tuple(joint.split(", "))
+    return Finding(
+        code, severity, where, "what was found", evidence, log=part if is_of_log else log,
+        joints=joints, words={"channel": channel}, fault="what was found",
+    )  # fmt: skip
 
 
 def joint(error, *, urdf=100.0, constant=True, **others):
@@ -129,7 +136,7 @@ def test_each_joint_has_a_verdict_of_its_own():
 def test_the_good_joint_with_the_largest_error_has_the_cause_of_its_residual():
     logs = {"val.csv": Metrics({"a": joint(4.0), "b": joint(6.0), "c": joint(20.0)}, 1.0)}
     fit = Metrics({name: joint(5.0) for name in "abc"}, 1.0)
-    causes = {"b": "it is noise. Do this"}  # of no other joint is the cause computed
+    causes = {"b": ("it is noise", "Do this")}  # of no other joint is the cause computed
     found = judge(Predictions(fit, logs), Determined(), cause_of=causes.__getitem__)
     assert found.joints["b"].reasons[1:] == (
         "largest error of the good joints: it is noise. Do this",
@@ -373,7 +380,7 @@ def test_a_hypothesis_is_refuted_by_the_worst_of_all_logs_of_its_joints():
     found = rejected([*guesses, finding("urdf_mismatch", "run.csv")], logs, ScaleCheck())
     assert [f.severity for f in found] == ["warning", "note", "warning", "warning"]
     assert found[1].message == (
-        "what was found; rejected: torque error on validation logs at most 3.0 %"
+        "run.csv: what was found; rejected: torque error on validation logs at most 3.0 %"
     )
     repeated = finding("repeated_motion", "one")
     assert rejected([repeated, guesses[1]], logs, ScaleCheck())[1].severity == "warning"
@@ -670,7 +677,7 @@ def test_joints_better_by_the_urdf_are_those_of_all_logs():
         "the joints e do not move in any recording: not evaluated",
         "the joints d do not move in any validation log: not evaluated",
     ]
-    errors = {name: own for name, (_, _, own) in found.on_each().items()}
+    errors = {name: one.errors for name, one in found.on_each().items()}
     assert errors == {"a": [4.0, 4.0], "b": [4.0, 4.0], "c": [4.0], "d": [], "e": []}
     part = replace(found, hidden=("b", "e"))  # their metrics are ignored
     assert part.fitted.keys() == {"a", "c", "d"}

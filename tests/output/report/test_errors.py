@@ -95,10 +95,11 @@ def test_every_joint_has_its_verdict_and_its_reason(screen, identified):
     assert {why for joint, (_, why) in shown.items() if joint in good} == {cause, ""}
     (common,) = re.findall(r'<p class="common good"><strong>good</strong>: (.*?)</p>', screen)
     errors = [float(v.reasons[0].split()[3]) for v in good.values()]
+    assert float(good[worst].reasons[0].split()[3]) == max(errors)
     names = [joint for joint in shown if joint in good]
     assert unescape(common) == (
-        f"{', '.join(names)}: error at most {min(errors)} to {max(errors)} %, smaller than that of "
-        "a constant and that of the URDF"
+        f"{', '.join(names)}: error at most {max(errors)} %, smaller than that of a constant "
+        "and that of the URDF (the worst)"
     )
 
 
@@ -111,7 +112,7 @@ def test_joints_that_differ_in_the_numbers_of_their_reasons_have_one_line():
     measured = {joint: {"relative_error_pct": 20.0} for joint in verdicts}
     html = error_bars(TORQUE, [Errors("y", measured)], list(verdicts), verdicts)
     (common,) = re.findall(r'<p class="common usable">(.*?)</p>', html)
-    assert common == "<strong>usable</strong>: a, b: error 16.2 to 17.4 % on x"
+    assert common == "<strong>usable</strong>: a, b: error 17.4 % on x (the worst)"
     whys = re.findall(r'<span class="why">(.*?)</span>', html)
     assert whys == ["", "", "error 51 %"]
 
