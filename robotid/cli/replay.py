@@ -192,10 +192,7 @@ def replay_identified(identification: TorqueIdentification) -> Replay:
 
 
 def _replay_commanded(job: Job, results: Mapping[str, Result], ghost: str | Path | None) -> Replay:
-    """Return the replay of a log of commands: measured, commanded and simulated robot.
-
-    Poses are those of the URDF's joints, whose zero may differ from that of the encoders.
-    """
+    """Return the replay of a log of commands: measured, commanded and simulated robot."""
     (entry,) = job.identification
     first = next(iter(results.values()))
     model, zero = first.robot, np.array([drive.zero for drive in first.commanded])
@@ -293,10 +290,7 @@ def _torques(
     robots: Mapping[str, RobotModel],
     results: Mapping[str, Mapping[str, Any]],
 ) -> Torques:
-    """Return measured torques, and those predicted by each result and by the URDF.
-
-    "URDF + drives" has the bodies of the URDF, and the drives that the first result fits to them.
-    """
+    """Return measured torques, and those predicted by each result and by the URDF."""
     shown: dict[str, Array] = {}
     driven: dict[str, Array] = {}
     motion = None
@@ -356,10 +350,7 @@ def _payloads(track: Mapping[str, Any] | None) -> list[Mark]:
 
 
 def _limits_used(job: Job, motion: Log, model: RobotModel) -> tuple[list[Mark], list[str]]:
-    """Return marks at the smallest margin to each limit and at the smallest distance, and notes.
-
-    The notes state what cannot be marked and why: the URDF may lack limits or shapes.
-    """
+    """Return marks at the smallest margin to each limit and at the smallest distance, and notes."""
     v = np.gradient(motion.q, motion.t, axis=0) if motion.v is None else motion.v
     a = np.gradient(v, motion.t, axis=0) if motion.a is None else motion.a
     torque = predict_instants(model, model.standard_parameters(), motion.q, v, a)
