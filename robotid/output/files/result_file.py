@@ -25,7 +25,7 @@ from robotid.dynamics.friction_projection import (
     projected_pinocchio_model,
 )
 from robotid.dynamics.prediction import predict_instants
-from robotid.estimation.fitting.bands import FrictionCurve
+from robotid.estimation.fitting.standard_errors import FrictionCurve
 from robotid.estimation.variation.groups import RunSums
 from robotid.estimation.variation.variation import between_covariance
 from robotid.output.files.commanded import (

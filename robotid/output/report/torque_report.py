@@ -14,9 +14,10 @@ from robotid.diagnosis.residual.decisions import DEPENDENCE_SHARE
 from robotid.diagnosis.residual.residuals import friction_split
 from robotid.diagnosis.residual.torque_split import JointTorque
 from robotid.diagnosis.verdict.parameter_table import parameter_entries
-from robotid.estimation.fitting.bands import TorqueBand, next_errors
+from robotid.estimation.fitting.drive_terms import DriveChoice
 from robotid.estimation.fitting.evaluation import Evaluation
-from robotid.estimation.fitting.selected_drives import DriveChoice
+from robotid.estimation.fitting.fitted import next_errors
+from robotid.estimation.fitting.standard_errors import TorqueBand
 from robotid.identification.result import TorqueIdentification
 from robotid.identification.summary import left_out_lines
 from robotid.output.files.entries import input_entries

@@ -26,7 +26,7 @@ def written(tmp_path_factory):
         log = exact_log(model, truth(model), rng, samples=800, noise=0.1)
         robotid.write_log(log, folder / f"{name}.csv")
     (folder / "job.toml").write_text(
-        f'urdf = "{URDF}"\n[estimator]\ndraws = 0\n[output]\nreport = false\n'
+        f'urdf = "{URDF}"\n[output]\nreport = false\n'
         '[[identification]]\nlog = "first.csv"\n'
         '[[validation]]\nlog = "second.csv"\n'
     )

@@ -16,7 +16,9 @@ from robotid.diagnosis.residual.candidates import CANDIDATES, couplings, ripples
 from robotid.diagnosis.residual.misfit import Misfit
 from robotid.diagnosis.residual.misfit_findings import misfit_findings, setting_of
 from robotid.diagnosis.verdict.verdict import JointVerdict, Verdict
-from robotid.estimation.fitting.joint_motion import JointMotion
+from robotid.estimation.fitting.drive_terms import (
+    JointMotion,
+)
 from robotid.identification.closed_loop.loop_settings import LoopSettings
 from robotid.output.report.next_steps import _once, next_steps
 from robotid.output.report.steps import Origin, Step
