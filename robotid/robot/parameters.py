@@ -72,25 +72,20 @@ class ParameterLayout:
 
     Ten inertial parameters per body, then the drive terms joint by joint, then those of each
     coupling (without an offset, unless it replaces the drive of a joint).
-
-    Attributes:
-        bodies: Names of the bodies, one per movable joint (and one for a floating base).
-        joints: Names of the joints that move.
-        terms: The drive terms that are identified, names in ``TERMS`` in its order.
-        couplings: Drives that move several joints.
-        prismatic: Names of the prismatic joints.
-        strokes: Ranges of the prismatic joints with limits, by name [m].
-        own: Further terms of single drives, by the drive's name; they follow the others.
-        passive: Names of the joints without a drive, which have no terms but those in ``own``.
     """
 
+    # names of the bodies, one per movable joint (and one for a floating base)
     bodies: tuple[str, ...]
-    joints: tuple[str, ...]
+    joints: tuple[str, ...]  # names of the joints that move
+    # the drive terms that are identified, names in ``TERMS`` in its order
     terms: tuple[str, ...] = DRIVE_TERMS
-    couplings: tuple[Coupling, ...] = ()
-    prismatic: frozenset[str] = frozenset()
+    couplings: tuple[Coupling, ...] = ()  # drives that move several joints
+    prismatic: frozenset[str] = frozenset()  # names of the prismatic joints
+    # ranges of the prismatic joints with limits, by name [m]
     strokes: Mapping[str, float] = field(default_factory=dict)
+    # further terms of single drives, by the drive's name; they follow the others
     own: Mapping[str, tuple[DriveTerm, ...]] = field(default_factory=dict)
+    # names of the joints without a drive, which have no terms but those in ``own``
     passive: frozenset[str] = frozenset()
 
     def __post_init__(self) -> None:

@@ -32,13 +32,6 @@ def test_a_stand_is_the_mean_of_its_rows_however_long(rng):
     assert not motion.v.any()
 
 
-def test_rows_far_apart_are_poses_of_their_own_unless_alike():
-    q = [[0.0, 0.0], [1.0, 0.0], [1.0, 1e-3], [0.0, 1.0]]
-    motion, stands = means(log_of(np.arange(4) * 5.0, q), max_gap=12.5)
-    assert stands.all()
-    np.testing.assert_allclose(motion.q, [[0.0, 0.0], [1.0, 5e-4], [0.0, 1.0]])
-
-
 def test_slow_motion_has_its_sign_but_not_where_it_turns_or_one_joint_stands(rng):
     t = np.arange(2000) / 100
     triangle = 0.03 * np.abs((t + 5) % 20 - 10)  # turns at 5 s, at 15 s
@@ -81,16 +74,6 @@ def test_speeds_are_0_on_both_sides_of_where_a_joint_turns_round_or_sets_out():
         np.testing.assert_allclose(motion.q, q.reshape(8, 25, 2).mean(axis=1))
         assert not motion.a.any()
         assert motion.rate is None
-
-
-def test_the_slope_of_a_short_stretch_counts_as_far_as_it_goes():
-    """Half of a quarter of a second is enough; of less, the speed counts by its share of that."""
-    for rows, share in ((3, 0.02 / 0.125), (10, 0.09 / 0.125), (14, 1.0), (25, 1.0)):
-        t = 5.0 + np.concatenate([np.arange(rows), 100 + np.arange(25)]) / 100
-        motion, _ = means(log_of(t, np.outer(t, [0.05, -0.08])))
-        wanted = np.outer([share, 1.0], [0.05, -0.08])
-        np.testing.assert_allclose(motion.v, wanted, rtol=1e-9)
-        assert motion.segment.tolist() == [0, 1]
 
 
 def test_stretches_on_both_sides_of_a_jump_of_the_speed_are_left_out():

@@ -1,22 +1,16 @@
 import numpy as np
 import pytest
-from helpers.fitting import fit
 from helpers.hostile_urdfs import FILES
-from helpers.synthetic import exact_log, truth
 
 from robotid.base.exceptions import SettingsError
-from robotid.data.signal_settings import SignalSettings
 from robotid.diagnosis.urdf.inspection import inspect_urdf
-from robotid.estimation.fitting.estimator_settings import EstimatorSettings
 from robotid.robot.geometry import (
-    Surface,
     body_boxes,
     body_points,
     box_half_spaces,
     geometry_half_spaces,
     hull_half_spaces,
     kinematic_lengths,
-    link_clouds,
 )
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
@@ -81,12 +75,6 @@ def test_the_extent_of_a_shape_is_that_which_the_urdf_states(tmp_path, shape, lo
     np.testing.assert_allclose(points.max(axis=0), high, atol=6e-4)
 
 
-@pytest.mark.parametrize("shape", ['<sphere radius="x"/>', "<capsule/>", '<box size="1 1"/>'])
-def test_a_shape_that_is_not_understood_leaves_its_body_unbounded(tmp_path, shape):
-    own = f"<collision><geometry>{shape}</geometry></collision>"
-    assert body_points(arm(tmp_path, own, SPHERE)) == {}
-
-
 def test_a_body_whose_link_has_mass_but_no_shape_is_not_bounded(tmp_path):
     assert body_points(arm(tmp_path, BOX)) == {}
     with pytest.raises(SettingsError, match=r"no link has readable geometry in arm\.urdf"):
@@ -107,25 +95,6 @@ def test_a_mesh_is_found_beside_the_urdf_and_scaled(tmp_path):
     assert body_points(arm(tmp_path, BOX + MESH.format("lost.stl"), SPHERE)) == {}
 
 
-def test_the_meshes_of_a_robot_are_read_once_however_many(tmp_path, monkeypatch):
-    corners, read = np.array([[0.0, 0, 0], [1, 0, 0], [0, 2, 0]]), []
-
-    def surfaces(path):
-        read.append(path.name)
-        return (Surface(corners, np.array([[0, 1, 2]]), None),)
-
-    monkeypatch.setattr("robotid.robot.geometry.read_surfaces", surfaces)
-    (tmp_path / "part.stl").touch()
-    one, other = (arm(tmp_path, 70 * MESH.format("part.stl"), BOX) for _ in range(2))
-    for model in (one, one.with_terms({}), one):
-        assert len(body_points(model)["one"]) == 70 * 3 + 8
-        body_boxes(model)
-        assert len(link_clouds(model)[0]) == 71
-    assert len(read) == 70
-    body_points(other)  # the same file, read anew
-    assert len(read) == 140
-
-
 def test_half_spaces_hold_every_point_and_touch_the_hull(rng):
     cube = np.array(np.meshgrid(*[[0.0, 1.0]] * 3)).reshape(3, -1).T
     cloud = rng.standard_normal((3000, 3))
@@ -140,27 +109,6 @@ def test_half_spaces_hold_every_point_and_touch_the_hull(rng):
     assert len(b) == 6
     A, b = hull_half_spaces(cube * [1.0, 1.0, 0.0])
     assert len(b) == 6
-
-
-def test_the_centres_of_mass_of_a_real_arm_stay_in_its_meshes(ur5, rng):
-    noise = 20 * np.array([4.0, 2.0, 1.0, 0.3, 0.2, 0.1])
-    log = exact_log(ur5, truth(ur5), rng, samples=200, noise=noise)
-    settings = EstimatorSettings(prior_weight=0.01, constraints={"com_within": "hull"})
-    exact = SignalSettings(cutoff=None, trim=0.0, min_velocity=0.0)
-    found = fit(ur5, [log], signals=exact, estimator=settings)
-    free = fit(ur5, [log], signals=exact, estimator=EstimatorSettings(prior_weight=0.01))
-    spaces = geometry_half_spaces(ur5, "hull")
-    assert set(spaces) == set(ur5.layout.bodies)
-
-    def beyond(pi):
-        bodies = pi[:60].reshape(-1, 10)
-        return max(
-            float((A @ (bodies[i, 1:4] / bodies[i, 0]) - b).max())
-            for i, (A, b) in enumerate(spaces[name] for name in ur5.layout.bodies)
-        )
-
-    assert beyond(free.standard) > 0.02
-    assert beyond(found.standard) < 1e-6
 
 
 def test_the_box_of_a_body_holds_its_geometry_or_its_frames_and_the_urdfs_own_body(tmp_path):

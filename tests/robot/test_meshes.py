@@ -3,9 +3,7 @@ import pinocchio as pin
 import pytest
 import trimesh
 
-from robotid.output.viewer import scene
 from robotid.output.viewer.scene import robot_scene
-from robotid.output.viewer.thinning import thin
 from robotid.robot.examples import example_urdfs
 from robotid.robot.geometry import find_mesh, read_shapes, read_surfaces
 from robotid.robot.model import RobotModel
@@ -112,16 +110,6 @@ def test_a_file_that_is_no_mesh_is_refused_by_name(tmp_path):
         read_surfaces(tmp_path / "bad.dae")
 
 
-def test_a_mesh_without_triangles_counts_as_not_found_and_the_body_gets_a_skeleton(package):
-    (package / "meshes" / "cube.stl").write_text("nothing")
-    urdf = package / "urdf" / "r.urdf"
-    urdf.write_text(URDF.replace('<cylinder radius="0.1" length="0.4"/>', ""))
-    shown = robot_scene(RobotModel.from_urdf(urdf))
-    assert shown.notes[0].startswith("2 meshes were not found or are not readable")
-    assert shown.content["meshes"] == []
-    assert "#e07b1f" in [p["colour"] for p in shown.content["parts"] if p["node"] == 1]
-
-
 def test_a_scene_holds_each_mesh_once_and_names_what_is_missing(package):
     model = RobotModel.from_urdf(package / "urdf" / "r.urdf")
     shown = robot_scene(model)
@@ -142,54 +130,6 @@ def test_a_scene_holds_each_mesh_once_and_names_what_is_missing(package):
     (note,) = robot_scene(RobotModel.from_urdf(package / "urdf" / "r.urdf")).notes
     lost = "package://my_robot/meshes/lost.stl"
     assert note == f"2 meshes were not found or are not readable, for example {lost}"
-
-
-def test_a_mesh_is_thinned_once_until_its_file_is_another(package, monkeypatch):
-    model = RobotModel.from_urdf(package / "urdf" / "r.urdf")
-    runs = []
-    monkeypatch.setattr(scene, "thin", lambda *given: runs.append(1) or thin(*given))
-    first, again = (robot_scene(model).content["meshes"] for _ in range(2))
-    assert first == again
-    trimesh.creation.box((1, 1, 5)).export(package / "meshes" / "cube.stl")
-    other = robot_scene(model).content["meshes"]
-    heights = [m["step"][2] * 65_535 for meshes in (first, other) for m in meshes]
-    np.testing.assert_allclose(heights, [0.5, 2.5])  # at half its size
-    assert len(runs) == 2
-
-
-def test_the_limit_of_triangles_is_of_what_is_drawn(package, monkeypatch):
-    """A ball that two visuals share counts twice."""
-    trimesh.creation.icosphere(subdivisions=3).export(package / "meshes" / "cube.stl")
-    monkeypatch.setattr(scene, "_TRIANGLES", 1000)
-    (ball,) = robot_scene(RobotModel.from_urdf(package / "urdf" / "r.urdf")).content["meshes"]
-    assert 400 < ball["faces"]["shape"][0] <= 500
-
-
-def test_parts_sit_where_pinocchio_puts_the_visuals(package):
-    """Pinocchio's own reading of the visuals is the oracle."""
-    path = package / "urdf" / "r.urdf"
-    hand = """
-      <link name="hand"><visual><origin xyz="0.1 0.2 0.3" rpy="1 0.5 -0.3"/>
-        <geometry><box size="1 1 1"/></geometry></visual></link>
-      <joint name="mount" type="fixed"><parent link="arm"/><child link="hand"/>
-        <origin xyz="3 2 1" rpy="-0.4 0.2 1.1"/></joint></robot>"""
-    lost = '<visual><geometry><mesh filename="package://my_robot/meshes/lost.stl"/></geometry></visual>'
-    wrong = '<visual><geometry><sphere radius="oops"/></geometry></visual>'
-    path.write_text(URDF.replace(lost, "").replace(wrong, "").replace("</robot>", hand))
-    full = pin.buildModelFromUrdf(str(path))
-    shapes = pin.buildGeomFromUrdf(
-        full, str(path), pin.VISUAL, package_dirs=[str(package.parent)]
-    ).geometryObjects
-    parts = robot_scene(RobotModel.from_urdf(path)).content["parts"]
-    assert len(shapes) == len(parts) == 5
-    for shape in shapes:
-        wanted = shape.placement.homogeneous
-        if "arm_2" in shape.name:  # the page's cylinder lies along y, that of a URDF along z
-            turn = pin.Quaternion.FromTwoVectors(np.array([0.0, 1, 0]), np.array([0.0, 0, 1]))
-            wanted = wanted @ pin.SE3(turn, np.zeros(3)).homogeneous
-        own = [p for p in parts if p["node"] == shape.parentJoint]
-        own = [np.array(p["matrix"]).reshape(4, 4).T for p in own]
-        assert any(np.allclose(M, wanted, atol=1e-9) for M in own), shape.name
 
 
 def test_meshes_of_the_example_robots_are_found_from_anywhere(tmp_path):

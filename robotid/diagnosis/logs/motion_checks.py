@@ -8,6 +8,7 @@ import numpy as np
 from robotid.base.exceptions import RobotIdError
 from robotid.base.findings import Finding, toml_key
 from robotid.base.typing import Array
+from robotid.data.alike_motions import REPEATED, repeated_share
 from robotid.data.log import Trajectory
 from robotid.data.signal_settings import LogUnits, SignalSettings
 from robotid.diagnosis.catalogue import finding
@@ -21,11 +22,9 @@ from robotid.estimation.estimators.determination import (
     determine,
     is_poorly_excited,
 )
-from robotid.estimation.fitting.left_out import NEAR, REPEATED, moving_pieces
 from robotid.robot.model import RobotModel
 from robotid.robot.prior import prior_spread
 
-_INSTANTS = 300
 _ROWS = 5000  # of a log, from which its excitation is computed
 #: Largest range of a locked joint, and largest difference from its stated position [rad or m].
 STILL = 0.02
@@ -36,15 +35,7 @@ def check_repeated_motion(
     fitted: Sequence[Trajectory], validation: Trajectory, name: str
 ) -> Iterator[Finding]:
     """Yield a warning "repeated_motion" if a validation log repeats motion that is fitted."""
-    from scipy.spatial import cKDTree
-
-    size = np.maximum(np.ptp(validation.q, axis=0), 1e-3)
-    own = moving_pieces(validation, size, _INSTANTS)
-    share = 0.0
-    for known in [moving_pieces(motion, size, None) for motion in fitted if len(own)]:
-        if len(known):
-            distance, _ = cKDTree(known).query(own, p=np.inf, distance_upper_bound=NEAR)
-            share = max(share, float(np.mean(np.isfinite(distance))))
+    share = repeated_share(fitted, validation)
     if share >= REPEATED:
         yield finding("repeated_motion", name, share=share)
 

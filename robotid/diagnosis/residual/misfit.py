@@ -26,8 +26,8 @@ from robotid.diagnosis.residual.decisions import (
     select,
 )
 from robotid.diagnosis.residual.term_trials import Sample, Trial, Trials
+from robotid.estimation.fitting.drive_terms import JointMotion
 from robotid.estimation.fitting.fitted import Fit
-from robotid.estimation.fitting.joint_motion import JointMotion
 from robotid.robot.drives import (
     COUNTERBALANCE,
     FAMILIES,

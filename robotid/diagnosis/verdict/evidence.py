@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from robotid.base.findings import listed, quoted
-from robotid.estimation.fitting.metrics import JointMetrics, Metrics
+from robotid.estimation.fitting.evaluation import JointMetrics, Metrics
 
 if TYPE_CHECKING:
     from robotid.diagnosis.verdict.scale_check import ScaleCheck

@@ -11,8 +11,7 @@ import numpy as np
 
 from robotid.base.files import finite
 from robotid.base.typing import Array
-from robotid.estimation.fitting.fitted import Fit
-from robotid.estimation.fitting.identified import FROM_DATA, FROM_PRIOR, Identified, sources_of
+from robotid.estimation.fitting.fitted import FROM_DATA, FROM_PRIOR, Fit, Identified, sources_of
 
 #: Columns of a row: link or drive, parameter, the URDF's value, the identified one, its standard
 #: error, its 95 % interval, what determined it, unit.

@@ -141,23 +141,6 @@ FORCE = {"/left": (WRENCH, S, Maker.wrench)}
 INERTIAL = {"/imu": (IMU, S, Maker.imu)}
 
 
-def test_measured_torques_of_a_controller_are_not_those_of_its_output():
-    def point(k, effort=()):
-        return SimpleNamespace(positions=[k], velocities=[k + 0.1], effort=list(effort))
-
-    for measured, wanted in (("feedback", "reference"), ("actual", "desired")):
-        parts = {
-            measured: point(1.0, [1.2]),
-            "output": point(2.0, [2.2]),
-            wanted: point(3.0, [3.2]),
-        }
-        found = bags._controlled(SimpleNamespace(**parts))
-        assert found == {
-            "position": [1.0], "velocity": [1.1], "effort": [1.2],
-            "qref": [2.0], "dqref": [2.1], "tauref": [3.2],
-        }  # fmt: skip
-
-
 @pytest.mark.parametrize("name", ["log", "log.bag"])
 def test_odometry_is_interpolated_at_the_stamps_of_the_joints(tmp_path, name):
     store = Stores.ROS1_NOETIC if name == "log.bag" else Stores.ROS2_HUMBLE

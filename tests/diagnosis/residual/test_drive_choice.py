@@ -18,7 +18,7 @@ from helpers.driven import (
 from robotid.base.exceptions import SettingsError
 from robotid.diagnosis.residual.drive_choice import choose_drives
 from robotid.diagnosis.verdict.parameter_table import parameter_entries
-from robotid.estimation.fitting.bands import friction_curve
+from robotid.estimation.fitting.fitted import friction_curve
 from robotid.robot.drives import (
     AUTO,
     FAMILIES,

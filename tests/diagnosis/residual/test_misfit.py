@@ -30,8 +30,8 @@ from robotid.diagnosis.residual.misfit import couplings as couplings_of
 from robotid.diagnosis.residual.term_trials import RIDGE, Trials, take_sample
 from robotid.diagnosis.verdict.verdict import warnings_of
 from robotid.dynamics.base_parameters import structural_mapping
+from robotid.estimation.fitting.drive_terms import JointMotion
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
-from robotid.estimation.fitting.joint_motion import JointMotion
 from robotid.estimation.fitting.recorded import Recordings
 from robotid.estimation.fitting.survey import hold_log
 from robotid.identification.pipeline import conclude, identify
@@ -39,7 +39,7 @@ from robotid.robot.drives import AUTO
 from robotid.robot.model import RobotModel
 
 log_with = partial(helper.log_with, rate=50.0)  # [Hz]: the effects are slower than 10 Hz
-FIT = EstimatorSettings(draws=0)  # bounds have no part in what is tested here
+FIT = EstimatorSettings()  # bounds have no part in what is tested here
 WLS = EstimatorSettings("wls")  # nor has the prior, where terms alone are read
 PAN, LIFT, ELBOW = "shoulder_pan_joint", "shoulder_lift_joint", "elbow_joint"
 

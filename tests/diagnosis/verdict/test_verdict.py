@@ -14,7 +14,7 @@ from robotid.diagnosis.verdict.verdict import (
     rejected,
     warnings_of,
 )
-from robotid.estimation.fitting.metrics import JointMetrics, Metrics
+from robotid.estimation.fitting.evaluation import JointMetrics, Metrics
 
 NOISE = np.array([2.0, 2.0, 1.0, 0.3, 0.3, 0.1])
 JOINTS = ("a", "b", "c")
