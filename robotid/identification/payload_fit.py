@@ -337,7 +337,7 @@ def fit_with_friction(
     own: Mapping[str, tuple[DriveTerm, ...]] = {}
     if any(names != () for names in wanted.values()):
         judged = rescaled(gains) if gains else reference
-        own = with_drives(judged, ConsistentSettings(draws=0), wanted).model.layout.own
+        own = with_drives(judged, ConsistentSettings(), wanted).model.layout.own
     if own:
         model = reference.model.with_terms(own)
         loaded, reference = (run.with_model(model) for run in (loaded, reference))

@@ -37,11 +37,11 @@ from robotid.diagnosis.verdict.unlike_runs import rescaled_findings, unlike_find
 from robotid.diagnosis.verdict.verdict import blocking, check_ignored, rejected, warnings_of
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.constraint_rows import logged_base
+from robotid.estimation.fitting.drive_terms import DriveChoice
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
 from robotid.estimation.fitting.fit import fit_recordings, rough_choice, solve_recordings
 from robotid.estimation.fitting.fitted import Fit, Solution
 from robotid.estimation.fitting.recorded import Recordings
-from robotid.estimation.fitting.selected_drives import DriveChoice
 from robotid.estimation.fitting.survey import hold_log
 from robotid.estimation.variation.variation import vary
 from robotid.identification.repeated_errors import with_repeated_errors

@@ -7,6 +7,7 @@ import numpy as np
 
 from robotid.base.exceptions import RobotIdError
 from robotid.base.findings import Finding
+from robotid.data.alike_motions import REPEATED, repeated_share
 from robotid.data.log import Trajectory
 from robotid.data.signal_settings import SignalSettings
 from robotid.diagnosis.catalogue import finding
@@ -20,11 +21,9 @@ from robotid.estimation.estimators.determination import (
     determine,
     is_poorly_excited,
 )
-from robotid.estimation.fitting.left_out import NEAR, REPEATED, moving_pieces
 from robotid.robot.model import RobotModel
 from robotid.robot.prior import prior_spread
 
-_INSTANTS = 300
 _ROWS = 5000  # of a log, from which its excitation is computed
 
 
@@ -32,15 +31,7 @@ def check_repeated_motion(
     fitted: Sequence[Trajectory], validation: Trajectory, name: str
 ) -> Iterator[Finding]:
     """Yield a warning "repeated_motion" if a validation log repeats motion that is fitted."""
-    from scipy.spatial import cKDTree
-
-    size = np.maximum(np.ptp(validation.q, axis=0), 1e-3)
-    own = moving_pieces(validation, size, _INSTANTS)
-    share = 0.0
-    for known in [moving_pieces(motion, size, None) for motion in fitted if len(own)]:
-        if len(known):
-            distance, _ = cKDTree(known).query(own, p=np.inf, distance_upper_bound=NEAR)
-            share = max(share, float(np.mean(np.isfinite(distance))))
+    share = repeated_share(fitted, validation)
     if share >= REPEATED:
         yield finding("repeated_motion", name, share=share)
 

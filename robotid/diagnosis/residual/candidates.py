@@ -8,7 +8,7 @@ from operator import attrgetter
 import numpy as np
 
 from robotid.base.typing import Array
-from robotid.estimation.fitting.joint_motion import JointMotion
+from robotid.estimation.fitting.drive_terms import JointMotion
 from robotid.robot.drives import FAMILIES, DriveMotion, DriveTerm, Family, Harmonic
 
 _RIPPLES = np.arange(5, 241)  # periods per revolution tested: 200 of a gear of 100 : 1

@@ -19,7 +19,7 @@ from robotid.diagnosis.residual.decisions import (
 )
 from robotid.diagnosis.residual.selection import Round, select
 from robotid.diagnosis.residual.term_trials import Sample, Trial, Trials
-from robotid.estimation.fitting.joint_motion import JointMotion
+from robotid.estimation.fitting.drive_terms import JointMotion
 from robotid.robot.drives import DriveTerm, has_turned
 
 

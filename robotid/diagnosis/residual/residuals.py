@@ -1,4 +1,4 @@
-"""Spectrum and autocorrelation of a residual, and friction against speed."""
+"""Spectrum of a residual, and friction against speed."""
 
 import itertools
 
@@ -39,30 +39,6 @@ def spectrum(
     if size % 2 == 0:
         density[-1] /= 2.0
     return np.fft.rfftfreq(size, dt), density
-
-
-def autocorrelation(x: Array, used: NDArray[np.bool_], segment: Array, lags: int) -> Array:
-    """Return the autocorrelation of a signal with gaps and excluded samples.
-
-    r(k) = sum x(i) x(i + k) / sqrt(sum x(i)^2 sum x(i + k)^2), summed over pairs of used samples in
-    one segment: by Cauchy and Schwarz it is at most 1, however few pairs have this lag.
-
-    References:
-    Parzen (1963), On spectral analysis with missing observations.
-    """
-    products, earlier, later, pairs = np.zeros((4, lags + 1))
-    bounds = np.flatnonzero(np.r_[True, np.diff(segment) != 0, True])
-    for start, end in itertools.pairwise(bounds):
-        mask = used[start:end].astype(float)
-        masked = mask * x[start:end]
-        products += _lagged(masked, masked, lags)
-        earlier += _lagged(masked**2, mask, lags)
-        later += _lagged(mask, masked**2, lags)
-        pairs += _lagged(mask, mask, lags)
-    size = np.sqrt(np.maximum(earlier * later, 0.0))
-    known = (np.round(pairs) > 0) & (size > 1e-12 * size[0])  # the FFT rounds
-    r = np.divide(products, size, out=np.full(lags + 1, np.nan), where=known)
-    return np.asarray(np.clip(r, -1.0, 1.0))
 
 
 def friction_split(model: RobotModel, evaluation: Evaluation, pi: Array) -> tuple[Array, Array]:

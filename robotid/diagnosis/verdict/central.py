@@ -5,8 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from robotid.base.typing import Array
-from robotid.estimation.fitting.fitted import Fit
-from robotid.estimation.fitting.identified import FROM_DATA, FROM_PRIOR, sources_of
+from robotid.estimation.fitting.fitted import FROM_DATA, FROM_PRIOR, Fit, sources_of
 
 #: Mass [kg], centre of mass [m], inertia about it [kg m^2], in the axes of the joint frame.
 CENTRAL_TERMS = ("m", "cx", "cy", "cz", "Ixx", "Iyy", "Izz", "Ixy", "Ixz", "Iyz")

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from robotid.base.typing import Array
-from robotid.estimation.fitting.identified import Identified
+from robotid.estimation.fitting.fitted import Identified
 
 #: Size of the correlation from which two parameters are strongly correlated: if one were known,
 #: the error of the other would be less than a third of what it is, sqrt(1 - r^2) = 0.31.

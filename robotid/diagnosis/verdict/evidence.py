@@ -7,7 +7,7 @@ from functools import cached_property
 import numpy as np
 
 from robotid.base.findings import listed, quoted
-from robotid.estimation.fitting.metrics import JointMetrics, Metrics
+from robotid.estimation.fitting.evaluation import JointMetrics, Metrics
 
 #: [%] largest torque prediction error on validation logs of a joint that is "good".
 GOOD = 15.0

@@ -68,7 +68,7 @@ def fit_findings(
     findings += misfit_findings(fit, misfits, on_misfit)
     findings += [*_drive_findings(fit), *_correlated(fit)]
     findings += discrepancies
-    findings += encoder_findings(fit)
+    findings += encoder_findings(fit.regressor_noise, fit.model, fit.mapping)
     findings += [
         finding("validation_was_fitted", subject=e.recording.log.path, name=e.recording.name)
         for e in fit.refitted

@@ -8,7 +8,7 @@ from typing import Any
 
 from robotid.base.files import finite
 from robotid.diagnosis.verdict.correlation import correlated_parameters
-from robotid.estimation.fitting.identified import Identified
+from robotid.estimation.fitting.fitted import Identified
 
 #: Columns of a row: link or drive, parameter, the URDF's value, the identified one, its standard
 #: error, its 95 % interval, what determined it, unit.

@@ -10,8 +10,8 @@ import numpy as np
 
 from robotid.base.findings import listed
 from robotid.base.typing import Array
-from robotid.estimation.fitting.bands import QUANTILE
 from robotid.estimation.fitting.fitted import Fit
+from robotid.estimation.fitting.standard_errors import QUANTILE
 
 #: Relative difference up to which a mass or a gravity torque confirms the torque scale [-].
 AGREES = 0.05

@@ -12,8 +12,9 @@ from robotid.diagnosis.residual.dependence import Dependence
 from robotid.diagnosis.residual.residuals import friction_split, spectrum
 from robotid.diagnosis.residual.torque_split import JointTorque, spread_rows
 from robotid.dynamics.prediction import drive_motion_along
-from robotid.estimation.fitting.bands import QUANTILE, TorqueBand, friction_curve
 from robotid.estimation.fitting.evaluation import Evaluation
+from robotid.estimation.fitting.fitted import friction_curve
+from robotid.estimation.fitting.standard_errors import QUANTILE, TorqueBand
 from robotid.identification.result import TorqueIdentification
 from robotid.output.pages.charts import Chart, Plot, Series, broken
 

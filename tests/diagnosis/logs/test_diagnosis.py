@@ -231,7 +231,7 @@ def test_what_makes_a_result_wrong_leads_its_verdict_unless_it_is_ignored(
 ):
     job = tmp_path / "job.toml"
     job.write_text(
-        f'urdf = "{URDF}"\n[estimator]\ndraws = 0\n[output]\nreport = false\n'
+        f'urdf = "{URDF}"\n[output]\nreport = false\n'
         f'[[identification]]\nlog = "{wrong_sign}"\n'
     )
     words = ["identify", str(job), "--out", str(tmp_path / "out"), "--json"]

@@ -39,7 +39,7 @@ def four(model):
     return RobotModel.from_urdf(model.tree, joints=model.joints[:4])
 
 
-SETTINGS = EstimatorSettings(prior_weight=1.0, draws=0)
+SETTINGS = EstimatorSettings(prior_weight=1.0)
 
 
 def fitted(model, logs, estimator=SETTINGS):

@@ -27,8 +27,10 @@ from robotid.diagnosis.residual.drive_choice import choose_drives
 from robotid.diagnosis.verdict.parameter_table import parameter_entries
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.prediction import predict, remember
-from robotid.estimation.fitting.bands import friction_curve
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
+from robotid.estimation.fitting.fitted import (
+    friction_curve,
+)
 from robotid.estimation.fitting.recorded import Recordings
 from robotid.identification.pipeline import identify, with_drives
 from robotid.output.files.urdf import load_identified, write_urdf

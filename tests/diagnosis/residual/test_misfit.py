@@ -37,8 +37,8 @@ from robotid.diagnosis.verdict.fit_findings import fit_findings
 from robotid.diagnosis.verdict.verdict import warnings_of
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.simulation.truth import another_robot
+from robotid.estimation.fitting.drive_terms import JointMotion
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
-from robotid.estimation.fitting.joint_motion import JointMotion
 from robotid.estimation.fitting.recorded import Recordings
 from robotid.estimation.fitting.survey import hold_log
 from robotid.identification.pipeline import conclude, identify
@@ -46,7 +46,7 @@ from robotid.robot.drives import AUTO, Harmonic, Viscous, drive_line
 from robotid.robot.model import RobotModel
 
 log_with = partial(helper.log_with, rate=50.0)  # [Hz]: the effects are slower than 10 Hz
-FIT = EstimatorSettings(draws=0)  # bounds have no part in what is tested here
+FIT = EstimatorSettings()  # bounds have no part in what is tested here
 WLS = EstimatorSettings("wls")  # nor has the prior, where terms alone are read
 PAN, LIFT, ELBOW = "shoulder_pan_joint", "shoulder_lift_joint", "elbow_joint"
 
@@ -345,7 +345,6 @@ def test_a_hook_of_stribeck_makes_its_joint_usable(ur5, tmp_path):
     table = {
         "urdf": ur5.tree.path,
         "model": {"friction": "viscous+coulomb"},
-        "estimator": {"draws": 0},
         "identification": [{"log": str(paths[0])}],
         "validation": [{"log": str(paths[1])}],
         "output": {"report": False},

@@ -16,9 +16,15 @@ from robotid.diagnosis.residual.misfit import find_misfits
 from robotid.diagnosis.residual.model_error import with_model_error
 from robotid.diagnosis.residual.term_trials import take_sample
 from robotid.dynamics.torque import trajectory_regressor
-from robotid.estimation.fitting.bands import expected_band, friction_curve
-from robotid.estimation.fitting.open_terms import open_torques
-from robotid.estimation.fitting.selected_drives import DriveChoice, FoundShape
+from robotid.estimation.fitting.drive_terms import (
+    DriveChoice,
+    FoundShape,
+    open_torques,
+)
+from robotid.estimation.fitting.fitted import (
+    expected_band,
+    friction_curve,
+)
 from robotid.robot.drives import LoadFriction, Stribeck, Tanh
 
 QUANTILE = 1.5

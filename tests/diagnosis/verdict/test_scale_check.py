@@ -27,7 +27,7 @@ def near_urdf(model, scale=1.0):
 def found_of(model, pi, **constraints):
     noise, rngs = NOISE[: len(model.joints)], np.random.default_rng(0).spawn(2)
     logs = [exact_log(model, pi, rng, noise=noise) for rng in rngs]
-    settings = EstimatorSettings(draws=0, constraints=constraints)
+    settings = EstimatorSettings(constraints=constraints)
     return identify(model, logs[:1], validation=logs[1:], signals=EXACT, estimator=settings)
 
 
@@ -194,12 +194,12 @@ def test_a_result_that_its_prior_holds_back_bears_no_witness(four, rng):
     size = four.layout.n_inertial
     pi[:size] = 3.0 * four.standard_parameters()[:size]  # the sensors say three times the URDF
     log = exact_log(four, pi, rng, samples=1000, noise=0.5)
-    kept = EstimatorSettings(prior_weight=1e9, draws=0)
+    kept = EstimatorSettings(prior_weight=1e9, )
     held = identify(four, [log], estimator=kept)
     assert held.scale_check.factor == pytest.approx(1.0, abs=0.05)  # it stays at the URDF
     assert not held.scale_check.follows
     assert not held.scale_check.agrees
-    free = identify(four, [log], estimator=EstimatorSettings(draws=0))
+    free = identify(four, [log], estimator=EstimatorSettings())
     assert free.scale_check.follows
 
 

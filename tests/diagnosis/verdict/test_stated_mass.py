@@ -22,7 +22,7 @@ EXACT = SignalSettings(cutoff=None, trim=0.0, min_velocity=0.0, velocity="measur
 
 
 def checked(model, log, **constraints):
-    settings = EstimatorSettings(draws=0, constraints=constraints)
+    settings = EstimatorSettings(constraints=constraints)
     return check_scale(fit(model, [log], signals=EXACT, estimator=settings))
 
 

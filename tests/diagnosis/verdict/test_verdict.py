@@ -21,7 +21,7 @@ from robotid.diagnosis.verdict.verdict import (
     warnings_of,
 )
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
-from robotid.estimation.fitting.metrics import JointMetrics, Metrics
+from robotid.estimation.fitting.evaluation import JointMetrics, Metrics
 from robotid.identification.pipeline import identify
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
@@ -430,7 +430,7 @@ def spoilt_logs(model, spoil=None):
 def found_of(model, spoil=None, ignore=(), **settings):
     """Return what is found of such logs."""
     log, kept = spoilt_logs(model, spoil)
-    settings = EstimatorSettings(prior_weight=1.0, draws=0, **settings)
+    settings = EstimatorSettings(prior_weight=1.0, **settings)
     return identify(
         model, [log], validation=[kept], estimator=settings, friction="none", ignore=ignore
     )
@@ -449,7 +449,7 @@ def run(arm, tmp_path):
             "identification": [{"log": "run.csv"}],
             "validation": [{"log": "kept.csv"}],
             "model": {"friction": "viscous+coulomb"},
-            "estimator": {"prior_weight": 1.0, "draws": 0, **settings},
+            "estimator": {"prior_weight": 1.0, **settings},
             "output": {"report": False},
         }
         out = tmp_path / "out"

@@ -28,7 +28,7 @@ from robotid.output.report.tables import open_section
 
 EXACT = SignalSettings(cutoff=None, trim=0.0)
 NOISE = 0.1  # [N m]
-CHOICE = EstimatorSettings(draws=0)  # intervals are not read
+CHOICE = EstimatorSettings()  # intervals are not read
 
 
 def moved(model, change, *, samples=600, noise=NOISE):

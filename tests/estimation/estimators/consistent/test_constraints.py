@@ -12,8 +12,11 @@ from robotid.base.exceptions import SettingsError
 from robotid.dynamics.factors import compress
 from robotid.estimation.estimators import Consistent
 from robotid.estimation.estimators.consistent.body_constraints import Constraints, slabs
-from robotid.estimation.fitting.consistent_estimator import make_constraints
-from robotid.estimation.fitting.estimator_settings import ConstraintSettings, EstimatorSettings
+from robotid.estimation.fitting.estimator_settings import (
+    ConstraintSettings,
+    EstimatorSettings,
+    make_constraints,
+)
 from robotid.robot.geometry import body_boxes
 from robotid.robot.parameters import ParameterLayout, pseudo_inertia
 

@@ -135,7 +135,7 @@ def test_the_held_out_errors_are_those_of_a_loop_by_hand(case):
 def test_the_chosen_weight_is_the_best_of_its_curve_and_is_stated(ur5, rng):
     log = exact_log(ur5, truth(ur5), rng, noise=NOISE)
     for how in ("cv", "evidence"):
-        settings = EstimatorSettings(prior_weight=how, draws=0)
+        settings = EstimatorSettings(prior_weight=how)
         found = fitted(ur5, [log], signals=EXACT, estimator=settings)
         prior = found.estimate.details["prior"]
         assert prior["chosen_by"] == how
@@ -306,7 +306,7 @@ def test_poor_excitation_is_predicted_better_than_by_wls(ur5, rng):
     short = exact_log(ur5, pi, rng, samples=100, noise=NOISE)
     new = exact_log(ur5, pi, rng, noise=NOISE)
     for weight in ("auto", 1.0):
-        settings = EstimatorSettings(prior_weight=weight, draws=0)
+        settings = EstimatorSettings(prior_weight=weight)
         found = fitted(ur5, [short], validation=[new], signals=EXACT, estimator=settings)
         measured = found.validation[0].metrics
         ours, wls = (
@@ -412,7 +412,7 @@ def test_extents_that_the_data_contradict_are_named_and_no_others(rng):
         own = mass * 0.5**2
         pi[last] += [mass, 0.5 * mass, 0.0, 0.0, 0.0, 0.0, own, 0.0, 0.0, own]
         log = exact_log(z1, pi, rng, samples=500, noise=0.05)
-        found[mass] = identify(z1, [log], signals=EXACT, estimator=EstimatorSettings(draws=0))
+        found[mass] = identify(z1, [log], signals=EXACT, estimator=EstimatorSettings())
     assert found[0.0].estimate.details["relaxed"] == []
     relaxed = found[2.0].estimate.details["relaxed"]
     assert link in relaxed
