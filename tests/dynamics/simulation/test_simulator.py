@@ -51,15 +51,6 @@ def test_the_log_of_the_plant_obeys_its_own_equation(ur5, rng):
     np.testing.assert_allclose(np.gradient(log.q, log.t, axis=0)[5:-5], log.v[5:-5], atol=1e-3)
 
 
-def test_the_plant_is_integrated_in_short_steps_whatever_the_rate_of_the_log(ur5):
-    motion = random_fourier(ur5, np.random.default_rng(0))
-    rare, often = (
-        simulate(ur5, truth(ur5), motion, rate=rate, duration=1.0, rng=np.random.default_rng(0))
-        for rate in (25.0, 200.0)
-    )
-    np.testing.assert_allclose(rare.q, often.q[::8], atol=1e-3)
-
-
 def followed(model, pi, settings, *, seed=1, rate=500.0, duration=2.0):
     motion = random_fourier(model, np.random.default_rng(seed))
     return follow(model, pi, motion, rate=rate, duration=duration, settings=settings)
