@@ -4,16 +4,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.estimation import EXACT, NOISE, Case, consistent
-from helpers.fitting import identify
-from helpers.synthetic import exact_log, truth
+from helpers.estimation import NOISE, Case, consistent
+from helpers.synthetic import truth
 
 from robotid.base.exceptions import SettingsError
 from robotid.dynamics.factors import compress
 from robotid.estimation.estimators import Consistent
 from robotid.estimation.estimators.consistent.body_constraints import Constraints, slabs
 from robotid.estimation.fitting.consistent_estimator import make_constraints
-from robotid.estimation.fitting.estimator_settings import ConstraintSettings, EstimatorSettings
+from robotid.estimation.fitting.estimator_settings import ConstraintSettings
 from robotid.robot.geometry import body_boxes
 from robotid.robot.parameters import ParameterLayout, pseudo_inertia
 
@@ -48,14 +47,6 @@ def test_bounds_of_mass_are_kept_and_reached(case):
     assert masses(estimate)[3] == pytest.approx(high, rel=1e-6)
     assert {"mass forearm_link", "mass wrist_1_link"} <= set(estimate.details["active"])
     assert "mass" in estimate.details["constraints"]
-
-
-def test_a_bound_that_does_not_bind_changes_nothing(case):
-    fit, factors = case
-    free = fit.fit(factors)
-    wide = {name: (0.01, 100.0) for name in fit.layout.bodies}
-    estimate = constrained(fit, mass=wide, total_mass=(0.1, 500.0)).fit(factors)
-    np.testing.assert_allclose(estimate.theta, free.theta, rtol=0, atol=1e-6 * fit.prior_std.max())
 
 
 def test_a_known_total_mass_is_met_exactly(case):
@@ -103,28 +94,6 @@ def test_a_centre_of_mass_stays_in_its_box(case):
     assert "centre_of_mass forearm_link" in estimate.details["active"]
 
 
-def test_gradients_of_active_constraints_are_those_of_their_slack(case):
-    fit, factors = case
-    low = 1.2 * masses(fit.fit(factors))[2]
-    fit = constrained(fit, mass={"forearm_link": (low, np.inf)})
-    estimate = fit.fit(factors)
-    bounds = fit.programme.bounds
-    is_active = bounds.G @ (estimate.theta / fit.prior_std) + bounds.h < 1e-5
-    row = bounds.G[is_active][
-        bounds.active(estimate.theta / fit.prior_std, 1e-5).index("mass forearm_link")
-    ]
-    assert np.flatnonzero(row).tolist() == [20]
-    gradients = bounds.G[is_active]
-    # stationary: the gradient of the objective is a combination of the active ones
-    rows = fit.rows(factors, estimate.sigma)
-    D = rows[:, :-1] @ fit.K
-    slope = 2 * D.T @ (D @ estimate.theta - rows[:, -1])
-    slope += fit.prior_weight * fit.programme.penalty.gradient(estimate.theta)
-    slope *= fit.prior_std
-    left = slope - gradients.T @ np.linalg.lstsq(gradients.T, slope, rcond=None)[0]
-    assert np.linalg.norm(left) < 1e-4 * np.linalg.norm(slope)
-
-
 @pytest.mark.parametrize(
     ("bounds", "text"),
     [
@@ -155,38 +124,6 @@ def test_links_on_locked_joints_count_in_the_bounds(case):
     held[20:30] = [2.0, 0, 0, 0, 0.01, 0, 0.01, 0, 0, 0.01]
     with pytest.raises(SettingsError, match="its links on locked joints alone have 2 kg"):
         constrained(replace(case[0], held=held), mass={"forearm_link": (0.5, 1.0)})
-
-
-@pytest.mark.parametrize(
-    ("options", "text"),
-    [
-        ({"mass": {"a": "heavy"}}, "mass of a is 'heavy', wanted a number or"),
-        ({"mass": {"a": [np.inf, np.inf]}}, r"a is \[inf, inf\], wanted finite numbers of at most"),
-        ({"total_mass": [1.0, np.nan]}, r"total_mass is \[1.0, nan\], wanted finite numbers"),
-        ({"total_mass": [1.0, 1e300]}, r"1e\+300\], .* at most 1e\+09 kg; write 1e\+09 for no"),
-        ({"total_mass": [3.0]}, r"total_mass is \[3.0\], wanted a number or"),
-        ({"total_mass": [4.0, 3.0]}, "the first value is larger than the second"),
-        ({"com": {"a": [[0, 0], [1, 1]]}}, "com of a is .* wanted"),
-        ({"com": {"a": [[0, 0, 1], [1, 1, 0]]}}, "a coordinate of the first corner is larger"),
-        ({"com_within": "sphere"}, "com_within is 'sphere', wanted one of"),
-    ],
-)
-def test_settings_that_are_no_bounds_are_refused(options, text):
-    with pytest.raises(SettingsError, match=text):
-        EstimatorSettings(constraints=options)
-
-
-def test_a_job_states_its_constraints(ur5, rng):
-    log = exact_log(ur5, truth(ur5), rng, noise=NOISE)
-    settings = EstimatorSettings(
-        constraints={"mass": {"forearm_link": 2.5}, "pinned": ["wrist_3_link"], "total_mass": 20.0}
-    )
-    found = identify(ur5, [log], signals=EXACT, estimator=settings)
-    assert found.standard[20] == pytest.approx(2.5, rel=1e-9)
-    assert found.standard[:60:10].sum() == pytest.approx(20.0, rel=1e-9)
-    np.testing.assert_allclose(found.standard[50:60], found.prior[50:60], rtol=1e-9, atol=1e-12)
-    assert found.sources[50:60] == ("prior",) * 10
-    assert found.is_consistent
 
 
 def test_the_slabs_of_a_box_hold_for_grains_inside_and_fail_for_one_outside(rng):
@@ -223,14 +160,6 @@ def test_extents_keep_the_mass_of_each_body_in_its_box(case, ur5):
     ]
 
 
-def test_what_is_stated_of_a_centre_of_mass_widens_the_extent_of_its_body(ur5):
-    bounds = ConstraintSettings(com={"forearm_link": [[1.0, -0.1, 0.0], [1.2, 0.0, 0.1]]})
-    extent = body_boxes(ur5)["forearm_link"]
-    made = make_constraints(bounds, {}, {"forearm_link": extent}).extent["forearm_link"]
-    np.testing.assert_array_equal(made[0], np.minimum(extent[0], [1.0, -0.1, 0.0]))
-    np.testing.assert_array_equal(made[1], np.maximum(extent[1], [1.2, 0.0, 0.1]))
-
-
 @pytest.fixture(scope="module")
 def two_bodies():
     """Two bodies of 3 and 5 kg; the first has 1 kg on locked joints."""
@@ -257,14 +186,6 @@ def test_bounds_are_checked_with_the_figures_of_each_body(two_bodies, bounds, te
     layout, prior, held = two_bodies
     with pytest.raises(SettingsError, match=text):
         Constraints(**bounds).check(layout, prior, held)
-
-
-def test_bounds_that_meet_are_no_contradiction(two_bodies):
-    layout, prior, held = two_bodies
-    for low, high in ((3.5, 3.5), (6.5, 9.0), (1.0, 3.5)):
-        masses = {"one": (2.0, 4.0), "two": (1.5, 2.5)}
-        Constraints(mass=masses, total_mass=(low, high)).check(layout, prior, held)
-    Constraints(mass={"one": (1.0, 1.1), "two": (0.1, 0.2)}).check(layout, prior, held)
 
 
 def test_rows_of_bounds_are_those_of_their_body_and_sign(two_bodies):
