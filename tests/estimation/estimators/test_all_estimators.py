@@ -1,6 +1,5 @@
 """Laws that every estimator obeys, and what an estimate and the scatter of segments state."""
 
-import re
 from dataclasses import fields, replace
 from functools import partial
 
@@ -17,20 +16,17 @@ from robotid.estimation.estimators import (
     RLS,
     TLS,
     WLS,
-    BatchEstimator,
     Consistent,
     DescentState,
     Estimate,
     Kalman,
     KalmanState,
     NormalisedGradient,
-    RecursiveEstimator,
     RLSState,
     fold,
     load_state,
     save_state,
 )
-from robotid.estimation.estimators.estimator import require_rows
 from robotid.estimation.estimators.segments import scatter
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
@@ -64,14 +60,6 @@ def test_truth_is_recovered_from_one_motion(make, panda, rng):
     beta = case.base(make(case).fit(case.problem))
     # 1e-8 relative: rounding of 4200 rows and, for the cone solver, its own tolerance
     assert np.linalg.norm(beta - case.beta) < 1e-8 * np.linalg.norm(case.beta)
-
-
-@makers(ESTIMATORS)
-def test_it_says_what_it_reads(make, states):
-    estimator = make(states)
-    kind = BatchEstimator if estimator.reads == "factors" else RecursiveEstimator
-    assert estimator.reads in ("factors", "samples")
-    assert isinstance(estimator, kind)
 
 
 @makers(BATCH)
@@ -265,20 +253,6 @@ def test_text_states_value_and_error_of_each_parameter():
 )
 def test_an_estimator_says_how_its_rows_weigh(estimator, weighing):
     assert estimator.weighing == weighing
-
-
-@pytest.mark.parametrize(("rows", "wanted"), [(57, 97), (41, 97)])
-def test_too_few_rows_are_reported_with_ten_samples_per_parameter_over_the_joints(rows, wanted):
-    """Of six joints: a sample has six rows."""
-    text = (
-        f"{rows} torque rows for 58 parameters: too few rows to fit; record at least {wanted} "
-        "samples, or reduce min_velocity and trim"
-    )
-    with pytest.raises(DataError, match=f"^{re.escape(text)}$"):
-        require_rows(rows, 58, 6)
-    with pytest.raises(DataError, match=r"^0 torque rows for 58 parameters: no joint moves"):
-        require_rows(0, 58, 6)
-    require_rows(58, 58, 6)
 
 
 def test_what_one_segment_alone_determines_has_the_mean_scatter_of_all_others(rng):

@@ -203,6 +203,17 @@ def test_pinned_bodies_keep_the_urdf_and_the_rest_is_the_constrained_least_squar
     assert np.abs(slope[kept]).max() < 1e-5 * np.abs(slope).max()
 
 
+def test_without_noise_a_redrawn_fit_is_the_fit_at_its_bounds(case, rng):
+    fit, factors = case
+    fit = constrained(fit, mass={"forearm_link": (1.2 * masses(fit.fit(factors))[2], np.inf)})
+    found = fit.fit(factors)
+    rows, b = fit.rows(factors, found.sigma), len(fit.K)
+    moved, failures = fit.programme.redrawn(rows, 1.0, found.theta, np.zeros((b, b)), 0.0, 3, rng)
+    assert found.details["active"] == ["mass forearm_link"]
+    assert failures == []
+    assert np.abs(moved / fit.prior_std).max() < 1e-6
+
+
 def test_a_centre_of_mass_stays_in_its_box(case):
     fit, factors = case
     free = centre(fit.fit(factors), 2)

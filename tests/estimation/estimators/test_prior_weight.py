@@ -102,7 +102,7 @@ def test_the_chosen_weight_is_the_best_of_its_curve_and_is_stated(ur5, rng):
 CHANCE = np.array([[0.05], [-0.05], [0.02], [-0.05], [0.05], [-0.02]])  # (segments, 1)
 
 
-def chosen(case, monkeypatch, excess):
+def chosen(case, monkeypatch, excess, repeated=0.0):
     """Return the choice where mean squares rise by excess (6, n) per decade away from 1."""
     fit, problem = case
 
@@ -110,7 +110,7 @@ def chosen(case, monkeypatch, excess):
         return (1.0 + abs(np.log10(w)) * np.asarray(excess)) / 6.0, []
 
     monkeypatch.setattr("robotid.estimation.estimators.prior_weight.held_out_errors", errors)
-    return choose_weight(fit, Segments.of(fit, cut(problem, 6)), "cv")
+    return choose_weight(fit, Segments.of(fit, cut(problem, 6)), "cv", repeated)
 
 
 @pytest.mark.parametrize(("gain", "weight"), [(0.018, 100.0), (0.03, 10.0), (0.5, 1.0)])
@@ -210,6 +210,13 @@ def test_no_joint_is_predicted_clearly_worse_than_by_least_squares(
     assert choice.loss == pytest.approx(ratio if weight == 100.0 else 1.0, abs=1e-2)
 
 
+def test_rows_without_constraint_forces_are_one_joint():
+    fold = SimpleNamespace(rows=np.array([10, 30]), is_projected=True)
+    segments = Segments((fold, fold), np.array([2.0, 4.0]), None, 1.0)
+    errors = segments.errors(np.array([[40.0, 160.0], [8.0, 0.0]]))
+    np.testing.assert_allclose(errors, [[20.0 / 80], [2.0 / 80]])
+
+
 def test_one_stretch_is_too_few(case):
     fit, problem = case
     with pytest.raises(DataError, match="needs at least 2 segments, found 1"):
@@ -284,6 +291,15 @@ def test_the_loss_of_a_segment_is_the_mean_of_the_joints_that_have_rows_in_it(lo
     excess = np.repeat([loss, -0.012], 6)
     assert (excess.mean() <= 2 * excess.std(ddof=1) / np.sqrt(12)) is np.bool_(accepted)
     assert weighting._is_accepted(parts, best, 0.0) is accepted
+
+
+@pytest.mark.parametrize(("repeated", "weight"), [(0.0, 1.0), (0.028, 10**0.5), (0.031, 10.0)])
+def test_an_error_that_repeats_makes_a_residual_larger_by_its_share(
+    case, monkeypatch, repeated, weight
+):
+    """Of 1.5 % without scatter at a weight of 10; log(1.015) is -log(1 - 0.0293) / 2."""
+    excess = np.full((6, 1), 1.015**2 - 1.0)
+    assert chosen(case, monkeypatch, excess, repeated).weight == pytest.approx(weight)
 
 
 def test_a_larger_weight_may_leave_an_error_that_repeats_in_all_segments():

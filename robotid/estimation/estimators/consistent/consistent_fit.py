@@ -364,7 +364,7 @@ class Consistent(BatchEstimator):
         known = np.flatnonzero(np.isfinite(np.diag(estimate.covariance)))
         if not len(known):
             raise DataError(
-                "the estimate has no covariance and cannot be projected; use the estimator 'rls' or "
+                "the estimate has no covariance and cannot be projected; use 'rls' or "
                 "'kalman', which have one"
             )
         projected = self._minimised(_information_rows(estimate, known), estimate)
@@ -400,7 +400,8 @@ class Consistent(BatchEstimator):
         freedom = np.maximum(rows - used / self.independent_share, _LEAST_FREEDOM * rows)
         torque = np.sqrt(factors.torque_squares() / rows)
         least = _FLOOR * np.where(torque > 0, torque, 1.0)
-        return np.maximum(sigma * np.sqrt(np.maximum(rows - used, 1.0) / freedom), least)
+        level = sigma * np.sqrt(np.maximum(rows - used, 1.0) / freedom)
+        return np.asarray(np.maximum(level, least))
 
     def rows(self, factors: Factors, sigma: Array) -> Array:
         """Return rows [R d], shape (b + 1, b + 1): |R K pi - d|^2 is the weighted cost of the data.
