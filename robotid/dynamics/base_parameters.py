@@ -31,19 +31,12 @@ _SHOWN = 1e-6  # smaller coefficients are omitted in the expressions, not in K
 
 @dataclass(frozen=True, eq=False)
 class BaseMapping:
-    """The linear map from standard to base parameters and back.
+    """The linear map from standard to base parameters and back."""
 
-    Attributes:
-        K: Map with beta = K pi and W pi = W[:, independent] beta, shape (b, p).
-        independent: Independent columns of W, shape (b,), ascending.
-        names: Names of the p standard parameters.
-        pivots: Absolute values of all p pivots, descending, relative to the first, shape (p,).
-    """
-
-    K: Array
-    independent: Array
-    names: tuple[str, ...]
-    pivots: Array
+    K: Array  # map with beta = K pi and W pi = W[:, independent] beta, shape (b, p)
+    independent: Array  # independent columns of W, shape (b,), ascending
+    names: tuple[str, ...]  # names of the p standard parameters
+    pivots: Array  # absolute values of all p pivots, descending, relative to the first, shape (p,)
 
     @property
     def base_names(self) -> tuple[str, ...]:
@@ -189,14 +182,12 @@ def _linked_parts(linked: Array) -> tuple[int, Array]:
 
 
 def _factor(rows: Array, filled: Array) -> Array:
-    """Return R with R^T R = W^T W.
+    """Return R with R^T R = W^T W: rows (N, m, c), filled (m, c).
 
     The equation of a joint has the columns of all bodies that the joint moves, so it contains those
     of every joint after it. The equations are folded from the ends of the robot to its base; the
     columns of each are adjacent in a suitable order. If the equations are not nested so, the rows
     are factored as a whole.
-
-    rows (N, m, c), filled (m, c).
     """
     c, filled = rows.shape[2], _with_carried(filled)
     fewest = np.argsort(filled.sum(axis=1), kind="stable")

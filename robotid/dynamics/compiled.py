@@ -87,27 +87,17 @@ class CompiledWriter:
 
 
 class Tree(NamedTuple):
-    """A robot's B bodies as arrays for compiled code. Parents come before their children.
+    """A robot's B bodies as arrays for compiled code. Parents come before their children."""
 
-    Attributes:
-        parents: Parent of each body, shape (B,), int; -1: the world.
-        joints: Constants of each joint, its ratio to its coordinate and its offset, shape (B, 41).
-        leaders: Coordinate that moves each joint, shape (B,), int.
-        rows: Row of the regressor of each slot of each body, shape (B, D), int; -1 if unused.
-        depths: Number of rows that each body affects, shape (B,), int.
-        slots: Slot of a body's own joint, shape (B,), int; -1: floating base.
-        is_below: Whether joint k moves body i, its own included, shape (B, B), bool, [i, k].
-        gravity: Shape (3,) [m/s^2].
-    """
-
-    parents: Array
+    parents: Array  # parent of each body, shape (B,), int; -1: the world
+    # constants of each joint, its ratio to its coordinate and its offset, shape (B, 41)
     joints: Array
-    leaders: Array
-    rows: Array
-    depths: Array
-    slots: Array
-    is_below: Array
-    gravity: Array
+    leaders: Array  # coordinate that moves each joint, shape (B,), int
+    rows: Array  # row of the regressor of each slot of each body, shape (B, D), int; -1 if unused
+    depths: Array  # number of rows that each body affects, shape (B,), int
+    slots: Array  # slot of a body's own joint, shape (B,), int; -1: floating base
+    is_below: Array  # whether joint k moves body i, its own included, shape (B, B), bool, [i, k]
+    gravity: Array  # shape (3,) [m/s^2]
 
     @property
     def prismatic(self) -> Array:
@@ -123,16 +113,11 @@ class Tree(NamedTuple):
 
     def work_space(self) -> Array:
         """Return a new work space for ``row_lanes``."""
-        from robotid.dynamics.kernels.lanes import work_space  # imports Numba
-
-        work: Array = work_space(row_lanes().rows_size(*self.rows.shape))
+        work: Array = row_lanes().work_of(*self.rows.shape)
         return work
 
     def places(self, wanted: Array) -> Array:
-        """Return the places of the columns of each body in each of its rows, shape (B, D, 10).
-
-        wanted (n_rows, 10 B).
-        """
+        """Return the places (B, D, 10) of the columns of each body in each of its rows."""
         by_body = wanted.reshape(len(wanted), -1, 10).swapaxes(0, 1)  # (B, n_rows, 10)
         found = np.take_along_axis(by_body, self.rows.clip(min=0)[..., None], axis=1)
         return np.where(self.rows[..., None] >= 0, found, -1)
@@ -149,11 +134,7 @@ class Tree(NamedTuple):
 def own_motion(
     q: Array, v: Array, a: Array, base: Array | None = None
 ) -> tuple[Array, Array, Array, Array]:
-    """Return writable copies in C order: for other arrays Numba would compile again.
-
-    q (N, n_rows) [rad, m], v (N, n_rows) [rad/s, m/s], a (N, n_rows) [rad/s^2, m/s^2], base
-    (12, N).
-    """
+    """Return writable copies in C order, base (12, N): for others Numba would compile again."""
     base = np.zeros((12, 0)) if base is None else base
     q, v, a, base = (np.array(x, dtype=float, order="C") for x in (q, v, a, base))
     return q, v, a, base

@@ -131,17 +131,11 @@ _NARROW = (0.02, 2e-3, 0.1)  # smallest deviations: force over weight, height [m
 
 @dataclass(frozen=True, eq=False)
 class FoundContact:
-    """Whether a link touches the ground, sample by sample.
+    """Whether a link touches the ground, sample by sample."""
 
-    Attributes:
-        frame: The link.
-        touches: Probability that it does, shape (N,).
-        force: Its estimated force upwards, shape (N,) [N].
-    """
-
-    frame: str
-    touches: Array
-    force: Array
+    frame: str  # the link
+    touches: Array  # probability that it does, shape (N,)
+    force: Array  # its estimated force upwards, shape (N,) [N]
 
     @property
     def shares(self) -> tuple[float, float, float]:

@@ -4,6 +4,8 @@ With the Jacobian J of the constraints, W pi = tau + J^T f with the forces f. Th
 projected orthogonally to the columns of J^T of unknown forces, P W pi = P tau with P = I - B B^T
 and B an orthonormal basis of these columns. The forces disappear, and as many equations as they
 have components. A force of 1 N counts as much as a torque of 1 N m.
+
+Shapes: q (N, n), J (N, m, n_rows), contacts (N, k) and used (N, n_rows) bool, B (N, n_rows, r).
 """
 
 from collections.abc import Iterator
@@ -28,56 +30,47 @@ _WEAK = 0.01  # ... if rows of the base alone are used, which feet of equal heig
 _AS_IS = BaseSource()
 _BLOCK = 1024  # samples whose Jacobians are in memory together
 _CACHED = 64  # samples that are projected together
+_AXES = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
 
 
 def constraint_jacobian(model: RobotModel, q: Array, contacts: Array) -> Array:
-    """Return the Jacobian of a robot's constraints at each sample, shape (N, m, n_rows).
-
-    q (N, n) [rad, m], contacts (N, k).
-    """
-    pin_model, G = model.pin_model, model.velocity_map
-    data, axes = pin_model.createData(), pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+    """Return the Jacobian J of a robot's constraints at each sample, 0 of links in the air."""
+    pin_model, G, data = model.pin_model, model.velocity_map, model.pin_model.createData()
     frames = [[frame_id(pin_model, link) for link in x.frames] for x in model.constraints]
     edges = np.cumsum([0, *(x.sizes[x.kind] for x in model.constraints)])
-    place = {x: k for k, x in enumerate(c for c in model.constraints if isinstance(c, Contact))}
+    place = {x: k for k, x in enumerate(model.contacts)}
     J = np.zeros((len(q), edges[-1], model.n_rows))
     for k, q_k in enumerate(np.ascontiguousarray(model.configurations(q))):
         pin.computeJointJacobians(pin_model, data, q_k)
         for x, ids, first, stop in zip(model.constraints, frames, edges, edges[1:], strict=False):
             if x in place and not contacts[k, place[x]]:
                 continue
-            own = [pin.getFrameJacobian(pin_model, data, i, axes) for i in ids]
+            own = [pin.getFrameJacobian(pin_model, data, i, _AXES) for i in ids]
             placement = pin.updateFramePlacement(pin_model, data, ids[0])
             J[k, first:stop] = x.rows(own, placement) @ G
     return J
 
 
 def contact_links(model: RobotModel, q: Array) -> tuple[Array, Array]:
-    """Return axes and Jacobians of rotation of the links of contacts, with the world's axes.
-
-    q (N, n) [rad, m] -> (N, k, 3, 3), (N, k, 3, n_rows).
-    """
+    """Return axes (N, k, 3, 3) and Jacobians of rotation (N, k, 3, n_rows) of links of contacts."""
     pin_model, data = model.pin_model, model.pin_model.createData()
     frames = [frame_id(pin_model, x.frame) for x in model.contacts]
     rotation = np.empty((len(q), len(frames), 3, 3))
     turning = np.empty((len(q), len(frames), 3, pin_model.nv))
-    axes = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
     for k, q_k in enumerate(np.ascontiguousarray(model.configurations(q))):
         pin.computeJointJacobians(pin_model, data, q_k)
         for i, frame in enumerate(frames):
             rotation[k, i] = pin.updateFramePlacement(pin_model, data, frame).rotation
-            turning[k, i] = pin.getFrameJacobian(pin_model, data, frame, axes)[3:]
+            turning[k, i] = pin.getFrameJacobian(pin_model, data, frame, _AXES)[3:]
     return rotation, turning @ model.velocity_map
 
 
 def force_basis(J: Array, used: Array, floats: bool = False) -> Array:
-    """Return orthonormal bases of the torques that unknown constraint forces can cause.
+    """Return orthonormal bases B of the torques that unknown constraint forces can cause.
 
     Two feet that press against each other hardly load the base: by their difference in height, if
     their vertical forces are known. In the rows of a floating base alone, forces that would have to
     be a hundred times larger than others for an effect of the same size are taken to have none.
-
-    J (N, m, n_rows), used (N, n_rows) -> (N, n_rows, k).
     """
     A = J.swapaxes(1, 2) * used[:, :, None]
     parts, least = [], _least(used, floats)
@@ -94,19 +87,13 @@ def _least(used: Array, floats: bool) -> float:
 
 
 def loop_basis(model: RobotModel, q: Array) -> Array:
-    """Return bases of the torques that the forces of loops can cause, as of ``force_basis``.
-
-    q (N, n) [rad, m].
-    """
+    """Return bases of the torques that the forces of loops can cause, as of ``force_basis``."""
     J = constraint_jacobian(replace(model, constraints=model.loops), q, np.ones((len(q), 0)))
     return force_basis(J, np.ones((len(q), model.n_rows), dtype=bool))
 
 
 def without_forces(basis: Array, rows: Array) -> Array:
-    """Return rows orthogonal to the torques of constraint forces, same shape.
-
-    basis (N, n_rows, m), rows (N, n_rows).
-    """
+    """Return rows (N, n_rows) or (N, n_rows, c) orthogonal to the torques of constraint forces."""
     if rows.ndim == 2:
         return without_forces(basis, rows[..., None])[..., 0]
     projected: Array = basis @ (basis.swapaxes(1, 2) @ rows)
@@ -114,10 +101,7 @@ def without_forces(basis: Array, rows: Array) -> Array:
 
 
 def mixed_rows(basis: Array, weights: Array) -> Array:
-    """Return the rows that are used or projected into used rows, shape (n_rows,), bool.
-
-    weights (N, n_rows).
-    """
+    """Return the rows that are used or projected into used rows, shape (n_rows,), bool."""
     return np.asarray(np.any(weights, axis=0) | np.any(basis, axis=(0, 2)))
 
 
@@ -127,16 +111,11 @@ class ProjectedRows(RowSource):
 
     Every used row has the columns of all rows; a row with weight 0 in all samples has none. The
     count of rows is that of independent equations, the sum of the diagonal of P.
-
-    Attributes:
-        own: The rows before the projection, not weighted.
-        basis: As of ``force_basis``.
-        weights: Weight of each row, shape (N, n_rows).
     """
 
-    own: RowSource
-    basis: Array
-    weights: Array
+    own: RowSource  # the rows before the projection, not weighted
+    basis: Array  # as of ``force_basis``
+    weights: Array  # weight of each row, shape (N, n_rows)
 
     @property
     def samples(self) -> int:
@@ -148,30 +127,32 @@ class ProjectedRows(RowSource):
 
     @cached_property
     def columns(self) -> tuple[Array, ...]:
-        every: Array = np.unique(np.concatenate(self.own.columns))
-        is_used = np.asarray(np.any(self.weights, axis=0))
+        every, is_used = self._every, np.any(self.weights, axis=0)
         return tuple(every if used else every[:0] for used in is_used)
+
+    @cached_property
+    def _every(self) -> Array:
+        return np.unique(np.concatenate(self.own.columns))
 
     def rows(self, start: int, stop: int) -> Array:
         B = self.basis[start:stop]
         left = 1.0 - np.einsum("kij,kij->ki", B, B)  # (k, n_rows), diagonal of P
-        is_used = self.weights[start:stop] > 0
-        count: Array = np.rint(np.sum(left, axis=0, where=is_used)).astype(int)
-        return count
+        count: Array = np.rint(np.sum(left, axis=0, where=self.weights[start:stop] > 0))
+        return count.astype(int)
 
     def select(self, columns: Array) -> "ProjectedRows":
         return replace(self, own=self.own.select(columns))
 
     def blocks(self, start: int, stop: int, segment: int | None = None) -> Iterator[list[Array]]:
-        every = np.unique(np.concatenate(self.own.columns))
+        every = self._every
         places = [np.append(np.searchsorted(every, own), len(every)) for own in self.own.columns]
         mixed = np.flatnonzero(mixed_rows(self.basis, self.weights))
         room, done = np.zeros((2, _CACHED, len(mixed), len(every) + 1))
-        found: list[Array] = []
+        out: list[Array] = []
         for block in self.own.blocks(start, stop, segment):
             size = len(block[0])
-            if not found or len(found[0]) < size:
-                found = [np.zeros((size, len(own) + 1), order="F") for own in self.columns]
+            if not out or len(out[0]) < size:
+                out = [np.zeros((size, len(own) + 1), order="F") for own in self.columns]
             for first in range(0, size, _CACHED):  # as many as the cache of a core holds
                 some = slice(first, min(first + _CACHED, size))
                 k = slice(start + some.start, start + some.stop)
@@ -183,9 +164,9 @@ class ProjectedRows(RowSource):
                 np.matmul(P, X, out=Y)
                 for j, rows in zip(mixed, Y.swapaxes(0, 1), strict=True):
                     if len(self.columns[j]):
-                        found[j][some] = rows
+                        out[j][some] = rows
             start += size
-            yield [rows[:size] for rows in found]
+            yield [rows[:size] for rows in out]
 
 
 def constrained(
@@ -195,8 +176,6 @@ def constrained(
 
     Torques of measured forces are subtracted, those of unknown forces are eliminated. Rows in which
     nothing remains, and samples at which a contact changes or the base jumps, are not used.
-
-    used (N, n_rows).
     """
     if not has_torque:
         used = used & (np.arange(model.n_rows) < model.n_rows - len(model.joints))
@@ -233,11 +212,9 @@ def touching(model: RobotModel, motion: Trajectory) -> Array:
 
 
 def constraint_forces(model: RobotModel, motion: Trajectory, torque: Array, used: Array) -> Array:
-    """Return the constraint forces for which a robot has a torque, shape (N, m) [N, N m].
+    """Return the constraint forces for which a robot has a torque (N, n_rows), (N, m) [N, N m].
 
     Unknown ones are those of least squares.
-
-    torque (N, n_rows) [N m, N], used (N, n_rows).
     """
     J = constraint_jacobian(model, motion.q, touching(model, motion))
     known, tau = _measured(model), motion.tau if motion.loaded is None else motion.loaded
@@ -253,10 +230,9 @@ def constraint_forces(model: RobotModel, motion: Trajectory, torque: Array, used
 
 def logged_base(model: RobotModel, source: BaseSource = _AS_IS) -> BaseColumns:
     """Return the columns of a floating base and of contacts that logs of a robot have."""
-    link = source.link or ""
+    link, flagged = source.link or "", [x for x in model.contacts if not x.always]
     if link:
         _require_link(model, link, "link")
-    flagged = [x for x in model.contacts if not x.always]
     return BaseColumns(
         model.free_flyer,
         tuple(x.frame for x in flagged),
@@ -287,9 +263,9 @@ def _imu_frame(model: RobotModel, link: str) -> ImuFrame:
             f"{model.tree.root!r}; wanted a link that is fixed to it"
         )
     place = frame.placement
-    coefficients: Array = pin.Quaternion(place.rotation).coeffs()
     gravity: Array = model.pin_model.gravity.linear
-    return ImuFrame(coefficients.copy(), place.translation.copy(), gravity.copy())
+    turn = np.array(pin.Quaternion(place.rotation).coeffs())
+    return ImuFrame(turn, place.translation.copy(), gravity.copy())
 
 
 def _measured(model: RobotModel) -> list[int]:

@@ -14,21 +14,14 @@ from robotid.robot.parameters import ParameterLayout
 
 @dataclass(frozen=True)
 class RowPlan:
-    """The columns of a block of rows and their places, joint by joint.
+    """The columns of a block of rows and their places, joint by joint."""
 
-    Attributes:
-        inertial: Per row its inertial columns, n arrays of shape (c_j,).
-        places: Per row their places in the block, likewise.
-        drives: Per row the place of each drive column, its drive parameter, and its ratio.
-        torques: Per row the place of the torque, the last one of the row.
-        first: First place of each row, and the end, shape (n + 1,), int.
-    """
-
-    inertial: tuple[Array, ...]
-    places: tuple[Array, ...]
+    inertial: tuple[Array, ...]  # per row its inertial columns, n arrays of shape (c_j,)
+    places: tuple[Array, ...]  # per row their places in the block, likewise
+    # per row the place of each drive column, its drive parameter, and its ratio
     drives: tuple[tuple[tuple[int, int, float], ...], ...]
-    torques: tuple[int, ...]
-    first: Array
+    torques: tuple[int, ...]  # per row the place of the torque, the last one of the row
+    first: Array  # first place of each row, and the end, shape (n + 1,), int
 
 
 def drive_values(
@@ -41,23 +34,20 @@ def drive_values(
 ) -> Array:
     """Return the columns of drive parameters, shape (k, N), at the speed w of their drives.
 
-    Row j of the regressor has them times ``layout.drive_loads[j]``.
-
-    q (N, n) [rad, m], v (N, n_rows) [rad/s, m/s], a (N, n_rows) [rad/s^2, m/s^2], direction (N,
-    c), memory (N, m).
+    Row j of the regressor has them times ``layout.drive_loads[j]``. memory (N, m).
     """
     motion = drive_motion(layout, q, v, a, direction)
-    states = np.empty((len(v), 0)) if memory is None else memory
-    if states.shape != (len(v), len(layout.remembering)):
+    states, wanted = np.empty((len(v), 0)) if memory is None else memory, layout.remembering
+    if states.shape != (len(v), len(wanted)):
         raise DataError(
-            f"memory has shape {states.shape}, wanted {(len(v), len(layout.remembering))}: a "
-            "column for each drive parameter with internal state or load; call remember() with "
-            "the trajectory first"
+            f"memory has shape {states.shape}, wanted {(len(v), len(wanted))}: a column for each "
+            "drive parameter with internal state or load; call remember() with the trajectory first"
         )
-    place = {k: m for m, k in enumerate(layout.remembering)}
     values = np.empty((len(layout.drive_parameters), len(v)))
-    for k, (x, (d, term)) in enumerate(zip(values, layout.drive_parameters, strict=True)):
-        x[:] = states[:, place[k]] if k in place else term.column(motion.of(d))
+    for k, (d, term) in enumerate(layout.drive_parameters):
+        if k not in wanted:
+            values[k] = term.column(motion.of(d))
+    values[list(wanted)] = states.T
     return values
 
 
@@ -81,10 +71,7 @@ def drive_motion(
     rate: Array | None = None,
     begins: Array | None = None,
 ) -> DriveMotion:
-    """Return the motion and load of drives, arrays of shape (d, N).
-
-    direction (N, c), load (N, n) [N m, N], rate (N, n) [N m/s, N/s], begins (N,).
-    """
+    """Return the motion and load of drives, arrays of shape (d, N): load and rate (N, n)."""
     R = layout.drive_ratios
     n = R.shape[1]
     w = R @ v[:, v.shape[1] - n :].T
@@ -107,36 +94,25 @@ def instant_state(
     """Return the columns with internal state or load at independent samples, shape (N, m).
 
     Internal states are at their steady value, and the torque is constant.
-
-    direction (N, c), load (N, n) [N m, N].
     """
     signs = friction_directions(layout, v, direction)
     return remembered(layout, drive_motion(layout, q, v, a, signs, load))
 
 
 def remembered(layout: ParameterLayout, motion: DriveMotion) -> Array:
-    """Return the columns of drive parameters with internal state or load, shape (N, m).
-
-    motion (d, N).
-    """
+    """Return the columns of drive parameters with internal state or load, shape (N, m)."""
     own = [layout.drive_parameters[k] for k in layout.remembering]
     return np.column_stack([term.column(motion.of(d)) for d, term in own])
 
 
 def friction_speeds(layout: ParameterLayout) -> Array:
-    """Return the speeds whose sign is the direction of friction: of joints, then of couplings.
-
-    -> (c, n).
-    """
+    """Return the speeds (c, n) whose sign is the direction of friction: joints, then couplings."""
     ratios: Array = layout.drive_ratios / layout.drive_speeds[:, None]
     return ratios if layout.follows_direction else ratios[:0]
 
 
 def sure_rows(layout: ParameterLayout, v: Array, least: float) -> Array:
-    """Return the rows in which the sign of friction is certain, shape (N, n_rows), bool.
-
-    v (N, n_rows) [rad/s, m/s].
-    """
+    """Return the rows in which the sign of friction is certain, shape (N, n_rows), bool."""
     ratios = friction_speeds(layout)
     first = v.shape[1] - ratios.shape[1]
     slow = np.abs(v[:, first:] @ ratios.T) < least  # (N, c)
@@ -146,10 +122,7 @@ def sure_rows(layout: ParameterLayout, v: Array, least: float) -> Array:
 
 
 def friction_directions(layout: ParameterLayout, v: Array, direction: Array | None) -> Array:
-    """Return the directions of friction, shape (N, c): those given, or the signs of the speeds.
-
-    v (N, n_rows) [rad/s, m/s], direction (N, c).
-    """
+    """Return the directions of friction, shape (N, c): those given, or the signs of the speeds."""
     speeds = friction_speeds(layout)
     if direction is None:
         signs: Array = np.sign(v[:, v.shape[1] - speeds.shape[1] :] @ speeds.T)

@@ -37,21 +37,14 @@ _WIDE, _WIDE_PANEL = 200, 24  # ... and from so many columns on, which exceed a 
 
 @dataclass(frozen=True, eq=False)
 class Factors:
-    """Triangular factors of [W_j tau_j], joint by joint, each with its own columns.
+    """Triangular factors of [W_j tau_j], joint by joint, each with its own columns."""
 
-    Attributes:
-        triangles: Upper triangular factors, n arrays of shape (c_j + 1, c_j + 1).
-        columns: The columns of joint j, n arrays of shape (c_j,), ascending.
-        rows: Number of rows folded in per joint, shape (n,), int.
-        names: Names of the c columns.
-        is_projected: Whether constraint forces were eliminated from the rows: the rows of all
-            joints are mixed, and have one noise level.
-    """
-
-    triangles: tuple[Array, ...]
-    columns: tuple[Array, ...]
-    rows: Array
-    names: tuple[str, ...]
+    triangles: tuple[Array, ...]  # upper triangular factors, n arrays of shape (c_j + 1, c_j + 1)
+    columns: tuple[Array, ...]  # the columns of joint j, n arrays of shape (c_j,), ascending
+    rows: Array  # number of rows folded in per joint, shape (n,), int
+    names: tuple[str, ...]  # names of the c columns
+    # whether constraint forces were eliminated from the rows: the rows of all joints are
+    # mixed, and have one noise level
     is_projected: bool = False
 
     @property
@@ -59,7 +52,7 @@ class Factors:
         """The factors over all c columns, shape (n, c + 1, c + 1), 0 for columns not of a joint."""
         size = len(self.names) + 1
         dense = np.zeros((len(self.triangles), size, size))
-        for R, triangle, own in zip(dense, self.triangles, self.columns, strict=True):
+        for R, (triangle, own) in zip(dense, self._joints(), strict=True):
             places = np.append(own, size - 1)
             R[np.ix_(places, places)] = triangle
         return dense
@@ -68,40 +61,33 @@ class Factors:
         """Return the factors of the same rows with fewer columns: columns (b,)."""
         columns = np.asarray(columns, dtype=int)
         triangles, remaining = [], []
-        for triangle, own in zip(self.triangles, self.columns, strict=True):
+        for triangle, own in self._joints():
             remaining.append(np.flatnonzero(np.isin(columns, own)))
             places = np.append(np.searchsorted(own, columns[remaining[-1]]), len(own))
             triangles.append(triangle_of(triangle[:, places]))
         names = tuple(self.names[i] for i in columns)
-        return Factors(
-            tuple(triangles), tuple(remaining), self.rows, names, is_projected=self.is_projected
-        )
+        return replace(self, triangles=tuple(triangles), columns=tuple(remaining), names=names)
 
     def weighted(self, sigma: Array) -> Array:
         """Return one factor, shape (c + 1, c + 1), of all joints' rows [W_j tau_j] / sigma_j.
 
         From the ends of the robot to its base, each factor is folded into the smallest one that has
         all its columns: a joint's columns are among those of the joint before it.
-
-        sigma (n,) [N m or N].
         """
         c = len(self.names)
         folded, everything = [Triangle(len(own) + 1) for own in self.columns], Triangle(c + 1)
-        for total, own, level in zip(folded, self.triangles, sigma, strict=True):
-            total.fold_triangle(own / level, np.arange(len(own)))
+        for total, triangle, level in zip(folded, self.triangles, sigma, strict=True):
+            total.fold_triangle(triangle / level, np.arange(len(triangle)))
         for j, k, places in self._carriers:
             carrier = everything if k is None else folded[k]
             carrier.fold_triangle(folded[j].R, places)
         return everything.R
 
     def weighted_rows(self, theta: Array, sigma: Array) -> tuple[Array, Array]:
-        """Return rows W_j / sigma_j and (tau_j - W_j theta) / sigma_j that have these factors.
-
-        theta (c,), sigma (n,) [N m or N] -> (m, c), (m,).
-        """
+        """Return rows W_j / sigma_j and (tau_j - W_j theta) / sigma_j that have these factors."""
         ends = np.cumsum([len(R) for R in self.triangles])
         W, residual = np.zeros((ends[-1], len(self.names))), np.empty(ends[-1])
-        for R, own, level, end in zip(self.triangles, self.columns, sigma, ends, strict=True):
+        for (R, own), level, end in zip(self._joints(), sigma, ends, strict=True):
             rows = slice(end - len(R), end)
             W[rows, own] = R[:, :-1] / level
             residual[rows] = R[:, -1] / level - W[rows, own] @ theta[own]
@@ -109,33 +95,25 @@ class Factors:
 
     def residual_squares(self, theta: Array) -> Array:
         """Return |tau_j - W_j theta|^2 of each joint, shape (n,) [(N m)^2 or N^2]: theta (c,)."""
-        residuals = [
-            R[:, -1] - R[:, :-1] @ theta[own]
-            for R, own in zip(self.triangles, self.columns, strict=True)
-        ]
-        return np.array([residual @ residual for residual in residuals])
+        return np.array([residual @ residual for residual in self._residuals(theta)])
 
     def score(self, theta: Array, weights: Array) -> Array:
         """Return sum_j weight_j W_j^T (tau_j - W_j theta), shape (c,): theta (c,), weights (n,)."""
         total = np.zeros(len(self.names))
-        for R, own, weight in zip(self.triangles, self.columns, weights, strict=True):
-            total[own] += weight * (R[:, :-1].T @ (R[:, -1] - R[:, :-1] @ theta[own]))
+        parts = zip(self._joints(), self._residuals(theta), weights, strict=True)
+        for (R, own), residual, weight in parts:
+            total[own] += weight * (R[:, :-1].T @ residual)
         return total
 
     def without(self, theta: Array) -> "Factors":
         """Return the factors of the same rows with the torque tau_j - W_j theta: theta (c,)."""
-        triangles = []
-        for R, own in zip(self.triangles, self.columns, strict=True):
-            left = R.copy(order="K")
-            left[:, -1] -= R[:, :-1] @ theta[own]
-            triangles.append(left)
-        return replace(self, triangles=tuple(triangles))
+        triangles = tuple(R.copy(order="K") for R in self.triangles)
+        for triangle, residual in zip(triangles, self._residuals(theta), strict=True):
+            triangle[:, -1] = residual
+        return replace(self, triangles=triangles)
 
     def noise_levels(self, theta: Array, freedom: Array) -> Array:
-        """Return the standard deviation of each joint's residual, shape (n,) [N m or N].
-
-        theta (c,), freedom (n,).
-        """
+        """Return the standard deviation of each joint's residual, with its freedom, shape (n,)."""
         squares = self.residual_squares(theta)
         if self.is_projected:
             squares, freedom = (np.full(len(x), x.sum()) for x in (squares, freedom))
@@ -149,17 +127,22 @@ class Factors:
     def information(self, weights: Array) -> Array:
         """Return sum_j weight_j W_j^T W_j, shape (c, c): weights (n,)."""
         total = np.zeros((len(self.names), len(self.names)))
-        for R, own, weight in zip(self.triangles, self.columns, weights, strict=True):
+        for (R, own), weight in zip(self._joints(), weights, strict=True):
             total[np.ix_(own, own)] += weight * (R[:, :-1].T @ R[:, :-1])
         return total
 
     def leverages(self, covariance: Array) -> Array:
         """Return the trace of W_j C W_j^T for each joint, shape (n,): covariance (c, c)."""
-        pairs = [
-            (R[:, :-1], covariance[np.ix_(own, own)])
-            for R, own in zip(self.triangles, self.columns, strict=True)
-        ]
+        pairs = [(R[:, :-1], covariance[np.ix_(own, own)]) for R, own in self._joints()]
         return np.array([np.vdot(A @ C, A) for A, C in pairs])
+
+    def _joints(self) -> Iterator[tuple[Array, Array]]:
+        """Yield factor and columns of each joint."""
+        return zip(self.triangles, self.columns, strict=True)
+
+    def _residuals(self, theta: Array) -> Iterator[Array]:
+        """Yield tau_j - W_j theta of the rows of each factor."""
+        return (R[:, -1] - R[:, :-1] @ theta[own] for R, own in self._joints())
 
     @cached_property
     def _carriers(self) -> list[tuple[int, int | None, Array]]:
@@ -170,29 +153,23 @@ class Factors:
         """
         order = sorted(range(len(self.columns)), key=lambda j: (len(self.columns[j]), -j))
         sets = [set(own.tolist()) for own in self.columns]
-        found: list[tuple[int, int | None, Array]] = []
+        carriers: list[tuple[int, int | None, Array]] = []
         for position, j in enumerate(order, start=1):
             carrier = next((k for k in order[position:] if sets[j] <= sets[k]), None)
             places = np.append(self.columns[j], len(self.names))
             if carrier is not None:
                 places = np.searchsorted(self.columns[carrier], places)
-            found.append((j, carrier, places))
-        return found
+            carriers.append((j, carrier, places))
+        return carriers
 
 
 @dataclass(frozen=True, eq=False)
 class Reduction:
-    """The reduction of the rows of one piece of a log, or of several.
-
-    Attributes:
-        factors: Their triangular factors.
-        squares: Sums of tau^2, v^2 and a^2 over all samples, used or not, shape (3, n_rows).
-        samples: Number of these samples.
-    """
+    """The reduction of the rows of one piece of a log, or of several."""
 
     factors: Factors
-    squares: Array
-    samples: int
+    squares: Array  # sums of tau^2, v^2 and a^2 over all samples, used or not, shape (3, n_rows)
+    samples: int  # number of these samples
 
     @classmethod
     def of(
@@ -217,9 +194,9 @@ def compress(problem: Problem, *, threads: int | None = None) -> Factors:
         rows = _fold_sources(triangles, columns, problem.sources, threads)
     else:
         rows = _fold_blocks(triangles, columns, problem)
-    found = tuple(triangle.R for triangle in triangles)
-    _require_finite(found)
-    return Factors(found, tuple(columns), rows, problem.names, is_projected=problem.is_projected)
+    factors = tuple(triangle.R for triangle in triangles)
+    _require_finite(factors)
+    return Factors(factors, tuple(columns), rows, problem.names, problem.is_projected)
 
 
 def compress_segments(
@@ -230,23 +207,17 @@ def compress_segments(
         raise DataError("the problem has blocks only, wanted row sources to cut into segments")
     columns = tuple(np.flatnonzero(row) for row in problem.support)
     part = -(-_PART // length) * length  # whole segments
-    found = []
+    segments = []
     for source in problem.sources:
-        places = _places(source, columns)
-        starts = range(0, source.samples, part)
-        fold = partial(_fold_part, source, part, length)
-        folded = chain.from_iterable(
-            in_order(fold, starts, is_parallel=source.is_parallel, threads=threads)
-        )
-        for start, triangles in zip(range(0, source.samples, length), folded, strict=True):
+        places, starts = _places(source, columns), range(0, source.samples, length)
+        folded = _folded(source, part, length, threads)
+        for start, triangles in zip(starts, folded, strict=True):
             _require_finite(triangles)
             rows = source.rows(start, min(start + length, source.samples))
             placed = zip(triangles, places, columns, strict=True)
             own = tuple(_placed(R, place, len(wanted) + 1) for R, place, wanted in placed)
-            found.append(
-                Factors(own, columns, rows, problem.names, is_projected=problem.is_projected)
-            )
-    return tuple(found)
+            segments.append(Factors(own, columns, rows, problem.names, problem.is_projected))
+    return tuple(segments)
 
 
 def merge(factors: Sequence[Factors]) -> Factors:
@@ -332,14 +303,11 @@ class Triangle:
     """A triangular factor into which rows are folded.
 
     It is changed in place, unlike other objects of the package: it is the innermost loop.
-
-    Attributes:
-        R: Upper triangular factor of all rows so far, shape (c, c), column-major; read only.
     """
 
     def __init__(self, columns: int) -> None:
         """Initialise for rows of so many columns."""
-        self.R = np.zeros((columns, columns), order="F")
+        self.R = np.zeros((columns, columns), order="F")  # of all rows so far; read only
         self._is_empty = True
         self._panel = _PANEL if columns < _WIDE else _WIDE_PANEL
         # 8 sizes of C's int: m, n, l, nb, lda, ldb, ldt, info; then T and work
@@ -348,20 +316,15 @@ class Triangle:
         self._sizes[[4, 6]] = columns, self._panel
 
     def fold(self, rows: Array) -> None:
-        """Replace R by the triangular factor of [R; rows].
+        """Replace R by the triangular factor of [R; rows]: rows (m, c).
 
         References:
             LAPACK Working Note 257; Golub, Van Loan (2013), Matrix Computations, section 6.5.3.
-
-        rows (m, c).
         """
         self._fold(rows, 0, 0)
 
     def fold_triangle(self, other: Array, places: Array) -> None:
-        """Replace R by the triangular factor of [R; other], without computing with its zeros.
-
-        other (m, m), places (m,).
-        """
+        """Replace R by the triangular factor of [R; other], with places of its columns."""
         if len(places) == len(self.R):
             if self._is_empty:
                 self.R[:], self._is_empty = other, False
@@ -378,15 +341,13 @@ class Triangle:
         if len(rows) == 0:
             return
         self._is_empty = False
-        call, width = _dtpqrt(), rows.shape[1]
-        panel = min(self._panel, width)
+        call, width, panel = _dtpqrt(), rows.shape[1], min(self._panel, rows.shape[1])
         if call is None:
             corner = self.R[first:, first:]
             corner[:] = scipy.linalg.lapack.dtpqrt(triangular, panel, corner, rows)[0]
             return
-        ldb = max(len(rows), rows.strides[1] // rows.itemsize)
         self._sizes[:4] = len(rows), width, triangular, panel
-        self._sizes[5] = ldb
+        self._sizes[5] = max(len(rows), rows.strides[1] // rows.itemsize)
         addresses = self._addresses.copy()
         addresses[4] += first * (len(self.R) + 1) * self.R.itemsize
         addresses[6] = rows.ctypes.data
@@ -446,11 +407,7 @@ def _fold_sources(
     """Fold each source into the factors, part by part; return the number of rows per joint."""
     for source in sources:
         places = _places(source, columns)
-        starts = range(0, source.samples, _PART)
-        fold = partial(_fold_part, source, _PART, _PART)
-        for part in chain.from_iterable(
-            in_order(fold, starts, is_parallel=source.is_parallel, threads=threads)
-        ):
+        for part in _folded(source, _PART, _PART, threads):
             for triangle, place, R_j in zip(triangles, places, part, strict=True):
                 triangle.fold_triangle(R_j, place)
     rows: Array = np.sum([source.rows(0, source.samples) for source in sources], axis=0)
@@ -480,10 +437,18 @@ def _require_finite(triangles: Sequence[Array]) -> None:
         raise DataError("the problem has a row that is not finite; check the trajectory")
 
 
+def _folded(
+    source: RowSource, length: int, segment: int, threads: int | None
+) -> Iterator[list[Array]]:
+    """Yield the factors of each segment of a source, computed in parts of so many samples."""
+    starts, fold = range(0, source.samples, length), partial(_fold_part, source, length, segment)
+    parts = in_order(fold, starts, is_parallel=source.is_parallel, threads=threads)
+    return chain.from_iterable(parts)
+
+
 def _fold_part(source: RowSource, length: int, segment: int, start: int) -> list[list[Array]]:
     """Return the factors of each segment of a part of so many samples, joint by joint."""
-    folded: list[list[Triangle]] = []
-    done = 0
+    folded, done = list[list[Triangle]](), 0
     for block in source.blocks(start, min(start + length, source.samples), segment):
         if done % segment == 0:
             folded.append([Triangle(len(own) + 1) for own in source.columns])
@@ -494,15 +459,10 @@ def _fold_part(source: RowSource, length: int, segment: int, start: int) -> list
 
 
 def triangle_of(rows: Array) -> Array:
-    """Return the square upper triangular factor R of rows, padded with zeros if m < k.
-
-    rows (m, k).
-    """
-    k = rows.shape[1]
-    if len(rows) == 0:
-        return np.zeros((k, k))
-    packed = scipy.linalg.lapack.dgeqrf(np.asfortranarray(rows), overwrite_a=True)[0]
+    """Return the square upper triangular factor R of rows (m, k), with zeros below if m < k."""
+    k, filled = rows.shape[1], min(rows.shape)
     R = np.zeros((k, k))
-    filled = min(k, len(rows))
-    R[:filled] = np.triu(packed[:filled])
+    if len(rows):
+        packed = scipy.linalg.lapack.dgeqrf(np.asfortranarray(rows), overwrite_a=True)[0]
+        R[:filled] = np.triu(packed[:filled])
     return R

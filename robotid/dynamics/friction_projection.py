@@ -41,17 +41,12 @@ _ROUNDING = 1e-12  # of the largest eigenvalue of products: a smaller one counts
 
 @dataclass(frozen=True, eq=False)
 class DriveMoments:
-    """Second moments of the terms of one drive over the rows of the logs.
+    """Second moments of the terms of one drive over the rows of the logs."""
 
-    Attributes:
-        terms: The drive's own terms except inertia, then the terms of a simulator that it lacks.
-        products: Mean products of their columns over the rows, shape (k, k).
-        torque: RMS torque of the rows in the drive's joints [N m or N].
-    """
-
+    # the drive's own terms except inertia, then the terms of a simulator that it lacks
     terms: tuple[str, ...]
-    products: Array
-    torque: float
+    products: Array  # mean products of their columns over the rows, shape (k, k)
+    torque: float  # RMS torque of the rows in the drive's joints [N m or N]
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values for result.json."""
@@ -95,28 +90,18 @@ class DriveMoments:
 
 @dataclass(frozen=True, eq=False)
 class ProjectedDrive:
-    """A drive whose terms were projected.
+    """A drive whose terms were projected."""
 
-    Attributes:
-        name: Joint or coupling.
-        replaced: The terms that the format lacks.
-        values: Parameters of the terms that the format has, by name.
-        transfer: Map from the drive's parameters to these, shape (len(values), m); 0 in the row of
-            a parameter at its bound of 0.
-        own: Indices of the drive's m parameters in the layout of the robot.
-        error: RMS error of the projection [N m or N].
-        torque: RMS torque of the drive's joints [N m or N].
-        is_linear: Whether its joints are prismatic.
-    """
-
-    name: str
-    replaced: tuple[str, ...]
-    values: Mapping[str, float]
+    name: str  # joint or coupling
+    replaced: tuple[str, ...]  # the terms that the format lacks
+    values: Mapping[str, float]  # parameters of the terms that the format has, by name
+    # map from the drive's parameters to these, shape (len(values), m); 0 in the row of a
+    # parameter at its bound of 0
     transfer: Array
-    own: tuple[int, ...]
-    error: float
-    torque: float
-    is_linear: bool = False
+    own: tuple[int, ...]  # indices of the drive's m parameters in the layout of the robot
+    error: float  # RMS error of the projection [N m or N]
+    torque: float  # RMS torque of the drive's joints [N m or N]
+    is_linear: bool = False  # whether its joints are prismatic
 
     def __str__(self) -> str:
         unit = {name: term.units[self.is_linear] for name, term in _SIMPLE.items()}
@@ -139,27 +124,20 @@ class ProjectedDrive:
 
 @dataclass(frozen=True, eq=False)
 class Projection:
-    """A robot whose drives have only the terms of a format.
+    """A robot whose drives have only the terms of a format."""
 
-    Attributes:
-        model: The robot.
-        pi: Its standard parameters, shape (p,), SI units.
-        drives: The drives whose terms were projected; the others are unchanged.
-    """
-
-    model: RobotModel
-    pi: Array
+    model: RobotModel  # the robot
+    pi: Array  # its standard parameters, shape (p,), SI units
+    # the drives whose terms were projected; the others are unchanged
     drives: tuple[ProjectedDrive, ...]
 
 
 def drive_moments(
     model: RobotModel, recordings: Iterable[tuple[Trajectory, Array]]
 ) -> dict[str, DriveMoments]:
-    """Return the moments of the drives with further terms, by name.
+    """Return the moments of the drives with further terms, by name: recordings (N, n_rows).
 
     Friction is that of ``predict``: internal states are at their steady value, without a delay.
-
-    recordings (N, n_rows).
     """
     layout = model.layout
     sums: dict[str, tuple[tuple[str, ...], Array, float, int]] = {}
@@ -208,8 +186,6 @@ def project_friction(
 
     Drives whose terms the format has are unchanged. So are inertia and, in a format without them,
     offsets. Viscous and Coulomb friction and a spring are not negative.
-
-    pi (p,).
     """
     layout, projected = model.layout, []
     for d, drive in enumerate(layout.drives):
@@ -233,10 +209,7 @@ def project_friction(
 def projected_pinocchio_model(
     model: RobotModel, pi: Array, moments: Mapping[str, DriveMoments]
 ) -> Any:  # noqa: ANN401
-    """Return ``pinocchio_model`` of a robot with projected friction; a warning names its drives.
-
-    pi (p,).
-    """
+    """Return ``pinocchio_model`` of a robot with projected friction; a warning names its drives."""
     projection = project_friction(model, pi, moments, ("viscous", "coulomb", "offset"))
     if projection.drives:
         changes = "; ".join(str(drive) for drive in projection.drives)

@@ -33,21 +33,14 @@ _START = 5  # constant work of one call of inverse dynamics, as of work_per_samp
 
 
 class TorqueSlopes(NamedTuple):
-    """Derivatives of the torque of the bodies at N samples, of a robot with n joints.
+    """Derivatives of the torque of the bodies at N samples, of a robot with n joints."""
 
-    Attributes:
-        by_q: By the positions, shape (N, n, n).
-        by_v: By the velocities, likewise.
-        by_a: By the accelerations, likewise: the mass matrix of the bodies.
-        by_gravity: By gravity, along the axes of the world, shape (N, n, 3).
-        by_origin: By the origin of each joint in the frame of the body before, shape (N, n, n, 3):
-            torque, joint, axis.
-    """
-
-    by_q: Array
-    by_v: Array
-    by_a: Array
-    by_gravity: Array
+    by_q: Array  # by the positions, shape (N, n, n)
+    by_v: Array  # by the velocities, likewise
+    by_a: Array  # by the accelerations, likewise: the mass matrix of the bodies
+    by_gravity: Array  # by gravity, along the axes of the world, shape (N, n, 3)
+    # by the origin of each joint in the frame of the body before, shape (N, n, n, 3): torque,
+    # joint, axis
     by_origin: Array
 
 
@@ -67,8 +60,6 @@ def predict(
 
     References:
         Luh, Walker, Paul (1980), On-Line Computational Scheme for Mechanical Manipulators.
-
-    parameters (p,).
     """
     source = trajectory_rows(model, trajectory, None, compiled)
     stacked = np.column_stack(list(parameters))
@@ -91,14 +82,12 @@ def predict_instants(
     v: ArrayLike | None = None,
     a: ArrayLike | None = None,
 ) -> Array:
-    """Return the torques predicted from parameters at independent samples.
+    """Return the torques predicted from parameters at independent samples, (n_rows,) [N m, N].
 
     Friction has the sign of the speed: at rest, where it can have any value within its limits, it
     counts as 0. Internal states of friction are at their steady value, under the torque of the
     bodies, and there is no delay. Velocities and accelerations of a robot whose ``dynamics`` is
     "static" affect only the sign of friction.
-
-    pi (p,), q (n,) [rad, m], v (n_rows,) [rad/s, m/s] -> (n_rows,) [N m, N].
     """
     q = real_numbers(q, "q")
     wanted = (*q.shape[:-1], model.n_rows)
@@ -109,17 +98,16 @@ def predict_instants(
             f"{'the pose of the base, then ' if model.free_flyer else ''}a column for each of "
             f"{listed(model.joints)}"
         )
-    given = [
-        np.zeros(wanted) if x is None else real_numbers(x, name) for name, x in (("v", v), ("a", a))
-    ]
-    for name, x in zip("va", given, strict=True):
-        if x.shape != wanted:
+    given = {"q": q}
+    for name, x in (("v", v), ("a", a)):
+        given[name] = np.zeros(wanted) if x is None else real_numbers(x, name)
+        if given[name].shape != wanted:
             raise DataError(
-                f"{name} has shape {x.shape}, wanted {wanted}, as q is {q.shape}: a column for "
-                f"each of {listed(model.row_names)}"
+                f"{name} has shape {given[name].shape}, wanted {wanted}, as q is {q.shape}: a "
+                f"column for each of {listed(model.row_names)}"
             )
-    q, v, a = (np.atleast_2d(x) for x in (q, *given))
-    for name, x in (("q", q), ("v", v), ("a", a)):
+    q, v, a = map(np.atleast_2d, given.values())
+    for name, x in zip("qva", (q, v, a), strict=True):
         if not np.isfinite(x).all():
             row = int(np.argmin(np.isfinite(x).all(axis=1)))
             raise DataError(f"{name} is not finite in row {row}: {x[row].tolist()}")
@@ -134,8 +122,6 @@ def rigid_parts(model: RobotModel, pi: Array, q: Array, v: Array, a: Array) -> l
 
     They are g(q) = tau(q, 0, 0), M(q) a = tau(q, 0, a) - g(q) and C(q, v) v = tau(q, v, a) -
     tau(q, 0, a). Their sum is the torque of the bodies.
-
-    pi (p,), q (N, n) [rad, m], v (N, n_rows) [rad/s, m/s], a (N, n_rows) [rad/s^2, m/s^2].
     """
     bodies = np.where(np.arange(len(pi)) < model.layout.n_inertial, pi, 0.0)
     rigid = _newton_euler if _has_centres(model, pi) else _rows_by_pi
@@ -196,8 +182,6 @@ def inverse_dynamics(model: RobotModel, pi: Array, trajectory: Trajectory) -> Ar
 
     For inconsistent bodies, as of ordinary least squares, it is the difference of the torques of
     two sets of consistent bodies.
-
-    pi (p,) -> (N, n_rows) [N m, N].
     """
     m, added = trajectory, _consistent_addition(model, pi)
     torque = _newton_euler(model, pi + added, m.q, m.v, m.a)
@@ -258,9 +242,9 @@ def _newton_euler(model: RobotModel, pi: Array, q: Array, v: Array, a: Array) ->
     """Return the torque of the bodies, shape (N, n_rows)."""
     G, pin_model = model.velocity_map, model.with_parameters(pi).pin_model
     data, torque = pin_model.createData(), np.empty((len(v), pin_model.nv))
-    is_plain, is_moving = np.array_equal(G, np.eye(len(G))), v.any() or a.any()
+    is_plain = np.array_equal(G, np.eye(len(G)))
     configurations = np.ascontiguousarray(model.configurations(q))
-    if is_moving:
+    if v.any() or a.any():
         rates, changes = (v, a) if is_plain else (v @ G.T, a @ G.T)
         instants = zip(torque, configurations, rates, changes, strict=True)
         for torque_k, q_k, v_k, a_k in instants:
@@ -333,10 +317,7 @@ def _with_movable_origins(model: pin.Model) -> tuple[pin.Model, list[int]]:
 
 
 def is_loaded(model: RobotModel) -> bool:
-    """Return whether these columns depend on the torque of a robot's reference.
-
-    Those of bristles do not: they depend on the displacement only.
-    """
+    """Return whether columns depend on the torque of a robot's reference; bristles' do not."""
     return any(term.needs_load for _, term in model.layout.drive_parameters)
 
 
@@ -352,12 +333,10 @@ def remember(model: RobotModel, trajectory: Trajectory) -> Trajectory:
 def drive_motion_along(
     model: RobotModel, trajectory: Trajectory, *, has_rate: bool = True
 ) -> DriveMotion:
-    """Return the motion and load of the drives of a robot along a trajectory.
+    """Return the motion and load of the drives of a robot along a trajectory, (d, N).
 
     The load is the torque of the bodies, and the rate that of the whole torque, by the model's
     reference; a delayed torque itself is not included.
-
-    -> (d, N).
     """
     key, known = (model.pin_model, model.layout, has_rate), trajectory.derived.get("drive motion")
     if known is None or known[0] != key or not np.array_equal(known[1], model.carried_by):

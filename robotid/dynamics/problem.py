@@ -19,19 +19,12 @@ Block: TypeAlias = tuple[Array, Array, Array]
 
 @dataclass(frozen=True, eq=False)
 class Sample:
-    """One sample, for recursive estimators.
+    """One sample, for recursive estimators."""
 
-    Attributes:
-        Y: Regressor, shape (n, c).
-        tau: Measured torque, shape (n,) [N m or N].
-        weight: Row weights, shape (n,); 0 excludes a row.
-        mass_regressor: Regressor of the mass matrix, shape (n, n, c), or None.
-    """
-
-    Y: Array
-    tau: Array
-    weight: Array
-    mass_regressor: Array | None = None
+    Y: Array  # regressor, shape (n, c)
+    tau: Array  # measured torque, shape (n,) [N m or N]
+    weight: Array  # row weights, shape (n,); 0 excludes a row
+    mass_regressor: Array | None = None  # regressor of the mass matrix, shape (n, n, c), or None
 
 
 class RowSource(ABC):
@@ -44,6 +37,11 @@ class RowSource(ABC):
 
     @property
     @abstractmethod
+    def is_parallel(self) -> bool:
+        """Whether several threads are faster than one."""
+
+    @property
+    @abstractmethod
     def columns(self) -> tuple[Array, ...]:
         """The columns of row j, n arrays of shape (c_j,), ascending."""
 
@@ -51,47 +49,29 @@ class RowSource(ABC):
     def rows(self, start: int, stop: int) -> Array:
         """Return the number of rows with a positive weight per joint, shape (n,), int."""
 
-    @property
-    @abstractmethod
-    def is_parallel(self) -> bool:
-        """Whether several threads are faster than one."""
-
     @abstractmethod
     def blocks(self, start: int, stop: int, segment: int | None = None) -> Iterator[list[Array]]:
-        """Yield the rows of samples start to stop, a few hundred samples at a time.
-
-        -> (k, c_j + 1).
-        """
+        """Yield the rows (k, c_j + 1) of samples start to stop, a few hundred samples at a time."""
 
     @abstractmethod
     def select(self, columns: Array) -> "RowSource":
-        """Return the same rows with fewer columns, column k being ``columns[k]`` of this one.
-
-        columns (b,).
-        """
+        """Return the same rows with fewer columns, column k being ``columns[k]`` of this one."""
 
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """The rows of W theta = tau, which can be read in blocks repeatedly.
+    """The rows of W theta = tau, which can be read in blocks repeatedly."""
 
-    Attributes:
-        stream: Starts a new pass and yields the blocks in order.
-        names: Names of the c columns.
-        n_joints: Number n of rows per sample.
-        support: Shape (n, c), bool: False where row j is zero for every motion.
-        mass_stream: Starts a new pass over the regressors of the mass matrix of each block's
-            samples, shape (k, n, n, c), or None if the problem has none.
-        sources: The same rows joint by joint, in order; empty if there are only blocks.
-        is_projected: Whether constraint forces were eliminated from the rows, as of ``Factors``.
-    """
-
-    stream: Callable[[], Iterator[Block]]
-    names: tuple[str, ...]
-    n_joints: int
-    support: Array
+    stream: Callable[[], Iterator[Block]]  # starts a new pass and yields the blocks in order
+    names: tuple[str, ...]  # names of the c columns
+    n_joints: int  # number n of rows per sample
+    support: Array  # shape (n, c), bool: False where row j is zero for every motion
+    # starts a new pass over the regressors of the mass matrix of each block's samples, shape
+    # (k, n, n, c), or None if the problem has none
     mass_stream: Callable[[], Iterator[Array]] | None = None
+    # the same rows joint by joint, in order; empty if there are only blocks
     sources: tuple[RowSource, ...] = ()
+    # whether constraint forces were eliminated from the rows, as of ``Factors``
     is_projected: bool = False
 
     def __post_init__(self) -> None:
@@ -108,10 +88,8 @@ class Problem:
         n, c = self.n_joints, len(self.names)
         masses = repeat(None) if self.mass_stream is None else self.mass_stream()
         for (W, tau, weight), mass in zip(self.blocks(), masses, strict=False):
-            rows = zip(W.reshape(-1, n, c), tau.reshape(-1, n), weight.reshape(-1, n), strict=True)
-            by_sample = repeat(None) if mass is None else mass
-            for (Y, torque, row_weight), M in zip(rows, by_sample, strict=False):
-                yield Sample(Y, torque, row_weight, M)
+            by_joint = W.reshape(-1, n, c), tau.reshape(-1, n), weight.reshape(-1, n)
+            yield from map(Sample, *by_joint, repeat(None) if mass is None else mass)
 
     def select(self, columns: Array) -> "Problem":
         """Return the same rows with only the given columns: columns (b,)."""
@@ -127,13 +105,10 @@ class Problem:
                 yield mass[..., columns]
 
         return replace(
-            self,
-            stream=stream,
-            names=tuple(self.names[i] for i in columns),
-            support=self.support[:, columns],
-            mass_stream=None if masses is None else mass_stream,
+            self, stream=stream, names=tuple(self.names[i] for i in columns),
+            support=self.support[:, columns], mass_stream=None if masses is None else mass_stream,
             sources=tuple(source.select(columns) for source in self.sources),
-        )
+        )  # fmt: skip
 
 
 def concatenate(problems: Sequence[Problem]) -> Problem:
@@ -148,15 +123,13 @@ def concatenate(problems: Sequence[Problem]) -> Problem:
                 f"joints and {len(other.names)} of {other.n_joints} joints"
             )
     masses = [p.mass_stream for p in problems if p.mass_stream is not None]
-    has_mass = len(masses) == len(problems)
+    has_mass, has_sources = len(masses) == len(problems), all(p.sources for p in problems)
     return replace(
         first,
         stream=lambda: chain.from_iterable(problem.blocks() for problem in problems),
         support=np.any([problem.support for problem in problems], axis=0),
         mass_stream=(lambda: chain.from_iterable(m() for m in masses)) if has_mass else None,
-        sources=tuple(chain.from_iterable(problem.sources for problem in problems))
-        if all(problem.sources for problem in problems)
-        else (),
+        sources=tuple(source for p in problems for source in p.sources if has_sources),
     )
 
 

@@ -54,17 +54,12 @@ def choose_engine(model: RobotModel, samples: int, compiled: bool | None) -> str
 
 @dataclass(frozen=True, eq=False)
 class InertialRows:
-    """Inertial columns of a trajectory's regressor, which are independent of drives.
+    """Inertial columns of a trajectory's regressor, which are independent of drives."""
 
-    Attributes:
-        pin_model: The robot.
-        columns: Indices of the inertial parameters of each row, n_rows arrays of shape (c_j,).
-        values: The columns of each row, one row after another, shape (sum of c_j, N).
-    """
-
-    pin_model: pin.Model
+    pin_model: pin.Model  # the robot
+    # indices of the inertial parameters of each row, n_rows arrays of shape (c_j,)
     columns: tuple[Array, ...]
-    values: Array
+    values: Array  # the columns of each row, one row after another, shape (sum of c_j, N)
 
     @cached_property
     def first(self) -> Array:
@@ -125,24 +120,15 @@ def kept_rows(model: RobotModel, trajectory: Trajectory) -> InertialRows | None:
 
 @dataclass(frozen=True, eq=False)
 class TrajectoryRows(RowSource):
-    """Rows of a robot's trajectory; see ``RowSource``.
+    """Rows of a robot's trajectory; see ``RowSource``."""
 
-    Attributes:
-        model: The robot.
-        trajectory: N samples.
-        weights: Weight of each row, shape (N, n_rows).
-        support: Shape (n_rows, p), bool: False where row j is zero for every motion.
-        selected: Indices of its columns among the p columns, shape (c,).
-        engine: Name of the code that computes the regressor, as of ``choose_engine``.
-        inertial: Its inertial columns if they are stored with the trajectory.
-    """
-
-    model: RobotModel
-    trajectory: Trajectory
-    weights: Array
-    support: Array
-    selected: Array
-    engine: str
+    model: RobotModel  # the robot
+    trajectory: Trajectory  # N samples
+    weights: Array  # weight of each row, shape (N, n_rows)
+    support: Array  # shape (n_rows, p), bool: False where row j is zero for every motion
+    selected: Array  # indices of its columns among the p columns, shape (c,)
+    engine: str  # name of the code that computes the regressor, as of ``choose_engine``
+    # its inertial columns if they are stored with the trajectory
     inertial: InertialRows | None = None
 
     @property
@@ -251,7 +237,7 @@ class _PinocchioWriter:
     def write(self, start: int, stop: int) -> None:
         """Write the rows of samples start to stop of those loaded."""
         part, m = slice(start, stop), self._motion
-        own = slice(self._first + start, self._first + stop)
+        own = slice(self._first + start, self._first + stop)  # in the trajectory
         if self._stored is None:
             self.write_inertial(m.q[own], m.v[own], m.a[own])
         else:

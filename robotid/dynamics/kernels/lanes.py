@@ -39,28 +39,22 @@ _ROUND = 6755399441055744.0  # 1.5 2^52: adding and subtracting it rounds to the
 class _Vector(types.Type):
     """Numba's type of a vector, a number of each lane."""
 
-    def __init__(self) -> None:
-        super().__init__(name="vector")
-
 
 class _Mask(types.Type):
     """Numba's type of a mask, a truth value of each lane."""
 
-    def __init__(self) -> None:
-        super().__init__(name="mask")
 
-
-def _modelled(kind: Any, code: ir.Type) -> Any:
+def _modelled(kind: Any, name: str, code: ir.Type) -> Any:
     class Model(models.PrimitiveModel):
         def __init__(self, manager: Any, own: Any) -> None:
             super().__init__(manager, own, code)
 
     register_model(kind)(Model)
-    return kind()
+    return kind(name=name)
 
 
-_vector = _modelled(_Vector, _CODE)
-_mask = _modelled(_Mask, ir.VectorType(ir.IntType(1), LANES))
+_vector = _modelled(_Vector, "vector", _CODE)
+_mask = _modelled(_Mask, "mask", ir.VectorType(ir.IntType(1), LANES))
 
 
 def _wide(builder: Any, value: Any) -> Any:
@@ -130,13 +124,17 @@ _define(operator.invert, _mask, (_mask,), lambda builder, x: builder.not_(x))
 _intrinsic: Any = intrinsic  # a function of compiled code, defined by its type and its code
 
 
+def _coded(code: Any) -> Any:
+    """Return the code of an intrinsic from a function of the builder and the values."""
+    return lambda context, builder, signature, given: code(builder, *given)
+
+
 @_intrinsic
 def read(typing, numbers, at):
     """Return the vector of adjacent numbers of an array, shape (k,), from index ``at``."""
 
     def code(context, builder, signature, given):
-        place = _place(context, builder, signature.args[0], *given)
-        vector = builder.load(place)
+        vector = builder.load(_place(context, builder, signature.args[0], *given))
         vector.align = 8
         return vector
 
@@ -168,20 +166,13 @@ def _number_type(value):
 @_intrinsic
 def wide(typing, number):
     """Return a vector of one number."""
-
-    def code(context, builder, signature, given):
-        return _wide(builder, given[0])
-
-    return _vector(types.float64), code
+    return _vector(types.float64), _coded(_wide)
 
 
 @_intrinsic
 def where(typing, mask, x, y):
     """Return x in the lanes of a mask, and y in the others; either may be a number."""
-
-    def code(context, builder, signature, given):
-        return builder.select(given[0], _wide(builder, given[1]), _wide(builder, given[2]))
-
+    code = _coded(lambda builder, m, a, b: builder.select(m, _wide(builder, a), _wide(builder, b)))
     return _vector(mask, _number_type(x), _number_type(y)), code
 
 
@@ -189,41 +180,44 @@ def where(typing, mask, x, y):
 def is_any(typing, mask):
     """Return whether a mask is true in any lane."""
 
-    def code(context, builder, signature, given):
-        bits = builder.bitcast(given[0], ir.IntType(LANES))
+    def code(builder, lanes):
+        bits = builder.bitcast(lanes, ir.IntType(LANES))
         return builder.icmp_unsigned("!=", bits, bits.type(0))
 
-    return types.boolean(mask), code
+    return types.boolean(mask), _coded(code)
 
 
 @_intrinsic
 def lane_of(typing, x, lane):
     """Return the number of one lane."""
-
-    def code(context, builder, signature, given):
-        return builder.extract_element(*given)
-
+    code = _coded(lambda builder, vector, k: builder.extract_element(vector, k))
     return types.float64(x, types.intp), code
 
 
 @_intrinsic
 def with_lane(typing, x, lane, value):
     """Return a vector with another number in one lane."""
-
-    def code(context, builder, signature, given):
-        return builder.insert_element(given[0], given[2], given[1])
-
+    code = _coded(lambda builder, vector, k, number: builder.insert_element(vector, number, k))
     return _vector(x, types.intp, types.float64), code
 
 
 @_intrinsic
 def copysign(typing, x, y):
     """Return the size of x with the sign of y, of each lane; x may be a number."""
+    code = _coded(lambda builder, a, b: _call("copysign")(builder, _wide(builder, a), b))
+    return _vector(_number_type(x), y), code
+
+
+@_intrinsic
+def applied(typing, address, x):
+    """Return the result of the function at an address of ``pointed`` for a tuple of numbers."""
 
     def code(context, builder, signature, given):
-        return _call("copysign")(builder, _wide(builder, given[0]), given[1])
+        numbers = unpack_tuple(builder, given[1])
+        kind = ir.FunctionType(context.get_value_type(_PAIR), [number.type for number in numbers])
+        return builder.call(builder.inttoptr(given[0], kind.as_pointer()), numbers)
 
-    return _vector(_number_type(x), y), code
+    return _PAIR(address, x), code
 
 
 def work_space(entries: int) -> Array:
@@ -255,18 +249,6 @@ def _cached(compile: Any, function: Any, **options: Any) -> Any:
         return compile(cache=True, **options)(function)
     except RuntimeError:  # no cache folder: the code exists only in this process
         return compile(**options)(function)
-
-
-@_intrinsic
-def applied(typing, address, x):
-    """Return the result of the function at an address of ``pointed`` for a tuple of numbers."""
-
-    def code(context, builder, signature, given):
-        numbers = unpack_tuple(builder, given[1])
-        kind = ir.FunctionType(context.get_value_type(_PAIR), [number.type for number in numbers])
-        return builder.call(builder.inttoptr(given[0], kind.as_pointer()), numbers)
-
-    return _PAIR(address, x), code
 
 
 @compiled

@@ -26,6 +26,7 @@ from robotid.dynamics.kernels.lanes import (
     put_lane,
     scale,
     times,
+    work_space,
     write,
 )
 from robotid.dynamics.kernels.tree_lanes import (
@@ -53,9 +54,9 @@ from robotid.dynamics.kernels.tree_lanes import (
 _MOTION, _D, _X, _Y, _Z, _DW, _WW, _COLUMNS, _WORLD = np.array([0, 3, 6, 9, 12, 15, 18, 21, 31])
 
 
-def rows_size(bodies: int, depth: int) -> int:
-    """Return the number of entries of the work space of rows, and of their gradient."""
-    return int(_WORLD) + (bodies + 1) * (FRAME + 12 * depth + 12)
+def work_of(bodies, depth):
+    """Return a new work space of rows, and of their gradient."""
+    return work_space(int(_WORLD) + (bodies + 1) * (FRAME + 12 * depth + 12))
 
 
 @compiled
@@ -274,10 +275,7 @@ def pull_rows(tree, places, motion, weights, work, out):
 
 @compiled
 def placements(tree, q, work, R, p):
-    """Write the poses of bodies in the frame of the root link.
-
-    q (N, n_rows), R (3, 3, B, N), p (3, B, N).
-    """
+    """Write the poses of bodies in the frame of the root link: R (3, 3, B, N), p (3, B, N)."""
     N, size = len(q), FRAME
     for start in range(0, N, LANES):
         for i in range(len(tree.parents)):

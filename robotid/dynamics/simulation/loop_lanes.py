@@ -79,89 +79,59 @@ _MOVED_BEFORE = 0.1  # assumed time of motion before the simulation, for initial
 
 
 class Terms(NamedTuple):
-    """Friction and offset of the joints: T terms, joint by joint.
+    """Friction and offset of the joints: T terms, joint by joint."""
 
-    Attributes:
-        codes: Codes of ``coded_term``, shape (T, 5), int; the third is the kind of the term.
-        shapes: Shape parameters of laws, or of bristles with their index, shape (T, 11).
-        values: Parameters, shape (T,).
-        spans: Indices of each joint's first term, of its first term that is a bristle term or
-            part of the drives' sums, and of the end, shape (n, 3), int.
-    """
-
-    codes: Array
-    shapes: Array
-    values: Array
+    codes: Array  # codes of ``coded_term``, shape (T, 5), int; the third is the kind of the term
+    shapes: Array  # shape parameters of laws, or of bristles with their index, shape (T, 11)
+    values: Array  # parameters, shape (T,)
+    # indices of each joint's first term, of its first term that is a bristle term or part of
+    # the drives' sums, and of the end, shape (n, 3), int
     spans: Array
 
 
 class Robot(NamedTuple):
-    """The part of a robot that is simulated, with n joints.
+    """The part of a robot that is simulated, with n joints."""
 
-    Attributes:
-        tree: Its bodies and joints.
-        zeros: Position of the URDF at position 0 of each encoder, shape (n,) [rad or m].
-        bodies: Inertial parameters, shape (n, 10).
-        drives: Armature, kp, kd, torque limit, and the sums of affine terms: constant, by the
-            speed, and by its direction, shape (n, 7).
-        terms: Friction and offset.
-    """
-
-    tree: Tree
-    zeros: Array
-    bodies: Array
+    tree: Tree  # its bodies and joints
+    zeros: Array  # position of the URDF at position 0 of each encoder, shape (n,) [rad or m]
+    bodies: Array  # inertial parameters, shape (n, 10)
+    # armature, kp, kd, torque limit, and the sums of affine terms: constant, by the speed,
+    # and by its direction, shape (n, 7)
     drives: Array
-    terms: Terms
+    terms: Terms  # friction and offset
 
 
 class Columns(NamedTuple):
-    """Parameters of the sensitivities.
+    """Parameters of the sensitivities."""
 
-    Attributes:
-        kinds: Kind, joint and index of each column, shape (C, 3), int.
-        sums: Index of the first column of each of the P sensitivities, each the sum of its columns,
-            and the number of columns, shape (P + 1,), int.
-        directions: Directions in a body's ten parameters, shape (D, 10).
-    """
-
-    kinds: Array
+    kinds: Array  # kind, joint and index of each column, shape (C, 3), int
+    # index of the first column of each of the P sensitivities, each the sum of its columns,
+    # and the number of columns, shape (P + 1,), int
     sums: Array
-    directions: Array
+    directions: Array  # directions in a body's ten parameters, shape (D, 10)
 
 
 class Course(NamedTuple):
-    """Inputs of roll-outs.
+    """Inputs of roll-outs."""
 
-    Attributes:
-        command: Position, its derivative by the delay, speed, torque, and the derivatives of speed
-            and torque by the delay: means over each step, or values of its tick, shape
-            (K, n, 6, LANES).
-        steps: Length of each step, shape (K, LANES) [s].
-        ticks: 1 where the controller has a tick at the start of a step, else 0, shape (K, LANES);
-            1 at the first; empty in continuous time.
-        every: Number of steps from one sample to the next.
-        start: Initial positions and speeds, shape (2, n, LANES).
-    """
-
+    # position, its derivative by the delay, speed, torque, and the derivatives of speed and
+    # torque by the delay: means over each step, or values of its tick, shape (K, n, 6, LANES)
     command: Array
-    steps: Array
+    steps: Array  # length of each step, shape (K, LANES) [s]
+    # 1 where the controller has a tick at the start of a step, else 0, shape (K, LANES); 1 at
+    # the first; empty in continuous time
     ticks: Array
-    every: int
-    start: Array
+    every: int  # number of steps from one sample to the next
+    start: Array  # initial positions and speeds, shape (2, n, LANES)
 
 
 class Motion(NamedTuple):
-    """Simulated motion at N samples.
+    """Simulated motion at N samples."""
 
-    Attributes:
-        q: Positions, shape (N, n, LANES).
-        v: Speeds, shape (N, n, LANES).
-        S: Sensitivities of positions, shape (N, n, P, LANES), or of positions and then of speeds,
-            shape (N, 2n, P, LANES).
-    """
-
-    q: Array
-    v: Array
+    q: Array  # positions, shape (N, n, LANES)
+    v: Array  # speeds, shape (N, n, LANES)
+    # sensitivities of positions, shape (N, n, P, LANES), or of positions and then of speeds,
+    # shape (N, 2n, P, LANES)
     S: Array
 
 

@@ -50,30 +50,18 @@ class Loops:
     the controller samples all signals at its ticks, with a zero-order hold of the torque. Ticks are
     counted from the first row of a log. A command at a tick is averaged over the row after the
     tick, so that a delay of part of a row interpolates between whole rows.
-
-    Attributes:
-        bodies: Ten inertial parameters of each body, shape (n, 10), in the order of the layout.
-        armature: Shape (n,) [kg m^2 or kg].
-        kp: Shape (n,) [N m/rad or N/m].
-        kd: Shape (n,) [N m s/rad or N s/m].
-        limit: Largest torque, shape (n,) [N m or N]; infinite without one.
-        delay: Shape (n,) [s].
-        zero: Shape (n,) [rad or m].
-        terms: Friction and offset of each joint.
-        values: Their parameters, joint by joint, shape (T,).
-        rate: Sampling rate of the controller [Hz]; None: continuous time.
     """
 
-    bodies: Array
-    armature: Array
-    kp: Array
-    kd: Array
-    limit: Array
-    delay: Array
-    zero: Array
-    terms: tuple[tuple[DriveTerm, ...], ...]
-    values: Array
-    rate: float | None = None
+    bodies: Array  # ten inertial parameters of each body, shape (n, 10), in the order of the layout
+    armature: Array  # shape (n,) [kg m^2 or kg]
+    kp: Array  # shape (n,) [N m/rad or N/m]
+    kd: Array  # shape (n,) [N m s/rad or N s/m]
+    limit: Array  # largest torque, shape (n,) [N m or N]; infinite without one
+    delay: Array  # shape (n,) [s]
+    zero: Array  # shape (n,) [rad or m]
+    terms: tuple[tuple[DriveTerm, ...], ...]  # friction and offset of each joint
+    values: Array  # their parameters, joint by joint, shape (T,)
+    rate: float | None = None  # sampling rate of the controller [Hz]; None: continuous time
 
     def place(self, joint: int, term: DriveTerm) -> int:
         """Return the index of the parameter of a joint's term in ``values``."""
@@ -81,10 +69,7 @@ class Loops:
 
 
 def open_loops(model: RobotModel, pi: Array) -> Loops:
-    """Return bodies and drives of standard parameters without control: no gain, no delay.
-
-    pi (p,).
-    """
+    """Return bodies and drives of standard parameters without control: no gain, no delay."""
     layout, n = model.layout, len(model.joints)
     terms: list[list[DriveTerm]] = [[] for _ in range(n)]
     values: list[list[float]] = [[] for _ in range(n)]
@@ -105,20 +90,13 @@ def open_loops(model: RobotModel, pi: Array) -> Loops:
 
 @dataclass(frozen=True, eq=False)
 class Window:
-    """A segment of a log of commands that is simulated from its measured initial state.
+    """A segment of a log of commands that is simulated from its measured initial state."""
 
-    Attributes:
-        log: The log, with commands.
-        start_row: First simulated sample.
-        first: First counted sample; before it, the error of the initial state decays.
-        stop: Sample after the last one.
-        given: Initial position and speed, shape (2, n); the measured ones if None.
-    """
-
-    log: Log
-    start_row: int
-    first: int
-    stop: int
+    log: Log  # the log, with commands
+    start_row: int  # first simulated sample
+    first: int  # first counted sample; before it, the error of the initial state decays
+    stop: int  # sample after the last one
+    # initial position and speed, shape (2, n); the measured ones if None
     given: Array | None = None
 
     @property
@@ -177,20 +155,14 @@ def cut_windows(log: Log, length: float, lead: float) -> tuple[Window, ...]:
 
 @dataclass(frozen=True, eq=False)
 class RollOut:
-    """The simulated motion of a window.
+    """The simulated motion of a window."""
 
-    Attributes:
-        window: The window.
-        q: Positions of the counted samples, shape (N, n) [rad or m].
-        v: Speeds of the counted samples, shape (N, n) [rad/s or m/s].
-        slopes: For each part of the robot: its joints, shape (k,); the indices of its
-            sensitivities, ascending, shape (c,); and the derivatives of its positions, shape
-            (N, k, c), or of its positions and speeds, shape (N, 2k, c).
-    """
-
-    window: Window
-    q: Array
-    v: Array
+    window: Window  # the window
+    q: Array  # positions of the counted samples, shape (N, n) [rad or m]
+    v: Array  # speeds of the counted samples, shape (N, n) [rad/s or m/s]
+    # for each part of the robot: its joints, shape (k,); the indices of its sensitivities,
+    # ascending, shape (c,); and the derivatives of its positions, shape (N, k, c), or of its
+    # positions and speeds, shape (N, 2k, c)
     slopes: tuple[tuple[Array, Array, Array], ...] = ()
 
 

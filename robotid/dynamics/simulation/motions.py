@@ -13,20 +13,15 @@ from robotid.robot.model import RobotModel
 
 _ORDER = 5  # of the polynomials through samples
 _HARMONICS = 5  # of a random motion
-_ROTARY_AMPLITUDE = 1.2  # largest amplitude of a revolute joint [rad]
-_LINEAR_AMPLITUDE = 0.15  # largest amplitude of a prismatic joint [m]
-_ROTARY_SPEED = 1.5  # largest peak speed of a revolute joint [rad/s]
-_LINEAR_SPEED = 0.3  # largest peak speed of a prismatic joint [m/s]
+# largest amplitude and peak speed of a revolute [rad, rad/s] and of a prismatic joint [m, m/s]
+_LARGEST = ((1.2, 1.5), (0.15, 0.3))
 
 
 class Motion(Protocol):
     """A motion that a controller can track."""
 
     def evaluate(self, t: Array) -> tuple[Array, Array, Array]:
-        """Return q, v, a, each of shape (N, n) [rad, rad/s, rad/s^2 or m, m/s, m/s^2].
-
-        t (N,) [s].
-        """
+        """Return q, v, a, each of shape (N, n) [rad, rad/s, rad/s^2 or m, m/s, m/s^2]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,28 +130,22 @@ class SampledMotion(Motion):
 
 @dataclass(frozen=True, eq=False)
 class FloatingMotion(Motion):
-    """A motion of a robot whose base floats: splines through poses and joint positions.
+    """A motion of a robot whose base floats: splines through poses and joint positions."""
 
-    Attributes:
-        t: Times, shape (N,) [s].
-        pose: Pose of the base, as of ``BaseMotion``, shape (N, 7) [m, -].
-        q: Joint positions, shape (N, n) [rad or m].
-        contacts: Which contacts touch the ground, shape (N, k), bool; each until the next sample.
-    """
-
-    t: Array
-    pose: Array
-    q: Array
+    t: Array  # times, shape (N,) [s]
+    pose: Array  # pose of the base, as of ``BaseMotion``, shape (N, 7) [m, -]
+    q: Array  # joint positions, shape (N, n) [rad or m]
+    # which contacts touch the ground, shape (N, k), bool; each until the next sample
     contacts: Array
-
-    @property
-    def duration(self) -> float:
-        """Duration [s]."""
-        return float(self.t[-1] - self.t[0])
 
     @cached_property
     def _samples(self) -> SampledMotion:
         return SampledMotion(self.t, np.hstack([self.pose, self.q]))
+
+    @property
+    def duration(self) -> float:
+        """Duration [s]."""
+        return self._samples.duration
 
     def touching(self, t: Array) -> Array:
         """Return which contacts touch the ground, shape (N, k), bool: t (N,) [s]."""
@@ -168,8 +157,6 @@ class FloatingMotion(Motion):
         """Return q (N, 7 + n), v (N, 6 + n) and a (N, 6 + n), the twist with the axes of the base.
 
         With the unit quaternion p / |p| of the spline p, w = 2 p* dp/dt / |p|^2 (vector part).
-
-        t (N,) [s].
         """
         x, rate, change = self._samples.evaluate(t)
         p, dp, ddp = x[:, 3:7], rate[:, 3:7], change[:, 3:7]
@@ -218,18 +205,14 @@ def random_fourier(
     mean = np.array(middle) if centre is None else centre
     amplitude, speed = np.empty(n), np.empty(n)
     for j, joint in enumerate(model.limits):
-        is_prismatic = joint.type == "prismatic"
-        amplitude[j] = _LINEAR_AMPLITUDE if is_prismatic else _ROTARY_AMPLITUDE
-        if joint.has_limits:
-            amplitude[j] = min(
-                amplitude[j], 0.9 * min(joint.upper - mean[j], mean[j] - joint.lower)
+        size, highest = _LARGEST[joint.type == "prismatic"]
+        room = min(joint.upper - mean[j], mean[j] - joint.lower) if joint.has_limits else np.inf
+        if room <= 0:
+            raise DataError(
+                f"the centre {mean[j]:g} of joint {joint.name!r} is not inside its limits "
+                f"{joint.lower:g} to {joint.upper:g}"
             )
-            if amplitude[j] <= 0:
-                raise DataError(
-                    f"the centre {mean[j]:g} of joint {joint.name!r} is not inside its limits "
-                    f"{joint.lower:g} to {joint.upper:g}"
-                )
-        highest = _LINEAR_SPEED if is_prismatic else _ROTARY_SPEED
+        amplitude[j] = min(size, 0.9 * room)
         speed[j] = min(highest, 0.9 * joint.velocity) if joint.velocity > 0 else highest
     unit = FourierTrajectory(np.zeros(n), sine, cosine, period)
     q, v, _ = unit.evaluate(np.linspace(0.0, period, 1000))

@@ -50,11 +50,8 @@ def measure(
     level = np.hypot(share, of(noise.torque, "noise.torque"))
     q = _noisy(run.q, of(noise.q, "noise.q"), rng)
     v = _noisy(v, of(noise.v, "noise.v"), rng)
-    tau = _noisy(tau, level, rng)
-    q, v, tau = (
-        _rounded(x, of(size, f"step.{name}"))
-        for x, size, name in ((q, step.q, "q"), (v, step.v, "v"), (tau, step.tau, "tau"))
-    )
+    signals = {"q": q, "v": v, "tau": _noisy(tau, level, rng)}
+    q, v, tau = (_rounded(x, of(getattr(step, k), f"step.{k}")) for k, x in signals.items())
     logged = np.ones(len(run.t), dtype=bool)
     if sensors.dropped:
         logged = rng.random(len(logged)) >= sensors.dropped

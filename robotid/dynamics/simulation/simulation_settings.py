@@ -1,7 +1,7 @@
 """Settings of a simulation: true parameters, controller, actuators, sensors and payload."""
 
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, TypeAlias
@@ -11,7 +11,15 @@ import numpy as np
 from robotid.base.exceptions import SettingsError
 from robotid.base.files import missing_file
 from robotid.base.findings import listed
-from robotid.base.settings import NOT_NEGATIVE, POSITIVE, Range, Settings, check_keys, setting
+from robotid.base.settings import (
+    NOT_NEGATIVE,
+    POSITIVE,
+    Range,
+    Settings,
+    check_keys,
+    is_number,
+    setting,
+)
 from robotid.base.typing import Array
 from robotid.data.log import suggestion
 
@@ -21,39 +29,30 @@ PerJoint: TypeAlias = float | Mapping[str, float]
 _SHARE = Range("0 to less than 1", lambda x: 0 <= x < 1)
 
 
-def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
-
-
 def _are_within(values: Sequence[float], most: float) -> bool:
-    return all(_is_number(x) and abs(x) <= most for x in values)
+    return all(is_number(x) and abs(x) <= most for x in values)
 
 
-def _all_of(is_right: Any) -> Any:  # noqa: ANN401
+def _all_of(is_right: Callable[[float], bool]) -> Callable[[PerJoint], bool]:
     """Return a check of a number, or of each number in a table."""
 
     def holds(value: PerJoint) -> bool:
         values = list(value.values()) if isinstance(value, Mapping) else [value]
-        return all(_is_number(x) and is_right(x) for x in values)
+        return all(is_number(x) and is_right(x) for x in values)
 
     return holds
 
 
-_NUMBERS = "a number, or a table of numbers by joint"
-_LEAST, _LARGEST = 1e-9, 1e12  # of gains, in any unit, so that squares do not overflow
-_LONGEST = 1.0  # of delays [s]
-LEVEL: Mapping[str, Any] = {
-    "reads": (int, float, dict),
-    "within": Range(f"0 to 1e12: {_NUMBERS}", _all_of(lambda x: 0 <= x <= _LARGEST)),
-}
-GAIN: Mapping[str, Any] = {
-    "reads": (int, float, dict),
-    "within": Range(f"1e-9 to 1e12: {_NUMBERS}", _all_of(lambda x: _LEAST <= x <= _LARGEST)),
-}
-DELAY: Mapping[str, Any] = {
-    "reads": (int, float, dict),
-    "within": Range(f"0 to 1 s: {_NUMBERS}", _all_of(lambda x: 0 <= x <= _LONGEST)),
-}
+def _per_joint(least: float, most: float, words: str) -> Mapping[str, Any]:
+    """Return type and range of a setting that may be a table by joint."""
+    check = _all_of(lambda x: least <= x <= most)
+    within = Range(f"{words}: a number, or a table of numbers by joint", check)
+    return {"reads": (int, float, dict), "within": within}
+
+
+LEVEL = _per_joint(0.0, 1e12, "0 to 1e12")
+GAIN = _per_joint(1e-9, 1e12, "1e-9 to 1e12")  # in any unit: squares do not overflow
+DELAY = _per_joint(0.0, 1.0, "0 to 1 s")
 
 
 def _effort_from(value: float | bool) -> float | None:

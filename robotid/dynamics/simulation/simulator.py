@@ -99,8 +99,6 @@ def follow(
     References:
         Rang, Angermann (2005), New Rosenbrock W-methods of order 3 for partial differential
         algebraic equations of index 1.
-
-    pi (p,).
     """
     _check_size(duration * rate, 1)
     t = np.arange(round(duration * rate) + 1) / rate

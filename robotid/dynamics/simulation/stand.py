@@ -22,20 +22,14 @@ _MOST = 30  # iterations of Newton's method
 
 @dataclass(frozen=True, eq=False)
 class Stand:
-    """Base and contacts of a robot along its motion.
+    """Base and contacts of a robot along its motion."""
 
-    Attributes:
-        pose: Pose of the base, shape (N, 7) [m, -].
-        twist: Twist with the axes of the base, shape (N, 6) [m/s, rad/s].
-        acceleration: Its time derivative, shape (N, 6).
-        contacts: Whether links touch the ground, by link; only of those that may leave it.
-        wrenches: Measured components of wrenches, by name as "fz l_sole", each (N,) [N or N m].
-    """
-
-    pose: Array
-    twist: Array
-    acceleration: Array
+    pose: Array  # pose of the base, shape (N, 7) [m, -]
+    twist: Array  # twist with the axes of the base, shape (N, 6) [m/s, rad/s]
+    acceleration: Array  # its time derivative, shape (N, 6)
+    # whether links touch the ground, by link; only of those that may leave it
     contacts: Mapping[str, Array]
+    # measured components of wrenches, by name as "fz l_sole", each (N,) [N or N m]
     wrenches: Mapping[str, Array]
 
     def logged(self, sensors: Sensors, rows: Array) -> dict[str, Any]:

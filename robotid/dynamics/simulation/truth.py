@@ -24,9 +24,9 @@ def draw_parameters(model: RobotModel, settings: Truth, rng: np.random.Generator
     effort = {joint.name: joint.effort for joint in model.limits}
     for i, (d, term) in enumerate(layout.drive_parameters, start=layout.n_inertial):
         drawn = rng.uniform(*term.typical)
-        own = [x / _TYPICAL_EFFORT for j, _ in layout.drives[d].ratios if (x := effort[j]) > 0]
+        shares = [x / _TYPICAL_EFFORT for j, _ in layout.drives[d].ratios if (x := effort[j]) > 0]
         is_share = isinstance(term, MemorylessTerm) and term.is_loaded
-        size = 1.0 if is_share or term.is_measured else min([1.0, *own])
+        size = 1.0 if is_share or term.is_measured else min([1.0, *shares])
         pi[i] = has_drives * size * drawn
     for name, value in settings.values.items():
         if name not in layout.names:

@@ -13,6 +13,7 @@ import scipy.linalg
 
 from robotid.base.exceptions import RankDeficientError
 from robotid.base.typing import Array
+from robotid.estimation.estimators.estimator import Estimate
 
 _PRIOR_LED = 0.9  # ratio of the spreads after and before the data above which a direction is weak
 _LED_IN_PART = 0.3  # share of a parameter's spread in weak directions that makes it a group member
@@ -23,6 +24,7 @@ _TIE = 0.95  # coefficients above this share of the largest are equal to it: the
 _TERMS = 4  # largest number of printed terms of a sum
 _DIGITS = 3  # printed digits of a coefficient
 _NAMED = 5  # largest number of parameters of a group, and half as many sums, that are printed
+_ILL_CONDITIONED = 1e3  # condition number of unit columns above which a motion is poor
 _GROUPS = 2  # largest number of groups whose sums are printed
 
 
@@ -152,6 +154,11 @@ def determine(names: Sequence[str], rows: Array, spread: Array) -> Determination
         shrinkage[len(spread) - len(free) :] = after
     groups = _groups(tuple(names), weak, spread)
     return Determination(tuple(names), spread, shrinkage, weak, groups)
+
+
+def is_poorly_excited(wls: Estimate, count: int) -> bool:
+    """Return whether the motion, not the noise, leaves base parameters undetermined."""
+    return wls.rank < count or wls.condition > _ILL_CONDITIONED
 
 
 def _groups(names: tuple[str, ...], weak: Array, spread: Array) -> tuple[Group, ...]:

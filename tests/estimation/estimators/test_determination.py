@@ -20,7 +20,7 @@ from robotid.estimation.fitting.estimator_settings import EstimatorSettings
 
 EXACT = SignalSettings(cutoff=None, trim=0.0)
 NOISE = 0.1  # [N m]
-CHOICE = EstimatorSettings(draws=0)  # intervals are not read
+CHOICE = EstimatorSettings()  # intervals are not read
 
 
 def moved(model, change, *, samples=600, noise=NOISE):

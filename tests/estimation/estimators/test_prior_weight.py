@@ -87,7 +87,7 @@ def test_the_held_out_errors_are_those_of_a_loop_by_hand(case):
 def test_the_chosen_weight_is_the_best_of_its_curve_and_is_stated(ur5, rng):
     log = exact_log(ur5, truth(ur5), rng, noise=NOISE)
     for how in ("cv", "evidence"):
-        settings = EstimatorSettings(prior_weight=how, draws=0)
+        settings = EstimatorSettings(prior_weight=how)
         found = fitted(ur5, [log], signals=EXACT, estimator=settings)
         prior = found.estimate.details["prior"]
         assert prior["chosen_by"] == how
