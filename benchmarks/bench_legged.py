@@ -1,7 +1,6 @@
 """Legged robots with unknown contact forces: intervals, prediction, time.
 
     python benchmarks/bench_legged.py [--runs 20] [--robots go1 g1 talos cassie] [--unseen]
-    python benchmarks/bench_legged.py --flags [--robots go1 g1 talos] [--seconds 10]
     python benchmarks/bench_legged.py --faults [--robots go1 g1 talos human human_soft icub]
     python benchmarks/bench_legged.py --robots human human_soft icub --seconds 15
 
@@ -16,9 +15,7 @@ half of its log: its URDF is the truth. With --unseen: joint torque of the last 
 fitted on the others.
 Without torques of joints: a human on two force shoes, also with errors of soft tissue, and
 an iCub that walks on the spot, of whose feet the vertical forces are measured.
-With --faults: how many logs with a wrong pose of the base the doctor names. With --flags: how many
-contacts it names, as delayed if all flags of a log are, and as slipping on the ground of the
-benchmark and on a slippery one.
+With --faults: how many logs with a wrong pose of the base the doctor names.
 """
 
 import setting  # noqa: I001 -- pins the threads of BLAS before numpy is imported
@@ -27,7 +24,6 @@ import argparse
 import os
 import sys
 import time
-from itertools import pairwise
 from pathlib import Path
 from dataclasses import replace
 from tempfile import TemporaryDirectory
@@ -55,7 +51,7 @@ from robotid.dynamics.used_rows import base_problem
 from robotid.estimation.fitting.estimator_settings import ConsistentSettings
 from robotid.estimation.fitting.survey import hold_log
 from robotid.identification.pipeline import identify
-from robotid.robot.constraints import Contact, link_positions
+from robotid.robot.constraints import Contact
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 
@@ -63,9 +59,9 @@ FEET = ("FL_foot", "FR_foot", "RL_foot", "RR_foot")
 POSTURE = {"hip": (0.0, 0.12), "thigh": (0.8, 0.25), "calf": (-1.6, 0.3)}  # middle, reach [rad]
 SIGNALS = SignalSettings(cutoff=25.0, velocity="differentiated")
 ARMATURE, DAMPING = 0.01, 0.2
-PRIOR = ConsistentSettings(prior_weight=1.0, draws=0)
-AUTO_PRIOR = ConsistentSettings(draws=0)
-WEAK_PRIOR = ConsistentSettings(prior_weight=1e-4, draws=0)
+PRIOR = ConsistentSettings(prior_weight=1.0)
+AUTO_PRIOR = ConsistentSettings()
+WEAK_PRIOR = ConsistentSettings(prior_weight=1e-4)
 
 
 def robot():
@@ -308,58 +304,6 @@ def unseen(name, seed, duration):
         )
 
 
-DELAYS = (0.0, 0.04, -0.04, 0.08, -0.08)  # [s] of flags
-GROUND, SLIPPERY = 0.8, {"go1": 0.2, "g1": 0.1, "talos": 0.1}  # coefficients of friction
-SLIDES = (0.0, 0.01, 0.03, 0.1, np.inf)  # [m] classes of the way of a foot in contact
-
-
-def slides(model, log):
-    """Return how far each foot slides while it is in contact [m]."""
-    frames, every = [contact.frame for contact in model.contacts], 10  # 20 ms
-    places = link_positions(
-        model.pin_model, model.configurations(np.hstack([log.base.pose, log.q])[::every]), frames
-    )
-    ways = np.linalg.norm(np.diff(places[..., :2], axis=0), axis=2)
-    flags = np.stack([log.contacts[x] for x in frames], axis=1)
-    stands = np.array([flags[k : k + every + 1].all(axis=0) for k in range(0, len(flags), every)])
-    return np.sum(ways * stands[: len(ways)], axis=0)
-
-
-def named(model, log, codes):
-    """Return the doctor's finding of the codes by contact."""
-    found = [x for x in check_base(model, log, SIGNALS) if x.code in codes]
-    return [next((x for x in found if own.frame in x.message), None) for own in model.contacts]
-
-
-def flags(name, seeds, duration):
-    """Print how many contacts the doctor names as delayed, and as slipping."""
-    plant, late, slips = PLANTS[name](), {delay: [] for delay in DELAYS}, []
-    model = plant.model
-    for seed in seeds:
-        for friction in (GROUND, SLIPPERY[name]):
-            log = plant.log(model, np.random.default_rng(seed), duration, friction=friction)
-            found = named(model, log, ("slipping_foot", "moving_contact"))
-            ways = slides(model, log)
-            slips += [(friction, x, one is not None) for x, one in zip(ways, found, strict=True)]
-            for delay in DELAYS if friction == GROUND else ():
-                rows = np.searchsorted(log.t, log.t - delay).clip(0, len(log.t) - 1)
-                own = {x: flags[rows] for x, flags in log.contacts.items()}
-                late[delay] += named(model, replace(log, contacts=own), ("contact_delay",))
-    for delay, found in late.items():
-        own = [1e3 * x.evidence["delay"] for x in found if x is not None]
-        print(
-            f"{name}, flags {1e3 * delay:+.0f} ms: {len(own)} of {len(found)} contacts named, "
-            f"{min(own, default=0.0):.0f} to {max(own, default=0.0):.0f} ms"
-        )
-    for friction in (GROUND, SLIPPERY[name]):
-        for low, high in pairwise(SLIDES):
-            own = [is_named for mu, x, is_named in slips if mu == friction and low <= x < high]
-            print(
-                f"{name}, friction {friction:g}, slides by {100 * low:g} to {100 * high:g} cm: "
-                f"{sum(own)} of {len(own)} contacts named"
-            )
-
-
 Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 QUARTER, BACK = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), [-1, -1, -1, 1]
 #: Poses x y z qx qy qz qw (N, 7) as another tool or a wrong reading has them.
@@ -427,20 +371,17 @@ def main():
     parser.add_argument("--robots", nargs="+", choices=PLANTS, default=WITH_TORQUES)
     parser.add_argument("--unseen", action="store_true", help="only errors on unseen motion")
     parser.add_argument("--faults", action="store_true", help="only wrong poses")
-    parser.add_argument("--flags", action="store_true", help="only delays of flags, and slips")
     options = parser.parse_args()
     runs, seconds = (1, 4.0) if options.quick else (options.runs, options.seconds)
     for name in ("go1", "cassie") if options.quick else options.robots:
         if options.faults:
             faults(name, range(options.first, options.first + runs), seconds)
-        elif options.flags:
-            flags(name, range(options.first, options.first + runs), seconds)
         elif options.unseen:
             for seed in range(options.first, options.first + runs):
                 unseen(name, seed, seconds)
         else:
             coverage(name, range(options.first, options.first + runs), seconds)
-    if not (options.unseen or options.flags or options.faults):
+    if not (options.unseen or options.faults):
         if "ROBOTID_DATA" in os.environ:
             trot()
         speed(6.0)

@@ -13,7 +13,9 @@ from robotid.data.transmission import Transmission
 from robotid.dynamics.simulation.simulation_settings import Simulation
 from robotid.estimation.fitting.estimator_settings import ESTIMATORS, ConstraintSettings
 from robotid.identification.closed_loop.loop_settings import LoopSettings
+from robotid.robot.constraints import Contact, Loop
 from robotid.robot.drives import AUTO, TERMS
+from robotid.robot.parameters import Coupling
 
 REFERENCE = Path(__file__).with_name("reference")
 PLANT = """# Keys of a plant
@@ -85,6 +87,9 @@ TABLES = {
     "controller": LoopSettings,
     "estimator.constraints": ConstraintSettings,
     "[transmission]": Transmission,
+    "[coupling]": Coupling,
+    "[contact]": Contact,
+    "[loop]": Loop,
     "[identification]": LogEntry,
     "[payload_check]": PayloadEntry,
 }
@@ -131,6 +136,9 @@ def job_file():
             "model",
             "estimator",
             "transmission",
+            "coupling",
+            "contact",
+            "loop",
             "identification",
             "validation",
             "payload_check",

@@ -18,8 +18,7 @@ from helpers.paths import DOCS, ROOT
 from robotid.cli import COMMANDS, main
 from robotid.cli.job import Job, LogEntry, job_from_settings
 from robotid.data.files.formats import write_columns
-from robotid.diagnosis.logs.check_logs import CODES
-from robotid.diagnosis.verdict.verdict import WARNING_CODES
+from robotid.diagnosis.catalogue import entries
 from robotid.dynamics.simulation.motions import random_fourier
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
 from robotid.robot import examples
@@ -60,7 +59,7 @@ def test_the_page_of_the_job_file_is_what_the_settings_say(tmp_path):
     page = "".join(text for name, text in written.items() if name.startswith("job_"))
     for key in Job.paths().keys() - {"model"}:
         assert f"| `{key.rpartition('.')[2]}` |" in page or key.startswith(
-            ("ident", "valid", "transm", "payload_check")
+            ("ident", "valid", "transm", "payload_check", "coupling", "contact", "loop")
         )
     text = re.search(r"<!-- example -->\n```toml\n(.*?)```", page, re.DOTALL).group(1)
     job = job_from_settings(tomllib.loads(text), "job_file.md", tmp_path)
@@ -212,8 +211,8 @@ def test_doctor_lists_every_corruption_and_none_other():
 
 def codes_of_findings():
     """Return the codes that the code gives to findings, those of unread logs included."""
-    places = {"Finding": 0, "_Alteration": 0, "log_finding": 1, "Candidate": 1}
-    codes = {*CODES, *WARNING_CODES, *REASONS, "unusable_log"}
+    places = {"Finding": 0, "finding": 0}
+    codes = {*entries(), *REASONS}
     for path in (ROOT / "robotid").rglob("*.py"):
         text = path.read_text()
         if not re.search(rf"\bcode\b|\b({'|'.join(places)})\(", text):

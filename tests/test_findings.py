@@ -1,6 +1,28 @@
+"""Findings, the causes they are merged into, and the catalogue of their sentences."""
+
 import tomllib
+from dataclasses import replace
+from string import Formatter
+
+import pytest
+from helpers.paths import ROOT
 
 from robotid.base.findings import Finding, by_severity, grouped, listed, toml_key
+from robotid.diagnosis.catalogue import entries, finding, reason_of, step_of
+
+
+@pytest.mark.parametrize("code", entries())
+def test_each_entry_is_complete(code):
+    entry, steps = entries()[code], {"", "doctor", "scale", "gains", "delay", "locks", "zeros"}
+    steps |= {"payload", "unclipped", "terms", "as_found", "validate", "watch", "richer", "inspect"}
+    assert entry["severity"] in ("note", "warning", "error")
+    assert step_of(code) in steps
+    assert (ROOT / f"docs/reference/findings/{entry['page']}.md").exists()
+    tables = {key for key, value in entry.items() if isinstance(value, dict)}
+    texts = [entry["message"], entry.get("remedy", "")]
+    texts += [text for key in tables for text in entry[key].values()]
+    slots = {name for text in texts for _, name, _, _ in Formatter().parse(text) if name}
+    assert tables <= slots | {"what", "cure", "todo"}, "a choice that no sentence has"
 
 
 def test_names_stand_in_a_sentence_and_a_long_list_is_cut():
@@ -16,136 +38,122 @@ def test_errors_come_first_and_the_order_of_each_kind_is_kept():
     assert [f.code for f in by_severity(found)] == ["1", "3", "2", "0", "4"]
 
 
-def quantised(log, joint, share, severity="warning"):
-    message = f"{log}: {share} % of {joint}'s torque is one step of 0.02"
-    return Finding("quantised", severity, f"{log}: tau_{joint}", message)
+def test_a_finding_has_its_subject_its_figures_and_its_sentence():
+    one = finding("spikes", "a.csv", "lift", subject="tau_lift", channel="tau", rows=2,
+                  largest=7.25, when="3.5")  # fmt: skip
+    assert (one.where, one.log, one.joints) == ("a.csv: tau_lift", "a.csv", ("lift",))
+    assert one.evidence == {"rows": 2.0, "largest": 7.25}
+    assert one.message == (
+        "a.csv: tau of lift has spikes of up to 7.25 in 2 rows, the first at t = 3.5 s; remove "
+        "these rows from the recording"
+    )
+    harmless = one.reworded(severity="note", remedy="; no action needed")
+    assert harmless.message.endswith("at t = 3.5 s; no action needed")
+    slow = finding("torque_delay", "a.csv", sense=False, todo="none", delay=-0.0021,
+                   std_error=0.001)  # fmt: skip
+    assert slow.message == (
+        "a.csv: the torque leads the position by 2.1 +- 1.0 ms, which is not significant; no "
+        "action needed"
+    )
+    assert reason_of(slow) == (
+        "the torque is delayed by -0.002 s relative to the position (negative: early)"
+    )
+
+
+def still(log, joint, size, severity="warning"):
+    return finding("static_joint", log, joint, severity=severity, range=size, unit="rad",
+                   moving_share=0.0)  # fmt: skip
 
 
 def test_findings_of_one_code_are_one_cause_and_say_what_they_share_once():
     findings = [
-        quantised("b.csv", "arm_7", "9.5"),
-        quantised("a.csv", "arm_1", "37"),
-        quantised("a.csv", "arm_7", "12", "error"),
-        Finding("bent", "warning", "arm_1.coulomb", "arm_1: bent in 2 places"),
-        Finding("bent", "warning", "arm_1.viscous", "arm_1: bent throughout"),
+        still("b.csv", "arm_7", 1e-4),
+        still("a.csv", "arm_1", 3e-4),
+        still("a.csv", "arm_7", 2e-4, "error"),
+        Finding("bent", "warning", "arm_1", "arm_1: bent in 2 places"),
+        Finding("bent", "warning", "arm_1", "arm_1: bent throughout"),
         Finding("old", "note", "urdf", "the URDF is of 2020"),
     ]
-    quantised_, bent, old = grouped(findings, ["arm_1", "arm_7", "arm_70"])
-    assert (quantised_.code, quantised_.severity) == ("quantised", "error")
-    assert quantised_.joints == ("arm_1", "arm_7")  # in the order of the robot
-    assert quantised_.findings == (findings[2], findings[0], findings[1])
-    said = "a.csv, b.csv: 9.5 to 37 % of arm_7, arm_1's torque is one step of 0.02"
-    assert quantised_.messages == (said,)
+    rest, bent, old = grouped(findings, ["arm_1", "arm_7", "arm_70"])
+    assert (rest.code, rest.severity) == ("static_joint", "error")
+    assert rest.joints == ("arm_1", "arm_7")  # in the order of the robot
+    assert rest.findings == (findings[2], findings[0], findings[1])
+    assert rest.messages[0].startswith("a.csv, b.csv: arm_7, arm_1 at rest (range 0.0001 to 0.0003")
+    assert len(rest.messages) == 1
     assert bent.messages == ("arm_1: bent in 2 places", "arm_1: bent throughout")
     assert (bent.severity, bent.joints) == ("warning", ("arm_1",))
     assert (old.severity, old.joints, old.messages) == ("note", (), ("the URDF is of 2020",))
+    assert grouped([]) == ()
 
 
 def test_logs_with_other_joints_are_named_one_by_one():
     """No sentence on all three joints, because none of the logs has them all."""
     joints = ["j1", "j2", "j3"]
-
-    def rest(log, joint, size):
-        message = f"{log}: {joint} at rest (range {size} rad): move it, or lock it"
-        return Finding("static_joint", "warning", f"{log}: {joint}", message)
-
     sizes = {"a.csv": {"j2": 1e-4, "j3": 3e-4}, "b.csv": {"j1": 2e-4, "j3": 5e-4},
              "c.csv": {"j2": 4e-4, "j3": 2e-4}}  # fmt: skip
-    findings = [rest(log, *pair) for log, own in sizes.items() for pair in own.items()]
+    findings = [still(log, *pair) for log, of_log in sizes.items() for pair in of_log.items()]
     (cause,) = grouped(findings, joints)
-    assert cause.messages == (
-        "a.csv, c.csv: j2, j3 at rest (range 0.0001 to 0.0004 rad): move it, or lock it",
-        "b.csv: j1, j3 at rest (range 0.0002 to 0.0005 rad): move it, or lock it",
-    )
-    assert cause.joints == tuple(joints)
-    whole = [rest("d.csv", joint, 6e-4) for joint in joints]  # true of d.csv
-    (cause,) = grouped([*findings, *whole], joints)
-    assert cause.messages == (
-        "a.csv, b.csv, c.csv, d.csv: j2, j3, j1 at rest (range 0.0001 to 0.0006 rad): move it, or "
-        "lock it",
-    )
+    first, second = cause.messages
+    assert first.startswith("a.csv, c.csv: j2, j3 at rest (range 0.0001 to 0.0004 rad)")
+    assert second.startswith("b.csv: j1, j3 at rest (range 0.0002 to 0.0005 rad)")
+    everywhere = [still("d.csv", joint, 6e-4) for joint in joints]  # true of d.csv
+    (cause,) = grouped([*findings, *everywhere], joints)
+    (message,) = cause.messages
+    assert message.startswith("a.csv, b.csv, c.csv, d.csv: j2, j3, j1 at rest (range 0.0001 to")
 
 
-def late(log, seconds, rows="4"):
-    message = (
-        f"{log}: {1e3 * seconds:.1f} ms late, held for {rows} rows; set torque_delay = "
-        f"{seconds:.4f} (--torque-delay {seconds:.4f})"
-    )
-    return Finding("late", "warning", log, message)
+def late(log, seconds):
+    return finding("torque_delay", log, severity="warning", sense=True, todo="filter",
+                   delay=seconds, std_error=0.001, total=seconds)  # fmt: skip
 
 
-def test_what_is_typed_keeps_one_value_and_ranges_of_ranges_are_one_range():
-    findings = [late("c", 0.0201, "4 to 6"), late("a", 0.0199), late("b", 0.02, "1 to 4")]
-    (cause,) = grouped(findings)
-    assert cause.messages == (
-        "c, a, b: 19.9 to 20.1 ms late, held for 1 to 6 rows; set torque_delay = 0.0200 "
-        "(--torque-delay 0.0200)",
-    )
-    (cause,) = grouped(findings[:2])
-    assert "torque_delay = 0.0199 (--torque-delay 0.0199)" in cause.messages[0]
+def test_what_is_typed_keeps_one_value_unless_the_values_are_far_apart():
+    (cause,) = grouped([late("c", 0.0201), late("a", 0.0199), late("b", 0.02)])
+    (message,) = cause.messages
+    assert message.startswith("c, a, b: the torque lags the position by 19.9 to 20.1 +- 1.0 ms")
+    assert "torque_delay = 0.0200 (--torque-delay 0.0200)" in message
+    (cause,) = grouped([late("a", 0.02), late("b", 0.03)])
+    assert [m.partition(" +-")[0] for m in cause.messages] == [
+        "a: the torque lags the position by 20.0", "b: the torque lags the position by 30.0",
+    ]  # fmt: skip
 
 
-def test_of_decreases_the_smallest_is_stated_as_a_decrease():
-    def exchanged(log, before, after):
-        message = (
-            f"{log}: with these columns exchanged, the share decreases from {before} to {after} %"
-        )
-        return Finding("torque_order", "error", log, message)
-
-    (cause,) = grouped([exchanged("a", "102", "0.39"), exchanged("b", "87", "0.56")])
-    assert cause.messages == (
-        "a, b: with these columns exchanged, the share decreases from 87 to 0.56 %",
-    )
-
-
-def cut(log, start, end):
-    message = f"{log}: at rest for {start} s; cut it with start = {start} and end = {end}"
-    return Finding("standstill", "note", log, message)
-
-
-def test_settings_that_differ_by_log_are_stated_log_by_log():
-    (cause,) = grouped([cut("a", "2.33", "54.03"), cut("b", "4.1", "46.98")])
-    assert cause.messages == (
-        "a: at rest for 2.33 s; cut it with start = 2.33 and end = 54.03",
-        "b: at rest for 4.1 s; cut it with start = 4.1 and end = 46.98",
-    )
-    (cause,) = grouped([cut("a", "2.33", "54.03"), cut("b", "2.4", "54.1")])
-    assert cause.messages == (
-        "a, b: at rest for 2.33 to 2.4 s; cut it with start = 2.33 and end = 54.03",
-    )
-
-
-def test_settings_of_several_numbers_are_far_if_any_of_them_is():
-    texts = [f"{log}: set mass = [1.0, {high}]" for log, high in (("a", 2.0), ("b", 3.0))]
-    findings = [Finding("bounds", "note", text[0], text) for text in texts]
-    (cause,) = grouped(findings)
-    assert cause.messages == tuple(texts)
+def test_of_decreases_the_worst_is_stated_as_a_decrease():
+    sizes = {"a": (1.02, 0.0039), "b": (0.87, 0.0056)}
+    found = [
+        finding("joint_order", log, ("x", "y"), unexplained=before, unexplained_so_read=after)
+        for log, (before, after) in sizes.items()
+    ]
+    (cause,) = grouped(found)
+    (message,) = cause.messages
+    assert "decreases from 87 to 0.56 %" in message
 
 
 def test_what_is_typed_for_several_joints_is_typed_for_each():
-    todo = "{0} stands at {1}; state locked = {{ {0} = {1} }} (--lock {0}={1})"
-    places = (("a", "j6", 0.1824), ("b", "j6", 0.1825), ("a", "j7", 1.0))
-    findings = [
-        Finding("locked", "error", f"{log}: {joint}", todo.format(joint, at))
+    places = (("a", "j6", 0.1824), ("b", "j6", 0.1824), ("a", "j7", 1.0))
+    found = [
+        finding("locked_position", log, joint, what="stands", todo="stands", default=True,
+                unit="rad", stated=0.0, median=at, range=0.0, percent="",
+                setting=f"locked = {{ {joint} = {at} }}", flag=f"--lock {joint}={at}")
         for log, joint, at in places
-    ]
-    (cause,) = grouped(findings, ["j6", "j7"])
+    ]  # fmt: skip
+    (cause,) = grouped(found, ["j6", "j7"])
     assert cause.messages == (
-        "j6, j7 stands at 0.1824 to 1.0; state locked = { j6 = 0.1824 }, locked = { j7 = 1.0 } "
-        "(--lock j6=0.1824 --lock j7=1.0)",
+        "a, b: j6, j7 is locked at 0 rad but is at 0.1824 to 1 rad in the log; state locked = "
+        "{ j6 = 0.1824 }, locked = { j7 = 1.0 } (--lock j6=0.1824 --lock j7=1.0)",
     )
+
+
+def test_other_words_are_other_sentences_and_quoted_names_are_quoted_one_by_one():
+    links = [finding("zero_mass", subject=f"link {x}", link=x) for x in ("a b", "c")]
+    assert grouped(links)[0].messages[0].startswith("link 'a b', 'c' has the mass 0 kg")
+    rest = [finding("standstill", log, before=2.0, after=0.0, start=start, end="9")
+            for log, start in (("a", "2.33"), ("b", "4.1"))]  # fmt: skip
+    assert len(grouped(rest)[0].messages) == 2
+    assert len(grouped([rest[0], replace(rest[0], log="b")])[0].messages) == 1
 
 
 def test_a_name_is_quoted_as_a_key_where_it_needs_it():
     for name in ("arm_1-x", "a.b", 'say "x"', "", "gel\u00e4nk"):
         assert tomllib.loads(f"{toml_key(name)} = 1") == {name: 1}
     assert toml_key("arm_1-x") == "arm_1-x"
-
-
-def test_quoted_names_are_quoted_one_by_one():
-    findings = [Finding("odd", "note", x, f"link '{x}': {x} weighs 1 kg") for x in ("a b", "c")]
-    assert grouped(findings, ["a b", "c"])[0].messages == ("link 'a b', 'c': a b, c weighs 1 kg",)
-
-
-def test_no_finding_has_no_cause():
-    assert grouped([]) == ()

@@ -1,19 +1,17 @@
-"""Findings about logs, a robot or a result."""
+"""Findings about logs, a robot or a result: data, of which sentences are made."""
 
 import json
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from string import Formatter
+from typing import Any
 
 _SPREAD = 0.1  # of the numbers of a setting that is stated once for several findings
 _RANK = {"error": 0, "warning": 1, "note": 2}
-_NUMBER = r"(?<![\w.])[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?(?!\w|\.\w)"
-_RANGE = rf"{_NUMBER}(?: to {_NUMBER})?"
-#: Text for a user to type: a flag with its value, or a key of a job file with its value.
-_TYPED = (
-    r"--[a-z][a-z-]* [^\s,;)]+"
-    r"|(?<![\w.])[\w.-]{3,} = (?:\[[^\]]*\]|\{[^}]*\}|\"[^\"]*\"|[-+]?\d[\d.]*(?:e[-+]?\d+)?)"
-)
+_FACTORS = {" %": 100.0, " ms": 1e3}  # of the units that a slot may have
+#: Words that name subjects: sentences that differ only in them are one.
+_NAMES = ("joint", "joints", "link", "links", "channel", "setting", "flag")
 
 
 @dataclass(frozen=True)
@@ -26,6 +24,11 @@ class Finding:
         where: Its subject: a link, a joint, a parameter or a file.
         message: The fault, the value found, the value expected, the remedy.
         evidence: The numbers it depends on, by name.
+        log: The log concerned; empty if none.
+        joints: The joints concerned.
+        words: Texts of the message that are no numbers, by name.
+        fault: Template of the message, with slots for numbers and words; empty: it is the message.
+        remedy: Template of its second part.
     """
 
     code: str
@@ -33,6 +36,16 @@ class Finding:
     where: str
     message: str
     evidence: Mapping[str, float] = field(default_factory=dict)
+    log: str = ""
+    joints: tuple[str, ...] = ()
+    words: Mapping[str, str] = field(default_factory=dict)
+    fault: str = ""
+    remedy: str = ""
+
+    def reworded(self, **changes: Any) -> "Finding":  # noqa: ANN401
+        """Return the finding with other fields, and the message that follows from them."""
+        other = replace(self, **changes)
+        return replace(other, message=sentence([other])) if other.fault else other
 
 
 @dataclass(frozen=True)
@@ -52,15 +65,6 @@ class Cause:
     joints: tuple[str, ...]
     messages: tuple[str, ...]
     findings: tuple[Finding, ...]
-
-
-def log_finding(
-    log: str, code: str, severity: str, message: str, part: str = "", /, **evidence: float
-) -> Finding:
-    """Return a finding about a log."""
-    where = f"{log}: {part}" if part else log
-    figures = {name: float(value) for name, value in evidence.items()}
-    return Finding(code, severity, where, f"{log}: {message}", figures)
 
 
 def not_ignored(findings: Iterable[Finding], ignore: Iterable[str]) -> tuple[Finding, ...]:
@@ -99,11 +103,12 @@ def grouped(findings: Iterable[Finding], joints: Sequence[str] = ()) -> tuple[Ca
     for finding in by_severity(findings):
         by_code.setdefault(finding.code, []).append(finding)
     causes = []
-    for code, found in by_code.items():
-        about = {joint for finding in found for joint in _joints_of(finding, joints)}
+    for code, alike in by_code.items():
+        about = {joint for finding in alike for joint in finding.joints or (finding.where,)}
         named = tuple(joint for joint in joints if joint in about)
-        messages = _merged(found, joints)
-        causes.append(Cause(code, found[0].severity, named, messages, tuple(found)))
+        messages = tuple(sentence(group) for group in _alike(alike))
+        messages = tuple(dict.fromkeys(messages))
+        causes.append(Cause(code, alike[0].severity, named, messages, tuple(alike)))
     return tuple(causes)
 
 
@@ -112,98 +117,80 @@ def number_of(causes: Iterable[Cause]) -> int:
     return sum(len(cause.messages) for cause in causes)
 
 
-def _joints_of(finding: Finding, joints: Sequence[str]) -> set[str]:
-    """Return the joints in the subject of a finding: a joint, a channel or a parameter."""
-    parts = finding.where.rpartition(": ")[2].split(", ")
-    names = {x for p in parts for x in (p, p.partition("_")[2], p.rpartition(".")[0])}
-    return names.intersection(joints)
+def sentence(findings: Sequence[Finding]) -> str:
+    """Return the message of findings with one template.
 
-
-def _merged(findings: Sequence[Finding], joints: Sequence[str]) -> tuple[str, ...]:
-    """Return the messages; those that differ only in names of joints or logs and numbers are one.
-
-    Text to type has one value, because a user cannot type a range of values. If no log has all the
-    joints of a message, the logs with the same joints have one.
+    A slot has a format, and may end in " %" or " ms", which scale its number, or in " %~" if the
+    unit is not written; "|" is its absolute value. Of several findings it is the range of their
+    numbers, or by its conversion the middle one (!t, which a user types), the smallest (!l), the
+    largest (!h), or that of the finding with the largest last of such slots (!w). Names are joined,
+    in quotes by !q.
     """
-    if len(findings) == 1:
-        return (findings[0].message,)
-    logs = {finding.where.rpartition(": ")[0] or finding.where for finding in findings}
-    names = sorted({name for name in (*joints, *logs) if name}, key=len, reverse=True)
-    named = "|".join(rf"'{x}'|(?<!\w){x}(?!\w)" for x in map(re.escape, names))
-    slots = "|".join([_TYPED, *([named] if named else []), _RANGE])
-    slot = re.compile(f"({slots})")
-    alike: dict[tuple[str, ...], list[tuple[Finding, list[str]]]] = {}
-    for finding in findings:
-        parts = slot.split(finding.message)  # text, slot, text, slot, ..., text
-        alike.setdefault(tuple(parts[::2]), []).append((finding, parts[1::2]))
-    merged = []
-    for texts, filled in (
-        (x, own) for x, all_ in alike.items() for own in _by_joints(all_, joints)
-    ):
-        columns = list(zip(*filled, strict=True))
-        if any(map(_are_far, columns)):  # one setting does not suit them all
-            words = [list(values) for values in filled]
-        else:
-            words = [[_in_one(list(dict.fromkeys(values))) for values in columns]]
-        merged += ["".join(a + b for a, b in zip(texts, [*own, ""], strict=True)) for own in words]
-    return tuple(merged)
+    first = findings[0]
+    if not first.fault:
+        return first.message
+    template, text = first.fault + first.remedy, []
+    worst = [name for _, name, _, how in Formatter().parse(template) if name and how == "w"]
+    last = max(findings, key=lambda x: x.evidence[worst[-1]] if worst else 0.0)
+    for literal, name, spec, how in Formatter().parse(template):
+        text.append(literal)
+        if name is not None:
+            values = [_value(x, name) for x in ([last] if how == "w" else findings)]
+            text.append(_filled(values, spec or "", how or ""))
+    logs = ", ".join(dict.fromkeys(finding.log for finding in findings))
+    return f"{logs}: {''.join(text)}" if logs else "".join(text)
 
 
-def _by_joints(
-    filled: Sequence[tuple[Finding, list[str]]], joints: Sequence[str]
-) -> list[list[list[str]]]:
-    """Return the words of findings, together for logs with the same joints.
+def _value(finding: Finding, name: str) -> str | float:
+    return finding.words[name] if name in finding.words else finding.evidence[name]
 
-    They are together for all logs if one of them has all the joints: its own sentence is true.
+
+def _filled(values: Sequence[str | float], spec: str, how: str) -> str:
+    """Return names with commas, or the range of numbers, or one of them."""
+    numbers = sorted(value for value in values if not isinstance(value, str))
+    if not numbers:
+        names = list(dict.fromkeys(f"'{x}'" if how == "q" else str(x) for x in values))
+        return (" " if names[0].startswith("--") else ", ").join(names)
+    bare = spec.removesuffix("~")
+    unit = next((unit for unit in _FACTORS if bare.endswith(unit)), "")
+    plain, factor = bare.removesuffix(unit).removeprefix("|"), _FACTORS.get(unit, 1.0)
+    numbers = sorted(map(abs, numbers)) if spec.startswith("|") else numbers
+    places = {"t": [(len(numbers) - 1) // 2], "l": [0], "h": [-1]}.get(how, [0, -1])
+    ends = [format(factor * numbers[k], plain) for k in places]
+    return " to ".join(dict.fromkeys(ends)) + unit * (not spec.endswith("~"))
+
+
+def _alike(findings: Sequence[Finding]) -> list[list[Finding]]:
+    """Return the findings whose messages differ only in names and numbers, in groups.
+
+    A user types one value, so they are apart if settings are. Logs with other joints are apart,
+    unless one of them has all of the joints: then its own sentence is true.
     """
-    of_log: dict[str, set[str]] = {}
-    for finding, _ in filled:
-        log = finding.where.rpartition(": ")[0]
-        of_log.setdefault(log, set()).update(_joints_of(finding, joints))
-    if set().union(*of_log.values()) in of_log.values():
-        return [[words for _, words in filled]]
-    found: dict[frozenset[str], list[list[str]]] = {}
-    for finding, words in filled:
-        own = of_log[finding.where.rpartition(": ")[0]]
-        found.setdefault(frozenset(own), []).append(words)
-    return list(found.values())
+    groups: dict[tuple[object, ...], list[Finding]] = {}
+    for k, finding in enumerate(findings):
+        other = tuple(sorted(x for x in finding.words.items() if x[0] not in _NAMES))
+        key = (finding.fault, finding.remedy, other) if finding.fault else (finding.message, k)
+        groups.setdefault(key, []).append(finding)
+    apart: list[list[Finding]] = []
+    for group in groups.values():
+        of_log: dict[str, frozenset[str]] = {}
+        for finding in group:
+            of_log[finding.log] = of_log.get(finding.log, frozenset()).union(finding.joints)
+        same: dict[frozenset[str], list[Finding]] = {}
+        every = frozenset[str]().union(*of_log.values())
+        for finding in group:
+            key_joints = every if every in of_log.values() else of_log[finding.log]
+            same.setdefault(key_joints, []).append(finding)
+        for members in same.values():
+            apart += [[x] for x in members] if _are_far(members) else [members]
+    return apart
 
 
-def _are_far(values: Sequence[str]) -> bool:
-    """Whether settings to type differ in numbers alone, by more than a tenth of the largest."""
-    if not all(re.fullmatch(_TYPED, value) for value in values):
-        return False
-    if len({re.sub(_NUMBER, "", value) for value in values}) > 1:
-        return False
-    numbers = zip(
-        *([float(x) for x in re.findall(_NUMBER, value)] for value in values), strict=True
-    )
-    return any(max(own) - min(own) > _SPREAD * max(map(abs, own)) for own in numbers)
-
-
-def _in_one(values: list[str]) -> str:
-    """Return names with commas, the range of numbers, or the text to type for all of them."""
-    if len(values) == 1:
-        return values[0]
-    if all(re.fullmatch(_TYPED, value) for value in values):
-        return _typed_once(values)
-    if not all(re.fullmatch(_RANGE, value) for value in values):
-        return ", ".join(values)
-    ends = [(value.split(" to ")[0], value.split(" to ")[-1]) for value in values]
-    if any(float(first) > float(last) for first, last in ends):  # decreases are not ranges
-        first, last = max(ends, key=lambda pair: float(pair[1]))  # the smallest decrease
-        return f"{first} to {last}"
-    numbers = [number for pair in ends for number in pair]
-    return f"{min(numbers, key=float)} to {max(numbers, key=float)}"
-
-
-def _typed_once(values: list[str]) -> str:
-    """Return settings; of settings that differ only in their numbers, the middle one."""
-    alike: dict[str, list[str]] = {}
-    for value in values:
-        alike.setdefault(re.sub(_NUMBER, "", value), []).append(value)
-    middle = [
-        sorted(own, key=lambda x: [float(y) for y in re.findall(_NUMBER, x)])[(len(own) - 1) // 2]
-        for own in alike.values()
-    ]
-    return (" " if middle[0].startswith("--") else ", ").join(middle)
+def _are_far(findings: Sequence[Finding]) -> bool:
+    """Whether numbers to type differ by more than a tenth of the largest."""
+    slots = Formatter().parse(findings[0].fault + findings[0].remedy)
+    for name in (name for _, name, _, how in slots if name and how == "t"):
+        numbers = [finding.evidence[name] for finding in findings]
+        if max(numbers) - min(numbers) > _SPREAD * max(map(abs, numbers)):
+            return True
+    return False

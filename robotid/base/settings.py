@@ -68,7 +68,7 @@ def require_flag(value: object, name: str) -> None:
 
 
 #: Keys that are required in a table of a list of tables, if its schema has them.
-REQUIRED = ("log", "name", "ratios", "joints", "matrix", "mass")
+REQUIRED = ("log", "name", "ratios", "joints", "matrix", "mass", "frame", "frames")
 POSITIVE = Range("a positive number", lambda x: x > 0)
 #: Of limits and noise, in any unit: their squares and ratios are finite.
 SIZE = Range("1e-09 to 1e+12", lambda x: 1e-9 <= x <= 1e12)
@@ -149,9 +149,6 @@ class Settings:
 
         Args:
             table: The table, with keys and types of the ``schema``.
-
-        Raises:
-            SettingsError: If a value is not usable.
         """
         given = {}
         for f, key, (*tables, last) in cls.entries():

@@ -5,12 +5,7 @@ from functools import cache
 
 __version__ = "0.2.0"
 
-_PACKAGES = {
-    "pinocchio": "pin",
-    "numpy": "numpy",
-    "scipy": "scipy",
-    "numba": "numba",
-}
+_PACKAGES = {"pinocchio": "pin", "numpy": "numpy", "scipy": "scipy", "numba": "numba"}
 
 
 def code_versions() -> dict[str, str]:

@@ -51,7 +51,7 @@ def print_steps(steps: "Sequence[Step]") -> None:
 
 
 def print_causes(
-    findings: Sequence[Mapping[str, Any]],
+    findings: Sequence[Finding],
     joints: Sequence[str],
     *,
     is_verbose: bool,
@@ -60,9 +60,9 @@ def print_causes(
     none: str = "no findings",
 ) -> None:
     """Print findings by cause, then their number."""
-    every = [Finding(**as_finding(f)) for f in findings]
-    shown = [f for f in every if is_verbose or f.severity != "note"]
-    causes, others = grouped(shown, joints), grouped([f for f in every if f not in shown], joints)
+    shown = [f for f in findings if is_verbose or f.severity != "note"]
+    notes_hidden = [f for f in findings if f not in shown]
+    causes, others = grouped(shown, joints), grouped(notes_hidden, joints)
     for cause in causes:
         for message in cause.messages:
             if message not in printed:
@@ -74,11 +74,6 @@ def print_causes(
         notes = count + (f"; worst: {worst}" if worst else "") + (f"; {notes}" if notes else "")
     if summary := notes or none:
         echo(summary)
-
-
-def as_finding(found: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the attributes of a ``Finding`` from a finding in JSON."""
-    return {key: found[key] for key in ("code", "severity", "where", "message")}
 
 
 def _some(count: int, what: str) -> str:
@@ -130,11 +125,7 @@ def show_found(
 
 
 class Terminated(KeyboardInterrupt):
-    """The process received SIGTERM or SIGHUP: it cleans up as after Ctrl-C.
-
-    Attributes:
-        number: The signal.
-    """
+    """The process received SIGTERM or SIGHUP: it cleans up as after Ctrl-C."""
 
     def __init__(self, number: int) -> None:
         self.number = number
@@ -142,10 +133,7 @@ class Terminated(KeyboardInterrupt):
 
 
 def open_closed_streams() -> None:
-    """Open a standard stream that is closed, as by ``2>&-``; text written to it is discarded.
-
-    Otherwise the next file that is opened gets the number of the stream.
-    """
+    """Open a standard stream that is closed, as by ``2>&-``; text written to it is discarded."""
     while (number := os.open(os.devnull, os.O_RDWR)) <= _LAST_STREAM:
         pass
     os.close(number)
@@ -170,11 +158,7 @@ def _is_open(stream: TextIO | None) -> bool:
 
 @contextmanager
 def terminations_raised() -> Iterator[None]:
-    """Raise ``Terminated`` at SIGTERM and SIGHUP in the context; later signals are ignored.
-
-    A signal that is ignored already stays ignored, as SIGHUP under nohup. Only the main thread
-    receives signals: the function has no effect in other threads.
-    """
+    """Raise ``Terminated`` at SIGTERM and SIGHUP in the context; later signals are ignored."""
     numbers = [number for number in _ENDS if signal.getsignal(number) is signal.SIG_DFL]
     if threading.current_thread() is not threading.main_thread():
         numbers = []

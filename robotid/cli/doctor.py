@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from robotid.base.findings import Finding, grouped
-from robotid.cli.console import as_finding, echo, print_causes, progress_of, show_found
+from robotid.cli.console import echo, print_causes, progress_of, show_found
 from robotid.cli.flags import add_job, job_from_flags
 from robotid.cli.job import job_file
 from robotid.cli.logs import examine
@@ -59,29 +59,36 @@ def run(options: argparse.Namespace) -> int:
         findings = examine(job, model, progress=progress)
     content = findings_to_dict(findings) | {"joints": list(model.joints)}
     count = len({entry.path for entry in (*job.identification, *job.validation)})
-    show_found(content, options, partial(_show, is_verbose=options.verbose, count=count))
+    shown = partial(_show, findings, model.joints, is_verbose=options.verbose, count=count)
+    show_found(content, options, shown)
     return 1 if blocking(findings, job.ignore) else 0
 
 
-def _show(content: dict[str, Any], *, is_verbose: bool, count: int) -> None:
-    findings, joints = content["findings"], content["joints"]
+def _show(
+    findings: Sequence[Finding],
+    joints: Sequence[str],
+    content: Mapping[str, Any],
+    *,
+    is_verbose: bool,
+    count: int,
+) -> None:
     worst = _worst_of(findings, joints)
     print_causes(findings, joints, is_verbose=is_verbose, worst=worst, none="")
-    if all(finding["severity"] == "note" for finding in findings):
+    if all(finding.severity == "note" for finding in findings):
         echo(f"no fault found in {count} {'log' if count == 1 else 'logs'}")
 
 
-def _worst_of(findings: Sequence[Mapping[str, Any]], joints: Sequence[str]) -> str:
+def _worst_of(findings: Sequence[Finding], joints: Sequence[str]) -> str:
     """Return the joint with the most errors, then the most warnings, then the largest figure."""
     ranks = dict.fromkeys(joints, (0, 0, 0.0))
     for finding in findings:
-        (cause,) = grouped([Finding(**as_finding(finding))], joints)
+        (cause,) = grouped([finding], joints)
         for joint in cause.joints:
             errors, warnings, share = ranks[joint]
             ranks[joint] = (
                 errors + (cause.severity == "error"),
                 warnings + (cause.severity == "warning"),
-                max(share, finding["evidence"].get("share", 0.0)),
+                max(share, finding.evidence.get("share", 0.0)),
             )
     worst = max(ranks, key=lambda joint: ranks[joint], default="")
     return worst if any(ranks.get(worst, ())[:2]) else ""

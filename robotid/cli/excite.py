@@ -14,7 +14,7 @@ from robotid.base.files import check_file
 from robotid.base.findings import listed
 from robotid.base.typing import ProgressCallback
 from robotid.cli.console import echo, print_files, progress_of, show_found
-from robotid.cli.flags import JOB, ROBOT, Flags, add_json, add_progress, job_from_flags
+from robotid.cli.flags import JOB, ROBOT, Flags, add_json, add_progress, job_from_flags, number
 from robotid.cli.job import Job, as_job
 from robotid.cli.logs import result_run
 from robotid.data.log import Log
@@ -312,12 +312,7 @@ def _centre(word: str, _: str) -> tuple[float, ...]:
 
 
 def _clearance(word: str, flag: str) -> float | None:
-    if word == "none":
-        return None
-    try:
-        return float(word)
-    except ValueError as error:
-        raise SettingsError(f"{flag} {word!r}: wanted metres, or none") from error
+    return None if word == "none" else number(word, flag, "metres, or none")
 
 
 _COM = "--com {!r}: wanted three numbers X,Y,Z [m], together with --mass"

@@ -12,32 +12,35 @@ from robotid.base.settings import Entries, Settings, table_in
 from robotid.cli.job import Job, job_from_settings, read_job
 
 
+def number(word: str, flag: str, wanted: str = "a number", shown: str = "") -> float:
+    """Return the number of a word."""
+    try:
+        return float(word)
+    except ValueError as error:
+        raise SettingsError(f"{flag} {shown or repr(word)}: wanted {wanted}") from error
+
+
 def pairs(words: Sequence[str], flag: str) -> dict[str, float]:
     """Return numbers by joint."""
-    found = {}
-    for name, number in _once(words, flag).items():
-        try:
-            found[name] = float(number)
-        except ValueError as error:
-            shown = f"{name}={number}" if number else name
-            raise SettingsError(f"{flag} {shown!r}: wanted JOINT=NUMBER") from error
-    return found
+    return {
+        name: number(text, flag, "JOINT=NUMBER", repr(f"{name}={text}" if text else name))
+        for name, text in _once(words, flag).items()
+    }
 
 
 def _once(words: Sequence[str], flag: str) -> dict[str, str]:
     """Return the texts of words like JOINT=TEXT by joint; refuse two of one joint."""
-    found: dict[str, str] = {}
+    texts: dict[str, str] = {}
     for word in words:
         name, _, value = word.partition("=")
-        if found.setdefault(name, value) != value:
+        if texts.setdefault(name, value) != value:
             raise SettingsError(
-                f"{flag} states {name} twice, as {found[name]} and as {value}; state it once"
+                f"{flag} states {name} twice, as {texts[name]} and as {value}; state it once"
             )
-    return found
+    return texts
 
 
 def _names(words: Sequence[str], flag: str) -> dict[str, str]:
-    """Return names by joint."""
     if wrong := [word for word in words if not all(word.partition("=")[::2])]:
         raise SettingsError(f"{flag} {wrong[0]!r}: wanted JOINT=NAME")
     return _once(words, flag)
@@ -47,26 +50,13 @@ def _of_all_or_pairs(words: Sequence[str], flag: str) -> float | dict[str, float
     """Return one number for all joints, or numbers by joint."""
     if len(words) > 1 or "=" in words[0]:
         return pairs(words, flag)
-    try:
-        return float(words[0])
-    except ValueError as error:
-        raise SettingsError(f"{flag} {words[0]!r}: wanted NUMBER or JOINT=NUMBER") from error
-
-
-def _number_or_false(word: str, flag: str) -> float | bool:
-    try:
-        return False if word == "false" else float(word)
-    except ValueError as error:
-        raise SettingsError(f"{flag} {word!r}: wanted a number or false") from error
+    return number(words[0], flag, "NUMBER or JOINT=NUMBER")
 
 
 def _payload_check(word: str, flag: str) -> list[dict[str, Any]]:
     """Return the log with a payload, and its known mass [kg]."""
     log, _, mass = word.rpartition("=")
-    try:
-        return [{"log": log, "mass": float(mass)}]
-    except ValueError as error:
-        raise SettingsError(f"{flag} {word!r}: wanted LOG=KG") from error
+    return [{"log": log, "mass": number(mass, flag, "LOG=KG", repr(word))}]
 
 
 @dataclass(frozen=True)
@@ -143,7 +133,9 @@ def _reader(kinds: Any) -> Callable[[Any, str], Any]:  # noqa: ANN401
         return pairs if kinds.outer is dict else _listed
     if dict in kinds:
         return _of_all_or_pairs
-    return _number_or_false if {bool, float} <= {*kinds} else lambda value, _: value
+    if {bool, float} <= {*kinds}:
+        return lambda word, flag: word != "false" and number(word, flag, "a number or false")
+    return lambda value, _: value
 
 
 def _listed(words: Sequence[str], _: str) -> list[str]:
@@ -273,8 +265,7 @@ def job_from_flags(options: argparse.Namespace, *, needs_logs: bool = True) -> "
         if options.logs or given:
             raise SettingsError(
                 f"{options.source} is a job file; it states the logs and settings. Remove "
-                f"{listed([*options.logs, *given])}, and state in the job file: "
-                f"{listed(_keys_of(options.logs, given))}"
+                f"{listed([*options.logs, *given])}, and state them in the job file"
             )
         return read_job(options.source)
     if not options.logs and needs_logs:
@@ -310,18 +301,6 @@ def refuse_log_flags(options: argparse.Namespace, why: str) -> None:
 def _given(options: argparse.Namespace) -> list[str]:
     validate = ["--validate"] if getattr(options, "validate", None) is not None else []
     return validate + JOB.given(options)
-
-
-def _keys_of(logs: Sequence[str], flags: Sequence[str]) -> list[str]:
-    """Return the keys of a job file that state what logs and flags state."""
-    keys = ["log in [[identification]]"] if logs else []
-    for flag in flags:
-        if flag == "--validate":
-            keys.append("log in [[validation]]")
-            continue
-        table, _, key = JOB.keys[flag][0].rpartition(".")
-        keys.append(f"{key} in [{table}]" if table else f"{key} at the top")
-    return keys
 
 
 def _name(flag: str) -> str:

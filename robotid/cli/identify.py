@@ -8,9 +8,9 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from robotid.base.arguments import checked
 from robotid.base.exceptions import DataError, SettingsError
 from robotid.base.files import check_folder, folder_beside, remove_written, write_json
+from robotid.base.findings import Finding
 from robotid.base.settings import require_flag, require_kind
 from robotid.base.text import columns, terminal_width, wrapped
 from robotid.base.typing import STAGES, ProgressCallback, ignore_progress, report_stage
@@ -25,13 +25,7 @@ from robotid.cli.console import (
 )
 from robotid.cli.flags import OUTPUT, add_job, add_out, add_progress, job_from_flags, source_words
 from robotid.cli.job import Job, LogEntry, job_file
-from robotid.cli.logs import (
-    examine_logs,
-    locked_as_logged,
-    needed_of,
-    survey_logs,
-    units_of_logs,
-)
+from robotid.cli.logs import examine_logs, locked_as_logged, needed_of, survey_logs, units_of_logs
 from robotid.cli.payload import check_payloads
 from robotid.data.files.read import Readable, read_logs
 from robotid.data.log import Log
@@ -72,7 +66,6 @@ _log = logging.getLogger(__name__)
 _NO_LOGS: tuple[Log, ...] = ()
 
 
-@checked("progress")
 def identify(
     model: RobotModel | str | Path,
     logs: Readable | Sequence[Readable] | None = None,
@@ -121,6 +114,7 @@ def identify(
         NotConvergedError: If a solver fails, or the closed loop cannot be simulated.
         SettingsError: If a setting is out of range, or a code to ignore is unknown.
     """
+    require_kind(progress, (Callable, type(None)), "progress", "a function")  # type: ignore[arg-type]
     if logs is None:
         job = job_file(model)
         if not (validation is _NO_LOGS and signals is controller is None and not ignore):
@@ -181,10 +175,7 @@ def identify(
 def run_job(
     job: Job, folder: str | Path, *, plan: WorkPlan | None = None, source: Sequence[str] = ()
 ) -> tuple[Identification, dict[str, Any]]:
-    """Identify and write result.json, report and URDF; return the result and result.json.
-
-    The words of the source, after ``robotid identify``, repeat the run.
-    """
+    """Identify and write result.json, report and URDF; return the result and result.json."""
     chosen, target = plan or WorkPlan(job.workers or 1), Path(folder)
     model = job.model()
     check_folder(target, ["result.json", *_names(model)])
@@ -193,13 +184,8 @@ def run_job(
     return _write(found, _job_of(found), target, source=source)
 
 
-@checked("identification")
 def save_result(
-    identification: Identification,
-    folder: str | Path,
-    *,
-    report: bool = True,
-    replay: bool = False,
+    identification: Identification, folder: str | Path, *, report: bool = True, replay: bool = False
 ) -> Path:
     """Write the files of ``robotid identify``: result.json, report, URDF with its sidecar.
 
@@ -222,6 +208,8 @@ def save_result(
         ModelError: If the URDF of the robot no longer exists.
         SettingsError: If the folder is a file, or is not writable.
     """
+    kind = "a robotid.Identification"
+    require_kind(identification, Identification, "identification", kind)
     require_kind(folder, (str, Path), "folder", "the path of a folder")
     require_kind(report, bool, "report", "True or False")
     require_kind(replay, bool, "replay", "True or False")
@@ -239,11 +227,7 @@ def _names(model: RobotModel) -> tuple[str, str, str, str]:
 
 
 def _write(
-    found: Identification,
-    job: Job,
-    target: Path,
-    *,
-    source: Sequence[str] = (),
+    found: Identification, job: Job, target: Path, *, source: Sequence[str] = ()
 ) -> tuple[Identification, dict[str, Any]]:
     """Write all files of a result; return the identification with its report, and result.json."""
     names = report, replay, name, sidecar = _names(found.model)
@@ -292,10 +276,7 @@ def _replay_of(found: Identification, job: Job, folder: Path) -> "Replay":
 
 
 def _job_of(identification: Identification) -> Job:
-    """Return the job of an identification; one made in Python gets an equivalent job.
-
-    Logs in memory have no file, and a ``Log`` has no gains, units or names of columns.
-    """
+    """Return the job of an identification; one made in Python gets an equivalent job."""
     model, asked = identification.model, identification.stated
     if isinstance(asked.job, Job):
         return asked.job
@@ -362,8 +343,7 @@ def identify_job(
         which = "no log is usable" if job.identification else "no log is given"
         raise DataError(f"{which}, wanted at least one to identify from")
     report_stage(plan.progress, "checking logs")
-    placed = locked_as_logged(job, model, fitted, validation)
-    job, model, fitted, validation = placed.job, placed.model, placed.fitted, placed.validation
+    job, model, fitted, validation, notes = locked_as_logged(job, model, fitted, validation)
     locked = locked_findings(model, job.placed(model))
     found = [*locked, *examine_logs(job, model, fitted, validation)]
     recordings = Recordings(model, structural_mapping(model), fitted, validation)
@@ -387,7 +367,7 @@ def identify_job(
     return replace(
         concluded,
         stated=replace(concluded.stated, job=job),
-        findings=(*placed.notes, *concluded.findings),
+        findings=(*notes, *concluded.findings),
         payload_checks=check_payloads(job, concluded.model, fitted),
     )
 
@@ -452,7 +432,7 @@ def run(options: argparse.Namespace) -> int:
     show_found(
         result,
         options,
-        partial(show_result, is_verbose=options.verbose),
+        partial(show_result, findings=found.findings, is_verbose=options.verbose),
         [*result["outputs"].values(), "result.json"],
     )
     if not options.json:
@@ -460,7 +440,9 @@ def run(options: argparse.Namespace) -> int:
     return 1 if result["verdict"]["log_errors"] else 0
 
 
-def show_result(result: dict[str, Any], *, is_verbose: bool = False) -> None:
+def show_result(
+    result: dict[str, Any], *, findings: Sequence[Finding] = (), is_verbose: bool = False
+) -> None:
     """Print an identification."""
     width, wls = terminal_width(), result.get("wls")
     echo(f"\n{result['robot']}: {len(result['joints'])} joints, {_found(result)}")
@@ -476,7 +458,7 @@ def show_result(result: dict[str, Any], *, is_verbose: bool = False) -> None:
     print()
     verdict = result["verdict"]
     print_causes(
-        result["warnings"],
+        findings or [Finding(**entry) for entry in result["warnings"]],
         result["joints"],
         is_verbose=is_verbose,
         worst="" if verdict["status"] == "good" else _worst(result),

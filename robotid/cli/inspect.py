@@ -2,11 +2,12 @@
 
 import argparse
 import shlex
+from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
 from robotid.base.exceptions import ModelError
-from robotid.base.findings import listed
+from robotid.base.findings import Finding, listed
 from robotid.cli.console import echo, print_causes, show_found
 from robotid.cli.flags import add_json, add_verbose
 from robotid.diagnosis.urdf.inspection import inspect_urdf
@@ -24,20 +25,19 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Run the command."""
-    content = inspect_urdf(options.urdf, free_flyer=options.free_flyer).to_dict()
+    inspection = inspect_urdf(options.urdf, free_flyer=options.free_flyer)
+    content = inspection.to_dict()
     if not (content["robot"] or options.json):
         raise ModelError(content["findings"][0]["message"])
-    show_found(content, options, partial(_show, options=options))
+    show_found(content, options, partial(_show, options=options, findings=inspection.findings))
     if content["structure"] is None:
         raise ModelError(f"{options.urdf} does not give a valid model; see the findings")
 
 
-def _show(content: dict[str, Any], *, options: argparse.Namespace) -> None:
+def _show(
+    content: dict[str, Any], *, options: argparse.Namespace, findings: Sequence[Finding]
+) -> None:
     structure, joints = content["structure"], content["joints"]
-    findings = [
-        {**finding, "where": finding.get("link") or finding.get("joint") or ""}
-        for finding in content["findings"]
-    ]
     if content["robot"]:
         echo(f"{content['robot']}: {len(joints)} joints: {listed(joints)}", "  ")
     if structure:
@@ -45,8 +45,7 @@ def _show(content: dict[str, Any], *, options: argparse.Namespace) -> None:
             f"{structure['standard']} standard inertial parameters, {structure['base_inertial']} "
             f"base; with drives {structure['base']}"
         )
-    names = list(dict.fromkeys([*joints, *(finding["where"] for finding in findings)]))
-    print_causes(findings, [name for name in names if name], is_verbose=options.verbose)
+    print_causes(findings, joints, is_verbose=options.verbose)
     if options.base:
         print("\nbase parameters, inertial")
         for group in content["base_groups"]:

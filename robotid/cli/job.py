@@ -4,7 +4,7 @@ import os
 import re
 import tomllib
 from collections.abc import Mapping, Sequence
-from dataclasses import MISSING, asdict, dataclass
+from dataclasses import MISSING, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -88,41 +88,6 @@ def _dump_drives(drives: Mapping[str, Sequence[str | DriveTerm]]) -> dict[str, l
         joint: [e if isinstance(e, str) else e.to_dict() for e in entries]
         for joint, entries in drives.items()
     }
-
-
-def _load_couplings(tables: Sequence[Mapping[str, Any]]) -> tuple[Coupling, ...]:
-    return tuple(
-        Coupling(
-            table["name"],
-            tuple((j, float(r)) for j, r in table["ratios"].items()),
-            table.get("replaces", False),
-        )
-        for table in tables
-    )
-
-
-def _dump_couplings(couplings: Sequence[Coupling]) -> list[dict[str, Any]]:
-    return [
-        {"name": coupling.name, "ratios": dict(coupling.ratios)}
-        | ({"replaces": True} if coupling.replaces else {})
-        for coupling in couplings
-    ]
-
-
-def _load_contacts(tables: Sequence[Mapping[str, Any]]) -> tuple[Contact, ...]:
-    return tuple(
-        Contact(**{**table, "measured": tuple(table.get("measured", ()))}) for table in tables
-    )
-
-
-def _dump_contact(contact: Contact) -> dict[str, Any]:
-    table = asdict(contact) | {"measured": list(contact.measured)}
-    unstated: dict[str, Any] = {"axes": "world", "threshold": None, "uncertainty": None}
-    return {key: x for key, x in table.items() if key not in unstated or x != unstated[key]}
-
-
-def _load_loops(tables: Sequence[Mapping[str, Any]]) -> tuple[Loop, ...]:
-    return tuple(Loop.from_dict(table) for table in tables)
 
 
 def _motors(gear: Transmission) -> list[Coupling]:
@@ -216,9 +181,6 @@ class Job(Settings):
         "drives that move several joints, each with a name and its ratios by joint [-]; with "
         "replaces = true it replaces the drive of the joint of that name",
         at="coupling",
-        reads=[{"name": (str,), "ratios": Entries(dict, (int, float)), "replaces": (bool,)}],
-        load=_load_couplings,
-        dump=_dump_couplings,
     )
     transmissions: tuple[Transmission, ...] = setting(
         (), "motors and gears, where logs have columns of motors", at="transmission"
@@ -229,46 +191,9 @@ class Job(Settings):
     source: LogSource = setting(LogSource(), "location of the signals in the log files", at="log")
     units: LogUnits = setting(LogUnits(), "units of the logs, if not SI")
     base: BaseSource = setting(BaseSource(), "motion of a floating base in the logs")
-    contacts: tuple[Contact, ...] = setting(
-        (),
-        "links that may touch the ground: frame, the link; kind, point or surface; measured, "
-        "components of the wrench that logs have as wrench_fz_<link>, of fx to mz, the others are "
-        "unknown; axes of these, world or link; always, whether it always touches the "
-        "ground (true if all components are measured), else logs have contact_<link>, 1 or 0, or "
-        "it is found; threshold, for a column that is a force "
-        "instead [N]; radius of a ball-shaped foot, below whose frame the ground is [m]; "
-        "uncertainty, standard deviation of the point of contact [m], estimated if it is not "
-        "stated",
-        at="contact",
-        reads=[
-            {
-                "frame": (str,),
-                "kind": (str,),
-                "measured": Entries(list, (str,)),
-                "always": (bool,),
-                "radius": (int, float),
-                "uncertainty": (int, float),
-                "axes": (str,),
-                "threshold": (int, float),
-            }
-        ],
-        load=_load_contacts,
-        dump=lambda contacts: [_dump_contact(x) for x in contacts],
-    )
+    contacts: tuple[Contact, ...] = setting((), "links that may touch the ground", at="contact")
     loops: tuple[Loop, ...] = setting(
-        (),
-        "connections that close kinematic chains: frames, the two links, whose origins coincide; "
-        "kind, hinge (default), point or rigid; axis of the hinge, the same in both frames",
-        at="loop",
-        reads=[
-            {
-                "frames": Entries(list, (str,)),
-                "kind": (str,),
-                "axis": Entries(list, (int, float)),
-            }
-        ],
-        load=_load_loops,
-        dump=lambda loops: [x.to_dict() for x in loops],
+        (), "connections of two links that close kinematic chains", at="loop"
     )
     passive: tuple[str, ...] = setting(
         (),
@@ -286,11 +211,7 @@ class Job(Settings):
         "whether the identified friction is also written to <dynamics> of the URDF",
         at="output.dynamics",
     )
-    report: bool = setting(
-        True,
-        "whether report.html is written",
-        at="output.report",
-    )
+    report: bool = setting(True, "whether report.html is written", at="output.report")
     replay: bool = setting(
         False,
         "whether replay.html is written: the first validation log, or the first fitted log",
@@ -410,15 +331,7 @@ class Job(Settings):
 
 
 def read_job(path: str | Path) -> Job:
-    """Read a job file.
-
-    Args:
-        path: The TOML file. Paths in it are relative to its folder; ``$NAME`` in a path is replaced
-            by the environment variable.
-
-    Raises:
-        SettingsError: If the file is missing, is not TOML, or a key or a value is wrong.
-    """
+    """Read a job file."""
     require_kind(path, (str, Path), "path", "the path of a job file")
     check_path(path)
     source = Path(path)

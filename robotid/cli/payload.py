@@ -12,10 +12,10 @@ from robotid.base.findings import listed
 from robotid.base.text import columns, in_digits_of
 from robotid.base.typing import ProgressCallback, report_stage
 from robotid.cli.console import echo, progress_of, show_found
-from robotid.cli.flags import JOB, LOG, add_json, job_from_flags, refuse_log_flags
+from robotid.cli.flags import JOB, LOG, add_json, job_from_flags, number, refuse_log_flags
 from robotid.cli.job import Job, LogEntry
 from robotid.cli.logs import job_of_result, survey_logs
-from robotid.diagnosis.verdict.payload_check import PayloadCheck
+from robotid.diagnosis.verdict.scale_check import PayloadCheck
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.estimation.fitting.recorded import Recordings
 from robotid.estimation.fitting.survey import SurveyedLog
@@ -36,16 +36,14 @@ def stated_masses(words: Sequence[str], links: Sequence[str]) -> dict[str, float
     """Return the known mass of each payload, by link [kg]."""
     masses = {}
     for word in words:
-        link, _, number = word.rpartition("=")
+        link, _, mass = word.rpartition("=")
         if not link and len(links) > 1:
             raise SettingsError(
                 f"--mass {word}: the link is ambiguous, wanted one of {listed(links)}. "
                 "Write --mass LINK=KG"
             )
-        try:
-            masses[link or next(iter(links), "")] = float(number)
-        except ValueError as error:
-            raise SettingsError(f"--mass {word!r}: wanted KG or LINK=KG") from error
+        known = number(mass, "--mass", "KG or LINK=KG", repr(word))
+        masses[link or next(iter(links), "")] = known
     return masses
 
 

@@ -14,14 +14,7 @@ from robotid.base.files import file_sha256
 from robotid.base.findings import listed
 from robotid.base.text import columns
 from robotid.cli.console import echo, recordings_of, show_found
-from robotid.cli.flags import (
-    JOB,
-    MOTION,
-    add_json,
-    job_from_flags,
-    pairs,
-    refuse_log_flags,
-)
+from robotid.cli.flags import JOB, MOTION, add_json, job_from_flags, pairs, refuse_log_flags
 from robotid.cli.job import Job, LogEntry
 from robotid.cli.logs import result_run
 from robotid.design.previews import preview_logs
@@ -38,11 +31,7 @@ def preview_job(
     noise: Mapping[str, float] | None = None,
     correlation: float | None = None,
 ) -> dict[str, Any]:
-    """Preview the logs of a job from their positions alone.
-
-    A given result adds the information of its logs, and its noise. If one of the motions is a log
-    of that result, all logs of the result are previewed and compared with its standard errors.
-    """
+    """Preview the logs of a job from their positions alone."""
     stated: dict[str, Any] = {"noise": noise, "correlation": correlation}
     if not job.identification:
         raise DataError("no motion is given, wanted at least one to preview")

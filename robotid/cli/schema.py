@@ -10,6 +10,8 @@ from robotid.base.settings import REQUIRED, Entries, Key, Settings
 from robotid.cli.job import Job, LogEntry, PayloadEntry
 from robotid.data.transmission import Transmission
 from robotid.estimation.fitting.estimator_settings import ESTIMATORS, ConstraintSettings
+from robotid.robot.constraints import Contact, Loop
+from robotid.robot.parameters import Coupling
 
 _DRAFT = "https://json-schema.org/draft/2020-12/schema"
 _NAMES = {str: "string", datetime: "string", bool: "boolean", int: "integer", float: "number"}
@@ -19,16 +21,15 @@ _TABLES: Mapping[str, type[Settings]] = {
     "validation": LogEntry,
     "payload_check": PayloadEntry,
     "transmission": Transmission,
+    "coupling": Coupling,
+    "contact": Contact,
+    "loop": Loop,
     "estimator.constraints": ConstraintSettings,
 }  # whose keys a job's own paths do not have
 
 
 def job_schema() -> dict[str, Any]:
-    """Return the JSON schema of a job file: every key, its types and its description.
-
-    References:
-        JSON Schema, draft 2020-12.
-    """
+    """Return the JSON schema of a job file: every key, its types and its description."""
     keys = dict(Job.paths())
     for kind in ESTIMATORS.values():
         keys |= {f"estimator.{name}": key for name, key in kind.paths().items()}

@@ -30,8 +30,13 @@ from robotid.data.files.formats import write_columns
 from robotid.data.files.parquet_files import load_pyarrow
 from robotid.data.log import Log
 from robotid.dynamics.base_parameters import structural_mapping
-from robotid.identification.online.identifier import Observer, OnlineIdentifier, Track, track
-from robotid.identification.online.online_settings import OnlineSettings
+from robotid.identification.online.identifier import (
+    Observer,
+    OnlineIdentifier,
+    OnlineSettings,
+    Track,
+    track,
+)
 from robotid.output.viewer.replays import gap_marks, live_page
 from robotid.output.viewer.scene import coordinates
 from robotid.output.viewer.server import LivePage
@@ -203,10 +208,7 @@ class _LiveFeed:
         if self._speed > 0:
             ahead = (t - start) / self._speed - (time.monotonic() - self._started)
             time.sleep(max(ahead, 0.0))
-        message = {
-            "t": t,
-            "q": coordinates(self._model, self._log.q[k : k + 1])[0].tolist(),
-        }
+        message = {"t": t, "q": coordinates(self._model, self._log.q[k : k + 1])[0].tolist()}
         if identifier.is_ready:
             reading, (tau, predicted) = identifier.reading, identifier.compared
             message |= {

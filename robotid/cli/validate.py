@@ -2,11 +2,11 @@
 
 import argparse
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from functools import partial
 from itertools import compress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -29,20 +29,20 @@ from robotid.cli.logs import log_of_commands, survey_logs, units_of_logs
 from robotid.data.log import Log
 from robotid.diagnosis.logs.check_logs import diagnose
 from robotid.diagnosis.verdict.evidence import Determined, Predictions
+from robotid.diagnosis.verdict.fit_findings import unlike_findings
 from robotid.diagnosis.verdict.position_verdict import judge_positions
-from robotid.diagnosis.verdict.unlike_runs import unlike_findings
 from robotid.diagnosis.verdict.verdict import Verdict, VerdictWarning, blocking, judge, warnings_of
 from robotid.dynamics.base_parameters import structural_mapping
-from robotid.estimation.fitting.bands import rms_error, torque_band
 from robotid.estimation.fitting.evaluation import (
     Evaluation,
+    Metrics,
     evaluate_logs,
     hidden_joints,
     shares_rows,
 )
 from robotid.estimation.fitting.fit import sums_of_logs
-from robotid.estimation.fitting.metrics import Metrics
 from robotid.estimation.fitting.recorded import Recordings
+from robotid.estimation.fitting.standard_errors import rms_error, torque_band
 from robotid.estimation.fitting.survey import SurveyedLog
 from robotid.estimation.variation.groups import RunSums, runs_of
 from robotid.estimation.variation.variation import vary
@@ -61,34 +61,7 @@ from robotid.output.files.result_file import (
 )
 from robotid.robot.model import RobotModel
 
-if TYPE_CHECKING:
-    from robotid.cli.job import LogEntry
-
-
 _ADVICE = "identify again from all logs"
-
-
-@dataclass(frozen=True)
-class AddedLogs:
-    """The variation between the logs of a result and new ones.
-
-    Attributes:
-        content: As "variation" of result.json, of all these logs.
-        findings: Findings about the new logs that differ, and about their robots.
-    """
-
-    content: dict[str, Any]
-    findings: tuple[Finding, ...]
-
-    @property
-    def shown(self) -> dict[str, Any]:
-        """The content without the sums of the logs."""
-        return {key: x for key, x in self.content.items() if key != "sums"}
-
-    def write(self, result: Result) -> None:
-        """Write the variation to the result.json."""
-        content = read_json(result.path, "result")  # with the keys as they are in the file
-        write_json({**content, "variation": self.content}, result.path)
 
 
 def check_update(result: Result, job: Job, entries: Sequence[LogEntry]) -> None:
@@ -114,12 +87,8 @@ def check_update(result: Result, job: Job, entries: Sequence[LogEntry]) -> None:
 
 def add_logs(
     result: Result, model: RobotModel, job: Job, logs: Sequence[SurveyedLog]
-) -> AddedLogs | None:
-    """Return the variation between the logs of a result and new ones.
-
-    The sums of the new logs about the parameters of the fit are added to those of the others; the
-    mixed-effects model is that of all. To first order it is the variation of a fit to all logs.
-    """
+) -> tuple[dict[str, Any], tuple[Finding, ...]] | None:
+    """Return the variation between the logs of a result and new ones, and findings about these."""
     stated = result.content.get("variation", {})
     if "sums" not in stated:
         return None
@@ -153,7 +122,7 @@ def add_logs(
         | {"unit": units},
         "added": [*stated.get("added", ()), *added],
     }  # fmt: skip
-    return AddedLogs(content, tuple(unlike_findings(unlike)))
+    return content, tuple(unlike_findings(unlike))
 
 
 def _require_shapes(
@@ -208,17 +177,18 @@ def validate(
     driven = stated_urdf_with_drives(content, source)
     _, evaluations = evaluate_logs((), surveyed, {"estimate": pi}, prior, driven)
     own = [log.with_model(source) for log in surveyed]
-    added = add_logs(loaded, source, job, own)
-    unlike = () if added is None else added.findings
+    variation, unlike = add_logs(loaded, source, job, own) or ({}, ())
     verdict = _verdict(job, source, content, evaluations, surveyed, unlike)
-    if update and added is not None:
-        added.write(loaded)
+    if update:
+        stored = read_json(loaded.path, "result")  # with the keys as they are in the file
+        write_json({**stored, "variation": variation}, loaded.path)
+    shown = {key: x for key, x in variation.items() if key != "sums"}
     return {
         "result": str(result),
         "predicted_with": content["outputs"].get("urdf", "base parameters of result.json"),
         "validation": [e.to_dict() | _expected(content, model, e) for e in evaluations],
         "verdict": verdict.to_dict(),
-        **({} if added is None else {"variation": added.shown}),
+        **({"variation": shown} if shown else {}),
         "findings": [asdict(finding) for finding in unlike],
     }
 
@@ -226,11 +196,7 @@ def validate(
 def _expected(
     result: Mapping[str, Any], model: RobotModel, evaluation: Evaluation
 ) -> dict[str, Any]:
-    """Return the expected torque error of a log by the result, and how often it is within 95 %.
-
-    The error has the uncertainty of the parameters, the spread of the drives between logs, if three
-    or more were fitted, and the residual of the fit.
-    """
+    """Return the expected torque error of a log by the result, and how often it is within 95 %."""
     covariance = stated_covariance(result, model.layout.names)
     if covariance is None:
         return {}

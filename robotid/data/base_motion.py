@@ -45,21 +45,15 @@ _GAP = 2.5  # median steps of time: a longer one is a gap, over which the pose m
 
 @dataclass(frozen=True, eq=False)
 class ImuFrame:
-    """Place of an IMU in the base link.
+    """Place of an IMU in the base link."""
 
-    Attributes:
-        quaternion: Orientation of the IMU in the base link, qx qy qz qw, shape (4,).
-        lever: Origin of the IMU in the base link, shape (3,) [m].
-        gravity: Gravity in the world, shape (3,) [m/s^2].
-        bias: Bias of the gyroscopes with the axes of the base, shape (3,) [rad/s]; None to
-            estimate it at rest.
-        offset: Bias of the accelerometers with the axes of the base, shape (3,) [m/s^2]; None: 0.
-    """
-
-    quaternion: Array
-    lever: Array
-    gravity: Array
+    quaternion: Array  # orientation of the IMU in the base link, qx qy qz qw, shape (4,)
+    lever: Array  # origin of the IMU in the base link, shape (3,) [m]
+    gravity: Array  # gravity in the world, shape (3,) [m/s^2]
+    # bias of the gyroscopes with the axes of the base, shape (3,) [rad/s]; None to estimate it at
+    # rest
     bias: Array | None = None
+    # bias of the accelerometers with the axes of the base, shape (3,) [m/s^2]; None: 0
     offset: Array | None = None
 
     @property
@@ -73,16 +67,12 @@ class ImuFrame:
 
 @dataclass(frozen=True, eq=False)
 class ImuMotion:
-    """Recorded values of an IMU with the axes of the base link.
+    """Recorded values of an IMU with the axes of the base link."""
 
-    Attributes:
-        values: Angular velocity without bias [rad/s] and specific force, the acceleration minus
-            gravity [m/s^2], shape (N, 6).
-        frame: Place of the IMU, with the bias that was subtracted.
-    """
-
+    # angular velocity without bias [rad/s] and specific force, the acceleration minus gravity
+    # [m/s^2], shape (N, 6)
     values: Array
-    frame: ImuFrame
+    frame: ImuFrame  # place of the IMU, with the bias that was subtracted
 
     def at(self, rows: slice) -> "ImuMotion":
         """Return some samples."""

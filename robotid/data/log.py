@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from robotid.base.arguments import check_fields, checked, frozen, real_numbers
+from robotid.base.arguments import frozen, real_numbers
 from robotid.base.exceptions import DataError, SettingsError
 from robotid.base.findings import listed
 from robotid.base.settings import is_number, require_each, require_flag, require_kind
@@ -105,8 +105,8 @@ class Log:
                 f"{where}: the pose of the base has {len(self.base.pose)} rows, wanted "
                 f"{len(self.t)}, one for each time stamp"
             )
-        check_fields(self, "contacts", "wrenches")
         for kind, dtype in (("contacts", np.bool_), ("wrenches", np.float64)):
+            require_kind(getattr(self, kind), Mapping, kind, "a table of arrays by name")
             own = {
                 name: frozen(real_numbers(x, f"{where}: {name!r} of {kind}"), dtype)
                 for name, x in getattr(self, kind).items()
@@ -180,13 +180,13 @@ class Log:
         chosen = {name: x[:, columns] for name, x in self._arrays().items()}
         return replace(self, joints=tuple(joints), **chosen)
 
-    @checked()
     def turned(self, sign: Array) -> "Log":
         """Return the log with the signs of some joints reversed.
 
         Args:
             sign: 1 or -1 of each joint, shape (n,).
         """
+        sign = real_numbers(sign, "sign")
         if sign.shape != (len(self.joints),):
             raise DataError(f"sign has shape {sign.shape}, wanted ({len(self.joints)},)")
         return replace(self, **{name: sign * x for name, x in self._arrays().items()})
@@ -301,7 +301,6 @@ class Trajectory:
         """Sums of tau^2, v^2 and a^2 over the samples, shape (3, n)."""
         return np.array([np.einsum("kj,kj->j", x, x) for x in (self.tau, self.v, self.a)])
 
-    @checked()
     def part(self, start: int, stop: int) -> "Trajectory":
         """Return the samples start to stop.
 
@@ -311,7 +310,6 @@ class Trajectory:
         """
         return self.at(slice(start, stop))
 
-    @checked()
     def every(self, step: int) -> "Trajectory":
         """Return every n-th sample, without a rate.
 
@@ -326,13 +324,13 @@ class Trajectory:
         vars(thinned)["rate"] = None
         return thinned
 
-    @checked()
     def at(self, rows: Array | slice) -> "Trajectory":
         """Return some samples, without new checks of their values.
 
         Args:
             rows: Their numbers.
         """
+        require_kind(rows, (slice, np.ndarray, list), "rows", "a slice or an array of numbers")
         some = copy(self)
         vars(some).pop("derived", None)
         for name in _BY_SAMPLE:

@@ -13,14 +13,11 @@ from robotid.diagnosis.residual.misfit import Misfit
 from robotid.diagnosis.residual.torque_split import JointTorque, joint_torques
 from robotid.diagnosis.verdict.evidence import Determined, Predictions
 from robotid.diagnosis.verdict.parameter_table import parameter_entries, parameter_table
-from robotid.diagnosis.verdict.payload_check import PayloadCheck
-from robotid.diagnosis.verdict.scale_check import ScaleCheck, check_scale
+from robotid.diagnosis.verdict.scale_check import PayloadCheck, ScaleCheck, check_scale
 from robotid.diagnosis.verdict.verdict import Verdict, VerdictWarning, judge
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
-from robotid.estimation.fitting.evaluation import Evaluated, Evaluation, hidden_joints
-from robotid.estimation.fitting.fitted import Fit
-from robotid.estimation.fitting.identified import Identified
-from robotid.estimation.fitting.metrics import Metrics
+from robotid.estimation.fitting.evaluation import Evaluated, Evaluation, Metrics, hidden_joints
+from robotid.estimation.fitting.fitted import Fit, Identified
 from robotid.estimation.variation.variation import Variation
 from robotid.identification.summary import (
     error_lines,
@@ -167,9 +164,9 @@ class TorqueIdentification(Identification, Fit):
     def _friction_lines(self) -> list[str]:
         return friction_lines({drive.joint: drive.to_dict() for drive in self.drives})
 
-    def _cause_of(self, joint: str) -> str:
-        """Return the cause of a joint's residual, as a sentence."""
-        return self.joint_torques[self.model.row_names.index(joint)].sentence
+    def _cause_of(self, joint: str) -> tuple[str, str]:
+        """Return the cause of a joint's residual, and what to do."""
+        return self.joint_torques[self.model.row_names.index(joint)].cause
 
     @cached_property
     def joint_torques(self) -> tuple[JointTorque, ...]:

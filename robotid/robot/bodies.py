@@ -24,19 +24,14 @@ _DRAWS = 2000  # bodies that an estimate allows
 
 @dataclass(frozen=True)
 class LinkPlace:
-    """The body that a link belongs to.
+    """The body that a link belongs to."""
 
-    Attributes:
-        link: Name of the link.
-        body: Index of its body in ``layout.bodies``; -1 if it is fixed to the world.
-        role: "moved": the link that the body's joint moves; "fixed": joined to it by fixed joints
-            only; "held": behind a locked joint, with the URDF's inertial.
-        parameters: Its inertial parameters in the body's frame, shape (10,); 0 without inertial.
-    """
-
-    link: str
-    body: int
+    link: str  # name of the link
+    body: int  # index of its body in ``layout.bodies``; -1 if it is fixed to the world
+    # "moved": the link that the body's joint moves; "fixed": joined to it by fixed joints only;
+    # "held": behind a locked joint, with the URDF's inertial
     role: str
+    # its inertial parameters in the body's frame, shape (10,); 0 without inertial
     parameters: Array
 
     @property

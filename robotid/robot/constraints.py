@@ -2,7 +2,7 @@
 
 import difflib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import MISSING, dataclass
 from functools import cache
 from types import MappingProxyType
 from typing import Any, ClassVar
@@ -10,45 +10,58 @@ from typing import Any, ClassVar
 import numpy as np
 import pinocchio as pin
 
-from robotid.base.arguments import check_fields
 from robotid.base.exceptions import ModelError, SettingsError
 from robotid.base.findings import listed
-from robotid.base.settings import is_number, require_each, require_flag, require_kind
+from robotid.base.settings import (
+    Settings,
+    is_number,
+    require_each,
+    require_flag,
+    require_kind,
+    setting,
+)
 from robotid.base.typing import Array
 from robotid.robot.drive_term import DriveTerm
 
 
 @dataclass(frozen=True)
-class Contact:
-    """A link that touches the ground.
+class Contact(Settings):
+    """A link that touches the ground."""
 
-    Attributes:
-        frame: The link, whose frame is at the point or on the surface of contact; the centre of the
-            foot if it has a radius.
-        kind: "point", which transmits a force, or "surface", which also transmits a moment.
-        measured: Components of the wrench of the ground on the link that are measured, of fx, fy,
-            fz, mx, my, mz with the axes of the world and the origin of the link. The others are
-            unknown.
-        always: Whether it touches the ground at all samples; else logs state when. True if all
-            components are measured: the wrench itself states it.
-        radius: Of a ball that rolls on level ground: the force of the ground acts this far below
-            the frame [m].
-        uncertainty: Standard deviation of the point of contact, along each axis [m]; None: it is
-            estimated from the logs. It is an error of the intervals.
-        axes: Axes of the components: "world", or "link" for those of the link, as a sensor in it
-            measures.
-        threshold: Force above which it touches the ground [N], if the log's column of the contact
-            is a force; None for a column of 0 and 1.
-    """
-
-    frame: str
-    kind: str = "point"
-    measured: tuple[str, ...] = ()
-    always: bool = False
-    radius: float = 0.0
-    uncertainty: float | None = None
-    axes: str = "world"
-    threshold: float | None = None
+    frame: str = setting(
+        MISSING,
+        "the link, whose frame is at the point or on the surface of contact; the centre of the "
+        "foot if it has a radius",
+    )
+    kind: str = setting(
+        "point", "point, which transmits a force, or surface, which also transmits a moment"
+    )
+    measured: tuple[str, ...] = setting(
+        (),
+        "components of the wrench of the ground on the link that logs have as wrench_fz_<link>, of "
+        "fx to mz, with the axes of the world and the origin of the link; the others are unknown",
+    )
+    always: bool = setting(
+        False,
+        "whether it always touches the ground (true if all components are measured); else logs "
+        "have contact_<link>, 1 or 0, or it is found",
+    )
+    radius: float = setting(
+        0.0, "of a ball that rolls on level ground: its ground is this far below the frame [m]"
+    )
+    uncertainty: float | None = setting(
+        None,
+        "standard deviation of the point of contact along each axis [m], an error of the "
+        "intervals; estimated from the logs if not stated",
+    )
+    axes: str = setting(
+        "world",
+        "axes of the components: world, or link, as a sensor in it measures",
+        dump=lambda axes: None if axes == "world" else axes,
+    )
+    threshold: float | None = setting(
+        None, "force above which it touches the ground [N], if contact_<link> is a force"
+    )
 
     sizes: ClassVar[dict[str, int]] = {"point": 3, "surface": 6}
     components: ClassVar[tuple[str, ...]] = ("fx", "fy", "fz", "mx", "my", "mz")
@@ -76,7 +89,7 @@ class Contact:
                 f"uncertainty of the contact {self.frame!r} is {length:g}, wanted a length [m], at "
                 "least 0"
             )
-        check_fields(self, "axes")
+        require_kind(self.axes, str, "axes of a contact", "'world' or 'link'")
         if self.axes not in ("world", "link"):
             raise SettingsError(
                 f"axes of the contact {self.frame!r} is {self.axes!r}, wanted 'world' or 'link'"
@@ -124,19 +137,18 @@ class Contact:
 
 
 @dataclass(frozen=True)
-class Loop:
-    """Two links that are connected at all samples, which closes a kinematic chain.
+class Loop(Settings):
+    """Two links that are connected at all samples, which closes a kinematic chain."""
 
-    Attributes:
-        frames: The two links, whose frames have their origins at the connection.
-        kind: "point", a ball joint; "hinge", a revolute joint; or "rigid", no relative motion.
-        axis: Axis of the hinge, the same in the frames of both links, shape (3,). The frames of a
-            rigid connection coincide.
-    """
-
-    frames: tuple[str, str]
-    kind: str = "hinge"
-    axis: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    frames: tuple[str, str] = setting(
+        MISSING, "the two links, whose frames have their origins at the connection"
+    )
+    kind: str = setting(
+        "hinge", "point, a ball joint; hinge, a revolute joint; or rigid, whose frames coincide"
+    )
+    axis: tuple[float, float, float] = setting(
+        (0.0, 0.0, 1.0), "axis of the hinge, the same in the frames of both links"
+    )
 
     sizes: ClassVar[dict[str, int]] = {"point": 3, "hinge": 5, "rigid": 6}
 
@@ -156,24 +168,6 @@ class Loop:
     def name(self) -> str:
         """Name for messages."""
         return " - ".join(self.frames)
-
-    @classmethod
-    def from_dict(cls, table: Mapping[str, Any]) -> "Loop":
-        """Return a loop from plain values, as of ``to_dict``.
-
-        Args:
-            table: Its attributes by name; lists for tuples.
-
-        Raises:
-            SettingsError: If a value is not usable.
-        """
-        plain: dict[str, Any] = {"frames": (), **table}
-        lists = {key: tuple(x) for key, x in plain.items() if isinstance(x, list)}
-        return cls(**{**plain, **lists})
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return plain values for a file."""
-        return {"frames": list(self.frames), "kind": self.kind, "axis": list(self.axis)}
 
     def rows(self, jacobians: Sequence[Array], placement: pin.SE3) -> Array:
         """Return the relative velocity that the loop prevents, per speed, shape (m, nv).
@@ -237,7 +231,7 @@ Constraint = Contact | Loop
 
 
 def _check_kind(constraint: Any, where: str) -> None:  # noqa: ANN401
-    check_fields(constraint, "kind")
+    require_kind(constraint.kind, str, f"kind of {where}", "a word")
     for frame in constraint.frames:
         require_kind(frame, str, "a frame", "the name of a link")
     if constraint.kind not in constraint.sizes:

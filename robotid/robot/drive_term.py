@@ -37,25 +37,16 @@ def linear(z: Array) -> Slope:
 
 @dataclass(frozen=True, slots=True)
 class DriveMotion:
-    """Motion and load of drives; all arrays of one shape, time along the last axis.
+    """Motion and load of drives; all arrays of one shape, time along the last axis."""
 
-    Attributes:
-        q: Positions [rad or m].
-        v: Velocities w [rad/s or m/s].
-        a: Accelerations dw/dt [rad/s^2 or m/s^2].
-        direction: Direction of friction: the signs of w, or smooth values for them [-].
-        load: Joint load torque of the rigid bodies [N m or N].
-        rate: Time derivative of the whole torque [N m/s or N/s].
-        begins: First samples of segments without gaps, bool; None if the samples are not in a
-            sequence: internal states are at their steady value then.
-    """
-
-    q: Array
-    v: Array
-    a: Array
-    direction: Array
-    load: Array
-    rate: Array
+    q: Array  # positions [rad or m]
+    v: Array  # velocities w [rad/s or m/s]
+    a: Array  # accelerations dw/dt [rad/s^2 or m/s^2]
+    direction: Array  # direction of friction: the signs of w, or smooth values for them [-]
+    load: Array  # joint load torque of the rigid bodies [N m or N]
+    rate: Array  # time derivative of the whole torque [N m/s or N/s]
+    # first samples of segments without gaps, bool; None if the samples are not in a sequence:
+    # internal states are at their steady value then
     begins: Array | None = None
 
     def of(self, drive: int | list[int]) -> "DriveMotion":
@@ -67,52 +58,39 @@ class DriveMotion:
 
 @dataclass(frozen=True)
 class DriveTerm(ABC):
-    """One term of a drive's torque, linear in its parameter.
+    """One term of a drive's torque, linear in its parameter."""
 
-    Attributes:
-        data_range: Range of the data, of the quantity that ``guards`` names: q, or abs(v).
-
-    Class attributes:
-        label: Its name in parameters, as ``"elbow.viscous"``.
-        units: Unit of the parameter for a rotary drive, and for a linear one.
-        is_nonnegative: Whether the parameter cannot be negative by physics.
-        highest: Largest parameter of a drive that can move.
-        is_shared: Whether couplings have it too.
-        is_inertia: Whether it multiplies the acceleration and so adds to the mass matrix.
-        is_friction: Whether a job's ``friction`` chooses it; if not, it has a switch of its own.
-        follows_direction: Whether its column contains the direction of friction.
-        has_state: Whether its column depends on more than the current q, v, a and direction.
-        needs_load: Whether its column depends on the torque of its drive.
-        is_measured: Whether it affects the measured torque only, not the motion of the robot.
-        guards: "v" or "q" if its column is constant outside the range of the data, else "".
-        preference: Preference as the name of a base parameter [-].
-        typical: Typical range, for simulated robots.
-        dynamics: Attribute of the URDF's ``<dynamics>`` that states it, or None.
-        part: Its share of a split torque: "friction", "spring" and the like.
-        ends: Smallest and largest value of its shape parameters, by name; -1e9 and 1e9 of others.
-        rising: Names of shape parameters that increase in this order.
-    """
-
+    # range of the data, of the quantity that ``guards`` names: q, or abs(v)
     data_range: tuple[float, float] = ANYWHERE
 
-    label: ClassVar[str] = ""
+    label: ClassVar[str] = ""  # its name in parameters, as ``"elbow.viscous"``
+    # unit of the parameter for a rotary drive, and for a linear one
     units: ClassVar[tuple[str, str]] = ("N m", "N")
-    is_nonnegative: ClassVar[bool] = False
-    highest: ClassVar[float] = np.inf
-    is_shared: ClassVar[bool] = True
+    is_nonnegative: ClassVar[bool] = False  # whether the parameter cannot be negative by physics
+    highest: ClassVar[float] = np.inf  # largest parameter of a drive that can move
+    is_shared: ClassVar[bool] = True  # whether couplings have it too
+    # whether it multiplies the acceleration and so adds to the mass matrix
     is_inertia: ClassVar[bool] = False
+    # whether a job's ``friction`` chooses it; if not, it has a switch of its own
     is_friction: ClassVar[bool] = True
+    # whether its column contains the direction of friction
     follows_direction: ClassVar[bool] = False
+    # whether its column depends on more than the current q, v, a and direction
     has_state: ClassVar[bool] = False
-    needs_load: ClassVar[bool] = False
+    needs_load: ClassVar[bool] = False  # whether its column depends on the torque of its drive
+    # whether it affects the measured torque only, not the motion of the robot
     is_measured: ClassVar[bool] = False
+    # "v" or "q" if its column is constant outside the range of the data, else ""
     guards: ClassVar[str] = ""
-    preference: ClassVar[float] = 1.0
-    typical: ClassVar[tuple[float, float]] = (0.2, 0.9)
+    preference: ClassVar[float] = 1.0  # preference as the name of a base parameter [-]
+    typical: ClassVar[tuple[float, float]] = (0.2, 0.9)  # typical range, for simulated robots
+    # attribute of the URDF's ``<dynamics>`` that states it, or None
     dynamics: ClassVar[str | None] = None
+    # its share of a split torque: "friction", "spring" and the like
     part: ClassVar[str] = "friction"
+    # smallest and largest value of its shape parameters, by name; -1e9 and 1e9 of others
     ends: ClassVar[Mapping[str, tuple[float, float]]] = {}
-    rising: ClassVar[tuple[str, ...]] = ()
+    rising: ClassVar[tuple[str, ...]] = ()  # names of shape parameters that increase in this order
 
     def __post_init__(self) -> None:
         kind = type(self).__name__
@@ -152,15 +130,11 @@ class MemorylessTerm(DriveTerm):
     A law returns a(v) with da/dv, or b(q) with db/dq. Its arguments are the speed or position, and
     up to four shape parameters of the term by their names. It is evaluated on NumPy's arrays and,
     compiled by Numba, on scalars. Regressor, plant and simulations use it.
-
-    Class attributes:
-        speed_law: The law a of the speed, a static method; None: 1.
-        position_law: The law b of the position, likewise.
-        is_loaded: Whether the absolute joint load torque multiplies it, like the direction.
     """
 
-    speed_law: ClassVar[Law | None] = None
-    position_law: ClassVar[Law | None] = None
+    speed_law: ClassVar[Law | None] = None  # the law a of the speed, a static method; None: 1
+    position_law: ClassVar[Law | None] = None  # the law b of the position, likewise
+    # whether the absolute joint load torque multiplies it, like the direction
     is_loaded: ClassVar[bool] = False
 
     @property
@@ -227,18 +201,12 @@ DataRange = Mapping[str, tuple[float, float]]
 
 @dataclass(frozen=True)
 class Shape:
-    """A shape parameter: terms are nonlinear in it.
+    """A shape parameter: terms are nonlinear in it."""
 
-    Attributes:
-        name: Field of the terms.
-        units: Its unit for a rotary drive, and for a linear one.
-        bounds: Search bounds, relative to its reference.
-        of: Its reference: "v", the largest speed in the data, "q", the range of positions; "": 1.
-    """
-
-    name: str
-    units: tuple[str, str]
-    bounds: tuple[float, float]
+    name: str  # field of the terms
+    units: tuple[str, str]  # its unit for a rotary drive, and for a linear one
+    bounds: tuple[float, float]  # search bounds, relative to its reference
+    # its reference: "v", the largest speed in the data, "q", the range of positions; "": 1
     of: str = ""
 
     def within(self, data_range: DataRange) -> tuple[float, float]:
@@ -253,35 +221,24 @@ class Shape:
 
 @dataclass(frozen=True)
 class Family:
-    """Terms that are chosen together, with their common shape parameters.
+    """Terms that are chosen together, with their common shape parameters."""
 
-    Attributes:
-        name: Its name in a job's ``friction``.
-        meaning: Its description in a finding.
-        make: Returns the terms from the ranges of the data and the shape parameters.
-        shapes: Its shape parameters.
-        needs: Range of positions that the motion must cover, in revolutions; 0: any.
-        is_automatic: Whether ``friction = "auto"`` tries it.
-        code: Code of the finding that a model lacks it; empty: residuals are not tested for it.
-        tested: Shape parameters of the test; speeds relative to their root mean square.
-        instead: Families advised where the joint moved less than this one needs.
-        advice: Advice in addition to adding it to the model; empty if none.
-        has_size: Whether its parameter is its size in a finding; else the RMS of its torque.
-        is_imitated: Whether stiction at reversals, after the filter, resembles it: its finding is
-            a note then.
-    """
-
-    name: str
-    meaning: str
+    name: str  # its name in a job's ``friction``
+    meaning: str  # its description in a finding
+    # returns the terms from the ranges of the data and the shape parameters
     make: Callable[..., tuple[DriveTerm, ...]]
-    shapes: tuple[Shape, ...] = ()
-    needs: float = 0.0
-    is_automatic: bool = False
+    shapes: tuple[Shape, ...] = ()  # its shape parameters
+    needs: float = 0.0  # range of positions that the motion must cover, in revolutions; 0: any
+    is_automatic: bool = False  # whether ``friction = "auto"`` tries it
+    # code of the finding that a model lacks it; empty: residuals are not tested for it
     code: str = ""
+    # shape parameters of the test; speeds relative to their root mean square
     tested: tuple[tuple[float, ...], ...] = ((),)
-    instead: tuple[str, ...] = ()
-    advice: str = ""
+    instead: tuple[str, ...] = ()  # families advised where the joint moved less than this one needs
+    advice: str = ""  # advice in addition to adding it to the model; empty if none
+    # whether its parameter is its size in a finding; else the RMS of its torque
     has_size: bool = False
+    # whether stiction at reversals, after the filter, resembles it: its finding is a note then
     is_imitated: bool = False
 
     def tested_terms(self, speed: float) -> tuple[DriveTerm, ...]:

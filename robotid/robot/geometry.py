@@ -34,40 +34,26 @@ _HOUSINGS = 0.1  # of the robot's length, for the parts of a body beyond its joi
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """Triangles of one colour.
+    """Triangles of one colour."""
 
-    Attributes:
-        vertices: Corners, shape (V, 3) [m].
-        faces: Triangles as indices of corners, shape (F, 3).
-        rgba: Colour, shape (4,), 0 to 1; None if the file states none.
-        is_closed: Whether it is known to be closed, together with the other colours of its file.
-    """
-
-    vertices: Array
-    faces: Array
-    rgba: tuple[float, ...] | None
+    vertices: Array  # corners, shape (V, 3) [m]
+    faces: Array  # triangles as indices of corners, shape (F, 3)
+    rgba: tuple[float, ...] | None  # colour, shape (4,), 0 to 1; None if the file states none
+    # whether it is known to be closed, together with the other colours of its file
     is_closed: bool = False
 
 
 @dataclass(frozen=True, eq=False)
 class Shape:
-    """One ``<visual>`` or ``<collision>`` of a link.
+    """One ``<visual>`` or ``<collision>`` of a link."""
 
-    Attributes:
-        link: Name of the link.
-        placement: Pose in the link's frame, shape (4, 4).
-        kind: "mesh", "box", "cylinder" or "sphere"; "" if it is another one or not valid.
-        size: Scale of a mesh [-]; edges of a box, radius and length of a cylinder, radius of a
-            sphere [m].
-        file: File name of the mesh in the URDF; empty if it is not a mesh.
-        rgba: Colour that the URDF states, shape (4,), 0 to 1; None if it states none.
-    """
-
-    link: str
-    placement: Array
-    kind: str
+    link: str  # name of the link
+    placement: Array  # pose in the link's frame, shape (4, 4)
+    kind: str  # "mesh", "box", "cylinder" or "sphere"; "" if it is another one or not valid
+    # scale of a mesh [-]; edges of a box, radius and length of a cylinder, radius of a sphere [m]
     size: tuple[float, ...]
-    file: str
+    file: str  # file name of the mesh in the URDF; empty if it is not a mesh
+    # colour that the URDF states, shape (4,), 0 to 1; None if it states none
     rgba: tuple[float, ...] | None
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from robotid.base.arguments import checked
+from robotid.base.arguments import real_numbers
 from robotid.base.exceptions import DataError, ModelError, SettingsError
 from robotid.base.findings import listed
 from robotid.base.native_messages import caught_messages
@@ -287,7 +287,6 @@ class RobotModel:
         inertial = [inertia.toDynamicParameters() for inertia in self.pin_model.inertias[1:]]
         return np.concatenate([*inertial, np.zeros(len(self.layout.drive_names))])
 
-    @checked()
     def with_terms(self, own: Mapping[str, Sequence[DriveTerm]]) -> "RobotModel":
         """Return the same robot with other terms of single drives, and no reference.
 
@@ -297,16 +296,21 @@ class RobotModel:
         Raises:
             SettingsError: If a name is not that of a drive.
         """
-        by_drive = {name: tuple(terms) for name, terms in own.items() if terms}
+        require_kind(own, Mapping, "own", "a table of drive terms")
+        by_drive = {
+            name: tuple(require_each(terms, DriveTerm, f"own of {name!r}", "drive terms"))
+            for name, terms in own.items()
+            if terms
+        }
         return replace(self, layout=replace(self.layout, own=by_drive), reference=None)
 
-    @checked()
     def with_gravity(self, gravity: Array) -> "RobotModel":
         """Return the same robot under another gravity.
 
         Args:
             gravity: In the root link's frame, shape (3,) [m/s^2].
         """
+        gravity = real_numbers(gravity, "gravity")
         if gravity.shape != (3,):
             raise DataError(f"gravity has shape {gravity.shape}, wanted (3,)")
         pin_model = self.pin_model.copy()
@@ -321,7 +325,6 @@ class RobotModel:
         """
         return replace(self, reference=pi)
 
-    @checked()
     def with_parameters(self, pi: Array) -> "RobotModel":
         """Return the same robot with other inertial parameters.
 
@@ -334,7 +337,7 @@ class RobotModel:
         Raises:
             DataError: If pi has another length, or a value that is not finite or not below 1e30.
         """
-        size = self.layout.n_inertial
+        pi, size = real_numbers(pi, "pi"), self.layout.n_inertial
         if pi.shape not in ((size,), (len(self.layout.names),)):
             raise DataError(f"pi has shape {pi.shape}, wanted ({len(self.layout.names)},)")
         for i in np.flatnonzero(~(np.abs(pi[:size]) <= _MOST)).tolist():
@@ -345,7 +348,6 @@ class RobotModel:
             copy.inertias[i + 1] = _inertia(values)
         return replace(self, pin_model=copy)
 
-    @checked()
     def configurations(self, q: Array) -> Array:
         """Return Pinocchio's configurations from joint coordinates.
 
@@ -358,7 +360,7 @@ class RobotModel:
         Raises:
             DataError: If q has another width, is not finite, or a quaternion is not of length 1.
         """
-        base = 7 if self.free_flyer else 0
+        base, q = 7 if self.free_flyer else 0, real_numbers(q, "q")
         wanted = base + len(self.joints)
         if q.ndim != 2 or q.shape[1] != wanted:
             raise DataError(f"q has shape {q.shape}, wanted (N, {wanted})")

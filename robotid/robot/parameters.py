@@ -1,7 +1,7 @@
 """Names and order of the standard parameters, pseudo-inertia, physical consistency."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import MISSING, dataclass, field
 from functools import cache, cached_property
 from numbers import Real
 
@@ -9,7 +9,14 @@ import numpy as np
 
 from robotid.base.exceptions import DataError, SettingsError
 from robotid.base.findings import listed
-from robotid.base.settings import require_each, require_flag, require_kind
+from robotid.base.settings import (
+    Entries,
+    Settings,
+    require_each,
+    require_flag,
+    require_kind,
+    setting,
+)
 from robotid.base.typing import Array
 from robotid.robot.drives import DRIVE_TERMS, TERMS, DriveTerm
 from robotid.robot.urdf_text import LARGEST
@@ -22,23 +29,32 @@ INERTIAL_TERMS = ("m", "mcx", "mcy", "mcz", "Ixx", "Ixy", "Iyy", "Ixz", "Iyz", "
 PAPER_TERMS = ("Ixx", "Ixy", "Ixz", "Iyy", "Iyz", "Izz", "mcx", "mcy", "mcz", "m")
 
 
+def _load_ratios(table: Mapping[str, float]) -> tuple[tuple[str, float], ...]:
+    return tuple((joint, float(ratio)) for joint, ratio in table.items())
+
+
 @dataclass(frozen=True)
-class Coupling:
+class Coupling(Settings):
     """A drive that moves with several joints, at the speed w = sum_j ratio_j v_j.
 
     Its drive terms load each of these joints:
     ``tau_j += ratio_j (Ia dw/dt + Fv w + Fc sign w)``.
-
-    Attributes:
-        name: Name of the drive, used in parameter names.
-        ratios: Pairs of joint name and ratio [-].
-        replaces: Whether it replaces the own drive of the joint with its name, and has an offset
-            then; if not, it is an additional drive.
     """
 
-    name: str
-    ratios: tuple[tuple[str, float], ...]
-    replaces: bool = False
+    name: str = setting(MISSING, "name of the drive, used in parameter names")
+    ratios: tuple[tuple[str, float], ...] = setting(
+        MISSING,
+        "ratio by joint [-]; in Python, pairs",
+        reads=Entries(dict, (int, float)),
+        load=_load_ratios,
+        dump=dict,
+    )
+    replaces: bool = setting(
+        False,
+        "whether it replaces the own drive of the joint with its name, and has an offset then; if "
+        "not, it is an additional drive",
+        dump=lambda replaces: replaces or None,
+    )
 
     def __post_init__(self) -> None:
         wanted = "pairs of a joint's name and a number"
@@ -56,25 +72,20 @@ class ParameterLayout:
 
     Ten inertial parameters per body, then the drive terms joint by joint, then those of each
     coupling (without an offset, unless it replaces the drive of a joint).
-
-    Attributes:
-        bodies: Names of the bodies, one per movable joint (and one for a floating base).
-        joints: Names of the joints that move.
-        terms: The drive terms that are identified, names in ``TERMS`` in its order.
-        couplings: Drives that move several joints.
-        prismatic: Names of the prismatic joints.
-        strokes: Ranges of the prismatic joints with limits, by name [m].
-        own: Further terms of single drives, by the drive's name; they follow the others.
-        passive: Names of the joints without a drive, which have no terms but those in ``own``.
     """
 
+    # names of the bodies, one per movable joint (and one for a floating base)
     bodies: tuple[str, ...]
-    joints: tuple[str, ...]
+    joints: tuple[str, ...]  # names of the joints that move
+    # the drive terms that are identified, names in ``TERMS`` in its order
     terms: tuple[str, ...] = DRIVE_TERMS
-    couplings: tuple[Coupling, ...] = ()
-    prismatic: frozenset[str] = frozenset()
+    couplings: tuple[Coupling, ...] = ()  # drives that move several joints
+    prismatic: frozenset[str] = frozenset()  # names of the prismatic joints
+    # ranges of the prismatic joints with limits, by name [m]
     strokes: Mapping[str, float] = field(default_factory=dict)
+    # further terms of single drives, by the drive's name; they follow the others
     own: Mapping[str, tuple[DriveTerm, ...]] = field(default_factory=dict)
+    # names of the joints without a drive, which have no terms but those in ``own``
     passive: frozenset[str] = frozenset()
 
     def __post_init__(self) -> None:

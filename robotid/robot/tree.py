@@ -35,52 +35,31 @@ _MOST_JOINTS = 300  # memory grows with their square, time with their cube: 2 Gi
 
 @dataclass(frozen=True)
 class Inertial:
-    """The ``<inertial>`` of a link.
+    """The ``<inertial>`` of a link."""
 
-    Attributes:
-        mass: Mass [kg].
-        com: Centre of mass in the link frame [m].
-        rpy: Roll, pitch, yaw of the frame of the inertia [rad].
-        inertia: ixx ixy ixz iyy iyz izz about the centre of mass [kg m^2].
-    """
-
-    mass: float
-    com: tuple[float, ...]
-    rpy: tuple[float, ...]
-    inertia: tuple[float, ...]
+    mass: float  # mass [kg]
+    com: tuple[float, ...]  # centre of mass in the link frame [m]
+    rpy: tuple[float, ...]  # roll, pitch, yaw of the frame of the inertia [rad]
+    inertia: tuple[float, ...]  # ixx ixy ixz iyy iyz izz about the centre of mass [kg m^2]
 
 
 @dataclass(frozen=True)
 class Joint:
-    """One ``<joint>`` of a URDF.
+    """One ``<joint>`` of a URDF."""
 
-    Attributes:
-        name: Its name.
-        type: fixed, revolute, continuous or prismatic.
-        parent: Parent link.
-        child: Child link.
-        lower: Lower position limit [rad or m], -inf if none is stated.
-        upper: Upper position limit [rad or m], inf if none is stated.
-        velocity: Velocity limit [rad/s or m/s], inf if none is stated.
-        effort: Effort limit [N m or N], inf if none is stated.
-        mimic: Name of the joint that it mimics, multiplier [-], offset [rad or m]; or None.
-        xyz: Origin in the parent's frame [m].
-        rpy: Roll, pitch, yaw there [rad].
-        axis: Direction of the joint axis, of any length.
-    """
-
-    name: str
-    type: str
-    parent: str
-    child: str
-    lower: float = -math.inf
-    upper: float = math.inf
-    velocity: float = math.inf
-    effort: float = math.inf
+    name: str  # its name
+    type: str  # fixed, revolute, continuous or prismatic
+    parent: str  # parent link
+    child: str  # child link
+    lower: float = -math.inf  # lower position limit [rad or m], -inf if none is stated
+    upper: float = math.inf  # upper position limit [rad or m], inf if none is stated
+    velocity: float = math.inf  # velocity limit [rad/s or m/s], inf if none is stated
+    effort: float = math.inf  # effort limit [N m or N], inf if none is stated
+    # name of the joint that it mimics, multiplier [-], offset [rad or m]; or None
     mimic: tuple[str, float, float] | None = None
-    xyz: tuple[float, ...] = _ZERO
-    rpy: tuple[float, ...] = _ZERO
-    axis: tuple[float, ...] = (1.0, 0.0, 0.0)
+    xyz: tuple[float, ...] = _ZERO  # origin in the parent's frame [m]
+    rpy: tuple[float, ...] = _ZERO  # roll, pitch, yaw there [rad]
+    axis: tuple[float, ...] = (1.0, 0.0, 0.0)  # direction of the joint axis, of any length
 
     @property
     def is_movable(self) -> bool:
@@ -103,24 +82,15 @@ class Joint:
 
 @dataclass(frozen=True)
 class Tree:
-    """The kinematic tree of a URDF.
+    """The kinematic tree of a URDF."""
 
-    Attributes:
-        path: File it was read from.
-        name: Name of the robot.
-        root: Link that no joint moves.
-        links: Names of the links, in the file's order.
-        joints: The joints, in the file's order.
-        inertials: The ``<inertial>`` of each link that has one, by its name.
-        robot: The parsed ``<robot>``, for elements that the dynamics do not need.
-    """
-
-    path: str
-    name: str
-    root: str
-    links: tuple[str, ...]
-    joints: tuple[Joint, ...]
-    inertials: Mapping[str, Inertial]
+    path: str  # file it was read from
+    name: str  # name of the robot
+    root: str  # link that no joint moves
+    links: tuple[str, ...]  # names of the links, in the file's order
+    joints: tuple[Joint, ...]  # the joints, in the file's order
+    inertials: Mapping[str, Inertial]  # the ``<inertial>`` of each link that has one, by its name
+    # the parsed ``<robot>``, for elements that the dynamics do not need
     robot: ET.Element = field(repr=False, compare=False)
 
     def __getstate__(self) -> dict[str, Any]:

@@ -17,8 +17,9 @@ import pytest
 from helpers.paths import ROOT
 from helpers.synthetic import exact_log, truth
 
+from robotid.base.findings import Finding
 from robotid.base.typing import STAGES
-from robotid.cli import compare, doctor, main
+from robotid.cli import doctor, main
 from robotid.data.files.read import write_log
 from robotid.robot.model import RobotModel
 
@@ -117,10 +118,11 @@ def test_inspect_says_what_it_found_first_and_a_missing_file_once(tmp_path, caps
 
 
 def finding(joint, code, share, severity="warning"):
-    message = f"run.csv: {share:g} % of {joint}'s torque is odd"
-    evidence = {"share": share / 100}
-    return {"code": code, "severity": severity, "where": f"run.csv: {joint}", "message": message,
-            "evidence": evidence}  # fmt: skip
+    odd = Finding(
+        code, severity, f"run.csv: {joint}", "", {"share": share / 100}, log="run.csv",
+        joints=(joint,), words={"joint": joint}, fault="{share:.0f %} of {joint}'s torque is odd",
+    )  # fmt: skip
+    return odd.reworded()
 
 
 def test_findings_are_told_by_cause_and_the_worst_joint_is_named(capsys):
@@ -130,15 +132,14 @@ def test_findings_are_told_by_cause_and_the_worst_joint_is_named(capsys):
         *(finding(joint, "odd", share) for joint, share in (("arm_6", 37), ("arm_7", 68))),
         finding("arm_1", "noise", 1, "note"),
     ]
-    content = {"findings": findings, "joints": joints}
-    doctor._show(content, is_verbose=False, count=2)
+    doctor._show(findings, joints, {}, is_verbose=False, count=2)
     assert capsys.readouterr().out.splitlines() == [
         "warning: stepped: run.csv: 20 % of arm_6, arm_7's torque is odd",
         "warning: odd: run.csv: 37 to 68 % of arm_6, arm_7's torque is odd",
         "2 findings, 2 causes; worst: arm_7; 1 note hidden (--verbose)",
     ]
     findings.append(finding("arm_1", "reversed", 1, "error"))  # graver than any two warnings
-    doctor._show(content, is_verbose=True, count=2)
+    doctor._show(findings, joints, {}, is_verbose=True, count=2)
     lines = capsys.readouterr().out.splitlines()
     assert lines[0] == "error: reversed: run.csv: 1 % of arm_1's torque is odd"
     assert lines[-2:] == [
@@ -148,30 +149,8 @@ def test_findings_are_told_by_cause_and_the_worst_joint_is_named(capsys):
     wrong = [finding("arm_6", code, 1, "error") for code in ("one", "two")]
     wrong += [finding("arm_7", code, 9) for code in ("three", "four")]
     wrong.append(finding("arm_7", "five", 9, "error"))
-    doctor._show({"findings": wrong, "joints": joints}, is_verbose=False, count=2)
+    doctor._show(wrong, joints, {}, is_verbose=False, count=2)
     assert capsys.readouterr().out.splitlines()[-1].endswith("worst: arm_6"), "two errors"
-
-
-def test_compare_shows_the_largest_differences_and_fits_eighty_columns(monkeypatch, capsys):
-    monkeypatch.setenv("COLUMNS", "80")
-    entry = {"values": [-1.2345e-5, 1.3], "std_errors": [0.012, 0.12], "unit": "N m s/rad"}
-    name = "shoulder_lift_joint.harmonic2_cos"
-    result = {"label": "A", "verdict": {"status": "good"}, "estimator": "consistent"}
-    content = {
-        "results": [result | {"path": "folder/" * 12 + "result.json"}] * 2,
-        "notes": ["another robot"], "fitted_alike": True, "validation": [], "fitted": [],
-        "base_parameters": [
-            entry | {"name": f"{name}_{k}", "differences": [20.0 - k]} for k in range(15)
-        ],
-        "settings": [], "versions": [], "inputs": [], "changes": [], "findings": [],
-    }  # fmt: skip
-    compare._show(content)
-    lines = capsys.readouterr().out.splitlines()
-    assert max(len(line) for line in lines if "folder/" not in line) <= 80
-    assert [line.split()[0] for line in lines if name in line] == [f"{name}_{k}" for k in range(12)]
-    assert lines[-1] == "  3 more with smaller differences: --verbose"
-    compare._show(content, is_verbose=True)
-    assert f"{name}_14" in capsys.readouterr().out
 
 
 CLOSED = {"no output": ">&-", "no errors": "2>&-", "neither": ">&- 2>&-"}

@@ -52,19 +52,6 @@ def test_a_bag_becomes_a_table_of_standard_names(tmp_path, log, bag, suffix):
     assert_same(read_log(target, JOINTS), log)
 
 
-def test_commands_are_kept_under_their_standard_names(tmp_path, log):
-    names = {"q": log.q, "q_des": log.q + 1, "qd_cmd": log.v, "loadsize": log.tau}
-    table = {f"{start}_{j}": x[:, k] for start, x in names.items() for k, j in enumerate(JOINTS)}
-    write_columns({"time": log.t, **table}, tmp_path / "run.parquet")
-    done = convert(tmp_path / "run.parquet", tmp_path / "run.csv")
-    standard = [f"{kind}_{joint}" for kind in ("q", "qref", "dqref") for joint in JOINTS]
-    assert done.columns == ("time", *standard)
-    assert done.ignored == ("loadsize_shoulder", "loadsize_elbow")
-    back = read_log(tmp_path / "run.csv", JOINTS, needs="commands")
-    np.testing.assert_array_equal(back.q_ref, log.q + 1)
-    np.testing.assert_array_equal(back.v_ref, log.v)
-
-
 def test_joints_are_chosen_renamed_and_effort_may_be_current(tmp_path, log, bag):
     source = LogSource(topic="/arm", joints={"joint_2": "elbow"}, effort="current")
     done = convert(bag, tmp_path / "run.csv", joints=["joint_2"], source=source)

@@ -72,11 +72,7 @@ def robotid(*words, **where):
 
 @pytest.mark.parametrize(
     ("words", "code"),
-    [
-        (["--help"], 0),
-        (["inspect", URDF, "--json"], 0),
-        (["doctor", URDF, "{zeros}"], 1),
-    ],
+    [(["--help"], 0), (["inspect", URDF, "--json"], 0), (["doctor", URDF, "{zeros}"], 1)],
     ids=["help", "json", "doctor"],
 )
 def test_a_reader_that_leaves_is_no_error_and_hides_none(log, tmp_path, words, code):

@@ -67,10 +67,7 @@ def test_a_motion_is_designed_written_and_told(designed):
         (["--seconds", "0"], "seconds is 0.0, wanted 0.001 or more s"),
         (["--seed", "-1"], "seed is -1, wanted 0 or a positive whole number"),
         (["--floor", "1e300"], "floor is 1e+300, wanted at most 1000 m"),
-        (
-            ["--max-jerk", "wrist_1_joint=1e300"],
-            "jerk of 'wrist_1_joint' is 1e+300, wanted",
-        ),
+        (["--max-jerk", "wrist_1_joint=1e300"], "jerk of 'wrist_1_joint' is 1e+300, wanted"),
         (["--box", "post=0,0,0,1,1,nan"], "the lower and the upper corner [m], within 1000 m"),
         (["--criterion", "widest"], "criterion is widest, which needs an earlier result"),
     ],
@@ -81,60 +78,6 @@ def test_bad_flags_are_refused_before_anything_is_written(tmp_path, capsys, word
     assert main([*own, "--out", str(tmp_path / "m.csv")]) == 2
     assert message in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
-
-
-def test_sweeps_say_what_they_use_of_jerk_and_refuse_what_is_too_little(tmp_path, capsys):
-    words = [*WORDS, "--kind", "sweeps", "--clearance", "none", "--json"]
-    words += ["--out", str(tmp_path / "m.csv"), "--points", "100", "--max-jerk"]
-    assert main([*words, "wrist_2_joint=1000"]) == 0
-    content = json.loads(capsys.readouterr().out)
-    columns = open_table(tmp_path / "m.csv", LogSource()).read(["time", "ddq_wrist_2_joint"])
-    jerk = np.gradient(columns["ddq_wrist_2_joint"], columns["time"])
-    used = 1.0 - content["limits"]["jerk"]["margin"]
-    assert used == pytest.approx(np.abs(jerk).max() / 1000, rel=0.05)
-    assert content["seconds"] > 0.0
-    (tmp_path / "m.csv").unlink()
-    assert main([*words, "wrist_2_joint=20"]) == 2
-    assert "wrist_2_joint needs " in (said := capsys.readouterr().err)
-    assert f"{100 * used * 50:.0f} % of its jerk limit at " in said
-    assert not list(tmp_path.iterdir())
-
-
-def test_a_payload_is_found_by_a_motion_of_the_few_joints_that_show_it(tmp_path, capsys):
-    robot, motion = str(example_urdf("ur10_robot.urdf")), str(tmp_path / "motion.parquet")
-    words = ["--kind", "payload", "--mass", "2", "--com", "0.02,0.01,0.05", "--harmonics", "3",
-             "--duration", "5", "--starts", "1", "--seconds", "0.5",
-             "--clearance", "none"]  # fmt: skip
-    page = ["--report", str(tmp_path / "motion.html")]
-    assert main(["excite", robot, "--out", motion, "--json", *words, *page]) == 0
-    told = json.loads(capsys.readouterr().out)["payload"]
-    assert told["moving"] == WRIST
-    columns = open_table(tmp_path / "motion.parquet", LogSource()).read(
-        ["q_elbow_joint", "q_wrist_2_joint"]
-    )
-    assert np.ptp(columns["q_elbow_joint"]) == 0.0
-    assert told["resting"]["elbow_joint"] == pytest.approx(columns["q_elbow_joint"][0])
-    assert (
-        "For a payload on wrist_3_link, wrist_1_joint, wrist_2_joint, wrist_3_joint move;"
-        in (tmp_path / "motion.html").read_text()
-    )
-    plant = tmp_path / "plant.toml"
-    plant.write_text(
-        "[payload]\nmass = 2.0\ncom = [0.02, 0.01, 0.05]\n"
-        "inertia = [0.02, 0.0, 0.025, 0.0, 0.0, 0.015]\n"
-    )
-    logs = [str(tmp_path / name) for name in ("loaded.parquet", "bare.parquet")]
-    for log, own in zip(logs, (["--plant", str(plant)], []), strict=True):
-        noisy = ["--rate", "200", "--torque-noise", "0.02", "--perturb", "0.1", "--seed", "3"]
-        noisy += ["--controller", "perfect"]
-        assert main(["simulate", robot, motion, "--out", log, *noisy, *own, "--json"]) == 0
-    capsys.readouterr()
-    assert main(["payload", robot, logs[0], "--reference", logs[1], "--json"]) == 0
-    found = json.loads(capsys.readouterr().out)["payloads"][0]
-    low, high = found["mass_interval"]
-    assert low < 2.0 < high < low + 0.6
-    error = np.subtract(found["com"], [0.02, 0.01, 0.05])
-    assert (np.abs(error) < 3 * np.array(found["com_std_error"])).all()
 
 
 def test_after_a_result_a_motion_is_made_for_what_it_knows_the_least(tmp_path, capsys):

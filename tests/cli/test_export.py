@@ -3,10 +3,8 @@
 import json
 import shutil
 
-import mujoco
 import numpy as np
 import pytest
-import yaml
 from helpers.paths import URDF
 from helpers.synthetic import exact_log, truth
 
@@ -14,9 +12,7 @@ import robotid
 from robotid.cli import main
 from robotid.cli.identify import run_job
 from robotid.cli.job import read_job
-from robotid.output.files.urdf import load_identified
 from robotid.robot.model import RobotModel
-from robotid.robot.urdf_text import read_with_yourdfpy
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +31,7 @@ def result(tmp_path_factory):
     log = exact_log(model, truth(model), rng, samples=400, noise=0.1)
     robotid.write_log(log, folder / "first.csv")
     (folder / "job.toml").write_text(
-        f'urdf = "{urdf}"\n[estimator]\ndraws = 0\n[[identification]]\nlog = "first.csv"\n'
+        f'urdf = "{urdf}"\n[[identification]]\nlog = "first.csv"\n'
     )
     run_job(read_job(folder / "job.toml"), folder / "out")
     return folder / "out"
@@ -44,49 +40,6 @@ def result(tmp_path_factory):
 def export(result, kind, target, capsys, *flags):
     code = main(["export", str(result), "--format", kind, "--out", str(target), *flags])
     return code, *capsys.readouterr()
-
-
-def test_each_format_is_written_and_what_it_does_not_state_is_said(result, tmp_path, capsys):
-    wanted = robotid.load_result(result)
-    values = dict(zip(wanted.robot.layout.names, wanted.parameters, strict=True))
-    masses = [values["link_1.m"], values["link_2.m"]]
-
-    code, out, _ = export(result, "urdf", tmp_path / "a.urdf", capsys)
-    assert code == 0
-    lines = out.splitlines()
-    assert lines[0] == f"written: {tmp_path / 'a.urdf'}, {tmp_path / 'a.drive.json'}"
-    has_place = [f"{j}.{t}" for j in ("joint_1", "joint_2") for t in ("armature", "offset")]
-    missing = ", ".join(name for name in has_place if values[name])
-    said = " ".join(line.strip() for line in lines[1:])
-    assert said == f"URDF cannot state {missing}; the drive parameters file of the URDF has them"
-    dynamics = read_with_yourdfpy(tmp_path / "a.urdf").joints[-1].dynamics
-    assert float(dynamics.damping) == values["joint_2.viscous"]
-    _, again = load_identified(tmp_path / "a.urdf", tmp_path / "a.drive.json")
-    np.testing.assert_allclose(again, wanted.parameters, rtol=1e-9, atol=1e-12)
-
-    code, out, _ = export(result / "result.json", "mjcf", tmp_path / "a.xml", capsys, "--json")
-    assert code == 0
-    assert json.loads(out) == {
-        "result": str(result / "result.json"),
-        "format": "mjcf",
-        "files": [str(tmp_path / "a.xml")],
-        "not_stated": ["meshes not exported, missing or in a format that MJCF cannot read: no.dae"],
-        "projected": {},
-    }
-    robot = mujoco.MjModel.from_xml_path(str(tmp_path / "a.xml"))
-    np.testing.assert_allclose(robot.body_mass[-2:], masses, rtol=1e-12)
-    assert robot.nmesh == 1  # found beside the URDF that was identified
-
-    code, out, _ = export(result, "sdf", tmp_path / "a.sdf", capsys)
-    assert code == 0
-    assert "joint_2.offset" in out
-    assert f"<mass>{float(masses[1])!r}</mass>" in (tmp_path / "a.sdf").read_text()
-
-    code, out, _ = export(result, "ranges", tmp_path / "a.yaml", capsys)
-    assert (code, out) == (0, f"written: {tmp_path / 'a.yaml'}\n")
-    read = yaml.safe_load((tmp_path / "a.yaml").read_text())
-    nominal = [read["bodies"][link]["mass"]["nominal"] for link in ("link_1", "link_2")]
-    np.testing.assert_allclose(nominal, masses, rtol=1e-5)
 
 
 def test_a_result_that_must_not_be_used_is_not_exported(result, tmp_path, capsys):

@@ -19,7 +19,6 @@ from robotid.output.files.result_file import load_result, stated_scale_check
 from robotid.output.report.next_steps import next_steps
 from robotid.output.report.steps import Origin
 from robotid.robot.bodies import link_transfer
-from robotid.robot.drives import Tanh
 from robotid.robot.examples import example_urdf
 
 LOAD = np.array([2.0, 0.04, 0.06, 0.2, 0.06, 0.0, 0.06, 0.0, 0.0, 0.03])
@@ -78,7 +77,7 @@ def test_a_log_and_a_result_are_references_alike(files, capsys):
 
 def test_a_job_states_a_check_of_the_scale_which_its_result_has(files):
     table = {
-        "urdf": ARM, "identification": [{"log": "bare.csv"}], "estimator": {"draws": 0},
+        "urdf": ARM, "identification": [{"log": "bare.csv"}],
         "model": {"friction": "viscous+coulomb"}, "output": {"report": False},
         "payload_check": [
             {"log": "loaded.csv", "mass": 1.8, "link": "tool0", "end": 3.0},
@@ -163,39 +162,3 @@ def test_what_is_missing_is_named(files, capsys):
     finally:
         bare.write_bytes(content)
     assert "is missing or was changed; give a log without the payload" in said
-
-
-def test_friction_that_the_reference_shows_is_that_of_the_payload_s_logs(upright, tmp_path, capsys):
-    """A drive with a slope at rest: viscous and Coulomb's alone leave ten times the error."""
-    model = upright.with_terms({"joint_1": [Tanh(speed=0.3)]})
-    bare, rng = truth(model), np.random.default_rng(3)
-    bare[model.layout.names.index("joint_1.tanh")] = 8.0
-    loaded = bare.copy()
-    loaded[10:20] += [2.0, 0.4, 0.1, 0.0, 0.05, 0.0, 0.1, 0.0, 0.0, 0.1]  # of link_2
-    gains = np.array([3.0, 7.0])  # [N m/A]
-    for name, pi in {"bare": bare, "loaded": loaded}.items():
-        log = exact_log(model, pi, rng, samples=800, rate=100.0, noise=0.05)
-        write_log(log, tmp_path / f"{name}.csv")
-        columns = {"time": log.t}
-        for j, joint in enumerate(model.joints):
-            columns |= {f"q_{joint}": log.q[:, j], f"current_{joint}": log.tau[:, j] / gains[j]}
-        write_columns(columns, tmp_path / f"{name}_currents.csv")
-
-    def found(kind, *words):
-        logs = [str(tmp_path / f"{name}{kind}.csv") for name in ("loaded", "bare")]
-        command = ["payload", model.tree.path, logs[0], "--reference", logs[1], *words, "--json"]
-        assert main(command) == 0
-        return json.loads(capsys.readouterr().out)
-
-    chosen, plain = found(""), found("", "--friction", "viscous+coulomb")
-    (payload,), (other,) = chosen["payloads"], plain["payloads"]
-    assert payload["mass"] == pytest.approx(2.0, abs=3 * payload["mass_std_error"])
-    assert payload["mass_std_error"] < 0.2 * other["mass_std_error"]
-    missed = [content["relative_error_pct"]["joint_1"] for content in (chosen, plain)]
-    assert missed[0] < 0.2 < 1.0 < missed[1]
-    scaled = found("_currents", "--gains", "--mass", "2")["gains"]
-    one = found("_currents", "--gains", "--mass", "2", "--gain", "joint_2=7")["gains"]
-    assert (list(scaled), list(one)) == (["joint_1", "joint_2"], ["joint_1"])
-    for gain, true in ((scaled["joint_1"], 3.0), (scaled["joint_2"], 7.0), (one["joint_1"], 3.0)):
-        assert gain["gain"] == pytest.approx(true, abs=4 * gain["std_error"])
-        assert gain["std_error"] < 0.02 * true

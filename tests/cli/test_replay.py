@@ -116,23 +116,6 @@ def test_the_urdf_with_drives_is_rnea_and_drive_terms(identified, monkeypatch):
         np.testing.assert_allclose(found[used], wanted, atol=np.ptp(wanted) / 60_000)
 
 
-def test_a_joint_that_stands_still_has_no_prediction(folder):
-    text = (folder / "log.csv").read_text().splitlines()
-    names, last = text[0].split(","), text[-1].split(",")
-    held = ["0" if name.startswith("d") else x for name, x in zip(names, last, strict=True)]
-    still = [",".join([f"{15 + k / 100:.2f}", *held[1:]]) for k in range(300)]
-    (folder / "still.csv").write_text("\n".join([*text, *still]) + "\n")
-    _, data = run(folder, folder / "still.csv", folder / "out")
-    torques = data["torques"]
-    rest = (torques["t"] > 16.0) & (torques["t"] < 17.0)
-    assert np.isfinite(torques["values"][rest, :6]).all()
-    assert np.isnan(torques["values"][rest, 6:12]).all()
-    strip = torques["strips"][0]  # of 18 s
-    bins = len(strip)
-    assert (strip[16 * bins // 18 + 1 : 17 * bins // 18] == 65_534).all()
-    assert (strip[5 * bins // 18 : 10 * bins // 18] < 65_000).mean() > 0.8
-
-
 def test_torque_that_the_result_does_not_explain_is_marked(folder):
     header, *rows = (folder / "log.csv").read_text().splitlines()
     pushed = header.split(",").index("tau_elbow_joint")
@@ -168,23 +151,6 @@ def test_a_track_gives_parameters_over_time_and_marks_the_load(panda, tmp_path, 
     assert data["bands"]["names"] == [entry["name"] for entry in entries]
     wanted = [e["value"] for e in entries] + [e["std_error"] for e in entries]
     np.testing.assert_allclose(data["bands"]["values"][-1], wanted, rtol=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("name", "content", "message"),
-    [
-        ("lost.json", None, "there is no result '.*lost.json'"),
-        ("other.json", '{"schema_version": 7}', r"other\.json has schema_version 7, wanted 1"),
-        ("text.json", "oh", r"text\.json is not JSON"),
-    ],
-)
-def test_what_is_no_result_is_refused(tmp_path, name, content, message, folder, capsys):
-    if content is not None:
-        (tmp_path / name).write_text(content)
-    assert run(folder, folder / "log.csv", tmp_path / name)[0] == 1
-    import re
-
-    assert re.search(message, capsys.readouterr().err)
 
 
 def test_a_base_is_where_the_log_says_or_said_to_be_held(tmp_path, capsys):

@@ -11,10 +11,8 @@ import pytest
 from helpers.paths import ROOT
 
 from robotid.base.exceptions import SettingsError
-from robotid.cli import main
-from robotid.cli.job import Job, job_from_settings
+from robotid.cli.job import job_from_settings
 from robotid.cli.schema import job_schema
-from robotid.estimation.fitting.estimator_settings import ESTIMATORS
 
 JOBS = sorted((ROOT / "tests/jobs").rglob("*.toml"))
 LOG = {"log": "run.csv"}
@@ -55,28 +53,6 @@ def test_what_a_job_refuses_is_invalid(check, wrong):
         check(job | wrong)
     with pytest.raises(SettingsError):
         job_from_settings(job | wrong, "job.toml", Path())
-
-
-def test_each_key_says_what_it_is_and_the_robot_is_required(capsys):
-    assert main(["schema"]) == 0
-    text = capsys.readouterr().out
-    assert text.startswith('{\n  "')  # a line for each key
-    printed = json.loads(text)
-    assert printed == job_schema()
-    assert printed["required"] == ["urdf"]
-    found = printed["properties"]
-    assert set(found) == set(Job.schema())
-    assert (
-        found["signals"]["properties"]["rate"]["description"] == Job.paths()["signals.rate"].words
-    )
-    start = found["identification"]["items"]["properties"]["start"]
-    assert start == {
-        "type": ["number"],
-        "description": "start of the window in the log's own time [s]",
-    }
-    assert found["estimator"]["properties"]["name"]["enum"] == [*ESTIMATORS]
-    weight = found["estimator"]["properties"]["prior_weight"]
-    assert weight["anyOf"] == [{"enum": ["auto", "cv", "evidence"]}, {"type": ["number"]}]
 
 
 def test_a_shell_is_told_what_may_follow(tmp_path):

@@ -9,8 +9,6 @@ import pytest
 
 from robotid.base.files import file_sha256
 from robotid.cli import main, simulate
-from robotid.cli.job import Job
-from robotid.cli.simulate import _motion
 from robotid.data.files.formats import write_columns
 from robotid.data.files.read import read_log
 from robotid.dynamics.base_parameters import structural_mapping
@@ -234,17 +232,3 @@ def motion_of(path, model):
     """Return instants, positions, velocities and accelerations of a motion's table."""
     log = read_log(path, model.joints, needs="motion")
     return log.t, log.q, log.v, log.a
-
-
-def test_a_motion_passes_its_rows_with_their_speeds_and_accelerations(tmp_path, ur5):
-    t, w = 3.0 + 0.05 * np.arange(41), np.linspace(1.0, 3.0, 6)
-    angle = np.outer(t, w)
-    q, v, a = np.sin(angle), 1.05 * w * np.cos(angle), -0.9 * w**2 * np.sin(angle)
-    columns = {"time": t}
-    for key, values in (("q", q), ("dq", v), ("ddq", a)):
-        columns |= {f"{key}_{joint}": values[:, j] for j, joint in enumerate(ur5.joints)}
-    write_columns(columns, tmp_path / "motion.csv")
-    job = Job(urdf=URDF)
-    found = _motion(job, ur5, tmp_path / "motion.csv", None).evaluate(t - 3.0)
-    for one, stated in zip(found, (q, v, a), strict=True):
-        np.testing.assert_allclose(one, stated, atol=1e-9)

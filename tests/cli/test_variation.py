@@ -9,21 +9,18 @@ import pytest
 from helpers.driven import JOINTS, arm, driven_log
 from helpers.synthetic import truth
 
-from robotid.base.exceptions import DataError, SettingsError
-from robotid.cli import main
+from robotid.base.exceptions import DataError
 from robotid.cli.identify import run_job
 from robotid.cli.job import LogEntry, job_from_settings
 from robotid.cli.logs import survey_logs
-from robotid.cli.preview import preview_job
 from robotid.cli.validate import _show as show_validation
 from robotid.cli.validate import validate
 from robotid.data.files.read import write_log
 from robotid.dynamics.torque import joint_torque_regressor
 from robotid.estimation.fitting.recorded import Recordings
 from robotid.estimation.variation.groups import runs_of, sums_of
-from robotid.estimation.variation.spread import Mixture
 from robotid.estimation.variation.variation import SCORES, vary
-from robotid.output.files.ranges import parameter_ranges, stated_ranges
+from robotid.output.files.ranges import stated_ranges
 from robotid.robot.examples import example_urdf
 
 COULOMB = "shoulder_lift_joint.coulomb"
@@ -37,7 +34,6 @@ def settings(folder, units=()):
     return {
         "urdf": str(example_urdf("ur5_robot.urdf")), "joints": list(JOINTS),
         "locked": {"*": 0.0}, "identification": logs, "model": {"friction": "viscous+coulomb"},
-        "estimator": {"draws": 0},
     }  # fmt: skip
 
 
@@ -88,23 +84,6 @@ def test_result_has_the_variation_of_each_drive_parameter(result, folder):
     assert "spread_within_units" not in entry
 
 
-def test_ranges_stay_possible_and_have_no_ends_at_a_bound(result):
-    found, _ = result
-    ends = np.array([-1.0, 5.0])
-    normal = Mixture(np.ones(1), ends.mean(keepdims=True), np.array([np.ptp(ends) / 3.919928]))
-    each = [replace(x, prediction=replace(x.prediction, mixture=normal))
-            for x in found.variation.parameters]  # fmt: skip
-    wide = replace(found, variation=replace(found.variation, parameters=tuple(each)))
-    drives = parameter_ranges(wide)["drives"]["elbow_joint"]
-    assert (drives["coulomb"]["low"], drives["coulomb"]["high"]) == (0.0, pytest.approx(5.0))
-    assert (drives["offset"]["low"], drives["offset"]["high"]) == pytest.approx((-1.0, 5.0))
-    standard = found.standard.copy()
-    standard[found.model.layout.names.index("elbow_joint.coulomb")] = 0.0
-    drives = parameter_ranges(replace(wide, standard=standard))["drives"]["elbow_joint"]
-    assert drives["coulomb"] == {"nominal": 0.0, "source": "bound", "unit": "N m"}
-    assert drives["viscous"]["source"] == "logs"
-
-
 def spread_of(found, log, count=3000):
     """Return the RMS torque of drawn differences of the parameters, per joint."""
     rng, C = np.random.default_rng(0), found.standard_covariance + found.between
@@ -136,66 +115,6 @@ def test_validation_expects_the_error_of_the_next_log(result, folder, capsys):
         "expected rmse by the fit and spread between logs (share of rows within 95 %): "
         "shoulder_lift_joint 1.23 (95 %)"
     ) in printed
-
-
-def test_preview_adds_the_spread_between_logs(result, folder):
-    found, _ = result
-    log = driven_log(found.model, truth(found.model), 9, duration=6.0)
-    write_log(log, folder / "next.csv")
-    job = job_from_settings(
-        {**settings(folder), "identification": [{"log": str(folder / "next.csv")}]}, "j", folder
-    )
-    given = folder / "out" / "result.json"
-    wide = preview_job(job, str(given))["torque"]
-    bare = json.loads(given.read_text())
-    del bare["variation"]
-    other = folder / "bare"
-    other.mkdir()
-    for file in given.parent.iterdir():
-        if file.suffix in (".urdf", ".json"):
-            (other / file.name).write_bytes(file.read_bytes())
-    (other / "result.json").write_text(json.dumps(bare))
-    narrow = preview_job(job, str(other))["torque"]
-    K = found.mapping.K
-    W = joint_torque_regressor(found.model, log.q, log.v, log.a)[:, found.mapping.independent]
-    added = np.einsum("ij,jk,ik->i", W, K @ found.between @ K.T, W).reshape(-1, len(JOINTS))
-    for j, joint in enumerate(JOINTS):
-        squares = (wide[joint]["half_width"] ** 2 - narrow[joint]["half_width"] ** 2) / 1.96**2
-        assert squares == pytest.approx(added[:, j].mean(), rel=0.1), joint
-
-
-@pytest.mark.parametrize(
-    ("places", "value"),
-    [
-        ((), 5),
-        (("parameters",), []),
-        (("parameters", COULOMB, "next_interval"), [1.0]),
-        (("parameters", COULOMB, "next_quantiles", 0), 1e9),
-        (("parameters", COULOMB, "std_error"), -1.0),
-        (("parameters", "elbow.warmth"), {}),
-        (("correlation", 0), [1.0]),
-        (("correlation", 0, 0), -1.0),
-        (("sums", "H", 0, 0), -1.0),
-        (("sums", "h"), [[]]),
-        (("sums", "scatter", 0), []),
-        (("sums", "sigma"), []),
-    ],
-    ids=str,
-)
-def test_a_variation_that_was_changed_by_hand_is_refused(
-    result, folder, tmp_path, places, value, capsys
-):
-    shutil.copytree(folder / "out", tmp_path / "out")
-    path = tmp_path / "out" / "result.json"
-    content = json.loads(path.read_text())
-    *rest, last = ("variation", *places)
-    table = content
-    for key in rest:
-        table = table[key]
-    table[last] = value
-    path.write_text(json.dumps(content))
-    assert main(["validate", str(path), str(folder / "run_0.csv")]) == 1
-    assert "variation" in capsys.readouterr().err
 
 
 def changed_log(found, seed, **factors):
@@ -272,70 +191,3 @@ def test_logs_are_added_to_the_variation_without_the_others(result, folder, writ
         validate(file, [written / "more_0.csv"], update=True)
     with pytest.raises(DataError, match=r"run_3.csv, which result.json has already; leave it out"):
         validate(file, [folder / "run_3.csv"], update=True)
-
-
-def test_a_new_log_that_differs_is_named_with_its_cause(result, folder, written, capsys):
-    found, _ = result
-    log = changed_log(found, 13, shoulder_lift_joint__coulomb=5.0)
-    write_log(log, written / "worn.csv")
-    before = (written / "result.json").read_bytes()
-    done = validate(written / "result.json", [written / "worn.csv", written / "more_0.csv"])
-    assert (written / "result.json").read_bytes() == before
-    (finding,) = done["findings"]
-    assert finding["code"] == "unlike_run"
-    assert finding["message"].startswith(f"worn.csv: {COULOMB} is ")
-    assert "; 5 other logs predict " in finding["message"]
-    true = truth(found.model)[found.model.layout.names.index(COULOMB)] * 5.0
-    assert finding["evidence"]["value"] == pytest.approx(true, rel=0.1)
-    assert {
-        "code": "unlike_run",
-        "joint": "",
-        "message": "worn.csv: the log differs from the other logs",
-        "effect": "usable",
-    } in done["verdict"]["warnings"]
-    show_validation(done)
-    assert f"worn.csv: {COULOMB} is " in " ".join(capsys.readouterr().out.split())
-    log = changed_log(found, 15)
-    write_log(replace(log, q=log.q + np.array([0.0, 0.2, 0.0])), written / "slipped.csv")
-    done = validate(written / "result.json", [written / "more_0.csv", written / "slipped.csv"])
-    (finding,) = done["findings"]
-    assert finding["message"].startswith("slipped.csv: the positions of elbow_joint differ by +0.")
-    assert finding["evidence"]["value"] == pytest.approx(0.2, abs=0.05)  # first order
-    content = json.loads(before)
-    content["variation"]["sums"]["unit"] = ["a", "b", "c", "d"]  # of another robot
-    (written / "result.json").write_text(json.dumps(content))
-    done = validate(written / "result.json", [written / "worn.csv"])
-    (finding,) = done["findings"]
-    assert finding["message"].startswith(f"unit worn.csv: {COULOMB} is ")
-
-
-def test_the_robot_of_added_logs_is_stated_if_that_of_others_is(written, capsys):
-    file, log = written / "result.json", str(written / "more_0.csv")
-    content = json.loads(file.read_text())
-    sums = content["variation"]["sums"]
-    assert sums["unit"] == [""] * 4
-    sums["unit"] = ["a", "a", "b", "b"]
-    for entry, unit in zip(content["settings"]["identification"], sums["unit"], strict=True):
-        entry["unit"] = unit
-    file.write_text(json.dumps(content))
-    done = validate(file, [log])["variation"]  # of an unknown robot
-    assert done["units"] == 3
-    with pytest.raises(SettingsError, match=r"more_0.csv has no unit, but run_0.csv has unit = .a"):
-        validate(file, [log], update=True)
-    assert json.loads(file.read_text()) == content
-    assert main(["validate", str(file), log, "--update", "--unit", "b"]) == 0
-    printed = " ".join(capsys.readouterr().out.split())
-    assert "result.json counts these logs now: spread between 5 logs, by joint: coul" in printed
-    variation = json.loads(file.read_text())["variation"]
-    assert variation["units"] == 2
-    assert variation["sums"]["unit"] == ["a", "a", "b", "b", "b"]
-
-
-def test_results_without_sums_cannot_be_updated(written):
-    file = written / "result.json"
-    content = json.loads(file.read_text())
-    del content["variation"]["sums"]
-    file.write_text(json.dumps(content))
-    assert "variation" not in validate(file, [written / "more_0.csv"])
-    with pytest.raises(DataError, match="wanted a result of three or more logs with torques; id"):
-        validate(file, [written / "more_0.csv"], update=True)

@@ -5,7 +5,6 @@ import pytest
 
 from robotid.base.exceptions import DataError, SettingsError
 from robotid.data.log import Log
-from robotid.data.measured_velocity import velocity_lag
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import process, resolve, unwrap
 
@@ -29,14 +28,6 @@ def test_switched_off_the_rows_stay_as_they_were():
     assert out.rate is None
 
 
-def test_measured_acceleration_is_used_with_measured_velocity():
-    t = np.arange(0, 5, 0.01)
-    log = sine_log(t)
-    with_a = Log(t=t, q=log.q, tau=log.tau, joints=log.joints, v=log.v, a=3 * log.q)
-    off = SignalSettings(cutoff=None, trim=0.0)
-    np.testing.assert_array_equal(process(with_a, off).a, 3 * log.q)
-
-
 def test_derivatives_of_a_jittered_sine_are_right():
     rng = np.random.default_rng(0)
     t = np.arange(0, 10, 0.005)
@@ -47,12 +38,6 @@ def test_derivatives_of_a_jittered_sine_are_right():
     np.testing.assert_allclose(np.diff(out.t), 0.005, rtol=1e-9)
     np.testing.assert_allclose(out.v[:, 0], w * np.cos(w * out.t), atol=2e-3)
     np.testing.assert_allclose(out.a[:, 0], -(w**2) * np.sin(w * out.t), atol=2e-2)
-
-
-def test_the_filter_does_not_delay():
-    log = sine_log(np.arange(0, 10, 0.01))
-    out = process(log, SignalSettings(cutoff=5.0))
-    np.testing.assert_allclose(out.tau[:, 0], np.cos(np.pi * out.t), atol=1e-3)
 
 
 def test_noise_above_the_cutoff_is_removed():
@@ -95,32 +80,6 @@ def test_nothing_crosses_a_gap():
     np.testing.assert_allclose(out.v[:, 0], np.pi * np.cos(np.pi * out.t), atol=1e-2)
 
 
-def test_each_end_of_each_stretch_is_trimmed():
-    t = np.concatenate([np.arange(0, 4, 0.01), np.arange(7, 11, 0.01)])
-    out = process(sine_log(t), SignalSettings(trim=0.5))
-    for number, (start, end) in enumerate([(0, 3.99), (7, 10.99)]):
-        rows = out.t[out.segment == number]
-        assert rows[0] == pytest.approx(start + 0.5, abs=0.011)
-        assert rows[-1] == pytest.approx(end - 0.5, abs=0.011)
-
-
-def test_jitter_of_a_few_steps_is_no_gap_for_a_slow_filter():
-    t = np.arange(0, 5, 0.001)
-    t = np.delete(t, np.arange(1000, 1008))  # 8 ms, as on a "1 kHz" Panda
-    assert set(process(sine_log(t), SignalSettings(cutoff=8.0)).segment) == {0}
-
-
-@pytest.mark.parametrize("lag", [-0.03, 0.0, 0.006, 0.16])
-def test_lag_of_the_measured_velocity_is_found(lag):
-    assert velocity_lag(sine_log(np.arange(0, 10, 0.01), lag=lag)) == pytest.approx(lag, abs=1e-3)
-
-
-def test_lag_of_a_robot_that_stands_still_is_zero():
-    t = np.arange(0, 3, 0.01)
-    zeros = np.zeros((len(t), 1))
-    assert velocity_lag(Log(t=t, q=zeros, tau=zeros, joints=("a",), v=zeros)) == 0.0
-
-
 @pytest.mark.parametrize(("lag", "choice"), [(0.006, "measured"), (0.16, "differentiated")])
 def test_auto_takes_the_measured_velocity_unless_it_is_late(lag, choice):
     log = sine_log(np.arange(0, 10, 0.01), lag=lag)
@@ -134,12 +93,6 @@ def test_auto_takes_no_acceleration_without_the_measured_velocity(velocity, lag)
     assert resolve(log, SignalSettings(velocity=velocity)).acceleration == "differentiated"
     stated = SignalSettings(velocity=velocity, acceleration="measured")
     assert resolve(log, stated).acceleration == "measured"
-
-
-def test_what_was_automatic_is_stated():
-    resolved = resolve(sine_log(np.arange(0, 10, 0.01)), SignalSettings(cutoff=10.0))
-    assert resolved.rate == pytest.approx(100.0)
-    assert resolved.max_gap == pytest.approx(0.025)
 
 
 @pytest.mark.parametrize("rate", [None, 200.0])

@@ -32,13 +32,6 @@ def test_a_stand_is_the_mean_of_its_rows_however_long(rng):
     assert not motion.v.any()
 
 
-def test_rows_far_apart_are_poses_of_their_own_unless_alike():
-    q = [[0.0, 0.0], [1.0, 0.0], [1.0, 1e-3], [0.0, 1.0]]
-    motion, stands = means(log_of(np.arange(4) * 5.0, q), max_gap=12.5)
-    assert stands.all()
-    np.testing.assert_allclose(motion.q, [[0.0, 0.0], [1.0, 5e-4], [0.0, 1.0]])
-
-
 def test_slow_motion_has_its_sign_but_not_where_it_turns_or_one_joint_stands(rng):
     t = np.arange(2000) / 100
     triangle = 0.03 * np.abs((t + 5) % 20 - 10)  # turns at 5 s, at 15 s
@@ -83,16 +76,6 @@ def test_speeds_are_0_on_both_sides_of_where_a_joint_turns_round_or_sets_out():
         assert motion.rate is None
 
 
-def test_the_slope_of_a_short_stretch_counts_as_far_as_it_goes():
-    """Half of a quarter of a second is enough; of less, the speed counts by its share of that."""
-    for rows, share in ((3, 0.02 / 0.125), (10, 0.09 / 0.125), (14, 1.0), (25, 1.0)):
-        t = 5.0 + np.concatenate([np.arange(rows), 100 + np.arange(25)]) / 100
-        motion, _ = means(log_of(t, np.outer(t, [0.05, -0.08])))
-        wanted = np.outer([share, 1.0], [0.05, -0.08])
-        np.testing.assert_allclose(motion.v, wanted, rtol=1e-9)
-        assert motion.segment.tolist() == [0, 1]
-
-
 def test_stretches_on_both_sides_of_a_jump_of_the_speed_are_left_out():
     """One joint jumps by 0.15 rad/s in a quarter of a second, which is 0.6 rad/s^2, above 0.3."""
     row = np.arange(200)  # eight segments of 25 rows
@@ -109,14 +92,14 @@ def test_stretches_on_both_sides_of_a_jump_of_the_speed_are_left_out():
 
 
 def test_two_stands_are_one_unless_a_gap_lies_between_them():
-    t = np.concatenate([np.arange(30), np.arange(30) + 35, np.arange(20) + 300]) / 100
-    q = np.tile([0.3, -0.2], (80, 1))
-    tau = np.arange(160.0).reshape(80, 2)
+    t = np.concatenate([np.arange(30), np.arange(18) + 35, np.arange(20) + 300]) / 100
+    q = np.tile([0.3, -0.2], (68, 1))
+    tau = np.arange(136.0).reshape(68, 2)
     motion, stands = means(log_of(t, q, tau), max_gap=1.0)
     assert stands.tolist() == [True, True]
     assert motion.segment.tolist() == [0, 1]
-    np.testing.assert_allclose(motion.tau, [tau[:60].mean(axis=0), tau[60:].mean(axis=0)])
-    np.testing.assert_allclose(motion.t, [t[:60].mean(), t[60:].mean()])
+    np.testing.assert_allclose(motion.tau, [tau[:48].mean(axis=0), tau[48:].mean(axis=0)])
+    np.testing.assert_allclose(motion.t, [t[:48].mean(), t[48:].mean()])
 
 
 def test_a_jump_of_the_speed_across_a_gap_is_no_acceleration():

@@ -18,14 +18,7 @@ import robotid
 from helpers.hostile_inputs import JOINTS, URDF, good_log, good_result
 from robotid import Log, RobotModel, SignalSettings, Trajectory
 from robotid.base.exceptions import RobotIdError
-from robotid.cli.job import read_job
 from robotid.data.signal_settings import LogSource, LogUnits
-from robotid.output.files.mjcf import write_mjcf
-from robotid.output.files.ranges import write_ranges
-from robotid.output.files.sdf import write_sdf
-from robotid.output.files.urdf import write_urdf
-from robotid.output.report import pictures
-from robotid.output.report.document import write_report
 from robotid.robot.parameters import Coupling
 
 __all__ = ["ARGUMENT_KINDS"]
@@ -83,7 +76,7 @@ CALLS = {
     "EstimatorSettings": (
         robotid.EstimatorSettings,
         lambda c, _: {"name": "consistent", "margin": 1e-4, "prior": "entropic",
-                      "prior_weight": "auto", "draws": 16, "constraints": {}, "robust": "none"},
+                      "prior_weight": "auto", "constraints": {}, "robust": "none"},
     ),
     "from_urdf": (
         RobotModel.from_urdf,
@@ -128,60 +121,18 @@ CALLS = {
         lambda **given: robot().found.predict(**given),
         lambda c, _: {"q": c.log.q, "v": c.log.v, "a": c.log.q},
     ),
-    "predict of a result": (
-        lambda **given: robot().result.predict(**given),
-        lambda c, _: {"q": c.log.q, "v": c.log.v, "a": c.log.q},
-    ),
     "friction": (
         lambda **given: robot().found.friction(**given),
         lambda c, _: {"joint": "joint_1", "v": [0.1, 0.2], "q": 0.1, "load": 1.0},
     ),
-    "friction of a result": (
-        lambda **given: robot().result.friction(**given), lambda c, _: {"joint": "joint_1"}
-    ),
     "follow_commands": (
         lambda **given: robot().result.follow_commands(**given), lambda c, _: {"log": c.log}
     ),
-    "plot_torques": (
-        lambda joint, recording: pictures.plot_torques(robot().found, joint, recording=recording),
-        lambda c, _: {"joint": "joint_1", "recording": None},
-    ),
-    "plot_friction": (
-        lambda joint: pictures.plot_friction(robot().found, joint),
-        lambda c, _: {"joint": "joint_1"},
-    ),
-    "plot_why": (lambda **given: pictures.plot_why(robot().found, **given),
-                 lambda c, _: {"joint": "joint_1"}),
-    "metrics": (lambda **given: robot().found.metrics(**given), lambda c, _: {"name": "wls"}),
     "save": (
         lambda **given: robotid.save_result(robot().found, **given),
         lambda c, f: {"folder": f / "saved", "report": False, "replay": False},
     ),
     "load_result": (robotid.load_result, lambda c, _: {"path": good_result()[0]}),
-    "read_job": (read_job, lambda c, _: {"path": "job.toml"}),
-    "write_urdf": (
-        write_urdf,
-        lambda c, f: {"model": c.model, "pi": c.found.standard, "target": f / "x.urdf",
-                      "dynamics": True},
-    ),
-    "write_sdf": (
-        write_sdf,
-        lambda c, f: {"model": c.model, "pi": c.found.standard, "target": f / "x.sdf",
-                      "original": None, "notes": ()},
-    ),
-    "write_mjcf": (
-        write_mjcf,
-        lambda c, f: {"model": c.model, "pi": c.found.standard, "target": f / "x.xml",
-                      "original": None, "commanded": (), "step": 0.001, "delay": "history",
-                      "notes": ()},
-    ),
-    "write_ranges": (
-        write_ranges, lambda c, f: {"found": c.found, "target": f / "x.yaml"}
-    ),
-    "write_report": (
-        write_report,
-        lambda c, f: {"identification": c.found, "target": f / "x.html", "files": None},
-    ),
     "replay": (
         robotid.replay,
         lambda c, _: {"model": c.model, "t": c.log.t[:60], "q": c.log.q[:60], "torques": None,

@@ -139,22 +139,9 @@ def good_file(name):
 
 
 SPECIAL = [
-    b"\0",
-    b"\xff",
-    b"\n",
-    b",",
-    b'"',
-    b"nan",
-    b"1e308",
-    b"\0\0\0\0",
-    b"\xff\xff\xff\xff",
-    b"\xff\xff\xff\x7f",
-    b"\x80",
-    b"-",
-    b"'",
-    b"(",
-    b"9" * 30,
-]
+    b"\0", b"\xff", b"\n", b",", b'"', b"nan", b"1e308", b"\0\0\0\0", b"\xff\xff\xff\xff",
+    b"\xff\xff\xff\x7f", b"\x80", b"-", b"'", b"(", b"9" * 30,
+]  # fmt: skip
 
 
 @st.composite
@@ -190,28 +177,9 @@ def write_bytes(content, path):
 # --- tables of hostile values --------------------------------------------------------------------
 
 NUMBERS = [
-    0.0,
-    -0.0,
-    1.0,
-    -1.0,
-    1e-320,
-    1e-308,
-    1e-30,
-    1e30,
-    1e150,
-    1e300,
-    1e308,
-    -1e308,
-    np.nan,
-    np.inf,
-    -np.inf,
-    1e6,
-    1.7e9,
-    1.7e18,
-    2**53,
-    np.pi,
-    360.0,
-]
+    0.0, -0.0, 1.0, -1.0, 1e-320, 1e-308, 1e-30, 1e30, 1e150, 1e300, 1e308, -1e308, np.nan,
+    np.inf, -np.inf, 1e6, 1.7e9, 1.7e18, 2**53, np.pi, 360.0,
+]  # fmt: skip
 numbers = st.sampled_from(NUMBERS) | st.floats()
 
 
@@ -254,25 +222,10 @@ def _spoil(values, action, row, number):
 MILD = [0.0, -1.0, 1e-300, 1e-30, 1e-9, 1e-3, 0.1, 0.5, 2.0, np.pi, 10.0, 1e3, 1e6, 1e9, 1e20, 1e29]
 names = st.sampled_from(
     [
-        "",
-        " ",
-        "t",
-        "time",
-        "q_",
-        "_",
-        "q_joint_1",
-        "tau_joint_3",
-        "nan",
-        "x" * 300,
-        "time,t",
-        '"',
-        "é",
-        "\U0001f916",
-        "a/b",
-        "#x",
-        "current_joint_1",
+        "", " ", "t", "time", "q_", "_", "q_joint_1", "tau_joint_3", "nan", "x" * 300, "time,t",
+        '"', "é", "\U0001f916", "a/b", "#x", "current_joint_1",
     ]
-)
+)  # fmt: skip
 
 
 def write_csv(table, path):
@@ -502,53 +455,18 @@ def run_job_file(text, folder):
 
 flags = st.sampled_from(
     [
-        "--rate",
-        "--cutoff",
-        "--friction",
-        "--joints",
-        "--lock",
-        "--gain",
-        "--ignore",
-        "--estimator",
-        "--time-unit",
-        "--angle-unit",
-        "--topic",
-        "--effort",
-        "--stamp",
-        "--workers",
-        "--serve",
-        "--speed",
-        "--json",
+        "--rate", "--cutoff", "--friction", "--joints", "--lock", "--gain", "--ignore",
+        "--estimator", "--time-unit", "--angle-unit", "--topic", "--effort", "--stamp",
+        "--workers", "--serve", "--speed", "--json",
     ]
-)
+)  # fmt: skip
 arguments = st.sampled_from(
     [
-        "",
-        "x",
-        "0",
-        "-1",
-        "1",
-        "nan",
-        "inf",
-        "1e308",
-        "1e-308",
-        "99999",
-        "false",
-        "joint_1=nan",
-        "joint_1=1e308",
-        "joint_1",
-        "joint_1,joint_1",
-        "=",
-        ",",
-        "1_0",
-        "consistent",
-        "wls",
-        "ms",
-        "deg",
-        "٣",
-        "a=b=c",
+        "", "x", "0", "-1", "1", "nan", "inf", "1e308", "1e-308", "99999", "false", "joint_1=nan",
+        "joint_1=1e308", "joint_1", "joint_1,joint_1", "=", ",", "1_0", "consistent", "wls", "ms",
+        "deg", "٣", "a=b=c",
     ]
-)
+)  # fmt: skip
 command_lines = st.tuples(
     st.sampled_from(["identify", "doctor", "track", "convert", "inspect", "compare", "validate"]),
     st.lists(st.tuples(flags, arguments), min_size=1, max_size=3),
@@ -682,18 +600,9 @@ READERS = {
     ".parquet": write_parquet,
 }
 FILES = [
-    "log.csv",
-    "log.parquet",
-    "log.npz",
-    "plain.npz",
-    "log.mat",
-    "plain.mat",
-    "log.h5",
-    "plain.h5",
-    "log.mcap",
-    "log.bag",
-    "log.db3",
-]
+    "log.csv", "log.parquet", "log.npz", "plain.npz", "log.mat", "plain.mat", "log.h5",
+    "plain.h5", "log.mcap", "log.bag", "log.db3",
+]  # fmt: skip
 
 #: By name: a strategy of examples, and what is done with one in an empty folder.
 KINDS = {

@@ -70,11 +70,3 @@ def test_what_it_has_no_place_for_is_named_if_it_is_not_zero(ur5):
     pi[list(model.layout.names).index("wrist_1_joint.load")] = 0.05
     with pytest.warns(UserWarning, match=r"no field for wrist_1_joint\.load: its torques"):
         pinocchio_model(model, pi)
-
-
-def test_it_is_a_model_of_its_own(ur5):
-    pi = ur5.standard_parameters()
-    made = pinocchio_model(ur5, pi)
-    made.armature[:] = 7.0
-    assert not ur5.pin_model.armature.any()
-    assert list(made.names) == list(ur5.pin_model.names)

@@ -1,14 +1,10 @@
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.fitting import identify
-from helpers.synthetic import exact_log, truth
+from helpers.synthetic import truth
 
 from robotid.data.signal_settings import SignalSettings
-from robotid.diagnosis.verdict.fit_findings import consistency_findings
 from robotid.dynamics.torque import joint_torque_regressor
-from robotid.estimation.fitting.estimator_settings import EstimatorSettings
-from robotid.output.files.entries import build_result
 from robotid.robot.examples import example_urdf
 from robotid.robot.mass_matrix import check_mass_matrix, joint_mass_matrices
 from robotid.robot.model import RobotModel
@@ -80,43 +76,6 @@ def test_the_least_and_the_share_are_those_of_every_block_of_poses(ur5, upper_ar
 def test_a_floating_base_has_one_too():
     model = RobotModel.from_urdf(example_urdf("solo12.urdf"), free_flyer=True)
     assert check_mass_matrix(model, model.standard_parameters(), poses=20).is_positive
-
-
-def test_the_result_states_it_and_a_finding_says_if_it_fails(forearm, rng):
-    log = exact_log(forearm, truth(forearm), rng, samples=100, noise=5 * NOISE)
-    consistent = identify(forearm, [log], signals=EXACT)
-    stated = build_result(consistent, {})["consistency"]["mass_matrix"]
-    assert stated["poses"] == 10_000
-    assert stated["positive_share"] == 1.0
-    assert stated["smallest_eigenvalue"] > 0
-    assert [f.code for f in consistency_findings(consistent)] == []
-    wls = identify(forearm, [log], signals=EXACT, estimator="wls")
-    (finding,) = consistency_findings(wls)
-    assert finding.code == "mass_matrix"
-    assert "not positive definite at" in finding.message
-
-
-def test_active_bounds_are_reported(forearm, rng):
-    log = exact_log(forearm, truth(forearm), rng, noise=NOISE)
-    settings = EstimatorSettings(
-        prior_weight=100.0, constraints={"mass": {"forearm_link": [9.0, 20.0]}}
-    )
-    found = identify(forearm, [log], signals=EXACT, estimator=settings)
-    (finding,) = consistency_findings(found)
-    # 9 kg find no room in the forearm's box; 3 kg do, and no motion shows a single mass
-    assert (finding.code, finding.severity) == ("active_bound", "warning")
-    assert (
-        "the bounds mass forearm_link are active: they increase the torque error of elbow"
-        in finding.message
-    )
-    settings = EstimatorSettings(constraints={"mass": {"forearm_link": [3.0, 20.0]}})
-    found = identify(forearm, [log], signals=EXACT, estimator=settings)
-    (finding,) = consistency_findings(found)
-    assert (finding.code, finding.severity) == ("active_bound", "note")
-    assert (
-        "the bounds mass forearm_link are active: the URDF's values are outside them"
-        in finding.message
-    )
 
 
 def test_a_slider_without_limits_stays_within_a_metre_and_a_joint_goes_half_a_turn(tmp_path):

@@ -74,16 +74,6 @@ def test_joints_come_in_the_order_asked_for(tmp_path):
     np.testing.assert_array_equal(forward.configurations(q), backward.configurations(q[:, ::-1]))
 
 
-def test_locked_joints_are_lumped_where_they_stand(tmp_path):
-    path = write(tmp_path)
-    model = RobotModel.from_urdf(path, joints=["shoulder"], locked={"elbow": np.pi / 2})
-    m, mcx, _, mcz = model.standard_parameters()[:4]
-    assert m == 3
-    assert mcx == pytest.approx(2 * 0.1 + 1 * 0.5)  # the lower link hangs straight down
-    assert mcz == pytest.approx(-0.2)
-    assert dict(model.locked) == {"elbow": np.pi / 2}
-
-
 @pytest.mark.parametrize("axis", ["0 1 0", "1 2 3"])
 def test_a_locked_continuous_joint_gives_the_torque_at_its_angle(tmp_path, rng, axis):
     model = RobotModel.from_urdf(
@@ -198,17 +188,6 @@ def test_what_the_dynamics_do_not_use_cannot_stop_a_model(tmp_path):
         return text.replace("</joint>", more + "</geometry></visual></joint>", 1)
 
     assert RobotModel.from_urdf(write(tmp_path, change=spoil)).joints == ("shoulder", "elbow")
-
-
-def test_a_missing_file_is_named(tmp_path):
-    with pytest.raises(ModelError, match=r"there is no URDF file '.*none.urdf'"):
-        RobotModel.from_urdf(tmp_path / "none.urdf")
-
-
-def test_an_example_robot_is_found_by_name():
-    assert example_urdf("panda.urdf").is_file()
-    with pytest.raises(ModelError, match=r"example-robot-data has no 'panda7.urdf'"):
-        example_urdf("panda7.urdf")
 
 
 def test_what_needs_a_fixed_base_is_refused_for_other_robots(tmp_path):

@@ -37,17 +37,12 @@ _WORD = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|[0-9]+|[^\W\d_]+")
 
 @dataclass(frozen=True)
 class Reading:
-    """The columns of the joints of a robot.
+    """The columns of the joints of a robot."""
 
-    Attributes:
-        columns: Names of the columns by kind and joint; more than one is ambiguous.
-        notes: Joints that are spelt otherwise in the file.
-        assumed: What was assumed of the order of numbered columns.
-    """
-
+    # names of the columns by kind and joint; more than one is ambiguous
     columns: Mapping[tuple[str, str], list[str]] = field(default_factory=dict)
-    notes: tuple[str, ...] = ()
-    assumed: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()  # joints that are spelt otherwise in the file
+    assumed: tuple[str, ...] = ()  # what was assumed of the order of numbered columns
 
     @property
     def positions(self) -> dict[str, str]:

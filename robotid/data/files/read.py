@@ -15,7 +15,6 @@ from typing import Any, get_args
 
 import numpy as np
 
-from robotid.base.arguments import checked
 from robotid.base.exceptions import DataError, SettingsError
 from robotid.base.files import check_file, check_path
 from robotid.base.findings import listed
@@ -51,7 +50,6 @@ _BASE = BaseColumns()
 _STILL = 0.02  # range of the position of a joint at rest [rad or m]
 
 
-@checked("base", "passive")
 def read_log(
     path: str | Path | Frame,
     joints: Sequence[str],
@@ -96,6 +94,8 @@ def read_log(
         SettingsError: If gains, columns or the source have names that are not read.
         MissingDependencyError: If a package that reads the file is not installed.
     """
+    require_kind(base, BaseColumns, "base", "a BaseColumns")
+    require_each(passive, str, "passive", "names of joints")
     layout, table = lay_out(
         path, joints, gains=gains, columns=columns, units=units, prismatic=prismatic,
         source=source, transmissions=transmissions, needs=needs, base=base, passive=passive,

@@ -1,20 +1,19 @@
-"""Checks of the pose of a floating base: jumps, unit, order of its quaternion, axes, twist."""
+"""Checks of the pose of a floating base and of its IMU: jumps, units, quaternion, axes, twist."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from itertools import permutations, product
 
 import numpy as np
 
 from robotid.base.exceptions import DataError
-from robotid.base.findings import Finding, log_finding
+from robotid.base.findings import Finding
 from robotid.base.text import seconds
 from robotid.base.typing import Array
-from robotid.data.base_motion import base_state, in_base, pose_jumps
+from robotid.data.base_motion import ImuFrame, base_state, in_base, pose_jumps
 from robotid.data.log import Log, Trajectory
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import process
-from robotid.diagnosis.logs.slips import rms
+from robotid.diagnosis.catalogue import finding
 from robotid.robot.constraints import link_positions
 from robotid.robot.model import RobotModel
 
@@ -32,6 +31,15 @@ _ABOVE = 0.3  # vertical distance of base and feet over their distance, from whi
 _STRIDE = 0.2  # [s] over which the acceleration of a base is averaged against noise
 _FASTEST = 30.0  # [m/s^2] RMS of this above which its position is in mm
 _ALONG = 0.8  # component of the unit vector from the feet to the base that may be the vertical
+_IMU_UNLIKE = 0.3  # of the motion: an angular velocity that differs by more is wrong
+_IMU_BETTER = 0.5  # ... and has other axes if these reduce the difference below this share
+_IMU_MOVES = 0.1  # [rad/s] RMS from which angular velocities are compared
+_TILT = 8.0  # [deg] largest angle between the mean specific force and the vertical
+_SIZE = 0.1  # largest relative error of its size
+_SHORTEST = 2.0  # [s] in which the mean acceleration of a robot is small
+_DEGREES = np.pi / 180
+_DRAWN = 1e-4  # weight of the stated axes, relative to the data
+_IMU_ALONG = 0.25  # largest difference of an axis from one of the link, of length 1
 
 
 def check_pose(log: Log) -> Iterator[Finding]:
@@ -40,17 +48,12 @@ def check_pose(log: Log) -> Iterator[Finding]:
         return
     rows, *sizes = pose_jumps(log.t, log.base.pose)
     for size, unit in zip(sizes, ("m", "rad"), strict=True):
-        if not size.any():
-            continue
-        times, own = log.t[rows[size > 0.0]], size[size > 0.0]
-        message = (
-            f"the pose of the base jumps {len(own)} time{'s' * (len(own) > 1)}, first at t = "
-            f"{seconds(times[0])} s by {own[0]:.2g} {unit}: a marker or tag was found again, or "
-            "odometry was corrected. Rows whose smoothed motion contains a jump are left out. If "
-            "that leaves too few, correct base_x to base_qw, or use an IMU"
-        )
-        evidence = {"jumps": float(len(own)), "size": float(own.max()), "first": float(times[0])}
-        yield log_finding(log.name, "base_jump", "warning", message, **evidence)
+        if size.any():
+            times, jumps = log.t[rows[size > 0.0]], size[size > 0.0]
+            yield finding(
+                "base_jump", log.name, jumps=len(jumps), times=len(jumps) > 1, unit=unit,
+                when=seconds(times[0]), first_size=jumps[0], size=jumps.max(), first=times[0],
+            )  # fmt: skip
 
 
 def check_unit(log: Log) -> Iterator[Finding]:
@@ -58,19 +61,13 @@ def check_unit(log: Log) -> Iterator[Finding]:
     if log.base is None or not log.base.has_position:
         return
     t = np.arange(log.t[0], log.t[-1], _STRIDE)
-    x = np.stack([np.interp(t, log.t, own) for own in log.base.pose[:, :3].T], axis=1)
+    x = np.stack([np.interp(t, log.t, column) for column in log.base.pose[:, :3].T], axis=1)
     if len(t) < 3:
         return
-    second = np.diff(x, n=2, axis=0) / _STRIDE**2
-    size = float(np.sqrt(np.mean(np.sum(second**2, axis=1))))
-    if size < _FASTEST:
-        return
-    message = (
-        f"the acceleration of the base is {size:.3g} m/s^2 (RMS over {_STRIDE:g} s), more than "
-        f"that of jumps. If base_x, base_y and base_z are in mm, it is {1e-3 * size:.2g} m/s^2: "
-        "convert them to m. Else correct them"
-    )
-    yield log_finding(log.name, "base_unit", "error", message, acceleration=size)
+    size = rms(np.diff(x, n=2, axis=0) / _STRIDE**2)
+    if size >= _FASTEST:
+        evidence = {"acceleration": size, "stride": _STRIDE, "if_mm": 1e-3 * size}
+        yield finding("base_unit", log.name, **evidence)
 
 
 def check_twist(log: Log, signals: SignalSettings) -> Iterator[Finding]:
@@ -92,49 +89,39 @@ def check_twist(log: Log, signals: SignalSettings) -> Iterator[Finding]:
     def of_pose(quaternion: Array) -> Array:
         return base_state(motion.t, np.hstack([place, quaternion]), None, None)[1]
 
-    wanted, readings = of_pose(quaternion), orientation_readings(quaternion)
+    wanted = of_pose(quaternion)
+    readings = {key: of_pose(q) for key, q in orientation_readings(quaternion).items()}
+    read = {"logged": twist, "world": _turned(quaternion, twist)}
+    read |= {"base": _turned(quaternion * _BACK, twist)}
     parts = {"linear": slice(0, 3), "angular": slice(3, 6)}
-    read = twist, _turned(quaternion, twist), _turned(quaternion * _BACK, twist)
-    axes = {  # differences from the pose: as logged, of the world, of the base if turned before
-        what: [rms((x - wanted)[:, part]) for x in read] for what, part in parts.items()
+    axes = {
+        what: {key: rms((x - wanted)[:, part]) for key, x in read.items()}
+        for what, part in parts.items()
     }
-    for what, part in parts.items():
-        (off, in_world, turned), unit = axes[what], "m/s" if what == "linear" else "rad/s"
-        size, (name, factor) = rms(wanted[:, part]), _UNITS[what]
-        scaled = rms(factor * twist[:, part] - wanted[:, part])
-        others = {x: rms(twist[:, part] - of_pose(q)[:, part]) for x, q in readings.items()}
-        words = min(others, key=lambda x: others[x])
-        best = min(in_world, turned, scaled, others[words])
+    for (what, part), other in zip(parts.items(), ("angular", "linear"), strict=True):
+        unit, (logged_unit, factor) = "m/s" if what == "linear" else "rad/s", _UNITS[what]
+        size, off = rms(wanted[:, part]), axes[what]["logged"]
+        causes = {key: axes[what][key] for key in ("world", "base")}
+        causes["unit"] = rms(factor * twist[:, part] - wanted[:, part])
+        turned = {key: rms((twist - x)[:, part]) for key, x in readings.items()}
+        cause = min(causes | turned, key=lambda key: (causes | turned)[key])
+        best = (causes | turned)[cause]
         is_explained = best < _BETTER * off
         if size < _TURNS_BY or off < (_SOME if is_explained else _UNLIKE) * size:
             continue
-        message = (
-            f"the measured {what} velocity of the base differs by {off:.2g} {unit} from that of "
-            f"its pose, {size:.2g} {unit} (RMS)"
-        )
-        evidence = {"off": off, "size": size, "off_world": in_world}
-        if is_explained and best == others[words]:
-            message += f"; with another quaternion by {best:.2g} {unit}: {words}"
-            evidence = {"speed": off, "best": best}
-            yield log_finding(log.name, "base_orientation", "error", message, **evidence)
+        figures: dict[str, float | str] = {"size": size, "best": best, "what": what, "unit": unit}
+        if is_explained and cause in turned:
+            yield finding(
+                "base_orientation", log.name, source="twist", reading=cause, cure=cause, turn=False,
+                speed=off, **figures,
+            )  # fmt: skip
             return
-        other = next(x for x in parts if x != what)
-        remedy = ". Check the columns base_vx to base_wz, or remove them"
-        if is_explained and best == in_world:
-            is_mixed = axes[other][0] < _BETTER * axes[other][1]
-            remedy = (
-                f"; read with the axes of the world it differs by {best:.2g} {unit}. State twist "
-                "= 'world' in [base]"
-            ) + is_mixed * f", and turn the {other} velocity, which has the axes of the base, too"
-        elif is_explained and best == turned:
-            remedy = (
-                f"; it has the axes of the base, with which it differs by {best:.2g} {unit}. State "
-                "twist = 'base' in [base]"
-            )
-        elif is_explained:
-            remedy = f", by {best:.2g} {unit} if it is in {name}: convert it to {unit}"
-        message += remedy
-        yield log_finding(log.name, "base_twist", "error", message, **evidence)
+        yield finding(
+            "base_twist", log.name, cure=cause if is_explained else "unknown", off=off,
+            mixed=is_explained and cause == "world"
+            and axes[other]["logged"] < _BETTER * axes[other]["world"],
+            other=other, logged_unit=logged_unit, off_world=axes[what]["world"], **figures,
+        )  # fmt: skip
 
 
 def _turned(quaternion: Array, twist: Array) -> Array:
@@ -143,18 +130,9 @@ def _turned(quaternion: Array, twist: Array) -> Array:
 
 
 def orientation_readings(quaternion: Array) -> dict[str, Array]:
-    """Return a quaternion (N, 4) as it is if its columns are wrong, by what is wrong with them.
-
-    quaternion (N, 4).
-    """
-    order, inverse = np.roll(quaternion, -1, axis=1), "the orientation of the world in the base"
-    return {
-        "its order is qw qx qy qz: state base_qw = 'base_qx', base_qx = 'base_qy', base_qy = "
-        "'base_qz' and base_qz = 'base_qw' in [columns]": order,
-        f"it is {inverse}: reverse the signs of base_qx, base_qy and base_qz": quaternion * _BACK,
-        f"its order is qw qx qy qz, and it is {inverse}: reverse the signs of base_qy, base_qz and "
-        "base_qw, and correct the order in [columns]": order * _BACK,
-    }
+    """Return a quaternion (N, 4) as it is if its columns are wrong, by what is wrong with them."""
+    order = np.roll(quaternion, -1, axis=1)
+    return {"order": order, "inverse": quaternion * _BACK, "both": order * _BACK}
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,17 +150,15 @@ class _Feet:
         R = np.stack([in_base(quaternion, axis) for axis in np.eye(3)], axis=1)
         return R[:: self.every], np.gradient(R, self.t, axis=0)[:: self.every]
 
-    def speed(self, pose: tuple[Array, Array], body: Array, world: Array) -> float:
+    def speed(self, pose: tuple[Array, Array]) -> float:
         """Return the mean speed of the slowest contact of each sample [m/s].
 
         Without a place of the base it is that of the slowest pair, relative to each other.
-
-        body (3, 3), world (3, 3).
         """
-        R, dR = (x @ body for x in pose)
+        R, dR = pose
         v = self.x @ dR.swapaxes(1, 2) + self.dx @ R.swapaxes(1, 2)  # (n, k, 3)
         if self.dp is not None:
-            v += (self.dp @ world.T)[:, None]
+            v += self.dp[:, None]
         else:
             first, second = np.triu_indices(v.shape[1], 1)
             v = v[:, first] - v[:, second]
@@ -197,14 +173,13 @@ class _Feet:
 
 
 def check_order(model: RobotModel, log: Log, motion: Trajectory) -> Iterator[Finding]:
-    """Yield a finding if feet on the ground hardly move with another reading of the base's pose.
+    """Yield a finding if feet on the ground hardly move with another reading of the quaternion.
 
     The slowest foot of each sample is taken to be on the ground, whatever its flags. Tried are
-    other orders of the quaternion, its inverse, other axes of the base, and of its position; the
-    base must be above the feet. Without position the feet hardly move relative to each other, and
-    only quaternions are tried: other axes are those of its IMU. A world with another vertical axis
-    is found, too: the base is above the feet along it. A tilt that is constant moves no foot, and
-    is not found: it looks like a slope.
+    another order of the quaternion and its inverse; the base must be above the feet. Without
+    position the feet hardly move relative to each other. A world with another vertical axis is
+    found, too: the base is above the feet along it. A tilt that is constant moves no foot, and is
+    not found: it looks like a slope.
     """
     if log.base is None or not model.contacts or len(motion.t) < 3:
         return
@@ -216,91 +191,46 @@ def check_order(model: RobotModel, log: Log, motion: Trajectory) -> Iterator[Fin
     every = max(1, len(q) // _MOST)
     dx, dp = (np.gradient(y, motion.t, axis=0)[::every] for y in (x, p))
     feet = _Feet(motion.t, every, x[::every], dx, dp if log.base.has_position else None)
-    yield from _check_readings(model, log, feet, q)
+    yield from _check_readings(log, feet, q, np.asarray(model.pin_model.gravity.linear))
 
 
-def _check_readings(model: RobotModel, log: Log, feet: _Feet, q: Array) -> Iterator[Finding]:
+def _check_readings(log: Log, feet: _Feet, q: Array, gravity: Array) -> Iterator[Finding]:
     """Yield the finding of ``check_order`` for feet and the logged quaternion (N, 4)."""
-    one = np.eye(3)
-    stated, gravity = feet.turned(q), np.asarray(model.pin_model.gravity.linear)
     size = float(np.linalg.norm(gravity))
     up = -gravity / size if size else np.zeros(3)
-    mean = feet.upwards(stated[0])
-    speed, height = feet.speed(stated, one, one), float(mean @ up)
-    is_moving = speed >= _MOVES
-    if not is_moving and height > -_ABOVE:
-        if height < _ABOVE:
-            yield from _check_vertical(log, mean, gravity)
-        return
-    found: list[tuple[float, float, str]] = []  # size, speed, words
-    for words, quaternion in {"": q, **orientation_readings(q)}.items():
+    stated = feet.turned(q)
+    mean, speed = feet.upwards(stated[0]), feet.speed(stated)
+    height, is_moving = float(mean @ up), speed >= _MOVES
+    found: list[tuple[float, float, str, str]] = []  # rank, speed, reading, gravity
+    for key, quaternion in (
+        orientation_readings(q).items() if is_moving or height <= -_ABOVE else ()
+    ):
         pose = feet.turned(quaternion)
-        for body, world in _axes() if is_moving and feet.dp is not None else [(one, one)]:
-            own, direction = feet.speed(pose, body, world), feet.upwards(pose[0] @ body)
-            changes = [words] if words else []
-            changes += [_named_body(body)] if (body != one).any() else []
-            changes += [_named_world(world)] if (world != one).any() else []
-            is_above, is_slow = direction @ up >= _ABOVE, is_moving and own < _SLOWER * speed
-            is_turned_back = height < -_ABOVE and is_above and own < speed + _MOVES
-            remedy = _vertical(direction, gravity)
-            if not changes or not (is_slow or (is_turned_back and changes == [words])):
-                continue
-            if not is_above and remedy is None:
-                continue
-            if not is_above:
-                changes.append(f"the vertical of the world is another axis: state {remedy}")
-            found.append(((own + _FLOOR) * _SIMPLER ** len(changes), own, "; ".join(changes)))
+        moves, direction = feet.speed(pose), feet.upwards(pose[0])
+        is_above, is_slow = direction @ up >= _ABOVE, is_moving and moves < _SLOWER * speed
+        is_turned_back = height < -_ABOVE and is_above and moves < speed + _MOVES
+        remedy = "" if is_above else _vertical(direction, gravity)
+        if (is_slow or is_turned_back) and remedy is not None:
+            changes = (key == "both") + bool(remedy)
+            found.append(((moves + _FLOOR) * _SIMPLER**changes, moves, key, remedy))
     if found:
-        _, own, words = min(found, key=lambda x: x[0])
-        message = (
-            f"with the pose of the base as logged, the feet on the ground move at {speed:.2g} m/s "
-            f"(mean) {'above' if height < -_ABOVE else 'below'} the base, else at {own:.2g} m/s "
-            f"below it: {words}"
-        )
-        evidence = {"speed": speed, "best": own}
-        yield log_finding(log.name, "base_orientation", "error", message, **evidence)
-    elif height < _ABOVE:
-        yield from _check_vertical(log, mean, gravity)
-
-
-def _axes() -> Iterator[tuple[Array, Array]]:
-    """Yield axes of the base, and of its position, one of both changed to others of the 48."""
-    one = np.eye(3)
-    yield one, one
-    for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):
-        turn = one[list(order)] * np.array(signs)
-        if np.array_equal(turn, one):
-            continue
-        yield turn, one
-        yield one, turn
-
-
-def _named_body(body: Array) -> str:
-    """Return what axes of the base in the log mean."""
-    words = f"the axes x, y, z of the base in the log are {', '.join(_names(body))} of its link"
-    if np.linalg.det(body) < 0.0:
-        return f"{words}, left-handed: convert position and orientation to right-handed axes"
-    return f"{words}: add a link with these axes to the URDF, and state it as link in [base]"
-
-
-def _named_world(world: Array) -> str:
-    """Return what axes of the position mean."""
-    signed = [name.replace("x", "base_x").replace("y", "base_y").replace("z", "base_z")
-              for name in _names(world)]  # fmt: skip
-    return (
-        "the position has other axes than the orientation: replace base_x, base_y, base_z by "
-        f"{', '.join(signed)}"
-    )
-
-
-def _names(turn: Array) -> list[str]:
-    """Return the signed axis of each row."""
-    columns = np.abs(turn).argmax(axis=1)
-    return [("-" if turn[i, k] < 0 else "") + "xyz"[k] for i, k in enumerate(columns)]
+        _, best, key, remedy = min(found, key=lambda x: x[0])
+        yield finding(
+            "base_orientation", log.name, source="feet", reading=key, cure=key, speed=speed,
+            best=best, side=height < -_ABOVE, turn=bool(remedy), gravity=remedy,
+        )  # fmt: skip
+    elif height < _ABOVE and (remedy := _vertical(mean, gravity)) is not None:
+        mean = mean / np.linalg.norm(mean)
+        k = int(np.argmax(np.abs(mean)))
+        yield finding(
+            "base_orientation", log.name, source="vertical", cure="vertical", turn=False,
+            axis=("-" if mean[k] < 0 else "") + "xyz"[k], gravity=remedy, height=float(mean @ up),
+            best=abs(mean[k]),
+        )  # fmt: skip
 
 
 def _vertical(direction: Array, gravity: Array) -> str | None:
-    """Return the setting of gravity along the axis of a direction upwards; None if it has none.
+    """Return the setting of gravity along the axis of a direction upwards; None without one.
 
     The mean direction of a base that rolls over is short: it has none.
     """
@@ -312,19 +242,112 @@ def _vertical(direction: Array, gravity: Array) -> str | None:
     return f"gravity = [{', '.join(f'{x:g}' for x in wanted)}]"
 
 
-def _check_vertical(log: Log, mean: Array, gravity: Array) -> Iterator[Finding]:
-    """Yield a finding if the base is above its feet along another axis of the world."""
-    remedy = _vertical(mean, gravity)
-    if remedy is None:
+def rms(values: Array) -> float:
+    """Return the root mean square of the lengths of vectors: values (N, 3)."""
+    return float(np.sqrt(np.mean(np.sum(values**2, axis=1))))
+
+
+def check_imu(log: Log, motion: Trajectory, legs: tuple[Array, Array]) -> Iterator[Finding]:
+    """Yield findings on the IMU of one log: legs (N, m, 3)."""
+    if log.base is None or log.base.imu is None or motion.t[-1] - motion.t[0] < _SHORTEST:
         return
-    mean = mean / np.linalg.norm(mean)
-    k = int(np.argmax(np.abs(mean)))
-    axis = ("-" if mean[k] < 0 else "") + "xyz"[k]
-    message = (
-        "the feet are not below the base, which is above them along "
-        f"{axis} of the world. If that axis is the vertical, state {remedy} at the top of the job "
-        "file, and measured forces with the same axes; else check base_qx to base_qw"
-    )
-    up = -gravity / np.linalg.norm(gravity).clip(1e-9)
-    evidence = {"height": float(mean @ up), "best": abs(mean[k])}
-    yield log_finding(log.name, "base_orientation", "error", message, **evidence)
+    frame, w = log.base.imu.frame, motion.v[:, 3:6]
+    turned = np.broadcast_to(np.eye(3), (len(w), 3, 3))
+    own = base_state(motion.t, motion.q[:, :7], None, None)[1][:, 3:]
+    found = list(_check_orientation(log, motion, own))
+    found = found or list(_check_axes(log, frame, w, turned, -own, "orientation"))
+    yield from found or _check_axes(log, frame, w, *legs, "links")
+    yield from _check_gravity(log, frame, motion)
+
+
+def _check_orientation(log: Log, motion: Trajectory, own: Array) -> Iterator[Finding]:
+    """Yield a finding if the gyroscopes agree with another reading of the quaternion only.
+
+    ``own`` is the angular velocity by the quaternion as logged, shape (N, 3) [rad/s].
+    """
+    w, place = motion.v[:, 3:6], motion.q[:, :3]
+    now, size = rms(w - own), rms(own)
+    if rms(w) < _IMU_MOVES or now <= _IMU_UNLIKE * size:
+        return
+    readings = {
+        key: rms(w - base_state(motion.t, np.hstack([place, q]), None, None)[1][:, 3:])
+        for key, q in orientation_readings(motion.q[:, 3:7]).items()
+    }
+    key = min(readings, key=lambda x: readings[x])
+    if readings[key] <= _IMU_UNLIKE * size:
+        yield finding(
+            "base_orientation", log.name, source="imu", reading=key, cure=key, turn=False,
+            speed=now, best=readings[key],
+        )  # fmt: skip
+
+
+def _check_axes(
+    log: Log, frame: ImuFrame, w: Array, D: Array, d: Array, source: str
+) -> Iterator[Finding]:
+    """Yield a finding if D w + d is 0 with other axes or another unit of w only."""
+
+    def off(w: Array) -> float:
+        return float(np.sqrt(np.mean(np.sum((np.einsum("kij,kj->ki", D, w) + d) ** 2, axis=1))))
+
+    size, now = off(0.0 * w), off(w)
+    if rms(w) < _IMU_MOVES or now <= _IMU_UNLIKE * size:
+        return
+    M = _turn(w, D, d)
+    best, degrees = off(w @ M.T), off(_DEGREES * w)
+    cure: dict[str, float | str] = {"cure": "unknown"}
+    if best < _IMU_BETTER * now:
+        cure = _named(M, frame.rotation)
+    elif degrees < _IMU_BETTER * now:
+        best, cure = degrees, {"cure": "degrees"}
+    elif source == "links":  # feet that slip
+        return
+    yield finding("imu_axes", log.name, source=source, off=now / size, best=best / size, **cure)
+
+
+def _turn(w: Array, D: Array, d: Array) -> Array:
+    """Return the rotation M, shape (3, 3), for which D M w + d is smallest.
+
+    Directions without motion do not turn: the solution is drawn to 1 with a small weight.
+    """
+    G = np.einsum("kia,kic,kb,ke->abce", D, D, w, w, optimize=True).reshape(9, 9)
+    g = -np.einsum("kia,ki,kb->ab", D, d, w, optimize=True).ravel()
+    weight = _DRAWN * np.trace(G)
+    M = np.linalg.solve(G + weight * np.eye(9), g + weight * np.eye(3).ravel()).reshape(3, 3)
+    U, _, V = np.linalg.svd(M)
+    turn: Array = U @ np.diag([1.0, 1.0, np.linalg.det(U @ V)]) @ V
+    return turn
+
+
+def _named(M: Array, Q: Array) -> dict[str, float | str]:
+    """Return what a rotation M of measured vectors means, for an IMU with the axes Q."""
+    own = Q.T @ M @ Q
+    whole = np.rint(own)
+    if np.abs(own - whole).max() < _IMU_ALONG:
+        rows = np.abs(whole).argmax(axis=0)
+        names = [("-" if whole[i, k] < 0 else "") + "xyz"[i] for k, i in enumerate(rows)]
+        return {"cure": "axes", "axes": ", ".join(names)}
+    angle = np.degrees(np.arccos(np.clip((np.trace(M) - 1.0) / 2.0, -1.0, 1.0)))
+    return {"cure": "turned", "angle": angle}
+
+
+def _check_gravity(log: Log, frame: ImuFrame, motion: Trajectory) -> Iterator[Finding]:
+    """Yield a finding if the mean specific force in the world is not opposite to gravity."""
+    quaternion, v, a = motion.q[:, 3:7], motion.v, motion.a
+    f = a[:, :3] + np.cross(v[:, 3:6], v[:, :3]) - in_base(quaternion, frame.gravity)
+    back = quaternion * np.array([-1.0, -1.0, -1.0, 1.0])
+    mean = in_base(back, f).mean(axis=0)
+    g = float(np.linalg.norm(frame.gravity))
+    size = float(np.linalg.norm(mean))
+    cosine = -float(mean @ frame.gravity) / max(g * size, 1e-12)
+    angle = float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
+    if angle < _TILT and abs(size / g - 1.0) < _SIZE:
+        return
+    causes = {
+        "units": abs(size - 1.0) < _SIZE,
+        "subtracted": size < 0.5 * g,
+        "reversed": angle > 180.0 - _TILT,
+        "scale": angle < _TILT,
+        "axes": True,
+    }
+    cause = next(key for key, holds in causes.items() if holds)
+    yield finding("imu_gravity", log.name, cause_of=cause, angle=angle, size=size, wanted=g)

@@ -9,37 +9,34 @@ from dataclasses import replace
 from typing import Any
 
 from robotid.base.exceptions import DataError
-from robotid.base.findings import Finding, by_severity, log_finding
+from robotid.base.findings import Finding, by_severity
 from robotid.base.settings import require_kind
 from robotid.data.files.read import Readable, read_logs
 from robotid.data.log import Log, Trajectory
 from robotid.data.signal_settings import SignalSettings
-from robotid.diagnosis.logs.channels import check_channels
-from robotid.diagnosis.logs.clock import check_clock, check_rest
+from robotid.diagnosis.catalogue import finding
+from robotid.diagnosis.logs.channels import (
+    check_channels,
+    check_clock,
+    check_rest,
+    check_torque_channels,
+)
 from robotid.diagnosis.logs.command_channels import check_commands
 from robotid.diagnosis.logs.contacts import check_base
+from robotid.diagnosis.logs.loads import Segments, check_payload_change
 from robotid.diagnosis.logs.motion_checks import check_excitation, check_repeated_motion
-from robotid.diagnosis.logs.mounted import Segments, check_payload_change
-from robotid.diagnosis.logs.torque_channels import check_torque_channels
 from robotid.diagnosis.logs.torque_checks import check_torques
 from robotid.diagnosis.logs.torque_delay import check_torque_delay
 from robotid.diagnosis.logs.torque_sample import Probe, smooth_motion, take_probe
-from robotid.diagnosis.urdf.inertials import assumed_inertials, explained_by_assumed
-from robotid.diagnosis.urdf.rounding import rounded_robot
+from robotid.diagnosis.urdf.inertials import (
+    assumed_inertials,
+    explained_by_assumed,
+    rounded_robot,
+)
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.constraint_rows import logged_base
 from robotid.robot.model import RobotModel
 from robotid.robot.prior import with_assumed_inertials
-
-#: Codes of the doctor's errors, which can be ignored.
-CODES = (
-    "base_orientation", "base_twist", "gravity", "gravity_compensated", "imu_axes", "imu_gravity",
-    "joint_axis", "joint_order", "delayed_command",
-    "locked_position", "measured_wrench", "position_offset", "position_order", "position_sign",
-    "spikes",
-    "torque_order", "torque_sign", "velocity_mismatch", "unsigned_torque", "velocity_order",
-    "velocity_scale",
-)  # fmt: skip
 
 
 def check_logs(
@@ -110,9 +107,11 @@ def diagnose(
 
 def findings_to_dict(findings: Sequence[Finding]) -> dict[str, Any]:
     """Return findings as plain values, as ``robotid doctor --json`` prints them."""
+    keys = ("code", "severity", "where", "message")
     plain = [
-        vars(finding) | {"evidence": {key: float(x) for key, x in finding.evidence.items()}}
-        for finding in findings
+        {key: getattr(one, key) for key in keys}
+        | {"evidence": {key: float(x) for key, x in one.evidence.items()}}
+        for one in findings
     ]
     return {"findings": plain}
 
@@ -122,8 +121,8 @@ def _examine_log(
 ) -> tuple[Trajectory | None, Probe | None]:
     """Add the findings on one log; return its smooth motion and a probe of it, or None."""
     name = log.name
-    findings += [log_finding(name, "log_note", "note", note) for note in log.notes]
-    findings += [log_finding(name, "log_assumption", "warning", text) for text in log.assumed]
+    findings += [finding("log_note", name, text=note) for note in log.notes]
+    findings += [finding("log_assumption", name, text=text) for text in log.assumed]
     if not model.is_static:  # rows of static poses may have gaps between them
         findings += [*check_clock(log), *check_channels(log, signals)]
     prismatic = [limit.name for limit in model.limits if limit.type == "prismatic"]
@@ -133,9 +132,7 @@ def _examine_log(
     sizes = list(check_torque_channels(log.select(driven))) if has_torque else []
     findings += sizes
     if model.free_flyer or model.constraints or model.passive:
-        message = "torques of a robot with a floating base, contacts, loops or passive joints are "
-        message += "not checked"
-        findings.append(log_finding(name, "floating_base", "note", message))
+        findings.append(finding("floating_base", name))
         findings += check_base(model, log, signals)
         return None, None
     if model.is_static:
@@ -143,20 +140,19 @@ def _examine_log(
     try:
         motion = smooth_motion(model, log, signals)
     except DataError as error:
-        findings.append(Finding(error.code, "error", name, str(error)))
+        findings.append(Finding(error.code, "error", name, str(error), log=name))
         return None, None
     findings += check_rest(log, motion, model.layout)
     if not log.has_torque:
         return motion, None
     probe = take_probe(model, motion)
     if probe is None:
-        message = "the motion is too small to check the torques; record motion of every joint"
-        findings.append(log_finding(name, "no_motion", "warning", message))
+        findings.append(finding("no_motion", name))
         return motion, None
-    if any(finding.severity == "error" for finding in sizes):
+    if any(x.severity == "error" for x in sizes):
         return motion, probe  # torques without signs fit no model
     torques = list(check_torques(probe, name))
     findings += torques
-    if not any(finding.severity == "error" for finding in torques):
+    if not any(x.severity == "error" for x in torques):
         findings += check_torque_delay(model, log, signals, name)
     return motion, probe

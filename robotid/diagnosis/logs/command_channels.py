@@ -7,13 +7,12 @@ from itertools import pairwise
 
 import numpy as np
 
-from robotid.base.findings import Finding, listed, log_finding
-from robotid.base.text import period
+from robotid.base.findings import Finding, listed
 from robotid.base.typing import Array
 from robotid.data.log import Log
 from robotid.data.measured_velocity import quantum
-from robotid.diagnosis.logs.clock import runs_of
-from robotid.diagnosis.logs.command_lead import find_lead
+from robotid.diagnosis.catalogue import finding
+from robotid.diagnosis.logs.channels import runs_of
 
 _SECONDS = 5.0  # [s] length of the segments whose spectra are averaged
 _GAP = 5  # [median steps] a longer step ends the segment that is examined
@@ -46,6 +45,7 @@ _TOP = 0.1  # relative distance from the largest speed within which a joint runs
 _FLAT = 0.6  # least share at the largest speed, of the rows above half of it; a sine has 0.43
 _OFTEN = 0.02  # share of the rows at the largest speed from which it is reported
 _UNLIKE = 0.2  # least relative difference between this speed and the speed of the command
+_LEADS = 5.0  # standard errors by which a joint moves before its command
 _PULSES = 3  # least number of movements that end at one speed
 
 
@@ -232,20 +232,8 @@ class _Loop:
 
 
 def _without_torque(log: Log) -> Finding:
-    without_commands = (
-        "the log has forces of the ground and no torques: the rows of the base identify masses; "
-        "friction and armature of the joints are not identified"
-        if log.wrenches
-        else "the log has neither torques nor commands: nothing can be identified from motion alone"
-    )
-    message = (
-        "the log has no torque. Commands and positions determine the delay of each drive. They "
-        "determine friction, armature and load only as ratios to the gains of the controller; "
-        "state a known gain, else the inertias of the URDF set the scale"
-        if log.q_ref is not None
-        else without_commands
-    )
-    return log_finding(log.name, "no_torque", "note", message)
+    what = "commands" if log.q_ref is not None else "forces" if log.wrenches else "nothing"
+    return finding("no_torque", log.name, what=what)
 
 
 def _shown(log: Log, loops: Sequence[_Loop]) -> Iterator[Finding]:
@@ -254,17 +242,18 @@ def _shown(log: Log, loops: Sequence[_Loop]) -> Iterator[Finding]:
     if not lags:
         return
     ends = {loop.name: loop.bandwidth for loop in loops if np.isfinite(loop.bandwidth)}
-    shown = ", ".join(
+    lines = ", ".join(
         f"{name} {1e3 * lag:.3g} ms" + (f" to {ends[name]:.2g} Hz" if name in ends else "")
         for name, lag in lags.items()
     )
-    message = (
-        f"lag of the positions behind their commands, and bandwidth if it is excited: {shown}. "
-        "The delay of a drive is at most this lag; no action needed"
-    )
     evidence = {f"lag_{name}": lag for name, lag in lags.items()}
     evidence |= {f"bandwidth_{name}": width for name, width in ends.items()}
-    yield log_finding(log.name, "loops", "note", message, **evidence)
+    yield finding("loops", log.name, loops=lines, **evidence)
+
+
+def _named(log: Log, names: Sequence[str]) -> Sequence[str]:
+    """Return the names of joints, none if they are all of the log."""
+    return () if len(names) == len(log.joints) else names
 
 
 def _held(log: Log, loops: Sequence[_Loop]) -> Iterator[Finding]:
@@ -282,17 +271,11 @@ def _held(log: Log, loops: Sequence[_Loop]) -> Iterator[Finding]:
     lengths = np.concatenate(list(rows.values()))
     least, most = (int(x) for x in np.quantile(lengths, [0.05, 0.95]))
     mean, step = float(lengths.mean()), loops[0].step
-    span = f"{least}" if least == most else f"{least} to {most}"
-    message = (
-        f"the command of {listed(rows)} is updated every {span} rows, at {1 / (mean * step):.3g} "
-        f"Hz on average, and is constant for {1e3 * mean * step:.3g} ms. This zero-order hold acts "
-        "as a delay of half that time; simulate the rows as logged, else "
-        f"{500 * mean * step:.2g} ms are added to the identified delay of the drive"
-    )
-    part = "" if len(rows) == len(log.joints) else listed(rows)
-    yield log_finding(
-        log.name, "repeated_command", "note", message, part, rows=mean, period=mean * step
-    )
+    yield finding(
+        "repeated_command", log.name, _named(log, list(rows)), joint=listed(rows),
+        span=f"{least}" if least == most else f"{least} to {most}", rows=mean,
+        updated=1 / (mean * step), period=mean * step, half=0.5 * mean * step,
+    )  # fmt: skip
 
 
 def _alike(log: Log, loops: Sequence[_Loop]) -> Iterator[Finding]:
@@ -310,40 +293,21 @@ def _alike(log: Log, loops: Sequence[_Loop]) -> Iterator[Finding]:
             near = [i for i in left if same[k, i] > _ALIKE]
             group += near
             left = [i for i in left if i not in near]
-        if len(group) == 1:
-            continue
-        least = min(max(same[i, k] for k in group if k != i) for i in group)
-        names = [loops[i].name for i in sorted(group)]
-        message = (
-            f"the commands of {listed(names)} are proportional (correlation {least:.3f} or more): "
-            "effects of the position or speed of one joint are not distinguishable from those of "
-            "another, nor the coupling between joints from their own inertia and friction; give "
-            "each joint its own frequencies or phases"
-        )
-        yield log_finding(
-            log.name, "proportional_commands", "warning", message, listed(names),
-            correlation=float(least), joints=len(names),
-        )  # fmt: skip
+        if len(group) > 1:
+            least = min(max(same[i, k] for k in group if k != i) for i in group)
+            names = [loops[i].name for i in sorted(group)]
+            yield finding(
+                "proportional_commands", log.name, names, correlation=least, joints=len(names)
+            )
 
 
 def _early(log: Log, loops: Sequence[_Loop]) -> Iterator[Finding]:
     """Yield joints that move before their command, which is impossible."""
     for loop in loops:
-        found = find_lead(loop.command, loop.q, loop.step, loop.bandwidth, len(loops))
-        if found is None:
-            continue
-        t = log.t[loop.rows]
-        is_whole = found.stop - found.start == len(t)
-        part = "" if is_whole else f" in {period(float(t[found.start]), float(t[found.stop - 1]))}"
-        message = (
-            f"{loop.name} moves {1e3 * found.lead:.3g} +- {1e3 * found.std_error:.2g} ms before "
-            f"its command{part}: the logged command is not the command of the drive, or it has "
-            "another clock; log the command that is sent to the drive, with the time of sending"
-        )
-        yield log_finding(
-            log.name, "delayed_command", "error", message, loop.name,
-            lag=-found.lead, std_error=found.std_error,
-        )  # fmt: skip
+        lag, error = loop.lag
+        if lag < -max(_LEADS * error, loop.step):
+            yield finding("delayed_command", log.name, loop.name, lag=lag, lead=-lag,
+                          std_error=error)  # fmt: skip
 
 
 def _slow(log: Log, loops: Sequence[_Loop]) -> Iterator[Finding]:
@@ -357,20 +321,12 @@ def _slow(log: Log, loops: Sequence[_Loop]) -> Iterator[Finding]:
         if np.isnan(loop.bandwidth) and not is_determined:
             names, ranges = [*names, loop.name], [*ranges, (least, most)]
             fastest = max(fastest, float(f.max(initial=0.0)))
-    if fastest == 0.0:
-        return
-    least, most = min(low for low, _ in ranges), max(high for _, high in ranges)
-    message = (
-        f"the command of {listed(names)} is too slow to identify the delay: the joints follow it "
-        f"up to {fastest:.2g} Hz, the largest excited frequency. Any delay up to "
-        f"{1e3 * most:.0f} ms is consistent with this, with more or less damping, friction or "
-        "saturation. Record a chirp beyond the bandwidth of the loop (a response of 70 %), or steps"
-    )
-    part = "" if len(names) == len(log.joints) else listed(names)
-    yield log_finding(
-        log.name, "slow_command", "warning", message, part,
-        frequency=fastest, shortest=least, longest=most,
-    )  # fmt: skip
+    if fastest > 0.0:
+        least, most = min(low for low, _ in ranges), max(high for _, high in ranges)
+        yield finding(
+            "slow_command", log.name, _named(log, names), joint=listed(names),
+            frequency=fastest, shortest=least, longest=most,
+        )  # fmt: skip
 
 
 def _small(log: Log, loops: Sequence[_Loop]) -> Iterator[Finding]:
@@ -379,25 +335,16 @@ def _small(log: Log, loops: Sequence[_Loop]) -> Iterator[Finding]:
         (swept, followed), step = loop.sweeps, quantum(log.q[:, loop.joint])
         sweep = float(np.ptp(loop.command))
         share = float(np.median(followed / swept)) if len(swept) >= _SWEEPS else 1.0
+        evidence = {"sweep": sweep, "followed": share, "step": step}
         if share < (_FOLLOWED if loop.lag[0] > 0 else _STUCK):
-            sweep, dead = float(np.median(swept)), float(np.median(swept - followed))
-            message = (
-                f"{loop.name} follows {100 * share:.0f} % of slow sweeps of {sweep:.3g} "
-                f"{loop.unit}: friction, backlash or the dead band of its drive suppress "
-                f"{dead:.2g} {loop.unit}; move it by {5 * dead:.2g} {loop.unit} or more"
-            )
+            dead = float(np.median(swept - followed))
+            evidence |= {"sweep": float(np.median(swept)), "dead": dead, "wanted": 5 * dead}
+            what = "suppressed"
         elif sweep < _FEW * step:
-            message = (
-                f"{loop.name} has a command range of {sweep:.3g} {loop.unit}, {sweep / step:.1f} "
-                "steps of its encoder: the motion is too small; move it by "
-                f"{5 * _FEW * step:.2g} {loop.unit} or more"
-            )
+            what, evidence = "steps", evidence | {"count": sweep / step, "wanted": 5 * _FEW * step}
         else:
             continue
-        yield log_finding(
-            log.name, "small_command", "warning", message, loop.name,
-            sweep=sweep, followed=share, step=step,
-        )  # fmt: skip
+        yield finding("small_command", log.name, loop.name, what=what, unit=loop.unit, **evidence)
 
 
 def _saturated(log: Log, loops: Sequence[_Loop]) -> Iterator[tuple[str, Finding]]:
@@ -417,18 +364,19 @@ def _saturated(log: Log, loops: Sequence[_Loop]) -> Iterator[tuple[str, Finding]
             if unlike > _UNLIKE:
                 clipped.append((at, float(np.ptp(error[at]))))
         share = sum(len(at) for at, _ in clipped) / len(v)
-        if len(clipped) < _PULSES or share < _OFTEN:
-            continue
-        change = max(change for _, change in clipped)
-        message = (
-            f"{loop.name} runs at its largest speed of {top:.3g} {loop.unit}/s in {len(clipped)} "
-            f"movements, {100 * share:.2g} % of the rows, while its position error changes by up "
-            f"to {change:.2g} {loop.unit}: the drive is at its limit of speed or torque; state the "
-            "limit in [controller], or record a slower motion"
-        )
-        evidence = {"speed": top, "share": share, "error": change}
-        found = log_finding(log.name, "saturated", "warning", message, loop.name, **evidence)
-        yield loop.name, found
+        if len(clipped) >= _PULSES and share >= _OFTEN:
+            evidence = {"speed": top, "share": share, "error": max(x for _, x in clipped)}
+            yield (
+                loop.name,
+                finding(
+                    "saturated",
+                    log.name,
+                    loop.name,
+                    unit=loop.unit,
+                    movements=len(clipped),
+                    **evidence,
+                ),
+            )
 
 
 def _sampled(log: Log, loops: Sequence[_Loop]) -> Iterator[Finding]:
@@ -439,18 +387,12 @@ def _sampled(log: Log, loops: Sequence[_Loop]) -> Iterator[Finding]:
         width = loop.bandwidth if np.isfinite(loop.bandwidth) else float(f[-1]) if len(f) else 0.0
         if width * loop.step * _RATE > 1:
             found[loop.name] = width
-    if not found:
-        return
-    rate, width = 1 / loops[0].step, max(found.values())
-    message = (
-        f"{listed(found)} follow their commands up to {width:.3g} Hz and are logged at {rate:.3g} "
-        f"Hz, {rate / width:.2g} rows per period: delay and damping are not distinguishable at "
-        f"this rate; log at {_RATE * width:.2g} Hz or more"
-    )
-    part = "" if len(found) == len(log.joints) else listed(found)
-    yield log_finding(
-        log.name, "slow_sampling", "warning", message, part, rate=rate, bandwidth=width
-    )
+    if found:
+        rate, width = 1 / loops[0].step, max(found.values())
+        yield finding(
+            "slow_sampling", log.name, _named(log, list(found)), joint=listed(found), rate=rate,
+            bandwidth=width, rows=rate / width, wanted=_RATE * width,
+        )  # fmt: skip
 
 
 def _disturbed(log: Log, loops: Sequence[_Loop]) -> Iterator[Finding]:
@@ -465,20 +407,11 @@ def _disturbed(log: Log, loops: Sequence[_Loop]) -> Iterator[Finding]:
         if len(rows) * loop.step < _CONSTANT:
             continue
         centred = np.concatenate([q[i:k] - q[i:k].mean(axis=0) for i, k in runs])
-        own, others = centred[:, loop.joint], np.delete(centred, loop.joint, axis=1)
-        size = float(np.sqrt(2) * own.std())
+        moved, others = centred[:, loop.joint], np.delete(centred, loop.joint, axis=1)
+        size = float(np.sqrt(2) * moved.std())
         if size < max(_DISTURBED, 3 * quantum(log.q[:, loop.joint])):
             continue
-        fit = others @ np.linalg.lstsq(others, own)[0]
-        share = 1 - float(np.sum((own - fit) ** 2) / np.sum(own**2))
-        if share < _EXPLAINED:
-            continue
-        message = (
-            f"{loop.name} moves by {size:.2g} although its command is constant, and the motion of "
-            f"the other joints explains {100 * share:.0f} % of it: the base moves, or the gains of "
-            "this joint are too low for its load; fix the base, and identify the stiffness of this "
-            "joint"
-        )
-        yield log_finding(
-            log.name, "moved_by_others", "warning", message, loop.name, size=size, share=share
-        )
+        fit = others @ np.linalg.lstsq(others, moved)[0]
+        share = 1 - float(np.sum((moved - fit) ** 2) / np.sum(moved**2))
+        if share >= _EXPLAINED:
+            yield finding("moved_by_others", log.name, loop.name, size=size, share=share)

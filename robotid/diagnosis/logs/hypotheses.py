@@ -1,9 +1,4 @@
-"""Tests of how well the model explains each torque, as stated and under other hypotheses.
-
-The torque of a joint must be a sum, with factors >= 0, of the torques of the links that it carries
-by the URDF, of the inertia and the frictions of its drive, and of a constant. Masses may be wrong
-by any factor; signs, columns, gravity and positions may not.
-"""
+"""Checks of how well the model explains each torque, as stated and under other hypotheses."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -17,7 +12,6 @@ from robotid.diagnosis.logs.torque_sample import Probe
 
 #: Decrease of the misfit from which another gravity is reported.
 HINT = 0.7
-
 _FLOOR = 1e-3  # an unexplained share below this is negligible
 _POOR = 0.08  # unexplained share from which other readings of the positions are tested
 _CLEARLY = 2.0  # decrease of the misfit, a factor 7, beyond the readings with stated positions
@@ -32,20 +26,15 @@ _CONSTANT = 1e-9  # relative variation of a torque that is rounding
 
 @dataclass(frozen=True)
 class Explanation:
-    """A hypothesis on the log, and how well the torques are explained under it.
+    """A hypothesis on the log, and how well the torques are explained under it."""
 
-    Attributes:
-        kind: "stated", "payload", "torque_sign", "unsigned_torque", "torque_order", "gravity",
-            "joint_order", "joint_axis", "position_order", "position_sign" or "position_offset".
-        share: Unexplained share of each torque's variance, shape (n,).
-        joints: Indices of the joints concerned.
-        values: "torque_order": the joint of each torque column; "gravity": the vector [m/s^2];
-            "position_offset": the offset [rad].
-    """
-
+    #: "stated", "payload", "torque_sign", "unsigned_torque", "torque_order", "gravity",
+    #: "joint_order", "joint_axis", "position_order", "position_sign" or "position_offset"
     kind: str
-    share: Array
-    joints: tuple[int, ...] = ()
+    share: Array  # Unexplained share of each torque's variance, shape (n,)
+    joints: tuple[int, ...] = ()  # Indices of the joints concerned
+    #: "torque_order": the joint of each torque column; "gravity": the vector [m/s^2];
+    #: "position_offset": the offset [rad]
     values: tuple[float, ...] = ()
 
     @property
@@ -55,10 +44,7 @@ class Explanation:
 
 
 def compensated(probe: Probe) -> tuple[Probe, Array]:
-    """Return a motion with the URDF's gravity added to its torques, and its unexplained shares.
-
-    -> (n,).
-    """
+    """Return a motion with the URDF's gravity added to its torques, and its unexplained shares."""
     gravity = probe.loads() - probe.loads(np.zeros(3))
     whole = replace(probe, tau=probe.tau + gravity.sum(axis=2))
     size, logged = _variation(whole.tau), _variation(probe.tau)
@@ -66,10 +52,7 @@ def compensated(probe: Probe) -> tuple[Probe, Array]:
 
 
 def unexplained(probe: Probe) -> Array:
-    """Return the share of each torque column that the model of each joint does not explain.
-
-    -> (n, n, 2).
-    """
+    """Return the share of each torque column that the model of each joint does not explain."""
     N, n = probe.tau.shape
     every = np.hstack([probe.tau, -probe.tau])
     share = _shares(probe, np.broadcast_to(every, (n, N, 2 * n)))

@@ -1,27 +1,29 @@
-"""Check of the torques against the URDF's masses: scale of each torque, payload, mismatch.
+"""Checks of the torques against the URDF's masses: scale, payload, mismatch, parts, other loads."""
 
-One linear model of all joints with priors: each link has the URDF's parameters times 1 +- 0.3, the
-last link has a payload with a wide prior, the drives have no prior, and the torques are accurate to
-5 %.
-"""
-
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
+import scipy.special
 
-from robotid.base.findings import Finding, listed, log_finding
+from robotid.base.findings import Finding, listed
 from robotid.base.typing import Array
+from robotid.data.log import Trajectory
+from robotid.data.signal_settings import SignalSettings
+from robotid.diagnosis.catalogue import finding
 from robotid.diagnosis.logs.hypotheses import compensated, own_share
 from robotid.diagnosis.logs.torque_sample import Probe
+from robotid.dynamics.base_parameters import BaseMapping
+from robotid.dynamics.factors import Reduction, compress_segments
+from robotid.dynamics.rows import keep_inertial_rows
+from robotid.dynamics.used_rows import base_problem, row_mask
+from robotid.estimation.estimators.two_runs import payload_runs
+from robotid.robot.bodies import link_places
 from robotid.robot.drives import COUNTERBALANCE, drive_line, spring_family
+from robotid.robot.model import RobotModel
+from robotid.robot.prior import payload_spread, prior_spread
 
-#: Message on torques without gravity.
-NO_GRAVITY = (
-    "the torques contain no gravity: they fit the URDF with its gravity added, and do not fit it "
-    "as logged. If the controller compensates gravity before they are logged, log the total torque "
-    "of the motors; if the robot moves in a horizontal plane or floats, state gravity = [0, 0, 0]"
-)
 _SPREAD = 0.3  # prior standard deviation of a link's mass, relative to the URDF's
 _PRECISION = 0.05  # of a torque, model errors included
 _INDEPENDENT = 20.0  # number of independent instants of a log
@@ -43,42 +45,40 @@ _FOLLOWED = 0.5  # ratio of unexplained shares with and without gravity, if a to
 _LIFTS = 0.3  # of the largest gravity torque: a joint with less has no counterbalance
 _CANCELS, _MOST_CANCELLED = 0.2, 1.6  # limits of the share of gravity that a counterbalance cancels
 _MISMATCH = 7.5  # largest sum of squared errors of the links, in standard deviations
+_LIGHTER = 4.0  # decrease of the misfit, a likelihood ratio of 7, from which a part is not mounted
+_MOUNTED_ALIKE = 2.0  # smallest significant difference of misfits
+_LIGHT = 0.02  # of the arm's mass, below which a part is not checked
+_NO_LOAD = 1e-6  # [kg, kg m] prior standard deviation of a payload that is left out
+_P_VALUE = 3e-7  # of a log without another load, five standard errors
+_NOTHING = 0.01  # of the arm's mass, the smallest change of load
+_CLEARLY = 1.5  # least ratio of the misfit of other torque scales to that of a load
+_ROWS = 2000  # of a motion: more are not independent after the filter
+_SEGMENT = 0.4  # [s] longer than the correlation of noise
+_SEGMENTS = 24
 
 
 @dataclass(frozen=True, eq=False)
 class LoadModel:
-    """The whitened torques of each joint, projected orthogonally to the columns of its drive.
+    """The whitened torques of each joint, projected orthogonally to the columns of its drive."""
 
-    Attributes:
-        R: Triangular factor of the c free parameters and the torque of each joint, shape
-            (n, c+1, c+1); 0 of joints that are ignored.
-        mean: Prior mean of the free parameters: factors of the URDF's links, and m, mcx, mcy, mcz
-            of a payload.
-        spread: Prior standard deviation, shape (c,).
-        expected: Misfit of torques that fit as well as with separate parameters for each joint.
-        independent: Number of independent torques.
-    """
-
+    #: Triangular factor of the c free parameters and the torque of each joint, shape (n, c+1, c+1);
+    #: 0 of joints that are ignored
     R: Array
+    #: Prior mean of the free parameters: factors of the URDF's links, and m, mcx, mcy, mcz of a
+    #: payload
     mean: Array
-    spread: Array
-    expected: float
-    independent: float
+    spread: Array  # Prior standard deviation, shape (c,)
+    expected: float  # Misfit of torques that fit as well as with separate parameters for each joint
+    independent: float  # Number of independent torques
 
     def misfits(self, scales: Array) -> Array:
-        """Return the misfits of scaled torques: chi-squares, prior included, shape (T,).
-
-        scales (T, n).
-        """
+        """Return the misfits of scaled torques: chi-squares, prior included, shape (T,)."""
         R = np.asarray(np.linalg.qr(self._rows(scales), mode="r"))  # (T, c+1, c+1)
         chi: Array = R[:, -1, -1] ** 2
         return chi
 
     def fit(self, scale: Array) -> tuple[float, Array, Array]:
-        """Fit with the torque columns multiplied by a scale, without negative masses of links.
-
-        scale (n,).
-        """
+        """Fit with the torque columns multiplied by a scale, without negative masses of links."""
         from scipy.optimize import lsq_linear
 
         rows = self._rows(scale[None])[0]
@@ -130,8 +130,6 @@ def check_loads(probe: Probe, share: Array, name: str) -> Iterator[Finding]:
 
     Another scale is accepted if the torques then fit with about the URDF's masses; else the URDF
     is of another robot.
-
-    share (n,).
     """
     model = load_model(probe, share)
     bodies = len(probe.model.layout.bodies)
@@ -143,7 +141,7 @@ def check_loads(probe: Probe, share: Array, name: str) -> Iterator[Finding]:
             yield from _scaled(probe, scale, _needed(model, scale, other), name)
             return
         if _holds_no_gravity(probe):
-            yield log_finding(name, "gravity_compensated", "error", NO_GRAVITY)
+            yield finding("gravity_compensated", name)
             return
         if len(other) or _error_of_links(theta) > _MISMATCH:
             yield _mismatch(probe, theta[:bodies], name)
@@ -254,25 +252,13 @@ def _balanced(
 ) -> Finding:
     joint, extent = probe.model.joints[j], float(np.ptp(probe.motion.q[:, j]))
     line = f"{drive_line(joint, spring_family(extent, COUNTERBALANCE))} in [drives]"
-    message = (
-        f"{joint}: a torque that depends on its position cancels {100 * cancelled:.0f} % of its "
-        "gravity torque by the URDF, and the other torques contain gravity: the joint has a "
-        "counterbalance or a spring"
-    )
     evidence = {"cancelled_pct": 100 * cancelled, "turned": extent}
     if lighter is None:
-        message = f"{message}. Add it to the model: {line}"
-        return log_finding(name, "counterbalance", "warning", message, joint, **evidence)
+        return finding("counterbalance", name, joint, setting=line, **evidence)
     _, k, factor = lighter
+    evidence |= {"mass": float(probe.model.standard_parameters()[10 * k]), "factor": factor}
     link = probe.model.layout.bodies[k]
-    mass = float(probe.model.standard_parameters()[10 * k])
-    message = (
-        f"{message}, or the URDF's mass of {link}, {mass:.3g} kg, is too large: {factor:.2g} times "
-        f"it explains the torques as well. Correct the mass, or, if the joint has a spring, state "
-        f"it: {line}"
-    )
-    evidence |= {"mass": mass, "factor": factor}
-    return log_finding(name, "link_mass", "warning", message, joint, **evidence)
+    return finding("link_mass", name, joint, setting=line, link=link, **evidence)
 
 
 def _error_of_links(theta: Array) -> float:
@@ -322,37 +308,24 @@ def _needed(model: LoadModel, scale: Array, other: Array) -> Array:
 
 def _scaled(probe: Probe, scale: Array, other: Array, name: str) -> Iterator[Finding]:
     joints, factors = [probe.model.joints[j] for j in other], scale[other].tolist()
-    code, todo = "current_for_torque", "with [torque] gains (--gain {0}=...), or correct the gain"
+    code = "current_for_torque"
     if len(other) > 1 and np.ptp(np.log(factors)) < np.log(_ALIKE):
         factor = float(np.exp(np.log(factors).mean()))
-        message = (
-            f"the torques of {listed(joints)} fit the URDF much better if multiplied by "
-            f"{factor:.3g}: they may be currents, or have another unit or gain; name the columns "
-            "current_<joint> " + todo.format("JOINT")
-        )
         is_all = len(other) == len(scale)
         is_unit = is_all and abs(np.log(factor)) > np.log(_OTHER_UNIT)
-        severity, part = "error" if is_unit else "warning", "" if is_all else listed(joints)
-        yield log_finding(name, code, severity, message, part, factor=factor, joints=len(other))
+        yield finding(
+            code, name, () if is_all else joints, severity="error" if is_unit else "warning",
+            factor=factor, joints=len(other), joint=listed(joints),
+        )  # fmt: skip
         return
     for joint, factor in zip(joints, factors, strict=True):
-        message = (
-            f"the torque of {joint} fits the URDF much better if multiplied by {factor:.3g}: it "
-            "may be a current, or have another unit or gain; name the column "
-            f"current_{joint} " + todo.format(joint)
-        )
-        yield log_finding(name, code, "warning", message, joint, factor=factor)
+        yield finding(code, name, joint, factor=factor)
 
 
 def _mismatch(probe: Probe, factors: Array, name: str) -> Finding:
     found = dict(zip(probe.model.layout.bodies, factors.tolist(), strict=True))
-    shown = ", ".join(f"{link} {factor:.2g}" for link, factor in found.items())
-    message = (
-        f"the torques fit only if the URDF's masses are multiplied by {shown}: the URDF may be of "
-        "another robot or without a load that is mounted, or the torques may be currents with "
-        "several gains; check the model and the unit. A prior from this URDF is not reliable"
-    )
-    return log_finding(name, "urdf_mismatch", "warning", message, **found)
+    words = ", ".join(f"{link} {factor:.2g}" for link, factor in found.items())
+    return finding("urdf_mismatch", name, factors=words, **found)
 
 
 def _payload(probe: Probe, load: Array, error: float, name: str) -> Iterator[Finding]:
@@ -361,12 +334,139 @@ def _payload(probe: Probe, load: Array, error: float, name: str) -> Iterator[Fin
     if abs(mass) < 3 * error:
         return
     link = probe.model.layout.bodies[-1]
-    message = (
-        f"{link} carries roughly {abs(mass):.2g} kg {'more' if mass > 0 else 'less'} than in the "
-        "URDF, if the URDF's other masses and the gains are right; if a tool or payload is "
-        "mounted, add it to the URDF, else it is identified as part of the last link. robotid "
-        "payload, with a log without it as --reference, identifies it with an interval"
-    )
     evidence = {"mass": mass, "std_error": error, "mcx": load[1], "mcy": load[2], "mcz": load[3]}
     severity = "warning" if abs(mass) - 2 * error > _LARGE * arm else "note"
-    yield log_finding(name, "payload", severity, message, link, **evidence)
+    yield finding(
+        "payload", name, subject=link, severity=severity, link=link, sense=mass > 0, **evidence
+    )
+
+
+def check_unmounted_parts(probe: Probe, share: Array, name: str) -> Iterator[Finding]:
+    """Yield a warning "unmounted_part" if the torques fit better without a part of the last link.
+
+    Parts are links that fixed or locked joints attach to the link of the last moving joint, with
+    all links that they carry.
+    """
+    model = load_model(probe, share)
+    whole, loaded = _misfit_without_load(model), model.fit(np.ones(len(share)))[0]
+    arm = float(probe.model.standard_parameters()[: probe.model.layout.n_inertial : 10].sum())
+    trials = []
+    for links, parameters in _parts(probe):
+        pi = probe.model.standard_parameters()
+        size = probe.model.layout.n_inertial
+        pi[size - 10 : size] -= parameters
+        if pi[size - 10] > 0 and parameters[0] > _LIGHT * arm:
+            lighter = probe.of(probe.model.with_parameters(pi))
+            left = _misfit_without_load(load_model(lighter, share))
+            trials.append((left, links, float(parameters[0])))
+    left, links, mass = min(trials, default=(np.inf, [], 0.0))
+    # a load of any mass, positive or negative, must not explain the torques much better
+    if left <= min(whole - _LIGHTER, loaded + _MOUNTED_ALIKE):
+        last = probe.model.layout.bodies[-1]
+        yield finding(
+            "unmounted_part", name, subject=last, link=last, parts=listed(links, 4), mass=mass,
+            gain=whole - left,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Segments:
+    """Motions of a robot, and the reduced least-squares problems of their segments."""
+
+    model: RobotModel  # The robot
+    mapping: BaseMapping  # Standard to base parameters
+    motions: Sequence[Trajectory]  # The motions
+    min_velocity: float  # Lower bound on the speed of the rows that are used
+
+    @property
+    def seconds(self) -> float:
+        """Total duration [s]."""
+        return sum(float(np.ptp(motion.t)) for motion in self.motions)
+
+    @cached_property
+    def reductions(self) -> tuple[Reduction, ...]:
+        """The reduced problem of each segment, in order."""
+        return tuple(part for motion in self.motions for part in self._of(motion))
+
+    def _of(self, motion: Trajectory) -> Iterator[Reduction]:
+        thin = motion.every(max(1, len(motion.t) // _ROWS))
+        keep_inertial_rows(self.model, thin)  # used for the excitation, too
+        count = int(np.clip(np.ptp(thin.t) / _SEGMENT, 1, _SEGMENTS))
+        length = -(-len(thin.t) // count)
+        rows = row_mask(self.model, thin, self.min_velocity)
+        problem = base_problem(self.model, self.mapping, thin, rows, compiled=False)
+        for i, factors in enumerate(compress_segments(problem, length)):
+            part = thin.part(i * length, (i + 1) * length)
+            yield Reduction(factors, part.squares, len(part.t))
+
+
+def check_payload_change(
+    fitted: Segments, validation: Segments, signals: SignalSettings, name: str
+) -> Iterator[Finding]:
+    """Yield a warning "payload_change" if a validation log has another load than the fitted ones.
+
+    Both are fitted together, with free parameters of all links and a load in the last link of the
+    validation log only. The load is reported if the same robot with it fits both.
+    """
+    model, mapping = fitted.model, fitted.mapping
+    first, second, layout = fitted.reductions, validation.reductions, model.layout
+    every = (*first, *second)
+    squares, samples = sum(r.squares for r in every), sum(r.samples for r in every)
+    size = payload_spread(model)
+    last = mapping.K[:, layout.n_inertial - 10 : layout.n_inertial]
+    seconds = fitted.seconds + validation.seconds
+    runs = payload_runs(
+        first,
+        second,
+        layout,
+        mapping.K,
+        model.standard_parameters(),
+        prior_spread(model, np.asarray(squares), samples),
+        (last, np.full(10, np.nan), size),
+        share=min(1.0, 2.0 * (signals.cutoff or np.inf) * seconds / samples),
+    )
+    theta, covariance = runs.alike()
+    least = -float(scipy.special.ndtri(_P_VALUE)) * float(np.sqrt(covariance[-10, -10]))
+    if abs(theta[-10]) <= max(least, _NOTHING * size[0]):
+        return  # standard errors with changes over time are not smaller
+    # the load is tested with errors that include changes over time; torque scales are tried below
+    found = runs.compare(by_joint=False)
+    mass, error = float(found.theta[-10]), float(np.sqrt(found.covariance[-10, -10]))
+    half_width = -float(scipy.special.stdtrit(found.freedom[-10], _P_VALUE)) * error
+    if not max(half_width, _NOTHING * size[0]) < abs(mass) < size[0]:
+        return
+    left = runs.residual_ratios(found.theta) - 1.0
+    by_scales = runs.residual_ratios_by_scales(runs.D.shape[1] - 10) - 1.0
+    if _CLEARLY * left.mean() > by_scales.mean():
+        return  # the logs differ by another effect
+    link = layout.bodies[-1]
+    yield finding(
+        "payload_change", name, subject=link, link=link, sense=mass > 0, mass=mass, std_error=error
+    )
+
+
+def _misfit_without_load(model: LoadModel) -> float:
+    spread = np.append(model.spread[:-4], np.full(4, _NO_LOAD))
+    return replace(model, spread=spread).fit(np.ones(len(model.R)))[0]
+
+
+def _parts(probe: Probe) -> Iterator[tuple[list[str], Array]]:
+    """Yield the links of each part on the last link, and their inertial parameters, (10,)."""
+    last = len(probe.model.layout.bodies) - 1
+    places = {p.link: p for p in link_places(probe.model) if p.body == last and p.role != "moved"}
+    parent = {joint.child: joint.parent for joint in probe.model.tree.joints}
+    seen = set()
+    for root in places:
+        links = [link for link in places if root in _ancestry(link, parent)]
+        massive = [link for link in links if places[link].parameters[0] > 0]
+        if massive and tuple(massive) not in seen:
+            seen.add(tuple(massive))
+            yield massive, np.sum([places[link].parameters for link in massive], axis=0)
+
+
+def _ancestry(link: str, parent: dict[str, str]) -> Iterator[str]:
+    """Yield a link and the links that carry it."""
+    yield link
+    while link in parent:
+        link = parent[link]
+        yield link

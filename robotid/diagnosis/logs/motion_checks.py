@@ -1,74 +1,43 @@
-"""Checks of motions for their roles: excitation to fit, and no repetition to validate."""
+"""Checks of motions for their roles, and of locked joints: excitation, repetition, positions."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from robotid.base.exceptions import RobotIdError
-from robotid.base.findings import Finding, log_finding
+from robotid.base.findings import Finding, toml_key
 from robotid.base.typing import Array
+from robotid.data.alike_motions import REPEATED, repeated_share
 from robotid.data.log import Trajectory
-from robotid.data.signal_settings import SignalSettings
+from robotid.data.signal_settings import LogUnits, SignalSettings
+from robotid.diagnosis.catalogue import finding
 from robotid.dynamics.base_parameters import BaseMapping
 from robotid.dynamics.factors import compress, merge
 from robotid.dynamics.used_rows import base_problem, independent_share, row_mask
 from robotid.estimation.estimators import WLS, Estimate
-from robotid.estimation.estimators.determination import Determination, base_spread, determine
+from robotid.estimation.estimators.determination import (
+    Determination,
+    base_spread,
+    determine,
+    is_poorly_excited,
+)
 from robotid.robot.model import RobotModel
 from robotid.robot.prior import prior_spread
 
-_AHEAD = (0.0, 0.25, 0.5, 0.75, 1.0)  # [s] after an instant, positions that are compared
-_NEAR = 0.02  # of the range of each joint: closer positions are equal
-_SHARE = 0.3  # of the validation motion that is in a fitted log, too
-_INSTANTS = 300
-_FEW = 60  # ... of each of many motions
 _ROWS = 5000  # of a log, from which its excitation is computed
-_ILL_CONDITIONED = 1e3  # condition number of unit columns above which a motion is poor
-_RICHER = "a motion of all joints together, in both directions and as fast as permitted"
-_LOST = "the excitation is good, but these parameters are not identifiable above the noise"
+#: Largest range of a locked joint, and largest difference from its stated position [rad or m].
+STILL = 0.02
+_FAR = 2 * np.pi  # number in a log above which a position may be a percentage
 
 
 def check_repeated_motion(
     fitted: Sequence[Trajectory], validation: Trajectory, name: str
 ) -> Iterator[Finding]:
     """Yield a warning "repeated_motion" if a validation log repeats motion that is fitted."""
-    from scipy.spatial import cKDTree
-
-    size = np.maximum(np.ptp(validation.q, axis=0), 1e-3)
-    own = _segments(validation, size, _INSTANTS)
-    share = 0.0
-    for known in [_segments(motion, size, None) for motion in fitted if len(own)]:
-        if len(known):
-            distance, _ = cKDTree(known).query(own, p=np.inf, distance_upper_bound=_NEAR)
-            share = max(share, float(np.mean(np.isfinite(distance))))
-    if share < _SHARE:
-        return
-    message = (
-        f"{100 * share:.0f} % of this validation motion is in a fitted log, too: its torque "
-        "prediction error is too optimistic; record another motion to validate with"
-    )
-    yield log_finding(name, "repeated_motion", "warning", message, share=share)
-
-
-def alike_motions(motions: Sequence[Trajectory]) -> list[list[int]]:
-    """Return the motions in groups: one that repeats another one is in its group."""
-    from scipy.spatial import cKDTree
-
-    low, high = (np.array([f(x.q, axis=0) for x in motions]) for f in (np.min, np.max))
-    size = np.maximum(high.max(axis=0) - low.min(axis=0), 1e-3)
-    trees = [cKDTree(known) if len(known := _segments(x, size, None)) else None for x in motions]
-    groups: list[list[int]] = []
-    for k, motion in enumerate(motions):
-        own, same = _segments(motion, size, _FEW), list[list[int]]()
-        for group in groups if len(own) else ():
-            others = [tree for j in group if (tree := trees[j]) is not None]
-            far = [x.query(own, p=np.inf, distance_upper_bound=_NEAR)[0] for x in others]
-            if any(np.mean(np.isfinite(distance)) >= _SHARE for distance in far):
-                same.append(group)
-        groups = [group for group in groups if group not in same]
-        groups.append([*(j for group in same for j in group), k])
-    return sorted(sorted(group) for group in groups)
+    share = repeated_share(fitted, validation)
+    if share >= REPEATED:
+        yield finding("repeated_motion", name, share=share)
 
 
 def check_excitation(
@@ -92,8 +61,10 @@ def check_excitation(
         factors = merge([compress(problem) for problem in problems])
         found = WLS(prior=mapping.to_base(prior)).fit(factors)
     except RobotIdError as error:
-        message = f"the excitation was not checked: {error}"
-        yield log_finding(name, "excitation", "warning", message)
+        yield finding(
+            "excitation", name, severity="warning", what="unchecked", todo="unchecked",
+            text=str(error),
+        )  # fmt: skip
         return
     share = step * min(independent_share(replace(signals, rate=m.rate)) for m in motions)
     squares = np.sum([motion.squares for motion in thinned], axis=0)
@@ -109,43 +80,53 @@ def excitation_finding(wls: Estimate, known: Determination, name: str) -> Findin
     evidence = {"rank": known.rank, "base": count, "weakest": known.shrinkage[-1]}
     if np.isfinite(wls.condition):
         evidence["condition"] = wls.condition
-    message = (
-        f"the motion determines {known.rank} of {count} base parameters "
-        f"(condition number {wls.condition:.3g} of the regressor, unit columns)"
-    )
     is_poor = is_poorly_excited(wls, count)
-    if known.groups:
-        advice = f"record {_RICHER}" if is_poor else f"{_LOST}; a faster motion determines more"
-        message += f": {known.described()}; {advice}"
-    elif is_poor:
-        left = 100 * known.shrinkage[-1]
-        message += f". The standard error of the least determined one is {left:.2g} % of its prior"
-        message += f" standard deviation; to determine it better, record {_RICHER}"
-    else:
-        message += "; no action needed"
-    severity = "warning" if known.groups and is_poor else "note"
-    return log_finding(name, "excitation", severity, message, **evidence)
+    todo = "poor" if is_poor else "lost"
+    if not known.groups:
+        todo = "weak" if is_poor else "good"
+    return finding(
+        "excitation", name, severity="warning" if todo == "poor" else "note", what="rank",
+        todo=todo, described=known.described() if known.groups else "",
+        condition_number=f"{wls.condition:.3g}", **evidence,
+    )  # fmt: skip
 
 
-def is_poorly_excited(wls: Estimate, count: int) -> bool:
-    """Return whether the motion, not the noise, leaves base parameters undetermined."""
-    return wls.rank < count or wls.condition > _ILL_CONDITIONED
+def check_locked(
+    model: RobotModel,
+    positions: Mapping[str, Array],
+    log: str,
+    asked: Collection[str],
+    units: LogUnits,
+) -> Iterator[Finding]:
+    """Yield an error "locked_position" per locked joint that moves or has another position."""
+    prismatic = {joint.name for joint in model.tree.movable if joint.type == "prismatic"}
+    for joint, q in positions.items():
+        stated = model.locked[joint]
+        middle, extent = float(np.median(q)), float(np.ptp(q))
+        if extent <= STILL and abs(middle - stated) <= STILL:
+            continue
+        what = "moves" if extent > STILL else "stands"
+        yield finding(
+            "locked_position", log, joint, what=what, todo=what, default=joint in asked,
+            unit="m" if joint in prismatic else "rad", stated=stated, median=middle, range=extent,
+            setting=f"locked = {{ {joint} = {middle:.4g} }}", flag=f"--lock {joint}={middle:.4g}",
+            percent=percent_hint(model, joint, middle, units),
+        )  # fmt: skip
 
 
-def _segments(motion: Trajectory, size: Array, count: int | None) -> Array:
-    """Return positions at instants and up to a second after, over the size, where joints move."""
-    step = float(np.median(np.diff(motion.t)))
-    ahead = [round(s / step) for s in _AHEAD]
-    last = len(motion.t) - ahead[-1]
-    if last <= 0:
-        return np.empty((0, len(_AHEAD) * len(size)))
-    starts = np.arange(last)
-    whole = motion.segment[starts] == motion.segment[starts + ahead[-1]]
-    moved = np.abs(motion.q[starts + ahead[-1]] - motion.q[starts]) / size
-    starts = starts[whole & (moved.max(axis=1) > 2 * _NEAR)]
-    if count is not None and len(starts) > count:
-        starts = starts[np.linspace(0, len(starts) - 1, count).astype(int)]
-    else:
-        # instants so close that fast motion moves less than the bound between two of them
-        starts = starts[:: max(1, round(0.005 / step))]
-    return np.hstack([motion.q[starts + k] / size for k in ahead])
+def percent_hint(model: RobotModel, name: str, position: float, units: LogUnits) -> str:
+    """Return what to state if the position of a gripper is a percentage; "" if it cannot be one."""
+    joint = next(joint for joint in model.tree.movable if joint.name == name)
+    first, scale = units.scale(name, is_angle=joint.type != "prismatic")
+    logged = (position - first) / scale
+    moves = any(other.parent == joint.child for other in model.tree.movable)
+    if name in units.percent or moves or not joint.has_limits or not _FAR < logged <= 100:
+        return ""
+    low, high = joint.lower, joint.upper
+    unit = "m" if joint.type == "prismatic" else "rad"
+    return (
+        f". If {logged:.4g}, the number in the log, is a percentage, as of LeRobot's grippers, "
+        f"state percent = {{ {toml_key(name)} = [{low:.4g}, {high:.4g}] }} in [units], the "
+        f"positions at 0 and at 100 [{unit}]: it then is at "
+        f"{low + (high - low) * logged / 100:.4g} {unit}"
+    )

@@ -1,15 +1,20 @@
 """Checks of the torques against the model: signs, order of columns, gravity, positions."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from robotid.base.findings import Finding, listed, log_finding
+from robotid.base.findings import Finding
 from robotid.base.typing import Array
+from robotid.diagnosis.catalogue import finding
 from robotid.diagnosis.logs.hypotheses import HINT, Explanation, explanations
-from robotid.diagnosis.logs.loads import NO_GRAVITY, check_loads, counterbalance, holds_gravity
-from robotid.diagnosis.logs.mounted import check_unmounted_parts
+from robotid.diagnosis.logs.loads import (
+    check_loads,
+    check_unmounted_parts,
+    counterbalance,
+    holds_gravity,
+)
 from robotid.diagnosis.logs.torque_sample import Probe
 
 _CERTAIN = 2.5  # significant decrease of the logarithm of the unexplained share, a factor 12
@@ -45,11 +50,12 @@ class _Reading:
     def joints(self) -> list[str]:
         return [self.probe.model.joints[j] for j in self.best.joints]
 
-    def finding(self, message: str, part: str) -> Finding:
+    def finding(self, joints: Sequence[str], severity: str = "", **values: float | str) -> Finding:
         """Return the error that columns contain other quantities than stated."""
-        return log_finding(
-            self.log, self.best.kind, "error", message, part, gain=self.gain,
+        return finding(
+            self.best.kind, self.log, joints, severity=severity, gain=self.gain,
             unexplained=self.stated.share.max(), unexplained_so_read=self.best.share.max(),
+            **values,
         )  # fmt: skip
 
 
@@ -67,12 +73,12 @@ def check_torques(probe: Probe, name: str) -> Iterator[Finding]:
         best = stated  # a load explains the torques better
     make = _FINDINGS.get(best.kind)
     found = list(make(_Reading(probe, stated, best, name))) if make else []
-    for finding in found:
+    for one in found:
         # a fault that a load on the last link explains as well is only a warning
-        yield replace(finding, severity="warning") if _is_excused(best, loaded) else finding
+        yield replace(one, severity="warning") if _is_excused(best, loaded) else one
     if not found:
         loads = list(check_loads(probe, loaded.share, name))
-        if not {finding.code for finding in loads} - {"payload"}:
+        if not {load.code for load in loads} - {"payload"}:
             parts = list(check_unmounted_parts(probe, loaded.share, name))
             loads = parts or loads
         yield from loads
@@ -84,75 +90,41 @@ def check_torques(probe: Probe, name: str) -> Iterator[Finding]:
 def _sign(reading: _Reading) -> Iterator[Finding]:
     for j, joint in zip(reading.best.joints, reading.joints, strict=True):
         before, after = reading.stated.share[j], reading.best.share[j]
-        if before < _WRONG or after > _EXPLAINED:
-            continue
-        message = (
-            f"the torque of {joint} has the opposite sign: {100 * before:.0f} % of its variance "
-            f"is unexplained, with the sign reversed {100 * after:.2g} %; negate tau_{joint} (or "
-            "its gain), or check the joint's axis in the URDF"
-        )
-        evidence = {"unexplained": before, "unexplained_if_negated": after}
-        yield log_finding(reading.log, "torque_sign", "error", message, joint, **evidence)
+        if before >= _WRONG and after <= _EXPLAINED:
+            evidence = {"unexplained": before, "unexplained_if_negated": after}
+            yield finding("torque_sign", reading.log, joint, **evidence)
 
 
 def _unsigned(reading: _Reading) -> Iterator[Finding]:
     for j, joint in zip(reading.best.joints, reading.joints, strict=True):
         before, after = reading.stated.share[j], reading.best.share[j]
-        if after > _EXPLAINED:
-            continue
-        message = (
-            f"the torque of {joint} is logged without its sign: {100 * before:.0f} % of its "
-            f"variance is unexplained, with the signs of the model {100 * after:.2g} %; log "
-            f"tau_{joint} with its sign"
-        )
-        evidence = {"unexplained": before, "unexplained_with_signs": after}
-        yield log_finding(reading.log, "unsigned_torque", "error", message, joint, **evidence)
+        if after <= _EXPLAINED:
+            yield finding(
+                "unsigned_torque", reading.log, joint, kind="one", cure="one", unexplained=before,
+                unexplained_with_signs=after,
+            )  # fmt: skip
 
 
 def _exchanged(reading: _Reading) -> Iterator[Finding]:
     if not reading.is_certain:
         return
-    names, best = reading.joints, reading.best
+    names, best, owners = reading.joints, reading.best, ""
     if best.kind == "torque_order":
-        owners = [reading.probe.model.joints[int(best.values[j])] for j in best.joints]
-        pairs = zip(names, owners, strict=True)
-        shown = ", ".join(f"tau_{a} is the torque of {b}" for a, b in pairs)
-        what, todo = f"torque columns are exchanged: {shown}", "rename these columns"
-    elif best.kind == "position_order":
-        what, todo = f"the position columns of {listed(names)} are exchanged", "rename them"
-    else:
-        what, todo = f"all columns of {listed(names)} are exchanged", "correct the joint names"
-    message = (
-        f"{what}. With these columns exchanged, the largest unexplained share of a torque "
-        f"decreases from {100 * reading.stated.share.max():.2g} to "
-        f"{100 * best.share.max():.2g} %; {todo}"
-    )
-    yield reading.finding(message, listed(names))
+        joints = [reading.probe.model.joints[int(best.values[j])] for j in best.joints]
+        pairs = zip(names, joints, strict=True)
+        owners = ", ".join(f"tau_{a} is the torque of {b}" for a, b in pairs)
+    yield reading.finding(names, owners=owners)
 
 
 def _position(reading: _Reading) -> Iterator[Finding]:
-    if not reading.is_certain:
-        return
-    best, (joint,) = reading.best, reading.joints
-    if best.kind == "joint_axis":
-        what = (
-            f"position and torque of {joint} have the opposite sign: its axis is reversed. Reverse "
-            f"the joint's axis in the URDF, or negate q_{joint}, dq_{joint} and tau_{joint}"
-        )
-    elif best.kind == "position_sign":
-        what = f"the position of {joint} has the opposite sign. Negate q_{joint} (and dq_{joint})"
-    else:
-        what = (
-            f"the zero position of {joint} has an error of about {best.values[0]:.2g} rad. Correct "
-            f"q_{joint} or the joint's origin in the URDF"
-        )
-    before = reading.stated.share
-    worst = int(np.argmax(before - best.share))
-    message = (
-        f"{what}. The unexplained share of the torque of {reading.probe.model.joints[worst]} then "
-        f"decreases from {100 * before[worst]:.3g} to {100 * best.share[worst]:.3g} %"
-    )
-    yield reading.finding(message, joint)
+    if reading.is_certain:
+        before, best = reading.stated.share, reading.best
+        worst = int(np.argmax(before - best.share))
+        offset = {"offset": best.values[0]} if best.values else {}
+        yield reading.finding(
+            reading.joints, worst=reading.probe.model.joints[worst], before=before[worst],
+            after=best.share[worst], what="log", cure="log", **offset,
+        )  # fmt: skip
 
 
 def _gravity(reading: _Reading) -> Iterator[Finding]:
@@ -160,23 +132,19 @@ def _gravity(reading: _Reading) -> Iterator[Finding]:
     size = float(np.linalg.norm(believed))
     if not g.any():
         if size > 0 and reading.is_certain and not holds_gravity(reading.probe):
-            code = "gravity_compensated"
-            yield log_finding(reading.log, code, "error", NO_GRAVITY, gain=gain)
+            yield finding("gravity_compensated", reading.log, gain=gain)
         return
     cosine = float(g @ believed) / (float(np.linalg.norm(g)) * size) if size > 0 else 0.0
     angle = float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
     is_wrong = angle > _WRONG_TILT and reading.is_certain
     if not is_wrong and (angle < _TILT or gain < HINT):
         return
-    shown, stated = (", ".join(f"{x:.2f}" for x in vector) for vector in (g, believed))
-    message = (
-        f"gravity [{shown}] m/s^2 explains the torques best. Its direction is {angle:.0f} degrees "
-        f"from the stated [{stated}]; if the robot is mounted on a wall, a ceiling or a slope, "
-        f"state gravity = [{shown}] in the job file"
-    )
+    best, stated = (", ".join(f"{x:.2f}" for x in vector) for vector in (g, believed))
     evidence = {"angle_deg": angle, "x": g[0], "y": g[1], "z": g[2], "gain": gain}
-    severity = "error" if is_wrong else "warning"
-    yield log_finding(reading.log, "gravity", severity, message, **evidence)
+    yield finding(
+        "gravity", reading.log, severity="error" if is_wrong else "warning", what="log",
+        cure="log", best=best, stated=stated, **evidence,
+    )  # fmt: skip
 
 
 _FINDINGS: dict[str, Callable[[_Reading], Iterator[Finding]]] = {
@@ -204,23 +172,10 @@ def _is_excused(best: Explanation, loaded: Explanation) -> bool:
 
 def _unexplained(probe: Probe, share: Array, name: str) -> Iterator[Finding]:
     """Yield torques with a large unexplained share; one finding if these are most of them."""
-    bad = np.flatnonzero(share > _UNEXPLAINED)
+    code, bad = "unexplained_torque", np.flatnonzero(share > _UNEXPLAINED)
     if 2 * len(bad) > len(share):
-        message = (
-            f"the torques of {len(bad)} of {len(share)} joints fit neither gravity, inertia nor "
-            "friction of this model. The base may move, the robot may touch its environment, or "
-            "the log and the URDF may be of different robots; an identification from this log is "
-            "wrong"
-        )
-        evidence = {"joints": len(bad), "share": float(np.median(share))}
-        yield log_finding(name, "unexplained_torque", "warning", message, **evidence)
+        evidence = {"joints": len(bad), "of": len(share), "share": float(np.median(share))}
+        yield finding(code, name, what="robot", **evidence)
         return
     for j in bad:
-        joint = probe.model.joints[j]
-        message = (
-            f"{100 * share[j]:.0f} % of the variance of {joint}'s torque fits neither gravity, "
-            "inertia nor friction. The channel may contain another quantity or mostly noise; the "
-            "joint may have a spring, an eccentric gear or a coupled drive. Parameters that depend "
-            "on this torque are not reliable"
-        )
-        yield log_finding(name, "unexplained_torque", "warning", message, joint, share=share[j])
+        yield finding(code, name, probe.model.joints[j], what="joint", share=share[j])

@@ -10,12 +10,13 @@ from itertools import pairwise
 
 import numpy as np
 
-from robotid.base.findings import Finding, log_finding
+from robotid.base.findings import Finding
 from robotid.base.typing import Array
 from robotid.data.filters import cubic_spline
 from robotid.data.log import Log, Trajectory
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import low_pass
+from robotid.diagnosis.catalogue import finding
 from robotid.diagnosis.logs.torque_sample import coupled_columns, smooth_motion
 from robotid.dynamics.torque import carried_columns
 from robotid.robot.model import RobotModel
@@ -46,30 +47,18 @@ _WIDE = 3.0, 0.4  # the same of the motion from which the regressor is computed
 _SETTLED = 1.5  # [periods of the filter] settling time of the filter at an end of a segment
 _HARMONICS = 4  # of a torque that is periodic in the position, as of gears and magnets
 _EXACT = 1e-5  # share of a torque that is noise even in an exact log
-# Least share of the unexplained torque that a joint's own delay must explain, and some of it in
-# each block of the log: friction and elasticity alone explain up to 0.71 with a long delay, and up
-# to 0.32 with one inside the half of the grid (honest recordings: 0.17)
-_EXPLAINS, _EXPLAINS_INSIDE = 0.75, 0.35
-# Difference from the others' delay below which the larger share is needed: [s], and [samples]
-_OWN, _ROWS_APART = 0.01, 1.5
 
 
 @dataclass(frozen=True, eq=False)
 class _Misfit:
-    """The unexplained part of each torque at each delay of the grid.
+    """The unexplained part of each torque at each delay of the grid."""
 
-    Attributes:
-        squares: Sums of squares in each block of the log, as shares of the joint's torque, shape
-            (n, blocks, delays).
-        rows: Number of instants of each joint, shape (n,).
-        joints: Names of these joints.
-        loaded: The same sums if friction also grows with the load, shape (n, blocks, delays); None:
-            not compared.
-    """
-
+    #: Sums of squares in each block of the log, as shares of the joint's torque, shape (n, blocks,
+    #: delays)
     squares: Array
-    rows: Array
-    joints: tuple[str, ...]
+    rows: Array  # Number of instants of each joint, shape (n,)
+    #: The same sums if friction also grows with the load, shape (n, blocks, delays); None: not
+    #: compared
     loaded: Array | None = None
 
     def delays_without(self, axis: int) -> list[float]:
@@ -95,49 +84,8 @@ class _Misfit:
     def without(self, left_out: Collection[int]) -> "_Misfit":
         """Return the misfit of the joints that are not left out."""
         used = [k for k in range(len(self.rows)) if k not in left_out]
-        names = tuple(self.joints[k] for k in used)
         loaded = None if self.loaded is None else self.loaded[used]
-        return _Misfit(self.squares[used], self.rows[used], names, loaded)
-
-    def exceptions(self, step: float) -> dict[int, "_OwnDelay"]:
-        """Return the joints with a delay of their own, the clearest first.
-
-        Each is left out of the common delay with which the next ones are compared.
-        """
-        found: dict[int, _OwnDelay] = {}
-        while len(found) < len(self.joints) - 1:
-            names = [k for k in range(len(self.joints)) if k not in found]
-            rest = self.without(found)
-            delays = {k: rest.own_delay(i, step) for i, k in enumerate(names)}
-            distinct = [k for k, one in delays.items() if one.is_significant]
-            if not distinct:
-                break
-            clearest = max(distinct, key=lambda k: delays[k].explained)
-            found[clearest] = delays[clearest]
-        return found
-
-    def own_delay(self, k: int, step: float) -> "_OwnDelay":
-        """Return the delay that explains the torque of one joint best."""
-        others = self.without({k})
-        common = 0.0 if others.is_of_load else others.delay()
-        common = common if np.isfinite(common) else 0.0
-        squares = self.squares[k]
-        rests = [np.delete(squares, b, axis=0).sum(axis=0) for b in range(len(squares))]
-        delays = [float(_GRID[np.argmin(rest)]) for rest in rests]
-        pairs = list(zip(delays, squares, strict=True))
-        now = _at(common, squares)
-        then = np.array([_at(delay, block) for delay, block in pairs])
-        best = float(_GRID[np.argmin(squares.sum(axis=0))])
-        error = float(np.hypot(_GRID[1] - _GRID[0], np.sqrt((len(delays) - 1) * np.var(delays))))
-        explained = 1.0 - float((then.sum() + _EXACT) / (now.sum() + _EXACT))
-        is_better = bool(np.count_nonzero(then < now) >= len(now) - 1)
-        is_better = is_better and explained > float(self.by_load(common)[k])
-        is_distinct = bool(abs(best - common) > _SIGNIFICANT * error) and is_better
-        is_inside = abs(best) <= 0.5 * _LONGEST and abs(best - common) > max(
-            _OWN, _ROWS_APART * step
-        )
-        least = _EXPLAINS_INSIDE if is_inside else _EXPLAINS
-        return _OwnDelay(best, error, common, explained, is_distinct and explained > least)
+        return _Misfit(self.squares[used], self.rows[used], loaded)
 
     def delay(self) -> float:
         """Return the delay with the smallest misfit [s], NaN if it is at an end of the grid."""
@@ -174,64 +122,22 @@ def _at(delay: float, values: Array) -> Array:
     return found
 
 
-@dataclass(frozen=True)
-class _OwnDelay:
-    """The delay of one joint's torque [s], and its standard error.
-
-    Attributes:
-        common: Delay of the torques of the other joints [s].
-        explained: Share of the unexplained torque that the delay of the other blocks explains.
-        is_significant: Whether the delay differs from the common one.
-    """
-
-    delay: float
-    error: float
-    common: float
-    explained: float
-    is_significant: bool
-
-    def finding(self, joint: str, log: str) -> Finding:
-        """Return the finding that the torque of a joint has another delay."""
-        size = 1e3 * abs(self.delay)
-        is_end = abs(self.delay) >= _LONGEST - 1e-9
-        value = f"{size:.0f} ms or more" if is_end else f"{size:.0f} +- {1e3 * self.error:.0f} ms"
-        message = (
-            f"the torque of {joint} {'lags' if self.delay > 0 else 'leads'} the position by "
-            f"{value}, the torques of the other joints lag it by {1e3 * self.common:.0f} ms. The "
-            f"delay explains {100 * self.explained:.0f} % of the torque that the model does not "
-            f"explain; correct the time stamps or the filter of tau_{joint} in the logger, "
-            "because torque_delay shifts all joints"
-        )
-        evidence = {"delay": self.delay, "std_error": self.error, "gain": self.explained}
-        return log_finding(log, "joint_torque_delay", "warning", message, joint, **evidence)
-
-
 @dataclass(frozen=True, eq=False)
 class _Window:
-    """Filtered torques of contiguous rows of a motion, and the columns that may explain them.
+    """Filtered torques of contiguous rows of a motion, and the columns that may explain them."""
 
-    Attributes:
-        inertial: Of the bodies that each joint carries, joint after joint, shape (N, columns).
-        drive: Of each joint's inertia, frictions and position, and of coupled drives, (N, n, k).
-        steady: Whether the drive is far from stiction, shape (N, n), bool.
-        delayed: Torques at each delay of the grid after the instants, shape (n, delays, N).
-        load: Friction that grows with the URDF's torque, per unit of its coefficient, (N, n).
-    """
-
-    inertial: Array
+    inertial: Array  # Of the bodies that each joint carries, joint after joint, shape (N, columns)
+    #: Of each joint's inertia, frictions and position, and of coupled drives, (N, n, k)
     drive: Array
-    steady: Array
-    delayed: Array
-    load: Array
+    steady: Array  # Whether the drive is far from stiction, shape (N, n), bool
+    delayed: Array  # Torques at each delay of the grid after the instants, shape (n, delays, N)
+    load: Array  # Friction that grows with the URDF's torque, per unit of its coefficient, (N, n)
 
 
 def check_torque_delay(
     model: RobotModel, log: Log, signals: SignalSettings, name: str
 ) -> Iterator[Finding]:
     """Yield the delay of the torque relative to the position: "torque_delay", at most once.
-
-    Before it, a warning "joint_torque_delay" per joint whose torque has another delay; this joint
-    is then not used for the common delay.
 
     The delay minimises the unexplained part of the delayed torque. The model has, besides the
     inertias, friction as an antisymmetric function of the speed, and a torque that is periodic in
@@ -249,13 +155,7 @@ def check_torque_delay(
     wide = replace(signals, cutoff=signals.cutoff and min(times * signals.cutoff, most * rate))
     motion = smooth_motion(model, log, wide)
     misfit = _misfit(model, motion, replace(signals, cutoff=cutoff), 1 / cutoff)
-    if misfit is None:
-        return
-    own = misfit.exceptions(step)
-    if 2 * len(own) < len(misfit.joints):  # at most half of the joints are exceptions
-        yield from (own[k].finding(misfit.joints[k], name) for k in sorted(own))
-        misfit = misfit.without(own)
-    if len(misfit.joints) > 1:
+    if misfit is not None and len(misfit.rows) > 1:
         yield from _common(misfit, step, signals, name)
 
 
@@ -268,34 +168,14 @@ def _common(misfit: _Misfit, step: float, signals: SignalSettings, name: str) ->
     is_significant = abs(delay) > _SIGNIFICANT * error and gain > (
         _HELPS if abs(delay) > _DELAYED else 0.0
     )
-    is_of_load = is_significant and misfit.is_of_load
-    is_significant = is_significant and not is_of_load
-    total = delay + signals.torque_delay
-    if is_of_load:
-        todo = (
-            ", but friction that grows with the load explains the torques better; no action needed"
-        )
-    elif not is_significant:
-        todo = ", which is not significant; no action needed"
-    elif gain > _HELPS:
-        todo = (
-            f". The delay explains {100 * gain:.0f} % of the torque that the model does not "
-            "explain; correct the logger's clock, or set "
-            f"torque_delay = {total:.4f} (--torque-delay {total:.4f})"
-        )
-    else:
-        todo = (
-            ". Unmodelled friction can look like this; if the drive filters its torque, "
-            f"set torque_delay = {total:.4f} (--torque-delay {total:.4f})"
-        )
-    message = (
-        f"the torque {'lags' if delay > 0 else 'leads'} the position by {1e3 * abs(delay):.1f} "
-        f"+- {1e3 * error:.1f} ms{todo}"
-    )
-    evidence = {"delay": delay, "std_error": error, "gain": gain}
-    yield log_finding(
-        name, "torque_delay", "warning" if is_significant else "note", message, **evidence
-    )
+    todo = "none"
+    if is_significant:
+        todo = "of_load" if misfit.is_of_load else "clear" if gain > _HELPS else "filter"
+    yield finding(
+        "torque_delay", name, severity="note" if todo in ("none", "of_load") else "warning",
+        todo=todo, sense=delay > 0, delay=delay, std_error=error, gain=gain,
+        total=delay + signals.torque_delay,
+    )  # fmt: skip
 
 
 def _misfit(
@@ -315,8 +195,7 @@ def _misfit(
     if len(used) < max(2.0, len(own) / 2):
         return None
     squares, loaded, rows = zip(*used.values(), strict=True)
-    names = tuple(model.joints[j] for j in used)
-    return _Misfit(np.array(squares), np.array(rows, dtype=float), names, np.array(loaded))
+    return _Misfit(np.array(squares), np.array(rows, dtype=float), np.array(loaded))
 
 
 def _segments(model: RobotModel, motion: Trajectory, every: int) -> list[Array]:

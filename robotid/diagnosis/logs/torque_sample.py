@@ -71,28 +71,17 @@ class _Loads:
 
 @dataclass(frozen=True, eq=False)
 class Probe:
-    """The parts of the model's torque at some instants, linear in masses and gravity.
+    """The parts of the model's torque at some instants, linear in masses and gravity."""
 
-    Attributes:
-        model: The robot.
-        motion: The smooth motion that contains the instants.
-        rows: The N instants, as rows of the motion, shape (N,), int.
-        q: Joint positions, shape (N, n) [rad or m].
-        v: Velocities, shape (N, n).
-        a: Accelerations, shape (N, n).
-        tau: Torques, shape (N, n) [N m or N].
-        parts: The parts of the model's torque at these instants.
-        balanced: Joints whose torque may also depend on their position, as with a counterbalance.
-    """
-
-    model: RobotModel
-    motion: Trajectory
-    rows: Array
-    q: Array
-    v: Array
-    a: Array
-    tau: Array
-    parts: _Loads
+    model: RobotModel  # The robot
+    motion: Trajectory  # The smooth motion that contains the instants
+    rows: Array  # The N instants, as rows of the motion, shape (N,), int
+    q: Array  # Joint positions, shape (N, n) [rad or m]
+    v: Array  # Velocities, shape (N, n)
+    a: Array  # Accelerations, shape (N, n)
+    tau: Array  # Torques, shape (N, n) [N m or N]
+    parts: _Loads  # The parts of the model's torque at these instants
+    #: Joints whose torque may also depend on their position, as with a counterbalance
     balanced: tuple[int, ...] = ()
 
     @property
@@ -106,10 +95,7 @@ class Probe:
         return self.parts.moving[1]
 
     def loads(self, gravity: Array | None = None) -> Array:
-        """Return the torque of each link on each joint by the URDF, shape (N, n, bodies).
-
-        gravity (3,) [m/s^2].
-        """
+        """Return the torque of each link on each joint by the URDF, shape (N, n, bodies)."""
         links = self.parts.moving[0]
         if gravity is None:
             return links
@@ -151,10 +137,7 @@ class Probe:
 
 
 def coupled_columns(model: RobotModel, q: Array, v: Array, a: Array) -> Array:
-    """Return the regressor's columns of coupled drives, shape (N, n, k).
-
-    q (N, n) [rad or m], v (N, n), a (N, n).
-    """
+    """Return the regressor's columns of coupled drives, shape (N, n, k)."""
     layout, coupled = model.layout, np.flatnonzero(model.layout.is_coupled)
     if not len(coupled):
         return np.empty((*v.shape, 0))

@@ -19,6 +19,7 @@ import numpy as np
 from robotid.base.findings import Finding, listed
 from robotid.base.typing import Array
 from robotid.data.log import Trajectory
+from robotid.diagnosis.catalogue import finding
 from robotid.diagnosis.residual.decisions import (
     ALTERATION,
     ALTERATION_P_VALUE,
@@ -28,9 +29,10 @@ from robotid.diagnosis.residual.decisions import (
     WEAK,
     WEAK_P_VALUE,
     WEAK_SIZE,
+    Round,
+    select,
 )
 from robotid.diagnosis.residual.misfit import Misfit, find_misfits
-from robotid.diagnosis.residual.selection import Round, select
 from robotid.diagnosis.residual.term_trials import Sample, Trials, along
 from robotid.dynamics.prediction import body_slopes, drive_torque, inverse_dynamics
 from robotid.estimation.fitting.fitted import Fit
@@ -44,23 +46,15 @@ _STEPS = 5  # Gauss-Newton steps of a size
 
 @dataclass(frozen=True, eq=False)
 class _Alteration:
-    """A possible difference from what was stated, with sizes x, 0 if there is none.
-
-    Attributes:
-        code: Code of the finding.
-        where: Joint concerned; empty for all of them.
-        Z: Torques of sizes of 1, shape (N, n, c).
-        least: Smallest size that changes a result.
-        words: Returns the finding's sentence for sizes (c,) and their standard errors (c,).
-        applied: Returns the robot and its motions with sizes (c,), if torques are nonlinear.
-    """
+    """A possible difference from what was stated, with sizes x, 0 if there is none."""
 
     code: str
-    where: str
-    Z: Array
-    least: float
-    words: Callable[[Array, Array], str]
-    applied: _Applied | None = None
+    joints: tuple[str, ...]  # none: all of them
+    Z: Array  # torques of sizes of 1, shape (N, n, c)
+    least: float  # smallest size that changes a result
+    #: the values of the finding, for sizes (c,)
+    values: Callable[[Array], dict[str, float | str]]
+    applied: _Applied | None = None  # robot and motions with sizes (c,), if torques are nonlinear
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,8 +116,6 @@ def _refined(applied: _Applied, x: Array, pi: Array, sample: Sample) -> tuple[Ar
 
     Torques are nonlinear over a tenth of a radian: Gauss-Newton steps are repeated until the sizes
     converge.
-
-    x (c,), pi (p,).
     """
     every, error = list(range(len(x))), np.full(len(x), np.inf)
     for _ in range(_STEPS):
@@ -165,26 +157,25 @@ def _alterations(model: RobotModel, pi: Array, sample: Sample) -> Iterator[_Alte
         return model, [replace(m, q=m.q + x * np.eye(n)[joint]) for m in sample.at]
 
     for j, joint in enumerate(model.joints):
-        only, none = np.eye(n)[j], np.zeros(n)
+        only, one = np.eye(n)[j], (joint,)
         unit = "m" if joint in model.layout.prismatic else "rad"
-        applied = partial(offset, j)
-        Z = moved(none, only)
-        yield _Alteration("position_offset", joint, Z, 0.01, _zero(joint, unit), applied)
+        Z, zero = moved(np.zeros(n), only), partial(_zero, unit=unit)
+        yield _Alteration("position_offset", one, Z, 0.01, zero, partial(offset, j))
         backlash = 0.5 * Z * sample.motions[j].direction[:, None, None]
-        yield _Alteration("lost_motion", joint, backlash, 0.005, _lost_motion(joint, unit))
-        yield _Alteration("angle_scale", joint, moved(only, none), 0.02, _scale(f"q_{joint}"))
+        yield _Alteration("lost_motion", one, backlash, 0.005, partial(_named, unit=unit))
+        scaled = partial(_factor, subject=f"q_{joint}")
+        yield _Alteration("angle_scale", one, moved(only, np.zeros(n)), 0.02, scaled)
         if sample.torque[j]:  # a torque of 0 has no scale
-            yield _Alteration("torque_scale", joint, (tau * only)[..., None], 0.05, _gain(joint))
+            yield _Alteration("torque_scale", one, (tau * only)[..., None], 0.05, _gain)
     for first in range(1, n - 1):  # the drives of a wrist are of the same type
-        names = listed(model.joints[first:])
         Z = (tau * (np.arange(n) >= first))[..., None]
-        yield _Alteration("torque_scale", ", ".join(model.joints[first:]), Z, 0.05, _gains(names))
-    every = moved(np.ones(n), np.zeros(n))
-    yield _Alteration("angle_scale", "", every, 0.02, _scale("every position"))
+        yield _Alteration("torque_scale", model.joints[first:], Z, 0.05, _gains)
+    every = partial(_factor, subject="every position")
+    yield _Alteration("angle_scale", (), moved(np.ones(n), np.zeros(n)), 0.02, every)
     bodies = np.where(np.arange(len(pi)) < model.layout.n_inertial, pi, 0.0)
     still = [replace(m, v=0.0 * m.v, a=0.0 * m.a) for m in sample.at]
     inertial = tau - of_drives - _torques(model, bodies, still)
-    yield _Alteration("time_scale", "", inertial[..., None], 0.04, _clock)
+    yield _Alteration("time_scale", (), inertial[..., None], 0.04, _clock)
     down = np.array(model.pin_model.gravity.linear)
     if down.any():
         across = np.linalg.svd(down[None])[2][1:]  # two directions perpendicular to gravity
@@ -192,12 +183,17 @@ def _alterations(model: RobotModel, pi: Array, sample: Sample) -> Iterator[_Alte
         def tilted(x: Array) -> tuple[RobotModel, Sequence[Trajectory]]:
             return model.with_gravity(_tilted(x, across, down)), sample.at
 
+        def tilt(x: Array) -> dict[str, float | str]:
+            best = ", ".join(f"{value:.2f}" for value in _tilted(x, across, down))
+            return {"best": best, "what": "residual", "cure": "residual"}
+
         Z = by_gravity @ (np.linalg.norm(down) * across).T
-        yield _Alteration("gravity", "", Z, 0.05, _tilt(across, down), tilted)
+        yield _Alteration("gravity", (), Z, 0.05, tilt, tilted)
     for j, joint in enumerate(model.joints):
-        yield _Alteration("joint_origin", joint, by_origin[:, :, j], 0.01, _origin(joint))
+        named = partial(_named, subject=joint)
+        yield _Alteration("joint_origin", (joint,), by_origin[:, :, j], 0.01, named)
     anywhere = by_origin.reshape(len(tau), n, -1)
-    yield _Alteration("joint_origin", "", anywhere, 0.01, _origin("a joint"))
+    yield _Alteration("joint_origin", (), anywhere, 0.01, partial(_named, subject="a joint"))
 
 
 def _torques(model: RobotModel, pi: Array, at: Sequence[Trajectory]) -> Array:
@@ -261,86 +257,44 @@ def _found(fit: Fit, sample: Sample, own: Sequence[_Alteration]) -> Iterator[_Fo
 
 def _complexity(one: _Alteration) -> tuple[int, int]:
     """Return the number of sizes of an alteration, and the number of joints it names."""
-    return one.Z.shape[2], one.where.count(",")
+    return one.Z.shape[2], len(one.joints)
 
 
 def _finding(
     found: _Alteration, size: Array, error: Array, share: float, alike: Sequence[_Alteration]
 ) -> Finding:
-    others = [f"{one.code} of {one.where}" for one in alike if one.where]
-    also = f"; {listed(others)} would explain the same share" if others else ""
-    message = (
-        f"{found.words(size, error)}. This explains {100 * share:.0f} % of the squared residual, "
-        f"which other masses and friction do not explain{also}"
-    )
-    evidence = {
-        "size": float(size[0] if len(size) == 1 else np.linalg.norm(size)),
-        "std_error": float(np.linalg.norm(error)),
-        "share_pct": 100 * share,
-    }
-    return Finding(found.code, "warning", found.where or "all joints", message, evidence)
+    others = [f"{one.code} of {', '.join(one.joints)}" for one in alike if one.joints]
+    tangents = np.degrees(np.arctan([np.linalg.norm(size), np.linalg.norm(error)]))
+    values = found.values(size)
+    values = {"named" if key == "subject" else key: value for key, value in values.items()}
+    return finding(
+        found.code, "", found.joints, subject="" if found.joints else "all joints",
+        severity="warning", explained=True, also=bool(others), others=listed(others),
+        size=size[0] if len(size) == 1 else np.linalg.norm(size), share_pct=100 * share,
+        std_error=np.linalg.norm(error), angle=tangents[0], angle_error=tangents[1], **values,
+    )  # fmt: skip
 
 
-def _zero(joint: str, unit: str) -> Callable[[Array, Array], str]:
-    return lambda x, error: (
-        f"{joint}: position offset {-x[0]:.3g} +- {error[0]:.2g} {unit}: correct q_{joint}, or the "
-        "joint's origin in the URDF"
-    )
+def _zero(x: Array, unit: str) -> dict[str, float | str]:
+    return {"correction": -x[0], "unit": unit, "what": "residual", "cure": "residual"}
 
 
-def _lost_motion(joint: str, unit: str) -> Callable[[Array, Array], str]:
-    return lambda x, error: (
-        f"{joint}: its position differs by {abs(x[0]):.2g} +- {error[0]:.1g} {unit} between the "
-        "directions of motion: backlash between the joint and its encoder; remove the backlash, or "
-        "log the position of an encoder on the joint"
-    )
+def _named(x: Array, **words: str) -> dict[str, float | str]:
+    return {**words}
 
 
-def _scale(what: str) -> Callable[[Array, Array], str]:
-    return lambda x, error: (
-        f"{what} fits best with a factor of {1 + x[0]:.3f} +- {error[0]:.2g}: check the unit, the "
-        "gear ratio and the encoder counts per revolution"
-    )
+def _factor(x: Array, subject: str) -> dict[str, float | str]:
+    return {"factor": 1 + x[0], "subject": subject}
 
 
-def _gain(joint: str) -> Callable[[Array, Array], str]:
-    return lambda x, error: (
-        f"{joint}: its torque is about {1 + x[0]:.2f} (+- {error[0]:.1g}) times the value that the "
-        f"other joints indicate: check its gain and gear ratio (--gain {joint}=...)"
-    )
+def _gain(x: Array) -> dict[str, float | str]:
+    return {"factor": 1 + x[0], "what": "one", "cure": "one"}
 
 
-def _gains(joints: str) -> Callable[[Array, Array], str]:
-    return lambda x, error: (
-        f"{joints}: their torques are {'at least' if x[0] > 0 else 'at most'} {1 + x[0]:.2f} (+- "
-        f"{error[0]:.1g}) times the values that the joints before them indicate: check their gains "
-        "and gear ratios (--gain JOINT=...)"
-    )
+def _gains(x: Array) -> dict[str, float | str]:
+    sense = "more" if x[0] > 0 else "less"
+    return {"factor": 1 + x[0], "what": sense, "cure": sense}
 
 
-def _clock(x: Array, error: Array) -> str:
-    return (
-        f"inertial torques are {1 + x[0]:.3f} +- {error[0]:.2g} times the value that gravity "
-        f"indicates: the time stamps run {np.sqrt(max(1 + x[0], 0.0)):.3f} times as fast as the "
-        "clock, or the stated gravity is wrong"
-    )
-
-
-def _tilt(across: Array, down: Array) -> Callable[[Array, Array], str]:
-    def words(x: Array, error: Array) -> str:
-        tilted = _tilted(x, across, down)
-        angle, std_error = (np.degrees(np.arctan(np.linalg.norm(size))) for size in (x, error))
-        shown = ", ".join(f"{value:.2f}" for value in tilted)
-        return (
-            f"gravity is tilted by about {angle:.2g} +- {std_error:.1g} degrees from the stated "
-            f"direction: if the base is not level, set gravity = [{shown}] in the job file"
-        )
-
-    return words
-
-
-def _origin(joint: str) -> Callable[[Array, Array], str]:
-    return lambda x, error: (
-        f"{joint}: its origin differs by {np.linalg.norm(x):.2g} +- {np.linalg.norm(error):.1g} m "
-        "from the URDF's: check that the URDF is of this robot"
-    )
+def _clock(x: Array) -> dict[str, float | str]:
+    return {"factor": 1 + x[0], "speed": np.sqrt(max(1 + x[0], 0.0))}

@@ -23,14 +23,13 @@ import numpy as np
 
 from robotid.base.typing import Array
 from robotid.data.log import Trajectory
-from robotid.diagnosis.residual.decisions import FAMILY_P_VALUE
-from robotid.diagnosis.residual.selection import p_value
+from robotid.diagnosis.residual.decisions import FAMILY_P_VALUE, p_value
 from robotid.dynamics.constraint_rows import without_forces
 from robotid.dynamics.torque import trajectory_regressor
 from robotid.dynamics.used_rows import independent_share
+from robotid.estimation.fitting.drive_terms import JointMotion, joint_motions, travelled
 from robotid.estimation.fitting.evaluation import Evaluation, Recording
 from robotid.estimation.fitting.fitted import Solution
-from robotid.estimation.fitting.joint_motion import JointMotion, joint_motions, travelled
 from robotid.robot.model import RobotModel
 
 #: Smallest share of a column that the regressor must not explain.
@@ -51,17 +50,11 @@ OptionT = TypeVar("OptionT", bound=Hashable)
 
 @dataclass(frozen=True, eq=False)
 class Normal:
-    """Normal equations of the base parameters in K segments, all joints together.
+    """Normal equations of the base parameters in K segments, all joints together."""
 
-    Attributes:
-        A: W^T W of each segment, shape (K, b, b).
-        B: W^T r of each segment, shape (K, b).
-        fitted: Number of segments of fitted logs, which come first.
-    """
-
-    A: Array
-    B: Array
-    fitted: int
+    A: Array  # W^T W of each segment, shape (K, b, b)
+    B: Array  # W^T r of each segment, shape (K, b)
+    fitted: int  # Number of segments of fitted logs, which come first
 
     @classmethod
     def of(cls, W: Array, r: Array, segments: Sequence[slice], fitted: int) -> "Normal":
@@ -99,46 +92,31 @@ class Sample:
     """Samples of the recordings, weighted for each joint by its RMS residual, 0 where not used.
 
     Rows of a floating base precede those of the n joints.
-
-    Attributes:
-        joints: Names of the n joints.
-        is_prismatic: Which of them are prismatic, shape (n,), bool.
-        motions: Motion of each joint in the N samples.
-        recordings: The fitted recordings, then the validation recordings, if they are used.
-        at: Their motions at these samples.
-        taken: Indices of these samples in each recording.
-        weight: Weights of the torques, shape (N, n_rows) [1/(N m), 1/N]; one for all rows if
-            constraint forces were eliminated.
-        torque: Weighted sum of the squared torques of fitted samples, shape (n_rows,).
-        segments: Samples of each of the K segments, those of the validation logs last.
-        rows: Number of samples of fitted logs.
-        W: Regressor of the base parameters over their prior spread, shape (N, n_rows, b), and
-            columns that are refitted with them.
-        r: Residual of the estimate, shape (N, n_rows).
-        independent: Columns of the regressor that belong to base parameters, shape (b,), int.
-        U: Factor of the prior covariance of base parameters, C = U^T U, shape (b, b).
-        normal: Normal equations of the segments, of all joints of the robot.
-        standard: Standard parameters of the estimate, shape (p,).
-        basis: As of ``Trajectory.basis``, at these samples.
     """
 
-    joints: tuple[str, ...]
-    is_prismatic: Array
-    motions: tuple[JointMotion, ...]
+    joints: tuple[str, ...]  # Names of the n joints
+    is_prismatic: Array  # Which of them are prismatic, shape (n,), bool
+    motions: tuple[JointMotion, ...]  # Motion of each joint in the N samples
+    #: The fitted recordings, then the validation recordings, if they are used
     recordings: tuple[Recording, ...]
-    at: tuple[Trajectory, ...]
-    taken: tuple[Array, ...]
+    at: tuple[Trajectory, ...]  # Their motions at these samples
+    taken: tuple[Array, ...]  # Indices of these samples in each recording
+    #: Weights of the torques, shape (N, n_rows) [1/(N m), 1/N]; one for all rows if constraint
+    #: forces were eliminated
     weight: Array
-    torque: Array
+    torque: Array  # Weighted sum of the squared torques of fitted samples, shape (n_rows,)
+    #: Samples of each of the K segments, those of the validation logs last
     segments: tuple[slice, ...]
-    rows: int
+    rows: int  # Number of samples of fitted logs
+    #: Regressor of the base parameters over their prior spread, shape (N, n_rows, b), and columns
+    #: that are refitted with them
     W: Array
-    r: Array
-    independent: Array
-    U: Array
-    normal: Normal
-    standard: Array
-    basis: Array | None = None
+    r: Array  # Residual of the estimate, shape (N, n_rows)
+    independent: Array  # Columns of the regressor that belong to base parameters, shape (b,), int
+    U: Array  # Factor of the prior covariance of base parameters, C = U^T U, shape (b, b)
+    normal: Normal  # Normal equations of the segments, of all joints of the robot
+    standard: Array  # Standard parameters of the estimate, shape (p,)
+    basis: Array | None = None  # As of ``Trajectory.basis``, at these samples
 
     @property
     def fitted(self) -> int:
@@ -146,10 +124,7 @@ class Sample:
         return self.normal.fitted
 
     def with_columns(self, Z: Array) -> "Sample":
-        """Return the same samples with more columns that are refitted with the base parameters.
-
-        Z (N, n_rows, c) [N m or N].
-        """
+        """Return the same samples with more columns that are refitted with the base parameters."""
         left = Z if self.basis is None else without_forces(self.basis, Z)
         columns = self.weight[:, :, None] * left
         size = np.linalg.norm(columns, axis=(0, 1))
@@ -281,8 +256,6 @@ def _free(sample: Sample, X: Array) -> Sample:
     """Return the samples with the bodies of least squares, if these predict held-out segments.
 
     A prior that is wrong binds the bodies, and its error looks like friction.
-
-    X (N, n_rows, b).
     """
     W = sample.weight[..., None] * X
     size = np.linalg.norm(W[: sample.rows], axis=(0, 1))
@@ -311,10 +284,7 @@ def _free(sample: Sample, X: Array) -> Sample:
 
 
 def along(sample: Sample, model: RobotModel, at: Sequence[Trajectory], tau: Array) -> Sample:
-    """Return the same samples for another robot, or with changed positions.
-
-    tau (N, n) [N m or N].
-    """
+    """Return the same samples for another robot, or with changed positions."""
     Y = np.concatenate([_regressor(model, motion) for motion in at])
     W = sample.weight[:, :, None] * _in_units(Y, sample.independent, sample.U)
     W = np.concatenate([W, sample.W[:, :, W.shape[2] :]], axis=2)
@@ -413,16 +383,11 @@ def _is_steady(recording: Recording) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Trial:
-    """Fit of columns Z, together with the base parameters, to a residual.
+    """Fit of columns Z, together with the base parameters, to a residual."""
 
-    Attributes:
-        S: [Z r]^T M [Z r] of the fitted samples, shape (..., c + 1, c + 1).
-        T: Fit of the columns of W to [Z r], shape (..., b, c + 1).
-        rows: W and [Z r] of each of K segments, shapes (N_k, b) and (N_k, c + 1).
-    """
-
-    S: Array
-    T: Array
+    S: Array  # [Z r]^T M [Z r] of the fitted samples, shape (..., c + 1, c + 1)
+    T: Array  # Fit of the columns of W to [Z r], shape (..., b, c + 1)
+    #: W and [Z r] of each of K segments, shapes (N_k, b) and (N_k, c + 1)
     rows: Sequence[tuple[Array, Array]]
 
     @cached_property
@@ -454,10 +419,7 @@ class Trial:
         return theta, covariance
 
     def left(self, which: Sequence[int] | Array) -> Array:
-        """Return the squared residual of each segment with some columns fitted, shape (K,).
-
-        which (m, k).
-        """
+        """Return the squared residual of each segment with some columns fitted, shape (K,)."""
         k = np.asarray(which, dtype=int)
         theta = self.parameters(k)
         with_r = np.concatenate([k, np.full((*k.shape[:-1], 1), -1)], axis=-1)
@@ -478,10 +440,7 @@ class Trial:
 def _each(
     choices: Mapping[OptionT, Sequence[int]], of: Callable[[Array], Array]
 ) -> dict[OptionT, Array]:
-    """Evaluate a function of the columns of each option, all options of one size together.
-
-    of (m, k).
-    """
+    """Evaluate a function of the columns of each option, all options of one size together."""
     found: dict[OptionT, Array] = {}
     for size in {len(which) for which in choices.values()}:
         alike = {x: which for x, which in choices.items() if len(which) == size}
@@ -491,17 +450,11 @@ def _each(
 
 @dataclass(frozen=True, eq=False)
 class Trials:
-    """Trials of columns.
+    """Trials of columns."""
 
-    Attributes:
-        sample: The samples.
-        Z: Torques of parameters of 1, shape (N, n, c).
-        ridge: Smallest share of a column that the regressor must not explain.
-    """
-
-    sample: Sample
-    Z: Array
-    ridge: float = RIDGE
+    sample: Sample  # The samples
+    Z: Array  # Torques of parameters of 1, shape (N, n, c)
+    ridge: float = RIDGE  # Smallest share of a column that the regressor must not explain
 
     @cached_property
     def held_out(self) -> Trial:

@@ -12,9 +12,15 @@ import numpy as np
 from robotid.base.exceptions import ModelError
 from robotid.base.findings import Finding, listed
 from robotid.base.settings import require_flag, require_kind
-from robotid.diagnosis.urdf.inertials import assumed_inertials, impossible_inertial, negative_masses
+from robotid.diagnosis.catalogue import finding
+from robotid.diagnosis.urdf.inertials import (
+    assumed_inertials,
+    impossible_inertial,
+    negative_masses,
+    rounded_angles,
+    weak_parameters,
+)
 from robotid.diagnosis.urdf.mesh_check import audit_links
-from robotid.diagnosis.urdf.rounding import rounded_angles, weak_parameters
 from robotid.dynamics.base_parameters import (
     BaseMapping,
     independent_factors,
@@ -87,7 +93,7 @@ class Inspection:
             "joints": list(self.joints),
             "structure": found and vars(found) | {"undetermined": list(found.undetermined)},
             "base_groups": list(self.base_groups),
-            "findings": [_plain(finding) for finding in self.findings],
+            "findings": [_plain(one) for one in self.findings],
         }
 
 
@@ -107,12 +113,12 @@ def inspect_urdf(path: str | Path, *, free_flyer: bool = False) -> Inspection:
     try:
         robot = parse_urdf(path)
     except ModelError as error:
-        return Inspection("", (), None, (), (Finding("unusable", "error", where, str(error)),))
+        return Inspection("", (), None, (), (finding("unusable", subject=where, text=str(error)),))
     findings, name, model = [*_numbers(robot), *negative_masses(robot)], robot.get("name", ""), None
     try:
         model = RobotModel.from_urdf(path, free_flyer=free_flyer)
     except ModelError as error:
-        findings.append(Finding("unusable", "error", where, str(error)))
+        findings.append(finding("unusable", subject=where, text=str(error)))
     if name:
         findings += _joint_findings(Path(path))
     if model is None:
@@ -129,7 +135,7 @@ def inspect_urdf(path: str | Path, *, free_flyer: bool = False) -> Inspection:
     ]
     rounded = list(rounded_angles(model, full))
     findings += rounded
-    if not any(finding.evidence["felt"] for finding in rounded):
+    if not any(one.evidence["felt"] for one in rounded):
         findings += weak_parameters(model, full)
     structure = Structure(
         standard=model.layout.n_inertial,
@@ -164,8 +170,10 @@ def _numbers(robot: ET.Element) -> Iterator[Finding]:
             for key in keys:
                 fault = number_fault(element, key) if key in element.attrib else None
                 if fault is not None:
-                    message = f"{kind} {name!r}: {part}{fault}; write the true value"
-                    yield Finding("not_a_number", "error", f"{kind} {name}", message)
+                    yield finding(
+                        "not_a_number", subject=f"{kind} {name}", kind=kind, name=name,
+                        fault=f"{part}{fault}",
+                    )  # fmt: skip
 
 
 def _joint_findings(path: Path) -> Iterator[Finding]:
@@ -173,17 +181,28 @@ def _joint_findings(path: Path) -> Iterator[Finding]:
     try:
         joints = read_with_yourdfpy(path).joints
     except ModelError as error:
-        message = f"{error}; limits, damping, friction and mimic of its joints were not checked"
-        yield Finding("yourdfpy_refuses", "warning", f"file {path.name}", message)
+        yield finding("yourdfpy_refuses", subject=f"file {path.name}", text=str(error))
         return
     names = {joint.name for joint in joints if joint.type in MOVABLE}
     for joint in joints:
+        subject = f"joint {joint.name}"
         if faults := [*_no_range(joint), *_zero_limits(joint)]:
-            yield Finding("no_limits", "warning", f"joint {joint.name}", ". ".join(faults))
+            yield finding("no_limits", subject=subject, faults=". ".join(faults))
         for key in ("damping", "friction") if joint.dynamics is not None else ():
-            yield from _negative(joint, key, getattr(joint.dynamics, key))
+            text = getattr(joint.dynamics, key) or ""
+            if (value := numbers(text, 1, math.inf)) and value[0] < 0:
+                yield finding(
+                    f"negative_{key}", subject=subject, name=joint.name, text=str(text),
+                    **{key: value[0]},
+                )  # fmt: skip
         if joint.mimic is not None:
-            yield _mimic(joint, names)
+            leader = joint.mimic.joint
+            what = "unknown" if leader not in names or leader == joint.name else "independent"
+            yield finding(
+                "mimic_joint", subject=subject, name=joint.name, leader=leader, what=what,
+                cure=what, severity="warning" if what == "unknown" else "note",
+                multiplier=joint.mimic.multiplier or 0.0, offset=joint.mimic.offset or 0.0,
+            )  # fmt: skip
 
 
 def _no_range(joint: Any) -> Iterator[str]:  # noqa: ANN401
@@ -207,35 +226,6 @@ def _zero_limits(joint: Any) -> Iterator[str]:  # noqa: ANN401
         )
 
 
-def _negative(joint: Any, key: str, text: str | None) -> Iterator[Finding]:  # noqa: ANN401
-    value = numbers(text or "", 1, math.inf)
-    if not value or value[0] >= 0:
-        return
-    is_refused = key == "friction"
-    harm = "Pinocchio rejects the file" if is_refused else "it adds energy in simulators"
-    message = (
-        f"joint {joint.name!r} has {key} {text}, wanted 0 or more; robotid does not use it, but "
-        f"{harm}: correct the sign"
-    )
-    yield Finding(f"negative_{key}", "warning", f"joint {joint.name}", message, {key: value[0]})
-
-
-def _mimic(joint: Any, names: set[str]) -> Finding:  # noqa: ANN401
-    leader = joint.mimic.joint
-    if leader not in names or leader == joint.name:
-        message = (
-            f"joint {joint.name!r} mimics {leader!r}, which is not another movable joint of the "
-            "file; name the leading joint, or remove the <mimic>"
-        )
-        return Finding("mimic_joint", "warning", f"joint {joint.name}", message)
-    message = (
-        f"joint {joint.name!r} mimics {leader!r} (multiplier {joint.mimic.multiplier:g}, offset "
-        f"{joint.mimic.offset:g}) but is treated as an independent joint; use mimic = 'coupled' if "
-        f"the drive of {leader!r} moves both"
-    )
-    return Finding("mimic_joint", "note", f"joint {joint.name}", message)
-
-
 def _link_findings(model: RobotModel) -> Iterator[Finding]:
     """Yield faults of the inertials, and the bodies of several links."""
     inertials = model.tree.inertials
@@ -244,43 +234,26 @@ def _link_findings(model: RobotModel) -> Iterator[Finding]:
         by_body.setdefault(place.body, []).append(place)
     for body, members in by_body.items():
         having = [place.link for place in members if place.link in inertials]
-        for place in members:
-            if place.link in inertials:
-                matters = body >= 0 and not any(inertials[link].mass > 0 for link in having)
-                yield from impossible_inertial(place.link, inertials[place.link], matters)
+        for link in (place.link for place in members):
+            if link in inertials:
+                matters = body >= 0 and not any(inertials[name].mass > 0 for name in having)
+                yield from impossible_inertial(link, inertials[link], matters)
             elif body >= 0 and (having or model.layout.bodies[body] not in model.assumed):
-                yield _missing(place.link, having)
+                what = "frame" if having else "body"
+                yield finding(
+                    "missing_inertial", subject=f"link {link}", what=what, cure=what, link=link,
+                    severity="note" if having else "warning", others=listed(having),
+                )  # fmt: skip
         lumped = [p.link for p in members if p.role == "fixed" and p.link in inertials]
         if lumped and body >= 0:
-            moved = model.layout.bodies[body]
-            message = (
-                f"link {moved!r} is one body with {listed(lumped)}, attached by fixed joints: "
-                "their sum is identified and written to this link of the URDF; no action needed"
-            )
-            yield Finding("fixed_lumped", "note", f"link {moved}", message)
+            link = model.layout.bodies[body]
+            others = listed(lumped)
+            yield finding("fixed_lumped", subject=f"link {link}", link=link, others=others)
 
 
-def _missing(link: str, having: list[str]) -> Finding:
-    if having:
-        message = (
-            f"link {link!r} moves but has no <inertial>, wanted one. The mass of its body is in "
-            f"{listed(having)}; no action needed if the link is only a frame"
-        )
-        return Finding("missing_inertial", "note", f"link {link}", message)
-    message = (
-        f"link {link!r} moves but has no <inertial>, nor has any link attached to it, wanted one. "
-        "Its body is massless; add estimates of mass, centre of mass and inertia"
-    )
-    return Finding("missing_inertial", "warning", f"link {link}", message)
-
-
-def _plain(finding: Finding) -> Mapping[str, Any]:
-    kind, name = finding.where.split(" ", 1)
+def _plain(found: Finding) -> Mapping[str, Any]:
+    kind, name = found.where.split(" ", 1)
     place = {} if kind == "file" else {kind: name}
-    return {
-        "code": finding.code,
-        "severity": finding.severity,
-        **place,
-        "message": finding.message,
-        "evidence": {key: float(value) for key, value in finding.evidence.items()},
-    }
+    evidence = {key: float(value) for key, value in found.evidence.items()}
+    plain = {"code": found.code, "severity": found.severity, **place, "message": found.message}
+    return {**plain, "evidence": evidence}

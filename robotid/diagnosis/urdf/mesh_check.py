@@ -7,6 +7,7 @@ import numpy as np
 
 from robotid.base.findings import Finding, listed
 from robotid.base.typing import Array
+from robotid.diagnosis.catalogue import finding
 from robotid.robot.geometry import body_points, kinematic_lengths
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
@@ -35,20 +36,14 @@ def audit_links(model: RobotModel) -> Iterator[Finding]:
     yield from _copies(model, points)
     unread = [body for body in model.layout.bodies if body not in points]
     if unread and next(model.tree.robot.iter("mesh"), None) is not None:
-        message = (
-            f"the geometry of {len(unread)} bodies, as {unread[0]!r}, is missing, or its meshes "
-            "are not found or cannot be read: their mass and centre of mass were not checked "
-            "against it; set ROS_PACKAGE_PATH so that the meshes are found"
-        )
-        yield Finding("geometry_unread", "note", f"link {unread[0]}", message)
+        link = unread[0]
+        yield finding("geometry_unread", subject=f"link {link}", link=link, bodies=len(unread))
 
 
 def audit_bodies(model: RobotModel, pi: Array, points: Mapping[str, Array]) -> Iterator[Finding]:
     """Yield the bodies whose parameters are impossible in the box around their geometry.
 
     A body without geometry is compared with the length that the kinematics give it.
-
-    pi (p,), points (k, 3) [m].
     """
     J = pseudo_inertia(pi[: model.layout.n_inertial])
     lengths = kinematic_lengths(model) if set(model.layout.bodies) - points.keys() else {}
@@ -61,63 +56,50 @@ def audit_bodies(model: RobotModel, pi: Array, points: Mapping[str, Array]) -> I
             continue
         is_note = J_i[3, 3] < _SMALL * np.abs(J[:, 3, 3]).sum()
         if body in points:
-            found = list(_against_geometry(body, J_i, points[body]))
-            if found:  # the collision geometry may be a stand-in
-                whole = body_points(model, with_visual=True)
-                found = list(_against_geometry(body, J_i, whole.get(body, points[body])))
+            faults = list(_against_geometry(body, J_i, points[body]))
+            if faults:  # the collision geometry may be a stand-in
+                everything = body_points(model, with_visual=True)
+                faults = list(_against_geometry(body, J_i, everything.get(body, points[body])))
         else:
-            found = list(_against_kinematics(body, J_i, lengths.get(body, np.inf), model.length))
+            faults = list(_against_kinematics(body, J_i, lengths.get(body, np.inf), model.length))
             is_note |= body not in inner
-        for finding in found:
-            yield replace(finding, severity="note") if is_note else finding
+        for fault in faults:
+            yield replace(fault, severity="note") if is_note else fault
 
 
 def _against_geometry(body: str, J: Array, points: Array) -> Iterator[Finding]:
     """Yield the parameters of a body that are impossible in the box around its geometry."""
-    at, mass = f"link {body}", float(J[3, 3])
+    of_link, mass = {"subject": f"link {body}", "link": body}, float(J[3, 3])
     low, high = points.min(axis=0), points.max(axis=0)
     sides = np.maximum(high - low, _THIN)
     diagonal = float(np.linalg.norm(sides))
     centre = J[:3, 3] / mass
     outside = float(np.linalg.norm(np.maximum(np.maximum(low - centre, centre - high), 0.0)))
     if outside > _MARGIN * diagonal:
-        message = (
-            f"link {body!r}: its centre of mass {_metres(centre)} m is {outside:.3g} m outside the "
-            f"box of its geometry, {_metres(low)} to {_metres(high)} m; check the frame and the "
-            "unit of <inertial><origin>"
-        )
-        yield Finding("com_outside", "warning", at, message, {"outside": outside})
+        yield finding(
+            "com_outside", **of_link, what="box", centre=_metres(centre), low=_metres(low),
+            high=_metres(high), outside=outside,
+        )  # fmt: skip
     density = mass / float(np.prod(sides))
     if not _LIGHTEST <= density <= _DENSEST:
-        message = (
-            f"link {body!r}: its mass of {mass:.4g} kg in a box of {_metres(sides)} m gives a "
-            f"density of {density:.3g} kg/m^3, wanted {_LIGHTEST:g} to {_DENSEST:g}; check the "
-            "mass, and whether the meshes are in mm"
-        )
-        yield Finding("density", "warning", at, message, {"density": density})
+        yield finding(
+            "density", **of_link, sides=_metres(sides), mass=mass, density=density,
+            least=_LIGHTEST, most=_DENSEST,
+        )  # fmt: skip
     second = np.trace(J[:3, :3]) / mass - float(centre @ centre)  # mean square distance
     farthest = float(np.max(np.sum((points - centre) ** 2, axis=1))) ** 0.5
     gyration = max(float(second), 0.0) ** 0.5
     if gyration > farthest + 0.5 * _THIN:
-        message = (
-            f"link {body!r}: its radius of gyration is {gyration:.3g} m, but its geometry ends "
-            f"{farthest:.3g} m from its centre of mass; check the unit of the inertia, and that it "
-            "is about the centre of mass"
-        )
-        evidence = {"gyration": gyration, "farthest": farthest}
-        yield Finding("gyration", "warning", at, message, evidence)
+        yield finding("gyration", **of_link, gyration=gyration, farthest=farthest)
         return
     variance = np.maximum(np.diag(J)[:3] / mass - centre**2, 0.0)  # (3,), of the mass [m^2]
     lengths = 2.0 * np.sqrt(5.0 * variance)  # (3,), of the equivalent ellipsoid [m]
     k = int(np.argmax(lengths / sides))
     if lengths[k] > _LONGEST * sides[k]:
-        message = (
-            f"link {body!r}: its equivalent ellipsoid is {lengths[k]:.3g} m long in {'xyz'[k]}, "
-            f"the box of its geometry {sides[k]:.3g} m; wanted: at most {_LONGEST * sides[k]:.3g} "
-            "m, with all mass on two sides of the box; check its inertia and its geometry"
-        )
-        evidence = {"length": float(lengths[k]), "side": float(sides[k])}
-        yield Finding("ellipsoid", "note", at, message, evidence)
+        yield finding(
+            "ellipsoid", **of_link, what="box", cure="box", axis="xyz"[k], length=lengths[k],
+            side=sides[k], most=_LONGEST * sides[k],
+        )  # fmt: skip
 
 
 def _against_kinematics(body: str, J: Array, length: float, longest: float) -> Iterator[Finding]:
@@ -126,26 +108,22 @@ def _against_kinematics(body: str, J: Array, length: float, longest: float) -> I
     A body may be wide where its joints are close: warnings need more than the longest of all bodies
     allows.
     """
-    at, centre = f"link {body}", J[:3, 3] / J[3, 3]
-    about = f"its joints allow a length of about {length:.3g} m, housings included"
+    of_link, centre = {"subject": f"link {body}", "link": body}, J[:3, 3] / J[3, 3]
     distance = float(np.linalg.norm(centre))
     if distance > max(length, longest):
-        message = (
-            f"link {body!r}: its centre of mass {_metres(centre)} m is {distance:.3g} m from its "
-            f"joint, {about}; check the frame and the unit of <inertial><origin>"
-        )
-        yield Finding("com_outside", "warning", at, message, {"outside": distance - length})
+        yield finding(
+            "com_outside", **of_link, what="joint", centre=_metres(centre), distance=distance,
+            length=length, outside=distance - length,
+        )  # fmt: skip
         return
     variance = np.linalg.eigvalsh(J[:3, :3] / J[3, 3] - np.outer(centre, centre))[-1]  # [m^2]
     ellipsoid = 2.0 * float(np.sqrt(5.0 * max(variance, 0.0)))
     if ellipsoid > _SLENDER * length:
-        severity = "warning" if ellipsoid > _LONGEST * max(length, longest) else "note"
-        message = (
-            f"link {body!r}: its equivalent ellipsoid is {ellipsoid:.3g} m long, {about} (wanted: "
-            f"at most {_SLENDER * length:.3g} m); check its inertia"
-        )
-        evidence = {"length": ellipsoid, "side": length}
-        yield Finding("ellipsoid", severity, at, message, evidence)
+        is_far = ellipsoid > _LONGEST * max(length, longest)
+        yield finding(
+            "ellipsoid", **of_link, severity="warning" if is_far else "note", what="joint",
+            cure="joint", length=ellipsoid, side=length, most=_SLENDER * length,
+        )  # fmt: skip
 
 
 def _templates(model: RobotModel) -> Iterator[Finding]:
@@ -155,14 +133,11 @@ def _templates(model: RobotModel) -> Iterator[Finding]:
         is_isotropic = ixx == iyy == izz and ixy == ixz == iyz == 0
         if not (is_isotropic and np.isclose(ixx, _ROUND, rtol=_ALIKE).any()):
             continue
-        if inertial.mass not in (*_ROUND, 0.5) and np.any(inertial.com):
-            continue
-        message = (
-            f"link {link!r} has the mass {inertial.mass:g} kg and {ixx:g} kg m^2 about every axis: "
-            "these are values of a template; use values from CAD, or identify them"
-        )
-        evidence = {"mass": inertial.mass, "moment": ixx}
-        yield Finding("default_inertial", "warning", f"link {link}", message, evidence)
+        if inertial.mass in (*_ROUND, 0.5) or not np.any(inertial.com):
+            yield finding(
+                "default_inertial", subject=f"link {link}", what="template", cure="template",
+                link=link, mass=inertial.mass, moment=ixx,
+            )  # fmt: skip
 
 
 def _copies(model: RobotModel, points: dict[str, Array]) -> Iterator[Finding]:
@@ -182,14 +157,11 @@ def _copies(model: RobotModel, points: dict[str, Array]) -> Iterator[Finding]:
         if len(group) < 2 or not boxes.any() or inertials[group[0]].mass <= 0:
             continue
         spread = float(np.max(np.abs(boxes - boxes[0])) / np.max(boxes))
-        if spread < _SIZE:
-            continue
-        message = (
-            f"the links {listed(group)} have the same mass, centre of mass and inertia, but "
-            "different sizes: the values were copied; write the values of each link"
-        )
-        evidence = {"links": float(len(group)), "difference": spread}
-        yield Finding("copied_inertial", "warning", f"link {group[0]}", message, evidence)
+        if spread >= _SIZE:
+            yield finding(
+                "copied_inertial", subject=f"link {group[0]}", links=len(group), difference=spread,
+                names=listed(group),
+            )  # fmt: skip
 
 
 def _is_copy(one: Inertial, other: Inertial) -> bool:

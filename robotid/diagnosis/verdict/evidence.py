@@ -1,13 +1,19 @@
-"""Evidence for a verdict: torque prediction errors, and what the data determine."""
+"""Evidence for a verdict: prediction errors, what the data determine, what a result is for."""
+
+from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from robotid.base.findings import listed, quoted
-from robotid.estimation.fitting.metrics import JointMetrics, Metrics
+from robotid.estimation.fitting.evaluation import JointMetrics, Metrics
+
+if TYPE_CHECKING:
+    from robotid.diagnosis.verdict.scale_check import ScaleCheck
 
 #: [%] largest torque prediction error on validation logs of a joint that is "good".
 GOOD = 15.0
@@ -17,13 +23,15 @@ POOR = 50.0
 BEATEN = 1.05
 #: [%] a larger error on the fitted logs, twice that of WLS, makes a joint poor.
 COSTLY = 3.0
-
 _TIE = 0.3  # [%] ... and, for the URDF with fitted drives, by this share of the torque
 _OPTIMISM = 2.0  # validation error over fitted error beyond which the fit is over-fitted
 _BASE = "base."  # of the rows of a floating base
 _WRONG = 2.0  # an error this many times that of WLS gives a warning ...
 _HARMLESS = 1.0  # [%] ... but not below this share of the torque
 _NAMED = 8  # parameters that a reason names
+_USES_NAMED = 3  # joints that the line names
+_NOT_VERIFIED = "not verified, no validation log"
+_UNSCALED = "torque scale not verified"
 
 
 @dataclass(frozen=True)
@@ -74,22 +82,19 @@ class Predictions:
             )
         return notes
 
-    def on_each(self) -> dict[str, tuple[list[str], list[str], list[float]]]:
-        """Return the errors, the warnings and the prediction errors [%] by log of each joint."""
+    def on_each(self) -> dict[str, JointEvidence]:
+        """Return the evidence for each joint."""
         moved = [joint for m in (self.fitted, *self.tested.values()) for joint in m]
         named = [joint for joint in self.joints if joint not in self.hidden]
         return {joint: self._on(joint) for joint in dict.fromkeys([*named, *moved])}
 
-    def _on(self, joint: str) -> tuple[list[str], list[str], list[float]]:
-        poor, warnings, errors = [], [], []
+    def _on(self, joint: str) -> JointEvidence:
+        evidence = JointEvidence()
         for log, metrics in self.tested.items():
-            measured = metrics.get(joint)
-            if measured is not None:
-                found = _judge_joint(joint, log, measured, self.fitted.get(joint))
-                poor += found[0]
-                warnings += found[1]
-                errors.append(error_of(measured))
-        return poor, warnings, errors
+            if (measured := metrics.get(joint)) is not None:
+                _judge_joint(evidence, joint, log, measured, self.fitted.get(joint))
+                evidence.errors.append(error_of(measured))
+        return evidence
 
     def untested(self) -> list[str]:
         """Return why no prediction of unseen motion was evaluated; empty if one was."""
@@ -141,6 +146,15 @@ class Predictions:
 
 
 @dataclass(frozen=True)
+class JointEvidence:
+    """Why a joint is poor, the worst kind of reason first; cautions; errors by log [%]."""
+
+    poor: list[tuple[int, str]] = field(default_factory=list)
+    cautions: list[str] = field(default_factory=list)
+    errors: list[float] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
 class Determined:
     """Parameters that the data determine.
 
@@ -176,20 +190,19 @@ class Determined:
 
     def notes(self) -> list[str]:
         """Return notes that do not change the verdict: parameters hidden by the noise."""
-        alone = [
-            f"{listed(self.uncertain_drives, _NAMED)}: the standard error is as large as that of "
-            "the prior: only a sum with other terms is identifiable; use the friction curve"
-        ]
-        alone = alone if self.uncertain_drives else []
-        if not self.undetermined or self.is_poorly_excited:
-            return alone
-        return [
-            f"{len(self.undetermined)} base parameters are not identifiable above the noise of a "
-            "rich motion, or only in sums with others. What is not determined keeps the URDF's "
-            "values: "
-            f"{listed(self.undetermined, _NAMED)}",
-            *alone,
-        ]
+        notes = []
+        if self.undetermined and not self.is_poorly_excited:
+            notes.append(
+                f"{len(self.undetermined)} base parameters are not identifiable above the noise of "
+                "a rich motion, or only in sums with others. What is not determined keeps the "
+                f"URDF's values: {listed(self.undetermined, _NAMED)}"
+            )
+        if self.uncertain_drives:
+            notes.append(
+                f"{listed(self.uncertain_drives, _NAMED)}: the standard error is as large as that "
+                "of the prior: only a sum with other terms is identifiable; use the friction curve"
+            )
+        return notes
 
 
 def is_beaten(measured: JointMetrics) -> bool:
@@ -210,34 +223,124 @@ def error_of(measured: JointMetrics) -> float:
 
 
 def _judge_joint(
-    joint: str, log: str, measured: JointMetrics, fitted: JointMetrics | None
-) -> tuple[list[str], list[str]]:
-    """Return the errors (the result is poor) and the warnings about one joint."""
-    error = error_of(measured)
-    urdf = measured.baselines.get("urdf")
+    evidence: JointEvidence,
+    joint: str,
+    log: str,
+    measured: JointMetrics,
+    fitted: JointMetrics | None,
+) -> None:
+    """Add the first reason that one log gives: rank 0 is worse than a constant, 1 than the URDF."""
+    error, urdf = error_of(measured), measured.baselines.get("urdf")
+    on_log = f"error {error:.1f} % on {log}"
     if measured.relative_error_pct is None:
-        return [
+        why = (
             f"{joint}: the torque is 0 throughout {log}: not evaluated. If the joint has no drive, "
             f"state passive = [{quoted(joint)}] in the job file"
-        ], []
-    if not measured.better_than_constant and not joint.startswith(_BASE):  # its weight is constant
+        )
+        evidence.poor.append((2, why))
+    elif not measured.better_than_constant and not joint.startswith(_BASE):  # a constant weight
         constant = error / np.sqrt(1.0 - measured.r2)
         why = f"error {error:.1f} %; a constant would give {constant:.1f} %"
-        return [f"{joint}: worse than a constant torque on {log}: {why}"], []
-    if urdf is not None and error > urdf:
-        return [f"{joint}: error {error:.1f} % on {log}, worse than the URDF's {urdf:.1f} %"], []
-    if error > POOR:
-        return [f"{joint}: error {error:.1f} % on {log}, above {POOR:g} %"], []
-    if error > GOOD:
-        why = f"error {error:.1f} % on {log} (wanted: at most {GOOD:g} %)"
-        return [], [f"{joint}: {why}; see its residual in the report"]
-    if fitted is not None and error > max(_OPTIMISM * error_of(fitted), 5.0):
-        return [], [
-            f"{joint}: error {error:.1f} % on {log}, {error_of(fitted):.1f} % on the fitted "
-            "recordings; record and fit a richer motion"
-        ]
-    if is_beaten(measured):
+        evidence.poor.append((0, f"{joint}: worse than a constant torque on {log}: {why}"))
+    elif urdf is not None and error > urdf:
+        evidence.poor.append((1, f"{joint}: {on_log}, worse than the URDF's {urdf:.1f} %"))
+    elif error > POOR:
+        evidence.poor.append((2, f"{joint}: {on_log}, above {POOR:g} %"))
+    elif error > GOOD:
+        why = f"{on_log} (wanted: at most {GOOD:g} %)"
+        evidence.cautions.append(f"{joint}: {why}; see its residual in the report")
+    elif fitted is not None and error > max(_OPTIMISM * error_of(fitted), 5.0):
+        evidence.cautions.append(
+            f"{joint}: {on_log}, {error_of(fitted):.1f} % on the fitted recordings; record and fit "
+            "a richer motion"
+        )
+    elif is_beaten(measured):
         driven = measured.baselines["urdf_with_drives"]
-        why = f"error {error:.1f} % on {log}, {driven:.1f} % with the URDF and fitted drives"
-        return [], [f"{joint}: {why}: keep the URDF's values for its link"]
-    return [], []
+        evidence.cautions.append(
+            f"{joint}: {on_log}, {driven:.1f} % with the URDF and fitted drives: keep the URDF's "
+            "values for its link"
+        )
+
+
+def uses_of_torques(
+    joints: Mapping[str, str],
+    *,
+    is_consistent: bool,
+    is_static: bool,
+    log_errors: Sequence[str],
+    scale_check: ScaleCheck | None,
+) -> dict[str, str]:
+    """Return what a result with predicted torques can be used for: "yes" or "no", and why.
+
+    Torque feed-forward needs the predicted torque of its joints. Inertials in a simulation need
+    physical consistency and the torque scale, too. The mass of a payload is that of the gravity
+    torque: it needs the joints that gravity loads, and the torque scale.
+    """
+    predicted = _predicted(joints)
+    loaded = (
+        {} if scale_check is None else {j: s for j, s in joints.items() if j in scale_check.gravity}
+    )
+    if log_errors:
+        predicted = inertials = payload = "no, errors of the recordings"
+    elif scale_check is not None and scale_check.contradicts:
+        inertials = payload = "no, the torque scale is contradicted"
+    else:
+        is_scaled = scale_check is not None and scale_check.agrees
+        inertials = predicted if is_scaled else _with(predicted, _UNSCALED)
+        payload = _predicted(loaded) if loaded else "no, no joint determines its gravity"
+        payload = payload if is_scaled else _with(payload, _UNSCALED)
+        if not is_consistent:
+            inertials = "no, not physically consistent"
+        elif "poor" in joints.values():
+            inertials = f"no, torques of {_named(joints, 'poor')} are poor"
+    if is_static:
+        predicted = _with(predicted, "at rest and in slow motion")
+        inertials = "no, inertias are the URDF's" if inertials.startswith("yes") else inertials
+    return {
+        "torque feed-forward": predicted,
+        "inertials in simulation": inertials,
+        "payload estimation": payload,
+    }
+
+
+def uses_of_motion(
+    joints: Mapping[str, str], *, log_errors: Sequence[str], is_scaled: bool
+) -> dict[str, str]:
+    """Return what a result with simulated positions can be used for: "yes" or "no", and why."""
+    simulated = "no, errors of the recordings" if log_errors else _predicted(joints)
+    torque = simulated if is_scaled else _with(simulated, "scale not verified by a torque")
+    return {
+        "simulation of drives and controllers": simulated,
+        "torque feed-forward": torque,
+        "payload estimation": "no, it needs a result from logged torques",
+    }
+
+
+def uses_line(uses: Mapping[str, str]) -> str:
+    """Return the uses as one line of text; "" if there are none."""
+    return f"use for: {'; '.join(f'{what}: {is_so}' for what, is_so in uses.items())}" * bool(uses)
+
+
+def _predicted(joints: Mapping[str, str]) -> str:
+    """Return whether the predictions of joints can be used."""
+    tested = {joint: status for joint, status in joints.items() if status != "not evaluated"}
+    if not tested:
+        return _NOT_VERIFIED
+    poor = [joint for joint, status in tested.items() if status == "poor"]
+    if len(poor) == len(tested):
+        return "no, the errors on validation logs are large"
+    if poor:
+        return f"yes, without {_named(joints, 'poor')}"
+    if len(tested) < len(joints):
+        return f"yes, without {_named(joints, 'not evaluated')} (not evaluated)"
+    return "yes, with the warnings" if "usable" in tested.values() else "yes"
+
+
+def _named(joints: Mapping[str, str], status: str) -> str:
+    """Return the joints with a status, as part of a sentence."""
+    return listed([joint for joint, found in joints.items() if found == status], _USES_NAMED)
+
+
+def _with(use: str, condition: str) -> str:
+    """Return a use under a condition; a "no" remains."""
+    return f"{use}, {condition}" if use.startswith("yes") else use

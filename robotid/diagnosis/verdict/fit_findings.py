@@ -1,9 +1,8 @@
-"""Findings about a fit: undetermined parameters, outliers, mass matrix, optimum, bounds."""
+"""Findings about a fit: determination, outliers, optimum, bounds, logs and units that differ."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
-from dataclasses import replace
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -11,16 +10,18 @@ import numpy as np
 from robotid.base.findings import Finding, listed
 from robotid.base.typing import Array
 from robotid.data.log import Log
+from robotid.diagnosis.catalogue import finding
 from robotid.diagnosis.residual.decisions import TENFOLD
-from robotid.diagnosis.residual.misfit import Misfit
-from robotid.diagnosis.residual.misfit_findings import misfit_findings
+from robotid.diagnosis.residual.misfit import Misfit, misfit_findings
 from robotid.diagnosis.urdf.mesh_check import audit_bodies
-from robotid.diagnosis.verdict.correlation import correlated_parameters
-from robotid.diagnosis.verdict.evidence import is_harmless_cost
+from robotid.diagnosis.verdict.evidence import GOOD, error_of, is_harmless_cost
+from robotid.diagnosis.verdict.parameter_table import correlated_parameters
+from robotid.diagnosis.verdict.scale_check import friction_shares
 from robotid.estimation.estimators.consistent.body_constraints import slabs
 from robotid.estimation.fitting.estimator_settings import BoundedSettings, ConsistentSettings
 from robotid.estimation.fitting.fitted import Fit
 from robotid.estimation.fitting.regressor_noise import encoder_findings
+from robotid.estimation.variation.variation import UnlikeRun, Variation
 from robotid.robot.bodies import density_share, held_parameters, least_density, negligible_bodies
 from robotid.robot.geometry import body_boxes, body_points
 from robotid.robot.model import RobotModel
@@ -40,6 +41,9 @@ _DENSEST = 12_000.0  # [kg/m^3] of a link: lead has 11,340
 _UNLIKELY = 0.05  # share of the bodies that the errors allow below which one is not possible
 _AT_BOUND = 1e-3  # relative difference of a mass from a stated bound that determines it
 _VANISHED = 0.05  # share of a link's URDF mass below which the link has practically vanished
+_RESCALED = 0.1  # least difference from 1 of a factor between measured and predicted torque
+_LEFT = 1 / 3  # ... and the largest share of the squared error that it leaves
+_MOSTLY = 0.6  # share of friction in a torque from which friction may have changed, too
 
 
 def fit_findings(
@@ -52,13 +56,13 @@ def fit_findings(
     findings = _static_findings(fit)
     determined = fit.determination
     if determined.groups:
-        message = (
-            f"the data determine {determined.rank} of {len(determined.names)} base parameters: "
-            f"{determined.described()}. What is not determined keeps the URDF's values, because "
-            "the data reduce its prior uncertainty by less than 10 %; record a richer motion"
-        )
-        severity = "warning" if fit.is_poorly_excited else "note"
-        findings.append(Finding("undetermined", severity, "base_parameters", message))
+        findings.append(
+            finding(
+                "undetermined", subject="base_parameters", described=determined.described(),
+                severity="warning" if fit.is_poorly_excited else "note", rank=determined.rank,
+                base=len(determined.names),
+            )
+        )  # fmt: skip
     findings += consistency_findings(fit)
     findings += _bound_findings(fit)
     findings += _total_mass(fit)
@@ -68,14 +72,11 @@ def fit_findings(
     findings += misfit_findings(fit, misfits, on_misfit)
     findings += [*_drive_findings(fit), *_correlated(fit)]
     findings += discrepancies
-    findings += encoder_findings(fit)
-    for evaluation in fit.refitted:
-        message = (
-            f"the validation log {evaluation.recording.name} contains fitted samples: its "
-            "error is that of the fit, not of a prediction; validate on another recording"
-        )
-        where = evaluation.recording.log.path
-        findings.append(Finding("validation_was_fitted", "warning", where, message))
+    findings += encoder_findings(fit.regressor_noise, fit.model, fit.mapping)
+    findings += [
+        finding("validation_was_fitted", subject=e.recording.log.path, name=e.recording.name)
+        for e in fit.refitted
+    ]
     return findings + _costs(fit)
 
 
@@ -92,22 +93,17 @@ def _costs(fit: Fit) -> list[Finding]:
         if measured.rmse <= _DIFFERS * free.rmse:
             continue
         error, least = measured.relative_error_pct, free.relative_error_pct or 0.0
-        own = f"{measured.rmse:.3g} {measured.unit}"
-        message = f"{joint}: the residual is {own}, that of unconstrained WLS {free.rmse:.3g}"
         is_little = error is not None and error**2 - least**2 < _LITTLE**2
         is_little = is_little and is_harmless_cost(error or 0.0, least) and not (asked or locked)
-        if is_little or joint in fit.overfitted:
-            severity, more = "note", "" if is_little else ", which predicts unseen logs worse"
-            message += f": {error or 0.0:.2g} % instead of {least:.2g} % of the torque{more}; "
-            message += "no action needed"
-        else:
-            severity = "warning"
-            message += (
-                f": physics and data disagree; check {asked}{locked}the torque scale (gains), the "
-                "drive model and the payload"
+        what = "overfitted" if joint in fit.overfitted else "costly"
+        what = "little" if is_little else what
+        findings.append(
+            finding(
+                "constraint_costs", "", joint, severity="warning" if what == "costly" else "note",
+                what=what, cure=what, asked=asked, locked=locked, unit=measured.unit,
+                error_pct=error or 0.0, wls_error_pct=least, rmse=measured.rmse, wls_rmse=free.rmse,
             )
-        evidence = {"error_pct": error or 0.0, "wls_error_pct": least}
-        findings.append(Finding("constraint_costs", severity, joint, message, evidence))
+        )  # fmt: skip
     return findings
 
 
@@ -115,52 +111,40 @@ def _static_findings(fit: Fit) -> list[Finding]:
     """Return a note on the samples of a static model, and on joints without Coulomb friction."""
     if not fit.model.is_static:
         return []
-    recordings = [e.recording for e in fit.fitted]
-    rows, samples = (
-        sum(getattr(r.extent, key) for r in recordings) for key in ("samples", "smooth")
-    )
-    message = (
-        f"the {rows} rows count as {samples} independent samples: poses at rest and slow segments "
-        "of 0.25 s; inertias about the centres of mass keep the URDF's values"
-    )
-    if still := _drives_at_rest(fit):
-        message += (
-            f". Poses at rest do not determine the Coulomb friction of {listed(still)}: at rest it "
-            "has any value between its bounds, and the intervals include it. Add slow motion of "
-            "these joints, or set friction = 'none' in [model]; to halve its effect, approach each "
-            "pose from both sides"
+    extents = [e.recording.extent for e in fit.fitted]
+    rows, samples = sum(x.samples for x in extents), sum(x.smooth for x in extents)
+    still = _drives_at_rest(fit)
+    return [
+        finding(
+            "static", subject="standard_parameters", cure=bool(still), still=listed(still),
+            rows=rows, samples=samples,
         )
-    evidence = {"rows": float(rows), "samples": float(samples)}
-    return [Finding("static", "note", "standard_parameters", message, evidence)]
+    ]  # fmt: skip
 
 
 def _drives_at_rest(fit: Fit) -> list[str]:
     """Return the names of drives whose friction has no direction in any used sample."""
-    layout, still = fit.model.layout, []
-    for d, (drive, ratios) in enumerate(zip(layout.drives, layout.drive_ratios, strict=True)):
-        motions = [(e.recording.trajectory, e.recording.mask) for e in fit.fitted]
-        shown = [
+    layout = fit.model.layout
+    motions = [(e.recording.trajectory, e.recording.mask) for e in fit.fitted]
+    return [
+        drive.name
+        for d, (drive, ratios) in enumerate(zip(layout.drives, layout.drive_ratios, strict=True))
+        if not any(
             motion.direction is None or motion.direction[mask[:, ratios != 0].all(axis=1), d].any()
             for motion, mask in motions
-        ]
-        still += [] if any(shown) else [drive.name]
-    return still
+        )
+    ]
 
 
-def _drive_findings(fit: Fit) -> list[Finding]:
-    """Return notes on friction shapes at their bounds, and on motion outside the fitted range."""
-    findings, model = [], fit.model
+def _drive_findings(fit: Fit) -> Iterator[Finding]:
+    """Yield notes on friction shapes at their bounds, and on motion outside the fitted range."""
     for choice in fit.drives:
         for shape in choice.shapes:
             if shape.is_at_bound:
-                message = (
-                    f"{choice.joint}: {shape.name} is {shape.value:.3g} {shape.unit}, the "
-                    "bound of its search range: the motion does not determine where the curve "
-                    "bends; record slower and faster motion of this joint"
-                )
-                findings.append(Finding("shape_at_bound", "note", choice.joint, message))
+                words = {"name": shape.name, "unit": shape.unit}
+                yield finding("shape_at_bound", "", choice.joint, value=shape.value, **words)
         guards = {term.guards for term in choice.terms if np.isfinite(term.data_range).all()} - {""}
-        j = model.joints.index(choice.joint)
+        j = fit.model.joints.index(choice.joint)
         for evaluation in fit.validation:
             motion, mask = evaluation.recording.trajectory, evaluation.recording.mask
             for key in sorted(guards):
@@ -168,77 +152,57 @@ def _drive_findings(fit: Fit) -> list[Finding]:
                 x, low = (np.abs(x), 0.0) if key == "v" else (x, low)
                 share = float(np.mean((x < low) | (x > high))) if len(x) else 0.0
                 if share > _BEYOND:
-                    what = {"q": "positions", "v": "speeds"}[key]
-                    message = (
-                        f"{choice.joint}: {100 * share:.0f} % of the samples of "
-                        f"{evaluation.recording.name} have {what} outside the fitted range of "
-                        f"{low:.3g} to {high:.3g}; {listed(choice.families)} is constant there"
-                    )
-                    evidence = {"share_pct": 100 * share}
-                    findings.append(
-                        Finding("beyond_range", "note", choice.joint, message, evidence)
-                    )
-    return findings
+                    yield finding(
+                        "beyond_range", "", choice.joint, share_pct=100 * share, low=low, high=high,
+                        what={"q": "positions", "v": "speeds"}[key],
+                        name=evaluation.recording.name, families=listed(choice.families),
+                    )  # fmt: skip
 
 
-def _correlated(found: Fit) -> list[Finding]:
-    """Return a note on each drive with a pair of parameters of which only the sum is determined."""
-    names, pairs, findings = found.model.layout.names, correlated_parameters(found), []
-    for joint in dict.fromkeys(names[i].rpartition(".")[0] for i in pairs):
-        own = [(i, *pair) for i, pair in pairs.items() if names[i].rpartition(".")[0] == joint]
-        i, k, r = max(own, key=lambda pair: abs(pair[2]))
+def _correlated(fit: Fit) -> Iterator[Finding]:
+    """Yield notes on drives with parameters of which only the sum is determined.
+
+    They have a strongly correlated pair, or terms that increase another standard error tenfold.
+    """
+    names, pairs = fit.model.layout.names, correlated_parameters(fit)
+    joints = list(dict.fromkeys(names[i].rpartition(".")[0] for i in pairs))
+    for joint in joints:
+        of_joint = [(i, *x) for i, x in pairs.items() if names[i].rpartition(".")[0] == joint]
+        i, k, r = max(of_joint, key=lambda pair: abs(pair[2]))
         single = [
-            f"{names[m].rpartition('.')[2]} {found.standard[m]:.3g} +- "
-            f"{found.standard_error[m]:.2g}"
+            f"{names[m].rpartition('.')[2]} {fit.standard[m]:.3g} +- {fit.standard_error[m]:.2g}"
             for m in sorted((i, k))
         ]
-        curve = found.friction(joint)
-        slowest = len(curve.v) // 2
-        sums = [
+        curve = fit.friction(joint)
+        sums = " and ".join(
             f"{curve.torque[m]:.3g} +- {curve.std[m]:.2g} at {curve.v[m]:.3g}"
-            for m in (slowest, -1)
-        ]
-        speed = "m/s" if joint in found.model.layout.prismatic else "rad/s"
-        message = (
-            f"{joint}: {listed(single)} are strongly correlated (r = {r:.3f}): use their sum; "
-            f"friction and offset are {' and '.join(sums)} {speed}"
+            for m in (len(curve.v) // 2, -1)  # the slowest and the fastest
         )
-        findings.append(Finding("correlated_terms", "note", joint, message, {"r": r}))
-    return [*findings, *_grown(found, {finding.where for finding in findings})]
-
-
-def _grown(found: Fit, reported: Collection[str]) -> list[Finding]:
-    """Return notes on terms that increase the standard error of another parameter tenfold."""
-    findings = []
-    for choice in found.drives:
+        unit = "m/s" if joint in fit.model.layout.prismatic else "rad/s"
+        yield finding(
+            "correlated_terms", "", joint, what="pair", pair=listed(single), sums=sums, unit=unit,
+            r=r,
+        )  # fmt: skip
+    for choice in fit.drives:
         name = max(choice.grown, key=lambda name: choice.grown[name], default="")
-        if choice.joint not in reported and choice.grown.get(name, 1.0) > TENFOLD:
-            grown = choice.grown[name]
-            message = (
-                f"{choice.joint}: {listed(choice.families)} multiplies the standard error of "
-                f"{name} by {grown:.0f}; the friction curve is more accurate than its terms"
-            )
-            evidence = {"grown": grown}
-            findings.append(Finding("correlated_terms", "note", choice.joint, message, evidence))
-    return findings
+        if choice.joint not in joints and choice.grown.get(name, 1.0) > TENFOLD:
+            yield finding(
+                "correlated_terms", "", choice.joint, what="grown", name=name,
+                families=listed(choice.families), grown=choice.grown[name],
+            )  # fmt: skip
 
 
 def not_written(log_errors: Sequence[Finding], inconsistent: str = "") -> list[Finding]:
     """Return a warning that the URDF is not written, with the reason; nothing if it is written."""
-    if log_errors:
-        codes = listed(dict.fromkeys(finding.code for finding in log_errors))
-        message = (
-            f"URDF not written: {codes} failed. Correct the cause; if a finding is wrong, add "
-            "its code to ignore in [doctor]"
-        )
-    elif inconsistent:
-        message = (
-            f"URDF not written: the {inconsistent} estimate is not physically consistent; "
-            "use the 'consistent' estimator"
-        )
-    else:
-        return []
-    return [Finding("urdf_not_written", "warning", "urdf", message)]
+    codes = listed(dict.fromkeys(error.code for error in log_errors))
+    what = "codes" if log_errors else "inconsistent"
+    words = {"codes": codes, "estimator": inconsistent}
+    is_written = not (log_errors or inconsistent)
+    return (
+        []
+        if is_written
+        else [finding("urdf_not_written", subject="urdf", what=what, cure=what, **words)]
+    )
 
 
 def locked_findings(model: RobotModel, stated: Collection[str]) -> list[Finding]:
@@ -249,14 +213,7 @@ def locked_findings(model: RobotModel, stated: Collection[str]) -> list[Finding]
     """
     relevant = set(model.locked) if model.free_flyer else _in_line(model)
     assumed = [name for name in model.locked if name not in stated and name in relevant]
-    if not assumed:
-        return []
-    message = (
-        f"the job neither identifies nor locks {listed(assumed)}. Their positions are assumed "
-        "to be 0; state them with locked = { joint = position }, or confirm 0 for all "
-        'others with locked = { "*" = 0.0 }'
-    )
-    return [Finding("locked_at_zero", "warning", ", ".join(assumed), message)]
+    return [finding("locked_at_zero", "", assumed)] if assumed else []
 
 
 def _in_line(model: RobotModel) -> set[str]:
@@ -277,45 +234,36 @@ def _in_line(model: RobotModel) -> set[str]:
 
 def log_findings(logs: Sequence[Log]) -> list[Finding]:
     """Return what was noted and assumed of logs, each once, with the names of its logs."""
-    logs_of: dict[tuple[str, str, str], list[str]] = {}
+    logs_of: dict[tuple[str, str], list[str]] = {}
     for log in logs:
-        for note in log.notes:
-            logs_of.setdefault(("log_note", "note", note), []).append(Path(log.path).name)
-        for text in log.assumed:
-            logs_of.setdefault(("log_assumption", "warning", text), []).append(Path(log.path).name)
-    return [
-        Finding(code, severity, ", ".join(names), f"{', '.join(names)}: {text}")
-        for (code, severity, text), names in logs_of.items()
-    ]
+        for code, texts in (("log_note", log.notes), ("log_assumption", log.assumed)):
+            for text in texts:
+                logs_of.setdefault((code, text), []).append(Path(log.path).name)
+    return [finding(code, ", ".join(names), text=text) for (code, text), names in logs_of.items()]
 
 
 def consistency_findings(fit: Fit) -> list[Finding]:
     """Return findings about the consistency of a fit."""
-    findings = []
-    check, details = fit.mass_matrix, fit.estimate.details
+    findings, check = [], fit.mass_matrix
     if not check.is_positive:
-        is_consistent = isinstance(fit.estimator, ConsistentSettings)
-        advice = (
-            "raise [estimator] prior_weight" if is_consistent else "use the 'consistent' estimator"
-        )
-        message = (
-            f"the mass matrix is not positive definite at {100 * (1 - check.positive_share):.3g} % "
-            f"of {check.poses} random poses (smallest eigenvalue {check.smallest_eigenvalue:.3g}): "
-            f"a simulation with these parameters diverges; {advice}"
-        )
-        findings.append(Finding("mass_matrix", "warning", "standard_parameters", message))
-    bounds = [name for name in details.get("active", ()) if name.startswith(_USER_BOUNDS)]
+        findings.append(
+            finding(
+                "mass_matrix", subject="standard_parameters", share=1 - check.positive_share,
+                cure=isinstance(fit.estimator, ConsistentSettings), poses=check.poses,
+                smallest=check.smallest_eigenvalue,
+            )
+        )  # fmt: skip
+    active = fit.estimate.details.get("active", ())
+    bounds = [name for name in active if name.startswith(_USER_BOUNDS)]
     if bounds:
-        against = _contradiction(fit)
-        why = (
-            f"{against}; check these bounds, the torque scale (gains) and the payload"
-            if against
-            else "the URDF's values are outside them; the bounds do not increase the torque error"
-        )
-        is_stated = bool(_stated(fit).intersection(bounds))
-        severity = "warning" if against and is_stated else "note"
-        message = f"the bounds {listed(bounds)} are active: {why}"
-        findings.append(Finding("active_bound", severity, ", ".join(bounds), message))
+        why, words = _contradiction(fit)
+        is_warning = why != "harmless" and bool(_stated(fit).intersection(bounds))
+        findings.append(
+            finding(
+                "active_bound", subject=", ".join(bounds), bounds=listed(bounds), why=why,
+                severity="warning" if is_warning else "note", **words,
+            )
+        )  # fmt: skip
     return findings
 
 
@@ -324,17 +272,11 @@ def _total_mass(fit: Fit) -> list[Finding]:
     size = fit.model.layout.n_inertial
     pi = np.array([fit.prior, fit.standard])
     before, after = pi[:, :size:10].sum(axis=1).tolist()
-    if fit.estimator.bounds.total is not None:  # the user states it
+    is_stated = fit.estimator.bounds.total is not None
+    if is_stated or not before > 0 or before / _FAR <= after <= _FAR * before:
         return []
-    if not before > 0 or before / _FAR <= after <= _FAR * before:
-        return []
-    message = (
-        f"the identified total mass is {after:.4g} kg, the URDF's is {before:.4g} kg; wanted: "
-        f"within a factor of {_FAR:g}. Check the sign, the order and the unit of the torques, and "
-        "the masses of the URDF; if the URDF's masses are wrong, ignore total_mass"
-    )
-    evidence = {"urdf": before, "identified": after}
-    return [Finding("total_mass", "error", "standard_parameters", message, evidence)]
+    evidence = {"urdf": before, "identified": after, "far": _FAR}
+    return [finding("total_mass", subject="standard_parameters", **evidence)]
 
 
 def _is_within_box(fit: Fit, body: str, box: Array) -> bool:
@@ -355,24 +297,23 @@ def _impossible_shapes(fit: Fit) -> list[Finding]:
     """
     model, points = fit.model, body_points(fit.model)
     boxes, negligible = body_boxes(model), negligible_bodies(model)
-    before = {(finding.code, finding.where) for finding in audit_bodies(model, fit.prior, points)}
+    before = {(fault.code, fault.where) for fault in audit_bodies(model, fit.prior, points)}
     findings = []
-    for finding in audit_bodies(model, fit.standard, points):
-        body = finding.where.removeprefix("link ")
+    for fault in audit_bodies(model, fit.standard, points):
+        body = fault.words["link"]
         if body in negligible:  # it keeps the URDF's values, and has no effect
             continue
-        if (finding.code, finding.where) in before:
-            message = f"{finding.message.partition(';')[0]}; the URDF has the same fault"
-            finding = replace(finding, severity="note", message=message)
+        identified = f"as identified, {fault.fault}"
+        if (fault.code, fault.where) in before:
+            fault = fault.reworded(severity="note", remedy="; the URDF has the same fault")
         elif _is_within_box(fit, body, boxes[body]):
-            fault = finding.message.partition(";")[0]
-            message = f"as identified, {fault}; it is within the margin of the fit"
-            finding = replace(finding, severity="note", message=message)
+            remedy = "; it is within the margin of the fit"
+            fault = fault.reworded(severity="note", fault=identified, remedy=remedy)
         else:
-            fault = finding.message.partition(";")[0]
-            message = f"as identified, {fault}. {_remedy(fit, body)}"
-            finding = replace(finding, message=message)
-        findings.append(finding)
+            remedy = f". {_cure(fit, body)}. The predicted torque may still be right; do not use "
+            remedy += "mass, centre of mass and inertia of this link"
+            fault = fault.reworded(fault=identified, remedy=remedy)
+        findings.append(fault)
     return findings
 
 
@@ -394,40 +335,30 @@ def _dense_bodies(fit: Fit) -> list[Finding]:
             continue
         # at equal inertia the density is proportional to the mass to the power of 2.5
         excess = float(now[0]) * (1.0 - (_DENSEST / density) ** 0.4)
-        needs = (
-            f"needs a density of at least {float(f'{density:.2g}'):.0f} kg/m^3 (wanted: at most "
-            f"{_DENSEST:g}, steel has 7900)"
-            if np.isfinite(density)
-            else "is that of a body without volume"
-        )
-        own = slice(10 * k, 10 * k + 10)
-        covariance = fit.standard_covariance[own, own]
+        rows = slice(10 * k, 10 * k + 10)
+        covariance = fit.standard_covariance[rows, rows]
         share = density_share(now, covariance, _DENSEST, np.random.default_rng(0))
-        severity, error = "warning", ""
-        conclusion = "such a body is not possible"
-        if share > _UNLIKELY and not _stated_of(fit, body):
-            severity, error = "note", f" +- {1.96 * np.sqrt(covariance[0, 0]):.2g}"
-            conclusion = (
-                f"{100 * share:.0f} % of the bodies that these errors allow need less, so the data "
-                "do not determine this link"
+        is_open = share > _UNLIKELY and not _stated_of(fit, body)
+        is_finite = bool(np.isfinite(density))
+        findings.append(
+            finding(
+                "dense_body", subject=f"link {body}", severity="note" if is_open else "warning",
+                link=body, error=is_open, needs="finite" if is_finite else "none",
+                conclusion=is_open, cure=_cure(fit, body, excess), mass=now[0], density=density,
+                rounded=float(f"{density:.2g}") if is_finite else 0.0, densest=_DENSEST,
+                share=share, half_width=1.96 * np.sqrt(covariance[0, 0]),
             )
-        message = (
-            f"as identified, the mass of {body} is {now[0]:.3g}{error} kg and its inertia {needs}: "
-            f"{conclusion}. {_remedy(fit, body, excess)}"
-        )
-        evidence = {"mass": float(now[0]), "density": density}
-        findings.append(Finding("dense_body", severity, f"link {body}", message, evidence))
+        )  # fmt: skip
     return findings
 
 
-def _remedy(fit: Fit, body: str, excess: float = 0.0) -> str:
-    """Return what to correct for an impossible body, and what remains valid."""
+def _cure(fit: Fit, body: str, excess: float = 0.0) -> str:
+    """Return what to correct for an impossible body."""
     cure = "Record motion about more axes, or pin it to the URDF"
     for stated, mass in _stated_of(fit, body).items():
         limit = f" (possible: up to about {mass - excess:.3g} kg)" if excess > 0 else ""
         cure = f"Check the stated {stated} of {mass:.4g} kg{limit}: weigh it, or remove it"
-    use = "do not use mass, centre of mass and inertia of this link"
-    return f"{cure}. The predicted torque may still be right; {use}"
+    return cure
 
 
 def _stated_of(fit: Fit, body: str) -> dict[str, float]:
@@ -447,19 +378,13 @@ def _bound_findings(fit: Fit) -> list[Finding]:
     findings, names = [], fit.model.layout.names
     at_bound = [name for name, is_at in zip(names, fit.at_bound, strict=True) if is_at]
     if at_bound:
-        message = (
-            f"{listed(at_bound, _NAMED)}: 0, at the bound, without a standard error. Without "
-            "this bound the value is negative, which no drive has: the friction model lacks a "
-            "term, or the motion does not distinguish these terms from others"
-        )
-        findings.append(Finding("at_bound", "note", ", ".join(at_bound), message))
-    for body in fit.estimate.details.get("relaxed", ()):
-        message = (
-            f"{body}: the data contradict the box of its geometry: mass is outside. The fit "
-            "ignored the box of this link. If a part is mounted there, add it to the URDF; "
-            "otherwise check the URDF's geometry and the torque scale"
-        )
-        findings.append(Finding("extent_contradicted", "warning", f"link {body}", message))
+        joints = list(dict.fromkeys(name.rpartition(".")[0] for name in at_bound))
+        where, text = ", ".join(at_bound), listed(at_bound, _NAMED)
+        findings.append(finding("at_bound", "", joints, subject=where, names=text))
+    findings += [
+        finding("extent_contradicted", subject=f"link {body}", link=body)
+        for body in fit.estimate.details.get("relaxed", ())
+    ]
     return findings
 
 
@@ -467,20 +392,19 @@ def _outlier_findings(fit: Fit) -> list[Finding]:
     outliers = fit.outliers
     if not outliers:
         return []
-    places = [
+    places = "; ".join(
         f"{o.joint} at {o.t:.3f} s of {o.log}: measured {o.torque:.4g}, predicted "
         f"{o.predicted:.4g}, residual {o.size:.0f} times the typical one"
         for o in outliers[:_NAMED]
-    ]
-    more = f"; and {len(outliers) - _NAMED} more" if len(outliers) > _NAMED else ""
-    advice = "check the recording there, cut it out, or set robust = 'tukey' in [estimator]"
-    if fit.estimator.is_robust:
-        advice = "the robust loss downweighted them"
+    )
+    places += f"; and {len(outliers) - _NAMED} more" if len(outliers) > _NAMED else ""
     count = f"{len(outliers)} outlier{'s' if len(outliers) > 1 else ''}"
-    found = f"{count} in the fitted logs: {'; '.join(places)}"
-    evidence = {"places": float(len(outliers)), "largest": outliers[0].size}
-    where, message = outliers[0].joint, f"{found}{more}; {advice}"
-    return [Finding("outliers", "warning", where, message, evidence)]
+    return [
+        finding(
+            "outliers", "", outliers[0].joint, count=count, where=places,
+            cure=fit.estimator.is_robust, places=len(outliers), largest=outliers[0].size,
+        )
+    ]  # fmt: skip
 
 
 def _asked(fit: Fit) -> str:
@@ -512,12 +436,12 @@ def _locked_links(fit: Fit) -> str:
     return "".join(links)
 
 
-def _contradiction(fit: Fit) -> str:
-    """Return how data or masses contradict active bounds, as text; empty if they do not."""
+def _contradiction(fit: Fit) -> tuple[str, dict[str, str]]:
+    """Return whether data ("costs") or masses ("vanished") contradict active bounds."""
     ours, wls = (fit.metrics(name).per_joint for name in ("estimate", "wls"))
     costs = [joint for joint in ours if ours[joint].rmse > _COSTS * wls[joint].rmse]
     if costs:
-        return f"they increase the torque error of {listed(costs)}"
+        return "costs", {"costs": listed(costs)}
     layout = fit.model.layout
     masses = fit.standard[: layout.n_inertial : 10]
     urdf = fit.model.standard_parameters()[: layout.n_inertial : 10]
@@ -526,7 +450,7 @@ def _contradiction(fit: Fit) -> str:
         for link, mass, before in zip(layout.bodies, masses, urdf, strict=True)
         if mass < _VANISHED * before
     ]
-    return f"with them {', '.join(vanished)}" if vanished else ""
+    return ("vanished", {"vanished": ", ".join(vanished)}) if vanished else ("harmless", {})
 
 
 def _stated(fit: Fit) -> set[str]:
@@ -537,3 +461,64 @@ def _stated(fit: Fit) -> set[str]:
         *(f"mass {link}" for link in stated.mass),
         *(f"centre_of_mass {link}" for link in stated.com),
     }
+
+
+def unlike_findings(variation: Variation | None) -> Iterator[Finding]:
+    """Yield a finding for each unit and log that differs from what the others predict."""
+    if variation is None:
+        return
+    for unlike in variation.unlike_units:
+        name = f"unit {variation.unit_names[unlike.run]}"
+        yield _unlike("unlike_unit", name, unlike, variation.units - 1, "other units")
+    for unlike in variation.unlike:
+        count = len(variation.runs) - 1
+        yield _unlike("unlike_run", variation.runs[unlike.run], unlike, count, "other logs")
+
+
+def _unlike(code: str, name: str, unlike: UnlikeRun, others: int, rest: str) -> Finding:
+    """Return the finding about a log or a unit, with the prediction of the others."""
+    (low, high), kind = (float(end) for end in unlike.ends), unlike.kind
+    size, span = f"{unlike.value:.3g} +- {unlike.std_error:.2g}", f"{low:.3g} to {high:.3g}"
+    if kind == "zero":
+        size = f"{unlike.value:+.3g} +- {unlike.std_error:.2g}"
+    if kind == "gain":
+        size = f"{100 * (unlike.value - 1):+.3g} +- {100 * unlike.std_error:.2g} %"
+        span = f"{100 * (low - 1):+.3g} to {100 * (high - 1):+.3g} %"
+    return finding(
+        code, subject=name, name=name, what=kind, cure=kind, others=f"{others} {rest}", rest=rest,
+        parameter=unlike.where if kind in ("zero", "gain") else unlike.name, unit=unlike.unit,
+        size=size, range=span if kind == "gain" else f"{span} {unlike.unit}", value=unlike.value,
+        std_error=unlike.std_error, low=low, high=high, probability=unlike.probability,
+    )  # fmt: skip
+
+
+def rescaled_findings(fit: Fit, loaded: Collection[str] = ()) -> Iterator[Finding]:
+    """Yield a finding for each torque of a validation log that is a multiple of its prediction.
+
+    The factor c minimises |tau - c tau_predicted| over the rows used. It is reported if the torque
+    error is above the limit of a good prediction, and the factor removes most of its square.
+    """
+    if fit.model.constraints:  # the rows are projected, and mix the joints
+        return
+    friction = dict[str, float]()
+    for e in fit.validation:
+        motion, mask = e.recording.trajectory, e.recording.mask
+        log = Path(e.recording.log.path).name
+        if e.is_refitted or e.recording.is_partial or log in loaded:
+            continue
+        for k, joint in enumerate(fit.model.row_names):
+            measured = e.metrics["estimate"].per_joint.get(joint)
+            if joint not in fit.model.joints or measured is None or error_of(measured) <= GOOD:
+                continue
+            if measured.relative_error_pct is None:
+                continue  # the torque is 0: it has no gain
+            tau, predicted = motion.tau[mask[:, k], k], e.torques["estimate"][mask[:, k], k]
+            factor = float(predicted @ tau) / max(float(predicted @ predicted), 1e-300)
+            left = float(np.sum((tau - factor * predicted) ** 2) / np.sum((tau - predicted) ** 2))
+            if abs(factor - 1.0) < _RESCALED or left > _LEFT:
+                continue
+            friction = friction or friction_shares(fit)
+            yield finding(
+                "gain_change", log, joint, what=friction[joint] > _MOSTLY, factor=factor,
+                share_pct=100 * (1 - left), friction=friction[joint],
+            )  # fmt: skip

@@ -1,13 +1,13 @@
 """The verdict on positions simulated from commands or torques, compared with simpler models."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
 from robotid.base.findings import listed
-from robotid.diagnosis.verdict.evidence import BEATEN, error_of
-from robotid.diagnosis.verdict.uses import uses_of_motion
+from robotid.diagnosis.verdict.evidence import BEATEN, error_of, uses_of_motion
 from robotid.diagnosis.verdict.verdict import JointVerdict, Verdict, concluded, on_joint
-from robotid.estimation.fitting.metrics import JointMetrics, Metrics
+from robotid.estimation.fitting.evaluation import JointMetrics, Metrics
 
 #: [%] simulated position error of a joint on validation logs: limits of "good" and "usable".
 GOOD, POOR = 5.0, 30.0
@@ -22,7 +22,6 @@ _SIMPLER = {
     "rows": "the fit to torques alone",
     "steady": "constant velocity from the start",
 }
-_DRIVEN = {**_SIMPLER, "urdf": "the URDF with fitted drives"}
 
 
 def judge_positions(
@@ -38,39 +37,31 @@ def judge_positions(
     knows_torques: bool = False,
 ) -> Verdict:
     """Return the verdict on simulated positions."""
-    own = {} if fitted is None else fitted.per_joint
-    found = {
-        joint: _judge_joint(joint, metrics.per_joint.get(joint), own.get(joint), is_validation)
-        for joint in joints
-    }
-    worst_first = sorted(
-        found, key=lambda j: -error_of(metrics.per_joint[j]) if j in metrics.per_joint else 0.0
-    )
-    reasons = {
-        status: [why for j in worst_first if found[j].status == status for why in found[j].reasons]
-        for status in ("poor", "not evaluated", "usable")
-    }
-    warnings = list(cautions)
-    if not is_validation:
-        warnings.append("prediction of unseen motion not evaluated: no validation log given")
-    if not is_settled:
-        warnings.append("the fit has not converged")
-    worst = max(map(error_of, metrics.per_joint.values()), default=0.0)
+    measured, of_fit = metrics.per_joint, {} if fitted is None else fitted.per_joint
+    verdicts = {j: _judge_joint(j, measured.get(j), of_fit.get(j), is_validation) for j in joints}
+    errors = {joint: error_of(m) for joint, m in measured.items()}
+    worst_first = sorted(verdicts, key=lambda joint: -errors.get(joint, 0.0))
+
+    def reasons(status: str) -> list[str]:
+        stated = (verdicts[joint] for joint in worst_first)
+        return [why for verdict in stated if verdict.status == status for why in verdict.reasons]
+
+    unseen = "prediction of unseen motion not evaluated: no validation log given"
+    warnings = [*cautions, *([] if is_validation else [unseen])]
+    warnings += [] if is_settled else ["the fit has not converged"]
     verdict = concluded(
-        found,
-        poor=reasons["poor"],
-        warnings=[*warnings, *reasons["not evaluated"], *reasons["usable"]],
-        good=f"simulated position error on validation logs: at most {worst:.2g} % of each joint's "
-        "RMS motion, smaller than those of simpler models",
+        verdicts,
+        poor=reasons("poor"),
+        warnings=[*warnings, *reasons("not evaluated"), *reasons("usable")],
+        good="simulated position error on validation logs: at most "
+        f"{max(errors.values(), default=0.0):.2g} % of each joint's RMS motion, smaller than those "
+        "of simpler models",
         notes=[scale] if scale else [],
         log_errors=log_errors,
-        is_tested=is_validation and bool(metrics.per_joint),
+        is_tested=is_validation and bool(measured),
     )
-    uses = uses_of_motion(
-        {joint: found[joint].status for joint in found if joint in metrics.per_joint},
-        log_errors=log_errors,
-        is_scaled=knows_torques,
-    )
+    status = {joint: verdict.status for joint, verdict in verdicts.items() if joint in measured}
+    uses = uses_of_motion(status, log_errors=log_errors, is_scaled=knows_torques)
     return replace(verdict, use_for=uses)
 
 
@@ -80,10 +71,10 @@ def _judge_joint(
     """Return the verdict on one joint; metrics are None if no log commands it to move."""
     simple = None if fitted is None else fitted.baselines.get("second_order")
     if fitted is not None and simple is not None:
-        own = error_of(fitted)
-        if own > max(_FITTED, HARDLY * simple):
+        error = error_of(fitted)
+        if error > max(_FITTED, HARDLY * simple):
             lacking = (
-                f"{joint}: simulated position error {own:.2g} % of its RMS motion on the fitted "
+                f"{joint}: simulated position error {error:.2g} % of its RMS motion on the fitted "
                 f"logs, {simple:.2g} % with a second-order model: the model lacks an effect of "
                 "this joint, such as a torque limit"
             )
@@ -92,19 +83,11 @@ def _judge_joint(
         still = f"{joint}: commanded to rest in all logs: not evaluated"
         return on_joint([], [], is_tested=False, checked=still)
     error, baselines = error_of(measured), measured.baselines
-    names = _DRIVEN if "steady" in baselines else _SIMPLER
-    beaten = [
-        key
-        for key in names
-        if (simpler := baselines.get(key)) is not None and error > BEATEN * simpler
-    ]
-    error_text = f"{joint}: simulated position error {error:.2g} % of its RMS motion"
-    if beaten:
-        error_text += f"; smaller with {listed(names[key] for key in beaten)}"
-    if not is_validation:
-        return on_joint([], [], is_tested=False, checked=error_text)
-    if error > POOR or "command" in beaten:
-        return on_joint([error_text], [], is_tested=True, checked="")
-    return on_joint(
-        [], [error_text] if error > GOOD or beaten else [], is_tested=True, checked=error_text
-    )
+    simpler = {key: other for key, other in baselines.items() if other is not None}
+    beaten = [key for key in _SIMPLER if error > BEATEN * simpler.get(key, math.inf)]
+    words = _SIMPLER | ({"urdf": "the URDF with fitted drives"} if "steady" in baselines else {})
+    text = f"{joint}: simulated position error {error:.2g} % of its RMS motion"
+    text += f"; smaller with {listed(words[key] for key in beaten)}" * bool(beaten)
+    is_poor = is_validation and (error > POOR or "command" in beaten)
+    is_usable = is_validation and not is_poor and (error > GOOD or bool(beaten))
+    return on_joint([text] * is_poor, [text] * is_usable, is_tested=is_validation, checked=text)

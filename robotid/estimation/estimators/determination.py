@@ -13,6 +13,7 @@ import scipy.linalg
 
 from robotid.base.exceptions import RankDeficientError
 from robotid.base.typing import Array
+from robotid.estimation.estimators.estimator import Estimate
 
 _PRIOR_LED = 0.9  # ratio of the spreads after and before the data above which a direction is weak
 _LED_IN_PART = 0.3  # share of a parameter's spread in weak directions that makes it a group member
@@ -23,6 +24,7 @@ _TIE = 0.95  # coefficients above this share of the largest are equal to it: the
 _TERMS = 4  # largest number of printed terms of a sum
 _DIGITS = 3  # printed digits of a coefficient
 _NAMED = 5  # largest number of parameters of a group, and half as many sums, that are printed
+_ILL_CONDITIONED = 1e3  # condition number of unit columns above which a motion is poor
 _GROUPS = 2  # largest number of groups whose sums are printed
 
 
@@ -114,23 +116,18 @@ class Determination:
 
     def to_list(self) -> list[dict[str, Any]]:
         """Return the groups as plain values, as they are written to result.json."""
+
+        def plain(c: Combination) -> dict[str, Any]:
+            return {"text": str(c), "terms": dict(zip(c.names, c.coefficients, strict=True))}
+
         return [
-            {
-                "parameters": list(group.names),
-                "determined": [
-                    {"text": str(c), "terms": dict(zip(c.names, c.coefficients, strict=True))}
-                    for c in group.combinations
-                ],
-            }
+            {"parameters": list(group.names), "determined": [plain(c) for c in group.combinations]}
             for group in self.groups
         ]
 
 
 def base_spread(K: Array, spread: Array, known: Sequence[bool] | Array = ()) -> Array:
-    """Return the prior standard deviation of each base parameter, shape (b,); 0 if known.
-
-    K (b, p), spread (p,), known (p,).
-    """
+    """Return the prior standard deviation of each base parameter, (b,); 0 if known (p,)."""
     free = spread * ~np.asarray(known, dtype=bool) if len(known) else spread
     return np.asarray(np.linalg.norm(K * free, axis=1))
 
@@ -157,6 +154,11 @@ def determine(names: Sequence[str], rows: Array, spread: Array) -> Determination
         shrinkage[len(spread) - len(free) :] = after
     groups = _groups(tuple(names), weak, spread)
     return Determination(tuple(names), spread, shrinkage, weak, groups)
+
+
+def is_poorly_excited(wls: Estimate, count: int) -> bool:
+    """Return whether the motion, not the noise, leaves base parameters undetermined."""
+    return wls.rank < count or wls.condition > _ILL_CONDITIONED
 
 
 def _groups(names: tuple[str, ...], weak: Array, spread: Array) -> tuple[Group, ...]:

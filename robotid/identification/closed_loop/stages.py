@@ -117,10 +117,10 @@ def fit_loops(
     progress: ProgressCallback = ignore_progress,
 ) -> Fitted:
     """Fit drives, loops and bodies to logs of commands and positions."""
+    task = _Task(model, logs, loop, settings, signals, progress)
     _check_settings(model, logs, loop, settings)
     initialise = _initialise_from_torque if loop.kind == "torque" else _initialise_from_commands
-    initialised = initialise(model, logs, loop, settings, signals, progress)
-    initialised, theta = _best_start(initialised)
+    initialised, theta = _best_start(initialise(task))
     simulator, estimator = initialised.simulator, initialised.estimator
     is_plain, every = initialised.linear is None, simulator.windows
     if is_plain:
@@ -151,9 +151,8 @@ def fit_loops(
     dropped: dict[str, Tried] = {}
     while True:
         simulator, estimate, tried = _with_chosen_terms(
-            model, logs, signals, initialised, estimator, fitted, dropped,
-            passes=_PASSES if chooses else 0, progress=progress,
-        )  # fmt: skip
+            task, initialised, estimator, fitted, dropped, passes=_PASSES if chooses else 0
+        )
         failing = impossible(simulator, estimate.theta, tried)
         try:
             if initialised.linear is None and not failing:
@@ -173,17 +172,41 @@ def fit_loops(
     return Fitted(simulator, estimate, initialised.plain, *others)
 
 
+@dataclass(frozen=True, eq=False)
+class _Task:
+    """What is fitted, and how."""
+
+    model: RobotModel
+    logs: Sequence[Log]
+    loop: LoopSettings
+    settings: SimulationSettings
+    signals: SignalSettings | None
+    progress: ProgressCallback
+
+    def windows(self, logs: Sequence[Log], length: float, lead: float) -> tuple[Window, ...]:
+        """Return the windows of logs, of the stated length and lead or these."""
+        length = self.settings.window or length
+        lead = lead if self.settings.lead is None else self.settings.lead
+        return tuple(w for log in logs for w in cut_windows(log, length, lead))
+
+    def from_rows(self, model: RobotModel) -> TorqueIdentification:
+        """Return the identification from the torques alone, with the model's friction terms."""
+        return identify(model, self.logs, signals=self.signals, friction="none", doctor=False)
+
+    def bodies(self, robot: ClosedLoopRobot) -> list[FreeParameter]:
+        """Return the free parameters of bodies."""
+        spread = self.settings.bodies
+        return free_body_parameters(robot, spread) if spread else []
+
+
 def _with_chosen_terms(
-    model: RobotModel,
-    logs: Sequence[Log],
-    signals: SignalSettings | None,
+    task: _Task,
     initialised: "_Initial",
     estimator: OutputError,
     fitted: tuple[LoopSimulator, Array, Estimate | None],
     dropped: Mapping[str, Tried],
     *,
     passes: int,
-    progress: ProgressCallback,
 ) -> tuple[LoopSimulator, Estimate, list[Tried]]:
     """Return the fit with the friction terms that held-out windows confirm, and those tried.
 
@@ -193,7 +216,7 @@ def _with_chosen_terms(
     simulator, theta, estimate = fitted
     tried: list[Tried] = []
     for _ in range(passes):
-        report_stage(progress, "trying friction terms", STAGES)
+        report_stage(task.progress, "trying friction terms", STAGES)
         offered = [
             set_
             for set_ in candidates(simulator, initialised.torque)
@@ -206,12 +229,11 @@ def _with_chosen_terms(
         chosen = [set_ for set_, t in zip(offered, judged, strict=True) if t.is_chosen]
         if not chosen and estimate is not None:
             break
-        report_stage(progress, "fitting loops", STAGES)
+        report_stage(task.progress, "fitting loops", STAGES)
         simulator, theta = _with(simulator, theta, chosen)
         if simulator.torque is not None:
-            extended = with_terms(model, simulator.base)
-            rows = torque_rows(identified_rows(extended, logs, signals), initialised.share)
-            simulator = replace(simulator, torque=rows)
+            from_rows = task.from_rows(with_terms(task.model, simulator.base))
+            simulator = replace(simulator, torque=torque_rows(from_rows, initialised.share))
         estimate = estimator.fit(simulator, theta)
         theta = estimate.theta
     assert estimate is not None  # of a rough fit, the first pass makes it
@@ -342,20 +364,14 @@ class _Initial:
         return 1.0 if self.linear is None else _BOTH
 
 
-def _initialise_from_commands(
-    model: RobotModel,
-    logs: Sequence[Log],
-    loop: LoopSettings,
-    settings: SimulationSettings,
-    signals: SignalSettings | None,
-    progress: ProgressCallback,
-) -> _Initial:
+def _initialise_from_commands(task: _Task) -> _Initial:
     """Return closed loops on commands, initialised with a second-order model of each joint."""
+    model, loop, settings = task.model, task.loop, task.settings
     robot = ClosedLoopRobot(model, step=settings.step)
-    encoders = find_encoders(model, logs) if loop.zeros == "find" else same_encoders(model)
-    logs = [log.turned(encoders.sign) for log in logs]
-    length, lead = settings.window or _WINDOW, _LEAD if settings.lead is None else settings.lead
-    windows = tuple(w for log in logs for w in cut_windows(log, length, lead))
+    encoders = find_encoders(model, task.logs) if loop.zeros == "find" else same_encoders(model)
+    logs = [log.turned(encoders.sign) for log in task.logs]
+    task = replace(task, logs=logs)
+    windows = task.windows(logs, _WINDOW, _LEAD)
     stated = replace(stated_loops(model, loop), zero=encoders.zero)
     uses_torques = settings.torques and all(log.has_torque for log in logs)
     has_gain, lag = is_stated(loop.kp, model), None
@@ -366,7 +382,7 @@ def _initialise_from_commands(
             moved, stated, is_free, knows_delay=loop.delay is not None, is_whole=True
         )
         has_gain, stated = has_gain | (matched.kp != stated.kp), matched
-    report_stage(progress, "trying second-order models", STAGES)
+    report_stage(task.progress, "trying second-order models", STAGES)
     second_order = cache(
         lambda finds_limit: fit_second_order(
             robot, windows, stated, finds_delay=loop.delay is None, finds_limit=finds_limit
@@ -378,7 +394,7 @@ def _initialise_from_commands(
     finds_kd = uses_torques or all(log.v_ref is not None for log in logs)
     dt = max(float(np.median(np.diff(log.t))) for log in logs)
     most = np.tile(np.exp(-_WHITE * dt / plain.time_constant), 3)  # positions, speeds, torques
-    estimator = OutputError(settings.whiten, most, progress=progress)
+    estimator = OutputError(settings.whiten, most, progress=task.progress)
     may_limit = ~is_stated(loop.limit, model) & (loop.limit != "find")
     scales = (1.0,) if has_gain.all() else _SCALES
 
@@ -395,58 +411,51 @@ def _initialise_from_commands(
             finds_kd=finds_kd | by_limit, finds_limit=finds_limit,
         )  # fmt: skip
         free_parameters += free_zeros(model, encoders) if loop.zeros == "find" else []
-        free_parameters += free_body_parameters(robot, settings.bodies) if settings.bodies else []
+        free_parameters += task.bodies(robot)
         simulator = LoopSimulator(
             robot, windows, base, tuple(free_parameters), velocities=settings.velocities, lag=lag
         )
         if uses_torques and lag is None:
-            rows = torque_rows(identified_rows(with_terms(model, base), logs, signals))
-            simulator = replace(simulator, torque=rows)
+            from_rows = task.from_rows(with_terms(model, base))
+            simulator = replace(simulator, torque=torque_rows(from_rows))
         return _Initial(
             simulator, estimator, typical.torque, encoders, plain,
             groups=tuple(groups), scales=scales, factor=factor, limited=limited, vary=vary,
         )  # fmt: skip
 
-    report_stage(progress, "fitting loops", STAGES)
+    report_stage(task.progress, "fitting loops", STAGES)
     n = len(model.joints)
     return vary(np.ones(n), np.zeros(n, dtype=bool))
 
 
-def _initialise_from_torque(
-    model: RobotModel,
-    logs: Sequence[Log],
-    loop: LoopSettings,
-    settings: SimulationSettings,
-    signals: SignalSettings | None,
-    progress: ProgressCallback,
-) -> _Initial:
+def _initialise_from_torque(task: _Task) -> _Initial:
     """Return a robot driven by the logged torque, initialised from the torque rows alone.
 
     Where the fit uses these rows, the prior of the bodies is their estimate from the rows; else
     that of the URDF.
     """
-    report_stage(progress, "fitting torques", STAGES)
-    from_rows = identified_rows(model, logs, signals)
+    model, loop, settings = task.model, task.loop, task.settings
+    report_stage(task.progress, "fitting torques", STAGES)
+    from_rows = task.from_rows(model)
     linear = open_loops(model, from_rows.standard)
     is_urdf = not (settings.torques and settings.bodies)
     base = replace(linear, bodies=stated_loops(model, loop).bodies) if is_urdf else linear
     robot = ClosedLoopRobot(model, step=settings.step)
-    length, lead = settings.window or DRIFTS, settings.lead or 0.0
-    windows = tuple(w for log in logs for w in cut_windows(log, length, lead))
+    windows = task.windows(task.logs, DRIFTS, 0.0)
     typical = typical_sizes_of_torques(model, from_rows.standard, base.armature, windows)
     groups = groups_of(loop, model.joints, range(len(model.joints)))
     none = np.zeros(len(groups), dtype=bool)
     free_parameters = free_drive_parameters(
         model, loop, groups, base, typical, finds_kd=False, finds_limit=none
     )
-    free_parameters += free_body_parameters(robot, settings.bodies) if settings.bodies else []
+    free_parameters += task.bodies(robot)
     simulator = LoopSimulator(
         robot, windows, base, tuple(free_parameters), velocities=settings.velocities
     )
-    report_stage(progress, "fitting loops", STAGES)
+    report_stage(task.progress, "fitting loops", STAGES)
     if settings.torques:
         simulator = replace(simulator, torque=torque_rows(from_rows, _BOTH))
-    estimator = OutputError(whitens=settings.whiten, frees=True, progress=progress)
+    estimator = OutputError(whitens=settings.whiten, frees=True, progress=task.progress)
     encoders = same_encoders(model)
     return _Initial(simulator, estimator, typical.torque, encoders, linear=from_rows)
 
@@ -592,13 +601,6 @@ def _with(
     base = replace(loops, terms=tuple(map(tuple, terms)), values=np.array(values))
     wide = replace(simulator, base=base, free_parameters=(*simulator.free_parameters, *further))
     return wide, np.concatenate([theta, np.zeros(len(further))])
-
-
-def identified_rows(
-    model: RobotModel, logs: Sequence[Log], signals: SignalSettings | None
-) -> TorqueIdentification:
-    """Return the identification from the torques of logs alone, with the model's friction terms."""
-    return identify(model, logs, signals=signals, friction="none", doctor=False)
 
 
 def torque_rows(from_torques: TorqueIdentification, inflation: float = 1.0) -> TorqueRows:

@@ -9,7 +9,14 @@ import numpy as np
 
 from robotid.base.arguments import real_numbers
 from robotid.base.exceptions import DataError
-from robotid.base.settings import is_number, require_kind
+from robotid.base.settings import (
+    NOT_NEGATIVE,
+    POSITIVE,
+    Settings,
+    is_number,
+    require_kind,
+    setting,
+)
 from robotid.base.typing import Array
 from robotid.data.log import Log, Trajectory
 from robotid.dynamics.base_parameters import structural_mapping
@@ -25,7 +32,6 @@ from robotid.identification.online.change_detection import (
     load_spread,
     payload_of,
 )
-from robotid.identification.online.online_settings import Change, OnlineSettings, Reading
 from robotid.robot.model import RobotModel
 from robotid.robot.prior import prior_spread
 
@@ -34,9 +40,85 @@ _OVERSAMPLED = 12.0  # estimator updates per period of the cut-off
 _STORED_EVERY = 0.1  # time between stored states, for the reset after a change [s]
 _STORED = 30  # number of stored states
 _REOPENED = 0.1  # change of every parameter after a change, relative to its prior spread
+_ORDER = 4  # of the causal filter
+_DRIFT = 4.0  # mean squared innovation without a change [variances]
+_MEMORY = 5.0  # time over which the noise level of each joint is averaged [s]
+_ROWS = 20.0  # rate of the rows of the history [Hz]
+
 Observer = Callable[[int, "OnlineIdentifier"], None]
 
-_ROWS = 20.0  # rate of the rows of the history [Hz]
+
+@dataclass(frozen=True)
+class OnlineSettings(Settings):
+    """Settings of an online identification."""
+
+    rate: float = setting(200.0, "approximate rate of the samples [Hz]", within=POSITIVE)
+    cutoff: float = setting(8.0, "cut-off of the causal filter [Hz]", within=POSITIVE)
+    min_velocity: float = setting(
+        0.02,
+        "speed below which a joint's row is not used if Coulomb friction is identified [rad/s]; "
+        "for prismatic joints as in ``SignalSettings``",
+        within=NOT_NEGATIVE,
+    )
+    warmup: float = setting(
+        1.0,
+        "time of motion before the first estimate, which scales the drive terms [s]",
+        within=POSITIVE,
+    )
+    walk: float = setting(
+        1e-4,
+        "random walk of the parameters, relative to their prior spread, per square root of a "
+        "second [s^-1/2]",
+        within=NOT_NEGATIVE,
+    )
+    threshold: float = setting(
+        40.0, "evidence at which a change is flagged; see ``ChangeDetector``", within=POSITIVE
+    )
+    model_error: float = setting(
+        0.05,
+        "error of the model without a change, relative to each joint's torque [-]",
+        within=NOT_NEGATIVE,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Reading:
+    """The estimate at one time.
+
+    Attributes:
+        t: The time of the estimate: that of the newest sample minus the delay [s].
+        theta: Base parameters, shape (b,).
+        std_error: Their standard errors, shape (b,).
+        sigma: Noise level of each joint, shape (n,) [N m or N].
+        excitation: Reduction of the parameters' prior variance by the motion so far, mean over the
+            parameters, 0 to 1.
+        converged: Whether the parameters' uncertainty adds less than half a noise level to the
+            predicted torque.
+    """
+
+    t: float
+    theta: Array
+    std_error: Array
+    sigma: Array
+    excitation: float
+    converged: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Change:
+    """A step change of the parameters.
+
+    Attributes:
+        flagged: Time at which it was flagged, on the clock of the samples [s].
+        onset: Estimated time of the change [s].
+        theta: Base parameters before it, shape (b,).
+        covariance: Their covariance, shape (b, b).
+    """
+
+    flagged: float
+    onset: float
+    theta: Array
+    covariance: Array
 
 
 class OnlineIdentifier:
@@ -76,7 +158,7 @@ class OnlineIdentifier:
         self.changes: tuple[Change, ...] = ()
         n = len(model.joints)
         is_continuous = np.array([joint.turns_freely for joint in model.limits])
-        self._signals = LiveSignals(n, s.rate, s.cutoff, s.order, is_continuous)
+        self._signals = LiveSignals(n, s.rate, s.cutoff, _ORDER, is_continuous)
         self.delay = self._signals.delay
         self._every = max(1, int(s.rate / (_OVERSAMPLED * s.cutoff)))
         self._pace()
@@ -236,8 +318,8 @@ class OnlineIdentifier:
         self._prior_variance = np.diag(C)
         rms = np.sqrt(np.mean(tau**2, axis=0))
         s = self.settings
-        detector = ChangeDetector(len(joints), s.threshold, s.drift)
-        self._innovations = Innovations(rms, self._dt, s.noise_memory, s.model_error, detector)
+        detector = ChangeDetector(len(joints), s.threshold, _DRIFT)
+        self._innovations = Innovations(rms, self._dt, _MEMORY, s.model_error, detector)
         walk = s.walk * np.sqrt(self._dt)
         # noise levels are estimated online, so the weights of the rows include them
         self._kalman = Kalman(np.ones(len(joints)), beta, C, walk, None, self._share)

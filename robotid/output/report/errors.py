@@ -6,10 +6,10 @@ from dataclasses import dataclass
 from html import escape
 from typing import Any, NamedTuple
 
-from robotid.base.findings import Finding, grouped, listed
+from robotid.base.findings import listed
 from robotid.diagnosis.verdict import evidence
 from robotid.diagnosis.verdict import position_verdict as positions
-from robotid.estimation.fitting.metrics import Metrics
+from robotid.estimation.fitting.evaluation import Metrics
 from robotid.identification.result import Identification
 from robotid.identification.summary import joint_reason, verdict_cell
 from robotid.output.pages.html import code, listing, percent, text
@@ -185,13 +185,12 @@ def _common(bars: Sequence[_Bar]) -> list[list[_Bar]]:
 
 
 def _reason_of(bars: Sequence[_Bar]) -> str:
-    """Return the common reason of joints, with the range of its numbers, and their names."""
-    reasons = [Finding("", "note", b.joint, joint_reason(b.joint, b.reasons)) for b in bars]
-    (cause,) = grouped(reasons, [bar.joint for bar in bars])
+    """Return the common reason of joints, with the numbers of the worst one, and their names."""
+    worst = joint_reason(bars[0].joint, bars[0].reasons)
     status, names = bars[0].status, escape(listed(bar.joint for bar in bars))
     return (
         f'<p class="common {status.replace(" ", "-")}"><strong>{status}</strong>: {names}: '
-        f"{escape('; '.join(cause.messages))}</p>\n"
+        f"{escape(worst)} (the worst)</p>\n"
     )
 
 

@@ -4,21 +4,23 @@ from __future__ import annotations
 
 import json
 import shlex
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from typing import TYPE_CHECKING, TypeAlias
 
 from robotid.base.findings import Cause, grouped, listed, toml_key
 from robotid.base.settings import is_number
-from robotid.diagnosis.residual.misfit_findings import setting_of, with_entries
+from robotid.diagnosis.catalogue import entries as catalogue_entries
+from robotid.diagnosis.catalogue import step_of
+from robotid.diagnosis.residual.misfit import setting_of, with_entries
 from robotid.diagnosis.verdict.evidence import GOOD, is_beaten
 from robotid.identification.result import Identification, TorqueIdentification
 from robotid.output.report.steps import MOST, NAMED, Origin, Step, exports_of, sentence_of
 from robotid.robot.drives import COUNTERBALANCE, DriveTerm, spring_family
 
 if TYPE_CHECKING:
-    from robotid.diagnosis.verdict.payload_check import PayloadCheck
+    from robotid.diagnosis.verdict.scale_check import PayloadCheck
 
 _NEW = "NEW.csv"
 _LOADED = "LOADED.csv"
@@ -32,23 +34,22 @@ def next_steps(found: Identification, origin: Origin) -> tuple[Step, ...]:
     """
     if not isinstance(found, TorqueIdentification):
         return _steps_of_motion(found, origin)
-    asked: dict[int, list[Cause]] = {}
+    asked: dict[str, list[Cause]] = {}
     findings = [finding for finding in found.findings if finding.severity != "note"]
     causes = (*grouped(findings, found.model.joints), *_of_verdict(found))
-    named = {
-        j for c in causes if c.severity != "note" and c.code in _NAMED_CAUSES for j in c.joints
-    }
+    named = {j for c in causes if c.severity != "note" and _names_cause(c) for j in c.joints}
     for cause in causes:
         if cause.code in _UNNAMED and named.intersection(cause.joints):
             # the named cause of these joints has a step of its own
             cause = replace(cause, joints=tuple(j for j in cause.joints if j not in named))
             if not cause.joints:
                 continue
-        number = _step_for(cause)
-        if cause.severity != "note" and number is not None:
-            asked.setdefault(number, []).append(cause)
-    urgent = sorted(asked, key=lambda k: (all(c.severity != "error" for c in asked[k]), k))
-    steps = [_STEPS[number][0](found, origin, asked[number]) for number in urgent]
+        step = _step_for(cause)
+        if cause.severity != "note" and step:
+            asked.setdefault(step, []).append(cause)
+    in_order = [name for name in _STEPS if name in asked]
+    urgent = sorted(in_order, key=lambda name: all(c.severity != "error" for c in asked[name]))
+    steps = [_STEPS[name](found, origin, asked[name]) for name in urgent]
     return _once([*steps, *_uses(found, origin, steps)][:MOST])
 
 
@@ -95,7 +96,7 @@ def _of_verdict(found: TorqueIdentification) -> list[Cause]:
     """Return the causes of a verdict that no finding names."""
     causes, predictions = [], found.predictions
     measured = [(j, m) for metrics in predictions.values() for j, m in metrics.per_joint.items()]
-    rescaled = {f.where.rpartition(": ")[2] for f in found.findings if f.code == "gain_change"}
+    rescaled = {joint for f in found.findings if f.code == "gain_change" for joint in f.joints}
     beaten = {joint for joint, m in measured if is_beaten(m)} - rescaled
     poor = {j for j, m in measured if m.relative_error_pct and m.relative_error_pct > GOOD}
     for code, joints in (("beaten", beaten), ("poor_prediction", poor)):
@@ -112,10 +113,16 @@ def _of_verdict(found: TorqueIdentification) -> list[Cause]:
     return causes
 
 
-def _step_for(cause: Cause) -> int | None:
-    """Return the number of the step that removes a cause; None if there is none."""
-    last = 0 if cause.severity == "error" else None  # doctor explains all other errors
-    return next((k for k, (_, codes) in enumerate(_STEPS) if cause.code in codes), last)
+def _step_for(cause: Cause) -> str:
+    """Return the name of the step that removes a cause; empty if there is none."""
+    last = "doctor" if cause.severity == "error" else ""  # doctor explains all other errors
+    return _OF_VERDICT.get(cause.code) or step_of(cause.code) or last
+
+
+def _names_cause(cause: Cause) -> bool:
+    """Whether a cause names why the error of its joints is large."""
+    names_cause = catalogue_entries().get(cause.code, {}).get("names_cause", False)
+    return names_cause or step_of(cause.code) in ("terms", "as_found")
 
 
 def _named(causes: Sequence[Cause], wanted: Sequence[str] = ()) -> str:
@@ -206,7 +213,7 @@ def _delay(found: TorqueIdentification, origin: Origin, causes: Sequence[Cause])
 def _locks(found: TorqueIdentification, origin: Origin, causes: Sequence[Cause]) -> Step:
     joints = list(found.model.locked)
     places = {
-        finding.where.rpartition(": ")[2]: f"{finding.evidence['median']:.4g}"
+        finding.joints[0]: f"{finding.evidence['median']:.4g}"
         for cause in causes
         for finding in cause.findings
         if "median" in finding.evidence
@@ -254,7 +261,7 @@ def _terms(found: TorqueIdentification, origin: Origin, causes: Sequence[Cause])
             own += [entry for entry in misfit.entries if entry not in own]
     lines = [with_entries(found, joint, own) for joint, own in entries.items()]
     blocks = [*couplings.values(), *(["\n".join(["[drives]", *lines])] if lines else [])]
-    what = listed(dict.fromkeys(_CAUSES[cause.code] for cause in causes))
+    what = listed(dict.fromkeys(catalogue_entries()[cause.code]["cause"] for cause in causes))
     words = f"Add the missing drive terms to the model of {_named(causes)}: {what}."
     if not blocks and any(m.term.name == "coulomb" and m.term.code in codes for m in found.misfits):
         return Step(
@@ -272,7 +279,7 @@ def _balanced(causes: Sequence[Cause]) -> list[tuple[str, float]]:
     """Return the joints with a counterbalance, and the rotation of each [rad]."""
     found = [finding for cause in causes for finding in cause.findings]
     return [
-        (finding.where.rpartition(": ")[2], finding.evidence["turned"])
+        (finding.joints[0], finding.evidence["turned"])
         for finding in found
         if finding.code == "counterbalance" and "turned" in finding.evidence
     ]
@@ -403,82 +410,17 @@ def _replay(found: Identification, origin: Origin) -> tuple[str, ...]:
     return origin.using("replay", str(found.model.tree.path), log, origin.folder)
 
 
-#: Drive terms that the model may lack, by the code of the finding.
-_CAUSES = {
-    "backlash": "backlash or windup",
-    "counterbalance": "a counterbalance",
-    "coupling": "a coupling to another joint",
-    "friction_shape": "another friction curve",
-    "load_friction": "load-dependent friction",
-    "position_periodic": "a torque that is periodic in the position",
-    "spring": "a spring",
-}
-#: Findings that name a cause but have no command: their messages state the remedy.
-_AS_FOUND = (
-    "angle_scale",
-    "active_bound",
-    "base_jump",
-    "base_orientation",
-    "base_unit",
-    "bunched_stamps",
-    "com_outside",
-    "constant_torque",
-    "contact_delay",
-    "dense_body",
-    "density",
-    "drift",
-    "ellipsoid",
-    "gain_change",
-    "gravity",
-    "gravity_compensated",
-    "gyration",
-    "repeated_torque",
-    "joint_axis",
-    "joint_order",
-    "joint_origin",
-    "joint_torque_delay",
-    "link_mass",
-    "lost_motion",
-    "mass_matrix",
-    "measured_wrench",
-    "moving_contact",
-    "payload",
-    "position_order",
-    "position_sign",
-    "rolling_contact",
-    "time_scale",
-    "torque_order",
-    "torque_sign",
-    "unlike_run",
-    "unlike_unit",
-    "unmounted_part",
-    "unsigned_torque",
-)
-#: Codes that name the cause of an error of a joint, and codes that state the error only.
-_NAMED_CAUSES = (*_CAUSES, *_AS_FOUND, "clipped", "payload_change", "position_offset")
+#: The steps, the most informative first, by the name that the catalogue of findings gives them.
+_STEPS: Mapping[str, _Maker] = {
+    "doctor": _doctor, "scale": _scale, "gains": _gains, "delay": _delay, "locks": _locks,
+    "zeros": _zeros, "payload": _payload, "unclipped": _unclipped, "terms": _terms,
+    "as_found": _as_found, "validate": _validate, "possible": _possible, "watch": _watch,
+    "pin": _pin, "richer": _richer, "inspect": _inspect,
+}  # fmt: skip
+#: Those of causes of a verdict that no finding names.
+_OF_VERDICT = {
+    "scale_unchecked": "scale", "not_validated": "validate", "impossible": "possible",
+    "poor_prediction": "watch", "beaten": "pin",
+}  # fmt: skip
+#: Codes that state the error of a joint only, not its cause.
 _UNNAMED = ("poor_prediction", "unexplained_torque", "constraint_costs")
-#: The steps, the most informative first, each with the codes that it removes.
-_STEPS: Sequence[tuple[_Maker, tuple[str, ...]]] = (
-    (_doctor, ()),
-    (_scale, ("total_mass", "urdf_mismatch", "scale_unchecked")),
-    (_gains, ("current_for_torque", "torque_scale")),
-    (_delay, ("torque_delay",)),
-    (_locks, ("locked_at_zero", "locked_position")),
-    (_zeros, ("position_offset",)),
-    (_payload, ("payload_change",)),
-    (_unclipped, ("clipped",)),
-    (_terms, tuple(_CAUSES)),
-    (_as_found, _AS_FOUND),
-    (_validate, ("not_validated", "repeated_motion", "validation_was_fitted")),
-    (_possible, ("impossible",)),
-    (_watch, (*_UNNAMED, "outliers", "spikes")),
-    (_pin, ("beaten",)),
-    (_richer, ("undetermined", "excitation", "weak_parameters", "no_motion")),
-    (
-        _inspect,
-        (
-            "copied_inertial", "default_inertial", "missing_inertial", "negative_mass",
-            "not_positive_definite", "zero_mass",
-        ),
-    ),
-)  # fmt: skip

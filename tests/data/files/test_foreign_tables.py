@@ -165,27 +165,6 @@ def test_logs_are_given_one_or_several_of_every_kind(ur5, tmp_path, rng):
             read_logs(wrong, ur5.joints)
 
 
-def test_identify_takes_paths_and_frames_and_finds_what_it_finds_in_logs(ur5, tmp_path, rng):
-    first, second = (
-        exact_log(ur5, truth(ur5), rng, samples=200, rate=50.0, noise=0.1) for _ in range(2)
-    )
-    write_log(first, tmp_path / "first.csv")
-    settings = robotid.EstimatorSettings("wls")
-    one = robotid.identify(ur5, [first], validation=[second], estimator=settings)
-    other = robotid.identify(
-        ur5.tree.path, tmp_path / "first.csv", validation=frame_of(second), estimator=settings
-    )
-    np.testing.assert_array_equal(one.standard, other.standard)
-    assert one.verdict.to_dict()["status"] == other.verdict.to_dict()["status"]
-    assert [f.code for f in robotid.doctor(ur5, tmp_path / "first.csv")] == [
-        f.code for f in robotid.doctor(ur5, [first])
-    ]
-    with pytest.raises(DataError, match="no log was given; at least one is needed"):
-        robotid.identify(ur5, [])
-    with pytest.raises(ModelError, match="model is a NoneType, wanted a RobotModel or the path"):
-        robotid.identify(None, first)
-
-
 def test_swapped_arguments_are_named(ur5, rng, tmp_path):
     log = exact_log(ur5, truth(ur5), rng, samples=100)
     urdf = example_urdf("ur5_robot.urdf")

@@ -1,7 +1,6 @@
 """Findings on the pose of a floating base: jumps, and the order of its quaternion."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pinocchio as pin
@@ -11,20 +10,13 @@ from helpers.humans import FEET, human_urdf, logged, walk
 from robotid.data.base_motion import BaseMotion, base_state, in_base, quaternions_of_angles
 from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
-from robotid.data.signals import process
-from robotid.diagnosis.logs import base_pose
 from robotid.diagnosis.logs.base_pose import (
-    _check_readings,
-    _check_vertical,
-    _Feet,
-    _names,
-    _vertical,
     check_pose,
     check_twist,
     check_unit,
 )
 from robotid.diagnosis.logs.contacts import check_base
-from robotid.robot.constraints import Contact, frame_id, link_positions
+from robotid.robot.constraints import Contact
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 
@@ -78,21 +70,6 @@ def test_another_order_of_the_quaternion_is_named(robot, log, change, words):
     assert found.evidence["best"] < 0.1  # [m/s], noise of the markers
 
 
-def test_gravity_is_stated_along_the_one_axis_that_may_be_the_vertical():
-    G = np.array([0.0, 0.0, -3.7])
-    for up, said in (
-        ([0.9, 0.1, -0.3], "[-3.7, 0, 0]"), ([0.2, -0.8, 0.1], "[0, 3.7, 0]"),
-        ([-0.1, 0.0, 0.4], "[0, 0, -3.7]"), ([0.02, 0.05, 0.29], None), ([0.7, 0.6, 0.0], None),
-    ):  # fmt: skip
-        assert _vertical(np.array(up), G) == (said and f"gravity = {said}")
-    turn = np.array([[0.1, 0.9, 0.0], [0.2, 0.1, -0.8], [0.7, -0.1, 0.3]])
-    assert _names(turn) == ["y", "-z", "x"]
-    lying = np.array([0.18, -0.72, 0.24])  # its length is 0.78
-    (found,) = _check_vertical(SimpleNamespace(name="run.csv"), lying, G)
-    assert "above them along -y of the world" in found.message
-    assert found.evidence == {"height": pytest.approx(4 / 13), "best": pytest.approx(12 / 13)}
-
-
 @pytest.mark.parametrize(("axis", "down"), [("y", -9.81), ("-y", 9.81)])
 def test_another_vertical_axis_of_the_world_is_named(robot, log, axis, down):
     turn = pin.Quaternion(pin.rpy.rpyToMatrix(np.sign(down) * np.pi / 2, 0.0, 0.0))  # z becomes it
@@ -111,20 +88,6 @@ def test_another_vertical_axis_of_the_world_is_named(robot, log, axis, down):
         gravity=(0.0, down, 0.0),
     )  # fmt: skip
     assert not list(check_base(stated, other, SLOW))
-
-
-def test_the_pose_of_another_link_is_that_of_the_root_first(robot, log):
-    data, head = robot.pin_model.createData(), frame_id(robot.pin_model, "Head")
-    poses = []
-    for q in robot.configurations(np.hstack([log.base.pose, log.q])):
-        pin.framesForwardKinematics(robot.pin_model, data, q)
-        leans = data.oMf[head].act(pin.SE3(pin.exp3(np.array([0.0, 0.0, 1.5])), np.zeros(3)))
-        poses.append(pin.SE3ToXYZQUAT(leans))
-    straight = [pin.SE3ToXYZQUAT(pin.XYZQUATToSE3(x) * UNTURNED) for x in poses]
-    stated = replace(log, base=BaseMotion(np.array(straight), link="Head"))
-    assert not list(check_base(robot, stated, SLOW))
-    other = replace(log, base=BaseMotion(np.array(poses), link="Head"))  # turned about its axis
-    assert [x.code for x in check_base(robot, other, SLOW)] == ["base_orientation"]
 
 
 def test_a_base_that_rolls_over_has_no_wrong_axes(robot, log):
@@ -185,149 +148,9 @@ def test_an_impact_is_no_jump(log):
     assert found.code == "base_jump"
 
 
-def test_a_turn_of_the_tag_is_found_and_one_in_a_gap_is_not(log):
-    half = np.array([0.0, 0.0, np.sin(0.1), np.cos(0.1)])  # 0.2 rad about z
-
-    def turned(q):
-        x, y, z, w = q.T
-        a, b = half[2], half[3]
-        later = np.column_stack([b * x - a * y, b * y + a * x, b * z + a * w, b * w - a * z])
-        return np.where(np.arange(len(q))[:, None] < 150, q, later)
-
-    jumped = with_quaternion(log, turned)
-    (found,) = check_pose(jumped)
-    assert found.evidence["size"] == pytest.approx(0.2, abs=0.02)
-    assert " rad: " in found.message
-    apart = np.where(np.arange(len(log.t)) < 150, log.t, log.t + 5.0)
-    assert not list(check_pose(replace(jumped, t=apart)))
-    after = log.base.pose.copy()
-    after[150, 0] += 0.05
-    after[151:, 0] -= 0.1  # the step after a gap has no step before it
-    assert list(check_pose(replace(log, base=BaseMotion(after))))
-    assert not list(check_pose(replace(log, t=apart, base=BaseMotion(after))))
-
-
 Y_UP = pin.rpy.rpyToMatrix(-np.pi / 2, 0.0, 0.0)  # z becomes y
 QUARTER = pin.rpy.rpyToMatrix(0.0, 0.0, np.pi / 2)
 MIRROR = np.eye(3)[[0, 2, 1]]  # y and z exchanged: left-handed
-
-
-@pytest.mark.parametrize(
-    ("place", "turn", "words"),
-    [
-        (Y_UP, lambda R: R, ["replace base_x, base_y, base_z by base_x, -base_z, base_y"]),
-        (np.diag([1.0, -1.0, 1.0]), lambda R: R, ["by base_x, -base_y, base_z"]),
-        (np.eye(3), lambda R: R @ QUARTER.T,
-         ["base in the log are -y, x, z of its link: add a link with these axes"]),
-        (Y_UP, lambda R: Y_UP @ R @ Y_UP.T,
-         ["are x, z, -y of its link", "state gravity = [0, -9.81, 0]"]),
-        (MIRROR, lambda R: MIRROR @ R @ MIRROR,
-         ["are x, z, y of its link, left-handed", "state gravity = [0, -9.81, 0]"]),
-    ],
-)  # fmt: skip
-def test_axes_of_another_tool_are_named(robot, log, place, turn, words):
-    pose = log.base.pose.copy()
-    pose[:, :3] = pose[:, :3] @ place.T
-    pose[:, 3:] = [pin.Quaternion(turn(pin.Quaternion(x).matrix())).coeffs() for x in pose[:, 3:]]
-    (found,) = check_base(robot, replace(log, base=BaseMotion(pose)), SLOW)
-    assert (found.code, found.severity) == ("base_orientation", "error")
-    assert all(text in found.message for text in words)
-    assert ("gravity" in found.message) == (len(words) == 2)
-    assert found.evidence["best"] < 0.1 < 2.0 * found.evidence["speed"]
-
-
-def test_contacts_need_not_be_known_to_name_another_order(robot, log):
-    unknown = replace(log, contacts={})  # not found either: the log has no torque
-    assert not list(check_base(robot, unknown, SLOW))
-    (found,) = check_base(robot, with_quaternion(unknown, lambda q: np.roll(q, 1, axis=1)), SLOW)
-    assert "its order is qw qx qy qz: state" in found.message
-
-
-def test_without_a_place_speeds_of_feet_are_relative_and_one_foot_has_none(rng):
-    x, dx = rng.standard_normal((2, 4, 3, 3))
-    R, dR = rng.standard_normal((2, 4, 3, 3))
-    v = [[dR[i] @ x[i, k] + R[i] @ dx[i, k] for k in range(3)] for i in range(4)]
-    pairs = [[np.linalg.norm(y[j] - y[k]) for j, k in ((0, 1), (0, 2), (1, 2))] for y in v]
-    one = np.eye(3)
-    found = _Feet(np.arange(4.0), 1, x, dx, None).speed((R, dR), one, one)
-    assert found == pytest.approx(np.mean(np.min(pairs, axis=1)))
-    assert _Feet(np.arange(4.0), 1, x[:, :1], dx[:, :1], None).speed((R, dR), one, one) == 0.0
-
-
-def test_the_speed_of_feet_is_the_mean_of_the_slower_one(robot, log):
-    """With the inverse quaternion, by finite differences of the places of the feet."""
-    wrong = with_quaternion(log, lambda q: q * [-1.0, -1.0, -1.0, 1.0])
-    (found,) = check_base(robot, wrong, SLOW)
-    speeds = []
-    for own in (wrong, log):
-        motion = process(own, replace(SLOW, velocity="differentiated"))
-        feet = link_positions(robot.pin_model, robot.configurations(motion.q), FEET)
-        v = np.linalg.norm(np.gradient(feet, motion.t, axis=0), axis=2)
-        speeds.append(v.min(axis=1).mean())
-    assert [found.evidence[x] for x in ("speed", "best")] == pytest.approx(speeds, rel=0.02)
-    low, high = sorted(f"{x:.2g} m/s" for x in speeds)
-    assert f"move at {high} (mean) below the base, else at {low} below it" in found.message
-
-
-def test_of_readings_that_are_almost_as_slow_the_one_with_fewer_changes_is_named(
-    robot, log, monkeypatch
-):
-    as_logged = []
-
-    def speed(feet, pose, body, world):
-        as_logged.append(pose[0])  # the first one is asked first
-        if (pose[0] == as_logged[0]).all():
-            return 0.2
-        return 0.020 if (body == np.eye(3)).all() and (world == np.eye(3)).all() else 0.019
-
-    another = {"inverse": log.base.pose[:1, 3:] * [-1.0, -1.0, -1.0, 1.0]}
-    monkeypatch.setattr(
-        base_pose,
-        "orientation_readings",
-        lambda q: {words: np.tile(one, (len(q), 1)) for words, one in another.items()},
-    )
-    monkeypatch.setattr(base_pose._Feet, "speed", speed)
-    monkeypatch.setattr(base_pose._Feet, "upwards", lambda feet, R: np.array([0.0, 0.0, 1.0]))
-    (found,) = (x for x in check_base(robot, log, SLOW) if x.code == "base_orientation")
-    assert found.evidence["best"] == 0.020
-    assert found.message.endswith("below it: inverse")
-
-
-@pytest.mark.parametrize(
-    ("logged", "inverse", "both", "wanted"),
-    [
-        (4.9e-3, 1e-3, 1.0, None),  # feet that hardly move are not examined
-        (5.1e-3, 1e-3, 1.0, "inverse"),
-        (0.1, 0.0649, 1.0, "inverse"),  # 0.65 of the speed as logged
-        (0.1, 0.0651, 1.0, None),
-        (0.1, 0.05, 0.0416, "inverse"),  # (0.05 + 0.001) 1.2 = (0.0415 + 0.001) 1.2^2
-        (0.1, 0.05, 0.0414, "inverse; the axes x, y, z of the base"),
-    ],
-)
-def test_a_pose_is_another_one_if_its_feet_are_slower(
-    robot, monkeypatch, logged, inverse, both, wanted
-):
-    """Of the axes of the base, one other order is as slow as stated; ``both``: with the inverse."""
-    order = np.eye(3)[[1, 0, 2]]
-
-    def speed(pose, body, world):
-        if pose[0, 0, 0] == 1.0:
-            return logged if (body == np.eye(3)).all() else 1.0
-        if (world != np.eye(3)).any():
-            return 1.0
-        return {True: inverse}.get((body == np.eye(3)).all(), both if (body == order).all() else 1)
-
-    monkeypatch.setattr(base_pose, "orientation_readings", lambda q: {"inverse": 2.0 * q})
-    feet = SimpleNamespace(
-        turned=lambda q: q[:, 0, None, None] * np.eye(3), speed=speed, dp=0.0,
-        upwards=lambda R: np.array([0.0, 0.0, 1.0]),
-    )  # fmt: skip
-    found = list(_check_readings(robot, SimpleNamespace(name="log"), feet, np.ones((5, 4))))
-    assert len(found) == (wanted is not None)
-    for finding in found:
-        best = inverse if wanted == "inverse" else both
-        assert finding.evidence == pytest.approx({"speed": logged, "best": best})
-        assert f"below it: {wanted}" in finding.message
 
 
 def test_inverted_flags_are_no_error_of_the_pose(robot, log):

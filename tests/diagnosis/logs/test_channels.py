@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,8 +9,7 @@ import pytest
 from robotid.cli.job import LogEntry, read_job
 from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
-from robotid.diagnosis.logs.channels import _noise, _velocity_scale, check_channels
-from robotid.diagnosis.logs.torque_channels import check_torque_channels
+from robotid.diagnosis.logs.channels import check_channels, check_torque_channels
 
 RATE, N = 500.0, 20000  # [Hz], rows of 40 s
 JOB = Path(__file__).parents[2] / "jobs" / "ur10e.toml"
@@ -135,31 +133,3 @@ def test_the_delay_of_a_velocity_is_as_sure_as_joints_agree():
     off = np.array([0.03, 0.033]) - found.evidence["delay"]
     expected = 1.48 * np.median(np.abs(off)) / np.sqrt(2)
     assert found.evidence["std_error"] == pytest.approx(expected, rel=0.05)
-
-
-def test_the_scale_of_a_velocity_is_the_ratio_of_sizes_with_noise_in_both(rng):
-    """Between the two regressions of which each takes the other's noise for a smaller factor."""
-    slope = rng.standard_normal((4000, 2))
-    v = slope * [2.0, 1.0] + [1.0, 0.3] * rng.standard_normal((4000, 2)) + 5.0
-    log = SimpleNamespace(name="run", joints=("one", "two"), q=slope, has_torque=True)
-    alike = np.diag(np.corrcoef(slope.T, v.T)[:2, 2:])
-    assert (alike > 0.8).all()
-    (found,) = _velocity_scale(log, slope, v, alike, "measured")
-    assert found.where == "run: one"
-    ratio = v[:, 0].std() / slope[:, 0].std()
-    assert f"dq_one is {ratio:.3g} times d(q)/dt of q_one" in found.message
-    assert ratio == pytest.approx(np.sqrt(5.0), rel=0.05)
-
-
-def test_the_noise_of_each_torque_is_compared_with_its_own_signal(rng):
-    tau = rng.standard_normal((300, 3)) * [2.0, 7.0, 0.5]
-    noise = np.array([0.31, 0.29, 0.6]) * tau.std(axis=0)
-    log = SimpleNamespace(name="run.csv", joints=tuple("abc"))
-    every, *noisy = _noise(log, "tau", tau, noise)
-    assert every.evidence == pytest.approx(dict(zip("abc", noise, strict=True)))
-    assert f"of tau: {', '.join(f'{x:.2g}' for x in noise)} (" in every.message
-    assert [f.where for f in noisy] == ["run.csv: a", "run.csv: c"]
-    assert [f.evidence["share"] for f in noisy] == pytest.approx([0.31, 0.6])
-    assert [f.message.split(" % of the torque signal of ")[0] for f in noisy] == [
-        "run.csv: noise is 31", "run.csv: noise is 60"
-    ]  # fmt: skip

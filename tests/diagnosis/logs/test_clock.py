@@ -1,12 +1,11 @@
 """Figures of a log's clock, of its rows and of its rests, against logs made of them."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
+from helpers.findings import Figures
 
 from robotid.data.log import Log, Trajectory
-from robotid.diagnosis.logs.clock import check_clock, check_rest
+from robotid.diagnosis.logs.channels import check_clock, check_rest
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 
@@ -36,12 +35,12 @@ def test_rate_and_jitter_are_those_of_the_steps():
     t = stamps()
     found = said(check_clock(log_of(t)))
     assert set(found) == {"rate", "jitter"}
-    assert found["rate"].evidence == {
+    assert Figures(found["rate"]) == {
         "rate": pytest.approx(100.0), "samples": 901, "duration": pytest.approx(9.0)
     }  # fmt: skip
     assert found["rate"].message.startswith("run.csv: 901 rows in 9 s, median rate 100 Hz")
     spread = np.sqrt(2.0 / 3.0) * 0.2
-    assert found["jitter"].evidence == {
+    assert Figures(found["jitter"]) == {
         "relative_spread": pytest.approx(spread),
         "shortest": pytest.approx(0.008),
         "longest": pytest.approx(0.012),
@@ -57,7 +56,7 @@ def test_gaps_are_counted_and_the_longest_has_its_time():
     assert gap.severity == "warning"
     # before it, 300 steps of which one is a gap of 40 ms in place of 8
     at = START + 300 * 0.01 + 0.032
-    assert gap.evidence == {"gaps": 3, "longest": pytest.approx(0.5), "at": pytest.approx(at)}
+    assert Figures(gap) == {"gaps": 3, "longest": pytest.approx(0.5), "at": pytest.approx(at)}
     assert gap.message.startswith("run.csv: 3 gaps, the longest of 0.5 s at t = 6.032 s")
     # a gap has no part in the jitter
     assert found["jitter"].evidence["longest"] == pytest.approx(0.012)
@@ -88,21 +87,13 @@ def test_rows_that_are_stamped_on_arrival_are_named_with_their_remedy():
     found = said(check_clock(log_of(bunched())))["bunched_stamps"]
     assert found.severity == "warning"
     late = 5 * len(range(1, 150, 4))  # steps of 0.1 ms, in every fourth six
-    assert found.evidence == {
+    assert Figures(found) == {
         "rows": late, "share": pytest.approx(late / 899), "longest": pytest.approx(0.0595)
     }  # fmt: skip
     assert "the mean step is 10 ms, the typical one 10 ms, so no rows" in found.message
     assert 'so no rows are missing: state stamp = "even" in [log]' in found.message
     missing = said(check_clock(log_of(bunched(lost=90))))["bunched_stamps"]
     assert missing.message.endswith("are wrong; log the time of recording")
-
-
-def test_rows_that_were_recorded_together_have_no_finding():
-    t = bunched()
-    log = log_of(t)
-    q = np.column_stack([np.sin(2.0 * t), 0.5 * np.cos(1.5 * t)])  # as the stamps say
-    assert "bunched_stamps" not in said(check_clock(replace(log, q=q)))
-    assert "bunched_stamps" not in said(check_clock(replace(log, q=0.0 * q)))
 
 
 def test_rows_that_repeat_the_one_before_are_counted_where_the_robot_moves():
@@ -114,20 +105,9 @@ def test_rows_that_repeat_the_one_before_are_counted_where_the_robot_moves():
 
     found = stale(79)
     assert found.severity == "warning"
-    assert found.evidence == {"rows": 4, "share": pytest.approx(4 / 79), "longest_run": 3}
+    assert Figures(found) == {"rows": 4, "share": pytest.approx(4 / 79), "longest_run": 3}
     assert ": 4 rows (5.1 %) repeat" in found.message
     assert stale(80).severity == "note"  # a twentieth is not more than a twentieth
-
-
-def test_the_longest_run_of_repeated_rows_is_one_in_motion():
-    log, rows = log_of(START + 0.01 * np.arange(79)), np.arange(79)
-    rows[5:15], rows[61:64] = 4, 60  # at rest before and after it, and in motion
-    held = {name: getattr(log, name)[rows].copy() for name in ("q", "v", "tau")}
-    for at in (slice(0, 5), slice(15, 20)):
-        held["q"][at] = held["q"][5]
-    held["tau"][[*range(5), *range(15, 20)]] += np.arange(10.0)[:, None]
-    found = said(check_clock(Log(log.t, joints=log.joints, **held)))["stale_rows"]
-    assert (found.evidence["rows"], found.evidence["longest_run"]) == (3, 3)
 
 
 def test_a_position_that_is_held_between_steps_is_not_stale():
@@ -168,7 +148,7 @@ def test_rests_at_the_ends_are_those_of_all_joints(slider):
     log, motion = moved(slider, (300, 400, 0.3), (200, 650, -0.5))
     (rest,) = check_rest(log, motion, slider.layout)
     assert rest.code == "standstill"
-    assert rest.evidence == {"before": pytest.approx(2.0), "after": pytest.approx(3.5)}
+    assert Figures(rest) == {"before": pytest.approx(2.0), "after": pytest.approx(3.5)}
     assert "the first 2 s and the last 3.5 s" in rest.message
     assert "start = 5 and end = 9.5" in rest.message
     assert list(check_rest(*moved(slider, (50, 950, 0.1), (80, 920, 0.5)), slider.layout)) == []
@@ -189,11 +169,11 @@ def test_joints_that_hardly_move_are_named_with_their_range_and_share(slider):
     assert "moving 30 % of the time" in hardly.message
     # far, but in a twelfth of the time; and not at all
     found = said(check_rest(*moved(slider, (0, -2, 0.0), (400, 479, 1.0)), slider.layout))
-    assert found["hardly_moves"].evidence == {
+    assert Figures(found["hardly_moves"]) == {
         "range": pytest.approx(0.8), "moving_share": pytest.approx(80 / 1001)
     }  # fmt: skip
     still = found["static_joint"]
     assert (still.where, still.severity) == ("run.csv: torso_lift_joint", "warning")
-    assert still.evidence == {"range": 0.0, "moving_share": 0.0}
+    assert Figures(still) == {"range": 0.0, "moving_share": 0.0}
     assert "torso_lift_joint at rest (range 0 m): this log" in still.message
     assert "arm_1_joint (range 0.8 rad, moving 8 % of" in found["hardly_moves"].message

@@ -19,7 +19,6 @@ from helpers.driven import arm
 from helpers.synthetic import exact_log, perfect, truth
 
 from robotid.base.exceptions import SettingsError
-from robotid.base.findings import Finding
 from robotid.cli import main
 from robotid.cli.job import Job, LogEntry, read_job
 from robotid.cli.logs import examine
@@ -27,7 +26,7 @@ from robotid.data.files.formats import write_columns
 from robotid.data.files.read import write_log
 from robotid.data.signal_settings import SignalSettings
 from robotid.diagnosis.logs.check_logs import check_logs, diagnose, findings_to_dict
-from robotid.diagnosis.verdict.verdict import blocking, check_ignored
+from robotid.diagnosis.verdict.verdict import check_ignored
 from robotid.dynamics.simulation.motions import random_fourier
 from robotid.dynamics.simulation.simulation_settings import Sensors
 from robotid.dynamics.simulation.truth import another_robot
@@ -112,12 +111,6 @@ def test_each_corruption_is_found_by_its_own_code(name, spoilt):
     assert set(case.codes) & loud(findings)  # a note is not read
     assert loud(findings) - set(case.codes) <= BESIDES.get(name, set())
     json.dumps(findings_to_dict(findings), allow_nan=False)
-
-
-def test_a_coarse_velocity_that_is_not_used_is_a_note(spoilt):
-    job, _ = spoilt("velocity of a 12-bit encoder")
-    job = replace(job, signals=replace(job.signals, velocity="differentiated"))
-    assert "quantised" not in loud(examine(job))
 
 
 def test_where_names_the_joint_and_the_evidence_says_how_much(spoilt):
@@ -264,8 +257,7 @@ def test_what_makes_a_result_wrong_leads_its_verdict_unless_it_is_ignored(
 ):
     job = tmp_path / "job.toml"
     job.write_text(
-        f'urdf = "{URDF}"\n[estimator]\ndraws = 0\n[output]\nreport = false\n'
-        f'[[identification]]\nlog = "{wrong_sign}"\n'
+        f'urdf = "{URDF}"\n[output]\nreport = false\n[[identification]]\nlog = "{wrong_sign}"\n'
     )
     words = ["identify", str(job), "--out", str(tmp_path / "out"), "--json"]
     assert main(words) == 1
@@ -286,13 +278,6 @@ def test_an_unknown_code_to_ignore_is_wrong_use(wrong_sign, tmp_path, capsys):
     assert "Did you mean 'torque_sign'?" in capsys.readouterr().err
     with pytest.raises(SettingsError, match=r"has the code 'x', which is unknown or changes"):
         check_ignored(["x"])
-
-
-def test_only_errors_alarm_and_only_those_that_are_not_ignored():
-    gap = Finding("gap", "warning", "a.csv", "a gap")
-    sign = Finding("torque_sign", "error", "a.csv", "opposite sign")
-    assert blocking([gap, sign], []) == (sign,)
-    assert blocking([gap, sign], ["torque_sign"]) == ()
 
 
 def test_findings_change_no_data(ur5, short):

@@ -1,14 +1,11 @@
 """Findings on an IMU: turned axes, units, gravity; and feet that slip."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.paths import JOBS
 
-from robotid.cli.job import read_job
 from robotid.data.base_motion import (
     BaseMotion,
     ImuFrame,
@@ -18,17 +15,10 @@ from robotid.data.base_motion import (
     quaternions_of_angles,
 )
 from robotid.data.log import Log
-from robotid.data.signal_settings import BaseSource, SignalSettings
+from robotid.data.signal_settings import SignalSettings
 from robotid.diagnosis.logs.contacts import check_base
-from robotid.diagnosis.logs.imu import (
-    _check_axes,
-    _check_gravity,
-    _check_orientation,
-    _named,
-    _turn,
-)
 from robotid.dynamics.constraint_rows import constraint_jacobian
-from robotid.robot.constraints import Contact, link_positions
+from robotid.robot.constraints import link_positions
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 
@@ -126,19 +116,6 @@ def test_the_axes_of_a_turned_imu_are_named(robot, sway):
     assert found.evidence["off"] > 0.5
 
 
-def test_gravity_that_was_subtracted_is_named(robot, sway):
-    def subtracted(values, share=1.0):
-        up = in_base(sway.base.pose[:, 3:], -G) @ TURN
-        return np.hstack([values[:, :3], values[:, 3:] - share * up])
-
-    (found,) = check_base(robot, measured(sway, subtracted), RAW)
-    assert found.code == "imu_gravity"
-    assert "gravity was subtracted" in found.message
-    assert found.evidence["size"] < 0.5
-    (found,) = check_base(robot, measured(sway, lambda x: subtracted(x, 0.6)), RAW)
-    assert "gravity was subtracted" in found.message  # what is left is below half of it
-
-
 def test_axes_of_imu_and_orientation_that_are_turned_alike_are_found_by_the_legs(robot, sway):
     turn = pin.rpy.rpyToMatrix(0.0, 0.0, np.pi / 2)  # orientation and values agree
     log = without_position(sway, turn)
@@ -148,83 +125,6 @@ def test_axes_of_imu_and_orientation_that_are_turned_alike_are_found_by_the_legs
     (found,) = [x for x in check_base(robot, log, RAW) if x.code.startswith("imu")]
     assert found.code == "imu_axes"
     assert "does not agree with that from the links in contact" in found.message
-
-
-def test_the_imu_of_a_standing_humanoid(recordings, monkeypatch):
-    monkeypatch.setenv("ROBOTID_DATA", str(recordings))
-    job = read_job(JOBS / "legged" / "icub.toml")
-    names = {"w": "gyro", "a": "acc"}
-    own = {f"imu_{k}{x}": f"imu_{name}_{x}" for k, name in names.items() for x in "xyz"}
-    for link, codes in (("root_link_imu_frame", []), ("root_link", ["imu_gravity"])):
-        other = replace(job, columns={**job.columns, **own}, base=BaseSource(imu=link))
-        model = other.model()
-        log = other.read(other.identification[0], model)
-        assert "bias of the gyroscopes, estimated in" in log.notes[-1]
-        found = check_base(model, log, job.signals)
-        assert [x.code for x in found if x.severity != "note"] == codes
-
-
-@pytest.mark.parametrize("has_position", [True, False])
-def test_a_foot_that_slips_for_a_while_is_named(robot, sway, has_position):
-    q, foot = sway.q.copy(), "HL_FOOT"
-    joints = [robot.joints.index(f"HL_{name}") for name in ("HAA", "HFE", "KFE")]
-    slip = 0.05 * np.clip((sway.t - 1.0) / 0.2, 0.0, 1.0)  # [rad] over 0.2 s
-    q[:, joints[0]] += 2.0 * slip
-    log = replace(sway, q=q)
-    found = list(check_base(robot, log if has_position else without_position(log), RAW))
-    (own,) = [x for x in found if foot in x.message]
-    assert [own.code, own.severity] == ["slipping_foot", "note"]
-    assert own.evidence["share"] == pytest.approx(0.05, abs=0.02)
-    assert own.evidence["distance"] == pytest.approx(0.025, rel=0.3)
-    assert all(x is own for x in found)
-
-
-def test_an_error_of_the_position_is_no_slip(robot, sway):
-    pose = sway.base.pose.copy()
-    pose[:, 0] += 0.04 * np.clip((sway.t - 1.0) / 0.1, 0.0, 1.0)  # [m] of all feet within 0.1 s
-    log = replace(sway, base=replace(sway.base, pose=pose))
-    assert not list(check_base(robot, log, RAW))
-
-
-@pytest.mark.parametrize("slips", [True, False])
-def test_of_two_feet_one_slips_at_its_whole_speed(robot, sway, slips):
-    """Relative to the median of both feet its speed is halved, then below 0.1 m/s."""
-    feet = ("HL_FOOT", "FR_FOOT")
-    two = replace(robot, constraints=tuple(Contact(foot) for foot in feet))
-    q, joint = sway.q.copy(), robot.joints.index("HL_HAA")
-    q[:, joint] += 0.1 * np.clip((sway.t - 1.0) / 0.2, 0.0, 1.0) * slips  # 0.5 rad/s over 0.2 s
-    log = replace(sway, q=q, contacts={foot: sway.contacts[foot] for foot in feet})
-    places = link_positions(
-        robot.pin_model, robot.configurations(np.hstack([log.base.pose, q])), feet[:1]
-    )[:, 0]
-    speed = np.linalg.norm(np.gradient(places, log.t, axis=0), axis=1)
-    found = list(check_base(two, log, RAW))
-    assert [x.code for x in found] == ["slipping_foot"] * slips
-    if slips:
-        assert 0.1 < speed.max() < 0.2
-        assert feet[0] in found[0].message
-        rms = np.sqrt(np.mean(speed[speed > 0.1] ** 2))
-        assert found[0].evidence["speed"] == pytest.approx(rms, rel=0.1)
-
-
-def test_what_other_axes_leave_is_stated_as_a_share_of_the_motion(robot, sway):
-    rng = np.random.default_rng(0)
-    noise = 0.15 * np.std(sway.base.imu.values[:, :3]) * rng.standard_normal((len(sway.t), 3))
-
-    def changed(x):
-        return np.hstack([x[:, [1, 0, 2]] * [1, -1, 1] + noise, x[:, 3:]])
-
-    found = next(x for x in check_base(robot, measured(sway, changed), RAW) if x.code == "imu_axes")
-    right, wrong = sway.base.imu.values[:, :3], measured(sway, changed).base.imu.values[:, :3]
-
-    def rms(x):
-        return np.sqrt(np.mean(np.sum(x**2, axis=1)))
-
-    off, best = rms(wrong - right) / rms(right), rms(noise) / rms(right)
-    assert found.evidence["off"] == pytest.approx(off, rel=0.03)
-    assert found.evidence["best"] == pytest.approx(best, rel=0.1)
-    shown = f"{found.evidence['off']:.0%} of the motion, {found.evidence['best']:.0%} at best"
-    assert shown in found.message
 
 
 def test_the_mean_specific_force_in_the_world_is_stated_for_a_robot_that_drives_a_curve():
@@ -253,48 +153,6 @@ def test_the_mean_specific_force_in_the_world_is_stated_for_a_robot_that_drives_
     assert not list(check_base(free, log.window(4.0, 5.9), RAW))  # too short for a mean
 
 
-@pytest.mark.parametrize(
-    ("angle", "size", "cause"),
-    [
-        (7.0, 9.81, None),
-        (9.0, 9.81, "are not those of the link"),
-        (7.0, 13.0, "its scale is wrong"),
-        (9.0, 13.0, "are not those of the link"),
-        (173.0, 9.81, "its sign is reversed"),
-        (171.0, 9.81, "are not those of the link"),
-    ],
-)
-def test_a_specific_force_is_wrong_beyond_8_degrees_from_the_vertical(angle, size, cause):
-    force = size * pin.exp3(np.radians(angle) * np.array([0.6, -0.8, 0.0])) @ -G / 9.81
-    still, upright = np.zeros((3, 6)), np.tile([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0], (3, 1))
-    motion = SimpleNamespace(q=upright, v=still, a=still + np.append(force + G, np.zeros(3)))
-    found = list(_check_gravity(SimpleNamespace(name="log"), FRAME, motion))
-    assert len(found) == (cause is not None)
-    for finding in found:
-        assert cause in finding.message
-        assert finding.evidence["angle"] == pytest.approx(angle)
-
-
-def test_the_turn_is_the_rotation_that_explains_the_motion():
-    rng = np.random.default_rng(3)
-    R, w, D = pin.rpy.rpyToMatrix(0.5, -0.3, 0.9), *rng.normal(size=(2, 200, 3))
-    D = rng.normal(size=(200, 2, 3))
-    d = -np.einsum("kij,jl,kl->ki", D, R, w)
-    np.testing.assert_allclose(_turn(w, D, d), R, atol=2e-3)
-    # a matrix with a small reversed axis: the nearest rotation, not the nearest reflection
-    P = R @ np.diag([1.0, 1.0, -0.3])
-    np.testing.assert_allclose(_turn(w, D, -np.einsum("kij,jl,kl->ki", D, P, w)), R, atol=2e-3)
-    about_z = w * [0.0, 0.0, 1.0]  # what does not move is not turned
-    np.testing.assert_allclose(
-        _turn(about_z, np.tile(np.eye(3), (200, 1, 1)), -about_z), np.eye(3), atol=1e-9
-    )
-    tilt = pin.exp3(np.radians(50.0) * np.array([0.6, 0.0, 0.8]))
-    Q = pin.rpy.rpyToMatrix(0.1, 1.0, -2.0)
-    assert _named(tilt, Q) == "its axes are turned by 50 deg relative to those of the stated link"
-    cycle = np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # x is y, y -z, z -x
-    assert _named(Q @ cycle @ Q.T, Q) == "its axes x, y, z are y, -z, -x of the stated link"
-
-
 @pytest.mark.parametrize("has_contacts", [True, False])
 @pytest.mark.parametrize(
     ("change", "words"),
@@ -314,43 +172,3 @@ def test_another_quaternion_is_named_without_a_position(robot, sway, change, wor
     assert [(x.code, x.severity) for x in found] == [("base_orientation", "error")]
     assert words in found[0].message
     assert found[0].evidence["best"] < 0.02 * found[0].evidence["speed"]
-
-
-@pytest.mark.parametrize(("left", "is_found"), [(0.28, True), (0.32, False)])
-def test_another_quaternion_explains_gyroscopes_but_for_a_third_of_the_motion(left, is_found):
-    """Of 0.25 rad/s; the pose of the log is that of the world in the base, 7 s after the start."""
-    t = 7.0 + 0.02 * np.arange(200)
-    angles = 0.12 * np.column_stack([np.sin(1.6 * t), np.sin(2.3 * t), np.sin(1.1 * t)])
-    right = np.hstack([np.zeros((200, 3)), quaternions_of_angles(angles)])
-    own, w = (base_state(t, right * [1, 1, 1, s, s, s, 1], None, None)[1][:, 3:] for s in (-1, 1))
-    size = np.sqrt(np.mean(np.sum(own**2, axis=1)))
-    assert 0.2 < size < 0.35
-    w = w + left * size / np.sqrt(3)
-    v = np.hstack([np.zeros((200, 3)), w])
-    motion = SimpleNamespace(t=t, q=right * [1, 1, 1, -1, -1, -1, 1], v=v)
-    found = list(_check_orientation(SimpleNamespace(name="log"), motion, own))
-    assert len(found) == is_found
-    for finding in found:
-        off = np.sqrt(np.mean(np.sum((w - own) ** 2, axis=1)))
-        assert finding.evidence == pytest.approx({"speed": off, "best": left * size})
-        assert f"differs by {off:.2g} rad/s (RMS)" in finding.message
-        assert "it is the orientation of the world in the base" in finding.message
-
-
-@pytest.mark.parametrize(("source", "is_error"), [("from the orientation", True), ("x", False)])
-def test_an_angular_velocity_that_nothing_explains_is_an_error_only_by_the_orientation(
-    source, is_error
-):
-    """Feet in contact may slip; the noise is broadband and has no axes."""
-    w, own = np.random.default_rng(0).standard_normal((2, 300, 3)) * [[[0.5]], [[0.8]]]
-    D = np.tile(np.eye(3), (300, 1, 1))
-    log = SimpleNamespace(name="log")
-    found = list(_check_axes(log, FRAME, w, D, -own, source))
-    assert len(found) == is_error
-    for finding in found:
-        size, off = (np.sqrt(np.mean(np.sum(x**2, axis=1))) for x in (own, w - own))
-        assert finding.evidence["off"] == pytest.approx(off / size)
-        assert 0.5 < finding.evidence["best"] / finding.evidence["off"] < 1.0
-        assert "neither other axes nor degrees explain it. Check the columns" in finding.message
-    slow = 0.09 / np.sqrt(np.mean(np.sum(w**2, axis=1)))  # below 0.1 rad/s
-    assert not list(_check_axes(log, FRAME, slow * w, D, -own, source))

@@ -6,14 +6,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from helpers.corruptions import clean_log, robot
-from scipy.optimize import nnls
 
 from robotid.data.signal_settings import SignalSettings
-from robotid.diagnosis.logs import hypotheses
-from robotid.diagnosis.logs import loads as loads_module
 from robotid.diagnosis.logs.check_logs import diagnose
-from robotid.diagnosis.logs.hypotheses import explanations, own_share
-from robotid.diagnosis.logs.loads import LoadModel, _payload, load_model
+from robotid.diagnosis.logs.hypotheses import explanations
+from robotid.diagnosis.logs.loads import load_model
 from robotid.diagnosis.logs.torque_sample import smooth_motion, take_probe
 from robotid.dynamics.torque import joint_torque_regressor
 from robotid.robot.examples import example_urdf
@@ -122,193 +119,9 @@ def test_a_balanced_joint_may_follow_its_position_either_way_and_no_other(ur5, u
     np.testing.assert_array_equal(drives[:, :, 3:5], [[[1.0, -1.0]]] * np.ones((*c.shape, 1)))
 
 
-def test_exchanged_columns_keep_each_torque_s_own_share(ur5, ur5_log):
-    probe = take_probe(ur5, smooth_motion(ur5, ur5_log, SIGNALS))
-    order = [0, 4, 2, 3, 1, 5]
-    moved = probe.with_motion(tuple(x[:, order] for x in (probe.q, probe.v, probe.a)))
-    positions, columns = hypotheses._exchanged(probe, (1, 4))
-    np.testing.assert_allclose(positions.share, own_share(moved), rtol=1e-9)
-    # of a torque column, that of the joint whose position it has
-    whole = own_share(replace(moved, tau=probe.tau[:, order]))
-    np.testing.assert_allclose(columns.share, whole[order], rtol=1e-9)
-    assert abs(columns.share[1] - columns.share[4]) > 1e-3
-
-
-@pytest.mark.parametrize(("sign", "word"), [(1.0, "more"), (-1.0, "less")])
-def test_a_load_is_a_warning_if_it_surely_weighs_a_twelfth_of_the_arm_more_or_less(sign, word):
-    model, error = robot("ur5"), 0.1
-    masses = model.standard_parameters()[: model.layout.n_inertial : 10]
-    heavy = 0.08 * masses.sum() + 2 * error
-    found = {}
-    for mass in (2.9 * error, 3.1 * error, heavy - 0.01, heavy + 0.01):
-        load = sign * np.array([mass, 0.01, 0.02, 0.03])
-        found[mass] = list(_payload(SimpleNamespace(model=model), load, error, "run.csv"))
-    none, *others = found.values()
-    assert none == []
-    assert [f.severity for (f,) in others] == ["note", "note", "warning"]
-    (last,) = others[-1]
-    assert f"roughly {heavy + 0.01:.2g} kg {word} than in the URDF, if" in last.message
-    assert list(last.evidence.values()) == pytest.approx([*load[:1], error, *load[1:]])
-
-
-def test_shares_under_another_gravity_are_those_of_each_joint_by_itself(ur5, ur5_log):
-    probe = take_probe(ur5, smooth_motion(ur5, ur5_log, SIGNALS), samples=120)
-    shares, least = hypotheses._shares_by_gravity(probe)
-    for g in (np.array([0.0, 3.0, -9.0]), np.array([5.0, 0.0, 1.0]), probe.gravity):
-        np.testing.assert_allclose(shares(g), own_share(probe, g), rtol=1e-6, atol=1e-9)
-        assert (least <= shares(g) + 1e-9).all()
-
-
-def test_a_gravity_that_cannot_be_reported_is_not_searched_for(ur5, ur5_log):
-    probe = take_probe(ur5, smooth_motion(ur5, ur5_log, SIGNALS))
-    columns = np.concatenate([probe.loads(), probe.drives], axis=2).swapaxes(0, 1)
-    exact = columns.sum(axis=2).T  # every factor is 1, the gravity is the stated one
-    noise = np.random.default_rng(0).normal(size=exact.shape)
-    probe = replace(probe, tau=exact + 0.02 * exact.std(axis=0) * noise)
-    stated = hypotheses.Explanation("stated", own_share(probe))
-    found = hypotheses._gravity(probe, stated)
-    assert found.values == tuple(probe.gravity)
-    assert found.misfit == stated.misfit
-    tilted = probe.of(ur5.with_gravity(np.array([4.0, 0.0, -9.0])))  # not that of the torques
-    stated = hypotheses.Explanation("stated", own_share(tilted))
-    found = hypotheses._gravity(tilted, stated)
-    assert found.misfit < stated.misfit - hypotheses.HINT
-    assert np.degrees(np.arctan2(np.hypot(*found.values[:2]), -found.values[2])) < 5.0
-
-
-def test_a_share_with_any_load_is_that_of_factors_of_either_sign_for_its_moments(ur5, ur5_log):
-    probe = take_probe(ur5, smooth_motion(ur5, ur5_log, SIGNALS), samples=120)
-    last = np.array([-0.4, 0.3, 0.2])  # of first moments, beside 2 kg
-    extra = probe.last_body @ np.array([2.0, *last])
-    probe = replace(probe, tau=probe.tau + extra)
-    found, plain = own_share(probe, any_load=True), own_share(probe)
-    for j in range(6):
-        body = probe.last_body[:, j]
-        X = np.hstack([probe.loads()[:, j], body, -body[:, 1:], probe.drives[:, j]])
-        size = np.linalg.norm(X, axis=0)
-        left = nnls(X / np.where(size > 0, size, 1.0), probe.tau[:, j])[1] ** 2
-        wanted = left / np.sum((probe.tau[:, j] - probe.tau[:, j].mean()) ** 2)
-        assert found[j] == pytest.approx(wanted, rel=1e-5, abs=1e-9)
-    assert plain[1] > 1.5 * found[1]
-
-
-def test_what_a_load_model_expects_is_of_the_torques_that_it_uses(ur5, ur5_log):
-    """Of 4 s there are 12 instants; one torque is not explained, one never changes."""
-    motion = smooth_motion(ur5, ur5_log.window(1.0, 5.6), SIGNALS)
-    probe = take_probe(ur5, motion, samples=80)
-    probe.tau[:, 4] = 3.0
-    share = np.array([0.02, 0.3, 0.1, 0.04, 0.01, 0.06])
-    model = load_model(probe, share)
-    instants = 3.0 * np.ptp(motion.t[probe.rows])
-    assert instants < 15.0
-    used = [0, 2, 3, 5]
-    wanted = instants * np.sum(share[used] / (0.05**2 + share[used]))
-    assert model.expected == pytest.approx(wanted)
-    assert model.independent == pytest.approx(4 * instants)
-    assert model.R.any(axis=(1, 2)).tolist() == [j in used for j in range(6)]
-
-
-def test_joints_with_a_third_of_the_largest_gravity_are_lifting(rng):
-    """By mean size, whatever the sign, and whatever the inertial torques and the links are."""
-    means = np.array([-8.0, 3.1, 10.0, 2.9, 5.0])  # [N m], [N]
-    gravity = means * rng.choice([0.5, 1.5], (3, 1)) * np.array([[1], [-1], [1.0]])
-    gravity[:] *= np.abs(means) / np.abs(gravity).mean(axis=0)
-    inertial, parts = rng.normal(size=(3, 5, 2)), np.array([1.5, -0.5])
-
-    def loads(at=None):
-        return inertial + (gravity[..., None] * parts if at is None else 0.0)
-
-    joints = SimpleNamespace(joints=tuple("abcde"), layout=SimpleNamespace(prismatic={"c"}))
-    assert loads_module._lifting(SimpleNamespace(model=joints, loads=loads)) == [0, 4, 1]
-
-
-def test_what_a_counterbalance_cancels_is_its_share_of_gravity(ur5, ur5_log):
-    probe = take_probe(ur5, smooth_motion(ur5, ur5_log, SIGNALS), samples=150)
-    rest = probe.loads() - probe.loads(np.zeros(3))
-    for j, (cosine, sine) in ((1, (21.0, -4.0)), (2, (3.0, 7.0))):
-        own = cosine * np.cos(probe.q[:, j]) + sine * np.sin(probe.q[:, j])
-        theta = np.array([1.2, 0.9, 1.1, 1.0, 0.8, 1.3, 0.5, 0.1, -0.2, 0.3])
-        tau = np.hstack([probe.loads()[:, j], probe.last_body[:, j]]) @ theta
-        tau = tau + own + probe.drives[:, j, :4] @ [2.0, 5.0, 3.0, -1.0]
-        both = probe.tau.copy()
-        both[:, j] = tau
-        gravity = rest[:, j].sum(axis=1)
-        gravity = gravity - gravity.mean()
-        wanted = -(gravity @ own) / (gravity @ gravity)
-        found = loads_module._cancelled(replace(probe, tau=both), j, theta)
-        assert found == pytest.approx(wanted, rel=1e-6)
-
-
-def test_scales_of_torques_are_reported_together_if_alike_else_joint_by_joint():
-    probe = SimpleNamespace(model=SimpleNamespace(joints=tuple("abcd")))
-    scale = np.array([12.0, 1.0, 18.0, 15.0])
-    (together,) = loads_module._scaled(probe, scale, np.array([0, 2, 3]), "run.csv")
-    factor = (12 * 18 * 15) ** (1 / 3)
-    assert together.evidence == pytest.approx({"factor": factor, "joints": 3.0})
-    assert (together.where, together.severity) == ("run.csv: a, c, d", "warning")
-    scale[2] = 20.0
-    apart = list(loads_module._scaled(probe, scale, np.array([0, 2, 3]), "run.csv"))
-    assert [(f.where, f.evidence) for f in apart] == [
-        ("run.csv: a", {"factor": 12.0}), ("run.csv: c", {"factor": 20.0}),
-        ("run.csv: d", {"factor": 15.0}),
-    ]  # fmt: skip
-    for unit, severity in ((29.0, "warning"), (31.0, "error")):
-        (every,) = loads_module._scaled(probe, np.full(4, unit), np.arange(4), "run.csv")
-        assert (every.where, every.severity) == ("run.csv", severity)
-
-
-@pytest.mark.parametrize(
-    ("decades", "used"),
-    [
-        ([0.0, 0.0, 0.0], [1, 1, 1]),  # as logged
-        ([-1.3, -1.3, -1.3], [1, 1, 1]),  # one gain of all
-        ([0.0, -0.8, 0.0], [1, 1, 1]),
-        ([0.5, 0.0, 2.1], [1, 1, 1]),
-        ([0.0, 0.0, -0.6], [1, 0, 1]),  # a torque that is ignored has no scale
-    ],
-)
-def test_the_scales_of_torques_are_those_that_they_were_divided_by(rng, decades, used):
-    """Two links of 1.1 and 0.9 times their masses, torques accurate to a thousandth."""
-    theta, R = np.array([1.1, 0.9, 0.3, 0.0, 0.1, 0.0]), np.zeros((3, 7, 7))
-    for j in np.flatnonzero(used):
-        X = rng.standard_normal((40, 6)) * [5, 3, 1, 1, 1, 1]
-        tau = X @ theta + 1e-3 * rng.standard_normal(40)
-        R[j] = np.linalg.qr(np.column_stack([X, tau / 10.0 ** decades[j]]), mode="r")
-        R[j] /= 0.01 * tau.std() / 10.0 ** decades[j]
-    model = LoadModel(R, np.array([1, 1, 0, 0, 0, 0.0]), np.array([0.3] * 2 + [20, 10, 10, 10]),
-                      0.0, 120.0)  # fmt: skip
-    found = loads_module._torque_scales(model)
-    np.testing.assert_allclose(np.log10(found), decades, atol=1e-9)
-
-
 @dataclass(frozen=True)
 class _Probe:
     gravity: np.ndarray
     model: SimpleNamespace
     motion: SimpleNamespace
     balanced: tuple[int, ...] = ()
-
-
-@pytest.mark.parametrize(("scaled", "is_found"), [(17.1, True), (16.9, False)])
-def test_a_counterbalance_explains_more_than_another_scale(monkeypatch, scaled, is_found):
-    """By five units of the misfit, which is 12 with it."""
-    given = {
-        "own_share": lambda probe, any_load: np.array([0.01 if probe.balanced else 0.9]),
-        "load_model": lambda *_: SimpleNamespace(fit=lambda ones: (12.0, "theta", None)),
-        "_is_this_robot": lambda *_: True,
-        "_lifting": lambda _: [1],
-        "_cancelled": lambda probe, j, theta: 0.37,
-        "_scaled_fit": lambda _: scaled,
-        "_lighter": lambda whole, chi: None,
-    }
-    for name, own in given.items():
-        monkeypatch.setattr(loads_module, name, own)
-    motion = SimpleNamespace(q=np.array([[0.0, -0.5], [4.0, 1.0]]))
-    probe = _Probe(np.array([0.0, 0.0, -9.81]), SimpleNamespace(joints=("a", "b")), motion)
-    other, found = loads_module.counterbalance(probe, "run.csv")
-    assert other.balanced == (1,) * is_found
-    assert len(found) == is_found
-    for finding in found:
-        assert (finding.code, finding.where) == ("counterbalance", "run.csv: b")
-        assert finding.evidence == {"cancelled_pct": pytest.approx(37.0), "turned": 1.5}
-        assert "cancels 37 % of its gravity torque" in finding.message

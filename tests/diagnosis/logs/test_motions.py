@@ -10,7 +10,6 @@ from helpers.synthetic import exact_log, truth
 from robotid.data.log import Trajectory
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import process
-from robotid.diagnosis.logs import motion_checks as motions_module
 from robotid.diagnosis.logs.motion_checks import check_excitation, check_repeated_motion
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.torque import joint_torque_regressor
@@ -105,27 +104,3 @@ def test_the_excitation_by_a_joint_at_rest_is_checked_too(planar, motions):
     assert found.evidence["rank"] < b
     assert found.severity == "warning"
     assert found.message.startswith("one: the motion determines 7 of 11 base parameters")
-
-
-def test_of_long_motions_every_nth_row_counts_for_n_in_what_is_independent(
-    planar, motions, monkeypatch
-):
-    """A fourth of the rows, of which a tenth is independent behind the filter."""
-    monkeypatch.setattr(motions_module, "_ROWS", 250)
-    mapping, two = structural_mapping(planar), [replace(m, rate=100.0) for m in motions[1:]]
-    signals = SignalSettings(cutoff=5.0, trim=0.0, min_velocity=0.0)
-    (found,) = check_excitation(planar, mapping, two, signals, "x")
-    thin = [m.every(4) for m in two]
-    Y = np.concatenate([joint_torque_regressor(planar, m.q, m.v, m.a) for m in thin])
-    W = Y[:, mapping.independent].reshape(-1, 2, len(mapping.K))
-    tau, sigma = np.concatenate([m.tau for m in thin]), np.ones(2)
-    assert len(tau) == 250 + 150
-    for _ in range(30):
-        rows = (W / sigma[:, None]).reshape(-1, W.shape[2])
-        beta = np.linalg.lstsq(rows, (tau / sigma).ravel(), rcond=None)[0]
-        sigma = np.sqrt(np.mean((tau - W @ beta) ** 2, axis=0))
-    rows = np.sqrt(4 * 0.1) * (W / sigma[:, None]).reshape(-1, W.shape[2])
-    spread = prior_spread(planar, sum(m.squares for m in thin), sum(len(m.t) for m in thin))
-    size = np.sqrt(mapping.K**2 @ spread**2)
-    weakest = 1 / np.sqrt(1 + np.linalg.svd(rows * size, compute_uv=False)[-1] ** 2)
-    assert found.evidence["weakest"] == pytest.approx(weakest, rel=0.02)

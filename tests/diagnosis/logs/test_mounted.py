@@ -1,7 +1,6 @@
 """Parts of the URDF that were not mounted, loads that only the validation log has."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,17 +8,11 @@ from helpers.corruptions import NOISE, clean_log, robot
 from helpers.synthetic import perfect
 
 from robotid.data.signal_settings import SignalSettings
-from robotid.diagnosis.logs import mounted
 from robotid.diagnosis.logs.check_logs import diagnose
-from robotid.diagnosis.logs.mounted import Segments, check_payload_change
-from robotid.diagnosis.logs.torque_sample import smooth_motion
-from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.simulation.motions import random_fourier
 from robotid.dynamics.simulation.simulation_settings import Sensors
 from robotid.dynamics.simulation.truth import another_robot
 from robotid.robot.bodies import link_places
-from robotid.robot.drives import FAMILIES
-from robotid.robot.prior import payload_spread
 
 CODES = {"unmounted_part", "payload_change", "payload"}
 
@@ -93,21 +86,6 @@ def arm_and_log():
     return model, *(clean_log(model, seed, pi=pi, rate=50.0, duration=10.0) for seed in (0, 1))
 
 
-def test_joints_with_friction_of_their_own_are_examined_like_others(arm_and_log):
-    model, fitted, other = arm_and_log
-    own = model.with_terms({joint: FAMILIES["load"].make({}) for joint in model.joints})
-    found = [diagnose(m, [fitted], [other], SignalSettings()) for m in (model, own)]
-    assert found[0] == found[1]
-
-
-def test_each_validation_log_is_compared_with_the_fitted_ones(arm_and_log):
-    model, fitted, other = arm_and_log
-    late = replace(other, path="late", tau=np.roll(other.tau, 5, axis=0))
-    alone = [diagnose(model, [fitted], [log], SignalSettings()) for log in (other, late)]
-    both = diagnose(model, [fitted], [other, late], SignalSettings())
-    assert set(map(str, both)) == {str(finding) for found in alone for finding in found}
-
-
 def test_a_load_is_named_beside_a_urdf_of_another_robot(arm_and_log):
     """Links that weigh half or twice what the URDF says are no reason to miss a load."""
     model, *_ = arm_and_log
@@ -124,96 +102,3 @@ def test_a_load_is_named_beside_a_urdf_of_another_robot(arm_and_log):
     mass, error = change.evidence["mass"], change.evidence["std_error"]
     assert mass == pytest.approx(1.0, abs=4 * error)
     assert error < 0.05
-
-
-def test_segments_are_of_all_motions(ur5):
-    motions = [
-        smooth_motion(ur5, clean_log(ur5, seed, duration=duration), SignalSettings())
-        for seed, duration in ((0, 7.0), (1, 12.0))
-    ]
-    segments = Segments(ur5, structural_mapping(ur5), motions, 0.0)
-    assert segments.seconds == pytest.approx(sum(m.t[-1] - m.t[0] for m in motions))
-    alone = [replace(segments, motions=[motion]).reductions for motion in motions]
-    assert len(segments.reductions) == len(alone[0]) + len(alone[1])
-    # of 0.4 s, at most 24
-    assert [len(parts) for parts in alone] == [int(np.ptp(motions[0].t) / 0.4), 24]
-    rows = [sum(part.samples for part in parts) for parts in (segments.reductions, *alone)]
-    assert rows[0] == rows[1] + rows[2]
-    squares = sum(part.squares for part in segments.reductions)
-    np.testing.assert_allclose(squares, sum(motion.squares for motion in motions), rtol=1e-9)
-
-
-def test_rows_of_both_logs_are_independent_by_the_band_of_the_filter(ur5, monkeypatch):
-    class Asked(Exception):
-        pass
-
-    def asked(first, second, *args, share, **others):
-        rows = sum(part.samples for part in (*first, *second))
-        raise Asked(share * rows)
-
-    monkeypatch.setattr("robotid.diagnosis.logs.mounted.payload_runs", asked)
-    signals = SignalSettings(cutoff=3.0)
-    fitted, kept = (
-        Segments(
-            ur5,
-            structural_mapping(ur5),
-            [smooth_motion(ur5, clean_log(ur5, seed, duration=duration), signals)],
-            0.0,
-        )
-        for seed, duration in ((0, 3.0), (1, 5.0))
-    )
-    with pytest.raises(Asked) as found:
-        list(check_payload_change(fitted, kept, signals, "kept"))
-    seconds = sum(float(np.ptp(run.motions[0].t)) for run in (fitted, kept))
-    assert found.value.args[0] == pytest.approx(2 * 3.0 * seconds)
-
-
-@pytest.mark.parametrize(
-    ("share", "error", "found"),
-    [(0.0099, 1e-9, False), (0.0101, 1e-9, True), (-0.0101, 1e-9, True), (0.0101, 0.0021, False),
-     (0.0101, 0.002, True), (1.01, 1e-3, False)],
-)  # fmt: skip
-def test_a_change_of_load_is_significant_and_from_a_hundredth_of_the_arms_mass_to_all_of_it(
-    ur5, monkeypatch, share, error, found
-):
-    """Five standard errors with many degrees of freedom; scales leave more than the load."""
-    size = payload_spread(ur5)[0]
-    theta, covariance = np.ones(12), np.eye(12)
-    theta[-10], covariance[-10, -10] = share * size, (error * size) ** 2
-    compared = SimpleNamespace(theta=theta, covariance=covariance, freedom=np.full(12, 1e9))
-    runs = SimpleNamespace(
-        D=np.ones((3, 15)), alike=lambda: (np.full(12, size), 1e-9 * covariance),
-        compare=lambda by_joint: compared, residual_ratios=lambda x: np.array([1.2, 1.4]),
-        residual_ratios_by_scales=lambda count: np.array([1.0 + 0.1 * count, 1.42]),
-    )  # fmt: skip
-    monkeypatch.setattr(mounted, "payload_runs", lambda *_, **__: runs)
-    part = SimpleNamespace(squares=np.ones((3, 6)), samples=10)
-    mapping = structural_mapping(ur5)
-    run = SimpleNamespace(model=ur5, mapping=mapping, reductions=(part,), seconds=1.0)
-    findings = list(check_payload_change(run, run, SignalSettings(), "kept"))
-    assert len(findings) == found
-    for finding in findings:
-        assert finding.evidence == pytest.approx({"mass": share * size, "std_error": error * size})
-        word = "more" if share > 0 else "less"
-        assert f" kg {word} than in the fitted logs" in finding.message
-
-
-def test_a_part_is_a_link_with_all_that_it_carries(monkeypatch):
-    """An adapter without mass carries a hand with a finger; a camera is beside it."""
-    masses = {"flange": 9.0, "adapter": 0.0, "hand": 1.0, "finger": 0.2, "camera": 0.3}
-    places = [
-        SimpleNamespace(link=x, body=2, role="fixed", parameters=m * np.arange(1.0, 11.0))
-        for x, m in masses.items()
-    ]
-    places[0].role = "moved"
-    places.append(SimpleNamespace(**{**vars(places[2]), "link": "elbow", "body": 1}))
-    monkeypatch.setattr(mounted, "link_places", lambda model: places)
-    parents = ("elbow", "flange"), ("flange", "adapter"), ("adapter", "hand"), ("hand", "finger")
-    joints = [SimpleNamespace(parent=x, child=y) for x, y in (*parents, ("flange", "camera"))]
-    model = SimpleNamespace(
-        layout=SimpleNamespace(bodies=tuple("abc")), tree=SimpleNamespace(joints=joints)
-    )
-    found = list(mounted._parts(SimpleNamespace(model=model)))
-    assert [links for links, _ in found] == [["hand", "finger"], ["finger"], ["camera"]]
-    for (_, parameters), mass in zip(found, (1.2, 0.2, 0.3), strict=True):
-        np.testing.assert_allclose(parameters, mass * np.arange(1.0, 11.0))

@@ -1,5 +1,4 @@
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pinocchio as pin
@@ -7,9 +6,8 @@ import pytest
 from helpers.corruptions import clean_log
 
 from robotid.data.signal_settings import SignalSettings
-from robotid.diagnosis.logs import torque_sample as sample
 from robotid.diagnosis.logs.hypotheses import compensated, own_share
-from robotid.diagnosis.logs.torque_sample import _inner, coupled_columns, smooth_motion, take_probe
+from robotid.diagnosis.logs.torque_sample import coupled_columns, smooth_motion, take_probe
 from robotid.dynamics.torque import joint_torque_regressor
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
@@ -65,36 +63,3 @@ def test_the_sign_of_a_slow_joint_turns_within_a_twentieth_of_its_own_speed(prob
     found = replace(probe, v=v).drives
     np.testing.assert_allclose(found[:, :, 2], np.tanh(v / still), rtol=1e-12)
     np.testing.assert_array_equal(found[:, :, 1], v)
-
-
-def test_rows_near_either_end_of_a_segment_are_not_used(rng):
-    t = np.concatenate([np.arange(60), 100 + np.arange(45), 200 + np.arange(20)]) / 100.0
-    segment = np.repeat([3, 5, 6], [60, 45, 20])
-    motion = SimpleNamespace(t=t, segment=segment)
-    wanted = [
-        min(x - t[segment == s].min(), t[segment == s].max() - x) >= 0.15 - 1e-12
-        for x, s in zip(t, segment, strict=True)
-    ]
-    found = _inner(motion)
-    edge = np.isclose([min(x - t[segment == s].min(), t[segment == s].max() - x)
-                       for x, s in zip(t, segment, strict=True)], 0.15)  # fmt: skip
-    np.testing.assert_array_equal(found[~edge], np.array(wanted)[~edge])
-    assert not found[segment == 6].any()
-    assert found[segment == 3].sum() >= 28
-
-
-def test_a_probe_has_fifty_rows_or_more_in_which_a_joint_moves(monkeypatch):
-    """By its own speed: the second joint moves at more than a tenth of the first one's."""
-    monkeypatch.setattr(sample, "_probe_at", lambda model, motion, rows: rows)
-    model = SimpleNamespace(
-        layout=SimpleNamespace(drive_speeds=np.array([1.0, 0.1, 9.0])), joints=("a", "b")
-    )
-    for moving in (50, 49):
-        v = np.tile([0.019, 0.0019], (120, 1))
-        v[30 : 30 + moving : 2, 0], v[31 : 30 + moving : 2, 1] = 0.021, -0.0021
-        motion = SimpleNamespace(t=np.arange(120) / 100.0, segment=np.zeros(120), v=v)
-        found = take_probe(model, motion, samples=7)
-        if moving < 50:
-            assert found is None
-        else:
-            np.testing.assert_array_equal(found, [30, 38, 46, 54, 62, 70, 79])

@@ -2,29 +2,24 @@
 
 import sys
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.fitting import identify
 from helpers.misfits import EFFECTS, log_with
 from helpers.paths import ROOT
-from helpers.robots import motion, possible_parameters
 
 from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
-from robotid.diagnosis.residual import discrepancies
-from robotid.diagnosis.residual.discrepancies import _alterations, explain_residual
+from robotid.diagnosis.residual.discrepancies import explain_residual
 from robotid.diagnosis.residual.misfit import find_misfits
-from robotid.diagnosis.residual.term_trials import Trials, along, take_sample
+from robotid.diagnosis.residual.term_trials import take_sample
 from robotid.dynamics.base_parameters import structural_mapping
-from robotid.dynamics.prediction import inverse_dynamics
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
 from robotid.estimation.fitting.recorded import Recordings
 from robotid.estimation.fitting.survey import hold_log
 from robotid.identification.pipeline import with_drives
-from robotid.robot.drives import AUTO, wanted_families
+from robotid.robot.drives import wanted_families
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 
@@ -43,7 +38,7 @@ def four(model):
     return RobotModel.from_urdf(model.tree, joints=model.joints[:4])
 
 
-SETTINGS = EstimatorSettings(prior_weight=1.0, draws=0)
+SETTINGS = EstimatorSettings(prior_weight=1.0)
 
 
 def fitted(model, logs, estimator=SETTINGS):
@@ -153,15 +148,6 @@ def named(findings):
     return [(finding.code, finding.where) for finding in findings]
 
 
-def test_a_zero_that_is_off_makes_no_spring_of_another_joint():
-    joints = [f"panda_joint{i}" for i in range(1, 8)]
-    panda = RobotModel.from_urdf(example_urdf("panda.urdf"), joints=joints)
-    alone, misfits, others = both(panda, panda, 2, 1, 0.15)
-    assert [(m.joint, m.term.code, m.matters) for m in alone] == [("panda_joint3", "spring", True)]
-    assert misfits == ()
-    assert named(others) == [("position_offset", "panda_joint2")]
-
-
 @pytest.mark.parametrize(
     ("offset", "size", "rate"), [(0.1, 1.0, 50.0), (0.03, 3.0, 100.0)]
 )  # what explains more
@@ -172,29 +158,6 @@ def test_a_spring_is_named_beside_a_zero_that_is_off(model, offset, size, rate):
     assert spring.size == pytest.approx(alone[0].size, rel=0.01)
     assert named(others) == [("position_offset", "elbow_joint")]
     assert others[0].evidence["size"] == pytest.approx(-offset, rel=0.04)
-
-
-def test_what_is_found_is_said_of_the_result_and_doubts_it(model):
-    logs = recorded(model, model, 3, 2, 0.1, effect="spring", rate=50.0)
-    result = identify(model, logs[:1], validation=logs[1:], estimator=SETTINGS, friction=AUTO)
-    said = [(f.code, f.where) for f in result.findings if f.severity == "warning"]
-    assert {("spring", "elbow_joint"), ("position_offset", "elbow_joint")} <= set(said)
-    assert [(m.joint, m.term.code) for m in result.misfits] == [("elbow_joint", "spring")]
-    assert {"spring", "position_offset"} <= {doubt.code for doubt in result.warnings}
-
-
-def test_columns_beside_the_base_parameters_are_refitted_with_them(four, rng):
-    found = fitted(four, [log_with(four, 3, "spring", part=part, duration=12.0) for part in (0, 1)])
-    sample = take_sample(found)
-    Z = rng.standard_normal((*sample.r.shape, 2)) + sample.r[..., None]
-    together, _ = Trials(sample, Z).whole.estimate([0, 1], sample.fitted)
-    beside = sample.with_columns(Z[..., :1])
-    alone, _ = Trials(beside, Z[..., 1:]).whole.estimate([0], sample.fitted)
-    assert alone[0] == pytest.approx(together[1], rel=2e-3)
-    tau = np.concatenate([m.tau for m in sample.at])
-    there = along(beside, found.model, sample.at, tau)
-    np.testing.assert_allclose(there.W, beside.W, atol=1e-9 * np.abs(beside.W).max())
-    assert not there.r.any()
 
 
 def test_a_base_that_is_not_level_makes_no_counterbalance(model):
@@ -226,15 +189,6 @@ def test_a_joint_that_lies_elsewhere_is_named(model, tmp_path):
     assert first.evidence["size"] == pytest.approx(0.05, rel=0.25)
 
 
-def test_a_base_that_is_not_level_is_named(four):
-    turn = pin.exp3(np.array([0.15, 0.0, 0.0]))
-    first = found(four, lambda log: log, turn=turn)[0]
-    assert (first.code, first.where) == ("gravity", "all joints")
-    assert first.evidence["size"] == pytest.approx(np.tan(0.15), rel=0.03)
-    stated = [float(x) for x in first.message.split("gravity = [")[1].split("]")[0].split(",")]
-    np.testing.assert_allclose(stated, turn @ [0.0, 0.0, -9.81], atol=0.15)
-
-
 def test_a_small_share_of_the_residual_is_named_if_recordings_kept_apart_show_it(model):
     def change(log):
         rng = np.random.default_rng(int(log.name[3]))
@@ -245,196 +199,3 @@ def test_a_small_share_of_the_residual_is_named_if_recordings_kept_apart_show_it
     assert (first.code, first.where) == ("time_scale", "all joints")
     assert 3 < first.evidence["share_pct"] < 10
     assert first.evidence["size"] == pytest.approx(0.21, rel=0.25)
-
-
-def test_what_may_be_otherwise_changes_torques_as_differences_do(four, rng):
-    pi = possible_parameters(four, rng)  # armatures and friction, too
-    at = [motion(four, rng, count) for count in (7, 4)]
-    direction = [SimpleNamespace(direction=np.ones(11)) for _ in four.joints]
-    sample = SimpleNamespace(at=at, motions=direction, torque=np.ones(4))
-    n, step = len(four.joints), 1e-6
-
-    def slope(scale, shift):
-        def torques(x):
-            f = 1 + x * scale
-            changed = [replace(m, q=f * m.q + x * shift, v=f * m.v, a=f * m.a) for m in at]
-            return np.concatenate([inverse_dynamics(four, pi, m) for m in changed])
-
-        return (torques(step) - torques(-step)) / (2 * step)
-
-    own = {(x.code, x.where): x.Z[..., 0] for x in _alterations(four, pi, sample)}
-    for j, joint in enumerate(four.joints):
-        only = np.eye(n)[j]
-        for code, wanted in (
-            ("angle_scale", slope(only, 0.0)),
-            ("position_offset", slope(0.0, only)),
-            ("torque_scale", only * np.concatenate([inverse_dynamics(four, pi, m) for m in at])),
-        ):
-            np.testing.assert_allclose(own[code, joint], wanted, rtol=1e-4, atol=1e-3)
-    every = slope(np.ones(n), 0.0)
-    np.testing.assert_allclose(own["angle_scale", ""], every, rtol=1e-4, atol=1e-3)
-    bodies = np.where(np.arange(len(pi)) < four.layout.n_inertial, pi, 0.0)
-
-    def on_clock(f):  # torques of the bodies if the time stamps run f times as fast
-        faster = [replace(m, v=f * m.v, a=f**2 * m.a) for m in at]
-        return np.concatenate([inverse_dynamics(four, bodies, m) for m in faster])
-
-    np.testing.assert_allclose(own["time_scale", ""], on_clock(np.sqrt(2.0)) - on_clock(1.0),
-                               atol=1e-9)  # fmt: skip
-
-
-def test_what_differs_is_reported_with_the_norm_of_its_sizes_and_others_that_would_do():
-    def alteration(code, where, words=lambda x, error: f"{x.tolist()} {error.tolist()}"):
-        return discrepancies._Alteration(code, where, None, 0.1, words)
-
-    one, other = alteration("gravity", ""), alteration("position_offset", "b")
-    x, error = np.array([0.3, -0.4]), np.array([0.05, 0.12])
-    found = discrepancies._finding(one, x, error, 0.234, [other, alteration("time_scale", "")])
-    assert found.message == (
-        "[0.3, -0.4] [0.05, 0.12]. This explains 23 % of the squared residual, which other masses "
-        "and friction do not explain; position_offset of b would explain the same share"
-    )
-    assert found.evidence == pytest.approx({"size": 0.5, "std_error": 0.13, "share_pct": 23.4})
-    assert (found.where, found.severity) == ("all joints", "warning")
-    single = discrepancies._finding(other, -x[:1], error[:1], 0.5, [])
-    assert single.evidence == {"size": -0.3, "std_error": 0.05, "share_pct": 50.0}
-    assert (single.where, single.message.endswith("do not explain")) == ("b", True)
-
-
-def test_sentences_have_sizes_and_errors_of_their_own():
-    x, error = np.array([-0.123]), np.array([0.0456])
-    reported = {
-        name: make(x, error)
-        for name, make in (
-            ("zero", discrepancies._zero("a", "rad")),
-            ("lost", discrepancies._lost_motion("a", "m")),
-            ("scale", discrepancies._scale("q_a")), ("gain", discrepancies._gain("a")),
-            ("gains", discrepancies._gains("a, b")), ("clock", discrepancies._clock),
-        )
-    }  # fmt: skip
-    assert reported["zero"].startswith("a: position offset 0.123 +- 0.046 rad: correct q_a")
-    assert "differs by 0.12 +- 0.05 m between the directions" in reported["lost"]
-    assert reported["scale"].startswith("q_a fits best with a factor of 0.877 +- 0.046: ")
-    assert "its torque is about 0.88 (+- 0.05) times the value" in reported["gain"]
-    assert "their torques are at most 0.88 (+- 0.05) times the values" in reported["gains"]
-    assert "at least 1.12 (" in discrepancies._gains("a, b")(-x, error)
-    assert "inertial torques are 0.877 +- 0.046 times the value" in reported["clock"]
-    assert f"run {np.sqrt(0.877):.3f} times as fast" in reported["clock"]
-    down, across = np.array([0.0, 0.0, -9.81]), np.eye(3)[:2]
-    x, error = np.tan(np.radians([3.0, 0.0])), np.tan(np.radians([0.3, 0.4]))
-    tilt = discrepancies._tilt(across, down)(x, error)
-    assert "gravity is tilted by about 3 +- 0.5 degrees" in tilt
-    assert f"set gravity = [{9.81 * np.sin(np.radians(3)):.2f}, 0.00, -9.80] in" in tilt
-    origin = discrepancies._origin("a")(np.array([0.03, 0.0, -0.04]), np.array([0.003, 0.004, 0.0]))
-    assert origin.startswith("a: its origin differs by 0.05 +- 0.005 m from")
-
-
-def test_a_second_difference_is_sized_beside_the_first_and_confirmed_by_validation(
-    monkeypatch, rng
-):
-    """Of twelve segments and three of validation; the third option is not confirmed."""
-
-    def alteration(code, columns):
-        return discrepancies._Alteration(
-            code, "", np.zeros((1, 1, columns)), 0.1, lambda x, e: f"{x.tolist()} {e.tolist()}"
-        )
-
-    own = [alteration("a", 1), alteration("b", 2), alteration("c", 1)]
-    before = rng.uniform(1.0, 1.1, 15)
-    noisy = rng.uniform(0.99, 1.01, 15)
-    shares = {(0,): 0.1, (1, 2): 0.5, (3,): 0.12, (1, 2, 0): 0.65, (1, 2, 3): 0.7}
-    unsure = np.where(np.arange(15) < 12, 1.0, 0.1)
-
-    def left(which):
-        share = shares.get(tuple(which), 0.0)
-        if 3 in which:  # it explains the fitted logs only
-            return before * (1 - (0.5 + 0.2 * unsure if len(which) > 1 else share * unsure) * noisy)
-        return before * (1 - share * noisy)
-
-    sizes = np.array([2.0, -3.0, 5.0])
-    whole = SimpleNamespace(
-        estimate=lambda chosen, fitted: (
-            sizes[: len(chosen)],
-            np.diag([0.01, 0.04, 0.09])[: len(chosen), : len(chosen)],
-        )
-    )
-    held_out = SimpleNamespace(
-        left=left, left_each=lambda options: {one: left(which) for one, which in options.items()}
-    )
-    monkeypatch.setattr(
-        discrepancies, "Trials", lambda sample, Z: SimpleNamespace(held_out=held_out, whole=whole)
-    )
-    sample = SimpleNamespace(fitted=12)
-    first, *rest = discrepancies._found(SimpleNamespace(standard=None), sample, own)
-    assert first.alteration is own[1]
-    share = (before - left([1, 2]))[:12].sum() / before[:12].sum()
-    assert first.finding.evidence == pytest.approx(
-        {"size": np.sqrt(13.0), "std_error": np.sqrt(0.05), "share_pct": 100 * share}
-    )
-    assert rest == []  # the best of the rest is not confirmed
-    shares[1, 2, 0] = 0.75
-    _, second = discrepancies._found(SimpleNamespace(standard=None), sample, own)
-    assert second.alteration is own[0]
-    assert (second.finding.evidence["size"], second.finding.evidence["std_error"]) == (
-        5.0, pytest.approx(0.3),
-    )  # fmt: skip
-
-
-def test_columns_of_terms_are_of_their_joint_and_the_residual_of_fitted_logs(monkeypatch, rng):
-    motions = (3.0, 5.0, 7.0)
-
-    def lacking(joint, count):
-        return SimpleNamespace(
-            joint=joint, term=SimpleNamespace(columns=lambda m: m * np.ones((4, count)))
-        )
-
-    sample = SimpleNamespace(joints=("a", "b", "c"), motions=motions, fitted=5)
-    Z = discrepancies._columns([lacking("c", 1), lacking("a", 2)], sample)
-    assert Z.shape == (4, 3, 3)
-    np.testing.assert_array_equal(Z[0], [[0, 3, 3], [0, 0, 0], [7, 0, 0]])
-    left = rng.random(8)
-    given = []
-
-    def trials(sample, Z):
-        return SimpleNamespace(
-            held_out=SimpleNamespace(left=lambda which: given.append(which) or left)
-        )
-
-    monkeypatch.setattr(discrepancies, "Trials", trials)
-    assert discrepancies._left(sample, Z) == pytest.approx(left[:5].sum())
-    assert given == [[0, 1, 2]]
-
-
-@pytest.mark.parametrize(
-    ("share", "p", "confirmed", "size", "error", "is_found"),
-    [
-        (0.11, 2.9e-4, 0.03, 0.11, 0.02, True),
-        (0.11, 3.1e-4, 0.03, 0.11, 0.02, False),
-        (0.11, 2.9e-4, 0.027, 0.11, 0.02, False),  # a quarter of the share
-        (0.11, 2.9e-4, 0.03, 0.09, 0.01, False),  # the size that changes a result is 0.1
-        (0.11, 2.9e-4, 0.03, 0.11, 0.023, False),  # five standard errors
-        (0.11, 2.9e-4, None, 0.11, 0.02, True),
-        (0.09, 9e-6, None, 0.21, 0.02, False),
-        (0.09, 9e-6, 0.095, 0.21, 0.02, True),
-        (0.09, 1.1e-5, 0.095, 0.21, 0.02, False),
-        (0.09, 9e-6, 0.085, 0.21, 0.02, False),
-        (0.09, 9e-6, 0.095, 0.19, 0.02, False),
-        (0.031, 9e-6, 0.095, 0.21, 0.02, True),
-        (0.029, 9e-6, 0.095, 0.21, 0.02, False),
-    ],
-)
-def test_a_difference_is_reported_by_its_share_p_value_validation_and_size(
-    monkeypatch, share, p, confirmed, size, error, is_found
-):
-    before = np.ones(12 if confirmed is None else 16)
-    left = before - np.where(np.arange(len(before)) < 12, share, confirmed or 0.0)
-    held_out = SimpleNamespace(
-        left=lambda which: before, left_each=lambda options: dict.fromkeys(options, left)
-    )
-    whole = SimpleNamespace(estimate=lambda *_: (np.array([size]), np.array([[error**2]])))
-    trials = SimpleNamespace(held_out=held_out, whole=whole)
-    monkeypatch.setattr(discrepancies, "Trials", lambda sample, Z: trials)
-    monkeypatch.setattr(discrepancies.Round, "p_value", lambda self, option: p)
-    one = discrepancies._Alteration("a", "", np.zeros((1, 1, 1)), 0.1, lambda x, e: "")
-    found = discrepancies._found(SimpleNamespace(), SimpleNamespace(fitted=12), [one])
-    assert len(list(found)) == is_found

@@ -6,7 +6,6 @@ from helpers.stands import stand
 
 from robotid.base.exceptions import SettingsError
 from robotid.data.signal_settings import SignalSettings
-from robotid.diagnosis.residual import drive_choice
 from robotid.diagnosis.residual.drive_choice import choose_drives
 from robotid.diagnosis.residual.term_trials import Trials, take_sample
 from robotid.dynamics.base_parameters import structural_mapping
@@ -16,7 +15,6 @@ from robotid.dynamics.simulation.simulator import simulate
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
 from robotid.estimation.fitting.fit import solve_recordings
 from robotid.estimation.fitting.recorded import Recordings
-from robotid.estimation.fitting.selected_drives import DriveChoice
 from robotid.estimation.fitting.survey import hold_log
 from robotid.robot.constraints import Contact
 from robotid.robot.drives import Lag, LoadFriction, Stribeck
@@ -114,33 +112,3 @@ def test_families_that_need_the_load_are_refused(fit):
     for term in (LoadFriction(), Lag()):
         with pytest.raises(SettingsError, match=f"FL_HFE has the drive term '{term.name}', which"):
             quadruped(own_terms={"FL_HFE": [term]})
-
-
-def test_terms_are_selected_again_together_with_those_of_other_joints(fit):
-    """A joint whose terms are dropped leaves no columns for the joints after it."""
-    sample = take_sample(fit, for_drives=True)
-    names = sample.joints[:4]
-    drives = drive_choice._drives(fit, sample, wanted(fit, *names))
-    first = Stribeck(speed=0.1)
-    choices = {name: DriveChoice(name, ("stribeck",), (first,)) for name in names[:3]}
-    choices[names[3]] = DriveChoice(names[3], (), ())
-    size, calls = sample.W.shape[2], {}
-
-    def choose(j, together):
-        calls[j] = together.W[..., size:]
-        if j == 0:
-            choices[names[0]] = DriveChoice(names[0], (), ())
-
-    drive_choice._choose_together(sample, drives, choices, choose)
-    assert [*calls] == [0, 1, 2]
-    assert [columns.shape[2] for columns in calls.values()] == [2, 1, 1]
-    for j, k, column in ((0, 1, 0), (0, 2, 1), (1, 2, 0), (2, 1, 0)):
-        Z = np.zeros((*sample.r.shape, 1))
-        Z[:, 6 + k] = drives[k].columns([first])
-        left = sample.weight * without_forces(sample.basis, Z)[..., 0]
-        found = calls[j][..., column]
-        np.testing.assert_allclose(found * (left**2).sum(), left * (left * found).sum(), atol=1e-6)
-    calls.clear()
-    choices |= {name: DriveChoice(name, (), ()) for name in names[1:3]}
-    drive_choice._choose_together(sample, drives, choices, choose)
-    assert not calls

@@ -5,22 +5,18 @@ without load, whether the model that is fitted knows of load friction or not.
 """
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from helpers.driven import ELBOW, LIFT, arm, driven, driven_log, found_in
 
-from robotid.diagnosis.residual import model_error
 from robotid.diagnosis.residual.drive_choice import choose_drives
 from robotid.diagnosis.residual.misfit import find_misfits
-from robotid.diagnosis.residual.model_error import settled_shapes, with_model_error
 from robotid.diagnosis.residual.term_trials import take_sample
 from robotid.dynamics.torque import trajectory_regressor
-from robotid.estimation.fitting.bands import expected_band, friction_curve
-from robotid.estimation.fitting.open_terms import open_torques
-from robotid.estimation.fitting.selected_drives import DriveChoice, FoundShape
-from robotid.robot.drives import DriveMotion, LoadFriction, Stribeck, Tanh
+from robotid.estimation.fitting.drive_terms import open_torques
+from robotid.estimation.fitting.fitted import expected_band, friction_curve
+from robotid.robot.drives import LoadFriction, Stribeck
 
 QUANTILE = 1.5
 PLAIN = "viscous+coulomb"
@@ -137,35 +133,6 @@ def test_a_prediction_errs_by_what_a_missing_term_moves_and_by_its_torque(
     np.testing.assert_allclose(curves[0].std, np.abs(changed), atol=0.3 * np.abs(changed).max())
 
 
-def test_without_rows_to_judge_by_errors_stay_as_they_are(fits):
-    found = fits("loaded", PLAIN)
-    assert with_model_error(found, None, ()) == (found, ())
-    assert found.mapping.names  # and with rows and no misfit they do, too
-    same, on_misfit = with_model_error(found, take_sample(found), ())
-    np.testing.assert_array_equal(same.base_error, found.base_error)
-    assert on_misfit == ()
-
-
-def test_errors_grow_by_the_squares_of_all_that_is_open(fits, rng):
-    found = fits("loaded", PLAIN)
-    sample, b = take_sample(found), len(found.base)
-    shifts = rng.standard_normal((3, b))
-    moved = [
-        model_error._Move(joint, shift, lambda motion, alone: motion.v)
-        for joint, shift in zip((ELBOW, LIFT, ELBOW), shifts, strict=True)
-    ]
-    wider = model_error._wider(found, sample, moved)
-    X = shifts @ sample.U  # of base parameters
-    np.testing.assert_allclose(wider.base_error**2, found.base_error**2 + np.sum(X**2, axis=0))
-    terms = wider.open_terms[len(found.open_terms) :]
-    assert [term.joint for term in terms] == [ELBOW, LIFT, ELBOW]
-    moves = np.array([term.moves for term in terms])
-    np.testing.assert_allclose(moves @ found.mapping.K.T, X, atol=1e-9 * np.abs(X).max())
-    more = wider.standard_covariance - found.standard_covariance
-    np.testing.assert_allclose(more, moves.T @ moves, atol=1e-9 * np.abs(more).max())
-    assert model_error._wider(found, sample, []) is found
-
-
 def test_an_error_of_a_shape_moves_parameters_as_refits_do(plain, hooked, fits):
     """The oracle: fits with the shape stated, larger and smaller by its standard error."""
     true, log = hooked
@@ -197,41 +164,6 @@ def test_an_error_of_a_shape_moves_parameters_as_refits_do(plain, hooked, fits):
     np.testing.assert_allclose(friction_curve(found, ELBOW, v).std, wanted, rtol=0.05)
 
 
-def test_shapes_that_err_together_have_one_covariance(fits):
-    """A hook's speed and excess make up for each other: alone each looks far too sure."""
-    found = fits("hooked", {ELBOW: "lugre", "*": "none"})
-    (choice,) = found.drives
-    C = np.array(choice.shape_covariance)
-    np.testing.assert_allclose(np.sqrt(np.diag(C)), [s.std_error for s in choice.shapes])
-    np.testing.assert_allclose(C, C.T)
-    assert np.linalg.eigvalsh(C / np.sqrt(np.outer(np.diag(C), np.diag(C)))).min() > -1e-9
-    speed, excess = 1, 2
-    assert abs(C[speed, excess]) > 0.5 * np.sqrt(C[speed, speed] * C[excess, excess])
-
-
-def test_shapes_are_settled_once_none_of_them_moves_by_a_fifth_of_its_error(fits, monkeypatch):
-    found = fits("hooked", {ELBOW: "lugre", "*": "none"})
-    (choice,) = found.drives
-    values = np.array([shape.value for shape in choice.shapes])
-    errors = 0.01 * values * [1.0, 2.0, 3.0]
-    for shares, is_settled in (
-        ([0.1, -0.19, 0.0], True), ([0.3, 0.0, -0.1], False), ([0.1, 0.0, -0.3], False),
-    ):  # fmt: skip
-        step = np.array(shares) * errors
-
-        class Trial:
-            def estimate(self, chosen, fitted, step=step):
-                assert chosen == [0, 1, 2]
-                return step, np.diag(errors**2)
-
-        monkeypatch.setattr(model_error, "_shape_trial", lambda *args, trial=Trial: trial())
-        moved = settled_shapes(found)
-        assert (moved is None) == is_settled
-        if moved is not None:
-            np.testing.assert_allclose([s.value for s in moved[0].shapes], values + step)
-            np.testing.assert_allclose([s.std_error for s in moved[0].shapes], errors)
-
-
 def test_a_clean_robot_has_the_errors_of_its_noise(plain):
     true, pi = driven(plain, {}, {})
     found = found_in(
@@ -240,140 +172,3 @@ def test_a_clean_robot_has_the_errors_of_its_noise(plain):
     assert find_misfits(take_sample(found)) == found.misfits == ()
     np.testing.assert_allclose(found.base_error, found.wls.std_error)
     assert choose_drives(found, dict.fromkeys(found.model.joints, ())) == ()
-
-
-def two_shapes():
-    """Return a fit of two joints, the second of which has two terms with a shape each."""
-    ranges = {"v": (0.02, 2.0), "q": (-1.0, 1.0)}
-    terms = (Stribeck(data_range=ranges["v"], speed=0.2), Tanh(data_range=ranges["v"], speed=0.7))
-    shapes = tuple(FoundShape(n, x, 0.1, "", False) for n, x in (("s", 0.2), ("t", 0.7)))
-    choice = DriveChoice(
-        "b", ("stribeck", "tanh"), terms, shapes=shapes, sizes=((0.2,), (0.7,)), data_range=ranges,
-        shape_covariance=((0.04, 0.03), (0.03, 0.09)),
-    )  # fmt: skip
-    names = ("b.stribeck", "a.stribeck", "a.tanh", "b.tanh")
-    layout = SimpleNamespace(names=names)
-    standard = np.array([3.0, 70.0, 90.0, -2.0])
-    return SimpleNamespace(model=SimpleNamespace(layout=layout), standard=standard), choice, ranges
-
-
-def test_a_torque_changes_with_each_shape_as_differences_do(rng):
-    found, choice, ranges = two_shapes()
-    v = 2.0 * rng.standard_normal(30)
-    motion = DriveMotion(*[np.zeros(30)] * 1, v, np.zeros(30), np.sign(v), *[np.zeros(30)] * 2)
-    step = 1e-6
-
-    def torque(k, sign):
-        sizes = np.array([0.2, 0.7])
-        sizes[k] += sign * step
-        own = (
-            Stribeck(data_range=ranges["v"], speed=sizes[0]),
-            Tanh(data_range=ranges["v"], speed=sizes[1]),
-        )
-        return sum(x * t.column(motion) for x, t in zip((3.0, -2.0), own, strict=True))
-
-    slopes = [(torque(k, 1) - torque(k, -1)) / (2 * step) for k in (0, 1)]
-    for k in (0, 1):
-        slope = model_error.shape_slope(found, choice, k, motion)
-        np.testing.assert_allclose(slope, slopes[k], rtol=0.01, atol=1e-3)
-    change = model_error._shape_change(found, choice, np.array([0.5, -2.0]), motion, None)
-    np.testing.assert_allclose(change, 0.5 * slopes[0] - 2.0 * slopes[1], rtol=0.02, atol=3e-3)
-
-
-def test_uncertain_shapes_are_directions_of_their_covariance(rng, monkeypatch):
-    found, choice, _ = two_shapes()
-    T = rng.standard_normal((5, 3))  # the last column is of the residual
-    monkeypatch.setattr(model_error, "_shape_trial", lambda *_: SimpleNamespace(T=T))
-    found.drives = (DriveChoice("a", (), ()), choice)
-    moves = list(model_error._of_shapes(found, None, []))
-    assert [move.joint for move in moves] == ["b", "b"]
-    X = np.array([move.shift for move in moves])
-    C = T[:, :2] @ np.array(choice.shape_covariance) @ T[:, :2].T
-    np.testing.assert_allclose(X.T @ X, C, atol=1e-12)
-    axes = np.array([move.torque.args[2] for move in moves])
-    np.testing.assert_allclose(axes.T @ axes, choice.shape_covariance, atol=1e-12)
-    np.testing.assert_allclose(X, -(axes @ T[:, :2].T))
-
-
-def test_terms_that_were_nearly_selected_move_parameters_together(rng, monkeypatch):
-    undecided = (Stribeck(speed=0.3), Tanh(speed=0.4))
-    choices = (DriveChoice("a", (), ()), DriveChoice("b", (), (), undecided=undecided))
-    v = rng.standard_normal((2, 12))
-    still = np.zeros(12)
-
-    def of(speed):
-        return DriveMotion(still, speed, still, np.sign(speed), still, still)
-
-    motions = [SimpleNamespace(of=lambda j, x=x: of(x) if j == 1 else None) for x in v]
-    taken = (np.array([0, 5, 7]), np.array([2, 11]))
-    sample = SimpleNamespace(joints=("a", "b"), taken=taken, of_joint=lambda j: ("of", j))
-    T, theta, given = rng.standard_normal((4, 3)), np.array([1.5, -0.25]), []
-
-    def trials(*arguments):
-        given.append(arguments)
-        return SimpleNamespace(whole=SimpleNamespace(T=T, parameters=lambda which: theta[which]))
-
-    monkeypatch.setattr(model_error, "Trials", trials)
-    (move,) = model_error._of_undecided(SimpleNamespace(drives=choices), sample, motions)
-    ((own, Z),) = given
-    assert own == ("of", 1)
-    speed = np.concatenate([x[k] for x, k in zip(v, taken, strict=True)])
-    columns = np.column_stack([term.column(of(speed)) for term in undecided])
-    np.testing.assert_allclose(Z[:, 0], columns)
-    assert move.joint == "b"
-    np.testing.assert_allclose(move.shift, -T[:, :2] @ theta)
-    wanted = 1.5 * undecided[0].column(of(v[0])) - 0.25 * undecided[1].column(of(v[0]))
-    np.testing.assert_allclose(move.torque(of(v[0]), None), wanted)
-
-
-@pytest.mark.parametrize(("shares", "is_settled"), [((0.3, 0.1), False), ((0.19, 0.1), True)])
-def test_shapes_of_every_joint_must_settle(monkeypatch, shares, is_settled):
-    _, choice, _ = two_shapes()
-    choices = [replace(choice, joint="a"), DriveChoice("c", (), ()), choice]
-    steps = {"a": shares[0], "b": shares[1]}
-    error = 0.01
-
-    def trial(found, choice, *_):
-        step = error * np.array([steps[choice.joint], -0.05])
-        return SimpleNamespace(estimate=lambda which, fitted: (step, error**2 * np.eye(2)))
-
-    monkeypatch.setattr(model_error, "take_sample", lambda *_, **__: SimpleNamespace(fitted=6))
-    monkeypatch.setattr(model_error, "_motions", lambda *_: [])
-    monkeypatch.setattr(model_error, "_shape_trial", trial)
-    moved = settled_shapes(SimpleNamespace(drives=choices))
-    assert (moved is None) is is_settled
-    if moved:
-        first, same, last = moved
-        assert same is choices[1]
-        for found, share in ((first, shares[0]), (last, shares[1])):
-            values = [shape.value for shape in found.shapes]
-            assert values == pytest.approx([0.2 + error * share, 0.7 - 0.05 * error])
-
-
-def test_drive_parameters_whose_error_grows_by_a_third_are_named(monkeypatch):
-    """Not those of bodies, nor one without an error before."""
-    before = SimpleNamespace(
-        drives=(), standard_error=np.array([1.0, 1.0, 2.0, 3.0, np.inf, 2.0]),
-        model=SimpleNamespace(layout=SimpleNamespace(n_inertial=2)),
-        mapping=SimpleNamespace(names=tuple("abcdef")),
-    )  # fmt: skip
-    after = SimpleNamespace(standard_error=np.array([9.0, 1.0, 2.5, 4.0, np.inf, 9.0]))
-    given = []
-
-    def wider(found, sample, moves):
-        given.append(list(moves))
-        return after if len(given) == 3 else before
-
-    monkeypatch.setattr(model_error, "_wider", wider)
-    monkeypatch.setattr(model_error, "_of_misfit", lambda misfit: f"move of {misfit}")
-    found, names = with_model_error(before, "sample", ["x", "y"])
-    assert given == [[], [], ["move of x", "move of y"]]
-    assert (found is after, names) == (True, ("d", "f"))
-
-
-def test_a_fixed_parameter_moves_a_millionth_of_the_smallest_spread():
-    given = []
-    mapping = SimpleNamespace(gain=lambda spread: given.append(spread) or "gain")
-    found = SimpleNamespace(prior_std=np.array([0.0, 2e-3, 5.0]), mapping=mapping)
-    assert model_error._gain(found) == "gain"
-    np.testing.assert_allclose(given, [[2e-9, 2e-3, 5.0]])

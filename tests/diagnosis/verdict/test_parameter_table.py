@@ -1,15 +1,13 @@
 """The table of parameters: every parameter once, with what result.json says of it."""
 
 import json
-import math
-import sys
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from robotid.diagnosis.verdict import parameter_table
-from robotid.diagnosis.verdict.correlation import correlated_parameters
+from robotid.diagnosis.verdict.parameter_table import correlated_parameters
 from robotid.output.files.entries import build_result
 from robotid.output.files.result_file import Result
 
@@ -57,29 +55,6 @@ def test_the_interval_of_a_parameter_that_is_a_base_parameter_is_that_of_it(iden
     assert (reach >= 1.95).all()
 
 
-def test_without_pandas_it_is_a_list_that_a_notebook_shows(identified, monkeypatch):
-    monkeypatch.setattr(parameter_table, "find_spec", lambda name: None)
-    monkeypatch.setitem(sys.modules, "pandas", None)
-    rows = identified.table()
-    k = identified.model.layout.names.index("forearm_link.m")
-    assert rows[k] == {
-        "part": "forearm_link",
-        "parameter": "m",
-        "urdf": identified.prior[k],
-        "value": identified.standard[k],
-        "std_error": identified.standard_error[k],
-        "low": identified.standard_interval[k, 0],
-        "high": identified.standard_interval[k, 1],
-        "source": identified.sources[k],
-        "unit": "kg",
-    }
-    assert all(row["std_error"] is None or math.isfinite(row["std_error"]) for row in rows)
-    assert rows[-1]["urdf"] is None
-    html = rows._repr_html_()
-    assert html.count("<tr>") == len(rows) + 1
-    assert f"{identified.standard[k]:.4g}" in html
-
-
 def test_a_parameter_is_correlated_with_another_one_of_its_own_drive_that_has_an_error():
     """Two drives of four parameters each, behind two of a body."""
     drives = [(k // 4, None) for k in range(8)]
@@ -102,56 +77,3 @@ def test_a_parameter_is_correlated_with_another_one_of_its_own_drive_that_has_an
     pairs = correlated_parameters(found)
     assert {i: k for i, (k, _) in pairs.items()} == {i: k for i, (k, _) in wanted.items()}
     assert [r for _, r in pairs.values()] == pytest.approx([r for _, r in wanted.values()])
-
-
-def test_a_parameter_without_a_standard_error_has_no_interval_and_no_reach(monkeypatch):
-    names, inf = ("one.m", "a.viscous", "a.coulomb"), np.inf
-    monkeypatch.setattr(parameter_table, "correlated_parameters", lambda found: {1: (2, -0.96)})
-    found = SimpleNamespace(
-        model=SimpleNamespace(
-            layout=SimpleNamespace(names=names, units=("kg", "N m s/rad", "N m"), n_inertial=1)
-        ),
-        sources=("data", "mixed", "bound"), at_bound=np.array([False, False, True]),
-        standard=np.array([2.5, 0.5, 0.0]), prior=np.array([3.0, 0.0, 0.0]),
-        standard_error=np.array([0.25, 0.125, inf]), standard_quantile=np.array([2.0, 2.5, 1.96]),
-        standard_interval=np.array([[2.0, 3.0], [0.1875, 0.8125], [-inf, inf]]),
-    )  # fmt: skip
-    keys = ("name", "value", "std_error", "quantile", "interval_95", "unit", "prior", "source",
-            "at_bound")  # fmt: skip
-    body = ("one.m", 2.5, 0.25, 2.0, [2.0, 3.0], "kg", 3.0, "data", False)
-    first = ("a.viscous", 0.5, 0.125, 2.5, [0.1875, 0.8125], "N m s/rad", 0.0, "mixed", False)
-    other = ("a.coulomb", 0.0, None, None, [None, None], "N m", 0.0, "bound", True)
-    partner = {"correlated_with": "a.coulomb", "correlation": -0.96}
-    assert parameter_table.parameter_entries(found) == (
-        [dict(zip(keys, body, strict=True))],
-        [dict(zip(keys, first, strict=True)) | partner, dict(zip(keys, other, strict=True))],
-    )
-
-
-@pytest.mark.parametrize("has_pandas", [True, False])
-def test_names_with_dots_keep_them_and_drives_have_no_value_of_the_urdf(monkeypatch, has_pandas):
-    if not has_pandas:
-        monkeypatch.setattr(parameter_table, "find_spec", lambda name: None)
-    body = {"name": "arm.left.mcx", "value": 0.5, "std_error": 0.25, "interval_95": [0.0, 1.0],
-            "prior": 0.75, "source": "data", "unit": "kg m"}  # fmt: skip
-    drive = body | {"name": "a.b.viscous", "prior": 3.0, "unit": "N m s/rad", "source": "mixed"}
-    old = {"name": "c.offset", "value": -2.0, "unit": "N m"}  # of a result that lacks the rest
-    rows = parameter_table.parameter_table([body], [drive, old])
-    rows = rows.to_dict("records") if has_pandas else rows
-    none = float("nan") if has_pandas else None
-    wanted = [
-        ("arm.left", "mcx", 0.75, 0.5, 0.25, 0.0, 1.0, "data", "kg m"),
-        ("a.b", "viscous", none, 0.5, 0.25, 0.0, 1.0, "mixed", "N m s/rad"),
-        ("c", "offset", none, -2.0, none, none, none, "", "N m"),
-    ]
-    for row, values in zip(rows, wanted, strict=True):
-        assert list(row) == list(parameter_table.HEADERS)
-        assert [str(x) for x in row.values()] == [str(x) for x in values]
-
-
-def test_columns_of_numbers_are_numbers_though_all_of_them_are_missing():
-    drive = {"name": "a.offset", "value": 2, "unit": "N m"}
-    frame = parameter_table.parameter_table([], [drive, drive | {"name": "b.offset"}])
-    numbers = parameter_table.HEADERS[2:7]
-    assert {name: frame[name].dtype for name in numbers} == dict.fromkeys(numbers, float)
-    assert frame["value"].tolist() == [2.0, 2.0]

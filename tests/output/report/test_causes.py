@@ -12,7 +12,11 @@ JOINTS = ("one", "two", "three")
 
 
 def finding(code, severity, where, message=""):
-    return Finding(code, severity, where, message or f"{where} has {code}")
+    if message:
+        return Finding(code, severity, where, message)
+    words = {"joint": where}
+    return Finding(code, severity, where, f"{where} has {code}", joints=(where,), words=words,
+                   fault=f"{{joint}} has {code}")  # fmt: skip
 
 
 MANY = [

@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import scipy.stats
 from helpers.paths import JOBS
 
 from robotid.base.exceptions import DataError
@@ -12,18 +11,12 @@ from robotid.cli.job import read_job
 from robotid.data.base_motion import BaseMotion, quaternions_of_angles
 from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
-from robotid.data.signals import process
-from robotid.dynamics import completed_logs
 from robotid.dynamics.completed_logs import (
-    FoundContact,
-    _forces,
-    _noise_of_groups,
-    _probabilities,
     find_contacts,
     with_contacts,
 )
 from robotid.dynamics.constraint_rows import constraint_jacobian
-from robotid.dynamics.prediction import predict, predict_instants
+from robotid.dynamics.prediction import predict_instants
 from robotid.robot.constraints import Contact
 
 FEET = ("FL_FOOT", "FR_FOOT", "HL_FOOT", "HR_FOOT")
@@ -88,30 +81,6 @@ def test_feet_without_load_are_found(robot):
     assert with_contacts(robot, full, RAW) is full
 
 
-def test_the_shares_are_of_all_samples_of_which_undecided_ones_count_as_contact(robot, monkeypatch):
-    log, *_ = standing(robot, np.ones((200, 4), dtype=bool))
-    touches = [np.repeat([1.0, 0.0, 0.5], n) for n in ([120, 50, 30], [40, 150, 10])]
-    found = [FoundContact(FEET[k], x, 0.0 * x) for k, x in zip((1, 3), touches, strict=True)]
-    monkeypatch.setattr(completed_logs, "find_contacts", lambda *_: (log.t, found))
-    stated = {foot: log.t >= 0.0 for foot in (FEET[0], FEET[2])}
-    full = with_contacts(robot, replace(log, contacts=stated), RAW)
-    assert full.notes == (
-        "contacts found from torques and motion: FR_FOOT 60 % in contact, 25 % not, 15 % "
-        "undecided; HR_FOOT 20 % in contact, 75 % not, 5 % undecided. Undecided samples count as "
-        "contact",
-    )
-    for k, x in zip((1, 3), touches, strict=True):
-        np.testing.assert_array_equal(full.contacts[FEET[k]], x > 0.0)
-    part = [FoundContact(FEET[1], np.zeros(190), np.zeros(190))]  # rows beyond are undecided, too
-    monkeypatch.setattr(completed_logs, "find_contacts", lambda *_: (log.t[4:-6], part))
-    full = with_contacts(
-        robot, replace(log, contacts={FEET[k]: log.t >= 0 for k in (0, 2, 3)}), RAW
-    )
-    np.testing.assert_array_equal(
-        np.flatnonzero(full.contacts[FEET[1]]), [*range(4), *range(194, 200)]
-    )
-
-
 def test_what_cannot_be_found_names_what_to_log(robot):
     log, *_ = standing(robot, np.ones((50, 4), dtype=bool))
     still = replace(log, tau=0 * log.tau, has_torque=False)
@@ -145,44 +114,6 @@ def test_contacts_of_a_trot_agree_with_stated_ones(recordings, monkeypatch):
         decided = np.abs(contact.touches - 0.5) > 0.48
         assert np.mean((contact.touches > 0.5)[decided] == stated[decided]) > 0.975
         assert min(on, off) > 0.2
-
-
-@pytest.mark.parametrize("levels", [(0.1, 0.01), (1.0, 0.03), (0.02, 0.3)])
-def test_rows_count_by_their_noise_which_their_residuals_give(robot, rng, levels):
-    """Forces are near those with the true weights, though rows of the base have large leverages."""
-    log, *_ = standing(robot, np.ones((300, 4), dtype=bool))
-    motion = process(log, RAW)
-    motion = replace(motion, contacts=np.empty((len(motion.t), 0), dtype=bool))
-    J = constraint_jacobian(robot, motion.q, np.ones((len(motion.t), 4), dtype=bool))
-    sigma = np.where(np.arange(18) < 6, *levels)  # of the base and of the joints
-    f = np.array([1.5, -1.0, 5.0] * 4) * rng.uniform(0.5, 1.5, (len(motion.t), 12))
-    b = np.einsum("kmj,km->kj", J, f) + sigma * rng.standard_normal((len(motion.t), 18))
-    torque = predict(replace(robot, constraints=()), [robot.standard_parameters()], motion)[0]
-    found, _ = _forces(robot, replace(motion, tau=torque - b), robot.contacts)
-
-    def upwards(sigma):
-        return np.array([np.linalg.lstsq((j / sigma).T, x / sigma, rcond=None)[0][2::3]
-                         for j, x in zip(J, b, strict=True)])  # fmt: skip
-
-    wanted, plain = upwards(sigma), upwards(np.ones(18))
-    assert np.std(found - wanted) < 0.75 * np.std(plain - wanted)
-    true = f[:, 2::3]
-    assert np.std(found - true) < 1.06 * np.std(wanted - true)
-    assert np.std(plain - true) > (1.0 if levels[0] < levels[1] else 1.8) * np.std(wanted - true)
-
-
-def test_the_noise_of_forces_moments_and_joints_is_found_at_any_ratio(robot, rng):
-    """Two contacts, whose forces ten samples of each determine; in any number of samples."""
-    two = replace(robot, constraints=[Contact(foot) for foot in FEET[:2]])
-    q = np.hstack([np.tile([0, 0, 0.3, 0, 0, 0, 1.0], (1501, 1)), rng.uniform(-1, 1, (1501, 12))])
-    J = constraint_jacobian(two, q, np.ones((1501, 2), dtype=bool))
-    f = np.array([20.0, -30.0, 60.0] * 2) * rng.uniform(0.5, 1.5, (1501, 6))
-    for levels in ((2.0, 0.1, 0.05), (0.5, 0.05, 0.9), (0.3, 4.0, 0.3)):
-        sigma = np.repeat(levels, [3, 3, 12])
-        b = np.einsum("kmj,km->kj", J, f) + sigma * rng.standard_normal((1501, 18))
-        found = _noise_of_groups(J, b, 30.0)
-        np.testing.assert_allclose(found[[0, 3, 6]], levels, rtol=0.15)
-        assert all(len(set(x)) == 1 for x in np.split(found, [3, 6]))
 
 
 @pytest.mark.parametrize("axes", ["world", "link"])
@@ -219,36 +150,3 @@ def of_feet(rng, drift):
     way = rng.normal(size=(900, 4, 3))
     way *= (speed / np.linalg.norm(way, axis=2))[..., None]
     return touches, force, height, way + drift
-
-
-def test_probabilities_are_those_of_two_normal_distributions(rng):
-    """By Bayes' rule, with the shares, means and deviations that the probabilities give."""
-    _, force, height, velocity = of_feet(rng, 0.0)
-    p = _probabilities(force, height, velocity, 4)
-    odds = np.log(p.mean() / (1.0 - p.mean()))
-    speed = np.log10(np.linalg.norm(velocity, axis=2) + 1e-3)
-    for x in (force, height, speed):
-        on = np.average(x, weights=p)
-        off = 0.0 if x is force else np.average(x, weights=1.0 - p)
-        a = np.sqrt(np.average((x - on) ** 2, weights=p))
-        b = np.sqrt(np.average((x - off) ** 2, weights=1.0 - p))
-        if x is force:  # a normal distribution with the median of |x|
-            order = np.argsort(np.abs(x).ravel())
-            share = np.cumsum((1.0 - p).ravel()[order]) / (1.0 - p).sum()
-            median = np.abs(x).ravel()[order][np.searchsorted(share, 0.5)]
-            b = min(b, median / scipy.stats.norm.ppf(0.75))
-        y = np.clip(x, min(on, off), max(on, off))
-        odds = odds + scipy.stats.norm(on, a).logpdf(y) - scipy.stats.norm(off, b).logpdf(y)
-    np.testing.assert_allclose(p, 1.0 / (1.0 + np.exp(-odds)), atol=0.02)
-    assert np.mean((p > 0.05) & (p < 0.95)) > 0.005  # some are undecided
-
-
-def test_without_a_position_speeds_are_relative_to_the_links_in_contact(rng):
-    state = rng.bit_generator.state
-    drift = np.array([0.8, -0.5, 0.3]) * np.sin(0.03 * np.arange(900))[:, None, None]
-    touches, force, _, velocity = of_feet(rng, drift)
-    rng.bit_generator.state = state
-    still = of_feet(rng, 0.0)[3]
-    p, wanted = (_probabilities(force, None, v, 4) for v in (velocity, still))
-    assert np.mean(np.abs(p - wanted)) < 2e-3
-    assert np.mean((p > 0.5) == touches) > 0.95

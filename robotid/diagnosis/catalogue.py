@@ -1,0 +1,86 @@
+"""The catalogue: what each code of a finding means, read from ``catalogue.toml``.
+
+An entry has the severity, the message as a template, the remedy that follows it, the reason of a
+verdict (``verdict``), whether an error may be ignored (``ignorable``), the next step
+(``step``) and the page of the documentation (``page``). Tables of an entry have parts of its
+sentences, of which a word given to ``finding`` chooses one.
+"""
+
+import tomllib
+from collections.abc import Mapping, Sequence
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from robotid.base.findings import Finding, listed
+
+#: Terms of a drive, which the reasons of a verdict name likewise.
+MISSING_TERM = "{term} would explain {share_pct:.0f} % of the squared residual ({error_pct:.1f} % "
+MISSING_TERM += "of the torque): the drive model lacks it"
+
+
+@cache
+def entries() -> Mapping[str, Mapping[str, Any]]:
+    """Return the entry of each code."""
+    text = (Path(__file__).parent / "catalogue.toml").read_text(encoding="utf-8")
+    table = tomllib.loads(text)
+    return {code: table.get(entry.get("like", ""), {}) | entry for code, entry in table.items()}
+
+
+@cache
+def codes_with(key: str) -> tuple[str, ...]:
+    """Return the codes whose entries have a key, in order."""
+    return tuple(code for code, entry in entries().items() if key in entry)
+
+
+def step_of(code: str) -> str:
+    """Return the next step that removes the cause of a finding; empty if there is none."""
+    return str(entries().get(code, {}).get("step", ""))
+
+
+def finding(
+    code: str,
+    log: str = "",
+    joints: str | Sequence[str] = (),
+    /,
+    *,
+    subject: str = "",
+    severity: str = "",
+    **values: float | str,
+) -> Finding:
+    """Return a finding: of a log and joints, or at another subject.
+
+    Values are figures, words, or the choice of a part of the sentence.
+    """
+    entry = entries()[code]
+    joints = (joints,) if isinstance(joints, str) else tuple(joints)
+    about = subject or ", ".join(joints)
+    words: dict[str, str] = {"joint": listed(joints)} if joints else {}
+    fault, remedy = entry["message"], entry.get("remedy", "")
+    evidence = {}
+    chosen = {}
+    for name, value in values.items():
+        key = {True: "yes", False: "no"}[value] if isinstance(value, bool) else value
+        if isinstance(entry.get(name), dict):
+            chosen[f"{{{name}}}"] = entry[name].get(key, "")
+        elif isinstance(value, str):
+            words[name] = value
+        else:
+            evidence[name] = float(value)
+    for slot, part in (*chosen.items(), *chosen.items()):  # parts may contain others
+        fault, remedy = fault.replace(slot, part), remedy.replace(slot, part)
+    plain = Finding(
+        code, severity or entry["severity"], f"{log}: {about}" if log and about else
+        log or about, "", evidence, log, joints, words, fault, remedy,
+    )  # fmt: skip
+    return plain.reworded()
+
+
+def reason_of(found: Finding) -> str:
+    """Return the reason of a verdict for a warning: without joint and log."""
+    entry = entries()[found.code]
+    if "term" in entry:
+        return MISSING_TERM.format(term=entry["term"], **found.evidence)
+    if entry["verdict"] is True:
+        return found.message
+    return found.reworded(log="", fault=entry["verdict"], remedy="").message
