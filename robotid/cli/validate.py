@@ -29,20 +29,20 @@ from robotid.cli.logs import log_of_commands, survey_logs, units_of_logs
 from robotid.data.log import Log
 from robotid.diagnosis.logs.check_logs import diagnose
 from robotid.diagnosis.verdict.evidence import Determined, Predictions
+from robotid.diagnosis.verdict.fit_findings import unlike_findings
 from robotid.diagnosis.verdict.position_verdict import judge_positions
-from robotid.diagnosis.verdict.unlike_runs import unlike_findings
 from robotid.diagnosis.verdict.verdict import Verdict, VerdictWarning, blocking, judge, warnings_of
 from robotid.dynamics.base_parameters import structural_mapping
-from robotid.estimation.fitting.bands import rms_error, torque_band
 from robotid.estimation.fitting.evaluation import (
     Evaluation,
+    Metrics,
     evaluate_logs,
     hidden_joints,
     shares_rows,
 )
 from robotid.estimation.fitting.fit import sums_of_logs
-from robotid.estimation.fitting.metrics import Metrics
 from robotid.estimation.fitting.recorded import Recordings
+from robotid.estimation.fitting.standard_errors import rms_error, torque_band
 from robotid.estimation.fitting.survey import SurveyedLog
 from robotid.estimation.variation.groups import RunSums, runs_of
 from robotid.estimation.variation.variation import vary
