@@ -59,9 +59,9 @@ FEET = ("FL_foot", "FR_foot", "RL_foot", "RR_foot")
 POSTURE = {"hip": (0.0, 0.12), "thigh": (0.8, 0.25), "calf": (-1.6, 0.3)}  # middle, reach [rad]
 SIGNALS = SignalSettings(cutoff=25.0, velocity="differentiated")
 ARMATURE, DAMPING = 0.01, 0.2
-PRIOR = ConsistentSettings(prior_weight=1.0, draws=0)
-AUTO_PRIOR = ConsistentSettings(draws=0)
-WEAK_PRIOR = ConsistentSettings(prior_weight=1e-4, draws=0)
+PRIOR = ConsistentSettings(prior_weight=1.0)
+AUTO_PRIOR = ConsistentSettings()
+WEAK_PRIOR = ConsistentSettings(prior_weight=1e-4)
 
 
 def robot():

@@ -140,7 +140,7 @@ def motions(is_quick):
     ratios = {is_short: {weight: [] for weight in weights} for is_short in (False, True)}
     for title, model, signals, train, test in cases(is_quick):
         for weight in weights:
-            settings = EstimatorSettings(prior_weight=weight, draws=0)
+            settings = EstimatorSettings(prior_weight=weight)
             found = identify(model, train, validation=test, signals=signals, estimator=settings)
             wls, error = (error_per_joint(found, which) for which in ("wls", "estimate"))
             ratios["short" in title][weight].append(mean(error / wls))

@@ -38,9 +38,9 @@ from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.simulation.motions import random_fourier
-from robotid.estimation.fitting.bands import expected_band
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
 from robotid.estimation.fitting.fit import solve_recordings
+from robotid.estimation.fitting.fitted import expected_band
 from robotid.estimation.fitting.recorded import Recordings
 from robotid.estimation.fitting.survey import hold_log
 from robotid.estimation.variation.draws import scores_to_values
@@ -375,7 +375,7 @@ def groups_of(model, held, unit):
     """Return the fit's information on each run, from logs that were read."""
     held = [replace(log, unit=str(u)) for log, u in zip(held, unit, strict=True)]
     some = Recordings(model, structural_mapping(model), held)
-    return solve_recordings(some, EstimatorSettings(draws=0)).with_errors().runs
+    return solve_recordings(some, EstimatorSettings()).with_errors().runs
 
 
 def fleets(count, units=20):
@@ -526,7 +526,7 @@ def warm_up(honest, count):
             tau[:, 1] += more * (terms[0] * np.sign(v) + terms[1] * v)
             size = terms[0] + terms[1] * np.sqrt(np.mean(v**2))
             true = np.polyfit(t / 60.0, more * size, 1)[0]
-            fit = identify(model, [replace(log, tau=tau)], estimator=EstimatorSettings(draws=0),
+            fit = identify(model, [replace(log, tau=tau)], estimator=EstimatorSettings(),
                            friction="viscous+coulomb", doctor=False)  # fmt: skip
             drifts = [f.evidence for f in fit.findings if f.code == "drift"]
             found += bool(drifts)

@@ -43,11 +43,7 @@ def check_path(path: str | Path) -> None:
 
 
 def check_file(target: Path, inputs: Iterable[str | Path | None] = ()) -> None:
-    """Refuse a path where no file can be written, before its content is computed.
-
-    A file that exists is replaced only if robotid wrote it, and it has not changed since: it has
-    the mark of ``_mark``, or it is of the result in its folder.
-    """
+    """Refuse a path where no file can be written, or with a file that robotid did not write."""
     check_path(target)
     if not target.parent.is_dir():
         raise DataError(
@@ -126,11 +122,7 @@ def _is_written(path: Path) -> bool:
 
 
 def _mark(path: Path) -> int:
-    """Return the last digits of the modification time of a file that robotid wrote [ns].
-
-    They are a hash of its content: a file that is copied or edited has others. The mark needs no
-    record beside the file, and NTFS has it, too, whose times are multiples of 100 ns.
-    """
+    """Return the last digits of the time of a file that robotid wrote: a hash of its content."""
     return 100 * (int(file_sha256(path)[:12], 16) % (_MARKS // 100))
 
 
@@ -153,7 +145,7 @@ _SHOWN = 60  # characters of a name in a message
 
 @contextmanager
 def written_whole(target: str | Path, inputs: Iterable[str | Path | None] = ()) -> Iterator[Path]:
-    """Provide a hidden name in the folder of a file; the written file then replaces the target.
+    """Provide a hidden name beside a file; what is written there then replaces the file.
 
     After an error the target is unchanged, and no hidden file remains. A device, a pipe or
     ``/dev/stdout`` is not replaced: it receives the content when that is complete.
@@ -197,11 +189,7 @@ def _is_stream(path: Path) -> bool:
 
 @contextmanager
 def folder_beside(target: Path) -> Iterator[Path]:
-    """Provide a hidden folder in a folder; its files are then moved to the folder.
-
-    After an error no file is moved, existing files are unchanged, and the hidden folder is
-    removed.
-    """
+    """Provide a hidden folder in a folder; its files are then moved there, or none of them."""
     with tempfile.TemporaryDirectory(prefix=".robotid-", dir=target) as hidden:
         new, old = Path(hidden, "new"), Path(hidden, "old")
         new.mkdir()
@@ -305,10 +293,7 @@ def log_exists(path: Path) -> bool:
 
 
 def file_sha256(path: str | Path) -> str:
-    """Return the SHA-256 of a file, in hexadecimal; of a folder, that of its files' hashes.
-
-    That of an episode depends on the files of its dataset and on its number.
-    """
+    """Return the SHA-256 of a file, in hexadecimal; of a folder, that of its files' hashes."""
     source = Path(path)
     if source.exists() and not source.is_file() and not source.is_dir():
         raise DataError(missing_file(source, "file"))

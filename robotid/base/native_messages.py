@@ -14,10 +14,7 @@ _PLACE = "         at line "  # the second line of such a message: a line of urd
 
 @contextmanager
 def caught_messages() -> Iterator[list[str]]:
-    """Catch the messages that urdfdom and Pinocchio print on file descriptor 2.
-
-    Other output there is printed at the end of the block.
-    """
+    """Catch the messages that urdfdom and Pinocchio print on file descriptor 2."""
     messages: list[str] = []
     with _ONE_AT_A_TIME, tempfile.TemporaryFile() as caught:
         try:

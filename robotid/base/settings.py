@@ -149,9 +149,6 @@ class Settings:
 
         Args:
             table: The table, with keys and types of the ``schema``.
-
-        Raises:
-            SettingsError: If a value is not usable.
         """
         given = {}
         for f, key, (*tables, last) in cls.entries():

@@ -25,10 +25,7 @@ def terminal_width() -> int:
 
 
 def tinted(text: str, word: str, tone: str, stream: TextIO) -> str:
-    """Return text with the first occurrence of a word in colour, for a terminal with colours.
-
-    The text is unchanged for other streams, or if the environment variable NO_COLOR is set.
-    """
+    """Return text with the first occurrence of a word in colour, for a terminal with colours."""
     has_codes = "WT_SESSION" in os.environ if os.name == "nt" else os.getenv("TERM") != "dumb"
     if tone not in _TONES or os.environ.get("NO_COLOR") or not (has_codes and stream.isatty()):
         return text
@@ -59,10 +56,7 @@ def arguments(command: str) -> list[str]:
 
 
 def command_lines(command: str, width: int) -> list[str]:
-    """Return a command in lines of at most a width, to paste into a shell.
-
-    Each argument is in one line, however long; a line that continues ends with a backslash.
-    """
+    """Return a command in lines of at most a width, to paste into a shell."""
     lines = [""]
     for argument in arguments(command):
         if lines[-1].strip() and len(lines[-1]) + len(argument) + 3 > width:

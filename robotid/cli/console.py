@@ -125,11 +125,7 @@ def show_found(
 
 
 class Terminated(KeyboardInterrupt):
-    """The process received SIGTERM or SIGHUP: it cleans up as after Ctrl-C.
-
-    Attributes:
-        number: The signal.
-    """
+    """The process received SIGTERM or SIGHUP: it cleans up as after Ctrl-C."""
 
     def __init__(self, number: int) -> None:
         self.number = number
@@ -137,10 +133,7 @@ class Terminated(KeyboardInterrupt):
 
 
 def open_closed_streams() -> None:
-    """Open a standard stream that is closed, as by ``2>&-``; text written to it is discarded.
-
-    Otherwise the next file that is opened gets the number of the stream.
-    """
+    """Open a standard stream that is closed, as by ``2>&-``; text written to it is discarded."""
     while (number := os.open(os.devnull, os.O_RDWR)) <= _LAST_STREAM:
         pass
     os.close(number)
@@ -165,11 +158,7 @@ def _is_open(stream: TextIO | None) -> bool:
 
 @contextmanager
 def terminations_raised() -> Iterator[None]:
-    """Raise ``Terminated`` at SIGTERM and SIGHUP in the context; later signals are ignored.
-
-    A signal that is ignored already stays ignored, as SIGHUP under nohup. Only the main thread
-    receives signals: the function has no effect in other threads.
-    """
+    """Raise ``Terminated`` at SIGTERM and SIGHUP in the context; later signals are ignored."""
     numbers = [number for number in _ENDS if signal.getsignal(number) is signal.SIG_DFL]
     if threading.current_thread() is not threading.main_thread():
         numbers = []

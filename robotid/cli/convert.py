@@ -44,10 +44,7 @@ def convert(
     joints: Sequence[str] | None = None,
     source: LogSource = _WHOLE,
 ) -> Conversion:
-    """Write a log in another format, with standard column names; no robot model is required.
-
-    Numbers and units are unchanged. They are checked when the log is read with a robot.
-    """
+    """Write a log in another format, with standard column names; no robot model is required."""
     file = Path(path)
     check_file(Path(target), [file])
     opened = open_table(file, source)

@@ -33,12 +33,7 @@ _NOISE = Noise(q=2e-5, v=2e-4, tau=0.02)  # encoder [rad], its rate [rad/s], 2 %
 def run_demo(
     folder: str | Path, *, progress: ProgressCallback | None = None
 ) -> tuple[TorqueIdentification, dict[str, Any], Array]:
-    """Simulate, identify, validate, and write all files.
-
-    The simulated robot has other bodies than its URDF, and armature and friction in every joint.
-
-    -> (b,).
-    """
+    """Simulate, identify, validate, and write all files."""
     target = Path(folder)
     check_folder(target, ["identification.csv", "validation.csv", "result.json", "replay.html"])
     target.mkdir(parents=True, exist_ok=True)

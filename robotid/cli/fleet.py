@@ -4,24 +4,28 @@ import argparse
 import hashlib
 import json
 import shutil
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import groupby
-from operator import itemgetter
 from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
 
 from robotid.base.exceptions import DataError, SettingsError
-from robotid.base.files import check_folder, folder_beside, read_json, write_json, write_text
+from robotid.base.files import (
+    check_folder,
+    dataset_of,
+    folder_beside,
+    read_json,
+    write_json,
+    write_text,
+)
 from robotid.base.versions import __version__, code_versions
 from robotid.cli.console import echo, progress_of, show_found
 from robotid.cli.flags import add_json, add_out, add_progress
 from robotid.cli.identify import identify_job
 from robotid.cli.job import Job, LogEntry, PayloadEntry, read_job, stated_path
-from robotid.cli.logs import identity_of
-from robotid.data.files.parquet_files import parquet_rows, parquet_values, read_text_table
+from robotid.data.files.parquet_files import parquet_rows, read_text_table
 from robotid.data.log import suggestion
 from robotid.dynamics.factors import available_cores
 from robotid.estimation.fitting.estimator_settings import SimulationSettings
@@ -41,7 +45,7 @@ COLUMNS = {
     "job": "job file with the settings",
 }
 _FILES = ("fleet.parquet", "fleet.json", "fleet.html")
-#: Folder of the units that are finished, until all are.
+#: Folder of the identified units.
 UNITS = ".robotid-units"
 _RESULTS: Mapping[str, type] = {
     "unit": str, "log": str, "status": str, "verdict": str, "reasons": str, "parameter": str,
@@ -52,19 +56,12 @@ _RESULTS: Mapping[str, type] = {
 
 @dataclass(frozen=True)
 class FleetUnit(Workload):
-    """A unit with its logs: the work of one task.
-
-    Attributes:
-        unit: Its name.
-        logs: Its logs, and the known payload of each [kg] or None.
-        urdf: Its URDF; that of the job if None.
-        job: Job file with the settings, whose logs are not used; none if None.
-    """
+    """A unit with its logs: the work of one task."""
 
     unit: str
-    logs: tuple[tuple[Path, float | None], ...]
-    urdf: Path | None
-    job: Path | None
+    logs: tuple[tuple[Path, float | None], ...]  # each with its known payload [kg]
+    urdf: Path | None  # that of the job if None
+    job: Path | None  # job file with the settings; its logs are not used
 
     @property
     def name(self) -> str:
@@ -200,10 +197,7 @@ def _mass(source: Path, number: int, text: str) -> float | None:
 
 
 def identify_unit(unit: FleetUnit, threads: int | None) -> UnitRows:
-    """Identify a unit; a failure is a row of its result.
-
-    A log that cannot be read is a row, too; the unit is identified from its other logs.
-    """
+    """Identify a unit; a failure is a row of its result."""
     del threads
     refused: dict[Path, str] = {}
     rows: UnitRows = []
@@ -259,85 +253,52 @@ def run_fleet(
     *,
     plan: WorkPlan | None = None,
     resume: bool = False,
-    update: bool = False,
 ) -> dict[str, Any]:
-    """Identify all units; write fleet.parquet, fleet.json and fleet.html.
-
-    Finished units are stored until all are, and are not repeated by a resumed run, unless their
-    inputs have changed. A unit that ends its worker in every attempt is a failure in the table.
-    Files of results are written when all units are finished, with the same bits.
-    """
-    chosen, target, inputs = plan or WorkPlan(1), Path(folder), _inputs(units)
+    """Identify all units; write fleet.parquet, fleet.json and fleet.html when all are finished."""
+    chosen, target = plan or WorkPlan(1), Path(folder)
     check_folder(target, _FILES)
-    known = _known(target, inputs) if update else frozenset()
     if not resume:
         shutil.rmtree(target / UNITS, ignore_errors=True)
     (target / UNITS).mkdir(parents=True, exist_ok=True)
-    stored = {unit.unit: target / UNITS / f"{_key(inputs, unit)}.json" for unit in units}
-    if known:
-        _keep(target / "fleet.parquet", known, stored)
+    stored = {unit.unit: target / UNITS / f"{_key(unit)}.json" for unit in units}
     missing = [unit for unit in units if not stored[unit.unit].exists()]
+    failed: dict[str, UnitRows] = {}
     with chosen:
         for k, rows in chosen.as_finished(
             identify_unit, missing, "identifying", counted="logs",
             lost=lambda unit, error: [_failure(unit, error)],
         ):  # fmt: skip
-            _store(rows, stored[missing[k].unit])
+            if any(row["status"] == "failed" for row in rows):
+                failed[missing[k].unit] = rows
+            else:
+                write_text(json.dumps(rows, allow_nan=False), stored[missing[k].unit])
         with folder_beside(target) as partial:
             gathered = _Gathered()
             with parquet_rows(partial / "fleet.parquet", _RESULTS) as table:
                 for unit in units:  # one after the other: not all are in memory
-                    rows = read_json(stored[unit.unit], "result of a unit")
+                    rows = failed.get(unit.unit) or read_json(stored[unit.unit], "unit's result")
                     table.add(rows)
                     gathered.add(rows)
-            about = {"robotid": __version__, "outputs": dict(table=_FILES[0], page=_FILES[2])}
-            content = about | gathered.content(units) | {"inputs": inputs}
+            outputs = {"table": _FILES[0], "page": _FILES[2]}
+            content = {"robotid": __version__, "versions": code_versions(), "outputs": outputs}
+            content |= gathered.content(units)
             write_json(content, partial / "fleet.json")
             write_text(fleet_page(content), partial / "fleet.html")
-    shutil.rmtree(target / UNITS)
     return content
 
 
-def _inputs(units: Sequence[FleetUnit]) -> dict[str, Any]:
-    """Return what determines the results, with a hash for each unit."""
-
-    def digest(unit: FleetUnit) -> str:
-        files = [path for path, _ in unit.logs] + [x for x in (unit.urdf, unit.job) if x]
-        states = [identity_of(path) if path.exists() else None for path in files]
-        text = json.dumps([states, [mass for _, mass in unit.logs], str(unit.urdf), str(unit.job)])
-        return hashlib.sha256(text.encode()).hexdigest()
-
-    return {"versions": code_versions(), "units": {unit.unit: digest(unit) for unit in units}}
-
-
-def _known(folder: Path, inputs: Mapping[str, Any]) -> frozenset[str]:
-    """Return the units of the results in a folder that have the same inputs."""
-    stated = read_json(folder / "fleet.json", "fleet to update").get("inputs", {})
-    if stated.get("versions") != inputs["versions"]:
-        raise DataError(
-            f"the results in {folder} are of other versions of robotid or its packages; run "
-            "without --update"
-        )
-    own = inputs["units"].items()
-    return frozenset(name for name, key in own if stated["units"].get(name) == key)
-
-
-def _key(inputs: Mapping[str, Any], unit: FleetUnit) -> str:
+def _key(unit: FleetUnit) -> str:
     """Return a hash of a unit and of all inputs of its result."""
-    text = json.dumps([inputs["versions"], unit.unit, inputs["units"][unit.unit]])
-    return hashlib.sha256(text.encode()).hexdigest()
-
-
-def _store(rows: UnitRows, path: Path) -> None:
-    write_text(json.dumps(rows, allow_nan=False), path)
-
-
-def _keep(table: Path, known: Collection[str], stored: Mapping[str, Path]) -> None:
-    """Store the results of units in a table as finished, if nothing failed."""
-    for name, rows in groupby(parquet_values(table), key=itemgetter("unit")):
-        of_unit = list(rows)
-        if name in known and all(row["status"] == "done" for row in of_unit):
-            _store(of_unit, stored[name])
+    files = [path for path, _ in unit.logs] + [x for x in (unit.urdf, unit.job) if x]
+    states = [
+        [str(file), file.stat().st_size, file.stat().st_mtime_ns]
+        for path in files
+        for place in [(dataset_of(path) or path).resolve()]
+        for file in (sorted(place.rglob("*")) if place.is_dir() else [place])
+        if file.is_file()
+    ]
+    stated = [unit.unit, [mass for _, mass in unit.logs], str(unit.urdf), str(unit.job)]
+    return hashlib.sha256(json.dumps([code_versions(), states, stated]).encode()).hexdigest()
 
 
 class _Gathered:
@@ -416,9 +377,8 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--workers", type=int, metavar="N", help=words)
     words = "address of a Dask cluster, as tcp://host:8786"
     group.add_argument("--scheduler", metavar="ADDRESS", help=words)
-    add("--resume", action="store_true", help="continue an interrupted run in --out")
-    words = "take units whose inputs have not changed from the results in --out"
-    add("--update", action="store_true", help=words)
+    words = "keep the units of --out that were identified and whose inputs have not changed"
+    add("--resume", action="store_true", help=words)
     add_json(parser)
     add_progress(parser)
 
@@ -429,9 +389,7 @@ def run(options: argparse.Namespace) -> int:
         units = read_fleet(options.table, options.urdf, options.job)
         workers = available_cores() if options.workers is None else options.workers
         plan = WorkPlan(workers, options.scheduler, progress)
-        content = run_fleet(
-            units, options.out, plan=plan, resume=options.resume, update=options.update
-        )
+        content = run_fleet(units, options.out, plan=plan, resume=options.resume)
     show_found(content, options, _show, ["fleet.parquet", "fleet.html", "fleet.json"])
     return 0 if content["done"] else 1
 

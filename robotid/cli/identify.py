@@ -175,10 +175,7 @@ def identify(
 def run_job(
     job: Job, folder: str | Path, *, plan: WorkPlan | None = None, source: Sequence[str] = ()
 ) -> tuple[Identification, dict[str, Any]]:
-    """Identify and write result.json, report and URDF; return the result and result.json.
-
-    The words of the source, after ``robotid identify``, repeat the run.
-    """
+    """Identify and write result.json, report and URDF; return the result and result.json."""
     chosen, target = plan or WorkPlan(job.workers or 1), Path(folder)
     model = job.model()
     check_folder(target, ["result.json", *_names(model)])
@@ -279,10 +276,7 @@ def _replay_of(found: Identification, job: Job, folder: Path) -> "Replay":
 
 
 def _job_of(identification: Identification) -> Job:
-    """Return the job of an identification; one made in Python gets an equivalent job.
-
-    Logs in memory have no file, and a ``Log`` has no gains, units or names of columns.
-    """
+    """Return the job of an identification; one made in Python gets an equivalent job."""
     model, asked = identification.model, identification.stated
     if isinstance(asked.job, Job):
         return asked.job
@@ -349,8 +343,7 @@ def identify_job(
         which = "no log is usable" if job.identification else "no log is given"
         raise DataError(f"{which}, wanted at least one to identify from")
     report_stage(plan.progress, "checking logs")
-    placed = locked_as_logged(job, model, fitted, validation)
-    job, model, fitted, validation = placed.job, placed.model, placed.fitted, placed.validation
+    job, model, fitted, validation, notes = locked_as_logged(job, model, fitted, validation)
     locked = locked_findings(model, job.placed(model))
     found = [*locked, *examine_logs(job, model, fitted, validation)]
     recordings = Recordings(model, structural_mapping(model), fitted, validation)
@@ -374,7 +367,7 @@ def identify_job(
     return replace(
         concluded,
         stated=replace(concluded.stated, job=job),
-        findings=(*placed.notes, *concluded.findings),
+        findings=(*notes, *concluded.findings),
         payload_checks=check_payloads(job, concluded.model, fitted),
     )
 

@@ -331,15 +331,7 @@ class Job(Settings):
 
 
 def read_job(path: str | Path) -> Job:
-    """Read a job file.
-
-    Args:
-        path: The TOML file. Paths in it are relative to its folder; ``$NAME`` in a path is replaced
-            by the environment variable.
-
-    Raises:
-        SettingsError: If the file is missing, is not TOML, or a key or a value is wrong.
-    """
+    """Read a job file."""
     require_kind(path, (str, Path), "path", "the path of a job file")
     check_path(path)
     source = Path(path)

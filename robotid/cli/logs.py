@@ -1,16 +1,16 @@
 """The logs of a job: opened once, examined, and identified by their inputs."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
 from robotid.base.exceptions import DataError, SettingsError
-from robotid.base.files import dataset_of, file_sha256, log_exists
+from robotid.base.files import file_sha256, log_exists
 from robotid.base.findings import Finding, by_severity
 from robotid.base.typing import STAGES, ProgressCallback, report_stage
 from robotid.cli.job import Job, LogEntry, written_job
@@ -19,7 +19,7 @@ from robotid.data.files.read import LogLayout
 from robotid.data.files.table import Table
 from robotid.data.log import Log
 from robotid.diagnosis.logs.check_logs import diagnose
-from robotid.diagnosis.logs.locked_joints import STILL, check_locked, percent_hint
+from robotid.diagnosis.logs.motion_checks import STILL, check_locked, percent_hint
 from robotid.diagnosis.verdict.fit_findings import log_findings
 from robotid.diagnosis.verdict.verdict import check_ignored
 from robotid.dynamics.base_parameters import structural_mapping
@@ -43,12 +43,7 @@ def survey_logs(
     refuse: Callable[[LogEntry, DataError], None] | None = None,
     needs: Needs = "torque",
 ) -> tuple[tuple[SurveyedLog, ...], ...]:
-    """Return the logs of each group, ready to be read.
-
-    The logs are in memory if all their files together have at most the permitted number of rows,
-    or if the model is static. Files of formats that are only read whole do not count. Otherwise
-    each log is divided into pieces of a fixed number of rows: an eighth of the permitted number.
-    """
+    """Return the logs of each group, ready to be read."""
     paths = dict.fromkeys(entry.path for entry in chain(*groups))
     opened = {path: _open(job, model, path, needs) for path in paths}
     rows = sum(_count(found) for found in opened.values())
@@ -104,44 +99,27 @@ def examine(
     groups = job.identification, job.validation
     fitted, validation = survey_logs(job, model, *groups, refuse=refuse, needs="any")
     report_stage(progress, "checking logs", STAGES[:2])
-    placed = locked_as_logged(job, model, fitted, validation)
-    found = examine_logs(placed.job, placed.model, placed.fitted, placed.validation)
-    return by_severity([*refused, *placed.notes, *found])
+    job, model, first, second, notes = locked_as_logged(job, model, fitted, validation)
+    return by_severity([*refused, *notes, *examine_logs(job, model, first, second)])
 
 
-@dataclass(frozen=True, eq=False)
-class LockedLogs:
-    """A job whose joints are locked at their positions in the logs.
-
-    Attributes:
-        job: The job.
-        model: Its robot.
-        fitted: Its logs to fit.
-        validation: Its validation logs.
-        notes: The joints that were locked so with their positions, if there are any.
-    """
-
-    job: Job
-    model: RobotModel
-    fitted: tuple[SurveyedLog, ...]
-    validation: tuple[SurveyedLog, ...]
-    notes: tuple[Finding, ...] = ()
+#: A job, its robot, its logs to fit, its validation logs, and notes on them.
+LockedLogs: TypeAlias = tuple[
+    Job, RobotModel, Sequence[SurveyedLog], Sequence[SurveyedLog], tuple[Finding, ...]
+]
 
 
 def locked_as_logged(
     job: Job, model: RobotModel, fitted: Sequence[SurveyedLog], validation: Sequence[SurveyedLog]
 ) -> LockedLogs:
-    """Return the job with joints locked at their positions in the logs, unless it states them.
-
-    A joint that moves, or has another position in another log, is left to ``check_locked``.
-    """
+    """Return the job with joints locked at their positions in the logs, unless it states them."""
     logged, logs = {}, (*fitted, *validation)
     for joint in [joint for joint in model.locked if joint not in job.placed(model)]:
         found = [log.locked[joint] for log in logs if joint in log.locked]
         if found and np.ptp(np.concatenate(found)) <= STILL:
             logged[joint] = float(np.median(np.concatenate(found)))
     if not logged:
-        return LockedLogs(job, model, tuple(fitted), tuple(validation))
+        return job, model, fitted, validation, ()
     shown = ", ".join(f"{joint} = {position:.4g}" for joint, position in logged.items())
     message = (
         f"joints are locked at their positions in the logs: {shown}. State other positions with "
@@ -152,7 +130,7 @@ def locked_as_logged(
     job = replace(job, locked={**job.locked, **logged})
     model = job.model()
     first, second = (tuple(replace(x, model=model) for x in logs) for logs in (fitted, validation))
-    return LockedLogs(job, model, first, second, notes=(note,))
+    return job, model, first, second, (note,)
 
 
 def examine_logs(
@@ -196,17 +174,6 @@ def result_run(job: Job, path: str | Path) -> tuple[Job, list[LogEntry], RobotMo
     return job, fitted, model, Run.of(recordings, stated_parameters(result, model), details)
 
 
-def identity_of(path: Path) -> dict[str, Any]:
-    """Return size [bytes] and time of change [ns] of a file, or of each file of a folder."""
-    whole = (dataset_of(path) or path).resolve()
-    files = sorted(p for p in whole.rglob("*") if p.is_file()) if whole.is_dir() else [whole]
-    found = {}
-    for file in files:
-        about = file.stat()
-        found[str(file)] = {"size": about.st_size, "changed": about.st_mtime_ns}
-    return found
-
-
 def _open(
     job: Job, model: RobotModel, path: Path, needs: Needs
 ) -> tuple[LogLayout, Table] | DataError:
@@ -226,10 +193,7 @@ def _count(found: tuple[LogLayout, Table] | DataError) -> int:
 
 
 def log_of_commands(job: Job, entry: LogEntry, result: Result) -> Log:
-    """Return a log with the inputs of the simulated robot, gravity compensation included.
-
-    The input is the command; it is the torque where the logged torque drives the robot.
-    """
+    """Return a log with the inputs of the simulated robot, gravity compensation included."""
     log = job.read(entry, result.robot, needs=needed_of(job))
     if job.controller.kind == "torque":
         from robotid.identification.closed_loop.from_commands import driven_log

@@ -10,14 +10,10 @@ class CommandParser(argparse.ArgumentParser):
     """A parser that suggests the nearest choice, and whose help may show its main flags only.
 
     A flag with one value is refused if it occurs twice.
-
-    Attributes:
-        main_flags: Flags of the short help; all flags are shown if it is empty.
-        examples: Command lines at the end of the short help.
     """
 
-    main_flags: Sequence[str] = ()
-    examples: Sequence[str] = ()
+    main_flags: Sequence[str] = ()  # of the short help; all flags if empty
+    examples: Sequence[str] = ()  # command lines at its end
 
     def __init__(self, *words: Any, **settings: Any) -> None:  # noqa: ANN401
         super().__init__(*words, **settings)

@@ -31,11 +31,7 @@ def preview_job(
     noise: Mapping[str, float] | None = None,
     correlation: float | None = None,
 ) -> dict[str, Any]:
-    """Preview the logs of a job from their positions alone.
-
-    A given result adds the information of its logs, and its noise. If one of the motions is a log
-    of that result, all logs of the result are previewed and compared with its standard errors.
-    """
+    """Preview the logs of a job from their positions alone."""
     stated: dict[str, Any] = {"noise": noise, "correlation": correlation}
     if not job.identification:
         raise DataError("no motion is given, wanted at least one to preview")

@@ -40,7 +40,7 @@ from robotid.output.files.result_file import (
     stated_model,
     stated_urdf_with_drives,
 )
-from robotid.output.files.shape import FILE, NUMBER, TABLE, TEXT, check_shape
+from robotid.output.files.shape import check_shape, schema
 from robotid.output.report.pictures import shown_evaluation
 from robotid.output.viewer.replays import Bands, Mark, Replay, Torques, replay
 from robotid.output.viewer.unexplained import find_unexplained
@@ -54,12 +54,6 @@ _PROJECTED = "Torques: the part that contact forces cannot cause."
 _DRIVEN = "URDF + drives"
 
 #: The entries of a track.json that are read.
-_TRACK = {
-    "settings": TABLE,
-    "history": FILE,
-    "changes": [{"onset": NUMBER, "payload": {"mass": NUMBER, "std_error": NUMBER, "body": TEXT}}],
-    "base_parameters": [{"name": TEXT, "unit": TEXT}],
-}
 
 
 @dataclass(frozen=True)
@@ -192,10 +186,7 @@ def replay_identified(identification: TorqueIdentification) -> Replay:
 
 
 def _replay_commanded(job: Job, results: Mapping[str, Result], ghost: str | Path | None) -> Replay:
-    """Return the replay of a log of commands: measured, commanded and simulated robot.
-
-    Poses are those of the URDF's joints, whose zero may differ from that of the encoders.
-    """
+    """Return the replay of a log of commands: measured, commanded and simulated robot."""
     (entry,) = job.identification
     first = next(iter(results.values()))
     model, zero = first.robot, np.array([drive.zero for drive in first.commanded])
@@ -282,7 +273,7 @@ def _track(path: Path) -> Mapping[str, Any] | None:
     content = read_json(path, "result")
     if not (isinstance(content, dict) and {"history", "changes"} <= set(content)):
         return None
-    check_shape(content, _TRACK, path.name)
+    check_shape(content, schema("track"), path.name)
     return content
 
 
@@ -293,10 +284,7 @@ def _torques(
     robots: Mapping[str, RobotModel],
     results: Mapping[str, Mapping[str, Any]],
 ) -> Torques:
-    """Return measured torques, and those predicted by each result and by the URDF.
-
-    "URDF + drives" has the bodies of the URDF, and the drives that the first result fits to them.
-    """
+    """Return measured torques, and those predicted by each result and by the URDF."""
     shown: dict[str, Array] = {}
     driven: dict[str, Array] = {}
     motion = None
@@ -356,10 +344,7 @@ def _payloads(track: Mapping[str, Any] | None) -> list[Mark]:
 
 
 def _limits_used(job: Job, motion: Log, model: RobotModel) -> tuple[list[Mark], list[str]]:
-    """Return marks at the smallest margin to each limit and at the smallest distance, and notes.
-
-    The notes state what cannot be marked and why: the URDF may lack limits or shapes.
-    """
+    """Return marks at the smallest margin to each limit and at the smallest distance, and notes."""
     v = np.gradient(motion.q, motion.t, axis=0) if motion.v is None else motion.v
     a = np.gradient(v, motion.t, axis=0) if motion.a is None else motion.a
     torque = predict_instants(model, model.standard_parameters(), motion.q, v, a)

@@ -1,8 +1,7 @@
 """robotid report: write the report of a result again from its inputs."""
 
 import argparse
-from collections.abc import Mapping, Sequence
-from itertools import chain
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -28,10 +27,7 @@ _PART = 0.01  # ... or over its standard error, for the tolerance of solvers
 def rewrite_report(
     path: str | Path, target: str | Path | None = None, *, progress: ProgressCallback | None = None
 ) -> dict[str, Any]:
-    """Write the report of a result again, in the form of this version of robotid.
-
-    The fit is repeated with the inputs and settings of the result.
-    """
+    """Write the report of a result again, in the form of this version of robotid."""
     loaded = load_result(path)
     content, folder = loaded.content, loaded.path.parent
     goal = folder / "report.html" if target is None else Path(target)
@@ -42,14 +38,13 @@ def rewrite_report(
     found = identify_job(job, job.model(), WorkPlan(job.workers or 1, progress=progress))
     _require_same(found, content, loaded.path.name)
     report_stage(progress, "writing")
-    beside = {"result": loaded.path.name, **content["outputs"], "replay": "replay.html"}
+    is_beside = goal.resolve().parent == folder.resolve()
+    names = {"result": loaded.path.name, **content["outputs"], "replay": "replay.html"}
     files = {
         what: name
-        for what, name in beside.items()
-        if what != "report" and goal.resolve().with_name(name) == (folder / name).resolve()
-        if (folder / name).is_file()
+        for what, name in names.items()
+        if is_beside and what != "report" and (folder / name).is_file()
     }
-    is_beside = goal.resolve().parent == folder.resolve()
     origin = Origin((), str(folder), "replay.html" if is_beside else "")
     write_report(found, goal, files=files, origin=origin)
     return {"result": str(loaded.path), "report": str(goal)}
@@ -57,46 +52,31 @@ def rewrite_report(
 
 def _check_inputs(job: Job, content: Mapping[str, Any], name: str) -> None:
     """Refuse inputs that differ from those of the result."""
-    inputs = {
-        role: [entry for entry in content["inputs"] if entry["role"] == role]
-        for role in ("urdf", "identification", "validation")
+    roles = {"urdf": [job.urdf]} | {
+        role: [entry.path for entry in getattr(job, role)]
+        for role in ("identification", "validation")
     }
-    if not all(entry["path"] for entries in inputs.values() for entry in entries):
-        raise DataError(
-            f"{name} has a log in memory as input, which no longer exists; write the report in "
-            "Python, robotid.write_report(found, ...)"
-        )
-    logs = [entry.path for entry in (*job.identification, *job.validation)]
-    _check_counts(inputs, job, name)
-    for path, entry in zip([job.urdf, *logs], chain(*inputs.values()), strict=True):
-        what, wanted = "URDF" if entry["role"] == "urdf" else "log", entry["sha256"]
-        if not log_exists(path):
+    for role, paths in roles.items():
+        stated = [entry for entry in content["inputs"] if entry["role"] == role]
+        if not all(entry["path"] for entry in stated):
             raise DataError(
-                f"the {what} {str(path)!r}, an input of {name}, does not exist; restore it, or "
-                "identify again"
+                f"{name} has a log in memory as input, which no longer exists; write the report "
+                "in Python, with robotid.save_result"
             )
-        if not wanted:
+        if len(stated) != len(paths):
             raise DataError(
-                f"{name} states no SHA-256 of its input, the {what} {str(path)!r}; changes of the "
-                "file cannot be detected. Identify again"
+                f"{name} has {len(stated)} inputs of the role {role!r}, but its settings name "
+                f"{len(paths)}: the file was edited. Identify again"
             )
-        if (found := file_sha256(path)) != wanted:
-            raise DataError(
-                f"the {what} {str(path)!r} has changed since {name} was written: its SHA-256 "
-                f"starts with {found[:12]}, wanted {wanted[:12]}; restore the file, or identify "
-                "again"
-            )
-
-
-def _check_counts(inputs: Mapping[str, Sequence[Any]], job: Job, name: str) -> None:
-    """Refuse a result with another number of inputs than its settings state."""
-    stated = {"urdf": [job.urdf], "identification": job.identification}
-    for role, entries in (stated | {"validation": job.validation}).items():
-        if len(inputs[role]) != len(entries):
-            raise DataError(
-                f"{name} has {len(inputs[role])} inputs of the role {role!r}, but its settings "
-                f"name {len(entries)}: the file was edited. Identify again"
-            )
+        for path, entry in zip(paths, stated, strict=True):
+            what = f"the {'URDF' if role == 'urdf' else 'log'} {str(path)!r}, an input of {name},"
+            if not log_exists(path):
+                raise DataError(f"{what} does not exist; restore it, or identify again")
+            if file_sha256(path) != entry["sha256"]:
+                raise DataError(
+                    f"{what} has changed: its SHA-256 is not the stated one; restore the file, or "
+                    "identify again"
+                )
 
 
 def _require_same(found: Identification, content: Mapping[str, Any], name: str) -> None:

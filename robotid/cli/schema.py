@@ -29,11 +29,7 @@ _TABLES: Mapping[str, type[Settings]] = {
 
 
 def job_schema() -> dict[str, Any]:
-    """Return the JSON schema of a job file: every key, its types and its description.
-
-    References:
-        JSON Schema, draft 2020-12.
-    """
+    """Return the JSON schema of a job file: every key, its types and its description."""
     keys = dict(Job.paths())
     for kind in ESTIMATORS.values():
         keys |= {f"estimator.{name}": key for name, key in kind.paths().items()}

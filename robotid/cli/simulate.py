@@ -1,7 +1,6 @@
 """robotid simulate: simulate a log of a motion with a robot of known parameters."""
 
 import argparse
-from collections.abc import Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -124,18 +123,17 @@ def _truth(
 ) -> dict[str, Any]:
     """Return the true parameters and settings of the log, and the tracking errors."""
     layout, size = model.layout, model.layout.n_inertial
-    urdf = model.standard_parameters()
     mapping = structural_mapping(model)
     units = [layout.units[i] for i in mapping.independent]
 
     def base(parameters: Array) -> list[dict[str, Any]]:
-        entries = _entries(mapping.base_names, units, mapping.to_base(parameters))
-        words = zip(entries, mapping.expressions, strict=True)
-        return [entry | {"expression": expression} for entry, expression in words]
+        values = mapping.to_base(parameters)
+        return _rows(
+            name=mapping.base_names, value=values, unit=units, expression=mapping.expressions
+        )
 
-    loaded = carried(model, pi, settings.payload)
-    standard = _entries(layout.names, layout.units, pi)
-    for entry, value in zip(standard[:size], urdf.tolist(), strict=False):
+    standard = _rows(name=layout.names, value=pi, unit=layout.units)
+    for entry, value in zip(standard[:size], model.standard_parameters().tolist(), strict=False):
         entry["urdf"] = value
     error = run.q - run.reference
     content: dict[str, Any] = {
@@ -150,38 +148,26 @@ def _truth(
         "standard_parameters": standard[:size],
         "drive_parameters": standard[size:],
         "base_parameters": base(pi),
-        "following": [
-            {
-                "joint": joint,
-                "rms": rms,
-                "largest": largest,
-                "range": moved,
-                "commanded": commanded,
-                "unit": unit,
-                "at_limit": share,
-            }
-            for joint, rms, largest, moved, commanded, unit, share in zip(
-                model.joints,
-                np.sqrt(np.mean(error**2, axis=0)).tolist(),
-                np.abs(error).max(axis=0).tolist(),
-                np.ptp(run.q, axis=0).tolist(),
-                np.ptp(run.reference, axis=0).tolist(),
-                ["m" if joint in layout.prismatic else "rad" for joint in model.joints],
-                run.saturated.tolist(),
-                strict=True,
-            )
-        ],
+        "following": _rows(
+            joint=model.joints,
+            rms=np.sqrt(np.mean(error**2, axis=0)),
+            largest=np.abs(error).max(axis=0),
+            range=np.ptp(run.q, axis=0),
+            commanded=np.ptp(run.reference, axis=0),
+            unit=["m" if joint in layout.prismatic else "rad" for joint in model.joints],
+            at_limit=run.saturated,
+        ),
     }
     if settings.payload.mass > 0:
+        loaded = carried(model, pi, settings.payload)
         content["base_parameters_with_payload"] = base(loaded)
     return content
 
 
-def _entries(names: Sequence[str], units: Sequence[str], values: Array) -> list[dict[str, Any]]:
-    return [
-        {"name": name, "value": value, "unit": unit}
-        for name, unit, value in zip(names, units, values.tolist(), strict=True)
-    ]
+def _rows(**columns: Any) -> list[dict[str, Any]]:  # noqa: ANN401
+    """Return the rows of a table of lists and arrays."""
+    plain = [x.tolist() if isinstance(x, np.ndarray) else x for x in columns.values()]
+    return [dict(zip(columns, row, strict=True)) for row in zip(*plain, strict=True)]
 
 
 _HALF = 0.5  # of the commanded range: a joint that moves less does not follow

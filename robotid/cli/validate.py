@@ -29,20 +29,20 @@ from robotid.cli.logs import log_of_commands, survey_logs, units_of_logs
 from robotid.data.log import Log
 from robotid.diagnosis.logs.check_logs import diagnose
 from robotid.diagnosis.verdict.evidence import Determined, Predictions
+from robotid.diagnosis.verdict.fit_findings import unlike_findings
 from robotid.diagnosis.verdict.position_verdict import judge_positions
-from robotid.diagnosis.verdict.unlike_runs import unlike_findings
 from robotid.diagnosis.verdict.verdict import Verdict, VerdictWarning, blocking, judge, warnings_of
 from robotid.dynamics.base_parameters import structural_mapping
-from robotid.estimation.fitting.bands import rms_error, torque_band
 from robotid.estimation.fitting.evaluation import (
     Evaluation,
+    Metrics,
     evaluate_logs,
     hidden_joints,
     shares_rows,
 )
 from robotid.estimation.fitting.fit import sums_of_logs
-from robotid.estimation.fitting.metrics import Metrics
 from robotid.estimation.fitting.recorded import Recordings
+from robotid.estimation.fitting.standard_errors import rms_error, torque_band
 from robotid.estimation.fitting.survey import SurveyedLog
 from robotid.estimation.variation.groups import RunSums, runs_of
 from robotid.estimation.variation.variation import vary
@@ -88,11 +88,7 @@ def check_update(result: Result, job: Job, entries: Sequence[LogEntry]) -> None:
 def add_logs(
     result: Result, model: RobotModel, job: Job, logs: Sequence[SurveyedLog]
 ) -> tuple[dict[str, Any], tuple[Finding, ...]] | None:
-    """Return the variation between the logs of a result and new ones, and findings about these.
-
-    The sums of the new logs about the parameters of the fit are added to those of the others; the
-    mixed-effects model is that of all. To first order it is the variation of a fit to all logs.
-    """
+    """Return the variation between the logs of a result and new ones, and findings about these."""
     stated = result.content.get("variation", {})
     if "sums" not in stated:
         return None
@@ -200,11 +196,7 @@ def validate(
 def _expected(
     result: Mapping[str, Any], model: RobotModel, evaluation: Evaluation
 ) -> dict[str, Any]:
-    """Return the expected torque error of a log by the result, and how often it is within 95 %.
-
-    The error has the uncertainty of the parameters, the spread of the drives between logs, if three
-    or more were fitted, and the residual of the fit.
-    """
+    """Return the expected torque error of a log by the result, and how often it is within 95 %."""
     covariance = stated_covariance(result, model.layout.names)
     if covariance is None:
         return {}

@@ -13,7 +13,7 @@ from robotid.base.settings import is_number, require_each, require_kind
 from robotid.base.typing import Array
 from robotid.data.files.read import Readable
 from robotid.data.signal_settings import SignalSettings
-from robotid.diagnosis.verdict.payload_check import PayloadCheck
+from robotid.diagnosis.verdict.scale_check import PayloadCheck
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.factors import join
 from robotid.estimation.estimators import Consistent, Constraints, Estimate
@@ -337,7 +337,7 @@ def fit_with_friction(
     own: Mapping[str, tuple[DriveTerm, ...]] = {}
     if any(names != () for names in wanted.values()):
         judged = rescaled(gains) if gains else reference
-        own = with_drives(judged, ConsistentSettings(draws=0), wanted).model.layout.own
+        own = with_drives(judged, ConsistentSettings(), wanted).model.layout.own
     if own:
         model = reference.model.with_terms(own)
         loaded, reference = (run.with_model(model) for run in (loaded, reference))

@@ -31,7 +31,7 @@ def result(tmp_path_factory):
     log = exact_log(model, truth(model), rng, samples=400, noise=0.1)
     robotid.write_log(log, folder / "first.csv")
     (folder / "job.toml").write_text(
-        f'urdf = "{urdf}"\n[estimator]\ndraws = 0\n[[identification]]\nlog = "first.csv"\n'
+        f'urdf = "{urdf}"\n[[identification]]\nlog = "first.csv"\n'
     )
     run_job(read_job(folder / "job.toml"), folder / "out")
     return folder / "out"

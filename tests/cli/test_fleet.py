@@ -111,61 +111,41 @@ def test_an_interrupted_run_is_resumed_with_the_same_bits(table, done, tmp_path,
         fleet, "identify_unit", lambda unit, threads: repeated.append(unit.unit) or first(unit, 1)
     )
     run_fleet(units, tmp_path, resume=True)
-    assert repeated == ["c", "d"]
+    assert repeated == ["a", "c", "d"]  # a has a lost log
     for name in FILES:
         assert (tmp_path / name).read_bytes() == (done[0] / name).read_bytes()
-    assert {path.name for path in tmp_path.iterdir()} == set(FILES)
+    assert {path.name for path in tmp_path.iterdir()} == {fleet.UNITS, *FILES}
 
 
-def test_only_units_with_the_same_inputs_are_resumed(table, tmp_path, monkeypatch):
-    units, seen = read_fleet(table), []
-
-    def interrupted(unit, threads):
-        seen.append(unit.unit)
-        if unit.unit == "c":
-            raise KeyboardInterrupt
-        return [fleet._failure(unit, DataError("no"))]
-
-    monkeypatch.setattr(fleet, "identify_unit", interrupted)
-    other = [replace(units[0], logs=units[0].logs[:1]), *units[1:]]
-    for resumed, options in ((units, {}), (other, {"resume": True}), (other, {})):
-        with pytest.raises(KeyboardInterrupt):
-            run_fleet(resumed, tmp_path, **options)
-    assert seen == ["a", "b", "c", "a", "c", "a", "b", "c"]
-
-
-def test_units_with_the_same_inputs_are_kept_and_new_logs_added(
-    table, done, tmp_path, monkeypatch, capsys
-):
+def test_units_with_the_same_inputs_are_kept_and_new_logs_added(table, done, tmp_path, monkeypatch):
     units, first, repeated = read_fleet(table), fleet.identify_unit, []
     monkeypatch.setattr(
         fleet, "identify_unit", lambda unit, threads: repeated.append(unit.unit) or first(unit, 1)
     )
     shutil.copytree(done[0], tmp_path / "own")
-    same = run_fleet(units, tmp_path / "own", update=True)
+    same = run_fleet(units, tmp_path / "own", resume=True)
     assert same == done[1]
     assert repeated == ["a", "d"]  # with a failure
     for name in FILES:
         assert (tmp_path / "own" / name).read_bytes() == (done[0] / name).read_bytes()
     repeated.clear()
     extra = replace(units[2], logs=(*units[2].logs, units[1].logs[0]))
-    changed = [units[1], extra]
-    found = run_fleet(changed, tmp_path / "own", update=True)
-    assert repeated == ["c"]
-    assert found["logs"] == 3
+    changed = [
+        units[1],
+        extra,
+        replace(units[1], unit="loaded", logs=((units[1].logs[0][0], 2.0),)),
+    ]
+    found = run_fleet(changed, tmp_path / "own", resume=True)
+    assert repeated == ["c", "loaded"]
+    assert found["logs"] == 4
     run_fleet(changed, tmp_path / "whole")
     for name in FILES:
         own = (tmp_path / "own" / name).read_bytes()
         assert own == (tmp_path / "whole" / name).read_bytes()
-    stated = json.loads((tmp_path / "own" / "fleet.json").read_text())
-    stated["inputs"]["versions"]["numpy"] = "0.1"
-    (tmp_path / "own" / "fleet.json").write_text(json.dumps(stated))
-    with pytest.raises(DataError, match="are of other versions of robotid or its packages; run w"):
-        run_fleet(changed, tmp_path / "own", update=True)
-    words = ["fleet", str(table), "--out", str(tmp_path / "none"), "--update"]
-    assert main(words) == 1
-    assert "fleet.json" in capsys.readouterr().err
-    assert not (tmp_path / "none").exists()
+    repeated.clear()
+    monkeypatch.setattr(fleet, "code_versions", lambda: {"numpy": "0.1"})
+    run_fleet(units[1:2], tmp_path / "own", resume=True)
+    assert repeated == ["b"]
 
 
 def test_rows_state_urdf_job_and_payload(tmp_path):

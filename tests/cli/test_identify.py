@@ -46,7 +46,7 @@ def test_files_of_an_earlier_run_do_not_stay_beside_a_new_result(arm, rng, tmp_p
     write_log(log, tmp_path / "run.csv")
     job = Job(Path(arm.tree.path), identification=(LogEntry(tmp_path / "run.csv"),))
     out = tmp_path / "out"
-    _, result = run_job(replace(job, estimator=EstimatorSettings(draws=0)), out)
+    _, result = run_job(replace(job, estimator=EstimatorSettings()), out)
     written = [out / result["outputs"][key] for key in ("urdf", "sidecar", "report")]
     assert all(path.exists() for path in written)
     noisy = replace(log, tau=log.tau + 30.0 * rng.standard_normal(log.tau.shape))

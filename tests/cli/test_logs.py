@@ -43,17 +43,16 @@ def test_a_joint_is_locked_at_the_median_of_all_logs_if_it_stands_there_in_each(
     first = Held({"jc": np.array([0.3, 0.3001]), "jd": np.array([0.1, 0.1])})
     second = Held({"jc": np.array([0.3004, 0.3002, 0.3001])})
     far = Held({"jd": np.array([0.4, 0.4])})
-    found = locked_as_logged(hand, model, [first], [second])
-    assert found.job.locked == {"jc": pytest.approx(0.3001), "jd": pytest.approx(0.1)}
-    assert found.model.locked["jc"] == pytest.approx(0.3001)
-    (note,) = found.notes
+    job, own, fitted, kept, (note,) = locked_as_logged(hand, model, [first], [second])
+    assert job.locked == {"jc": pytest.approx(0.3001), "jd": pytest.approx(0.1)}
+    assert own.locked["jc"] == pytest.approx(0.3001)
     assert (note.code, note.severity) == ("locked_as_logged", "note")
     assert "jc = 0.3001, jd = 0.1." in note.message
-    assert {log.model for log in (*found.fitted, *found.validation)} == {found.model}
-    found = locked_as_logged(hand, model, [first, far], [second])
-    assert found.job.locked == {"jc": pytest.approx(0.3001)}
+    assert {log.model for log in (*fitted, *kept)} == {own}
+    job, *_ = locked_as_logged(hand, model, [first, far], [second])
+    assert job.locked == {"jc": pytest.approx(0.3001)}
     stated = replace(hand, locked={"jc": 0.0, "jd": 0.2})
-    assert locked_as_logged(stated, stated.model(), [first], [second]).notes == ()
+    assert locked_as_logged(stated, stated.model(), [first], [second])[-1] == ()
 
 
 @pytest.mark.parametrize("at", [0, 1, 2])

@@ -77,7 +77,7 @@ def test_a_log_and_a_result_are_references_alike(files, capsys):
 
 def test_a_job_states_a_check_of_the_scale_which_its_result_has(files):
     table = {
-        "urdf": ARM, "identification": [{"log": "bare.csv"}], "estimator": {"draws": 0},
+        "urdf": ARM, "identification": [{"log": "bare.csv"}],
         "model": {"friction": "viscous+coulomb"}, "output": {"report": False},
         "payload_check": [
             {"log": "loaded.csv", "mass": 1.8, "link": "tool0", "end": 3.0},

@@ -35,9 +35,7 @@ def run(recordings, tmp_path_factory):
                 patch.setenv("ROBOTID_DATA", str(recordings))
                 job = read_job(JOBS / f"{name}.toml")
             folder = tmp_path_factory.mktemp(name)
-            # no interval is asked for here: no sample of fits is drawn
-            estimator = replace(job.estimator, draws=0)
-            job = replace(job, report=name == "kinova_gen3", estimator=estimator)
+            job = replace(job, report=name == "kinova_gen3")
             done[name] = (*run_job(job, folder), folder)
         return done[name]
 

@@ -66,7 +66,7 @@ def test_an_input_that_was_changed_or_is_gone_is_named(out, capsys, name, what):
     path.write_bytes(path.read_bytes() + b"\n")
     assert main(["report", str(out)]) == 1
     said = capsys.readouterr().err
-    assert f"the {what} '{path}' has changed since result.json was written" in said
+    assert f"the {what} '{path}', an input of result.json, has changed" in said
     path.unlink()
     assert main(["report", str(out)]) == 1
     assert f"the {what} '{path}', an input of result.json, does not exist" in (

@@ -29,7 +29,7 @@ def made(arm, tmp_path_factory):
         "urdf": arm.tree.path,
         "identification": [{"log": "run.csv"}],
         "model": {"friction": "viscous+coulomb"},
-        "estimator": {"prior_weight": 1.0, "draws": 0},
+        "estimator": {"prior_weight": 1.0},
         "output": {"report": False},
     }
     run_job(job_from_settings(table, "job.toml", tmp_path), tmp_path / "out")

@@ -34,7 +34,6 @@ def settings(folder, units=()):
     return {
         "urdf": str(example_urdf("ur5_robot.urdf")), "joints": list(JOINTS),
         "locked": {"*": 0.0}, "identification": logs, "model": {"friction": "viscous+coulomb"},
-        "estimator": {"draws": 0},
     }  # fmt: skip
 
 

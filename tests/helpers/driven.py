@@ -20,7 +20,7 @@ from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 
 EXACT = SignalSettings(cutoff=None, trim=0.0)
-FIT = EstimatorSettings(draws=0)  # bounds of bodies have no part in what drives have
+FIT = EstimatorSettings()  # bounds of bodies have no part in what drives have
 JOINTS = ("shoulder_lift_joint", "elbow_joint", "wrist_1_joint")
 LIFT, ELBOW, WRIST = JOINTS
 

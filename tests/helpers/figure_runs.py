@@ -48,7 +48,6 @@ ignore = ["payload_change"]
 [estimator]
 name = "consistent"
 prior_weight = 0.4
-draws = 20
 [estimator.constraints]
 mass = { hand = [1.0, 1.65] }
 total_mass = [12.0, 16.5]
@@ -288,8 +287,8 @@ ESTIMATORS = {
     "ols": 'name = "ols"',
     "huber": 'name = "wls"\nrobust = "huber"',
     "tls": 'name = "tls"\nregressor_noise = 0.02',
-    "tukey": 'name = "consistent"\nrobust = "tukey"\nprior_weight = "evidence"\ndraws = 12',
-    "rls": 'name = "rls"\nforgetting = 0.9995\nprior_weight = 0.5\nphysical = true\ndraws = 0',
+    "tukey": 'name = "consistent"\nrobust = "tukey"\nprior_weight = "evidence"',
+    "rls": 'name = "rls"\nforgetting = 0.9995\nprior_weight = 0.5\nphysical = true',
     "kalman": 'name = "kalman"\nwalk = 1e-4\ngate = 0.999\nprior_weight = 2.0',
     "prx": 'name = "prx"\npasses = 2\nmetric = "rows"\nseed = 4\nprior_weight = 0.5',
     "gradient": 'name = "gradient"\npasses = 3\nstep_size = 0.7\naverage = false\nseed = -1\n'
@@ -366,7 +365,6 @@ friction = "coulomb"
 report = false
 [estimator]
 prior_weight = 0.8
-draws = 0
 [[identification]]
 log = "slow.csv"
 [[identification]]

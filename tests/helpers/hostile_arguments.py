@@ -76,7 +76,7 @@ CALLS = {
     "EstimatorSettings": (
         robotid.EstimatorSettings,
         lambda c, _: {"name": "consistent", "margin": 1e-4, "prior": "entropic",
-                      "prior_weight": "auto", "draws": 16, "constraints": {}, "robust": "none"},
+                      "prior_weight": "auto", "constraints": {}, "robust": "none"},
     ),
     "from_urdf": (
         RobotModel.from_urdf,

@@ -41,7 +41,7 @@ def test_data_that_excite_too_little_are_refused_by_least_squares_only(ur5, rng)
     still = Log(t=log.t, q=q, v=v, a=a, tau=log.tau, joints=log.joints)
     with pytest.raises(RankDeficientError, match=r"undetermined: .*wrist_3_joint.viscous"):
         fit(ur5, [still], signals=EXACT, estimator="wls")
-    found = identify(ur5, [still], signals=EXACT, estimator=EstimatorSettings(draws=0))
+    found = identify(ur5, [still], signals=EXACT, estimator=EstimatorSettings())
     assert "wrist_3_joint.viscous" in found.estimate.undetermined
     assert found.verdict.status != "good"
 

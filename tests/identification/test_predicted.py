@@ -10,8 +10,9 @@ from robotid.cli.export import export
 from robotid.cli.identify import save_result
 from robotid.dynamics.friction_projection import project_friction
 from robotid.dynamics.prediction import drive_motion_along
-from robotid.estimation.fitting.bands import QUANTILE, friction_curve
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
+from robotid.estimation.fitting.fitted import friction_curve
+from robotid.estimation.fitting.standard_errors import QUANTILE
 from robotid.output.files.result_file import load_result
 from robotid.robot.drives import LoadFriction
 
@@ -22,7 +23,7 @@ def found():
     model, pi = driven(arm(), {ELBOW: (LoadFriction(),)}, {f"{ELBOW}.load": 0.07})
     log = driven_log(model, pi, 3, reach=1.5, noise=0.01)
     friction = {"*": "", ELBOW: "load"}
-    return found_in(arm(), [log], friction=friction, estimator=EstimatorSettings(draws=0))
+    return found_in(arm(), [log], friction=friction, estimator=EstimatorSettings())
 
 
 @pytest.fixture(scope="module")

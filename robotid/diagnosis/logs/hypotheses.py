@@ -1,9 +1,4 @@
-"""Tests of how well the model explains each torque, as stated and under other hypotheses.
-
-The torque of a joint must be a sum, with factors >= 0, of the torques of the links that it carries
-by the URDF, of the inertia and the frictions of its drive, and of a constant. Masses may be wrong
-by any factor; signs, columns, gravity and positions may not.
-"""
+"""Checks of how well the model explains each torque, as stated and under other hypotheses."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -17,7 +12,6 @@ from robotid.diagnosis.logs.torque_sample import Probe
 
 #: Decrease of the misfit from which another gravity is reported.
 HINT = 0.7
-
 _FLOOR = 1e-3  # an unexplained share below this is negligible
 _POOR = 0.08  # unexplained share from which other readings of the positions are tested
 _CLEARLY = 2.0  # decrease of the misfit, a factor 7, beyond the readings with stated positions

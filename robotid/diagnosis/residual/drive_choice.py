@@ -30,12 +30,13 @@ from robotid.diagnosis.residual.decisions import (
     GROWN,
     TENFOLD,
     UNDECIDED_P_VALUE,
+    Round,
+    select,
 )
-from robotid.diagnosis.residual.selection import Round, select
 from robotid.diagnosis.residual.term_trials import RIDGE, Sample, Trial, Trials, take_sample
 from robotid.dynamics.prediction import drive_motion_along
+from robotid.estimation.fitting.drive_terms import DriveChoice, FoundShape, Tried, with_shapes
 from robotid.estimation.fitting.fitted import Solution
-from robotid.estimation.fitting.selected_drives import DriveChoice, FoundShape, Tried, with_shapes
 from robotid.robot.drives import FAMILIES, DataRange, DriveMotion, DriveTerm, Family, MemorylessTerm
 
 _GRID = 6  # values of a shape tested between its bounds

@@ -23,13 +23,12 @@ from robotid.diagnosis.residual.decisions import GROWN
 from robotid.diagnosis.residual.misfit import Misfit
 from robotid.diagnosis.residual.term_trials import Sample, Trial, Trials, take_sample
 from robotid.dynamics.prediction import drive_motion_along
+from robotid.estimation.fitting.drive_terms import JointMotion, OpenTerm
 from robotid.estimation.fitting.fitted import Fit, Solution
-from robotid.estimation.fitting.joint_motion import JointMotion
-from robotid.estimation.fitting.open_terms import OpenTerm
 from robotid.robot.drives import DriveMotion, DriveTerm
 
 if TYPE_CHECKING:
-    from robotid.estimation.fitting.selected_drives import DriveChoice
+    from robotid.estimation.fitting.drive_terms import DriveChoice
 
 _STEP = 1e-3  # relative step of a finite difference
 _ROUNDING = 1e-10  # share of a column below which it is rounding

@@ -23,14 +23,13 @@ import numpy as np
 
 from robotid.base.typing import Array
 from robotid.data.log import Trajectory
-from robotid.diagnosis.residual.decisions import FAMILY_P_VALUE
-from robotid.diagnosis.residual.selection import p_value
+from robotid.diagnosis.residual.decisions import FAMILY_P_VALUE, p_value
 from robotid.dynamics.constraint_rows import without_forces
 from robotid.dynamics.torque import trajectory_regressor
 from robotid.dynamics.used_rows import independent_share
+from robotid.estimation.fitting.drive_terms import JointMotion, joint_motions, travelled
 from robotid.estimation.fitting.evaluation import Evaluation, Recording
 from robotid.estimation.fitting.fitted import Solution
-from robotid.estimation.fitting.joint_motion import JointMotion, joint_motions, travelled
 from robotid.robot.model import RobotModel
 
 #: Smallest share of a column that the regressor must not explain.

@@ -5,10 +5,9 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from robotid.base.findings import listed
-from robotid.diagnosis.verdict.evidence import BEATEN, error_of
-from robotid.diagnosis.verdict.uses import uses_of_motion
+from robotid.diagnosis.verdict.evidence import BEATEN, error_of, uses_of_motion
 from robotid.diagnosis.verdict.verdict import JointVerdict, Verdict, concluded, on_joint
-from robotid.estimation.fitting.metrics import JointMetrics, Metrics
+from robotid.estimation.fitting.evaluation import JointMetrics, Metrics
 
 #: [%] simulated position error of a joint on validation logs: limits of "good" and "usable".
 GOOD, POOR = 5.0, 30.0

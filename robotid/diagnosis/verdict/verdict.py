@@ -18,11 +18,10 @@ from robotid.diagnosis.verdict.evidence import (
     Predictions,
     error_of,
     is_harmless_cost,
+    uses_of_torques,
 )
 from robotid.diagnosis.verdict.scale_check import ScaleCheck
-from robotid.diagnosis.verdict.uses import uses_of_torques
-from robotid.estimation.fitting.left_out import logs_that_test
-from robotid.estimation.fitting.metrics import Metrics
+from robotid.estimation.fitting.evaluation import Metrics, logs_that_test
 
 _REJECTED = 5.0  # [%] a smaller prediction error rejects a hypothesis on columns or masses
 _SCALED = 2.0  # a gravity torque within this factor of the URDF's contradicts a wrong unit

@@ -9,34 +9,47 @@ import numpy as np
 
 from robotid.base.exceptions import NotConvergedError, RankDeficientError, SettingsError
 from robotid.base.typing import Array
+from robotid.dynamics.base_parameters import BaseMapping
 from robotid.dynamics.factors import Factors, Reduction, join
-from robotid.dynamics.prediction import is_loaded
+from robotid.dynamics.prediction import body_slopes_by_position, is_loaded
 from robotid.estimation.estimators import WLS, Consistent, Estimate
 from robotid.estimation.estimators.determination import Determination, base_spread, determine
 from robotid.estimation.estimators.estimator import Weighing
-from robotid.estimation.fitting.baselines import urdf_with_drives
-from robotid.estimation.fitting.consistent_estimator import Known, consistent_fit, pinned_links
 from robotid.estimation.fitting.estimator_settings import (
     BoundedSettings,
     EstimatorSettings,
+    Known,
     RecursiveSettings,
+    consistent_fit,
+    pinned_links,
 )
-from robotid.estimation.fitting.evaluation import Evaluation, evaluate_logs
+from robotid.estimation.fitting.evaluation import (
+    FEWEST_LEFT_OUT,
+    Evaluation,
+    Metrics,
+    evaluate_logs,
+    left_out_metrics,
+)
 from robotid.estimation.fitting.fitted import Fit, Solution
-from robotid.estimation.fitting.left_out import FEWEST_LEFT_OUT, left_out_metrics
-from robotid.estimation.fitting.metrics import Metrics
 from robotid.estimation.fitting.recorded import Recordings
 from robotid.estimation.fitting.regressor_noise import RegressorNoise, find_regressor_noise
 from robotid.estimation.fitting.robust import reweigh
 from robotid.estimation.fitting.standard_errors import (
-    Redraws,
     StandardErrors,
     measured_errors,
     standard_of,
     with_wls_errors,
 )
-from robotid.estimation.fitting.zeros import sums_with_zeros
-from robotid.estimation.variation.groups import FEWEST_RUNS, RunSums, runs_of, sums_of
+from robotid.estimation.variation.groups import (
+    FEWEST_RUNS,
+    RunSums,
+    columns_of,
+    groups_at,
+    runs_of,
+    sums_of,
+    with_zeros,
+)
+from robotid.robot.model import RobotModel
 from robotid.robot.prior import prior_spread
 
 _MOST_LOADS = 20  # largest number of fits until the joint load torque has converged
@@ -49,7 +62,7 @@ def rough_choice(choice: EstimatorSettings) -> EstimatorSettings:
     if not isinstance(choice, BoundedSettings):
         return choice
     weight = 1.0 if isinstance(choice.prior_weight, str) else choice.prior_weight
-    return replace(choice, prior_weight=weight, draws=0)
+    return replace(choice, prior_weight=weight)
 
 
 def fit_recordings(recordings: Recordings, choice: EstimatorSettings) -> Fit:
@@ -180,7 +193,7 @@ class Solved:
 
     def _measured(self) -> tuple[Estimate, Estimate, StandardErrors]:
         """Return the estimate and that of WLS with standard errors, and how these were found."""
-        ground, choice, fit, estimate = self.ground, self.choice, self.in_cone, self.estimate
+        ground, fit, estimate = self.ground, self.in_cone, self.estimate
         factors, rough, mapping = ground.factors, ground.rough, ground.recordings.mapping
         segments, share, K = ground.segments, ground.before.share, mapping.K
         more = ground.more(rough.sigma)
@@ -193,14 +206,11 @@ class Solved:
             if estimate.names == mapping.names:
                 sigma = estimate.sigma
             more = ground.more(sigma)
-            redraws, ratio = None, 1.0  # without bounds
-            if fit is not None and isinstance(choice, BoundedSettings):
-                redraws = Redraws(fit, choice.draws, np.random.default_rng(0))
-                ratio = fit.weight_ratio
+            ratio = 1.0 if fit is None else fit.weight_ratio
             is_filter = self.weighing == "by age"
             estimate, errors = measured_errors(
                 estimate, segments, factors, share, K, sigma,
-                is_filter=is_filter, weight_ratio=ratio, redraws=redraws, more=more,
+                is_filter=is_filter, weight_ratio=ratio, bounded=fit, more=more,
             )  # fmt: skip
         if (repeated := ground.recordings.repeated) is not None:
             errors = replace(errors, method=f"{errors.method}; {repeated.described}")
@@ -391,3 +401,66 @@ def _run(
         estimate = with_wls_errors(estimate, ground.rough)
     fit = consistent_fit(choice, before)
     return fit.project(estimate), fit, estimator.weighing
+
+
+def sums_with_zeros(
+    sums: RunSums, recordings: Recordings, standard: Array, shift: Array
+) -> RunSums:
+    """Return the sums of logs with those over the rows of the zeros of the positions.
+
+    The torque of a log whose positions are x too large is tau(q - x) = tau(q) - d tau / dq x. Logs
+    in files, and robots with a floating base or constraints, have no such rows.
+
+    standard (p,), shift (b,).
+    """
+    model, mapping = recordings.model, recordings.mapping
+    groups = [group for group, _ in groups_at(model, mapping, standard)]
+    z = sum(group.kind == "zero" for group in groups)
+    if not (z and recordings.is_in_memory):
+        return sums
+    B, acts = (x[:, :-z] for x in columns_of(groups, model.n_rows))
+    theta, runs = mapping.to_base(standard) + shift, []
+    for k, log in enumerate(recordings.fitted):
+        motion = log.whole.trajectory
+        slopes = body_slopes_by_position(model, standard, motion).reshape(-1, z)
+        parts, size = [], recordings.segment_length(k) * model.n_rows
+        A, start = np.empty((len(slopes), B.shape[1])), 0
+        r, scale = np.empty((2, len(slopes)))
+        for W, tau, weight in recordings.problem_of(k, motion).blocks():
+            rows = slice(start, start + len(tau))
+            scale[rows] = np.sqrt(weight) / np.resize(sums.sigma, len(tau))
+            A[rows] = scale[rows, None] * (W @ B) * np.resize(acts, (len(tau), acts.shape[1]))
+            r[rows] = scale[rows] * (tau - W @ theta)
+            start += len(tau)
+        for first in range(0, start, size):
+            rows = slice(first, first + size)
+            parts.append((A[rows], -scale[rows, None] * slopes[rows], r[rows]))
+        runs.append(parts)
+    return with_zeros(sums, groups, runs)
+
+
+def urdf_with_drives(
+    model: RobotModel, mapping: BaseMapping, factors: Factors, sigma: Array, spread: Array
+) -> Array:
+    """Return the URDF's inertial parameters with fitted drive terms, shape (p,).
+
+    Weighted least squares of the drive terms d >= 0 (offsets of either sign) with the bodies' pi_I
+    as in the URDF: min sum_j |R_j K_I pi_I + R_j K_D d - tau_j|^2 / sigma_j^2.
+
+    sigma (n,) [N m or N], spread (p,).
+    """
+    from scipy.optimize import lsq_linear
+
+    pi = model.standard_parameters()
+    size = model.layout.n_inertial
+    pi[size:] = 0.0
+    if size == len(pi):
+        return pi
+    rows = factors.weighted(sigma)
+    R, tau = rows[:, :-1], rows[:, -1]
+    scale = spread[size:]
+    lowest = np.where(model.layout.is_nonnegative()[size:], 0.0, -np.inf)
+    X = R @ mapping.K[:, size:] * scale
+    found = lsq_linear(X, tau - R @ mapping.to_base(pi), bounds=(lowest, np.inf), method="bvls")
+    pi[size:] = scale * found.x
+    return pi

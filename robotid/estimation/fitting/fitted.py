@@ -1,49 +1,191 @@
-"""The result of a fit: identified parameters, standard errors, predictions."""
+"""The result of a fit: identified parameters, their intervals, predictions and bands."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from robotid.base.exceptions import SettingsError
-from robotid.base.settings import require_kind
+from robotid.base.arguments import real_numbers
+from robotid.base.exceptions import DataError, SettingsError
+from robotid.base.findings import listed
+from robotid.base.settings import is_number, require_kind
 from robotid.base.typing import Array
+from robotid.data.log import suggestion
 from robotid.dynamics.base_parameters import BaseMapping
 from robotid.dynamics.factors import Factors
-from robotid.dynamics.friction_projection import DriveMoments
+from robotid.dynamics.friction_projection import (
+    DriveMoments,
+    drive_moments,
+    projected_pinocchio_model,
+)
+from robotid.dynamics.prediction import drive_motion_along, predict_instants
 from robotid.estimation.estimators import Estimate
 from robotid.estimation.estimators.determination import Determination, is_poorly_excited
-from robotid.estimation.fitting.bands import (
-    QUANTILE,
-    FrictionCurve,
-    TorqueBand,
-    expected_band,
-    fitted_moments,
-    recording_bands,
-    typical_friction,
-)
+from robotid.estimation.fitting.drive_terms import DriveChoice, JointMotion, OpenTerm, open_torques
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
-from robotid.estimation.fitting.evaluation import Evaluation, pool
-from robotid.estimation.fitting.identified import FROM_DATA, FROM_PRIOR, Identified, sources_of
-from robotid.estimation.fitting.metrics import Metrics
-from robotid.estimation.fitting.open_terms import OpenTerm
+from robotid.estimation.fitting.evaluation import Evaluation, Metrics, pool
 from robotid.estimation.fitting.regressor_noise import RegressorNoise
 from robotid.estimation.fitting.robust import Outlier, find_outliers
-from robotid.estimation.fitting.selected_drives import DriveChoice
-from robotid.estimation.fitting.standard_errors import StandardErrors
+from robotid.estimation.fitting.standard_errors import (
+    QUANTILE,
+    FrictionCurve,
+    StandardErrors,
+    TorqueBand,
+    rms_error,
+    torque_band,
+)
 from robotid.estimation.variation.groups import RunsOf, RunSums
 from robotid.estimation.variation.variation import Variation, between_covariance
 from robotid.robot.bodies import held_parameters
+from robotid.robot.drives import DriveMotion
 from robotid.robot.mass_matrix import MassMatrixCheck, check_mass_matrix
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
 
+#: The possible sources of the value of a standard parameter.
+SOURCES = ("data", "mixed", "prior", "bound")
+FROM_DATA = 0.3  # standard error over prior standard deviation below which the source is the data
+FROM_PRIOR = 0.9  # ... and above which it is the prior
 _KNOWN = 1e-300  # smallest prior standard deviation, of fixed parameters
 _STAYED = 0.3  # change in prior standard deviations up to which the source may be the prior
 _WORSE = 1.2  # error of WLS over that of the estimate above which it is clearly worse
 _AT_BOUND = 1e-6  # size of a drive term at its bound of 0, in prior standard deviations
+_COVERAGE = 0.95
+_SPEEDS = 20  # points of a friction curve in each direction
+
+
+def sources_of(share: Array, is_prior: Array, is_bound: Array) -> tuple[str, ...]:
+    """Return the source of the value of each parameter, of ``SOURCES``.
+
+    share (p,) [-], is_prior (p,), is_bound (p,).
+    """
+    names = np.select([is_prior, is_bound, share < FROM_DATA], ["prior", "bound", "data"], "mixed")
+    return tuple(names.tolist())
+
+
+@dataclass(frozen=True, eq=False)
+class Identified(ABC):
+    """Standard and base parameters of a robot, for every method of identification.
+
+    Attributes:
+        model: The robot of the URDF, with the identified drive terms.
+        mapping: Standard to base parameters.
+        prior: Standard parameters of the URDF, shape (p,).
+        standard: Standard parameters, shape (p,).
+        standard_covariance: Their covariance given the prior, shape (p, p).
+        base: Base parameters, shape (b,).
+        base_error: Their standard errors, shape (b,); inf if not identifiable.
+    """
+
+    model: RobotModel
+    mapping: BaseMapping
+    prior: Array
+    standard: Array
+    standard_covariance: Array
+    base: Array
+    base_error: Array
+
+    @property
+    @abstractmethod
+    def standard_error(self) -> Array:
+        """Standard errors of the standard parameters, shape (p,); inf if there is none."""
+
+    @property
+    @abstractmethod
+    def standard_quantile(self) -> Array:
+        """Half-width of each standard parameter's 95 % interval in standard errors, shape (p,)."""
+
+    @property
+    @abstractmethod
+    def base_quantile(self) -> Array:
+        """Half-width of each base parameter's 95 % interval in standard errors, shape (b,)."""
+
+    @property
+    @abstractmethod
+    def at_bound(self) -> Array:
+        """Which standard parameters are determined by a bound only, shape (p,), bool."""
+
+    @property
+    @abstractmethod
+    def sources(self) -> tuple[str, ...]:
+        """The source of the value of each standard parameter, of ``SOURCES``."""
+
+    @property
+    @abstractmethod
+    def undetermined(self) -> tuple[str, ...]:
+        """Names of the base parameters that are not identifiable."""
+
+    @property
+    @abstractmethod
+    def moments(self) -> Mapping[str, DriveMoments]:
+        """Moments that project the friction of each drive on simpler terms, by drive."""
+
+    @property
+    @abstractmethod
+    def is_consistent(self) -> bool:
+        """Whether the parameters are physically consistent."""
+
+    @property
+    def standard_interval(self) -> Array:
+        """95 % interval of each standard parameter, shape (p, 2); infinite if there is none.
+
+        Its half-width is ``standard_quantile`` standard errors.
+        """
+        half = self.standard_quantile * self.standard_error
+        return np.column_stack([self.standard - half, self.standard + half])
+
+    @property
+    def base_interval(self) -> Array:
+        """95 % interval of each base parameter, shape (b, 2).
+
+        It is infinite if the parameter is not identifiable or is at its bound.
+        """
+        half = self.base_quantile * self.base_error
+        return np.column_stack([self.base - half, self.base + half])
+
+    def predict(
+        self, q: ArrayLike, v: ArrayLike | None = None, a: ArrayLike | None = None
+    ) -> Array:
+        """Return the torques of a motion by the identified bodies, drives and friction.
+
+        Coulomb friction acts by the sign of the speed; at rest, where stiction can have any value
+        up to its size, it is 0. Friction with an internal state (presliding) has its value after
+        long motion in one direction. A delayed torque (lag) has its steady-state value.
+
+        Args:
+            q: Positions in the order of ``model.joints``, shape (n,) or (N, n) [rad, m].
+            v: Velocities, likewise [rad/s, m/s]; None: at rest.
+            a: Accelerations, likewise [rad/s^2, m/s^2]; None: 0.
+
+        Returns:
+            Torques, likewise [N m, N].
+
+        Raises:
+            DataError: If a shape is wrong, or a value is not finite.
+        """
+        return predict_instants(self.model, self.standard, q, v, a)
+
+    def pinocchio_model(self) -> Any:  # noqa: ANN401
+        """Return a ``pinocchio.Model`` with the identified inertias, armature and friction.
+
+        ``damping`` is the viscous friction; ``lowerDryFrictionLimit`` = -Fc - offset and
+        ``upperDryFrictionLimit`` = Fc - offset contain Coulomb friction and offset. ``rnea``
+        computes inertias and armature only; the torque of moving joints is
+
+        ``rnea(q, v, a) + damping v - where(v > 0, lowerDryFrictionLimit, upperDryFrictionLimit)``
+
+        which equals ``predict``. Friction that depends on load, position, an internal state or,
+        nonlinearly, on speed is projected on these terms by least squares over the fitted rows; a
+        warning states the error. Drives coupled to several joints are not represented. Locked
+        joints are part of their parent links. With mimic joints, or joints in another order than
+        in the URDF, ``model.configurations(q)`` and ``model.velocity_map`` give Pinocchio's
+        coordinates.
+        """
+        return projected_pinocchio_model(self.model, self.standard, self.moments)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -297,3 +439,162 @@ class Fit(Identified, Solution):
             for joint in (pairs[0][0] if pairs else ())
             if all(wls[joint].rmse > _WORSE * own[joint].rmse for own, wls in pairs)
         )
+
+
+def expected_band(found: Fit, evaluation: Evaluation, between: Array | None = None) -> TorqueBand:
+    """Return the torque band of a recording by the fit's noise level, not by its own residual.
+
+    between (p, p).
+    """
+    K, motion = found.mapping.K, evaluation.recording.trajectory
+    moves = np.array([term.moves for term in found.open_terms]).reshape(-1, K.shape[1])
+    C = found.standard_covariance - moves.T @ moves
+    covariance = K @ (C if between is None else C + between) @ K.T
+
+    def torques(rows: Array) -> list[Array]:
+        model = found.model.with_reference(found.standard)
+        return open_torques(model, found.open_terms, evaluation.recording, rows)
+
+    def errors(rows: Array) -> list[tuple[Array, Array]]:
+        return list(zip(moves @ K.T, torques(rows), strict=True))
+
+    sigma = found.estimate.sigma
+    return torque_band(found.model, found.mapping, motion, covariance, sigma, errors)
+
+
+def next_errors(found: Fit) -> Array:
+    """Return the expected RMS torque error of the next log, shape (n_rows,) [N m, N].
+
+    Its motion is like that of the fitted logs, and its drives vary like theirs.
+    """
+    bands = [expected_band(found, evaluation, found.between) for evaluation in found.fitted]
+    return rms_error(bands)
+
+
+def recording_bands(found: Fit) -> tuple[TorqueBand, ...]:
+    """Return the torque band of each recording from its residuals, fitted recordings first.
+
+    The noise part is chosen so that the bands contain 95 % of the torques of all recordings of the
+    same kind, fitted or validation. For validation recordings it is the prediction error on new
+    motion, and the band covers further motions as it covers these (split conformal prediction, Lei
+    et al. 2018, doi:10.1080/01621459.2017.1307116, with the parameters' part as the lower bound).
+    """
+    evaluations = (*found.fitted, *found.validation)
+    is_fitted = [k < len(found.fitted) or e.is_refitted for k, e in enumerate(evaluations)]
+    bands = [
+        expected_band(found, evaluation, None if is_own else found.between)
+        for evaluation, is_own in zip(evaluations, is_fitted, strict=True)
+    ]
+    own: dict[bool, list[tuple[TorqueBand, Evaluation]]] = {True: [], False: []}
+    for kind, band, evaluation in zip(is_fitted, bands, evaluations, strict=True):
+        own[kind].append((band, evaluation))
+    noise = {kind: _residual_noise(pairs) for kind, pairs in own.items() if pairs}
+    pairs = zip(bands, is_fitted, strict=True)
+    return tuple(replace(band, noise=noise[kind]) for band, kind in pairs)
+
+
+def _residual_noise(own: Sequence[tuple[TorqueBand, Evaluation]]) -> Array:
+    """Return the noise with which bands contain 95 % of the torques, shape (n_rows,) [N m, N]."""
+    noise = own[0][0].noise.copy()
+    rows = []
+    for band, e in own:
+        residual = e.recording.trajectory.tau - e.torques["estimate"]
+        rows.append((band.parameters, residual[band.samples], e.recording.mask[band.samples]))
+    std, residual, mask = (np.concatenate(part) for part in zip(*rows, strict=True))
+    needed = (residual / QUANTILE) ** 2 - std**2
+    for j, used in enumerate(mask.T.astype(bool)):
+        if used.any():
+            noise[j] = np.sqrt(max(np.quantile(needed[used, j], _COVERAGE), 0.0))
+    return noise
+
+
+def typical_friction(
+    found: Fit,
+    joint: str,
+    v: ArrayLike | None = None,
+    *,
+    q: float | None = None,
+    load: float | None = None,
+) -> FrictionCurve:
+    """Return friction and offset of a drive under the conditions of the fitted logs.
+
+    See ``friction_curve``.
+
+    v (k,) [rad/s or m/s].
+    """
+    layout, d = found.model.layout, _drive_number(found, joint)
+    ratios, first = layout.drive_ratios[d], found.model.n_rows - len(found.model.joints)
+    rows = [e.recording.mask[:, first:][:, ratios != 0.0].all(axis=1) for e in found.fitted]
+    motions = [e.recording.trajectory for e in found.fitted]
+    for name, value in (("q", q), ("load", load)):
+        if not (value is None or is_number(value)):
+            raise DataError(f"{name} is {str(value)[:60]!r}, wanted a finite number or None")
+    if v is None:
+        used = zip(motions, rows, strict=True)
+        speeds = np.concatenate([np.abs(m.v[is_used, first:] @ ratios) for m, is_used in used])
+        if not speeds.any():
+            raise DataError(
+                f"{joint} was at rest in the fitted logs, so the range of speeds is not known; "
+                "state the speeds: friction(joint, v)"
+            )
+        side = np.linspace(speeds.min(), speeds.max(), _SPEEDS)
+        v = np.append(-side[::-1], side)
+    if q is None:
+        angles = [m.q[:, m.q.shape[1] - len(ratios) :] for m in motions]  # without the base's pose
+        positions = [x[is_used] @ ratios for x, is_used in zip(angles, rows, strict=True)]
+        q = float(np.median(np.concatenate(positions))) if np.any(np.concatenate(rows)) else 0.0
+    if load is None:
+        load = 0.0
+        if any(term.name == "load" for term in layout.own.get(joint, ())):
+            loads = [drive_motion_along(found.model, m).load[d] for m in motions]
+            load = float(np.sqrt(np.mean(np.concatenate(loads)[np.concatenate(rows)] ** 2)))
+    speeds = real_numbers(v, "v")
+    if speeds.ndim != 1 or not np.isfinite(speeds).all():
+        raise DataError(f"v has shape {speeds.shape}, wanted finite speeds, shape (k,)")
+    return friction_curve(found, joint, speeds, q=q, load=load)
+
+
+def fitted_moments(found: Fit) -> dict[str, DriveMoments]:
+    """Return the moments that project drive friction on simpler terms, from the fitted rows."""
+    rows = ((e.recording.trajectory, e.recording.mask) for e in found.fitted)
+    return drive_moments(found.model, rows)
+
+
+def friction_curve(
+    found: Fit, joint: str, v: Array, *, q: float = 0.0, load: float = 0.0
+) -> FrictionCurve:
+    """Return friction and offset of a drive against its speed, with the band of its parameters.
+
+    Friction terms with an internal state have their value after long motion in one direction.
+
+    v (k,) [rad/s or m/s].
+    """
+    layout, d = found.model.layout, _drive_number(found, joint)
+    none = np.zeros_like(v)
+    motion = DriveMotion(q + none, v, none, np.sign(v), load + none, none)
+    own = [
+        (k, term)
+        for k, (drive, term) in enumerate(layout.drive_parameters, start=layout.n_inertial)
+        if drive == d and not term.is_inertia
+    ]
+    X = np.column_stack([none, *(term.column(motion) for _, term in own)])[:, 1:]
+    k = [k for k, _ in own]
+    moves = np.array([term.moves[k] for term in found.open_terms]).reshape(-1, len(k))
+    C = found.standard_covariance[np.ix_(k, k)] - moves.T @ moves
+    variance = np.einsum("ij,jk,ik->i", X, C, X)
+    for term, moved in zip(found.open_terms, moves @ X.T, strict=True):
+        if term.joint == joint:  # the term's own torque adds to the change of the parameters
+            moved = moved + term.torque(motion, JointMotion.steady(motion))
+        variance += moved**2
+    return FrictionCurve(v, X @ found.standard[k], np.sqrt(np.maximum(variance, 0.0)), load)
+
+
+def _drive_number(found: Fit, joint: str) -> int:
+    require_kind(joint, str, "joint", "the name of a joint or of a coupling")
+    names = [drive.name for drive in found.model.layout.drives]
+    if joint not in names:
+        raise DataError(
+            f"{joint!r} is no drive of {found.model.name}; drives: {listed(names)}"
+            f"{suggestion(joint, names)}"
+        )
+    return names.index(joint)

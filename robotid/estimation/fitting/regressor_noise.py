@@ -29,7 +29,6 @@ References:
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -39,13 +38,12 @@ from robotid.data.filters import local_polynomial
 from robotid.data.log import Trajectory
 from robotid.data.measured_velocity import quantum
 from robotid.data.signal_settings import SignalSettings
+from robotid.dynamics.base_parameters import BaseMapping
 from robotid.dynamics.factors import Factors, Reduction
 from robotid.estimation.estimators.batch import solve_factor
 from robotid.estimation.fitting.recorded import Recordings
 from robotid.estimation.fitting.survey import SurveyedLog, hold_log
-
-if TYPE_CHECKING:
-    from robotid.estimation.fitting.fitted import Fit
+from robotid.robot.model import RobotModel
 
 _FEWEST, _MOST = 4, 6  # pairs of rounding errors
 _PRECISE = 0.2  # uncertainty of the shift in standard errors at which no more pairs are drawn
@@ -138,12 +136,13 @@ def find_regressor_noise(
     return RegressorNoise(np.max(steps, axis=0), share, shift, error, meat)
 
 
-def encoder_findings(fit: "Fit") -> list[Finding]:
+def encoder_findings(
+    noise: RegressorNoise | None, model: RobotModel, mapping: BaseMapping
+) -> list[Finding]:
     """Return a finding if encoder quantisation biases inertial parameters."""
-    noise, model = fit.regressor_noise, fit.model
     if noise is None:
         return []
-    is_inertial = fit.mapping.K[:, : model.layout.n_inertial].any(axis=1)
+    is_inertial = mapping.K[:, : model.layout.n_inertial].any(axis=1)
     moved = np.where(is_inertial, np.abs(noise.shift) / noise.std_error, 0.0)
     worst = int(np.argmax(moved))
     if moved[worst] < _NAMED:
@@ -163,7 +162,7 @@ def encoder_findings(fit: "Fit") -> list[Finding]:
     message = (
         f"{listed(names, _JOINTS)}: the position is quantised in steps of up to {step:.3g} "
         f"{unit}{resolution}. The resulting noise is up to {100 * noise.share.max():.2g} % of the "
-        f"RMS acceleration and shifts {fit.mapping.base_names[worst]} by {moved[worst]:.1f} "
+        f"RMS acceleration and shifts {mapping.base_names[worst]} by {moved[worst]:.1f} "
         f"standard errors; {effect}. A longer log does not reduce it: lower cutoff, move faster, "
         "log the velocity of the drive, or use an encoder of higher resolution"
     )

@@ -6,20 +6,31 @@ the covariance of the score of segment s, W_s^T (tau_s - W_s theta), is that of 
 its colour. It is computed from the factors of the segments, without a second pass over the rows.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from robotid.base.exceptions import NotConvergedError
 from robotid.base.typing import Array
+from robotid.data.log import Trajectory
 from robotid.dynamics.base_parameters import BaseMapping
 from robotid.dynamics.factors import Factors
+from robotid.dynamics.torque import trajectory_regressor
 from robotid.estimation.estimators import Consistent, Estimate
 from robotid.estimation.estimators.batch import solve_factor
 from robotid.estimation.estimators.segments import FEWEST_SEGMENTS, quantile, scatter
+from robotid.robot.model import RobotModel
 
-_LEAST_SOLVED = 0.8  # smallest share of the resampled fits that must be solved
+if TYPE_CHECKING:
+    pass
+
+_DRAWS = 64  # fits to resampled data and prior, for standard errors with active bounds
+_LEAST_SOLVED = 0.8  # smallest share of them that must be solved
+#: Half-width of a 95 % band in standard deviations.
+QUANTILE = 1.96
+_ROUNDING = 1e-9  # relative tolerance for a row on the edge of the band
+_MOST = 500  # largest number of samples at which a band is computed
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,15 +58,6 @@ class StandardErrors:
         return quantile(self.freedom)
 
 
-@dataclass(frozen=True, eq=False)
-class Redraws:
-    """Resampling of a physically consistent fit, for standard errors with active bounds."""
-
-    fit: Consistent
-    draws: int  # number of fits to resampled data and prior; 0: without the bounds
-    rng: np.random.Generator  # of the noise
-
-
 def measured_errors(
     estimate: Estimate,
     segments: Sequence[Factors],
@@ -66,7 +68,7 @@ def measured_errors(
     *,
     is_filter: bool = False,
     weight_ratio: float = 1.0,
-    redraws: Redraws | None = None,
+    bounded: Consistent | None = None,
     more: Array | None = None,
 ) -> tuple[Estimate, StandardErrors]:
     """Return an estimate with its covariance from the scatter of the segments.
@@ -78,15 +80,15 @@ def measured_errors(
     * standard parameters: B (K^T M K + g L) B with B = (K^T H K + L)^-1. L is the precision of the
       prior as it was weighted, g is its ratio to the precision L / g of the plausible prior; this
       is the mean square error if the true parameters have the plausible prior. If bounds are
-      active, it is computed from fits to resampled data and prior; without ``redraws`` the bounds
-      are neglected;
+      active, it is computed from fits to resampled data and prior; without the fit ``bounded``
+      they are neglected;
     * a filter with forgetting: its own covariance times the mean inflation.
 
     estimate (b,), K (b, p), sigma (n,) [N m or N], more (b, b).
     """
     b = len(factors.names)
-    if not (estimate.details.get("active") and redraws is not None and redraws.draws > 0):
-        redraws = None  # no bound is active, or bounds are neglected
+    if not estimate.details.get("active"):
+        bounded = None
     if len(segments) < FEWEST_SEGMENTS:
         method = (
             f"the bandwidth of the filter: a share of {share:.3g} of the rows is assumed to be "
@@ -96,8 +98,8 @@ def measured_errors(
         errors = StandardErrors(method, len(segments), 1 / share, np.full(b, np.inf))
         R = factors.weighted(sigma)[:b, :b]
         meat = share * R.T @ R + (0.0 if more is None else share**2 * more)
-        if redraws is not None:
-            return _bounded(estimate, errors, redraws, factors, sigma, meat)
+        if bounded is not None:
+            return _redrawn(estimate, errors, bounded, factors, sigma, meat)
         if len(estimate.theta) != b and (weight_ratio > 1.0 or more is not None):
             C = about_prior(estimate.covariance, K, meat, R, share, max(weight_ratio, 1.0))
             estimate = replace(estimate, covariance=C)
@@ -126,8 +128,8 @@ def measured_errors(
     estimate = replace(estimate, covariance=covariance)
     method = f"the scatter of the scores of {len(segments)} segments"
     errors = StandardErrors(method, len(segments), found.inflation, found.freedom())
-    if redraws is not None:
-        return _bounded(estimate, errors, redraws, factors, sigma, share**2 * found.meat)
+    if bounded is not None:
+        return _redrawn(estimate, errors, bounded, factors, sigma, share**2 * found.meat)
     return estimate, errors
 
 
@@ -182,10 +184,10 @@ def about_prior(
     return 0.5 * (covariance + covariance.T)
 
 
-def _bounded(
+def _redrawn(
     estimate: Estimate,
     errors: StandardErrors,
-    redraws: Redraws,
+    fit: Consistent,
     factors: Factors,
     sigma: Array,
     meat: Array,
@@ -194,18 +196,14 @@ def _bounded(
 
     The meat is the covariance of the score of the rows of ``Consistent.rows``.
     """
-    fit = redraws.fit
-    rows = fit.rows(factors, sigma)
+    rows, rng = fit.rows(factors, sigma), np.random.default_rng(0)
     found, failures = fit.programme.redrawn(
-        rows, fit.prior_weight, estimate.theta, meat, fit.weight_ratio, redraws.draws, redraws.rng
+        rows, fit.prior_weight, estimate.theta, meat, fit.weight_ratio, _DRAWS, rng
     )
-    if len(found) < _LEAST_SOLVED * redraws.draws:
-        raise NotConvergedError(
-            "standard errors with active bounds cannot be computed: only "
-            f"{len(found)} of {redraws.draws} fits to resampled data were solved; set draws = 0 "
-            "for standard errors without the bounds",
-            failures[0],
-        )
+    if len(found) < _LEAST_SOLVED * _DRAWS:
+        solved = f"only {len(found)} of {_DRAWS} fits to resampled data were solved: {failures[0]}"
+        method = f"{errors.method}; active bounds are neglected, {solved}"
+        return estimate, replace(errors, method=method)
     unsolved = f" ({len(failures)} more not solved: {failures[0]})" if failures else ""
     method = (
         f"{errors.method}; bounds are active: {len(found)} fits to resampled data and "
@@ -217,3 +215,111 @@ def _bounded(
         replace(estimate, covariance=covariance),
         replace(errors, method=method, freedom=freedom, unbounded=estimate.std_error),
     )
+
+
+@dataclass(frozen=True, eq=False)
+class TorqueBand:
+    """Standard deviations of predicted torques at some samples of a trajectory.
+
+    Attributes:
+        samples: Indices of these samples, shape (k,), int.
+        parameters: Part due to the uncertainty of the parameters, shape (k, n_rows) [N m, N].
+        noise: Part due to the residual of the model, shape (n_rows,) [N m, N].
+    """
+
+    samples: Array
+    parameters: Array
+    noise: Array
+
+    @property
+    def total(self) -> Array:
+        """Standard deviation of measured torque minus prediction, shape (k, n_rows) [N m, N]."""
+        return np.asarray(np.hypot(self.parameters, self.noise))
+
+    def coverage(self, tau: Array, prediction: Array, mask: Array) -> Array:
+        """Return the share of each joint's torques in the 95 % band, shape (n_rows,) [-].
+
+        tau (N, n_rows) [N m, N], prediction (N, n_rows) [N m, N], mask (N, n_rows).
+        """
+        used = mask[self.samples]
+        error = np.abs(tau[self.samples] - prediction[self.samples])
+        # a row that determines the band may lie on its edge
+        is_inside = (error <= (1.0 + _ROUNDING) * QUANTILE * self.total) & used
+        count = used.sum(axis=0)
+        return np.where(count > 0, is_inside.sum(axis=0) / np.maximum(count, 1), np.nan)
+
+
+def torque_band(
+    model: RobotModel,
+    mapping: BaseMapping,
+    trajectory: Trajectory,
+    covariance: Array,
+    noise: Array,
+    errors: Callable[[Array], Sequence[tuple[Array, Array]]] = lambda rows: (),
+) -> TorqueBand:
+    """Return the band of predicted torques, at up to 500 samples.
+
+    Its variance is diag(W C W^T) + sum (W x + z)^2. Each pair (x, z) is an error that changes the
+    base parameters by x and, together with them, the torque by z.
+
+    covariance (b, b), noise (n_rows,) [N m, N], errors (b,).
+    """
+    count = len(trajectory.t)
+    samples = np.unique(np.linspace(0, count - 1, min(count, _MOST)).round().astype(int))
+    W = trajectory_regressor(model, trajectory, samples)[:, mapping.independent]
+    variance = np.einsum("ij,ij->i", W @ covariance, W)
+    for x, z in errors(samples):
+        variance += (W @ x + z.ravel()) ** 2
+    std = np.sqrt(np.maximum(variance, 0.0)).reshape(len(samples), -1)
+    return TorqueBand(samples, std, np.asarray(noise))
+
+
+def rms_error(bands: Sequence[TorqueBand]) -> Array:
+    """Return the expected RMS error of predicted torques, shape (n_rows,) [N m, N]."""
+    return np.asarray(np.sqrt(np.mean(np.vstack([b.total for b in bands]) ** 2, axis=0)))
+
+
+@dataclass(frozen=True, eq=False)
+class FrictionCurve:
+    """Friction and offset of a drive at constant speed.
+
+    Attributes:
+        v: Speeds, shape (k,) [rad/s or m/s].
+        torque: Friction plus offset, shape (k,) [N m or N].
+        std: Standard deviation due to the uncertainty of the parameters, shape (k,) [N m or N].
+        load: Joint load torque at which the friction is evaluated [N m or N].
+    """
+
+    v: Array
+    torque: Array
+    std: Array
+    load: float
+
+    def __str__(self) -> str:
+        rows = zip(self.v.tolist(), self.torque.tolist(), self.half_width.tolist(), strict=True)
+        return "\n".join(
+            [
+                f"friction and offset against speed, joint load torque {self.load:.3g}",
+                f"{'speed':>10} {'torque':>10} {'95 %':>9}",
+                *(f"{v:10.4g} {torque:10.4g} +-{half:7.2g}" for v, torque, half in rows),
+            ]
+        )
+
+    def __repr__(self) -> str:
+        if not len(self.v):
+            return "<FrictionCurve: no speeds>"
+        return f"<FrictionCurve: {len(self.v)} speeds, {self.v.min():.4g} to {self.v.max():.4g}>"
+
+    @property
+    def half_width(self) -> Array:
+        """Half-width of the 95 % band, shape (k,) [N m or N]."""
+        return QUANTILE * self.std
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain values, as ``curve`` of a joint's friction in result.json has them."""
+        return {
+            "v": self.v.tolist(),
+            "torque": self.torque.tolist(),
+            "std_error": self.std.tolist(),
+            "load": self.load,
+        }

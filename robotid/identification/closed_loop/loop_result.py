@@ -10,17 +10,17 @@ from robotid.base.exceptions import SettingsError
 from robotid.base.typing import Array
 from robotid.data.log import Log, Trajectory
 from robotid.diagnosis.catalogue import entries
-from robotid.diagnosis.verdict.correlation import correlated_sets
+from robotid.diagnosis.verdict.parameter_table import correlated_sets
 from robotid.diagnosis.verdict.position_verdict import judge_positions
 from robotid.diagnosis.verdict.verdict import Verdict
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.friction_projection import DriveMoments, drive_moments
 from robotid.estimation.estimators.estimator import Estimate
 from robotid.estimation.estimators.output_error import segment_scores
-from robotid.estimation.fitting.bands import QUANTILE
 from robotid.estimation.fitting.estimator_settings import SimulationSettings
-from robotid.estimation.fitting.identified import FROM_PRIOR, sources_of
-from robotid.estimation.fitting.metrics import Metrics
+from robotid.estimation.fitting.evaluation import Metrics
+from robotid.estimation.fitting.fitted import FROM_PRIOR, sources_of
+from robotid.estimation.fitting.standard_errors import QUANTILE
 from robotid.estimation.variation.groups import FEWEST_RUNS, Group, RunsOf, inflation_of
 from robotid.estimation.variation.spread import Runs
 from robotid.identification.closed_loop.loop_settings import LoopSettings

@@ -12,8 +12,7 @@ from robotid.base.text import period
 from robotid.base.typing import Array
 from robotid.data.log import Log
 from robotid.dynamics.simulation.loops import ClosedLoopRobot, Loops, cut_windows
-from robotid.estimation.fitting.evaluation import Extent
-from robotid.estimation.fitting.metrics import JointMetrics, Metrics
+from robotid.estimation.fitting.evaluation import Extent, JointMetrics, Metrics
 from robotid.robot.model import RobotModel
 
 #: Horizons after which a simulation restarts from the measured state [s].

@@ -13,11 +13,10 @@ from robotid.base.versions import __version__, versions
 from robotid.data.transmission import Transmission
 from robotid.diagnosis.verdict.parameter_table import parameter_entries
 from robotid.dynamics.base_parameters import structural_mapping
-from robotid.estimation.fitting.bands import QUANTILE, next_errors, typical_friction
-from robotid.estimation.fitting.evaluation import Evaluated, Evaluation
-from robotid.estimation.fitting.identified import SOURCES, Identified
-from robotid.estimation.fitting.left_out import LEFT_OUT
-from robotid.estimation.fitting.selected_drives import DriveChoice
+from robotid.estimation.fitting.drive_terms import DriveChoice
+from robotid.estimation.fitting.evaluation import LEFT_OUT, Evaluated, Evaluation
+from robotid.estimation.fitting.fitted import SOURCES, Identified, next_errors, typical_friction
+from robotid.estimation.fitting.standard_errors import QUANTILE
 from robotid.identification.result import Identification, TorqueIdentification
 from robotid.output.files.ranges import parameter_ranges
 from robotid.output.files.result_file import SCHEMA_VERSION

@@ -19,8 +19,8 @@ from robotid.base.settings import require_kind
 from robotid.base.typing import Array
 from robotid.base.versions import __version__
 from robotid.dynamics.friction_projection import project_friction
-from robotid.estimation.fitting.bands import QUANTILE
-from robotid.estimation.fitting.identified import Identified
+from robotid.estimation.fitting.fitted import Identified
+from robotid.estimation.fitting.standard_errors import QUANTILE
 from robotid.identification.result import TorqueIdentification
 from robotid.output.files.commanded import commanded_drives
 from robotid.output.files.exports import Format, Option, Written, yaml_text

@@ -12,7 +12,7 @@ from robotid.base.exceptions import DataError, SettingsError
 from robotid.base.files import write_text
 from robotid.base.typing import Array
 from robotid.dynamics.friction_projection import project_friction
-from robotid.estimation.fitting.bands import QUANTILE
+from robotid.estimation.fitting.standard_errors import QUANTILE
 from robotid.estimation.variation.draws import (
     correlated_scores,
     possible_draws,

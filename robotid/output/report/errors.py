@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 from robotid.base.findings import listed
 from robotid.diagnosis.verdict import evidence
 from robotid.diagnosis.verdict import position_verdict as positions
-from robotid.estimation.fitting.metrics import Metrics
+from robotid.estimation.fitting.evaluation import Metrics
 from robotid.identification.result import Identification
 from robotid.identification.summary import joint_reason, verdict_cell
 from robotid.output.pages.html import code, listing, percent, text

@@ -8,25 +8,21 @@ from pathlib import Path
 import numpy as np
 
 from robotid.base.findings import listed
-from robotid.base.typing import Array
 from robotid.base.versions import versions
 from robotid.data.signal_settings import SignalSettings
 from robotid.diagnosis.residual.decisions import DEPENDENCE_SHARE
-from robotid.diagnosis.residual.residuals import friction_split
-from robotid.diagnosis.residual.torque_split import JointTorque
+from robotid.diagnosis.residual.torque_split import JointTorque, friction_split
 from robotid.diagnosis.verdict.parameter_table import parameter_entries
-from robotid.estimation.estimators.batch import solve_factor
-from robotid.estimation.fitting.bands import TorqueBand, next_errors
+from robotid.estimation.fitting.drive_terms import DriveChoice
 from robotid.estimation.fitting.evaluation import Evaluation
-from robotid.estimation.fitting.fitted import Fit
-from robotid.estimation.fitting.selected_drives import DriveChoice
+from robotid.estimation.fitting.fitted import next_errors
+from robotid.estimation.fitting.standard_errors import TorqueBand
 from robotid.identification.result import TorqueIdentification
 from robotid.identification.summary import left_out_lines
 from robotid.output.files.entries import input_entries
 from robotid.output.pages.charts import Chart, chart_html
 from robotid.output.pages.html import Cell, block, cell, code, folded, listing, percent, table, text
 from robotid.output.report.dock import Residual
-from robotid.output.report.ellipsoids import ellipsoid_pictures
 from robotid.output.report.errors import TORQUE, errors_of, worst_errors
 from robotid.output.report.next_steps import next_steps
 from robotid.output.report.pictures import (
@@ -50,17 +46,12 @@ from robotid.output.report.tables import (
     version_table,
 )
 
-_PAIRS = 15  # strongest correlations that are listed
-_STRONG = 0.8  # smallest correlation that is listed
-_KNOWN = 0.99  # share of the data from which a parameter is not listed
 _LOW = 130  # [px] height of a friction chart
 _CURVES = 8  # friction charts that are not folded
 _POINTS = 300  # of a chart of the residual analysis
 _ALL_POINTS = 1800  # of one chart, summed over the joints
 _FEWEST_POINTS = 100
 _MOST = 12  # joints with all charts; others have charts of significant dependences only
-_WEAK = (("parameter", "code", "name"), ("share of data %", ".1f", "share"))
-_CORRELATED = (("parameter", "code", "one"), ("and", "code", "other"), ("correlation", ".3f", "r"))
 _TRIED = (
     ("terms", "text", "terms"), ("held-out error %", ".2f", "error"), ("p-value", ".1e", "p_value"),
     ("", "text", "selected"),
@@ -89,7 +80,7 @@ def torque_report(found: TorqueIdentification, origin: Origin, replay: str = "")
         errors=(block("report.torque_errors"), ""),
         curves=("Torques", torques_section(found, worst, origin, replay)),
         friction=friction_section(found, worst),
-        bodies=body_table(found) + ellipsoid_pictures(found),
+        bodies=body_table(found),
         why=why_section(found),
         variation=variation_section(found.variation, _next_errors(found)),
         parameters=parameter_section(
@@ -105,7 +96,6 @@ def torque_report(found: TorqueIdentification, origin: Origin, replay: str = "")
             "drives": ("Selection of friction terms", drive_choices(found)),
             "base": ("Base parameters", base_table(found)),
             "consistency": ("Physical consistency", consistency_section(found)),
-            "information": ("Excitation and correlation", information_section(found)),
             "open": ("Parameters not identifiable", open_section(found)),
             "settings": ("Settings", settings_tables(found)),
             "inputs": ("Inputs", input_table(input_entries(found))),
@@ -317,51 +307,6 @@ def _choice(drive: DriveChoice) -> str:
     ]
     tried_terms = listing(title, _TRIED, rows)
     return f"<details><summary>{escape(title)}</summary>{tried_terms}</details>\n"
-
-
-def information(found: Fit) -> tuple[Array, Array]:
-    """Return the correlation of base parameters, and the share of the data in each.
-
-    The correlation (b, b) is that of the errors of WLS if rows were independent; NaN for parameters
-    that are not identifiable. The share (b,), 0 to 1, is S^2 / (S^2 + s^2) with the prior standard
-    deviation S and the standard error s of WLS.
-    """
-    K = found.mapping.K
-    prior = np.einsum("bi,i,bi->b", K, found.prior_std**2, K)  # variances
-    error = np.diag(found.wls.covariance)
-    is_known = np.isfinite(error) & (error > 0)
-    bread = solve_factor(found.factors, found.wls.sigma, found.wls.theta).covariance
-    std = np.sqrt(np.where(is_known, np.diag(bread), np.nan))
-    share = np.where(np.isfinite(error), prior / (prior + error), 0.0)
-    return bread / np.outer(std, std), share
-
-
-def information_section(found: TorqueIdentification) -> str:
-    """Return the information in the data: shares of the data, correlations."""
-    (correlation, share), names = information(found), found.mapping.base_names
-    weak = [
-        {"name": names[i], "share": 100 * share[i]}
-        for i in np.argsort(share, kind="stable")
-        if share[i] < _KNOWN
-    ]
-    r = np.tril(np.where(np.isfinite(correlation), correlation, 0.0), -1)
-    count = int((np.abs(r) >= _STRONG).sum())
-    order = np.argsort(-np.abs(r), axis=None, kind="stable")[: min(count, _PAIRS)]
-    pairs = [
-        {"one": names[i], "other": names[j], "r": r[i, j]}
-        for i, j in zip(*np.unravel_index(order, r.shape), strict=True)
-    ]
-    title = f"The strongest of {count} correlations of {_STRONG:g} and more"
-    percents = np.round(100 * share).astype(int)
-    return block(
-        "report.information",
-        condition=f"{found.wls.condition:.3g}",
-        mean=f"{percents.mean():.0f}",
-        least=percents.min(),
-        weak=listing("Base parameters that the data determine by less than 99 %", _WEAK, weak),
-        pairs=listing(title, _CORRELATED, pairs)
-        or f"<p>No correlation is above {_STRONG:g}.</p>\n",
-    )
 
 
 def why_section(found: TorqueIdentification) -> str:

@@ -12,19 +12,17 @@ from robotid.data.log import Trajectory
 from robotid.data.signal_settings import SignalSettings
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.torque import joint_torque_regressor
-from robotid.estimation.fitting.bands import (
-    TorqueBand,
+from robotid.estimation.fitting.drive_terms import OpenTerm
+from robotid.estimation.fitting.estimator_settings import EstimatorSettings
+from robotid.estimation.fitting.evaluation import Evaluation
+from robotid.estimation.fitting.fitted import (
     expected_band,
     friction_curve,
     next_errors,
     recording_bands,
-    rms_error,
-    torque_band,
     typical_friction,
 )
-from robotid.estimation.fitting.estimator_settings import EstimatorSettings
-from robotid.estimation.fitting.evaluation import Evaluation
-from robotid.estimation.fitting.open_terms import OpenTerm
+from robotid.estimation.fitting.standard_errors import TorqueBand, rms_error, torque_band
 from robotid.output.files.entries import build_result
 from robotid.robot.drives import LoadFriction, PositionCoulomb
 from robotid.robot.examples import example_urdf

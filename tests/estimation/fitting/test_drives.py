@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from robotid.estimation.fitting.selected_drives import DriveChoice, FoundShape
+from robotid.estimation.fitting.drive_terms import DriveChoice, FoundShape
 from robotid.robot.drives import LuGre, Stribeck
 
 SEEN = {"v": (0.0, 2.0), "q": (-0.3, 0.4)}

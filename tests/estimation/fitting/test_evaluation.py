@@ -10,6 +10,7 @@ from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import turns_note
 from robotid.dynamics.used_rows import row_mask
 from robotid.estimation.fitting.evaluation import (
+    TorqueSums,
     _conclude,
     _joined,
     _parts,
@@ -20,7 +21,6 @@ from robotid.estimation.fitting.evaluation import (
     predict,
     shares_rows,
 )
-from robotid.estimation.fitting.metrics import TorqueSums
 from robotid.estimation.fitting.survey import hold_log
 from robotid.robot.parameters import Coupling
 

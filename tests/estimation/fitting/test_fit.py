@@ -8,15 +8,12 @@ from helpers.fitting import fit
 from helpers.synthetic import exact_log, truth
 
 from robotid.data.signal_settings import SignalSettings
-from robotid.dynamics.base_parameters import BaseMapping, structural_mapping
-from robotid.dynamics.factors import Factors
-from robotid.estimation.estimators import Consistent
-from robotid.estimation.estimators.consistent.consistent_fit import WeightChoice
-from robotid.estimation.fitting import consistent_estimator as estimators
-from robotid.estimation.fitting.consistent_estimator import Known, consistent_fit
-from robotid.estimation.fitting.estimator_settings import ConsistentSettings, EstimatorSettings
+from robotid.dynamics.base_parameters import BaseMapping
+from robotid.estimation.fitting.estimator_settings import (
+    EstimatorSettings,
+    Known,
+)
 from robotid.estimation.fitting.fit import rough_choice
-from robotid.robot.bodies import held_parameters
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 from robotid.robot.prior import prior_spread
@@ -24,8 +21,8 @@ from robotid.robot.prior import prior_spread
 
 @pytest.mark.parametrize(("weight", "rough"), [("auto", 1.0), ("evidence", 1.0), (2.5, 2.5)])
 def test_rough_settings_keep_a_stated_weight_and_draw_nothing(weight, rough):
-    choice = EstimatorSettings("consistent", prior_weight=weight, draws=40)
-    assert rough_choice(choice) == replace(choice, prior_weight=rough, draws=0)
+    choice = EstimatorSettings("consistent", prior_weight=weight)
+    assert rough_choice(choice) == replace(choice, prior_weight=rough)
     least_squares = EstimatorSettings("wls", robust="huber")
     assert rough_choice(least_squares) is least_squares
 
@@ -35,7 +32,7 @@ def test_a_base_parameter_of_terms_at_their_bound_alone_has_no_error(rng):
     joint = model.joints[1]
     log = exact_log(model, truth(model), rng, samples=250, noise=np.array([0.5, 0.1]))
     log = replace(log, tau=log.tau - [0.0, 9.0] * log.v)  # negative friction of the second joint
-    choice = EstimatorSettings("consistent", prior_weight=1.0, draws=0)
+    choice = EstimatorSettings("consistent", prior_weight=1.0)
     found = fit(model, [log], signals=SignalSettings(cutoff=None, trim=0.0), estimator=choice)
     K = found.mapping.K
     at_bound = set(np.flatnonzero(found.at_bound))
@@ -74,48 +71,3 @@ def test_the_prior_of_a_fit_has_the_scale_of_the_samples_of_all_logs(rng):
     np.testing.assert_allclose(found.base, found.estimate.theta, atol=1e-9)
     np.testing.assert_allclose(found.base_error, found.estimate.std_error)
     np.testing.assert_allclose(found.wls.theta, found.estimate.theta, rtol=1e-6)
-
-
-@pytest.mark.parametrize(("weight", "how"), [(2.5, ""), ("auto", "cv"), ("evidence", "evidence")])
-def test_a_consistent_fit_has_every_setting_and_the_weight_of_its_choice(monkeypatch, weight, how):
-    urdf = example_urdf("double_pendulum_simple.urdf")
-    model = RobotModel.from_urdf(urdf, locked={"joint2": 0.4})
-    mapping, pi = structural_mapping(model), model.standard_parameters() + 0.1
-    spread, sigma = np.linspace(0.2, 0.9, len(pi)), np.array([0.7])
-    triangle = (np.eye(len(mapping.K) + 1),)
-    columns = (np.arange(len(mapping.K)),)
-    folds = [Factors(triangle, columns, np.array([k + 9]), mapping.base_names) for k in range(13)]
-    asked = []
-
-    def chosen(fit, segments, how, repeated):
-        assert repeated == 0.25
-        asked.append((fit, segments, how))
-        return WeightChoice(7.0, how, ((7.0, 0.2),), 0.5)
-
-    monkeypatch.setattr(estimators, "choose_weight", chosen)
-    monkeypatch.setattr(Consistent, "noise", lambda fit, factors: sigma)
-    settings = ConsistentSettings(
-        prior_weight=weight, constraints={"extent": "none", "total_mass": [1.0, 9.0]},
-    )  # fmt: skip
-    known = Known(model, mapping, pi, spread, 0.3, sigma, tuple(folds), 0.25)
-    fit = consistent_fit(settings, known)
-    assert fit.independent_share == 0.3
-    assert fit.constraints.total_mass == (1.0, 9.0)
-    held = held_parameters(model)
-    assert held.any()
-    wanted = (mapping.K, pi, spread, held, sigma)
-    for ours, own in zip(
-        (fit.K, fit.prior, fit.prior_std, fit.held, fit.wls_noise), wanted, strict=True
-    ):
-        np.testing.assert_array_equal(ours, own)
-    if not how:
-        assert (fit.prior_weight, fit.plausible_weight, fit.choice) == (2.5, 1.0, None)
-        assert not asked
-        return
-    assert (fit.prior_weight, fit.plausible_weight, fit.choice.how) == (7.0, 0.5, how)
-    [(before, segments, other)] = asked
-    assert (before.prior_weight, other) == (1.0, how)
-    assert sum(fold.rows.sum() for fold in segments.folds) == sum(range(9, 22))
-    assert len(segments.folds) == 6
-    alone = consistent_fit(settings, replace(known, held_out=tuple(folds[:1])))
-    assert (alone.prior_weight, len(asked)) == ((1.0, 1) if how == "cv" else (7.0, 2))

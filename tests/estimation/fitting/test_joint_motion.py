@@ -8,7 +8,7 @@ from helpers.driven import arm
 
 from robotid.data.log import Trajectory
 from robotid.data.signal_settings import SignalSettings
-from robotid.estimation.fitting.joint_motion import joint_motions, travelled
+from robotid.estimation.fitting.drive_terms import joint_motions, travelled
 
 
 def recording(model, rng, count, cutoff, start):

@@ -7,13 +7,13 @@ import pytest
 from helpers.driven import EXACT, arm, driven_log
 from helpers.synthetic import truth
 
+from robotid.data.alike_motions import alike_motions
 from robotid.diagnosis.verdict.evidence import Determined, Predictions
 from robotid.diagnosis.verdict.verdict import judge
 from robotid.dynamics.base_parameters import structural_mapping
-from robotid.estimation.fitting import left_out
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
+from robotid.estimation.fitting.evaluation import LEFT_OUT, logs_that_test
 from robotid.estimation.fitting.fit import solve_recordings
-from robotid.estimation.fitting.left_out import LEFT_OUT, alike_motions, logs_that_test
 from robotid.estimation.fitting.recorded import Recordings
 from robotid.estimation.fitting.survey import hold_log
 from robotid.identification.pipeline import conclude
@@ -41,15 +41,11 @@ def fit_of(model, fitted, validation=(), choice=WLS):
     return solve_recordings(some, choice).with_errors()
 
 
-@pytest.mark.parametrize("choice", [WLS, EstimatorSettings(prior_weight=1.0, draws=0)])
-@pytest.mark.parametrize("most", [10, 2])
-def test_errors_are_those_of_validation_logs_of_a_fit_to_the_others(
-    logs, choice, most, monkeypatch
-):
+@pytest.mark.parametrize("choice", [WLS, EstimatorSettings(prior_weight=1.0)])
+def test_errors_are_those_of_validation_logs_of_a_fit_to_the_others(logs, choice):
     model, held = logs
-    monkeypatch.setattr(left_out, "_FITS", most)
     whole = fit_of(model, held, choice=choice)
-    folds = [{0, 2}, {1}, {3}] if most == 10 else [{0, 2, 3}, {1}]
+    folds = [{0, 2}, {1}, {3}]
     assert len(whole.left_out) == 4
     assert whole.predictions == whole.left_out
     for out in folds:
@@ -85,7 +81,7 @@ def test_motions_that_repeat_one_another_are_one_group(logs):
 def test_the_verdict_is_on_the_logs_left_out(logs):
     model, held = logs
     some = Recordings(model, structural_mapping(model), held)
-    found = conclude(some, EstimatorSettings(prior_weight=1.0, draws=0), friction="viscous+coulomb")
+    found = conclude(some, EstimatorSettings(prior_weight=1.0), friction="viscous+coulomb")
     worst = max(m.relative_error_pct for each in found.left_out.values()
                 for m in each.per_joint.values())  # fmt: skip
     reasons = " ".join(found.verdict.reasons)

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from robotid.base.exceptions import DataError
-from robotid.estimation.fitting.metrics import TorqueSums
+from robotid.estimation.fitting.evaluation import TorqueSums
 
 TAU = np.array([[1.0, 10.0], [-1.0, 10.0], [3.0, 12.0], [0.0, 12.0]])
 

@@ -181,7 +181,7 @@ def test_repeated_rounding_errors_count_as_often_as_they_are_repeated(planar):
 
 def test_a_finding_names_joints_step_and_parameter(planar, motion):
     log = recorded(planar, motion)
-    found = identify(planar, [log], signals=SIGNALS, estimator=EstimatorSettings(draws=0))
+    found = identify(planar, [log], signals=SIGNALS, estimator=EstimatorSettings())
     (finding,) = [f for f in found.findings if f.code == "encoder_noise"]
     assert finding.severity == "warning"
     assert "steps of up to 0.00307 rad (11.0 bits per revolution)" in finding.message
@@ -200,7 +200,9 @@ def test_fine_encoders_change_nothing_and_are_not_named(planar, motion, step):
     log = recorded(planar, motion, step=step)
     found = fit(planar, [log], signals=SIGNALS, estimator="wls")
     assert found.regressor_noise is None
-    assert regressor_noise.encoder_findings(found) == []
+    assert regressor_noise.encoder_findings(
+        found.regressor_noise, found.model, found.mapping
+    ) == []
 
 
 def test_measured_velocities_have_no_noise_of_the_positions(planar, motion):
@@ -403,11 +405,9 @@ def test_a_finding_names_the_joints_of_coarse_steps_and_the_worst_inertial_sum(
         shift=np.array([90.0, 0.2, shift]), std_error=np.array([1.0, 0.5, 0.75]), meat=np.eye(3),
     )  # fmt: skip
     layout = SimpleNamespace(n_inertial=2, prismatic={"d"})
-    fit = SimpleNamespace(
-        regressor_noise=noise, model=SimpleNamespace(joints=tuple("abcd"), layout=layout),
-        mapping=SimpleNamespace(K=K, base_names=("x", "y", "z")),
-    )  # fmt: skip
-    found = regressor_noise.encoder_findings(fit)
+    model = SimpleNamespace(joints=tuple("abcd"), layout=layout)
+    mapping = SimpleNamespace(K=K, base_names=("x", "y", "z"))
+    found = regressor_noise.encoder_findings(noise, model, mapping)
     assert len(found) == (severity is not None)
     if not found:
         return

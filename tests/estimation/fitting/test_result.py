@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from robotid.base.exceptions import SettingsError
-from robotid.estimation.fitting import fitted as result_module
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
 from robotid.estimation.fitting.fitted import Fit
 
@@ -66,28 +65,6 @@ def test_intervals_are_each_value_s_own_quantile_times_its_own_error():
     found = SimpleNamespace(base=np.array([1.0, -2.0]), standard=np.array([7.0, 5.0]), **half)
     assert Fit.base_interval.fget(found).tolist() == [[0.0, 2.0], [-2.75, -1.25]]
     assert Fit.standard_interval.fget(found).tolist() == [[5.0, 9.0], [-np.inf, np.inf]]
-
-
-def test_predictions_are_of_logs_without_fitted_rows():
-    validation = [
-        SimpleNamespace(
-            recording=SimpleNamespace(name=name), is_refitted=is_refitted,
-            metrics={"estimate": f"{name} estimate", "wls": f"{name} wls"},
-        )
-        for name, is_refitted in (("a", True), ("b", False), ("c", False))
-    ]  # fmt: skip
-    found = SimpleNamespace(validation=validation)
-    assert Fit.predictions.fget(found) == {"b": "b estimate", "c": "c estimate"}
-    assert Fit.refitted.fget(found) == (validation[0],)
-
-
-def test_a_band_is_that_of_the_recording_or_of_the_noise_of_the_fit(monkeypatch):
-    monkeypatch.setattr(
-        result_module, "expected_band", lambda found, e, between: ("expected", e, between)
-    )
-    a, b, c, other = (SimpleNamespace(name=name) for name in "abcd")
-    own = SimpleNamespace(fitted=(a, b), validation=(c,), _bands=(1, 2, 3), between=7)
-    assert [Fit.band(own, e) for e in (a, b, c, other)] == [1, 2, 3, ("expected", other, 7)]
 
 
 def test_wls_is_overfitted_where_it_predicts_every_unseen_log_by_a_fifth_worse():

@@ -84,7 +84,7 @@ def test_a_recursive_estimate_is_made_physical_on_request(rng, name):
     log = exact_log(model, truth(model), rng, noise=20 * np.array([4.0, 2.0, 0.3]))
     free = fit(model, [log], signals=EXACT, estimator=name)
     assert not free.is_consistent
-    settings = EstimatorSettings(name, physical=True, draws=0)
+    settings = EstimatorSettings(name, physical=True)
     found = fit(model, [log], signals=EXACT, estimator=settings)
     assert found.is_consistent
     assert "projected onto physically consistent" in found.estimate.message
@@ -112,7 +112,6 @@ def test_a_job_with_a_recursive_estimator_runs_from_file_to_report(rng, tmp_path
         "gate": 0.999999,
         "physical": True,
         "prior_weight": "auto",
-        "draws": 64,
         "constraints": {},
     }
     assert "a Kalman filter" in (tmp_path / "out" / "report.html").read_text()

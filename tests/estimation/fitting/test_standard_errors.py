@@ -8,7 +8,7 @@ import scipy.stats
 from helpers.fitting import fit
 from helpers.synthetic import exact_log, truth
 
-from robotid.base.exceptions import DataError, NotConvergedError
+from robotid.base.exceptions import DataError
 from robotid.data.signal_settings import SignalSettings
 from robotid.dynamics.base_parameters import BaseMapping
 from robotid.dynamics.factors import Factors, compress, merge
@@ -16,7 +16,6 @@ from robotid.dynamics.problem import Problem
 from robotid.estimation.estimators import OLS, WLS
 from robotid.estimation.estimators.segments import quantile, scatter
 from robotid.estimation.fitting.standard_errors import (
-    Redraws,
     about_prior,
     measured_errors,
     standard_of,
@@ -342,7 +341,7 @@ def test_standard_parameters_are_the_prior_moved_by_the_least_to_the_base_parame
 
 @pytest.mark.parametrize("count", [40, 11])
 def test_with_active_bounds_errors_are_those_of_resampled_fits(W, rng, count):
-    share, given, distances = 0.25, [], rng.standard_normal((8, 6))
+    share, given, distances = 0.25, [], rng.standard_normal((60, 6))
     parts = segments(W, W @ TRUTH + noise(rng, 0.9))[:count]
     whole, K = merge(parts), np.hstack([np.eye(4), rng.standard_normal((4, 2))])
     wls = WLS(independent_share=share).fit(whole)
@@ -364,28 +363,27 @@ def test_with_active_bounds_errors_are_those_of_resampled_fits(W, rng, count):
     )  # fmt: skip
     every = (estimate, parts, whole, share, K, wls.sigma)
     plain, without = measured_errors(*every)
-    found, errors = measured_errors(*every, redraws=Redraws(fit, 10, "noise"))
-    (rows, weight, pi, meat, ratio, draws, source), *_ = given
+    found, errors = measured_errors(*every, bounded=fit)
+    (rows, weight, pi, meat, ratio, draws, _), *_ = given
     assert rows == (whole, wls.sigma)
-    assert (weight, ratio, draws, source) == (2.5, 1.5, 10, "noise")
+    assert (weight, ratio, draws) == (2.5, 1.5, 64)
     np.testing.assert_array_equal(pi, theta)
     wanted = share * R.T @ R
     if count == 40:
         wanted = share**2 * scatter(parts, K @ theta, wls.sigma, share * K @ C @ K.T).meat
     np.testing.assert_allclose(meat, wanted, rtol=1e-9)
-    np.testing.assert_allclose(found.covariance, distances.T @ distances / 8, rtol=1e-12)
-    np.testing.assert_allclose(1 / errors.freedom, 1 / without.freedom + 1 / 8, rtol=1e-12)
+    np.testing.assert_allclose(found.covariance, distances.T @ distances / 60, rtol=1e-12)
+    np.testing.assert_allclose(1 / errors.freedom, 1 / without.freedom + 1 / 60, rtol=1e-12)
     np.testing.assert_array_equal(errors.unbounded, plain.std_error)
     assert errors.method == (
-        f"{without.method}; bounds are active: 8 fits to resampled data and prior "
+        f"{without.method}; bounds are active: 60 fits to resampled data and prior "
         "(2 more not solved: slow)"
     )
     solved[:] = distances[:7], ["slow", "other", "other"]
-    with pytest.raises(NotConvergedError, match="solved 7 of 10 fits") as error:
-        measured_errors(*every, redraws=Redraws(fit, 10, "noise"))
-    assert error.value.status == "slow"
-    for off in (Redraws(fit, 0, "noise"), None):  # bounds are neglected
-        assert measured_errors(*every, redraws=off)[1].unbounded is None
+    found, errors = measured_errors(*every, bounded=fit)
+    assert "active bounds are neglected, only 7 of 64 fits" in errors.method
+    np.testing.assert_array_equal(found.covariance, plain.covariance)
+    assert errors.unbounded is without.unbounded is None
     if count == 11:
         wide = measured_errors(*every, weight_ratio=3.0)[0]
         L = np.diag(np.arange(1.0, 7.0))

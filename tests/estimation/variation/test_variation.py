@@ -7,12 +7,11 @@ import pytest
 from helpers.driven import EXACT, FIT, arm, driven_log
 from helpers.synthetic import truth
 
-from robotid.diagnosis.verdict.unlike_runs import unlike_findings
+from robotid.diagnosis.verdict.fit_findings import unlike_findings
 from robotid.dynamics.base_parameters import structural_mapping
-from robotid.estimation.fitting.fit import solve_recordings
+from robotid.estimation.fitting.fit import solve_recordings, sums_with_zeros
 from robotid.estimation.fitting.recorded import Recordings
 from robotid.estimation.fitting.survey import hold_log
-from robotid.estimation.fitting.zeros import sums_with_zeros
 from robotid.estimation.variation.groups import (
     Group,
     RunsOf,

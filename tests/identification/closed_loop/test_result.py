@@ -7,7 +7,7 @@ import pytest
 import scipy.stats
 
 from robotid.data.log import Log
-from robotid.estimation.fitting.bands import QUANTILE
+from robotid.estimation.fitting.standard_errors import QUANTILE
 from robotid.identification.closed_loop.encoder_zeros import Encoders
 from robotid.identification.closed_loop.further_parameters import GainScale, Tried
 from robotid.identification.closed_loop.loop_findings import loop_findings

@@ -1,0 +1,276 @@
+"""Terms of the drives: those selected, those in doubt, and the motion that they depend on."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
+from operator import attrgetter
+from typing import Any
+
+import numpy as np
+
+from robotid.base.typing import Array
+from robotid.data.log import Trajectory
+from robotid.dynamics.constraint_rows import without_forces
+from robotid.dynamics.drive_columns import friction_directions
+from robotid.dynamics.prediction import drive_motion_along
+from robotid.estimation.fitting.evaluation import Recording
+from robotid.robot.drives import FAMILIES, DriveMotion, DriveTerm, Family
+from robotid.robot.model import RobotModel
+
+_FARTHEST = 1.33  # largest factor by which a shape parameter changes in one step
+
+
+@dataclass(frozen=True)
+class Tried:
+    """A set of drive terms that was tried for a joint.
+
+    Attributes:
+        families: Names of the families in addition to viscous and Coulomb friction.
+        held_out_error_pct: Residual of the held-out segments, relative to the torque [%].
+        p_value: p-value of the reduction of the held-out residual [-]; 1 without a reduction.
+        is_selected: Whether it was selected.
+    """
+
+    families: tuple[str, ...]
+    held_out_error_pct: float
+    p_value: float
+    is_selected: bool
+
+
+@dataclass(frozen=True)
+class FoundShape:
+    """An identified shape parameter of a friction term.
+
+    Attributes:
+        name: Its name, as ``stribeck.speed``.
+        value: Its value [unit].
+        std_error: Its standard error [unit].
+        unit: Its unit.
+        is_at_bound: Whether it is at a bound of the search range.
+    """
+
+    name: str
+    value: float
+    std_error: float
+    unit: str
+    is_at_bound: bool
+
+
+@dataclass(frozen=True)
+class DriveChoice:
+    """The terms selected for one joint's drive.
+
+    Attributes:
+        joint: The joint.
+        families: Names of the families in addition to viscous and Coulomb friction.
+        terms: The terms.
+        tried: The sets of terms that were tried, step by step.
+        shapes: The identified shape parameters.
+        shape_covariance: Their covariance, row by row.
+        sizes: Values of the shape parameters of each family.
+        data_range: Ranges of position "q" and of absolute speed "v" in the fitted rows.
+        grown: Factor by which the terms increase the standard errors of the drive's armature,
+            viscous and Coulomb friction and offset, by name.
+        undecided: Terms that reduce the held-out residual, but not significantly. They were not
+            selected; the standard errors include the change that they would cause.
+    """
+
+    joint: str
+    families: tuple[str, ...]
+    terms: tuple[DriveTerm, ...]
+    tried: tuple[Tried, ...] = ()
+    shapes: tuple[FoundShape, ...] = ()
+    shape_covariance: tuple[tuple[float, ...], ...] = ()
+    sizes: tuple[tuple[float, ...], ...] = ()
+    data_range: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    grown: Mapping[str, float] = field(default_factory=dict)
+    undecided: tuple[DriveTerm, ...] = ()
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the sets tried, the selected families and the shapes, as plain values."""
+        return {
+            "families": list(self.families),
+            "shapes": [asdict(shape) for shape in self.shapes],
+            "data_range": {key: list(pair) for key, pair in self.data_range.items()},
+            "tried": [{**asdict(step), "families": list(step.families)} for step in self.tried],
+        }
+
+    def moved(self, step: Array, covariance: Array) -> "DriveChoice":
+        """Return the choice with shapes changed by a step, within their bounds.
+
+        No shape changes by more than a third.
+
+        step (k,), covariance (k, k).
+        """
+        flat = np.array([size for own in self.sizes for size in own])
+        families = [FAMILIES[name] for name in self.families]
+        bounds = np.array([s.within(self.data_range) for family in families for s in family.shapes])
+        near = np.clip(flat + step, flat / _FARTHEST, flat * _FARTHEST)
+        sizes = np.clip(near, *bounds.T)
+        chosen = with_shapes(families, sizes)
+        shapes = zip(self.shapes, sizes, np.sqrt(np.diag(covariance)), strict=True)
+        return replace(
+            self,
+            terms=tuple(t for family, own in chosen for t in family.make(self.data_range, *own)),
+            shapes=tuple(
+                replace(shape, value=float(size), std_error=float(error))
+                for shape, size, error in shapes
+            ),
+            shape_covariance=tuple(tuple(row) for row in covariance.tolist()),
+            sizes=tuple(tuple(own) for _, own in chosen),
+        )
+
+    def altered(self, which: int, share: float) -> tuple[DriveTerm, ...]:
+        """Return the terms with one of the shapes increased."""
+        flat = [(at, k) for at, own in enumerate(self.sizes) for k in range(len(own))]
+        sizes = [list(own) for own in self.sizes]
+        at, k = flat[which]
+        sizes[at][k] *= 1.0 + share
+        every = zip(self.families, sizes, strict=True)
+        return tuple(
+            term for name, own in every for term in FAMILIES[name].make(self.data_range, *own)
+        )
+
+
+def with_shapes(families: Sequence[Family], flat: Array) -> list[tuple[Family, list[float]]]:
+    """Return each family with its shapes, from one array of all shapes: flat (k,)."""
+    sizes = iter(flat.tolist())
+    return [(family, [next(sizes) for _ in family.shapes]) for family in families]
+
+
+@dataclass(frozen=True, eq=False)
+class JointMotion:
+    """Motion and load of a joint in N rows of the fitted recordings.
+
+    Attributes:
+        q: Positions, shape (N,) [rad or m].
+        v: Speeds, shape (N,) [rad/s or m/s].
+        a: Accelerations, shape (N,) [rad/s^2 or m/s^2].
+        direction: Direction of friction: the sign of v, filtered as the torque, shape (N,) [-].
+        load: Torque of the rigid bodies by the estimate, shape (N,) [N m or N].
+        travelled: Distance since the last change of sign of v, shape (N,) [rad or m].
+        time: Time since the start of the recording, over the longest duration, shape (N,) [-].
+        passes: Cut-off frequency of the torque filter [Hz]; infinite without a filter.
+        longest: The longest duration of a recording [s].
+        others: Motion of the joints before and after it, by name.
+        scale: Motion whose typical speeds, distances and loads scale columns; None: this one.
+    """
+
+    q: Array
+    v: Array
+    a: Array
+    direction: Array
+    load: Array
+    travelled: Array
+    time: Array
+    passes: float = np.inf
+    longest: float = 1.0
+    others: dict[str, "JointMotion"] = field(default_factory=dict)
+    scale: "JointMotion | None" = None
+
+    @classmethod
+    def steady(cls, motion: DriveMotion) -> "JointMotion":
+        """Return the motion of a joint after long motion at constant speed, the others at rest.
+
+        motion (N,).
+        """
+        none, far = np.zeros_like(motion.v), np.full_like(motion.v, np.inf)
+        m = motion
+        return cls(m.q, m.v, m.a, m.direction, m.load, travelled=far, time=none)
+
+    def at(self, rows: slice) -> "JointMotion":
+        """Return the motion in some of the rows, without the other joints."""
+        q, v, a, direction, load = (
+            x[rows] for x in (self.q, self.v, self.a, self.direction, self.load)
+        )
+        travelled, time = self.travelled[rows], self.time[rows]
+        return JointMotion(q, v, a, direction, load, travelled, time, self.passes, self.longest)
+
+
+def joint_motions(
+    recordings: Sequence[Recording], rows: Sequence[Array], load: Array, model: RobotModel
+) -> tuple[JointMotion, ...]:
+    """Return the motion of each joint and its neighbours in some rows of recordings.
+
+    load (N, n) [N m or N].
+    """
+    motions = [recording.trajectory for recording in recordings]
+    passes = max(recording.signals.cutoff or np.inf for recording in recordings)
+    longest = max(float(np.ptp(m.t)) for m in motions)
+
+    def joined(of: Callable[[Trajectory], Array]) -> Array:
+        return np.concatenate([of(m)[k] for m, k in zip(motions, rows, strict=True)])
+
+    n = len(model.joints)  # the pose and twist of a floating base come before them
+    q, v, a = (x[:, x.shape[1] - n :] for x in (joined(attrgetter(name)) for name in "qva"))
+    signs = joined(partial(_directions, model))
+    distance = joined(travelled)
+    time = joined(lambda m: (m.t - m.t[0]) / (longest or 1.0))
+    columns = zip(q.T, v.T, a.T, signs.T, load.T, distance.T, strict=True)
+    alone = [
+        JointMotion(q_j, v_j, a_j, sign, load_j, far, time, passes, longest or 1.0)
+        for q_j, v_j, a_j, sign, load_j, far in columns
+    ]
+    neighbours = [[k for k in (j - 1, j + 1) if 0 <= k < len(alone)] for j in range(len(alone))]
+    return tuple(
+        replace(motion, others={model.joints[k]: alone[k] for k in near})
+        for motion, near in zip(alone, neighbours, strict=True)
+    )
+
+
+def _directions(model: RobotModel, motion: Trajectory) -> Array:
+    """Return the direction of the friction of each joint's own drive, shape (N, n)."""
+    signs = friction_directions(model.layout, motion.v, motion.direction)[:, : len(model.joints)]
+    v = motion.v[:, motion.v.shape[1] - len(model.joints) :]
+    return signs if signs.shape[1] else np.sign(v)
+
+
+def travelled(motion: Trajectory) -> Array:
+    """Return the distance of each joint since its last reversal, shape (N, n) [rad or m]."""
+    is_first = np.diff(motion.segment, prepend=motion.segment[0] - 1) != 0
+    n = len(motion.joints)
+    q, v = (x[:, x.shape[1] - n :] for x in (motion.q, motion.v))
+    reverses = (np.diff(np.sign(v), axis=0, prepend=0.0) != 0) | is_first[:, None]
+    last = np.maximum.accumulate(np.where(reverses, np.arange(len(reverses))[:, None], 0), axis=0)
+    distance: Array = np.abs(q - np.take_along_axis(q, last, axis=0))
+    return distance
+
+
+@dataclass(frozen=True, eq=False)
+class OpenTerm:
+    """An uncertainty of a joint's drive model: an undecided term, or the error of a shape.
+
+    Attributes:
+        joint: The joint.
+        moves: Change of the standard parameters that it causes, shape (p,).
+        torque: Function of the motion of the drive and of the joint that returns its own torque,
+            shape (N,) [N m or N].
+    """
+
+    joint: str
+    moves: Array
+    torque: Callable[[DriveMotion, JointMotion], Array]
+
+
+def open_torques(
+    model: RobotModel, terms: Sequence[OpenTerm], recording: Recording, rows: Array
+) -> list[Array]:
+    """Return the torque of each open term of the drives along a recording.
+
+    The model has the identified bodies as its reference.
+
+    rows (k,) -> (k, n_rows) [N m or N].
+    """
+    if not terms:
+        return []
+    joints, first = model.joints, model.n_rows - len(model.joints)
+    drives = drive_motion_along(model, recording.trajectory)
+    load, every = drives.load[: len(joints)].T, np.arange(len(recording.trajectory.t))
+    motions = joint_motions([recording], [every], load, model)
+    torques = []
+    for term in terms:
+        j, torque = joints.index(term.joint), np.zeros((len(rows), model.n_rows))
+        torque[:, first + j] = term.torque(drives.of(j), motions[j])[rows]
+        basis = recording.trajectory.basis
+        torques.append(torque if basis is None else without_forces(basis[rows], torque))
+    return torques
