@@ -58,8 +58,7 @@ def fit_findings(
     if determined.groups:
         findings.append(
             finding(
-                "undetermined", subject="base_parameters", what="torques", cure="torques",
-                described=determined.described(),
+                "undetermined", subject="base_parameters", described=determined.described(),
                 severity="warning" if fit.is_poorly_excited else "note", rank=determined.rank,
                 base=len(determined.names),
             )
@@ -381,7 +380,7 @@ def _bound_findings(fit: Fit) -> list[Finding]:
     if at_bound:
         joints = list(dict.fromkeys(name.rpartition(".")[0] for name in at_bound))
         where, text = ", ".join(at_bound), listed(at_bound, _NAMED)
-        findings.append(finding("at_bound", "", joints, subject=where, what="drive", names=text))
+        findings.append(finding("at_bound", "", joints, subject=where, names=text))
     findings += [
         finding("extent_contradicted", subject=f"link {body}", link=body)
         for body in fit.estimate.details.get("relaxed", ())
