@@ -25,6 +25,7 @@ from robotid.dynamics.torque import (
 )
 from robotid.identification.pipeline import identify
 from robotid.output.files.urdf import load_identified, read_sidecar, write_urdf
+from robotid.robot.drive_term import DriveMotion
 from robotid.robot.drives import (
     DRIVE_TERMS,
     FAMILIES,
@@ -33,7 +34,6 @@ from robotid.robot.drives import (
     Bristles,
     Counterbalance,
     Cubic,
-    DriveMotion,
     Harmonic,
     Hat,
     Lag,

@@ -9,7 +9,8 @@ import numpy as np
 
 from robotid.base.typing import Array
 from robotid.estimation.fitting.drive_terms import JointMotion
-from robotid.robot.drives import FAMILIES, DriveMotion, DriveTerm, Family, Harmonic
+from robotid.robot.drive_term import DriveMotion, DriveTerm, Family
+from robotid.robot.drives import FAMILIES, Harmonic
 
 _RIPPLES = np.arange(5, 241)  # periods per revolution tested: 200 of a gear of 100 : 1
 _PEAKS = 6  # of them are tested: those with the largest periodic residual

@@ -20,7 +20,8 @@ from robotid.diagnosis.residual.decisions import (
 from robotid.diagnosis.residual.selection import Round, select
 from robotid.diagnosis.residual.term_trials import Sample, Trial, Trials
 from robotid.estimation.fitting.drive_terms import JointMotion
-from robotid.robot.drives import DriveTerm, has_turned
+from robotid.robot.drive_term import DriveTerm
+from robotid.robot.drives import has_turned
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,8 @@ from robotid.diagnosis.residual.candidates import Candidate
 from robotid.diagnosis.residual.decisions import MAIN
 from robotid.diagnosis.residual.misfit import Misfit
 from robotid.estimation.fitting.fitted import Fit
-from robotid.robot.drives import COUNTERBALANCE, DriveTerm, drive_line, spring_family
+from robotid.robot.drive_term import DriveTerm
+from robotid.robot.drives import COUNTERBALANCE, drive_line, spring_family
 
 _OF_POSITION = ("position_periodic", "spring", "position_offset")
 _BALANCES = ("counterbalance", "link_mass")

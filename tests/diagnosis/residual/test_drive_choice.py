@@ -34,10 +34,10 @@ from robotid.estimation.fitting.fitted import (
 from robotid.estimation.fitting.recorded import Recordings
 from robotid.identification.pipeline import identify, with_drives
 from robotid.output.files.urdf import load_identified, write_urdf
+from robotid.robot.drive_term import DriveMotion
 from robotid.robot.drives import (
     AUTO,
     FAMILIES,
-    DriveMotion,
     Harmonic,
     LoadFriction,
     Stribeck,
