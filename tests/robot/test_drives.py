@@ -465,6 +465,13 @@ def test_friction_by_position_is_a_power_of_it():
     assert units == [("N m", "N"), ("N m/rad", "N/m"), ("N m/rad^2", "N/m^2")]
 
 
+def test_ripple_is_a_cosine_or_a_sine():
+    q = np.linspace(-2.0, 2.0, 9)
+    (c, dc), (s, ds) = (Harmonic.position_law(q, 2.5, x) for x in (0.0, 1.0))
+    np.testing.assert_allclose([c, ds / 2.5], [np.cos(2.5 * q)] * 2)
+    np.testing.assert_allclose([s, -dc / 2.5], [np.sin(2.5 * q)] * 2)
+
+
 def test_a_lever_that_is_not_described_hangs_at_the_zero_position():
     """Arms of 0.1 and 0.5 m, a spring without length at rest: tau = k a b sin q."""
     z = np.array([-2.0, 0.0, 0.7])
