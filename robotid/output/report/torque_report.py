@@ -11,8 +11,7 @@ from robotid.base.findings import listed
 from robotid.base.versions import versions
 from robotid.data.signal_settings import SignalSettings
 from robotid.diagnosis.residual.decisions import DEPENDENCE_SHARE
-from robotid.diagnosis.residual.residuals import friction_split
-from robotid.diagnosis.residual.torque_split import JointTorque
+from robotid.diagnosis.residual.torque_split import JointTorque, friction_split
 from robotid.diagnosis.verdict.parameter_table import parameter_entries
 from robotid.estimation.fitting.drive_terms import DriveChoice
 from robotid.estimation.fitting.evaluation import Evaluation
