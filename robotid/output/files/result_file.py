@@ -17,9 +17,7 @@ from robotid.base.settings import require_kind
 from robotid.base.typing import Array
 from robotid.data.log import Log, suggestion
 from robotid.diagnosis.verdict.parameter_table import parameter_table
-from robotid.diagnosis.verdict.payload_check import PayloadCheck
-from robotid.diagnosis.verdict.scale_check import ScaleCheck
-from robotid.diagnosis.verdict.stated_mass import StatedMass
+from robotid.diagnosis.verdict.scale_check import PayloadCheck, ScaleCheck, StatedMass
 from robotid.dynamics.friction_projection import (
     DriveMoments,
     projected_pinocchio_model,

@@ -5,7 +5,7 @@ import pytest
 from helpers.synthetic import exact_log, truth
 
 from robotid.data.signal_settings import SignalSettings
-from robotid.diagnosis.residual.residuals import friction_split, spectrum
+from robotid.diagnosis.residual.torque_split import friction_split, spectrum
 from robotid.estimation.fitting.evaluation import evaluate_logs
 from robotid.estimation.fitting.survey import hold_log
 

@@ -12,9 +12,14 @@ from robotid.base.findings import Finding
 from robotid.cli import _parser
 from robotid.cli.job import job_from_settings
 from robotid.diagnosis.catalogue import codes_with
-from robotid.diagnosis.residual.candidates import CANDIDATES, couplings, ripples
-from robotid.diagnosis.residual.misfit import Misfit
-from robotid.diagnosis.residual.misfit_findings import misfit_findings, setting_of
+from robotid.diagnosis.residual.misfit import (
+    CANDIDATES,
+    Misfit,
+    couplings,
+    misfit_findings,
+    ripples,
+    setting_of,
+)
 from robotid.diagnosis.verdict.verdict import JointVerdict, Verdict
 from robotid.estimation.fitting.drive_terms import (
     JointMotion,

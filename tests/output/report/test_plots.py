@@ -5,7 +5,7 @@ import pytest
 from helpers.figures import torques
 from helpers.pages import chart
 
-from robotid.diagnosis.residual.residuals import spectrum
+from robotid.diagnosis.residual.torque_split import spectrum
 
 JOINTS = range(6)
 
