@@ -50,9 +50,10 @@ def finding(
 ) -> Finding:
     """Return a finding: of a log and joints, or at another subject.
 
-    Values are figures, words, or the choice of a part of the sentence.
+    Values are figures, words, or the choice of a part of the sentence. Behind a colon, the code
+    has the name of another sentence.
     """
-    entry = entries()[code]
+    entry, code = entries()[code], code.partition(":")[0]
     joints = (joints,) if isinstance(joints, str) else tuple(joints)
     about = subject or ", ".join(joints)
     words: dict[str, str] = {"joint": listed(joints)} if joints else {}

@@ -136,7 +136,7 @@ class RobotModel:
             require_kind(name, str, "one of joints or locked", "the name of a joint")
         require_each(terms, str, "terms", f"a list of some of {listed(DRIVE_TERMS)}")
         require_each(passive, str, "passive", "a list of names of joints")
-        require_each(couplings, Coupling, "couplings", "a list of robotid.Coupling")
+        require_each(couplings, Coupling, "couplings", "a list of Coupling")
         for name, own in own_terms.items():
             require_each(own, DriveTerm, f"own_terms of {name!r}", "a list of drive terms")
         for name, flag in (("free_flyer", free_flyer), ("snap_angles", snap_angles)):

@@ -33,6 +33,9 @@ _ALIKE = 0.02  # of the squared residual: within this difference the simpler opt
 # The same p-value decides whether least squares predicts better than bodies bound to the prior.
 FAMILY_P_VALUE = 0.01
 FAMILY = Rule(most=4, share=0.05, p_value=FAMILY_P_VALUE, alike=_ALIKE)
+# Families selected from simulated positions, one of each at most, by the share of a joint's squared
+# residual in held-out windows with unit noise: benchmarks/bench_commands.py
+SIMULATED_FAMILY = Rule(most=3, share=0.02, p_value=None, alike=0.0)
 #: Share of the torque: a smaller gain may be an effect of the filter on velocity signs.
 FAMILY_LEAST = 0.006
 #: p-value below which a family that is not selected is undecided: it widens intervals.
