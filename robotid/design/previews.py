@@ -378,7 +378,7 @@ def preview_logs(
     size = largest_torques(model, peak)
     earlier = run or like
     pi = assumed_parameters(model, size, fastest) if earlier is None else earlier.standard
-    motions = [_expected(motion, pi) for motion in motions]
+    motions = [_with_expected(motion, pi) for motion in motions]
     if not isinstance(noise, TorqueNoise):
         residual_noise = (
             None if earlier is None else earlier.noise(mapping.K).last(len(model.joints))
@@ -510,7 +510,7 @@ def _with_torque(log: SurveyedLog) -> SurveyedLog:
     return log
 
 
-def _expected(log: SurveyedLog, pi: Array) -> SurveyedLog:
+def _with_expected(log: SurveyedLog, pi: Array) -> SurveyedLog:
     """Return a motion with the torque that parameters predict, behind its filter."""
     return log.with_torque(predict(log.model, [pi], log.whole.trajectory)[0])
 
