@@ -15,7 +15,7 @@ from robotid.cli.console import echo, progress_of, show_found
 from robotid.cli.flags import JOB, LOG, add_json, job_from_flags, number, refuse_log_flags
 from robotid.cli.job import Job, LogEntry
 from robotid.cli.logs import job_of_result, survey_logs
-from robotid.diagnosis.verdict.payload_check import PayloadCheck
+from robotid.diagnosis.verdict.scale_check import PayloadCheck
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.estimation.fitting.recorded import Recordings
 from robotid.estimation.fitting.survey import SurveyedLog

@@ -40,7 +40,7 @@ from robotid.output.files.result_file import (
     stated_model,
     stated_urdf_with_drives,
 )
-from robotid.output.files.shape import FILE, NUMBER, TABLE, TEXT, check_shape
+from robotid.output.files.shape import check_shape, schema
 from robotid.output.report.pictures import shown_evaluation
 from robotid.output.viewer.replays import Bands, Mark, Replay, Torques, replay
 from robotid.output.viewer.unexplained import find_unexplained
@@ -54,12 +54,6 @@ _PROJECTED = "Torques: the part that contact forces cannot cause."
 _DRIVEN = "URDF + drives"
 
 #: The entries of a track.json that are read.
-_TRACK = {
-    "settings": TABLE,
-    "history": FILE,
-    "changes": [{"onset": NUMBER, "payload": {"mass": NUMBER, "std_error": NUMBER, "body": TEXT}}],
-    "base_parameters": [{"name": TEXT, "unit": TEXT}],
-}
 
 
 @dataclass(frozen=True)
@@ -279,7 +273,7 @@ def _track(path: Path) -> Mapping[str, Any] | None:
     content = read_json(path, "result")
     if not (isinstance(content, dict) and {"history", "changes"} <= set(content)):
         return None
-    check_shape(content, _TRACK, path.name)
+    check_shape(content, schema("track"), path.name)
     return content
 
 

@@ -13,7 +13,7 @@ from robotid.base.settings import is_number, require_each, require_kind
 from robotid.base.typing import Array
 from robotid.data.files.read import Readable
 from robotid.data.signal_settings import SignalSettings
-from robotid.diagnosis.verdict.payload_check import PayloadCheck
+from robotid.diagnosis.verdict.scale_check import PayloadCheck
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.factors import join
 from robotid.estimation.estimators import Consistent, Constraints, Estimate

@@ -23,7 +23,7 @@ from robotid.data.signal_settings import SignalSettings
 from robotid.diagnosis.logs.check_logs import diagnose
 from robotid.diagnosis.residual.discrepancies import explain_residual
 from robotid.diagnosis.residual.drive_choice import choose_drives
-from robotid.diagnosis.residual.misfit_findings import counterbalanced, settled, with_known_springs
+from robotid.diagnosis.residual.misfit import counterbalanced, settled, with_known_springs
 from robotid.diagnosis.residual.model_error import settled_shapes, with_model_error
 from robotid.diagnosis.residual.term_trials import take_sample
 from robotid.diagnosis.urdf.inertials import (
@@ -31,9 +31,14 @@ from robotid.diagnosis.urdf.inertials import (
     explained_by_assumed,
     impossible_inertials,
 )
-from robotid.diagnosis.verdict.fit_findings import fit_findings, log_findings, not_written
+from robotid.diagnosis.verdict.fit_findings import (
+    fit_findings,
+    log_findings,
+    not_written,
+    rescaled_findings,
+    unlike_findings,
+)
 from robotid.diagnosis.verdict.scale_check import check_scale
-from robotid.diagnosis.verdict.unlike_runs import rescaled_findings, unlike_findings
 from robotid.diagnosis.verdict.verdict import blocking, check_ignored, rejected, warnings_of
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.constraint_rows import logged_base

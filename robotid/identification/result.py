@@ -13,8 +13,7 @@ from robotid.diagnosis.residual.misfit import Misfit
 from robotid.diagnosis.residual.torque_split import JointTorque, joint_torques
 from robotid.diagnosis.verdict.evidence import Determined, Predictions
 from robotid.diagnosis.verdict.parameter_table import parameter_entries, parameter_table
-from robotid.diagnosis.verdict.payload_check import PayloadCheck
-from robotid.diagnosis.verdict.scale_check import ScaleCheck, check_scale
+from robotid.diagnosis.verdict.scale_check import PayloadCheck, ScaleCheck, check_scale
 from robotid.diagnosis.verdict.verdict import Verdict, VerdictWarning, judge
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
 from robotid.estimation.fitting.evaluation import Evaluated, Evaluation, Metrics, hidden_joints

@@ -148,6 +148,10 @@ def test_half_of_the_rest_is_noted():
     log = read_log(frame(**currents), JOINTS, needs="commands", gains=dict.fromkeys(JOINTS, 2.0))
     assert log.has_torque
     assert (log.tau == 2.0).all()
+    half = frame(tau_shoulder=part)
+    log = read_log(half, JOINTS, needs="commands", passive=("elbow",))  # it needs no torque
+    np.testing.assert_array_equal(log.tau, np.column_stack([part, 0 * part]))
+    assert log.has_torque
 
 
 def test_commands_in_other_units_than_positions_are_refused():

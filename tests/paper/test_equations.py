@@ -9,7 +9,6 @@ from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.simulation.simulator import RobotPlant
 from robotid.paper import planar_2r
 from robotid.paper.equations import (
-    Bounds,
     LinearPlant,
     PlanarDynamics,
     mass_matrix,
@@ -40,14 +39,6 @@ def test_mass_matrix_from_base_parameters_is_pinocchios_crba(arm, ur5, rng):
         np.testing.assert_allclose(D, np.triu(M) + np.triu(M, 1).T, atol=1e-12)
 
 
-def test_armature_counts_and_friction_does_not(arm, ur5, rng):
-    pi = truth(ur5)  # all drive terms are there
-    q, _, _ = states(rng, 5, 6)
-    plant = RobotPlant(ur5, pi)
-    for D, q_k in zip(mass_matrix(arm, q, arm.mapping.to_base(pi)), q, strict=True):
-        np.testing.assert_allclose(D, plant.mass_matrix(q_k), atol=1e-11)
-
-
 def test_a_linear_plant_moves_as_the_robot_does(arm, ur5, rng):
     pi = truth(ur5)
     q, v, u = states(rng, 10, 6)
@@ -55,19 +46,6 @@ def test_a_linear_plant_moves_as_the_robot_does(arm, ur5, rng):
     ours = LinearPlant(arm, arm.mapping.to_base(pi)).acceleration(q, v, 20 * u)
     # wrist inertias of 0.1 kg m^2 multiply rounding of 50 N m
     np.testing.assert_allclose(ours, RobotPlant(ur5, pi).acceleration(q, v, 20 * u), rtol=1e-9)
-
-
-@pytest.mark.parametrize("form", list(planar_2r.PARAMETER_NAMES))
-def test_planar_dynamics_are_those_of_the_closed_form(form, rng):
-    dynamics = PlanarDynamics(form)
-    P = rng.normal(size=len(dynamics.names))
-    q, v, a = states(rng, 20, 2)
-    D, u = mass_matrix(dynamics, q, P), torque(dynamics, q, v, a, P)
-    for k in range(20):
-        column = [planar_2r.regressor(q[k], 0 * e, e, form=form) @ P for e in np.eye(2)]
-        np.testing.assert_allclose(D[k].T, column, atol=1e-13)
-        one = planar_2r.regressor(q[k], v[k], a[k], form=form) @ P
-        np.testing.assert_allclose(u[k], one, atol=1e-12)
 
 
 def test_acceleration_solves_the_dynamics(rng):
@@ -143,12 +121,6 @@ def test_one_shot_names_what_the_motion_leaves_open(rng):
     G[:, 3] = 2 * G[:, 1]
     with pytest.raises(RankDeficientError, match=r"excite 3 of 4 .* undetermined: b, d\."):
         one_shot(G, G, np.ones(4), "abcd")
-
-
-def test_bounds_project_onto_their_box():
-    bounds = Bounds(np.array([0.0, -1.0]), np.array([2.0, np.inf]))
-    found = bounds.project(np.array([[3.0, -5.0], [1.0, 7.0]]))
-    np.testing.assert_array_equal(found, [[2.0, -1.0], [1.0, 7.0]])
 
 
 def swing(q, v, _):

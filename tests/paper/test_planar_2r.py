@@ -16,7 +16,6 @@ from robotid.paper.planar_2r import (
     PARAMETER_NAMES,
     PlanarLinks,
     parameters,
-    printed_velocity_coefficient,
     regressor,
     urdf_text,
 )
@@ -149,41 +148,6 @@ def test_printed_regressor_is_wrong_in_both_rows_of_column_4_only():
         np.testing.assert_allclose(wrong, expected, atol=1e-12)
 
 
-def test_printed_torque_is_off_by_hundreds_of_newton_metres():
-    P_printed, P = parameters(PAPER_LINKS, form="printed"), parameters(PAPER_LINKS)
-    errors = np.array(
-        [
-            regressor(q, v, a, form="printed") @ P_printed - regressor(q, v, a) @ P
-            for q, v, a in states(200)
-        ]
-    )
-    # p4 s2 v1^2 + p3 s2 v2^2 and the like, at most 5 kg m^2 times (10 rad/s)^2
-    assert (np.abs(errors).max(axis=0) > 100.0).all()
-    assert (np.abs(errors).max(axis=0) < 500.0).all()
-
-
-def test_printed_regressor_entry_by_entry():
-    q, v, a = np.array([0.3, np.arctan2(0.6, 0.8)]), np.array([2.0, 3.0]), np.array([5.0, 7.0])
-    # c2 = 0.8, s2 = 0.6, put into the matrix between (26) and (27) by hand
-    row1 = [5, 12, 2 * 0.8 * 5 + 0.8 * 7 - 2 * 0.6 * 6, 0.6 * 4]
-    row1 += [-2 * 0.6 * 5 - 0.6 * 7 - 0.8 * 9 - 2 * 0.8 * 6]
-    row2 = [0, 12, 0.8 * 5, -0.6 * 9, -0.6 * 5 + 0.8 * 4]
-    np.testing.assert_allclose(regressor(q, v, a, form="printed"), [row1, row2], rtol=1e-14)
-
-
-@ARMS
-def test_printed_c122_has_the_wrong_sign_and_c112_is_missing(links):
-    P = parameters(links)
-    for q, v, _ in states(50):
-        h = printed_velocity_coefficient(q, links)
-        v1, v2 = v
-        mended = [-h * v2**2 - 2 * h * v1 * v2, h * v1**2]
-        np.testing.assert_allclose(velocity_vector(q, v, P), mended, rtol=1e-12, atol=1e-11)
-        printed = np.array([h * v2**2, h * v1**2])  # (26) without the undefined C112
-        missing = velocity_vector(q, v, P) - printed
-        np.testing.assert_allclose(missing, [-2 * h * v2 * (v1 + v2), 0.0], atol=1e-11)
-
-
 # --- energy -----------------------------------------------------------------------------------
 
 
@@ -216,14 +180,6 @@ def test_printed_arm_invents_energy():
 # --- rank -------------------------------------------------------------------------------------
 
 
-def test_four_base_parameters_by_pinocchio():
-    model = pin.buildModelFromXML(urdf_text())
-    data = model.createData()
-    rows = [pin.computeJointTorqueRegressor(model, data, *state).copy() for state in states(50)]
-    assert rows[0].shape == (2, 20)
-    assert stacked_rank(rows) == 4
-
-
 def test_closed_form_columns_span_what_pinocchios_do():
     model = pin.buildModelFromXML(urdf_text())
     data = model.createData()
@@ -232,13 +188,6 @@ def test_closed_form_columns_span_what_pinocchios_do():
         for state in states(50)
     ]
     assert stacked_rank(both) == 4
-
-
-@pytest.mark.parametrize(("form", "rank"), [("corrected", 4), ("corrected_five", 5)])
-def test_rank_of_the_corrected_forms(form, rank):
-    # Split, columns 3 (acceleration, v1 v2) and 4 (v1^2, v2^2) are independent of each other; only
-    # their sum is a direction of a rigid arm, so the five columns span one direction too many.
-    assert stacked_rank([regressor(*state, form=form) for state in states(50)]) == rank
 
 
 def test_five_columns_find_p3_equal_to_p4_on_a_rigid_arm():

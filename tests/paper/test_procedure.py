@@ -23,7 +23,6 @@ from robotid.paper.procedure import (
     Influences,
     LoopSettings,
     _Loop,
-    random_torque,
     run_procedure,
 )
 from robotid.robot.model import RobotModel
@@ -167,24 +166,6 @@ def test_the_closed_form_arm_and_its_urdf_are_one_plant(tmp_path):
 # --- bounds, disturbance, noise, friction -----------------------------------------------------
 
 
-def test_the_estimate_stays_in_its_bounds():
-    bounds = Bounds(np.array([0.0, 0.0, 0.0, 0.0]), np.array([15.0, 4.0, 10.0, 1.0]))
-    history = run(settings=short(3, bounds=bounds), offset=DEGREE)
-    free = twelve_iterations("corrected").estimates[:4, 0]
-    assert (history.estimates >= 0).all()
-    assert (history.estimates <= bounds.upper).all()
-    assert free.min() < -1.0  # p5 goes there without them
-
-
-def test_a_disturbance_keeps_the_estimate_from_settling(rng):
-    disturbed = Influences(random_torque(0.1, rng))
-    history = run(P4, settings=short(5), influences=disturbed, offset=DEGREE)
-    error = history.relative_error(P4)[1:, 0]
-    assert (error > 1e-4).all()
-    assert (error < 0.1).all()
-    np.testing.assert_array_equal(history.NA, [0])
-
-
 def test_updates_are_left_out_and_counted_of_runs_that_go_on(rng):
     motion = ProgramMotion(np.tile([1.0, 1.5], (3, 1)), np.full(3, 2.0))
     guesses = np.array([-P4, -P4, P4 / 2])  # of the first two D is negative
@@ -233,19 +214,6 @@ def test_noise_makes_the_smallest_samples_dangerous_and_eps2_leaves_them_out():
 
 def noise(seed):
     return Influences(q=1e-5, v=1e-4, a=1e-2, rng=np.random.default_rng(seed))
-
-
-def test_runs_at_once_are_the_runs_one_by_one(rng):
-    A, T = rng.uniform(0.5, 1.5, (3, 2)), rng.uniform(1, 3, 3)
-    guess, gain = P4 * rng.uniform(0.5, 1.5, (3, 4)), rng.uniform(5, 20, 3)
-    settings = short(2, updates=40, alpha=2 * gain, beta=gain**2)
-    together = run_procedure(ARM, PLANT, ProgramMotion(A, T), guess, settings=settings)
-    for r in range(3):
-        settings = short(2, updates=40, alpha=2 * gain[r], beta=gain[r] ** 2)
-        alone = run_procedure(
-            ARM, PLANT, ProgramMotion(A[r], T[r]), guess[r : r + 1], settings=settings
-        )
-        np.testing.assert_allclose(together.estimates[:, r], alone.estimates[:, 0], rtol=1e-10)
 
 
 def test_an_impossible_guess_is_not_updated_and_a_runaway_is_told():

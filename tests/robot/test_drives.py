@@ -1,6 +1,7 @@
 """Every term walks from the regressor to the written file, in the joints that have it."""
 
 import itertools
+import tomllib
 from dataclasses import replace
 
 import numpy as np
@@ -24,14 +25,15 @@ from robotid.dynamics.torque import (
 )
 from robotid.identification.pipeline import identify
 from robotid.output.files.urdf import load_identified, read_sidecar, write_urdf
+from robotid.robot.drive_term import DriveMotion
 from robotid.robot.drives import (
     DRIVE_TERMS,
     FAMILIES,
     TERMS,
     Asymmetric,
+    Bristles,
     Counterbalance,
     Cubic,
-    DriveMotion,
     Harmonic,
     Hat,
     Lag,
@@ -44,6 +46,9 @@ from robotid.robot.drives import (
     Spring,
     Stribeck,
     Tanh,
+    drive_line,
+    has_turned,
+    spring_family,
     term_from_dict,
 )
 from robotid.robot.examples import example_urdf
@@ -432,6 +437,88 @@ def test_knots_and_centres_of_families_lie_in_the_range_seen():
     assert [(term.order, term.centre) for term in by_position] == [(1, 1.0), (2, 1.0)]
 
 
-def test_friction_by_position_has_the_unit_of_its_power_of_the_position():
+H = 1e-6
+
+
+def test_the_slope_of_a_law_is_that_of_differences(term):
+    law = getattr(term, "speed_law", None) or getattr(term, "position_law", None)
+    if law is None:
+        return
+    shape = term.speed_shape or term.position_shape
+    z = np.linspace(-1.93, 1.87, 77)
+    (y, slope), (above, _), (below, _) = (law(x, *shape) for x in (z, z + H, z - H))
+    is_smooth = np.abs(above - 2 * y + below) < 1e-9  # not at a kink
+    assert np.mean(is_smooth) > 0.9
+    exact = (above - below)[is_smooth] / (2 * H)
+    np.testing.assert_allclose((slope + 0 * z)[is_smooth], exact, atol=1e-8)
+    for one in (-1.3, 0.61):  # of single numbers, as it is compiled
+        np.testing.assert_allclose(law(one, *shape)[0], law(np.array([one]), *shape)[0][0])
+
+
+def test_friction_by_position_is_a_power_of_it():
+    q = np.linspace(-1.0, 1.0, 9)
+    for order in range(4):
+        y, slope = PositionCoulomb.position_law(q, float(order), 0.3)
+        np.testing.assert_allclose(y, (q - 0.3) ** order, atol=1e-15)
+        np.testing.assert_allclose(slope, order * (q - 0.3) ** max(order - 1, 0))
     units = [PositionCoulomb(order=k).units for k in range(3)]
     assert units == [("N m", "N"), ("N m/rad", "N/m"), ("N m/rad^2", "N/m^2")]
+
+
+def test_ripple_is_a_cosine_or_a_sine():
+    q = np.linspace(-2.0, 2.0, 9)
+    (c, dc), (s, ds) = (Harmonic.position_law(q, 2.5, x) for x in (0.0, 1.0))
+    np.testing.assert_allclose([c, ds / 2.5], [np.cos(2.5 * q)] * 2)
+    np.testing.assert_allclose([s, -dc / 2.5], [np.sin(2.5 * q)] * 2)
+
+
+def test_a_lever_that_is_not_described_hangs_at_the_zero_position():
+    """Arms of 0.1 and 0.5 m, a spring without length at rest: tau = k a b sin q."""
+    z = np.array([-2.0, 0.0, 0.7])
+    term = Counterbalance()
+    y, slope = term.position_law(z, term.arm, term.base, term.angle, term.rest)
+    np.testing.assert_allclose(y, 0.05 * np.sin(z), atol=1e-15)
+    np.testing.assert_allclose(slope, 0.05 * np.cos(z))
+
+
+def test_bristles_keep_what_the_solution_of_their_equation_keeps():
+    s_0, w, c = 0.03, 0.4, 0.6
+    v = np.array([0.0, 0.1, -0.3, 1.2, -2.0])
+    way = np.array([0.0, 0.02, -0.05, 0.004, 0.1])
+    g, slope, kept = Bristles.law((s_0, w, c), way, v)
+
+    def level(v):
+        return 1.0 + c * np.exp(-(v**2) / w**2)
+
+    np.testing.assert_allclose(g, level(v))
+    np.testing.assert_allclose(slope, (level(v + H) - level(v - H)) / (2 * H), atol=1e-8)
+    for first in (-0.7, 1.4):  # dz/ds = 1 - z / g, by a fine Runge-Kutta scheme
+        z, n = np.full(5, first), 400
+        for _ in range(n):
+            h = np.abs(way) / s_0 / n
+            k1 = 1 - z / g
+            k2 = 1 - (z + h / 2 * k1) / g
+            z = z + h * (1 - (z + h / 2 * k2) / g)
+        np.testing.assert_allclose(g + (first - g) * kept, z, atol=1e-5)
+
+
+def test_a_family_is_advised_a_tenth_beyond_the_turns_that_it_needs():
+    needs = {name: family.needs for name, family in FAMILIES.items() if family.needs}
+    assert needs == {"harmonics1": 0.1, "harmonics2": 0.5, "harmonics4": 0.5}
+    for name, turns in needs.items():
+        enough = 1.1 * turns * 2 * np.pi  # [rad]
+        assert has_turned(name, enough * (1 + 1e-9))
+        assert not has_turned(name, enough * (1 - 1e-9))
+    assert has_turned("spring", 0.0)
+    for turned, wanted in ((4.0, "harmonics2"), (3.4, "harmonics1"), (0.7, "harmonics1"),
+                           (0.68, "spring")):  # fmt: skip
+        assert spring_family(turned, "harmonics2", "harmonics1") == wanted
+
+
+def test_the_line_of_a_drive_is_read_back_as_it_was():
+    wave = Harmonic(data_range=(-1.0, 2.0), order=3.0, is_sine=True)
+    [(joint, entries)] = tomllib.loads(drive_line("a joint", wave, "load", Spring())).items()
+    assert joint == "a joint"
+    assert entries[1] == "load"
+    assert term_from_dict(entries[0]) == Harmonic(order=3.0, is_sine=True), "the range is the log's"
+    assert term_from_dict(entries[2]) == Spring()

@@ -15,13 +15,16 @@ from robotid.data.files.read import Readable, read_logs
 from robotid.data.log import Log, Trajectory
 from robotid.data.signal_settings import SignalSettings
 from robotid.diagnosis.catalogue import finding
-from robotid.diagnosis.logs.channels import check_channels
-from robotid.diagnosis.logs.clock import check_clock, check_rest
+from robotid.diagnosis.logs.channels import (
+    check_channels,
+    check_clock,
+    check_rest,
+    check_torque_channels,
+)
 from robotid.diagnosis.logs.command_channels import check_commands
 from robotid.diagnosis.logs.contacts import check_base
+from robotid.diagnosis.logs.loads import Segments, check_payload_change
 from robotid.diagnosis.logs.motion_checks import check_excitation, check_repeated_motion
-from robotid.diagnosis.logs.mounted import Segments, check_payload_change
-from robotid.diagnosis.logs.torque_channels import check_torque_channels
 from robotid.diagnosis.logs.torque_checks import check_torques
 from robotid.diagnosis.logs.torque_delay import check_torque_delay
 from robotid.diagnosis.logs.torque_sample import Probe, smooth_motion, take_probe

@@ -12,7 +12,7 @@ from robotid.base.typing import Array
 from robotid.data.log import Log
 from robotid.data.measured_velocity import quantum
 from robotid.diagnosis.catalogue import finding
-from robotid.diagnosis.logs.clock import runs_of
+from robotid.diagnosis.logs.channels import runs_of
 
 _SECONDS = 5.0  # [s] length of the segments whose spectra are averaged
 _GAP = 5  # [median steps] a longer step ends the segment that is examined

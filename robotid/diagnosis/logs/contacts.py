@@ -13,8 +13,14 @@ from robotid.data.log import Log, Trajectory
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import process
 from robotid.diagnosis.catalogue import finding
-from robotid.diagnosis.logs.base_pose import check_order, check_pose, check_twist, check_unit, rms
-from robotid.diagnosis.logs.imu import check_imu
+from robotid.diagnosis.logs.base_pose import (
+    check_imu,
+    check_order,
+    check_pose,
+    check_twist,
+    check_unit,
+    rms,
+)
 from robotid.dynamics.completed_logs import closed_log, with_contacts
 from robotid.dynamics.constraint_rows import (
     constraint_jacobian,

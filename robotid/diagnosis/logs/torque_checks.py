@@ -9,8 +9,12 @@ from robotid.base.findings import Finding
 from robotid.base.typing import Array
 from robotid.diagnosis.catalogue import finding
 from robotid.diagnosis.logs.hypotheses import HINT, Explanation, explanations
-from robotid.diagnosis.logs.loads import check_loads, counterbalance, holds_gravity
-from robotid.diagnosis.logs.mounted import check_unmounted_parts
+from robotid.diagnosis.logs.loads import (
+    check_loads,
+    check_unmounted_parts,
+    counterbalance,
+    holds_gravity,
+)
 from robotid.diagnosis.logs.torque_sample import Probe
 
 _CERTAIN = 2.5  # significant decrease of the logarithm of the unexplained share, a factor 12

@@ -1,16 +1,41 @@
-"""Thresholds of this package: p-values, shares and sizes above which something is reported.
+"""Decisions: how options are selected on held-out segments, and the thresholds of this package.
 
-Each group names the benchmark that measures its correct and false detections.
+Options compete to explain a residual. Each is fitted together with those selected before, with one
+segment of the recordings held out after the other, and compared by the squared residual of the
+held-out segments. An option is selected if it reduces it significantly and by enough; of options
+that explain about the same the simplest is selected. Then the others compete again, until none
+improves the fit. The caller decides what follows: a term is added, reported or left undecided.
+Each group of thresholds names the benchmark that measures its correct and false detections.
 """
 
-from robotid.diagnosis.residual.selection import Rule
+from collections.abc import Callable, Hashable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, Generic, TypeVar
+
+import numpy as np
+from scipy.special import stdtr
+
+from robotid.base.typing import Array
+
+
+@dataclass(frozen=True)
+class Rule:
+    """Conditions for the selection of an option."""
+
+    most: int  # Largest number of options selected
+    share: float  # Smallest share of the squared residual of a selected option [-]
+    p_value: float | None  # Largest p-value of a selected option [-]; None: it is not tested
+    alike: float  # Share of the squared residual within which options count as equal [-]
+
 
 _ALIKE = 0.02  # of the squared residual: within this difference the simpler option is selected
-
 # Families selected for a joint's drive: benchmarks/bench_friction.py
 # The same p-value decides whether least squares predicts better than bodies bound to the prior.
 FAMILY_P_VALUE = 0.01
 FAMILY = Rule(most=4, share=0.05, p_value=FAMILY_P_VALUE, alike=_ALIKE)
+# Families selected from simulated positions, one of each at most, by the share of a joint's squared
+# residual in held-out windows with unit noise: benchmarks/bench_commands.py
+SIMULATED_FAMILY = Rule(most=3, share=0.02, p_value=None, alike=0.0)
 #: Share of the torque: a smaller gain may be an effect of the filter on velocity signs.
 FAMILY_LEAST = 0.006
 #: p-value below which a family that is not selected is undecided: it widens intervals.
@@ -19,7 +44,6 @@ UNDECIDED_P_VALUE = 0.25
 TENFOLD = 10.0
 #: Distance from a bound, of the logarithm of its range, within which a shape is at the bound.
 AT_BOUND = 0.02
-
 # Terms that a drive model lacks: benchmarks/bench_misfit.py
 MISFIT = Rule(most=3, share=0.1, p_value=3e-4, alike=_ALIKE)
 #: Share of the squared residual above which a term is a warning.
@@ -34,7 +58,6 @@ CONFIRMED = 0.25
 MAIN = 50.0
 #: Factor on a standard error above which a parameter is reported as affected by a misfit.
 GROWN = 1.3
-
 # Recordings or URDF that differ from what was stated: benchmarks/bench_verdict.py. Only the best
 # hypothesis is tested.
 ALTERATION = Rule(most=3, share=-float("inf"), p_value=None, alike=_ALIKE)
@@ -44,6 +67,97 @@ ALTERATION_P_VALUE, ALTERATION_SHARE = 3e-4, 0.1
 WEAK, WEAK_P_VALUE, WEAK_SIZE = 0.03, 1e-5, 2.0
 #: Standard errors that its size must differ from 0.
 SIGNIFICANT = 5.0
-
 # A residual that depends on a quantity: no benchmark, tests/diagnosis/residual/test_torque_split.py
 DEPENDENCE_SHARE, DEPENDENCE_P_VALUE = 0.1, 1e-3
+# Segments that are held out in turn, and their samples.
+SEGMENTS, SHORTEST = 16, 10  # most segments, and fewest independent samples of one
+#: Smallest number of segments for a test.
+FEWEST = 6
+#: Typical residuals above which a sample is excluded.
+OUTLIER = 12.0
+#: Share of a column below which it is rounding, and relative step of a derivative by a shape.
+ROUNDING, STEP = 1e-10, 1e-3
+_STILL = 1e-9  # of the largest squared residual of a segment: below, the joint is at rest in it
+_FEWEST = 3  # segments for a test
+_NOTHING = 1e-300
+Option = TypeVar("Option", bound=Hashable)
+
+
+@dataclass(frozen=True, eq=False)
+class Round(Generic[Option]):
+    """Squared residuals of held-out segments with each option, together with those selected."""
+
+    before: Array  # Squared residual of each of K segments without any option, shape (K,)
+    left: Mapping[Option, Array]  # Squared residuals with each option, shape (K,)
+    fitted: int  # Number of segments of fitted logs, which come first; the others are validation
+    whole: float  # Squared residual to which shares refer
+    least: float = -np.inf  # Smallest reduction of the squared residual, whatever its share
+
+    def gain(self, option: Option) -> float:
+        """Return the reduction of the squared residual of fitted logs by an option."""
+        return float((self.before - self.left[option])[: self.fitted].sum())
+
+    def share(self, option: Option) -> float:
+        """Return the share of the squared residual of fitted logs that an option removes [-]."""
+        return self.gain(option) / max(self.whole, _NOTHING)
+
+    def p_value(self, option: Option) -> float:
+        """Return the p-value of the reduction by an option [-]."""
+        return p_value(self.before, self.left[option], self.fitted)
+
+    def alike(self, rule: Rule, tried: Callable[[Option], int] = lambda option: 1) -> list[Option]:
+        """Return the options that may be selected and explain as much as the best of them."""
+        shares = {
+            option: share
+            for option in self.left
+            for share in [self.share(option)]
+            if share > rule.share
+            and self.gain(option) > self.least
+            and (rule.p_value is None or tried(option) * self.p_value(option) < rule.p_value)
+        }
+        largest = max(shares.values(), default=0.0)
+        return [option for option, share in shares.items() if share >= largest - rule.alike]
+
+    def best(
+        self,
+        rule: Rule,
+        cost: Callable[[Option], Any] = lambda option: 0,
+        tried: Callable[[Option], int] = lambda option: 1,
+    ) -> Option | None:
+        """Return the simplest of the options that explain as much as the best; None without one."""
+        alike = self.alike(rule, tried)
+        return min(alike, key=lambda option: (cost(option), -self.share(option)), default=None)
+
+
+def select(
+    offered: Callable[[], Round[Option]],
+    rule: Rule,
+    cost: Callable[[Option], Any] = lambda option: 0,
+    tried: Callable[[Option], int] = lambda option: 1,
+) -> Iterator[tuple[Round[Option], Option | None]]:
+    """Yield each round with the option selected in it; None in a last round without one."""
+    for _ in range(rule.most):
+        this = offered()
+        best = this.best(rule, cost, tried)
+        yield this, best
+        if best is None:
+            return
+
+
+def p_value(before: Array, after: Array, fitted: int) -> float:
+    """Return the p-value of a reduction of the squared residuals of segments [-].
+
+    Student's test of the mean of their shares, each between -1 and 1, over the segments of fitted
+    logs or over all, whichever p-value is smaller. Segments with the joint at rest do not count.
+    """
+    return min(_student(before[:k], after[:k]) for k in {fitted, len(before)})
+
+
+def _student(before: Array, after: Array) -> float:
+    """Return the p-value of the mean share; 1 for too few segments."""
+    moves = before > _STILL * before.max(initial=0.0)
+    if moves.sum() < _FEWEST:
+        return 1.0
+    gain = (before - after)[moves] / np.maximum(before, after)[moves]
+    spread = max(float(np.std(gain, ddof=1)) / np.sqrt(len(gain)), _NOTHING)
+    return float(stdtr(len(gain) - 1, -gain.mean() / spread))

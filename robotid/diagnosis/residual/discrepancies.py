@@ -29,9 +29,10 @@ from robotid.diagnosis.residual.decisions import (
     WEAK,
     WEAK_P_VALUE,
     WEAK_SIZE,
+    Round,
+    select,
 )
 from robotid.diagnosis.residual.misfit import Misfit, find_misfits
-from robotid.diagnosis.residual.selection import Round, select
 from robotid.diagnosis.residual.term_trials import Sample, Trials, along
 from robotid.dynamics.prediction import body_slopes, drive_torque, inverse_dynamics
 from robotid.estimation.fitting.fitted import Fit

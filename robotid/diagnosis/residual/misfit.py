@@ -1,26 +1,54 @@
-"""Misfit of the drive models: tests the residual of a fit for terms that drives may have."""
+"""Terms that drive models lack: candidates, tests of the residual, and their findings."""
 
+from __future__ import annotations
+
+import json
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from operator import attrgetter
 
 import numpy as np
 
+from robotid.base.findings import Finding, listed, toml_key
 from robotid.base.typing import Array
-from robotid.diagnosis.residual.candidates import CANDIDATES, Candidate, couplings, ripples
+from robotid.diagnosis.catalogue import finding
 from robotid.diagnosis.residual.decisions import (
     CONFIRMED,
+    MAIN,
     MISFIT,
     MISFIT_MATTERS,
     MISFIT_REPORTED,
     MISFIT_WARNS,
     ONE_SIDED,
+    Round,
+    select,
 )
-from robotid.diagnosis.residual.selection import Round, select
 from robotid.diagnosis.residual.term_trials import Sample, Trial, Trials
 from robotid.estimation.fitting.drive_terms import JointMotion
-from robotid.robot.drives import DriveTerm, has_turned
+from robotid.estimation.fitting.fitted import Fit
+from robotid.robot.drive_term import DriveMotion, DriveTerm, Family
+from robotid.robot.drives import (
+    COUNTERBALANCE,
+    FAMILIES,
+    Harmonic,
+    drive_line,
+    has_turned,
+    spring_family,
+)
+
+_RIPPLES = np.arange(5, 241)  # periods per revolution tested: 200 of a gear of 100 : 1
+_PEAKS = 6  # of them are tested: those with the largest periodic residual
+_STEEP = 8  # twice the order of the filter, which is applied in both directions
+_REVERSES = 0.05  # of the RMS speed, over which the sign of a coupling's speed changes
+_WINDUP = (0.02, 0.1)  # of the RMS displacement since a reversal: decay of a deflection
+_LOADED = 0.05  # of the RMS rigid-body torque, over which the loaded side of a gear changes
+_OF_POSITION = ("position_periodic", "spring", "position_offset")
+_BALANCES = ("counterbalance", "link_mass")
+_OF_MASSES = (*_BALANCES, "current_for_torque", "urdf_mismatch")
+_SPRINGS = ("ripple", "spring")  # parts of the torque that depend on the position
+_DIGITS = "0123456789"
 
 
 @dataclass(frozen=True)
@@ -75,7 +103,7 @@ class Misfit:
         return bool(self.share >= MISFIT_WARNS and explained >= MISFIT_MATTERS and not is_uncertain)
 
 
-def find_misfits(sample: "Sample | None") -> tuple[Misfit, ...]:
+def find_misfits(sample: Sample | None) -> tuple[Misfit, ...]:
     """Return the terms that would explain a part of the residual of a fit, the largest first."""
     if sample is None:
         return ()
@@ -183,3 +211,283 @@ def _size(
     size, slope = float(np.sqrt(theta @ S @ theta)), S @ theta
     error = float(np.sqrt(slope @ covariance @ slope)) / size
     return size, error, ("N m rms", "N rms")[int(sample.is_prismatic[j])]
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A term that a drive's torque may have, linear in its parameters."""
+
+    name: str  # Its name
+    code: str  # Code of the finding that reports it
+    #: Columns of its c parameters in N samples, shape (N, c). They are scaled by the motion given,
+    #: unless that names another motion
+    columns: Callable[[JointMotion], Array]
+    meaning: str  # Description of the term for a finding
+    advice: str = ""  # Remedy other than adding it to the model; empty if none
+    #: Unit of the parameter of a revolute and of a prismatic joint; None: the size is the RMS
+    #: torque of the term
+    units: tuple[str, str] | None = None
+    revolute_only: bool = False  # Whether only a revolute joint has it
+    #: Friction families of a job that contain it, see ``FAMILIES``. The first one for which the
+    #: joint moved far enough is advised
+    families: tuple[str, ...] = ()
+    #: Terms of a job's [drives] that are equal to it, if no family is
+    terms: tuple[DriveTerm, ...] = ()
+    tried: int = 1  # Number of such terms among which the residual selected it
+    coupled: str = ""  # The other joint of a coupling; empty if none
+    ratio: float = 0.0  # Ratio of the other joint; that of the joint itself is 1
+    #: Whether stiction at reversals looks like it behind a filter: it is a note at most
+    is_imitated: bool = False
+
+
+def _rms(m: JointMotion, of: Callable[[JointMotion], Array]) -> float:
+    """Return the RMS value of a signal of the motion that sets the scale; 1 if it is 0."""
+    return float(np.sqrt(np.mean(of(m.scale or m) ** 2))) or 1.0
+
+
+def _of_terms(m: JointMotion, family: Family) -> Array:
+    """Return the columns of a family's terms, shape (N, c)."""
+    motion = DriveMotion(m.q, m.v, m.a, m.direction, m.load, np.zeros_like(m.v))
+    terms = family.tested_terms(_rms(m, attrgetter("v")))
+    return np.column_stack([term.column(motion) for term in terms])
+
+
+def _of_family(family: Family) -> Candidate:
+    """Return the candidate of a family of drive terms."""
+    units = family.tested_terms(1.0)[0].units if family.has_size else None
+    return Candidate(
+        family.name, family.code, partial(_of_terms, family=family), family.meaning, family.advice,
+        units=units, revolute_only=family.needs > 0, families=(family.name, *family.instead),
+        is_imitated=family.is_imitated,
+    )  # fmt: skip
+
+
+def _ripple(m: JointMotion, count: int) -> Array:
+    """Return cosine and sine of a multiple of the position, after the filter of torques."""
+    waves = np.array([np.cos(count * m.q), np.sin(count * m.q)])
+    columns: Array = (_passed(m, np.array([count])) * waves).T
+    return columns
+
+
+def _passed(m: JointMotion, counts: Array) -> Array:
+    """Return the filter's gain for torques with k periods per revolution, shape (k, N)."""
+    rate = np.abs(m.v) / (2 * np.pi * m.passes)  # revolutions per second over the cut-off
+    passed: Array = 1.0 / (1.0 + np.outer(counts.astype(float) ** _STEEP, rate**_STEEP))
+    return passed
+
+
+def ripples(m: JointMotion, weight: Array, r: Array) -> tuple[Candidate, ...]:
+    """Return candidates of a torque periodic in the position, from the residual's spectrum."""
+    first = np.exp(1j * m.q)
+    wave = first ** _RIPPLES[0]  # e^(i count q)
+    explained = np.zeros(len(_RIPPLES))
+    for k, size in enumerate(weight * _passed(m, _RIPPLES)):
+        if power := size @ size:
+            explained[k] = np.abs((r * size) @ wave) ** 2 / power
+        wave *= first
+    counts = _RIPPLES[np.sort(np.argsort(-explained)[:_PEAKS])]
+    return tuple(
+        Candidate(
+            f"ripple {count}", "position_periodic", partial(_ripple, count=count),
+            f"a torque with {count} periods per revolution (gear teeth, motor poles, harmonic "
+            "drive)",
+            revolute_only=True,
+            terms=(Harmonic(order=float(count)), Harmonic(order=float(count), is_sine=True)),
+            tried=len(_RIPPLES),
+        )
+        for count in counts.tolist()
+    )  # fmt: skip
+
+
+def _windup(m: JointMotion) -> Array:
+    displacement = m.travelled[:, None] / (np.array(_WINDUP) * _rms(m, attrgetter("travelled")))
+    deflection = m.direction[:, None] * np.exp(-displacement)
+    return np.column_stack([deflection, np.tanh(m.load / (_LOADED * _rms(m, attrgetter("load"))))])
+
+
+def _drift(m: JointMotion) -> Array:
+    drifting: Array = m.time[:, None] * np.column_stack([m.direction, m.v, np.ones_like(m.v)])
+    return drifting
+
+
+def _coupled(m: JointMotion, other: str, ratio: float) -> Array:
+    """Return columns of a drive at the speed w = v + ratio v' of both joints, at the first."""
+
+    def drive_speed(motion: JointMotion) -> Array:
+        return motion.v + ratio * motion.others[other].v
+
+    if other not in m.others:  # it is at rest
+        none = np.zeros_like(m.v)
+        return np.column_stack([none, none, np.tanh(m.v / (_REVERSES * _rms(m, drive_speed)))])
+    partner, w = m.others[other], drive_speed(m)
+    return np.column_stack([partner.a, partner.v, np.tanh(w / (_REVERSES * _rms(m, drive_speed)))])
+
+
+#: The candidates of each joint, without couplings: Coulomb friction where the model lacks it, the
+#: families of drive terms, and effects that no term models.
+CANDIDATES = (
+    Candidate(
+        "coulomb", "friction_shape", lambda m: m.direction[:, None], "Coulomb friction",
+        "Set friction = 'viscous+coulomb' in [model]",
+    ),
+    *(_of_family(family) for family in FAMILIES.values() if family.code),
+    Candidate(
+        "windup", "backlash", _windup,
+        "a torque that changes after each reversal, or with the loaded side of the gear "
+        "(backlash, windup)",
+        "Increase min_velocity to exclude the reversals",
+    ),
+    Candidate(
+        "drift", "drift", _drift,
+        "friction or an offset that drifts with time (warm-up of the drive)",
+        "Warm the robot up before recording, or cut the log with start",
+    ),
+)  # fmt: skip
+
+
+def couplings(motion: JointMotion) -> tuple[Candidate, ...]:
+    """Return candidates of a drive coupled to a joint and to the joint before or after it."""
+    return tuple(
+        Candidate(
+            f"coupling {ratio:+g} {name}", "coupling",
+            partial(_coupled, other=name, ratio=ratio),
+            f"a drive that is coupled to {name}",
+            coupled=name,
+            ratio=ratio,
+        )
+        for name in motion.others
+        for ratio in (1.0, -1.0)
+    )  # fmt: skip
+
+
+def misfit_findings(fit: Fit, misfits: Sequence[Misfit], on_misfit: Sequence[str]) -> list[Finding]:
+    """Return a finding for each term that a drive model lacks."""
+    return [_finding(misfit, fit, on_misfit) for misfit in misfits]
+
+
+def setting_of(misfit: Misfit, fit: Fit) -> str:
+    """Return the entry of a job file that adds a term to the model; empty if there is none.
+
+    It is a line of [drives] that includes the present terms of the joint, or a table [[coupling]].
+    """
+    joint, other = misfit.joint, misfit.term.coupled
+    if other:
+        ratios = f"{toml_key(joint)} = 1.0, {toml_key(other)} = {misfit.term.ratio}"
+        return f"[[coupling]]\nname = {json.dumps(f'{joint}_{other}')}\nratios = {{ {ratios} }}"
+    if not misfit.entries:
+        return ""
+    return f"[drives]\n{with_entries(fit, joint, misfit.entries)}"
+
+
+def with_entries(fit: Fit, joint: str, entries: Sequence[str | DriveTerm]) -> str:
+    """Return the line of a job's [drives] that adds entries to the present ones of a joint."""
+    (families, chosen), *_ = [
+        *((c.families, c.terms) for c in fit.drives if c.joint == joint),
+        ((), ()),
+    ]
+    stated = [t for t in fit.model.layout.own.get(joint, ()) if t not in chosen]
+    kinds = {entry.rstrip(_DIGITS) for entry in entries if isinstance(entry, str)}
+    others = [name for name in families if name.rstrip(_DIGITS) not in kinds]
+    return drive_line(joint, *stated, *others, *entries)
+
+
+def counterbalanced(found: Sequence[Finding], logs: Sequence[str]) -> dict[str, str]:
+    """Return the family of the counterbalance of each joint with one in the fitted logs."""
+    return {
+        joint: spring_family(one.evidence["turned"], COUNTERBALANCE)
+        for one in found
+        for joint in one.joints
+        if one.code in _BALANCES and one.log in logs
+    }
+
+
+def with_known_springs(
+    found: Sequence[Finding], fit: Fit, wanted: Mapping[str, Sequence[str] | None]
+) -> list[Finding]:
+    """Return the findings before a fit; a counterbalance that its model includes becomes a note.
+
+    A spring that a wrong mass would imitate becomes a note only if it was stated, not selected.
+    """
+    own = fit.model.layout.own
+    springs = {joint for joint, terms in own.items() if any(t.part in _SPRINGS for t in terms)}
+    auto = [c for c in fit.drives if wanted[c.joint] is None]
+    selected = {c.joint for c in auto if any(t.part in _SPRINGS for t in c.terms)}
+    known = {"counterbalance": springs, "link_mass": springs - selected}
+
+    def as_known(one: Finding) -> Finding:
+        joint = one.joints[0] if one.joints else ""
+        if joint not in known.get(one.code, ()):
+            return one
+        names = listed(term.name for term in own[joint] if term.part in _SPRINGS)
+        remedy = f". The model includes it: {names} of {{joint}}"
+        return one.reworded(severity="note", remedy=remedy)
+
+    return [as_known(one) for one in found]
+
+
+def settled(found: Sequence[Finding], of_fit: Sequence[Finding]) -> list[Finding]:
+    """Return the findings before and of the fit, without hypotheses that a term explains.
+
+    The doctor's model has no springs: it attributes a torque that depends on the position to wrong
+    masses, or to nothing. The term that explains it is then a warning, even if it is small.
+    """
+    rest, terms = list(found), []
+    for term in of_fit:
+        hypotheses = [f for f in rest if _explains(term, f)]
+        rest = [f for f in rest if f not in hypotheses]
+        if hypotheses:
+            codes = listed(dict.fromkeys(f.code for f in hypotheses))
+            term = term.reworded(
+                severity="warning",
+                remedy=f"{term.remedy}. It explains {codes} and may bias the masses",
+                evidence={**term.evidence, "replaces": float(len(hypotheses))},
+            )
+        terms.append(term)
+    return rest + terms
+
+
+def _explains(term: Finding, hypothesis: Finding) -> bool:
+    """Return whether a term of the fit explains a hypothesis from before the fit."""
+    if term.evidence.get("share_pct", 0.0) < MAIN:
+        return False
+    if hypothesis.code == "unexplained_torque":
+        return bool(hypothesis.joints) and hypothesis.joints == term.joints
+    return hypothesis.code in _OF_MASSES and term.code in _OF_POSITION
+
+
+def _advice(term: Candidate, setting: str) -> str:
+    """Return the remedy for a term that the model lacks, as text."""
+    if not setting:
+        return term.advice
+    table, *lines = setting.split("\n")
+    if term.coupled:
+        size = "with the second ratio from the data sheet"
+        return f"Add {table} to the job: {' and '.join(lines)}, {size}"
+    added = f"add it to the model with {lines[0]} in {table}"
+    return f"{term.advice}, or {added}" if term.advice else f"{added[0].upper()}{added[1:]}"
+
+
+def _finding(misfit: Misfit, found: Fit, on_misfit: Sequence[str]) -> Finding:
+    term, validation = misfit.term, misfit.confirmed
+    wide = [name for name in on_misfit if name.startswith(f"{misfit.joint}.")]
+    figures = {
+        "share_pct": 100 * misfit.share,
+        "error_pct": 100 * misfit.error,
+        "size": misfit.size,
+        "std_error": misfit.std_error,
+        "p_value": misfit.p_value,
+    }
+    change, error = misfit.trend
+    drifts = not math.isnan(change)
+    if drifts:
+        figures |= {"trend": change, "trend_std_error": error}
+    if validation is not None:
+        percent = 100 * validation
+        figures |= {"validation_share_pct": percent, "validated_pct": max(percent, 0.0)}
+    cure = _advice(term, setting_of(misfit, found)) or "The model has no such term"
+    return finding(
+        term.code, "", misfit.joint, severity="warning" if misfit.matters else "note",
+        meaning=term.meaning, unit=misfit.unit, trend_unit=misfit.unit.removesuffix(" rms"),
+        change=drifts, sense=change < 0, confirmed=validation is not None, cure=cure,
+        widened=bool(wide), wide=listed(wide), **figures,
+    )  # fmt: skip

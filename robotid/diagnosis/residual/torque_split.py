@@ -1,33 +1,43 @@
-"""Parts of a joint's torque, and the quantities that its residual depends on.
+"""Parts of a joint's torque, and what its residual depends on: quantities, frequency, lag.
 
 A torque is the sum of gravity, inertia, velocity torques, and the torques of the drives:
 
     tau = g(q) + M(q) a + C(q, v) v + friction + motor inertia + offset + ... + residual.
 
-``dependence`` tests what the residual depends on.
+The dependence of the residual is cross-validated: neighbouring samples are correlated, so whole
+segments are held out in turn, and the means of the bins in the other segments predict each.
 """
 
+from __future__ import annotations
+
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from robotid.base.exceptions import DataError
 from robotid.base.typing import Array
-from robotid.diagnosis.residual.dependence import FEWEST, Dependence, even_bins, follow
+from robotid.diagnosis.residual.decisions import (
+    DEPENDENCE_P_VALUE,
+    DEPENDENCE_SHARE,
+    FEWEST,
+    OUTLIER,
+    SEGMENTS,
+    SHORTEST,
+    p_value,
+)
 from robotid.dynamics.drive_columns import drive_values, friction_directions
 from robotid.dynamics.prediction import rigid_parts
 from robotid.dynamics.used_rows import independent_share
-from robotid.estimation.fitting.evaluation import Evaluation
+from robotid.estimation.fitting.evaluation import Evaluation, predict
 from robotid.estimation.fitting.fitted import Fit
 from robotid.robot.model import RobotModel
 
 _RIGID = ("gravity", "inertia", "Coriolis")
 _ROWS = 4000  # samples of all recordings together that are split
-_SEGMENTS = 16  # held out in turn
-_SHORTEST = 10  # independent samples in a segment
-_OUTLIER = 12.0  # typical residuals above which a sample is excluded
 _QUARTERS = 4  # parts of a recording for the test of a drift, and pieces of each part
 _ROUNDING = 1e-10  # of the torque, below which a part counts as 0
 _SLOW = 0.25  # of the RMS speed: below is low speed
@@ -44,6 +54,8 @@ _CHANGED = (
     "The fitted recordings do not have this dependence: something has changed since (friction with "
     "temperature, a sensor offset, a load), or the joint does not move this way in them"
 )
+_BINS = 10  # of a quantity, with equal numbers of samples
+_FEWEST_IN_BIN = 3  # segments from which the scatter of a bin's mean is determined
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,7 +191,7 @@ class JointTorque:
     terms: Mapping[str, Mapping[str, Array]]
     quantities: Mapping[str, tuple[str, Array]]
     broadband: float | None
-    fitted: "JointTorque | None" = None
+    fitted: JointTorque | None = None
 
     @cached_property
     def residual(self) -> Array:
@@ -217,7 +229,7 @@ class JointTorque:
         r = self.residual
         if not self.used.any():
             return ()
-        used = self.used & (np.abs(r) <= _OUTLIER * np.median(np.abs(r[self.used])))
+        used = self.used & (np.abs(r) <= OUTLIER * np.median(np.abs(r[self.used])))
         everywhere, piece = np.zeros(int(used.sum()), dtype=int), self.rows.pieces[used]
         segments = None if self.rows.segments is None else self.rows.segments[used]
         found = [follow("constant", self.unit, r[used], r[used], everywhere, segments)]
@@ -370,7 +382,7 @@ def _rows(own: Sequence[tuple[Evaluation, Array]]) -> Rows:
         min(len(k), independent_share(e.recording.signals) * len(e.recording.trajectory.t))
         for e, k in own
     )
-    many, total = min(_SEGMENTS, int(independent / _SHORTEST)), sum(counts)
+    many, total = min(SEGMENTS, int(independent / SHORTEST)), sum(counts)
     return Rows(
         recordings=tuple(e.recording.name for e, _ in own),
         t=np.concatenate([e.recording.trajectory.t[k] for e, k in own]),
@@ -405,3 +417,127 @@ def _broadband_shares(evaluations: Sequence[Evaluation]) -> list[float | None]:
 
 def _percent(share: float) -> str:
     return f"{100 * share:.2g} %" if share < 0.1 else f"{100 * share:.0f} %"
+
+
+@dataclass(frozen=True, eq=False)
+class Dependence:
+    """Dependence of the residual of a joint on a quantity."""
+
+    name: str  # "constant", "position", "speed", "acceleration", "load" or "time"
+    unit: str  # Unit of the quantity
+    centres: Array  # Mean of the quantity in each bin, shape (B,)
+    means: Array  # Mean residual in each bin, shape (B,) [N m or N]
+    #: Standard error of these means, from their scatter between segments, shape (B,); NaN in bins
+    #: of fewer than three segments
+    errors: Array
+    #: Share of the residual's variance that the means of other segments explain; None if there are
+    #: too few segments. A negative share means that they explain nothing
+    share: float | None
+    p_value: float  # p-value of that share [-]
+
+    @property
+    def is_significant(self) -> bool:
+        """Whether the dependence is significant, and large enough to matter."""
+        return (
+            self.share is not None
+            and self.share >= DEPENDENCE_SHARE
+            and self.p_value < DEPENDENCE_P_VALUE
+        )
+
+    @property
+    def where(self) -> float:
+        """The value of the quantity where the mean residual differs from 0 most significantly."""
+        significance = np.abs(self.means) / np.where(self.errors > 0, self.errors, np.inf)
+        return float(self.centres[int(np.argmax(significance))])
+
+    def at(self, x: Array) -> tuple[Array, Array]:
+        """Return the mean residual and its standard error, linear between bins, shape (N,) each."""
+        curves = (np.interp(x, self.centres, y, np.nan, np.nan) for y in (self.means, self.errors))
+        mean, error = curves
+        return mean, error
+
+
+def follow(
+    name: str, unit: str, x: Array, r: Array, bins: Array, segments: Array | None
+) -> Dependence:
+    """Return the dependence of a residual on a quantity.
+
+    With N_kb samples and the sum S_kb of their residuals in segment k and bin b, the mean of a bin
+    is m_b = sum_k S_kb / n_b. Its variance is sum_k (S_kb - N_kb m_b)^2 / n_b^2, for independent
+    clusters (Liang, Zeger 1986). The squared residual of segment k after the means of the other
+    segments is compared with that after their common mean; for a single bin, with that around 0.
+    """
+    n = np.bincount(bins).astype(float)
+    centres, means = np.bincount(bins, x) / n, np.bincount(bins, r) / n
+    if segments is None:
+        return Dependence(name, unit, centres, means, np.full(len(n), np.nan), None, 1.0)
+    segment = np.unique(segments, return_inverse=True)[1]
+    K, B = int(segment.max()) + 1, len(n)
+    cell = segment * B + bins
+    N = np.bincount(cell, minlength=K * B).reshape(K, B).astype(float)  # samples of segment and bin
+    S = np.bincount(cell, r, K * B).reshape(K, B)  # sums of their residuals
+    Q = np.bincount(segment, r**2)
+    present = (N > 0).sum(axis=0)
+    scatter = np.sum((S - N * means) ** 2, axis=0) * present / np.maximum(present - 1, 1)
+    errors = np.where(present >= _FEWEST_IN_BIN, np.sqrt(scatter) / n, np.nan)
+    if K < FEWEST:
+        return Dependence(name, unit, centres, means, errors, None, 1.0)
+    N_other, S_other = n - N, S.sum(axis=0) - S  # of all segments but one
+    plain = (S_other.sum(axis=1) / N_other.sum(axis=1))[:, None] * (B > 1)  # with a constant
+    mean = np.where(N_other > 0, S_other / np.maximum(N_other, 1.0), plain)  # (K, B)
+    before, after = (
+        Q - 2 * np.sum(m * S, axis=1) + np.sum(m**2 * N, axis=1) for m in (plain, mean)
+    )
+    whole = float(before.sum())
+    share = 1.0 - float(after.sum()) / whole if whole > 0 else 0.0  # 0 for a residual of 0
+    return Dependence(name, unit, centres, means, errors, share, p_value(before, after, K))
+
+
+def even_bins(x: Array) -> Array:
+    """Return the bin of each value: ten bins with equal numbers of samples, also split at 0."""
+    edges = np.unique(np.append(np.quantile(x, np.arange(1, _BINS) / _BINS), 0.0))
+    return np.unique(np.searchsorted(edges, x, side="right"), return_inverse=True)[1]
+
+
+def spectrum(
+    x: Array, used: NDArray[np.bool_], segment: Array, dt: float, *, length: float = 5.0
+) -> tuple[Array, Array]:
+    """Return the power spectral density of a signal with gaps and excluded samples.
+
+    Welch's mean over half-overlapping Hann windows w, none of them across a gap. Excluded samples
+    count as zero, and a window is normalised by its used samples:
+    S(f) = 2 dt sum |FFT(w m x)|^2 / sum w^2 m, with m = 1 where a sample is used.
+
+    References:
+    Welch (1967), The use of fast Fourier transform for the estimation of power spectra.
+    Parzen (1963), On spectral analysis with missing observations.
+    """
+    bounds = np.flatnonzero(np.r_[True, np.diff(segment) != 0, True])
+    size = min(max(round(length / dt), 8), int(np.diff(bounds).max()))
+    window = np.hanning(size + 2)[1:-1]  # without the zeros at its ends
+    power, weight = np.zeros(size // 2 + 1), 0.0
+    for start, end in itertools.pairwise(bounds):
+        for first in range(int(start), int(end) - size + 1, max(size // 2, 1)):
+            masked = window * used[first : first + size]
+            power += np.abs(np.fft.rfft(masked * x[first : first + size])) ** 2
+            weight += float(np.sum(masked**2))
+    if weight == 0.0:
+        return np.empty(0), np.empty(0)
+    density = 2.0 * dt * power / weight
+    density[0] /= 2.0
+    if size % 2 == 0:
+        density[-1] /= 2.0
+    return np.fft.rfftfreq(size, dt), density
+
+
+def friction_split(model: RobotModel, evaluation: Evaluation, pi: Array) -> tuple[Array, Array]:
+    """Return the measured torque without rigid-body torques, and the identified friction.
+
+    The first is tau - Y pi with pi without friction and offset, the second their torque.
+    """
+    layout = model.layout
+    inertial = [True] * layout.n_inertial
+    stiff = np.array(inertial + [term.is_inertia for _, term in layout.drive_parameters])
+    trajectory = evaluation.recording.trajectory
+    moved, whole = predict(model, [np.where(stiff, pi, 0.0), pi], trajectory)
+    return trajectory.tau - moved, whole - moved

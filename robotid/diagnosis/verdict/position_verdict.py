@@ -5,8 +5,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from robotid.base.findings import listed
-from robotid.diagnosis.verdict.evidence import BEATEN, error_of
-from robotid.diagnosis.verdict.uses import uses_of_motion
+from robotid.diagnosis.verdict.evidence import BEATEN, error_of, uses_of_motion
 from robotid.diagnosis.verdict.verdict import JointVerdict, Verdict, concluded, on_joint
 from robotid.estimation.fitting.evaluation import JointMetrics, Metrics
 

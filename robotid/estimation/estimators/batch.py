@@ -1,6 +1,5 @@
 """Ordinary, weighted and total least squares on triangular factors."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -33,15 +32,12 @@ class OLS(BatchEstimator):
 
     The covariance has a separate noise level for each joint,
     ``(W^T W)^-1 (sum_j sigma_j^2 W_j^T W_j) (W^T W)^-1``.
-
-    Attributes:
-        prior: Parameter values for directions that are not identifiable, shape (c,); None: an error
-            is raised if there are any.
-        independent_share: Share of independent rows [-], 2 cutoff / rate for low-pass filtered
-            rows. The covariance is divided by it.
     """
 
+    #: Parameter values for directions that are not identifiable, shape (c,); None: an error if any.
     prior: Array | None = None
+    #: Share of independent rows [-], 2 cutoff / rate for low-pass filtered rows. The covariance is
+    #: divided by it.
     independent_share: float = 1.0
 
     @property
@@ -63,19 +59,13 @@ class WLS(BatchEstimator):
     The noise level sigma_j of each joint is computed from its residual and the effective degrees of
     freedom of its rows, and is iterated to convergence, which may be slow with few rows.
 
-    Attributes:
-        prior: As in ``OLS``.
-        independent_share: As in ``OLS``.
-        levels: Noise levels from which the iteration starts, shape (n,), as of a similar fit; None:
-            those of equal weights.
-
     References:
         Gautier (1997), Dynamic identification of robots with power model, section II.
     """
 
-    prior: Array | None = None
-    independent_share: float = 1.0
-    levels: Array | None = None
+    prior: Array | None = None  # as in ``OLS``
+    independent_share: float = 1.0  # as in ``OLS``
+    levels: Array | None = None  # (n,), initial noise levels; None: those of equal weights
 
     def _fit(self, factors: Factors) -> Estimate:
         sigma = self.levels
@@ -113,20 +103,15 @@ class TLS(BatchEstimator):
     columns have none. It is biased if the residual is a model error, which it attributes to noise
     of the regressor. For ``regressor_noise`` towards 0 it is WLS, whose covariance it returns.
 
-    Attributes:
-        regressor_noise: RMS noise of the columns over their RMS [-]; None: 0.01, reduced if it
-            exceeds half of the residual's variance.
-        exact: Columns without noise, by the last part of their names.
-        independent_share: As in ``OLS``.
-
     References:
         Golub, Hoffman, Stewart (1987), A generalization of the Eckart-Young-Mirsky matrix
         approximation theorem; Van Huffel, Vandewalle (1991), The Total Least Squares Problem, 3.6.
     """
 
+    #: RMS noise of the columns over their RMS [-]; None: 0.01, reduced if it exceeds half of the
+    #: residual's variance.
     regressor_noise: float | None = _TLS_NOISE
-    exact: Sequence[str] = ("offset",)
-    independent_share: float = 1.0
+    independent_share: float = 1.0  # as in ``OLS``
 
     def _fit(self, factors: Factors) -> Estimate:
         wls = WLS(independent_share=self.independent_share).fit(factors)
@@ -136,7 +121,7 @@ class TLS(BatchEstimator):
         count = max(int(factors.rows.sum()), 1)
         level = _TLS_NOISE if self.regressor_noise is None else self.regressor_noise
         noise = level * np.linalg.norm(R[:, :-1], axis=0) / np.sqrt(count)
-        is_exact = [name.rsplit(".", 1)[-1] in self.exact for name in factors.names]
+        is_exact = [name.endswith(".offset") for name in factors.names]  # constant columns
         theta, share = self._split(R, np.where(is_exact, 0.0, noise), wls.theta)
         freedom = np.maximum(factors.rows - len(theta) / len(factors.rows), 1.0)
         return replace(
@@ -151,7 +136,7 @@ class TLS(BatchEstimator):
         """Return the parameters and the share of the residual due to the regressor's noise.
 
         The residual of WLS, 1 in these units, is the sum of the torque's noise and the regressor's
-        noise times theta. The share depends on theta and theta on the share: both are iterated.
+        noise times theta. Share and theta depend on each other: both are iterated.
         """
         for _ in range(_TLS_ITERATIONS):
             share = float(((noise * theta) ** 2).sum())
@@ -193,10 +178,7 @@ class Solution:
     def estimate(
         self, names: tuple[str, ...], covariance: Array, sigma: Array, n_iter: int, message: str
     ) -> Estimate:
-        """Return the estimate; parameters that are not identifiable have infinite variance.
-
-        covariance (c, c), sigma (n,) [N m or N].
-        """
+        """Return the estimate; parameters that are not identifiable have infinite variance."""
         is_open = np.isin(names, self.undetermined)
         covariance = covariance.copy()
         covariance[is_open, is_open] = np.inf
@@ -207,10 +189,7 @@ class Solution:
 
 
 def solve_factor(factors: Factors, sigma: Array, prior: Array | None) -> Solution:
-    """Solve the weighted problem; directions that are not identifiable have the prior's values.
-
-    sigma (n,) [N m or N], prior (c,).
-    """
+    """Solve the weighted problem; directions that are not identifiable have the prior's values."""
     R = factors.weighted(sigma)
     c = len(factors.names)
     A, d = R[:, :c], R[:, c]
@@ -247,10 +226,7 @@ def _noise(factors: Factors, theta: Array, used: Array) -> Array:
 
 
 def mixed_tls(rows: Array, noise: Array) -> Array:
-    """Return the parameters of mixed total least squares, shape (c,).
-
-    rows (k, c + 1), noise (c,).
-    """
+    """Return the parameters (c,) of mixed total least squares: rows (k, c + 1), noise (c,)."""
     c = len(noise)
     exact, noisy = np.flatnonzero(noise == 0), np.flatnonzero(noise > 0)
     scale = np.append(noise[noisy], 1.0)

@@ -17,7 +17,6 @@ from robotid.estimation.estimators.estimator import Estimate, Weighing, require_
 from robotid.estimation.estimators.recursive import (
     RecursiveEstimator,
     fold,
-    require_samples,
     scaled_rows,
 )
 
@@ -54,30 +53,17 @@ class Descent(RecursiveEstimator[DescentState]):
 
     ``fit`` reads the samples in several passes, until PRX = 0. A gradient method has no estimate of
     its uncertainty: the covariance is infinite, rank and condition number are unknown.
-
-    Attributes:
-        sigma: Noise level of each joint, shape (n,) [N m or N].
-        prior: Initial values, shape (c,); 0 if None.
-        scale: Column scaling, shape (c,); None: ``fit`` uses the column norms, and a state of
-            ``init`` is not scaled.
-        average: Whether the estimate is the average of the iterates; recommended with noise.
-        passes: Largest number of passes of ``fit``.
-        rng: Random generator of the order in which ``fit`` reads the samples; None: order of time.
-        eps1: Norm of the moving average of PRX below which it is 0, in scaled parameters.
-        eps2: Samples with |Psi|^2 <= eps2 are skipped.
-
-    Raises:
-        DataError: If a setting is out of its range.
     """
 
-    sigma: Array
-    prior: Array | None = None
+    sigma: Array  # (n,), noise level of each joint [N m or N]
+    prior: Array | None = None  # (c,), initial values; 0 if None
+    #: Column scaling, shape (c,); None: ``fit`` uses the column norms, ``init`` does not scale.
     scale: Array | None = None
-    average: bool = True
-    passes: int = 4
-    rng: np.random.Generator | None = None
-    eps1: float = 1e-9
-    eps2: float = 1e-12
+    average: bool = True  # whether the estimate is the average of the iterates; better with noise
+    passes: int = 4  # largest number of passes of ``fit``
+    rng: np.random.Generator | None = None  # of the order of the samples; None: order of time
+    eps1: float = 1e-9  # norm of the moving average of PRX below which it is 0, scaled parameters
+    eps2: float = 1e-12  # samples with |Psi|^2 <= eps2 are skipped
 
     def __post_init__(self) -> None:
         for name in ("passes", "eps1", "eps2"):
@@ -126,36 +112,25 @@ class Descent(RecursiveEstimator[DescentState]):
         share = 1.0 / min(steps, _MEMORY)
         squares = state.squares.copy()
         squares[used] += share * (e**2 * sigma[used] ** 2 / sample.weight[used] - squares[used])
-        return DescentState(
-            x,
-            mean,
-            state.prx + share * (prx - state.prx),
-            state.prx_square + share * (float(prx @ prx) - state.prx_square),
-            squares,
-            steps,
-            state.skipped,
-            state.rows + len(rows),
-        )
+        prx_square = state.prx_square + share * (float(prx @ prx) - state.prx_square)
+        prx = state.prx + share * (prx - state.prx)
+        count = state.rows + len(rows)
+        return DescentState(x, mean, prx, prx_square, squares, steps, state.skipped, count)
 
     def estimate(self, state: DescentState, names: tuple[str, ...]) -> Estimate:
         c = len(names)
         prx = float(np.linalg.norm(state.prx))
-        return Estimate(
-            theta=state.mean / self._unit,
-            covariance=np.full((c, c), np.inf),
-            names=names,
-            sigma=np.sqrt(state.squares),
-            rank=c,
-            condition=float("inf"),
-            undetermined=(),
-            converged=self._is_zero(state),
-            n_iter=state.steps,
-            message=f"{state.steps} steps, {state.skipped} without information, |PRX| = {prx:.3g}; "
-            "a gradient method has no covariance, it is stated as infinite",
+        message = (
+            f"{state.steps} steps, {state.skipped} without information, |PRX| = {prx:.3g}; "
+            "a gradient method has no covariance, it is stated as infinite"
         )
+        return Estimate(
+            state.mean / self._unit, np.full((c, c), np.inf), names, np.sqrt(state.squares),
+            rank=c, condition=float("inf"), undetermined=(), converged=self._is_zero(state),
+            n_iter=state.steps, message=message,
+        )  # fmt: skip
 
     def fit(self, data: Problem) -> Estimate:
-        require_samples(data)
         estimator, c = self, len(data.names)
         if self.scale is None and self._takes_scale:
             estimator = replace(self, scale=column_scale(data, self.sigma))
@@ -183,10 +158,7 @@ class Descent(RecursiveEstimator[DescentState]):
         return norm <= self.eps1 or norm <= _ZERO * standard_error
 
     def _has_settled(self, before: DescentState, after: DescentState) -> bool:
-        """Return whether PRX = 0 after a pass.
-
-        A PRX that scatters about 0 is 0 only if the pass has not reduced the residual.
-        """
+        """Return whether PRX = 0 after a pass; if it scatters, the residual must not decrease."""
         first, last = (float(np.sum(s.squares / self.sigma**2)) for s in (before, after))
         gain = 1.0 - last / first if first > 0 else 1.0
         is_small = float(np.linalg.norm(after.prx)) <= self.eps1
@@ -200,14 +172,11 @@ class NormalisedGradient(Descent):
     theta <- theta - mu / (1e-9 + |Psi|_F^2) Psi^T e, e = Psi theta - tau, rows in units of their
     noise. Without noise |theta~| does not increase for 0 < mu < 2.
 
-    Attributes:
-        step_size: The relaxation mu, above 0 and below 2 [-].
-
     References:
         Goodwin, Sin (1984), Adaptive Filtering, Prediction and Control, 3.3.
     """
 
-    step_size: float = 1.0
+    step_size: float = 1.0  # the relaxation mu, above 0 and below 2 [-]
 
     @property
     def _takes_scale(self) -> bool:
@@ -239,16 +208,13 @@ class PRX(Descent):
     squares, and that of the average, the k-th iterate weighted by k^2, 1.03 to 1.05 times. ``fit``
     scales the columns for step "exact" only.
 
-    Attributes:
-        step: "exact" or "printed".
-        metric: For step "exact": "noise" for M = diag(sigma^-2); "mass" for M = D(q, P^)^-1, as
-            printed; "rows" for M = (Psi Psi^T)^-1, which fits all rows of a sample together.
-
     References:
         Tzvetkova, Extracting Inertial Parameters from Robotic Manipulators Dynamics, (20)-(25).
     """
 
-    step: str = "exact"
+    step: str = "exact"  # or "printed"
+    #: For step "exact": "noise" for M = diag(sigma^-2); "mass" for M = D(q, P^)^-1, as printed;
+    #: "rows" for M = (Psi Psi^T)^-1, which fits all rows of a sample together.
     metric: str = "noise"
 
     @property
@@ -284,14 +250,12 @@ class PRX(Descent):
         if self.step == "exact":
             return _exact(Psi, e[used], eta[used])
         gamma = values[0] / np.vdot(Psi, Psi)  # sigma_D / |Psi|_F^2
-        printed: Array = gamma * (eta[used] @ Psi)  # (24)
-        return printed
+        return np.asarray(gamma * (eta[used] @ Psi))  # (24)
 
     def _inertia(self, x: Array, sample: Sample) -> tuple[Array, Array]:
         """Return eigenvalues and eigenvectors of D(q, P^), which is linear in P^ (11).
 
-        The proof holds for any positive definite D. For an intermediate estimate with an indefinite
-        D, small and negative eigenvalues are replaced by a positive bound.
+        The proof needs a positive definite D: smaller eigenvalues are replaced by a positive bound.
         """
         if sample.mass_regressor is None:
             raise DataError(
@@ -307,12 +271,7 @@ class PRX(Descent):
 
 
 def column_scale(problem: Problem, sigma: Array) -> Array:
-    """Return the RMS of columns, shape (c,), positive, with rows in units of their noise.
-
-    Scaled by it, all columns have the same norm. The value of a column without data is 1.
-
-    sigma (n,) [N m or N].
-    """
+    """Return the RMS of columns, (c,), rows in units of their noise (n,); 1 of a silent column."""
     n, c = problem.n_joints, len(problem.names)
     squares, count = np.zeros(c), 0
     for W, _, weight in problem.blocks():

@@ -116,23 +116,18 @@ class Determination:
 
     def to_list(self) -> list[dict[str, Any]]:
         """Return the groups as plain values, as they are written to result.json."""
+
+        def plain(c: Combination) -> dict[str, Any]:
+            return {"text": str(c), "terms": dict(zip(c.names, c.coefficients, strict=True))}
+
         return [
-            {
-                "parameters": list(group.names),
-                "determined": [
-                    {"text": str(c), "terms": dict(zip(c.names, c.coefficients, strict=True))}
-                    for c in group.combinations
-                ],
-            }
+            {"parameters": list(group.names), "determined": [plain(c) for c in group.combinations]}
             for group in self.groups
         ]
 
 
 def base_spread(K: Array, spread: Array, known: Sequence[bool] | Array = ()) -> Array:
-    """Return the prior standard deviation of each base parameter, shape (b,); 0 if known.
-
-    K (b, p), spread (p,), known (p,).
-    """
+    """Return the prior standard deviation of each base parameter, (b,); 0 if known (p,)."""
     free = spread * ~np.asarray(known, dtype=bool) if len(known) else spread
     return np.asarray(np.linalg.norm(K * free, axis=1))
 

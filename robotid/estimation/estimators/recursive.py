@@ -31,8 +31,7 @@ _PRIOR_LED = 0.9  # ratio to the prior standard deviation above which a paramete
 class RecursiveEstimator(Estimator[Problem], Generic[StateT]):
     """Interface of recursive estimators: settings in the constructor, results in a state.
 
-    A state is an immutable dataclass of arrays and numbers. ``save_state`` and ``load_state``
-    preserve it exactly.
+    A state is an immutable dataclass of arrays and numbers.
     """
 
     reads: ClassVar[Literal["samples"]] = "samples"
@@ -117,14 +116,6 @@ def load_state(path: str | Path, kind: type[StateT]) -> StateT:
     return kind(**plain)
 
 
-def require_samples(data: object) -> None:
-    """Raise an error if data for ``fit`` have no samples."""
-    if not isinstance(data, Problem):
-        raise DataError(
-            "a recursive estimator needs samples, but factors have none; call fit with the problem"
-        )
-
-
 class Filter(RecursiveEstimator[StateT]):
     """A recursive estimator that reads the samples once, in the order of time."""
 
@@ -135,7 +126,6 @@ class Filter(RecursiveEstimator[StateT]):
         """Return the number of rows that a state depends on."""
 
     def fit(self, data: Problem) -> Estimate:
-        require_samples(data)
         c = len(data.names)
         state = fold(self, data.samples(), self.init(c))
         require_rows(self._rows_of(state), c, data.n_joints)
@@ -169,27 +159,17 @@ class RLS(Filter[RLSState]):
     information of each stays between forgetting^c and 1 times that of the prior. Parameters that
     are not identifiable have infinite variance.
 
-    Attributes:
-        sigma: Noise level of each joint, shape (n,) [N m or N]. Only the ratios matter: the
-            common factor is estimated.
-        forgetting: Weight of a sample relative to the next one, 0 < forgetting <= 1 [-].
-        prior: Parameter values for directions that are not identifiable, shape (c,); None: 0, and
-            ``fit`` raises an error if there are any.
-        prior_std: Prior standard deviations, shape (c,); None: no prior information.
-        independent_share: Share of independent rows, 2 cutoff / rate [-].
-
-    Raises:
-        DataError: If a setting is out of its range, or forgetting < 1 comes without a prior.
-
     References:
         Bierman (1977), Factorization Methods for Discrete Sequential Estimation, chapter IV.
     """
 
-    sigma: Array
-    forgetting: float = 1.0
+    sigma: Array  # (n,), noise levels [N m or N]; only the ratios matter
+    forgetting: float = 1.0  # weight of a sample relative to the next one, 0 < forgetting <= 1
+    #: Parameter values for directions that are not identifiable, shape (c,); None: 0, and ``fit``
+    #: raises an error if there are any.
     prior: Array | None = None
-    prior_std: Array | None = None
-    independent_share: float = 1.0
+    prior_std: Array | None = None  # (c,), prior standard deviations; None: no prior information
+    independent_share: float = 1.0  # 2 cutoff / rate
 
     def __post_init__(self) -> None:
         if not 0 < self.forgetting <= 1:
@@ -280,30 +260,17 @@ class Kalman(Filter[KalmanState]):
     used. A parameter with almost no information from the data is undetermined, and its standard
     deviation is that of its prior.
 
-    Attributes:
-        sigma: Noise level of each joint, shape (n,) [N m or N].
-        prior: Prior values, shape (c,).
-        prior_std: Prior standard deviations, shape (c,), positive; or the prior covariance, shape
-            (c, c).
-        walk: Standard deviation of the random walk per sample, over prior_std [-].
-        gate: Probability that a row without a fault passes the chi-square gate (one degree of
-            freedom per row), below 1; None: no gate.
-        independent_share: Share of independent rows, 2 cutoff / rate [-].
-
-    Raises:
-        DataError: If a setting is out of its range.
-
     References:
         Bierman (1977), Factorization Methods for Discrete Sequential Estimation, II (Joseph form);
         Bar-Shalom, Li, Kirubarajan (2001), Estimation with Applications to Tracking, 5.4.
     """
 
-    sigma: Array
-    prior: Array
-    prior_std: Array
-    walk: float = 0.0
-    gate: float | None = 1 - 1e-7
-    independent_share: float = 1.0
+    sigma: Array  # (n,), noise levels [N m or N]
+    prior: Array  # (c,), prior values
+    prior_std: Array  # (c,), prior standard deviations, positive; or (c, c), the prior covariance
+    walk: float = 0.0  # standard deviation of the random walk per sample, over prior_std [-]
+    gate: float | None = 1 - 1e-7  # probability that a row without a fault passes; None: no gate
+    independent_share: float = 1.0  # 2 cutoff / rate
 
     def __post_init__(self) -> None:
         for name in ("sigma", "prior_std"):
@@ -368,10 +335,10 @@ class Kalman(Filter[KalmanState]):
         is_open = after > _PRIOR_LED * std
         eigenvalues = np.linalg.eigvalsh(state.P / np.outer(std, std))
         return Estimate(
-            theta=state.theta,
-            covariance=state.P,
-            names=names,
-            sigma=np.sqrt(variance),
+            state.theta,
+            state.P,
+            names,
+            np.sqrt(variance),
             rank=int(np.sum(eigenvalues < _PRIOR_LED**2)),
             condition=float(np.sqrt(eigenvalues[-1] / max(eigenvalues[0], 1e-300))),
             undetermined=tuple(np.array(names)[is_open].tolist()),

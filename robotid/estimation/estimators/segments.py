@@ -44,11 +44,9 @@ class Scatter:
     def freedom(self) -> Array:
         """Return the degrees of freedom of each parameter's variance, shape (c,), at least 1.
 
-        They are inf for parameters that no segment sees: their variance is that of a prior.
-
-        References:
-            Bell, McCaffrey (2002), Bias reduction in standard errors for linear regression with
-            multi-stage samples, section 4.
+        They are inf for parameters that no segment sees: their variance is that of a prior. Bell,
+        McCaffrey (2002), Bias reduction in standard errors for linear regression with multi-stage
+        samples, section 4.
         """
         along = self.axes.mT @ self.root.T  # (s, c, c): column l is that of parameter l
         weight = (self.leverage * self.gain)[..., None]

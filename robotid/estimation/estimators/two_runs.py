@@ -59,14 +59,10 @@ class TwoRuns:
     def compare(self, *, by_joint: bool = True) -> Compared:
         """Fit both runs and the unknown gains together.
 
-        Standard errors are from the scatter of the scores of segments and of joints, and are at
-        least those for a ``share`` of independent rows. With fewer than 12 segments the latter are
-        used.
-
-        References:
-            Gautier, Briot (2014), Global identification of joint drive gains and dynamic parameters
-            of robots, Journal of Dynamic Systems, Measurement, and Control 136, section 3, which
-            uses total least squares instead.
+        Standard errors are from the scatter of the scores of segments and of joints, and at least
+        those for a ``share`` of independent rows. For gains see Gautier, Briot (2014), Global
+        identification of joint drive gains and dynamic parameters of robots, section 3, who use
+        total least squares.
         """
         size, u = len(self.mean), len(self.unknown)
         gain = self._first_gains()
@@ -227,10 +223,9 @@ class TwoRuns:
     ) -> tuple[Array, Array]:
         """Return covariance and degrees of freedom, including the uncertainty of the prior.
 
-        The scatter between segments includes errors that vary with time. The scatter between the
-        joints of each run includes constant errors, as those of a gain or of friction. The larger
-        standard error of a parameter is used. The scatter of few parts may be too small, so a
-        standard error is at least that of independent noise.
+        The scatter between segments includes errors that vary with time, that between the joints of
+        each run constant errors, as of a gain or of friction. The larger standard error is used; it
+        is at least that of independent noise, as the scatter of few parts may be too small.
         """
         if len(self.reference) + len(self.loaded) < FEWEST_SEGMENTS:
             return bread, np.full(len(solution), np.inf)

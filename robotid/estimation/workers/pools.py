@@ -179,12 +179,12 @@ class Pool:
         return self.workers if self._client is None else sum(self._client.nthreads().values())
 
     def _submit(self, work: Work, piece: Workload) -> "Future[_Outcome]":
-        stated = run_task, work, piece, _log.getEffectiveLevel()
+        level = _log.getEffectiveLevel()
         try:
-            return self._started().submit(*stated)
+            return self._started().submit(run_task, work, piece, level)
         except BrokenExecutor:  # a worker ended while it waited for work
             self.close(is_urgent=True)
-            return self._started().submit(*stated)
+            return self._started().submit(run_task, work, piece, level)
 
     def _started(self) -> Executor:
         """Return the executor, which is started at its first use."""

@@ -11,8 +11,7 @@ from robotid.base.typing import ProgressCallback, ignore_progress, report_stage
 from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import unwrap
-from robotid.diagnosis.verdict.fit_findings import not_written
-from robotid.diagnosis.verdict.unlike_runs import unlike_findings
+from robotid.diagnosis.verdict.fit_findings import not_written, unlike_findings
 from robotid.diagnosis.verdict.verdict import blocking
 from robotid.dynamics.prediction import predict_instants
 from robotid.dynamics.simulation.loops import Loops, open_loops

@@ -13,13 +13,11 @@ from numpy.typing import ArrayLike
 from robotid.base.exceptions import DataError, ModelError
 from robotid.base.files import check_path, moved_file, read_json
 from robotid.base.findings import listed
-from robotid.base.settings import Range, require_kind
+from robotid.base.settings import require_kind
 from robotid.base.typing import Array
 from robotid.data.log import Log, suggestion
 from robotid.diagnosis.verdict.parameter_table import parameter_table
-from robotid.diagnosis.verdict.payload_check import PayloadCheck
-from robotid.diagnosis.verdict.scale_check import ScaleCheck
-from robotid.diagnosis.verdict.stated_mass import StatedMass
+from robotid.diagnosis.verdict.scale_check import PayloadCheck, ScaleCheck, StatedMass
 from robotid.dynamics.friction_projection import (
     DriveMoments,
     projected_pinocchio_model,
@@ -27,22 +25,13 @@ from robotid.dynamics.friction_projection import (
 from robotid.dynamics.prediction import predict_instants
 from robotid.estimation.fitting.standard_errors import FrictionCurve
 from robotid.estimation.variation.groups import RunSums
-from robotid.estimation.variation.variation import SCORES, between_covariance
+from robotid.estimation.variation.variation import between_covariance
 from robotid.output.files.commanded import (
     CommandedDrive,
     commanded_drives,
     loops_of,
 )
-from robotid.output.files.shape import (
-    FILE,
-    FLAG,
-    MAYBE,
-    NUMBER,
-    TABLE,
-    TEXT,
-    check_shape,
-    require_lengths,
-)
+from robotid.output.files.shape import check_shape, require_lengths, schema
 from robotid.output.files.urdf import load_identified, terms_from_facts
 from robotid.robot.model import RobotModel
 
@@ -50,95 +39,7 @@ if TYPE_CHECKING:
     from robotid.identification.closed_loop.position_errors import PositionEvaluation
 
 SCHEMA_VERSION = 1
-_STATUSES = ("good", "usable", "poor", "not evaluated")
-_STATUS = Range("good, usable, poor or not evaluated", _STATUSES.__contains__)
-_METRICS = {"per_joint": {...: {"relative_error_pct": MAYBE, "rmse": MAYBE, "unit": TEXT}}}
-_PARAMETER = {"name": TEXT, "value": NUMBER, "unit": TEXT}
-_RECORDING = {
-    **dict.fromkeys(("start", "end", "rows_used"), NUMBER),
-    "signals": TABLE,
-}
 _ROUNDING = 1e-9  # [-] of eigenvalues that may be 0
-_VARIATION = {
-    "logs": [TEXT],
-    "parameters": {
-        ...: {
-            **dict.fromkeys(("mean", "std_error", "spread", "spread_within_units?"), NUMBER),
-            "next_interval": [NUMBER] * 2,
-            "seen_interval?": [NUMBER] * 2,
-            "next_quantiles": [NUMBER] * len(SCORES),
-        }
-    },
-    "correlation": [[NUMBER]],
-    "sums?": {
-        "H": [[NUMBER]],
-        "h": [[NUMBER]],
-        "scatter": [[NUMBER] * 2],
-        "sigma": [NUMBER],
-        "shift?": [NUMBER],
-        "unit": [TEXT],
-    },
-    "added?": [{"path": TEXT, "sha256": (str, type(None))}],
-}
-#: The entries of a result.json that are read.
-_SHAPE = {
-    "robotid": TEXT,
-    "robot": TEXT,
-    "joints": [TEXT],
-    "versions?": {...: TEXT},
-    "settings": {"estimator": {"name": TEXT}},
-    "inputs": [{"role": TEXT, "path": TEXT, "sha256": (str, type(None))}],
-    "outputs": {"urdf?": FILE, "sidecar?": FILE},
-    "structure": {"base": NUMBER, "undetermined": [TEXT]},
-    "scale_check?": {
-        **{key: {...: NUMBER} for key in ("gravity", "gravity_error", "friction")},
-        **{key: [NUMBER] for key in ("unexplained", "masses")},
-        "scale": MAYBE,
-        "factor": NUMBER,
-        "common?": [NUMBER],
-        "mass_error?": NUMBER,
-        "assumed?": NUMBER,
-        "stated?": {
-            "names": [TEXT],
-            "ratio": MAYBE,
-            "half_width": NUMBER,
-            "absorbed_by": [TEXT],
-        },
-        "payloads?": [
-            {
-                **dict.fromkeys(("link", "log", "sha256"), TEXT),
-                **dict.fromkeys(("known", "std_error"), NUMBER),
-                "identified": MAYBE,
-                "interval": [NUMBER],
-            }
-        ],
-        "is_stated": FLAG,
-    },
-    "consistency": {
-        "is_consistent": FLAG,
-        "fit?": {"prior?": {"weight": NUMBER, "plausible_weight?": NUMBER}},
-    },
-    "base_parameters": [{**_PARAMETER, "expression": TEXT, "std_error": MAYBE}],
-    "standard_parameters": [_PARAMETER],
-    "drive_parameters": [{**_PARAMETER, "with_urdf?": NUMBER}],
-    "ranges?": {"robot": TEXT, "drives": {...: TABLE}},
-    "simulation?": {"controller": {"kind": TEXT, "rate?": MAYBE}},
-    "own_terms?": {...: [TABLE]},
-    "variation?": _VARIATION,
-    "covariance?": {"names": [TEXT], "root": [[NUMBER]]},
-    "friction?": {...: {"data_range?": {...: [NUMBER]}}},
-    "drive_moments?": {...: {"terms": [TEXT], "products": [[NUMBER]], "torque": NUMBER}},
-    "identification": _METRICS,
-    "validation": [{"log": TEXT, **_METRICS}],
-    "verdict": {
-        "status": _STATUS,
-        "reasons": [TEXT],
-        "use_for?": {...: TEXT},
-        "per_joint?": {...: {"status": _STATUS, "reasons": [TEXT]}},
-        "log_errors?": [TEXT],
-        "warnings?": [{"code": TEXT, "joint": TEXT, "message": TEXT, "effect?": TEXT}],
-    },
-}
 
 
 @dataclass(frozen=True, eq=False)
@@ -393,17 +294,10 @@ def read_result(path: str | Path) -> dict[str, Any]:
             f"{name} has schema_version {version!r}, wanted {SCHEMA_VERSION} of a result "
             "written by 'robotid identify'"
         )
-    check_shape(result, _SHAPE, name)
+    check_shape(result, schema("result"), name)
     for k, entry in enumerate(result["inputs"]):
         if entry["role"] != "urdf":
-            check_shape(entry, _RECORDING, f"{name}.inputs[{k}]")
-    for joint, own in result.get("friction", {}).items():
-        for quantity, ends in own.get("data_range", {}).items():
-            if len(ends) != 2:
-                at = f"{name}.friction.{joint}.data_range.{quantity}"
-                raise DataError(
-                    f"{at} has {len(ends)} numbers, wanted 2: the smallest, the largest"
-                )
+            check_shape(entry, schema("recording"), f"{name}.inputs[{k}]")
     validation = [entry for entry in result["inputs"] if entry["role"] == "validation"]
     if len(validation) != len(result["validation"]):
         raise DataError(

@@ -26,7 +26,7 @@ from robotid.base.versions import __version__
 from robotid.dynamics.friction_projection import Projection
 from robotid.dynamics.torque import random_regressor
 from robotid.output.files import xml_splice
-from robotid.output.files.shape import FLAG, NUMBER, TABLE, TEXT, check_shape
+from robotid.output.files.shape import check_shape, schema
 from robotid.output.files.xml_splice import Document, Edit
 from robotid.robot.bodies import (
     LinkPlace,
@@ -44,22 +44,6 @@ from robotid.robot.tree import MOMENTS, Inertial
 #: The drive terms of ``<dynamics>``.
 DYNAMICS_TERMS = tuple(name for name, term in TERMS.items() if term.dynamics)
 _SCHEMA_VERSION = 1
-_SHAPE = {
-    "urdf_sha256": TEXT,
-    "joints": [TEXT],
-    "locked": {...: NUMBER},
-    "gravity": [NUMBER],
-    "free_flyer": FLAG,
-    "mimic": TEXT,
-    "dynamics?": TEXT,
-    "terms": [TEXT],
-    "own_terms?": {...: [TABLE]},
-    "passive?": [TEXT],
-    "loops?": [{"frames": [TEXT], "kind": TEXT, "axis": [NUMBER]}],
-    "drives": {...: {...: NUMBER}},
-    "couplings": [{"name": TEXT, "ratios": {...: NUMBER}, "replaces?": FLAG}],
-    "lumped": TABLE,
-}
 _HUNK = re.compile(r"@@ -(\d+)")
 _OWNER = re.compile(r"""<(?:link|joint)\s[^>]*?\bname\s*=\s*["']([^"']*)""")
 _UNCHANGED = 1e-12  # relative difference below which a parameter counts as unchanged
@@ -151,7 +135,7 @@ def read_sidecar(path: str | Path) -> dict[str, Any]:
             f"{source.name} has schema_version {version!r}, wanted {_SCHEMA_VERSION} of a drive "
             "parameters file written by robotid"
         )
-    check_shape(content, _SHAPE, source.name)
+    check_shape(content, schema("sidecar"), source.name)
     return dict(content)
 
 

@@ -1,4 +1,4 @@
-"""The page of a fleet: verdicts, failures, units that differ, distribution of each parameter."""
+"""The page of a fleet: verdicts, failures, units that differ, variation of each parameter."""
 
 from collections import Counter
 from collections.abc import Mapping
@@ -6,13 +6,8 @@ from html import escape
 from pathlib import PurePath
 from typing import Any
 
-import numpy as np
-
-from robotid.output.pages.charts import Chart, Series, chart_html
 from robotid.output.pages.html import block, facts_html, listing, page, with_error
 
-_BINS = 24  # of a distribution, at most
-_CHARTS = 12  # distributions on the page, those with the largest spread
 _ROWS = 20  # failures on the page, and units that differ; all are in the files of results
 _FAILURES = (
     ("unit", "code", "unit"), ("log", "code", "log"), ("alike", "d", "alike"),
@@ -44,7 +39,6 @@ def fleet_page(content: Mapping[str, Any]) -> str:
         "failures": ("Failures", _failures(content)),
         "unlike": ("Units that differ", _unlike(content)),
         "parameters": ("Variation between units", _parameters(content)),
-        "distributions": ("Distributions", _distributions(content)),
     }
     title = f"Fleet of {content['units']} units"
     return page(title, f"<h1>{title}</h1>\n{facts_html(facts)}", sections)
@@ -102,26 +96,3 @@ def _parameters(content: Mapping[str, Any]) -> str:
     if not table:
         return "<p>Fewer than three units of one robot were identified.</p>\n"
     return block("fleet.parameters") + table
-
-
-def _distributions(content: Mapping[str, Any]) -> str:
-    """Return histograms, those with the largest spread relative to the mean's error first."""
-    every = sorted(content["parameters"], key=lambda e: -e["spread"] / (abs(e["mean"]) or 1.0))
-    first = every[:_CHARTS]
-    note = block("fleet.largest", shown=len(first), count=len(every)) if every[_CHARTS:] else ""
-    return f'{note}<div class="plots">\n{"".join(map(_histogram, first))}</div>\n'
-
-
-def _histogram(entry: Mapping[str, Any]) -> str:
-    values = np.array(entry["values"])
-    count, edges = np.histogram(values, bins=min(_BINS, max(4, len(values) // 2)))
-    chart = Chart(
-        f"Distribution of {entry['name']} over units",
-        (edges[1:] + edges[:-1]) / 2,
-        (Series("units", count.astype(float), "tone-1", "bars"),),
-        f"{entry['name']} [{entry['unit']}]",
-        "units",
-        height=120,
-        marks=tuple(entry["next_interval"]),
-    )
-    return chart_html(chart, f"<strong>{escape(entry['name'])}</strong>; dotted: 95 % of the next")

@@ -13,14 +13,15 @@ from robotid.base.findings import Cause, grouped, listed, toml_key
 from robotid.base.settings import is_number
 from robotid.diagnosis.catalogue import entries as catalogue_entries
 from robotid.diagnosis.catalogue import step_of
-from robotid.diagnosis.residual.misfit_findings import setting_of, with_entries
+from robotid.diagnosis.residual.misfit import setting_of, with_entries
 from robotid.diagnosis.verdict.evidence import GOOD, is_beaten
 from robotid.identification.result import Identification, TorqueIdentification
 from robotid.output.report.steps import MOST, NAMED, Origin, Step, exports_of, sentence_of
-from robotid.robot.drives import COUNTERBALANCE, DriveTerm, spring_family
+from robotid.robot.drive_term import DriveTerm
+from robotid.robot.drives import COUNTERBALANCE, spring_family
 
 if TYPE_CHECKING:
-    from robotid.diagnosis.verdict.payload_check import PayloadCheck
+    from robotid.diagnosis.verdict.scale_check import PayloadCheck
 
 _NEW = "NEW.csv"
 _LOADED = "LOADED.csv"

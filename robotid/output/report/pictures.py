@@ -8,9 +8,13 @@ from robotid.base.findings import listed
 from robotid.base.settings import require_kind
 from robotid.base.typing import Array
 from robotid.data.log import suggestion
-from robotid.diagnosis.residual.dependence import Dependence
-from robotid.diagnosis.residual.residuals import friction_split, spectrum
-from robotid.diagnosis.residual.torque_split import JointTorque, spread_rows
+from robotid.diagnosis.residual.torque_split import (
+    Dependence,
+    JointTorque,
+    friction_split,
+    spectrum,
+    spread_rows,
+)
 from robotid.dynamics.prediction import drive_motion_along
 from robotid.estimation.fitting.evaluation import Evaluation
 from robotid.estimation.fitting.fitted import friction_curve

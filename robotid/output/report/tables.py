@@ -10,7 +10,7 @@ import numpy as np
 
 from robotid.base.findings import listed
 from robotid.base.typing import Array
-from robotid.diagnosis.verdict.central import CENTRAL_TERMS, central_parameters
+from robotid.diagnosis.verdict.parameter_table import CENTRAL_TERMS, central_parameters
 from robotid.estimation.variation.variation import Variation, VaryingParameter
 from robotid.identification.result import TorqueIdentification
 from robotid.output.files.urdf import urdf_changes

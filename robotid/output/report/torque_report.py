@@ -8,59 +8,33 @@ from pathlib import Path
 import numpy as np
 
 from robotid.base.findings import listed
-from robotid.base.typing import Array
 from robotid.base.versions import versions
 from robotid.data.signal_settings import SignalSettings
 from robotid.diagnosis.residual.decisions import DEPENDENCE_SHARE
-from robotid.diagnosis.residual.residuals import friction_split
-from robotid.diagnosis.residual.torque_split import JointTorque
+from robotid.diagnosis.residual.torque_split import JointTorque, friction_split
 from robotid.diagnosis.verdict.parameter_table import parameter_entries
-from robotid.estimation.estimators.batch import solve_factor
 from robotid.estimation.fitting.drive_terms import DriveChoice
 from robotid.estimation.fitting.evaluation import Evaluation
-from robotid.estimation.fitting.fitted import Fit, next_errors
+from robotid.estimation.fitting.fitted import next_errors
 from robotid.estimation.fitting.standard_errors import TorqueBand
 from robotid.identification.result import TorqueIdentification
 from robotid.identification.summary import left_out_lines
 from robotid.output.files.entries import input_entries
 from robotid.output.pages.charts import Chart, chart_html
 from robotid.output.pages.html import Cell, block, cell, code, folded, listing, percent, table, text
+from robotid.output.report import pictures, tables
 from robotid.output.report.dock import Residual
-from robotid.output.report.ellipsoids import ellipsoid_pictures
 from robotid.output.report.errors import TORQUE, errors_of, worst_errors
 from robotid.output.report.next_steps import next_steps
-from robotid.output.report.pictures import (
-    friction_chart,
-    shown_evaluation,
-    spectrum_chart,
-    torque_charts,
-    why_charts,
-)
 from robotid.output.report.report_page import Report, curves_section, drawn
 from robotid.output.report.steps import Origin
-from robotid.output.report.tables import (
-    base_table,
-    body_table,
-    consistency_section,
-    input_table,
-    open_section,
-    parameter_section,
-    settings_tables,
-    variation_section,
-    version_table,
-)
 
-_PAIRS = 15  # strongest correlations that are listed
-_STRONG = 0.8  # smallest correlation that is listed
-_KNOWN = 0.99  # share of the data from which a parameter is not listed
 _LOW = 130  # [px] height of a friction chart
 _CURVES = 8  # friction charts that are not folded
 _POINTS = 300  # of a chart of the residual analysis
 _ALL_POINTS = 1800  # of one chart, summed over the joints
 _FEWEST_POINTS = 100
 _MOST = 12  # joints with all charts; others have charts of significant dependences only
-_WEAK = (("parameter", "code", "name"), ("share of data %", ".1f", "share"))
-_CORRELATED = (("parameter", "code", "one"), ("and", "code", "other"), ("correlation", ".3f", "r"))
 _TRIED = (
     ("terms", "text", "terms"), ("held-out error %", ".2f", "error"), ("p-value", ".1e", "p_value"),
     ("", "text", "selected"),
@@ -89,10 +63,10 @@ def torque_report(found: TorqueIdentification, origin: Origin, replay: str = "")
         errors=(block("report.torque_errors"), ""),
         curves=("Torques", torques_section(found, worst, origin, replay)),
         friction=friction_section(found, worst),
-        bodies=body_table(found) + ellipsoid_pictures(found),
+        bodies=tables.body_table(found),
         why=why_section(found),
-        variation=variation_section(found.variation, _next_errors(found)),
-        parameters=parameter_section(
+        variation=tables.variation_section(found.variation, _next_errors(found)),
+        parameters=tables.parameter_section(
             found.model,
             found.standard if found.has_urdf else None,
             entries,
@@ -103,13 +77,12 @@ def torque_report(found: TorqueIdentification, origin: Origin, replay: str = "")
         appendix={
             "residuals": ("Residual spectra", residual_section(found)),
             "drives": ("Selection of friction terms", drive_choices(found)),
-            "base": ("Base parameters", base_table(found)),
-            "consistency": ("Physical consistency", consistency_section(found)),
-            "information": ("Excitation and correlation", information_section(found)),
-            "open": ("Parameters not identifiable", open_section(found)),
-            "settings": ("Settings", settings_tables(found)),
-            "inputs": ("Inputs", input_table(input_entries(found))),
-            "versions": ("Versions", version_table(versions())),
+            "base": ("Base parameters", tables.base_table(found)),
+            "consistency": ("Physical consistency", tables.consistency_section(found)),
+            "open": ("Parameters not identifiable", tables.open_section(found)),
+            "settings": ("Settings", tables.settings_tables(found)),
+            "inputs": ("Inputs", tables.input_table(input_entries(found))),
+            "versions": ("Versions", tables.version_table(versions())),
         },
     )
 
@@ -247,7 +220,7 @@ def _charts(
             f"{100 * inside:.0f} %"
         )
     kind = "not fitted" if found.validation else "fitted"
-    torque, residual = torque_charts(found, e, row, band=band, link=link)
+    torque, residual = pictures.torque_charts(found, e, row, band=band, link=link)
     caption = f"{escape(recording.name)}, {kind}: {words}"
     return chart_html(torque, caption, points=points) + chart_html(residual, "", points=points)
 
@@ -257,10 +230,10 @@ def friction_section(found: TorqueIdentification, worst: Sequence[str]) -> str:
     model, layout = found.model, found.model.layout
     if model.is_static or all(term.is_inertia for _, term in layout.drive_parameters):
         return ""
-    split = friction_split(model, shown_evaluation(found), found.standard)
+    split = friction_split(model, pictures.shown_evaluation(found), found.standard)
     figures = {}
     for joint in model.row_names:
-        chart = friction_chart(found, joint, split=split)
+        chart = pictures.friction_chart(found, joint, split=split)
         if chart is None:
             is_driven = joint in model.joints and joint not in model.passive
             why = "no samples used" if is_driven else "no drive"
@@ -274,7 +247,7 @@ def friction_section(found: TorqueIdentification, worst: Sequence[str]) -> str:
     if more:
         title = f"{len(figures) - len(first)} more joints with smaller errors"
         more = folded("friction-more", title, f'<div class="plots small">\n{more}</div>\n')
-    name = escape(shown_evaluation(found).name)
+    name = escape(pictures.shown_evaluation(found).name)
     shown = "".join(figures[joint] for joint in first)
     return block("report.friction", log=name, figures=shown, more=more)
 
@@ -283,9 +256,9 @@ def residual_section(found: TorqueIdentification) -> str:
     """Return the spectrum of each joint's residual."""
     if found.model.is_static:
         return "<p>Static poses and slow segments have no spectrum.</p>\n"
-    evaluation, figures = shown_evaluation(found), ""
+    evaluation, figures = pictures.shown_evaluation(found), ""
     for row, joint in enumerate(found.model.row_names):
-        chart, name = spectrum_chart(found, evaluation, row), escape(joint)
+        chart, name = pictures.spectrum_chart(found, evaluation, row), escape(joint)
         caption = f"<strong>{name}</strong>"
         figures += chart_html(chart, caption) if chart else f"<p>{name}: no samples used.</p>\n"
     return block("report.residuals", name=escape(evaluation.name), figures=figures)
@@ -317,51 +290,6 @@ def _choice(drive: DriveChoice) -> str:
     ]
     tried_terms = listing(title, _TRIED, rows)
     return f"<details><summary>{escape(title)}</summary>{tried_terms}</details>\n"
-
-
-def information(found: Fit) -> tuple[Array, Array]:
-    """Return the correlation of base parameters, and the share of the data in each.
-
-    The correlation (b, b) is that of the errors of WLS if rows were independent; NaN for parameters
-    that are not identifiable. The share (b,), 0 to 1, is S^2 / (S^2 + s^2) with the prior standard
-    deviation S and the standard error s of WLS.
-    """
-    K = found.mapping.K
-    prior = np.einsum("bi,i,bi->b", K, found.prior_std**2, K)  # variances
-    error = np.diag(found.wls.covariance)
-    is_known = np.isfinite(error) & (error > 0)
-    bread = solve_factor(found.factors, found.wls.sigma, found.wls.theta).covariance
-    std = np.sqrt(np.where(is_known, np.diag(bread), np.nan))
-    share = np.where(np.isfinite(error), prior / (prior + error), 0.0)
-    return bread / np.outer(std, std), share
-
-
-def information_section(found: TorqueIdentification) -> str:
-    """Return the information in the data: shares of the data, correlations."""
-    (correlation, share), names = information(found), found.mapping.base_names
-    weak = [
-        {"name": names[i], "share": 100 * share[i]}
-        for i in np.argsort(share, kind="stable")
-        if share[i] < _KNOWN
-    ]
-    r = np.tril(np.where(np.isfinite(correlation), correlation, 0.0), -1)
-    count = int((np.abs(r) >= _STRONG).sum())
-    order = np.argsort(-np.abs(r), axis=None, kind="stable")[: min(count, _PAIRS)]
-    pairs = [
-        {"one": names[i], "other": names[j], "r": r[i, j]}
-        for i, j in zip(*np.unravel_index(order, r.shape), strict=True)
-    ]
-    title = f"The strongest of {count} correlations of {_STRONG:g} and more"
-    percents = np.round(100 * share).astype(int)
-    return block(
-        "report.information",
-        condition=f"{found.wls.condition:.3g}",
-        mean=f"{percents.mean():.0f}",
-        least=percents.min(),
-        weak=listing("Base parameters that the data determine by less than 99 %", _WEAK, weak),
-        pairs=listing(title, _CORRELATED, pairs)
-        or f"<p>No correlation is above {_STRONG:g}.</p>\n",
-    )
 
 
 def why_section(found: TorqueIdentification) -> str:
@@ -398,7 +326,7 @@ def _joint(torque: JointTorque, link: str, points: int, *, is_full: bool) -> str
     def drawn_chart(chart: Chart, caption: str) -> str:
         return chart_html(chart, caption, points=2 * len(chart.x))
 
-    charts = why_charts(torque, link=link, points=points)
+    charts = pictures.why_charts(torque, link=link, points=points)
     caption = "Torque components, stacked; shaded: samples not used"
     split = drawn_chart(charts.pop("split"), caption)
     significant = {d.name for d in torque.follows if d.is_significant}

@@ -25,7 +25,6 @@ from robotid.data.base_motion import BaseColumns, ImuFrame, quaternions_of_angle
 from robotid.data.files import bags
 from robotid.data.files.bags import _interpolated
 from robotid.data.files.read import read_log
-from robotid.data.files.table import Table
 from robotid.data.signal_settings import LogSource
 
 ODOMETRY, IMU = "nav_msgs/msg/Odometry", "sensor_msgs/msg/Imu"
@@ -325,28 +324,6 @@ def test_messages_of_a_sensor_are_sorted_by_their_stamps(monkeypatch):
         t, values = sensor.load(Path("x.mcap"), source)
         np.testing.assert_allclose(t, t_wanted, rtol=0, atol=1e-9)
         assert values.tolist() == [[x, 10 * x] for x in order]
-
-
-def test_the_last_command_before_each_message_is_held():
-    """Intervals of 0.1, 0.2 and 0.5 s; a command at the time of a message counts for it."""
-    t, sent = np.array([5.0, 5.1, 5.15, 5.4, 5.6, 6.0]), np.array([5.2, 5.1, 5.9, 5.4])
-    rows = {"time": t, "q_a": 10.0 * t, "tau_a": -t}
-    commands = {"time": sent, "qref_a": np.array([2.0, 1.0, 4.0, 3.0])}
-
-    def table(columns):
-        return Table(list(columns), lambda wanted: {name: columns[name] for name in wanted})
-
-    found = bags._with_commands(table(rows), table(commands), (t, np.sort(sent)), "goal")
-    assert found.names == ["time", "q_a", "tau_a", "qref_a"]
-    read = found.read(["time", "qref_a", "q_a"])
-    assert read["time"].tolist() == t[1:].tolist()
-    assert read["qref_a"].tolist() == [1.0, 1.0, 3.0, 3.0, 4.0]
-    assert read["q_a"].tolist() == (10.0 * t[1:]).tolist()
-    assert found.notes == (
-        "a zero-order hold is applied to the commands of topic 'goal', with a median interval of "
-        "200 ms; messages before the first command, left out: 1; messages after the last "
-        "command: 1",
-    )
 
 
 def test_a_field_of_a_controller_is_of_the_first_point_that_has_a_number():

@@ -10,14 +10,13 @@ from helpers.humans import FEET, human_urdf, logged, walk
 from robotid.data.base_motion import BaseMotion, base_state, in_base, quaternions_of_angles
 from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
-from robotid.data.signals import process
 from robotid.diagnosis.logs.base_pose import (
     check_pose,
     check_twist,
     check_unit,
 )
 from robotid.diagnosis.logs.contacts import check_base
-from robotid.robot.constraints import Contact, frame_id, link_positions
+from robotid.robot.constraints import Contact
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 
@@ -91,20 +90,6 @@ def test_another_vertical_axis_of_the_world_is_named(robot, log, axis, down):
     assert not list(check_base(stated, other, SLOW))
 
 
-def test_the_pose_of_another_link_is_that_of_the_root_first(robot, log):
-    data, head = robot.pin_model.createData(), frame_id(robot.pin_model, "Head")
-    poses = []
-    for q in robot.configurations(np.hstack([log.base.pose, log.q])):
-        pin.framesForwardKinematics(robot.pin_model, data, q)
-        leans = data.oMf[head].act(pin.SE3(pin.exp3(np.array([0.0, 0.0, 1.5])), np.zeros(3)))
-        poses.append(pin.SE3ToXYZQUAT(leans))
-    straight = [pin.SE3ToXYZQUAT(pin.XYZQUATToSE3(x) * UNTURNED) for x in poses]
-    stated = replace(log, base=BaseMotion(np.array(straight), link="Head"))
-    assert not list(check_base(robot, stated, SLOW))
-    other = replace(log, base=BaseMotion(np.array(poses), link="Head"))  # turned about its axis
-    assert [x.code for x in check_base(robot, other, SLOW)] == ["base_orientation"]
-
-
 def test_a_base_that_rolls_over_has_no_wrong_axes(robot, log):
     angle = np.pi * np.clip(log.t - log.t[-1] / 2 + 0.5, 0.0, 1.0)  # the whole world turns in 1 s
     turns = [pin.Quaternion(pin.exp3(np.array([x, 0.0, 0.0]))) for x in angle]
@@ -163,77 +148,9 @@ def test_an_impact_is_no_jump(log):
     assert found.code == "base_jump"
 
 
-def test_a_turn_of_the_tag_is_found_and_one_in_a_gap_is_not(log):
-    half = np.array([0.0, 0.0, np.sin(0.1), np.cos(0.1)])  # 0.2 rad about z
-
-    def turned(q):
-        x, y, z, w = q.T
-        a, b = half[2], half[3]
-        later = np.column_stack([b * x - a * y, b * y + a * x, b * z + a * w, b * w - a * z])
-        return np.where(np.arange(len(q))[:, None] < 150, q, later)
-
-    jumped = with_quaternion(log, turned)
-    (found,) = check_pose(jumped)
-    assert found.evidence["size"] == pytest.approx(0.2, abs=0.02)
-    assert " rad: " in found.message
-    apart = np.where(np.arange(len(log.t)) < 150, log.t, log.t + 5.0)
-    assert not list(check_pose(replace(jumped, t=apart)))
-    after = log.base.pose.copy()
-    after[150, 0] += 0.05
-    after[151:, 0] -= 0.1  # the step after a gap has no step before it
-    assert list(check_pose(replace(log, base=BaseMotion(after))))
-    assert not list(check_pose(replace(log, t=apart, base=BaseMotion(after))))
-
-
 Y_UP = pin.rpy.rpyToMatrix(-np.pi / 2, 0.0, 0.0)  # z becomes y
 QUARTER = pin.rpy.rpyToMatrix(0.0, 0.0, np.pi / 2)
 MIRROR = np.eye(3)[[0, 2, 1]]  # y and z exchanged: left-handed
-
-
-@pytest.mark.parametrize(
-    ("place", "turn", "words"),
-    [
-        (Y_UP, lambda R: R, ["replace base_x, base_y, base_z by base_x, -base_z, base_y"]),
-        (np.diag([1.0, -1.0, 1.0]), lambda R: R, ["by base_x, -base_y, base_z"]),
-        (np.eye(3), lambda R: R @ QUARTER.T,
-         ["base in the log are -y, x, z of its link: add a link with these axes"]),
-        (Y_UP, lambda R: Y_UP @ R @ Y_UP.T,
-         ["are x, z, -y of its link", "state gravity = [0, -9.81, 0]"]),
-        (MIRROR, lambda R: MIRROR @ R @ MIRROR,
-         ["are x, z, y of its link, left-handed", "state gravity = [0, -9.81, 0]"]),
-    ],
-)  # fmt: skip
-def test_axes_of_another_tool_are_named(robot, log, place, turn, words):
-    pose = log.base.pose.copy()
-    pose[:, :3] = pose[:, :3] @ place.T
-    pose[:, 3:] = [pin.Quaternion(turn(pin.Quaternion(x).matrix())).coeffs() for x in pose[:, 3:]]
-    (found,) = check_base(robot, replace(log, base=BaseMotion(pose)), SLOW)
-    assert (found.code, found.severity) == ("base_orientation", "error")
-    assert all(text in found.message for text in words)
-    assert ("gravity" in found.message) == (len(words) == 2)
-    assert found.evidence["best"] < 0.1 < 2.0 * found.evidence["speed"]
-
-
-def test_contacts_need_not_be_known_to_name_another_order(robot, log):
-    unknown = replace(log, contacts={})  # not found either: the log has no torque
-    assert not list(check_base(robot, unknown, SLOW))
-    (found,) = check_base(robot, with_quaternion(unknown, lambda q: np.roll(q, 1, axis=1)), SLOW)
-    assert "its order is qw qx qy qz: state" in found.message
-
-
-def test_the_speed_of_feet_is_the_mean_of_the_slower_one(robot, log):
-    """With the inverse quaternion, by finite differences of the places of the feet."""
-    wrong = with_quaternion(log, lambda q: q * [-1.0, -1.0, -1.0, 1.0])
-    (found,) = check_base(robot, wrong, SLOW)
-    speeds = []
-    for own in (wrong, log):
-        motion = process(own, replace(SLOW, velocity="differentiated"))
-        feet = link_positions(robot.pin_model, robot.configurations(motion.q), FEET)
-        v = np.linalg.norm(np.gradient(feet, motion.t, axis=0), axis=2)
-        speeds.append(v.min(axis=1).mean())
-    assert [found.evidence[x] for x in ("speed", "best")] == pytest.approx(speeds, rel=0.02)
-    low, high = sorted(f"{x:.2g} m/s" for x in speeds)
-    assert f"move at {high} (mean) below the base, else at {low} below it" in found.message
 
 
 def test_inverted_flags_are_no_error_of_the_pose(robot, log):

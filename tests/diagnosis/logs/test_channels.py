@@ -9,8 +9,7 @@ import pytest
 from robotid.cli.job import LogEntry, read_job
 from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
-from robotid.diagnosis.logs.channels import check_channels
-from robotid.diagnosis.logs.torque_channels import check_torque_channels
+from robotid.diagnosis.logs.channels import check_channels, check_torque_channels
 
 RATE, N = 500.0, 20000  # [Hz], rows of 40 s
 JOB = Path(__file__).parents[2] / "jobs" / "ur10e.toml"

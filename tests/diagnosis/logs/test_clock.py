@@ -1,13 +1,11 @@
 """Figures of a log's clock, of its rows and of its rests, against logs made of them."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from helpers.findings import Figures
 
 from robotid.data.log import Log, Trajectory
-from robotid.diagnosis.logs.clock import check_clock, check_rest
+from robotid.diagnosis.logs.channels import check_clock, check_rest
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 
@@ -98,14 +96,6 @@ def test_rows_that_are_stamped_on_arrival_are_named_with_their_remedy():
     assert missing.message.endswith("are wrong; log the time of recording")
 
 
-def test_rows_that_were_recorded_together_have_no_finding():
-    t = bunched()
-    log = log_of(t)
-    q = np.column_stack([np.sin(2.0 * t), 0.5 * np.cos(1.5 * t)])  # as the stamps say
-    assert "bunched_stamps" not in said(check_clock(replace(log, q=q)))
-    assert "bunched_stamps" not in said(check_clock(replace(log, q=0.0 * q)))
-
-
 def test_rows_that_repeat_the_one_before_are_counted_where_the_robot_moves():
     def stale(count):
         log, rows = log_of(START + 0.01 * np.arange(count)), np.arange(count)
@@ -118,17 +108,6 @@ def test_rows_that_repeat_the_one_before_are_counted_where_the_robot_moves():
     assert Figures(found) == {"rows": 4, "share": pytest.approx(4 / 79), "longest_run": 3}
     assert ": 4 rows (5.1 %) repeat" in found.message
     assert stale(80).severity == "note"  # a twentieth is not more than a twentieth
-
-
-def test_the_longest_run_of_repeated_rows_is_one_in_motion():
-    log, rows = log_of(START + 0.01 * np.arange(79)), np.arange(79)
-    rows[5:15], rows[61:64] = 4, 60  # at rest before and after it, and in motion
-    held = {name: getattr(log, name)[rows].copy() for name in ("q", "v", "tau")}
-    for at in (slice(0, 5), slice(15, 20)):
-        held["q"][at] = held["q"][5]
-    held["tau"][[*range(5), *range(15, 20)]] += np.arange(10.0)[:, None]
-    found = said(check_clock(Log(log.t, joints=log.joints, **held)))["stale_rows"]
-    assert (found.evidence["rows"], found.evidence["longest_run"]) == (3, 3)
 
 
 def test_a_position_that_is_held_between_steps_is_not_stale():

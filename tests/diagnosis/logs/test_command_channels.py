@@ -11,11 +11,8 @@ from helpers.findings import Figures
 from helpers.servos import Servo, chirps, record
 
 from robotid.base.exceptions import DataError
-from robotid.cli import main
-from robotid.data.files.formats import write_columns
-from robotid.data.files.read import read_log, write_log
-from robotid.data.log import Log
-from robotid.data.signal_settings import LogSource, SignalSettings
+from robotid.data.files.read import read_log
+from robotid.data.signal_settings import LogSource
 from robotid.diagnosis.logs.check_logs import check_logs
 from robotid.diagnosis.logs.command_channels import check_commands
 from robotid.robot.examples import example_urdf
@@ -81,24 +78,6 @@ def test_steps_and_pseudo_random_commands_are_fine(seed):
     assert found(record(commands, GOOD, rate=100.0)) == {}
 
 
-def test_a_log_without_commands_shows_nothing():
-    t = np.arange(100) / 100
-    log = Log(t, np.zeros((100, 1)), np.zeros((100, 1)), ("a",))
-    assert list(check_commands(log)) == []
-    (note,) = check_commands(replace(log, has_torque=False))
-    assert "neither torques nor commands" in note.message
-
-
-def test_a_gap_and_a_joint_that_is_told_to_stand_are_no_fault(log):
-    kept = (log.t < 5.0) | (log.t > 7.0)
-    cut = {name: getattr(log, name)[kept] for name in ("t", "q", "tau", "q_ref")}
-    assert found(replace(log, **cut)) == {}
-    still = np.column_stack([log.q_ref[:, 0], np.zeros(len(log.t))])
-    noisy = 1e-4 * np.random.default_rng(0).standard_normal(len(log.t))
-    q = np.column_stack([log.q[:, 0], noisy])
-    assert found(replace(log, q=q, q_ref=still)) == {}
-
-
 # --- each fault by its own code -------------------------------------------------------------------
 
 
@@ -111,16 +90,6 @@ def test_a_chirp_below_the_bandwidth_does_not_tell_the_delay(fastest):
     assert finding.evidence["longest"] - finding.evidence["shortest"] > 0.02
     assert 0.08 < finding.evidence["longest"] < 0.11  # the lag: no delay is longer
     assert fastest <= finding.evidence["frequency"] < 2 * fastest + 0.5
-
-
-def test_one_slow_joint_is_named():
-    told = chirps([0.3, 0.3], 8.0)
-    slow = found(record(lambda t: told(t) * [1, 0] + waves([0, 0.3], [0, 3.0])(t), GOOD))
-    assert list(slow) == ["slow_command"]
-    assert slow["slow_command"].where == "log: joint_1"
-    assert "the command of joint_1 is too slow to identify the delay: " in (
-        slow["slow_command"].message
-    )
 
 
 @pytest.mark.parametrize(
@@ -281,41 +250,6 @@ def of_ur5(ur5):
     return replace(log, joints=ur5.joints)
 
 
-def test_a_log_without_torque_is_examined(ur5, of_ur5, tmp_path, capsys):
-    log = of_ur5
-    findings = check_logs(ur5, log, validation=log)
-    assert {f.code for f in findings if f.severity != "note"} == {"repeated_motion"}
-    assert {"no_torque", "rate", "noise"} <= {f.code for f in findings}
-    assert not any("tau" in f.message for f in findings)
-    write_log(log, tmp_path / "run.csv")
-    assert (
-        main(
-            ["doctor", str(example_urdf("ur5_robot.urdf")), str(tmp_path / "run.csv"), "--verbose"]
-        )
-        == 0
-    )
-    assert "no_torque: run.csv: the log has no torque" in " ".join(capsys.readouterr().out.split())
-
-
-def test_what_is_in_the_file_is_examined(ur5, of_ur5, tmp_path):
-    log = of_ur5
-    table = {"time": log.t}
-    for kind, values in (("q", log.q), ("qref", log.q_ref), ("tau", 5 * log.q)):
-        table |= {f"{kind}_{joint}": values[:, j] for j, joint in enumerate(log.joints)}
-    for gone, needed in (("qref_", "torque"), ("tau_", "commands"), ("none", "both")):
-        path = tmp_path / f"{needed}.parquet"
-        write_columns({n: x for n, x in table.items() if not n.startswith(gone)}, path)
-        read = read_log(path, log.joints, needs="any")
-        assert read.has_torque == (needed != "commands")
-        assert (read.q_ref is None) == (needed == "torque")
-    half = dict(list(table.items())[:9])  # two joints have a command, none a torque
-    write_columns(half, tmp_path / "half.parquet")
-    with pytest.raises(DataError, match=r"no columns 'qref_elbow_joint', 'qref_wrist_1_joint'"):
-        read_log(tmp_path / "half.parquet", log.joints, needs="any")
-    with pytest.raises(DataError, match="has no torque"):
-        check_logs(ur5, replace(log, q_ref=None))
-
-
 def test_sizes_of_loads_taken_for_torques_are_an_error(ur5, of_ur5):
     rng = np.random.default_rng(0)
     log = of_ur5
@@ -339,13 +273,3 @@ def test_loads_of_a_servo_arm_mapped_to_torques_are_an_error():
     log = read_log(path, model.joints, source=source, columns=loads)
     errors = {f.code for f in check_logs(model, log) if f.severity == "error"}
     assert errors == {"unsigned_torque", "velocity_scale"}  # the jaw's dq is its motor's
-
-
-def test_velocities_of_a_log_without_torque_are_judged_without_it(ur5, of_ur5):
-    log = of_ur5
-    v = np.gradient(log.q, log.t, axis=0)
-    scaled = replace(log, v=v * [1, 1, 1, 1, 1, 2.3])
-    for velocity, severity in (("auto", "warning"), ("measured", "error")):
-        findings = check_logs(ur5, scaled, signals=SignalSettings(velocity=velocity))
-        (finding,) = [f for f in findings if f.code == "velocity_scale"]
-        assert finding.severity == severity

@@ -5,20 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from helpers.findings import Figures
-from helpers.paths import ROOT
-from helpers.synthetic import exact_log, truth
 
 from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
-from robotid.data.signals import process
-from robotid.diagnosis.logs.channels import check_channels
-from robotid.diagnosis.logs.clock import check_clock
-from robotid.diagnosis.logs.motion_checks import check_excitation
-from robotid.diagnosis.logs.torque_channels import check_torque_channels
-from robotid.diagnosis.urdf.inertials import impossible_inertial
-from robotid.dynamics.base_parameters import structural_mapping
-from robotid.robot.model import RobotModel
-from robotid.robot.tree import Inertial
+from robotid.diagnosis.logs.channels import check_channels, check_clock, check_torque_channels
 
 T = 3.0 + np.arange(2000) / 100
 
@@ -85,41 +75,6 @@ def test_clocks_that_were_set_are_told_from_gaps():
     assert rate.evidence["samples"] == 1900
     assert rate.evidence["rate"] == pytest.approx(100.0)
     assert rate.evidence["duration"] == pytest.approx(19.99 + 10.0)
-
-
-def test_impossible_inertias_are_told_with_their_moments():
-    def found(*inertia, mass=2.0):
-        return list(impossible_inertial("arm", Inertial(mass, (0, 0, 0), (0, 0, 0), inertia), True))
-
-    [broken] = found(4.0, 0.0, 0.0, 1.0, 0.0, 2.5)
-    assert broken.severity == "error"
-    assert Figures(broken) == pytest.approx(
-        {"smallest": 1.0, "middle": 2.5, "largest": 4.0, "triangle": -0.5}
-    )
-    assert "the sum of the two smaller ones is 3.5, wanted more than 4" in broken.message
-    [negative] = found(1.0, 2.0, 0.0, 1.0, 0.0, 2.5)  # -1, 2.5, 3
-    assert "moments of inertia -1, 2.5, 3 kg m^2 are not all positive" in negative.message
-    assert "(-1 is not)" in negative.message
-    assert negative.evidence["triangle"] == pytest.approx(-1.5)
-    [flat] = found(3.0, 0.0, 0.0, 1.0, 0.0, 2.0)
-    assert flat.severity == "note"
-    assert found(3.0, 0.0, 0.0, 1.5, 0.0, 2.0) == []
-    zero, _ = found(4.0, 0.0, 0.0, 1.0, 0.0, 2.5, mass=0.0)
-    assert (zero.code, zero.severity) == ("zero_mass", "warning")
-    assert found(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, mass=0.0)[1:] == []
-
-
-def test_what_a_motion_determines_is_the_same_of_its_halves():
-    model = RobotModel.from_urdf(ROOT / "urdf" / "planar_2r.urdf")
-    rng = np.random.default_rng(1)
-    log = exact_log(model, truth(model), rng, samples=900, rate=100.0, noise=[0.2, 0.05])
-    signals = SignalSettings(cutoff=None, trim=0.0, min_velocity=0.0)
-    motion, mapping = process(log, signals), structural_mapping(model)
-    parts = [motion.part(0, 300), motion.part(300, 900)]
-    [whole], [cut] = (check_excitation(model, mapping, m, signals, "x") for m in ([motion], parts))
-    assert cut.evidence == pytest.approx(whole.evidence, rel=1e-9)
-    assert cut.message == whole.message
-    assert 0 < whole.evidence["weakest"] < 1
 
 
 def test_a_torque_is_clipped_at_either_limit_and_held_by_groups():

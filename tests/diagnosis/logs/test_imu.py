@@ -5,9 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.paths import JOBS
 
-from robotid.cli.job import read_job
 from robotid.data.base_motion import (
     BaseMotion,
     ImuFrame,
@@ -17,7 +15,7 @@ from robotid.data.base_motion import (
     quaternions_of_angles,
 )
 from robotid.data.log import Log
-from robotid.data.signal_settings import BaseSource, SignalSettings
+from robotid.data.signal_settings import SignalSettings
 from robotid.diagnosis.logs.contacts import check_base
 from robotid.dynamics.constraint_rows import constraint_jacobian
 from robotid.robot.constraints import link_positions
@@ -118,19 +116,6 @@ def test_the_axes_of_a_turned_imu_are_named(robot, sway):
     assert found.evidence["off"] > 0.5
 
 
-def test_gravity_that_was_subtracted_is_named(robot, sway):
-    def subtracted(values, share=1.0):
-        up = in_base(sway.base.pose[:, 3:], -G) @ TURN
-        return np.hstack([values[:, :3], values[:, 3:] - share * up])
-
-    (found,) = check_base(robot, measured(sway, subtracted), RAW)
-    assert found.code == "imu_gravity"
-    assert "gravity was subtracted" in found.message
-    assert found.evidence["size"] < 0.5
-    (found,) = check_base(robot, measured(sway, lambda x: subtracted(x, 0.6)), RAW)
-    assert "gravity was subtracted" in found.message  # what is left is below half of it
-
-
 def test_axes_of_imu_and_orientation_that_are_turned_alike_are_found_by_the_legs(robot, sway):
     turn = pin.rpy.rpyToMatrix(0.0, 0.0, np.pi / 2)  # orientation and values agree
     log = without_position(sway, turn)
@@ -140,40 +125,6 @@ def test_axes_of_imu_and_orientation_that_are_turned_alike_are_found_by_the_legs
     (found,) = [x for x in check_base(robot, log, RAW) if x.code.startswith("imu")]
     assert found.code == "imu_axes"
     assert "does not agree with that from the links in contact" in found.message
-
-
-def test_the_imu_of_a_standing_humanoid(recordings, monkeypatch):
-    monkeypatch.setenv("ROBOTID_DATA", str(recordings))
-    job = read_job(JOBS / "legged" / "icub.toml")
-    names = {"w": "gyro", "a": "acc"}
-    own = {f"imu_{k}{x}": f"imu_{name}_{x}" for k, name in names.items() for x in "xyz"}
-    for link, codes in (("root_link_imu_frame", []), ("root_link", ["imu_gravity"])):
-        other = replace(job, columns={**job.columns, **own}, base=BaseSource(imu=link))
-        model = other.model()
-        log = other.read(other.identification[0], model)
-        assert "bias of the gyroscopes, estimated in" in log.notes[-1]
-        found = check_base(model, log, job.signals)
-        assert [x.code for x in found if x.severity != "note"] == codes
-
-
-def test_what_other_axes_leave_is_stated_as_a_share_of_the_motion(robot, sway):
-    rng = np.random.default_rng(0)
-    noise = 0.15 * np.std(sway.base.imu.values[:, :3]) * rng.standard_normal((len(sway.t), 3))
-
-    def changed(x):
-        return np.hstack([x[:, [1, 0, 2]] * [1, -1, 1] + noise, x[:, 3:]])
-
-    found = next(x for x in check_base(robot, measured(sway, changed), RAW) if x.code == "imu_axes")
-    right, wrong = sway.base.imu.values[:, :3], measured(sway, changed).base.imu.values[:, :3]
-
-    def rms(x):
-        return np.sqrt(np.mean(np.sum(x**2, axis=1)))
-
-    off, best = rms(wrong - right) / rms(right), rms(noise) / rms(right)
-    assert found.evidence["off"] == pytest.approx(off, rel=0.03)
-    assert found.evidence["best"] == pytest.approx(best, rel=0.1)
-    shown = f"{found.evidence['off']:.0%} of the motion, {found.evidence['best']:.0%} at best"
-    assert shown in found.message
 
 
 def test_the_mean_specific_force_in_the_world_is_stated_for_a_robot_that_drives_a_curve():

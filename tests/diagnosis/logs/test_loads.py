@@ -6,11 +6,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from helpers.corruptions import clean_log, robot
-from scipy.optimize import nnls
 
 from robotid.data.signal_settings import SignalSettings
 from robotid.diagnosis.logs.check_logs import diagnose
-from robotid.diagnosis.logs.hypotheses import explanations, own_share
+from robotid.diagnosis.logs.hypotheses import explanations
 from robotid.diagnosis.logs.loads import load_model
 from robotid.diagnosis.logs.torque_sample import smooth_motion, take_probe
 from robotid.dynamics.torque import joint_torque_regressor
@@ -118,38 +117,6 @@ def test_a_balanced_joint_may_follow_its_position_either_way_and_no_other(ur5, u
         np.testing.assert_allclose(drives[:, j, 5:], wave if j in (1, 3) else 0.0 * wave)
     np.testing.assert_array_equal(drives[:, :, 0], probe.a)
     np.testing.assert_array_equal(drives[:, :, 3:5], [[[1.0, -1.0]]] * np.ones((*c.shape, 1)))
-
-
-def test_a_share_with_any_load_is_that_of_factors_of_either_sign_for_its_moments(ur5, ur5_log):
-    probe = take_probe(ur5, smooth_motion(ur5, ur5_log, SIGNALS), samples=120)
-    last = np.array([-0.4, 0.3, 0.2])  # of first moments, beside 2 kg
-    extra = probe.last_body @ np.array([2.0, *last])
-    probe = replace(probe, tau=probe.tau + extra)
-    found, plain = own_share(probe, any_load=True), own_share(probe)
-    for j in range(6):
-        body = probe.last_body[:, j]
-        X = np.hstack([probe.loads()[:, j], body, -body[:, 1:], probe.drives[:, j]])
-        size = np.linalg.norm(X, axis=0)
-        left = nnls(X / np.where(size > 0, size, 1.0), probe.tau[:, j])[1] ** 2
-        wanted = left / np.sum((probe.tau[:, j] - probe.tau[:, j].mean()) ** 2)
-        assert found[j] == pytest.approx(wanted, rel=1e-5, abs=1e-9)
-    assert plain[1] > 1.5 * found[1]
-
-
-def test_what_a_load_model_expects_is_of_the_torques_that_it_uses(ur5, ur5_log):
-    """Of 4 s there are 12 instants; one torque is not explained, one never changes."""
-    motion = smooth_motion(ur5, ur5_log.window(1.0, 5.6), SIGNALS)
-    probe = take_probe(ur5, motion, samples=80)
-    probe.tau[:, 4] = 3.0
-    share = np.array([0.02, 0.3, 0.1, 0.04, 0.01, 0.06])
-    model = load_model(probe, share)
-    instants = 3.0 * np.ptp(motion.t[probe.rows])
-    assert instants < 15.0
-    used = [0, 2, 3, 5]
-    wanted = instants * np.sum(share[used] / (0.05**2 + share[used]))
-    assert model.expected == pytest.approx(wanted)
-    assert model.independent == pytest.approx(4 * instants)
-    assert model.R.any(axis=(1, 2)).tolist() == [j in used for j in range(6)]
 
 
 @dataclass(frozen=True)

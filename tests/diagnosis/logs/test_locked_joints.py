@@ -11,7 +11,7 @@ from robotid.cli.job import Job, LogEntry
 from robotid.cli.logs import examine
 from robotid.data.files.read import read_log, write_log
 from robotid.data.signal_settings import LogUnits
-from robotid.diagnosis.logs.locked_joints import check_locked, percent_hint
+from robotid.diagnosis.logs.motion_checks import check_locked, percent_hint
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
 from robotid.robot.drives import DRIVE_TERMS
 from robotid.robot.examples import example_urdf
@@ -48,14 +48,6 @@ def found(job):
     return [f for f in examine(job) if f.code == "locked_position"]
 
 
-@pytest.mark.parametrize("stated", [HELD, "*"])
-def test_a_joint_that_stands_elsewhere_is_named_with_its_position(job, stated):
-    (finding,) = found(replace(job(None), locked={stated: 0.5}))
-    assert (finding.severity, finding.where) == ("error", f"run.csv: {HELD}")
-    assert "wrist_3_joint is locked at 0.5 rad but is at 0.7 rad in the log" in finding.message
-    assert f"state locked = {{ {HELD} = 0.7 }}" in finding.message
-
-
 def test_a_joint_that_nobody_placed_is_locked_where_the_logs_have_it(job, tmp_path):
     unplaced = job(None, estimator=EstimatorSettings("wls"))
     log = read_log(tmp_path / "run.csv", (*unplaced.model().joints, HELD))
@@ -71,14 +63,6 @@ def test_a_joint_that_nobody_placed_is_locked_where_the_logs_have_it(job, tmp_pa
     assert (note.severity, note.where) == ("note", HELD)
     assert "wrist_3_joint = 0.7" in note.message
     assert "locked_at_zero" not in {f.code for f in identification.findings}
-
-
-def test_a_mimic_joint_is_placed_with_its_leader(job):
-    arm = [f"panda_joint{i}" for i in range(1, 8)]
-    finger = {"panda_finger_joint1": 0.03}
-    panda = replace(job(None), urdf=example_urdf("panda.urdf"), joints=arm, locked=finger)
-    assert panda.placed(panda.model()) == ("panda_finger_joint1", "panda_finger_joint2")
-    assert replace(panda, locked={}).placed(panda.model()) == ()
 
 
 def test_logs_that_disagree_of_a_joint_place_it_nowhere(job, tmp_path):
@@ -114,11 +98,6 @@ def test_positions_and_ranges_have_the_unit_of_their_joint():
 
 def test_a_joint_that_stands_where_it_is_said_to_is_not_named(job):
     assert found(job(0.7)) == []
-
-
-def test_degrees_of_the_log_are_degrees_here(job):
-    (finding,) = found(job(0.7, units=LogUnits(angle="deg")))
-    assert finding.evidence["median"] == pytest.approx(np.deg2rad(0.7))
 
 
 def hint(position, name="gripper", **units):

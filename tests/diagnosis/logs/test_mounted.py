@@ -9,14 +9,10 @@ from helpers.synthetic import perfect
 
 from robotid.data.signal_settings import SignalSettings
 from robotid.diagnosis.logs.check_logs import diagnose
-from robotid.diagnosis.logs.mounted import Segments
-from robotid.diagnosis.logs.torque_sample import smooth_motion
-from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.simulation.motions import random_fourier
 from robotid.dynamics.simulation.simulation_settings import Sensors
 from robotid.dynamics.simulation.truth import another_robot
 from robotid.robot.bodies import link_places
-from robotid.robot.drives import FAMILIES
 
 CODES = {"unmounted_part", "payload_change", "payload"}
 
@@ -90,21 +86,6 @@ def arm_and_log():
     return model, *(clean_log(model, seed, pi=pi, rate=50.0, duration=10.0) for seed in (0, 1))
 
 
-def test_joints_with_friction_of_their_own_are_examined_like_others(arm_and_log):
-    model, fitted, other = arm_and_log
-    own = model.with_terms({joint: FAMILIES["load"].make({}) for joint in model.joints})
-    found = [diagnose(m, [fitted], [other], SignalSettings()) for m in (model, own)]
-    assert found[0] == found[1]
-
-
-def test_each_validation_log_is_compared_with_the_fitted_ones(arm_and_log):
-    model, fitted, other = arm_and_log
-    late = replace(other, path="late", tau=np.roll(other.tau, 5, axis=0))
-    alone = [diagnose(model, [fitted], [log], SignalSettings()) for log in (other, late)]
-    both = diagnose(model, [fitted], [other, late], SignalSettings())
-    assert set(map(str, both)) == {str(finding) for found in alone for finding in found}
-
-
 def test_a_load_is_named_beside_a_urdf_of_another_robot(arm_and_log):
     """Links that weigh half or twice what the URDF says are no reason to miss a load."""
     model, *_ = arm_and_log
@@ -121,20 +102,3 @@ def test_a_load_is_named_beside_a_urdf_of_another_robot(arm_and_log):
     mass, error = change.evidence["mass"], change.evidence["std_error"]
     assert mass == pytest.approx(1.0, abs=4 * error)
     assert error < 0.05
-
-
-def test_segments_are_of_all_motions(ur5):
-    motions = [
-        smooth_motion(ur5, clean_log(ur5, seed, duration=duration), SignalSettings())
-        for seed, duration in ((0, 7.0), (1, 12.0))
-    ]
-    segments = Segments(ur5, structural_mapping(ur5), motions, 0.0)
-    assert segments.seconds == pytest.approx(sum(m.t[-1] - m.t[0] for m in motions))
-    alone = [replace(segments, motions=[motion]).reductions for motion in motions]
-    assert len(segments.reductions) == len(alone[0]) + len(alone[1])
-    # of 0.4 s, at most 24
-    assert [len(parts) for parts in alone] == [int(np.ptp(motions[0].t) / 0.4), 24]
-    rows = [sum(part.samples for part in parts) for parts in (segments.reductions, *alone)]
-    assert rows[0] == rows[1] + rows[2]
-    squares = sum(part.squares for part in segments.reductions)
-    np.testing.assert_allclose(squares, sum(motion.squares for motion in motions), rtol=1e-9)

@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.fitting import identify
 from helpers.misfits import EFFECTS, log_with
 from helpers.paths import ROOT
 
@@ -14,13 +13,13 @@ from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
 from robotid.diagnosis.residual.discrepancies import explain_residual
 from robotid.diagnosis.residual.misfit import find_misfits
-from robotid.diagnosis.residual.term_trials import Trials, along, take_sample
+from robotid.diagnosis.residual.term_trials import take_sample
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
 from robotid.estimation.fitting.recorded import Recordings
 from robotid.estimation.fitting.survey import hold_log
 from robotid.identification.pipeline import with_drives
-from robotid.robot.drives import AUTO, wanted_families
+from robotid.robot.drives import wanted_families
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 
@@ -149,15 +148,6 @@ def named(findings):
     return [(finding.code, finding.where) for finding in findings]
 
 
-def test_a_zero_that_is_off_makes_no_spring_of_another_joint():
-    joints = [f"panda_joint{i}" for i in range(1, 8)]
-    panda = RobotModel.from_urdf(example_urdf("panda.urdf"), joints=joints)
-    alone, misfits, others = both(panda, panda, 2, 1, 0.15)
-    assert [(m.joint, m.term.code, m.matters) for m in alone] == [("panda_joint3", "spring", True)]
-    assert misfits == ()
-    assert named(others) == [("position_offset", "panda_joint2")]
-
-
 @pytest.mark.parametrize(
     ("offset", "size", "rate"), [(0.1, 1.0, 50.0), (0.03, 3.0, 100.0)]
 )  # what explains more
@@ -168,29 +158,6 @@ def test_a_spring_is_named_beside_a_zero_that_is_off(model, offset, size, rate):
     assert spring.size == pytest.approx(alone[0].size, rel=0.01)
     assert named(others) == [("position_offset", "elbow_joint")]
     assert others[0].evidence["size"] == pytest.approx(-offset, rel=0.04)
-
-
-def test_what_is_found_is_said_of_the_result_and_doubts_it(model):
-    logs = recorded(model, model, 3, 2, 0.1, effect="spring", rate=50.0)
-    result = identify(model, logs[:1], validation=logs[1:], estimator=SETTINGS, friction=AUTO)
-    said = [(f.code, f.where) for f in result.findings if f.severity == "warning"]
-    assert {("spring", "elbow_joint"), ("position_offset", "elbow_joint")} <= set(said)
-    assert [(m.joint, m.term.code) for m in result.misfits] == [("elbow_joint", "spring")]
-    assert {"spring", "position_offset"} <= {doubt.code for doubt in result.warnings}
-
-
-def test_columns_beside_the_base_parameters_are_refitted_with_them(four, rng):
-    found = fitted(four, [log_with(four, 3, "spring", part=part, duration=12.0) for part in (0, 1)])
-    sample = take_sample(found)
-    Z = rng.standard_normal((*sample.r.shape, 2)) + sample.r[..., None]
-    together, _ = Trials(sample, Z).whole.estimate([0, 1], sample.fitted)
-    beside = sample.with_columns(Z[..., :1])
-    alone, _ = Trials(beside, Z[..., 1:]).whole.estimate([0], sample.fitted)
-    assert alone[0] == pytest.approx(together[1], rel=2e-3)
-    tau = np.concatenate([m.tau for m in sample.at])
-    there = along(beside, found.model, sample.at, tau)
-    np.testing.assert_allclose(there.W, beside.W, atol=1e-9 * np.abs(beside.W).max())
-    assert not there.r.any()
 
 
 def test_a_base_that_is_not_level_makes_no_counterbalance(model):
@@ -220,15 +187,6 @@ def test_a_joint_that_lies_elsewhere_is_named(model, tmp_path):
     first = found(model, lambda log: log, robot=path)[0]
     assert (first.code, first.where) == ("joint_origin", "elbow_joint")
     assert first.evidence["size"] == pytest.approx(0.05, rel=0.25)
-
-
-def test_a_base_that_is_not_level_is_named(four):
-    turn = pin.exp3(np.array([0.15, 0.0, 0.0]))
-    first = found(four, lambda log: log, turn=turn)[0]
-    assert (first.code, first.where) == ("gravity", "all joints")
-    assert first.evidence["size"] == pytest.approx(np.tan(0.15), rel=0.03)
-    stated = [float(x) for x in first.message.split("gravity = [")[1].split("]")[0].split(",")]
-    np.testing.assert_allclose(stated, turn @ [0.0, 0.0, -9.81], atol=0.15)
 
 
 def test_a_small_share_of_the_residual_is_named_if_recordings_kept_apart_show_it(model):

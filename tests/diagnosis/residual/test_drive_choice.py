@@ -1,6 +1,5 @@
 """Friction that the drives of a known robot have is chosen, sized and guarded; no other is."""
 
-import pickle
 import re
 from functools import cache, partial
 
@@ -9,40 +8,25 @@ import pytest
 from helpers import driven as helper
 from helpers.driven import (
     ELBOW,
-    EXACT,
     JOINTS,
     LIFT,
-    WRIST,
     arm,
     driven,
     driven_log,
 )
 
 from robotid.base.exceptions import SettingsError
-from robotid.cli.job import job_from_settings
-from robotid.cli.logs import survey_logs
-from robotid.data.files.read import write_log
-from robotid.data.signals import process
 from robotid.diagnosis.residual.drive_choice import choose_drives
 from robotid.diagnosis.verdict.parameter_table import parameter_entries
-from robotid.dynamics.base_parameters import structural_mapping
-from robotid.dynamics.prediction import predict, remember
-from robotid.estimation.fitting.estimator_settings import EstimatorSettings
-from robotid.estimation.fitting.fitted import (
-    friction_curve,
-)
-from robotid.estimation.fitting.recorded import Recordings
-from robotid.identification.pipeline import identify, with_drives
-from robotid.output.files.urdf import load_identified, write_urdf
+from robotid.estimation.fitting.fitted import friction_curve
+from robotid.robot.drive_term import DriveMotion
 from robotid.robot.drives import (
     AUTO,
     FAMILIES,
-    DriveMotion,
     Harmonic,
     LoadFriction,
     Stribeck,
     Tanh,
-    wanted_families,
 )
 
 found_in, fitted_in = (partial(f, estimator="wls") for f in (helper.found_in, helper.fitted_in))
@@ -255,132 +239,6 @@ def test_harmonics_are_for_joints_that_turn_far_enough(plain):
         fitted_in(plain, [log], friction={ELBOW: "harmonics4"})
 
 
-def test_a_shape_beyond_its_bounds_is_named(plain):
-    sizes = FAMILIES["tanh"].shapes[0].within(SEEN)
-    (term,) = FAMILIES["tanh"].make(SEEN, 1.8 * sizes[1])
-    true, pi = driven(plain, {ELBOW: [term]}, {f"{ELBOW}.tanh": 12.0})
-    log = driven_log(true, pi, SEED, reach=QUANTILE)
-    found = found_in(plain, [log], friction={ELBOW: "tanh", "*": "none"})
-    ((shape,),) = (choice.shapes for choice in found.drives)
-    assert shape.is_at_bound
-    assert shape.value == pytest.approx(sizes[1], rel=0.02)
-    (said,) = [f for f in found.findings if f.code == "shape_at_bound"]
-    assert said.where == ELBOW
-    assert f"elbow_joint: tanh.speed is {shape.value:.3g} rad/s, the bound" in said.message
-
-
-def test_validation_beyond_what_was_seen_is_named_and_has_no_say(plain, cases, chosen_in):
-    true, pi, log = cases("stribeck")
-    alone = chosen_in("stribeck")
-    fast = driven_log(true, pi, 8, reach=QUANTILE, speed=1.8)
-    found = found_in(plain, [log], validation=[fast])
-    assert chosen(found) == chosen(alone) == {ELBOW: ("stribeck",)}
-    assert [c.tried for c in found.drives] == [c.tried for c in alone.drives]
-    np.testing.assert_array_equal(found.standard, alone.standard)
-    assert [c.shapes for c in found.drives] == [c.shapes for c in alone.drives]
-    (said,) = [f for f in found.findings if f.code == "beyond_range"]
-    top = max(abs(log.v[:, 1]))
-    share = 100 * np.mean(np.abs(fast.v[:, 1])[np.abs(fast.v[:, 1]) > 0.02] > top)
-    assert said.where == ELBOW
-    assert said.evidence["share_pct"] == pytest.approx(share, abs=1.0)
-    assert f"have speeds outside the fitted range of 0 to {top:.3g}" in said.message
-    slow = driven_log(true, pi, SEED, reach=QUANTILE, speed=0.7)
-    again = found_in(plain, [log], validation=[slow])
-    assert not any(f.code == "beyond_range" for f in again.findings)
-
-
-def test_a_joint_that_moves_in_one_of_several_logs_is_judged_by_that(plain, cases):
-    true, pi, _ = cases("stribeck")
-    logs = [driven_log(true, pi, seed, reach=QUANTILE, still=still)
-            for seed, still in ((4, (1,)), (SEED, (0,)), (5, (1,)))]  # fmt: skip
-    found = helper.found_in(plain, logs)
-    assert chosen(found) == {ELBOW: ("stribeck",)}
-    k = list(found.model.layout.names).index(f"{ELBOW}.stribeck")
-    assert abs(found.standard[k] - 3.0) < 3.0 * found.standard_error[k]
-    assert found.standard_error[k] < 0.3
-    still = [driven_log(true, pi, seed, reach=QUANTILE, still=(1,)) for seed in (4, 5)]
-    found = helper.fitted_in(plain, still)
-    assert ELBOW not in {choice.joint for choice in found.drives}
-    assert chosen(found) == {}
-
-
-@pytest.mark.parametrize(
-    ("stated", "message"),
-    [
-        ("viscous+stribek", "friction of shoulder_lift_joint has stribek, wanted auto, or some of"),
-        ({ELBOW: "load+x"}, "friction of elbow_joint has x, wanted auto, or some of load, "),
-        ({"elbow": "load"}, "friction is stated for elbow, wanted joints that are identified: "),
-    ],
-)
-def test_names_that_are_none_are_refused(stated, message):
-    with pytest.raises(SettingsError, match=message):
-        wanted_families(stated, JOINTS)
-
-
-def test_friction_is_stated_for_all_joints_or_for_some():
-    assert wanted_families(AUTO, JOINTS) == dict.fromkeys(JOINTS)
-    assert wanted_families("viscous+coulomb", JOINTS) == dict.fromkeys(JOINTS, ())
-    assert wanted_families("coulomb+load+lag", JOINTS)[LIFT] == ("load", "lag")
-    stated = wanted_families({ELBOW: "none", "*": "cubic", WRIST: AUTO}, JOINTS)
-    assert stated == {LIFT: ("cubic",), ELBOW: (), WRIST: None}
-    assert wanted_families({ELBOW: "load"}, JOINTS) == {LIFT: None, ELBOW: ("load",), WRIST: None}
-
-
-@pytest.mark.parametrize("estimator", ["wls", "consistent"])
-def test_the_load_of_the_gears_is_that_of_the_bodies_found(plain, estimator, tmp_path):
-    true, pi = driven(plain, {ELBOW: [LoadFriction()]}, {f"{ELBOW}.load": 0.35})
-    log = driven_log(true, pi, SEED, reach=QUANTILE)
-    found = fitted_in(plain, [log], friction={"*": "load"}, estimator=estimator)
-    np.testing.assert_array_equal(found.model.reference, found.standard)
-    motion = process(log, EXACT)
-    wanted = predict(found.model, [found.standard], remember(found.model, motion))[0]
-    np.testing.assert_allclose(found.fitted[0].torques["estimate"], wanted, atol=1e-9)
-    if estimator == "consistent":
-        sidecar = write_urdf(found.model, found.standard, tmp_path / "arm.urdf")
-        model, pi = load_identified(tmp_path / "arm.urdf", sidecar)
-        again = predict(model, [pi], remember(model, motion))[0]
-        np.testing.assert_allclose(again, wanted, atol=1e-8)
-    # one more fit under that load leaves it as it is
-    start = found.model.with_reference(found.standard)
-    again = fitted_in(start, [log], friction="none", estimator=estimator)
-    moved = predict(again.model, [again.standard], remember(again.model, motion))[0] - wanted
-    assert np.abs(moved).max() < 0.003 * np.abs(wanted).max()
-
-
-@pytest.mark.parametrize("workers", [1, 2])
-def test_logs_in_files_choose_as_in_memory(plain, cases, chosen_in, tmp_path, workers):
-    """Two workers are sent the robot with its own terms."""
-    held = chosen_in("presliding")
-    write_log(cases("presliding")[2], tmp_path / "fit.parquet")
-    table = {
-        "urdf": plain.tree.path,
-        "joints": list(JOINTS),
-        "signals": {"cutoff": False, "trim": 0.0},
-        "reduction": {"rows_in_memory": 1024, "workers": workers},
-        "identification": [{"log": "fit.parquet"}],
-    }
-    job = job_from_settings(table, "job", tmp_path)
-    fitted, kept = survey_logs(job, plain, job.identification, job.validation)
-    recordings = Recordings(plain, structural_mapping(plain), fitted, kept)
-    assert not recordings.is_in_memory
-    found = with_drives(recordings, EstimatorSettings("wls"), wanted_families(AUTO, JOINTS))
-    assert chosen(found) == chosen(held) == {ELBOW: ("presliding",)}
-    ((shape,), (alike,)) = ([s for c in x.drives for s in c.shapes] for x in (found, held))
-    # other rows of the log are looked at
-    assert abs(shape.value - alike.value) < 3.0 * np.hypot(alike.std_error, shape.std_error)
-
-
-def test_a_robot_with_terms_of_its_own_can_be_sent_to_workers():
-    own = {ELBOW: [LoadFriction(), Stribeck(speed=0.2, data_range=(0.1, 1.0))]}
-    true, pi = driven(arm(), own, {})
-    log = driven_log(true, pi, 1, duration=3.0)
-    sent = pickle.loads(pickle.dumps(true))
-    assert sent.layout == true.layout
-    motion = process(log, EXACT)
-    wanted, again = (predict(m, [pi], remember(m, motion))[0] for m in (true, sent))
-    np.testing.assert_array_equal(again, wanted)
-
-
 @pytest.mark.parametrize("load", [-0.05, 0.7])
 def test_friction_that_would_be_negative_or_hold_any_load_is_none(plain, load):
     true, pi = driven(plain, {ELBOW: [LoadFriction()]}, {f"{ELBOW}.load": load})
@@ -408,9 +266,3 @@ def test_what_is_nearly_chosen_widens_the_intervals_it_would_move(plain):
         assert found.standard_error[k] > alone.standard_error[k]
         assert abs(found.standard[k] - coulomb) < SURE * found.standard_error[k]
     assert seen
-
-
-def test_identify_chooses_unless_told_otherwise(plain, cases):
-    log = cases("load")[2]
-    assert chosen(identify(plain, [log], signals=EXACT, doctor=False)) == {ELBOW: ("load",)}
-    assert fitted_in(plain, [log], friction="viscous+coulomb").drives == ()

@@ -14,35 +14,28 @@ from helpers.misfits import EFFECTS
 from helpers.paths import ROOT
 
 from robotid.base.findings import Finding
-from robotid.cli.identify import run_job
 from robotid.cli.job import job_from_settings, read_job
-from robotid.cli.logs import survey_logs
-from robotid.data.files.read import write_log
 from robotid.data.signal_settings import SignalSettings
 from robotid.diagnosis.logs.check_logs import check_logs
-from robotid.diagnosis.residual import candidates, misfit
-from robotid.diagnosis.residual.candidates import CANDIDATES
-from robotid.diagnosis.residual.candidates import couplings as couplings_of
-from robotid.diagnosis.residual.misfit import find_misfits
-from robotid.diagnosis.residual.misfit_findings import (
-    counterbalanced,
+from robotid.diagnosis.residual import misfit
+from robotid.diagnosis.residual.misfit import (
+    CANDIDATES,
+    find_misfits,
     misfit_findings,
+    ripples,
     setting_of,
     settled,
-    with_entries,
-    with_known_springs,
 )
+from robotid.diagnosis.residual.misfit import couplings as couplings_of
 from robotid.diagnosis.residual.term_trials import RIDGE, Trials, take_sample
-from robotid.diagnosis.verdict.fit_findings import fit_findings
 from robotid.diagnosis.verdict.verdict import warnings_of
 from robotid.dynamics.base_parameters import structural_mapping
-from robotid.dynamics.simulation.truth import another_robot
 from robotid.estimation.fitting.drive_terms import JointMotion
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
 from robotid.estimation.fitting.recorded import Recordings
 from robotid.estimation.fitting.survey import hold_log
 from robotid.identification.pipeline import conclude, identify
-from robotid.robot.drives import AUTO, Harmonic, Viscous, drive_line
+from robotid.robot.drives import AUTO
 from robotid.robot.model import RobotModel
 
 log_with = partial(helper.log_with, rate=50.0)  # [Hz]: the effects are slower than 10 Hz
@@ -162,16 +155,6 @@ def test_the_size_holds_the_truth(three, effect, joint, size, unit):
     assert found.std_error < 0.03 * size
 
 
-def test_the_size_of_several_columns_is_their_torque(four):
-    """A torque that no base parameter explains is seen as it was added, root mean square."""
-    log, clean = (log_with(four, 1, effect, 2, noise=0.0) for effect in ("periodic", None))
-    added = np.sqrt(np.mean((log.tau - clean.tau)[:, 2] ** 2))
-    (found,) = misfits(identified(four, 1, "periodic", 2))
-    # gravity explains a part of a slow harmonic
-    assert 0.6 * added < found.size < 1.05 * added
-    assert (found.unit, found.std_error < 0.05 * added) == ("N m rms", True)
-
-
 def test_coulomb_friction_that_was_left_out_is_asked_for(three):
     terms = ("armature", "viscous", "offset")
     model = RobotModel.from_urdf(three.tree, joints=three.joints, terms=terms)
@@ -208,19 +191,6 @@ def test_a_ripple_is_named_with_its_periods_a_turn_and_the_terms_that_predict_it
     assert better.misfits == ()
 
 
-def test_a_setting_keeps_what_the_drive_has_already(three):
-    friction = {ELBOW: "load+harmonics1", "*": "none"}
-    found = concluded(three, [log_with(three, 1, "load", 2, duration=12.0)], friction)
-    stated = Harmonic(order=9.0)
-    own = {**found.model.layout.own, ELBOW: (*found.model.layout.own[ELBOW], stated)}
-    found = replace(found, model=found.model.with_terms(own))
-    line = with_entries(found, ELBOW, ["harmonics2", "stribeck"])
-    assert tomllib.loads(line)[ELBOW] == [
-        {"term": "Harmonic", "order": 9.0, "is_sine": False}, "load", "harmonics2", "stribeck",
-    ]  # fmt: skip
-    assert with_entries(found, LIFT, ["load"]) == f'{LIFT} = ["load"]'
-
-
 @pytest.mark.parametrize("memory", [0, 50])
 def test_noise_of_any_colour_is_no_term(three, memory):
     assert misfits(identified(three, 5, noise=0.03, memory=memory)) == ()
@@ -255,50 +225,6 @@ def test_a_counterbalance_is_named_taken_into_the_model_and_no_error(four):
     assert stated.verdict.joints[LIFT].status == "usable"
 
 
-def test_a_mass_that_is_too_large_is_named_beside_a_spring(ur5):
-    """The URDF's upper arm has 5 times its mass; the log is of about the right one."""
-    k, log = 10 * ur5.layout.bodies.index("upper_arm_link"), log_with(ur5, 3)
-    pi, truth = ur5.standard_parameters(), another_robot(ur5, np.random.default_rng(3))
-    pi[k : k + 10] *= 5.0
-    (found,) = [f for f in check_logs(ur5.with_parameters(pi), log) if f.severity != "note"]
-    assert (found.code, found.where) == ("link_mass", f"run0.csv: {LIFT}")
-    assert found.evidence["mass"] == pytest.approx(pi[k])
-    wanted = np.linalg.norm(truth[k + 1 : k + 4]) / np.linalg.norm(pi[k + 1 : k + 4])
-    assert found.evidence["factor"] == pytest.approx(wanted, abs=0.06)
-    assert f"the URDF's mass of upper_arm_link, {pi[k]:.3g} kg, is too large" in found.message
-    assert counterbalanced([found], ["run0.csv"]) == {LIFT: "harmonics1"}
-    terms = (Viscous(), Harmonic(order=1.0))
-    fit = SimpleNamespace(
-        model=SimpleNamespace(layout=SimpleNamespace(own={LIFT: terms})),
-        drives=[SimpleNamespace(joint=LIFT, terms=terms)],
-    )
-    assert with_known_springs([found], fit, {LIFT: None}) == [found]
-    (note,) = with_known_springs([found], fit, {LIFT: ("harmonics1",)})
-    assert note.severity == "note"
-    assert note.message.endswith(f"torques as well. The model includes it: cos1 of {LIFT}")
-
-
-def test_a_counterbalance_of_a_validation_log_alone_has_no_part_in_the_model():
-    on_joint = [
-        Finding("counterbalance", "warning", f"{log}: {joint}", "", {"turned": turned})
-        for log, joint, turned in (("a.csv", LIFT, 2.0), ("b.csv", ELBOW, 2.0), ("a.csv", PAN, 0.3))
-    ]
-    other = Finding("spring", "warning", f"a.csv: {ELBOW}", "", {"turned": 2.0})
-    found = counterbalanced([*on_joint, other], ["a.csv"])
-    assert found == {LIFT: "harmonics1", PAN: "spring"}
-
-
-def test_a_coupling_is_named_on_both_joints_with_the_setting_to_copy(three):
-    pair = {joint: 1.0 for joint in three.joints[1:]}
-    one, other = findings_of(concluded(three, logs_of(three, 4, coupling=tuple(pair.items()))))
-    assert [(f.code, f.severity, f.where) for f in (one, other)] == [
-        ("coupling", "warning", joint) for joint in pair
-    ]
-    assert 'Add [[coupling]] to the job: name = "shoulder_lift_joint_elbow_joint"' in one.message
-    assert "ratios = { shoulder_lift_joint = 1.0, elbow_joint = 1.0 }" in one.message
-    assert one.evidence["share_pct"] > 90
-
-
 def test_columns_join_the_regressor_and_base_parameters_are_refitted(three):
     sample = take_sample(identified(three, 1, "load", 1, duration=12.0))
     j, b = 2, sample.W.shape[-1]
@@ -325,53 +251,17 @@ def test_columns_join_the_regressor_and_base_parameters_are_refitted(three):
         assert trial.left([0, 1])[left_out or 0] == pytest.approx(squares, rel=1e-6)
 
 
-def test_a_misfit_reaches_the_verdict_unless_the_torque_is_explained_well(three):
-    large, small, note = (
-        Finding("friction_shape", severity, LIFT, "", {"share_pct": 90, "error_pct": error})
-        for severity, error in (("warning", 5.1), ("warning", 4.9), ("note", 20.0))
-    )
-    (doubt,) = warnings_of([large, small, note], three.joints)
-    assert (doubt.code, doubt.joint) == ("friction_shape", LIFT)
-    assert doubt.message == (
-        "friction of another shape than viscous and Coulomb would explain 90 % of the squared "
-        "residual (5.1 % of the torque): the drive model lacks it"
-    )
-
-
-def test_a_hook_of_stribeck_makes_its_joint_usable(ur5, tmp_path):
-    paths = [tmp_path / name for name in ("fit.csv", "kept.csv")]
-    for k, path in enumerate(paths):
-        write_log(log_with(ur5, 1, "stribeck", 2, part=k), path)
-    table = {
-        "urdf": ur5.tree.path,
-        "model": {"friction": "viscous+coulomb"},
-        "identification": [{"log": str(paths[0])}],
-        "validation": [{"log": str(paths[1])}],
-        "output": {"report": False},
-    }
-    found, result = run_job(job_from_settings(table, "job", tmp_path), tmp_path / "out")
-    (named,) = [f for f in result["warnings"] if f["code"] == "friction_shape"]
-    assert named["where"] == ELBOW
-    assert f"with {ELBOW} = [".lower() in named["message"].lower()
-    assert "Add it to the model with" in named["message"]
-    assert f"{ELBOW}.coulomb" in named["message"].partition("include this misfit")[0]
-    assert set(found.on_misfit) <= {name for name in found.mapping.names if ELBOW in name}
-    by_joint = found.verdict.joints
-    assert by_joint[ELBOW].status == "usable"
-    assert by_joint[ELBOW].reasons[-1].endswith("(friction_shape)")
-    assert by_joint[LIFT].status == "good"
-
-
 def test_a_term_stands_for_what_the_doctor_guessed_of_its_torque(three):
     guesses = [
         Finding("urdf_mismatch", "warning", "run.csv", ""),
-        Finding("unexplained_torque", "warning", f"run.csv: {LIFT}", ""),
-        Finding("unexplained_torque", "warning", f"run.csv: {PAN}", ""),
+        Finding("unexplained_torque", "warning", f"run.csv: {LIFT}", "", joints=(LIFT,)),
+        Finding("unexplained_torque", "warning", f"run.csv: {PAN}", "", joints=(PAN,)),
         Finding("clipped", "warning", f"run.csv: {LIFT}", ""),
     ]
 
     def said(code, share):
-        term = Finding(code, "note", LIFT, "It is.", {"share_pct": share, "error_pct": 1.0})
+        figures = {"share_pct": share, "error_pct": 1.0}
+        term = Finding(code, "note", LIFT, "It is.", figures, joints=(LIFT,))
         *kept, term = settled(guesses, [term])
         return [guesses.index(f) for f in kept], term
 
@@ -383,44 +273,8 @@ def test_a_term_stands_for_what_the_doctor_guessed_of_its_torque(three):
     assert said("position_offset", 90.0)[0] == [2, 3]
     assert said("load_friction", 90.0)[0] == [0, 2, 3]
     assert said("spring", 40.0) == ([0, 1, 2, 3], Finding(
-        "spring", "note", LIFT, "It is.", {"share_pct": 40.0, "error_pct": 1.0}
+        "spring", "note", LIFT, "It is.", {"share_pct": 40.0, "error_pct": 1.0}, joints=(LIFT,)
     ))  # fmt: skip
-
-
-@pytest.mark.parametrize(
-    ("effect", "seed", "size", "guess"),
-    [("counterbalance", 5, 3.0, "current_for_torque"), ("periodic", 1, 2.0, "counterbalance")],
-)
-def test_a_joint_that_follows_its_position_is_no_other_robot(ur5, four, effect, seed, size, guess):
-    model = ur5 if guess == "current_for_torque" else four  # guessed of six only
-    logs = [log_with(model, seed, effect, 1, part=k, size=size) for k in (0, 1)]
-    guesses = check_logs(model, logs[:1], validation=logs[1:])
-    assert guess in {finding.code for finding in guesses}
-    found = fitted(model, logs, estimator=FIT)
-    said = settled(guesses, fit_findings(found, misfits(found)))
-    said = {f.code for f in said if f.severity != "note"}
-    assert EFFECTS[effect].code in said
-    assert not said & {"counterbalance", "urdf_mismatch", "current_for_torque"}
-    assert "unexplained_torque" not in said
-
-
-def test_logs_in_files_are_judged_by_the_stretches_at_hand(three, tmp_path):
-    for k, name in enumerate(("fit.csv", "kept.csv")):
-        write_log(log_with(three, 1, "load", 1, part=k), tmp_path / name)
-    table = {
-        "urdf": three.tree.path,
-        "joints": list(three.joints),
-        "reduction": {"rows_in_memory": 1024},
-        "identification": [{"log": "fit.csv"}],
-        "validation": [{"log": "kept.csv"}],
-    }
-    job = job_from_settings(table, "job", tmp_path)
-    surveyed = survey_logs(job, three, job.identification, job.validation)
-    recordings = Recordings(three, structural_mapping(three), *surveyed)
-    assert not recordings.is_in_memory
-    (found,) = misfits(conclude(recordings, EstimatorSettings("wls"), friction="none"))
-    assert (found.joint, found.term.code) == (LIFT, "load_friction")
-    assert found.size == pytest.approx(0.1, abs=0.01)
 
 
 def test_a_log_too_short_to_judge_by_is_not_judged(three):
@@ -465,21 +319,6 @@ def test_a_coupled_drive_turns_by_the_ratio_of_the_other_joint(rng):
     assert [(c.coupled, c.ratio) for c in couplings_of(motion)] == [("b", 1.0), ("b", -1.0)]
 
 
-def test_a_misfit_matters_by_its_part_of_the_torque_if_nothing_denies_it():
-    (load, tanh) = (c for c in CANDIDATES if c.name in ("load", "tanh"))
-    still = np.zeros(3)
-    motion = JointMotion(*7 * [still])
-    usual = misfit.Misfit(
-        LIFT, load, 0.36, 1e-9, 0.2, 0.1, 0.01, "N m per N m", 0.04, still, still, motion
-    )
-    assert usual.matters  # 2.4 % of the torque
-    assert not replace(usual, error=0.03).matters  # 1.8 %
-    assert not replace(usual, share=0.24, error=0.9).matters
-    assert replace(usual, confirmed=None).matters
-    assert not replace(usual, confirmed=0.08).matters  # less than a quarter of the share
-    assert not replace(usual, term=tanh).matters
-
-
 def test_ripples_that_are_tried_explain_most_over_what_the_filter_lets_through(rng):
     n = 2000
     q, v = np.cumsum(rng.standard_normal(n)) * 0.05, rng.standard_normal(n) * 3.0
@@ -487,45 +326,13 @@ def test_ripples_that_are_tried_explain_most_over_what_the_filter_lets_through(r
     motion = JointMotion(q, v, still, still, still, still, still, passes=20.0)
     weight, r = rng.uniform(0.5, 2.0, n) * (rng.random(n) < 0.8), rng.standard_normal(n)
     r += sum(0.4 * np.cos(k * q + k) for k in (9, 41, 230))
-    found = [int(c.name.split()[1]) for c in candidates.ripples(motion, weight, weight * r)]
+    found = [int(c.name.split()[1]) for c in ripples(motion, weight, weight * r)]
     explained = {}
     for k in range(5, 241):
         size = weight / (1 + (k * np.abs(v) / (2 * np.pi * 20.0)) ** 8)
         explained[k] = np.abs(np.sum(weight * r * size * np.exp(1j * k * q))) ** 2 / (size @ size)
     assert found == sorted(sorted(explained, key=explained.get)[-6:])
     assert {9, 41} < set(found)
-
-
-def test_entries_keep_other_families_and_a_term_replaces_all_that_it_explains():
-    own = (Harmonic(order=3.0), Harmonic(order=8.0))
-    drives = [
-        SimpleNamespace(joint="a", families=("load",), terms=()),
-        SimpleNamespace(joint="b", families=("harmonics1", "load"), terms=own[:1]),
-    ]
-    layout = SimpleNamespace(own={"b": own})
-    fit = SimpleNamespace(drives=drives, model=SimpleNamespace(layout=layout))
-    assert with_entries(fit, "b", ["harmonics4"]) == drive_line("b", own[1], "load", "harmonics4")
-    assert with_entries(fit, "b", ["spring"]) == (
-        drive_line("b", own[1], "harmonics1", "load", "spring")
-    )
-    assert with_entries(fit, "c", ["spring"]) == drive_line("c", "spring")
-    before = [
-        Finding("counterbalance", "warning", "run: b", "x", {}),
-        Finding("urdf_mismatch", "warning", "run", "x", {}),
-        Finding("unexplained_torque", "warning", "run: c", "x", {}),
-    ]
-    spring = Finding("spring", "note", "b", "a spring", {"share_pct": 51.0})
-    small = replace(spring, evidence={"share_pct": 49.0})
-    other, (_, found) = settled(before, [small, spring])[:1], settled(before, [small, spring])[1:]
-    assert other == before[2:]
-    assert (found.severity, found.evidence) == ("warning", {"share_pct": 51.0, "replaces": 2.0})
-    assert found.message.endswith(
-        "It explains counterbalance, urdf_mismatch and may bias the masses"
-    )
-    load = Finding("load_friction", "note", "c", "load", {"share_pct": 60.0})
-    *rest, last = settled(before, [load])
-    assert rest == before[:2]
-    assert last.evidence["replaces"] == 1.0
 
 
 def test_a_misfit_is_reported_with_the_intervals_of_its_own_joint():

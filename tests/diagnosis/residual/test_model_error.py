@@ -5,7 +5,6 @@ without load, whether the model that is fitted knows of load friction or not.
 """
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,19 +12,11 @@ from helpers.driven import ELBOW, LIFT, arm, driven, driven_log, found_in
 
 from robotid.diagnosis.residual.drive_choice import choose_drives
 from robotid.diagnosis.residual.misfit import find_misfits
-from robotid.diagnosis.residual.model_error import with_model_error
 from robotid.diagnosis.residual.term_trials import take_sample
 from robotid.dynamics.torque import trajectory_regressor
-from robotid.estimation.fitting.drive_terms import (
-    DriveChoice,
-    FoundShape,
-    open_torques,
-)
-from robotid.estimation.fitting.fitted import (
-    expected_band,
-    friction_curve,
-)
-from robotid.robot.drives import LoadFriction, Stribeck, Tanh
+from robotid.estimation.fitting.drive_terms import open_torques
+from robotid.estimation.fitting.fitted import expected_band, friction_curve
+from robotid.robot.drives import LoadFriction, Stribeck
 
 QUANTILE = 1.5
 PLAIN = "viscous+coulomb"
@@ -124,11 +115,8 @@ def test_a_prediction_errs_by_what_a_missing_term_moves_and_by_its_torque(
         changed = (other.torques["estimate"] - one.torques["estimate"])[band.samples, joint]
         W = trajectory_regressor(found.model, one.recording.trajectory.at(band.samples))
         W = W.reshape(len(band.samples), -1, W.shape[1])[:, joint]
-        (torque,) = (
-            z
-            for x, z in zip(found.open_terms, open_torques(found, one, band.samples), strict=True)
-            if x is term
-        )
+        model = found.model.with_reference(found.standard)
+        (torque,) = open_torques(model, [term], one.recording, band.samples)
         errs = W @ term.moves + torque[:, joint]
         assert np.sqrt(np.mean((errs - changed) ** 2)) < 0.2 * np.sqrt(np.mean(changed**2))
         assert not torque[:, :joint].any()
@@ -140,15 +128,6 @@ def test_a_prediction_errs_by_what_a_missing_term_moves_and_by_its_torque(
     curves = [friction_curve(x, ELBOW, v, load=20.0) for x in (found, better)]
     changed = curves[1].torque - curves[0].torque
     np.testing.assert_allclose(curves[0].std, np.abs(changed), atol=0.3 * np.abs(changed).max())
-
-
-def test_without_rows_to_judge_by_errors_stay_as_they_are(fits):
-    found = fits("loaded", PLAIN)
-    assert with_model_error(found, None, ()) == (found, ())
-    assert found.mapping.names  # and with rows and no misfit they do, too
-    same, on_misfit = with_model_error(found, take_sample(found), ())
-    np.testing.assert_array_equal(same.base_error, found.base_error)
-    assert on_misfit == ()
 
 
 def test_an_error_of_a_shape_moves_parameters_as_refits_do(plain, hooked, fits):
@@ -182,18 +161,6 @@ def test_an_error_of_a_shape_moves_parameters_as_refits_do(plain, hooked, fits):
     np.testing.assert_allclose(friction_curve(found, ELBOW, v).std, wanted, rtol=0.05)
 
 
-def test_shapes_that_err_together_have_one_covariance(fits):
-    """A hook's speed and excess make up for each other: alone each looks far too sure."""
-    found = fits("hooked", {ELBOW: "lugre", "*": "none"})
-    (choice,) = found.drives
-    C = np.array(choice.shape_covariance)
-    np.testing.assert_allclose(np.sqrt(np.diag(C)), [s.std_error for s in choice.shapes])
-    np.testing.assert_allclose(C, C.T)
-    assert np.linalg.eigvalsh(C / np.sqrt(np.outer(np.diag(C), np.diag(C)))).min() > -1e-9
-    speed, excess = 1, 2
-    assert abs(C[speed, excess]) > 0.5 * np.sqrt(C[speed, speed] * C[excess, excess])
-
-
 def test_a_clean_robot_has_the_errors_of_its_noise(plain):
     true, pi = driven(plain, {}, {})
     found = found_in(
@@ -202,18 +169,3 @@ def test_a_clean_robot_has_the_errors_of_its_noise(plain):
     assert find_misfits(take_sample(found)) == found.misfits == ()
     np.testing.assert_allclose(found.base_error, found.wls.std_error)
     assert choose_drives(found, dict.fromkeys(found.model.joints, ())) == ()
-
-
-def two_shapes():
-    """Return a fit of two joints, the second of which has two terms with a shape each."""
-    ranges = {"v": (0.02, 2.0), "q": (-1.0, 1.0)}
-    terms = (Stribeck(data_range=ranges["v"], speed=0.2), Tanh(data_range=ranges["v"], speed=0.7))
-    shapes = tuple(FoundShape(n, x, 0.1, "", False) for n, x in (("s", 0.2), ("t", 0.7)))
-    choice = DriveChoice(
-        "b", ("stribeck", "tanh"), terms, shapes=shapes, sizes=((0.2,), (0.7,)), data_range=ranges,
-        shape_covariance=((0.04, 0.03), (0.03, 0.09)),
-    )  # fmt: skip
-    names = ("b.stribeck", "a.stribeck", "a.tanh", "b.tanh")
-    layout = SimpleNamespace(names=names)
-    standard = np.array([3.0, 70.0, 90.0, -2.0])
-    return SimpleNamespace(model=SimpleNamespace(layout=layout), standard=standard), choice, ranges

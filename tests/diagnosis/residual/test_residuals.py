@@ -1,50 +1,13 @@
-"""Spectrum and autocorrelation against brute force and closed form; friction against the truth."""
+"""Spectrum against brute force and closed form; friction against the truth."""
 
 import numpy as np
 import pytest
 from helpers.synthetic import exact_log, truth
 
 from robotid.data.signal_settings import SignalSettings
-from robotid.diagnosis.residual.residuals import autocorrelation, friction_split, spectrum
+from robotid.diagnosis.residual.torque_split import friction_split, spectrum
 from robotid.estimation.fitting.evaluation import evaluate_logs
 from robotid.estimation.fitting.survey import hold_log
-
-
-def brute_force(x, used, segment, lags):
-    found = []
-    for k in range(lags + 1):
-        pairs = [
-            (x[i], x[i + k])
-            for i in range(len(x) - k)
-            if used[i] and used[i + k] and segment[i] == segment[i + k]
-        ]
-        one, other = np.array(pairs).T if pairs else np.full((2, 1), np.nan)
-        found.append(one @ other / np.sqrt(one @ one * (other @ other)))
-    return np.array(found)
-
-
-def test_autocorrelation_is_the_mean_of_products_of_used_pairs(rng):
-    x = np.cumsum(rng.standard_normal(120))
-    used = rng.random(120) > 0.3
-    segment = np.repeat([0, 1, 2], [50, 30, 40])
-    r = autocorrelation(x, used, segment, 60)
-    np.testing.assert_allclose(r, brute_force(x, used, segment, 60), atol=1e-10)
-    assert np.isnan(r[55:]).all()  # longer than every segment
-
-
-def test_no_correlation_exceeds_1_where_few_pairs_are_far_apart():
-    # the largest values are one lag apart, and there is no other pair of that lag
-    x = np.r_[5.0, np.full(60, 0.1), 5.0, np.full(20, 0.1)]
-    r = autocorrelation(x, np.ones(82, dtype=bool), np.zeros(82), 81)
-    assert np.nanmax(np.abs(r)) <= 1.0
-    assert r[61] > 0.9
-
-
-def test_a_sine_correlates_as_a_cosine_across_rows_left_out(rng):
-    t = np.arange(20_000) / 100.0
-    used = rng.random(len(t)) > 0.5
-    r = autocorrelation(np.sin(2 * np.pi * t), used, np.zeros(len(t)), 200)
-    np.testing.assert_allclose(r, np.cos(2 * np.pi * np.arange(201) / 100.0), atol=0.02)
 
 
 def test_the_spectrum_s_integral_is_the_mean_square_of_the_rows_used(rng):

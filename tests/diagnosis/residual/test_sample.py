@@ -6,8 +6,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from robotid.data.log import Trajectory
-from robotid.data.signal_settings import SignalSettings
 from robotid.diagnosis.residual.term_trials import (
     Normal,
     Sample,
@@ -84,27 +82,6 @@ def test_a_column_of_a_joint_at_rest_takes_nothing(sample, rng):
     assert tried.whole.parameters([0, 1])[1] == 0.0
     apart = tried.held_out
     np.testing.assert_allclose(apart.left([0, 1]), apart.left([0]))
-
-
-def test_columns_beside_are_as_free_as_what_is_left(sample, rng):
-    Z = rng.standard_normal((N, JOINTS, 1))
-    beside = sample.with_columns(Z)
-    columns = sample.weight[:, :, None] * Z
-    spread = 1e3 * np.linalg.norm(sample.r) / np.linalg.norm(columns)
-    np.testing.assert_allclose(beside.W, np.concatenate([sample.W, spread * columns], axis=2))
-    for k, rows in enumerate(sample.segments):
-        W = beside.W[rows].reshape(-1, BASE + 1)
-        np.testing.assert_allclose(beside.normal.A[k], W.T @ W)
-        np.testing.assert_allclose(beside.normal.B[k], W.T @ sample.r[rows].ravel())
-
-
-def recording(count, cutoff):
-    q = np.zeros((count, 1))
-    motion = Trajectory(
-        np.arange(count) / 100.0, q, q, q, q, ("a",), 100.0, np.zeros(count, dtype=int)
-    )
-    signals = SignalSettings(cutoff=cutoff, rate=100.0)
-    return SimpleNamespace(recording=SimpleNamespace(trajectory=motion, signals=signals))
 
 
 def test_the_torque_of_a_joint_alone_is_along_its_projected_axis(sample, rng):

@@ -16,11 +16,12 @@ from robotid.base.exceptions import DataError
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import process
 from robotid.diagnosis.residual import torque_split
-from robotid.diagnosis.residual.dependence import even_bins, follow
 from robotid.diagnosis.residual.torque_split import (
     JointTorque,
     Rows,
     _broadband_shares,
+    even_bins,
+    follow,
     joint_torques,
     split_torque,
 )

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from robotid.diagnosis.verdict.correlation import correlated_sets
+from robotid.diagnosis.verdict.parameter_table import correlated_sets
 
 
 def test_sets_are_joined_by_correlations_of_either_sign_and_hold_numbers_of_all_parameters():

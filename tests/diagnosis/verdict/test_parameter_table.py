@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from robotid.diagnosis.verdict import parameter_table
-from robotid.diagnosis.verdict.correlation import correlated_parameters
+from robotid.diagnosis.verdict.parameter_table import correlated_parameters
 from robotid.output.files.entries import build_result
 from robotid.output.files.result_file import Result
 
@@ -77,11 +77,3 @@ def test_a_parameter_is_correlated_with_another_one_of_its_own_drive_that_has_an
     pairs = correlated_parameters(found)
     assert {i: k for i, (k, _) in pairs.items()} == {i: k for i, (k, _) in wanted.items()}
     assert [r for _, r in pairs.values()] == pytest.approx([r for _, r in wanted.values()])
-
-
-def test_columns_of_numbers_are_numbers_though_all_of_them_are_missing():
-    drive = {"name": "a.offset", "value": 2, "unit": "N m"}
-    frame = parameter_table.parameter_table([], [drive, drive | {"name": "b.offset"}])
-    numbers = parameter_table.HEADERS[2:7]
-    assert {name: frame[name].dtype for name in numbers} == dict.fromkeys(numbers, float)
-    assert frame["value"].tolist() == [2.0, 2.0]

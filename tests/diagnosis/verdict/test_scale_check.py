@@ -3,12 +3,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.findings import Figures
 from helpers.fitting import identify
 from helpers.synthetic import exact_log, truth
 
 from robotid.data.signal_settings import SignalSettings
-from robotid.diagnosis.verdict.fit_findings import fit_findings
 from robotid.diagnosis.verdict.scale_check import ScaleCheck, common_factor
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
 from robotid.robot.model import RobotModel
@@ -71,17 +69,6 @@ def test_a_load_in_the_hand_is_no_other_scale(four):
     assert "absolute scale not verified" in found.verdict.reasons[-1]
 
 
-def test_a_load_that_is_left_out_is_said_with_its_mass_and_both_figures():
-    loaded = ScaleCheck(scale=1.01, factor=1.37, masses=(20.0, 24.9, 4.7), unexplained=(0.2, 0.01))
-    assert loaded.agrees
-    message = loaded.message
-    assert "only if a load of +4.7 kg is added to the last link" in message
-    assert "Without the load: gravity torque 1.01 x the URDF's, total mass 20.2 kg" in message
-    assert "With it: gravity torque 1.37 x the URDF's, total mass 24.9 kg" in message
-    alike = replace(loaded, factor=1.04, masses=(20.0, 20.9, 0.5))
-    assert "within 5 %: gravity torque 1.04 x" in alike.message
-
-
 @pytest.mark.parametrize(
     ("factor", "mass", "contradicts"), [(1.37, 20.4, True), (1.2, 20.4, False), (1.01, 27.3, True)]
 )
@@ -121,80 +108,14 @@ def test_friction_stands_beside_it_as_a_share_of_the_torque(ur5, alike):
     json.dumps(found.scale_check.to_dict(), allow_nan=False)
 
 
-def test_an_identified_body_that_cannot_be_so_is_not_good_and_the_urdfs_fault_is_its_own(
-    ur5, alike
-):
-    found = alike
-    shapes = {f.code for f in fit_findings(found) if f.severity == "warning"}
-    assert not shapes & {"com_outside", "gyration", "density"}
-    i = ur5.layout.names.index("forearm_link.mcx")
-
-    def is_forearm(finding):
-        return (finding.code, finding.where) == ("com_outside", "link forearm_link")
-
-    far = found.standard.copy()
-    far[i] += 1.0 * far[i - 1]  # the centre of mass a metre aside
-    (finding,) = [f for f in fit_findings(replace(found, standard=far)) if is_forearm(f)]
-    assert (finding.severity, finding.where) == ("warning", "link forearm_link")
-    assert finding.message.startswith("as identified, link 'forearm_link'")
-    of_urdf = fit_findings(replace(found, standard=far, prior=far))
-    (finding,) = [f for f in of_urdf if is_forearm(f)]
-    assert finding.severity == "note"
-    assert "the URDF has the same fault" in finding.message
-
-
-def test_a_needle_denser_than_any_material_is_named_unless_the_urdf_has_it(ur5, alike):
-    found = alike
-
-    def dense(found):
-        return [f for f in fit_findings(found) if f.code == "dense_body"]
-
-    assert dense(found) == []
-    needle = found.standard.copy()
-    second = slice(10, 20)  # 7.6 kg about the URDF's frame, semi-axes of 6, 6 and 225 mm
-    x, y, z = 7.6 * np.array([0.006, 0.006, 0.225]) ** 2 / 5.0
-    needle[second] = [7.6, 0.0, 0.0, 0.0, y + z, 0.0, z + x, 0.0, 0.0, x + y]
-    sure = replace(
-        found, standard=needle, standard_covariance=1e-6 * found.standard_covariance
-    )  # its errors allow no other body
-    (finding,) = dense(sure)
-    assert finding.severity == "warning"
-    assert finding.where == f"link {ur5.layout.bodies[1]}"
-    density = 7.6 / (4.0 / 3.0 * np.pi * 0.006 * 0.006 * 0.225)
-    assert Figures(finding) == {"mass": 7.6, "density": pytest.approx(density)}
-    assert finding.message == (
-        "as identified, the mass of upper_arm_link is 7.6 kg and its inertia needs a density of at "
-        "least 220000 kg/m^3 (wanted: at most 12000, steel has 7900): such a body is not "
-        "possible. Record motion about more axes, or pin it to the URDF. The predicted torque may "
-        "still be right; do not use mass, centre of mass and inertia of this link"
-    )
-    total = float(needle[: ur5.layout.n_inertial : 10].sum())
-    possible = 7.6 * (12_000 / density) ** 0.4  # at this density, with the same inertia
-    for stated, cure in (
-        ({"total_mass": total}, f"total_mass of {total:.4g} kg (possible: up to about "
-         f"{total - 7.6 + possible:.3g} kg)"),
-        ({"mass": {"upper_arm_link": 7.6}}, "mass of upper_arm_link of 7.6 kg (possible: up to "
-         f"about {possible:.3g} kg)"),
-    ):  # fmt: skip
-        asked = EstimatorSettings(constraints=stated)
-        (finding,) = dense(replace(found, standard=needle, estimator=asked))
-        assert f"Check the stated {cure}: weigh it, or remove it. " in finding.message
-        assert finding.severity == "warning"  # whatever the errors allow
-    wide = EstimatorSettings(constraints={"total_mass": [0.5 * total, 2.0 * total]})
-    (finding,) = dense(replace(sure, estimator=wide))
-    assert "Record motion" in finding.message  # the range does not determine the mass
-    assert dense(replace(found, standard=needle, prior=needle)) == []
-    flat = found.standard.copy()
-    flat[second] = [7.6, 0.0, 0.0, 0.0, x, 0.0, x, 0.0, 0.0, x + x]  # all of it in a plane
-    assert dense(replace(found, standard=flat)) == []  # it is not physically consistent
-
-
 def test_a_result_that_its_prior_holds_back_bears_no_witness(four, rng):
     pi = truth(four)
     size = four.layout.n_inertial
     pi[:size] = 3.0 * four.standard_parameters()[:size]  # the sensors say three times the URDF
     log = exact_log(four, pi, rng, samples=1000, noise=0.5)
-    kept = EstimatorSettings(prior_weight=1e9, )
+    kept = EstimatorSettings(
+        prior_weight=1e9,
+    )
     held = identify(four, [log], estimator=kept)
     assert held.scale_check.factor == pytest.approx(1.0, abs=0.05)  # it stays at the URDF
     assert not held.scale_check.follows

@@ -1,6 +1,5 @@
 """A stated mass verifies the torque scale only where torque determines that mass."""
 
-import json
 from types import SimpleNamespace
 
 import numpy as np
@@ -11,11 +10,14 @@ from helpers.fitting import fit
 from helpers.synthetic import exact_log, truth
 
 from robotid.data.signal_settings import SignalSettings
-from robotid.diagnosis.verdict.scale_check import ScaleCheck, check_scale
-from robotid.diagnosis.verdict.stated_mass import StatedMass, determines_total_mass, stated_mass
+from robotid.diagnosis.verdict.scale_check import (
+    StatedMass,
+    check_scale,
+    determines_total_mass,
+    stated_mass,
+)
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
-from robotid.output.files.result_file import stated_scale_check
 from robotid.robot.model import RobotModel
 
 EXACT = SignalSettings(cutoff=None, trim=0.0, min_velocity=0.0, velocity="measured")
@@ -82,13 +84,6 @@ def test_the_named_links_take_up_most_of_the_likeliest_change_that_no_torque_sho
     assert stated_mass(found) == StatedMass(("total_mass",), absorbed_by=wanted)
 
 
-def test_a_stated_mass_of_the_last_link_of_a_fixed_arm_verifies_nothing(lifted):
-    model, pi, log = lifted
-    last = model.layout.bodies[-1]
-    stated = checked(model, log, mass={last: float(pi[model.layout.n_inertial - 10])}).stated
-    assert (stated.names, stated.ratio) == ((f"mass of {last}",), None)
-
-
 def test_the_force_of_a_rail_verifies_a_total_mass_and_contradicts_a_wrong_one(crane):
     model, pi, log = crane
     total = float(pi[0] + pi[10])
@@ -112,14 +107,6 @@ def test_stated_masses_of_all_links_add_up_to_one_that_torque_determines(crane):
     total = checked(model, log, total_mass=float(pi[0] + pi[10])).stated
     assert alone.ratio is None
     assert (both.ratio, both.half_width) == pytest.approx((total.ratio, total.half_width), rel=0.1)
-
-
-def test_with_motor_inertia_the_rail_does_not_determine_the_mass(crane):
-    model, pi, log = crane
-    model = RobotModel.from_urdf(model.tree.path, terms=("armature", "viscous"))
-    found = checked(model, log, total_mass=float(pi[0] + pi[10]))
-    assert found.stated.ratio is None
-    assert not found.is_total_determined
 
 
 def test_the_mass_that_remains_beside_a_pinned_link_is_determined(crane):
@@ -161,40 +148,6 @@ def test_each_limit_of_a_stated_mass(ratio, half_width, verifies, contradicts):
     stated = StatedMass(("total_mass",), ratio, half_width)
     assert (stated.verifies, stated.contradicts) == (verifies, contradicts)
     assert ("does not verify" in stated.message) is not (verifies or contradicts)
-
-
-@pytest.mark.parametrize("stated", [None, StatedMass(("mass of a",), None, 0.0, ("b", "c"))])
-def test_a_written_statement_is_read_as_it_was(stated):
-    written = json.loads(json.dumps(ScaleCheck(scale=1.2, stated=stated).to_dict()))
-    assert stated_scale_check({"scale_check": written}).stated == stated
-    former = {key: value for key, value in written.items() if key != "stated"}
-    read = stated_scale_check({"scale_check": former})
-    assert read.stated == (None if stated is None else StatedMass(()))
-    assert not read.agrees
-    assert stated_scale_check({}) is stated_scale_check({"scale_check": None}) is None
-
-
-def test_a_message_names_the_figure_its_limit_and_the_probable_cause():
-    plain = ScaleCheck(scale=0.87, factor=1.14, masses=(28.7, 26.0, 2.6), unexplained=(0.08, 0.04))
-    assert (
-        "total mass 26 kg against the URDF's 28.7 kg; gravity torque and total mass differ by more "
-        "than 5 %. Probable cause: the URDF's masses, or the gains of the torques. Verify"
-    ) in plain.message
-    open_mass = StatedMass(("total_mass",), absorbed_by=tuple("abcdef"))
-    assert "(the mass of a, b, c, d and 2 more changes with it" in open_mass.message
-    mass = ScaleCheck(scale=1.0, factor=1.0, masses=(10.0, 15.0, 0.0), unexplained=(0.2, 0.2))
-    assert "; total mass differs by more than 35 %. Probable" in mass.message
-    load = ScaleCheck(scale=1.01, factor=1.2, masses=(10.0, 13.0, 2.0), unexplained=(0.2, 0.01))
-    assert "Probable cause: a load of +2 kg on the last link" in load.message
-    gravity = {"b": 1.3, "a": 1.4, "c": 0.7}
-    single = ScaleCheck(scale=1.1, factor=1.1, masses=(10.0, 10.0, 0.0), gravity=gravity)
-    assert "by joint: a 1.40: probable cause: masses of the URDF, or" in single.message
-    prior = ScaleCheck(scale=1.0, factor=1.0, masses=(10.0, 10.0, 0.0), follows=False)
-    assert "the residual of a joint is above 1.5 x that of WLS. Probable cause: a prior" in (
-        prior.message
-    )
-    weighed = ScaleCheck(scale=0.9, factor=0.9, masses=(10.0, 9.0, 0.0), is_total_determined=True)
-    assert weighed.message.endswith("State the measured mass of the moving links (total_mass)")
 
 
 @pytest.mark.parametrize("mass", [0.0, -0.1])

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from robotid.base.findings import Finding
-from robotid.diagnosis.verdict import unlike_runs
+from robotid.diagnosis.verdict import fit_findings
 from robotid.diagnosis.verdict.evidence import Predictions
-from robotid.diagnosis.verdict.unlike_runs import rescaled_findings
+from robotid.diagnosis.verdict.fit_findings import rescaled_findings
 from robotid.output.report.steps import sentence_of
 
 JOINTS = ("a", "b", "c")
@@ -35,7 +35,7 @@ def evaluation(path, tau, own, mask, *, is_refitted=False):
 
 def said(validation, monkeypatch, *, constraints=(), loaded=()):
     shares = dict(zip(JOINTS, (0.2, 0.9, 0.2), strict=True))
-    monkeypatch.setattr(unlike_runs, "friction_shares", lambda fit: shares)
+    monkeypatch.setattr(fit_findings, "friction_shares", lambda fit: shares)
     model = SimpleNamespace(joints=JOINTS, row_names=JOINTS, constraints=constraints)
     fit = SimpleNamespace(model=model, validation=validation)
     return list(rescaled_findings(fit, loaded))

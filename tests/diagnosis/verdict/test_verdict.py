@@ -2,16 +2,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.synthetic import exact_log, truth
 
 from robotid.base.findings import Finding
-from robotid.cli.identify import run_job
-from robotid.cli.job import job_from_settings
-from robotid.cli.validate import validate
-from robotid.data.files.read import write_log
 from robotid.diagnosis.verdict.evidence import Determined, Predictions, is_beaten
 from robotid.diagnosis.verdict.scale_check import ScaleCheck
-from robotid.diagnosis.verdict.stated_mass import StatedMass
 from robotid.diagnosis.verdict.verdict import (
     VerdictWarning,
     blocking,
@@ -20,11 +14,7 @@ from robotid.diagnosis.verdict.verdict import (
     rejected,
     warnings_of,
 )
-from robotid.estimation.fitting.estimator_settings import EstimatorSettings
 from robotid.estimation.fitting.evaluation import JointMetrics, Metrics
-from robotid.identification.pipeline import identify
-from robotid.robot.examples import example_urdf
-from robotid.robot.model import RobotModel
 
 NOISE = np.array([2.0, 2.0, 1.0, 0.3, 0.3, 0.1])
 JOINTS = ("a", "b", "c")
@@ -98,14 +88,6 @@ def test_alarms_come_before_everything_and_constants_before_the_rest():
     assert found.reasons[2].startswith("a: error 60.0 %")
 
 
-def test_the_largest_error_is_the_first_reason():
-    found = verdict({"a": joint(16.2), "b": joint(4.0), "c": joint(17.4)})
-    assert [reason[:16] for reason in found.reasons] == ["c: error 17.4 % ", "a: error 16.2 % "]
-    assert list(found.joints) == ["a", "b", "c"]
-    found = verdict({"a": joint(60.0), "c": joint(70.0)})
-    assert [reason[:16] for reason in found.reasons] == ["c: error 70.0 % ", "a: error 60.0 % "]
-
-
 def test_worse_than_the_urdf_is_poor():
     found = verdict({"a": joint(8.0, urdf=6.0)})
     assert found.status == "poor"
@@ -165,23 +147,6 @@ def test_the_worst_of_several_recordings_decides_on_a_joint():
     ]
 
 
-def test_what_is_good_is_said_with_the_worst_of_all_joints_and_recordings():
-    logs = {"one": {"a": joint(3.0), "b": joint(2.0)}, "two": {"a": joint(4.5), "b": joint(1.0)}}
-    kept = {name: Metrics(own, 1.0) for name, own in logs.items()}
-    fit = Metrics({"a": joint(3.0), "b": joint(2.0)}, 1.0)
-    found = judged(fit, kept)
-    assert found.status == "good"
-    assert found.reasons[0].startswith("torque prediction error on validation logs: at most 4.5 %")
-    for name, worst in (("a", 4.5), ("b", 2.0)):
-        [reason] = found.joints[name].reasons
-        assert reason.startswith(f"error at most {worst} %, smaller than")
-
-
-def test_without_a_kept_recording_no_joint_is_evaluated():
-    alone = verdict(None).joints["a"]
-    assert (alone.status, alone.reasons) == ("not evaluated", ("no validation log given",))
-
-
 def test_a_joint_that_moves_nowhere_is_not_evaluated():
     found = judged(
         Metrics({"a": joint(3.0)}, 1.0),
@@ -192,12 +157,6 @@ def test_a_joint_that_moves_nowhere_is_not_evaluated():
     assert found.reasons == ("the joints b do not move in any recording: not evaluated",)
     assert found.joints["b"].status == "not evaluated"
     assert found.joints["b"].reasons == ("it does not move in any recording",)
-
-
-def test_a_result_that_is_validated_later_knows_only_what_was_kept():
-    kept = {"val.csv": Metrics({"a": joint(4.0)}, 1.0)}
-    found = judged(Metrics({}, 0.0), kept, joints=("a", "b"))
-    assert found.reasons == ("the joints b do not move in any validation log: not evaluated",)
 
 
 def test_a_doubt_makes_its_joint_and_the_whole_usable_at_best():
@@ -238,13 +197,6 @@ def test_an_impossible_body_makes_the_result_usable_and_no_joint(code):
     assert {own.status for own in concluded.joints.values()} == {"good"}
 
 
-def test_kept_recordings_that_were_fitted_are_named():
-    found = judged(Metrics({"a": joint(3.0)}, 1.0), {}, refitted=["x.csv"])
-    assert found.status == "usable"
-    (reason,) = found.reasons
-    assert reason.endswith("not evaluated: x.csv contain fitted samples")
-
-
 def test_a_torque_of_zero_is_no_prediction():
     found = verdict({"a": joint(None, constant=False)})
     assert found.status == "poor"
@@ -271,14 +223,6 @@ def test_each_threshold_lies_where_it_is_stated(error, fitted, status):
     found = verdict({"a": joint(error)}, fitted={"a": joint(fitted)})
     assert found.status == status
     assert found.joints["a"].status == status
-
-
-def test_an_alarm_alone_makes_a_good_prediction_poor():
-    kept = {"val.csv": Metrics({"a": joint(4.0)}, 1.0)}
-    found = judged(Metrics({"a": joint(3.0)}, 1.0), kept, log_errors=["late"])
-    assert found.status == "poor"
-    assert found.reasons == ("late",)
-    assert found.to_dict()["log_errors"] == ["late"]
 
 
 def test_an_error_equal_to_the_urdfs_is_not_worse_than_it():
@@ -308,11 +252,6 @@ def test_notes_errors_and_harmless_warnings_raise_no_doubt():
         finding("constraint_costs", "b", error_pct=0.9, wls_error_pct=1e-3),
     ]
     assert warnings_of(harmless, JOINTS) == ()
-
-
-def test_what_several_logs_show_is_said_once():
-    found = warnings_of([finding("clipped", f"{log}: a") for log in ("one", "two")], JOINTS)
-    assert found == (VerdictWarning("clipped", "a", "the torque is clipped at a limit"),)
 
 
 def test_figures_are_stated():
@@ -351,22 +290,6 @@ def test_only_a_robust_loss_outvotes_jumps_and_ignored_errors_are_no_alarm():
     assert blocking(found, ()) == (jump, other)
     assert blocking(found, (), is_robust=True) == (other,)
     assert blocking(found, ["late"]) == (jump,)
-
-
-def test_many_open_parameters_are_counted_and_the_first_eight_named():
-    kept = {"val.csv": Metrics({"a": joint(4.0)}, 1.0)}
-    names = [f"x{k}.m" for k in range(11)]
-    for is_poor in (True, False):
-        found = judged(
-            Metrics({"a": joint(3.0)}, 1.0), kept, undetermined=names,
-            is_poorly_excited=is_poor,
-        )  # fmt: skip
-        said = found.reasons[-1]
-        assert ("determine 11 base" in said, said.startswith("11 base")) == (is_poor, not is_poor)
-        assert all(name in said for name in names[:8])
-        assert "x8.m" not in said
-        assert "3 more" in said
-        assert found.status == ("usable" if is_poor else "good")
 
 
 def kept_logs(**errors):
@@ -411,170 +334,12 @@ def test_gravity_that_was_compensated_is_refuted_by_gravity(scale, factor, sever
     assert found.severity == severity
 
 
-@pytest.fixture(scope="module")
-def arm(ur5):
-    """The first four joints of a UR5."""
-    return RobotModel.from_urdf(ur5.tree, joints=ur5.joints[:4])
-
-
-def spoilt_logs(model, spoil=None):
-    """Return two logs of the same arm, to fit and to validate with, as a test spoils them."""
-    logs, noise = [], 0.1 * NOISE[: len(model.joints)]
-    for name, rng in zip(("run.csv", "kept.csv"), np.random.default_rng(0).spawn(2), strict=True):
-        log = exact_log(model, truth(model), rng, samples=800, rate=100.0, noise=noise)
-        log = replace(log, path=name)
-        logs.append(log if spoil is None else spoil(log))
-    return logs
-
-
-def found_of(model, spoil=None, ignore=(), **settings):
-    """Return what is found of such logs."""
-    log, kept = spoilt_logs(model, spoil)
-    settings = EstimatorSettings(prior_weight=1.0, **settings)
-    return identify(
-        model, [log], validation=[kept], estimator=settings, friction="none", ignore=ignore
-    )
-
-
-@pytest.fixture
-def run(arm, tmp_path):
-    """Run a job on such logs; return what is found, its result, and the verdict of its file."""
-
-    def runner(**settings):
-        for log in spoilt_logs(arm):
-            write_log(log, tmp_path / log.path)
-        table = {
-            "urdf": str(example_urdf("ur5_robot.urdf")),
-            "joints": list(arm.joints),
-            "identification": [{"log": "run.csv"}],
-            "validation": [{"log": "kept.csv"}],
-            "model": {"friction": "viscous+coulomb"},
-            "estimator": {"prior_weight": 1.0, **settings},
-            "output": {"report": False},
-        }
-        out = tmp_path / "out"
-        found, result = run_job(job_from_settings(table, "job.toml", tmp_path), out)
-        again = validate(out / "result.json", [tmp_path / "kept.csv"])
-        return found, result, again["verdict"]
-
-    return runner
-
-
-def test_a_stated_bound_that_binds_makes_it_usable(run):
-    far = {"com": {"forearm_link": [[1, 1, 1], [1.2, 1.2, 1.2]]}}
-    _, result, again = run(constraints=far)
-    assert result["verdict"]["status"] == again["status"] == "usable"
-    bound = "centre_of_mass forearm_link: the data, or the masses that result from it, contradict"
-    assert bound in str(result["verdict"])
-    (finding,) = [f for f in result["warnings"] if f["code"] == "active_bound"]
-    assert "they increase the torque error of shoulder_lift_joint," in finding["message"]
-
-
-def test_a_stated_bound_that_only_the_urdf_minds_is_a_note(arm):
-    found = found_of(arm, constraints={"total_mass": [10.0, 17.0]})
-    (finding,) = [f for f in found.findings if f.code == "active_bound"]
-    assert found.warnings == ()
-    assert finding.severity == "note"
-    assert "the bounds do not increase the torque error" in finding.message
-    assert found.verdict.status == "good"
-
-
-def test_a_mass_that_is_stated_does_not_come_from_the_data(arm):
-    found = found_of(arm, constraints={"mass": {"forearm_link": 2.0}})
-    k = arm.layout.names.index("forearm_link.m")
-    assert (found.standard[k], found.sources[k]) == (pytest.approx(2.0), "prior")
-
-
-def test_a_wrong_total_mass_makes_a_joint_poor_that_errs_by_three_percent_and_twice_wls(run, arm):
-    _, result, again = run(constraints={"total_mass": 5.0})
-    assert result["verdict"]["status"] == again["status"] == "poor"
-    fitted, wls = (
-        x["per_joint"] for x in (result["identification"], result["wls"]["identification"])
-    )
-    for joint, verdict in result["verdict"]["per_joint"].items():
-        error, least = (x[joint]["relative_error_pct"] for x in (fitted, wls))
-        assert error > 2.0 * least
-        wanted = "poor" if error > 3.0 else "usable"
-        assert (verdict["status"], again["per_joint"][joint]["status"]) == (wanted, wanted)
-        assert "physics and data disagree" in str(verdict["reasons"])
-    costs = [f["message"] for f in result["warnings"] if f["code"] == "constraint_costs"]
-    assert costs
-    assert all("the constraints in [estimator] (total_mass)" in text for text in costs)
-    found = found_of(arm, constraints={"total_mass": 5.0}, ignore=["constraint_costs"])
-    assert "constraint_costs" not in {doubt.code for doubt in found.warnings}
-
-
-def test_spikes_in_torques_do_not_condemn_a_robust_fit(arm):
-    def spoil(log):
-        tau = log.tau.copy()
-        if log.path == "run.csv":
-            tau[[200, 400, 600], 2] += 1000.0
-        return replace(log, tau=tau)
-
-    plain = found_of(arm, spoil)
-    assert "has spikes of up to" in plain.verdict.reasons[0]
-    assert plain.log_errors
-    robust = found_of(arm, spoil, robust="tukey")
-    assert robust.verdict.status == "good", robust.verdict.reasons
-    assert robust.warnings == robust.log_errors == ()
-
-
-def test_what_noise_hides_of_a_rich_motion_is_said_and_does_not_condemn():
-    logs = {"val.csv": Metrics({"a": joint(4.0)}, 1.0)}
-    found = judged(
-        Metrics({"a": joint(3.0)}, 1.0),
-        logs,
-        undetermined=("x.Ixy",),
-        is_poorly_excited=False,
-    )
-    assert found.status == "good"
-    assert "1 base parameters are not identifiable above the noise" in found.reasons[-1]
-
-
-def test_the_urdf_with_fitted_drives_is_to_be_beaten():
-    found = verdict({"a": joint(8.0, urdf_with_drives=7.0)}, fitted={"a": joint(7.0)})
-    assert found.status == found.joints["a"].status == "usable"
-    assert found.joints["a"].reasons == (
-        "a: error 8.0 % on val.csv, 7.0 % with the URDF and fitted drives: keep the URDF's values "
-        "for its link",
-    )
-    assert "predicts a better than the identified bodies" in found.reasons[1]
-    tie = verdict({"a": joint(8.0, urdf_with_drives=7.8)}, fitted={"a": joint(7.0)})
-    assert tie.status == "good"
-
-
 @pytest.mark.parametrize(
     ("error", "driven", "is_worse"),
     [(1.2, 1.0, False), (1.35, 1.0, True), (12.5, 12.0, False), (12.7, 12.0, True)],
 )
 def test_a_twentieth_and_a_third_of_a_percent_must_be_missed_more(error, driven, is_worse):
     assert is_beaten(joint(error, urdf_with_drives=driven)) is is_worse
-
-
-def refuted_code(code, error, gravity=None, where="run.csv", more=()):
-    scale_check = ScaleCheck(gravity=gravity or {}, gravity_error=gravity or {})
-    kept = {"val.csv": Metrics({"a": joint(error), "b": joint(1.0)}, 1.0)}
-    return rejected([finding(code, where), *more], kept, scale_check)[0].severity
-
-
-def test_a_prediction_of_unseen_motion_refutes_hypotheses_on_masses_and_units():
-    assert refuted_code("urdf_mismatch", 1.0) == "note"
-    assert refuted_code("urdf_mismatch", 5.1) == "warning"
-    assert refuted_code("clipped", 1.0) == "warning"
-    assert refuted_code("current_for_torque", 1.0, {"a": 1.3}) == "note"
-    assert refuted_code("current_for_torque", 1.0, {"a": 0.1}) == "warning"  # 1 % of what unit?
-    assert refuted_code("current_for_torque", 1.0, {"a": 1.3, "b": 2.1}) == "warning"
-    assert refuted_code("unexplained_torque", 9.0, where="run.csv: b") == "note"
-    assert refuted_code("unexplained_torque", 9.0, where="run.csv: a") == "warning"
-    assert refuted_code("gravity", 1.0) == "note"
-    assert refuted_code("gravity", 1.0, where="all joints") == "warning"  # by what was left
-    no_gravity = finding("gravity_compensated", "run.csv", "error")
-    kept = {"val.csv": Metrics({"a": joint(1.0)}, 1.0)}
-    for factor, severity in ((1.3, "note"), (0.2, "error")):
-        scale_check = ScaleCheck(scale=factor, factor=factor)
-        assert rejected([no_gravity], kept, scale_check)[0].severity == severity
-    seen = [finding("repeated_motion", "val.csv")]
-    assert refuted_code("urdf_mismatch", 1.0, more=seen) == "warning"
 
 
 @pytest.mark.parametrize("errors", [(9.0, 1.0), (1.0, 9.0)])
@@ -600,58 +365,6 @@ def test_drive_parameters_that_the_prior_determines_are_named_and_change_no_verd
 
 
 MASS = ("total_mass",)
-
-
-@pytest.mark.parametrize(
-    ("scale_check", "status", "said"),
-    [
-        (ScaleCheck(scale=0.97, factor=0.97, masses=(10.0, 10.2, 0.0)), "good", "within 5 %"),
-        (
-            ScaleCheck(scale=0.8, factor=0.8, masses=(10.0, 9.0, 0.0)),
-            "good",
-            "absolute scale not verified",
-        ),
-        (
-            ScaleCheck(scale=0.6, factor=0.6, masses=(10.0, 9.0, 0.0)),
-            "usable",
-            "absolute scale not verified",
-        ),
-        (
-            ScaleCheck(scale=0.8, factor=0.8, unexplained=(0.01, 0.1), masses=(10.0, 9.0, 0.0)),
-            "usable",
-            "The same factor 0.80 fits all joints",
-        ),
-        (ScaleCheck(scale=1.0, factor=1.0, masses=(10.0, 15.0, 0.0)), "usable", "15 kg against"),
-        (ScaleCheck(scale=1.0, factor=1.4, masses=(10.0, 15.0, 5.0)), "good", "within 5 %"),
-        (
-            ScaleCheck(
-                scale=0.6, factor=0.6, masses=(10.0, 9.0, 0.0), stated=StatedMass(MASS, 1.02, 0.02)
-            ),
-            "good",
-            "absolute scale verified by a stated mass",
-        ),
-        (
-            ScaleCheck(
-                scale=1.0, factor=1.0, masses=(10.0, 9.9, 0.0), stated=StatedMass(MASS, 0.9, 0.02)
-            ),
-            "usable",
-            "absolute scale contradicted by a stated mass",
-        ),
-        (
-            ScaleCheck(scale=1.2, factor=1.2, masses=(10.0, 30.0, 0.0), stated=StatedMass(MASS)),
-            "good",
-            "The stated total_mass does not verify the scale",
-        ),
-    ],
-)
-def test_good_needs_a_witness_or_says_that_there_is_none(scale_check, status, said):
-    found = judged(
-        Metrics({"a": joint(3.0)}, 1.0),
-        {"val.csv": Metrics({"a": joint(4.0)}, 1.0)},
-        scale_check=scale_check,
-    )
-    assert found.status == status
-    assert said in found.reasons[-1]
 
 
 def test_errors_of_the_wrench_on_the_base_are_noted_beside_those_of_joints():

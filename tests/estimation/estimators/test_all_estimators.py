@@ -1,4 +1,4 @@
-"""Laws that every estimator obeys: those of all, of those with errors, of recursive ones."""
+"""Laws that every estimator obeys, and what an estimate and the scatter of segments state."""
 
 from dataclasses import fields, replace
 from functools import partial
@@ -9,23 +9,25 @@ from helpers.driven import arm
 from helpers.estimation import ESTIMATORS, NOISE, Case, RandomStates
 
 from robotid.base.exceptions import DataError
-from robotid.dynamics.factors import compress
+from robotid.dynamics.factors import Factors, compress, triangle_of
 from robotid.estimation.estimators import (
     OLS,
     PRX,
     RLS,
-    BatchEstimator,
+    TLS,
+    WLS,
     Consistent,
     DescentState,
+    Estimate,
     Kalman,
     KalmanState,
     NormalisedGradient,
-    RecursiveEstimator,
     RLSState,
     fold,
     load_state,
     save_state,
 )
+from robotid.estimation.estimators.segments import scatter
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 
@@ -58,14 +60,6 @@ def test_truth_is_recovered_from_one_motion(make, panda, rng):
     beta = case.base(make(case).fit(case.problem))
     # 1e-8 relative: rounding of 4200 rows and, for the cone solver, its own tolerance
     assert np.linalg.norm(beta - case.beta) < 1e-8 * np.linalg.norm(case.beta)
-
-
-@makers(ESTIMATORS)
-def test_it_says_what_it_reads(make, states):
-    estimator = make(states)
-    kind = BatchEstimator if estimator.reads == "factors" else RecursiveEstimator
-    assert estimator.reads in ("factors", "samples")
-    assert isinstance(estimator, kind)
 
 
 @makers(BATCH)
@@ -206,3 +200,101 @@ def test_saved_and_resumed_gives_the_same_bits(make, states, tmp_path):
     read = load_state(tmp_path / "state.npz", STATES[type(estimator)])
     assert bits(read) == bits(half)
     assert bits(fold(estimator, samples[150:], read)) == bits(unbroken)
+
+
+THETA, ERROR = np.array([1.5, -20.0, 0.25]), np.array([0.1, 3.0, np.inf])
+ESTIMATE = Estimate(
+    theta=THETA,
+    covariance=np.diag(ERROR**2) + 0.01 * (1 - np.eye(3)),
+    names=("a.m", "b.viscous", "c.offset"),
+    sigma=np.ones(2),
+    rank=2,
+    condition=12.5,
+    undetermined=("c.offset",),
+    converged=True,
+    n_iter=3,
+    message="solved by hand",
+)
+
+
+def test_each_parameter_has_its_own_error():
+    np.testing.assert_array_equal(ESTIMATE.std_error, ERROR)
+
+
+def test_intervals_reach_students_quantile():
+    np.testing.assert_allclose(ESTIMATE.quantile, 1.959964, rtol=1e-6)
+    few = replace(ESTIMATE, details={"freedom": np.array([12.0, 4.0, np.inf])})
+    np.testing.assert_allclose(few.quantile, [2.178813, 2.776445, 1.959964], rtol=1e-6)
+
+
+def test_text_states_value_and_error_of_each_parameter():
+    head, message, *rows = str(ESTIMATE).splitlines()
+    assert head == "Estimate: 3 parameters, rank 2, condition 12.5, converged"
+    assert message == "solved by hand"
+    assert [row.split() for row in rows] == [
+        ["a.m", "1.5", "+-", "0.1"],
+        ["b.viscous", "-20", "+-", "3"],
+        ["c.offset", "0.25", "+-", "inf"],
+    ]
+    assert repr(ESTIMATE) == f"<{head}>"
+
+
+@pytest.mark.parametrize(
+    ("estimator", "weighing"),
+    [
+        (OLS(), "alike"),
+        (WLS(), "by joint"),
+        (TLS(), "by joint"),
+        (RLS(np.ones(2)), "by joint"),
+        (RLS(np.ones(2), 0.9, np.zeros(3), np.ones(3)), "by age"),
+        (Kalman(np.ones(2), np.zeros(3), np.ones(3)), "by age"),
+        (NormalisedGradient(np.ones(2)), "by step"),
+    ],
+)
+def test_an_estimator_says_how_its_rows_weigh(estimator, weighing):
+    assert estimator.weighing == weighing
+
+
+def test_what_one_segment_alone_determines_has_the_mean_scatter_of_all_others(rng):
+    """The third parameter is that of one segment, the fourth has a prior and no rows."""
+    count, each, sigma = 14, 30, 0.3
+    W = np.zeros((count, each, 4))
+    W[..., :2] = rng.standard_normal((count, each, 2))
+    W[3] = rng.standard_normal((each, 4)) * [0.0, 0.0, 5.0, 0.0]
+    tau = rng.standard_normal((count, each)) * np.linspace(0.2, 0.5, count)[:, None]
+    W, tau = W.reshape(-1, 4), tau.reshape(-1)
+    bread = np.linalg.inv(W.T @ W / sigma**2 + np.diag([0.0, 0.0, 0.0, 1e4]))
+    theta = bread @ W.T @ tau / sigma**2
+    segments = [
+        Factors((triangle_of(A),), (np.arange(4),), np.array([each]), ("a", "b", "c", "d"))
+        for A in np.split(np.column_stack([W, tau]), count)
+    ]
+    found = scatter(segments, theta, np.array([sigma]), bread)
+    squares = 0.0  # of the scores of the first two parameters, which the fourth segment lacks
+    for k in set(range(count)) - {3}:
+        A = W[k * each : (k + 1) * each, :2] / sigma
+        values, V = np.linalg.eigh(np.eye(each) - A @ bread[:2, :2] @ A.T)
+        left = tau[k * each : (k + 1) * each] / sigma - A @ theta[:2]
+        score = A.T @ (V @ ((V.T @ left) / np.sqrt(values)))
+        squares += np.outer(score, score)
+    np.testing.assert_allclose(found.meat[:2, :2], squares, rtol=1e-9)
+    inflation = np.trace(squares @ bread[:2, :2]) / 2.0  # leverages of parameters sum to 1 each
+    np.testing.assert_allclose(found.inflation, inflation, rtol=1e-9)
+    C = found.covariance
+    np.testing.assert_allclose(C[2, 2], found.inflation * bread[2, 2], rtol=1e-9)
+    np.testing.assert_allclose(C[3], 0.0, atol=1e-15)
+    freedom = found.freedom()
+    assert freedom[2] == 1.0
+    assert freedom[3] == np.inf
+    assert ((freedom[:2] > 5.0) & (freedom[:2] <= count)).all()
+
+
+def test_a_file_that_is_no_state_is_refused(tmp_path):
+    with pytest.raises(DataError, match="of the state does not exist"):
+        load_state(tmp_path / "none.npz", RLSState)
+    (tmp_path / "text.npz").write_text("not a state")
+    with pytest.raises(DataError, match=r"text.npz is not a file of a state"):
+        load_state(tmp_path / "text.npz", RLSState)
+    save_state(RLS(np.ones(2)).init(3), tmp_path / "rls.npz")
+    with pytest.raises(DataError, match="contains a state 'RLSState', wanted 'KalmanState'"):
+        load_state(tmp_path / "rls.npz", KalmanState)

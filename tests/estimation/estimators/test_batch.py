@@ -3,16 +3,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from helpers.estimation import NOISE, Case, still_wrist
-from helpers.fitting import identify
-from helpers.synthetic import exact_log, truth
 
 from robotid.base.exceptions import DataError, RankDeficientError
-from robotid.data.signal_settings import SignalSettings
 from robotid.dynamics.factors import compress
 from robotid.dynamics.problem import Problem
 from robotid.estimation.estimators import OLS, TLS, WLS
 from robotid.estimation.estimators.batch import _noise, mixed_tls, solve_factor
-from robotid.estimation.fitting.estimator_settings import EstimatorSettings
 
 
 def test_wls_beats_ols_where_joints_are_unequally_noisy(ur5, rng):
@@ -111,13 +107,6 @@ def test_covariances_are_their_formulas(rng, share):
     np.testing.assert_allclose(wls.sigma, np.sqrt(squares / (40 - spent)), rtol=1e-6)
 
 
-@pytest.mark.parametrize("kind", [OLS, WLS])
-def test_a_prior_says_nothing_where_the_data_determine_everything(ur5, rng, kind):
-    case = Case(ur5, rng, NOISE)
-    free, held = (kind(prior=prior).fit(case.problem) for prior in (None, case.beta + 3.0))
-    np.testing.assert_allclose(held.theta, free.theta, rtol=1e-6, atol=1e-7)
-
-
 def problem(W, tau, names):
     blocks = [(W, tau, np.ones(len(tau)))]
     return Problem(lambda: iter(blocks), names, 1, np.ones((1, W.shape[1]), dtype=bool))
@@ -202,15 +191,6 @@ def test_noise_that_is_not_stated_explains_at_most_half_of_the_residual(rng):
         found = TLS(regressor_noise=None).fit(compress(problem(W, tau, ("a", "b"))))
         assert float(found.message.split("; ")[1].split(" %")[0]) == pytest.approx(share, rel=0.5)
         np.testing.assert_allclose(found.theta, [10.0, 3.0], atol=4 * found.std_error.max())
-
-
-def test_a_robot_is_identified_and_the_message_tells_the_noise(ur5):
-    log = exact_log(ur5, truth(ur5), np.random.default_rng(0), noise=np.full(6, 0.5))
-    signals = SignalSettings(cutoff=None, trim=0.0, min_velocity=0.0)
-    small = EstimatorSettings("tls", regressor_noise=1e-6)
-    found = identify(ur5, [log], signals=signals, estimator=small)
-    np.testing.assert_allclose(found.base, found.wls.theta, rtol=1e-3, atol=1e-3)
-    assert "total least squares" in found.estimate.message
 
 
 def test_data_that_leave_parameters_open_are_refused(rng):

@@ -1,19 +1,13 @@
 """Which directions data determine: closed forms, brute force, and one answer everywhere."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
-from helpers.fitting import fit, identify
+from helpers.fitting import identify
 from helpers.synthetic import exact_log, truth
 
 from robotid.base.exceptions import RankDeficientError
-from robotid.base.findings import listed
 from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
-from robotid.data.signals import process, resolve
-from robotid.diagnosis.logs.motion_checks import check_excitation
-from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.torque import joint_torque_regressor
 from robotid.estimation.estimators.determination import (
     Combination,
@@ -23,8 +17,6 @@ from robotid.estimation.estimators.determination import (
     determine,
 )
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
-from robotid.output.files.entries import build_result
-from robotid.output.report.tables import open_section
 
 EXACT = SignalSettings(cutoff=None, trim=0.0)
 NOISE = 0.1  # [N m]
@@ -61,29 +53,7 @@ def pan(ur5):
     return identify(ur5, [moved(ur5, pan_one_way)], signals=EXACT, estimator=CHOICE)
 
 
-def test_a_sum_that_alone_is_measured_is_named_as_such():
-    known = determine(["x.coulomb", "x.offset", "y.m"], np.diag([9.0, 0, 9])[:, [0, 0, 2]], 5 * ONE)
-    assert known.rank == 2
-    assert known.undetermined == ("x.coulomb", "x.offset")
-    assert known.described() == (
-        "x.coulomb and x.offset are identifiable only as x.coulomb + x.offset"
-    )
-    ((group,),) = [known.to_list()]
-    assert group["determined"][0]["terms"] == pytest.approx({"x.coulomb": 1.0, "x.offset": 1.0})
-
-
 ONE = np.ones(3)
-
-
-def test_units_and_scales_do_not_matter():
-    rows, spread = np.array([[3.0, 6e3, 0.0], [0.0, 0.0, 40.0]]), np.array([1.0, 1e-3, 0.1])
-    scale = np.array([1.0, 1e-3, 1e4])  # of other units
-    one, other = (determine("abc", rows * s, spread / s) for s in (ONE, scale))
-    assert one.rank == other.rank == 2
-    np.testing.assert_allclose(one.shrinkage, other.shrinkage)
-    # 3 a + 6000 b is measured; b leads, for its share of the sum is the largest
-    assert str(one.groups[0].combinations[0]) == "b + 0.0005 a"
-    assert str(other.groups[0].combinations[0]) == "b + 0.5 a"
 
 
 def test_words_name_the_four_largest_terms_of_a_sum_by_their_shares():
@@ -216,97 +186,6 @@ def test_a_joint_that_turns_one_way_leaves_friction_and_offset_a_sum(pan):
     assert pan.standard[at].sum() == pytest.approx(pi[at].sum(), abs=0.15)
     of_sum = np.sqrt(pan.standard_covariance[np.ix_(at, at)].sum())
     assert pan.standard_error[at].min() > 10.0 * of_sum
-
-
-@pytest.mark.parametrize("case", ["wrist", "pan"])
-def test_doctor_result_report_and_refusal_say_the_same(ur5, case, request):
-    found = request.getfixturevalue(case)
-    known = found.determination
-    assert known.undetermined == found.estimate.undetermined  # of the consistent fit itself
-    structure = build_result(found, {})["structure"]
-    assert structure["rank"] == known.rank
-    assert structure["undetermined"] == list(known.undetermined)
-    sums = [entry for group in structure["indistinguishable"] for entry in group["determined"]]
-    html = open_section(found).replace("<wbr>", "")
-    assert f"The data determine {known.rank} of 58 base parameters" in html
-    for entry in sums:
-        assert entry["text"] in html
-    assert known.rank == len(known.names) - len(known.undetermined) + len(sums)
-    reasons = found.verdict.reasons
-    assert any(listed(known.undetermined, 8) in reason for reason in reasons)
-
-    log = found.fitted[0].recording.log
-    with pytest.raises(RankDeficientError) as caught:
-        fit(ur5, [log], signals=EXACT, estimator="wls")
-    assert caught.value.rank == known.rank
-    assert caught.value.undetermined == known.undetermined
-    assert known.described() in str(caught.value)
-
-    motion = process(log, resolve(log, EXACT))
-    mapping = structural_mapping(ur5)
-    (finding,) = check_excitation(ur5, mapping, [motion], EXACT, "run.csv")
-    assert finding.severity == "warning"
-    assert finding.evidence["rank"] == known.rank
-    assert known.described() in finding.message
-    assert "no action needed" not in finding.message
-
-
-def test_few_rows_of_a_long_motion_tell_the_doctor_the_same(ur5, monkeypatch):
-    log = moved(ur5, lambda *motion: None)
-    motion, mapping = process(log, resolve(log, EXACT)), structural_mapping(ur5)
-
-    def weakest():
-        (finding,) = check_excitation(ur5, mapping, [motion], EXACT, "run.csv")
-        assert finding.severity == "note"
-        assert finding.message.endswith("no action needed")
-        return finding.evidence["weakest"]
-
-    whole = weakest()
-    monkeypatch.setattr("robotid.diagnosis.logs.motion_checks._ROWS", 120)
-    assert weakest() == pytest.approx(whole, rel=0.25)
-
-
-def test_an_ill_conditioned_motion_is_not_passed_over(ur5, monkeypatch):
-    log = moved(ur5, lambda *motion: None)
-    motion, mapping = process(log, resolve(log, EXACT)), structural_mapping(ur5)
-    monkeypatch.setattr("robotid.estimation.estimators.determination._ILL_CONDITIONED", 1.0)
-    (finding,) = check_excitation(ur5, mapping, [motion], EXACT, "run.csv")
-    assert "no action needed" not in finding.message
-    assert finding.severity == "note"
-    assert (
-        "% of its prior standard deviation; to determine it better, record a motion of all joints"
-        in finding.message
-    )
-
-
-def test_what_is_lost_in_the_noise_of_a_rich_motion_is_a_note(ur5):
-    log = moved(ur5, lambda *motion: None, noise=10.0)
-    motion, mapping = process(log, resolve(log, EXACT)), structural_mapping(ur5)
-    (finding,) = check_excitation(ur5, mapping, [motion], EXACT, "run.csv")
-    assert finding.severity == "note"
-    assert finding.evidence["rank"] < 58
-    assert finding.evidence["condition"] < 100
-    assert "not identifiable above the noise; a faster motion determines more" in finding.message
-
-
-def test_too_few_rows_are_said(ur5):
-    log = moved(ur5, lambda *motion: None, samples=9)
-    motion, mapping = process(log, resolve(log, EXACT)), structural_mapping(ur5)
-    (finding,) = check_excitation(ur5, mapping, [motion], EXACT, "run.csv")
-    assert finding.severity == "warning"
-    assert "torque rows for 58 parameters: too few rows to fit" in finding.message
-
-
-def test_a_pinned_link_is_not_listed(ur5, wrist):
-    log = wrist.fitted[0].recording.log
-    settings = replace(wrist.estimator, constraints={"pinned": ["wrist_3_link"]})
-    found = fit(ur5, [log], signals=EXACT, estimator=settings)
-    own = found.mapping.described([f"wrist_3_link.{term}" for term in ("mcx", "Ixy", "Ixz", "Iyz")])
-    assert len(own["alone"]) == 4
-    assert not set(own["alone"]) & set(found.determination.undetermined)
-    assert set(own["alone"]) & set(wrist.determination.undetermined)
-    assert "wrist_3_joint.viscous" in found.determination.undetermined
-    assert found.determination.undetermined == found.estimate.undetermined
 
 
 def test_one_measured_sum_of_four_makes_one_group_of_them():

@@ -6,8 +6,8 @@ import pytest
 from scipy.signal import lfilter
 
 from robotid.base.exceptions import DataError, NotConvergedError
-from robotid.estimation.estimators import Estimator, output_error
-from robotid.estimation.estimators.output_error import OutputError, Residual, _freed, linearised
+from robotid.estimation.estimators import output_error
+from robotid.estimation.estimators.output_error import OutputError, Residual, linearised
 
 DT, RHO, SIGMA = 0.02, 0.9, 0.02
 TRUTH = np.array([1.5, 0.3, 0.1])  # gain, time constant [s], offset
@@ -66,55 +66,12 @@ START = np.array([1.0, 0.2, 0.0])
 UNBOUNDED = np.outer([-1.0, 1.0], np.full(3, np.inf))
 
 
-def test_the_slopes_of_the_lag_are_those_of_differences(rng):
-    lag, h = lagging(rng), 1e-6
-    slopes = np.stack([r.slopes[:, 0] for r in lag.residuals(TRUTH, with_slopes=True)])
-    for k in range(3):
-        up, down = TRUTH.copy(), TRUTH.copy()
-        up[k], down[k] = TRUTH[k] + h, TRUTH[k] - h
-        exact = (lag.simulated(up) - lag.simulated(down)) / (2 * h)
-        np.testing.assert_allclose(slopes[..., k], exact, atol=1e-7)
-
-
 def test_parameters_are_recovered_without_noise(rng):
     found = OutputError().fit(lagging(rng, sigma=1e-9), START)
     np.testing.assert_allclose(found.theta, TRUTH, rtol=1e-6)
     assert found.converged
     assert found.undetermined == ()
     assert found.names == ("gain", "time", "offset")
-
-
-@pytest.mark.parametrize("rounds", [1, 5])
-def test_parameters_alone_are_those_of_the_fit(rng, rounds):
-    lag, estimator = lagging(rng), OutputError(rounds=rounds)
-    found = estimator.fit(lag, START).theta
-    np.testing.assert_array_equal(estimator.minimise(lag, START), found)
-    about_start = replace(lag, prior=START, prior_std=np.full(3, 1e3))
-    np.testing.assert_allclose(estimator.minimise(about_start), found, rtol=1e-6)
-    assert (found != OutputError(rounds=6 - rounds).fit(lag, START).theta).any()
-
-
-def test_the_noise_that_is_left_is_found(rng):
-    found = OutputError().fit(lagging(rng, windows=100), START)
-    np.testing.assert_allclose(found.details["correlation"], [RHO], atol=0.03)
-    np.testing.assert_allclose(found.sigma, [SIGMA], rtol=0.03)
-    plain = OutputError(whitens=False).fit(lagging(rng, windows=100), START)
-    np.testing.assert_allclose(plain.sigma, [SIGMA / np.sqrt(1 - RHO**2)], rtol=0.1)
-    assert plain.details["correlation"] == [0.0]
-
-
-def test_no_more_correlation_is_taken_out_than_is_allowed(rng):
-    found = OutputError(most=np.array([0.5])).fit(lagging(rng), START)
-    assert found.details["correlation"] == [0.5]
-
-
-def test_the_condition_is_that_of_the_slopes_of_unit_columns(rng):
-    lag = lagging(rng)
-    found = OutputError(whitens=False).fit(lag, START)
-    A = np.concatenate([r.slopes[:, 0] for r in lag.residuals(found.theta, with_slopes=True)])
-    unit = A / np.linalg.norm(A, axis=0)
-    assert found.condition == pytest.approx(np.linalg.cond(unit), rel=1e-3)  # a last step apart
-    assert found.condition > 1.5
 
 
 def test_standard_errors_are_the_scatter_of_many_noises():
@@ -125,12 +82,6 @@ def test_standard_errors_are_the_scatter_of_many_noises():
     assert ((ratio > 0.8) & (ratio < 1.25)).all(), ratio
     bias = (theta.mean(axis=0) - TRUTH) / (theta.std(axis=0) / np.sqrt(60))
     assert np.abs(bias).max() < 4
-
-
-def test_correlated_noise_does_not_make_plain_squares_sure(rng):
-    """Their errors come from the scatter of segments, five times those of white noise here."""
-    found = OutputError(whitens=False).fit(lagging(rng), START)
-    assert found.details["inflation"] > 2
 
 
 @pytest.mark.parametrize("bounds", [(2.0, np.inf), (-np.inf, 1.2)])
@@ -156,24 +107,6 @@ def test_a_prior_weighs_as_an_observation(rng):
     held = OutputError().fit(replace(lag, prior=prior, prior_std=np.full(3, 1e-9)), START)
     np.testing.assert_allclose(held.theta, prior, atol=1e-6)
     assert held.undetermined == lag.names
-
-
-def test_rows_of_torque_weigh_in_one_estimate(rng):
-    lag = lagging(rng)
-    free = OutputError().fit(lag, START)
-    sure = 0.2 * free.std_error[0]  # a row that knows the gain five times as well
-    rows = np.array([[1.0, 0.0, 0.0, TRUTH[0]]]) / sure
-    both = OutputError().fit(replace(lag, further=rows), START)
-    assert abs(both.theta[0] - TRUTH[0]) < 3 * sure
-    np.testing.assert_allclose(both.std_error[0], sure, rtol=0.1)
-    assert both.std_error[1] < free.std_error[1], "what goes with the gain is surer, too"
-
-
-def test_it_says_that_it_has_not_settled(rng):
-    found = OutputError(steps=1, rounds=1).fit(lagging(rng), START)
-    assert not found.converged
-    assert found.message.endswith("not converged")
-    assert OutputError().fit(lagging(rng), START).message.endswith(", converged")
 
 
 def test_a_step_that_cannot_be_simulated_is_shortened(rng):
@@ -221,21 +154,6 @@ class Started(Lagging):
         found = super().residuals(theta, with_slopes=with_slopes)
         fades = 0.97 ** np.arange(self.told.shape[1])[:, None, None]
         return [replace(r, by_start=fades) if with_slopes or with_starts else r for r in found]
-
-
-def test_what_a_window_starts_with_changes_nothing_where_starts_are_free(rng):
-    lag = lagging(rng)
-    fades = 0.97 ** np.arange(lag.told.shape[1])
-    off = lag.measured + rng.standard_normal((len(lag.told), 1)) * fades
-    exact, moved = (
-        OutputError(frees=True).fit(Started(**{**vars(lag), "measured": x}), START)
-        for x in (lag.measured, off)
-    )
-    np.testing.assert_allclose(moved.theta, exact.theta, rtol=1e-6)
-    np.testing.assert_allclose(moved.sigma, exact.sigma, rtol=1e-6)
-    assert (np.abs(exact.theta - TRUTH) < 3.3 * exact.std_error).all()
-    held = OutputError().fit(Started(**{**vars(lag), "measured": off}), START)
-    assert np.abs(held.theta - exact.theta).max() > 1e-3
 
 
 def test_a_step_of_parameters_and_starts_together_settles_what_held_starts_bind(rng):
@@ -298,18 +216,6 @@ def test_a_covariance_is_of_scores_rows_and_prior_together(rng, spread):
     np.testing.assert_allclose(found.covariance, wanted * np.outer(wider, wider), rtol=1e-5)
 
 
-def test_a_better_start_is_sought_by_residuals_over_their_size(rng):
-    """Of two joints, one in small units, and two numbers that a start has."""
-    e, G = rng.standard_normal((40, 2)) * [1.0, 1e-3], rng.standard_normal((40, 2, 2))
-    G[:, 1] *= 1e-3
-    residual = Residual(e, None, np.array([0, 1]), np.arange(0), G)
-    size = np.sqrt(np.mean(e**2, axis=0))
-    H = np.einsum("kji,kjl,j->il", G, G, size**-2.0)
-    x = np.linalg.solve(H, np.einsum("kji,kj,j->i", G, e, size**-2.0))
-    np.testing.assert_allclose(_freed(residual), e - G @ x, rtol=1e-9, atol=1e-12)
-    assert _freed(replace(residual, by_start=None)) is e
-
-
 def test_other_residuals_move_an_estimate_by_its_normal_equations(rng):
     """Whitened by the other residuals, free starts taken out, without parameters at a bound."""
     one = lagging(rng, windows=5)
@@ -360,17 +266,6 @@ def test_residuals_of_larger_variance_count_less_beside_further_rows(rng):
     assert less.details["inflation"] == pytest.approx(same.details["inflation"], rel=1e-4)
 
 
-def test_what_is_linearised_is_whitened(rng):
-    lag, estimator = lagging(rng), OutputError()
-    weights = estimator.weights(lag, TRUTH)
-    A, b, columns = next(iter(linearised(lag, weights, TRUTH)))
-    r = lag.residuals(TRUTH, with_slopes=True)[0]
-    rho, sigma = weights.rho[0], weights.sigma[0]
-    np.testing.assert_allclose(b, (r.e[1:, 0] - rho * r.e[:-1, 0]) / sigma)
-    np.testing.assert_allclose(A, (r.slopes[1:, 0] - rho * r.slopes[:-1, 0]) / sigma)
-    np.testing.assert_array_equal(columns, [0, 1, 2])
-
-
 def test_standard_errors_of_what_drifts_are_the_scatter_of_many_drifts():
     """What an input's noise adds up to: whitening leaves much of it, as long as a window goes."""
     rng = np.random.default_rng(9)
@@ -383,16 +278,6 @@ def test_standard_errors_of_what_drifts_are_the_scatter_of_many_drifts():
     theta = np.array([d.theta for d in draws])
     ratio = np.mean([d.std_error for d in draws], axis=0) / theta.std(axis=0)
     assert ((ratio > 0.8) & (ratio < 1.25)).all(), ratio
-
-
-def test_it_is_an_estimator_that_reads_a_simulator_and_begins_with_its_prior(rng):
-    estimator, lag = OutputError(), lagging(rng)
-    assert isinstance(estimator, Estimator)
-    assert estimator.reads == "simulator"
-    near = replace(lag, prior=1.1 * TRUTH, prior_std=np.full(3, np.inf))
-    found, initialised = estimator.fit(near), estimator.fit(near, near.prior)
-    np.testing.assert_array_equal(found.theta, initialised.theta)
-    assert not np.array_equal(found.theta, estimator.fit(near, START).theta), "to the last bit"
 
 
 def test_noise_and_correlation_of_a_joint_are_those_of_all_its_windows(rng):

@@ -7,7 +7,7 @@ import pytest
 from helpers.driven import EXACT, FIT, arm, driven_log
 from helpers.synthetic import truth
 
-from robotid.diagnosis.verdict.unlike_runs import unlike_findings
+from robotid.diagnosis.verdict.fit_findings import unlike_findings
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.estimation.fitting.fit import solve_recordings, sums_with_zeros
 from robotid.estimation.fitting.recorded import Recordings

@@ -2,7 +2,6 @@
 
 import json
 import os
-import xml.etree.ElementTree as ET
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,20 +11,12 @@ import pinocchio as pin
 import pytest
 import yaml
 from helpers.commanded_results import by_position, written_result
-from helpers.mujoco_plant import LEG, ROBOTS, followed, loaded, multisine, plant, recorded
+from helpers.mujoco_plant import LEG, followed, loaded, multisine, plant, recorded
 
-from robotid.base.exceptions import DataError, SettingsError
+from robotid.base.exceptions import DataError
 from robotid.cli import main
-from robotid.data.log import Log
-from robotid.dynamics.simulation.loops import ClosedLoopRobot, cut_windows
-from robotid.identification.closed_loop.loop_result import logged_motion
-from robotid.output.files.commanded import loops_of
-from robotid.output.files.isaac import isaac_actuators
-from robotid.output.files.mjcf import write_mjcf
-from robotid.output.files.ranges import stated_ranges
 from robotid.output.files.result_file import load_result
 from robotid.robot.examples import example_urdf
-from robotid.robot.model import RobotModel
 
 RATE = 200.0  # [Hz] of the commands
 CHIRP = Path(os.environ.get("ROBOTID_DATA", "/none")) / "commands" / "go2" / "chirp.parquet"
@@ -112,54 +103,6 @@ def test_a_delay_is_exact_to_a_step(late):
     np.testing.assert_allclose(lag[20:], max(late / step + 0.5, 1.0) if late else 0.0, atol=1e-9)
 
 
-def test_a_filter_stands_for_the_delay_where_it_is_asked_for(tmp_path):
-    leg = plant("leg", np.random.default_rng(0), delay=0.02)
-    pi = leg.model.standard_parameters()
-    notes = write_mjcf(leg.model, pi, tmp_path / "a.xml", commanded=leg.drives, delay="filter")
-    assert any("first-order filters" in note for note in notes)
-    robot = mujoco.MjModel.from_xml_path(str(tmp_path / "a.xml"))
-    assert not robot.actuator_delay.any()
-    data = mujoco.MjData(robot)
-    data.ctrl[:] = 1.0
-    while data.time < 0.02 - 1e-9:
-        mujoco.mj_step(robot, data)
-    np.testing.assert_allclose(data.act, 1 - np.exp(-1.0), rtol=1e-6)
-    prompt = [replace(drive, delay=0.0) for drive in leg.drives]
-    for delay in ("filter", "history"):
-        notes = write_mjcf(leg.model, pi, tmp_path / "b.xml", commanded=prompt, delay=delay)
-        assert not any("delays" in note for note in notes)
-    with pytest.raises(SettingsError, match="delay is 'none', wanted one of history, filter"):
-        write_mjcf(leg.model, pi, tmp_path / "a.xml", commanded=leg.drives, delay="none")
-
-
-@pytest.mark.parametrize("name", ROBOTS)
-def test_the_plant_is_quick_and_its_truth_says_what_it_does(name):
-    rng = np.random.default_rng(2)
-    robot = plant(name, rng)
-    log, truth = recorded(robot, rng, duration=4.0)
-    assert truth[f"{log.joints[0]}.kp"] == robot.drives[0].kp
-    assert log.q.shape == log.q_ref.shape == (2000, len(robot.drives))
-    assert np.ptp(log.q, axis=0).min() > 0.15
-    assert np.sqrt(np.mean((log.q - log.q_ref) ** 2, axis=0)).max() < 0.2
-    exact, noisy = (
-        recorded(robot, np.random.default_rng(3), duration=1.0, noise=x)[0].q for x in (0.0, 1e-3)
-    )
-    assert np.std(noisy - exact) == pytest.approx(1e-3, rel=0.05)
-
-
-def test_the_plant_logs_the_torques_of_its_drives():
-    """kp (q_ref(t - delay) - q) - kd v, from the log itself, and the offset of the equation."""
-    leg = plant("leg", np.random.default_rng(0), delay=0.006, offset=0.7)
-    log, _ = recorded(leg, np.random.default_rng(1), duration=2.0, noise=0.0, torque=0.0)
-    assert log.has_torque
-    v = np.gradient(log.q, log.t, axis=0)
-    kp, kd = (np.array([getattr(drive, key) for drive in leg.drives]) for key in ("kp", "kd"))
-    late = 3  # rows
-    by_hand = kp * (log.q_ref[:-late] - log.q[late:]) - kd * v[late:]
-    np.testing.assert_allclose(log.tau[late:-1], by_hand[:-1], atol=0.05)
-    assert np.ptp(by_hand, axis=0).min() > 0.8
-
-
 @pytest.fixture(scope="module")
 def result(tmp_path_factory):
     leg = plant("leg", np.random.default_rng(0), coulomb=0.2, offset=0.1, zero=0.02, delay=0.0063)
@@ -169,35 +112,6 @@ def result(tmp_path_factory):
     friction = {LEG[2]: by_position(0.05, 0.3, -2.5, -1.0)}
     folder = tmp_path_factory.mktemp("results") / "leg"
     return written_result(leg, folder, position=friction, limits={LEG[0]: 21.0}), leg
-
-
-def test_the_drives_of_a_result_are_read(result):
-    folder, leg = result
-    found = load_result(folder).commanded
-    for drive, wanted in zip(found, leg.drives, strict=True):
-        assert drive == replace(wanted, effort_limit=21.0 if drive.joint == LEG[0] else np.inf)
-
-
-def test_a_result_with_a_clock_follows_by_it_and_its_export_says_so(result, tmp_path, capsys):
-    folder, leg = result
-    text = json.loads((folder / "result.json").read_text())
-    held = tmp_path / "held"
-    held.mkdir()
-    for name in ("robot.urdf", "robot.drive.json"):
-        (held / name).write_bytes((folder / name).read_bytes())
-    text["simulation"]["controller"]["rate"] = 100.0
-    (held / "result.json").write_text(json.dumps(text))
-    log, _ = recorded(leg, np.random.default_rng(5), duration=0.5, noise=0.0)
-    at_once, by_clock = (load_result(at).follow_commands(log) for at in (folder, held))
-    model, pi = load_result(held).identified
-    loops = loops_of(model, pi, load_result(held).commanded, 100.0)
-    (out,) = ClosedLoopRobot(model).roll_out(loops, cut_windows(log, np.inf, 0.0))
-    np.testing.assert_array_equal(by_clock, out.q)
-    assert np.abs(by_clock - at_once).max() > 3e-4
-    for at, says in ((held, True), (folder, False)):
-        code, out, _ = export(at, "mjcf", tmp_path / "a.xml", capsys)
-        assert code == 0
-        assert ("the controller runs at 100 Hz with a zero-order hold" in out) is says
 
 
 def test_encoders_that_count_the_other_way_are_heard_and_answered_in_their_sense(result):
@@ -242,20 +156,6 @@ def test_impossible_drives_are_refused(result, tmp_path):
     assert {(drive.kd, drive.delay, drive.zero) for drive in bare} == {(0.0, 0.0, 0.0)}
 
 
-def test_mujoco_rolls_out_what_our_own_roll_out_does():
-    """The estimator's simulator and the exported file are one robot, on a log."""
-    leg = plant("leg", np.random.default_rng(4), zero=0.04, offset=0.1, effort_limit=4.0)
-    log, _ = recorded(leg, np.random.default_rng(5), duration=4.0, noise=0.0)
-    pi, names = leg.model.standard_parameters(), leg.model.layout.names
-    for drive in leg.drives:
-        for term in ("armature", "viscous", "coulomb", "offset"):
-            pi[names.index(f"{drive.joint}.{term}")] = getattr(drive, term)
-    robot = ClosedLoopRobot(leg.model, step=1e-3)
-    (found,) = robot.roll_out(loops_of(leg.model, pi, leg.drives), cut_windows(log, np.inf, 0.0))
-    assert np.abs(found.q - log.q).max() < 3e-4
-    assert np.abs(log.q - log.q_ref).max() > 0.05
-
-
 def export(folder, kind, target, capsys, *flags):
     code = main(["export", str(folder), "--format", kind, "--out", str(target), *flags])
     out, err = capsys.readouterr()
@@ -293,30 +193,6 @@ def test_mjcf_of_a_result_has_the_nearest_friction_and_says_so(result, tmp_path,
     np.testing.assert_allclose(robot.dof_frictionloss, [0.2, 0.2, 0.4 + mean], rtol=1e-4)
 
 
-def test_a_controller_that_carries_the_weight_is_named(tmp_path, capsys):
-    settings = {"estimator": {"name": "wls"}, "controller": {"gravity_compensation": True}}
-    folder = written_result(
-        plant("planar", np.random.default_rng(0)), tmp_path / "out", settings=settings
-    )
-    for kind in ("mjcf", "isaac"):
-        code, out, _ = export(folder, kind, tmp_path / "a", capsys)
-        assert code == 0
-        assert "the controller compensates gravity with the URDF's model" in out
-        said = " ".join((tmp_path / "a").read_text().split())
-        assert "compensates gravity with the URDF's model" in said
-
-
-def test_the_motion_of_a_log_is_that_of_its_positions_between_gaps():
-    t = np.concatenate([0.01 * np.arange(5), 1.0 + 0.01 * np.arange(4)])
-    q = np.column_stack([3.0 * t, -0.5 * t**2])
-    q[5:] += 10.0  # nothing is differentiated across the gap
-    motion = logged_motion(Log(t, q, np.zeros_like(q), ("a", "b"), q_ref=q, has_torque=False))
-    np.testing.assert_array_equal(motion.segment, [0] * 5 + [1] * 4)
-    np.testing.assert_allclose(motion.v[:, 0], 3.0)
-    np.testing.assert_allclose(motion.v[[1, 7], 1], -t[[1, 7]])
-    np.testing.assert_array_equal(motion.q, q)
-
-
 def test_isaac_actuators_are_grouped_and_read_back(result, tmp_path, capsys):
     folder, _ = result
     # the hip has another effort limit, so it is a group of its own
@@ -351,77 +227,3 @@ def test_isaac_actuators_are_grouped_and_read_back(result, tmp_path, capsys):
             "min_delay": 3 if joint != LEG[2] else 2,  # 3.15 and 2.4 steps
             "max_delay": 3 if joint != LEG[2] else 2,
         }
-
-
-def test_isaac_groups_are_of_equal_drives_with_whole_delays():
-    """Joints of four legs; their names are taken literally."""
-    quadruped = RobotModel.from_urdf(example_urdf("go2.urdf"))
-    (one, *_) = plant("leg", np.random.default_rng(0), delay=0.0063).drives
-    drives = [replace(one, joint=name, kp=2.0 if "calf" in name else 1.0)
-              for name in quadruped.joints]  # fmt: skip
-    groups = isaac_actuators(quadruped, drives, 0.0063)["actuators"]
-    assert list(groups) == ["joint", "calf_joint"]  # hips and thighs are alike
-    assert groups["calf_joint"]["joint_names_expr"] == [
-        f"{leg}_calf_joint" for leg in ("FL", "FR", "RL", "RR")
-    ]
-    for late, step, whole in ((0.0063, 0.0063, 1), (0.3, 0.1, 3), (0.00497, 0.005, 1)):
-        own = [replace(drive, delay=late) for drive in drives]
-        group = isaac_actuators(quadruped, own, step)["actuators"]["calf_joint"]
-        assert (group["min_delay"], group["max_delay"]) == (whole, whole)
-    dotted = plant("planar", np.random.default_rng(0))
-    named = [replace(drive, joint=f"{drive.joint}.x") for drive in dotted.drives]
-    for group in isaac_actuators(dotted.model, named, 0.005)["actuators"].values():
-        assert group["joint_names_expr"][0].endswith(r"\.x")
-        assert group["velocity_limit"] is None or group["velocity_limit"] > 0
-
-
-def test_ranges_have_gains_delays_and_friction(result, tmp_path, capsys):
-    folder, leg = result
-    code, *_ = export(folder, "ranges", tmp_path / "a.yaml", capsys)
-    assert code == 0
-    drives = yaml.safe_load((tmp_path / "a.yaml").read_text())["drives"]
-    assert list(drives) == list(LEG)
-    for drive in leg.drives:
-        terms = drives[drive.joint]
-        kp = {"nominal": pytest.approx(drive.kp), "source": "stated", "unit": "N m/rad"}
-        assert terms["kp"] == kp
-        for term in ("delay", "armature", "coulomb"):
-            x = getattr(drive, term)
-            half = 1.96 * (0.1 * x + 1e-6)
-            assert terms[term]["low"] == pytest.approx(x - half, rel=1e-3)
-            assert terms[term]["high"] == pytest.approx(x + half, rel=1e-3)
-            assert terms[term]["source"] == "data"
-    assert {"coulomb_q1", "coulomb_q2"} <= drives[LEG[2]].keys()
-    entries = [
-        {"name": f"j.{term}", "value": 1.0, "std_error": 1.0, "unit": "-"}
-        for term in ("kp", "kd", "zero", "offset")
-    ]
-    entries += [{**entry, "name": "j.bias", "quantile": 2.5} for entry in entries[-1:]]
-    content = load_result(folder).content | {"drive_parameters": entries}
-    lows = {term: ends["low"] for term, ends in stated_ranges(content)["drives"]["j"].items()}
-    wanted = {"kp": np.exp(-1.96), "kd": 0.0, "zero": -0.96, "offset": -0.96, "bias": -1.5}
-    assert lows == pytest.approx(wanted, rel=1e-4)
-
-
-def test_options_of_other_formats_and_results_without_gains_are_refused(result, tmp_path, capsys):
-    folder, _ = result
-    for kind, *flags in (
-        ("sdf", "--step", "0.001"), ("isaac", "--delay", "filter"),
-    ):  # fmt: skip
-        code, _, err = export(folder, kind, tmp_path / "a", capsys, *flags)
-        assert code == 2
-        assert f"{flags[0]} is an option of mjcf" in err or "--delay is an option of" in err
-    code, _, err = export(folder, "isaac", tmp_path / "a", capsys, "--step", "0")
-    assert code == 2
-    assert "step is 0 s, wanted a positive time" in err
-    with pytest.raises(DataError, match="the result has no gains of drives"):
-        isaac_actuators(plant("leg", np.random.default_rng(0)).model, (), 0.005)
-    assert not list(tmp_path.iterdir())
-
-
-def test_a_file_without_commands_is_as_before(tmp_path):
-    leg = plant("leg", np.random.default_rng(0))
-    write_mjcf(leg.model, leg.model.standard_parameters(), tmp_path / "a.xml")
-    top = ET.parse(tmp_path / "a.xml").getroot()
-    assert {actuator.tag for actuator in top.find("actuator")} == {"motor"}
-    assert "timestep" not in top.find("option").attrib

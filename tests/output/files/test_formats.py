@@ -13,7 +13,6 @@ from helpers.commanded_results import written_result
 from helpers.mujoco_plant import plant
 from helpers.paths import DOCS, ROOT
 
-from robotid.base.exceptions import SettingsError
 from robotid.cli import main
 from robotid.cli.export import export
 from robotid.output.files import exports
@@ -71,22 +70,6 @@ def test_the_pages_name_each_format():
     for kind in formats():
         assert re.search(rf"`{kind}`|--format {kind} ", readme)
         assert f"--format {kind} --out" in page
-
-
-def test_each_option_goes_to_the_formats_that_have_it_alone(result, tmp_path):
-    refused = {
-        (kind, name)
-        for kind in formats()
-        for name in ("step", "delay")
-        if name not in formats()[kind].options
-    }
-    assert {kind for kind, _ in refused} == {"urdf", "sdf", "isaac", "ranges"}
-    for kind, name in refused:
-        with pytest.raises(SettingsError, match=rf"--{name} is an option of .*mjcf.*, not of"):
-            export(result, kind, tmp_path / "a", **{name: 1})
-    with pytest.raises(SettingsError, match="format is 'obj', wanted one of urdf, isaac, mjcf"):
-        export(result, "obj", tmp_path / "a")
-    assert not list(tmp_path.iterdir())
 
 
 def test_a_new_format_is_a_module(result, tmp_path, capsys, monkeypatch):

@@ -12,7 +12,6 @@ import robotid
 from robotid.base.exceptions import DataError
 from robotid.cli.identify import run_job
 from robotid.cli.job import read_job
-from robotid.estimation.fitting.estimator_settings import EstimatorSettings
 from robotid.robot.model import RobotModel
 
 URDF = ROOT / "urdf" / "planar_2r.urdf"
@@ -85,13 +84,3 @@ def test_a_result_without_a_urdf_says_why_there_is_no_robot(written, tmp_path):
     assert result.verdict["status"]
     with pytest.raises(DataError, match=r"result.json has no URDF, because its parameters are"):
         _ = result.robot
-
-
-def test_a_folder_without_a_result_is_named(tmp_path):
-    with pytest.raises(DataError, match=r"there is no result '.*result.json'"):
-        robotid.load_result(tmp_path)
-
-
-def test_estimators_of_stored_settings_are_those_that_ran(written):
-    stated = robotid.load_result(written[0]).content["settings"]["estimator"]
-    assert EstimatorSettings(**stated) == written[1].estimator

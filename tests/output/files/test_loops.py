@@ -1,15 +1,12 @@
 """What result.json holds of loops, figure by figure, for two joints of two kinds and three logs."""
 
-from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from helpers.crane import RATES, STARTS
 
 from robotid.output.files.entries import (
     _covariance,
-    input_entries,
     loop_entries,
     loop_parameters,
 )
@@ -18,30 +15,6 @@ from robotid.output.files.entries import (
 @pytest.fixture(scope="module")
 def entries(crane):
     return loop_entries(crane)
-
-
-def test_what_was_stated_has_no_error_and_what_was_found_has_its_own(crane, entries):
-    estimate, loops = crane.fit.estimate, crane.fit.loops
-    [k] = [k for k, name in enumerate(estimate.names) if name.endswith("delay")]
-    units = {"kp": ("N/m", "N m/rad"), "kd": ("N s/m", "N m s/rad"), "delay": ("s", "s"),
-             "limit": ("N", "N m"), "zero": ("m", "rad")}  # fmt: skip
-    wanted = []
-    for j, joint in enumerate(("rail", "turn")):
-        for what, unit in units.items():
-            if (joint, what) == ("turn", "limit"):
-                continue  # it has none
-            is_free = what == "delay"  # of all drives together
-            wanted.append({
-                "name": f"{joint}.{what}", "value": getattr(loops, what)[j],
-                "std_error": estimate.std_error[k] if is_free else None,
-                "quantile": estimate.quantile[k] if is_free else None,
-                "unit": unit[j], "source": "data" if is_free else "stated",
-            })  # fmt: skip
-    assert entries["loop_parameters"] == wanted
-    assert loops.delay == pytest.approx(np.full(2, 0.006), abs=4 * estimate.std_error[k])
-    assert entries["simulation"]["controller"] == {
-        "kind": "pd", "effort_limit": {"rail": 80.0}, "rate": None,
-    }  # fmt: skip
 
 
 def test_each_joint_has_the_error_of_its_own_unknown():
@@ -88,65 +61,6 @@ def test_each_joint_has_the_error_of_its_own_unknown():
                 "unit": unit, "source": source if name in errors else "stated",
             }  # fmt: skip
     assert loop_parameters(SimpleNamespace(loop=SimpleNamespace(kind="torque"))) == []
-
-
-def test_sums_of_bodies_that_were_not_fitted_are_named(crane):
-    n, names = crane.model.layout.n_inertial, np.array(crane.mapping.base_names)
-    is_body = np.array(crane.mapping.independent) < n
-    assert is_body.sum() > 1
-    assert (~is_body).sum() > 1
-    error = np.ones(len(names))
-    last, drive = np.flatnonzero(is_body)[-1], np.flatnonzero(~is_body)[0]
-    error[[last, drive]] = np.inf
-    other = loop_entries(replace(crane, base_error=error))
-    assert other["ranges"]["undetermined"] == [names[last]]
-
-
-def test_each_log_has_its_times_rate_and_role(crane):
-    inputs = input_entries(crane)[1:]
-    assert [entry["role"] for entry in inputs] == ["identification"] * 2 + ["validation"]
-    for entry, start, rate in zip(inputs, STARTS, RATES, strict=True):
-        rows = round(1.5 * rate)
-        assert entry["samples"] == entry["rows_used"] == rows
-        assert entry["rate"] == pytest.approx(rate)
-        assert entry["start"] == start
-        assert entry["end"] == pytest.approx(start + (rows - 1) / rate)
-
-
-def test_open_loops_have_the_errors_of_each_joint_and_horizon(crane, entries):
-    for role, runs in (("identification", crane.fitted), ("validation", crane.validation)):
-        shown = [run.to_dict() for run in runs]
-        if role == "identification":
-            assert entries["simulation"][role] == shown
-        assert len(shown) == {"identification": 2, "validation": 1}[role]
-        for entry, run in zip(shown, runs, strict=True):
-            assert (entry["start"], entry["end"]) == (run.log.t[0], run.log.t[-1])
-            error = np.sqrt(np.mean((run.log.q - run.q) ** 2, axis=0))
-            off = np.sqrt(np.mean((run.log.q_ref - run.log.q) ** 2, axis=0))
-            for j, joint in enumerate(("rail", "turn")):
-                own = entry["per_joint"][joint]
-                assert own["unit"] == ("m", "rad")[j]
-                assert own["rmse"] == pytest.approx(error[j])
-                assert own["command_rmse"] == pytest.approx(off[j])
-                assert own["urdf_rmse"] == run.baselines["urdf"][j]
-            assert list(entry["horizons"]) == ["0.1", "0.5"]
-            for horizon, errors in run.horizons.items():
-                assert entry["horizons"][f"{horizon:g}"] == dict(
-                    zip(("rail", "turn"), errors, strict=True)
-                )
-    [kept] = [run.to_dict() for run in crane.validation]
-    share = 100 * crane.validation[0].rmse / crane.validation[0].log.q.std(axis=0)
-    for joint, own in zip(("rail", "turn"), share, strict=True):
-        assert kept["per_joint"][joint]["relative_error_pct"] == pytest.approx(own)
-
-
-def test_the_fit_says_what_it_is(crane, entries):
-    fit, estimate = entries["simulation"]["fit"], crane.fit.estimate
-    assert fit["converged"] is True
-    assert fit["parameters"] == len(estimate.names) == 5  # two armatures and frictions, one delay
-    assert entries["structure"]["rank"] == estimate.rank == 5
-    assert entries["uncertainty"]["inflation"] == estimate.details["inflation"]
-    assert entries["simulation"]["signs"] == {"rail": 1.0, "turn": 1.0}
 
 
 def test_the_covariance_is_that_of_the_free_parameters_that_are_not_at_a_bound(rng):

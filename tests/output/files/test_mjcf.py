@@ -1,7 +1,5 @@
 """What MuJoCo loads moves as what was identified."""
 
-import xml.etree.ElementTree as ET
-
 import mujoco
 import numpy as np
 import pinocchio as pin
@@ -11,13 +9,8 @@ from helpers.robots import possible_parameters
 from helpers.simulators import SIMULATED, simulated, states
 from scipy.spatial.distance import pdist
 
-from robotid.base.exceptions import ModelError
-from robotid.output.files.commanded import CommandedDrive
-from robotid.output.files.exports import unstated_terms
 from robotid.output.files.mjcf import write_mjcf
 from robotid.robot.closure import Chains
-from robotid.robot.constraints import Loop
-from robotid.robot.drives import Cubic, Spring
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import Coupling
 
@@ -111,22 +104,6 @@ def test_inverse_dynamics_on_a_log_are_the_fits(identified, tmp_path):
     np.testing.assert_allclose(found[moves], wanted[moves], atol=1e-9 * abs(wanted).max(), rtol=0)
 
 
-def test_friction_is_coulombs_at_slow_speeds_too(identified, tmp_path):
-    model, pi = identified.model, identified.standard
-    write_mjcf(model, pi, tmp_path / "robot.xml")
-    robot, data = load(tmp_path / "robot.xml")
-    data.qpos, data.qvel, data.qacc = 0.5, 0.005, 0.0
-    mujoco.mj_inverse(robot, data)
-    coulomb = [pi[model.layout.names.index(f"{joint}.coulomb")] for joint in model.joints]
-    np.testing.assert_allclose(-data.qfrc_constraint, coulomb, rtol=1e-12)
-    # at rest, with a torque below the friction: one in a thousand of the acceleration remains
-    robot.opt.gravity, data.qvel = 0.0, 0.0
-    k = model.joints.index("elbow_joint")
-    data.qfrc_applied[k] = 0.5 * coulomb[k]
-    mujoco.mj_forward(robot, data)
-    assert abs(data.qacc[k]) < 0.002 * abs(data.qacc_smooth[k])
-
-
 def test_limits_shapes_and_meshes(tmp_path):
     box = b"\0" * 80 + (4).to_bytes(4, "little")
     corners = np.vstack([np.zeros(3), np.eye(3)]).astype("<f4")
@@ -160,16 +137,6 @@ def test_limits_shapes_and_meshes(tmp_path):
     np.testing.assert_allclose(np.sort(pdist(robot.mesh_vert)), edges, rtol=1e-5)
 
 
-def test_joints_that_follow_are_held_to_their_leader(tmp_path):
-    model, pi = simulated("fingers that slide")
-    write_mjcf(model, pi, tmp_path / "robot.xml")
-    robot, _ = load(tmp_path / "robot.xml")
-    pair = [named(robot, f"panda_finger_joint{i}") for i in (2, 1)]
-    assert [robot.eq_obj1id[0], robot.eq_obj2id[0]] == pair
-    np.testing.assert_array_equal(robot.eq_data[0, :5], [0, 1, 0, 0, 0])
-    assert robot.nu == robot.nv - 1
-
-
 def test_an_actuator_takes_off_the_offsets_of_all_drives_that_turn_with_its_joint(tmp_path):
     shared = Coupling("k", (("j", 0.5), ("k", -3.0)), replaces=True)
     model = small(tmp_path, couplings=[shared])
@@ -180,62 +147,6 @@ def test_an_actuator_takes_off_the_offsets_of_all_drives_that_turn_with_its_join
     robot, _ = load(tmp_path / "robot.xml")
     bias = [-(0.7 + 0.5 * 0.9), 3.0 * 0.9]
     np.testing.assert_allclose(robot.actuator_biasprm[:, 0], bias, rtol=1e-12)
-
-
-def test_springs_are_at_rest_at_the_zero_of_the_urdf_wherever_the_encoder_has_its_own(tmp_path):
-    model = small(tmp_path, own_terms={"j": [Spring()], "k": [Spring()]})
-    pi = possible_parameters(model, np.random.default_rng(0))
-    values = dict(zip(model.layout.names, pi.tolist(), strict=True))
-    drives = [
-        CommandedDrive(
-            joint, 50.0, 2.0, 0.0, zero,
-            *(values[f"{joint}.{term}"] for term in ("armature", "viscous", "coulomb", "offset")),
-            np.inf,
-        )
-        for joint, zero in (("j", 0.3), ("k", -0.7))
-    ]  # fmt: skip
-    write_mjcf(model, pi, tmp_path / "robot.xml", commanded=drives)
-    robot, data = load(tmp_path / "robot.xml")
-    read = np.array([0.25, 0.4])  # by the encoders
-    data.qpos = read
-    mujoco.mj_forward(robot, data)
-    stiffness = np.array([values["j.spring"], values["k.spring"]])
-    assert (stiffness != 0.0).all()
-    np.testing.assert_allclose(data.qfrc_passive, -stiffness * (read + np.array([0.3, -0.7])))
-    np.testing.assert_allclose(robot.qpos0, [-0.3, 0.7])
-    np.testing.assert_allclose(robot.jnt_range[0], [-1.3, 1.7])
-
-
-def test_a_term_that_mjcf_has_no_place_for_is_named(tmp_path):
-    model = small(tmp_path, own_terms={"j": [Cubic()], "k": [Spring(), Cubic()]})
-    pi = possible_parameters(model, np.random.default_rng(0))
-    pi[model.layout.names.index("j.cubic")] = 0.0  # nothing is lost of it
-    pi[model.layout.names.index("k.spring")] = stiffness = -3.0
-    notes = write_mjcf(model, pi, tmp_path / "robot.xml")
-    robot, data = load(tmp_path / "robot.xml")
-    data.qpos = [0.0, 0.4]
-    mujoco.mj_forward(robot, data)
-    np.testing.assert_allclose(data.qfrc_passive, [0.0, -stiffness * 0.4])
-    assert notes[0] == "MJCF cannot state k.cubic; the drive parameters file of the URDF has them"
-    parser = ET.XMLParser(target=ET.TreeBuilder(insert_comments=True))
-    comment = ET.parse(tmp_path / "robot.xml", parser).getroot()[0].text
-    assert notes[0] in comment
-    assert notes[1] in comment
-    assert "arm- -1" in comment  # two dashes would end it
-
-
-def test_what_no_simulator_reads_is_refused_before_anything_is_written(tmp_path):
-    model = small(tmp_path, last="world")
-    pi = possible_parameters(model, np.random.default_rng(0))
-    with pytest.raises(ModelError, match="a moving link is named 'world'"):
-        write_mjcf(model, pi, tmp_path / "robot.xml")
-    model = small(tmp_path, held=".5", joints=["j"])
-    pi = model.standard_parameters()  # the sum of both links, of which one is impossible
-    with pytest.raises(
-        ModelError, match="link 'lower', beyond a locked joint, has a physically impossible"
-    ):
-        write_mjcf(model, pi, tmp_path / "robot.xml")
-    assert not (tmp_path / "robot.xml").exists()
 
 
 @pytest.mark.parametrize("robot", [four_bar, ankle])
@@ -257,13 +168,3 @@ def test_loops_are_closed_in_mujoco(robot, tmp_path, rng):
         mujoco.mj_forward(robot, data)
         wanted = oracle.acceleration(q_k, v, tau)
         np.testing.assert_allclose(data.qacc[at], wanted, atol=1e-2 * np.abs(wanted).max())
-
-
-def test_a_rigid_loop_is_a_weld_and_others_are_stated_elsewhere(tmp_path):
-    model = four_bar(tmp_path, constraints=[Loop(("coupler_end", "rocker_end"), "rigid")])
-    pi = model.standard_parameters()
-    write_mjcf(model, pi, tmp_path / "welded.xml")
-    robot, _ = load(tmp_path / "welded.xml")
-    assert list(robot.eq_type) == [mujoco.mjtEq.mjEQ_WELD]
-    (note,) = unstated_terms(model, pi, "SDF", ())
-    assert note.startswith("SDF cannot state the loop coupler_end - rocker_end; the drive param")

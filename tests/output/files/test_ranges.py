@@ -12,13 +12,10 @@ from scipy.spatial.transform import Rotation
 from robotid.data.log import Trajectory
 from robotid.dynamics.friction_projection import drive_moments, project_friction
 from robotid.output.files.entries import build_result
-from robotid.output.files.exports import yaml_text
 from robotid.output.files.ranges import (
-    body_ranges,
     parameter_ranges,
     projected_ranges,
     ranges_text,
-    stated_ranges,
     write_ranges,
 )
 from robotid.robot.drives import Stribeck
@@ -96,22 +93,6 @@ def test_widths_are_those_of_draws_from_the_covariance(identified):
             )
 
 
-def test_a_link_of_which_something_was_identified_has_ends_and_another_none(identified):
-    """Of a link whose mass alone is uncertain, and of one of which nothing was fitted."""
-    C = np.zeros_like(identified.standard_covariance)
-    C[10, 10] = 0.01**2
-    found = body_ranges(
-        identified.model, identified.standard, C, identified.sources, np.full(len(C), 2.0)
-    )
-    first, second, *_ = found.values()
-    m = identified.standard[10]
-    assert second["mass"]["high"] == pytest.approx(m + 0.02)
-    assert second["mass"]["low"] == pytest.approx(m * np.exp(-0.02 / m))
-    x = second["com"]["x"]
-    assert x["high"] - x["nominal"] == pytest.approx(0.02 * abs(x["nominal"]) / m)
-    assert first["mass"].keys() == {"nominal", "source"}
-
-
 def test_what_is_drawn_is_possible_however_wide_the_intervals(identified):
     wide = replace(identified, standard_covariance=25.0 * identified.standard_covariance)
     for (_, key, _), figure in figures(parameter_ranges(wide)):
@@ -119,30 +100,6 @@ def test_what_is_drawn_is_possible_however_wide_the_intervals(identified):
             assert 0 < figure["low"] < figure["nominal"] < figure["high"]
         elif key in ("armature", "viscous", "coulomb") and "low" in figure:
             assert 0 <= figure["low"] <= figure["nominal"] <= figure["high"]
-
-
-def test_sources_are_said_and_a_drive_at_its_bound_has_no_interval(identified):
-    layout = identified.model.layout
-    at = layout.names.index("elbow_joint.coulomb")
-    standard = identified.standard.copy()
-    standard[at] = 0.0
-    unbounded = replace(identified.errors, unbounded=None)
-    held = replace(identified, standard=standard, errors=unbounded)
-    assert held.sources[at] == "prior"  # the URDF's value, 0, stands; but no interval is known
-    content = parameter_ranges(held)
-    bound = {"nominal": 0.0, "source": "bound", "unit": "N m"}
-    assert content["drives"]["elbow_joint"]["coulomb"] == bound
-    sources = dict(zip(layout.names, held.sources, strict=True))
-    assert len(set(sources.values())) > 1
-    for (owner, key, inner), figure in figures(content):
-        if key in ("mass", "com"):
-            own = {sources[f"{owner}.m"]} | ({sources[f"{owner}.mc{inner}"]} if inner else set())
-        elif key in ("second_moments", "principal_moments"):
-            own = {source for name, source in sources.items() if name.startswith(f"{owner}.")}
-        else:
-            own = {sources[f"{owner}.{key}"] if "low" in figure else "bound"}
-        assert figure["source"] == (own.pop() if len(own) == 1 else "mixed")
-    assert content["undetermined"] == list(identified.determination.undetermined)
 
 
 def test_yaml_and_result_have_the_same_figures(identified, ranges, tmp_path):
@@ -160,89 +117,6 @@ def test_yaml_and_result_have_the_same_figures(identified, ranges, tmp_path):
             assert value == (exact[key] if is_text else pytest.approx(exact[key], rel=1e-5, abs=0))
     assert not wanted
     assert build_result(identified, {"estimator": {"name": "consistent"}})["ranges"] == ranges
-
-
-@pytest.mark.parametrize("name", ["a\u2028b", "a\u2029b", "a\x85b", "a\ufeffb", "no", "é"])
-def test_names_of_any_characters_are_read_back_from_yaml(name):
-    table = {name: {"inner": {name: 1.5, "plain": [name, True, None]}}, "plain": name}
-    text = yaml_text(table, "# head")
-    assert yaml.safe_load(text) == table
-    assert len(text.splitlines()) == text.count("\n")
-
-
-def test_ends_of_loop_parameters_are_as_far_as_each_reaches():
-    entries = [
-        ("a.kp", 20.0, 2.0, 2.5, {}), ("a.kd", 0.5, 0.4, None, {}),
-        ("a.delay", 0.01, 0.002, 3.0, {}),
-        ("b.kp", 30.0, None, None, {}), ("b.offset", -0.2, 0.3, 2.0, {"source": "mixed"}),
-        ("b.coulomb", 0.0, 0.1, 2.0, {"at_bound": True}), ("b.zero", 0.1, 0.05, 2.0, {}),
-    ]  # fmt: skip
-    content = {
-        "robot": "arm",
-        "structure": {"undetermined": ["x"]},
-        "drive_parameters": [
-            {"name": name, "value": value, "std_error": error, "quantile": reach, "unit": name[-3:]}
-            | others
-            for name, value, error, reach, others in entries
-        ],
-    }
-    found = stated_ranges(content)
-    assert (found["robot"], found["confidence"], found["undetermined"]) == ("arm", 0.95, ["x"])
-    low, high = 20.0 * np.exp(-2.5 * 2.0 / 20.0), 20.0 + 2.5 * 2.0
-    wanted = {
-        "a": {
-            "kp": (20.0, low, high, "data"), "kd": (0.5, 0.0, 0.5 + 1.96 * 0.4, "data"),
-            "delay": (0.01, 0.004, 0.016, "data"),
-        },
-        "b": {
-            "kp": (30.0, None, None, "stated"), "offset": (-0.2, -0.8, 0.4, "mixed"),
-            "coulomb": (0.0, 0.0, 0.2, "bound"), "zero": (0.1, 0.0, 0.2, "data"),
-        },
-    }  # fmt: skip
-    assert {drive: list(terms) for drive, terms in found["drives"].items()} == {
-        drive: list(terms) for drive, terms in wanted.items()
-    }
-    for drive, terms in wanted.items():
-        for term, (nominal, low, high, source) in terms.items():
-            own = found["drives"][drive][term]
-            assert (own["nominal"], own["source"]) == (nominal, source)
-            assert own["unit"] == f"{drive}.{term}"[-3:]
-            if low is None:
-                assert not {"low", "high"} & set(own)
-            else:
-                assert (own["low"], own["high"]) == pytest.approx((low, high), abs=1e-12)
-
-
-def test_ends_of_gains_are_those_of_the_next_log():
-    entries = [
-        ("a.kp", 20.0, 2.0),
-        ("a.delay", 0.01, 0.002),
-        ("a.kd", 0.5, None),
-        ("b.zero", 0.1, 0.1),
-    ]
-    content = {
-        "robot": "arm",
-        "structure": {"undetermined": []},
-        "drive_parameters": [
-            {"name": name, "value": value, "std_error": error, "unit": "x"}
-            for name, value, error in entries
-        ],
-        "variation": {
-            "parameters": {
-                "a.kp": {"next_interval": [-1.0, 33.0]},
-                "a.delay": {"next_interval": [0.004, 0.02]},
-                "b.zero": {"next_interval": [-0.7, 0.4]}, "a.kd": {"next_interval": [0.1, 0.9]},
-                "calf.armature": {"next_interval": [0.0, 1.0]},
-            }
-        },
-    }  # fmt: skip
-    drives = stated_ranges(content)["drives"]
-    ends = {name: (drives[name[0]][name[2:]].get("low"), drives[name[0]][name[2:]].get("high"),
-                   drives[name[0]][name[2:]]["source"]) for name, *_ in entries}  # fmt: skip
-    assert ends == {
-        "a.kp": (0.0, 33.0, "logs"), "a.delay": (0.004, 0.02, "logs"),
-        "a.kd": (None, None, "stated"), "b.zero": (-0.7, 0.4, "logs"),
-    }  # fmt: skip
 
 
 def test_projected_friction_is_as_wide_as_draws_of_what_it_replaces(ur5):

@@ -6,20 +6,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scipy.stats
-from helpers.commanded_results import written_result
-from helpers.mujoco_plant import plant
 
 import robotid
-from robotid.base.exceptions import DataError
 from robotid.cli import main
 from robotid.estimation.variation.variation import SCORES
 from robotid.output.files.result_file import load_result
 from robotid.output.files.samples import (
-    _between,
-    _positive_definite,
-    _quantile,
     sample,
-    write_samples,
 )
 from robotid.robot.parameters import pseudo_inertia
 
@@ -144,110 +137,3 @@ def test_bad_options_are_named(folder, tmp_path, flags, words, capsys):
     assert words in capsys.readouterr().err
     assert not target.exists()
     assert not list(tmp_path.iterdir())
-
-
-def test_results_of_earlier_versions_have_no_covariance(folder):
-    result = load_result(folder)
-    content = {key: value for key, value in result.content.items() if key != "covariance"}
-    with pytest.raises(DataError, match="of an earlier version has no covariance; identify"):
-        sample(replace(result, content=content), 3, np.random.default_rng(0))
-
-
-def test_samples_of_gains_are_positive_and_vary_with_the_logs(tmp_path):
-    leg = plant("leg", np.random.default_rng(0), delay=0.004)
-    result = load_result(written_result(leg, tmp_path / "out"))
-    names, first = list(result.robot.layout.names), leg.drives[0]
-    own = [f"{first.joint}.delay", f"{first.joint}.kp", f"{leg.drives[1].joint}.kp"]
-    root = [[]] * len(names) + [[0.004], [0.0, 0.5], [0.0, 0.3, 0.4]]
-    spread = 0.8 * first.kp
-    variation = {
-        "parameters": {
-            own[1]: {
-                "std_error": 0.1 * spread,
-                "next_interval": [first.kp - 1.96 * spread, first.kp + 1.96 * spread],
-                "next_quantiles": (first.kp + spread * SCORES).tolist(),
-            }
-        },
-        "correlation": [[1.0]],
-    }
-    stated = {"covariance": {"names": [*names, *own], "root": root}, "variation": variation}
-    every, values = sample(
-        replace(result, content={**result.content, **stated}), 1500, np.random.default_rng(2)
-    )
-    assert every == [*names, *own]
-    assert (values[:, : len(names)] == result.parameters).all()
-    delay, kp, other = values[:, len(names) :].T
-    half = scipy.stats.truncnorm(-1.0, np.inf, 0.004, 0.004)
-    assert scipy.stats.kstest(delay, half.cdf).pvalue > 1e-3
-    wide = scipy.stats.truncnorm(-1 / 0.8, np.inf, first.kp, spread)
-    assert scipy.stats.kstest(kp, wide.cdf).pvalue > 1e-3
-    assert other.std() == pytest.approx(0.5, rel=0.1)
-    # of the error of the mean, a tenth of the deviation, the other gain knows 0.6
-    assert np.corrcoef(kp, other)[0, 1] == pytest.approx(0.06, abs=0.08)
-    plain = replace(result, content={**result.content, "covariance": stated["covariance"]})
-    write_samples(plain, tmp_path / "x.json", 20, 1)
-    content = json.loads((tmp_path / "x.json").read_text())
-    assert content["parameters"]["units"][-3:] == ["s", "N m/rad", "N m/rad"]
-    assert len(content["drives"][first.joint]["kp"]) == 20
-
-
-@pytest.mark.parametrize(("std_error", "of_gain"), [(0.8, 0.5), (0.3, 0.3)])
-def test_a_gain_of_the_next_log_has_the_part_of_the_fit_in_its_error(tmp_path, std_error, of_gain):
-    """Its deviation is 1 % of it, its error in the fit half of that, with r = 0.6 to another."""
-    leg = plant("leg", np.random.default_rng(0))
-    result = load_result(written_result(leg, tmp_path / "out"))
-    names, first = list(result.robot.layout.names), leg.drives[0]
-    own, size = [f"{drive.joint}.kp" for drive in leg.drives[:2]], 0.01 * first.kp
-    entry = {
-        "std_error": std_error * size,
-        "next_interval": [first.kp - 1.96 * size, first.kp + 1.96 * size],
-        "next_quantiles": (first.kp + size * SCORES).tolist(),
-    }
-    root = [[]] * len(names) + [[0.5 * size], [0.3 * size, 0.4 * size]]
-    stated = {
-        "covariance": {"names": [*names, *own], "root": root},
-        "variation": {"parameters": {own[0]: entry}, "correlation": [[1.0]]},
-    }
-    varying = replace(result, content={**result.content, **stated})
-    _, values = sample(varying, 800, np.random.default_rng(3))
-    kp, other = values[:, -2:].T
-    assert kp.std() == pytest.approx(size, rel=0.1)
-    assert np.corrcoef(kp, other)[0, 1] == pytest.approx(0.6 * of_gain, abs=0.08)
-
-
-def test_positive_definite_matrices_have_positive_eigenvalues(rng):
-    A = rng.standard_normal((400, 4, 4))
-    J = A @ A.mT - rng.uniform(0.0, 1.0, 400)[:, None, None] * np.eye(4)
-    wanted = np.linalg.eigvalsh(J)[:, 0] > 0.0
-    assert 50 < wanted.sum() < 350
-    np.testing.assert_array_equal(_positive_definite(J), wanted)
-    assert _positive_definite(np.diag([1.0, 2.0, 3.0, 0.0])[None]).tolist() == [False]
-
-
-def test_parameters_at_a_bound_have_no_quantiles_of_the_next_log():
-    """A place is that in the stated variation; an interval is 1.96 errors wide on each side."""
-    entries = [{"name": "a.kp"}, {"name": "b.kp", "at_bound": True}, {"name": "c.kd"}]
-    low = np.array([1.0, 2.0, 3.0])
-    parameters = {
-        entry["name"]: {
-            "next_interval": [x, x + 0.98], "std_error": x / 10, "next_quantiles": [x, x + 0.5]
-        }
-        for entry, x in zip(entries, low, strict=True)
-    }  # fmt: skip
-    found = _between({"drive_parameters": entries, "variation": {"parameters": parameters}})
-    assert list(found) == ["a.kp", "c.kd"]
-    for name, place, x in (("a.kp", 0, 1.0), ("c.kd", 2, 3.0)):
-        assert found[name]["at"] == place
-        assert found[name]["errors"] == pytest.approx((x / 10, 0.25), rel=1e-4)
-        np.testing.assert_array_equal(found[name]["quantiles"], [x, x + 0.5])
-    assert _between({"drive_parameters": entries}) == {}
-
-
-def test_the_typical_quantile_is_the_median_of_those_of_uncertain_parameters():
-    standard = [{"quantile": 2.0, "std_error": 1.0}, {"quantile": 9.0, "std_error": 0.0}, {}]
-    drives = [{"quantile": 3.0, "std_error": 0.1}, {"quantile": None, "std_error": 0.1},
-              {"quantile": 2.5, "std_error": 0.2}]  # fmt: skip
-    content = {"standard_parameters": standard, "drive_parameters": drives}
-    assert _quantile(content) == 2.5
-    content["drive_parameters"] = content["standard_parameters"] = standard[1:]
-    assert _quantile(content) == pytest.approx(1.96, abs=1e-3)

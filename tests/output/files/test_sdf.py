@@ -101,30 +101,6 @@ def test_mass_matrix_and_forces_are_pinocchios(name, tmp_path):
         np.testing.assert_allclose(force, state.tau, atol=1e-9 * abs(state.tau).max(), rtol=0)
 
 
-def test_limits_friction_mimic_and_what_is_not_stated(tmp_path):
-    model, pi = simulated("fingers that slide")
-    notes = write_sdf(model, pi, tmp_path / "robot.sdf")
-    text = (tmp_path / "robot.sdf").read_text()
-    assert all(note in text for note in notes)
-    offsets = ", ".join(f"{joint}.offset" for joint in model.joints)
-    assert notes[0] == f"SDF cannot state {offsets}; the drive parameters file of the URDF has them"
-    assert "<gravity>0.0 0.0 -9.81</gravity>" in notes[-1]
-    top = ET.parse(tmp_path / "robot.sdf").getroot()
-    assert top.get("version") == "1.11"  # the first with <mimic>
-    values = dict(zip(model.layout.names, pi, strict=True))
-    joints = {joint.get("name"): joint for joint in top.iter("joint")}
-    for limits in model.limits:
-        axis = joints[limits.name].find("axis")
-        for key in ("lower", "upper", "effort", "velocity"):
-            assert float(axis.findtext(f"limit/{key}")) == getattr(limits, key)
-        assert float(axis.findtext("dynamics/friction")) == values[f"{limits.name}.coulomb"]
-    # links on fixed joints are frames but for the root, which is at rest
-    fixed = [joint.get("name") for joint in top.iter("joint") if joint.get("type") == "fixed"]
-    assert fixed == ["world_to_panda_link0"]
-    (mimic,) = top.iter("mimic")
-    assert (mimic.get("joint"), mimic.findtext("multiplier")) == ("panda_finger_joint1", "1.0")
-
-
 def test_shapes_lie_where_the_urdf_has_them(tmp_path):
     model, pi = simulated("humanoid, floating")  # with links on fixed joints, which are frames
     write_sdf(model, pi, tmp_path / "robot.sdf")

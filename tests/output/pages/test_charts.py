@@ -8,7 +8,6 @@ from helpers.pages import charts
 from robotid.base.exceptions import DataError
 from robotid.output.pages.charts import (
     Chart,
-    Plot,
     Series,
     broken,
     chart_html,
@@ -290,12 +289,3 @@ def test_a_line_is_broken_in_the_middle_of_each_gap():
     np.testing.assert_array_equal(times, [10.0, 10.5, 11.0, 12.5, 14.0, 14.5, 17.5, 20.5])
     np.testing.assert_array_equal(one, [0, 1, 2, np.nan, 3, 4, np.nan, 5])
     np.testing.assert_array_equal(two, -one)
-
-
-def test_a_cell_of_a_notebook_is_as_high_as_its_charts():
-    def height(*each):
-        own = [Chart("a", np.arange(2.0), (), "x", "y", height=h) for h in each]
-        plot = Plot("two", tuple((chart, "") for chart in own))
-        return int(re.search(r"height:(\d+)px", plot._repr_html_())[1])
-
-    assert (height(100, 150), height(500, 500)) == (100 + 150 + 2 * 112 + 60, 900)

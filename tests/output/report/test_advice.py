@@ -12,17 +12,20 @@ from robotid.base.findings import Finding
 from robotid.cli import _parser
 from robotid.cli.job import job_from_settings
 from robotid.diagnosis.catalogue import codes_with
-from robotid.diagnosis.residual.candidates import CANDIDATES, couplings, ripples
-from robotid.diagnosis.residual.misfit import Misfit
-from robotid.diagnosis.residual.misfit_findings import misfit_findings, setting_of
-from robotid.diagnosis.verdict.payload_check import PayloadCheck
+from robotid.diagnosis.residual.misfit import (
+    CANDIDATES,
+    Misfit,
+    couplings,
+    misfit_findings,
+    ripples,
+    setting_of,
+)
 from robotid.diagnosis.verdict.verdict import JointVerdict, Verdict
 from robotid.estimation.fitting.drive_terms import (
     JointMotion,
 )
-from robotid.estimation.fitting.estimator_settings import ConsistentSettings
 from robotid.identification.closed_loop.loop_settings import LoopSettings
-from robotid.output.report.next_steps import _of_verdict, _once, next_steps
+from robotid.output.report.next_steps import _once, next_steps
 from robotid.output.report.steps import Origin, Step
 from robotid.robot.examples import example_urdf
 
@@ -37,12 +40,6 @@ def told(identified, *findings, **others):
 def warning(code, where="elbow_joint", severity="warning", **evidence):
     joints = tuple(where.rpartition(": ")[2].split(", "))
     return Finding(code, severity, where, f"{code} is so; do something", evidence, joints=joints)
-
-
-def files_of(identified):
-    """Return the URDF, the fitted log and the validation log."""
-    logs = (identified.fitted[0].recording.log, identified.validation[0].recording.log)
-    return (str(identified.model.tree.path), *(log.path for log in logs))
 
 
 def predicted(identified, path, errors):
@@ -206,97 +203,6 @@ def test_a_flag_that_was_given_is_stated_anew_and_not_twice():
     assert "j7=1" not in origin.again("--lock", "j7=2").replace("j7=2", "")
 
 
-def test_a_locked_joint_is_stated_where_the_log_has_it(identified):
-    there = warning("locked_position", "a.csv: j6", median=0.18241, stated=0.0)
-    (step, *_) = next_steps(told(identified, there), FLAGS)
-    assert step.blocks == (
-        "robotid identify arm.urdf first.csv --cutoff 8 --lock j6=0.1824 --out out",
-    )
-
-
-def test_many_locked_joints_are_placed_together(identified):
-    locked = {f"hand_{i}": 0.0 for i in range(40)}
-    hand = replace(identified, model=replace(identified.model, locked=locked))
-    (step, *_) = next_steps(told(hand, warning("locked_at_zero", ", ".join(locked))), FLAGS)
-    assert "hand_0, hand_1" in step.words
-    assert step.blocks == (
-        "robotid identify arm.urdf first.csv --cutoff 8 --lock '*=POSITION' --out out",
-    )
-    (step, *_) = next_steps(told(hand, warning("locked_at_zero", ", ".join(locked))), JOB)
-    assert step.blocks[0] == '[locked]\n"*" = POSITION'
-
-
-def test_a_result_without_trouble_is_measured_used_and_played(identified, monkeypatch):
-    urdf, first, kept = files_of(identified)
-    weigh = ["robotid", "payload", urdf, "LOADED.csv", "--reference", first, "--mass", "KG"]
-    looked, scale, used = next_steps(told(identified), JOB)
-    assert looked.words.startswith("Examine the residual of shoulder_pan_joint, elbow_joint, ")
-    assert looked.blocks == (shlex.join(["robotid", "replay", urdf, kept, "out"]),)
-    assert scale.words.startswith("Verify the torque scale with a payload of known mass")
-    assert scale.blocks == (
-        '[[payload_check]]\nlog = "LOADED.csv"\nmass = KG',
-        "robotid identify 'my job.toml' --out out",
-        shlex.join([*weigh, "--gains"]),
-    )
-    assert used.words.startswith("Use the result: the identified URDF is written")
-    assert used.blocks == ("robotid export out/result.json --format mjcf --out ur5.xml",)
-    # nothing to examine, and no URDF to export
-    calm = told(identified, validation=(predicted(identified, kept, [1.0] * 6),))
-    assert [step.blocks for step in next_steps(calm, JOB)] == [
-        scale.blocks,
-        used.blocks,
-        looked.blocks,
-    ]
-    without = replace(calm, log_errors=("wrong",))
-    vars(without)["verdict"] = identified.verdict
-    weighed, *others = next_steps(without, FLAGS)
-    assert weighed.words == scale.words
-    assert weighed.blocks == (
-        FLAGS.again("--payload-check", "LOADED.csv=KG"),
-        shlex.join([*weigh, "--gains"]),
-    )
-    validated = ("robotid validate out/result.json NEW.csv",)
-    assert [step.blocks for step in others] == [looked.blocks, validated]
-    spiky = replace(calm, findings=(warning("spikes", ""),))
-    few = ", ".join(identified.model.joints[:4])
-    assert f"the residual of {few} and 2 more in" in next_steps(spiky, JOB)[0].words
-    (fitted, *_) = identified.fitted
-    unsaved = replace(fitted.recording, log=replace(fitted.recording.log, path=""))
-    arrays = replace(calm, fitted=(replace(fitted, recording=unsaved),))
-    assert next_steps(arrays, JOB)[0].blocks == scale.blocks[:2]
-    with monkeypatch.context() as patched:
-        patched.setattr(type(calm), "is_consistent", False)
-        by_flags, by_job = (next_steps(replace(calm), origin)[0] for origin in (FLAGS, JOB))
-    assert by_flags.words.startswith("Identify with the consistent estimator: the result of con")
-    assert by_flags.blocks == (FLAGS.again("--estimator", "consistent"),)
-    table = '[estimator]\nname = "consistent"'
-    assert by_job.blocks == (table, "robotid identify 'my job.toml' --out out")
-    poor = replace(calm, findings=(warning("undetermined", ""),))
-    (again,) = (s for s in next_steps(poor, JOB) if s.words.startswith("Record another motion"))
-    count = len(poor.determination.undetermined)
-    assert again.words.endswith(f"the data do not determine {count} base parameters.")
-    assert again.blocks == (
-        '[[identification]]\nlog = "NEW.csv"',
-        "robotid identify 'my job.toml' --out out",
-    )
-    assert next_steps(poor, FLAGS)[0].blocks == (
-        "robotid identify arm.urdf NEW.csv first.csv --cutoff 8 --out out",
-    )
-    assert next_steps(poor, Origin())[0].blocks == ('[[identification]]\nlog = "NEW.csv"',)
-
-
-def test_a_step_names_no_joint_of_a_note(identified):
-    calm = next_steps(told(identified), JOB)[0].words
-    lift, other = [joint for joint in identified.model.joints if joint not in calm][:2]
-    steps = [
-        next_steps(told(identified, *(warning("constraint_costs", *each) for each in pairs)), JOB)
-        for pairs in (((lift, "note"), (other, "warning")), ((lift, "note"), (other, "note")))
-    ]
-    named = [[x in each[0].words for x in (lift, other)] for each in steps]
-    assert all(each[0].words.startswith("Examine the residual of") for each in steps)
-    assert named == [[False, True], [False, False]]
-
-
 def test_an_error_comes_before_a_warning_and_three_steps_are_enough(identified):
     codes = ("undetermined", "current_for_torque", "torque_delay", "unexplained_torque")
     found = told(
@@ -344,23 +250,6 @@ def test_a_setting_is_a_line_of_the_job_file_or_a_flag(identified, code, evidenc
     )
 
 
-def test_the_log_with_the_payload_is_the_one_that_is_identified(identified):
-    """A validation log with less: the fitted log has the payload, and the gains are needed."""
-    typed = replace(FLAGS, source=(*FLAGS.source, "--gain", "elbow_joint=2"))
-    urdf, fitted, kept = (
-        identified.model.tree.path,
-        *(e[0].recording.log.path for e in (identified.fitted, identified.validation)),
-    )
-    blocks = [
-        next_steps(told(identified, warning("payload_change", mass=mass)), typed)[0].blocks[0]
-        for mass in (-3.0, 3.0)
-    ]
-    swapped = [str(urdf), str(fitted), "--reference", str(kept), "--gain", "elbow_joint=2"]
-    assert blocks[0] == shlex.join(["robotid", "payload", *swapped])
-    usual = [str(urdf), str(kept), "--reference", "out/result.json"]
-    assert blocks[1] == shlex.join(["robotid", "payload", *usual])
-
-
 IN_DOUBT = {*codes_with("verdict"), *codes_with("term"), "payload"}
 
 
@@ -375,38 +264,6 @@ def test_whatever_leaves_a_result_in_doubt_has_a_step(identified, code):
         assert own[0].words == f"{code.capitalize()} is so; do something."
 
 
-def test_what_two_steps_ask_to_be_typed_is_typed_last(identified):
-    found = told(identified, warning("current_for_torque"), warning("torque_delay", delay=0.01))
-    first, second, *_ = next_steps(found, JOB)
-    table, command = first.blocks
-    assert table == "[torque.gains]\nelbow_joint = GAIN"
-    assert command.endswith("--mass KG --gains")
-    assert second.blocks[-1] == "robotid identify 'my job.toml' --out out"
-
-
-def test_without_a_recording_apart_one_is_asked_for(identified):
-    step = next_steps(told(identified, validation=()), FLAGS)[0]
-    assert step.words.startswith("Record another motion and use it as validation log")
-    assert step.blocks[0].endswith("--validate NEW.csv --out out")
-
-
-def test_links_that_the_urdf_describes_better_are_pinned(identified):
-    (kept,) = identified.validation
-    measured = kept.metrics["estimate"].per_joint
-    joint = {
-        name: replace(m, baselines={**m.baselines, "urdf_with_drives": 0.1})
-        if name == "elbow_joint"
-        else replace(m, baselines={**m.baselines, "urdf_with_drives": 99.0})
-        for name, m in measured.items()
-    }
-    metrics = {**kept.metrics, "estimate": replace(kept.metrics["estimate"], per_joint=joint)}
-    steps = next_steps(told(identified, validation=(replace(kept, metrics=metrics),)), JOB)
-    (step,) = [
-        step for step in steps if step.words.startswith("Keep the URDF's values for the links of")
-    ]
-    assert step.blocks[0] == '[estimator.constraints]\npinned = ["forearm_link"]'
-
-
 def test_nothing_is_typed_where_nothing_is_known_of_commands(identified):
     found = told(identified, warning("torque_delay", delay=0.005))
     for step in next_steps(found, Origin()):
@@ -414,116 +271,9 @@ def test_nothing_is_typed_where_nothing_is_known_of_commands(identified):
     assert Origin().using("replay", "x") == ()
 
 
-def test_the_source_of_a_command_line_is_what_is_identified():
-    from robotid.cli.flags import source_words
-
-    line = "identify --verbose arm.urdf a.csv --out here --gain j=2 --json --validate b.csv"
-    wanted = ("arm.urdf", "a.csv", "--gain", "j=2", "--validate", "b.csv")
-    assert source_words(line.split()) == wanted
-    assert source_words(["identify", "job.toml", "--out=x"]) == ("job.toml",)
-    assert (Origin(wanted).job, JOB.job) == ("", "my job.toml")
-
-
-def test_figures_in_steps_are_those_of_all_findings_and_of_the_result(identified):
-    late = (warning("torque_delay", "a.csv", delay=0.004), warning("torque_delay", delay=0.008))
-    step = next_steps(told(identified, *late), FLAGS)[0]
-    assert "state its delay of 0.0060 s" in step.words
-    assert step.blocks[0].endswith("--torque-delay 0.0060 --out out")
-    zeros = (
-        warning("position_offset", "elbow_joint", size=0.0123),
-        warning("position_offset", "wrist_1_joint", size=-0.5),
-    )
-    step = next_steps(told(identified, *zeros), FLAGS)[0]
-    assert step.words.endswith("; of elbow_joint by -0.0123; of wrist_1_joint by 0.5.")
-    before, after = (pi[:60:10].sum() for pi in (identified.prior, identified.standard))
-    step = next_steps(told(identified, warning("total_mass", "robot")), JOB)[0]
-    assert f"({after:.4g} kg identified, {before:.4g} kg in the URDF)" in step.words
-    found = told(identified, warning("total_mass", "robot"))
-    found = replace(found, estimator=ConsistentSettings(constraints={"total_mass": 31.5}))
-    bounded = replace(found, estimator=ConsistentSettings(constraints={"total_mass": [9.0, 99.0]}))
-    assert f"({after:.4g} kg identified, {before:.4g} kg" in next_steps(bounded, JOB)[0].words
-    assert f"({after:.4g} kg stated, {before:.4g} kg" in next_steps(found, JOB)[0].words
-    weighed = replace(identified.scale_check, is_total_determined=True)
-    found = told(identified, warning("total_mass", "robot"))
-    found.__dict__["_scale"] = weighed
-    step = next_steps(found, JOB)[0]
-    assert "State the measured mass of the moving links" in step.words
-    assert step.blocks[0] == "[estimator.constraints]\ntotal_mass = KG"
-    assert f"{after:.4g}" != f"{before:.4g}"
-    assert step.blocks[0] == "[estimator.constraints]\ntotal_mass = KG"
-
-
-def test_a_payload_that_contradicts_the_scale_is_the_one_to_identify_gains_from(identified):
-    near = PayloadCheck("wrist", 2.0, 2.02, 0.01, (2.0, 2.04), "near.csv")
-    far = PayloadCheck("tool0", 2.5, 3.25, 0.1, (3.05, 3.45), "far.csv")
-    gains = ("--gain", "two=1.5", "--cutoff", "8", "--gain", "one=-2")
-    origin = Origin(("arm.urdf", "first.csv", *gains), "out")
-
-    def step(*payloads, findings=()):
-        found = replace(told(identified, *findings), payload_checks=payloads)
-        return next_steps(found, origin)[0]
-
-    urdf, log = identified.model.tree.path, identified.fitted[0].recording.log.path
-    words = "robotid payload {} {} --reference {} --link {} --mass {} --gains"
-    wrong = step(near, far)
-    assert wrong.words.startswith(f"Correct the torque scale: {far.message}. State the gains ")
-    assert wrong.blocks == (
-        words.format(urdf, "far.csv", log, "tool0", "2.5"),
-        "robotid identify arm.urdf first.csv --cutoff 8 --gain two=GAIN --gain one=GAIN --out out",
-    )
-    right = step(near, findings=(warning("scale_unchecked"),))
-    assert right.words == f"Verify the torque scale: {near.message}."
-    assert right.blocks[0] == words.format(urdf, "near.csv", log, "wrist", "2")
-    assert "GAIN" not in right.blocks[1]
-
-
-def test_a_flag_is_replaced_with_its_value_and_nothing_else():
-    source = ("a.urdf", "x.csv", "--gain", "one=1", "--gain=two=2", "--rename", "one=1", "--cutoff",
-              "8", "--payload-check", "l.csv=2", "y.csv")  # fmt: skip
-    again = Origin(source).again("--cutoff", "5", "--gain", "one=3")
-    assert again == (
-        "robotid identify a.urdf x.csv --gain=two=2 --rename one=1 --payload-check l.csv=2 y.csv "
-        "--cutoff 5 --gain one=3"
-    )
-    twice = Origin((*source, "--gain", "one=7", "--gain", "one=8"), "o").again("--gain", "one=3")
-    assert twice.count("one=") == 2  # the gain and the name
-    assert twice.endswith("--cutoff 8 --payload-check l.csv=2 y.csv --gain one=3 --out o")
-
-
 def test_a_block_of_several_steps_is_in_the_last_of_them_only():
     steps = [Step("a", ("x", "y")), Step("b", ("z",)), Step("c", ("x", "w")), Step("d", ("w",))]
     assert [step.blocks for step in _once(steps)] == [("y",), ("z",), ("x",), ("w",)]
-
-
-def test_a_torque_with_another_gain_is_no_reason_to_keep_the_urdf(identified):
-    (kept,) = identified.validation
-    own = kept.metrics["estimate"]
-    beaten = {j: replace(m, baselines={**m.baselines, "urdf_with_drives": 0.01})
-              for j, m in own.per_joint.items()}  # fmt: skip
-    metrics = {**kept.metrics, "estimate": replace(own, per_joint=beaten)}
-    runs = (replace(kept, metrics=metrics),)
-
-    def named(*findings):
-        causes = {
-            c.code: c.joints for c in _of_verdict(told(identified, *findings, validation=runs))
-        }
-        return causes["beaten"]
-
-    joints = identified.model.joints
-    assert named() == joints
-    assert named(warning("gain_change", f"kept.csv: {joints[2]}")) == (*joints[:2], *joints[3:])
-    assert named(warning("torque_delay", f"kept.csv: {joints[2]}")) == joints
-
-
-def test_joints_that_any_recording_misses_are_looked_at_and_the_first_is_played(identified):
-    names = identified.model.joints
-    errors = ("x.csv", [35.0, 1, 1, 1, 1, 1]), ("y.csv", [1, 1, 1, 1, 35.0, 1])
-    runs = tuple(predicted(identified, *each) for each in errors)
-    steps = next_steps(told(identified, validation=runs), JOB)
-    (look,) = [step for step in steps if step.words.startswith("Examine the residual of")]
-    assert f"the residual of {names[0]}, {names[4]} in" in look.words
-    (played,) = [b for step in steps for b in step.blocks if b.startswith("robotid replay")]
-    assert " x.csv out" in played
 
 
 # --- identifications that predict positions -------------------------------------------------------

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from helpers.pages import tables
 
-from robotid.diagnosis.verdict.central import central_parameters
+from robotid.diagnosis.verdict.parameter_table import central_parameters
 from robotid.output.pages.html import with_error
 from robotid.output.report.tables import body_table
 from robotid.robot.bodies import central_inertial

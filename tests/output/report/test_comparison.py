@@ -20,7 +20,7 @@ from robotid.data.files.read import write_log
 from robotid.diagnosis.residual.torque_split import split_torque
 from robotid.output.files.entries import build_result
 from robotid.output.files.result_file import read_result
-from robotid.output.report.comparison import _friction_curves, compare_results, write_comparison
+from robotid.output.report.comparison import compare_results, write_comparison
 from robotid.robot.drives import LoadFriction, Stribeck
 from robotid.robot.model import RobotModel
 
@@ -95,51 +95,6 @@ def test_another_recording_is_not_compared(changed):
     assert "A was validated on second.csv, other results were not" in found["notes"][0]
     assert "the results have no common validation recording" in found["notes"][-1]
     assert [row["in"] for row in found["inputs"]][:2] == [[True, False], [False, True]]
-
-
-def test_a_third_result_is_compared_with_the_first_and_with_what_all_have(folder, tmp_path):
-    paths = [folder / "a.json", folder / "b.json", tmp_path / "c.json"]
-
-    def compared(change):
-        result = read_result(folder / "b.json")
-        change(result)
-        write_json(result, paths[2])
-        return compare_results(paths)
-
-    def farther(result):
-        for entry in result["base_parameters"]:
-            entry["value"], entry["std_error"] = entry["value"] + 0.5, 3.0 * entry["std_error"]
-        result["settings"]["signals"] = {"order": 6}
-        result["inputs"][-1]["rows_used"] = 77
-
-    found, a = compared(farther), read_result(folder / "a.json")
-    first = {entry["name"]: entry for entry in a["base_parameters"]}
-    c = {entry["name"]: entry for entry in read_result(paths[2])["base_parameters"]}
-    for entry in found["base_parameters"]:
-        one, other = first[entry["name"]], c[entry["name"]]
-        s = math.hypot(one["std_error"], other["std_error"])
-        assert entry["differences"][1] == pytest.approx((other["value"] - one["value"]) / s)
-        assert entry["values"][2] == other["value"]
-    assert [result["label"] for result in found["results"]] == ["A", "B", "C"]
-    (order,) = [row for row in found["settings"] if row["name"] == "signals.order"]
-    assert (order["values"][2], order["values"][0]) == ("6", order["values"][1])
-    assert found["fitted_alike"]
-    (entry,) = found["validation"]
-    assert all(len(joint["rmse"]) == 3 for joint in entry["per_joint"])
-    (note,) = found["notes"]
-    rows = a["inputs"][-1]["rows_used"]
-    assert f"the signal settings of second.csv differ (rows {rows} | {rows} | 77)" in note
-
-    found = compared(lambda result: result["inputs"][1].update(sha256="1" * 64))
-    assert not found["fitted_alike"]
-    assert [row["in"] for row in found["inputs"] if not all(row["in"])] == [
-        [True, True, False], [False, False, True],
-    ]  # fmt: skip
-    found = compared(lambda result: result["inputs"][-1].update(sha256="0" * 64))
-    assert found["validation"] == []
-    assert [note[:15] for note in found["notes"]] == [
-        *(f"{label} was validated"[:15] for label in "ABC"), "the results hav",
-    ]  # fmt: skip
 
 
 def test_other_base_parameters_are_refused_by_name(changed):
@@ -236,29 +191,6 @@ def test_the_page_shows_the_figures_of_the_two_results(folder, tmp_path):
         assert reasons == result["verdict"]["reasons"]
 
 
-def test_the_least_error_of_comparable_results_is_bold(folder, tmp_path):
-    b = copy.deepcopy(read_result(folder / "b.json"))
-    a = read_result(folder / "a.json")
-    joint = next(iter(b["validation"][0]["per_joint"]))
-    for part in (b["validation"][0], b["identification"]):
-        part["per_joint"][joint]["relative_error_pct"] = 0.01
-    write_json(b, tmp_path / "b.json")
-    write_comparison([folder / "a.json", tmp_path / "b.json"], tmp_path / "c.html")
-    html = (tmp_path / "c.html").read_text(encoding="utf-8")
-    assert html.count("<strong>0.01</strong>") == 2
-    error = a["validation"][0]["per_joint"][joint]["relative_error_pct"]
-    assert f"<strong>{percent(error)}</strong>" not in html.split(">unit<")[1].split("</tr>")[1]
-
-
-def test_names_of_files_cannot_inject_markup(folder, tmp_path):
-    path = tmp_path / "<b>x.json"
-    write_json({**read_result(folder / "b.json"), "robot": "<i>r"}, path)
-    write_comparison([folder / "a.json", path], tmp_path / "c.html")
-    html = (tmp_path / "c.html").read_text(encoding="utf-8")
-    assert "<b>" not in html
-    assert "<i>" not in html
-
-
 def test_results_and_logs_of_one_name_are_told_apart_by_the_shortest_path(folder, tmp_path):
     result = read_result(folder / "a.json")
     places = [tmp_path / day / "out" / "result.json" for day in ("monday", "tuesday")]
@@ -345,25 +277,3 @@ def test_the_page_in_the_browser(folder, tmp_path, browser):
         assert shown == sorted(shown, reverse=shown[0] > shown[-1])
         assert not seen.errors
         assert not seen.requests
-
-
-def test_friction_is_compared_up_to_the_fastest_speed_of_any_result():
-    def result(viscous, coulomb, fastest, other):
-        values = {"one.viscous": viscous, "one.coulomb": coulomb, "two.viscous": other}
-        return {
-            "joints": ["two", "one"],
-            "friction": {joint: {"data_range": {"v": [0.1, fastest]}} for joint in ("one", "two")},
-            "drive_parameters": [{"name": k, "value": x} for k, x in values.items()],
-            "identification": {"per_joint": {"one": {"unit": "N m"}, "two": {"unit": "N"}}},
-        }
-
-    first, second = _friction_curves([result(2.0, 1.0, 2.0, 1.0), result(4.0, 0.5, 3.0, 1.1)])
-    assert (first["joint"], first["unit"]) == ("one", "N m")  # differs the most
-    assert (second["joint"], second["unit"]) == ("two", "N")
-    v = np.array(first["speeds"])
-    np.testing.assert_allclose(v, np.linspace(-3.0, 3.0, len(v)))
-    for torque, (viscous, coulomb) in zip(first["torques"], ((2.0, 1.0), (4.0, 0.5)), strict=True):
-        np.testing.assert_allclose(torque, viscous * v + coulomb * np.sign(v), atol=1e-12)
-    # at 3 rad/s: 7 N m and 12.5 N m; 3 N and 3.3 N
-    assert first["difference"] == pytest.approx(5.5 / 12.5)
-    assert second["difference"] == pytest.approx(0.3 / 3.3)

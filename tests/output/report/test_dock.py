@@ -36,15 +36,6 @@ def frame(seen):
     return next(f for f in seen.page.frames if "replay.html" in f.url)
 
 
-def wait(seen, expression):
-    """Wait until the page in the dock says yes."""
-    for _ in range(400):
-        if frame(seen).evaluate(expression):
-            return
-        seen.page.wait_for_timeout(50)
-    raise AssertionError(f"{expression} is not true")
-
-
 def test_a_missing_replay_is_written_by_the_command_of_the_report(browser, folder):
     with visit(browser, folder / "result" / "report.html", reduced_motion="reduce") as seen:
         (worst,) = seen.page.locator("details[open] a[data-at]").all()[:1]
@@ -97,22 +88,3 @@ def test_the_cursor_of_the_charts_moves_with_the_replay(docked):
     until(docked, f"{CURSOR} === {time}")
     # a cursor of the recording that the replay does not show would be wrong
     assert docked.page.evaluate("charts.link('recording 1').listeners.size") == 0
-
-
-def test_a_click_in_a_chart_sets_the_time_and_a_pointer_that_passes_restores_it(docked):
-    chart = docked.page.locator("details[open] .u-over").first
-    chart.evaluate("(e) => { e.scrollIntoView(); scrollBy(0, -60); }")  # above the dock
-    box = chart.bounding_box()
-    frame(docked).evaluate("replay.seek(1)")
-    until(docked, f"{CURSOR} === 1")
-    x, y = box["x"] + 0.6 * box["width"], box["y"] + 0.2 * box["height"]
-    docked.page.mouse.move(x, y)
-    until(docked, f"{CURSOR} > 3")
-    wait(docked, f"replay.clock.time === {docked.page.evaluate(CURSOR)}")
-    docked.page.mouse.move(box["x"] - 30, y)
-    wait(docked, "replay.clock.time === 1")
-    docked.page.mouse.click(x, y)
-    wait(docked, "replay.clock.time > 3")
-    docked.page.mouse.move(box["x"] - 30, y)
-    docked.page.wait_for_timeout(100)
-    assert frame(docked).evaluate("replay.clock.time") == docked.page.evaluate(CURSOR) > 3

@@ -76,33 +76,6 @@ def test_a_recording_that_was_fitted_is_none_that_was_predicted(identified):
         assert own["wls_relative_error_pct"] == wls.per_joint[joint].relative_error_pct
 
 
-def test_every_joint_has_its_verdict_and_its_reason(screen, identified):
-    said = re.findall(
-        r'<li class="([\w-]*)"><a [^>]*>(.*?)</a>.*?<span class="why">(.*?)</span>', screen
-    )
-    shown = {
-        re.sub("<wbr>", "", name): (status.replace("-", " "), unescape(why.split(" <a")[0]))
-        for status, name, why in said
-    }
-    verdicts = identified.verdict.joints
-    assert {joint: status for joint, (status, _) in shown.items()} == {
-        joint: v.status for joint, v in verdicts.items()
-    }
-    good = {j: v for j, v in verdicts.items() if v.status == "good"}
-    worst = next(joint for joint in shown if joint in good)
-    (cause,) = good[worst].reasons[1:]  # of the joint with the largest error
-    assert cause.startswith("largest error of the good joints: the residual is ")
-    assert {why for joint, (_, why) in shown.items() if joint in good} == {cause, ""}
-    (common,) = re.findall(r'<p class="common good"><strong>good</strong>: (.*?)</p>', screen)
-    errors = [float(v.reasons[0].split()[3]) for v in good.values()]
-    assert float(good[worst].reasons[0].split()[3]) == max(errors)
-    names = [joint for joint in shown if joint in good]
-    assert unescape(common) == (
-        f"{', '.join(names)}: error at most {max(errors)} %, smaller than that of a constant "
-        "and that of the URDF (the worst)"
-    )
-
-
 def test_joints_that_differ_in_the_numbers_of_their_reasons_have_one_line():
     reasons = {"a": "a: error 17.4 % on x", "b": "b: error 16.2 % on x", "c": "c: error 51 %"}
     verdicts = {

@@ -1,10 +1,5 @@
 """The charts that Python is given of a result: of the joints named, shown and kept as a page."""
 
-import re
-from dataclasses import replace
-from html import unescape
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 from scipy.stats import norm
@@ -87,69 +82,6 @@ def test_another_joint_is_refused_by_name(identified, plot):
         getattr(pictures, plot)(identified, "elbow_joind")
 
 
-def test_a_notebook_shows_the_page_that_is_written(identified, tmp_path):
-    plot = pictures.plot_friction(identified, "elbow_joint")
-    path = plot.write(tmp_path / "friction.html")
-    page = path.read_text()
-    assert page.count('<figure class="chart"') == 1
-    assert "Content-Security-Policy" in page
-    (inside,) = re.findall(r'<iframe [^>]*srcdoc="([^"]*)"', plot._repr_html_())
-    assert unescape(inside) == page
-    assert repr(plot) == (
-        "<Plot of Friction of elbow_joint against speed; .write('plot.html') saves it>"
-    )
-    with pytest.raises(DataError, match="does not exist; create it"):
-        plot.write(tmp_path / "none" / "friction.html")
-
-
-@pytest.mark.parametrize("n", [301, 4001])
-def test_friction_is_drawn_at_position_and_load_of_the_samples_used(rng, monkeypatch, n):
-    """Of at most 800 samples, spread over the recording."""
-    row = 1
-    v, q = rng.standard_normal((2, n, 2))
-    mask = rng.random((n, 2)) < 0.6
-    q[~mask[:, row], row] += 50.0
-    motion = SimpleNamespace(v=v, q=q)
-    loads = rng.standard_normal((2, n)) * [[1.0], [4.0]]
-    left, friction = rng.standard_normal((2, n, 2))
-    drives = [SimpleNamespace(name=name) for name in ("a", "b")]
-    layout = SimpleNamespace(own={"b": (SimpleNamespace(name="load"),)}, drives=drives)
-    model = SimpleNamespace(
-        row_names=("a", "b"), row_units=("N m", "N"), layout=layout, passive=(), joints=("a", "b"),
-        n_rows=2,
-    )  # fmt: skip
-    evaluation = SimpleNamespace(recording=SimpleNamespace(trajectory=motion, mask=mask))
-    found = SimpleNamespace(model=model, validation=(evaluation,), fitted=(), standard=None)
-    given = []
-
-    def curve(found, joint, speeds, **at):
-        given.append((joint, at))
-        return SimpleNamespace(torque=speeds**3, std=0.5 + speeds**2)
-
-    monkeypatch.setattr(pictures, "friction_curve", curve)
-    along = SimpleNamespace(load=loads)
-    monkeypatch.setattr(pictures, "drive_motion_along", lambda model, motion: along)
-    chart = pictures.friction_chart(found, "b", split=(left, friction))
-    used = np.flatnonzero(mask[:, row])
-    used = used[:: -(-len(used) // 800)]
-    used = used[np.argsort(v[used, row])]
-    load = np.sqrt(np.mean(loads[row, used] ** 2))
-    assert given == [
-        ("b", {"q": pytest.approx(np.median(q[used, row])), "load": pytest.approx(load)})
-    ]
-    drawn = np.isfinite(series(chart, "measured").y)
-    speed = v[used, row]
-    np.testing.assert_array_equal(chart.x[drawn], speed)
-    np.testing.assert_array_equal(series(chart, "measured").y[drawn], left[used, row])
-    np.testing.assert_array_equal(series(chart, "identified").y[drawn], friction[used, row])
-    steady = series(chart, f"steady at a load of {load:.3g} N, 95 % band")
-    np.testing.assert_array_equal(steady.y[drawn], speed**3)
-    np.testing.assert_allclose(steady.half[drawn], 1.96 * (0.5 + speed**2))
-    assert (chart.x_label, chart.y_label) == ("speed [m/s]", "friction [N]")
-    mask[:, row] = False
-    assert pictures.friction_chart(found, "b", split=(left, friction)) is None
-
-
 def test_a_line_hides_four_times_as_high_as_the_others_and_gaps_of_a_pixel_are_one():
     flat = np.array([0.0, np.nan, 1.0])
     assert not pictures._dwarfs(np.array([-1.9, 2.0]), flat, flat)
@@ -159,33 +91,3 @@ def test_a_line_hides_four_times_as_high_as_the_others_and_gaps_of_a_pixel_are_o
     spans = pictures.unused_spans(t, used)
     wanted = [(0.0, 0.1), (9.9, 10.5), (10.9, 11.1), (99.9, 100.0)]
     np.testing.assert_allclose(spans, wanted)
-
-
-def test_reasons_of_two_recordings_show_the_first_over_time(identified):
-    (j,) = (k for k, n in enumerate(identified.model.joints) if n == "wrist_2_joint")
-    torque = joint_torques(identified)[j]
-    n = len(torque.rows.t)
-    recording = (np.arange(n) >= n // 3).astype(int)
-    two = replace(torque, rows=replace(torque.rows, recordings=("a", "b"), recording=recording))
-    charts = why_charts(two, link="shared", points=7)
-    own = np.linspace(0, n // 3 - 1, 7).round().astype(int)
-    for name, label in (("split", "measured"), ("power", "torque × speed")):
-        chart = charts[name]
-        assert chart.link == "shared"
-        drawn = np.isfinite(series(chart, label).y)
-        np.testing.assert_array_equal(chart.x[drawn], torque.rows.t[own])
-    speed = torque.quantities["speed"][1]
-    heat = series(charts["power"], "into friction").y[drawn]
-    np.testing.assert_allclose(heat, (torque.parts["friction"] * speed)[own])
-    used = np.flatnonzero(torque.used)
-    for dependence in two.follows[1:]:
-        chart, name = charts[dependence.name], dependence.name
-        assert chart.link == ""  # time of two recordings is not that of one
-        x = two.rows.time if name == "time" else torque.quantities[name][1]
-        rows = used[np.argsort(x[used])]
-        rows = rows[np.linspace(0, len(rows) - 1, 7).round().astype(int)]
-        np.testing.assert_array_equal(chart.x, x[rows])
-        mean, error = dependence.at(x[rows])
-        np.testing.assert_array_equal(series(chart, "mean").y, mean)
-        np.testing.assert_allclose(series(chart, "mean").half, 1.96 * error)
-    assert why_charts(torque, link="shared")["time"].link == "shared"

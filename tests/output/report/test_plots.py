@@ -1,14 +1,11 @@
 """The report's charts: the data in the page against the series they claim."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from helpers.figures import torques
 from helpers.pages import chart
 
-from robotid.diagnosis.residual.residuals import spectrum
-from robotid.output.report.pictures import torque_charts
+from robotid.diagnosis.residual.torque_split import spectrum
 
 JOINTS = range(6)
 
@@ -51,14 +48,6 @@ def test_torque_is_drawn_as_measured_identified_urdf_and_residual(
     assert upper["link"] == lower["link"] != ""
 
 
-def test_a_urdf_that_would_dwarf_the_torque_is_hidden_at_first(identified, kept):
-    torques = dict(kept.torques)
-    for factor, wanted in ((1.0, False), (100.0, True)):
-        torques["urdf"] = factor * kept.torques["urdf"]
-        upper, _ = torque_charts(identified, replace(kept, torques=torques), 1)
-        assert [series.is_hidden for series in upper.series] == [wanted, False, False]
-
-
 @pytest.mark.parametrize("j", JOINTS)
 def test_the_band_is_that_of_the_joint(report, identified, kept, j):
     name, band = identified.model.joints[j], identified.band(kept)
@@ -69,17 +58,6 @@ def test_the_band_is_that_of_the_joint(report, identified, kept, j):
         known = np.isfinite(series["half"])
         half = np.interp(what["x"][known], t[band.samples], 1.96 * band.total[:, j])
         np.testing.assert_allclose(series["half"][known], half, rtol=0.02)
-
-
-@pytest.mark.parametrize("j", JOINTS)
-def test_the_ground_is_shaded_where_rows_are_not_used(report, identified, kept, j):
-    motion, used = kept.recording.trajectory, kept.recording.mask[:, j].astype(bool)
-    spans = chart(report, f"Torque of {identified.model.joints[j]} over time:")["spans"]
-    t = motion.t
-    assert all(any(a <= t[k] <= b for a, b in spans) for k in np.flatnonzero(~used))
-    assert not any(a < t[k] < b for a, b in spans for k in np.flatnonzero(used))
-    after = np.flatnonzero(np.diff(motion.segment))[0] + 1
-    assert any(a <= motion.t[after - 1] and motion.t[after] <= b for a, b in spans)  # the gap
 
 
 @pytest.mark.parametrize("j", JOINTS)
@@ -115,21 +93,3 @@ def test_the_spectrum_is_that_of_torque_and_residual(report, identified, kept, p
         np.testing.assert_allclose(series["y"], np.sqrt(density[shown]), rtol=1e-3)
     assert what["marks"] == [12.0]
     assert what["logarithmic"] == "y"
-
-
-def test_captions_say_error_and_how_much_the_band_holds(identified, report):
-    """Of each joint in the validation recording, by hand."""
-    (kept,) = identified.validation
-    motion, band = kept.recording.trajectory, identified.band(kept)
-    residual = np.abs(motion.tau - kept.torques["estimate"])[band.samples]
-    inside = residual <= 1.959964 * np.sqrt(band.parameters**2 + band.noise**2)
-    said = []
-    for j, joint in enumerate(identified.model.joints):
-        own, used = kept.metrics["estimate"].per_joint[joint], kept.recording.mask[band.samples, j]
-        share = 100 * inside[used, j].mean()
-        said.append(
-            f"error {own.relative_error_pct:.1f} %, RMSE {own.rmse:.3g} N m; "
-            f"95 % band contains {share:.0f} %"
-        )
-    assert all(words in report for words in said), said
-    assert len(set(said)) == len(said)

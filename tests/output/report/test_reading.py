@@ -59,14 +59,6 @@ def column(table, number):
     return table.locator("tbody tr:visible").locator(f":nth-child({number})").all_inner_texts()
 
 
-def test_rows_are_filtered_by_all_words(seen, identified):
-    table, tools = table_of(seen)
-    tools.get_by_role("searchbox").fill("elbow_JOINT off")
-    names = column(table, 2)
-    assert names == ["offset"]
-    assert tools.locator("output").inner_text() == f"1 of {len(identified.standard)} rows"
-
-
 def test_csv_holds_every_number_in_full_with_ascii_minus_signs(seen, identified):
     _table, tools = table_of(seen)
     with seen.page.expect_download() as caught:
@@ -122,26 +114,6 @@ def test_a_link_opens_what_it_leads_to(seen):
     top = page.locator(key).bounding_box()["y"]
     assert 30 < top < 400  # below the contents, which stay
     assert page.locator("nav").bounding_box()["y"] == 0
-
-
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_nothing_is_wider_than_a_phone(browser, path, scheme):
-    with visit(browser, path, size=(390, 844), color_scheme=scheme) as seen:
-        width = "document.querySelector('{}').scrollWidth"
-        assert [seen.page.evaluate(width.format(x)) for x in ("html", "nav")] == [390, 390]
-        until(seen, "document.querySelectorAll('#friction ~ .plots canvas').length >= 6")
-        place = seen.page.locator("#friction ~ .plots .place").first.bounding_box()
-        assert place["width"] > 340
-        assert seen.errors == []
-
-
-def test_printing_opens_everything(seen):
-    page = seen.page
-    count = page.locator("details").count()
-    page.evaluate("window.dispatchEvent(new Event('beforeprint'))")
-    assert page.locator("details[open]").count() == count > 15
-    page.evaluate("window.dispatchEvent(new Event('afterprint'))")
-    assert page.locator("details[open]").count() < count
 
 
 def luminance(colour):

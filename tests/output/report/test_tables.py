@@ -1,25 +1,20 @@
 """Every cell of the report's tables, against the result and against figures worked out again."""
 
-import hashlib
 import re
 from dataclasses import asdict, replace
 from decimal import Decimal
-from html import unescape
-from pathlib import Path
 
 import numpy as np
 import pytest
 from helpers.figures import figures
 from helpers.pages import number, percent, tables
 
-from robotid.estimation.estimators.determination import Group
 from robotid.identification.summary import verdict_cell
 from robotid.output.report.steps import Origin
 from robotid.output.report.tables import (
     _drive_table,
-    base_table,
 )
-from robotid.output.report.torque_report import information, torque_report
+from robotid.output.report.torque_report import torque_report
 
 
 @pytest.fixture(scope="module")
@@ -65,14 +60,6 @@ def test_errors_are_those_of_estimate_wls_and_baselines(shown, identified, capti
     # figures that are alike would hide a swap
     for one, other in (("error %", "WLS %"), ("WLS %", "URDF %"), ("URDF %", "gravity only %")):
         assert shown[caption].column(one) != shown[caption].column(other)
-
-
-def test_the_verdict_stands_with_its_reasons_and_no_other(report, identified):
-    box = report.split('<div class="verdict ')[1].split("</div>")[0]
-    assert box.startswith(f'{identified.verdict.status}"')
-    assert f"<strong>{identified.verdict.status}</strong>" in box
-    said = [unescape(reason) for reason in re.findall(r"<li>(.*?)</li>", box)]
-    assert said == list(identified.verdict.reasons)
 
 
 def relative(value, error):
@@ -140,15 +127,6 @@ def test_base_parameters_have_their_values_errors_and_expressions(shown, identif
         assert row[5] == mapping.expressions[k]
 
 
-def test_a_base_parameter_that_is_not_determined_has_no_error(identified):
-    names = identified.mapping.base_names
-    group = replace(Group((names[3],), ()))
-    known = replace(identified.determination, groups=(group,))
-    rows = tables(base_table(replace(identified, determination=known)))
-    dashed = [row[0] for row in rows["Base parameters"].rows if row[2:4] == ["–", "–"]]
-    assert dashed == [names[3], "elbow_joint.viscous"]
-
-
 def test_the_lines_of_the_urdf_that_change_stand_under_the_name_of_their_link(identified):
     diff = torque_report(identified, Origin()).parameters
     links = re.findall(r"<strong>(.*?)</strong>", diff)
@@ -180,27 +158,6 @@ def test_masses_and_eigenvalues_are_those_of_each_body(shown, identified):
     assert total[:3] == ["total", *totals]
 
 
-def test_shares_of_the_data_are_listed_weakest_first(shown, identified):
-    caption = "Base parameters that the data determine by less than 99 %"
-    K, spread = identified.mapping.K, identified.prior_std
-    before = np.einsum("bp,p,bp->b", K, spread**2, K)
-    share = before / (before + identified.wls.std_error**2)
-    order = [k for k in np.argsort(share, kind="stable") if share[k] < 0.99]
-    wanted = [[identified.mapping.base_names[k], number(100 * share[k], ".1f")] for k in order]
-    assert shown[caption].rows == wanted
-    assert len(wanted) > 2
-
-
-def test_the_strongest_correlations_are_named_with_their_sign(shown, identified):
-    (caption,) = [name for name in shown if name.startswith("The strongest of")]
-    names, r = identified.mapping.base_names, information(identified)[0]
-    pairs = [(abs(r[i, j]), i, j) for i in range(len(r)) for j in range(i) if abs(r[i, j]) >= 0.8]
-    assert caption == f"The strongest of {len(pairs)} correlations of 0.8 and more"
-    pairs.sort(key=lambda pair: -pair[0])
-    wanted = [[names[i], names[j], number(r[i, j], ".3f")] for _, i, j in pairs[:15]]
-    assert shown[caption].rows == wanted
-
-
 def test_what_is_open_is_named(report, shown, identified):
     layout, said = identified.model.layout, text_of(section(report, "open"))
     assert f"The data determine {identified.determination.rank} of {len(identified.base)} " in said
@@ -209,44 +166,6 @@ def test_what_is_open_is_named(report, shown, identified):
     kept = [n for n, s in zip(layout.names, identified.sources, strict=True) if s == "prior"]
     title = "Standard parameters that remain at the URDF's values"
     assert said.endswith(f"{title} {', '.join(kept)}")
-
-
-def test_settings_are_those_used(shown, identified):
-    rows = dict(shown["Model and estimator"].rows)
-    assert rows["estimator"] == "consistent"
-    assert rows["robust"] == identified.estimator.robust
-    message, count = identified.estimate.message, identified.estimate.n_iter
-    assert rows["solver"] == f"{message} ({count} iterations)"
-    assert rows["drive terms"] == "armature, viscous, coulomb, offset"
-    assert rows["gravity [m/s²]"] == "0, 0, -9.81"
-    assert rows["base"] == "fixed"
-    assert rows["joints"] == ", ".join(identified.model.joints)
-    assert rows["locked joints"] == "none"
-    (caption,) = [name for name in shown if name.startswith("Signals, as used")]
-    wanted = [
-        [e.recording.name, f"{s.cutoff:g} Hz, order {s.order}", f"{s.rate:g}", s.velocity,
-         f"{s.trim:g}", f"{s.min_velocity:g}", f"{s.max_gap:g}"]
-        for e in (*identified.fitted, *identified.validation)
-        for s in [e.recording.signals]
-    ]  # fmt: skip
-    assert shown[caption].rows == wanted
-    assert shown[caption].column("rate Hz") == ["50", "40", "50"]
-
-
-def test_inputs_are_the_files_with_their_hashes(shown, identified):
-    rows = shown["Files read"].rows
-    roles = ["URDF", "fitted", "fitted", "validation"]
-    assert [row[0] for row in rows] == roles
-    recordings = [e.recording for e in (*identified.fitted, *identified.validation)]
-    paths = [identified.model.tree.path, *[r.log.path for r in recordings]]
-    assert [row[1] for row in rows] == [str(path) for path in paths]
-    digests = [hashlib.sha256(Path(path).read_bytes()).hexdigest() for path in paths]
-    assert [row[7] for row in rows] == digests
-    assert [row[2:7] for row in rows[1:]] == [
-        ["180", "50", "0", "3.58", "1"],
-        ["140", "40", "0", "3.475", "1"],
-        ["270", "50", "0", "5.98", "2"],
-    ]
 
 
 def test_a_drive_parameter_that_stands_on_a_misfit_says_so(identified):

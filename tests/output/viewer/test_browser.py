@@ -5,7 +5,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from contextlib import contextmanager
 
 import numpy as np
@@ -356,76 +355,6 @@ def test_axe_finds_no_fault(browser, page):
             assert len(found["passes"]) > 10 or scheme == "dark"
             assert found["passes"]
         assert seen.errors == []
-
-
-def test_the_address_keeps_time_joint_and_camera(browser, still, ur5):
-    seen = still
-    seen.page.evaluate("replay.seek(9.25); replay.pick(3)")
-    box = seen.page.locator("#meshcat-pane").bounding_box()
-    x, y = box["x"] + 30, box["y"] + box["height"] - 30
-    seen.page.mouse.move(x, y)
-    seen.page.mouse.down()
-    seen.page.mouse.move(x + 90, y - 20, steps=4)
-    seen.page.mouse.up()
-    camera = "replay.viewer.camera.position.toArray()"
-    place, address = seen.page.evaluate(camera), seen.page.url
-    assert "t=9.250" in address
-    assert f"joint={ur5.joints[2]}" in address
-    with visit(browser, address, **OPEN) as seen:
-        assert seen.page.evaluate("replay.clock.time") == pytest.approx(9.25)
-        assert seen.page.evaluate("replay.picked") == ur5.joints[2]
-        assert seen.page.evaluate(camera) == pytest.approx(place, rel=1e-4)
-        # a link of a report to the open replay, and one to another recording
-        seen.page.evaluate(f"location.hash = 't=8.125&joint={ur5.joints[4]}'")
-        until(seen, "replay.clock.time === 8.125")
-        assert seen.page.evaluate("replay.picked") == ur5.joints[4]
-        assert seen.page.locator("#state").inner_text() == ""
-        seen.page.evaluate("location.hash = 't=8.5&log=other.csv'")
-        until(seen, "replay.clock.time === 8.5")
-        assert "to other.csv; this replay shows another" in seen.page.inner_text("#state")
-        assert seen.errors == []
-
-
-def test_the_camera_follows_a_floating_base(browser, tmp_path, planar):
-    floating = RobotModel.from_urdf(planar.tree, free_flyer=True)
-    base = np.zeros((len(T), 7))
-    base[:, 0], base[:, 6] = 2.0 * (T - T[0]), 1.0
-    q, tau = motion(2)
-    shown = replay(floating, T, np.hstack([base, q]), torques=Torques(T, tau))
-    with visit(browser, shown.write(tmp_path / "r.html"), **OPEN) as seen:
-        target = "replay.viewer.controls.target.toArray()"
-        first = np.array(seen.page.evaluate(target))
-        seen.page.evaluate("replay.seek(9.0)")
-        moved = np.array(seen.page.evaluate(target)) - first
-        np.testing.assert_allclose(moved, [4.0, 0.0, 0.0], atol=1e-3)
-        seen.page.get_by_label("camera follows the robot").uncheck()
-        seen.page.evaluate("replay.seek(10.0)")
-        assert seen.page.evaluate(target) == pytest.approx(list(first + moved))
-        assert seen.page.locator(".plot").count() == 2
-        assert seen.errors == []
-
-
-def test_a_phone_shows_everything_without_scrolling_sideways(still):
-    with sized(still, 390, 844) as seen:
-        assert seen.page.evaluate("document.documentElement.scrollWidth") <= 390
-        assert seen.page.locator("#play").is_visible()
-        drawn = pixels(seen)
-        assert np.ptp(drawn.reshape(-1, 3), axis=0).max() > 60
-        seen.page.locator(".plot").last.scroll_into_view_if_needed()
-        assert seen.errors == []
-
-
-def test_a_notebook_s_frame_plays(browser, planar, tmp_path):
-    cell = tmp_path / "notebook.html"
-    cell.write_text(f"<title>n</title>{replay(planar, T, motion(2)[0])._repr_html_()}")
-    with visit(browser, cell) as seen:
-        inside = seen.page.frame_locator("iframe")
-        inside.locator("#clock").wait_for()
-        assert inside.locator("#play").inner_text() == "Pause"
-        end = time.monotonic() + 20.0
-        while inside.locator("#clock").inner_text().startswith("7.00 "):
-            assert time.monotonic() < end
-        assert [e for e in seen.errors if "sandbox" not in e] == []
 
 
 # the command as it is, but the page is told nothing after 3 s of the log until a file is there

@@ -58,20 +58,3 @@ def test_charts_strip_and_arcs_show_the_selected_prediction(seen, label):
     red = 255 if share >= 0.5 else 43 + 2 * share * (255 - 43)
     red -= max(0.0, 2 * share - 1) * (255 - 215)
     assert int(found["colour"][4:].split(",")[0]) == pytest.approx(red, abs=1.5)
-
-
-def test_the_switch_is_reached_by_keys_and_the_address_has_it(browser, seen):
-    seen.page.get_by_label("URDF", exact=True).check()
-    assert [seen.page.locator("#models label").nth(k).inner_text() for k in range(3)] == [
-        "URDF", "URDF + drives", "identified",
-    ]  # fmt: skip
-    seen.page.evaluate("replay.seek(4)")
-    seen.page.get_by_label("URDF", exact=True).press("ArrowRight")
-    assert seen.page.get_by_label("URDF + drives").is_checked()
-    assert seen.page.evaluate("replay.clock.time") == 4
-    assert shown(seen)["strip"] == pytest.approx(0.3, abs=2e-3)
-    address = seen.page.url
-    assert "model=URDF+%2B+drives" in address
-    with visit(browser, address, size=(900, 620), reduced_motion="reduce") as again:
-        assert again.page.get_by_label("URDF + drives").is_checked()
-        assert again.page.evaluate("replay.level(10, 0)") == pytest.approx(3.0, abs=0.02)

@@ -6,8 +6,7 @@ import pytest
 from helpers.replay_data import leave_out_meshes, shown
 
 from robotid.base.exceptions import DataError
-from robotid.output.viewer.replays import Bands, Mark, Torques, _moved, _view, replay
-from robotid.output.viewer.scene import robot_scene
+from robotid.output.viewer.replays import Torques, replay
 from robotid.robot.model import RobotModel
 
 URDF = """<robot name="&lt;b&gt;x&lt;/b&gt;">
@@ -142,20 +141,6 @@ def test_every_series_is_that_of_its_joint_and_of_who_says_so(identified):
     np.testing.assert_allclose(moved["q"], trajectory.q[rows], atol=1e-5)
 
 
-def test_bands_are_those_of_their_parameter(arm, motion):
-    t, q = motion
-    theta, error = np.column_stack([q, 3 + q[:, :1]]), np.column_stack([0.1 * q, 7 + q[:, 1:]])
-    bands = Bands(t, ["a.m", "b.m", "c.viscous"], ["kg", "kg", "N m s/rad"], theta, error)
-    data = shown(replay(arm, t, q, bands=bands).html)["bands"]
-    assert (data["names"], data["units"]) == (
-        ["a.m", "b.m", "c.viscous"],
-        ["kg", "kg", "N m s/rad"],
-    )
-    rows = np.abs(data["t"][:, None] + 5.0 - t).argmin(axis=1)
-    np.testing.assert_allclose(data["values"][:, :3], theta[rows], rtol=1e-5, atol=1e-6)
-    np.testing.assert_allclose(data["values"][:, 3:], error[rows], rtol=1e-5, atol=1e-6)
-
-
 def test_the_strip_is_of_the_first_prediction_over_what_it_is_compared_to(arm, motion):
     t, q = motion
     rng = np.random.default_rng(5)
@@ -188,71 +173,6 @@ def test_the_strip_is_of_the_first_prediction_over_what_it_is_compared_to(arm, m
             np.testing.assert_allclose(
                 mean, np.sqrt(np.mean((q - other) ** 2, axis=0)) / of, rtol=0.05
             )
-
-
-def test_the_camera_sees_the_outermost_points_about_the_base_and_the_ground(tmp_path):
-    path = tmp_path / "arm.urdf"
-    path.write_text(URDF)
-    model = RobotModel.from_urdf(path, free_flyer=True)
-    q = np.zeros((11, 9))
-    q[:, 0], q[:, 2], q[:, 6] = np.linspace(0.0, 50.0, 11), -2.0, 1.0
-    still = _view(model, robot_scene(model).corners, [q[:1] * [0, 1, 1, 1, 1, 1, 1, 1, 1]])
-    moved = _view(model, robot_scene(model).corners, [q])
-    for end in (np.min, np.max):
-        ends = [end(np.array(view["points"]), axis=0) for view in (still, moved)]
-        np.testing.assert_allclose(*ends, atol=1e-9)
-    size = np.linalg.norm(np.ptp(np.array(still["points"]), axis=0))
-    assert moved["radius"] == pytest.approx(size / 2, rel=1e-6)
-    points = np.array(still["points"])
-    assert moved["ground"] == pytest.approx(points[:, 2].min() - 2.0)
-    assert 20 * moved["cell"] <= 2.5 * moved["radius"]
-    # a turn of either sign, at any time, is one and the same
-    q[[2, 5, 6], 3:7] *= -1.0
-    _, coordinates = _moved(model, np.arange(11) / 30.0, q, 1000.0)
-    np.testing.assert_allclose(coordinates[:, 6], 1.0)
-
-
-def test_marks_are_told_in_order_with_their_kind(arm, motion):
-    marks = [Mark(6.5, "later", "contact"), Mark(5.25, "first", "payload")]
-    data = shown(replay(arm, *motion, marks=marks).html)
-    told = [(mark["t"], mark["label"], mark["kind"]) for mark in data["marks"]]
-    assert told == [(5.25, "first", "payload"), (6.5, "later", "contact")]
-
-
-def test_ellipsoids_are_those_of_their_body(identified):
-    """Centre, size and direction of each, by moments of a solid: Ixx = m (b^2 + c^2) / 5, ..."""
-    model = identified.model
-    t = np.arange(3) / 10.0
-    masses = {"URDF": identified.prior, "identified": identified.standard}
-    page = replay(model, t, np.zeros((3, 6)), masses=masses)
-    before, after = shown(page.html)["masses"]
-    assert (before["label"], after["label"]) == ("URDF", "identified")
-    for marks, pi in ((before, identified.prior), (after, identified.standard)):
-        assert [body["name"] for body in marks["bodies"]] == list(model.layout.bodies)
-        assert [body["node"] for body in marks["bodies"]] == [1, 2, 3, 4, 5, 6]
-        for i, body in enumerate(marks["bodies"]):
-            m, *moment = pi[10 * i : 10 * i + 4]
-            Ixx, Ixy, Iyy, Ixz, Iyz, Izz = pi[10 * i + 4 : 10 * i + 10]
-            assert body["fault"] == ""
-            assert body["mass"] == pytest.approx(m)
-            c = np.array(body["com"])
-            np.testing.assert_allclose(m * c, moment, atol=1e-12)
-            a2, b2, c2 = np.square(body["semi_axes"])
-            solid = m / 5 * np.diag([b2 + c2, a2 + c2, a2 + b2])
-            R = pin.Quaternion(np.array(body["quaternion"])).toRotationMatrix()
-            about_joint = R @ solid @ R.T + m * (c @ c * np.eye(3) - np.outer(c, c))
-            wanted = np.array([[Ixx, Ixy, Ixz], [Ixy, Iyy, Iyz], [Ixz, Iyz, Izz]])
-            np.testing.assert_allclose(about_joint, wanted, atol=1e-9 * np.trace(wanted))
-
-
-def test_a_notebook_shows_the_page_in_a_frame_that_reaches_nothing(arm, motion):
-    from html import unescape
-
-    shown_as = replay(arm, *motion)
-    cell = shown_as._repr_html_()
-    assert 'sandbox="allow-scripts"' in cell
-    inside = re.search(r'srcdoc="([^"]*)"', cell)[1]
-    assert unescape(inside) == shown_as.html
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from robotid.output.viewer.scene import _corners, _ends, _reach, ellipsoids, robot_scene
+from robotid.output.viewer.scene import _corners, ellipsoids, robot_scene
 from robotid.robot.model import RobotModel
 
 
@@ -18,17 +18,6 @@ def test_the_ellipsoid_of_a_solid_ellipsoid_is_itself(rng):
         assert np.linalg.det(found.rotation) == pytest.approx(1.0)
         # the axes agree but for their signs
         np.testing.assert_allclose(np.abs(found.rotation.T @ M.rotation), np.eye(3), atol=1e-7)
-
-
-def test_what_no_solid_can_be_has_no_ellipsoid_and_says_why():
-    thin = [1.0, 0, 0, 0, 0.1, 0, 0.1, 0, 0, 0.3]  # one moment exceeds the sum of the others
-    pi = np.array([np.zeros(10), [-1.0, *np.ones(9)], thin]).ravel()
-    nothing, negative, impossible = ellipsoids(pi)
-    assert (nothing.fault, nothing.com) == ("no mass", None)
-    assert (negative.fault, negative.com) == ("negative mass", None)
-    assert impossible.fault == "no solid has this inertia"
-    assert impossible.semi_axes is None
-    np.testing.assert_allclose(impossible.com, 0.0)
 
 
 @pytest.mark.parametrize(
@@ -78,27 +67,3 @@ def test_shapes_are_placed_as_in_the_urdf_and_cylinders_along_its_z(tmp_path):
     np.testing.assert_allclose(found["sphere"], wanted, atol=1e-12)
     np.testing.assert_allclose(found["cylinder"][:3, 1], wanted[:3, 2], atol=1e-12)
     assert np.linalg.det(found["cylinder"]) == pytest.approx(1.0)
-
-
-BRANCHED = """<robot name="tree"><link name="base"/><link name="a"/><link name="b"/><link name="c"/>
-<link name="near"/><link name="far"/>
-<joint name="ja" type="revolute"><parent link="base"/><child link="a"/><origin xyz="0 0 0.5"/>
-<axis xyz="0 0 1"/><limit effort="1" velocity="1"/></joint>
-<joint name="jb" type="revolute"><parent link="base"/><child link="b"/><origin xyz="0.3 0 0"/>
-<axis xyz="0 0 1"/><limit effort="1" velocity="1"/></joint>
-<joint name="jc" type="revolute"><parent link="b"/><child link="c"/><origin xyz="0 0.4 0"/>
-<axis xyz="0 0 1"/><limit effort="1" velocity="1"/></joint>
-<joint name="f1" type="fixed"><parent link="c"/><child link="near"/><origin xyz="0 0 0.1"/></joint>
-<joint name="f2" type="fixed"><parent link="c"/><child link="far"/><origin xyz="0.2 0 0"/></joint>
-</robot>"""
-
-
-def test_a_skeleton_reaches_to_each_child_and_to_the_farthest_frame(tmp_path):
-    (tmp_path / "tree.urdf").write_text(BRANCHED)
-    model = RobotModel.from_urdf(tmp_path / "tree.urdf")
-    tree = model.pin_model
-    assert _reach(model) == pytest.approx(0.7)  # 0.3 + 0.4 along one branch, 0.5 along the other
-    number = {name: tree.getJointId(name) for name in ("ja", "jb", "jc")}
-    np.testing.assert_allclose(sorted(map(tuple, _ends(model, 0))), [(0, 0, 0.5), (0.3, 0, 0)])
-    np.testing.assert_allclose(_ends(model, number["jb"]), [[0, 0.4, 0]])
-    np.testing.assert_allclose(_ends(model, number["jc"]), [[0.2, 0, 0]])

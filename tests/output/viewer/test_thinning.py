@@ -71,17 +71,6 @@ def test_a_sheet_keeps_its_rim_and_is_not_called_closed():
     assert 50 < len(thinned.faces) <= 60
 
 
-def test_solids_that_lie_in_each_other_stay_apart():
-    ball, scale = trimesh.creation.icosphere(subdivisions=4), 1e3
-    sizes = scale * np.array([1.0, 1.02, 1.0])
-    solids = [[Surface(size * ball.vertices, ball.faces, None)] for size in sizes]
-    for (solid,), size in zip(thin(solids, 6000), sizes, strict=True):
-        mesh = trimesh.Trimesh(solid.vertices, solid.faces)
-        assert mesh.volume == pytest.approx(ball.volume * size**3, rel=0.01)
-        assert 1700 < len(solid.faces) < 2300
-        np.testing.assert_allclose(np.linalg.norm(solid.vertices, axis=1), size, rtol=3e-3)
-
-
 def test_sharp_edges_get_a_corner_for_each_side_and_smooth_ones_do_not():
     box, ball = trimesh.creation.box((1, 1, 1)), trimesh.creation.icosphere(subdivisions=3)
     (cube,), (sphere,) = thin([[surface_of(box)], [surface_of(ball)]], 10_000)
@@ -89,17 +78,6 @@ def test_sharp_edges_get_a_corner_for_each_side_and_smooth_ones_do_not():
     assert len(cube.vertices) == 24
     assert len(sphere.vertices) == len(ball.vertices)
     assert thin([[]], 100) == [[]]
-
-
-def test_edges_stay_sharp_when_few_triangles_are_left():
-    box = trimesh.creation.box((1, 2, 3)).subdivide_loop(0)
-    for _ in range(5):
-        box = box.subdivide()
-    ((thinned,),) = thin([[surface_of(box)]], 100)
-    assert len(thinned.faces) <= 100
-    mesh = trimesh.Trimesh(thinned.vertices, thinned.faces)
-    assert mesh.volume == pytest.approx(6.0, rel=1e-3)
-    np.testing.assert_allclose(np.ptp(mesh.vertices, axis=0), [1, 2, 3], atol=1e-3)
 
 
 def test_a_surface_without_an_outside_is_not_called_closed(rng):

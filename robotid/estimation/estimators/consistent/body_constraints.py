@@ -59,25 +59,18 @@ class Subspace:
 
 @dataclass(frozen=True, eq=False)
 class Constraints:
-    """Bounds in addition to physical consistency, by name of the body that a joint moves.
+    """Bounds in addition to physical consistency, by name of the body that a joint moves."""
 
-    Attributes:
-        mass: Smallest and largest mass of a body [kg].
-        total_mass: Smallest and largest mass of all bodies together [kg], or None.
-        com: Half-spaces A c <= b that contain the centre of mass c of a body in its own frame, by
-            name: A of shape (k, 3), unit rows, and b of shape (k,) [m].
-        pinned: Bodies that keep the prior's values.
-        extent: Box that contains all mass of a body, by name: lower and upper corner in its own
-            frame, shape (2, 3) [m]; see ``slabs``.
-        relaxed: Bodies whose extent was removed because the data contradict it.
-    """
-
-    mass: dict[str, tuple[float, float]] = field(default_factory=dict)
-    total_mass: tuple[float, float] | None = None
+    mass: dict[str, tuple[float, float]] = field(default_factory=dict)  # smallest, largest [kg]
+    total_mass: tuple[float, float] | None = None  # of all bodies together [kg]
+    #: Half-spaces A c <= b that contain the centre of mass c of a body in its own frame: A of shape
+    #: (k, 3), unit rows, and b of shape (k,) [m].
     com: dict[str, tuple[Array, Array]] = field(default_factory=dict)
-    pinned: tuple[str, ...] = ()
+    pinned: tuple[str, ...] = ()  # bodies that keep the prior's values
+    #: Box that contains all mass of a body: lower and upper corner in its own frame, shape (2, 3)
+    #: [m]; see ``slabs``.
     extent: dict[str, Array] = field(default_factory=dict)
-    relaxed: tuple[str, ...] = ()
+    relaxed: tuple[str, ...] = ()  # bodies whose extent was removed: the data contradict it
 
     def without_extent(self, bodies: Iterable[str]) -> "Constraints":
         """Return the same constraints without the extents of some bodies."""
@@ -207,14 +200,8 @@ def slabs(box: Array) -> Array:
     """Return the matrices Q_k, shape (3, 4, 4), with tr(J Q_k) >= 0 for all mass inside a box.
 
     Every mass element with x_k between the corners l and u has (x_k - l_k) (u_k - x_k) >= 0; the
-    integral over the body is tr(J Q_k). Together with J >= 0 it bounds the centre of mass and the
-    radii of gyration by the box.
-
-    References:
-        Wensing, Kim, Slotine (2018), Linear Matrix Inequalities for Physically Consistent Inertial
-        Parameter Identification, (12), with an ellipsoid that is a slab.
-
-    box (2, 3) [m].
+    integral over the body is tr(J Q_k) (Wensing, Kim, Slotine, 2018, Linear Matrix Inequalities for
+    Physically Consistent Inertial Parameter Identification, (12), its ellipsoid being a slab).
     """
     Q = np.zeros((3, 4, 4))
     for k, (low, high) in enumerate(box.T.tolist()):

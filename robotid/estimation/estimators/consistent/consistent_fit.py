@@ -52,11 +52,7 @@ class Entropic:
 
     @classmethod
     def of(cls, layout: ParameterLayout, prior: Array, std: Array, held: Array) -> "Entropic":
-        """Return the penalty: prior (p,), std (p,), held (10 bodies,).
-
-        If the pseudo-inertia of a prior is not physically consistent or its relative thickness is
-        below 1 %, its eigenvalues are increased to 1 % first.
-        """
+        """Return the penalty; relative eigenvalues of the prior's bodies are at least 1 %."""
         size = layout.n_inertial
         mass, moment = std[:size].reshape(-1, 10)[:, :2].T
         # diagonal T^-1/2, which make pseudo-inertias dimensionless
@@ -87,8 +83,8 @@ class Entropic:
     def root(self, pi: Array) -> Array:
         """Return S with S^T S half its second derivative at pi, shape (p, p), upper triangular.
 
-        For a thin body the root is computed directly: its second derivative has a condition number
-        too large to be factorised. With J = L L^T it is g_kl = tr(C_k C_l), C_k = L^-1 B_k L^-T.
+        The second derivative of a thin body is too ill conditioned to be factorised. With
+        J = L L^T it is g_kl = tr(C_k C_l), C_k = L^-1 B_k L^-T, and S is computed from C.
         """
         L = self._prior_factor @ np.linalg.cholesky(self._ratio(pi))
         C = _whitened(pseudo_inertia_basis()[None], L[:, None])  # (n, 10, 4, 4)
@@ -141,13 +137,9 @@ class Programme:
         return self.minimise_each(rows[None], weight, is_exact=is_exact, starts=starts)[0]
 
     def minimise_each(
-        self,
-        rows: Array,
-        weight: float,
-        *,
-        is_exact: bool = True,
+        self, rows: Array, weight: float, *, is_exact: bool = True,
         starts: Sequence[Minimum] | None = None,
-    ) -> list[Minimum]:
+    ) -> list[Minimum]:  # fmt: skip
         """Return the minimum of each of f data sets, as ``minimise``: rows (f, k, b + 1)."""
         tolerance = _EXACT if is_exact else _ROUGH
         if starts is not None:
@@ -318,22 +310,6 @@ class Consistent(BatchEstimator):
     (see ``Programme.redrawn``). Its rank, condition number and undetermined names refer to the base
     parameters.
 
-    Attributes:
-        layout: The standard parameters.
-        K: Map to the base parameters, shape (b, p).
-        prior: Prior value of each parameter, shape (p,), as the URDF's.
-        prior_std: Prior standard deviation of each parameter, shape (p,), positive.
-        held: Known part of each body, as the links on locked joints, shape (10 bodies,); the rest
-            of the body must be physically consistent. None: no known parts.
-        prior_weight: Weight of the prior [-].
-        plausible_weight: Weight at which the prior has the plausible spread of the true parameters
-            [-].
-        independent_share: Share of independent rows, 2 cutoff / rate [-].
-        constraints: Bounds in addition to physical consistency.
-        wls_noise: Noise levels of weighted least squares of the fitted rows, shape (n,) [N m or N];
-            None: they are computed.
-        choice: How ``prior_weight`` was chosen; None: it was given.
-
     References:
         Sousa, Cortesao (2014), Physical feasibility of robot base inertial parameter
         identification: a linear matrix inequality approach; Wensing, Kim, Slotine (2018), Linear
@@ -342,16 +318,18 @@ class Consistent(BatchEstimator):
     """
 
     layout: ParameterLayout
-    K: Array
-    prior: Array
-    prior_std: Array
+    K: Array  # (b, p), map to the base parameters
+    prior: Array  # (p,), prior values, as the URDF's
+    prior_std: Array  # (p,), prior standard deviations, positive
+    #: Known part of each body, as the links on locked joints, shape (10 bodies,); the rest of the
+    #: body must be physically consistent. None: no known parts.
     held: Array | None = None
     prior_weight: float = 1.0
-    plausible_weight: float = 1.0
-    independent_share: float = 1.0
+    plausible_weight: float = 1.0  # at which the prior has the spread of the true parameters
+    independent_share: float = 1.0  # 2 cutoff / rate
     constraints: Constraints = field(default_factory=Constraints)
-    wls_noise: Array | None = None
-    choice: WeightChoice | None = None
+    wls_noise: Array | None = None  # (n,), noise levels of WLS [N m or N]; None: computed
+    choice: WeightChoice | None = None  # of ``prior_weight``; None: it was given
 
     def __post_init__(self) -> None:
         p = len(self.layout.names)
@@ -386,8 +364,8 @@ class Consistent(BatchEstimator):
         known = np.flatnonzero(np.isfinite(np.diag(estimate.covariance)))
         if not len(known):
             raise DataError(
-                "the estimate has no covariance, so it cannot be projected onto physically "
-                "consistent parameters; use the estimator 'rls' or 'kalman', which have one"
+                "the estimate has no covariance and cannot be projected; use 'rls' or "
+                "'kalman', which have one"
             )
         projected = self._minimised(_information_rows(estimate, known), estimate)
         words = f"{estimate.message}; projected onto physically consistent parameters"
@@ -422,7 +400,8 @@ class Consistent(BatchEstimator):
         freedom = np.maximum(rows - used / self.independent_share, _LEAST_FREEDOM * rows)
         torque = np.sqrt(factors.torque_squares() / rows)
         least = _FLOOR * np.where(torque > 0, torque, 1.0)
-        return np.maximum(sigma * np.sqrt(np.maximum(rows - used, 1.0) / freedom), least)
+        level = sigma * np.sqrt(np.maximum(rows - used, 1.0) / freedom)
+        return np.asarray(np.maximum(level, least))
 
     def rows(self, factors: Factors, sigma: Array) -> Array:
         """Return rows [R d], shape (b + 1, b + 1): |R K pi - d|^2 is the weighted cost of the data.
@@ -503,8 +482,8 @@ def _information_rows(estimate: Estimate, known: Array) -> Array:
         L = scale[:, None] * np.linalg.cholesky(C / np.outer(scale, scale))
     except np.linalg.LinAlgError as error:
         raise DataError(
-            "the covariance of the estimate is not positive definite, so it cannot be projected "
-            "onto physically consistent parameters; use more samples or a prior"
+            "the covariance of the estimate is not positive definite, so it cannot be projected; "
+            "use more samples or a prior"
         ) from error
     chosen = np.zeros((len(known), len(estimate.theta) + 1))
     chosen[np.arange(len(known)), known] = 1.0

@@ -161,7 +161,7 @@ class EntropicProblem:
         gap = x @ self.G.T + self.h - unit * multipliers
         s = 0.5 * (gap + np.hypot(gap, 2.0 * np.sqrt(unit * mu)))
         s = np.maximum(s, _LEAST / np.sqrt(unit))
-        return _Point(x, t[:, :, None, None] * _transposed(inverse) @ inverse, s, mu / s)
+        return _Point(x, t[:, :, None, None] * inverse.mT @ inverse, s, mu / s)
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,9 +199,9 @@ class _Coordinates:
 
     @classmethod
     def of(cls, R: Array, problem: EntropicProblem, weight: float) -> "_Coordinates":
-        moved = svec(R[:, :, None] @ _UNITS @ _transposed(R)[:, :, None]) @ _TO_PARAMETERS
+        moved = svec(R[:, :, None] @ _UNITS @ R.mT[:, :, None]) @ _TO_PARAMETERS
         own = problem.scale[: problem.inertial].reshape(-1, _ENTRIES, 1)
-        return cls(_transposed(moved) / own, 1.0 / (np.sqrt(weight) * problem.stiffness))
+        return cls(moved.mT / own, 1.0 / (np.sqrt(weight) * problem.stiffness))
 
     def into(self, rows: Array) -> Array:
         """Return rows of coefficients of x as coefficients of z, shape (f, k, p)."""
@@ -244,15 +244,15 @@ class _System:
     ) -> "_System":
         x, J = point.x, problem.bodies(point.x)
         L, Q = np.linalg.cholesky(J), np.linalg.cholesky(point.Z)
-        U, length, Vt = np.linalg.svd(_transposed(Q) @ L)
-        R = L @ _transposed(Vt) / np.sqrt(length)[..., None, :]
-        R_inverse = _transposed(Q @ U) / np.sqrt(length)[..., None]
+        U, length, Vt = np.linalg.svd(Q.mT @ L)
+        R = L @ Vt.mT / np.sqrt(length)[..., None, :]
+        R_inverse = (Q @ U).mT / np.sqrt(length)[..., None]
         coordinates = _Coordinates.of(R, problem, weight)
         A_z, G_z, N_z = (coordinates.into(rows) for rows in (A, problem.G, problem.N.T))
         residual = _times(A, x) - d
         drives = problem.stiffness * (x - problem.centre)[:, problem.inertial :]
-        slope = weight * svec(_transposed(R) @ problem.P_inverse @ R).reshape(len(x), -1)
-        gradient = _times(_transposed(A_z), residual)
+        slope = weight * svec(R.mT @ problem.P_inverse @ R).reshape(len(x), -1)
+        gradient = _times(A_z.mT, residual)
         gradient += np.hstack([slope, np.sqrt(weight) * drives])
         ratio = point.multipliers / point.s
         rows = np.concatenate([A_z, np.sqrt(ratio)[:, :, None] * G_z], axis=1)
@@ -280,7 +280,7 @@ class _System:
         bodies[..., _EYE, _EYE] += np.reshape(t, (-1, 1, 1)) / length
         short = point.x @ self.problem.G.T + self.problem.h - point.s
         aim = (mu - pairs) / point.s
-        right = _times(_transposed(self.G), aim - self.ratio * short) - self.gradient
+        right = _times(self.G.mT, aim - self.ratio * short) - self.gradient
         right[:, :size] += svec(bodies).reshape(len(right), -1)
         z = self._solve(right)
         if self.N.shape[1]:
@@ -297,7 +297,7 @@ class _System:
     @cached_property
     def _held(self) -> tuple[Array, Array]:
         """Effect of the equalities' multipliers on a step, shape (f, p, e), and on equalities."""
-        columns = self._solve(_transposed(self.N))
+        columns = self._solve(self.N.mT)
         return columns, self.N @ columns
 
     def _solve(self, right: Array) -> Array:
@@ -323,7 +323,7 @@ class _System:
         if short.any():
             left = np.where(short, np.maximum(left, _CENTRED), left)
             step, length = aimed(left, np.where(short, 0.0, share))
-        Z = _transposed(self.R_inverse) @ step.Z @ self.R_inverse
+        Z = self.R_inverse.mT @ step.Z @ self.R_inverse
         return _Point(
             point.x + length * step.x,
             point.Z + length[:, :, None, None] * Z,
@@ -374,7 +374,3 @@ def _to_zero(x: Array, step: Array) -> Array:
 def _times(A: Array, x: Array) -> Array:
     """Return the product of each matrix and vector, shape (f, m)."""
     return np.asarray((A @ x[..., None])[..., 0])
-
-
-def _transposed(A: Array) -> Array:
-    return A.swapaxes(-1, -2)

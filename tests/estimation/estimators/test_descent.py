@@ -102,23 +102,6 @@ def test_only_steps_that_use_the_mass_matrix_ask_for_its_regressor():
     assert not NormalisedGradient(np.ones(2)).needs_mass
 
 
-def test_the_gradient_step_is_its_formula(rng):
-    sigma, scale, theta = (
-        np.array([0.5, 2.0]),
-        np.array([1.0, 3.0, 0.2]),
-        np.array([1.0, -1.0, 2.0]),
-    )
-    ours = NormalisedGradient(sigma, theta, scale, step_size=0.7, average=False)
-    Y, tau, weight = rng.standard_normal((2, 3)), rng.standard_normal(2), np.array([4.0, 1.0])
-    state = ours.update(ours.init(3), Sample(Y, tau, weight))
-    root = np.sqrt(weight) / sigma
-    Psi = root[:, None] * Y / scale
-    e = root * (Y @ theta - tau)
-    x = scale * theta - 0.7 / (1e-9 + (Psi**2).sum()) * Psi.T @ e
-    np.testing.assert_allclose(state.x, x, rtol=1e-12)
-    np.testing.assert_allclose(ours.estimate(state, ("a", "b", "c")).theta, x / scale, rtol=1e-12)
-
-
 def test_averaging_takes_the_noise_out_of_prx(states, rng):
     problem, beta = states.problem, states.beta
     ((W, tau, weight),) = problem.blocks()
@@ -136,15 +119,6 @@ def test_averaging_takes_the_noise_out_of_prx(states, rng):
     assert mean < 1.0  # nearer to least squares than that is to the truth
     assert np.isinf(fit.std_error).all()
     assert "a gradient method has no covariance" in fit.message
-
-
-def test_prx_stops_when_the_gradient_is_zero(states):
-    problem = states.problem
-    fit = PRX(np.ones(6), average=False, passes=30, rng=_rng(), eps1=1e-7).fit(problem)
-    assert fit.converged
-    assert fit.n_iter < 30_000
-    short = PRX(np.ones(6), average=False, passes=1, rng=_rng()).fit(problem)
-    assert not short.converged
 
 
 def test_a_state_averages_what_rows_of_their_own_weight_leave(rng):

@@ -8,17 +8,11 @@ from helpers.estimation import NOISE, Case
 from robotid.base.exceptions import DataError, RankDeficientError
 from robotid.dynamics.problem import Problem, Sample
 from robotid.dynamics.torque import build_problem, joint_torque_regressor
-from robotid.estimation.estimators import OLS, RLS, WLS, Kalman, fold
+from robotid.estimation.estimators import RLS, WLS, Kalman, fold
 from robotid.estimation.estimators import recursive as filters
 from robotid.estimation.estimators.recursive import KalmanState
 
 NAMES = ("a", "b", "c")
-
-
-def test_rls_without_forgetting_is_ols_after_the_last_sample(ur5, rng):
-    case = Case(ur5, rng, NOISE)
-    ours, ols = RLS(np.ones(6)).fit(case.problem), OLS().fit(case.problem)
-    np.testing.assert_allclose(ours.theta, ols.theta, rtol=1e-9, atol=1e-11)
 
 
 def test_rls_with_the_noise_levels_of_wls_is_wls(ur5, rng):
@@ -119,24 +113,6 @@ def test_each_step_renews_what_a_round_forgets_of_one_parameters_prior(rng):
     np.testing.assert_allclose(estimate.theta, np.linalg.solve(L, eta), rtol=1e-10)
 
 
-@pytest.mark.parametrize("share", [1.0, 0.2])
-def test_without_forgetting_sigma_has_n_minus_c_degrees_of_freedom(rng, share):
-    sigma = np.array([0.5, 0.1])
-    samples, Y, tau, weight = samples_of_known(rng, 12, sigma)
-    ours = RLS(sigma, independent_share=share)
-    estimate = ours.estimate(fold(ours, samples, ours.init(3)), NAMES)
-    used = weight.reshape(-1) > 0
-    root = (np.sqrt(weight) / sigma).reshape(-1)[used]
-    W, d = root[:, None] * Y.reshape(-1, 3)[used], root * tau.reshape(-1)[used]
-    theta, squares, *_ = np.linalg.lstsq(W, d, rcond=None)
-    variance = squares[0] / (len(d) - 3)
-    np.testing.assert_allclose(estimate.theta, theta, rtol=1e-9)
-    np.testing.assert_allclose(estimate.sigma, np.sqrt(variance) * sigma, rtol=1e-9)
-    expected = variance / share * np.linalg.inv(W.T @ W)
-    np.testing.assert_allclose(estimate.covariance, expected, rtol=1e-8)
-    np.testing.assert_allclose(estimate.std_error, np.sqrt(np.diag(expected)), rtol=1e-8)
-
-
 def test_few_samples_are_refused_with_forgetting_too(rng):
     _, Y, tau, weight = samples_of_known(rng, 1, np.ones(2))
     problem = Problem(
@@ -234,43 +210,6 @@ def test_without_walk_it_is_the_posterior_of_the_prior(rng, share):
     np.testing.assert_allclose(estimate.std_error, np.sqrt(np.diag(np.linalg.inv(H))), rtol=1e-9)
 
 
-def test_sigma_is_the_whole_misfit_prior_included_over_all_rows(rng):
-    # each innovation counts with what was known before it, so no row is spent on a parameter
-    sigma, prior, std = np.array([0.5]), np.zeros(3), np.array([0.3, 1.0, 2.0])
-    samples, Y, tau, _ = random_samples(rng, 10, sigma)
-    samples = [replace(sample, weight=np.ones(1)) for sample in samples]
-    ours = Kalman(sigma, prior, std, gate=None)
-    state = fold(ours, samples, ours.init(3))
-    residual = (tau[:, 0] - Y[:, 0] @ state.theta) / sigma
-    misfit = residual @ residual + ((state.theta / std) ** 2).sum()
-    (level,) = ours.estimate(state, ("a", "b", "c")).sigma
-    assert level == pytest.approx(0.5 * np.sqrt(misfit / 10), rel=1e-9)
-
-
-@pytest.mark.parametrize("full", [False, True])
-def test_what_is_not_seen_walks_as_far_as_the_walk_says(full):
-    std = np.array([0.3, 1.0, 2.0])
-    before = np.diag(std**2) if full else std
-    ours = Kalman(np.ones(1), np.zeros(3), before, walk=0.1)
-    unseen = Sample(np.zeros((1, 3)), np.zeros(1), np.ones(1))
-    state = fold(ours, [unseen] * 7, ours.init(3))
-    np.testing.assert_allclose(state.P, np.diag(std**2 * (1 + 7 * 0.01)), rtol=1e-12)
-
-
-@pytest.mark.parametrize("gate", [0.5, 0.99])
-def test_the_gate_turns_away_as_many_good_rows_as_it_says(rng, gate):
-    known = Kalman(np.array([2.0, 0.5]), np.ones(3), np.full(3, 1e-9), gate=gate)
-    state, count = known.init(3), 3000
-    for Y in rng.standard_normal((count, 2, 3)):
-        tau = Y.sum(axis=1) + known.sigma * rng.standard_normal(2)
-        state = known.update(state, Sample(Y, tau, np.ones(2)))
-    turned_away = state.gated / count
-    # four standard deviations of a binomial share
-    bound = 4 * np.sqrt(gate * (1 - gate) / count)
-    np.testing.assert_allclose(turned_away, 1 - gate, atol=bound)
-    np.testing.assert_array_equal(state.rows + state.gated, count)
-
-
 @pytest.mark.parametrize("share", [1.0, 0.25])
 def test_the_gate_is_chi_squares_bound_on_the_innovation(share):
     sigma, std, gate = np.array([0.5, 0.2]), np.array([0.3, 1.0]), 0.95
@@ -309,16 +248,6 @@ def test_rows_are_counted_joint_by_joint_used_or_rejected():
     assert gated.tolist() == [1, 2, 1, 5, 6]
     assert in_a_row.tolist() == [0, 3, 1, 2, 0]
     assert state.rows.tolist() == [7, 5, 3, 2, 9]
-
-
-def test_a_walk_is_in_units_of_each_parameter_s_own_spread():
-    P = np.array([[2.0, 0.5], [0.5, 3.0]])
-    for spread in (np.array([0.3, 7.0]), np.array([[0.09, 0.2], [0.2, 49.0]])):
-        kalman = Kalman(np.ones(2), np.zeros(2), spread, walk=0.1)
-        still = Sample(np.zeros((2, 2)), np.zeros(2), np.zeros(2))
-        walked = kalman.update(replace(kalman.init(2), P=P), still).P
-        np.testing.assert_allclose(walked, P + np.diag([0.0009, 0.49]))
-    np.testing.assert_array_equal(P, [[2.0, 0.5], [0.5, 3.0]])
 
 
 def test_two_steps_of_weighted_rows_are_bayes_rule_with_the_noise_of_each_joint(rng):
