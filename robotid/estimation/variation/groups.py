@@ -137,7 +137,7 @@ def sums_of(
 
 
 def with_zeros(sums: RunSums, parts: Sequence[Array]) -> RunSums:
-    """Return sums with those over the rows D of z zeros: D^2, D r by segment, (2, s, z) each run."""
+    """Return sums with those over the rows D of z zeros: D^2, D r by segment, (2, s, z) a run."""
     H, h, scatter = sums.H.copy(), sums.h.copy(), sums.scatter.copy()
     for j in range(-parts[0].shape[2], 0):
         H[:, j, j], h[:, j] = np.array([part[:, :, j].sum(axis=1) for part in parts]).T
