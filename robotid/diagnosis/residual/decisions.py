@@ -69,6 +69,14 @@ WEAK, WEAK_P_VALUE, WEAK_SIZE = 0.03, 1e-5, 2.0
 SIGNIFICANT = 5.0
 # A residual that depends on a quantity: no benchmark, tests/diagnosis/residual/test_torque_split.py
 DEPENDENCE_SHARE, DEPENDENCE_P_VALUE = 0.1, 1e-3
+# Segments that are held out in turn, and their samples.
+SEGMENTS, SHORTEST = 16, 10  # most segments, and fewest independent samples of one
+#: Smallest number of segments for a test.
+FEWEST = 6
+#: Typical residuals above which a sample is excluded.
+OUTLIER = 12.0
+#: Share of a column below which it is rounding, and relative step of a derivative by a shape.
+ROUNDING, STEP = 1e-10, 1e-3
 _STILL = 1e-9  # of the largest squared residual of a segment: below, the joint is at rest in it
 _FEWEST = 3  # segments for a test
 _NOTHING = 1e-300
