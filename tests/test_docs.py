@@ -234,7 +234,8 @@ def codes_of_findings():
             for value in given:
                 if isinstance(value, ast.Constant | ast.JoinedStr | ast.IfExp):
                     codes |= {x.value for x in ast.walk(value) if isinstance(x, ast.Constant)}
-    return {code for code in codes if isinstance(code, str) and code.islower()}
+    codes = {code.partition(":")[0] for code in codes if isinstance(code, str)}
+    return {code for code in codes if code.islower()}
 
 
 def pairs(target, value):

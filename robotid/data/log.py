@@ -99,7 +99,7 @@ class Log:
         if len(self.t) < 2:
             raise DataError(f"{where} has {len(self.t)} rows, wanted at least 2; record longer")
         require_increasing(self.t, where)
-        require_kind(self.base, (BaseMotion, type(None)), "base", "a robotid.BaseMotion")
+        require_kind(self.base, (BaseMotion, type(None)), "base", "a BaseMotion")
         if self.base is not None and len(self.base.pose) != len(self.t):
             raise DataError(
                 f"{where}: the pose of the base has {len(self.base.pose)} rows, wanted "

@@ -61,9 +61,8 @@ class BaseMapping:
         terms = np.abs(self.K) > 0
         kinds: dict[str, tuple[str, ...]] = {"alone": (), "in sums": (), "never": ()}
         for name in names:
-            rows = np.flatnonzero(terms[:, self.names.index(name)])
-            is_alone = len(rows) == 1 and terms[rows[0]].sum() == 1
-            kind = "never" if not len(rows) else "alone" if is_alone else "in sums"
+            rows = terms[terms[:, self.names.index(name)]]  # that it is in
+            kind = "never" if not len(rows) else "alone" if rows.sum() == 1 else "in sums"
             kinds[kind] += (name,)
         return kinds
 
@@ -76,10 +75,7 @@ class BaseMapping:
     def to_standard(self, beta: Array, prior: Array, spread: Array | None = None) -> Array:
         """Return the standard parameters nearest to a prior that have these base parameters.
 
-        Nearest in units of the spread: pi = prior + G (beta - K prior) with
-        G = S^2 K^T (K S^2 K^T)^-1, S = diag(spread).
-
-        beta (b,), prior (p,), spread (p,) -> (p,).
+        Nearest in units of the spread: pi = prior + G (beta - K prior), G of ``gain``.
         """
         if beta.shape != (len(self.K),):
             raise DataError(f"beta has shape {beta.shape}, wanted ({len(self.K)},)")
@@ -87,10 +83,7 @@ class BaseMapping:
         return pi
 
     def gain(self, spread: Array | None = None) -> Array:
-        """Return G = S^2 K^T (K S^2 K^T)^-1, shape (p, b): the change of pi per change of beta.
-
-        spread (p,).
-        """
+        """Return G = S^2 K^T (K S^2 K^T)^-1, shape (p, b), S = diag(spread): d pi / d beta."""
         s = np.ones(self.K.shape[1]) if spread is None else spread
         # K S = (Q R)^T, so that S (K S)^+ = S Q R^-T has no loss of digits
         Q, R = scipy.linalg.qr((self.K * s).T, mode="economic")
@@ -123,8 +116,6 @@ def base_mapping(
 
     References:
         Gautier (1991), Numerical calculation of the base inertial parameters of robots.
-
-    W (m, p), scales (p,), preference (p,).
     """
     if W.ndim != 2 or W.shape[1] != len(names) or len(W) < len(names):
         raise DataError(f"W has shape {W.shape}, wanted at least {len(names)} rows of {len(names)}")
@@ -151,11 +142,9 @@ def base_mapping(
 
 
 def independent_factors(W: Array, n_rows: int) -> list[tuple[Array, Array]]:
-    """Return factors of the parts of a regressor that have no equation and no column in common.
+    """Return columns and factors of the parts of a regressor that share no equation and no column.
 
-    For example, arms on a common fixed base are such parts.
-
-    W (N n_rows, p) -> (c, c).
+    For example, arms on a common fixed base are such parts: W (N n_rows, p).
     """
     samples = W.reshape(-1, n_rows, W.shape[1])
     filled = (samples != 0.0).any(axis=0)  # (n_rows, p)
@@ -227,9 +216,7 @@ def _with_carried(filled: Array) -> Array:
 def _span(own: Array) -> tuple[int, int] | None:
     """Return first and end of columns, None if they are not adjacent."""
     places = np.flatnonzero(own)
-    if not len(places):
-        return 0, 0
-    first, last = int(places[0]), int(places[-1]) + 1
+    first, last = (int(places[0]), int(places[-1]) + 1) if len(places) else (0, 0)
     return (first, last) if last - first == len(places) else None
 
 
@@ -249,11 +236,9 @@ def _pivot(R: Array, columns: Array) -> tuple[Array, Array]:
 def _expression(row: Array, names: tuple[str, ...], first: int) -> str:
     text = names[first]
     for i in np.flatnonzero(np.abs(row) > _SHOWN):
-        if i == first:
-            continue
-        sign = "-" if row[i] < 0 else "+"
-        size = f"{abs(row[i]):.6g}"
-        text += f" {sign} {names[i]}" if size == "1" else f" {sign} {size} {names[i]}"
+        if i != first:
+            size = f"{abs(row[i]):.6g} ".removeprefix("1 ")
+            text += f" {'-' if row[i] < 0 else '+'} {size}{names[i]}"
     return text
 
 

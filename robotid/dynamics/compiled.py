@@ -56,11 +56,8 @@ class CompiledWriter:
         """Prepare to write to ``out``, shape (C, k), k a multiple of 8; see ``why_not`` before."""
         self._model, self._tree, self._out = model, tree, out
         self._places = _places(tree, plan)
-        drives = [drive for row in plan.drives for drive in row]
-        self._drives = [k for _, k, _ in drives]
-        self._ratios = np.array([[ratio] for _, _, ratio in drives]).reshape(-1, 1)
-        self._ends = np.array([*(place for place, _, _ in drives), *plan.torques])
-        self._widths = np.diff(plan.first)
+        self._ends = np.append(plan.drive_places, plan.torques)
+        self._plan, self._widths = plan, np.diff(plan.first)
         self._root = np.zeros(out.shape[1])
         self._work = tree.work_space()
 
@@ -71,9 +68,9 @@ class CompiledWriter:
             self._motion = own_motion(q[:, 1:], v, a, _base_state(self._model, q, v, a))
         else:
             self._motion = own_motion(q, v, a)
-        values = values[self._drives]
-        if (self._ratios != 1.0).any():
-            values *= self._ratios
+        values = values[self._plan.drive_numbers]
+        if (self._plan.ratios != 1.0).any():
+            values *= self._plan.ratios
         self._values = np.array(np.vstack([values, tau.T]), order="C")  # as of ``own_motion``
         self._weights = np.zeros((0, 0)) if weights is None else np.array(weights, float, order="C")
 

@@ -101,10 +101,7 @@ def _closed(model: RobotModel, log: Log, q: np.ndarray, missing: np.ndarray) -> 
 
 
 def _root_poses(model: RobotModel, q: Array, poses: Array, link: str) -> Array:
-    """Return the poses of the root link from those of another link, x y z qx qy qz qw, (N, 7).
-
-    q (N, n) [rad or m], poses (N, 7) [m, -].
-    """
+    """Return the poses of the root link from those of another link, x y z qx qy qz qw, (N, 7)."""
     pin_model, root = model.pin_model, np.empty_like(poses)
     data, frame = pin_model.createData(), frame_id(pin_model, link)
     still = np.hstack([np.tile([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0], (len(q), 1)), q])
@@ -151,12 +148,11 @@ def with_contacts(model: RobotModel, log: Log, signals: SignalSettings) -> Log:
     the shares.
     """
     flagged = [x.frame for x in model.contacts if not x.always]
-    missing = [frame for frame in flagged if frame not in log.contacts]
-    if not missing:
+    if all(frame in log.contacts for frame in flagged):
         return log
-    t, found = find_contacts(model, log, signals)
+    t, contacts = find_contacts(model, log, signals)
     flags, parts = dict(log.contacts), []
-    for contact in found:
+    for contact in contacts:
         on, off, open_ = contact.shares
         if on + off < _FEWEST:
             raise _unknown(log, [contact.frame], f"{100 * (on + off):.0f} % of samples are decided")
@@ -194,9 +190,8 @@ def find_contacts(
     if motion.contacts is None:
         motion = replace(motion, contacts=np.empty((len(motion.t), 0), dtype=bool))
     force, velocity = _forces(model, motion, wanted)
-    load = np.linalg.norm(model.pin_model.gravity.linear) * sum(
-        inertia.mass for inertia in model.pin_model.inertias
-    )
+    mass = sum(inertia.mass for inertia in model.pin_model.inertias)
+    load = np.linalg.norm(model.pin_model.gravity.linear) * mass
     heights = None
     if log.base.has_position:
         frames = [x.frame for x in wanted]
@@ -211,8 +206,7 @@ def find_contacts(
 def _up(model: RobotModel) -> Array:
     """Return the direction against gravity, shape (3,)."""
     gravity: Array = model.pin_model.gravity.linear
-    up: Array = -gravity / np.linalg.norm(gravity)
-    return up
+    return np.asarray(-gravity / np.linalg.norm(gravity))
 
 
 def _unknown(log: Log, frames: Sequence[str], why: str) -> DataError:
@@ -278,8 +272,6 @@ def _noise_of_groups(J: Array, b: Array, size: float) -> Array:
 
     References:
         Searle, Casella, McCulloch (1992), Variance Components, section 8.3.
-
-    J (N, m, n_rows), b (N, n_rows).
     """
     step, n = max(1, len(b) // _SAMPLES), b.shape[1]
     J, b, weak = J[::step], b[::step], np.eye(J.shape[1]) / (_WIDER * size) ** 2
@@ -303,10 +295,7 @@ def _noise_of_groups(J: Array, b: Array, size: float) -> Array:
 
 
 def _probabilities(force: Array, heights: Array | None, velocity: Array, feet: int) -> Array:
-    """Return the probabilities of contact, shape (N, k).
-
-    force (N, k), heights (N, k) [m], velocity (N, k, 3) [m/s].
-    """
+    """Return the probabilities of contact, shape (N, k), by values of this shape."""
     p = (force > _LOAD / feet).astype(float)
     for _ in range(_ROUNDS):
         if min(p.sum(), (1.0 - p).sum()) < _SOME:  # all or none touch: the force alone decides
@@ -326,10 +315,7 @@ def _probabilities(force: Array, heights: Array | None, velocity: Array, feet: i
 
 
 def _evidence(x: Array, p: Array, narrow: float, off: float | None) -> Array:
-    """Return the logarithm of the ratio of the densities of a value with and without contact.
-
-    x (N, k), p (N, k).
-    """
+    """Return the logarithm of the ratio of the densities of a value with and without contact."""
     on, is_fixed = float(np.average(x, weights=p)), off is not None
     off = float(np.average(x, weights=1.0 - p)) if off is None else off
     a = max(float(np.sqrt(np.average((x - on) ** 2, weights=p))), narrow)

@@ -1,26 +1,26 @@
 """The drive columns of the regressor, and the plan of a block of rows."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from robotid.base.exceptions import DataError
 from robotid.base.typing import Array
 from robotid.data.log import Trajectory
-from robotid.robot.drives import DriveMotion
+from robotid.robot.drive_term import DriveMotion
 from robotid.robot.parameters import ParameterLayout
 
 
-@dataclass(frozen=True)
-class RowPlan:
+class RowPlan(NamedTuple):
     """The columns of a block of rows and their places, joint by joint."""
 
-    inertial: tuple[Array, ...]  # per row its inertial columns, n arrays of shape (c_j,)
-    places: tuple[Array, ...]  # per row their places in the block, likewise
-    # per row the place of each drive column, its drive parameter, and its ratio
-    drives: tuple[tuple[tuple[int, int, float], ...], ...]
-    torques: tuple[int, ...]  # per row the place of the torque, the last one of the row
+    inertial: list[Array]  # per row its inertial columns, n arrays of shape (c_j,)
+    places: list[Array]  # per row their places in the block, likewise
+    drive_places: Array  # places of the E drive columns, shape (E,), int
+    drive_numbers: Array  # their drive parameters, shape (E,), int
+    ratios: Array  # their ratios, shape (E, 1)
+    torques: Array  # per row the place of the torque, the last one of the row, shape (n,), int
     first: Array  # first place of each row, and the end, shape (n + 1,), int
 
 
@@ -142,17 +142,15 @@ def plan_rows(layout: ParameterLayout, columns: Sequence[Array]) -> RowPlan:
     base = len(columns) - len(loads)  # rows of a floating base, without drives
     first = np.concatenate([[0], np.cumsum([len(row) + 1 for row in columns])])
     inertial = [np.flatnonzero(row < size) for row in columns]
+    drives = [
+        (first[j] + k, g - size, loads[j - base, g - size])
+        for j, row in enumerate(columns)
+        for k, g in enumerate(row)
+        if g >= size
+    ]
+    places, numbers, ratios = np.array(drives).reshape(-1, 3).T
     return RowPlan(
-        inertial=tuple(row[k] for row, k in zip(columns, inertial, strict=True)),
-        places=tuple(start + k for start, k in zip(first[:-1], inertial, strict=True)),
-        drives=tuple(
-            tuple(
-                (int(first[j]) + k, int(g) - size, float(loads[j - base, g - size]))
-                for k, g in enumerate(row)
-                if g >= size
-            )
-            for j, row in enumerate(columns)
-        ),
-        torques=tuple(int(end) - 1 for end in first[1:]),
-        first=first,
-    )
+        [row[k] for row, k in zip(columns, inertial, strict=True)],
+        [start + k for start, k in zip(first, inertial, strict=False)],
+        places.astype(int), numbers.astype(int), ratios[:, None], first[1:] - 1, first,
+    )  # fmt: skip

@@ -6,9 +6,10 @@ X and Y over the rows. A result contains them, so that the logs are not needed.
 """
 
 import warnings
+from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
+from itertools import chain, combinations
 from typing import Any
 
 import numpy as np
@@ -18,15 +19,8 @@ from robotid.base.typing import Array
 from robotid.data.log import Trajectory
 from robotid.dynamics.prediction import drive_motion_along
 from robotid.robot.as_pinocchio import pinocchio_model
-from robotid.robot.drives import (
-    TERMS,
-    DriveMotion,
-    DriveTerm,
-    Lag,
-    LuGre,
-    Presliding,
-    Spring,
-)
+from robotid.robot.drive_term import DriveMotion, DriveTerm
+from robotid.robot.drives import TERMS, Lag, LuGre, Presliding, Spring
 from robotid.robot.model import RobotModel
 
 #: The terms that friction is projected on. The offset is always one of them, so that it does not
@@ -66,10 +60,7 @@ class DriveMoments:
         return cls(terms, products, float(table["torque"]))
 
     def transfer(self, own: Sequence[str], onto: Sequence[str]) -> Array:
-        """Return the linear map from a drive's parameters to those of its projection.
-
-        -> (len(onto), len(own)).
-        """
+        """Return the linear map from a drive's parameters to those of its projection."""
         root = self._root()
         Y, X = (root[:, [self.terms.index(name) for name in names]] for names in (onto, own))
         T: Array = np.linalg.lstsq(Y, X, rcond=None)[0]
@@ -141,7 +132,7 @@ def drive_moments(
     """
     layout = model.layout
     sums: dict[str, tuple[tuple[str, ...], Array, float, int]] = {}
-    first = model.n_rows - len(model.joints)
+    n = len(model.joints)
     for trajectory, mask in recordings if layout.own else ():
         along = drive_motion_along(model, trajectory)
         motion = replace(along, rate=np.zeros_like(along.rate), begins=None)
@@ -149,12 +140,12 @@ def drive_moments(
             if drive.name not in layout.own:
                 continue
             moved = layout.drive_ratios[d] != 0.0
-            rows = mask[:, first:][:, moved].all(axis=1)
+            rows = mask[:, -n:][:, moved].all(axis=1)
             names, columns = _columns(model, d, motion.of(d))
-            X = columns[:, rows]
-            torque = float((trajectory.tau[:, -len(model.joints) :][rows][:, moved] ** 2).sum())
+            X, tau = columns[:, rows], trajectory.tau[:, -n:][rows][:, moved]
             _, products, total, count = sums.get(drive.name, (names, 0.0 * X @ X.T, 0.0, 0))
-            sums[drive.name] = (names, products + X @ X.T, total + torque, count + int(rows.sum()))
+            total += float((tau**2).sum())
+            sums[drive.name] = (names, products + X @ X.T, total, count + int(rows.sum()))
     return {
         name: DriveMoments(names, products / count, float(np.sqrt(total / count)))
         for name, (names, products, total, count) in sums.items()
@@ -171,12 +162,8 @@ def _columns(model: RobotModel, d: int, motion: DriveMotion) -> tuple[tuple[str,
 
 def _own_terms(model: RobotModel, d: int) -> list[tuple[int, DriveTerm]]:
     """Return indices and terms of a drive's parameters except inertia."""
-    layout = model.layout
-    return [
-        (k, term)
-        for k, (drive, term) in enumerate(layout.drive_parameters, start=layout.n_inertial)
-        if drive == d and not term.is_inertia
-    ]
+    drives = enumerate(model.layout.drive_parameters, start=model.layout.n_inertial)
+    return [(k, term) for k, (drive, term) in drives if drive == d and not term.is_inertia]
 
 
 def project_friction(
@@ -189,10 +176,10 @@ def project_friction(
     """
     layout, projected = model.layout, []
     for d, drive in enumerate(layout.drives):
-        own = _own_terms(model, d)
         simple = (*_SIMPLE, Lag.label)  # a delay is not friction: it is omitted and named
-        excess = [term.name for k, term in own if term.name not in simple and pi[k] != 0.0]
-        excess += [t.name for k, t in own if t.name == "spring" not in onto and pi[k] != 0.0]
+        names = [term.name for k, term in _own_terms(model, d) if pi[k] != 0.0]
+        excess = [name for name in names if name not in simple]
+        excess += [name for name in names if name == "spring" not in onto]
         if excess:
             if drive.name not in moments:
                 raise DataError(
@@ -235,39 +222,25 @@ def _projected(
     has_spring = any(term.part in ("spring", "ripple") for _, term in own)
     usable = {*names, "spring"} if has_spring else {*names}
     bounded = [name for name in _SIMPLE if name in onto and name in usable and name != "offset"]
-    best, least = tuple[str, ...](), np.inf
-    for size in range(len(bounded) + 1):
-        for free in combinations(bounded, size):  # the others at their bound of 0
-            z = moments.transfer(names, (*free, "offset")) @ x
-            error = moments.rms(_difference(names, x, (*free, "offset"), z))
-            if (z[:-1] >= 0).all() and error < least:
-                best, least = free, error
-    free = (*best, "offset")
-    T = dict(zip(free, moments.transfer(names, free), strict=True))
+    best, least, T_best = tuple[str, ...](), np.inf, np.zeros((0, len(names)))
+    for free in chain.from_iterable(combinations(bounded, k) for k in range(len(bounded) + 1)):
+        onto_free = (*free, "offset")  # the others are at their bound of 0
+        T = moments.transfer(names, onto_free)
+        left = Counter(dict(zip(names, x.tolist(), strict=True)))
+        left.subtract(dict(zip(onto_free, (T @ x).tolist(), strict=True)))
+        error = moments.rms(left)
+        if ((T @ x)[:-1] >= 0).all() and error < least:
+            best, least, T_best = onto_free, error, T
     stated = [name for name in _SIMPLE if name in bounded or (name in onto and name in names)]
-    transfer = np.zeros((len(stated), len(names)))
+    transfer, drive = np.zeros((len(stated), len(names))), model.layout.drives[d]
     for k, name in enumerate(stated):
-        transfer[k] = T.get(name, 0.0)
+        if name in best:
+            transfer[k] = T_best[best.index(name)]
     return ProjectedDrive(
-        name=model.layout.drives[d].name,
-        replaced=tuple(excess),
-        values=dict(zip(stated, (transfer @ x).tolist(), strict=True)),
-        transfer=transfer,
-        own=tuple(k for k, _ in own),
-        error=least,
-        torque=moments.torque,
-        is_linear={joint for joint, _ in model.layout.drives[d].ratios} <= model.layout.prismatic,
-    )
-
-
-def _difference(
-    names: Sequence[str], x: Array, others: Sequence[str], z: Array
-) -> dict[str, float]:
-    """Return the parameters x minus z by name of the term."""
-    difference = dict(zip(names, x.tolist(), strict=True))
-    for name, value in zip(others, z.tolist(), strict=True):
-        difference[name] = difference.get(name, 0.0) - value
-    return difference
+        drive.name, tuple(excess), dict(zip(stated, (transfer @ x).tolist(), strict=True)),
+        transfer, tuple(k for k, _ in own), error=least, torque=moments.torque,
+        is_linear={joint for joint, _ in drive.ratios} <= model.layout.prismatic,
+    )  # fmt: skip
 
 
 def _simplified(

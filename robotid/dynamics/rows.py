@@ -4,7 +4,7 @@ import logging
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import chain, pairwise
+from itertools import pairwise
 
 import numpy as np
 import pinocchio as pin
@@ -236,16 +236,15 @@ class _PinocchioWriter:
 
     def write(self, start: int, stop: int) -> None:
         """Write the rows of samples start to stop of those loaded."""
-        part, m = slice(start, stop), self._motion
+        part, m, plan = slice(start, stop), self._motion, self._plan
         own = slice(self._first + start, self._first + stop)  # in the trajectory
         if self._stored is None:
             self.write_inertial(m.q[own], m.v[own], m.a[own])
         else:
             self._out[self._to, : stop - start] = self._stored[self._from, own]
         out = self._out[:, : stop - start]
-        for place, k, ratio in chain.from_iterable(self._plan.drives):
-            np.multiply(ratio, self._values[k, part], out=out[place])
-        out[list(self._plan.torques)] = m.tau[own].T
+        out[plan.drive_places] = plan.ratios * self._values[plan.drive_numbers, part]
+        out[plan.torques] = m.tau[own].T
         if self._weights is not None:
             for root, (i, j) in zip(
                 np.sqrt(self._weights[part]).T, pairwise(self._plan.first), strict=True

@@ -44,8 +44,6 @@ def static_rows(model: RobotModel, log: Log, signals: SignalSettings) -> tuple[T
     Where a joint moves, friction has its sign. Where it is at rest, friction is anywhere within its
     limits: rest phases are used without friction, which is part of the residual then, and only for
     joints that move in fewer samples of the log than there are rest phases.
-
-    -> (N, n_rows).
     """
     layout, n = model.layout, len(model.joints)
     unit, least = layout.drive_speeds[:n], min(signals.min_velocity, _MOVES)

@@ -18,7 +18,8 @@ from robotid.base.native_messages import caught_messages
 from robotid.base.settings import require_each, require_flag, require_kind
 from robotid.base.typing import Array
 from robotid.robot.constraints import Constraint, Contact, Loop, check_constraints
-from robotid.robot.drives import DRIVE_TERMS, TERMS, DriveMotion, DriveTerm
+from robotid.robot.drive_term import DriveMotion, DriveTerm
+from robotid.robot.drives import DRIVE_TERMS, TERMS
 from robotid.robot.parameters import DYNAMICS, Coupling, ParameterLayout
 from robotid.robot.tree import Joint, Tree, choose_joints, mimic_followers, read_tree
 from robotid.robot.urdf_text import LARGEST
@@ -136,7 +137,7 @@ class RobotModel:
             require_kind(name, str, "one of joints or locked", "the name of a joint")
         require_each(terms, str, "terms", f"a list of some of {listed(DRIVE_TERMS)}")
         require_each(passive, str, "passive", "a list of names of joints")
-        require_each(couplings, Coupling, "couplings", "a list of robotid.Coupling")
+        require_each(couplings, Coupling, "couplings", "a list of Coupling")
         for name, own in own_terms.items():
             require_each(own, DriveTerm, f"own_terms of {name!r}", "a list of drive terms")
         for name, flag in (("free_flyer", free_flyer), ("snap_angles", snap_angles)):

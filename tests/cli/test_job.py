@@ -4,7 +4,7 @@ from types import SimpleNamespace
 import pytest
 
 from robotid.base.exceptions import SettingsError
-from robotid.cli.job import _motors, job_from_settings, read_job
+from robotid.cli.job import Job, _motors, job_from_settings, read_job
 from robotid.data.signal_settings import LogSource
 from robotid.robot.constraints import Loop
 from robotid.robot.parameters import Coupling
@@ -223,3 +223,9 @@ def test_the_motor_of_several_joints_replaces_the_drive_of_the_joint_with_its_na
     ratios = (("a", 60.0), ("b", -1.5))
     gear = SimpleNamespace(shared={"a": ratios})
     assert _motors(gear) == [Coupling("a", ratios, replaces=True)]
+
+
+def test_friction_that_is_stated_as_selected_is_the_default():
+    for friction, terms in (("auto", Job(Path("x")).terms), ("none", ("armature", "offset"))):
+        table = {"urdf": "x", "model": {"friction": friction}}
+        assert job_from_settings(table, "job.toml", Path()).terms == terms

@@ -154,31 +154,6 @@ def test_further_terms_leave_the_base_parameters_of_the_others_as_they_are(rng):
     np.testing.assert_allclose(W[:, after.independent] @ after.to_base(pi), W @ pi, atol=1e-9)
 
 
-def test_further_terms_that_are_multiples_of_each_other_are_one_base_parameter(rng):
-    """So slow that it is straight, a curve is a multiple of the speed."""
-    own = {
-        "elbow_joint": [Power(exponent=1.0), Tanh(speed=1e5)],
-        "wrist_2_joint": [Cubic(), Power(exponent=3.0)],
-    }
-    model = RobotModel.from_urdf(example_urdf("ur5_robot.urdf"), terms=("coulomb",), own_terms=own)
-    plain, found = structural_mapping(model.with_terms({})), structural_mapping(model)
-    assert len(found.K) == len(plain.K) + 2
-    np.testing.assert_array_equal(structural_mapping(model, plain=plain).K, found.K)
-    pi = rng.standard_normal(len(model.layout.names))
-    pi[model.layout.names.index("elbow_joint.tanh")] = speed = 1e5
-    q, v, a = rng.uniform(-2, 2, (3, 40, 6))
-    W = joint_torque_regressor(model, q, v, a)
-    torque = W @ pi
-    np.testing.assert_allclose(
-        W[:, found.independent] @ found.to_base(pi), torque, atol=1e-7 * abs(torque).max()
-    )
-    values = dict(zip(found.base_names, found.to_base(pi), strict=True))
-    stated = dict(zip(model.layout.names, pi, strict=True))
-    (name,) = {"elbow_joint.power", "elbow_joint.tanh"} & set(values)
-    straight = stated["elbow_joint.power"] + 1.0  # [N m s/rad]
-    assert values[name] == pytest.approx(straight * (speed if name.endswith("tanh") else 1.0))
-
-
 #: Which columns four equations have: a trunk with two branches; one column of a branch does not
 #: load the trunk; equations that are not nested; two robots in one.
 PATTERNS = {
@@ -220,3 +195,28 @@ def test_pivots_are_shares_of_the_largest_whatever_the_unit(rng):
         spread = np.array([2.0, 0.5, 1.0, 3.0, 0.1])
         G = np.diag(spread**2) @ found.K.T @ np.linalg.inv(found.K @ np.diag(spread**2) @ found.K.T)
         np.testing.assert_allclose(found.gain(spread), G, atol=1e-9)
+
+
+def test_further_terms_that_are_multiples_of_each_other_are_one_base_parameter(rng):
+    """So slow that it is straight, a curve is a multiple of the speed."""
+    own = {
+        "elbow_joint": [Power(exponent=1.0), Tanh(speed=1e5)],
+        "wrist_2_joint": [Cubic(), Power(exponent=3.0)],
+    }
+    model = RobotModel.from_urdf(example_urdf("ur5_robot.urdf"), terms=("coulomb",), own_terms=own)
+    plain, found = structural_mapping(model.with_terms({})), structural_mapping(model)
+    assert len(found.K) == len(plain.K) + 2
+    np.testing.assert_array_equal(structural_mapping(model, plain=plain).K, found.K)
+    pi = rng.standard_normal(len(model.layout.names))
+    pi[model.layout.names.index("elbow_joint.tanh")] = speed = 1e5
+    q, v, a = rng.uniform(-2, 2, (3, 40, 6))
+    W = joint_torque_regressor(model, q, v, a)
+    torque = W @ pi
+    np.testing.assert_allclose(
+        W[:, found.independent] @ found.to_base(pi), torque, atol=1e-7 * abs(torque).max()
+    )
+    values = dict(zip(found.base_names, found.to_base(pi), strict=True))
+    stated = dict(zip(model.layout.names, pi, strict=True))
+    (name,) = {"elbow_joint.power", "elbow_joint.tanh"} & set(values)
+    straight = stated["elbow_joint.power"] + 1.0  # [N m s/rad]
+    assert values[name] == pytest.approx(straight * (speed if name.endswith("tanh") else 1.0))

@@ -26,14 +26,11 @@ from robotid.identification.pipeline import identify
 from robotid.robot.closure import Chains
 from robotid.robot.constraints import Loop
 from robotid.robot.model import RobotModel
-from robotid.robot.parameters import Coupling
 from tests.helpers.cassie import FEET, cassie, truth
 from tests.helpers.closed_chains import (
     FOUR_BAR,
     FOUR_BAR_LOOP,
-    MOTORS,
     PARALLELOGRAM,
-    WRIST,
     Oracle,
     ankle,
     four_bar,
@@ -108,45 +105,6 @@ def test_rows_of_a_biped_with_rods_are_those_of_pinocchio(tmp_path, rng):
     assert np.sum(basis**2) == pytest.approx(
         len(q) * (10 + 5)
     )  # of 12 and 6, and two are redundant
-
-
-def test_a_differential_is_the_constraint_dynamics_of_its_rotors(tmp_path, rng):
-    """Motors that turn 9 (pitch + roll) and 9 (pitch - roll) are couplings of both joints."""
-    A = 9.0 * np.array([[1.0, 1.0], [1.0, -1.0]])
-    for name, text in (("wrist", WRIST), ("whole", WRIST + MOTORS)):
-        (tmp_path / f"{name}.urdf").write_text(f"<robot name='wrist'>{text}</robot>")
-    whole = pin.buildModelFromUrdf(str(tmp_path / "whole.urdf"))
-    data = whole.createData()
-    at = [whole.joints[whole.getJointId(x)].idx_v for x in ("pitch", "roll", "left", "right")]
-    wrist = RobotModel.from_urdf(
-        tmp_path / "wrist.urdf", passive=("pitch", "roll"), terms=("armature", "viscous"),
-        couplings=[
-            Coupling(motor, tuple(zip(("pitch", "roll"), ratios.tolist(), strict=True)))
-            for motor, ratios in zip(("left", "right"), A, strict=True)
-        ],
-    )  # fmt: skip
-    pi = wrist.standard_parameters()
-    drives = {"armature": 3e-5, "viscous": 2e-4}
-    names = wrist.layout.names[wrist.layout.n_inertial :]
-    pi[wrist.layout.n_inertial :] = [drives[name.rpartition(".")[2]] for name in names]
-    T = np.vstack([np.eye(2), A])  # speeds of joints and rotors from those of the joints
-    rows = []
-    for _ in range(5):
-        q, v, torque = rng.standard_normal((3, 2))
-        speed, angle, tau = np.zeros((3, 4))
-        speed[at], angle[at] = T @ v, T @ q
-        tau[at[2:]] = torque - drives["viscous"] * (A @ v)
-        M = pin.crba(whole, data, angle)
-        M = np.triu(M) + np.triu(M, 1).T
-        h = pin.nonLinearEffects(whole, data, angle, speed)
-        gear = np.zeros((2, 4))
-        gear[:, at] = np.hstack([A, -np.eye(2)])  # gear @ speed = 0
-        system = np.block([[M, gear.T], [gear, np.zeros((2, 2))]])
-        a = np.linalg.solve(system, np.append(tau - h, np.zeros(2)))[at[:2]]
-        rows.append([q, v, a, A.T @ torque])
-    q, v, a, tau = np.swapaxes(rows, 0, 1)
-    W = joint_torque_regressor(wrist, q, v, a)
-    np.testing.assert_allclose((W @ pi).reshape(q.shape), tau, atol=1e-8)
 
 
 def test_a_walk_does_not_cross_dead_centres(tmp_path, rng):

@@ -18,7 +18,6 @@ from robotid.robot.drives import (
     Lag,
     LoadFriction,
     Presliding,
-    Spring,
     Stribeck,
 )
 from robotid.robot.examples import example_urdf
@@ -123,23 +122,6 @@ def test_friction_that_would_be_negative_is_0_and_the_rest_is_fitted_again(case)
     (viscous, offset), *_ = np.linalg.lstsq(A, y, rcond=None)
     assert drive.values["viscous"] == pytest.approx(viscous, rel=1e-8)
     assert drive.values["offset"] == pytest.approx(offset, rel=1e-8)
-
-
-def test_what_a_format_states_stays_to_the_last_bit(case, ur5):
-    model, pi, recordings = case
-    plain, values = ur5.with_terms({ELBOW: (Spring(),)}), ur5.standard_parameters()
-    values = np.insert(values, plain.layout.names.index(f"{ELBOW}.spring"), 7.0)
-    kept = project_friction(plain, values, {}, ("viscous", "coulomb", "spring"))
-    assert kept.model is plain
-    assert kept.pi is values
-    with pytest.raises(DataError, match="elbow_joint has spring, but the result of an earlier"):
-        project_friction(plain, values, {}, ("viscous", "coulomb"))
-    # a term of size 0 needs no projection
-    zero = pi.copy()
-    zero[[model.layout.names.index(f"{LIFT}.load")]] = 0.0
-    moments = drive_moments(model, recordings)
-    drives = project_friction(model, zero, moments, ("viscous", "coulomb")).drives
-    assert [drive.name for drive in drives] == [ELBOW, WRIST]
 
 
 def test_the_moments_are_read_back_and_the_sentence_states_the_figures(case):

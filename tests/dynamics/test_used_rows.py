@@ -74,22 +74,6 @@ def test_a_stretch_is_slow_whose_inertia_is_two_hundredths_of_gravity(gravity):
         assert used.all()
 
 
-def test_a_slider_is_slow_by_the_length_of_the_robot():
-    """Its inertia m a, of a speed v and a length l some v^2 / l, against gravity m g."""
-    model = RobotModel.from_urdf(
-        example_urdf("tiago_no_hand.urdf"), joints=["torso_lift_joint", "arm_4_joint"],
-        terms=("coulomb", "offset"),
-    )  # fmt: skip
-    assert model.length < 0.9 or model.length > 1.1
-    fastest = np.sqrt(0.02 * 9.81 * model.length)  # [m/s]
-    t = 5.0 + np.arange(300) / 100
-    for share, count in ((0.98, 12), (1.02, 0)):
-        q = np.outer(t, [share * fastest, 0.1])
-        log = Log(t, q, q, tuple(model.joints), v=np.zeros_like(q))
-        motion, _ = static_rows(model, log, resolve(log, SignalSettings(cutoff=None)))
-        assert len(motion.t) == count
-
-
 LSB = 2 * np.pi / 4096  # [rad] of a 12-bit encoder
 
 

@@ -40,23 +40,6 @@ FOUR_BAR = "<robot name='four_bar'>" + "".join(
         _joint("rocker_tip", "fixed", "rocker", "rocker_end", "0.3 0 0"),
     ]
 ) + "</robot>"  # fmt: skip
-#: A wrist that two motors in its base move by a differential: both pitch, their difference rolls.
-WRIST = "".join(
-    [
-        _link("base"), _link("yoke", _inertial(0.6, "0.01 0.02 0.05", 0.002, 0.003, 0.001)),
-        _link("hand", _inertial(0.8, "0.05 -0.01 0.02", 0.001, 0.004, 0.004)),
-        _joint("pitch", "revolute", "base", "yoke", "0 0 0.3", axis="0 1 0"),
-        _joint("roll", "revolute", "yoke", "hand", "0.1 0 0", axis="1 0 0"),
-    ]
-)  # fmt: skip
-MOTORS = "".join(
-    text
-    for name, y in (("left", 0.1), ("right", -0.1))
-    for text in (
-        _link(f"{name}_rotor", _inertial(0.1, "0 0 0", 1e-5, 3e-5, 1e-5)),
-        _joint(f"{name}", "revolute", "base", f"{name}_rotor", f"0 {y} 0", axis="0 1 0"),
-    )
-)
 PARALLELOGRAM = (  # crank and rocker at 0.5 rad
     FOUR_BAR.replace('rpy="0 0 1.2"', 'rpy="0 0 0.5"')
     .replace('"0 0 0" rpy="0 0 0"', '"0 0 0" rpy="0 0 0.5"', 1)

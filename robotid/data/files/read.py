@@ -312,8 +312,8 @@ def lay_out(
     for name, value, kinds, wanted in (
         ("columns", columns, (Mapping, type(None)), "a table of names by column"),
         ("gains", gains, (Mapping, type(None)), "a table of numbers by joint"),
-        ("units", units, LogUnits, "a robotid.LogUnits"),
-        ("source", source, LogSource, "a robotid.LogSource"),
+        ("units", units, LogUnits, "a LogUnits"),
+        ("source", source, LogSource, "a LogSource"),
     ):
         require_kind(value, kinds, name, wanted)
     require_each(prismatic, str, "prismatic", "a list of names")

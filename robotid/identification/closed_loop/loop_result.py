@@ -9,6 +9,7 @@ import numpy as np
 from robotid.base.exceptions import SettingsError
 from robotid.base.typing import Array
 from robotid.data.log import Log, Trajectory
+from robotid.diagnosis.catalogue import entries
 from robotid.diagnosis.verdict.parameter_table import correlated_sets
 from robotid.diagnosis.verdict.position_verdict import judge_positions
 from robotid.diagnosis.verdict.verdict import Verdict
@@ -38,11 +39,6 @@ from robotid.robot.parameters import pseudo_inertia
 _CHANGE = 0.1  # plausible standard deviation of a parameter between logs, over its value
 _LEAST = 0.01  # ... at least, over its prior standard deviation
 _LEAST_INFORMATION = 1e-12
-#: The limit of an identification from positions and stated gains.
-STATED_SCALE = (
-    "positions do not determine the scale: all drive and inertial parameters scale with kp as "
-    "stated (kp stated 20 % too large makes all 20 % too large). Log a torque to check the scale"
-)
 _CAUTIONS = ("at_bound", "coarse_steps", "gains_contradicted")  # with these no result is good
 _GAP = 3.0  # step in time above which no speed is computed [median steps]
 _MOVING = 0.05  # smallest speed above the noise, relative to the largest speed of a joint
@@ -233,7 +229,7 @@ class PositionIdentification(Identification):
             is_settled=self.estimate.converged,
             log_errors=self.log_errors,
             cautions=[f.message for f in self.findings if f.code in _CAUTIONS],
-            scale=STATED_SCALE if self.is_scaled_by_gain else "",
+            scale=entries()["scale"]["what"]["gains"] if self.is_scaled_by_gain else "",
             knows_torques=self.loop.kind == "torque" or self.fit.simulator.knows_torques,
         )
 

@@ -51,15 +51,6 @@ def test_the_log_of_the_plant_obeys_its_own_equation(ur5, rng):
     np.testing.assert_allclose(np.gradient(log.q, log.t, axis=0)[5:-5], log.v[5:-5], atol=1e-3)
 
 
-def test_the_plant_is_integrated_in_short_steps_whatever_the_rate_of_the_log(ur5):
-    motion = random_fourier(ur5, np.random.default_rng(0))
-    rare, often = (
-        simulate(ur5, truth(ur5), motion, rate=rate, duration=1.0, rng=np.random.default_rng(0))
-        for rate in (25.0, 200.0)
-    )
-    np.testing.assert_allclose(rare.q, often.q[::8], atol=1e-3)
-
-
 def followed(model, pi, settings, *, seed=1, rate=500.0, duration=2.0):
     motion = random_fourier(model, np.random.default_rng(seed))
     return follow(model, pi, motion, rate=rate, duration=duration, settings=settings)
@@ -97,11 +88,13 @@ def test_a_perfect_log_is_inverse_dynamics_drives_that_remember_included(ur5):
 def test_drives_give_no_more_than_their_limits(ur5):
     pi, most = truth(ur5), {"shoulder_pan_joint": 8.0}
     free = followed(ur5, pi, Simulation())
-    held = followed(ur5, pi, Simulation(actuator=Actuator(effort=1.0, limits=most)))
+    held = followed(ur5, pi, Simulation(actuator=Actuator(effort=0.4, limits=most)))
     assert free.tau[:, 0].min() < -9.0
     assert free.tau[:, 0].max() > 9.0
     assert (held.tau[:, 0].min(), held.tau[:, 0].max()) == (-8.0, 8.0)
-    assert (np.abs(held.tau) <= [j.effort for j in ur5.limits]).all()
+    largest = 0.4 * np.array([j.effort for j in ur5.limits])
+    assert (np.abs(held.tau) <= largest + 1e-9).all()
+    assert np.abs(held.tau[:, 1]).max() == largest[1]
     assert held.saturated[0] == np.mean(np.abs(held.tau[:, 0]) == 8.0) > 0.0
     assert (free.saturated == 0.0).all()
 

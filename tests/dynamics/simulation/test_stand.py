@@ -33,16 +33,6 @@ def motion(robot):
     return stand(robot, MIDDLE, 0.25, np.random.default_rng(1), parts=2, length=1.0)
 
 
-def test_the_twist_and_its_derivative_are_those_of_the_pose(robot, motion):
-    h, t = 1e-5, np.array([0.33, 0.71, 1.47])
-    (_, v, a), before, after = (motion.evaluate(x) for x in (t, t - h, t + h))
-    assert np.abs(v[:, :6]).max() > 0.05
-    np.testing.assert_allclose(a, (after[1] - before[1]) / (2 * h), atol=1e-4)
-    for k in range(3):
-        difference = pin.difference(robot.pin_model, before[0][k], after[0][k])
-        np.testing.assert_allclose(v[k], difference / (2 * h), atol=1e-7)
-
-
 def test_the_torques_cause_the_motion_in_constrained_dynamics(robot, motion):
     pi = robot.standard_parameters()
     run = follow(robot, pi, motion, rate=10.0, duration=2.0, settings=PERFECT)

@@ -5,8 +5,8 @@ import pinocchio as pin
 import pytest
 from helpers.mujoco_plant import held, multisine, plant, recorded
 
-from robotid.base.findings import Finding
 from robotid.data.log import Log
+from robotid.diagnosis.catalogue import finding
 from robotid.dynamics.simulation.loops import ClosedLoopRobot, cut_windows
 from robotid.estimation.fitting.estimator_settings import SimulationSettings
 from robotid.identification.closed_loop.from_commands import identify_loops, with_gravity
@@ -21,6 +21,9 @@ from robotid.robot.drives import Coulomb, Offset, PositionCoulomb, Viscous
 NOISE = 1e-3  # [rad]: with less, that MuJoCo's friction is a little soft shows beside the errors
 SETTINGS = SimulationSettings(window=1.0, lead=0.3, bodies=0.0, step=2e-3)
 COARSE = replace(SETTINGS, step=4e-3)  # of logs at 250 Hz: the fit halves it where it matters
+
+
+SLOW = finding("slow_command", "log", "hip", frequency=2.0, shortest=0.0, longest=0.09)
 
 
 def stated(robot, **changes):
@@ -41,10 +44,8 @@ def leg():
 def found(leg):
     """What is found with stated gains; the doctor said of the log that it shows no delay."""
     robot, log, kept = leg
-    evidence = {"frequency": 2.0, "shortest": 0.0, "longest": 0.09}
-    slow = Finding("slow_command", "warning", "log", "any delay explains it", evidence)
     return identify_loops(
-        robot.model, [log], [kept], stated(robot), SETTINGS, chooses=False, examined=[slow]
+        robot.model, [log], [kept], stated(robot), SETTINGS, chooses=False, examined=[SLOW]
     )
 
 
@@ -246,7 +247,7 @@ def test_stated_gains_that_the_bodies_contradict_are_named(leg, found):
 def test_a_slow_command_does_not_contradict_the_delay_that_was_found(found):
     [settled] = [f for f in found.findings if f.code == "slow_command"]
     assert settled.severity == "note"
-    assert "any delay" not in settled.message
+    assert "Any delay" not in settled.message
     names, errors = found.fit.estimate.names, found.fit.estimate.std_error
     worst = max(e for n, e in zip(names, errors, strict=True) if n.endswith("delay"))
     assert settled.evidence["std_error"] == pytest.approx(worst)
@@ -254,16 +255,14 @@ def test_a_slow_command_does_not_contradict_the_delay_that_was_found(found):
 
 
 def test_a_delay_at_its_bound_leaves_the_warning_of_a_slow_command(found):
-    evidence = {"frequency": 2.0, "shortest": 0.0, "longest": 0.09}
-    slow = Finding("slow_command", "warning", "log", "any delay explains it", evidence)
     delay = next(name for name in found.fit.estimate.names if name.endswith("delay"))
     other = next(name for name in found.fit.estimate.names if name.endswith("coulomb"))
     details = {**found.estimate.details, "at_bound": (other, delay)}
     fitted = replace(found.fit, estimate=replace(found.estimate, details=details))
     bound = replace(found, fit=fitted)
-    named = {finding.code: finding for finding in loop_findings(bound, [slow])}
+    named = {one.code: one for one in loop_findings(bound, [SLOW])}
     assert named["slow_command"].severity == "warning"
-    assert "any delay explains it. The delay of the fit is 0" in named["slow_command"].message
+    assert "or steps. The delay of the fit is 0" in named["slow_command"].message
     assert "the data do not determine it" in named["no_delay"].message
     entries = build_result(bound, {"estimator": {"name": "simulation"}})["drive_parameters"]
     sources = {e["source"] for e in entries if e["name"].endswith(".delay")}
