@@ -45,7 +45,8 @@ class Finding:
     def reworded(self, **changes: Any) -> "Finding":  # noqa: ANN401
         """Return the finding with other fields, and the message that follows from them."""
         other = replace(self, **changes)
-        return replace(other, message=sentence([other])) if other.fault else other
+        added = other.remedy.removeprefix(self.remedy)
+        return replace(other, message=sentence([other]) if other.fault else self.message + added)
 
 
 @dataclass(frozen=True)

@@ -14,10 +14,6 @@ from typing import Any
 
 from robotid.base.findings import Finding, listed
 
-#: Terms of a drive, which the reasons of a verdict name likewise.
-MISSING_TERM = "{term} would explain {share_pct:.0f} % of the squared residual ({error_pct:.1f} % "
-MISSING_TERM += "of the torque): the drive model lacks it"
-
 
 @cache
 def entries() -> Mapping[str, Mapping[str, Any]]:
@@ -80,8 +76,8 @@ def finding(
 def reason_of(found: Finding) -> str:
     """Return the reason of a verdict for a warning: without joint and log."""
     entry = entries()[found.code]
-    if "term" in entry:
-        return MISSING_TERM.format(term=entry["term"], **found.evidence)
     if entry["verdict"] is True:
         return found.message
-    return found.reworded(log="", fault=entry["verdict"], remedy="").message
+    return found.reworded(
+        log="", fault=entry["verdict"].replace("{term}", entry.get("term", "")), remedy=""
+    ).message

@@ -1,31 +1,22 @@
 """Errors of contacts, an IMU and the motion of the base that do not average out.
 
-A force f that acts x beside the stated point adds J_w^T (x x f) to the torque, with the Jacobian
-J_w of the link's rotation. Links of other lengths, feet that are deformed, or are not balls, cause
-such errors. They repeat in every step: the scatter of the residual does not contain them. With the
-rows D of the torque per offset along each axis, and offsets x ~ N(0, s^2) of all contacts,
+A force f that acts x beside the stated point adds D x = J_w^T (x x f) to the torque, with the
+Jacobian J_w of the link's rotation. Feet that deform, or are not balls, cause such errors in every
+step, so that the scatter of the residual does not contain them. With offsets x ~ N(0, s^2) the
+score W^T tau has the covariance s^2 W^T D D^T W beside that of its noise. If s is not stated, it
+has the largest evidence, and in place of s^2 I all points have the mean over points of E[x x^T],
+given the rows. Without torques of joints an offset is like a displaced centre of mass: s then is 2
+cm.
 
-    W pi = tau + J^T f + D x,
+A bias of the accelerometers acts as a change of gravity with the axes of the base; D then has the
+torque per acceleration of the base. The bias is estimated together with the parameters, where the
+base turns, and subtracted; the covariance D Cov(b) D^T is left in the score. Its prior size: a
+robot hardly moves away, so its mean acceleration in the world is that of the bias.
 
-the score W^T tau has the covariance s^2 W^T D D^T W beside that of its noise. If s is not stated,
-it is the one with the largest evidence, and offsets need not be alike along all axes: feet that are
-balls are off along one. In place of s^2 I all points then have the mean over points of E[x x^T],
-3 by 3, given the rows. Which of them is off to which side is not taken from the rows: what is not
-fixed in a link, as of a foot that rolls, has this size only. Without torques of joints an offset is
-like a displaced centre of mass: s then is 2 cm, its bound.
-
-A bias of the accelerometers acts as a change of gravity with the axes of the base. D then has the
-torque per acceleration of the base. Where the base turns, gravity turns in its axes and the bias
-does not: the rows determine it. It is estimated together with the parameters and subtracted; of
-the score the covariance D Cov(b) D^T is left, as of partitioned least squares. Its prior size: a
-robot hardly moves away, so its mean acceleration in the world is that of the bias, or of a tilted
-orientation.
-
-Without torques of joints the residual is mostly an error of the motion, as of soft tissue under
-markers. It is in the regressor, too, E beside W: the score has the mean -E^T E theta, least squares
-underestimates the mass by about three times the squared ratio of residual and weight, and neither
-more data nor the scatter of the segments show it. E is taken to be the error of the acceleration of
-the base that would cause the residual; its effect is counted as an error.
+Without torques of joints the residual is mostly an error E of the regressor, as of the motion of
+soft tissue. The score then has the mean -E^T E theta: least squares underestimates the mass, and
+neither more data nor the scatter of segments show it. E is the error of the acceleration of the
+base that would cause the residual; its effect is counted as an error.
 
 References:
     Carroll, Ruppert, Stefanski, Crainiceanu (2006), Measurement Error in Nonlinear Models.

@@ -1,10 +1,8 @@
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.paths import URDF
 from helpers.robots import ROBOTS, mimicking
 
-from robotid.base.exceptions import DataError
 from robotid.design.information import MotionRegressor, Placements, fixed_tree
 from robotid.dynamics.torque import joint_torque_regressor
 from robotid.robot.examples import example_urdf
@@ -51,14 +49,6 @@ def test_its_gradient_is_that_of_differences_by_each_joint(model):
             np.testing.assert_allclose(found[kind, :, joint], change, rtol=0, atol=bound)
 
 
-def test_columns_of_drives_are_left_at_0():
-    model = RobotModel.from_urdf(example_urdf("ur5_robot.urdf"))
-    size = model.layout.n_inertial
-    W = MotionRegressor(model, np.array([11, size, 14]))(*np.ones((3, 2, 6)))
-    assert (W[:, 1] == 0.0).all()
-    assert W[:, [0, 2]].any(axis=(0, 2)).all()
-
-
 def test_bodies_are_where_pinocchio_has_them(model):
     q = np.random.default_rng(3).uniform(-2, 2, (70, len(model.joints)))
     placed, data = Placements.along(fixed_tree(model), q), model.pin_model.createData()
@@ -67,9 +57,3 @@ def test_bodies_are_where_pinocchio_has_them(model):
         for i, M in enumerate(list(data.oMi)[1:]):
             np.testing.assert_allclose(placed.R[:, :, i, n], M.rotation, atol=1e-13)
             np.testing.assert_allclose(placed.p[:, i, n], M.translation, atol=1e-13)
-
-
-def test_a_floating_base_is_refused():
-    model = RobotModel.from_urdf(URDF / "planar_2r.urdf", free_flyer=True)
-    with pytest.raises(DataError, match="the base floats"):
-        MotionRegressor(model, np.arange(3))

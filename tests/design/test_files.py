@@ -53,13 +53,3 @@ def test_ros_reads_it_as_a_joint_trajectory(motion, tmp_path):
         q, v, a = motion.evaluate(np.array([k / 10]))
         for name, values in (("positions", q), ("velocities", v), ("accelerations", a)):
             np.testing.assert_allclose(point[name], values[0], atol=1e-6)
-
-
-def test_a_ur_is_told_every_8_ms(motion, tmp_path):
-    lines = write_motion(motion, JOINTS, 2.0, 10.0, tmp_path / "m.script").read_text().splitlines()
-    moves = [line for line in lines if "servoj" in line]
-    assert len(moves) == 251
-    numbers = re.search(r"\[(.*)\], t=0.008", moves[125]).group(1)
-    q = motion.evaluate(np.array([1.0]))[0][0]
-    np.testing.assert_allclose(np.array(numbers.split(","), dtype=float), q, atol=1e-6)
-    assert lines[1].startswith(f"  movej([{motion.evaluate(np.zeros(1))[0][0, 0]:.6f}, ")

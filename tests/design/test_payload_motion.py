@@ -4,7 +4,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from robotid.base.exceptions import SettingsError
 from robotid.design.basis import FourierBasis
 from robotid.design.design import Designer, Multipliers
 from robotid.design.information import Aim
@@ -118,12 +117,3 @@ def test_standard_errors_are_those_of_both_runs_fitted_at_once(designer, found):
     [said] = [x for x in found.described() if x.startswith("Expected standard errors")]
     numbers = [float(x) for x in re.findall(r" ([\d.e-]+) kg", said)]
     np.testing.assert_allclose(numbers, [mass, centre, inertia], rtol=0.12)  # of two digits
-
-
-def test_what_cannot_be_asked_for_is_refused(designer):
-    with pytest.raises(SettingsError, match="base_link does not move: no torque depends"):
-        design_payload(designer, RNG(0), Payload(link="base_link"))
-    with pytest.raises(
-        SettingsError, match="wrist_3_joint cannot move forearm_link, wanted joints"
-    ):
-        design_payload(designer, RNG(0), Payload(link="forearm_link"), moving=WRIST[-1:])

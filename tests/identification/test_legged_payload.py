@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from helpers.stands import stand
 
-from robotid.base.exceptions import SettingsError
 from robotid.data.signal_settings import SignalSettings
 from robotid.dynamics.simulation.simulation_settings import (
     Controller,
@@ -83,8 +82,3 @@ def test_the_noise_is_that_of_all_rows_together(found):
     _, levels = found
     assert np.ptp(levels) == 0.0
     assert 0.5 * 0.01 < levels[0] < 0.01
-
-
-def test_gains_of_such_a_robot_must_be_stated(robot, runs):
-    with pytest.raises(SettingsError, match="gains are identified for a robot with a fixed base"):
-        identify_payload(robot, *runs, unknown_gains=["FL_HFE"], signals=RAW, friction="none")

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from helpers.stands import stand
 
-from robotid.base.exceptions import DataError
 from robotid.data.base_motion import BaseMotion
 from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
@@ -68,9 +67,3 @@ def test_the_errors_are_those_of_least_squares_with_noise_in_the_joints(planned)
     np.testing.assert_allclose(found_white.base_error, wanted, rtol=1e-5)
     level = np.einsum("kjj,j->", P[:, 6:, 6:], size**2) / np.trace(P, axis1=1, axis2=2).sum()
     np.testing.assert_allclose(found.expected.estimate.sigma, np.sqrt(level), rtol=0.01)
-
-
-def test_a_floating_base_needs_contacts(planned):
-    _, log = planned
-    with pytest.raises(DataError, match="the base floats without contacts"):
-        preview(quadruped([]), replace(log, contacts={}), signals=RAW)

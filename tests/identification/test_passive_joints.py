@@ -64,15 +64,6 @@ def test_the_torque_of_a_declared_passive_joint_is_not_judged(cartpole, tmp_path
     assert not re.search(r"\d{30}|Infinity|inf %", figures)
 
 
-def test_a_moving_joint_whose_torque_is_zero_is_proposed_as_passive(cartpole):
-    path, log, other = cartpole
-    found = identify(RobotModel.from_urdf(path), [log], validation=[other])
-    dead, _ = [finding for finding in found.findings if finding.code == "constant_torque"]
-    assert 'state passive = ["hinge"]' in dead.message
-    assert not {f.code for f in found.findings} & {"gain_change", "torque_scale"}
-    assert any('state passive = ["hinge"]' in why for why in found.verdict.joints["hinge"].reasons)
-
-
 def test_a_moving_joint_without_a_torque_column_is_proposed_as_passive(cartpole, tmp_path):
     log = cartpole[1]
     table = np.column_stack([log.t, log.q, log.tau[:, 0]])

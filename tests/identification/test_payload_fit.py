@@ -97,16 +97,6 @@ def test_a_payload_on_a_link_that_is_fixed_to_a_moving_one_is_exact(ur5, rng):
     assert repr(found).startswith("<PayloadFit of ur5: tool0 2 +- ")
 
 
-def test_two_payloads_at_once(panda, rng):
-    links = ["panda_link5", "panda_hand"]
-    log, without = recorded(panda, rng, links=links, mass=1.5)
-    found = with_known_friction(panda, [log], [without], links=links, signals=EXACT)
-    assert [p.link for p in found.payloads] == links
-    for payload in found.payloads:
-        assert payload.mass == pytest.approx(1.5, rel=1e-6)
-        np.testing.assert_allclose(payload.com, COM, rtol=1e-5)
-
-
 def test_a_known_mass_is_checked_by_the_torque_that_does_not_know_it(hand, rng):
     logs = [replace(log, tau=1.1 * log.tau) for log in recorded(hand, rng, noise=LEVEL[2:])]
     asked = {"links": ["tool0"], "signals": EXACT}

@@ -31,15 +31,6 @@ def found(arm, logs, reported):
     return identify(arm, logs[:1], validation=logs[1:], progress=lambda *x: reported.append(x))
 
 
-def test_the_start_of_each_stage_is_reported(found, reported):
-    assert [x for x in reported if x[3] == "stages"] == [
-        (name, k, 5, "stages")
-        for k, name in enumerate(
-            ["reading logs", "checking logs", "fitting", "errors and intervals"]
-        )
-    ]
-
-
 def test_its_text_has_verdict_reasons_and_every_joint(found):
     text = str(found)
     assert text == found.summary()

@@ -12,7 +12,8 @@ from robotid.diagnosis.logs.torque_sample import Probe
 
 #: Decrease of the misfit from which another gravity is reported.
 HINT = 0.7
-_FLOOR = 1e-3  # an unexplained share below this is negligible
+#: An unexplained share below this is negligible.
+FLOOR = 1e-3
 _POOR = 0.08  # unexplained share from which other readings of the positions are tested
 _CLEARLY = 2.0  # decrease of the misfit, a factor 7, beyond the readings with stated positions
 _ROWS, _QUARTER = 200, 4  # rows of these tests, and the divisor of their number in a first pass
@@ -40,7 +41,7 @@ class Explanation:
     @property
     def misfit(self) -> float:
         """The sum of the logarithms of the unexplained shares: lower is better."""
-        return float(np.sum(np.log(self.share + _FLOOR)))
+        return float(np.sum(np.log(self.share + FLOOR)))
 
 
 def compensated(probe: Probe) -> tuple[Probe, Array]:
@@ -113,7 +114,7 @@ def _order(share: Array) -> Explanation:
     """Return the best assignment of torque columns to joints."""
     from scipy.optimize import linear_sum_assignment
 
-    columns, joints = linear_sum_assignment(np.log(share[:, :, 0] + _FLOOR))
+    columns, joints = linear_sum_assignment(np.log(share[:, :, 0] + FLOOR))
     moved = tuple(np.flatnonzero(columns != joints).tolist())
     found = share[columns, joints, 0]
     return Explanation("torque_order", found, moved, tuple(joints.astype(float).tolist()))
@@ -131,7 +132,7 @@ def _gravity(probe: Probe, stated: Explanation) -> Explanation:
     joints = tuple(range(len(probe.model.joints)))
     is_stated = replace(stated, kind="gravity", joints=joints, values=tuple(probe.gravity.tolist()))
     is_poor = stated.share.max() > _POOR
-    if not is_poor and stated.misfit - len(joints) * np.log(_FLOOR) < HINT:
+    if not is_poor and stated.misfit - len(joints) * np.log(FLOOR) < HINT:
         return is_stated
     share_in, least = _shares_by_gravity(probe)
     if not is_poor and stated.misfit - Explanation("", least).misfit < HINT:

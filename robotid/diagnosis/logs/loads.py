@@ -12,7 +12,7 @@ from robotid.base.typing import Array
 from robotid.data.log import Trajectory
 from robotid.data.signal_settings import SignalSettings
 from robotid.diagnosis.catalogue import finding
-from robotid.diagnosis.logs.hypotheses import compensated, own_share
+from robotid.diagnosis.logs.hypotheses import FLOOR, compensated, own_share
 from robotid.diagnosis.logs.torque_sample import Probe
 from robotid.dynamics.base_parameters import BaseMapping
 from robotid.dynamics.factors import Reduction, compress_segments
@@ -40,7 +40,6 @@ _CLEARER = 5.0  # decrease of the misfit by a counterbalance beyond that by anot
 _FREE, _LEAST = 5.0, 0.1  # spread of a mass that is not taken from the URDF, its smallest factor
 _SCALES = np.logspace(-3, 3, 61)
 _LARGE = 0.08  # payload over the arm's mass that errors of the links do not explain
-_FLOOR = 1e-3  # an unexplained share below this is negligible
 _FOLLOWED = 0.5  # ratio of unexplained shares with and without gravity, if a torque contains it
 _LIFTS = 0.3  # of the largest gravity torque: a joint with less has no counterbalance
 _CANCELS, _MOST_CANCELLED = 0.2, 1.6  # limits of the share of gravity that a counterbalance cancels
@@ -172,7 +171,7 @@ def _holds_no_gravity(probe: Probe) -> bool:
 def holds_gravity(probe: Probe) -> bool:
     """Return whether the torque of a joint contains its gravity torque by the URDF."""
     with_gravity, without = own_share(probe), own_share(probe, np.zeros(3))
-    followed = (with_gravity + _FLOOR < _FOLLOWED * (without + _FLOOR)) & (without < 1.0)
+    followed = (with_gravity + FLOOR < _FOLLOWED * (without + FLOOR)) & (without < 1.0)
     return bool(followed.any())
 
 

@@ -33,6 +33,9 @@ _ALIKE = 0.02  # of the squared residual: within this difference the simpler opt
 # The same p-value decides whether least squares predicts better than bodies bound to the prior.
 FAMILY_P_VALUE = 0.01
 FAMILY = Rule(most=4, share=0.05, p_value=FAMILY_P_VALUE, alike=_ALIKE)
+# Families selected from simulated positions, one of each at most, by the share of a joint's squared
+# residual in held-out windows with unit noise: benchmarks/bench_commands.py
+SIMULATED_FAMILY = Rule(most=3, share=0.02, p_value=None, alike=0.0)
 #: Share of the torque: a smaller gain may be an effect of the filter on velocity signs.
 FAMILY_LEAST = 0.006
 #: p-value below which a family that is not selected is undecided: it widens intervals.
@@ -66,6 +69,14 @@ WEAK, WEAK_P_VALUE, WEAK_SIZE = 0.03, 1e-5, 2.0
 SIGNIFICANT = 5.0
 # A residual that depends on a quantity: no benchmark, tests/diagnosis/residual/test_torque_split.py
 DEPENDENCE_SHARE, DEPENDENCE_P_VALUE = 0.1, 1e-3
+# Segments that are held out in turn, and their samples.
+SEGMENTS, SHORTEST = 16, 10  # most segments, and fewest independent samples of one
+#: Smallest number of segments for a test.
+FEWEST = 6
+#: Typical residuals above which a sample is excluded.
+OUTLIER = 12.0
+#: Share of a column below which it is rounding, and relative step of a derivative by a shape.
+ROUNDING, STEP = 1e-10, 1e-3
 _STILL = 1e-9  # of the largest squared residual of a segment: below, the joint is at rest in it
 _FEWEST = 3  # segments for a test
 _NOTHING = 1e-300

@@ -28,6 +28,8 @@ from robotid.diagnosis.residual.decisions import (
     FAMILY,
     FAMILY_LEAST,
     GROWN,
+    ROUNDING,
+    STEP,
     TENFOLD,
     UNDECIDED_P_VALUE,
     Round,
@@ -37,14 +39,13 @@ from robotid.diagnosis.residual.term_trials import RIDGE, Sample, Trial, Trials,
 from robotid.dynamics.prediction import drive_motion_along
 from robotid.estimation.fitting.drive_terms import DriveChoice, FoundShape, Tried, with_shapes
 from robotid.estimation.fitting.fitted import Solution
-from robotid.robot.drives import FAMILIES, DataRange, DriveMotion, DriveTerm, Family, MemorylessTerm
+from robotid.robot.drive_term import DataRange, DriveMotion, DriveTerm, Family, MemorylessTerm
+from robotid.robot.drives import FAMILIES
 
 _GRID = 6  # values of a shape tested between its bounds
 _SPAN = 100.0  # largest over smallest of them; an upper bound beyond is also tested
 _SLOWEST = 0.0  # share of samples slower than the data range
 _REVOLUTION = 2 * np.pi  # [rad]
-_ROUNDING = 1e-10  # share of a column below which it is rounding: the ridge of shapes
-_STEP = 1e-3  # relative step of a finite difference
 _STEPS = 40  # iterations of the search for all shapes of a joint together
 _SHARPEST = 1e-6  # of the squared residual: lower limit for weights, for exact data
 _NOTHING = 1e-300
@@ -556,13 +557,13 @@ def _refined(
 
     def left(log_sizes: Array) -> float:
         terms = _terms(drive, with_shapes(families, np.exp(log_sizes)))
-        (squares,) = _trials(sample, drive, terms, _ROUNDING).whole.left(list(range(len(terms))))
+        (squares,) = _trials(sample, drive, terms, ROUNDING).whole.left(list(range(len(terms))))
         return float(np.log(squares + _NOTHING))
 
     best = start
     if len(start):
         sample = _reweighted(sample, drive, chosen).joined()
-        bounds, options = _log_bounds(drive, families), {"eps": _STEP, "maxiter": _STEPS}
+        bounds, options = _log_bounds(drive, families), {"eps": STEP, "maxiter": _STEPS}
         found = minimize(left, start, method="L-BFGS-B", bounds=bounds, options=options)
         best = found.x if found.fun <= left(start) else start
     return with_shapes(families, np.exp(best))
@@ -585,10 +586,10 @@ def _with_slopes(
 ) -> tuple[int, Trial]:
     """Return the number c of columns of terms, and a trial of them and of d(torque)/d(shape)."""
     Z = drive.columns(_terms(drive, with_shapes(families, flat)))
-    theta = Trials(sample, Z[:, None], _ROUNDING).whole.parameters(list(range(Z.shape[1])))
+    theta = Trials(sample, Z[:, None], ROUNDING).whole.parameters(list(range(Z.shape[1])))
     slopes = np.empty((len(Z), len(flat)))
-    for k, h in enumerate(_STEP * flat):
+    for k, h in enumerate(STEP * flat):
         larger = flat + h * (np.arange(len(flat)) == k)
         moved = drive.columns(_terms(drive, with_shapes(families, larger)))
         slopes[:, k] = (moved - Z) @ theta / h
-    return Z.shape[1], Trials(sample, np.hstack([Z, slopes])[:, None], _ROUNDING).whole
+    return Z.shape[1], Trials(sample, np.hstack([Z, slopes])[:, None], ROUNDING).whole

@@ -19,19 +19,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from robotid.base.typing import Array
-from robotid.diagnosis.residual.decisions import GROWN
+from robotid.diagnosis.residual.decisions import GROWN, ROUNDING, STEP
 from robotid.diagnosis.residual.misfit import Misfit
 from robotid.diagnosis.residual.term_trials import Sample, Trial, Trials, take_sample
 from robotid.dynamics.prediction import drive_motion_along
 from robotid.estimation.fitting.drive_terms import JointMotion, OpenTerm
 from robotid.estimation.fitting.fitted import Fit, Solution
-from robotid.robot.drives import DriveMotion, DriveTerm
+from robotid.robot.drive_term import DriveMotion, DriveTerm
 
 if TYPE_CHECKING:
     from robotid.estimation.fitting.drive_terms import DriveChoice
 
-_STEP = 1e-3  # relative step of a finite difference
-_ROUNDING = 1e-10  # share of a column below which it is rounding
 _MOVES = 0.2  # change of a shape in standard errors above which the fit is repeated
 _PINNED = 1e-6  # of the smallest prior spread: spread of a parameter that is fixed
 
@@ -131,7 +129,7 @@ def _shape_trial(
         )[rows]
         for motion, rows in zip(motions, sample.taken, strict=True)
     ]
-    return Trials(sample.of_joint(j), np.concatenate(slopes)[:, None], _ROUNDING).whole
+    return Trials(sample.of_joint(j), np.concatenate(slopes)[:, None], ROUNDING).whole
 
 
 def settled_shapes(found: Solution) -> "tuple[DriveChoice, ...] | None":
@@ -191,9 +189,9 @@ def shape_slope(found: Solution, choice: "DriveChoice", which: int, motion: Driv
     """Return the derivative of a drive's torque with respect to one of its shapes, shape (N,)."""
     layout = found.model.layout
     theta = dict(zip(layout.names, found.standard, strict=True))
-    size = choice.shapes[which].value * _STEP
+    size = choice.shapes[which].value * STEP
     change = np.zeros_like(motion.v)
-    for term, other in zip(choice.terms, choice.altered(which, _STEP), strict=True):
+    for term, other in zip(choice.terms, choice.altered(which, STEP), strict=True):
         change += theta[f"{choice.joint}.{term.name}"] * (
             other.column(motion) - term.column(motion)
         )

@@ -23,7 +23,14 @@ import numpy as np
 
 from robotid.base.typing import Array
 from robotid.data.log import Trajectory
-from robotid.diagnosis.residual.decisions import FAMILY_P_VALUE, p_value
+from robotid.diagnosis.residual.decisions import (
+    FAMILY_P_VALUE,
+    FEWEST,
+    OUTLIER,
+    SEGMENTS,
+    SHORTEST,
+    p_value,
+)
 from robotid.dynamics.constraint_rows import without_forces
 from robotid.dynamics.torque import trajectory_regressor
 from robotid.dynamics.used_rows import independent_share
@@ -37,11 +44,7 @@ RIDGE = 1e-4
 _ROWS = 3000  # samples of all fitted logs together, and of all validation logs
 _NUMBERS = 2**24  # elements of their regressor
 _PER_INDEPENDENT = 2.0  # samples per independent one behind the filter
-_SEGMENTS = 16  # held out in turn
-_SHORTEST = 10  # independent samples in a segment
-_FEWEST = 6  # segments for a test
 _NEAR = 0.5  # periods of the filter's cut-off
-_OUTLIER = 12.0  # typical residuals above which a sample is excluded
 _FREE = 1e3  # prior spread of an added column, in residuals
 _SHORTEST_UNIT = 1e-4  # rows with a smaller sqrt(P_jj) are not used
 
@@ -209,7 +212,7 @@ def take_sample(fit: Solution, *, for_drives: bool = False, is_free: bool = Fals
     own = sum(map(len, rows[: len(fit.fitted)]))
     segments = _segments(own, sum(map(len, rows)) - own, independent)
     number = sum(part.stop <= own for part in segments)
-    if number < _FEWEST:
+    if number < FEWEST:
         return None
     motion = [e.recording.trajectory.at(k) for e, k in parts]
     Y = np.concatenate([_regressor(model, e.recording.trajectory, k) for e, k in parts])
@@ -313,7 +316,7 @@ def _segments(fitted: int, validation: int, independent: float) -> tuple[slice, 
     """Return the segments of the samples of fitted and of validation recordings."""
     edges = [0]
     for rows in (fitted, validation):
-        count = min(_SEGMENTS, max(1, int(rows * independent / _SHORTEST))) if rows else 0
+        count = min(SEGMENTS, max(1, int(rows * independent / SHORTEST))) if rows else 0
         first = edges[-1]
         edges += [first + rows * (i + 1) // count for i in range(count)]
     return tuple(slice(*pair) for pair in pairwise(edges))
@@ -346,7 +349,7 @@ def _noise_level(r: Array, used: Array, own: int, basis: Array | None) -> tuple[
     """
     u = np.ones(r.shape) if basis is None else _lengths(basis)
     size = np.abs(r) / u
-    usual: Array = size <= _OUTLIER * _typical_size(size[:own], used[:own])
+    usual: Array = size <= OUTLIER * _typical_size(size[:own], used[:own])
     if basis is not None:
         usual = np.all(usual | ~used, axis=1, keepdims=True)
     used = used & usual

@@ -20,7 +20,15 @@ from numpy.typing import NDArray
 
 from robotid.base.exceptions import DataError
 from robotid.base.typing import Array
-from robotid.diagnosis.residual.decisions import DEPENDENCE_P_VALUE, DEPENDENCE_SHARE, p_value
+from robotid.diagnosis.residual.decisions import (
+    DEPENDENCE_P_VALUE,
+    DEPENDENCE_SHARE,
+    FEWEST,
+    OUTLIER,
+    SEGMENTS,
+    SHORTEST,
+    p_value,
+)
 from robotid.dynamics.drive_columns import drive_values, friction_directions
 from robotid.dynamics.prediction import rigid_parts
 from robotid.dynamics.used_rows import independent_share
@@ -30,9 +38,6 @@ from robotid.robot.model import RobotModel
 
 _RIGID = ("gravity", "inertia", "Coriolis")
 _ROWS = 4000  # samples of all recordings together that are split
-_SEGMENTS = 16  # held out in turn
-_SHORTEST = 10  # independent samples in a segment
-_OUTLIER = 12.0  # typical residuals above which a sample is excluded
 _QUARTERS = 4  # parts of a recording for the test of a drift, and pieces of each part
 _ROUNDING = 1e-10  # of the torque, below which a part counts as 0
 _SLOW = 0.25  # of the RMS speed: below is low speed
@@ -49,8 +54,6 @@ _CHANGED = (
     "The fitted recordings do not have this dependence: something has changed since (friction with "
     "temperature, a sensor offset, a load), or the joint does not move this way in them"
 )
-#: Smallest number of segments for a test.
-FEWEST = 6
 _BINS = 10  # of a quantity, with equal numbers of samples
 _FEWEST_IN_BIN = 3  # segments from which the scatter of a bin's mean is determined
 
@@ -226,7 +229,7 @@ class JointTorque:
         r = self.residual
         if not self.used.any():
             return ()
-        used = self.used & (np.abs(r) <= _OUTLIER * np.median(np.abs(r[self.used])))
+        used = self.used & (np.abs(r) <= OUTLIER * np.median(np.abs(r[self.used])))
         everywhere, piece = np.zeros(int(used.sum()), dtype=int), self.rows.pieces[used]
         segments = None if self.rows.segments is None else self.rows.segments[used]
         found = [follow("constant", self.unit, r[used], r[used], everywhere, segments)]
@@ -379,7 +382,7 @@ def _rows(own: Sequence[tuple[Evaluation, Array]]) -> Rows:
         min(len(k), independent_share(e.recording.signals) * len(e.recording.trajectory.t))
         for e, k in own
     )
-    many, total = min(_SEGMENTS, int(independent / _SHORTEST)), sum(counts)
+    many, total = min(SEGMENTS, int(independent / SHORTEST)), sum(counts)
     return Rows(
         recordings=tuple(e.recording.name for e, _ in own),
         t=np.concatenate([e.recording.trajectory.t[k] for e, k in own]),

@@ -229,7 +229,7 @@ def on_joint(
 
 def check_ignored(ignore: Sequence[str]) -> None:
     """Check that every code to ignore is the code of an error or a warning."""
-    known = sorted({*codes_with("ignorable"), *codes_with("verdict"), *codes_with("term")})
+    known = sorted({*codes_with("ignorable"), *codes_with("verdict")})
     require_kind(ignore, (list, tuple, set, frozenset), "ignore", "a list of codes")
     for code in ignore:
         require_kind(code, str, "a code in ignore", "the code of a finding")
@@ -301,7 +301,7 @@ def warnings_of(
     jumps = {(f.log, f.joints) for f in findings if is_robust and is_downweighted(f)}
     warnings: list[VerdictWarning] = []
     for one in findings:
-        is_known = one.code in (*codes_with("verdict"), *codes_with("term"))
+        is_known = one.code in codes_with("verdict")
         if one.severity != "warning" or not is_known or one.code == "repeated_motion":
             continue
         # the unexplained torque is the spikes, which a robust fit downweights

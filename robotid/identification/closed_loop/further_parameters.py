@@ -13,7 +13,7 @@ import numpy as np
 import scipy.linalg
 
 from robotid.base.typing import Array
-from robotid.diagnosis.residual.decisions import Round, Rule
+from robotid.diagnosis.residual.decisions import SIMULATED_FAMILY, Round
 from robotid.dynamics.simulation.loops import friction_at_rest
 from robotid.estimation.estimators.estimator import Estimate
 from robotid.estimation.estimators.output_error import OutputError, is_at_bound, linearised
@@ -22,8 +22,6 @@ from robotid.robot.drive_term import ANYWHERE
 from robotid.robot.drives import FAMILIES, LoadFriction, PositionCoulomb
 
 _OFFERED = ("stribeck", "load", "position")  # candidate families
-# share: of a joint's squared residual in held-out windows, with unit noise; bench_commands.py
-_RULE = Rule(most=len(_OFFERED), share=0.02, p_value=None, alike=0.0)
 _FOLDS = 6
 _FEWEST = 2  # smallest number of windows for a cross-validation
 _SLOW = 0.3  # Stribeck speed of candidates, over the typical speed of the joint
@@ -106,7 +104,7 @@ def choose(
         removed = _gains(folds, columns, {s: sets[s] for s in remaining})
         rounds = _by_joint(offered, removed, rows)
         gains |= {s: this.share(s) for this in rounds for s in this.left}
-        best = [s for this in rounds for s in [this.best(_RULE)] if s is not None]
+        best = [s for this in rounds for s in [this.best(SIMULATED_FAMILY)] if s is not None]
         if not best:
             break
         for s in sorted(best, key=lambda s: -gains[s]):

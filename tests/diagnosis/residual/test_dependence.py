@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from robotid.diagnosis.residual.decisions import p_value
-from robotid.diagnosis.residual.torque_split import FEWEST, even_bins, follow
+from robotid.diagnosis.residual.decisions import FEWEST, p_value
+from robotid.diagnosis.residual.torque_split import even_bins, follow
 
 B, K, SIZE = 4, 7, 33  # bins, segments, rows of each
 

@@ -254,13 +254,14 @@ def test_columns_join_the_regressor_and_base_parameters_are_refitted(three):
 def test_a_term_stands_for_what_the_doctor_guessed_of_its_torque(three):
     guesses = [
         Finding("urdf_mismatch", "warning", "run.csv", ""),
-        Finding("unexplained_torque", "warning", f"run.csv: {LIFT}", ""),
-        Finding("unexplained_torque", "warning", f"run.csv: {PAN}", ""),
+        Finding("unexplained_torque", "warning", f"run.csv: {LIFT}", "", joints=(LIFT,)),
+        Finding("unexplained_torque", "warning", f"run.csv: {PAN}", "", joints=(PAN,)),
         Finding("clipped", "warning", f"run.csv: {LIFT}", ""),
     ]
 
     def said(code, share):
-        term = Finding(code, "note", LIFT, "It is.", {"share_pct": share, "error_pct": 1.0})
+        figures = {"share_pct": share, "error_pct": 1.0}
+        term = Finding(code, "note", LIFT, "It is.", figures, joints=(LIFT,))
         *kept, term = settled(guesses, [term])
         return [guesses.index(f) for f in kept], term
 
@@ -272,7 +273,7 @@ def test_a_term_stands_for_what_the_doctor_guessed_of_its_torque(three):
     assert said("position_offset", 90.0)[0] == [2, 3]
     assert said("load_friction", 90.0)[0] == [0, 2, 3]
     assert said("spring", 40.0) == ([0, 1, 2, 3], Finding(
-        "spring", "note", LIFT, "It is.", {"share_pct": 40.0, "error_pct": 1.0}
+        "spring", "note", LIFT, "It is.", {"share_pct": 40.0, "error_pct": 1.0}, joints=(LIFT,)
     ))  # fmt: skip
 
 

@@ -65,14 +65,6 @@ def test_a_joint_that_no_log_moves_is_left_out_where_motion_is_wanted(arm):
     assert len(pool_positions([driven], moving=True).per_joint) == 1, "by its torque"
 
 
-def test_a_motion_of_no_size_has_no_share_and_a_rail_has_metres(tmp_path):
-    rail = slider(tmp_path)
-    [found] = pool_positions([run(rail.joints, [1e-3], [0.0], [0.0])]).per_joint.values()
-    assert found.unit == "m"
-    assert found.relative_error_pct is None
-    assert not found.better_than_constant
-
-
 def test_errors_are_of_samples_in_windows_and_the_spread_is_about_the_mean(tmp_path):
     """A body that follows a command about 3 m, its log with a gap and a sample by itself."""
     rail, rng = slider(tmp_path), np.random.default_rng(1)

@@ -13,12 +13,6 @@ def test_joints_that_are_alike_share_a_group_named_by_their_words():
     assert groups_of(LoopSettings(), legs, "kkk") == ["knee", "knee", "knee"]
 
 
-def test_groups_of_joints_that_are_not_there_are_refused():
-    loop = LoopSettings(groups={"front": ["FL_hip_jiont"]})
-    with pytest.raises(SettingsError, match=r"groups.front has 'FL_hip_jiont'.*FL_hip_joint"):
-        groups_of(loop, JOINTS, [1] * 5)
-
-
 def test_a_joint_of_two_groups_is_refused():
     loop = LoopSettings(groups={"front": ["tail"], "back": ["tail"]})
     with pytest.raises(SettingsError, match=r"joint 'tail' is in the groups front and back"):
