@@ -29,7 +29,8 @@ from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import process
 from robotid.dynamics.prediction import remember
 from robotid.dynamics.prediction import predict
-from robotid.robot.drives import DriveMotion, LoadFriction, Stribeck
+from robotid.robot.drive_term import DriveMotion
+from robotid.robot.drives import LoadFriction, Stribeck
 from robotid.robot.drives import AUTO
 from robotid.dynamics.simulation.truth import another_robot
 from robotid.dynamics.simulation.motions import random_fourier

@@ -54,7 +54,8 @@ from robotid.output.files.urdf import DYNAMICS_TERMS, write_urdf
 from robotid.output.report.document import write_report
 from robotid.output.report.next_steps import next_steps
 from robotid.output.report.steps import Origin
-from robotid.robot.drives import AUTO, DriveTerm, wanted_families
+from robotid.robot.drive_term import DriveTerm
+from robotid.robot.drives import AUTO, wanted_families
 from robotid.robot.model import RobotModel
 from robotid.robot.tree import read_tree
 

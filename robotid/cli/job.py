@@ -27,7 +27,8 @@ from robotid.estimation.fitting.estimator_settings import (
 )
 from robotid.identification.closed_loop.loop_settings import LoopSettings
 from robotid.robot.constraints import Contact, Loop
-from robotid.robot.drives import AUTO, DRIVE_TERMS, FAMILIES, TERMS, DriveTerm, term_from_dict
+from robotid.robot.drive_term import DriveTerm
+from robotid.robot.drives import AUTO, DRIVE_TERMS, FAMILIES, TERMS, term_from_dict
 from robotid.robot.parameters import DYNAMICS, Coupling
 
 if TYPE_CHECKING:

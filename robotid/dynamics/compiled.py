@@ -68,7 +68,9 @@ class CompiledWriter:
             self._motion = own_motion(q[:, 1:], v, a, _base_state(self._model, q, v, a))
         else:
             self._motion = own_motion(q, v, a)
-        values = values[self._plan.drive_numbers] * self._plan.ratios
+        values = values[self._plan.drive_numbers]
+        if (self._plan.ratios != 1.0).any():
+            values *= self._plan.ratios
         self._values = np.array(np.vstack([values, tau.T]), order="C")  # as of ``own_motion``
         self._weights = np.zeros((0, 0)) if weights is None else np.array(weights, float, order="C")
 

@@ -8,7 +8,7 @@ import numpy as np
 from robotid.base.exceptions import DataError
 from robotid.base.typing import Array
 from robotid.data.log import Trajectory
-from robotid.robot.drives import DriveMotion
+from robotid.robot.drive_term import DriveMotion
 from robotid.robot.parameters import ParameterLayout
 
 

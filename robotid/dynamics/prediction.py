@@ -26,7 +26,8 @@ from robotid.dynamics.drive_columns import (
 )
 from robotid.dynamics.rows import BLOCK, COMPILED, InertialRows, TrajectoryRows, trajectory_rows
 from robotid.dynamics.torque import joint_torque_regressor
-from robotid.robot.drives import DriveMotion, Lag
+from robotid.robot.drive_term import DriveMotion
+from robotid.robot.drives import Lag
 from robotid.robot.model import RobotModel
 
 _START = 5  # constant work of one call of inverse dynamics, as of work_per_sample

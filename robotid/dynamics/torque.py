@@ -17,7 +17,8 @@ from robotid.dynamics.drive_columns import drive_values, friction_directions, in
 from robotid.dynamics.problem import Block, Problem, RowSource
 from robotid.dynamics.rows import BLOCK, inertial_columns, kept_rows, trajectory_rows
 from robotid.robot.closure import Chains
-from robotid.robot.drives import TERMS, DriveMotion
+from robotid.robot.drive_term import DriveMotion
+from robotid.robot.drives import TERMS
 from robotid.robot.model import RobotModel
 
 _DECADES = 3.0  # of speeds, at random states of a robot with nonlinear friction

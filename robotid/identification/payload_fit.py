@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -330,8 +331,8 @@ def fit_with_friction(
 
     Friction is a torque, not a current: ``rescaled`` returns the reference with identified gains.
     """
-    asked = {"links": links, "masses": masses, "unknown_gains": unknown_gains}
-    fit = fit_payloads(loaded, reference, **asked)
+    fitted = partial(fit_payloads, links=links, masses=masses, unknown_gains=unknown_gains)
+    fit = fitted(loaded, reference)
     gains = {joint: gain.value for joint, gain in fit.gains.items()}
     wanted = wanted_families(friction, reference.model.joints)
     own: Mapping[str, tuple[DriveTerm, ...]] = {}
@@ -341,7 +342,7 @@ def fit_with_friction(
     if own:
         model = reference.model.with_terms(own)
         loaded, reference = (run.with_model(model) for run in (loaded, reference))
-        fit = fit_payloads(loaded, reference, **asked)
+        fit = fitted(loaded, reference)
     if masses and not unknown_gains:
         fit = replace(fit, checks=mass_checks(loaded, reference, masses=masses, links=links))
     return fit

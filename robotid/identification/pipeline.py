@@ -17,7 +17,8 @@ from robotid.base.exceptions import (
 from robotid.base.findings import Finding, not_ignored
 from robotid.base.settings import require_flag, require_kind
 from robotid.base.typing import ProgressCallback, ignore_progress, report_stage
-from robotid.data.files.read import Needs, Readable, read_logs
+from robotid.data.files.columns import Needs
+from robotid.data.files.read import Readable, read_logs
 from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
 from robotid.diagnosis.logs.check_logs import diagnose

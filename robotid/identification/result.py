@@ -114,7 +114,8 @@ class Identification(Identified):
         ]
         for caption, metrics, evaluation in [*compared, ("fitted rows", self.metrics(), None)]:
             wls = self.beside(evaluation)
-            lines += [caption, *error_lines(metrics.to_dict(), wls and wls.to_dict())]
+            beside = None if wls is None else wls.to_dict()
+            lines += [caption, *error_lines(metrics.to_dict(), beside)]
         lines += self._friction_lines()
         lines += variation_lines(None if self.variation is None else self.variation.to_dict())
         if self.report:

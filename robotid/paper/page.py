@@ -9,57 +9,51 @@ import numpy as np
 from robotid.base.typing import Array
 from robotid.base.versions import __version__
 from robotid.output.pages.charts import Chart, Series, chart_html
-from robotid.output.pages.html import Column, block, listing, number, page, text
+from robotid.output.pages.html import block, listing, number, page, text
 from robotid.paper.errata import EnergyDrift
-from robotid.paper.study import CASES, DURATION, PROGRAM, ModelStudy, RandomRuns
+from robotid.paper.study import CASES, DURATION, PROGRAM, ModelStudy
 
 _SHOWN = (1, 2, 5, 20, 100)  # iterations drawn in figure 4
-_BINS = 30  # of a histogram of iterations
 _DRAWN_CASES = {
     "clean": "clean", "disturbed": "torque ±10 %", "noisy": "noise",
     "noisy_dead_zone": "noise, ε₂ = 1",
 }  # fmt: skip
 
-_RESULT: Sequence[Column] = (
+_RESULT = (
     ("model", "text", "name"), ("start", ".2g", "start"), ("after 1", ".2g", "first"),
     ("after 10", ".2g", "tenth"), ("at the end", ".2g", "last"),
     ("start on program", ".2g", "on_program"), ("NA (25)", "d", "NA"),
     ("one-shot (18)", ".2g", "one_shot"),
 )  # fmt: skip
-_PARAMETERS: Sequence[Column] = (
+_PARAMETERS = (
     ("parameter", "code", "name"), ("true", ".4g", "true"), ("estimate", ".7g", "estimate"),
     ("difference", ".1e", "difference"),
 )  # fmt: skip
-_VECTOR: Sequence[Column] = (
+_VECTOR = (
     ("parameter", "code", "name"), ("true", ".4g", "true"), ("identified", ".7g", "identified"),
 )  # fmt: skip
-_DISTURBED: Sequence[Column] = (
+_DISTURBED = (
     ("model", "text", "name"), ("case", "text", "case"), ("at the end", ".2g", "last"),
     ("mean of last tenth", ".2g", "last_tenth"), ("of averaged P̂", ".2g", "averaged"),
     ("≤ 10⁻⁴", "text", "converged"),
 )  # fmt: skip
-_RANDOM: Sequence[Column] = (
+_RANDOM = (
     ("model", "text", "name"), ("start", "text", "start"), ("runs", "d", "runs"),
     ("converged", "d", "converged"), ("least", ".0f", "0"), ("median", ".0f", "50"),
     ("90 %", ".0f", "90"), ("most", ".0f", "100"), ("allowed", "d", "most_iterations"),
 )  # fmt: skip
-_FAILURES: Sequence[Column] = (
-    ("model", "text", "name"), ("reason", "text", "reason"), ("runs", "d", "runs"),
-    ("median error", ".2g", "median"), ("largest error", ".2g", "largest"),
-)  # fmt: skip
-_ERRATA: Sequence[Column] = (
+_ERRATA = (
     ("where", "code", "where"), ("printed", "text", "printed"), ("corrected", "text", "corrected"),
     ("anywhere [N m]", ".1f", "max_torque_difference"),
     ("on the program [N m]", ".1f", "max_torque_difference_on_program"),
 )  # fmt: skip
-_ENERGY: Sequence[Column] = (("model", "text", "name"), ("%", ".3g", "change"))
-_SETTINGS: Sequence[Column] = (("setting", "text", "name"), ("value", "text", "value"))
+_ENERGY = (("model", "text", "name"), ("%", ".3g", "change"))
+_SETTINGS = (("setting", "text", "name"), ("value", "text", "value"))
 
 
 def paper_page(
     content: Mapping[str, Any],
     studies: Sequence[ModelStudy],
-    runs: Mapping[str, RandomRuns],
     drift: EnergyDrift,
 ) -> str:
     """Return the page.
@@ -70,13 +64,12 @@ def paper_page(
     result = block("paper.result") + _result_table(content) + _parameter_tables(content)
     figures = _program_figures() + _control_figures(studies) + _estimate_figures(studies)
     disturbed = _disturbance(content) + _disturbed_figures(studies)
-    random = _trajectories(content) + _histograms(runs)
     sections = {
         "result": ("Accuracy of the estimates", result + _vector_table(content)),
         "figures": ("The paper's figures", figures),
         "convergence": ("Proximity and error", _convergence_figures(studies)),
         "disturbance": ("Disturbance and noise", disturbed),
-        "trajectories": ("Random trajectories", random),
+        "trajectories": ("Random trajectories", _trajectories(content)),
         "errata": ("Errata", block("paper.errata") + listing("Errata", _ERRATA, content["errata"])),
         "energy": ("Energy", _energy(content) + _energy_figure(drift)),
         "settings": ("Settings", _settings(content)),
@@ -159,33 +152,17 @@ def _disturbance(content: Mapping[str, Any]) -> str:
 
 def _trajectories(content: Mapping[str, Any]) -> str:
     starts = {
-        "trajectories": ("up to 0.05 rad off the program", ""),
-        "trajectories_on_program": ("on the program", ", start on the program"),
+        "trajectories": "up to 0.05 rad off the program",
+        "trajectories_on_program": "on the program",
     }
-    rows, failures = [], ""
-    for key, (start, title) in starts.items():
+    rows = []
+    for key, start in starts.items():
         for name, run in content[key].items():
             reached = run["iterations"] or [float("nan")]
             quantiles = {f"{p}": float(np.percentile(reached, p)) for p in (0, 50, 90, 100)}
             rows.append({**run, **quantiles, "name": name, "start": start})
-        failures += _failure_table(content[key], title)
     table = listing("Iterations to a relative error of 10⁻³", _RANDOM, rows)
-    return block("paper.trajectories") + table + failures
-
-
-def _failure_table(by_model: Mapping[str, Any], title: str) -> str:
-    rows = []
-    for name, run in by_model.items():
-        kinds: dict[str, list[float]] = {}
-        for failure in run["failures"]:
-            kind = failure["reason"].split(":")[0].split(" in iteration")[0].split(",")[0]
-            kinds.setdefault(kind, []).append(failure["relative_error"])
-        rows += [
-            {"name": name, "reason": kind, "runs": len(errors), "largest": max(errors),
-             "median": float(np.median(errors))}
-            for kind, errors in kinds.items()
-        ]  # fmt: skip
-    return listing(f"Runs without convergence{title}; all are in paper.json", _FAILURES, rows)
+    return block("paper.trajectories") + table
 
 
 def _energy(content: Mapping[str, Any]) -> str:
@@ -309,18 +286,6 @@ def _disturbed_figures(studies: Sequence[ModelStudy]) -> str:
         )
         for study in studies
     ))  # fmt: skip
-
-
-def _histograms(runs: Mapping[str, RandomRuns]) -> str:
-    """Return the numbers of iterations of the random motions."""
-    charts = []
-    for k, (name, run) in enumerate(runs.items(), start=1):
-        count, edges = np.histogram(run.iterations, np.linspace(0, len(run.errors) - 1, _BINS + 1))
-        bars = Series("motions", count.astype(float), f"tone-{k}", "bars")
-        title = f"{name}: {len(run.iterations)} of {len(run.guess)} random motions converged"
-        middle = (edges[1:] + edges[:-1]) / 2
-        charts.append(Chart(title, middle, (bars,), "iterations to 10⁻³", "motions", height=140))
-    return _plots(*charts)
 
 
 def _energy_figure(drift: EnergyDrift) -> str:

@@ -71,7 +71,7 @@ def run_paper(
     with folder_beside(target) as beside:
         (beside / "planar_2r.urdf").write_text(urdf_text(), encoding="utf-8")
         _write_replay(arm, physical, beside / "replay.html")
-        html = paper_page(content, studies, near, drift)
+        html = paper_page(content, studies, drift)
         (beside / "paper.html").write_text(html, encoding="utf-8")
         write_json(content, beside / "paper.json")
     return content

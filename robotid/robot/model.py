@@ -18,7 +18,8 @@ from robotid.base.native_messages import caught_messages
 from robotid.base.settings import require_each, require_flag, require_kind
 from robotid.base.typing import Array
 from robotid.robot.constraints import Constraint, Contact, Loop, check_constraints
-from robotid.robot.drives import DRIVE_TERMS, TERMS, DriveMotion, DriveTerm
+from robotid.robot.drive_term import DriveMotion, DriveTerm
+from robotid.robot.drives import DRIVE_TERMS, TERMS
 from robotid.robot.parameters import DYNAMICS, Coupling, ParameterLayout
 from robotid.robot.tree import Joint, Tree, choose_joints, mimic_followers, read_tree
 from robotid.robot.urdf_text import LARGEST

@@ -18,7 +18,8 @@ from robotid.base.settings import (
     setting,
 )
 from robotid.base.typing import Array
-from robotid.robot.drives import DRIVE_TERMS, TERMS, DriveTerm
+from robotid.robot.drive_term import DriveTerm
+from robotid.robot.drives import DRIVE_TERMS, TERMS
 from robotid.robot.urdf_text import LARGEST
 
 #: The identified dynamics: all, or those of poses at rest and slow motion.

@@ -13,7 +13,7 @@ import numpy as np
 
 from robotid.base.typing import Array
 from robotid.robot.bodies import held_parameters, link_places, negligible_bodies
-from robotid.robot.drives import DriveMotion
+from robotid.robot.drive_term import DriveMotion
 from robotid.robot.geometry import body_frames, body_points
 from robotid.robot.mass_matrix import carried_inertia
 from robotid.robot.model import RobotModel

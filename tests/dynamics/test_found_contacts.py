@@ -18,9 +18,20 @@ from robotid.dynamics.completed_logs import (
 from robotid.dynamics.constraint_rows import constraint_jacobian
 from robotid.dynamics.prediction import predict_instants
 from robotid.robot.constraints import Contact
+from robotid.robot.examples import example_urdf
+from robotid.robot.model import RobotModel
 
 FEET = ("FL_FOOT", "FR_FOOT", "HL_FOOT", "HR_FOOT")
 RAW = SignalSettings(cutoff=None, trim=0.0, velocity="differentiated")
+
+
+@pytest.fixture(scope="module")
+def robot():
+    """Return Solo12 on its four feet, as points."""
+    return RobotModel.from_urdf(
+        example_urdf("solo12.urdf"), free_flyer=True, terms=(),
+        constraints=[Contact(foot) for foot in FEET],
+    )  # fmt: skip
 
 
 def standing(robot, loaded):

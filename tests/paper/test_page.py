@@ -1,7 +1,5 @@
 """The page of the paper's simulation: what each line of its figures holds."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 from helpers.pages import chart, charts
@@ -77,13 +75,7 @@ def test_errors_are_those_of_their_model_and_case(studies):
             np.testing.assert_allclose(line["y"], study.errors(case), rtol=1e-3)
 
 
-def test_iterations_are_counted_and_energies_are_in_percent():
-    run = SimpleNamespace(errors=np.ones((61, 7)), guess=np.ones((7, 5)), iterations=[3, 4, 59])
-    (what,) = charts(page._histograms({"one": run}))
-    assert what["title"] == "one: 3 of 7 random motions converged"
-    close(what["x"], np.arange(1.0, 60.0, 2.0))
-    counts = {k: round(y) for k, y in enumerate(what["series"][0]["y"]) if y > 0.5}
-    assert counts == {1: 1, 2: 1, 29: 1}
+def test_energies_are_in_percent():
     t = np.linspace(0.0, 1.3, 5)
     drift = EnergyDrift(t, {"one": 0.03 * t, "other": -0.2 * t**2})
     (what,) = charts(page._energy_figure(drift))

@@ -80,7 +80,7 @@ def test_the_page_is_whole_and_offline(written):
     html = (written[0] / "paper.html").read_text()
     names = {path.name for path in written[0].iterdir()}
     assert names == {"paper.json", "paper.html", "replay.html", "planar_2r.urdf"}
-    assert html.count('<figure class="chart"') == 6 + 12 + 3 + 2 + 3 + 3 + 1
+    assert html.count('<figure class="chart"') == 6 + 12 + 3 + 2 + 3 + 1
     assert "default-src 'none'" in html
     assert not re.search(r'(src|href)="(?!#)', html)
     ids = re.findall(r'\bid="([^"]*)"', html)

@@ -25,6 +25,7 @@ from robotid.dynamics.torque import (
 )
 from robotid.identification.pipeline import identify
 from robotid.output.files.urdf import load_identified, read_sidecar, write_urdf
+from robotid.robot.drive_term import DriveMotion
 from robotid.robot.drives import (
     DRIVE_TERMS,
     FAMILIES,
@@ -33,7 +34,6 @@ from robotid.robot.drives import (
     Bristles,
     Counterbalance,
     Cubic,
-    DriveMotion,
     Harmonic,
     Hat,
     Lag,
@@ -463,6 +463,13 @@ def test_friction_by_position_is_a_power_of_it():
         np.testing.assert_allclose(slope, order * (q - 0.3) ** max(order - 1, 0))
     units = [PositionCoulomb(order=k).units for k in range(3)]
     assert units == [("N m", "N"), ("N m/rad", "N/m"), ("N m/rad^2", "N/m^2")]
+
+
+def test_ripple_is_a_cosine_or_a_sine():
+    q = np.linspace(-2.0, 2.0, 9)
+    (c, dc), (s, ds) = (Harmonic.position_law(q, 2.5, x) for x in (0.0, 1.0))
+    np.testing.assert_allclose([c, ds / 2.5], [np.cos(2.5 * q)] * 2)
+    np.testing.assert_allclose([s, -dc / 2.5], [np.sin(2.5 * q)] * 2)
 
 
 def test_a_lever_that_is_not_described_hangs_at_the_zero_position():

@@ -109,7 +109,7 @@ def _columns(path: Path, features: Mapping[str, Any]) -> dict[str, _Place]:
 
 def _names(stated: object) -> list[str]:
     """Return the names of a feature's values; none if their form is unknown."""
-    groups = list(stated.values()) if isinstance(stated, dict) else [stated]
+    groups: list[Any] = list(stated.values()) if isinstance(stated, dict) else [stated]
     if not all(isinstance(group, list) for group in groups):  # neither {"motors": [...]} nor a list
         return []
     names = [name for group in groups for name in group]

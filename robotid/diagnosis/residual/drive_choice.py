@@ -39,7 +39,8 @@ from robotid.diagnosis.residual.term_trials import RIDGE, Sample, Trial, Trials,
 from robotid.dynamics.prediction import drive_motion_along
 from robotid.estimation.fitting.drive_terms import DriveChoice, FoundShape, Tried, with_shapes
 from robotid.estimation.fitting.fitted import Solution
-from robotid.robot.drives import FAMILIES, DataRange, DriveMotion, DriveTerm, Family, MemorylessTerm
+from robotid.robot.drive_term import DataRange, DriveMotion, DriveTerm, Family, MemorylessTerm
+from robotid.robot.drives import FAMILIES
 
 _GRID = 6  # values of a shape tested between its bounds
 _SPAN = 100.0  # largest over smallest of them; an upper bound beyond is also tested

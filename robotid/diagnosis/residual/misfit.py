@@ -28,12 +28,10 @@ from robotid.diagnosis.residual.decisions import (
 from robotid.diagnosis.residual.term_trials import Sample, Trial, Trials
 from robotid.estimation.fitting.drive_terms import JointMotion
 from robotid.estimation.fitting.fitted import Fit
+from robotid.robot.drive_term import DriveMotion, DriveTerm, Family
 from robotid.robot.drives import (
     COUNTERBALANCE,
     FAMILIES,
-    DriveMotion,
-    DriveTerm,
-    Family,
     Harmonic,
     drive_line,
     has_turned,

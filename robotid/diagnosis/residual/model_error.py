@@ -25,7 +25,7 @@ from robotid.diagnosis.residual.term_trials import Sample, Trial, Trials, take_s
 from robotid.dynamics.prediction import drive_motion_along
 from robotid.estimation.fitting.drive_terms import JointMotion, OpenTerm
 from robotid.estimation.fitting.fitted import Fit, Solution
-from robotid.robot.drives import DriveMotion, DriveTerm
+from robotid.robot.drive_term import DriveMotion, DriveTerm
 
 if TYPE_CHECKING:
     from robotid.estimation.fitting.drive_terms import DriveChoice

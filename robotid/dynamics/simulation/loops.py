@@ -21,8 +21,8 @@ from robotid.base.typing import Array
 from robotid.data.log import Log
 from robotid.dynamics.compiled import Tree, flatten, why_not
 from robotid.dynamics.factors import in_order
-from robotid.robot.drive_term import BRISTLES, DIRECTED
-from robotid.robot.drives import Bristles, DriveTerm, MemorylessTerm
+from robotid.robot.drive_term import BRISTLES, DIRECTED, DriveTerm, MemorylessTerm
+from robotid.robot.drives import Bristles
 from robotid.robot.mass_matrix import rigid_mass_matrices
 from robotid.robot.model import RobotModel
 

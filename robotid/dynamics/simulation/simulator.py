@@ -23,15 +23,8 @@ from robotid.dynamics.simulation.simulation_settings import (
 )
 from robotid.dynamics.simulation.stand import supported
 from robotid.robot.bodies import link_transfer
-from robotid.robot.drives import (
-    Bristles,
-    Coulomb,
-    DriveTerm,
-    Lag,
-    MemorylessTerm,
-    Offset,
-    Viscous,
-)
+from robotid.robot.drive_term import DriveTerm, MemorylessTerm
+from robotid.robot.drives import Bristles, Coulomb, Lag, Offset, Viscous
 from robotid.robot.mass_matrix import drive_inertia, rigid_mass_matrices
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia

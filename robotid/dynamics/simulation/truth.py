@@ -7,7 +7,7 @@ from robotid.base.findings import listed
 from robotid.base.typing import Array
 from robotid.data.log import suggestion
 from robotid.dynamics.simulation.simulation_settings import Truth
-from robotid.robot.drives import MemorylessTerm
+from robotid.robot.drive_term import MemorylessTerm
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import inertial_from_pseudo_inertia, pseudo_inertia
 

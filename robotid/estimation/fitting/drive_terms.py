@@ -14,7 +14,8 @@ from robotid.dynamics.constraint_rows import without_forces
 from robotid.dynamics.drive_columns import friction_directions
 from robotid.dynamics.prediction import drive_motion_along
 from robotid.estimation.fitting.evaluation import Recording
-from robotid.robot.drives import FAMILIES, DriveMotion, DriveTerm, Family
+from robotid.robot.drive_term import DriveMotion, DriveTerm, Family
+from robotid.robot.drives import FAMILIES
 from robotid.robot.model import RobotModel
 
 _FARTHEST = 1.33  # largest factor by which a shape parameter changes in one step

@@ -41,7 +41,7 @@ from robotid.estimation.fitting.standard_errors import (
 from robotid.estimation.variation.groups import RunsOf, RunSums
 from robotid.estimation.variation.variation import Variation, between_covariance
 from robotid.robot.bodies import held_parameters
-from robotid.robot.drives import DriveMotion
+from robotid.robot.drive_term import DriveMotion
 from robotid.robot.mass_matrix import MassMatrixCheck, check_mass_matrix
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia

@@ -15,7 +15,7 @@ from robotid.dynamics.prediction import predict
 from robotid.estimation.estimators import WLS
 from robotid.estimation.fitting.evaluation import Evaluation
 from robotid.estimation.fitting.recorded import Recordings
-from robotid.robot.drives import DriveMotion
+from robotid.robot.drive_term import DriveMotion
 from robotid.robot.model import RobotModel
 
 #: Losses with a bounded influence of each row, and their tuning constants in standard deviations,

@@ -35,6 +35,7 @@ _log = logging.getLogger(__name__)
 _FEEDER = "QueueFeederThread"
 _PATIENCE = 5.0  # largest time to wait for this thread [s]
 
+_ABSENT = 4.0  # times the patience after which a cluster without workers ends the work
 #: Attempts to process a piece whose worker ends: by processes, and by a cluster after its own ones.
 _ATTEMPTS = (3, 2)
 
@@ -165,7 +166,7 @@ class Pool:
         """Wait for a finished piece, while there are workers."""
         while True:
             try:
-                return finished.get(timeout=self.patience)
+                return finished.get(timeout=_ABSENT * self.patience)
             except Empty:
                 if not self._count():
                     raise WorkerError(

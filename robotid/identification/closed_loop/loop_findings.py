@@ -1,6 +1,7 @@
 """Findings of a closed-loop identification: scale, bounds, delays, gains, limits, encoders."""
 
 from collections.abc import Iterator, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -63,7 +64,7 @@ def _of_fit(result: PositionIdentification) -> Iterator[Finding]:
             yield finding("friction_found", "", tried.joint, terms=terms, gain_pct=gain)
 
 
-def _named(code: str, names: Sequence[str], **values: float | str) -> Finding:
+def _named(code: str, names: Sequence[str], **values: Any) -> Finding:  # noqa: ANN401
     """Return a finding about parameters."""
     words = listed(names, _NAMED)
     return finding(code, subject=words, names=words, **values)

@@ -47,6 +47,7 @@ def build_result(
         from robotid.identification.closed_loop.loop_result import PositionIdentification
 
         require_kind(found, PositionIdentification, "identification", "a robotid.Identification")
+        assert isinstance(found, PositionIdentification)
         own = loop_entries(found)
     common = {
         "schema_version": SCHEMA_VERSION,

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from functools import cache, cached_property
 from importlib import import_module
 from pathlib import Path
+from string import Template
 from typing import Any
 
 from robotid.base.findings import listed
@@ -167,6 +168,12 @@ def export(result: Result, target: Path) -> Written:
     sidecar = write_urdf(*result.identified, target, dynamics=exported.projection)
     unstated = unstated_terms(exported.model, exported.pi, "URDF", DYNAMICS_TERMS)
     return exported.written(target, sidecar, notes=[*exported.notes, *unstated])
+
+
+def head_of(name: str, **values: object) -> str:
+    """Return the comment at the head of a file, of the folder assets, with its values."""
+    path = Path(__file__).parent / "assets" / f"{name}.txt"
+    return Template(path.read_text(encoding="utf-8")).substitute(values)
 
 
 def yaml_text(table: Mapping[str, Any], head: str) -> str:

@@ -18,6 +18,7 @@ from robotid.output.files.exports import (
     Format,
     Option,
     Written,
+    head_of,
     unstated_terms,
     yaml_text,
 )
@@ -35,19 +36,6 @@ FORMAT = Format(
     use_of_gains="Use it for training in Isaac Lab.",
     options={"step": Option("time step, the unit of delays [s], default 0.005", "S", float)},
 )
-_HEAD = """\
-Actuators of {robot} for Isaac Lab 2.2 or later (Isaac Sim 5, where friction is a torque), by
-robotid {version}. N m, N m s/rad, kg m^2, rad/s; N, N s/m, kg, m/s of prismatic joints.
-
-  import yaml
-  from isaaclab.actuators import DelayedPDActuatorCfg
-  groups = yaml.safe_load(open("{file}"))["actuators"]
-  actuators = {{name: DelayedPDActuatorCfg(**group) for name, group in groups.items()}}
-
-Delays are rounded to steps of physics_dt; sim.dt must be equal to it. If min_delay is less than
-max_delay, Isaac Lab draws a delay for each robot at each reset. Friction is Coulomb friction, at
-rest and in motion.
-"""
 
 
 def export(result: Result, target: Path, *, step: float = _STEP) -> Written:
@@ -100,7 +88,9 @@ def write_isaac(
         values = [f"{drive.joint} {x:.4g}" for drive in commanded if (x := getattr(drive, key))]
         if values:
             every.append(f"Isaac Lab cannot state {words} ({listed(values)}); {remedy}")
-    head = _HEAD.format(robot=json.dumps(model.name), version=__version__, file=Path(target).name)
+    head = head_of(
+        "isaac", robot=json.dumps(model.name), version=__version__, file=Path(target).name
+    )
     write_text(yaml_text(content, "\n".join([head, *every]) if every else head), target)
     return tuple(every)
 

@@ -23,7 +23,7 @@ from robotid.estimation.fitting.fitted import Identified
 from robotid.estimation.fitting.standard_errors import QUANTILE
 from robotid.identification.result import TorqueIdentification
 from robotid.output.files.commanded import commanded_drives
-from robotid.output.files.exports import Format, Option, Written, yaml_text
+from robotid.output.files.exports import Format, Option, Written, head_of, yaml_text
 from robotid.output.files.result_file import Result
 from robotid.output.files.samples import SIMULATED, write_samples
 from robotid.output.files.urdf import link_parameters
@@ -46,30 +46,6 @@ FORMAT = Format(
         "seed": Option("seed of these samples, default 0", "K", int),
     },
 )
-_HEAD = """\
-Ranges for domain randomisation of {robot}, by robotid {version}. kg, m, kg m^2, in a link's frame.
-
-nominal is the identified value, low to high its 95 % interval, limited to possible values. The low
-end of a positive parameter is computed from its logarithm. source is the source of the interval:
-  data   the motion;
-  logs   the spread between logs, drives only: the 95 % prediction interval of the next log;
-  prior  the plausible error of the URDF: the motion does not determine the parameter;
-  mixed  both, or the motion determines only sums with other parameters;
-  bound  the value is at a physical bound; a drive at 0 has no interval: no low, no high;
-  stated the job stated the value, it was not identified: no low, no high.
-
-second_moments are the integrals of x^2, y^2, z^2 dm about the centre of mass along the principal
-axes; the quaternion w x y z rotates these axes into the link's. Their principal moments of inertia
-  Ixx = y + z,  Iyy = z + x,  Izz = x + y
-are possible for any draw; draws of principal_moments need not be possible.
-
-Independent draws change the torque more than the data allow, because the motion determines sums of
-parameters. undetermined lists the sums that the motion does not determine.
-projected_drives has the friction of exports for drives with further terms: viscous and Coulomb
-friction and an offset, fitted to the identified friction over the fitted rows. Drive parameters
-are those of the joint, gear included. If the result was identified from commands, they include the
-gains kp and kd, the delay of commands and the zero of the encoder.
-"""
 
 
 def export(
@@ -213,7 +189,7 @@ def write_ranges(found: TorqueIdentification, target: str | Path) -> None:
 
 def ranges_text(ranges: Mapping[str, Any]) -> str:
     """Return ranges as YAML, with an explanation in the head."""
-    head = _HEAD.format(robot=json.dumps(ranges["robot"]), version=__version__)
+    head = head_of("ranges", robot=json.dumps(ranges["robot"]), version=__version__)
     return yaml_text(ranges, head)
 
 

@@ -18,7 +18,8 @@ from robotid.output.files.urdf import terms_from_facts
 from robotid.output.pages.charts import Chart, Series, chart_html
 from robotid.output.pages.html import Cell, block, code, listing, number, page, percent, text
 from robotid.output.report.tables import both
-from robotid.robot.drives import TERMS, DriveMotion
+from robotid.robot.drive_term import DriveMotion
+from robotid.robot.drives import TERMS
 
 _SPEEDS = 40  # of a friction curve, in each direction
 _FAR = 3.0  # combined standard errors beyond which a difference is in bold

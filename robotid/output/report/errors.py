@@ -99,8 +99,8 @@ def errors_of(found: Identification) -> tuple[Errors, ...]:
 
     def joints(metrics: Metrics, wls: Metrics | None) -> dict[str, Any]:
         content: dict[str, Any] = metrics.to_dict()["per_joint"]
-        for joint in content if wls is not None else ():
-            content[joint]["wls_relative_error_pct"] = wls.per_joint[joint].relative_error_pct
+        for joint, plain in ({} if wls is None else wls.per_joint).items():
+            content[joint]["wls_relative_error_pct"] = plain.relative_error_pct
         return content
 
     name = found.fitted[0].name if len(found.fitted) == 1 else ""

@@ -34,20 +34,12 @@ _TONES = 8  # distinguishable colours of lines in one chart
 _NAMED = 5  # base parameters with the largest expected standard errors that are named
 _SHARP = 0.1  # share of the plausible range below which one is well determined ...
 _OPEN = 0.5  # ... and above which it is undetermined
-_VISIBLE = 1e-3  # change of a criterion that is worth a chart
 _WIDE = 10.0  # ratio of distances from which their axis is logarithmic
 _SOURCES = {
     "data": "by the motion",
     "mixed": "by motion and URDF together",
     "prior": "by the URDF alone",
     "bound": "by the bounds of physical consistency",
-}
-_CRITERIA = {
-    "D": "D: −log det of the information matrix, per parameter",
-    "A": "A: log of the mean variance",
-    "E": "E: −log of the smallest eigenvalue of the information matrix",
-    "condition": "log of the condition number of the information matrix",
-    "widest": "mean log variance of the quarter of the parameters with the largest prior variance",
 }
 
 
@@ -68,9 +60,6 @@ def write_motion_page(
         "time": Section("Course over time", _over_time(model, content, course)),
         "expected": Section("Expected standard errors", errors),
     }
-    best = [entry[1] for entry in content["history"]]
-    if best and max(best) - min(best) > _VISIBLE:
-        sections["design"] = Section("Course of the optimisation", _history(content))
     return write_text(
         page(f"{model.name}: excitation trajectory", _head(model, content), sections), target
     )
@@ -222,15 +211,3 @@ def _expected(preview: Preview) -> str:
 
 def _paragraphs(sentences: Sequence[str]) -> str:
     return "".join(f"<p>{escape(words)}</p>\n" for words in sentences if words)
-
-
-def _history(content: Mapping[str, Any]) -> str:
-    """Return the chart of the best criterion against the computing time."""
-    seconds, best = np.array(content["history"]).T
-    chart = Chart(
-        "criterion of the best motion against the computing time", seconds,
-        (Series("best so far", best, "tone-1"),),
-        "computing time [s]", "criterion",
-    )  # fmt: skip
-    criterion = escape(_CRITERIA[content["criterion"]])
-    return chart_html(chart, f"Criterion {criterion}; smaller is better")

@@ -17,7 +17,8 @@ from robotid.diagnosis.residual.misfit import setting_of, with_entries
 from robotid.diagnosis.verdict.evidence import GOOD, is_beaten
 from robotid.identification.result import Identification, TorqueIdentification
 from robotid.output.report.steps import MOST, NAMED, Origin, Step, exports_of, sentence_of
-from robotid.robot.drives import COUNTERBALANCE, DriveTerm, spring_family
+from robotid.robot.drive_term import DriveTerm
+from robotid.robot.drives import COUNTERBALANCE, spring_family
 
 if TYPE_CHECKING:
     from robotid.diagnosis.verdict.scale_check import PayloadCheck

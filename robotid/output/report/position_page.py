@@ -121,7 +121,7 @@ def _method(found: PositionIdentification) -> str:
 
 def _horizons(runs: Sequence[PositionEvaluation]) -> str:
     """Return errors over the horizon of the simulation: a chart of the worst joints, and tables."""
-    joints, parts = runs[0].log.joints, []
+    joints, parts = runs[0].log.joints, list[str]()
     for run in runs:
         whole = {} if run.is_driven else {run.extent.end - run.extent.start: run.rmse}
         errors = {h: x / POSITION.scale for h, x in sorted((dict(run.horizons) | whole).items())}

@@ -22,29 +22,12 @@ from robotid.identification.summary import left_out_lines
 from robotid.output.files.entries import input_entries
 from robotid.output.pages.charts import Chart, chart_html
 from robotid.output.pages.html import Cell, block, cell, code, folded, listing, percent, table, text
+from robotid.output.report import pictures, tables
 from robotid.output.report.dock import Residual
 from robotid.output.report.errors import TORQUE, errors_of, worst_errors
 from robotid.output.report.next_steps import next_steps
-from robotid.output.report.pictures import (
-    friction_chart,
-    shown_evaluation,
-    spectrum_chart,
-    torque_charts,
-    why_charts,
-)
 from robotid.output.report.report_page import Report, curves_section, drawn
 from robotid.output.report.steps import Origin
-from robotid.output.report.tables import (
-    base_table,
-    body_table,
-    consistency_section,
-    input_table,
-    open_section,
-    parameter_section,
-    settings_tables,
-    variation_section,
-    version_table,
-)
 
 _LOW = 130  # [px] height of a friction chart
 _CURVES = 8  # friction charts that are not folded
@@ -80,10 +63,10 @@ def torque_report(found: TorqueIdentification, origin: Origin, replay: str = "")
         errors=(block("report.torque_errors"), ""),
         curves=("Torques", torques_section(found, worst, origin, replay)),
         friction=friction_section(found, worst),
-        bodies=body_table(found),
+        bodies=tables.body_table(found),
         why=why_section(found),
-        variation=variation_section(found.variation, _next_errors(found)),
-        parameters=parameter_section(
+        variation=tables.variation_section(found.variation, _next_errors(found)),
+        parameters=tables.parameter_section(
             found.model,
             found.standard if found.has_urdf else None,
             entries,
@@ -94,12 +77,12 @@ def torque_report(found: TorqueIdentification, origin: Origin, replay: str = "")
         appendix={
             "residuals": ("Residual spectra", residual_section(found)),
             "drives": ("Selection of friction terms", drive_choices(found)),
-            "base": ("Base parameters", base_table(found)),
-            "consistency": ("Physical consistency", consistency_section(found)),
-            "open": ("Parameters not identifiable", open_section(found)),
-            "settings": ("Settings", settings_tables(found)),
-            "inputs": ("Inputs", input_table(input_entries(found))),
-            "versions": ("Versions", version_table(versions())),
+            "base": ("Base parameters", tables.base_table(found)),
+            "consistency": ("Physical consistency", tables.consistency_section(found)),
+            "open": ("Parameters not identifiable", tables.open_section(found)),
+            "settings": ("Settings", tables.settings_tables(found)),
+            "inputs": ("Inputs", tables.input_table(input_entries(found))),
+            "versions": ("Versions", tables.version_table(versions())),
         },
     )
 
@@ -237,7 +220,7 @@ def _charts(
             f"{100 * inside:.0f} %"
         )
     kind = "not fitted" if found.validation else "fitted"
-    torque, residual = torque_charts(found, e, row, band=band, link=link)
+    torque, residual = pictures.torque_charts(found, e, row, band=band, link=link)
     caption = f"{escape(recording.name)}, {kind}: {words}"
     return chart_html(torque, caption, points=points) + chart_html(residual, "", points=points)
 
@@ -247,10 +230,10 @@ def friction_section(found: TorqueIdentification, worst: Sequence[str]) -> str:
     model, layout = found.model, found.model.layout
     if model.is_static or all(term.is_inertia for _, term in layout.drive_parameters):
         return ""
-    split = friction_split(model, shown_evaluation(found), found.standard)
+    split = friction_split(model, pictures.shown_evaluation(found), found.standard)
     figures = {}
     for joint in model.row_names:
-        chart = friction_chart(found, joint, split=split)
+        chart = pictures.friction_chart(found, joint, split=split)
         if chart is None:
             is_driven = joint in model.joints and joint not in model.passive
             why = "no samples used" if is_driven else "no drive"
@@ -264,7 +247,7 @@ def friction_section(found: TorqueIdentification, worst: Sequence[str]) -> str:
     if more:
         title = f"{len(figures) - len(first)} more joints with smaller errors"
         more = folded("friction-more", title, f'<div class="plots small">\n{more}</div>\n')
-    name = escape(shown_evaluation(found).name)
+    name = escape(pictures.shown_evaluation(found).name)
     shown = "".join(figures[joint] for joint in first)
     return block("report.friction", log=name, figures=shown, more=more)
 
@@ -273,9 +256,9 @@ def residual_section(found: TorqueIdentification) -> str:
     """Return the spectrum of each joint's residual."""
     if found.model.is_static:
         return "<p>Static poses and slow segments have no spectrum.</p>\n"
-    evaluation, figures = shown_evaluation(found), ""
+    evaluation, figures = pictures.shown_evaluation(found), ""
     for row, joint in enumerate(found.model.row_names):
-        chart, name = spectrum_chart(found, evaluation, row), escape(joint)
+        chart, name = pictures.spectrum_chart(found, evaluation, row), escape(joint)
         caption = f"<strong>{name}</strong>"
         figures += chart_html(chart, caption) if chart else f"<p>{name}: no samples used.</p>\n"
     return block("report.residuals", name=escape(evaluation.name), figures=figures)
@@ -343,7 +326,7 @@ def _joint(torque: JointTorque, link: str, points: int, *, is_full: bool) -> str
     def drawn_chart(chart: Chart, caption: str) -> str:
         return chart_html(chart, caption, points=2 * len(chart.x))
 
-    charts = why_charts(torque, link=link, points=points)
+    charts = pictures.why_charts(torque, link=link, points=points)
     caption = "Torque components, stacked; shaded: samples not used"
     split = drawn_chart(charts.pop("split"), caption)
     significant = {d.name for d in torque.follows if d.is_significant}

@@ -19,10 +19,10 @@ from robotid.base.exceptions import SettingsError
 from robotid.diagnosis.residual.drive_choice import choose_drives
 from robotid.diagnosis.verdict.parameter_table import parameter_entries
 from robotid.estimation.fitting.fitted import friction_curve
+from robotid.robot.drive_term import DriveMotion
 from robotid.robot.drives import (
     AUTO,
     FAMILIES,
-    DriveMotion,
     Harmonic,
     LoadFriction,
     Stribeck,

@@ -13,7 +13,7 @@ from robotid.dynamics.simulation.law_lanes import (
 )
 from robotid.dynamics.simulation.simulator import RobotPlant
 from robotid.dynamics.torque import joint_torque_regressor
-from robotid.robot.drive_term import LOADED, DriveTerm
+from robotid.robot.drive_term import LOADED, DriveTerm, MemorylessTerm
 from robotid.robot.drives import (
     TERMS,
     Armature,
@@ -26,7 +26,6 @@ from robotid.robot.drives import (
     Lag,
     LoadFriction,
     LuGre,
-    MemorylessTerm,
     PositionCoulomb,
     Power,
     Presliding,
