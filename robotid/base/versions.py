@@ -1,6 +1,5 @@
 """The versions of the software that a result depends on."""
 
-import platform
 from functools import cache
 
 __version__ = "0.2.0"
@@ -10,6 +9,8 @@ _PACKAGES = {"pinocchio": "pin", "numpy": "numpy", "scipy": "scipy", "numba": "n
 
 def code_versions() -> dict[str, str]:
     """Return the versions that determine results to the last bit."""
+    import platform  # only results state versions
+
     found = {name: _installed(package) for name, package in _PACKAGES.items()}
     return {"robotid": __version__, **found, "python": platform.python_version()}
 
@@ -21,6 +22,8 @@ def versions() -> dict[str, str]:
 
 def _platform() -> str:
     """Return the text of platform.platform(), which would start a process on Linux."""
+    import platform
+
     system = platform.uname()
     if system.system != "Linux":
         return platform.platform()

@@ -15,10 +15,10 @@ from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any, TextIO
 
-from robotid.base.findings import Finding, grouped, number_of
 from robotid.base.text import command_lines, period, terminal_width, tinted, wrapped
 
 if TYPE_CHECKING:
+    from robotid.base.findings import Finding
     from robotid.base.typing import ProgressCallback
     from robotid.output.report.steps import Step
 
@@ -51,7 +51,7 @@ def print_steps(steps: "Sequence[Step]") -> None:
 
 
 def print_causes(
-    findings: Sequence[Finding],
+    findings: "Sequence[Finding]",
     joints: Sequence[str],
     *,
     is_verbose: bool,
@@ -60,6 +60,8 @@ def print_causes(
     none: str = "no findings",
 ) -> None:
     """Print findings by cause, then their number."""
+    from robotid.base.findings import grouped, number_of
+
     shown = [f for f in findings if is_verbose or f.severity != "note"]
     notes_hidden = [f for f in findings if f not in shown]
     causes, others = grouped(shown, joints), grouped(notes_hidden, joints)

@@ -378,8 +378,7 @@ def preview_logs(
     size = largest_torques(model, peak)
     earlier = run or like
     pi = assumed_parameters(model, size, fastest) if earlier is None else earlier.standard
-    for motion in motions:
-        _expect(motion, pi)
+    motions = [_with_expected(motion, pi) for motion in motions]
     if not isinstance(noise, TorqueNoise):
         residual_noise = (
             None if earlier is None else earlier.noise(mapping.K).last(len(model.joints))
@@ -511,12 +510,9 @@ def _with_torque(log: SurveyedLog) -> SurveyedLog:
     return log
 
 
-def _expect(log: SurveyedLog, pi: Array) -> None:
-    """Set the torque of a motion to the one that parameters predict, behind its filter."""
-    rows = log.whole
-    (torque,) = predict(log.model, [pi], rows.trajectory)
-    (piece,) = log.pieces
-    piece.take(replace(rows, trajectory=replace(rows.trajectory, tau=torque)), log.model)
+def _with_expected(log: SurveyedLog, pi: Array) -> SurveyedLog:
+    """Return a motion with the torque that parameters predict, behind its filter."""
+    return log.with_torque(predict(log.model, [pi], log.whole.trajectory)[0])
 
 
 def _errors(

@@ -30,9 +30,7 @@ def result(tmp_path_factory):
     model = RobotModel.from_urdf(urdf)
     log = exact_log(model, truth(model), rng, samples=400, noise=0.1)
     robotid.write_log(log, folder / "first.csv")
-    (folder / "job.toml").write_text(
-        f'urdf = "{urdf}"\n[[identification]]\nlog = "first.csv"\n'
-    )
+    (folder / "job.toml").write_text(f'urdf = "{urdf}"\n[[identification]]\nlog = "first.csv"\n')
     run_job(read_job(folder / "job.toml"), folder / "out")
     return folder / "out"
 

@@ -229,3 +229,14 @@ def test_friction_that_is_stated_as_selected_is_the_default():
     for friction, terms in (("auto", Job(Path("x")).terms), ("none", ("armature", "offset"))):
         table = {"urdf": "x", "model": {"friction": friction}}
         assert job_from_settings(table, "job.toml", Path()).terms == terms
+
+
+def test_contacts_couplings_and_loops_are_written_as_they_are_read():
+    table = {
+        "coupling": [{"name": "c", "ratios": {"a": 1.0, "b": -2.0}, "replaces": True}],
+        "contact": [{"frame": "foot", "kind": "surface", "measured": ["fz"], "always": False,
+                     "radius": 0.0, "axes": "link", "threshold": 5.0, "uncertainty": 0.01}],
+        "loop": [{"frames": ["a", "b"], "kind": "point", "axis": [0.0, 1.0, 0.0]}],
+    }  # fmt: skip
+    stated = job_from_settings({"urdf": "x", **table}, "job.toml", Path()).to_dict()
+    assert {key: stated[key] for key in table} == table

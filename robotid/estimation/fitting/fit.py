@@ -43,7 +43,6 @@ from robotid.estimation.fitting.standard_errors import (
 from robotid.estimation.variation.groups import (
     FEWEST_RUNS,
     RunSums,
-    columns_of,
     groups_at,
     runs_of,
     sums_of,
@@ -418,25 +417,20 @@ def sums_with_zeros(
     z = sum(group.kind == "zero" for group in groups)
     if not (z and recordings.is_in_memory):
         return sums
-    B, acts = (x[:, :-z] for x in columns_of(groups, model.n_rows))
-    theta, runs = mapping.to_base(standard) + shift, []
+    theta, parts = mapping.to_base(standard) + shift, []
     for k, log in enumerate(recordings.fitted):
-        motion = log.whole.trajectory
+        motion, start = log.whole.trajectory, 0
         slopes = body_slopes_by_position(model, standard, motion).reshape(-1, z)
-        parts, size = [], recordings.segment_length(k) * model.n_rows
-        A, start = np.empty((len(slopes), B.shape[1])), 0
         r, scale = np.empty((2, len(slopes)))
         for W, tau, weight in recordings.problem_of(k, motion).blocks():
             rows = slice(start, start + len(tau))
             scale[rows] = np.sqrt(weight) / np.resize(sums.sigma, len(tau))
-            A[rows] = scale[rows, None] * (W @ B) * np.resize(acts, (len(tau), acts.shape[1]))
             r[rows] = scale[rows] * (tau - W @ theta)
             start += len(tau)
-        for first in range(0, start, size):
-            rows = slice(first, first + size)
-            parts.append((A[rows], -scale[rows, None] * slopes[rows], r[rows]))
-        runs.append(parts)
-    return with_zeros(sums, groups, runs)
+        D = -scale[:, None] * slopes
+        firsts = np.arange(0, start, recordings.segment_length(k) * model.n_rows)
+        parts.append(np.array([np.add.reduceat(x, firsts) for x in (D**2, D * r[:, None])]))
+    return with_zeros(sums, parts)
 
 
 def urdf_with_drives(

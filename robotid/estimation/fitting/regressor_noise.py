@@ -287,7 +287,7 @@ def _pair(
 def _shifted(log: SurveyedLog, change: Array) -> SurveyedLog:
     """Return a log in memory with changed positions, smoothed in the same way."""
     source = replace(log.head, q=log.head.q + change)
-    return replace(log, source=source, windows=(source,), asked=log.signals)
+    return replace(log, source=source, windows=(source,), asked=log.signals, given=None)
 
 
 def _without_steps(near: Recordings, steps: Sequence[Array]) -> Recordings:

@@ -97,6 +97,7 @@ class LogPiece:
     span: tuple[int, int]  # first row that is read for it, and the row after the last one
     near: Place  # position in the file at the start of the span, or shortly before
     segments: tuple[Segment, ...]  # the uninterrupted segments that contain its rows
+    given: Rows | None = None  # rows that were smoothed before, of a log in memory
 
     @property
     def name(self) -> str:
@@ -112,20 +113,9 @@ class LogPiece:
         """Return its rows and its smoothed motion; for a log in memory they are cached."""
         return self._cached if isinstance(self.header.source, Log) else self._read()
 
-    def take(self, rows: Rows, before: RobotModel) -> None:
-        """Store rows that were smoothed before."""
-        model, motion, mask = self.header.model, rows.trajectory, rows.mask
-        if model.layout != before.layout or is_loaded(model):
-            motion = remember(model, motion.with_states(None))
-        # static rows were chosen by their speeds already, those of a free base without its jumps
-        # and with the forces of its contacts
-        if not (model.is_static or model.constraints or motion.switching is not None):
-            mask = row_mask(model, motion, self.header.signals.min_velocity)
-        vars(self)["_cached"] = replace(rows, trajectory=motion, mask=mask)
-
     @cached_property
     def _cached(self) -> Rows:
-        return self._read()
+        return self.given or self._read()
 
     def _read(self) -> Rows:
         header = self.header
@@ -196,6 +186,7 @@ class SurveyedLog:
         length: Rows per piece.
         places: Positions in the file at which blocks of rows start.
         unit: Name of the robot, if there are several of one kind.
+        given: Its rows if it is in memory and they were smoothed before.
     """
 
     model: RobotModel
@@ -209,6 +200,7 @@ class SurveyedLog:
     length: int = PIECE
     places: Sequence[Place] = (Place(),)
     unit: str = ""
+    given: Rows | None = None
 
     @property
     def path(self) -> str:
@@ -280,13 +272,24 @@ class SurveyedLog:
 
     def with_model(self, model: RobotModel) -> "SurveyedLog":
         """Return the log for a robot whose drives have other terms or another load."""
-        other = replace(self, model=model, asked=self.signals)
-        if self.is_in_memory and np.array_equal(
-            friction_speeds(model.layout), friction_speeds(self.model.layout)
-        ):
-            for piece, own in zip(other.pieces, self.pieces, strict=True):
-                piece.take(own.read(), self.model)
-        return other
+        before, given = self.model, None
+        is_alike = np.array_equal(friction_speeds(model.layout), friction_speeds(before.layout))
+        if self.is_in_memory and is_alike:
+            rows = self.pieces[0].read()
+            motion, mask = rows.trajectory, rows.mask
+            if model.layout != before.layout or is_loaded(model):
+                motion = remember(model, motion.with_states(None))
+            # static rows were chosen by their speeds already, those of a free base without its
+            # jumps and with the forces of its contacts
+            if not (model.is_static or model.constraints or motion.switching is not None):
+                mask = row_mask(model, motion, self.signals.min_velocity)
+            given = replace(rows, trajectory=motion, mask=mask)
+        return replace(self, model=model, asked=self.signals, given=given)
+
+    def with_torque(self, tau: Array) -> "SurveyedLog":
+        """Return a log in memory with other torques of its smoothed motion, shape (N, n_rows)."""
+        rows = self.whole
+        return replace(self, given=replace(rows, trajectory=replace(rows.trajectory, tau=tau)))
 
     def with_accelerometer_bias(self, bias: Array) -> "SurveyedLog":
         """Return the log with another bias of the accelerometers of its IMU: bias (3,) [m/s^2]."""
@@ -303,7 +306,7 @@ class SurveyedLog:
         elif source.base.imu is not None:
             frame = replace(source.base.imu, offset=bias)
             source = replace(source, base=replace(source.base, imu=frame))
-        return replace(self, source=source, windows=windows, asked=self.signals)
+        return replace(self, source=source, windows=windows, asked=self.signals, given=None)
 
     @property
     def whole(self) -> Rows:
@@ -342,7 +345,7 @@ class SurveyedLog:
                 low = max(span[0] - 1, window[0])
                 span = low, low + 2
             near = _near(self.places, span[0])
-            found.append(LogPiece(header, first, stop, span, near, tuple(mine)))
+            found.append(LogPiece(header, first, stop, span, near, tuple(mine), self.given))
         return tuple(found)
 
 

@@ -79,7 +79,7 @@ class RunSums:
     r = tau - W theta, over the noise level of their joint. Zeros are last: see ``with_zeros``.
 
     Attributes:
-        H: A^T A of each run, shape (k, Q, Q). A pair of groups counts the joints of both.
+        H: A^T A of each run, shape (k, Q, Q); the blocks of the groups are used.
         h: A^T r of each run, shape (k, Q), each group over its own joints.
         scatter: Of each group, the scatter of the scores of segments about each run's estimate,
             and that of independent rows, shape (g, 2); see ``inflation_of``.
@@ -136,22 +136,12 @@ def sums_of(
     return RunSums(H, h, np.array(scatter), sigma)
 
 
-def with_zeros(
-    sums: RunSums, groups: Sequence[Group], rows: Sequence[Sequence[tuple[Array, Array, Array]]]
-) -> RunSums:
-    """Return sums with those over the rows of the zeros of the positions: rows (N n, Q - z)."""
+def with_zeros(sums: RunSums, parts: Sequence[Array]) -> RunSums:
+    """Return sums with those over the rows D of z zeros: D^2, D r by segment, (2, s, z) a run."""
     H, h, scatter = sums.H.copy(), sums.h.copy(), sums.scatter.copy()
-    z = sum(group.kind == "zero" for group in groups)
-    own, others = slice(H.shape[1] - z, None), slice(0, H.shape[1] - z)
-    parts = [[(D.T @ D, D.T @ r) for _, D, r in run] for run in rows]
-    for k, run in enumerate(rows):
-        H[k, own, own] = sum(D_D for D_D, _ in parts[k])
-        h[k, own] = sum(D_r for _, D_r in parts[k])
-        H[k, others, own] = sum(A.T @ D for A, D, _ in run)
-    H[:, own, others] = H[:, others, own].transpose(0, 2, 1)
-    for j in range(z):
-        each = [np.array([(D_D[j, j], D_r[j]) for D_D, D_r in run]) for run in parts]
-        scatter[len(groups) - z + j] = _scatter([(x[:, :1, None], x[:, 1:]) for x in each])
+    for j in range(-parts[0].shape[2], 0):
+        H[:, j, j], h[:, j] = np.array([part[:, :, j].sum(axis=1) for part in parts]).T
+        scatter[j] = _scatter([(D_D[:, j, None, None], D_r[:, j, None]) for D_D, D_r in parts])
     return RunSums(H, h, scatter, sums.sigma)
 
 

@@ -212,7 +212,7 @@ class _Grid:
         weight = self.all[0].sum(axis=1 - axis)
         variance = (self.within, self.between)[axis].ravel()
         if len(variance) == 1:
-            return np.sqrt(np.repeat(variance, len(wanted)))
+            return np.asarray(np.sqrt(np.repeat(variance, len(wanted))))
         middle = weight.cumsum() - 0.5 * weight
         return np.asarray(np.exp(np.interp(wanted, middle, 0.5 * np.log(variance))))
 

@@ -317,7 +317,7 @@ def _unlike(
     ])  # fmt: skip
     noise = float(np.median([group.inflation for group, _ in pairs]))  # of a typical group
     unlike = []
-    for k in np.flatnonzero(probability.min(axis=0) * n_tests < FALSE_ALARMS):
+    for k in np.flatnonzero(probability.min(axis=0) * n_tests < FALSE_ALARMS).tolist():
         evidence = [
             _explained(c, k, noise / group.inflation, is_drive=group.group.kind == "drive")
             if p[k] * n_tests < FALSE_ALARMS

@@ -41,7 +41,7 @@ def _thinned(patches: Sequence[Surface], share: float) -> list[Surface]:
         return []
     faces, patch = _oriented(mesh), patch[is_proper]
     parts = [_simplified(mesh.vertices, faces[patch == k], share) for k in range(len(patches))]
-    together = trimesh.util.concatenate(parts)
+    together: Any = trimesh.util.concatenate(parts)
     together.merge_vertices()
     is_closed = together.is_watertight and together.is_winding_consistent
     surfaces = []

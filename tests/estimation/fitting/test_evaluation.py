@@ -1,20 +1,14 @@
-from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
-import pytest
 from helpers.synthetic import exact_log, truth
 
 from robotid.data.log import Log, Trajectory
 from robotid.data.signal_settings import SignalSettings
-from robotid.data.signals import turns_note
 from robotid.dynamics.used_rows import row_mask
 from robotid.estimation.fitting.evaluation import (
     TorqueSums,
-    _conclude,
     _joined,
-    _parts,
-    _Score,
     evaluate_logs,
     hidden_joints,
     pool,
@@ -147,31 +141,6 @@ def test_rows_recorded_twice_are_found_whatever_the_clock_says(ur5, rng):
     assert not shares_rows(jittered, log)
 
 
-def test_two_hundred_rows_of_a_window_are_looked_for_whatever_its_pieces():
-    first, stop = 5003, 7003  # of a long file
-    ends = [first, 5600, 6205, stop]
-    pieces = [SimpleNamespace(first=row) for row in ends[:-1]]
-    log = SimpleNamespace(pieces=pieces, first=first, stop=stop, is_in_memory=False)
-    rows = [
-        np.arange(piece.first, end)[part.sampled]
-        for piece, part, end in zip(pieces, _parts(log), ends[1:], strict=True)
-    ]
-    np.testing.assert_array_equal(np.concatenate(rows), np.arange(first, stop, 10))
-
-
-def test_a_recording_is_named_by_its_file_and_stretch(ur5, rng):
-    pi = truth(ur5)
-    found = evaluated(ur5, exact_log(ur5, pi, rng), {"x": pi}, pi)
-    assert found.recording.name == "log 0-11.98 s"
-    log = replace(exact_log(ur5, pi, rng), path="some/run.csv").window(2.0, 7.5)
-    later = replace(log, t=log.t + 3.0)
-    extent = evaluated(ur5, later, {"x": pi}, pi).recording.extent
-    assert (extent.start, extent.end) == pytest.approx((5.0, 10.5))
-    assert (extent.samples, extent.rate) == (len(log.t), pytest.approx(50.0))
-    assert (extent.smooth, extent.rows_used, extent.segments) == (len(log.t), 6 * len(log.t), 1)
-    assert evaluated(ur5, later, {"x": pi}, pi).recording.name == "run.csv 5-10.5 s"
-
-
 def test_parts_of_a_log_keep_the_gaps_between_them(rng):
     q = rng.standard_normal((3, 5, 2))
     segments = ([0, 0, 1, 1, 3], [3, 3, 4, 4, 4], [9, 9, 9, 9, 9])
@@ -183,85 +152,3 @@ def test_parts_of_a_log_keep_the_gaps_between_them(rng):
     assert whole.segment.tolist() == [0, 0, 1, 1, 2, 3, 3, 4, 4, 4, 5, 5, 5, 5, 5]
     np.testing.assert_array_equal(whole.q, np.concatenate(q))
     np.testing.assert_array_equal(whole.t, np.concatenate([m.t for m in motions]))
-
-
-@pytest.mark.parametrize(
-    ("rows", "same", "shared"), [(200, 4, False), (200, 5, True), (10, 1, False), (10, 2, True)]
-)
-def test_more_than_two_percent_and_more_than_one_row_make_a_shared_log(rng, rows, same, shared):
-    def log(q):
-        return Log(t=np.arange(rows) / 100.0, q=q, v=None, tau=q + 1.0, joints=("a", "b"))
-
-    q, other = rng.standard_normal((2, rows, 2))
-    other[:same] = q[:same]
-    assert shares_rows(log(q), log(other)) is shared
-
-
-def test_of_a_long_log_its_start_its_middle_and_its_end_are_shown():
-    def shown(count, is_in_memory=False):
-        pieces = [SimpleNamespace(first=100 * k) for k in range(count)]
-        log = SimpleNamespace(pieces=pieces, first=0, stop=100 * count, is_in_memory=is_in_memory)
-        return [part.shown for part in _parts(log)]
-
-    start, end = slice(10_000), slice(-10_000, None)
-    assert shown(5) == [start, None, start, None, end]
-    assert shown(4) == [start, None, start, end]
-    assert shown(2) == [start, end]
-    assert shown(1, is_in_memory=True) == [slice(None)]
-
-
-def test_scores_of_pieces_join_field_by_field(rng):
-    def score(k):
-        tau = rng.standard_normal((4, 2))
-        sums = TorqueSums.of(tau, 0.5 * tau, np.ones((4, 2), dtype=bool), {"urdf": 0.1 * tau})
-        return _Score(
-            sums={"x": sums}, smooth=3 + k, used=5 * k, segments=frozenset({k, 7}),
-            turned=np.arange(3) == k, shown=((k, k, {}),), sampled=rng.standard_normal((k, 4)),
-            found=(np.arange(4) == k, np.arange(3) < k),
-        )  # fmt: skip
-
-    one, two = score(1), score(2)
-    both = one.join(two)
-    assert (both.smooth, both.used, both.segments) == (9, 15, {1, 2, 7})
-    assert both.turned.tolist() == [False, True, True]
-    assert both.shown == ((1, 1, {}), (2, 2, {}))
-    np.testing.assert_array_equal(both.sampled, np.concatenate([one.sampled, two.sampled]))
-    assert [x.tolist() for x in both.found] == [[False, True, True, False], [True, True, False]]
-    wanted = one.sums["x"].residual + two.sums["x"].residual
-    np.testing.assert_allclose(both.sums["x"].residual, wanted)
-
-
-def test_an_evaluation_of_a_window_has_its_extent_and_what_its_pieces_show(rng):
-    """Rows 3 to 8 of twelve in a file; the position of the second joint was unwrapped."""
-    stamps, values = 1.0 + 0.5 * np.arange(12), rng.standard_normal((6, 2))
-    head = Log(stamps[3:9], values, 2 * values, ("a", "b"), path="x/run.csv")
-    motions = [
-        Trajectory(stamps[k], *[rng.standard_normal((2, 2)) for _ in range(4)], ("a", "b"), 2.0,
-                   np.zeros(2, dtype=int))
-        for k in (slice(3, 5), slice(6, 8))
-    ]  # fmt: skip
-    masks, torques = rng.random((2, 2, 2)) < 0.7, rng.standard_normal((2, 2, 2))
-    tau = rng.standard_normal((9, 2))
-    sums = {"x": TorqueSums.of(tau, 0.5 * tau, np.ones((9, 2), dtype=bool), {})}
-    score = _Score(
-        sums=sums, smooth=41, used=77, segments=frozenset({2, 5, 7}),
-        turned=np.array([False, True]), sampled=None, found=(),
-        shown=tuple((m, k, {"x": t}) for m, k, t in zip(motions, masks, torques, strict=True)),
-    )  # fmt: skip
-    model = SimpleNamespace(row_names=("a", "b"), row_units=("N m", "N"))
-    log = SimpleNamespace(
-        first=3, stop=9, step=0.5, stamps=stamps, head=head, model=model, signals=EXACT
-    )
-    found = _conclude(log, score, True)
-    extent, recording = found.recording.extent, found.recording
-    assert (extent.samples, extent.rate, extent.start, extent.end) == (6, 2.0, 2.5, 5.0)
-    assert (extent.smooth, extent.rows_used, extent.segments) == (41, 77, 3)
-    assert (recording.name, recording.is_partial) == ("run.csv 2.5-5 s", True)
-    assert recording.log.notes == (*head.notes, turns_note(["b"]))
-    np.testing.assert_array_equal(recording.mask, np.concatenate(masks))
-    np.testing.assert_array_equal(found.torques["x"], np.concatenate(torques))
-    np.testing.assert_array_equal(recording.trajectory.q, np.concatenate([m.q for m in motions]))
-    assert (found.metrics["x"].per_joint["b"].unit, found.is_refitted) == ("N", True)
-    assert found.metrics["x"].per_joint["a"].rmse == pytest.approx(
-        0.5 * np.sqrt(np.mean(tau[:, 0] ** 2))
-    )

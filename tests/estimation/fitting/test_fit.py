@@ -3,28 +3,16 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
 from helpers.fitting import fit
 from helpers.synthetic import exact_log, truth
 
 from robotid.data.signal_settings import SignalSettings
-from robotid.dynamics.base_parameters import BaseMapping
 from robotid.estimation.fitting.estimator_settings import (
     EstimatorSettings,
-    Known,
 )
-from robotid.estimation.fitting.fit import rough_choice
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 from robotid.robot.prior import prior_spread
-
-
-@pytest.mark.parametrize(("weight", "rough"), [("auto", 1.0), ("evidence", 1.0), (2.5, 2.5)])
-def test_rough_settings_keep_a_stated_weight_and_draw_nothing(weight, rough):
-    choice = EstimatorSettings("consistent", prior_weight=weight)
-    assert rough_choice(choice) == replace(choice, prior_weight=rough)
-    least_squares = EstimatorSettings("wls", robust="huber")
-    assert rough_choice(least_squares) is least_squares
 
 
 def test_a_base_parameter_of_terms_at_their_bound_alone_has_no_error(rng):
@@ -42,15 +30,6 @@ def test_a_base_parameter_of_terms_at_their_bound_alone_has_no_error(rng):
     np.testing.assert_array_equal(is_open, wanted)
     C = found.standard_covariance
     np.testing.assert_allclose(found.base_error[~is_open] ** 2, np.diag(K @ C @ K.T)[~is_open])
-
-
-def test_what_is_known_of_base_parameters_follows_from_the_standard_ones(rng):
-    K = np.hstack([np.eye(3), rng.standard_normal((3, 2))])
-    mapping = BaseMapping(K, np.arange(3), tuple("abcde"), np.ones(5))
-    pi, spread = rng.standard_normal(5), np.array([0.1, 2.0, 0.5, 7.0, 1.5])
-    known = Known(None, mapping, pi, spread, 0.3, np.ones(2))
-    np.testing.assert_allclose(known.beta, K @ pi)
-    np.testing.assert_allclose(known.covariance, K @ np.diag(spread**2) @ K.T)
 
 
 def test_the_prior_of_a_fit_has_the_scale_of_the_samples_of_all_logs(rng):

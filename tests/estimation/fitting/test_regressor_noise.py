@@ -3,26 +3,22 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import scipy.linalg
 from helpers.fitting import fit, identify
 from helpers.paths import ROOT
 from helpers.synthetic import truth
 
-from robotid.data.files.read import lay_out, write_log
 from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import process
 from robotid.dynamics.base_parameters import structural_mapping
-from robotid.dynamics.factors import Factors, join
+from robotid.dynamics.factors import join
 from robotid.dynamics.simulation.motions import random_fourier
 from robotid.dynamics.torque import joint_torque_regressor
 from robotid.estimation.estimators import OLS, WLS
-from robotid.estimation.fitting import regressor_noise, survey
+from robotid.estimation.fitting import regressor_noise
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
-from robotid.estimation.fitting.fit import solve_recordings
 from robotid.estimation.fitting.recorded import Recordings
 from robotid.estimation.fitting.regressor_noise import (
-    _is_enough,
     acceleration_noise,
     find_regressor_noise,
     rounding_errors,
@@ -30,7 +26,7 @@ from robotid.estimation.fitting.regressor_noise import (
     without_noise,
 )
 from robotid.estimation.fitting.standard_errors import measured_errors
-from robotid.estimation.fitting.survey import hold_log, survey_log
+from robotid.estimation.fitting.survey import hold_log
 from robotid.robot.model import RobotModel
 
 RATE, STEP = 200.0, 2 * np.pi / 2**11  # [Hz], [rad]
@@ -230,33 +226,6 @@ def test_an_estimator_that_reads_samples_counts_the_shift_as_an_error(planar, mo
     assert "its standard errors include it" in finding.message
 
 
-def test_corrected_factors_are_those_of_the_fit(planar, motion, runs):
-    _, noises, known, _ = runs
-    found = fit(planar, [recorded(planar, motion)], signals=SIGNALS, estimator="wls")
-    np.testing.assert_allclose(found.regressor_noise.shift, noises[0].shift, rtol=1e-6)
-    np.testing.assert_allclose(found.base_error, known[0], rtol=1e-4)
-    np.testing.assert_allclose(found.wls.theta, found.base, rtol=1e-6)
-    beta = found.mapping.to_base(truth(planar))
-    assert (np.abs(found.base - beta) < 3.0 * known[0]).all()
-
-
-def test_what_is_held_out_is_corrected_as_the_whole_is(planar, motion):
-    recordings, parts, whole, wls = fitted(planar, recorded(planar, motion))
-    ground = solve_recordings(recordings, EstimatorSettings("wls")).ground
-    theta, shift = wls.theta * 1.01, ground.noise.shift
-    assert len(ground.before.held_out) == len(ground.segments) == len(parts)
-    for own in (ground.before.held_out, ground.segments):
-        for part, corrected in zip(parts, own, strict=True):
-            np.testing.assert_allclose(
-                corrected.residual_squares(theta), part.factors.residual_squares(theta + shift),
-                rtol=1e-6,
-            )  # fmt: skip
-    np.testing.assert_allclose(
-        ground.factors.residual_squares(theta), whole.factors.residual_squares(theta + shift)
-    )
-    np.testing.assert_allclose(ground.rough.theta, wls.theta - shift)
-
-
 def test_ordinary_least_squares_are_corrected_by_their_own_weights(planar, motion):
     log = recorded(planar, motion)
     recordings, _, whole, _ = fitted(planar, log)
@@ -275,50 +244,6 @@ def test_total_least_squares_have_a_correction_of_their_own(planar, motion):
     assert found.regressor_noise is None
 
 
-def test_rows_that_are_not_looked_at_scale_the_covariance_of_the_score(planar, motion, monkeypatch):
-    """Of thrice the rows, D, H and the shift's score are three times as large, its variance nine.
-
-    The scatter of repeated rounding errors is a variance of rows: three times as large.
-    """
-    monkeypatch.setattr(regressor_noise, "_is_enough", lambda moves: len(moves) == 4)
-    log = recorded(planar, [x[:700] for x in motion])
-    recordings, parts, whole, wls = fitted(planar, log)
-
-    def found(reduction):
-        return find_regressor_noise(recordings, reduction, wls.theta, wls.sigma, wls.sigma)
-
-    thrice = join(parts * 3)
-    both = found(whole), found(thrice)
-    monkeypatch.setattr(regressor_noise, "_repeated", lambda linear: np.zeros(linear.shape[-1]))
-    alone = found(whole), found(thrice)
-    size = np.sqrt(np.outer(np.diag(both[1].meat), np.diag(both[1].meat)))
-    for one, more in (both, alone):
-        np.testing.assert_allclose(more.shift / one.std_error, one.shift / one.std_error, atol=1e-6)
-        np.testing.assert_allclose(more.std_error, one.std_error / np.sqrt(3), rtol=1e-6)
-        np.testing.assert_allclose(more.share, one.share, rtol=1e-9)
-    np.testing.assert_allclose(alone[1].meat / size, 9 * alone[0].meat / size, atol=1e-6)
-    repeated = [x.meat - y.meat for x, y in zip(both, alone, strict=True)]
-    assert (np.diag(repeated[0]) > 0).any()
-    np.testing.assert_allclose(repeated[1] / size, 3 * repeated[0] / size, atol=1e-6)
-
-
-def test_of_a_log_in_a_file_windows_stand_for_all_rows(planar, motion, tmp_path, monkeypatch):
-    log = recorded(planar, motion)
-    whole_log = found_in(planar, log)
-    monkeypatch.setattr(survey, "_WINDOW", 1000)
-    path = tmp_path / "log.csv"
-    write_log(log, path)
-    layout, table = lay_out(path, planar.joints)
-    surveyed = survey_log(layout, table, planar, SIGNALS, length=1600)
-    assert [len(x.t) for x in surveyed.windows] == [1000] * 3
-    recordings = Recordings(planar, structural_mapping(planar), [surveyed])
-    whole = join(recordings.reduce())
-    wls = WLS(independent_share=recordings.share).fit(whole.factors)
-    found = find_regressor_noise(recordings, whole, wls.theta, wls.sigma, wls.sigma)
-    worst = int(np.argmax(np.abs(whole_log.shift) / wls.std_error))
-    assert found.shift[worst] == pytest.approx(whole_log.shift[worst], rel=0.3)
-
-
 def test_the_share_of_the_noise_is_that_of_the_log_in_which_it_is_largest():
     logs = [SimpleNamespace(step=h, signals=SIGNALS) for h in (0.01, 0.004)]
     steps = [np.array([0.02, 0.0, 1e-4]), np.array([1e-3, 0.0, 0.03])]
@@ -328,64 +253,6 @@ def test_the_share_of_the_noise_is_that_of_the_log_in_which_it_is_largest():
     wanted = np.maximum(*noise) / np.sqrt(whole.squares[2] / 20)
     assert (wanted < 1.0).all()
     np.testing.assert_allclose(regressor_noise._share(logs, steps, whole), wanted, rtol=1e-12)
-
-
-def test_shift_and_covariance_are_those_of_given_draws_of_two_logs(rng, monkeypatch):
-    """The formulas at the top of the module, with the sums of each draw given."""
-    rows, sigma, level = (11, 16), np.array([0.3, 1.7]), np.array([0.5, 0.9])
-    W = [3.0 * rng.standard_normal((count, 3)) for count in rows]
-    triangles = [np.linalg.qr(np.column_stack([x, x[:, 0]]), mode="r") for x in W]
-    factors = Factors(tuple(triangles), (np.arange(3),) * 2, np.array(rows), tuple("abc"))
-    logs = [
-        SimpleNamespace(
-            step=h, signals=SIGNALS, is_in_memory=True, whole=SimpleNamespace(trajectory=h)
-        )
-        for h in (0.01, 0.004)
-    ]
-    steps = {0.01: np.array([0.02, 1e-4]), 0.004: np.array([1e-3, 0.03])}
-    E = [0.4 * rng.standard_normal((4, 3)) for _ in range(12)]
-    pairs = [
-        [regressor_noise._Sums(60 * rng.standard_normal((5, 3)), x.T @ x, 9) for x in two]
-        for two in zip(E[::2], E[1::2], strict=True)
-    ]
-    plain = regressor_noise._Sums(rng.standard_normal((5, 3)), np.zeros((3, 3)), 9)
-    given = iter(pairs)
-    monkeypatch.setattr(regressor_noise, "_steps", lambda log: steps[log.step])
-    monkeypatch.setattr(regressor_noise, "_without_steps", lambda near, _: near)
-    monkeypatch.setattr(regressor_noise, "_sums", lambda near, motions, *_: plain)
-    monkeypatch.setattr(regressor_noise, "_pair", lambda *_: next(given))
-    model = SimpleNamespace(is_static=False, free_flyer=False)
-    recordings = SimpleNamespace(model=model, share=0.3, fitted=logs)
-    squares = np.array([[0.0] * 2, [0.0] * 2, [8e4, 2e5]])
-    whole = SimpleNamespace(factors=factors, squares=squares, samples=20)
-    found = find_regressor_noise(recordings, whole, 1e4 * np.array([9.0, -7.0, 5.0]), sigma, level)
-    H = sum(x.T @ x / s**2 for x, s in zip(W, sigma, strict=True))
-    B = np.linalg.inv(H)
-    noisy = sum(x.T @ x * (e / s**2) ** 2 for x, s, e in zip(W, sigma, level, strict=True))
-    scale = sum(rows) / 9
-    moved = np.array([plain.score - 0.5 * (one.score + two.score) for one, two in pairs])
-    D = scale * np.mean([0.5 * (one.information + two.information) for one, two in pairs], axis=0)
-    D_theta = scale * moved.mean(axis=0)
-    np.testing.assert_allclose(found.shift, -np.linalg.solve(H - D, D_theta), rtol=1e-9)
-    np.testing.assert_allclose(found.std_error, np.sqrt(np.diag(B @ noisy @ B) / 0.3), rtol=1e-9)
-    x, X = scipy.linalg.eigh(D, H)  # X X^T = H^-1
-    assert (x > 0).all()
-    assert (x < 0.8).all()
-    linear = np.array([0.5 * (one.segments - two.segments) @ X for one, two in pairs])
-    repeated = np.mean(linear.sum(axis=1) ** 2 - np.sum(linear**2, axis=1), axis=0)
-    unsure = 0.1 * x / (1 - x) ** 2 * (X.T @ D_theta)
-    meat = H @ X @ np.diag(scale * np.maximum(repeated, 0.0) + unsure**2) @ X.T @ H
-    meat += scale**2 * np.cov(moved.T) / 6
-    np.testing.assert_allclose(found.meat, meat, rtol=1e-8, atol=1e-9 * meat.max())
-    np.testing.assert_array_equal(found.steps, [0.02, 0.03])
-    np.testing.assert_array_equal(
-        found.share, regressor_noise._share(logs, list(steps.values()), whole)
-    )
-    counted = found.uncorrected(H)
-    np.testing.assert_allclose(
-        counted.meat - found.meat, H @ np.outer(found.shift, found.shift) @ H
-    )
-    assert (found.is_corrected, counted.is_corrected) == (True, False)
 
 
 @pytest.mark.parametrize(
@@ -430,44 +297,3 @@ def test_a_finding_names_the_joints_of_coarse_steps_and_the_worst_inertial_sum(
             "share_pct": 40,
         }
     )
-
-
-def test_draws_end_when_the_shift_is_known_to_a_fifth_of_a_standard_error_or_is_negligible():
-    """Of k draws of scatter s the mean is known to s / sqrt(k); six are the most."""
-    scatter = {4: np.array([-1.0, -1.0, 1.0, 1.0]) * np.sqrt(0.75), 3: np.array([-1.0, 0.0, 1.0])}
-    for mean, spread, count, is_enough in (
-        (5.0, 0.39, 4, True), (5.0, 0.41, 4, False), (0.0, 0.41, 4, False),
-        (-0.09, 9.0, 3, True), (-0.11, 9.0, 3, False),
-    ):  # fmt: skip
-        moves = np.column_stack([np.zeros(count), mean + spread * scatter[count]])
-        assert _is_enough(moves) == is_enough
-    assert _is_enough(9.0 * np.arange(6.0)[:, None])
-    assert not _is_enough(9.0 * np.arange(5.0)[:, None])
-
-
-def test_steps_are_smoothed_over_a_period_of_the_filter_on_either_side(monkeypatch):
-    """At least over five rows; an angle is unwrapped before, the position of a slider is not."""
-    asked = []
-
-    def smooth(q, steps, width):
-        asked.append((q[:, 0].tolist(), q[:, 1].tolist(), steps, width))
-        return width
-
-    monkeypatch.setattr(regressor_noise, "smoothed", smooth)
-    monkeypatch.setattr(regressor_noise, "_shifted", lambda log, change: (log.name, change))
-    model = SimpleNamespace(joints=("a", "s"), layout=SimpleNamespace(prismatic=("s",)))
-    head = SimpleNamespace(q=np.array([[3.0, 3.0], [3.5 - 2 * np.pi, -3.0]]))
-    logs = [
-        SimpleNamespace(
-            name=k, model=model, head=head, step=0.002, signals=SimpleNamespace(cutoff=cutoff)
-        )
-        for k, cutoff in enumerate((None, 5.0))
-    ]
-    near = Recordings(model, None, logs, logs)
-    found = regressor_noise._without_steps(near, ["first", "second"])
-    assert found.fitted == [(0, 11), (1, 201)]
-    assert found.validation == ()
-    assert [steps for *_, steps, _ in asked] == ["first", "second"]
-    for angle, slider, *_ in asked:
-        np.testing.assert_allclose(angle, [3.0, 3.5])
-        assert slider == [3.0, -3.0]

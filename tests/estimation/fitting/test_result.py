@@ -4,9 +4,7 @@ from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
-import pytest
 
-from robotid.base.exceptions import SettingsError
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
 from robotid.estimation.fitting.fitted import Fit
 
@@ -87,10 +85,3 @@ def test_wls_is_overfitted_where_it_predicts_every_unseen_log_by_a_fifth_worse()
     seen = log(is_refitted=True, a=(1.0, 1.0), b=(1.0, 2.0), c=(1.0, 1.0))
     assert overfitted(seen, first) == {"a", "c"}
     assert overfitted(seen) == overfitted() == frozenset()
-
-
-def test_metrics_are_of_the_estimate_or_of_wls():
-    for name in ("urdf", None, ["wls"]):
-        with pytest.raises(SettingsError, match="wanted 'estimate' or 'wls'") as caught:
-            Fit.metrics(None, name)
-        assert str(caught.value).startswith(f"name is {name!r}, ")

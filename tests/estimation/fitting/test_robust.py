@@ -8,20 +8,17 @@ from helpers.driven import JOINTS, arm
 from helpers.fitting import fit
 from helpers.synthetic import exact_log, truth
 
-from robotid.base.exceptions import NotConvergedError, SettingsError
+from robotid.base.exceptions import SettingsError
 from robotid.data.files.read import lay_out, write_log
 from robotid.data.log import Log, Trajectory
 from robotid.data.signal_settings import SignalSettings
 from robotid.dynamics.base_parameters import structural_mapping
-from robotid.dynamics.factors import join
-from robotid.dynamics.prediction import predict
 from robotid.dynamics.used_rows import base_problem
-from robotid.estimation.estimators import WLS
 from robotid.estimation.fitting import robust
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
 from robotid.estimation.fitting.recorded import Recordings
 from robotid.estimation.fitting.robust import LOSSES, find_outliers, loss_slope, loss_weight
-from robotid.estimation.fitting.survey import hold_log, survey_log
+from robotid.estimation.fitting.survey import survey_log
 from robotid.identification.pipeline import conclude
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
@@ -219,11 +216,6 @@ def test_logs_larger_than_memory_are_refused_by_name(model, tmp_path):
         conclude(recordings, EstimatorSettings("wls", robust="huber"))
 
 
-def test_a_job_refuses_another_loss():
-    with pytest.raises(SettingsError, match="robust is 'cauchy'"):
-        EstimatorSettings("wls", robust="cauchy")
-
-
 def test_a_reversal_excuses_the_step_of_coulomb_friction_of_its_own_joint(model):
     """Where |v| <= |a| / cutoff, an error is counted beyond twice the joint's friction."""
     t, pi = np.arange(400) / 100, truth(model)
@@ -302,43 +294,3 @@ def test_a_coupled_drive_steps_at_each_of_its_joints_by_its_ratio():
         if name in names:
             pi[names.index(name)] = value
     assert robust._friction_step(model, pi) == pytest.approx([1.4, 2.2, 3.5])
-
-
-def test_weights_and_their_loss_are_those_of_the_residuals_of_all_logs_together(model, monkeypatch):
-    """The scale of a joint is the median of both logs; of the second most rows are not used."""
-    rng, pi = np.random.default_rng(8), truth(model)
-    signals = SignalSettings(cutoff=None, trim=0.0, min_velocity=0.3)
-    logs = [
-        exact_log(model, pi, rng, samples=n, noise=s * NOISE) for n, s in ((180, 1.0), (130, 2.0))
-    ]
-    own = Recordings(
-        model, structural_mapping(model), [hold_log(model, log, signals) for log in logs]
-    )
-    prior = model.standard_parameters()
-    weighted, understated = robust.reweigh(own, "huber", prior)
-    theta = WLS(prior=own.mapping.to_base(prior)).fit(
-        join(weighted.reduce(is_cut=False)).factors
-    ).theta  # fmt: skip
-    rows = [log.whole for log in own.fitted]
-    residuals = [
-        row.trajectory.tau
-        - predict(model, [own.mapping.to_standard(theta, prior)], row.trajectory)[0]
-        for row in rows
-    ]
-    together, used = np.concatenate(residuals), np.concatenate([row.mask for row in rows])
-    scale = [1.4826 * np.median(np.abs(together[used[:, j], j])) for j in range(3)]
-    for weight, residual in zip(weighted.weights, residuals, strict=True):
-        wanted = np.minimum(1.0, 1.345 * np.array(scale) / np.abs(residual))
-        np.testing.assert_allclose(weight, wanted, atol=5e-3)
-    scaled = np.abs(together / scale)[used]
-    mean = np.minimum(1.0, 1.345 / scaled).mean() / np.mean(scaled < 1.345)
-    assert understated == pytest.approx(mean, rel=1e-2)
-    assert mean > 1.05
-    monkeypatch.setattr(robust, "_MAX_ITERATIONS", 1)  # the first fit has none to compare with
-    with pytest.raises(NotConvergedError, match=r"of the huber loss have not converged after 1 p"):
-        robust.reweigh(own, "tukey", prior)
-    monkeypatch.undo()
-    # residuals beyond the constant of the loss have no slope: a thousandth at least
-    monkeypatch.setattr(robust, "loss_slope", lambda loss, r: np.full(r.shape, 2e-4))
-    weight = np.minimum(1.0, 1.345 / scaled).mean()
-    assert robust.reweigh(own, "huber", prior)[1] == pytest.approx(weight / 1e-3, rel=1e-2)

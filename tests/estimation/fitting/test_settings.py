@@ -1,6 +1,6 @@
 import json
 import pickle
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,15 +11,11 @@ from helpers.paths import ROOT
 from helpers.synthetic import exact_log, truth
 
 from robotid.base.exceptions import SettingsError
-from robotid.base.settings import setting
-from robotid.cli import main
 from robotid.cli.identify import run_job
 from robotid.cli.job import LogEntry, job_from_settings, read_job
-from robotid.cli.schema import job_schema
 from robotid.data.files.read import write_log
 from robotid.data.signal_settings import SignalSettings
 from robotid.dynamics.base_parameters import structural_mapping
-from robotid.estimation.estimators import WLS, BatchEstimator
 from robotid.estimation.fitting.estimator_settings import (
     ESTIMATORS,
     EstimatorSettings,
@@ -27,7 +23,6 @@ from robotid.estimation.fitting.estimator_settings import (
 )
 from robotid.estimation.fitting.fit import fit_recordings
 from robotid.estimation.fitting.recorded import Recordings
-from robotid.estimation.fitting.robust import LOSSES
 from robotid.estimation.fitting.survey import hold_log
 from robotid.robot.model import RobotModel
 
@@ -143,11 +138,6 @@ def test_a_setting_that_does_not_fit_is_refused(options, text):
         EstimatorSettings(**options)
 
 
-def test_words_of_the_settings_are_those_that_the_estimators_know():
-    keys = EstimatorSettings("consistent").paths()
-    assert set(keys["robust"].among) == {"none", *LOSSES}
-
-
 @pytest.mark.parametrize("name", ESTIMATORS)
 def test_settings_of_each_estimator_survive_a_round_trip(name):
     settings = EstimatorSettings(name)
@@ -155,43 +145,3 @@ def test_settings_of_each_estimator_survive_a_round_trip(name):
     assert EstimatorSettings(**settings.to_dict()) == settings
     assert replace(settings) == settings
     assert pickle.loads(pickle.dumps(settings)) == settings
-
-
-@dataclass(frozen=True)
-class Shrunk(BatchEstimator):
-    """Least squares, times a factor."""
-
-    factor: float
-
-    def _fit(self, factors):
-        found = WLS().fit(factors)
-        return replace(found, theta=self.factor * found.theta)
-
-
-@dataclass(frozen=True)
-class ShrunkSettings(EstimatorSettings):
-    name: str = setting("shrunk", "a toy", among=("shrunk",))
-    factor: float = setting(0.5, "what parameters are shrunk to [-]")
-
-    def make(self, known):
-        assert known.pi.shape == known.spread.shape
-        return Shrunk(self.factor)
-
-
-def test_a_new_estimator_is_a_module_and_its_settings(rng, monkeypatch, capsys):
-    monkeypatch.setitem(ESTIMATORS, "shrunk", ShrunkSettings)
-    model = arm()
-    log = exact_log(model, truth(model), rng)
-    wls, found = (
-        fit(model, [log], signals=EXACT, estimator=EstimatorSettings(name, **own))
-        for name, own in (("wls", {}), ("shrunk", {"factor": 0.25}))
-    )
-    np.testing.assert_allclose(found.base, 0.25 * wls.base, rtol=1e-9, atol=1e-12)
-    with pytest.raises(SettingsError, match="estimator 'shrunk' has no setting 'starts'"):
-        EstimatorSettings("shrunk", starts=3)
-    with pytest.raises(SystemExit):
-        main(["identify", "--help"])
-    assert "gradient, simulation, shrunk" in " ".join(capsys.readouterr().out.split())
-    keys = job_schema()["properties"]["estimator"]["properties"]
-    assert keys["factor"]["description"] == "what parameters are shrunk to [-]"
-    assert keys["name"]["enum"][-1] == "shrunk"

@@ -182,22 +182,6 @@ def test_parquet_is_read_across_its_row_groups(robot, recording, tmp_path):
         long_log(robot, path, SignalSettings())
 
 
-def test_blank_lines_of_a_csv_are_no_rows(robot, recording, tmp_path, monkeypatch):
-    monkeypatch.setattr(
-        "robotid.data.files.csv_files._BLOCK", 170
-    )  # lines, so that pieces start within one
-    path = tmp_path / "run.csv"
-    write_log(recording, path)
-    lines = path.read_text().splitlines()
-    lines[700:700] = ["", "  "]
-    path.write_text("\ufeff" + "\r\n".join(lines) + "\r\n\r\n", encoding="utf-8")
-    assert_alike(robot, path, SignalSettings())
-    lines[1500] = lines[1500].replace(",", ",,", 1)
-    path.write_text("\n".join(lines))
-    with pytest.raises(DataError, match=r"line 1501 has 14 cells, the header has 13"):
-        long_log(robot, path, SignalSettings())
-
-
 def spoilt(recording, tmp_path, name, row, value):
     table = {"time": recording.t.copy()}
     for j, joint in enumerate(recording.joints):
@@ -234,17 +218,6 @@ def test_time_must_increase_where_pieces_meet_too(robot, recording, tmp_path, ro
         long_log(robot, path, SignalSettings())
     assert str(in_pieces.value) == str(in_memory.value)
     assert f"t[{row}]" in str(in_pieces.value)
-
-
-def test_a_log_is_read_in_pieces_of_16384_rows_if_nothing_else_is_said(tmp_path):
-    arm = RobotModel.from_urdf(example_urdf("ur5_robot.urdf"), joints=["elbow_joint"])
-    t = 3.0 + 0.01 * np.arange(16_500)
-    columns = {"t": t, "q_elbow_joint": np.sin(t), "tau_elbow_joint": np.cos(t)}
-    write_columns(columns, tmp_path / "run.parquet")
-    layout, table = lay_out(tmp_path / "run.parquet", arm.joints)
-    found = survey_log(layout, table, arm, SignalSettings(), (4.0, None))
-    assert [(p.first, p.stop) for p in found.pieces] == [(100, 16_484), (16_484, 16_500)]
-    assert found.with_accelerometer_bias(np.ones(3)).windows == found.windows  # it has no IMU
 
 
 def test_samples_have_the_regressor_of_their_mass_matrix(robot, recording, tmp_path):
@@ -347,42 +320,6 @@ def test_means_of_segments_of_a_static_robot_replace_filter_and_rate(robot, reco
         signals, cutoff=None, rate=None, velocity="differentiated", acceleration="differentiated"
     )
     assert hold_log(robot, recording, signals).signals.rate == 50.0
-
-
-def test_windows_of_a_long_log_are_named_by_their_own_rows(monkeypatch):
-    monkeypatch.setattr(survey, "_WINDOW", 100)
-    q = np.zeros((2, 1))
-    windows = tuple(Log(np.arange(2.0), q, q, ("a",), path="run.csv", notes=(n,)) for n in "xyz")
-    log = SimpleNamespace(windows=windows, first=7, stop=1008)
-    looks = survey.SurveyedLog.looks.fget(log)
-    assert [own.path for own in looks] == [
-        "run.csv rows 7-107", "run.csv rows 457-557", "run.csv rows 908-1008",
-    ]  # fmt: skip
-    assert {own.notes for own in looks} == {()}
-    head = survey.SurveyedLog.head.fget(log)
-    assert head.notes == (
-        "x", "the log is too long for the memory; the doctor checked rows 7-107, 457-557, "
-        "908-1008 only",
-    )  # fmt: skip
-    short = SimpleNamespace(windows=windows[:1], first=7, stop=300)
-    assert survey.SurveyedLog.looks.fget(short) == windows[:1]
-    assert survey.SurveyedLog.head.fget(short) is windows[0]
-
-
-def test_a_log_without_a_segment_of_sufficient_length_is_named():
-    for is_static, words in (
-        (False, "none of its 2 segments without gaps is long enough for the filter and a trim of "
-         "0.75 s at each end"),
-        (True, "no segment of 0.25 s is slow enough for dynamics = 'static'"),
-    ):  # fmt: skip
-        for path, name in (("", "log"), ("run.csv", "run.csv")):
-            log = SimpleNamespace(
-                model=SimpleNamespace(is_static=is_static), path=path, segments=("a", "b"),
-                signals=SignalSettings(trim=0.75),
-            )  # fmt: skip
-            error = survey.SurveyedLog.too_short(log)
-            assert str(error).startswith(f"{name}: {words}; record")
-            assert error.code == "too_short"
 
 
 def test_other_drive_terms_keep_the_rows_and_torques_without_contact_forces(rng):

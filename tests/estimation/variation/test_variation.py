@@ -15,7 +15,6 @@ from robotid.estimation.fitting.survey import hold_log
 from robotid.estimation.variation.groups import (
     Group,
     RunsOf,
-    columns_of,
     groups_at,
     inflation_of,
     runs_of,
@@ -23,8 +22,6 @@ from robotid.estimation.variation.groups import (
 )
 from robotid.estimation.variation.spread import Runs, SpreadModel
 from robotid.estimation.variation.variation import (
-    UnlikeRun,
-    Variation,
     between_covariance,
     shrunk_correlation,
     vary,
@@ -105,7 +102,6 @@ def test_rows_of_zeros_are_differences_of_the_torque(model):
     found = sums_with_zeros(plain, own, base, shift)
     groups = [group for group, _ in groups_at(model, own.mapping, base)]
     assert [(g.name, g.units) for g in groups[-3:]] == [(j, ("rad",)) for j in model.joints]
-    B, acts = (x[:, :-3] for x in columns_of(groups, 3))
     h, parts = 1e-6, [[] for _ in model.joints]
     for k, log in enumerate(own.fitted):
         motion, w = log.whole.trajectory, (log.whole.mask * weights[k] / sigma**2).ravel()
@@ -116,16 +112,12 @@ def test_rows_of_zeros_are_differences_of_the_torque(model):
             @ own.mapping.to_base(base) for e in np.eye(3)
         ], 1)  # fmt: skip
         r = motion.tau.ravel() - W @ (own.mapping.to_base(base) + shift)
-        A = (W @ B) * np.tile(acts, (len(motion.t), 1))
         cuts = np.arange(own.segment_length(k) * 3, len(r), own.segment_length(k) * 3)
         for j, part in enumerate(parts):
             x = [(w * D[:, j] * y) for y in (D[:, j], r)]
             H, g = ([each.sum() for each in np.split(y, cuts)] for y in x)
             part.append((np.array(H)[:, None, None], np.array(g)[:, None]))
-        near = {"rtol": 1e-5, "atol": 1e-5 * np.abs(found.H[k]).max()}
-        np.testing.assert_allclose(found.H[k, -3:, -3:], D.T @ (w[:, None] * D), **near)
-        np.testing.assert_allclose(found.H[k, :-3, -3:], A.T @ (w[:, None] * D), **near)
-        np.testing.assert_allclose(found.H[k], found.H[k].T, rtol=1e-12)
+        np.testing.assert_allclose(np.diag(found.H[k])[-3:], w @ D**2, rtol=1e-5)
         np.testing.assert_allclose(found.h[k, -3:], D.T @ (w * r), rtol=1e-4)
         np.testing.assert_allclose(found.H[k, :-3, :-3], plain.H[k, :-3, :-3], rtol=0)
         np.testing.assert_allclose(found.h[k, :-3], plain.h[k, :-3], rtol=0)
@@ -367,37 +359,6 @@ def test_two_logs_have_no_variation_and_three_are_not_compared(model):
     assert len(three.parameters) > 5
 
 
-def test_findings_name_log_value_and_prediction():
-    ends = np.array([0.98, 1.03])
-    gain = UnlikeRun(1, "gain", "elbow", "elbow.gain", "-", 1.2, 0.011, ends, 1e-7)
-    drive = UnlikeRun(
-        0, "drive", "elbow", "elbow.coulomb", "N m", 8.21, 0.12, np.array([5.0, 6.0]), 1e-6
-    )
-    load = UnlikeRun(2, "payload", "tool", "tool.m", "kg", 2.81, 0.02, np.array([-0.1, 0.1]), 1e-9)
-    found = [
-        *unlike_findings(
-            Variation(("a.csv", "b.csv", "c.csv", "d.csv"), 1, (), (gain, drive, load))
-        )
-    ]
-    assert [each.where for each in found] == ["b.csv", "a.csv", "c.csv"]
-    assert {each.code for each in found} == {"unlike_run"}
-    assert found[0].message.startswith(
-        "b.csv: the torque of elbow differs from that of the fit by +20 +- 1.1 %; 3 other logs "
-        "predict -2 to +3 %. The torque constant"
-    )
-    assert found[1].message.startswith(
-        "a.csv: elbow.coulomb is 8.21 +- 0.12 N m; 3 other logs predict 5 to 6 N m. Temperature"
-    )
-    assert found[2].message.startswith(
-        "c.csv: tool.m is 2.81 +- 0.02 kg more than in the other logs; 3 other logs predict "
-        "-0.1 to 0.1 kg. A load"
-    )
-    assert found[0].evidence == {
-        "value": 1.2, "std_error": 0.011, "low": 0.98, "high": 1.03, "probability": 1e-7,
-    }  # fmt: skip
-    assert [*unlike_findings(None)] == []
-
-
 def units_of(rng, shift, *, units=5, runs=2):
     """Return a group of two payload terms in runs of units; one unit is shifted."""
     unit = np.repeat(np.arange(units), runs)
@@ -489,23 +450,6 @@ def test_a_robot_with_a_changed_gain_is_named_though_the_friction_of_robots_diff
     assert not variation.unlike
 
 
-def test_the_cause_of_an_unlike_run_is_the_one_that_explains_most_of_its_rows():
-    """chi^2 without the inflation of a group by coloured noise: 5000 times 9 and 3000 times 20."""
-    rng = np.random.default_rng(7)
-
-    def group(kind, size, inflation):
-        x = 0.01 * rng.normal(size=(8, 1))
-        x[2] += size
-        own = Group(kind, kind, (f"{kind}.x",), ("N",), np.eye(1), (0,))
-        runs = Runs(np.ones((8, 1, 1)), x, np.zeros(8, int), np.full(1, 0.1))
-        return RunsOf(own, np.zeros(1), runs, inflation)
-
-    one, other = group("drive", np.sqrt(5000.0), 9.0), group("gain", np.sqrt(3000.0), 20.0)
-    for pair in ((one, other), (other, one)):
-        unlike = vary(list("abcdefgh"), pair).unlike
-        assert [odd.kind for odd in unlike if odd.run == 2] == ["gain"]
-
-
 def test_only_parameters_of_which_a_run_has_information_vary():
     rng = np.random.default_rng(6)
     group = stated("b", rng.normal(size=(5, 3)), 0.1)
@@ -513,25 +457,6 @@ def test_only_parameters_of_which_a_run_has_information_vary():
     runs = replace(group.runs, H=H, h=np.einsum("kij,kj->ki", H, rng.normal(size=(5, 3))))
     found = vary(list("abcde"), (replace(group, runs=runs),)).parameters
     assert [each.name for each in found] == ["b.0", "b.2"]
-
-
-def test_a_payload_of_a_robot_is_compared_if_all_its_runs_determine_it():
-    """Its first run alone does not: nothing of the second parameter."""
-    rng, unit = np.random.default_rng(8), np.array([0, 0, 1, 1, 2, 2, 3, 3, 3, 4, 4])
-    x = 0.05 * rng.normal(size=(11, 2))
-    x[unit == 3] += [0.0, 3.0]
-    H = np.tile(np.diag([400.0, 400.0]), (11, 1, 1))
-    H[6, 1, 1] = 0.0
-    own = Group("payload", "hand", ("hand.m", "hand.mcx"), ("kg", "kg m"), np.eye(2), (0,))
-
-    def unlike():
-        runs = Runs(H, np.einsum("kij,kj->ki", H, x), unit, np.ones(2))
-        return vary(list("abcdefghijk"), (RunsOf(own, np.zeros(2), runs, 1.0),)).unlike_units
-
-    (found,) = unlike()
-    assert (found.run, found.kind, found.name) == (3, "payload", "hand.mcx")
-    H[6:9, 1, 1] = 0.0
-    assert not unlike()
 
 
 def test_a_run_is_named_by_the_number_of_all_parameters_in_all_runs():
