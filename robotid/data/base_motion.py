@@ -293,7 +293,7 @@ def _pose_of(values: Mapping[str, Array], frame: ImuFrame | None) -> Array | Non
         return np.hstack([angles[:, :3], quaternions_of_angles(_radians(angles[:, 3:]))])
     quaternion = values.get("base quaternion")
     if (own := values.get("base imu quaternion")) is not None and frame is not None:
-        quaternion = _of_base(own, frame.quaternion)
+        quaternion = _product(own, frame.quaternion[None] * [-1.0, -1.0, -1.0, 1.0])
     elif (angles := values.get("base rpy")) is not None:
         quaternion = quaternions_of_angles(_radians(angles))
     return None if quaternion is None else np.hstack([0.0 * quaternion[:, :3], quaternion])
@@ -309,13 +309,6 @@ def _radians(angles: Array) -> Array:
             code="angle_unit",
         )
     return angles
-
-
-def _of_base(quaternion: Array, own: Array) -> Array:
-    """Return the orientation of the base (N, 4) from that of an IMU, and the IMU's in the base."""
-    x, w, back = quaternion[:, :3], quaternion[:, 3:], -own[:3]
-    vector = w * back + own[3] * x + np.cross(x, back)
-    return np.hstack([vector, w * own[3] - x @ back[:, None]])
 
 
 def contacts_of(values: Array, wanted: BaseColumns, where: str) -> dict[str, Array]:

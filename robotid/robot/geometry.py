@@ -23,7 +23,6 @@ from robotid.robot.urdf_text import LARGEST, numbers
 _FORMATS = (".stl", ".dae", ".obj", ".ply", ".off", ".glb", ".gltf")
 _MOST_BYTES = 2**28  # of a mesh; that of a link has about 2**20
 
-GREY = (0.6, 0.65, 0.7, 1.0)  # of shapes without colour
 _SIDES = 16  # of the prism around a cylinder
 _MOST_FACES = 100  # a hull with more is replaced by an outer polytope with this many faces
 _GROWN = 0.05  # enlargement on each side of the box of a body's geometry, over its diagonal

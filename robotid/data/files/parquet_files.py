@@ -206,11 +206,3 @@ def parquet_rows(path: Path, columns: Mapping[str, type]) -> Iterator[ParquetRow
         rows = ParquetRows(writer, schema)
         yield rows
         rows.write()
-
-
-def parquet_values(path: Path) -> Iterator[dict[str, Any]]:
-    """Yield the rows of a Parquet file, without their nulls; a row group of them is in memory."""
-    with _opened(path) as file:
-        for batch in file.iter_batches(_GROUP):
-            for row in batch.to_pylist():
-                yield {name: value for name, value in row.items() if value is not None}

@@ -91,7 +91,7 @@ def test_a_torque_is_clipped_at_either_limit_and_held_by_groups():
         share = np.mean(tau[:-1, 0] == limit) * 1999 / 2000
         assert Figures(finding) == pytest.approx({"limit": limit, "share": share})
         assert f"at its limit {limit:g} in {100 * share:.3g} % of the rows" in finding.message
-    repeated = {f.where: f.evidence for f in found if f.code == "repeated_torque"}
+    repeated = {f.where: Figures(f) for f in found if f.code == "repeated_torque"}
     assert repeated == {
         "run.csv: b, d": pytest.approx({"rows": 4.0, "delay": 0.015}),
         "run.csv: c": pytest.approx({"rows": 7.0, "delay": 0.03}),
