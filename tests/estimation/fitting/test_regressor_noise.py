@@ -10,6 +10,7 @@ from helpers.synthetic import truth
 from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import process
+from robotid.diagnosis.verdict.fit_findings import encoder_noise
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.factors import join
 from robotid.dynamics.simulation.motions import random_fourier
@@ -196,9 +197,7 @@ def test_fine_encoders_change_nothing_and_are_not_named(planar, motion, step):
     log = recorded(planar, motion, step=step)
     found = fit(planar, [log], signals=SIGNALS, estimator="wls")
     assert found.regressor_noise is None
-    assert regressor_noise.encoder_findings(
-        found.regressor_noise, found.model, found.mapping
-    ) == []
+    assert list(encoder_noise(found)) == []
 
 
 def test_measured_velocities_have_no_noise_of_the_positions(planar, motion):
@@ -274,7 +273,9 @@ def test_a_finding_names_the_joints_of_coarse_steps_and_the_worst_inertial_sum(
     layout = SimpleNamespace(n_inertial=2, prismatic={"d"})
     model = SimpleNamespace(joints=tuple("abcd"), layout=layout)
     mapping = SimpleNamespace(K=K, base_names=("x", "y", "z"))
-    found = regressor_noise.encoder_findings(noise, model, mapping)
+    found = list(
+        encoder_noise(SimpleNamespace(regressor_noise=noise, model=model, mapping=mapping))
+    )
     assert len(found) == (severity is not None)
     if not found:
         return
