@@ -3,6 +3,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from helpers.findings import Figures
 from helpers.fitting import fit, identify
 from helpers.paths import ROOT
 from helpers.synthetic import truth
@@ -289,7 +290,7 @@ def test_a_finding_names_the_joints_of_coarse_steps_and_the_worst_inertial_sum(
         f"40 % of the RMS acceleration and shifts z by {size:.1f} standard errors"
         in finding.message
     )
-    assert finding.evidence == pytest.approx(
+    assert Figures(finding) == pytest.approx(
         {
             "step_a": steps[0],
             "step_c": steps[2],
