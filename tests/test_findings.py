@@ -118,6 +118,17 @@ def test_what_is_typed_keeps_one_value_unless_the_values_are_far_apart():
     ]  # fmt: skip
 
 
+def test_the_largest_or_the_smallest_stands_for_several_where_the_sentence_says_so():
+    sizes = [("a", 7.25, 2), ("b", 3.5, 4)]
+    found = [finding("spikes", log, "lift", channel="tau", rows=rows, largest=size, when="3")
+             for log, size, rows in sizes]  # fmt: skip
+    (message,) = grouped(found)[0].messages
+    assert "a, b: tau of lift has spikes of up to 7.25 in 2 to 4 rows" in message
+    steps = [finding("jitter", log, shortest=low, longest=high, median=0.01, relative_spread=0.1)
+             for log, low, high in (("a", 0.008, 0.02), ("b", 0.009, 0.03))]  # fmt: skip
+    assert "vary from 8 to 30 ms about 10 ms" in grouped(steps)[0].messages[0]
+
+
 def test_of_decreases_the_worst_is_stated_as_a_decrease():
     sizes = {"a": (1.02, 0.0039), "b": (0.87, 0.0056)}
     found = [

@@ -159,11 +159,6 @@ def table(
     )
 
 
-def figure(caption: str, svg: str) -> str:
-    """Return the HTML of a figure, which scrolls on narrow pages, also by keyboard."""
-    return f'<figure tabindex="0"><figcaption>{caption}</figcaption>{svg}</figure>\n'
-
-
 def folded(key: str, summary: str, html: str, *, is_open: bool = False) -> str:
     """Return the HTML of foldable content, which is open in print."""
     opened = " open" if is_open else ""
