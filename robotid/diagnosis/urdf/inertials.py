@@ -126,19 +126,6 @@ def rounded_angles(model: RobotModel, mapping: BaseMapping) -> Iterator[Finding]
         )  # fmt: skip
 
 
-def rounded_robot(model: RobotModel, mapping: BaseMapping) -> Iterator[Finding]:
-    """Yield one finding if the angles that a URDF rounds change the identifiable parameters."""
-    joints = [name for name in _rounded(model.tree) if name in _carrying(model.tree)]
-    effect, figures = _effect(model, mapping) if joints else ("none", {})
-    if effect != "none":
-        file = Path(model.tree.path).name
-        yield finding(
-            "rounded_rpy", subject=file, severity="warning" if effect == "more" else "note",
-            what="robot", file=file, names=listed(joints, 6), effect=effect, joints=len(joints),
-            **figures,
-        )  # fmt: skip
-
-
 def weak_parameters(model: RobotModel, mapping: BaseMapping) -> Iterator[Finding]:
     """Yield a warning if parameters are at the limit between identifiable and unidentifiable."""
     if weak := _between(mapping):

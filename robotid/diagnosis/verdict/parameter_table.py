@@ -3,15 +3,13 @@
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from html import escape
-from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
 
 from robotid.base.files import finite
 from robotid.base.typing import Array
-from robotid.estimation.fitting.fitted import FROM_DATA, FROM_PRIOR, Fit, Identified, sources_of
+from robotid.estimation.fitting.fitted import Fit, Identified
 
 #: Columns of a row: link or drive, parameter, the URDF's value, the identified one, its standard
 #: error, its 95 % interval, what determined it, unit.
@@ -24,21 +22,6 @@ CORRELATED = 0.95
 CENTRAL_TERMS = ("m", "cx", "cy", "cz", "Ixx", "Iyy", "Izz", "Ixy", "Ixz", "Iyz")
 _PAIRS = ((0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 2))  # axes of Pinocchio's six inertias
 _ORDER = [0, 1, 2, 3, 4, 6, 9, 5, 7, 8]  # of CENTRAL_TERMS in Pinocchio's order
-_STAYED = 0.3  # change in prior standard deviations up to which the source may be the prior
-
-
-class ParameterRows(list[dict[str, Any]]):
-    """The rows if pandas is not installed: dictionaries, which a notebook shows as a table."""
-
-    def _repr_html_(self) -> str:
-        rows = [HEADERS, *(tuple("" if x is None else x for x in row.values()) for row in self)]
-        html = "".join(f"<tr>{''.join(map(_cell, row))}</tr>" for row in rows)
-        return f"<table>{html}</table>"
-
-
-def _cell(value: object) -> str:
-    words = f"{value:.4g}" if isinstance(value, float) else str(value)
-    return f"<td>{escape(words)}</td>"
 
 
 def parameter_entries(found: Identified) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
@@ -57,33 +40,30 @@ def parameter_entries(found: Identified) -> tuple[list[dict[str, Any]], list[dic
             "prior": float(found.prior[i]),
             "source": sources[i],
             "at_bound": bool(at_bound[i]),
-            **(_partner(layout.names[pairs[i][0]], pairs[i][1]) if i in pairs else {}),
+            **(
+                {"correlated_with": layout.names[pairs[i][0]], "correlation": pairs[i][1]}
+                if i in pairs
+                else {}
+            ),
         }
         for i, name in enumerate(layout.names)
     ]
     return entries[: layout.n_inertial], entries[layout.n_inertial :]
 
 
-def _partner(name: str, correlation: float) -> dict[str, Any]:
-    return {"correlated_with": name, "correlation": correlation}
-
-
 def parameter_table(
     bodies: Iterable[Mapping[str, Any]], drives: Iterable[Mapping[str, Any]]
 ) -> Any:  # noqa: ANN401
     """Return the parameters of a result as a table, links first, then drives."""
+    import pandas
+
     entries = [*bodies, *({**entry, "prior": None} for entry in drives)]
-    rows = ParameterRows()
+    rows = []
     for entry in entries:
         part, _, parameter = entry["name"].rpartition(".")
         low, high = entry.get("interval_95", (None, None))  # of results without intervals
         values = [entry.get("prior"), entry["value"], entry.get("std_error"), low, high]
-        row = (part, parameter, *values, entry.get("source", ""), entry["unit"])
-        rows.append(dict(zip(HEADERS, row, strict=True)))
-    if find_spec("pandas") is None:
-        return rows
-    import pandas
-
+        rows.append((part, parameter, *values, entry.get("source", ""), entry["unit"]))
     frame = pandas.DataFrame(rows, columns=list(HEADERS))
     return frame.astype(dict.fromkeys(_NUMBERS, float))
 
@@ -128,8 +108,6 @@ class CentralParameters:
     urdf: Array  # Values of the URDF, shape (n, 10); NaN for the centre and inertia without mass
     values: Array  # Identified values, likewise
     half: Array  # Half-widths of their 95 % intervals, shape (n, 10); inf if there is none
-    #: What determined each value, of ``SOURCES``, shape (n, 10), text
-    sources: np.ndarray[tuple[int, int], np.dtype[np.str_]]
 
 
 def central_parameters(found: Fit) -> CentralParameters:
@@ -140,36 +118,16 @@ def central_parameters(found: Fit) -> CentralParameters:
     n, size = len(found.model.layout.bodies), found.model.layout.n_inertial
     pi, before = (x[:size].reshape(n, 10) for x in (found.standard, found.prior))
     error = found.standard_error[:size]
-    unbounded = error if found.errors.unbounded is None else found.errors.unbounded[:size]
-    wider = np.where(error > 0, unbounded / np.where(error > 0, error, 1.0), 1.0)
-    of_standard = np.array(found.sources[:size]).reshape(n, 10)
     quantile = found.standard_quantile[:size].reshape(n, 10).max(axis=1)
-    urdf, values, half, share, moved = (np.full((n, 10), np.nan) for _ in range(5))
+    urdf, values, half = (np.full((n, 10), np.nan) for _ in range(3))
     for i in range(n):
         urdf[i], _ = _central(before[i])
         values[i], G = _central(pi[i])
         own = slice(10 * i, 10 * i + 10)
         C = found.standard_covariance[own, own]
-        S = np.diag(found.prior_std[own] ** 2)
-        D = np.diag(np.where(np.isfinite(wider[own]), wider[own], 1.0))
-        std, free, prior = (_std(G, X) for X in (C, D @ C @ D, S))
+        std = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", G, C, G), 0.0))
         half[i] = np.where(np.isfinite(error[own]).all(), quantile[i] * std, np.inf)
-        share[i] = free / np.maximum(prior, 1e-300)
-        moved[i] = np.abs(values[i] - urdf[i]) > _STAYED * prior
-    is_kept = (of_standard == "prior").all(axis=1, keepdims=True)
-    is_prior = is_kept | ((share > FROM_PRIOR) & (moved == 0))
-    is_bound = (of_standard == "bound").any(axis=1, keepdims=True) & (share >= FROM_DATA)
-    sources = np.array(sources_of(share.ravel(), is_prior.ravel(), is_bound.ravel()))
-    sources = sources.reshape(n, 10)
-    sources[:, 0] = of_standard[:, 0]
-    urdf, values, half = (x[:, _ORDER] for x in (urdf, values, half))
-    return CentralParameters(urdf, values, half, sources[:, _ORDER])
-
-
-def _std(G: Array, C: Array) -> Array:
-    """Return the standard deviations of G x, x with the covariance C."""
-    std: Array = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", G, C, G), 0.0))
-    return std
+    return CentralParameters(*(x[:, _ORDER] for x in (urdf, values, half)))
 
 
 def _central(pi: Array) -> tuple[Array, Array]:
