@@ -15,13 +15,11 @@ from scipy.spatial.transform import Rotation
 
 from robotid.base.exceptions import DataError, SettingsError
 from robotid.base.files import write_text
-from robotid.base.settings import require_kind
 from robotid.base.typing import Array
 from robotid.base.versions import __version__
 from robotid.dynamics.friction_projection import project_friction
 from robotid.estimation.fitting.fitted import Identified
 from robotid.estimation.fitting.standard_errors import QUANTILE
-from robotid.identification.result import TorqueIdentification
 from robotid.output.files.commanded import commanded_drives
 from robotid.output.files.exports import Format, Option, Written, head_of, yaml_text
 from robotid.output.files.result_file import Result
@@ -168,23 +166,6 @@ def stated_ranges(content: Mapping[str, Any]) -> dict[str, Any]:
             of_logs = {"low": max(low, least), "high": high, "source": "logs"}
             merged[drive][term] = own | of_logs
     return {"undetermined": content["structure"]["undetermined"], **ranges, "drives": merged}
-
-
-def write_ranges(found: TorqueIdentification, target: str | Path) -> None:
-    """Write the ranges of an identification as YAML.
-
-    Args:
-        found: The identification.
-        target: The file to write.
-
-    Raises:
-        DataError: If its folder does not exist.
-        ModelError: If a link or a drive would be physically impossible.
-        SettingsError: If the target is a folder.
-    """
-    require_kind(found, TorqueIdentification, "found", "a robotid.Identification")
-    require_kind(target, (str, Path), "target", "the path of a file to write")
-    write_text(ranges_text(parameter_ranges(found)), target)
 
 
 def ranges_text(ranges: Mapping[str, Any]) -> str:

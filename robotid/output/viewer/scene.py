@@ -41,18 +41,6 @@ class Scene:
     corners: tuple[Array, ...]
 
 
-@dataclass(frozen=True, eq=False)
-class Ellipsoid:
-    """The mass distribution of a body as a solid."""
-
-    mass: float  # mass [kg]
-    com: Array | None  # centre of mass in the body's frame, shape (3,) [m]; None without mass
-    # lengths of the semi-axes, shape (3,) [m]; None if no solid has this inertia
-    semi_axes: Array | None
-    rotation: Array  # directions of the axes as columns, a rotation, shape (3, 3)
-    fault: str  # reason for no solid; empty if there is one
-
-
 def robot_scene(model: RobotModel) -> Scene:
     """Return the nodes and the parts of a robot.
 
@@ -90,30 +78,17 @@ def coordinates(model: RobotModel, q: Array) -> Array:
 
 
 def mass_marks(model: RobotModel, pi: Array, label: str) -> dict[str, Any]:
-    """Return the centre of mass and the equimomental ellipsoid of each body, for the viewer.
-
-    pi (p,).
-    """
-    found = ellipsoids(pi[: model.layout.n_inertial])
-    return {
-        "label": label,
-        "bodies": [
-            {
-                "node": i + 1,
-                "name": body,
-                "mass": mark.mass,
-                "com": None if mark.com is None else mark.com.tolist(),
-                "semi_axes": None if mark.semi_axes is None else mark.semi_axes.tolist(),
-                "quaternion": pin.Quaternion(mark.rotation).coeffs().tolist(),
-                "fault": mark.fault,
-            }
-            for i, (body, mark) in enumerate(zip(model.layout.bodies, found, strict=True))
-        ],
-    }
+    """Return the centre of mass and the equimomental ellipsoid of each body: pi (p,)."""
+    J = pseudo_inertia(pi[: model.layout.n_inertial])
+    bodies = [
+        {"node": i, "name": body, **ellipsoid(own)}
+        for i, (body, own) in enumerate(zip(model.layout.bodies, J, strict=True), start=1)
+    ]
+    return {"label": label, "bodies": bodies}
 
 
-def ellipsoids(pi: Array) -> tuple[Ellipsoid, ...]:
-    """Return the equimomental ellipsoid of each body.
+def ellipsoid(J: Array) -> dict[str, Any]:
+    """Return mass, centre of mass and equimomental ellipsoid of a pseudo-inertia (4, 4), as plain.
 
     The second moments about the centre of mass, Sigma_c = Sigma - m c c', are those of a solid
     ellipsoid of uniform density whose semi-axes have the lengths sqrt(5 s_i / m), s_i the
@@ -122,10 +97,20 @@ def ellipsoids(pi: Array) -> tuple[Ellipsoid, ...]:
     References:
         Wensing, Kim, Slotine (2018), Linear matrix inequalities for physically consistent
         inertial parameter identification, section IV.
-
-    pi (10 bodies,).
     """
-    return tuple(_ellipsoid(J) for J in pseudo_inertia(pi))
+    m, place = float(J[3, 3]), {"com": None, "semi_axes": None, "quaternion": [0.0, 0.0, 0.0, 1.0]}
+    if not m > 0:
+        return {"mass": m, **place, "fault": "no mass" if m == 0 else "negative mass"}
+    c = J[:3, 3] / m
+    s, axes = np.linalg.eigh(J[:3, :3] - m * np.outer(c, c))
+    place["com"] = c.tolist()
+    if s[0] < -1e-12 * float(np.trace(J[:3, :3])):  # beyond rounding
+        return {"mass": m, **place, "fault": "no solid has this inertia"}
+    if np.linalg.det(axes) < 0:
+        axes[:, 0] = -axes[:, 0]
+    place["semi_axes"] = np.sqrt(5.0 * np.maximum(s, 0.0) / m).tolist()
+    place["quaternion"] = pin.Quaternion(axes).coeffs().tolist()
+    return {"mass": m, **place, "fault": ""}
 
 
 def packed(values: Array, kind: str = "<f4") -> dict[str, Any]:
@@ -133,20 +118,6 @@ def packed(values: Array, kind: str = "<f4") -> dict[str, Any]:
     array = np.ascontiguousarray(values, dtype=kind)
     data = base64.b64encode(array.tobytes()).decode("ascii")
     return {"kind": kind, "shape": list(array.shape), "data": data}
-
-
-def _ellipsoid(J: Array) -> Ellipsoid:
-    m = float(J[3, 3])
-    if not m > 0:
-        return Ellipsoid(m, None, None, np.eye(3), "no mass" if m == 0 else "negative mass")
-    c = J[:3, 3] / m
-    s, axes = np.linalg.eigh(J[:3, :3] - m * np.outer(c, c))
-    if np.linalg.det(axes) < 0:
-        axes[:, 0] = -axes[:, 0]
-    rounding = 1e-12 * float(np.trace(J[:3, :3]))
-    if s[0] < -rounding:
-        return Ellipsoid(m, c, None, np.eye(3), "no solid has this inertia")
-    return Ellipsoid(m, c, np.sqrt(5.0 * np.maximum(s, 0.0) / m), axes, "")
 
 
 class _Library:
