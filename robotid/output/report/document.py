@@ -5,8 +5,8 @@ from pathlib import Path
 
 from robotid.base.files import write_text
 from robotid.identification.result import Identification, TorqueIdentification
+from robotid.output.report.next_steps import Origin
 from robotid.output.report.report_page import page_of
-from robotid.output.report.steps import Origin
 from robotid.output.report.torque_report import torque_report
 
 
