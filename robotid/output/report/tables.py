@@ -193,7 +193,7 @@ def _changes(model: RobotModel | None, standard: Array | None) -> str:
 def body_table(identification: TorqueIdentification) -> str:
     """Return mass, centre of mass and inertia about it of each link, below them those of the URDF.
 
-    A value that the data do not determine is the URDF's, and stands without interval.
+    A value that the data do not determine is the URDF's, and has no interval.
     """
     central = central_parameters(identification)
     rows = []
