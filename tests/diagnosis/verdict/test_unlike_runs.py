@@ -6,7 +6,7 @@ import pytest
 
 from robotid.base.findings import Finding
 from robotid.diagnosis.verdict.evidence import Predictions
-from robotid.output.report.steps import sentence_of
+from robotid.output.report.next_steps import sentence_of
 
 JOINTS = ("a", "b", "c")
 
