@@ -159,13 +159,11 @@ class EstimatorSettings(Settings):
 
     The call returns the settings class of that estimator. A setting of another estimator is an
     error.
-
-    Attributes:
-        has_equal_weights: Whether all rows have equal weights, whatever the noise of their joints.
-        allows_for_noise: Whether the estimator itself accounts for noise of the regressor.
     """
 
+    #: Whether all rows have equal weights, whatever the noise of their joints.
     has_equal_weights: ClassVar[bool] = False
+    #: Whether the estimator itself accounts for noise of the regressor.
     allows_for_noise: ClassVar[bool] = False
 
     name: str = setting("consistent", "name of the estimator")
