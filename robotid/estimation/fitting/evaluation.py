@@ -76,7 +76,7 @@ class Metrics:
 
 @dataclass(frozen=True, eq=False)
 class TorqueSums:
-    """Sums from which the metrics of a prediction are computed; sums of two recordings can merge."""
+    """Sums from which the metrics of a prediction are computed; those of two recordings merge."""
 
     rows: Array  # (n,), number of rows used per joint, int
     mean: Array  # (n,), mean of the measured torque over them [N m, N]
