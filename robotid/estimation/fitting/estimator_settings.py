@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from robotid.robot.model import RobotModel
 
 _NOT_NEGATIVE = Range("x >= 0", lambda x: x >= 0)
-_COUNT = Range("1 to 10000", lambda x: 1 <= x <= 10_000)
 _LARGEST = 1e9  # [kg] or [m] of bounds, as of numbers in a URDF
 _WINDOW = Range("0.05 s or more", lambda x: 0.05 <= x < math.inf)
 _FOLDS = 6  # of the cross-validation, prior_weight = "cv"
@@ -275,21 +274,6 @@ class RecursiveSettings(BoundedSettings):
     )
 
 
-@dataclass(frozen=True, init=False)
-class DescentSettings(RecursiveSettings):
-    """Settings of gradient methods, which end near the least squares solution."""
-
-    average: bool = setting(True, "whether the iterates are averaged")
-    passes: int = setting(4, "largest number of passes over the logs", within=_COUNT)
-    seed: int = setting(0, "seed of the random order of the samples; negative: order of time")
-
-    @property
-    def _common(self) -> dict[str, Any]:
-        """Return the arguments common to these estimators."""
-        rng = np.random.default_rng(self.seed) if self.seed >= 0 else None
-        return {"average": self.average, "passes": self.passes, "rng": rng}
-
-
 @dataclass(frozen=True)
 class OLSSettings(EstimatorSettings):
     """Settings of ordinary least squares: none."""
@@ -394,7 +378,7 @@ class KalmanSettings(RecursiveSettings):
 
 
 @dataclass(frozen=True)
-class PRXSettings(DescentSettings):
+class PRXSettings(RecursiveSettings):
     """Settings of the paper's update law."""
 
     name: str = _called("prx", "gradient steps along PRX (the paper's update), sample by sample")
@@ -403,33 +387,23 @@ class PRXSettings(DescentSettings):
         "step length: exact (line search) or printed (as in the paper)",
         among=("exact", "printed"),
     )
-    metric: str = setting(
-        "noise",
-        "metric of the residual for the exact step: noise (levels), mass (matrix), or rows",
-        among=("noise", "mass", "rows"),
-    )
 
     def make(self, known: Known) -> "RecursiveEstimator[Any]":
         from robotid.estimation.estimators import PRX
 
-        own = {"step": self.step, "metric": self.metric, **self._common}
-        return PRX(known.sigma, known.beta, **own)
+        return PRX(known.sigma, known.beta, rng=np.random.default_rng(0), step=self.step)
 
 
 @dataclass(frozen=True)
-class GradientSettings(DescentSettings):
+class GradientSettings(RecursiveSettings):
     """Settings of normalised gradient steps."""
 
     name: str = _called("gradient", "normalised gradient steps, sample by sample")
-    step_size: float = setting(
-        1.0, "relaxation factor [-]", within=Range("0 < x < 2", lambda x: 0 < x < 2)
-    )
 
     def make(self, known: Known) -> "RecursiveEstimator[Any]":
         from robotid.estimation.estimators import NormalisedGradient
 
-        own = {"step_size": self.step_size, **self._common}
-        return NormalisedGradient(known.sigma, known.beta, **own)
+        return NormalisedGradient(known.sigma, known.beta, rng=np.random.default_rng(0))
 
 
 @dataclass(frozen=True)

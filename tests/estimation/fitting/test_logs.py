@@ -1,6 +1,5 @@
 """Segments that logs in memory are cut into."""
 
-
 import numpy as np
 import pytest
 from helpers.driven import arm

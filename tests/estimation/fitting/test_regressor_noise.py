@@ -196,9 +196,7 @@ def test_fine_encoders_change_nothing_and_are_not_named(planar, motion, step):
     log = recorded(planar, motion, step=step)
     found = fit(planar, [log], signals=SIGNALS, estimator="wls")
     assert found.regressor_noise is None
-    assert regressor_noise.encoder_findings(
-        found.regressor_noise, found.model, found.mapping
-    ) == []
+    assert regressor_noise.encoder_findings(found.regressor_noise, found.model, found.mapping) == []
 
 
 def test_measured_velocities_have_no_noise_of_the_positions(planar, motion):
