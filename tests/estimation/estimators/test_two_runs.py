@@ -27,26 +27,6 @@ def segments(rng, beta, hold):
     return tuple(found)
 
 
-@pytest.mark.parametrize("hold", [1, 6])
-def test_errors_that_count_what_changes_with_time_are_no_smaller_than_those_of_alike_rows(
-    rng, hold
-):
-    loaded = segments(rng, np.add(BETA, [0.0, 0.0, CHANGE]), hold)
-    runs = TwoRuns(
-        segments(rng, BETA, hold), loaded, np.eye(3)[:, 2:], np.zeros(3), np.zeros(4),
-        1e-6 * np.eye(4), 1.0, np.empty(0, dtype=int),
-    )  # fmt: skip
-    theta, covariance = runs.alike()
-    found = runs.compare()
-    np.testing.assert_allclose(found.theta, theta, atol=1e-12)
-    assert (np.diag(found.covariance) >= np.diag(covariance) * (1 - 1e-12)).all()
-    # rows with weights 1 / noise^2: 12 x 60 of each joint with, and without the change
-    information = (720 * NOISE**-2.0).sum()
-    expected = np.sqrt(np.array([0.5, 2.0]) / information)  # of what both have, of the change
-    np.testing.assert_allclose(np.sqrt(np.diag(covariance))[[0, 3]], expected, rtol=0.1)
-    assert np.abs(theta - [*BETA, CHANGE]).max() < 5 * np.sqrt(hold) * expected[1]
-
-
 def of_rows(W, tau, count):
     """Return the factors of so many segments of rows W (n, N, c) and torques (n, N)."""
     columns, rows = (np.arange(W.shape[2]),) * len(W), np.full(len(W), W.shape[1] // count)
@@ -267,23 +247,6 @@ def test_the_noise_of_a_joint_is_its_residual_or_its_signal_or_one():
     # the rows are left at least
     wanted = [np.sqrt(46 / 920), np.sqrt(34 / 8.5), 3.0, 2e-7, 1.0, 1.0]
     np.testing.assert_allclose(TwoRuns._noise.func(runs), wanted)
-
-
-@pytest.mark.parametrize("unknown", [[1], [0, 1]])
-def test_gains_start_at_least_squares_of_both_runs(rng, unknown):
-    """Torques over their gains, of a load that is known: exact ones start at their gains."""
-    W, c = rng.standard_normal((2, 2, 40, 3)), np.array([0.0, 0.7, -0.4])
-    gains = np.ones(2)
-    gains[unknown] = [2.5, 0.3][: len(unknown)]
-    tau = np.stack([W[0] @ BETA, W[1] @ (BETA + c)]) / gains[:, None]
-    runs = TwoRuns(
-        of_rows(W[0], tau[0], 2), of_rows(W[1], tau[1], 2), np.zeros((3, 0)), c, np.zeros(3),
-        1e-9 * np.eye(3), 1.0, np.array(unknown),
-    )  # fmt: skip
-    np.testing.assert_allclose(runs._first_gains(), gains, rtol=1e-6)
-    found = runs.compare()
-    np.testing.assert_allclose(found.gain, gains, rtol=1e-6)
-    np.testing.assert_allclose(found.theta, BETA, rtol=1e-6)
 
 
 def test_rows_without_constraint_forces_have_one_noise_level_in_both_runs(rng):

@@ -65,15 +65,6 @@ def test_standard_errors_of_recursive_estimators_are_honest(rng, name):
 
 
 @pytest.mark.parametrize("name", RECURSIVE)
-def test_noise_free_data_do_not_upset_them(rng, name):
-    model = arm()
-    log = exact_log(model, truth(model), rng)
-    found = fit(model, [log], validation=[log], signals=EXACT, estimator=name)
-    # exact for least squares; a gradient method is still on its way
-    assert relative_errors(found, "estimate").max() < (30 if name in ("prx", "gradient") else 1e-3)
-
-
-@pytest.mark.parametrize("name", RECURSIVE)
 def test_a_recursive_estimate_is_made_physical_on_request(rng, name):
     model = arm()
     log = exact_log(model, truth(model), rng, noise=20 * np.array([4.0, 2.0, 0.3]))
