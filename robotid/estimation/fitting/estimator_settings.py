@@ -441,9 +441,6 @@ class SimulationSettings(EstimatorSettings):
     torques: bool = setting(
         True, "whether torques are fitted in addition to the positions, if all logs have them"
     )
-    whiten: bool = setting(
-        True, "whether the residuals are whitened by their estimated correlation"
-    )
 
 
 #: The settings of each estimator, by its name.

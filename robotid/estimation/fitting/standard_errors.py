@@ -8,7 +8,7 @@ its colour. It is computed from the factors of the segments, without a second pa
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -21,9 +21,6 @@ from robotid.estimation.estimators import Consistent, Estimate
 from robotid.estimation.estimators.batch import solve_factor
 from robotid.estimation.estimators.segments import FEWEST_SEGMENTS, quantile, scatter
 from robotid.robot.model import RobotModel
-
-if TYPE_CHECKING:
-    pass
 
 _DRAWS = 64  # fits to resampled data and prior, for standard errors with active bounds
 _LEAST_SOLVED = 0.8  # smallest share of them that must be solved

@@ -235,11 +235,7 @@ class Pool:
     ) -> _Outcome:
         """Process a piece alone after its worker ended; return what replaces its result if lost."""
         attempts = _ATTEMPTS[self.scheduler is not None]
-        for left in reversed(range(attempts)):
-            if self.scheduler is None:
-                self.close(is_urgent=True)
-            if not left:
-                break
+        for _ in range(1, attempts):
             _log.warning("a worker ended; %s is repeated", piece.name)
             try:
                 return self._finished([self._submit(work, piece)]).result()

@@ -12,20 +12,14 @@ from robotid.base.exceptions import DataError
 from robotid.dynamics.factors import Factors, compress, triangle_of
 from robotid.estimation.estimators import (
     OLS,
-    PRX,
     RLS,
     TLS,
     WLS,
     Consistent,
-    DescentState,
     Estimate,
     Kalman,
-    KalmanState,
     NormalisedGradient,
-    RLSState,
     fold,
-    load_state,
-    save_state,
 )
 from robotid.estimation.estimators.segments import scatter
 from robotid.robot.examples import example_urdf
@@ -33,7 +27,6 @@ from robotid.robot.model import RobotModel
 
 BATCH = ("ols", "wls", "tls", "consistent")
 RECURSIVE = tuple(name for name in ESTIMATORS if name not in BATCH)
-STATES = {RLS: RLSState, Kalman: KalmanState, PRX: DescentState, NormalisedGradient: DescentState}
 EXACT_COVARIANCE = ("ols", "wls", "consistent", "rls", "kalman")
 
 
@@ -189,19 +182,6 @@ def test_a_row_of_weight_zero_is_as_if_it_had_never_been(make, states):
     np.testing.assert_array_equal(still.theta, estimator.estimate(state, problem.names).theta)
 
 
-@makers(RECURSIVE)
-def test_saved_and_resumed_gives_the_same_bits(make, states, tmp_path):
-    problem = states.problem
-    estimator, state = started(make, states)
-    samples = list(problem.samples())[:300]
-    unbroken = fold(estimator, samples, state)
-    half = fold(estimator, samples[:150], state)
-    save_state(half, tmp_path / "state.npz")
-    read = load_state(tmp_path / "state.npz", STATES[type(estimator)])
-    assert bits(read) == bits(half)
-    assert bits(fold(estimator, samples[150:], read)) == bits(unbroken)
-
-
 THETA, ERROR = np.array([1.5, -20.0, 0.25]), np.array([0.1, 3.0, np.inf])
 ESTIMATE = Estimate(
     theta=THETA,
@@ -287,14 +267,3 @@ def test_what_one_segment_alone_determines_has_the_mean_scatter_of_all_others(rn
     assert freedom[2] == 1.0
     assert freedom[3] == np.inf
     assert ((freedom[:2] > 5.0) & (freedom[:2] <= count)).all()
-
-
-def test_a_file_that_is_no_state_is_refused(tmp_path):
-    with pytest.raises(DataError, match="of the state does not exist"):
-        load_state(tmp_path / "none.npz", RLSState)
-    (tmp_path / "text.npz").write_text("not a state")
-    with pytest.raises(DataError, match=r"text.npz is not a file of a state"):
-        load_state(tmp_path / "text.npz", RLSState)
-    save_state(RLS(np.ones(2)).init(3), tmp_path / "rls.npz")
-    with pytest.raises(DataError, match="contains a state 'RLSState', wanted 'KalmanState'"):
-        load_state(tmp_path / "rls.npz", KalmanState)

@@ -16,7 +16,7 @@ from robotid.estimation.estimators.consistent.body_constraints import (
     Subspace,
     slabs,
 )
-from robotid.estimation.estimators.consistent.consistent_fit import Entropic
+from robotid.estimation.estimators.consistent.interior_point import Entropic
 from robotid.estimation.estimators.estimator import Estimate
 from robotid.estimation.fitting.estimator_settings import ConstraintSettings, make_constraints
 from robotid.robot.geometry import body_boxes
