@@ -15,7 +15,6 @@ from robotid.dynamics.factors import Factors, merge
 from robotid.estimation.estimators import OLS, WLS
 from robotid.estimation.estimators.segments import scatter
 from robotid.estimation.fitting.standard_errors import (
-    about_prior,
     measured_errors,
     standard_of,
     with_wls_errors,
@@ -231,17 +230,6 @@ def test_the_prior_makes_the_sandwich_of_its_formula(W):
     np.testing.assert_allclose(
         found.covariance, B @ (share**2 * K.T @ meat @ K + L) @ B, rtol=1e-6, atol=1e-12
     )
-
-
-@pytest.mark.parametrize("pull", [1.0, 2.5])
-def test_a_prior_that_pulls_more_than_it_is_sure_widens_by_its_own_part(rng, pull):
-    K, R, share = rng.standard_normal((4, 6)), np.triu(rng.standard_normal((4, 4))), 0.3
-    L, root = np.diag(np.arange(1.0, 7.0)), rng.standard_normal((4, 4))
-    meat = root @ root.T
-    C = np.linalg.inv(share * K.T @ R.T @ R @ K + L)
-    found = about_prior(C, K, meat, R, share, pull)
-    np.testing.assert_allclose(found, C @ (K.T @ meat @ K + pull * L) @ C, atol=1e-12)
-    np.testing.assert_array_equal(found, found.T)
 
 
 def test_what_is_scattered_beside_the_rows_adds_to_the_meat(W):
