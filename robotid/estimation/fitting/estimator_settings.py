@@ -1,33 +1,17 @@
-"""The estimators' settings, one table for each, and the estimators that they make."""
+"""The estimators' settings, one table for each."""
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
-from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, ClassVar, Self
-
-import numpy as np
+from dataclasses import dataclass, fields
+from typing import Any, ClassVar, Self
 
 from robotid.base.exceptions import SettingsError
 from robotid.base.findings import listed
 from robotid.base.settings import Range, Settings, require_kind, setting
-from robotid.base.typing import Array
-
-if TYPE_CHECKING:
-    from robotid.dynamics.base_parameters import BaseMapping
-    from robotid.dynamics.factors import Factors
-    from robotid.estimation.estimators import (
-        BatchEstimator,
-        Consistent,
-        Constraints,
-        RecursiveEstimator,
-    )
-    from robotid.robot.model import RobotModel
 
 _NOT_NEGATIVE = Range("x >= 0", lambda x: x >= 0)
 _LARGEST = 1e9  # [kg] or [m] of bounds, as of numbers in a URDF
 _WINDOW = Range("0.05 s or more", lambda x: 0.05 <= x < math.inf)
-_FOLDS = 6  # of the cross-validation, prior_weight = "cv"
 _FINITE = Range("a positive, finite number", lambda x: 0 < x < math.inf)
 
 
@@ -126,32 +110,6 @@ def _is_number(value: object) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
-@dataclass(frozen=True, eq=False)
-class Known:
-    """A robot and the prior of its parameters."""
-
-    model: "RobotModel"
-    mapping: "BaseMapping"  # standard to base parameters
-    pi: Array  # (p,), standard parameters of the URDF
-    spread: Array  # (p,), prior standard deviations
-    share: float  # share of the rows that count as independent [-]
-    sigma: Array  # (n,), noise level of each joint [N m or N]
-    held_out: "tuple[Factors, ...]" = ()  # segments for choosing the weight and testing extents
-    repeated: float = 0.0  # share of errors of points of contact in the squared residual [-]
-
-    @property
-    def beta(self) -> Array:
-        """Base parameters of the URDF, shape (b,)."""
-        return self.mapping.to_base(self.pi)
-
-    @property
-    def covariance(self) -> Array:
-        """Prior covariance of the base parameters, shape (b, b)."""
-        KS = self.mapping.K * self.spread
-        covariance: Array = KS @ KS.T
-        return covariance
-
-
 @dataclass(frozen=True, init=False)
 class EstimatorSettings(Settings):
     """The estimator and its settings, as ``EstimatorSettings("wls", robust="huber")``.
@@ -191,18 +149,6 @@ class EstimatorSettings(Settings):
     @classmethod
     def from_dict(cls, table: Mapping[str, Any]) -> Self:
         return cls(**table)
-
-    def make(self, known: Known) -> "BatchEstimator | RecursiveEstimator[Any]":
-        """Return the estimator that reads rows or samples.
-
-        Args:
-            known: The robot and its prior.
-
-        Raises:
-            SettingsError: If constraints contradict each other or do not match the robot, or the
-                estimator reads a simulator.
-        """
-        raise SettingsError(f"{self!r} describes no estimator; use EstimatorSettings(name)")
 
     @property
     def words(self) -> str:
@@ -282,22 +228,12 @@ class OLSSettings(EstimatorSettings):
 
     name: str = _called("ols", "ordinary least squares")
 
-    def make(self, known: Known) -> "BatchEstimator":
-        from robotid.estimation.estimators import OLS
-
-        return OLS(independent_share=known.share)
-
 
 @dataclass(frozen=True)
 class WLSSettings(RobustSettings):
     """Settings of weighted least squares."""
 
     name: str = _called("wls", "weighted least squares, rows weighted by the noise of their joint")
-
-    def make(self, known: Known) -> "BatchEstimator":
-        from robotid.estimation.estimators import WLS
-
-        return WLS(independent_share=known.share)
 
 
 @dataclass(frozen=True)
@@ -314,11 +250,6 @@ class TLSSettings(EstimatorSettings):
         within=Range("x > 0", lambda x: x > 0),
     )
 
-    def make(self, known: Known) -> "BatchEstimator":
-        from robotid.estimation.estimators import TLS
-
-        return TLS(self.regressor_noise, independent_share=known.share)
-
 
 @dataclass(frozen=True)
 class ConsistentSettings(RobustSettings, BoundedSettings):
@@ -328,9 +259,6 @@ class ConsistentSettings(RobustSettings, BoundedSettings):
         "consistent",
         "weighted least squares with physically consistent bodies and the URDF's values as prior",
     )
-
-    def make(self, known: Known) -> "BatchEstimator":
-        return consistent_fit(self, known)
 
 
 @dataclass(frozen=True)
@@ -343,13 +271,6 @@ class RLSSettings(RecursiveSettings):
         "forgetting factor: weight of a sample relative to the next one [-]",
         within=Range("0 < x <= 1", lambda x: 0 < x <= 1),
     )
-
-    def make(self, known: Known) -> "RecursiveEstimator[Any]":
-        from robotid.estimation.estimators import RLS
-
-        # without forgetting the prior is not used: the result is that of batch least squares
-        std = np.sqrt(np.diag(known.covariance)) if self.forgetting < 1 else None
-        return RLS(known.sigma, self.forgetting, known.beta, std, known.share)
 
 
 @dataclass(frozen=True)
@@ -370,12 +291,6 @@ class KalmanSettings(RecursiveSettings):
         ),
     )
 
-    def make(self, known: Known) -> "RecursiveEstimator[Any]":
-        from robotid.estimation.estimators import Kalman
-
-        gate = None if self.gate is False else float(self.gate)
-        return Kalman(known.sigma, known.beta, known.covariance, self.walk, gate, known.share)
-
 
 @dataclass(frozen=True)
 class PRXSettings(RecursiveSettings):
@@ -388,22 +303,12 @@ class PRXSettings(RecursiveSettings):
         among=("exact", "printed"),
     )
 
-    def make(self, known: Known) -> "RecursiveEstimator[Any]":
-        from robotid.estimation.estimators import PRX
-
-        return PRX(known.sigma, known.beta, rng=np.random.default_rng(0), step=self.step)
-
 
 @dataclass(frozen=True)
 class GradientSettings(RecursiveSettings):
     """Settings of normalised gradient steps."""
 
     name: str = _called("gradient", "normalised gradient steps, sample by sample")
-
-    def make(self, known: Known) -> "RecursiveEstimator[Any]":
-        from robotid.estimation.estimators import NormalisedGradient
-
-        return NormalisedGradient(known.sigma, known.beta, rng=np.random.default_rng(0))
 
 
 @dataclass(frozen=True)
@@ -458,81 +363,3 @@ ESTIMATORS: Mapping[str, type[EstimatorSettings]] = {
         SimulationSettings,
     )
 }
-
-
-def consistent_fit(settings: BoundedSettings, known: Known) -> "Consistent":
-    """Return the physically consistent estimator, which can also project an estimate."""
-    from robotid.dynamics.factors import gather
-    from robotid.estimation.estimators import Consistent
-    from robotid.estimation.estimators.prior_weight import (
-        AS_GOOD,
-        Segments,
-        choose_weight,
-        contradicted_extents,
-        loss_of,
-    )
-    from robotid.robot.bodies import held_parameters
-    from robotid.robot.geometry import body_boxes, geometry_half_spaces
-
-    bounds, weight, model = settings.bounds, settings.prior_weight, known.model
-    geometry = geometry_half_spaces(model, bounds.com_within)
-    extent = body_boxes(model) if bounds.extent == "box" else {}
-    bounds = replace(bounds, pinned=pinned_links(bounds, model))
-    fit = Consistent(
-        layout=model.layout,
-        K=known.mapping.K,
-        prior=known.pi,
-        prior_std=known.spread,
-        held=held_parameters(model),
-        prior_weight=1.0 if isinstance(weight, str) else weight,
-        independent_share=known.share,
-        constraints=make_constraints(bounds, geometry, extent),
-        wls_noise=known.sigma,
-    )
-    folds = gather(known.held_out, _FOLDS)
-    how = "" if not isinstance(weight, str) else "cv" if weight == "auto" else weight
-    if how == "cv" and len(folds) < 2:
-        how = ""
-    if not extent and not how:
-        return fit
-    segments = Segments.of(fit, folds)
-    if extent:
-        beyond = contradicted_extents(fit, segments)
-        if beyond:  # else the programme that is set up already remains
-            fit = replace(fit, constraints=fit.constraints.without_extent(beyond))
-    if not how:
-        return fit
-    choice = choose_weight(fit, segments, how, known.repeated)
-    if fit.constraints.extent and choice.loss > AS_GOOD:
-        unbound = replace(fit, constraints=fit.constraints.without_extent(fit.constraints.extent))
-        if AS_GOOD * loss_of(unbound, segments, choice.weight) < choice.loss:
-            fit, choice = unbound, choose_weight(unbound, segments, how, known.repeated)
-    return replace(
-        fit, prior_weight=choice.weight, plausible_weight=choice.plausible, choice=choice
-    )
-
-
-def pinned_links(bounds: ConstraintSettings, model: "RobotModel") -> tuple[str, ...]:
-    """Return the links that keep the URDF's values: those stated, and those of negligible mass."""
-    from robotid.robot.bodies import negligible_bodies
-
-    bounded = {*bounds.pinned, *bounds.mass, *bounds.com}
-    return (*bounds.pinned, *(x for x in negligible_bodies(model) if x not in bounded))
-
-
-def make_constraints(
-    bounds: ConstraintSettings,
-    geometry: Mapping[str, tuple[Array, Array]],
-    extent: Mapping[str, Array] = MappingProxyType({}),
-) -> "Constraints":
-    """Return the constraints in the form that the estimator needs."""
-    from robotid.estimation.estimators import Constraints
-
-    A = np.vstack([np.eye(3), -np.eye(3)])
-    com, extents = dict(geometry), dict(extent)
-    for name, (low, high) in bounds.boxes.items():
-        com[name] = (A, np.concatenate([high, np.negative(low)]))
-        if name in extents:  # a stated box enlarges the box of the geometry
-            lower, upper = extents[name]
-            extents[name] = np.array([np.minimum(lower, low), np.maximum(upper, high)])
-    return Constraints(bounds.masses, bounds.total, com, tuple(bounds.pinned), extents)
