@@ -206,8 +206,7 @@ class OpenTerm:
 
     joint: str
     moves: Array  # (p,), change of the standard parameters that it causes
-    #: (N,), function of the motion of the drive and of the joint that returns its own torque [N m
-    #: or N].
+    #: Its own torque, (N,) [N m or N], from the motion of the drive and of the joint.
     torque: Callable[[DriveMotion, JointMotion], Array]
 
 

@@ -178,7 +178,7 @@ class Pool:
         return f"the Dask cluster {self.scheduler}, one BLAS thread per piece"
 
     def close(self, *, is_urgent: bool = False) -> None:
-        """Stop the workers, at once if it is urgent; the next work starts new ones."""
+        """Stop the workers, without waiting if it is urgent; the next work starts new ones."""
         executor, client = self._executor, self._client
         self._executor = self._client = None
         if client is not None:
