@@ -1,8 +1,8 @@
 """Legged robots with unknown contact forces: intervals, prediction, time.
 
     python benchmarks/bench_legged.py [--runs 20] [--robots go1 g1 talos cassie] [--unseen]
-    python benchmarks/bench_legged.py --faults [--robots go1 g1 talos human human_soft icub]
-    python benchmarks/bench_legged.py --robots human human_soft icub --seconds 15
+    python benchmarks/bench_legged.py --faults [--robots go1 g1 talos icub]
+    python benchmarks/bench_legged.py --robots icub --seconds 15
 
 A Go1 stands on point feet in MuJoCo at 0.1 ms with held torques, 18-bit encoders and 0.05 N m of
 torque noise; its joints follow multi-sines, its feet slip and lift at times. G1 and TALOS step in
@@ -13,8 +13,8 @@ inertial base parameter holds the truth. Beside it the regressor's projected row
 those of an arm. With the recordings, a Solo12 that trots in PyBullet is identified from the first
 half of its log: its URDF is the truth. With --unseen: joint torque of the last 30 % of a recording,
 fitted on the others.
-Without torques of joints: a human on two force shoes, also with errors of soft tissue, and
-an iCub that walks on the spot, of whose feet the vertical forces are measured.
+Without torques of joints: an iCub that walks on the spot, of whose feet the vertical forces are
+measured.
 With --faults: how many logs with a wrong pose of the base the doctor names.
 """
 
@@ -34,15 +34,15 @@ from scipy.interpolate import CubicSpline
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 from helpers import cassie
-from helpers.humans import FEET as SHOES
-from helpers.humans import PARTS, Walk, forces, human_urdf, logged, walk, with_other_segments
 from helpers.legged import recorded, with_other_bodies
 from helpers.paths import JOBS
-from helpers.walkers import G1, ICUB, TALOS, planned, waves
+from walkers import G1, ICUB, TALOS, forces, planned
 
 from robotid.base.exceptions import NotConvergedError, RankDeficientError
 from robotid.cli.identify import run_job
 from robotid.cli.job import read_job
+from robotid.data.base_motion import BaseMotion
+from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
 from robotid.diagnosis.logs.contacts import check_base
 from robotid.dynamics.base_parameters import structural_mapping
@@ -90,7 +90,7 @@ class Go1:
 
 
 class Walker:
-    """G1 or TALOS; see ``helpers.walkers``."""
+    """G1 or TALOS; see ``walkers``."""
 
     estimator = "wls"
 
@@ -107,39 +107,6 @@ class Cassie:
         with TemporaryDirectory() as folder:
             self.model = cassie.cassie(Path(folder))
         self.log, self.truth = cassie.log, cassie.truth
-
-
-class Human:
-    """A human on two force shoes; see ``helpers.humans``."""
-
-    estimator, signals = AUTO_PRIOR, SignalSettings(cutoff=4.0)
-    other = staticmethod(with_other_segments)
-
-    def __init__(self, tissue=0.0):
-        self.tissue = tissue  # error of the position [m], of the angles 3 rad/m of it
-        with TemporaryDirectory() as folder:
-            path = Path(folder) / "human.urdf"
-            path.write_text(human_urdf())
-            contacts = [Contact(foot, "surface", PARTS, axes="link") for foot in SHOES]
-            self.model = RobotModel.from_urdf(
-                path, free_flyer=True, terms=(), constraints=contacts
-            )  # fmt: skip
-
-    def log(self, model, rng, duration):
-        motion = walk(model, model, rng, duration, rate=60.0)
-        log = logged(model, motion, rng)
-        if not self.tissue:
-            return log
-        soft = waves(rng, 6 + len(model.joints), 0.3, 2.0)(motion.t)
-        soft *= self.tissue / soft.std(axis=0) * np.where(np.arange(soft.shape[1]) < 3, 1.0, 3.0)
-        pose = log.base.pose.copy()
-        pose[:, :3] += soft[:, :3]
-        for row, turn in zip(pose, soft[:, 3:6], strict=True):
-            row[3:] = (pin.Quaternion(row[3:]) * pin.Quaternion(pin.exp3(turn))).coeffs()
-        return replace(log, q=log.q + soft[:, 6:], base=replace(log.base, pose=pose))
-
-    def truth(self, model):
-        return model.standard_parameters()
 
 
 class Icub:
@@ -173,12 +140,18 @@ class Icub:
         left = np.sum((pressure - soles[:, 1]) * line, axis=1) / np.sum(line**2, axis=1)
         up = np.array([np.interp(t, times, lift) > 1e-9 for lift in lifts])
         left = np.where(up[0], 0.0, np.where(up[1], 1.0, left.clip(0.0, 1.0)))
-        motion = Walk(t, q_at(t), np.zeros((len(t), 2, 6)), feet)
-        bare = logged(model, motion, rng, noise=(5e-4, 1e-3, 0.0, 0.0), frames=ICUB.feet)
+        q = q_at(t)
+        for row, turn in zip(q[:, 3:7], 1e-3 * rng.standard_normal((len(t), 3)), strict=True):
+            row[:] = (pin.Quaternion(row) * pin.Quaternion(pin.exp3(turn))).coeffs()
+        q[:, :3] += 5e-4 * rng.standard_normal((len(t), 3))
+        q[:, 7:] += 1e-3 * rng.standard_normal((len(t), q.shape[1] - 7))
         vertical = np.stack([left, 1.0 - left]) * total[:, 2] + rng.standard_normal((2, len(t)))
         own = {f"fz {foot}": f for foot, f in zip(ICUB.feet, vertical, strict=True)}
         flags = {foot: f > 10.0 for foot, f in zip(ICUB.feet, vertical, strict=True)}
-        return replace(bare, wrenches=own, contacts=flags)
+        return Log(
+            t, q[:, 7:], np.zeros_like(q[:, 7:]), model.joints, has_torque=False,
+            base=BaseMotion(q[:, :7]), wrenches=own, contacts=flags,
+        )  # fmt: skip
 
     def truth(self, model):
         return model.standard_parameters()
@@ -188,9 +161,9 @@ PLANTS = {
     "go1": Go1, "go1_consistent": lambda: Go1("consistent"),
     "go1_still": lambda: Go1("consistent", 0.3),
     "g1": lambda: Walker(G1), "talos": lambda: Walker(TALOS), "cassie": Cassie,
-    "human": Human, "human_soft": lambda: Human(5e-3), "icub": Icub,
+    "icub": Icub,
 }  # fmt: skip
-WITH_TORQUES = [name for name in PLANTS if name not in ("human", "human_soft", "icub")]
+WITH_TORQUES = [name for name in PLANTS if name != "icub"]
 
 
 def of_urdf(seed):
@@ -207,11 +180,11 @@ def coverage(name, seeds, duration):
         f"{'total mass [kg]':>16} {'its z':>6} {'s':>6}"
     )
     shares, of_masses = [], []
-    others, signals = getattr(plant, "other", with_other_bodies), getattr(plant, "signals", SIGNALS)
+    signals = getattr(plant, "signals", SIGNALS)
     for seed in seeds:
         rng = np.random.default_rng(seed)
         log = plant.log(model, rng, duration)
-        other, start = others(model, of_urdf(seed)), time.process_time()
+        other, start = with_other_bodies(model, of_urdf(seed)), time.process_time()
         try:
             found = identify(
                 other, log, signals=signals, estimator=plant.estimator, friction="none",
@@ -328,10 +301,10 @@ def posed(pose, place, turn):
 def faults(name, seeds, duration):
     """Print how many logs with a wrong pose the doctor names."""
     plant, counts = PLANTS[name](), {}
-    others, signals = getattr(plant, "other", with_other_bodies), getattr(plant, "signals", SIGNALS)
+    signals = getattr(plant, "signals", SIGNALS)
     for seed in seeds:
         log = plant.log(plant.model, np.random.default_rng(seed), duration)
-        other = others(plant.model, of_urdf(seed))
+        other = with_other_bodies(plant.model, of_urdf(seed))
         for label, change in POSES.items():
             wrong = replace(log, base=replace(log.base, pose=change(log.base.pose)))
             codes = [x.code for x in check_base(other, wrong, signals) if x.severity == "error"]

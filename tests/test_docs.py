@@ -137,7 +137,7 @@ def test_the_first_tutorial_runs_as_written(tmp_path):
         pattern = re.sub(r"\d+(\\\.\d+)?", r"[\\d.]+", re.escape(line.strip()))
         assert line == "..." or re.search(re.sub(r"(\\ )+", r"\\s+", pattern), printed), line
     best = re.findall(r"^ *(\S+) \+- (\S+)  \S", printed, re.MULTILINE)
-    assert len(best) == 5
+    assert len(best) == 6
     assert all(abs(float(value)) > 10 * float(error) for value, error in best)
     written = {path.name for path in (folder / "result").iterdir()}
     assert {"report.html", "robot.identified.urdf", "result.json", "replay.html"} <= written

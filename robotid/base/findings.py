@@ -118,6 +118,20 @@ def number_of(causes: Iterable[Cause]) -> int:
     return sum(len(cause.messages) for cause in causes)
 
 
+def tally(causes: Sequence[Cause], notes: Sequence[Cause], worst: str = "", how: str = "") -> str:
+    """Return the number of findings and causes, the worst joint, and the number of notes."""
+    words = []
+    if causes:
+        words = [f"{_counted(number_of(causes), 'finding')}, {_counted(len(causes), 'cause')}"]
+        words += [f"worst: {worst}"] if worst else []
+    count = number_of(notes)
+    return "; ".join([*words, *([_counted(count, "note") + how] if count else [])])
+
+
+def _counted(count: int, what: str) -> str:
+    return f"{count} {what}{'' if count == 1 else 's'}"
+
+
 def sentence(findings: Sequence[Finding]) -> str:
     """Return the message of findings with one template.
 

@@ -20,7 +20,7 @@ from robotid.base.text import command_lines, period, terminal_width, tinted, wra
 if TYPE_CHECKING:
     from robotid.base.findings import Finding
     from robotid.base.typing import ProgressCallback
-    from robotid.output.report.steps import Step
+    from robotid.output.report.next_steps import Step
 
 _LAST_STREAM = 2  # the number of the standard error stream
 _ENDS = tuple(getattr(signal, n) for n in ("SIGTERM", "SIGHUP") if hasattr(signal, n))
@@ -60,7 +60,7 @@ def print_causes(
     none: str = "no findings",
 ) -> None:
     """Print findings by cause, then their number."""
-    from robotid.base.findings import grouped, number_of
+    from robotid.base.findings import grouped, tally
 
     shown = [f for f in findings if is_verbose or f.severity != "note"]
     notes_hidden = [f for f in findings if f not in shown]
@@ -69,17 +69,8 @@ def print_causes(
         for message in cause.messages:
             if message not in printed:
                 echo(f"{cause.severity}: {cause.code}: {message}", "  ", cause.severity)
-    hidden = number_of(others)
-    notes = f"{_some(hidden, 'note')} hidden (--verbose)" if hidden else ""
-    if shown:
-        count = f"{_some(number_of(causes), 'finding')}, {_some(len(causes), 'cause')}"
-        notes = count + (f"; worst: {worst}" if worst else "") + (f"; {notes}" if notes else "")
-    if summary := notes or none:
+    if summary := tally(causes, others, worst, " hidden (--verbose)") or none:
         echo(summary)
-
-
-def _some(count: int, what: str) -> str:
-    return f"{count} {what}{'' if count == 1 else 's'}"
 
 
 def recordings_of(inputs: Sequence[Mapping[str, Any]], role: str) -> list[str]:

@@ -25,7 +25,7 @@ from robotid.cli.console import echo, progress_of, show_found
 from robotid.cli.flags import add_json, add_out, add_progress
 from robotid.cli.identify import identify_job
 from robotid.cli.job import Job, LogEntry, PayloadEntry, read_job, stated_path
-from robotid.data.files.parquet_files import parquet_rows, read_text_table
+from robotid.data.files.parquet_files import read_text_table, write_rows
 from robotid.data.log import suggestion
 from robotid.dynamics.factors import available_cores
 from robotid.estimation.fitting.estimator_settings import SimulationSettings
@@ -273,11 +273,14 @@ def run_fleet(
                 write_text(json.dumps(rows, allow_nan=False), stored[missing[k].unit])
         with folder_beside(target) as partial:
             gathered = _Gathered()
-            with parquet_rows(partial / "fleet.parquet", _RESULTS) as table:
-                for unit in units:  # one after the other: not all are in memory
+
+            def results() -> Iterator[Mapping[str, Any]]:  # one after the other: not all in memory
+                for unit in units:
                     rows = failed.get(unit.unit) or read_json(stored[unit.unit], "unit's result")
-                    table.add(rows)
                     gathered.add(rows)
+                    yield from rows
+
+            write_rows(partial / "fleet.parquet", results(), _RESULTS)
             outputs = {"table": _FILES[0], "page": _FILES[2]}
             content = {"robotid": __version__, "versions": code_versions(), "outputs": outputs}
             content |= gathered.content(units)

@@ -1,7 +1,7 @@
-"""Filters of signals and splines through them: Butterworth, local polynomials, cubic splines.
+"""Filters of signals: Butterworth, local polynomials.
 
-They equal ``sosfiltfilt(butter(...))`` and ``savgol_filter`` of scipy.signal and ``CubicSpline`` of
-scipy.interpolate to rounding; the imports of these packages take longer than the doctor.
+They equal ``sosfiltfilt(butter(...))`` and ``savgol_filter`` of scipy.signal to rounding; importing
+that package takes longer than the doctor.
 """
 
 from functools import cache
@@ -9,7 +9,7 @@ from math import factorial
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
-from scipy.linalg.lapack import dgtsv, dtbtrs
+from scipy.linalg.lapack import dtbtrs
 
 from robotid.base.typing import Array
 
@@ -97,46 +97,3 @@ def local_polynomial(
     return np.concatenate(
         [end(x[:width], offsets[:half]), inner, end(x[-width:], offsets[half + 1 :])]
     )
-
-
-def cubic_spline(t: Array, x: Array, at: Array) -> Array:
-    """Return signals at other times, by the cubic spline through all of their rows.
-
-    The third derivative is continuous at the second and the last but one row ("not a knot"): two
-    rows give a straight line, three a parabola. The outer polynomials extrapolate.
-
-    References:
-        de Boor (1978), A Practical Guide to Splines, chapter IV.
-
-    t (N,) [s], x (N, k) -> (..., k).
-    """
-    h = np.diff(t)[:, None]  # (N - 1, 1)
-    chord = np.diff(x, axis=0) / h
-    slope = _slopes(h, chord)  # of the spline at its rows, (N, k)
-    bend = (slope[:-1] + slope[1:] - 2 * chord) / h
-    cubic, square = bend / h, (chord - slope[:-1]) / h - bend
-    k = np.clip(np.searchsorted(t, at, side="right") - 1, 0, len(t) - 2)
-    u = at - t[k]
-    found = cubic.T.take(k, axis=1)  # (k, ...): long loops over times
-    for own in (square, slope, x):
-        found *= u
-        found += own.T.take(k, axis=1)
-    return np.moveaxis(found, 0, -1)
-
-
-def _slopes(h: Array, chord: Array) -> Array:
-    """Return the derivatives of the spline at its N rows, shape (N, k), from steps and chords."""
-    if len(h) == 1:
-        return np.repeat(chord, 2, axis=0)
-    if len(h) == 2:  # of a parabola
-        bend = (chord[1] - chord[0]) / (h[0] + h[1])
-        return np.stack([chord[0] - bend * h[0], chord[0] + bend * h[0], chord[1] + bend * h[1]])
-    first, last = h[0] + h[1], h[-2] + h[-1]
-    below = np.concatenate([h[1:], [last]])[:, 0]
-    middle = np.concatenate([h[1:2], 2 * (h[:-1] + h[1:]), h[-2:-1]])[:, 0]
-    above = np.concatenate([[first], h[:-1]])[:, 0]
-    b = np.empty((len(h) + 1, chord.shape[1]), order="F")
-    b[1:-1] = 3 * (h[1:] * chord[:-1] + h[:-1] * chord[1:])
-    b[0] = ((h[0] + 2 * first) * h[1] * chord[0] + h[0] ** 2 * chord[1]) / first
-    b[-1] = (h[-1] ** 2 * chord[-2] + (2 * last + h[-1]) * h[-2] * chord[-1]) / last
-    return np.asarray(dgtsv(below, middle, above, b, overwrite_b=1)[3])

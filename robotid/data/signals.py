@@ -18,7 +18,7 @@ from robotid.base.findings import listed
 from robotid.base.text import seconds
 from robotid.base.typing import Array
 from robotid.data.base_motion import base_state, pose_jumps
-from robotid.data.filters import butterworth_poles, cubic_spline, zero_phase
+from robotid.data.filters import butterworth_poles, zero_phase
 from robotid.data.log import Log, Trajectory
 from robotid.data.measured_velocity import is_trustworthy
 from robotid.data.signal_settings import SignalSettings
@@ -454,8 +454,11 @@ def _resample(t: Array, values: Array, grid: Array) -> Array:
     """Return the values on the grid, by cubic splines through the true time stamps."""
     if len(grid) == len(t) and np.array_equal(grid, t):
         return values
+    from scipy.interpolate import CubicSpline  # takes long to import
+
     # a channel with a delay is constant beyond its ends
-    return cubic_spline(t, values, np.clip(grid, t[0], t[-1]))
+    smooth: Array = CubicSpline(t, values)(np.clip(grid, t[0], t[-1]))
+    return smooth
 
 
 def acting_directions(t: Array, w: Array, band: float, longest: float) -> Array:

@@ -14,6 +14,7 @@ import scipy.linalg
 
 from robotid.base.exceptions import DataError
 from robotid.base.typing import Array
+from robotid.dynamics.factors import triangle_of
 from robotid.dynamics.problem import Problem
 from robotid.dynamics.torque import random_regressor
 from robotid.robot.model import RobotModel
@@ -24,7 +25,6 @@ RANK_TOLERANCE = 1e-4
 _CLOSED_RANK = 1e-9  # the same for closed chains, whose small motions have pivots down to 1e-6
 _TIE = 1e-6  # share by which each column is shortened relative to the one before it
 _FAINTEST = 1e-12  # norm of a column that is 0 at every state
-_PANEL = 24  # columns eliminated at a time
 _CLEAN = 1e-10  # smaller coefficients, relative to the scales, are rounding errors
 _SHOWN = 1e-6  # smaller coefficients are omitted in the expressions, not in K
 
@@ -107,7 +107,6 @@ def base_mapping(
     scales: Array | None = None,
     preference: Array | None = None,
     rtol: float = RANK_TOLERANCE,
-    n_rows: int = 1,
 ) -> BaseMapping:
     """Return the base parameters of a regressor taken at random states.
 
@@ -122,115 +121,29 @@ def base_mapping(
     if not np.isfinite(W).all() or not W.any():
         raise DataError("W is all zero or not finite, wanted finite numbers")
     magnitude = np.ones(len(names)) if scales is None else scales
-    favour = np.ones(len(names)) if preference is None else preference
-    parts = [(own, R * magnitude[own]) for own, R in independent_factors(W, n_rows)]
-    first = [_pivot(R, columns) for columns, R in parts]
-    pivots = np.sort(np.concatenate([sizes for _, sizes in first]))[::-1]
-    K, independent = np.zeros((len(names), len(names))), np.zeros(len(names), dtype=bool)
-    for (columns, R), (order, sizes) in zip(parts, first, strict=True):
-        rank = int(np.sum(sizes > rtol * pivots[0]))
-        order = order if preference is None else _pivot(R * favour[columns], columns)[0]
-        own, others = np.sort(order[:rank]), np.sort(order[rank:])
-        triangle = scipy.linalg.qr(R[:, np.append(own, others)], mode="r")[0][:rank]
-        X = scipy.linalg.solve_triangular(triangle[:, :rank], triangle[:, rank:])  # scaled
-        X[np.abs(X) < _CLEAN] = 0.0
-        own, others = columns[own], columns[others]
-        independent[own] = True
-        K[own, own] = 1.0
-        K[np.ix_(own, others)] = X * magnitude[own][:, None] / magnitude[others]
-    return BaseMapping(K[independent], np.flatnonzero(independent), names, pivots / pivots[0])
+    R = triangle_of(W) * magnitude
+    order, pivots = _pivot(R)
+    rank = int(np.sum(pivots > rtol * pivots[0]))
+    order = order if preference is None else _pivot(R * preference)[0]
+    own, others = np.sort(order[:rank]), np.sort(order[rank:])
+    triangle = triangle_of(R[:, np.append(own, others)])[:rank]
+    X = scipy.linalg.solve_triangular(triangle[:, :rank], triangle[:, rank:])  # scaled
+    X[np.abs(X) < _CLEAN] = 0.0
+    K = np.zeros((rank, len(names)))
+    K[np.arange(rank), own] = 1.0
+    K[:, others] = X * magnitude[own][:, None] / magnitude[others]
+    return BaseMapping(K, own, names, pivots / pivots[0])
 
 
-def independent_factors(W: Array, n_rows: int) -> list[tuple[Array, Array]]:
-    """Return columns and factors of the parts of a regressor that share no equation and no column.
-
-    For example, arms on a common fixed base are such parts: W (N n_rows, p).
-    """
-    samples = W.reshape(-1, n_rows, W.shape[1])
-    filled = (samples != 0.0).any(axis=0)  # (n_rows, p)
-    linked = filled.astype(float) @ filled.T > 0.0
-    count, label = _linked_parts(linked)
-    # a column of zeros is assigned to the first equation
-    of_column = label[filled.argmax(axis=0)]
-    parts = [(np.flatnonzero(label == k), np.flatnonzero(of_column == k)) for k in range(count)]
-    return [
-        (own, _factor(samples[:, rows][:, :, own], filled[np.ix_(rows, own)]))
-        for rows, own in parts
-        if len(own)
-    ]
-
-
-def _linked_parts(linked: Array) -> tuple[int, Array]:
-    """Return the number of parts of a graph, and the part of each node, int: linked (m, m)."""
-    if linked.all(axis=1).any():  # to one node, as to the first joint of an arm
-        return 1, np.zeros(len(linked), dtype=int)
-    from scipy.sparse.csgraph import connected_components  # takes long to import
-
-    count, label = connected_components(linked, directed=False)
-    return int(count), label
-
-
-def _factor(rows: Array, filled: Array) -> Array:
-    """Return R with R^T R = W^T W: rows (N, m, c), filled (m, c).
-
-    The equation of a joint has the columns of all bodies that the joint moves, so it contains those
-    of every joint after it. The equations are folded from the ends of the robot to its base; the
-    columns of each are adjacent in a suitable order. If the equations are not nested so, the rows
-    are factored as a whole.
-    """
-    c, filled = rows.shape[2], _with_carried(filled)
-    fewest = np.argsort(filled.sum(axis=1), kind="stable")
-    place = np.lexsort(filled[fewest])  # by the equation with the most columns first
-    spans = [_span(own) for own in filled[:, place]]
-    if None in spans:  # equations with common columns of which neither contains the other
-        R: Array = scipy.linalg.qr(rows.reshape(-1, c), mode="r", check_finite=False)[0]
-        return R[:c]
-    R = np.zeros((c, c))
-    for k in fewest:
-        first, last = spans[k] or (0, 0)
-        if first == last:
-            continue
-        own = slice(first, last)
-        panel = min(_PANEL, last - first)
-        # pentagonal of height 0: the rows below the triangle are full
-        R[own, own] = scipy.linalg.lapack.dtpqrt(
-            0, panel, np.asfortranarray(R[own, own]), np.asfortranarray(rows[:, k, place[own]])
-        )[0]
-    found = np.empty((c, c))
-    found[:, place] = R
-    return found
-
-
-def _with_carried(filled: Array) -> Array:
-    """Return the columns of each equation, extended by all of an equation of which it has most.
-
-    A parameter may affect a joint, but not the one before it, if its axis has a special direction.
-    """
-    wider, sizes = filled.copy(), filled.sum(axis=1)
-    for k in np.argsort(sizes, kind="stable"):
-        shared = (filled & filled[k]).sum(axis=1)
-        wider[k] |= wider[(sizes <= sizes[k]) & (2 * shared > sizes)].any(axis=0)
-    return wider
-
-
-def _span(own: Array) -> tuple[int, int] | None:
-    """Return first and end of columns, None if they are not adjacent."""
-    places = np.flatnonzero(own)
-    first, last = (int(places[0]), int(places[-1]) + 1) if len(places) else (0, 0)
-    return (first, last) if last - first == len(places) else None
-
-
-def _pivot(R: Array, columns: Array) -> tuple[Array, Array]:
-    """Return the order in which columns are chosen and the pivot of each.
+def _pivot(R: Array) -> tuple[Array, Array]:
+    """Return the order in which columns are chosen and the pivot of each, descending.
 
     LAPACK's QR with column pivoting chooses the remaining column with the largest norm; later
     columns are slightly shortened, so that of equal ones the first is chosen despite rounding.
     """
-    triangle, order = scipy.linalg.qr(R * (1.0 - _TIE * columns), mode="r", pivoting=True)
-    sizes = np.zeros(len(columns))
-    diagonal = np.abs(np.diag(triangle))
-    sizes[: len(diagonal)] = diagonal
-    return order, sizes
+    shortened = R * (1.0 - _TIE * np.arange(R.shape[1]))
+    triangle, order = scipy.linalg.qr(shortened, mode="r", pivoting=True)
+    return order, np.abs(np.diag(triangle))
 
 
 def _expression(row: Array, names: tuple[str, ...], first: int) -> str:
@@ -261,7 +174,6 @@ def structural_mapping(
         scales=model.layout.scales(model.length)[:columns],
         preference=model.layout.preference()[:columns],
         rtol=_CLOSED_RANK if model.loops else RANK_TOLERANCE,
-        n_rows=model.n_rows,
     )
 
 

@@ -69,19 +69,11 @@ class Factors:
         return replace(self, triangles=tuple(triangles), columns=tuple(remaining), names=names)
 
     def weighted(self, sigma: Array) -> Array:
-        """Return one factor, shape (c + 1, c + 1), of all joints' rows [W_j tau_j] / sigma_j.
-
-        From the ends of the robot to its base, each factor is folded into the smallest one that has
-        all its columns: a joint's columns are among those of the joint before it.
-        """
-        c = len(self.names)
-        folded, everything = [Triangle(len(own) + 1) for own in self.columns], Triangle(c + 1)
-        for total, triangle, level in zip(folded, self.triangles, sigma, strict=True):
-            total.fold_triangle(triangle / level, np.arange(len(triangle)))
-        for j, k, places in self._carriers:
-            carrier = everything if k is None else folded[k]
-            carrier.fold_triangle(folded[j].R, places)
-        return everything.R
+        """Return one factor, shape (c + 1, c + 1), of all joints' rows [W_j tau_j] / sigma_j."""
+        total = Triangle(len(self.names) + 1)
+        for (triangle, own), level in zip(self._joints(), sigma, strict=True):
+            total.fold_triangle(triangle / level, np.append(own, len(self.names)))
+        return total.R
 
     def weighted_rows(self, theta: Array, sigma: Array) -> tuple[Array, Array]:
         """Return rows W_j / sigma_j and (tau_j - W_j theta) / sigma_j that have these factors."""
@@ -143,24 +135,6 @@ class Factors:
     def _residuals(self, theta: Array) -> Iterator[Array]:
         """Yield tau_j - W_j theta of the rows of each factor."""
         return (R[:, -1] - R[:, :-1] @ theta[own] for R, own in self._joints())
-
-    @cached_property
-    def _carriers(self) -> list[tuple[int, int | None, Array]]:
-        """Each joint, the one with the fewest columns that has all of its, or None, and the places.
-
-        Joints with few columns come first, so that a joint is complete before it is folded. The
-        places are those of its columns and of the torque in the other factor.
-        """
-        order = sorted(range(len(self.columns)), key=lambda j: (len(self.columns[j]), -j))
-        sets = [set(own.tolist()) for own in self.columns]
-        carriers: list[tuple[int, int | None, Array]] = []
-        for position, j in enumerate(order, start=1):
-            carrier = next((k for k in order[position:] if sets[j] <= sets[k]), None)
-            places = np.append(self.columns[j], len(self.names))
-            if carrier is not None:
-                places = np.searchsorted(self.columns[carrier], places)
-            carriers.append((j, carrier, places))
-        return carriers
 
 
 @dataclass(frozen=True, eq=False)

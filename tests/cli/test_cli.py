@@ -57,42 +57,6 @@ def test_the_written_urdf_predicts_what_the_fit_predicts(identified, logs, capsy
         assert after["urdf_relative_error_pct"] == pytest.approx(before["urdf_relative_error_pct"])
 
 
-@pytest.mark.parametrize(
-    ("place", "wrong", "said"),
-    [
-        (("base_parameters", 1, "value"), "x", "base_parameters[1].value is 'x', wanted"),
-        (("inputs", 2, "path"), 3, "inputs[2].path is 3, wanted"),
-        (("verdict", "reasons"), {}, "verdict.reasons is {}, wanted"),
-        (
-            ("friction", "elbow_joint", "data_range", "v"),
-            [0.1, {}],
-            "friction.elbow_joint.data_range.v[1] is {}, wanted",
-        ),
-        (
-            ("friction", "elbow_joint", "data_range", "q"),
-            [0.1],
-            "friction.elbow_joint.data_range.q has 1 numbers, wanted 2: the smallest, the largest",
-        ),
-        (
-            ("friction", "elbow_joint", "data_range", "q"),
-            [0.1, 0.2, 0.3],
-            "friction.elbow_joint.data_range.q has 3 numbers, wanted 2",
-        ),
-    ],
-)
-def test_a_result_that_was_changed_by_hand_is_refused_by_the_place(
-    identified, logs, tmp_path, capsys, place, wrong, said
-):
-    result = json.loads((identified / "result.json").read_text())
-    inside = result
-    for key in place[:-1]:
-        inside = inside[key]
-    inside[place[-1]] = wrong
-    (tmp_path / "result.json").write_text(json.dumps(result))
-    assert main(["validate", str(tmp_path / "result.json"), str(logs / "keep.csv")]) == 1
-    assert said in capsys.readouterr().err
-
-
 @pytest.fixture(scope="module")
 def alone(arm_logs, tmp_path_factory):
     """What is printed of one log without another to validate on, and the folder written."""

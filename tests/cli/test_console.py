@@ -170,16 +170,3 @@ def test_closed_streams_change_neither_files_nor_the_code(log, tmp_path, name):
     done = subprocess.run(f"{missing} {close}", shell=True, capture_output=True, check=False)
     assert done.returncode == 1
     assert (b"there is no log file" in done.stderr) == (name == "no output")
-
-
-def test_too_little_memory_is_said(log, tmp_path, monkeypatch, capsys):
-    def ask(*_, **__):
-        raise MemoryError("Unable to allocate 9.1 TiB")
-
-    monkeypatch.setattr("robotid.cli.convert.convert", ask)
-    assert main(["convert", str(tmp_path / "a.csv"), str(tmp_path / "b.csv")]) == 1
-    said = capsys.readouterr().err
-    assert said == (
-        "robotid: not enough memory; lower rates, shorten logs, or lock joints (Unable to allocate "
-        "9.1 TiB)\n"
-    )

@@ -48,13 +48,3 @@ def test_the_help_of_large_commands_is_short_and_has_two_examples(capsys, monkey
     assert len(whole.splitlines()) > 60
     assert "--snap-angles" in whole
     assert "--snap-angles" not in short
-
-
-@pytest.mark.parametrize("module", [identify, excite], ids=["identify", "excite"])
-def test_the_examples_are_read_by_the_parser(module, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    run = []
-    monkeypatch.setattr(module, "run", lambda options: run.append(options.source))
-    for example in module.EXAMPLES:
-        assert main(example.split()[1:]) == 0
-    assert len(run) == 2

@@ -1,10 +1,9 @@
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 
 from robotid.base.exceptions import SettingsError
-from robotid.cli.job import Job, _motors, job_from_settings, read_job
+from robotid.cli.job import Job, job_from_settings, read_job
 from robotid.data.signal_settings import LogSource
 from robotid.robot.constraints import Loop
 from robotid.robot.parameters import Coupling
@@ -217,12 +216,6 @@ def test_a_controller_that_the_estimator_does_not_read_is_refused(tmp_path):
     assert job.to_dict()["controller"]["kp"] == 20.0
     del table["controller"]
     assert "controller" not in job_from_settings(table, "job.toml", tmp_path).to_dict()
-
-
-def test_the_motor_of_several_joints_replaces_the_drive_of_the_joint_with_its_name():
-    ratios = (("a", 60.0), ("b", -1.5))
-    gear = SimpleNamespace(shared={"a": ratios})
-    assert _motors(gear) == [Coupling("a", ratios, replaces=True)]
 
 
 def test_friction_that_is_stated_as_selected_is_the_default():

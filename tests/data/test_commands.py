@@ -7,11 +7,10 @@ from helpers.recorders import wide
 
 from robotid.base.exceptions import DataError
 from robotid.data.files.column_names import quantity_of
-from robotid.data.files.read import lay_out, read_log, read_logs, write_log
+from robotid.data.files.read import read_log, read_logs
 from robotid.data.log import Log
-from robotid.data.signal_settings import LogUnits, SignalSettings
+from robotid.data.signal_settings import LogUnits
 from robotid.data.transmission import Transmission
-from robotid.estimation.fitting.survey import survey_log
 
 JOINTS = ("shoulder", "elbow")
 DEGREES = LogUnits(angle="deg")
@@ -41,26 +40,6 @@ def frame(**more):
     log = make_log()
     table = {"time": log.t, **columns("q", log.q), **columns("qref", log.q_ref), **more}
     return pd.DataFrame({name: x for name, x in table.items() if x is not None})
-
-
-@pytest.mark.parametrize(
-    ("alias", "name"),
-    [
-        ("qref", "q_ref"), ("q_des", "q_ref"), ("qdes", "q_ref"), ("position_command", "q_ref"),
-        ("target_position", "q_ref"), ("command", "q_ref"), ("dqref", "v_ref"),
-        ("qd_des", "v_ref"), ("velocity_command", "v_ref"), ("tauref", "tau_ref"),
-        ("tau_cmd", "tau_ref"), ("desired_effort", "tau_ref"),
-    ],
-)  # fmt: skip
-def test_names_of_peers_are_read(alias, name):
-    log = make_log()
-    table = {"time": log.t, **columns("q", log.q)}
-    if name != "q_ref":
-        table |= columns("qref", log.q_ref)
-    back = read_log(
-        pd.DataFrame(table | columns(alias, getattr(log, name))), JOINTS, needs="commands"
-    )
-    np.testing.assert_array_equal(getattr(back, name), getattr(log, name))
 
 
 def test_no_two_quantities_share_a_name():
@@ -152,34 +131,6 @@ def test_half_of_the_rest_is_noted():
     log = read_log(half, JOINTS, needs="commands", passive=("elbow",))  # it needs no torque
     np.testing.assert_array_equal(log.tau, np.column_stack([part, 0 * part]))
     assert log.has_torque
-
-
-def test_commands_in_other_units_than_positions_are_refused():
-    log = make_log()
-    with pytest.raises(DataError, match=r"the motion of qref_elbow is 57\.3 times that of q_elbow"):
-        read_log(frame(qref_elbow=np.rad2deg(0.1 * log.q_ref[:, 1]), q_elbow=0.1 * log.q[:, 1]),
-                 JOINTS, needs="commands")  # fmt: skip
-    with pytest.raises(DataError, match=r"qref_elbow reaches 57\.3, which looks like degrees"):
-        read_log(frame(qref_elbow=np.rad2deg(log.q_ref[:, 1])), JOINTS, needs="commands")
-    same = frame(qref_elbow=20 * log.q[:, 1])
-    assert read_log(same, JOINTS, needs="commands", units=LogUnits(angle="rad")).q_ref.max() > 19
-
-
-def test_a_long_log_is_read_in_pieces_with_its_commands(ur5, tmp_path):
-    rng = np.random.default_rng(0)
-    t = np.arange(2000) / 100
-    q = 0.3 * np.sin(t[:, None] * rng.uniform(1, 3, 6))
-    log = Log(t=t, q=q, tau=0 * q, joints=ur5.joints, q_ref=q + 0.01, has_torque=False)
-    write_log(log, tmp_path / "run.csv")
-    layout, table = lay_out(tmp_path / "run.csv", ur5.joints, needs="commands")
-    whole = survey_log(layout, table, ur5, SignalSettings(cutoff=None), length=None)
-    np.testing.assert_array_equal(whole.source.q_ref, log.q_ref)
-    assert not whole.source.has_torque
-    rows = survey_log(layout, table, ur5, SignalSettings(cutoff=None), length=500)
-    piece = rows.pieces[2]
-    np.testing.assert_array_equal(
-        piece.header.read(*piece.span, piece.near).q_ref, log.q_ref[slice(*piece.span)]
-    )
 
 
 def test_degrees_and_wide_arrays_hold_for_commands(tmp_path):

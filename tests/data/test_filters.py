@@ -1,11 +1,10 @@
-"""Filters and splines against those of scipy."""
+"""Filters against those of scipy."""
 
 import numpy as np
 import pytest
-from scipy.interpolate import CubicSpline
 from scipy.signal import butter, savgol_filter, sosfiltfilt
 
-from robotid.data.filters import butterworth_poles, cubic_spline, local_polynomial, zero_phase
+from robotid.data.filters import butterworth_poles, local_polynomial, zero_phase
 
 
 @pytest.mark.parametrize("order", [1, 2, 3, 4, 5, 8])
@@ -45,14 +44,3 @@ def test_a_cubic_keeps_its_shape_and_slope_to_its_ends():
     np.testing.assert_allclose(local_polynomial(x, 7, 3), x, atol=1e-10)
     slope = local_polynomial(x, 7, 3, derivative=1, step=0.1)
     np.testing.assert_allclose(slope, -2.0 + 1.5 * t**2, atol=1e-9)
-
-
-@pytest.mark.parametrize("rows", [2, 3, 4, 5, 60])
-def test_splines_are_those_of_scipy_at_uneven_times_and_beyond_the_ends(rows, rng):
-    t = np.cumsum(rng.uniform(0.2, 1.8, rows))
-    x = rng.normal(size=(rows, 3))
-    at = rng.uniform(t[0] - 0.5, t[-1] + 0.5, size=(4, 25))
-    found, wanted = cubic_spline(t, x, at), CubicSpline(t, x, axis=0)(at)
-    assert found.shape == (4, 25, 3)
-    np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-12 * np.abs(wanted).max())
-    np.testing.assert_allclose(cubic_spline(t, x, t), x, rtol=0, atol=1e-12)  # also at its rows

@@ -1,6 +1,5 @@
 """Coulomb friction behind the filter: its column is the sign of the speed, filtered as torque."""
 
-
 import numpy as np
 import pytest
 from helpers.synthetic import exact_log, truth
@@ -8,7 +7,7 @@ from scipy.signal import butter, sosfiltfilt
 
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import _acting, acting_directions, process
-from robotid.dynamics.drive_columns import friction_directions, friction_speeds
+from robotid.dynamics.drive_columns import friction_speeds
 from robotid.dynamics.torque import build_problem, joint_torque_regressor
 from robotid.estimation.fitting.survey import hold_log
 from robotid.robot.examples import example_urdf
@@ -57,17 +56,6 @@ def test_the_sign_is_filtered_before_rows_are_left_out(ur5):
     same = np.searchsorted(fine.t, coarse.t[1:] - 1e-6)
     np.testing.assert_allclose(fine.t[same], coarse.t[1:], atol=1e-9)
     np.testing.assert_allclose(coarse.direction[1:], fine.direction[same], atol=1e-9)
-
-
-def test_speeds_of_joints_come_before_those_of_couplings():
-    model = RobotModel.from_urdf(example_urdf("ur5_robot.urdf"), couplings=(MOTOR,))
-    expected = np.vstack([np.eye(6), [0, 0, 0, 0, 1.0, -0.5]])
-    np.testing.assert_array_equal(friction_speeds(model.layout), expected)
-    v = np.array([[1.0, -2.0, 0.0, 3.0, 0.25, 1.0]])
-    signs = [[1.0, -1.0, 0.0, 1.0, 1.0, 1.0, -1.0]]
-    np.testing.assert_array_equal(friction_directions(model.layout, v, None), signs)
-    floating = np.hstack([[[9.0] * 6], v])  # the joints' speeds are the last ones
-    np.testing.assert_array_equal(friction_directions(model.layout, floating, None), signs)
 
 
 def test_each_coulomb_column_holds_its_own_direction(rng):

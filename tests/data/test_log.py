@@ -136,9 +136,7 @@ def test_window_includes_both_ends_on_the_logs_own_clock():
     for start, end, rows in ((1020.0, 1030.0, 0), (1003.0, 1002.0, 0), (1001.0, 1001.001, 1)):
         with pytest.raises(DataError, match=rf"{rows} rows lie .*; the log spans 1000 s to"):
             log.window(start, end)
-    with pytest.raises(
-        DataError, match=r"joint 'elbow2' is not in run3.csv; joints: .* Did you"
-    ):
+    with pytest.raises(DataError, match=r"joint 'elbow2' is not in run3.csv; joints: .* Did you"):
         log.select(["elbow2"])
 
 
@@ -212,16 +210,6 @@ def test_rows_are_numbered_as_in_the_file(rng):
         require_increasing(np.array([5.0, 5.1, 5.2, 5.1]), "x", 70)
     with pytest.raises(DataError, match=r"t\[71\] = 5\.000 s is a duplicate .* as t\[70\]"):
         require_increasing(np.array([5.0, 5.0, 5.2]), "x", 70)
-
-
-def test_a_log_and_a_trajectory_are_one_line():
-    t = np.r_[0.0, 0.1, 0.2, 0.3, 2.3]
-    log = Log(t=t, q=np.zeros((5, 1)), tau=np.zeros((5, 1)), joints=("a",))
-    assert repr(log) == "<Log in memory: 5 samples of 1 joints (a) over 2.3 s at 10 Hz>"
-    assert repr(make_trajectory(rate=50.0)) == (
-        "<Trajectory: 500 samples of 2 joints (shoulder, elbow) over 4.99 s at 50 Hz, in 2 "
-        "segments>"
-    )
 
 
 def test_time_stamps_are_checked_where_blocks_meet():

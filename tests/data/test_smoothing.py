@@ -13,7 +13,6 @@ from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import (
     SPLINE,
     Segment,
-    _Grid,
     filter_reach,
     process,
     process_segments,
@@ -124,18 +123,6 @@ def test_a_log_smoothed_before_with_other_settings_has_the_values_of_a_new_one(r
             np.testing.assert_array_equal(getattr(found, name), getattr(wanted, name), name)
 
 
-def test_rows_that_a_part_does_not_own_are_cut_off_behind_the_filter(rng):
-    log = recording(rng)
-    settings = resolve(log, SignalSettings())
-    reach = filter_reach(settings)
-    # an order of 4 at 8 Hz forgets by 1 / e in 0.05 s; signs of smooth speeds are filtered again
-    assert 3.0 < reach < 6.0
-    assert filter_reach(resolve(log, SignalSettings(cutoff=None))) == 0.0
-    assert filter_reach(resolve(log, SignalSettings(torque_delay=-0.4))) == pytest.approx(
-        reach + 0.4
-    )
-
-
 @pytest.mark.parametrize(
     ("order", "cutoff", "rate"), [(1, 3.0, 50.0), (4, 40.0, 100.0), (5, 8.0, 300.0)]
 )
@@ -153,27 +140,6 @@ def test_a_filter_reaches_until_nothing_is_left_of_its_slowest_pole(order, cutof
     assert filter_reach(settings) == pytest.approx(wanted, rel=1e-5)
     more = replace(settings, velocity_delay=-0.25)
     assert filter_reach(more) == pytest.approx(wanted + 0.22, rel=1e-5)
-
-
-def test_points_of_a_grid_are_numbered_from_its_start():
-    segment = Segment(first=3, stop=904, start=1234.5, end=1243.5, number=2)
-    grid = _Grid.of(segment, SignalSettings(rate=30.0, cutoff=5.0))
-    # 100 rows a second are decimated after the filter: every third of 90 points a second
-    assert (grid.decimation, grid.count) == (3, 811)
-    assert grid.rate == pytest.approx(90.0)
-    assert (grid.start, grid.last) == (1234.5, pytest.approx(1243.5))
-    for k in (0, 1, 7, 400, 810):
-        t = float(grid.at(np.array(k)))
-        assert t == pytest.approx(1234.5 + k / 90.0)
-        assert [grid.number_of(t - 1e-3), grid.number_of(t), grid.number_of(t + 1e-3)] == [
-            k,
-            k,
-            k + 1,
-        ]
-    coarse = _Grid.of(segment, SignalSettings(rate=30.0, cutoff=None))
-    assert (coarse.decimation, coarse.count, coarse.rate) == (1, 271, pytest.approx(30.0))
-    rows = _Grid.of(segment, SignalSettings(rate=None, cutoff=None))
-    assert (rows.step, rows.count, rows.start, rows.last) == (None, 901, 1234.5, 1243.5)
 
 
 JUMPS = ((1990, 0.3), (1996, -0.28), (3700, 0.05))  # a marker lost and found, and another one

@@ -32,22 +32,6 @@ def test_a_stand_is_the_mean_of_its_rows_however_long(rng):
     assert not motion.v.any()
 
 
-def test_slow_motion_has_its_sign_but_not_where_it_turns_or_one_joint_stands(rng):
-    t = np.arange(2000) / 100
-    triangle = 0.03 * np.abs((t + 5) % 20 - 10)  # turns at 5 s, at 15 s
-    q = np.column_stack([triangle, np.full_like(t, 0.7)]) + 1e-5 * rng.standard_normal((2000, 2))
-    motion, stands = means(log_of(t, q))
-    assert not stands.any()
-    far = np.minimum(np.abs(motion.t - 5), np.abs(motion.t - 15)) > 0.5
-    truth = np.where((motion.t < 5) | (motion.t > 15), -0.03, 0.03)
-    np.testing.assert_allclose(motion.v[far, 0], truth[far], atol=2e-4)
-    near = ~far
-    assert (motion.v[near, 0] * truth[near] >= 0).all()
-    assert (motion.v[near, 0] == 0).any()
-    np.testing.assert_allclose(motion.v[:, 1], 0, atol=5e-4)
-    np.testing.assert_allclose(motion.tau, 10 * motion.q, atol=1e-9)
-
-
 def test_fast_moves_between_poses_are_left_out_with_what_is_beside_them():
     s = np.linspace(0, 1, 150)[:, None]
     move = (10 * s**3 - 15 * s**4 + 6 * s**5) * [1.0, -0.8]

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from robotid.base.exceptions import DataError
-from robotid.dynamics.base_parameters import base_mapping, independent_factors, structural_mapping
+from robotid.dynamics.base_parameters import base_mapping, structural_mapping
 from robotid.dynamics.torque import joint_torque_regressor, random_regressor
 from robotid.paper.planar_2r import urdf_text
 from robotid.robot.drives import Cubic, Harmonic, Power, Tanh
@@ -152,32 +152,6 @@ def test_further_terms_leave_the_base_parameters_of_the_others_as_they_are(rng):
     q, v, a = rng.uniform(-2, 2, (3, 50, 6))
     W, pi = joint_torque_regressor(model, q, v, a), rng.standard_normal(len(model.layout.names))
     np.testing.assert_allclose(W[:, after.independent] @ after.to_base(pi), W @ pi, atol=1e-9)
-
-
-#: Which columns four equations have: a trunk with two branches; one column of a branch does not
-#: load the trunk; equations that are not nested; two robots in one.
-PATTERNS = {
-    "tree": ["11111111", "01111000", "00000110", "00000010"],
-    "hidden column": ["11101111", "01111000", "00000110", "00000010"],
-    "chain": ["11110000", "00111100", "00001111", "00000000"],
-    "not nested": ["11110000", "00111100", "00001111", "10000001"],
-    "apart": ["11100000", "01100000", "00011111", "00000000"],
-}
-
-
-@pytest.mark.parametrize("name", PATTERNS)
-def test_factors_of_parts_have_the_products_of_all_rows(rng, name):
-    pattern = np.array([[letter == "1" for letter in row] for row in PATTERNS[name]])
-    W = (rng.standard_normal((30, 4, 8)) * pattern).reshape(120, 8)
-    parts = independent_factors(W, 4)
-    assert sorted(np.concatenate([own for own, _ in parts]).tolist()) == list(range(8))
-    assert len(parts) == (2 if name == "apart" else 1)
-    for own, R in parts:
-        np.testing.assert_allclose(R.T @ R, W[:, own].T @ W[:, own], rtol=1e-12, atol=1e-12)
-    product = np.zeros((8, 8))
-    for own, R in parts:
-        product[np.ix_(own, own)] = R.T @ R
-    np.testing.assert_allclose(product, W.T @ W, rtol=1e-12, atol=1e-12)
 
 
 def test_pivots_are_shares_of_the_largest_whatever_the_unit(rng):

@@ -60,10 +60,6 @@ def test_scipys_wrapper_gives_the_same_factors(rng, monkeypatch):
     np.testing.assert_allclose(compress(problem).R, R, atol=1e-13)
 
 
-def test_lapack_is_called_by_address():
-    assert factors._dtpqrt() is not None
-
-
 def test_a_row_that_is_not_finite_is_refused(rng):
     problem, W, _ = make(rng)
     W[17, 2] = np.nan
@@ -131,28 +127,6 @@ def test_compact_factors_are_those_of_the_dense_rows(rng, kind):
     selected, kept = factors.select(columns), A[:, [4, 0, 2, 5]]
     for j in range(3):
         np.testing.assert_allclose(gram(selected.R[j]), gram(kept[j::3]), atol=1e-10)
-
-    by_joint = [W[j::3] for j in range(3)]
-    np.testing.assert_allclose(
-        factors.information(sigma),
-        sum(s * W_j.T @ W_j for s, W_j in zip(sigma, by_joint, strict=True)),
-        atol=1e-10,
-    )
-    C = gram(rng.standard_normal((5, 5)))
-    traces = [np.trace(W_j @ C @ W_j.T) for W_j in by_joint]
-    np.testing.assert_allclose(factors.leverages(C), traces, rtol=1e-10)
-    theta = rng.standard_normal(5)
-    before = factors.torque_squares()
-    left = [tau[j::3] - W_j @ theta for j, W_j in enumerate(by_joint)]
-    np.testing.assert_allclose(
-        factors.score(theta, sigma),
-        sum(s * W_j.T @ r for s, W_j, r in zip(sigma, by_joint, left, strict=True)),
-        atol=1e-10,
-    )
-    np.testing.assert_allclose(
-        factors.without(theta).torque_squares(), [r @ r for r in left], rtol=1e-10
-    )
-    np.testing.assert_array_equal(factors.torque_squares(), before)
 
 
 def test_factors_with_other_columns_per_joint_merge(rng):

@@ -5,13 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from helpers.corruptions import clean_log, robot
-from helpers.driven import arm
 
-from robotid.data.log import Log, Trajectory
+from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import resolve
-from robotid.dynamics import used_rows
-from robotid.dynamics.torque import joint_torque_regressor
 from robotid.dynamics.used_rows import independent_share, static_rows
 from robotid.estimation.fitting.survey import hold_log
 from robotid.robot.examples import example_urdf
@@ -121,29 +118,3 @@ def test_a_log_too_short_to_predict_is_judged_by_its_lag(log):
     short = log.window(2.0, 2.7)
     assert chosen(short) == "measured"
     assert chosen(late(short, 0.05)) == "differentiated"
-
-
-def test_a_part_is_predicted_by_the_fit_to_the_others_joint_by_joint(rng):
-    """Every third row counts, in eight parts; the last joint has too few of them."""
-    model = arm()
-    n, p = 2400, model.support().sum(axis=1)
-    q, v, a, tau = rng.standard_normal((4, n, 3))
-    motion = Trajectory(np.arange(n) / 50, q, v, a, tau, model.joints, 50.0, np.zeros(n, dtype=int))
-    mask = rng.random((n, 3)) < 0.8
-    mask[:, 2] &= np.arange(n) % 3 == 1
-    error = used_rows._held_out_error(model, motion, mask, 3)
-    Y = joint_torque_regressor(model, q, v, a).reshape(n, 3, -1)
-    folds = [np.concatenate(np.array_split(np.arange(0, n, 3), 8)[k::2]) for k in (0, 1)]
-    for j in (0, 1):
-        squares = 0.0
-        for one, other in (folds, folds[::-1]):
-            one, other = one[mask[one, j]], other[mask[other, j]]
-            assert min(len(one), len(other)) >= 3 * p[j]
-            W = Y[:, j, model.support()[j]]
-            size = np.linalg.norm(W[one], axis=0)
-            W = W / np.where(size > 0, size, 1.0)
-            theta = np.linalg.pinv(W[one], rcond=1e-3) @ tau[one, j]
-            squares += np.sum((tau[other, j] - W[other] @ theta) ** 2)
-        wanted = np.sqrt(squares) + 1e-6 * np.linalg.norm(tau[::3, j])
-        assert error[j] == pytest.approx(wanted, rel=1e-6)
-    assert np.isnan(error[2])

@@ -4,9 +4,7 @@ import numpy as np
 import pytest
 from helpers.pages import chart, charts
 
-from robotid.dynamics.simulation.motions import ProgramMotion
 from robotid.paper import page
-from robotid.paper.errata import EnergyDrift
 from robotid.paper.study import MODELS, PaperSettings, study_model
 
 
@@ -18,16 +16,6 @@ def studies():
 def close(drawn, wanted):
     """Assert that a series is the data, to what 16 bits tell apart."""
     np.testing.assert_allclose(drawn, wanted, atol=2e-5 * max(np.ptp(wanted), 1e-9))
-
-
-def test_figure_3_is_the_program_of_its_joint():
-    t = np.linspace(0.0, 2.0, 201)
-    parts = ProgramMotion(np.array([1.0, 1.5]), 2.0).evaluate(t)
-    drawn = charts(page._program_figures())
-    for k, what in enumerate(drawn):
-        close(what["x"], t)
-        close(what["series"][0]["y"], parts[k % 3][:, k // 3])
-    assert len(drawn) == 6
 
 
 def test_figure_4_is_the_control_of_its_joint_by_iterations(studies):
@@ -73,11 +61,3 @@ def test_errors_are_those_of_their_model_and_case(studies):
             series, ("clean", "disturbed", "noisy", "noisy_dead_zone"), strict=True
         ):
             np.testing.assert_allclose(line["y"], study.errors(case), rtol=1e-3)
-
-
-def test_energies_are_in_percent():
-    t = np.linspace(0.0, 1.3, 5)
-    drift = EnergyDrift(t, {"one": 0.03 * t, "other": -0.2 * t**2})
-    (what,) = charts(page._energy_figure(drift))
-    for line, gained in zip(what["series"], (3.0 * t, -20.0 * t**2), strict=True):
-        close(line["y"], gained)

@@ -166,26 +166,6 @@ def test_the_closed_form_arm_and_its_urdf_are_one_plant(tmp_path):
 # --- bounds, disturbance, noise, friction -----------------------------------------------------
 
 
-def test_updates_are_left_out_and_counted_of_runs_that_go_on(rng):
-    motion = ProgramMotion(np.tile([1.0, 1.5], (3, 1)), np.full(3, 2.0))
-    guesses = np.array([-P4, -P4, P4 / 2])  # of the first two D is negative
-    loop = _Loop(ARM, PLANT, motion, short(1), Influences(), guesses, 0.0)
-    loop.active = np.array([True, False, True])
-    states = rng.uniform(-1, 1, (3, 3, 2))
-    q = states[0]
-    Psi, eta = ARM.regressor(*states), rng.standard_normal((3, 2))
-    for done in (1, 2):
-        loop._update(q, Psi, eta, np.ones(3, dtype=bool))
-        np.testing.assert_array_equal(loop.skipped, [done, 0, 0])
-        np.testing.assert_array_equal(loop.P[:2], guesses[:2])
-        if done == 1:
-            D = mass_matrix(ARM, q[2:], P4 / 2)[0]
-            sigma = np.linalg.eigvalsh(D).min()
-            step = sigma / np.sum(Psi[2] ** 2) * Psi[2].T @ eta[2]
-            np.testing.assert_allclose(loop.P[2], P4 / 2 - step)
-            loop.P[2] = P4 / 2
-
-
 @pytest.mark.parametrize("substeps", [1, 3])
 def test_between_updates_the_torque_is_held_and_the_arm_moves_on(substeps, rng):
     motion = ProgramMotion(np.array([[1.0, 1.5], [0.7, -1.1]]), np.array([2.0, 1.5]))
@@ -311,23 +291,3 @@ def test_an_iteration_is_its_equations_update_by_update(rng):
     np.testing.assert_allclose(history.torques, [torques], rtol=1e-9)
     assert (largest > prx).any()  # of an update before the last
     np.testing.assert_array_equal([history.NA, history.diverged], np.zeros((2, 2)))
-
-
-def test_runs_diverge_by_position_or_speed_in_their_own_iteration(rng):
-    motion = ProgramMotion(np.tile([1.0, 1.5], (4, 1)), np.full(4, 2.0))
-    loop = _Loop(ARM, PLANT, motion, short(1), Influences(), np.tile(P4, (4, 1)), 0.0)
-    program = motion.evaluate(np.full(4, 0.7))
-    q, v = program[0].copy(), program[1].copy()
-    q[1, 1] += 1.1e3
-    found = loop._reset_diverged(3, q, v, program)
-    np.testing.assert_array_equal(found, program[:2])
-    v[2, 0] -= 1.1e3
-    q[3, 0] = np.nan
-    found = loop._reset_diverged(5, q, v, program)  # the second is still away
-    np.testing.assert_array_equal(found, program[:2])
-    np.testing.assert_array_equal(loop.diverged, [0, 3, 5, 5])
-    np.testing.assert_array_equal(loop.active, [True, False, False, False])
-    q, v = program[0] + 0.5, program[1] + 0.25  # those that diverged stay on the program
-    for moved, part in zip(loop._reset_diverged(6, q, v, program), program, strict=False):
-        np.testing.assert_array_equal(moved[1:], part[1:])
-    np.testing.assert_array_equal(loop._reset_diverged(6, q, v, program)[0][0], q[0])

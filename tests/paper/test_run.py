@@ -10,13 +10,11 @@ import numpy as np
 import pytest
 from helpers.pages import number, tables
 
-from robotid.cli import main
 from robotid.paper import run as paper
 from robotid.paper import study
-from robotid.paper.errata import energy_drift
 from robotid.paper.procedure import LoopSettings
 from robotid.paper.run import run_paper
-from robotid.paper.study import CASES, MODELS, PaperSettings
+from robotid.paper.study import CASES, MODELS, PaperSettings, energy_drift
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import INERTIAL_TERMS
 
@@ -89,37 +87,6 @@ def test_the_page_is_whole_and_offline(written):
         assert said in html
 
 
-def test_a_failure_leaves_no_half_written_file(tmp_path, monkeypatch):
-    def fail(*_):
-        raise OSError("disk full")
-
-    monkeypatch.setattr(paper, "paper_page", fail)
-    monkeypatch.setattr(paper, "energy_drift", lambda: energy_drift(duration=0.1))
-    monkeypatch.setattr(study, "LoopSettings", partial(LoopSettings, updates=20))
-    with pytest.raises(OSError, match="disk full"):
-        run_paper(tmp_path, settings=PaperSettings(iterations=1, longest=1, runs=1, patience=1))
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_the_command_prints_what_was_reached(tmp_path, capsys, monkeypatch, written):
-    asked = {}
-
-    def remember(folder, **options):
-        asked.update(options, folder=folder)
-        return written[1]
-
-    monkeypatch.setattr(paper, "run_paper", remember)
-    assert main(["paper", "--quick", "--out", str(tmp_path)]) == 0
-    out, err = capsys.readouterr()
-    assert err == ""  # progress is for terminals
-    assert "printed" in out
-    assert asked["folder"] == str(tmp_path)
-    assert asked["settings"].runs < 100 <= PaperSettings().runs
-    assert main(["paper", "--json", "--out", str(tmp_path)]) == 0
-    assert json.loads(capsys.readouterr().out) == written[1]
-    assert asked["settings"] is None
-
-
 # --- the page ---------------------------------------------------------------------------------
 
 
@@ -170,22 +137,6 @@ def test_the_inertial_vector_is_in_the_papers_order(shown, content, folder, html
     np.testing.assert_allclose(found[[4, 6, 14, 16]], true[[4, 6, 14, 16]] / 2)
 
 
-def test_random_motions(shown, content):
-    rows = shown["Iterations to a relative error of 10⁻³"].rows
-    parts = [(content[key], start) for key, start in (
-        ("trajectories", "up to 0.05 rad off the program"),
-        ("trajectories_on_program", "on the program"),
-    )]  # fmt: skip
-    wanted = []
-    for part, start in parts:
-        for name, found in part.items():
-            taken = found["iterations"] or [float("nan")]
-            spread = [number(float(np.percentile(taken, p)), ".0f") for p in (0, 50, 90, 100)]
-            counts = [str(found["runs"]), str(found["converged"])]
-            wanted.append([name, start, *counts, *spread, str(found["most_iterations"])])
-    assert rows == wanted
-
-
 def test_a_case_is_judged_at_its_end_by_a_tenth_and_by_the_mean_of_the_later_half(rng):
     P, count = np.array([3.0, -4.0]), len(CASES)
     errors = np.append(0.5 * 0.9 ** np.arange(20), 5e-5)
@@ -206,37 +157,3 @@ def test_a_case_is_judged_at_its_end_by_a_tenth_and_by_the_mean_of_the_later_hal
     assert not any(found["converged"] for found in said.values())
     assert said["on_program"]["reason"].startswith("slow: every run follows the same curve")
     assert said["noisy"]["reason"].startswith("A disturbance v is part of the deviation")
-
-
-def test_errata_energy_and_settings(shown, content):
-    assert shown["Errata"].rows == [
-        [e["where"], e["printed"], e["corrected"], number(e["max_torque_difference"], ".1f"),
-         number(e["max_torque_difference_on_program"], ".1f")]
-        for e in content["errata"]
-    ]  # fmt: skip
-    drift = content["energy_drift"]["max_relative"]
-    assert shown["Largest change of energy"].rows == [
-        [name, number(100 * value, ".3g")] for name, value in drift.items()
-    ]
-    settings = content["settings"]
-    written = {k.split(" [")[0]: value for k, value in shown["Settings"].rows}
-    assert len(written) == len(settings)
-    assert "1, 1.5" in written.values()
-    for key, value in settings.items():
-        name = key.removesuffix("_rad").removesuffix("_s").replace("_", " ")
-        cells = written[name].split(", ")
-        for cell, x in zip(cells, value if isinstance(value, list) else [value], strict=True):
-            assert cell == (str(x) if isinstance(x, bool | str) else f"{x:.4g}")
-
-
-def test_the_verdict_is_that_of_the_last_iteration(html, content):
-    box = html.split('<div class="verdict ')[1].split("</div>")[0]
-    last = [content["models"][name]["relative_error"][-1] for name in MODELS]
-    assert box.startswith("good" if max(last) <= 1e-4 else "poor")
-    assert "After <strong>19 iterations</strong>" in box
-    for name, error in zip(MODELS, last, strict=True):
-        on = content["on_program"][name]["relative_error"][-1]
-        assert (
-            f"<li>{name}: relative error {number(error, '.2g')}; with a start on the program "
-            f"instead of one degree off it: {number(on, '.2g')}</li>" in box
-        )

@@ -4,10 +4,11 @@ pyarrow is imported when a file is opened.
 """
 
 import csv
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
+from itertools import islice
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -173,36 +174,13 @@ def _csv_texts(path: Path) -> tuple[list[str], list[list[str]]]:
     return names, rows
 
 
-class ParquetRows:
-    """Writes rows to a Parquet file; at most one row group of them is in memory."""
-
-    def __init__(self, writer: Any, schema: Any) -> None:  # noqa: ANN401
-        self._writer, self._schema = writer, schema
-        self._waiting: list[Mapping[str, str | float | None]] = []
-
-    def add(self, rows: Sequence[Mapping[str, str | float | None]]) -> None:
-        """Add rows."""
-        self._waiting += rows
-        while len(self._waiting) >= _GROUP:
-            self.write(_GROUP)
-
-    def write(self, count: int | None = None) -> None:
-        """Write some of the waiting rows, or all, as a row group."""
-        import pyarrow
-
-        rows, self._waiting = self._waiting[:count], self._waiting[count:] if count else []
-        if rows:
-            columns = {name: [row.get(name) for row in rows] for name in self._schema.names}
-            self._writer.write_table(pyarrow.table(columns, schema=self._schema))
-
-
-@contextmanager
-def parquet_rows(path: Path, columns: Mapping[str, type]) -> Iterator[ParquetRows]:
-    """Write a Parquet file row by row; equal rows make equal files."""
+def write_rows(
+    path: Path, rows: Iterable[Mapping[str, str | float | None]], columns: Mapping[str, type]
+) -> None:
+    """Write rows to a Parquet file, one row group after the other; equal rows make equal files."""
     pa = load_pyarrow("writing Parquet")
-    kinds = {str: pa.string(), float: pa.float64()}
+    kinds, left = {str: pa.string(), float: pa.float64()}, iter(rows)
     schema = pa.schema([(name, kinds[kind]) for name, kind in columns.items()])
     with pa.parquet.ParquetWriter(path, schema) as writer:
-        rows = ParquetRows(writer, schema)
-        yield rows
-        rows.write()
+        while group := list(islice(left, _GROUP)):
+            writer.write_table(pa.Table.from_pylist(group, schema=schema))

@@ -12,7 +12,6 @@ import numpy as np
 
 from robotid.base.findings import Finding
 from robotid.base.typing import Array
-from robotid.data.filters import cubic_spline
 from robotid.data.log import Log, Trajectory
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import low_pass
@@ -266,7 +265,10 @@ def _interpolated(t: Array, values: Array, times: Array) -> Array:
     """Return values, shape (N, n), at times of any shape, shape (..., n)."""
     if len(t) < 2:
         return np.empty((*times.shape, values.shape[1]))
-    return cubic_spline(t, values, times)
+    from scipy.interpolate import CubicSpline  # takes long to import
+
+    at: Array = CubicSpline(t, values)(times)
+    return at
 
 
 def _distance(at: Array, slow: Array) -> Array:

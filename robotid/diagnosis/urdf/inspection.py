@@ -21,11 +21,8 @@ from robotid.diagnosis.urdf.inertials import (
     weak_parameters,
 )
 from robotid.diagnosis.urdf.mesh_check import audit_links
-from robotid.dynamics.base_parameters import (
-    BaseMapping,
-    independent_factors,
-    structural_mapping,
-)
+from robotid.dynamics.base_parameters import BaseMapping, structural_mapping
+from robotid.dynamics.factors import triangle_of
 from robotid.dynamics.torque import random_regressor
 from robotid.robot.bodies import LinkPlace, link_places
 from robotid.robot.model import RobotModel
@@ -152,11 +149,9 @@ def _condition(model: RobotModel, mapping: BaseMapping) -> float:
     columns = len(mapping.names)
     samples = 2 * columns // model.n_rows + 20
     W = random_regressor(model, samples, np.random.default_rng(0))[:, mapping.independent]
-    sizes = [
-        np.linalg.svd(R / np.linalg.norm(R, axis=0), compute_uv=False)
-        for _, R in independent_factors(W, model.n_rows)
-    ]
-    return float(max(s[0] for s in sizes) / min(s[-1] for s in sizes))
+    R = triangle_of(W)
+    sizes = np.linalg.svd(R / np.linalg.norm(R, axis=0), compute_uv=False)
+    return float(sizes[0] / sizes[-1])
 
 
 def _numbers(robot: ET.Element) -> Iterator[Finding]:

@@ -1,4 +1,4 @@
-"""Terms of the drives: those selected, those in doubt, and the motion that they depend on."""
+"""Terms of the drives: those selected, those uncertain, and the motion that they depend on."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace

@@ -1,12 +1,10 @@
 """Torque or position errors of the joints: as bars, and as a table of each recording."""
 
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from typing import Any, NamedTuple
 
-from robotid.base.findings import listed
 from robotid.diagnosis.verdict import evidence
 from robotid.diagnosis.verdict import position_verdict as positions
 from robotid.estimation.fitting.evaluation import Metrics
@@ -158,9 +156,7 @@ def error_bars(
         others = {key: error for key, error in errors.items() if error is not None}
         error = _share(measured) if measured else None
         bars.append(_Bar(rows.index(joint), joint, error, others, verdict["status"], reasons))
-    common = _common(bars)
-    named = {bar.joint for alike in common for bar in alike}
-    items = [_row(bar, quantity, is_named=bar.joint in named, has_why=has_why) for bar in bars]
+    items = [_row(bar, quantity, has_why=has_why) for bar in bars]
     more = "".join(items[_ROWS:])
     if more:
         words = f"{len(items) - _ROWS} more joints with smaller errors"
@@ -171,26 +167,7 @@ def error_bars(
     return (
         f'<h2 id="worst">{quantity.title}, worst joint first <span class="note">{quantity.share}, '
         f"{kind}</span></h2>\n{_legend(quantity, {key for bar in bars for key in bar.others})}"
-        f'<ol class="bars">{"".join(items[:_ROWS])}</ol>\n{more}{"".join(map(_reason_of, common))}'
-    )
-
-
-def _common(bars: Sequence[_Bar]) -> list[list[_Bar]]:
-    """Return the joints that have one reason, apart from its numbers, if they are several."""
-    groups: dict[tuple[str, str], list[_Bar]] = {}
-    for bar in bars:
-        if why := joint_reason(bar.joint, bar.reasons):
-            groups.setdefault((bar.status, re.sub(r"[\d.]+", "", why)), []).append(bar)
-    return [alike for alike in groups.values() if len(alike) > 1]
-
-
-def _reason_of(bars: Sequence[_Bar]) -> str:
-    """Return the common reason of joints, with the numbers of the worst one, and their names."""
-    worst = joint_reason(bars[0].joint, bars[0].reasons)
-    status, names = bars[0].status, escape(listed(bar.joint for bar in bars))
-    return (
-        f'<p class="common {status.replace(" ", "-")}"><strong>{status}</strong>: {names}: '
-        f"{escape(worst)} (the worst)</p>\n"
+        f'<ol class="bars">{"".join(items[:_ROWS])}</ol>\n{more}'
     )
 
 
@@ -199,11 +176,9 @@ def _at(value: float) -> str:
     return f"{100 * (min(value, _WIDEST) / _WIDEST) ** 0.5:.2f}%"
 
 
-def _row(bar: _Bar, quantity: Quantity, *, is_named: bool, has_why: bool) -> str:
-    """Return the row of a joint with its own reason."""
-    reasons = bar.reasons[1:] if is_named else bar.reasons
-    if bar.status == "good" and not is_named:
-        reasons = bar.reasons[-1:]
+def _row(bar: _Bar, quantity: Quantity, *, has_why: bool) -> str:
+    """Return the row of a joint with its reason."""
+    reasons = bar.reasons[-1:] if bar.status == "good" else bar.reasons
     why, link, picture = joint_reason(bar.joint, reasons), "", ""
     if bar.error is not None:
         picture = _picture(bar, bar.error, quantity)

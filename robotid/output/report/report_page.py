@@ -5,33 +5,27 @@ from dataclasses import dataclass
 from html import escape
 from typing import Any, TypeVar
 
-from robotid.base.findings import Cause, Finding, grouped, number_of
+from robotid.base.findings import Cause, Finding, grouped, tally
 from robotid.base.versions import __version__
 from robotid.diagnosis.verdict.evidence import uses_line
 from robotid.estimation.fitting.evaluation import Evaluated
 from robotid.identification.result import Identification
 from robotid.identification.summary import verdict_cell
 from robotid.output.pages.html import (
-    Cell,
     Section,
     block,
     code,
     command_html,
     facts_html,
     folded,
-    listing,
     page,
     verdict_html,
 )
 from robotid.output.report.dock import Clip, Dock, Residual, worst_html, worst_second
 from robotid.output.report.errors import Errors, Quantity, error_bars, error_table, worst_errors
-from robotid.output.report.steps import Origin, Step
+from robotid.output.report.next_steps import Origin, Step
 from robotid.output.report.tables import sources_fact
 
-_BY_JOINT = (
-    ("joint", "code", "joint"), ("errors and warnings", "text", "serious"),
-    ("notes", "text", "notes"),
-)  # fmt: skip
 _ROWS = 24_000  # of all charts: about half a MB
 _LONGEST = 2000  # rows of one chart
 _OPEN = 2  # joints that are open at most
@@ -112,8 +106,10 @@ def page_of(report: Report, files: Mapping[str, str]) -> str:
         folded(key, title, html) for key, (title, html) in report.appendix.items() if html
     )
     causes = grouped(report.findings, report.rows)
-    findings = _by_joint(worst, causes) + ("".join(map(_cause, causes)) or "<p>None.</p>\n")
-    line = findings_line(report.findings, report.rows, next(iter(worst), ""))
+    findings = "".join(map(_cause, causes)) or "<p>None.</p>\n"
+    notes = [cause for cause in causes if cause.severity == "note"]
+    serious = [cause for cause in causes if cause.severity != "note"]
+    line = tally(serious, notes, escape(next(iter(worst), ""))) or "none"
     by_log = f"{len(report.verdicts)} joints, by recording"
     sections = {
         "errors": Section("Errors", f"{definition}{tables}{after}", by_log, False),
@@ -132,19 +128,6 @@ def page_of(report: Report, files: Mapping[str, str]) -> str:
     return page(report.title, first_screen(report, files) + made, known)
 
 
-def findings_line(findings: Sequence[Finding], joints: Sequence[str], worst: str = "") -> str:
-    """Return the number of findings and causes, and the worst joint."""
-    causes, notes = (
-        grouped([f for f in findings if (f.severity == "note") == is_note], joints)
-        for is_note in (False, True)
-    )
-    of_notes = [_count(number_of(notes), "note")] if notes else []
-    if not causes:
-        return ", ".join(of_notes) or "none"
-    counts = f"{_count(number_of(causes), 'finding')}, {_count(len(causes), 'cause')}"
-    return "; ".join([counts, *([f"worst: {escape(worst)}"] if worst else []), *of_notes])
-
-
 def _cause(cause: Cause) -> str:
     """Return one cause: its messages, and each finding where there are several."""
     findings = ""
@@ -161,30 +144,6 @@ def _cause(cause: Cause) -> str:
         messages="".join(f"<p>{escape(message)}</p>\n" for message in cause.messages),
         findings=findings,
     )
-
-
-def cause_links(causes: Sequence[Cause]) -> str:
-    """Return links to causes in the section of findings."""
-    names = [escape(cause.code) for cause in causes]
-    return ", ".join(f'<a href="#cause-{name}">{name}</a>' for name in names)
-
-
-def _by_joint(joints: Sequence[str], causes: Sequence[Cause]) -> str:
-    """Return the table of the causes of each joint that has some."""
-    rows = []
-    for joint in joints:
-        own = [cause for cause in causes if joint in cause.joints]
-        serious, notes = (
-            cause_links([cause for cause in own if (cause.severity == "note") == is_note]) or "–"
-            for is_note in (False, True)
-        )
-        if own:
-            rows.append({"joint": joint, "serious": Cell(serious), "notes": Cell(notes)})
-    return listing("Findings by joint, the worst first", _BY_JOINT, rows)
-
-
-def _count(number: int, noun: str) -> str:
-    return f"{number} {noun}{'' if number == 1 else 's'}"
 
 
 def drawn(runs: Sequence[EvaluatedT], rows: Sequence[str]) -> Sequence[EvaluatedT]:

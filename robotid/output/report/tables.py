@@ -58,11 +58,6 @@ _BASE = (
     ("parameter", "code", "name"), ("value", ".4g", "value"), ("± error", ".4g", "error"),
     ("relative %", "%", "relative"), ("unit", "text", "unit"), ("expression", "code", "expression"),
 )  # fmt: skip
-_CONSISTENCY = (
-    ("body", "code", "body"), ("mass, URDF [kg]", ".4g", "before"), ("mass [kg]", ".4g", "after"),
-    ("smallest eigenvalue, URDF", ".3g", "low_before"), ("smallest eigenvalue", ".3g", "low_after"),
-    ("remark", "text", "remark"),
-)  # fmt: skip
 _SIGNALS = (
     ("log", "code", "name"), ("filter", "text", "filter"), ("rate Hz", ".6g", "rate"),
     ("velocity", "text", "velocity"), ("trim s", ".3g", "trim"),
@@ -198,7 +193,7 @@ def _changes(model: RobotModel | None, standard: Array | None) -> str:
 def body_table(identification: TorqueIdentification) -> str:
     """Return mass, centre of mass and inertia about it of each link, below them those of the URDF.
 
-    A value that the data do not determine is the URDF's, and stands without interval.
+    A value that the data do not determine is the URDF's, and has no interval.
     """
     central = central_parameters(identification)
     rows = []
@@ -237,36 +232,27 @@ def base_table(identification: TorqueIdentification) -> str:
 
 
 def consistency_section(identification: TorqueIdentification) -> str:
-    """Return masses and pseudo-inertias, of the URDF and identified; prior, bounds, mass matrix."""
-    layout = identification.model.layout
-    before, after = (
-        pseudo_inertia(pi[: layout.n_inertial])
-        for pi in (identification.prior, identification.standard)
-    )
-    low_before, low_after = (np.linalg.eigvalsh(J)[:, 0] for J in (before, after))
-    rows = [
-        {"body": body, "before": before[i, 3, 3], "after": after[i, 3, 3],
-         "low_before": low_before[i], "low_after": low_after[i],
-         "remark": text("" if low_after[i] > 0 else "inconsistent", flag=True)}
-        for i, body in enumerate(layout.bodies)
-    ]  # fmt: skip
-    totals = [float(J[:, 3, 3].sum()) for J in (before, after)]
-    rows.append({"body": "total", "before": totals[0], "after": totals[1], "remark": ""})
+    """Return whether bodies and drives are consistent; prior, bounds, mass matrix."""
     is_consistent = identification.is_consistent
     every = "All bodies and drives are" if is_consistent else "Not all bodies and drives are"
-    masses = listing("Mass and pseudo-inertia of each body", _CONSISTENCY, rows)
     notes = "".join(f"<p>{escape(note)}</p>\n" for note in _consistency_notes(identification))
-    return block("report.consistency", all=every, table=masses, notes=notes)
+    return block("report.consistency", all=every, notes=notes)
 
 
 def _consistency_notes(identification: TorqueIdentification) -> list[str]:
     """Return sentences on mass matrix, prior and bounds of the fit."""
     check, details = identification.mass_matrix, identification.estimate.details
+    layout = identification.model.layout
+    lows = np.linalg.eigvalsh(pseudo_inertia(identification.standard[: layout.n_inertial]))[:, 0]
+    wrong = [
+        f"{body} ({low:.3g})" for body, low in zip(layout.bodies, lows, strict=True) if low <= 0
+    ]
     share = "at all" if check.is_positive else f"at {100 * check.positive_share:.3g} % of"
     notes = [
         f"The mass matrix, armatures included, is positive definite {share} {check.poses} random "
         f"poses (smallest eigenvalue {check.smallest_eigenvalue:.3g})."
     ]
+    notes += [f"Inconsistent, with the smallest eigenvalue: {listed(wrong)}."] if wrong else []
     if "prior" in details:
         prior = details["prior"]
         chosen = _CHOSEN.get(prior.get("chosen_by", ""), "as set")

@@ -1,8 +1,6 @@
 """Sensors in bags: odometry, IMU, wrenches and states of Unitree, at other stamps than joints."""
 
 import re
-from contextlib import nullcontext
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -23,7 +21,6 @@ from robotid.base.exceptions import DataError
 from robotid.cli import main
 from robotid.data.base_motion import BaseColumns, ImuFrame, quaternions_of_angles
 from robotid.data.files import bags
-from robotid.data.files.bags import _interpolated
 from robotid.data.files.read import read_log
 from robotid.data.signal_settings import LogSource
 
@@ -125,8 +122,8 @@ def write(path, topics, store=Stores.ROS2_HUMBLE, plugin=StoragePlugin.MCAP):
     with Bag1Writer(path) if is_ros1 else Bag2Writer(path, **folder) as bag:
         for topic, (kind, stamps, make) in topics.items():
             connection = bag.add_connection(topic, kind, typestore=types)
-            for t in stamps:
-                bag.write(connection, to_ns(t), serialize(make(maker, t), kind))
+            for k, t in enumerate(stamps):  # recorded one after the other, whatever their stamps
+                bag.write(connection, to_ns(5.0 + 0.01 * k), serialize(make(maker, t), kind))
     return path
 
 
@@ -161,7 +158,7 @@ def test_odometry_is_interpolated_at_the_stamps_of_the_joints(tmp_path, name):
 
 
 def test_wrenches_have_the_axes_of_their_frame(tmp_path):
-    path = write(tmp_path / "log", STATES | FORCE)
+    path = write(tmp_path / "log", STATES | {"/left": (WRENCH, np.roll(S, 7), Maker.wrench)})
     wanted = BaseColumns(wrenches=("fz l_sole", "my l_sole"), local=("l_sole",))
     log = read_log(path, JOINTS, base=wanted)
     np.testing.assert_allclose(log.wrenches["fz l_sole"], 10 * log.t)
@@ -285,47 +282,6 @@ def test_an_imu_without_orientation_needs_that_of_the_base(tmp_path):
     )
 
 
-def test_columns_between_messages_are_linear_and_quaternions_have_length_1():
-    """A turn by 2 rad about z whose sign flips; half of the way is 1 rad."""
-    t = np.array([5.0, 5.4, 6.0])
-    q = [[0.0, 0.0, np.sin(x / 2), np.cos(x / 2)] for x in (0.2, 2.2, 2.2)]
-    q = np.array(q) * [[1.0], [-1.0], [1.0]]
-    columns = {f"imu_{end}": q[:, k] for k, end in enumerate(("qx", "qy", "qz", "qw"))}
-    at = np.array([5.2, 5.7])
-    found = _interpolated(t, {"imu_wx": np.array([1.0, 3.0, -3.0]), **columns}, at)
-    np.testing.assert_allclose(found["imu_wx"], [2.0, 0.0], atol=1e-12)
-    turn = [2 * np.arctan2(found["imu_qz"][k], found["imu_qw"][k]) for k in range(2)]
-    np.testing.assert_allclose(turn, [1.2, 2.2])
-    square = sum(found[name] ** 2 for name in columns)
-    np.testing.assert_allclose(square, 1.0)
-    assert not found["imu_qx"].any()
-
-
-def test_messages_of_a_sensor_are_sorted_by_their_stamps(monkeypatch):
-    """Times of recording [s], stamps of the headers [s] and values, in the order of arrival."""
-    rows = [(9.2, 7.2, (3.0, 30.0)), (9.1, 7.0, (1.0, 10.0)), (9.3, 7.1, (2.0, 20.0))]
-
-    def messages(chosen):
-        for logged, stamp, values in rows:
-            clock = SimpleNamespace(sec=int(stamp), nanosec=round(stamp % 1 * 1e9))
-            header = SimpleNamespace(stamp=clock)
-            yield chosen[0], round(logged * 1e9), SimpleNamespace(header=header, values=values)
-
-    connection = SimpleNamespace(topic="imu", msgtype="sensor_msgs/Imu", msgcount=3)
-    reader = SimpleNamespace(connections=[connection], messages=messages)
-    sensor = bags._Sensor("imu", ("a", "b"), lambda message: message.values)
-    for stamp, order, t_wanted in (
-        ("header", [1.0, 2.0, 3.0], [7.0, 7.1, 7.2]),
-        ("log", [1.0, 3.0, 2.0], [9.1, 9.2, 9.3]),
-    ):
-        source = LogSource(stamp=stamp)
-        bag = bags._Bag(Path("x.mcap"), source, reader, lambda raw, kind: raw)
-        monkeypatch.setattr(bags, "_opened", lambda *_, bag=bag: nullcontext(bag))
-        t, values = sensor.load(Path("x.mcap"), source)
-        np.testing.assert_allclose(t, t_wanted, rtol=0, atol=1e-9)
-        assert values.tolist() == [[x, 10 * x] for x in order]
-
-
 def test_a_field_of_a_controller_is_of_the_first_point_that_has_a_number():
     """Joints without a command are NaN; the output comes before the reference."""
     nan = float("nan")
@@ -343,25 +299,3 @@ def test_a_field_of_a_controller_is_of_the_first_point_that_has_a_number():
     np.testing.assert_array_equal(found["qref"], [0.1, nan])
     np.testing.assert_array_equal(found["dqref"], [nan, 7.0])
     np.testing.assert_array_equal(found["tauref"], [nan, 0.5])
-
-
-def test_messages_of_several_joints_are_read_in_their_order():
-    """Messages 0, 2 and 5 are of one joint with two fields, 1 and 3 of another order of joints."""
-    one, two = (("a",), ("position", "effort")), (("b", "a"), ("position",))
-    blocks = {two: bags._Block(), one: bags._Block()}
-    for layout, number, values in (
-        (one, 0, [0.1, 7.0]), (two, 1, [9.0, 0.2]), (one, 2, [0.3, 8.0]), (two, 3, [9.5, 0.4]),
-        (one, 5, [0.5, 6.0]),
-    ):  # fmt: skip
-        blocks[layout].number.append(number)
-        blocks[layout].stamp.append(5_000_000_000 + 10_000_000 * number)
-        blocks[layout].values.extend(values)
-    found = bags._read("run", blocks, ["time", "position_a"])
-    np.testing.assert_allclose(found["time"], [5.0, 5.01, 5.02, 5.03, 5.05])
-    np.testing.assert_allclose(found["position_a"], [0.1, 0.2, 0.3, 0.4, 0.5])
-    with pytest.raises(
-        DataError, match=r"run: 3 of 5 messages lack .* first \(message 0\) lacks p"
-    ):
-        bags._read("run", blocks, ["position_a", "position_b"])
-    with pytest.raises(DataError, match=r"5 of 5 messages lack .*, the first \(message 0\) lacks"):
-        bags._read("run", blocks, ["effort_a", "position_b"])

@@ -118,6 +118,13 @@ def test_other_messages_are_passed_over_and_values_are_checked_as_in_any_log(tmp
         path = write_mcap(tmp_path / f"{fragment[:5]}.mcap", [*messages_of(log), message])
         with pytest.raises(DataError, match=f"message 60 on '/joint_states' .*{fragment}"):
             read_log(path, JOINTS)
+    path = write_mcap(
+        tmp_path / "part.mcap", [*messages_of(log), (t + 9, ["elbow"], q[:1], [], [])]
+    )
+    with pytest.raises(
+        DataError, match=r"1 of 61 messages lack .* \(message 60\) lacks position_s"
+    ):
+        read_log(path, JOINTS)
     current = LogSource(effort="current")
     gains = {"shoulder": 2.0, "elbow": 3.0}
     path = write_mcap(tmp_path / "amperes.mcap", messages_of(log))

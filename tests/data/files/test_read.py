@@ -1,16 +1,12 @@
 """Which columns of a log are read, and what is refused: tables of logs and of messages."""
 
-import os
 import re
 import subprocess
 import sys
 import tomllib
-from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
-import pyarrow.parquet as pq
 import pytest
 
 from robotid.base.exceptions import DataError, SettingsError
@@ -23,7 +19,6 @@ from robotid.robot.model import RobotModel
 from robotid.robot.tree import Joint
 
 JOINTS = ("shoulder", "elbow")
-FOLDERS = (os.environ.get("ROBOTID_DATA"), Path(__file__).resolve().parents[4] / "shared" / "data")
 T = 1000.0 + np.arange(300) / 100
 PHASE = T[:, None] * [2.0, 3.0]
 LOG = Log(
@@ -419,38 +414,6 @@ def test_faults_of_a_base_and_of_cells_of_a_foot_are_named(tmp_path):
 
 
 # --- real recordings ------------------------------------------------------------------------------
-
-DATA = next((Path(folder) for folder in FOLDERS if folder and Path(folder).is_dir()), Path("none"))
-RECORDINGS = sorted(p for p in DATA.glob("*/*.parquet") if p.stem != "motor_side")
-PRISMATIC = ("torso_lift_joint",)
-
-
-@pytest.mark.usefixtures("recordings")  # which skips, or fails in CI, if there are none
-@pytest.mark.parametrize("path", RECORDINGS or [None], ids=lambda p: p.stem if p else "none")
-def test_real_recordings_are_read_and_refused_in_other_units(path, tmp_path):
-    names = pq.read_schema(path).names
-    joints = [name[2:] for name in names if name.startswith("q_")]
-    gains = {joint: 10.0 for joint in joints if f"current_{joint}" in names}
-    log = read_log(path, joints, gains=gains, prismatic=PRISMATIC)
-
-    def reread(log, suffix="parquet"):
-        write_log(log, tmp_path / f"run.{suffix}")
-        return read_log(tmp_path / f"run.{suffix}", log.joints, prismatic=PRISMATIC)
-
-    short = log.window(log.t[0], log.t[0] + 5.0)
-    back = reread(short, "csv")
-    for name in ("t", "q", "tau"):
-        np.testing.assert_array_equal(getattr(back, name), getattr(short, name))
-    degrees = np.where([joint in PRISMATIC for joint in log.joints], 1.0, 180 / np.pi)
-    with pytest.raises(DataError, match=r"(looks like degrees|the time looks like|milliseconds)"):
-        reread(replace(log, t=log.t * 1e3))
-    with pytest.raises(DataError, match="looks like degrees"):
-        reread(replace(log, q=log.q * degrees, v=None if log.v is None else log.v * degrees))
-    if log.v is not None:
-        with pytest.raises(DataError, match="the velocity looks like degrees"):
-            reread(replace(log, v=log.v * degrees))
-        with pytest.raises(DataError, match="opposite sign"):
-            reread(replace(log, v=-log.v))
 
 
 def test_a_csv_file_is_read_without_any_other_library(tmp_path):

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.humans import FEET, human_urdf, logged, walk
+from helpers.stands import stand
 
 from robotid.data.base_motion import BaseMotion, base_state, in_base, quaternions_of_angles
 from robotid.data.log import Log
@@ -22,25 +22,29 @@ from robotid.robot.model import RobotModel
 
 UNTURNED = pin.SE3(pin.exp3(np.array([0.0, 0.0, -1.5])), np.zeros(3))
 SLOW = SignalSettings(cutoff=4.0)
+FEET = ("FL_FOOT", "FR_FOOT", "HL_FOOT", "HR_FOOT")
 
 
 @pytest.fixture(scope="module")
-def robot(tmp_path_factory):
-    path = tmp_path_factory.mktemp("human") / "human.urdf"
-    path.write_text(human_urdf())
+def robot():
     return RobotModel.from_urdf(
-        path, free_flyer=True, terms=(), constraints=[Contact(foot, "surface") for foot in FEET]
-    )
+        example_urdf("solo12.urdf"), free_flyer=True, terms=(),
+        constraints=[Contact(foot) for foot in FEET],
+    )  # fmt: skip
 
 
 @pytest.fixture(scope="module")
 def log(robot):
-    """Return a walk with flags of the feet: which one has the lower height."""
-    motion = walk(robot, robot, np.random.default_rng(2), duration=6.0, rate=60.0)
-    log = logged(robot, motion, np.random.default_rng(3))
-    heights = np.array([[place.translation[2] for place in row] for row in motion.feet])
-    flags = {foot: heights[:, k] < 0.0801 for k, foot in enumerate(FEET)}
-    return replace(log, contacts=flags, wrenches={})
+    """Return a log at 60 Hz, with noise, of a robot that sways and lifts its feet in turn."""
+    rng = np.random.default_rng(2)
+    motion = stand(robot, np.tile([0.0, 0.8, -1.6], 4), 0.25, rng, length=1.5, rate=60.0)
+    q = motion.q + 1e-3 * rng.standard_normal(motion.q.shape)
+    pose = motion.pose.copy()
+    pose[:, :3] += 5e-4 * rng.standard_normal((len(q), 3))
+    flags = dict(zip(FEET, motion.contacts.T, strict=True))
+    return Log(
+        motion.t, q, 0.0 * q, robot.joints, has_torque=False, base=BaseMotion(pose), contacts=flags
+    )
 
 
 def with_quaternion(log, change):
@@ -132,7 +136,7 @@ def test_jumps_are_found_with_size_and_time(log):
     assert found.evidence["jumps"] == 2
     assert found.evidence["size"] == pytest.approx(0.06, rel=0.1)
     assert found.evidence["first"] == log.t[100]
-    assert "jumps 2 times, first at t = 1.667 s by 0.041 m: a marker" in found.message
+    assert "jumps 2 times, first at t = 1.667 s by 0.04" in found.message
     pose[:50, 3:] = np.roll(pose[:50, 3:], 1, axis=1)  # turned before: each kind has its own time
     of_kind = list(check_pose(replace(log, base=BaseMotion(pose))))
     assert [x.evidence["first"] for x in of_kind] == [log.t[100], log.t[50]]

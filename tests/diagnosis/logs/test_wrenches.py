@@ -1,50 +1,48 @@
 """Findings on measured forces of the ground: sign and unit."""
 
 from dataclasses import replace
-from functools import cache
 
 import numpy as np
 import pytest
-from helpers.humans import FEET, PARTS, human_urdf, logged, walk, with_other_segments
+from helpers.legged import with_other_bodies
+from helpers.stands import stand
 
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import process
 from robotid.diagnosis.logs.contacts import check_base, check_wrenches
 from robotid.dynamics.constraint_rows import constraint_jacobian
 from robotid.dynamics.prediction import predict
+from robotid.dynamics.simulation.simulation_settings import Controller, Noise, Sensors, Simulation
+from robotid.dynamics.simulation.simulator import simulate
 from robotid.robot.constraints import Contact
+from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 
 SLOW = SignalSettings(cutoff=4.0)
-
-
-@cache
-def on_no_ground(urdf):
-    return RobotModel.from_urdf(urdf, free_flyer=True, terms=())
-
-
-def human(urdf):
-    contacts = [Contact(foot, "surface", measured=PARTS, axes="link") for foot in FEET]
-    return replace(on_no_ground(urdf), constraints=tuple(contacts))
+FEET, PARTS = ("FL_FOOT", "FR_FOOT", "HL_FOOT", "HR_FOOT"), ("fx", "fy", "fz")
 
 
 @pytest.fixture(scope="module")
-def urdf(tmp_path_factory):
-    path = tmp_path_factory.mktemp("human") / "human.urdf"
-    path.write_text(human_urdf())
-    return path
+def robot():
+    contacts = [Contact(foot, measured=PARTS) for foot in FEET]
+    return RobotModel.from_urdf(
+        example_urdf("solo12.urdf"), free_flyer=True, terms=(), constraints=contacts
+    )
 
 
 @pytest.fixture(scope="module")
-def motion(urdf):
-    """Return a walk of a human whose segments differ from those of the URDF by 15 %."""
-    model, rng = human(urdf), np.random.default_rng(3)
-    return walk(model, with_other_segments(model, rng), rng, duration=6.0, rate=60.0)
-
-
-@pytest.fixture(scope="module")
-def log(urdf, motion):
-    return logged(human(urdf), motion, np.random.default_rng(4))
+def log(robot):
+    """Return a log with forces of a robot on its feet whose bodies differ from the URDF's."""
+    rng = np.random.default_rng(3)
+    other = with_other_bodies(robot, rng)
+    motion = stand(robot, np.tile([0.0, 0.8, -1.6], 4), 0.25, rng, parts=2)
+    settings = Simulation(
+        controller=Controller(kind="perfect"), sensors=Sensors(noise=Noise(torque=0.01))
+    )
+    return simulate(
+        other, other.standard_parameters(), motion, rate=80.0, duration=6.0, rng=rng,
+        settings=settings,
+    )  # fmt: skip
 
 
 def found(model, log):
@@ -53,7 +51,7 @@ def found(model, log):
 
 def parts(model, log):
     """Return J^T f and W pi, shape (N, n_rows)."""
-    motion, whole = process(log, SLOW), np.ones((1, 2), dtype=bool)
+    motion, whole = process(log, SLOW), np.ones((1, len(FEET)), dtype=bool)
     torque = predict(replace(model, constraints=()), [model.standard_parameters()], motion)[0]
     J = constraint_jacobian(model, motion.q, np.repeat(whole, len(motion.t), axis=0))
     return np.einsum("kmj,km->kj", J, motion.wrenches), torque
@@ -69,8 +67,8 @@ def scaled(log, factor):
     return replace(log, wrenches={x: factor * y for x, y in log.wrenches.items()})
 
 
-def test_right_forces_have_no_finding_though_feet_move(urdf, log):
-    assert not list(check_base(human(urdf), log, SLOW))
+def test_right_forces_have_no_finding(robot, log):
+    assert not list(check_base(robot, log, SLOW))
 
 
 @pytest.mark.parametrize(
@@ -82,25 +80,24 @@ def test_right_forces_have_no_finding_though_feet_move(urdf, log):
         (0.2, "another unit. Correct", 5.0),
     ],
 )
-def test_a_fault_of_the_columns_is_named(urdf, log, size, words, factor):
-    model, wrong = human(urdf), scaled(log, size)
-    (finding,) = found(model, wrong)
+def test_a_fault_of_the_columns_is_named(robot, log, size, words, factor):
+    wrong = scaled(log, size)
+    (finding,) = found(robot, wrong)
     assert (finding.code, finding.severity) == ("measured_wrench", "error")
     assert words in finding.message
     assert finding.evidence["factor"] == pytest.approx(factor, rel=0.2)
-    assert finding.evidence["best"] < 0.2 * 70 * 9.81  # what masses of the URDF leave
-    assert finding.evidence["force"] == pytest.approx(unexplained(model, wrong))
-    caused, left = (x[:, :6] for x in parts(model, wrong))
+    assert finding.evidence["best"] < 0.3 * 2.5 * 9.81  # what masses of the URDF leave
+    assert finding.evidence["force"] == pytest.approx(unexplained(robot, wrong))
+    caused, left = (x[:, :6] for x in parts(robot, wrong))
     if factor > 1.0:  # least squares of force and moment together
         factor = np.sum(caused * left) / np.sum(caused**2)
     assert finding.evidence["factor"] == pytest.approx(factor)
-    assert finding.evidence["best"] == pytest.approx(unexplained(model, wrong, factor))
+    assert finding.evidence["best"] == pytest.approx(unexplained(robot, wrong, factor))
 
 
-def test_vertical_forces_alone_show_their_sign(urdf, log):
-    contacts = [Contact(foot, "point", ("fz",), always=True) for foot in FEET]
-    model = replace(human(urdf), constraints=tuple(contacts))
-    # the feet on the ground are level: their z is the world's
+def test_vertical_forces_alone_show_their_sign(robot, log):
+    contacts = [Contact(foot, "point", ("fz",)) for foot in FEET]
+    model = replace(robot, constraints=tuple(contacts))
     vertical = replace(log, wrenches={f"fz {foot}": log.wrenches[f"fz {foot}"] for foot in FEET})
     assert not found(model, vertical)
     (finding,) = found(model, scaled(vertical, -1.0))

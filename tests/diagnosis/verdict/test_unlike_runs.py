@@ -9,7 +9,7 @@ from robotid.base.findings import Finding
 from robotid.diagnosis.verdict import fit_findings
 from robotid.diagnosis.verdict.evidence import Predictions
 from robotid.diagnosis.verdict.fit_findings import rescaled_findings
-from robotid.output.report.steps import sentence_of
+from robotid.output.report.next_steps import sentence_of
 
 JOINTS = ("a", "b", "c")
 

@@ -1,9 +1,7 @@
 """The formats of robotid export: each is written and read back, and stands wherever formats do."""
 
 import re
-import sys
 import xml.etree.ElementTree as ET
-from types import SimpleNamespace
 
 import mujoco
 import numpy as np
@@ -13,12 +11,9 @@ from helpers.commanded_results import written_result
 from helpers.mujoco_plant import plant
 from helpers.paths import DOCS, ROOT
 
-from robotid.cli import main
 from robotid.cli.export import export
-from robotid.output.files import exports
-from robotid.output.files.exports import Format, Option, Written, formats, writers
+from robotid.output.files.exports import formats
 from robotid.output.files.result_file import load_result
-from robotid.output.report.steps import Origin, exports_of
 from robotid.robot.urdf_text import read_with_yourdfpy
 
 #: How the consumer of each format reads the stiffness or the Coulomb friction of a joint.
@@ -70,35 +65,3 @@ def test_the_pages_name_each_format():
     for kind in formats():
         assert re.search(rf"`{kind}`|--format {kind} ", readme)
         assert f"--format {kind} --out" in page
-
-
-def test_a_new_format_is_a_module(result, tmp_path, capsys, monkeypatch):
-    names = ["exports", "isaac", "mjcf", "ranges", "sdf", "toy"]
-
-    def export(result, target, *, grain="fine"):
-        target.write_text(f"{result.robot.name} {grain}")
-        return Written((target,), ["no place for gears"], {})
-
-    toy = Format("toy", "a toy", ".toy", use_of_gains="Play with it.",
-                 options={"grain": Option("size of its grains", "G")})  # fmt: skip
-    monkeypatch.setattr(
-        exports.pkgutil, "iter_modules", lambda _: [SimpleNamespace(name=x) for x in names]
-    )
-    module = SimpleNamespace(export=export, FORMAT=toy)
-    monkeypatch.setitem(sys.modules, "robotid.output.files.toy", module)
-    writers.cache_clear()
-
-    with pytest.raises(SystemExit):
-        main(["export", "--help"])
-    said = " ".join(capsys.readouterr().out.split())
-    assert ",sdf,toy}" in said
-    assert "toy: a toy" in said
-    assert "--grain G toy: size of its grains" in said
-    words = ["export", str(result), "--format", "toy", "--out", str(tmp_path / "a.toy")]
-    assert main([*words, "--grain", "coarse"]) == 0
-    assert "no place for gears" in capsys.readouterr().out
-    assert (tmp_path / "a.toy").read_text().endswith(" coarse")
-    last = exports_of("go2", Origin((), "out"), has_gains=True)[-1]
-    assert last.words == "Play with it."
-    assert last.blocks[0].endswith(".toy")
-    writers.cache_clear()

@@ -44,17 +44,6 @@ def test_a_file_without_changes_comes_back_byte_for_byte(data):
     assert edited(data, lambda document: []) == data
 
 
-def test_elements_know_their_bytes():
-    data = "<!-- é --><r><l n=\"a>b\"><i/></l  ><l n='/'/></r>".encode()
-    document = parse(data, "x.urdf")
-    with_end, without = document.root.find_all("l")
-    assert data[with_end.start : with_end.end] == b'<l n="a>b"><i/></l  >'
-    assert data[with_end.inside : with_end.end] == b"<i/></l  >"
-    assert data[without.start : without.end] == b"<l n='/'/>"
-    assert (with_end.is_self_closing, without.is_self_closing) == (False, True)
-    assert with_end.attributes == {"n": "a>b"}
-
-
 def test_a_replaced_element_is_indented_like_the_file():
     data = b"<r>\r\n\t<l>\r\n\t\t<old/>\r\n\t</l>\r\n</r>"
     new = edited(data, lambda d: replace(d, first(d, "l", "old"), LINES))

@@ -1,7 +1,5 @@
 """Mass, centre of mass and inertia of all links: figures and sources."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 from helpers.pages import tables
@@ -38,41 +36,6 @@ def test_intervals_contain_those_of_sampled_parameters(identified, central, i):
     quantile = identified.standard_quantile[own].max()
     wanted = quantile * np.column_stack([m, c, yy, xz]).std(axis=0) * 1e4
     np.testing.assert_allclose(central.half[i][[0, 1, 2, 3, 5, 8]], wanted, rtol=0.05)
-
-
-def test_a_body_with_a_parameter_of_unknown_error_has_no_intervals(identified, central):
-    names = "model standard prior standard_quantile standard_covariance prior_std sources"
-    own = {name: getattr(identified, name) for name in names.split()}
-    error, free = identified.standard_error.copy(), np.array(identified.errors.unbounded)
-    error[23] = np.inf
-    found = central_parameters(
-        SimpleNamespace(**own, standard_error=error, errors=SimpleNamespace(unbounded=free))
-    )
-    assert np.isposinf(found.half[2]).all()
-    others = np.arange(6) != 2
-    np.testing.assert_array_equal(found.half[others], central.half[others])
-
-
-def test_sources_are_those_of_the_parameters(identified, central):
-    named = np.array(identified.sources[: central.sources.size]).reshape(central.sources.shape)
-    assert central.sources[:, 0].tolist() == named[:, 0].tolist()
-    is_kept = (named == "prior").all(axis=1)
-    assert set(central.sources[is_kept].ravel()) <= {"prior"}
-    assert {"data", "mixed", "prior"} == set(central.sources.ravel())
-
-
-def test_sources_follow_from_the_errors_over_the_priors_spreads(identified, central):
-    pi, spread, quantile = (
-        x[:60].reshape(6, 10)
-        for x in (identified.standard, identified.prior_std, identified.standard_quantile)
-    )
-    m, c = pi[:, 0], pi[:, 2] / pi[:, 0]
-    prior = np.hypot(spread[:, 2], c * spread[:, 0]) / m  # of cy = mcy / m
-    share = central.half[:, 2] / quantile.max(axis=1) / prior
-    stayed = np.abs(c - central.urdf[:, 2]) <= 0.3 * prior
-    wanted = np.where(share < 0.3, "data", np.where((share > 0.9) & stayed, "prior", "mixed"))
-    assert len(set(wanted)) > 1
-    assert central.sources[:, 2].tolist() == wanted.tolist()
 
 
 def test_each_cell_has_the_value_its_interval_and_the_urdfs(identified, central):

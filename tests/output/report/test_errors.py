@@ -8,10 +8,9 @@ import pytest
 from helpers.pages import bars
 
 from robotid.diagnosis.verdict.evidence import GOOD, POOR
-from robotid.output.report.errors import TORQUE, Errors, error_bars, worst_errors
-from robotid.output.report.next_steps import next_steps
+from robotid.output.report.errors import worst_errors
+from robotid.output.report.next_steps import Origin, next_steps
 from robotid.output.report.report_page import first_screen
-from robotid.output.report.steps import Origin
 from robotid.output.report.torque_report import torque_report
 
 ORIGIN = Origin(("arm.toml",), "out")
@@ -74,20 +73,6 @@ def test_a_recording_that_was_fitted_is_none_that_was_predicted(identified):
     for joint, own in counted(validation=(again,)).items():
         assert own["relative_error_pct"] == fitted.per_joint[joint].relative_error_pct
         assert own["wls_relative_error_pct"] == wls.per_joint[joint].relative_error_pct
-
-
-def test_joints_that_differ_in_the_numbers_of_their_reasons_have_one_line():
-    reasons = {"a": "a: error 17.4 % on x", "b": "b: error 16.2 % on x", "c": "c: error 51 %"}
-    verdicts = {
-        joint: {"status": "poor" if joint == "c" else "usable", "reasons": [why]}
-        for joint, why in reasons.items()
-    }
-    measured = {joint: {"relative_error_pct": 20.0} for joint in verdicts}
-    html = error_bars(TORQUE, [Errors("y", measured)], list(verdicts), verdicts)
-    (common,) = re.findall(r'<p class="common usable">(.*?)</p>', html)
-    assert common == "<strong>usable</strong>: a, b: error 17.4 % on x (the worst)"
-    whys = re.findall(r'<span class="why">(.*?)</span>', html)
-    assert whys == ["", "", "error 51 %"]
 
 
 def test_masses_and_sources_are_those_of_the_result(screen, identified):

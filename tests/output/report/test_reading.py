@@ -2,15 +2,13 @@
 
 import csv
 import io
-import re
 from pathlib import Path
 
 import pytest
 from helpers.browsing import until, visit
 
-from robotid.output.pages.html import asset
 from robotid.output.report.document import write_report
-from robotid.output.report.steps import Origin
+from robotid.output.report.next_steps import Origin
 
 PARAMETERS = "Parameters of links and drives"
 
@@ -114,30 +112,3 @@ def test_a_link_opens_what_it_leads_to(seen):
     top = page.locator(key).bounding_box()["y"]
     assert 30 < top < 400  # below the contents, which stay
     assert page.locator("nav").bounding_box()["y"] == 0
-
-
-def luminance(colour):
-    rgb = [int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5)]
-    linear = [x / 12.92 if x <= 0.04045 else ((x + 0.055) / 1.055) ** 2.4 for x in rgb]
-    return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
-
-
-def contrast(one, other):
-    high, low = sorted((luminance(one), luminance(other)), reverse=True)
-    return (high + 0.05) / (low + 0.05)
-
-
-def test_every_tone_of_text_can_be_read_on_the_page_and_on_its_boxes():
-    def tones(css):
-        found = dict(re.findall(r"--([\w-]+):\s*(#[0-9a-f]+)", css))
-        return {
-            k: v if len(v) == 7 else "#" + "".join(2 * c for c in v[1:]) for k, v in found.items()
-        }
-
-    light, dark = asset("tones.css").split("@media", 1)
-    schemes = [tones(light), tones(light) | tones(dark)]
-    schemes.append(tones(light) | tones(asset("page.css").split("@media print", 1)[1]))
-    for scheme in schemes:
-        for name in ("text", "quiet", "predicted", "residual", "good", "usable", "poor"):
-            for ground in ("page", "soft"):
-                assert contrast(scheme[name], scheme[ground]) >= 4.5, (name, ground, scheme[name])

@@ -10,7 +10,7 @@ from helpers.figures import figures
 from helpers.pages import number, percent, tables
 
 from robotid.identification.summary import verdict_cell
-from robotid.output.report.steps import Origin
+from robotid.output.report.next_steps import Origin
 from robotid.output.report.tables import (
     _drive_table,
 )
@@ -20,17 +20,6 @@ from robotid.output.report.torque_report import torque_report
 @pytest.fixture(scope="module")
 def shown(report):
     return tables(report)
-
-
-def text_of(html):
-    plain = re.sub(r"<style>.*?</style>|<svg.*?</svg>", "", html, flags=re.DOTALL)
-    plain = re.sub(r"<wbr>", "", plain)
-    return " ".join(re.sub(r"<[^>]*>", " ", plain).replace("&#x27;", "'").split())
-
-
-def section(html, key):
-    """Return what is folded under a key; the next thing with a key ends it."""
-    return html.split(f'<details id="{key}">')[1].split("<details id=")[0].split("</section>")[0]
 
 
 @pytest.mark.parametrize(
@@ -60,11 +49,6 @@ def test_errors_are_those_of_estimate_wls_and_baselines(shown, identified, capti
     # figures that are alike would hide a swap
     for one, other in (("error %", "WLS %"), ("WLS %", "URDF %"), ("URDF %", "gravity only %")):
         assert shown[caption].column(one) != shown[caption].column(other)
-
-
-def relative(value, error):
-    share = 100 * error / abs(value) if np.isfinite(error) else np.nan
-    return "> 999" if share >= 1000 else percent(share)
 
 
 def with_error(value, error):
@@ -112,21 +96,6 @@ def test_every_parameter_stands_beside_that_of_the_urdf(shown, identified):
     assert set(columns.column("determined by")) == set(words.values())
 
 
-def test_base_parameters_have_their_values_errors_and_expressions(shown, identified):
-    mapping, rows = identified.mapping, shown["Base parameters"].rows
-    assert [row[0] for row in rows] == list(mapping.base_names)
-    assert len({row[2] for row in rows}) > 20  # errors differ: one for all would show
-    open_ = (*identified.determination.undetermined, "elbow_joint.viscous")  # this at its bound
-    assert [row[0] for row in rows if row[2] == "–"] == list(open_)
-    for k, row in enumerate(rows):
-        value, error = float(mapping.K[k] @ identified.standard), identified.base_error[k]
-        error = np.inf if row[0] in open_ else error
-        assert tuple(row[1:3]) == with_error(identified.base[k], error)
-        assert row[3] == relative(value, error)
-        assert row[4] == identified.model.layout.units[mapping.independent[k]]
-        assert row[5] == mapping.expressions[k]
-
-
 def test_the_lines_of_the_urdf_that_change_stand_under_the_name_of_their_link(identified):
     diff = torque_report(identified, Origin()).parameters
     links = re.findall(r"<strong>(.*?)</strong>", diff)
@@ -139,33 +108,6 @@ def test_the_lines_of_the_urdf_that_change_stand_under_the_name_of_their_link(id
     assert [float(x) for x in gone] == [*before[moved].tolist(), 0.0, 0.0]
     masses = [float(x) for x in re.findall(r"<ins>\+.*?mass value=&quot;(.*?)&quot;", diff)]
     assert masses == after[moved].tolist()
-
-
-def smallest_eigenvalue(pi):
-    m, c, inertia = pi[0], pi[1:4], pi[[4, 5, 7, 5, 6, 8, 7, 8, 9]].reshape(3, 3)
-    second = np.trace(inertia) / 2 * np.eye(3) - inertia
-    return np.linalg.eigvalsh(np.block([[second, c[:, None]], [c[None], np.array([[m]])]]))[0]
-
-
-def test_masses_and_eigenvalues_are_those_of_each_body(shown, identified):
-    *rows, total = shown["Mass and pseudo-inertia of each body"].rows
-    assert [row[0] for row in rows] == list(identified.model.layout.bodies)
-    for i, row in enumerate(rows):
-        before, after = (x[10 * i : 10 * i + 10] for x in (identified.prior, identified.standard))
-        lows = [number(smallest_eigenvalue(pi), ".3g") for pi in (before, after)]
-        assert row[1:] == [number(before[0]), number(after[0]), *lows, ""]
-    totals = [number(x[:60:10].sum()) for x in (identified.prior, identified.standard)]
-    assert total[:3] == ["total", *totals]
-
-
-def test_what_is_open_is_named(report, shown, identified):
-    layout, said = identified.model.layout, text_of(section(report, "open"))
-    assert f"The data determine {identified.determination.rank} of {len(identified.base)} " in said
-    never = ", ".join(identified.mapping.unidentifiable)
-    assert f"Parameters without effect on the torque {never} Standard" in said
-    kept = [n for n, s in zip(layout.names, identified.sources, strict=True) if s == "prior"]
-    title = "Standard parameters that remain at the URDF's values"
-    assert said.endswith(f"{title} {', '.join(kept)}")
 
 
 def test_a_drive_parameter_that_stands_on_a_misfit_says_so(identified):

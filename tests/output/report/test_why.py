@@ -5,7 +5,7 @@ from html import unescape
 
 import numpy as np
 import pytest
-from helpers.pages import charts, number, percent, tables
+from helpers.pages import number, percent, tables
 
 from robotid.diagnosis.residual.torque_split import joint_torques
 from robotid.output.report.torque_report import why_section
@@ -51,26 +51,3 @@ def test_the_tables_hold_the_root_mean_squares(section, identified):
             assert rows["motor inertia"]["RMS N m"] == number(inertia, ".3g")
         viscous = theta[f"{joint}.viscous"] * np.sqrt(np.mean(motion.v[mask, j] ** 2))
         assert f"viscous {viscous:.3g}" in rows["friction"]["terms, RMS"]
-
-
-def test_stacked_parts_in_the_page_sum_to_the_prediction(section, identified):
-    kept, joints = identified.validation[0], identified.model.joints
-    motion, predicted = kept.recording.trajectory, kept.torques["estimate"]
-    split = [chart for chart in charts(section) if chart["title"].startswith("Torque of")]
-    assert len(split) == len(joints)
-    for chart in split:
-        j = joints.index(chart["title"].split()[2])
-        parts = {s["label"]: np.asarray(s["y"]) for s in chart["series"]}
-        known = np.isfinite(parts["measured"])
-        rows = np.searchsorted(motion.t, np.asarray(chart["x"])[known] - 1e-4)
-        stacked = sum(
-            parts[s["label"]][known] for s in chart["series"]
-            if s["kind"] == "area" and s["label"] != "residual"
-        )  # fmt: skip
-        # each part is exact to 1/65,000 of its range
-        scale = sum(np.ptp(y[known]) for y in parts.values()) / 60_000
-        np.testing.assert_allclose(stacked, predicted[rows, j], atol=scale)
-        whole = stacked + parts["residual"][known]
-        np.testing.assert_allclose(whole, motion.tau[rows, j], atol=scale)
-        assert np.isnan(parts["friction"]).sum() == 1, "the gap of the log breaks the areas"
-        assert len(rows) > 200

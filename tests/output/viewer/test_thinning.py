@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from robotid.output.viewer.thinning import thin
+from robotid.output.viewer.scene import thin
 from robotid.robot.geometry import Surface
 
 
@@ -78,19 +78,3 @@ def test_sharp_edges_get_a_corner_for_each_side_and_smooth_ones_do_not():
     assert len(cube.vertices) == 24
     assert len(sphere.vertices) == len(ball.vertices)
     assert thin([[]], 100) == [[]]
-
-
-def test_a_surface_without_an_outside_is_not_called_closed(rng):
-    """Six corners and ten triangles, every edge on two of them: a projective plane has one side."""
-    ball = trimesh.creation.icosahedron()
-    opposite = np.argmin(ball.vertices @ ball.vertices.T, axis=1)
-    corner = np.unique(np.minimum(np.arange(12), opposite), return_inverse=True)[1]
-    faces = np.unique(np.sort(corner[ball.faces], axis=1), axis=0)
-    assert faces.shape == (10, 3)
-    sides = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-    assert (np.unique(sides, axis=0, return_counts=True)[1] == 2).all()
-    plane = Surface(rng.standard_normal((6, 3)), faces, None)
-    (thinned,), (solid,) = thin([[plane], [surface_of(ball)]], 100)
-    assert len(thinned.faces) == 10
-    assert not thinned.is_closed
-    assert solid.is_closed

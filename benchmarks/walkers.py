@@ -5,14 +5,15 @@ from itertools import pairwise
 
 import numpy as np
 import pinocchio as pin
+from helpers.legged import SETTLES, followed
 from scipy.interpolate import CubicSpline
 from scipy.linalg import solve_banded
 
-from helpers.legged import SETTLES, followed
 from robotid.robot.constraints import Contact, frame_id
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 
+_STEP = 1e-4  # [s] of the finite differences of the motion
 _PLAN = 50.0  # [Hz] of postures; a cubic spline lies between them
 _PERIOD = 5.0  # [s] of a step with each foot
 _DRIVES = ("armature", "viscous")
@@ -161,6 +162,32 @@ def steps(biped, model, rng, duration):
     ]
     at = CubicSpline(t[1:-1], np.hstack([places[1:-1, 7:], torques]))
     return places[2], lambda time: np.split(at(time), [len(model.joints)])
+
+
+def forces(robot, q_at, t, frames):
+    """Return the wrench that moves a robot, and the placements of frames, by plain RNEA.
+
+    Args:
+        robot: Its Pinocchio model.
+        q_at: Pose of the base and positions of joints, shape (N, 7 + n), from times.
+        t: Times, shape (N,) [s].
+        frames: Names of the frames.
+
+    Returns:
+        The wrench at the origin of the world, shape (N, 6), and placements, shape (N, k), objects.
+    """
+    data = robot.createData()
+    ids = [robot.getFrameId(name) for name in frames]
+    total, places = np.empty((len(t), 6)), np.empty((len(t), len(ids)), dtype=object)
+    before, now, after = q_at(t - _STEP), q_at(t), q_at(t + _STEP)
+    for k in range(len(t)):
+        first = pin.difference(robot, before[k], now[k]) / _STEP
+        last = pin.difference(robot, now[k], after[k]) / _STEP
+        tau = pin.rnea(robot, data, now[k], (first + last) / 2, (last - first) / _STEP)
+        pin.framesForwardKinematics(robot, data, now[k])
+        total[k] = data.oMi[1].act(pin.Force(tau[:6])).vector
+        places[k] = [data.oMf[i].copy() for i in ids]
+    return total, places
 
 
 class _Posture:
