@@ -55,26 +55,22 @@ _FREQUENCIES = 2048  # frequencies at which the noise of an acceleration is summ
 
 @dataclass(frozen=True, eq=False)
 class RegressorNoise:
-    """Effect of position quantisation on least squares.
+    """Effect of position quantisation on least squares."""
 
-    Attributes:
-        steps: Largest quantisation step of each joint's position in the logs, shape (n,)
-            [rad or m]; 0: none, or without effect because velocities are measured.
-        share: RMS of the quantisation noise of each acceleration, over the RMS of the
-            acceleration, shape (n,) [-].
-        shift: Bias of the base parameters, E[theta_ls] - theta, shape (b,).
-        std_error: Standard errors of the base parameters by residual and filter, without the
-            quantisation, shape (b,); inf if not identifiable.
-        meat: Covariance of the score that the scatter of segments does not include, shape (b, b):
-            of repeated rounding errors and of the shift.
-        is_corrected: Whether the estimate is corrected; if not, its covariance includes the shift.
-    """
-
+    #: (n,), largest quantisation step of each joint's position in the logs [rad or m]; 0: none, or
+    #: without effect because velocities are measured.
     steps: Array
+    #: (n,), RMS of the quantisation noise of each acceleration, over the RMS of the acceleration
+    #: [-].
     share: Array
-    shift: Array
+    shift: Array  # (b,), bias of the base parameters, E[theta_ls] - theta
+    #: (b,), standard errors of the base parameters by residual and filter, without the
+    #: quantisation; inf if not identifiable.
     std_error: Array
+    #: (b, b), covariance of the score that the scatter of segments does not include: of repeated
+    #: rounding errors and of the shift.
     meat: Array
+    #: Whether the estimate is corrected; if not, its covariance includes the shift.
     is_corrected: bool = True
 
     def uncorrected(self, information: Array) -> "RegressorNoise":
