@@ -9,14 +9,7 @@ import numpy as np
 
 from robotid.base.arguments import real_numbers
 from robotid.base.exceptions import DataError
-from robotid.base.settings import (
-    NOT_NEGATIVE,
-    POSITIVE,
-    Settings,
-    is_number,
-    require_kind,
-    setting,
-)
+from robotid.base.settings import NOT_NEGATIVE, POSITIVE, Settings, is_number, require_kind, setting
 from robotid.base.typing import Array
 from robotid.data.log import Log, Trajectory
 from robotid.dynamics.base_parameters import structural_mapping
