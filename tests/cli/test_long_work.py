@@ -17,7 +17,7 @@ from helpers.synthetic import exact_log, truth
 
 from robotid.cli import main
 from robotid.data.files.read import write_log
-from robotid.estimation.workers.pools import Pool
+from robotid.estimation.workers.plan import Pool
 from robotid.robot.model import RobotModel
 
 URDF = str(ROOT / "urdf" / "planar_2r.urdf")

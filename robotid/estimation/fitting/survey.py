@@ -42,7 +42,7 @@ from robotid.dynamics.factors import Reduction
 from robotid.dynamics.prediction import is_loaded, remember
 from robotid.dynamics.rows import COMPILED, choose_engine
 from robotid.dynamics.used_rows import base_problem, prefers_measured, row_mask, static_rows
-from robotid.estimation.workers.pools import Workload
+from robotid.estimation.workers.plan import Workload
 from robotid.robot.model import RobotModel
 
 #: Default number of rows of a piece.
@@ -172,35 +172,23 @@ class ReducedPiece(PieceTask):
 
 @dataclass(frozen=True, eq=False)
 class SurveyedLog:
-    """A surveyed log, which can be read in pieces.
-
-    Attributes:
-        model: The robot.
-        source: The log if it is in memory, else the assignment of columns of its file.
-        asked: Settings of the processing to a trajectory, as given by the user.
-        stamps: Time stamps of all rows of the file, shape (N,) [s].
-        first: First row of the log in the file.
-        stop: The row after the last one.
-        windows: Ranges of rows that were checked: all rows, or the first, middle and last ones.
-        locked: Positions of locked joints in the windows, if the file has them, by name [rad or m].
-        length: Rows per piece.
-        places: Positions in the file at which blocks of rows start.
-        unit: Name of the robot, if there are several of one kind.
-        given: Its rows if it is in memory and they were smoothed before.
-    """
+    """A surveyed log, which can be read in pieces."""
 
     model: RobotModel
+    #: The log if it is in memory, else the assignment of columns of its file.
     source: LogLayout | Log
-    asked: SignalSettings
-    stamps: Array
-    first: int
-    stop: int
+    asked: SignalSettings  # settings of the processing to a trajectory, as given by the user
+    stamps: Array  # (N,), time stamps of all rows of the file [s]
+    first: int  # first row of the log in the file
+    stop: int  # the row after the last one
+    #: Ranges of rows that were checked: all rows, or the first, middle and last ones.
     windows: tuple[Log, ...]
+    #: Positions of locked joints in the windows, if the file has them, by name [rad or m].
     locked: Mapping[str, Array] = field(default_factory=dict)
-    length: int = PIECE
-    places: Sequence[Place] = (Place(),)
-    unit: str = ""
-    given: Rows | None = None
+    length: int = PIECE  # rows per piece
+    places: Sequence[Place] = (Place(),)  # positions in the file at which blocks of rows start
+    unit: str = ""  # name of the robot, if there are several of one kind
+    given: Rows | None = None  # its rows if it is in memory and they were smoothed before
 
     @property
     def path(self) -> str:

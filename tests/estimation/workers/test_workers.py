@@ -1,6 +1,5 @@
 """Who works on pieces never shows in the result; what goes wrong is said by name."""
 
-import logging
 import os
 import pickle
 import subprocess
@@ -21,8 +20,7 @@ from robotid.base.exceptions import (
     WorkerError,
 )
 from robotid.dynamics.factors import available_cores
-from robotid.estimation.workers.plan import WorkPlan, choose_workers
-from robotid.estimation.workers.pools import Pool, run_task
+from robotid.estimation.workers.plan import Pool, WorkPlan, choose_workers
 
 # a busy disk is no error of a cluster
 pytestmark = pytest.mark.filterwarnings("ignore:Creating scratch directories:UserWarning")
@@ -224,14 +222,3 @@ def test_errors_travel_between_processes_with_their_facts(error):
     assert type(again) is type(error)
     assert str(again) == str(error)
     assert vars(again) == vars(error)
-
-
-def test_a_task_leaves_the_logger_as_it_was(tmp_path):
-    (piece,) = pieces_in(tmp_path / "marks", 1)
-    logger = logging.getLogger("robotid")
-    before = logger.level, list(logger.handlers)
-    assert run_task(reduce_piece, piece, logging.WARNING)[1] == []
-    assert run_task(reduce_piece, piece, logging.INFO)[1] == [
-        ("robotid.piecework", logging.INFO, "reduced random rows 0")
-    ]
-    assert (logger.level, logger.handlers) == before

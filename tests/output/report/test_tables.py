@@ -10,7 +10,7 @@ from helpers.figures import figures
 from helpers.pages import number, percent, tables
 
 from robotid.identification.summary import verdict_cell
-from robotid.output.report.steps import Origin
+from robotid.output.report.next_steps import Origin
 from robotid.output.report.tables import (
     _drive_table,
 )
