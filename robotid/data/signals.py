@@ -212,15 +212,7 @@ def _process(part: _Part, segments: Sequence[Segment]) -> Trajectory:
     log, settings, n = part.log, part.settings, len(part.log.joints)
     base = 0 if log.base is None else 6
     motions = [_smooth(part, segment) for segment in segments]
-    widths = (
-        0,
-        n + (base and 7),
-        base + n,
-        base + n,
-        base + n,
-        len(part.speeds),
-        len(log.wrenches),
-    )
+    widths = 0, n + (base and 7), *[base + n] * 3, len(part.speeds), len(log.wrenches)
     nothing = [np.empty((0, width) if width or k else 0) for k, width in enumerate(widths)]
     moving = [motion for motion in motions if motion]
     t, q, v, a, tau, direction, wrenches = map(np.concatenate, zip(nothing, *moving, strict=True))

@@ -145,9 +145,9 @@ def test_datasets_that_do_not_fit_are_refused(tmp_path, change, text):
     path = dataset(tmp_path)
     file = path / "meta" / "info.json"
     info = json.loads(file.read_text())
-    info["features"] = change
-    if change is MISSING:
-        del info["features"]
+    features = info.pop("features")
+    if change is not MISSING:
+        info["features"] = features | change if change and "action" in change else change
     file.write_text(json.dumps(info))
     with pytest.raises(DataError, match=text):
         read_log(path, JOINTS, needs="commands", units=DEGREES)
