@@ -34,10 +34,10 @@ import numpy as np
 
 from robotid.base.findings import Finding, listed
 from robotid.base.typing import Array
-from robotid.data.filters import local_polynomial
 from robotid.data.log import Trajectory
 from robotid.data.measured_velocity import quantum
 from robotid.data.signal_settings import SignalSettings
+from robotid.data.signals import local_polynomial
 from robotid.dynamics.base_parameters import BaseMapping
 from robotid.dynamics.factors import Factors, Reduction
 from robotid.estimation.estimators.batch import solve_factor
