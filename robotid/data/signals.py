@@ -563,8 +563,8 @@ def _means(values: Array, first: Array, total: Array) -> Array:
     return means
 
 
-# The filters equal sosfiltfilt and savgol_filter of scipy.signal, whose import takes longer than the
-# doctor.
+# The filters equal sosfiltfilt and savgol_filter of scipy.signal, whose import takes longer than
+# the doctor.
 
 
 @cache  # a log has few filters, each for many channels
