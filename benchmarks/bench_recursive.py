@@ -32,7 +32,7 @@ from robotid.dynamics.torque import (
 )
 from robotid.estimation.estimators import PRX, RLS, Kalman, NormalisedGradient, fold
 from robotid.estimation.estimators.descent import column_scale
-from robotid.identification.online.identifier import OnlineIdentifier
+from robotid.identification.online import OnlineIdentifier
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 

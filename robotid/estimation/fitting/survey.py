@@ -264,20 +264,27 @@ class SurveyedLog:
         is_alike = np.array_equal(friction_speeds(model.layout), friction_speeds(before.layout))
         if self.is_in_memory and is_alike:
             rows = self.pieces[0].read()
-            motion, mask = rows.trajectory, rows.mask
+            motion = rows.trajectory
             if model.layout != before.layout or is_loaded(model):
                 motion = remember(model, motion.with_states(None))
-            # static rows were chosen by their speeds already, those of a free base without its
-            # jumps and with the forces of its contacts
-            if not (model.is_static or model.constraints or motion.switching is not None):
-                mask = row_mask(model, motion, self.signals.min_velocity)
-            given = replace(rows, trajectory=motion, mask=mask)
+            given = self._rows_of(model, replace(rows, trajectory=motion))
         return replace(self, model=model, asked=self.signals, given=given)
 
     def with_torque(self, tau: Array) -> "SurveyedLog":
         """Return a log in memory with other torques of its smoothed motion, shape (N, n_rows)."""
-        rows = self.whole
-        return replace(self, given=replace(rows, trajectory=replace(rows.trajectory, tau=tau)))
+        rows = replace(self.whole, trajectory=replace(self.whole.trajectory, tau=tau))
+        return replace(self, given=self._rows_of(self.model, rows))
+
+    def _rows_of(self, model: RobotModel, rows: Rows) -> Rows:
+        """Return rows with those used chosen again, now that they have torques of this robot.
+
+        Static rows were chosen by their speeds already, those of a free base without its jumps and
+        with the forces of its contacts.
+        """
+        if model.is_static or model.constraints or rows.trajectory.switching is not None:
+            return rows
+        mask = row_mask(model, rows.trajectory, self.signals.min_velocity)
+        return replace(rows, mask=mask)
 
     def with_accelerometer_bias(self, bias: Array) -> "SurveyedLog":
         """Return the log with another bias of the accelerometers of its IMU: bias (3,) [m/s^2]."""

@@ -3,6 +3,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from helpers.findings import Figures
 from helpers.fitting import fit, identify
 from helpers.paths import ROOT
 from helpers.synthetic import truth
@@ -10,6 +11,7 @@ from helpers.synthetic import truth
 from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import process
+from robotid.diagnosis.verdict.fit_findings import encoder_noise
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.factors import join
 from robotid.dynamics.simulation.motions import random_fourier
@@ -179,7 +181,7 @@ def test_fine_encoders_change_nothing_and_are_not_named(planar, motion, step):
     log = recorded(planar, motion, step=step)
     found = fit(planar, [log], signals=SIGNALS, estimator="wls")
     assert found.regressor_noise is None
-    assert regressor_noise.encoder_findings(found.regressor_noise, found.model, found.mapping) == []
+    assert list(encoder_noise(found)) == []
 
 
 def test_measured_velocities_have_no_noise_of_the_positions(planar, motion):
@@ -244,7 +246,9 @@ def test_a_finding_names_the_joints_of_coarse_steps_and_the_worst_inertial_sum(
     layout = SimpleNamespace(n_inertial=2, prismatic={"d"})
     model = SimpleNamespace(joints=tuple("abcd"), layout=layout)
     mapping = SimpleNamespace(K=K, base_names=("x", "y", "z"))
-    found = regressor_noise.encoder_findings(noise, model, mapping)
+    found = list(
+        encoder_noise(SimpleNamespace(regressor_noise=noise, model=model, mapping=mapping))
+    )
     assert len(found) == (severity is not None)
     if not found:
         return
@@ -258,7 +262,7 @@ def test_a_finding_names_the_joints_of_coarse_steps_and_the_worst_inertial_sum(
         f"40 % of the RMS acceleration and shifts z by {size:.1f} standard errors"
         in finding.message
     )
-    assert finding.evidence == pytest.approx(
+    assert Figures(finding) == pytest.approx(
         {
             "step_a": steps[0],
             "step_c": steps[2],
