@@ -26,7 +26,8 @@ sys.path.insert(0, str(ROOT / "tests"))
 
 import numpy as np
 from helpers.corruptions import CASES, ROBOTS, clean_log, robot, table_of
-from helpers.servos import bandwidth, faulty_logs, good_commands, record, some_servos
+from helpers.servos import record
+from random_servos import bandwidth, faulty_logs, good_commands, some_servos
 
 from robotid.cli.job import Job, LogEntry, read_job
 from robotid.cli.logs import examine

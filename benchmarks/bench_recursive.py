@@ -32,7 +32,7 @@ from robotid.dynamics.torque import (
 )
 from robotid.estimation.estimators import PRX, RLS, Kalman, NormalisedGradient, fold
 from robotid.estimation.estimators.descent import column_scale
-from robotid.identification.online.identifier import OnlineIdentifier
+from robotid.identification.online import OnlineIdentifier
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 
@@ -180,7 +180,6 @@ def steps(samples):
         "Kalman, walk and gate": (ours(bench, Kalman(bench.sigma, **prior, walk=1e-6)), "Kalman"),
         "PRX exact": (ours(bench, PRX(bench.sigma, average=False, **prx)), "PRX"),
         "PRX exact, averaged": (ours(bench, PRX(bench.sigma, **prx)), "PRX"),
-        "PRX exact, rows": (ours(bench, PRX(bench.sigma, metric="rows", **prx)), "PRX"),
         "PRX printed": (
             ours(bench, PRX(bench.sigma, bench.start, step="printed", average=False), True),
             "PRX",

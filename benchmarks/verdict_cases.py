@@ -635,7 +635,7 @@ CASES = {
     "gaps of 0.5 and 1 s": Case(FINE, ("gap",), record=gaps),
     # the wrong robot
     "hand of the URDF not mounted": Case(
-        FINE, ("unmounted_part", "payload", "urdf_mismatch"), world="hand"
+        FINE, ("payload", "urdf_mismatch"), world="hand"
     ),
     "1 kg in the fitted log": Case(
         NOT_GOOD, ("payload", "payload_change", "urdf_mismatch"), loads=(True, False)

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from robotid.design.previews import preview
     from robotid.diagnosis.urdf.inspection import inspect_urdf as inspect
     from robotid.estimation.fitting.estimator_settings import EstimatorSettings
-    from robotid.identification.online.identifier import OnlineIdentifier
+    from robotid.identification.online import OnlineIdentifier
     from robotid.identification.payload_fit import identify_payload as payload
     from robotid.identification.result import Identification
     from robotid.output.files.result_file import load_result
@@ -47,7 +47,7 @@ _PLACES = {
     "Log": "data.log.Log",
     "Trajectory": "data.log.Trajectory",
     "Identification": "identification.result.Identification",
-    "OnlineIdentifier": "identification.online.identifier.OnlineIdentifier",
+    "OnlineIdentifier": "identification.online.OnlineIdentifier",
     "EstimatorSettings": "estimation.fitting.estimator_settings.EstimatorSettings",
     "SignalSettings": "data.signal_settings.SignalSettings",
     "RobotIdError": "base.exceptions.RobotIdError",

@@ -25,7 +25,7 @@ PACKAGES = {
     "dynamics": ["kernels", ".", "simulation"],
     "estimation": ["workers", "estimators", "variation", "fitting"],
     "diagnosis": [".", "urdf", "logs", "residual", "verdict"],
-    "identification": [".", "closed_loop", "online"],
+    "identification": [".", "closed_loop"],
     "design": ["."],
     "output": ["pages", "files", "viewer", "report"],
     "paper": ["."],

@@ -26,7 +26,7 @@ from robotid.design.motion_files import write_motion
 from robotid.dynamics.prediction import predict_instants
 from robotid.dynamics.simulation.motions import random_fourier
 from robotid.dynamics.simulation.simulation_settings import Simulation
-from robotid.output.files.samples import sample
+from robotid.output.files.ranges import sample
 from robotid.robot.examples import example_urdf
 
 PAGES = sorted([*DOCS.glob("tutorials/*.md"), *DOCS.glob("how_to/*.md")])

@@ -18,7 +18,6 @@ from robotid.cli.job import read_job
 from robotid.data.base_motion import BaseMotion
 from robotid.data.signal_settings import LogSource
 from robotid.output.files.mjcf import write_mjcf
-from robotid.output.files.ranges import write_ranges
 from robotid.output.files.sdf import write_sdf
 from robotid.output.files.urdf import write_urdf
 from robotid.output.report import pictures
@@ -109,8 +108,6 @@ CALLS = {
     "path    ": lambda m, log: robotid.inspect(5),
     "model ": lambda m, log: robotid.OnlineIdentifier(5),
     "settings": lambda m, log: robotid.OnlineIdentifier(m, 5),
-    "identification": lambda m, log: write_report(5, "x.html"),
-    "found": lambda m, log: write_ranges(5, "x.yaml"),
     "pi": lambda m, log: write_urdf(m, 5, "x.urdf"),
     "target": lambda m, log: write_sdf(m, m.standard_parameters(), 5),
     "model  ": lambda m, log: write_mjcf(5, m.standard_parameters(), "x.xml"),
@@ -305,12 +302,6 @@ def test_flags_and_numbers_of_numpy_are_flags_and_numbers(log):
     part = log.window(np.float32(0.1), np.int64(1))
     assert (part.t[0], part.t[-1]) == (0.12, 1.0)
     assert len(log.window(-np.inf, np.inf).t) == len(log.t)
-
-
-def test_files_of_a_page_are_named_by_text(found, tmp_path):
-    with pytest.raises(SettingsError, match=r"an entry of files is \['result', 5\]"):
-        write_report(found, tmp_path / "page.html", files={"result": 5})
-    assert not list(tmp_path.iterdir())
 
 
 JUNK = (5, 0.5, "x", [None], {1: 2}, object(), np.zeros(0), np.array(["a", "b", "c"]))

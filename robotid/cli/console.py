@@ -20,7 +20,7 @@ from robotid.base.text import command_lines, period, terminal_width, tinted, wra
 if TYPE_CHECKING:
     from robotid.base.findings import Finding
     from robotid.base.typing import ProgressCallback
-    from robotid.output.report.steps import Step
+    from robotid.output.report.next_steps import Step
 
 _LAST_STREAM = 2  # the number of the standard error stream
 _ENDS = tuple(getattr(signal, n) for n in ("SIGTERM", "SIGHUP") if hasattr(signal, n))

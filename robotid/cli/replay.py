@@ -42,8 +42,7 @@ from robotid.output.files.result_file import (
 )
 from robotid.output.files.shape import check_shape, schema
 from robotid.output.report.pictures import shown_evaluation
-from robotid.output.viewer.replays import Bands, Mark, Replay, Torques, replay
-from robotid.output.viewer.unexplained import find_unexplained
+from robotid.output.viewer.replays import Bands, Mark, Replay, Torques, find_unexplained, replay
 from robotid.robot.model import RobotModel
 
 #: Columns of the pose of a floating base in the world: position [m] and quaternion.

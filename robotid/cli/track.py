@@ -30,7 +30,7 @@ from robotid.data.files.formats import write_columns
 from robotid.data.files.parquet_files import load_pyarrow
 from robotid.data.log import Log
 from robotid.dynamics.base_parameters import structural_mapping
-from robotid.identification.online.identifier import (
+from robotid.identification.online import (
     Observer,
     OnlineIdentifier,
     OnlineSettings,

@@ -1,7 +1,8 @@
 """Distances between the links of a moving robot, and to the floor and to boxes.
 
 Every shape is replaced by its convex hull, which contains it. Distances between hulls are computed
-by coal. A hull moves with the screws of the joints before it, so a distance has an exact gradient.
+by coal, where spheres and boxes around them do not show that they are apart. A hull moves with the
+screws of the joints before it, so a distance has an exact gradient.
 """
 
 from collections.abc import Sequence
@@ -35,7 +36,6 @@ _WIDE = 100.0  # [m] extent of the floor
 _SPARE = 0.002  # [m] reserve of distances for the motion between samples, but at most ...
 _SPARE_SHARE = 0.25  # ... this share of the slack of links that are close by design
 _EXACT = 0.01  # [m] margin below which distances are exact
-_SIGNS = np.array(np.meshgrid(*[[-1.0, 1.0]] * 3)).reshape(3, -1).T  # corners of a box, (8, 3)
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,6 @@ class _Hull:
     centre: Array
     radius: float
     half: Array  # of the box around it, in that frame, shape (3,)
-    corners: Array  # about the centre, shape (k, 3)
     shape: Any  # of coal, about the centre
 
 
@@ -214,49 +213,46 @@ class Clearance:
         spare: Array = np.minimum(_SPARE, _SPARE_SHARE * self.slack)[:, None]
         return spare
 
-    def margins(self, placed: Placements, spare: float, *, hints: Array | None = None) -> Array:
+    def margins(self, placed: Placements, spare: float) -> Array:
         """Return margins of distances, shape (pairs, N) [m]; a lower bound of those over 1 cm."""
         required = self.required[:, None] + spare * self.spare
         exact = np.minimum(_EXACT, self.slack[:, None] / 4)
-        return self.near(placed, required + exact, hints=hints).distance - required
+        return self.near(placed, required + exact).distance - required
 
     def placed(self, q: Array) -> Placements:
         """Return the poses of the bodies: q (N, n) [rad or m]."""
         return Placements.along(self._tree, q)
 
     def near(
-        self,
-        placed: Placements,
-        within: float | Array,
-        chosen: Array | None = None,
-        hints: Array | None = None,
+        self, placed: Placements, within: float | Array, chosen: Array | None = None
     ) -> Nearness:
         """Return the distances of pairs along a motion, exact where they are near."""
-        # within (pairs, N) [m], chosen (pairs,), hints (pairs, N, 3)
+        # within (pairs, N) [m], chosen (pairs,)
         import coal
 
-        from robotid.design.gap_lanes import lower_bounds  # imports Numba
-
         chosen = self.likely if chosen is None else chosen
-        bound = np.full((len(self.pairs), placed.p.shape[2]), np.inf)
+        bound = self._apart(placed, chosen)
         limit = np.broadcast_to(within, bound.shape)
-        hints = np.zeros((*bound.shape, 3)) if hints is None else hints
-        numbers, enough = np.flatnonzero(chosen), np.array(limit, order="C")
-        lower_bounds(numbers, self.pairs, enough, hints, bound, placed.R, placed.p, *self._corners)
         pairs, samples = np.nonzero(bound < limit)
         hulls = self.pairs[pairs].T  # (2, k)
-        centres, rotations = self._poses(placed, hulls.ravel(), np.tile(samples, 2))
-        shapes = [self._hulls[k].shape for k in hulls.ravel().tolist()]
-        poses = [coal.Transform3s(R, x) for R, x in zip(rotations, centres, strict=True)]
+        centres, rotations = self._poses(placed, hulls, samples)
+        by_boxes = self._between_boxes(hulls, centres, rotations)
+        bound[pairs, samples] = np.maximum(bound[pairs, samples], by_boxes)
+        is_near = bound[pairs, samples] < limit[pairs, samples]
+        pairs, samples = pairs[is_near], samples[is_near]
+        shapes = [[self._hulls[k].shape for k in side] for side in hulls[:, is_near].tolist()]
+        poses = [
+            [coal.Transform3s(R, x) for R, x in zip(turns[is_near], places[is_near], strict=True)]
+            for turns, places in zip(rotations, centres, strict=True)
+        ]
         count, result, exact = len(pairs), coal.DistanceResult(), np.empty(len(pairs))
         points, normals = np.empty((2, count, 3)), np.empty((count, 3))
-        for k in range(count):
-            one, other = (shapes[k], poses[k]), (shapes[count + k], poses[count + k])
+        for k, sides in enumerate(zip(shapes[0], poses[0], shapes[1], poses[1], strict=True)):
             result.clear()
-            exact[k] = coal.distance(*one, *other, self._request, result)
+            exact[k] = coal.distance(*sides, self._request, result)
             points[:, k] = result.getNearestPoint1(), result.getNearestPoint2()
             normals[k] = result.normal
-        bound[pairs, samples], hints[pairs, samples] = exact, normals
+        bound[pairs, samples] = exact
         gradient = self._gradient(placed, pairs, samples, points, normals)
         return Nearness(bound, pairs, samples, gradient)
 
@@ -316,24 +312,48 @@ class Clearance:
                     body = int(tree.parents[body + 1]) - 1
         return out
 
+    def _apart(self, placed: Placements, chosen: Array) -> Array:
+        """Return the distances of the spheres around chosen pairs, (pairs, N); inf of others."""
+        bodies, middles = self._bodies, self._middles
+        radii = np.array([hull.radius for hull in self._hulls])
+        turned = np.einsum("cdhn,hd->chn", placed.R[:, :, bodies], middles)
+        is_fixed = (bodies < 0)[:, None]
+        centres = np.where(is_fixed, middles.T[:, :, None], turned + placed.p[:, bodies])
+        first, second = self.pairs[chosen].T
+        bound = np.full((len(self.pairs), placed.p.shape[2]), np.inf)
+        between = np.linalg.norm(centres[:, second] - centres[:, first], axis=0)
+        bound[chosen] = between - (radii[first] + radii[second])[:, None]
+        return bound
+
+    def _between_boxes(self, hulls: Array, centres: Array, rotations: Array) -> Array:
+        """Return the largest gaps of k pairs of boxes along one of their sides, (k,) [m].
+
+        hulls (2, k), centres (2, k, 3), rotations (2, k, 3, 3).
+        """
+        half = np.array([hull.half for hull in self._hulls])[hulls]  # (2, k, 3)
+        sides = np.concatenate([*rotations], axis=2).swapaxes(1, 2)  # (k, 6, 3)
+        reach = np.abs(sides @ rotations) @ half[..., None]  # (2, k, 6, 1)
+        gaps = np.abs(sides @ (centres[1] - centres[0])[..., None]) - reach.sum(axis=0)
+        largest: Array = gaps.max(axis=(1, 2), initial=-np.inf)
+        return largest
+
     @cached_property
-    def _corners(self) -> tuple[Array, ...]:
-        """The hulls as ``lower_bounds`` takes them."""
-        hulls = self._hulls
-        starts = np.cumsum([0, *(len(hull.corners) for hull in hulls)])
-        of_each = zip(*[(h.body, h.centre, h.radius, h.half) for h in hulls], strict=True)
-        points = np.array(np.vstack([hull.corners for hull in hulls]), order="C")
-        return *map(np.array, of_each), points, starts
+    def _bodies(self) -> Array:
+        return np.array([hull.body for hull in self._hulls])
+
+    @cached_property
+    def _middles(self) -> Array:
+        return np.array([hull.centre for hull in self._hulls])
 
     def _poses(self, placed: Placements, hulls: Array, samples: Array) -> tuple[Array, Array]:
-        """Return centres of k hulls at k samples, (k, 3), and their rotations, (k, 3, 3)."""
-        bodies = np.array([hull.body for hull in self._hulls])[hulls]
-        middles = np.array([hull.centre for hull in self._hulls])[hulls]
-        rotations = np.moveaxis(placed.R[:, :, bodies, samples], -1, 0)  # (k, 3, 3)
-        centres = placed.p[:, bodies, samples].T + (rotations @ middles[..., None])[..., 0]
-        is_fixed = bodies < 0
-        rotations = np.where(is_fixed[:, None, None], np.eye(3), rotations)
-        return np.where(is_fixed[:, None], middles, centres), np.ascontiguousarray(rotations)
+        """Return centres (2, k, 3) and rotations (2, k, 3, 3) of hulls (2, k) at samples (k,)."""
+        bodies, middles = self._bodies[hulls], self._middles[hulls]
+        rotations = np.moveaxis(placed.R[:, :, bodies, samples], (0, 1), (2, 3))
+        centres = np.moveaxis(placed.p[:, bodies, samples], 0, 2)
+        centres = centres + (rotations @ middles[..., None])[..., 0]
+        is_fixed = (bodies < 0)[..., None]
+        rotations = np.where(is_fixed[..., None], np.eye(3), rotations)
+        return np.where(is_fixed, middles, centres), np.ascontiguousarray(rotations)
 
     def _gradient(
         self, placed: Placements, pairs: Array, samples: Array, points: Array, normals: Array
@@ -342,7 +362,7 @@ class Clearance:
         prismatic = self._tree.prismatic[:, None]
         axes = np.einsum("cdjk,jd->kjc", placed.R[..., samples], self._tree.axes)  # in the world
         origins = placed.p[..., samples].T  # (k, m, 3)
-        bodies = np.array([hull.body for hull in self._hulls])[self.pairs[pairs]]  # (k, 2)
+        bodies = self._bodies[self.pairs[pairs]]  # (k, 2)
         out = np.zeros(axes.shape[:2])
         for side, sign in ((0, -1.0), (1, 1.0)):
             levers = np.cross(axes, points[side][:, None] - origins)
@@ -364,15 +384,14 @@ def _hull(name: str, body: int, points: Array) -> _Hull:
     is_flat = np.linalg.matrix_rank(about, tol=_THINNEST) < 3
     if is_flat or (len(points) == 8 and np.allclose(np.abs(about), extent / 2)):
         extent, radius = np.maximum(extent, _THINNEST), radius + is_flat * _THINNEST
-        corners = _SIGNS * extent / 2
-        return _Hull(name, body, centre, radius, extent / 2, corners, coal.Box(*extent))
+        return _Hull(name, body, centre, radius, extent / 2, coal.Box(*extent))
     corners = np.unique(np.round(about, 6), axis=0)
     corners = corners[ConvexHull(corners).vertices]
     listed_ones = coal.StdVec_Vec3s()
     for corner in corners:
         listed_ones.append(corner)
     shape = coal.ConvexBase.convexHull(listed_ones, False, "Qt")
-    return _Hull(name, body, centre, radius, extent / 2, corners, shape)
+    return _Hull(name, body, centre, radius, extent / 2, shape)
 
 
 def _corners(box: Box) -> Array:

@@ -380,13 +380,6 @@ class Designer:
         F: Array = flat @ flat.T + self.known
         return F
 
-    @cached_property
-    def _hints(self) -> Array | None:
-        """Separating directions of the hulls in the last motion, shape (pairs, N, 3)."""
-        if self.clearance is None:
-            return None
-        return np.zeros((len(self.clearance.pairs), self._functions.shape[1], 3))
-
     def _followed(self, C: Array) -> tuple[MotionRows, Array, Array]:
         """Return rows, torques (N, n) and used shares of limits (6, N, n) of a motion."""
         *state, jerk = self._functions @ C
@@ -401,7 +394,7 @@ class Designer:
         if self.clearance is None:
             return used, np.inf, rows
         placed = self.clearance.placed(rows.motion[0])
-        margins = self.clearance.margins(placed, spare, hints=self._hints)
+        margins = self.clearance.margins(placed, spare)
         return used, float(margins.min(initial=np.inf)), rows
 
     def _near(self, rows: MotionRows, multipliers: Multipliers) -> Nearness | None:
@@ -410,7 +403,7 @@ class Designer:
             return None
         within = multipliers.distance_without_cost(self._required)
         placed = self.clearance.placed(rows.motion[0])
-        return self.clearance.near(placed, within, hints=self._hints)
+        return self.clearance.near(placed, within)
 
     def _objective(self, C: Array) -> float:
         """Return the criterion of a motion."""

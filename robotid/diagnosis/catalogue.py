@@ -73,6 +73,11 @@ def finding(
     return plain.reworded()
 
 
+def sentence_of(code: str, **values: float | str) -> str:
+    """Return a sentence of the catalogue that is no finding."""
+    return finding(code, severity="note", **values).message
+
+
 def reason_of(found: Finding) -> str:
     """Return the reason of a verdict for a warning: without joint and log."""
     entry = entries()[found.code]

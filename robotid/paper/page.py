@@ -10,8 +10,7 @@ from robotid.base.typing import Array
 from robotid.base.versions import __version__
 from robotid.output.pages.charts import Chart, Series, chart_html
 from robotid.output.pages.html import block, listing, number, page, text
-from robotid.paper.errata import EnergyDrift
-from robotid.paper.study import CASES, DURATION, PROGRAM, ModelStudy
+from robotid.paper.study import CASES, DURATION, PROGRAM, EnergyDrift, ModelStudy
 
 _SHOWN = (1, 2, 5, 20, 100)  # iterations drawn in figure 4
 _DRAWN_CASES = {

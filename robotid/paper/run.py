@@ -15,7 +15,6 @@ from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.torque import joint_torque_regressor
 from robotid.output.viewer.replays import Torques, replay
 from robotid.paper.equations import PlanarDynamics, torque
-from robotid.paper.errata import EnergyDrift, energy_drift, errata
 from robotid.paper.page import paper_page
 from robotid.paper.planar_2r import urdf_text
 from robotid.paper.procedure import LoopSettings
@@ -25,9 +24,12 @@ from robotid.paper.study import (
     DURATION,
     MODELS,
     PROGRAM,
+    EnergyDrift,
     ModelStudy,
     PaperSettings,
     RandomRuns,
+    energy_drift,
+    errata,
     paper_arm,
     random_runs,
     study_model,

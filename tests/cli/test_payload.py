@@ -16,8 +16,7 @@ from robotid.cli.payload import stated_masses
 from robotid.data.files.formats import write_columns
 from robotid.data.files.read import write_log
 from robotid.output.files.result_file import load_result, stated_scale_check
-from robotid.output.report.next_steps import next_steps
-from robotid.output.report.steps import Origin
+from robotid.output.report.next_steps import Origin, next_steps
 from robotid.robot.bodies import link_transfer
 from robotid.robot.examples import example_urdf
 

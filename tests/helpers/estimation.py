@@ -87,11 +87,10 @@ def still_wrist(model, rng):
     return case
 
 
-def _descent(kind, prior=None, passes=10, **options):
+def _descent(kind, passes=10):
     def make(case):
         rng = np.random.default_rng(0)
-        start = None if prior is None else prior * case.beta
-        return kind(case.sigma, start, average=False, passes=passes, rng=rng, **options)
+        return kind(case.sigma, average=False, passes=passes, rng=rng)
 
     return make
 
@@ -110,8 +109,6 @@ ESTIMATORS = {
     # the covariance form keeps half the digits of P / sigma^2, which starts at 1e8 here
     "kalman": (_kalman, 1e-6),
     "prx": (_descent(PRX), 1e-9),
-    "prx rows": (_descent(PRX, metric="rows"), 1e-9),
-    "prx mass": (_descent(PRX, prior=0.5, metric="mass"), 1e-3),
     # one number for all rows: the rate is that of the worst column
     "gradient": (_descent(NormalisedGradient, passes=20), 1e-4),
 }

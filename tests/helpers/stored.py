@@ -52,15 +52,12 @@ class Runs:
         self.folder = Path(folder)
         self.documents = {}
 
-    def run(self, name, *words, code=0):
-        """Run a command line, keep what it prints under a name, and return it.
+    def run(self, name, line, code=0):
+        """Run what follows ``robotid``, @ being the folder; keep and return what it prints.
 
-        Args:
-            name: The name.
-            words: What follows ``robotid``.
-            code: Exit code that is wanted; None: it is kept, too.
+        The exit code is ``code``; if that is None, it is kept, too.
         """
-        words = [str(word) for word in words]
+        words = line.replace("@", f"{self.folder}/").split()
         out, err = io.StringIO(), io.StringIO()
         surroundings = {"COLUMNS": "100", "NO_COLOR": "1"}
         with mock.patch.dict(os.environ, surroundings), redirect_stdout(out), redirect_stderr(err):

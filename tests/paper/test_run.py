@@ -12,10 +12,9 @@ from helpers.pages import number, tables
 
 from robotid.paper import run as paper
 from robotid.paper import study
-from robotid.paper.errata import energy_drift
 from robotid.paper.procedure import LoopSettings
 from robotid.paper.run import run_paper
-from robotid.paper.study import CASES, MODELS, PaperSettings
+from robotid.paper.study import CASES, MODELS, PaperSettings, energy_drift
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import INERTIAL_TERMS
 

@@ -10,11 +10,11 @@ from robotid.base.exceptions import SettingsError
 from robotid.dynamics.simulation.motions import ProgramMotion
 from robotid.paper import study
 from robotid.paper.equations import LinearPlant
-from robotid.paper.errata import energy_drift
 from robotid.paper.planar_2r import PAPER_PARAMETERS
 from robotid.paper.procedure import LoopSettings, run_procedure
 from robotid.paper.study import (
     PaperSettings,
+    energy_drift,
     paper_arm,
     random_runs,
     study_model,

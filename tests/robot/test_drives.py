@@ -18,11 +18,7 @@ from robotid.dynamics.prediction import drive_motion_along, predict, remember
 from robotid.dynamics.rows import COMPILED, TrajectoryRows
 from robotid.dynamics.simulation.motions import random_fourier
 from robotid.dynamics.simulation.simulator import RobotPlant
-from robotid.dynamics.torque import (
-    InstantRegressor,
-    joint_torque_regressor,
-    trajectory_regressor,
-)
+from robotid.dynamics.torque import InstantRegressor, joint_torque_regressor, trajectory_regressor
 from robotid.identification.pipeline import identify
 from robotid.output.files.urdf import load_identified, read_sidecar, write_urdf
 from robotid.robot.drive_term import DriveMotion

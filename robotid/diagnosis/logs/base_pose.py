@@ -31,15 +31,11 @@ _ABOVE = 0.3  # vertical distance of base and feet over their distance, from whi
 _STRIDE = 0.2  # [s] over which the acceleration of a base is averaged against noise
 _FASTEST = 30.0  # [m/s^2] RMS of this above which its position is in mm
 _ALONG = 0.8  # component of the unit vector from the feet to the base that may be the vertical
-_IMU_UNLIKE = 0.3  # of the motion: an angular velocity that differs by more is wrong
-_IMU_BETTER = 0.5  # ... and has other axes if these reduce the difference below this share
 _IMU_MOVES = 0.1  # [rad/s] RMS from which angular velocities are compared
 _TILT = 8.0  # [deg] largest angle between the mean specific force and the vertical
 _SIZE = 0.1  # largest relative error of its size
 _SHORTEST = 2.0  # [s] in which the mean acceleration of a robot is small
 _DEGREES = np.pi / 180
-_DRAWN = 1e-4  # weight of the stated axes, relative to the data
-_IMU_ALONG = 0.25  # largest difference of an axis from one of the link, of length 1
 
 
 def check_pose(log: Log) -> Iterator[Finding]:
@@ -247,87 +243,37 @@ def rms(values: Array) -> float:
     return float(np.sqrt(np.mean(np.sum(values**2, axis=1))))
 
 
-def check_imu(log: Log, motion: Trajectory, legs: tuple[Array, Array]) -> Iterator[Finding]:
-    """Yield findings on the IMU of one log: legs (N, m, 3)."""
+def check_imu(log: Log, motion: Trajectory) -> Iterator[Finding]:
+    """Yield findings on the IMU of one log."""
     if log.base is None or log.base.imu is None or motion.t[-1] - motion.t[0] < _SHORTEST:
         return
-    frame, w = log.base.imu.frame, motion.v[:, 3:6]
-    turned = np.broadcast_to(np.eye(3), (len(w), 3, 3))
-    own = base_state(motion.t, motion.q[:, :7], None, None)[1][:, 3:]
-    found = list(_check_orientation(log, motion, own))
-    found = found or list(_check_axes(log, frame, w, turned, -own, "orientation"))
-    yield from found or _check_axes(log, frame, w, *legs, "links")
-    yield from _check_gravity(log, frame, motion)
+    yield from _check_gyroscopes(log, motion)
+    yield from _check_gravity(log, log.base.imu.frame, motion)
 
 
-def _check_orientation(log: Log, motion: Trajectory, own: Array) -> Iterator[Finding]:
-    """Yield a finding if the gyroscopes agree with another reading of the quaternion only.
+def _check_gyroscopes(log: Log, motion: Trajectory) -> Iterator[Finding]:
+    """Yield a finding if the angular velocity is not that of the orientation.
 
-    ``own`` is the angular velocity by the quaternion as logged, shape (N, 3) [rad/s].
+    Another reading of the quaternion, or deg/s, may explain it.
     """
-    w, place = motion.v[:, 3:6], motion.q[:, :3]
-    now, size = rms(w - own), rms(own)
-    if rms(w) < _IMU_MOVES or now <= _IMU_UNLIKE * size:
+    w, place, quaternion = motion.v[:, 3:6], motion.q[:, :3], motion.q[:, 3:7]
+
+    def off(x: Array, q: Array = quaternion) -> float:
+        return rms(x - base_state(motion.t, np.hstack([place, q]), None, None)[1][:, 3:])
+
+    now, size = off(w), off(0.0 * w)
+    if rms(w) < _IMU_MOVES or now <= _UNLIKE * size:
         return
-    readings = {
-        key: rms(w - base_state(motion.t, np.hstack([place, q]), None, None)[1][:, 3:])
-        for key, q in orientation_readings(motion.q[:, 3:7]).items()
-    }
-    key = min(readings, key=lambda x: readings[x])
-    if readings[key] <= _IMU_UNLIKE * size:
+    readings = {key: off(w, q) for key, q in orientation_readings(quaternion).items()}
+    key, degrees = min(readings, key=lambda x: readings[x]), off(_DEGREES * w)
+    if readings[key] <= _UNLIKE * size:
         yield finding(
             "base_orientation", log.name, source="imu", reading=key, cure=key, turn=False,
             speed=now, best=readings[key],
         )  # fmt: skip
-
-
-def _check_axes(
-    log: Log, frame: ImuFrame, w: Array, D: Array, d: Array, source: str
-) -> Iterator[Finding]:
-    """Yield a finding if D w + d is 0 with other axes or another unit of w only."""
-
-    def off(w: Array) -> float:
-        return float(np.sqrt(np.mean(np.sum((np.einsum("kij,kj->ki", D, w) + d) ** 2, axis=1))))
-
-    size, now = off(0.0 * w), off(w)
-    if rms(w) < _IMU_MOVES or now <= _IMU_UNLIKE * size:
         return
-    M = _turn(w, D, d)
-    best, degrees = off(w @ M.T), off(_DEGREES * w)
-    cure: dict[str, float | str] = {"cure": "unknown"}
-    if best < _IMU_BETTER * now:
-        cure = _named(M, frame.rotation)
-    elif degrees < _IMU_BETTER * now:
-        best, cure = degrees, {"cure": "degrees"}
-    elif source == "links":  # feet that slip
-        return
-    yield finding("imu_axes", log.name, source=source, off=now / size, best=best / size, **cure)
-
-
-def _turn(w: Array, D: Array, d: Array) -> Array:
-    """Return the rotation M, shape (3, 3), for which D M w + d is smallest.
-
-    Directions without motion do not turn: the solution is drawn to 1 with a small weight.
-    """
-    G = np.einsum("kia,kic,kb,ke->abce", D, D, w, w, optimize=True).reshape(9, 9)
-    g = -np.einsum("kia,ki,kb->ab", D, d, w, optimize=True).ravel()
-    weight = _DRAWN * np.trace(G)
-    M = np.linalg.solve(G + weight * np.eye(9), g + weight * np.eye(3).ravel()).reshape(3, 3)
-    U, _, V = np.linalg.svd(M)
-    turn: Array = U @ np.diag([1.0, 1.0, np.linalg.det(U @ V)]) @ V
-    return turn
-
-
-def _named(M: Array, Q: Array) -> dict[str, float | str]:
-    """Return what a rotation M of measured vectors means, for an IMU with the axes Q."""
-    own = Q.T @ M @ Q
-    whole = np.rint(own)
-    if np.abs(own - whole).max() < _IMU_ALONG:
-        rows = np.abs(whole).argmax(axis=0)
-        names = [("-" if whole[i, k] < 0 else "") + "xyz"[i] for k, i in enumerate(rows)]
-        return {"cure": "axes", "axes": ", ".join(names)}
-    angle = np.degrees(np.arccos(np.clip((np.trace(M) - 1.0) / 2.0, -1.0, 1.0)))
-    return {"cure": "turned", "angle": angle}
+    cure = "degrees" if degrees < _BETTER * now else "unknown"
+    yield finding("imu_axes", log.name, off=now / size, best=min(degrees, now) / size, cure=cure)
 
 
 def _check_gravity(log: Log, frame: ImuFrame, motion: Trajectory) -> Iterator[Finding]:

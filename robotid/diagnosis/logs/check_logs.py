@@ -31,7 +31,7 @@ from robotid.diagnosis.logs.torque_sample import Probe, smooth_motion, take_prob
 from robotid.diagnosis.urdf.inertials import (
     assumed_inertials,
     explained_by_assumed,
-    rounded_robot,
+    rounded_angles,
 )
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.constraint_rows import logged_base
@@ -101,7 +101,7 @@ def diagnose(
     if mapping is not None:
         names = ", ".join(log.name for log in fitted)
         findings += check_excitation(model, mapping, moving, signals, names)
-        findings += rounded_robot(model, mapping)
+        findings += [x for x in rounded_angles(model, mapping) if x.evidence["felt"]]
     return by_severity(x for x in findings if not explained_by_assumed(model, x))
 
 

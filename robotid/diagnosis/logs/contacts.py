@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator
 from dataclasses import replace
-from itertools import combinations
 
 import numpy as np
 
@@ -75,7 +74,7 @@ def check_base(model: RobotModel, log: Log, signals: SignalSettings) -> Iterator
     J, turn = _contact_jacobian(model, motion.q)
     wrong = []
     if imu is not None:
-        wrong = list(check_imu(whole, motion, _of_pairs(J, flags, motion.v)))
+        wrong = list(check_imu(whole, motion))
         yield from wrong
         if any(one.code in ("imu_axes", "base_orientation") for one in wrong):
             return
@@ -196,17 +195,6 @@ def _relative(velocity: Array, flags: Array) -> Array:
     relative: Array = velocity - np.nanmedian(standing, axis=1)[:, None]
     relative[flags.sum(axis=1) < 2] = 0.0
     return relative
-
-
-def _of_pairs(J: Array, flags: Array, v: Array) -> tuple[Array, Array]:
-    """Return D and d of the relative velocities D w + d of pairs of links in contact."""
-    D, d = np.zeros((len(J), 0, 3)), np.zeros((len(J), 0))
-    for i, j in combinations(range(J.shape[1]), 2):
-        both = flags[:, i] & flags[:, j]
-        own = (J[:, i] - J[:, j]) * both[:, None, None]
-        D = np.concatenate([D, own[..., 3:6]], axis=1)
-        d = np.concatenate([d, np.einsum("kij,kj->ki", own[..., 6:], v[:, 6:])], axis=1)
-    return D, d
 
 
 def _contact_jacobian(model: RobotModel, q: Array) -> tuple[Array, Array]:

@@ -19,7 +19,6 @@ from robotid.dynamics.factors import Reduction, compress_segments
 from robotid.dynamics.rows import keep_inertial_rows
 from robotid.dynamics.used_rows import base_problem, row_mask
 from robotid.estimation.estimators.two_runs import payload_runs
-from robotid.robot.bodies import link_places
 from robotid.robot.drives import COUNTERBALANCE, drive_line, spring_family
 from robotid.robot.model import RobotModel
 from robotid.robot.prior import payload_spread, prior_spread
@@ -44,10 +43,6 @@ _FOLLOWED = 0.5  # ratio of unexplained shares with and without gravity, if a to
 _LIFTS = 0.3  # of the largest gravity torque: a joint with less has no counterbalance
 _CANCELS, _MOST_CANCELLED = 0.2, 1.6  # limits of the share of gravity that a counterbalance cancels
 _MISMATCH = 7.5  # largest sum of squared errors of the links, in standard deviations
-_LIGHTER = 4.0  # decrease of the misfit, a likelihood ratio of 7, from which a part is not mounted
-_MOUNTED_ALIKE = 2.0  # smallest significant difference of misfits
-_LIGHT = 0.02  # of the arm's mass, below which a part is not checked
-_NO_LOAD = 1e-6  # [kg, kg m] prior standard deviation of a payload that is left out
 _P_VALUE = 3e-7  # of a log without another load, five standard errors
 _NOTHING = 0.01  # of the arm's mass, the smallest change of load
 _CLEARLY = 1.5  # least ratio of the misfit of other torque scales to that of a load
@@ -336,36 +331,15 @@ def _payload(probe: Probe, load: Array, error: float, name: str) -> Iterator[Fin
     evidence = {"mass": mass, "std_error": error, "mcx": load[1], "mcy": load[2], "mcz": load[3]}
     severity = "warning" if abs(mass) - 2 * error > _LARGE * arm else "note"
     yield finding(
-        "payload", name, subject=link, severity=severity, link=link, sense=mass > 0, **evidence
+        "payload",
+        name,
+        subject=link,
+        severity=severity,
+        link=link,
+        sense=mass > 0,
+        cure=mass > 0,
+        **evidence,
     )
-
-
-def check_unmounted_parts(probe: Probe, share: Array, name: str) -> Iterator[Finding]:
-    """Yield a warning "unmounted_part" if the torques fit better without a part of the last link.
-
-    Parts are links that fixed or locked joints attach to the link of the last moving joint, with
-    all links that they carry.
-    """
-    model = load_model(probe, share)
-    whole, loaded = _misfit_without_load(model), model.fit(np.ones(len(share)))[0]
-    arm = float(probe.model.standard_parameters()[: probe.model.layout.n_inertial : 10].sum())
-    trials = []
-    for links, parameters in _parts(probe):
-        pi = probe.model.standard_parameters()
-        size = probe.model.layout.n_inertial
-        pi[size - 10 : size] -= parameters
-        if pi[size - 10] > 0 and parameters[0] > _LIGHT * arm:
-            lighter = probe.of(probe.model.with_parameters(pi))
-            left = _misfit_without_load(load_model(lighter, share))
-            trials.append((left, links, float(parameters[0])))
-    left, links, mass = min(trials, default=(np.inf, [], 0.0))
-    # a load of any mass, positive or negative, must not explain the torques much better
-    if left <= min(whole - _LIGHTER, loaded + _MOUNTED_ALIKE):
-        last = probe.model.layout.bodies[-1]
-        yield finding(
-            "unmounted_part", name, subject=last, link=last, parts=listed(links, 4), mass=mass,
-            gain=whole - left,
-        )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -442,30 +416,3 @@ def check_payload_change(
     yield finding(
         "payload_change", name, subject=link, link=link, sense=mass > 0, mass=mass, std_error=error
     )
-
-
-def _misfit_without_load(model: LoadModel) -> float:
-    spread = np.append(model.spread[:-4], np.full(4, _NO_LOAD))
-    return replace(model, spread=spread).fit(np.ones(len(model.R)))[0]
-
-
-def _parts(probe: Probe) -> Iterator[tuple[list[str], Array]]:
-    """Yield the links of each part on the last link, and their inertial parameters, (10,)."""
-    last = len(probe.model.layout.bodies) - 1
-    places = {p.link: p for p in link_places(probe.model) if p.body == last and p.role != "moved"}
-    parent = {joint.child: joint.parent for joint in probe.model.tree.joints}
-    seen = set()
-    for root in places:
-        links = [link for link in places if root in _ancestry(link, parent)]
-        massive = [link for link in links if places[link].parameters[0] > 0]
-        if massive and tuple(massive) not in seen:
-            seen.add(tuple(massive))
-            yield massive, np.sum([places[link].parameters for link in massive], axis=0)
-
-
-def _ancestry(link: str, parent: dict[str, str]) -> Iterator[str]:
-    """Yield a link and the links that carry it."""
-    yield link
-    while link in parent:
-        link = parent[link]
-        yield link

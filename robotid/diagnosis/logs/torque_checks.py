@@ -11,7 +11,6 @@ from robotid.diagnosis.catalogue import finding
 from robotid.diagnosis.logs.hypotheses import HINT, Explanation, explanations
 from robotid.diagnosis.logs.loads import (
     check_loads,
-    check_unmounted_parts,
     counterbalance,
     holds_gravity,
 )
@@ -77,11 +76,7 @@ def check_torques(probe: Probe, name: str) -> Iterator[Finding]:
         # a fault that a load on the last link explains as well is only a warning
         yield replace(one, severity="warning") if _is_excused(best, loaded) else one
     if not found:
-        loads = list(check_loads(probe, loaded.share, name))
-        if not {load.code for load in loads} - {"payload"}:
-            parts = list(check_unmounted_parts(probe, loaded.share, name))
-            loads = parts or loads
-        yield from loads
+        yield from check_loads(probe, loaded.share, name)
         # the friction of a joint at rest has any value: nothing contradicts its torque
         still = np.ptp(probe.motion.q, axis=0) < _STILL
         yield from _unexplained(probe, np.where(still, 0.0, loaded.share), name)

@@ -18,7 +18,7 @@ from robotid.robot.urdf_text import exact_angle, numbers
 #: Findings that take the URDF's masses as evidence.
 _OF_MASSES = (
     "current_for_torque", "joint_origin", "link_mass", "payload", "torque_scale", "total_mass",
-    "unmounted_part", "urdf_mismatch",
+    "urdf_mismatch",
 )  # fmt: skip
 _SLACK = 1e-9  # relative violation of the triangle inequality that is rounding
 _NOISE = 1e-10  # smaller pivots, over the largest, are rounding errors
@@ -123,19 +123,6 @@ def rounded_angles(model: RobotModel, mapping: BaseMapping) -> Iterator[Finding]
             wanted=listed(f"{angle!r} for {word}" for word, angle in exact.items()),
             effect=effect if is_felt else "none", felt=float(is_felt),
             largest_error=max(abs(float(word) - angle) for word, angle in exact.items()), **figures,
-        )  # fmt: skip
-
-
-def rounded_robot(model: RobotModel, mapping: BaseMapping) -> Iterator[Finding]:
-    """Yield one finding if the angles that a URDF rounds change the identifiable parameters."""
-    joints = [name for name in _rounded(model.tree) if name in _carrying(model.tree)]
-    effect, figures = _effect(model, mapping) if joints else ("none", {})
-    if effect != "none":
-        file = Path(model.tree.path).name
-        yield finding(
-            "rounded_rpy", subject=file, severity="warning" if effect == "more" else "note",
-            what="robot", file=file, names=listed(joints, 6), effect=effect, joints=len(joints),
-            **figures,
         )  # fmt: skip
 
 

@@ -20,7 +20,6 @@ from robotid.diagnosis.verdict.scale_check import friction_shares
 from robotid.estimation.estimators.consistent.body_constraints import slabs
 from robotid.estimation.fitting.estimator_settings import BoundedSettings, ConsistentSettings
 from robotid.estimation.fitting.fitted import Fit
-from robotid.estimation.fitting.regressor_noise import encoder_findings
 from robotid.estimation.variation.variation import UnlikeRun, Variation
 from robotid.robot.bodies import density_share, held_parameters, least_density, negligible_bodies
 from robotid.robot.geometry import body_boxes, body_points
@@ -31,6 +30,8 @@ _COSTS = 1.05  # residual over that of WLS above which bounds increase the torqu
 _FAR = 3.0  # a total mass differs from the URDF's at most by this factor
 _ROUNDING = 1e-6  # [m^2] tolerance of a body that touches its box
 _NAMED = 5  # outliers that a finding names
+_BIASED = 0.5, 2.0  # shift of a parameter by encoder noise, in standard errors: note, warning
+_COARSE = 0.1  # share of encoder noise over the largest one, from which a joint is named
 _DIFFERS = 1.2  # residual of a consistent fit over that of WLS above which it is reported
 _LITTLE = 5.0  # [%] ... as a note if the constraints add less to the torque error
 _SHRUNK = 0.1  # of the URDF's smallest eigenvalue: below, a body is barely possible
@@ -72,7 +73,7 @@ def fit_findings(
     findings += misfit_findings(fit, misfits, on_misfit)
     findings += [*_drive_findings(fit), *_correlated(fit)]
     findings += discrepancies
-    findings += encoder_findings(fit.regressor_noise, fit.model, fit.mapping)
+    findings += encoder_noise(fit)
     findings += [
         finding("validation_was_fitted", subject=e.recording.log.path, name=e.recording.name)
         for e in fit.refitted
@@ -277,6 +278,30 @@ def _total_mass(fit: Fit) -> list[Finding]:
         return []
     evidence = {"urdf": before, "identified": after, "far": _FAR}
     return [finding("total_mass", subject="standard_parameters", **evidence)]
+
+
+def encoder_noise(fit: Fit) -> Iterator[Finding]:
+    """Yield a finding if encoder quantisation biases inertial parameters."""
+    noise, model = fit.regressor_noise, fit.model
+    if noise is None:
+        return
+    is_inertial = fit.mapping.K[:, : model.layout.n_inertial].any(axis=1)
+    moved = np.where(is_inertial, np.abs(noise.shift) / noise.std_error, 0.0)
+    worst = int(np.argmax(moved))
+    if moved[worst] < _BIASED[0]:
+        return
+    coarse = np.flatnonzero(noise.share > _COARSE * noise.share.max())
+    steps = {model.joints[j]: noise.steps[j] for j in coarse}
+    coarsest = max(steps, key=lambda joint: steps[joint])
+    is_prismatic = coarsest in model.layout.prismatic
+    yield finding(
+        "encoder_noise", subject=listed(steps), names=listed(steps, 4), step=steps[coarsest],
+        severity="warning" if moved[worst] >= _BIASED[1] else "note", std_errors=moved[worst],
+        unit="m" if is_prismatic else "rad", bits_of=not is_prismatic,
+        bits=np.log2(2 * np.pi / steps[coarsest]), share_pct=100 * noise.share.max(),
+        parameter=fit.mapping.base_names[worst], effect=noise.is_corrected,
+        **{f"step_{joint}": step for joint, step in steps.items()},
+    )  # fmt: skip
 
 
 def _is_within_box(fit: Fit, body: str, box: Array) -> bool:

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
-from typing import Any
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, ClassVar, Self
 
 import numpy as np
 import scipy.special
 
 from robotid.base.findings import listed
 from robotid.base.typing import Array
+from robotid.diagnosis.catalogue import sentence_of
 from robotid.dynamics.constraint_rows import loop_basis, without_forces
 from robotid.dynamics.prediction import predict
 from robotid.dynamics.torque import joint_torque_regressor
@@ -33,8 +34,138 @@ _BETTER = 0.5  # ... and that share is less than this times the one with a paylo
 AGREES = 0.05
 _SAME = 1e-6  # share of a claim that changes no torque, below which it is rounding
 _ABSORBS = 0.1  # share of a change of a stated mass that a link takes up to be named
-_LISTS = ("names", "absorbed_by")
-_NAMED = 4  # links that a sentence names
+
+
+class KnownMass:
+    """A mass that the user knows, against the one that torque alone determines."""
+
+    kind: ClassVar[str]
+
+    @property
+    def status(self) -> str:
+        """Whether it "verifies" or "contradicts" the scale, or is "open" or "undetermined"."""
+        raise NotImplementedError
+
+    @property
+    def verifies(self) -> bool:
+        """Whether torque determines the mass within 5 %, and confirms it within 5 %."""
+        return self.status == "verifies"
+
+    @property
+    def contradicts(self) -> bool:
+        """Whether the mass that torque determines is another one."""
+        return self.status == "contradicts"
+
+    @property
+    def message(self) -> str:
+        """Both masses, and what follows for the scale of the torques."""
+        raise NotImplementedError
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the figures as result.json has them."""
+        figures = {f.name: getattr(self, f.name) for f in fields(self)}  # type: ignore[arg-type]
+        return {key: list(x) if isinstance(x, tuple) else x for key, x in figures.items()}
+
+    @classmethod
+    def from_dict(cls, stated: Mapping[str, Any]) -> Self:
+        """Return the figures that a result.json has."""
+        figures = {key: tuple(x) if isinstance(x, list) else x for key, x in stated.items()}
+        figures.pop("message", None)
+        return cls(**figures)
+
+
+@dataclass(frozen=True)
+class StatedMass(KnownMass):
+    """Masses that the user states, and what torque alone determines of them.
+
+    Attributes:
+        names: What is stated: "total_mass", or "mass of" a link.
+        ratio: Mass that torque alone determines, without this statement and without the URDF's
+            masses, over the stated mass [-]; None if torque does not determine it.
+        half_width: Half-width of its 95 % interval, plus that of the stated range [-].
+        absorbed_by: Links whose masses change with the stated one while no torque changes.
+    """
+
+    names: tuple[str, ...]
+    ratio: float | None = None
+    half_width: float = 0.0
+    absorbed_by: tuple[str, ...] = ()
+    kind: ClassVar[str] = "stated mass"
+
+    @property
+    def status(self) -> str:
+        """It contradicts if the whole 95 % interval differs by more than 5 %."""
+        if self.ratio is None:
+            return "undetermined"
+        if abs(self.ratio - 1.0) - self.half_width > AGREES:
+            return "contradicts"
+        is_near = abs(self.ratio - 1.0) <= AGREES and self.half_width <= AGREES
+        return "verifies" if is_near else "open"
+
+    @property
+    def message(self) -> str:
+        """What the statement verifies, or why it does not."""
+        return sentence_of(
+            "scale:stated", what=self.status, names=listed(self.names) if self.names else "mass",
+            absorbed=bool(self.absorbed_by), links=listed(self.absorbed_by, 4),
+            ratio=self.ratio or 0.0, half_width=self.half_width, limit=AGREES,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class PayloadCheck(KnownMass):
+    """The known mass of a payload, and its mass as torque alone determines it.
+
+    Attributes:
+        link: The link that carries it.
+        known: Its known mass [kg].
+        identified: Its mass identified without this knowledge [kg]; None if the motion does not
+            determine it.
+        std_error: Standard error of that [kg].
+        interval: 95 % interval of it [kg].
+        log: The log with the payload; "" if it is not a file.
+        sha256: SHA-256 of the log; "" if it is not a file.
+    """
+
+    link: str
+    known: float
+    identified: float | None = None
+    std_error: float = 0.0
+    interval: tuple[float, float] = (0.0, 0.0)
+    log: str = ""
+    sha256: str = ""
+    kind: ClassVar[str] = "payload of known mass"
+
+    @property
+    def ratio(self) -> float | None:
+        """Identified over known mass, the scale of the torques [-]."""
+        return None if self.identified is None else self.identified / self.known
+
+    @property
+    def status(self) -> str:
+        """It contradicts if the masses differ by more than 5 %, and the interval excludes it."""
+        if self.ratio is None:
+            return "undetermined"
+        low, high = self.interval
+        if abs(self.ratio - 1.0) > AGREES:
+            return "open" if low <= self.known <= high else "contradicts"
+        return "verifies" if 0.5 * (high - low) <= AGREES * self.known else "open"
+
+    @property
+    def message(self) -> str:
+        """Both masses, their difference, and what follows for the scale of the torques."""
+        mass, ratio = self.identified or 0.0, self.ratio or 1.0
+        low, high = self.interval
+        errors = abs(mass - self.known) / self.std_error if self.std_error > 0 else 0.0
+        return sentence_of(
+            "scale:payload", what=self.status, known=self.known, link=self.link, mass=mass,
+            low=low, high=high, excess=ratio - 1.0, far=self.std_error > 0, errors=errors,
+            limit=AGREES, large=ratio > 1.0, ratio=ratio,
+        )  # fmt: skip
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the figures as result.json has them, and what they mean."""
+        return super().to_dict() | {"message": self.message}
 
 
 @dataclass(frozen=True)
@@ -114,14 +245,13 @@ class ScaleCheck:
         return self.common is not None and abs(self.common[0] - 1.0) <= self.common[1]
 
     @property
-    def _decisive(self) -> dict[PayloadCheck | StatedMass, str]:
-        """The known masses that verify or contradict the scale, and their names."""
-        checks: dict[PayloadCheck | StatedMass, str] = dict.fromkeys(
-            self.payloads, "payload of known mass"
-        )
-        if self.stated is not None:
-            checks[self.stated] = "stated mass"
-        return {c: name for c, name in checks.items() if c.verifies or c.contradicts}
+    def _known(self) -> tuple[KnownMass, ...]:
+        return (*self.payloads, *(() if self.stated is None else (self.stated,)))
+
+    @property
+    def _decisive(self) -> list[KnownMass]:
+        """The known masses that verify or contradict the scale."""
+        return [mass for mass in self._known if mass.verifies or mass.contradicts]
 
     @property
     def has_one_factor(self) -> bool:
@@ -137,94 +267,63 @@ class ScaleCheck:
     def figures(self) -> str:
         """Gravity torque and total mass against the URDF's, as text."""
         before, after, _ = self.masses
-        if self.assumed:
-            count = f"{self.assumed} link{'s' if self.assumed > 1 else ''}"
-            return f"total mass {after:.4g} kg; the URDF states no usable inertials of {count}"
-        mass = f"total mass {after:.4g} kg against the URDF's {before:.4g} kg"
-        if self.scale is None:
-            return f"gravity loads no joint, {mass}"
-        return f"gravity torque {self.factor:.2f} x the URDF's, {mass}"
+        usual = "unloaded" if self.scale is None else "loaded"
+        return sentence_of(
+            "scale:figures", what="assumed" if self.assumed else usual, several=self.assumed > 1,
+            assumed=self.assumed, factor=self.factor, before=before, after=after,
+        )  # fmt: skip
 
     @property
     def message(self) -> str:
         """What was verified, or the figure that exceeds its limit, its cause and the remedy."""
-        checks: list[PayloadCheck | StatedMass] = [*self.payloads]
-        checks += [] if self.stated is None else [self.stated]
-        beside = "".join(
-            f". {check.message[0].upper()}{check.message[1:]}"
-            for check in reversed(checks)
-            if check not in self._decisive
-        )
-        sentences = [
-            f"absolute scale {'verified' if check.verifies else 'contradicted'} by a {name}: "
-            f"{check.message}"
-            for check, name in sorted(self._decisive.items(), key=lambda item: item[0].verifies)
+        decisive = sorted(self._decisive, key=lambda mass: mass.verifies)
+        beside = [mass.message for mass in reversed(self._known) if mass not in decisive]
+        stated = [
+            sentence_of("scale:known", done=x.verifies, kind=x.kind, text=x.message)
+            for x in decisive
         ]
-        if sentences:
-            others = [f"{x[0].upper()}{x[1:]}" for x in sentences[1:]]
-            return ". ".join([sentences[0], *others]) + beside
-        if self.agrees:
-            return f"{self._agreement}{beside}"
-        remedy = (
-            "State the measured mass of the moving links (total_mass)"
-            if self.is_total_determined
-            else "Verify it with a payload of known mass (robotid payload)"
-        )
-        remedy = "" if self.payloads else f". {remedy}"
-        return f"absolute scale not verified: {self.figures}{self._excess}{beside}{remedy}"
+        if not decisive:
+            stated = [self._agreement if self.agrees else self._doubt]
+        text = ". ".join([stated[0], *(f"{x[0].upper()}{x[1:]}" for x in stated[1:] + beside)])
+        if decisive or self.agrees or self.payloads:
+            return text
+        return text + sentence_of("scale:remedy", what=self.is_total_determined)
 
     @property
     def _agreement(self) -> str:
         """How gravity and total mass confirm the scale."""
-        agrees = "absolute scale: gravity and total mass agree with the URDF's within 5 %"
-        if self._is_total_open:
-            agrees = "absolute scale: gravity agrees with the URDF's within 5 %"
-        if self._off_whole <= AGREES:
-            return f"{agrees}: {self.figures}"
         before, after, payload = self.masses
-        return (
-            f"{agrees} only if a load of {payload:+.3g} kg is added to the last link, "
-            "which the URDF does not have. Without the load: gravity torque "
-            f"{self.scale:.2f} x the URDF's, total mass {after - payload:.4g} kg against the "
-            f"URDF's {before:.4g} kg. With it: {self.figures}. If no such load was mounted, "
-            "check the gains of the torques"
-        )
+        return sentence_of(
+            "scale:agrees", what=self._is_total_open, load=self._off_whole > AGREES,
+            payload=payload, scale=self.scale or 0.0, rest=after - payload, before=before,
+            figures=self.figures,
+        )  # fmt: skip
 
     @property
-    def _excess(self) -> str:
+    def _doubt(self) -> str:
         """Which figures exceed which limit, and the probable cause."""
         limit = _ANOTHER if self._off > _ANOTHER else AGREES
-        ratios = self._ratios_whole
-        beyond = [what for what, ratio in ratios.items() if abs(ratio - 1.0) > limit]
-        excess = "; the residual of a joint is above 1.5 x that of WLS" if not self.follows else ""
-        if beyond:
-            verb = "differs" if len(beyond) == 1 else "differ"
-            excess = f"; {' and '.join(beyond)} {verb} by more than {100 * limit:.0f} %{excess}"
-        if self.common is not None and limit > AGREES and self._is_urdf:
-            common, half = self.common
-            excess += (
-                f". The factor common to the joints is {common:.2f} +- {half:.2g} (95 %), as the "
-                "URDF's errors spread theirs: 1 is possible"
-            )
-        by_factor, by_payload = self.unexplained
+        beyond = [x for x, ratio in self._ratios_whole.items() if abs(ratio - 1.0) > limit]
         compared = {} if self.assumed else self.gravity
         single = [f"{j} {x:.2f}" for j, x in compared.items() if abs(x - 1.0) > _ANOTHER]
-        if self.has_one_factor:
-            same = f"The same factor {self.factor:.2f} fits all joints"
-            cause = "the gains of the torques, or the URDF's mass of a link that loads all of them"
-            return f"{excess}. {same}: probable cause: {cause}"
-        is_urdf = self.scale is not None and abs(self.scale - 1.0) <= AGREES
-        if is_urdf and self.masses[2] > 0 and by_payload < _BETTER * by_factor:
-            load = f"a load of {self.masses[2]:+.3g} kg on the last link that the URDF lacks"
-            return f"{excess}. Probable cause: {load}"
-        if single:
-            by_joint = f"Gravity torque over the URDF's, by joint: {listed(single)}"
-            return f"{excess}. {by_joint}: probable cause: masses of the URDF, or single gains"
-        if not self.follows:
-            return f"{excess}. Probable cause: a prior or constraint that the data contradict"
-        if beyond:
-            return f"{excess}. Probable cause: the URDF's masses, or the gains of the torques"
-        return excess
+        by_factor, by_payload = self.unexplained
+        is_like = self.scale is not None and abs(self.scale - 1.0) <= AGREES
+        causes = {
+            "factor": self.has_one_factor,
+            "load": is_like and self.masses[2] > 0 and by_payload < _BETTER * by_factor,
+            "single": bool(single),
+            "prior": not self.follows,
+            "masses": bool(beyond),
+            "none": True,
+        }
+        common, half = self.common or (1.0, 0.0)
+        return sentence_of(
+            "scale:doubt", figures=self.figures, beyond=("none", "one", "two")[len(beyond)],
+            names=" and ".join(beyond), limit=limit, held=not self.follows,
+            spread=self._is_urdf and limit > AGREES, common=common, half=half,
+            cause=next(cause for cause, holds in causes.items() if holds), factor=self.factor,
+            load=self.masses[2], ratios=listed(single),
+        )  # fmt: skip
 
     @property
     def _is_total_open(self) -> bool:
@@ -267,15 +366,15 @@ class ScaleCheck:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the figures as result.json has them."""
-        figures = asdict(self) | {
-            key: list(getattr(self, key)) for key in ("unexplained", "masses")
+        nested = {
+            "common": self.common and list(self.common),
+            "stated": self.stated and self.stated.to_dict(),
+            "payloads": [x.to_dict() for x in self.payloads],
         }
-        del figures["stated"], figures["payloads"], figures["common"]
-        figures |= {} if self.common is None else {"common": list(self.common)}
-        stated = {} if self.stated is None else {"stated": self.stated.to_dict()}
-        checks = {"payloads": [x.to_dict() for x in self.payloads]} if self.payloads else {}
-        concluded = {"agrees": self.agrees, "message": self.message}
-        return figures | {"is_stated": self.stated is not None} | stated | checks | concluded
+        figures = {k: list(x) if isinstance(x, tuple) else x for k, x in vars(self).items()}
+        figures = {key: x for key, x in figures.items() if key not in nested}
+        figures |= {key: x for key, x in nested.items() if x} | {"is_stated": bool(self.stated)}
+        return figures | {"agrees": self.agrees, "message": self.message}
 
 
 def check_scale(found: Fit) -> ScaleCheck:
@@ -393,65 +492,6 @@ def _with_payload(of_urdf: Array, of_result: Array, last: Array) -> tuple[float,
     return float(both[0]), max(float(both[1]), 0.0), left
 
 
-@dataclass(frozen=True)
-class StatedMass:
-    """Masses that the user states, and what torque alone determines of them.
-
-    Attributes:
-        names: What is stated: "total_mass", or "mass of" a link.
-        ratio: Mass that torque alone determines, without this statement and without the URDF's
-            masses, over the stated mass [-]; None if torque does not determine it.
-        half_width: Half-width of its 95 % interval, plus that of the stated range [-].
-        absorbed_by: Links whose masses change with the stated one while no torque changes.
-    """
-
-    names: tuple[str, ...]
-    ratio: float | None = None
-    half_width: float = 0.0
-    absorbed_by: tuple[str, ...] = ()
-
-    @property
-    def verifies(self) -> bool:
-        """Whether torque determines the stated mass within 5 %, and confirms it within 5 %."""
-        is_near = self.ratio is not None and abs(self.ratio - 1.0) <= AGREES
-        return is_near and self.half_width <= AGREES
-
-    @property
-    def contradicts(self) -> bool:
-        """Whether the whole 95 % interval differs from the stated mass by more than 5 %."""
-        return self.ratio is not None and abs(self.ratio - 1.0) - self.half_width > AGREES
-
-    @property
-    def message(self) -> str:
-        """What the statement verifies, or why it does not."""
-        stated = f"the stated {listed(self.names)}" if self.names else "the stated mass"
-        if self.ratio is None:
-            links = listed(self.absorbed_by, _NAMED)
-            why = f" (the mass of {links} changes with it at equal torque)"
-            return (
-                f"{stated} does not verify the scale: torque does not determine it"
-                f"{why if self.absorbed_by else ''}"
-            )
-        found = (
-            f"torque alone determines {self.ratio:.3g} +- {self.half_width:.2g} x {stated} "
-            f"(limit: 1 +- {AGREES:g})"
-        )
-        if self.verifies:
-            return found
-        if self.contradicts:
-            return f"{found}; probable cause: the gains of the torques, or the stated mass"
-        return f"{found}; this does not verify the scale"
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the figures as result.json has them."""
-        return asdict(self) | {key: list(getattr(self, key)) for key in _LISTS}
-
-    @classmethod
-    def from_dict(cls, stated: Mapping[str, Any]) -> StatedMass:
-        """Return the figures that a result.json has."""
-        return cls(**(dict(stated) | {key: tuple(stated[key]) for key in _LISTS}))
-
-
 def stated_mass(found: Fit) -> StatedMass | None:
     """Return the check of the masses that the user states; None without one.
 
@@ -517,95 +557,3 @@ def _checked(found: Fit, names: Sequence[str], C: Array, widths: Array) -> State
     error = float(np.sqrt(max(M @ wls.covariance[np.ix_(is_known, is_known)] @ M, 0.0)))
     width = QUANTILE * error + float(np.abs(sums) @ widths)
     return StatedMass(tuple(names), ratio, width)
-
-
-@dataclass(frozen=True)
-class PayloadCheck:
-    """The known mass of a payload, and its mass as torque alone determines it.
-
-    Attributes:
-        link: The link that carries it.
-        known: Its known mass [kg].
-        identified: Its mass identified without this knowledge [kg]; None if the motion does not
-            determine it.
-        std_error: Standard error of that [kg].
-        interval: 95 % interval of it [kg].
-        log: The log with the payload; "" if it is not a file.
-        sha256: SHA-256 of the log; "" if it is not a file.
-    """
-
-    link: str
-    known: float
-    identified: float | None = None
-    std_error: float = 0.0
-    interval: tuple[float, float] = (0.0, 0.0)
-    log: str = ""
-    sha256: str = ""
-
-    @property
-    def ratio(self) -> float | None:
-        """Identified over known mass, the scale of the torques [-]."""
-        return None if self.identified is None else self.identified / self.known
-
-    @property
-    def verifies(self) -> bool:
-        """Whether the masses differ by at most 5 %, and the half-width of the interval is so, too.
-
-        A stated mass of the robot verifies the scale by the same criterion.
-        """
-        low, high = self.interval
-        is_sharp = 0.5 * (high - low) <= AGREES * self.known
-        return self.ratio is not None and abs(self.ratio - 1.0) <= AGREES and is_sharp
-
-    @property
-    def contradicts(self) -> bool:
-        """Whether the masses differ by more than 5 %, and the known one is outside the interval."""
-        low, high = self.interval
-        is_outside = not low <= self.known <= high
-        return self.ratio is not None and abs(self.ratio - 1.0) > AGREES and is_outside
-
-    @property
-    def message(self) -> str:
-        """Both masses, their difference, and what follows for the scale of the torques."""
-        what, ratio = f"payload of {self.known:g} kg on {self.link}", self.ratio
-        if self.identified is None or ratio is None:
-            return (
-                f"{what}: the motion does not determine its mass, which does not verify the scale; "
-                "record poses and motions in which its gravity loads different joints"
-            )
-        low, high = self.interval
-        deviation = (
-            f", {abs(self.identified - self.known) / self.std_error:.1f} standard errors"
-            if self.std_error > 0
-            else ""
-        )
-        found = (
-            f"{what}: torque alone determines {self.identified:.4g} kg (95 % interval {low:.4g} to "
-            f"{high:.4g}), {100 * (ratio - 1):+.1f} %{deviation}"
-        )
-        limit = f"{100 * AGREES:g} %"
-        if self.verifies:
-            return f"{found}; wanted: at most {limit}"
-        if self.contradicts:
-            size = f"{100 * abs(ratio - 1):.0f} % too {'large' if ratio > 1 else 'small'}"
-            return (
-                f"{found}; wanted: at most {limit}. The torques of the joints that carry it are "
-                f"about {size}, and so are masses and inertias: divide the gains of the torques by "
-                f"{ratio:.3g}, or check the known mass"
-            )
-        return (
-            f"{found}. This neither verifies nor contradicts the scale; wanted: a difference and a "
-            f"half-width of the interval of at most {limit}. Use a larger payload, or a longer "
-            "motion"
-        )
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the figures as result.json has them."""
-        return asdict(self) | {"interval": list(self.interval), "message": self.message}
-
-    @classmethod
-    def from_dict(cls, stated: Mapping[str, Any]) -> PayloadCheck:
-        """Return the check that a result.json has."""
-        own = {key: value for key, value in stated.items() if key != "message"}
-        low, high = stated["interval"]
-        return cls(**own | {"interval": (low, high)})

@@ -13,8 +13,6 @@ from robotid.estimation.estimators.recursive import (
     RecursiveEstimator,
     RLSState,
     fold,
-    load_state,
-    save_state,
 )
 
 __all__ = [
@@ -36,6 +34,4 @@ __all__ = [
     "RLSState",
     "RecursiveEstimator",
     "fold",
-    "load_state",
-    "save_state",
 ]

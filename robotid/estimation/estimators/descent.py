@@ -27,8 +27,9 @@ _AVERAGE = 3.0  # weight of the newest iterate: 3 / (k + 2), the initial value d
 _MEMORY = 1000.0  # [samples] over which PRX and the residuals are averaged
 _SILENT = 1e-9  # relative norm below which columns are not scaled
 _SMALLEST = 1e-6  # lower bound of the eigenvalues of D(q, P^), relative to the largest
-_RIDGE = 1e-9  # relative regularisation for metric "rows", for dependent rows
 _REGULARISATION = 1e-9  # of the normalised gradient
+_NO_PRX = 1e-9  # norm of the moving average of PRX below which it is 0, scaled parameters
+_NO_SAMPLE = 1e-12  # samples with |Psi|^2 below it are skipped
 _GAIN = 0.01  # relative decrease of the squared residual per pass at convergence
 _ZERO = 2.0  # a mean PRX of fewer standard errors is 0
 
@@ -62,14 +63,6 @@ class Descent(RecursiveEstimator[DescentState]):
     average: bool = True  # whether the estimate is the average of the iterates; better with noise
     passes: int = 4  # largest number of passes of ``fit``
     rng: np.random.Generator | None = None  # of the order of the samples; None: order of time
-    eps1: float = 1e-9  # norm of the moving average of PRX below which it is 0, scaled parameters
-    eps2: float = 1e-12  # samples with |Psi|^2 <= eps2 are skipped
-
-    def __post_init__(self) -> None:
-        for name in ("passes", "eps1", "eps2"):
-            if not getattr(self, name) > 0:
-                raise DataError(f"{name} is {getattr(self, name)}, wanted a positive number")
-        self._check()
 
     @property
     def weighing(self) -> Weighing:
@@ -79,10 +72,6 @@ class Descent(RecursiveEstimator[DescentState]):
     @abstractmethod
     def _takes_scale(self) -> bool:
         """Whether ``fit`` scales the columns if no scale is given."""
-
-    @abstractmethod
-    def _check(self) -> None:
-        """Raise an error if settings of the subclass are out of their range."""
 
     @abstractmethod
     def _moved(self, x: Array, Psi: Array, e: Array, used: Rows, sample: Sample) -> Array:
@@ -99,7 +88,7 @@ class Descent(RecursiveEstimator[DescentState]):
         if self.scale is not None:
             Psi = Psi / self.scale
         steps = state.steps + 1
-        if np.vdot(Psi, Psi) <= self.eps2:
+        if np.vdot(Psi, Psi) <= _NO_SAMPLE:
             return replace(state, steps=steps, skipped=state.skipped + 1)
         # usually all rows are used, and a slice is fast
         used = slice(None) if len(rows) == len(sigma) else np.flatnonzero(sample.weight)
@@ -150,18 +139,18 @@ class Descent(RecursiveEstimator[DescentState]):
         return 1.0 if self.scale is None else self.scale
 
     def _is_zero(self, state: DescentState) -> bool:
-        """Return whether PRX = 0 (25): within eps1, or within its own scatter."""
+        """Return whether PRX = 0 (25): within rounding, or within its own scatter."""
         if state.steps < _MEMORY:
             return False
         norm = float(np.linalg.norm(state.prx))
         standard_error = np.sqrt(state.prx_square / (2 * _MEMORY))
-        return norm <= self.eps1 or norm <= _ZERO * standard_error
+        return norm <= _NO_PRX or norm <= _ZERO * standard_error
 
     def _has_settled(self, before: DescentState, after: DescentState) -> bool:
         """Return whether PRX = 0 after a pass; if it scatters, the residual must not decrease."""
         first, last = (float(np.sum(s.squares / self.sigma**2)) for s in (before, after))
         gain = 1.0 - last / first if first > 0 else 1.0
-        is_small = float(np.linalg.norm(after.prx)) <= self.eps1
+        is_small = float(np.linalg.norm(after.prx)) <= _NO_PRX
         return is_small or (self._is_zero(after) and gain < _GAIN)
 
 
@@ -169,39 +158,32 @@ class Descent(RecursiveEstimator[DescentState]):
 class NormalisedGradient(Descent):
     """Normalised gradient (NLMS), the fastest recursive estimator.
 
-    theta <- theta - mu / (1e-9 + |Psi|_F^2) Psi^T e, e = Psi theta - tau, rows in units of their
-    noise. Without noise |theta~| does not increase for 0 < mu < 2.
+    theta <- theta - Psi^T e / (1e-9 + |Psi|_F^2), e = Psi theta - tau, rows in units of their
+    noise. Without noise |theta~| does not increase.
 
     References:
         Goodwin, Sin (1984), Adaptive Filtering, Prediction and Control, 3.3.
     """
 
-    step_size: float = 1.0  # the relaxation mu, above 0 and below 2 [-]
-
     @property
     def _takes_scale(self) -> bool:
         return True
 
-    def _check(self) -> None:
-        if not 0 < self.step_size < 2:
-            raise DataError(f"step_size is {self.step_size}, wanted above 0 and below 2")
-
     def _moved(self, x: Array, Psi: Array, e: Array, used: Rows, sample: Sample) -> Array:
-        gamma = self.step_size / (_REGULARISATION + np.vdot(Psi, Psi))
-        return x - gamma * (e @ Psi)
+        return x - 1.0 / (_REGULARISATION + np.vdot(Psi, Psi)) * (e @ Psi)
 
 
 @dataclass(frozen=True, eq=False)
 class PRX(Descent):
-    """The paper's update P^ <- P^ - gamma Psi^T eta (24), with e = Psi P^ - tau and eta = M e.
+    """The paper's update P^ <- P^ - gamma Psi^T eta (24), with e = Psi P^ - tau.
 
     * step "printed": eta = D^-1 e, gamma = sigma_D / |Psi|_F^2, sigma_D the smallest eigenvalue of
       D(q, P^). For an arm with six joints the steps are very small.
-    * step "exact": gamma = e^T eta / |Psi^T eta|^2, the minimiser of |P~| along the direction.
+    * step "exact": eta = e, rows in units of their noise; gamma = e^T e / |Psi^T e|^2, the
+      minimiser of |P~| along the direction.
 
-    Without noise |P~| does not increase: with "exact" for any positive definite M, with "printed"
-    if sigma_min(D(q, P^)) <= 2 sigma_min(D(q, P)). With column scaling this is the norm of
-    scale * P~.
+    Without noise |P~| does not increase: with "exact" always, with "printed" if
+    sigma_min(D(q, P^)) <= 2 sigma_min(D(q, P)). With column scaling this is the norm of scale * P~.
 
     With noise each iterate changes by about the noise of its sample: on recordings of a UR10e and a
     Panda the prediction error of the last iterate is 1.3 to 1.9 times that of weighted least
@@ -213,44 +195,31 @@ class PRX(Descent):
     """
 
     step: str = "exact"  # or "printed"
-    #: For step "exact": "noise" for M = diag(sigma^-2); "mass" for M = D(q, P^)^-1, as printed;
-    #: "rows" for M = (Psi Psi^T)^-1, which fits all rows of a sample together.
-    metric: str = "noise"
+
+    def __post_init__(self) -> None:
+        if self.step not in ("exact", "printed"):
+            raise DataError(f"step is {self.step!r}, wanted 'exact' or 'printed'")
 
     @property
     def needs_mass(self) -> bool:
-        return self.step == "printed" or self.metric == "mass"
+        return self.step == "printed"
 
     @property
     def _takes_scale(self) -> bool:
         return self.step == "exact"
 
-    def _check(self) -> None:
-        if self.step not in ("exact", "printed"):
-            raise DataError(f"step is {self.step!r}, wanted 'exact' or 'printed'")
-        if self.metric not in ("noise", "mass", "rows"):
-            raise DataError(f"metric is {self.metric!r}, wanted 'noise', 'mass' or 'rows'")
-
     def _moved(self, x: Array, Psi: Array, e: Array, used: Rows, sample: Sample) -> Array:
-        if self.needs_mass:
-            return x - self._massive_step(x, sample, used)
-        if self.metric == "noise":
-            return x - _exact(Psi, e, e)
-        A = Psi @ Psi.T
-        A.flat[:: len(A) + 1] += _RIDGE * np.trace(A)
-        return x - _exact(Psi, e, np.linalg.solve(A, e))
-
-    def _massive_step(self, x: Array, sample: Sample, used: Rows) -> Array:
-        """Return the step with eta = D^-1 e (20), rows as in the paper."""
-        Psi = sample.Y[used] / self._unit
+        if self.step == "exact":
+            direction = e @ Psi
+            square = direction @ direction
+            return x - ((e @ e) / square if square > 0 else 0.0) * direction
+        Psi = sample.Y[used] / self._unit  # rows as in the paper
         values, vectors = self._inertia(x, sample)
         e = np.zeros(len(values))
         e[used] = Psi @ x - sample.tau[used]
-        eta = vectors @ ((e @ vectors) / values)  # D^-1 e
-        if self.step == "exact":
-            return _exact(Psi, e[used], eta[used])
+        eta = vectors @ ((e @ vectors) / values)  # D^-1 e (20)
         gamma = values[0] / np.vdot(Psi, Psi)  # sigma_D / |Psi|_F^2
-        return np.asarray(gamma * (eta[used] @ Psi))  # (24)
+        return np.asarray(x - gamma * (eta[used] @ Psi))  # (24)
 
     def _inertia(self, x: Array, sample: Sample) -> tuple[Array, Array]:
         """Return eigenvalues and eigenvectors of D(q, P^), which is linear in P^ (11).
@@ -282,11 +251,3 @@ def column_scale(problem: Problem, sigma: Array) -> Array:
         raise DataError("the problem has a row that is not finite; check the trajectory")
     rms = np.sqrt(squares / max(count, 1))
     return np.where(rms > _SILENT * rms.max(initial=0.0), rms, 1.0)
-
-
-def _exact(Psi: Array, e: Array, eta: Array) -> Array:
-    """Return gamma* Psi^T eta, gamma* = e^T eta / |Psi^T eta|^2: the nearest point to P."""
-    direction = eta @ Psi
-    square = direction @ direction
-    gamma = (e @ eta) / square if square > 0 else 0.0
-    return gamma * direction

@@ -1,19 +1,16 @@
 """Recursive estimators: their interface, recursive least squares and a Kalman filter."""
 
-import json
 import math
 from abc import abstractmethod
 from collections.abc import Iterable
-from dataclasses import dataclass, fields
-from pathlib import Path
+from dataclasses import dataclass
 from statistics import NormalDist
-from typing import Any, ClassVar, Generic, Literal, TypeVar
+from typing import ClassVar, Generic, Literal, TypeVar
 
 import numpy as np
 from scipy.linalg.lapack import dtpqrt
 
 from robotid.base.exceptions import DataError, RankDeficientError
-from robotid.base.files import written_whole
 from robotid.base.typing import Array
 from robotid.dynamics.factors import Factors
 from robotid.dynamics.problem import Problem, Sample
@@ -84,36 +81,6 @@ def scaled_rows(sample: Sample, sigma: Array, c: int) -> Array:
             "remains valid"
         )
     return rows
-
-
-def save_state(state: Any, path: str | Path) -> None:  # noqa: ANN401
-    """Write a state to an NPZ file, exactly, without pickle, completely or not at all."""
-    content = {f.name: np.asarray(getattr(state, f.name)) for f in fields(state)}
-    kind = np.frombuffer(json.dumps(type(state).__name__).encode(), dtype=np.uint8)
-    with written_whole(path) as beside, open(beside, "wb") as stream:
-        np.savez(stream, allow_pickle=False, __kind__=kind, **content)
-
-
-def load_state(path: str | Path, kind: type[StateT]) -> StateT:
-    """Return a state of a class, as ``RLSState``, from a file, with the same bits.
-
-    Raises:
-        DataError: If the file does not exist, is not NPZ, or contains another class of state.
-    """
-    source = Path(path)
-    if not source.is_file():
-        raise DataError(f"the file {str(source)!r} of the state does not exist")
-    try:
-        with np.load(source, allow_pickle=False) as archive:
-            content = dict(archive)
-    except (ValueError, OSError) as error:
-        raise DataError(f"{source.name} is not a file of a state: {error}") from error
-    stored = json.loads(bytes(content.pop("__kind__", np.frombuffer(b"null", np.uint8))))
-    if stored != kind.__name__:
-        raise DataError(f"{source.name} contains a state {stored!r}, wanted {kind.__name__!r}")
-    # LAPACK needs column order: NPZ preserves the memory order of arrays
-    plain = {key: x if x.ndim else x.item() for key, x in content.items()}
-    return kind(**plain)
 
 
 class Filter(RecursiveEstimator[StateT]):

@@ -23,68 +23,43 @@ _FARTHEST = 1.33  # largest factor by which a shape parameter changes in one ste
 
 @dataclass(frozen=True)
 class Tried:
-    """A set of drive terms that was tried for a joint.
+    """A set of drive terms that was tried for a joint."""
 
-    Attributes:
-        families: Names of the families in addition to viscous and Coulomb friction.
-        held_out_error_pct: Residual of the held-out segments, relative to the torque [%].
-        p_value: p-value of the reduction of the held-out residual [-]; 1 without a reduction.
-        is_selected: Whether it was selected.
-    """
-
-    families: tuple[str, ...]
-    held_out_error_pct: float
-    p_value: float
-    is_selected: bool
+    families: tuple[str, ...]  # names of the families in addition to viscous and Coulomb friction
+    held_out_error_pct: float  # residual of the held-out segments, relative to the torque [%]
+    p_value: float  # p-value of the reduction of the held-out residual [-]; 1 without a reduction
+    is_selected: bool  # whether it was selected
 
 
 @dataclass(frozen=True)
 class FoundShape:
-    """An identified shape parameter of a friction term.
+    """An identified shape parameter of a friction term."""
 
-    Attributes:
-        name: Its name, as ``stribeck.speed``.
-        value: Its value [unit].
-        std_error: Its standard error [unit].
-        unit: Its unit.
-        is_at_bound: Whether it is at a bound of the search range.
-    """
-
-    name: str
-    value: float
-    std_error: float
-    unit: str
-    is_at_bound: bool
+    name: str  # its name, as ``stribeck.speed``
+    value: float  # its value [unit]
+    std_error: float  # its standard error [unit]
+    unit: str  # its unit
+    is_at_bound: bool  # whether it is at a bound of the search range
 
 
 @dataclass(frozen=True)
 class DriveChoice:
-    """The terms selected for one joint's drive.
-
-    Attributes:
-        joint: The joint.
-        families: Names of the families in addition to viscous and Coulomb friction.
-        terms: The terms.
-        tried: The sets of terms that were tried, step by step.
-        shapes: The identified shape parameters.
-        shape_covariance: Their covariance, row by row.
-        sizes: Values of the shape parameters of each family.
-        data_range: Ranges of position "q" and of absolute speed "v" in the fitted rows.
-        grown: Factor by which the terms increase the standard errors of the drive's armature,
-            viscous and Coulomb friction and offset, by name.
-        undecided: Terms that reduce the held-out residual, but not significantly. They were not
-            selected; the standard errors include the change that they would cause.
-    """
+    """The terms selected for one joint's drive."""
 
     joint: str
-    families: tuple[str, ...]
+    families: tuple[str, ...]  # names of the families in addition to viscous and Coulomb friction
     terms: tuple[DriveTerm, ...]
-    tried: tuple[Tried, ...] = ()
-    shapes: tuple[FoundShape, ...] = ()
-    shape_covariance: tuple[tuple[float, ...], ...] = ()
-    sizes: tuple[tuple[float, ...], ...] = ()
+    tried: tuple[Tried, ...] = ()  # the sets of terms that were tried, step by step
+    shapes: tuple[FoundShape, ...] = ()  # the identified shape parameters
+    shape_covariance: tuple[tuple[float, ...], ...] = ()  # their covariance, row by row
+    sizes: tuple[tuple[float, ...], ...] = ()  # values of the shape parameters of each family
+    #: Ranges of position "q" and of absolute speed "v" in the fitted rows.
     data_range: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    #: Factor by which the terms increase the standard errors of the drive's armature, viscous and
+    #: Coulomb friction and offset, by name.
     grown: Mapping[str, float] = field(default_factory=dict)
+    #: Terms that reduce the held-out residual, but not significantly. They were not selected; the
+    #: standard errors include the change that they would cause.
     undecided: tuple[DriveTerm, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
@@ -141,32 +116,20 @@ def with_shapes(families: Sequence[Family], flat: Array) -> list[tuple[Family, l
 
 @dataclass(frozen=True, eq=False)
 class JointMotion:
-    """Motion and load of a joint in N rows of the fitted recordings.
+    """Motion and load of a joint in N rows of the fitted recordings."""
 
-    Attributes:
-        q: Positions, shape (N,) [rad or m].
-        v: Speeds, shape (N,) [rad/s or m/s].
-        a: Accelerations, shape (N,) [rad/s^2 or m/s^2].
-        direction: Direction of friction: the sign of v, filtered as the torque, shape (N,) [-].
-        load: Torque of the rigid bodies by the estimate, shape (N,) [N m or N].
-        travelled: Distance since the last change of sign of v, shape (N,) [rad or m].
-        time: Time since the start of the recording, over the longest duration, shape (N,) [-].
-        passes: Cut-off frequency of the torque filter [Hz]; infinite without a filter.
-        longest: The longest duration of a recording [s].
-        others: Motion of the joints before and after it, by name.
-        scale: Motion whose typical speeds, distances and loads scale columns; None: this one.
-    """
-
-    q: Array
-    v: Array
-    a: Array
-    direction: Array
-    load: Array
-    travelled: Array
-    time: Array
-    passes: float = np.inf
-    longest: float = 1.0
+    q: Array  # (N,), positions [rad or m]
+    v: Array  # (N,), speeds [rad/s or m/s]
+    a: Array  # (N,), accelerations [rad/s^2 or m/s^2]
+    direction: Array  # (N,), direction of friction: the sign of v, filtered as the torque [-]
+    load: Array  # (N,), torque of the rigid bodies by the estimate [N m or N]
+    travelled: Array  # (N,), distance since the last change of sign of v [rad or m]
+    time: Array  # (N,), time since the start of the recording, over the longest duration [-]
+    passes: float = np.inf  # cut-off frequency of the torque filter [Hz]; infinite without a filter
+    longest: float = 1.0  # the longest duration of a recording [s]
+    #: Motion of the joints before and after it, by name.
     others: dict[str, "JointMotion"] = field(default_factory=dict)
+    #: Motion whose typical speeds, distances and loads scale columns; None: this one.
     scale: "JointMotion | None" = None
 
     @classmethod
@@ -239,17 +202,11 @@ def travelled(motion: Trajectory) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class OpenTerm:
-    """An uncertainty of a joint's drive model: an undecided term, or the error of a shape.
-
-    Attributes:
-        joint: The joint.
-        moves: Change of the standard parameters that it causes, shape (p,).
-        torque: Function of the motion of the drive and of the joint that returns its own torque,
-            shape (N,) [N m or N].
-    """
+    """An uncertainty of a joint's drive model: an undecided term, or the error of a shape."""
 
     joint: str
-    moves: Array
+    moves: Array  # (p,), change of the standard parameters that it causes
+    #: Its own torque, (N,) [N m or N], from the motion of the drive and of the joint.
     torque: Callable[[DriveMotion, JointMotion], Array]
 
 

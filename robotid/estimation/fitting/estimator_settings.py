@@ -1,34 +1,17 @@
-"""The estimators' settings, one table for each, and the estimators that they make."""
+"""The estimators' settings, one table for each."""
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
-from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, ClassVar, Self
-
-import numpy as np
+from dataclasses import dataclass, fields
+from typing import Any, ClassVar, Self
 
 from robotid.base.exceptions import SettingsError
 from robotid.base.findings import listed
 from robotid.base.settings import Range, Settings, require_kind, setting
-from robotid.base.typing import Array
-
-if TYPE_CHECKING:
-    from robotid.dynamics.base_parameters import BaseMapping
-    from robotid.dynamics.factors import Factors
-    from robotid.estimation.estimators import (
-        BatchEstimator,
-        Consistent,
-        Constraints,
-        RecursiveEstimator,
-    )
-    from robotid.robot.model import RobotModel
 
 _NOT_NEGATIVE = Range("x >= 0", lambda x: x >= 0)
-_COUNT = Range("1 to 10000", lambda x: 1 <= x <= 10_000)
 _LARGEST = 1e9  # [kg] or [m] of bounds, as of numbers in a URDF
 _WINDOW = Range("0.05 s or more", lambda x: 0.05 <= x < math.inf)
-_FOLDS = 6  # of the cross-validation, prior_weight = "cv"
 _FINITE = Range("a positive, finite number", lambda x: 0 < x < math.inf)
 
 
@@ -127,45 +110,17 @@ def _is_number(value: object) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
-@dataclass(frozen=True, eq=False)
-class Known:
-    """A robot and the prior of its parameters."""
-
-    model: "RobotModel"
-    mapping: "BaseMapping"  # standard to base parameters
-    pi: Array  # (p,), standard parameters of the URDF
-    spread: Array  # (p,), prior standard deviations
-    share: float  # share of the rows that count as independent [-]
-    sigma: Array  # (n,), noise level of each joint [N m or N]
-    held_out: "tuple[Factors, ...]" = ()  # segments for choosing the weight and testing extents
-    repeated: float = 0.0  # share of errors of points of contact in the squared residual [-]
-
-    @property
-    def beta(self) -> Array:
-        """Base parameters of the URDF, shape (b,)."""
-        return self.mapping.to_base(self.pi)
-
-    @property
-    def covariance(self) -> Array:
-        """Prior covariance of the base parameters, shape (b, b)."""
-        KS = self.mapping.K * self.spread
-        covariance: Array = KS @ KS.T
-        return covariance
-
-
 @dataclass(frozen=True, init=False)
 class EstimatorSettings(Settings):
     """The estimator and its settings, as ``EstimatorSettings("wls", robust="huber")``.
 
     The call returns the settings class of that estimator. A setting of another estimator is an
     error.
-
-    Attributes:
-        has_equal_weights: Whether all rows have equal weights, whatever the noise of their joints.
-        allows_for_noise: Whether the estimator itself accounts for noise of the regressor.
     """
 
+    #: Whether all rows have equal weights, whatever the noise of their joints.
     has_equal_weights: ClassVar[bool] = False
+    #: Whether the estimator itself accounts for noise of the regressor.
     allows_for_noise: ClassVar[bool] = False
 
     name: str = setting("consistent", "name of the estimator")
@@ -194,18 +149,6 @@ class EstimatorSettings(Settings):
     @classmethod
     def from_dict(cls, table: Mapping[str, Any]) -> Self:
         return cls(**table)
-
-    def make(self, known: Known) -> "BatchEstimator | RecursiveEstimator[Any]":
-        """Return the estimator that reads rows or samples.
-
-        Args:
-            known: The robot and its prior.
-
-        Raises:
-            SettingsError: If constraints contradict each other or do not match the robot, or the
-                estimator reads a simulator.
-        """
-        raise SettingsError(f"{self!r} describes no estimator; use EstimatorSettings(name)")
 
     @property
     def words(self) -> str:
@@ -277,21 +220,6 @@ class RecursiveSettings(BoundedSettings):
     )
 
 
-@dataclass(frozen=True, init=False)
-class DescentSettings(RecursiveSettings):
-    """Settings of gradient methods, which end near the least squares solution."""
-
-    average: bool = setting(True, "whether the iterates are averaged")
-    passes: int = setting(4, "largest number of passes over the logs", within=_COUNT)
-    seed: int = setting(0, "seed of the random order of the samples; negative: order of time")
-
-    @property
-    def _common(self) -> dict[str, Any]:
-        """Return the arguments common to these estimators."""
-        rng = np.random.default_rng(self.seed) if self.seed >= 0 else None
-        return {"average": self.average, "passes": self.passes, "rng": rng}
-
-
 @dataclass(frozen=True)
 class OLSSettings(EstimatorSettings):
     """Settings of ordinary least squares: none."""
@@ -300,22 +228,12 @@ class OLSSettings(EstimatorSettings):
 
     name: str = _called("ols", "ordinary least squares")
 
-    def make(self, known: Known) -> "BatchEstimator":
-        from robotid.estimation.estimators import OLS
-
-        return OLS(independent_share=known.share)
-
 
 @dataclass(frozen=True)
 class WLSSettings(RobustSettings):
     """Settings of weighted least squares."""
 
     name: str = _called("wls", "weighted least squares, rows weighted by the noise of their joint")
-
-    def make(self, known: Known) -> "BatchEstimator":
-        from robotid.estimation.estimators import WLS
-
-        return WLS(independent_share=known.share)
 
 
 @dataclass(frozen=True)
@@ -332,11 +250,6 @@ class TLSSettings(EstimatorSettings):
         within=Range("x > 0", lambda x: x > 0),
     )
 
-    def make(self, known: Known) -> "BatchEstimator":
-        from robotid.estimation.estimators import TLS
-
-        return TLS(self.regressor_noise, independent_share=known.share)
-
 
 @dataclass(frozen=True)
 class ConsistentSettings(RobustSettings, BoundedSettings):
@@ -346,9 +259,6 @@ class ConsistentSettings(RobustSettings, BoundedSettings):
         "consistent",
         "weighted least squares with physically consistent bodies and the URDF's values as prior",
     )
-
-    def make(self, known: Known) -> "BatchEstimator":
-        return consistent_fit(self, known)
 
 
 @dataclass(frozen=True)
@@ -361,13 +271,6 @@ class RLSSettings(RecursiveSettings):
         "forgetting factor: weight of a sample relative to the next one [-]",
         within=Range("0 < x <= 1", lambda x: 0 < x <= 1),
     )
-
-    def make(self, known: Known) -> "RecursiveEstimator[Any]":
-        from robotid.estimation.estimators import RLS
-
-        # without forgetting the prior is not used: the result is that of batch least squares
-        std = np.sqrt(np.diag(known.covariance)) if self.forgetting < 1 else None
-        return RLS(known.sigma, self.forgetting, known.beta, std, known.share)
 
 
 @dataclass(frozen=True)
@@ -388,15 +291,9 @@ class KalmanSettings(RecursiveSettings):
         ),
     )
 
-    def make(self, known: Known) -> "RecursiveEstimator[Any]":
-        from robotid.estimation.estimators import Kalman
-
-        gate = None if self.gate is False else float(self.gate)
-        return Kalman(known.sigma, known.beta, known.covariance, self.walk, gate, known.share)
-
 
 @dataclass(frozen=True)
-class PRXSettings(DescentSettings):
+class PRXSettings(RecursiveSettings):
     """Settings of the paper's update law."""
 
     name: str = _called("prx", "gradient steps along PRX (the paper's update), sample by sample")
@@ -405,33 +302,13 @@ class PRXSettings(DescentSettings):
         "step length: exact (line search) or printed (as in the paper)",
         among=("exact", "printed"),
     )
-    metric: str = setting(
-        "noise",
-        "metric of the residual for the exact step: noise (levels), mass (matrix), or rows",
-        among=("noise", "mass", "rows"),
-    )
-
-    def make(self, known: Known) -> "RecursiveEstimator[Any]":
-        from robotid.estimation.estimators import PRX
-
-        own = {"step": self.step, "metric": self.metric, **self._common}
-        return PRX(known.sigma, known.beta, **own)
 
 
 @dataclass(frozen=True)
-class GradientSettings(DescentSettings):
+class GradientSettings(RecursiveSettings):
     """Settings of normalised gradient steps."""
 
     name: str = _called("gradient", "normalised gradient steps, sample by sample")
-    step_size: float = setting(
-        1.0, "relaxation factor [-]", within=Range("0 < x < 2", lambda x: 0 < x < 2)
-    )
-
-    def make(self, known: Known) -> "RecursiveEstimator[Any]":
-        from robotid.estimation.estimators import NormalisedGradient
-
-        own = {"step_size": self.step_size, **self._common}
-        return NormalisedGradient(known.sigma, known.beta, **own)
 
 
 @dataclass(frozen=True)
@@ -469,9 +346,6 @@ class SimulationSettings(EstimatorSettings):
     torques: bool = setting(
         True, "whether torques are fitted in addition to the positions, if all logs have them"
     )
-    whiten: bool = setting(
-        True, "whether the residuals are whitened by their estimated correlation"
-    )
 
 
 #: The settings of each estimator, by its name.
@@ -489,81 +363,3 @@ ESTIMATORS: Mapping[str, type[EstimatorSettings]] = {
         SimulationSettings,
     )
 }
-
-
-def consistent_fit(settings: BoundedSettings, known: Known) -> "Consistent":
-    """Return the physically consistent estimator, which can also project an estimate."""
-    from robotid.dynamics.factors import gather
-    from robotid.estimation.estimators import Consistent
-    from robotid.estimation.estimators.prior_weight import (
-        AS_GOOD,
-        Segments,
-        choose_weight,
-        contradicted_extents,
-        loss_of,
-    )
-    from robotid.robot.bodies import held_parameters
-    from robotid.robot.geometry import body_boxes, geometry_half_spaces
-
-    bounds, weight, model = settings.bounds, settings.prior_weight, known.model
-    geometry = geometry_half_spaces(model, bounds.com_within)
-    extent = body_boxes(model) if bounds.extent == "box" else {}
-    bounds = replace(bounds, pinned=pinned_links(bounds, model))
-    fit = Consistent(
-        layout=model.layout,
-        K=known.mapping.K,
-        prior=known.pi,
-        prior_std=known.spread,
-        held=held_parameters(model),
-        prior_weight=1.0 if isinstance(weight, str) else weight,
-        independent_share=known.share,
-        constraints=make_constraints(bounds, geometry, extent),
-        wls_noise=known.sigma,
-    )
-    folds = gather(known.held_out, _FOLDS)
-    how = "" if not isinstance(weight, str) else "cv" if weight == "auto" else weight
-    if how == "cv" and len(folds) < 2:
-        how = ""
-    if not extent and not how:
-        return fit
-    segments = Segments.of(fit, folds)
-    if extent:
-        beyond = contradicted_extents(fit, segments)
-        if beyond:  # else the programme that is set up already remains
-            fit = replace(fit, constraints=fit.constraints.without_extent(beyond))
-    if not how:
-        return fit
-    choice = choose_weight(fit, segments, how, known.repeated)
-    if fit.constraints.extent and choice.loss > AS_GOOD:
-        unbound = replace(fit, constraints=fit.constraints.without_extent(fit.constraints.extent))
-        if AS_GOOD * loss_of(unbound, segments, choice.weight) < choice.loss:
-            fit, choice = unbound, choose_weight(unbound, segments, how, known.repeated)
-    return replace(
-        fit, prior_weight=choice.weight, plausible_weight=choice.plausible, choice=choice
-    )
-
-
-def pinned_links(bounds: ConstraintSettings, model: "RobotModel") -> tuple[str, ...]:
-    """Return the links that keep the URDF's values: those stated, and those of negligible mass."""
-    from robotid.robot.bodies import negligible_bodies
-
-    bounded = {*bounds.pinned, *bounds.mass, *bounds.com}
-    return (*bounds.pinned, *(x for x in negligible_bodies(model) if x not in bounded))
-
-
-def make_constraints(
-    bounds: ConstraintSettings,
-    geometry: Mapping[str, tuple[Array, Array]],
-    extent: Mapping[str, Array] = MappingProxyType({}),
-) -> "Constraints":
-    """Return the constraints in the form that the estimator needs."""
-    from robotid.estimation.estimators import Constraints
-
-    A = np.vstack([np.eye(3), -np.eye(3)])
-    com, extents = dict(geometry), dict(extent)
-    for name, (low, high) in bounds.boxes.items():
-        com[name] = (A, np.concatenate([high, np.negative(low)]))
-        if name in extents:  # a stated box enlarges the box of the geometry
-            lower, upper = extents[name]
-            extents[name] = np.array([np.minimum(lower, low), np.maximum(upper, high)])
-    return Constraints(bounds.masses, bounds.total, com, tuple(bounds.pinned), extents)

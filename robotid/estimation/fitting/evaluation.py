@@ -34,39 +34,26 @@ _FITS = 10  # largest number of fits; more motions are left out together
 
 @dataclass(frozen=True)
 class JointMetrics:
-    """Prediction error of the torque or the position of one joint over the rows used.
+    """Prediction error of the torque or the position of one joint over the rows used."""
 
-    Attributes:
-        rmse: Root mean square of the residual [unit].
-        unit: N m or rad; N or m for a prismatic joint.
-        relative_error_pct: 100 |tau - prediction| / |tau| [%]; 100 for a prediction of 0. For a
-            position, relative to its motion about the mean. None if the measured signal is 0.
-        r2: Share of the variance that the prediction explains [-].
-        rows: Number of rows used.
-        baselines: relative_error_pct of other predictions, by name [%].
-        better_than_constant: Whether the residual is smaller than that of the mean.
-    """
-
-    rmse: float
-    unit: str
+    rmse: float  # root mean square of the residual [unit]
+    unit: str  # N m or rad; N or m for a prismatic joint
+    #: 100 |tau - prediction| / |tau| [%]; 100 for a prediction of 0. For a position, relative to
+    #: its motion about the mean. None if the measured signal is 0.
     relative_error_pct: float | None
-    r2: float
-    rows: int
-    baselines: Mapping[str, float | None]
-    better_than_constant: bool
+    r2: float  # share of the variance that the prediction explains [-]
+    rows: int  # number of rows used
+    baselines: Mapping[str, float | None]  # relative_error_pct of other predictions, by name [%]
+    better_than_constant: bool  # whether the residual is smaller than that of the mean
 
 
 @dataclass(frozen=True)
 class Metrics:
-    """Metrics of every joint of one recording.
+    """Metrics of every joint of one recording."""
 
-    Attributes:
-        per_joint: Metrics by name of the joint; joints without rows are not in it.
-        pooled_rmse: Root mean square of the residuals of all joints together [N m, N].
-    """
-
+    #: Metrics by name of the joint; joints without rows are not in it.
     per_joint: Mapping[str, JointMetrics]
-    pooled_rmse: float
+    pooled_rmse: float  # root mean square of the residuals of all joints together [N m, N]
 
     def to_dict(self) -> dict[str, Any]:
         """Return the metrics as they are written to result.json."""
@@ -89,22 +76,14 @@ class Metrics:
 
 @dataclass(frozen=True, eq=False)
 class TorqueSums:
-    """Sums from which the metrics of a prediction are computed; sums of two recordings can merge.
+    """Sums from which the metrics of a prediction are computed; those of two recordings merge."""
 
-    Attributes:
-        rows: Number of rows used per joint, shape (n,), int.
-        mean: Mean of the measured torque over them, shape (n,) [N m, N].
-        spread: Sum of squared deviations of the torque from the mean, shape (n,).
-        torque: Sum of squares of the torque, shape (n,).
-        residual: Sum of squared residuals of the prediction, shape (n,).
-        baselines: Sums of squared residuals of other predictions, by name, each of shape (n,).
-    """
-
-    rows: Array
-    mean: Array
-    spread: Array
-    torque: Array
-    residual: Array
+    rows: Array  # (n,), number of rows used per joint, int
+    mean: Array  # (n,), mean of the measured torque over them [N m, N]
+    spread: Array  # (n,), sum of squared deviations of the torque from the mean
+    torque: Array  # (n,), sum of squares of the torque
+    residual: Array  # (n,), sum of squared residuals of the prediction
+    #: Sums of squared residuals of other predictions, by name, each of shape (n,).
     baselines: Mapping[str, Array]
 
     @classmethod
@@ -176,44 +155,26 @@ class TorqueSums:
 
 @dataclass(frozen=True)
 class Extent:
-    """Size of a log.
+    """Size of a log."""
 
-    Attributes:
-        samples: Number of rows of the log.
-        rate: Median sampling rate [Hz].
-        start: First time stamp [s].
-        end: Last time stamp [s].
-        smooth: Number of samples of the smoothed trajectory.
-        rows_used: Number of torque rows used.
-        segments: Number of uninterrupted segments of the trajectory.
-    """
-
-    samples: int
-    rate: float
-    start: float
-    end: float
-    smooth: int
-    rows_used: int
-    segments: int
+    samples: int  # number of rows of the log
+    rate: float  # median sampling rate [Hz]
+    start: float  # first time stamp [s]
+    end: float  # last time stamp [s]
+    smooth: int  # number of samples of the smoothed trajectory
+    rows_used: int  # number of torque rows used
+    segments: int  # number of uninterrupted segments of the trajectory
 
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """A log processed for a model. Of a long log, only some segments are in memory.
+    """A log processed for a model. Of a long log, only some segments are in memory."""
 
-    Attributes:
-        log: The raw log, or its first rows.
-        signals: The settings of the processing, automatic settings resolved.
-        trajectory: The smoothed motion or segments of it, N samples.
-        mask: Rows used, shape (N, n_rows), bool.
-        extent: Size of the whole log.
-    """
-
-    log: Log
-    signals: SignalSettings
-    trajectory: Trajectory
-    mask: Array
-    extent: Extent
+    log: Log  # the raw log, or its first rows
+    signals: SignalSettings  # the settings of the processing, automatic settings resolved
+    trajectory: Trajectory  # the smoothed motion or segments of it, N samples
+    mask: Array  # (N, n_rows), rows used, bool
+    extent: Extent  # size of the whole log
 
     @property
     def name(self) -> str:
@@ -252,23 +213,17 @@ class Evaluated(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """A recording with its predicted torques.
-
-    Attributes:
-        recording: The recording.
-        torques: Predicted torques by name of the parameters, each of shape (N, n_rows) [N m, N];
-            they include the baselines "urdf", "gravity_only" and "urdf_with_drives".
-        sums: Sums over the whole log from which the metrics are computed, by name of the
-            parameters, without the baselines.
-        metrics: Metrics over the whole log, likewise.
-        is_refitted: Whether it is a validation recording that contains fitted rows.
-    """
+    """A recording with its predicted torques."""
 
     recording: Recording
+    #: Predicted torques by name of the parameters, each of shape (N, n_rows) [N m, N]; they include
+    #: the baselines "urdf", "gravity_only" and "urdf_with_drives".
     torques: Mapping[str, Array]
+    #: Sums over the whole log from which the metrics are computed, by name of the parameters,
+    #: without the baselines.
     sums: Mapping[str, TorqueSums]
-    metrics: Mapping[str, Metrics]
-    is_refitted: bool = False
+    metrics: Mapping[str, Metrics]  # metrics over the whole log, likewise
+    is_refitted: bool = False  # whether it is a validation recording that contains fitted rows
 
     @property
     def log(self) -> Log:

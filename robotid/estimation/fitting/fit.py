@@ -15,13 +15,16 @@ from robotid.dynamics.prediction import body_slopes_by_position, is_loaded
 from robotid.estimation.estimators import WLS, Consistent, Estimate
 from robotid.estimation.estimators.determination import Determination, base_spread, determine
 from robotid.estimation.estimators.estimator import Weighing
+from robotid.estimation.fitting.chosen_estimator import (
+    Known,
+    consistent_fit,
+    make_estimator,
+    pinned_links,
+)
 from robotid.estimation.fitting.estimator_settings import (
     BoundedSettings,
     EstimatorSettings,
-    Known,
     RecursiveSettings,
-    consistent_fit,
-    pinned_links,
 )
 from robotid.estimation.fitting.evaluation import (
     FEWEST_LEFT_OUT,
@@ -165,7 +168,7 @@ class Solved:
         ground, own, mapping = self.ground, self.recordings, self.recordings.mapping
         if own.validation or len(ground.logs) < FEWEST_LEFT_OUT:
             return {}
-        before, estimator = ground.before, self.choice.make(ground.before)
+        before, estimator = ground.before, make_estimator(self.choice, ground.before)
         if estimator.reads != "factors":
             return {}
         fit_to = estimator if self.in_cone is None else self.in_cone
@@ -259,7 +262,7 @@ def _under_own_load(recordings: Recordings, choice: EstimatorSettings) -> Record
             standard = standard - 0.5 * moved
         loads = [_size_of(ground, x) for x in (moved, standard)]
         if (loads[0] <= _SETTLED * loads[1]).all():
-            estimator = choice.make(before)
+            estimator = make_estimator(choice, before)
             if estimator.reads == "factors":
                 estimate = estimator.fit(ground.factors)
                 standard, _ = standard_of(estimate, mapping, before.pi, before.spread)
@@ -384,7 +387,7 @@ def _run(
 ) -> tuple[Estimate, Consistent | None, Weighing]:
     """Return the estimate, the estimator that made it consistent, if any, and the weighting."""
     recordings, before = ground.recordings, ground.before
-    estimator = choice.make(before)
+    estimator = make_estimator(choice, before)
     if recordings.model.is_static and estimator.needs_mass:
         raise SettingsError(
             f"the estimator {choice.name!r} needs the mass matrix, which dynamics = 'static' does "

@@ -69,25 +69,15 @@ def sources_of(share: Array, is_prior: Array, is_bound: Array) -> tuple[str, ...
 
 @dataclass(frozen=True, eq=False)
 class Identified(ABC):
-    """Standard and base parameters of a robot, for every method of identification.
+    """Standard and base parameters of a robot, for every method of identification."""
 
-    Attributes:
-        model: The robot of the URDF, with the identified drive terms.
-        mapping: Standard to base parameters.
-        prior: Standard parameters of the URDF, shape (p,).
-        standard: Standard parameters, shape (p,).
-        standard_covariance: Their covariance given the prior, shape (p, p).
-        base: Base parameters, shape (b,).
-        base_error: Their standard errors, shape (b,); inf if not identifiable.
-    """
-
-    model: RobotModel
-    mapping: BaseMapping
-    prior: Array
-    standard: Array
-    standard_covariance: Array
-    base: Array
-    base_error: Array
+    model: RobotModel  # the robot of the URDF, with the identified drive terms
+    mapping: BaseMapping  # standard to base parameters
+    prior: Array  # (p,), standard parameters of the URDF
+    standard: Array  # (p,), standard parameters
+    standard_covariance: Array  # (p, p), their covariance given the prior
+    base: Array  # (b,), base parameters
+    base_error: Array  # (b,), their standard errors; inf if not identifiable
 
     @property
     @abstractmethod
@@ -190,25 +180,16 @@ class Identified(ABC):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Solution:
-    """Parameters of a robot fitted to recordings, without standard errors.
+    """Parameters of a robot fitted to recordings, without standard errors."""
 
-    Attributes:
-        model: The robot of the URDF.
-        mapping: Standard to base parameters.
-        prior_std: Prior standard deviations of the standard parameters, shape (p,).
-        standard: Standard parameters, shape (p,).
-        fitted: The fitted recordings.
-        validation: The validation recordings.
-        drives: Friction of the joints in addition to viscous and Coulomb friction, and the terms
-            that were tried.
-    """
-
-    model: RobotModel
-    mapping: BaseMapping
-    prior_std: Array
-    standard: Array
-    fitted: tuple[Evaluation, ...]
-    validation: tuple[Evaluation, ...]
+    model: RobotModel  # the robot of the URDF
+    mapping: BaseMapping  # standard to base parameters
+    prior_std: Array  # (p,), prior standard deviations of the standard parameters
+    standard: Array  # (p,), standard parameters
+    fitted: tuple[Evaluation, ...]  # the fitted recordings
+    validation: tuple[Evaluation, ...]  # the validation recordings
+    #: Friction of the joints in addition to viscous and Coulomb friction, and the terms that were
+    #: tried.
     drives: tuple[DriveChoice, ...] = ()
 
 
@@ -217,37 +198,26 @@ class Fit(Identified, Solution):
     """Parameters of a robot fitted to recordings, without findings and verdict.
 
     Its recordings have the predictions "estimate" and "wls".
-
-    Attributes:
-        estimator: The estimator's settings.
-        estimate: Result of the estimator: base parameters, or standard ones ("consistent").
-        wls: Weighted least squares on the same factors, base parameters.
-        urdf_with_drives: The prior with fitted drive terms, shape (p,).
-        errors: Method and degrees of freedom of the standard errors.
-        factors: Triangular factors of the fitted rows, base parameters.
-        determination: Which base parameters the fitted rows determine.
-        open_terms: Uncertainties of the drive models; ``standard_covariance`` includes them.
-        regressor_noise: Effect of position quantisation on least squares; None: negligible.
-        runs: Information of each of three or more fitted logs on parameters that may vary.
-        sums: Sums over their rows from which it is computed.
-        left_out: Without validation logs, metrics of each fitted log as a fit to the others
-            predicts it, by its name.
-        variation: Variation of the drives' parameters between these logs.
     """
 
-    estimator: EstimatorSettings
-    estimate: Estimate
-    wls: Estimate
-    urdf_with_drives: Array
-    errors: StandardErrors
-    factors: Factors
-    determination: Determination
+    estimator: EstimatorSettings  # the estimator's settings
+    estimate: Estimate  # result of the estimator: base parameters, or standard ones ("consistent")
+    wls: Estimate  # weighted least squares on the same factors, base parameters
+    urdf_with_drives: Array  # (p,), the prior with fitted drive terms
+    errors: StandardErrors  # method and degrees of freedom of the standard errors
+    factors: Factors  # triangular factors of the fitted rows, base parameters
+    determination: Determination  # which base parameters the fitted rows determine
+    #: Uncertainties of the drive models; ``standard_covariance`` includes them.
     open_terms: tuple[OpenTerm, ...] = ()
+    #: Effect of position quantisation on least squares; None: negligible.
     regressor_noise: RegressorNoise | None = None
+    #: Information of each of three or more fitted logs on parameters that may vary.
     runs: tuple[RunsOf, ...] = ()
-    sums: RunSums | None = None
+    sums: RunSums | None = None  # sums over their rows from which it is computed
+    #: Without validation logs, metrics of each fitted log as a fit to the others predicts it, by
+    #: its name.
     left_out: Mapping[str, Metrics] = field(default_factory=dict)
-    variation: Variation | None = None
+    variation: Variation | None = None  # variation of the drives' parameters between these logs
     _checked: list[tuple[Array, MassMatrixCheck]] = field(default_factory=list, repr=False)
 
     def friction(

@@ -53,26 +53,19 @@ class RepeatedErrors:
 
 @dataclass(frozen=True, eq=False)
 class Recordings:
-    """The logs of a fit, in memory or read in pieces from their files when needed.
-
-    Attributes:
-        model: The robot.
-        mapping: Standard to base parameters.
-        fitted: Logs to fit.
-        validation: Validation logs.
-        plan: Processes that work on the pieces of logs in files; None: this process.
-        weights: Weights of the rows of each log to fit, shapes (N, n_rows); 1 if None.
-        repeated: Effect of errors of points of contact and of an IMU; None without any.
-        levels: Noise levels of an earlier fit, shape (n,), from which the next one starts.
-    """
+    """The logs of a fit, in memory or read in pieces from their files when needed."""
 
     model: RobotModel
-    mapping: BaseMapping
-    fitted: Sequence[SurveyedLog]
-    validation: Sequence[SurveyedLog] = ()
+    mapping: BaseMapping  # standard to base parameters
+    fitted: Sequence[SurveyedLog]  # logs to fit
+    validation: Sequence[SurveyedLog] = ()  # validation logs
+    #: Processes that work on the pieces of logs in files; None: this process.
     plan: WorkPlan | None = None
+    #: Weights of the rows of each log to fit, shapes (N, n_rows); 1 if None.
     weights: tuple[Array, ...] | None = None
+    #: Effect of errors of points of contact and of an IMU; None without any.
     repeated: RepeatedErrors | None = None
+    #: (n,), noise levels of an earlier fit, from which the next one starts.
     levels: Array | None = None
 
     @property

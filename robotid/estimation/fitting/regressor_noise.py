@@ -32,55 +32,45 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from robotid.base.findings import Finding, listed
 from robotid.base.typing import Array
 from robotid.data.log import Trajectory
 from robotid.data.measured_velocity import quantum
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import local_polynomial
-from robotid.dynamics.base_parameters import BaseMapping
 from robotid.dynamics.factors import Factors, Reduction
 from robotid.estimation.estimators.batch import solve_factor
 from robotid.estimation.fitting.recorded import Recordings
 from robotid.estimation.fitting.survey import SurveyedLog, hold_log
-from robotid.robot.model import RobotModel
 
 _FEWEST, _MOST = 4, 6  # pairs of rounding errors
 _PRECISE = 0.2  # uncertainty of the shift in standard errors at which no more pairs are drawn
 _WORST = 0.8  # largest share of noise in a direction that is corrected
 _SHARE_ERROR = 0.1  # relative standard error of a share of noise
 _MATTERS = 0.1  # shift of the parameters in standard errors below which nothing is corrected
-_NAMED, _WARNED = 0.5, 2.0  # shift of a parameter in standard errors: note, warning
-_ALIKE = 0.1  # share of noise over the largest share, from which a joint is named
 _CUBIC = 5  # smallest number of rows on each side for smoothing
 _JOINED = 4  # segments that are joined into one, for speed
 _ROWS = 20_000  # rows of a log in which the step of its positions is searched
 _FREQUENCIES = 2048  # frequencies at which the noise of an acceleration is summed
-_JOINTS = 4  # largest number of joints named in a finding
 
 
 @dataclass(frozen=True, eq=False)
 class RegressorNoise:
-    """Effect of position quantisation on least squares.
+    """Effect of position quantisation on least squares."""
 
-    Attributes:
-        steps: Largest quantisation step of each joint's position in the logs, shape (n,)
-            [rad or m]; 0: none, or without effect because velocities are measured.
-        share: RMS of the quantisation noise of each acceleration, over the RMS of the
-            acceleration, shape (n,) [-].
-        shift: Bias of the base parameters, E[theta_ls] - theta, shape (b,).
-        std_error: Standard errors of the base parameters by residual and filter, without the
-            quantisation, shape (b,); inf if not identifiable.
-        meat: Covariance of the score that the scatter of segments does not include, shape (b, b):
-            of repeated rounding errors and of the shift.
-        is_corrected: Whether the estimate is corrected; if not, its covariance includes the shift.
-    """
-
+    #: (n,), largest quantisation step of each joint's position in the logs [rad or m]; 0: none, or
+    #: without effect because velocities are measured.
     steps: Array
+    #: (n,), RMS of the quantisation noise of each acceleration, over the RMS of the acceleration
+    #: [-].
     share: Array
-    shift: Array
+    shift: Array  # (b,), bias of the base parameters, E[theta_ls] - theta
+    #: (b,), standard errors of the base parameters by residual and filter, without the
+    #: quantisation; inf if not identifiable.
     std_error: Array
+    #: (b, b), covariance of the score that the scatter of segments does not include: of repeated
+    #: rounding errors and of the shift.
     meat: Array
+    #: Whether the estimate is corrected; if not, its covariance includes the shift.
     is_corrected: bool = True
 
     def uncorrected(self, information: Array) -> "RegressorNoise":
@@ -134,44 +124,6 @@ def find_regressor_noise(
     meat = meat + scale**2 * np.cov(draws.T) / len(draws)
     shift = -root @ move
     return RegressorNoise(np.max(steps, axis=0), share, shift, error, meat)
-
-
-def encoder_findings(
-    noise: RegressorNoise | None, model: RobotModel, mapping: BaseMapping
-) -> list[Finding]:
-    """Return a finding if encoder quantisation biases inertial parameters."""
-    if noise is None:
-        return []
-    is_inertial = mapping.K[:, : model.layout.n_inertial].any(axis=1)
-    moved = np.where(is_inertial, np.abs(noise.shift) / noise.std_error, 0.0)
-    worst = int(np.argmax(moved))
-    if moved[worst] < _NAMED:
-        return []
-    coarse = np.flatnonzero(noise.share > _ALIKE * noise.share.max())
-    names = [model.joints[j] for j in coarse]
-    largest = int(coarse[np.argmax(noise.steps[coarse])])
-    step, unit = float(noise.steps[largest]), "rad"
-    resolution = f" ({np.log2(2 * np.pi / step):.1f} bits per revolution)"
-    if model.joints[largest] in model.layout.prismatic:
-        unit, resolution = "m", ""
-    effect = (
-        "the estimate is corrected for this bias"
-        if noise.is_corrected
-        else "this estimator does not correct the bias, its standard errors include it"
-    )
-    message = (
-        f"{listed(names, _JOINTS)}: the position is quantised in steps of up to {step:.3g} "
-        f"{unit}{resolution}. The resulting noise is up to {100 * noise.share.max():.2g} % of the "
-        f"RMS acceleration and shifts {mapping.base_names[worst]} by {moved[worst]:.1f} "
-        f"standard errors; {effect}. A longer log does not reduce it: lower cutoff, move faster, "
-        "log the velocity of the drive, or use an encoder of higher resolution"
-    )
-    evidence = {
-        f"step_{name}": float(noise.steps[j]) for name, j in zip(names, coarse, strict=True)
-    }
-    evidence |= {"std_errors": float(moved[worst]), "share_pct": 100 * float(noise.share.max())}
-    severity = "warning" if moved[worst] >= _WARNED else "note"
-    return [Finding("encoder_noise", severity, listed(names), message, evidence)]
 
 
 def smoothed(q: Array, steps: Array, width: int) -> Array:

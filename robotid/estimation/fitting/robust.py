@@ -31,25 +31,15 @@ _NEAR = 0.5  # [s] rows closer than this are one outlier: the filter spreads it
 
 @dataclass(frozen=True)
 class Outlier:
-    """A row, or rows close to each other, with a very large residual.
+    """A row, or rows close to each other, with a very large residual."""
 
-    Attributes:
-        log: The file.
-        joint: The joint.
-        t: Time of the row with the largest residual [s].
-        torque: Filtered torque of that row [N m or N].
-        predicted: Predicted torque [N m or N].
-        size: Their difference over the joint's typical residual [-].
-        rows: Number of rows.
-    """
-
-    log: str
+    log: str  # the file
     joint: str
-    t: float
-    torque: float
-    predicted: float
-    size: float
-    rows: int
+    t: float  # time of the row with the largest residual [s]
+    torque: float  # filtered torque of that row [N m or N]
+    predicted: float  # predicted torque [N m or N]
+    size: float  # their difference over the joint's typical residual [-]
+    rows: int  # number of rows
 
 
 def loss_weight(loss: str, r: Array) -> Array:

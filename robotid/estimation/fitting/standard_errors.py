@@ -8,7 +8,7 @@ its colour. It is computed from the factors of the segments, without a second pa
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -22,9 +22,6 @@ from robotid.estimation.estimators.batch import solve_factor
 from robotid.estimation.estimators.segments import FEWEST_SEGMENTS, quantile, scatter
 from robotid.robot.model import RobotModel
 
-if TYPE_CHECKING:
-    pass
-
 _DRAWS = 64  # fits to resampled data and prior, for standard errors with active bounds
 _LEAST_SOLVED = 0.8  # smallest share of them that must be solved
 #: Half-width of a 95 % band in standard deviations.
@@ -35,21 +32,14 @@ _MOST = 500  # largest number of samples at which a band is computed
 
 @dataclass(frozen=True, eq=False)
 class StandardErrors:
-    """How the standard errors of an estimate were computed.
+    """How the standard errors of an estimate were computed."""
 
-    Attributes:
-        method: Description of the method.
-        segments: Number of segments whose scores were used.
-        inflation: Variance of the scores over that of independent rows [-].
-        freedom: Degrees of freedom of each base parameter's standard error, shape (b,).
-        unbounded: Standard errors of the standard parameters without the bounds, shape (p,); None
-            if no bound is active.
-    """
-
-    method: str
-    segments: int
-    inflation: float
-    freedom: Array
+    method: str  # description of the method
+    segments: int  # number of segments whose scores were used
+    inflation: float  # variance of the scores over that of independent rows [-]
+    freedom: Array  # (b,), degrees of freedom of each base parameter's standard error
+    #: (p,), standard errors of the standard parameters without the bounds; None if no bound is
+    #: active.
     unbounded: Array | None = None
 
     @property
@@ -219,17 +209,11 @@ def _redrawn(
 
 @dataclass(frozen=True, eq=False)
 class TorqueBand:
-    """Standard deviations of predicted torques at some samples of a trajectory.
+    """Standard deviations of predicted torques at some samples of a trajectory."""
 
-    Attributes:
-        samples: Indices of these samples, shape (k,), int.
-        parameters: Part due to the uncertainty of the parameters, shape (k, n_rows) [N m, N].
-        noise: Part due to the residual of the model, shape (n_rows,) [N m, N].
-    """
-
-    samples: Array
-    parameters: Array
-    noise: Array
+    samples: Array  # (k,), indices of these samples, int
+    parameters: Array  # (k, n_rows), part due to the uncertainty of the parameters [N m, N]
+    noise: Array  # (n_rows,), part due to the residual of the model [N m, N]
 
     @property
     def total(self) -> Array:
@@ -281,19 +265,12 @@ def rms_error(bands: Sequence[TorqueBand]) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class FrictionCurve:
-    """Friction and offset of a drive at constant speed.
+    """Friction and offset of a drive at constant speed."""
 
-    Attributes:
-        v: Speeds, shape (k,) [rad/s or m/s].
-        torque: Friction plus offset, shape (k,) [N m or N].
-        std: Standard deviation due to the uncertainty of the parameters, shape (k,) [N m or N].
-        load: Joint load torque at which the friction is evaluated [N m or N].
-    """
-
-    v: Array
-    torque: Array
-    std: Array
-    load: float
+    v: Array  # (k,), speeds [rad/s or m/s]
+    torque: Array  # (k,), friction plus offset [N m or N]
+    std: Array  # (k,), standard deviation due to the uncertainty of the parameters [N m or N]
+    load: float  # joint load torque at which the friction is evaluated [N m or N]
 
     def __str__(self) -> str:
         rows = zip(self.v.tolist(), self.torque.tolist(), self.half_width.tolist(), strict=True)

@@ -42,7 +42,7 @@ from robotid.dynamics.factors import Reduction
 from robotid.dynamics.prediction import is_loaded, remember
 from robotid.dynamics.rows import COMPILED, choose_engine
 from robotid.dynamics.used_rows import base_problem, prefers_measured, row_mask, static_rows
-from robotid.estimation.workers.pools import Workload
+from robotid.estimation.workers.plan import Workload
 from robotid.robot.model import RobotModel
 
 #: Default number of rows of a piece.
@@ -172,35 +172,23 @@ class ReducedPiece(PieceTask):
 
 @dataclass(frozen=True, eq=False)
 class SurveyedLog:
-    """A surveyed log, which can be read in pieces.
-
-    Attributes:
-        model: The robot.
-        source: The log if it is in memory, else the assignment of columns of its file.
-        asked: Settings of the processing to a trajectory, as given by the user.
-        stamps: Time stamps of all rows of the file, shape (N,) [s].
-        first: First row of the log in the file.
-        stop: The row after the last one.
-        windows: Ranges of rows that were checked: all rows, or the first, middle and last ones.
-        locked: Positions of locked joints in the windows, if the file has them, by name [rad or m].
-        length: Rows per piece.
-        places: Positions in the file at which blocks of rows start.
-        unit: Name of the robot, if there are several of one kind.
-        given: Its rows if it is in memory and they were smoothed before.
-    """
+    """A surveyed log, which can be read in pieces."""
 
     model: RobotModel
+    #: The log if it is in memory, else the assignment of columns of its file.
     source: LogLayout | Log
-    asked: SignalSettings
-    stamps: Array
-    first: int
-    stop: int
+    asked: SignalSettings  # settings of the processing to a trajectory, as given by the user
+    stamps: Array  # (N,), time stamps of all rows of the file [s]
+    first: int  # first row of the log in the file
+    stop: int  # the row after the last one
+    #: Ranges of rows that were checked: all rows, or the first, middle and last ones.
     windows: tuple[Log, ...]
+    #: Positions of locked joints in the windows, if the file has them, by name [rad or m].
     locked: Mapping[str, Array] = field(default_factory=dict)
-    length: int = PIECE
-    places: Sequence[Place] = (Place(),)
-    unit: str = ""
-    given: Rows | None = None
+    length: int = PIECE  # rows per piece
+    places: Sequence[Place] = (Place(),)  # positions in the file at which blocks of rows start
+    unit: str = ""  # name of the robot, if there are several of one kind
+    given: Rows | None = None  # its rows if it is in memory and they were smoothed before
 
     @property
     def path(self) -> str:
@@ -276,20 +264,27 @@ class SurveyedLog:
         is_alike = np.array_equal(friction_speeds(model.layout), friction_speeds(before.layout))
         if self.is_in_memory and is_alike:
             rows = self.pieces[0].read()
-            motion, mask = rows.trajectory, rows.mask
+            motion = rows.trajectory
             if model.layout != before.layout or is_loaded(model):
                 motion = remember(model, motion.with_states(None))
-            # static rows were chosen by their speeds already, those of a free base without its
-            # jumps and with the forces of its contacts
-            if not (model.is_static or model.constraints or motion.switching is not None):
-                mask = row_mask(model, motion, self.signals.min_velocity)
-            given = replace(rows, trajectory=motion, mask=mask)
+            given = self._rows_of(model, replace(rows, trajectory=motion))
         return replace(self, model=model, asked=self.signals, given=given)
 
     def with_torque(self, tau: Array) -> "SurveyedLog":
         """Return a log in memory with other torques of its smoothed motion, shape (N, n_rows)."""
-        rows = self.whole
-        return replace(self, given=replace(rows, trajectory=replace(rows.trajectory, tau=tau)))
+        rows = replace(self.whole, trajectory=replace(self.whole.trajectory, tau=tau))
+        return replace(self, given=self._rows_of(self.model, rows))
+
+    def _rows_of(self, model: RobotModel, rows: Rows) -> Rows:
+        """Return rows with those used chosen again, now that they have torques of this robot.
+
+        Static rows were chosen by their speeds already, those of a free base without its jumps and
+        with the forces of its contacts.
+        """
+        if model.is_static or model.constraints or rows.trajectory.switching is not None:
+            return rows
+        mask = row_mask(model, rows.trajectory, self.signals.min_velocity)
+        return replace(rows, mask=mask)
 
     def with_accelerometer_bias(self, bias: Array) -> "SurveyedLog":
         """Return the log with another bias of the accelerometers of its IMU: bias (3,) [m/s^2]."""

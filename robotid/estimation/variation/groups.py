@@ -35,40 +35,24 @@ _LEAST = 1e-12  # smallest information and inflation
 
 @dataclass(frozen=True, eq=False)
 class Group:
-    """Parameters that vary together.
+    """Parameters that vary together."""
 
-    Attributes:
-        kind: "drive", "gain", "payload" or "zero".
-        name: Name of the drive, joint or link.
-        parameters: Their names, q items.
-        units: Their units, q items.
-        columns: B, shape (b, q); 0 for a zero.
-        rows: The joints whose torque they change, indices.
-    """
-
-    kind: str
-    name: str
-    parameters: tuple[str, ...]
-    units: tuple[str, ...]
-    columns: Array
-    rows: tuple[int, ...]
+    kind: str  # "drive", "gain", "payload" or "zero"
+    name: str  # name of the drive, joint or link
+    parameters: tuple[str, ...]  # their names, q items
+    units: tuple[str, ...]  # their units, q items
+    columns: Array  # (b, q), B; 0 for a zero
+    rows: tuple[int, ...]  # the joints whose torque they change, indices
 
 
 @dataclass(frozen=True, eq=False)
 class RunsOf:
-    """The runs' information about the deviation of a group from the fit.
-
-    Attributes:
-        group: The group.
-        centre: Its values in the fit, shape (q,): 0 for a payload, 1 for a gain.
-        runs: Information about x, coloured noise included.
-        inflation: Variance of coloured noise over that of independent rows [-].
-    """
+    """The runs' information about the deviation of a group from the fit."""
 
     group: Group
-    centre: Array
-    runs: Runs
-    inflation: float
+    centre: Array  # (q,), its values in the fit: 0 for a payload, 1 for a gain
+    runs: Runs  # information about x, coloured noise included
+    inflation: float  # variance of coloured noise over that of independent rows [-]
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,19 +61,14 @@ class RunSums:
 
     The rows are A = W B of the Q parameters of all groups, in their order, and the residuals
     r = tau - W theta, over the noise level of their joint. Zeros are last: see ``with_zeros``.
-
-    Attributes:
-        H: A^T A of each run, shape (k, Q, Q); the blocks of the groups are used.
-        h: A^T r of each run, shape (k, Q), each group over its own joints.
-        scatter: Of each group, the scatter of the scores of segments about each run's estimate,
-            and that of independent rows, shape (g, 2); see ``inflation_of``.
-        sigma: Noise level per joint, shape (n,) [N m or N].
     """
 
-    H: Array
-    h: Array
+    H: Array  # (k, Q, Q), A^T A of each run; the blocks of the groups are used
+    h: Array  # (k, Q), A^T r of each run, each group over its own joints
+    #: (g, 2), of each group, the scatter of the scores of segments about each run's estimate, and
+    #: that of independent rows; see ``inflation_of``.
     scatter: Array
-    sigma: Array
+    sigma: Array  # (n,), noise level per joint [N m or N]
 
     def joined(self, new: "RunSums") -> "RunSums":
         """Return the sums of these runs and of new ones."""

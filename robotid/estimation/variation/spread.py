@@ -33,20 +33,14 @@ _HALVINGS = 60  # of the range of a quantile
 
 @dataclass(frozen=True, eq=False)
 class Runs:
-    """Information of k runs about q parameters that may vary.
+    """Information of k runs about q parameters that may vary."""
 
-    Attributes:
-        H: Information (inverse covariance) of each run, shape (k, q, q), symmetric; singular if
-            the run does not determine all.
-        h: H times the estimate of each run, shape (k, q).
-        unit: Index of the unit (robot) of each run, shape (k,), int, from 0.
-        scale: Plausible standard deviation of each parameter, shape (q,), positive.
-    """
-
+    #: (k, q, q), information (inverse covariance) of each run, symmetric; singular if the run does
+    #: not determine all.
     H: Array
-    h: Array
-    unit: Array
-    scale: Array
+    h: Array  # (k, q), H times the estimate of each run
+    unit: Array  # (k,), index of the unit (robot) of each run, int, from 0
+    scale: Array  # (q,), plausible standard deviation of each parameter, positive
 
     def without(self, run: int) -> "Runs":
         """Return the runs except one."""
@@ -57,17 +51,11 @@ class Runs:
 
 @dataclass(frozen=True, eq=False)
 class Mixture:
-    """Mixtures of g normal distributions.
+    """Mixtures of g normal distributions."""
 
-    Attributes:
-        weight: Weights, which sum to 1, shape (..., g).
-        mean: Means, shape (..., g).
-        std: Standard deviations, shape (..., g).
-    """
-
-    weight: Array
-    mean: Array
-    std: Array
+    weight: Array  # (..., g), weights, which sum to 1
+    mean: Array  # (..., g), means
+    std: Array  # (..., g), standard deviations
 
     def at(self, index: int | tuple[int, ...]) -> "Mixture":
         """Return some of the mixtures."""
@@ -108,25 +96,17 @@ class Mixture:
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """Mean and spread of one parameter, and prediction of a new run of a new unit.
+    """Mean and spread of one parameter, and prediction of a new run of a new unit."""
 
-    Attributes:
-        mean: Mean over runs and units.
-        std_error: Its standard error.
-        spread: Standard deviation between runs, or units if there are several, median.
-        spread_ends: Ends of its 95 % interval, shape (2,).
-        mixture: Predictive distribution of a new run.
-        after: Expected standard error of the mean, and expected width of the prediction interval,
-            with one more run, or one more unit if there are several.
-        within: Median of the standard deviation between runs of a unit, if there are several units.
-    """
-
-    mean: float
-    std_error: float
-    spread: float
-    spread_ends: Array
-    mixture: Mixture
+    mean: float  # mean over runs and units
+    std_error: float  # its standard error
+    spread: float  # standard deviation between runs, or units if there are several, median
+    spread_ends: Array  # (2,), ends of its 95 % interval
+    mixture: Mixture  # predictive distribution of a new run
+    #: Expected standard error of the mean, and expected width of the prediction interval, with one
+    #: more run, or one more unit if there are several.
     after: tuple[float, float] = (math.nan, math.nan)
+    #: Median of the standard deviation between runs of a unit, if there are several units.
     within: float | None = None
 
     @cached_property
@@ -142,17 +122,11 @@ class Prediction:
 
 @dataclass(frozen=True, eq=False)
 class Compared:
-    """Runs, or units, each compared with the prediction of all others.
+    """Runs, or units, each compared with the prediction of all others."""
 
-    Attributes:
-        values: Their own parameters, shape (m, q).
-        covariance: Covariance of these, shape (m, q, q).
-        mixture: Prediction of an estimate as uncertain as theirs, shapes (m, q, g).
-    """
-
-    values: Array
-    covariance: Array
-    mixture: Mixture
+    values: Array  # (m, q), their own parameters
+    covariance: Array  # (m, q, q), covariance of these
+    mixture: Mixture  # prediction of an estimate as uncertain as theirs, shapes (m, q, g)
 
 
 @dataclass(frozen=True, eq=False)

@@ -32,23 +32,16 @@ _RANGE = 0.05, 30.0  # their range, over the smallest standard error, over the s
 
 @dataclass(frozen=True, eq=False)
 class VaryingParameter:
-    """A parameter of a drive in several runs.
+    """A parameter of a drive in several runs."""
 
-    Attributes:
-        name: Its name, for example "elbow.coulomb".
-        unit: Its unit.
-        prediction: Mean, spread between runs, and prediction interval of the next run; between
-            units and of the next unit, if there are several.
-        values: Its value in each run, shape (k,): the run's own and the mean, weighted by their
-            information.
-        std_errors: Their standard errors, shape (k,).
-    """
-
-    name: str
-    unit: str
+    name: str  # its name, for example "elbow.coulomb"
+    unit: str  # its unit
+    #: Mean, spread between runs, and prediction interval of the next run; between units and of the
+    #: next unit, if there are several.
     prediction: Prediction
+    #: (k,), its value in each run: the run's own and the mean, weighted by their information.
     values: Array
-    std_errors: Array
+    std_errors: Array  # (k,), their standard errors
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values, as result.json has them."""
@@ -70,29 +63,17 @@ class VaryingParameter:
 
 @dataclass(frozen=True, eq=False)
 class UnlikeRun:
-    """A run, or a unit, that differs from what the others predict.
+    """A run, or a unit, that differs from what the others predict."""
 
-    Attributes:
-        run: Index of the run, or of the unit.
-        kind: "drive", "gain", "payload" or "zero".
-        where: Drive, joint or link.
-        name: The parameter that differs most.
-        unit: Its unit.
-        value: Its value in this run; of a payload and a zero, more than in the other runs.
-        std_error: Its standard error.
-        ends: 95 % prediction interval from the other runs, shape (2,).
-        probability: Probability of such a deviation, before the number of tests is counted.
-    """
-
-    run: int
-    kind: str
-    where: str
-    name: str
-    unit: str
-    value: float
-    std_error: float
-    ends: Array
-    probability: float
+    run: int  # index of the run, or of the unit
+    kind: str  # "drive", "gain", "payload" or "zero"
+    where: str  # drive, joint or link
+    name: str  # the parameter that differs most
+    unit: str  # its unit
+    value: float  # its value in this run; of a payload and a zero, more than in the other runs
+    std_error: float  # its standard error
+    ends: Array  # (2,), 95 % prediction interval from the other runs
+    probability: float  # probability of such a deviation, before the number of tests is counted
 
     def to_dict(self, names: Sequence[str]) -> dict[str, Any]:
         """Return plain values, as result.json has them."""
@@ -101,26 +82,17 @@ class UnlikeRun:
 
 @dataclass(frozen=True, eq=False)
 class Variation:
-    """Variation of the drives' parameters between runs.
+    """Variation of the drives' parameters between runs."""
 
-    Attributes:
-        runs: Names of the k runs.
-        units: Number of units (robots).
-        parameters: The parameters of the drives, m items.
-        unlike: Runs that differ from the others, at most one cause for each.
-        unit_names: Names of the units, in the order of their indices.
-        unlike_units: Units that differ from the others, at most one cause for each; their runs
-            are not in ``unlike``.
-        of_runs: Index of the unit of each run, k items.
-    """
-
-    runs: tuple[str, ...]
-    units: int
-    parameters: tuple[VaryingParameter, ...]
-    unlike: tuple[UnlikeRun, ...]
-    unit_names: tuple[str, ...] = ()
+    runs: tuple[str, ...]  # names of the k runs
+    units: int  # number of units (robots)
+    parameters: tuple[VaryingParameter, ...]  # the parameters of the drives, m items
+    unlike: tuple[UnlikeRun, ...]  # runs that differ from the others, at most one cause for each
+    unit_names: tuple[str, ...] = ()  # names of the units, in the order of their indices
+    #: Units that differ from the others, at most one cause for each; their runs are not in
+    #: ``unlike``.
     unlike_units: tuple[UnlikeRun, ...] = ()
-    of_runs: tuple[int, ...] = ()
+    of_runs: tuple[int, ...] = ()  # index of the unit of each run, k items
 
     @cached_property
     def correlation(self) -> Array:

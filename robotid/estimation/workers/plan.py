@@ -1,43 +1,96 @@
-"""Distribution of work to workers, with progress."""
+"""Distribution of work on pieces to processes of this machine, or those of a Dask cluster.
+
+Every piece is processed independently with one BLAS thread, so that its result has the same bits in
+any process, also if a worker ends and its piece is repeated.
+"""
 
 import logging
-from collections.abc import Iterator, Sequence
-from contextlib import closing
-from dataclasses import dataclass, field
-from typing import Any, Self
-
-from robotid.base.typing import ProgressCallback, ignore_progress
-from robotid.dynamics.factors import available_cores
-from robotid.estimation.workers.pools import (
-    Lost,
-    Pool,
-    Work,
-    Workload,
-    noted,
-    require_workers,
+import os
+import signal
+import socket
+import threading
+import time
+from abc import abstractmethod
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import (
+    FIRST_COMPLETED,
+    BrokenExecutor,
+    CancelledError,
+    Executor,
+    Future,
+    wait,
 )
+from contextlib import closing, contextmanager
+from dataclasses import dataclass, field
+from itertools import islice
+from typing import TYPE_CHECKING, Any, Protocol, Self, TypeAlias
 
-_WORTH_WORKERS = 500_000  # smallest number of samples for workers; their start takes about 1 s
+from threadpoolctl import threadpool_limits
+
+from robotid.base.exceptions import MissingDependencyError, SettingsError, WorkerError
+from robotid.base.typing import ProgressCallback, ignore_progress
+from robotid.base.versions import code_versions
+from robotid.dynamics.factors import available_cores
+
+if TYPE_CHECKING:
+    from distributed import Client
 
 _log = logging.getLogger(__name__)
+
+_WORTH_WORKERS = 500_000  # smallest number of samples for workers; their start takes about 1 s
+#: Attempts to process a piece whose worker ends: by processes, and by a cluster after its own ones.
+_ATTEMPTS = (3, 2)
+# The pool's feeder thread may be the last owner of a semaphore. If the process ends between the
+# calls that remove and unregister it, the resource tracker warns of a leak.
+_FEEDER = "QueueFeederThread"
+_PATIENCE = 5.0  # largest time to wait for this thread [s]
+_ANSWER = 30.0  # ... for a worker of a cluster [s]
+
+
+class Workload(Protocol):
+    """A unit of work, such as a piece of a log; can be pickled."""
+
+    @property
+    @abstractmethod
+    def name(self) -> str:
+        """Name in messages, such as ``run3.parquet rows 0-16384``."""
+
+    @property
+    @abstractmethod
+    def samples(self) -> int:
+        """Approximate number of samples, for the progress."""
+
+
+#: Work on a piece, with the number of threads or None for any; can be pickled.
+Work: TypeAlias = Callable[[Any, int | None], Any]
+
+#: Result of a piece that ended its worker in every attempt, from the piece and the error.
+Lost: TypeAlias = Callable[[Any, WorkerError], Any]
+
+#: A result, with logger, level and text of the messages that were logged meanwhile.
+_Outcome: TypeAlias = tuple[Any, list[tuple[str, int, str]]]
 
 
 @dataclass
 class WorkPlan:
-    """Distribution of work on pieces; it never changes a result.
+    """Distribution of work on pieces: in this process, worker processes or a Dask cluster.
 
-    As a context manager, it reuses its workers until the context ends.
+    It never changes a result. As a context manager, it reuses its workers until the context ends.
+    They end with the process that started them. The workers of a cluster must be able to read the
+    logs under the same path.
     """
 
     workers: int | None = 1  # worker processes; None: one per core for long work
     scheduler: str | None = None  # address of a Dask scheduler, whose workers are used instead
     progress: ProgressCallback | None = None  # called with work, samples done, total, "samples"
-    _pool: Pool | None = field(default=None, init=False, repr=False)
+    _size: int = field(default=1, init=False, repr=False)  # number of worker processes
+    _executor: Executor | None = field(default=None, init=False, repr=False)
+    _client: "Client | None" = field(default=None, init=False, repr=False)
     _reuses: bool = field(default=False, init=False, repr=False)
 
     def __post_init__(self) -> None:
         if self.workers is not None:
-            require_workers(self.workers)
+            self._size = require_workers(self.workers)
 
     @property
     def is_asked_for(self) -> bool:
@@ -50,7 +103,7 @@ class WorkPlan:
 
     def __exit__(self, *_: object) -> None:
         self._reuses = False
-        self._close()
+        self.close()
 
     def map(self, work: Work, pieces: Sequence[Workload], what: str) -> Iterator[Any]:
         """Process every piece and yield the results in order, in memory only if they are early."""
@@ -74,13 +127,14 @@ class WorkPlan:
         """Process every piece; yield index and result of each as it is finished."""
         report, done = self.progress or ignore_progress, 0
         total = sum(piece.samples for piece in pieces)
-        pool = self._pool or self._choose(pieces)
-        how = "this process" if pool is None else pool.description
+        if self._executor is None:
+            self._size = choose_workers(pieces, self.workers)
+        is_here = self.scheduler is None and self._size == 1
+        how = "this process" if is_here else self.description
         _log.info("%s %d pieces, %d %s in total: %s", what, len(pieces), total, counted, how)
         report(what, done, total, counted)
         every = enumerate(pieces)
-        results = _here(work, every) if pool is None else pool.run(work, every, lost)
-        self._pool = pool
+        results = _here(work, every) if is_here else self.run(work, every, lost)
         try:
             with closing(results):  # type: ignore[type-var]
                 for left in reversed(range(len(pieces))):
@@ -92,19 +146,238 @@ class WorkPlan:
                     yield index, result
         finally:
             if not self._reuses:
-                self._close()
+                self.close()
 
-    def _choose(self, pieces: Sequence[Workload]) -> Pool | None:
-        """Return the cluster, worker processes, or None for this process."""
+    @property
+    def description(self) -> str:
+        """Name of the workers in messages, such as ``2 worker processes``."""
+        if self.scheduler is None:
+            return f"{self._size} worker processes, one BLAS thread each"
+        return f"the Dask cluster {self.scheduler}, one BLAS thread per piece"
+
+    def close(self, *, is_urgent: bool = False) -> None:
+        """Stop the workers, without waiting if it is urgent; the next work starts new ones."""
+        executor, client = self._executor, self._client
+        self._executor = self._client = None
+        if client is not None:
+            client.close(timeout=5)
+        elif executor is not None:
+            executor.shutdown(wait=True, kill_workers=is_urgent)  # type: ignore[call-arg]
+            for thread in threading.enumerate():
+                if thread.name == _FEEDER:
+                    thread.join(_PATIENCE)
+
+    def run(
+        self, work: Work, pieces: Iterable[tuple[int, Workload]], lost: Lost | None = None
+    ) -> Iterator[tuple[int, Any]]:
+        """Yield the results of pieces with their indices; closing the iterator ends the work."""
+        try:
+            yield from self._collect(work, iter(pieces), lost)
+        except BaseException:
+            self.close(is_urgent=True)
+            raise
+
+    def _collect(
+        self, work: Work, waiting: Iterator[tuple[int, Workload]], lost: Lost | None
+    ) -> Iterator[tuple[int, Any]]:
+        """Yield results, with at most two submitted pieces per worker.
+
+        If a worker ends, the pieces under way are repeated one after the other, so that the piece
+        that ends its worker is known.
+        """
+        running: dict[Future[_Outcome], tuple[int, Workload]] = {}
+        while True:
+            for index, piece in islice(waiting, max(0, 2 * max(1, self._count()) - len(running))):
+                with _interrupts_deferred():
+                    running[self._submit(work, piece)] = index, piece
+            if not running:
+                return
+            future = self._finished(running)
+            index, piece = running.pop(future)
+            try:
+                result, messages = future.result()
+            except CancelledError as error:
+                raise WorkerError(
+                    f"the connection ended while {piece.name} was processed"
+                ) from error
+            except Exception as error:
+                if not _is_of_worker(error):
+                    raise
+                result, messages = self._repeated(work, piece, error, lost)
+            for name, level, text in messages:
+                logging.getLogger(name).log(level, "%s", text)
+            yield index, result
+
+    def _repeated(
+        self, work: Work, piece: Workload, error: Exception, lost: Lost | None
+    ) -> _Outcome:
+        """Process a piece alone after its worker ended; return what replaces its result if lost."""
+        attempts = _ATTEMPTS[self.scheduler is not None]
+        for _ in range(1, attempts):
+            _log.warning("a worker ended; %s is repeated", piece.name)
+            try:
+                return self._finished([self._submit(work, piece)]).result()
+            except Exception as again:
+                if not _is_of_worker(again):
+                    raise
+                error = again
+        failure = WorkerError(
+            f"a worker ended during its work (killed, or out of memory), in each of {attempts} "
+            f"attempts. Unfinished piece: {piece.name}"
+        )
+        if lost is None:
+            raise failure from error
+        return lost(piece, failure), []
+
+    def _finished(self, running: Iterable[Future[_Outcome]]) -> Future[_Outcome]:
+        """Wait for a finished piece, while there are workers."""
+        while True:
+            finished = wait(running, _ANSWER, FIRST_COMPLETED).done
+            if finished:
+                return finished.pop()
+            if not self._count():
+                raise WorkerError(
+                    f"the cluster {self.scheduler} has no workers any more. Start workers with "
+                    f"'dask worker {self.scheduler}' and repeat the command"
+                )
+
+    def _count(self) -> int:
+        """Return the number of workers."""
+        self._started()
+        return self._size if self._client is None else sum(self._client.nthreads().values())
+
+    def _submit(self, work: Work, piece: Workload) -> "Future[_Outcome]":
+        level = _log.getEffectiveLevel()
+        try:
+            return self._started().submit(run_task, work, piece, level)
+        except BrokenExecutor:  # a worker ended while it waited for work
+            self.close(is_urgent=True)
+            return self._started().submit(run_task, work, piece, level)
+
+    def _started(self) -> Executor:
+        """Return the executor, which is started at its first use."""
+        if self._executor is not None:
+            return self._executor
         if self.scheduler is not None:
-            return Pool(scheduler=self.scheduler)
-        workers = choose_workers(pieces, self.workers)
-        return Pool(workers) if workers > 1 else None
+            self._client = _connect(self.scheduler)
+            self._executor = self._client.get_executor(pure=False)
+            return self._executor
+        from loky import ProcessPoolExecutor
 
-    def _close(self) -> None:
-        pool, self._pool = self._pool, None
-        if pool is not None:
-            pool.close()
+        self._executor = ProcessPoolExecutor(
+            self._size,
+            initializer=_start_worker,
+            initargs=(os.getpid(),),
+            env={"LOKY_MAX_MEMORY_LEAK_SIZE": "1e15"},  # [bytes]; pieces limit the memory
+        )
+        return self._executor
+
+
+def require_workers(workers: int) -> int:
+    """Return a number of workers, which must be at least 1."""
+    if workers < 1:
+        raise SettingsError(f"workers is {workers}, wanted at least 1")
+    return workers
+
+
+def _connect(address: str) -> "Client":
+    """Return a client of a cluster with workers, all of this version of robotid."""
+    try:
+        from distributed import Client
+    except ImportError as error:
+        raise MissingDependencyError("--scheduler", "distributed", "cluster") from error
+    client = None
+    try:
+        client = Client(address, timeout=_ANSWER, set_as_default=False)
+        client.wait_for_workers(1, timeout=_ANSWER)
+    except (OSError, TimeoutError, ValueError) as error:
+        if client is not None:
+            client.close()
+        raise WorkerError(
+            f"no Dask scheduler with workers answers at {address!r} ({error}). Start them with "
+            f"'dask scheduler' and 'dask worker {address}'"
+        ) from error
+    here = code_versions()["robotid"]
+    for worker, versions in client.run(code_versions).items():
+        if versions["robotid"] != here:
+            client.close()
+            raise WorkerError(
+                f"workers must run robotid {here}, but {worker} has {versions['robotid']}. Install "
+                "the same version on all hosts"
+            )
+    return client
+
+
+class _Recorder(logging.Handler):
+    """Stores records as plain text, which can be pickled."""
+
+    def __init__(self, level: int) -> None:
+        super().__init__(level)
+        self.messages: list[tuple[str, int, str]] = []
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self.messages.append((record.name, record.levelno, record.getMessage()))
+
+
+def run_task(work: Work, piece: Workload, level: int) -> _Outcome:
+    """Process a piece with one thread; return the result and the logged messages."""
+    logger, recorder = logging.getLogger("robotid"), _Recorder(level)
+    before = logger.level
+    logger.addHandler(recorder)
+    logger.setLevel(level)
+    try:
+        with noted(f"while processing {piece.name} on host {socket.gethostname()!r}"):
+            return work(piece, 1), recorder.messages
+    finally:
+        logger.removeHandler(recorder)
+        logger.setLevel(before)
+
+
+@contextmanager
+def noted(note: str) -> Iterator[None]:
+    """Limit BLAS to one thread, and add a note to an error."""
+    try:
+        with threadpool_limits(limits=1, user_api="blas"):
+            yield
+    except Exception as error:
+        error.add_note(note)
+        raise
+
+
+def _is_of_worker(error: Exception) -> bool:
+    """Return whether an error says that a worker ended."""
+    return isinstance(error, BrokenExecutor) or type(error).__name__ == "KilledWorker"  # Dask's
+
+
+@contextmanager
+def _interrupts_deferred() -> Iterator[None]:
+    """Defer signals until the context ends: in the pool's functions they leave locks closed."""
+    received: list[int] = []
+    handlers: dict[int, Any] = {}
+    if threading.current_thread() is threading.main_thread():
+        for name in ("SIGINT", "SIGTERM", "SIGHUP"):
+            number = getattr(signal, name, None)
+            if number is not None and callable(signal.getsignal(number)):
+                handlers[number] = signal.signal(number, lambda number, _: received.append(number))
+    try:
+        yield
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+        if received:
+            signal.raise_signal(received[0])
+
+
+def _start_worker(parent: int) -> None:
+    """Prepare a worker: it ignores Ctrl-C, and ends with the process that started it."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_after, args=(parent,), daemon=True).start()
+
+
+def _end_after(parent: int) -> None:
+    while os.getppid() == parent:
+        time.sleep(0.1)  # [s]
+    os._exit(1)
 
 
 def choose_workers(pieces: Sequence[Workload], workers: int | None = None) -> int:

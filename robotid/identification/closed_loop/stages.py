@@ -394,7 +394,7 @@ def _initialise_from_commands(task: _Task) -> _Initial:
     finds_kd = uses_torques or all(log.v_ref is not None for log in logs)
     dt = max(float(np.median(np.diff(log.t))) for log in logs)
     most = np.tile(np.exp(-_WHITE * dt / plain.time_constant), 3)  # positions, speeds, torques
-    estimator = OutputError(settings.whiten, most, progress=task.progress)
+    estimator = OutputError(most=most, progress=task.progress)
     may_limit = ~is_stated(loop.limit, model) & (loop.limit != "find")
     scales = (1.0,) if has_gain.all() else _SCALES
 
@@ -455,7 +455,7 @@ def _initialise_from_torque(task: _Task) -> _Initial:
     report_stage(task.progress, "fitting loops", STAGES)
     if settings.torques:
         simulator = replace(simulator, torque=torque_rows(from_rows, _BOTH))
-    estimator = OutputError(whitens=settings.whiten, frees=True, progress=task.progress)
+    estimator = OutputError(frees=True, progress=task.progress)
     encoders = same_encoders(model)
     return _Initial(simulator, estimator, typical.torque, encoders, linear=from_rows)
 

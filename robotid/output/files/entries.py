@@ -18,9 +18,8 @@ from robotid.estimation.fitting.evaluation import LEFT_OUT, Evaluated, Evaluatio
 from robotid.estimation.fitting.fitted import SOURCES, Identified, next_errors, typical_friction
 from robotid.estimation.fitting.standard_errors import QUANTILE
 from robotid.identification.result import Identification, TorqueIdentification
-from robotid.output.files.ranges import parameter_ranges
+from robotid.output.files.ranges import covariance_entry, parameter_ranges
 from robotid.output.files.result_file import SCHEMA_VERSION
-from robotid.output.files.samples import covariance_entry
 from robotid.robot.drives import TERMS
 from robotid.robot.parameters import pseudo_inertia
 

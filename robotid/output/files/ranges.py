@@ -15,22 +15,26 @@ from scipy.spatial.transform import Rotation
 
 from robotid.base.exceptions import DataError, SettingsError
 from robotid.base.files import write_text
-from robotid.base.settings import require_kind
 from robotid.base.typing import Array
 from robotid.base.versions import __version__
 from robotid.dynamics.friction_projection import project_friction
 from robotid.estimation.fitting.fitted import Identified
 from robotid.estimation.fitting.standard_errors import QUANTILE
-from robotid.identification.result import TorqueIdentification
+from robotid.estimation.variation.draws import (
+    correlated_scores,
+    possible_draws,
+    root_of,
+    scores_to_values,
+)
+from robotid.estimation.variation.variation import SCORES
 from robotid.output.files.commanded import commanded_drives
 from robotid.output.files.exports import Format, Option, Written, head_of, yaml_text
 from robotid.output.files.result_file import Result
-from robotid.output.files.samples import SIMULATED, write_samples
 from robotid.output.files.urdf import link_parameters
-from robotid.robot.bodies import principal_moments
+from robotid.robot.bodies import held_parameters, principal_moments
 from robotid.robot.drives import TERMS
 from robotid.robot.model import RobotModel
-from robotid.robot.parameters import pseudo_inertia_basis
+from robotid.robot.parameters import pseudo_inertia, pseudo_inertia_basis
 
 #: Parameters of drives that cannot be negative.
 _NOT_NEGATIVE = {"kd", "delay", *(name for name, term in TERMS.items() if term.is_nonnegative)}
@@ -170,23 +174,6 @@ def stated_ranges(content: Mapping[str, Any]) -> dict[str, Any]:
     return {"undetermined": content["structure"]["undetermined"], **ranges, "drives": merged}
 
 
-def write_ranges(found: TorqueIdentification, target: str | Path) -> None:
-    """Write the ranges of an identification as YAML.
-
-    Args:
-        found: The identification.
-        target: The file to write.
-
-    Raises:
-        DataError: If its folder does not exist.
-        ModelError: If a link or a drive would be physically impossible.
-        SettingsError: If the target is a folder.
-    """
-    require_kind(found, TorqueIdentification, "found", "a robotid.Identification")
-    require_kind(target, (str, Path), "target", "the path of a file to write")
-    write_text(ranges_text(parameter_ranges(found)), target)
-
-
 def ranges_text(ranges: Mapping[str, Any]) -> str:
     """Return ranges as YAML, with an explanation in the head."""
     head = head_of("ranges", robot=json.dumps(ranges["robot"]), version=__version__)
@@ -248,3 +235,194 @@ def _range(
         return {"nominal": nominal, "source": source}
     low = nominal * math.exp(-half / nominal) if is_positive else max(nominal - half, least)
     return {"nominal": nominal, "low": low, "high": nominal + half, "source": source}
+
+
+_DIGITS = 9  # significant digits of the root in result.json
+_MOST = 1_000_000
+_POSITIVE = ("kp", "limit")
+#: Drive terms of simulators, which replace the friction of drives with further terms.
+SIMULATED = ("viscous", "coulomb", "offset")
+
+
+def covariance_entry(names: Sequence[str], covariance: Array, is_fixed: Array) -> dict[str, Any]:
+    """Return the covariance of parameters for result.json, as its root.
+
+    covariance (p, p), is_fixed (p,).
+    """
+    is_known = ~(is_fixed | is_fixed[:, None]) & np.isfinite(covariance)
+    L = root_of(np.where(is_known, covariance, 0.0))
+    root = [[float(f"{x:.{_DIGITS}g}") for x in np.trim_zeros(row, "b")] for row in L]
+    return {"names": list(names), "root": root}
+
+
+def write_samples(result: Result, target: Path, count: int, seed: int) -> None:
+    """Write samples of the parameters of a result as JSON."""
+    if not 1 <= count <= _MOST:
+        raise SettingsError(f"samples is {count}, wanted a whole number from 1 to {_MOST}")
+    if seed < 0:
+        raise SettingsError(f"seed is {seed}, wanted a whole number, 0 or more")
+    names, values = sample(result, count, np.random.default_rng(seed))
+    model, pi = result.identified
+    units = {entry["name"]: entry["unit"] for entry in result.content["drive_parameters"]}
+    covariance = np.cov(values.T) if count > 1 else np.zeros((len(names),) * 2)
+    content = {
+        "robot": model.name,
+        "samples": count,
+        "seed": seed,
+        "bodies": _bodies(model, values),
+        "drives": _drives(model, names, values),
+        "projected_drives": _projected(result, values),
+        "parameters": {
+            "names": names,
+            "units": [*model.layout.units, *(units[name] for name in names[len(pi) :])],
+            "nominal": [*pi.tolist(), *_nominal(result, names[len(pi) :])],
+            "mean": values.mean(axis=0).tolist(),
+            "covariance": covariance.tolist(),
+        },
+    }
+    write_text(json.dumps(content, allow_nan=False) + "\n", target)
+
+
+def sample(result: Result, count: int, rng: np.random.Generator) -> tuple[list[str], Array]:
+    """Return samples of all parameters from their joint distribution.
+
+    Bodies are normal with the covariance of the fit, given that all are physically possible.
+    Drive parameters with a spread between logs have the predictive distribution of the next log or
+    robot. Their correlation is that of the error of the fit, with all its parameters, and that of
+    their values in the logs, among each other.
+
+    -> (count, p).
+    """
+    model, pi = result.identified
+    stated = result.content.get("covariance")
+    if stated is None:
+        raise DataError(
+            f"{result.path.name} of an earlier version has no covariance; identify again"
+        )
+    names, size = list(stated["names"]), len(pi)
+    root = np.zeros((len(names), len(names)))
+    for row, values in zip(root, stated["root"], strict=True):
+        row[: len(values)] = values
+    root *= _quantile(result.content) / QUANTILE
+    nominal = np.concatenate([pi, _nominal(result, names[size:])])
+    between = _between(result.content)
+    spread = [name in between for name in names]
+    link_parameters(model, pi)  # raises if a link is impossible
+    held, terms = held_parameters(model), [name.rpartition(".")[2] for name in names]
+    is_positive = np.isin(terms, _POSITIVE) & (np.arange(len(names)) >= size)
+    is_bounded = np.isin(terms, _NOT_NEGATIVE) | is_positive
+    is_bounded[:size] = model.layout.is_nonnegative()
+    signed, varies = is_bounded.copy(), np.array(spread, dtype=bool)  # drawn anew below
+    is_bounded, is_positive = is_bounded & ~varies, is_positive & ~varies
+
+    def is_possible(x: Array) -> Array:
+        drawn = nominal + x
+        signs = (drawn[:, is_bounded] >= 0.0).all(axis=1) & (drawn[:, is_positive] > 0.0).all(
+            axis=1
+        )
+        bodies = (drawn[:, : model.layout.n_inertial] - held).reshape(-1)
+        are_bodies = _positive_definite(pseudo_inertia(bodies)).reshape(len(x), -1)
+        return np.asarray(signs & are_bodies.all(axis=1))
+
+    x = possible_draws(root, is_possible, count, rng)
+    drawn = nominal + x
+    if any(spread):
+        error = np.sqrt((root**2).sum(axis=1))
+        own = [name for name in names if name in between]
+        at = np.flatnonzero(spread)
+        scores = x[:, at] / np.where(error[at] > 0.0, error[at], 1.0)
+        # the rest of the error of the mean is due to the spread, and correlates as it does
+        of_mean, total = np.array([between[name]["errors"] for name in own]).T
+        share = np.minimum(np.minimum(error[at], of_mean) / total, 1.0) ** 2
+        order = [between[name]["at"] for name in own]
+        R = np.array(result.content["variation"]["correlation"])[np.ix_(order, order)]
+        z = correlated_scores(scores, share, R, rng.standard_normal(scores.shape))
+        for k, (i, name) in enumerate(zip(at.tolist(), own, strict=True)):
+            least = 0.0 if signed[i] else -math.inf
+            drawn[:, i] = scores_to_values(z[:, k], SCORES, between[name]["quantiles"], least)
+    return names, drawn
+
+
+def _positive_definite(J: Array) -> Array:
+    """Return which symmetric matrices, shape (k, n, n), are positive definite, shape (k,).
+
+    They are those whose elimination has positive pivots only.
+    """
+    left = np.array(J.transpose(1, 2, 0), order="C")
+    found = np.ones(len(J), dtype=bool)
+    for k in range(len(left)):
+        found &= left[k, k] > 0.0
+        below = left[k + 1 :, k]
+        left[k + 1 :, k + 1 :] -= below[:, None] * (below / np.where(found, left[k, k], 1.0))
+    return found
+
+
+def _between(content: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """Return quantiles of the next log, errors of the mean and of it, and number, by parameter."""
+    found: dict[str, dict[str, Any]] = {}
+    entries = {entry["name"]: entry for entry in content["drive_parameters"]}
+    parameters = content.get("variation", {}).get("parameters", {})
+    for k, (name, entry) in enumerate(parameters.items()):
+        if entries[name].get("at_bound"):
+            continue
+        low, high = entry["next_interval"]
+        errors = entry["std_error"], (high - low) / (2.0 * QUANTILE)
+        found[name] = {"quantiles": np.array(entry["next_quantiles"]), "errors": errors, "at": k}
+    return found
+
+
+def _quantile(content: Mapping[str, Any]) -> float:
+    """Return the typical half-width of an interval in standard errors."""
+    entries = (*content["standard_parameters"], *content["drive_parameters"])
+    own = [q for entry in entries if (q := entry.get("quantile")) and entry.get("std_error")]
+    return float(np.median(own)) if own else QUANTILE
+
+
+def _nominal(result: Result, names: list[str]) -> list[float]:
+    """Return the identified values of gains, delays and zeros."""
+    stated = {entry["name"]: float(entry["value"]) for entry in result.content["drive_parameters"]}
+    return [stated[name] for name in names]
+
+
+def _bodies(model: RobotModel, values: Array) -> dict[str, Any]:
+    """Return mass, centre of mass, and inertia about it along the link's axes, by link."""
+    layout = model.layout
+    own = values[:, : layout.n_inertial] - held_parameters(model)
+    J = pseudo_inertia(own.reshape(-1)).reshape(len(values), -1, 4, 4)
+    m = J[..., 3, 3]
+    c = J[..., :3, 3] / m[..., None]
+    about = J[..., :3, :3] - m[..., None, None] * c[..., :, None] * c[..., None, :]
+    trace = np.trace(about, axis1=-2, axis2=-1)[..., None, None]
+    inertia = trace * np.eye(3) - about
+    rows, columns = (0, 1, 2, 0, 0, 1), (0, 1, 2, 1, 2, 2)
+    return {
+        body: {
+            "mass": m[:, i].tolist(),
+            "com": c[:, i].tolist(),
+            "inertia": inertia[:, i][:, rows, columns].tolist(),
+        }
+        for i, body in enumerate(layout.bodies)
+    }
+
+
+def _drives(model: RobotModel, names: list[str], values: Array) -> dict[str, dict[str, Any]]:
+    """Return the samples of drive terms, gains, delays and zeros, by drive."""
+    found: dict[str, dict[str, Any]] = {}
+    for k in range(model.layout.n_inertial, len(names)):
+        drive, _, term = names[k].rpartition(".")
+        found.setdefault(drive, {})[term] = values[:, k].tolist()
+    return found
+
+
+def _projected(result: Result, values: Array) -> dict[str, dict[str, Any]]:
+    """Return viscous and Coulomb friction and offset in place of all friction of a drive."""
+    model, pi = result.identified
+    drives = project_friction(model, pi, result.drive_moments, SIMULATED).drives
+    found: dict[str, dict[str, Any]] = {}
+    for drive in drives:
+        own = values[:, list(drive.own)] @ drive.transfer.T
+        found[drive.name] = {
+            term: (np.maximum(x, 0.0) if term != "offset" else x).tolist()
+            for term, x in zip(drive.values, own.T, strict=True)
+        }
+    return found

@@ -16,7 +16,7 @@ import numpy as np
 
 from robotid.base.typing import Array
 from robotid.output.pages.html import block, command_html
-from robotid.output.report.steps import Origin
+from robotid.output.report.next_steps import Origin
 
 _WORDS = "shows the robot in motion, on the clock of these charts"
 _WINDOW = 1.0  # [s]

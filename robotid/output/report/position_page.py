@@ -21,9 +21,8 @@ from robotid.output.pages.charts import Chart, Series, chart_html
 from robotid.output.pages.html import block, code, number, table, text
 from robotid.output.report.dock import Residual
 from robotid.output.report.errors import POSITION, Errors, errors_of, worst_errors
-from robotid.output.report.next_steps import next_steps
+from robotid.output.report.next_steps import Origin, next_steps
 from robotid.output.report.report_page import Report, curves_section
-from robotid.output.report.steps import Origin
 from robotid.output.report.tables import (
     input_table,
     pairs_table,

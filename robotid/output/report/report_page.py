@@ -23,7 +23,7 @@ from robotid.output.pages.html import (
 )
 from robotid.output.report.dock import Clip, Dock, Residual, worst_html, worst_second
 from robotid.output.report.errors import Errors, Quantity, error_bars, error_table, worst_errors
-from robotid.output.report.steps import Origin, Step
+from robotid.output.report.next_steps import Origin, Step
 from robotid.output.report.tables import sources_fact
 
 _ROWS = 24_000  # of all charts: about half a MB

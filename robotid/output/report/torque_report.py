@@ -25,9 +25,8 @@ from robotid.output.pages.html import Cell, block, cell, code, folded, listing, 
 from robotid.output.report import pictures, tables
 from robotid.output.report.dock import Residual
 from robotid.output.report.errors import TORQUE, errors_of, worst_errors
-from robotid.output.report.next_steps import next_steps
+from robotid.output.report.next_steps import Origin, next_steps
 from robotid.output.report.report_page import Report, curves_section, drawn
-from robotid.output.report.steps import Origin
 
 _LOW = 130  # [px] height of a friction chart
 _CURVES = 8  # friction charts that are not folded

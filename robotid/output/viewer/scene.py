@@ -14,8 +14,7 @@ import numpy as np
 import pinocchio as pin
 
 from robotid.base.typing import Array
-from robotid.output.viewer.thinning import thin
-from robotid.robot.geometry import Shape, Surface, find_mesh, read_shapes, read_surfaces
+from robotid.robot.geometry import Shape, Surface, find_mesh, joined, read_shapes, read_surfaces
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
 
@@ -39,18 +38,6 @@ class Scene:
     notes: tuple[str, ...]  # shapes that are not drawn, as sentences
     # points on each node whose hull contains its parts, shape (k, 3) each [m]
     corners: tuple[Array, ...]
-
-
-@dataclass(frozen=True, eq=False)
-class Ellipsoid:
-    """The mass distribution of a body as a solid."""
-
-    mass: float  # mass [kg]
-    com: Array | None  # centre of mass in the body's frame, shape (3,) [m]; None without mass
-    # lengths of the semi-axes, shape (3,) [m]; None if no solid has this inertia
-    semi_axes: Array | None
-    rotation: Array  # directions of the axes as columns, a rotation, shape (3, 3)
-    fault: str  # reason for no solid; empty if there is one
 
 
 def robot_scene(model: RobotModel) -> Scene:
@@ -90,30 +77,17 @@ def coordinates(model: RobotModel, q: Array) -> Array:
 
 
 def mass_marks(model: RobotModel, pi: Array, label: str) -> dict[str, Any]:
-    """Return the centre of mass and the equimomental ellipsoid of each body, for the viewer.
-
-    pi (p,).
-    """
-    found = ellipsoids(pi[: model.layout.n_inertial])
-    return {
-        "label": label,
-        "bodies": [
-            {
-                "node": i + 1,
-                "name": body,
-                "mass": mark.mass,
-                "com": None if mark.com is None else mark.com.tolist(),
-                "semi_axes": None if mark.semi_axes is None else mark.semi_axes.tolist(),
-                "quaternion": pin.Quaternion(mark.rotation).coeffs().tolist(),
-                "fault": mark.fault,
-            }
-            for i, (body, mark) in enumerate(zip(model.layout.bodies, found, strict=True))
-        ],
-    }
+    """Return the centre of mass and the equimomental ellipsoid of each body: pi (p,)."""
+    J = pseudo_inertia(pi[: model.layout.n_inertial])
+    bodies = [
+        {"node": i, "name": body, **ellipsoid(own)}
+        for i, (body, own) in enumerate(zip(model.layout.bodies, J, strict=True), start=1)
+    ]
+    return {"label": label, "bodies": bodies}
 
 
-def ellipsoids(pi: Array) -> tuple[Ellipsoid, ...]:
-    """Return the equimomental ellipsoid of each body.
+def ellipsoid(J: Array) -> dict[str, Any]:
+    """Return mass, centre of mass and equimomental ellipsoid of a pseudo-inertia (4, 4), as plain.
 
     The second moments about the centre of mass, Sigma_c = Sigma - m c c', are those of a solid
     ellipsoid of uniform density whose semi-axes have the lengths sqrt(5 s_i / m), s_i the
@@ -122,10 +96,20 @@ def ellipsoids(pi: Array) -> tuple[Ellipsoid, ...]:
     References:
         Wensing, Kim, Slotine (2018), Linear matrix inequalities for physically consistent
         inertial parameter identification, section IV.
-
-    pi (10 bodies,).
     """
-    return tuple(_ellipsoid(J) for J in pseudo_inertia(pi))
+    m, place = float(J[3, 3]), {"com": None, "semi_axes": None, "quaternion": [0.0, 0.0, 0.0, 1.0]}
+    if not m > 0:
+        return {"mass": m, **place, "fault": "no mass" if m == 0 else "negative mass"}
+    c = J[:3, 3] / m
+    s, axes = np.linalg.eigh(J[:3, :3] - m * np.outer(c, c))
+    place["com"] = c.tolist()
+    if s[0] < -1e-12 * float(np.trace(J[:3, :3])):  # beyond rounding
+        return {"mass": m, **place, "fault": "no solid has this inertia"}
+    if np.linalg.det(axes) < 0:
+        axes[:, 0] = -axes[:, 0]
+    place["semi_axes"] = np.sqrt(5.0 * np.maximum(s, 0.0) / m).tolist()
+    place["quaternion"] = pin.Quaternion(axes).coeffs().tolist()
+    return {"mass": m, **place, "fault": ""}
 
 
 def packed(values: Array, kind: str = "<f4") -> dict[str, Any]:
@@ -133,20 +117,6 @@ def packed(values: Array, kind: str = "<f4") -> dict[str, Any]:
     array = np.ascontiguousarray(values, dtype=kind)
     data = base64.b64encode(array.tobytes()).decode("ascii")
     return {"kind": kind, "shape": list(array.shape), "data": data}
-
-
-def _ellipsoid(J: Array) -> Ellipsoid:
-    m = float(J[3, 3])
-    if not m > 0:
-        return Ellipsoid(m, None, None, np.eye(3), "no mass" if m == 0 else "negative mass")
-    c = J[:3, 3] / m
-    s, axes = np.linalg.eigh(J[:3, :3] - m * np.outer(c, c))
-    if np.linalg.det(axes) < 0:
-        axes[:, 0] = -axes[:, 0]
-    rounding = 1e-12 * float(np.trace(J[:3, :3]))
-    if s[0] < -rounding:
-        return Ellipsoid(m, c, None, np.eye(3), "no solid has this inertia")
-    return Ellipsoid(m, c, np.sqrt(5.0 * np.maximum(s, 0.0) / m), axes, "")
 
 
 class _Library:
@@ -355,3 +325,93 @@ def _from_y_axis(axis: Array, position: Array) -> Array:
     M[:3, :3] = pin.Quaternion.FromTwoVectors(_UP, axis).toRotationMatrix()
     M[:3, 3] = position
     return M
+
+
+_CREASE = np.radians(30.0)  # angle between two faces beyond which their edge is sharp
+# whether rims are preserved, and growth rate of the error bound, until few enough remain
+_ATTEMPTS = ((True, 3.0), (False, 3.0), (False, 7.0))
+
+
+def thin(solids: Sequence[Sequence[Surface]], most: int) -> list[list[Surface]]:
+    """Return surfaces with at most so many triangles in total; closed ones stay closed.
+
+    fast-simplification collapses edges in the order of the change of shape; a collapsed edge opens
+    no hole. The triangles of a surface have one orientation, outwards if it is closed. Each side of
+    a sharp edge has its own corners.
+
+    References:
+        Garland, Heckbert (1997), Surface simplification using quadric error metrics.
+    """
+    share = most / max(sum(len(patch.faces) for solid in solids for patch in solid), 1)
+    return [_thinned_solid(solid, share) if solid else [] for solid in solids]
+
+
+def _thinned_solid(patches: Sequence[Surface], share: float) -> list[Surface]:
+    import trimesh
+
+    whole = joined(patches)
+    size = float(np.ptp(whole.vertices, axis=0).max()) or 1.0
+    patch = np.repeat(np.arange(len(patches)), [len(surface.faces) for surface in patches])
+    mesh = trimesh.Trimesh(whole.vertices / size, whole.faces, process=False)
+    mesh.merge_vertices()
+    is_proper = mesh.unique_faces() & mesh.nondegenerate_faces()
+    mesh.update_faces(is_proper)
+    if not len(mesh.faces):
+        return []
+    faces, patch = _oriented(mesh), patch[is_proper]
+    parts = [_simplified(mesh.vertices, faces[patch == k], share) for k in range(len(patches))]
+    together: Any = trimesh.util.concatenate(parts)
+    together.merge_vertices()
+    is_closed = together.is_watertight and together.is_winding_consistent
+    surfaces = []
+    for part, surface in zip(parts, patches, strict=True):
+        if len(part.faces):
+            smooth = trimesh.graph.smooth_shade(part, angle=_CREASE, facet_minarea=None)
+            vertices, triangles = size * smooth.vertices, np.asarray(smooth.faces)
+            surfaces.append(Surface(vertices, triangles, surface.rgba, is_closed))
+    return surfaces
+
+
+def _simplified(V: Array, F: Array, share: float) -> Any:  # noqa: ANN401
+    """Return a share of the triangles of a patch, as a mesh; its rim is kept if it can be.
+
+    Otherwise, too many triangles would remain. The library's error bound assumes coordinates of
+    about 1.
+    """
+    import fast_simplification
+    import trimesh
+
+    most = int(share * len(F))
+    if len(F) > most:
+        used, F = np.unique(F, return_inverse=True)
+        V, F = np.ascontiguousarray(V[used]), F.reshape(-1, 3).astype(np.int32)
+        for keeps_rims, step in _ATTEMPTS:
+            places, faces = fast_simplification.simplify(
+                V, F, target_count=most, preserve_border=keeps_rims, agg=step
+            )
+            if len(faces) <= most:
+                break
+        V, F = places, faces
+    mesh = trimesh.Trimesh(V, F, process=False)
+    mesh.merge_vertices()
+    mesh.update_faces(mesh.unique_faces() & mesh.nondegenerate_faces())
+    return mesh
+
+
+def _oriented(mesh: Any) -> Array:  # noqa: ANN401
+    """Return the triangles with one orientation on each connected surface, outwards."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    F, (f, g), n = np.asarray(mesh.faces), mesh.face_adjacency.T, len(mesh.faces)
+    first, second = mesh.face_adjacency_edges.T[:, :, None]
+    forward = [((F[k] == first) & (np.roll(F[k], -1, axis=1) == second)).any(1) for k in (f, g)]
+    opposed = forward[0] == forward[1]  # orientations of the neighbours
+    # f is a face as it is, f + n its reverse
+    rows, columns = np.r_[f, f + n], np.r_[g + n * opposed, g + n * ~opposed]
+    graph = coo_array((np.ones(len(rows)), (rows, columns)), shape=(2 * n, 2 * n))
+    _, part = connected_components(graph, directed=False)
+    volume = np.linalg.det(mesh.triangles - mesh.vertices.mean(axis=0)) / 6
+    sums = np.bincount(part, np.r_[volume, -volume])
+    reverse = (part[:n] != part[n:]) & (sums[part[:n]] < sums[part[n:]])
+    return np.where(reverse[:, None], F[:, ::-1], F)

@@ -55,15 +55,6 @@ def test_a_clean_log_of_a_light_arm_at_30_hertz_raises_no_alarm():
     assert loud(diagnose(model, [log], [], SIGNALS)) == []
 
 
-@pytest.mark.parametrize("name", ["ur5", "panda"])
-def test_torques_of_a_gravity_compensated_channel_are_named(name):
-    weightless, model = robot(name, gravity=(0.0, 0.0, 0.0)), robot(name)
-    findings = diagnose(model, [clean_log(weightless, 0)], [], SIGNALS)
-    (found,) = [f for f in findings if f.severity == "error"]
-    assert found.code == "gravity_compensated"
-    assert "the torques contain no gravity" in found.message
-
-
 def test_a_load_is_not_taken_for_another_gravity():
     # 1.2 kg in the hand of an arm of 0.6 kg
     model = RobotModel.from_urdf(example_urdf("so101.urdf"))

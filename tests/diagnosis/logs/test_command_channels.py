@@ -35,10 +35,6 @@ def found(log):
     return {f.code: f for f in check_commands(log) if f.code not in ("no_torque", "loops")}
 
 
-def waves(amplitudes, speeds):
-    return lambda t: np.asarray(amplitudes) * np.sin(np.multiply.outer(t, speeds))
-
-
 # --- nothing where nothing is ---------------------------------------------------------------------
 
 

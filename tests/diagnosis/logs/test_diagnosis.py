@@ -18,7 +18,6 @@ from helpers.corruptions import (
 from helpers.driven import arm
 from helpers.synthetic import exact_log, perfect, truth
 
-from robotid.base.exceptions import SettingsError
 from robotid.cli import main
 from robotid.cli.job import Job, LogEntry, read_job
 from robotid.cli.logs import examine
@@ -26,7 +25,6 @@ from robotid.data.files.formats import write_columns
 from robotid.data.files.read import write_log
 from robotid.data.signal_settings import SignalSettings
 from robotid.diagnosis.logs.check_logs import check_logs, diagnose, findings_to_dict
-from robotid.diagnosis.verdict.verdict import check_ignored
 from robotid.dynamics.simulation.motions import random_fourier
 from robotid.dynamics.simulation.simulation_settings import Sensors
 from robotid.dynamics.simulation.truth import another_robot
@@ -138,20 +136,6 @@ def test_delays_are_measured_and_corrected_only_on_request(spoilt):
     assert found.evidence["delay"] == pytest.approx(0.03, abs=0.001)
     stated = replace(job, signals=SignalSettings(velocity_delay=0.03))
     assert "velocity_delay" not in {f.code for f in examine(stated)}
-
-
-def test_a_motion_recorded_twice_is_no_validation():
-    model, noise = arm(), np.array([0.5, 0.25, 0.1])
-
-    def recorded(seed, rate):
-        rng = np.random.default_rng(seed)
-        samples = round(15 * rate)
-        return exact_log(model, truth(model), rng, samples=samples, rate=rate, noise=noise)
-
-    first, again, other = recorded(0, 100.0), recorded(0, 120.0), recorded(1, 100.0)
-    later = replace(again, t=again.t + 100.0).window(104.0, 111.0)
-    assert "repeated_motion" in loud(diagnose(model, [first], [later], SIGNALS))
-    assert "repeated_motion" not in loud(diagnose(model, [first], [other], SIGNALS))
 
 
 def test_a_payload_is_weighed(ur5):
@@ -270,14 +254,6 @@ def test_what_makes_a_result_wrong_leads_its_verdict_unless_it_is_ignored(
     result = json.loads(capsys.readouterr().out)
     assert not any("opposite sign" in reason for reason in result["verdict"]["reasons"])
     assert result["settings"]["doctor"] == {"ignore": ["torque_sign"]}
-
-
-def test_an_unknown_code_to_ignore_is_wrong_use(wrong_sign, tmp_path, capsys):
-    words = ["identify", URDF, wrong_sign, "--out", str(tmp_path), "--ignore", "torque_sgn"]
-    assert main(words) == 2
-    assert "Did you mean 'torque_sign'?" in capsys.readouterr().err
-    with pytest.raises(SettingsError, match=r"has the code 'x', which is unknown or changes"):
-        check_ignored(["x"])
 
 
 def test_findings_change_no_data(ur5, short):

@@ -8,7 +8,7 @@ from helpers.findings import Figures
 
 from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
-from robotid.diagnosis.logs.channels import check_channels, check_clock, check_torque_channels
+from robotid.diagnosis.logs.channels import check_channels, check_torque_channels
 
 T = 3.0 + np.arange(2000) / 100
 
@@ -55,26 +55,6 @@ def test_a_held_torque_is_late_by_half_of_what_it_is_held_less_a_row(rows):
     assert f"mean delay of {1e3 * late:.2g} ms" in found.message
     assert f"torque_delay = {late:.4f} (--torque-delay {late:.4f})" in found.message
     assert f"a cutoff below {25 / rows:.2g} Hz" in found.message
-
-
-def test_clocks_that_were_set_are_told_from_gaps():
-    set_ = np.where(np.arange(2000) > 500, 7.0, 0.0) + np.where(np.arange(2000) > 900, 3.0, 0.0)
-    log = log_of(t=T + set_, q=log_of().q)
-    kept = np.delete(np.arange(2000), np.r_[1200:1260, 1700:1740])
-    log = replace(log, t=log.t[kept], q=log.q[kept], tau=log.tau[kept])
-    found = list(check_clock(log))
-    step = one(found, "clock_step")
-    assert Figures(step) == {"jump": pytest.approx(7.0), "at": pytest.approx(8.0), "steps": 2.0}
-    assert "the clock jumps by 7 s at t = 8 s" in step.message
-    gap = one(found, "gap")
-    assert Figures(gap) == {
-        "gaps": 2.0, "longest": pytest.approx(0.61), "at": pytest.approx(14.99 + 10.0)
-    }  # fmt: skip
-    assert "2 gaps, the longest of 0.61 s at t = 24.99 s" in gap.message
-    rate = one(found, "rate")
-    assert rate.evidence["samples"] == 1900
-    assert rate.evidence["rate"] == pytest.approx(100.0)
-    assert rate.evidence["duration"] == pytest.approx(19.99 + 10.0)
 
 
 def test_a_torque_is_clipped_at_either_limit_and_held_by_groups():

@@ -1,7 +1,6 @@
 """Another scale of the torques, another robot's URDF, an uninformative torque: told apart."""
 
-from dataclasses import dataclass, replace
-from types import SimpleNamespace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -117,11 +116,3 @@ def test_a_balanced_joint_may_follow_its_position_either_way_and_no_other(ur5, u
         np.testing.assert_allclose(drives[:, j, 5:], wave if j in (1, 3) else 0.0 * wave)
     np.testing.assert_array_equal(drives[:, :, 0], probe.a)
     np.testing.assert_array_equal(drives[:, :, 3:5], [[[1.0, -1.0]]] * np.ones((*c.shape, 1)))
-
-
-@dataclass(frozen=True)
-class _Probe:
-    gravity: np.ndarray
-    model: SimpleNamespace
-    motion: SimpleNamespace
-    balanced: tuple[int, ...] = ()

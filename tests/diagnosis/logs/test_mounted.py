@@ -1,49 +1,21 @@
-"""Parts of the URDF that were not mounted, loads that only the validation log has."""
+"""Loads that only the validation log has."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.corruptions import NOISE, clean_log, robot
-from helpers.synthetic import perfect
+from helpers.corruptions import clean_log, robot
 
 from robotid.data.signal_settings import SignalSettings
 from robotid.diagnosis.logs.check_logs import diagnose
-from robotid.dynamics.simulation.motions import random_fourier
-from robotid.dynamics.simulation.simulation_settings import Sensors
 from robotid.dynamics.simulation.truth import another_robot
-from robotid.robot.bodies import link_places
 
-CODES = {"unmounted_part", "payload_change", "payload"}
+CODES = {"payload_change", "payload"}
 
 
 def loud(model, fitted, kept=()):
     found = diagnose(model, [fitted], list(kept), SignalSettings())
     return [f for f in found if f.code in CODES and f.severity != "note"]
-
-
-def recorded(model, seed, without=0.0):
-    """Simulate an arm whose links are 10 to 30 % off, without some parameters of the last one."""
-    rng = np.random.default_rng(seed)
-    size, pi = model.layout.n_inertial, model.standard_parameters()
-    links = pi[:size].reshape(-1, 10)
-    links[-1] -= without
-    links *= 1 + rng.uniform(0.1, 0.3, (len(links), 1)) * rng.choice([-1, 1], (len(links), 1))
-    pi[size:] = [rng.uniform(*term.typical) for _, term in model.layout.drive_parameters]
-    motion = random_fourier(model, rng, period=5.0)
-    sensors = Sensors(noise=NOISE)
-    return perfect(model, pi, motion, rng, rate=100.0, duration=10.0, sensors=sensors)
-
-
-def test_a_hand_that_was_not_mounted_is_named():
-    panda = robot("panda")
-    parts = [p for p in link_places(panda) if p.body == 6 and p.role != "moved"]
-    hand = np.sum([p.parameters for p in parts], axis=0)
-    (found,) = loud(panda, recorded(panda, 0, hand))
-    assert (found.code, found.where) == ("unmounted_part", "log: panda_link7")
-    assert found.evidence["mass"] == pytest.approx(0.76)
-    assert "without panda_hand, panda_leftfinger, panda_rightfinger" in found.message
-    assert loud(panda, recorded(panda, 0)) == []
 
 
 def test_a_load_in_the_validation_log_only_is_weighed(arm_and_log):

@@ -41,15 +41,6 @@ def test_a_short_clean_log_has_no_late_torque_but_a_delayed_one_has(name, seed, 
         assert spoilt.evidence["gain"] > 0.25
 
 
-def test_a_stated_delay_is_no_longer_found(ur5):
-    log = delayed(controlled_log("ur5", 100, duration=8.0), 0.03)
-    (spoilt,) = found(ur5, log)
-    delay = spoilt.evidence["delay"]
-    (mended,) = found(ur5, log, replace(SIGNALS, torque_delay=delay))
-    assert mended.severity == "note"
-    assert abs(mended.evidence["delay"]) < 2e-3
-
-
 def test_a_log_without_a_filter_is_judged_too(ur5):
     signals = replace(SIGNALS, cutoff=None)
     log = exact_log(ur5, truth(ur5), np.random.default_rng(0), samples=800, rate=100.0)

@@ -97,11 +97,3 @@ def test_the_smaller_p_value_of_fitted_logs_or_of_all_counts(order):
     values = [scipy.stats.ttest_1samp(gain[:k], 0.0, alternative="greater").pvalue for k in (6, 9)]
     assert (values[1] < values[0]) == (order > 0)
     assert p_value(before, after, 6) == pytest.approx(min(values))
-
-
-@pytest.mark.parametrize(("alike", "wanted"), [(0.0, ["c"]), (0.25, ["b", "c"]), (0.5, [*"abc"])])
-def test_options_count_as_equal_up_to_the_stated_share_included(alike, wanted):
-    left = {key: np.array([x, 0.0]) for key, x in (("a", 12.0), ("b", 8.0), ("c", 4.0))}
-    this = Round(np.array([16.0, 0.0]), left, 2, 16.0)  # shares of 0.25, 0.5 and 0.75
-    assert this.alike(Rule(1, 0.0, None, alike)) == wanted
-    assert this.alike(Rule(1, 0.25, None, 1.0)) == ["b", "c"]  # more than the smallest share

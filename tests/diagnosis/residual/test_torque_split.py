@@ -10,12 +10,10 @@ import pytest
 from helpers.driven import ELBOW, EXACT, LIFT, WRIST, arm, driven, driven_log
 from helpers.misfits import coloured
 from helpers.synthetic import truth
-from scipy.signal import butter, sosfiltfilt
 
 from robotid.base.exceptions import DataError
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import process
-from robotid.diagnosis.residual import torque_split
 from robotid.diagnosis.residual.torque_split import (
     JointTorque,
     Rows,
@@ -27,7 +25,6 @@ from robotid.diagnosis.residual.torque_split import (
 )
 from robotid.dynamics.prediction import predict, remember
 from robotid.dynamics.torque import joint_torque_regressor
-from robotid.output.report.pictures import why_charts
 from robotid.robot.drives import Harmonic, Hat, Lag, LoadFriction, Presliding, Spring, Stribeck
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
@@ -239,27 +236,6 @@ def test_what_a_residual_follows_is_found_with_its_share(name, rng):
     assert ("at low speed" in said) == (name == "speed")
 
 
-def test_the_residual_against_time_is_drawn_as_time_is_asked_of_it(rng):
-    v, q, load = motion(rng)
-    drift = 0.3 * np.linspace(-1, 1, len(v))
-    found = torque(2.0 * q + drift + 0.1 * rng.standard_normal(len(v)), v, q, load)
-    residual, less = found.against_time
-    assert less == "position"
-    left = found.residual - np.interp(q, *_bins(found, "position"))
-    np.testing.assert_allclose(residual, left)
-    time = found.follows[-1]
-    assert time.name == "time"
-    chart = why_charts(found)["time"]
-    assert "minus its mean over position against time" in chart.title
-    assert chart.series[0].y.std() < 0.6  # drift and noise; the plain residual is far larger
-    assert why_charts(found)["position"].series[0].y.std() > 1.0
-
-
-def _bins(found, name):
-    (dependence,) = [d for d in found.follows if d.name == name]
-    return dependence.centres, dependence.means
-
-
 def test_noise_of_any_colour_follows_nothing():
     rng, log_errors, tried, shares = np.random.default_rng(0), 0, 0, []
     for trial in range(60):
@@ -300,29 +276,6 @@ def test_what_the_fitted_recordings_do_not_show_has_changed(rng):
     assert "something has changed since" in replace(after, fitted=before).sentence
 
 
-@pytest.mark.parametrize(("kind", "low", "high"), [("noise", 0.9, 1.0), ("slow", 0.046, 0.07)])
-def test_filtered_noise_is_quick_and_what_is_slow_is_not(kind, low, high):
-    rng, rate, cutoff, N = np.random.default_rng(0), 500.0, 10.0, 20_000
-    t, segment = np.arange(N) / rate, np.arange(N) // 500
-    if kind == "noise":
-        sos = butter(4, cutoff, fs=rate, output="sos")
-        r = sosfiltfilt(sos, rng.standard_normal(N))
-    else:  # 1 - cos(2 pi f L) of f = cutoff / 20, for L = 1 / cutoff; its sign changes at gaps
-        r = (-1.0) ** segment * np.cos(2 * np.pi * cutoff / 20 * t)
-    mask = np.ones((N, 1), bool)
-    mask[:100] = False
-    r = np.where(mask[:, 0], r, 1e3)
-    e = SimpleNamespace(
-        recording=SimpleNamespace(
-            trajectory=SimpleNamespace(tau=r[:, None], segment=segment, rate=rate),
-            signals=SignalSettings(cutoff=cutoff), mask=mask,
-        ),
-        torques={"estimate": np.zeros((N, 1))},
-    )  # fmt: skip
-    (broadband,) = _broadband_shares([e])
-    assert low <= broadband <= high
-
-
 def test_what_is_forgotten_is_one_less_the_autocorrelation_of_all_recordings(rng):
     """Of two recordings of other rates, with gaps and rows left out; without a filter of a row."""
     shares = np.zeros((2, 3))  # products and squares
@@ -347,32 +300,6 @@ def test_what_is_forgotten_is_one_less_the_autocorrelation_of_all_recordings(rng
     assert still is None
 
 
-def test_samples_of_two_recordings_are_cut_together_into_segments_of_ten(rng):
-    def evaluation(name, count, rate, cutoff, start):
-        t = start + np.arange(count) / rate
-        trajectory = SimpleNamespace(t=t, segment=(np.arange(count) > count // 3).astype(int))
-        signals = SignalSettings(cutoff=cutoff, rate=rate)
-        recording = SimpleNamespace(name=name, trajectory=trajectory, signals=signals)
-        return SimpleNamespace(recording=recording)
-
-    own = [
-        (evaluation("a", 400, 100.0, 10.0, 3.0), np.arange(0, 400, 5)),
-        (evaluation("b", 300, 50.0, 5.0, 9.0), np.arange(0, 300, 2)),
-    ]
-    found = torque_split._rows(own)
-    # a fifth of either is independent: 80 of the first and 60 of the second, ten each
-    assert found.segments.tolist() == [14 * k // 230 for k in range(230)]
-    assert found.recordings == ("a", "b")
-    assert found.recording.tolist() == [0] * 80 + [1] * 150
-    t, segment = (
-        np.concatenate([getattr(e.recording.trajectory, x)[k] for e, k in own])
-        for x in ("t", "segment")
-    )
-    np.testing.assert_array_equal(found.t, t)
-    np.testing.assert_array_equal(found.segment, segment)
-    assert torque_split._rows([(own[1][0], np.arange(55))]).segments is None
-
-
 def test_a_residual_is_examined_without_outliers_of_the_samples_used(rng):
     v, q, load = motion(rng)
     found = torque(0.5 * np.tanh(v) + 0.1 * rng.standard_normal(len(v)), v, q, load)
@@ -393,55 +320,3 @@ def test_a_residual_is_examined_without_outliers_of_the_samples_used(rng):
     assert rms["measured"] == pytest.approx(np.sqrt(np.mean(tau[used] ** 2)))
     assert rms["residual"] == pytest.approx(np.sqrt(np.mean(r[used] ** 2)))
     np.testing.assert_allclose(spoilt.power, tau * v)
-
-
-def test_only_what_fitted_recordings_could_have_shown_has_changed(rng):
-    found = torque(np.zeros(800), *motion(rng, 800))
-    parts = {
-        "significant": ("speed", 0.5, True), "none": ("speed", 0.0, False),
-        "short": ("speed", None, False), "other": ("position", 0.0, False),
-    }  # fmt: skip
-    changed = {}
-    for key, (name, share, is_significant) in parts.items():
-        before = SimpleNamespace(
-            follows=(SimpleNamespace(name=name, share=share, is_significant=is_significant),)
-        )
-        changed[key] = replace(found, fitted=before)._has_changed("speed")
-    assert changed == {"significant": False, "none": True, "short": False, "other": False}
-
-
-def test_samples_of_all_recordings_together_are_at_most_so_many(identified, monkeypatch):
-    """A half of them of each of two fitted logs, whose parts follow each other."""
-    monkeypatch.setattr(torque_split, "_ROWS", 90)
-    found = torque_split._torques_of(identified, identified.fitted)
-    assert [torque.joint for torque in found] == list(identified.model.joints)
-    taken = []
-    for e in identified.fitted:
-        count = len(e.recording.trajectory.t)
-        taken.append(np.linspace(0, count - 1, 45).round().astype(int))
-    for j, torque in enumerate(found):
-        for name, own in (
-            (
-                "tau",
-                [
-                    e.recording.trajectory.tau[k, j]
-                    for e, k in zip(identified.fitted, taken, strict=True)
-                ],
-            ),
-            (
-                "used",
-                [e.recording.mask[k, j] for e, k in zip(identified.fitted, taken, strict=True)],
-            ),
-        ):
-            np.testing.assert_array_equal(getattr(torque, name), np.concatenate(own))
-        whole = np.concatenate(
-            [e.torques["estimate"][k, j] for e, k in zip(identified.fitted, taken, strict=True)]
-        )
-        np.testing.assert_allclose(sum(torque.parts.values()), whole, atol=1e-8)
-        for part, terms in torque.terms.items():
-            np.testing.assert_allclose(sum(terms.values()), torque.parts[part], atol=1e-9)
-        speed = [
-            e.recording.trajectory.v[k, j] for e, k in zip(identified.fitted, taken, strict=True)
-        ]
-        assert torque.quantities["speed"][0] == "rad/s"
-        np.testing.assert_array_equal(torque.quantities["speed"][1], np.concatenate(speed))

@@ -1,5 +1,4 @@
 import re
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,7 +9,6 @@ from robotid.diagnosis.urdf.mesh_check import audit_bodies, audit_links
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 
-DOCS = Path(__file__).parents[3] / "docs" / "evidence/urdf_audit.md"
 ARM = """<robot name="arm">
   <link name="base"/>
   <joint name="j1" type="continuous"><parent link="base"/><child link="upper"/>

@@ -208,8 +208,8 @@ def test_the_doctor_names_rounded_angles_that_matter_once(tmp_path, rng):
         assert len(findings) == expected, angle
         if findings:
             severity = {"3.14": "warning", "3.1416": "note"}[angle]
-            assert (findings[0].severity, findings[0].where) == (severity, "two.urdf")
-            assert "rounds angles of the joints elbow. With the rounding" in findings[0].message
+            assert (findings[0].severity, findings[0].where) == (severity, "joint elbow")
+            assert "joint 'elbow' has rounded angles in rpy" in findings[0].message
         snapped = RobotModel.from_urdf(tmp_path / "two.urdf", snap_angles=True)
         assert not [f for f in check_logs(snapped, [log]) if f.code == "rounded_rpy"]
 

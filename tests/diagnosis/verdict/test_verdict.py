@@ -1,6 +1,5 @@
 from dataclasses import replace
 
-import numpy as np
 import pytest
 
 from robotid.base.findings import Finding
@@ -16,7 +15,6 @@ from robotid.diagnosis.verdict.verdict import (
 )
 from robotid.estimation.fitting.evaluation import JointMetrics, Metrics
 
-NOISE = np.array([2.0, 2.0, 1.0, 0.3, 0.3, 0.1])
 JOINTS = ("a", "b", "c")
 
 
@@ -88,20 +86,6 @@ def test_alarms_come_before_everything_and_constants_before_the_rest():
     assert found.reasons[2].startswith("a: error 60.0 %")
 
 
-def test_worse_than_the_urdf_is_poor():
-    found = verdict({"a": joint(8.0, urdf=6.0)})
-    assert found.status == "poor"
-    assert found.reasons == ("a: error 8.0 % on val.csv, worse than the URDF's 6.0 %",)
-
-
-def test_large_errors_and_open_parameters_make_it_usable_at_best():
-    assert verdict({"a": joint(20.0)}).status == "usable"
-    assert verdict({"a": joint(60.0)}).status == "poor"
-    assert verdict({"a": joint(9.0)}).status == "usable"  # three times the error of the fit
-    assert verdict({"a": joint(4.0)}, undetermined=["x.m"]).status == "usable"
-    assert verdict({"a": joint(4.0)}, is_consistent=False).status == "usable"
-
-
 def test_each_joint_has_a_verdict_of_its_own():
     joints = {"a": joint(4.0), "b": joint(20.0), "c": joint(40.0, constant=False)}
     found = verdict(joints, fitted={name: joint(3.0) for name in "abcd"}).joints
@@ -133,30 +117,6 @@ def test_the_good_joint_with_the_largest_error_has_the_cause_of_its_residual():
     found = judge(Predictions(fit, logs), Determined(), cause_of=causes.__getitem__)
     assert found.status == "good"
     assert found.reasons[1:] == ("b: largest error: it is noise",)
-
-
-def test_the_worst_of_several_recordings_decides_on_a_joint():
-    logs = {
-        "one.csv": Metrics({"a": joint(4.0)}, 1.0),
-        "two.csv": Metrics({"a": joint(60.0)}, 1.0),
-    }
-    found = judged(Metrics({"a": joint(3.0)}, 1.0), logs)
-    assert found.joints["a"].status == "poor"
-    assert found.to_dict()["per_joint"]["a"]["reasons"] == [
-        "a: error 60.0 % on two.csv, above 50 %"
-    ]
-
-
-def test_a_joint_that_moves_nowhere_is_not_evaluated():
-    found = judged(
-        Metrics({"a": joint(3.0)}, 1.0),
-        {"val.csv": Metrics({"a": joint(4.0)}, 1.0)},
-        joints=("a", "b"),
-    )
-    assert found.status == "usable"
-    assert found.reasons == ("the joints b do not move in any recording: not evaluated",)
-    assert found.joints["b"].status == "not evaluated"
-    assert found.joints["b"].reasons == ("it does not move in any recording",)
 
 
 def test_a_doubt_makes_its_joint_and_the_whole_usable_at_best():
@@ -254,17 +214,6 @@ def test_notes_errors_and_harmless_warnings_raise_no_doubt():
     assert warnings_of(harmless, JOINTS) == ()
 
 
-def test_figures_are_stated():
-    (late,) = warnings_of([finding("torque_delay", "run.csv", delay=0.0562)], JOINTS)
-    assert late.message == (
-        "run.csv: the torque is delayed by +0.056 s relative to the position (negative: early)"
-    )
-    (costs,) = warnings_of(
-        [finding("constraint_costs", "a", error_pct=4.0, wls_error_pct=1)], JOINTS
-    )
-    assert costs.message.startswith("torque error 4.0 % on the fitted recordings, 1.0 %")
-
-
 def test_a_repeated_motion_matters_if_no_other_motion_was_kept_apart():
     repeated = [finding("repeated_motion", "one.csv")]
     assert warnings_of(repeated, JOINTS, ["one.csv", "two.csv"]) == ()
@@ -342,19 +291,6 @@ def test_a_twentieth_and_a_third_of_a_percent_must_be_missed_more(error, driven,
     assert is_beaten(joint(error, urdf_with_drives=driven)) is is_worse
 
 
-@pytest.mark.parametrize("errors", [(9.0, 1.0), (1.0, 9.0)])
-def test_the_worst_of_several_recordings_refutes_no_hypothesis(errors):
-    kept = {f"{k}.csv": Metrics({"a": joint(x)}, 1.0) for k, x in enumerate(errors)}
-    mismatch, scale_check = (
-        finding("urdf_mismatch", "run.csv"),
-        ScaleCheck(gravity={}, gravity_error={}),
-    )
-    assert rejected([mismatch], kept, scale_check)[0].severity == "warning"
-    few = {name: Metrics({"a": joint(x / 2)}, 1.0) for name, x in zip(kept, errors, strict=True)}
-    [note] = rejected([mismatch], few, scale_check)
-    assert note.message.endswith("rejected: torque error on validation logs at most 4.5 %")
-
-
 def test_drive_parameters_that_the_prior_determines_are_named_and_change_no_verdict():
     for undetermined in ((), ("a.m",)):
         more = Determined(undetermined, is_poorly_excited=False, uncertain_drives=["a.coulomb"])
@@ -362,9 +298,6 @@ def test_drive_parameters_that_the_prior_determines_are_named_and_change_no_verd
         assert "a.coulomb: the standard error is as large as that of the prior" in more.notes()[-1]
         plain = Determined(undetermined, is_poorly_excited=False).notes()
         assert more.notes()[:-1] == plain
-
-
-MASS = ("total_mass",)
 
 
 def test_errors_of_the_wrench_on_the_base_are_noted_beside_those_of_joints():

@@ -12,20 +12,13 @@ from robotid.base.exceptions import DataError
 from robotid.dynamics.factors import Factors, compress, triangle_of
 from robotid.estimation.estimators import (
     OLS,
-    PRX,
     RLS,
     TLS,
     WLS,
-    Consistent,
-    DescentState,
     Estimate,
     Kalman,
-    KalmanState,
     NormalisedGradient,
-    RLSState,
     fold,
-    load_state,
-    save_state,
 )
 from robotid.estimation.estimators.segments import scatter
 from robotid.robot.examples import example_urdf
@@ -33,7 +26,6 @@ from robotid.robot.model import RobotModel
 
 BATCH = ("ols", "wls", "tls", "consistent")
 RECURSIVE = tuple(name for name in ESTIMATORS if name not in BATCH)
-STATES = {RLS: RLSState, Kalman: KalmanState, PRX: DescentState, NormalisedGradient: DescentState}
 EXACT_COVARIANCE = ("ols", "wls", "consistent", "rls", "kalman")
 
 
@@ -79,16 +71,6 @@ def test_input_is_not_changed(make, ur5, rng):
     np.testing.assert_array_equal(factors.R, before)
 
 
-@makers(EXACT_COVARIANCE)
-def test_noise_level_of_each_joint_is_found(make, rng):
-    noise = NOISE[[1, 2, 4]]
-    case = Case(arm(), rng, noise, samples=3000)
-    sigma = make(case).fit(case.problem).sigma
-    # OLS lets the noise of the shoulder into the wrist's residual; the others weigh it down
-    rtol = 0.2 if isinstance(make(case), OLS) else 0.05
-    np.testing.assert_allclose(sigma, noise, rtol=rtol)
-
-
 @makers(ESTIMATORS)
 def test_fewer_rows_than_parameters_are_refused(make, ur5, rng):
     case = Case(ur5, rng, samples=9)
@@ -121,17 +103,6 @@ def test_standard_errors_match_monte_carlo(make, noisy):
     # 60 runs know a standard deviation to 9 %; constraints and prior only make the fit tighter
     assert 0.9 < np.median(ratio) < 1.6
     assert ratio.min() > 0.65
-
-
-@makers(EXACT_COVARIANCE)
-def test_fewer_independent_rows_widen_the_errors(make, ur5, rng):
-    case = Case(ur5, rng, NOISE)
-    estimator = make(case)
-    wide = replace(estimator, independent_share=0.25).fit(case.problem)
-    narrow = estimator.fit(case.problem)
-    ratio = np.sqrt(np.diag(case.covariance(wide)) / np.diag(case.covariance(narrow)))
-    # the consistent fit also finds the noise larger: fewer rows are left to tell it
-    assert 1.5 < np.median(ratio) <= (2.1 if isinstance(estimator, Consistent) else 2.0001)
 
 
 def started(make, case):
@@ -187,19 +158,6 @@ def test_a_row_of_weight_zero_is_as_if_it_had_never_been(make, states):
     none = replace(sample, weight=np.zeros(3))
     still = estimator.estimate(estimator.update(state, none), problem.names)
     np.testing.assert_array_equal(still.theta, estimator.estimate(state, problem.names).theta)
-
-
-@makers(RECURSIVE)
-def test_saved_and_resumed_gives_the_same_bits(make, states, tmp_path):
-    problem = states.problem
-    estimator, state = started(make, states)
-    samples = list(problem.samples())[:300]
-    unbroken = fold(estimator, samples, state)
-    half = fold(estimator, samples[:150], state)
-    save_state(half, tmp_path / "state.npz")
-    read = load_state(tmp_path / "state.npz", STATES[type(estimator)])
-    assert bits(read) == bits(half)
-    assert bits(fold(estimator, samples[150:], read)) == bits(unbroken)
 
 
 THETA, ERROR = np.array([1.5, -20.0, 0.25]), np.array([0.1, 3.0, np.inf])
@@ -287,14 +245,3 @@ def test_what_one_segment_alone_determines_has_the_mean_scatter_of_all_others(rn
     assert freedom[2] == 1.0
     assert freedom[3] == np.inf
     assert ((freedom[:2] > 5.0) & (freedom[:2] <= count)).all()
-
-
-def test_a_file_that_is_no_state_is_refused(tmp_path):
-    with pytest.raises(DataError, match="of the state does not exist"):
-        load_state(tmp_path / "none.npz", RLSState)
-    (tmp_path / "text.npz").write_text("not a state")
-    with pytest.raises(DataError, match=r"text.npz is not a file of a state"):
-        load_state(tmp_path / "text.npz", RLSState)
-    save_state(RLS(np.ones(2)).init(3), tmp_path / "rls.npz")
-    with pytest.raises(DataError, match="contains a state 'RLSState', wanted 'KalmanState'"):
-        load_state(tmp_path / "rls.npz", KalmanState)

@@ -10,16 +10,16 @@ from helpers.synthetic import truth
 
 from robotid.base.exceptions import DataError, SettingsError
 from robotid.dynamics.factors import Factors, compress, triangle_of
-from robotid.estimation.estimators import PRX, RLS, WLS, Consistent, Kalman, fold
+from robotid.estimation.estimators import PRX, WLS, Consistent
 from robotid.estimation.estimators.consistent.body_constraints import (
-    Bounds,
     Constraints,
     Subspace,
     slabs,
 )
-from robotid.estimation.estimators.consistent.consistent_fit import Entropic
+from robotid.estimation.estimators.consistent.interior_point import Entropic
 from robotid.estimation.estimators.estimator import Estimate
-from robotid.estimation.fitting.estimator_settings import ConstraintSettings, make_constraints
+from robotid.estimation.fitting.chosen_estimator import make_constraints
+from robotid.estimation.fitting.estimator_settings import ConstraintSettings
 from robotid.robot.geometry import body_boxes
 from robotid.robot.parameters import ParameterLayout, inertial_from_pseudo_inertia, pseudo_inertia
 
@@ -133,11 +133,6 @@ def test_a_subspace_holds_what_the_equalities_say(rng):
     np.testing.assert_allclose(whole.T @ whole, np.eye(4), atol=1e-14)
 
 
-def test_a_bound_is_active_at_its_face_only():
-    bounds = Bounds(np.array([[2.0, 0.0], [0.0, 1.0]]), np.array([-2.0, 0.0]), ("a", "b"))
-    assert bounds.active(np.array([1.0, 5.0]), 1e-6) == ("a",)
-
-
 @pytest.fixture
 def case(ur5, rng):
     """The fit of a UR5 whose masses are unlike its URDF's, and the factors of a noisy log."""
@@ -226,38 +221,6 @@ def test_a_centre_of_mass_stays_in_its_box(case):
     assert "centre_of_mass forearm_link" in estimate.details["active"]
 
 
-@pytest.mark.parametrize(
-    ("bounds", "text"),
-    [
-        ({"mass": {"tool0": (1.0, 2.0)}}, r"\['tool0'\], which are not bodies of the model"),
-        ({"mass": {"forearm_link": (3.0, 2.0)}}, r"\[3, 2\] kg: the first value is larger"),
-        ({"mass": {"forearm_link": (-2.0, -1.0)}}, "is bounded by -1 kg, wanted a positive"),
-        ({"total_mass": (0.0, 2.0), "mass": {"forearm_link": (3.0, 9.0)}}, "allow .3, inf. kg"),
-        (
-            {"mass": {"forearm_link": (0.1, 0.2)}, "pinned": ("forearm_link",)},
-            "forearm_link is pinned at the URDF's 2.275 kg, outside its bounds",
-        ),
-        (
-            {
-                "com": {"forearm_link": (np.eye(3)[:1], np.array([-1.0]))},
-                "pinned": ("forearm_link",),
-            },
-            "forearm_link is pinned, but the URDF's centre of mass .* mm outside its bounds",
-        ),
-    ],
-)
-def test_bounds_that_contradict_each_other_are_refused_before_the_solver_runs(case, bounds, text):
-    with pytest.raises(SettingsError, match=text):
-        constrained(case[0], **bounds)
-
-
-def test_links_on_locked_joints_count_in_the_bounds(case):
-    held = np.zeros(60)
-    held[20:30] = [2.0, 0, 0, 0, 0.01, 0, 0.01, 0, 0, 0.01]
-    with pytest.raises(SettingsError, match="its links on locked joints alone have 2 kg"):
-        constrained(replace(case[0], held=held), mass={"forearm_link": (0.5, 1.0)})
-
-
 def test_the_slabs_of_a_box_hold_for_grains_inside_and_fail_for_one_outside(rng):
     box = np.array([[-0.1, -0.2, 0.0], [0.3, 0.2, 0.5]])
     grains = rng.uniform(*box, size=(50, 3))
@@ -308,6 +271,9 @@ def two_bodies():
         ({"mass": {"one": (2.0, 4.0), "two": (1.5, 2.5)}, "total_mass": (1.0, 3.4)},
          r"allow \[3.5, 6.5\] kg"),
         ({"mass": {"one": (0.1, 0.9)}}, "joints alone have 1 kg"),
+        ({"mass": {"tool": (1.0, 2.0)}}, r"\['tool'\], which are not bodies of the model"),
+        ({"mass": {"two": (3.0, 2.0)}}, r"\[3, 2\] kg: the first value is larger"),
+        ({"mass": {"two": (-2.0, -1.0)}}, "is bounded by -1 kg, wanted a positive"),
         ({"mass": {"two": (0.1, 4.0)}, "pinned": ("two",)}, r"the URDF's 5 kg, outside its bounds"),
         ({"pinned": ("two",),
           "com": {"two": (np.vstack([np.eye(3), -np.eye(3)]), np.array([9, 0.15, 9, 9, 9, 9.0]))}},
@@ -390,21 +356,6 @@ def test_a_prior_that_is_not_finite_is_refused(ur5, rng):
     case = Case(ur5, rng, NOISE)
     with pytest.raises(DataError, match="prior and held must be finite"):
         consistent(case, held=np.full(60, np.nan))
-
-
-@pytest.mark.parametrize("kind", ["rls", "kalman"])
-def test_the_running_estimate_can_be_made_physical(ur5, rng, kind):
-    case = Case(ur5, rng, 40 * NOISE, samples=200)
-    prior = case.mapping.to_base(ur5.standard_parameters())
-    sigma = 40 * NOISE
-    estimator = RLS(sigma) if kind == "rls" else Kalman(sigma, prior, 50 + 0 * prior, gate=None)
-    state = fold(estimator, case.problem.samples(), estimator.init(len(prior)))
-    running = estimator.estimate(state, case.problem.names)
-    free = case.mapping.to_standard(running.theta, ur5.standard_parameters())
-    assert np.linalg.eigvalsh(pseudo_inertia(free[:60])).min() < 0
-    projected = consistent(case).project(running)
-    assert np.linalg.eigvalsh(pseudo_inertia(projected.theta[:60])).min() > 0
-    assert "projected onto physically consistent" in projected.message
 
 
 def test_projection_is_the_consistent_fit_of_the_same_data(ur5, rng):

@@ -34,18 +34,9 @@ def moved(model, change, *, samples=600, noise=NOISE):
     return Log(t=log.t, q=q, v=v, a=a, tau=tau, joints=log.joints)
 
 
-def still_wrist(t, q, v, a):
-    q[:, 5], v[:, 5], a[:, 5] = 0.3, 0.0, 0.0
-
-
 def pan_one_way(t, q, v, a):
     """The first joint turns one way only, now faster, now slower."""
     q[:, 0], v[:, 0], a[:, 0] = 0.5 * t - 0.3 * np.cos(t), 0.5 + 0.3 * np.sin(t), 0.3 * np.cos(t)
-
-
-@pytest.fixture(scope="module")
-def wrist(ur5):
-    return identify(ur5, [moved(ur5, still_wrist)], signals=EXACT, estimator=CHOICE)
 
 
 @pytest.fixture(scope="module")
@@ -152,26 +143,6 @@ def test_named_sums_hold_along_every_direction_the_data_leave_open(seed):
     assert sums + len(alone) == known.rank
 
 
-def test_moving_along_a_weak_direction_changes_no_torque_and_no_named_sum(ur5, wrist):
-    known, mapping = wrist.determination, wrist.mapping
-    e = wrist.fitted[0]
-    motion, mask = e.recording.trajectory, e.recording.mask
-    W = joint_torque_regressor(ur5, motion.q, motion.v, motion.a)[:, mapping.independent]
-    W = W[mask.astype(bool).reshape(-1)]  # the rows that were fitted
-    assert known.rank == np.linalg.matrix_rank(W / np.linalg.norm(W, axis=0).clip(1e-9), tol=1e-6)
-    places = {name: k for k, name in enumerate(known.names)}
-    assert len(known.weak.T) == 11
-    for weak in known.weak.T:
-        change = known.spread * weak  # one plausible spread
-        assert np.abs(W @ change).max() < 1e-9
-        for c in [c for group in known.groups for c in group.combinations]:
-            terms = [places[name] for name in c.names]
-            size = np.abs(np.array(c.coefficients) * known.spread[terms]).max()
-            assert abs(np.array(c.coefficients) @ change[terms]) < 0.01 * size
-    strong = np.ones(58) - known.weak @ known.weak.sum(axis=0)  # any other direction shows
-    assert np.abs(W @ (known.spread * strong)).max() > 1.0
-
-
 def test_a_joint_that_turns_one_way_leaves_friction_and_offset_a_sum(pan):
     known = pan.determination
     assert known.undetermined == ("shoulder_pan_joint.coulomb", "shoulder_pan_joint.offset")
@@ -186,30 +157,3 @@ def test_a_joint_that_turns_one_way_leaves_friction_and_offset_a_sum(pan):
     assert pan.standard[at].sum() == pytest.approx(pi[at].sum(), abs=0.15)
     of_sum = np.sqrt(pan.standard_covariance[np.ix_(at, at)].sum())
     assert pan.standard_error[at].min() > 10.0 * of_sum
-
-
-def test_one_measured_sum_of_four_makes_one_group_of_them():
-    """Three directions are open: none of the other parameters is among them."""
-    rows = 50.0 * np.array(
-        [[0.0, 1.0, 1.0, 0.0, -1.0, 1.0], [1.0, 0, 0, 0, 0, 0], [0, 0, 0, 1.0, 0, 0]]
-    )
-    spread = np.array([1.0, 2.0, 2.0, 3.0, 2.0, 2.0])
-    found = determine(tuple("abcdef"), rows, spread)
-    (group,) = found.groups
-    assert group.names == ("b", "c", "e", "f")
-    (one,) = group.combinations
-    assert (one.names, one.coefficients) == (("b", "c", "e", "f"), pytest.approx((1, 1, -1, 1)))
-    assert one.shares == pytest.approx((1, 1, -1, 1))
-    assert found.rank == 3
-    size = 50.0 * np.array([np.sqrt(4 * 2.0**2), 1.0, 3.0])
-    np.testing.assert_allclose(found.shrinkage, [*np.sort(1 / np.hypot(1, size)), 1, 1, 1])
-
-
-def test_a_sum_of_parameters_of_other_spreads_has_physical_coefficients():
-    """0.5 a - 4 b is measured: in units of the spreads 1 and -0.8."""
-    spread = np.array([2.0, 0.2])
-    found = determine(("a", "b"), 90.0 * np.array([[0.5, -4.0]]), spread)
-    (group,) = found.groups
-    (one,) = group.combinations
-    assert one.coefficients == pytest.approx((1.0, -8.0))
-    assert one.shares == pytest.approx((1.0, -0.8))

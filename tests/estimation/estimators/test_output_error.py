@@ -1,13 +1,11 @@
 from dataclasses import dataclass, field, replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from scipy.signal import lfilter
 
 from robotid.base.exceptions import DataError, NotConvergedError
-from robotid.estimation.estimators import output_error
-from robotid.estimation.estimators.output_error import OutputError, Residual, linearised
+from robotid.estimation.estimators.output_error import OutputError, Residual
 
 DT, RHO, SIGMA = 0.02, 0.9, 0.02
 TRUTH = np.array([1.5, 0.3, 0.1])  # gain, time constant [s], offset
@@ -129,23 +127,6 @@ def test_fewer_samples_than_parameters_are_refused(rng):
         OutputError(whitens=False).fit(short, START)
 
 
-def test_what_a_start_could_do_is_taken_out_of_rows(rng):
-    lag = lagging(rng)
-    [first, *others] = lag.residuals(TRUTH, with_slopes=True)
-    fades = 0.9 ** np.arange(len(first.e))
-    by_start = np.tile(fades[:, None, None], (1, first.e.shape[1], 1))
-    weights = OutputError().weights(lag, TRUTH)
-    freed = SimpleNamespace(residuals=lambda *_, **__: [replace(first, by_start=by_start), *others])
-    A, b, _ = next(iter(linearised(freed, weights, TRUTH, frees=True)))
-    G = weights.whiten(by_start, first.joints).reshape(-1)
-    size = np.linalg.norm(G)
-    assert np.abs(G @ A).max() < 1e-9 * size * np.linalg.norm(A)
-    plain, e, _ = next(iter(linearised(lag, weights, TRUTH)))
-    u = G / size
-    np.testing.assert_allclose(A, plain - np.outer(u, u @ plain), atol=1e-9 * np.abs(plain).max())
-    np.testing.assert_allclose(b, e - u * (u @ e), atol=1e-9 * np.abs(e).max())
-
-
 @dataclass(frozen=True, eq=False)
 class Started(Lagging):
     """The same, where a window's start adds what fades away."""
@@ -242,16 +223,6 @@ def test_other_residuals_move_an_estimate_by_its_normal_equations(rng):
     wanted = inverse @ (pulls[1] - pulls[0])[:2]
     np.testing.assert_allclose(change, [*wanted, 0.0], rtol=1e-9)
     np.testing.assert_allclose(error, [*np.sqrt(np.diag(inverse)), 0.0], rtol=1e-9)
-    # in units that differ by twelve orders the change is the same
-    H, unit = H[:2, :2], np.array([1e6, 1e-6])
-    fit = SimpleNamespace(
-        weights=lambda *_: None,
-        normal=lambda lag, *_, **__: (H * np.outer(unit, unit), unit * lag.pulls[:2]),
-    )
-    lags = [SimpleNamespace(pulls=x, bounds=UNBOUNDED[:, :2]) for x in pulls]
-    moved = OutputError.moved(fit, *lags, theta[:2])
-    np.testing.assert_allclose(moved[0] * unit, wanted, rtol=1e-9)
-    np.testing.assert_allclose(moved[1] * unit, np.sqrt(np.diag(inverse)), rtol=1e-9)
 
 
 def test_residuals_of_larger_variance_count_less_beside_further_rows(rng):
@@ -278,72 +249,3 @@ def test_standard_errors_of_what_drifts_are_the_scatter_of_many_drifts():
     theta = np.array([d.theta for d in draws])
     ratio = np.mean([d.std_error for d in draws], axis=0) / theta.std(axis=0)
     assert ((ratio > 0.8) & (ratio < 1.25)).all(), ratio
-
-
-def test_noise_and_correlation_of_a_joint_are_those_of_all_its_windows(rng):
-    """Of the first in two windows, of the third in one; the second has none."""
-    e = [rng.standard_normal((30, 2)).cumsum(axis=0), rng.standard_normal((11, 1)) * 5.0]
-    e[0][:, 1] = rng.standard_normal(30) + 0.2 * e[0][:, 1]
-    joints = (np.array([0, 2]), np.array([0]))
-    found = [Residual(x, None, j, np.arange(3)) for x, j in zip(e, joints, strict=True)]
-    most = np.array([0.9, 0.9, 0.05])
-    weights = OutputError(most=most, inflation=2.25)._weigh(found)
-    own = {0: [e[0][:, 0], e[1][:, 0]], 2: [e[0][:, 1]]}
-    for j, windows in own.items():
-        along = sum(x[1:] @ x[:-1] for x in windows) / sum(x[:-1] @ x[:-1] for x in windows)
-        rho = np.clip(along, 0.0, most[j])
-        squares = sum(np.sum((x[1:] - rho * x[:-1]) ** 2) for x in windows)
-        sigma = 1.5 * np.sqrt(squares / sum(len(x) - 1 for x in windows))
-        assert (weights.rho[j], weights.sigma[j]) == pytest.approx((rho, sigma))
-    assert weights.rho[2] == 0.05
-    whitened = weights.whiten(e[0], joints[0])
-    wanted = (e[0][1:] - weights.rho[[0, 2]] * e[0][:-1]) / weights.sigma[[0, 2]]
-    np.testing.assert_allclose(whitened, wanted)
-    assert OutputError(whitens=False)._weigh(found).rho.tolist() == [0.0, 0.0, 0.0]
-
-
-def test_a_step_stops_at_bounds_and_the_others_go_as_far_as_is_best_then(rng):
-    """Two of five are at their bounds; their damped normal equations are solved by hand."""
-    A = rng.standard_normal((20, 5)) * [1.0, 30.0, 0.1, 4.0, 2.0]
-    H, theta = A.T @ A, np.array([1.0, 2.0, 30.0, 4.0, 5.0])
-    step = np.array([-3.0, 0.1, 5.0, -6.0, 0.7])
-    g, damping = H @ step, 0.2
-    lowest = np.array([0.5, 1.0, 0.0, 3.0, 0.0])
-    damped = H + damping * np.diag(np.diag(H))
-    free = theta + np.linalg.solve(damped, g)
-    assert (free < lowest).tolist() == [True, False, False, True, False]
-    moved = np.array([0, 3])
-    others = np.array([1, 2, 4])
-    left = g[others] - H[np.ix_(others, moved)] @ (lowest - theta)[moved]
-    wanted = lowest.copy()
-    wanted[others] = theta[others] + np.linalg.solve(damped[np.ix_(others, others)], left)
-    infinite = np.full(5, np.inf)
-    below, above = np.array([lowest, infinite]), np.array([-infinite, -lowest])
-    for sign, bounds in ((1, below), (-1, above)):
-        found = output_error._bounded_step(H, sign * g, sign * theta, bounds, damping)
-        np.testing.assert_allclose(found, sign * wanted, rtol=1e-9)
-    # at its bound, a parameter that would go beyond it stays
-    theta[0] = 0.5
-    for sign, bounds in ((1, below), (-1, above)):
-        found = output_error._bounded_step(H, sign * g, sign * theta, bounds, damping)
-        assert found[0] == sign * 0.5
-
-
-def test_windows_are_cut_into_segments_by_their_rows_or_each_alike(rng):
-    found = [
-        (rng.standard_normal((n, 2)), rng.standard_normal(n), np.array(columns))
-        for n, columns in ((410, [0, 2]), (95, [1, 2]))
-    ]
-    for are_windows, counts in ((False, (39, 9)), (True, (6, 6))):
-        parts = output_error._segments(found, 3, are_windows=are_windows)
-        assert len(parts) == sum(counts)
-        first = 0
-        for (A, b, columns), count in zip(found, counts, strict=True):
-            own = parts[first : first + count]
-            first += count
-            rows = np.column_stack([A, b])
-            for part, cut in zip(own, np.array_split(rows, count), strict=True):
-                np.testing.assert_array_equal(part.columns[0], columns)
-                (R,) = part.triangles
-                np.testing.assert_allclose(R.T @ R, cut.T @ cut, atol=1e-9)
-                assert part.rows.tolist() == [len(cut)]

@@ -1,6 +1,6 @@
 """The weight of the prior chosen from the data: brute force, closed form, what it is good for."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -12,11 +12,8 @@ from helpers.fitting import fit as fitted
 from helpers.synthetic import exact_log, truth
 
 from robotid.base.exceptions import DataError
-from robotid.data.signals import process
-from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.factors import compress, compress_segments, merge
-from robotid.dynamics.torque import build_problem
-from robotid.estimation.estimators import Consistent
+from robotid.estimation.estimators import Constraints
 from robotid.estimation.estimators import prior_weight as weighting
 from robotid.estimation.estimators.prior_weight import (
     Segments,
@@ -27,7 +24,7 @@ from robotid.estimation.estimators.prior_weight import (
     plausible_weight,
 )
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
-from robotid.robot.prior import prior_spread
+from robotid.robot.geometry import body_boxes
 
 
 @pytest.fixture
@@ -137,19 +134,6 @@ def test_no_joint_may_lose_more_than_five_percent(case, monkeypatch, loss, weigh
     assert chosen(case, monkeypatch, excess).weight == pytest.approx(weight)
 
 
-def test_a_joint_at_rest_is_left_out_of_the_choice(case, monkeypatch):
-    fit, problem = case
-
-    def errors(fit, segments, w, starts):
-        squares = (1.0 + abs(np.log10(w) + 2.0) * (0.009 + CHANCE)) / 6.0
-        return np.hstack([squares, np.zeros_like(squares)]), []
-
-    monkeypatch.setattr("robotid.estimation.estimators.prior_weight.held_out_errors", errors)
-    choice = choose_weight(fit, Segments.of(fit, cut(problem, 6)), "cv")
-    assert choice.weight == pytest.approx(100.0)
-    assert choice.curve[-1][1] == pytest.approx(np.sqrt(1.036))
-
-
 def test_a_good_prior_gets_more_weight_than_a_bad_one(case):
     fit, problem = case
     segments = cut(problem, 4)
@@ -162,52 +146,6 @@ def test_a_good_prior_gets_more_weight_than_a_bad_one(case):
         )
         assert good == 100.0
         assert bad <= 1.0, how
-
-
-def test_the_information_of_all_segments_but_one_counts_the_share_that_is_independent(case):
-    fit, problem = case
-    fit, segments = replace(fit, independent_share=0.25), cut(problem, 3)
-    for k, rows in enumerate(Segments.of(fit, segments, NOISE).others):
-        others = fit.rows(merge([s for i, s in enumerate(segments) if i != k]), NOISE)
-        np.testing.assert_allclose(rows.T @ rows, others.T @ others, rtol=1e-9, atol=1e-6)
-
-
-def test_the_noise_level_is_that_of_the_whole_regressor_whatever_the_prior(case):
-    fit, problem = case
-    fit = replace(fit, prior_weight=100.0, independent_share=0.5)
-    W, tau, _ = (np.concatenate(x) for x in zip(*problem.blocks(), strict=True))
-    W, tau = W.reshape(-1, 6, W.shape[1]).swapaxes(0, 1), tau.reshape(-1, 6).T
-    levels = np.ones(6)
-    for _ in range(100):
-        rows = (W / levels[:, None, None]).reshape(-1, len(fit.K))
-        C = np.linalg.pinv(rows.T @ rows)
-        r = tau - W @ (C @ rows.T @ (tau / levels[:, None]).ravel())
-        used = np.einsum("jkp,jkp->j", W @ C, W) / levels**2
-        levels = np.sqrt((r**2).sum(axis=1) / (tau.shape[1] - used))
-        sigma = np.sqrt((r**2).sum(axis=1) / (tau.shape[1] - used / 0.5))
-    np.testing.assert_allclose(fit.noise(compress(problem)), sigma, rtol=1e-3)
-
-
-@pytest.mark.parametrize(("ratio", "weight"), [(1.09, 100.0), (1.11, 10.0)])
-def test_no_joint_is_predicted_clearly_worse_than_by_least_squares(
-    case, monkeypatch, ratio, weight
-):
-    """Joint 4 has ``ratio`` times the error of least squares at 100, and its error below."""
-    fit, problem = case
-    segments = Segments.of(fit, cut(problem, 6))
-    least = segments.least_squares_errors
-
-    def errors(fit, segments, w, starts):
-        squares = least * (1.0 + abs(np.log10(w) + 2.0) * (1e-4 + 1e-2 * CHANCE))
-        squares[:, 4] *= ratio**2 if w > 50.0 else 1.0
-        return squares, []
-
-    monkeypatch.setattr(weighting, "held_out_errors", errors)
-    monkeypatch.setattr(weighting, "_MOST_JOINT_LOSS", 2.0)
-    monkeypatch.setattr(weighting, "_ALIKE", 1e9)
-    choice = choose_weight(fit, segments, "cv")
-    assert choice.weight == pytest.approx(weight)
-    assert choice.loss == pytest.approx(ratio if weight == 100.0 else 1.0, abs=1e-2)
 
 
 def test_rows_without_constraint_forces_are_one_joint():
@@ -223,85 +161,6 @@ def test_one_stretch_is_too_few(case):
         choose_weight(fit, Segments.of(fit, [compress(problem)]), "cv")
 
 
-def test_the_noise_level_of_few_rows_is_right_on_average(ur5, rng):
-    found = []
-    for _ in range(15):
-        log = exact_log(ur5, truth(ur5), rng, samples=40, noise=NOISE)
-        trajectory, mapping = process(log, EXACT), structural_mapping(ur5)
-        factors = compress(mapping.reduce(build_problem(ur5, trajectory)))
-        prior = ur5.standard_parameters()
-        fit = Consistent(
-            ur5.layout, mapping.K, prior, prior_spread(ur5, trajectory.squares, len(trajectory.t))
-        )
-        found.append(fit.noise(factors) ** 2)
-    ratio = np.sqrt(np.mean(found, axis=0)) / NOISE
-    # 15 runs of 30 degrees of freedom know it to 3 %; what the prior misses adds to it
-    assert (ratio > 0.85).all()
-    assert (ratio < 1.2).all()
-
-
-@dataclass(frozen=True)
-class Boxed:
-    """A fit of three bodies whose slacks of their boxes, by a fit without them, are given."""
-
-    constraints: str
-    slack: np.ndarray
-    layout = SimpleNamespace(bodies=("a", "b", "c"))
-    prior_std = np.array([2.0, 1.0, 1.0])  # in which the cone has its coefficients
-
-    @property
-    def programme(self):
-        bounds = SimpleNamespace(
-            G=np.diag(self.prior_std), h=np.full(3, 0.5), labels=[f"extent {x}" for x in "abc"]
-        )
-        x = self.slack - 0.5
-        return SimpleNamespace(
-            bounds=bounds,
-            minimise=lambda rows, weight, is_exact: SimpleNamespace(x=x),
-            covariance=lambda weight, rows, x: np.diag([4.0, 4.0, 0.25]),
-        )
-
-
-@pytest.mark.parametrize(
-    ("ratio", "p_value", "named"),
-    [(1.015, 0.0, ()), (1.025, 0.0, ("a", "c")), (1.025, 0.2, ()), (0.9, 0.0, ())],
-)
-def test_an_extent_is_contradicted_by_four_errors_two_percent_and_two_errors_of_pairs(
-    monkeypatch, ratio, p_value, named
-):
-    constraints = SimpleNamespace(extent=("a", "b", "c"), without_extent=lambda _: "free")
-    fit = Boxed(constraints, np.array([-8.1, -7.9, -2.1]))  # four times 2, 2 and 0.5
-    swing = p_value * np.tile([1.0, -1.0], 4)
-
-    def held_out(fit, segments, weight, starts=None):
-        left = np.ones((8, 1)) if fit.constraints == "free" else ratio + swing[:, None]
-        return left, []
-
-    monkeypatch.setattr("robotid.estimation.estimators.prior_weight.held_out_errors", held_out)
-    segments = SimpleNamespace(rows=None, folds=[None] * 8)
-    assert contradicted_extents(fit, segments) == named
-
-
-@pytest.mark.parametrize(("loss", "accepted"), [(0.055, False), (0.045, True)])
-def test_the_loss_of_a_segment_is_the_mean_of_the_joints_that_have_rows_in_it(loss, accepted):
-    """Six segments in which one of three joints moves a little, six in which all move."""
-    best, parts = np.zeros((2, 12, 3))
-    best[:6, 0], best[6:] = 1e-3, 1.0
-    parts[:6, 0], parts[6:] = 1e-3 * np.exp(2 * loss), np.exp(-2 * 0.012)
-    excess = np.repeat([loss, -0.012], 6)
-    assert (excess.mean() <= 2 * excess.std(ddof=1) / np.sqrt(12)) is np.bool_(accepted)
-    assert weighting._is_accepted(parts, best, 0.0) is accepted
-
-
-@pytest.mark.parametrize(("repeated", "weight"), [(0.0, 1.0), (0.028, 10**0.5), (0.031, 10.0)])
-def test_an_error_that_repeats_makes_a_residual_larger_by_its_share(
-    case, monkeypatch, repeated, weight
-):
-    """Of 1.5 % without scatter at a weight of 10; log(1.015) is -log(1 - 0.0293) / 2."""
-    excess = np.full((6, 1), 1.015**2 - 1.0)
-    assert chosen(case, monkeypatch, excess, repeated).weight == pytest.approx(weight)
-
-
 def test_a_larger_weight_may_leave_an_error_that_repeats_in_all_segments():
     best = np.full((6, 1), 1.0)
     worse = best * 1.01**2  # in each segment, without scatter
@@ -309,3 +168,13 @@ def test_a_larger_weight_may_leave_an_error_that_repeats_in_all_segments():
     assert not weighting._is_accepted(worse, best, 0.009)
     assert weighting._is_accepted(worse, best, 0.011)
     assert not weighting._is_accepted(best * 1.03**2, best, 0.1)
+
+
+def test_an_extent_is_contradicted_by_a_body_clearly_outside_its_box(ur5):
+    """Of a tenth of the size of the body, and of a generous size; and of noise too large to see."""
+    body = "wrist_3_link"
+    for noise, size, named in ((0.1, 0.1, (body,)), (0.1, 50.0, ()), (1.0, 0.1, ())):
+        case = Case(ur5, np.random.default_rng(0), noise * NOISE)
+        box = size * (body_boxes(ur5)[body] - body_boxes(ur5)[body].mean(axis=0))
+        fit = consistent(case, constraints=Constraints(extent={body: box}))
+        assert contradicted_extents(fit, Segments.of(fit, cut(case.problem, 4))) == named

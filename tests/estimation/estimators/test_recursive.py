@@ -9,8 +9,6 @@ from robotid.base.exceptions import DataError, RankDeficientError
 from robotid.dynamics.problem import Problem, Sample
 from robotid.dynamics.torque import build_problem, joint_torque_regressor
 from robotid.estimation.estimators import RLS, WLS, Kalman, fold
-from robotid.estimation.estimators import recursive as filters
-from robotid.estimation.estimators.recursive import KalmanState
 
 NAMES = ("a", "b", "c")
 
@@ -126,46 +124,6 @@ def test_few_samples_are_refused_with_forgetting_too(rng):
         RLS(np.ones(2), 1.0, np.zeros(3), np.ones(3)).fit(problem)
 
 
-def test_a_filter_that_never_walks_is_wls(ur5, rng):
-    case = Case(ur5, rng, NOISE, samples=2000)
-    wls = WLS().fit(case.problem)
-    ours = Kalman(wls.sigma, 0 * case.beta, 1e3 + 0 * case.beta, gate=None).fit(case.problem)
-    assert np.max(np.abs(ours.theta - wls.theta) / wls.std_error) < 0.01
-    np.testing.assert_allclose(ours.std_error, wls.std_error, rtol=0.01)
-    np.testing.assert_allclose(ours.sigma, NOISE, rtol=0.05)
-
-
-def test_the_gate_turns_outliers_away_and_counts_them(ur5, rng):
-    case = Case(ur5, rng, 0.1 * NOISE)
-    tau = np.array(case.trajectory.tau)
-    tau[100::50, 2] += 300.0
-    spoiled = replace(case.trajectory, tau=tau)
-    problem = case.mapping.reduce(build_problem(ur5, spoiled))
-
-    def fit(gate):
-        prior = case.mapping.to_base(ur5.standard_parameters())
-        filtered = Kalman(0.1 * NOISE, prior, 5.0 + np.abs(prior), gate=gate)
-        state = fold(filtered, problem.samples(), filtered.init(len(prior)))
-        error = np.linalg.norm(state.theta - case.beta) / np.linalg.norm(case.beta)
-        return error, state
-
-    open_error, _ = fit(None)
-    error, state = fit(1 - 1e-7)
-    assert error < 0.2 * open_error
-    np.testing.assert_array_equal(state.gated, [0, 0, 10, 0, 0, 0])
-    filtered = Kalman(NOISE, state.theta, np.full(len(state.theta), 5.0))
-    assert filtered.estimate(state, problem.names).converged
-
-
-def test_a_gate_does_not_shut_a_joint_out_for_good(ur5, rng):
-    case = Case(ur5, rng, samples=200)
-    # the prior is far too sure of itself, so at first every row looks like an outlier
-    far = Kalman(0.1 * NOISE, case.beta + 5.0, 1e-3 + 0 * case.beta)
-    state = fold(far, case.problem.samples(), far.init(len(case.beta)))
-    assert (state.gated >= 50).any()
-    assert (state.rows > 0).all()
-
-
 def test_a_walking_filter_follows_a_change_and_a_still_one_does_not(ur5, rng):
     case = Case(ur5, rng, 0.1 * NOISE, samples=2000)
     other = 1.2 * case.pi
@@ -184,30 +142,6 @@ def test_a_walking_filter_follows_a_change_and_a_still_one_does_not(ur5, rng):
     still = miss(Kalman(0.1 * NOISE, prior, std, gate=None))
     assert miss(Kalman(0.1 * NOISE, prior, std, walk=1e-3, gate=None)) < 0.2 * still
     assert miss(RLS(NOISE, 0.99, prior, std)) < 0.05 * still
-
-
-def random_samples(rng, count, sigma, c=3):
-    Y = rng.standard_normal((count, len(sigma), c))
-    tau = Y @ np.arange(1.0, c + 1) + sigma * rng.standard_normal((count, len(sigma)))
-    weight = rng.uniform(0.5, 2.0, tau.shape)
-    return [Sample(*x) for x in zip(Y, tau, weight, strict=True)], Y, tau, weight
-
-
-@pytest.mark.parametrize("share", [1.0, 0.2])
-def test_without_walk_it_is_the_posterior_of_the_prior(rng, share):
-    sigma, prior, std = np.array([0.5, 0.1]), np.array([1.0, 0.0, -1.0]), np.array([0.3, 1.0, 2.0])
-    samples, Y, tau, weight = random_samples(rng, 8, sigma)
-    ours = Kalman(sigma, prior, std, gate=None, independent_share=share)
-    state = fold(ours, samples, ours.init(3))
-    w = (share * weight / sigma**2).reshape(-1)
-    W, d = Y.reshape(-1, 3), tau.reshape(-1)
-    H = np.diag(std**-2.0) + W.T @ (w[:, None] * W)
-    theta = np.linalg.solve(H, prior / std**2 + W.T @ (w * d))
-    np.testing.assert_allclose(state.theta, theta, rtol=1e-10)
-    np.testing.assert_allclose(state.P, np.linalg.inv(H), rtol=1e-9)
-    np.testing.assert_array_equal(state.rows, [8, 8])
-    estimate = ours.estimate(state, ("a", "b", "c"))
-    np.testing.assert_allclose(estimate.std_error, np.sqrt(np.diag(np.linalg.inv(H))), rtol=1e-9)
 
 
 @pytest.mark.parametrize("share", [1.0, 0.25])
@@ -234,20 +168,6 @@ def test_after_fifty_rows_turned_away_the_next_is_believed():
     state = sure.update(state, far)
     assert (state.gated[0], state.rows[0], state.in_a_row[0]) == (50, 1, 0)
     assert state.theta[0] == pytest.approx(100.0 * 1e-6 / (1 + 1e-6))
-
-
-def test_rows_are_counted_joint_by_joint_used_or_rejected():
-    """Of five joints the second has no row; the last is used after some were rejected."""
-    state = KalmanState(
-        None, None, None, rows=np.array([7, 5, 3, 2, 9]), gated=np.array([1, 2, 0, 4, 6]),
-        in_a_row=np.array([0, 3, 0, 1, 2]), steps=9,
-    )  # fmt: skip
-    used, passed = np.array([0, 2, 3, 4]), np.array([True, False, False, True])
-    rows, gated, in_a_row = filters._count(state, used, passed)
-    assert rows.tolist() == [8, 5, 3, 2, 10]
-    assert gated.tolist() == [1, 2, 1, 5, 6]
-    assert in_a_row.tolist() == [0, 3, 1, 2, 0]
-    assert state.rows.tolist() == [7, 5, 3, 2, 9]
 
 
 def test_two_steps_of_weighted_rows_are_bayes_rule_with_the_noise_of_each_joint(rng):

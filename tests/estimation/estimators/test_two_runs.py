@@ -14,39 +14,6 @@ NOISE = np.array([0.2, 0.05])
 NAMES = ("a", "b", "c")
 
 
-def segments(rng, beta, hold):
-    """Return the factors of 12 segments of 60 rows of two joints, noise of so many rows alike."""
-    found = []
-    for _ in range(12):
-        triangles = []
-        for sigma in NOISE:
-            W = rng.standard_normal((60, 3))
-            noise = sigma * np.repeat(rng.standard_normal(60 // hold), hold)
-            triangles.append(triangle_of(np.column_stack([W, W @ beta + noise])))
-        found.append(Factors(tuple(triangles), (np.arange(3),) * 2, np.array([60, 60]), NAMES))
-    return tuple(found)
-
-
-@pytest.mark.parametrize("hold", [1, 6])
-def test_errors_that_count_what_changes_with_time_are_no_smaller_than_those_of_alike_rows(
-    rng, hold
-):
-    loaded = segments(rng, np.add(BETA, [0.0, 0.0, CHANGE]), hold)
-    runs = TwoRuns(
-        segments(rng, BETA, hold), loaded, np.eye(3)[:, 2:], np.zeros(3), np.zeros(4),
-        1e-6 * np.eye(4), 1.0, np.empty(0, dtype=int),
-    )  # fmt: skip
-    theta, covariance = runs.alike()
-    found = runs.compare()
-    np.testing.assert_allclose(found.theta, theta, atol=1e-12)
-    assert (np.diag(found.covariance) >= np.diag(covariance) * (1 - 1e-12)).all()
-    # rows with weights 1 / noise^2: 12 x 60 of each joint with, and without the change
-    information = (720 * NOISE**-2.0).sum()
-    expected = np.sqrt(np.array([0.5, 2.0]) / information)  # of what both have, of the change
-    np.testing.assert_allclose(np.sqrt(np.diag(covariance))[[0, 3]], expected, rtol=0.1)
-    assert np.abs(theta - [*BETA, CHANGE]).max() < 5 * np.sqrt(hold) * expected[1]
-
-
 def of_rows(W, tau, count):
     """Return the factors of so many segments of rows W (n, N, c) and torques (n, N)."""
     columns, rows = (np.arange(W.shape[2]),) * len(W), np.full(len(W), W.shape[1] // count)
@@ -94,44 +61,6 @@ def test_both_runs_are_one_fit_with_the_prior_by_the_noise_of_each_joint(rng, sh
     np.testing.assert_allclose(found.unexplained, np.sqrt(left / torque), rtol=1e-9)
     # one set of both runs' own parameters leaves more than each by itself
     np.testing.assert_allclose(runs.residual_ratios(theta), left / own, rtol=1e-9)
-
-
-@pytest.mark.parametrize("hold", [1, 20])
-def test_errors_are_those_of_rows_that_last_as_long_as_their_noise(rng, hold):
-    """Of one joint, whose rows come in runs of so many alike: they count once."""
-    W = np.repeat(rng.standard_normal((2, 1, 600 // hold, 3)), hold, axis=2)
-    noise = np.repeat(rng.standard_normal((2, 1, 600 // hold)), hold, axis=2)
-    tau = W @ BETA + noise
-    runs = TwoRuns(
-        of_rows(W[0], tau[0], 10), of_rows(W[1], tau[1], 10), np.eye(3)[:, 2:], np.zeros(3),
-        np.zeros(4), 1e-6 * np.eye(4), 1.0, np.empty(0, dtype=int),
-    )  # fmt: skip
-    found, alike = runs.compare(), runs.alike()[1]
-    ratio = np.diag(found.covariance) / np.diag(alike)
-    assert (ratio >= 1.0 - 1e-12).all()
-    assert np.median(ratio) == pytest.approx(hold, rel=0.6)
-    assert ((found.freedom > 2.0) & (found.freedom < 20.0)).all()  # of 20 segments
-
-
-def test_freedom_is_that_of_the_scatter_whose_error_is_larger(rng):
-    """The first parameter differs from joint to joint, the third from segment to segment."""
-    n, N, count = 6, 240, 12
-    W = rng.standard_normal((2, n, N, 3))
-    beta = np.tile(BETA, (2, n, N, 1))
-    beta[..., 0] += 0.3 * (-1.0) ** np.arange(n)[:, None]
-    beta[..., 2] += 0.5 * np.repeat((-1.0) ** (np.arange(count) // 2), N // count)
-    tau = np.einsum("rjkc,rjkc->rjk", W, beta) + 0.02 * rng.standard_normal((2, n, N))
-    runs = TwoRuns(
-        of_rows(W[0], tau[0], count), of_rows(W[1], tau[1], count), np.eye(3)[:, 1:2], np.zeros(3),
-        np.zeros(4), 1e-6 * np.eye(4), 1.0, np.empty(0, dtype=int),
-    )  # fmt: skip
-    found, segments = runs.compare(), runs.compare(by_joint=False)
-    grown = np.diag(found.covariance) > 1.01 * np.diag(segments.covariance)
-    assert grown[[0, 2]].tolist() == [True, False]
-    assert (found.freedom[grown] != segments.freedom[grown]).all()
-    assert (found.freedom[grown] < 12.0).all()  # of 12 parts, not of 24
-    np.testing.assert_array_equal(found.freedom[~grown], segments.freedom[~grown])
-    assert segments.freedom[0] > 12.0
 
 
 def scattered(parts, theta, bread):
@@ -249,41 +178,6 @@ def test_runs_that_differ_by_scales_leave_more_by_a_load_than_by_scales(rng):
             np.testing.assert_allclose(found, left / own.reshape(2, 2).sum(axis=0), rtol=1e-4)
         assert (found < 1.3).all()
         assert runs.residual_ratios(runs.compare().theta).mean() > 2.0
-
-
-def test_the_noise_of_a_joint_is_its_residual_or_its_signal_or_one():
-    """Of joints with many rows, some, few, without noise, without a signal, and without rows."""
-    logged = SimpleNamespace(
-        is_projected=False,
-        rows=np.array([1000, 85, 10, 1000, 1000, 0]),
-        columns=[np.arange(count) for count in (20, 20, 10, 20, 20, 0)],
-        torque_squares=lambda: np.array([80.0, 80.0, 90.0, 4000.0, 0.0, 0.0]),
-    )
-    runs = SimpleNamespace(
-        _logged=logged, _whole=(None, None), share=0.5,
-        _own_squares=np.array([46.0, 34.0, 1e-9, 0.0, 0.0, 0.0]),
-    )  # fmt: skip
-    # two runs' columns over the independent share of the rows: 80 degrees of freedom; a tenth of
-    # the rows are left at least
-    wanted = [np.sqrt(46 / 920), np.sqrt(34 / 8.5), 3.0, 2e-7, 1.0, 1.0]
-    np.testing.assert_allclose(TwoRuns._noise.func(runs), wanted)
-
-
-@pytest.mark.parametrize("unknown", [[1], [0, 1]])
-def test_gains_start_at_least_squares_of_both_runs(rng, unknown):
-    """Torques over their gains, of a load that is known: exact ones start at their gains."""
-    W, c = rng.standard_normal((2, 2, 40, 3)), np.array([0.0, 0.7, -0.4])
-    gains = np.ones(2)
-    gains[unknown] = [2.5, 0.3][: len(unknown)]
-    tau = np.stack([W[0] @ BETA, W[1] @ (BETA + c)]) / gains[:, None]
-    runs = TwoRuns(
-        of_rows(W[0], tau[0], 2), of_rows(W[1], tau[1], 2), np.zeros((3, 0)), c, np.zeros(3),
-        1e-9 * np.eye(3), 1.0, np.array(unknown),
-    )  # fmt: skip
-    np.testing.assert_allclose(runs._first_gains(), gains, rtol=1e-6)
-    found = runs.compare()
-    np.testing.assert_allclose(found.gain, gains, rtol=1e-6)
-    np.testing.assert_allclose(found.theta, BETA, rtol=1e-6)
 
 
 def test_rows_without_constraint_forces_have_one_noise_level_in_both_runs(rng):

@@ -23,7 +23,6 @@ from robotid.estimation.fitting.fitted import (
     typical_friction,
 )
 from robotid.estimation.fitting.standard_errors import TorqueBand, rms_error, torque_band
-from robotid.output.files.entries import build_result
 from robotid.robot.drives import LoadFriction, PositionCoulomb
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
@@ -108,27 +107,6 @@ def test_a_validation_log_that_was_fitted_has_the_noise_of_the_fitted_ones(found
         assert bands[0].noise[j] == pytest.approx(wanted)
     apart = recording_bands(identification)
     assert (apart[0].noise != apart[1].noise).all()
-
-
-def test_intervals_hold_the_truth(found):
-    identification, pi = found
-    low, high = identification.base_interval.T
-    beta = identification.mapping.to_base(pi)
-    assert np.mean((low <= beta) & (beta <= high)) > 0.85
-    assert np.mean((low <= beta) & (beta <= high)) < 1.0
-
-
-def test_result_json_states_bands_intervals_and_method(found):
-    identification, _ = found
-    result = build_result(identification, {})
-    assert result["uncertainty"]["segments"] in (47, 48)
-    assert 0.5 < result["uncertainty"]["inflation"] < 2
-    band = result["validation"][0]["band"]["elbow_joint"]
-    assert band["half_width"] == pytest.approx(1.96 * 1.0, rel=0.15)
-    assert 0 < band["of_parameters"] < band["half_width"]
-    assert 91 < band["coverage_pct"] < 99
-    low, high = result["base_parameters"][0]["interval_95"]
-    assert low < result["base_parameters"][0]["value"] < high
 
 
 def test_a_row_on_the_edge_of_the_band_lies_in_it():

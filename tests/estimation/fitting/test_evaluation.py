@@ -60,12 +60,6 @@ def test_each_kept_log_is_looked_for_in_each_fitted_one(ur5, rng):
         assert [e.is_refitted for e in kept] == [True, False, True]
 
 
-def test_gravity_knows_no_offset(ur5, rng):
-    pi = truth(ur5)
-    found = evaluated(ur5, exact_log(ur5, pi, rng), {"truth": pi}, pi)
-    assert np.abs(found.torques["gravity_only"][:, 0]).max() < 1e-9
-
-
 def test_pooled_metrics_are_those_of_all_rows(ur5, rng):
     pi = truth(ur5)
     logs = [exact_log(ur5, pi, rng, noise=np.full(6, s), samples=200) for s in (0.1, 0.3)]

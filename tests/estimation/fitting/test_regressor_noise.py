@@ -3,6 +3,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from helpers.findings import Figures
 from helpers.fitting import fit, identify
 from helpers.paths import ROOT
 from helpers.synthetic import truth
@@ -10,13 +11,13 @@ from helpers.synthetic import truth
 from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import process
+from robotid.diagnosis.verdict.fit_findings import encoder_noise
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.factors import join
 from robotid.dynamics.simulation.motions import random_fourier
 from robotid.dynamics.torque import joint_torque_regressor
 from robotid.estimation.estimators import OLS, WLS
 from robotid.estimation.fitting import regressor_noise
-from robotid.estimation.fitting.estimator_settings import EstimatorSettings
 from robotid.estimation.fitting.recorded import Recordings
 from robotid.estimation.fitting.regressor_noise import (
     acceleration_noise,
@@ -175,28 +176,12 @@ def test_repeated_rounding_errors_count_as_often_as_they_are_repeated(planar):
     assert 0.8 < np.median(ratio) < 1.5, ratio
 
 
-def test_a_finding_names_joints_step_and_parameter(planar, motion):
-    log = recorded(planar, motion)
-    found = identify(planar, [log], signals=SIGNALS, estimator=EstimatorSettings())
-    (finding,) = [f for f in found.findings if f.code == "encoder_noise"]
-    assert finding.severity == "warning"
-    assert "steps of up to 0.00307 rad (11.0 bits per revolution)" in finding.message
-    assert "the estimate is corrected for this bias" in finding.message
-    assert finding.evidence["std_errors"] >= 2.0
-    noise = found.regressor_noise
-    moved = np.abs(noise.shift) / noise.std_error
-    inertial = found.mapping.K[:, : planar.layout.n_inertial].any(axis=1)
-    worst = int(np.flatnonzero(inertial)[np.argmax(moved[inertial])])
-    assert finding.evidence["std_errors"] == pytest.approx(moved[worst])
-    assert found.mapping.base_names[worst] in finding.message
-
-
 @pytest.mark.parametrize("step", [2 * np.pi / 2**18, 0.0])
 def test_fine_encoders_change_nothing_and_are_not_named(planar, motion, step):
     log = recorded(planar, motion, step=step)
     found = fit(planar, [log], signals=SIGNALS, estimator="wls")
     assert found.regressor_noise is None
-    assert regressor_noise.encoder_findings(found.regressor_noise, found.model, found.mapping) == []
+    assert list(encoder_noise(found)) == []
 
 
 def test_measured_velocities_have_no_noise_of_the_positions(planar, motion):
@@ -242,17 +227,6 @@ def test_total_least_squares_have_a_correction_of_their_own(planar, motion):
     assert found.regressor_noise is None
 
 
-def test_the_share_of_the_noise_is_that_of_the_log_in_which_it_is_largest():
-    logs = [SimpleNamespace(step=h, signals=SIGNALS) for h in (0.01, 0.004)]
-    steps = [np.array([0.02, 0.0, 1e-4]), np.array([1e-3, 0.0, 0.03])]
-    whole = SimpleNamespace(squares=np.array([[0.0] * 3, [0.0] * 3, [8e4, 5.0, 2e5]]), samples=20)
-    noise = [e / np.sqrt(12) * acceleration_noise(x.step, SIGNALS)
-             for x, e in zip(logs, steps, strict=True)]  # fmt: skip
-    wanted = np.maximum(*noise) / np.sqrt(whole.squares[2] / 20)
-    assert (wanted < 1.0).all()
-    np.testing.assert_allclose(regressor_noise._share(logs, steps, whole), wanted, rtol=1e-12)
-
-
 @pytest.mark.parametrize(
     ("steps", "shift", "severity", "coarsest"),
     [
@@ -272,7 +246,9 @@ def test_a_finding_names_the_joints_of_coarse_steps_and_the_worst_inertial_sum(
     layout = SimpleNamespace(n_inertial=2, prismatic={"d"})
     model = SimpleNamespace(joints=tuple("abcd"), layout=layout)
     mapping = SimpleNamespace(K=K, base_names=("x", "y", "z"))
-    found = regressor_noise.encoder_findings(noise, model, mapping)
+    found = list(
+        encoder_noise(SimpleNamespace(regressor_noise=noise, model=model, mapping=mapping))
+    )
     assert len(found) == (severity is not None)
     if not found:
         return
@@ -286,7 +262,7 @@ def test_a_finding_names_the_joints_of_coarse_steps_and_the_worst_inertial_sum(
         f"40 % of the RMS acceleration and shifts z by {size:.1f} standard errors"
         in finding.message
     )
-    assert finding.evidence == pytest.approx(
+    assert Figures(finding) == pytest.approx(
         {
             "step_a": steps[0],
             "step_c": steps[2],

@@ -4,7 +4,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import scipy.stats
-from helpers.driven import JOINTS, arm
+from helpers.driven import arm
 from helpers.fitting import fit
 from helpers.synthetic import exact_log, truth
 
@@ -14,15 +14,11 @@ from robotid.data.log import Log, Trajectory
 from robotid.data.signal_settings import SignalSettings
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.used_rows import base_problem
-from robotid.estimation.fitting import robust
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
 from robotid.estimation.fitting.recorded import Recordings
 from robotid.estimation.fitting.robust import LOSSES, find_outliers, loss_slope, loss_weight
 from robotid.estimation.fitting.survey import survey_log
 from robotid.identification.pipeline import conclude
-from robotid.robot.examples import example_urdf
-from robotid.robot.model import RobotModel
-from robotid.robot.parameters import Coupling
 
 NOISE = np.array([6.0, 3.0, 0.9])
 OUTLIERS = {  # [N m] by joint and row
@@ -158,16 +154,6 @@ def test_a_row_is_an_outlier_by_the_residual_and_the_torque_of_its_own_joint(mod
         assert outlier.size == pytest.approx(abs(size) / usual[j])
 
 
-def test_friction_that_the_filter_smears_leaves_no_residual(model):
-    quiet = exact_log(model, truth(model), np.random.default_rng(4), samples=2000, rate=100.0)
-    noise = 1e-3 * np.random.default_rng(5).standard_normal(quiet.tau.shape)
-    found = fit(model, [replace(quiet, tau=quiet.tau + noise)], estimator="wls")
-    (evaluation,) = found.fitted
-    residual = np.abs(evaluation.recording.trajectory.tau - evaluation.torques["estimate"])
-    usual = np.median(residual, axis=0)
-    assert (np.where(evaluation.recording.mask, residual, 0.0) < 10 * usual).all()
-
-
 def test_friction_that_is_not_coulombs_near_a_reversal_is_no_outlier(model):
     pi = truth(model)
     quiet = exact_log(model, pi, np.random.default_rng(4), samples=2000, rate=100.0)
@@ -281,16 +267,3 @@ def test_a_joint_that_stops_reverses_in_the_filtered_motion(model):
     assert size(110, 0, steps[0] + 11.0) == pytest.approx(steps[0] + 11.0)  # of another joint
     gap = (np.arange(600) >= 110).astype(int)  # the sign changes between two segments
     assert size(110, 1, steps[1] + 11.0, gap) == pytest.approx(steps[1] + 11.0)
-
-
-def test_a_coupled_drive_steps_at_each_of_its_joints_by_its_ratio():
-    lift, _, wrist = JOINTS
-    model = RobotModel.from_urdf(
-        example_urdf("ur5_robot.urdf"), joints=JOINTS,
-        couplings=[Coupling("pair", ((lift, 1.0), (wrist, -2.5)))],
-    )  # fmt: skip
-    names, pi = model.layout.names, np.zeros(len(model.layout.names))
-    for name, value in (("pair.coulomb", 0.7), ("elbow_joint.coulomb", 1.1), ("pair.offset", 9.0)):
-        if name in names:
-            pi[names.index(name)] = value
-    assert robust._friction_step(model, pi) == pytest.approx([1.4, 2.2, 3.5])

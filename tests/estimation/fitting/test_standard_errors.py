@@ -11,12 +11,10 @@ from helpers.synthetic import exact_log, truth
 from robotid.base.exceptions import DataError
 from robotid.data.signal_settings import SignalSettings
 from robotid.dynamics.base_parameters import BaseMapping
-from robotid.dynamics.factors import Factors, compress, merge
-from robotid.dynamics.problem import Problem
+from robotid.dynamics.factors import Factors, merge
 from robotid.estimation.estimators import OLS, WLS
-from robotid.estimation.estimators.segments import quantile, scatter
+from robotid.estimation.estimators.segments import scatter
 from robotid.estimation.fitting.standard_errors import (
-    about_prior,
     measured_errors,
     standard_of,
     with_wls_errors,
@@ -103,14 +101,6 @@ def test_behind_the_filter_errors_are_the_scatter_and_those_of_independent_rows_
     assert blind.max() < 0.5
 
 
-def test_independent_rows_need_no_inflation_and_coloured_ones_do(W):
-    rng = np.random.default_rng(2)
-    _, white = estimate(W, W @ TRUTH + noise(rng, 0.0))
-    _, coloured = estimate(W, W @ TRUTH + noise(rng, 0.9))
-    assert 0.7 < white.inflation < 1.4
-    assert coloured.inflation > 5  # (1 + 0.9) / (1 - 0.9) = 19 for rows that never change
-
-
 def test_an_open_parameter_has_no_error_and_leaves_that_of_others(W):
     tau = W @ TRUTH + noise(np.random.default_rng(3), 0.5)
     parts = segments(W, tau)
@@ -124,29 +114,6 @@ def test_an_open_parameter_has_no_error_and_leaves_that_of_others(W):
     others = wanted.copy()
     others[2, 2] = np.inf
     np.testing.assert_allclose(found, others, rtol=1e-9)
-
-
-def test_one_parameter_is_the_closed_form_of_cr2(rng):
-    x, e = rng.standard_normal((20, 10)), rng.standard_normal((20, 10))
-    y = 0.7 * x + e
-    theta = (x * y).sum() / (x**2).sum()
-    bread = 1 / (x**2).sum()
-
-    def problem(x, y):
-        blocks = [(x[:, None], y, np.ones(len(x)))]
-        return Problem(lambda: iter(blocks), ("a",), 1, np.ones((1, 1), dtype=bool))
-
-    parts = [compress(problem(*part)) for part in zip(x, y, strict=True)]
-    found = scatter(parts, np.array([theta]), np.ones(1), np.array([[bread]]))
-    # with one column, (I - H_ss)^-1/2 acts along x_s alone, with leverage h_s
-    h = (x**2).sum(axis=1) * bread
-    scores = (x * (y - theta * x)).sum(axis=1) / np.sqrt(1 - h)
-    assert found.covariance[0, 0] == pytest.approx(bread**2 * (scores**2).sum(), rel=1e-9)
-    a = np.sqrt((x**2).sum(axis=1) / (1 - h)) * bread
-    back = np.sqrt((x**2).sum(axis=1)) * a
-    gram = np.diag(a**2) - np.outer(back, back) * bread
-    freedom = np.trace(gram) ** 2 / (gram**2).sum()
-    assert found.freedom()[0] == pytest.approx(freedom, rel=1e-9)
 
 
 def test_scores_scatter_as_the_matrices_of_their_rows_say(W):
@@ -185,18 +152,6 @@ def test_scores_scatter_as_the_matrices_of_their_rows_say(W):
         assert found.freedom()[k] == pytest.approx(max(wanted, 1.0), rel=1e-6)
 
 
-def test_a_direction_of_one_stretch_alone_gets_the_scatter_of_the_others(W):
-    alone = W.copy()
-    alone[:, :, 1] = 0.0
-    alone[60:120, :, 1] = W[60:120, :, 1]  # the second of 40 segments
-    rng = np.random.default_rng(3)
-    ratio = []
-    for _ in range(40):
-        found, _ = estimate(alone, alone @ TRUTH + noise(rng, 0.0))
-        ratio.append(((found.theta - TRUTH)[1] / found.std_error[1]) ** 2)
-    assert 0.5 < np.mean(ratio) < 2.0
-
-
 def test_few_stretches_keep_the_band_of_the_filter(W):
     parts = segments(W, W @ TRUTH + noise(np.random.default_rng(0), 0.0))[:11]
     whole = merge(parts)
@@ -233,12 +188,6 @@ def test_few_segments_have_errors_that_repeat_in_every_row(W, rng):
     found, _ = measured_errors(own, parts, whole, share, K, rough.sigma, more=more)
     wanted = own.covariance @ (prior + share**2 * K.T @ more @ K) @ own.covariance
     np.testing.assert_allclose(found.covariance, wanted, rtol=1e-6, atol=1e-9)
-
-
-def test_quantiles_are_students():
-    np.testing.assert_allclose(
-        quantile(np.array([5.0, 30.0, np.inf])), scipy.stats.t.ppf(0.975, [5.0, 30.0, 1e12]), 1e-9
-    )
 
 
 def test_a_filter_that_forgets_keeps_its_own_covariance_grown_by_the_inflation(W):
@@ -281,17 +230,6 @@ def test_the_prior_makes_the_sandwich_of_its_formula(W):
     np.testing.assert_allclose(
         found.covariance, B @ (share**2 * K.T @ meat @ K + L) @ B, rtol=1e-6, atol=1e-12
     )
-
-
-@pytest.mark.parametrize("pull", [1.0, 2.5])
-def test_a_prior_that_pulls_more_than_it_is_sure_widens_by_its_own_part(rng, pull):
-    K, R, share = rng.standard_normal((4, 6)), np.triu(rng.standard_normal((4, 4))), 0.3
-    L, root = np.diag(np.arange(1.0, 7.0)), rng.standard_normal((4, 4))
-    meat = root @ root.T
-    C = np.linalg.inv(share * K.T @ R.T @ R @ K + L)
-    found = about_prior(C, K, meat, R, share, pull)
-    np.testing.assert_allclose(found, C @ (K.T @ meat @ K + pull * L) @ C, atol=1e-12)
-    np.testing.assert_array_equal(found, found.T)
 
 
 def test_what_is_scattered_beside_the_rows_adds_to_the_meat(W):
@@ -390,15 +328,3 @@ def test_with_active_bounds_errors_are_those_of_resampled_fits(W, rng, count):
         np.testing.assert_allclose(
             wide.covariance, C @ (share * K.T @ R.T @ R @ K + 3.0 * L) @ C, atol=1e-9
         )
-
-
-def test_a_gradient_method_has_rank_and_names_of_least_squares(W):
-    wls = WLS().fit(merge(segments(W, W @ TRUTH + noise(np.random.default_rng(5), 0.0))))
-    wls = replace(wls, rank=3, condition=7.5, undetermined=("b",), sigma=np.array([1.0, 2.0]))
-    own = {"rank": 4, "condition": np.inf, "undetermined": (), "sigma": SIGMA, "n_iter": 11}
-    rough = replace(wls, **own, message="11 steps; a gradient method has no covariance")
-    found = with_wls_errors(rough, wls)
-    assert (found.rank, found.condition, found.undetermined) == (3, 7.5, ("b",))
-    assert (found.n_iter, found.message.split("; ")[0]) == (11, "11 steps")
-    assert "gradient" not in found.message
-    np.testing.assert_array_equal(found.sigma, SIGMA)

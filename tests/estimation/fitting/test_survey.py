@@ -2,12 +2,9 @@
 
 import pickle
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pinocchio as pin
-import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
 from helpers.closed_chains import four_bar
 from helpers.driven import arm
@@ -15,7 +12,7 @@ from helpers.synthetic import truth
 
 from robotid.base.exceptions import DataError
 from robotid.data.base_motion import BaseColumns, BaseMotion, ImuFrame
-from robotid.data.files.formats import open_table, write_columns
+from robotid.data.files.formats import write_columns
 from robotid.data.files.read import lay_out, read_log, write_log
 from robotid.data.log import Log
 from robotid.data.signal_settings import LogUnits, SignalSettings
@@ -165,23 +162,6 @@ def test_full_turns_are_taken_out_of_each_piece(tmp_path):
     assert np.any(turned, axis=0).tolist() == free.tolist()
 
 
-def test_parquet_is_read_across_its_row_groups(robot, recording, tmp_path):
-    path = tmp_path / "run.parquet"
-    write_log(recording, path)
-    table = pq.read_table(path)
-    pq.write_table(table, path, row_group_size=170)
-    rows = open_table(path, lay_out(path, robot.joints)[0].source).rows
-    assert rows.count() == 2000
-    for first, stop in ((0, 2000), (169, 341), (170, 340), (1999, 2000)):
-        part = rows.read(["time", "q_elbow_joint"], first, stop, None)
-        np.testing.assert_array_equal(part["time"], recording.t[first:stop])
-        np.testing.assert_array_equal(part["q_elbow_joint"], recording.q[first:stop, 1])
-    with_null = table.set_column(0, "time", pa.array([None, *recording.t[1:].tolist()]))
-    pq.write_table(with_null, path)
-    with pytest.raises(DataError, match=r"run.parquet: time is NaN at row 0"):
-        long_log(robot, path, SignalSettings())
-
-
 def spoilt(recording, tmp_path, name, row, value):
     table = {"time": recording.t.copy()}
     for j, joint in enumerate(recording.joints):
@@ -245,31 +225,6 @@ def test_pieces_travel_as_they_are(robot, recording, tmp_path):
         np.testing.assert_array_equal(again.reduce().factors.R, piece.reduce().factors.R)
     # the model and the mapping go along once
     assert len(pickle.dumps(pieces)) < len(pickle.dumps(pieces[:1])) + 1000 * len(pieces)
-
-
-def test_positions_of_locked_joints_are_those_of_all_windows_in_radians():
-    kinds = {"a": "revolute", "b": "continuous", "s": "prismatic", "c": "revolute"}
-    joints = [SimpleNamespace(name=name, type=kind) for name, kind in kinds.items()]
-    model = SimpleNamespace(tree=SimpleNamespace(movable=joints))
-    layout = SimpleNamespace(units=LogUnits("s", "deg"))
-    windows = [
-        {
-            "x": np.array([10.0, np.nan, 30.0]),
-            "y": np.array([1.0, 2.0, 3.0]),
-            "z": np.full(3, np.nan),
-        },
-        {"x": np.array([40.0, 50.0]), "y": np.array([4.0, 5.0]), "z": np.full(2, np.nan)},
-    ]
-    names = {"a": "x", "s": "y", "c": "z"}
-    found = survey._positions(names, windows, layout, model)
-    assert found.keys() == {"a", "s"}  # nothing of the one whose column is empty
-    np.testing.assert_allclose(found["a"], np.deg2rad([10.0, 30.0, 40.0, 50.0]))
-    np.testing.assert_array_equal(found["s"], [1.0, 2.0, 3.0, 4.0, 5.0])
-    part = survey._positions(names, windows, layout, model, slice(2, 4))
-    np.testing.assert_allclose(part["a"], np.deg2rad([30.0, 40.0]))
-    layout.units = LogUnits("s", "rad")
-    plain = survey._positions({"b": "x"}, windows[1:], layout, model)
-    np.testing.assert_array_equal(plain["b"], [40.0, 50.0])
 
 
 def test_the_pieces_of_a_log_have_the_bias_of_all_rests_of_its_windows(monkeypatch, tmp_path):

@@ -102,16 +102,3 @@ def test_correlation_is_shrunk_by_its_uncertainty():
     wanted[1, 1] = 1.0
     assert shrunk_correlation(x) == pytest.approx(wanted)
     assert shrunk_correlation(x[:2]) == pytest.approx(np.eye(3))  # r is 1 or -1 for any two runs
-
-
-def test_variance_of_a_correlation_has_the_mean_of_independent_parameters():
-    """E (1 - r^2)^2 is k (k - 2) / (k^2 - 1) of independent normal values, Var(r) 1 / (k - 1)."""
-    x = np.random.default_rng(5).normal(size=(20_000, 5, 2))
-    z = x - x.mean(axis=1, keepdims=True)
-    r = (z[..., 0] * z[..., 1]).sum(axis=1) / np.sqrt((z**2).sum(axis=1).prod(axis=1))
-    assert np.mean((1 - r**2) ** 2) == pytest.approx(5 * 3 / 24, rel=0.01)
-    assert np.mean(r**2) == pytest.approx(1 / 4, rel=0.03)
-    shares = [(1 - r[k] ** 2) ** 2 * 6 / 15 / r[k] ** 2 for k in range(3)]
-    for k in range(3):
-        off = shrunk_correlation(x[k])[0, 1]
-        assert off == pytest.approx(r[k] * (1 - min(max(shares[k], 1e-3), 1.0)))

@@ -83,24 +83,6 @@ def test_one_parameter_is_integrated_as_by_dense_matrices(unit):
         assert weight[d_run < found.within**2 * 1.0001].sum() == pytest.approx(0.5, abs=0.12)
 
 
-def test_prediction_is_the_monte_carlo_integral_over_spreads_of_any_size():
-    rng = np.random.default_rng(4)
-    x, error = np.array([1.3, 2.1, 1.7, 2.6]), np.array([0.2, 0.5, 0.3, 0.2])
-    (found,) = SpreadModel(alone(x, error)).predict()
-    s = 0.3 * np.exp(rng.uniform(-6, 5, 200_000))  # density of log s is uniform here
-    weight = 1 / (error**2 + s[:, None] ** 2)
-    total = weight.sum(axis=1)
-    mean = weight @ x / total
-    log = 0.5 * np.log(weight).sum(axis=1) - 0.5 * np.log(total)
-    log -= 0.5 * (weight * (x - mean[:, None]) ** 2).sum(axis=1)
-    density = np.exp(log) * s / 0.3 * scipy.stats.t(4).pdf(s / 0.3)
-    draws = rng.choice(len(s), 200_000, p=density / density.sum())
-    new = mean[draws] + np.sqrt(1 / total[draws] + s[draws] ** 2) * rng.normal(size=200_000)
-    assert found.ends == pytest.approx(np.quantile(new, [0.025, 0.975]), abs=0.04)
-    assert found.spread == pytest.approx(np.quantile(s[draws], 0.5), rel=0.05)
-    assert found.spread_ends == pytest.approx(np.quantile(s[draws], [0.025, 0.975]), rel=0.1)
-
-
 @pytest.mark.parametrize("unit", [(0,) * 7, (0, 0, 0, 1), (0, 0, 1, 1, 1, 2, 3)])
 @pytest.mark.parametrize("is_unit", [False, True])
 def test_each_is_compared_with_the_others_as_if_it_had_never_been(unit, is_unit):
@@ -161,23 +143,6 @@ def test_intervals_of_the_next_run_and_of_the_spread_cover(runs, ratio, next_run
         assert spread[0] <= known / (2 * count) <= spread[1]
 
 
-def test_intervals_of_the_next_robot_and_of_spreads_between_robots_cover():
-    rng, inside, spreads, count = np.random.default_rng(6), 0, 0, 40
-    between = np.array([[0.13, 0.4], [0.31, 0.2]])
-    for _ in range(count):
-        every = drawn(rng, np.repeat(np.arange(7), 3), between)
-        known = every.unit < 6
-        model = SpreadModel(Runs(every.H[known], every.h[known], every.unit[known], every.scale))
-        x, C = np.linalg.solve(every.H[-1], every.h[-1]), np.linalg.inv(every.H[-1])
-        for p, found in enumerate(model.predict()):
-            m = found.mixture
-            ends = Mixture(m.weight, m.mean, np.sqrt(m.std**2 + C[p, p])).ends
-            inside += ends[0] < x[p] < ends[1]
-            spreads += found.spread_ends[0] < between[1, p] < found.spread_ends[1]
-    assert 0.9 <= inside / (2 * count) <= 1.0
-    assert 0.9 <= spreads / (2 * count) <= 1.0
-
-
 def test_the_mean_of_alike_runs_has_the_error_of_their_joint_fit():
     """Correlated parameters with a small spread: the means of the others count."""
     runs = drawn(np.random.default_rng(3), [0] * 8, np.zeros((2, 2)))
@@ -212,10 +177,3 @@ def test_quantiles_and_probabilities_are_those_of_the_mixture():
     share = weight @ scipy.stats.norm.sf((9.0 - mean) / std)
     assert mixture.beyond(np.array(9.0)) == pytest.approx(2 * share)
     assert mixture.beyond(mixture.quantiles(np.array([0.5]))) == pytest.approx(1.0)
-
-
-def test_runs_without_scatter_have_the_smallest_spread():
-    runs = Runs(np.full((5, 1, 1), 1e12), np.full((5, 1), 2e12), np.zeros(5, int), np.ones(1))
-    (found,) = SpreadModel(runs).predict()
-    assert found.spread < 0.01
-    assert found.mean == pytest.approx(2.0)

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from robotid.estimation.variation.spread import Runs, SpreadModel
 from robotid.estimation.variation.variation import between_units
 
 
@@ -77,16 +76,3 @@ def test_the_probability_is_that_of_weighted_least_squares_over_all_spreads():
     log, p = np.array(found).T
     weight = np.exp(log - log.max())
     assert unlike[6] == pytest.approx(weight @ p / weight.sum())
-
-
-@pytest.mark.parametrize(("x", "error", "scale"), [
-    ([-4.0, -4.0, -4.0], 0.05, 0.4),  # a tenth of their size
-    ([0.3, -0.1, 0.1, 0.1], 0.7, 0.7),  # their errors
-    ([1.0, 4.0, 7.0], 0.2, 3.0),  # their scatter
-])  # fmt: skip
-def test_the_plausible_spread_is_the_largest_of_a_tenth_the_errors_and_the_scatter(x, error, scale):
-    H = np.full((len(x), 1, 1), error**-2)
-    runs = Runs(H, H[:, 0] * np.array(x)[:, None], np.zeros(len(x), int), np.array([scale]))
-    (wanted,) = SpreadModel(runs).predict()
-    found, _ = between_units(np.array(x), np.full(len(x), error), 1e-9)
-    assert (found.spread, *found.ends) == pytest.approx((wanted.spread, *wanted.ends))

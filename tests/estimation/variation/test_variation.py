@@ -127,30 +127,6 @@ def test_rows_of_zeros_are_differences_of_the_torque(model):
         assert found.scatter[j - 3, 0] / found.scatter[j - 3, 1] == pytest.approx(wanted, rel=1e-4)
 
 
-@pytest.mark.parametrize("light", [1.0, 1e-3])
-def test_a_plausible_zero_changes_the_torque_of_its_joint_by_one_percent(model, light):
-    logs, base = segments_of(model, noise=0.02, spread=0.0, seed=5)
-    own = recordings(model, logs[:3])
-    segments = [own.segments(k, log.whole.trajectory) for k, log in enumerate(own.fitted)]
-    sums = sums_of(model, own.mapping, segments, base, np.ones(3))
-    sums = sums_with_zeros(sums, own, base, np.zeros(len(own.mapping.base_names)))
-    H = sums.H.copy()
-    H[:, -1] /= light
-    H[:, :, -1] /= light
-    found = {
-        (g.group.kind, g.group.name): g
-        for g in runs_of(model, own.mapping, base, replace(sums, H=H), np.zeros(3, int))
-    }
-    for joint in model.joints:
-        of_gain, of_zero = (
-            (found[kind, joint].runs.H * found[kind, joint].inflation).sum()
-            for kind in ("gain", "zero")
-        )
-        wanted = max(0.005, 0.01 * np.sqrt(of_gain / of_zero))
-        assert found["zero", joint].runs.scale == pytest.approx([wanted])
-    assert (found["zero", model.joints[2]].runs.scale.item() == 0.005) == (light < 1)
-
-
 def regressor_rows(own, k, motion):
     problem = own.problem_of(k, motion)
     return np.vstack([W for W, _, _ in problem.blocks()])
@@ -198,18 +174,6 @@ def test_scales_are_a_tenth_of_the_drive_and_a_hundredth_of_the_robot(model):
     assert not any(kind == "zero" for kind, _ in found)
     payload = found["payload", "wrist_1_link"].runs.scale
     assert payload == pytest.approx([mass, 0.1 * mass, 0.1 * mass, 0.1 * mass])
-
-
-def test_information_counts_the_noise_of_the_segments(model):
-    logs, base = segments_of(model, noise=0.02, spread=0.0, seed=3)
-    level = float(np.std(logs[0].tau[:, 0])) * 0.02
-    z = []
-    for group in groups_of(model, logs, base, sigma=level):
-        if group.group.kind == "drive":
-            assert 0.02 < group.inflation < 20
-            for H, h in zip(group.runs.H, group.runs.h, strict=True):
-                z += (np.linalg.solve(H, h) / np.sqrt(np.diag(np.linalg.inv(H)))).tolist()
-    assert 0.6 < np.std(z) < 1.6  # errors as large as stated
 
 
 @pytest.mark.parametrize("level", [1.5, 0.4])
@@ -266,27 +230,6 @@ def test_the_run_that_differs_is_named_with_its_cause(model, kind, where, name, 
     assert found.probability < 0.02 / 100
 
 
-def test_parameters_have_their_mean_spread_and_next_interval(model):
-    logs, base = segments_of(model, spread=0.1, seed=2)
-    fit = solve_recordings(recordings(model, logs), FIT).with_errors()
-    found = {each.name: each for each in vary(NAMES, fit.runs).parameters}
-    name = f"{LIFT}.coulomb"
-    true = base[at(model, name)]
-    coulomb = found[name]
-    assert coulomb.unit == "N m"
-    assert coulomb.prediction.mean == pytest.approx(true, rel=0.15)
-    assert coulomb.prediction.spread == pytest.approx(0.1 * true, rel=0.7)
-    assert coulomb.prediction.ends[0] < true < coulomb.prediction.ends[1]
-    assert coulomb.values.std() == pytest.approx(0.1 * true, rel=0.7)
-    assert coulomb.prediction.within is None
-    rng, own = np.random.default_rng(2), []
-    names = [n for n in model.layout.names if n.endswith(("coulomb", "viscous"))]
-    for _ in NAMES:
-        own.append(true * (1 + 0.1 * rng.normal(size=len(names))[names.index(name)]))
-    assert (np.abs(coulomb.values - own) < 5 * coulomb.std_errors).all()
-    assert coulomb.to_dict()["by_log"] == coulomb.values.tolist()
-
-
 def stated(name, x, error, *, unit=None, scale=1.0):
     """Return estimates (k, q) of the terms of a drive in k runs, each with one standard error."""
     count, size = np.shape(x)
@@ -323,20 +266,6 @@ def test_a_payload_is_compared_only_in_runs_that_determine_it():
     assert unlike(0.9) == []  # mcx: 1.05
     assert unlike(0.9, "drive") == [(6, "drive")]
     assert unlike(0.9, of_others=np.diag([1.0, 0, 0, 1])) == [(6, "payload")]  # no run has mcx
-
-
-def test_spreads_are_stated_between_units_and_within_them():
-    rng, unit = np.random.default_rng(0), np.repeat(np.arange(8), 6)
-    x = 5.0 * rng.normal(size=8)[unit] + 0.4 * rng.normal(size=len(unit))
-    group = stated("a", x[:, None], 0.02, unit=unit)
-    found = vary([f"{k}" for k in range(len(unit))], (group,))
-    (own,) = found.parameters
-    assert found.units == 8
-    assert own.prediction.within == pytest.approx(np.sqrt(np.mean([x[unit == k].var(ddof=1)
-                                                        for k in range(8)])), rel=0.3)  # fmt: skip
-    means = [x[unit == k].mean() for k in range(8)]
-    assert own.prediction.spread == pytest.approx(np.std(means, ddof=1), rel=0.25)
-    assert own.to_dict()["spread_within_units"] == own.prediction.within
 
 
 def test_gains_are_of_the_rows_of_joints_behind_those_of_a_floating_base():
@@ -392,11 +321,6 @@ def test_the_unit_that_differs_is_named_and_its_logs_are_not():
     assert vary(names, [alike], []).unlike_units == ()
 
 
-def test_three_units_are_not_compared():
-    group, _ = units_of(np.random.default_rng(0), np.array([9.0, 0.0]), units=3)
-    assert vary([f"{k}.csv" for k in range(6)], [group]).unlike_units == ()
-
-
 def test_spread_of_drives_adds_to_the_covariance_of_the_fit():
     names = ["link.m", "b.coulomb", "a.viscous", "a.coulomb"]
     variation = {
@@ -424,30 +348,6 @@ def test_correlation_is_that_between_logs_or_between_units():
     found = vary([str(k) for k in range(12)], [replace(group, group=drive, runs=one)])
     values = np.array([each.values for each in found.parameters])
     assert found.correlation == pytest.approx(shrunk_correlation(values.T))
-
-
-def test_a_robot_with_a_changed_gain_is_named_though_the_friction_of_robots_differs(model):
-    """Five robots with two logs each; friction differs by 15 % between robots, 5 % between logs."""
-    rng, base, logs = np.random.default_rng(0), truth(model), []
-    friction = [k for k, n in enumerate(model.layout.names) if n.endswith(("coulomb", "viscous"))]
-    for robot in range(5):
-        own = base.copy()
-        own[friction] *= 1 + 0.15 * rng.normal(size=len(friction))
-        for run in range(2):
-            pi = own.copy()
-            pi[friction] *= 1 + 0.05 * rng.normal(size=len(friction))
-            log = driven_log(model, pi, 2 * robot + run, duration=12.0, rate=30.0, noise=0.01)
-            logs.append(scaled(log, 1, 1.15) if robot == 3 else log)
-    held = [
-        replace(hold_log(model, log, EXACT), unit=f"arm-{k // 2}") for k, log in enumerate(logs)
-    ]
-    some = Recordings(model, structural_mapping(model), held)
-    fit = solve_recordings(some, FIT).with_errors()
-    variation = vary([str(k) for k in range(10)], fit.runs, [f"arm-{k}" for k in range(5)])
-    (found,) = variation.unlike_units
-    assert (found.run, found.kind, found.where) == (3, "gain", ELBOW)
-    assert found.value == pytest.approx(1.15, abs=0.04)
-    assert not variation.unlike
 
 
 def test_only_parameters_of_which_a_run_has_information_vary():

@@ -1,6 +1,5 @@
 """Who works on pieces never shows in the result; what goes wrong is said by name."""
 
-import logging
 import os
 import pickle
 import subprocess
@@ -22,7 +21,6 @@ from robotid.base.exceptions import (
 )
 from robotid.dynamics.factors import available_cores
 from robotid.estimation.workers.plan import WorkPlan, choose_workers
-from robotid.estimation.workers.pools import Pool, run_task
 
 # a busy disk is no error of a cluster
 pytestmark = pytest.mark.filterwarnings("ignore:Creating scratch directories:UserWarning")
@@ -114,13 +112,13 @@ def test_few_pieces_are_under_way_at_a_time(tmp_path):
             taken.append(k)
             yield k, piece
 
-    pool = Pool(1)
-    for done, _ in enumerate(pool.run(reduce_piece, pieces())):
-        assert len(taken) == min(10, done + 2)
-    (worker,) = workers_of(tmp_path / "marks")
-    assert is_running(worker)
-    pool.close()
-    assert not is_running(worker)
+    plan = WorkPlan(2)
+    for done, _ in enumerate(plan.run(reduce_piece, pieces())):
+        assert len(taken) == min(10, done + 4)
+    workers = workers_of(tmp_path / "marks")
+    assert all(map(is_running, workers))
+    plan.close()
+    assert not any(map(is_running, workers))
 
 
 def test_an_error_of_the_data_keeps_its_type_and_names_the_piece(plan, tmp_path):
@@ -203,7 +201,7 @@ def test_workers_default_to_the_cores_for_long_work_only(tmp_path):
     assert choose_workers(short, 3) == 3
     assert choose_workers(short, 30) == 10
     assert choose_workers(short * 500) == available_cores()
-    for wrong in (lambda: choose_workers(short, 0), lambda: WorkPlan(0), lambda: Pool(0)):
+    for wrong in (lambda: choose_workers(short, 0), lambda: WorkPlan(0)):
         with pytest.raises(SettingsError, match="workers is 0, wanted at least 1"):
             wrong()
 
@@ -224,14 +222,3 @@ def test_errors_travel_between_processes_with_their_facts(error):
     assert type(again) is type(error)
     assert str(again) == str(error)
     assert vars(again) == vars(error)
-
-
-def test_a_task_leaves_the_logger_as_it_was(tmp_path):
-    (piece,) = pieces_in(tmp_path / "marks", 1)
-    logger = logging.getLogger("robotid")
-    before = logger.level, list(logger.handlers)
-    assert run_task(reduce_piece, piece, logging.WARNING)[1] == []
-    assert run_task(reduce_piece, piece, logging.INFO)[1] == [
-        ("robotid.piecework", logging.INFO, "reduced random rows 0")
-    ]
-    assert (logger.level, logger.handlers) == before

@@ -9,8 +9,11 @@ from robotid.data.log import Log
 from robotid.diagnosis.catalogue import finding
 from robotid.dynamics.simulation.loops import ClosedLoopRobot, cut_windows
 from robotid.estimation.fitting.estimator_settings import SimulationSettings
-from robotid.identification.closed_loop.from_commands import identify_loops, with_gravity
-from robotid.identification.closed_loop.loop_findings import loop_findings
+from robotid.identification.closed_loop.from_commands import (
+    identify_loops,
+    loop_findings,
+    with_gravity,
+)
 from robotid.identification.closed_loop.loop_settings import LoopSettings
 from robotid.identification.closed_loop.position_errors import run_open_loop
 from robotid.identification.closed_loop.stages import fit_loops, stated_loops

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from robotid.identification.online.change_detection import ChangeDetector, Innovations, payload_of
+from robotid.identification.online import ChangeDetector, Innovations, payload_of
 
 
 def test_noise_alone_is_no_change_and_a_shift_is_flagged_where_it_began(rng):

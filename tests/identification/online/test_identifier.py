@@ -7,8 +7,7 @@ from helpers.synthetic import exact_log, payload_log, truth
 
 from robotid.base.exceptions import DataError
 from robotid.dynamics.torque import joint_torque_regressor
-from robotid.identification.online.causal_signals import LiveSignals
-from robotid.identification.online.identifier import OnlineIdentifier, OnlineSettings
+from robotid.identification.online import LiveSignals, OnlineIdentifier, OnlineSettings
 
 
 def run(identifier, log, start=0, end=None):

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from robotid.base.exceptions import DataError
-from robotid.identification.online.causal_signals import LiveSignals
+from robotid.identification.online import LiveSignals
 
 FIXED = np.array([False])
 

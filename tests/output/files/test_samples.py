@@ -10,10 +10,10 @@ import scipy.stats
 import robotid
 from robotid.cli import main
 from robotid.estimation.variation.variation import SCORES
-from robotid.output.files.result_file import load_result
-from robotid.output.files.samples import (
+from robotid.output.files.ranges import (
     sample,
 )
+from robotid.output.files.result_file import load_result
 from robotid.robot.parameters import pseudo_inertia
 
 COUNT = 400

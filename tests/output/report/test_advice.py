@@ -25,8 +25,7 @@ from robotid.estimation.fitting.drive_terms import (
     JointMotion,
 )
 from robotid.identification.closed_loop.loop_settings import LoopSettings
-from robotid.output.report.next_steps import _once, next_steps
-from robotid.output.report.steps import Origin, Step
+from robotid.output.report.next_steps import Origin, Step, _once, next_steps
 from robotid.robot.examples import example_urdf
 
 JOB = Origin(("my job.toml",), "out")

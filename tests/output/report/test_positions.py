@@ -9,7 +9,7 @@ from helpers.pages import bars, chart, charts, tables
 
 from robotid.base.findings import Finding
 from robotid.output.report.document import write_report
-from robotid.output.report.steps import Origin
+from robotid.output.report.next_steps import Origin
 
 JOINTS = ("rail", "turn")
 

@@ -8,7 +8,7 @@ import pytest
 from helpers.browsing import until, visit
 
 from robotid.output.report.document import write_report
-from robotid.output.report.steps import Origin
+from robotid.output.report.next_steps import Origin
 
 PARAMETERS = "Parameters of links and drives"
 

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from robotid.output.viewer.thinning import thin
+from robotid.output.viewer.scene import thin
 from robotid.robot.geometry import Surface
 
 

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from robotid.output.viewer.unexplained import find_unexplained, residual_levels
+from robotid.output.viewer.replays import find_unexplained, residual_levels
 
 T = np.arange(2000) / 100.0  # [s]
 JOINTS = ("a", "b", "c")

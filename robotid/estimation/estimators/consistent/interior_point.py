@@ -19,7 +19,7 @@ References:
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -27,8 +27,20 @@ import scipy.linalg
 
 from robotid.base.exceptions import NotConvergedError
 from robotid.base.typing import Array
-from robotid.robot.parameters import pseudo_inertia_basis
+from robotid.estimation.estimators.consistent.body_constraints import Bounds, Subspace
+from robotid.robot.parameters import (
+    ParameterLayout,
+    inertial_from_pseudo_inertia,
+    pseudo_inertia,
+    pseudo_inertia_basis,
+)
 
+_EXACT = 1e-12  # relative decrease of the objective per step at which a fit is exact
+_ROUGH = 1e-6  # ... and at which it is sufficient for a prediction
+_TOGETHER = 2**17  # entries of the data sets that are fitted in one pass: they fit into a cache
+_CONTRADICTED = 1e-7  # distance of the NNLS problem below which the inequalities contradict
+_SINGULAR = 1e-12  # ratio of the axes of a body, squared, below which it is singular
+_THINNEST = 0.01  # smallest relative thickness of a prior's pseudo-inertia
 _SIZE, _ENTRIES = 4, 10  # of a pseudo-inertia, and of its upper triangle
 _MOST = 100  # steps; 8 to 20 are typical
 _BACK = 0.995  # largest step as a share of the step length to the boundary
@@ -71,20 +83,124 @@ class Minimum:
 
 
 @dataclass(frozen=True, eq=False)
-class EntropicProblem:
-    """The problem without its data and weight; x is in units of a scale."""
+class Entropic:
+    """2 sum_i d(J_i || P_i) of the bodies plus |(pi - centre) / std|^2 of the drives.
 
-    scale: Array  # (p,), unit of each parameter
-    held: Array  # (10 n,), known part of each body's parameters, in these units
-    P: Array  # (n, 4, 4), pseudo-inertias of the prior without the known parts
-    centre: Array  # (p,), c, where the penalty is 0
-    stiffness: Array  # (p - 10 n,), D of the drives
-    G: Array  # (k, p), coefficients of the inequalities
-    h: Array  # (k,), their constants
-    N: Array  # (p, e), directions fixed by equalities, orthonormal
-    origin: Array  # (p,), o, a point that meets the equalities
+    d(J || P) = tr(P^-1 J) - log det(P^-1 J) - 4 is the Bregman divergence of -log det. It does not
+    depend on the frame of a body; near the prior the penalty is about |delta / std|^2.
+
+    References:
+        Lee, Wensing, Park (2019), Geometric robot dynamic identification: a convex programming
+        approach, (22), (24), (32).
+    """
+
+    centre: Array  # (p,), prior values
+    precision: Array  # (drives,), 1 / std^2 of the drives
+    held: Array  # (10 bodies,), known part of each body
+
+    @classmethod
+    def of(cls, layout: ParameterLayout, prior: Array, std: Array, held: Array) -> "Entropic":
+        """Return the penalty; relative eigenvalues of the prior's bodies are at least 1 %."""
+        size = layout.n_inertial
+        mass, moment = std[:size].reshape(-1, 10)[:, :2].T
+        # diagonal T^-1/2, which make pseudo-inertias dimensionless
+        unit = np.column_stack([mass / moment] * 3 + [np.ones_like(mass)]) / np.sqrt(mass)[:, None]
+        shrink, grow = (np.eye(4) * x[:, None, :] for x in (unit, 1.0 / unit))
+        P = pseudo_inertia(prior[:size] - held)
+        values, vectors = np.linalg.eigh(shrink @ P @ shrink)
+        floored = (vectors * np.maximum(values, _THINNEST)[:, None]) @ vectors.mT
+        thin = (values[:, 0] < _THINNEST)[:, None, None]
+        P = np.where(thin, grow @ floored @ grow, P)
+        bodies = inertial_from_pseudo_inertia(P).reshape(-1) + held
+        return cls(np.concatenate([bodies, prior[size:]]), std[size:] ** -2.0, held)
+
+    def value(self, pi: Array) -> float:
+        """Return the penalty, at least 0; infinite if a body is singular: pi (p,)."""
+        values = np.linalg.eigvalsh(self._ratio(pi))  # of P^-1 J
+        if (values[:, 0] <= _SINGULAR * np.maximum(values[:, 3], 1.0)).any():
+            return float("inf")
+        divergence = (values - np.log(values) - 1.0).sum()
+        return float(2.0 * divergence + self.precision @ self._drives(pi) ** 2)
+
+    def gradient(self, pi: Array) -> Array:
+        """Return its gradient, shape (p,): pi (p,)."""
+        slope = np.linalg.inv(self.prior) - np.linalg.inv(self._rest(pi))
+        inertial = 2.0 * np.einsum("nij,kij->nk", slope, pseudo_inertia_basis()).reshape(-1)
+        return np.concatenate([inertial, 2.0 * self.precision * self._drives(pi)])
+
+    def root(self, pi: Array) -> Array:
+        """Return S with S^T S half its second derivative at pi, shape (p, p), upper triangular.
+
+        The second derivative of a thin body is too ill conditioned to be factorised. With
+        J = L L^T it is g_kl = tr(C_k C_l), C_k = L^-1 B_k L^-T, and S is computed from C.
+        """
+        L = self._prior_factor @ np.linalg.cholesky(self._ratio(pi))
+        C = _whitened(pseudo_inertia_basis()[None], L[:, None])  # (n, 10, 4, 4)
+        bodies = np.linalg.qr(svec(C).mT, mode="r")
+        return np.asarray(scipy.linalg.block_diag(*bodies, np.diag(np.sqrt(self.precision))))
+
+    def hessian(self, pi: Array) -> Array:
+        """Return its second derivative, shape (p, p), positive definite: pi (p,)."""
+        S = self.root(pi)
+        return np.asarray(2.0 * S.T @ S)
+
+    @cached_property
+    def prior(self) -> Array:
+        """The pseudo-inertias P of the prior without the known parts, shape (n, 4, 4)."""
+        return self._rest(self.centre)
+
+    @cached_property
+    def _prior_factor(self) -> Array:
+        return np.linalg.cholesky(self.prior)
+
+    def _ratio(self, pi: Array) -> Array:
+        """Return L^-1 J L^-T of each body, dimensionless, 1 at the prior P = L L^T."""
+        return _whitened(self._rest(pi), self._prior_factor)
+
+    def _rest(self, pi: Array) -> Array:
+        return pseudo_inertia(pi[: len(self.held)] - self.held)
+
+    def _drives(self, pi: Array) -> Array:
+        return (pi - self.centre)[len(self.held) :]
+
+
+@dataclass(frozen=True, eq=False)
+class Programme:
+    """Minimise |rows [K pi; -1]|^2 + weight penalty(pi) between bounds.
+
+    The log det of the penalty is a barrier: the bodies of a minimum are physically consistent.
+    """
+
+    K: Array  # (b, p), map to the base parameters
+    scale: Array  # (p,), unit of each parameter: bounds and subspace are in x = pi / scale
+    penalty: Entropic
+    bounds: Bounds
+    space: Subspace  # of the points that meet the equalities
 
     def minimise(
+        self, rows: Array, weight: float, *, is_exact: bool = True, start: Minimum | None = None
+    ) -> Minimum:
+        """Return the minimum of rows (k, b + 1); its x is pi, shape (p,)."""
+        starts = None if start is None else [start]
+        return self.minimise_each(rows[None], weight, is_exact=is_exact, starts=starts)[0]
+
+    def minimise_each(
+        self, rows: Array, weight: float, *, is_exact: bool = True,
+        starts: Sequence[Minimum] | None = None,
+    ) -> list[Minimum]:  # fmt: skip
+        """Return the minimum of each of f data sets, as ``minimise``: rows (f, k, b + 1)."""
+        tolerance = _EXACT if is_exact else _ROUGH
+        if starts is not None:
+            starts = [replace(start, x=start.x / self.scale) for start in starts]
+        A, d = rows[:, :, :-1] @ (self.K * self.scale), rows[:, :, -1]
+        minima: list[Minimum] = []
+        most = max(1, _TOGETHER // A[0].size)
+        for k in (slice(first, first + most) for first in range(0, len(A), most)):
+            near = None if starts is None else starts[k]
+            minima += self._descended(A[k], d[k], weight, tolerance, near)
+        return [replace(minimum, x=minimum.x * self.scale) for minimum in minima]
+
+    def _descended(
         self,
         A: Array,
         d: Array,
@@ -123,25 +239,36 @@ class EntropicProblem:
     @property
     def inertial(self) -> int:
         """Number of inertial parameters; they are the first ones."""
-        return len(self.held)
+        return len(self.penalty.held)
+
+    @cached_property
+    def centre(self) -> Array:
+        """Centre of the penalty in units of the scale, shape (p,)."""
+        return self.penalty.centre / self.scale
+
+    @cached_property
+    def stiffness(self) -> Array:
+        """Stiffness of the penalty of the drives, D."""
+        return np.sqrt(self.penalty.precision) * self.scale[self.inertial :]
 
     @cached_property
     def P_inverse(self) -> Array:
         """Inverse pseudo-inertias of the prior, shape (n, 4, 4)."""
-        return np.asarray(np.linalg.inv(self.P))
+        return np.asarray(np.linalg.inv(self.penalty.prior))
 
     def bodies(self, x: Array) -> Array:
         """Return the pseudo-inertias without the known parts, shape (f, n, 4, 4): x (f, p)."""
-        own = (x[:, : self.inertial] - self.held) * self.scale[: self.inertial]
+        scale = self.scale[: self.inertial]
+        own = (x[:, : self.inertial] - self.penalty.held / scale) * scale
         J: Array = own.reshape(len(x), -1, _ENTRIES) @ _BASIS
         return J.reshape(*J.shape[:2], _SIZE, _SIZE)
 
     def _first(self, A: Array, d: Array, weight: float) -> "_Point":
         """Return the prior as a point, with a t that balances penalty and data."""
         squares = np.sum((A @ self.centre - d) ** 2, axis=1)
-        t = np.maximum(weight, _FIRST * squares / max(_SIZE * len(self.P), 1))[:, None]
+        t = np.maximum(weight, _FIRST * squares / max(_SIZE * len(self.penalty.prior), 1))[:, None]
         x = np.broadcast_to(self.centre, (len(A), len(self.centre)))
-        return self._centred(x, np.zeros((len(A), len(self.h))), t, t, weight)
+        return self._centred(x, np.zeros((len(A), len(self.bounds.h))), t, t, weight)
 
     def _near(self, starts: Sequence[Minimum], weight: float) -> "_Point":
         """Return points near minima."""
@@ -157,11 +284,92 @@ class EntropicProblem:
         """Return the nearest centred points: Z J = t 1, and s lambda = mu for each row."""
         inverse = np.linalg.inv(np.linalg.cholesky(self.bodies(x)))
         flat = _Coordinates.of(np.linalg.inv(inverse), self, weight)
-        unit = 1.0 / np.maximum((flat.into(self.G) ** 2).sum(axis=2), 1e-300)
-        gap = x @ self.G.T + self.h - unit * multipliers
+        unit = 1.0 / np.maximum((flat.into(self.bounds.G) ** 2).sum(axis=2), 1e-300)
+        gap = x @ self.bounds.G.T + self.bounds.h - unit * multipliers
         s = 0.5 * (gap + np.hypot(gap, 2.0 * np.sqrt(unit * mu)))
         s = np.maximum(s, _LEAST / np.sqrt(unit))
         return _Point(x, t[:, :, None, None] * inverse.mT @ inverse, s, mu / s)
+
+    def redrawn(
+        self,
+        rows: Array,
+        weight: float,
+        pi: Array,
+        meat: Array,
+        weight_ratio: float,
+        draws: int,
+        rng: np.random.Generator,
+    ) -> tuple[Array, list[str]]:
+        """Return the distances of fits to resampled data and prior from this fit, and failures.
+
+        Noise of the data has the covariance of their score. Noise of the prior has the covariance
+        of the plausible prior. Both move the minimum without the inequalities, with the penalty
+        expanded at the fit; the nearest point within the bounds, in the metric of the fit, is the
+        minimum with them (Bardsley, Fox, 2012, An MCMC method for uncertainty quantification in
+        nonnegativity constrained inverse problems, section 3).
+
+        rows (k, b + 1), pi (p,), meat (b, b) -> (m, p).
+        """
+        S, space = self._scaled_root(pi), self.space
+        L = np.sqrt(weight) * S  # half the Hessian of the weighted penalty is L^T L
+        slope = 0.5 * weight * self.penalty.gradient(pi) * self.scale
+        lowest = pi / self.scale - scipy.linalg.cho_solve((L, False), slope)
+        A = np.vstack([rows[:, :-1] @ self.K * self.scale, L])
+        d = np.concatenate([rows[:, -1], L @ lowest])
+        free = space.basis.shape[1]
+        stacked = np.column_stack([A @ space.basis, d - A @ space.origin])
+        triangle = scipy.linalg.qr(stacked, mode="r")[0][:free]
+        # signs of rows depend on rounding: make the diagonal positive
+        triangle = np.sign(np.diag(triangle))[:, None] * triangle
+        R = triangle[:, :-1]
+        at = space.basis.T @ (pi / self.scale - space.origin)
+        # y = R (x - at): with independent rows, whose meat is their information, noise is white
+        prior = space.basis @ scipy.linalg.solve_triangular(R, np.eye(len(R)))
+        data = self.K * self.scale @ prior
+        # score of the prior: weight H (pi - true pi), covariance of pi: weight_ratio / (weight H)
+        score = np.sqrt(weight_ratio) * L @ prior
+        size, axes = np.linalg.eigh(data.T @ meat @ data + score.T @ score)
+        root = axes * np.sqrt(np.maximum(size, 0.0)) @ axes.T
+        noise = rng.standard_normal((draws, len(R))) @ root
+        G = self.bounds.G @ prior
+        slack = self.bounds.h + self.bounds.G @ (space.origin + space.basis @ at)
+        solved = [nearest(G, slack, y) for y in triangle[:, -1] - R @ at + noise]
+        moved = np.array([y for y in solved if not isinstance(y, str)])
+        failures = [status for status in solved if isinstance(status, str)]
+        return self.scale * (moved.reshape(-1, len(R)) @ prior.T), failures
+
+    def whitened(self, rows: Array) -> tuple[Array, Array]:
+        """Return A (k, m), r (k,), r = A x + noise, for coordinates x whose prior is N(0, 1)."""
+        beta, M = self._plausible
+        return rows[:, :-1] @ M, rows[:, -1] - rows[:, :-1] @ beta
+
+    @cached_property
+    def _plausible(self) -> tuple[Array, Array]:
+        """Prior of the base parameters, beta + M x, shapes (b,) and (b, m); see ``whitened``."""
+        centre, basis = self.centre, self.space.basis
+        S = self._scaled_root(self.penalty.centre)
+        # the point of the subspace nearest to the centre
+        away = np.linalg.lstsq(S @ basis, S @ (centre - self.space.origin), rcond=None)[0]
+        nearest = self.space.origin + basis @ away
+        L = scipy.linalg.qr(S @ basis, mode="r")[0][: basis.shape[1]]
+        K = self.K * self.scale
+        return K @ nearest, scipy.linalg.solve_triangular(L, (K @ basis).T, trans="T").T
+
+    def covariance(
+        self, weight: float, rows: Array | None = None, pi: Array | None = None
+    ) -> Array:
+        """Return the covariance without inequalities, (p, p), of rows (k, b + 1) at pi (p,)."""
+        S = np.sqrt(weight) * self._scaled_root(self.penalty.centre if pi is None else pi)
+        data = [] if rows is None else [rows[:, :-1] @ self.K * self.scale]
+        stacked = np.vstack([*data, S]) @ self.space.basis
+        R = scipy.linalg.qr(stacked, mode="r")[0][: stacked.shape[1]]
+        inverse = scipy.linalg.solve_triangular(R, np.eye(len(R)))
+        spread = self.scale[:, None] * self.space.basis @ inverse
+        return np.asarray(spread @ spread.T)
+
+    def _scaled_root(self, pi: Array) -> Array:
+        """Return the root of half the penalty's Hessian, in units of the scale."""
+        return np.asarray(self.penalty.root(pi) * self.scale)
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,7 +406,7 @@ class _Coordinates:
     drives: Array  # (p - 10 n,)
 
     @classmethod
-    def of(cls, R: Array, problem: EntropicProblem, weight: float) -> "_Coordinates":
+    def of(cls, R: Array, problem: Programme, weight: float) -> "_Coordinates":
         moved = svec(R[:, :, None] @ _UNITS @ R.mT[:, :, None]) @ _TO_PARAMETERS
         own = problem.scale[: problem.inertial].reshape(-1, _ENTRIES, 1)
         return cls(moved.mT / own, 1.0 / (np.sqrt(weight) * problem.stiffness))
@@ -224,7 +432,7 @@ class _Coordinates:
 class _System:
     """The factorised equations of a step from each point."""
 
-    problem: EntropicProblem
+    problem: Programme
     point: _Point
     weight: float
     R_inverse: Array  # (f, n, 4, 4): R^-1 J R^-T = R^T Z R = diag(l)
@@ -239,16 +447,16 @@ class _System:
     roots: list[Array]  # lower triangles of the Hessians
 
     @classmethod
-    def of(
-        cls, problem: EntropicProblem, point: _Point, A: Array, d: Array, weight: float
-    ) -> "_System":
+    def of(cls, problem: Programme, point: _Point, A: Array, d: Array, weight: float) -> "_System":
         x, J = point.x, problem.bodies(point.x)
         L, Q = np.linalg.cholesky(J), np.linalg.cholesky(point.Z)
         U, length, Vt = np.linalg.svd(Q.mT @ L)
         R = L @ Vt.mT / np.sqrt(length)[..., None, :]
         R_inverse = (Q @ U).mT / np.sqrt(length)[..., None]
         coordinates = _Coordinates.of(R, problem, weight)
-        A_z, G_z, N_z = (coordinates.into(rows) for rows in (A, problem.G, problem.N.T))
+        A_z, G_z, N_z = (
+            coordinates.into(rows) for rows in (A, problem.bounds.G, problem.space.fixed.T)
+        )
         residual = _times(A, x) - d
         drives = problem.stiffness * (x - problem.centre)[:, problem.inertial :]
         slope = weight * svec(R.mT @ problem.P_inverse @ R).reshape(len(x), -1)
@@ -278,14 +486,14 @@ class _System:
         if cross is not None:
             bodies -= 2.0 * cross / (length[..., :, None] + length[..., None, :])
         bodies[..., _EYE, _EYE] += np.reshape(t, (-1, 1, 1)) / length
-        short = point.x @ self.problem.G.T + self.problem.h - point.s
+        short = point.x @ self.problem.bounds.G.T + self.problem.bounds.h - point.s
         aim = (mu - pairs) / point.s
         right = _times(self.G.mT, aim - self.ratio * short) - self.gradient
         right[:, :size] += svec(bodies).reshape(len(right), -1)
         z = self._solve(right)
         if self.N.shape[1]:
             columns, small = self._held
-            off = (point.x - self.problem.origin) @ self.problem.N
+            off = (point.x - self.problem.space.origin) @ self.problem.space.fixed
             z = z - _times(columns @ np.linalg.inv(small), _times(self.N, z) + off)
         J = unsvec(z[:, :size]).reshape(bodies.shape)
         Z = bodies - J
@@ -374,3 +582,33 @@ def _to_zero(x: Array, step: Array) -> Array:
 def _times(A: Array, x: Array) -> Array:
     """Return the product of each matrix and vector, shape (f, m)."""
     return np.asarray((A @ x[..., None])[..., 0])
+
+
+def nearest(G: Array, h: Array, point: Array) -> Array | str:
+    """Return the point with G x + h >= 0 nearest to a point (p,), or why there is none.
+
+    The shortest vector under inequalities is the residual of a problem of nonnegative least squares
+    (Lawson, Hanson, 1974, Solving least squares problems, chapter 23).
+    """
+    from scipy.optimize import nnls
+
+    size = np.linalg.norm(G, axis=1)
+    G, slack = G / size[:, None], (h + G @ point) / size
+    violation = -slack.min(initial=np.inf)
+    if violation <= 0:
+        return point
+    E = np.vstack([G.T, -slack / violation])
+    goal = np.append(np.zeros(len(point)), 1.0)
+    try:
+        multipliers, distance = nnls(E, goal)
+    except RuntimeError:  # too many iterations
+        return "MaxIterations"
+    if distance < _CONTRADICTED:
+        return "infeasible"
+    residual = E @ multipliers - goal
+    return np.asarray(point - violation / residual[-1] * residual[:-1])
+
+
+def _whitened(S: Array, L: Array) -> Array:
+    """Return L^-1 S L^-T of symmetric matrices."""
+    return np.asarray(np.linalg.solve(L, np.linalg.solve(L, S).swapaxes(-1, -2)))

@@ -1,22 +1,21 @@
-"""Online identification: samples as input, an estimate at any time as output."""
+"""Online identification: samples as input, an estimate at any time as output.
+
+Position and torque pass the same Bessel filter, with the same delay at all frequencies of the pass
+band, so that they remain synchronous. Velocity and acceleration are central differences of the
+filtered position, with a delay of one step. Innovations show noise, convergence and changes.
+"""
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import overload
 
 import numpy as np
+import scipy.linalg
 
 from robotid.base.arguments import real_numbers
-from robotid.base.exceptions import DataError
-from robotid.base.settings import (
-    NOT_NEGATIVE,
-    POSITIVE,
-    Settings,
-    is_number,
-    require_kind,
-    setting,
-)
+from robotid.base.exceptions import DataError, SettingsError
+from robotid.base.settings import NOT_NEGATIVE, POSITIVE, Settings, is_number, require_kind, setting
 from robotid.base.typing import Array
 from robotid.data.log import Log, Trajectory
 from robotid.dynamics.base_parameters import structural_mapping
@@ -24,16 +23,275 @@ from robotid.dynamics.drive_columns import sure_rows
 from robotid.dynamics.problem import Sample
 from robotid.dynamics.torque import InstantRegressor
 from robotid.estimation.estimators import Estimate, Kalman, KalmanState
-from robotid.identification.online.causal_signals import Instant, LiveSignals
-from robotid.identification.online.change_detection import (
-    ChangeDetector,
-    Innovations,
-    Payload,
-    load_spread,
-    payload_of,
-)
 from robotid.robot.model import RobotModel
 from robotid.robot.prior import prior_spread
+
+#: One instant of smooth motion: t [s], then q, v, a, tau, each of shape (n,).
+Instant = tuple[float, Array, Array, Array, Array]
+
+_SLOWEST = 1e-5  # smallest cut-off over the rate
+_GAP_CYCLES = 0.25  # longest pause without a gap [periods of the cut-off]
+_SETTLE = 4.0  # time after a start or a gap before the first instant [delays]
+
+
+class LiveSignals:
+    """Converts samples of q and tau online into instants of q, v, a, tau.
+
+    Attributes:
+        delay: Delay of the instants after the samples [s].
+
+    is_continuous (n,).
+    """
+
+    def __init__(
+        self, n: int, rate: float, cutoff: float, order: int, is_continuous: Array
+    ) -> None:
+        if not 0 < cutoff < rate / 2:
+            raise SettingsError(
+                f"cutoff {cutoff:g} Hz is not between 0 and half the rate {rate:g} Hz"
+            )
+        if cutoff < _SLOWEST * rate:
+            raise SettingsError(
+                f"cutoff {cutoff:g} Hz is less than {_SLOWEST:g} of the rate {rate:g} Hz, which is "
+                "too low for an exact filter. Set a larger cutoff, or correct the time stamps"
+            )
+        if order < 2 or order % 2:
+            raise SettingsError(f"order is {order}, wanted an even number")
+        self._step, self._n = 1.0 / rate, n
+        self._is_continuous = np.asarray(is_continuous, dtype=bool)
+        self._gap = max(_GAP_CYCLES / cutoff, 2.5 / rate)
+        self._M = _bessel(order, cutoff, rate)  # [x; y]_k+1 = M [x; u]_k
+        A, B, C = self._M[:-1, :-1], self._M[:-1, -1:], self._M[-1:, :-1]
+        inverse = np.linalg.inv(np.eye(order) - A)
+        self._rest = (inverse @ B)[:, 0]  # state at a constant input of 1
+        self.delay = (float((C @ inverse @ inverse @ B)[0, 0]) + 1.0) * self._step
+        self._warm = int(np.ceil(_SETTLE * self.delay / self._step))
+        self._last: tuple[float, Array] | None = None
+        self._x = np.zeros((order, 2 * n))
+        self._recent: list[Array] = []
+        self._next, self._count = 0.0, 0
+
+    def push(self, t: float, q: Array, tau: Array) -> Iterator[Instant]:
+        """Process a sample and return the delayed instants that it completes; typically one."""
+        # q (n,) [rad or m], tau (n,) [N m or N]
+        if q.shape != (self._n,) or tau.shape != (self._n,):
+            raise DataError(f"q has shape {q.shape} and tau {tau.shape}, wanted ({self._n},) each")
+        u = np.concatenate([q, tau])
+        if not (np.isfinite(t) and np.isfinite(u.sum())):
+            raise DataError(f"the sample at t = {t:g} s is not finite, so it was refused")
+        last = self._last
+        if last is not None:
+            if t <= last[0]:
+                raise DataError(f"t must increase, but {t:.15g} s follows {last[0]:.15g} s")
+            jump = np.where(self._is_continuous, u[: self._n] - last[1][: self._n], 0.0)
+            u[: self._n] -= 2 * np.pi * np.round(jump / (2 * np.pi))
+        self._last = (t, u)
+        if last is None or t - last[0] > self._gap:
+            self._restart(t, u)
+            return iter(())
+        return iter(self._advance(last, t, u))
+
+    def _restart(self, t: float, u: Array) -> None:
+        self._x = np.outer(self._rest, u)
+        self._recent, self._count, self._next = [], 0, t + self._step
+
+    def _advance(self, last: tuple[float, Array], t: float, u: Array) -> list[Instant]:
+        """Return the instants at the grid times up to t."""
+        done = []
+        while self._next <= t + 1e-9 * self._step:
+            share = (self._next - last[0]) / (t - last[0])
+            stacked = np.vstack([self._x, last[1] + share * (u - last[1])])
+            moved = self._M @ stacked
+            self._x = moved[:-1]
+            self._recent = [*self._recent[-2:], moved[-1]]
+            self._count += 1
+            if self._count > self._warm:
+                done.append(self._instant(self._next))
+            self._next += self._step
+        return done
+
+    def _instant(self, t: float) -> Instant:
+        n, h = self._n, self._step
+        before, here, after = self._recent
+        q = here[:n]
+        v = (after[:n] - before[:n]) / (2 * h)
+        a = (after[:n] - 2 * q + before[:n]) / h**2
+        return t - self.delay, q, v, a, here[n:]
+
+
+def _bessel(order: int, cutoff: float, rate: float) -> Array:
+    """Return [A B; C D] of a Bessel low-pass, from sections in series for numerical accuracy."""
+    from scipy.signal import bessel
+
+    sections = bessel(order, cutoff, fs=rate, norm="mag", output="sos")
+    M = np.eye(1)  # [A B; C D] without a state: y = u
+    for b0, b1, b2, _, a1, a2 in sections:
+        A = np.array([[-a1, 1.0], [-a2, 0.0]])
+        B = np.array([[b1 - a1 * b0], [b2 - a2 * b0]])
+        C, D = np.array([[1.0, 0.0]]), b0
+        # in series: u of this section is y of the previous ones
+        k = len(M) - 1
+        A1, B1, C1, D1 = M[:k, :k], M[:k, k:], M[k:, :k], M[k:, k:]
+        M = np.block([[A1, np.zeros((k, 2)), B1], [B @ C1, A, B @ D1], [D * C1, C, D * D1]])
+    return M
+
+
+_LARGEST = 25.0  # largest squared innovation in the evidence [variances]
+_FIRST_NOISE = 0.1  # initial noise level, relative to the RMS torque of each row
+_SMALLEST_NOISE = 1e-4  # smallest noise level, relative to the RMS torque of each row
+_PSEUDO = 20.0  # weight of the initial noise level [samples]
+_CLIP = 9.0  # largest squared innovation in the noise level [variances]
+_CONVERGED = 0.25  # variance of the prediction over that of the noise, below which it has converged
+
+
+@dataclass(frozen=True, eq=False)
+class Payload:
+    """A payload on the last body.
+
+    Attributes:
+        parameters: Its ten inertial parameters in the body's frame, shape (10,).
+        std_error: Their standard errors, shape (10,).
+    """
+
+    parameters: Array
+    std_error: Array
+
+    @property
+    def mass(self) -> float:
+        """Its mass [kg]."""
+        return float(self.parameters[0])
+
+    @property
+    def mass_std_error(self) -> float:
+        """Standard error of its mass [kg]."""
+        return float(self.std_error[0])
+
+
+class ChangeDetector:
+    """CUSUM on squared innovations, row by row.
+
+    With the squared innovation d_j^2 in units of its variance, the evidence is
+    g_j <- max(0, g_j + share (min(d_j^2, 25) - drift)), and a change is flagged when one g_j
+    reaches the threshold. The onset of the change is the time at which that g_j last left 0.
+
+    References:
+        Page (1954), Continuous Inspection Schemes.
+    """
+
+    def __init__(self, n: int, threshold: float, drift: float) -> None:
+        self.threshold, self.drift = threshold, drift
+        self.evidence = np.zeros(n)
+        self._onset = np.full(n, np.nan)
+
+    def push(self, t: float, squares: Array, share: float) -> float | None:
+        """Process one sample; return the onset of a change flagged now [s], else None."""
+        # squares (n,)
+        evidence = self.evidence + share * (np.minimum(squares, _LARGEST) - self.drift)
+        evidence[squares == 0.0] = self.evidence[squares == 0.0]
+        starts = (self.evidence <= 0.0) & (evidence > 0.0)
+        self._onset[starts] = t
+        self.evidence = np.maximum(evidence, 0.0)
+        j = int(np.argmax(self.evidence))
+        if self.evidence[j] < self.threshold:
+            return None
+        self.evidence = np.zeros(len(evidence))
+        return float(self._onset[j])
+
+
+class Innovations:
+    """Noise level of each row, and convergence and change relative to it.
+
+    The mean of innovation times residual is the variance of the noise, at any uncertainty of the
+    parameters. For the detection of changes, ``model_error`` times each row's torque is added to
+    its noise, since no model is exact.
+
+    Attributes:
+        variance: Noise variance of each row, shape (n,) [(N m)^2 or N^2].
+        ratio: Mean variance of the prediction, from the parameters' uncertainty, over that of the
+            noise, shape (n,); inf before the first sample.
+
+    rms (n,) [N m or N].
+    """
+
+    def __init__(
+        self, rms: Array, dt: float, memory: float, model_error: float, detector: ChangeDetector
+    ) -> None:
+        self._floor = (_SMALLEST_NOISE * np.maximum(rms, 1e-3 * rms.max())) ** 2 + 1e-300
+        self.variance = np.maximum((_FIRST_NOISE * rms) ** 2, self._floor)
+        self.ratio = np.full(len(rms), np.inf)
+        self._torque = rms**2
+        self._dt, self._memory, self._model_error = dt, memory / dt, model_error
+        self._samples = np.full(len(rms), _PSEUDO)
+        self._detector = detector
+
+    @property
+    def is_converged(self) -> bool:
+        """Whether the parameters' uncertainty adds less than half a noise level to each row."""
+        return bool((self.ratio < _CONVERGED).all())
+
+    def push(
+        self,
+        t: float,
+        tau: Array,
+        e: Array,
+        residual: Array,
+        uncertainty: Array,
+        used: Array,
+        share: float,
+    ) -> float | None:
+        """Process one sample; return the onset of a change flagged now [s], else None.
+
+        tau (n,) [N m or N], e (n,) [N m or N], residual (n,) [N m or N], uncertainty (n,)
+        [(N m)^2 or N^2], used (n,).
+        """
+        expected = uncertainty + self.variance + self._model_error**2 * self._torque
+        # before convergence, innovations do not indicate a change
+        evidence = np.where(used & (self.ratio < _CONVERGED), e**2 / expected, 0.0)
+        self._update_noise(tau, e * residual, uncertainty, used)
+        return self._detector.push(t, evidence, share)
+
+    def forget_convergence(self) -> None:
+        """Reset the convergence, after the covariance was increased."""
+        self.ratio = np.full(len(self.ratio), np.inf)
+
+    def _update_noise(self, tau: Array, product: Array, uncertainty: Array, used: Array) -> None:
+        """Average noise and torque over the memory, and the variance ratio over one second."""
+        bounded = np.clip(product, 0.0, _CLIP * (uncertainty + self.variance))
+        ratio = uncertainty / self.variance
+        self._samples = np.minimum(self._samples + used, self._memory)
+        gain = used / self._samples
+        self._torque = self._torque + gain * (tau**2 - self._torque)
+        self.variance = np.maximum(self.variance + gain * (bounded - self.variance), self._floor)
+        known = np.isfinite(self.ratio)
+        averaged = np.where(known, self.ratio, ratio)
+        averaged += min(1.0, self._dt) * (ratio - averaged)
+        self.ratio = np.where(used, averaged, self.ratio)
+
+
+def payload_of(difference: Array, covariance: Array, columns: Array, spread: Array) -> Payload:
+    """Return the payload that explains a difference of the base parameters.
+
+    Minimises (d - K_L phi)^T C^-1 (d - K_L phi) + |phi / spread|^2.
+    """
+    # difference (b,), covariance (b, b), columns (b, 10), spread (10,)
+    scale = np.sqrt(np.diag(covariance))
+    L = scale[:, None] * np.linalg.cholesky(covariance / np.outer(scale, scale))
+    A = scipy.linalg.solve_triangular(L, columns * spread, lower=True)
+    d = scipy.linalg.solve_triangular(L, difference, lower=True)
+    R = scipy.linalg.qr(np.vstack([A, np.eye(10)]), mode="r")[0][:10]
+    phi = scipy.linalg.cho_solve((R, False), A.T @ d)
+    inverse = scipy.linalg.solve_triangular(R, np.eye(10))
+    return Payload(spread * phi, spread * np.sqrt(np.einsum("ij,ij->i", inverse, inverse)))
+
+
+def load_spread(spread: Array) -> Array:
+    """Return the prior standard deviations of a payload, (10,): of a mean link, twice its size."""
+    # spread (10 bodies,)
+    by_body = spread.reshape(-1, 10)
+    mass = max(float(by_body[:, 0].mean()), float(by_body[-1, 0]))
+    radius = 2.0 * float(np.max(by_body[-1, 1:4]) / by_body[-1, 0])
+    return mass * np.array([1.0, *[radius] * 3, *[radius**2] * 6])
+
 
 _ARRAYS = {1: ("q", "tau"), 3: ("q", "v", "a", "tau")}  # by the number of arrays after t and q
 _OVERSAMPLED = 12.0  # estimator updates per period of the cut-off
