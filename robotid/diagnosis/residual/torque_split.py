@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from robotid.base.exceptions import DataError
 from robotid.base.typing import Array
+from robotid.diagnosis.catalogue import sentence_of
 from robotid.diagnosis.residual.decisions import (
     DEPENDENCE_P_VALUE,
     DEPENDENCE_SHARE,
@@ -42,18 +43,6 @@ _QUARTERS = 4  # parts of a recording for the test of a drift, and pieces of eac
 _ROUNDING = 1e-10  # of the torque, below which a part counts as 0
 _SLOW = 0.25  # of the RMS speed: below is low speed
 _NOISY = 0.5  # broadband share above which the residual counts as noise
-_ADVICE = {
-    "constant": "Zero the torque sensor, and check for a spring or a load that the model lacks",
-    "position": "Check for a spring, a cable or a gear ripple that the model lacks",
-    "speed": "Try another friction model",
-    "acceleration": "Check for an inertia that the model lacks, or a delayed torque",
-    "load": "Check the scale of the torque, and for friction that increases with the load",
-    "time": "Possible causes: warm-up of the friction, drift of a sensor, a changed load",
-}
-_CHANGED = (
-    "The fitted recordings do not have this dependence: something has changed since (friction with "
-    "temperature, a sensor offset, a load), or the joint does not move this way in them"
-)
 _BINS = 10  # of a quantity, with equal numbers of samples
 _FEWEST_IN_BIN = 3  # segments from which the scatter of a bin's mean is determined
 
@@ -271,38 +260,30 @@ class JointTorque:
     def cause(self) -> tuple[str, str]:
         """The cause of the residual, and what to do."""
         rms, best = self.rms, self._best(self.follows)
-        if np.isnan(rms["measured"]):
-            return "no sample is used: the joint does not move", ""
-        if rms["measured"] == 0:
-            return "the measured torque is 0 throughout", ""
-        left = f"the residual is {_percent(rms['residual'] / rms['measured'])} of the torque"
-        if best is not None:
-            advice = _CHANGED if self._has_changed(best.name) else _ADVICE[best.name]
-            return f"{left} and {self._described(best)}", advice
-        if self.broadband is None or self.rows.segments is None:
-            return f"{left}; the recordings are too short to determine its cause", ""
-        if self.broadband >= _NOISY:
-            share = _percent(self.broadband)
-            return f"{left}; {share} of its power is broadband (above the cut-off): noise", ""
-        names = [d.name for d in self.follows if d.name != "constant"]
-        share = _percent(1.0 - self.broadband)
-        return (
-            f"{left}; neither a constant nor {', '.join(names)} explain it, but {share} of its "
-            "power is below the cut-off: systematic",
-            "Check the motion of other joints, and elasticity",
-        )
-
-    def _described(self, best: Dependence) -> str:
-        """Return the dependence of the residual as text."""
-        share = _percent(best.share or 0.0)
-        if best.name == "constant":
-            return f"{share} of its power is a constant of {best.means[0]:.2g} {self.unit}"
-        rms_speed = self.size(self.quantities[best.name][1]) if best.name == "speed" else 0.0
-        low = " at low speed," if abs(best.where) < _SLOW * rms_speed else ""
-        return (
-            f"depends on the {best.name}, which explains {share} of its variance (most "
-            f"clearly{low} at {best.where:.2g} {best.unit})"
-        )
+        name, slow = "" if best is None else best.name, False
+        if best is not None and name == "speed":
+            slow = abs(best.where) < _SLOW * self.size(self.quantities["speed"][1])
+        kinds = {
+            "unused": bool(np.isnan(rms["measured"])),
+            "zero": rms["measured"] == 0,
+            "constant": name == "constant",
+            "quantity": best is not None,
+            "short": self.broadband is None or self.rows.segments is None,
+            "noise": (self.broadband or 0.0) >= _NOISY,
+            "slow": True,
+        }
+        kind = next(kind for kind, holds in kinds.items() if holds)
+        quick = self.broadband or 0.0
+        share = {"noise": quick, "slow": 1.0 - quick}.get(kind, (best and best.share) or 0.0)
+        cause = sentence_of(
+            "residual:cause", what=kind, left=_percent(rms["residual"] / (rms["measured"] or 1.0)),
+            share=_percent(share), name=name, unit=self.unit if best is None else best.unit,
+            size=0.0 if best is None else best.means[0], low=slow,
+            where=0.0 if best is None else best.where,
+            names=", ".join(d.name for d in self.follows if d.name != "constant"),
+        )  # fmt: skip
+        what = "changed" if name and self._has_changed(name) else name or kind
+        return cause, sentence_of("residual:advice", what=what)
 
     def _has_changed(self, name: str) -> bool:
         """Whether the residual of the fitted recordings does not depend on a quantity."""

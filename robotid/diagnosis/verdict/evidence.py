@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from robotid.base.findings import listed, quoted
+from robotid.diagnosis.catalogue import sentence_of
 from robotid.estimation.fitting.evaluation import JointMetrics, Metrics
 
 if TYPE_CHECKING:
@@ -76,10 +77,7 @@ class Predictions:
             if not own or own.keys() & self.tested[log].keys():
                 continue
             errors = [f"{x.removeprefix(_BASE)} {error_of(m):.0f} %" for x, m in own.items()]
-            notes.append(
-                f"wrench on the base that contact forces cannot cause, error on {log}: "
-                f"{listed(errors)}. The verdict is on the torque of the joints"
-            )
+            notes.append(sentence_of("verdict:base", log=log, errors=listed(errors)))
         return notes
 
     def on_each(self) -> dict[str, JointEvidence]:
@@ -100,22 +98,15 @@ class Predictions:
         """Return why no prediction of unseen motion was evaluated; empty if one was."""
         if self.validation:
             return []
-        why = "no validation log given"
-        if self.refitted:
-            why = f"{listed(self.refitted)} contain fitted samples"
-        return [f"prediction of unseen motion not evaluated: {why}"]
+        what = "refitted" if self.refitted else "none"
+        return [sentence_of("verdict:untested", what=what, logs=listed(self.refitted))]
 
     def better_by_urdf(self, rescaled: Collection[str] = ()) -> list[str]:
         """Return the joints that the URDF with fitted drives predicts better, and the remedy."""
         worse = [j for own in self.tested.values() for j, m in own.items() if is_beaten(m)]
         worse = [joint for joint in worse if joint not in rescaled]
-        if not worse:
-            return []
-        return [
-            f"the URDF with fitted drives predicts {listed(dict.fromkeys(worse))} better than the "
-            "identified bodies: keep the URDF's values for the links of these joints (pinned in "
-            "[estimator.constraints])"
-        ]
+        joints = listed(dict.fromkeys(worse))
+        return [sentence_of("verdict:urdf", joints=joints)] if worse else []
 
     def at_rest(self) -> list[str]:
         """Return the joints at rest in all recordings, and those at rest in all validation logs."""
@@ -125,16 +116,12 @@ class Predictions:
         missing = [joint for joint in names if joint in fitted]
         if still and not fitted:  # evaluated again without the fitted recordings
             still, missing = [], still
-        reasons = []
-        if still:
-            reasons.append(
-                f"the joints {listed(still)} do not move in any recording: not evaluated"
-            )
-        if missing and self.validation:
-            reasons.append(
-                f"the joints {listed(missing)} do not move in any validation log: not evaluated"
-            )
-        return reasons
+        named = {"recording": still, "validation log": missing if self.validation else []}
+        return [
+            sentence_of("verdict:rest", joints=listed(names), logs=logs)
+            for logs, names in named.items()
+            if names
+        ]
 
     def why_untested(self, joint: str) -> str:
         """Return why a joint was evaluated on no validation log."""
@@ -175,34 +162,20 @@ class Determined:
 
     def warnings(self) -> list[str]:
         """Return the reasons why the result is at best usable."""
-        reasons = []
-        if self.undetermined and self.is_poorly_excited:
-            reasons.append(
-                f"the data do not determine {len(self.undetermined)} base parameters "
-                f"individually: {listed(self.undetermined, _NAMED)}"
-            )
-        if not self.is_consistent:
-            reasons.append(
-                "the standard parameters are not physically consistent: URDF not written. The "
-                "base parameters still predict torque"
-            )
-        return reasons
+        is_open = bool(self.undetermined) and self.is_poorly_excited
+        holds = {"open": is_open, "inconsistent": not self.is_consistent}
+        return [self._sentence(what, self.undetermined) for what, is_so in holds.items() if is_so]
 
     def notes(self) -> list[str]:
         """Return notes that do not change the verdict: parameters hidden by the noise."""
-        notes = []
-        if self.undetermined and not self.is_poorly_excited:
-            notes.append(
-                f"{len(self.undetermined)} base parameters are not identifiable above the noise of "
-                "a rich motion, or only in sums with others. What is not determined keeps the "
-                f"URDF's values: {listed(self.undetermined, _NAMED)}"
-            )
-        if self.uncertain_drives:
-            notes.append(
-                f"{listed(self.uncertain_drives, _NAMED)}: the standard error is as large as that "
-                "of the prior: only a sum with other terms is identifiable; use the friction curve"
-            )
-        return notes
+        hidden = () if self.is_poorly_excited else self.undetermined
+        named = {"hidden": hidden, "drives": self.uncertain_drives}
+        return [self._sentence(what, names) for what, names in named.items() if names]
+
+    @staticmethod
+    def _sentence(what: str, names: Sequence[str]) -> str:
+        named = listed(names, _NAMED)
+        return sentence_of("verdict:determined", what=what, count=len(names), names=named)
 
 
 def is_beaten(measured: JointMetrics) -> bool:
@@ -231,35 +204,32 @@ def _judge_joint(
 ) -> None:
     """Add the first reason that one log gives: rank 0 is worse than a constant, 1 than the URDF."""
     error, urdf = error_of(measured), measured.baselines.get("urdf")
-    on_log = f"error {error:.1f} % on {log}"
-    if measured.relative_error_pct is None:
-        why = (
-            f"{joint}: the torque is 0 throughout {log}: not evaluated. If the joint has no drive, "
-            f"state passive = [{quoted(joint)}] in the job file"
-        )
-        evidence.poor.append((2, why))
-    elif not measured.better_than_constant and not joint.startswith(_BASE):  # a constant weight
-        constant = error / np.sqrt(1.0 - measured.r2)
-        why = f"error {error:.1f} %; a constant would give {constant:.1f} %"
-        evidence.poor.append((0, f"{joint}: worse than a constant torque on {log}: {why}"))
-    elif urdf is not None and error > urdf:
-        evidence.poor.append((1, f"{joint}: {on_log}, worse than the URDF's {urdf:.1f} %"))
-    elif error > POOR:
-        evidence.poor.append((2, f"{joint}: {on_log}, above {POOR:g} %"))
-    elif error > GOOD:
-        why = f"{on_log} (wanted: at most {GOOD:g} %)"
-        evidence.cautions.append(f"{joint}: {why}; see its residual in the report")
-    elif fitted is not None and error > max(_OPTIMISM * error_of(fitted), 5.0):
-        evidence.cautions.append(
-            f"{joint}: {on_log}, {error_of(fitted):.1f} % on the fitted recordings; record and fit "
-            "a richer motion"
-        )
-    elif is_beaten(measured):
-        driven = measured.baselines["urdf_with_drives"]
-        evidence.cautions.append(
-            f"{joint}: {on_log}, {driven:.1f} % with the URDF and fitted drives: keep the URDF's "
-            "values for its link"
-        )
+    urdf = np.inf if urdf is None else urdf
+    before = 0.0 if fitted is None else error_of(fitted)
+    is_flat = not measured.better_than_constant and not joint.startswith(_BASE)  # no weight alone
+    kinds = {
+        "zero": (2, measured.relative_error_pct is None),
+        "constant": (0, is_flat),
+        "urdf": (1, error > urdf),
+        "poor": (2, error > POOR),
+        "usable": (None, error > GOOD),
+        "optimistic": (None, fitted is not None and error > max(_OPTIMISM * before, 5.0)),
+        "beaten": (None, is_beaten(measured)),
+    }
+    what, rank = next(((x, rank) for x, (rank, holds) in kinds.items() if holds), ("", None))
+    if not what:
+        return
+    driven = measured.baselines.get("urdf_with_drives") or 0.0
+    constant = error / np.sqrt(1.0 - measured.r2) if what == "constant" else 0.0
+    text = sentence_of(
+        "verdict:joint", what=what, subject_of=joint, on=log, error=error, urdf=urdf, fit=before,
+        quoted=quoted(joint), driven=driven, constant=constant,
+        poor=POOR, good=GOOD,
+    )  # fmt: skip
+    if rank is None:
+        evidence.cautions.append(text)
+    else:
+        evidence.poor.append((rank, text))
 
 
 def uses_of_torques(
