@@ -14,9 +14,7 @@ def test_each_joint_has_its_gains_with_units_and_sources(crane):
     shown = {entry["name"]: entry for entry in loop_parameters(crane)}
     units = {"rail": ("N/m", "N s/m", "m"), "turn": ("N m/rad", "N m s/rad", "rad")}
     loops, unknowns = crane.fit.loops, crane.fit.simulator.free_parameters
-    free = {
-        f"{crane.model.joints[j]}.{x.what}": k for k, x in enumerate(unknowns) for j in x.joints
-    }
+    free = {(x.what, crane.model.joints[j]): k for k, x in enumerate(unknowns) for j in x.joints}
     for j, (joint, (of_kp, of_kd, of_zero)) in enumerate(units.items()):
         for what, unit in (("kp", of_kp), ("kd", of_kd), ("delay", "s"), ("zero", of_zero)):
             entry, k = shown[f"{joint}.{what}"], free.get((what, joint))
