@@ -33,8 +33,8 @@ import pinocchio as pin
 from scipy.interpolate import CubicSpline
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
+import cassie
 from hanging_cassie import hanging
-from helpers import cassie
 from helpers.legged import recorded, with_other_bodies
 from helpers.paths import JOBS
 from walkers import G1, ICUB, TALOS, forces, planned

@@ -86,13 +86,12 @@ def timed(step, samples):
 
 
 def ours(bench, estimator, with_mass=False):
-    regressor = InstantRegressor(bench.model, bench.mapping.independent)
-    weight = np.ones(bench.n)
-    state = [estimator.init(bench.c)]
+    columns, weight = bench.mapping.independent, np.ones(bench.n)
+    regressor, state = InstantRegressor(bench.model, columns), [estimator.init(bench.c)]
 
     def step(k):
         Y = regressor(bench.q[k], bench.v[k], bench.a[k])
-        D = regressor.mass(bench.q[k]) if with_mass else None
+        D = mass_regressor(bench.model, bench.q[k : k + 1])[0][..., columns] if with_mass else None
         state[0] = estimator.update(state[0], Sample(Y, bench.tau[k], weight, D))
 
     return step

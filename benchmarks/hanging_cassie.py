@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pinocchio as pin
-from helpers.cassie import ARMATURE, DAMPING, FEET, LIGHT, PASSIVE, SIDES, SPRINGS
+from cassie import ARMATURE, DAMPING, FEET, LIGHT, PASSIVE, SIDES, SPRINGS
 from helpers.legged import followed, multisine
 
 from robotid.robot.closure import Chains

@@ -361,8 +361,7 @@ def base_state(
     pose = np.hstack([pose[:, :3], quaternion])
     if twist is None:
         rate = np.gradient(pose, t, axis=0)
-        vector, scalar = quaternion[:, :3], quaternion[:, 3:]
-        w = 2.0 * (scalar * rate[:, 3:6] - rate[:, 6:] * vector - np.cross(vector, rate[:, 3:6]))
+        w = 2.0 * vector_part(quaternion, rate[:, 3:])
         twist = np.hstack([in_base(quaternion, rate[:, :3]), w])
     if imu is not None:
         down = in_base(quaternion, imu.frame.gravity)
@@ -408,6 +407,13 @@ def in_base(quaternion: Array, vector: Array) -> Array:
     u = np.cross(vector, quaternion[:, :3])
     turned: Array = vector + 2.0 * (quaternion[:, 3:] * u + np.cross(u, quaternion[:, :3]))
     return turned
+
+
+def vector_part(p: Array, rate: Array) -> Array:
+    """Return the vector part of the product p* r of quaternions x y z w, shape (N, 3)."""
+    vector, scalar = p[:, :3], p[:, 3:]
+    part: Array = scalar * rate[:, :3] - rate[:, 3:] * vector - np.cross(vector, rate[:, :3])
+    return part
 
 
 def quaternions_of_angles(angles: Array) -> Array:

@@ -286,29 +286,10 @@ class Trajectory:
         vars(same).update(memory=memory, derived=self.derived)
         return same
 
-    def projected(self, basis: Array, tau: Array, loaded: Array) -> "Trajectory":
-        """Return the same motion without the torques of constraint forces.
-
-        Args:
-            basis: As of ``force_basis``, shape (N, n_rows, m).
-            tau: The remaining torques, shape (N, n_rows) [N m, N].
-            loaded: The torques with them, shape (N, n_rows) [N m, N].
-        """
-        return replace(self, basis=basis, tau=tau, loaded=loaded)
-
     @property
     def squares(self) -> Array:
         """Sums of tau^2, v^2 and a^2 over the samples, shape (3, n)."""
         return np.array([np.einsum("kj,kj->j", x, x) for x in (self.tau, self.v, self.a)])
-
-    def part(self, start: int, stop: int) -> "Trajectory":
-        """Return the samples start to stop.
-
-        Args:
-            start: First sample.
-            stop: Sample after the last one; beyond the end means to the end.
-        """
-        return self.at(slice(start, stop))
 
     def every(self, step: int) -> "Trajectory":
         """Return every n-th sample, without a rate.

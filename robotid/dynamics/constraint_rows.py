@@ -193,7 +193,7 @@ def constrained(
         parts.append(force_basis(np.delete(J, known, axis=1), used[k], floats))
     basis = np.concatenate(parts)
     used = used & (np.sum(basis**2, axis=2) < 1.0 - _RANK)
-    return motion.projected(basis, without_forces(basis, tau), tau), used
+    return replace(motion, basis=basis, tau=without_forces(basis, tau), loaded=tau), used
 
 
 def touching(model: RobotModel, motion: Trajectory) -> Array:

@@ -150,12 +150,6 @@ class InstantRegressor:
         _write_drives(model, q[None], v[None], a[None], None, memory, Y[None, :, size:])
         return Y[:, self._columns]
 
-    def mass(self, q: Array) -> Array:
-        """Return the regressor of the mass matrix, shape (n, n, c); see ``mass_regressor``."""
-        still, unit = np.zeros(len(q)), np.eye(len(q))
-        at_rest = self(q, still, still)
-        return np.stack([self(q, still, a) - at_rest for a in unit], axis=1)
-
 
 def build_problem(
     model: RobotModel,

@@ -148,10 +148,7 @@ def _held_out_error(model: RobotModel, motion: Trajectory, mask: Array, every: i
         for (A, known), (B, unknown) in (parts, parts[::-1]):
             size = np.linalg.norm(A, axis=0)
             size[size == 0] = 1.0
-            X = A / size
-            squared, V = np.linalg.eigh(X.T @ X)  # of singular values
-            kept = squared > _DEPENDENT**2 * squared[-1]
-            theta = V[:, kept] @ (V[:, kept].T @ (X.T @ known) / squared[kept])
+            theta = np.linalg.lstsq(A / size, known, rcond=_DEPENDENT)[0]
             squares += float(np.sum((unknown - B @ (theta / size)) ** 2))
         error[j] = np.sqrt(squares) + _EXACT * np.linalg.norm(tau)
     return error

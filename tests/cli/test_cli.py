@@ -115,11 +115,6 @@ def test_wls_result_without_a_urdf_can_be_validated(arm, arm_logs, tmp_path, cap
     assert found == pytest.approx(100 * wanted, rel=0.1)
 
 
-TAU, Q = "tau_joint_2", "q_joint_2"
-# fmt: off
-# fmt: on
-
-
 WRONG_USE = {
     "unknown estimator": (["--estimator", "magic"], 2, "estimator is 'magic'"),
     "bad gain": (["--gain", "elbow"], 2, "wanted JOINT=NUMBER"),
@@ -155,25 +150,3 @@ def test_demo_runs_from_nothing_and_finds_the_truth(tmp_path, capsys, monkeypatc
     assert len(set(links)) == 4
     assert {name for name in links if (out / name).is_file()} == set(links)
     assert str(out / "report.html") in printed
-
-
-def test_nothing_stays_behind_when_a_run_fails_late(arm_logs, tmp_path, monkeypatch):
-    import robotid.cli.identify
-
-    def broken(*_args, **_options):
-        raise OSError("disk full")
-
-    monkeypatch.setattr(robotid.cli.identify, "write_json", broken)
-    out = tmp_path / "out"
-    words = [
-        "identify",
-        ARM,
-        str(arm_logs / "fit.csv"),
-        "--out",
-        str(out),
-        "--estimator",
-        "wls",
-        *PLAIN,
-    ]
-    assert main(words) == 1
-    assert list(out.iterdir()) == []

@@ -1,8 +1,5 @@
 """`convert` writes what a robot recorded under standard names, or nothing."""
 
-import json
-import subprocess
-import sys
 from dataclasses import replace
 
 import numpy as np
@@ -109,34 +106,3 @@ def test_the_command_refuses_by_name_and_leaves_what_was_there(tmp_path, bag, ca
     assert "run.mcap: logs are written as .csv, " in capsys.readouterr().err
     assert target.read_text() == "precious"
     assert {path.name for path in tmp_path.iterdir()} == {"bag", "run.csv"}
-
-
-FULL_DISK = """
-import contextlib, io, json, resource, sys
-sys.dont_write_bytecode = True  # a cut file would be read by the next process
-from robotid.cli import main
-resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))
-ends = []
-for target in sys.argv[2:]:
-    with contextlib.redirect_stderr(io.StringIO()) as said:
-        ends.append((main(["convert", sys.argv[1], target]), said.getvalue()))
-print(json.dumps(ends))
-"""
-
-
-def test_on_a_full_disk_the_old_file_stays_and_no_part_of_the_new(tmp_path):
-    t, q = np.arange(20_000) / 100, np.random.default_rng(0).normal(size=20_000)
-    np.savez(tmp_path / "in.npz", time=t, q_a=q)
-    suffixes = ("csv", "parquet", "npz", "h5", "hdf5", "mat")
-    targets = [tmp_path / f"out.{suffix}" for suffix in suffixes]
-    for target in targets:
-        write_text("precious", target)
-    command = [sys.executable, "-c", FULL_DISK, tmp_path / "in.npz", *targets]
-    run = subprocess.run(command, capture_output=True, text=True, check=True)
-    for target, (code, said) in zip(targets, json.loads(run.stdout), strict=True):
-        assert code == 1
-        assert said.startswith("robotid: [Errno 27] ")
-        assert said.endswith(f"\n  while writing {str(target)!r}\n")
-        assert target.read_text() == "precious"
-    assert run.stderr == ""
-    assert {*tmp_path.iterdir()} == {tmp_path / "in.npz", *targets}

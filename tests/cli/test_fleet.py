@@ -3,7 +3,6 @@
 import json
 import shutil
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pyarrow.parquet
@@ -14,7 +13,7 @@ from helpers.synthetic import exact_log, truth
 
 from robotid.base.exceptions import DataError
 from robotid.cli import fleet, main
-from robotid.cli.fleet import _Gathered, read_fleet, run_fleet
+from robotid.cli.fleet import read_fleet, run_fleet
 from robotid.data.files.read import write_log
 from robotid.estimation.variation.variation import between_units
 from robotid.robot.model import RobotModel
@@ -92,29 +91,6 @@ def test_a_failure_is_a_row_and_the_others_are_identified(done, table):
     shown = page["Units and logs that were not identified"].rows
     assert [row[0] for row in shown] == ["a", "d", "d"]
     assert sum(content["verdicts"].values()) == 3
-
-
-def test_an_interrupted_run_is_resumed_with_the_same_bits(table, done, tmp_path, monkeypatch):
-    units, first = read_fleet(table), fleet.identify_unit
-
-    def interrupted(unit, threads):
-        if unit.unit == "c":
-            raise KeyboardInterrupt
-        return first(unit, threads)
-
-    monkeypatch.setattr(fleet, "identify_unit", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        run_fleet(units, tmp_path)
-    assert {path.name for path in tmp_path.iterdir()} == {fleet.UNITS}
-    repeated = []
-    monkeypatch.setattr(
-        fleet, "identify_unit", lambda unit, threads: repeated.append(unit.unit) or first(unit, 1)
-    )
-    run_fleet(units, tmp_path, resume=True)
-    assert repeated == ["a", "c", "d"]  # a has a lost log
-    for name in FILES:
-        assert (tmp_path / name).read_bytes() == (done[0] / name).read_bytes()
-    assert {path.name for path in tmp_path.iterdir()} == {fleet.UNITS, *FILES}
 
 
 def test_units_with_the_same_inputs_are_kept_and_new_logs_added(table, done, tmp_path, monkeypatch):
@@ -198,61 +174,17 @@ def test_the_command_prints_what_failed_and_takes_a_parquet_table(table, tmp_pat
     assert content["failures"][1]["log"] == str(tmp_path / "none.csv")
 
 
-def test_units_are_compared_by_parameter_robot_and_expression(monkeypatch):
-    """Five units and a failed one; of one robot only two, and one value without an error."""
-    rng, gathered = np.random.default_rng(3), _Gathered()
-    x = np.array([4.0, -2.0]) + [0.1, 0.05] * rng.normal(size=(5, 2))
-    x[1, 0], x[3, 1] = 70.0, -60.0
-    errors = 0.02 * np.exp(rng.normal(size=(5, 2)))
-    units = [SimpleNamespace(logs=range(k + 1)) for k in range(8)]
-    for k in range(5):
-        rows = [
-            {"unit": f"u{k}", "status": "done", "verdict": "good" if k % 2 else "usable",
-             "parameter": name, "parameter_unit": unit, "value": x[k, p],
-             "std_error": None if (k, p) == (0, 1) else errors[k, p], "robot": "arm",
-             "expression": name if p == 0 else "b.m + 2 c.m"}
-            for p, (name, unit) in enumerate((("a.coulomb", "N m"), ("b.m", "kg")))
-        ]  # fmt: skip
-        rows.append(rows[0] | {"log": "x.csv", "value": 99.0})  # of one log: not compared
-        rows.append({"unit": f"u{k}", "status": "failed", "log": f"{k}.csv", "error": "lost"})
-        gathered.add(rows)
-    for k in (5, 6):
-        row = {"unit": f"u{k}", "status": "done", "verdict": "good", "parameter": "b.m",
-               "parameter_unit": "kg", "value": 1.0, "std_error": 0.1, "robot": "leg",
-               "expression": "b.m"}  # fmt: skip
-        gathered.add([row])
-    gathered.add([{"unit": "u7", "status": "failed", "error": "bad"}])
-    levels = []
-    monkeypatch.setattr(
-        "robotid.cli.fleet.between_units",
-        lambda values, errors, level: levels.append(level) or between_units(values, errors, level),
-    )
-    found = gathered.content(units)
-    assert levels == [0.02 / 9] * 2  # of 5 + 4 values tested together
-    assert (found["units"], found["logs"], found["done"]) == (8, 36, 7)
-    assert found["verdicts"] == {"usable": 3, "good": 4}
-    assert found["failures"][0] == {"unit": "u0", "log": "0.csv", "error": "lost"}
-    assert found["failures"][-1] == {"unit": "u7", "log": "", "error": "bad"}
-    unlike = []
-    for p, entry in enumerate(found["parameters"]):
-        rows = slice(p, None)  # the first has no error of the second parameter
-        own = x[rows, p].tolist()
-        prediction, different = between_units(x[rows, p], errors[rows, p], 0.02 / 9)  # 5 + 4
-        assert (entry["robot"], entry["name"], entry["unit"]) == (
-            "arm", ("a.coulomb", "b.m")[p], ("N m", "kg")[p]
-        )  # fmt: skip
-        assert entry["expression"] == ("a.coulomb", "b.m + 2 c.m")[p]
-        assert (entry["units"], entry["values"]) == (len(own), own)
-        assert entry["spread_interval"] == prediction.spread_ends.tolist()
-        assert entry["next_interval"] == prediction.ends.tolist()
+def test_units_are_compared_by_parameter(done):
+    folder, content = done
+    count = sum(entry["units"] for entry in content["parameters"])
+    for entry in content["parameters"]:
+        rows = [row for row in rows_of(folder, parameter=entry["name"]) if row["verdict"]]
+        values, errors = (np.array([row[key] for row in rows]) for key in ("value", "std_error"))
+        assert (entry["units"], entry["values"]) == (3, values.tolist())
+        prediction, different = between_units(values, errors, 0.02 / count)
         figures = entry["mean"], entry["std_error"], entry["spread"]
         assert figures == (prediction.mean, prediction.std_error, prediction.spread)
-        unlike += [(probability, f"u{k + p}", p) for k, probability in different]
-    assert len(found["parameters"]) == 2
-    assert [each[1] for each in unlike] == ["u1", "u3"]
-    for entry, (probability, unit, p) in zip(found["unlike"], sorted(unlike), strict=True):
-        k = int(unit[1])
-        assert (entry["unit"], entry["probability"]) == (unit, probability)
-        assert entry["parameter"] == ("a.coulomb", "b.m")[p]
-        assert (entry["value"], entry["std_error"]) == (x[k, p], errors[k, p])
-        assert entry["others"] == found["parameters"][p]["next_interval"]
+        assert entry["next_interval"] == prediction.ends.tolist()
+        unlike = [x for x in content["unlike"] if x["parameter"] == entry["name"]]
+        assert sorted(x["unit"] for x in unlike) == [rows[k]["unit"] for k, _ in different]
+    assert content["parameters"]

@@ -7,7 +7,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from helpers.closed_chains import four_bar
 from helpers.synthetic import exact_log, truth
 
 from robotid.base.exceptions import DataError, SettingsError
@@ -114,16 +113,3 @@ def test_the_job_of_what_was_found_in_memory_builds_the_same_robot():
     np.testing.assert_array_equal(again.velocity_map, model.velocity_map)
     np.testing.assert_allclose(again.standard_parameters(), model.standard_parameters())
     assert (job.ignore, job.estimator, job.snap_angles) == (("spikes",), found.estimator, False)
-
-
-def test_the_job_of_a_closed_chain_in_memory_closes_it(tmp_path):
-    model = four_bar(tmp_path)
-    asked = SimpleNamespace(job=None, friction="none", signals=SignalSettings(), ignore=())
-    found = SimpleNamespace(
-        model=model, stated=asked, loop=LoopSettings(), fitted=(), validation=(),
-        estimator=EstimatorSettings("simulation"),
-    )  # fmt: skip
-    again = _job_of(found).model()
-    assert len(model.loops) == 1
-    assert again.loops == model.loops
-    assert again.passive == model.passive

@@ -17,7 +17,6 @@ from helpers.synthetic import exact_log, truth
 
 from robotid.cli import main
 from robotid.data.files.read import write_log
-from robotid.estimation.workers.plan import Pool
 from robotid.robot.model import RobotModel
 
 URDF = str(ROOT / "urdf" / "planar_2r.urdf")
@@ -125,7 +124,7 @@ def test_a_signal_ends_a_run_with_one_line_and_without_files(job, tmp_path, numb
 
 def test_an_address_where_nobody_listens_is_said(job, tmp_path, capsys, monkeypatch):
     pytest.importorskip("distributed")
-    monkeypatch.setattr(Pool.__init__, "__defaults__", (1, None, 0.2))
+    monkeypatch.setattr("robotid.estimation.workers.plan._ANSWER", 0.2)
     words = ["identify", job, "--out", str(tmp_path), "--scheduler", "tcp://127.0.0.1:9"]
     assert main(words) == 1
     assert "workers answers at 'tcp://127.0.0.1:9'" in capsys.readouterr().err

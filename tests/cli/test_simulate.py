@@ -1,6 +1,5 @@
 """`simulate` writes a log and what it was made from; identify finds that again."""
 
-import argparse
 import json
 import re
 
@@ -8,20 +7,11 @@ import numpy as np
 import pytest
 
 from robotid.base.files import file_sha256
-from robotid.cli import main, simulate
+from robotid.cli import main
 from robotid.data.files.formats import write_columns
 from robotid.data.files.read import read_log
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.simulation.motions import SampledMotion, random_fourier
-from robotid.dynamics.simulation.simulation_settings import (
-    Actuator,
-    Controller,
-    Noise,
-    Payload,
-    Sensors,
-    Simulation,
-    Truth,
-)
 from robotid.identification.pipeline import identify
 from robotid.output.files.urdf import load_identified
 from robotid.robot.examples import example_urdf
@@ -176,23 +166,6 @@ def test_a_robot_that_cannot_be_a_urdf_leaves_no_file(folder, capsys):
     assert code == 1
     assert "would be physically impossible" in " ".join(capsys.readouterr().err.split())
     assert not list(folder.glob("never*"))
-
-
-def test_every_flag_states_its_setting():
-    words = {"seed": "7", "rate": "50", "duration": "3", "perturb": "0.3", "controller": "pd",
-             "torque-noise": "0.02", "limits": "0.4", "payload": "1.5"}  # fmt: skip
-    parser = argparse.ArgumentParser()
-    simulate.add_flags(parser)
-    flags = [word for name, value in words.items() for word in (f"--{name}", value)]
-    robot = ["--lock", "wrist_3_joint=0.25", "--time-unit", "ms"]
-    files = ["arm.urdf", "motion.csv", "--out", "log.csv"]
-    job, settings = simulate.simulation_from_flags(parser.parse_args([*files, *flags, *robot]))
-    assert settings == Simulation(
-        seed=7, rate=50.0, duration=3.0, truth=Truth(inertials=0.3), controller=Controller("pd"),
-        sensors=Sensors(noise=Noise(tau=0.02)), actuator=Actuator(effort=0.4),
-        payload=Payload(mass=1.5),
-    )  # fmt: skip
-    assert (job.locked, job.units.time) == ({"wrist_3_joint": 0.25}, "ms")
 
 
 def test_a_limit_and_a_load_do_what_they_say_and_the_truth_states_it(arm, tmp_path):

@@ -233,22 +233,6 @@ def test_a_step_is_compared_with_those_on_both_sides_of_it(rng, is_later):
     assert pose_jumps(t, pose)[0].tolist() == []
 
 
-def test_columns_of_a_base_may_have_other_names(log, tmp_path):
-    write_log(log, tmp_path / "log.csv")
-    names = {"base_qy": "q2", "base_wz": "yaw_rate", "base_alx": "d", "contact_r_sole": "right"}
-    names["wrench_fz_l_sole"] = "F"
-    text = (tmp_path / "log.csv").read_text()
-    for standard, own in names.items():
-        assert text.count(standard) == 1
-        text = text.replace(standard, own)
-    (tmp_path / "log.csv").write_text(text)
-    again = read_log(tmp_path / "log.csv", log.joints, base=WANTED, columns=names)
-    for name in ("pose", "twist", "acceleration"):
-        np.testing.assert_allclose(getattr(again.base, name), getattr(log.base, name), atol=1e-15)
-    np.testing.assert_array_equal(again.contacts["r_sole"], log.contacts["r_sole"])
-    np.testing.assert_array_equal(again.wrenches["fz l_sole"], log.wrenches["fz l_sole"])
-
-
 @pytest.mark.parametrize("velocity", ["measured", "differentiated"])
 @pytest.mark.parametrize("acceleration", ["measured", "differentiated"])
 def test_velocities_and_accelerations_of_a_base_are_measured_where_those_of_joints_are(

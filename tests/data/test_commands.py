@@ -6,7 +6,7 @@ import pytest
 from helpers.recorders import wide
 
 from robotid.base.exceptions import DataError
-from robotid.data.files.column_names import quantity_of
+from robotid.data.files.columns import quantity_of
 from robotid.data.files.read import read_log, read_logs
 from robotid.data.log import Log
 from robotid.data.signal_settings import LogUnits

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.signal import butter, savgol_filter, sosfiltfilt
 
-from robotid.data.filters import butterworth_poles, local_polynomial, zero_phase
+from robotid.data.signals import butterworth_poles, local_polynomial, zero_phase
 
 
 @pytest.mark.parametrize("order", [1, 2, 3, 4, 5, 8])

@@ -58,25 +58,6 @@ def test_the_sign_is_filtered_before_rows_are_left_out(ur5):
     np.testing.assert_allclose(coarse.direction[1:], fine.direction[same], atol=1e-9)
 
 
-def test_each_coulomb_column_holds_its_own_direction(rng):
-    model = RobotModel.from_urdf(example_urdf("ur5_robot.urdf"), couplings=(MOTOR,))
-    q, v, a = rng.uniform(-1, 1, (3, 5, 6))
-    direction = rng.uniform(-1, 1, (5, 7))
-    Y = joint_torque_regressor(model, q, v, a, direction).reshape(5, 6, -1)
-    plain = joint_torque_regressor(model, q, v, a).reshape(5, 6, -1)
-    for k, name in enumerate(model.layout.names):
-        owner, term = name.rsplit(".", 1)
-        expected = plain[:, :, k]
-        if term == "coulomb":
-            expected = np.zeros((5, 6))
-            if owner == "motor":
-                expected[:, 4], expected[:, 5] = direction[:, 6], -0.5 * direction[:, 6]
-            else:
-                j = model.joints.index(owner)
-                expected[:, j] = direction[:, j]
-        np.testing.assert_array_equal(Y[:, :, k], expected)
-
-
 # --- which way friction acts ----------------------------------------------------------------------
 
 T = np.linspace(-1.0, 1.0, 401)

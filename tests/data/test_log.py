@@ -165,7 +165,7 @@ def test_some_samples_of_a_trajectory_cannot_be_changed_either_and_keep_nothing_
     whole.derived["inertial rows"] = "of all"
     rows = {"part": slice(7, 20), "every": slice(None, None, 9), "at": np.array([3, 400])}
     for some, own in zip(
-        [whole.part(7, 20), whole.every(9), whole.at(rows["at"])], rows.values(), strict=True
+        [whole.at(slice(7, 20)), whole.every(9), whole.at(rows["at"])], rows.values(), strict=True
     ):
         assert some.derived == {}
         for name in ("t", "q", "v", "a", "tau", "segment", "direction", "memory"):
@@ -173,7 +173,7 @@ def test_some_samples_of_a_trajectory_cannot_be_changed_either_and_keep_nothing_
             np.testing.assert_array_equal(found, getattr(whole, name)[own])
             with pytest.raises(ValueError, match="read-only"):
                 found[0] = 1
-    assert (whole.part(7, 20).rate, whole.every(9).rate) == (100.0, None)
+    assert (whole.at(slice(7, 20)).rate, whole.every(9).rate) == (100.0, None)
     other = whole.with_states(None)
     assert (other.memory, other.derived, whole.memory is memory) == (None, whole.derived, True)
 

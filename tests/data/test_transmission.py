@@ -86,19 +86,6 @@ def test_joints_of_a_transmission_are_all_read(tmp_path, motion):
         read_log(path, JOINTS[:2], transmissions=MOTORS)
 
 
-def test_the_recording_of_a_real_wrist_is_the_same_from_either_side(recordings):
-    joints = tuple(f"joint_{i}" for i in range(1, 7))
-    folder = recordings / "tx40"
-    R = np.diag([32.0, 32.0, 45.0, -48.0, 45.0, 32.0])
-    R[5, 4] = 32.0
-    zeros = (0.0, -np.pi / 2, np.pi / 2, 0.0, 0.0, 0.0)
-    gear = Transmission(joints=joints, matrix=R.tolist(), offset=zeros)
-    wanted = read_log(folder / "joint_side.parquet", joints)
-    found = read_log(folder / "motor_side.parquet", joints, transmissions=[gear])
-    np.testing.assert_allclose(found.q, wanted.q, atol=1e-9)
-    np.testing.assert_allclose(found.tau, wanted.tau, atol=1e-9)
-
-
 def test_motors_of_several_joints_drive_in_the_place_of_the_joints_without_their_own():
     assert Transmission(**WRIST).shared == {"wrist": (("elbow", 1.0), ("wrist", -30.0 / 32.0))}
     assert Transmission(**WRIST).gears == {"elbow": 45.0, "wrist": 32.0}

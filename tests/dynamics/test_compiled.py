@@ -11,7 +11,6 @@ from robotid.dynamics.drive_columns import friction_speeds
 from robotid.dynamics.factors import compress
 from robotid.dynamics.rows import COMPILED, TrajectoryRows
 from robotid.dynamics.torque import build_problem, joint_torque_regressor
-from robotid.estimation.estimators import WLS
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 
@@ -100,24 +99,6 @@ def test_factors_do_not_depend_on_the_number_of_threads(panda, long_log):
     np.testing.assert_array_equal(one.R, two.R)
     np.testing.assert_array_equal(one.R, three.R)
     np.testing.assert_array_equal(one.R, compress(problem).R)
-
-
-def test_estimates_are_the_same_on_both_paths_and_from_whole_blocks(panda, long_log):
-    mapping = structural_mapping(panda)
-    problems = [build_problem(panda, *long_log, compiled=flag) for flag in (True, False)]
-    problems = [mapping.reduce(problem) for problem in problems]
-    blocks = type(problems[1])(
-        problems[1].stream, problems[1].names, problems[1].n_joints, problems[1].support
-    )
-    fits = [WLS().fit(problem) for problem in [*problems, blocks]]
-    for fit in fits[1:]:
-        scale = np.abs(fit.theta).max()
-        np.testing.assert_allclose(fits[0].theta, fit.theta, atol=1e-12 * scale)
-        np.testing.assert_allclose(fits[0].std_error, fit.std_error, rtol=1e-11)
-    counts = [compress(problem).rows for problem in [*problems, blocks]]
-    np.testing.assert_array_equal(counts[0], (long_log[1] > 0).sum(axis=0))
-    np.testing.assert_array_equal(counts[0], counts[1])
-    np.testing.assert_array_equal(counts[0], counts[2])
 
 
 @pytest.mark.parametrize("flag", [True, False])

@@ -157,7 +157,7 @@ def test_forces_are_those_of_least_squares_over_the_rows_used(quadruped, rng):
     )  # fmt: skip
     used = rng.random((3, 18)) < 0.8
     J = constraint_jacobian(quadruped, q, np.column_stack([flags, np.ones(3, dtype=bool)]))
-    for own in (motion, motion.projected(np.zeros((3, 18, 1)), projected, tau)):
+    for own in (motion, replace(motion, basis=np.zeros((3, 18, 1)), tau=projected, loaded=tau)):
         found = constraint_forces(quadruped, own, torque, used)
         np.testing.assert_array_equal(found[:, [11, 12]], motion.wrenches)
         for k in range(3):

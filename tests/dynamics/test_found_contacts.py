@@ -149,15 +149,3 @@ def test_forces_are_found_beside_a_measured_one_whatever_is_up(robot, axes):
     assert [x.frame for x in found] == [FEET[0], FEET[2], FEET[3]]
     for contact, k in zip(found, (0, 2, 3), strict=True):
         np.testing.assert_allclose(contact.force, f[3 * k : 3 * k + 3] @ up, rtol=2e-3)
-
-
-def of_feet(rng, drift):
-    """Return contact, force, height and velocity of four feet, of which three or one touch."""
-    touches = np.arange(900)[:, None] // 50 % 4 == np.arange(4)
-    touches[300:] ^= True
-    force = np.where(touches, 0.33, 0.0) + 0.11 * rng.normal(size=(900, 4))
-    height = np.where(touches, 0.0, 0.03) + 0.014 * rng.normal(size=(900, 4))
-    speed = 10.0 ** (np.where(touches, -1.0, -0.3) + 0.3 * rng.normal(size=(900, 4)))
-    way = rng.normal(size=(900, 4, 3))
-    way *= (speed / np.linalg.norm(way, axis=2))[..., None]
-    return touches, force, height, way + drift

@@ -63,7 +63,7 @@ def test_what_is_kept_is_of_one_robot_and_goes_with_its_motion_alone(ur5, rng, m
     other = RobotModel.from_urdf(ur5.tree.path, gravity=(0.0, 0.0, 3.0))
     assert kept_rows(other, trajectory) is None
     assert kept_rows(ur5, replace(trajectory, q=trajectory.q + 0.1)) is None
-    assert kept_rows(ur5, trajectory.part(0, 20)) is None
+    assert kept_rows(ur5, trajectory.at(slice(0, 20))) is None
     keep_inertial_rows(other, trajectory)  # those of the last robot stay
     assert kept_rows(ur5, trajectory) is None
     monkeypatch.setattr(rows, "_MOST_BYTES", 8 * 40 * 209)  # bytes; a UR5 has 210 columns

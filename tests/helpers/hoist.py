@@ -200,21 +200,10 @@ def record(
     path, hoist, seed, *, seconds, rate, start=0.0, noise=1.0, scale=None, velocity=False,
     speed=1.0, kind="tau", cut=(),
 ):  # fmt: skip
-    """Write a log as CSV with its own names of columns, and return (t, q, v, a, tau without noise).
+    """Write a log as CSV, and return (t, q, v, a, tau without noise).
 
-    Args:
-        path: The file.
-        hoist: The robot.
-        seed: Of motion and noise.
-        seconds: Length [s].
-        rate: [Hz].
-        start: First time stamp [s].
-        noise: Times the noise of every torque.
-        scale: Factor of columns by their first letters, as {"time": 1e3}: other units.
-        velocity: Whether velocities are logged.
-        speed: Of the motion.
-        kind: First letters of the torques.
-        cut: First and last row that are lost.
+    Noise and speed are factors; scale has factors of columns by their first letters, as
+    {"time": 1e3}; kind is the first letters of torques; cut, the first and last row that are lost.
     """
     t = np.arange(round(seconds * rate)) / rate
     q, v, a = motion(hoist.joints, seed, t, speed)
@@ -341,11 +330,7 @@ def _rubbed(admittance, free, most):
 def follow(hoist, loop, wanted, *, step=5e-4):
     """Return positions, velocities and torques of a robot that follows commands, shape (N, n).
 
-    Args:
-        hoist: The robot; of its drives armature, viscous, coulomb and offset count.
-        loop: How it is controlled; of torques as functions of time none.
-        wanted: Commands at each step, shape (N, n).
-        step: [s], semi-implicit.
+    Commands are wanted at each step, (N, n); of drives armature, viscous, coulomb and offset count.
     """
     model = hoist.model()
     data = model.createData()

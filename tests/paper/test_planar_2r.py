@@ -93,13 +93,6 @@ def test_mass_matrix_and_velocity_vector_equal_pinocchio():
         np.testing.assert_allclose(velocity_vector(q, v, P), C, rtol=1e-12, atol=1e-12)
 
 
-def test_gravity_does_no_work_on_the_arm():
-    model = pin.buildModelFromXML(urdf_text())
-    data = model.createData()
-    for q, _, _ in states(20):
-        np.testing.assert_allclose(pin.computeGeneralizedGravity(model, data, q), 0.0, atol=1e-13)
-
-
 # --- D, C and G say the same ------------------------------------------------------------------
 
 
@@ -190,15 +183,6 @@ def test_closed_form_columns_span_what_pinocchios_do():
     assert stacked_rank(both) == 4
 
 
-def test_five_columns_find_p3_equal_to_p4_on_a_rigid_arm():
-    model = pin.buildModelFromXML(urdf_text())
-    data = model.createData()
-    W = np.vstack([regressor(*state, form="corrected_five") for state in states(50)])
-    tau = np.concatenate([pin.rnea(model, data, *state).copy() for state in states(50)])
-    P = np.linalg.lstsq(W, tau, rcond=None)[0]
-    np.testing.assert_allclose(P, [22.0, 5.0, 3.0, 3.0, 0.1], rtol=1e-11)
-
-
 # --- URDF -------------------------------------------------------------------------------------
 
 
@@ -219,14 +203,6 @@ def test_urdf_keeps_every_digit_and_moves_to_the_proximal_frames(links):
 
 
 # --- program motion ---------------------------------------------------------------------------
-
-
-def test_program_motion_goes_from_rest_to_rest():
-    A = np.array([1.0, -1.5])
-    q, v, a = program_motion(np.array([-1.0, 0.0, 1.0, 2.0, 3.0]), A, 2.0)
-    np.testing.assert_allclose(q, np.outer([0, 0, 0.5, 1, 1], A), atol=1e-15)
-    np.testing.assert_allclose(v, np.outer([0, 0, 15 / 16, 0, 0], A), atol=1e-15)
-    np.testing.assert_allclose(a, np.zeros((5, 2)), atol=1e-15)
 
 
 def test_program_motion_has_the_coefficients_of_equation_28():

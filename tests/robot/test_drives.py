@@ -335,11 +335,6 @@ def test_a_trajectory_without_its_memory_is_refused(rng):
     )
 
 
-def test_terms_are_read_back_from_plain_values(term):
-    if term.name not in TERMS:
-        assert term_from_dict(term.to_dict()) == term
-
-
 @pytest.mark.parametrize(
     ("table", "message"),
     [
@@ -459,22 +454,6 @@ def test_friction_by_position_is_a_power_of_it():
         np.testing.assert_allclose(slope, order * (q - 0.3) ** max(order - 1, 0))
     units = [PositionCoulomb(order=k).units for k in range(3)]
     assert units == [("N m", "N"), ("N m/rad", "N/m"), ("N m/rad^2", "N/m^2")]
-
-
-def test_ripple_is_a_cosine_or_a_sine():
-    q = np.linspace(-2.0, 2.0, 9)
-    (c, dc), (s, ds) = (Harmonic.position_law(q, 2.5, x) for x in (0.0, 1.0))
-    np.testing.assert_allclose([c, ds / 2.5], [np.cos(2.5 * q)] * 2)
-    np.testing.assert_allclose([s, -dc / 2.5], [np.sin(2.5 * q)] * 2)
-
-
-def test_a_lever_that_is_not_described_hangs_at_the_zero_position():
-    """Arms of 0.1 and 0.5 m, a spring without length at rest: tau = k a b sin q."""
-    z = np.array([-2.0, 0.0, 0.7])
-    term = Counterbalance()
-    y, slope = term.position_law(z, term.arm, term.base, term.angle, term.rest)
-    np.testing.assert_allclose(y, 0.05 * np.sin(z), atol=1e-15)
-    np.testing.assert_allclose(slope, 0.05 * np.cos(z))
 
 
 def test_bristles_keep_what_the_solution_of_their_equation_keeps():

@@ -19,7 +19,7 @@ from robotid.base.exceptions import DataError, MissingDependencyError
 from robotid.base.findings import listed
 from robotid.base.typing import Array
 from robotid.data.base_motion import ACCELERATION, POSE, TWIST, in_base
-from robotid.data.files.column_names import is_quantity
+from robotid.data.files.columns import is_quantity
 from robotid.data.files.table import Format, Table, choose, parsing
 from robotid.data.log import suggestion
 from robotid.data.signal_settings import LogSource

@@ -10,6 +10,7 @@ from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -431,10 +432,8 @@ def _sensors_of(bag: _Bag) -> list[_Sensor]:
             )
     sensors = []
     for topic in stated or sorted(types):
-        make = _low_state if _is_low_state(types[topic]) else _SENSORS.get(types[topic])
-        if make is not None:
-            columns, values = make(next(bag.messages(topic))[1])
-            sensors.append(_Sensor(topic, tuple(columns), values))
+        if types[topic] in _SENSORS or _is_low_state(types[topic]):
+            sensors.append(_sensor(topic, types[topic], next(bag.messages(topic))[1]))
     return sensors
 
 
@@ -512,55 +511,41 @@ def _first_of(message: Any, *names: str) -> Any:  # noqa: ANN401
     return next((getattr(message, name) for name in names if hasattr(message, name)), None)
 
 
-def _xyz(vector: Any) -> list[float]:  # noqa: ANN401
-    return [vector.x, vector.y, vector.z]
+def _parts(path: str, ends: Sequence[str] = "xyz") -> list[str]:
+    return [f"{path}.{end}" for end in ends]
 
 
-def _xyzw(quaternion: Any) -> list[float]:  # noqa: ANN401
-    return [*_xyz(quaternion), quaternion.w]
+_ODOMETRY, _IMU = "nav_msgs/msg/Odometry", "sensor_msgs/msg/Imu"
+#: Values of a message, in the order of the columns: twist with the axes of the child frame, wrench
+#: with the axes and the origin of the frame of the header.
+_SENSORS = {
+    _ODOMETRY: [
+        *_parts("pose.pose.position"), *_parts("pose.pose.orientation", "xyzw"),
+        *_parts("twist.twist.linear"), *_parts("twist.twist.angular"),
+    ],
+    _IMU: [
+        *_parts("orientation", "xyzw"), *_parts("angular_velocity"), *_parts("linear_acceleration"),
+    ],
+    "geometry_msgs/msg/WrenchStamped": [*_parts("wrench.force"), *_parts("wrench.torque")],
+}  # fmt: skip
 
 
-#: Columns of the messages of a topic, and their values in a message.
-_Values = tuple[list[str], Callable[[Any], Sequence[float]]]
+def _sensor(topic: str, kind: str, first: Any) -> _Sensor:  # noqa: ANN401
+    """Return the columns of a topic from its first message."""
+    if _is_low_state(kind):
+        return _low_state(topic, first)
+    fields = _SENSORS[kind]
+    columns = [f"base_{end}" for end in (*POSE, *TWIST)]
+    if kind == _IMU:  # a covariance of -1 marks what is not measured
+        places = [k for k, x in enumerate(fields)
+                  if getattr(first, f"{x.partition('.')[0]}_covariance")[0] != -1.0]  # fmt: skip
+        columns, fields = [f"imu_{IMU[k]}" for k in places], [fields[k] for k in places]
+    elif kind != _ODOMETRY:
+        columns = [f"wrench_{part}_{first.header.frame_id.lstrip('/')}" for part in _WRENCH]
+    return _Sensor(topic, tuple(columns), attrgetter(*fields) if fields else lambda _: ())
 
 
-def _odometry(first: Any) -> _Values:  # noqa: ANN401
-    """Return pose in the frame of the header, and twist with the axes of the child frame."""
-
-    def values(message: Any) -> list[float]:  # noqa: ANN401
-        pose, twist = message.pose.pose, message.twist.twist
-        place = [*_xyz(pose.position), *_xyzw(pose.orientation)]
-        return [*place, *_xyz(twist.linear), *_xyz(twist.angular)]
-
-    return [f"base_{end}" for end in (*POSE, *TWIST)], values
-
-
-def _imu(first: Any) -> _Values:  # noqa: ANN401
-    """Return orientation, angular velocity and specific force; -1 marks what is not measured."""
-    parts = {
-        "orientation": (IMU[:4], _xyzw),
-        "angular_velocity": (IMU[4:7], _xyz),
-        "linear_acceleration": (IMU[7:], _xyz),
-    }
-    known = [name for name in parts if getattr(first, f"{name}_covariance")[0] != -1.0]
-
-    def values(message: Any) -> list[float]:  # noqa: ANN401
-        return [x for name in known for x in parts[name][1](getattr(message, name))]
-
-    return [f"imu_{end}" for name in known for end in parts[name][0]], values
-
-
-def _wrench(first: Any) -> _Values:  # noqa: ANN401
-    """Return force and moment with the axes and the origin of the frame of the header."""
-    frame = first.header.frame_id.lstrip("/")
-
-    def values(message: Any) -> list[float]:  # noqa: ANN401
-        return [*_xyz(message.wrench.force), *_xyz(message.wrench.torque)]
-
-    return [f"wrench_{part}_{frame}" for part in _WRENCH], values
-
-
-def _low_state(first: Any) -> _Values:  # noqa: ANN401
+def _low_state(topic: str, first: Any) -> _Sensor:  # noqa: ANN401
     """Return the IMU, whose quaternion starts with w, and the forces of the feet, if any."""
 
     def feet(message: Any) -> list[float]:  # noqa: ANN401
@@ -573,11 +558,4 @@ def _low_state(first: Any) -> _Values:  # noqa: ANN401
         return [*xyz, w, *imu.gyroscope, *imu.accelerometer, *feet(message)]
 
     forces = [f"foot_force_{k}" for k in range(len(feet(first)))]
-    return [*(f"imu_{end}" for end in IMU), *forces], values
-
-
-_SENSORS: dict[str, Callable[[Any], _Values]] = {
-    "nav_msgs/msg/Odometry": _odometry,
-    "sensor_msgs/msg/Imu": _imu,
-    "geometry_msgs/msg/WrenchStamped": _wrench,
-}
+    return _Sensor(topic, (*(f"imu_{end}" for end in IMU), *forces), values)

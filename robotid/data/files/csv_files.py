@@ -16,7 +16,7 @@ import numpy as np
 from robotid.base.exceptions import DataError
 from robotid.base.findings import quoted
 from robotid.base.typing import Array
-from robotid.data.files.column_names import named_by_row
+from robotid.data.files.columns import named_by_row
 from robotid.data.files.table import Format, Place, RowReader, Table
 from robotid.data.signal_settings import LogSource
 

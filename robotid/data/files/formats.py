@@ -10,8 +10,7 @@ from robotid.base.typing import Array
 from robotid.data.files.arrays import HDF5, MAT, NPZ
 from robotid.data.files.bags import BAG
 from robotid.data.files.csv_files import CSV
-from robotid.data.files.lerobot import LEROBOT
-from robotid.data.files.parquet_files import PARQUET
+from robotid.data.files.parquet_files import LEROBOT, PARQUET
 from robotid.data.files.table import (
     Format,
     Table,

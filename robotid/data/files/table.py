@@ -19,7 +19,7 @@ import numpy as np
 from robotid.base.exceptions import DataError, RobotIdError
 from robotid.base.findings import listed
 from robotid.base.typing import Array
-from robotid.data.files.column_names import is_clock, named_by_row, quantity_of
+from robotid.data.files.columns import is_clock, named_by_row, quantity_of
 from robotid.data.log import suggestion
 from robotid.data.signal_settings import LogSource
 

@@ -369,7 +369,7 @@ class Segments:
         rows = row_mask(self.model, thin, self.min_velocity)
         problem = base_problem(self.model, self.mapping, thin, rows, compiled=False)
         for i, factors in enumerate(compress_segments(problem, length)):
-            part = thin.part(i * length, (i + 1) * length)
+            part = thin.at(slice(i * length, (i + 1) * length))
             yield Reduction(factors, part.squares, len(part.t))
 
 

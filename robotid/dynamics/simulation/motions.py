@@ -8,7 +8,7 @@ import numpy as np
 
 from robotid.base.exceptions import DataError, SettingsError
 from robotid.base.typing import Array
-from robotid.data.base_motion import in_base
+from robotid.data.base_motion import in_base, vector_part
 from robotid.robot.model import RobotModel
 
 _ORDER = 5  # of the polynomials through samples
@@ -162,8 +162,8 @@ class FloatingMotion(Motion):
         p, dp, ddp = x[:, 3:7], rate[:, 3:7], change[:, 3:7]
         square = np.sum(p**2, axis=1, keepdims=True)
         unit = p / np.sqrt(square)
-        w = 2.0 * _vector_part(p, dp) / square
-        alpha = 2.0 * _vector_part(p, ddp) / square
+        w = 2.0 * vector_part(p, dp) / square
+        alpha = 2.0 * vector_part(p, ddp) / square
         alpha -= 2.0 * np.sum(p * dp, axis=1, keepdims=True) / square * w
         v = in_base(unit, rate[:, :3])
         a = in_base(unit, change[:, :3]) - np.cross(w, v)
@@ -172,13 +172,6 @@ class FloatingMotion(Motion):
             np.hstack([v, w, rate[:, 7:]]),
             np.hstack([a, alpha, change[:, 7:]]),
         )
-
-
-def _vector_part(p: Array, rate: Array) -> Array:
-    """Return the vector part of the product p* r of quaternions x y z w, shape (N, 3)."""
-    vector, scalar = p[:, :3], p[:, 3:]
-    part: Array = scalar * rate[:, :3] - rate[:, 3:] * vector - np.cross(vector, rate[:, :3])
-    return part
 
 
 def random_fourier(

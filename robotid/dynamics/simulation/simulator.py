@@ -12,7 +12,7 @@ from robotid.base.typing import Array, ProgressCallback, ignore_progress
 from robotid.data.log import Log, Trajectory
 from robotid.dynamics.prediction import predict, remember
 from robotid.dynamics.simulation.motions import FloatingMotion, Motion
-from robotid.dynamics.simulation.sensors import Run, measure
+from robotid.dynamics.simulation.sensors import Run, measure, supported
 from robotid.dynamics.simulation.simulation_settings import (
     Actuator,
     Controller,
@@ -21,7 +21,6 @@ from robotid.dynamics.simulation.simulation_settings import (
     Simulation,
     by_joint,
 )
-from robotid.dynamics.simulation.stand import supported
 from robotid.robot.bodies import link_transfer
 from robotid.robot.drive_term import DriveTerm, MemorylessTerm
 from robotid.robot.drives import Bristles, Coulomb, Lag, Offset, Viscous

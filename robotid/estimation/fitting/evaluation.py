@@ -385,7 +385,7 @@ def _score(
         start, stop, _ = whole.shown.indices(len(motion.t))
         stored = {name: torque[start:stop] for name, torque in torques.items()}
         # the whole motion is used as it is, with its cached properties
-        part = motion if stop - start == len(motion.t) else motion.part(start, stop)
+        part = motion if stop - start == len(motion.t) else motion.at(slice(start, stop))
         shown = ((part, mask[start:stop], stored),)
     recorded = np.hstack([rows.positions, rows.torques])
     measured = mask & [name not in model.passive for name in model.row_names]

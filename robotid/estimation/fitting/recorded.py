@@ -173,7 +173,7 @@ class Recordings:
         """Yield the reduction of each segment of a log in memory."""
         motion, length = self.fitted[k].whole.trajectory, self.segment_length(k)
         for i, factors in enumerate(self.segments(k, motion)):
-            part = motion.part(i * length, (i + 1) * length)
+            part = motion.at(slice(i * length, (i + 1) * length))
             yield Reduction(factors, part.squares, len(part.t))
 
     def _whole(self, k: int) -> Iterator[Reduction]:

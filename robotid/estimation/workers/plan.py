@@ -44,6 +44,7 @@ _ATTEMPTS = (3, 2)
 # calls that remove and unregister it, the resource tracker warns of a leak.
 _FEEDER = "QueueFeederThread"
 _PATIENCE = 5.0  # largest time to wait for this thread [s]
+_ANSWER = 30.0  # ... for a worker of a cluster [s]
 
 
 class Workload(Protocol):
@@ -72,20 +73,24 @@ _Outcome: TypeAlias = tuple[Any, list[tuple[str, int, str]]]
 
 @dataclass
 class WorkPlan:
-    """Distribution of work on pieces; it never changes a result.
+    """Distribution of work on pieces: in this process, worker processes or a Dask cluster.
 
-    As a context manager, it reuses its workers until the context ends.
+    It never changes a result. As a context manager, it reuses its workers until the context ends.
+    They end with the process that started them. The workers of a cluster must be able to read the
+    logs under the same path.
     """
 
     workers: int | None = 1  # worker processes; None: one per core for long work
     scheduler: str | None = None  # address of a Dask scheduler, whose workers are used instead
     progress: ProgressCallback | None = None  # called with work, samples done, total, "samples"
-    _pool: "Pool | None" = field(default=None, init=False, repr=False)
+    _size: int = field(default=1, init=False, repr=False)  # number of worker processes
+    _executor: Executor | None = field(default=None, init=False, repr=False)
+    _client: "Client | None" = field(default=None, init=False, repr=False)
     _reuses: bool = field(default=False, init=False, repr=False)
 
     def __post_init__(self) -> None:
         if self.workers is not None:
-            require_workers(self.workers)
+            self._size = require_workers(self.workers)
 
     @property
     def is_asked_for(self) -> bool:
@@ -98,7 +103,7 @@ class WorkPlan:
 
     def __exit__(self, *_: object) -> None:
         self._reuses = False
-        self._close()
+        self.close()
 
     def map(self, work: Work, pieces: Sequence[Workload], what: str) -> Iterator[Any]:
         """Process every piece and yield the results in order, in memory only if they are early."""
@@ -122,13 +127,14 @@ class WorkPlan:
         """Process every piece; yield index and result of each as it is finished."""
         report, done = self.progress or ignore_progress, 0
         total = sum(piece.samples for piece in pieces)
-        pool = self._pool or self._choose(pieces)
-        how = "this process" if pool is None else pool.description
+        if self._executor is None:
+            self._size = choose_workers(pieces, self.workers)
+        is_here = self.scheduler is None and self._size == 1
+        how = "this process" if is_here else self.description
         _log.info("%s %d pieces, %d %s in total: %s", what, len(pieces), total, counted, how)
         report(what, done, total, counted)
         every = enumerate(pieces)
-        results = _here(work, every) if pool is None else pool.run(work, every, lost)
-        self._pool = pool
+        results = _here(work, every) if is_here else self.run(work, every, lost)
         try:
             with closing(results):  # type: ignore[type-var]
                 for left in reversed(range(len(pieces))):
@@ -140,41 +146,13 @@ class WorkPlan:
                     yield index, result
         finally:
             if not self._reuses:
-                self._close()
-
-    def _choose(self, pieces: Sequence[Workload]) -> "Pool | None":
-        """Return the cluster, worker processes, or None for this process."""
-        if self.scheduler is not None:
-            return Pool(scheduler=self.scheduler)
-        workers = choose_workers(pieces, self.workers)
-        return Pool(workers) if workers > 1 else None
-
-    def _close(self) -> None:
-        pool, self._pool = self._pool, None
-        if pool is not None:
-            pool.close()
-
-
-class Pool:
-    """Worker processes, or those of a Dask cluster.
-
-    They start with the first work, wait for more until ``close``, and end with the process that
-    started them. The workers of a cluster must be able to read the logs under the same path.
-    """
-
-    def __init__(
-        self, workers: int = 1, scheduler: str | None = None, patience: float = 30.0
-    ) -> None:
-        self.workers, self.scheduler = require_workers(workers), scheduler
-        self.patience = patience  # largest time to wait for a worker of a cluster [s]
-        self._executor: Executor | None = None
-        self._client: Client | None = None
+                self.close()
 
     @property
     def description(self) -> str:
-        """Name in messages, such as ``2 worker processes``."""
+        """Name of the workers in messages, such as ``2 worker processes``."""
         if self.scheduler is None:
-            return f"{self.workers} worker processes, one BLAS thread each"
+            return f"{self._size} worker processes, one BLAS thread each"
         return f"the Dask cluster {self.scheduler}, one BLAS thread per piece"
 
     def close(self, *, is_urgent: bool = False) -> None:
@@ -254,7 +232,7 @@ class Pool:
     def _finished(self, running: Iterable[Future[_Outcome]]) -> Future[_Outcome]:
         """Wait for a finished piece, while there are workers."""
         while True:
-            finished = wait(running, self.patience, FIRST_COMPLETED).done
+            finished = wait(running, _ANSWER, FIRST_COMPLETED).done
             if finished:
                 return finished.pop()
             if not self._count():
@@ -266,7 +244,7 @@ class Pool:
     def _count(self) -> int:
         """Return the number of workers."""
         self._started()
-        return self.workers if self._client is None else sum(self._client.nthreads().values())
+        return self._size if self._client is None else sum(self._client.nthreads().values())
 
     def _submit(self, work: Work, piece: Workload) -> "Future[_Outcome]":
         level = _log.getEffectiveLevel()
@@ -281,13 +259,13 @@ class Pool:
         if self._executor is not None:
             return self._executor
         if self.scheduler is not None:
-            self._client = _connect(self.scheduler, self.patience)
+            self._client = _connect(self.scheduler)
             self._executor = self._client.get_executor(pure=False)
             return self._executor
         from loky import ProcessPoolExecutor
 
         self._executor = ProcessPoolExecutor(
-            self.workers,
+            self._size,
             initializer=_start_worker,
             initargs=(os.getpid(),),
             env={"LOKY_MAX_MEMORY_LEAK_SIZE": "1e15"},  # [bytes]; pieces limit the memory
@@ -302,7 +280,7 @@ def require_workers(workers: int) -> int:
     return workers
 
 
-def _connect(address: str, patience: float) -> "Client":
+def _connect(address: str) -> "Client":
     """Return a client of a cluster with workers, all of this version of robotid."""
     try:
         from distributed import Client
@@ -310,8 +288,8 @@ def _connect(address: str, patience: float) -> "Client":
         raise MissingDependencyError("--scheduler", "distributed", "cluster") from error
     client = None
     try:
-        client = Client(address, timeout=patience, set_as_default=False)
-        client.wait_for_workers(1, timeout=patience)
+        client = Client(address, timeout=_ANSWER, set_as_default=False)
+        client.wait_for_workers(1, timeout=_ANSWER)
     except (OSError, TimeoutError, ValueError) as error:
         if client is not None:
             client.close()

@@ -14,8 +14,8 @@ from functools import cached_property
 import numpy as np
 
 from robotid.base.typing import Array
-from robotid.data.filters import zero_phase
 from robotid.data.log import Log
+from robotid.data.signals import zero_phase
 from robotid.dynamics.compiled import flatten
 from robotid.dynamics.prediction import predict_instants
 from robotid.robot.model import RobotModel

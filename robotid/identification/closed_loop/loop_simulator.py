@@ -8,7 +8,7 @@ import numpy as np
 
 from robotid.base.exceptions import NotConvergedError
 from robotid.base.typing import Array
-from robotid.data.filters import local_polynomial
+from robotid.data.signals import local_polynomial
 from robotid.dynamics.simulation.loops import ClosedLoopRobot, Column, Loops, RollOut, Window
 from robotid.estimation.estimators.output_error import Residual
 from robotid.robot.drive_term import DriveTerm

@@ -46,7 +46,7 @@ def joined(first, second):
 
 def test_the_share_that_repeats_is_that_of_the_log_that_has_most_of_it(motions):
     first, second, other = motions
-    kept = joined(first.part(100, 600), other)
+    kept = joined(first.at(slice(100, 600)), other)
     # rows that go on for a second, 400 of the first segment and 500 of the second, and move in it
     moved = [np.abs(part[100:] - part[:-100]) / np.ptp(kept.q, axis=0) > 0.04
              for part in np.split(kept.q, [500])]  # fmt: skip
@@ -62,7 +62,7 @@ def test_the_share_that_repeats_is_that_of_the_log_that_has_most_of_it(motions):
         )
     assert list(check_repeated_motion([second], kept, "kept.csv")) == []
     # 150 of 650 are less than three tenths
-    assert list(check_repeated_motion([first], joined(first.part(0, 250), other), "x")) == []
+    assert list(check_repeated_motion([first], joined(first.at(slice(0, 250)), other), "x")) == []
 
 
 def test_excitation_is_that_of_the_weighted_rows_of_all_motions(planar, motions):

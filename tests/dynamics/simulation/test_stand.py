@@ -8,9 +8,9 @@ import pytest
 from helpers.stands import stand
 
 from robotid.base.exceptions import DataError, SettingsError
+from robotid.dynamics.simulation.sensors import contact_forces
 from robotid.dynamics.simulation.simulation_settings import Controller, Sensors, Simulation
 from robotid.dynamics.simulation.simulator import follow, simulate
-from robotid.dynamics.simulation.stand import contact_forces
 from robotid.robot.constraints import Contact
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel

@@ -148,22 +148,6 @@ def test_a_good_prior_gets_more_weight_than_a_bad_one(case):
         assert bad <= 1.0, how
 
 
-def test_the_noise_level_is_that_of_the_whole_regressor_whatever_the_prior(case):
-    fit, problem = case
-    fit = replace(fit, prior_weight=100.0, independent_share=0.5)
-    W, tau, _ = (np.concatenate(x) for x in zip(*problem.blocks(), strict=True))
-    W, tau = W.reshape(-1, 6, W.shape[1]).swapaxes(0, 1), tau.reshape(-1, 6).T
-    levels = np.ones(6)
-    for _ in range(100):
-        rows = (W / levels[:, None, None]).reshape(-1, len(fit.K))
-        C = np.linalg.pinv(rows.T @ rows)
-        r = tau - W @ (C @ rows.T @ (tau / levels[:, None]).ravel())
-        used = np.einsum("jkp,jkp->j", W @ C, W) / levels**2
-        levels = np.sqrt((r**2).sum(axis=1) / (tau.shape[1] - used))
-        sigma = np.sqrt((r**2).sum(axis=1) / (tau.shape[1] - used / 0.5))
-    np.testing.assert_allclose(fit.noise(compress(problem)), sigma, rtol=1e-3)
-
-
 def test_rows_without_constraint_forces_are_one_joint():
     fold = SimpleNamespace(rows=np.array([10, 30]), is_projected=True)
     segments = Segments((fold, fold), np.array([2.0, 4.0]), None, 1.0)

@@ -1,4 +1,3 @@
-import json
 import pickle
 from dataclasses import replace
 from pathlib import Path
@@ -7,13 +6,10 @@ import numpy as np
 import pytest
 from helpers.driven import arm
 from helpers.fitting import fit
-from helpers.paths import ROOT
 from helpers.synthetic import exact_log, truth
 
 from robotid.base.exceptions import SettingsError
-from robotid.cli.identify import run_job
-from robotid.cli.job import LogEntry, job_from_settings, read_job
-from robotid.data.files.read import write_log
+from robotid.cli.job import read_job
 from robotid.data.signal_settings import SignalSettings
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.estimation.fitting.estimator_settings import (
@@ -24,7 +20,6 @@ from robotid.estimation.fitting.estimator_settings import (
 from robotid.estimation.fitting.fit import fit_recordings
 from robotid.estimation.fitting.recorded import Recordings
 from robotid.estimation.fitting.survey import hold_log
-from robotid.robot.model import RobotModel
 
 JOBS = Path(__file__).parents[2] / "jobs"
 RECURSIVE = [name for name, kind in ESTIMATORS.items() if issubclass(kind, RecursiveSettings)]
@@ -80,31 +75,6 @@ def test_the_printed_step_asks_for_the_mass_regressor_itself(ur5, rng):
     settings = EstimatorSettings("prx", step="printed")
     found = fit(ur5, [exact_log(ur5, truth(ur5), rng)], signals=EXACT, estimator=settings)
     assert not found.estimate.converged
-
-
-def test_a_job_with_a_recursive_estimator_runs_from_file_to_report(rng, tmp_path):
-    model = RobotModel.from_urdf(ROOT / "urdf" / "planar_2r.urdf")
-    log = exact_log(model, truth(model), rng, rate=100.0, noise=np.full(2, 0.1))
-    write_log(log, tmp_path / "log.csv")
-    (tmp_path / "job.toml").write_text(
-        f'urdf = "{model.tree.path}"\n[signals]\ncutoff = false\n'
-        '[estimator]\nname = "kalman"\nwalk = 1e-6\ngate = 0.999999\nphysical = true\n'
-        '[[identification]]\nlog = "log.csv"\n'
-    )
-    _, result = run_job(read_job(tmp_path / "job.toml"), tmp_path / "out")
-    assert result["settings"]["estimator"] == {
-        "name": "kalman",
-        "walk": 1e-6,
-        "gate": 0.999999,
-        "physical": True,
-        "prior_weight": "auto",
-        "constraints": {},
-    }
-    assert "a Kalman filter" in (tmp_path / "out" / "report.html").read_text()
-    stated = json.loads((tmp_path / "out" / "result.json").read_text())
-    again = job_from_settings(stated["settings"], "result.json", Path())
-    assert again.estimator == EstimatorSettings("kalman", walk=1e-6, gate=0.999999, physical=True)
-    assert again.identification == (LogEntry(tmp_path / "log.csv"),)
 
 
 @pytest.mark.parametrize(

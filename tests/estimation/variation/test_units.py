@@ -32,6 +32,14 @@ def test_units_that_differ_are_named_and_left_out_of_the_prediction():
     np.testing.assert_allclose(prediction.ends, alike.ends, atol=0.06)
 
 
+def test_a_precise_value_within_the_spread_does_not_hide_one_that_differs():
+    x = -2.0 + 0.1 * np.random.default_rng(8).normal(size=12)
+    x[[2, 9]] = -1.9, -1.0
+    errors = np.full(12, 0.02)
+    errors[2] = 1e-3  # 100 standard errors from the median, and one spread
+    assert [k for k, _ in between_units(x, errors, 1e-3)[1]] == [9]
+
+
 def test_a_value_with_a_large_error_is_not_unlike():
     x, errors = np.array([1.0, 1.02, 0.97, 1.01, 3.0]), np.array([0.01, 0.01, 0.01, 0.01, 1.0])
     assert between_units(x, errors, 1e-3)[1] == ()

@@ -20,7 +20,7 @@ from robotid.base.exceptions import (
     WorkerError,
 )
 from robotid.dynamics.factors import available_cores
-from robotid.estimation.workers.plan import Pool, WorkPlan, choose_workers
+from robotid.estimation.workers.plan import WorkPlan, choose_workers
 
 # a busy disk is no error of a cluster
 pytestmark = pytest.mark.filterwarnings("ignore:Creating scratch directories:UserWarning")
@@ -112,13 +112,13 @@ def test_few_pieces_are_under_way_at_a_time(tmp_path):
             taken.append(k)
             yield k, piece
 
-    pool = Pool(1)
-    for done, _ in enumerate(pool.run(reduce_piece, pieces())):
-        assert len(taken) == min(10, done + 2)
-    (worker,) = workers_of(tmp_path / "marks")
-    assert is_running(worker)
-    pool.close()
-    assert not is_running(worker)
+    plan = WorkPlan(2)
+    for done, _ in enumerate(plan.run(reduce_piece, pieces())):
+        assert len(taken) == min(10, done + 4)
+    workers = workers_of(tmp_path / "marks")
+    assert all(map(is_running, workers))
+    plan.close()
+    assert not any(map(is_running, workers))
 
 
 def test_an_error_of_the_data_keeps_its_type_and_names_the_piece(plan, tmp_path):
@@ -201,7 +201,7 @@ def test_workers_default_to_the_cores_for_long_work_only(tmp_path):
     assert choose_workers(short, 3) == 3
     assert choose_workers(short, 30) == 10
     assert choose_workers(short * 500) == available_cores()
-    for wrong in (lambda: choose_workers(short, 0), lambda: WorkPlan(0), lambda: Pool(0)):
+    for wrong in (lambda: choose_workers(short, 0), lambda: WorkPlan(0)):
         with pytest.raises(SettingsError, match="workers is 0, wanted at least 1"):
             wrong()
 

@@ -3,64 +3,25 @@
 from types import SimpleNamespace
 
 import numpy as np
-import pytest
 
 from robotid.output.files.entries import (
     _covariance,
-    loop_entries,
     loop_parameters,
 )
 
 
-@pytest.fixture(scope="module")
-def entries(crane):
-    return loop_entries(crane)
-
-
-def test_each_joint_has_the_error_of_its_own_unknown():
-    names = [("a", "revolute"), ("b", "prismatic"), ("c", "revolute")]
-    free_parameters = [("kp", (1,)), ("kp", (2,)), ("delay", (0, 2)), ("zero", (1,))]
-    estimate = SimpleNamespace(
-        std_error=np.array([1.0, 2.0, 3.0, 4.0]), quantile=np.array([2.1, 2.2, 2.3, 2.4]),
-        details={"at_bound": ("delay",)},
-    )  # fmt: skip
-    values = {
-        "kp": [10.0, 20.0, 30.0], "kd": [1.0, 2.0, 3.0], "delay": [0.1, 0.2, 0.3],
-        "limit": [np.inf, 9.0, np.inf], "zero": [0.01, 0.02, 0.03],
-    }  # fmt: skip
-    fit = SimpleNamespace(
-        loops=SimpleNamespace(**{what: np.array(x) for what, x in values.items()}),
-        estimate=estimate,
-        simulator=SimpleNamespace(
-            free_parameters=[
-                SimpleNamespace(name=what, what=what, joints=joints)
-                for what, joints in free_parameters
-            ]
-        ),
-    )
-    joints = [SimpleNamespace(name=name, type=kind) for name, kind in names]
-    loop = SimpleNamespace(kind="pd")
-    found = SimpleNamespace(loop=loop, fit=fit, model=SimpleNamespace(limits=joints))
-    shown = {entry["name"]: entry for entry in loop_parameters(found)}
-    errors = {"b.kp": (1.0, 2.1), "c.kp": (2.0, 2.2), "a.delay": (3.0, 2.3), "c.delay": (3.0, 2.3),
-              "b.zero": (4.0, 2.4)}  # fmt: skip
-    assert len(shown) == 13
-    for j, (joint, kind) in enumerate(names):
-        force, way = ("N", "m") if kind == "prismatic" else ("N m", "rad")
-        units = {"kp": f"{force}/{way}", "kd": f"{force} s/{way}", "delay": "s", "limit": force,
-                 "zero": way}  # fmt: skip
-        for what, unit in units.items():
-            name = f"{joint}.{what}"
-            if what == "limit" and joint != "b":
-                assert name not in shown
-                continue
-            error, reach = errors.get(name, (None, None))
-            source = "bound" if what == "delay" else "data"
-            assert shown[name] == {
-                "name": name, "value": values[what][j], "std_error": error, "quantile": reach,
-                "unit": unit, "source": source if name in errors else "stated",
-            }  # fmt: skip
-    assert loop_parameters(SimpleNamespace(loop=SimpleNamespace(kind="torque"))) == []
+def test_each_joint_has_its_gains_with_units_and_sources(crane):
+    shown = {entry["name"]: entry for entry in loop_parameters(crane)}
+    units = {"rail": ("N/m", "N s/m", "m"), "turn": ("N m/rad", "N m s/rad", "rad")}
+    loops, unknowns = crane.fit.loops, crane.fit.simulator.free_parameters
+    free = {(x.what, crane.model.joints[j]): k for k, x in enumerate(unknowns) for j in x.joints}
+    for j, (joint, (of_kp, of_kd, of_zero)) in enumerate(units.items()):
+        for what, unit in (("kp", of_kp), ("kd", of_kd), ("delay", "s"), ("zero", of_zero)):
+            entry, k = shown[f"{joint}.{what}"], free.get((what, joint))
+            assert (entry["value"], entry["unit"]) == (getattr(loops, what)[j], unit)
+            assert (entry["source"] == "stated") == (k is None)
+            error = None if k is None else crane.fit.estimate.std_error[k]
+            assert entry["std_error"] == error
 
 
 def test_the_covariance_is_that_of_the_free_parameters_that_are_not_at_a_bound(rng):

@@ -1,10 +1,8 @@
 """The charts that Python is given of a result: of the joints named, shown and kept as a page."""
 
 import numpy as np
-import pytest
 from scipy.stats import norm
 
-from robotid.base.exceptions import DataError
 from robotid.diagnosis.residual.torque_split import joint_torques
 from robotid.output.report import pictures
 from robotid.output.report.pictures import why_charts
@@ -71,15 +69,6 @@ def test_what_a_residual_follows_is_drawn_with_its_interval_and_what_friction_ta
     drawn = np.isfinite(whole)  # a gap has no line
     np.testing.assert_allclose(whole[drawn], torque.tau * speed)
     np.testing.assert_allclose(heat[drawn], torque.parts["friction"] * speed)
-
-
-@pytest.mark.parametrize("plot", ["plot_torques", "plot_friction", "plot_why"])
-def test_another_joint_is_refused_by_name(identified, plot):
-    words = (
-        r"joint 'elbow_joind' is not among the identified joints: .*Did you mean 'elbow_joint'\?"
-    )
-    with pytest.raises(DataError, match=words):
-        getattr(pictures, plot)(identified, "elbow_joind")
 
 
 def test_a_line_hides_four_times_as_high_as_the_others_and_gaps_of_a_pixel_are_one():

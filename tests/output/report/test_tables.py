@@ -11,9 +11,6 @@ from helpers.pages import number, percent, tables
 
 from robotid.identification.summary import verdict_cell
 from robotid.output.report.next_steps import Origin
-from robotid.output.report.tables import (
-    _drive_table,
-)
 from robotid.output.report.torque_report import torque_report
 
 
@@ -115,27 +112,3 @@ def test_a_drive_parameter_that_stands_on_a_misfit_says_so(identified):
     rows = tables(torque_report(found, Origin()).parameters)["Parameters of links and drives"].rows
     marked = [row[:2] for row in rows if row[8].endswith(", model misfit")]
     assert marked == [["elbow_joint", "coulomb"]]
-
-
-def test_drives_have_a_column_for_each_term_that_is_there_or_was_sought():
-    stated = [
-        ("link.m", 2.0, 0.1, "kg"), ("one.viscous", 0.0, 0.25, "N m s/rad"),
-        ("one.coulomb", 0.0, None, "N m"), ("two.coulomb", 0.0, None, "N m"),
-        ("two.offset", -1.5, None, "N m"), ("two.delay", 0.0125, 0.0005, "s"),
-        ("two.kp", 300.0, None, "N m/rad"),
-    ]  # fmt: skip
-    entries = [
-        dict(zip(("name", "value", "std_error", "unit"), one, strict=True)) for one in stated
-    ]
-    (table,) = tables(_drive_table(entries)).values()
-    heads = ["kp [N m/rad]", "delay [ms]", "viscous [N m s/rad]", "offset [N m]"]
-    assert table.headers == ["joint", *heads]
-    assert table.rows == [
-        ["one", "–", "–", "0.00 ± 0.25", "–"], ["two", "300", "12.50 ± 0.50", "–", "−1.5"],
-    ]  # fmt: skip
-    assert _drive_table(entries[:1]) == ""
-    many = [("two.viscous", 1.5, None, "N"), *((f"two.t{k}", 1.0, 0.5, "N") for k in range(7))]
-    found = [dict(zip(("name", "value", "std_error", "unit"), x, strict=True)) for x in many]
-    (table,) = tables(_drive_table(found)).values()
-    assert table.headers == ["term", "two"]
-    assert [row[0] for row in table.rows] == ["viscous [N]", *(f"t{k} [N]" for k in range(7))]
