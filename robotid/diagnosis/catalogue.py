@@ -40,8 +40,8 @@ def finding(
     joints: str | Sequence[str] = (),
     /,
     *,
-    subject: str = "",
-    severity: str = "",
+    subject: Any = "",  # noqa: ANN401
+    severity: Any = "",  # noqa: ANN401
     **values: float | str,
 ) -> Finding:
     """Return a finding: of a log and joints, or at another subject.
@@ -75,7 +75,7 @@ def finding(
 
 def sentence_of(code: str, **values: float | str) -> str:
     """Return a sentence of the catalogue that is no finding."""
-    return finding(code, severity="note", **values).message
+    return finding(code, **values).message
 
 
 def reason_of(found: Finding) -> str:

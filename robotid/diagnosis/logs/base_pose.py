@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -62,8 +63,7 @@ def check_unit(log: Log) -> Iterator[Finding]:
         return
     size = rms(np.diff(x, n=2, axis=0) / _STRIDE**2)
     if size >= _FASTEST:
-        evidence = {"acceleration": size, "stride": _STRIDE, "if_mm": 1e-3 * size}
-        yield finding("base_unit", log.name, **evidence)
+        yield finding("base_unit", log.name, acceleration=size, stride=_STRIDE, if_mm=1e-3 * size)
 
 
 def check_twist(log: Log, signals: SignalSettings) -> Iterator[Finding]:
@@ -105,7 +105,7 @@ def check_twist(log: Log, signals: SignalSettings) -> Iterator[Finding]:
         is_explained = best < _BETTER * off
         if size < _TURNS_BY or off < (_SOME if is_explained else _UNLIKE) * size:
             continue
-        figures: dict[str, float | str] = {"size": size, "best": best, "what": what, "unit": unit}
+        figures: dict[str, Any] = {"size": size, "best": best, "what": what, "unit": unit}
         if is_explained and cause in turned:
             yield finding(
                 "base_orientation", log.name, source="twist", reading=cause, cure=cause, turn=False,

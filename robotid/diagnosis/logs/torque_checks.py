@@ -49,10 +49,10 @@ class _Reading:
     def joints(self) -> list[str]:
         return [self.probe.model.joints[j] for j in self.best.joints]
 
-    def finding(self, joints: Sequence[str], severity: str = "", **values: float | str) -> Finding:
+    def finding(self, joints: Sequence[str], **values: float | str) -> Finding:
         """Return the error that columns contain other quantities than stated."""
         return finding(
-            self.best.kind, self.log, joints, severity=severity, gain=self.gain,
+            self.best.kind, self.log, joints, gain=self.gain,
             unexplained=self.stated.share.max(), unexplained_so_read=self.best.share.max(),
             **values,
         )  # fmt: skip

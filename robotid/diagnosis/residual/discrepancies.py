@@ -270,8 +270,9 @@ def _finding(
     return finding(
         found.code, "", found.joints, subject="" if found.joints else "all joints",
         severity="warning", explained=True, also=bool(others), others=listed(others),
-        size=size[0] if len(size) == 1 else np.linalg.norm(size), share_pct=100 * share,
-        std_error=np.linalg.norm(error), angle=tangents[0], angle_error=tangents[1], **values,
+        size=float(size[0] if len(size) == 1 else np.linalg.norm(size)), share_pct=100 * share,
+        std_error=float(np.linalg.norm(error)), angle=tangents[0], angle_error=tangents[1],
+        **values,
     )  # fmt: skip
 
 

@@ -181,8 +181,7 @@ def _joint_findings(path: Path) -> Iterator[Finding]:
     names = {joint.name for joint in joints if joint.type in MOVABLE}
     for joint in joints:
         subject = f"joint {joint.name}"
-        if faults := [*_no_range(joint), *_zero_limits(joint)]:
-            yield finding("no_limits", subject=subject, faults=". ".join(faults))
+        yield from _limit_findings(joint)
         for key in ("damping", "friction") if joint.dynamics is not None else ():
             text = getattr(joint.dynamics, key) or ""
             if (value := numbers(text, 1, math.inf)) and value[0] < 0:
@@ -200,25 +199,21 @@ def _joint_findings(path: Path) -> Iterator[Finding]:
             )  # fmt: skip
 
 
-def _no_range(joint: Any) -> Iterator[str]:  # noqa: ANN401
+def _limit_findings(joint: Any) -> Iterator[Finding]:  # noqa: ANN401
+    """Yield a finding if a joint has no range, or limits of speed or torque that are 0."""
     lower, upper = (getattr(joint.limit, key, None) for key in ("lower", "upper"))
-    if joint.type in ("revolute", "prismatic") and (lower or 0.0) >= (upper or 0.0):
-        yield (
-            f"joint {joint.name!r} is {joint.type}, but its limits are lower {lower}, upper "
-            f'{upper}, wanted lower < upper; write <limit lower="..." upper="..."/>, '
-            + ('or type="continuous" if it has no limits' if joint.type == "revolute" else "in m")
-        )
-
-
-def _zero_limits(joint: Any) -> Iterator[str]:  # noqa: ANN401
+    has_range = joint.type not in ("revolute", "prismatic") or (lower or 0.0) < (upper or 0.0)
     flags = {"velocity": "--max-velocity", "effort": "--max-torque"}
     zero = [key for key in flags if getattr(joint.limit, key, None) == 0.0]
-    if joint.type in MOVABLE and zero:
-        yield (
-            f"joint {joint.name!r} has limits {' and '.join(f'{key} 0' for key in zero)}, wanted "
-            "more than 0; they count as not stated. Write those of the drive, or state them for "
-            f"robotid excite: {' '.join(f'{flags[key]} {joint.name}=X' for key in zero)}"
-        )
+    zero = zero if joint.type in MOVABLE else []
+    if zero or not has_range:
+        yield finding(
+            "no_limits", subject=f"joint {joint.name}", name=joint.name,
+            range="none" if has_range else joint.type, lower=str(lower), upper=str(upper),
+            zero="none" if not zero else "alone" if has_range else "also",
+            limits=" and ".join(f"{key} 0" for key in zero),
+            flags=" ".join(f"{flags[key]} {joint.name}=X" for key in zero),
+        )  # fmt: skip
 
 
 def _link_findings(model: RobotModel) -> Iterator[Finding]:

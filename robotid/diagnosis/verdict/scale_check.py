@@ -15,7 +15,8 @@ from robotid.diagnosis.catalogue import sentence_of
 from robotid.dynamics.constraint_rows import loop_basis, without_forces
 from robotid.dynamics.prediction import predict
 from robotid.dynamics.torque import joint_torque_regressor
-from robotid.estimation.fitting.fitted import QUANTILE, Fit
+from robotid.estimation.fitting.fitted import Fit
+from robotid.estimation.fitting.standard_errors import QUANTILE
 from robotid.robot.parameters import pseudo_inertia
 from robotid.robot.prior import assumed_masses
 

@@ -117,21 +117,3 @@ def test_a_gripper_that_may_be_logged_in_percent_has_the_setting_and_the_positio
         (np.deg2rad(35.0), {"angle": "deg", "name": "wrist_roll"}),
     ):  # fmt: skip
         assert hint(position, **others) == ""
-
-
-def test_a_locked_gripper_in_percent_is_named_and_read(job, tmp_path):
-    (degrees,) = found(job(0.7, units=LogUnits(angle="deg")))
-    assert "percentage" not in degrees.message, "0.7 may be degrees"
-    log = read_log(tmp_path / "run.csv", (*job(0.7).model().joints, HELD))
-    q = np.degrees(log.q)
-    q[:, -1] = 20.0
-    write_log(replace(log, q=q, v=None, path=""), tmp_path / "run.csv")
-    in_degrees = replace(job(0.7), units=LogUnits(angle="deg"))
-    write_log(replace(log, q=q, v=None, path=""), tmp_path / "run.csv")
-    (finding,) = found(in_degrees)
-    assert "If 20, the number in the log, is a percentage" in finding.message
-    stated = LogUnits(angle="deg", percent={HELD: [0.5, 1.5]})
-    assert found(replace(in_degrees, units=stated)) == [], "at 0.7 rad"
-    noted = replace(in_degrees, locked={}, estimator=EstimatorSettings("wls"))
-    [note] = [f for f in examine(noted) if f.code == "locked_as_logged"]
-    assert "If 20, the number in the log, is a percentage" in note.message

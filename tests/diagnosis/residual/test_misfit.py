@@ -3,12 +3,10 @@
 import tomllib
 from dataclasses import replace
 from functools import partial
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from helpers import misfits as helper
-from helpers.findings import Figures
 from helpers.fitting import fit
 from helpers.misfits import EFFECTS
 from helpers.paths import ROOT
@@ -17,16 +15,14 @@ from robotid.base.findings import Finding
 from robotid.cli.job import job_from_settings, read_job
 from robotid.data.signal_settings import SignalSettings
 from robotid.diagnosis.logs.check_logs import check_logs
-from robotid.diagnosis.residual import misfit
+from robotid.diagnosis.residual.misfit import couplings as couplings_of
 from robotid.diagnosis.residual.misfit import (
-    CANDIDATES,
     find_misfits,
     misfit_findings,
     ripples,
     setting_of,
     settled,
 )
-from robotid.diagnosis.residual.misfit import couplings as couplings_of
 from robotid.diagnosis.residual.term_trials import RIDGE, Trials, take_sample
 from robotid.diagnosis.verdict.verdict import warnings_of
 from robotid.dynamics.base_parameters import structural_mapping
@@ -333,25 +329,3 @@ def test_ripples_that_are_tried_explain_most_over_what_the_filter_lets_through(r
         explained[k] = np.abs(np.sum(weight * r * size * np.exp(1j * k * q))) ** 2 / (size @ size)
     assert found == sorted(sorted(explained, key=explained.get)[-6:])
     assert {9, 41} < set(found)
-
-
-def test_a_misfit_is_reported_with_the_intervals_of_its_own_joint():
-    still = np.zeros(3)
-    (load,) = (c for c in CANDIDATES if c.name == "load")
-    found = misfit.Misfit(
-        "b", load, 0.36, 1e-9, -0.2, 0.125, 0.01, "N m per N m", 0.04, still, still,
-        JointMotion(*7 * [still]),
-    )  # fmt: skip
-    fit = SimpleNamespace()
-    names = ["a.viscous", "b.coulomb", "bb.offset", "b.viscous"]
-    (reported,) = misfit_findings(fit, [found], names)
-    assert "; the intervals of b.coulomb, b.viscous include this misfit" in reported.message
-    assert (
-        "b: " + load.meaning + ": 0.125 +- 0.01 N m per N m. It would explain 36 % of"
-        in reported.message
-    )
-    assert "(0 % on the validation logs); the residual is 4.0 % of the torque" in reported.message
-    assert Figures(reported) == pytest.approx({
-        "share_pct": 36, "error_pct": 4, "size": 0.125, "std_error": 0.01, "p_value": 1e-9,
-        "validation_share_pct": -20,
-    })  # fmt: skip

@@ -236,6 +236,16 @@ def test_what_a_residual_follows_is_found_with_its_share(name, rng):
     assert ("at low speed" in said) == (name == "speed")
 
 
+def test_time_explains_what_the_best_quantity_leaves(rng):
+    v, q, load = motion(rng)
+    noise = 0.1 * rng.standard_normal(len(v))
+    found = torque(2.0 * q + 0.3 * np.linspace(-1, 1, len(v)) + noise, v, q, load)
+    residual, less = found.against_time
+    (position,) = [d for d in found.follows if d.name == less == "position"]
+    means = np.interp(q, position.centres, position.means)
+    np.testing.assert_allclose(residual, found.residual - means)
+
+
 def test_noise_of_any_colour_follows_nothing():
     rng, log_errors, tried, shares = np.random.default_rng(0), 0, 0, []
     for trial in range(60):

@@ -3,25 +3,16 @@
 import math
 
 import numpy as np
-import pytest
 
 from robotid.dynamics.kernels.lanes import (
     LANES,
     compiled,
     copysign,
     cos_sin,
-    factor,
-    get,
     is_any,
-    lane_of,
-    put,
-    put_lane,
     read,
-    solve,
     where,
     wide,
-    with_lane,
-    work_space,
     write,
 )
 
@@ -72,32 +63,6 @@ def test_comparisons_are_numpys_and_false_for_nan():
 
 
 @compiled
-def lanes_of(work):
-    total = 0.0
-    for lane in range(LANES):
-        put_lane(work, 2, lane, 10.0 * lane)
-        total += lane * lane_of(get(work, 1), lane)
-    put(work, 0, with_lane(get(work, 2), 3, total))
-    return total
-
-
-def test_single_lanes_are_read_and_written():
-    work = work_space(3)
-    work[LANES : 2 * LANES] = y
-    assert lanes_of(work) == pytest.approx(np.arange(LANES) @ y)
-    expected = 10.0 * np.arange(LANES)
-    expected[3] = np.arange(LANES) @ y
-    np.testing.assert_allclose(work[:LANES], expected)
-
-
-def test_a_work_space_begins_at_a_line_of_the_cache():
-    for entries in (1, 7, 100):
-        work = work_space(entries)
-        assert work.shape == (entries * LANES,)
-        assert work.ctypes.data % (8 * LANES) == 0
-
-
-@compiled
 def turn(angles, out):
     c, s = cos_sin(read(angles, 0))
     write(out, 0, c)
@@ -109,15 +74,3 @@ def test_cosine_and_sine_in_all_quarters():
         out = np.zeros(2 * LANES)
         turn(angles, out)
         np.testing.assert_allclose(out.reshape(2, -1), [np.cos(angles), np.sin(angles)], atol=3e-13)
-
-
-def test_factor_and_solve_each_lane_on_its_own():
-    n, rng = 4, np.random.default_rng(0)
-    A = rng.normal(size=(LANES, n, n))
-    A, b = A @ A.swapaxes(1, 2) + np.eye(n), rng.normal(size=(LANES, n))
-    work = work_space(n * n + n)
-    work.reshape(-1, LANES)[:] = np.concatenate([A.reshape(LANES, -1), b], axis=1).T
-    factor(work, n, 0)
-    solve(work, n, 0, n * n)
-    found = work.reshape(-1, LANES)[n * n :].T
-    np.testing.assert_allclose(found, np.linalg.solve(A, b[..., None])[..., 0], rtol=1e-10)
