@@ -44,6 +44,18 @@ def test_distances_are_those_of_the_boxes(slider):
     assert near.distance[base_ball, 0] == pytest.approx(0.4, abs=1e-6)
 
 
+def test_spheres_and_boxes_are_never_farther_apart_than_what_is_in_them(panda):
+    clearance, rng = Clearance(panda, floor=-0.05), np.random.default_rng(6)
+    q = rng.uniform(-1.5, 1.5, (40, len(panda.joints)))
+    exact = distances(clearance, q).distance
+    near = clearance.near(clearance.placed(q), 0.05, clearance.everything)
+    assert (near.distance <= exact + 1e-6).all()
+    is_near = exact < 0.05
+    assert is_near.any()
+    np.testing.assert_allclose(near.distance[is_near], exact[is_near], atol=1e-9)
+    assert len(near.pairs) < 1.5 * is_near.sum()  # few of the others need an exact distance
+
+
 def test_gradients_of_distances_are_those_of_differences(panda):
     clearance, rng = Clearance(panda, floor=-0.05), np.random.default_rng(5)
     low, high = np.array([(j.lower, j.upper) for j in panda.limits]).T

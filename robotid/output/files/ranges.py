@@ -310,7 +310,7 @@ def sample(result: Result, count: int, rng: np.random.Generator) -> tuple[list[s
     link_parameters(model, pi)  # raises if a link is impossible
     held, terms = held_parameters(model), [name.rpartition(".")[2] for name in names]
     is_positive = np.isin(terms, _POSITIVE) & (np.arange(len(names)) >= size)
-    is_bounded = np.isin(terms, _NOT_NEGATIVE) | is_positive
+    is_bounded = np.isin(terms, [*_NOT_NEGATIVE]) | is_positive
     is_bounded[:size] = model.layout.is_nonnegative()
     signed, varies = is_bounded.copy(), np.array(spread, dtype=bool)  # drawn anew below
     is_bounded, is_positive = is_bounded & ~varies, is_positive & ~varies
