@@ -220,8 +220,8 @@ ESTIMATORS = {
     "tukey": 'name = "consistent"\nrobust = "tukey"\nprior_weight = "evidence"',
     "rls": 'name = "rls"\nforgetting = 0.9995\nprior_weight = 0.5\nphysical = true',
     "kalman": 'name = "kalman"\nwalk = 1e-4\ngate = 0.999\nprior_weight = 2.0',
-    "prx": 'name = "prx"\npasses = 2\nmetric = "rows"\nseed = 4\nprior_weight = 0.5',
-    "gradient": 'name = "gradient"\npasses = 3\nstep_size = 0.7\naverage = false\nseed = -1\n'
+    "prx": 'name = "prx"\nprior_weight = 0.5',
+    "gradient": 'name = "gradient"\n'
     "prior_weight = 0.5",
 }
 OF_ESTIMATORS = ("base_parameters", "drive_parameters", "consistency", "uncertainty",
