@@ -15,8 +15,8 @@ from robotid.cli.job import Job, LogEntry
 from robotid.data.files.read import write_log
 from robotid.data.signal_settings import SignalSettings
 from robotid.dynamics.simulation.motions import random_fourier
-from robotid.dynamics.simulation.simulation_settings import Truth
-from robotid.dynamics.simulation.simulator import Noise, simulate
+from robotid.dynamics.simulation.simulation_settings import Noise, Truth
+from robotid.dynamics.simulation.simulator import simulate
 from robotid.dynamics.simulation.truth import draw_parameters
 from robotid.estimation.workers.plan import WorkPlan
 from robotid.identification.result import TorqueIdentification

@@ -52,8 +52,9 @@ def export(
                 f"not of {format}; remove it"
             )
     with TemporaryDirectory(prefix="robotid-") as folder:
-        is_path = isinstance(result, str | Path)
-        path = result if is_path else save_result(result, folder, report=False)
+        path = (
+            result if isinstance(result, str | Path) else save_result(result, folder, report=False)
+        )
         loaded = load_result(path)
         check_file(Path(target), loaded.files)
         written = writers()[format].export(loaded, Path(target), **stated)

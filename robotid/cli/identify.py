@@ -117,7 +117,7 @@ def identify(
     require_kind(progress, (Callable, type(None)), "progress", "a function")  # type: ignore[arg-type]
     if logs is None:
         job = job_file(model)
-        if not (validation is _NO_LOGS and signals is controller is None and not ignore):
+        if not (validation is _NO_LOGS and signals is None and controller is None and not ignore):
             raise SettingsError(
                 f"{job.urdf.name} is identified by a job file, which states logs and settings; "
                 "state validation, signals, controller and ignore there"

@@ -105,12 +105,15 @@ def examine(
 
 #: A job, its robot, its logs to fit, its validation logs, and notes on them.
 LockedLogs: TypeAlias = tuple[
-    Job, RobotModel, Sequence[SurveyedLog], Sequence[SurveyedLog], tuple[Finding, ...]
+    Job, RobotModel, tuple[SurveyedLog, ...], tuple[SurveyedLog, ...], tuple[Finding, ...]
 ]
 
 
 def locked_as_logged(
-    job: Job, model: RobotModel, fitted: Sequence[SurveyedLog], validation: Sequence[SurveyedLog]
+    job: Job,
+    model: RobotModel,
+    fitted: tuple[SurveyedLog, ...],
+    validation: tuple[SurveyedLog, ...],
 ) -> LockedLogs:
     """Return the job with joints locked at their positions in the logs, unless it states them."""
     logged, logs = {}, (*fitted, *validation)

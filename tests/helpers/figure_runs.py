@@ -221,8 +221,7 @@ ESTIMATORS = {
     "rls": 'name = "rls"\nforgetting = 0.9995\nprior_weight = 0.5\nphysical = true',
     "kalman": 'name = "kalman"\nwalk = 1e-4\ngate = 0.999\nprior_weight = 2.0',
     "prx": 'name = "prx"\nprior_weight = 0.5',
-    "gradient": 'name = "gradient"\n'
-    "prior_weight = 0.5",
+    "gradient": 'name = "gradient"\nprior_weight = 0.5',
 }
 OF_ESTIMATORS = ("base_parameters", "drive_parameters", "consistency", "uncertainty",
                  "identification", "validation", "verdict")  # fmt: skip

@@ -107,12 +107,13 @@ def check_wrenches(model: RobotModel, log: str, motion: Trajectory) -> Iterator[
     """
     if motion.wrenches is None or not any(x.measured for x in model.contacts):
         return
+    wrenches = motion.wrenches[:: max(1, len(motion.t) // _MOST)]
     motion = motion.every(max(1, len(motion.t) // _MOST))
     (torque,) = predict(model, [model.standard_parameters()], motion)
     g = float(np.linalg.norm(model.pin_model.gravity.linear))
     weight = sum(x.mass for x in model.pin_model.inertias) * g
     J, basis = _base_rows(model, motion)
-    caused = without_forces(basis, np.einsum("kmj,km->kj", J, motion.wrenches))
+    caused = without_forces(basis, np.einsum("kmj,km->kj", J, wrenches))
     left = without_forces(basis, torque[:, :6])
     square = float(np.sum(caused**2))
     factor = float(np.sum(caused * left)) / square if square > 0.0 else 1.0

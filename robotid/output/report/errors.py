@@ -245,7 +245,7 @@ def error_table(
         if measured is not None:
             notes = [note for note in _notes(measured) if note not in status]
             is_flagged = bool(notes) or status.startswith("poor")
-            entry |= measured | {
+            entry |= dict(measured) | {
                 "verdict": text("; ".join([status, *notes]), flag=is_flagged),
                 "rmse": measured["rmse"] / quantity.scale,
                 "unit": f"{quantity.prefix}{measured['unit']}",

@@ -298,9 +298,9 @@ def why_charts(
 def _split(torque: JointTorque, link: str, points: int) -> Chart:
     k = _first(torque, points)
     parts = {name: torque.parts[name][k] for name in torque.present}
-    lines = [*parts.values(), torque.residual[k], torque.tau[k]]
-    t, *lines = broken(torque.rows.segment[k], torque.rows.t[k], *lines)
-    *stacked, residual, tau = lines
+    values = [*parts.values(), torque.residual[k], torque.tau[k]]
+    t, *values = broken(torque.rows.segment[k], torque.rows.t[k], *values)
+    *stacked, residual, tau = values
     areas = [Series(name, y, _TONES[name], "area") for name, y in zip(parts, stacked, strict=True)]
     lines = [Series("residual", residual, "residual", "area"), Series("measured", tau, "text")]
     return Chart(
