@@ -234,8 +234,9 @@ def codes_of_findings():
             for value in given:
                 if isinstance(value, ast.Constant | ast.JoinedStr | ast.IfExp):
                     codes |= {x.value for x in ast.walk(value) if isinstance(x, ast.Constant)}
-    codes = {code.partition(":")[0] for code in codes if isinstance(code, str)}
-    return {code for code in codes if code.islower()}
+    codes = {code for code in codes if isinstance(code, str) and code.islower()}
+    sentences = {code for code in codes if ":" in code and code.partition(":")[0] not in codes}
+    return {code.partition(":")[0] for code in codes - sentences}
 
 
 def pairs(target, value):
