@@ -184,7 +184,7 @@ WRONG = {
     "mass": ('"wls"', CONSTRAINTS + "mass = { a = nan }", "mass of a is nan, wanted finite"),
     "huge mass": ('"wls"', CONSTRAINTS + f"mass = {{ a = {10**400} }}", "mass of a"),
     "huge box": ('"wls"', CONSTRAINTS + f"com = {{ a = [{10**400}] }}", "com of a"),
-    "seed of text": ('"wls"', '"prx"\nseed = "a"', "seed is 'a', wanted a whole number"),
+    "step of text": ('"wls"', '"prx"\nstep = "a"', "step is 'a', wanted a number"),
     "deep": ("locked = { c = 0.8 }", f"locked = {'[' * 5000}", "is not valid TOML"),
     "NUL in a path": ('"robot.urdf"', '"robot\\u0000.urdf"', "is not a valid path"),
     "long path": ('"robot.urdf"', f'"{"r" * 5000}"', "is not a valid path, wanted UTF-8"),

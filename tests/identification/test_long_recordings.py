@@ -136,12 +136,11 @@ def test_a_job_in_pieces_ends_where_it_ends_in_memory(noisy_job, tmp_path):
     assert_close(other, one, 1e-5)
 
 
-@pytest.mark.parametrize("name", ["rls", "prx"])  # one and several passes
+@pytest.mark.parametrize("name", ["rls", "prx"])  # one pass and several
 def test_recursive_estimators_read_pieces_in_the_order_of_time(
     noisy_job, name, tmp_path, without_doctor
 ):
-    passes = {"passes": 2} if name == "prx" else {}
-    job = replace(noisy_job, estimator=EstimatorSettings(name, **passes), validation=())
+    job = replace(noisy_job, estimator=EstimatorSettings(name), validation=())
     one, _ = run_job(replace(job, rows_in_memory=10**9), tmp_path / "memory")
     other, _ = run_job(replace(job, rows_in_memory=HELD), tmp_path / "pieces")
     size = np.abs(one.estimate.theta).max()
