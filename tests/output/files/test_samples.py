@@ -6,13 +6,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scipy.stats
+from helpers.commanded_results import written_result
+from helpers.mujoco_plant import plant
 
 import robotid
 from robotid.cli import main
 from robotid.estimation.variation.variation import SCORES
-from robotid.output.files.ranges import (
-    sample,
-)
+from robotid.output.files.ranges import sample
 from robotid.output.files.result_file import load_result
 from robotid.robot.parameters import pseudo_inertia
 
@@ -123,6 +123,25 @@ def test_drives_have_the_quantiles_of_the_next_log_and_its_correlation(folder):
     found = scipy.stats.spearmanr(x).statistic
     assert found[0, 1] == pytest.approx(6 / np.pi * np.arcsin(0.4), abs=0.08)
     assert abs(found[0, 2]) < 0.12
+
+
+def test_drives_of_commands_have_no_sample_below_zero(tmp_path):
+    robot = plant("planar", np.random.default_rng(0))
+    size = len(robot.model.standard_parameters())
+    names = [*robot.model.layout.names, *(n for n in robot.truth if n.endswith((".kd", ".delay")))]
+    free = {n: x for n, x in robot.truth.items() if n.endswith((".kd", ".delay", ".viscous"))}
+    root = np.diag([2.0 * free.get(name, 0.0) for name in names])  # twice their size
+    covariance = {"names": names, "root": [row[: k + 1] for k, row in enumerate(root.tolist())]}
+    every, values = sample(
+        load_result(written_result(robot, tmp_path / "r", covariance=covariance)),
+        COUNT, np.random.default_rng(0),
+    )  # fmt: skip
+    assert every == names
+    assert len(names) > size
+    for name in free:
+        drawn = values[:, every.index(name)]
+        assert drawn.min() >= 0.0
+        assert np.std(drawn) > 0.5 * free[name]
 
 
 @pytest.mark.parametrize(("flags", "words"), [
