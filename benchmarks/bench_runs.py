@@ -592,9 +592,8 @@ class Plants:
     def chosen(self, found, logs, unit):
         """Return the variation of some logs of a pool, about the fit to all."""
         own = [
-            replace(group, across=group.across[logs],
-                    runs=replace(group.runs, H=group.runs.H[logs], h=group.runs.h[logs],
-                                 unit=np.array(unit)))
+            replace(group, runs=replace(group.runs, H=group.runs.H[logs], h=group.runs.h[logs],
+                                        unit=np.array(unit)))
             for group in found
         ]  # fmt: skip
         return vary([str(k) for k in range(len(logs))], own)

@@ -13,7 +13,6 @@ gc.disable()  # until the tests begin: nothing that is imported is garbage
 import numpy as np
 import pytest
 from helpers.browsing import launch
-from helpers.crane import identified_crane
 from helpers.paths import IN_CI, ROOT
 from helpers.synthetic import exact_log, truth
 
@@ -113,4 +112,6 @@ def identified(ur5, tmp_path_factory):
 @pytest.fixture(scope="session")
 def crane(tmp_path_factory):
     """A crane of which drives and delay are identified from commands: two logs, one held out."""
+    from helpers.crane import identified_crane  # MuJoCo is not among the least dependencies
+
     return identified_crane(tmp_path_factory.mktemp("crane"))
