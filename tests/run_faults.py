@@ -160,7 +160,7 @@ def try_fault(fault: Fault) -> bool:
         if faulty.stem.endswith("lanes"):  # Numba's; one of these files is compiled into the others
             compiled += [*tree.rglob("*.nbi"), *tree.rglob("*.nbc")]
         for path in compiled:
-            path.unlink()
+            path.unlink(missing_ok=True)
         result = outcome(tree, fault.tests)
     seconds = time.monotonic() - start
     print(f"{result:7} {seconds:4.0f} s  {fault.file}: {fault.label}", flush=True)
