@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, ClassVar, Self
@@ -37,15 +38,15 @@ _SAME = 1e-6  # share of a claim that changes no torque, below which it is round
 _ABSORBS = 0.1  # share of a change of a stated mass that a link takes up to be named
 
 
-class KnownMass:
+class KnownMass(ABC):
     """A mass that the user knows, against the one that torque alone determines."""
 
     kind: ClassVar[str]
 
     @property
+    @abstractmethod
     def status(self) -> str:
         """Whether it "verifies" or "contradicts" the scale, or is "open" or "undetermined"."""
-        raise NotImplementedError
 
     @property
     def verifies(self) -> bool:
@@ -58,9 +59,9 @@ class KnownMass:
         return self.status == "contradicts"
 
     @property
+    @abstractmethod
     def message(self) -> str:
         """Both masses, and what follows for the scale of the torques."""
-        raise NotImplementedError
 
     def to_dict(self) -> dict[str, Any]:
         """Return the figures as result.json has them."""

@@ -92,7 +92,7 @@ def test_torques_that_are_not_of_the_loop_are_named():
 
     before = missed(log.tau * [1.0, 0.02], gains)
     assert set(before) == {"joint_2"}, "not the other, whose torque is its loop's"
-    assert before["joint_2"].evidence["missed_pct"] == pytest.approx(98, abs=1)
+    assert before["joint_2"].evidence["missed_pct"] == pytest.approx(97.4, abs=0.5)  # 98, and noise
     assert "% of the larger" in before["joint_2"].message
     assert before["joint_2"].severity == "warning"
     assert set(missed(log.tau[:, ::-1], LoopSettings())) == {"joint_1", "joint_2"}
