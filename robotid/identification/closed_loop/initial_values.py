@@ -26,7 +26,7 @@ from robotid.robot.model import RobotModel
 _FREQUENCIES = (6.0, 12.0, 24.0, 48.0, 96.0)  # natural frequencies that are tried [rad/s]
 _DAMPINGS = (0.5, 1.5)  # damping ratios that are tried
 _FRICTIONS = (0.05, 0.5)  # Coulomb friction that is tried, over the typical torque
-_LIMITS = (0.6, 0.3, 0.15)  # torque limits that are tried, over the largest torque without a limit
+_LIMITS = (0.6, 0.3, 0.15)  # torque limits that are tried, from the mean torque to the largest one
 _DELAYS = (0.0, 0.005, 0.01, 0.02, 0.04, 0.08)  # delays that are tried [s]
 _TRIED = 8  # number of windows of the grid search
 _FITTED = 16  # number of windows of the fit
@@ -113,16 +113,18 @@ def fit_second_order(
     n = len(stated.kp)
     error = np.concatenate([w.log.q_ref[w.counted] - w.log.q[w.counted] for w in windows])  # type: ignore[index]
     torque = stated.kp * np.maximum(np.sqrt(np.mean(error**2, axis=0)), 1e-6)
+    mean = stated.kp * error.mean(axis=0)  # the load by gravity; a drive bears it within its limit
     bare = replace(
         stated,
         bodies=np.zeros_like(stated.bodies),
         zero=np.zeros(n),
         limit=np.full(n, np.inf),
         terms=(_TERMS,) * n,
-        values=np.zeros(n * len(_TERMS)),
+        values=np.column_stack([np.zeros((n, 2)), mean]).reshape(-1),
     )
-    largest = stated.kp * np.abs(error).max(axis=0)
-    limits = [share * largest for share in _LIMITS] if finds_limit else [bare.limit]
+    least, largest = np.abs(mean), stated.kp * np.abs(error).max(axis=0)
+    limits = [least + share * (largest - least) for share in _LIMITS]
+    limits = limits if finds_limit else [bare.limit]
     start = _coarse(robot, windows[:_TRIED], bare, torque, finds_delay, limits)
     free_parameters = _free_parameters(robot, start, torque, finds_delay, finds_limit)
     some = windows[:: max(1, len(windows) // _FITTED)]
@@ -164,14 +166,14 @@ def _coarse(
     limits: Sequence[Array],
 ) -> Loops:
     """Return the best of a grid for each joint: without bodies the joints are decoupled."""
-    n = len(bare.kp)
+    n, offset = len(bare.kp), bare.values[2 :: len(_TERMS)]
     best, found = np.full(n, np.inf), bare
     delays = np.array(_DELAYS) if finds_delay else np.zeros(1)
     first = float(delays[min(1, len(delays) - 1)])
     for w, z, f, limit in product(_FREQUENCIES, _DAMPINGS, _FRICTIONS, limits):
         J = bare.kp / w**2
         viscous = np.maximum(2 * z * w * J - bare.kd, 0.0)
-        values = np.column_stack([viscous, f * torque, np.zeros(n)]).reshape(-1)
+        values = np.column_stack([viscous, f * torque, offset]).reshape(-1)
         delay = np.full(n, first) if finds_delay else bare.delay
         trial = replace(bare, armature=J, values=values, delay=delay, limit=limit)
         best, found = _better(robot, windows, trial, best, found)

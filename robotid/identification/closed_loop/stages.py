@@ -244,8 +244,9 @@ def _best_start(initial: "_Initial") -> tuple["_Initial", Array]:
     """Return the initial values with the best first fit, and its parameters, shape (c,).
 
     Others are tried where the error of a joint is larger than that of a good fit and hardly smaller
-    than that of its second-order model: other scales of the torques, and torque limits. Each group
-    of joints with one gain takes its best. A fit that cannot be simulated is no candidate.
+    than that of its second-order model: other scales of the torques. Torque limits are tried for
+    every error that is larger. Each group of joints with one gain takes its best. A fit that cannot
+    be simulated is no candidate.
     """
     if initial.vary is None or initial.plain is None:
         return initial, _with_bodies_of_urdf(initial.simulator, initial.estimator)
@@ -253,7 +254,7 @@ def _best_start(initial: "_Initial") -> tuple["_Initial", Array]:
     factor, limited, best = np.ones(n), np.zeros(n, dtype=bool), np.full(n, np.inf)
     fits, failures = [], []
     second_order = _errors_of(initial.simulator, initial.plain.loops)
-    for has_limit, scale in product((False, True), initial.scales):
+    for scale, has_limit in product(initial.scales, (False, True)):
         try:
             fits.append(_first_fit(initial.vary(np.full(n, scale), np.full(n, has_limit))))
         except NotConvergedError as failure:
@@ -263,7 +264,8 @@ def _best_start(initial: "_Initial") -> tuple["_Initial", Array]:
         for members in (groups == group for group in dict.fromkeys(initial.groups)):
             if np.mean(error[members] / best[members]) < 1.0 / BEATEN:
                 factor[members], limited[members], best[members] = scale, has_limit, error[members]
-        if not ((best > GOOD) & (best > HARDLY * second_order)).any():
+        is_poor = (best > GOOD) & ((best > HARDLY * second_order) | (not has_limit))
+        if not is_poor.any():
             break
     if not fits:
         raise failures[0]

@@ -1,9 +1,14 @@
 """Terms that are offered, and what they gain in windows that they were not fitted to."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
+from helpers.mujoco_plant import plant
 
-from robotid.identification.closed_loop.further_parameters import _Fold, _gains
+from robotid.data.log import Log
+from robotid.dynamics.simulation.loops import cut_windows
+from robotid.identification.closed_loop.further_parameters import _Fold, _gains, candidates
 
 
 def test_gains_are_those_of_fits_to_the_other_folds(rng):
@@ -21,3 +26,18 @@ def test_gains_are_those_of_fits_to_the_other_folds(rng):
 
         for s, own in sets.items():
             assert found[s][k] == pytest.approx(left([0, 2]) - left([0, 2, *own]), rel=1e-9)
+
+
+def test_terms_are_scaled_by_half_the_range_of_a_joint_and_need_some_of_it(rng):
+    model, t = plant("planar", rng).model, np.arange(200) / 100.0
+    q = 0.3 + np.outer(np.cos(np.pi * t / 2), [0.4, 0.04])  # the second moves by less than 0.05
+    log = Log(t, q, 0 * q, model.joints, q_ref=q, has_torque=False)
+    simulator = SimpleNamespace(
+        robot=SimpleNamespace(model=model), windows=cut_windows(log, 1.0, 0.0)
+    )
+    offered = [free for set_ in candidates(simulator, np.array([2.0, 3.0])) for free in set_]
+    spread = {free.name: free.spread for free in offered}
+    assert {name.partition(".")[0] for name in spread if "position" in name} == {"joint_1"}
+    by_order = [2.0 / (np.ptp(q[:, 0]) / 2) ** order for order in (1, 2)]
+    assert [x for name, x in spread.items() if "position" in name] == pytest.approx(by_order)
+    assert spread["joint_2.load"] == 1.0

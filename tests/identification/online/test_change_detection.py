@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from robotid.identification.online import ChangeDetector, Innovations, payload_of
+from robotid.identification.online import ChangeDetector, Innovations, load_spread, payload_of
 
 
 def test_noise_alone_is_no_change_and_a_shift_is_flagged_where_it_began(rng):
@@ -93,3 +93,5 @@ def test_a_load_is_the_generalised_least_squares_of_its_change_about_none(rng):
     wanted = np.linalg.solve(H, columns.T @ np.linalg.solve(C, change))
     np.testing.assert_allclose(found.parameters, wanted)
     np.testing.assert_allclose(found.std_error, np.sqrt(np.diag(np.linalg.inv(H))))
+    bodies = np.concatenate([[4.0, *[1.0] * 9], [2.0, 0.2, 0.6, 0.1, *[1.0] * 6]])
+    np.testing.assert_allclose(load_spread(bodies), 3.0 * np.repeat([1.0, 0.6, 0.36], [1, 3, 6]))
