@@ -19,7 +19,7 @@ from robotid.dynamics.prediction import predict_instants
 from robotid.dynamics.simulation.loops import Loops, open_loops
 from robotid.estimation.fitting.estimator_settings import SimulationSettings
 from robotid.estimation.variation.variation import vary
-from robotid.identification.closed_loop.encoder_zeros import CLEAR, parallel_axes
+from robotid.identification.closed_loop.initial_values import CLEAR, parallel_axes
 from robotid.identification.closed_loop.loop_result import (
     PositionIdentification,
     identified_loops,

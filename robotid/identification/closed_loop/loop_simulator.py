@@ -16,8 +16,10 @@ from robotid.robot.model import RobotModel
 from robotid.robot.parameters import inertial_from_pseudo_inertia, pseudo_inertia
 from robotid.robot.prior import with_assumed_inertials
 
+#: Largest delay that is tried [s].
+LONGEST_DELAY = 0.1
+
 _AROUND = (0, -1, 1)  # lags that are tried about the known delay [samples]
-_LATEST = 0.1  # largest lag that is tried [s]
 _CLEAR = 9.0  # improvement that a fractional lag needs [variances of one row]
 _WHOLE = 0.15  # distance from a whole lag below which the lag is whole [samples]
 _SMOOTH = 0.02  # half-width of the differentiating filter [s]
@@ -116,7 +118,7 @@ def find_gains(
     """
     dt = float(np.median(np.diff(outs[0].window.log.t)))
     delayed = np.ceil(loops.delay / dt - 1e-6)
-    around = _AROUND if knows_delay else range(-int(delayed.min()), 1 + round(_LATEST / dt))
+    around = _AROUND if knows_delay else range(-int(delayed.min()), 1 + round(LONGEST_DELAY / dt))
     tries = np.array([np.maximum(delayed + rows, 0.0) for rows in around])
     costs = np.array([_fit_gains(outs, loops, is_free, lag)[0] for lag in tries])
     lag, least = tries[np.argmin(costs, axis=0), np.arange(len(delayed))], costs.min(axis=0)
@@ -482,21 +484,16 @@ class LoopSimulator:
 
 def with_terms(model: RobotModel, loops: Loops) -> RobotModel:
     """Return the model extended by the terms of loops that it lacks."""
-    own = {
-        joint: [
-            *model.layout.own.get(joint, ()),
-            *(t for t in terms if t not in _has(model, joint)),
-        ]
-        for joint, terms in zip(model.joints, loops.terms, strict=True)
-    }
-    extended = RobotModel.from_urdf(
-        model.tree, **{**model.options, "own_terms": {k: v for k, v in own.items() if v}}
-    )
+    own = dict(model.layout.own)
+    for joint, terms in zip(model.joints, loops.terms, strict=True):
+        if more := [term for term in terms if term not in terms_of(model, joint)]:
+            own[joint] = (*own.get(joint, ()), *more)
+    extended = RobotModel.from_urdf(model.tree, **{**model.options, "own_terms": own})
     return with_assumed_inertials(extended)
 
 
-def _has(model: RobotModel, joint: str) -> list[object]:
-    """Return the terms that the model has of a joint."""
+def terms_of(model: RobotModel, joint: str) -> list[DriveTerm]:
+    """Return the drive terms that the model has of a joint."""
     layout = model.layout
     return [term for d, term in layout.drive_parameters if layout.drives[d].name == joint]
 

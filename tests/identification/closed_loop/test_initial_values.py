@@ -9,8 +9,7 @@ from helpers.paths import URDF
 from robotid.data.log import Log
 from robotid.dynamics.prediction import predict_instants
 from robotid.dynamics.simulation.loops import cut_windows
-from robotid.identification.closed_loop.encoder_zeros import _Motion
-from robotid.identification.closed_loop.initial_values import typical_sizes
+from robotid.identification.closed_loop.initial_values import _Motion, typical_sizes
 from robotid.robot.model import RobotModel
 
 

@@ -9,6 +9,7 @@ from helpers.mujoco_plant import plant
 from robotid.data.log import Log
 from robotid.dynamics.simulation.loops import cut_windows
 from robotid.identification.closed_loop.further_parameters import _Fold, _gains, candidates
+from robotid.robot.drives import LoadFriction, PositionCoulomb
 
 
 def test_gains_are_those_of_fits_to_the_other_folds(rng):
@@ -36,8 +37,8 @@ def test_terms_are_scaled_by_half_the_range_of_a_joint_and_need_some_of_it(rng):
         robot=SimpleNamespace(model=model), windows=cut_windows(log, 1.0, 0.0)
     )
     offered = [free for set_ in candidates(simulator, np.array([2.0, 3.0])) for free in set_]
-    spread = {free.name: free.spread for free in offered}
-    assert {name.partition(".")[0] for name in spread if "position" in name} == {"joint_1"}
+    by_position = [free for free in offered if isinstance(free.term, PositionCoulomb)]
+    assert [free.joints for free in by_position] == [(0,), (0,)]
     by_order = [2.0 / (np.ptp(q[:, 0]) / 2) ** order for order in (1, 2)]
-    assert [x for name, x in spread.items() if "position" in name] == pytest.approx(by_order)
-    assert spread["joint_2.load"] == 1.0
+    assert [free.spread for free in by_position] == pytest.approx(by_order)
+    assert {free.spread for free in offered if isinstance(free.term, LoadFriction)} == {1.0}
