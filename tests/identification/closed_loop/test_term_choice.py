@@ -8,15 +8,15 @@ from helpers.mujoco_plant import plant
 
 from robotid.data.log import Log
 from robotid.dynamics.simulation.loops import cut_windows
-from robotid.identification.closed_loop.further_parameters import _Fold, _gains, candidates
+from robotid.identification.closed_loop.further_parameters import _gains, candidates
 from robotid.robot.drives import LoadFriction, PositionCoulomb
 
 
 def test_gains_are_those_of_fits_to_the_other_folds(rng):
     parts = [(rng.standard_normal((rows, 5)), rng.standard_normal(rows)) for rows in (12, 9, 15)]
-    folds = [_Fold(A.T @ A, A.T @ b, len(b)) for A, b in parts]
+    H, g = (np.array(x) for x in zip(*((A.T @ A, A.T @ b) for A, b in parts), strict=True))
     sets = {7: [1], 9: [4, 3]}
-    found = _gains(folds, [0, 2], sets)
+    found = _gains(H, g, [0, 2], sets)
     for k, (A, b) in enumerate(parts):
         others = [part for i, part in enumerate(parts) if i != k]
         A_f, b_f = (np.concatenate(x) for x in zip(*others, strict=True))
