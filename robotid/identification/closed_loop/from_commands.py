@@ -72,7 +72,7 @@ class PositionIdentification(Identification):
     """Identification that predicts positions, by simulation from commands or torques."""
 
     loop: LoopSettings  # what is known of the loops
-    estimator: SimulationSettings  # the estimator's settings
+    estimator: SimulationSettings
     fit: Fitted
     fitted: tuple[PositionEvaluation, ...]  # logs with their simulated positions
     validation: tuple[PositionEvaluation, ...]
@@ -239,10 +239,8 @@ def identify_loops(
     of_logs = loop_runs(model, simulator, fitted.estimate, units)
     extended = with_terms(model, fitted.loops)
     standard, slopes = simulator.standard(extended, fitted.estimate.theta)
-    covariance, mapping = (
-        slopes @ fitted.estimate.covariance @ slopes.T,
-        structural_mapping(extended),
-    )
+    covariance = slopes @ fitted.estimate.covariance @ slopes.T
+    mapping = structural_mapping(extended)
     result = PositionIdentification(
         model=extended,
         mapping=mapping,
@@ -376,14 +374,10 @@ def _errors(covariance: Array) -> Array:
 
 def logged_motion(log: Log) -> Trajectory:
     """Return the motion of a log of commands: positions and their numerical derivatives."""
-    still = np.zeros_like(log.q)
-    dt = np.diff(log.t)
-    gaps = dt > _GAP * np.median(dt)
-    segment = np.append(0, np.cumsum(gaps))
-    v = still.copy()
-    for k in range(segment[-1] + 1):
-        rows = np.flatnonzero(segment == k)
-        if len(rows) > 1:
+    dt, v, still = np.diff(log.t), np.zeros_like(log.q), np.zeros_like(log.q)
+    segment = np.append(0, np.cumsum(dt > _GAP * np.median(dt)))
+    for rows in (segment == k for k in range(segment[-1] + 1)):
+        if rows.sum() > 1:
             v[rows] = np.gradient(log.q[rows], log.t[rows], axis=0)
     return Trajectory(log.t, log.q, v, still, still, log.joints, None, segment)
 
@@ -409,7 +403,15 @@ def _of_fit(result: PositionIdentification) -> Iterator[Finding]:
             yield finding("torque_mismatch", "", joint, missed_pct=100 * share)
     if result.is_scaled_by_gain:
         yield finding("scale", severity="note", subject="controller", what="gains")
-    yield from _gains_contradicted(result)
+    scale, factor = result.fit.scale, 1.0
+    if scale is not None and scale.is_wrong:  # bodies or torques indicate other gains
+        factor += scale.common
+        kp = zip(result.model.joints, (factor * result.fit.loops.kp).tolist(), strict=True)
+        yield finding(
+            "gains_contradicted", subject="controller", what=result.fit.simulator.knows_torques,
+            agreeing=listed([f"{joint} = {value:.3g}" for joint, value in kp], _NAMED),
+            scale=factor, std_error=scale.common_error,
+        )  # fmt: skip
     if (halving := float(estimate.details.get("halving", 0.0))) > 1.0:
         step = float(estimate.details["step"])
         yield finding("coarse_steps", subject="fit", halving=halving, step=step, limit=CHANGE)
@@ -419,37 +421,27 @@ def _of_fit(result: PositionIdentification) -> Iterator[Finding]:
     if names := result.undetermined:
         has_gains = any(name.endswith((".kp", ".kd")) for name in names)
         yield _named("undetermined:commands", names, cure=has_gains)
-    yield from _at_rest(result)
+    moves = np.any([run.moves for run in result.fitted], axis=0)
+    terms = [x for x in result.fit.simulator.free_parameters if x.what == "term"]
+    at_rest = [x.name for x in terms if not moves[list(x.joints)].any()]
+    if left := [name for name in at_rest if name not in names]:
+        yield _named("undetermined:rest", left)
     yield from _limits_found(result)
     yield from _unequal_gains(result)
     yield from _encoder_findings(result)
     for tried in result.fit.tried:
         terms, gain = " and ".join(tried.terms), 100 * tried.gain
+        figures = {"terms": terms, "gain_pct": gain}
         if tried.dropped:
-            yield finding(
-                "friction_dropped", "", tried.joint, terms=terms, gain_pct=gain,
-                dropped=tried.dropped,
-            )  # fmt: skip
+            yield finding("friction_dropped", "", tried.joint, **figures, dropped=tried.dropped)
         elif tried.is_chosen:
-            yield finding("friction_found", "", tried.joint, terms=terms, gain_pct=gain)
+            yield finding("friction_found", "", tried.joint, **figures)
 
 
 def _named(code: str, names: Sequence[str], **values: Any) -> Finding:  # noqa: ANN401
     """Return a finding about parameters."""
     words = listed(names, _NAMED)
     return finding(code, subject=words, names=words, **values)
-
-
-def _at_rest(result: PositionIdentification) -> Iterator[Finding]:
-    """Yield which friction terms and offsets are of joints that no fitted log commands to move."""
-    moves = np.any([run.moves for run in result.fitted], axis=0)
-    names = [
-        free.name
-        for free in result.fit.simulator.free_parameters
-        if free.what == "term" and not moves[list(free.joints)].any()
-    ]
-    if left := [name for name in names if name not in result.undetermined]:
-        yield _named("undetermined:rest", left)
 
 
 def _settled_delay(examined: Finding, result: PositionIdentification) -> Finding:
@@ -460,17 +452,11 @@ def _settled_delay(examined: Finding, result: PositionIdentification) -> Finding
     if examined.code != "slow_command":
         return examined
     estimate, free_parameters = result.estimate, result.fit.simulator.free_parameters
-    errors = [
-        float(error)
-        for free, error in zip(free_parameters, estimate.std_error, strict=True)
-        if free.what == "delay"
-    ]
+    errors = estimate.std_error[[free.what == "delay" for free in free_parameters]].tolist()
     if any(name.endswith("delay") for name in estimate.details["at_bound"]):
-        known = (
-            ". The delay of the fit is 0, its lower bound: its standard error is that of the "
-            "bound, not of the delay"
-        )
-        return examined.reworded(remedy=examined.remedy + known)
+        known = "its standard error is that of the bound, not of the delay"
+        remedy = f"{examined.remedy}. The delay of the fit is 0, its lower bound: {known}"
+        return examined.reworded(remedy=remedy)
     span = examined.evidence["longest"] - examined.evidence["shortest"]
     error = max(errors, default=0.0)
     if error > _KNOWN * span:
@@ -478,23 +464,8 @@ def _settled_delay(examined: Finding, result: PositionIdentification) -> Finding
     entry = entries()["slow_command:known"]
     fault = entry["message"].replace("{what}", entry["what"]["fitted" if errors else "stated"])
     evidence = {**examined.evidence, "std_error": error}
-    return examined.reworded(
-        severity="note", fault=fault, remedy=entry["remedy"], evidence=evidence
-    )
-
-
-def _gains_contradicted(result: PositionIdentification) -> Iterator[Finding]:
-    """Yield a finding if bodies or logged torques indicate gains other than those stated."""
-    scale, joints = result.fit.scale, result.model.joints
-    if scale is None or not scale.is_wrong:
-        return
-    factor = 1.0 + scale.common
-    kp = zip(joints, (factor * result.fit.loops.kp).tolist(), strict=True)
-    yield finding(
-        "gains_contradicted", subject="controller", what=result.fit.simulator.knows_torques,
-        agreeing=listed([f"{joint} = {value:.3g}" for joint, value in kp], _NAMED),
-        scale=factor, std_error=scale.common_error,
-    )  # fmt: skip
+    settled = {"severity": "note", "fault": fault, "remedy": entry["remedy"]}
+    return examined.reworded(**settled, evidence=evidence)
 
 
 def _at_bound(result: PositionIdentification) -> Iterator[Finding]:
@@ -542,10 +513,8 @@ def _unequal_gains(result: PositionIdentification) -> Iterator[Finding]:
         kp = result.fit.loops.kp[joints]
         if kp.max() > _UNEQUAL * kp.min() > 0 and np.isfinite(effort):
             names = [result.model.joints[j] for j in joints]
-            yield finding(
-                "unequal_gains", "", names, lowest=kp.min(), highest=kp.max(),
-                group=listed(map(quoted, names)),
-            )  # fmt: skip
+            ends, group = {"lowest": kp.min(), "highest": kp.max()}, listed(map(quoted, names))
+            yield finding("unequal_gains", "", names, **ends, group=group)
 
 
 def _limits_found(result: PositionIdentification) -> Iterator[Finding]:
@@ -554,11 +523,9 @@ def _limits_found(result: PositionIdentification) -> Iterator[Finding]:
     severity = "note" if result.loop.limit == "find" else "warning"
     for free, value, error in zip(free_parameters, estimate.theta, estimate.std_error, strict=True):
         if free.what == "limit" and free.name not in estimate.details["at_bound"]:
-            joint = result.model.limits[free.joints[0]]
-            unit = "N" if joint.type == "prismatic" else "N m"
-            yield finding(
-                "limit", "", joint.name, severity=severity, limit=value, std_error=error, unit=unit
-            )
+            joint, figures = result.model.joints[free.joints[0]], {"std_error": error}
+            figures |= {"limit": value, "unit": units_of(result.model, free)}
+            yield finding("limit", "", joint, severity=severity, **figures)
 
 
 def _encoder_findings(result: PositionIdentification) -> Iterator[Finding]:

@@ -249,18 +249,18 @@ def _best_start(initial: "_Initial") -> tuple["_Initial", Array]:
     n, groups, fits = len(initial.torque), np.array(initial.groups), []
     factor, limited, best = np.ones(n), np.zeros(n, dtype=bool), np.full(n, np.inf)
     second_order = _errors_of(initial.simulator, initial.plain.loops)
-    for scale, has_limit in product(initial.scales, (False, True)):
+    for scale, has_limit in initial.starts:
         try:
             fits.append(_first_fit(initial.vary(np.full(n, scale), np.full(n, has_limit))))
-        except NotConvergedError as error:
-            failure = error
+        except NotConvergedError as exception:
+            failure = exception
             continue
         error = fits[-1][2]
         for members in (groups == group for group in set(initial.groups)):
             if np.mean(error[members] / best[members]) < 1.0 / BEATEN:
                 factor[members], limited[members], best[members] = scale, has_limit, error[members]
-        is_poor = (best > GOOD) & ((best > HARDLY * second_order) | (not has_limit))
-        if not is_poor.any():
+        may_limit = not has_limit and (scale, True) in initial.starts
+        if not ((best > GOOD) & (may_limit | (best > HARDLY * second_order))).any():
             break
     if not fits:
         raise failure
@@ -340,7 +340,8 @@ class _Initial:
     plain: SecondOrder | None = None
     linear: TorqueIdentification | None = None
     groups: tuple[str, ...] = ()  # of joints with one gain
-    scales: tuple[float, ...] = (1.0,)  # of the torques, from which fits may start
+    #: Scales of the torques from which fits may start, and whether torque limits are fitted.
+    starts: tuple[tuple[float, bool], ...] = ((1.0, False),)
     factor: Array = field(default_factory=lambda: np.ones(1))  # of the scale of torques, (n,)
     #: Whether a limit is fitted that was not asked for, shape (n,), bool.
     limited: Array = field(default_factory=lambda: np.zeros(1, dtype=bool))
@@ -380,6 +381,7 @@ def _initialise_from_commands(task: _Task) -> _Initial:
     most = np.tile(np.exp(-_WHITE * dt / plain.time_constant), 3)  # positions, speeds, torques
     estimator = OutputError(most=most, progress=task.progress)
     scales = (1.0,) if has_gain.all() else _SCALES
+    starts = tuple(product(scales, (False, True) if may_limit.any() else (False,)))
 
     def vary(factor: Array, limited: Array) -> _Initial:
         limited = limited & may_limit
@@ -403,7 +405,7 @@ def _initialise_from_commands(task: _Task) -> _Initial:
             simulator = replace(simulator, torque=torque_rows(from_rows))
         return _Initial(
             simulator, estimator, typical.torque, encoders, plain,
-            groups=tuple(groups), scales=scales, factor=factor, limited=limited, vary=vary,
+            groups=tuple(groups), starts=starts, factor=factor, limited=limited, vary=vary,
         )  # fmt: skip
 
     report_stage(task.progress, "fitting loops", STAGES)
