@@ -422,16 +422,15 @@ def _of_fit(result: PositionIdentification) -> Iterator[Finding]:
         has_gains = any(name.endswith((".kp", ".kd")) for name in names)
         yield _named("undetermined:commands", names, cure=has_gains)
     moves = np.any([run.moves for run in result.fitted], axis=0)
-    terms = [x for x in result.fit.simulator.free_parameters if x.what == "term"]
-    at_rest = [x.name for x in terms if not moves[list(x.joints)].any()]
+    friction = [x for x in result.fit.simulator.free_parameters if x.what == "term"]
+    at_rest = [x.name for x in friction if not moves[list(x.joints)].any()]
     if left := [name for name in at_rest if name not in names]:
         yield _named("undetermined:rest", left)
     yield from _limits_found(result)
     yield from _unequal_gains(result)
     yield from _encoder_findings(result)
     for tried in result.fit.tried:
-        terms, gain = " and ".join(tried.terms), 100 * tried.gain
-        figures = {"terms": terms, "gain_pct": gain}
+        figures: Any = {"terms": " and ".join(tried.terms), "gain_pct": 100 * tried.gain}
         if tried.dropped:
             yield finding("friction_dropped", "", tried.joint, **figures, dropped=tried.dropped)
         elif tried.is_chosen:

@@ -177,7 +177,7 @@ def _gains(H: Array, g: Array, columns: list[int], sets: dict[int, list[int]]) -
             X = scipy.linalg.cho_solve(factor, B)
             S = H_f[np.ix_(further, further)] - B.T @ X
             y = np.linalg.lstsq(S, g_f[further] - B.T @ move, rcond=None)[0]
-            both, step = [*columns, *further], np.concatenate([move - X @ y, y])
+            both, step = np.append(base, further), np.concatenate([move - X @ y, y])
             gains[s][k] = before - step @ H_k[np.ix_(both, both)] @ step + 2 * g_k[both] @ step
     return gains
 

@@ -3,6 +3,7 @@
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -251,7 +252,7 @@ class LoopSimulator:
 
     def loops(self, theta: Array) -> Loops:
         """Return bodies, drives and loops at given values of the free parameters: theta (c,)."""
-        base, changed = self.base, dict[str, Array]()
+        base, changed = self.base, dict[str, Any]()
         for free, value in zip(self.free_parameters, theta, strict=True):
             if free.what == "body":
                 continue
