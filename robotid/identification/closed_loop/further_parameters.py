@@ -172,7 +172,8 @@ def _gains(H: Array, g: Array, columns: list[int], sets: dict[int, list[int]]) -
             return {s: np.zeros(len(H)) for s in sets}
         move = scipy.linalg.cho_solve(factor, g_f[base])
         before = move @ H_k[np.ix_(base, base)] @ move - 2 * g_k[base] @ move
-        for s, further in sets.items():
+        for s, places in sets.items():
+            further = np.array(places)
             B = H_f[np.ix_(base, further)]
             X = scipy.linalg.cho_solve(factor, B)
             S = H_f[np.ix_(further, further)] - B.T @ X
