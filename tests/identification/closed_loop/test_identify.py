@@ -164,23 +164,6 @@ def test_it_is_an_identification_as_others_are(found, tmp_path):
     assert f"{found.model.name}: drives from commands" in page
 
 
-def test_each_kept_log_is_judged(leg, found):
-    _, log, kept = leg
-    robot, loops = found.fit.simulator.robot, found.fit.loops
-    n = 400  # 0.8 s
-    short = replace(log, t=log.t[:n], q=log.q[:n], tau=log.tau[:n], q_ref=log.q_ref[:n])
-    assert list(run_open_loop(robot, loops, short).horizons) == [0.1, 0.5], "as long as the log"
-    [good], otherwise = found.validation, replace(kept, q=kept.q[::-1].copy())
-    poor = run_open_loop(robot, loops, otherwise)
-    for runs in ((good, poor), (poor, good)):
-        verdict = replace(found, validation=runs).verdict
-        assert verdict.status == "poor"
-        assert "simulated position error" in verdict.reasons[0]
-    verdict = replace(found, validation=()).verdict
-    assert verdict.status == "not evaluated"
-    assert verdict.reasons[0].endswith("no validation log given")
-
-
 def test_without_gains_the_scale_is_said_to_rest_on_the_urdf(scaleless):
     assert not scaleless.has_stated_gains
     [scale] = [f for f in scaleless.findings if f.code == "scale"]

@@ -1,4 +1,4 @@
-"""Terms that are offered, and what they gain in windows that they were not fitted to."""
+"""Terms that are offered, what they gain in held-out windows, and scales of stated gains."""
 
 from types import SimpleNamespace
 
@@ -8,7 +8,12 @@ from helpers.mujoco_plant import plant
 
 from robotid.data.log import Log
 from robotid.dynamics.simulation.loops import cut_windows
-from robotid.identification.closed_loop.further_parameters import _gains, candidates
+from robotid.identification.closed_loop.further_parameters import (
+    GainScale,
+    _gains,
+    _last,
+    candidates,
+)
 from robotid.robot.drives import LoadFriction, PositionCoulomb
 
 
@@ -42,3 +47,32 @@ def test_terms_are_scaled_by_half_the_range_of_a_joint_and_need_some_of_it(rng):
     by_order = [2.0 / (np.ptp(q[:, 0]) / 2) ** order for order in (1, 2)]
     assert [free.spread for free in by_position] == pytest.approx(by_order)
     assert {free.spread for free in offered if isinstance(free.term, LoadFriction)} == {1.0}
+
+
+@pytest.mark.parametrize(
+    ("change", "common", "is_wrong"),
+    [
+        ((-0.2, -0.18), -0.19, True),
+        ((0.2, 0.18), 0.19, True),
+        ((-0.03, -0.03), -0.03, False),  # small
+        ((-0.2, 0.6), -0.19, False),  # one joint shows another
+    ],
+)
+def test_gains_are_wrong_where_all_joints_show_it(change, common, is_wrong):
+    scale = GainScale(np.array(change), np.array([0.05, 0.05]), common, 0.006)
+    assert scale.is_wrong is is_wrong
+    unsure = GainScale(np.array(change), np.array([0.05, 0.05]), common, 0.07)
+    assert not unsure.is_wrong
+
+
+def test_the_last_unknowns_are_those_of_the_inverse(rng):
+    A = rng.standard_normal((9, 5)) * [1.0, 1e3, 1.0, 1e-2, 10.0]
+    H, x = A.T @ A, np.arange(1.0, 6.0)
+    found, error = _last(H, H @ x, 2)
+    np.testing.assert_allclose(found, x[3:], rtol=1e-8)
+    np.testing.assert_allclose(error, np.sqrt(np.diag(np.linalg.inv(H)))[3:], rtol=1e-8)
+    A[:, 4] = A[:, 0]  # the last is not distinguishable from the first, that before it is
+    _, error = _last(A.T @ A, A.T @ A @ x, 2)
+    left = np.linalg.inv(A[:, :4].T @ A[:, :4])
+    assert error[0] == pytest.approx(np.sqrt(left[3, 3]), rel=1e-8)
+    assert error[1] == np.inf
