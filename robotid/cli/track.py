@@ -91,7 +91,7 @@ def _history_name() -> str:
 def _summary(found: Track, job: Job, log: Log, history: str) -> dict[str, Any]:
     identifier = found.identifier
     model, mapping = identifier.model, identifier.mapping
-    converged = np.flatnonzero(found.converged)
+    converged = np.flatnonzero([reading.converged for reading in found.readings])
     last = identifier.reading
     columns = {
         "name": mapping.base_names,

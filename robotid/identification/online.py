@@ -15,6 +15,7 @@ import scipy.linalg
 
 from robotid.base.arguments import real_numbers
 from robotid.base.exceptions import DataError, SettingsError
+from robotid.base.findings import listed
 from robotid.base.settings import NOT_NEGATIVE, POSITIVE, Settings, is_number, require_kind, setting
 from robotid.base.typing import Array
 from robotid.data.log import Log, Trajectory
@@ -69,16 +70,8 @@ class LiveSignals:
 
     def push(self, t: float, q: Array, tau: Array) -> list[Instant]:
         """Process a sample and return the delayed instants that it completes; typically one."""
-        # q (n,) [rad or m], tau (n,) [N m or N]
-        if q.shape != (self._n,) or tau.shape != (self._n,):
-            raise DataError(f"q has shape {q.shape} and tau {tau.shape}, wanted ({self._n},) each")
-        u = np.concatenate([q, tau])
-        if not (np.isfinite(t) and np.isfinite(u.sum())):
-            raise DataError(f"the sample at t = {t:g} s is not finite, so it was refused")
-        last = self._last
+        u, last = np.concatenate([q, tau]), self._last
         if last is not None:
-            if t <= last[0]:
-                raise DataError(f"t must increase, but {t:.15g} s follows {last[0]:.15g} s")
             jump = np.where(self._is_continuous, u[: self._n] - last[1][: self._n], 0.0)
             u[: self._n] -= 2 * np.pi * np.round(jump / (2 * np.pi))
         self._last = (t, u)
@@ -400,20 +393,19 @@ class OnlineIdentifier:
         if not is_number(t):
             raise DataError(f"the sample at t = {str(t)[:60]} s is not finite, so it was refused")
         arrays = [real_numbers(x, name) for name, x in zip(names, (q, *rest), strict=True)]
+        n, shapes = len(self.model.joints), [np.shape(x) for x in arrays]
+        if any(shape != (n,) for shape in shapes):
+            raise DataError(f"{listed(names)} have shapes {listed(shapes)}, wanted ({n},) each")
+        if not (np.isfinite(t) and all(np.isfinite(x).all() for x in arrays)):
+            raise DataError(f"the sample at t = {t:g} s is not finite, so it was refused")
+        if t <= self._now:
+            raise DataError(f"t must increase, but {t:.15g} s follows {self._now:.15g} s")
         if len(rest) == 1:
             for instant in self._signals.push(t, *arrays):
                 self._skipped += 1
                 if self._skipped % self._every == 0:
                     self._take(instant, t)
         else:
-            n = len(self.model.joints)
-            if any(np.shape(x) != (n,) for x in arrays):
-                shapes = [np.shape(x) for x in arrays]
-                raise DataError(f"q, v, a and tau have shapes {shapes}, wanted ({n},) each")
-            if not (np.isfinite(t) and all(np.isfinite(x).all() for x in arrays)):
-                raise DataError(f"the sample at t = {t:g} s is not finite, so it was refused")
-            if t <= self._now:
-                raise DataError(f"t must increase, but {t:.15g} s follows {self._now:.15g} s")
             if self.delay:  # no filter, and every sample is used
                 self.delay, self._every = 0.0, 1
                 self._pace()
@@ -564,18 +556,17 @@ class Track:
 
     identifier: OnlineIdentifier  # the identifier after the last sample
     t: Array  # times of the newest sample, shape (N,) [s]
-    theta: Array  # base parameters, shape (N, b)
-    std_error: Array  # their standard errors, shape (N, b)
-    excitation: Array  # reduction of the prior variance, shape (N,) [-]
-    converged: Array  # whether the estimate has converged, shape (N,), bool
+    readings: tuple[Reading, ...]  # the estimates then
 
     def columns(self) -> dict[str, Array]:
         """Return the columns of the history, (N,) each: time, base parameters, standard errors."""
         table = {"time": self.t}
         for i, name in enumerate(self.identifier.names):
-            table[name] = self.theta[:, i]
-            table[f"{name}.std_error"] = self.std_error[:, i]
-        return table | {"excitation": self.excitation, "converged": self.converged.astype(float)}
+            table[name] = np.array([x.theta[i] for x in self.readings])
+            table[f"{name}.std_error"] = np.array([x.std_error[i] for x in self.readings])
+        for key in ("excitation", "converged"):
+            table[key] = np.array([float(getattr(x, key)) for x in self.readings])
+        return table
 
 
 def track(
@@ -598,6 +589,4 @@ def track(
             f"{log.path or 'log'}: the robot moves for less than the warm-up of "
             f"{settings.warmup:g} s, so there is no estimate. Use a longer log with motion"
         )
-    keys = ("theta", "std_error", "excitation", "converged")
-    history = {key: np.array([getattr(reading, key) for reading in readings]) for key in keys}
-    return Track(identifier, np.array(times), **history)
+    return Track(identifier, np.array(times), tuple(readings))

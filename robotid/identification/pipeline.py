@@ -14,7 +14,6 @@ from robotid.base.exceptions import (
     SettingsError,
 )
 from robotid.base.findings import Finding, not_ignored
-from robotid.base.settings import require_flag, require_kind
 from robotid.base.typing import ProgressCallback, ignore_progress, report_stage
 from robotid.data.files.columns import Needs
 from robotid.data.files.read import Readable, read_logs
@@ -39,7 +38,7 @@ from robotid.diagnosis.verdict.fit_findings import (
     unlike_findings,
 )
 from robotid.diagnosis.verdict.scale_check import check_scale
-from robotid.diagnosis.verdict.verdict import blocking, check_ignored, rejected, warnings_of
+from robotid.diagnosis.verdict.verdict import blocking, rejected, warnings_of
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.constraint_rows import logged_base
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
@@ -71,12 +70,6 @@ def identify(
     progress: ProgressCallback | None = None,
 ) -> TorqueIdentification:
     """Identify a robot's parameters from motion logs, as the command line does."""
-    require_kind(signals, (SignalSettings, type(None)), "signals", "a robotid.SignalSettings")
-    require_kind(
-        estimator, (str, EstimatorSettings), "estimator", "a name or a robotid.EstimatorSettings"
-    )
-    require_flag(doctor, "doctor")
-    check_ignored(ignore)
     choice = EstimatorSettings(estimator) if isinstance(estimator, str) else estimator
     settings = signals or SignalSettings()
     report_stage(progress, "reading logs")

@@ -24,7 +24,6 @@ from robotid.robot.drives import FAMILIES, LoadFriction, PositionCoulomb
 _OFFERED = ("stribeck", "load", "position")  # candidate families
 _FOLDS = 6
 _SLOW = 0.3  # Stribeck speed of candidates, over the typical speed of the joint
-_POSITIONS = 201  # at which the sign of the friction is checked
 _WIDE = 0.05  # smallest half-range of a position-dependent candidate [rad or m]
 
 _log = logging.getLogger(__name__)
@@ -125,8 +124,7 @@ def impossible(simulator: LoopSimulator, theta: Array, tried: Sequence[Tried]) -
     weakest = {t.joint: t for t in sorted(tried, key=lambda t: -t.gain) if t.is_chosen}
     for t in weakest.values():
         j = model.joints.index(t.joint)
-        measured = np.concatenate([w.log.q[w.counted, j] for w in simulator.windows])
-        q = np.linspace(measured.min(), measured.max(), _POSITIONS)
+        q = np.concatenate([w.log.q[w.counted, j] for w in simulator.windows])
         friction = friction_at_rest(loops, j, q)
         if (least := float(friction.min())) < 0.0:
             at = float(q[np.argmin(friction)])

@@ -36,8 +36,7 @@ _DAMPINGS = (0.5, 1.5)  # damping ratios that are tried
 _FRICTIONS = (0.05, 0.5)  # Coulomb friction that is tried, over the typical torque
 _LIMITS = (0.6, 0.3, 0.15)  # torque limits that are tried, from the mean torque to the largest one
 _DELAYS = (0.0, 0.005, 0.01, 0.02, 0.04, 0.08)  # delays that are tried [s]
-_TRIED = 8  # number of windows of the grid search
-_FITTED = 16  # number of windows of the fit
+_FITTED = 16  # number of windows of the fit; the grid search has the first half as many
 _SHOWS = 1e-3  # smallest identifiable inertia, over that of the fastest loop ...
 _CLEAR = 2.0  # ... and over its standard error
 _LOWEST = 1e-6  # lower bound of the inertia, over its initial value
@@ -58,7 +57,6 @@ CLEAR = 0.2
 _TRIALS = np.array([(s, z) for s in (1.0, -1.0) for z in np.deg2rad(np.arange(-180, 180, 15))])
 _SAMPLES = 400  # of all logs together
 _SLOW, _FAST = 0.4, 4.0  # cut-offs of the slow motion and of the sign of friction [Hz]
-_PAD = 9  # rows by which the filter extends both ends
 _PERIODS = 30  # smallest number of cut-off periods in all logs together
 _RANGE = 0.4  # smallest range of a joint whose zero is identified [rad]
 _SAME = 1.0 - 1e-6  # smallest cosine of parallel axes
@@ -146,7 +144,7 @@ def fit_second_order(
     least, largest = np.abs(mean), stated.kp * np.abs(error).max(axis=0)
     limits = [least + share * (largest - least) for share in _LIMITS]
     limits = limits if finds_limit else [bare.limit]
-    start = _coarse(robot, windows[:_TRIED], bare, torque, finds_delay, limits)
+    start = _coarse(robot, windows[: _FITTED // 2], bare, torque, finds_delay, limits)
     free: list[FreeParameter] = []
     for j, joint in enumerate(robot.model.joints):
         J, T, F = float(start.armature[j]), float(start.delay[j]), float(start.limit[j])
@@ -496,7 +494,8 @@ def _smooth(log: Log, count: int, cutoff: float) -> tuple[Array, ...]:
     dt = float(np.median(np.diff(log.t)))
 
     def low_pass(x: Array, below: float) -> Array:
-        return zero_phase(x, 2, min(below, 0.2 / dt), 1.0 / dt, _PAD)
+        order = 2  # both ends are extended by 3 (order + 1) rows, as SciPy's filtfilt does
+        return zero_phase(x, order, min(below, 0.2 / dt), 1.0 / dt, 3 * (order + 1))
 
     v = np.gradient(low_pass(log.q, _FAST), dt, axis=0)
     motion = (log.q, v, np.gradient(v, dt, axis=0), log.q_ref - log.q, np.tanh(v / _STILL))

@@ -20,7 +20,6 @@ from robotid.robot.prior import with_assumed_inertials
 #: Largest delay that is tried [s].
 LONGEST_DELAY = 0.1
 
-_AROUND = (0, -1, 1)  # lags that are tried about the known delay [samples]
 _CLEAR = 9.0  # improvement that a fractional lag needs [variances of one row]
 _WHOLE = 0.15  # distance from a whole lag below which the lag is whole [samples]
 _SMOOTH = 0.02  # half-width of the differentiating filter [s]
@@ -113,7 +112,10 @@ def find_gains(
     """
     dt = float(np.median(np.diff(outs[0].window.log.t)))
     delayed = np.ceil(loops.delay / dt - 1e-6)
-    around = _AROUND if knows_delay else range(-int(delayed.min()), 1 + round(LONGEST_DELAY / dt))
+    # a known delay is that of a row at most one row away
+    around = (
+        range(-1, 2) if knows_delay else range(-int(delayed.min()), 1 + round(LONGEST_DELAY / dt))
+    )
     tries = np.array([np.maximum(delayed + rows, 0.0) for rows in around])
     costs = np.array([_fit_gains(outs, loops, is_free, lag)[0] for lag in tries])
     lag, least = tries[np.argmin(costs, axis=0), np.arange(len(delayed))], costs.min(axis=0)

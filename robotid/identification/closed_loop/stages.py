@@ -245,7 +245,7 @@ def _best_start(initial: "_Initial") -> tuple["_Initial", Array]:
     be simulated is no candidate.
     """
     if initial.vary is None or initial.plain is None:
-        return initial, _with_bodies_of_urdf(initial.simulator, initial.estimator)
+        return _first_fit(initial)[:2]
     n, groups, fits = len(initial.torque), np.array(initial.groups), []
     factor, limited, best = np.ones(n), np.zeros(n, dtype=bool), np.full(n, np.inf)
     second_order = _errors_of(initial.simulator, initial.plain.loops)
@@ -297,9 +297,16 @@ def _with_limits_reached(
 
 
 def _first_fit(initial: "_Initial") -> tuple["_Initial", Array, Array]:
-    """Return initial values, the parameters of a first fit, and its errors of positions."""
-    theta = _with_bodies_of_urdf(initial.simulator, initial.estimator)
-    return initial, theta, _errors_of(initial.simulator, initial.simulator.loops(theta))
+    """Return initial values, the parameters of a first fit to few windows, and its errors.
+
+    It is a fit of the drives alone: with free bodies, many scales have nearly the same residual.
+    """
+    simulator = initial.simulator
+    drives = tuple(free for free in simulator.free_parameters if free.what != "body")
+    few = replace(simulator, windows=_few(simulator.windows), free_parameters=drives)
+    theta = simulator.prior.copy()
+    theta[np.isin(simulator.names, few.names)] = replace(initial.estimator, rounds=1).minimise(few)
+    return initial, theta, _errors_of(simulator, simulator.loops(theta))
 
 
 def _errors_of(simulator: LoopSimulator, loops: Loops) -> Array:
@@ -315,18 +322,6 @@ def _errors_of(simulator: LoopSimulator, loops: Loops) -> Array:
     error = q - np.concatenate([out.q for out in outs])
     share: Array = 100.0 * np.sqrt(np.mean(error**2, axis=0)) / np.maximum(q.std(axis=0), 1e-12)
     return np.where(np.ptp(q_ref, axis=0) > 0.0, share, 1.0)
-
-
-def _with_bodies_of_urdf(simulator: LoopSimulator, estimator: OutputError) -> Array:
-    """Return the parameters of a first fit of the drives alone to few windows, shape (c,).
-
-    With free bodies, many scales have nearly the same residual.
-    """
-    drives = tuple(free for free in simulator.free_parameters if free.what != "body")
-    few = replace(simulator, windows=_few(simulator.windows), free_parameters=drives)
-    theta = simulator.prior.copy()
-    theta[np.isin(simulator.names, few.names)] = replace(estimator, rounds=1).minimise(few)
-    return theta
 
 
 @dataclass(frozen=True, eq=False)
