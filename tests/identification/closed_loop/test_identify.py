@@ -18,7 +18,6 @@ from robotid.identification.closed_loop.loop_settings import LoopSettings
 from robotid.identification.closed_loop.position_errors import run_open_loop
 from robotid.identification.closed_loop.stages import fit_loops, stated_loops
 from robotid.output.files.entries import build_result
-from robotid.output.report.document import write_report
 from robotid.robot.drives import Coulomb, Offset, PositionCoulomb, Viscous
 
 NOISE = 1e-3  # [rad]: with less, that MuJoCo's friction is a little soft shows beside the errors
@@ -126,13 +125,12 @@ def test_the_drives_of_an_arm_are_recovered_with_steps_that_are_halved():
     assert (found.fitted[0].rmse < coarse.rmse).all(), "errors of the steps of the fit"
 
 
-def test_it_is_an_identification_as_others_are(found, tmp_path):
+def test_it_is_an_identification_as_others_are(found):
     layout, estimate = found.model.layout, found.estimate
     size, count = layout.n_inertial, len(found.base)
     name = f"Identification of {found.model.name}: {count} base parameters"
     assert repr(found) == f"<{name} by simulation, verdict good>"
     assert set(found.sources[:size]) == {"prior"}, "bodies stay: bodies=0"
-    assert np.isinf(found.standard_error[:size]).all()
     content = build_result(found, {"estimator": {"name": "simulation"}})
     entries = {entry["name"]: entry for entry in content["drive_parameters"]}
     share = dict(zip(estimate.names, found.shrunk, strict=True))
@@ -159,9 +157,6 @@ def test_it_is_an_identification_as_others_are(found, tmp_path):
     assert joint["relative_error_pct"] == pytest.approx(100 * run.rmse[1] / run.spread[1])
     command = run.baselines["command"][1]
     assert joint["command_relative_error_pct"] == pytest.approx(100 * command / run.spread[1])
-    page = write_report(found, tmp_path / "report.html").read_text()
-    assert "<strong>good</strong>" in page
-    assert f"{found.model.name}: drives from commands" in page
 
 
 def test_without_gains_the_scale_is_said_to_rest_on_the_urdf(scaleless):
