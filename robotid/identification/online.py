@@ -263,7 +263,6 @@ def load_spread(spread: Array) -> Array:
 _ARRAYS = {1: ("q", "tau"), 3: ("q", "v", "a", "tau")}  # by the number of arrays after t and q
 _OVERSAMPLED = 12.0  # estimator updates per period of the cut-off
 _STORED_EVERY = 0.1  # time between stored states, for the reset after a change [s]
-_STORED = 30  # number of stored states
 _REOPENED = 0.1  # change of every parameter after a change, relative to its prior spread
 _ORDER = 4  # of the causal filter
 _ROWS = 20.0  # rate of the rows of the history [Hz]
@@ -365,7 +364,9 @@ class OnlineIdentifier:
         self._skipped, self._t, self._now = 0, -np.inf, -np.inf
         self._warmup: list[Instant] = []
         self._kalman: Kalman | None = None
-        self._recent: deque[tuple[float, KalmanState]] = deque(maxlen=_STORED)
+        self._recent: deque[tuple[float, KalmanState]] = deque(
+            maxlen=round(_MEMORY / _STORED_EVERY)
+        )
 
     @overload
     def update(self, t: float, q: Array, tau: Array, /) -> None: ...

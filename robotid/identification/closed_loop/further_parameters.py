@@ -17,7 +17,11 @@ from robotid.diagnosis.residual.decisions import SIMULATED_FAMILY, Round
 from robotid.dynamics.simulation.loops import friction_at_rest
 from robotid.estimation.estimators.estimator import Estimate
 from robotid.estimation.estimators.output_error import OutputError, is_at_bound, linearised
-from robotid.identification.closed_loop.loop_simulator import FreeParameter, LoopSimulator
+from robotid.identification.closed_loop.loop_simulator import (
+    SIGNIFICANT,
+    FreeParameter,
+    LoopSimulator,
+)
 from robotid.robot.drive_term import ANYWHERE
 from robotid.robot.drives import FAMILIES, LoadFriction, PositionCoulomb
 
@@ -27,7 +31,6 @@ _SLOW = 0.3  # Stribeck speed of candidates, over the typical speed of the joint
 _WIDE = 0.05  # smallest half-range of a position-dependent candidate [rad or m]
 
 _log = logging.getLogger(__name__)
-_DIFFERS = 3.0  # smallest significant difference of a scale [standard errors]
 _LARGE = 0.05  # smallest relevant difference of a scale; missing friction terms cause smaller ones
 
 
@@ -197,8 +200,8 @@ class GainScale:
         Different factors indicate another model error, so that the gains are not questioned.
         """
         error = np.hypot(self.error, self.common_error)
-        agree = np.abs(self.change - self.common) <= _DIFFERS * error
-        is_other = abs(self.common) > max(_DIFFERS * self.common_error, _LARGE)
+        agree = np.abs(self.change - self.common) <= SIGNIFICANT * error
+        is_other = abs(self.common) > max(SIGNIFICANT * self.common_error, _LARGE)
         return bool(is_other and agree.all())
 
 

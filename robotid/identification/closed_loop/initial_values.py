@@ -14,6 +14,7 @@ import numpy as np
 from robotid.base.exceptions import NotConvergedError
 from robotid.base.typing import Array
 from robotid.data.log import Log
+from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import zero_phase
 from robotid.dynamics.compiled import flatten
 from robotid.dynamics.prediction import predict_instants
@@ -60,7 +61,6 @@ _SLOW, _FAST = 0.4, 4.0  # cut-offs of the slow motion and of the sign of fricti
 _PERIODS = 30  # smallest number of cut-off periods in all logs together
 _RANGE = 0.4  # smallest range of a joint whose zero is identified [rad]
 _SAME = 1.0 - 1e-6  # smallest cosine of parallel axes
-_STILL = 0.02  # speed over which friction reverses [rad/s or m/s]
 
 
 @dataclass(frozen=True, eq=False)
@@ -498,7 +498,8 @@ def _smooth(log: Log, count: int, cutoff: float) -> tuple[Array, ...]:
         return zero_phase(x, order, min(below, 0.2 / dt), 1.0 / dt, 3 * (order + 1))
 
     v = np.gradient(low_pass(log.q, _FAST), dt, axis=0)
-    motion = (log.q, v, np.gradient(v, dt, axis=0), log.q_ref - log.q, np.tanh(v / _STILL))
+    direction = np.tanh(v / SignalSettings().min_velocity)  # friction reverses about this speed
+    motion = (log.q, v, np.gradient(v, dt, axis=0), log.q_ref - log.q, direction)
     rows = np.linspace(0, len(log.t) - 1, count).astype(int)
     return tuple(low_pass(x, cutoff)[rows] for x in motion)
 

@@ -19,8 +19,9 @@ from robotid.robot.prior import with_assumed_inertials
 
 #: Largest delay that is tried [s].
 LONGEST_DELAY = 0.1
+#: Smallest significant difference [standard errors].
+SIGNIFICANT = 3.0
 
-_CLEAR = 9.0  # improvement that a fractional lag needs [variances of one row]
 _WHOLE = 0.15  # distance from a whole lag below which the lag is whole [samples]
 _SMOOTH = 0.02  # half-width of the differentiating filter [s]
 _FREE = 0.95  # torque relative to the limit, below which the drive is not saturated
@@ -128,7 +129,7 @@ def find_gains(
         bend, slope = 2 * (least + next_ - 2 * half), 4 * half - 3 * least - next_
         share = np.clip(-slope / np.maximum(2 * bend, 1e-300), 0.0, 1.0)
         gain = -(slope + bend * share) * share
-        is_between = (gain > _CLEAR * least / rows) & (share > _WHOLE)
+        is_between = (gain > SIGNIFICANT**2 * least / rows) & (share > _WHOLE)
         lag = np.where(is_between, whole + side * share, lag)
     gains = _fit_gains(outs, loops, is_free, lag)[1]
     kp, kd = np.where(gains > 0, gains, [loops.kp, loops.kd])
