@@ -51,7 +51,7 @@ from robotid.identification.closed_loop.stages import (
     stated_loops,
 )
 from robotid.identification.result import Identification, StatedSettings
-from robotid.robot.drives import TERMS
+from robotid.robot.drives import TERMS, Spring
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
 
@@ -349,15 +349,11 @@ def loop_runs(
 def units_of(model: RobotModel, free: FreeParameter) -> str:
     """Return the unit of a free parameter of a loop or drive."""
     is_linear = model.joints[free.joints[0]] in model.layout.prismatic
-    if free.term is not None:
-        return free.term.units[is_linear]
-    if free.what == "armature":
-        return TERMS["armature"].units[is_linear]
-    force, length = ("N", "m") if is_linear else ("N m", "rad")
-    return {
-        "kp": f"{force}/{length}", "kd": f"{force} s/{length}", "delay": "s", "limit": force,
-        "zero": length,
-    }[free.what]  # fmt: skip
+    like = {"kp": Spring(), "kd": TERMS["viscous"], "limit": TERMS["coulomb"]}
+    term = free.term or like.get(free.what) or TERMS.get(free.what)
+    if term is not None:
+        return term.units[is_linear]
+    return {"delay": "s"}.get(free.what, "m" if is_linear else "rad")
 
 
 def _largest_quantile(slopes: Array, quantile: Array) -> Array:
