@@ -18,9 +18,10 @@ from robotid.data.measured_velocity import (
 )
 from robotid.data.signal_settings import SignalSettings
 from robotid.diagnosis.catalogue import finding
-from robotid.diagnosis.logs.motion_checks import STILL
 from robotid.robot.parameters import ParameterLayout
 
+#: Largest range of a locked joint, and largest difference from its stated position [rad or m].
+STILL = 0.02
 _SPIKE = 15.0  # smallest distance of a spike from its neighbours, over the typical distance
 _BEYOND = 1.5  # ... and over the amplitude of the channel
 _RESTING = 3.0  # [standard deviations of the noise] within which a channel is constant

@@ -16,7 +16,7 @@ from robotid.data.log import Log, Trajectory
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import low_pass
 from robotid.diagnosis.catalogue import finding
-from robotid.diagnosis.logs.torque_sample import coupled_columns, smooth_motion
+from robotid.diagnosis.logs.hypotheses import coupled_columns, smooth_motion
 from robotid.dynamics.torque import carried_columns
 from robotid.robot.model import RobotModel
 

@@ -15,12 +15,12 @@ from robotid.base.settings import require_flag, require_kind
 from robotid.diagnosis.catalogue import finding
 from robotid.diagnosis.urdf.inertials import (
     assumed_inertials,
+    audit_links,
     impossible_inertial,
     negative_masses,
     rounded_angles,
     weak_parameters,
 )
-from robotid.diagnosis.urdf.mesh_check import audit_links
 from robotid.dynamics.base_parameters import BaseMapping, structural_mapping
 from robotid.dynamics.factors import triangle_of
 from robotid.dynamics.torque import random_regressor

@@ -13,10 +13,10 @@ from robotid.data.log import Log
 from robotid.diagnosis.catalogue import finding
 from robotid.diagnosis.residual.decisions import TENFOLD
 from robotid.diagnosis.residual.misfit import Misfit, misfit_findings
-from robotid.diagnosis.urdf.mesh_check import audit_bodies
-from robotid.diagnosis.verdict.evidence import GOOD, error_of, is_harmless_cost
+from robotid.diagnosis.urdf.inertials import audit_bodies
 from robotid.diagnosis.verdict.parameter_table import correlated_parameters
 from robotid.diagnosis.verdict.scale_check import friction_shares
+from robotid.diagnosis.verdict.verdict import GOOD, error_of, is_harmless_cost
 from robotid.estimation.estimators.consistent.body_constraints import slabs
 from robotid.estimation.fitting.estimator_settings import BoundedSettings, ConsistentSettings
 from robotid.estimation.fitting.fitted import Fit

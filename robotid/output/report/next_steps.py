@@ -14,7 +14,7 @@ from robotid.base.settings import is_number
 from robotid.diagnosis.catalogue import entries as catalogue_entries
 from robotid.diagnosis.catalogue import step_of
 from robotid.diagnosis.residual.misfit import setting_of, with_entries
-from robotid.diagnosis.verdict.evidence import GOOD, is_beaten
+from robotid.diagnosis.verdict.verdict import GOOD, is_beaten
 from robotid.identification.result import Identification, TorqueIdentification
 from robotid.output.files.exports import formats
 from robotid.robot.drive_term import DriveTerm

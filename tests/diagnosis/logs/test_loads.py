@@ -8,9 +8,8 @@ from helpers.corruptions import clean_log, robot
 
 from robotid.data.signal_settings import SignalSettings
 from robotid.diagnosis.logs.check_logs import diagnose
-from robotid.diagnosis.logs.hypotheses import explanations
-from robotid.diagnosis.logs.loads import load_model
-from robotid.diagnosis.logs.torque_sample import smooth_motion, take_probe
+from robotid.diagnosis.logs.hypotheses import explanations, smooth_motion, take_probe
+from robotid.diagnosis.logs.torque_checks import load_model
 from robotid.dynamics.torque import joint_torque_regressor
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel

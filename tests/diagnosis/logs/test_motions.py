@@ -10,7 +10,7 @@ from helpers.synthetic import exact_log, truth
 from robotid.data.log import Trajectory
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import process
-from robotid.diagnosis.logs.motion_checks import check_excitation, check_repeated_motion
+from robotid.diagnosis.logs.check_logs import check_excitation, check_repeated_motion
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.torque import joint_torque_regressor
 from robotid.robot.model import RobotModel

@@ -6,8 +6,13 @@ import pytest
 from helpers.corruptions import clean_log
 
 from robotid.data.signal_settings import SignalSettings
-from robotid.diagnosis.logs.hypotheses import compensated, own_share
-from robotid.diagnosis.logs.torque_sample import coupled_columns, smooth_motion, take_probe
+from robotid.diagnosis.logs.hypotheses import (
+    compensated,
+    coupled_columns,
+    own_share,
+    smooth_motion,
+    take_probe,
+)
 from robotid.dynamics.torque import joint_torque_regressor
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel

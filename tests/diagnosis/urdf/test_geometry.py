@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from helpers.findings import Figures
 
+from robotid.diagnosis.urdf.inertials import audit_bodies, audit_links
 from robotid.diagnosis.urdf.inspection import inspect_urdf
-from robotid.diagnosis.urdf.mesh_check import audit_bodies, audit_links
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import pytest
 
 from robotid.base.findings import Finding
-from robotid.diagnosis.verdict.evidence import Predictions
+from robotid.diagnosis.verdict.verdict import Predictions
 from robotid.output.report.next_steps import sentence_of
 
 JOINTS = ("a", "b", "c")

@@ -3,11 +3,13 @@ from dataclasses import replace
 import pytest
 
 from robotid.base.findings import Finding
-from robotid.diagnosis.verdict.evidence import Determined, Predictions, is_beaten
 from robotid.diagnosis.verdict.scale_check import ScaleCheck
 from robotid.diagnosis.verdict.verdict import (
+    Determined,
+    Predictions,
     VerdictWarning,
     blocking,
+    is_beaten,
     is_downweighted,
     judge,
     rejected,
