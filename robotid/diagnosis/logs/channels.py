@@ -47,15 +47,15 @@ _SET = 1.0  # [s] in a longer gap, a position that moves as in one step shows th
 _STALE = 0.05  # share of stale rows from which they are a warning
 _CONTINUES = 0.15  # motion after repeated rows, over that in as many rows before and after it,
 _AROUND = 10  # ... estimated from at most this many rows
-_STILL = 0.02  # [rad/s, or m/s of a prismatic joint] slower: at rest
+AT_REST = 0.02  # [rad/s, or m/s of a prismatic joint] slower: at rest
 _REST = 1.0  # [s] a longer rest at an end is reported
-_STATIC = 1e-3  # [rad or m] smaller range: the joint does not move
+STATIC = 1e-3  # [rad or m] smaller range: the joint does not move
 _HARDLY = 0.2  # [rad] smaller range: the joint hardly moves
 _HARDLY_PRISMATIC = 0.05  # [m] the same of a prismatic joint
 _MOVING = 0.1  # share of the log in which a joint must move
 _PLATEAU = 5  # consecutive rows at the limit of a clipped channel, at least
 _CLIPPED = 0.01  # share of the rows at the limit from which a channel is clipped
-_ZERO = 0.05  # of its largest value, below which a torque that is never negative is 0
+ZERO = 0.05  # of its largest value, below which a torque that is never negative is 0
 _AWAY = 0.2  # of its largest value, above which it is not 0 any more
 _TOUCHES = 3  # times that a torque without sign reaches 0 and increases again, at least
 _ALL = 3  # joints of which no torque is ever negative, at least
@@ -290,13 +290,13 @@ def check_rest(log: Log, motion: Trajectory, layout: ParameterLayout) -> Iterato
     """Yield the rests at the ends of a log, and the joints that do not move or hardly move."""
     speed = np.abs(motion.v) / layout.drive_speeds[: len(log.joints)]
     # a prismatic joint that moves by a millimetre is at rest, too
-    yield from _standstill(log, motion.t[(np.abs(motion.v) > _STILL).any(axis=1)])
+    yield from _standstill(log, motion.t[(np.abs(motion.v) > AT_REST).any(axis=1)])
     for j, joint in enumerate(log.joints):
         extent = float(np.ptp(motion.q[:, j]))
-        share = float(np.mean(speed[:, j] > _STILL))
+        share = float(np.mean(speed[:, j] > AT_REST))
         is_prismatic = joint in layout.prismatic
         unit, least = ("m", _HARDLY_PRISMATIC) if is_prismatic else ("rad", _HARDLY)
-        code = "static_joint" if extent < _STATIC else "hardly_moves"
+        code = "static_joint" if extent < STATIC else "hardly_moves"
         if extent < least or share < _MOVING:
             yield finding(code, log.name, joint, range=extent, moving_share=share, unit=unit)
 
@@ -394,7 +394,7 @@ def _in_motion(log: Log, runs: list[tuple[int, int]]) -> list[tuple[int, int]]:
     m = np.minimum(n, _AROUND)
     around = np.linalg.norm(q[first] - q[np.maximum(first - m, 0)], axis=1)
     around += np.linalg.norm(q[np.minimum(last + 1 + m, last_row)] - q[last + 1], axis=1)
-    moves = np.abs(change).max(axis=1, initial=0.0) > _STILL * (t[last + 1] - t[first])
+    moves = np.abs(change).max(axis=1, initial=0.0) > AT_REST * (t[last + 1] - t[first])
     if not log.has_torque:
         steps = np.array([quantum(x) for x in q.T])
         moves &= (np.abs(change) > 1.5 * steps).any(axis=1)
@@ -459,7 +459,7 @@ def _touches(x: Array) -> int:
     """Return how often a torque reaches 0 and increases again."""
     top = float(np.quantile(np.abs(x), 0.995))
     near = runs_of(x < _AWAY * top)
-    return sum(x[i:k].min() < _ZERO * top for i, k in near if i > 0 and k < len(x))
+    return sum(x[i:k].min() < ZERO * top for i, k in near if i > 0 and k < len(x))
 
 
 def _held(log: Log) -> Iterator[Finding]:

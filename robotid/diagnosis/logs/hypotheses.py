@@ -14,13 +14,26 @@ from robotid.base.typing import Array
 from robotid.data.log import Log, Trajectory
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import process, resolve, unwrap
+from robotid.diagnosis.logs.channels import AT_REST, ZERO
 from robotid.dynamics.drive_columns import drive_values, friction_directions, friction_speeds
 from robotid.dynamics.torque import carried_columns
 from robotid.robot.model import RobotModel
 
+#: Decrease of the misfit from which another gravity is reported.
+HINT = 0.7
+#: An unexplained share below this is negligible.
+FLOOR = 1e-3
+#: Relative variation of a torque that is rounding.
+CONSTANT = 1e-6
 _MARGIN = 0.15  # [s] rows closer to the end of a segment are not used: the filter has not settled
-_STILL = 0.02  # [rad/s] slower, the sign of a friction torque is unknown
-_SLOW = 0.05  # ... for a slow joint: share of its largest speed
+_SLOW = 0.05  # largest speed of the unknown sign of friction of a slow joint, over its largest
+_POOR = 0.08  # unexplained share from which other readings of the positions are tested
+_CLEARLY = 2.0  # decrease of the misfit, a factor 7, beyond the readings with stated positions
+_ROWS, _QUARTER = 200, 4  # rows of these tests, and the divisor of their number in a first pass
+_OFFSETS = (0.4, -0.4, np.pi / 2, -np.pi / 2, np.pi)  # [rad] errors of a zero position
+_EARTH = 9.81  # [m/s^2]
+_ITERATIONS = 8  # of signs and fit
+_FOLDED = 0.4  # largest ratio of unexplained shares at which a torque is an absolute value
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,8 +75,7 @@ class _Loads:
     @cached_property
     def _places(self) -> tuple[Array, Array]:
         """Rows and bodies of the carried columns, one entry for ten columns."""
-        carried = self.model.support()[:, : self.model.layout.n_inertial : 10]
-        rows, bodies = np.nonzero(carried)
+        rows, bodies = np.nonzero(self.model.support()[:, : self.model.layout.n_inertial : 10])
         return rows, bodies
 
     def _by_link(self, ten: Array) -> Array:
@@ -76,18 +88,25 @@ class _Loads:
 
 @dataclass(frozen=True, eq=False)
 class Probe:
-    """The parts of the model's torque at some instants, linear in masses and gravity."""
+    """The parts of the model's torque at N instants, linear in masses and gravity."""
 
-    model: RobotModel  # The robot
+    model: RobotModel
     motion: Trajectory  # The smooth motion that contains the instants
-    rows: Array  # The N instants, as rows of the motion, shape (N,), int
-    q: Array  # Joint positions, shape (N, n) [rad or m]
-    v: Array  # Velocities, shape (N, n)
-    a: Array  # Accelerations, shape (N, n)
-    tau: Array  # Torques, shape (N, n) [N m or N]
-    parts: _Loads  # The parts of the model's torque at these instants
-    #: Joints whose torque may also depend on their position, as with a counterbalance
-    balanced: tuple[int, ...] = ()
+    rows: Array  # (N,), the instants as rows of the motion
+    q: Array  # (N, n), joint positions [rad or m]
+    v: Array  # (N, n), velocities
+    a: Array  # (N, n), accelerations
+    tau: Array  # (N, n), torques [N m or N]
+    parts: _Loads
+
+    @classmethod
+    def of(
+        cls, model: RobotModel, motion: Trajectory, rows: Array,
+        state: tuple[Array, Array, Array] | None = None,
+    ) -> "Probe":  # fmt: skip
+        """Return the probe at rows of a motion, or with another state (N, n) and its torques."""
+        state = state or (motion.q[rows], motion.v[rows], motion.a[rows])
+        return cls(model, motion, rows, *state, motion.tau[rows], _Loads(model, *state))
 
     @property
     def gravity(self) -> Array:
@@ -109,36 +128,20 @@ class Probe:
 
     @cached_property
     def drives(self) -> Array:
-        """Columns of the drives: inertia, frictions, offset of either sign, shape (N, n, 5 + k).
-
-        These are a, v, sign v, 1, -1, the columns of coupled drives, and those of a counterbalance
-        if there is one, 0 for other joints.
-        """
+        """Columns of the drives: a, v, sign v, 1, -1, and of coupled drives, (N, n, 5 + k)."""
         v, one = self.v, np.ones_like(self.v)
-        least = _STILL * self.model.layout.drive_speeds[: v.shape[1]]
+        least = AT_REST * self.model.layout.drive_speeds[: v.shape[1]]
         still = np.minimum(least, _SLOW * np.abs(v).max(axis=0))
         own = [self.a, v, np.tanh(v / np.where(still > 0, still, least)), one, -one]
-        swings = np.zeros((*v.shape, 4 if self.balanced else 0))
-        for j in self.balanced:
-            swings[:, j] = np.hstack([self.swing(j), -self.swing(j)])
-        return np.concatenate([np.stack(own, axis=2), self.parts.coupled, swings], axis=2)
-
-    def swing(self, j: int) -> Array:
-        """Return the columns of a counterbalance, cos q and sin q, shape (N, 2)."""
-        return np.column_stack([np.cos(self.q[:, j]), np.sin(self.q[:, j])])
-
-    def of(self, model: RobotModel) -> "Probe":
-        """Return the same motion of another robot."""
-        return replace(self, model=model, parts=replace(self.parts, model=model))
+        return np.concatenate([np.stack(own, axis=2), self.parts.coupled], axis=2)
 
     def at(self, rows: Array) -> "Probe":
         """Return the probe at other rows of the same motion: rows (N,)."""
-        return replace(_probe_at(self.model, self.motion, rows), balanced=self.balanced)
+        return Probe.of(self.model, self.motion, rows)
 
     def with_motion(self, state: tuple[Array, Array, Array]) -> "Probe":
         """Return the probe with another motion and the same torques: state (N, n)."""
-        moved = _probe(self.model, self.motion, self.rows, state)
-        return replace(moved, balanced=self.balanced)
+        return Probe.of(self.model, self.motion, self.rows, state)
 
 
 def coupled_columns(model: RobotModel, q: Array, v: Array, a: Array) -> Array:
@@ -153,55 +156,24 @@ def coupled_columns(model: RobotModel, q: Array, v: Array, a: Array) -> Array:
 
 def smooth_motion(model: RobotModel, log: Log, settings: SignalSettings) -> Trajectory:
     """Return the motion of a log with velocities and accelerations derived from its positions."""
-    free = np.array([joint.turns_freely for joint in model.limits])
-    log = unwrap(log, free)
-    own = replace(settings, velocity="differentiated", acceleration="differentiated")
-    return process(log, resolve(log, own), friction_speeds(model.layout))
+    log = unwrap(log, np.array([joint.turns_freely for joint in model.limits]))
+    settings = replace(settings, velocity="differentiated", acceleration="differentiated")
+    return process(log, resolve(log, settings), friction_speeds(model.layout))
 
 
 def take_probe(model: RobotModel, motion: Trajectory, *, samples: int = 500) -> Probe | None:
     """Return a probe of a motion, None if the motion is too small for any check."""
-    slow = _STILL * model.layout.drive_speeds[: len(model.joints)]
-    rows = np.flatnonzero((np.abs(motion.v) > slow).any(axis=1) & _inner(motion))
-    if len(rows) < 50:
-        return None
-    chosen = np.unique(np.linspace(0, len(rows) - 1, samples).astype(int))
-    return _probe_at(model, motion, rows[chosen])
-
-
-def _inner(motion: Trajectory) -> Array:
-    """Return which rows are far from the ends of their segment, shape (N,), bool."""
-    inner = np.ones(len(motion.t), dtype=bool)
+    inner = np.ones(len(motion.t), dtype=bool)  # far from the ends of the segment
     for number in np.unique(motion.segment):
         part = motion.segment == number
         t = motion.t[part]
         inner[part] = (t >= t[0] + _MARGIN) & (t <= t[-1] - _MARGIN)
-    return inner
-
-
-def _probe_at(model: RobotModel, motion: Trajectory, rows: Array) -> Probe:
-    return _probe(model, motion, rows, (motion.q[rows], motion.v[rows], motion.a[rows]))
-
-
-def _probe(
-    model: RobotModel, motion: Trajectory, rows: Array, state: tuple[Array, Array, Array]
-) -> Probe:
-    return Probe(model, motion, rows, *state, motion.tau[rows], _Loads(model, *state))
-
-
-#: Decrease of the misfit from which another gravity is reported.
-HINT = 0.7
-#: An unexplained share below this is negligible.
-FLOOR = 1e-3
-_POOR = 0.08  # unexplained share from which other readings of the positions are tested
-_CLEARLY = 2.0  # decrease of the misfit, a factor 7, beyond the readings with stated positions
-_ROWS, _QUARTER = 200, 4  # rows of these tests, and the divisor of their number in a first pass
-_OFFSETS = (0.4, -0.4, np.pi / 2, -np.pi / 2, np.pi)  # [rad] errors of a zero position
-_EARTH = 9.81  # [m/s^2]
-_RINGING = 0.05  # of its largest value, undershoot below 0 by the filter
-_ITERATIONS = 8  # of signs and fit
-_FOLDED = 0.4  # largest ratio of unexplained shares at which a torque is an absolute value
-_CONSTANT = 1e-9  # relative variation of a torque that is rounding
+    slow = AT_REST * model.layout.drive_speeds[: len(model.joints)]
+    rows = np.flatnonzero((np.abs(motion.v) > slow).any(axis=1) & inner)
+    if len(rows) < 50:
+        return None
+    chosen = np.unique(np.linspace(0, len(rows) - 1, samples).astype(int))
+    return Probe.of(model, motion, rows[chosen])
 
 
 @dataclass(frozen=True)
@@ -211,7 +183,7 @@ class Explanation:
     #: "stated", "payload", "torque_sign", "unsigned_torque", "torque_order", "gravity",
     #: "joint_order", "joint_axis", "position_order", "position_sign" or "position_offset"
     kind: str
-    share: Array  # Unexplained share of each torque's variance, shape (n,)
+    share: Array  # (n,), unexplained share of each torque's variance
     joints: tuple[int, ...] = ()  # Indices of the joints concerned
     #: "torque_order": the joint of each torque column; "gravity": the vector [m/s^2];
     #: "position_offset": the offset [rad]
@@ -231,29 +203,20 @@ def compensated(probe: Probe) -> tuple[Probe, Array]:
     return whole, _over(own_share(whole) * size, logged)
 
 
-def unexplained(probe: Probe) -> Array:
-    """Return the share of each torque column that the model of each joint does not explain."""
-    N, n = probe.tau.shape
-    every = np.hstack([probe.tau, -probe.tau])
-    share = _shares(probe, np.broadcast_to(every, (n, N, 2 * n)))
-    return share.reshape(n, 2, n).transpose(2, 0, 1)
-
-
 def explanations(probe: Probe) -> tuple[Explanation, Explanation, list[Explanation]]:
     """Return how well the torques are explained as stated, and under each other hypothesis."""
-    share = unexplained(probe)
+    N, n = probe.tau.shape
+    every = np.broadcast_to(np.hstack([probe.tau, -probe.tau]), (n, N, 2 * n))
+    share = _shares(probe, every).reshape(n, 2, n).transpose(2, 0, 1)  # (column, joint, sign)
     own = np.diagonal(share).T  # (n, 2)
     stated = Explanation("stated", own[:, 0])
-    others = [_signs(own), _unsigned(probe, own), _order(share), _gravity(probe, stated)]
+    negated = tuple(np.flatnonzero(own[:, 1] < own[:, 0]).tolist())
+    signs = Explanation("torque_sign", own.min(axis=1), negated)
+    others = [signs, _unsigned(probe, own), _order(share), _gravity(probe, stated)]
     loaded = Explanation("payload", np.minimum(own_share(probe, any_load=True), stated.share))
     if stated.share.max() > _POOR:
         others += _positions(probe, min(e.misfit for e in [stated, *others]))
     return stated, loaded, others
-
-
-def _signs(own: Array) -> Explanation:
-    reversed_ = np.flatnonzero(own[:, 1] < own[:, 0])
-    return Explanation("torque_sign", own.min(axis=1), tuple(reversed_.tolist()))
 
 
 def _unsigned(probe: Probe, own: Array) -> Explanation:
@@ -268,7 +231,7 @@ def _unsigned(probe: Probe, own: Array) -> Explanation:
     share, joints = own[:, 0].copy(), []
     loads = probe.loads()
     for j, tau in enumerate(probe.tau.T):
-        if tau.min() < -_RINGING * tau.max() or share[j] < _POOR:
+        if tau.min() < -ZERO * tau.max() or share[j] < _POOR:
             continue
         X = np.hstack([loads[:, j], probe.drives[:, j]])
         starts = (loads[:, j].sum(axis=1), probe.v[:, j], probe.a[:, j])
@@ -281,8 +244,12 @@ def _unsigned(probe: Probe, own: Array) -> Explanation:
 
 def _folded_misfit(X: Array, tau: Array, sign: Array) -> tuple[float, float]:
     """Return the unexplained shares of a torque whose signs are iterated from initial ones."""
+    from scipy.optimize import nnls
+
+    size = np.linalg.norm(X, axis=0)
+    columns = X / np.where(size > 0, size, 1.0)
     for _ in range(_ITERATIONS):
-        sign = np.where(_nonnegative_prediction(X, sign * tau) < 0, -1.0, 1.0)
+        sign = np.where(columns @ nnls(columns, sign * tau)[0] < 0, -1.0, 1.0)
     signed = sign * tau
     left = float(_misfits(X[None], signed[None, :, None])[0, 0])
     of_size, of_signed = (float(np.sum((x - x.mean()) ** 2)) for x in (tau, signed))
@@ -295,8 +262,8 @@ def _order(share: Array) -> Explanation:
 
     columns, joints = linear_sum_assignment(np.log(share[:, :, 0] + FLOOR))
     moved = tuple(np.flatnonzero(columns != joints).tolist())
-    found = share[columns, joints, 0]
-    return Explanation("torque_order", found, moved, tuple(joints.astype(float).tolist()))
+    values = tuple(joints.astype(float).tolist())
+    return Explanation("torque_order", share[columns, joints, 0], moved, values)
 
 
 def _gravity(probe: Probe, stated: Explanation) -> Explanation:
@@ -335,8 +302,10 @@ def _gravity(probe: Probe, stated: Explanation) -> Explanation:
 
     simplex = [[0.0, 0.0], [0.1, 0.0], [0.0, 0.1]]
     options = {"initial_simplex": simplex, "xatol": 5e-3, "fatol": 1e-2, "maxfev": 60}
-    found = minimize(lambda x: tilted(x).misfit, np.zeros(2), method="Nelder-Mead", options=options)
-    return tilted(found.x)
+    best_x = minimize(
+        lambda x: tilted(x).misfit, np.zeros(2), method="Nelder-Mead", options=options
+    ).x
+    return tilted(best_x)
 
 
 def _shares_by_gravity(probe: Probe) -> tuple[Callable[[Array], Array], Array]:
@@ -383,8 +352,8 @@ def _positions(probe: Probe, best: float) -> Iterator[Explanation]:
     if first is not None and _refined(few, first).misfit < likely:
         near = [e for e in offsets if e.misfit < first.misfit + 0.5 * _CLEARLY]
         tried = [_offset(some, e.joints[0], e.values[0]) for e in near]
-        found = _refined(some, min(tried, key=lambda e: e.misfit))
-        yield from [found] if found.misfit < enough else []
+        refined = _refined(some, min(tried, key=lambda e: e.misfit))
+        yield from [refined] if refined.misfit < enough else []
 
 
 def _revolute(probe: Probe) -> list[int]:
@@ -428,12 +397,12 @@ def _refined(probe: Probe, rough: Explanation) -> Explanation:
     from scipy.optimize import minimize_scalar
 
     j, centre = rough.joints[0], rough.values[0]
-    found = minimize_scalar(
+    best = minimize_scalar(
         lambda offset: _offset(probe, j, float(offset)).misfit,
         bounds=(centre - 0.4, centre + 0.4), method="bounded",
         options={"xatol": 5e-3, "maxiter": 15},
     )  # fmt: skip
-    return min(rough, _offset(probe, j, float(found.x)), key=lambda e: e.misfit)
+    return min(rough, _offset(probe, j, float(best.x)), key=lambda e: e.misfit)
 
 
 def _moved(probe: Probe, j: int, sign: float, offset: float) -> tuple[Array, Array, Array]:
@@ -470,7 +439,7 @@ def _over(left: Array, size: Array) -> Array:
 def _variation(tau: Array) -> Array:
     """Return the sum of squares of torques (N, ...) about their mean, 0 if constant."""
     centred = tau - tau.mean(axis=0)
-    is_constant = np.ptp(tau, axis=0) <= _CONSTANT * np.abs(tau).max(axis=0)
+    is_constant = np.ptp(tau, axis=0) <= CONSTANT * np.abs(tau).max(axis=0)
     return np.where(is_constant, 0.0, np.sum(centred**2, axis=0))
 
 
@@ -489,13 +458,3 @@ def _misfits(X: Array, torques: Array) -> Array:
 def _triangles(rows: Array) -> Array:
     """Return the triangular factors of the rows of each joint, (n, N, c), shape (n, c, c)."""
     return np.asarray(np.linalg.qr(rows, mode="r"))
-
-
-def _nonnegative_prediction(X: Array, tau: Array) -> Array:
-    """Return the prediction of a torque by columns with factors >= 0, shape (N,)."""
-    from scipy.optimize import nnls
-
-    size = np.linalg.norm(X, axis=0)
-    columns = X / np.where(size > 0, size, 1.0)
-    predicted: Array = columns @ nnls(columns, tau)[0]
-    return predicted

@@ -21,8 +21,7 @@ from robotid.robot.urdf_text import exact_angle, numbers
 
 #: Findings that take the URDF's masses as evidence.
 _OF_MASSES = (
-    "current_for_torque", "joint_origin", "link_mass", "payload", "torque_scale", "total_mass",
-    "urdf_mismatch",
+    "current_for_torque", "joint_origin", "payload", "torque_scale", "total_mass", "urdf_mismatch",
 )  # fmt: skip
 _SLACK = 1e-9  # relative violation of the triangle inequality that is rounding
 _NOISE = 1e-10  # smaller pivots, over the largest, are rounding errors

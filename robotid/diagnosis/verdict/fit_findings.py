@@ -12,7 +12,7 @@ from robotid.base.typing import Array
 from robotid.data.log import Log
 from robotid.diagnosis.catalogue import finding
 from robotid.diagnosis.residual.decisions import TENFOLD
-from robotid.diagnosis.residual.misfit import Misfit, misfit_findings
+from robotid.diagnosis.residual.misfit import Misfit, misfit_finding
 from robotid.diagnosis.urdf.inertials import audit_bodies
 from robotid.diagnosis.verdict.parameter_table import correlated_parameters
 from robotid.diagnosis.verdict.scale_check import friction_shares
@@ -70,7 +70,7 @@ def fit_findings(
     findings += _impossible_shapes(fit)
     findings += _dense_bodies(fit)
     findings += _outlier_findings(fit)
-    findings += misfit_findings(fit, misfits, on_misfit)
+    findings += [misfit_finding(misfit, fit, on_misfit) for misfit in misfits]
     findings += [*_drive_findings(fit), *_correlated(fit)]
     findings += discrepancies
     findings += encoder_noise(fit)

@@ -16,7 +16,6 @@ from helpers.driven import (
 )
 
 from robotid.base.exceptions import SettingsError
-from robotid.diagnosis.residual.drive_choice import choose_drives
 from robotid.diagnosis.verdict.parameter_table import parameter_entries
 from robotid.estimation.fitting.fitted import friction_curve
 from robotid.robot.drive_term import DriveMotion
@@ -204,27 +203,6 @@ def test_of_families_alike_the_better_conditioned_is_chosen(plain, rising):
 
 def rising_logs(found):
     return [evaluation.recording.log for evaluation in found.fitted]
-
-
-def test_a_counterbalance_that_is_known_is_in_the_model_before_others_are_tried(plain, cases):
-    log = cases("load")[2]
-    fit = fitted_in(plain, [log], friction="none")
-    first = {ELBOW: "harmonics1"}
-    wanted = dict.fromkeys(JOINTS)
-    choices = {c.joint: c for c in choose_drives(fit, wanted, first)}
-    assert choices[ELBOW].families == ("harmonics1", "load")
-    assert choices[ELBOW].tried[0].families == ("harmonics1",)
-    assert choices[ELBOW].tried[0].is_selected
-    assert choices[LIFT].families == ()
-    # what explains far more of the same kind replaces it
-    fit = fitted_in(plain, [cases("harmonics4")[2]], friction="none")
-    choices = {c.joint: c for c in choose_drives(fit, wanted, first)}
-    assert choices[ELBOW].families == ("harmonics4",)
-    assert [x.families for x in choices[ELBOW].tried if x.is_selected] == [
-        ("harmonics1",), ("harmonics4",)
-    ]  # fmt: skip
-    fixed = choose_drives(fit, {**wanted, ELBOW: ("load",)}, first)
-    assert {c.joint: c.families for c in fixed}[ELBOW] == ("load",)
 
 
 def test_harmonics_are_for_joints_that_turn_far_enough(plain):

@@ -84,7 +84,6 @@ def test_every_command_is_one_that_the_program_takes(identified):
 NAMED = {
     "backlash": "Exclude the samples",
     "clipped": "Record a slower motion",
-    "counterbalance": "Add the missing drive terms",
     "coupling": "Add the missing drive terms",
     "drift": "Drift is so; do something",
     "friction_shape": "Add the missing drive terms",
@@ -160,18 +159,14 @@ def test_a_named_cause_has_its_step_and_no_guess_beside_it(identified, code, rng
     own = [c for c in candidates(joint, "wrist_1_joint", rng) if c.code == code]
     entries = {c.name: c.families[:1] or c.terms for c in own}
     lacks = [lacking(joint, c, entries[c.name]) for c in own[:2]]
-    evidence = {"turned": 2.0} if code == "counterbalance" else {}
-    found = told(
-        identified, warning("unexplained_torque"), warning(code, **evidence), misfits=tuple(lacks)
-    )
+    found = told(identified, warning("unexplained_torque"), warning(code), misfits=tuple(lacks))
     steps = next_steps(found, JOB)
     assert not any(_guesses(step, joint) for step in steps)
     assert sum(step.words.startswith(NAMED[code]) for step in steps) == 1
     blocks = [block for step in steps for block in step.blocks]
-    if code in ("counterbalance", "friction_shape", "spring"):
+    if code in ("friction_shape", "spring"):
         (drives,) = [block for block in blocks if block.startswith("[drives]")]
         wanted = {
-            "counterbalance": ("harmonics1",),
             "friction_shape": ("stribeck",),
             "spring": ("harmonics2", "spring"),
         }
