@@ -175,7 +175,7 @@ def _is_excused(best: Explanation, loaded: Explanation) -> bool:
             loaded.share[j] < min(_UNEXPLAINED, _MUCH_BETTER * (best.share[j] + FLOOR))
             for j in best.joints
         )
-        return all(excused)
+        return bool(all(excused))
     return loaded.misfit - best.misfit < np.log(_MUCH_BETTER)
 
 

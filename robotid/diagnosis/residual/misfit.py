@@ -86,8 +86,9 @@ class Misfit:
 
 def find_misfits(sample: Sample | None) -> tuple[Misfit, ...]:
     """Return the terms that would explain a part of the residual of a fit, the largest first."""
-    joints = () if sample is None else range(len(sample.joints))
-    misfits = [misfit for j in joints for misfit in _of_joint(sample, j)]
+    if sample is None:
+        return ()
+    misfits = [misfit for j in range(len(sample.joints)) for misfit in _of_joint(sample, j)]
     coupled = [(m.joint, m.term.coupled) for m in misfits]
     # a coupled drive loads both joints
     return tuple(

@@ -15,8 +15,8 @@ from robotid.diagnosis.residual.decisions import TENFOLD
 from robotid.diagnosis.residual.misfit import Misfit, misfit_finding
 from robotid.diagnosis.urdf.inertials import audit_bodies
 from robotid.diagnosis.verdict.parameter_table import correlated_parameters
-from robotid.diagnosis.verdict.scale_check import friction_shares
-from robotid.diagnosis.verdict.verdict import GOOD, error_of, is_harmless_cost
+from robotid.diagnosis.verdict.scale_check import DIFFERS, friction_shares
+from robotid.diagnosis.verdict.verdict import BEATEN, GOOD, SMALL, error_of, is_harmless_cost
 from robotid.estimation.estimators.consistent.body_constraints import slabs
 from robotid.estimation.fitting.estimator_settings import BoundedSettings, ConsistentSettings
 from robotid.estimation.fitting.fitted import Fit
@@ -26,14 +26,12 @@ from robotid.robot.geometry import body_boxes, body_points
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
 
-_COSTS = 1.05  # residual over that of WLS above which bounds increase the torque error
 _FAR = 3.0  # a total mass differs from the URDF's at most by this factor
 _ROUNDING = 1e-6  # [m^2] tolerance of a body that touches its box
 _NAMED = 5  # outliers that a finding names
 _BIASED = 0.5, 2.0  # shift of a parameter by encoder noise, in standard errors: note, warning
 _COARSE = 0.1  # share of encoder noise over the largest one, from which a joint is named
 _DIFFERS = 1.2  # residual of a consistent fit over that of WLS above which it is reported
-_LITTLE = 5.0  # [%] ... as a note if the constraints add less to the torque error
 _SHRUNK = 0.1  # of the URDF's smallest eigenvalue: below, a body is barely possible
 _MUCH = 0.2  # ... if links on locked joints have more than this share of its mass
 _USER_BOUNDS = ("mass ", "total_mass ", "centre_of_mass ")
@@ -42,8 +40,7 @@ _DENSEST = 12_000.0  # [kg/m^3] of a link: lead has 11,340
 _UNLIKELY = 0.05  # share of the bodies that the errors allow below which one is not possible
 _AT_BOUND = 1e-3  # relative difference of a mass from a stated bound that determines it
 _VANISHED = 0.05  # share of a link's URDF mass below which the link has practically vanished
-_RESCALED = 0.1  # least difference from 1 of a factor between measured and predicted torque
-_LEFT = 1 / 3  # ... and the largest share of the squared error that it leaves
+_LEFT = 1 / 3  # largest share of the squared error that a gain of the torque leaves
 _MOSTLY = 0.6  # share of friction in a torque from which friction may have changed, too
 
 
@@ -55,25 +52,29 @@ def fit_findings(
 ) -> list[Finding]:
     """Return the findings about a fit: undetermined parameters, outliers, costs of constraints."""
     findings = _static_findings(fit)
-    determined = fit.determination
+    determined, details = fit.determination, fit.estimate.details
     if determined.groups:
-        findings.append(
+        findings += [
             finding(
                 "undetermined", subject="base_parameters", described=determined.described(),
                 severity="warning" if fit.is_poorly_excited else "note", rank=determined.rank,
                 base=len(determined.names),
             )
-        )  # fmt: skip
+        ]  # fmt: skip
     findings += consistency_findings(fit)
-    findings += _bound_findings(fit)
-    findings += _total_mass(fit)
-    findings += _impossible_shapes(fit)
-    findings += _dense_bodies(fit)
+    at_bound = [x for x, is_at in zip(fit.model.layout.names, fit.at_bound, strict=True) if is_at]
+    if at_bound:
+        joints = list(dict.fromkeys(name.rpartition(".")[0] for name in at_bound))
+        where, names = ", ".join(at_bound), listed(at_bound, _NAMED)
+        findings += [finding("at_bound", "", joints, subject=where, names=names)]
+    findings += [
+        finding("extent_contradicted", subject=f"link {body}", link=body)
+        for body in details.get("relaxed", ())
+    ]
+    findings += [*_total_mass(fit), *_impossible_shapes(fit), *_dense_bodies(fit)]
     findings += _outlier_findings(fit)
     findings += [misfit_finding(misfit, fit, on_misfit) for misfit in misfits]
-    findings += [*_drive_findings(fit), *_correlated(fit)]
-    findings += discrepancies
-    findings += encoder_noise(fit)
+    findings += [*_drive_findings(fit), *_correlated(fit), *discrepancies, *encoder_noise(fit)]
     findings += [
         finding("validation_was_fitted", subject=e.recording.log.path, name=e.recording.name)
         for e in fit.refitted
@@ -94,7 +95,7 @@ def _costs(fit: Fit) -> list[Finding]:
         if measured.rmse <= _DIFFERS * free.rmse:
             continue
         error, least = measured.relative_error_pct, free.relative_error_pct or 0.0
-        is_little = error is not None and error**2 - least**2 < _LITTLE**2
+        is_little = error is not None and error**2 - least**2 < SMALL**2
         is_little = is_little and is_harmless_cost(error or 0.0, least) and not (asked or locked)
         what = "overfitted" if joint in fit.overfitted else "costly"
         what = "little" if is_little else what
@@ -112,22 +113,9 @@ def _static_findings(fit: Fit) -> list[Finding]:
     """Return a note on the samples of a static model, and on joints without Coulomb friction."""
     if not fit.model.is_static:
         return []
-    extents = [e.recording.extent for e in fit.fitted]
-    rows, samples = sum(x.samples for x in extents), sum(x.smooth for x in extents)
-    still = _drives_at_rest(fit)
-    return [
-        finding(
-            "static", subject="standard_parameters", cure=bool(still), still=listed(still),
-            rows=rows, samples=samples,
-        )
-    ]  # fmt: skip
-
-
-def _drives_at_rest(fit: Fit) -> list[str]:
-    """Return the names of drives whose friction has no direction in any used sample."""
-    layout = fit.model.layout
+    layout, extents = fit.model.layout, [e.recording.extent for e in fit.fitted]
     motions = [(e.recording.trajectory, e.recording.mask) for e in fit.fitted]
-    return [
+    still = [
         drive.name
         for d, (drive, ratios) in enumerate(zip(layout.drives, layout.drive_ratios, strict=True))
         if not any(
@@ -135,6 +123,12 @@ def _drives_at_rest(fit: Fit) -> list[str]:
             for motion, mask in motions
         )
     ]
+    return [
+        finding(
+            "static", subject="standard_parameters", cure=bool(still), still=listed(still),
+            rows=sum(x.samples for x in extents), samples=sum(x.smooth for x in extents),
+        )
+    ]  # fmt: skip
 
 
 def _drive_findings(fit: Fit) -> Iterator[Finding]:
@@ -195,15 +189,14 @@ def _correlated(fit: Fit) -> Iterator[Finding]:
 
 def not_written(log_errors: Sequence[Finding], inconsistent: str = "") -> list[Finding]:
     """Return a warning that the URDF is not written, with the reason; nothing if it is written."""
+    if not (log_errors or inconsistent):
+        return []
     codes = listed(dict.fromkeys(error.code for error in log_errors))
     what = "codes" if log_errors else "inconsistent"
-    words = {"codes": codes, "estimator": inconsistent}
-    is_written = not (log_errors or inconsistent)
-    return (
-        []
-        if is_written
-        else [finding("urdf_not_written", subject="urdf", what=what, cure=what, **words)]
-    )
+    return [
+        finding("urdf_not_written", subject="urdf", what=what, cure=what, codes=codes,
+                estimator=inconsistent)
+    ]  # fmt: skip
 
 
 def locked_findings(model: RobotModel, stated: Collection[str]) -> list[Finding]:
@@ -328,16 +321,16 @@ def _impossible_shapes(fit: Fit) -> list[Finding]:
         body = fault.words["link"]
         if body in negligible:  # it keeps the URDF's values, and has no effect
             continue
-        identified = f"as identified, {fault.fault}"
         if (fault.code, fault.where) in before:
             fault = fault.reworded(severity="note", remedy="; the URDF has the same fault")
-        elif _is_within_box(fit, body, boxes[body]):
-            remedy = "; it is within the margin of the fit"
-            fault = fault.reworded(severity="note", fault=identified, remedy=remedy)
         else:
+            fault = fault.reworded(fault=f"as identified, {fault.fault}")
             remedy = f". {_cure(fit, body)}. The predicted torque may still be right; do not use "
             remedy += "mass, centre of mass and inertia of this link"
-            fault = fault.reworded(fault=identified, remedy=remedy)
+            if _is_within_box(fit, body, boxes[body]):
+                fault = fault.reworded(severity="note")
+                remedy = "; it is within the margin of the fit"
+            fault = fault.reworded(remedy=remedy)
         findings.append(fault)
     return findings
 
@@ -346,9 +339,8 @@ def _dense_bodies(fit: Fit) -> list[Finding]:
     """Return the identified bodies whose inertia needs a density above that of any material.
 
     As notes if the errors of mass and inertia allow a body of a material and no stated mass
-    determines it. Bodies that have this
-    density in the URDF are left out, and all of a result that is not physically consistent, which
-    is a reason of its own.
+    determines it. Bodies that have this density in the URDF are left out, and all of a result that
+    is not physically consistent, which is a reason of its own.
     """
     if not fit.is_consistent:
         return []
@@ -398,21 +390,6 @@ def _stated_of(fit: Fit, body: str) -> dict[str, float]:
     return {stated: mass} if is_at else {}
 
 
-def _bound_findings(fit: Fit) -> list[Finding]:
-    """Return notes on drive terms at 0, and warnings about bodies outside their geometry."""
-    findings, names = [], fit.model.layout.names
-    at_bound = [name for name, is_at in zip(names, fit.at_bound, strict=True) if is_at]
-    if at_bound:
-        joints = list(dict.fromkeys(name.rpartition(".")[0] for name in at_bound))
-        where, text = ", ".join(at_bound), listed(at_bound, _NAMED)
-        findings.append(finding("at_bound", "", joints, subject=where, names=text))
-    findings += [
-        finding("extent_contradicted", subject=f"link {body}", link=body)
-        for body in fit.estimate.details.get("relaxed", ())
-    ]
-    return findings
-
-
 def _outlier_findings(fit: Fit) -> list[Finding]:
     outliers = fit.outliers
     if not outliers:
@@ -447,24 +424,24 @@ def _locked_links(fit: Fit) -> str:
     Such links keep the URDF's inertials: the moved link takes all their errors.
     """
     model, size = fit.model, fit.model.layout.n_inertial
-    held, found = held_parameters(model), fit.standard[:size]
+    held, identified = held_parameters(model), fit.standard[:size]
     own, before = (
         np.linalg.eigvalsh(pseudo_inertia(pi[:size] - held))[:, 0]
-        for pi in (found, model.standard_parameters())
+        for pi in (identified, model.standard_parameters())
     )
-    links = [
+    is_shrunk = (own < _SHRUNK * before) & (held[::10] > _MUCH * identified[::10])
+    return "".join(
         f"the URDF's inertials of the links on locked joints, {held[10 * k]:.3g} kg of the "
-        f"{found[10 * k]:.3g} kg of {model.layout.bodies[k]} (identify their joints, too, if they "
-        "are wrong), "
-        for k in np.flatnonzero((own < _SHRUNK * before) & (held[::10] > _MUCH * found[::10]))
-    ]
-    return "".join(links)
+        f"{identified[10 * k]:.3g} kg of {model.layout.bodies[k]} (identify their joints, too, if "
+        "they are wrong), "
+        for k in np.flatnonzero(is_shrunk)
+    )
 
 
 def _contradiction(fit: Fit) -> tuple[str, dict[str, str]]:
     """Return whether data ("costs") or masses ("vanished") contradict active bounds."""
     ours, wls = (fit.metrics(name).per_joint for name in ("estimate", "wls"))
-    costs = [joint for joint in ours if ours[joint].rmse > _COSTS * wls[joint].rmse]
+    costs = [joint for joint in ours if ours[joint].rmse > BEATEN * wls[joint].rmse]
     if costs:
         return "costs", {"costs": listed(costs)}
     layout = fit.model.layout
@@ -503,17 +480,17 @@ def unlike_findings(variation: Variation | None) -> Iterator[Finding]:
 def _unlike(code: str, name: str, unlike: UnlikeRun, others: int, rest: str) -> Finding:
     """Return the finding about a log or a unit, with the prediction of the others."""
     (low, high), kind = (float(end) for end in unlike.ends), unlike.kind
-    size, span = f"{unlike.value:.3g} +- {unlike.std_error:.2g}", f"{low:.3g} to {high:.3g}"
-    if kind == "zero":
-        size = f"{unlike.value:+.3g} +- {unlike.std_error:.2g}"
+    sign = "+" if kind == "zero" else ""
+    size = f"{unlike.value:{sign}.3g} +- {unlike.std_error:.2g}"
+    span = f"{low:.3g} to {high:.3g} {unlike.unit}"
     if kind == "gain":
         size = f"{100 * (unlike.value - 1):+.3g} +- {100 * unlike.std_error:.2g} %"
         span = f"{100 * (low - 1):+.3g} to {100 * (high - 1):+.3g} %"
     return finding(
         code, subject=name, name=name, what=kind, cure=kind, others=f"{others} {rest}", rest=rest,
         parameter=unlike.where if kind in ("zero", "gain") else unlike.name, unit=unlike.unit,
-        size=size, range=span if kind == "gain" else f"{span} {unlike.unit}", value=unlike.value,
-        std_error=unlike.std_error, low=low, high=high, probability=unlike.probability,
+        size=size, range=span, value=unlike.value, std_error=unlike.std_error, low=low, high=high,
+        probability=unlike.probability,
     )  # fmt: skip
 
 
@@ -540,7 +517,7 @@ def rescaled_findings(fit: Fit, loaded: Collection[str] = ()) -> Iterator[Findin
             tau, predicted = motion.tau[mask[:, k], k], e.torques["estimate"][mask[:, k], k]
             factor = float(predicted @ tau) / max(float(predicted @ predicted), 1e-300)
             left = float(np.sum((tau - factor * predicted) ** 2) / np.sum((tau - predicted) ** 2))
-            if abs(factor - 1.0) < _RESCALED or left > _LEFT:
+            if abs(factor - 1.0) < DIFFERS or left > _LEFT:
                 continue
             friction = friction or friction_shares(fit)
             yield finding(

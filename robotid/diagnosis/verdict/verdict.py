@@ -33,38 +33,54 @@ from robotid.estimation.fitting.evaluation import logs_that_test
 GOOD = 15.0
 #: [%] a joint with a larger torque prediction error is not usable.
 POOR = 50.0
+#: [%] the same limits of simulated position errors.
+GOOD_POSITION, POOR_POSITION = 5.0, 30.0
+#: Error over that of the second-order model from which it is hardly smaller: half the squares.
+HARDLY = 0.7
 #: A simpler model is better if its error is smaller by this factor ...
 BEATEN = 1.05
+_TIE = 0.3  # [%] ... and, for the URDF with fitted drives, by this share of the torque
 #: [%] a larger error on the fitted logs, twice that of WLS, makes a joint poor.
 COSTLY = 3.0
-_TIE = 0.3  # [%] ... and, for the URDF with fitted drives, by this share of the torque
-_OPTIMISM = 2.0  # validation error over fitted error beyond which the fit is over-fitted
+#: [%] of the torque: a smaller prediction error rejects a hypothesis on columns or masses, and
+#: gives no warning of a missing drive term.
+SMALL = 5.0
+_HARMLESS = 1.0  # [%] of the torque, below which an error gives no warning
+_MUCH = 2.0  # ratio of two errors, or of two gravity torques, that is no chance
 _BASE = "base."  # of the rows of a floating base
-_WRONG = 2.0  # an error this many times that of WLS gives a warning ...
-_HARMLESS = 1.0  # [%] ... but not below this share of the torque
 _NAMED = 8  # parameters that a reason names
 _USES_NAMED = 3  # joints that the line names
 _NOT_VERIFIED = "not verified, no validation log"
 _UNSCALED = "torque scale not verified"
+_HYPOTHESES = ("current_for_torque", "gravity", "gravity_compensated", "unexplained_torque",
+               "urdf_mismatch")  # fmt: skip
+_STATIC = (
+    "static model: gravity, offsets and Coulomb friction were identified. Inertias, armature and "
+    "viscous friction keep the URDF's values: the result is valid at rest and for slow motion"
+)
+_HIDDEN = "gravity changes its torque less than friction does at rest"
+# places that are not a recording
+_OF_THE_FIT = ("all joints", "estimator", "recordings", "standard_parameters")
+#: Simpler models, by name of the baseline; "urdf" has fitted drives where torques are the input.
+_SIMPLER = {
+    "command": "the command itself",
+    "second_order": "a second-order model",
+    "urdf": "the URDF with the stated gains",
+    "rows": "the fit to torques alone",
+    "steady": "constant velocity from the start",
+}
 
 
 @dataclass(frozen=True)
 class Predictions:
-    """Torque prediction errors of each joint.
+    """Torque prediction errors of each joint."""
 
-    Attributes:
-        fit: Metrics over the fitted recordings.
-        validation: Metrics of each validation log, by its name; or of each log left out in turn.
-        joints: The model's joints; one without a sample in any recording is not evaluated.
-        refitted: Names of validation logs that are left out because they contain fitted samples.
-        hidden: Joints that are not evaluated, as of ``hidden_joints``; their metrics are ignored.
-    """
-
-    fit: Metrics
-    validation: Mapping[str, Metrics]
+    fit: Metrics  # over the fitted recordings
+    validation: Mapping[str, Metrics]  # by validation log, or by log left out in turn
+    #: The model's joints; one without a sample in any recording is not evaluated.
     joints: Sequence[str] = ()
-    refitted: Sequence[str] = ()
-    hidden: Sequence[str] = ()
+    refitted: Sequence[str] = ()  # validation logs left out because they contain fitted samples
+    hidden: Sequence[str] = ()  # joints not evaluated, of ``hidden_joints``; without metrics
 
     @cached_property
     def fitted(self) -> dict[str, JointMetrics]:
@@ -97,15 +113,12 @@ class Predictions:
         """Return the evidence for each joint."""
         moved = [joint for m in (self.fitted, *self.tested.values()) for joint in m]
         named = [joint for joint in self.joints if joint not in self.hidden]
-        return {joint: self._on(joint) for joint in dict.fromkeys([*named, *moved])}
-
-    def _on(self, joint: str) -> JointEvidence:
-        evidence = JointEvidence()
+        every = {joint: JointEvidence() for joint in dict.fromkeys([*named, *moved])}
         for log, metrics in self.tested.items():
-            if (measured := metrics.get(joint)) is not None:
-                _judge_joint(evidence, joint, log, measured, self.fitted.get(joint))
-                evidence.errors.append(error_of(measured))
-        return evidence
+            for joint, measured in metrics.items():
+                _judge_joint(every[joint], joint, log, measured, self.fitted.get(joint))
+                every[joint].errors.append(error_of(measured))
+        return every
 
     def untested(self) -> list[str]:
         """Return why no prediction of unseen motion was evaluated; empty if one was."""
@@ -156,21 +169,14 @@ class JointEvidence:
 
 @dataclass(frozen=True)
 class Determined:
-    """Parameters that the data determine.
+    """Parameters that the data determine."""
 
-    Attributes:
-        undetermined: Base parameters that the data do not determine individually.
-        is_consistent: Whether the parameters are physically consistent.
-        is_poorly_excited: Whether a richer motion would determine them; else noise is the limit.
-        is_static: Whether the model is static.
-        uncertain_drives: Other drive parameters whose standard error is not smaller than 0.9 of
-            their prior standard deviation.
-    """
-
-    undetermined: Sequence[str] = ()
-    is_consistent: bool = True
-    is_poorly_excited: bool = True
+    undetermined: Sequence[str] = ()  # base parameters that are not determined individually
+    is_consistent: bool = True  # whether the parameters are physically consistent
+    is_poorly_excited: bool = True  # whether a richer motion would determine them; else noise
     is_static: bool = False
+    #: Other drive parameters whose standard error is not smaller than 0.9 of their prior standard
+    #: deviation.
     uncertain_drives: Sequence[str] = ()
 
     def warnings(self) -> list[str]:
@@ -199,7 +205,7 @@ def is_beaten(measured: JointMetrics) -> bool:
 
 def is_harmless_cost(error: float, wls_error: float) -> bool:
     """Return whether constraints cost so little torque error that the verdict does not count it."""
-    return error < max(_WRONG * wls_error, _HARMLESS)
+    return error < max(_MUCH * wls_error, _HARMLESS)
 
 
 def error_of(measured: JointMetrics) -> float:
@@ -226,7 +232,7 @@ def _judge_joint(
         "urdf": (1, error > urdf),
         "poor": (2, error > POOR),
         "usable": (None, error > GOOD),
-        "optimistic": (None, fitted is not None and error > max(_OPTIMISM * before, 5.0)),
+        "optimistic": (None, fitted is not None and error > max(_MUCH * before, SMALL)),
         "beaten": (None, is_beaten(measured)),
     }
     what, rank = next(((x, rank) for x, (rank, holds) in kinds.items() if holds), ("", None))
@@ -329,74 +335,34 @@ def _with(use: str, condition: str) -> str:
     return f"{use}, {condition}" if use.startswith("yes") else use
 
 
-_REJECTED = 5.0  # [%] a smaller prediction error rejects a hypothesis on columns or masses
-_SCALED = 2.0  # a gravity torque within this factor of the URDF's contradicts a wrong unit
-_SMALL = 5.0  # [%] of the torque: a missing drive term below this gives no warning
-_HYPOTHESES = (
-    "current_for_torque",
-    "gravity",
-    "gravity_compensated",
-    "unexplained_torque",
-    "urdf_mismatch",
-)
-_STATIC = (
-    "static model: gravity, offsets and Coulomb friction were identified. Inertias, armature and "
-    "viscous friction keep the URDF's values: the result is valid at rest and for slow motion"
-)
-_HIDDEN = "gravity changes its torque less than friction does at rest"
-# places that are not a recording
-_OF_THE_FIT = ("all joints", "estimator", "recordings", "standard_parameters")
-
-
 @dataclass(frozen=True)
 class VerdictWarning:
-    """Reason why a result may be wrong although it predicts torque well.
+    """Reason why a result may be wrong although it predicts torque well."""
 
-    Attributes:
-        code: Code of the finding.
-        joint: The joint concerned; empty if the whole result is.
-        message: The reason as text.
-        effect: The best verdict on the joint with this warning: "usable" or "poor".
-    """
-
-    code: str
-    joint: str
+    code: str  # of the finding
+    joint: str  # empty if the whole result is concerned
     message: str
-    effect: str = "usable"
+    effect: str = "usable"  # the best verdict on the joint with this warning: or "poor"
 
 
 @dataclass(frozen=True)
 class JointVerdict:
-    """Verdict on the torque prediction of one joint.
+    """Verdict on the torque prediction of one joint."""
 
-    Attributes:
-        status: "good", "usable", "poor" or "not evaluated".
-        reasons: Why, the worst first; for "good" what was checked.
-    """
-
-    status: str
-    reasons: tuple[str, ...]
+    status: str  # "good", "usable", "poor" or "not evaluated"
+    reasons: tuple[str, ...]  # the worst first; for "good" what was checked
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """Verdict on a result.
+    """Verdict on a result."""
 
-    Attributes:
-        status: "good", "usable", "poor" or "not evaluated".
-        reasons: Why, the worst first; for "good" what was checked.
-        joints: The verdict on each joint of the model.
-        log_errors: Faults of the recordings.
-        warnings: Warnings of the doctor and of the fit.
-        use_for: Whether the result can be used for a purpose, "yes" or "no" and why, by purpose.
-    """
-
-    status: str
-    reasons: tuple[str, ...]
+    status: str  # "good", "usable", "poor" or "not evaluated"
+    reasons: tuple[str, ...]  # the worst first; for "good" what was checked
     joints: Mapping[str, JointVerdict] = field(default_factory=dict)
-    log_errors: tuple[str, ...] = ()
-    warnings: tuple[VerdictWarning, ...] = ()
-    use_for: Mapping[str, str] = field(default_factory=dict)
+    log_errors: tuple[str, ...] = ()  # faults of the recordings
+    warnings: tuple[VerdictWarning, ...] = ()  # of the doctor and of the fit
+    use_for: Mapping[str, str] = field(default_factory=dict)  # "yes" or "no" and why, by purpose
 
     def to_dict(self) -> dict[str, Any]:
         """Return the verdict as plain values, as result.json has it."""
@@ -576,16 +542,14 @@ def rejected(
     for one in findings:
         joints = [joint for joint in one.joints if joint in errors] or [*errors]
         worst = max((errors[joint] for joint in joints), default=np.inf)
-        is_rejected = one.code in _HYPOTHESES and worst < _REJECTED
+        is_rejected = one.code in _HYPOTHESES and worst < SMALL
         if one.where == "all joints":
             is_rejected = False  # it was found in the residual of the prediction
         elif one.code == "current_for_torque":
             ratios = [scale_check.gravity[j] for j in joints if j in scale_check.gravity]
-            is_rejected &= all(1 / _SCALED < ratio < _SCALED for ratio in ratios)
+            is_rejected &= all(1 / _MUCH < ratio < _MUCH for ratio in ratios)
         elif one.code == "gravity_compensated":
-            is_rejected &= (
-                scale_check.scale is not None and 1 / _SCALED < scale_check.factor < _SCALED
-            )
+            is_rejected &= scale_check.scale is not None and 1 / _MUCH < scale_check.factor < _MUCH
         elif one.severity == "error":
             is_rejected = False
         if is_rejected:
@@ -654,25 +618,10 @@ def _warnings(finding: Finding, joints: Sequence[str]) -> Iterator[VerdictWarnin
 def _is_harmless(finding: Finding) -> bool:
     """Return whether the torque error is small in spite of a constraint or a missing term."""
     if finding.code in codes_with("term"):
-        return finding.evidence["error_pct"] < _SMALL and "replaces" not in finding.evidence
+        return finding.evidence["error_pct"] < SMALL and "replaces" not in finding.evidence
     if finding.code != "constraint_costs":
         return False
     return is_harmless_cost(finding.evidence["error_pct"], finding.evidence["wls_error_pct"])
-
-
-#: [%] simulated position error of a joint on validation logs: limits of "good" and "usable".
-GOOD_POSITION, POOR_POSITION = 5.0, 30.0
-#: Error over that of the second-order model from which it is hardly smaller: half the squares.
-HARDLY = 0.7
-_FITTED = 15.0  # [%] ... on fitted logs: then the model lacks an effect if this large
-#: Simpler models, by name of the baseline; "urdf" has fitted drives where torques are the input.
-_SIMPLER = {
-    "command": "the command itself",
-    "second_order": "a second-order model",
-    "urdf": "the URDF with the stated gains",
-    "rows": "the fit to torques alone",
-    "steady": "constant velocity from the start",
-}
 
 
 def judge_positions(
@@ -725,7 +674,7 @@ def _judge_position(
     simple = None if fitted is None else fitted.baselines.get("second_order")
     if fitted is not None and simple is not None:
         error = error_of(fitted)
-        if error > max(_FITTED, HARDLY * simple):
+        if error > max(GOOD, HARDLY * simple):
             lacking = (
                 f"{joint}: simulated position error {error:.2g} % of its RMS motion on the fitted "
                 f"logs, {simple:.2g} % with a second-order model: the model lacks an effect of "
