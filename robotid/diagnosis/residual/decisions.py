@@ -77,9 +77,11 @@ FEWEST = 6
 OUTLIER = 12.0
 #: Share of a column below which it is rounding, and relative step of a derivative by a shape.
 ROUNDING, STEP = 1e-10, 1e-3
+#: Segments from which a scatter is determined.
+SCATTERED = 3
+#: A sum of squares that is 0, as a divisor.
+NOTHING = 1e-300
 _STILL = 1e-9  # of the largest squared residual of a segment: below, the joint is at rest in it
-_FEWEST = 3  # segments for a test
-_NOTHING = 1e-300
 Option = TypeVar("Option", bound=Hashable)
 
 
@@ -99,7 +101,7 @@ class Round(Generic[Option]):
 
     def share(self, option: Option) -> float:
         """Return the share of the squared residual of fitted logs that an option removes [-]."""
-        return self.gain(option) / max(self.whole, _NOTHING)
+        return self.gain(option) / max(self.whole, NOTHING)
 
     def p_value(self, option: Option) -> float:
         """Return the p-value of the reduction by an option [-]."""
@@ -156,8 +158,8 @@ def p_value(before: Array, after: Array, fitted: int) -> float:
 def _student(before: Array, after: Array) -> float:
     """Return the p-value of the mean share; 1 for too few segments."""
     moves = before > _STILL * before.max(initial=0.0)
-    if moves.sum() < _FEWEST:
+    if moves.sum() < SCATTERED:
         return 1.0
     gain = (before - after)[moves] / np.maximum(before, after)[moves]
-    spread = max(float(np.std(gain, ddof=1)) / np.sqrt(len(gain)), _NOTHING)
+    spread = max(float(np.std(gain, ddof=1)) / np.sqrt(len(gain)), NOTHING)
     return float(stdtr(len(gain) - 1, -gain.mean() / spread))

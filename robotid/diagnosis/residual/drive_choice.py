@@ -28,6 +28,7 @@ from robotid.diagnosis.residual.decisions import (
     AT_BOUND,
     FAMILY,
     FAMILY_LEAST,
+    NOTHING,
     ROUNDING,
     STEP,
     TENFOLD,
@@ -47,7 +48,6 @@ _SPAN = 100.0  # largest over smallest of them; an upper bound beyond is also te
 _REVOLUTION = 2 * np.pi  # [rad]
 _STEPS = 40  # iterations of the search for all shapes of a joint together
 _SHARPEST = 1e-6  # of the squared residual: lower limit for weights, for exact data
-_NOTHING = 1e-300
 _LOADED = ("load", "lag")  # families that depend on the torque of the drive
 _Sized = tuple[Family, list[float]]  # a family and its shapes
 
@@ -237,9 +237,9 @@ def _amplitude(drive: _Drive, term: DriveTerm) -> float:
     At low speed the filter reduces the sign of the velocity and hides the amplitude of the curve.
     """
     if term.guards != "v" or not isinstance(term, MemorylessTerm):
-        return _NOTHING
+        return NOTHING
     v = np.linspace(*drive.data_range["v"], 50)
-    return float(np.abs(term.amplitude(np.zeros_like(v), v)).max()) + _NOTHING
+    return float(np.abs(term.amplitude(np.zeros_like(v), v)).max()) + NOTHING
 
 
 def _auto(sample: Sample, drive: _Drive) -> DriveChoice:
@@ -344,7 +344,7 @@ def _considered(
 
 
 def _percent(left: Array, torque: float) -> float:
-    return 100.0 * float(np.sqrt(left.sum() / max(torque, _NOTHING)))
+    return 100.0 * float(np.sqrt(left.sum() / max(torque, NOTHING)))
 
 
 def _fixed(sample: Sample, drive: _Drive, names: Sequence[str]) -> DriveChoice:
@@ -452,7 +452,7 @@ def _reweighted(sample: Sample, drive: _Drive, chosen: Sequence[_Sized]) -> Samp
     terms = _terms(drive, chosen)
     whole = Trials(sample, drive.columns(terms)[:, None]).whole
     before, after = (float(whole.left(which).sum()) for which in ([], list(range(len(terms)))))
-    return sample.reweighted(np.sqrt(before / max(after, _SHARPEST * before, _NOTHING)))
+    return sample.reweighted(np.sqrt(before / max(after, _SHARPEST * before, NOTHING)))
 
 
 def _terms(drive: _Drive, chosen: Sequence[_Sized]) -> tuple[DriveTerm, ...]:
@@ -480,7 +480,7 @@ def _refined(sample: Sample, drive: _Drive, chosen: Sequence[_Sized]) -> list[_S
     def left(log_sizes: Array) -> float:
         columns = drive.columns(_terms(drive, sized(np.exp(log_sizes))))
         (squares,) = Trials(joined, columns[:, None], ROUNDING).whole.left(range(columns.shape[1]))
-        return float(np.log(squares + _NOTHING))
+        return float(np.log(squares + NOTHING))
 
     bounds, options = _log_bounds(drive, chosen), {"eps": STEP, "maxiter": _STEPS}
     best = minimize(left, start, method="L-BFGS-B", bounds=bounds, options=options)

@@ -16,7 +16,7 @@ from robotid.diagnosis.residual.misfit import (
     CANDIDATES,
     Misfit,
     couplings,
-    misfit_findings,
+    misfit_finding,
     ripples,
     setting_of,
 )
@@ -133,7 +133,8 @@ def test_every_setting_that_is_advised_for_a_term_is_read(identified, joint, rng
         for entries in ((name,) for name in term.families) if term.families else (term.terms,):
             found = told(identified, misfits=(lacking(joint, term, entries),))
             setting = setting_of(found.misfits[0], found)
-            (finding,) = misfit_findings(found, found.misfits, found.on_misfit)
+            (misfit,) = found.misfits
+            finding = misfit_finding(misfit, found, found.on_misfit)
             if not setting:
                 assert term.name in ("coulomb", "windup", "drift")
                 assert finding.message.endswith(term.advice)
