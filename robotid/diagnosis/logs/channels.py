@@ -52,7 +52,7 @@ _REST = 1.0  # [s] a longer rest at an end is reported
 STATIC = 1e-3  # [rad or m] smaller range: the joint does not move
 _HARDLY = 0.2  # [rad] smaller range: the joint hardly moves
 _HARDLY_PRISMATIC = 0.05  # [m] the same of a prismatic joint
-_MOVING = 0.1  # share of the log in which a joint must move
+MOVING = 0.1  # share of the log in which a joint must move
 _PLATEAU = 5  # consecutive rows at the limit of a clipped channel, at least
 _CLIPPED = 0.01  # share of the rows at the limit from which a channel is clipped
 ZERO = 0.05  # of its largest value, below which a torque that is never negative is 0
@@ -297,7 +297,7 @@ def check_rest(log: Log, motion: Trajectory, layout: ParameterLayout) -> Iterato
         is_prismatic = joint in layout.prismatic
         unit, least = ("m", _HARDLY_PRISMATIC) if is_prismatic else ("rad", _HARDLY)
         code = "static_joint" if extent < STATIC else "hardly_moves"
-        if extent < least or share < _MOVING:
+        if extent < least or share < MOVING:
             yield finding(code, log.name, joint, range=extent, moving_share=share, unit=unit)
 
 

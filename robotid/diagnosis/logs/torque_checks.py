@@ -12,6 +12,7 @@ from robotid.base.typing import Array
 from robotid.data.log import Trajectory
 from robotid.data.signal_settings import SignalSettings
 from robotid.diagnosis.catalogue import finding
+from robotid.diagnosis.decisions import SIGNIFICANT
 from robotid.diagnosis.logs.channels import STATIC
 from robotid.diagnosis.logs.hypotheses import (
     CONSTANT,
@@ -23,7 +24,6 @@ from robotid.diagnosis.logs.hypotheses import (
     explanations,
     own_share,
 )
-from robotid.diagnosis.residual.decisions import SIGNIFICANT
 from robotid.dynamics.base_parameters import BaseMapping
 from robotid.dynamics.factors import Reduction, compress_segments
 from robotid.dynamics.rows import keep_inertial_rows
@@ -32,7 +32,8 @@ from robotid.estimation.estimators.two_runs import payload_runs
 from robotid.robot.model import RobotModel
 from robotid.robot.prior import payload_spread, prior_spread
 
-_MUCH_BETTER = 12.0  # ratio of unexplained shares from which another reading is certain
+_MUCH_BETTER = 12.0  # ratio of unexplained shares from which another reading is certain ...
+_CERTAIN = float(np.log(_MUCH_BETTER))  # ... as a decrease of the misfit
 _UNEXPLAINED = 0.25  # unexplained share of a torque's variance that is reported, not accepted
 _WRONG = 0.5  # largest unexplained share of a torque with the right sign
 _TILT = 5.0  # [deg] angle of gravity from the stated one that is a warning
@@ -73,7 +74,7 @@ class _Reading:
     @property
     def is_certain(self) -> bool:
         is_explained = float(np.median(self.best.share)) < _UNEXPLAINED
-        return is_explained and self.gain > np.log(_MUCH_BETTER)
+        return is_explained and self.gain > _CERTAIN
 
     @property
     def joints(self) -> list[str]:
@@ -175,8 +176,8 @@ def _is_excused(best: Explanation, loaded: Explanation) -> bool:
             loaded.share[j] < min(_UNEXPLAINED, _MUCH_BETTER * (best.share[j] + FLOOR))
             for j in best.joints
         )
-        return bool(all(excused))
-    return loaded.misfit - best.misfit < np.log(_MUCH_BETTER)
+        return all(excused)
+    return loaded.misfit - best.misfit < _CERTAIN
 
 
 def _unexplained(probe: Probe, share: Array, name: str) -> Iterator[Finding]:

@@ -24,7 +24,7 @@ import numpy as np
 from robotid.base.exceptions import SettingsError
 from robotid.base.findings import listed
 from robotid.base.typing import Array
-from robotid.diagnosis.residual.decisions import (
+from robotid.diagnosis.decisions import (
     AT_BOUND,
     FAMILY,
     FAMILY_LEAST,

@@ -14,7 +14,7 @@ import numpy as np
 from robotid.base.findings import Finding, listed, toml_key
 from robotid.base.typing import Array
 from robotid.diagnosis.catalogue import finding
-from robotid.diagnosis.residual.decisions import (
+from robotid.diagnosis.decisions import (
     CONFIRMED,
     MAIN,
     MISFIT,

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from robotid.base.typing import Array
-from robotid.diagnosis.residual.decisions import GROWN, ROUNDING, STEP
+from robotid.diagnosis.decisions import GROWN, ROUNDING, STEP
 from robotid.diagnosis.residual.misfit import Misfit
 from robotid.diagnosis.residual.term_trials import Sample, Trial, Trials, take_sample
 from robotid.dynamics.prediction import drive_motion_along

@@ -21,11 +21,11 @@ from numpy.typing import NDArray
 from robotid.base.exceptions import DataError
 from robotid.base.typing import Array
 from robotid.diagnosis.catalogue import sentence_of
-from robotid.diagnosis.residual.decisions import (
-    DEPENDENCE_P_VALUE,
-    DEPENDENCE_SHARE,
+from robotid.diagnosis.decisions import (
     FEWEST,
+    LEAST_SHARE,
     OUTLIER,
+    P_VALUE,
     ROUNDING,
     SCATTERED,
     SEGMENTS,
@@ -393,11 +393,7 @@ class Dependence:
     @property
     def is_significant(self) -> bool:
         """Whether the dependence is significant, and large enough to matter."""
-        return (
-            self.share is not None
-            and self.share >= DEPENDENCE_SHARE
-            and self.p_value < DEPENDENCE_P_VALUE
-        )
+        return self.share is not None and self.share >= LEAST_SHARE and self.p_value < P_VALUE
 
     @property
     def where(self) -> float:

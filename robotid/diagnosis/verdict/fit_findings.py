@@ -11,7 +11,7 @@ from robotid.base.findings import Finding, listed
 from robotid.base.typing import Array
 from robotid.data.log import Log
 from robotid.diagnosis.catalogue import finding
-from robotid.diagnosis.residual.decisions import TENFOLD
+from robotid.diagnosis.decisions import TENFOLD
 from robotid.diagnosis.residual.misfit import Misfit, misfit_finding
 from robotid.diagnosis.urdf.inertials import audit_bodies
 from robotid.diagnosis.verdict.parameter_table import correlated_parameters

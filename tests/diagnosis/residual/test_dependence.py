@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from robotid.diagnosis.residual.decisions import FEWEST, p_value
+from robotid.diagnosis.decisions import FEWEST, p_value
 from robotid.diagnosis.residual.torque_split import even_bins, follow
 
 B, K, SIZE = 4, 7, 33  # bins, segments, rows of each

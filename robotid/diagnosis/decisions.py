@@ -44,8 +44,11 @@ UNDECIDED_P_VALUE = 0.25
 TENFOLD = 10.0
 #: Distance from a bound, of the logarithm of its range, within which a shape is at the bound.
 AT_BOUND = 0.02
+#: Share of the squared residual that a missing term, a recording or URDF that differs, or a
+#: quantity must explain, and the largest p-value of that share.
+LEAST_SHARE, P_VALUE = 0.1, 3e-4
 # Terms that a drive model lacks: benchmarks/bench_misfit.py
-MISFIT = Rule(most=3, share=0.1, p_value=3e-4, alike=_ALIKE)
+MISFIT = Rule(most=3, share=LEAST_SHARE, p_value=P_VALUE, alike=_ALIKE)
 #: Share of the squared residual above which a term is a warning.
 MISFIT_WARNS = 0.25
 #: Size over the torque above which a term is reported, and above which it is a warning.
@@ -61,14 +64,11 @@ GROWN = 1.3
 # Recordings or URDF that differ from what was stated: benchmarks/bench_verdict.py. Only the best
 # hypothesis is tested.
 ALTERATION = Rule(most=3, share=-float("inf"), p_value=None, alike=_ALIKE)
-ALTERATION_P_VALUE, ALTERATION_SHARE = 3e-4, 0.1
 #: A smaller share is also reported if validation logs confirm it fully, its p-value is tiny and its
 #: size is twice the one that changes a result: it biases masses even if noise hides it.
 WEAK, WEAK_P_VALUE, WEAK_SIZE = 0.03, 1e-5, 2.0
 #: Standard errors that its size must differ from 0.
 SIGNIFICANT = 5.0
-# A residual that depends on a quantity: no benchmark, tests/diagnosis/residual/test_torque_split.py
-DEPENDENCE_SHARE, DEPENDENCE_P_VALUE = 0.1, 1e-3
 # Segments that are held out in turn, and their samples.
 SEGMENTS, SHORTEST = 16, 10  # most segments, and fewest independent samples of one
 #: Smallest number of segments for a test.
@@ -77,6 +77,9 @@ FEWEST = 6
 OUTLIER = 12.0
 #: Share of a column below which it is rounding, and relative step of a derivative by a shape.
 ROUNDING, STEP = 1e-10, 1e-3
+#: Size of the correlation from which two parameters or signals are strongly correlated: if one were
+#: known, the error of the other would be less than a third of what it is, sqrt(1 - r^2) = 0.31.
+CORRELATED = 0.95
 #: Segments from which a scatter is determined.
 SCATTERED = 3
 #: A sum of squares that is 0, as a divisor.
