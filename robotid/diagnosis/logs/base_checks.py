@@ -26,16 +26,30 @@ from robotid.dynamics.prediction import predict
 from robotid.robot.constraints import Contact, link_positions
 from robotid.robot.model import RobotModel
 
+_MOST = 1000  # samples at which poses and forces are compared
+_MOVES = 5e-3  # [m/s] speed of feet on the ground below which they are at rest
 _SLIDES = 0.1  # [m/s] RMS speed of a foot in contact that is reported ...
-_STANDS = 0.3  # ... if it is above this share of its speed without contact
+_STANDS = 0.3  # ... if it is above this share of its speed without contact, or without rolling
 _LOADED = 0.1  # of the largest measured force: a foot with more is on the ground
-_ROLLS = 0.3  # median speed at the contact of a rolling foot, as a share of that of its frame ...
-_CREEPS = 2e-3  # [m/s] ... if the frame is faster than this
-_FORCES = 400  # samples at which forces are examined
-_BETTER = 0.5  # ratio of the residuals of the force below which another reading is found ...
-_FORCE = 0.3  # ... of the weight: masses may be it
+_FORCE = 0.3  # residual of forces over the weight: masses may be it
 _ALIKE = (0.6, 1.6)  # factors of the forces that a wrong URDF explains
 _FORCE_UNITS = {"kN": 1e3, "kgf": 9.81}
+_SLOWER = 0.65  # ratio of the speeds below which another pose is found ...
+_BETTER = 0.5  # ... and of residuals, below which other forces or another twist are
+_SIMPLER = 1.2  # a pose with another change is preferred if it reduces the speed by this ...
+_NOISE = 1e-3  # [m/s or rad/s] ... plus this; RMS from which velocities are compared
+_UNLIKE, _SOME = 0.3, 0.05  # of the motion: difference of a wrong velocity, of one with a cause
+_DEGREES = np.pi / 180
+_UNITS = {"linear": ("mm/s", 1e-3), "angular": ("deg/s", _DEGREES)}
+_BACK = np.array([-1.0, -1.0, -1.0, 1.0])  # signs of the inverse quaternion
+_ABOVE = 0.3  # vertical distance of base and feet over their distance, from which one is above
+_ALONG = 0.8  # component of the unit vector from the feet to the base that may be the vertical
+_STRIDE = 0.2  # [s] over which the acceleration of a base is averaged against noise
+_FASTEST = 30.0  # [m/s^2] RMS of this above which its position is in mm
+_IMU_MOVES = 0.1  # [rad/s] RMS from which angular velocities are compared
+_TILT = 8.0  # [deg] largest angle between the mean specific force and the vertical
+_SIZE = 0.1  # largest relative error of its size
+_SHORTEST = 2.0  # [s] in which the mean acceleration of a robot is small
 
 
 def check_base(model: RobotModel, log: Log, signals: SignalSettings) -> Iterator[Finding]:
@@ -66,18 +80,14 @@ def check_base(model: RobotModel, log: Log, signals: SignalSettings) -> Iterator
     for note in whole.notes[len(log.notes) :]:
         yield finding("log_note", log.name, text=note)
     flags = _flags(model, log, whole, motion.t)
-    J, turn = _contact_jacobian(model, motion.q)
-    wrong = []
-    if imu is not None:
-        wrong = list(check_imu(whole, motion))
-        yield from wrong
-        if any(one.code in ("imu_axes", "base_orientation") for one in wrong):
-            return
-    if not model.contacts:
+    wrong = [] if imu is None else list(check_imu(whole, motion))
+    yield from wrong
+    is_turned = any(one.code in ("imu_axes", "base_orientation") for one in wrong)
+    if not model.contacts or is_turned:
         return
     if not wrong:
         yield from check_wrenches(model, log.name, motion)
-    yield from _check_feet(model, log, motion, J, turn, flags)
+    yield from _check_feet(model, log, motion, flags)
 
 
 def _flags(model: RobotModel, log: Log, whole: Log, t: Array) -> Array:
@@ -102,8 +112,8 @@ def check_wrenches(model: RobotModel, log: str, motion: Trajectory) -> Iterator[
     """
     if motion.wrenches is None or not any(x.measured for x in model.contacts):
         return
-    wrenches = motion.wrenches[:: max(1, len(motion.t) // _FORCES)]
-    motion = motion.every(max(1, len(motion.t) // _FORCES))
+    every = max(1, len(motion.t) // _MOST)
+    wrenches, motion = motion.wrenches[::every], motion.every(every)
     (torque,) = predict(model, [model.standard_parameters()], motion)
     g = float(np.linalg.norm(model.pin_model.gravity.linear))
     weight = sum(x.mass for x in model.pin_model.inertias) * g
@@ -136,13 +146,16 @@ def _base_rows(model: RobotModel, motion: Trajectory) -> tuple[Array, Array]:
     return J[:, known], force_basis(np.delete(J, known, axis=1), used, floats=True)
 
 
-def _check_feet(
-    model: RobotModel, log: Log, motion: Trajectory, J: Array, turn: Array, flags: Array
-) -> Iterator[Finding]:
+def _check_feet(model: RobotModel, log: Log, motion: Trajectory, flags: Array) -> Iterator[Finding]:
     """Yield findings on the motion of each link in contact."""
+    J, turn = _contact_jacobian(model, motion.q)
     velocity = np.einsum("kcij,kj->kci", J, motion.v)  # (N, contacts, 3) [m/s]
     has_ground = log.base is None or log.base.has_position
-    squares = np.sum((velocity if has_ground else _relative(velocity, flags)) ** 2, axis=2)
+    if not has_ground:  # relative to the median of the links in contact, if there are two
+        pairs = (flags.sum(axis=1) > 1)[:, None, None]
+        standing = np.where(flags[..., None] | ~pairs, velocity, np.nan)
+        velocity = (velocity - np.nanmedian(standing, axis=1)[:, None]) * pairs
+    squares = np.sum(velocity**2, axis=2)
     for k, contact in enumerate(model.contacts):
         stated = (
             np.ones(len(log.t), dtype=bool) if contact.always else log.contacts.get(contact.frame)
@@ -183,18 +196,6 @@ def _loaded(contact: Contact, log: Log, t: Array) -> Array:
     return _at(size > _LOADED * size.max(), log, t)
 
 
-def _relative(velocity: Array, flags: Array) -> Array:
-    """Return velocities (N, k, 3) relative to the median of the links in contact.
-
-    They are 0 where fewer than two links are in contact.
-    """
-    standing = np.where(flags[..., None], velocity, np.nan)
-    standing[flags.sum(axis=1) < 2] = 0.0
-    relative: Array = velocity - np.nanmedian(standing, axis=1)[:, None]
-    relative[flags.sum(axis=1) < 2] = 0.0
-    return relative
-
-
 def _contact_jacobian(model: RobotModel, q: Array) -> tuple[Array, Array]:
     """Return the Jacobians (N, k, 3, n_rows) of the k points of contact, and of their links' turn.
 
@@ -215,42 +216,22 @@ def _radius(stated: float, v: Array, rolls: Array) -> tuple[float, float, float]
 
     With it are the median speeds with the stated radius and with this one.
     """
-    pace = np.linalg.norm(rolls, axis=1)
-    if not np.any(pace > 0.0):
+    if not rolls.any():
         return None
     # weighted median of v / roll: the smallest sum of |v - change roll|, samples that slip apart
     u, along = rolls[:, :2].ravel(), v[:, :2].ravel()
-    ratio = along[u != 0.0] / u[u != 0.0]
+    u, along = u[u != 0.0], along[u != 0.0]
+    ratio = along / u
     order = np.argsort(ratio)
-    weight = np.cumsum(np.abs(u[u != 0.0])[order])
+    weight = np.cumsum(np.abs(u)[order])
     change = float(ratio[order][np.searchsorted(weight, 0.5 * weight[-1])])
     before, after = (
         float(np.median(np.linalg.norm(v[:, :2] - x * rolls[:, :2], axis=1))) for x in (0.0, change)
     )
     radius = stated + change
-    if radius <= 0.0 or before < _CREEPS or after > _ROLLS * before:
+    if radius <= 0.0 or before < _MOVES or after > _STANDS * before:
         return None
     return radius, before, after
-
-
-_MOVES = 5e-3  # [m/s] mean speed of feet on the ground below which no other pose is tried
-_SLOWER = 0.65  # ratio of the speeds below which another pose is found ...
-_SIMPLER = 1.2  # a pose with another change is preferred if it reduces the speed by this ...
-_FLOOR = 1e-3  # [m/s] ... plus this
-_MOST = 1000  # samples at which poses are compared
-_TURNS_BY = 1e-3  # [m/s or rad/s] RMS from which velocities are compared
-_UNLIKE, _SOME = 0.3, 0.05  # of the motion: difference of a wrong velocity, of one with a cause
-_UNITS = {"linear": ("mm/s", 1e-3), "angular": ("deg/s", np.pi / 180)}
-_BACK = np.array([-1.0, -1.0, -1.0, 1.0])  # signs of the inverse quaternion
-_ABOVE = 0.3  # vertical distance of base and feet over their distance, from which one is above
-_STRIDE = 0.2  # [s] over which the acceleration of a base is averaged against noise
-_FASTEST = 30.0  # [m/s^2] RMS of this above which its position is in mm
-_ALONG = 0.8  # component of the unit vector from the feet to the base that may be the vertical
-_IMU_MOVES = 0.1  # [rad/s] RMS from which angular velocities are compared
-_TILT = 8.0  # [deg] largest angle between the mean specific force and the vertical
-_SIZE = 0.1  # largest relative error of its size
-_SHORTEST = 2.0  # [s] in which the mean acceleration of a robot is small
-_DEGREES = np.pi / 180
 
 
 def check_pose(log: Log) -> Iterator[Finding]:
@@ -289,9 +270,9 @@ def check_twist(log: Log, signals: SignalSettings) -> Iterator[Finding]:
     base = log.base
     if base is None or base.twist is None or base.imu is not None:
         return
-    own = replace(signals, velocity="measured", acceleration="differentiated")
-    try:
-        motion = process(replace(log, v=np.zeros_like(log.q)), own)  # that of joints has no effect
+    settings = replace(signals, velocity="measured", acceleration="differentiated")
+    try:  # the velocity of joints has no effect
+        motion = process(replace(log, v=np.zeros_like(log.q)), settings)
     except DataError:  # too short: raised again when the log is read
         return
     place, quaternion, twist = motion.q[:, :3], motion.q[:, 3:7], motion.v[:, :6]
@@ -317,7 +298,7 @@ def check_twist(log: Log, signals: SignalSettings) -> Iterator[Finding]:
         cause = min(causes | turned, key=lambda key: (causes | turned)[key])
         best = (causes | turned)[cause]
         is_explained = best < _BETTER * off
-        if size < _TURNS_BY or off < (_SOME if is_explained else _UNLIKE) * size:
+        if size < _NOISE or off < (_SOME if is_explained else _UNLIKE) * size:
             continue
         figures: dict[str, Any] = {"size": size, "best": best, "what": what, "unit": unit}
         if is_explained and cause in turned:
@@ -411,7 +392,7 @@ def _check_readings(log: Log, feet: _Feet, q: Array, gravity: Array) -> Iterator
     stated = feet.turned(q)
     mean, speed = feet.upwards(stated[0]), feet.speed(stated)
     height, is_moving = float(mean @ up), speed >= _MOVES
-    found: list[tuple[float, float, str, str]] = []  # rank, speed, reading, gravity
+    slower: list[tuple[float, float, str, str]] = []  # rank, speed, reading, gravity
     for key, quaternion in (
         orientation_readings(q).items() if is_moving or height <= -_ABOVE else ()
     ):
@@ -422,9 +403,9 @@ def _check_readings(log: Log, feet: _Feet, q: Array, gravity: Array) -> Iterator
         remedy = "" if is_above else _vertical(direction, gravity)
         if (is_slow or is_turned_back) and remedy is not None:
             changes = (key == "both") + bool(remedy)
-            found.append(((moves + _FLOOR) * _SIMPLER**changes, moves, key, remedy))
-    if found:
-        _, best, key, remedy = min(found, key=lambda x: x[0])
+            slower.append(((moves + _NOISE) * _SIMPLER**changes, moves, key, remedy))
+    if slower:
+        _, best, key, remedy = min(slower, key=lambda x: x[0])
         yield finding(
             "base_orientation", log.name, source="feet", reading=key, cure=key, speed=speed,
             best=best, side=height < -_ABOVE, turn=bool(remedy), gravity=remedy,
@@ -494,8 +475,7 @@ def _check_gravity(log: Log, frame: ImuFrame, motion: Trajectory) -> Iterator[Fi
     """Yield a finding if the mean specific force in the world is not opposite to gravity."""
     quaternion, v, a = motion.q[:, 3:7], motion.v, motion.a
     f = a[:, :3] + np.cross(v[:, 3:6], v[:, :3]) - in_base(quaternion, frame.gravity)
-    back = quaternion * np.array([-1.0, -1.0, -1.0, 1.0])
-    mean = in_base(back, f).mean(axis=0)
+    mean = in_base(quaternion * _BACK, f).mean(axis=0)
     g = float(np.linalg.norm(frame.gravity))
     size = float(np.linalg.norm(mean))
     cosine = -float(mean @ frame.gravity) / max(g * size, 1e-12)
