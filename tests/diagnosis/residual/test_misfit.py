@@ -170,6 +170,9 @@ def test_a_ripple_is_named_with_its_periods_a_turn_and_the_terms_that_predict_it
     found = concluded(three, logs, AUTO)
     named, *_ = found.misfits
     assert (named.joint, named.term.name) == (LIFT, "ripple 40")
+    plain = log_with(three, 2, noise=0.0).tau[:, 1]
+    assert named.unit == "N m rms"  # 0.15 of the RMS torque in amplitude
+    assert named.size == pytest.approx(0.15 * np.sqrt(np.mean(plain**2) / 2), rel=0.1)
     pasted = setting_of(named, found)
     assert pasted == (
         f'[drives]\n{LIFT} = [{{ term = "Harmonic", order = 40.0, is_sine = false }}, '

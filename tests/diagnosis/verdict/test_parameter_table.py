@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from robotid.diagnosis.verdict import parameter_table
-from robotid.diagnosis.verdict.parameter_table import correlated_parameters
+from robotid.diagnosis.verdict.parameter_table import central_parameters, correlated_parameters
 from robotid.output.files.entries import build_result
 from robotid.output.files.result_file import Result
 
@@ -53,6 +53,15 @@ def test_the_interval_of_a_parameter_that_is_a_base_parameter_is_that_of_it(iden
     known = np.isfinite(errors) & (errors > 0)
     reach = np.diff(own[known], axis=1)[:, 0] / (2.0 * errors[known])
     assert (reach >= 1.95).all()
+
+
+def test_a_body_with_a_parameter_without_an_error_has_no_interval(identified):
+    half = central_parameters(identified).half
+    errors = identified.standard_error[: identified.model.layout.n_inertial].reshape(-1, 10)
+    known = np.isfinite(errors).all(axis=1)
+    np.testing.assert_array_equal(np.isfinite(half).all(axis=1), known)
+    assert np.isinf(half[~known]).all()
+    assert 0 < known.sum() < len(known)
 
 
 def test_a_parameter_is_correlated_with_another_one_of_its_own_drive_that_has_an_error():
