@@ -50,6 +50,9 @@ from robotid.estimation.estimators.determination import (
 from robotid.robot.model import RobotModel
 from robotid.robot.prior import prior_spread, with_assumed_inertials
 
+_ROWS = 5000  # of a log, from which its excitation is computed
+_FAR = 2 * np.pi  # number in a log above which a position may be a percentage
+
 
 def check_logs(
     model: RobotModel,
@@ -58,36 +61,16 @@ def check_logs(
     validation: Readable | Sequence[Readable] = (),
     signals: SignalSettings | None = None,
 ) -> tuple[Finding, ...]:
-    """Check logs for faults before an identification.
-
-    Args:
-        model: The robot.
-        logs: Logs to fit, one or several: of the model's joints in its order, or paths or
-            DataFrames with their columns.
-        validation: Validation logs, likewise.
-        signals: How logs become trajectories; the defaults if None.
-
-    Returns:
-        The findings, errors first. Each has a code, a severity, a place and a message.
-
-    Raises:
-        DataError: If a file or a DataFrame is no log.
-        SettingsError: If a setting does not fit a log.
-    """
+    """Return the faults of logs, or of paths or DataFrames with their columns, errors first."""
     require_kind(model, RobotModel, "model", "a robotid.RobotModel")
     require_kind(signals, (SignalSettings, type(None)), "signals", "a robotid.SignalSettings")
     first, second = (
         read_logs(
-            some,
-            model.joints,
-            prismatic=model.layout.prismatic,
-            needs="any",
-            base=logged_base(model),
-            passive=model.passive,
-            robot=model.tree.movable,
+            some, model.joints, prismatic=model.layout.prismatic, needs="any",
+            base=logged_base(model), passive=model.passive, robot=model.tree.movable,
         )
         for some in (logs, validation)
-    )
+    )  # fmt: skip
     return diagnose(model, first, second, signals or SignalSettings())
 
 
@@ -105,11 +88,12 @@ def diagnose(
     moving = [probe.motion for probe in probes]
     segments = Segments(model, mapping, moving, signals.min_velocity) if mapping else None
     for log, (motion, probe) in zip(validation, motions[len(fitted) :], strict=True):
-        if motion is not None:
-            findings += check_repeated_motion(first, motion, log.name)
+        share = 0.0 if motion is None else repeated_share(first, motion)
+        if share >= REPEATED:
+            findings.append(finding("repeated_motion", log.name, share=share))
         if probe is not None and segments is not None:
-            own = replace(segments, motions=[probe.motion])
-            findings += check_payload_change(segments, own, signals, log.name)
+            other = replace(segments, motions=[probe.motion])
+            findings += check_payload_change(segments, other, signals, log.name)
     if mapping is not None:
         names = ", ".join(log.name for log in fitted)
         findings += check_excitation(model, mapping, moving, signals, names)
@@ -120,12 +104,9 @@ def diagnose(
 def findings_to_dict(findings: Sequence[Finding]) -> dict[str, Any]:
     """Return findings as plain values, as ``robotid doctor --json`` prints them."""
     keys = ("code", "severity", "where", "message")
-    plain = [
-        {key: getattr(one, key) for key in keys}
-        | {"evidence": {key: float(x) for key, x in one.evidence.items()}}
-        for one in findings
-    ]
-    return {"findings": plain}
+    evidence = [{key: float(x) for key, x in one.evidence.items()} for one in findings]
+    plain = [{key: getattr(one, key) for key in keys} for one in findings]
+    return {"findings": [x | {"evidence": y} for x, y in zip(plain, evidence, strict=True)]}
 
 
 def _examine_log(
@@ -170,26 +151,10 @@ def _examine_log(
     return motion, probe
 
 
-_ROWS = 5000  # of a log, from which its excitation is computed
-_FAR = 2 * np.pi  # number in a log above which a position may be a percentage
-
-
-def check_repeated_motion(
-    fitted: Sequence[Trajectory], validation: Trajectory, name: str
-) -> Iterator[Finding]:
-    """Yield a warning "repeated_motion" if a validation log repeats motion that is fitted."""
-    share = repeated_share(fitted, validation)
-    if share >= REPEATED:
-        yield finding("repeated_motion", name, share=share)
-
-
 def check_excitation(
-    model: RobotModel,
-    mapping: BaseMapping,
-    motions: Sequence[Trajectory],
-    signals: SignalSettings,
-    name: str,
-) -> Iterator[Finding]:
+    model: RobotModel, mapping: BaseMapping, motions: Sequence[Trajectory],
+    signals: SignalSettings, name: str,
+) -> Iterator[Finding]:  # fmt: skip
     """Yield which base parameters the fitted motions determine, by ``determine``.
 
     Of long logs every n-th row is used.
@@ -202,7 +167,7 @@ def check_excitation(
             base_problem(model, mapping, *pair) for pair in zip(thinned, masks, strict=True)
         )
         factors = merge([compress(problem) for problem in problems])
-        found = WLS(prior=mapping.to_base(prior)).fit(factors)
+        wls = WLS(prior=mapping.to_base(prior)).fit(factors)
     except RobotIdError as error:
         yield finding(
             "excitation", name, severity="warning", what="unchecked", todo="unchecked",
@@ -212,9 +177,9 @@ def check_excitation(
     share = step * min(independent_share(replace(signals, rate=m.rate)) for m in motions)
     squares = np.sum([motion.squares for motion in thinned], axis=0)
     spread = prior_spread(model, squares, sum(len(motion.t) for motion in thinned))
-    rows = factors.weighted(found.sigma / np.sqrt(share))[:, :-1]
+    rows = factors.weighted(wls.sigma / np.sqrt(share))[:, :-1]
     known = determine(mapping.base_names, rows, base_spread(mapping.K, spread))
-    yield excitation_finding(found, known, name)
+    yield excitation_finding(wls, known, name)
 
 
 def excitation_finding(wls: Estimate, known: Determination, name: str) -> Finding:
@@ -235,14 +200,11 @@ def excitation_finding(wls: Estimate, known: Determination, name: str) -> Findin
 
 
 def check_locked(
-    model: RobotModel,
-    positions: Mapping[str, Array],
-    log: str,
-    asked: Collection[str],
+    model: RobotModel, positions: Mapping[str, Array], log: str, asked: Collection[str],
     units: LogUnits,
-) -> Iterator[Finding]:
+) -> Iterator[Finding]:  # fmt: skip
     """Yield an error "locked_position" per locked joint that moves or has another position."""
-    prismatic = {joint.name for joint in model.tree.movable if joint.type == "prismatic"}
+    types = {joint.name: joint.type for joint in model.tree.movable}
     for joint, q in positions.items():
         stated = model.locked[joint]
         middle, extent = float(np.median(q)), float(np.ptp(q))
@@ -251,7 +213,8 @@ def check_locked(
         what = "moves" if extent > STILL else "stands"
         yield finding(
             "locked_position", log, joint, what=what, todo=what, default=joint in asked,
-            unit="m" if joint in prismatic else "rad", stated=stated, median=middle, range=extent,
+            unit="m" if types[joint] == "prismatic" else "rad", stated=stated, median=middle,
+            range=extent,
             setting=f"locked = {{ {joint} = {middle:.4g} }}", flag=f"--lock {joint}={middle:.4g}",
             percent=percent_hint(model, joint, middle, units),
         )  # fmt: skip

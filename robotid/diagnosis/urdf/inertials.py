@@ -10,6 +10,7 @@ import numpy as np
 from robotid.base.findings import Finding, listed
 from robotid.base.typing import Array
 from robotid.diagnosis.catalogue import finding
+from robotid.diagnosis.decisions import ROUNDING
 from robotid.dynamics.base_parameters import BaseMapping, structural_mapping
 from robotid.robot.bodies import link_places
 from robotid.robot.geometry import body_points, kinematic_lengths
@@ -23,8 +24,15 @@ from robotid.robot.urdf_text import exact_angle, numbers
 _OF_MASSES = (
     "current_for_torque", "joint_origin", "payload", "torque_scale", "total_mass", "urdf_mismatch",
 )  # fmt: skip
-_SLACK = 1e-9  # relative violation of the triangle inequality that is rounding
-_NOISE = 1e-10  # smaller pivots, over the largest, are rounding errors
+_DENSEST, _LIGHTEST = 20_000.0, 10.0  # [kg/m^3] over the box: about solid tungsten, and foam
+_MARGIN = 0.1  # of the box's diagonal, by which a centre of mass may lie outside
+_LONGEST = 5.0**0.5  # ellipsoid of a body with half of its mass on each of two sides, over the box
+_SLENDER = 1.6  # ellipsoid over the length that the kinematics give; a uniform rod has 1.29
+_THIN = 0.01  # [m] least side of a box, so that thin sheets have a volume
+_SMALL = 1e-3  # share of the robot's mass below which a fault of a body is only a note
+_ROUND = tuple(10.0**k for k in range(-6, 3))  # inertias [kg m^2] and masses [kg] of templates
+_ALIKE = 1e-9  # relative difference of copied inertials, and of a sum of moments, by rounding
+_SIZE = 0.05  # largest relative difference of boxes of equal size
 
 
 def negative_masses(robot: ET.Element) -> Iterator[Finding]:
@@ -45,19 +53,13 @@ def assumed_inertials(model: RobotModel) -> list[Finding]:
         bodies = [body for body in model.layout.bodies if model.assumed.get(body) == code]
         if bodies:
             mass = sum(float(pi[10 * model.layout.bodies.index(body)]) for body in bodies)
-            findings.append(
+            findings += [
                 finding(
-                    code,
-                    subject=f"link {bodies[0]}",
-                    severity="warning",
-                    what="assumed",
-                    cure="assumed",
-                    reason=reason,
-                    links=listed(bodies, 12),
-                    bodies=len(bodies),
+                    code, subject=f"link {bodies[0]}", severity="warning", what="assumed",
+                    cure="assumed", reason=reason, links=listed(bodies, 12), bodies=len(bodies),
                     mass=mass,
                 )
-            )
+            ]  # fmt: skip
     return findings
 
 
@@ -94,9 +96,9 @@ def impossible_inertial(link: str, inertial: Inertial, matters: bool) -> Iterato
     A, B, C = np.linalg.eigvalsh([[ixx, ixy, ixz], [ixy, iyy, iyz], [ixz, iyz, izz]]).tolist()
     margin = A + B - C
     faults = {
-        "negative": min(A, 0.0) < -_SLACK * abs(C),
-        "triangle": margin < -_SLACK * abs(C),
-        "flat": margin <= _SLACK * abs(C),
+        "negative": min(A, 0.0) < -_ALIKE * abs(C),
+        "triangle": margin < -_ALIKE * abs(C),
+        "flat": margin <= _ALIKE * abs(C),
     }
     what = next((key for key, holds in faults.items() if holds), "")
     if what and (inertial.mass != 0 or any(inertial.inertia)):
@@ -141,7 +143,7 @@ def weak_parameters(model: RobotModel, mapping: BaseMapping) -> Iterator[Finding
 
 def _between(mapping: BaseMapping) -> int:
     """Return the number of pivots that are neither rounding errors nor large enough."""
-    return int(np.sum(mapping.pivots > _NOISE)) - len(mapping.K)
+    return int(np.sum(mapping.pivots > ROUNDING)) - len(mapping.K)
 
 
 def _rounded(tree: Tree) -> dict[str, dict[str, float]]:
@@ -180,17 +182,6 @@ def _carrying(tree: Tree) -> set[str]:
     return carrying
 
 
-_DENSEST, _LIGHTEST = 20_000.0, 10.0  # [kg/m^3] over the box: about solid tungsten, and foam
-_MARGIN = 0.1  # of the box's diagonal, by which a centre of mass may lie outside
-_LONGEST = 5.0**0.5  # ellipsoid of a body with half of its mass on each of two sides, over the box
-_SLENDER = 1.6  # ellipsoid over the length that the kinematics give; a uniform rod has 1.29
-_THIN = 0.01  # [m] least side of a box, so that thin sheets have a volume
-_SMALL = 1e-3  # share of the robot's mass below which a fault of a body is only a note
-_ROUND = tuple(10.0**k for k in range(-6, 3))  # inertias [kg m^2] and masses [kg] of templates
-_ALIKE = 1e-9  # largest relative difference of inertials that are copies
-_SIZE = 0.05  # largest relative difference of boxes of equal size
-
-
 def audit_links(model: RobotModel) -> Iterator[Finding]:
     """Yield implausible inertials of a robot.
 
@@ -214,10 +205,8 @@ def audit_bodies(model: RobotModel, pi: Array, points: Mapping[str, Array]) -> I
     """
     J = pseudo_inertia(pi[: model.layout.n_inertial])
     lengths = kinematic_lengths(model) if set(model.layout.bodies) - points.keys() else {}
-    # the last bodies end beyond their joints
-    inner = (
-        {model.layout.bodies[i - 1] for i in model.pin_model.parents if i > 0} if lengths else ()
-    )
+    parents = [i for i in model.pin_model.parents if i > 0] if lengths else []
+    inner = {model.layout.bodies[i - 1] for i in parents}  # the last ones end beyond their joints
     for body, J_i in zip(model.layout.bodies, J, strict=True):
         if not J_i[3, 3] > 0:
             continue
@@ -309,19 +298,19 @@ def _templates(model: RobotModel) -> Iterator[Finding]:
 
 def _copies(model: RobotModel, points: dict[str, Array]) -> Iterator[Finding]:
     """Yield links with the same inertial as a link of another size."""
-    inertials = model.tree.inertials
-    owners = [body for body in model.layout.bodies if body in inertials and body in points]
     groups: list[list[str]] = []
-    for link in owners:
+    inertials = model.tree.inertials
+    values = {link: [x.mass, *x.com, *x.inertia] for link, x in inertials.items() if link in points}
+    for link in (body for body in model.layout.bodies if body in values):
         for group in groups:
-            if _is_copy(inertials[link], inertials[group[0]]):
+            if np.allclose(values[link], values[group[0]], rtol=_ALIKE, atol=1e-12):
                 group.append(link)
                 break
         else:
             groups.append([link])
     for group in groups:
         boxes = np.sort([np.ptp(points[link], axis=0) for link in group], axis=1)
-        if len(group) < 2 or not boxes.any() or inertials[group[0]].mass <= 0:
+        if len(group) < 2 or not boxes.any() or values[group[0]][0] <= 0:
             continue
         spread = float(np.max(np.abs(boxes - boxes[0])) / np.max(boxes))
         if spread >= _SIZE:
@@ -329,11 +318,6 @@ def _copies(model: RobotModel, points: dict[str, Array]) -> Iterator[Finding]:
                 "copied_inertial", subject=f"link {group[0]}", links=len(group), difference=spread,
                 names=listed(group),
             )  # fmt: skip
-
-
-def _is_copy(one: Inertial, other: Inertial) -> bool:
-    a, b = (np.array([x.mass, *x.com, *x.inertia], dtype=float) for x in (one, other))
-    return bool(np.allclose(a, b, rtol=_ALIKE, atol=1e-12))
 
 
 def _metres(values: Array) -> str:
