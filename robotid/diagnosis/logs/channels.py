@@ -271,7 +271,7 @@ def _correlation(one: Array, other: Array) -> Array:
     """Return the correlation of each column with each of the other, shape (n, n)."""
     a, b = one - one.mean(axis=0), other - other.mean(axis=0)
     size = np.outer(np.linalg.norm(a, axis=0), np.linalg.norm(b, axis=0))
-    return np.divide(a.T @ b, size, out=np.zeros_like(size), where=size > 0)
+    return np.asarray(np.divide(a.T @ b, size, out=np.zeros_like(size), where=size > 0))
 
 
 def check_clock(log: Log) -> Iterator[Finding]:

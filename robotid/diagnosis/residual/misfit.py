@@ -132,14 +132,9 @@ def _of_joint(sample: Sample, j: int) -> Iterator[Misfit]:
         every_new, with_new = [*chosen, *new], slice(len(chosen), None)
         estimate, covariance = whole.estimate(every_new, sample.fitted)
         estimate, covariance = estimate[with_new], covariance[with_new, with_new]
-        size, std_error, unit = float(estimate[0]), float(np.sqrt(covariance[0, 0])), ""
-        if best.units is not None:
-            unit = best.units[int(is_prismatic)]
-        else:  # RMS torque that base parameters cannot explain: size^2 = theta^T S theta
-            S = whole.S[new][:, new] / np.sum(weight**2)
-            size, slope = float(np.sqrt(estimate @ S @ estimate)), S @ estimate
-            std_error = float(np.sqrt(slope @ covariance @ slope)) / size
-            unit = ("N m rms", "N rms")[int(is_prismatic)]
+        S = whole.S[new][:, new] / np.sum(weight**2)
+        size, std_error = _size(best, estimate, covariance, S)
+        unit = (best.units or ("N m rms", "N rms"))[int(is_prismatic)]
         trend = (math.nan, math.nan)
         if best.code == "drift":
             speed = float(np.sqrt(np.mean(motion.v[fitted] ** 2)))
@@ -160,6 +155,15 @@ def _of_joint(sample: Sample, j: int) -> Iterator[Misfit]:
             )  # fmt: skip
         chosen = every_new
         before, offered_terms = this.left[best], [c for c in offered_terms if c.code != best.code]
+
+
+def _size(term: Candidate, theta: Array, covariance: Array, S: Array) -> tuple[float, float]:
+    """Return the size of a term and its standard error: a parameter, or its RMS torque."""
+    if term.units is not None:
+        return float(theta[0]), float(np.sqrt(covariance[0, 0]))
+    # RMS torque that base parameters cannot explain: size^2 = theta^T S theta
+    size, slope = float(np.sqrt(theta @ S @ theta)), S @ theta
+    return size, float(np.sqrt(slope @ covariance @ slope)) / size
 
 
 @dataclass(frozen=True)
