@@ -184,8 +184,7 @@ def _check_feet(model: RobotModel, log: Log, motion: Trajectory, flags: Array) -
 def _at(flags: Array, log: Log, t: Array) -> Array:
     """Return flags at other times: those of the last row."""
     rows = np.searchsorted(log.t, t + 1e-9, side="right") - 1
-    at: Array = flags[rows.clip(0, len(flags) - 1)]
-    return at
+    return np.asarray(flags[rows.clip(0, len(flags) - 1)])
 
 
 def _loaded(contact: Contact, log: Log, t: Array) -> Array:
@@ -359,8 +358,7 @@ class _Feet:
     def upwards(self, R: Array) -> Array:
         """Return the mean unit vector from the contacts to the base, shape (3,)."""
         x = self.x / np.linalg.norm(self.x, axis=2, keepdims=True).clip(1e-9)
-        up: Array = -(x @ R.swapaxes(1, 2)).mean(axis=(0, 1))
-        return up
+        return np.asarray(-(x @ R.swapaxes(1, 2)).mean(axis=(0, 1)))
 
 
 def check_order(model: RobotModel, log: Log, motion: Trajectory) -> Iterator[Finding]:

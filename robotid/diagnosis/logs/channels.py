@@ -248,8 +248,7 @@ def _without_spikes(x: Array) -> Array:
     # the median of five is the median of e and of the middle two of the others
     low = np.maximum(np.minimum(a, b), np.minimum(c, d))
     high = np.minimum(np.maximum(a, b), np.maximum(c, d))
-    middle: Array = np.maximum(np.minimum(low, high), np.minimum(np.maximum(low, high), e))
-    return middle
+    return np.asarray(np.maximum(np.minimum(low, high), np.minimum(np.maximum(low, high), e)))
 
 
 def _white_noise(t: Array, values: Array) -> Array:

@@ -31,11 +31,7 @@ from robotid.diagnosis.logs.command_channels import check_commands
 from robotid.diagnosis.logs.hypotheses import Probe, smooth_motion, take_probe
 from robotid.diagnosis.logs.torque_checks import Segments, check_payload_change, check_torques
 from robotid.diagnosis.logs.torque_delay import check_torque_delay
-from robotid.diagnosis.urdf.inertials import (
-    assumed_inertials,
-    explained_by_assumed,
-    rounded_angles,
-)
+from robotid.diagnosis.urdf.inertials import assumed_inertials, explained_by_assumed, rounded_angles
 from robotid.dynamics.base_parameters import BaseMapping, structural_mapping
 from robotid.dynamics.constraint_rows import logged_base
 from robotid.dynamics.factors import compress, merge

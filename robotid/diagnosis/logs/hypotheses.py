@@ -150,8 +150,7 @@ def coupled_columns(model: RobotModel, q: Array, v: Array, a: Array) -> Array:
     if not len(coupled):
         return np.empty((*v.shape, 0))
     values = drive_values(layout, q, v, a, friction_directions(layout, v, None))
-    columns: Array = layout.drive_loads[:, coupled] * values[coupled].T[:, None]
-    return columns
+    return np.asarray(layout.drive_loads[:, coupled] * values[coupled].T[:, None])
 
 
 def smooth_motion(model: RobotModel, log: Log, settings: SignalSettings) -> Trajectory:

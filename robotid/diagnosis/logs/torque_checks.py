@@ -207,8 +207,7 @@ class LoadModel:
     def misfits(self, scales: Array) -> Array:
         """Return the misfits of scaled torques: chi-squares, prior included, shape (T,)."""
         R = np.asarray(np.linalg.qr(self._rows(scales), mode="r"))  # (T, c+1, c+1)
-        chi: Array = R[:, -1, -1] ** 2
-        return chi
+        return np.asarray(R[:, -1, -1] ** 2)
 
     def fit(self, scale: Array) -> tuple[float, Array, Array]:
         """Fit with the torque columns multiplied by a scale, without negative masses of links."""
@@ -353,8 +352,7 @@ def _needed(model: LoadModel, scale: Array, other: Array) -> Array:
         without = np.where(np.arange(len(scale)) == j, 1.0, smallest)
         if model.is_this_robot(without):
             smallest = without
-    needed: Array = other[smallest[other] != 1.0]
-    return needed
+    return np.asarray(other[smallest[other] != 1.0])
 
 
 def _scaled(probe: Probe, scale: Array, other: Array, name: str) -> Iterator[Finding]:

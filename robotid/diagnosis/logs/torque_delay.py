@@ -102,8 +102,7 @@ def _at(delay: float, values: Array) -> Array:
     """Return values on the grid, shape (..., delays), at a delay of it, linear in between."""
     k = min(max(int(np.searchsorted(_GRID, delay)), 1), len(_GRID) - 1)
     share = (delay - _GRID[k - 1]) / (_GRID[k] - _GRID[k - 1])
-    at: Array = values[..., k - 1] + share * (values[..., k] - values[..., k - 1])
-    return at
+    return np.asarray(values[..., k - 1] + share * (values[..., k] - values[..., k - 1]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,8 +192,7 @@ def _segments(model: RobotModel, motion: Trajectory, every: int) -> list[Array]:
 
 def _units(model: RobotModel) -> Array:
     """Return the speed of each joint that counts as 1 rad/s, shape (n,)."""
-    speeds: Array = model.layout.drive_speeds[: len(model.joints)]
-    return speeds
+    return np.asarray(model.layout.drive_speeds[: len(model.joints)])
 
 
 def _window(
@@ -235,8 +233,7 @@ def _of_urdf(model: RobotModel, carried: Array) -> Array:
     support, pi = model.support()[:, :size], model.standard_parameters()[:size]
     ends = np.cumsum(support.sum(axis=1))
     weighted = np.cumsum(carried * np.concatenate([pi[row] for row in support]), axis=1)
-    torque: Array = np.diff(weighted[:, ends - 1], axis=1, prepend=0.0)
-    return torque
+    return np.asarray(np.diff(weighted[:, ends - 1], axis=1, prepend=0.0))
 
 
 def _interpolated(t: Array, values: Array, times: Array) -> Array:
@@ -245,16 +242,14 @@ def _interpolated(t: Array, values: Array, times: Array) -> Array:
         return np.empty((*times.shape, values.shape[1]))
     from scipy.interpolate import CubicSpline  # takes long to import
 
-    at: Array = CubicSpline(t, values)(times)
-    return at
+    return np.asarray(CubicSpline(t, values)(times))
 
 
 def _distance(at: Array, slow: Array) -> Array:
     """Return the distance of each time from the nearest slow instant, shape as at [s]."""
     bounds = np.concatenate([[-np.inf], slow, [np.inf]])
     after = np.searchsorted(bounds, at)
-    distance: Array = np.minimum(at - bounds[after - 1], bounds[after] - at)
-    return distance
+    return np.asarray(np.minimum(at - bounds[after - 1], bounds[after] - at))
 
 
 def _squares(windows: Sequence[_Window], j: int, own: slice) -> tuple[Array, Array, int] | None:
@@ -293,5 +288,4 @@ def _orthonormal(X: Array) -> Array:
     X = X[:, is_excited] / length[is_excited]
     squares, V = np.linalg.eigh(X.T @ X)
     independent = squares > _EXACT**2 * squares[-1]
-    basis: Array = X @ (V[:, independent] / np.sqrt(squares[independent]))
-    return basis
+    return np.asarray(X @ (V[:, independent] / np.sqrt(squares[independent])))

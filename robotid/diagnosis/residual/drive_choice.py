@@ -143,10 +143,7 @@ def _range_of(motions: Sequence[DriveMotion], taken: Sequence[Array], used: Arra
     own = [(m.q[rows], m.v[rows]) for m, rows in zip(motions, taken, strict=True)]
     q, v = (np.concatenate(x)[used] for x in zip(*own, strict=True))
     speed = np.abs(v)
-    return {
-        "q": (float(q.min()), float(q.max())),
-        "v": (float(speed.min()), float(speed.max())),
-    }
+    return {"q": (float(q.min()), float(q.max())), "v": (float(speed.min()), float(speed.max()))}
 
 
 def _candidates(drive: _Drive, families: Sequence[Family]) -> Iterator[_Sized]:
@@ -418,8 +415,7 @@ def _at_bound(drive: _Drive, chosen: Sequence[_Sized]) -> Array:
     """Return which shapes are at a bound of their search range, shape (k,)."""
     bounds = _log_bounds(drive, chosen)
     margin = AT_BOUND * np.ptp(bounds, axis=1)
-    is_near: Array = np.min(np.abs(np.log(_flat(chosen))[:, None] - bounds), axis=1) < margin
-    return is_near
+    return np.asarray(np.min(np.abs(np.log(_flat(chosen))[:, None] - bounds), axis=1) < margin)
 
 
 def _grown(sample: Sample, drive: _Drive, chosen: Sequence[_Sized]) -> dict[str, float]:
@@ -463,8 +459,7 @@ def _terms(drive: _Drive, chosen: Sequence[_Sized]) -> tuple[DriveTerm, ...]:
 def _log_bounds(drive: _Drive, chosen: Sequence[_Sized]) -> Array:
     """Return the logarithms of the search range of each shape, shape (k, 2)."""
     bounds = [shape.within(drive.data_range) for family, _ in chosen for shape in family.shapes]
-    logs: Array = np.log(np.reshape(bounds, (-1, 2)))
-    return logs
+    return np.asarray(np.log(np.reshape(bounds, (-1, 2))))
 
 
 def _refined(sample: Sample, drive: _Drive, chosen: Sequence[_Sized]) -> list[_Sized]:

@@ -29,12 +29,7 @@ from robotid.diagnosis.residual.term_trials import Sample, Trials
 from robotid.estimation.fitting.drive_terms import JointMotion
 from robotid.estimation.fitting.fitted import Fit
 from robotid.robot.drive_term import DriveMotion, DriveTerm, Family
-from robotid.robot.drives import (
-    FAMILIES,
-    Harmonic,
-    drive_line,
-    has_turned,
-)
+from robotid.robot.drives import FAMILIES, Harmonic, drive_line, has_turned
 
 _RIPPLES = np.arange(5, 241)  # periods per revolution tested: 200 of a gear of 100 : 1
 _PEAKS = 6  # of them are tested: those with the largest periodic residual
@@ -72,8 +67,7 @@ class Misfit:
 
     def torque(self, motion: JointMotion) -> Array:
         """Return the torque of the term along a motion of the joint, shape (N,) [N m or N]."""
-        torque: Array = self.term.columns(replace(motion, scale=self.scale)) @ self.theta
-        return torque
+        return np.asarray(self.term.columns(replace(motion, scale=self.scale)) @ self.theta)
 
     @property
     def matters(self) -> bool:
@@ -218,15 +212,13 @@ def _of_family(family: Family) -> Candidate:
 def _ripple(m: JointMotion, count: int) -> Array:
     """Return cosine and sine of a multiple of the position, after the filter of torques."""
     waves = np.array([np.cos(count * m.q), np.sin(count * m.q)])
-    columns: Array = (_passed(m, np.array([count])) * waves).T
-    return columns
+    return np.asarray((_passed(m, np.array([count])) * waves).T)
 
 
 def _passed(m: JointMotion, counts: Array) -> Array:
     """Return the filter's gain for torques with k periods per revolution, shape (k, N)."""
     rate = np.abs(m.v) / (2 * np.pi * m.passes)  # revolutions per second over the cut-off
-    passed: Array = 1.0 / (1.0 + np.outer(counts.astype(float) ** _STEEP, rate**_STEEP))
-    return passed
+    return np.asarray(1.0 / (1.0 + np.outer(counts.astype(float) ** _STEEP, rate**_STEEP)))
 
 
 def ripples(m: JointMotion, weight: Array, r: Array) -> tuple[Candidate, ...]:
@@ -259,8 +251,7 @@ def _windup(m: JointMotion) -> Array:
 
 
 def _drift(m: JointMotion) -> Array:
-    drifting: Array = m.time[:, None] * np.column_stack([m.direction, m.v, np.ones_like(m.v)])
-    return drifting
+    return np.asarray(m.time[:, None] * np.column_stack([m.direction, m.v, np.ones_like(m.v)]))
 
 
 def _coupled(m: JointMotion, other: str, ratio: float) -> Array:

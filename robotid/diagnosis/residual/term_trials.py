@@ -23,14 +23,7 @@ import numpy as np
 
 from robotid.base.typing import Array
 from robotid.data.log import Trajectory
-from robotid.diagnosis.decisions import (
-    FAMILY_P_VALUE,
-    FEWEST,
-    OUTLIER,
-    SEGMENTS,
-    SHORTEST,
-    p_value,
-)
+from robotid.diagnosis.decisions import FAMILY_P_VALUE, FEWEST, OUTLIER, SEGMENTS, SHORTEST, p_value
 from robotid.dynamics.constraint_rows import without_forces
 from robotid.dynamics.torque import trajectory_regressor
 from robotid.dynamics.used_rows import independent_share
@@ -307,8 +300,7 @@ def _in_units(Y: Array, independent: Array, U: Array) -> Array:
 def _lengths(basis: Array) -> Array:
     """Return sqrt(P_jj), the length of P e_j, of each row, shape (N, n_rows)."""
     squares = 1.0 - np.sum(basis**2, axis=2)
-    lengths: Array = np.sqrt(np.maximum(squares, _SHORTEST_UNIT**2))
-    return lengths
+    return np.asarray(np.sqrt(np.maximum(squares, _SHORTEST_UNIT**2)))
 
 
 def _noise_level(r: Array, used: Array, own: int, basis: Array | None) -> tuple[Array, Array]:
@@ -369,8 +361,7 @@ class Trial:
         """Return the parameters of some columns, shape (..., k): which (m, k)."""
         S, k = self.S, np.asarray(which, dtype=int)
         products = S[..., k[..., :, None], k[..., None, :]]
-        theta: Array = np.linalg.solve(products, S[..., k, -1][..., None])[..., 0]
-        return theta
+        return np.asarray(np.linalg.solve(products, S[..., k, -1][..., None])[..., 0])
 
     def estimate(self, which: Sequence[int], fitted: int) -> tuple[Array, Array]:
         """Return the parameters of some columns and their covariance, shapes (k,) and (k, k).
@@ -392,8 +383,7 @@ class Trial:
         with_r = np.concatenate([k, np.full((*k.shape[:-1], 1), -1)], axis=-1)
         x = np.concatenate([-theta, np.ones((*theta.shape[:-1], 1))], axis=-1)
         square = self.H[:, with_r[..., :, None], with_r[..., None, :]]
-        left: Array = (x[..., None, :] @ square @ x[..., :, None])[..., 0, 0]
-        return left
+        return np.asarray((x[..., None, :] @ square @ x[..., :, None])[..., 0, 0])
 
     def left_each(self, choices: Mapping[OptionT, Sequence[int]]) -> dict[OptionT, Array]:
         """Return the squared residual of each segment with columns of each option, shapes (K,)."""

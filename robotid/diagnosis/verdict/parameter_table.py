@@ -69,8 +69,7 @@ def parameter_table(
 def _correlations(C: Array, own: Sequence[int]) -> Array:
     """Return the correlations of parameters with each other, 0 of each with itself."""
     error = np.sqrt(np.diag(C)[own])
-    R: Array = C[np.ix_(own, own)] / np.outer(error, error) - np.eye(len(own))
-    return R
+    return np.asarray(C[np.ix_(own, own)] / np.outer(error, error) - np.eye(len(own)))
 
 
 def correlated_sets(C: Array, own: Sequence[int]) -> list[list[int]]:

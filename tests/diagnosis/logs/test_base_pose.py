@@ -10,12 +10,7 @@ from helpers.stands import stand
 from robotid.data.base_motion import BaseMotion, base_state, in_base, quaternions_of_angles
 from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
-from robotid.diagnosis.logs.base_checks import (
-    check_base,
-    check_pose,
-    check_twist,
-    check_unit,
-)
+from robotid.diagnosis.logs.base_checks import check_base, check_pose, check_twist, check_unit
 from robotid.robot.constraints import Contact
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel

@@ -6,15 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.corruptions import (
-    CASES,
-    NOISE,
-    ROBOTS,
-    clean_log,
-    controlled_log,
-    robot,
-    table_of,
-)
+from helpers.corruptions import CASES, NOISE, ROBOTS, clean_log, controlled_log, robot, table_of
 from helpers.driven import arm
 from helpers.synthetic import exact_log, perfect, truth
 

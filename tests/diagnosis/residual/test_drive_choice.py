@@ -6,27 +6,13 @@ from functools import cache, partial
 import numpy as np
 import pytest
 from helpers import driven as helper
-from helpers.driven import (
-    ELBOW,
-    JOINTS,
-    LIFT,
-    arm,
-    driven,
-    driven_log,
-)
+from helpers.driven import ELBOW, JOINTS, LIFT, arm, driven, driven_log
 
 from robotid.base.exceptions import SettingsError
 from robotid.diagnosis.verdict.parameter_table import parameter_entries
 from robotid.estimation.fitting.fitted import friction_curve
 from robotid.robot.drive_term import DriveMotion
-from robotid.robot.drives import (
-    AUTO,
-    FAMILIES,
-    Harmonic,
-    LoadFriction,
-    Stribeck,
-    Tanh,
-)
+from robotid.robot.drives import AUTO, FAMILIES, Harmonic, LoadFriction, Stribeck, Tanh
 
 found_in, fitted_in = (partial(f, estimator="wls") for f in (helper.found_in, helper.fitted_in))
 SEED, QUANTILE = 3, 1.5  # of the motion: the elbow turns more than half a turn

@@ -6,10 +6,7 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from robotid.diagnosis.verdict.fit_findings import (
-    consistency_findings,
-    locked_findings,
-)
+from robotid.diagnosis.verdict.fit_findings import consistency_findings, locked_findings
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
 from robotid.robot.bodies import density_share
 from robotid.robot.examples import example_urdf

@@ -123,9 +123,7 @@ def test_a_result_that_its_prior_holds_back_bears_no_witness(four, rng):
     size = four.layout.n_inertial
     pi[:size] = 3.0 * four.standard_parameters()[:size]  # the sensors say three times the URDF
     log = exact_log(four, pi, rng, samples=1000, noise=0.5)
-    kept = EstimatorSettings(
-        prior_weight=1e9,
-    )
+    kept = EstimatorSettings(prior_weight=1e9)
     held = identify(four, [log], estimator=kept)
     assert held.scale_check.factor == pytest.approx(1.0, abs=0.05)  # it stays at the URDF
     assert not held.scale_check.follows
