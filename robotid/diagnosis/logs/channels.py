@@ -65,7 +65,8 @@ _REGULAR = 0.8  # share of holds of about one length that a quantised torque doe
 
 def check_channels(log: Log, signals: SignalSettings) -> Iterator[Finding]:
     """Yield the findings on the sensors behind the channels of a log."""
-    channels = dict(_channels(log))
+    every = {"q": log.q, "dq": log.v, "tau": log.tau if log.has_torque else None}
+    channels = {kind: values for kind, values in every.items() if values is not None}
     noise = {kind: _white_noise(log.t, values) for kind, values in channels.items()}
     for kind, values in channels.items():
         yield from _quantisation(log, kind, values, signals.velocity)
@@ -115,16 +116,20 @@ def _spikes(
     log: Log, kind: str, values: Array, noise: Array, *, is_used: bool = True
 ) -> Iterator[Finding]:
     """Yield rows that differ strongly from both neighbours."""
-    smooth = _without_spikes(values)
+    from scipy.ndimage import median_filter  # takes long to import
+
+    smooth = median_filter(values, size=(5, 1), mode="nearest")
     amplitudes = [_amplitude(*of) for of in zip(values.T, smooth.T, noise, strict=True)]
     least = _LEAST.get(kind, _LEAST_TORQUE * float(np.median(amplitudes)))
     for j, (joint, x) in enumerate(zip(log.joints, values.T, strict=True)):
-        amplitude = max(amplitudes[j], least)
-        rows, height = _jumps(x - smooth[:, j], noise[j], amplitude)
+        amplitude, deviation = max(amplitudes[j], least), x - smooth[:, j]
+        typical = max(1.48 * float(np.median(np.abs(deviation))), noise[j])
+        smallest = max(_BEYOND * amplitude, _SPIKE * typical)
+        rows = np.flatnonzero(np.abs(deviation) > smallest)
         if len(rows) == 0:
             continue
-        largest, first = np.abs(height).max(), float(log.t[rows[0]])
-        energy = np.sum(height**2) / np.sum((x - np.median(x)) ** 2)
+        largest, first = np.abs(deviation[rows]).max(), float(log.t[rows[0]])
+        energy = np.sum(deviation[rows] ** 2) / np.sum((x - np.median(x)) ** 2)
         is_harmful = is_used and largest > _ABSURD * amplitude and energy > _HARM
         yield finding(
             "spikes", log.name, joint, subject=f"{kind}_{joint}", channel=kind,
@@ -213,22 +218,6 @@ def _slopes(log: Log, velocity: Array) -> tuple[Array, Array]:
     return slope[is_regular][::every], v[is_regular][::every]
 
 
-def _channels(log: Log) -> Iterator[tuple[str, Array]]:
-    for kind, values in (("q", log.q), ("dq", log.v), ("tau", log.tau)):
-        if values is not None and (kind != "tau" or log.has_torque):
-            yield kind, values
-
-
-def _jumps(deviation: Array, noise: float, amplitude: float) -> tuple[Array, Array]:
-    """Return the rows that differ strongly from their neighbours, and their deviations."""
-    size = np.abs(deviation)
-    rows = np.flatnonzero(size > _BEYOND * amplitude)
-    if len(rows):
-        typical = max(1.48 * float(np.median(size)), noise)
-        rows = rows[size[rows] > _SPIKE * typical]
-    return rows, deviation[rows]
-
-
 def _amplitude(x: Array, smooth: Array, noise: float) -> float:
     """Return the 99.5 % quantile of the distance of a channel from its median, without spikes.
 
@@ -239,16 +228,6 @@ def _amplitude(x: Array, smooth: Array, noise: float) -> float:
     away = away[away > _RESTING * noise]
     distance = np.abs(x - median)
     return max(float(np.quantile(part, 0.995)) for part in (distance, away) if len(part))
-
-
-def _without_spikes(x: Array) -> Array:
-    """Return the running median over five rows, shape (N, n)."""
-    padded = np.pad(x, ((2, 2), (0, 0)), mode="edge")
-    a, b, c, d, e = (padded[k : len(x) + k] for k in range(5))
-    # the median of five is the median of e and of the middle two of the others
-    low = np.maximum(np.minimum(a, b), np.minimum(c, d))
-    high = np.minimum(np.maximum(a, b), np.maximum(c, d))
-    return np.asarray(np.maximum(np.minimum(low, high), np.minimum(np.maximum(low, high), e)))
 
 
 def _white_noise(t: Array, values: Array) -> Array:
@@ -411,7 +390,10 @@ def check_torque_channels(log: Log) -> Iterator[Finding]:
     for joint, x in zip(log.joints, log.tau.T, strict=True):
         moves = bool(np.ptp(log.q[:, log.joints.index(joint)]) > STILL)
         yield from _clipping(log, joint, x, moving, moves=moves)
-    yield from _unsigned(log)
+    # a single torque that is never negative may be of a joint that gravity loads in one direction
+    touching = sum(_touches(x) >= _SEVERAL for x in log.tau.T)
+    if log.tau.min() >= 0 and touching >= _SEVERAL:
+        yield finding("unsigned_torque", log.name, joints=touching, kind="all", cure="all")
     yield from _held(log)
 
 
@@ -431,16 +413,6 @@ def _clipping(log: Log, joint: str, x: Array, moving: Array, *, moves: bool) -> 
         is_coarse = step > 0 and np.ptp(x) / step < COARSE
         if share >= _CLIPPED and plateau >= _PLATEAU and not is_coarse:
             yield finding("clipped", log.name, joint, limit=limit, share=share)
-
-
-def _unsigned(log: Log) -> Iterator[Finding]:
-    """Yield a finding if no torque is ever negative although several reach 0 repeatedly.
-
-    A single such torque may belong to a joint that gravity loads in one direction only.
-    """
-    touching = sum(_touches(x) >= _SEVERAL for x in log.tau.T)
-    if log.tau.min() >= 0 and touching >= _SEVERAL:
-        yield finding("unsigned_torque", log.name, joints=touching, kind="all", cure="all")
 
 
 def _touches(x: Array) -> int:

@@ -37,32 +37,55 @@ _FOLDED = 0.4  # largest ratio of unexplained shares at which a torque is an abs
 
 
 @dataclass(frozen=True, eq=False)
-class _Loads:
-    """The torques of links and the columns of drives at N instants, each computed at first use.
+class Probe:
+    """The parts of the model's torque at N instants, linear in masses and gravity.
 
-    Whole regressors are too large: 0.3 MB per instant for 60 joints.
+    Each part is computed at first use. Whole regressors are too large: 0.3 MB per instant for 60
+    joints.
     """
 
     model: RobotModel
-    q: Array
-    v: Array
-    a: Array
+    motion: Trajectory  # The smooth motion that contains the instants
+    rows: Array  # (N,), the instants as rows of the motion
+    q: Array  # (N, n), joint positions [rad or m]
+    v: Array  # (N, n), velocities
+    a: Array  # (N, n), accelerations
+    tau: Array  # (N, n), torques [N m or N]
+
+    @classmethod
+    def of(cls, model: RobotModel, motion: Trajectory, rows: Array) -> "Probe":
+        """Return the probe at rows of a motion."""
+        at = (x[rows] for x in (motion.q, motion.v, motion.a, motion.tau))
+        return cls(model, motion, rows, *at)
+
+    @property
+    def gravity(self) -> Array:
+        """Gravity of the model, shape (3,) [m/s^2]."""
+        return np.array(self.model.pin_model.gravity.linear)
 
     @cached_property
-    def moving(self) -> tuple[Array, Array]:
-        """Torques of each link by the URDF, (N, n, bodies), and four columns of the last body."""
+    def _places(self) -> tuple[Array, Array]:
+        """Rows and bodies of the carried columns, one entry for ten columns."""
+        rows, bodies = np.nonzero(self.model.support()[:, : self.model.layout.n_inertial : 10])
+        return rows, bodies
+
+    @cached_property
+    def _ten(self) -> Array:
+        """Columns of the ten parameters of each carried body, shape (N, bodies carried, 10)."""
         columns = carried_columns(self.model, self.q, self.v, self.a)
-        ten = columns.reshape(len(columns), -1, 10)
+        return columns.reshape(len(columns), -1, 10)
+
+    def _by_link(self, ten: Array) -> Array:
+        pi = self.model.standard_parameters()[: self.model.layout.n_inertial].reshape(-1, 10)
         rows, bodies = self._places
-        is_last = bodies == self.model.layout.n_inertial // 10 - 1
-        last = np.zeros((*self.v.shape, 4))
-        last[:, rows[is_last]] = ten[:, is_last, :4]
-        return self._by_link(ten), last
+        loads = np.zeros((*self.v.shape, len(pi)))
+        loads[:, rows, bodies] = np.einsum("kbi,bi->kb", ten, pi[bodies])
+        return loads
 
     @cached_property
-    def coupled(self) -> Array:
-        """Columns of the coupled drives, shape (N, n, k)."""
-        return coupled_columns(self.model, self.q, self.v, self.a)
+    def links(self) -> Array:
+        """The torque of each link on each joint by the URDF, shape (N, n, bodies)."""
+        return self._by_link(self._ten)
 
     @cached_property
     def gravity_loads(self) -> Array:
@@ -73,58 +96,20 @@ class _Loads:
         return np.array([self._by_link(x.reshape(len(x), -1, 10)) for x in columns])
 
     @cached_property
-    def _places(self) -> tuple[Array, Array]:
-        """Rows and bodies of the carried columns, one entry for ten columns."""
-        rows, bodies = np.nonzero(self.model.support()[:, : self.model.layout.n_inertial : 10])
-        return rows, bodies
-
-    def _by_link(self, ten: Array) -> Array:
-        pi = self.model.standard_parameters()[: self.model.layout.n_inertial].reshape(-1, 10)
-        rows, bodies = self._places
-        loads = np.zeros((*self.v.shape, len(pi)))
-        loads[:, rows, bodies] = np.einsum("kbi,bi->kb", ten, pi[bodies])
-        return loads
-
-
-@dataclass(frozen=True, eq=False)
-class Probe:
-    """The parts of the model's torque at N instants, linear in masses and gravity."""
-
-    model: RobotModel
-    motion: Trajectory  # The smooth motion that contains the instants
-    rows: Array  # (N,), the instants as rows of the motion
-    q: Array  # (N, n), joint positions [rad or m]
-    v: Array  # (N, n), velocities
-    a: Array  # (N, n), accelerations
-    tau: Array  # (N, n), torques [N m or N]
-    parts: _Loads
-
-    @classmethod
-    def of(
-        cls, model: RobotModel, motion: Trajectory, rows: Array,
-        state: tuple[Array, Array, Array] | None = None,
-    ) -> "Probe":  # fmt: skip
-        """Return the probe at rows of a motion, or with another state (N, n) and its torques."""
-        state = state or (motion.q[rows], motion.v[rows], motion.a[rows])
-        return cls(model, motion, rows, *state, motion.tau[rows], _Loads(model, *state))
-
-    @property
-    def gravity(self) -> Array:
-        """Gravity of the model, shape (3,) [m/s^2]."""
-        return np.array(self.model.pin_model.gravity.linear)
-
-    @property
     def last_body(self) -> Array:
         """Columns of mass and first moments of the last body, shape (N, n, 4)."""
-        return self.parts.moving[1]
+        rows, bodies = self._places
+        is_last = bodies == self.model.layout.n_inertial // 10 - 1
+        last = np.zeros((*self.v.shape, 4))
+        last[:, rows[is_last]] = self._ten[:, is_last, :4]
+        return last
 
     def loads(self, gravity: Array | None = None) -> Array:
-        """Return the torque of each link on each joint by the URDF, shape (N, n, bodies)."""
-        links = self.parts.moving[0]
+        """Return the torque of each link, also with another gravity, shape (N, n, bodies)."""
         if gravity is None:
-            return links
-        more: Array = np.tensordot(gravity - self.gravity, self.parts.gravity_loads, axes=1)
-        return links + more
+            return self.links
+        more = np.tensordot(gravity - self.gravity, self.gravity_loads, axes=1)
+        return np.asarray(self.links + more)
 
     @cached_property
     def drives(self) -> Array:
@@ -133,15 +118,8 @@ class Probe:
         least = AT_REST * self.model.layout.drive_speeds[: v.shape[1]]
         still = np.minimum(least, _SLOW * np.abs(v).max(axis=0))
         own = [self.a, v, np.tanh(v / np.where(still > 0, still, least)), one, -one]
-        return np.concatenate([np.stack(own, axis=2), self.parts.coupled], axis=2)
-
-    def at(self, rows: Array) -> "Probe":
-        """Return the probe at other rows of the same motion: rows (N,)."""
-        return Probe.of(self.model, self.motion, rows)
-
-    def with_motion(self, state: tuple[Array, Array, Array]) -> "Probe":
-        """Return the probe with another motion and the same torques: state (N, n)."""
-        return Probe.of(self.model, self.motion, self.rows, state)
+        coupled = coupled_columns(self.model, self.q, v, self.a)
+        return np.concatenate([np.stack(own, axis=2), coupled], axis=2)
 
 
 def coupled_columns(model: RobotModel, q: Array, v: Array, a: Array) -> Array:
@@ -314,7 +292,7 @@ def _shares_by_gravity(probe: Probe) -> tuple[Callable[[Array], Array], Array]:
     the shares that all their columns leave, with factors of any sign, (n,): no gravity leaves less.
     """
     links, size = probe.loads(), _variation(probe.tau)
-    X = [links, *probe.parts.gravity_loads, probe.drives, probe.tau[:, :, None]]
+    X = [links, *probe.gravity_loads, probe.drives, probe.tau[:, :, None]]
     R = _triangles(np.concatenate(X, axis=2).swapaxes(0, 1))
     bodies = links.shape[2]
     parts = R[:, :, : 4 * bodies].reshape(*R.shape[:2], 4, bodies)
@@ -336,7 +314,9 @@ def _positions(probe: Probe, best: float) -> Iterator[Explanation]:
     required decrease there is not tested further.
     """
     every = max(1, len(probe.rows) // _ROWS)
-    some, few = (probe.at(probe.rows[::k]) for k in (every, _QUARTER * every))
+    some, few = (
+        Probe.of(probe.model, probe.motion, probe.rows[::k]) for k in (every, _QUARTER * every)
+    )
     joints = range(len(probe.model.joints))
     enough, likely = best - _CLEARLY, best - 0.5 * _CLEARLY
     readings: list[Callable[[Probe], list[Explanation]]] = [
@@ -368,7 +348,7 @@ def _exchanged(probe: Probe, pair: tuple[int, int]) -> list[Explanation]:
     """
     order = np.arange(len(probe.model.joints))
     order[list(pair)] = pair[::-1]
-    moved = probe.with_motion((probe.q[:, order], probe.v[:, order], probe.a[:, order]))
+    moved = replace(probe, q=probe.q[:, order], v=probe.v[:, order], a=probe.a[:, order])
     share = _shares(moved, np.stack([probe.tau.T, probe.tau.T[order]], axis=2))
     return [
         Explanation("position_order", share[:, 0], pair),
@@ -378,8 +358,7 @@ def _exchanged(probe: Probe, pair: tuple[int, int]) -> list[Explanation]:
 
 def _reversed(probe: Probe, j: int) -> list[Explanation]:
     """Return the readings that the position of a joint is reversed, and its torque as well."""
-    other = probe.with_motion(_moved(probe, j, -1.0, 0.0))
-    share = _shares(other, np.stack([probe.tau.T, -probe.tau.T], axis=2))
+    share = _shares(_moved(probe, j, -1.0, 0.0), np.stack([probe.tau.T, -probe.tau.T], axis=2))
     is_j = np.arange(len(share)) == j
     axis = Explanation("joint_axis", np.where(is_j, share[:, 1], share[:, 0]), (j,))
     sign = Explanation("position_sign", share[:, 0], (j,))
@@ -387,7 +366,7 @@ def _reversed(probe: Probe, j: int) -> list[Explanation]:
 
 
 def _offset(probe: Probe, j: int, offset: float) -> Explanation:
-    share = own_share(probe.with_motion(_moved(probe, j, 1.0, -offset)))
+    share = own_share(_moved(probe, j, 1.0, -offset))
     return Explanation("position_offset", share, (j,), (offset,))
 
 
@@ -404,12 +383,12 @@ def _refined(probe: Probe, rough: Explanation) -> Explanation:
     return min(rough, _offset(probe, j, float(best.x)), key=lambda e: e.misfit)
 
 
-def _moved(probe: Probe, j: int, sign: float, offset: float) -> tuple[Array, Array, Array]:
-    q, v, a = probe.q.copy(), probe.v.copy(), probe.a.copy()
-    q[:, j] = sign * q[:, j] + offset
-    v[:, j] *= sign
-    a[:, j] *= sign
-    return q, v, a
+def _moved(probe: Probe, j: int, sign: float, offset: float) -> Probe:
+    """Return the probe with another position of a joint and the same torques."""
+    only = np.arange(len(probe.model.joints)) == j
+    signs = np.where(only, sign, 1.0)
+    q, v, a = (signs * x for x in (probe.q, probe.v, probe.a))
+    return replace(probe, q=q + offset * only, v=v, a=a)
 
 
 def own_share(probe: Probe, gravity: Array | None = None, any_load: bool = False) -> Array:

@@ -19,20 +19,9 @@ import numpy as np
 from robotid.base.findings import Finding, listed
 from robotid.base.typing import Array
 from robotid.data.log import Trajectory
+from robotid.diagnosis import decisions
 from robotid.diagnosis.catalogue import finding
-from robotid.diagnosis.decisions import (
-    ALTERATION,
-    CONFIRMED,
-    LEAST_SHARE,
-    NOTHING,
-    P_VALUE,
-    SIGNIFICANT,
-    WEAK,
-    WEAK_P_VALUE,
-    WEAK_SIZE,
-    Round,
-    select,
-)
+from robotid.diagnosis.decisions import Round, select
 from robotid.diagnosis.residual.misfit import Misfit, find_misfits
 from robotid.diagnosis.residual.term_trials import Sample, Trials, along
 from robotid.dynamics.prediction import body_slopes, drive_torque, inverse_dynamics
@@ -241,29 +230,33 @@ def _found(fit: Fit, sample: Sample, possible: Sequence[_Alteration]) -> Iterato
     def complexity(one: _Alteration) -> tuple[int, int]:
         return one.Z.shape[2], len(one.joints)  # number of sizes, and of joints named
 
-    for this, best in select(offered, ALTERATION, complexity):
+    for this, best in select(offered, decisions.ALTERATION, complexity):
         if best is None:
             return
         gain = float((before - this.left[best])[sample.fitted :].sum())
-        confirmed = gain / max(of_validation, NOTHING)
+        confirmed = gain / max(of_validation, decisions.NOTHING)
         share, by_p_value = this.share(best), this.p_value(best)
-        has_validation, is_weak = len(total) > sample.fitted, share < LEAST_SHARE
-        is_confirmed = not has_validation or confirmed > CONFIRMED * share
+        has_validation, is_weak = len(total) > sample.fitted, share < decisions.LEAST_SHARE
+        is_confirmed = not has_validation or confirmed > decisions.CONFIRMED * share
         if is_weak:
-            is_confirmed = has_validation and confirmed > share > WEAK and by_p_value < WEAK_P_VALUE
-        if by_p_value > P_VALUE or not is_confirmed:
+            is_confirmed = (
+                has_validation
+                and confirmed > share > decisions.WEAK
+                and by_p_value < decisions.WEAK_P_VALUE
+            )
+        if by_p_value > decisions.P_VALUE or not is_confirmed:
             return
         which = untried.pop(best)
         chosen, before = [*chosen, *which], this.left[best]
         sizes, covariance = whole.estimate(chosen, sample.fitted)
         size, error = (x[-len(which) :] for x in (sizes, np.sqrt(np.diag(covariance))))
-        least = best.least * (WEAK_SIZE if is_weak else 1.0)
-        if np.linalg.norm(size) < max(least, SIGNIFICANT * float(np.linalg.norm(error))):
+        least = best.least * (decisions.WEAK_SIZE if is_weak else 1.0)
+        if np.linalg.norm(size) < max(least, decisions.SIGNIFICANT * float(np.linalg.norm(error))):
             return
         corrected = sample
         if best.applied is not None and len(chosen) == len(which):
             size, error, corrected = _refined(best.applied, size, fit.standard, sample)
-        others = [one for one in this.alike(ALTERATION) if one is not best and one.joints]
+        others = [one for one in this.alike(decisions.ALTERATION) if one is not best and one.joints]
         alike = listed(f"{one.code} of {', '.join(one.joints)}" for one in others)
         norm, norm_error = float(np.linalg.norm(size)), float(np.linalg.norm(error))
         angle, angle_error = np.degrees(np.arctan([norm, norm_error]))

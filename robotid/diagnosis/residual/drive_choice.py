@@ -24,18 +24,8 @@ import numpy as np
 from robotid.base.exceptions import SettingsError
 from robotid.base.findings import listed
 from robotid.base.typing import Array
-from robotid.diagnosis.decisions import (
-    AT_BOUND,
-    FAMILY,
-    FAMILY_LEAST,
-    NOTHING,
-    ROUNDING,
-    STEP,
-    TENFOLD,
-    UNDECIDED_P_VALUE,
-    Round,
-    select,
-)
+from robotid.diagnosis import decisions
+from robotid.diagnosis.decisions import Round, select
 from robotid.diagnosis.residual.term_trials import Sample, Trial, Trials, take_sample
 from robotid.dynamics.prediction import drive_motion_along
 from robotid.estimation.fitting.drive_terms import DriveChoice, FoundShape, Tried, with_shapes
@@ -234,9 +224,9 @@ def _amplitude(drive: _Drive, term: DriveTerm) -> float:
     At low speed the filter reduces the sign of the velocity and hides the amplitude of the curve.
     """
     if term.guards != "v" or not isinstance(term, MemorylessTerm):
-        return NOTHING
+        return decisions.NOTHING
     v = np.linspace(*drive.data_range["v"], 50)
-    return float(np.abs(term.amplitude(np.zeros_like(v), v)).max()) + NOTHING
+    return float(np.abs(term.amplitude(np.zeros_like(v), v)).max()) + decisions.NOTHING
 
 
 def _auto(sample: Sample, drive: _Drive) -> DriveChoice:
@@ -250,18 +240,18 @@ def _auto(sample: Sample, drive: _Drive) -> DriveChoice:
 
     def offered() -> Round[int]:
         left, total = every.left_each(chosen), float(before.sum())
-        return Round(before, left, len(before), total, FAMILY_LEAST**2 * torque)
+        return Round(before, left, len(before), total, decisions.FAMILY_LEAST**2 * torque)
 
     def cost(i: int) -> tuple[int, int]:
         return every.simplicity(i)
 
-    for this, best in select(offered, FAMILY, cost):
+    for this, best in select(offered, decisions.FAMILY, cost):
         refined = None if best is None else _conditioned(sample, drive, every, this, chosen, best)
         best = None if refined is None else refined.number
         tried += _considered(every, this, torque, chosen, best)
         if refined is None:
             nearest = min(this.left, key=lambda i: float(this.left[i].sum()), default=None)
-            if nearest is not None and this.p_value(nearest) < UNDECIDED_P_VALUE:
+            if nearest is not None and this.p_value(nearest) < decisions.UNDECIDED_P_VALUE:
                 undecided = [every.own[nearest]]
             break
         every = _Options.of(refined.weighted, drive, [*refined.own, *grid])
@@ -296,7 +286,7 @@ def _conditioned(
     def refined(i: int) -> _Refined:
         own = _refined(sample, drive, [every.own[k] for k in (*chosen, i)])
         weighted = _reweighted(sample, drive, own)
-        is_grown = max(_grown(weighted, drive, own).values(), default=1.0) > TENFOLD
+        is_grown = max(_grown(weighted, drive, own).values(), default=1.0) > decisions.TENFOLD
         return _Refined(i, own, weighted, (bool(_at_bound(drive, own).any()), is_grown))
 
     def left_of(other: _Refined) -> Array:
@@ -312,7 +302,7 @@ def _conditioned(
     by_family.pop(every.name(best))
     others = [refined(i) for i in by_family.values() if left[i].sum() < whole]
     better = [other for other in others if other.faults < first.faults]
-    least, slack = left_of(first), FAMILY.alike * whole
+    least, slack = left_of(first), decisions.FAMILY.alike * whole
     alike = [other for other in better if _is_alike(least, left_of(other), slack)]
     return min((first, *alike), key=lambda x: (x.faults, *every.simplicity(x.number)))
 
@@ -341,7 +331,7 @@ def _considered(
 
 
 def _percent(left: Array, torque: float) -> float:
-    return 100.0 * float(np.sqrt(left.sum() / max(torque, NOTHING)))
+    return 100.0 * float(np.sqrt(left.sum() / max(torque, decisions.NOTHING)))
 
 
 def _fixed(sample: Sample, drive: _Drive, names: Sequence[str]) -> DriveChoice:
@@ -414,7 +404,7 @@ def _flat(chosen: Sequence[_Sized]) -> Array:
 def _at_bound(drive: _Drive, chosen: Sequence[_Sized]) -> Array:
     """Return which shapes are at a bound of their search range, shape (k,)."""
     bounds = _log_bounds(drive, chosen)
-    margin = AT_BOUND * np.ptp(bounds, axis=1)
+    margin = decisions.AT_BOUND * np.ptp(bounds, axis=1)
     return np.asarray(np.min(np.abs(np.log(_flat(chosen))[:, None] - bounds), axis=1) < margin)
 
 
@@ -448,7 +438,7 @@ def _reweighted(sample: Sample, drive: _Drive, chosen: Sequence[_Sized]) -> Samp
     terms = _terms(drive, chosen)
     whole = Trials(sample, drive.columns(terms)[:, None]).whole
     before, after = (float(whole.left(which).sum()) for which in ([], list(range(len(terms)))))
-    return sample.reweighted(np.sqrt(before / max(after, _SHARPEST * before, NOTHING)))
+    return sample.reweighted(np.sqrt(before / max(after, _SHARPEST * before, decisions.NOTHING)))
 
 
 def _terms(drive: _Drive, chosen: Sequence[_Sized]) -> tuple[DriveTerm, ...]:
@@ -474,10 +464,11 @@ def _refined(sample: Sample, drive: _Drive, chosen: Sequence[_Sized]) -> list[_S
 
     def left(log_sizes: Array) -> float:
         columns = drive.columns(_terms(drive, sized(np.exp(log_sizes))))
-        (squares,) = Trials(joined, columns[:, None], ROUNDING).whole.left(range(columns.shape[1]))
-        return float(np.log(squares + NOTHING))
+        whole = Trials(joined, columns[:, None], decisions.ROUNDING).whole
+        (squares,) = whole.left(range(columns.shape[1]))
+        return float(np.log(squares + decisions.NOTHING))
 
-    bounds, options = _log_bounds(drive, chosen), {"eps": STEP, "maxiter": _STEPS}
+    bounds, options = _log_bounds(drive, chosen), {"eps": decisions.STEP, "maxiter": _STEPS}
     best = minimize(left, start, method="L-BFGS-B", bounds=bounds, options=options)
     return sized(np.exp(best.x if best.fun <= left(start) else start))
 
@@ -486,10 +477,10 @@ def _with_slopes(sample: Sample, drive: _Drive, chosen: Sequence[_Sized]) -> tup
     """Return the number c of columns of terms, and a trial of them and of d(torque)/d(shape)."""
     families, flat = [family for family, _ in chosen], _flat(chosen)
     Z = drive.columns(_terms(drive, chosen))
-    theta = Trials(sample, Z[:, None], ROUNDING).whole.parameters(range(Z.shape[1]))
+    theta = Trials(sample, Z[:, None], decisions.ROUNDING).whole.parameters(range(Z.shape[1]))
     slopes = np.empty((len(Z), len(flat)))
-    for k, h in enumerate(STEP * flat):
+    for k, h in enumerate(decisions.STEP * flat):
         larger = flat + h * (np.arange(len(flat)) == k)
         moved = drive.columns(_terms(drive, with_shapes(families, larger)))
         slopes[:, k] = (moved - Z) @ theta / h
-    return Z.shape[1], Trials(sample, np.hstack([Z, slopes])[:, None], ROUNDING).whole
+    return Z.shape[1], Trials(sample, np.hstack([Z, slopes])[:, None], decisions.ROUNDING).whole

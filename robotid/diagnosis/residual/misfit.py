@@ -13,18 +13,9 @@ import numpy as np
 
 from robotid.base.findings import Finding, listed, toml_key
 from robotid.base.typing import Array
+from robotid.diagnosis import decisions
 from robotid.diagnosis.catalogue import finding
-from robotid.diagnosis.decisions import (
-    CONFIRMED,
-    MAIN,
-    MISFIT,
-    MISFIT_MATTERS,
-    MISFIT_REPORTED,
-    MISFIT_WARNS,
-    ONE_SIDED,
-    Round,
-    select,
-)
+from robotid.diagnosis.decisions import Round, select
 from robotid.diagnosis.residual.term_trials import Sample, Trials
 from robotid.estimation.fitting.drive_terms import JointMotion
 from robotid.estimation.fitting.fitted import Fit
@@ -73,9 +64,13 @@ class Misfit:
     def matters(self) -> bool:
         """Whether it is a warning."""
         explained = np.sqrt(self.share) * self.error
-        is_denied = self.confirmed is not None and self.confirmed < CONFIRMED * self.share
+        is_denied = self.confirmed is not None and self.confirmed < decisions.CONFIRMED * self.share
         is_uncertain = is_denied or self.term.is_imitated
-        return bool(self.share >= MISFIT_WARNS and explained >= MISFIT_MATTERS and not is_uncertain)
+        return bool(
+            self.share >= decisions.MISFIT_WARNS
+            and explained >= decisions.MISFIT_MATTERS
+            and not is_uncertain
+        )
 
 
 def find_misfits(sample: Sample | None) -> tuple[Misfit, ...]:
@@ -83,11 +78,11 @@ def find_misfits(sample: Sample | None) -> tuple[Misfit, ...]:
     if sample is None:
         return ()
     misfits = [misfit for j in range(len(sample.joints)) for misfit in _of_joint(sample, j)]
-    coupled = [(m.joint, m.term.coupled) for m in misfits]
-    # a coupled drive loads both joints
+    coupled = [(m.joint, m.term.coupled) for m in misfits]  # a coupled drive loads both joints
     return tuple(
         m for m in misfits
-        if not m.term.coupled or m.share > ONE_SIDED or (m.term.coupled, m.joint) in coupled
+        if not m.term.coupled
+        or m.share > decisions.ONE_SIDED or (m.term.coupled, m.joint) in coupled
     )  # fmt: skip
 
 
@@ -118,7 +113,7 @@ def _of_joint(sample: Sample, j: int) -> Iterator[Misfit]:
         left = held_out.left_each({c: [*chosen, *place[c]] for c in offered_terms})
         return Round(before, left, sample.fitted, squares)
 
-    rounds = select(offered, MISFIT, lambda c: len(place[c]), attrgetter("tried"))
+    rounds = select(offered, decisions.MISFIT, lambda c: len(place[c]), attrgetter("tried"))
     for this, best in rounds:
         if best is None:
             return
@@ -140,7 +135,7 @@ def _of_joint(sample: Sample, j: int) -> Iterator[Misfit]:
         unfitted = [
             float(whole.left(which)[sample.fitted :].sum()) for which in ([], chosen, every_new)
         ]
-        if np.sqrt(share) * error >= MISFIT_REPORTED:
+        if np.sqrt(share) * error >= decisions.MISFIT_REPORTED:
             yield Misfit(
                 sample.joints[j], best, share, this.p_value(best),
                 (unfitted[1] - unfitted[2]) / unfitted[0] if unfitted[0] > 0 else None,
@@ -353,7 +348,7 @@ def settled(before: Sequence[Finding], of_fit: Sequence[Finding]) -> list[Findin
 
 def _explains(term: Finding, hypothesis: Finding) -> bool:
     """Return whether a term of the fit explains a hypothesis from before the fit."""
-    if term.evidence.get("share_pct", 0.0) < MAIN:
+    if term.evidence.get("share_pct", 0.0) < decisions.MAIN:
         return False
     if hypothesis.code == "unexplained_torque":
         return bool(hypothesis.joints) and hypothesis.joints == term.joints

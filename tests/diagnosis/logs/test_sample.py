@@ -7,6 +7,7 @@ from helpers.corruptions import clean_log
 
 from robotid.data.signal_settings import SignalSettings
 from robotid.diagnosis.logs.hypotheses import (
+    Probe,
     compensated,
     coupled_columns,
     own_share,
@@ -39,7 +40,7 @@ def probe():
 
 
 def test_a_probe_at_other_rows_is_of_the_same_motion(probe):
-    other = probe.at(probe.rows[3:40:5])
+    other = Probe.of(probe.model, probe.motion, probe.rows[3:40:5])
     for key in ("q", "v", "a", "tau"):
         np.testing.assert_array_equal(getattr(other, key), getattr(probe, key)[3:40:5])
     np.testing.assert_allclose(other.loads(), probe.loads()[3:40:5], atol=1e-12)
