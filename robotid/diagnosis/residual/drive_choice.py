@@ -121,19 +121,14 @@ def _drives(
             for k, name in enumerate(fit.mapping.base_names)
             if name.startswith(f"{joint}.")
         }
+        taken = [(m.q[rows], m.v[rows]) for m, rows in zip(own, sample.taken, strict=True)]
+        q, v = (np.concatenate(x)[used[:, j]] for x in zip(*taken, strict=True))
+        ends = {key: (float(x.min()), float(x.max())) for key, x in (("q", q), ("v", np.abs(v)))}
         drives[j] = _Drive(
-            bool(sample.is_prismatic[j]), is_free, own, sample.taken,
-            _range_of(own, sample.taken, used[:, j]), float(np.abs(largest[:, j]).max()), plain,
+            bool(sample.is_prismatic[j]), is_free, own, sample.taken, ends,
+            float(np.abs(largest[:, j]).max()), plain,
         )  # fmt: skip
     return drives
-
-
-def _range_of(motions: Sequence[DriveMotion], taken: Sequence[Array], used: Array) -> DataRange:
-    """Return the ranges of position and of absolute velocity in the used samples."""
-    own = [(m.q[rows], m.v[rows]) for m, rows in zip(motions, taken, strict=True)]
-    q, v = (np.concatenate(x)[used] for x in zip(*own, strict=True))
-    speed = np.abs(v)
-    return {"q": (float(q.min()), float(q.max())), "v": (float(speed.min()), float(speed.max()))}
 
 
 def _candidates(drive: _Drive, families: Sequence[Family]) -> Iterator[_Sized]:

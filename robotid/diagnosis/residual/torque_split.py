@@ -18,7 +18,6 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from robotid.base.exceptions import DataError
 from robotid.base.typing import Array
 from robotid.diagnosis.catalogue import sentence_of
 from robotid.diagnosis.decisions import (
@@ -62,11 +61,6 @@ class TorqueSplit:
     loads: Array  # (n_rows, k), ratio of each row to the drive of each parameter [-]
 
     @cached_property
-    def predicted(self) -> Array:
-        """The torque predicted, the sum of the parts, shape (N, n_rows) [N m, N]."""
-        return np.asarray(sum(self.parts.values()))
-
-    @cached_property
     def load(self) -> Array:
         """The torque of the bodies, shape (N, n_rows) [N m, N]."""
         return np.asarray(sum(self.parts[name] for name in _RIGID if name in self.parts))
@@ -91,12 +85,6 @@ def split_torque(
     A static model has no torques of motion: gravity is the only part of the bodies.
     """
     layout, first = model.layout, model.n_rows - len(model.joints)
-    wanted = (len(q), model.n_rows)
-    if v.shape != wanted or a.shape != wanted or len(pi) != len(layout.names):
-        raise DataError(
-            f"v, a and pi have shapes {v.shape}, {a.shape} and {pi.shape}, wanted {wanted}, "
-            f"{wanted} and ({len(layout.names)},)"
-        )
     parts = dict(zip(_RIGID, rigid_parts(model, pi, q, v, a), strict=True))
     if model.is_static:
         parts = {"gravity": parts["gravity"]}

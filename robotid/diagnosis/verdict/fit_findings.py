@@ -20,6 +20,7 @@ from robotid.diagnosis.verdict.verdict import BEATEN, GOOD, SMALL, error_of, is_
 from robotid.estimation.estimators.consistent.body_constraints import slabs
 from robotid.estimation.fitting.estimator_settings import BoundedSettings, ConsistentSettings
 from robotid.estimation.fitting.fitted import Fit
+from robotid.estimation.fitting.standard_errors import QUANTILE
 from robotid.estimation.variation.variation import UnlikeRun, Variation
 from robotid.robot.bodies import density_share, held_parameters, least_density, negligible_bodies
 from robotid.robot.geometry import body_boxes, body_points
@@ -45,51 +46,48 @@ _MOSTLY = 0.6  # share of friction in a torque from which friction may have chan
 
 
 def fit_findings(
-    fit: Fit,
-    misfits: Sequence[Misfit] = (),
-    on_misfit: Sequence[str] = (),
+    fit: Fit, misfits: Sequence[Misfit] = (), on_misfit: Sequence[str] = (),
     discrepancies: Sequence[Finding] = (),
-) -> list[Finding]:
-    """Return the findings about a fit: undetermined parameters, outliers, costs of constraints."""
-    findings = _static_findings(fit)
-    determined, details = fit.determination, fit.estimate.details
+) -> Iterator[Finding]:  # fmt: skip
+    """Yield the findings about a fit: undetermined parameters, outliers, costs of constraints."""
+    if fit.model.is_static:
+        yield _of_static(fit)
+    determined = fit.determination
     if determined.groups:
-        findings += [
-            finding(
-                "undetermined", subject="base_parameters", described=determined.described(),
-                severity="warning" if fit.is_poorly_excited else "note", rank=determined.rank,
-                base=len(determined.names),
-            )
-        ]  # fmt: skip
-    findings += consistency_findings(fit)
+        yield finding(
+            "undetermined", subject="base_parameters", described=determined.described(),
+            severity="warning" if fit.is_poorly_excited else "note", rank=determined.rank,
+            base=len(determined.names),
+        )  # fmt: skip
+    yield from consistency_findings(fit)
     at_bound = [x for x, is_at in zip(fit.model.layout.names, fit.at_bound, strict=True) if is_at]
     if at_bound:
         joints = list(dict.fromkeys(name.rpartition(".")[0] for name in at_bound))
-        where, names = ", ".join(at_bound), listed(at_bound, _NAMED)
-        findings += [finding("at_bound", "", joints, subject=where, names=names)]
-    findings += [
-        finding("extent_contradicted", subject=f"link {body}", link=body)
-        for body in details.get("relaxed", ())
-    ]
-    findings += [*_total_mass(fit), *_impossible_shapes(fit), *_dense_bodies(fit)]
-    findings += _outlier_findings(fit)
-    findings += [misfit_finding(misfit, fit, on_misfit) for misfit in misfits]
-    findings += [*_drive_findings(fit), *_correlated(fit), *discrepancies, *encoder_noise(fit)]
-    findings += [
-        finding("validation_was_fitted", subject=e.recording.log.path, name=e.recording.name)
-        for e in fit.refitted
-    ]
-    return findings + _costs(fit)
+        names = listed(at_bound, _NAMED)
+        yield finding("at_bound", "", joints, subject=", ".join(at_bound), names=names)
+    for body in fit.estimate.details.get("relaxed", ()):
+        yield finding("extent_contradicted", subject=f"link {body}", link=body)
+    yield from (*_total_mass(fit), *_impossible_shapes(fit), *_dense_bodies(fit))
+    if fit.outliers:
+        yield _of_outliers(fit)
+    yield from (misfit_finding(misfit, fit, on_misfit) for misfit in misfits)
+    yield from (*_drive_findings(fit), *_correlated(fit), *discrepancies, *encoder_noise(fit))
+    for e in fit.refitted:
+        yield finding("validation_was_fitted", subject=e.recording.log.path, name=e.recording.name)
+    yield from _costs(fit)
 
 
-def _costs(fit: Fit) -> list[Finding]:
-    """Return the joints whose torque error the constraints increase.
+def _costs(fit: Fit) -> Iterator[Finding]:
+    """Yield the joints whose torque error the constraints increase.
 
     It is a note if they add little, sqrt(error^2 - wls^2) of the torque, the verdict does not count
     it, and the user states no constraint; and if WLS predicts unseen recordings worse.
     """
-    findings, wls, asked = [], fit.metrics("wls").per_joint, _asked(fit)
-    locked = _locked_links(fit)
+    wls, settings, locked = fit.metrics("wls").per_joint, fit.estimator, _locked_links(fit)
+    asked = ""  # the constraints that the user states
+    if isinstance(settings, BoundedSettings) and any(settings.constraints.values()):
+        keys = listed(key for key, value in settings.constraints.items() if value)
+        asked = f"the constraints in [estimator] ({keys}), "
     for joint, measured in fit.metrics().per_joint.items():
         free = wls[joint]
         if measured.rmse <= _DIFFERS * free.rmse:
@@ -99,20 +97,15 @@ def _costs(fit: Fit) -> list[Finding]:
         is_little = is_little and is_harmless_cost(error or 0.0, least) and not (asked or locked)
         what = "overfitted" if joint in fit.overfitted else "costly"
         what = "little" if is_little else what
-        findings.append(
-            finding(
-                "constraint_costs", "", joint, severity="warning" if what == "costly" else "note",
-                what=what, cure=what, asked=asked, locked=locked, unit=measured.unit,
-                error_pct=error or 0.0, wls_error_pct=least, rmse=measured.rmse, wls_rmse=free.rmse,
-            )
+        yield finding(
+            "constraint_costs", "", joint, severity="warning" if what == "costly" else "note",
+            what=what, cure=what, asked=asked, locked=locked, unit=measured.unit,
+            error_pct=error or 0.0, wls_error_pct=least, rmse=measured.rmse, wls_rmse=free.rmse,
         )  # fmt: skip
-    return findings
 
 
-def _static_findings(fit: Fit) -> list[Finding]:
+def _of_static(fit: Fit) -> Finding:
     """Return a note on the samples of a static model, and on joints without Coulomb friction."""
-    if not fit.model.is_static:
-        return []
     layout, extents = fit.model.layout, [e.recording.extent for e in fit.fitted]
     motions = [(e.recording.trajectory, e.recording.mask) for e in fit.fitted]
     still = [
@@ -123,12 +116,10 @@ def _static_findings(fit: Fit) -> list[Finding]:
             for motion, mask in motions
         )
     ]
-    return [
-        finding(
-            "static", subject="standard_parameters", cure=bool(still), still=listed(still),
-            rows=sum(x.samples for x in extents), samples=sum(x.smooth for x in extents),
-        )
-    ]  # fmt: skip
+    return finding(
+        "static", subject="standard_parameters", cure=bool(still), still=listed(still),
+        rows=sum(x.samples for x in extents), samples=sum(x.smooth for x in extents),
+    )  # fmt: skip
 
 
 def _drive_findings(fit: Fit) -> Iterator[Finding]:
@@ -187,16 +178,13 @@ def _correlated(fit: Fit) -> Iterator[Finding]:
             )  # fmt: skip
 
 
-def not_written(log_errors: Sequence[Finding], inconsistent: str = "") -> list[Finding]:
-    """Return a warning that the URDF is not written, with the reason; nothing if it is written."""
-    if not (log_errors or inconsistent):
-        return []
+def not_written(log_errors: Sequence[Finding], inconsistent: str = "") -> Iterator[Finding]:
+    """Yield a warning that the URDF is not written, with the reason; nothing if it is written."""
     codes = listed(dict.fromkeys(error.code for error in log_errors))
     what = "codes" if log_errors else "inconsistent"
-    return [
-        finding("urdf_not_written", subject="urdf", what=what, cure=what, codes=codes,
-                estimator=inconsistent)
-    ]  # fmt: skip
+    words = {"what": what, "cure": what, "codes": codes, "estimator": inconsistent}
+    if log_errors or inconsistent:
+        yield finding("urdf_not_written", subject="urdf", **words)
 
 
 def locked_findings(model: RobotModel, stated: Collection[str]) -> list[Finding]:
@@ -226,51 +214,46 @@ def _in_line(model: RobotModel) -> set[str]:
     return carrying & rotating | {name for name, own in carriers.items() if own & identified}
 
 
-def log_findings(logs: Sequence[Log]) -> list[Finding]:
-    """Return what was noted and assumed of logs, each once, with the names of its logs."""
+def log_findings(logs: Sequence[Log]) -> Iterator[Finding]:
+    """Yield what was noted and assumed of logs, each once, with the names of its logs."""
     logs_of: dict[tuple[str, str], list[str]] = {}
     for log in logs:
         for code, texts in (("log_note", log.notes), ("log_assumption", log.assumed)):
             for text in texts:
                 logs_of.setdefault((code, text), []).append(Path(log.path).name)
-    return [finding(code, ", ".join(names), text=text) for (code, text), names in logs_of.items()]
+    for (code, text), names in logs_of.items():
+        yield finding(code, ", ".join(names), text=text)
 
 
-def consistency_findings(fit: Fit) -> list[Finding]:
-    """Return findings about the consistency of a fit."""
-    findings, check = [], fit.mass_matrix
+def consistency_findings(fit: Fit) -> Iterator[Finding]:
+    """Yield findings about the consistency of a fit."""
+    check = fit.mass_matrix
     if not check.is_positive:
-        findings.append(
-            finding(
-                "mass_matrix", subject="standard_parameters", share=1 - check.positive_share,
-                cure=isinstance(fit.estimator, ConsistentSettings), poses=check.poses,
-                smallest=check.smallest_eigenvalue,
-            )
+        yield finding(
+            "mass_matrix", subject="standard_parameters", share=1 - check.positive_share,
+            cure=isinstance(fit.estimator, ConsistentSettings), poses=check.poses,
+            smallest=check.smallest_eigenvalue,
         )  # fmt: skip
     active = fit.estimate.details.get("active", ())
     bounds = [name for name in active if name.startswith(_USER_BOUNDS)]
     if bounds:
         why, words = _contradiction(fit)
         is_warning = why != "harmless" and bool(_stated(fit).intersection(bounds))
-        findings.append(
-            finding(
-                "active_bound", subject=", ".join(bounds), bounds=listed(bounds), why=why,
-                severity="warning" if is_warning else "note", **words,
-            )
+        yield finding(
+            "active_bound", subject=", ".join(bounds), bounds=listed(bounds), why=why,
+            severity="warning" if is_warning else "note", **words,
         )  # fmt: skip
-    return findings
 
 
-def _total_mass(fit: Fit) -> list[Finding]:
-    """Return an error if the total mass differs from the URDF's by more than a factor of 3."""
+def _total_mass(fit: Fit) -> Iterator[Finding]:
+    """Yield an error if the total mass differs from the URDF's by more than a factor of 3."""
     size = fit.model.layout.n_inertial
     pi = np.array([fit.prior, fit.standard])
     before, after = pi[:, :size:10].sum(axis=1).tolist()
     is_stated = fit.estimator.bounds.total is not None
-    if is_stated or not before > 0 or before / _FAR <= after <= _FAR * before:
-        return []
-    evidence = {"urdf": before, "identified": after, "far": _FAR}
-    return [finding("total_mass", subject="standard_parameters", **evidence)]
+    if not is_stated and before > 0 and not before / _FAR <= after <= _FAR * before:
+        evidence = {"urdf": before, "identified": after, "far": _FAR}
+        yield finding("total_mass", subject="standard_parameters", **evidence)
 
 
 def encoder_noise(fit: Fit) -> Iterator[Finding]:
@@ -307,8 +290,8 @@ def _is_within_box(fit: Fit, body: str, box: Array) -> bool:
     return bool(is_inside.all())
 
 
-def _impossible_shapes(fit: Fit) -> list[Finding]:
-    """Return the identified bodies that are not possible in their geometry.
+def _impossible_shapes(fit: Fit) -> Iterator[Finding]:
+    """Yield the identified bodies that are not possible in their geometry.
 
     As notes if the URDF's body is not possible either, or if the body is in the box of a fit with
     extents. Bodies of negligible mass are left out.
@@ -316,7 +299,6 @@ def _impossible_shapes(fit: Fit) -> list[Finding]:
     model, points = fit.model, body_points(fit.model)
     boxes, negligible = body_boxes(model), negligible_bodies(model)
     before = {(fault.code, fault.where) for fault in audit_bodies(model, fit.prior, points)}
-    findings = []
     for fault in audit_bodies(model, fit.standard, points):
         body = fault.words["link"]
         if body in negligible:  # it keeps the URDF's values, and has no effect
@@ -331,20 +313,19 @@ def _impossible_shapes(fit: Fit) -> list[Finding]:
                 fault = fault.reworded(severity="note")
                 remedy = "; it is within the margin of the fit"
             fault = fault.reworded(remedy=remedy)
-        findings.append(fault)
-    return findings
+        yield fault
 
 
-def _dense_bodies(fit: Fit) -> list[Finding]:
-    """Return the identified bodies whose inertia needs a density above that of any material.
+def _dense_bodies(fit: Fit) -> Iterator[Finding]:
+    """Yield the identified bodies whose inertia needs a density above that of any material.
 
     As notes if the errors of mass and inertia allow a body of a material and no stated mass
     determines it. Bodies that have this density in the URDF are left out, and all of a result that
     is not physically consistent, which is a reason of its own.
     """
     if not fit.is_consistent:
-        return []
-    findings, size = [], fit.model.layout.n_inertial
+        return
+    size = fit.model.layout.n_inertial
     before, after = (pi[:size].reshape(-1, 10) for pi in (fit.prior, fit.standard))
     for k, (body, was, now) in enumerate(zip(fit.model.layout.bodies, before, after, strict=True)):
         density = least_density(now)
@@ -357,16 +338,13 @@ def _dense_bodies(fit: Fit) -> list[Finding]:
         share = density_share(now, covariance, _DENSEST, np.random.default_rng(0))
         is_open = share > _UNLIKELY and not _stated_of(fit, body)
         is_finite = bool(np.isfinite(density))
-        findings.append(
-            finding(
-                "dense_body", subject=f"link {body}", severity="note" if is_open else "warning",
-                link=body, error=is_open, needs="finite" if is_finite else "none",
-                conclusion=is_open, cure=_cure(fit, body, excess), mass=now[0], density=density,
-                rounded=float(f"{density:.2g}") if is_finite else 0.0, densest=_DENSEST,
-                share=share, half_width=1.96 * np.sqrt(covariance[0, 0]),
-            )
+        yield finding(
+            "dense_body", subject=f"link {body}", severity="note" if is_open else "warning",
+            link=body, error=is_open, needs="finite" if is_finite else "none",
+            conclusion=is_open, cure=_cure(fit, body, excess), mass=now[0], density=density,
+            rounded=float(f"{density:.2g}") if is_finite else 0.0, densest=_DENSEST,
+            share=share, half_width=QUANTILE * np.sqrt(covariance[0, 0]),
         )  # fmt: skip
-    return findings
 
 
 def _cure(fit: Fit, body: str, excess: float = 0.0) -> str:
@@ -390,10 +368,8 @@ def _stated_of(fit: Fit, body: str) -> dict[str, float]:
     return {stated: mass} if is_at else {}
 
 
-def _outlier_findings(fit: Fit) -> list[Finding]:
+def _of_outliers(fit: Fit) -> Finding:
     outliers = fit.outliers
-    if not outliers:
-        return []
     places = "; ".join(
         f"{o.joint} at {o.t:.3f} s of {o.log}: measured {o.torque:.4g}, predicted "
         f"{o.predicted:.4g}, residual {o.size:.0f} times the typical one"
@@ -401,21 +377,10 @@ def _outlier_findings(fit: Fit) -> list[Finding]:
     )
     places += f"; and {len(outliers) - _NAMED} more" if len(outliers) > _NAMED else ""
     count = f"{len(outliers)} outlier{'s' if len(outliers) > 1 else ''}"
-    return [
-        finding(
-            "outliers", "", outliers[0].joint, count=count, where=places,
-            cure=fit.estimator.is_robust, places=len(outliers), largest=outliers[0].size,
-        )
-    ]  # fmt: skip
-
-
-def _asked(fit: Fit) -> str:
-    """Return the constraints that the user states, as text; empty if none."""
-    settings = fit.estimator
-    if not isinstance(settings, BoundedSettings):
-        return ""
-    asked = [key for key, value in settings.constraints.items() if value]
-    return f"the constraints in [estimator] ({listed(asked)}), " if asked else ""
+    return finding(
+        "outliers", "", outliers[0].joint, count=count, where=places,
+        cure=fit.estimator.is_robust, places=len(outliers), largest=outliers[0].size,
+    )  # fmt: skip
 
 
 def _locked_links(fit: Fit) -> str:
