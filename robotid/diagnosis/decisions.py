@@ -75,6 +75,14 @@ SEGMENTS, SHORTEST = 16, 10  # most segments, and fewest independent samples of 
 FEWEST = 6
 #: Typical residuals above which a sample is excluded.
 OUTLIER = 12.0
+#: Standard errors, or deviations, beyond which a value is no noise.
+BEYOND_NOISE = 3.0
+#: Share of the rows from which a fault of single rows is reported.
+SHARE_OF_ROWS = 0.02
+#: Instants of a motion that are used: more are not independent after the filter.
+ROWS = 2000
+#: Relative size below which a quantity counts as 0.
+TINY = 1e-6
 #: Share of a column below which it is rounding, and relative step of a derivative by a shape.
 ROUNDING, STEP = 1e-10, 1e-3
 #: Size of the correlation from which two parameters or signals are strongly correlated: if one were

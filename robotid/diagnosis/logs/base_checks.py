@@ -31,14 +31,14 @@ _MOVES = 5e-3  # [m/s] speed of feet on the ground below which they are at rest
 _SLIDES = 0.1  # [m/s] RMS speed of a foot in contact that is reported ...
 _STANDS = 0.3  # ... if it is above this share of its speed without contact, or without rolling
 _LOADED = 0.1  # of the largest measured force: a foot with more is on the ground
-_FORCE = 0.3  # residual of forces over the weight: masses may be it
 _ALIKE = (0.6, 1.6)  # factors of the forces that a wrong URDF explains
 _FORCE_UNITS = {"kN": 1e3, "kgf": 9.81}
 _SLOWER = 0.65  # ratio of the speeds below which another pose is found ...
 _BETTER = 0.5  # ... and of residuals, below which other forces or another twist are
 _SIMPLER = 1.2  # a pose with another change is preferred if it reduces the speed by this ...
 _NOISE = 1e-3  # [m/s or rad/s] ... plus this; RMS from which velocities are compared
-_UNLIKE, _SOME = 0.3, 0.05  # of the motion: difference of a wrong velocity, of one with a cause
+# of the motion or weight: difference of a wrong velocity or force, of a velocity with a cause
+_UNLIKE, _SOME = 0.3, 0.05
 _DEGREES = np.pi / 180
 _UNITS = {"linear": ("mm/s", 1e-3), "angular": ("deg/s", _DEGREES)}
 _BACK = np.array([-1.0, -1.0, -1.0, 1.0])  # signs of the inverse quaternion
@@ -130,7 +130,7 @@ def check_wrenches(model: RobotModel, log: str, motion: Trajectory) -> Iterator[
     if abs(factor + 1.0) < 1.0 - _ALIKE[0]:
         factor, what = -1.0, "reversed"
     stated, best = (rms((left - x * caused)[:, :3]) for x in (1.0, factor))
-    if stated > _FORCE * weight and best < _BETTER * stated:
+    if stated > _UNLIKE * weight and best < _BETTER * stated:
         yield finding("measured_wrench", log, what=what, force=stated, best=best, factor=factor)
 
 

@@ -18,6 +18,7 @@ from robotid.data.measured_velocity import (
 )
 from robotid.data.signal_settings import SignalSettings
 from robotid.diagnosis.catalogue import finding
+from robotid.diagnosis.decisions import BEYOND_NOISE, SHARE_OF_ROWS
 from robotid.robot.parameters import ParameterLayout
 
 #: [rad/s, or m/s of a prismatic joint] slower: at rest.
@@ -34,7 +35,6 @@ _LEAST = {"q": 1e-3, "dq": 0.02}  # [rad or m, rad/s or m/s] smaller values: at 
 _LEAST_TORQUE = 0.01  # share of the median joint's torque below which a torque is negligible
 _SPIKE = 15.0  # smallest distance of a spike from its neighbours, over the typical distance
 _BEYOND = 1.5  # ... and over the amplitude of the channel
-_RESTING = 3.0  # [standard deviations of the noise] within which a channel is constant
 _ABSURD = 5.0  # spike over the amplitude of the channel, above which it cannot be motion
 _HARM = 0.02  # share of a channel's energy in its spikes that ruins a least-squares fit
 _NOISY = 0.3  # noise over signal from which a torque is uninformative
@@ -48,8 +48,7 @@ _EVEN = 0.05  # spread of the time steps over their median, or of mean over medi
 _GAP = 2.5  # [median steps] a longer step is a gap
 _LONG = 0.05  # [s] ... a longer gap is a warning
 _BUNCHED = 0.2  # [median steps] a shorter step is of rows that were stamped together ...
-_BUNCHES = 0.02  # ... which are reported from this share of rows on, if the motion per row in them
-_CLOCK_ALIKE = 0.3  # ... over that of all rows is not below this: they were not recorded together
+_CLOCK_ALIKE = 0.3  # ... if the motion per row in them is less than this share of the usual one
 _SET = 1.0  # [s] in a longer gap, a position that moves as in one step shows that the clock was set
 _STALE = 0.05  # share of stale rows from which they are a warning
 _CONTINUES = 0.15  # motion after repeated rows, over that in as many rows before and after it,
@@ -176,7 +175,7 @@ def _velocity_delay(log: Log, stated: float) -> Iterator[Finding]:
     scatter = float(np.median(np.abs(used - lag))) * 1.48 if len(used) else 0.0
     step = float(np.median(np.diff(log.t)))
     error = max(scatter / np.sqrt(max(len(used), 1)), 0.02 * step)
-    if abs(lag) < max(_LAG, 3 * error, 0.1 * step):
+    if abs(lag) < max(_LAG, BEYOND_NOISE * error, 0.1 * step):
         return
     is_delayed = abs(lag) >= LARGEST_LAG
     yield finding(
@@ -225,7 +224,7 @@ def _amplitude(x: Array, smooth: Array, noise: float) -> float:
     """
     median = np.median(x)
     away = np.abs(smooth - median)
-    away = away[away > _RESTING * noise]
+    away = away[away > BEYOND_NOISE * noise]
     distance = np.abs(x - median)
     return max(float(np.quantile(part, 0.995)) for part in (distance, away) if len(part))
 
@@ -329,7 +328,7 @@ def _bunches(log: Log, step: Array) -> Iterator[Finding]:
     share = float(np.mean(is_bunched))
     moved = np.abs(np.diff(log.q, axis=0)).mean(axis=0)
     change = np.abs(np.diff(log.q[:, int(np.argmax(moved))]))  # of the joint that moves most
-    if share < _BUNCHES or change[is_bunched].mean() <= _CLOCK_ALIKE * change.mean():
+    if share < SHARE_OF_ROWS or change[is_bunched].mean() <= _CLOCK_ALIKE * change.mean():
         return
     usual = float(np.median(step[~is_bunched]))
     yield finding(

@@ -12,7 +12,7 @@ from robotid.base.typing import Array
 from robotid.data.log import Log
 from robotid.data.measured_velocity import quantum
 from robotid.diagnosis.catalogue import finding
-from robotid.diagnosis.decisions import CORRELATED, SIGNIFICANT
+from robotid.diagnosis.decisions import CORRELATED, SHARE_OF_ROWS, SIGNIFICANT
 from robotid.diagnosis.logs.channels import runs_of
 from robotid.estimation.fitting.standard_errors import QUANTILE
 
@@ -41,7 +41,6 @@ _DISTURBED = 0.01  # [rad or m] motion that is allowed under a constant command
 _EXPLAINED = 0.7  # share of this motion that the other joints must explain
 _TOP = 0.1  # relative distance from the largest speed within which a joint runs at it
 _FLAT = 0.6  # least share at the largest speed, of the rows above half of it; a sine has 0.43
-_OFTEN = 0.02  # share of the rows at the largest speed from which it is reported
 _UNLIKE = 0.2  # least relative difference between this speed and the speed of the command
 _PULSES = 3  # least number of movements that end at one speed
 
@@ -351,7 +350,7 @@ def _saturated(log: Log, loops: Sequence[_Loop]) -> Iterator[tuple[str, Finding]
             if unlike > _UNLIKE:
                 clipped.append((at, float(np.ptp(error[at]))))
         share = sum(len(at) for at, _ in clipped) / len(v)
-        if len(clipped) >= _PULSES and share >= _OFTEN:
+        if len(clipped) >= _PULSES and share >= SHARE_OF_ROWS:
             saturated = finding(
                 "saturated", log.name, loop.name, unit=loop.unit, movements=len(clipped),
                 speed=top, share=share, error=max(x for _, x in clipped),

@@ -14,6 +14,7 @@ from robotid.base.typing import Array
 from robotid.data.log import Log, Trajectory
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import process, resolve, unwrap
+from robotid.diagnosis.decisions import TINY
 from robotid.diagnosis.logs.channels import AT_REST, ZERO
 from robotid.dynamics.drive_columns import drive_values, friction_directions, friction_speeds
 from robotid.dynamics.torque import carried_columns
@@ -23,8 +24,6 @@ from robotid.robot.model import RobotModel
 HINT = 0.7
 #: An unexplained share below this is negligible.
 FLOOR = 1e-3
-#: Relative variation of a torque that is rounding.
-CONSTANT = 1e-6
 _MARGIN = 0.15  # [s] rows closer to the end of a segment are not used: the filter has not settled
 _SLOW = 0.05  # largest speed of the unknown sign of friction of a slow joint, over its largest
 _POOR = 0.08  # unexplained share from which other readings of the positions are tested
@@ -417,7 +416,7 @@ def _over(left: Array, size: Array) -> Array:
 def _variation(tau: Array) -> Array:
     """Return the sum of squares of torques (N, ...) about their mean, 0 if constant."""
     centred = tau - tau.mean(axis=0)
-    is_constant = np.ptp(tau, axis=0) <= CONSTANT * np.abs(tau).max(axis=0)
+    is_constant = np.ptp(tau, axis=0) <= TINY * np.abs(tau).max(axis=0)
     return np.where(is_constant, 0.0, np.sum(centred**2, axis=0))
 
 

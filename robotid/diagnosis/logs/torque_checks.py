@@ -12,10 +12,9 @@ from robotid.base.typing import Array
 from robotid.data.log import Trajectory
 from robotid.data.signal_settings import SignalSettings
 from robotid.diagnosis.catalogue import finding
-from robotid.diagnosis.decisions import SIGNIFICANT
+from robotid.diagnosis.decisions import BEYOND_NOISE, ROWS, SIGNIFICANT, TINY
 from robotid.diagnosis.logs.channels import STATIC
 from robotid.diagnosis.logs.hypotheses import (
-    CONSTANT,
     FLOOR,
     HINT,
     Explanation,
@@ -53,7 +52,6 @@ _FOLLOWED = 0.5  # ratio of unexplained shares with and without gravity, if a to
 _MISMATCH = 7.5  # largest sum of squared errors of the links, in standard deviations
 _NOTHING = 0.01  # of the arm's mass, the smallest change of load
 _CLEARLY = 1.5  # least ratio of the misfit of other torque scales to that of a load
-_ROWS = 2000  # of a motion: more are not independent after the filter
 _SEGMENT = 0.4  # [s] longer than the correlation of noise
 _SEGMENTS = 24
 
@@ -247,13 +245,13 @@ def load_model(probe: Probe, share: Array, level: Array | None = None) -> LoadMo
     bodies = links.shape[2]
     X = np.concatenate([links, last, probe.tau[:, :, None]], axis=2)
     level = probe.tau.std(axis=0) if level is None else level
-    used = (level > CONSTANT * np.abs(probe.tau).max()) & (share < _UNEXPLAINED)
+    used = (level > TINY * np.abs(probe.tau).max()) & (share < _UNEXPLAINED)
     R = np.zeros((n, bodies + 5, bodies + 5))
     for j in np.flatnonzero(used).tolist():
         drive = np.delete(probe.drives[:, j], 4, axis=1)
         length = np.linalg.norm(drive, axis=0)
         U, s, _ = np.linalg.svd(drive / np.where(length > 0, length, 1.0), full_matrices=False)
-        Q = U[:, s > CONSTANT * s[0]]
+        Q = U[:, s > TINY * s[0]]
         left = X[:, j] - Q @ (Q.T @ X[:, j])
         sigma = np.sqrt(_PRECISION**2 + share[j]) * level[j]
         R[j] = np.linalg.qr(left * np.sqrt(independent / N) / sigma, mode="r")
@@ -374,7 +372,7 @@ def _scaled(probe: Probe, scale: Array, other: Array, name: str) -> Iterator[Fin
 def _payload(probe: Probe, load: Array, error: float, name: str) -> Iterator[Finding]:
     mass = float(load[0])
     arm = float(probe.model.standard_parameters()[: probe.model.layout.n_inertial : 10].sum())
-    if abs(mass) < 3 * error:
+    if abs(mass) < BEYOND_NOISE * error:
         return
     link = probe.model.layout.bodies[-1]
     yield finding(
@@ -399,7 +397,7 @@ class Segments:
         return tuple(part for motion in self.motions for part in self._of(motion))
 
     def _of(self, motion: Trajectory) -> Iterator[Reduction]:
-        thin = motion.every(max(1, len(motion.t) // _ROWS))
+        thin = motion.every(max(1, len(motion.t) // ROWS))
         keep_inertial_rows(self.model, thin)  # used for the excitation, too
         count = int(np.clip(np.ptp(thin.t) / _SEGMENT, 1, _SEGMENTS))
         length = -(-len(thin.t) // count)

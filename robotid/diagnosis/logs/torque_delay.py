@@ -16,7 +16,7 @@ from robotid.data.log import Log, Trajectory
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import low_pass
 from robotid.diagnosis.catalogue import finding
-from robotid.diagnosis.decisions import ROUNDING
+from robotid.diagnosis.decisions import BEYOND_NOISE, ROUNDING, ROWS
 from robotid.diagnosis.logs.channels import AT_REST, MOVING
 from robotid.diagnosis.logs.hypotheses import coupled_columns, smooth_motion
 from robotid.dynamics.torque import carried_columns
@@ -27,13 +27,11 @@ _GRID = np.linspace(-_LONGEST, _LONGEST, 81)
 _NEAR = 0.01  # [s] around the delay, where the misfit is a parabola
 _FINEST = 0.001  # [s] apparent delay by friction that the model does not describe
 _HELD = 0.1  # [samples] ... or by a zero-order hold of the torque
-_SIGNIFICANT = 3.0  # [standard errors] from which a delay is reported
 _DELAYED = 0.04  # [s] a longer delay must explain more: other model errors look like one, too
 _HELPS = 0.15  # least share of the unexplained torque that it must explain
 _FEW = 100  # least number of rows of a joint that is used
 _SLOW = 0.05  # [rad/s] slower: a drive may be in stiction
 _AWAY = 0.75  # [periods of the filter] closer to a slow instant, friction is unknown
-_ROWS = 2000  # number of instants that are used
 _BLOCKS = 8  # number of segments with these instants in a long log, and of blocks of the jackknife
 _OVERSAMPLED = 8.0  # instants per period of the filter: the regressor has a larger bandwidth
 # Cut-off of the comparison over the job's, and over the rate at most, since interpolation smooths
@@ -145,7 +143,7 @@ def check_torque_delay(
     error = float(np.hypot(error, max(_FINEST, _HELD * step)))
     least = _HELPS if abs(delay) > _DELAYED else 0.0
     todo = "none"
-    if abs(delay) > _SIGNIFICANT * error and gain > least:
+    if abs(delay) > BEYOND_NOISE * error and gain > least:
         todo = "of_load" if gain < misfit.by_load else "clear" if gain > _HELPS else "filter"
     yield finding(
         "torque_delay", name, severity="note" if todo in ("none", "of_load") else "warning",
@@ -180,7 +178,7 @@ def _segments(model: RobotModel, motion: Trajectory, every: int) -> list[Array]:
     if len(moving) == 0:
         return []
     first, stop = int(moving[0]), int(moving[-1]) + 1
-    length = _ROWS * every // _BLOCKS
+    length = ROWS * every // _BLOCKS
     if stop - first > _BLOCKS * length:
         starts = np.linspace(first, stop - length, _BLOCKS).astype(int)
         chosen = [np.arange(start, start + length) for start in starts]

@@ -37,7 +37,6 @@ _GRID = 6  # values of a shape tested between its bounds
 _SPAN = 100.0  # largest over smallest of them; an upper bound beyond is also tested
 _REVOLUTION = 2 * np.pi  # [rad]
 _STEPS = 40  # iterations of the search for all shapes of a joint together
-_SHARPEST = 1e-6  # of the squared residual: lower limit for weights, for exact data
 _LOADED = ("load", "lag")  # families that depend on the torque of the drive
 _Sized = tuple[Family, list[float]]  # a family and its shapes
 
@@ -433,7 +432,9 @@ def _reweighted(sample: Sample, drive: _Drive, chosen: Sequence[_Sized]) -> Samp
     terms = _terms(drive, chosen)
     whole = Trials(sample, drive.columns(terms)[:, None]).whole
     before, after = (float(whole.left(which).sum()) for which in ([], list(range(len(terms)))))
-    return sample.reweighted(np.sqrt(before / max(after, _SHARPEST * before, decisions.NOTHING)))
+    return sample.reweighted(
+        np.sqrt(before / max(after, decisions.TINY * before, decisions.NOTHING))
+    )
 
 
 def _terms(drive: _Drive, chosen: Sequence[_Sized]) -> tuple[DriveTerm, ...]:

@@ -25,9 +25,8 @@ from robotid.robot.drives import FAMILIES, Harmonic, drive_line, has_turned
 _RIPPLES = np.arange(5, 241)  # periods per revolution tested: 200 of a gear of 100 : 1
 _PEAKS = 6  # of them are tested: those with the largest periodic residual
 _STEEP = 8  # twice the order of the filter, which is applied in both directions
-_REVERSES = 0.05  # of the RMS speed, over which the sign of a coupling's speed changes
+_REVERSES = 0.05  # of the RMS value: width of a change of a coupling's direction or a gear's side
 _WINDUP = (0.02, 0.1)  # of the RMS displacement since a reversal: decay of a deflection
-_LOADED = 0.05  # of the RMS rigid-body torque, over which the loaded side of a gear changes
 _OF_POSITION = ("position_periodic", "spring", "position_offset")
 _OF_MASSES = ("current_for_torque", "urdf_mismatch")
 _DIGITS = "0123456789"
@@ -242,7 +241,9 @@ def ripples(m: JointMotion, weight: Array, r: Array) -> tuple[Candidate, ...]:
 def _windup(m: JointMotion) -> Array:
     displacement = m.travelled[:, None] / (np.array(_WINDUP) * _rms(m, attrgetter("travelled")))
     deflection = m.direction[:, None] * np.exp(-displacement)
-    return np.column_stack([deflection, np.tanh(m.load / (_LOADED * _rms(m, attrgetter("load"))))])
+    return np.column_stack(
+        [deflection, np.tanh(m.load / (_REVERSES * _rms(m, attrgetter("load"))))]
+    )
 
 
 def _drift(m: JointMotion) -> Array:

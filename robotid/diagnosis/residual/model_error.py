@@ -18,7 +18,7 @@ from functools import partial
 import numpy as np
 
 from robotid.base.typing import Array
-from robotid.diagnosis.decisions import GROWN, ROUNDING, STEP
+from robotid.diagnosis.decisions import GROWN, ROUNDING, STEP, TINY
 from robotid.diagnosis.residual.misfit import Misfit
 from robotid.diagnosis.residual.term_trials import Sample, Trial, Trials, take_sample
 from robotid.dynamics.prediction import drive_motion_along
@@ -27,7 +27,6 @@ from robotid.estimation.fitting.fitted import Fit, Solution
 from robotid.robot.drive_term import DriveMotion, DriveTerm
 
 _MOVES = 0.2  # change of a shape in standard errors above which the fit is repeated
-_PINNED = 1e-6  # of the smallest prior spread: spread of a parameter that is fixed
 
 
 def with_model_error(
@@ -62,7 +61,7 @@ def _wider(fit: Fit, sample: Sample, moved: Sequence[_Move]) -> Fit:
         return fit
     X = sample.U.T @ np.column_stack([move.shift for move in moved])  # (b, m), base parameters
     spread = fit.prior_std
-    least = _PINNED * float(spread[spread > 0].min())  # a fixed parameter hardly changes
+    least = TINY * float(spread[spread > 0].min())  # a fixed parameter hardly changes
     GX = fit.mapping.gain(np.maximum(spread, least)) @ X  # (p, m), standard parameters
     terms = [OpenTerm(x.joint, moves, x.torque) for x, moves in zip(moved, GX.T, strict=True)]
     return replace(

@@ -11,7 +11,7 @@ from robotid.base.findings import Finding, listed
 from robotid.base.typing import Array
 from robotid.data.log import Log
 from robotid.diagnosis.catalogue import finding
-from robotid.diagnosis.decisions import TENFOLD
+from robotid.diagnosis.decisions import SHARE_OF_ROWS, TENFOLD, TINY
 from robotid.diagnosis.residual.misfit import Misfit, misfit_finding
 from robotid.diagnosis.urdf.inertials import audit_bodies
 from robotid.diagnosis.verdict.parameter_table import correlated_parameters
@@ -28,7 +28,6 @@ from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
 
 _FAR = 3.0  # a total mass differs from the URDF's at most by this factor
-_ROUNDING = 1e-6  # [m^2] tolerance of a body that touches its box
 _NAMED = 5  # outliers that a finding names
 _BIASED = 0.5, 2.0  # shift of a parameter by encoder noise, in standard errors: note, warning
 _COARSE = 0.1  # share of encoder noise over the largest one, from which a joint is named
@@ -36,7 +35,6 @@ _DIFFERS = 1.2  # residual of a consistent fit over that of WLS above which it i
 _SHRUNK = 0.1  # of the URDF's smallest eigenvalue: below, a body is barely possible
 _MUCH = 0.2  # ... if links on locked joints have more than this share of its mass
 _USER_BOUNDS = ("mass ", "total_mass ", "centre_of_mass ")
-_BEYOND = 0.02  # share of samples outside the fitted range of friction that is reported
 _DENSEST = 12_000.0  # [kg/m^3] of a link: lead has 11,340
 _UNLIKELY = 0.05  # share of the bodies that the errors allow below which one is not possible
 _AT_BOUND = 1e-3  # relative difference of a mass from a stated bound that determines it
@@ -137,7 +135,7 @@ def _drive_findings(fit: Fit) -> Iterator[Finding]:
                 x, (low, high) = getattr(motion, key)[mask[:, j], j], choice.data_range[key]
                 x, low = (np.abs(x), 0.0) if key == "v" else (x, low)
                 share = float(np.mean((x < low) | (x > high))) if len(x) else 0.0
-                if share > _BEYOND:
+                if share > SHARE_OF_ROWS:
                     yield finding(
                         "beyond_range", "", choice.joint, share_pct=100 * share, low=low, high=high,
                         what={"q": "positions", "v": "speeds"}[key],
@@ -286,7 +284,7 @@ def _is_within_box(fit: Fit, body: str, box: Array) -> bool:
     (J,) = pseudo_inertia(fit.standard[10 * i : 10 * i + 10])
     slack = np.einsum("ij,kji->k", J, slabs(box)) / J[3, 3]  # tr(J Q_k) / m
     centre = J[:3, 3] / J[3, 3]
-    is_inside = (box[0] <= centre) & (centre <= box[1]) & (slack >= -_ROUNDING)
+    is_inside = (box[0] <= centre) & (centre <= box[1]) & (slack >= -TINY)
     return bool(is_inside.all())
 
 

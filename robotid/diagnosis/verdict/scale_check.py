@@ -13,6 +13,7 @@ import scipy.special
 from robotid.base.findings import listed
 from robotid.base.typing import Array
 from robotid.diagnosis.catalogue import sentence_of
+from robotid.diagnosis.decisions import TINY
 from robotid.dynamics.constraint_rows import loop_basis, without_forces
 from robotid.dynamics.prediction import predict
 from robotid.dynamics.torque import joint_torque_regressor
@@ -32,7 +33,6 @@ _TOTAL = "total mass"
 AGREES = 0.05
 #: Difference of a factor from 1 that is reported, and standard error of a ratio that is used [-].
 DIFFERS = 2 * AGREES
-_ROUNDING = 1e-6  # share of a claim that changes no torque, and of a variance of ratios
 _ABSORBS = 0.1  # share of a change of a stated mass that a link takes up to be named
 
 
@@ -422,7 +422,7 @@ def common_factor(ratios: Array, sensitivity: Array, inertial: Array) -> tuple[f
     # mass times radius of gyration
     moment = np.sqrt(np.maximum(pi[:, 0] * second - np.sum(pi[:, 1:4] ** 2, axis=1), 0.0))
     E = np.column_stack([np.einsum("kbp,bp->kb", A, pi), *(A[:, :, i] * moment for i in (1, 2, 3))])
-    L = np.linalg.cholesky(E @ E.T + _ROUNDING * np.eye(len(ratios)))
+    L = np.linalg.cholesky(E @ E.T + TINY * np.eye(len(ratios)))
     one, r = np.linalg.solve(L, np.column_stack([np.ones(len(ratios)), ratios])).T
     factor = float(one @ r / (one @ one))
     free = len(ratios) - 1
@@ -494,9 +494,9 @@ def _checked(found: Fit, names: Sequence[str], C: Array, widths: Array) -> State
     free = claims - claims @ inverse @ (K * spread)  # (k, p), changes no torque
     U, size, _ = np.linalg.svd(free)
     size = np.append(size, np.zeros(len(U) - len(size)))
-    Z = U[:, size <= _ROUNDING * np.linalg.norm(claims)]  # (k, d)
+    Z = U[:, size <= TINY * np.linalg.norm(claims)]  # (k, d)
     o = Z.sum(axis=0)
-    if not np.linalg.norm(o) > _ROUNDING:
+    if not np.linalg.norm(o) > TINY:
         change = np.abs(free.sum(axis=0) * spread)[: model.layout.n_inertial : 10]
         shares = change / change.sum()
         links = [x for x, part in zip(model.layout.bodies, shares, strict=True) if part > _ABSORBS]
