@@ -11,20 +11,11 @@ from robotid.data.base_motion import BaseMotion, base_state, in_base, quaternion
 from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
 from robotid.diagnosis.logs.base_checks import check_base, check_pose, check_twist, check_unit
-from robotid.robot.constraints import Contact
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 
 SLOW = SignalSettings(cutoff=4.0)
 FEET = ("FL_FOOT", "FR_FOOT", "HL_FOOT", "HR_FOOT")
-
-
-@pytest.fixture(scope="module")
-def robot():
-    return RobotModel.from_urdf(
-        example_urdf("solo12.urdf"), free_flyer=True, terms=(),
-        constraints=[Contact(foot) for foot in FEET],
-    )  # fmt: skip
 
 
 @pytest.fixture(scope="module")

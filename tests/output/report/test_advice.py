@@ -25,7 +25,7 @@ from robotid.estimation.fitting.drive_terms import (
     JointMotion,
 )
 from robotid.identification.closed_loop.loop_settings import LoopSettings
-from robotid.output.report.next_steps import Origin, Step, _once, next_steps
+from robotid.output.report.next_steps import Origin, Step, _once, next_steps, sentence_of
 from robotid.robot.examples import example_urdf
 
 JOB = Origin(("my job.toml",), "out")
@@ -316,3 +316,15 @@ def test_a_poor_result_of_torques_is_not_exported(identified):
     assert wrong.has_urdf
     assert blocks
     assert not any(block.split()[1] in ("export", "validate") for block in blocks)
+
+
+@pytest.mark.parametrize(
+    ("message", "wanted"),
+    [
+        ("first_2.csv: a load", "first_2.csv: a load"),
+        ("a.csv, b.csv: it", "a.csv, b.csv: it"),
+        ("the torque", "The torque"),
+    ],
+)
+def test_the_name_of_a_file_keeps_its_letters(message, wanted):
+    assert sentence_of(Finding("x", "warning", "y", message).message) == wanted
