@@ -74,7 +74,7 @@ def test_sweeps_beyond_a_limit_are_each_a_fifth_shorter(designer, monkeypatch):
     spans = []
     for attempts in (1, 3):
         results = iter([False] * (attempts - 1) + [True])
-        monkeypatch.setattr(routes, "_is_feasible", lambda _: next(results))
+        monkeypatch.setattr(routes, "_is_feasible", lambda _, verdicts=results: next(verdicts))
         design = design_sweeps(designer, np.random.default_rng(0), speeds=(0.8,))
         spans.append(np.ptp(design.motion.places, axis=0))
     assert (spans[1] / spans[0]).min() == pytest.approx(0.64)
