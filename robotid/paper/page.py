@@ -10,7 +10,7 @@ from robotid.base.typing import Array
 from robotid.base.versions import __version__
 from robotid.output.pages.charts import Chart, Series, chart_html
 from robotid.output.pages.html import block, listing, number, page, text
-from robotid.paper.study import CASES, DURATION, PROGRAM, EnergyDrift, ModelStudy
+from robotid.paper.study import CASES, DURATION, PROGRAM, ModelStudy
 
 _SHOWN = (1, 2, 5, 20, 100)  # iterations drawn in figure 4
 _DRAWN_CASES = {
@@ -53,13 +53,9 @@ _SETTINGS = (("setting", "text", "name"), ("value", "text", "value"))
 def paper_page(
     content: Mapping[str, Any],
     studies: Sequence[ModelStudy],
-    drift: EnergyDrift,
+    drift: tuple[Array, Mapping[str, Array]],
 ) -> str:
-    """Return the page.
-
-    References:
-        Tzvetkova, figures 3 to 5.
-    """
+    """Return the page, with figures 3 to 5 of the paper."""
     result = block("paper.result") + _result_table(content) + _parameter_tables(content)
     figures = _program_figures() + _control_figures(studies) + _estimate_figures(studies)
     disturbed = _disturbance(content) + _disturbed_figures(studies)
@@ -70,7 +66,7 @@ def paper_page(
         "disturbance": ("Disturbance and noise", disturbed),
         "trajectories": ("Random trajectories", _trajectories(content)),
         "errata": ("Errata", block("paper.errata") + listing("Errata", _ERRATA, content["errata"])),
-        "energy": ("Energy", _energy(content) + _energy_figure(drift)),
+        "energy": ("Energy", _energy(content) + _energy_figure(*drift)),
         "settings": ("Settings", _settings(content)),
     }
     return page("The paper's simulation", _summary(content), sections)
@@ -230,12 +226,10 @@ def _control_figures(studies: Sequence[ModelStudy]) -> str:
     """Return the control (21) of both joints in successive iterations, and less the last one."""
     charts = []
     for study in studies:
-        stored = study.history.torques
-        if stored is None:
-            continue
-        t, program = study.program_control(stored.shape[1] + 1)
+        control = study.history.torques
+        t, program = study.program_control(control.shape[1] + 1)
         for j in range(2):
-            torques, last = stored[:, :, 0, j], stored[-1, :, 0, j]
+            torques, last = control[:, :, j], control[-1, :, j]
             drawn = {f"iteration {k}": torques[k - 1] for k in _SHOWN if k <= len(torques)}
             title = f"Figure 4({'ab'[j]}). {study.name}: control u{j + 1} (21)"
             series = [*_lines(drawn), Series("program control", program[:-1, j], "text")]
@@ -287,8 +281,8 @@ def _disturbed_figures(studies: Sequence[ModelStudy]) -> str:
     ))  # fmt: skip
 
 
-def _energy_figure(drift: EnergyDrift) -> str:
+def _energy_figure(t: Array, gained: Mapping[str, Array]) -> str:
     """Return the energy gained by each model in free motion."""
-    lines = _lines({name: 100 * gained for name, gained in drift.gained.items()})
+    lines = _lines({name: 100 * share for name, share in gained.items()})
     title = "Energy gained in free motion"
-    return _plots(Chart(title, drift.t, tuple(lines), "time [s]", "energy gained [%]"))
+    return _plots(Chart(title, t, tuple(lines), "time [s]", "energy gained [%]"))

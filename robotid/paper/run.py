@@ -14,7 +14,6 @@ from robotid.base.versions import __version__
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.torque import joint_torque_regressor
 from robotid.output.viewer.replays import Torques, replay
-from robotid.paper.equations import PlanarDynamics, torque
 from robotid.paper.page import paper_page
 from robotid.paper.planar_2r import urdf_text
 from robotid.paper.procedure import LoopSettings
@@ -24,7 +23,6 @@ from robotid.paper.study import (
     DURATION,
     MODELS,
     PROGRAM,
-    EnergyDrift,
     ModelStudy,
     PaperSettings,
     RandomRuns,
@@ -50,9 +48,6 @@ def run_paper(
     """Run the paper's simulation with its three models, write it and return paper.json's content.
 
     Every file is written in a temporary folder inside the target and then moved.
-
-    References:
-        Tzvetkova, section VI.
     """
     chosen = settings or PaperSettings()
     report = progress or ignore_progress
@@ -99,9 +94,9 @@ def _content(
     studies: list[ModelStudy],
     near: Mapping[str, RandomRuns],
     exact: Mapping[str, RandomRuns],
-    drift: EnergyDrift,
+    drift: tuple[Array, Mapping[str, Array]],
 ) -> dict[str, Any]:
-    loop = LoopSettings()
+    loop, (t, gained) = LoopSettings(), drift
     return {
         "schema_version": 1,
         "robotid": __version__,
@@ -125,8 +120,8 @@ def _content(
         "trajectories_on_program": {name: runs.to_dict() for name, runs in exact.items()},
         "errata": [asdict(e) for e in errata(np.random.default_rng(settings.seed))],
         "energy_drift": {
-            "duration": float(drift.t[-1]),
-            "max_relative": {n: float(np.abs(E).max()) for n, E in drift.gained.items()},
+            "duration": float(t[-1]),
+            "max_relative": {name: float(np.abs(E).max()) for name, E in gained.items()},
         },
     }
 
@@ -189,7 +184,7 @@ def _inertial_vector(arm: RobotModel, study: ModelStudy) -> dict[str, Any]:
     q, v, a = np.random.default_rng(0).uniform(-1.0, 1.0, (3, 20, 2))
     mapping = structural_mapping(arm, inertial_only=True)
     W_b = joint_torque_regressor(arm, q, v, a)[:, mapping.independent]  # (40, b)
-    u = torque(study.dynamics, q, v, a, study.history.estimates[-1, 0])  # (20, 2)
+    u = study.dynamics.torque(q, v, a, study.history.estimates[-1, 0])  # (20, 2)
     beta = np.linalg.lstsq(W_b, u.ravel())[0]
     return {
         "names": [f"{body}.{term}" for body in arm.layout.bodies for term in PAPER_TERMS],
@@ -202,14 +197,15 @@ def _write_replay(arm: RobotModel, study: ModelStudy, target: Path) -> None:
     """Write the replay of the program motion (28), with the torques of the estimates."""
     t = np.linspace(0.0, DURATION, _SAMPLES)
     q, v, a = PROGRAM.evaluate(t)
-    dynamics = PlanarDynamics("corrected")
     estimates = study.history.estimates[:, 0]
-    last = len(estimates) - 1
-    guesses = {"initial values": estimates[0], f"after {last} iterations": estimates[-1]}
+    label = f"after {len(estimates) - 1} iterations"
     torques = Torques(
         t,
-        torque(dynamics, q, v, a, study.P),
-        {label: torque(dynamics, q, v, a, P) for label, P in guesses.items()},
+        study.dynamics.torque(q, v, a, study.P),
+        {
+            "initial values": study.dynamics.torque(q, v, a, estimates[0]),
+            label: study.dynamics.torque(q, v, a, estimates[-1]),
+        },
     )
     notes = ["Program motion (28). Colour of the arcs: residual of the initial values."]
     replay(arm, t, q, torques=torques, notes=notes).write(target)
