@@ -13,7 +13,14 @@ import numpy as np
 from robotid.base.exceptions import DataError
 from robotid.base.typing import Array
 from robotid.dynamics.problem import Problem, Sample, shuffled
-from robotid.estimation.estimators.estimator import Estimate, Weighing, require_rows
+from robotid.estimation.estimators.batch import SILENT
+from robotid.estimation.estimators.estimator import (
+    ALIKE,
+    ROUNDING,
+    Estimate,
+    Weighing,
+    require_rows,
+)
 from robotid.estimation.estimators.recursive import (
     RecursiveEstimator,
     fold,
@@ -25,13 +32,9 @@ Rows: TypeAlias = slice | Array
 
 _AVERAGE = 3.0  # weight of the newest iterate: 3 / (k + 2), the initial value decays as k^-3
 _MEMORY = 1000.0  # [samples] over which PRX and the residuals are averaged
-_SILENT = 1e-9  # relative norm below which columns are not scaled
 _SMALLEST = 1e-6  # lower bound of the eigenvalues of D(q, P^), relative to the largest
-_REGULARISATION = 1e-9  # of the normalised gradient
 _NO_PRX = 1e-9  # norm of the moving average of PRX below which it is 0, scaled parameters
-_NO_SAMPLE = 1e-12  # samples with |Psi|^2 below it are skipped
 _GAIN = 0.01  # relative decrease of the squared residual per pass at convergence
-_ZERO = 2.0  # a mean PRX of fewer standard errors is 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,11 +71,6 @@ class Descent(RecursiveEstimator[DescentState]):
     def weighing(self) -> Weighing:
         return "by step"
 
-    @property
-    @abstractmethod
-    def _takes_scale(self) -> bool:
-        """Whether ``fit`` scales the columns if no scale is given."""
-
     @abstractmethod
     def _moved(self, x: Array, Psi: Array, e: Array, used: Rows, sample: Sample) -> Array:
         """Return x, shape (c,), after rows Psi (k, c), residuals e (k,), both in units of noise."""
@@ -88,7 +86,7 @@ class Descent(RecursiveEstimator[DescentState]):
         if self.scale is not None:
             Psi = Psi / self.scale
         steps = state.steps + 1
-        if np.vdot(Psi, Psi) <= _NO_SAMPLE:
+        if np.vdot(Psi, Psi) <= ROUNDING:
             return replace(state, steps=steps, skipped=state.skipped + 1)
         # usually all rows are used, and a slice is fast
         used = slice(None) if len(rows) == len(sigma) else np.flatnonzero(sample.weight)
@@ -121,7 +119,7 @@ class Descent(RecursiveEstimator[DescentState]):
 
     def fit(self, data: Problem) -> Estimate:
         estimator, c = self, len(data.names)
-        if self.scale is None and self._takes_scale:
+        if self.scale is None and not self.needs_mass:
             estimator = replace(self, scale=column_scale(data, self.sigma))
         state, settled = estimator.init(c), False
         for _ in range(self.passes):
@@ -144,7 +142,7 @@ class Descent(RecursiveEstimator[DescentState]):
             return False
         norm = float(np.linalg.norm(state.prx))
         standard_error = np.sqrt(state.prx_square / (2 * _MEMORY))
-        return norm <= _NO_PRX or norm <= _ZERO * standard_error
+        return norm <= _NO_PRX or norm <= ALIKE * standard_error
 
     def _has_settled(self, before: DescentState, after: DescentState) -> bool:
         """Return whether PRX = 0 after a pass; if it scatters, the residual must not decrease."""
@@ -158,19 +156,13 @@ class Descent(RecursiveEstimator[DescentState]):
 class NormalisedGradient(Descent):
     """Normalised gradient (NLMS), the fastest recursive estimator.
 
-    theta <- theta - Psi^T e / (1e-9 + |Psi|_F^2), e = Psi theta - tau, rows in units of their
-    noise. Without noise |theta~| does not increase.
-
-    References:
-        Goodwin, Sin (1984), Adaptive Filtering, Prediction and Control, 3.3.
+    theta <- theta - Psi^T e / |Psi|_F^2, e = Psi theta - tau, rows in units of their noise. Without
+    noise |theta~| does not increase. Goodwin, Sin (1984), Adaptive Filtering, Prediction and
+    Control, 3.3.
     """
 
-    @property
-    def _takes_scale(self) -> bool:
-        return True
-
     def _moved(self, x: Array, Psi: Array, e: Array, used: Rows, sample: Sample) -> Array:
-        return x - 1.0 / (_REGULARISATION + np.vdot(Psi, Psi)) * (e @ Psi)
+        return x - 1.0 / np.vdot(Psi, Psi) * (e @ Psi)
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,10 +180,8 @@ class PRX(Descent):
     With noise each iterate changes by about the noise of its sample: on recordings of a UR10e and a
     Panda the prediction error of the last iterate is 1.3 to 1.9 times that of weighted least
     squares, and that of the average, the k-th iterate weighted by k^2, 1.03 to 1.05 times. ``fit``
-    scales the columns for step "exact" only.
-
-    References:
-        Tzvetkova, Extracting Inertial Parameters from Robotic Manipulators Dynamics, (20)-(25).
+    scales the columns for step "exact" only. Tzvetkova, Extracting Inertial Parameters from Robotic
+    Manipulators Dynamics, (20)-(25).
     """
 
     step: str = "exact"  # or "printed"
@@ -203,10 +193,6 @@ class PRX(Descent):
     @property
     def needs_mass(self) -> bool:
         return self.step == "printed"
-
-    @property
-    def _takes_scale(self) -> bool:
-        return self.step == "exact"
 
     def _moved(self, x: Array, Psi: Array, e: Array, used: Rows, sample: Sample) -> Array:
         if self.step == "exact":
@@ -250,4 +236,4 @@ def column_scale(problem: Problem, sigma: Array) -> Array:
     if not np.isfinite(squares).all():
         raise DataError("the problem has a row that is not finite; check the trajectory")
     rms = np.sqrt(squares / max(count, 1))
-    return np.where(rms > _SILENT * rms.max(initial=0.0), rms, 1.0)
+    return np.where(rms > SILENT * rms.max(initial=0.0), rms, 1.0)

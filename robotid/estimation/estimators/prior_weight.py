@@ -9,20 +9,18 @@ import numpy as np
 from robotid.base.exceptions import DataError, NotConvergedError
 from robotid.base.typing import Array
 from robotid.dynamics.factors import Factors, Triangle, merge
-from robotid.estimation.estimators.consistent.consistent_fit import Consistent, WeightChoice
-from robotid.estimation.estimators.consistent.interior_point import Minimum
+from robotid.estimation.estimators.consistent_fit import Consistent, WeightChoice
+from robotid.estimation.estimators.estimator import ALIKE, MOST_EXPLAINED
+from robotid.estimation.estimators.interior_point import Minimum
 
 _SMALLEST, _LARGEST = -4.0, 2.0  # decades of the weights tried
 _USUAL = -1.0  # at smaller entropic weights bodies become thin, and fits converge slowly
 _PATIENCE = 2  # decades without a better score after which the search ends
-_ALIKE = 2.0  # standard errors by which the mean log error of a larger weight may be above the best
 _MOST_LOSS = 1.02  # largest ratio of the held-out errors of a larger weight, mean over joints
 _MOST_JOINT_LOSS = 1.05  # ... and of any one joint
 #: Largest ratio of the held-out error of a joint to that of least squares.
 AS_GOOD = 1.1
-_MOST_REPEATED = 0.5  # largest share of repeated errors in the squared residual
 _BEYOND = 4.0  # standard errors by which a body must be outside its box
-_CLEAR = 0.02  # relative increase of the mean square error at which an extent is contradicted
 _REESTIMATED = 8  # largest number of steps of the plausible weight
 _EXPECTED = (0.5, 1.02)  # distances from the prior over the expected one at which they end
 _STEP = 0.5  # decades between the best weight and the refined ones
@@ -42,9 +40,9 @@ class Segments:
         cls, fit: Consistent, segments: Sequence[Factors], sigma: Array | None = None
     ) -> "Segments":
         """Return segments with the noise level of a fit to all of them: sigma (n,) [N m or N]."""
-        whole = merge(segments)
-        level = fit.noise(whole) if sigma is None else sigma
-        return cls(tuple(segments), level, fit.rows(whole, level), fit.independent_share)
+        factors = merge(segments)
+        level = fit.noise(factors) if sigma is None else sigma
+        return cls(tuple(segments), level, fit.rows(factors, level), fit.independent_share)
 
     @cached_property
     def others(self) -> Array:
@@ -112,7 +110,7 @@ def choose_weight(
         return float(np.exp(0.5 * np.log(_by_joint(errors)).mean())), errors
 
     # a residual without the repeated error is smaller by this log ratio
-    excess = -0.5 * np.log1p(-min(repeated, _MOST_REPEATED))
+    excess = -0.5 * np.log1p(-min(repeated, MOST_EXPLAINED))
     choice = replace(_search(score, how, excess, least, _USUAL), plausible=plausible)
     larger = [weight for weight, _ in choice.curve if weight >= choice.weight]
     return replace(choice, weight=_converging(fit, segments.rows, larger, fits))
@@ -201,7 +199,7 @@ def contradicted_extents(fit: Consistent, segments: Segments) -> tuple[str, ...]
         bound = held_out_errors(fit, segments, 1.0)[0].sum(axis=1)
     except NotConvergedError:  # noise-free data that contradict the extents
         return bodies
-    is_clear = bound.sum() > (1.0 + _CLEAR) * unbound.sum() and not _is_as_good(bound, unbound)
+    is_clear = bound.sum() > _MOST_LOSS * unbound.sum() and not _is_as_good(bound, unbound)
     return bodies if is_clear else ()
 
 
@@ -305,7 +303,7 @@ def _is_accepted(parts: Array, best: Array, allowed: float) -> bool:
     logs = 0.5 * np.log(np.where(both, parts, 1.0) / np.where(both, best, 1.0))
     excess = logs.sum(axis=1) / np.maximum(both.sum(axis=1), 1)  # (segments,)
     error = excess.std(ddof=1) / np.sqrt(len(excess))
-    return bool(excess.mean() <= max(allowed, _ALIKE * error))
+    return bool(excess.mean() <= max(allowed, ALIKE * error))
 
 
 def _by_joint(parts: Array) -> Array:
@@ -320,7 +318,7 @@ def _is_as_good(parts: Array, best: Array) -> bool:
     if not len(excess):
         return False
     error = np.sqrt(len(excess)) * excess.std(ddof=1)
-    return bool(excess.sum() <= _ALIKE * error)
+    return bool(excess.sum() <= ALIKE * error)
 
 
 def _is_promising(values: Iterable[float], factor: float = 1.0) -> bool:

@@ -15,14 +15,19 @@ from robotid.base.typing import Array
 from robotid.dynamics.factors import Factors
 from robotid.dynamics.problem import Problem, Sample
 from robotid.estimation.estimators.batch import solve_factor
-from robotid.estimation.estimators.estimator import Estimate, Estimator, Weighing, require_rows
+from robotid.estimation.estimators.determination import PRIOR_LED
+from robotid.estimation.estimators.estimator import (
+    ROUNDING,
+    Estimate,
+    Estimator,
+    Weighing,
+    require_rows,
+)
 
 StateT = TypeVar("StateT")
 
 _BLOCK = 8  # block size of LAPACK
-_TINY = 1e-12  # smallest noise over sigma, for noise-free data
 _PATIENCE = 50  # largest number of successive rows of a joint that the gate rejects
-_PRIOR_LED = 0.9  # ratio to the prior standard deviation above which a parameter is undetermined
 
 
 class RecursiveEstimator(Estimator[Problem], Generic[StateT]):
@@ -41,8 +46,7 @@ class RecursiveEstimator(Estimator[Problem], Generic[StateT]):
     def update(self, state: StateT, sample: Sample) -> StateT:
         """Return the state after one more sample; rows of weight 0 are skipped.
 
-        Raises:
-            DataError: If the sample is not finite or has a wrong shape; the state remains valid.
+        A sample that is not finite or has a wrong shape is a DataError; the state remains valid.
         """
 
     @abstractmethod
@@ -58,20 +62,14 @@ def fold(estimator: RecursiveEstimator[StateT], samples: Iterable[Sample], state
 
 
 def scaled_rows(sample: Sample, sigma: Array, c: int) -> Array:
-    """Return rows sqrt(weight_j) / sigma_j [Y_j tau_j] of nonzero weight, shape (k, c + 1).
-
-    sigma (n,) [N m or N].
-    """
+    """Return rows sqrt(weight_j) / sigma_j [Y_j tau_j] of nonzero weight, shape (k, c + 1)."""
     n = len(sigma)
     if sample.Y.shape != (n, c) or sample.tau.shape != (n,) or sample.weight.shape != (n,):
         raise DataError(
             f"the sample has Y {sample.Y.shape}, tau {sample.tau.shape}, weight "
             f"{sample.weight.shape}, wanted {(n, c)}, {(n,)}, {(n,)}"
         )
-    rows = np.empty((n, c + 1))
-    rows[:, :c] = sample.Y
-    rows[:, c] = sample.tau
-    rows *= (np.sqrt(sample.weight) / sigma)[:, None]
+    rows = np.column_stack([sample.Y, sample.tau]) * (np.sqrt(sample.weight) / sigma)[:, None]
     if not sample.weight.all():
         rows = rows[sample.weight != 0]
     # the sum is the fastest test: it is finite only if every entry is
@@ -124,10 +122,8 @@ class RLS(Filter[RLSState]):
     With forgetting, information that is not updated by motion would vanish (wind-up). Each step
     therefore adds one row of the prior, one parameter after the other, so that the prior
     information of each stays between forgetting^c and 1 times that of the prior. Parameters that
-    are not identifiable have infinite variance.
-
-    References:
-        Bierman (1977), Factorization Methods for Discrete Sequential Estimation, chapter IV.
+    are not identifiable have infinite variance. Bierman (1977), Factorization Methods for Discrete
+    Sequential Estimation, chapter IV.
     """
 
     sigma: Array  # (n,), noise levels [N m or N]; only the ratios matter
@@ -168,9 +164,15 @@ class RLS(Filter[RLSState]):
             return state
         count = self.forgetting * state.rows + len(rows)
         before = state.R
-        if self.forgetting < 1:
+        if self.forgetting < 1 and self.prior is not None and self.prior_std is not None:
             before = np.sqrt(self.forgetting) * before
-            rows = np.vstack([rows, self._prior_row(state)])
+            # a row of the prior that replaces the information forgotten in c steps
+            c = len(before) - 1
+            i = state.steps % c
+            row = np.zeros(c + 1)
+            row[i] = np.sqrt(1.0 - self.forgetting**c) / self.prior_std[i]
+            row[c] = row[i] * self.prior[i]
+            rows = np.vstack([rows, row])
         R = dtpqrt(0, min(_BLOCK, len(before)), before, rows)[0]
         return RLSState(R, count, state.steps + 1)
 
@@ -180,7 +182,7 @@ class RLS(Filter[RLSState]):
         start = np.zeros(c) if self.prior is None else self.prior
         solution = solve_factor(factors, np.ones(1), start)
         freedom = max(state.rows - solution.rank, 1.0)
-        scale = max(abs(float(state.R[c, c])) / np.sqrt(freedom), _TINY)
+        scale = max(abs(float(state.R[c, c])) / np.sqrt(freedom), ROUNDING)
         covariance = scale**2 / self.independent_share * solution.covariance
         message = (
             f"{state.steps} samples used, forgetting {self.forgetting:g}; noise levels "
@@ -191,16 +193,6 @@ class RLS(Filter[RLSState]):
     def _rows_of(self, state: RLSState) -> int:
         # forgotten rows count, too
         return int(state.rows) if self.forgetting == 1 else state.steps * len(self.sigma)
-
-    def _prior_row(self, state: RLSState) -> Array:
-        """Return a row of the prior that replaces the information forgotten in c steps."""
-        c = len(state.R) - 1
-        row = np.zeros(c + 1)
-        if self.prior is not None and self.prior_std is not None:
-            i = state.steps % c
-            weight = np.sqrt(1.0 - self.forgetting**c) / self.prior_std[i]
-            row[i], row[c] = weight, weight * self.prior[i]
-        return row
 
 
 @dataclass(frozen=True, eq=False)
@@ -225,11 +217,9 @@ class Kalman(Filter[KalmanState]):
     an inexact K, exactly symmetric, and its products have only n columns. A row with an improbable
     innovation is rejected and counted. After 50 rejected rows in a row the next row of the joint is
     used. A parameter with almost no information from the data is undetermined, and its standard
-    deviation is that of its prior.
-
-    References:
-        Bierman (1977), Factorization Methods for Discrete Sequential Estimation, II (Joseph form);
-        Bar-Shalom, Li, Kirubarajan (2001), Estimation with Applications to Tracking, 5.4.
+    deviation is that of its prior. Bierman (1977), Factorization Methods for Discrete Sequential
+    Estimation, II; Bar-Shalom, Li, Kirubarajan (2001), Estimation with Applications to
+    Tracking, 5.4.
     """
 
     sigma: Array  # (n,), noise levels [N m or N]
@@ -280,7 +270,10 @@ class Kalman(Filter[KalmanState]):
             P.flat[:: len(P) + 1] += (self.walk * self._prior_spread()) ** 2
         PY = P @ Y.T  # (c, k)
         T = Y @ PY  # (k, k), covariance of the prediction, then of the innovation
-        passed = self._passes(e, np.diag(T), state.in_a_row[used])
+        passed = np.ones(len(e), dtype=bool)
+        if self.gate is not None:  # chi-square test of the innovation
+            bound = NormalDist().inv_cdf((1 + self.gate) / 2) ** 2
+            passed = (e**2 <= bound * (np.diag(T) + 1)) | (state.in_a_row[used] >= _PATIENCE)
         if not passed.all():
             Y, e, PY, T = Y[passed], e[passed], PY[:, passed], T[np.ix_(passed, passed)]
         T.flat[:: len(T) + 1] += 1.0
@@ -291,29 +284,32 @@ class Kalman(Filter[KalmanState]):
         k = used[passed]
         products[k] += scale[k] ** 2 / sample.weight[k] * e * residual
         P = P - (A + A.T)  # exactly symmetric
-        counts = _count(state, used, passed)
-        return KalmanState(state.theta + K @ e, P, products, *counts, state.steps + 1)
+        rows_used, gated, in_a_row = state.rows.copy(), state.gated, state.in_a_row
+        rows_used[used] += passed
+        if not passed.all() or in_a_row.any():
+            gated, in_a_row = gated.copy(), in_a_row.copy()
+            gated[used] += ~passed
+            in_a_row[used] = np.where(passed, 0, in_a_row[used] + 1)
+        counts = (rows_used, gated, in_a_row, state.steps + 1)
+        return KalmanState(state.theta + K @ e, P, products, *counts)
 
     def estimate(self, state: KalmanState, names: tuple[str, ...]) -> Estimate:
         std = self._prior_spread()
         after = np.sqrt(np.maximum(np.diag(state.P), 0.0))
         # the mean of innovation times residual is the noise variance, independent of P
         variance = np.maximum(state.products, 0.0) / np.maximum(state.rows, 1)
-        is_open = after > _PRIOR_LED * std
+        is_open = after > PRIOR_LED * std
         eigenvalues = np.linalg.eigvalsh(state.P / np.outer(std, std))
         return Estimate(
-            state.theta,
-            state.P,
-            names,
-            np.sqrt(variance),
-            rank=int(np.sum(eigenvalues < _PRIOR_LED**2)),
+            state.theta, state.P, names, np.sqrt(variance),
+            rank=int(np.sum(eigenvalues < PRIOR_LED**2)),
             condition=float(np.sqrt(eigenvalues[-1] / max(eigenvalues[0], 1e-300))),
             undetermined=tuple(np.array(names)[is_open].tolist()),
             converged=True,
             n_iter=state.steps,
             message=f"{state.steps} samples, {int(state.gated.sum())} rows rejected by the gate, "
             f"{int(state.rows.sum())} used",
-        )
+        )  # fmt: skip
 
     def _rows_of(self, state: KalmanState) -> int:
         return int(state.rows.sum())
@@ -321,22 +317,3 @@ class Kalman(Filter[KalmanState]):
     def _prior_spread(self) -> Array:
         is_matrix = self.prior_std.ndim == 2
         return np.asarray(np.sqrt(np.diag(self.prior_std)) if is_matrix else self.prior_std)
-
-    def _passes(self, e: Array, variance: Array, in_a_row: Array) -> Array:
-        """Return which rows pass the gate: e^2 / (variance + 1) below the chi-square quantile."""
-        if self.gate is None:
-            return np.ones(len(e), dtype=bool)
-        bound = NormalDist().inv_cdf((1 + self.gate) / 2) ** 2
-        return (e**2 <= bound * (variance + 1)) | (in_a_row >= _PATIENCE)
-
-
-def _count(state: KalmanState, used: Array, passed: Array) -> tuple[Array, Array, Array]:
-    """Return the numbers of rows used, rejected, and rejected since the last one used."""
-    rows = state.rows.copy()
-    rows[used] += passed
-    if passed.all() and not state.in_a_row.any():
-        return rows, state.gated, state.in_a_row
-    gated, in_a_row = state.gated.copy(), state.in_a_row.copy()
-    gated[used] += ~passed
-    in_a_row[used] = np.where(passed, 0, in_a_row[used] + 1)
-    return rows, gated, in_a_row

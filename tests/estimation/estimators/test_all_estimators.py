@@ -20,7 +20,7 @@ from robotid.estimation.estimators import (
     NormalisedGradient,
     fold,
 )
-from robotid.estimation.estimators.segments import scatter
+from robotid.estimation.estimators.estimator import scatter
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 

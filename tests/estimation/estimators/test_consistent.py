@@ -11,13 +11,13 @@ from helpers.synthetic import truth
 from robotid.base.exceptions import DataError, SettingsError
 from robotid.dynamics.factors import Factors, compress, triangle_of
 from robotid.estimation.estimators import PRX, WLS, Consistent
-from robotid.estimation.estimators.consistent.body_constraints import (
+from robotid.estimation.estimators.consistent_fit import (
     Constraints,
     Subspace,
     slabs,
 )
-from robotid.estimation.estimators.consistent.interior_point import Entropic
 from robotid.estimation.estimators.estimator import Estimate
+from robotid.estimation.estimators.interior_point import Entropic
 from robotid.estimation.fitting.chosen_estimator import make_constraints
 from robotid.estimation.fitting.estimator_settings import ConstraintSettings
 from robotid.robot.geometry import body_boxes

@@ -1,5 +1,6 @@
 """Physically consistent fit: a convex programme on the triangular factors, any data and weight."""
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -7,19 +8,157 @@ from typing import Any
 import numpy as np
 import scipy.linalg
 
-from robotid.base.exceptions import DataError
+from robotid.base.exceptions import DataError, SettingsError
+from robotid.base.findings import listed
 from robotid.base.typing import Array
 from robotid.dynamics.factors import Factors
 from robotid.estimation.estimators.batch import WLS, solve_factor
-from robotid.estimation.estimators.consistent.body_constraints import Constraints, Subspace
-from robotid.estimation.estimators.consistent.interior_point import Entropic, Programme
 from robotid.estimation.estimators.determination import base_spread, determine
-from robotid.estimation.estimators.estimator import BatchEstimator, Estimate
-from robotid.robot.parameters import ParameterLayout
+from robotid.estimation.estimators.estimator import LEAST_FREEDOM, BatchEstimator, Estimate
+from robotid.estimation.estimators.interior_point import Bounds, Entropic, Programme, Subspace
+from robotid.robot.parameters import ParameterLayout, pseudo_inertia, pseudo_inertia_basis
 
 _FLOOR = 1e-6  # smallest noise level over the torque, for noise-free data
-_LEAST_FREEDOM = 0.1  # smallest degrees of freedom of a noise level, as a share of the rows
 _ACTIVE = 1e-5  # slack below which a constraint is active, dimensionless
+#: Lower bound of drive terms over their scale, as rounding must not negate them, and tolerance for
+#: a pinned body outside its bounds [kg], [m].
+_ROUNDING = 1e-9
+_OPEN = (0.0, np.inf)  # [kg]
+
+
+@dataclass(frozen=True, eq=False)
+class Constraints:
+    """Bounds in addition to physical consistency, by name of the body that a joint moves."""
+
+    mass: dict[str, tuple[float, float]] = field(default_factory=dict)  # smallest, largest [kg]
+    total_mass: tuple[float, float] | None = None  # of all bodies together [kg]
+    #: Half-spaces A c <= b that contain the centre of mass c of a body in its own frame: A of shape
+    #: (k, 3), unit rows, and b of shape (k,) [m].
+    com: dict[str, tuple[Array, Array]] = field(default_factory=dict)
+    pinned: tuple[str, ...] = ()  # bodies that keep the prior's values
+    #: Box that contains all mass of a body: lower and upper corner in its own frame, shape (2, 3)
+    #: [m]; see ``slabs``.
+    extent: dict[str, Array] = field(default_factory=dict)
+    relaxed: tuple[str, ...] = ()  # bodies whose extent was removed: the data contradict it
+
+    def without_extent(self, bodies: Iterable[str]) -> "Constraints":
+        """Return the same constraints without the extents of some bodies."""
+        relaxed = tuple(body for body in self.extent if body in set(bodies))
+        others = {body: box for body, box in self.extent.items() if body not in relaxed}
+        return replace(self, extent=others, relaxed=(*self.relaxed, *relaxed))
+
+    def check(self, layout: ParameterLayout, prior: Array, held: Array) -> None:
+        """Refuse unknown bodies and bounds that contradict each other, before the solver runs."""
+        known = {*self.mass, *self.com, *self.extent, *self.pinned}
+        unknown = sorted(known - set(layout.bodies))
+        if unknown:
+            raise SettingsError(
+                f"constraints name {unknown}, which are not bodies of the model, wanted names of "
+                f"{listed(layout.bodies)}; links connected by fixed joints are part of the body "
+                "that a joint moves"
+            )
+        values = prior[: layout.n_inertial].reshape(-1, 10)
+        parts = held.reshape(-1, 10)
+        for body, bounds in self.mass.items():
+            _check_range(f"mass of {body}", *bounds)
+            part = parts[layout.bodies.index(body), 0]
+            if bounds[1] < part:
+                raise SettingsError(
+                    f"mass of {body} is at most {bounds[1]:g} kg by its bound, but its links on "
+                    f"locked joints alone have {part:g} kg; increase the bound"
+                )
+        for i in map(layout.bodies.index, self.pinned):
+            self._check_pinned(layout.bodies[i], values[i], parts[i])
+        if self.total_mass is not None:
+            self._check_total(self.total_mass, dict(zip(layout.bodies, values[:, 0], strict=True)))
+
+    def bounds(self, layout: ParameterLayout, scale: Array) -> Bounds:
+        """Return signs of drives and ranges as rows of x = pi / scale, without pinned bodies."""
+        p = len(layout.names)
+        signs = np.flatnonzero(layout.is_nonnegative())
+        labels = [f"drive_signs {layout.names[i]}" for i in signs]
+        G, h = [np.eye(p)[signs]], [np.full(len(signs), -_ROUNDING)]
+        for row, constant, label in self._ranges(layout):
+            norm = np.linalg.norm(row * scale)
+            G.append((row * scale / norm)[None])
+            h.append(np.array([constant / norm]))
+            labels.append(label)
+        return Bounds(np.vstack(G), np.concatenate(h), tuple(labels))
+
+    def equalities(self, layout: ParameterLayout, prior: Array) -> tuple[Array, Array]:
+        """Return the equalities E pi = e (k,): pinned bodies, and masses given as one value."""
+        p = len(layout.names)
+        pinned = np.flatnonzero(np.repeat(np.isin(layout.bodies, self.pinned), 10))
+        E, e = [np.eye(p)[pinned]], [prior[pinned]]
+        for row, (low, high), _ in self._masses(layout):
+            if low == high:
+                E.append(row[None])
+                e.append(np.array([low]))
+        return np.vstack(E), np.concatenate(e)
+
+    def _masses(self, layout: ParameterLayout) -> Iterator[tuple[Array, tuple[float, float], str]]:
+        """Yield the rows of masses, (p,), with their bounds and labels."""
+        for body, bounds in self.mass.items():
+            if body not in self.pinned:
+                yield _row(layout, body, np.eye(10)[0]), bounds, f"mass {body}"
+        if self.total_mass is not None:
+            row = np.zeros(len(layout.names))
+            row[: layout.n_inertial : 10] = 1.0
+            yield row, self.total_mass, "total_mass all"
+
+    def _ranges(self, layout: ParameterLayout) -> Iterator[tuple[Array, float, str]]:
+        """Yield c (p,), c0 and label of each row c pi + c0 >= 0 of a bound that is a range."""
+        for row, (low, high), label in self._masses(layout):
+            for sign, bound in ((1.0, low), (-1.0, high)):
+                if low != high and np.isfinite(bound):
+                    yield sign * row, -sign * bound, label
+        for body, (A, b) in self.com.items():
+            for normal, distance in zip(A, b, strict=True):
+                if body not in self.pinned:
+                    c = np.concatenate([[distance], -normal, np.zeros(6)])
+                    yield _row(layout, body, c), 0.0, f"centre_of_mass {body}"
+        for body, box in self.extent.items():
+            if body not in self.pinned:
+                for c in np.einsum("kij,mij->mk", pseudo_inertia_basis(), slabs(box)):
+                    yield _row(layout, body, c), 0.0, f"extent {body}"
+
+    def _check_pinned(self, body: str, values: Array, held: Array) -> None:
+        (J,) = pseudo_inertia(values - held)
+        if np.linalg.eigvalsh(J)[0] <= 0:
+            raise SettingsError(
+                f"{body} is pinned, but its inertial in the URDF is not physically consistent; "
+                "correct it, or remove the link from 'pinned'"
+            )
+        low, high = self.mass.get(body, _OPEN)
+        if not low - _ROUNDING <= values[0] <= high + _ROUNDING:
+            raise SettingsError(
+                f"{body} is pinned at the URDF's {values[0]:g} kg, outside its bounds "
+                f"[{low:g}, {high:g}] kg; remove the link from 'pinned' or from 'mass'"
+            )
+        if body in self.com:
+            A, b = self.com[body]
+            centre = values[1:4] / values[0]
+            beyond = float((A @ centre - b).max())
+            if beyond > _ROUNDING:
+                raise SettingsError(
+                    f"{body} is pinned, but the URDF's centre of mass "
+                    f"{np.round(centre, 4).tolist()} m is {1e3 * beyond:.1f} mm outside its "
+                    "bounds; remove the link from 'pinned' or widen the bounds"
+                )
+
+    def _check_total(self, total: tuple[float, float], masses: dict[str, float]) -> None:
+        low, high = total
+        _check_range("total_mass", low, high)
+        bounds = [
+            (mass, mass) if body in self.pinned else self.mass.get(body, _OPEN)
+            for body, mass in masses.items()
+        ]
+        least, most = np.sum(bounds, axis=0)
+        if high < least - _ROUNDING or low > most + _ROUNDING:
+            raise SettingsError(
+                f"total_mass is bounded by [{low:g}, {high:g}] kg, but the bounds of the bodies "
+                f"and pinned masses allow [{least:g}, {most:g}] kg; correct the bounds"
+            )
 
 
 @dataclass(frozen=True)
@@ -50,13 +189,9 @@ class Consistent(BatchEstimator):
 
     The estimate contains the p standard parameters. Its covariance is that without the inequalities
     (see ``Programme.redrawn``). Its rank, condition number and undetermined names refer to the base
-    parameters.
-
-    References:
-        Sousa, Cortesao (2014), Physical feasibility of robot base inertial parameter
-        identification: a linear matrix inequality approach; Wensing, Kim, Slotine (2018), Linear
-        Matrix Inequalities for Physically Consistent Inertial Parameter Identification, (8); Lee,
-        Wensing, Park (2019), Geometric robot dynamic identification: a convex programming approach.
+    parameters. Sousa, Cortesao (2014), Physical feasibility of robot base inertial parameter
+    identification: a linear matrix inequality approach; Wensing, Kim, Slotine (2018), Linear Matrix
+    Inequalities for Physically Consistent Inertial Parameter Identification, (8).
     """
 
     layout: ParameterLayout
@@ -98,10 +233,6 @@ class Consistent(BatchEstimator):
         Minimises (K pi - beta)^T C^-1 (K pi - beta) + prior_weight penalty(pi) under the
         constraints of ``fit``, with the covariance C of the estimate of base parameters, as that of
         a recursive estimator at any time. Parameters with infinite variance are not used.
-
-        Raises:
-            DataError: If no base parameter has a finite variance, or C is not positive definite.
-            NotConvergedError: If the solver fails.
         """
         known = np.flatnonzero(np.isfinite(np.diag(estimate.covariance)))
         if not len(known):
@@ -139,7 +270,7 @@ class Consistent(BatchEstimator):
             sigma = WLS(prior, self.independent_share).fit(factors).sigma
         rows = np.maximum(factors.rows, 1)
         used = factors.leverages(solve_factor(factors, sigma, prior).covariance) / sigma**2
-        freedom = np.maximum(rows - used / self.independent_share, _LEAST_FREEDOM * rows)
+        freedom = np.maximum(rows - used / self.independent_share, LEAST_FREEDOM * rows)
         torque = np.sqrt(factors.torque_squares() / rows)
         least = _FLOOR * np.where(torque > 0, torque, 1.0)
         level = sigma * np.sqrt(np.maximum(rows - used, 1.0) / freedom)
@@ -214,6 +345,39 @@ class Consistent(BatchEstimator):
             "pinned": list(pinned),
             "relaxed": list(self.constraints.relaxed),
         }
+
+
+def slabs(box: Array) -> Array:
+    """Return the matrices Q_k, shape (3, 4, 4), with tr(J Q_k) >= 0 for all mass inside a box.
+
+    Every mass element with x_k between the corners l and u has (x_k - l_k) (u_k - x_k) >= 0; the
+    integral over the body is tr(J Q_k) (Wensing, Kim, Slotine, 2018, Linear Matrix Inequalities for
+    Physically Consistent Inertial Parameter Identification, (12), its ellipsoid being a slab).
+    """
+    Q = np.zeros((3, 4, 4))
+    for k, (low, high) in enumerate(box.T.tolist()):
+        Q[k, k, k] = -1.0
+        Q[k, k, 3] = Q[k, 3, k] = 0.5 * (low + high)
+        Q[k, 3, 3] = -low * high
+    return Q
+
+
+def _row(layout: ParameterLayout, body: str, c: Array) -> Array:
+    """Return coefficients of all parameters, (p,), from those of one body, (10,)."""
+    row = np.zeros(len(layout.names))
+    first = 10 * layout.bodies.index(body)
+    row[first : first + 10] = c
+    return row
+
+
+def _check_range(what: str, low: float, high: float) -> None:
+    if not low <= high:
+        raise SettingsError(
+            f"{what} is bounded by [{low:g}, {high:g}] kg: the first value is larger than the "
+            "second; write the smaller one first"
+        )
+    if high <= 0:
+        raise SettingsError(f"{what} is bounded by {high:g} kg, wanted a positive bound")
 
 
 def _information_rows(estimate: Estimate, known: Array) -> Array:
