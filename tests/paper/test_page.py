@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from helpers.pages import chart, charts
 
-from robotid.paper import page
+from robotid.paper import run as page
 from robotid.paper.study import MODELS, PaperSettings, study_model
 
 

@@ -1,6 +1,6 @@
 """Cross-validation on segments of the fitted data: weight of the prior, extents of bodies."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -36,13 +36,11 @@ class Segments:
     share: float  # of independent rows [-]
 
     @classmethod
-    def of(
-        cls, fit: Consistent, segments: Sequence[Factors], sigma: Array | None = None
-    ) -> "Segments":
-        """Return segments with the noise level of a fit to all of them: sigma (n,) [N m or N]."""
+    def of(cls, fit: Consistent, segments: Sequence[Factors]) -> "Segments":
+        """Return segments with the noise level of a fit to all of them."""
         factors = merge(segments)
-        level = fit.noise(factors) if sigma is None else sigma
-        return cls(tuple(segments), level, fit.rows(factors, level), fit.independent_share)
+        sigma = fit.noise(factors)
+        return cls(tuple(segments), sigma, fit.rows(factors, sigma), fit.independent_share)
 
     @cached_property
     def others(self) -> Array:
@@ -78,14 +76,10 @@ def choose_weight(
 ) -> WeightChoice:
     """Return the weight of the prior, chosen from the fitted data.
 
-    * "cv": the largest weight with the same prediction error on held-out segments as the best one.
-      The error of a joint is the RMS over all segments, the error of a weight is the geometric mean
-      over joints. A larger weight is accepted if its error is at most 2 % above the smallest one,
-      at most 5 % for any joint, and the mean log ratio of the errors by segment is at most two
-      standard errors above 0, or as large as an error that repeats in all segments makes it: such
-      an error has no scatter, and a smaller weight that only fits it is not better. The error of no
-      joint may be more than 10 % above that of least squares: where the prior is wrong, as of a
-      placeholder, the weight is smaller.
+    * "cv": the largest weight with the same prediction error on held-out segments as the best one,
+      see ``_is_accepted``. A repeated error has no scatter between segments, and a smaller weight
+      that only fits it is not better. The error of no joint may be more than 10 % above that of
+      least squares: where the prior is wrong, as of a placeholder, the weight is smaller.
     * "evidence": the weight with the largest ``log_evidence``.
 
     Weights are tried from 100 down to 0.1, and to 1e-4 where least squares is better, in decades,
@@ -113,7 +107,14 @@ def choose_weight(
     excess = -0.5 * np.log1p(-min(repeated, MOST_EXPLAINED))
     choice = replace(_search(score, how, excess, least, _USUAL), plausible=plausible)
     larger = [weight for weight, _ in choice.curve if weight >= choice.weight]
-    return replace(choice, weight=_converging(fit, segments.rows, larger, fits))
+    for weight in larger[:-1]:  # the first one at which the fit to all rows converges
+        near = next(iter(fits.get(weight, ())), None)
+        try:
+            fit.programme.minimise(segments.rows, weight, start=near)
+        except NotConvergedError:
+            continue
+        return replace(choice, weight=weight)
+    return replace(choice, weight=larger[-1])
 
 
 def loss_of(fit: Consistent, segments: Segments, weight: float) -> float:
@@ -125,22 +126,6 @@ def loss_of(fit: Consistent, segments: Segments, weight: float) -> float:
     return float(np.sqrt(_by_joint(errors) / _by_joint(segments.least_squares_errors)).max())
 
 
-def _converging(
-    fit: Consistent,
-    rows: Array,
-    weights: Sequence[float],
-    fits: Mapping[float, Sequence[Minimum]],
-) -> float:
-    """Return the first weight at which the fit to all rows converges, from fits to most of them."""
-    for weight in weights[:-1]:
-        try:
-            fit.programme.minimise(rows, weight, start=next(iter(fits.get(weight, ())), None))
-        except NotConvergedError:  # bodies shrink to points
-            continue
-        return weight
-    return weights[-1]
-
-
 def plausible_weight(fit: Consistent, rows: Array, weight: float) -> float:
     """Return the weight at which the distance from the prior is as expected, or the given one.
 
@@ -150,7 +135,7 @@ def plausible_weight(fit: Consistent, rows: Array, weight: float) -> float:
     more, or less than half, as far from the centre the penalty is not quadratic, the next weight is
     g over the penalty. The weight is reduced by half a decade at most, the distance of the weights
     tried: a larger disagreement is due to errors of the model. The steps end before a weight at
-    which the fit does not converge. rows (k, b + 1).
+    which the fit does not converge.
     """
     programme, solution, plausible = fit.programme, None, weight
     least = weight * 10.0**-_STEP
@@ -196,11 +181,12 @@ def contradicted_extents(fit: Consistent, segments: Segments) -> tuple[str, ...]
     except NotConvergedError:
         return ()
     try:
-        bound = held_out_errors(fit, segments, 1.0)[0].sum(axis=1)
+        excess = held_out_errors(fit, segments, 1.0)[0].sum(axis=1) - unbound
     except NotConvergedError:  # noise-free data that contradict the extents
         return bodies
-    is_clear = bound.sum() > _MOST_LOSS * unbound.sum() and not _is_as_good(bound, unbound)
-    return bodies if is_clear else ()
+    error = np.sqrt(len(excess)) * excess.std(ddof=1)  # of the sum, paired
+    least = max((_MOST_LOSS - 1.0) * unbound.sum(), ALIKE * error)
+    return bodies if excess.sum() > least else ()
 
 
 def held_out_errors(
@@ -226,7 +212,7 @@ def log_evidence(fit: Consistent, rows: Array) -> Callable[[float], float]:
 
     With the prior x = L (pi - centre) ~ N(0, 1 / weight) and r = A x + noise of unit variance,
     r ~ N(0, I + A A^T / weight). The penalty is expanded at its centre; the inequalities and a
-    constant are omitted. rows (k, b + 1).
+    constant are omitted.
     """
     A, r = fit.programme.whitened(rows)
     U, s, _ = np.linalg.svd(A, full_matrices=False)
@@ -249,10 +235,9 @@ def _search(
 ) -> WeightChoice:
     """Return the largest weight that ``_is_accepted`` in comparison with that of smallest score.
 
-    Weights are tried from 100 down to the usual smallest one in decades, until the score does not
-    decrease; and further while the loss is too large and decreases. ``score`` returns the score and
-    its parts by segment and joint, or no parts. The loss is the largest ratio of a joint's error to
-    that of least squares, shape (n,).
+    ``score`` returns the score and its parts by segment and joint, or no parts. The loss is the
+    largest ratio of a joint's error to that of least squares, shape (n,); below the usual smallest
+    weight, others are tried while it is too large and decreases.
     """
     tried: dict[float, float] = {}
     parts: dict[float, Array] = {}
@@ -292,7 +277,8 @@ def _search(
 def _is_accepted(parts: Array, best: Array, allowed: float) -> bool:
     """Return whether errors are about as small as the best ones, both of shape (segments, n).
 
-    The mean log ratio is at most the allowed one, or two standard errors.
+    The RMS error over segments, its geometric mean over joints, is at most 2 % larger, and that of
+    any joint 5 %. The mean log ratio by segment is at most the allowed one, or two standard errors.
     """
     if not parts.size:
         return False
@@ -310,15 +296,6 @@ def _by_joint(parts: Array) -> Array:
     """Return the mean squares of the joints with rows, shape (n,), from errors by segment."""
     squares = parts.sum(axis=0)
     return np.asarray(squares[squares > 0])
-
-
-def _is_as_good(parts: Array, best: Array) -> bool:
-    """Return whether the sum of parts is within two standard errors of the best, paired."""
-    excess = parts - best
-    if not len(excess):
-        return False
-    error = np.sqrt(len(excess)) * excess.std(ddof=1)
-    return bool(excess.sum() <= ALIKE * error)
 
 
 def _is_promising(values: Iterable[float], factor: float = 1.0) -> bool:

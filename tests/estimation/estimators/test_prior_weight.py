@@ -75,7 +75,7 @@ def test_the_held_out_errors_are_those_of_a_loop_by_hand(case):
         part = slice(200 * 6 * k, 200 * 6 * (k + 1))
         residual = (tau - W @ (fit.K @ pi))[part].reshape(-1, 6) / NOISE
         total, count = total + (residual**2).sum(axis=0), count + len(residual)
-    squares, _ = held_out_errors(fit, Segments.of(fit, segments, NOISE), 2.0)
+    squares, _ = held_out_errors(fit, replace(Segments.of(fit, segments), sigma=NOISE), 2.0)
     error = np.sqrt(squares.sum(axis=0))
     # it is computed to the solver's tolerance only
     np.testing.assert_allclose(error, np.sqrt(total / count), rtol=2e-4)
