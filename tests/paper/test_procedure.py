@@ -20,7 +20,6 @@ from robotid.paper.procedure import (
     one_shot,
     proximity,
     recursive_update,
-    reference_acceleration,
     rk4,
     run_procedure,
     smallest_eigenvalue,
@@ -253,21 +252,6 @@ def test_only_the_corrected_proximity_vanishes_at_the_truth(rng):
     printed = proximity(Psi, P, u, sign="printed")
     np.testing.assert_allclose(printed, 2 * np.einsum("rnc,rn->rc", Psi, u), rtol=1e-13)
     assert np.abs(printed).max() > 1.0
-
-
-def test_deviation_and_reference_are_equations_15_and_20(rng):
-    q, v, a, q_pr, v_pr, a_pr = rng.normal(size=(6, 4))
-    q_star = reference_acceleration(q, v, (q_pr, v_pr, a_pr), np.array(20.0), np.array(100.0))
-    np.testing.assert_allclose(q_star, a_pr - 20 * (v - v_pr) - 100 * (q - q_pr))
-    eta = a - a_pr + 20 * (v - v_pr) + 100 * (q - q_pr)
-    np.testing.assert_allclose(a - q_star, eta, atol=1e-12)
-
-
-def test_an_update_is_equation_24(rng):
-    P, Psi, eta = rng.normal(size=5), rng.normal(size=(2, 5)), rng.normal(size=2)
-    wanted = P - 1.7 / np.trace(Psi @ Psi.T) * Psi.T @ eta
-    found = recursive_update(P, Psi, eta, np.array(1.7), np.array(True))
-    np.testing.assert_allclose(found, wanted, rtol=1e-13)
 
 
 @pytest.mark.parametrize(
