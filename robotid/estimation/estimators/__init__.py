@@ -2,13 +2,15 @@
 
 from robotid.estimation.estimators.batch import OLS, TLS, WLS
 from robotid.estimation.estimators.consistent_fit import Consistent, Constraints
-from robotid.estimation.estimators.descent import PRX, DescentState, NormalisedGradient
 from robotid.estimation.estimators.estimator import BatchEstimator, Estimate, Estimator
 from robotid.estimation.estimators.output_error import OutputError
 from robotid.estimation.estimators.recursive import (
+    PRX,
     RLS,
+    DescentState,
     Kalman,
     KalmanState,
+    NormalisedGradient,
     RecursiveEstimator,
     RLSState,
     fold,

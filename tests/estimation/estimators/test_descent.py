@@ -10,7 +10,7 @@ from helpers.estimation import RandomStates
 from robotid.base.exceptions import DataError
 from robotid.dynamics.problem import Sample
 from robotid.estimation.estimators import PRX, NormalisedGradient
-from robotid.estimation.estimators.descent import column_scale
+from robotid.estimation.estimators.recursive import column_scale
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 

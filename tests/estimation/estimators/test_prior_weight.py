@@ -14,8 +14,8 @@ from helpers.synthetic import exact_log, truth
 from robotid.base.exceptions import DataError
 from robotid.dynamics.factors import compress, compress_segments, merge
 from robotid.estimation.estimators import Constraints
-from robotid.estimation.estimators import prior_weight as weighting
-from robotid.estimation.estimators.prior_weight import (
+from robotid.estimation.estimators import consistent_fit as weighting
+from robotid.estimation.estimators.consistent_fit import (
     Segments,
     choose_weight,
     contradicted_extents,
@@ -106,7 +106,7 @@ def chosen(case, monkeypatch, excess, repeated=0.0):
     def errors(fit, segments, w, starts):
         return (1.0 + abs(np.log10(w)) * np.asarray(excess)) / 6.0, []
 
-    monkeypatch.setattr("robotid.estimation.estimators.prior_weight.held_out_errors", errors)
+    monkeypatch.setattr("robotid.estimation.estimators.consistent_fit.held_out_errors", errors)
     return choose_weight(fit, Segments.of(fit, cut(problem, 6)), "cv", repeated)
 
 
@@ -181,7 +181,7 @@ def test_an_extent_is_contradicted_beyond_the_scatter_of_segments(ur5, monkeypat
     def errors(one, segments, weight, starts=None):
         return np.ones((4, 1)) + (one is fit) * scatter[:, None], []
 
-    monkeypatch.setattr("robotid.estimation.estimators.prior_weight.held_out_errors", errors)
+    monkeypatch.setattr("robotid.estimation.estimators.consistent_fit.held_out_errors", errors)
     assert contradicted_extents(fit, Segments.of(fit, cut(case.problem, 4))) == named
 
 
