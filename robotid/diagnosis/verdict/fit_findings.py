@@ -17,7 +17,7 @@ from robotid.diagnosis.urdf.inertials import audit_bodies
 from robotid.diagnosis.verdict.parameter_table import correlated_parameters
 from robotid.diagnosis.verdict.scale_check import DIFFERS, friction_shares
 from robotid.diagnosis.verdict.verdict import BEATEN, GOOD, SMALL, error_of, is_harmless_cost
-from robotid.estimation.estimators.consistent.body_constraints import slabs
+from robotid.estimation.estimators.consistent_fit import slabs
 from robotid.estimation.fitting.estimator_settings import BoundedSettings, ConsistentSettings
 from robotid.estimation.fitting.fitted import Fit
 from robotid.estimation.fitting.standard_errors import QUANTILE
