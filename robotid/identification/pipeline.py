@@ -22,7 +22,7 @@ from robotid.data.signal_settings import SignalSettings
 from robotid.diagnosis.logs.check_logs import diagnose
 from robotid.diagnosis.residual.discrepancies import explain_residual
 from robotid.diagnosis.residual.drive_choice import choose_drives
-from robotid.diagnosis.residual.misfit import counterbalanced, settled, with_known_springs
+from robotid.diagnosis.residual.misfit import settled
 from robotid.diagnosis.residual.model_error import settled_shapes, with_model_error
 from robotid.diagnosis.residual.term_trials import take_sample
 from robotid.diagnosis.urdf.inertials import (
@@ -136,8 +136,7 @@ def conclude(
     report_stage(progress, "fitting")
     try:
         recordings = with_repeated_errors(recordings)
-        balanced = counterbalanced(doctor_findings, [log.head.name for log in recordings.fitted])
-        fit = with_drives(recordings, choice, wanted, balanced, progress=progress)
+        fit = with_drives(recordings, choice, wanted, progress=progress)
     except (DataError, NotConvergedError, RankDeficientError) as error:
         for f in doctor_findings:
             if f.severity != "note" and f.message != str(error):
@@ -168,7 +167,7 @@ def conclude(
     # notes, and what the doctor says of excitation and logs, are replaced by those of the fit
     replaced = ("excitation", "log_assumption")
     others = [f for f in doctor_findings if f.severity != "note" and f.code not in replaced]
-    merged = settled(with_known_springs(others, fit, wanted), of_fit)
+    merged = settled(others, of_fit)
     merged = [finding for finding in merged if not explained_by_assumed(model, finding)]
     merged = rejected(merged, result.predictions, result.scale_check)
     log_errors = blocking(merged, ignore, is_robust=is_robust)
@@ -191,7 +190,6 @@ def with_drives(
     recordings: Recordings,
     choice: EstimatorSettings,
     wanted: Mapping[str, Sequence[str] | None],
-    balanced: Mapping[str, str] | None = None,
     *,
     progress: ProgressCallback | None = None,
 ) -> Fit:
@@ -199,7 +197,7 @@ def with_drives(
     report, rough = progress or ignore_progress, rough_choice(choice)
     report("fits", 0, 1, "fits")
     solved = solve_recordings(recordings, choice)
-    drives = choose_drives(solved.solution, wanted, balanced)
+    drives = choose_drives(solved.solution, wanted)
     if not any(drive.terms for drive in drives):
         return replace(solved.with_errors(), drives=drives)
 

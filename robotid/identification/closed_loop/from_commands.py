@@ -16,8 +16,7 @@ from robotid.data.signals import unwrap
 from robotid.diagnosis.catalogue import entries, finding
 from robotid.diagnosis.verdict.fit_findings import not_written, unlike_findings
 from robotid.diagnosis.verdict.parameter_table import correlated_sets
-from robotid.diagnosis.verdict.position_verdict import judge_positions
-from robotid.diagnosis.verdict.verdict import Verdict, blocking
+from robotid.diagnosis.verdict.verdict import Verdict, blocking, judge_positions
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.friction_projection import DriveMoments, drive_moments
 from robotid.dynamics.prediction import predict_instants

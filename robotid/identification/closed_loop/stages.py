@@ -15,8 +15,7 @@ from robotid.data.log import Log
 from robotid.data.measured_velocity import is_trustworthy
 from robotid.data.signal_settings import SignalSettings
 from robotid.diagnosis.logs.command_channels import largest_speeds
-from robotid.diagnosis.verdict.evidence import BEATEN
-from robotid.diagnosis.verdict.position_verdict import GOOD, HARDLY
+from robotid.diagnosis.verdict.verdict import BEATEN, GOOD_POSITION, HARDLY
 from robotid.dynamics.simulation.loops import (
     ClosedLoopRobot,
     Loops,
@@ -260,7 +259,7 @@ def _best_start(initial: "_Initial") -> tuple["_Initial", Array]:
             if np.mean(error[members] / best[members]) < 1.0 / BEATEN:
                 factor[members], limited[members], best[members] = scale, has_limit, error[members]
         may_limit = not has_limit and (scale, True) in initial.starts
-        if not ((best > GOOD) & (may_limit | (best > HARDLY * second_order))).any():
+        if not ((best > GOOD_POSITION) & (may_limit | (best > HARDLY * second_order))).any():
             break
     if not fits:
         raise failure
