@@ -67,6 +67,8 @@ def require_flag(value: object, name: str) -> None:
         require_kind(value, bool, name, "True or False")
 
 
+#: Settings and parameters are smaller, SI units: products of a few are finite.
+LARGEST_SETTING = 1e30
 #: Keys that are required in a table of a list of tables, if its schema has them.
 REQUIRED = ("log", "name", "ratios", "joints", "matrix", "mass", "frame", "frames")
 POSITIVE = Range("a positive number", lambda x: x > 0)
@@ -232,7 +234,7 @@ def _check_entries(value: object, wanted: Entries, at: str) -> None:
 def _check_type(value: object, kinds: tuple[type, ...], at: str) -> None:
     if not isinstance(value, kinds) or (isinstance(value, bool) and bool not in kinds):
         raise SettingsError(f"{at} is {shown(value)}, wanted {_type_name(kinds)}")
-    if isinstance(value, int | float) and not abs(value) <= _LARGEST:  # NaN, too
+    if isinstance(value, int | float) and not abs(value) <= LARGEST_SETTING:  # NaN, too
         raise SettingsError(f"{at} is {shown(value)}, wanted a number between -1e30 and 1e30")
 
 
@@ -269,7 +271,6 @@ def _is_so(holds: Callable[[], Any]) -> bool:
 
 
 _NUMBER = (int, float)
-_LARGEST = 10**30  # settings are smaller; results of larger values may overflow
 _WORDS = {str: "text", bool: "true or false", list: "a list", dict: "a table"}
 _ALSO = {bool: "false", str: "text", list: "a list"}
 

@@ -63,7 +63,7 @@ def link_places(model: RobotModel) -> tuple[LinkPlace, ...]:
 
 
 def link_transfer(model: RobotModel, link: str) -> tuple[int, Array]:
-    """Return the body of a link, and the map (10, 10) of parameters from its frame to the body's."""
+    """Return the body of a link, and the map (10, 10) of parameters from its frame to that."""
     if link not in model.tree.links:
         raise ModelError(
             f"link {link!r} is not in {Path(model.tree.path).name}; links: "

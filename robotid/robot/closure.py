@@ -45,7 +45,7 @@ class Chains:
         self._is_long = np.isin(model.joints, list(model.layout.prismatic))
 
     def gaps(self, q: Array) -> Array:
-        """Return the error of each loop at positions (N, n), (N, loops) [m]; angles times length."""
+        """Return the error of each loop at q (N, n), (N, loops) [m]; angles times the length."""
         errors = np.array([self._equations(x)[0] for x in q]).reshape(len(q), -1)
         first = np.flatnonzero(np.diff(self._loop, prepend=-1))
         return np.sqrt(np.add.reduceat(errors**2, first, axis=1))

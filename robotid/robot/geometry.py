@@ -345,9 +345,7 @@ def body_frames(model: RobotModel) -> dict[str, list[Array]]:
 
 
 @lru_cache(maxsize=2)  # the meshes of a robot are read once
-def _clouds(
-    robot: ET.Element, urdf: str, tags: tuple[str, ...]
-) -> dict[str, list[Array | None]]:
+def _clouds(robot: ET.Element, urdf: str, tags: tuple[str, ...]) -> dict[str, list[Array | None]]:
     """Return the points of each link's shapes of its last tag; None if a shape cannot be read."""
     by_link: dict[str, list[Shape]] = {}
     for tag in tags:

@@ -160,7 +160,7 @@ def test_compiled_instant_and_plain_rows_are_one(model, term, rng):
         at_once = InstantRegressor(model, kept)
         np.testing.assert_allclose(at_once(x.q[3], x.v[3], x.a[3]), W[3], atol=1e-12)
     for engine in (COMPILED, "Pinocchio"):
-        rows = TrajectoryRows(model, x, 2 + np.cos(x.q), model.support(), kept, engine)
+        rows = TrajectoryRows(model, x, 2 + np.cos(x.q), model.support, kept, engine)
         blocks = [[own.copy() for own in block] for block in rows.blocks(0, 70)]
         for j, parts in enumerate(zip(*blocks, strict=True)):
             expected = np.column_stack([W[:, j, rows.columns[j]], x.tau[:, j]])

@@ -187,7 +187,7 @@ def _misfit(
         _window(model, motion, part, step, every, signals, period)
         for part in _segments(model, motion, every)
     ]
-    ends = np.cumsum(model.support()[:, : model.layout.n_inertial].sum(axis=1)).tolist()
+    ends = np.cumsum(model.support[:, : model.layout.n_inertial].sum(axis=1)).tolist()
     own = [slice(*pair) for pair in pairwise([0, *ends])]
     found = [_squares(windows, j, part) for j, part in enumerate(own)] if windows else []
     used = {j: one for j, one in enumerate(found) if one is not None}
@@ -254,7 +254,7 @@ def _window(
 def _of_urdf(model: RobotModel, carried: Array) -> Array:
     """Return the torque of the URDF's bodies from ``carried_columns``, shape (N, n)."""
     size = model.layout.n_inertial
-    support, pi = model.support()[:, :size], model.standard_parameters()[:size]
+    support, pi = model.support[:, :size], model.standard_parameters()[:size]
     ends = np.cumsum(support.sum(axis=1))
     weighted = np.cumsum(carried * np.concatenate([pi[row] for row in support]), axis=1)
     torque: Array = np.diff(weighted[:, ends - 1], axis=1, prepend=0.0)

@@ -57,7 +57,7 @@ class _Loads:
     @cached_property
     def _places(self) -> tuple[Array, Array]:
         """Rows and bodies of the carried columns, one entry for ten columns."""
-        carried = self.model.support()[:, : self.model.layout.n_inertial : 10]
+        carried = self.model.support[:, : self.model.layout.n_inertial : 10]
         rows, bodies = np.nonzero(carried)
         return rows, bodies
 
