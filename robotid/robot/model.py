@@ -1,7 +1,13 @@
 """The robot: a kinematic tree with Pinocchio's dynamics and named standard parameters."""
 
 import math
-from collections.abc import Mapping, Sequence
+import os
+import sys
+import tempfile
+import threading
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -10,12 +16,10 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from robotid.base.arguments import real_numbers
 from robotid.base.exceptions import DataError, ModelError, SettingsError
 from robotid.base.findings import listed
-from robotid.base.native_messages import caught_messages
 from robotid.base.settings import LARGEST_SETTING, require_each, require_flag, require_kind
-from robotid.base.typing import Array
+from robotid.base.typing import Array, real_numbers
 from robotid.robot.constraints import Constraint, Contact, Loop, check_constraints
 from robotid.robot.drive_term import DriveMotion, DriveTerm
 from robotid.robot.drives import DRIVE_TERMS, TERMS
@@ -27,6 +31,9 @@ GRAVITY = (0.0, 0.0, -9.81)  # [m/s^2]
 _OFFSET = 0.01  # [m] axes that are nearer have no distance: 78 URDFs have 0.05 m or more, or 0.5 mm
 _STRONGEST = 100.0  # [m/s^2] with more, accelerations are negligible beside gravity
 _UNIT = 1e-6  # tolerance of the norm of a quaternion
+_ONE_AT_A_TIME = threading.Lock()
+_KINDS = ("Error:", "Warning:")  # first word of console_bridge's messages, which urdfdom uses
+_PLACE = "         at line "  # the second line of such a message: a line of urdfdom's source
 
 
 @dataclass(frozen=True, eq=False)
@@ -395,6 +402,52 @@ class RobotModel:
         return support
 
 
+def pinocchio_model(model: RobotModel, pi: Array) -> pin.Model:
+    """Return Pinocchio's model with inertias, armature, damping and dry friction of parameters.
+
+    Bodies behind locked joints are part of the links before them. With q, v and a of the model,
+
+    ``tau = rnea(q, v, a) + damping v - where(v > 0, lowerDryFrictionLimit, upperDryFrictionLimit)``
+
+    is the predicted torque of moving joints: ``rnea`` includes the armature, and the dry friction
+    of a joint that moves forwards is at its lower limit. Coulomb friction Fc and offset give the
+    limits -Fc - offset and Fc - offset; at rest, dry friction is anywhere between them. With mimic
+    joints or another order of joints, ``RobotModel.configurations`` and ``velocity_map`` convert
+    the identified joints to Pinocchio's, and torques back.
+
+    Terms without such a field are omitted, and a warning names them: friction and inertia of
+    couplings, and friction that depends on load, position or an internal state or, other than
+    linearly, on speed.
+
+    pi (p,).
+    """
+    layout, made = model.layout, pin.Model(model.with_parameters(pi).pin_model)
+    fields = {term: np.zeros(made.nv) for term in ("armature", "viscous", "coulomb", "offset")}
+    missing = []
+    parameters = zip(
+        layout.drive_parameters, layout.drive_names, pi[layout.n_inertial :], strict=True
+    )
+    for (d, term), name, value in parameters:
+        ratios = [(joint, ratio) for joint, ratio in layout.drives[d].ratios if ratio != 0.0]
+        if term.name not in fields or len(ratios) != 1:
+            missing += [name] if value != 0.0 and ratios else []
+            continue
+        ((joint, ratio),) = ratios
+        # tau_j = r f(r v_j): a negative ratio changes the sign of the offset only
+        share = {"coulomb": abs(ratio), "offset": ratio}.get(term.name, ratio**2)
+        fields[term.name][made.joints[made.getJointId(joint)].idx_v] += share * value
+    made.armature, made.damping = fields["armature"], fields["viscous"]
+    made.lowerDryFrictionLimit = -fields["coulomb"] - fields["offset"]
+    made.upperDryFrictionLimit = fields["coulomb"] - fields["offset"]
+    if missing:
+        warnings.warn(
+            f"Pinocchio's model has no field for {listed(missing)}: its torques are without these "
+            "terms; predict(q, v, a) includes them",
+            stacklevel=4,
+        )
+    return made
+
+
 def _terms_at_rest(
     terms: Sequence[str], own_terms: Mapping[str, Sequence[DriveTerm]]
 ) -> tuple[list[str], dict[str, list[DriveTerm]]]:
@@ -480,3 +533,33 @@ def _velocity_map(
         G[joint.idx_v, base + moving.index(leader)] = ratio
         shift[joint.idx_v] = offset
     return G, shift
+
+
+@contextmanager
+def caught_messages() -> Iterator[list[str]]:
+    """Catch the messages that urdfdom and Pinocchio print on file descriptor 2."""
+    messages: list[str] = []
+    with _ONE_AT_A_TIME, tempfile.TemporaryFile() as caught:
+        try:
+            stderr = os.dup(2)
+        except OSError:  # no stderr: nothing can be printed there
+            yield messages
+            return
+        if sys.stderr is not None:
+            sys.stderr.flush()
+        os.dup2(caught.fileno(), 2)
+        try:
+            yield messages
+        finally:
+            os.dup2(stderr, 2)
+            os.close(stderr)
+        caught.seek(0)
+        others = []
+        for line in caught.read().decode(errors="replace").splitlines():
+            kind, _, text = line.partition(" ")
+            if kind in _KINDS:
+                messages.append(text.strip())
+            elif not line.startswith(_PLACE):
+                others.append(f"{line}\n")
+        if others:
+            os.write(2, "".join(others).encode())

@@ -111,7 +111,7 @@ def test_a_wrench_with_the_axes_of_its_link(quadruped, rng):
         SettingsError, match="contact 'a': axes is 'foot', wanted one of world, link"
     ):
         Contact("a", axes="foot")
-    with pytest.raises(SettingsError, match="contact 'a': threshold is 'x', wanted a force .N."):
+    with pytest.raises(SettingsError, match=r"contact 'a': threshold is 'x', wanted a force \[N\]"):
         Contact("a", threshold="x")
 
 
