@@ -45,9 +45,7 @@ def require_each(
     is_list = isinstance(values, Collection) and not isinstance(values, str | bytes | Mapping)
     entries = list(values) if is_list and getattr(values, "ndim", 1) == 1 else [None]  # type: ignore[call-overload]
     if not all(isinstance(entry, kind) for entry in entries):
-        raise SettingsError(
-            f"{name} is {shown(values)}, a {type(values).__name__}, wanted {wanted}"
-        )
+        require_kind(values, (), name, wanted)
     return entries
 
 
@@ -131,10 +129,10 @@ class Settings:
     @classmethod
     def schema(cls) -> dict[str, Any]:
         """Return the permitted keys of a job file: a type or types, a table, or [a table]."""
-        found: dict[str, Any] = {}
+        schema: dict[str, Any] = {}
         for f, key, (*tables, last) in cls.entries():
-            table_in(found, tables)[last] = _read_type(f.type if key.reads is None else key.reads)
-        return found
+            table_in(schema, tables)[last] = _read_type(f.type if key.reads is None else key.reads)
+        return schema
 
     @classmethod
     def paths(cls) -> dict[str, Key]:
@@ -147,11 +145,7 @@ class Settings:
 
     @classmethod
     def from_dict(cls, table: Mapping[str, Any]) -> Self:
-        """Return the settings of a table of a job file.
-
-        Args:
-            table: The table, with keys and types of the ``schema``.
-        """
+        """Return the settings of a table of a job file, with keys and types of the ``schema``."""
         given = {}
         for f, key, (*tables, last) in cls.entries():
             inside = table
@@ -250,24 +244,15 @@ def shown(value: object) -> str:
 def _check_value(value: Any, key: Key, name: str) -> None:  # noqa: ANN401
     if value is None or not (key.among or key.within):
         return
-    words = [f"one of {listed(key.among)}"] if key.among else []
-    if key.within is None:
-        is_right = _is_so(lambda: value in key.among)
-    elif isinstance(value, str):
-        is_right, words = value in key.among, [key.within.words, *words]
-    else:
-        within = key.within
-        is_right, words = _is_so(lambda: within.holds(value)), [within.words]
-    if not is_right:
-        raise SettingsError(f"{name} is {shown(value)}, wanted {' or '.join(words)}")
-
-
-def _is_so(holds: Callable[[], Any]) -> bool:
-    """Return whether a check holds; it does not if it raises for a value."""
+    is_word = isinstance(value, str)
+    words = [] if key.within is None else [key.within.words]
+    words += [f"one of {listed(key.among)}"] if key.among and (is_word or not words) else []
     try:
-        return bool(holds())
-    except (TypeError, ValueError):
-        return False
+        is_number = bool(key.within and not is_word and key.within.holds(value))
+    except (TypeError, ValueError):  # of a value for which the check is not made
+        is_number = False
+    if not (is_number or (is_word and value in key.among)):
+        raise SettingsError(f"{name} is {shown(value)}, wanted {' or '.join(words)}")
 
 
 _NUMBER = (int, float)
