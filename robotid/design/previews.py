@@ -30,7 +30,7 @@ from robotid.data.files.read import Readable
 from robotid.data.log import Log, suggestion
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import low_pass
-from robotid.diagnosis.logs.motion_checks import excitation_finding
+from robotid.diagnosis.logs.check_logs import excitation_finding
 from robotid.dynamics.base_parameters import BaseMapping, structural_mapping
 from robotid.dynamics.factors import Factors, compress, join, merge
 from robotid.dynamics.prediction import predict, predict_instants
