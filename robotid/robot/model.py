@@ -153,11 +153,7 @@ class RobotModel:
             if word not in known:
                 raise ModelError(f"{name} is {word!r}, wanted one of {listed(known)}")
         if dynamics == "static":
-            if not np.any(_gravity(gravity)):
-                raise SettingsError(
-                    "dynamics is 'static', but gravity is 0, wanted gravity that loads the joints"
-                )
-            terms, own_terms = _terms_at_rest(terms, own_terms)
+            terms, own_terms = _terms_at_rest(terms, own_terms, gravity)
         if not (tree.movable or free_flyer):
             raise ModelError(
                 f"{Path(tree.path).name}: robot {tree.name!r} has no movable joint, so there is "
@@ -449,9 +445,13 @@ def pinocchio_model(model: RobotModel, pi: Array) -> pin.Model:
 
 
 def _terms_at_rest(
-    terms: Sequence[str], own_terms: Mapping[str, Sequence[DriveTerm]]
+    terms: Sequence[str], own_terms: Mapping[str, Sequence[DriveTerm]], gravity: Sequence[float]
 ) -> tuple[list[str], dict[str, list[DriveTerm]]]:
     """Return the drive terms that act at rest."""
+    if not np.any(_gravity(gravity)):
+        raise SettingsError(
+            "dynamics is 'static', but gravity is 0, wanted gravity that loads the joints"
+        )
     common = [x for x in terms if x not in TERMS or _acts_at_rest(TERMS[x])]
     return common, {name: list(filter(_acts_at_rest, own)) for name, own in own_terms.items()}
 
