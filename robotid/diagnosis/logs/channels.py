@@ -49,11 +49,13 @@ _GAP = 2.5  # [median steps] a longer step is a gap
 _LONG = 0.05  # [s] ... a longer gap is a warning
 _BUNCHED = 0.2  # [median steps] a shorter step is of rows that were stamped together ...
 _CLOCK_ALIKE = 0.3  # ... if the motion per row in them is less than this share of the usual one
-_SET = 1.0  # [s] in a longer gap, a position that moves as in one step shows that the clock was set
+_PAUSE = (
+    1.0  # [s] a longer rest at an end is reported; in a longer gap, a position that moves as in
+)
+# one step shows that the clock was set
 _STALE = 0.05  # share of stale rows from which they are a warning
 _CONTINUES = 0.15  # motion after repeated rows, over that in as many rows before and after it,
 _AROUND = 10  # ... estimated from at most this many rows
-_REST = 1.0  # [s] a longer rest at an end is reported
 _HARDLY = {"rad": 0.2, "m": 0.05}  # smaller range: the joint hardly moves
 _PLATEAU = 5  # consecutive rows at the limit of a clipped channel, at least
 _CLIPPED = 0.01  # share of the rows at the limit from which a channel is clipped
@@ -269,7 +271,7 @@ def check_rest(log: Log, motion: Trajectory, layout: ParameterLayout) -> Iterato
     before = after = 0.0
     if len(moving):
         before, after = float(moving[0] - log.t[0]), float(log.t[-1] - moving[-1])
-    if max(before, after) >= _REST:
+    if max(before, after) >= _PAUSE:
         yield finding(
             "standstill", log.name, before=before, after=after, start=seconds(moving[0]),
             end=seconds(moving[-1]),
@@ -304,7 +306,7 @@ def _rate(log: Log, step: Array, median: float) -> Iterator[Finding]:
 
 def _gaps(log: Log, step: Array, median: float) -> Iterator[Finding]:
     gaps = np.flatnonzero(step > _GAP * median * (1 + 1e-6))
-    is_set = np.array([step[k] > _SET and _goes_on(log.q, k) for k in gaps.tolist()], dtype=bool)
+    is_set = np.array([step[k] > _PAUSE and _goes_on(log.q, k) for k in gaps.tolist()], dtype=bool)
     if is_set.any():
         k = int(gaps[is_set][0])
         jump, at = float(step[k]) - median, float(log.t[k])
@@ -323,7 +325,7 @@ def _gaps(log: Log, step: Array, median: float) -> Iterator[Finding]:
 
 def _bunches(log: Log, step: Array) -> Iterator[Finding]:
     """Yield rows whose stamps are those of their arrival: they come together after a pause."""
-    mean = float(np.mean(step[step < _SET])) if (step < _SET).any() else 0.0
+    mean = float(np.mean(step[step < _PAUSE])) if (step < _PAUSE).any() else 0.0
     is_bunched = step < _BUNCHED * mean
     share = float(np.mean(is_bunched))
     moved = np.abs(np.diff(log.q, axis=0)).mean(axis=0)

@@ -15,8 +15,10 @@ from robotid.diagnosis.catalogue import finding
 from robotid.diagnosis.decisions import BEYOND_NOISE, ROWS, SIGNIFICANT, TINY
 from robotid.diagnosis.logs.channels import STATIC
 from robotid.diagnosis.logs.hypotheses import (
+    CERTAIN,
     FLOOR,
     HINT,
+    MUCH_BETTER,
     Explanation,
     Probe,
     compensated,
@@ -31,10 +33,9 @@ from robotid.estimation.estimators.two_runs import payload_runs
 from robotid.robot.model import RobotModel
 from robotid.robot.prior import payload_spread, prior_spread
 
-_MUCH_BETTER = 12.0  # ratio of unexplained shares from which another reading is certain ...
-_CERTAIN = float(np.log(_MUCH_BETTER))  # ... as a decrease of the misfit
 _UNEXPLAINED = 0.25  # unexplained share of a torque's variance that is reported, not accepted
-_WRONG = 0.5  # largest unexplained share of a torque with the right sign
+_WRONG = 0.5  # largest unexplained share of a torque with the right sign, or over that without
+# gravity, if the torque contains gravity
 _TILT = 5.0  # [deg] angle of gravity from the stated one that is a warning
 _WRONG_TILT = 30.0  # [deg] ... and an error
 _SPREAD = 0.3  # prior standard deviation of a link's mass, relative to the URDF's
@@ -48,7 +49,6 @@ _OTHER_UNIT = 30.0  # ... and a common scale of all torques farther from 1 is an
 _SCALES = np.logspace(-3, 3, 61)
 _ALIKE = _SCALES[2] / _SCALES[0]  # ratio below which two factors on this grid are equal
 _LARGE = 0.08  # payload over the arm's mass that errors of the links do not explain
-_FOLLOWED = 0.5  # ratio of unexplained shares with and without gravity, if a torque contains it
 _MISMATCH = 7.5  # largest sum of squared errors of the links, in standard deviations
 _NOTHING = 0.01  # of the arm's mass, the smallest change of load
 _CLEARLY = 1.5  # least ratio of the misfit of other torque scales to that of a load
@@ -72,7 +72,7 @@ class _Reading:
     @property
     def is_certain(self) -> bool:
         is_explained = float(np.median(self.best.share)) < _UNEXPLAINED
-        return is_explained and self.gain > _CERTAIN
+        return is_explained and self.gain > CERTAIN
 
     @property
     def joints(self) -> list[str]:
@@ -171,11 +171,11 @@ _FINDINGS: dict[str, Callable[[_Reading], Iterator[Finding]]] = {
 def _is_excused(best: Explanation, loaded: Explanation) -> bool:
     if best.kind in ("torque_sign", "unsigned_torque"):
         excused = (
-            loaded.share[j] < min(_UNEXPLAINED, _MUCH_BETTER * (best.share[j] + FLOOR))
+            loaded.share[j] < min(_UNEXPLAINED, MUCH_BETTER * (best.share[j] + FLOOR))
             for j in best.joints
         )
         return all(excused)
-    return loaded.misfit - best.misfit < _CERTAIN
+    return loaded.misfit - best.misfit < CERTAIN
 
 
 def _unexplained(probe: Probe, share: Array, name: str) -> Iterator[Finding]:
@@ -305,7 +305,7 @@ def _holds_no_gravity(probe: Probe) -> bool:
 def _holds_gravity(probe: Probe) -> bool:
     """Return whether the torque of a joint contains its gravity torque by the URDF."""
     with_gravity, without = own_share(probe), own_share(probe, np.zeros(3))
-    followed = (with_gravity + FLOOR < _FOLLOWED * (without + FLOOR)) & (without < 1.0)
+    followed = (with_gravity + FLOOR < _WRONG * (without + FLOOR)) & (without < 1.0)
     return bool(followed.any())
 
 
