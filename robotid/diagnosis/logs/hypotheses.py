@@ -18,11 +18,11 @@ from robotid.diagnosis.decisions import TINY
 from robotid.diagnosis.logs.channels import AT_REST, ZERO
 from robotid.dynamics.drive_columns import drive_values, friction_directions, friction_speeds
 from robotid.dynamics.torque import carried_columns
-from robotid.robot.model import RobotModel
+from robotid.robot.model import GRAVITY, RobotModel
 
 #: Decrease of the misfit from which another gravity is reported.
 HINT = 0.7
-#: Ratio of unexplained shares from which another reading is certain, also as decrease of the misfit.
+#: Ratio of unexplained shares from which another reading is certain; as decrease of the misfit.
 MUCH_BETTER = 12.0
 CERTAIN = float(np.log(MUCH_BETTER))
 #: An unexplained share below this is negligible.
@@ -32,7 +32,6 @@ _SLOW = 0.05  # largest speed of the unknown sign of friction of a slow joint, o
 _POOR = 0.08  # unexplained share from which other readings of the positions are tested
 _ROWS, _QUARTER = 200, 4  # rows of these tests, and the divisor of their number in a first pass
 _OFFSETS = (0.4, -0.4, np.pi / 2, -np.pi / 2, np.pi)  # [rad] errors of a zero position
-_EARTH = 9.81  # [m/s^2]
 _ITERATIONS = 8  # of signs and fit
 _FOLDED = 0.4  # largest ratio of unexplained shares at which a torque is an absolute value
 
@@ -252,7 +251,7 @@ def _gravity(probe: Probe, stated: Explanation) -> Explanation:
     """
     from scipy.optimize import minimize
 
-    size = float(np.linalg.norm(probe.gravity)) or _EARTH
+    size = float(np.linalg.norm(probe.gravity) or np.linalg.norm(GRAVITY))
     joints = tuple(range(len(probe.model.joints)))
     is_stated = replace(stated, kind="gravity", joints=joints, values=tuple(probe.gravity.tolist()))
     is_poor = stated.share.max() > _POOR

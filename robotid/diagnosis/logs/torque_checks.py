@@ -12,7 +12,7 @@ from robotid.base.typing import Array
 from robotid.data.log import Trajectory
 from robotid.data.signal_settings import SignalSettings
 from robotid.diagnosis.catalogue import finding
-from robotid.diagnosis.decisions import BEYOND_NOISE, ROWS, SIGNIFICANT, TINY
+from robotid.diagnosis.decisions import BEYOND_NOISE, NO_ERROR_OF_MASSES, ROWS, SIGNIFICANT, TINY
 from robotid.diagnosis.logs.channels import STATIC
 from robotid.diagnosis.logs.hypotheses import (
     CERTAIN,
@@ -44,8 +44,7 @@ _INDEPENDENT = 20.0  # number of independent instants of a log
 _PER_SECOND = 3.0  # ... per second of a short one
 _MASS, _MOMENT = 20.0, 10.0  # [kg], [kg m] prior standard deviations of a payload
 _WORSE = 0.25  # allowed increase of a torque's misfit over its own fit, in variances
-_OTHER_SCALE = 3.0  # a torque scale farther from 1 is no error of masses
-_OTHER_UNIT = 30.0  # ... and a common scale of all torques farther from 1 is another unit, no gain
+_OTHER_UNIT = 30.0  # a common scale of all torques farther from 1 is another unit, no gain
 _SCALES = np.logspace(-3, 3, 61)
 _ALIKE = _SCALES[2] / _SCALES[0]  # ratio below which two factors on this grid are equal
 _LARGE = 0.08  # payload over the arm's mass that errors of the links do not explain
@@ -272,7 +271,7 @@ def _check_loads(probe: Probe, share: Array, name: str) -> Iterator[Finding]:
     _, theta, error = model.fit(ones)
     if not model.is_this_robot(ones):
         scale = _torque_scales(model)
-        other = np.flatnonzero(np.abs(np.log(scale)) > np.log(_OTHER_SCALE))
+        other = np.flatnonzero(np.abs(np.log(scale)) > np.log(NO_ERROR_OF_MASSES))
         if len(other) and model.is_this_robot(scale):
             yield from _scaled(probe, scale, _needed(model, scale, other), name)
             return
@@ -320,7 +319,7 @@ def _torque_scales(model: LoadModel) -> Array:
     chi = model.misfits(np.vstack([np.ones(n), common]))
     best = int(np.argmin(chi[1:]))
     starts = [np.ones(n)]
-    is_other = abs(np.log(_SCALES[best])) > np.log(_OTHER_SCALE)
+    is_other = abs(np.log(_SCALES[best])) > np.log(NO_ERROR_OF_MASSES)
     if is_other and chi[0] - chi[1 + best] > SIGNIFICANT**2:
         starts.append(common[best])
     ends = np.array([_descended(model, start) for start in starts])
