@@ -66,7 +66,7 @@ class Probe:
     @cached_property
     def _places(self) -> tuple[Array, Array]:
         """Rows and bodies of the carried columns, one entry for ten columns."""
-        rows, bodies = np.nonzero(self.model.support()[:, : self.model.layout.n_inertial : 10])
+        rows, bodies = np.nonzero(self.model.support[:, : self.model.layout.n_inertial : 10])
         return rows, bodies
 
     @cached_property

@@ -69,7 +69,7 @@ def explained_by_assumed(model: RobotModel, found: Finding) -> bool:
     if found.code not in _OF_MASSES:
         return False
     rows = [name in found.joints for name in model.row_names]
-    carried = model.support()[rows if any(rows) else slice(None)].any(axis=0)
+    carried = model.support[rows if any(rows) else slice(None)].any(axis=0)
     return bool((carried & model.layout.owned_by(assumed_masses(model))).any())
 
 
