@@ -19,11 +19,17 @@ from robotid.robot.constraints import Constraint, Contact, Loop, check_constrain
 from robotid.robot.drive_term import DriveMotion, DriveTerm
 from robotid.robot.drives import DRIVE_TERMS, TERMS
 from robotid.robot.parameters import DYNAMICS, Coupling, ParameterLayout
-from robotid.robot.tree import Joint, Tree, choose_joints, mimic_followers, read_tree
+from robotid.robot.tree import (
+    SMALLEST_LENGTH,
+    Joint,
+    Tree,
+    choose_joints,
+    mimic_followers,
+    read_tree,
+)
 from robotid.robot.urdf_text import LARGEST
 
 GRAVITY = (0.0, 0.0, -9.81)  # [m/s^2]
-_OFFSET = 0.01  # [m] axes that are nearer have no distance: 78 URDFs have 0.05 m or more, or 0.5 mm
 _STRONGEST = 100.0  # [m/s^2] with more, accelerations are negligible beside gravity
 _UNIT = 1e-6  # tolerance of the norm of a quaternion
 
@@ -256,7 +262,7 @@ class RobotModel:
         """
         placements = self.pin_model.jointPlacements[1:]
         longest = max(float(np.linalg.norm(placement.translation)) for placement in placements)
-        return longest if longest > _OFFSET else 1.0
+        return longest if longest > SMALLEST_LENGTH else 1.0
 
     @property
     def carried_by(self) -> Array:
