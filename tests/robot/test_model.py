@@ -1,4 +1,4 @@
-"""Pinocchio's own model of a robot gives the torque that is predicted, drives included."""
+"""A robot from its URDF: joints, parameters, faults; as a model of Pinocchio, drives included."""
 
 import warnings
 
