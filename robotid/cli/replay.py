@@ -24,7 +24,7 @@ from robotid.cli.flags import (
 from robotid.cli.job import Job, LogEntry, written_job
 from robotid.cli.logs import log_of_commands
 from robotid.cli.track import serve
-from robotid.data.files.formats import open_table
+from robotid.data.files.read import open_table
 from robotid.data.log import Log
 from robotid.data.signal_settings import LogSource
 from robotid.design.clearance import Clearance

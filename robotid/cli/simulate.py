@@ -15,8 +15,7 @@ from robotid.base.versions import __version__
 from robotid.cli.console import echo, print_files, progress_of, show_found
 from robotid.cli.flags import JOB, ROBOT, Flags, add_json
 from robotid.cli.job import Job, LogEntry, as_job, job_from_settings, read_job
-from robotid.data.files.formats import check_suffix
-from robotid.data.files.read import write_log
+from robotid.data.files.read import check_suffix, write_log
 from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import process

@@ -50,27 +50,22 @@ class ImuFrame:
     quaternion: Array  # orientation of the IMU in the base link, qx qy qz qw, shape (4,)
     lever: Array  # origin of the IMU in the base link, shape (3,) [m]
     gravity: Array  # gravity in the world, shape (3,) [m/s^2]
-    # bias of the gyroscopes with the axes of the base, shape (3,) [rad/s]; None to estimate it at
-    # rest
-    bias: Array | None = None
-    # bias of the accelerometers with the axes of the base, shape (3,) [m/s^2]; None: 0
-    offset: Array | None = None
+    bias: Array | None = None  # of the gyroscopes, base axes (3,) [rad/s]; None: estimate at rest
+    offset: Array | None = None  # of the accelerometers, base axes (3,) [m/s^2]; None: 0
 
     @property
     def rotation(self) -> Array:
         """Axes of the IMU in the base link, shape (3, 3)."""
         x, y, z, w = self.quaternion
         S = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-        rotation: Array = np.eye(3) + 2.0 * (w * S + S @ S)
-        return rotation
+        return np.asarray(np.eye(3) + 2.0 * (w * S + S @ S))
 
 
 @dataclass(frozen=True, eq=False)
 class ImuMotion:
     """Recorded values of an IMU with the axes of the base link."""
 
-    # angular velocity without bias [rad/s] and specific force, the acceleration minus gravity
-    # [m/s^2], shape (N, 6)
+    # angular velocity without bias [rad/s], and acceleration minus gravity [m/s^2], shape (N, 6)
     values: Array
     frame: ImuFrame  # place of the IMU, with the bias that was subtracted
 
@@ -81,28 +76,15 @@ class ImuMotion:
 
 @dataclass(frozen=True, eq=False)
 class BaseMotion:
-    """Recorded motion of a floating base, sample by sample. The arrays are read-only.
+    """Recorded motion of a floating base, sample by sample. The arrays are read-only."""
 
-    Attributes:
-        pose: Position of the base link in the world [m] and its orientation as a quaternion,
-            x y z qx qy qz qw, shape (N, 7). Quaternions are normalised, with continuous signs.
-        twist: Linear [m/s] and angular velocity [rad/s] with the axes of the base link, shape
-            (N, 6); None if it was not recorded.
-        acceleration: Time derivative of the twist, shape (N, 6) [m/s^2, rad/s^2]; None if it was
-            not recorded.
-        imu: Values of an IMU, which determine angular velocity and acceleration; None without one.
-            The position is 0 if it was not recorded.
-        link: The link whose pose it is; "" for the root link. Only the root link has velocities.
-
-    Raises:
-        DataError: If a shape is not the expected one, or a quaternion is not of length 1.
-    """
-
+    # position in the world [m], 0 if not recorded, and orientation, x y z qx qy qz qw, (N, 7);
+    # quaternions become normalised, with continuous signs
     pose: Array
-    twist: Array | None = None
-    acceleration: Array | None = None
-    imu: ImuMotion | None = None
-    link: str = ""
+    twist: Array | None = None  # linear [m/s] and angular velocity [rad/s], base axes, (N, 6)
+    acceleration: Array | None = None  # time derivative of the twist, (N, 6) [m/s^2, rad/s^2]
+    imu: ImuMotion | None = None  # determines angular velocity and acceleration
+    link: str = ""  # whose pose it is; "": the root link, which alone has velocities
 
     def __post_init__(self) -> None:
         for name, width in (("pose", 7), ("twist", 6), ("acceleration", 6)):
@@ -123,11 +105,7 @@ class BaseMotion:
         object.__setattr__(self, "pose", pose)
 
     def at(self, rows: slice) -> "BaseMotion":
-        """Return some samples.
-
-        Args:
-            rows: Their numbers.
-        """
+        """Return some samples."""
         imu = None if self.imu is None else self.imu.at(rows)
         arrays = {"pose": self.pose, "twist": self.twist, "acceleration": self.acceleration}
         some: dict[str, Any] = {name: x[rows] for name, x in arrays.items() if x is not None}
@@ -143,32 +121,21 @@ class BaseMotion:
 class BaseColumns:
     """The columns of a floating base and of contacts that are read from a file.
 
-    Attributes:
-        floats: Whether the motion of a floating base is read: ``base_x`` to ``base_z`` [m] and
-            ``base_qx`` to ``base_qw``, or ``base_roll``, ``base_pitch``, ``base_yaw`` [rad]; also
-            velocities ``base_vx`` to ``base_wz`` and accelerations ``base_ax`` to ``base_alz``, if
-            they are there.
-        contacts: Links whose contacts are read from ``contact_<link>``, 1 or 0.
-        wrenches: Components of wrenches, as "fz l_sole" from ``wrench_fz_l_sole``. With these, a
-            log need not have torques.
-        twist: Axes of the velocities: "base" or "world".
-        thresholds: For each contact the force above which it counts, if its column is a force, or
-            None; empty: none is.
-        local: Links whose wrenches have the axes of the link instead of the world's.
-        imu: Place of an IMU in the base, whose ``imu_wx`` to ``imu_az`` replace velocities and
-            accelerations; orientation is that of the base, or of the IMU, ``imu_qx`` to
-            ``imu_qw``; the position may be missing. None without an IMU.
-        link: The link whose pose is read; "" for the root link. Its velocities are not read.
+    The pose is ``base_x`` to ``base_z`` [m] and ``base_qx`` to ``base_qw``, or ``base_roll``,
+    ``base_pitch``, ``base_yaw`` [rad]. Velocities ``base_vx`` to ``base_wz`` and accelerations
+    ``base_ax`` to ``base_alz`` are optional. An IMU's ``imu_wx`` to ``imu_az`` replace these; its
+    orientation is that of the base or ``imu_qx`` to ``imu_qw``, and the position may be missing.
     """
 
-    floats: bool = False
-    contacts: tuple[str, ...] = ()
-    wrenches: tuple[str, ...] = ()
-    twist: str = "base"
+    floats: bool = False  # whether the motion of a floating base is read
+    contacts: tuple[str, ...] = ()  # links whose contacts are read, ``contact_<link>``, 1 or 0
+    wrenches: tuple[str, ...] = ()  # as "fz l_sole", ``wrench_fz_l_sole``: torques may be missing
+    twist: str = "base"  # axes of the velocities: "base" or "world"
+    # of each contact the force from which it counts, None if its column is no force; empty: none is
     thresholds: tuple[float | None, ...] = ()
-    local: tuple[str, ...] = ()
-    imu: ImuFrame | None = None
-    link: str = ""
+    local: tuple[str, ...] = ()  # links whose wrenches have their axes, not the world's
+    imu: ImuFrame | None = None  # place of an IMU in the base
+    link: str = ""  # whose pose is read, without velocities; "": the root link
 
     @property
     def needs_heading(self) -> bool:
@@ -180,11 +147,7 @@ class BaseColumns:
         return any(part != vertical and link not in self.local for part, link in pairs)
 
     def present(self, names: Collection[str]) -> "BaseColumns":
-        """Return the same with only those contacts that a file has; the others may be found.
-
-        Args:
-            names: Names of its columns, and standard names that are renamed.
-        """
+        """Return the same with only those contacts that a file has; the others may be found."""
         kept = [k for k, link in enumerate(self.contacts) if f"contact_{link}" in names]
         limits = self.thresholds or (None,) * len(self.contacts)
         return replace(
@@ -205,13 +168,11 @@ def base_columns(
     if missing := [name for name in found["wrench"] if name not in names]:
         seen = [name for name in names if name.startswith("wrench_")]
         cells = [x for x in seen if x.startswith(tuple(f"{name}_" for name in missing))]
-        sums = (
-            f"If {listed(cells)} are cells of a foot, add a column of their sum. " if cells else ""
-        )
+        sums = f"If {listed(cells)} are cells of a foot, add a column of their sum. "
         raise DataError(
             f"{where} has no column {listed(missing)}; columns of that kind found: {listed(seen)}. "
-            f"{sums}Name the column in [columns], or remove the component from measured in "
-            "[[contact]]",
+            f"{sums if cells else ''}Name the column in [columns], or remove the component from "
+            "measured in [[contact]]",
             code="missing_column",
         )
     return {
@@ -223,37 +184,32 @@ def base_columns(
 
 def _columns_of_base(where: str, names: Sequence[str], wanted: BaseColumns) -> dict[str, list[str]]:
     """Return the columns of the motion of the base, by kind."""
-    forms = {"pose": POSE, "angles": _ANGLES, "twist": TWIST, "acceleration": ACCELERATION}
-    if wanted.link:
-        forms = {"pose": POSE, "angles": _ANGLES}
-    whole = {kind: [f"base_{end}" for end in ends] for kind, ends in forms.items()}
+    forms = {"pose": ("base", POSE), "angles": ("base", _ANGLES)}
     orientations = ["pose", "angles"]
     if wanted.imu is not None:
-        whole = {kind: whole[kind] for kind in orientations}
-        whole |= {
-            "imu quaternion": [f"imu_{end}" for end in IMU[:4]],
-            "quaternion": [f"base_{end}" for end in POSE[3:]],
-            "rpy": [f"base_{end}" for end in _ANGLES[3:]],
-            "imu": [f"imu_{end}" for end in IMU[4:]],
-        }
-        orientations = [kind for kind in whole if kind != "imu"]
-    found = {kind: own for kind, own in whole.items() if set(own) <= set(names)}
-    used = next((kind for kind in orientations if kind in found), "")
-    required = ["imu"] if wanted.imu is not None else []
-    missing = [x for kind in required for x in whole[kind] if x not in names]
-    is_blind = wanted.needs_heading or (wanted.imu is not None and not wanted.imu.gravity.any())
-    if not used and not missing and (not required or is_blind):
-        missing = [x for x in whole["imu quaternion" if required else "pose"] if x not in names]
+        forms |= {
+            "imu quaternion": ("imu", IMU[:4]), "quaternion": ("base", POSE[3:]),
+            "rpy": ("base", _ANGLES[3:]), "imu": ("imu", IMU[4:]),
+        }  # fmt: skip
+        orientations = [kind for kind in forms if kind != "imu"]
+    elif not wanted.link:
+        forms |= {"twist": ("base", TWIST), "acceleration": ("base", ACCELERATION)}
+    whole = {kind: [f"{start}_{end}" for end in ends] for kind, (start, ends) in forms.items()}
+    present = {kind: columns for kind, columns in whole.items() if set(columns) <= set(names)}
+    used = next((kind for kind in orientations if kind in present), "")
+    missing = [x for x in whole.get("imu", ()) if x not in names]
+    needs_pose = wanted.imu is None or wanted.needs_heading or not wanted.imu.gravity.any()
+    if not used and not missing and needs_pose:
+        missing = [x for x in whole.get("imu quaternion", whole["pose"]) if x not in names]
     if missing:
         seen = [name for name in names if name.startswith(("base_", "imu_"))]
-        what = "the IMU" if required else "the pose of the floating base"
-        remedy = _IMU_REMEDY if required else _POSE_REMEDY
+        what = "the pose of the floating base" if wanted.imu is None else "the IMU"
         raise DataError(
             f"{where} has no column {listed(missing)} of {what}; columns of the base found: "
-            f"{listed(seen)}. {remedy}",
+            f"{listed(seen)}. {_POSE_REMEDY if wanted.imu is None else _IMU_REMEDY}",
             code="missing_column",
         )
-    return {kind: own for kind, own in found.items() if kind == used or kind not in orientations}
+    return {kind: x for kind, x in present.items() if kind == used or kind not in orientations}
 
 
 def base_of(
@@ -266,10 +222,9 @@ def base_of(
     pose, frame = _pose_of(values, wanted.imu), wanted.imu
     if pose is None and frame is not None and "base imu" in values:
         imu, note = motion_of_imu(t, q, _checked(values["base imu"], "IMU", 6), frame)
-        pose = np.zeros((len(t), 7))
-        pose[:, 3:] = orientation_of_imu(t, imu.values, frame.gravity)
+        quaternion = orientation_of_imu(t, imu.values, frame.gravity)
         note += "; the orientation is estimated from angular velocity and specific force"
-        return BaseMotion(pose, imu=imu), note
+        return BaseMotion(np.hstack([np.zeros((len(t), 3)), quaternion]), imu=imu), note
     if pose is None:
         return None, ""
     twist, acceleration = values.get("base twist"), values.get("base acceleration")
@@ -314,11 +269,8 @@ def _radians(angles: Array) -> Array:
 def contacts_of(values: Array, wanted: BaseColumns, where: str) -> dict[str, Array]:
     """Return whether links touch the ground, by link, each of shape (N,), bool: values (N, k)."""
     links = wanted.contacts
-    limits = np.full(len(links), np.nan)
-    if wanted.thresholds:
-        limits[:] = [np.nan if x is None else x for x in wanted.thresholds]
-    is_force = ~np.isnan(limits)
-    values = np.where(is_force, values > limits, values)
+    limits = np.array(wanted.thresholds or [None] * len(links), dtype=float)  # None becomes NaN
+    values = np.where(np.isnan(limits), values, values > limits)
     for link, flags in zip(links, values.T, strict=True):
         wrong = np.flatnonzero((flags != 0.0) & (flags != 1.0))
         if len(wrong):
@@ -334,8 +286,7 @@ def table_of_base(
 ) -> dict[str, Array]:
     """Return the columns of a log with the motion of a base, contacts and wrenches, by name."""
     table: dict[str, Array] = {}
-    forms = {"pose": POSE, "twist": TWIST, "acceleration": ACCELERATION}
-    for kind, ends in forms.items():
+    for kind, ends in (("pose", POSE), ("twist", TWIST), ("acceleration", ACCELERATION)):
         values = getattr(base, kind, None)
         if values is not None:
             table |= {f"base_{end}": values[:, k] for k, end in enumerate(ends)}
@@ -405,15 +356,13 @@ def in_base(quaternion: Array, vector: Array) -> Array:
     quaternion (N, 4), vector (N, 3).
     """
     u = np.cross(vector, quaternion[:, :3])
-    turned: Array = vector + 2.0 * (quaternion[:, 3:] * u + np.cross(u, quaternion[:, :3]))
-    return turned
+    return np.asarray(vector + 2.0 * (quaternion[:, 3:] * u + np.cross(u, quaternion[:, :3])))
 
 
 def vector_part(p: Array, rate: Array) -> Array:
     """Return the vector part of the product p* r of quaternions x y z w, shape (N, 3)."""
     vector, scalar = p[:, :3], p[:, 3:]
-    part: Array = scalar * rate[:, :3] - rate[:, 3:] * vector - np.cross(vector, rate[:, :3])
-    return part
+    return np.asarray(scalar * rate[:, :3] - rate[:, 3:] * vector - np.cross(vector, rate[:, :3]))
 
 
 def quaternions_of_angles(angles: Array) -> Array:
@@ -422,14 +371,10 @@ def quaternions_of_angles(angles: Array) -> Array:
     angles (N, 3) [rad].
     """
     (cr, cp, cy), (sr, sp, sy) = np.cos(angles.T / 2), np.sin(angles.T / 2)
-    return np.column_stack(
-        [
-            sr * cp * cy - cr * sp * sy,
-            cr * sp * cy + sr * cp * sy,
-            cr * cp * sy - sr * sp * cy,
-            cr * cp * cy + sr * sp * sy,
-        ]
-    )
+    return np.column_stack([
+        sr * cp * cy - cr * sp * sy, cr * sp * cy + sr * cp * sy,
+        cr * cp * sy - sr * sp * cy, cr * cp * cy + sr * sp * sy,
+    ])  # fmt: skip
 
 
 def _checked(values: ArrayLike, name: str, width: int) -> Array:
@@ -445,8 +390,6 @@ def _checked(values: ArrayLike, name: str, width: int) -> Array:
 
 def motion_of_imu(t: Array, q: Array, values: Array, frame: ImuFrame) -> tuple[ImuMotion, str]:
     """Return the motion of an IMU without the bias of its gyroscopes, and a note on the bias.
-
-    The bias is that of ``bias_at_rest``.
 
     t (N,) [s], q (N, n) [rad or m], values (N, 6).
     """

@@ -23,8 +23,8 @@ from robotid.base.text import seconds
 from robotid.base.typing import Array
 from robotid.data.base_motion import base_state, pose_jumps
 from robotid.data.log import Log, Trajectory
-from robotid.data.measured_velocity import is_trustworthy
 from robotid.data.signal_settings import SignalSettings
+from robotid.data.units import is_trustworthy
 
 _SLOWEST = 1e-6  # smallest cut-off over the rate
 _GAP_STEPS = 2.5  # [median steps] a longer step may be a gap

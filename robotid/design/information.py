@@ -10,7 +10,7 @@ from robotid.base.exceptions import DataError, SettingsError
 from robotid.base.typing import Array
 from robotid.dynamics.base_parameters import BaseMapping
 from robotid.dynamics.compiled import Tree, flatten, own_motion, row_lanes, why_not
-from robotid.dynamics.drive_columns import drive_motion
+from robotid.dynamics.rows import drive_motion
 from robotid.robot.drive_term import DriveMotion, DriveTerm
 from robotid.robot.model import RobotModel
 

@@ -9,7 +9,7 @@ from robotid.base.exceptions import SettingsError
 from robotid.base.files import write_text
 from robotid.base.text import yaml_name
 from robotid.base.typing import Array
-from robotid.data.files.formats import check_suffix, write_columns
+from robotid.data.files.read import check_suffix, write_columns
 from robotid.dynamics.simulation.motions import Motion
 
 _UR_JOINTS = 6

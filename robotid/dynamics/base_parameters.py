@@ -5,7 +5,6 @@ are combinations of the independent ones, W_2 = W_1 R1^-1 R2, and W pi = W_1 bet
 beta = K pi = pi_1 + R1^-1 R2 pi_2 (Gautier 1991).
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -56,16 +55,6 @@ class BaseMapping:
         """Names of the standard parameters that affect no torque in any motion."""
         return tuple(self.names[i] for i in np.flatnonzero(~self.K.any(axis=0)))
 
-    def described(self, names: Sequence[str]) -> dict[str, tuple[str, ...]]:
-        """Return how some standard parameters are structurally identifiable."""
-        terms = np.abs(self.K) > 0
-        kinds: dict[str, tuple[str, ...]] = {"alone": (), "in sums": (), "never": ()}
-        for name in names:
-            rows = terms[terms[:, self.names.index(name)]]  # that it is in
-            kind = "never" if not len(rows) else "alone" if rows.sum() == 1 else "in sums"
-            kinds[kind] += (name,)
-        return kinds
-
     def to_base(self, pi: Array) -> Array:
         """Return the base parameters beta = K pi, shape (b,): pi (p,)."""
         if pi.shape != (self.K.shape[1],):
@@ -79,8 +68,7 @@ class BaseMapping:
         """
         if beta.shape != (len(self.K),):
             raise DataError(f"beta has shape {beta.shape}, wanted ({len(self.K)},)")
-        pi: Array = prior + self.gain(spread) @ (beta - self.to_base(prior))
-        return pi
+        return np.asarray(prior + self.gain(spread) @ (beta - self.to_base(prior)))
 
     def gain(self, spread: Array | None = None) -> Array:
         """Return G = S^2 K^T (K S^2 K^T)^-1, shape (p, b), S = diag(spread): d pi / d beta."""

@@ -18,13 +18,17 @@ from robotid.base.typing import Array
 from robotid.data.log import Trajectory
 from robotid.dynamics.compiled import work_per_sample
 from robotid.dynamics.constraint_rows import without_forces
-from robotid.dynamics.drive_columns import (
+from robotid.dynamics.rows import (
+    BLOCK,
+    COMPILED,
+    InertialRows,
+    TrajectoryRows,
     drive_motion,
     friction_directions,
     remembered,
+    trajectory_rows,
     trajectory_values,
 )
-from robotid.dynamics.rows import BLOCK, COMPILED, InertialRows, TrajectoryRows, trajectory_rows
 from robotid.dynamics.torque import joint_torque_regressor
 from robotid.robot.drive_term import DriveMotion
 from robotid.robot.drives import Lag

@@ -1,10 +1,15 @@
-"""Rows of a trajectory's problem joint by joint: regressor, torque and weight, block by block."""
+"""Rows of a trajectory's problem joint by joint: regressor, torque and weight, block by block.
+
+Inertial columns are computed by Pinocchio or by compiled code, drive columns by the terms of the
+drives. Shapes: q (N, n), v and a (N, n_rows).
+"""
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -12,25 +17,28 @@ import pinocchio as pin
 from robotid.base.exceptions import DataError
 from robotid.base.findings import listed
 from robotid.base.typing import Array
+from robotid.data.base_motion import in_base
 from robotid.data.log import Trajectory
 from robotid.dynamics.compiled import (
     LONG_ENOUGH,
-    CompiledWriter,
     Tree,
     flatten,
     keeps_code,
+    own_motion,
+    row_lanes,
     why_not,
     work_per_sample,
 )
-from robotid.dynamics.drive_columns import RowPlan, plan_rows, trajectory_values
 from robotid.dynamics.problem import RowSource
+from robotid.robot.drive_term import DriveMotion
 from robotid.robot.model import RobotModel
+from robotid.robot.parameters import ParameterLayout
 
 BLOCK = 512  # samples per block: with 100 columns it fits in the cache
 COMPILED = "compiled by Numba"
 
-_LANES = 64  # the compiled path works on whole groups of so many samples
-_BLOCK_SIZE = 2**18  # numbers per block, 2 MiB, but at least one group of samples
+BLOCK_SIZE = 2**18  # numbers per block, 2 MiB, but at least one group of samples
+_GROUP = 64  # samples: a multiple of those that compiled code computes together
 _LOADED = 8  # blocks that a writer loads together
 _MOST_BYTES = 2**25  # of inertial columns that are stored with a trajectory
 
@@ -50,6 +58,150 @@ def choose_engine(model: RobotModel, samples: int, compiled: bool | None) -> str
         engine = COMPILED if reason is None else f"{engine} ({reason})"
     _log.info("%s: regressor of %d samples: %s", model.name, samples, engine)
     return engine
+
+
+def drive_values(
+    layout: ParameterLayout,
+    q: Array,
+    v: Array,
+    a: Array,
+    direction: Array,
+    memory: Array | None = None,
+) -> Array:
+    """Return the columns of drive parameters, shape (k, N), at the speed w of their drives.
+
+    Row j of the regressor has them times ``layout.drive_loads[j]``. memory (N, m).
+    """
+    motion = drive_motion(layout, q, v, a, direction)
+    states, wanted = np.empty((len(v), 0)) if memory is None else memory, layout.remembering
+    if states.shape != (len(v), len(wanted)):
+        raise DataError(
+            f"memory has shape {states.shape}, wanted {(len(v), len(wanted))}: a column for each "
+            "drive parameter with internal state or load; call remember() with the trajectory first"
+        )
+    values = np.empty((len(layout.drive_parameters), len(v)))
+    for k, (d, term) in enumerate(layout.drive_parameters):
+        if k not in wanted:
+            values[k] = term.column(motion.of(d))
+    values[list(wanted)] = states.T
+    return values
+
+
+def trajectory_values(
+    layout: ParameterLayout, motion: Trajectory, part: slice = slice(None)
+) -> Array:
+    """Return the columns of drive parameters along a trajectory, (k, N); see ``drive_values``."""
+    direction, memory = (None if x is None else x[part] for x in (motion.direction, motion.memory))
+    signs = friction_directions(layout, motion.v[part], direction)
+    state = motion.q[part], motion.v[part], motion.a[part]
+    return drive_values(layout, *state, signs, memory)
+
+
+def drive_motion(
+    layout: ParameterLayout,
+    q: Array,
+    v: Array,
+    a: Array,
+    direction: Array,
+    load: Array | None = None,
+    rate: Array | None = None,
+    begins: Array | None = None,
+) -> DriveMotion:
+    """Return the motion and load of drives, arrays of shape (d, N): load and rate (N, n)."""
+    R = layout.drive_ratios
+    n = R.shape[1]
+    w = R @ v[:, v.shape[1] - n :].T
+    still = np.broadcast_to(0.0, w.shape)
+    share = R / np.sum(R**2, axis=1, keepdims=True).clip(min=1e-300)  # a drive's part of the load
+    return DriveMotion(
+        q=R @ q[:, q.shape[1] - n :].T,
+        v=w,
+        a=R @ a[:, a.shape[1] - n :].T,
+        direction=direction.T if direction.shape[1] else w,
+        load=still if load is None else share @ load.T,
+        rate=still if rate is None else share @ rate.T,
+        begins=begins,
+    )
+
+
+def instant_state(
+    layout: ParameterLayout, q: Array, v: Array, a: Array, direction: Array | None, load: Array
+) -> Array:
+    """Return the columns with internal state or load at independent samples, shape (N, m).
+
+    Internal states are at their steady value, and the torque is constant.
+    """
+    signs = friction_directions(layout, v, direction)
+    return remembered(layout, drive_motion(layout, q, v, a, signs, load))
+
+
+def remembered(layout: ParameterLayout, motion: DriveMotion) -> Array:
+    """Return the columns of drive parameters with internal state or load, shape (N, m)."""
+    own = [layout.drive_parameters[k] for k in layout.remembering]
+    return np.column_stack([term.column(motion.of(d)) for d, term in own])
+
+
+def friction_speeds(layout: ParameterLayout) -> Array:
+    """Return the speeds (c, n) whose sign is the direction of friction: joints, then couplings."""
+    ratios: Array = layout.drive_ratios / layout.drive_speeds[:, None]
+    return ratios if layout.follows_direction else ratios[:0]
+
+
+def sure_rows(layout: ParameterLayout, v: Array, least: float) -> Array:
+    """Return the rows in which the sign of friction is certain, shape (N, n_rows), bool."""
+    ratios = friction_speeds(layout)
+    first = v.shape[1] - ratios.shape[1]
+    slow = np.abs(v[:, first:] @ ratios.T) < least  # (N, c)
+    certain = np.ones(v.shape, dtype=bool)
+    certain[:, first:] = ~(slow @ (ratios != 0.0))
+    return certain
+
+
+def friction_directions(layout: ParameterLayout, v: Array, direction: Array | None) -> Array:
+    """Return the directions of friction, shape (N, c): those given, or the signs of the speeds."""
+    speeds = friction_speeds(layout)
+    if direction is None:
+        signs: Array = np.sign(v[:, v.shape[1] - speeds.shape[1] :] @ speeds.T)
+        return signs
+    wanted = (len(v), len(speeds))
+    if direction.shape != wanted:
+        raise DataError(
+            f"direction has shape {direction.shape}, wanted {wanted}: a column for each Coulomb "
+            "parameter of the model; process the log with the speeds of this model"
+        )
+    return direction
+
+
+class RowPlan(NamedTuple):
+    """The columns of a block of rows and their places, joint by joint."""
+
+    inertial: list[Array]  # per row its inertial columns, n arrays of shape (c_j,)
+    places: list[Array]  # per row their places in the block, likewise
+    drive_places: Array  # places of the E drive columns, shape (E,), int
+    drive_numbers: Array  # their drive parameters, shape (E,), int
+    ratios: Array  # their ratios, shape (E, 1)
+    torques: Array  # per row the place of the torque, the last one of the row, shape (n,), int
+    first: Array  # first place of each row, and the end, shape (n + 1,), int
+
+
+def plan_rows(layout: ParameterLayout, columns: Sequence[Array]) -> RowPlan:
+    """Return the plan of a block of rows: each row's columns in that order, then its torque."""
+    loads, size = layout.drive_loads, layout.n_inertial
+    base = len(columns) - len(loads)  # rows of a floating base, without drives
+    first = np.concatenate([[0], np.cumsum([len(row) + 1 for row in columns])])
+    inertial = [np.flatnonzero(row < size) for row in columns]
+    drives = [
+        (first[j] + k, g - size, loads[j - base, g - size])
+        for j, row in enumerate(columns)
+        for k, g in enumerate(row)
+        if g >= size
+    ]
+    places, numbers, ratios = np.array(drives).reshape(-1, 3).T
+    return RowPlan(
+        [row[k] for row, k in zip(columns, inertial, strict=True)],
+        [start + k for start, k in zip(first, inertial, strict=False)],
+        places.astype(int), numbers.astype(int), ratios[:, None], first[1:] - 1, first,
+    )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,7 +307,7 @@ class TrajectoryRows(RowSource):
         out = np.empty((plan.first[-1], length))
         motion = self.trajectory
         writer = (
-            CompiledWriter(self.model, self._tree, plan, out)
+            _CompiledWriter(self.model, self._tree, plan, out)
             if self.engine == COMPILED
             else _PinocchioWriter(self.model, plan, out, self.inertial)
         )
@@ -269,6 +421,54 @@ class _PinocchioWriter:
             out[places] = out[places] + values if is_added else values
 
 
+class _CompiledWriter:
+    """Writes blocks of rows into the same memory; one writer per thread."""
+
+    def __init__(self, model: RobotModel, tree: Tree, plan: RowPlan, out: Array) -> None:
+        self._model, self._tree, self._out = model, tree, out
+        self._places = _compiled_places(tree, plan)
+        self._ends = np.append(plan.drive_places, plan.torques)
+        self._plan, self._widths = plan, np.diff(plan.first)
+        self._root = np.zeros(out.shape[1])
+        self._work = tree.work_space()
+
+    def load(self, motion: Trajectory, part: slice, values: Array, weights: Array | None) -> None:
+        """Load the samples of the next blocks, and their drive columns: values (k, N)."""
+        q, v, a, tau = motion.q[part], motion.v[part], motion.a[part], motion.tau[part]
+        if self._model.free_flyer:  # the pose has one more entry than the twist
+            self._motion = own_motion(q[:, 1:], v, a, _base_state(self._model, q, v, a))
+        else:
+            self._motion = own_motion(q, v, a)
+        values = values[self._plan.drive_numbers]
+        if (self._plan.ratios != 1.0).any():
+            values *= self._plan.ratios
+        self._values = np.array(np.vstack([values, tau.T]), order="C")  # as of ``own_motion``
+        self._weights = np.zeros((0, 0)) if weights is None else np.array(weights, float, order="C")
+
+    def write(self, start: int, stop: int) -> None:
+        """Write the rows of samples start to stop of those loaded, at most k."""
+        lanes, span = row_lanes(), (start, stop)
+        lanes.inertial_rows(self._tree, self._places, self._motion, self._work, self._out, span)
+        lanes.finish_rows(
+            self._values, self._ends, self._widths, self._weights, self._root, self._out, span
+        )
+
+
+def _compiled_places(tree: Tree, plan: RowPlan) -> Array:
+    """Return the places of each body's columns in each of its rows, (B, D, 10); -1: none."""
+    table = np.full((len(plan.inertial), 10 * len(tree.parents)), -1)
+    for row, wanted, place in zip(table, plan.inertial, plan.places, strict=True):
+        row[wanted] = place
+    return tree.places(table)
+
+
+def _base_state(model: RobotModel, q: Array, v: Array, a: Array) -> Array:
+    """Return v, w, a - g, dw of the floating base in its own frame, shape (12, k)."""
+    g = model.pin_model.gravity.linear
+    gravity = in_base(q[:, 3:7], g)
+    return np.vstack([v[:, :6].T, (a[:, :3] - gravity).T, a[:, 3:6].T])
+
+
 def _as_slice(places: Array) -> Array | slice:
     """Return consecutive places as a slice, for which writing is faster."""
     if len(places) and (np.diff(places) == 1).all():
@@ -277,5 +477,5 @@ def _as_slice(places: Array) -> Array | slice:
 
 
 def _block_length(columns: int) -> int:
-    """Return the samples per block, a multiple of 64, such that it fits in the cache."""
-    return max(_LANES, min(BLOCK, _BLOCK_SIZE // columns // _LANES * _LANES))
+    """Return the samples per block, such that it fits in the cache."""
+    return max(_GROUP, min(BLOCK, BLOCK_SIZE // columns // _GROUP * _GROUP))

@@ -13,17 +13,23 @@ from robotid.base.exceptions import DataError
 from robotid.base.typing import Array
 from robotid.data.log import Trajectory
 from robotid.dynamics.constraint_rows import ProjectedRows, loop_basis, mixed_rows, without_forces
-from robotid.dynamics.drive_columns import drive_values, friction_directions, instant_state
 from robotid.dynamics.problem import Block, Problem, RowSource
-from robotid.dynamics.rows import BLOCK, inertial_columns, kept_rows, trajectory_rows
+from robotid.dynamics.rows import (
+    BLOCK,
+    BLOCK_SIZE,
+    drive_values,
+    friction_directions,
+    inertial_columns,
+    instant_state,
+    kept_rows,
+    trajectory_rows,
+)
 from robotid.robot.closure import Chains
 from robotid.robot.drive_term import DriveMotion
 from robotid.robot.drives import TERMS
 from robotid.robot.model import RobotModel
 
 _DECADES = 3.0  # of speeds, at random states of a robot with nonlinear friction
-_INSTANTS = 32  # samples whose whole regressors are in memory together
-_BLOCK_SIZE = 2**19  # numbers per block of W, 4 MiB
 
 
 def joint_torque_regressor(
@@ -177,7 +183,7 @@ def build_problem(
         source = ProjectedRows(own, trajectory.basis, weights)
         support = own.support.any(axis=0) & used
     samples = len(weights)
-    length = max(1, min(BLOCK, _BLOCK_SIZE // (model.n_rows * len(model.layout.names))))
+    length = max(1, min(BLOCK, BLOCK_SIZE // (model.n_rows * len(model.layout.names))))
 
     def stream() -> Iterator[Block]:
         m = trajectory

@@ -14,14 +14,16 @@ import numpy as np
 from robotid.base.exceptions import DataError
 from robotid.base.typing import Array
 from robotid.data.log import Log, Trajectory
-from robotid.data.measured_velocity import coarse_velocities, is_timely, unlike_velocities
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import process, standing_motion
+from robotid.data.units import coarse_velocities, is_timely, unlike_velocities
 from robotid.dynamics.base_parameters import BaseMapping
-from robotid.dynamics.drive_columns import friction_directions, friction_speeds, sure_rows
 from robotid.dynamics.problem import Problem
+from robotid.dynamics.rows import friction_directions, friction_speeds, sure_rows
 from robotid.dynamics.torque import build_problem, joint_torque_regressor
 from robotid.robot.model import RobotModel
+
+_log = logging.getLogger(__name__)
 
 _MOVES = 2e-3  # [rad/s] mean speed of a segment of a slow log from which its sign is certain
 _NEGLECTED = 0.02  # largest inertial torque that is neglected, over gravity's torque on a link
@@ -81,9 +83,6 @@ def independent_share(signals: SignalSettings) -> float:
     return min(1.0, 2.0 * signals.cutoff / signals.rate)
 
 
-_log = logging.getLogger(__name__)
-
-
 def prefers_measured(model: RobotModel, logs: Sequence[Log], settings: SignalSettings) -> bool:
     """Return whether velocity = "auto" uses the measured velocities of a log.
 
@@ -98,13 +97,13 @@ def prefers_measured(model: RobotModel, logs: Sequence[Log], settings: SignalSet
     if not is_known.any():
         return all(is_timely(log, settings.velocity_delay) for log in logs)
     ratio = float(np.median(errors[is_known, 1] / errors[is_known, 0]))
-    chosen = "measured" if ratio > _BETTER else "differentiated"
+    is_better = ratio > _BETTER
     _log.info(
         "%s: velocity = 'auto' uses %s velocities: the torque prediction error on held-out "
         "segments with differentiated velocities is %.2f times that with measured velocities",
-        logs[0].name, chosen, ratio,
+        logs[0].name, "measured" if is_better else "differentiated", ratio,
     )  # fmt: skip
-    return ratio > _BETTER
+    return is_better
 
 
 def _errors(model: RobotModel, log: Log, settings: SignalSettings) -> Array:
@@ -112,22 +111,17 @@ def _errors(model: RobotModel, log: Log, settings: SignalSettings) -> Array:
 
     NaN for a joint with too little motion or without torque.
     """
-    found = np.full((2, len(model.joints)), np.nan)
+    unknown = np.full((len(model.joints), 2), np.nan)
     if not log.has_torque or model.free_flyer or model.constraints:
-        return found.T
-    motions = []
-    for velocity in ("measured", "differentiated"):
-        chosen = replace(settings, velocity=velocity)
-        try:
-            motions.append(process(log, chosen, friction_speeds(model.layout)))
-        except DataError:  # too short: the error is raised again when the log is read
-            return found.T
-    masks = [row_mask(model, motion, settings.min_velocity) for motion in motions]
-    mask = masks[0] & masks[1]
+        return unknown
+    sources = [replace(settings, velocity=x) for x in ("measured", "differentiated")]
+    try:
+        motions = [process(log, chosen, friction_speeds(model.layout)) for chosen in sources]
+    except DataError:  # too short: the error is raised again when the log is read
+        return unknown
+    mask = np.all([row_mask(model, x, settings.min_velocity) for x in motions], axis=0)
     every = -(-len(mask) // _ROWS)
-    for errors, motion in zip(found, motions, strict=True):
-        errors[:] = _held_out_error(model, motion, mask, every)
-    return found.T
+    return np.stack([_held_out_error(model, x, mask, every) for x in motions], axis=1)
 
 
 def _held_out_error(model: RobotModel, motion: Trajectory, mask: Array, every: int) -> Array:

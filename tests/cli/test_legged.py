@@ -7,8 +7,7 @@ import pytest
 from helpers.stands import stand
 
 from robotid.cli import main
-from robotid.data.files.formats import write_columns
-from robotid.data.files.read import read_log
+from robotid.data.files.read import read_log, write_columns
 from robotid.robot.constraints import Contact
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from robotid.dynamics.drive_columns import drive_motion, friction_speeds, sure_rows
+from robotid.dynamics.rows import drive_motion, friction_speeds, sure_rows
 from robotid.robot.parameters import Coupling, ParameterLayout
 
 RATIOS = np.array([[1.0, 0, 0], [0, 1, 0], [0, 0, 1], [2.0, 0, -0.5]])  # drives over joints

@@ -4,7 +4,7 @@ import pytest
 
 from robotid.base.exceptions import DataError
 from robotid.data.log import Trajectory
-from robotid.data.transmission import Transmission
+from robotid.data.signal_settings import Transmission
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.problem import Sample, concatenate, shuffled
 from robotid.dynamics.simulation.truth import another_robot

@@ -16,8 +16,7 @@ from robotid.base.exceptions import DataError, SettingsError
 from robotid.base.findings import listed, quoted, toml_key
 from robotid.base.settings import is_number
 from robotid.data.log import repeated, suggestion
-from robotid.data.signal_settings import LogSource
-from robotid.data.transmission import Transmission
+from robotid.data.signal_settings import LogSource, Transmission
 from robotid.robot.tree import Joint
 
 _QUANTITIES = {

@@ -8,8 +8,7 @@ import numpy as np
 from robotid.base.exceptions import RobotIdError
 from robotid.base.findings import Finding, toml_key
 from robotid.base.typing import Array
-from robotid.data.alike_motions import REPEATED, repeated_share
-from robotid.data.log import Trajectory
+from robotid.data.log import REPEATED, Trajectory, repeated_share
 from robotid.data.signal_settings import LogUnits, SignalSettings
 from robotid.diagnosis.catalogue import finding
 from robotid.dynamics.base_parameters import BaseMapping

@@ -9,7 +9,7 @@ from robotid.base.typing import Array
 from robotid.data.log import Log, Trajectory
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import process, resolve, unwrap
-from robotid.dynamics.drive_columns import drive_values, friction_directions, friction_speeds
+from robotid.dynamics.rows import drive_values, friction_directions, friction_speeds
 from robotid.dynamics.torque import carried_columns
 from robotid.robot.model import RobotModel
 

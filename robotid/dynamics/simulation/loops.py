@@ -29,7 +29,7 @@ from robotid.robot.model import RobotModel
 if TYPE_CHECKING:
     from robotid.dynamics.simulation.loop_lanes import Course
 
-#: Kind, joint and index of a parameter of the sensitivities; see ``law_lanes``.
+#: Kind, joint and index of a parameter of the sensitivities; see ``loop_lanes``.
 Column: TypeAlias = tuple[int, int, int]
 
 _KINDS = ("armature", "kp", "kd", "limit", "term", "delay", "zero", "body", "start", "speed")
@@ -177,7 +177,7 @@ class _Part(NamedTuple):
 class ClosedLoopRobot:
     """Simulator of a robot with closed-loop drives."""
 
-    #: Numbers of the kinds of sensitivities, by name, as of ``law_lanes``.
+    #: Numbers of the kinds of sensitivities, by name, as of ``loop_lanes``.
     kinds: ClassVar[dict[str, int]] = {name: k for k, name in enumerate(_KINDS)}
 
     def __init__(self, model: RobotModel, *, step: float = 2e-3, corrects: bool = False) -> None:
@@ -222,7 +222,7 @@ class ClosedLoopRobot:
         numbers = np.arange(len(kinds)) if owners is None else np.array(owners, dtype=np.int64)
         wanted = np.column_stack([kinds, numbers])[np.argsort(numbers, kind="stable")]
         along = np.zeros((0, 10)) if directions is None else np.array(directions, order="C")
-        size, outputs = _lanes()[0].LANES, 2 if with_speeds else 1
+        size, outputs = _lanes().LANES, 2 if with_speeds else 1
         blocks = [windows[k : k + size] for k in range(0, len(windows), size)]
         pieces = [(part, block) for block in blocks for part in self._parts]
         done = in_order(lambda p: self._block(p[0], p[1], loops, wanted, along, outputs), pieces)
@@ -253,7 +253,7 @@ class ClosedLoopRobot:
 
         ``wanted`` has a row for each column: kind, joint, index, and index of the sensitivity.
         """
-        (lanes, laws), own, n = _lanes(), part.joints, len(part.joints)
+        lanes, own, n = _lanes(), part.joints, len(part.joints)
         columns = wanted[np.isin(wanted[:, 1], own)]
         numbers, first = np.unique(columns[:, 3], return_index=True)
         sums = np.append(first, len(columns)).astype(np.int64)
@@ -262,13 +262,14 @@ class ClosedLoopRobot:
         places, spans, affine = _arranged(loops, own)
         is_term = columns[:, 0] == self.kinds["term"]
         columns[is_term, 2] = [np.flatnonzero(places == k)[0] for k in columns[is_term, 2]]
-        every_term = [term for terms in loops.terms for term in terms]
-        coded = [laws.coded_term(every_term[k]) for k in places]
+        every_term = [(term, j) for j, terms in enumerate(loops.terms) for term in terms]
+        coded = [lanes.coded_term(every_term[k][0]) for k in places]
         codes = np.array([code for code, _ in coded], dtype=np.int64).reshape(-1, 5)
         shapes = np.array([numbers for _, numbers in coded]).reshape(-1, 11)
-        has_state = codes[:, 2] == BRISTLES
-        shapes[has_state, 3] = np.arange(has_state.sum())
-        terms = lanes.Terms(codes, shapes, loops.values[places], spans)
+        of_joint = np.array([np.flatnonzero(own == every_term[k][1])[0] for k in places], dtype=int)
+        states = np.flatnonzero(codes[:, 2] == BRISTLES)
+        bristles = np.column_stack([states, of_joint[states]])
+        terms = lanes.Terms(codes, shapes, loops.values[places], spans, bristles)
         drives = np.column_stack(
             [x[own] for x in (loops.armature, loops.kp, loops.kd, loops.limit)] + [affine]
         )
@@ -278,7 +279,7 @@ class ClosedLoopRobot:
         q, v = np.zeros((2, samples, n, lanes.LANES))
         S = np.zeros((samples, outputs * n, len(numbers), lanes.LANES))
         q[0], v[0] = course.start
-        work = lanes.work_of(n, len(numbers), int(has_state.sum()))
+        work = lanes.work_of(n, len(numbers), len(states))
         kinds, motion = lanes.Columns(columns, sums, along), lanes.Motion(q, v, S)
         failed = lanes.roll_out(robot, kinds, course, motion, work, self.corrects)
         if failed >= 0 or not (np.abs(v) < _FASTEST).all():
@@ -292,7 +293,7 @@ class ClosedLoopRobot:
 
     def _course(self, part: _Part, windows: Sequence[Window], loops: Loops) -> "Course":
         """Return the commands of a part's joints in a block of windows."""
-        lanes, laws = _lanes()
+        lanes = _lanes()
         samples = max(window.stop - window.start_row for window in windows)
         grids = [_Grid.of(window, samples, loops.rate) for window in windows]
         every = max(grid.least_steps(self.step, loops.rate) for grid in grids)
@@ -317,7 +318,7 @@ class ClosedLoopRobot:
                     continue
                 for i, j in enumerate(part.joints):
                     x = values[:, j].copy()  # contiguous and writable: else Numba compiles again
-                    laws.average_command(log.t, x, edges, loops.delay[j], mean, change)
+                    lanes.average_command(log.t, x, edges, loops.delay[j], mean, change)
                     command[:, i, k, own] = mean[of_step, None]
                     command[:, i, by_delay, own] = change[of_step, None]
         course: Course = lanes.Course(command, steps, ticks, every, start)
@@ -366,7 +367,7 @@ class _Grid:
         """Return the ends of all steps, and which steps start with a tick."""
         size = (len(self.stamps) - 1) * every
         times, is_tick = np.empty(size + 1), np.empty(size, dtype=bool)
-        _lanes()[1].divide_rows(self.stamps, self.ticks, times, is_tick)
+        _lanes().divide_rows(self.stamps, self.ticks, times, is_tick)
         return times, is_tick
 
 
@@ -382,9 +383,8 @@ def _parts(tree: Tree) -> list[_Part]:
 def _arranged(loops: Loops, joints: Array) -> tuple[Array, Array, Array]:
     """Return the indices in ``loops.values`` of the terms of joints, joint by joint.
 
-    Also, for each joint, the index of its first term, of its first bristle or affine term, and of
-    its end, shape (n, 3); and the sums of its affine terms: constant, by the speed, and by its
-    direction, shape (n, 3).
+    Also, for each joint, the index of its first term, and of its first bristle or affine term,
+    (n, 2); and the sums of its affine terms: constant, by the speed, by its direction, (n, 3).
     """
     first = np.cumsum([0, *map(len, loops.terms)])
     places, spans, affine = list[int](), [], np.zeros((len(joints), 3))
@@ -396,17 +396,16 @@ def _arranged(loops: Loops, joints: Array) -> tuple[Array, Array, Array]:
                 rest.append(k)
             else:
                 (rest if isinstance(term, Bristles) else others).append(k)
-        middle = len(places) + len(others)
-        spans.append([len(places), middle, middle + len(rest)])
+        spans.append([len(places), len(places) + len(others)])
         places += [*others, *rest]
     return np.array(places, dtype=int), np.array(spans, dtype=np.int64), affine
 
 
-def _lanes() -> tuple[ModuleType, ModuleType]:
-    """Return the compiled code of roll-outs and of laws, which imports Numba."""
-    from robotid.dynamics.simulation import law_lanes, loop_lanes
+def _lanes() -> ModuleType:
+    """Return the compiled code of roll-outs, which imports Numba."""
+    from robotid.dynamics.simulation import loop_lanes
 
-    return loop_lanes, law_lanes
+    return loop_lanes
 
 
 def _failed_at(
