@@ -1,4 +1,4 @@
-"""Reference motions: Fourier series, quintics from rest to rest, samples, legged robots."""
+"""Reference motions: Fourier series, quintics from rest to rest, samples."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -8,7 +8,6 @@ import numpy as np
 
 from robotid.base.exceptions import DataError, SettingsError
 from robotid.base.typing import Array
-from robotid.data.base_motion import in_base, vector_part
 from robotid.robot.model import RobotModel
 
 _ORDER = 5  # of the polynomials through samples
@@ -126,52 +125,6 @@ class SampledMotion(Motion):
     def evaluate(self, t: Array) -> tuple[Array, Array, Array]:
         q, v, a = (curve(t) for curve in self._curves)
         return q, v, a
-
-
-@dataclass(frozen=True, eq=False)
-class FloatingMotion(Motion):
-    """A motion of a robot whose base floats: splines through poses and joint positions."""
-
-    t: Array  # times, shape (N,) [s]
-    pose: Array  # pose of the base, as of ``BaseMotion``, shape (N, 7) [m, -]
-    q: Array  # joint positions, shape (N, n) [rad or m]
-    # which contacts touch the ground, shape (N, k), bool; each until the next sample
-    contacts: Array
-
-    @cached_property
-    def _samples(self) -> SampledMotion:
-        return SampledMotion(self.t, np.hstack([self.pose, self.q]))
-
-    @property
-    def duration(self) -> float:
-        """Duration [s]."""
-        return self._samples.duration
-
-    def touching(self, t: Array) -> Array:
-        """Return which contacts touch the ground, shape (N, k), bool: t (N,) [s]."""
-        rows = np.searchsorted(self.t - self.t[0], t + 1e-9, side="right") - 1
-        flags: Array = self.contacts[np.clip(rows, 0, len(self.t) - 1)]
-        return flags
-
-    def evaluate(self, t: Array) -> tuple[Array, Array, Array]:
-        """Return q (N, 7 + n), v (N, 6 + n) and a (N, 6 + n), the twist with the axes of the base.
-
-        With the unit quaternion p / |p| of the spline p, w = 2 p* dp/dt / |p|^2 (vector part).
-        """
-        x, rate, change = self._samples.evaluate(t)
-        p, dp, ddp = x[:, 3:7], rate[:, 3:7], change[:, 3:7]
-        square = np.sum(p**2, axis=1, keepdims=True)
-        unit = p / np.sqrt(square)
-        w = 2.0 * vector_part(p, dp) / square
-        alpha = 2.0 * vector_part(p, ddp) / square
-        alpha -= 2.0 * np.sum(p * dp, axis=1, keepdims=True) / square * w
-        v = in_base(unit, rate[:, :3])
-        a = in_base(unit, change[:, :3]) - np.cross(w, v)
-        return (
-            np.hstack([x[:, :3], unit, x[:, 7:]]),
-            np.hstack([v, w, rate[:, 7:]]),
-            np.hstack([a, alpha, change[:, 7:]]),
-        )
 
 
 def random_fourier(

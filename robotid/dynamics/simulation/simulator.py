@@ -1,4 +1,4 @@
-"""The simulated robot: a plant by Pinocchio's forward dynamics, a controller, and its log."""
+"""The simulated robot: a plant by Pinocchio's forward dynamics, a controller, sensors, its log."""
 
 import math
 from collections.abc import Callable, Iterator
@@ -11,13 +11,14 @@ from robotid.base.exceptions import DataError, NotConvergedError, SettingsError
 from robotid.base.typing import Array, ProgressCallback, ignore_progress
 from robotid.data.log import Log, Trajectory
 from robotid.dynamics.prediction import predict, remember
-from robotid.dynamics.simulation.motions import FloatingMotion, Motion
-from robotid.dynamics.simulation.sensors import Run, measure, supported
+from robotid.dynamics.simulation.motions import Motion
 from robotid.dynamics.simulation.simulation_settings import (
     Actuator,
     Controller,
     Noise,
     Payload,
+    PerJoint,
+    Sensors,
     Simulation,
     by_joint,
 )
@@ -33,6 +34,7 @@ _ELASTIC_STEP = 0.3  # largest step, relative to 1 / w of the fastest elastic ge
 _SHORTEST_STEP = 1e-6  # smallest step of the integration; a stiffer gear is refused [s]
 _MOST = 2e7  # largest number of steps of a simulation: half an hour ...
 _MOST_EACH = 100_000  # ... and between two samples
+_TICK = 1e-6  # smallest step between time stamps [s]
 _CHUNK = 1024  # number of steps for which a motion is evaluated together
 _LEAST_INERTIA = 0.02  # smallest inertia in the computation of PD gains [kg m^2 or kg]
 _ITERATIONS = 200  # of the fixed point of load and load-dependent friction
@@ -52,6 +54,19 @@ _BELOW[2, :2] = -9.0338057013044082e-01, 5.4180672388095326e-02
 _BELOW[3, :3] = 2.4212380706095346e-01, -1.2232505839045147e00, 5.4526025533510214e-01
 _WEIGHTS = np.array([*_BELOW[3, :2], 1.5452602553351020e00, _GAMMA])
 _STAGES = _ALPHA.sum(axis=1)  # times of the stages [steps]
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """The exact motion of a robot; arrays of shape (N, n)."""
+
+    t: Array  # shape (N,) [s]
+    q: Array  # [rad or m]
+    v: Array  # [rad/s or m/s]
+    a: Array  # [rad/s^2 or m/s^2]
+    tau: Array  # [N m or N]
+    reference: Array  # reference position [rad or m]
+    saturated: Array  # share of the time at the torque limit of each drive, shape (n,) [-]
 
 
 def simulate(
@@ -96,15 +111,9 @@ def follow(
     t = np.arange(round(duration * rate) + 1) / rate
     loaded = carried(model, pi, settings.payload)
     deflection = settings.payload.start if settings.payload.mass > 0 else math.inf
-    if not model.free_flyer:
-        model.require_fixed("simulation")
+    model.require_fixed("simulation")
     if settings.controller.kind == "perfect":
         return _perfect(model, pi, loaded, motion, t, deflection)
-    if model.free_flyer:
-        raise SettingsError(
-            f"controller: kind is {settings.controller.kind}, wanted perfect: a robot whose base "
-            "floats tracks the motion exactly. State --controller perfect"
-        )
     loops = [_Loop(model, x, settings) for x in (pi, loaded)]
     steps = max(1, math.ceil(1.0 / rate / min(loop.longest_step for loop in loops) - 1e-9))
     _check_size(len(t), steps)
@@ -197,12 +206,7 @@ def _perfect(
         robot = model.with_reference(x)
         torques += predict(robot, [x], remember(robot, rows))
     tau = np.where((t >= deflection)[:, None], torques[-1], torques[0])
-    n = len(model.joints)
-    if isinstance(motion, FloatingMotion):
-        tau, stand = supported(model, motion, t, (q, v, a), tau)
-        q, v, a = (x[:, x.shape[1] - n :] for x in (q, v, a))
-        return Run(t, q, v, a, tau, q, np.zeros(n), stand)
-    return Run(t, q, v, a, tau, q, np.zeros(n))
+    return Run(t, q, v, a, tau, q, np.zeros(len(model.joints)))
 
 
 def delay(model: RobotModel, pi: Array, settings: Simulation) -> Array:
@@ -253,8 +257,6 @@ class RobotPlant:
     """
 
     def __init__(self, model: RobotModel, pi: Array) -> None:
-        if model.free_flyer:
-            raise DataError("the base floats; forward dynamics need a robot with a fixed base")
         model.require_fixed("simulation")
         if pi.shape != (len(model.layout.names),):
             raise DataError(f"pi has shape {pi.shape}, wanted ({len(model.layout.names)},)")
@@ -631,3 +633,73 @@ def _limits(model: RobotModel, actuator: Actuator) -> Array:
     share = actuator.effort
     urdf = [share * j.effort if share and j.effort > 0 else np.inf for j in model.limits]
     return np.where(np.isnan(stated), urdf, stated)
+
+
+def measure(
+    run: Run,
+    sensors: Sensors,
+    joints: tuple[str, ...],
+    rng: np.random.Generator,
+    *,
+    delay: Array | float = 0.0,
+) -> Log:
+    """Return the log of a robot's motion by sensors, its torques with a delay (n,) [s].
+
+    Delay, noise and rounding are applied in this order. Jitter changes only the time stamps.
+    """
+
+    def of(value: PerJoint, name: str) -> Array:
+        return by_joint(value, joints, f"sensors: {name}")
+
+    noise, step, n = sensors.noise, sensors.step, len(joints)
+    v = _delayed(run.t, run.v, np.full(n, sensors.velocity_delay))
+    tau = _delayed(run.t, run.tau, sensors.torque_delay + delay * np.ones(n))
+    share = of(noise.tau, "noise.tau") * np.sqrt(np.mean(tau**2, axis=0))
+    level = np.hypot(share, of(noise.torque, "noise.torque"))
+    q = _noisy(run.q, of(noise.q, "noise.q"), rng)
+    v = _noisy(v, of(noise.v, "noise.v"), rng)
+    signals = {"q": q, "v": v, "tau": _noisy(tau, level, rng)}
+    q, v, tau = (_rounded(x, of(getattr(step, k), f"step.{k}")) for k, x in signals.items())
+    logged = np.ones(len(run.t), dtype=bool)
+    if sensors.dropped:
+        logged = rng.random(len(logged)) >= sensors.dropped
+        if logged.sum() < 2:
+            raise DataError(
+                f"{logged.sum()} of {len(logged)} samples remain, wanted at least 2. Set a smaller "
+                "dropped, or a longer duration"
+            )
+    t = run.t
+    if sensors.jitter:
+        spread = _TICK * np.arange(len(t))
+        t = t + sensors.jitter * rng.standard_normal(len(t))
+        t = np.maximum.accumulate(t - spread) + spread
+    return Log(
+        t=t[logged],
+        q=q[logged],
+        v=v[logged] if sensors.velocity else None,
+        a=run.a[logged] if sensors.acceleration else None,
+        tau=tau[logged],
+        joints=joints,
+    )
+
+
+def _delayed(t: Array, values: Array, delay: Array) -> Array:
+    """Return values delayed by joint; before the start, the first values."""
+    if not delay.any():
+        return values
+    columns = [np.interp(t - d, t, x) for d, x in zip(delay, values.T, strict=True)]
+    return np.column_stack(columns)
+
+
+def _noisy(values: Array, level: Array, rng: np.random.Generator) -> Array:
+    """Return values with white noise, its standard deviation given by joint."""
+    if not level.any():
+        return values
+    noisy: Array = values + level * rng.standard_normal(values.shape)
+    return noisy
+
+
+def _rounded(values: Array, step: Array) -> Array:
+    """Return values rounded to steps, for the joints that have one."""
+    size = np.where(step > 0, step, 1.0)
+    return np.where(step > 0, np.round(values / size) * size, values)

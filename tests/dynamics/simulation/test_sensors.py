@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from robotid.base.exceptions import DataError, SettingsError
-from robotid.dynamics.simulation.sensors import Run, measure
 from robotid.dynamics.simulation.simulation_settings import Noise, Sensors, Steps
+from robotid.dynamics.simulation.simulator import Run, measure
 
 JOINTS = ("a", "b")
 N = 4000

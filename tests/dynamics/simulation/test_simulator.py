@@ -15,7 +15,9 @@ from robotid.dynamics.simulation.simulation_settings import (
 from robotid.dynamics.simulation.simulator import carried, follow, simulate
 from robotid.dynamics.simulation.truth import draw_parameters
 from robotid.dynamics.torque import joint_torque_regressor
+from robotid.robot.constraints import Contact
 from robotid.robot.drives import Lag, LoadFriction, Presliding
+from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import Coupling
 
@@ -161,6 +163,20 @@ def test_gains_rates_and_durations_beyond_reason_are_told(ur5):
         )
         with pytest.raises(SettingsError, match=words):
             followed(ur5, truth(ur5), Simulation(), rate=rate, duration=duration)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"free_flyer": True}, "base floats"),
+        ({"constraints": [Contact("FL_FOOT")]}, "has contacts"),
+    ],
+)
+@pytest.mark.parametrize("kind", ["perfect", "pd"])
+def test_only_robots_with_a_fixed_base_are_simulated(options, words, kind):
+    model = RobotModel.from_urdf(example_urdf("solo12.urdf"), **options)
+    with pytest.raises(DataError, match=f"{words}.*; simulation needs a robot with a fixed base"):
+        followed(model, model.standard_parameters(), Simulation(controller=Controller(kind)))
 
 
 def test_a_payload_adds_what_pinocchio_says_of_its_body(ur5):
