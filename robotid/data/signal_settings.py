@@ -309,8 +309,7 @@ class Transmission(Settings):
     @property
     def to_torque(self) -> Array:
         """Matrix from motor torques to joint torques, T^T diag(efficiency), shape (n, n)."""
-        matrix: Array = self.T.T * (self.efficiency or 1.0)
-        return matrix
+        return self.T.T * (self.efficiency or 1.0)
 
     @property
     def shared(self) -> dict[str, tuple[tuple[str, float], ...]]:

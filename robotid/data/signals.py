@@ -420,8 +420,7 @@ class _Grid:
 
     def at(self, numbers: Array) -> Array:
         """Return the times of some points."""
-        times: Array = self.start + (self.step or 0.0) * numbers
-        return times
+        return self.start + (self.step or 0.0) * numbers
 
     def number_of(self, t: float) -> int:
         """Return the first point that is not before t."""
@@ -439,8 +438,7 @@ class _Grid:
 def _acting(t: Array, w: Array, settings: SignalSettings) -> Array:
     """Return the direction of Coulomb friction, before any filter."""
     if settings.friction_band > 0:
-        linear: Array = np.clip(w / settings.friction_band, -1.0, 1.0)
-        return linear
+        return np.clip(w / settings.friction_band, -1.0, 1.0)
     longest = _LONGEST / (settings.cutoff or np.inf)
     return acting_directions(t, w, settings.min_velocity, longest)
 
@@ -452,8 +450,7 @@ def _resample(t: Array, values: Array, grid: Array) -> Array:
     from scipy.interpolate import CubicSpline  # takes long to import
 
     # a channel with a delay is constant beyond its ends
-    smooth: Array = CubicSpline(t, values)(np.clip(grid, t[0], t[-1]))
-    return smooth
+    return np.asarray(CubicSpline(t, values)(np.clip(grid, t[0], t[-1])))
 
 
 def acting_directions(t: Array, w: Array, band: float, longest: float) -> Array:
@@ -559,8 +556,7 @@ def _blocks(t: Array, max_gap: float) -> tuple[Array, Array]:
 
 def _means(values: Array, first: Array, total: Array) -> Array:
     """Return sums of the rows of each block, over the totals."""
-    means: Array = (np.add.reduceat(values, first).T / total).T
-    return means
+    return (np.add.reduceat(values, first).T / total).T
 
 
 # The filters equal sosfiltfilt and savgol_filter of scipy.signal, whose import takes longer than

@@ -204,7 +204,7 @@ def _velocity_factor(log: Log) -> Array:
     ))  # fmt: skip
     follows = np.abs(both) > _ALIKE * np.sqrt(squares[0] * squares[1])
     factor = np.sqrt(squares[1] / np.where(follows, squares[0], np.nan))
-    return np.copysign(factor, both)
+    return np.asarray(np.copysign(factor, both))
 
 
 def _displacements(log: Log, v: Array) -> tuple[Array, Array]:
@@ -360,5 +360,4 @@ def _distances(slope: Array, v: Array, longest: int) -> Array:
     lag = of_v[n] - of_v[k] + of_slope[n - k]  # squares of the rows compared at a lag of k
     lead = of_v[n - k] + of_slope[n] - of_slope[k]
     squares = np.concatenate([lead[:0:-1], lag])
-    distances: Array = (squares - 2 * products) / (n - np.abs(np.arange(-longest, longest + 1)))
-    return distances
+    return np.asarray((squares - 2 * products) / (n - np.abs(np.arange(-longest, longest + 1))))

@@ -75,8 +75,7 @@ class BaseMapping:
         s = np.ones(self.K.shape[1]) if spread is None else spread
         # K S = (Q R)^T, so that S (K S)^+ = S Q R^-T has no loss of digits
         Q, R = scipy.linalg.qr((self.K * s).T, mode="economic")
-        gain: Array = s[:, None] * scipy.linalg.solve_triangular(R, Q.T).T
-        return gain
+        return np.asarray(s[:, None] * scipy.linalg.solve_triangular(R, Q.T).T)
 
     def reduce(self, problem: Problem) -> Problem:
         """Return the problem in the b base parameters, W_b beta = tau."""

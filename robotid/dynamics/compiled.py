@@ -59,7 +59,7 @@ class Tree(NamedTuple):
     @property
     def prismatic(self) -> Array:
         """Which joints are prismatic, shape (B,), bool."""
-        return np.any(self.joints[:, 33:36], axis=1)
+        return np.asarray(np.any(self.joints[:, 33:36], axis=1))
 
     @property
     def axes(self) -> Array:

@@ -290,8 +290,7 @@ def _noise_of_groups(J: Array, b: Array, size: float) -> Array:
         variance = np.maximum(variance, _NEGLIGIBLE * variance.max()) + _TINY
         if np.abs(np.log(variance / before)).max() < _SETTLED:
             break
-    sigma: Array = np.sqrt(variance @ member)
-    return sigma
+    return np.asarray(np.sqrt(variance @ member))
 
 
 def _probabilities(force: Array, heights: Array | None, velocity: Array, feet: int) -> Array:
@@ -299,8 +298,7 @@ def _probabilities(force: Array, heights: Array | None, velocity: Array, feet: i
     p = (force > _LOAD / feet).astype(float)
     for _ in range(_ROUNDS):
         if min(p.sum(), (1.0 - p).sum()) < _SOME:  # all or none touch: the force alone decides
-            alone: Array = expit((force - 0.25 * _LOAD / feet) / _NARROW[0])
-            return alone
+            return np.asarray(expit((force - 0.25 * _LOAD / feet) / _NARROW[0]))
         moving = velocity
         if heights is None:
             ground = np.einsum("ki,kij->kj", p, velocity) / (p.sum(axis=1)[:, None] + 1e-9)
@@ -324,8 +322,7 @@ def _evidence(x: Array, p: Array, narrow: float, off: float | None) -> Array:
         b = min(b, _spread(x - off, 1.0 - p))
     b = max(float(b), narrow)
     y = np.clip(x, min(on, off), max(on, off))  # values beyond both are no further evidence
-    ratio: Array = (((y - off) / b) ** 2 - ((y - on) / a) ** 2) / 2 - np.log(a / b)
-    return ratio
+    return np.asarray((((y - off) / b) ** 2 - ((y - on) / a) ** 2) / 2 - np.log(a / b))
 
 
 def _spread(x: Array, weights: Array) -> float:

@@ -390,7 +390,7 @@ def _fold_sources(
         for part in _folded(source, _PART, _PART, threads):
             for triangle, place, R_j in zip(triangles, places, part, strict=True):
                 triangle.fold_triangle(R_j, place)
-    return np.sum([source.rows(0, source.samples) for source in sources], axis=0)
+    return np.asarray(np.sum([source.rows(0, source.samples) for source in sources], axis=0))
 
 
 def _places(source: RowSource, columns: Sequence[Array]) -> list[Array]:

@@ -63,15 +63,13 @@ class DriveMoments:
         """Return the linear map from a drive's parameters to those of its projection."""
         root = self._root()
         Y, X = (root[:, [self.terms.index(name) for name in names]] for names in (onto, own))
-        T: Array = np.linalg.lstsq(Y, X, rcond=None)[0]
-        return T
+        return np.linalg.lstsq(Y, X, rcond=None)[0]
 
     def _root(self) -> Array:
         """Return M with M^T M the products, shape (k, k)."""
         values, vectors = np.linalg.eigh(self.products)
         floor = _ROUNDING * max(float(values[-1]), 0.0)
-        root: Array = np.sqrt(np.where(values > floor, values, 0.0))[:, None] * vectors.T
-        return root
+        return np.asarray(np.sqrt(np.where(values > floor, values, 0.0))[:, None] * vectors.T)
 
     def rms(self, x: Mapping[str, float]) -> float:
         """Return the RMS torque of a sum of terms over the rows [N m or N]."""

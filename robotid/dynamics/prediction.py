@@ -200,8 +200,7 @@ def inverse_dynamics(model: RobotModel, pi: Array, trajectory: Trajectory) -> Ar
 def drive_torque(model: RobotModel, pi: Array, trajectory: Trajectory) -> Array:
     """Return the torque of the drives' terms, shape (N, n) [N m, N]: pi (p,)."""
     layout, theta = model.layout, pi[model.layout.n_inertial :]
-    torque: Array = trajectory_values(layout, trajectory).T @ (layout.drive_loads * theta).T
-    return torque
+    return np.asarray(trajectory_values(layout, trajectory).T @ (layout.drive_loads * theta).T)
 
 
 def body_slopes(model: RobotModel, pi: Array, trajectory: Trajectory) -> TorqueSlopes:
@@ -364,8 +363,7 @@ def _load_torque(model: RobotModel, trajectory: Trajectory) -> Array:
         bodies[: len(pi)] = pi
         (load,) = predict(plain, [bodies], trajectory)
         trajectory.derived["load torque"] = known = model.pin_model, pi, load
-    torque: Array = known[2]
-    return torque
+    return known[2]
 
 
 def _drive_motion(model: RobotModel, trajectory: Trajectory, has_rate: bool) -> DriveMotion:

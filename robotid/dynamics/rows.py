@@ -161,8 +161,7 @@ def friction_directions(layout: ParameterLayout, v: Array, direction: Array | No
     """Return the directions of friction, shape (N, c): those given, or the signs of the speeds."""
     speeds = friction_speeds(layout)
     if direction is None:
-        signs: Array = np.sign(v[:, v.shape[1] - speeds.shape[1] :] @ speeds.T)
-        return signs
+        return np.asarray(np.sign(v[:, v.shape[1] - speeds.shape[1] :] @ speeds.T))
     wanted = (len(v), len(speeds))
     if direction.shape != wanted:
         raise DataError(

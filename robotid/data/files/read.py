@@ -275,8 +275,7 @@ class LogLayout:
             for joint, own in zip(self.joints, is_angle, strict=True)
         ]
         first, scale = np.array(scales).T
-        si: Array = first + scale * values if kind in ("q", "qref") else scale * values
-        return si
+        return np.asarray(first + scale * values if kind in ("q", "qref") else scale * values)
 
     def _of_joints(self, kind: str, values: Array) -> Array:
         """Return values of joints; those of motors are converted by their transmission."""

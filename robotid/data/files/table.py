@@ -282,8 +282,7 @@ def with_even_stamps(table: Table, column: str, stamp: str = "even") -> Table:
 
     def stamps(row: int, t: Array) -> Array:
         start, step = line()
-        even: Array = start + step * np.arange(row, row + len(t))
-        return even
+        return start + step * np.arange(row, row + len(t))
 
     return table.with_columns({column: Column((column,), stamps)}, table.names)
 

@@ -107,8 +107,7 @@ class Window:
     @property
     def around(self) -> Array:
         """Mean position about the first sample, shape (n,): that of a joint at rest."""
-        mean: Array = self.log.q[self._near].mean(axis=0)
-        return mean
+        return np.asarray(self.log.q[self._near].mean(axis=0))
 
     @property
     def _near(self) -> slice:
@@ -497,5 +496,4 @@ def _mass_matrix(model: RobotModel, loops: Loops, joints: Array, q: Array) -> Ar
     bodies, every = model.with_parameters(pi), loops.zero.copy()
     every[joints] += q
     (M,) = rigid_mass_matrices(bodies, bodies.configurations(every[None]))
-    mass: Array = (M + np.diag(loops.armature))[np.ix_(joints, joints)]
-    return mass
+    return np.asarray((M + np.diag(loops.armature))[np.ix_(joints, joints)])

@@ -293,8 +293,7 @@ class RobotPlant:
     def bodies_torque(self, q: Array, v: Array, a: Array) -> Array:
         """Return the inverse dynamics of the bodies alone, shape (n,) [N m or N]."""
         G, x = self.model.velocity_map, self._configuration(q)
-        rigid: Array = G.T @ pin.rnea(self._bodies.pin_model, self._data, x, G @ v, G @ a)
-        return rigid
+        return np.asarray(G.T @ pin.rnea(self._bodies.pin_model, self._data, x, G @ v, G @ a))
 
     def friction(self, q: Array, v: Array, z: Array | None = None) -> Friction:
         """Return the friction of the drives, without inertia and the sign of the speed."""
@@ -317,15 +316,13 @@ class RobotPlant:
     def friction_torque(self, F: Friction, v: Array, load: Array) -> Array:
         """Return the friction torque of the drives under a load (n,), shape (n,) [N m or N]."""
         sign = np.tanh(self.ratios @ v / _SIGN_SPEED)
-        torque: Array = self.ratios.T @ (self._along(F, load) * sign + F.rest)
-        return torque
+        return np.asarray(self.ratios.T @ (self._along(F, load) * sign + F.rest))
 
     def chord(self, F: Friction, v: Array, load: Array) -> Array:
         """Return the friction with the sign of the speed, divided by the speed, shape (n, n)."""
         x = np.maximum(np.abs(self.ratios @ v) / _SIGN_SPEED, 1e-6)  # tanh(x) / x is 1 at 0
         slope = np.maximum(self._along(F, load), 0.0) * np.tanh(x) / (x * _SIGN_SPEED)
-        over: Array = (self.ratios.T * slope) @ self.ratios
-        return over
+        return np.asarray((self.ratios.T * slope) @ self.ratios)
 
     def _along(self, F: Friction, load: Array) -> Array:
         """Return the friction that has the sign of the speed, shape (d,)."""
@@ -380,8 +377,7 @@ class RobotPlant:
         for _ in range(_ITERATIONS):
             before, load = load, bare - slope @ np.abs(load)
             if np.abs(load - before).max() <= _SETTLED * (1.0 + np.abs(load).max()):
-                settled: Array = a - per_load @ np.abs(load)
-                return settled
+                return np.asarray(a - per_load @ np.abs(load))
         raise NotConvergedError(
             f"load-dependent friction does not converge in {_ITERATIONS} steps: its parameters are "
             "so large that the drives lock. Set smaller parameters",
@@ -392,8 +388,7 @@ class RobotPlant:
         """Return Pinocchio's configuration, shape (nq,)."""
         if self._is_plain and self._is_angle:
             return q
-        x: Array = self.model.configurations(q[None])[0]
-        return x
+        return np.asarray(self.model.configurations(q[None])[0])
 
 
 def _grouped(model: RobotModel, pi: Array) -> tuple[Array, tuple[_Group, ...]]:
@@ -482,8 +477,7 @@ class _Loop:
         if not self.has_limits:
             return False
         _, _, motor, w, _ = self._parts(y)
-        limited: Array = np.abs(self.torque(motor, w, wanted)) >= self.limit
-        return limited
+        return np.abs(self.torque(motor, w, wanted)) >= self.limit
 
     def measured(self, y: Array, f: Array, wanted: Array) -> Array:
         """Return q, v, a and tau on the side of the sensors, shape (4, n)."""
@@ -552,8 +546,7 @@ def _advance(loop: _Loop, y: Array, wanted: Array, h: float, F: Friction, f: Arr
     for i in range(1, 4):
         x = y + h * (_ALPHA[i] @ K)
         K[i] = solve(loop.rate(x, wanted[i], loop.friction(x)), _BELOW[i] @ K)
-    after: Array = y + h * (_WEIGHTS @ K)
-    return after
+    return y + h * (_WEIGHTS @ K)
 
 
 class _Gear:
@@ -582,13 +575,11 @@ class _Gear:
         twist = motor - q
         deflection = twist - np.clip(twist, -self.play, self.play)
         is_engaged = np.abs(twist) >= self.play
-        tau: Array = self.k * deflection + self.d * (w - v) * is_engaged
-        return tau
+        return np.asarray(self.k * deflection + self.d * (w - v) * is_engaged)
 
     def twist(self, tau: Array) -> Array:
         """Return the angle of the motor relative to the joint for a torque at rest."""
-        twist: Array = tau / self.k + self.play * np.sign(tau)
-        return twist
+        return tau / self.k + self.play * np.sign(tau)
 
     def fastest(self, bodies: Array) -> float:
         """Return the largest natural frequency or damping rate of the gears [1/s]."""
@@ -623,8 +614,7 @@ class _Torque:
         if self.kind == "computed_torque":
             w = self.w
             return self.nominal.bodies_torque(q, v, a_r + w**2 * (q_r - q) + 2 * w * (v_r - v))
-        u: Array = forward + self.kp * (q_r - q) + self.kd * (v_r - v)
-        return u
+        return np.asarray(forward + self.kp * (q_r - q) + self.kd * (v_r - v))
 
 
 def _limits(model: RobotModel, actuator: Actuator) -> Array:
@@ -695,8 +685,7 @@ def _noisy(values: Array, level: Array, rng: np.random.Generator) -> Array:
     """Return values with white noise, its standard deviation given by joint."""
     if not level.any():
         return values
-    noisy: Array = values + level * rng.standard_normal(values.shape)
-    return noisy
+    return values + level * rng.standard_normal(values.shape)
 
 
 def _rounded(values: Array, step: Array) -> Array:

@@ -94,8 +94,7 @@ def _random_factor(size: float, rng: np.random.Generator) -> Array:
     S[np.triu_indices(4, 1)] = rng.standard_normal(6)
     S = S + S.T + np.diag(np.sqrt(2.0) * rng.standard_normal(4))
     values, axes = np.linalg.eigh(size * S)
-    factor: Array = axes * np.exp(values) @ axes.T
-    return factor
+    return np.asarray(axes * np.exp(values) @ axes.T)
 
 
 def _check(model: RobotModel, pi: Array) -> None:
