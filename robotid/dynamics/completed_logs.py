@@ -21,7 +21,7 @@ from robotid.data.base_motion import BaseMotion
 from robotid.data.log import Log, Trajectory
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import process
-from robotid.dynamics.constraint_rows import constraint_jacobian
+from robotid.dynamics.constraint_rows import constraint_jacobian, measured_rows
 from robotid.dynamics.prediction import predict
 from robotid.robot.closure import Chains
 from robotid.robot.constraints import Contact, frame_id, link_positions
@@ -51,13 +51,12 @@ def closed_log(model: RobotModel, log: Log) -> Log:
 
 def _with_passive(model: RobotModel, log: Log) -> Log:
     """Return the log with the positions of all joints, and no torque of passive ones."""
-    missing = np.array([joint not in log.joints for joint in model.joints])
-    q, tau = np.zeros((2, len(log.t), len(missing)))
-    logged = np.flatnonzero(~missing)
-    places = [log.joints.index(model.joints[j]) for j in logged]
-    q[:, logged], tau[:, logged] = log.q[:, places], log.tau[:, places]
-    tau[:, np.isin(model.joints, model.passive)] = 0.0
     absent = [joint for joint in model.joints if joint not in log.joints]
+    missing = np.isin(model.joints, absent)
+    q, tau = np.zeros((2, len(log.t), len(missing)))
+    places = [log.joints.index(joint) for joint in model.joints if joint in log.joints]
+    q[:, ~missing], tau[:, ~missing] = log.q[:, places], log.tau[:, places]
+    tau[:, np.isin(model.joints, model.passive)] = 0.0
     if absent and not model.loops:
         raise DataError(
             f"{log.name} has no position of {listed(absent)}, and no loop determines it; log it, "
@@ -68,29 +67,27 @@ def _with_passive(model: RobotModel, log: Log) -> Log:
     if not absent:
         return replace(log, tau=tau)
     note = f"positions of {listed(absent)} are computed from the loops"
-    unused = {"v": "velocities", "a": "accelerations", "q_ref": "commands"}
-    unused = {name: noun for name, noun in unused.items() if getattr(log, name) is not None}
-    if unused:
-        note += f"; {listed(unused.values())} are not used, since these joints have none"
+    optional = ((log.v, "velocities"), (log.a, "accelerations"), (log.q_ref, "commands"))
+    if unused := [noun for values, noun in optional if values is not None]:
+        note += f"; {listed(unused)} are not used, since these joints have none"
     return replace(
         log, joints=model.joints, q=q, tau=tau, v=None, a=None, q_ref=None, v_ref=None,
         tau_ref=None, notes=(*log.notes, note),
     )  # fmt: skip
 
 
-def _closed(model: RobotModel, log: Log, q: np.ndarray, missing: np.ndarray) -> np.ndarray:
+def _closed(model: RobotModel, log: Log, q: Array, missing: Array) -> Array:
     """Return positions at which the loops close; refuse those at which they do not."""
     chains = Chains(model)
     if missing.any():
         q = chains.closed(q, missing)
     gaps = chains.gaps(q)
     allowed = (_COMPUTED if missing.any() else _OPEN) * model.length
-    samples = np.flatnonzero(~(gaps.max(axis=1) <= allowed))
-    if not len(samples):
+    is_open = ~(gaps.max(axis=1) <= allowed)
+    if not is_open.any():
         return q
-    k = int(samples[0])
-    loop = int(gaps[k].argmax())
-    joints = [joint for joint, is_missing in zip(model.joints, missing, strict=True) if is_missing]
+    k = int(np.argmax(is_open))
+    loop, joints = int(gaps[k].argmax()), np.array(model.joints)[missing].tolist()
     what = f"no position of {listed(joints)} closes" if joints else "the positions do not close"
     raise DataError(
         f"{log.name}: {what} the loop {model.loops[loop].name} at t = {seconds(log.t[k])} s: "
@@ -131,8 +128,8 @@ class FoundContact:
     """Whether a link touches the ground, sample by sample."""
 
     frame: str  # the link
-    touches: Array  # probability that it does, shape (N,)
-    force: Array  # its estimated force upwards, shape (N,) [N]
+    touches: Array  # probability that it does, (N,)
+    force: Array  # its estimated force upwards, (N,) [N]
 
     @property
     def shares(self) -> tuple[float, float, float]:
@@ -192,20 +189,17 @@ def find_contacts(
     force, velocity = _forces(model, motion, wanted)
     mass = sum(inertia.mass for inertia in model.pin_model.inertias)
     load = np.linalg.norm(model.pin_model.gravity.linear) * mass
-    heights = None
+    frames, heights = [x.frame for x in wanted], None
     if log.base.has_position:
-        frames = [x.frame for x in wanted]
         positions = link_positions(model.pin_model, model.configurations(motion.q), frames)
         heights = positions @ _up(model)
     touches = _probabilities(force / load, heights, velocity, len(model.contacts))
-    return motion.t, tuple(
-        FoundContact(x.frame, touches[:, k], force[:, k]) for k, x in enumerate(wanted)
-    )
+    return motion.t, tuple(map(FoundContact, frames, touches.T, force.T))
 
 
 def _up(model: RobotModel) -> Array:
     """Return the direction against gravity, shape (3,)."""
-    gravity: Array = model.pin_model.gravity.linear
+    gravity = model.pin_model.gravity.linear
     return np.asarray(-gravity / np.linalg.norm(gravity))
 
 
@@ -227,24 +221,20 @@ def _forces(
 
     The noise level of each row is that of its residuals.
     """
+    names = [x.frame for x in wanted]
     turned = [
         replace(x, axes="world") if isinstance(x, Contact) and x in wanted else x
         for x in model.constraints
     ]
     model = replace(model.with_terms({}), constraints=tuple(turned))
     flags = np.ones((len(motion.t), len(model.contacts)), dtype=bool)
-    names = [x.frame for x in wanted]
-    stated = [not (x.always or x.frame in names) for x in model.contacts]
-    flags[:, stated] = motion.contacts
-    J, first = constraint_jacobian(model, motion.q, flags), 0
+    flags[:, [not (x.always or x.frame in names) for x in model.contacts]] = motion.contacts
+    J = constraint_jacobian(model, motion.q, flags)
     (torque,) = predict(model, [model.standard_parameters()], motion)
-    b = torque - motion.tau
-    known, starts = [], []
-    for x in model.constraints:
-        if isinstance(x, Contact):
-            known += [first + k for k in x.rows_measured]
-            starts += [first] if x.frame in names else []
-        first += x.sizes[x.kind]
+    b, known = torque - motion.tau, measured_rows(model)
+    firsts = np.cumsum([0, *(x.sizes[x.kind] for x in model.constraints)])
+    pairs = zip(model.constraints, firsts, strict=False)
+    starts = [first for x, first in pairs if isinstance(x, Contact) and x.frame in names]
     if motion.wrenches is not None:
         b -= np.einsum("kmj,km->kj", J[:, known], motion.wrenches)
     velocity = np.stack(
@@ -276,7 +266,7 @@ def _noise_of_groups(J: Array, b: Array, size: float) -> Array:
     step, n = max(1, len(b) // _SAMPLES), b.shape[1]
     J, b, weak = J[::step], b[::step], np.eye(J.shape[1]) / (_WIDER * size) ** 2
     group = np.repeat([0, 1, 2], [3, 3, n - 6])
-    member = (group == np.arange(3)[:, None]).astype(float)[: group.max() + 1]  # (groups, n)
+    member = 1.0 * (group == np.unique(group)[:, None])  # (groups, n)
     variance, largest = np.full(len(member), np.mean(b**2) + _TINY), np.mean(b**2, axis=0).max()
     for _ in range(_SCORINGS):
         inverse = 1.0 / (variance @ member)
@@ -285,8 +275,8 @@ def _noise_of_groups(J: Array, b: Array, size: float) -> Array:
         P = np.diag(inverse) - A.swapaxes(1, 2) @ np.linalg.solve(N, A)  # (N, n, n)
         left = member @ np.mean(np.einsum("kij,kj->ki", P, b) ** 2, axis=0)
         curvature = member @ np.mean(P**2, axis=0) @ member.T
-        found = np.linalg.lstsq(curvature, left, rcond=None)[0]  # contacts may explain a group
-        before, variance = variance, np.clip(found, _LEAST * variance, largest + _TINY)
+        scored = np.linalg.lstsq(curvature, left, rcond=None)[0]  # contacts may explain a group
+        before, variance = variance, np.clip(scored, _LEAST * variance, largest + _TINY)
         variance = np.maximum(variance, _NEGLIGIBLE * variance.max()) + _TINY
         if np.abs(np.log(variance / before)).max() < _SETTLED:
             break
@@ -295,7 +285,7 @@ def _noise_of_groups(J: Array, b: Array, size: float) -> Array:
 
 def _probabilities(force: Array, heights: Array | None, velocity: Array, feet: int) -> Array:
     """Return the probabilities of contact, shape (N, k), by values of this shape."""
-    p = (force > _LOAD / feet).astype(float)
+    p = 1.0 * (force > _LOAD / feet)
     for _ in range(_ROUNDS):
         if min(p.sum(), (1.0 - p).sum()) < _SOME:  # all or none touch: the force alone decides
             return np.asarray(expit((force - 0.25 * _LOAD / feet) / _NARROW[0]))

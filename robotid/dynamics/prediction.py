@@ -119,7 +119,12 @@ def predict_instants(
     direction = friction_directions(model.layout, v, None)
     if model.is_static:
         v, a = np.zeros_like(v), np.zeros_like(a)
-    return _rows_by_pi(model, pi, q, v, a, direction).reshape(wanted)
+    torque = np.empty_like(v)
+    for start in range(0, len(v), BLOCK):
+        k = slice(start, start + BLOCK)
+        Y = joint_torque_regressor(model, q[k], v[k], a[k], direction[k])
+        torque[k] = (Y @ pi).reshape(-1, model.n_rows)
+    return torque.reshape(wanted)
 
 
 def rigid_parts(model: RobotModel, pi: Array, q: Array, v: Array, a: Array) -> list[Array]:
@@ -128,24 +133,10 @@ def rigid_parts(model: RobotModel, pi: Array, q: Array, v: Array, a: Array) -> l
     They are g(q) = tau(q, 0, 0), M(q) a = tau(q, 0, a) - g(q) and C(q, v) v = tau(q, v, a) -
     tau(q, 0, a). Their sum is the torque of the bodies.
     """
-    bodies = np.where(np.arange(len(pi)) < model.layout.n_inertial, pi, 0.0)
-    rigid = _newton_euler if _has_centres(model, pi) else _rows_by_pi
     still = np.zeros_like(v)
-    g, g_and_Ma, whole = (rigid(model, bodies, q, *x) for x in ((still, still), (still, a), (v, a)))
+    states = ((still, still), (still, a), (v, a))
+    g, g_and_Ma, whole = (_bodies_torque(model, pi, q, *x) for x in states)
     return [g, g_and_Ma - g, whole - g_and_Ma]
-
-
-def _rows_by_pi(
-    model: RobotModel, pi: Array, q: Array, v: Array, a: Array, direction: Array | None = None
-) -> Array:
-    """Return Y pi at independent samples, shape (N, n_rows), by blocks."""
-    torque = np.empty_like(v)
-    for start in range(0, len(v), BLOCK):
-        k = slice(start, start + BLOCK)
-        signs = None if direction is None else direction[k]
-        Y = joint_torque_regressor(model, q[k], v[k], a[k], signs)
-        torque[k] = (Y @ pi).reshape(-1, model.n_rows)
-    return torque
 
 
 def _from_rows(source: TrajectoryRows, stacked: Array) -> list[Array]:
@@ -188,13 +179,17 @@ def inverse_dynamics(model: RobotModel, pi: Array, trajectory: Trajectory) -> Ar
     For inconsistent bodies, as of ordinary least squares, it is the difference of the torques of
     two sets of consistent bodies.
     """
-    m, added = trajectory, _consistent_addition(model, pi)
-    torque = _newton_euler(model, pi + added, m.q, m.v, m.a)
-    if added.any():
-        torque -= _newton_euler(model, added, m.q, m.v, m.a)
+    torque = _bodies_torque(model, pi, trajectory.q, trajectory.v, trajectory.a)
     if pi[model.layout.n_inertial :].any():
-        torque[:, model.n_rows - len(model.joints) :] += drive_torque(model, pi, m)
+        torque[:, model.n_rows - len(model.joints) :] += drive_torque(model, pi, trajectory)
     return torque
+
+
+def _bodies_torque(model: RobotModel, pi: Array, q: Array, v: Array, a: Array) -> Array:
+    """Return the torque of any bodies, shape (N, n_rows)."""
+    added = _consistent_addition(model, pi)
+    torque = _newton_euler(model, pi + added, q, v, a)
+    return torque - _newton_euler(model, added, q, v, a) if added.any() else torque
 
 
 def drive_torque(model: RobotModel, pi: Array, trajectory: Trajectory) -> Array:
@@ -213,8 +208,7 @@ def body_slopes_by_position(model: RobotModel, pi: Array, trajectory: Trajectory
 
     The others of ``body_slopes`` take several times as long.
     """
-    (by_q,) = _of_consistent(_position_slopes, model, pi, trajectory)
-    return by_q
+    return _of_consistent(_position_slopes, model, pi, trajectory)[0]
 
 
 def _of_consistent(
@@ -344,8 +338,8 @@ def drive_motion_along(
     """
     key, known = (model.pin_model, model.layout, has_rate), trajectory.derived.get("drive motion")
     if known is None or known[0] != key or not np.array_equal(known[1], model.carried_by):
-        found = _drive_motion(model, trajectory, has_rate)
-        trajectory.derived["drive motion"] = known = key, model.carried_by, found
+        moved = _drive_motion(model, trajectory, has_rate)
+        trajectory.derived["drive motion"] = known = key, model.carried_by, moved
     motion: DriveMotion = known[2]
     return motion
 

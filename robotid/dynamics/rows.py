@@ -124,17 +124,6 @@ def drive_motion(
     )
 
 
-def instant_state(
-    layout: ParameterLayout, q: Array, v: Array, a: Array, direction: Array | None, load: Array
-) -> Array:
-    """Return the columns with internal state or load at independent samples, shape (N, m).
-
-    Internal states are at their steady value, and the torque is constant.
-    """
-    signs = friction_directions(layout, v, direction)
-    return remembered(layout, drive_motion(layout, q, v, a, signs, load))
-
-
 def remembered(layout: ParameterLayout, motion: DriveMotion) -> Array:
     """Return the columns of drive parameters with internal state or load, shape (N, m)."""
     own = [layout.drive_parameters[k] for k in layout.remembering]
@@ -229,8 +218,8 @@ class InertialRows:
         return np.stack([stacked[own].T @ self.values[i:j] for own, (i, j) in rows], axis=-1)
 
 
-def inertial_columns(model: RobotModel, q: Array, v: Array, a: Array) -> Array:
-    """Return the inertial columns that affect each row, row by row, shape (sum of c_j, N)."""
+def inertial_rows(model: RobotModel, q: Array, v: Array, a: Array) -> InertialRows:
+    """Return the inertial columns that affect each row; of many joints they are few."""
     columns = _inertial_support(model)
     plan = plan_rows(model.layout, columns)
     out = np.empty((plan.first[-1], min(BLOCK, len(q))))
@@ -240,7 +229,7 @@ def inertial_columns(model: RobotModel, q: Array, v: Array, a: Array) -> Array:
         k = slice(start, min(start + BLOCK, len(q)))
         writer.write_inertial(q[k], v[k], a[k])
         values[:, k] = out[places, : k.stop - k.start]
-    return values
+    return InertialRows(model.pin_model, columns, values)
 
 
 def keep_inertial_rows(model: RobotModel, trajectory: Trajectory) -> None:
@@ -254,8 +243,8 @@ def keep_inertial_rows(model: RobotModel, trajectory: Trajectory) -> None:
     is_stored = kept_rows(model, trajectory) is not None
     if is_stored or is_large or choose_engine(model, samples, None) == COMPILED:
         return
-    values = inertial_columns(model, trajectory.q, trajectory.v, trajectory.a)
-    trajectory.derived["inertial rows"] = InertialRows(model.pin_model, columns, values)
+    rows = inertial_rows(model, trajectory.q, trajectory.v, trajectory.a)
+    trajectory.derived["inertial rows"] = rows
 
 
 def _inertial_support(model: RobotModel) -> tuple[Array, ...]:

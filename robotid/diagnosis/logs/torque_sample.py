@@ -9,8 +9,12 @@ from robotid.base.typing import Array
 from robotid.data.log import Log, Trajectory
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import process, resolve, unwrap
-from robotid.dynamics.rows import drive_values, friction_directions, friction_speeds
-from robotid.dynamics.torque import carried_columns
+from robotid.dynamics.rows import (
+    drive_values,
+    friction_directions,
+    friction_speeds,
+    inertial_rows,
+)
 from robotid.robot.model import RobotModel
 
 _MARGIN = 0.15  # [s] rows closer to the end of a segment are not used: the filter has not settled
@@ -33,7 +37,7 @@ class _Loads:
     @cached_property
     def moving(self) -> tuple[Array, Array]:
         """Torques of each link by the URDF, (N, n, bodies), and four columns of the last body."""
-        columns = carried_columns(self.model, self.q, self.v, self.a)
+        columns = inertial_rows(self.model, self.q, self.v, self.a).values.T
         ten = columns.reshape(len(columns), -1, 10)
         rows, bodies = self._places
         is_last = bodies == self.model.layout.n_inertial // 10 - 1
@@ -51,7 +55,7 @@ class _Loads:
         """Torques of links at rest, per m/s^2 of gravity in x, y, z, (3, N, n, bodies)."""
         rest = np.zeros_like(self.v)
         models = [self.model.with_gravity(axis) for axis in np.eye(3)]
-        columns = (carried_columns(model, self.q, rest, rest) for model in models)
+        columns = (inertial_rows(model, self.q, rest, rest).values.T for model in models)
         return np.array([self._by_link(x.reshape(len(x), -1, 10)) for x in columns])
 
     @cached_property
