@@ -45,7 +45,9 @@ def test_a_linear_plant_moves_as_the_robot_does(arm, ur5, rng):
     v += 0.5 * np.sign(v)  # away from 0, where the plant's friction is smooth
     ours = LinearPlant(arm, arm.mapping.to_base(pi)).acceleration(q, v, 20 * u)
     # wrist inertias of 0.1 kg m^2 multiply rounding of 50 N m
-    np.testing.assert_allclose(ours, RobotPlant(ur5, pi).acceleration(q, v, 20 * u), rtol=1e-9)
+    plant = RobotPlant(ur5, pi)
+    theirs = [plant.acceleration(*state) for state in zip(q, v, 20 * u, strict=True)]
+    np.testing.assert_allclose(ours, theirs, rtol=1e-9)
 
 
 def test_acceleration_solves_the_dynamics(rng):

@@ -66,7 +66,7 @@ class Run:
     a: Array  # [rad/s^2 or m/s^2]
     tau: Array  # [N m or N]
     reference: Array  # reference position [rad or m]
-    saturated: Array  # share of the time at the torque limit of each drive, shape (n,) [-]
+    saturated: Array  # share of the time at the torque limit of each drive, (n,) [-]
 
 
 def simulate(
@@ -121,11 +121,11 @@ def follow(
     loop, *later = loops if deflection > 0 else loops[1:]
     measured = np.empty((len(t), 4, len(model.joints)))
     reference, limited = np.empty_like(measured[:, 0]), np.zeros(len(model.joints))
-    y: Array | None = None
+    y = np.empty(0)
     for k, wanted in enumerate(_wanted(loop.controller, motion, len(t), steps, h)):
         if later and t[k] >= deflection - 1e-9 / rate:
             loop = later.pop()
-        y = loop.start(*wanted[0, 0, :3]) if y is None else y
+        y = y if k else loop.start(*wanted[0, 0, :3])
         F = loop.friction(y)
         f = loop.rate(y, wanted[0, 0], F)
         measured[k], reference[k] = loop.measured(y, f, wanted[0, 0]), wanted[0, 0, 0]
@@ -269,26 +269,22 @@ class RobotPlant:
         self._simple, self._groups = _grouped(model, pi)
         self.n_states = sum(g.states.stop - g.states.start for g in self._groups)
         self.is_loaded = any(_is_loaded(g.term) for g in self._groups)
-        G, A = model.velocity_map, self.armature
+        G, A, engine = model.velocity_map, self.armature, model.pin_model
         # Pinocchio's own joints, each with its own rotor: its ABA is sufficient
-        self._is_plain = np.array_equal(G, np.eye(len(G))) and np.array_equal(
-            A, np.diag(A.diagonal())
-        )
-        self._is_angle = (
-            model.pin_model.nq == model.pin_model.nv and not model.position_offset.any()
-        )
+        has_own_rotors = np.array_equal(A, np.diag(A.diagonal()))
+        self._is_plain = np.array_equal(G, np.eye(len(G))) and has_own_rotors
+        self._is_angle = engine.nq == engine.nv and not model.position_offset.any()
         self._driven = pin.Model(self._bodies.pin_model)
         if self._is_plain:
             self._driven.armature = A.diagonal().copy()
 
     def mass_matrix(self, q: Array) -> Array:
         """Return D(q), the mass matrix with the drives' armature, shape (n, n)."""
+        x = self._configuration(q)
         if self._is_plain:
-            mass: Array = pin.crba(self._driven, self._data, self._configuration(q))
-            return mass.copy()
-        x = self.model.configurations(q[None])
-        mass = rigid_mass_matrices(self._bodies, x, self._data)[0] + self.armature
-        return mass
+            return np.array(pin.crba(self._driven, self._data, x))
+        rigid = rigid_mass_matrices(self._bodies, x[None], self._data)[0]
+        return np.asarray(rigid + self.armature)
 
     def bodies_torque(self, q: Array, v: Array, a: Array) -> Array:
         """Return the inverse dynamics of the bodies alone, shape (n,) [N m or N]."""
@@ -341,13 +337,11 @@ class RobotPlant:
         return rate, end
 
     def acceleration(self, q: Array, v: Array, u: Array, F: Friction | None = None) -> Array:
-        """Return the acceleration D(q)^-1 (u - C(q, v)) of a torque, shape as q, (n,) or (N, n).
+        """Return the acceleration D(q)^-1 (u - C(q, v)) of a torque, shape (n,).
 
         References:
             Tzvetkova, (11).
         """
-        if q.ndim == 2:
-            return np.stack([self.acceleration(*one) for one in zip(q, v, u, strict=True)])
         F = self.friction(q, v) if F is None else F
         sign = np.tanh(self.ratios @ v / _SIGN_SPEED)
         free = u - self.ratios.T @ (F.along * sign + F.rest)
@@ -359,8 +353,7 @@ class RobotPlant:
         x, G = self._configuration(q), self.model.velocity_map
         if self._is_plain:
             robot = self._driven if rotors else self._bodies.pin_model
-            a: Array = pin.aba(robot, self._data, x, v, tau)
-            return a.copy()
+            return np.array(pin.aba(robot, self._data, x, v, tau))
         D = rigid_mass_matrices(self._bodies, x[None], self._data)[0] + rotors * self.armature
         bias = G.T @ pin.nonLinearEffects(self._bodies.pin_model, self._data, x, G @ v)
         return np.linalg.solve(D, tau - bias)
@@ -409,10 +402,9 @@ def _grouped(model: RobotModel, pi: Array) -> tuple[Array, tuple[_Group, ...]]:
     for term, numbers in terms.items():
         drives = [layout.drive_parameters[k][0] for k in numbers]
         is_all = drives == list(range(len(layout.drives)))
-        own = slice(states, states + len(numbers) * isinstance(term, Bristles))
+        first, states = states, states + len(numbers) * isinstance(term, Bristles)
         chosen = slice(None) if is_all else np.array(drives)
-        groups.append(_Group(term, chosen, theta[numbers], own))
-        states = own.stop
+        groups.append(_Group(term, chosen, theta[numbers], slice(first, states)))
     return simple, tuple(groups)
 
 
@@ -646,9 +638,11 @@ def measure(
     tau = _delayed(run.t, run.tau, sensors.torque_delay + delay * np.ones(n))
     share = of(noise.tau, "noise.tau") * np.sqrt(np.mean(tau**2, axis=0))
     level = np.hypot(share, of(noise.torque, "noise.torque"))
-    q = _noisy(run.q, of(noise.q, "noise.q"), rng)
-    v = _noisy(v, of(noise.v, "noise.v"), rng)
-    signals = {"q": q, "v": v, "tau": _noisy(tau, level, rng)}
+    signals = {
+        "q": _noisy(run.q, of(noise.q, "noise.q"), rng),
+        "v": _noisy(v, of(noise.v, "noise.v"), rng),
+        "tau": _noisy(tau, level, rng),
+    }
     q, v, tau = (_rounded(x, of(getattr(step, k), f"step.{k}")) for k, x in signals.items())
     logged = np.ones(len(run.t), dtype=bool)
     if sensors.dropped:
@@ -664,13 +658,10 @@ def measure(
         t = t + sensors.jitter * rng.standard_normal(len(t))
         t = np.maximum.accumulate(t - spread) + spread
     return Log(
-        t=t[logged],
-        q=q[logged],
+        t=t[logged], q=q[logged], tau=tau[logged], joints=joints,
         v=v[logged] if sensors.velocity else None,
         a=run.a[logged] if sensors.acceleration else None,
-        tau=tau[logged],
-        joints=joints,
-    )
+    )  # fmt: skip
 
 
 def _delayed(t: Array, values: Array, delay: Array) -> Array:
