@@ -305,7 +305,6 @@ def base_state(
 
     What was not recorded is differentiated: with the axes R of the base, v = R^T dx/dt and
     w = 2 (q* dq/dt), the vector part of the product of quaternions.
-
     t (N,) [s], pose (N, 7) [m, -], twist (N, 6), acceleration (N, 6).
     """
     quaternion = pose[:, 3:] / np.linalg.norm(pose[:, 3:], axis=1, keepdims=True)
@@ -327,7 +326,6 @@ def pose_jumps(t: Array, pose: Array) -> tuple[Array, Array, Array]:
 
     A step is compared with the mean of the steps before and after it, and their difference with
     those of 32 rows on each side. A change of the speed, as by an impact, is no jump.
-
     t (N,) [s], pose (N, 7) -> (k,) [m].
     """
     dt, sizes = np.diff(t), np.zeros((2, len(t)))
@@ -500,7 +498,6 @@ def inertial_state(
 
     With the lever r of the IMU, its specific force f without bias and gravity g, the specific
     force at the origin is f - alpha x r - w x (w x r), and dv/dt = that + g - w x v.
-
     t (N,) [s], velocity (N, 3) [m/s], down (N, 3) [m/s^2].
     """
     w, f, r = values[:, :3], values[:, 3:], frame.lever

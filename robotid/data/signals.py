@@ -183,7 +183,6 @@ def process_segments(
 
     The result for a part equals that for the whole, if the log has the rows of its segments
     within ``filter_reach`` of the part.
-
     speeds (c, n).
     """
     is_sharp = settings.cutoff is None and settings.friction_band == 0
@@ -499,7 +498,6 @@ def standing_motion(
     is too fast, or is accelerated or decelerated too much, are left out. Consecutive blocks at rest
     are joined: each pose at rest is one sample. There is no filter and no derivative: the speed is
     the slope of the positions over the block, and 0 for a single row.
-
     least (n,) [rad/s or m/s], fastest (n,), hardest (n,) [rad/s^2 or m/s^2] -> (K,).
     """
     of_block, segment = _blocks(log.t, max_gap)
@@ -581,7 +579,6 @@ def zero_phase(x: Array, order: int, cutoff: float, rate: float, pad: int) -> Ar
 
     The initial state of each pass is the steady state for the first value; both ends are extended
     by point reflection of the signal (Gustafsson 1996 compares such initial states).
-
     x (N, ...).
     """
     if not x.size:
@@ -627,7 +624,6 @@ def local_polynomial(
 
     At the ends the polynomial of the first and of the last ``width`` rows is used (Savitzky, Golay
     1964).
-
     x (N, ...).
     """
     half = width // 2

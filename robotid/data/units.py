@@ -262,7 +262,6 @@ def velocity_lags(log: Log) -> tuple[float, Array]:
     The delay minimises the distance between the measured velocity and the delayed derivative. It is
     found on a uniform grid in segments without gaps and refined by a parabola. It is positive if
     the measured velocity lags, and 0 if the joints are at rest.
-
     -> (n,).
     """
     v = _measured(log)

@@ -491,7 +491,6 @@ def write_columns(table: Mapping[str, Array], path: Path) -> None:
     """Write columns to a file; reading them returns exactly the same numbers.
 
     A temporary file in the same folder is written and then renamed, so the file is always complete.
-
     table (N,).
     """
     write = _WRITTEN[check_suffix(path)]

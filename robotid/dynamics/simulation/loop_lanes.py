@@ -772,7 +772,6 @@ def divide_rows(stamps, ticks, times, is_tick):
 
     Ticks divide a row. The longest steps are divided further, into two, three and so on, until the
     row has the required number.
-
     stamps (N,) [s], is_tick ((N - 1) every,).
     """
     every, i = len(is_tick) // (len(stamps) - 1), 0
