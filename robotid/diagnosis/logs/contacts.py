@@ -20,7 +20,6 @@ from robotid.diagnosis.logs.base_pose import (
     check_unit,
     rms,
 )
-from robotid.dynamics.completed_logs import closed_log, with_contacts
 from robotid.dynamics.constraint_rows import (
     constraint_jacobian,
     force_basis,
@@ -28,6 +27,7 @@ from robotid.dynamics.constraint_rows import (
     without_forces,
 )
 from robotid.dynamics.prediction import predict
+from robotid.dynamics.prepared_logs import closed_log, with_contacts
 from robotid.robot.constraints import Contact
 from robotid.robot.model import RobotModel
 

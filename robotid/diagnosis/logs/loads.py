@@ -16,8 +16,8 @@ from robotid.diagnosis.logs.hypotheses import FLOOR, compensated, own_share
 from robotid.diagnosis.logs.torque_sample import Probe
 from robotid.dynamics.base_parameters import BaseMapping
 from robotid.dynamics.factors import Reduction, compress_segments
+from robotid.dynamics.prepared_logs import base_problem, row_mask
 from robotid.dynamics.rows import keep_inertial_rows
-from robotid.dynamics.used_rows import base_problem, row_mask
 from robotid.estimation.estimators.two_runs import payload_runs
 from robotid.robot.drives import COUNTERBALANCE, drive_line, spring_family
 from robotid.robot.model import RobotModel

@@ -13,7 +13,7 @@ from robotid.data.signal_settings import LogUnits, SignalSettings
 from robotid.diagnosis.catalogue import finding
 from robotid.dynamics.base_parameters import BaseMapping
 from robotid.dynamics.factors import compress, merge
-from robotid.dynamics.used_rows import base_problem, independent_share, row_mask
+from robotid.dynamics.prepared_logs import base_problem, independent_share, row_mask
 from robotid.estimation.estimators import WLS, Estimate
 from robotid.estimation.estimators.determination import (
     Determination,

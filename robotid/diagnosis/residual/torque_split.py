@@ -31,8 +31,8 @@ from robotid.diagnosis.residual.decisions import (
     p_value,
 )
 from robotid.dynamics.prediction import predict, rigid_parts
+from robotid.dynamics.prepared_logs import independent_share
 from robotid.dynamics.rows import drive_values, friction_directions
-from robotid.dynamics.used_rows import independent_share
 from robotid.estimation.fitting.evaluation import Evaluation
 from robotid.estimation.fitting.fitted import Fit
 from robotid.robot.model import RobotModel

@@ -24,7 +24,7 @@ from robotid.dynamics.simulation.simulation_settings import (
 )
 from robotid.robot.bodies import link_transfer
 from robotid.robot.drive_term import DriveTerm, MemorylessTerm
-from robotid.robot.drives import Bristles, Coulomb, Lag, Offset, Viscous
+from robotid.robot.drives import Bristles, Lag
 from robotid.robot.mass_matrix import drive_inertia, rigid_mass_matrices
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
@@ -39,7 +39,6 @@ _CHUNK = 1024  # number of steps for which a motion is evaluated together
 _LEAST_INERTIA = 0.02  # smallest inertia in the computation of PD gains [kg m^2 or kg]
 _ITERATIONS = 200  # of the fixed point of load and load-dependent friction
 _SETTLED = 1e-12  # relative change of the load at convergence
-_SIMPLE = (Coulomb, Viscous, Offset)
 _SIGN_SPEED = 2e-4  # speed over which the plant's Coulomb friction reverses [rad/s or m/s]
 
 # ROS34PW2, a Rosenbrock W-method: order 3 for any Jacobian approximation, L-stable
@@ -266,7 +265,7 @@ class RobotPlant:
         self.armature = drive_inertia(model.layout, pi)  # (n, n)
         self.ratios = model.layout.drive_ratios  # (d, n)
         self._share = self.ratios / np.sum(self.ratios**2, axis=1, keepdims=True).clip(min=1e-300)
-        self._simple, self._groups = _grouped(model, pi)
+        self._groups = _grouped(model, pi)
         self.n_states = sum(g.states.stop - g.states.start for g in self._groups)
         self.is_loaded = any(_is_loaded(g.term) for g in self._groups)
         G, A, engine = model.velocity_map, self.armature, model.pin_model
@@ -294,8 +293,7 @@ class RobotPlant:
     def friction(self, q: Array, v: Array, z: Array | None = None) -> Friction:
         """Return the friction of the drives, without inertia and the sign of the speed."""
         angle, w = self.ratios @ q, self.ratios @ v
-        coulomb, viscous, offset = self._simple
-        along, rest, loaded = coulomb.copy(), viscous * w + offset, np.zeros(len(w))
+        along, rest, loaded = np.zeros((3, len(w)))
         for group in self._groups:
             term, drives, theta = group.term, group.drives, group.theta
             if isinstance(term, Bristles):
@@ -384,19 +382,12 @@ class RobotPlant:
         return np.asarray(self.model.configurations(q[None])[0])
 
 
-def _grouped(model: RobotModel, pi: Array) -> tuple[Array, tuple[_Group, ...]]:
-    """Return the friction terms of the drives, without inertia and terms of the measurement.
-
-    First Coulomb friction, viscous friction and offset of each drive, shape (3, d), which depend
-    only on the speed; then the others.
-    """
-    layout = model.layout
-    theta, simple = pi[layout.n_inertial :], np.zeros((3, len(layout.drives)))
+def _grouped(model: RobotModel, pi: Array) -> tuple[_Group, ...]:
+    """Return the friction terms of the drives, without inertia and terms of the measurement."""
+    layout, theta = model.layout, pi[model.layout.n_inertial :]
     terms: dict[Bristles | MemorylessTerm, list[int]] = {}
-    for k, (d, term) in enumerate(layout.drive_parameters):
-        if type(term) in _SIMPLE:
-            simple[_SIMPLE.index(type(term)), d] += theta[k]
-        elif theta[k] != 0.0 and isinstance(term, Bristles | MemorylessTerm):
+    for k, (_, term) in enumerate(layout.drive_parameters):
+        if theta[k] != 0.0 and isinstance(term, Bristles | MemorylessTerm):
             terms.setdefault(term, []).append(k)
     groups, states = [], 0
     for term, numbers in terms.items():
@@ -405,7 +396,7 @@ def _grouped(model: RobotModel, pi: Array) -> tuple[Array, tuple[_Group, ...]]:
         first, states = states, states + len(numbers) * isinstance(term, Bristles)
         chosen = slice(None) if is_all else np.array(drives)
         groups.append(_Group(term, chosen, theta[numbers], slice(first, states)))
-    return simple, tuple(groups)
+    return tuple(groups)
 
 
 def _is_loaded(term: DriveTerm) -> bool:

@@ -34,12 +34,18 @@ from robotid.data.signals import (
 )
 from robotid.data.units import check_reach, check_units
 from robotid.dynamics.base_parameters import BaseMapping
-from robotid.dynamics.completed_logs import closed_log, with_contacts
 from robotid.dynamics.constraint_rows import constrained, logged_base
 from robotid.dynamics.factors import Reduction
 from robotid.dynamics.prediction import is_loaded, remember
+from robotid.dynamics.prepared_logs import (
+    base_problem,
+    closed_log,
+    prefers_measured,
+    row_mask,
+    static_rows,
+    with_contacts,
+)
 from robotid.dynamics.rows import COMPILED, choose_engine, friction_speeds
-from robotid.dynamics.used_rows import base_problem, prefers_measured, row_mask, static_rows
 from robotid.estimation.workers.plan import Workload
 from robotid.robot.model import RobotModel
 
