@@ -47,8 +47,7 @@ class Tree(NamedTuple):
     """A robot's B bodies as arrays for compiled code. Parents come before their children."""
 
     parents: Array  # parent of each body, shape (B,), int; -1: the world
-    # constants of each joint, its ratio to its coordinate and its offset, shape (B, 41)
-    joints: Array
+    joints: Array  # constants of each joint, its ratio and offset to its coordinate, (B, 41)
     leaders: Array  # coordinate that moves each joint, shape (B,), int
     rows: Array  # row of the regressor of each slot of each body, shape (B, D), int; -1 if unused
     depths: Array  # number of rows that each body affects, shape (B,), int

@@ -43,9 +43,7 @@ class Factors:
     columns: tuple[Array, ...]  # the columns of joint j, n arrays of shape (c_j,), ascending
     rows: Array  # number of rows folded in per joint, shape (n,), int
     names: tuple[str, ...]  # names of the c columns
-    # whether constraint forces were eliminated from the rows: the rows of all joints are
-    # mixed, and have one noise level
-    is_projected: bool = False
+    is_projected: bool = False  # without constraint forces: rows are mixed, with one noise level
 
     @property
     def R(self) -> Array:

@@ -44,9 +44,7 @@ class TorqueSlopes(NamedTuple):
     by_v: Array  # by the velocities, likewise
     by_a: Array  # by the accelerations, likewise: the mass matrix of the bodies
     by_gravity: Array  # by gravity, along the axes of the world, shape (N, n, 3)
-    # by the origin of each joint in the frame of the body before, shape (N, n, n, 3): torque,
-    # joint, axis
-    by_origin: Array
+    by_origin: Array  # by each joint's origin in the body before, (N, n, n, 3): torque, joint, axis
 
 
 def predict(

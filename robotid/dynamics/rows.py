@@ -197,8 +197,7 @@ class InertialRows:
     """Inertial columns of a trajectory's regressor, which are independent of drives."""
 
     pin_model: pin.Model  # the robot
-    # indices of the inertial parameters of each row, n_rows arrays of shape (c_j,)
-    columns: tuple[Array, ...]
+    columns: tuple[Array, ...]  # inertial parameters of each row, n_rows arrays (c_j,), int
     values: Array  # the columns of each row, one row after another, shape (sum of c_j, N)
 
     @cached_property
@@ -268,8 +267,7 @@ class TrajectoryRows(RowSource):
     support: Array  # shape (n_rows, p), bool: False where row j is zero for every motion
     selected: Array  # indices of its columns among the p columns, shape (c,)
     engine: str  # name of the code that computes the regressor, as of ``choose_engine``
-    # its inertial columns if they are stored with the trajectory
-    inertial: InertialRows | None = None
+    inertial: InertialRows | None = None  # if they are stored with the trajectory
 
     @property
     def samples(self) -> int:

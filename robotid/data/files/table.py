@@ -80,7 +80,6 @@ class Table:
 
     def with_columns(self, columns: Mapping[str, Column], names: Sequence[str]) -> "Table":
         """Return a table in which some columns are computed, and the names of all its columns."""
-
         rows = None if self.rows is None else _ComputedRows(self.rows, columns)
         read = partial(_computed, columns, first=0, read=self.read)
         return replace(self, names=list(names), read=read, rows=rows)
@@ -279,7 +278,7 @@ def with_even_stamps(table: Table, column: str, stamp: str = "even") -> Table:
         t = np.concatenate([np.empty(0), *blocks])
         if len(t) < 2:
             return np.array([0.0, *t])
-        return np.polyfit(np.arange(len(t)), t - t[0], 1) + [0.0, t[0]]
+        return np.polyfit(np.arange(len(t)), t - t[0], 1) + np.array([0.0, t[0]])
 
     def stamps(row: int, t: Array) -> Array:
         return np.polyval(line(), np.arange(row, row + len(t)))

@@ -87,8 +87,7 @@ class Terms(NamedTuple):
     codes: Array  # codes of ``coded_term``, shape (T, 5), int; the third is the kind of the term
     shapes: Array  # shape parameters of laws or bristles, shape (T, 11)
     values: Array  # parameters, shape (T,)
-    # indices of each joint's first term, and of its first bristle or affine term, (n, 2), int
-    spans: Array
+    spans: Array  # index of each joint's first term, and first bristle or affine term, (n, 2), int
     bristles: Array  # index of each bristle term, and its joint, shape (B, 2), int
 
 
@@ -98,8 +97,7 @@ class Robot(NamedTuple):
     tree: Tree  # its bodies and joints
     zeros: Array  # position of the URDF at position 0 of each encoder, shape (n,) [rad or m]
     bodies: Array  # inertial parameters, shape (n, 10)
-    # armature, kp, kd, torque limit, and the sums of affine terms: constant, by the speed,
-    # and by its direction, shape (n, 7)
+    # armature, kp, kd, torque limit; sums of affine terms: 1, speed, its direction; shape (n, 7)
     drives: Array
     terms: Terms  # friction and offset
 
@@ -108,9 +106,7 @@ class Columns(NamedTuple):
     """Parameters of the sensitivities."""
 
     kinds: Array  # kind, joint and index of each column, shape (C, 3), int
-    # index of the first column of each of the P sensitivities, each the sum of its columns,
-    # and the number of columns, shape (P + 1,), int
-    sums: Array
+    sums: Array  # first column of each of the P sums that are sensitivities, and end, (P + 1,), int
     directions: Array  # directions in a body's ten parameters, shape (D, 10)
 
 
@@ -121,9 +117,7 @@ class Course(NamedTuple):
     # torque by the delay: means over each step, or values of its tick, shape (K, n, 6, LANES)
     command: Array
     steps: Array  # length of each step, shape (K, LANES) [s]
-    # 1 where the controller has a tick at the start of a step, else 0, shape (K, LANES); 1 at
-    # the first; empty in continuous time
-    ticks: Array
+    ticks: Array  # 1 at steps that start with a tick, as the first; (K, LANES); else empty
     every: int  # number of steps from one sample to the next
     start: Array  # initial positions and speeds, shape (2, n, LANES)
 
@@ -133,9 +127,7 @@ class Motion(NamedTuple):
 
     q: Array  # positions, shape (N, n, LANES)
     v: Array  # speeds, shape (N, n, LANES)
-    # sensitivities of positions, shape (N, n, P, LANES), or of positions and then of speeds,
-    # shape (N, 2n, P, LANES)
-    S: Array
+    S: Array  # sensitivities of positions, (N, n, P, LANES), or also of speeds, (N, 2n, P, LANES)
 
 
 class Places(NamedTuple):

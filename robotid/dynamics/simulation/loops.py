@@ -96,8 +96,7 @@ class Window:
     start_row: int  # first simulated sample
     first: int  # first counted sample; before it, the error of the initial state decays
     stop: int  # sample after the last one
-    # initial position and speed, shape (2, n); the measured ones if None
-    given: Array | None = None
+    given: Array | None = None  # initial position and speed, (2, n); None: the measured ones
 
     @property
     def counted(self) -> slice:
@@ -159,9 +158,8 @@ class RollOut:
     window: Window  # the window
     q: Array  # positions of the counted samples, shape (N, n) [rad or m]
     v: Array  # speeds of the counted samples, shape (N, n) [rad/s or m/s]
-    # for each part of the robot: its joints, shape (k,); the indices of its sensitivities,
-    # ascending, shape (c,); and the derivatives of its positions, shape (N, k, c), or of its
-    # positions and speeds, shape (N, 2k, c)
+    # of each part: its joints (k,), indices of its sensitivities (c,), and derivatives of its
+    # positions (N, k, c), or of its positions and speeds (N, 2k, c)
     slopes: tuple[tuple[Array, Array, Array], ...] = ()
 
 
