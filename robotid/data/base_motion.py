@@ -97,10 +97,8 @@ class BaseMotion:
                 f"the quaternion of the base has length {sizes[wrong[0]]:g} in row {wrong[0]}, "
                 "wanted 1, in the order qx qy qz qw"
             )
-        is_opposite = np.sum(self.pose[1:, 3:] * self.pose[:-1, 3:], axis=1) < 0
-        signs = np.where(np.append(0, np.cumsum(is_opposite)) % 2, -1.0, 1.0)
         pose = self.pose.copy()
-        pose[:, 3:] *= (signs / sizes)[:, None]
+        pose[:, 3:] *= continuous_signs(pose[:, 3:]) / sizes[:, None]
         pose.flags.writeable = False
         object.__setattr__(self, "pose", pose)
 
@@ -346,6 +344,12 @@ def pose_jumps(t: Array, pose: Array) -> tuple[Array, Array, Array]:
                 found[k + 2] = size[k]
     rows = np.flatnonzero(sizes.any(axis=0))
     return rows, *sizes[:, rows]
+
+
+def continuous_signs(q: Array) -> Array:
+    """Return the signs with which quaternions (N, 4) do not jump to their opposites, (N, 1)."""
+    is_opposite = np.sum(q[1:] * q[:-1], axis=1) < 0
+    return np.where(np.append(0, np.cumsum(is_opposite)) % 2, -1.0, 1.0)[:, None]
 
 
 def in_base(quaternion: Array, vector: Array) -> Array:

@@ -29,7 +29,9 @@ def why_not(model: RobotModel) -> str | None:
     """Return why the compiled path does not support a robot, or None if it does."""
     joints, first = list(model.pin_model.joints), 2 if model.free_flyer else 1
     for name, joint in list(zip(model.pin_model.names, joints, strict=True))[first:]:
-        if joint.nv != 1 or not _is_simple(_joint_axis(model.pin_model, joint.id)):
+        # prismatic, or revolute with an axis of length 1
+        axis = _joint_axis(model.pin_model, joint.id).reshape(2, -1)
+        if joint.nv != 1 or not np.allclose(np.sort(np.linalg.norm(axis, axis=1)), [0.0, 1.0]):
             return f"the compiled code does not support joint {name!r} ({joint.shortname()})"
     try:
         row_lanes()
@@ -139,12 +141,6 @@ def _joint_axis(pin_model: pin.Model, body: int) -> Array:
     joint = pin_model.joints[body]
     jacobian = pin.computeJointJacobian(pin_model, data, q, body)
     return np.asarray(jacobian.reshape(6, -1)[:, joint.idx_v])  # of one joint it is a vector
-
-
-def _is_simple(axis: Array) -> bool:
-    """Return whether a joint is prismatic or revolute with an axis of length 1."""
-    lengths = np.linalg.norm(axis.reshape(2, 3), axis=1)
-    return bool(np.allclose(np.sort(lengths), [0.0, 1.0]))
 
 
 @cache

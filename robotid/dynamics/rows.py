@@ -289,9 +289,10 @@ class TrajectoryRows(RowSource):
 
     def blocks(self, start: int, stop: int, segment: int | None = None) -> Iterator[list[Array]]:
         plan, segment = self._plan, segment or stop - start
-        length = _block_length(int(plan.first[-1]))
+        fitting = BLOCK_SIZE // int(plan.first[-1]) // _GROUP * _GROUP  # into the cache
+        length = max(_GROUP, min(BLOCK, fitting))
         out = np.empty((plan.first[-1], length))
-        motion = self.trajectory
+        motion, is_weighted = self.trajectory, bool((self.weights != 1.0).any())
         writer = (
             _CompiledWriter(self.model, self._tree, plan, out)
             if self.engine == COMPILED
@@ -300,7 +301,7 @@ class TrajectoryRows(RowSource):
         for first in range(start, stop, _LOADED * length):
             last = min(first + _LOADED * length, stop)
             part = slice(first, last)
-            weights = self.weights[part] if self._is_weighted else None
+            weights = self.weights[part] if is_weighted else None
             values = trajectory_values(self.model.layout, motion, part)
             writer.load(motion, part, values, weights)
             ends = range(start + segment, last, segment)  # of segments
@@ -316,10 +317,6 @@ class TrajectoryRows(RowSource):
     @cached_property
     def _plan(self) -> RowPlan:
         return plan_rows(self.model.layout, [self.selected[columns] for columns in self.columns])
-
-    @cached_property
-    def _is_weighted(self) -> bool:
-        return bool((self.weights != 1.0).any())
 
 
 def trajectory_rows(
@@ -422,7 +419,9 @@ class _CompiledWriter:
         """Load the samples of the next blocks, and their drive columns: values (k, N)."""
         q, v, a, tau = motion.q[part], motion.v[part], motion.a[part], motion.tau[part]
         if self._model.free_flyer:  # the pose has one more entry than the twist
-            self._motion = own_motion(q[:, 1:], v, a, _base_state(self._model, q, v, a))
+            falling = in_base(q[:, 3:7], self._model.pin_model.gravity.linear)
+            base = np.vstack([v[:, :6].T, (a[:, :3] - falling).T, a[:, 3:6].T])
+            self._motion = own_motion(q[:, 1:], v, a, base)
         else:
             self._motion = own_motion(q, v, a)
         values = values[self._plan.drive_numbers]
@@ -448,20 +447,8 @@ def _compiled_places(tree: Tree, plan: RowPlan) -> Array:
     return tree.places(table)
 
 
-def _base_state(model: RobotModel, q: Array, v: Array, a: Array) -> Array:
-    """Return v, w, a - g, dw of the floating base in its own frame, shape (12, k)."""
-    g = model.pin_model.gravity.linear
-    gravity = in_base(q[:, 3:7], g)
-    return np.vstack([v[:, :6].T, (a[:, :3] - gravity).T, a[:, 3:6].T])
-
-
 def _as_slice(places: Array) -> Array | slice:
     """Return consecutive places as a slice, for which writing is faster."""
     if len(places) and (np.diff(places) == 1).all():
         return slice(int(places[0]), int(places[-1]) + 1)
     return places
-
-
-def _block_length(columns: int) -> int:
-    """Return the samples per block, such that it fits in the cache."""
-    return max(_GROUP, min(BLOCK, BLOCK_SIZE // columns // _GROUP * _GROUP))

@@ -16,11 +16,11 @@ from typing import Any
 
 import numpy as np
 
-from robotid.base.exceptions import DataError, MissingDependencyError
+from robotid.base.exceptions import DataError
 from robotid.base.findings import listed
 from robotid.base.typing import Array
-from robotid.data.base_motion import IMU, POSE, TWIST
-from robotid.data.files.table import Format, Table, choose
+from robotid.data.base_motion import IMU, POSE, TWIST, continuous_signs
+from robotid.data.files.table import Format, Table, choose, load_package
 from robotid.data.log import repeated, suggestion
 from robotid.data.signal_settings import LogSource
 
@@ -133,13 +133,8 @@ BAG = Format((".mcap", ".db3", ".bag"), _open, topics="topic")
 
 @contextmanager
 def _opened(path: Path, source: LogSource) -> Iterator[_Bag]:
-    try:
-        from rosbags.rosbag1 import Reader as Reader1
-        from rosbags.rosbag2 import Reader as Reader2
-        from rosbags.typesys import Stores, get_typestore
-    except ImportError as error:
-        purpose = "reading ROS bags and MCAP files"
-        raise MissingDependencyError(purpose, "rosbags", "bag") from error
+    modules = ("rosbags.rosbag1", "rosbags.rosbag2", "rosbags.typesys")
+    ros1, ros2, typesys = load_package("reading ROS bags and MCAP files", "bag", *modules)
     if path.is_dir() and not (path / "metadata.yaml").is_file():
         raise DataError(
             f"{path.name} is a folder without metadata.yaml, so it is not a ROS 2 bag, and without "
@@ -147,10 +142,11 @@ def _opened(path: Path, source: LogSource) -> Iterator[_Bag]:
             "restore it with 'ros2 bag reindex'"
         )
     is_ros1 = path.suffix.lower() == ".bag" and not path.is_dir()
-    types = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.LATEST)
+    stores = typesys.Stores
+    types = typesys.get_typestore(stores.ROS1_NOETIC if is_ros1 else stores.LATEST)
     deserialize = types.deserialize_ros1 if is_ros1 else types.deserialize_cdr
     try:
-        reader: Any = Reader1(path) if is_ros1 else Reader2(path)
+        reader = (ros1 if is_ros1 else ros2).Reader(path)
         reader.open()
     except Exception as error:  # a parser of foreign bytes fails in many ways
         raise _broken(path, error) from error
@@ -453,7 +449,13 @@ def _with_sensors(
         sensed = [name for name in wanted if name in by_column]
         used = {by_column[name][0].topic: by_column[name][0] for name in sensed}
         for name in sensed:
-            _require_one(path.name, name, by_column[name])
+            topics = [sensor.topic for sensor in by_column[name]]
+            if len(topics) > 1:
+                raise DataError(
+                    f"{path.name} has {len(topics)} topics with {name}: {listed(topics)}. State "
+                    f'all topics of sensors to read: sensors = ["{topics[0]}"] (job file table '
+                    "[log], Python source=LogSource(sensors=...))"
+                )
         others = [name for name in wanted if name not in by_column and name != "time"]
         rows = states.read(["time", *others])
         loaded = {topic: sensor.load(path, source) for topic, sensor in used.items()}
@@ -473,20 +475,9 @@ def _with_sensors(
             rows |= _interpolated(t, columns, rows["time"])
         return {name: rows[name] for name in wanted}
 
-    topics = {name: f"topic {own[0].topic!r}" for name, own in by_column.items()}
+    sources = {name: f"topic {having[0].topic!r}" for name, having in by_column.items()}
     axes = {"wrench": "link"}
-    return replace(states, names=[*states.names, *topics], read=read, sensors=topics, axes=axes)
-
-
-def _require_one(where: str, name: str, sensors: Sequence[_Sensor]) -> None:
-    """Reject a column that several topics have."""
-    topics = [sensor.topic for sensor in sensors]
-    if len(topics) > 1:
-        raise DataError(
-            f"{where} has {len(topics)} topics with {name}: {listed(topics)}. State all topics of "
-            f'sensors to read: sensors = ["{topics[0]}"] (job file table [log], Python '
-            "source=LogSource(sensors=...))"
-        )
+    return replace(states, names=[*states.names, *sources], read=read, sensors=sources, axes=axes)
 
 
 def _interpolated(t: Array, columns: Mapping[str, Array], at: Array) -> dict[str, Array]:
@@ -496,9 +487,7 @@ def _interpolated(t: Array, columns: Mapping[str, Array], at: Array) -> dict[str
     quaternions = [[f"{start}{end}" for end in ("qx", "qy", "qz", "qw")] for start in starts]
     for names in quaternions:
         q = np.column_stack([columns[name] for name in names])
-        is_opposite = np.sum(q[1:] * q[:-1], axis=1) < 0
-        q *= np.where(np.append(0, np.cumsum(is_opposite)) % 2, -1.0, 1.0)[:, None]
-        columns |= dict(zip(names, q.T, strict=True))
+        columns |= dict(zip(names, (continuous_signs(q) * q).T, strict=True))
     values = {name: np.interp(at, t, x) for name, x in columns.items()}
     for names in quaternions:
         size = np.linalg.norm(np.column_stack([values[name] for name in names]), axis=1)

@@ -17,12 +17,20 @@ from typing import Any
 
 import numpy as np
 
-from robotid.base.exceptions import DataError, MissingDependencyError
+from robotid.base.exceptions import DataError
 from robotid.base.files import DATASET, missing_file, read_json
 from robotid.base.findings import listed
 from robotid.base.typing import Array
 from robotid.data.files.columns import named_by_row
-from robotid.data.files.table import Format, Place, RowReader, Table, choose, parsing
+from robotid.data.files.table import (
+    Format,
+    Place,
+    RowReader,
+    Table,
+    choose,
+    load_package,
+    parsing,
+)
 from robotid.data.log import repeated, suggestion
 from robotid.data.signal_settings import LogSource
 
@@ -53,12 +61,7 @@ PARQUET = Format((".parquet",), _open, _write, written=(".parquet",))
 
 def load_pyarrow(purpose: str) -> ModuleType:
     """Return pyarrow, with pyarrow.parquet imported."""
-    try:
-        import pyarrow
-        import pyarrow.parquet
-    except ImportError as error:
-        raise MissingDependencyError(purpose, "pyarrow", "parquet") from error
-    package: ModuleType = pyarrow
+    package: ModuleType = load_package(purpose, "parquet", "pyarrow", "pyarrow.parquet")[0]
     return package
 
 

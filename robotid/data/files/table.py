@@ -10,13 +10,14 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property, partial
+from importlib import import_module
 from itertools import chain
 from pathlib import Path
 from typing import Any, Protocol, TypeGuard
 
 import numpy as np
 
-from robotid.base.exceptions import DataError, RobotIdError
+from robotid.base.exceptions import DataError, MissingDependencyError, RobotIdError
 from robotid.base.findings import listed
 from robotid.base.typing import Array
 from robotid.data.files.columns import is_clock, named_by_row, quantity_of
@@ -295,6 +296,14 @@ def choose(where: str, candidates: Sequence[str], noun: str, listing: str) -> st
         f"{where} has {len(names)} {noun}: {listed(names)}; {listing}. State one: topic = "
         f'"{names[0]}" (job file table [log], CLI --topic, Python source=LogSource(topic=...))'
     )
+
+
+def load_package(purpose: str, extra: str, *modules: str) -> list[Any]:
+    """Return modules of a package that an extra of robotid installs."""
+    try:
+        return [import_module(name) for name in modules]
+    except ImportError as error:
+        raise MissingDependencyError(purpose, modules[0].partition(".")[0], extra) from error
 
 
 @contextmanager

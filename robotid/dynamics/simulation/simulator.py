@@ -414,7 +414,10 @@ class _Loop:
         self.plant = plant = RobotPlant(model, pi)
         mass = plant.mass_matrix(np.zeros(len(model.joints)))
         self.controller = _Torque(model, settings.controller, mass)
-        self.limit = _limits(model, settings.actuator)
+        share = settings.actuator.effort or 0.0
+        urdf = [share * max(joint.effort, 0.0) or np.inf for joint in model.limits]
+        limits = by_joint(settings.actuator.limits, model.joints, "actuator: limits", np.nan)
+        self.limit = np.where(np.isnan(limits), urdf, limits)  # [N m or N]
         self.has_limits, self.n = bool(np.isfinite(self.limit).any()), len(model.joints)
         self.is_at_motor = settings.sensors.side == "motor"
         self.gear = _Gear(plant, settings.actuator) if settings.actuator.is_elastic else None
@@ -457,10 +460,8 @@ class _Loop:
 
     def is_limited(self, y: Array, wanted: Array) -> Array | bool:
         """Return which drives are at their torque limit, shape (n,), bool."""
-        if not self.has_limits:
-            return False
         _, _, motor, w, _ = self._parts(y)
-        return np.abs(self.torque(motor, w, wanted)) >= self.limit
+        return self.has_limits and np.abs(self.torque(motor, w, wanted)) >= self.limit
 
     def measured(self, y: Array, f: Array, wanted: Array) -> Array:
         """Return q, v, a and tau on the side of the sensors, shape (4, n)."""
@@ -598,14 +599,6 @@ class _Torque:
             w = self.w
             return self.nominal.bodies_torque(q, v, a_r + w**2 * (q_r - q) + 2 * w * (v_r - v))
         return np.asarray(forward + self.kp * (q_r - q) + self.kd * (v_r - v))
-
-
-def _limits(model: RobotModel, actuator: Actuator) -> Array:
-    """Return the torque limit of each drive, shape (n,) [N m or N]; infinite without a limit."""
-    stated = by_joint(actuator.limits, model.joints, "actuator: limits", np.nan)
-    share = actuator.effort
-    urdf = [share * j.effort if share and j.effort > 0 else np.inf for j in model.limits]
-    return np.where(np.isnan(stated), urdf, stated)
 
 
 def measure(
