@@ -40,7 +40,8 @@ _UNIT = 1e-3  # tolerance of the norm of a logged quaternion
 _BESIDE, _USUAL = 32, 75.0  # rows beside a step, and the percentile of their steps ...
 _JUMPS = 15.0  # ... times which a step relative to those before and after it is a jump ...
 _SMALLEST = (5e-3, 0.02)  # [m], [rad] ... if it is not below this
-_GAP = 2.5  # median steps of time: a longer one is a gap, over which the pose may change
+#: Median steps of time: a longer one is a gap, unless the filter is slower.
+GAP_STEPS = 2.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -329,7 +330,7 @@ def pose_jumps(t: Array, pose: Array) -> tuple[Array, Array, Array]:
     dt, sizes = np.diff(t), np.zeros((2, len(t)))
     if len(dt) < 3:
         return np.empty(0, dtype=int), np.empty(0), np.empty(0)
-    whole = dt < _GAP * np.median(dt)
+    whole = dt < GAP_STEPS * np.median(dt)
     whole = whole[1:-1] & whole[:-2] & whole[2:]
     for found, values, least in zip(
         sizes, (pose[:, :3], 2.0 * pose[:, 3:]), _SMALLEST, strict=True
@@ -438,13 +439,9 @@ def orientation_of_imu(t: Array, values: Array, gravity: Array) -> Array:
 
     The angular velocity is integrated. With the axes that result, the mean specific force in some
     seconds is opposite to gravity, for the velocity of a robot hardly changes in them: this
-    corrects the tilt. The heading starts at 0.
-
-    References:
-        Mahony, Hamel, Pflimlin (2008), Nonlinear Complementary Filters on the Special Orthogonal
-        Group; here without delay, for the whole log is known.
-
-    t (N,) [s], values (N, 6), gravity (3,) [m/s^2].
+    corrects the tilt. The heading starts at 0. See Mahony, Hamel, Pflimlin (2008), Nonlinear
+    Complementary Filters on the Special Orthogonal Group; here without delay, for the whole log is
+    known. t (N,) [s], values (N, 6), gravity (3,) [m/s^2].
     """
     parts = np.split(np.arange(len(t)), np.flatnonzero(np.diff(t) > _BREAK) + 1)
     return np.concatenate([_levelled(t[k], values[k], -gravity) for k in parts])

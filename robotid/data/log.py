@@ -493,36 +493,39 @@ def median_step(t: Array) -> float:
 
 def repeated_share(fitted: Sequence[Trajectory], validation: Trajectory) -> float:
     """Return the largest share of a motion that is in one of others."""
-    from scipy.spatial import cKDTree
-
     size = np.maximum(np.ptp(validation.q, axis=0), 1e-3)
     instants = _segments(validation, size, _INSTANTS)
-    share = 0.0
-    for known in [_segments(motion, size, None) for motion in fitted if len(instants)]:
-        if len(known):
-            distance, _ = cKDTree(known).query(instants, p=np.inf, distance_upper_bound=_NEAR)
-            share = max(share, float(np.mean(np.isfinite(distance))))
-    return share
+    return max((_share(instants, _segments_tree(motion, size)) for motion in fitted), default=0.0)
 
 
 def alike_motions(motions: Sequence[Trajectory]) -> list[list[int]]:
     """Return the motions in groups: one that repeats another one is in its group."""
-    from scipy.spatial import cKDTree
-
     low, high = (np.array([f(x.q, axis=0) for x in motions]) for f in (np.min, np.max))
     size = np.maximum(high.max(axis=0) - low.min(axis=0), 1e-3)
-    trees = [cKDTree(known) if len(known := _segments(x, size, None)) else None for x in motions]
+    trees = [_segments_tree(motion, size) for motion in motions]
     groups: list[list[int]] = []
     for k, motion in enumerate(motions):
-        own, same = _segments(motion, size, _FEW), list[list[int]]()
-        for group in groups if len(own) else ():
-            others = [tree for j in group if (tree := trees[j]) is not None]
-            far = [x.query(own, p=np.inf, distance_upper_bound=_NEAR)[0] for x in others]
-            if any(np.mean(np.isfinite(distance)) >= REPEATED for distance in far):
-                same.append(group)
+        instants = _segments(motion, size, _FEW)
+        same = [x for x in groups if any(_share(instants, trees[j]) >= REPEATED for j in x)]
         groups = [group for group in groups if group not in same]
         groups.append([*(j for group in same for j in group), k])
     return sorted(sorted(group) for group in groups)
+
+
+def _segments_tree(motion: Trajectory, size: Array) -> Any:  # noqa: ANN401
+    """Return the tree of all segments of a motion; None without any."""
+    from scipy.spatial import cKDTree
+
+    segments = _segments(motion, size, None)
+    return cKDTree(segments) if len(segments) else None
+
+
+def _share(instants: Array, tree: Any) -> float:  # noqa: ANN401
+    """Return the share of instants that are near one of a tree."""
+    if tree is None or not len(instants):
+        return 0.0
+    distance, _ = tree.query(instants, p=np.inf, distance_upper_bound=_NEAR)
+    return float(np.mean(np.isfinite(distance)))
 
 
 def _segments(motion: Trajectory, size: Array, count: int | None) -> Array:

@@ -135,12 +135,7 @@ class LogUnits(Settings):
                 )
 
     def scale(self, joint: str, *, is_angle: bool) -> tuple[float, float]:
-        """Return a and b of a joint's positions a + b x [rad or m], x the number in the log.
-
-        Args:
-            joint: The joint.
-            is_angle: Whether its positions are angles.
-        """
+        """Return a and b of a joint's positions a + b x [rad or m], x the number in the log."""
         if joint in self.percent:
             first, last = self.percent[joint]
             return float(first), (last - first) / 100

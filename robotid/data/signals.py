@@ -21,15 +21,14 @@ from robotid.base.exceptions import DataError, SettingsError
 from robotid.base.findings import listed
 from robotid.base.text import seconds
 from robotid.base.typing import Array
-from robotid.data.base_motion import base_state, pose_jumps
+from robotid.data.base_motion import GAP_STEPS, base_state, pose_jumps
 from robotid.data.log import Log, Trajectory
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.units import is_trustworthy
 
 _SLOWEST = 1e-6  # smallest cut-off over the rate
-_GAP_STEPS = 2.5  # [median steps] a longer step may be a gap
 _UNWRAPPED: WeakKeyDictionary[Log, Log] = WeakKeyDictionary()
-_GAP_CYCLES = 0.25  # [periods of the filter] ... if it is also longer than this
+_GAP_CYCLES = 0.25  # [periods of the filter] shortest gap, if it is longer than ``GAP_STEPS``
 #: Rows after which the end of a cubic spline has no effect: it decreases by half or more per row.
 SPLINE = 64
 _SETTLED = 42.0  # [time constants] after which a filter's transient is negligible: 6e-19
@@ -102,7 +101,7 @@ def decide(
         acceleration = "measured" if is_used else "differentiated"
     gap = settings.max_gap
     if gap is None:
-        gap = max(_GAP_STEPS * step, _GAP_CYCLES / cutoff if cutoff else 0.0)
+        gap = max(GAP_STEPS * step, _GAP_CYCLES / cutoff if cutoff else 0.0)
     return replace(settings, rate=rate, velocity=velocity, acceleration=acceleration, max_gap=gap)
 
 
@@ -458,13 +457,10 @@ def acting_directions(t: Array, w: Array, band: float, longest: float) -> Array:
     It is the sign of the speed. In stiction, a drive stops abruptly and moves again later: its
     friction balances the applied torque, from one bound to the other, while the filtered speed
     oscillates about zero. There the direction changes linearly in time from the sign before to the
-    sign after. A drive was in stiction if it was in the band longer than the slopes at the edges
-    of the band indicate: by a factor of two if it reverses, of four if it does not.
-
-    References:
-        Karnopp (1985), Computer simulation of stick-slip friction in mechanical dynamic systems.
-
-    t (N,) [s], w (N, c) [rad/s].
+    sign after. A drive was in stiction if it was in the band longer than the slopes at the edges of
+    the band indicate: by a factor of two if it reverses, of four if it does not. See Karnopp
+    (1985), Computer simulation of stick-slip friction in mechanical dynamic systems. t (N,) [s], w
+    (N, c) [rad/s].
     """
     directions = np.where(np.abs(w) < _REST, 0.0, np.sign(w))
     for x, direction in zip(w.T, directions.T, strict=True):

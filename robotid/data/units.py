@@ -18,12 +18,10 @@ from robotid.data.log import Log
 from robotid.data.signal_settings import PER_SECOND, LogUnits
 
 _TIME_NAMES = {"ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}
-_DEGREES = 180 / np.pi  # degrees in a radian
 _EPOCHS = 6e8, 5e9  # [s] since 1970: dates from 1989 to 2128
 _SLOWEST = 0.1  # [s] a longer median step has another unit
 _FARTHEST = 4 * np.pi  # [rad] a joint beyond two revolutions is in degrees
 _FREE = 10 * np.pi  # [rad] ... one without limits beyond five: pendulums were recorded over 4.5
-_USUAL = 2 * np.pi  # [rad] ... and one within a revolution is in radians if others are farther
 #: [s] Largest lag of a measured velocity that "auto" uses.
 LARGEST_LAG = 0.02
 #: Least number of steps over the range of a channel with sufficient resolution.
@@ -134,10 +132,10 @@ def turned(joints: Sequence[str], q: Array, turning: Collection[str]) -> tuple[s
 
 def _alone(log: Log, kind: str, j: int, others: Array) -> str:
     """Return how to convert one joint that alone looks like degrees, as text; else ""."""
-    if len(others) < 2 or others.max() > _USUAL:
+    if len(others) < 2 or others.max() > _FARTHEST / 2:
         return ""
     kinds = [kind]
-    if kind == "q" and not _is_near(np.abs(_velocity_factor(log)), 1 / _DEGREES)[j]:
+    if kind == "q" and not _is_near(np.abs(_velocity_factor(log)), np.radians(1.0))[j]:
         kinds += [name for name, values in (("dq", log.v), ("ddq", log.a)) if values is not None]
     if kind == "q" and log.q_ref is not None and np.abs(log.q_ref[:, j]).max() > _FARTHEST:
         kinds.append("qref")
@@ -160,7 +158,7 @@ def _check_commands(log: Log, is_revolute: Array) -> None:
     follows = is_revolute & (np.abs(both) > _ALIKE * sizes[0] * sizes[1])
     factor = np.copysign(sizes[1], both) / np.where(follows, sizes[0], np.nan)
     ratio = np.abs(factor)
-    for j in np.flatnonzero(_is_near(ratio, _DEGREES) | _is_near(ratio, 1 / _DEGREES)):
+    for j in np.flatnonzero(_is_near(ratio, np.degrees(1.0)) | _is_near(ratio, np.radians(1.0))):
         raise DataError(
             f"{log.name}: the motion of qref_{log.joints[j]} is {factor[j]:.3g} times that of "
             f"q_{log.joints[j]}: one of them looks like degrees, the other like radians. Convert "
@@ -171,7 +169,7 @@ def _check_commands(log: Log, is_revolute: Array) -> None:
 
 def _check_degrees(log: Log, factor: Array) -> None:
     """Reject joints with only one of position and velocity in degrees."""
-    for wrong, ratio in (("velocity", _DEGREES), ("position", 1 / _DEGREES)):
+    for wrong, ratio in (("velocity", np.degrees(1.0)), ("position", np.radians(1.0))):
         for j in np.flatnonzero(_is_near(np.abs(factor), ratio)):
             raise DataError(
                 f"{log.name}: dq_{log.joints[j]} is {abs(factor[j]):.3g} times d(q)/dt: the "

@@ -98,10 +98,8 @@ def base_mapping(
     """Return the base parameters of a regressor taken at random states.
 
     The columns are compared after multiplication by ``scales``, physical magnitudes. They are not
-    normalised, since a column of rounding errors would become a parameter.
-
-    References:
-        Gautier (1991), Numerical calculation of the base inertial parameters of robots.
+    normalised, since a column of rounding errors would become a parameter. See Gautier (1991),
+    Numerical calculation of the base inertial parameters of robots.
     """
     if W.ndim != 2 or W.shape[1] != len(names) or len(W) < len(names):
         raise DataError(f"W has shape {W.shape}, wanted at least {len(names)} rows of {len(names)}")

@@ -154,10 +154,8 @@ def compress(problem: Problem, *, threads: int | None = None) -> Factors:
     """Fold a problem into its factors, block by block.
 
     Long problems are cut into parts of a fixed number of samples, whose factors are merged in
-    order: the result does not depend on the number of threads.
-
-    References:
-        Demmel, Grigori, Hoemmen, Langou (2012), Communication-optimal parallel and sequential QR.
+    order: the result does not depend on the number of threads. See Demmel, Grigori, Hoemmen, Langou
+    (2012), Communication-optimal parallel and sequential QR.
     """
     columns = [np.flatnonzero(row) for row in problem.support]
     triangles = [Triangle(len(own) + 1) for own in columns]
@@ -296,8 +294,7 @@ class Triangle:
     def fold(self, rows: Array) -> None:
         """Replace R by the triangular factor of [R; rows]: rows (m, c).
 
-        References:
-            LAPACK Working Note 257; Golub, Van Loan (2013), Matrix Computations, section 6.5.3.
+        See LAPACK Working Note 257; Golub, Van Loan (2013), Matrix Computations, section 6.5.3.
         """
         self._fold(rows, 0, 0)
 

@@ -59,10 +59,8 @@ def predict(
     Along a motion with constraints it is the torque that constraint forces cannot cause, P W theta.
 
     It is computed by the rows of the regressor for all vectors together, or, if the rows are not
-    compiled and the vectors are few, by inverse dynamics, once per vector.
-
-    References:
-        Luh, Walker, Paul (1980), On-Line Computational Scheme for Mechanical Manipulators.
+    compiled and the vectors are few, by inverse dynamics, once per vector. See Luh, Walker, Paul
+    (1980), On-Line Computational Scheme for Mechanical Manipulators.
     """
     source = trajectory_rows(model, trajectory, None, compiled)
     stacked = np.column_stack(list(parameters))
@@ -264,8 +262,7 @@ def _position_slopes(model: RobotModel, pi: Array, q: Array, v: Array, a: Array)
 def _torque_slopes(model: RobotModel, pi: Array, q: Array, v: Array, a: Array) -> tuple[Array, ...]:
     """Return the arrays of ``TorqueSlopes``.
 
-    References:
-        Carpentier, Mansard (2018), Analytical Derivatives of Rigid Body Dynamics Algorithms.
+    See Carpentier, Mansard (2018), Analytical Derivatives of Rigid Body Dynamics Algorithms.
     """
     plain, G = model.with_parameters(pi).pin_model, model.velocity_map
     extended, joints = _with_movable_origins(plain)

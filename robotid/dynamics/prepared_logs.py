@@ -270,10 +270,8 @@ def _noise_of_groups(J: Array, b: Array, size: float) -> Array:
 
     The variances have the largest likelihood of the residuals (restricted maximum likelihood, by
     Fisher scoring). Reweighting by residuals over leverages has the same solution, but with levels
-    that differ by a factor of 10 it takes tens of rounds.
-
-    References:
-        Searle, Casella, McCulloch (1992), Variance Components, section 8.3.
+    that differ by a factor of 10 it takes tens of rounds. See Searle, Casella, McCulloch (1992),
+    Variance Components, section 8.3.
     """
     step, n = max(1, len(b) // _SAMPLES), b.shape[1]
     J, b, weak = J[::step], b[::step], np.eye(J.shape[1]) / (_WIDER * size) ** 2

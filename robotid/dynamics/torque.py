@@ -41,25 +41,13 @@ def joint_torque_regressor(
     direction: Array | None = None,
     memory: Array | None = None,
 ) -> Array:
-    """Return the regressor Y with tau = Y pi at each of N samples.
+    """Return the regressor Y with tau = Y pi at each of N samples, shape (N n_rows, p).
 
     The columns are those of the ten inertial parameters of each body, from Pinocchio, and then of
-    the drives: ``tau_j = Ia a_j + Fv v_j + Fc sign(v_j) + off``, likewise for couplings.
-
-    Args:
-        model: The robot.
-        q: Positions, shape (N, n) [rad, m].
-        v: Velocities, shape (N, n_rows) [rad/s, m/s].
-        a: Accelerations, shape (N, n_rows) [rad/s^2, m/s^2].
-        direction: Directions of friction, shape (N, c); the signs of the speeds if None.
-        memory: Columns with internal state or load, shape (N, m); steady ones if None.
-
-    Returns:
-        Y, shape (N n_rows, p).
-
-    References:
-        Atkeson, An, Hollerbach (1986), Estimation of Inertial Parameters of Manipulator Loads and
-        Links; Carpentier et al. (2019), The Pinocchio C++ library.
+    the drives: ``tau_j = Ia a_j + Fv v_j + Fc sign(v_j) + off``, likewise for couplings. v and a
+    have shape (N, n_rows); directions (N, c) are the signs of the speeds if None, internal states
+    (N, m) steady ones. See Atkeson, An, Hollerbach (1986), Estimation of Inertial Parameters of
+    Manipulator Loads and Links; Carpentier et al. (2019), The Pinocchio C++ library.
     """
     wanted = (len(q), model.n_rows)
     if v.shape != wanted or a.shape != wanted:
@@ -91,10 +79,8 @@ def trajectory_regressor(
 def mass_regressor(model: RobotModel, q: Array) -> Array:
     """Return the regressor of D(q, pi) = mass_regressor @ pi, shape (N, n_rows, n_rows, p).
 
-    With drives, column j is W(q, 0, e_j) - W(q, 0, 0), where gravity and offsets cancel.
-
-    References:
-        Tzvetkova, Extracting Inertial Parameters from Robotic Manipulators Dynamics, (11), (13).
+    With drives, column j is W(q, 0, e_j) - W(q, 0, 0), where gravity and offsets cancel. See
+    Tzvetkova, Extracting Inertial Parameters from Robotic Manipulators Dynamics, (11), (13).
     """
     N, n = len(q), model.n_rows
     still = np.zeros((N, n))

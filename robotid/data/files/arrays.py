@@ -35,7 +35,6 @@ _SIMULATED = {
     "applied_torque": ("tau", 0),
 }  # fmt: skip
 _ROOTS = ("root_link_state_w", "root_state_w")
-_ROOT = 13  # values of a root state: position, quaternion, linear and angular velocity
 _OF_MASS = (
     "root_state_w has the velocity of the centre of mass, which is not used; export "
     "root_link_state_w to use it"
@@ -245,8 +244,9 @@ def _base_columns(where: str, arrays: Mapping[str, _Entry], joints: int) -> dict
         names = names if "qvel" in names else ["qpos"]
         kinds = (POSE, TWIST, ACCELERATION)[: len(names)]
     elif root:
-        if arrays[root].width != _ROOT:
-            raise DataError(f"{where}: {root} has {arrays[root].width} columns, wanted {_ROOT}")
+        wanted = len((*POSE, *TWIST))
+        if arrays[root].width != wanted:
+            raise DataError(f"{where}: {root} has {arrays[root].width} columns, wanted {wanted}")
         names, kinds = [root], (POSE, TWIST) if root == "root_link_state_w" else (POSE,)
     else:
         return {}

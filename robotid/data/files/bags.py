@@ -99,13 +99,9 @@ def _open(path: Path, source: LogSource) -> Table:
     of the required columns, as those of another publisher, are ignored; an inconsistent message,
     or one with only some of the required columns, is a ``DataError``.
 
-    A JointTrajectoryControllerState contains commands, too: its output to the drives, else its
-    reference (formerly "desired"), as ``qref_<joint>`` and ``dqref_<joint>``, and the effort of
-    the reference as ``tauref_<joint>``. For joint states, the commands are in a second topic; a
-    zero-order hold brings them to the time stamps of the states.
-
-    A LowState of Unitree contains its motors, by number: ``position_0``. Columns of sensors are of
-    further topics, as of ``_with_sensors``.
+    A controller's state has commands, too (``_controlled``). For joint states, these are in a
+    second topic; a zero-order hold brings them to the time stamps of the states. A LowState of
+    Unitree contains its motors, by number: ``position_0``.
     """
     with _opened(path, source) as bag:
         sensors = _sensors_of(bag)
@@ -293,6 +289,7 @@ def _content(
 def _controlled(message: Any) -> dict[str, Any]:  # noqa: ANN401
     """Return the fields of a controller's state; a field with NaN only is empty.
 
+    Commands are its output to the drives, else its reference; the effort is that of the reference.
     Up to control_msgs 4 its points were called desired and actual.
     """
 

@@ -488,11 +488,7 @@ def _format_of(path: Path) -> Format:
 
 
 def write_columns(table: Mapping[str, Array], path: Path) -> None:
-    """Write columns to a file; reading them returns exactly the same numbers.
-
-    A temporary file in the same folder is written and then renamed, so the file is always complete.
-    table (N,).
-    """
+    """Write columns (N,) to a file, at once or not at all; they are read exactly as written."""
     write = _WRITTEN[check_suffix(path)]
     with written_whole(path) as temporary:
         write(table, temporary)

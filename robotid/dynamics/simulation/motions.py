@@ -27,8 +27,7 @@ class Motion(Protocol):
 class FourierTrajectory(Motion):
     """A periodic motion q(t) = q0 + sum_k s_k sin(k w t) + c_k cos(k w t), w = 2 pi / period.
 
-    References:
-        Swevers et al. (1997), Optimal robot excitation and identification.
+    See Swevers et al. (1997), Optimal robot excitation and identification.
     """
 
     q0: Array  # mean position, shape (n,) [rad or m]
@@ -57,10 +56,8 @@ class ProgramMotion(Motion):
     """The motion q(t) = q0 + A (a1 t^5 + a2 t^4 + a3 t^3), from rest to rest.
 
     With a1 = 6 / T^5, a2 = -15 / T^4, a3 = 10 / T^3 the motion is from q0 to q0 + A, with zero
-    velocity and acceleration at both ends. Before 0 and after T the robot is at rest.
-
-    References:
-        Tzvetkova, (28).
+    velocity and acceleration at both ends. Before 0 and after T the robot is at rest. See
+    Tzvetkova, (28).
     """
 
     amplitude: Array  # A, displacement of each joint, (n,), or (R, n) for R motions [rad or m]
@@ -134,16 +131,9 @@ def random_fourier(
     period: float = 10.0,
     centre: Array | None = None,
 ) -> FourierTrajectory:
-    """Return a random motion within the limits of a robot.
+    """Return a random motion within the position and speed limits of a robot's URDF.
 
-    Args:
-        model: The robot; the motion is within the position and speed limits of its URDF.
-        rng: Source of the coefficients.
-        period: Period [s].
-        centre: Mean position, shape (n,) [rad or m]; the middle of the limits, or 0, if None.
-
-    Raises:
-        DataError: If the centre lies outside the limits.
+    Its mean position ``centre`` (n,) is the middle of the limits, or 0, if None.
     """
     n = len(model.joints)
     sine, cosine = rng.standard_normal((2, _HARMONICS, n)) / np.arange(1, _HARMONICS + 1)[:, None]

@@ -100,11 +100,9 @@ def follow(
 
     The plant is ``RobotPlant`` with the parameters pi. An elastic gear has the motor angle th and
     the torque tau = k dead(th - q) + d (w - v); rotor and friction are then on the motor's side.
-    The integrator is a Rosenbrock W-method of order 3, which is stable with stiction.
-
-    References:
-        Rang, Angermann (2005), New Rosenbrock W-methods of order 3 for partial differential
-        algebraic equations of index 1.
+    The integrator is a Rosenbrock W-method of order 3, which is stable with stiction. See Rang,
+    Angermann (2005), New Rosenbrock W-methods of order 3 for partial differential algebraic
+    equations of index 1.
     """
     _check_size(duration * rate, 1)
     t = np.arange(round(duration * rate) + 1) / rate
@@ -337,8 +335,7 @@ class RobotPlant:
     def acceleration(self, q: Array, v: Array, u: Array, F: Friction | None = None) -> Array:
         """Return the acceleration D(q)^-1 (u - C(q, v)) of a torque, shape (n,).
 
-        References:
-            Tzvetkova, (11).
+        See Tzvetkova, (11).
         """
         F = self.friction(q, v) if F is None else F
         sign = np.tanh(self.ratios @ v / _SIGN_SPEED)
