@@ -34,7 +34,7 @@ def why_not(model: RobotModel) -> str | None:
         if joint.nv != 1 or not np.allclose(np.sort(np.linalg.norm(axis, axis=1)), [0.0, 1.0]):
             return f"the compiled code does not support joint {name!r} ({joint.shortname()})"
     try:
-        row_lanes()
+        tree_lanes()
     except ImportError as error:
         return f"Numba cannot be imported: {error}"
     return None
@@ -42,7 +42,7 @@ def why_not(model: RobotModel) -> str | None:
 
 def keeps_code() -> bool:
     """Return whether there is a cache folder for compiled code."""
-    return row_lanes().inertial_rows.stats.cache_path is not None
+    return tree_lanes().inertial_rows.stats.cache_path is not None
 
 
 class Tree(NamedTuple):
@@ -68,8 +68,8 @@ class Tree(NamedTuple):
         return np.asarray(self.joints[:, 33:36] + self.joints[:, 36:39])  # of which one is 0
 
     def work_space(self) -> Array:
-        """Return a new work space for ``row_lanes``."""
-        return np.asarray(row_lanes().work_of(*self.rows.shape))
+        """Return a new work space for ``tree_lanes``."""
+        return np.asarray(tree_lanes().work_of(*self.rows.shape))
 
     def places(self, wanted: Array) -> Array:
         """Return the places (B, D, 10) of the columns of each body in each of its rows."""
@@ -144,8 +144,8 @@ def _joint_axis(pin_model: pin.Model, body: int) -> Array:
 
 
 @cache
-def row_lanes() -> ModuleType:
+def tree_lanes() -> ModuleType:
     """Return the compiled code of rows; it imports Numba."""
-    import robotid.dynamics.kernels.row_lanes
+    import robotid.dynamics.kernels.tree_lanes
 
-    return robotid.dynamics.kernels.row_lanes
+    return robotid.dynamics.kernels.tree_lanes

@@ -25,7 +25,7 @@ from robotid.dynamics.compiled import (
     flatten,
     keeps_code,
     own_motion,
-    row_lanes,
+    tree_lanes,
     why_not,
     work_per_sample,
 )
@@ -432,7 +432,7 @@ class _CompiledWriter:
 
     def write(self, start: int, stop: int) -> None:
         """Write the rows of samples start to stop of those loaded, at most k."""
-        lanes, span = row_lanes(), (start, stop)
+        lanes, span = tree_lanes(), (start, stop)
         lanes.inertial_rows(self._tree, self._places, self._motion, self._work, self._out, span)
         lanes.finish_rows(
             self._values, self._ends, self._widths, self._weights, self._root, self._out, span
