@@ -30,10 +30,18 @@ _DELAY = Range("seconds between -1 and 1", lambda x: abs(x) <= 1)
 _SINGULAR = 1e-9  # smallest singular value over the largest, for rows of length 1
 
 
-def _load_cutoff(value: float | bool) -> float | None:
-    if value is True:
-        raise SettingsError("cutoff is true, wanted a frequency [Hz], or false for no filter")
-    return None if value is False else value
+def or_false(if_true: str) -> dict[str, Any]:
+    """Return how a number is read that is None if a file states false; true is an error."""
+
+    def load(value: float | bool) -> float | None:
+        if value is True:
+            raise SettingsError(if_true)
+        return None if value is False else value
+
+    def dump(value: float | None) -> float | bool:
+        return False if value is None else value
+
+    return {"reads": (int, float, bool), "load": load, "dump": dump}
 
 
 @dataclass(frozen=True)
@@ -50,9 +58,7 @@ class SignalSettings(Settings):
         8.0,
         "cut-off of the zero-phase Butterworth filter [Hz]; false for no filter",
         within=_HZ,
-        reads=(int, float, bool),
-        load=_load_cutoff,
-        dump=lambda value: False if value is None else value,
+        **or_false("cutoff is true, wanted a frequency [Hz], or false for no filter"),
     )
     order: int = setting(
         4,
