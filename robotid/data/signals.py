@@ -10,11 +10,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from itertools import pairwise
-from math import factorial
 from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
+from numpy.polynomial.polynomial import polyder, polyval
 from scipy.linalg.lapack import dtbtrs
 
 from robotid.base.exceptions import DataError, SettingsError
@@ -625,16 +625,13 @@ def local_polynomial(
     half = width // 2
     offsets = np.arange(-half, half + 1)
     fit = np.linalg.pinv(np.vander(offsets, degree + 1, increasing=True))  # (degree + 1, width)
-    scale = factorial(derivative) / step**derivative
-    inner = sliding_window_view(x, width, axis=0) @ (scale * fit[derivative])
-    powers = np.arange(degree + 1 - derivative)
-    slopes = [factorial(k + derivative) / factorial(k) / step**derivative for k in powers]
+    terms = polyder(np.eye(degree + 1), derivative, 1 / step)
 
-    def end(rows: Array, at: Array) -> Array:
-        """Return the values at some offsets by the polynomial of ``width`` rows."""
-        coefficients = np.tensordot(fit[derivative:], rows, axes=1)
-        return np.tensordot(at[:, None] ** powers * slopes, coefficients, axes=1)
+    def weights(at: Array) -> Array:
+        """Return those of the rows in the values at some offsets, shape (k, width)."""
+        return np.asarray(polyval(at, terms).T @ fit)
 
-    return np.concatenate(
-        [end(x[:width], offsets[:half]), inner, end(x[-width:], offsets[half + 1 :])]
-    )
+    inner = sliding_window_view(x, width, axis=0) @ weights(offsets[half : half + 1])[0]
+    first = np.tensordot(weights(offsets[:half]), x[:width], axes=1)
+    last = np.tensordot(weights(offsets[half + 1 :]), x[-width:], axes=1)
+    return np.concatenate([first, inner, last])

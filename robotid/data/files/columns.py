@@ -8,6 +8,7 @@ import re
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
+from itertools import chain
 from typing import Literal, TypeAlias
 
 import numpy as np
@@ -281,8 +282,14 @@ class Finder:
         """Return the columns to read: time, q, required quantities, complete optional ones."""
         self._check_arguments()
         self.notes.extend(self.reading.notes)
-        found = {"time": [self._find("time", self._clocks()) or self._no_time()]}
-        optional, wanted = ["dq", "ddq"], self._wanted()
+        if (clock := self._find("time", self._clocks())) is None:
+            raise DataError(
+                f"{self.where} has no column 'time'; columns found: {listed(self.names)}. Rename "
+                'it, or state in the job file: columns = { time = "NAME" }, or without time stamps '
+                "the rate of the rows [Hz]: log = { rate = 100 }",
+                code="missing_column",
+            )
+        found, optional, wanted = {"time": [clock]}, ["dq", "ddq"], self._wanted()
         self._require(wanted)
         found["q"] = list(filter(None, map(self._find_of, *self._places("q"))))
         if "commands" in wanted:
@@ -333,11 +340,8 @@ class Finder:
     @property
     def motors(self) -> dict[str, str]:
         """The motor that corresponds to each joint that has one, by joint."""
-        return {
-            joint: motor
-            for gear in self.gears
-            for joint, motor in zip(gear.joints, gear.names, strict=True)
-        }
+        pairs = (zip(gear.joints, gear.names, strict=True) for gear in self.gears)
+        return dict(chain.from_iterable(pairs))
 
     def of_motors(self, kind: str) -> tuple[bool, ...]:
         """Return for which joints a quantity is read from the corresponding motor."""
@@ -360,11 +364,7 @@ class Finder:
 
     def has_torque(self, joint: str) -> bool:
         """Return whether the file has a torque or a current of a joint."""
-        return self._has("tau", joint) or self._has("current", joint)
-
-    def has_position(self, joint: str) -> bool:
-        """Return whether the file has the position of a joint."""
-        return self._has("q", joint)
+        return self.has("tau", joint) or self.has("current", joint)
 
     def _places(self, kind: str) -> tuple[list[str], list[str]]:
         """Return the kinds and names of the columns of each joint: its own, or its motor's."""
@@ -462,7 +462,7 @@ class Finder:
         if self.needs != "any":
             return {self.needs}
         has_torque = any(map(self.has_torque, self.joints))
-        has_command = [self._has("qref", joint) for joint in self.joints]
+        has_command = [self.has("qref", joint) for joint in self.joints]
         is_commanded = all(has_command) or (any(has_command) and not has_torque)
         wanted = {"commands"} if is_commanded else set[str]()
         return wanted | ({"torque"} if has_torque or not wanted else set())
@@ -472,8 +472,8 @@ class Finder:
         without = [
             joint
             for joint, kind, name in zip(self.joints, *self._places("tau"), strict=True)
-            if joint not in self.passive and not self._has(kind, name)
-            and not (name in self.gains and self._has(f"current{kind[3:]}", name))
+            if joint not in self.passive and not self.has(kind, name)
+            and not (name in self.gains and self.has(f"current{kind[3:]}", name))
         ]  # fmt: skip
         if without and any(map(self.has_torque, self.joints)):
             self.notes.append(
@@ -485,8 +485,8 @@ class Finder:
         """Return the error of a current without a gain, with the missing columns of all joints."""
         without, absent = [joint], list[str]()
         if joint in self.joints:
-            logged = [other for other in self.joints if self._has("current", other)]
-            without = [x for x in logged if not self._has("tau", x) and x not in self.gains]
+            logged = [other for other in self.joints if self.has("current", other)]
+            without = [x for x in logged if not self.has("tau", x) and x not in self.gains]
             absent = [x for x in self.joints if not self.has_torque(x)]
         has = f"joint {joint!r} has the current {current!r}"
         if len(without) > 1:
@@ -522,25 +522,12 @@ class Finder:
         plain = [name for name in clocks if name in ("time", "t")]
         return plain or [name for name in clocks if "header" in name.lower()] or clocks
 
-    def _no_time(self) -> str:
-        """Reject a log without a time column."""
-        raise DataError(
-            f"{self.where} has no column 'time'; columns found: {listed(self.names)}. Rename it, "
-            'or state in the job file: columns = { time = "NAME" }, or without time stamps the '
-            "rate of the rows [Hz]: log = { rate = 100 }",
-            code="missing_column",
-        )
-
-    def _has(self, kind: str, joint: str) -> bool:
+    def has(self, kind: str, joint: str) -> bool:
         """Return whether the file has a quantity of a joint or of its motor."""
-        return (
-            f"{kind}_{joint}" in self.columns
-            or (kind, joint) in self.reading.columns
-            or (
-                (kind in _OF_JOINTS and joint in self.motors)
-                and self._has(f"{kind}m", self.motors[joint])
-            )
-        )
+        if f"{kind}_{joint}" in self.columns or (kind, joint) in self.reading.columns:
+            return True
+        is_driven = kind in _OF_JOINTS and joint in self.motors
+        return is_driven and self.has(f"{kind}m", self.motors[joint])
 
     # --- a log that lacks required columns --------------------------------------------------------
 
@@ -557,9 +544,9 @@ class Finder:
                 (kind, name)
                 for joint, kind, name in zip(self.joints, *self._places("tau"), strict=True)
                 if joint not in self.passive
-                and not (self._has(kind, name) or self._has(f"current{kind[3:]}", name))
+                and not (self.has(kind, name) or self.has(f"current{kind[3:]}", name))
             ]
-        has_no_gain = any(self._has("current", x) and x not in self.gains for x in self.joints)
+        has_no_gain = any(self.has("current", x) and x not in self.gains for x in self.joints)
         if not absent or (has_no_gain and all(kind == "tau" for kind, _ in absent)):
             return  # the error of a missing gain names these joints, too
         clock = self._find("time", self._clocks())
@@ -639,8 +626,8 @@ class Finder:
             )
         kind, joints = absent[0][0], [joint for _, joint in absent]
         if kind == "tau" and not any(map(self.has_torque, self.joints)):
-            return without_torque(all(self._has("qref", other) for other in self.joints))
-        if kind == "qref" and not any(self._has("qref", other) for other in self.joints):
+            return without_torque(all(self.has("qref", other) for other in self.joints))
+        if kind == "qref" and not any(self.has("qref", other) for other in self.joints):
             return "; ".join(["Record the commands of the controller", *self.notes])
         at_rest = [joint for joint in self.joints if joint in joints]
         if len(at_rest) == len(self.joints):

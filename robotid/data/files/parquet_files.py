@@ -294,8 +294,7 @@ def _episode(path: Path, numbers: Sequence[int], wanted: str | None) -> int:
     if not names:
         raise DataError(f"{path.name} has no episode: its files data/**/*.parquet have no rows")
     if wanted is None:
-        chosen = choose(path.name, names, "episodes", "each episode is a separate log")
-        return numbers[names.index(chosen)]
+        wanted = choose(path.name, names, "episodes", "each episode is a separate log")
     digits = re.fullmatch(r"(?:episode_)?0*([0-9]+)", wanted)
     chosen = f"episode_{digits[1]}" if digits else wanted
     if chosen not in names:

@@ -355,7 +355,7 @@ def lay_out(
         needs, notes, {*chain.from_iterable(of_base.values()), *opened.sensors}, passive,
         tuple(robot), partial(_moves, opened, units, prismatic),
     )  # fmt: skip
-    joints = [joint for joint in joints if joint not in passive or finder.has_position(joint)]
+    joints = [joint for joint in joints if joint not in passive or finder.has("q", joint)]
     finder = replace(finder, joints=tuple(joints))
     if base.wrenches and needs in ("torque", "any") and not any(map(finder.has_torque, joints)):
         finder = replace(finder, needs="motion")

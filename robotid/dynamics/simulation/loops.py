@@ -71,20 +71,18 @@ class Loops:
 def open_loops(model: RobotModel, pi: Array) -> Loops:
     """Return bodies and drives of standard parameters without control: no gain, no delay."""
     layout, n = model.layout, len(model.joints)
-    terms: list[list[DriveTerm]] = [[] for _ in range(n)]
-    values: list[list[float]] = [[] for _ in range(n)]
     armature, none = np.zeros(n), np.zeros(n)
-    drives = zip(layout.drive_parameters, pi[layout.n_inertial :].tolist(), strict=True)
-    for (d, term), value in drives:
+    drives: list[list[tuple[DriveTerm, float]]] = [[] for _ in range(n)]
+    for (d, term), value in zip(layout.drive_parameters, pi[layout.n_inertial :], strict=True):
         if term.is_inertia:
             armature[d] = value
         else:
-            terms[d].append(term)
-            values[d].append(value)
+            drives[d].append((term, value))
     return Loops(
         bodies=pi[: layout.n_inertial].reshape(-1, 10), armature=armature, kp=none, kd=none,
-        limit=np.full(n, np.inf), delay=none, zero=none, terms=tuple(map(tuple, terms)),
-        values=np.concatenate([np.zeros(0), *values]),
+        limit=np.full(n, np.inf), delay=none, zero=none,
+        terms=tuple(tuple(term for term, _ in drive) for drive in drives),
+        values=np.array([value for drive in drives for _, value in drive]),
     )  # fmt: skip
 
 
@@ -125,8 +123,8 @@ class Window:
         if self.given is not None:
             return self.given
         t, q, k, near = self.log.t, self.log.q, self.start_row, self._near
-        along, order = t[near] - t[k], min(2, len(t[near]) - 1)
-        fit = np.polynomial.polynomial.polyfit(along, q[near], order)
+        order = min(2, len(t[near]) - 1)
+        fit = np.polynomial.polynomial.polyfit(t[near] - t[k], q[near], order)
         return np.stack([q[k], fit[1]])
 
 
@@ -417,7 +415,7 @@ def _failed_at(
         row, i, lane = (int(k) for k in np.unravel_index(np.argmax(is_fast), v.shape))
         return row, lane, i, q[0, :, lane]
     before, change = last
-    size = np.where(np.isfinite(change), np.abs(change), np.inf)
+    size = np.nan_to_num(np.abs(change), nan=np.inf, posinf=np.inf)
     i, lane = (int(k) for k in np.unravel_index(np.argmax(size), size.shape))
     return row, lane, i, np.clip(np.nan_to_num(before[:, lane]), -_FASTEST, _FASTEST)
 
@@ -445,12 +443,10 @@ def _wrong_friction(model: RobotModel, loops: Loops, j: int, angle: float) -> st
     """Return which friction of a joint makes its motion impossible or ambiguous; else ""."""
     name = model.joints[j]
     for term in loops.terms[j]:
-        value, wanted = float(loops.values[loops.place(j, term)]), ""
-        if term.is_nonnegative and value < 0.0:
-            wanted = "0 or more"
-        elif value > term.highest:
-            wanted = f"at most {term.highest:g}"
-        if wanted:
+        value = float(loops.values[loops.place(j, term)])
+        is_negative = term.is_nonnegative and value < 0.0
+        if is_negative or value > term.highest:
+            wanted = "0 or more" if is_negative else f"at most {term.highest:g}"
             return (
                 f"the simulation of {name} has no solution: {name}.{term.name} is {value:.3g}, "
                 f"wanted {wanted}. Set other friction terms of {name} in [drives]"
