@@ -35,7 +35,6 @@ _IMU_REMEDY = (
     "Record imu_wx, imu_wy, imu_wz [rad/s], imu_ax, imu_ay, imu_az [m/s^2], and the orientation "
     "imu_qx, imu_qy, imu_qz, imu_qw, or that of the base"
 )
-_TURN = 2.0 * np.pi  # [rad] larger roll and pitch are in degrees
 _UNIT = 1e-3  # tolerance of the norm of a logged quaternion
 _BESIDE, _USUAL = 32, 75.0  # rows beside a step, and the percentile of their steps ...
 _JUMPS = 15.0  # ... times which a step relative to those before and after it is a jump ...
@@ -256,7 +255,7 @@ def _pose_of(values: Mapping[str, Array], frame: ImuFrame | None) -> Array | Non
 def _radians(angles: Array) -> Array:
     """Return roll, pitch and yaw (N, 3); refuse those in degrees. Yaw may count full turns."""
     largest = float(np.abs(angles[:, :2]).max(initial=0.0))
-    if largest > _TURN:
+    if largest > 2.0 * np.pi:
         raise DataError(
             f"base_roll and base_pitch are up to {largest:.4g}, wanted at most pi: they look like "
             "degrees. Convert base_roll, base_pitch and base_yaw to rad",

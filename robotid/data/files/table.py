@@ -279,7 +279,8 @@ def with_even_stamps(table: Table, column: str, stamp: str = "even") -> Table:
         t = np.concatenate([np.empty(0), *blocks])
         if len(t) < 2:
             return np.array([0.0, *t])
-        return np.polyfit(np.arange(len(t)), t - t[0], 1) + np.array([0.0, t[0]])
+        slope, start = np.polyfit(np.arange(len(t)), t - t[0], 1)
+        return np.array([slope, start + t[0]])
 
     def stamps(row: int, t: Array) -> Array:
         return np.polyval(line(), np.arange(row, row + len(t)))
