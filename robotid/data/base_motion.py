@@ -160,10 +160,10 @@ def base_columns(
 ) -> dict[str, list[str]]:
     """Return the columns of a floating base and of contacts in a file, by kind."""
     names = [*names, *columns]
-    found = _columns_of_base(where, names, wanted) if wanted.floats else {}
-    found["contact"] = [f"contact_{link}" for link in wanted.present(names).contacts]
-    found["wrench"] = [f"wrench_{name.replace(' ', '_', 1)}" for name in wanted.wrenches]
-    if missing := [name for name in found["wrench"] if name not in names]:
+    by_kind = _columns_of_base(where, names, wanted) if wanted.floats else {}
+    by_kind["contact"] = [f"contact_{link}" for link in wanted.present(names).contacts]
+    by_kind["wrench"] = [f"wrench_{name.replace(' ', '_', 1)}" for name in wanted.wrenches]
+    if missing := [name for name in by_kind["wrench"] if name not in names]:
         seen = [name for name in names if name.startswith("wrench_")]
         cells = [x for x in seen if x.startswith(tuple(f"{name}_" for name in missing))]
         sums = f"If {listed(cells)} are cells of a foot, add a column of their sum. "
@@ -175,7 +175,7 @@ def base_columns(
         )
     return {
         kind if kind in ("contact", "wrench") else f"base {kind}": [columns.get(x, x) for x in own]
-        for kind, own in found.items()
+        for kind, own in by_kind.items()
         if own
     }
 
@@ -192,13 +192,13 @@ def _columns_of_base(where: str, names: Sequence[str], wanted: BaseColumns) -> d
         orientations = [kind for kind in forms if kind != "imu"]
     elif not wanted.link:
         forms |= {"twist": ("base", TWIST), "acceleration": ("base", ACCELERATION)}
-    whole = {kind: [f"{start}_{end}" for end in ends] for kind, (start, ends) in forms.items()}
-    present = {kind: columns for kind, columns in whole.items() if set(columns) <= set(names)}
+    of_kind = {kind: [f"{start}_{end}" for end in ends] for kind, (start, ends) in forms.items()}
+    present = {kind: columns for kind, columns in of_kind.items() if set(columns) <= set(names)}
     used = next((kind for kind in orientations if kind in present), "")
-    missing = [x for x in whole.get("imu", ()) if x not in names]
+    missing = [x for x in of_kind.get("imu", ()) if x not in names]
     needs_pose = wanted.imu is None or wanted.needs_heading or not wanted.imu.gravity.any()
     if not used and not missing and needs_pose:
-        missing = [x for x in whole.get("imu quaternion", whole["pose"]) if x not in names]
+        missing = [x for x in of_kind.get("imu quaternion", of_kind["pose"]) if x not in names]
     if missing:
         seen = [name for name in names if name.startswith(("base_", "imu_"))]
         what = "the pose of the floating base" if wanted.imu is None else "the IMU"
@@ -329,19 +329,19 @@ def pose_jumps(t: Array, pose: Array) -> tuple[Array, Array, Array]:
     dt, sizes = np.diff(t), np.zeros((2, len(t)))
     if len(dt) < 3:
         return np.empty(0, dtype=int), np.empty(0), np.empty(0)
-    whole = dt < GAP_STEPS * np.median(dt)
-    whole = whole[1:-1] & whole[:-2] & whole[2:]
-    for found, values, least in zip(
+    is_regular = dt < GAP_STEPS * np.median(dt)
+    is_regular = is_regular[1:-1] & is_regular[:-2] & is_regular[2:]
+    for jumps, values, least in zip(
         sizes, (pose[:, :3], 2.0 * pose[:, 3:]), _SMALLEST, strict=True
     ):
         steps = np.diff(values, axis=0)
         size = np.linalg.norm(steps[1:-1] - 0.5 * (steps[:-2] + steps[2:]), axis=1)
         impact = np.linalg.norm(steps[2:] - steps[:-2], axis=1) > size  # a change of the speed
-        for k in np.flatnonzero(whole & ~impact & (size > least)):
+        for k in np.flatnonzero(is_regular & ~impact & (size > least)):
             beside = slice(max(k - _BESIDE, 0), k + _BESIDE + 1)
-            usual = np.percentile(size[beside][whole[beside]], _USUAL)
+            usual = np.percentile(size[beside][is_regular[beside]], _USUAL)
             if size[k] > _JUMPS * usual and size[k] == size[max(k - 1, 0) : k + 2].max():
-                found[k + 2] = size[k]
+                jumps[k + 2] = size[k]
     rows = np.flatnonzero(sizes.any(axis=0))
     return rows, *sizes[:, rows]
 
@@ -468,8 +468,8 @@ def _mean(t: Array, x: Array) -> Array:
     first, last = (np.clip(t + side * _LEVEL / 2, t[0], t[-1]) for side in (-1, 1))
     for _ in range(2):
         areas = 0.5 * np.diff(t)[:, None] * (x[1:] + x[:-1])
-        whole = np.vstack([np.zeros(x.shape[1]), np.cumsum(areas, axis=0)])
-        ends = [np.stack([np.interp(at, t, y) for y in whole.T], axis=1) for at in (first, last)]
+        integral = np.vstack([np.zeros(x.shape[1]), np.cumsum(areas, axis=0)])
+        ends = [np.stack([np.interp(at, t, y) for y in integral.T], axis=1) for at in (first, last)]
         x = (ends[1] - ends[0]) / (last - first)[:, None]
     return x
 

@@ -382,10 +382,10 @@ def _names(joints: object, where: str) -> tuple[str, ...]:
     """Return the names of joints as a tuple."""
     names = joints.tolist() if isinstance(joints, np.ndarray) else joints
     is_list = isinstance(names, Iterable) and not isinstance(names, str | Mapping)
-    found: tuple[Any, ...] = tuple(names) if is_list else ()  # type: ignore[arg-type]
-    if not found or not all(isinstance(name, str) for name in found):
+    labels: tuple[Any, ...] = tuple(names) if is_list else ()  # type: ignore[arg-type]
+    if not labels or not all(isinstance(name, str) for name in labels):
         raise DataError(f"{where}: joints is {joints!r}, wanted at least one name in a tuple")
-    return found
+    return labels
 
 
 def require_finite(
@@ -536,9 +536,9 @@ def _segments(motion: Trajectory, size: Array, count: int | None) -> Array:
     if last <= 0:
         return np.empty((0, len(_AHEAD) * len(size)))
     starts = np.arange(last)
-    whole = motion.segment[starts] == motion.segment[starts + ahead[-1]]
+    is_unbroken = motion.segment[starts] == motion.segment[starts + ahead[-1]]
     moved = np.abs(motion.q[starts + ahead[-1]] - motion.q[starts]) / size
-    starts = starts[whole & (moved.max(axis=1) > 2 * _NEAR)]
+    starts = starts[is_unbroken & (moved.max(axis=1) > 2 * _NEAR)]
     if count is not None and len(starts) > count:
         starts = starts[np.linspace(0, len(starts) - 1, count).astype(int)]
     else:

@@ -131,8 +131,8 @@ def rigid_parts(model: RobotModel, pi: Array, q: Array, v: Array, a: Array) -> l
     """
     still = np.zeros_like(v)
     states = ((still, still), (still, a), (v, a))
-    g, g_and_Ma, whole = (_bodies_torque(model, pi, q, *x) for x in states)
-    return [g, g_and_Ma - g, whole - g_and_Ma]
+    g, g_and_Ma, total = (_bodies_torque(model, pi, q, *x) for x in states)
+    return [g, g_and_Ma - g, total - g_and_Ma]
 
 
 def _from_rows(source: TrajectoryRows, stacked: Array) -> list[Array]:

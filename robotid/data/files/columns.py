@@ -69,7 +69,7 @@ def read_names(
 ) -> Reading:
     """Return the columns of each joint."""
     joints = {label: place for place, label in places.items()}
-    read = [(name, found) for name in names if (found := quantity_of(name, effort, joints))]
+    read = [(name, quantity) for name in names if (quantity := quantity_of(name, effort, joints))]
     if numbered := _numbered(read, joints, orders):
         return numbered
     columns: dict[tuple[str, str], list[str]] = {}
@@ -142,10 +142,10 @@ def quantity_of(
 
 def named_by_row(row: Mapping[str, object]) -> dict[str, str]:
     """New names of columns whose joint is a text in a row: field.position0 by field.name0."""
-    found = {match: cell for x, cell in row.items() if (match := _NAME.fullmatch(x))}
+    joints = {match: cell for x, cell in row.items() if (match := _NAME.fullmatch(x))}
     return {
         x: f"{x.removesuffix(match[2])}_{str(joint).strip()}"
-        for match, joint in found.items()
+        for match, joint in joints.items()
         for x in row
         if x.startswith(match[1]) and x.endswith(match[2]) and is_quantity(x.removesuffix(match[2]))
     }
@@ -289,17 +289,17 @@ class Finder:
                 "the rate of the rows [Hz]: log = { rate = 100 }",
                 code="missing_column",
             )
-        found, optional, wanted = {"time": [clock]}, ["dq", "ddq"], self._wanted()
+        chosen, optional, wanted = {"time": [clock]}, ["dq", "ddq"], self._wanted()
         self._require(wanted)
-        found["q"] = list(filter(None, map(self._find_of, *self._places("q"))))
+        chosen["q"] = list(filter(None, map(self._find_of, *self._places("q"))))
         if "commands" in wanted:
-            found["qref"] = list(filter(None, map(self._find_of, *self._places("qref"))))
+            chosen["qref"] = list(filter(None, map(self._find_of, *self._places("qref"))))
             optional += ["dqref", "tauref"]
         if "torque" in wanted or ("commands" in wanted and self._has_all_torques()):
             places = zip(self.joints, *self._places("tau"), strict=True)
-            found["tau"] = ["" if joint in self.passive else self._find_torque(kind, name)
+            chosen["tau"] = ["" if joint in self.passive else self._find_torque(kind, name)
                             for joint, kind, name in places]  # fmt: skip
-        found |= {kind: names for kind in optional if (names := self._find_optional(kind))}
+        chosen |= {kind: names for kind in optional if (names := self._find_optional(kind))}
         sizes = [name for name in self.names if name.startswith(_SIZES) and name not in self.seen]
         if sizes:
             self.notes.append(
@@ -309,11 +309,11 @@ class Finder:
         extra = [name for name in self.names if name not in {*self.seen, *sizes}]
         if extra:
             self.notes.append(f"columns ignored: {listed(extra)}")
-        if twice := repeated([name for names in found.values() for name in names if name]):
+        if twice := repeated([name for names in chosen.values() for name in names if name]):
             raise SettingsError(
                 f"{self.where}: {listed(twice)} are read twice; correct columns in the job file"
             )
-        return found
+        return chosen
 
     def factors(self, torques: Sequence[str]) -> tuple[float, ...]:
         """Return the factor that converts each of n columns to a torque: a current's gain, or 1."""
@@ -552,28 +552,28 @@ class Finder:
         clock = self._find("time", self._clocks())
         read = {*self.joints, *self.motors.values()}
         columns = self.reading.columns.items()
-        found = {"time": clock} if clock else {}
-        found |= {f"{kind}_{x}": own for (kind, x), (own, *_) in columns if x in read}
-        found |= self.columns
+        recognised = {"time": clock} if clock else {}
+        recognised |= {f"{kind}_{x}": own for (kind, x), (own, *_) in columns if x in read}
+        recognised |= self.columns
         of_others = {name for (_, x), own in columns if x not in read for name in own}
         names = [name for name in self.names if name not in of_others]
-        raise self._missing(names, absent, found)
+        raise self._missing(names, absent, recognised)
 
     def _missing(
-        self, names: Sequence[str], absent: Sequence[tuple[str, str]], found: Mapping[str, str]
+        self, names: Sequence[str], absent: Sequence[tuple[str, str]], recognised: Mapping[str, str]
     ) -> DataError:
         """Return the error of missing columns: what was found, and a table to complete.
 
-        ``absent`` has quantity and joint, or motor; ``found`` the columns by standard name.
+        ``absent`` has quantity and joint, or motor; ``recognised`` the columns by standard name.
         """
         sought = [f"{kind}_{self._named(place)}" for kind, place in absent]
         sizes = [name for name in names if name.startswith(_SIZES)]
-        left = [x for x in names if x not in {*found.values(), *sizes}]
+        left = [x for x in names if x not in {*recognised.values(), *sizes}]
         nouns = dict.fromkeys(NOUNS[kind.removesuffix("m")] for kind, _ in absent)
         ends = tuple(kind.replace("tau", t) + "_" for kind, _ in absent for t in ("tau", "current"))
-        of_kind = [column for key, column in found.items() if key.startswith(ends)]
+        of_kind = [column for key, column in recognised.items() if key.startswith(ends)]
         references = tuple(f"{kind.removesuffix('ref')}ref_" for kind, _ in absent)
-        read = [x for key, x in found.items() if key.startswith(references)]
+        read = [x for key, x in recognised.items() if key.startswith(references)]
         commanded = [x for x in names if is_commanded(x) and x in {*left, *read}]
         others = [name for name in left if name not in commanded]
         text = (
@@ -589,7 +589,7 @@ class Finder:
         by_order, remedy = self._by_order(left, absent), self._remedy(absent)
         if not (by_order or others):
             return DataError(f"{text} {remedy}", code="missing_column")
-        lines = [f"{toml_key(key)} = {quoted(x)}" for key, x in found.items()]
+        lines = [f"{toml_key(key)} = {quoted(x)}" for key, x in recognised.items()]
         lines += [f"{toml_key(key)} = {quoted(x)}  # by order" for key, x in by_order.items()]
         lines += [f'# {toml_key(key)} = "NAME"' for key in map("_".join, absent)
                   if key not in by_order]  # fmt: skip

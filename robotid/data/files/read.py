@@ -359,12 +359,12 @@ def lay_out(
     finder = replace(finder, joints=tuple(joints))
     if base.wrenches and needs in ("torque", "any") and not any(map(finder.has_torque, joints)):
         finder = replace(finder, needs="motion")
-    found = finder.find_all() | of_base  # names of columns by kind
+    by_kind = finder.find_all() | of_base  # names of columns by kind
     layout = LogLayout(
         path=str(Path(path)) if isinstance(path, str | Path) else "",
         joints=tuple(joints),
-        columns=found,
-        factors=finder.factors(found.get("tau", [])),
+        columns=by_kind,
+        factors=finder.factors(by_kind.get("tau", [])),
         units=units,
         prismatic=tuple(prismatic),
         source=source,
@@ -377,7 +377,7 @@ def lay_out(
         assumed=finder.reading.assumed,
         turning=tuple(joint.name for joint in robot if joint.turns_freely),
     )
-    return layout, with_even_stamps(opened, found["time"][0], source.stamp)
+    return layout, with_even_stamps(opened, by_kind["time"][0], source.stamp)
 
 
 def _opened(path: str | Path | Frame, source: LogSource) -> tuple[str, Table]:
