@@ -124,8 +124,7 @@ def drive_moments(
     layout, n = model.layout, len(model.joints)
     sums: dict[str, tuple[tuple[str, ...], Array, float, int]] = {}
     for trajectory, mask in recordings if layout.own else ():
-        along = drive_motion_along(model, trajectory)
-        motion = replace(along, rate=np.zeros_like(along.rate), begins=None)
+        motion = replace(drive_motion_along(model, trajectory, has_rate=False), begins=None)
         for d, drive in enumerate(layout.drives):
             if drive.name not in layout.own:
                 continue

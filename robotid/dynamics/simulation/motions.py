@@ -125,29 +125,16 @@ class SampledMotion(Motion):
 
 
 def random_fourier(
-    model: RobotModel,
-    rng: np.random.Generator,
-    *,
-    period: float = 10.0,
-    centre: Array | None = None,
+    model: RobotModel, rng: np.random.Generator, *, period: float = 10.0
 ) -> FourierTrajectory:
-    """Return a random motion within the position and speed limits of a robot's URDF.
-
-    Its mean position ``centre`` (n,) is the middle of the limits, or 0, if None.
-    """
+    """Return a random motion about the middle of a robot's limits, or 0, within these limits."""
     n = len(model.joints)
     sine, cosine = rng.standard_normal((2, _HARMONICS, n)) / np.arange(1, _HARMONICS + 1)[:, None]
-    middle = [(j.lower + j.upper) / 2 if j.has_limits else 0.0 for j in model.limits]
-    mean = np.array(middle) if centre is None else centre
+    mean = np.array([(j.lower + j.upper) / 2 if j.has_limits else 0.0 for j in model.limits])
     amplitude, speed = np.empty(n), np.empty(n)
     for j, joint in enumerate(model.limits):
         size, highest = _LARGEST[joint.type == "prismatic"]
         room = min(joint.upper - mean[j], mean[j] - joint.lower) if joint.has_limits else np.inf
-        if room <= 0:
-            raise DataError(
-                f"the centre {mean[j]:g} of joint {joint.name!r} is not inside its limits "
-                f"{joint.lower:g} to {joint.upper:g}"
-            )
         amplitude[j] = min(size, 0.9 * room)
         speed[j] = min(highest, 0.9 * joint.velocity) if joint.velocity > 0 else highest
     unit = FourierTrajectory(np.zeros(n), sine, cosine, period)

@@ -47,13 +47,6 @@ def test_a_fourier_motion_keeps_its_derivatives(rng):
     np.testing.assert_allclose(motion.evaluate(t + 4.0)[0], q, atol=1e-12)
 
 
-def test_a_centre_outside_the_limits_is_refused(panda, rng):
-    centre = np.zeros(7)
-    centre[3] = 0.5
-    with pytest.raises(DataError, match=r"the centre 0.5 of joint 'panda_joint4' is not inside"):
-        random_fourier(panda, rng, centre=centre)
-
-
 def test_the_log_of_the_plant_obeys_its_own_equation(ur5, rng):
     pi = truth(ur5)
     log = simulate(ur5, pi, random_fourier(ur5, rng), rate=1000.0, duration=1.0, rng=rng)
