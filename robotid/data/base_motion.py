@@ -213,10 +213,7 @@ def _columns_of_base(where: str, names: Sequence[str], wanted: BaseColumns) -> d
 def base_of(
     t: Array, q: Array, values: Mapping[str, Array], wanted: BaseColumns
 ) -> tuple[BaseMotion | None, str]:
-    """Return the motion of the base from its columns, None without these, and a note or "".
-
-    t (N,) [s], q (N, n) [rad or m], values (N, k).
-    """
+    """Return the motion of the base from its columns (N, k), None without these, and a note."""
     pose, frame = _pose_of(values, wanted.imu), wanted.imu
     if pose is None and frame is not None and "base imu" in values:
         imu, note = motion_of_imu(t, q, _checked(values["base imu"], "IMU", 6), frame)
@@ -353,10 +350,7 @@ def continuous_signs(q: Array) -> Array:
 
 
 def in_base(quaternion: Array, vector: Array) -> Array:
-    """Return vectors with the axes of the base, R^T x, shape (N, 3).
-
-    quaternion (N, 4), vector (N, 3).
-    """
+    """Return vectors (N, 3) with the axes of the base, R^T x: quaternion (N, 4)."""
     u = np.cross(vector, quaternion[:, :3])
     return np.asarray(vector + 2.0 * (quaternion[:, 3:] * u + np.cross(u, quaternion[:, :3])))
 
@@ -368,10 +362,7 @@ def vector_part(p: Array, rate: Array) -> Array:
 
 
 def quaternions_of_angles(angles: Array) -> Array:
-    """Return qx qy qz qw of roll, pitch and yaw, R = Rz(yaw) Ry(pitch) Rx(roll), shape (N, 4).
-
-    angles (N, 3) [rad].
-    """
+    """Return qx qy qz qw of roll, pitch, yaw (N, 3) [rad], R = Rz(yaw) Ry(pitch) Rx(roll)."""
     (cr, cp, cy), (sr, sp, sy) = np.cos(angles.T / 2), np.sin(angles.T / 2)
     return np.column_stack([
         sr * cp * cy - cr * sp * sy, cr * sp * cy + sr * cp * sy,
@@ -391,10 +382,7 @@ def _checked(values: ArrayLike, name: str, width: int) -> Array:
 
 
 def motion_of_imu(t: Array, q: Array, values: Array, frame: ImuFrame) -> tuple[ImuMotion, str]:
-    """Return the motion of an IMU without the bias of its gyroscopes, and a note on the bias.
-
-    t (N,) [s], q (N, n) [rad or m], values (N, 6).
-    """
+    """Return the motion of an IMU (N, 6) without its gyroscopes' bias, and a note on the bias."""
     turned = np.hstack([values[:, :3] @ frame.rotation.T, values[:, 3:] @ frame.rotation.T])
     bias, note = frame.bias, ""
     if bias is None:

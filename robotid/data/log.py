@@ -478,10 +478,7 @@ def blocks_of(t: Array) -> Iterator[tuple[int, Array]]:
 
 
 def median_step(t: Array) -> float:
-    """Return the median time step [s]; those of a long log are sorted in a temporary file.
-
-    t (N,) [s].
-    """
+    """Return the median time step [s] of stamps (N,); those of a long log are sorted in a file."""
     if len(t) <= _BLOCK:
         return float(np.median(np.diff(t)))
     with tempfile.TemporaryFile() as file:

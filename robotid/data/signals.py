@@ -256,10 +256,7 @@ def _time_constant(settings: SignalSettings) -> float:
 
 
 def low_pass(values: Array, rate: float, settings: SignalSettings) -> Array:
-    """Return values after the zero-phase Butterworth filter, same shape; unchanged without one.
-
-    values (N, ...).
-    """
+    """Return values (N, ...) after the zero-phase Butterworth filter, if the settings have one."""
     if settings.cutoff is None or len(values) < 2:
         return values
     pad = min(len(values) - 1, int(2 * rate / settings.cutoff))  # two periods
@@ -559,10 +556,7 @@ def _means(values: Array, first: Array, total: Array) -> Array:
 
 @cache  # a log has few filters, each for many channels
 def butterworth_poles(order: int, cutoff: float, rate: float) -> Array:
-    """Return the poles of a digital Butterworth low-pass filter, by the bilinear transform.
-
-    -> (ceil(order / 2),).
-    """
+    """Return the ceil(order / 2) poles of a Butterworth low-pass, by the bilinear transform."""
     angles = np.pi * (2 * np.arange((order + 1) // 2) + order + 1) / (2 * order)
     analog = np.tan(np.pi * cutoff / rate) * np.exp(1j * angles)
     poles = np.asarray((1 + analog) / (1 - analog))

@@ -116,10 +116,7 @@ def check_reach(
 
 
 def turned(joints: Sequence[str], q: Array, turning: Collection[str]) -> tuple[str, ...]:
-    """Return what is assumed of joints without limits beyond the angles that others may reach.
-
-    q (N, n).
-    """
+    """Return what is assumed of joints without limits that turn farther than others: q (N, n)."""
     far = [name for name, x in zip(joints, q.T, strict=True)
            if name in turning and np.abs(x).max() > _FARTHEST]  # fmt: skip
     if not far:
@@ -206,10 +203,7 @@ def _velocity_factor(log: Log) -> Array:
 
 
 def _displacements(log: Log, v: Array) -> tuple[Array, Array]:
-    """Return displacements over short segments from positions and from speeds, shape (K, n).
-
-    Steps over gaps and over full turns are left out.
-    """
+    """Return displacements over short segments by positions and by speeds, (K, n), but jumps."""
     dt, step = np.diff(log.t)[:, None], np.diff(log.q, axis=0)
     median = float(np.median(dt))
     length = int(np.clip(round(_SEGMENT / median), 1, max(1, len(dt) // 4)))
@@ -241,10 +235,7 @@ def _once(check: Callable[[Log], ResultT]) -> Callable[[Log], ResultT]:
 
 
 def is_trustworthy(log: Log, stated: float = 0.0) -> bool:
-    """Return whether the measured velocities have a small lag and a sufficient resolution.
-
-    They must also correlate with the derivatives of their positions.
-    """
+    """Return whether velocities have a small lag, resolution, and follow from their positions."""
     return is_timely(log, stated) and not coarse_velocities(log) and not unlike_velocities(log)
 
 

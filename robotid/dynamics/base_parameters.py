@@ -62,10 +62,7 @@ class BaseMapping:
         return self.K @ pi
 
     def to_standard(self, beta: Array, prior: Array, spread: Array | None = None) -> Array:
-        """Return the standard parameters nearest to a prior that have these base parameters.
-
-        Nearest in units of the spread: pi = prior + G (beta - K prior), G of ``gain``.
-        """
+        """Return pi = prior + G (beta - K prior), the nearest to a prior in units of the spread."""
         if beta.shape != (len(self.K),):
             raise DataError(f"beta has shape {beta.shape}, wanted ({len(self.K)},)")
         return np.asarray(prior + self.gain(spread) @ (beta - self.to_base(prior)))

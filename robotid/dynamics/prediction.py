@@ -170,11 +170,7 @@ def _has_centres(model: RobotModel, pi: Array) -> bool:
 
 
 def inverse_dynamics(model: RobotModel, pi: Array, trajectory: Trajectory) -> Array:
-    """Return the torque W pi by the recursive Newton-Euler algorithm and the drives' terms.
-
-    For inconsistent bodies, as of ordinary least squares, it is the difference of the torques of
-    two sets of consistent bodies.
-    """
+    """Return the torque W pi by the recursive Newton-Euler algorithm and the drives' terms."""
     torque = _bodies_torque(model, pi, trajectory.q, trajectory.v, trajectory.a)
     if pi[model.layout.n_inertial :].any():
         torque[:, model.n_rows - len(model.joints) :] += drive_torque(model, pi, trajectory)
@@ -182,7 +178,7 @@ def inverse_dynamics(model: RobotModel, pi: Array, trajectory: Trajectory) -> Ar
 
 
 def _bodies_torque(model: RobotModel, pi: Array, q: Array, v: Array, a: Array) -> Array:
-    """Return the torque of any bodies, shape (N, n_rows)."""
+    """Return the torque of bodies, of inconsistent ones as a difference, shape (N, n_rows)."""
     added = _consistent_addition(model, pi)
     torque = _newton_euler(model, pi + added, q, v, a)
     return torque - _newton_euler(model, added, q, v, a) if added.any() else torque
@@ -200,10 +196,7 @@ def body_slopes(model: RobotModel, pi: Array, trajectory: Trajectory) -> TorqueS
 
 
 def body_slopes_by_position(model: RobotModel, pi: Array, trajectory: Trajectory) -> Array:
-    """Return the derivatives of the bodies' torque by the positions alone, shape (N, n, n).
-
-    The others of ``body_slopes`` take several times as long.
-    """
+    """Return ``body_slopes`` by the positions alone, (N, n, n), several times as fast."""
     return _of_consistent(_position_slopes, model, pi, trajectory)[0]
 
 
@@ -260,10 +253,7 @@ def _position_slopes(model: RobotModel, pi: Array, q: Array, v: Array, a: Array)
 
 
 def _torque_slopes(model: RobotModel, pi: Array, q: Array, v: Array, a: Array) -> tuple[Array, ...]:
-    """Return the arrays of ``TorqueSlopes``.
-
-    See Carpentier, Mansard (2018), Analytical Derivatives of Rigid Body Dynamics Algorithms.
-    """
+    """Return the arrays of ``TorqueSlopes`` (Carpentier, Mansard 2018, Analytical Derivatives)."""
     plain, G = model.with_parameters(pi).pin_model, model.velocity_map
     extended, joints = _with_movable_origins(plain)
     own = np.array([extended.joints[k].idx_v for k in joints])  # rows of the robot's own joints
@@ -340,10 +330,7 @@ def drive_motion_along(
 
 
 def _load_torque(model: RobotModel, trajectory: Trajectory) -> Array:
-    """Return the torque of the bodies by the model's reference, shape (N, n_rows) [N m, N].
-
-    The last one is stored with the trajectory: it is that of any terms of the drives.
-    """
+    """Return the bodies' torque by the model's reference, once, (N, n_rows) [N m, N]."""
     pi = model.carried_by[: model.layout.n_inertial]
     known = trajectory.derived.get("load torque")
     if known is None or known[0] is not model.pin_model or not np.array_equal(known[1], pi):

@@ -229,10 +229,7 @@ def _unknown(log: Log, frames: Sequence[str], why: str) -> DataError:
 def _forces(
     model: RobotModel, motion: Trajectory, wanted: Sequence[Contact]
 ) -> tuple[Array, Array]:
-    """Return forces upwards (N, k) [N] and velocities (N, k, 3) [m/s] of links, all touching.
-
-    The noise level of each row is that of its residuals.
-    """
+    """Return forces upwards (N, k) [N] and velocities (N, k, 3) [m/s] of links, all touching."""
     names = [x.frame for x in wanted]
     turned = [
         replace(x, axes="world") if isinstance(x, Contact) and x in wanted else x
@@ -415,10 +412,7 @@ def prefers_measured(model: RobotModel, logs: Sequence[Log], settings: SignalSet
 
 
 def _errors(model: RobotModel, log: Log, settings: SignalSettings) -> Array:
-    """Return the torque prediction errors with measured and differentiated velocities, (n, 2).
-
-    NaN for a joint with too little motion or without torque.
-    """
+    """Return torque prediction errors by both velocities, (n, 2); NaN with too little motion."""
     unknown = np.full((len(model.joints), 2), np.nan)
     if not log.has_torque or model.free_flyer or model.constraints:
         return unknown

@@ -68,10 +68,7 @@ def drive_values(
     direction: Array,
     memory: Array | None = None,
 ) -> Array:
-    """Return the columns of drive parameters, shape (k, N), at the speed w of their drives.
-
-    Row j of the regressor has them times ``layout.drive_loads[j]``. memory (N, m).
-    """
+    """Return the columns of drive parameters, (k, N); ``drive_loads[j]`` times these: row j."""
     motion = drive_motion(layout, q, v, a, direction)
     states, wanted = np.empty((len(v), 0)) if memory is None else memory, layout.remembering
     if states.shape != (len(v), len(wanted)):

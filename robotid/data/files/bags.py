@@ -65,10 +65,7 @@ class _Bag:
         return {topic: kind for topic, kind in self.types.items() if topic in filled}
 
     def messages(self, topic: str) -> Iterator[tuple[int, Any]]:
-        """Yield stamp [ns] and message; errors of the library become a DataError.
-
-        The stamp is that of the header, if there is one.
-        """
+        """Yield stamp [ns], of the header if any, and message; errors become a DataError."""
         chosen, is_stamped = [c for c in self.reader.connections if c.topic == topic], False
         count = 0
         try:

@@ -213,10 +213,7 @@ _Place = tuple[str, int]  # a feature, and the number of a value in its vectors
 
 
 def _open_episode(path: Path, source: LogSource) -> Table:
-    """Return the table of an episode: the topic, as ``episode_3``, or the only one.
-
-    LeRobot computes the time stamps of an episode from the numbers of the frames.
-    """
+    """Return the table of an episode: that of the topic, as ``episode_3``, or the only one."""
     pa = load_pyarrow("reading LeRobot datasets")
     columns = _motor_columns(path, _features(path))
     parts: dict[int, list[Path]] = {}  # files with rows of an episode, by its number

@@ -373,10 +373,7 @@ def _advance_bristles(work, at, terms, span, step):
 
 @compiled
 def _initialise_bristles(work, at, columns, terms):
-    """Write the initial z and its derivative by the initial speed v.
-
-    It is that of steady sliding, unless the joint needs more than ``_MOVED_BEFORE`` for it.
-    """
+    """Write the initial z of ``initial_deflection`` and its derivative by the initial speed v."""
     kinds, sums, P = columns.kinds, columns.sums, at.P
     for slot in range(len(terms.bristles)):
         x, i = terms.shapes[terms.bristles[slot, 0]], terms.bristles[slot, 1]
@@ -609,10 +606,7 @@ def _law(address, shapes, z, x0, x1, x2, x3):
 
 @compiled
 def term(codes, shapes, k, q, u, s, s_u):
-    """Return the regressor of a term, and its derivatives by speed and position.
-
-    ``s`` and ``s_u`` are of ``direction``; the joint load torque is left out.
-    """
+    """Return the regressor of a term but its load, and its derivatives by speed and position."""
     by_speed, by_position, kind = codes[k, 0], codes[k, 1], codes[k, 2]
     x, a, a_u, b, b_q = shapes[k], 1.0, 0.0, 1.0, 0.0
     if by_speed:
@@ -700,11 +694,7 @@ def initial_deflection_by_lane(x, v, time):
 
 @compiled
 def loop_torque(drive, error, speed_error, forward):
-    """Return the torque that a loop commands, and 1 below its limit, else 0.
-
-    ``error`` and ``speed_error`` are those of position and speed, ``forward`` is the feed-forward
-    torque.
-    """
+    """Return the torque that a loop commands, and 1 below its limit, else 0."""
     unlimited, limit = drive[1] * error + drive[2] * speed_error + forward, drive[3]
     is_free = abs(unlimited) < limit
     return where(is_free, unlimited, copysign(limit, unlimited)), where(is_free, 1.0, 0.0)
@@ -738,10 +728,7 @@ def by_loop(kind, is_on, error, speed_error, by_delay, torque):
 
 @compiled
 def average_command(stamps, values, times, delay, mean, change):
-    """Write the mean command over each step, and its derivative by the delay.
-
-    stamps (N,) [s], values (N,), times (K + 1,) [s], change (K,).
-    """
+    """Write the mean command over each step, (K,), and its derivative by the delay."""
     last, i = len(stamps) - 1, 0
     start = times[0] - delay
     while i < last and stamps[i + 1] <= start:

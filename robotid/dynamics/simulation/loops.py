@@ -209,10 +209,7 @@ class ClosedLoopRobot:
         owners: Sequence[int] | None = None,
         with_speeds: bool = False,
     ) -> list[RollOut]:
-        """Return the simulated motion of windows: directions (D, 10).
-
-        Columns with one owner are added to one sensitivity, that of their owner.
-        """
+        """Return the simulated motion of windows; columns with one owner are added together."""
         kinds = np.array(columns, dtype=np.int64).reshape(-1, 3)
         numbers = np.arange(len(kinds)) if owners is None else np.array(owners, dtype=np.int64)
         wanted = np.column_stack([kinds, numbers])[np.argsort(numbers, kind="stable")]

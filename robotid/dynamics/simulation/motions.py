@@ -25,10 +25,7 @@ class Motion(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class FourierTrajectory(Motion):
-    """A periodic motion q(t) = q0 + sum_k s_k sin(k w t) + c_k cos(k w t), w = 2 pi / period.
-
-    See Swevers et al. (1997), Optimal robot excitation and identification.
-    """
+    """A motion q0 + sum s_k sin(k w t) + c_k cos(k w t), w = 2 pi / period (Swevers 1997)."""
 
     q0: Array  # mean position, shape (n,) [rad or m]
     sine: Array  # coefficients s_k, shape (h, n) [rad or m]
