@@ -46,7 +46,7 @@ from robotid.dynamics.prepared_logs import (
     with_contacts,
 )
 from robotid.dynamics.rows import COMPILED, choose_engine, friction_speeds
-from robotid.estimation.workers.plan import Workload
+from robotid.estimation.work_plan import Workload
 from robotid.robot.model import RobotModel
 
 #: Default number of rows of a piece.
