@@ -392,11 +392,7 @@ def motion_of_imu(t: Array, q: Array, values: Array, frame: ImuFrame) -> tuple[I
 
 
 def bias_at_rest(parts: Sequence[tuple[Array, Array, Array]]) -> tuple[Array, str]:
-    """Return the bias of gyroscopes, shape (3,) [rad/s], and a note on it.
-
-    It is the mean angular velocity in all windows of 0.5 s in which joints and gyroscopes are at
-    rest; 0 without one.
-    """
+    """Return the mean angular velocity (3,) [rad/s] in all windows of rest, or 0, and a note."""
     means = []
     for t, q, w in parts:
         number = ((t - t[0]) / _WINDOW).astype(int)

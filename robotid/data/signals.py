@@ -380,10 +380,7 @@ def _jumping(stamps: Array, pose: Array, t: Array, settings: SignalSettings) -> 
 
 @dataclass(frozen=True)
 class _Grid:
-    """The ``count`` times at which a segment is filtered, and the decimation afterwards.
-
-    Without a step, they are the rows of the log.
-    """
+    """The times at which a segment is filtered, and the decimation; no step: the log's rows."""
 
     start: float
     last: float

@@ -212,10 +212,7 @@ def touching(model: RobotModel, motion: Trajectory) -> Array:
 
 
 def constraint_forces(model: RobotModel, motion: Trajectory, torque: Array, used: Array) -> Array:
-    """Return the constraint forces for which a robot has a torque (N, n_rows), (N, m) [N, N m].
-
-    Unknown ones are those of least squares.
-    """
+    """Return forces (N, m) [N, N m] for which a robot has a torque; unknown: least squares."""
     J = constraint_jacobian(model, motion.q, touching(model, motion))
     known, tau = measured_rows(model), motion.tau if motion.loaded is None else motion.loaded
     f = np.zeros(J.shape[:2])

@@ -238,10 +238,7 @@ def join(reductions: Sequence[Reduction]) -> Reduction:
 
 
 def join_segments(reductions: Iterable[Reduction], count: int, most: int) -> list[Reduction]:
-    """Return the reductions of at most so many segments of neighbouring pieces, in order.
-
-    They are joined one by one, to limit the memory; the last one may be shorter.
-    """
+    """Return reductions of at most so many segments, joined one by one to limit the memory."""
     length = -(-count // most)
     segments: list[Reduction] = []
     for k, reduction in enumerate(reductions):
@@ -276,10 +273,7 @@ def in_order(
 
 
 class Triangle:
-    """A triangular factor into which rows are folded.
-
-    It is changed in place, unlike other objects of the package: it is the innermost loop.
-    """
+    """A triangular factor into which rows are folded, in place: it is the innermost loop."""
 
     def __init__(self, columns: int) -> None:
         """Initialise for rows of so many columns."""
@@ -292,10 +286,7 @@ class Triangle:
         self._sizes[[4, 6]] = columns, self._panel
 
     def fold(self, rows: Array) -> None:
-        """Replace R by the triangular factor of [R; rows]: rows (m, c).
-
-        See LAPACK Working Note 257; Golub, Van Loan (2013), Matrix Computations, section 6.5.3.
-        """
+        """Replace R by the factor of [R; rows], rows (m, c) (Golub, Van Loan 2013, 6.5.3)."""
         self._fold(rows, 0, 0)
 
     def fold_triangle(self, other: Array, places: Array) -> None:

@@ -151,11 +151,7 @@ class FoundContact:
 
 
 def with_contacts(model: RobotModel, log: Log, signals: SignalSettings) -> Log:
-    """Return a log with all contacts of a robot; those that it does not state are found.
-
-    An undecided sample counts as contact: the force of the link is then eliminated. A note states
-    the shares.
-    """
+    """Return a log with all contacts of a robot; undecided samples of those found count as on."""
     flagged = [x.frame for x in model.contacts if not x.always]
     if all(frame in log.contacts for frame in flagged):
         return log

@@ -229,11 +229,7 @@ def inertial_rows(model: RobotModel, q: Array, v: Array, a: Array) -> InertialRo
 
 
 def keep_inertial_rows(model: RobotModel, trajectory: Trajectory) -> None:
-    """Compute the inertial columns of a trajectory once and store them with it.
-
-    They are not stored if they are too many, or if compiled code computes them faster than they can
-    be read from memory.
-    """
+    """Store the inertial columns of a trajectory with it, unless they are many or compiled."""
     columns, samples = _inertial_support(model), len(trajectory.t)
     is_large = 8 * samples * sum(map(len, columns)) > _MOST_BYTES
     is_stored = kept_rows(model, trajectory) is not None

@@ -204,10 +204,7 @@ def _is_low_state(kind: str) -> bool:
 
 
 def _choose_topic(bag: _Bag) -> str:
-    """Return the topic to read: the stated one, or the only one of joint states or a controller.
-
-    The topic of the commands must be another one, of joint states.
-    """
+    """Return the stated topic, or the only one of joint states or of a controller."""
     where, source, types, filled = bag.path.name, bag.source, bag.types, bag.filled
     listing = f"topics: {dict(sorted(types.items()))}"
     low = [kind for kind in types.values() if _is_low_state(kind)]
@@ -430,10 +427,7 @@ def _sensors_of(bag: _Bag) -> list[_Sensor]:
 def _with_sensors(
     states: Table, path: Path, sensors: Sequence[_Sensor], source: LogSource
 ) -> Table:
-    """Return a table with the columns of sensors, interpolated linearly at its time stamps.
-
-    Rows before the first or after the last message of a topic that is read are left out.
-    """
+    """Return a table with columns of sensors, interpolated; rows outside them are left out."""
     by_column: dict[str, list[_Sensor]] = {}
     for sensor in sensors:
         for name in sensor.columns:

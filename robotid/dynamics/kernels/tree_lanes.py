@@ -472,10 +472,7 @@ def _begin(work, tree):
 
 @compiled
 def inertial_rows(tree, places, motion, work, out, span):
-    """Write the inertial columns of a block of samples, row by row.
-
-    places (B, D, 10), motion (N, n_rows), out (columns, k).
-    """
+    """Write inertial columns row by row: places (B, D, 10), out (columns, k)."""
     size, stride = FRAME + 6 * places.shape[1], out.shape[1]
     columns = out.reshape(out.size)
     _begin(work, tree)
@@ -491,11 +488,7 @@ def inertial_rows(tree, places, motion, work, out, span):
 
 @compiled
 def finish_rows(values, places, widths, weights, root, out, span):
-    """Write drive columns and torques of a block, and scale its rows by their weights.
-
-    values (E, N), places (E,), widths (n_rows,), weights (N, n_rows), root (k,), out (columns,
-    k).
-    """
+    """Write drive columns and torques of a block, and scale its rows by their weights."""
     first, count = span[0], span[1] - span[0]
     for e in range(len(places)):
         for k in range(count):
@@ -563,10 +556,7 @@ def _pull_joint(work, own, joint, axes, pull, pulls, above):
 
 @compiled
 def pull_rows(tree, places, motion, weights, work, out):
-    """Write the gradient of sum(weights * rows) by q, v and a of a robot with a fixed base.
-
-    places (B, D, 10), weights (columns, N), out (3, N, n_rows).
-    """
+    """Write the gradient (3, N, n_rows) of sum(weights * rows) by q, v and a: a fixed base."""
     bodies, depth, N = len(tree.parents), places.shape[1], weights.shape[1]
     axes, pulls = FRAME + 6 * depth, FRAME + 12 * depth
     size = pulls + 12

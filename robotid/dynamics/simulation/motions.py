@@ -85,10 +85,7 @@ class ProgramMotion(Motion):
 
 @dataclass(frozen=True, eq=False)
 class SampledMotion(Motion):
-    """A motion through samples: piecewise quintics through q, v and a, or a spline through q.
-
-    Both have a continuous acceleration. Time starts at the first sample.
-    """
+    """A motion through samples from time 0: quintics through q, v, a, or a spline through q."""
 
     t: Array  # shape (N,) [s]
     q: Array  # shape (N, n) [rad or m]

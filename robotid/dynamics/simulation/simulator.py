@@ -400,11 +400,7 @@ def _is_loaded(term: DriveTerm) -> bool:
 
 
 class _Loop:
-    """The true robot and its controller as dy/dt = f(y, reference).
-
-    y has q and v of the joints, th and w of the motors if gears are elastic, then the bristle
-    deflections of presliding.
-    """
+    """The robot and its controller, dy/dt = f(y, reference); y: joints, motors, bristles."""
 
     def __init__(self, model: RobotModel, pi: Array, settings: Simulation) -> None:
         self.plant = plant = RobotPlant(model, pi)
