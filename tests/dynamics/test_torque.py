@@ -105,9 +105,9 @@ def test_support_is_where_the_regressor_can_be_non_zero(free_flyer, rng):
     )
     W = random_regressor(model, 30, rng).reshape(30, model.n_rows, -1)
     seen = np.abs(W).max(axis=0) > 1e-12
-    assert not (seen & ~model.support()).any()
+    assert not (seen & ~model.support).any()
     # and not much more: a body's ten columns are all allowed where one is seen
-    assert model.support().sum() < 2 * seen.sum()
+    assert model.support.sum() < 2 * seen.sum()
 
 
 def trajectory(model, rng, samples=1200):
