@@ -10,7 +10,7 @@ from robotid.base.exceptions import DataError
 from robotid.base.files import check_file
 from robotid.base.findings import listed
 from robotid.cli.console import echo, show_found
-from robotid.cli.flags import JOB, SOURCE, add_json
+from robotid.cli.flags import JOB, SOURCE, add_shown
 from robotid.data.base_motion import ACCELERATION, IMU, POSE, TWIST
 from robotid.data.files.columns import KINDS, is_clock, quantity_of
 from robotid.data.files.formats import open_table, write_columns
@@ -106,18 +106,16 @@ def _standard_names(
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
-    """Add the flags of the command."""
     add = parser.add_argument
     add("log", metavar="IN", help="log of any format, or the folder of a bag")
     add("out", metavar="OUT", help="file to write; its suffix determines the format")
     add("--joints", metavar="A,B,...", help="joints to write; default: all")
     add("--sensors", metavar="A,B,...", help="topics of base, IMU and forces; default: all")
     JOB.add(parser, SOURCE)
-    add_json(parser)
+    add_shown(parser, "json")
 
 
 def run(options: argparse.Namespace) -> None:
-    """Run the command."""
     joints = options.joints.split(",") if options.joints else None
     topics = tuple(options.sensors.split(",")) if options.sensors else ()
     source = LogSource(**source_settings(options), sensors=topics)

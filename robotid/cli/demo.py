@@ -63,12 +63,10 @@ def run_demo(
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
-    """Add the flags of the command."""
     add_out(parser, "robotid-demo")
 
 
 def run(options: argparse.Namespace) -> None:
-    """Run the command."""
     echo("simulating a Unitree Z1 arm whose masses, armature and friction differ from its URDF ...")
     with progress_of(options) as progress:
         identification, result, truth = run_demo(options.out, progress=progress)

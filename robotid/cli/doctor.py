@@ -8,7 +8,7 @@ from typing import Any
 
 from robotid.base.findings import Finding, grouped
 from robotid.cli.console import echo, print_causes, progress_of, show_found
-from robotid.cli.flags import add_job, job_from_flags
+from robotid.cli.flags import add_job, add_shown, job_from_flags
 from robotid.cli.job import job_file
 from robotid.cli.logs import examine
 from robotid.data.files.read import Readable
@@ -47,12 +47,11 @@ def doctor(
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
-    """Add the flags of the command."""
     add_job(parser)
+    add_shown(parser, "json", "verbose")
 
 
 def run(options: argparse.Namespace) -> int:
-    """Run the command."""
     with progress_of(options) as progress:
         job = job_from_flags(options)
         model = job.model()

@@ -14,7 +14,7 @@ from robotid.base.files import check_file
 from robotid.base.findings import listed
 from robotid.base.typing import ProgressCallback
 from robotid.cli.console import echo, print_files, progress_of, show_found
-from robotid.cli.flags import JOB, ROBOT, Flags, add_json, add_progress, job_from_flags, number
+from robotid.cli.flags import JOB, ROBOT, Flags, add_shown, job_from_flags, number
 from robotid.cli.job import Job, as_job
 from robotid.cli.logs import result_run
 from robotid.data.log import Log
@@ -243,7 +243,6 @@ EXAMPLES = (
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
-    """Add the flags of the command."""
     add = parser.add_argument
     add("source", metavar="JOB.toml | URDF")
     words = "motion to write: .csv, .parquet, .yaml (ROS 2 JointTrajectory) or .script (UR)"
@@ -253,16 +252,13 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     words = "page to write about the motion: limits over time, expected standard errors"
     add("--report", metavar="PAGE.html", help=words)
     _MOTION.add(parser)
-    add_json(parser)
-    add_progress(parser)
+    add_shown(parser, "json", "progress")
     flags = parser.add_argument_group("the robot, instead of a job file")
     JOB.add(flags, ROBOT[:3])
 
 
 def run(options: argparse.Namespace) -> None:
-    """Run the command."""
-    options.logs = []
-    job = job_from_flags(options, needs_logs=False)
+    job = job_from_flags(options)
     settings = motion_settings(options)
     with progress_of(options) as progress:
         content = excite(

@@ -61,18 +61,13 @@ def _payload_check(word: str, flag: str) -> list[dict[str, Any]]:
 
 @dataclass(frozen=True)
 class Flags:
-    """Flags that state settings; types, help and defaults come from the fields of the settings.
-
-    Attributes:
-        defaults: The default settings.
-        keys: For each flag the key of the job file and the placeholder of its value in the help.
-            A switch has its own help text in place of the placeholder, if it differs from that of
-            the key. A flag with a list of permitted words has an empty placeholder.
-        read: For flags whose value the type does not determine, the conversion of the words.
-    """
+    """Flags that state settings; types, help and defaults come from the fields of the settings."""
 
     defaults: Settings
+    # for each flag the key of the job file and the placeholder of its value in the help, empty for
+    # a list of permitted words; of a switch, the help where it differs from that of the key
     keys: Mapping[str, tuple[str, str]]
+    # the conversion of words whose type does not determine it
     read: Mapping[str, Callable[[Any, str], Any]] = field(default_factory=dict)
 
     def add(self, parser: "argparse._ActionsContainer", wanted: Sequence[str] = ()) -> None:
@@ -114,12 +109,11 @@ class Flags:
         return table
 
 
-def _in(table: Mapping[str, Any], at: str) -> Any:  # noqa: ANN401
+def _in(table: Any, at: str) -> Any:  # noqa: ANN401
     """Return the entry of nested tables at a dotted key, None if there is none."""
-    found: Any = table
     for name in at.split("."):
-        found = found.get(name) if isinstance(found, Mapping) else None
-    return found
+        table = table.get(name) if isinstance(table, Mapping) else None
+    return table
 
 
 def _is_repeated(kinds: Any) -> bool:  # noqa: ANN401
@@ -206,7 +200,17 @@ MOTION = tuple(
     if flag in LOG and not key.startswith(("torque.", "doctor."))
     if flag not in ("--effort", "--torque-delay")
 )
-_VERBOSE = "print notes, too; print stages and choices with their reasons on stderr"
+_SHOWN = {
+    "json": "print one JSON object",
+    "verbose": "print notes, too; print stages and choices with their reasons on stderr",
+    "progress": "show progress on stderr even if it is no terminal, or with --json",
+}
+
+
+def add_shown(parser: argparse.ArgumentParser, *names: str, **words: str) -> None:
+    """Add switches of what is shown, with words where they differ from the usual ones."""
+    for name in (*names, *words):
+        parser.add_argument(f"--{name}", action="store_true", help=words.get(name, _SHOWN[name]))
 
 
 def add_out(parser: argparse.ArgumentParser, folder: str) -> None:
@@ -215,67 +219,42 @@ def add_out(parser: argparse.ArgumentParser, folder: str) -> None:
     parser.add_argument("--out", default=folder, metavar="DIR", help=words)
 
 
-def add_json(parser: argparse.ArgumentParser, what: str = "one JSON object") -> None:
-    """Add the flag for JSON output."""
-    parser.add_argument("--json", action="store_true", help=f"print {what}")
+def add_work(parser: "argparse._ActionsContainer", default: str) -> None:
+    """Add the flags of worker processes and clusters."""
+    words = f"worker processes; default: {default}"
+    parser.add_argument("--workers", type=int, metavar="N", help=words)
+    words = "address of a Dask cluster, as tcp://host:8786"
+    parser.add_argument("--scheduler", metavar="ADDRESS", help=words)
 
 
-def add_verbose(parser: argparse.ArgumentParser, words: str = _VERBOSE) -> None:
-    """Add the flag for more output."""
-    parser.add_argument("--verbose", action="store_true", help=words)
-
-
-def add_progress(parser: argparse.ArgumentParser) -> None:
-    """Add the flag for progress in any case."""
-    words = "show progress on stderr even if it is no terminal, or with --json"
-    parser.add_argument("--progress", action="store_true", help=words)
-
-
-def add_robot_and_log(parser: argparse.ArgumentParser) -> None:
-    """Add a URDF and one log."""
-    parser.add_argument("source", metavar="URDF")
-    parser.add_argument("logs", nargs=1, metavar="LOG")
-
-
-def add_serve(parser: argparse.ArgumentParser, words: str) -> None:
-    """Add the flags of a live page."""
-    parser.add_argument("--serve", nargs="?", const=0, type=int, metavar="PORT", help=words)
-    speed = "speed of --serve, relative to real time; 0: as fast as possible; default: 1"
-    parser.add_argument("--speed", type=float, default=1.0, metavar="X", help=speed)
-
-
-def add_job(
-    parser: argparse.ArgumentParser, json_: str = "one JSON object", output: Sequence[str] = ()
-) -> None:
+def add_job(parser: argparse.ArgumentParser, output: Sequence[str] = ()) -> None:
     """Add a job file, or the flags in place of one."""
     parser.add_argument("source", metavar="JOB.toml | URDF")
     parser.add_argument("logs", nargs="*", metavar="LOG", help="logs to fit")
-    add_json(parser, json_)
     flags = parser.add_argument_group("instead of a job file, with URDF LOG [LOG ...]")
     words = "validation logs; repeatable"
     flags.add_argument("--validate", nargs="+", action="extend", metavar="LOG", help=words)
     JOB.add(flags, (*FIT, *LOG, *output))
-    add_verbose(parser)
 
 
-def job_from_flags(options: argparse.Namespace, *, needs_logs: bool = True) -> "Job":
+def job_from_flags(options: argparse.Namespace) -> Job:
     """Return the job that a command line names or states."""
+    logs = getattr(options, "logs", ())  # a command that designs a motion needs none
     if Path(options.source).suffix == ".toml":
-        given = _given(options)
-        if options.logs or given:
+        if given := [*logs, *_given(options)]:
             raise SettingsError(
                 f"{options.source} is a job file; it states the logs and settings. Remove "
-                f"{listed([*options.logs, *given])}, and state them in the job file"
+                f"{listed(given)}, and state them in the job file"
             )
         return read_job(options.source)
-    if not options.logs and needs_logs:
+    if logs == []:
         kind = "motion" if hasattr(options, "given") else "log"  # of preview
         one = kind.upper()
         raise SettingsError(f"no {kind} is given; wanted URDF {one} [{one} ...], or JOB.toml")
     validation = getattr(options, "validate", None) or ()
     table = {
         "urdf": options.source,
-        "identification": [{"log": log} for log in options.logs],
+        "identification": [{"log": log} for log in logs],
         "validation": [{"log": log} for log in validation],
         **JOB.stated(options),
     }

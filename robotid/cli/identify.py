@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 from robotid.base.exceptions import DataError, SettingsError
 from robotid.base.files import check_folder, folder_beside, remove_written, write_json
@@ -23,11 +23,19 @@ from robotid.cli.console import (
     recordings_of,
     show_found,
 )
-from robotid.cli.flags import OUTPUT, add_job, add_out, add_progress, job_from_flags, source_words
+from robotid.cli.flags import (
+    OUTPUT,
+    add_job,
+    add_out,
+    add_shown,
+    add_work,
+    job_from_flags,
+    source_words,
+)
 from robotid.cli.job import Job, LogEntry, job_file
 from robotid.cli.logs import examine_logs, locked_as_logged, needed_of, survey_logs, units_of_logs
 from robotid.cli.payload import check_payloads
-from robotid.data.files.read import Readable, read_logs
+from robotid.data.files.read import Readable
 from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
 from robotid.diagnosis.logs.check_logs import diagnose
@@ -41,7 +49,7 @@ from robotid.estimation.fitting.recorded import Recordings
 from robotid.estimation.workers.plan import WorkPlan
 from robotid.identification import pipeline
 from robotid.identification.closed_loop.loop_settings import LoopSettings
-from robotid.identification.pipeline import conclude, robot_of
+from robotid.identification.pipeline import conclude, logs_of, robot_of
 from robotid.identification.result import Identification, TorqueIdentification
 from robotid.identification.summary import (
     error_lines,
@@ -84,27 +92,23 @@ def identify(
     Args:
         model: The robot, or the path of its URDF with all joints free; or a job file, alone, which
             states logs and settings, and whose long logs are read in pieces.
-        logs: Logs to fit: a ``Log`` with the model's joints, the path of a file, a DataFrame with
-            the columns of such a file, or several of these. Files are read whole, as by
-            ``read_log``.
+        logs: Logs to fit, one or several: a ``Log`` with the model's joints, the path of a file, or
+            a DataFrame with its columns. Files are read whole, as by ``read_log``.
         validation: Logs for validation, of the same types.
         signals: Settings of the signal processing; the defaults if None.
         estimator: Name or settings of the estimator. "simulation" simulates the robot on the
             commands, or on the torques, of the logs.
-        controller: Known properties of the position controllers, with the keys of the table
-            ``[controller]`` of a job file; only for the estimator "simulation".
-        friction: Friction terms in addition to viscous and Coulomb friction, as of
-            ``wanted_families``; "auto" selects them. Simulation selects those of all joints, or
-            of none.
+        controller: Known properties of the position controllers, the keys of ``[controller]`` of a
+            job file; only for the estimator "simulation".
+        friction: Terms in addition to viscous and Coulomb friction, as of ``wanted_families``;
+            "auto" selects them. Simulation selects those of all joints, or of none.
         doctor: Whether the doctor checks the logs first; its findings count in the verdict.
         ignore: Codes of errors and warnings to ignore.
         progress: Called at the start of each stage with its name, the stages done, their number
-            and "stages"; in between with the name of a work, the units done, their number and
-            their name.
+            and "stages"; in between with a work, the units done, their number and their name.
 
     Returns:
-        The identification; its evaluations are of torques, or for the estimator "simulation" of
-            positions.
+        The identification; its evaluations are of torques, or by "simulation" of positions.
 
     Raises:
         DataError: If a log cannot be read, does not match the model or is too short.
@@ -138,7 +142,6 @@ def identify(
             friction=friction, doctor=doctor, ignore=ignore, progress=progress,
         )  # fmt: skip
     from robotid.identification.closed_loop.from_commands import identify_loops
-    from robotid.identification.closed_loop.loop_settings import LoopSettings
     from robotid.identification.closed_loop.stages import STAGES
 
     require_kind(signals, (SignalSettings, type(None)), "signals", "a robotid.SignalSettings")
@@ -154,17 +157,7 @@ def identify(
             "friction is stated by joint or with families, but simulation selects the terms of all "
             "joints, or of none; wanted 'auto' or 'viscous+coulomb'. State terms in the model"
         )
-    needs: Literal["torque", "commands"] = "torque" if loop.kind == "torque" else "commands"
-    fitted, held_out = (
-        read_logs(
-            some,
-            model.joints,
-            prismatic=model.layout.prismatic,
-            needs=needs,
-            robot=model.tree.movable,
-        )
-        for some in (logs, validation)
-    )
+    fitted, held_out = (logs_of(model, some, needed_of(loop)) for some in (logs, validation))
     return identify_loops(
         model, fitted, held_out, loop, choice, signals=settings, chooses=None in wanted,
         examined=diagnose(model, fitted, held_out, settings) if doctor else (), ignore=ignore,
@@ -176,12 +169,11 @@ def run_job(
     job: Job, folder: str | Path, *, plan: WorkPlan | None = None, source: Sequence[str] = ()
 ) -> tuple[Identification, dict[str, Any]]:
     """Identify and write result.json, report and URDF; return the result and result.json."""
-    chosen, target = plan or WorkPlan(job.workers or 1), Path(folder)
-    model = job.model()
+    plan, target, model = plan or WorkPlan(job.workers or 1), Path(folder), job.model()
     check_folder(target, ["result.json", *_names(model)])
-    found = identify_job(job, model, chosen)
-    report_stage(chosen.progress, "writing", _stages(job))
-    return _write(found, _job_of(found), target, source=source)
+    identification = identify_job(job, model, plan)
+    report_stage(plan.progress, "writing", _stages(job))
+    return _write(identification, _job_of(identification), target, source=source)
 
 
 def save_result(
@@ -189,10 +181,9 @@ def save_result(
 ) -> Path:
     """Write the files of ``robotid identify``: result.json, report, URDF with its sidecar.
 
-    ``robotid.load_result(folder)``, ``robotid validate`` and ``robotid replay`` read them. All
-    files are first written to a temporary folder and moved when they are complete. An impossible
-    result has no URDF. Logs in files are listed with their hashes. Gains, units and column names
-    with which the logs were read in Python are not recorded.
+    All files are first written to a temporary folder and moved when they are complete. An
+    impossible result has no URDF. Logs in files are listed with their hashes. Gains, units and
+    column names with which the logs were read in Python are not recorded.
 
     Args:
         identification: The identification.
@@ -208,8 +199,8 @@ def save_result(
         ModelError: If the URDF of the robot no longer exists.
         SettingsError: If the folder is a file, or is not writable.
     """
-    kind = "a robotid.Identification"
-    require_kind(identification, Identification, "identification", kind)
+    wanted = "a robotid.Identification"
+    require_kind(identification, Identification, "identification", wanted)
     require_kind(folder, (str, Path), "folder", "the path of a folder")
     require_kind(report, bool, "report", "True or False")
     require_kind(replay, bool, "replay", "True or False")
@@ -389,7 +380,7 @@ def _identify_loops(
 
     assert isinstance(job.estimator, SimulationSettings)
     logs, validation = (
-        [job.read(entry, model, needs=needed_of(job)) for entry in entries]
+        [job.read(entry, model, needs=needed_of(job.controller)) for entry in entries]
         for entries in (job.identification, job.validation)
     )
     found = identify_loops(
@@ -412,15 +403,14 @@ EXAMPLES = (
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
-    """Add the flags of the command."""
-    add_job(parser, "result.json", OUTPUT)
+    add_job(parser, OUTPUT)
     add_out(parser, "robotid-out")
-    _add_work(parser)
-    add_progress(parser)
+    flags = parser.add_argument_group("long logs; these flags do not change a bit of the result")
+    add_work(flags, "as in the job file, or one per core for long logs")
+    add_shown(parser, "verbose", "progress", json="print result.json")
 
 
 def run(options: argparse.Namespace) -> int:
-    """Run the command."""
     with progress_of(options) as progress:
         report_stage(progress, "reading logs")  # before what takes the first second: its modules
 
@@ -517,12 +507,3 @@ def _worst(result: Mapping[str, Any]) -> str:
         return ""
     error, joint = max(errors)
     return f"{joint}, {'position' if is_motion else 'torque'} error {error:.1f} %"
-
-
-def _add_work(parser: argparse.ArgumentParser) -> None:
-    """Add the flags of the reduction of long logs; they never change a result."""
-    flags = parser.add_argument_group("long logs; these flags do not change a bit of the result")
-    words = "worker processes; default: as in the job file, or one per core for long logs"
-    flags.add_argument("--workers", type=int, metavar="N", help=words)
-    words = "address of a Dask cluster, as tcp://host:8786"
-    flags.add_argument("--scheduler", metavar="ADDRESS", help=words)

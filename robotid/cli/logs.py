@@ -25,6 +25,7 @@ from robotid.diagnosis.verdict.verdict import check_ignored
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.estimation.fitting.recorded import Recordings
 from robotid.estimation.fitting.survey import SurveyedLog, survey_log
+from robotid.identification.closed_loop.loop_settings import LoopSettings
 from robotid.output.files.result_file import Result, load_result, stated_model, stated_parameters
 from robotid.robot.model import RobotModel
 
@@ -197,18 +198,14 @@ def _count(found: tuple[LogLayout, Table] | DataError) -> int:
 
 def log_of_commands(job: Job, entry: LogEntry, result: Result) -> Log:
     """Return a log with the inputs of the simulated robot, gravity compensation included."""
-    log = job.read(entry, result.robot, needs=needed_of(job))
+    from robotid.identification.closed_loop.from_commands import driven_log, with_gravity
+
+    log = job.read(entry, result.robot, needs=needed_of(job.controller))
     if job.controller.kind == "torque":
-        from robotid.identification.closed_loop.from_commands import driven_log
-
         return driven_log(result.robot, log, job.signals)
-    if not job.controller.gravity_compensation:
-        return log
-    from robotid.identification.closed_loop.from_commands import with_gravity
-
-    return with_gravity(job.model(), log)
+    return with_gravity(job.model(), log) if job.controller.gravity_compensation else log
 
 
-def needed_of(job: Job) -> Needs:
+def needed_of(controller: LoopSettings) -> Needs:
     """Return the signals that a simulation requires of a log in addition to positions."""
-    return "torque" if job.controller.kind == "torque" else "commands"
+    return "torque" if controller.kind == "torque" else "commands"

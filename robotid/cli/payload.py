@@ -12,7 +12,7 @@ from robotid.base.findings import listed
 from robotid.base.text import columns, in_digits_of
 from robotid.base.typing import ProgressCallback, report_stage
 from robotid.cli.console import echo, progress_of, show_found
-from robotid.cli.flags import JOB, LOG, add_json, job_from_flags, number, refuse_log_flags
+from robotid.cli.flags import JOB, LOG, add_shown, job_from_flags, number, refuse_log_flags
 from robotid.cli.job import Job, LogEntry
 from robotid.cli.logs import job_of_result, survey_logs
 from robotid.diagnosis.verdict.scale_check import PayloadCheck
@@ -108,7 +108,6 @@ def _width(check: PayloadCheck) -> float:
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
-    """Add the flags of the command."""
     add = parser.add_argument
     add("source", metavar="URDF")
     add("logs", nargs="+", metavar="LOG", help="logs with the payload")
@@ -121,13 +120,12 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     add("--mass", metavar="KG", help=words, **again)
     words = "from a known mass, estimate the gains of logged currents without --gain"
     add("--gains", action="store_true", help=words)
-    add_json(parser)
+    add_shown(parser, "json")
     flags = [flag for flag in LOG if flag != "--ignore"]  # the logs are not examined
     JOB.add(parser.add_argument_group("the logs, unless a RESULT is given"), flags)
 
 
 def run(options: argparse.Namespace) -> None:
-    """Run the command."""
     if any(map(is_result, options.reference)):
         refuse_log_flags(options, "a RESULT states how its logs are read")
     with progress_of(options) as progress:

@@ -14,7 +14,7 @@ from robotid.base.files import file_sha256
 from robotid.base.findings import listed
 from robotid.base.text import columns
 from robotid.cli.console import echo, recordings_of, show_found
-from robotid.cli.flags import JOB, MOTION, add_json, job_from_flags, pairs, refuse_log_flags
+from robotid.cli.flags import JOB, MOTION, add_shown, job_from_flags, pairs, refuse_log_flags
 from robotid.cli.job import Job, LogEntry
 from robotid.cli.logs import result_run
 from robotid.design.previews import preview_logs
@@ -89,7 +89,6 @@ _TERM = re.compile(r" [+-] ")  # the sign before each further term of an express
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
-    """Add the flags of the command."""
     add = parser.add_argument
     add("source", metavar="JOB.toml | URDF")
     add("logs", nargs="*", metavar="MOTION", help="motions or logs; only positions are read")
@@ -100,15 +99,13 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     add("--noise", metavar="JOINT=N_M", action="append", default=[], help=words)
     words = "correlation time of the noise [s]; 0: uncorrelated samples; default: 0.1"
     add("--correlation", metavar="S", type=float, help=words)
-    add_json(parser)
     words = "print standard parameters and whole expressions, too; print choices on stderr"
-    parser.add_argument("--verbose", action="store_true", help=words)
+    add_shown(parser, "json", verbose=words)
     flags = parser.add_argument_group("instead of a job file or a RESULT, with URDF MOTION")
     JOB.add(flags, ("--estimator", *MOTION))
 
 
 def run(options: argparse.Namespace) -> None:
-    """Run the command."""
     if options.given:
         refuse_log_flags(options, "a RESULT states how its logs are read")
     stated = {"noise": stated_noise(options), "correlation": options.correlation}

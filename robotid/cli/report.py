@@ -11,7 +11,7 @@ from robotid.base.findings import listed
 from robotid.base.typing import ProgressCallback, report_stage
 from robotid.base.versions import versions
 from robotid.cli.console import progress_of, show_found
-from robotid.cli.flags import add_json, add_progress, add_verbose
+from robotid.cli.flags import add_shown
 from robotid.cli.identify import identify_job
 from robotid.cli.job import Job, written_job
 from robotid.estimation.workers.plan import WorkPlan
@@ -106,17 +106,13 @@ def _require_same(found: Identification, content: Mapping[str, Any], name: str) 
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
-    """Add the flags of the command."""
     add = parser.add_argument
     add("result", metavar="RESULT", help="result.json or its folder")
     add("--out", metavar="FILE", help="page to write; default: report.html in the folder of RESULT")
-    add_json(parser)
-    add_verbose(parser)
-    add_progress(parser)
+    add_shown(parser, "json", "verbose", "progress")
 
 
 def run(options: argparse.Namespace) -> None:
-    """Run the command."""
     with progress_of(options) as progress:
         report_stage(progress, "reading logs")
 

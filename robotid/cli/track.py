@@ -5,29 +5,20 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import asdict
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from robotid.base.exceptions import MissingDependencyError, SettingsError
+from robotid.base.exceptions import SettingsError
 from robotid.base.files import check_folder, file_sha256, folder_beside, write_json
 from robotid.base.text import columns, in_digits_of
 from robotid.base.versions import __version__
 from robotid.cli.console import Terminated, echo, show_found
-from robotid.cli.flags import (
-    JOB,
-    ONLINE,
-    add_json,
-    add_out,
-    add_robot_and_log,
-    add_serve,
-    add_verbose,
-    job_from_flags,
-)
+from robotid.cli.flags import JOB, ONLINE, add_out, add_shown, job_from_flags
 from robotid.cli.job import Job
 from robotid.data.files.formats import write_columns
-from robotid.data.files.parquet_files import load_pyarrow
 from robotid.data.log import Log
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.identification.online import (
@@ -47,14 +38,12 @@ _RATE = 25.0  # [Hz] messages per second of the log
 _SLOWEST = 1e-3  # [-] smallest speed, relative to real time
 
 
-def run_track(
-    job: Job, folder: str | Path | None, *, observer: Observer | None = None
-) -> dict[str, Any]:
+def run_track(job: Job, folder: str | Path, *, observer: Observer | None = None) -> dict[str, Any]:
     """Track the one log of a job, write the history and track.json, and return its content."""
-    model, history = job.model(), _history_name()
-    if folder is not None:
-        inputs = [job.urdf, *(entry.path for entry in job.identification)]
-        check_folder(Path(folder), [history, "track.json"], inputs)
+    model = job.model()
+    history = "track.parquet" if find_spec("pyarrow") else "track.csv"
+    inputs = [job.urdf, *(entry.path for entry in job.identification)]
+    check_folder(Path(folder), [history, "track.json"], inputs)
     if len(job.identification) != 1:
         raise SettingsError(f"{len(job.identification)} logs are given, wanted one to track")
     log = job.read(job.identification[0], model)
@@ -71,35 +60,22 @@ def run_track(
     )
     found = track(model, log, settings, observer=observer)
     content = _summary(found, job, log, history)
-    if folder is not None:
-        target = Path(folder)
-        target.mkdir(parents=True, exist_ok=True)
-        with folder_beside(target) as partial:
-            write_columns(found.columns(), partial / history)
-            write_json(content, partial / "track.json")
+    target = Path(folder)
+    target.mkdir(parents=True, exist_ok=True)
+    with folder_beside(target) as partial:
+        write_columns(found.columns(), partial / history)
+        write_json(content, partial / "track.json")
     return content
-
-
-def _history_name() -> str:
-    try:
-        load_pyarrow("writing Parquet")
-    except MissingDependencyError:
-        return "track.csv"
-    return "track.parquet"
 
 
 def _summary(found: Track, job: Job, log: Log, history: str) -> dict[str, Any]:
     identifier = found.identifier
     model, mapping = identifier.model, identifier.mapping
-    converged = np.flatnonzero(found.converged)
-    last = identifier.reading
-    columns = {
-        "name": mapping.base_names,
-        "expression": mapping.expressions,
-        "value": last.theta.tolist(),
-        "std_error": last.std_error.tolist(),
-        "unit": [model.layout.units[i] for i in mapping.independent],
-    }
+    converged, last = found.t[found.converged].tolist(), identifier.reading
+    units = [model.layout.units[i] for i in mapping.independent]
+    rows = zip(mapping.base_names, mapping.expressions, last.theta.tolist(),
+               last.std_error.tolist(), units, strict=True)  # fmt: skip
+    keys = ("name", "expression", "value", "std_error", "unit")
     return {
         "schema_version": _SCHEMA,
         "robotid": __version__,
@@ -113,12 +89,10 @@ def _summary(found: Track, job: Job, log: Log, history: str) -> dict[str, Any]:
         "samples": len(log.t),
         "delay": identifier.delay,
         "first_estimate": float(found.t[0]),
-        "converged_at": float(found.t[converged[0]]) if len(converged) else None,
+        "converged_at": converged[0] if converged else None,
         "excitation": last.excitation,
         "sigma": dict(zip(model.row_names, last.sigma.tolist(), strict=True)),
-        "base_parameters": [
-            dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)
-        ],
+        "base_parameters": [dict(zip(keys, row, strict=True)) for row in rows],
         "changes": [_change(identifier, index) for index in range(len(identifier.changes))],
         "history": history,
     }
@@ -138,29 +112,9 @@ def _change(identifier: OnlineIdentifier, index: int) -> dict[str, Any]:
     }
 
 
-def serve(
-    job: Job,
-    folder: str | None,
-    options: argparse.Namespace,
-    finished: Callable[[dict[str, Any]], None],
-) -> None:
-    """Show a log in the browser while the estimator runs over it, until it is interrupted."""
-
-    def announce(url: str) -> None:
-        print(f"live: {url}  (stop with Ctrl-C)", file=sys.stderr, flush=True)
-
-    try:
-        serve_track(job, folder, port=options.serve, speed=options.speed, announce=announce,
-                    finished=finished)  # fmt: skip
-    except Terminated:
-        raise
-    except KeyboardInterrupt:
-        print("\nstopped", file=sys.stderr)
-
-
 def serve_track(
     job: Job,
-    folder: str | None,
+    folder: str,
     *,
     port: int = 0,
     speed: float = 1.0,
@@ -227,27 +181,37 @@ class _LiveFeed:
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
-    """Add the flags of the command."""
-    add_robot_and_log(parser)
+    parser.add_argument("source", metavar="URDF")
+    parser.add_argument("logs", nargs=1, metavar="LOG")
     add_out(parser, "robotid-track")
-    add_json(parser, "track.json")
+    add_shown(parser, "verbose", json="print track.json")
     JOB.add(parser.add_argument_group("the log"), ONLINE)
-    add_verbose(parser)
-    add_serve(parser, "show the run in the browser, in real time")
+    words = "show the run in the browser, in real time"
+    parser.add_argument("--serve", nargs="?", const=0, type=int, metavar="PORT", help=words)
+    words = "speed of --serve, relative to real time; 0: as fast as possible; default: 1"
+    parser.add_argument("--speed", type=float, default=1.0, metavar="X", help=words)
 
 
 def run(options: argparse.Namespace) -> None:
-    """Run the command."""
     job = job_from_flags(options)
 
     def finished(found: dict[str, Any]) -> None:
         show_found(found, options, _show, [found["history"], "track.json"])
         sys.stdout.flush()
 
+    def announce(url: str) -> None:
+        print(f"live: {url}  (stop with Ctrl-C)", file=sys.stderr, flush=True)
+
     if options.serve is None:
         finished(run_track(job, options.out))
-    else:
-        serve(job, options.out, options, finished)
+        return
+    try:
+        serve_track(job, options.out, port=options.serve, speed=options.speed, announce=announce,
+                    finished=finished)  # fmt: skip
+    except Terminated:
+        raise
+    except KeyboardInterrupt:
+        print("\nstopped", file=sys.stderr)
 
 
 def _show(found: dict[str, Any]) -> None:

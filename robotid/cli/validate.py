@@ -3,7 +3,6 @@
 import argparse
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, replace
-from functools import partial
 from itertools import compress
 from pathlib import Path
 from typing import Any
@@ -12,20 +11,17 @@ import numpy as np
 
 from robotid.base.exceptions import DataError
 from robotid.base.files import (
-    check_file,
     file_sha256,
     finite,
     log_exists,
-    read_json,
     source_entry,
-    write_json,
 )
 from robotid.base.findings import Finding, listed
 from robotid.base.text import terminal_width
 from robotid.cli.console import echo, print_verdict, show_found
-from robotid.cli.flags import add_json
+from robotid.cli.flags import add_shown
 from robotid.cli.job import Job, LogEntry, written_job
-from robotid.cli.logs import log_of_commands, survey_logs, units_of_logs
+from robotid.cli.logs import log_of_commands, survey_logs
 from robotid.data.log import Log
 from robotid.diagnosis.logs.check_logs import diagnose
 from robotid.diagnosis.verdict.evidence import Determined, Predictions
@@ -33,6 +29,7 @@ from robotid.diagnosis.verdict.fit_findings import unlike_findings
 from robotid.diagnosis.verdict.position_verdict import judge_positions
 from robotid.diagnosis.verdict.verdict import Verdict, VerdictWarning, blocking, judge, warnings_of
 from robotid.dynamics.base_parameters import structural_mapping
+from robotid.estimation.fitting.estimator_settings import EstimatorSettings
 from robotid.estimation.fitting.evaluation import (
     Evaluation,
     Metrics,
@@ -48,7 +45,7 @@ from robotid.estimation.variation.groups import RunSums, runs_of
 from robotid.estimation.variation.variation import vary
 from robotid.identification.closed_loop.position_errors import pool_positions
 from robotid.identification.repeated_errors import with_repeated_errors
-from robotid.identification.summary import error_lines, variation_lines
+from robotid.identification.summary import error_lines
 from robotid.output.files.result_file import (
     Result,
     load_result,
@@ -61,37 +58,14 @@ from robotid.output.files.result_file import (
 )
 from robotid.robot.model import RobotModel
 
-_ADVICE = "identify again from all logs"
 
-
-def check_update(result: Result, job: Job, entries: Sequence[LogEntry]) -> None:
-    """Check that logs can be added to the variation of a result."""
-    stated = result.content.get("variation", {})
-    if "sums" not in stated:
-        raise DataError(
-            f"{result.path.name} has no variation to which logs can be added, wanted a result of "
-            f"three or more logs with torques; {_ADVICE}"
-        )
-    known = [x for x in result.content["inputs"] if x["role"] == "identification"]
-    of_file = {x["sha256"]: x["path"] for x in (*known, *stated.get("added", ()))}
-    for entry in entries:
-        own = source_entry(str(entry.path))["sha256"]
-        if own in of_file:
-            raise DataError(
-                f"{entry.path} is {of_file[own]}, which {result.path.name} has already; "
-                "leave it out"
-            )
-        of_file[own] = str(entry.path)
-    units_of_logs([*job.identification, *entries])
-
-
-def add_logs(
-    result: Result, model: RobotModel, job: Job, logs: Sequence[SurveyedLog]
-) -> tuple[dict[str, Any], tuple[Finding, ...]] | None:
+def compare_runs(
+    result: Result, model: RobotModel, logs: Sequence[SurveyedLog], estimator: EstimatorSettings
+) -> tuple[dict[str, Any], tuple[Finding, ...]]:
     """Return the variation between the logs of a result and new ones, and findings about these."""
     stated = result.content.get("variation", {})
     if "sums" not in stated:
-        return None
+        return {}, ()
     mapping, before = structural_mapping(model), stated["sums"]
     recordings = with_repeated_errors(Recordings(model, mapping, logs))
     pi, old = stated_parameters(result.content, model), RunSums.from_dict(before)
@@ -99,37 +73,29 @@ def add_logs(
     try:
         if old.sigma.shape != (model.n_rows,) or not (old.sigma > 0).all():
             raise ValueError(f"sigma is {old.sigma}")
-        sums = old.joined(sums_of_logs(recordings, job.estimator, pi, old.sigma, shift))
+        sums = old.joined(sums_of_logs(recordings, estimator, pi, old.sigma, shift))
     except ValueError as error:
         raise DataError(
             f"variation.sums in {result.path.name} does not fit the robot ({error}): another "
-            f"version of robotid wrote it; {_ADVICE}"
+            "version of robotid wrote it; identify again from all logs"
         ) from error
-    new_units = [log.unit or any(before["unit"]) * Path(log.path).name for log in logs]
-    units = [*before["unit"], *new_units]
-    unit_names, unit = np.unique(units, return_inverse=True)
+    names = [Path(log.path).name for log in logs]
+    units = [log.unit or any(before["unit"]) * name for log, name in zip(logs, names, strict=True)]
+    unit_names, unit = np.unique([*before["unit"], *units], return_inverse=True)
     groups = runs_of(model, mapping, pi, sums, unit)
-    names = [*stated["logs"], *(Path(log.path).name for log in logs)]
-    varied = vary(names, groups, unit_names.tolist())
+    varied = vary([*stated["logs"], *names], groups, unit_names.tolist())
     assert varied is not None
     count = len(stated["logs"])
     unlike = replace(
         varied,
-        unlike=tuple(each for each in varied.unlike if each.run >= count),
-        unlike_units=tuple(each for each in varied.unlike_units if each.run in unit[count:]),
+        unlike=tuple(run for run in varied.unlike if run.run >= count),
+        unlike_units=tuple(run for run in varied.unlike_units if run.run in unit[count:]),
     )
     added = [source_entry(log.path) for log in logs]
-    content = varied.to_dict() | {
-        "sums": sums.to_dict() | {key: before[key] for key in ("shift",) if key in before}
-        | {"unit": units},
-        "added": [*stated.get("added", ()), *added],
-    }  # fmt: skip
-    return content, tuple(unlike_findings(unlike))
+    return varied.to_dict() | {"added": added}, tuple(unlike_findings(unlike))
 
 
-def validate(
-    result: str | Path, logs: Sequence[LogEntry | str | Path], *, update: bool = False
-) -> dict[str, Any]:
+def validate(result: str | Path, logs: Sequence[LogEntry | str | Path]) -> dict[str, Any]:
     """Compute the prediction error of a written result on other logs.
 
     If the result has a URDF, the prediction uses that file and its sidecar, as a user does. The
@@ -139,21 +105,16 @@ def validate(
     Args:
         result: A result.json or its folder.
         logs: Files of logs, read with the settings of the result.
-        update: Whether the logs are added to the variation between logs in the result.json.
 
     Returns:
         The errors of each log and the verdict, as ``robotid validate --json``.
 
     Raises:
         DataError: If a log cannot be used.
-        SettingsError: If the result cannot be updated.
     """
     loaded = load_result(result)
     content, job = loaded.content, written_job(loaded.content["settings"], loaded.path.name)
     entries = [log if isinstance(log, LogEntry) else LogEntry(Path(log)) for log in logs]
-    if update:
-        check_file(loaded.path)
-        check_update(loaded, job, entries)
     if "simulation" in content:
         return _validate_commands(loaded, job, entries)
     source = stated_model(content, job.model())
@@ -167,18 +128,14 @@ def validate(
     driven = stated_urdf_with_drives(content, source)
     _, evaluations = evaluate_logs((), surveyed, {"estimate": pi}, prior, driven)
     own = [log.with_model(source) for log in surveyed]
-    variation, unlike = add_logs(loaded, source, job, own) or ({}, ())
+    variation, unlike = compare_runs(loaded, source, own, job.estimator)
     verdict = _verdict(job, source, content, evaluations, surveyed, unlike)
-    if update:
-        stored = read_json(loaded.path, "result")  # with the keys as they are in the file
-        write_json({**stored, "variation": variation}, loaded.path)
-    shown = {key: x for key, x in variation.items() if key != "sums"}
     return {
         "result": str(result),
         "predicted_with": content["outputs"].get("urdf", "base parameters of result.json"),
         "validation": [e.to_dict() | _expected(content, model, e) for e in evaluations],
         "verdict": verdict.to_dict(),
-        **({"variation": shown} if shown else {}),
+        **({"variation": variation} if variation else {}),
         "findings": [asdict(finding) for finding in unlike],
     }
 
@@ -323,22 +280,17 @@ def _share(one: Log, other: Log) -> bool:
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
-    """Add the flags of the command."""
     add = parser.add_argument
     add("result", metavar="RESULT.json")
     add("logs", nargs="+", metavar="LOG")
     words = "name of the robot of the logs, if the fitted logs are of several"
     add("--unit", metavar="NAME", help=words)
-    words = "add the logs to the variation between logs in RESULT.json"
-    add("--update", action="store_true", help=words)
-    add_json(parser)
+    add_shown(parser, "json")
 
 
 def run(options: argparse.Namespace) -> None:
-    """Run the command."""
     entries = [_entry(log, options) for log in options.logs]
-    found = validate(options.result, entries, update=options.update)
-    show_found(found, options, partial(_show, is_update=options.update))
+    show_found(validate(options.result, entries), options, _show)
 
 
 def _entry(log: str, options: argparse.Namespace) -> "LogEntry":
@@ -347,8 +299,7 @@ def _entry(log: str, options: argparse.Namespace) -> "LogEntry":
     return LogEntry.from_dict({"log": log, **unit})
 
 
-def _show(found: dict[str, Any], *, is_update: bool = False) -> None:
-
+def _show(found: dict[str, Any]) -> None:
     echo(f"predicted with {found['predicted_with']}")
     for recording in found["validation"]:
         echo(f"\n{recording['name']}", "  ")
@@ -369,7 +320,3 @@ def _show(found: dict[str, Any], *, is_update: bool = False) -> None:
     for finding in found.get("findings", ()):
         echo(f"\n{finding['message']}")
     print_verdict(found["verdict"])
-    if is_update:
-        echo(f"the variation between logs in {found['result']} counts these logs now:")
-        for line in variation_lines(found["variation"]):
-            echo(line, "  ")
