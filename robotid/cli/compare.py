@@ -47,8 +47,7 @@ def run(options: argparse.Namespace) -> None:
         print(f"\nwritten to {options.out}")
 
 
-def _show(content: dict[str, Any], *, is_verbose: bool = False) -> None:
-
+def _show(content: dict[str, Any], *, is_verbose: bool) -> None:
     results = content["results"]
     labels = [result["label"] for result in results]
     for result in results:

@@ -83,28 +83,19 @@ def excite(
     course = designer.course(design)
     if settings.kind in ROUTES:
         _check_jerk(course, model.joints)
-    expected: Preview | list[str] | None = None
-    if report is not None:  # computed before any file is written: the motion may be too short
-        expected = (
-            _expected(job, model, design, settings, run, str(target))
-            if carried is None
-            else carried.described()
-        )
+    expected: Preview | list[str] = []
+    if carried is not None:
+        expected = carried.described()
+    elif report is not None:  # computed before any file is written: the motion may be too short
+        expected = _expected(job, model, design, settings, run, str(target))
     content = _content(designer, design, course, settings)
     write_motion(design.motion, model.joints, design.duration, settings.points, target)
     if carried is not None:
         content["payload"] = carried.to_dict()
-    if report is not None and expected is not None:
+    if report is not None:
         write_motion_page(report, model, content, course, expected)
         content["report"] = str(report)
     return content
-
-
-def _basis(settings: MotionSettings) -> Basis:
-    """Return the basis functions of the motion."""
-    if settings.kind == "bspline":
-        return BSplineBasis(settings.duration, 2 * settings.harmonics)
-    return FourierBasis(settings.duration, settings.harmonics)
 
 
 def _designer(
@@ -124,23 +115,18 @@ def _designer(
         )
     model.require_fixed("motion design")
     limits = MotionLimits.of_model(
-        model,
-        share=settings.share,
-        velocity=settings.velocity,
-        torque=settings.torque,
-        acceleration=settings.acceleration,
-        jerk=settings.jerk,
-        power=settings.power,
-    )
-    clearance = None
-    if settings.clearance is not None:
-        clearance = Clearance(
-            model, least=settings.clearance, floor=settings.floor, boxes=settings.boxes
-        )
-    designer = Designer.of_model(
-        model, _basis(settings), limits, name=name, clearance=clearance, noise=settings.noise,
-        run=run,
+        model, share=settings.share, velocity=settings.velocity, torque=settings.torque,
+        acceleration=settings.acceleration, jerk=settings.jerk, power=settings.power,
     )  # fmt: skip
+    clearance, least = None, settings.clearance
+    if least is not None:
+        clearance = Clearance(model, least=least, floor=settings.floor, boxes=settings.boxes)
+    basis: Basis = FourierBasis(settings.duration, settings.harmonics)
+    if settings.kind == "bspline":
+        basis = BSplineBasis(settings.duration, 2 * settings.harmonics)
+    designer = Designer.of_model(
+        model, basis, limits, name=name, clearance=clearance, noise=settings.noise, run=run
+    )
     return designer, run
 
 
@@ -190,22 +176,20 @@ def _content(
     """Return the design as plain values."""
     model, names = designer.information.model, designer.information.mapping.base_names
     margins: dict[str, Any] = {}
-    limits, clearance = course.limits, course.clearance
-    jerk = LIMITS.index("jerk")
-    most = design.used.copy()
+    jerk, most, clearance = LIMITS.index("jerk"), design.used.copy(), course.clearance
     if settings.kind in ROUTES:
         most[jerk] = course.largest[jerk]
-    for name, used, sizes in zip(LIMITS, most, limits.sizes, strict=True):
+    for name, used, sizes in zip(LIMITS, most, course.limits.sizes, strict=True):
         if np.isfinite(sizes).any():
             joint = int(np.argmax(used))
             margins[name] = {"margin": 1.0 - float(used[joint]), "where": model.joints[joint]}
     if clearance is not None:
         contact = design.contact
         margins["collision"] = {
-            "margin": None if contact is None else contact.margin,
-            "kept": None if contact is None else contact.required,
-            "where": None if contact is None else f"{contact.first} and {contact.second}",
-            "time": None if contact is None else contact.time,
+            "margin": contact and contact.margin,
+            "kept": contact and contact.required,
+            "where": contact and f"{contact.first} and {contact.second}",
+            "time": contact and contact.time,
             "unread": clearance.unread,
             "left_alone": clearance.made_to,
             "built_near": clearance.built_near,
@@ -271,7 +255,6 @@ def run(options: argparse.Namespace) -> None:
 
 
 def motion_settings(options: argparse.Namespace) -> MotionSettings:
-    """Return the settings of the motion that the flags state."""
     if options.com is not None and not options.mass:
         raise SettingsError(_COM.format(options.com))
     return MotionSettings.from_dict(_MOTION.stated(options))
@@ -301,10 +284,10 @@ def _boxes(words: Sequence[str], flag: str) -> tuple["Box", ...]:
 
 
 def _centre(word: str, _: str) -> tuple[float, ...]:
-    found = _numbers(word)
-    if len(found) != 3:
+    centre = _numbers(word)
+    if len(centre) != 3:
         raise SettingsError(_COM.format(word))
-    return found
+    return centre
 
 
 def _clearance(word: str, flag: str) -> float | None:
@@ -344,11 +327,10 @@ _MOTION = Flags(
 
 
 def _show(content: dict[str, Any]) -> None:
-    done = f"in {content['seconds']:.1f} s"
-    if content["starts"]:
-        plural = "start" if content["starts"] == 1 else "starts"
-        done = f"{content['starts']} {plural} {done}, "
-        done += "converged" if content["converged"] else "not converged: increase --seconds"
+    done, count = f"in {content['seconds']:.1f} s", content["starts"]
+    if count:
+        end = "converged" if content["converged"] else "not converged: increase --seconds"
+        done = f"{count} {'start' if count == 1 else 'starts'} {done}, {end}"
     condition = content["condition_number"]
     echo(
         f"{content['robot']}: a motion of {content['duration']:g} s for {len(content['joints'])} "
@@ -373,14 +355,12 @@ def _margin(name: str, margin: Mapping[str, Any]) -> str:
         return f"{100 * margin['margin']:5.1f} %  {margin['where']}"
     text = "no pair of links or obstacles comes close"
     if margin["margin"] is not None:
-        distance, time = 1e3 * margin["margin"], margin["time"]
-        clearance = 1e3 * margin["kept"]
-        where = f"{margin['where']} at {time:.2f} s"
-        text = f"{distance:5.1f} mm above the clearance of {clearance:.0f} mm, {where}"
-    if margin["unread"]:
-        text += f"; not checked, shapes not readable: {listed(margin['unread'])}"
-    if margin["left_alone"]:
-        text += f"; not checked, in contact by design: {listed(margin['left_alone'])}"
-    if margin["built_near"]:
-        text += f"; smaller clearance, close by design: {listed(margin['built_near'])}"
+        text = f"{1e3 * margin['margin']:5.1f} mm above the clearance of "
+        text += f"{1e3 * margin['kept']:.0f} mm, {margin['where']} at {margin['time']:.2f} s"
+    for key, words in (
+        ("unread", "not checked, shapes not readable"),
+        ("left_alone", "not checked, in contact by design"),
+        ("built_near", "smaller clearance, close by design"),
+    ):
+        text += f"; {words}: {listed(margin[key])}" if margin[key] else ""
     return text

@@ -114,11 +114,5 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     with progress_of(options) as progress:
-        report_stage(progress, "reading logs")
-
         written = rewrite_report(options.result, options.out, progress=progress)
-    show_found(written, options, _show)
-
-
-def _show(done: dict[str, Any]) -> None:
-    print(f"written: {done['report']}")
+    show_found(written, options, lambda done: print(f"written: {done['report']}"))
