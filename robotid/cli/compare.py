@@ -9,7 +9,7 @@ from typing import Any
 from robotid.base.findings import listed
 from robotid.base.text import columns, in_digits_of
 from robotid.cli.console import echo, show_found, window_name
-from robotid.cli.flags import add_shown
+from robotid.cli.job import add_shown
 from robotid.identification.summary import cell
 from robotid.output.report.comparison import compare_results, write_comparison
 

@@ -10,7 +10,7 @@ from robotid.base.exceptions import DataError
 from robotid.base.files import check_file
 from robotid.base.findings import listed
 from robotid.cli.console import echo, show_found
-from robotid.cli.flags import JOB, SOURCE, add_shown
+from robotid.cli.job import JOB, SOURCE, add_shown
 from robotid.data.base_motion import ACCELERATION, IMU, POSE, TWIST
 from robotid.data.files.columns import KINDS, is_clock, quantity_of
 from robotid.data.files.formats import open_table, write_columns

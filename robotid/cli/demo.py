@@ -9,9 +9,8 @@ import numpy as np
 from robotid.base.files import check_folder
 from robotid.base.typing import Array, ProgressCallback
 from robotid.cli.console import echo, print_files, progress_of
-from robotid.cli.flags import add_out
 from robotid.cli.identify import run_job, show_result
-from robotid.cli.job import Job, LogEntry
+from robotid.cli.job import Job, LogEntry, add_out
 from robotid.data.files.read import write_log
 from robotid.data.signal_settings import SignalSettings
 from robotid.dynamics.simulation.motions import random_fourier

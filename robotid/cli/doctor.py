@@ -8,8 +8,7 @@ from typing import Any
 
 from robotid.base.findings import Finding, grouped
 from robotid.cli.console import echo, print_causes, progress_of, show_found
-from robotid.cli.flags import add_job, add_shown, job_from_flags
-from robotid.cli.job import job_file
+from robotid.cli.job import add_job, add_shown, job_file, job_from_flags
 from robotid.cli.logs import examine
 from robotid.data.files.read import Readable
 from robotid.data.signal_settings import SignalSettings

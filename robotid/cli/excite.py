@@ -14,8 +14,7 @@ from robotid.base.files import check_file
 from robotid.base.findings import listed
 from robotid.base.typing import ProgressCallback
 from robotid.cli.console import echo, print_files, progress_of, show_found
-from robotid.cli.flags import JOB, ROBOT, Flags, add_shown, job_from_flags, number
-from robotid.cli.job import Job, as_job
+from robotid.cli.job import JOB, ROBOT, Flags, Job, add_shown, as_job, job_from_flags, number
 from robotid.cli.logs import result_run
 from robotid.data.log import Log
 from robotid.design.basis import Basis, BSplineBasis, FourierBasis

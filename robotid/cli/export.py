@@ -10,8 +10,8 @@ from robotid.base.exceptions import SettingsError
 from robotid.base.files import check_file
 from robotid.base.findings import listed
 from robotid.cli.console import echo, show_found
-from robotid.cli.flags import add_shown
 from robotid.cli.identify import save_result
+from robotid.cli.job import add_shown
 from robotid.identification.result import Identification
 from robotid.output.files.exports import formats, options_of, writers
 from robotid.output.files.result_file import load_result

@@ -23,9 +23,17 @@ from robotid.base.files import (
 )
 from robotid.base.versions import __version__, code_versions
 from robotid.cli.console import echo, progress_of, show_found
-from robotid.cli.flags import add_out, add_shown, add_work
 from robotid.cli.identify import identify_job
-from robotid.cli.job import Job, LogEntry, PayloadEntry, read_job, stated_path
+from robotid.cli.job import (
+    Job,
+    LogEntry,
+    PayloadEntry,
+    add_out,
+    add_shown,
+    add_work,
+    read_job,
+    stated_path,
+)
 from robotid.data.files.parquet_files import read_text_table, write_rows
 from robotid.data.log import suggestion
 from robotid.dynamics.factors import available_cores

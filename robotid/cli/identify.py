@@ -23,16 +23,18 @@ from robotid.cli.console import (
     recordings_of,
     show_found,
 )
-from robotid.cli.flags import (
+from robotid.cli.job import (
     OUTPUT,
+    Job,
+    LogEntry,
     add_job,
     add_out,
     add_shown,
     add_work,
+    job_file,
     job_from_flags,
     source_words,
 )
-from robotid.cli.job import Job, LogEntry, job_file
 from robotid.cli.logs import examine_logs, locked_as_logged, needed_of, survey_logs, units_of_logs
 from robotid.cli.payload import check_payloads
 from robotid.data.files.read import Readable

@@ -9,7 +9,7 @@ from typing import Any
 from robotid.base.exceptions import ModelError
 from robotid.base.findings import Finding, listed
 from robotid.cli.console import echo, print_causes, show_found
-from robotid.cli.flags import add_shown
+from robotid.cli.job import add_shown
 from robotid.diagnosis.urdf.inspection import inspect_urdf
 
 

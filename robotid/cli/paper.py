@@ -4,7 +4,7 @@ import argparse
 from typing import Any
 
 from robotid.cli.console import progress_of, show_found
-from robotid.cli.flags import add_out, add_shown
+from robotid.cli.job import add_out, add_shown
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:

@@ -12,8 +12,16 @@ from robotid.base.findings import listed
 from robotid.base.text import columns, in_digits_of
 from robotid.base.typing import ProgressCallback, report_stage
 from robotid.cli.console import echo, progress_of, show_found
-from robotid.cli.flags import JOB, LOG, add_shown, job_from_flags, number, refuse_log_flags
-from robotid.cli.job import Job, LogEntry
+from robotid.cli.job import (
+    JOB,
+    LOG,
+    Job,
+    LogEntry,
+    add_shown,
+    job_from_flags,
+    number,
+    refuse_log_flags,
+)
 from robotid.cli.logs import job_of_result, survey_logs
 from robotid.diagnosis.verdict.scale_check import PayloadCheck
 from robotid.dynamics.base_parameters import structural_mapping

@@ -14,8 +14,16 @@ from robotid.base.files import file_sha256
 from robotid.base.findings import listed
 from robotid.base.text import columns
 from robotid.cli.console import echo, recordings_of, show_found
-from robotid.cli.flags import JOB, MOTION, add_shown, job_from_flags, pairs, refuse_log_flags
-from robotid.cli.job import Job, LogEntry
+from robotid.cli.job import (
+    JOB,
+    MOTION,
+    Job,
+    LogEntry,
+    add_shown,
+    job_from_flags,
+    pairs,
+    refuse_log_flags,
+)
 from robotid.cli.logs import result_run
 from robotid.design.previews import preview_logs
 from robotid.estimation.fitting.survey import SurveyedLog, survey_log

@@ -13,8 +13,15 @@ from robotid.base.exceptions import DataError, SettingsError
 from robotid.base.files import check_file, read_json
 from robotid.base.findings import listed
 from robotid.base.typing import Array
-from robotid.cli.flags import JOB, ONLINE, job_from_flags, refuse_log_flags
-from robotid.cli.job import Job, LogEntry, written_job
+from robotid.cli.job import (
+    JOB,
+    ONLINE,
+    Job,
+    LogEntry,
+    job_from_flags,
+    refuse_log_flags,
+    written_job,
+)
 from robotid.cli.logs import log_of_commands
 from robotid.data.base_motion import BaseMotion
 from robotid.data.files.formats import open_table

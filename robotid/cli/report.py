@@ -11,9 +11,8 @@ from robotid.base.findings import listed
 from robotid.base.typing import ProgressCallback, report_stage
 from robotid.base.versions import versions
 from robotid.cli.console import progress_of, show_found
-from robotid.cli.flags import add_shown
 from robotid.cli.identify import identify_job
-from robotid.cli.job import Job, written_job
+from robotid.cli.job import Job, add_shown, written_job
 from robotid.estimation.workers.plan import WorkPlan
 from robotid.identification.result import Identification
 from robotid.output.files.result_file import load_result

@@ -13,8 +13,17 @@ from robotid.base.findings import listed
 from robotid.base.typing import Array, ProgressCallback, ignore_progress
 from robotid.base.versions import __version__
 from robotid.cli.console import echo, print_files, progress_of, show_found
-from robotid.cli.flags import JOB, ROBOT, Flags, add_shown
-from robotid.cli.job import Job, LogEntry, as_job, job_from_settings, read_job
+from robotid.cli.job import (
+    JOB,
+    ROBOT,
+    Flags,
+    Job,
+    LogEntry,
+    add_shown,
+    as_job,
+    job_from_settings,
+    read_job,
+)
 from robotid.data.files.formats import check_suffix
 from robotid.data.files.read import write_log
 from robotid.data.log import Log

@@ -16,18 +16,11 @@ from robotid.base.files import check_folder, file_sha256, folder_beside, write_j
 from robotid.base.text import columns, in_digits_of
 from robotid.base.versions import __version__
 from robotid.cli.console import Terminated, echo, show_found
-from robotid.cli.flags import JOB, ONLINE, add_out, add_shown, job_from_flags
-from robotid.cli.job import Job
+from robotid.cli.job import JOB, ONLINE, Job, add_out, add_shown, job_from_flags
 from robotid.data.files.formats import write_columns
 from robotid.data.log import Log
 from robotid.dynamics.base_parameters import structural_mapping
-from robotid.identification.online import (
-    Observer,
-    OnlineIdentifier,
-    OnlineSettings,
-    Track,
-    track,
-)
+from robotid.identification.online import Observer, OnlineIdentifier, OnlineSettings, Track, track
 from robotid.output.viewer.replays import gap_marks, live_page
 from robotid.output.viewer.scene import coordinates
 from robotid.output.viewer.server import LivePage

@@ -10,17 +10,11 @@ from typing import Any
 import numpy as np
 
 from robotid.base.exceptions import DataError
-from robotid.base.files import (
-    file_sha256,
-    finite,
-    log_exists,
-    source_entry,
-)
+from robotid.base.files import file_sha256, finite, log_exists, source_entry
 from robotid.base.findings import Finding, listed
 from robotid.base.text import terminal_width
 from robotid.cli.console import echo, print_verdict, show_found
-from robotid.cli.flags import add_shown
-from robotid.cli.job import Job, LogEntry, written_job
+from robotid.cli.job import Job, LogEntry, add_shown, written_job
 from robotid.cli.logs import log_of_commands, survey_logs
 from robotid.data.log import Log
 from robotid.diagnosis.logs.check_logs import diagnose

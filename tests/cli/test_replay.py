@@ -191,7 +191,10 @@ def test_a_base_is_where_the_log_says_or_said_to_be_held(tmp_path, capsys):
     capsys.readouterr()
     base[:, 3:] *= 0.5
     assert play(np.column_stack([rows, base]), [*columns, *names]) is None
-    assert "log.csv: the quaternion of the base has length 0.5 in row 0, wanted 1" in capsys.readouterr().err
+    assert (
+        "log.csv: the quaternion of the base has length 0.5 in row 0, wanted 1"
+        in capsys.readouterr().err
+    )
 
 
 def test_a_motion_without_torques_plays_and_marks_where_it_uses_the_most_of_limits(folder):
