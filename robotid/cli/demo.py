@@ -46,13 +46,9 @@ def run_demo(
         write_log(log, target / f"{name}.csv")
         entries.append(LogEntry(target / f"{name}.csv"))
     job = Job(
-        urdf=Path(model.tree.path),
-        locked=_LOCKED,
-        signals=SignalSettings(cutoff=10.0),
-        identification=(entries[0],),
-        validation=(entries[1],),
-        replay=True,
-    )
+        urdf=Path(model.tree.path), locked=_LOCKED, signals=SignalSettings(cutoff=10.0),
+        identification=(entries[0],), validation=(entries[1],), replay=True,
+    )  # fmt: skip
     found, result = run_job(job, target, plan=WorkPlan(progress=progress))
     identification = cast(TorqueIdentification, found)  # of the default estimator
     true = dict(zip(model.layout.names, truth, strict=True))

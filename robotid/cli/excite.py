@@ -185,31 +185,21 @@ def _content(
     if clearance is not None:
         contact = design.contact
         margins["collision"] = {
-            "margin": contact and contact.margin,
-            "kept": contact and contact.required,
+            "margin": contact and contact.margin, "kept": contact and contact.required,
             "where": contact and f"{contact.first} and {contact.second}",
-            "time": contact and contact.time,
-            "unread": clearance.unread,
-            "left_alone": clearance.made_to,
-            "built_near": clearance.built_near,
-        }
+            "time": contact and contact.time, "unread": clearance.unread,
+            "left_alone": clearance.made_to, "built_near": clearance.built_near,
+        }  # fmt: skip
     content = {
-        "robot": model.name,
-        "joints": list(model.joints),
-        "criterion": designer.name,
+        "robot": model.name, "joints": list(model.joints), "criterion": designer.name,
         "objective": design.objective,
         "condition_number": design.condition if np.isfinite(design.condition) else None,
-        "seconds": design.seconds,
-        "starts": design.starts,
-        "converged": bool(design.is_converged),
+        "seconds": design.seconds, "starts": design.starts, "converged": bool(design.is_converged),
         "feasible": all((m["margin"] or 0.0) >= 0.0 for m in margins.values()),
-        "kind": settings.kind,
-        "share": settings.share,
-        "duration": design.duration,
-        "points": settings.points,
-        "limits": margins,
+        "kind": settings.kind, "share": settings.share, "duration": design.duration,
+        "points": settings.points, "limits": margins,
         "history": [list(entry) for entry in design.history],
-    }
+    }  # fmt: skip
     if designer.name == "widest":
         content["widest"] = [names[k] for k in designer.widest[::-1]]
     return content

@@ -289,26 +289,15 @@ def _job_of(identification: Identification) -> Job:
             drives[name] = entries
     options = model.options
     return Job(
-        urdf=Path(model.tree.path),
-        joints=model.joints,
-        locked=options["locked"],
-        gravity=tuple(options["gravity"]),
-        mimic=model.mimic,
-        snap_angles=read_tree(model.tree.path).joints != model.tree.joints,
-        signals=asked.signals,
-        terms=(*model.layout.terms, *([AUTO] if is_auto else [])),
-        model_dynamics=model.dynamics,
-        drives=drives,
-        couplings=model.layout.couplings,
-        contacts=model.contacts,
-        loops=model.loops,
-        passive=model.passive,
-        estimator=identification.estimator,
+        urdf=Path(model.tree.path), joints=model.joints, locked=options["locked"],
+        gravity=tuple(options["gravity"]), mimic=model.mimic,
+        snap_angles=read_tree(model.tree.path).joints != model.tree.joints, signals=asked.signals,
+        terms=(*model.layout.terms, *([AUTO] if is_auto else [])), model_dynamics=model.dynamics,
+        drives=drives, couplings=model.layout.couplings, contacts=model.contacts,
+        loops=model.loops, passive=model.passive, estimator=identification.estimator,
         identification=_entries(identification.fitted),
-        validation=_entries(identification.validation),
-        ignore=asked.ignore,
-        controller=loop,
-    )
+        validation=_entries(identification.validation), ignore=asked.ignore, controller=loop,
+    )  # fmt: skip
 
 
 def _entries(evaluations: Sequence[Evaluated]) -> tuple[LogEntry, ...]:
@@ -350,13 +339,9 @@ def identify_job(
         )
     with plan:
         concluded = conclude(
-            recordings,
-            job.estimator,
-            found,
-            job.ignore,
-            friction=job.friction,
+            recordings, job.estimator, found, job.ignore, friction=job.friction,
             progress=plan.progress,
-        )
+        )  # fmt: skip
     return replace(
         concluded,
         stated=replace(concluded.stated, job=job),

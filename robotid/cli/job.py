@@ -155,13 +155,9 @@ class Job(Settings):
     )
     signals: SignalSettings = setting(SignalSettings(), "signal processing of the logs")
     terms: tuple[str, ...] = setting(
-        (*DRIVE_TERMS, AUTO),
-        "drive terms to identify",
-        at="model",
-        reads=_MODEL_KEYS,
-        load=_load_terms,
-        dump=_dump_terms,
-    )
+        (*DRIVE_TERMS, AUTO), "drive terms to identify", at="model", reads=_MODEL_KEYS,
+        load=_load_terms, dump=_dump_terms,
+    )  # fmt: skip
     model_dynamics: str = setting(
         "full",
         "full; or static, for logs of poses and slow sweeps: velocities determine only the sign of "
@@ -320,17 +316,12 @@ class Job(Settings):
 
     def _reading(self, model: "RobotModel") -> dict[str, Any]:
         return {
-            "joints": model.joints,
-            "gains": self.gains,
-            "columns": self.columns,
-            "units": self.units,
-            "prismatic": tuple(model.layout.prismatic),
-            "source": self.source,
-            "base": logged_base(model, self.base),
-            "passive": model.passive,
+            "joints": model.joints, "gains": self.gains, "columns": self.columns,
+            "units": self.units, "prismatic": tuple(model.layout.prismatic), "source": self.source,
+            "base": logged_base(model, self.base), "passive": model.passive,
             "robot": model.tree.movable,
             "transmissions": [gear.stated(model.tree.reductions) for gear in self.transmissions],
-        }
+        }  # fmt: skip
 
 
 def read_job(path: str | Path) -> Job:

@@ -144,17 +144,10 @@ def replay_files(job: Job, findings: Findings, *, ghost: str | Path | None = Non
         trunk = shown.standard_parameters()[:10]
         masses = {label: np.r_[trunk, pi] for label, pi in masses.items()}
     return replay(
-        shown,
-        motion.t,
-        q,
-        torques=torques,
-        masses=masses or None,
-        ghosts=ghosts,
+        shown, motion.t, q, torques=torques, masses=masses or None, ghosts=ghosts,
         bands=None if findings.track is None else _bands(findings.track, findings.folder),
-        marks=marks,
-        notes=notes,
-        log=entry.path.name,
-    )
+        marks=marks, notes=notes, log=entry.path.name,
+    )  # fmt: skip
 
 
 def replay_identified(identification: TorqueIdentification) -> Replay:
@@ -169,15 +162,12 @@ def replay_identified(identification: TorqueIdentification) -> Replay:
     sigma = identification.estimate.sigma[model.n_rows - len(model.joints) :]
     torques = _of_joints(Torques(motion.t, motion.tau, predicted, sigma), model)
     return replay(
-        model,
-        motion.t,
-        motion.q,
-        torques=torques,
+        model, motion.t, motion.q, torques=torques,
         masses={"URDF": identification.prior, "identified": identification.standard},
         marks=_contacts(torques, model),
         notes=[f"Motion: {shown.recording.name}.", *([_PROJECTED] if model.constraints else [])],
         log=Path(shown.recording.log.path).name,
-    )
+    )  # fmt: skip
 
 
 def _replay_commanded(job: Job, results: Mapping[str, Result], ghost: str | Path | None) -> Replay:

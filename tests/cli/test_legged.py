@@ -7,8 +7,10 @@ import pytest
 from helpers.stands import stand
 
 from robotid.cli import main
-from robotid.data.files.formats import write_columns
+from robotid.data.base_motion import BaseColumns
+from robotid.data.files.formats import open_table, write_columns
 from robotid.data.files.read import read_log
+from robotid.data.signal_settings import LogSource
 from robotid.robot.constraints import Contact
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
@@ -49,13 +51,28 @@ def test_a_motion_becomes_a_log_with_base_and_contacts(folder, capsys):
     content = json.loads(capsys.readouterr().out)
     assert content["samples"] == 101
     mass = sum(x["value"] for x in content["standard_parameters"] if x["name"].endswith(".m"))
-    from robotid.data.base_motion import BaseColumns
-
     read = read_log(log, content["joints"], base=BaseColumns(True, FEET))
     weight = np.abs(read.tau).sum(axis=1)
     assert weight.min() > 0.1 * mass
     assert not read.contacts["FL_FOOT"].all()
     assert read.base.twist is not None
+
+
+def test_a_filtered_motion_keeps_its_contacts_where_stamps_are_missing(folder, capsys):
+    """Every fifth row is missing: the filter's rows are even, contacts come from the last row."""
+    table = open_table(folder / "motion.parquet", LogSource())
+    columns = table.read(table.names)
+    kept = np.arange(len(columns["time"])) % 5 != 2
+    write_columns({name: column[kept] for name, column in columns.items()}, folder / "few.csv")
+    job, motion, out = (str(folder / x) for x in ("job.toml", "few.csv", "few_log.csv"))
+    words = ["--controller", "perfect", "--rate", "50", "--cutoff", "10", "--json"]
+    assert main(["simulate", job, motion, "--out", out, *words]) == 0
+    joints = json.loads(capsys.readouterr().out)["joints"]
+    log = read_log(out, joints, base=BaseColumns(True, FEET))
+    t, foot = columns["time"], columns["contact_FL_FOOT"] > 0.5
+    wanted = foot[np.searchsorted(t, log.t + t[0] - log.t[0])]
+    assert not foot.all()
+    assert np.mean(log.contacts["FL_FOOT"] == wanted) > 0.97
 
 
 def test_the_same_motion_with_the_usual_controller_is_refused(folder, capsys):
