@@ -10,8 +10,6 @@ from typing import Any
 
 from robotid.base.exceptions import DataError
 from robotid.base.findings import Finding, by_severity
-from robotid.base.settings import require_kind
-from robotid.data.files.read import Readable, read_logs
 from robotid.data.log import Log, Trajectory
 from robotid.data.signal_settings import SignalSettings
 from robotid.diagnosis.catalogue import finding
@@ -34,55 +32,14 @@ from robotid.diagnosis.urdf.inertials import (
     rounded_angles,
 )
 from robotid.dynamics.base_parameters import structural_mapping
-from robotid.dynamics.constraint_rows import logged_base
 from robotid.robot.model import RobotModel
 from robotid.robot.prior import with_assumed_inertials
-
-
-def check_logs(
-    model: RobotModel,
-    logs: Readable | Sequence[Readable],
-    *,
-    validation: Readable | Sequence[Readable] = (),
-    signals: SignalSettings | None = None,
-) -> tuple[Finding, ...]:
-    """Check logs for faults before an identification.
-
-    Args:
-        model: The robot.
-        logs: Logs to fit, one or several: of the model's joints in its order, or paths or
-            DataFrames with their columns.
-        validation: Validation logs, likewise.
-        signals: How logs become trajectories; the defaults if None.
-
-    Returns:
-        The findings, errors first. Each has a code, a severity, a place and a message.
-
-    Raises:
-        DataError: If a file or a DataFrame is no log.
-        SettingsError: If a setting does not fit a log.
-    """
-    require_kind(model, RobotModel, "model", "a robotid.RobotModel")
-    require_kind(signals, (SignalSettings, type(None)), "signals", "a robotid.SignalSettings")
-    first, second = (
-        read_logs(
-            some,
-            model.joints,
-            prismatic=model.layout.prismatic,
-            needs="any",
-            base=logged_base(model),
-            passive=model.passive,
-            robot=model.tree.movable,
-        )
-        for some in (logs, validation)
-    )
-    return diagnose(model, first, second, signals or SignalSettings())
 
 
 def diagnose(
     model: RobotModel, fitted: Sequence[Log], validation: Sequence[Log], signals: SignalSettings
 ) -> tuple[Finding, ...]:
-    """Check logs that are in memory, as ``check_logs`` does."""
+    """Check logs that are in memory; the findings have errors first."""
     # friction with an internal state is not examined here
     model = with_assumed_inertials(model.with_terms({}))
     findings = assumed_inertials(model)

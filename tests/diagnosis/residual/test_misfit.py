@@ -12,9 +12,9 @@ from helpers.misfits import EFFECTS
 from helpers.paths import ROOT
 
 from robotid.base.findings import Finding
+from robotid.cli.doctor import doctor
 from robotid.cli.job import job_from_settings, read_job
 from robotid.data.signal_settings import SignalSettings
-from robotid.diagnosis.logs.check_logs import check_logs
 from robotid.diagnosis.residual.misfit import couplings as couplings_of
 from robotid.diagnosis.residual.misfit import (
     find_misfits,
@@ -196,7 +196,7 @@ def test_a_counterbalance_is_named_taken_into_the_model_and_no_error(four):
     """40 N m at the lift: gravity of the URDF's is held by the other joints."""
     model = four
     logs = [log_with(model, 3, "balancing", 1, part=k) for k in (0, 1)]
-    guesses = check_logs(model, logs[:1], validation=logs[1:])
+    guesses = doctor(model, logs[:1], validation=logs[1:])
     said = [f for f in guesses if f.severity != "note"]
     assert {(f.code, f.severity) for f in said} == {("counterbalance", "warning")}
     assert said[0].where == f"run0.csv: {LIFT}"
