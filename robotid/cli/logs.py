@@ -1,11 +1,11 @@
 """The logs of a job: opened once, examined, and identified by their inputs."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cache
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
@@ -154,8 +154,7 @@ def examine_logs(
 def job_of_result(job: Job, path: str | Path, advice: str) -> tuple[Job, list[LogEntry]]:
     """Return a job with the settings of a result, and the logs that the result was fitted to."""
     result = load_result(path).content
-    stated = written_job(result["settings"], Path(path).name)
-    hashes = {i["sha256"] for i in result["inputs"] if i["role"] == "identification"}
+    stated, hashes = written_job(result["settings"], Path(path).name), fitted_hashes(result)
     for entry in stated.identification:
         if not log_exists(entry.path) or file_sha256(entry.path) not in hashes:
             raise DataError(
@@ -163,6 +162,11 @@ def job_of_result(job: Job, path: str | Path, advice: str) -> tuple[Job, list[Lo
             )
     wanted = replace(stated, urdf=job.urdf, identification=job.identification)
     return wanted, list(stated.identification)
+
+
+def fitted_hashes(result: Mapping[str, Any]) -> set[str]:
+    """Return the SHA-256 of the logs that a result was fitted to."""
+    return {entry["sha256"] for entry in result["inputs"] if entry["role"] == "identification"}
 
 
 def result_run(job: Job, path: str | Path) -> tuple[Job, list[LogEntry], RobotModel, "Run"]:

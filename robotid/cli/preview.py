@@ -24,7 +24,7 @@ from robotid.cli.job import (
     pairs,
     refuse_log_flags,
 )
-from robotid.cli.logs import result_run
+from robotid.cli.logs import fitted_hashes, result_run
 from robotid.design.previews import preview_logs
 from robotid.estimation.fitting.survey import SurveyedLog, survey_log
 from robotid.output.files.entries import build_preview
@@ -49,7 +49,7 @@ def preview_job(
         return build_preview(preview_logs(model, motions, job.estimator, **stated))
     job, fitted, model, run = result_run(job, given)
     result = load_result(given).content
-    hashes = {entry["sha256"] for entry in result["inputs"] if entry["role"] == "identification"}
+    hashes = fitted_hashes(result)
     is_fitted = {entry.path: file_sha256(entry.path) in hashes for entry in job.identification}
     if not any(is_fitted.values()):
         motions = _motions(job, model, job.identification)
@@ -116,17 +116,11 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     if options.given:
         refuse_log_flags(options, "a RESULT states how its logs are read")
-    stated = {"noise": stated_noise(options), "correlation": options.correlation}
-    show_found(
-        preview_job(job_from_flags(options), options.given, **stated),
-        options,
-        partial(_show, is_verbose=options.verbose),
+    noise = pairs(options.noise, "--noise")
+    content = preview_job(
+        job_from_flags(options), options.given, noise=noise, correlation=options.correlation
     )
-
-
-def stated_noise(options: argparse.Namespace) -> dict[str, float]:
-    """Return the noise that the flags state, by joint [N m or N]."""
-    return pairs(options.noise, "--noise")
+    show_found(content, options, partial(_show, is_verbose=options.verbose))
 
 
 def _show(content: dict[str, Any], *, is_verbose: bool) -> None:

@@ -1,7 +1,7 @@
 """robotid validate: compute a result's prediction error on other logs."""
 
 import argparse
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from itertools import compress
 from pathlib import Path
@@ -15,8 +15,7 @@ from robotid.base.findings import Finding, listed
 from robotid.base.text import terminal_width
 from robotid.cli.console import echo, print_verdict, show_found
 from robotid.cli.job import Job, LogEntry, add_shown, written_job
-from robotid.cli.logs import log_of_commands, survey_logs
-from robotid.data.log import Log
+from robotid.cli.logs import fitted_hashes, log_of_commands, survey_logs
 from robotid.diagnosis.logs.check_logs import diagnose
 from robotid.diagnosis.verdict.evidence import Determined, Predictions
 from robotid.diagnosis.verdict.fit_findings import unlike_findings
@@ -167,33 +166,19 @@ def _validate_commands(loaded: Result, job: Job, entries: Sequence[LogEntry]) ->
     model = loaded.robot
     logs = [log_of_commands(job, entry, loaded) for entry in entries]
     runs = [loaded.open_loop(log) for log in logs]
-    hashes = {i["sha256"] for i in loaded.content["inputs"] if i["role"] == "identification"}
-    is_validation = not any(file_sha256(entry.path) in hashes for entry in entries)
+    hashes = fitted_hashes(loaded.content)
     log_errors = blocking(diagnose(model, (), logs, job.signals), job.ignore)
     verdict = judge_positions(
-        pool_positions(runs, moving=True),
-        model.joints,
-        is_validation=is_validation,
+        pool_positions(runs, moving=True), model.joints,
+        is_validation=not any(file_sha256(entry.path) in hashes for entry in entries),
         log_errors=[finding.message for finding in log_errors],
-    )
+    )  # fmt: skip
     return {
         "result": str(loaded.path),
         "predicted_with": loaded.content["outputs"]["urdf"],
         "validation": [run.to_dict() for run in runs],
         "verdict": verdict.to_dict(),
     }
-
-
-def _fitted_logs(
-    job: Job, model: RobotModel, hashes: Collection[str]
-) -> tuple[list[Log], list[str]]:
-    """Return the fitted logs, windows of long ones, and the names of missing ones."""
-    exists = [log_exists(e.path) and file_sha256(e.path) in hashes for e in job.identification]
-    missing = [
-        e.path.name for e, found in zip(job.identification, exists, strict=True) if not found
-    ]
-    (surveyed,) = survey_logs(job, model, list(compress(job.identification, exists)))
-    return [look for log in surveyed for look in log.looks], missing
 
 
 def _verdict(
@@ -205,72 +190,50 @@ def _verdict(
     unlike: Sequence[Finding],
 ) -> Verdict:
     """Return the verdict on logs, which may be fitted, faulty, unlike, or of a fitted motion."""
-    hashes = {i["sha256"] for i in result["inputs"] if i["role"] == "identification"}
-    fitted, missing = _fitted_logs(job, model, hashes)
-    again = [
-        file_sha256(log.path) in hashes or any(_share(a, b) for a in log.looks for b in fitted)
+    hashes, is_robust = fitted_hashes(result), job.estimator.is_robust
+    is_there = [log_exists(e.path) and file_sha256(e.path) in hashes for e in job.identification]
+    (surveyed,) = survey_logs(job, model, list(compress(job.identification, is_there)))
+    fitted = [look for log in surveyed for look in log.looks]
+    again = [  # whether a log is a fitted one, or a cut or thinned copy
+        file_sha256(log.path) in hashes
+        or any(shares_rows(a, b) or shares_rows(b, a) for a in log.looks for b in fitted)
         for log in logs
     ]
     is_new = [not is_refitted for is_refitted in again]
     looks = [look for log in compress(logs, is_new) for look in log.looks]
     names = list(dict.fromkeys(Path(log.path).name for log in looks))
-    found = [
-        finding
-        for finding in diagnose(model, fitted, looks, job.signals)
-        if finding.where.split(": ")[0] in names and finding.code not in job.ignore
-    ]
-    found += [each for each in unlike if each.code not in job.ignore]
-    log_errors = blocking(found, job.ignore, is_robust=job.estimator.is_robust)
+    of_doctor = diagnose(model, fitted, looks, job.signals)
+    found = [*(x for x in of_doctor if x.where.split(": ")[0] in names), *unlike]
+    found = [finding for finding in found if finding.code not in job.ignore]
+    log_errors = [x.message for x in blocking(found, job.ignore, is_robust=is_robust)]
     stated = result["verdict"]
-    predictions = Predictions(
-        Metrics({}, 0.0),
-        {e.recording.name: e.metrics["estimate"] for e in compress(evaluations, is_new)},
-        tuple(joint for joint in model.joints if joint not in model.passive),
-        refitted=[e.recording.name for e in compress(evaluations, again)],
-        hidden=hidden_joints(model, evaluations),
-    )
-    determined = Determined(
-        result["structure"]["undetermined"],
-        result["consistency"]["is_consistent"],
-        result["structure"].get("poorly_excited", True),
-        model.is_static,
-    )
-    return judge(
-        predictions,
-        determined,
-        log_errors=list(
-            dict.fromkeys([*stated.get("log_errors", ()), *(f.message for f in log_errors)])
-        ),
-        warnings=list(dict.fromkeys(_warnings(job, model, stated, found, names, missing))),
-        scale_check=stated_scale_check(result),
-    )
-
-
-def _warnings(
-    job: Job,
-    model: RobotModel,
-    stated: Mapping[str, Any],
-    found: Sequence[Finding],
-    names: Sequence[str],
-    missing: Sequence[str],
-) -> list[VerdictWarning]:
-    """Return the warnings of the result, without those of its validation, and of the new logs."""
-    own = [VerdictWarning(**warning) for warning in stated.get("warnings", ())]
-    is_robust = job.estimator.is_robust
-    warnings = [warning for warning in own if warning.code != "repeated_motion"]
+    warnings = [VerdictWarning(**warning) for warning in stated.get("warnings", ())]
+    warnings = [warning for warning in warnings if warning.code != "repeated_motion"]
     warnings += warnings_of(found, model.joints, names, is_robust=is_robust)
-    if missing:
+    if not all(is_there):
+        missing = [e.path.name for e in compress(job.identification, np.logical_not(is_there))]
         message = (
             f"the fitted logs {listed(missing)} are missing or were changed: rows of these "
             "recordings were not compared with fitted rows"
         )
         warnings.append(VerdictWarning("fitted_logs_missing", "", message))
-    return warnings
-
-
-def _share(one: Log, other: Log) -> bool:
-    """Return whether one of two logs contains rows of the other, as a cut or thinned copy."""
-    return shares_rows(one, other) or shares_rows(other, one)
+    structure = result["structure"]
+    return judge(
+        Predictions(
+            Metrics({}, 0.0),
+            {e.recording.name: e.metrics["estimate"] for e in compress(evaluations, is_new)},
+            tuple(joint for joint in model.joints if joint not in model.passive),
+            refitted=[e.recording.name for e in compress(evaluations, again)],
+            hidden=hidden_joints(model, evaluations),
+        ),
+        Determined(
+            structure["undetermined"], result["consistency"]["is_consistent"],
+            structure.get("poorly_excited", True), model.is_static,
+        ),
+        log_errors=list(dict.fromkeys([*stated.get("log_errors", ()), *log_errors])),
+        warnings=list(dict.fromkeys(warnings)),
+        scale_check=stated_scale_check(result),
+    )  # fmt: skip
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
@@ -283,14 +246,9 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    entries = [_entry(log, options) for log in options.logs]
-    show_found(validate(options.result, entries), options, _show)
-
-
-def _entry(log: str, options: argparse.Namespace) -> "LogEntry":
-    """Return a log with its robot, checked as in a job file."""
     unit = {} if options.unit is None else {"unit": options.unit}
-    return LogEntry.from_dict({"log": log, **unit})
+    entries = [LogEntry.from_dict({"log": log, **unit}) for log in options.logs]
+    show_found(validate(options.result, entries), options, _show)
 
 
 def _show(found: dict[str, Any]) -> None:
@@ -303,14 +261,12 @@ def _show(found: dict[str, Any]) -> None:
             source = "fit, for logs of the same day"
             if expected["with_spread"]:
                 source = "fit and spread between logs"
-            own = [
-                f"{joint} {each['rmse']:.3g} ({each['within_95_pct']:.0f} %)"
-                for joint, each in expected["per_joint"].items()
-                if each["within_95_pct"] is not None
-            ]
-            echo(
-                f"expected rmse by the {source} (share of rows within 95 %): {', '.join(own)}", "  "
+            figures = ", ".join(
+                f"{joint} {error['rmse']:.3g} ({error['within_95_pct']:.0f} %)"
+                for joint, error in expected["per_joint"].items()
+                if error["within_95_pct"] is not None
             )
+            echo(f"expected rmse by the {source} (share of rows within 95 %): {figures}", "  ")
     for finding in found.get("findings", ()):
         echo(f"\n{finding['message']}")
     print_verdict(found["verdict"])
