@@ -35,7 +35,14 @@ from robotid.cli.job import (
     job_from_flags,
     source_words,
 )
-from robotid.cli.logs import examine_logs, locked_as_logged, needed_of, survey_logs, units_of_logs
+from robotid.cli.logs import (
+    Refuse,
+    examine_logs,
+    locked_as_logged,
+    needed_of,
+    survey_logs,
+    units_of_logs,
+)
 from robotid.cli.payload import check_payloads
 from robotid.data.files.read import Readable
 from robotid.data.log import Log
@@ -215,48 +222,46 @@ def save_result(
 
 def _names(model: RobotModel) -> tuple[str, str, str, str]:
     """Return the names of report, replay, URDF and sidecar."""
-    name = f"{Path(model.tree.path).stem}.identified.urdf"
-    return "report.html", "replay.html", name, str(Path(name).with_suffix(".drive.json"))
+    stem = Path(model.tree.path).stem
+    return "report.html", "replay.html", f"{stem}.identified.urdf", f"{stem}.identified.drive.json"
 
 
 def _write(
-    found: Identification, job: Job, target: Path, *, source: Sequence[str] = ()
+    identification: Identification, job: Job, target: Path, *, source: Sequence[str] = ()
 ) -> tuple[Identification, dict[str, Any]]:
     """Write all files of a result; return the identification with its report, and result.json."""
-    names = report, replay, name, sidecar = _names(found.model)
+    model = identification.model
+    names = report, replay, urdf, sidecar = _names(model)
     target.mkdir(parents=True, exist_ok=True)
     with folder_beside(target) as partial:
         outputs = {}
         played = {"replay": replay} if job.replay else {}
-        written = {"urdf": name, "sidecar": sidecar} if found.has_urdf else {}
+        written = {"urdf": urdf, "sidecar": sidecar} if identification.has_urdf else {}
         if job.report:
-            found = replace(found, report=str(target / report))
+            identification = replace(identification, report=str(target / report))
             links = {"result": "result.json", **written, **played}
             origin = Origin(tuple(source), str(target), replay)
-            write_report(found, partial / report, files=links, origin=origin)
+            write_report(identification, partial / report, files=links, origin=origin)
             outputs["report"] = report
         if written:
-            model, pi = found.model, found.standard
-            moments = found.moments if job.dynamics else {}
+            pi, moments = identification.standard, identification.moments if job.dynamics else {}
             dynamics = job.dynamics and project_friction(model, pi, moments, DYNAMICS_TERMS)
-            write_urdf(model, pi, partial / name, dynamics=dynamics)
-            outputs |= written
-        outputs |= played
-        result = build_result(found, job.to_dict(), outputs=outputs)
+            write_urdf(model, pi, partial / urdf, dynamics=dynamics)
+        outputs |= written | played
+        result = build_result(identification, job.to_dict(), outputs=outputs)
         write_json(result, partial / "result.json")
         if job.replay:
-            _replay_of(found, job, partial).write(partial / replay)
-    others = {*names} - set(outputs.values())
-    remove_written(target / other for other in sorted(others))
-    return found, result
+            _replay_of(identification, job, partial).write(partial / replay)
+    remove_written(target / name for name in sorted({*names} - set(outputs.values())))
+    return identification, result
 
 
-def _replay_of(found: Identification, job: Job, folder: Path) -> "Replay":
+def _replay_of(identification: Identification, job: Job, folder: Path) -> "Replay":
     """Return the replay of a result that is written in a folder; its modules are imported here."""
     from robotid.cli.replay import read_findings, replay_files, replay_identified, stated_job
 
-    if isinstance(found, TorqueIdentification):
-        return replay_identified(found)
+    if isinstance(identification, TorqueIdentification):
+        return replay_identified(identification)
     entries = (*job.validation, *job.identification)
     if not entries:
         raise DataError(
@@ -279,11 +284,10 @@ def _job_of(identification: Identification) -> Job:
     wanted = wanted_families(asked.friction, model.joints)
     is_auto = all(names is None for names in wanted.values())
     drives: dict[str, tuple[str | DriveTerm, ...]] = {}
-    for drive in model.layout.drives:
-        name, own = drive.name, model.layout.own.get(drive.name, ())
-        found = chosen.get(name)
-        stated = [term for term in own if found is None or term not in found.terms]
-        families = (wanted.get(name) or ()) if found is None else found.families
+    for name in (drive.name for drive in model.layout.drives):
+        choice, terms = chosen.get(name), model.layout.own.get(name, ())
+        stated = [term for term in terms if choice is None or term not in choice.terms]
+        families = (wanted.get(name) or ()) if choice is None else choice.families
         entries: tuple[str | DriveTerm, ...] = (*(() if is_auto else families), *stated)
         if entries:
             drives[name] = entries
@@ -308,11 +312,7 @@ def _entries(evaluations: Sequence[Evaluated]) -> tuple[LogEntry, ...]:
 
 
 def identify_job(
-    job: Job,
-    model: RobotModel,
-    plan: WorkPlan,
-    *,
-    refuse: Callable[[LogEntry, DataError], None] | None = None,
+    job: Job, model: RobotModel, plan: WorkPlan, *, refuse: Refuse | None = None
 ) -> Identification:
     """Identify from a job's logs; nothing is written."""
     check_ignored(job.ignore)
@@ -327,7 +327,7 @@ def identify_job(
     report_stage(plan.progress, "checking logs")
     job, model, fitted, validation, notes = locked_as_logged(job, model, fitted, validation)
     locked = locked_findings(model, job.placed(model))
-    found = [*locked, *examine_logs(job, model, fitted, validation)]
+    findings = [*locked, *examine_logs(job, model, fitted, validation)]
     recordings = Recordings(model, structural_mapping(model), fitted, validation)
     if not recordings.is_in_memory:
         recordings = replace(recordings, plan=plan)
@@ -339,7 +339,7 @@ def identify_job(
         )
     with plan:
         concluded = conclude(
-            recordings, job.estimator, found, job.ignore, friction=job.friction,
+            recordings, job.estimator, findings, job.ignore, friction=job.friction,
             progress=plan.progress,
         )  # fmt: skip
     return replace(
@@ -370,13 +370,13 @@ def _identify_loops(
         [job.read(entry, model, needs=needed_of(job.controller)) for entry in entries]
         for entries in (job.identification, job.validation)
     )
-    found = identify_loops(
+    identification = identify_loops(
         model, logs, validation, job.controller, job.estimator, signals=job.signals,
         chooses=AUTO in job.terms, examined=diagnose(model, logs, validation, job.signals),
         ignore=job.ignore, units=units_of_logs(job.identification),
         progress=progress or ignore_progress,
     )  # fmt: skip
-    return replace(found, stated=replace(found.stated, job=job))
+    return replace(identification, stated=replace(identification.stated, job=job))
 
 
 MAIN_FLAGS = (
@@ -405,15 +405,11 @@ def run(options: argparse.Namespace) -> int:
         workers = job.workers if options.workers is None else options.workers
         plan = WorkPlan(workers, options.scheduler, progress=progress)
         source = source_words(options.words)
-        found, result = run_job(job, options.out, plan=plan, source=source)
-    show_found(
-        result,
-        options,
-        partial(show_result, findings=found.findings, is_verbose=options.verbose),
-        [*result["outputs"].values(), "result.json"],
-    )
+        identification, result = run_job(job, options.out, plan=plan, source=source)
+    show = partial(show_result, findings=identification.findings, is_verbose=options.verbose)
+    show_found(result, options, show, [*result["outputs"].values(), "result.json"])
     if not options.json:
-        print_steps(next_steps(found, Origin(source, options.out)))
+        print_steps(next_steps(identification, Origin(source, options.out)))
     return 1 if result["verdict"]["log_errors"] else 0
 
 
@@ -467,23 +463,17 @@ def _drive_lines(result: Mapping[str, Any]) -> list[str]:
     if "simulation" not in result:
         lines = friction_lines(result["friction"]) + left_out_lines(result.get("left_out", ()))
         return lines + variation_lines(result.get("variation"))
-    rows = [
-        (
-            entry["name"],
-            f"{entry['value']:.4g}",
-            "at bound" if entry["source"] == "bound" else f"{entry['std_error']:.2g}",
-            entry["unit"],
-        )
-        for entry in result["drive_parameters"]
-        if entry["std_error"] is not None
-    ]
-    found = columns(("parameter", "value", "+-", "unit"), rows)
-    return found + variation_lines(result.get("variation"))
+    rows = []
+    for entry in result["drive_parameters"]:
+        if (error := entry["std_error"]) is not None:
+            half = "at bound" if entry["source"] == "bound" else f"{error:.2g}"
+            rows.append((entry["name"], f"{entry['value']:.4g}", half, entry["unit"]))
+    lines = columns(("parameter", "value", "+-", "unit"), rows)
+    return lines + variation_lines(result.get("variation"))
 
 
 def _worst(result: Mapping[str, Any]) -> str:
     """Return the joint with the largest prediction error, and that error."""
-    is_motion = "simulation" in result
     errors = [
         (m["relative_error_pct"], joint)
         for metrics in result["validation"] or [result["identification"]]
@@ -493,4 +483,5 @@ def _worst(result: Mapping[str, Any]) -> str:
     if not errors:
         return ""
     error, joint = max(errors)
-    return f"{joint}, {'position' if is_motion else 'torque'} error {error:.1f} %"
+    kind = "position" if "simulation" in result else "torque"
+    return f"{joint}, {kind} error {error:.1f} %"

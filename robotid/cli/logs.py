@@ -37,17 +37,21 @@ _PIECES = 8  # pieces per rows in memory: the filter of a piece needs memory of 
 _SHORTEST = 256  # rows of a piece
 
 
+#: Called with a log that cannot be read, in place of raising the error.
+Refuse: TypeAlias = Callable[[LogEntry, DataError], None]
+
+
 def survey_logs(
     job: Job,
     model: RobotModel,
     *groups: Sequence[LogEntry],
-    refuse: Callable[[LogEntry, DataError], None] | None = None,
+    refuse: Refuse | None = None,
     needs: Needs = "torque",
 ) -> tuple[tuple[SurveyedLog, ...], ...]:
     """Return the logs of each group, ready to be read."""
     paths = dict.fromkeys(entry.path for entry in chain(*groups))
     opened = {path: _open(job, model, path, needs) for path in paths}
-    rows = sum(_count(found) for found in opened.values())
+    rows = sum(map(_count, opened.values()))
     is_long = rows > job.rows_in_memory and not model.is_static
     length = max(job.rows_in_memory // _PIECES, _SHORTEST) if is_long else None
 
@@ -56,11 +60,11 @@ def survey_logs(
         units_of_logs(entries)
         for entry in entries:
             try:
-                found = opened[entry.path]
-                if isinstance(found, DataError):
-                    raise found
+                file = opened[entry.path]
+                if isinstance(file, DataError):
+                    raise file
                 window = entry.start, entry.end
-                log = survey_log(*found, model, job.signals, window, length=length)
+                log = survey_log(*file, model, job.signals, window, length=length)
                 logs.append(replace(log, unit=entry.unit or ""))
             except DataError as error:
                 if refuse is None:
@@ -119,9 +123,9 @@ def locked_as_logged(
     """Return the job with joints locked at their positions in the logs, unless it states them."""
     logged, logs = {}, (*fitted, *validation)
     for joint in [joint for joint in model.locked if joint not in job.placed(model)]:
-        found = [log.locked[joint] for log in logs if joint in log.locked]
-        if found and np.ptp(np.concatenate(found)) <= STILL:
-            logged[joint] = float(np.median(np.concatenate(found)))
+        positions = np.concatenate([log.locked.get(joint, []) for log in logs])
+        if len(positions) and np.ptp(positions) <= STILL:
+            logged[joint] = float(np.median(positions))
     if not logged:
         return job, model, fitted, validation, ()
     shown = ", ".join(f"{joint} = {position:.4g}" for joint, position in logged.items())
@@ -193,11 +197,9 @@ def _open(
     return layout, replace(table, read=lambda wanted: read(tuple(wanted)))
 
 
-def _count(found: tuple[LogLayout, Table] | DataError) -> int:
+def _count(file: tuple[LogLayout, Table] | DataError) -> int:
     """Return the approximate number of rows of a file, 0 if it is only read whole."""
-    if isinstance(found, DataError) or found[1].rows is None:
-        return 0
-    return found[1].rows.count()
+    return 0 if isinstance(file, DataError) or file[1].rows is None else file[1].rows.count()
 
 
 def log_of_commands(job: Job, entry: LogEntry, result: Result) -> Log:
