@@ -180,31 +180,22 @@ def _replay_commanded(job: Job, results: Mapping[str, Result], ghost: str | Path
     simulated = {label: result.follow_commands(log) for label, result in results.items()}
     names = ["simulated"] if len(simulated) == 1 else [f"simulated: {x}" for x in simulated]
     shown = dict(zip(names, simulated.values(), strict=True)) | {"commanded": q_ref}
-    ghosts = {label: _finite_rows(log.t, q + zero) for label, q in shown.items()}
+    known = {label: np.isfinite(q).all(axis=1) for label, q in shown.items()}
+    ghosts = {label: (log.t[rows], shown[label][rows] + zero) for label, rows in known.items()}
     if ghost is not None:
         other = job.read(LogEntry(Path(ghost)), model, needs="motion")
         ghosts[Path(ghost).name] = (other.t, other.q + zero)
     error = np.sqrt(np.mean((q_ref - log.q) ** 2, axis=0))
     left = np.sqrt(np.nanmean((shown[names[0]] - log.q) ** 2, axis=0))
     worst = [f"{model.joints[j]} {1e3 * left[j]:.2g}" for j in np.argsort(-left).tolist()]
+    notes = [
+        f"Motion: {entry.path.name}, as measured; ghosts: command and simulation.",
+        f"Simulated position error, RMS [mrad or mm]: {listed(worst, 3)}.",
+    ]
+    torques = Torques(log.t, log.q, shown, error, "position")
     return replay(
-        model,
-        log.t,
-        log.q + zero,
-        torques=Torques(log.t, log.q, shown, error, "position"),
-        ghosts=ghosts,
-        notes=[
-            f"Motion: {entry.path.name}, as measured; ghosts: command and simulation.",
-            f"Simulated position error, RMS [mrad or mm]: {listed(worst, 3)}.",
-        ],
-        log=entry.path.name,
+        model, log.t, log.q + zero, torques=torques, ghosts=ghosts, notes=notes, log=entry.path.name
     )
-
-
-def _finite_rows(t: Array, q: Array) -> tuple[Array, Array]:
-    """Return the rows without NaN."""
-    rows = np.isfinite(q).all(axis=1)
-    return t[rows], q[rows]
 
 
 def _base_poses(job: Job, entry: LogEntry, log: Log) -> Array | None:
@@ -246,9 +237,7 @@ def _torques(
     results: Mapping[str, Result],
 ) -> Torques:
     """Return measured torques, and those predicted by each result and by the URDF."""
-    shown: dict[str, Array] = {}
-    driven: dict[str, Array] = {}
-    motion = None
+    shown, driven, motion = dict[str, Array](), dict[str, Array](), None
     for label, robot in robots.items():
         rows = hold_log(robot, log, job.signals).whole
         motion = rows.trajectory
@@ -286,13 +275,9 @@ def _bands(track: Mapping[str, Any], folder: Path) -> Bands:
     if missing:
         raise DataError(f"{track['history']} has no column {missing[0]!r}; run robotid track again")
     columns = table.read(wanted)
-    return Bands(
-        t=columns["time"],
-        names=names,
-        units=[entry["unit"] for entry in entries],
-        theta=np.column_stack([columns[name] for name in names]),
-        std_error=np.column_stack([columns[name] for name in errors]),
-    )
+    theta, std_error = (np.column_stack([columns[x] for x in some]) for some in (names, errors))
+    units = [entry["unit"] for entry in entries]
+    return Bands(t=columns["time"], names=names, units=units, theta=theta, std_error=std_error)
 
 
 def _payloads(track: Mapping[str, Any] | None) -> list[Mark]:

@@ -37,72 +37,58 @@ def run_track(job: Job, folder: str | Path, *, observer: Observer | None = None)
     history = "track.parquet" if find_spec("pyarrow") else "track.csv"
     inputs = [job.urdf, *(entry.path for entry in job.identification)]
     check_folder(Path(folder), [history, "track.json"], inputs)
-    if len(job.identification) != 1:
-        raise SettingsError(f"{len(job.identification)} logs are given, wanted one to track")
-    log = job.read(job.identification[0], model)
+    (entry,) = job.identification
+    log = job.read(entry, model)
     if job.signals.cutoff is None:
         raise SettingsError(
             "the cutoff is disabled, but the online estimator differentiates positions; state a "
             "cutoff in Hz"
         )
-    step = float(np.median(np.diff(log.t)))
+    rate = job.signals.rate or 1.0 / float(np.median(np.diff(log.t)))
     settings = OnlineSettings(
-        rate=job.signals.rate or 1.0 / step,
-        cutoff=job.signals.cutoff,
-        min_velocity=job.signals.min_velocity,
+        rate=rate, cutoff=job.signals.cutoff, min_velocity=job.signals.min_velocity
     )
-    found = track(model, log, settings, observer=observer)
-    content = _summary(found, job, log, history)
+    tracked = track(model, log, settings, observer=observer)
+    content = _summary(tracked, job, log, history)
     target = Path(folder)
     target.mkdir(parents=True, exist_ok=True)
     with folder_beside(target) as partial:
-        write_columns(found.columns(), partial / history)
+        write_columns(tracked.columns(), partial / history)
         write_json(content, partial / "track.json")
     return content
 
 
-def _summary(found: Track, job: Job, log: Log, history: str) -> dict[str, Any]:
-    identifier = found.identifier
+def _summary(tracked: Track, job: Job, log: Log, history: str) -> dict[str, Any]:
+    identifier = tracked.identifier
     model, mapping = identifier.model, identifier.mapping
-    converged, last = found.t[found.converged].tolist(), identifier.reading
+    converged, last = tracked.t[tracked.converged].tolist(), identifier.reading
     units = [model.layout.units[i] for i in mapping.independent]
     rows = zip(mapping.base_names, mapping.expressions, last.theta.tolist(),
                last.std_error.tolist(), units, strict=True)  # fmt: skip
     keys = ("name", "expression", "value", "std_error", "unit")
+    inputs = {"urdf": str(job.urdf), "log": log.path}
     return {
-        "schema_version": _SCHEMA,
-        "robotid": __version__,
-        "robot": model.name,
-        "joints": list(model.joints),
-        "settings": job.to_dict(),
+        "schema_version": _SCHEMA, "robotid": __version__, "robot": model.name,
+        "joints": list(model.joints), "settings": job.to_dict(),
         "inputs": [
-            {"role": "urdf", "path": str(job.urdf), "sha256": file_sha256(job.urdf)},
-            {"role": "log", "path": log.path, "sha256": file_sha256(log.path)},
+            {"role": role, "path": path, "sha256": file_sha256(path)}
+            for role, path in inputs.items()
         ],
-        "samples": len(log.t),
-        "delay": identifier.delay,
-        "first_estimate": float(found.t[0]),
-        "converged_at": converged[0] if converged else None,
-        "excitation": last.excitation,
+        "samples": len(log.t), "delay": identifier.delay, "first_estimate": float(tracked.t[0]),
+        "converged_at": converged[0] if converged else None, "excitation": last.excitation,
         "sigma": dict(zip(model.row_names, last.sigma.tolist(), strict=True)),
         "base_parameters": [dict(zip(keys, row, strict=True)) for row in rows],
         "changes": [_change(identifier, index) for index in range(len(identifier.changes))],
         "history": history,
-    }
+    }  # fmt: skip
 
 
 def _change(identifier: OnlineIdentifier, index: int) -> dict[str, Any]:
     """Return a change with its equivalent payload, estimated up to the end of the log."""
     change, load = identifier.changes[index], identifier.payload(index)
-    return {
-        "flagged": change.flagged,
-        "onset": change.onset,
-        "payload": {
-            "body": identifier.model.layout.bodies[-1],
-            "mass": load.mass,
-            "std_error": load.mass_std_error,
-        },
-    }
+    body = identifier.model.layout.bodies[-1]
+    payload = {"body": body, "mass": load.mass, "std_error": load.mass_std_error}
+    return {"flagged": change.flagged, "onset": change.onset, "payload": payload}
 
 
 def serve_track(
@@ -112,7 +98,7 @@ def serve_track(
     port: int = 0,
     speed: float = 1.0,
     announce: Callable[[str], None],
-    finished: Callable[[dict[str, Any]], None] | None = None,
+    finished: Callable[[dict[str, Any]], None],
     linger: bool = True,
 ) -> dict[str, Any]:
     """Track the one log of a job, show it in a live page, and return as ``run_track``."""
@@ -129,8 +115,7 @@ def serve_track(
         announce(live.url)
         content = run_track(job, folder, observer=_LiveFeed(live, model, log, speed))
         live.finish()
-        if finished is not None:
-            finished(content)
+        finished(content)
         while linger:
             time.sleep(3600.0)
     return content
@@ -159,12 +144,10 @@ class _LiveFeed:
         if identifier.is_ready:
             reading, (tau, predicted) = identifier.reading, identifier.compared
             message |= {
-                "at": reading.t,
-                "tau": tau.tolist(),
+                "at": reading.t, "tau": tau.tolist(), "theta": reading.theta.tolist(),
                 "predicted": [x if np.isfinite(x) else None for x in predicted.tolist()],
-                "theta": reading.theta.tolist(),
                 "std_error": reading.std_error.tolist(),
-            }
+            }  # fmt: skip
         self._live.send(message)
         for change in identifier.changes[self._marks :]:
             label = f"step change, detected at {change.flagged:.2f} s"
