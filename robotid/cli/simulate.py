@@ -35,10 +35,10 @@ from robotid.dynamics.simulation.sensors import Run, measure
 from robotid.dynamics.simulation.simulation_settings import Simulation, read_simulation
 from robotid.dynamics.simulation.simulator import carried, delay, follow
 from robotid.dynamics.simulation.truth import draw_parameters
+from robotid.output.files.result_file import SCHEMA_VERSION
 from robotid.output.files.urdf import write_urdf
 from robotid.robot.model import RobotModel
 
-_SCHEMA_VERSION = 1
 _HALF = 0.5  # of the commanded range: a joint that moves less does not follow
 
 
@@ -143,7 +143,7 @@ def _truth(
     prior = model.standard_parameters()[:size]
     error = run.q - run.reference
     content: dict[str, Any] = {
-        "schema_version": _SCHEMA_VERSION,
+        "schema_version": SCHEMA_VERSION,
         "robotid": __version__,
         "robot": model.name,
         "joints": list(model.joints),

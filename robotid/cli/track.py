@@ -21,12 +21,12 @@ from robotid.data.files.formats import write_columns
 from robotid.data.log import Log
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.identification.online import Observer, OnlineIdentifier, OnlineSettings, Track, track
+from robotid.output.files.result_file import SCHEMA_VERSION
 from robotid.output.viewer.replays import gap_marks, live_page
 from robotid.output.viewer.scene import coordinates
 from robotid.output.viewer.server import LivePage
 from robotid.robot.model import RobotModel
 
-_SCHEMA = 1
 _RATE = 25.0  # [Hz] messages per second of the log
 _SLOWEST = 1e-3  # [-] smallest speed, relative to real time
 
@@ -68,7 +68,7 @@ def _summary(tracked: Track, job: Job, log: Log, history: str) -> dict[str, Any]
     keys = ("name", "expression", "value", "std_error", "unit")
     inputs = {"urdf": str(job.urdf), "log": log.path}
     return {
-        "schema_version": _SCHEMA, "robotid": __version__, "robot": model.name,
+        "schema_version": SCHEMA_VERSION, "robotid": __version__, "robot": model.name,
         "joints": list(model.joints), "settings": job.to_dict(),
         "inputs": [
             {"role": role, "path": path, "sha256": file_sha256(path)}
