@@ -30,7 +30,7 @@ from robotid.data.files.read import Readable
 from robotid.data.log import Log, suggestion
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import low_pass
-from robotid.diagnosis.logs.motion_checks import excitation_finding
+from robotid.diagnosis.logs.check_logs import excitation_finding
 from robotid.dynamics.base_parameters import BaseMapping, structural_mapping
 from robotid.dynamics.factors import Factors, compress, join, merge
 from robotid.dynamics.prediction import predict, predict_instants
@@ -38,7 +38,7 @@ from robotid.dynamics.used_rows import base_problem, independent_share
 from robotid.estimation.estimators import Estimate
 from robotid.estimation.estimators.batch import solve_factor
 from robotid.estimation.estimators.determination import base_spread, determine
-from robotid.estimation.estimators.segments import FEWEST_SEGMENTS, scatter
+from robotid.estimation.estimators.estimator import FEWEST_SEGMENTS, scatter
 from robotid.estimation.fitting.chosen_estimator import Known, consistent_fit, pinned_links
 from robotid.estimation.fitting.estimator_settings import ConsistentSettings, EstimatorSettings
 from robotid.estimation.fitting.evaluation import evaluate_logs

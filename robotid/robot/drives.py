@@ -458,8 +458,6 @@ TERM_CLASSES: dict[str, type[DriveTerm]] = {
     )
 }  # fmt: skip
 
-#: Family of a counterbalance that opposes gravity.
-COUNTERBALANCE = "harmonics1"
 _SPEED = Shape("speed", ("rad/s", "m/s"), (0.005, 0.5), "v")
 _RISE = Shape("speed", ("rad/s", "m/s"), (0.005, 1.0), "v")
 _WAY = Shape("displacement", ("rad", "m"), (0.0005, 0.015), "q")
@@ -523,12 +521,12 @@ FAMILIES: dict[str, Family] = {
                lambda data_range, way: (Presliding(displacement=way),), (_WAY,), is_automatic=True),
         Family("lag", "a delayed torque (a delay, an elastic gear)",
                lambda data_range: (Lag(),), is_automatic=True),
-        Family(COUNTERBALANCE, "a torque with one period per revolution, as of a counterbalance",
+        Family("harmonics1", "a torque with one period per revolution, as of a counterbalance",
                # unguarded, since gravity contains them too
                lambda data_range: (Harmonic(), Harmonic(is_sine=True)), needs=0.1),
         Family("harmonics2", "a spring or counterbalance torque that depends on the position",
                _harmonics(2), needs=0.5, is_automatic=True, code="spring",
-               instead=(COUNTERBALANCE, "spring")),
+               instead=("harmonics1", "spring")),
         Family("harmonics4",
                "a torque that is periodic in the joint's position (cogging, an eccentric gear)",
                _harmonics(4), needs=0.5, is_automatic=True, code="position_periodic"),
@@ -553,11 +551,6 @@ FAMILIES: dict[str, Family] = {
         Family("spring_table", "a nonlinear spring (table)", _table),
     )
 }  # fmt: skip
-
-
-def spring_family(turned: float, *families: str) -> str:
-    """Return the first spring family whose required range a joint covered."""
-    return next((name for name in families if has_turned(name, turned)), "spring")
 
 
 def has_turned(family: str, turned: float) -> bool:

@@ -16,7 +16,7 @@ from robotid.cli import fleet, main
 from robotid.cli.fleet import read_fleet, run_fleet
 from robotid.data.files.read import write_log
 from robotid.estimation.variation.variation import between_units
-from robotid.estimation.workers.plan import WorkPlan
+from robotid.estimation.work_plan import WorkPlan
 from robotid.robot.model import RobotModel
 
 URDF = ROOT / "urdf" / "planar_2r.urdf"

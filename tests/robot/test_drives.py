@@ -44,7 +44,6 @@ from robotid.robot.drives import (
     Tanh,
     drive_line,
     has_turned,
-    spring_family,
     term_from_dict,
 )
 from robotid.robot.examples import example_urdf
@@ -485,9 +484,6 @@ def test_a_family_is_advised_a_tenth_beyond_the_turns_that_it_needs():
         assert has_turned(name, enough * (1 + 1e-9))
         assert not has_turned(name, enough * (1 - 1e-9))
     assert has_turned("spring", 0.0)
-    for turned, wanted in ((4.0, "harmonics2"), (3.4, "harmonics1"), (0.7, "harmonics1"),
-                           (0.68, "spring")):  # fmt: skip
-        assert spring_family(turned, "harmonics2", "harmonics1") == wanted
 
 
 def test_the_line_of_a_drive_is_read_back_as_it_was():
