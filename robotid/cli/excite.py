@@ -17,12 +17,16 @@ from robotid.cli.console import echo, print_files, progress_of, show_found
 from robotid.cli.job import JOB, ROBOT, Flags, Job, add_shown, as_job, job_from_flags, number
 from robotid.cli.logs import result_run
 from robotid.data.log import Log
-from robotid.design.basis import Basis, BSplineBasis, FourierBasis
 from robotid.design.clearance import Box, Clearance
-from robotid.design.design import Design, Designer
-from robotid.design.excitation_settings import FARTHEST, ROUTES, MotionSettings
+from robotid.design.design import Design, Designer, FourierBasis
+from robotid.design.excitation import (
+    FARTHEST,
+    ROUTES,
+    MotionSettings,
+    check_motion_file,
+    write_motion,
+)
 from robotid.design.limits import LIMITS, Course, MotionLimits
-from robotid.design.motion_files import check_motion_file, write_motion
 from robotid.design.previews import Preview, Run, preview_logs
 from robotid.design.routes import design_stands, design_sweeps
 from robotid.estimation.fitting.survey import hold_log
@@ -107,9 +111,7 @@ def _designer(
     clearance, least = None, settings.clearance
     if least is not None:
         clearance = Clearance(model, least=least, floor=settings.floor, boxes=settings.boxes)
-    basis: Basis = FourierBasis(settings.duration, settings.harmonics)
-    if settings.kind == "bspline":
-        basis = BSplineBasis(settings.duration, 2 * settings.harmonics)
+    basis = FourierBasis(settings.duration, settings.harmonics)
     designer = Designer.of_model(
         model, basis, limits, name=name, clearance=clearance, noise=settings.noise, run=run
     )

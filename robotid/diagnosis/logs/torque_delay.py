@@ -162,7 +162,7 @@ def _misfit(
         _window(model, motion, part, step, every, signals, period)
         for part in _segments(model, motion, every)
     ]
-    ends = np.cumsum(model.support()[:, : model.layout.n_inertial].sum(axis=1)).tolist()
+    ends = np.cumsum(model.support[:, : model.layout.n_inertial].sum(axis=1)).tolist()
     columns = [slice(*pair) for pair in pairwise([0, *ends])]
     squares = [_squares(windows, j, own) for j, own in enumerate(columns)] if windows else []
     used = [one for one in squares if one is not None]
@@ -228,7 +228,7 @@ def _window(
 def _of_urdf(model: RobotModel, carried: Array) -> Array:
     """Return the torque of the URDF's bodies from ``carried_columns``, shape (N, n)."""
     size = model.layout.n_inertial
-    support, pi = model.support()[:, :size], model.standard_parameters()[:size]
+    support, pi = model.support[:, :size], model.standard_parameters()[:size]
     ends = np.cumsum(support.sum(axis=1))
     weighted = np.cumsum(carried * np.concatenate([pi[row] for row in support]), axis=1)
     return np.asarray(np.diff(weighted[:, ends - 1], axis=1, prepend=0.0))

@@ -19,7 +19,8 @@ _NUMBERS = HEADERS[2:7]
 #: Mass [kg], centre of mass [m], inertia about it [kg m^2], in the axes of the joint frame.
 CENTRAL_TERMS = ("m", "cx", "cy", "cz", "Ixx", "Iyy", "Izz", "Ixy", "Ixz", "Iyz")
 _PAIRS = ((0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 2))  # axes of Pinocchio's six inertias
-_ORDER = [0, 1, 2, 3, 4, 6, 9, 5, 7, 8]  # of CENTRAL_TERMS in Pinocchio's order
+_PINOCCHIO = ("m", "cx", "cy", "cz", "Ixx", "Ixy", "Iyy", "Ixz", "Iyz", "Izz")
+_ORDER = [_PINOCCHIO.index(term) for term in CENTRAL_TERMS]
 
 
 def parameter_entries(found: Identified) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
