@@ -283,6 +283,13 @@ def check_rest(log: Log, motion: Trajectory, layout: ParameterLayout) -> Iterato
             yield finding(code, log.name, joint, range=extent, moving_share=share, unit=unit)
 
 
+def distance(t: Array, instants: Array) -> Array:
+    """Return the distance of times from the nearest of some instants, shape as t [s]."""
+    bounds = np.concatenate([[-np.inf], instants, [np.inf]])
+    after = np.searchsorted(bounds, t)
+    return np.asarray(np.minimum(t - bounds[after - 1], bounds[after] - t))
+
+
 def runs_of(flags: Array) -> list[tuple[int, int]]:
     """Return the first row, and the row after the last one, of each run of true flags."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(int)))
