@@ -17,7 +17,7 @@ from robotid.base.text import columns, in_digits_of
 from robotid.base.versions import __version__
 from robotid.cli.console import Terminated, echo, show_found
 from robotid.cli.job import JOB, ONLINE, Job, add_out, add_shown, job_from_flags
-from robotid.data.files.formats import write_columns
+from robotid.data.files.read import write_columns
 from robotid.data.log import Log
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.identification.online import Observer, OnlineIdentifier, OnlineSettings, Track, track

@@ -17,8 +17,7 @@ from helpers.synthetic import exact_log, payload_log, truth
 from robotid.base.exceptions import DataError
 from robotid.cli import main
 from robotid.cli.replay import _of_joints, replay_identified
-from robotid.data.files.formats import open_table, write_columns
-from robotid.data.files.read import write_log
+from robotid.data.files.read import open_table, write_columns, write_log
 from robotid.data.signal_settings import LogSource
 from robotid.output.files.result_file import load_result
 from robotid.output.viewer.replays import Torques

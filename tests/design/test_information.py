@@ -5,7 +5,7 @@ from helpers.robots import ROBOTS, WRIST
 from robotid.base.exceptions import DataError
 from robotid.design.information import CRITERIA, MotionInformation, criterion
 from robotid.dynamics.base_parameters import structural_mapping
-from robotid.dynamics.drive_columns import friction_speeds
+from robotid.dynamics.rows import friction_speeds
 from robotid.dynamics.torque import joint_torque_regressor
 from robotid.robot.drives import Lag, LoadFriction, Stribeck
 from robotid.robot.examples import example_urdf

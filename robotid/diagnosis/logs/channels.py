@@ -8,7 +8,8 @@ from robotid.base.findings import Finding, listed, quoted
 from robotid.base.text import seconds
 from robotid.base.typing import Array
 from robotid.data.log import Log, Trajectory
-from robotid.data.measured_velocity import (
+from robotid.data.signal_settings import SignalSettings
+from robotid.data.units import (
     COARSE,
     LARGEST_LAG,
     is_trustworthy,
@@ -16,7 +17,6 @@ from robotid.data.measured_velocity import (
     unlike_velocities,
     velocity_lags,
 )
-from robotid.data.signal_settings import SignalSettings
 from robotid.diagnosis.catalogue import finding
 from robotid.diagnosis.decisions import AGREES, BEYOND_NOISE, DIFFERS, SHARE_OF_ROWS
 from robotid.robot.parameters import ParameterLayout

@@ -14,8 +14,7 @@ import numpy as np
 from robotid.base.exceptions import DataError, RobotIdError
 from robotid.base.findings import Finding, by_severity, toml_key
 from robotid.base.typing import Array
-from robotid.data.alike_motions import REPEATED, repeated_share
-from robotid.data.log import Log, Trajectory
+from robotid.data.log import REPEATED, Log, Trajectory, repeated_share
 from robotid.data.signal_settings import LogUnits, SignalSettings
 from robotid.diagnosis.catalogue import finding
 from robotid.diagnosis.logs.base_checks import check_base
@@ -33,7 +32,7 @@ from robotid.diagnosis.logs.torque_delay import check_torque_delay
 from robotid.diagnosis.urdf.inertials import assumed_inertials, explained_by_assumed, rounded_angles
 from robotid.dynamics.base_parameters import BaseMapping, structural_mapping
 from robotid.dynamics.factors import Reduction, compress, merge
-from robotid.dynamics.used_rows import base_problem, independent_share, row_mask
+from robotid.dynamics.prepared_logs import base_problem, independent_share, row_mask
 from robotid.estimation.estimators import WLS, Estimate
 from robotid.estimation.estimators.determination import (
     Determination,

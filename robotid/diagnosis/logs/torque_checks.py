@@ -25,8 +25,8 @@ from robotid.diagnosis.logs.hypotheses import (
 )
 from robotid.dynamics.base_parameters import BaseMapping
 from robotid.dynamics.factors import Reduction, compress_segments
+from robotid.dynamics.prepared_logs import base_problem, row_mask
 from robotid.dynamics.rows import keep_inertial_rows
-from robotid.dynamics.used_rows import base_problem, row_mask
 from robotid.estimation.estimators.two_runs import payload_runs
 from robotid.robot.model import RobotModel
 from robotid.robot.prior import payload_spread, prior_spread

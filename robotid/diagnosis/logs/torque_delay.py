@@ -19,7 +19,7 @@ from robotid.diagnosis.catalogue import finding
 from robotid.diagnosis.decisions import BEYOND_NOISE, ROUNDING, ROWS
 from robotid.diagnosis.logs.channels import AT_REST, MOVING, distance
 from robotid.diagnosis.logs.hypotheses import coupled_columns, smooth_motion
-from robotid.dynamics.torque import carried_columns
+from robotid.dynamics.rows import inertial_rows
 from robotid.robot.model import RobotModel
 
 _LONGEST = 0.1  # [s] largest delay of the grid
@@ -212,7 +212,7 @@ def _window(
     own = np.stack([motion.a[rows], v, *signs, v * np.abs(v), *waves], axis=2)
     own = low_pass(own, 1 / step, signals)[::every][inner]
     state = motion.q[coarse], motion.v[coarse], motion.a[coarse]
-    inertial, coupled = (columns(model, *state) for columns in (carried_columns, coupled_columns))
+    inertial, coupled = inertial_rows(model, *state).values.T, coupled_columns(model, *state)
     load = _interpolated(motion.t[coarse], np.abs(_of_urdf(model, inertial)), t) * signs[0]
     load = low_pass(load, 1 / step, signals)[::every][inner]
     inertial, coupled = (
@@ -229,7 +229,7 @@ def _window(
 
 
 def _of_urdf(model: RobotModel, carried: Array) -> Array:
-    """Return the torque of the URDF's bodies from ``carried_columns``, shape (N, n)."""
+    """Return the torque of the URDF's bodies from their columns, shape (N, n)."""
     size = model.layout.n_inertial
     support, pi = model.support[:, :size], model.standard_parameters()[:size]
     ends = np.cumsum(support.sum(axis=1))

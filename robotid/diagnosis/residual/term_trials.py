@@ -26,8 +26,8 @@ from robotid.data.log import Trajectory
 from robotid.diagnosis.decisions import FAMILY_P_VALUE, FEWEST, OUTLIER, SEGMENTS, SHORTEST, p_value
 from robotid.diagnosis.logs.channels import distance
 from robotid.dynamics.constraint_rows import without_forces
+from robotid.dynamics.prepared_logs import independent_share
 from robotid.dynamics.torque import trajectory_regressor
-from robotid.dynamics.used_rows import independent_share
 from robotid.estimation.fitting.drive_terms import JointMotion, joint_motions, travelled
 from robotid.estimation.fitting.evaluation import Evaluation, Recording
 from robotid.estimation.fitting.fitted import Solution
