@@ -180,3 +180,12 @@ def _student(before: Array, after: Array) -> float:
     gain = (before - after)[moves] / np.maximum(before, after)[moves]
     spread = max(float(np.std(gain, ddof=1)) / np.sqrt(len(gain)), NOTHING)
     return float(stdtr(len(gain) - 1, -gain.mean() / spread))
+
+
+def connected(is_alike: Array) -> list[list[int]]:
+    """Return the groups of several indices that a symmetric relation connects: (n, n)."""
+    from scipy.sparse.csgraph import connected_components
+
+    count, label = connected_components(is_alike)
+    groups = [np.flatnonzero(label == k).tolist() for k in range(count)]
+    return [group for group in groups if len(group) > 1]

@@ -10,9 +10,9 @@ import numpy as np
 from robotid.base.findings import Finding, listed
 from robotid.base.typing import Array
 from robotid.data.log import Log
-from robotid.data.measured_velocity import quantum
+from robotid.data.units import quantum
 from robotid.diagnosis.catalogue import finding
-from robotid.diagnosis.decisions import CORRELATED, DIFFERS, SHARE_OF_ROWS, SIGNIFICANT
+from robotid.diagnosis.decisions import CORRELATED, DIFFERS, SHARE_OF_ROWS, SIGNIFICANT, connected
 from robotid.diagnosis.logs.channels import runs_of
 from robotid.estimation.fitting.standard_errors import QUANTILE
 
@@ -279,19 +279,12 @@ def _alike(log: Log, loops: Sequence[_Loop]) -> Iterator[Finding]:
     lag = max(1, round(_INTERVAL / loops[0].step))
     changes = commands[lag:] - commands[:-lag]
     same = np.minimum(*(np.abs(np.corrcoef(x.T)) for x in (commands, changes)))
-    left = list(range(len(loops)))
-    while left:
-        group = [left.pop(0)]
-        for k in group:
-            near = [i for i in left if same[k, i] > CORRELATED]
-            group += near
-            left = [i for i in left if i not in near]
-        if len(group) > 1:
-            least = min(max(same[i, k] for k in group if k != i) for i in group)
-            names = [loops[i].name for i in sorted(group)]
-            yield finding(
-                "proportional_commands", log.name, names, correlation=least, joints=len(names)
-            )
+    for group in connected(same > CORRELATED):
+        least = min(max(same[i, k] for k in group if k != i) for i in group)
+        names = [loops[i].name for i in group]
+        yield finding(
+            "proportional_commands", log.name, names, correlation=least, joints=len(names)
+        )
 
 
 def _slow(log: Log, loops: Sequence[_Loop]) -> Iterator[Finding]:
