@@ -162,6 +162,18 @@ def test_full_turns_are_taken_out_of_each_piece(tmp_path):
     assert np.any(turned, axis=0).tolist() == free.tolist()
 
 
+def test_a_locked_joint_has_the_positions_of_all_windows(robot, recording, tmp_path, monkeypatch):
+    monkeypatch.setattr(survey, "_WINDOW", 100)
+    path = tmp_path / "run.csv"
+    write_log(recording, path)
+    held, *moving = robot.joints
+    model = RobotModel.from_urdf(robot.tree.path, joints=moving, locked={held: 0.0})
+    reading = {"robot": model.tree.movable}
+    found = long_log(model, path, SignalSettings(), **reading).locked
+    rows = np.r_[0:100, 950:1050, 1900:2000]
+    np.testing.assert_allclose(found[held], recording.q[rows, 0], rtol=1e-12)
+
+
 def spoilt(recording, tmp_path, name, row, value):
     table = {"time": recording.t.copy()}
     for j, joint in enumerate(recording.joints):
