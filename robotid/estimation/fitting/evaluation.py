@@ -3,7 +3,7 @@
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial, reduce
-from itertools import chain, islice
+from itertools import islice
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -18,7 +18,7 @@ from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import turns_note
 from robotid.dynamics.factors import Factors, merge
 from robotid.dynamics.prediction import predict
-from robotid.estimation.fitting.survey import PieceTask, SurveyedLog
+from robotid.estimation.fitting.recorded import LogPiece, SurveyedLog
 from robotid.estimation.workers.plan import WorkPlan
 from robotid.robot.model import RobotModel
 
@@ -299,69 +299,53 @@ class _Score:
     found: tuple[Array, ...]  # which of the sampled rows of each other log are in this one
 
 
-@dataclass(frozen=True, eq=False)
-class _Part(PieceTask):
-    """A piece, with the rows of it that are stored: sampled rows, and a segment for plots."""
-
-    sampled: slice
-    shown: slice | None
-
-
-def _parts(log: SurveyedLog) -> list[_Part]:
-    last = len(log.pieces) - 1
-    shown = {0: slice(_SHOWN), (last + 1) // 2: slice(_SHOWN), last: slice(-_SHOWN, None)}
-    if log.is_in_memory:
-        shown = {0: slice(None)}
-    every = _sampled_every(log.stop - log.first)
-    return [
-        _Part(piece, slice((log.first - piece.first) % every, None, every), shown.get(k))
-        for k, piece in enumerate(log.pieces)
-    ]
-
-
 def _score_logs(
     logs: Sequence[SurveyedLog], work: "partial[_Score]", plan: WorkPlan | None
 ) -> list[list[_Score]]:
     """Return the results of the pieces of each log; raise an error for a log without samples."""
-    parts = [_parts(log) for log in logs]
-    results = (plan or WorkPlan()).map(work, list(chain.from_iterable(parts)), "evaluating")
+    pieces = [piece for log in logs for piece in log.pieces]
+    results = (plan or WorkPlan()).map(work, pieces, "evaluating")
     scores = []
-    for log, own in zip(logs, parts, strict=True):
-        by_piece = list(islice(results, len(own)))
+    for log in logs:
+        by_piece = list(islice(results, len(log.pieces)))
         filled = [k for k, score in enumerate(by_piece) if score.smooth]
         if not filled:
             raise log.too_short()
         if not any(score.shown for score in by_piece):  # the chosen pieces have no samples
-            by_piece[filled[0]] = work(replace(own[filled[0]], shown=slice(_SHOWN)), None)
+            k = filled[0]
+            by_piece[k] = work(log.pieces[k], None, shown_rows=slice(_SHOWN))
         scores.append(by_piece)
     return scores
 
 
 def _score(
-    part: _Part,
+    piece: LogPiece,
     threads: int | None,
     *,
     parameters: Mapping[str, Array],
     prior: Array | None,
     driven: Array | None,
     sought: Sequence[Array] = (),
+    shown_rows: slice | None = None,
 ) -> _Score:
-    """Return the result of a piece, with the torques of a part of it."""
-    header, rows = part.piece.header, part.piece.read()
-    model, motion, mask = header.model, rows.trajectory, rows.mask
+    """Return the result of a piece, with the torques of the rows that are shown."""
+    rows, model = piece.read(), piece.model
+    motion, mask = rows.trajectory, rows.mask
     of_urdf = {"urdf": prior, "urdf_with_drives": driven}
     moving = {name: pi for name, pi in of_urdf.items() if pi is not None}
-    torques = _predict_all(model, motion, {**parameters, **moving}, prior, header.is_compiled)
+    torques = _predict_all(model, motion, {**parameters, **moving}, prior, piece.is_compiled)
     baselines = {x: torques[x] for x in ("gravity_only", *moving) if x in torques}
-    shown = None
-    if part.shown is not None and len(motion.t):
-        start, stop, _ = part.shown.indices(len(motion.t))
+    shown, shown_rows = None, shown_rows or _shown_rows(piece)
+    if shown_rows is not None and len(motion.t):
+        start, stop, _ = shown_rows.indices(len(motion.t))
         stored = {name: torque[start:stop] for name, torque in torques.items()}
         # the whole motion is used as it is, with its cached properties
         is_whole = stop - start == len(motion.t)
         shown = motion if is_whole else motion.at(slice(start, stop)), mask[start:stop], stored
     recorded = np.hstack([rows.positions, rows.torques])
     measured = mask & [name not in model.passive for name in model.row_names]
+    first, stop = piece.log_rows
+    every = _sampled_every(stop - first)
     return _Score(
         sums={x: TorqueSums.of(motion.tau, torques[x], measured, baselines) for x in parameters},
         smooth=len(motion.t),
@@ -369,9 +353,19 @@ def _score(
         segments=frozenset(np.unique(motion.segment).tolist()),
         turned=rows.turned,
         shown=shown,
-        sampled=recorded[part.sampled],
+        sampled=recorded[(first - piece.first) % every :: every],
         found=tuple(_rows_in(sampled, recorded) for sampled in sought),
     )
+
+
+def _shown_rows(piece: LogPiece) -> slice | None:
+    """Return the samples for plots: all in memory, else some of first, middle and last piece."""
+    k, count = piece.number
+    if isinstance(piece.source, Log):
+        return slice(None)
+    if k == count - 1:
+        return slice(-_SHOWN, None)
+    return slice(_SHOWN) if k in (0, count // 2) else None
 
 
 def _predict_all(

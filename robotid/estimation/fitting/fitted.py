@@ -506,7 +506,7 @@ def friction_curve(
     drive_terms = enumerate(layout.drive_parameters, start=layout.n_inertial)
     terms = {k: x for k, (drive, x) in drive_terms if drive == d and not x.is_inertia}
     places = list(terms)
-    X = np.array([term.column(motion) for term in terms.values()]).reshape(-1, len(v)).T
+    X = np.array([term.column(motion) for term in terms.values()]).reshape(len(terms), len(v)).T
     moves = np.array([term.moves[places] for term in fit.open_terms]).reshape(-1, len(places))
     C = fit.standard_covariance[np.ix_(places, places)] - moves.T @ moves
     variance = np.einsum("ij,jk,ik->i", X, C, X)

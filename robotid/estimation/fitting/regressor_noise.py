@@ -39,8 +39,7 @@ from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import local_polynomial
 from robotid.dynamics.factors import Factors, Reduction
 from robotid.estimation.estimators.batch import solve_factor
-from robotid.estimation.fitting.recorded import Recordings
-from robotid.estimation.fitting.survey import SurveyedLog, hold_log
+from robotid.estimation.fitting.recorded import Recordings, SurveyedLog, hold_log
 
 _FEWEST, _MOST = 4, 6  # pairs of rounding errors
 _PRECISE = 0.2  # uncertainty of the shift in standard errors at which no more pairs are drawn

@@ -14,8 +14,7 @@ from robotid.dynamics.simulation.simulation_settings import Controller, Noise, S
 from robotid.dynamics.simulation.simulator import simulate
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
 from robotid.estimation.fitting.fit import solve_recordings
-from robotid.estimation.fitting.recorded import Recordings
-from robotid.estimation.fitting.survey import hold_log
+from robotid.estimation.fitting.recorded import Recordings, hold_log
 from robotid.robot.constraints import Contact
 from robotid.robot.drives import Lag, LoadFriction, Stribeck
 from robotid.robot.examples import example_urdf

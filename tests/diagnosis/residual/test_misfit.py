@@ -28,8 +28,7 @@ from robotid.diagnosis.verdict.verdict import warnings_of
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.estimation.fitting.drive_terms import JointMotion
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
-from robotid.estimation.fitting.recorded import Recordings
-from robotid.estimation.fitting.survey import hold_log
+from robotid.estimation.fitting.recorded import Recordings, hold_log
 from robotid.identification.pipeline import conclude, identify
 from robotid.robot.drives import AUTO
 from robotid.robot.model import RobotModel

@@ -7,7 +7,7 @@ from helpers.synthetic import exact_log, truth
 from robotid.data.signal_settings import SignalSettings
 from robotid.diagnosis.residual.torque_split import friction_split, spectrum
 from robotid.estimation.fitting.evaluation import evaluate_logs
-from robotid.estimation.fitting.survey import hold_log
+from robotid.estimation.fitting.recorded import hold_log
 
 
 def test_the_spectrum_s_integral_is_the_mean_square_of_the_rows_used(rng):

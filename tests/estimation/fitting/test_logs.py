@@ -7,8 +7,7 @@ from helpers.synthetic import exact_log, truth
 
 from robotid.data.signal_settings import SignalSettings
 from robotid.dynamics.base_parameters import structural_mapping
-from robotid.estimation.fitting.recorded import Recordings, RepeatedErrors
-from robotid.estimation.fitting.survey import hold_log
+from robotid.estimation.fitting.recorded import Recordings, RepeatedErrors, hold_log
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ from robotid.dynamics.simulation.motions import random_fourier
 from robotid.dynamics.torque import joint_torque_regressor
 from robotid.estimation.estimators import OLS, WLS
 from robotid.estimation.fitting import regressor_noise
-from robotid.estimation.fitting.recorded import Recordings
+from robotid.estimation.fitting.recorded import Recordings, hold_log
 from robotid.estimation.fitting.regressor_noise import (
     acceleration_noise,
     find_regressor_noise,
@@ -27,7 +27,6 @@ from robotid.estimation.fitting.regressor_noise import (
     without_noise,
 )
 from robotid.estimation.fitting.standard_errors import measured_errors
-from robotid.estimation.fitting.survey import hold_log
 from robotid.robot.model import RobotModel
 
 RATE, STEP = 200.0, 2 * np.pi / 2**11  # [Hz], [rad]

@@ -15,9 +15,8 @@ from robotid.data.signal_settings import SignalSettings
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.used_rows import base_problem
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
-from robotid.estimation.fitting.recorded import Recordings
+from robotid.estimation.fitting.recorded import Recordings, survey_log
 from robotid.estimation.fitting.robust import LOSSES, find_outliers, loss_slope, loss_weight
-from robotid.estimation.fitting.survey import survey_log
 from robotid.identification.pipeline import conclude
 
 NOISE = np.array([6.0, 3.0, 0.9])

@@ -18,8 +18,7 @@ from robotid.estimation.fitting.estimator_settings import (
     RecursiveSettings,
 )
 from robotid.estimation.fitting.fit import fit_recordings
-from robotid.estimation.fitting.recorded import Recordings
-from robotid.estimation.fitting.survey import hold_log
+from robotid.estimation.fitting.recorded import Recordings, hold_log
 
 JOBS = Path(__file__).parents[2] / "jobs"
 RECURSIVE = [name for name, kind in ESTIMATORS.items() if issubclass(kind, RecursiveSettings)]

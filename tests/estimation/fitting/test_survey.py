@@ -2,6 +2,7 @@
 
 import pickle
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pinocchio as pin
@@ -21,9 +22,8 @@ from robotid.dynamics.factors import join
 from robotid.dynamics.simulation.motions import random_fourier
 from robotid.dynamics.torque import joint_torque_regressor, mass_regressor
 from robotid.estimation.estimators import WLS
-from robotid.estimation.fitting import survey
-from robotid.estimation.fitting.recorded import Recordings
-from robotid.estimation.fitting.survey import ReducedPiece, hold_log, survey_log
+from robotid.estimation.fitting import recorded as survey
+from robotid.estimation.fitting.recorded import Recordings, hold_log, reduce_piece, survey_log
 from robotid.robot.closure import Chains
 from robotid.robot.constraints import Contact
 from robotid.robot.drives import Cubic
@@ -57,9 +57,9 @@ def long_log(model, path, signals, *, start=None, end=None, length=LENGTH, **rea
 
 
 def pieces_of(log):
-    """Return the pieces of a log, ready to be reduced."""
+    """Return what reduces each piece of a log."""
     mapping = structural_mapping(log.model)
-    return [ReducedPiece(piece, mapping) for piece in log.pieces]
+    return [partial(reduce_piece, piece, mapping=mapping) for piece in log.pieces]
 
 
 def assert_alike(model, path, signals, *, start=None, end=None, **reading):
@@ -68,7 +68,7 @@ def assert_alike(model, path, signals, *, start=None, end=None, **reading):
     found = long_log(model, path, signals, start=start, end=end, **reading)
     whole = hold_log(model, read_log(path, model.joints, start=start, end=end, **reading), signals)
     wanted = join(Recordings(model, mapping, [whole]).reduce())
-    joined = join([piece.reduce() for piece in pieces_of(found)])
+    joined = join([reduced() for reduced in pieces_of(found)])
     assert found.signals == whole.signals
     assert joined.samples == wanted.samples
     np.testing.assert_array_equal(joined.factors.rows, wanted.factors.rows)
@@ -195,9 +195,9 @@ def test_a_hole_in_the_last_piece_is_named_by_its_row_in_the_file(
     window = (2.0, None)
     log = survey_log(short, table, robot, SignalSettings(cutoff=None), window, length=LENGTH)
     pieces = pieces_of(log)
-    pieces[-2].reduce()
+    pieces[-2]()
     with pytest.raises(DataError, match=r"tau_elbow_joint is NaN at row 1801 \(t = ") as found:
-        pieces[-1].reduce()
+        pieces[-1]()
     assert found.value.code == "not_finite"
 
 
@@ -234,7 +234,7 @@ def test_pieces_travel_as_they_are(robot, recording, tmp_path):
     write_log(recording, path)
     pieces = pieces_of(long_log(robot, path, SignalSettings()))
     for piece, again in zip(pieces, pickle.loads(pickle.dumps(pieces)), strict=True):
-        np.testing.assert_array_equal(again.reduce().factors.R, piece.reduce().factors.R)
+        np.testing.assert_array_equal(again().factors.R, piece().factors.R)
     # the model and the mapping go along once
     assert len(pickle.dumps(pieces)) < len(pickle.dumps(pieces[:1])) + 1000 * len(pieces)
 
