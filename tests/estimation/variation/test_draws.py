@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from robotid.estimation.variation.draws import (
+from robotid.estimation.variation.spread import (
     correlated_scores,
     possible_draws,
     root_of,
