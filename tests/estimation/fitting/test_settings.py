@@ -1,6 +1,5 @@
 import pickle
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,40 +8,15 @@ from helpers.fitting import fit
 from helpers.synthetic import exact_log, truth
 
 from robotid.base.exceptions import SettingsError
-from robotid.cli.job import read_job
 from robotid.data.signal_settings import SignalSettings
-from robotid.dynamics.base_parameters import structural_mapping
 from robotid.estimation.fitting.estimator_settings import (
     ESTIMATORS,
     EstimatorSettings,
     RecursiveSettings,
 )
-from robotid.estimation.fitting.fit import fit_recordings
-from robotid.estimation.fitting.recorded import Recordings, hold_log
 
-JOBS = Path(__file__).parents[2] / "jobs"
 RECURSIVE = [name for name, kind in ESTIMATORS.items() if issubclass(kind, RecursiveSettings)]
 EXACT = SignalSettings(cutoff=None, trim=0.0, min_velocity=0.0, velocity="measured")
-
-
-def relative_errors(found, name):
-    per_joint = found.validation[0].metrics[name].per_joint.values()
-    return np.array([joint.relative_error_pct for joint in per_joint])
-
-
-def test_recursive_estimators_predict_real_recordings_as_wls_does(recordings, monkeypatch):
-    monkeypatch.setenv("ROBOTID_DATA", str(recordings))
-    job = read_job(JOBS / "panda_inria.toml")
-    model = job.model()
-    fitted, kept = (
-        [hold_log(model, job.read(entry, model), job.signals) for entry in entries]
-        for entries in (job.identification, job.validation)
-    )
-    recordings = Recordings(model, structural_mapping(model), fitted, kept)
-    for name in RECURSIVE:
-        found = fit_recordings(recordings, EstimatorSettings(name))
-        ratio = relative_errors(found, "estimate") / relative_errors(found, "wls")
-        assert ratio.max() < 1.15, name
 
 
 @pytest.mark.parametrize("name", RECURSIVE)
