@@ -134,8 +134,8 @@ class JointMotion:
     def at(self, rows: slice) -> "JointMotion":
         """Return the motion in some of the rows, without the other joints."""
         names = ("q", "v", "a", "direction", "load", "travelled", "time")
-        arrays = (getattr(self, name)[rows] for name in names)
-        return JointMotion(*arrays, passes=self.passes, longest=self.longest)
+        some: dict[str, Any] = {name: getattr(self, name)[rows] for name in names}
+        return replace(self, **some, others={}, scale=None)
 
 
 def joint_motions(
@@ -157,7 +157,10 @@ def joint_motions(
     signs, distance = joined(partial(_directions, model)), joined(travelled)
     time = joined(lambda m: (m.t - m.t[0]) / longest)
     columns = zip(q.T, v.T, a.T, signs.T, load.T, distance.T, strict=True)
-    alone = [JointMotion(*x, time, passes, longest) for x in columns]
+    alone = [
+        JointMotion(q_j, v_j, a_j, sign, load_j, far, time, passes, longest)
+        for q_j, v_j, a_j, sign, load_j, far in columns
+    ]
     return tuple(
         replace(motion, others={model.joints[k]: alone[k] for k in (j - 1, j + 1) if 0 <= k < n})
         for j, motion in enumerate(alone)

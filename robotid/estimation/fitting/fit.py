@@ -86,6 +86,11 @@ class Known:
     repeated: float = 0.0  # share of errors of points of contact in the squared residual [-]
 
     @property
+    def beta(self) -> Array:
+        """Base parameters of the URDF, shape (b,)."""
+        return self.mapping.to_base(self.pi)
+
+    @property
     def covariance(self) -> Array:
         """Prior covariance of the base parameters, shape (b, b)."""
         KS = self.mapping.K * self.spread
@@ -100,7 +105,7 @@ def make_estimator(
     choice: EstimatorSettings, known: Known
 ) -> estimators.BatchEstimator | estimators.RecursiveEstimator[Any]:
     """Return the estimator that settings describe, for a robot and the prior of its parameters."""
-    share, sigma, beta = known.share, known.sigma, known.mapping.to_base(known.pi)
+    share, sigma, beta = known.share, known.sigma, known.beta
     match choice:
         case settings.OLSSettings():
             return estimators.OLS(independent_share=share)

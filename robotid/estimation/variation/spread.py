@@ -243,7 +243,7 @@ class _Grid:
     def values(self) -> tuple[Array, Array]:
         """Return the parameter in each run and its standard error, shape (k,)."""
         weight, mean, variance = self.all
-        mean, variance = _shrunk(*self.sums[:2], self.between, mean, variance)
+        mean, variance = _shrunk(self.sums[0], self.sums[1], self.between, mean, variance)
         mean, variance = mean[self.members], variance[self.members]
         W, w = self.W[:, None, None], self.w[:, None, None]
         mean, variance = _shrunk(W, w, self.within, mean, variance)
