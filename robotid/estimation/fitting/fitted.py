@@ -53,7 +53,6 @@ SOURCES = ("data", "mixed", "prior", "bound")
 FROM_DATA, FROM_PRIOR = 0.3, 0.9
 _WORSE = 1.2  # error of WLS over that of the estimate above which it is clearly worse
 _AT_BOUND = 1e-6  # size of a drive term at its bound of 0, in prior standard deviations
-_COVERAGE = 0.95
 _SPEEDS = 20  # points of a friction curve in each direction
 
 
@@ -77,13 +76,11 @@ class Identified(ABC):
 
     @property
     @abstractmethod
-    def standard_error(self) -> Array:
-        """Standard errors of the standard parameters, shape (p,); inf if there is none."""
+    def standard_error(self) -> Array: ...  # (p,), of the standard parameters; inf if there is none
 
     @property
     @abstractmethod
-    def standard_quantile(self) -> Array:
-        """Half-width of each standard parameter's 95 % interval in standard errors, shape (p,)."""
+    def standard_quantile(self) -> Array: ...  # (p,), half-width of 95 % intervals [std errors]
 
     @property
     @abstractmethod
@@ -97,23 +94,19 @@ class Identified(ABC):
 
     @property
     @abstractmethod
-    def sources(self) -> tuple[str, ...]:
-        """The source of the value of each standard parameter, of ``SOURCES``."""
+    def sources(self) -> tuple[str, ...]: ...  # of the value of each standard parameter
 
     @property
     @abstractmethod
-    def undetermined(self) -> tuple[str, ...]:
-        """Names of the base parameters that are not identifiable."""
+    def undetermined(self) -> tuple[str, ...]: ...  # names of parameters that are not identifiable
 
     @property
     @abstractmethod
-    def moments(self) -> Mapping[str, DriveMoments]:
-        """Moments that project the friction of each drive on simpler terms, by drive."""
+    def moments(self) -> Mapping[str, DriveMoments]: ...  # that project each drive's friction
 
     @property
     @abstractmethod
-    def is_consistent(self) -> bool:
-        """Whether the parameters are physically consistent."""
+    def is_consistent(self) -> bool: ...  # physically
 
     @property
     def standard_interval(self) -> Array:
@@ -450,7 +443,7 @@ def _residual_noise(bands: Sequence[TorqueBand], evaluations: Sequence[Evaluatio
         parts.append(np.where(e.recording.mask[band.samples], needed, np.nan))
     variance = np.concatenate(parts)
     for j in np.flatnonzero(np.isfinite(variance).any(axis=0)):
-        noise[j] = np.sqrt(max(np.nanquantile(variance[:, j], _COVERAGE), 0.0))
+        noise[j] = np.sqrt(max(np.nanquantile(variance[:, j], 0.95), 0.0))
     return noise
 
 

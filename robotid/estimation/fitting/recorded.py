@@ -54,7 +54,8 @@ from robotid.robot.model import RobotModel
 
 #: Default number of rows of a piece.
 PIECE = 16384
-_WINDOW = 20_000  # rows of each window that is checked
+#: Rows of each window that is checked.
+WINDOW = 20_000
 _SEGMENTS = 48  # of all logs in memory: enough to estimate the scatter of their scores
 _CORRELATIONS = 10  # shortest segment, in correlation times of filtered noise
 _SEGMENTS_IN_FILE = 64  # largest number of segments of a log in a file
@@ -457,10 +458,10 @@ def _window(stamps: Array, where: str, start: float | None, end: float | None) -
 
 def _close_looks(first: int, stop: int) -> list[tuple[int, int]]:
     """Return the ranges of the first, middle and last rows; one range if the log is short."""
-    if stop - first <= 3 * _WINDOW:
+    if stop - first <= 3 * WINDOW:
         return [(first, stop)]
-    middle = (first + stop - _WINDOW) // 2
-    return [(row, row + _WINDOW) for row in (first, middle, stop - _WINDOW)]
+    middle = (first + stop - WINDOW) // 2
+    return [(row, row + WINDOW) for row in (first, middle, stop - WINDOW)]
 
 
 def _positions(

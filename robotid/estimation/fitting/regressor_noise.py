@@ -37,7 +37,7 @@ from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import local_polynomial
 from robotid.dynamics.factors import Reduction
 from robotid.estimation.estimators.batch import solve_factor
-from robotid.estimation.fitting.recorded import Recordings, SurveyedLog, hold_log
+from robotid.estimation.fitting.recorded import WINDOW, Recordings, SurveyedLog, hold_log
 
 _FEWEST, _MOST = 4, 6  # pairs of rounding errors
 _PRECISE = 0.2  # uncertainty of the shift in standard errors at which no more pairs are drawn
@@ -46,7 +46,6 @@ _SHARE_ERROR = 0.1  # relative standard error of a share of noise
 _MATTERS = 0.1  # shift of the parameters in standard errors below which nothing is corrected
 _CUBIC = 5  # smallest number of rows on each side for smoothing
 _JOINED = 4  # segments that are joined into one, for speed
-_ROWS = 20_000  # rows of a log in which the step of its positions is searched
 _FREQUENCIES = 2048  # frequencies at which the noise of an acceleration is summed
 
 
@@ -237,7 +236,7 @@ def _steps(log: SurveyedLog) -> Array:
     """Return the quantisation steps of a log's positions, (n,); 0 if velocities are measured."""
     if log.signals.velocity == "measured":
         return np.zeros(len(log.model.joints))
-    return np.array([quantum(x, repeats=False) for x in log.head.q[:_ROWS].T])
+    return np.array([quantum(x, repeats=False) for x in log.head.q[:WINDOW].T])
 
 
 def _share(logs: Sequence[SurveyedLog], steps: Sequence[Array], whole: Reduction) -> Array:

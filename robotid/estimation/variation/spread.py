@@ -30,7 +30,6 @@ _SWEEPS = 2  # over the parameters of a group, each with the spread of the other
 _TAILS = np.array([0.025, 0.5, 0.975])
 _HALVINGS = 60  # of the range of a quantile
 _STEPS = 60  # of each chain; with a possible proposal, one step is an independent draw
-_SMALLEST = 1e-12  # eigenvalue over the largest that counts as 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -376,7 +375,8 @@ def root_of(covariance: Array) -> Array:
     scale = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     inverse = np.divide(1.0, scale, out=np.zeros_like(scale), where=scale > 0.0)
     w, V = np.linalg.eigh(inverse[:, None] * covariance * inverse)
-    w = np.where(w > _SMALLEST * max(float(w.max(initial=0.0)), 0.0), w, 0.0)
+    least = len(w) * np.finfo(float).eps * float(w.max(initial=0.0))  # rounding error
+    w = np.where(w > max(least, 0.0), w, 0.0)
     R = np.linalg.qr((scale[:, None] * V * np.sqrt(w)).T, mode="r")
     sign = np.where(np.diag(R) < 0.0, -1.0, 1.0)
     return np.asarray(np.tril((sign[:, None] * R).T))

@@ -23,7 +23,6 @@ from robotid.estimation.variation.spread import (
 SCORES = np.linspace(-3.5, 3.5, 15)
 #: Probability that one of alike runs or units is named.
 FALSE_ALARMS = 0.02
-_PENALTY = 2.0  # evidence that each parameter of a group must add (Akaike)
 _LEAST_SHRUNK = 1e-3  # smallest share of the shrinkage: the correlation has an inverse
 _SCALE = 0.1  # smallest plausible standard deviation between units, over the parameter's size
 _SPREADS = 32  # standard deviations between units over which a test is integrated
@@ -287,7 +286,7 @@ def _unlike(
 
 
 def _explained(compared: Compared, k: int, noise: float, *, is_drive: bool) -> float:
-    """Return what a difference of a group explains of a run or unit: chi^2 less 2 for each.
+    """Return what a difference of a group explains of a run or unit: chi^2 less 2 each (Akaike).
 
     The run's own errors are those of a common noise. Only drive terms vary between alike runs:
     gains, payloads and zeros need a cause.
@@ -298,7 +297,7 @@ def _explained(compared: Compared, k: int, noise: float, *, is_drive: bool) -> f
     if is_drive:
         V = V + np.diag(np.maximum(std**2 - np.diag(C), 0.0))
     away = compared.values[k] - mean
-    return float(away @ np.linalg.solve(V, away)) - _PENALTY * len(away)
+    return float(away @ np.linalg.solve(V, away)) - 2.0 * len(away)
 
 
 def _is_compared(group: RunsOf, which: Array, *, is_unit: bool) -> Array:

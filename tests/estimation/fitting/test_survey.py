@@ -163,7 +163,7 @@ def test_full_turns_are_taken_out_of_each_piece(tmp_path):
 
 
 def test_a_locked_joint_has_the_positions_of_all_windows(robot, recording, tmp_path, monkeypatch):
-    monkeypatch.setattr(survey, "_WINDOW", 100)
+    monkeypatch.setattr(survey, "WINDOW", 100)
     path = tmp_path / "run.csv"
     write_log(recording, path)
     held, *moving = robot.joints
@@ -191,7 +191,7 @@ def test_a_hole_in_the_last_piece_is_named_by_its_row_in_the_file(
     path = spoilt(recording, tmp_path, "tau_elbow_joint", 1801, np.nan)
     layout, table = lay_out(path, robot.joints)
     short = replace(layout, notes=())
-    monkeypatch.setattr(survey, "_WINDOW", 100)
+    monkeypatch.setattr(survey, "WINDOW", 100)
     window = (2.0, None)
     log = survey_log(short, table, robot, SignalSettings(cutoff=None), window, length=LENGTH)
     pieces = pieces_of(log)
@@ -241,7 +241,7 @@ def test_pieces_travel_as_they_are(robot, recording, tmp_path):
 
 def test_the_pieces_of_a_log_have_the_bias_of_all_rests_of_its_windows(monkeypatch, tmp_path):
     """The robot moves in the first window, rests in the middle one and a part of the last one."""
-    monkeypatch.setattr(survey, "_WINDOW", 200)
+    monkeypatch.setattr(survey, "WINDOW", 200)
     robot = RobotModel.from_urdf(example_urdf("solo12.urdf"), free_flyer=True, terms=())
     t = 3.0 + 0.01 * np.arange(1000)
     rests = ((t > 6.9) & (t < 9.1)) | (t > 11.495)
