@@ -297,11 +297,6 @@ class PRXSettings(RecursiveSettings):
     """Settings of the paper's update law."""
 
     name: str = _called("prx", "gradient steps along PRX (the paper's update), sample by sample")
-    step: str = setting(
-        "exact",
-        "step length: exact (line search) or printed (as in the paper)",
-        among=("exact", "printed"),
-    )
 
 
 @dataclass(frozen=True)

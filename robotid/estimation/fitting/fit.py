@@ -123,7 +123,7 @@ def make_estimator(
             gate = None if choice.gate is False else float(choice.gate)
             return estimators.Kalman(sigma, beta, known.covariance, choice.walk, gate, share)
         case settings.PRXSettings():
-            return estimators.PRX(sigma, beta, rng=np.random.default_rng(0), step=choice.step)
+            return estimators.PRX(sigma, beta, rng=np.random.default_rng(0))
         case settings.GradientSettings():
             return estimators.NormalisedGradient(sigma, beta, rng=np.random.default_rng(0))
     raise SettingsError(f"{choice!r} describes no estimator of rows; use EstimatorSettings(name)")
@@ -489,17 +489,12 @@ def _run(
     choice: EstimatorSettings, ground: _Ground
 ) -> tuple[Estimate, Consistent | None, Weighing]:
     """Return the estimate, the estimator that made it consistent, if any, and the weighting."""
-    recordings, before = ground.recordings, ground.before
+    before = ground.before
     estimator = make_estimator(choice, before)
-    if recordings.model.is_static and estimator.needs_mass:
-        raise SettingsError(
-            f"the estimator {choice.name!r} needs the mass matrix, which dynamics = 'static' does "
-            "not identify; use another estimator, or set dynamics = 'full'"
-        )
     if estimator.reads == "factors":
         in_cone = estimator if isinstance(estimator, Consistent) else None
         return estimator.fit(ground.factors), in_cone, estimator.weighing
-    estimate = estimator.fit(recordings.problem(with_mass=estimator.needs_mass))
+    estimate = estimator.fit(ground.recordings.problem())
     if not (isinstance(choice, RecursiveSettings) and choice.physical):
         return estimate, None, estimator.weighing
     if estimator.weighing == "by step":

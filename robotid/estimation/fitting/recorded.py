@@ -581,43 +581,32 @@ class Recordings:
             reductions.append(tuple(segments))
         return tuple(reductions)
 
-    def problem(self, *, with_mass: bool = False) -> Problem:
+    def problem(self) -> Problem:
         """Return the rows of the logs to fit, for estimators that read them in order of time."""
+        model, mapping = self.model, self.mapping
         if self.is_in_memory:
             motions = [log.whole.trajectory for log in self.fitted]
-            return concatenate([self.problem_of(k, x, with_mass) for k, x in enumerate(motions)])
-
-        def problems() -> Iterator[Problem]:
-            for rows in (piece.read() for piece in self.pieces):
-                yield base_problem(
-                    self.model, self.mapping, rows.trajectory, rows.mask, with_mass=with_mass
-                )
+            return concatenate([self.problem_of(k, motion) for k, motion in enumerate(motions)])
 
         def stream() -> Iterator[Block]:
-            return chain.from_iterable(problem.blocks() for problem in problems())
+            for rows in (piece.read() for piece in self.pieces):
+                yield from base_problem(model, mapping, rows.trajectory, rows.mask).blocks()
 
-        def mass_stream() -> Iterator[Array]:
-            for problem in problems():
-                yield from problem.mass_stream() if problem.mass_stream is not None else ()
-
-        support, is_projected = self.model.support(), bool(self.model.constraints)
+        support, is_projected = model.support(), bool(model.constraints)
         if is_projected:  # every row has the columns of all
             support = np.broadcast_to(support.any(axis=0), support.shape)
-        return Problem(
-            stream, self.mapping.base_names, self.model.n_rows,
-            support[:, self.mapping.independent], mass_stream if with_mass else None,
-            is_projected=is_projected,
-        )  # fmt: skip
+        names, support = mapping.base_names, support[:, mapping.independent]
+        return Problem(stream, names, model.n_rows, support, is_projected=is_projected)
 
     def segments(self, k: int, motion: Trajectory, joined: int = 1) -> tuple[Factors, ...]:
         """The factors of each segment of a log in memory, with the segments of ``reduce``."""
         return compress_segments(self.problem_of(k, motion), joined * self.segment_length(k))
 
-    def problem_of(self, k: int, motion: Trajectory, with_mass: bool = False) -> Problem:
+    def problem_of(self, k: int, motion: Trajectory) -> Problem:
         """Return the weighted rows of a log in memory for a motion of the same length."""
         mask = self.fitted[k].whole.mask
         weight = mask if self.weights is None else mask * self.weights[k]
-        return base_problem(self.model, self.mapping, motion, weight, with_mass=with_mass)
+        return base_problem(self.model, self.mapping, motion, weight)
 
     def segment_length(self, k: int) -> int:
         """Return the samples of each segment of a log in memory."""

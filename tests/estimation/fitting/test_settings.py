@@ -44,12 +44,6 @@ def test_a_recursive_estimate_is_made_physical_on_request(rng, name):
     assert "projected onto physically consistent" in found.estimate.message
 
 
-def test_the_printed_step_asks_for_the_mass_regressor_itself(ur5, rng):
-    settings = EstimatorSettings("prx", step="printed")
-    found = fit(ur5, [exact_log(ur5, truth(ur5), rng)], signals=EXACT, estimator=settings)
-    assert not found.estimate.converged
-
-
 @pytest.mark.parametrize(
     ("options", "text"),
     [
@@ -61,7 +55,7 @@ def test_the_printed_step_asks_for_the_mass_regressor_itself(ur5, rng):
         ({"name": "rls", "forgetting": 1.1}, "forgetting is 1.1, wanted 0 < x <= 1"),
         ({"name": "kalman", "walk": -1.0}, "walk is -1.0, wanted x >= 0"),
         ({"name": "kalman", "gate": True}, "gate is True, wanted 0.5 <= x < 1, or false"),
-        ({"name": "prx", "step": "paper"}, "step is 'paper', wanted one of exact, printed"),
+        ({"name": "consistent", "prior_weight": "x"}, "wanted one of auto, cv, evidence"),
     ],
 )
 def test_a_setting_that_does_not_fit_is_refused(options, text):

@@ -20,7 +20,7 @@ from robotid.data.signal_settings import LogUnits, SignalSettings
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.factors import join
 from robotid.dynamics.simulation.motions import random_fourier
-from robotid.dynamics.torque import joint_torque_regressor, mass_regressor
+from robotid.dynamics.torque import joint_torque_regressor
 from robotid.estimation.estimators import WLS
 from robotid.estimation.fitting import recorded as survey
 from robotid.estimation.fitting.recorded import Recordings, hold_log, reduce_piece, survey_log
@@ -210,23 +210,6 @@ def test_time_must_increase_where_pieces_meet_too(robot, recording, tmp_path, ro
         long_log(robot, path, SignalSettings())
     assert str(in_pieces.value) == str(in_memory.value)
     assert f"t[{row}]" in str(in_pieces.value)
-
-
-def test_samples_have_the_regressor_of_their_mass_matrix(robot, recording, tmp_path):
-    """Of two logs, in memory and in pieces."""
-    mapping, signals = structural_mapping(robot), SignalSettings(cutoff=None, trim=0.0)
-    logs = [recording.window(start, start + 0.8) for start in (1.0, 3.0)]
-    held = [hold_log(robot, log, signals) for log in logs]
-    q = np.concatenate([log.whole.trajectory.q for log in held])
-    wanted = mass_regressor(robot, q)[..., mapping.independent]
-    for k, log in enumerate(logs):
-        write_log(log, tmp_path / f"{k}.csv")
-    read = [long_log(robot, tmp_path / f"{k}.csv", signals, length=30) for k in range(2)]
-    for own in (held, read):
-        recordings = Recordings(robot, mapping, own)
-        found = [sample.mass_regressor for sample in recordings.problem(with_mass=True).samples()]
-        np.testing.assert_allclose(np.array(found), wanted, atol=1e-9)
-        assert next(recordings.problem().samples()).mass_regressor is None
 
 
 def test_pieces_travel_as_they_are(robot, recording, tmp_path):
