@@ -20,15 +20,15 @@ from robotid.dynamics.factors import Factors, Reduction, gather, join
 from robotid.dynamics.prediction import body_slopes_by_position, is_loaded
 from robotid.estimation import estimators
 from robotid.estimation.estimators import WLS, Consistent, Constraints, Estimate
-from robotid.estimation.estimators.determination import Determination, base_spread, determine
-from robotid.estimation.estimators.estimator import Weighing
-from robotid.estimation.estimators.prior_weight import (
+from robotid.estimation.estimators.consistent_fit import (
     AS_GOOD,
     Segments,
     choose_weight,
     contradicted_extents,
     loss_of,
 )
+from robotid.estimation.estimators.determination import Determination, base_spread, determine
+from robotid.estimation.estimators.estimator import Weighing
 from robotid.estimation.fitting import estimator_settings as settings
 from robotid.estimation.fitting.estimator_settings import (
     BoundedSettings,

@@ -49,7 +49,7 @@ from robotid.dynamics.used_rows import (
     row_mask,
     static_rows,
 )
-from robotid.estimation.workers.plan import WorkPlan
+from robotid.estimation.work_plan import WorkPlan
 from robotid.robot.model import RobotModel
 
 #: Default number of rows of a piece.

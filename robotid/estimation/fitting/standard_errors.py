@@ -19,7 +19,7 @@ from robotid.dynamics.factors import Factors
 from robotid.dynamics.torque import trajectory_regressor
 from robotid.estimation.estimators import Consistent, Estimate
 from robotid.estimation.estimators.batch import solve_factor
-from robotid.estimation.estimators.segments import (
+from robotid.estimation.estimators.estimator import (
     FEWEST_SEGMENTS,
     quantile,
     sandwich,

@@ -1,6 +1,6 @@
 """The page of a designed motion: criterion, smallest margin to each limit, expected errors."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -48,17 +48,16 @@ def write_motion_page(
     model: RobotModel,
     content: Mapping[str, Any],
     course: Course,
-    expected: Preview | Sequence[str],
+    expected: Preview,
 ) -> Path:
     """Write a designed motion's use of the limits and its expected errors, as one HTML file.
 
     The file loads nothing from the network. It is written under a temporary name, then renamed.
     """
-    errors = _expected(expected) if isinstance(expected, Preview) else _paragraphs(expected)
     sections = {
         "limits": Section("Smallest margin to each limit", _limit_table(model, content, course)),
         "time": Section("Course over time", _over_time(model, content, course)),
-        "expected": Section("Expected standard errors", errors),
+        "expected": Section("Expected standard errors", _expected(expected)),
     }
     return write_text(
         page(f"{model.name}: excitation trajectory", _head(model, content), sections), target
@@ -206,8 +205,4 @@ def _expected(preview: Preview) -> str:
         f"Standard deviation of the torque noise, {listed(dict.fromkeys(noise.origins))}: "
         f"{', '.join(stds)} (N m or N).",
     ]
-    return _paragraphs(sentences)
-
-
-def _paragraphs(sentences: Sequence[str]) -> str:
     return "".join(f"<p>{escape(words)}</p>\n" for words in sentences if words)
