@@ -77,7 +77,7 @@ class DriveChoice:
 
         No shape changes by more than a third; the covariance of the shapes (k, k) is stated.
         """
-        flat = np.array([size for own in self.sizes for size in own])
+        flat = np.array(list(chain.from_iterable(self.sizes)))
         families = [FAMILIES[name] for name in self.families]
         bounds = np.array([s.within(self.data_range) for family in families for s in family.shapes])
         near = np.clip(flat + step, flat / _FARTHEST, flat * _FARTHEST)
@@ -89,12 +89,12 @@ class DriveChoice:
             terms=self._terms_of(chosen),
             shapes=tuple(replace(x, value=size, std_error=float(e)) for x, size, e in shapes),
             shape_covariance=tuple(tuple(row) for row in covariance.tolist()),
-            sizes=tuple(tuple(own) for _, own in chosen),
+            sizes=tuple(tuple(of_family) for _, of_family in chosen),
         )
 
     def altered(self, which: int, share: float) -> tuple[DriveTerm, ...]:
         """Return the terms with one of the shapes increased."""
-        flat = np.array([size for own in self.sizes for size in own])
+        flat = np.array(list(chain.from_iterable(self.sizes)))
         flat[which] *= 1.0 + share
         return self._terms_of(with_shapes([FAMILIES[name] for name in self.families], flat))
 

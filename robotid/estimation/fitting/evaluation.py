@@ -438,16 +438,16 @@ def _sampled_every(rows: int) -> int:
 
 def _rows_in(sampled: Array, rows: Array) -> Array:
     """Return which sampled rows (m, 2 n) of positions and torques are among rows, shape (m,)."""
-    found = np.isin(sampled[:, 0], rows[:, 0])
-    likely = rows[np.isin(rows[:, 0], sampled[found, 0])]
-    for k in np.flatnonzero(found):
-        found[k] = (likely == sampled[k]).all(axis=1).any()
-    return found
+    is_in = np.isin(sampled[:, 0], rows[:, 0])
+    likely = rows[np.isin(rows[:, 0], sampled[is_in, 0])]
+    for k in np.flatnonzero(is_in):
+        is_in[k] = (likely == sampled[k]).all(axis=1).any()
+    return is_in
 
 
-def _is_shared(found: Array) -> bool:
-    """Return whether enough rows were found in another log to call it the same recording."""
-    return int(found.sum()) > max(1, _SHARED * len(found))
+def _is_shared(is_in: Array) -> bool:
+    """Return whether enough sampled rows are in another log to call it the same recording."""
+    return int(is_in.sum()) > max(1, _SHARED * len(is_in))
 
 
 def left_out_metrics(

@@ -100,10 +100,8 @@ def find_regressor_noise(
     rng, pairs = np.random.default_rng(0), list[tuple[_Sums, _Sums]]()
     is_enough = False
     while not is_enough:
-        errors = [
-            rounding_errors(log.head.q, own, rng)
-            for log, own in zip(near.fitted, steps, strict=True)
-        ]
+        logs = zip(near.fitted, steps, strict=True)
+        errors = [rounding_errors(log.head.q, step, rng) for log, step in logs]
         more, less = (
             _sums(near, list(map(_shifted, near.fitted, changes)), theta, weights)
             for changes in (errors, [-e for e in errors])
@@ -213,12 +211,12 @@ def _without_steps(near: Recordings, steps: Sequence[Array]) -> Recordings:
     Added rounding errors then do not interact with those of the recorded positions.
     """
     logs = []
-    for log, own in zip(near.fitted, steps, strict=True):
+    for log, step in zip(near.fitted, steps, strict=True):
         period = 1.0 / ((log.signals.cutoff or np.inf) * log.step)  # [rows], of the filter
         width = 2 * max(_CUBIC, round(period)) + 1
         is_prismatic = np.isin(log.model.joints, list(log.model.layout.prismatic))
         q = np.where(is_prismatic, log.head.q, np.unwrap(log.head.q, axis=0))
-        logs.append(_shifted(log, smoothed(q, own, width)))
+        logs.append(_shifted(log, smoothed(q, step, width)))
     return replace(near, fitted=logs, validation=())
 
 

@@ -104,10 +104,8 @@ def sums_of(
     """Return the sums of runs over all groups of parameters: standard (p,), sigma (n,)."""
     theta, groups = mapping.to_base(standard), [g for g, _ in groups_at(model, mapping, standard)]
     products = [_products(run, groups, theta, sigma) for run in segments]
-    scatter = [
-        _scatter([(H[:, own, own], g[:, own]) for H, g in products]) for own in _places(groups)
-    ]
-    H, h = (np.array([each[k].sum(axis=0) for each in products]) for k in (0, 1))
+    scatter = [_scatter([(H[:, x, x], g[:, x]) for H, g in products]) for x in _places(groups)]
+    H, h = (np.array([x.sum(axis=0) for x in parts]) for parts in zip(*products, strict=True))
     return RunSums(H, h, np.array(scatter), sigma)
 
 
@@ -127,16 +125,16 @@ def runs_of(
     every = groups_at(model, mapping, standard)
     places = _places([group for group, _ in every])
     squares = np.einsum("kqq->q", sums.H)
-    of_gains = {group.name: squares[own].item()
-                for (group, _), own in zip(every, places, strict=True)
+    of_gains = {group.name: squares[place].item()
+                for (group, _), place in zip(every, places, strict=True)
                 if group.kind == "gain"}  # fmt: skip
     runs = []
-    for (group, centre), own, scatter in zip(every, places, sums.scatter, strict=True):
-        H, h, inflation = sums.H[:, own, own], sums.h[:, own], _ratio(*scatter)
+    for (group, centre), place, scatter in zip(every, places, sums.scatter, strict=True):
+        H, h, inflation = sums.H[:, place, place], sums.h[:, place], _ratio(*scatter)
         if not H.any():  # no run has effects
             continue
         if group.kind == "zero":
-            like_gain = np.sqrt(of_gains[group.name] / squares[own])
+            like_gain = np.sqrt(of_gains[group.name] / squares[place])
             scale = np.maximum(_ZERO[group.units[0]], _LEVER * like_gain)
         else:
             scale = _scale(group, centre, H.sum(axis=0), model, standard)
@@ -196,10 +194,10 @@ def _products(
     H, g = np.zeros((len(segments), B.shape[1], B.shape[1])), np.zeros((len(segments), B.shape[1]))
     for k, segment in enumerate(segments):
         for j, level in enumerate(sigma):
-            R, own = segment.triangles[j] / level, segment.columns[j]
-            A = R[:, :-1] @ (B[own] * acts[j])
+            R, columns = segment.triangles[j] / level, segment.columns[j]
+            A = R[:, :-1] @ (B[columns] * acts[j])
             H[k] += A.T @ A
-            g[k] += A.T @ (R[:, -1] - R[:, :-1] @ theta[own])
+            g[k] += A.T @ (R[:, -1] - R[:, :-1] @ theta[columns])
     return H, g
 
 
