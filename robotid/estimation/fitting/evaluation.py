@@ -304,7 +304,9 @@ def _score_logs(
 ) -> list[list[_Score]]:
     """Return the results of the pieces of each log; raise an error for a log without samples."""
     pieces = [piece for log in logs for piece in log.pieces]
-    results = (plan or WorkPlan()).map(work, pieces, "evaluating")
+    results = (
+        (work(x, None) for x in pieces) if plan is None else plan.map(work, pieces, "evaluating")
+    )
     scores = []
     for log in logs:
         by_piece = list(islice(results, len(log.pieces)))
