@@ -21,6 +21,16 @@ _log = logging.getLogger(__name__)
 
 #: The description of a LeRobot dataset, in its folder.
 DATASET = Path("meta") / "info.json"
+#: Bytes of a whole path, and characters of an attribute of a URDF, which may be a path.
+LONGEST_PATH = 4095
+#: Levels of tables and lists, and of nested elements of a URDF.
+DEEPEST = 100
+#: Files of results, which name the other files that were written with them.
+_RECORDS = ("result.json", "track.json", "fleet.json")
+_PAGES = ("report.html", "replay.html")  # beside a result
+_MARKS = 10**6  # [ns] of a modification time that are a mark
+_LONGEST = 255  # bytes of a file's name
+_SHOWN = 60  # characters of a name in a message
 
 
 def check_path(path: str | Path) -> None:
@@ -29,10 +39,10 @@ def check_path(path: str | Path) -> None:
         raw = os.fsencode(path)
     except UnicodeEncodeError:
         raw = b"\0"
-    if b"\0" in raw or len(raw) > _LONGEST_PATH:
+    if b"\0" in raw or len(raw) > LONGEST_PATH:
         raise SettingsError(
             f"{str(path)[:_SHOWN]!r} is not a valid path, wanted UTF-8 without NUL, at most "
-            f"{_LONGEST_PATH} bytes"
+            f"{LONGEST_PATH} bytes"
         )
     name = max(raw.split(os.fsencode(os.sep)), key=len)
     if len(name) > _LONGEST:
@@ -133,16 +143,6 @@ def _marked(path: Path) -> None:
     os.utime(path, ns=(times.st_atime_ns, written))
 
 
-#: Files of results, which name the other files that were written with them.
-_RECORDS = ("result.json", "track.json", "fleet.json")
-_PAGES = ("report.html", "replay.html")  # beside a result
-_MARKS = 10**6  # [ns] of a modification time that are a mark
-_LONGEST = 255  # bytes of a file's name
-_LONGEST_PATH = 4095  # bytes of a whole path
-_HIDDEN = 32  # further bytes in the name of a hidden file
-_SHOWN = 60  # characters of a name in a message
-
-
 @contextmanager
 def written_whole(target: str | Path, inputs: Iterable[str | Path | None] = ()) -> Iterator[Path]:
     """Provide a hidden name beside a file; what is written there then replaces the file.
@@ -161,7 +161,8 @@ def written_whole(target: str | Path, inputs: Iterable[str | Path | None] = ()) 
             except BrokenPipeError as error:
                 raise DataError(f"the reader of {str(path)!r} closed it before the end") from error
         return
-    hidden = path.with_name(_hidden(path.name))
+    name = hashlib.sha256(os.fsencode(path.name)).hexdigest()[:16]  # short, also of a long name
+    hidden = path.with_name(f".{name}.{os.getpid()}")
     try:
         yield hidden
         _marked(hidden)
@@ -171,13 +172,6 @@ def written_whole(target: str | Path, inputs: Iterable[str | Path | None] = ()) 
         raise
     finally:
         hidden.unlink(missing_ok=True)
-
-
-def _hidden(name: str) -> str:
-    """Return the temporary name of a file; a long name is replaced by its hash."""
-    digest = hashlib.sha256(os.fsencode(name)).hexdigest()[:16]
-    short = name if len(os.fsencode(name)) <= _LONGEST - _HIDDEN else digest
-    return f".{short}.{os.getpid()}"
 
 
 def _is_stream(path: Path) -> bool:
@@ -271,13 +265,13 @@ def read_json(path: str | Path, what: str) -> Any:  # noqa: ANN401
             f"{source.name} is not JSON: {str(error)[:200]}; wanted a {what}"
         ) from error
     inside = [content]
-    for _ in range(_DEEPEST):
+    for _ in range(DEEPEST):
         lists = [
             x.values() if isinstance(x, dict) else x for x in inside if isinstance(x, dict | list)
         ]
         inside = [x for entries in lists for x in entries]
     if inside:
-        raise DataError(f"{source.name} has more than {_DEEPEST} levels: it is not a {what}")
+        raise DataError(f"{source.name} has more than {DEEPEST} levels: it is not a {what}")
     return content
 
 
@@ -325,9 +319,6 @@ def moved_file(path: Path, result: Path, hashes: Collection[str]) -> Path:
             if log_exists(place) and file_sha256(place) in hashes:
                 return place
     return path
-
-
-_DEEPEST = 40  # levels of tables and lists
 
 
 @lru_cache(maxsize=1024)

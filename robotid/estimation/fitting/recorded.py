@@ -592,7 +592,7 @@ class Recordings:
             for rows in (piece.read() for piece in self.pieces):
                 yield from base_problem(model, mapping, rows.trajectory, rows.mask).blocks()
 
-        support, is_projected = model.support(), bool(model.constraints)
+        support, is_projected = model.support, bool(model.constraints)
         if is_projected:  # every row has the columns of all
             support = np.broadcast_to(support.any(axis=0), support.shape)
         names, support = mapping.base_names, support[:, mapping.independent]

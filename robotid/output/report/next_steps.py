@@ -14,11 +14,10 @@ from robotid.base.settings import is_number
 from robotid.diagnosis.catalogue import entries as catalogue_entries
 from robotid.diagnosis.catalogue import step_of
 from robotid.diagnosis.residual.misfit import setting_of, with_entries
-from robotid.diagnosis.verdict.evidence import GOOD, is_beaten
+from robotid.diagnosis.verdict.verdict import GOOD, is_beaten
 from robotid.identification.result import Identification, TorqueIdentification
 from robotid.output.files.exports import formats
 from robotid.robot.drive_term import DriveTerm
-from robotid.robot.drives import COUNTERBALANCE, spring_family
 
 if TYPE_CHECKING:
     from robotid.diagnosis.verdict.scale_check import PayloadCheck
@@ -342,8 +341,6 @@ def _terms(found: TorqueIdentification, origin: Origin, causes: Sequence[Cause])
     """Return the step that adds missing drive terms to the model."""
     codes = {cause.code for cause in causes}
     entries: dict[str, list[str | DriveTerm]] = {}
-    for joint, rotation in _balanced(causes):
-        entries[joint] = [spring_family(rotation, COUNTERBALANCE)]
     couplings: dict[frozenset[str], str] = {}
     for misfit in found.misfits:
         term = misfit.term
@@ -366,16 +363,6 @@ def _terms(found: TorqueIdentification, origin: Origin, causes: Sequence[Cause])
             f"motion: {what} of {_named(causes)}."
         )
     return Step(words, (*blocks, *((origin.again(),) if origin.job and blocks else ())))
-
-
-def _balanced(causes: Sequence[Cause]) -> list[tuple[str, float]]:
-    """Return the joints with a counterbalance, and the rotation of each [rad]."""
-    found = [finding for cause in causes for finding in cause.findings]
-    return [
-        (finding.joints[0], finding.evidence["turned"])
-        for finding in found
-        if finding.code == "counterbalance" and "turned" in finding.evidence
-    ]
 
 
 def _payload(found: TorqueIdentification, origin: Origin, causes: Sequence[Cause]) -> Step:

@@ -7,7 +7,7 @@ from typing import Any, TypeVar
 
 from robotid.base.findings import Cause, Finding, grouped, tally
 from robotid.base.versions import __version__
-from robotid.diagnosis.verdict.evidence import uses_line
+from robotid.diagnosis.verdict.verdict import uses_line
 from robotid.estimation.fitting.evaluation import Evaluated
 from robotid.identification.result import Identification
 from robotid.identification.summary import verdict_cell

@@ -25,14 +25,14 @@ class Rule:
     most: int  # Largest number of options selected
     share: float  # Smallest share of the squared residual of a selected option [-]
     p_value: float | None  # Largest p-value of a selected option [-]; None: it is not tested
-    alike: float  # Share of the squared residual within which options count as equal [-]
+    #: Share of the squared residual within which options count as equal, the simpler is selected.
+    alike: float = 0.02
 
 
-_ALIKE = 0.02  # of the squared residual: within this difference the simpler option is selected
 # Families selected for a joint's drive: benchmarks/bench_friction.py
 # The same p-value decides whether least squares predicts better than bodies bound to the prior.
 FAMILY_P_VALUE = 0.01
-FAMILY = Rule(most=4, share=0.05, p_value=FAMILY_P_VALUE, alike=_ALIKE)
+FAMILY = Rule(most=4, share=0.05, p_value=FAMILY_P_VALUE)
 # Families selected from simulated positions, one of each at most, by the share of a joint's squared
 # residual in held-out windows with unit noise: benchmarks/bench_commands.py
 SIMULATED_FAMILY = Rule(most=3, share=0.02, p_value=None, alike=0.0)
@@ -44,8 +44,11 @@ UNDECIDED_P_VALUE = 0.25
 TENFOLD = 10.0
 #: Distance from a bound, of the logarithm of its range, within which a shape is at the bound.
 AT_BOUND = 0.02
+#: Share of the squared residual that a missing term, a recording or URDF that differs, or a
+#: quantity must explain, and the largest p-value of that share.
+LEAST_SHARE, P_VALUE = 0.1, 3e-4
 # Terms that a drive model lacks: benchmarks/bench_misfit.py
-MISFIT = Rule(most=3, share=0.1, p_value=3e-4, alike=_ALIKE)
+MISFIT = Rule(most=3, share=LEAST_SHARE, p_value=P_VALUE)
 #: Share of the squared residual above which a term is a warning.
 MISFIT_WARNS = 0.25
 #: Size over the torque above which a term is reported, and above which it is a warning.
@@ -60,26 +63,42 @@ MAIN = 50.0
 GROWN = 1.3
 # Recordings or URDF that differ from what was stated: benchmarks/bench_verdict.py. Only the best
 # hypothesis is tested.
-ALTERATION = Rule(most=3, share=-float("inf"), p_value=None, alike=_ALIKE)
-ALTERATION_P_VALUE, ALTERATION_SHARE = 3e-4, 0.1
+ALTERATION = Rule(most=3, share=-float("inf"), p_value=None)
 #: A smaller share is also reported if validation logs confirm it fully, its p-value is tiny and its
 #: size is twice the one that changes a result: it biases masses even if noise hides it.
 WEAK, WEAK_P_VALUE, WEAK_SIZE = 0.03, 1e-5, 2.0
 #: Standard errors that its size must differ from 0.
 SIGNIFICANT = 5.0
-# A residual that depends on a quantity: no benchmark, tests/diagnosis/residual/test_torque_split.py
-DEPENDENCE_SHARE, DEPENDENCE_P_VALUE = 0.1, 1e-3
 # Segments that are held out in turn, and their samples.
 SEGMENTS, SHORTEST = 16, 10  # most segments, and fewest independent samples of one
 #: Smallest number of segments for a test.
 FEWEST = 6
 #: Typical residuals above which a sample is excluded.
 OUTLIER = 12.0
+#: Standard errors, or deviations, beyond which a value is no noise.
+BEYOND_NOISE = 3.0
+#: Share of the rows from which a fault of single rows is reported.
+SHARE_OF_ROWS = 0.02
+#: Instants of a motion that are used: more are not independent after the filter.
+ROWS = 2000
+#: Relative size below which a quantity counts as 0.
+TINY = 1e-6
 #: Share of a column below which it is rounding, and relative step of a derivative by a shape.
 ROUNDING, STEP = 1e-10, 1e-3
+#: Size of the correlation from which two parameters or signals are strongly correlated: if one were
+#: known, the error of the other would be less than a third of what it is, sqrt(1 - r^2) = 0.31.
+CORRELATED = 0.95
+#: Relative difference up to which two values agree: as a mass or a gravity torque confirms the
+#: torque scale; and from which one is reported, or a standard error is too large to use a value.
+AGREES = 0.05
+DIFFERS = 2 * AGREES
+#: Factor beyond which a torque or a total mass is no error of the URDF's masses.
+NO_ERROR_OF_MASSES = 3.0
+#: Segments from which a scatter is determined.
+SCATTERED = 3
+#: A sum of squares that is 0, as a divisor.
+NOTHING = 1e-300
 _STILL = 1e-9  # of the largest squared residual of a segment: below, the joint is at rest in it
-_FEWEST = 3  # segments for a test
-_NOTHING = 1e-300
 Option = TypeVar("Option", bound=Hashable)
 
 
@@ -99,7 +118,7 @@ class Round(Generic[Option]):
 
     def share(self, option: Option) -> float:
         """Return the share of the squared residual of fitted logs that an option removes [-]."""
-        return self.gain(option) / max(self.whole, _NOTHING)
+        return self.gain(option) / max(self.whole, NOTHING)
 
     def p_value(self, option: Option) -> float:
         """Return the p-value of the reduction by an option [-]."""
@@ -156,8 +175,17 @@ def p_value(before: Array, after: Array, fitted: int) -> float:
 def _student(before: Array, after: Array) -> float:
     """Return the p-value of the mean share; 1 for too few segments."""
     moves = before > _STILL * before.max(initial=0.0)
-    if moves.sum() < _FEWEST:
+    if moves.sum() < SCATTERED:
         return 1.0
     gain = (before - after)[moves] / np.maximum(before, after)[moves]
-    spread = max(float(np.std(gain, ddof=1)) / np.sqrt(len(gain)), _NOTHING)
+    spread = max(float(np.std(gain, ddof=1)) / np.sqrt(len(gain)), NOTHING)
     return float(stdtr(len(gain) - 1, -gain.mean() / spread))
+
+
+def connected(is_alike: Array) -> list[list[int]]:
+    """Return the groups of several indices that a symmetric relation connects: (n, n)."""
+    from scipy.sparse.csgraph import connected_components
+
+    count, label = connected_components(is_alike)
+    groups = [np.flatnonzero(label == k).tolist() for k in range(count)]
+    return [group for group in groups if len(group) > 1]
