@@ -13,7 +13,7 @@ from robotid.cli.console import echo, show_found
 from robotid.cli.flags import JOB, SOURCE, add_json
 from robotid.data.base_motion import ACCELERATION, IMU, POSE, TWIST
 from robotid.data.files.columns import KINDS, is_clock, quantity_of
-from robotid.data.files.formats import open_table, write_columns
+from robotid.data.files.read import open_table, write_columns
 from robotid.data.files.table import with_even_stamps
 from robotid.data.log import repeated, suggestion
 from robotid.data.signal_settings import LogSource

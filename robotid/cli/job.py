@@ -16,8 +16,14 @@ from robotid.data.files.columns import Needs
 from robotid.data.files.read import LogLayout, lay_out, read_log
 from robotid.data.files.table import Table
 from robotid.data.log import Log
-from robotid.data.signal_settings import BaseSource, LogSource, LogUnits, SignalSettings
-from robotid.data.transmission import Transmission, check_transmissions
+from robotid.data.signal_settings import (
+    BaseSource,
+    LogSource,
+    LogUnits,
+    SignalSettings,
+    Transmission,
+    check_transmissions,
+)
 from robotid.dynamics.constraint_rows import logged_base
 from robotid.estimation.fitting.estimator_settings import (
     ESTIMATORS,

@@ -24,13 +24,13 @@ from robotid.cli.flags import (
 from robotid.cli.job import Job, LogEntry, written_job
 from robotid.cli.logs import log_of_commands
 from robotid.cli.track import serve
-from robotid.data.files.formats import open_table
+from robotid.data.files.read import open_table
 from robotid.data.log import Log
 from robotid.data.signal_settings import LogSource
 from robotid.design.clearance import Clearance
 from robotid.design.limits import LIMITS, Course, MotionLimits
-from robotid.dynamics.completed_logs import closed_log
 from robotid.dynamics.prediction import predict, predict_instants
+from robotid.dynamics.prepared_logs import closed_log
 from robotid.estimation.fitting.recorded import hold_log
 from robotid.identification.result import TorqueIdentification
 from robotid.output.files.result_file import (

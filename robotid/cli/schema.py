@@ -8,7 +8,7 @@ from typing import Any
 
 from robotid.base.settings import REQUIRED, Entries, Key, Settings
 from robotid.cli.job import Job, LogEntry, PayloadEntry
-from robotid.data.transmission import Transmission
+from robotid.data.signal_settings import Transmission
 from robotid.estimation.fitting.estimator_settings import ESTIMATORS, ConstraintSettings
 from robotid.robot.constraints import Contact, Loop
 from robotid.robot.parameters import Coupling

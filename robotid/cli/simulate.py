@@ -15,16 +15,14 @@ from robotid.base.versions import __version__
 from robotid.cli.console import echo, print_files, progress_of, show_found
 from robotid.cli.flags import JOB, ROBOT, Flags, add_json
 from robotid.cli.job import Job, LogEntry, as_job, job_from_settings, read_job
-from robotid.data.files.formats import check_suffix
-from robotid.data.files.read import write_log
+from robotid.data.files.read import check_suffix, write_log
 from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
 from robotid.data.signals import process
 from robotid.dynamics.base_parameters import structural_mapping
-from robotid.dynamics.simulation.motions import FloatingMotion, SampledMotion
-from robotid.dynamics.simulation.sensors import Run, measure
+from robotid.dynamics.simulation.motions import SampledMotion
 from robotid.dynamics.simulation.simulation_settings import Simulation, read_simulation
-from robotid.dynamics.simulation.simulator import carried, delay, follow
+from robotid.dynamics.simulation.simulator import Run, carried, delay, follow, measure
 from robotid.dynamics.simulation.truth import draw_parameters
 from robotid.output.files.urdf import write_urdf
 from robotid.robot.model import RobotModel
@@ -97,25 +95,13 @@ def simulate(
     return content
 
 
-def _motion(
-    job: Job, model: RobotModel, path: Path, cutoff: float | None
-) -> SampledMotion | FloatingMotion:
+def _motion(job: Job, model: RobotModel, path: Path, cutoff: float | None) -> SampledMotion:
     table = job.read(LogEntry(path), model, needs="motion")
     smooth = None
     if cutoff is not None:
         smooth = process(table, SignalSettings(cutoff=cutoff, velocity="differentiated", trim=0.0))
-    if table.base is None:
-        course = smooth or table
-        return SampledMotion(course.t, course.q, course.v, course.a)
-    flags = [
-        np.ones(len(table.t), dtype=bool) if x.always else table.contacts[x.frame]
-        for x in model.contacts
-    ]
-    touching = np.reshape(flags, (len(flags), len(table.t))).T
-    if smooth is None:
-        return FloatingMotion(table.t, table.base.pose, table.q, touching)
-    rows = np.clip(np.searchsorted(table.t, smooth.t), 0, len(table.t) - 1)
-    return FloatingMotion(smooth.t, smooth.q[:, :7], smooth.q[:, 7:], touching[rows])
+    course = smooth or table
+    return SampledMotion(course.t, course.q, course.v, course.a)
 
 
 def _truth(

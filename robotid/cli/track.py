@@ -26,8 +26,8 @@ from robotid.cli.flags import (
     job_from_flags,
 )
 from robotid.cli.job import Job
-from robotid.data.files.formats import write_columns
 from robotid.data.files.parquet_files import load_pyarrow
+from robotid.data.files.read import write_columns
 from robotid.data.log import Log
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.identification.online import (

@@ -10,8 +10,7 @@ from robotid.base.exceptions import DataError
 from robotid.base.files import write_text
 from robotid.cli import main
 from robotid.cli.convert import convert
-from robotid.data.files.formats import open_table, write_columns
-from robotid.data.files.read import read_log
+from robotid.data.files.read import open_table, read_log, write_columns
 from robotid.data.log import Log
 from robotid.data.signal_settings import LogSource
 

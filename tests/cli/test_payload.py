@@ -13,8 +13,7 @@ from robotid.cli import main
 from robotid.cli.identify import run_job
 from robotid.cli.job import job_from_settings
 from robotid.cli.payload import stated_masses
-from robotid.data.files.formats import write_columns
-from robotid.data.files.read import write_log
+from robotid.data.files.read import write_columns, write_log
 from robotid.output.files.result_file import load_result, stated_scale_check
 from robotid.output.report.next_steps import Origin, next_steps
 from robotid.robot.bodies import link_transfer

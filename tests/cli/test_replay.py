@@ -16,8 +16,7 @@ from helpers.synthetic import exact_log, payload_log, truth
 from robotid.base.exceptions import DataError
 from robotid.cli import main
 from robotid.cli.replay import replay_identified
-from robotid.data.files.formats import write_columns
-from robotid.data.files.read import write_log
+from robotid.data.files.read import write_columns, write_log
 from robotid.output.files.result_file import load_result
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel

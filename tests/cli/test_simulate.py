@@ -8,8 +8,7 @@ import pytest
 
 from robotid.base.files import file_sha256
 from robotid.cli import main
-from robotid.data.files.formats import write_columns
-from robotid.data.files.read import read_log
+from robotid.data.files.read import read_log, write_columns
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.simulation.motions import SampledMotion, random_fourier
 from robotid.identification.pipeline import identify

@@ -13,8 +13,7 @@ from helpers.synthetic import exact_log, perfect, truth
 from robotid.cli import main
 from robotid.cli.job import Job, LogEntry, read_job
 from robotid.cli.logs import examine
-from robotid.data.files.formats import write_columns
-from robotid.data.files.read import write_log
+from robotid.data.files.read import write_columns, write_log
 from robotid.data.signal_settings import SignalSettings
 from robotid.diagnosis.logs.check_logs import check_logs, diagnose, findings_to_dict
 from robotid.dynamics.simulation.motions import random_fourier
