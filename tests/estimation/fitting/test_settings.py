@@ -55,7 +55,7 @@ def test_a_recursive_estimate_is_made_physical_on_request(rng, name):
         ({"name": "rls", "forgetting": 1.1}, "forgetting is 1.1, wanted 0 < x <= 1"),
         ({"name": "kalman", "walk": -1.0}, "walk is -1.0, wanted x >= 0"),
         ({"name": "kalman", "gate": True}, "gate is True, wanted 0.5 <= x < 1, or false"),
-        ({"name": "consistent", "prior_weight": "x"}, "wanted one of auto, cv, evidence"),
+        ({"name": "consistent", "prior_weight": "x"}, "finite number or one of auto, cv, evidence"),
     ],
 )
 def test_a_setting_that_does_not_fit_is_refused(options, text):
