@@ -39,8 +39,7 @@ from robotid.dynamics.factors import Triangle, join, triangle_of
 from robotid.dynamics.prediction import predict
 from robotid.dynamics.prepared_logs import base_problem
 from robotid.estimation.estimators import WLS
-from robotid.estimation.fitting.recorded import Recordings, RepeatedErrors
-from robotid.estimation.fitting.survey import Rows
+from robotid.estimation.fitting.recorded import Recordings, RepeatedErrors, Rows
 from robotid.robot.constraints import Contact
 from robotid.robot.model import RobotModel
 from robotid.robot.prior import prior_spread
@@ -114,12 +113,16 @@ def with_repeated_errors(recordings: Recordings) -> Recordings:
         return replace(recordings, repeated=errors)
     bias = biases[0] + fit.known[c:]
     error = float(np.sqrt(np.mean(np.diag(fit.covariance)[c:])))
-    return replace(
-        recordings,
-        repeated=replace(errors, bias=bias, bias_error=error),
-        fitted=[log.with_accelerometer_bias(bias) for log in recordings.fitted],
-        validation=[log.with_accelerometer_bias(bias) for log in recordings.validation],
+    return _without_bias(recordings, replace(errors, bias=bias, bias_error=error), bias)
+
+
+def _without_bias(recordings: Recordings, errors: RepeatedErrors, bias: Array) -> Recordings:
+    """Return recordings with their errors, without the bias (3,) of accelerometers [m/s^2]."""
+    fitted, validation = (
+        [log.with_accelerometer_bias(bias) for log in logs]
+        for logs in (recordings.fitted, recordings.validation)
     )
+    return replace(recordings, repeated=errors, fitted=fitted, validation=validation)
 
 
 @dataclass(frozen=True, eq=False)
