@@ -53,7 +53,7 @@ def predict(
     *,
     compiled: bool | None = None,
 ) -> list[Array]:
-    """Return the torque W theta, (N, n_rows) [N m, N], of several vectors; if constrained P W theta.
+    """Return the torque W theta, (N, n_rows) [N m, N], of several vectors; constrained: P W theta.
 
     It is computed by the rows of the regressor for all vectors together, or, if the rows are not
     compiled and the vectors are few, by inverse dynamics, once per vector (Luh, Walker, Paul 1980).
