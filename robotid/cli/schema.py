@@ -75,7 +75,6 @@ def _types(kinds: tuple[type, ...]) -> list[str]:
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
-    """Add nothing but an example: the command has no flags."""
     parser.epilog = (
         "robotid schema > job.schema.json; the first line of the job file is then "
         "#:schema job.schema.json"
@@ -83,5 +82,4 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Run the command."""
     print(json.dumps(job_schema(), indent=2))

@@ -5,167 +5,100 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import asdict
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from robotid.base.exceptions import MissingDependencyError, SettingsError
+from robotid.base.exceptions import SettingsError
 from robotid.base.files import check_folder, file_sha256, folder_beside, write_json
 from robotid.base.text import columns, in_digits_of
 from robotid.base.versions import __version__
 from robotid.cli.console import Terminated, echo, show_found
-from robotid.cli.flags import (
-    JOB,
-    ONLINE,
-    add_json,
-    add_out,
-    add_robot_and_log,
-    add_serve,
-    add_verbose,
-    job_from_flags,
-)
-from robotid.cli.job import Job
-from robotid.data.files.parquet_files import load_pyarrow
+from robotid.cli.job import JOB, ONLINE, Job, add_out, add_shown, job_from_flags
 from robotid.data.files.read import write_columns
 from robotid.data.log import Log
 from robotid.dynamics.base_parameters import structural_mapping
-from robotid.identification.online import (
-    Observer,
-    OnlineIdentifier,
-    OnlineSettings,
-    Track,
-    track,
-)
+from robotid.identification.online import Observer, OnlineIdentifier, OnlineSettings, Track, track
+from robotid.output.files.result_file import SCHEMA_VERSION
 from robotid.output.viewer.replays import gap_marks, live_page
 from robotid.output.viewer.scene import coordinates
 from robotid.output.viewer.server import LivePage
 from robotid.robot.model import RobotModel
 
-_SCHEMA = 1
 _RATE = 25.0  # [Hz] messages per second of the log
 _SLOWEST = 1e-3  # [-] smallest speed, relative to real time
 
 
-def run_track(
-    job: Job, folder: str | Path | None, *, observer: Observer | None = None
-) -> dict[str, Any]:
+def run_track(job: Job, folder: str | Path, *, observer: Observer | None = None) -> dict[str, Any]:
     """Track the one log of a job, write the history and track.json, and return its content."""
-    model, history = job.model(), _history_name()
-    if folder is not None:
-        inputs = [job.urdf, *(entry.path for entry in job.identification)]
-        check_folder(Path(folder), [history, "track.json"], inputs)
-    if len(job.identification) != 1:
-        raise SettingsError(f"{len(job.identification)} logs are given, wanted one to track")
-    log = job.read(job.identification[0], model)
+    model = job.model()
+    history = "track.parquet" if find_spec("pyarrow") else "track.csv"
+    inputs = [job.urdf, *(entry.path for entry in job.identification)]
+    check_folder(Path(folder), [history, "track.json"], inputs)
+    (entry,) = job.identification
+    log = job.read(entry, model)
     if job.signals.cutoff is None:
         raise SettingsError(
             "the cutoff is disabled, but the online estimator differentiates positions; state a "
             "cutoff in Hz"
         )
-    step = float(np.median(np.diff(log.t)))
+    rate = job.signals.rate or 1.0 / float(np.median(np.diff(log.t)))
     settings = OnlineSettings(
-        rate=job.signals.rate or 1.0 / step,
-        cutoff=job.signals.cutoff,
-        min_velocity=job.signals.min_velocity,
+        rate=rate, cutoff=job.signals.cutoff, min_velocity=job.signals.min_velocity
     )
-    found = track(model, log, settings, observer=observer)
-    content = _summary(found, job, log, history)
-    if folder is not None:
-        target = Path(folder)
-        target.mkdir(parents=True, exist_ok=True)
-        with folder_beside(target) as partial:
-            write_columns(found.columns(), partial / history)
-            write_json(content, partial / "track.json")
+    tracked = track(model, log, settings, observer=observer)
+    content = _summary(tracked, job, log, history)
+    target = Path(folder)
+    target.mkdir(parents=True, exist_ok=True)
+    with folder_beside(target) as partial:
+        write_columns(tracked.columns(), partial / history)
+        write_json(content, partial / "track.json")
     return content
 
 
-def _history_name() -> str:
-    try:
-        load_pyarrow("writing Parquet")
-    except MissingDependencyError:
-        return "track.csv"
-    return "track.parquet"
-
-
-def _summary(found: Track, job: Job, log: Log, history: str) -> dict[str, Any]:
-    identifier = found.identifier
+def _summary(tracked: Track, job: Job, log: Log, history: str) -> dict[str, Any]:
+    identifier = tracked.identifier
     model, mapping = identifier.model, identifier.mapping
-    converged = np.flatnonzero(found.converged)
-    last = identifier.reading
-    columns = {
-        "name": mapping.base_names,
-        "expression": mapping.expressions,
-        "value": last.theta.tolist(),
-        "std_error": last.std_error.tolist(),
-        "unit": [model.layout.units[i] for i in mapping.independent],
-    }
+    converged, last = tracked.t[tracked.converged].tolist(), identifier.reading
+    units = [model.layout.units[i] for i in mapping.independent]
+    rows = zip(mapping.base_names, mapping.expressions, last.theta.tolist(),
+               last.std_error.tolist(), units, strict=True)  # fmt: skip
+    keys = ("name", "expression", "value", "std_error", "unit")
+    inputs = {"urdf": str(job.urdf), "log": log.path}
     return {
-        "schema_version": _SCHEMA,
-        "robotid": __version__,
-        "robot": model.name,
-        "joints": list(model.joints),
-        "settings": job.to_dict(),
+        "schema_version": SCHEMA_VERSION, "robotid": __version__, "robot": model.name,
+        "joints": list(model.joints), "settings": job.to_dict(),
         "inputs": [
-            {"role": "urdf", "path": str(job.urdf), "sha256": file_sha256(job.urdf)},
-            {"role": "log", "path": log.path, "sha256": file_sha256(log.path)},
+            {"role": role, "path": path, "sha256": file_sha256(path)}
+            for role, path in inputs.items()
         ],
-        "samples": len(log.t),
-        "delay": identifier.delay,
-        "first_estimate": float(found.t[0]),
-        "converged_at": float(found.t[converged[0]]) if len(converged) else None,
-        "excitation": last.excitation,
+        "samples": len(log.t), "delay": identifier.delay, "first_estimate": float(tracked.t[0]),
+        "converged_at": converged[0] if converged else None, "excitation": last.excitation,
         "sigma": dict(zip(model.row_names, last.sigma.tolist(), strict=True)),
-        "base_parameters": [
-            dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)
-        ],
+        "base_parameters": [dict(zip(keys, row, strict=True)) for row in rows],
         "changes": [_change(identifier, index) for index in range(len(identifier.changes))],
         "history": history,
-    }
+    }  # fmt: skip
 
 
 def _change(identifier: OnlineIdentifier, index: int) -> dict[str, Any]:
     """Return a change with its equivalent payload, estimated up to the end of the log."""
     change, load = identifier.changes[index], identifier.payload(index)
-    return {
-        "flagged": change.flagged,
-        "onset": change.onset,
-        "payload": {
-            "body": identifier.model.layout.bodies[-1],
-            "mass": load.mass,
-            "std_error": load.mass_std_error,
-        },
-    }
-
-
-def serve(
-    job: Job,
-    folder: str | None,
-    options: argparse.Namespace,
-    finished: Callable[[dict[str, Any]], None],
-) -> None:
-    """Show a log in the browser while the estimator runs over it, until it is interrupted."""
-
-    def announce(url: str) -> None:
-        print(f"live: {url}  (stop with Ctrl-C)", file=sys.stderr, flush=True)
-
-    try:
-        serve_track(job, folder, port=options.serve, speed=options.speed, announce=announce,
-                    finished=finished)  # fmt: skip
-    except Terminated:
-        raise
-    except KeyboardInterrupt:
-        print("\nstopped", file=sys.stderr)
+    body = identifier.model.layout.bodies[-1]
+    payload = {"body": body, "mass": load.mass, "std_error": load.mass_std_error}
+    return {"flagged": change.flagged, "onset": change.onset, "payload": payload}
 
 
 def serve_track(
     job: Job,
-    folder: str | None,
+    folder: str,
     *,
     port: int = 0,
     speed: float = 1.0,
     announce: Callable[[str], None],
-    finished: Callable[[dict[str, Any]], None] | None = None,
+    finished: Callable[[dict[str, Any]], None],
     linger: bool = True,
 ) -> dict[str, Any]:
     """Track the one log of a job, show it in a live page, and return as ``run_track``."""
@@ -182,8 +115,7 @@ def serve_track(
         announce(live.url)
         content = run_track(job, folder, observer=_LiveFeed(live, model, log, speed))
         live.finish()
-        if finished is not None:
-            finished(content)
+        finished(content)
         while linger:
             time.sleep(3600.0)
     return content
@@ -212,12 +144,10 @@ class _LiveFeed:
         if identifier.is_ready:
             reading, (tau, predicted) = identifier.reading, identifier.compared
             message |= {
-                "at": reading.t,
-                "tau": tau.tolist(),
+                "at": reading.t, "tau": tau.tolist(), "theta": reading.theta.tolist(),
                 "predicted": [x if np.isfinite(x) else None for x in predicted.tolist()],
-                "theta": reading.theta.tolist(),
                 "std_error": reading.std_error.tolist(),
-            }
+            }  # fmt: skip
         self._live.send(message)
         for change in identifier.changes[self._marks :]:
             label = f"step change, detected at {change.flagged:.2f} s"
@@ -227,27 +157,37 @@ class _LiveFeed:
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
-    """Add the flags of the command."""
-    add_robot_and_log(parser)
+    parser.add_argument("source", metavar="URDF")
+    parser.add_argument("logs", nargs=1, metavar="LOG")
     add_out(parser, "robotid-track")
-    add_json(parser, "track.json")
+    add_shown(parser, "verbose", json="print track.json")
     JOB.add(parser.add_argument_group("the log"), ONLINE)
-    add_verbose(parser)
-    add_serve(parser, "show the run in the browser, in real time")
+    words = "show the run in the browser, in real time"
+    parser.add_argument("--serve", nargs="?", const=0, type=int, metavar="PORT", help=words)
+    words = "speed of --serve, relative to real time; 0: as fast as possible; default: 1"
+    parser.add_argument("--speed", type=float, default=1.0, metavar="X", help=words)
 
 
 def run(options: argparse.Namespace) -> None:
-    """Run the command."""
     job = job_from_flags(options)
 
     def finished(found: dict[str, Any]) -> None:
         show_found(found, options, _show, [found["history"], "track.json"])
         sys.stdout.flush()
 
+    def announce(url: str) -> None:
+        print(f"live: {url}  (stop with Ctrl-C)", file=sys.stderr, flush=True)
+
     if options.serve is None:
         finished(run_track(job, options.out))
-    else:
-        serve(job, options.out, options, finished)
+        return
+    try:
+        serve_track(job, options.out, port=options.serve, speed=options.speed, announce=announce,
+                    finished=finished)  # fmt: skip
+    except Terminated:
+        raise
+    except KeyboardInterrupt:
+        print("\nstopped", file=sys.stderr)
 
 
 def _show(found: dict[str, Any]) -> None:

@@ -13,9 +13,7 @@ import numpy as np
 
 from robotid.base.exceptions import DataError, RobotIdError
 from robotid.base.findings import Finding, by_severity, toml_key
-from robotid.base.settings import require_kind
 from robotid.base.typing import Array
-from robotid.data.files.read import Readable, read_logs
 from robotid.data.log import REPEATED, Log, Trajectory, repeated_share
 from robotid.data.signal_settings import LogUnits, SignalSettings
 from robotid.diagnosis.catalogue import finding
@@ -33,7 +31,6 @@ from robotid.diagnosis.logs.torque_checks import check_payload_change, check_tor
 from robotid.diagnosis.logs.torque_delay import check_torque_delay
 from robotid.diagnosis.urdf.inertials import assumed_inertials, explained_by_assumed, rounded_angles
 from robotid.dynamics.base_parameters import BaseMapping, structural_mapping
-from robotid.dynamics.constraint_rows import logged_base
 from robotid.dynamics.factors import Reduction, compress, merge
 from robotid.dynamics.prepared_logs import base_problem, independent_share, row_mask
 from robotid.estimation.estimators import WLS, Estimate
@@ -50,30 +47,10 @@ _ROWS = 5000  # of a log, from which its excitation is computed
 _FAR = 2 * np.pi  # number in a log above which a position may be a percentage
 
 
-def check_logs(
-    model: RobotModel,
-    logs: Readable | Sequence[Readable],
-    *,
-    validation: Readable | Sequence[Readable] = (),
-    signals: SignalSettings | None = None,
-) -> tuple[Finding, ...]:
-    """Return the faults of logs, or of paths or DataFrames with their columns, errors first."""
-    require_kind(model, RobotModel, "model", "a robotid.RobotModel")
-    require_kind(signals, (SignalSettings, type(None)), "signals", "a robotid.SignalSettings")
-    first, second = (
-        read_logs(
-            some, model.joints, prismatic=model.layout.prismatic, needs="any",
-            base=logged_base(model), passive=model.passive, robot=model.tree.movable,
-        )
-        for some in (logs, validation)
-    )  # fmt: skip
-    return diagnose(model, first, second, signals or SignalSettings())
-
-
 def diagnose(
     model: RobotModel, fitted: Sequence[Log], validation: Sequence[Log], signals: SignalSettings
 ) -> tuple[Finding, ...]:
-    """Check logs that are in memory, as ``check_logs`` does."""
+    """Check logs that are in memory; the findings have errors first."""
     # friction with an internal state is not examined here
     model = with_assumed_inertials(model.with_terms({}))
     findings = assumed_inertials(model)

@@ -105,7 +105,9 @@ def test_a_tracker_tells_motion_torque_parameters_and_changes(panda, words, tmp_
         listener.start()
         announce.listener = listener
 
-    content = serve_track(job, str(tmp_path / "out"), speed=0.0, announce=announce, linger=False)
+    content = serve_track(
+        job, str(tmp_path / "out"), speed=0.0, announce=announce, finished=print, linger=False
+    )
     announce.listener.join(120)
     assert json.loads((tmp_path / "out" / "track.json").read_text()) == content
     (mark,) = [m["mark"] for m in heard if "mark" in m]
