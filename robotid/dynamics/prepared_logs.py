@@ -368,13 +368,11 @@ def base_problem(
     trajectory: Trajectory,
     weight: Array,
     *,
-    with_mass: bool = False,
     compiled: bool | None = None,
 ) -> Problem:
     """Return the problem of a trajectory in base parameters: weight (N, n_rows)."""
     rows = weight.astype(float)
-    problem = build_problem(model, trajectory, rows, with_mass=with_mass, compiled=compiled)
-    return mapping.reduce(problem)
+    return mapping.reduce(build_problem(model, trajectory, rows, compiled=compiled))
 
 
 def independent_share(signals: SignalSettings) -> float:
