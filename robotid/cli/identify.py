@@ -139,6 +139,9 @@ def identify(
     require_kind(
         estimator, (str, EstimatorSettings), "estimator", "a name or a robotid.EstimatorSettings"
     )
+    require_kind(signals, (SignalSettings, type(None)), "signals", "a robotid.SignalSettings")
+    require_flag(doctor, "doctor")
+    check_ignored(ignore)
     choice = EstimatorSettings(estimator) if isinstance(estimator, str) else estimator
     if not isinstance(choice, SimulationSettings):
         if controller is not None:
@@ -153,10 +156,7 @@ def identify(
     from robotid.identification.closed_loop.from_commands import identify_loops
     from robotid.identification.closed_loop.stages import STAGES
 
-    require_kind(signals, (SignalSettings, type(None)), "signals", "a robotid.SignalSettings")
     require_kind(controller, (Mapping, type(None)), "controller", "a table of its settings")
-    require_flag(doctor, "doctor")
-    check_ignored(ignore)
     loop, settings = LoopSettings.from_dict(controller or {}), signals or SignalSettings()
     report_stage(progress, "reading logs", STAGES)
     model = robot_of(model, logs)

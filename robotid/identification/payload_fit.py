@@ -32,42 +32,28 @@ from robotid.robot.parameters import ParameterLayout
 from robotid.robot.prior import payload_spread, prior_spread
 
 _SIGNIFICANT = 3.0  # standard errors from which a mass differs from 0
-_MASS = 0.3  # largest standard error of a determined mass, as a share of that mass,
-_SMALL = 0.05  # ... or of this share of the robot's mass
-_COM = 0.05  # ... of a determined centre of mass, as a share of the robot's length
-_INERTIA = 0.3  # ... of a determined inertia about it, as a share of the mean principal moment
+_DETERMINED = 0.3  # largest standard error of a determined mass or inertia, as a share of it
+_SMALL = 0.05  # ... of a determined centre of mass over the robot's length; a small mass over its
 _SAME = 1e-3  # of the largest column of a link: below, motion does not determine a parameter
 _MOST_LOADS = 20  # fits until the joint load torque is that of the identified bodies
 _CONVERGED = 1e-4  # relative change of the parameters at convergence
-_FREE = 1e-6  # weight of the prior in the fit that makes a payload consistent: none
-_EXACT = 1e-6  # smallest standard error in that fit, as a share of a parameter's size
+_NONE = 1e-6  # weight of the prior in the fit that makes a payload consistent, and its least error
+_PACKED = ((0, 1, 3), (1, 2, 4), (3, 4, 5))  # places of a matrix among xx xy yy xz yz zz
 
 
 @dataclass(frozen=True, eq=False)
 class Payload:
-    """Payload of a link, in the frame of the link.
-
-    Attributes:
-        link: The link.
-        mass: Mass [kg].
-        mass_std_error: Its standard error [kg]; 0 if the mass was stated.
-        mass_interval: 95 % interval of it, shape (2,) [kg].
-        com: Centre of mass, shape (3,) [m].
-        com_std_error: Its standard errors, shape (3,) [m].
-        inertia: Inertia about the centre of mass, axes of the link, shape (3, 3) [kg m^2].
-        inertia_std_error: Its standard errors, shape (3, 3) [kg m^2].
-        reasons: Why some of "com" and "inertia" are not determined, by name.
-    """
+    """Payload of a link, in the frame of the link."""
 
     link: str
-    mass: float
-    mass_std_error: float
-    mass_interval: Array
-    com: Array
-    com_std_error: Array
-    inertia: Array
-    inertia_std_error: Array
-    reasons: Mapping[str, str]
+    mass: float  # [kg]
+    mass_std_error: float  # [kg]; 0 if the mass was stated
+    mass_interval: Array  # 95 % interval of it, shape (2,) [kg]
+    com: Array  # centre of mass, shape (3,) [m]
+    com_std_error: Array  # its standard errors, shape (3,) [m]
+    inertia: Array  # about the centre of mass, axes of the link, shape (3, 3) [kg m^2]
+    inertia_std_error: Array  # its standard errors, shape (3, 3) [kg m^2]
+    reasons: Mapping[str, str]  # why some of "com" and "inertia" are not determined, by name
 
     @property
     def determined(self) -> tuple[str, ...]:
@@ -106,14 +92,13 @@ class Payload:
         """Return plain values, None for what is not determined."""
         names = ("com", "com_std_error", "inertia", "inertia_std_error")
         shown = {x: x.removesuffix("_std_error") in self.determined for x in names}
-        at_link = {"inertia_at_link": self.inertia_at_link.tolist()}
         return {
             "link": self.link,
             "mass": self.mass,
             "mass_std_error": self.mass_std_error,
             "mass_interval": self.mass_interval.tolist(),
             **{name: getattr(self, name).tolist() if shown[name] else None for name in names},
-            **(at_link if shown["inertia"] else {}),
+            **({"inertia_at_link": self.inertia_at_link.tolist()} if shown["inertia"] else {}),
             "determined": list(self.determined),
             "reasons": dict(self.reasons),
         }
@@ -130,26 +115,16 @@ class Gain:
 
 @dataclass(frozen=True, eq=False)
 class PayloadFit:
-    """Identified payloads, and gains identified from a known payload.
-
-    Attributes:
-        model: The robot.
-        payloads: One per link.
-        gains: Identified gains, by joint.
-        names: Names of the base parameters of the robot without payloads.
-        base: Base parameters, shape (b,), SI units.
-        base_error: Their standard errors, shape (b,), including the uncertainty of the gains.
-        unexplained: Relative torque error of each joint, shape (n,) [-].
-        checks: Known masses against those that torque alone determines, by link.
-    """
+    """Identified payloads, and gains identified from a known payload."""
 
     model: RobotModel
-    payloads: tuple[Payload, ...]
-    gains: Mapping[str, Gain]
-    names: tuple[str, ...]
-    base: Array
-    base_error: Array
-    unexplained: Array
+    payloads: tuple[Payload, ...]  # one per link
+    gains: Mapping[str, Gain]  # identified gains, by joint
+    names: tuple[str, ...]  # names of the base parameters of the robot without payloads
+    base: Array  # base parameters, shape (b,), SI units
+    base_error: Array  # their standard errors, (b,), including the uncertainty of the gains
+    unexplained: Array  # relative torque error of each joint, shape (n,) [-]
+    #: Known masses against those that torque alone determines, by link.
     checks: Mapping[str, PayloadCheck] = field(default_factory=dict)
 
     def __str__(self) -> str:
@@ -194,25 +169,22 @@ class PayloadFit:
 
 
 def payload_of(model: RobotModel, link: str, x: Array, C: Array, freedom: Array) -> Payload:
-    """Return a payload from its ten parameters; first-order errors of derived quantities.
-
-    x (10,), C (10, 10), freedom (10,).
-    """
+    """Return a payload from its ten parameters; first-order errors of derived quantities."""
     step = 1e-20  # complex-step derivative: exact
     shown = _about_com(x)
     J = np.column_stack([_about_com(x + 1j * step * e).imag / step for e in np.eye(10)])
     errors = np.sqrt(np.maximum(np.diag(J @ C @ J.T), 0.0))
     mass, error, t = float(x[0]), float(np.sqrt(C[0, 0])), float(quantile(freedom[:1])[0])
     com, com_error = shown[:3].real, errors[:3]
-    inertia, inertia_error = _matrix(shown[3:]), _matrix(errors[3:])
+    inertia, inertia_error = shown[3:].real[(_PACKED,)], errors[3:][(_PACKED,)]
     moment, largest = float(np.trace(inertia)) / 3, float(inertia_error.max())
     reasons = {}
-    if com_error.max() > _COM * model.length:
+    if com_error.max() > _SMALL * model.length:
         reasons["com"] = (
             f"its standard error of {com_error.max():.2g} m is too large; record poses of {link} "
             "about all axes"
         )
-    if largest > _INERTIA * moment:
+    if largest > _DETERMINED * moment:
         reasons["inertia"] = (
             f"{link} rotates too little: an inertia about the centre of mass of about "
             f"{moment:.2g} kg m^2 would have a standard error of {largest:.2g}; record fast motion "
@@ -231,12 +203,6 @@ def _about_com(x: Array) -> Array:
     steiner = (mc @ mc * np.eye(3) - np.outer(mc, mc)) / m
     i, j = (0, 0, 1, 0, 1, 2), (0, 1, 1, 2, 2, 2)
     return np.concatenate([mc / m, x[4:] - steiner[i, j]])
-
-
-def _matrix(entries: Array) -> Array:
-    """Return the symmetric matrix of xx xy yy xz yz zz, shape (3, 3)."""
-    xx, xy, yy, xz, yz, zz = entries.tolist()
-    return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
 
 
 class UndeterminedMassError(DataError):
@@ -289,8 +255,6 @@ def identify_payload(
         require_each(value, str, name, wanted)
     require_kind(masses, (Mapping, type(None)), "masses", "a table of masses [kg] by link")
     model = robot_of(model, logs)
-    refuse_loops(model, "the identification of a payload")
-    _check_gains(model, unknown_gains)
     settings, mapping = signals or SignalSettings(), structural_mapping(model)
     wanted_families(friction, model.joints)
     read = [logs_of(model, given) for given in (logs, reference)]
@@ -307,8 +271,8 @@ def identify_payload(
 
     def rescaled(gains: Mapping[str, float]) -> Recordings:
         factor = np.array([gains.get(joint, 1.0) for joint in model.joints])
-        torques = [replace(log, tau=factor * log.tau) for log in read[1]]
-        return replace(without, fitted=[hold_log(model, log, settings) for log in torques])
+        logs = [hold_log(model, replace(log, tau=factor * log.tau), settings) for log in read[1]]
+        return replace(without, fitted=logs)
 
     return fit_with_friction(
         loaded, without, friction, rescaled, links=tuple(links) or usual_links(model),
@@ -347,15 +311,6 @@ def fit_with_friction(
     return fit
 
 
-def _check_gains(model: RobotModel, unknown: Sequence[str]) -> None:
-    """Refuse unknown gains where constraint forces are eliminated, which mixes the rows."""
-    if unknown and (model.free_flyer or model.constraints):
-        raise SettingsError(
-            f"unknown gains are stated for {listed(unknown)}; gains are identified for a robot "
-            "with a fixed base, without contacts and loops. State them"
-        )
-
-
 def mass_checks(
     loaded: Recordings,
     reference: Recordings,
@@ -386,24 +341,33 @@ def fit_payloads(
     unknown_gains: Sequence[str] = (),
 ) -> PayloadFit:
     """Identify payloads from recordings, in memory or not; see ``identify_payload``."""
-    refuse_loops(loaded.model, "the identification of a payload")
-    _check_gains(loaded.model, unknown_gains)
+    model = loaded.model
+    refuse_loops(model, "the identification of a payload")
+    if unknown_gains and (model.free_flyer or model.constraints):  # constraints mix the rows
+        raise SettingsError(
+            f"unknown gains are stated for {listed(unknown_gains)}; gains are identified for a "
+            "robot with a fixed base, without contacts and loops. State them"
+        )
     if not loaded.model.layout.remembering:
         return _fit(loaded, reference, links, masses, unknown_gains)
     # the unknown bodies load the gears
-    bodies, before = loaded.model.standard_parameters(), np.inf
-    payload = np.zeros_like(bodies)
+    bodies, before = model.standard_parameters(), np.inf
+    added = np.zeros_like(bodies)
     for _ in range(_MOST_LOADS):
         ground, other = (
             run.with_model(run.model.with_reference(pi))
-            for run, pi in ((reference, bodies), (loaded, bodies + payload))
+            for run, pi in ((reference, bodies), (loaded, bodies + added))
         )
         fit = _fit(other, ground, links, masses, unknown_gains)
         size = float(np.linalg.norm(fit.base))
         if abs(size - before) < _CONVERGED * size:
             return fit
-        bodies, payload = _loads(fit, ground)
         before = size
+        bodies = ground.mapping.to_standard(fit.base, ground.model.standard_parameters())
+        added = np.zeros_like(bodies)
+        for payload in fit.payloads:
+            body, transfer = link_transfer(ground.model, payload.link)
+            added[10 * body : 10 * body + 10] += transfer @ payload.parameters
     raise NotConvergedError(
         f"the joint load torque has not converged after {_MOST_LOADS} fits; use friction = "
         "'viscous+coulomb', or record a richer motion",
@@ -449,17 +413,6 @@ def _fit(
         model, payloads, _gains(model, runs, compared), loaded.mapping.base_names,
         compared.theta[:b], base_error, compared.unexplained,
     )  # fmt: skip
-
-
-def _loads(fit: PayloadFit, reference: Recordings) -> tuple[Array, Array]:
-    """Return the standard parameters that load the gears, and the part of the payloads."""
-    model = reference.model
-    bodies = reference.mapping.to_standard(fit.base, model.standard_parameters())
-    added = np.zeros_like(bodies)
-    for payload in fit.payloads:
-        body, transfer = link_transfer(model, payload.link)
-        added[10 * body : 10 * body + 10] += transfer @ payload.parameters
-    return bodies, added
 
 
 def _payload_columns(model: RobotModel, K: Array, links: Sequence[str]) -> Array:
@@ -527,7 +480,7 @@ def _check_mass(model: RobotModel, link: str, mass: float, error: float, is_know
     if is_known:
         return
     arm = payload_spread(model)[0]
-    if error > _MASS * max(abs(mass), _SMALL * arm):
+    if error > _DETERMINED * max(abs(mass), _SMALL * arm):
         raise UndeterminedMassError(
             f"the motion does not determine the mass of the payload on {link}: {mass:.3g} +- "
             f"{error:.2g} kg; record poses and motions in which its gravity loads different "
@@ -544,35 +497,32 @@ def _possible(
     model: RobotModel, links: Sequence[str], x: Array, C: Array, masses: Mapping[str, float]
 ) -> Array:
     """Return the physically consistent parameters nearest to x in the metric of its covariance."""
-    mass = np.maximum(np.abs(x[::10]), _SMALL * payload_spread(model)[0])
-    radius = model.length
-    unit = np.array([1.0, *[radius] * 3, *[radius**2] * 6])
-    scale = (mass[:, None] * unit).reshape(-1)
-    ball = mass[:, None] * np.array([1.0, 0, 0, 0, *radius**2 * np.array([1.0, 0, 1, 0, 0, 1])])
+    spread, r = payload_spread(model), model.length
+    mass = np.maximum(np.abs(x[::10]), _SMALL * spread[0])[:, None]
+    scale = (mass * spread / spread[0]).reshape(-1)
+    ball = mass * [1.0, 0.0, 0.0, 0.0, r**2, 0.0, r**2, 0.0, 0.0, r**2]
     stated = {link: (masses[link], masses[link]) for link in links if link in masses}
-    count = len(x)
     fit = Consistent(
         layout=ParameterLayout(tuple(links), (), ()),
-        K=np.eye(count),
+        K=np.eye(len(x)),
         prior=ball.reshape(-1),
         prior_std=scale,
-        prior_weight=_FREE,
+        prior_weight=_NONE,
         constraints=Constraints(mass=stated),
     )
     # a stated mass has no covariance; its constraint fixes it. Data without noise have almost none
-    exact = np.diag(np.where(np.diag(C) == 0, scale, _EXACT * scale) ** 2)
-    names = fit.layout.names
-    start = Estimate(x, C + exact, names, np.ones(1), count, 1.0, (), True, 0, "two runs")
+    exact = np.diag(np.where(np.diag(C) == 0, scale, _NONE * scale) ** 2)
+    names, rank = fit.layout.names, len(x)
+    start = Estimate(x, C + exact, names, np.ones(1), rank, 1.0, (), True, 0, "two runs")
     return fit.project(start).theta
 
 
 def _gains(model: RobotModel, runs: TwoRuns, compared: Compared) -> dict[str, Gain]:
-    first = len(compared.theta)
-    error = np.sqrt(np.diag(compared.covariance)[first:])  # of the logarithm
-    half_width = quantile(compared.freedom[first:]) * error
-    gains = {}
-    for k, j in enumerate(runs.unknown):
+    first, gains = len(compared.theta), {}
+    errors = np.sqrt(np.diag(compared.covariance)[first:])  # of the logarithms
+    half_widths = quantile(compared.freedom[first:]) * errors
+    for j, error, half in zip(runs.unknown, errors.tolist(), half_widths.tolist(), strict=True):
         value = float(compared.gain[j])
-        ends = sorted((value * np.exp([-half_width[k], half_width[k]])).tolist())
-        gains[model.joints[j]] = Gain(value, abs(value) * float(error[k]), (ends[0], ends[1]))
+        low, high = sorted([value * np.exp(-half), value * np.exp(half)])
+        gains[model.joints[j]] = Gain(value, abs(value) * error, (low, high))
     return gains

@@ -1,7 +1,6 @@
 """identify(): from a model and logs to parameters and a verdict on them."""
 
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -15,7 +14,6 @@ from robotid.base.exceptions import (
     SettingsError,
 )
 from robotid.base.findings import Finding, not_ignored
-from robotid.base.settings import require_flag, require_kind
 from robotid.base.typing import ProgressCallback, ignore_progress, report_stage
 from robotid.data.files.columns import Needs
 from robotid.data.files.read import Readable, read_logs
@@ -40,13 +38,12 @@ from robotid.diagnosis.verdict.fit_findings import (
     unlike_findings,
 )
 from robotid.diagnosis.verdict.scale_check import check_scale
-from robotid.diagnosis.verdict.verdict import blocking, check_ignored, rejected, warnings_of
+from robotid.diagnosis.verdict.verdict import blocking, rejected, warnings_of
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.constraint_rows import logged_base
-from robotid.estimation.fitting.drive_terms import DriveChoice
 from robotid.estimation.fitting.estimator_settings import EstimatorSettings
 from robotid.estimation.fitting.fit import fit_recordings, rough_choice, solve_recordings
-from robotid.estimation.fitting.fitted import Fit, Solution
+from robotid.estimation.fitting.fitted import Fit
 from robotid.estimation.fitting.recorded import Recordings, hold_log
 from robotid.estimation.variation.variation import vary
 from robotid.identification.repeated_errors import with_repeated_errors
@@ -72,12 +69,6 @@ def identify(
     progress: ProgressCallback | None = None,
 ) -> TorqueIdentification:
     """Identify a robot's parameters from motion logs, as the command line does."""
-    require_kind(signals, (SignalSettings, type(None)), "signals", "a robotid.SignalSettings")
-    require_kind(
-        estimator, (str, EstimatorSettings), "estimator", "a name or a robotid.EstimatorSettings"
-    )
-    require_flag(doctor, "doctor")
-    check_ignored(ignore)
     choice = EstimatorSettings(estimator) if isinstance(estimator, str) else estimator
     settings = signals or SignalSettings()
     report_stage(progress, "reading logs")
@@ -142,9 +133,14 @@ def conclude(
             "the viscous term), but more is stated; remove it, or set dynamics = 'full'"
         )
     report_stage(progress, "fitting")
-    with _explained(doctor_findings):
+    try:
         recordings = with_repeated_errors(recordings)
         fit = with_drives(recordings, choice, wanted, progress=progress)
+    except (DataError, NotConvergedError, RankDeficientError) as error:
+        for f in doctor_findings:
+            if f.severity != "note" and f.message != str(error):
+                error.add_note(f"doctor: {f.severity}: {f.code}: {f.message}")
+        raise
     report_stage(progress, "errors and intervals")
     sample = take_sample(fit)
     misfits, discrepancies = explain_residual(fit, sample)
@@ -159,12 +155,18 @@ def conclude(
         stated=StatedSettings(recordings.fitted[0].asked, friction, tuple(ignore)),
     )
     result = replace(result, scale=check_scale(result))
+    # logs of which the doctor found another payload
+    changes = [f.where for f in doctor_findings if f.code == "payload_change"]
+    with_payload = {where.rpartition(": ")[0] or where for where in changes}
     of_fit = [
         *fit_findings(fit, misfits, on_misfit, discrepancies),
         *unlike_findings(fit.variation),
-        *rescaled_findings(fit, _loaded(doctor_findings)),
+        *rescaled_findings(fit, with_payload),
     ]
-    merged = settled(_kept(doctor_findings), of_fit)
+    # notes, and what the doctor says of excitation and logs, are replaced by those of the fit
+    replaced = ("excitation", "log_assumption")
+    others = [f for f in doctor_findings if f.severity != "note" and f.code not in replaced]
+    merged = settled(others, of_fit)
     merged = [finding for finding in merged if not explained_by_assumed(model, finding)]
     merged = rejected(merged, result.predictions, result.scale_check)
     log_errors = blocking(merged, ignore, is_robust=is_robust)
@@ -183,30 +185,6 @@ def conclude(
     )
 
 
-def _kept(findings: Sequence[Finding]) -> list[Finding]:
-    """Return the doctor's findings but notes and what the fit says of the excitation and logs."""
-    replaced = ("excitation", "log_assumption")
-    return [f for f in findings if f.severity != "note" and f.code not in replaced]
-
-
-def _loaded(findings: Sequence[Finding]) -> set[str]:
-    """Return the logs of which the doctor found another payload."""
-    changes = (f.where for f in findings if f.code == "payload_change")
-    return {where.rpartition(": ")[0] or where for where in changes}
-
-
-@contextmanager
-def _explained(findings: Sequence[Finding]) -> Iterator[None]:
-    """Add the findings of the doctor to the error of a fit that fails."""
-    try:
-        yield
-    except (DataError, NotConvergedError, RankDeficientError) as error:
-        for finding in findings:
-            if finding.severity != "note" and finding.message != str(error):
-                error.add_note(f"doctor: {finding.severity}: {finding.code}: {finding.message}")
-        raise
-
-
 def with_drives(
     recordings: Recordings,
     choice: EstimatorSettings,
@@ -223,8 +201,16 @@ def with_drives(
         return replace(solved.with_errors(), drives=drives)
 
     def changed() -> Recordings:
+        """Return the recordings with the selected drive terms, under the load of the last fit."""
+        solution, layout = solved.solution, recordings.model.layout
+        selected = {drive.joint: drive.terms for drive in drives}
+        model = recordings.model.with_terms({
+            d.name: (*layout.own.get(d.name, ()), *selected.get(d.name, ())) for d in layout.drives
+        })  # fmt: skip
+        values = dict(zip(solution.mapping.names, solution.standard, strict=True))
+        start = np.array([values.get(name, 0.0) for name in model.layout.names])
         levelled = replace(recordings, levels=solved.ground.rough.sigma)
-        extended = _with_terms(levelled, solved.solution, drives)
+        extended = levelled.with_model(model.with_reference(start))
         return extended if recordings.repeated is None else with_repeated_errors(extended)
 
     most = _MOST_SHAPES if any(drive.shapes for drive in drives) else 0
@@ -237,14 +223,3 @@ def with_drives(
         drives = moved
     report("fits", 1 + most, 2 + most, "fits")
     return replace(fit_recordings(changed(), choice), drives=drives)
-
-
-def _with_terms(recordings: Recordings, fit: Solution, drives: Sequence[DriveChoice]) -> Recordings:
-    """Return recordings of the robot with the selected drive terms, under the load of a fit."""
-    layout, selected = recordings.model.layout, {drive.joint: drive.terms for drive in drives}
-    model = recordings.model.with_terms(
-        {d.name: (*layout.own.get(d.name, ()), *selected.get(d.name, ())) for d in layout.drives}
-    )
-    fitted = dict(zip(fit.mapping.names, fit.standard, strict=True))
-    start = np.array([fitted.get(name, 0.0) for name in model.layout.names])
-    return recordings.with_model(model.with_reference(start))
