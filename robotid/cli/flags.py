@@ -237,13 +237,6 @@ def add_robot_and_log(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("logs", nargs=1, metavar="LOG")
 
 
-def add_serve(parser: argparse.ArgumentParser, words: str) -> None:
-    """Add the flags of a live page."""
-    parser.add_argument("--serve", nargs="?", const=0, type=int, metavar="PORT", help=words)
-    speed = "speed of --serve, relative to real time; 0: as fast as possible; default: 1"
-    parser.add_argument("--speed", type=float, default=1.0, metavar="X", help=speed)
-
-
 def add_job(
     parser: argparse.ArgumentParser, json_: str = "one JSON object", output: Sequence[str] = ()
 ) -> None:

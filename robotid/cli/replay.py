@@ -17,13 +17,11 @@ from robotid.cli.flags import (
     JOB,
     ONLINE,
     add_robot_and_log,
-    add_serve,
     job_from_flags,
     refuse_log_flags,
 )
 from robotid.cli.job import Job, LogEntry, written_job
 from robotid.cli.logs import log_of_commands
-from robotid.cli.track import serve
 from robotid.data.files.formats import open_table
 from robotid.data.log import Log
 from robotid.data.signal_settings import LogSource
@@ -41,7 +39,7 @@ from robotid.output.files.result_file import (
 )
 from robotid.output.files.shape import check_shape, schema
 from robotid.output.report.pictures import shown_evaluation
-from robotid.output.viewer.replays import Bands, Mark, Replay, Torques, find_unexplained, replay
+from robotid.output.viewer.replays import Bands, Mark, Replay, Torques, replay
 from robotid.robot.model import RobotModel
 
 #: Columns of the pose of a floating base in the world: position [m] and quaternion.
@@ -133,7 +131,6 @@ def replay_files(job: Job, findings: Findings, *, ghost: str | Path | None = Non
     else:
         torques = _torques(job, motion, model, robots, findings.results)
         torques = replace(torques, noise=_noise(findings, model))
-        marks += _contacts(torques, model)
         notes += [_PROJECTED] if model.constraints else []
     n = model.layout.n_inertial  # drives of the result may have further terms
     masses = {"URDF": model.standard_parameters(), **bodies} if bodies else {}
@@ -177,7 +174,6 @@ def replay_identified(identification: TorqueIdentification) -> Replay:
         motion.q,
         torques=torques,
         masses={"URDF": identification.prior, "identified": identification.standard},
-        marks=_contacts(torques, model),
         notes=[f"Motion: {shown.recording.name}.", *([_PROJECTED] if model.constraints else [])],
         log=Path(shown.recording.log.path).name,
     )
@@ -370,21 +366,6 @@ def _limits_used(job: Job, motion: Log, model: RobotModel) -> tuple[list[Mark], 
     return marks, notes
 
 
-def _contacts(torques: Torques, model: RobotModel) -> list[Mark]:
-    """Return marks at large torque residuals of the first result."""
-    if not torques.predicted or model.constraints:
-        return []
-    predicted = next(iter(torques.predicted.values()))
-    units = dict(zip(model.row_names, model.row_units, strict=True))
-    marks = []
-    for found in find_unexplained(torques.t, torques.measured, predicted, model.joints):
-        size = f"mean {found.residual:.2g} {units[found.joint]}"
-        label = f"unexplained torque, largest at {found.joint} ({size}, for "
-        label += f"{found.end - found.start:.1f} s): contact or load?"
-        marks.append(Mark(found.start, label, "contact", found.joint))
-    return marks
-
-
 def add_flags(parser: argparse.ArgumentParser) -> None:
     """Add the flags of the command."""
     add = parser.add_argument
@@ -393,7 +374,6 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     add("results", nargs="*", metavar="RESULT", help=results)
     add("--html", metavar="FILE", help="page to write; default: replay.html beside the RESULT")
     add("--ghost", metavar="LOG", help="second motion, shown as a ghost")
-    add_serve(parser, "track the log again in real time, and show it in the browser")
     group = parser.add_argument_group("the log, unless a RESULT is given")
     JOB.add(group, ONLINE)
 
@@ -406,10 +386,7 @@ def run(options: argparse.Namespace) -> None:
     else:
         refuse_log_flags(options, "a RESULT states how its logs are read")
         job = stated_job(findings, options.source, options.logs[0])
-    if options.html or options.serve is None:
-        page_file = Path(options.html or findings.beside / "replay.html")
-        check_file(page_file, [options.source, *options.logs, *options.results])
-        target = replay_files(job, findings, ghost=options.ghost).write(page_file)
-        print(f"written: {target}, {target.stat().st_size / 1e6:.1f} MB", file=sys.stderr)
-    if options.serve is not None:
-        serve(job, None, options, lambda found: None)
+    page_file = Path(options.html or findings.beside / "replay.html")
+    check_file(page_file, [options.source, *options.logs, *options.results])
+    target = replay_files(job, findings, ghost=options.ghost).write(page_file)
+    print(f"written: {target}, {target.stat().st_size / 1e6:.1f} MB", file=sys.stderr)

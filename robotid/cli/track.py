@@ -1,10 +1,6 @@
 """robotid track: run the online estimator over a log: history, step changes."""
 
 import argparse
-import sys
-import time
-from collections.abc import Callable
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -14,14 +10,13 @@ from robotid.base.exceptions import MissingDependencyError, SettingsError
 from robotid.base.files import check_folder, file_sha256, folder_beside, write_json
 from robotid.base.text import columns, in_digits_of
 from robotid.base.versions import __version__
-from robotid.cli.console import Terminated, echo, show_found
+from robotid.cli.console import echo, show_found
 from robotid.cli.flags import (
     JOB,
     ONLINE,
     add_json,
     add_out,
     add_robot_and_log,
-    add_serve,
     add_verbose,
     job_from_flags,
 )
@@ -29,27 +24,17 @@ from robotid.cli.job import Job
 from robotid.data.files.formats import write_columns
 from robotid.data.files.parquet_files import load_pyarrow
 from robotid.data.log import Log
-from robotid.dynamics.base_parameters import structural_mapping
 from robotid.identification.online import (
-    Observer,
     OnlineIdentifier,
     OnlineSettings,
     Track,
     track,
 )
-from robotid.output.viewer.replays import gap_marks, live_page
-from robotid.output.viewer.scene import coordinates
-from robotid.output.viewer.server import LivePage
-from robotid.robot.model import RobotModel
 
 _SCHEMA = 1
-_RATE = 25.0  # [Hz] messages per second of the log
-_SLOWEST = 1e-3  # [-] smallest speed, relative to real time
 
 
-def run_track(
-    job: Job, folder: str | Path | None, *, observer: Observer | None = None
-) -> dict[str, Any]:
+def run_track(job: Job, folder: str | Path | None) -> dict[str, Any]:
     """Track the one log of a job, write the history and track.json, and return its content."""
     model, history = job.model(), _history_name()
     if folder is not None:
@@ -69,7 +54,7 @@ def run_track(
         cutoff=job.signals.cutoff,
         min_velocity=job.signals.min_velocity,
     )
-    found = track(model, log, settings, observer=observer)
+    found = track(model, log, settings)
     content = _summary(found, job, log, history)
     if folder is not None:
         target = Path(folder)
@@ -138,94 +123,6 @@ def _change(identifier: OnlineIdentifier, index: int) -> dict[str, Any]:
     }
 
 
-def serve(
-    job: Job,
-    folder: str | None,
-    options: argparse.Namespace,
-    finished: Callable[[dict[str, Any]], None],
-) -> None:
-    """Show a log in the browser while the estimator runs over it, until it is interrupted."""
-
-    def announce(url: str) -> None:
-        print(f"live: {url}  (stop with Ctrl-C)", file=sys.stderr, flush=True)
-
-    try:
-        serve_track(job, folder, port=options.serve, speed=options.speed, announce=announce,
-                    finished=finished)  # fmt: skip
-    except Terminated:
-        raise
-    except KeyboardInterrupt:
-        print("\nstopped", file=sys.stderr)
-
-
-def serve_track(
-    job: Job,
-    folder: str | None,
-    *,
-    port: int = 0,
-    speed: float = 1.0,
-    announce: Callable[[str], None],
-    finished: Callable[[dict[str, Any]], None] | None = None,
-    linger: bool = True,
-) -> dict[str, Any]:
-    """Track the one log of a job, show it in a live page, and return as ``run_track``."""
-    if not (speed == 0 or speed >= _SLOWEST):
-        raise SettingsError(f"speed is {speed}, wanted 0, or {_SLOWEST} or more")
-    if not 0 <= port < 2**16:
-        raise SettingsError(f"port is {port}, wanted 1 to 65535, or 0 for any free port")
-    model = job.model()
-    log = job.read(job.identification[0], model)
-    mapping = structural_mapping(model)
-    units = [model.layout.units[i] for i in mapping.independent]
-    html = live_page(model, mapping.base_names, units, log.q, model.standard_parameters())
-    with LivePage(html, port) as live:
-        announce(live.url)
-        content = run_track(job, folder, observer=_LiveFeed(live, model, log, speed))
-        live.finish()
-        if finished is not None:
-            finished(content)
-        while linger:
-            time.sleep(3600.0)
-    return content
-
-
-class _LiveFeed:
-    """Sends the estimates of a tracker to a live page, no faster than the time of the log."""
-
-    def __init__(self, live: LivePage, model: RobotModel, log: Log, speed: float) -> None:
-        self._live, self._model, self._log, self._speed = live, model, log, speed
-        self._due, self._marks = -np.inf, 0
-        self._gaps = gap_marks(log.t)  # those that are not sent yet
-        self._started = time.monotonic()
-
-    def __call__(self, k: int, identifier: OnlineIdentifier) -> None:
-        t, start = float(self._log.t[k]), float(self._log.t[0])
-        if t < self._due and k < len(self._log.t) - 1:  # the page ends at the last pose
-            return
-        self._due = t + 1.0 / _RATE
-        while self._gaps and self._gaps[0].t < t:
-            self._live.send({"mark": asdict(self._gaps.pop(0))})
-        if self._speed > 0:
-            ahead = (t - start) / self._speed - (time.monotonic() - self._started)
-            time.sleep(max(ahead, 0.0))
-        message = {"t": t, "q": coordinates(self._model, self._log.q[k : k + 1])[0].tolist()}
-        if identifier.is_ready:
-            reading, (tau, predicted) = identifier.reading, identifier.compared
-            message |= {
-                "at": reading.t,
-                "tau": tau.tolist(),
-                "predicted": [x if np.isfinite(x) else None for x in predicted.tolist()],
-                "theta": reading.theta.tolist(),
-                "std_error": reading.std_error.tolist(),
-            }
-        self._live.send(message)
-        for change in identifier.changes[self._marks :]:
-            label = f"step change, detected at {change.flagged:.2f} s"
-            mark = {"t": change.onset, "label": label, "kind": "payload"}
-            self._live.send({"mark": mark})
-        self._marks = len(identifier.changes)
-
-
 def add_flags(parser: argparse.ArgumentParser) -> None:
     """Add the flags of the command."""
     add_robot_and_log(parser)
@@ -233,21 +130,12 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     add_json(parser, "track.json")
     JOB.add(parser.add_argument_group("the log"), ONLINE)
     add_verbose(parser)
-    add_serve(parser, "show the run in the browser, in real time")
 
 
 def run(options: argparse.Namespace) -> None:
     """Run the command."""
-    job = job_from_flags(options)
-
-    def finished(found: dict[str, Any]) -> None:
-        show_found(found, options, _show, [found["history"], "track.json"])
-        sys.stdout.flush()
-
-    if options.serve is None:
-        finished(run_track(job, options.out))
-    else:
-        serve(job, options.out, options, finished)
+    content = run_track(job_from_flags(options), options.out)
+    show_found(content, options, _show, [content["history"], "track.json"])
 
 
 def _show(found: dict[str, Any]) -> None:

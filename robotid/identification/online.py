@@ -6,7 +6,7 @@ filtered position, with a delay of one step. Innovations show noise, convergence
 """
 
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import overload
 
@@ -303,8 +303,6 @@ _DRIFT = 4.0  # mean squared innovation without a change [variances]
 _MEMORY = 5.0  # time over which the noise level of each joint is averaged [s]
 _ROWS = 20.0  # rate of the rows of the history [Hz]
 
-Observer = Callable[[int, "OnlineIdentifier"], None]
-
 
 @dataclass(frozen=True)
 class OnlineSettings(Settings):
@@ -487,15 +485,6 @@ class OnlineIdentifier:
         )
 
     @property
-    def compared(self) -> tuple[Array, Array]:
-        """Measured and predicted torque at the time of the reading, shape (n,) each.
-
-        The prediction is NaN where a joint is at rest, since its friction has no sign.
-        """
-        self._require_ready()
-        return self._compared
-
-    @property
     def estimate(self) -> Estimate:
         """The estimate in the form of the batch estimators."""
         kalman = self._require_ready()
@@ -597,7 +586,6 @@ class OnlineIdentifier:
         self._store(t)
         self._state, self._t = state, t
         residual = tau - Y @ state.theta
-        self._compared = tau, np.where(used, tau - residual, np.nan)
         onset = self._innovations.push(t, tau, e, residual, uncertainty, used, self._share)
         if onset is not None:
             self._reopen(now, onset)
@@ -639,17 +627,13 @@ class Track:
         return table | {"excitation": self.excitation, "converged": self.converged.astype(float)}
 
 
-def track(
-    model: RobotModel, log: Log, settings: OnlineSettings, *, observer: Observer | None = None
-) -> Track:
+def track(model: RobotModel, log: Log, settings: OnlineSettings) -> Track:
     """Run an online identification over a log, sample by sample."""
     identifier = OnlineIdentifier(model, settings)
     times: list[float] = []
     readings: list[Reading] = []
     for k, t in enumerate(log.t.tolist()):
         identifier.update(t, log.q[k], log.tau[k])
-        if observer is not None:
-            observer(k, identifier)
         is_due = not times or t > times[-1] + 0.999 / _ROWS
         if identifier.is_ready and (is_due or k == len(log.t) - 1):
             times.append(t)

@@ -457,7 +457,7 @@ flags = st.sampled_from(
     [
         "--rate", "--cutoff", "--friction", "--joints", "--lock", "--gain", "--ignore",
         "--estimator", "--time-unit", "--angle-unit", "--topic", "--effort", "--stamp",
-        "--workers", "--serve", "--speed", "--json",
+        "--workers", "--json",
     ]
 )  # fmt: skip
 arguments = st.sampled_from(
@@ -482,8 +482,6 @@ def run_flags(example, folder):
         for flag, argument in given
         for word in ((flag,) if flag == "--json" else (flag, argument))
     ]
-    if command == "track" and "--serve" in flat:
-        flat += ["--serve", "-5"]  # so that it ends
     own = {"convert": [path, folder / "out.csv"]}.get(command, [URDF, path])
     written = ["--out", out] if command in ("identify", "track") else []
     obey(command, *own, *written, *flat, out=out)

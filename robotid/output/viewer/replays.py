@@ -85,7 +85,7 @@ class Mark:
     Attributes:
         t: Its time, on the clock of the motion [s].
         label: Its description.
-        kind: "payload", "contact", "gap" or "note".
+        kind: "payload", "gap" or "note".
         joint: The affected joint, if any.
     """
 
@@ -208,43 +208,14 @@ def replay(
     return Replay(data)
 
 
-def live_page(
-    model: RobotModel, names: Sequence[str], units: Sequence[str], q: Array, masses: Array
-) -> str:
-    """Return a page that receives events from the relative address ``events``, and draws them.
-
-    q (N, n) [rad or m], masses (p,).
-    """
-    empty = np.zeros((0, 0))
-    return page(
-        _data(
-            model,
-            robot_scene(model),
-            [q],
-            start=0.0,
-            log="",
-            motion=_packed_motion(np.zeros(0), empty),
-            ghosts=[],
-            masses=[mass_marks(model, masses, "URDF")],
-            torques=_torque_rows(model, ["measured", "predicted"]),
-            bands={"names": list(names), "units": list(units), "t": None, "values": None},
-            marks=[],
-            notes=[],
-            live=True,
-        )
-    )
-
-
 def _data(
     model: RobotModel,
     scene: Scene,
     motions: Sequence[Array],
-    *,
-    live: bool = False,
     **content: Any,  # noqa: ANN401
 ) -> dict[str, Any]:
     view = _view(model, scene.corners, motions)
-    return {"title": model.name, "live": live, "scene": scene.content, **content, "view": view}
+    return {"title": model.name, "scene": scene.content, **content, "view": view}
 
 
 def _check_masses(model: RobotModel, label: str, pi: Array) -> None:
@@ -336,9 +307,11 @@ def _torque_data(model: RobotModel, torques: Torques, t: Array) -> dict[str, Any
     noise = rms if torques.noise is None else np.asarray(torques.noise, dtype=float)
     if noise.shape != wanted[1:]:
         raise DataError(f"noise has shape {noise.shape}, wanted {wanted[1:]}")
+    units = model.row_units[-len(model.joints) :]
     full, unit = (0.5, "RMS torque") if torques.noise is None else (6.0, "RMS noise")
     if torques.quantity == "position":
         full, unit = 0.25, "RMS command error"
+        units = tuple("m" if joint in model.layout.prismatic else "rad" for joint in model.joints)
     scale = {"of": np.where(noise > 0, noise, 1.0).tolist(), "full": full, "unit": unit}
     edges = np.linspace(t[0], t[-1], min(_BINS, max(len(torques.t) // 4, 1)) + 1)
     switched = series[1:] if torques.quantity == "torque" else series[1:2]
@@ -346,7 +319,12 @@ def _torque_data(model: RobotModel, torques: Torques, t: Array) -> dict[str, Any
     strips = [packed(_coded(level, np.array(scale["of"])), "<u2") for level in levels]
     times, values = _plotted(torques.t - t[0], np.hstack(series))
     return {
-        **_torque_rows(model, labels, torques.quantity),
+        "quantity": torques.quantity,
+        "joints": [
+            {"name": name, "unit": unit, "node": int(model.pin_model.getJointId(name))}
+            for name, unit in zip(model.joints, units, strict=True)
+        ],
+        "labels": labels,
         "scale": scale,
         "strips": strips,
         "t": packed(times),
@@ -369,27 +347,6 @@ def _coded(levels: Array, of: Array) -> Array:
     """Return residuals in hundredths of their scale; 65,534: not used, 65,535: a gap."""
     hundredths = np.minimum(np.round(100 * levels / of), 60_000)
     return np.where(np.isnan(levels), 65_535, np.where(levels < 0, 65_534, hundredths))
-
-
-def _torque_rows(
-    model: RobotModel, labels: Sequence[str], quantity: str = "torque"
-) -> dict[str, Any]:
-    """Return joints and labels of the plots, without times, values and the floating base."""
-    tree, units = model.pin_model, model.row_units[-len(model.joints) :]
-    if quantity == "position":
-        units = tuple("m" if joint in model.layout.prismatic else "rad" for joint in model.joints)
-    return {
-        "quantity": quantity,
-        "joints": [
-            {"name": name, "unit": unit, "node": int(tree.getJointId(name))}
-            for name, unit in zip(model.joints, units, strict=True)
-        ],
-        "labels": labels,
-        "scale": None,
-        "strips": [],
-        "t": None,
-        "values": None,
-    }
 
 
 def _band_data(bands: Bands, start: float) -> dict[str, Any]:
@@ -432,57 +389,6 @@ def _view(model: RobotModel, corners: Sequence[Array], motions: Sequence[Array])
     return {"points": outermost.tolist(), "radius": radius, "cell": cell, "ground": ground}
 
 
-_WINDOW = 0.2  # [s] averaging window of a residual
-_ABOVE = 6.0  # unexplained: a mean residual above this multiple of its median ...
-_SHARE = 0.3  # ... and above this share of the joint's torque
-_APART = 1.0  # [s] closer segments are merged
-_SHORTEST = 0.05  # [s] shorter segments are spikes
-
-
-@dataclass(frozen=True)
-class Unexplained:
-    """A segment of unexplained torque."""
-
-    start: float  # its start [s]
-    end: float  # its end [s]
-    joint: str  # the joint with the largest residual relative to its torque
-    residual: float  # largest mean residual of that joint [N m or N]
-
-
-def find_unexplained(
-    t: Array, tau: Array, predicted: Array, joints: Sequence[str]
-) -> tuple[Unexplained, ...]:
-    """Return the segments with an exceptional difference of measured and predicted torque.
-
-    The RMS residual of a joint over 0.2 s is unexplained if it is above six times its median over
-    the motion and above 0.3 of the RMS torque, for 0.05 s or longer.
-
-    t (N,) [s], tau (N, n) [N m or N], predicted (N, n).
-    """
-    if len(t) < 2:
-        return ()
-    width = max(1, round(_WINDOW / float(np.median(np.diff(t)))))
-    square = (tau - predicted) ** 2
-    level = np.sqrt(_running_mean(square, width))  # (N, n)
-    known = np.isfinite(level)
-    columns = zip(level.T, known.T, strict=True)
-    median = np.array([np.median(x[k]) if k.any() else np.inf for x, k in columns])
-    size = np.sqrt(np.mean(tau**2, axis=0))
-    share = np.where(known, level, 0.0) / np.maximum(size, 1e-12)
-    is_large = known & (level > _ABOVE * median) & (share > _SHARE)
-    rows = np.flatnonzero(is_large.any(axis=1))
-    if not len(rows):
-        return ()
-    found = []
-    for part in np.split(rows, np.flatnonzero(np.diff(t[rows]) > _APART) + 1):
-        start, end = float(t[part[0]]), float(t[part[-1]])
-        if end - start < _SHORTEST:
-            continue
-        k, j = divmod(int(np.argmax(np.where(is_large, share, 0.0)[part])), len(joints))
-        found.append(Unexplained(start, end, joints[j], float(level[part[k], j])))
-    return tuple(found)
-
-
 def residual_levels(edges: Array, t: Array, residual: Array) -> Array:
     """Return the RMS residual of each joint in each segment of time.
 
@@ -500,32 +406,18 @@ def residual_levels(edges: Array, t: Array, residual: Array) -> Array:
     return levels
 
 
-def _running_mean(values: Array, width: int) -> Array:
-    """Return the running mean without NaN; NaN if half of a window is NaN."""
-    known = np.isfinite(values)
-    sums = np.cumsum(np.vstack([np.zeros(values.shape[1]), np.where(known, values, 0.0)]), axis=0)
-    counts = np.cumsum(np.vstack([np.zeros(values.shape[1]), known]), axis=0)
-    rows = np.arange(len(values))
-    low, high = np.maximum(rows - width // 2, 0), np.minimum(rows + width // 2 + 1, len(values))
-    count = counts[high] - counts[low]
-    enough = count > width / 2
-    mean: Array = np.where(enough, (sums[high] - sums[low]) / np.maximum(count, 1), np.nan)
-    return mean
-
-
 _ASSETS = Path(__file__).parent / "assets"
 _SCRIPTS = (
     *("data", "scene", "masses", "arcs", "strip", "choice", "plots"),
-    *("clock", "picking", "controls", "live", "embed", "start"),
+    *("clock", "picking", "controls", "embed", "start"),
 )
 _SPEEDS = (0.1, 0.25, 0.5, 1, 2, 5, 10)
 
 
 def page(data: Mapping[str, Any]) -> str:
-    """Return the page of a replay. It loads nothing, except events if it is live."""
-    title = f"{data['title']}: {'live' if data['live'] else 'replay'}"
+    """Return the page of a replay. It loads nothing."""
+    title = f"{data['title']}: replay"
     policy = "; script-src 'unsafe-inline'; img-src data: blob:"
-    policy += "; connect-src 'self'" if data["live"] else ""
     style = f"{asset('uPlot.min.css')}\n/*tones*/{asset('charts.css')}{_asset('replay.css')}"
     body = Template(_asset("replay.html")).substitute(
         title=escape(title),

@@ -6,7 +6,7 @@ import pytest
 from helpers.replay_data import leave_out_meshes, shown
 
 from robotid.base.exceptions import DataError
-from robotid.output.viewer.replays import Torques, replay
+from robotid.output.viewer.replays import Torques, replay, residual_levels
 from robotid.robot.model import RobotModel
 
 URDF = """<robot name="&lt;b&gt;x&lt;/b&gt;">
@@ -192,3 +192,11 @@ def test_what_does_not_fit_is_refused(arm, motion, tmp_path, change, message):
     with pytest.raises(DataError, match=message):
         replay(arm, *change(*motion)).write(tmp_path / "r.html")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_levels_are_root_mean_squares_and_say_where_there_is_nothing():
+    t = np.r_[0.1, 0.3, 0.6, 0.9, 1.2, 3.0]
+    residual = np.array([[3.0, 1], [4.0, np.nan], [-1, np.nan], [1, np.nan], [2, -5], [7, 0]])
+    levels = residual_levels(np.array([0.0, 0.5, 1.0, 2.0, 2.5, 3.0]), t, residual)
+    wanted = [[np.sqrt(12.5), 1], [1, -1], [2, 5], [np.nan, np.nan], [7, 0]]
+    np.testing.assert_allclose(levels, wanted)
