@@ -17,8 +17,8 @@ from robotid.cli.job import Job, written_job
 from robotid.estimation.workers.plan import WorkPlan
 from robotid.identification.result import Identification
 from robotid.output.files.result_file import load_result
-from robotid.output.report.document import write_report
 from robotid.output.report.next_steps import Origin
+from robotid.output.report.report_page import write_report
 
 _SHARE = 1e-6  # permitted difference over a base parameter, for rounding ...
 _PART = 0.01  # ... or over its standard error, for the tolerance of solvers

@@ -5,11 +5,9 @@ Only the inertials of the original file change; all other bytes are unchanged. T
 coupled drives.
 """
 
-import difflib
 import hashlib
 import json
 import math
-import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -44,8 +42,6 @@ from robotid.robot.tree import MOMENTS, Inertial
 #: The drive terms of ``<dynamics>``.
 DYNAMICS_TERMS = tuple(name for name, term in TERMS.items() if term.dynamics)
 _SCHEMA_VERSION = 1
-_HUNK = re.compile(r"@@ -(\d+)")
-_OWNER = re.compile(r"""<(?:link|joint)\s[^>]*?\bname\s*=\s*["']([^"']*)""")
 _UNCHANGED = 1e-12  # relative difference below which a parameter counts as unchanged
 _ROUNDING = 1e-12  # of the size of a link, below which a number is 0
 _STATES = 64  # random states at which the written file must give the same torque
@@ -103,27 +99,6 @@ def write_urdf(
         (partial / sidecar.name).write_text(text + "\n", encoding="utf-8")
         _check_torque(model, pi, partial / goal.name, partial / sidecar.name)
     return sidecar
-
-
-def urdf_changes(model: RobotModel, pi: Array, *, dynamics: Projection | bool = False) -> list[str]:
-    """Return the differences of the URDF of ``write_urdf`` from the original, line by line.
-
-    pi (p,).
-    """
-    source = Path(model.tree.path)
-    if not source.is_file():
-        return []
-    original, written = source.read_bytes(), link_parameters(model, pi)
-    texts = original, _content(original, model, pi, written, dynamics=dynamics)
-    before, after = (text.decode("utf-8", errors="replace").splitlines() for text in texts)
-    names = source.name, f"{source.stem}.identified.urdf"
-    lines = list(difflib.unified_diff(before, after, *names, n=0, lineterm=""))
-    for k, line in enumerate(lines):
-        if place := _HUNK.match(line):
-            around = "\n".join(before[: int(place[1])])
-            owners = _OWNER.findall(around)
-            lines[k] = f"{line} {owners[-1] if owners else ''}".rstrip()
-    return lines
 
 
 def read_sidecar(path: str | Path) -> dict[str, Any]:

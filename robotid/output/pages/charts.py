@@ -17,7 +17,8 @@ from robotid.base.typing import Array
 from robotid.output.pages.html import asset, scaffold
 
 _KINDS = ("line", "dots", "bars", "area")
-_POINTS = 2000  # rows of a chart's data
+TONES = 8  # distinguishable colours of lines in one chart: tone-1 to tone-8
+POINTS = 2000  # rows of a chart's data
 _AROUND = 112  # [px] of caption, axis and legend of each chart in a notebook
 _HIGHEST = 900  # [px] of a notebook cell
 _STYLE = "main { padding: .5rem 1rem; } h1 { font-size: 1.125rem; margin: 0 0 .5rem; }"
@@ -107,7 +108,7 @@ class Plot:
         return write_text(self.html(), path)
 
 
-def chart_html(chart: Chart, caption: str, *, points: int = _POINTS) -> str:
+def chart_html(chart: Chart, caption: str, *, points: int = POINTS) -> str:
     """Return a chart as a figure: numbers of 16 bits, exact to 1/65,000 of their range."""
     order = np.argsort(chart.x, kind="stable")
     x = np.asarray(chart.x, dtype=float)[order]

@@ -12,8 +12,7 @@ from robotid.identification.result import Identification
 from robotid.identification.summary import joint_reason, verdict_cell
 from robotid.output.pages.html import code, listing, percent, text
 
-_SMALL = 1e-3  # [rad or m] unit of position errors
-_ROWS = 10  # joints that are visible without unfolding
+VISIBLE = 10  # joints that are visible without unfolding
 _WIDEST = 150.0  # [%] end of the scale; larger errors end there, too
 _COLUMNS = (
     ("joint", "code", "joint"), ("error %", "%", "relative_error_pct"),
@@ -70,8 +69,8 @@ POSITION = Quantity(
         "command": Mark("command", "M-3 6l6 6m0 -6l-6 6", "line"),
         "steady": Mark("constant speed", "M-3 9h6", "line"),
     },
-    _SMALL,
-    "m",
+    scale=1e-3,
+    prefix="m",
 )
 
 
@@ -157,9 +156,9 @@ def error_bars(
         error = _share(measured) if measured else None
         bars.append(_Bar(rows.index(joint), joint, error, others, verdict["status"], reasons))
     items = [_row(bar, quantity, has_why=has_why) for bar in bars]
-    more = "".join(items[_ROWS:])
+    more = "".join(items[VISIBLE:])
     if more:
-        words = f"{len(items) - _ROWS} more joints with smaller errors"
+        words = f"{len(items) - VISIBLE} more joints with smaller errors"
         more = f"<details><summary>{words}</summary><ol>{more}</ol></details>\n"
     kind = "not fitted"
     if recordings[0].is_fitted:
@@ -167,7 +166,7 @@ def error_bars(
     return (
         f'<h2 id="worst">{quantity.title}, worst joint first <span class="note">{quantity.share}, '
         f"{kind}</span></h2>\n{_legend(quantity, {key for bar in bars for key in bar.others})}"
-        f'<ol class="bars">{"".join(items[:_ROWS])}</ol>\n{more}'
+        f'<ol class="bars">{"".join(items[:VISIBLE])}</ol>\n{more}'
     )
 
 

@@ -14,7 +14,7 @@ from robotid.base.versions import __version__
 from robotid.design.clearance import Clearance
 from robotid.design.limits import LIMITS, Course
 from robotid.design.previews import Preview
-from robotid.output.pages.charts import Chart, Series, chart_html
+from robotid.output.pages.charts import TONES, Chart, Series, chart_html
 from robotid.output.pages.html import Section, block, facts_html, listing, page
 from robotid.robot.model import RobotModel
 
@@ -30,7 +30,6 @@ _UNCHECKED = {
     "left_alone": "Not checked, since in contact by design",
     "built_near": "Close by design, with a smaller clearance",
 }
-_TONES = 8  # distinguishable colours of lines in one chart
 _NAMED = 5  # base parameters with the largest expected standard errors that are named
 _SHARP = 0.1  # share of the plausible range below which one is well determined ...
 _OPEN = 0.5  # ... and above which it is undetermined
@@ -155,9 +154,7 @@ def _over_time(model: RobotModel, content: Mapping[str, Any], course: Course) ->
 
 
 def _lines(model: RobotModel, values: Array, joints: Array) -> list[Series]:
-    return [
-        Series(model.joints[j], values[:, j], f"tone-{j % _TONES + 1}") for j in joints.tolist()
-    ]
+    return [Series(model.joints[j], values[:, j], f"tone-{j % TONES + 1}") for j in joints.tolist()]
 
 
 def _distance_chart(model: RobotModel, course: Course, clearance: Clearance) -> str:

@@ -12,7 +12,6 @@ from robotid.diagnosis.residual.torque_split import (
     Dependence,
     JointTorque,
     friction_split,
-    spectrum,
     spread_rows,
 )
 from robotid.dynamics.prediction import drive_motion_along
@@ -22,10 +21,9 @@ from robotid.estimation.fitting.standard_errors import QUANTILE, TorqueBand
 from robotid.identification.result import TorqueIdentification
 from robotid.output.pages.charts import Chart, Plot, Series, broken
 
-_DOTS = 800  # of one friction chart
 _DWARFED = 4.0  # times the height of the measured torque above which the URDF's is hidden
 _PIXELS = 500  # spans closer than one of these pixels are merged
-_POINTS = 600  # of a chart
+_POINTS = 400  # of a chart of the residual analysis, or of friction
 _TONES = {
     "gravity": "tone-1",
     "inertia": "tone-4",
@@ -108,7 +106,7 @@ def plot_why(identification: TorqueIdentification, joint: str) -> Plot:
     torque = identification.joint_torques[_row_of(identification, joint)]
     charts = why_charts(torque)
     about = {name: f"residual against {name}" for name in charts}
-    about |= {"split": torque.sentence, "power": "mechanical power"}
+    about["split"] = torque.sentence
     shown = tuple((chart, f"{joint}: {about[name]}") for name, chart in charts.items())
     return Plot(f"Torque parts and residual of {joint}", shown)
 
@@ -210,33 +208,6 @@ def unused_spans(t: Array, used: NDArray[np.bool_]) -> tuple[tuple[float, float]
     return tuple(spans)
 
 
-def spectrum_chart(found: TorqueIdentification, evaluation: Evaluation, row: int) -> Chart | None:
-    """Return the spectrum of a joint's torque and residual; None if no sample was used."""
-    motion, used = evaluation.recording.trajectory, evaluation.recording.mask[:, row].astype(bool)
-    name, unit = found.model.row_names[row], found.model.row_units[row]
-    dt = float(np.median(np.diff(motion.t)[np.diff(motion.segment) == 0]))
-    residual = motion.tau[:, row] - evaluation.torques["estimate"][:, row]
-    (f, torque), (_, left) = (
-        spectrum(x, used, motion.segment, dt) for x in (motion.tau[:, row], residual)
-    )
-    if not len(f):
-        return None
-    cutoff = evaluation.recording.signals.cutoff
-    k = (f > 0) & (f <= (np.inf if cutoff is None else 2.0 * cutoff))
-    return Chart(
-        f"Spectrum of torque and residual of {name}",
-        f[k],
-        (
-            Series("torque", np.sqrt(torque[k]), "text", is_weak=True),
-            Series("residual", np.sqrt(left[k]), "residual"),
-        ),
-        "frequency [Hz]",
-        f"density [{unit}/√Hz]",
-        marks=() if cutoff is None else (cutoff,),
-        logarithmic="y",
-    )
-
-
 def friction_chart(
     found: TorqueIdentification, joint: str, *, split: tuple[Array, Array] | None = None
 ) -> Chart | None:
@@ -245,7 +216,7 @@ def friction_chart(
     motion, row = evaluation.recording.trajectory, model.row_names.index(joint)
     left, friction = split or friction_split(model, evaluation, found.standard)
     rows = np.flatnonzero(evaluation.recording.mask[:, row])
-    rows = rows[:: max(1, -(-len(rows) // _DOTS))]
+    rows = rows[:: max(1, -(-len(rows) // _POINTS))]
     is_driven = joint in model.joints and joint not in model.passive
     has_friction = is_driven or joint in model.layout.own
     if not has_friction or not len(rows):
@@ -277,26 +248,21 @@ def friction_chart(
     )
 
 
-def why_charts(
-    torque: JointTorque, *, link: str = "time", points: int = _POINTS
-) -> dict[str, Chart]:
+def why_charts(torque: JointTorque, *, link: str = "time") -> dict[str, Chart]:
     """Return the charts of a joint by name.
 
-    They are "split", the parts of the torque stacked over time; one for each quantity that the
-    residual may depend on, by its name; and "power", if there is a speed. Charts over time show the
-    first recording.
+    They are "split", the parts of the torque stacked over time, and one for each quantity that the
+    residual may depend on, by its name. Charts over time show the first recording.
     """
-    charts = {"split": _split(torque, link, points)}
+    charts = {"split": _split(torque, link)}
     for dependence in torque.follows:
         if dependence.name in (*torque.quantities, "time"):
-            charts[dependence.name] = _residual(torque, dependence, link, points)
-    if torque.power is not None:
-        charts["power"] = _power(torque, torque.power, link, points)
+            charts[dependence.name] = _residual(torque, dependence, link)
     return charts
 
 
-def _split(torque: JointTorque, link: str, points: int) -> Chart:
-    k = _first(torque, points)
+def _split(torque: JointTorque, link: str) -> Chart:
+    k = _first(torque)
     parts = {name: torque.parts[name][k] for name in torque.present}
     values = [*parts.values(), torque.residual[k], torque.tau[k]]
     t, *values = broken(torque.rows.segment[k], torque.rows.t[k], *values)
@@ -315,22 +281,12 @@ def _split(torque: JointTorque, link: str, points: int) -> Chart:
     )
 
 
-def _power(torque: JointTorque, power: Array, link: str, points: int) -> Chart:
-    k = _first(torque, points)
-    speed = torque.quantities["speed"][1]
-    dissipated = torque.parts.get("friction", np.zeros_like(speed)) * speed
-    t, whole, heat = broken(torque.rows.segment[k], torque.rows.t[k], power[k], dissipated[k])
-    title = f"Mechanical power of {torque.joint} over time, and that of its friction"
-    series = Series("into friction", heat, "tone-3"), Series("torque × speed", whole, "text")
-    return Chart(title, t, series, "time [s]", "power [W]", link, height=120)
-
-
-def _residual(torque: JointTorque, dependence: Dependence, link: str, points: int) -> Chart:
+def _residual(torque: JointTorque, dependence: Dependence, link: str) -> Chart:
     name, unit = dependence.name, dependence.unit
     x = torque.rows.time if name == "time" else torque.quantities[name][1]
     rows = np.flatnonzero(torque.used)
     rows = rows[np.argsort(x[rows])]
-    k = rows[spread_rows(len(rows), points)]
+    k = rows[spread_rows(len(rows), _POINTS)]
     mean, error = dependence.at(x[k])
     is_one = name == "time" and len(torque.rows.recordings) == 1
     residual, less = torque.against_time if name == "time" else (torque.residual, "")
@@ -350,7 +306,7 @@ def _residual(torque: JointTorque, dependence: Dependence, link: str, points: in
     )
 
 
-def _first(torque: JointTorque, points: int) -> Array:
+def _first(torque: JointTorque) -> Array:
     """Return samples spread evenly over the first recording."""
-    own = np.flatnonzero(torque.rows.recording == 0)
-    return own[spread_rows(len(own), points)]
+    rows = np.flatnonzero(torque.rows.recording == 0)
+    return rows[spread_rows(len(rows), _POINTS)]

@@ -8,7 +8,6 @@ import numpy as np
 
 from robotid.base.findings import listed
 from robotid.base.typing import Array
-from robotid.base.versions import versions
 from robotid.diagnosis.verdict.parameter_table import parameter_entries
 from robotid.identification.closed_loop.loop_result import PositionIdentification
 from robotid.identification.closed_loop.position_errors import (
@@ -16,22 +15,19 @@ from robotid.identification.closed_loop.position_errors import (
     PositionEvaluation,
     pool_positions,
 )
-from robotid.output.files.entries import input_entries, loop_parameters
-from robotid.output.pages.charts import Chart, Series, chart_html
+from robotid.output.files.entries import loop_parameters
+from robotid.output.pages.charts import TONES, Chart, Series, chart_html
 from robotid.output.pages.html import block, code, number, table, text
 from robotid.output.report.dock import Residual
-from robotid.output.report.errors import POSITION, Errors, errors_of, worst_errors
-from robotid.output.report.next_steps import Origin, next_steps
+from robotid.output.report.errors import POSITION, Errors, worst_errors
+from robotid.output.report.next_steps import Origin
 from robotid.output.report.report_page import Report, curves_section
 from robotid.output.report.tables import (
-    input_table,
     pairs_table,
     parameter_section,
+    sources_of,
     variation_section,
-    version_table,
 )
-
-_NAMED = 7  # joints in the chart of errors over the horizon
 
 
 def position_report(found: PositionIdentification, origin: Origin, replay: str = "") -> Report:
@@ -42,40 +38,27 @@ def position_report(found: PositionIdentification, origin: Origin, replay: str =
     moving = pool_positions(runs, moving=True).to_dict()["per_joint"]
     counted = [Errors(together, moving, is_fitted=not validation)]
     entries = [x for part in parameter_entries(found) for x in part] + loop_parameters(found)
-    verdict, worst = found.verdict.to_dict(), [*worst_errors(counted)]
     source, kind = ("torque-driven simulation", "driven") if is_driven else ("commands", "position")
     rate = "none" if found.loop.rate is None else f"{found.loop.rate}"
     controller = {"kind": found.loop.kind, "rate": rate}
+    worst = next(iter(worst_errors(counted)))
     return Report(
         title=f"{found.model.name}: drives from {source}",
-        robot=found.model.name,
-        rows=found.model.joints,
-        verdict=verdict,
-        findings=found.findings,
         quantity=POSITION,
         counted=counted,
-        recordings=errors_of(found),
         facts=_facts(found),
-        steps=next_steps(found, origin),
         made=f"<p>{escape(_method(found))}</p>\n",
         errors=(block(f"report.{kind}_errors", drift=f"{DRIFTS:g}"), _horizons(runs)),
-        curves=("Positions", _positions(found, worst, origin, replay)),
-        why="",
-        parameters=parameter_section(
-            found.model,
-            found.standard if found.has_urdf else None,
-            entries,
-            block(f"report.{kind}_parameters"),
-        ),
+        curves=("Positions", _positions(found, worst, kind, origin, replay)),
+        parameters=parameter_section(entries, block(f"report.{kind}_parameters")),
         entries=entries,
         variation=variation_section(found.variation, {}),
         appendix={
             "open": ("Parameters not identifiable", _open_section(found)),
             "settings": ("Controller", pairs_table("Controller", controller)),
-            "inputs": ("Inputs", input_table(input_entries(found))),
-            "versions": ("Versions", version_table(versions())),
+            **sources_of(found),
         },
-    )  # fmt: skip
+    )
 
 
 def _unit(run: PositionEvaluation) -> str:
@@ -126,7 +109,7 @@ def _horizons(runs: Sequence[PositionEvaluation]) -> str:
         errors = {h: x / POSITION.scale for h, x in sorted((dict(run.horizons) | whole).items())}
         if not parts and errors:
             y = np.stack([*errors.values()])  # (horizons, n)
-            worst = np.argsort(-run.rmse)[:_NAMED]
+            worst = np.argsort(-run.rmse)[:TONES]
             series = [
                 Series(joints[j], y[:, j], f"tone-{k + 1}", is_weak=True)
                 for k, j in enumerate(worst)
@@ -148,28 +131,26 @@ def _horizons(runs: Sequence[PositionEvaluation]) -> str:
 
 
 def _positions(
-    found: PositionIdentification, worst: Sequence[str], origin: Origin, replay: str
+    found: PositionIdentification, worst: str, kind: str, origin: Origin, replay: str
 ) -> str:
     """Return charts of each joint in every log."""
-    kind = "driven" if found.loop.kind == "torque" else "position"
     intro = block(f"report.{kind}s", drift=f"{DRIFTS:g}")
 
     def charts(run: PositionEvaluation, row: int, link: str, points: int) -> str:
         kind = "not fitted" if run in found.validation else "fitted"
-        return _charts(run, kind, row, link=link, points=points)
+        return _charts(run, kind, row, link, points)
 
     def residuals(row: int) -> Iterator[Residual]:
         for e in found.validation or found.fitted:
             yield Residual(e.name, e.log.name, e.log.t, (e.log.q - e.q)[:, row])
 
-    every = (*found.validation, *found.fitted)
-    units = every[0].units
+    runs = (*found.validation, *found.fitted)
     return curves_section(
-        found, every, worst, (replay, origin), intro, charts, residuals, POSITION, units, most=1
+        found, runs, worst, (replay, origin), intro, charts, residuals, POSITION, runs[0].units
     )
 
 
-def _charts(run: PositionEvaluation, kind: str, j: int, *, link: str, points: int) -> str:
+def _charts(run: PositionEvaluation, kind: str, j: int, link: str, points: int) -> str:
     """Return charts of positions and position errors of a joint in a log."""
     log, joint, unit = run.log, run.log.joints[j], run.units[j]
     q, q_sim = log.q[:, j], run.q[:, j]

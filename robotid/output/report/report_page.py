@@ -1,16 +1,19 @@
-"""The content of a report, on torques or on positions, and its page."""
+"""The report of an identification, on torques or on positions, as one self-contained page."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
+from pathlib import Path
 from typing import Any, TypeVar
 
-from robotid.base.findings import Cause, Finding, grouped, tally
+from robotid.base.files import write_text
+from robotid.base.findings import Cause, grouped, tally
 from robotid.base.versions import __version__
 from robotid.diagnosis.verdict.evidence import uses_line
 from robotid.estimation.fitting.evaluation import Evaluated
-from robotid.identification.result import Identification
+from robotid.identification.result import Identification, TorqueIdentification
 from robotid.identification.summary import verdict_cell
+from robotid.output.pages.charts import POINTS
 from robotid.output.pages.html import (
     Section,
     block,
@@ -22,63 +25,118 @@ from robotid.output.pages.html import (
     verdict_html,
 )
 from robotid.output.report.dock import Clip, Dock, Residual, worst_html, worst_second
-from robotid.output.report.errors import Errors, Quantity, error_bars, error_table, worst_errors
-from robotid.output.report.next_steps import Origin, Step
+from robotid.output.report.errors import (
+    Errors,
+    Quantity,
+    error_bars,
+    error_table,
+    errors_of,
+    worst_errors,
+)
+from robotid.output.report.next_steps import Origin, Step, next_steps
 from robotid.output.report.tables import sources_fact
 
-_ROWS = 24_000  # of all charts: about half a MB
-_LONGEST = 2000  # rows of one chart
-_OPEN = 2  # joints that are open at most
-_MOST_PLOTS = 84  # twelve recordings of a 7-joint arm
+_ROWS = 24_000  # of all charts over time: about half a MB
+_FEWEST = 140  # rows of one chart; recordings that would leave fewer are not drawn
 
 EvaluatedT = TypeVar("EvaluatedT", bound=Evaluated)
 
 
 @dataclass(frozen=True)
 class Report:
-    """The content of a report. Texts are HTML."""
+    """What a report shows of torques or of positions. Texts are HTML."""
 
     title: str  # title of the page, not escaped
-    robot: str  # name of the robot, not escaped
-    rows: Sequence[str]  # names of its joints
-    verdict: Mapping[str, Any]  # the verdict, as in result.json
-    findings: Sequence[Finding]
     quantity: Quantity  # the predicted quantity
     counted: Sequence[Errors]  # the recordings whose errors the verdict uses
-    recordings: Sequence[Errors]  # all recordings
     facts: Mapping[str, str]  # figures by their names
-    steps: Sequence[Step]  # the next steps
     made: str  # description of the identification
     errors: tuple[str, str]  # definition of the errors, and content after their tables
     curves: tuple[str, str]  # title and content of the section of charts over time
-    why: str  # residual analysis of each joint; "" if there is none
     parameters: str  # content of the section of parameters
     entries: Sequence[Mapping[str, Any]]  # the parameters, as in result.json
     # title and content of the parts of the appendix, by their keys
     appendix: Mapping[str, tuple[str, str]]
+    variation: str  # variation of drive parameters between logs; "" for fewer than three logs
+    why: str = ""  # residual analysis of each joint; "" if there is none
     friction: str = ""  # friction against speed; "" if there is none
-    bodies: str = ""  # pictures of the links, URDF and identified; "" if there are none
-    variation: str = ""  # variation of drive parameters between logs; "" for fewer than three logs
-
-    @property
-    def verdicts(self) -> Mapping[str, Mapping[str, Any]]:
-        """The verdict on each joint."""
-        verdicts: Mapping[str, Mapping[str, Any]] = self.verdict.get("per_joint", {})
-        return verdicts
+    bodies: str = ""  # links, URDF and identified; "" if there are none
 
 
-def first_screen(report: Report, files: Mapping[str, str]) -> str:
+def write_report(
+    found: Identification,
+    target: str | Path,
+    *,
+    files: Mapping[str, str] | None = None,
+    origin: Origin | None = None,
+) -> Path:
+    """Write the report of an identification as one HTML file, with links to files by their kind."""
+    at, links = origin or Origin(), files or {}
+    if isinstance(found, TorqueIdentification):
+        from robotid.output.report.torque_report import torque_report
+
+        report = torque_report(found, at, links.get("replay", ""))
+    else:  # modules of the simulation are imported here
+        from robotid.identification.closed_loop.loop_result import PositionIdentification
+        from robotid.output.report.position_page import position_report
+
+        assert isinstance(found, PositionIdentification)
+        report = position_report(found, at, links.get("replay", ""))
+    return write_text(_page(found, report, at, links), target)
+
+
+def _page(found: Identification, report: Report, origin: Origin, files: Mapping[str, str]) -> str:
+    rows, verdicts = found.model.row_names, found.verdict.to_dict()["per_joint"]
+    definition, after = report.errors
+    tables = "".join(
+        error_table(report.quantity, errors, rows, verdicts) for errors in errors_of(found)
+    )
+    count = sum(entry["source"] in ("data", "mixed") for entry in report.entries)
+    determined = f"{count} of {len(report.entries)} determined by the data, fully or partly"
+    appendix = "".join(
+        folded(key, title, html) for key, (title, html) in report.appendix.items() if html
+    )
+    causes = grouped(found.findings, rows)
+    findings = "".join(map(_cause, causes)) or "<p>None.</p>\n"
+    notes = [cause for cause in causes if cause.severity == "note"]
+    serious = [cause for cause in causes if cause.severity != "note"]
+    worst = escape(next(iter(worst_errors(report.counted)), ""))
+    sections = {
+        "errors": Section(
+            "Errors", f"{definition}{tables}{after}", f"{len(verdicts)} joints, by recording", False
+        ),
+        "findings": Section("Findings", findings, tally(serious, notes, worst) or "none", False),
+        "friction": Section("Friction against speed", report.friction),
+        "curves": Section(*report.curves),
+        "why": Section("Residual analysis", report.why, "torque components of each joint", False),
+        "variation": Section("Variation between logs", report.variation, "", False),
+        "bodies": Section("Links", report.bodies),
+        "parameters": Section("Parameters", report.parameters, determined, False),
+        "appendix": Section("Appendix", appendix),
+    }
+    written = block("report.written", version=__version__)
+    made = folded("made", "Method and data", f"{report.made}{written}")
+    known = {key: section for key, section in sections.items() if section.html}
+    return page(report.title, first_screen(found, report, origin, files) + made, known)
+
+
+def first_screen(
+    found: Identification, report: Report, origin: Origin, files: Mapping[str, str]
+) -> str:
     """Return the HTML of the first screen: verdict, figures, errors of joints, next steps."""
-    verdict, uses = report.verdict, uses_line(report.verdict.get("use_for", {}))
+    verdict = found.verdict.to_dict()
+    uses = uses_line(verdict.get("use_for", {}))
     uses = f"{uses[:1].upper()}{uses[1:]}." if uses else ""
+    bars = error_bars(
+        report.quantity, report.counted, found.model.row_names, verdict["per_joint"],
+        has_why=bool(report.why),
+    )  # fmt: skip
     return block(
         "report.first",
-        verdict=verdict_html(report.robot, verdict["status"], verdict["reasons"], uses),
+        verdict=verdict_html(found.model.name, verdict["status"], verdict["reasons"], uses),
         facts=facts_html({**report.facts, **sources_fact(report.entries)}, files),
-        bars=error_bars(
-            report.quantity, report.counted, report.rows, report.verdicts, has_why=bool(report.why)
-        ),
-        steps=_steps(report.steps),
+        bars=bars,
+        steps=_steps(next_steps(found, origin)),
     )
 
 
@@ -91,41 +149,6 @@ def _steps(steps: Sequence[Step]) -> str:
         for step in steps
     )
     return f'<h2 id="next">Do next</h2>\n<ol class="next">{items}</ol>\n' if items else ""
-
-
-def page_of(report: Report, files: Mapping[str, str]) -> str:
-    """Return the HTML of the report."""
-    worst, (definition, after) = list(worst_errors(report.counted)), report.errors
-    tables = "".join(
-        error_table(report.quantity, errors, report.rows, report.verdicts)
-        for errors in report.recordings
-    )
-    count = sum(entry["source"] in ("data", "mixed") for entry in report.entries)
-    determined = f"{count} of {len(report.entries)} determined by the data, fully or partly"
-    appendix = "".join(
-        folded(key, title, html) for key, (title, html) in report.appendix.items() if html
-    )
-    causes = grouped(report.findings, report.rows)
-    findings = "".join(map(_cause, causes)) or "<p>None.</p>\n"
-    notes = [cause for cause in causes if cause.severity == "note"]
-    serious = [cause for cause in causes if cause.severity != "note"]
-    line = tally(serious, notes, escape(next(iter(worst), ""))) or "none"
-    by_log = f"{len(report.verdicts)} joints, by recording"
-    sections = {
-        "errors": Section("Errors", f"{definition}{tables}{after}", by_log, False),
-        "findings": Section("Findings", findings, line, False),
-        "friction": Section("Friction against speed", report.friction),
-        "curves": Section(*report.curves),
-        "why": Section("Residual analysis", report.why, "torque components of each joint", False),
-        "variation": Section("Variation between logs", report.variation, "", False),
-        "bodies": Section("Links", report.bodies),
-        "parameters": Section("Parameters", report.parameters, determined, False),
-        "appendix": Section("Appendix", appendix),
-    }
-    written = block("report.written", version=__version__)
-    made = folded("made", "Method and data", f"{report.made}{written}")
-    known = {key: section for key, section in sections.items() if section.html}
-    return page(report.title, first_screen(report, files) + made, known)
 
 
 def _cause(cause: Cause) -> str:
@@ -148,32 +171,28 @@ def _cause(cause: Cause) -> str:
 
 def drawn(runs: Sequence[EvaluatedT], rows: Sequence[str]) -> Sequence[EvaluatedT]:
     """Return the recordings that are drawn: the first ones, to limit the page's size."""
-    return runs[: max(1, _MOST_PLOTS // len(rows))]
+    return runs[: max(1, _ROWS // (2 * len(rows) * _FEWEST))]
 
 
 def curves_section(
     found: Identification,
     evaluations: Sequence[EvaluatedT],
-    worst: Sequence[str],
+    worst: str,
     dock: tuple[str, Origin],
     intro: str,
     charts: Callable[[EvaluatedT, int, str, int], str],
     residuals: Callable[[int], Iterable[Residual]],
     quantity: Quantity,
     units: Sequence[str],
-    most: int = _OPEN,
 ) -> str:
-    """A part for each joint; the worst joint and the worst ones that are not good are open.
-
-    ``dock`` is the file of the replay and the source of the result.
-    """
+    """Return a part for each joint, the worst one open; the file of the replay and the source."""
     rows, verdicts = found.model.row_names, found.verdict.to_dict()["per_joint"]
     shown = drawn(evaluations, rows)
     runs = {f"recording {k}": e for k, e in enumerate(shown)}
     clips = [Clip(link, str(e.log.path), e.extent.start, e.extent.end) for link, e in runs.items()]
     player = Dock(*dock, str(found.model.tree.path), clips)
-    points = min(_LONGEST, max(200, _ROWS // (2 * len(rows) * max(1, len(runs)))))
-    parts, first = [player.html, intro], [*worst][:most]
+    points = min(POINTS, max(_FEWEST, _ROWS // (2 * len(rows) * max(1, len(runs)))))
+    parts = [player.html, intro]
     if left := [e.name for e in evaluations[len(shown) :]]:
         parts.append(block("report.not_drawn", names=escape(", ".join(left))))
     for row, name in enumerate(rows):
@@ -182,6 +201,5 @@ def curves_section(
         note = worst_html(worst_second(residuals(row)), name, unit, player, quantity.scale)
         html = note + "".join(charts(e, row, link, points) for link, e in runs.items())
         summary = f"<strong>{code(name).html}</strong> {escape(status)}"
-        is_open = name in first[:1] or (status.startswith(("poor", "usable")) and name in first)
-        parts.append(folded(f"joint-{row}", summary, html, is_open=is_open))
+        parts.append(folded(f"joint-{row}", summary, html, is_open=name == worst))
     return "".join(parts)

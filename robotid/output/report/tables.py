@@ -1,7 +1,7 @@
 """The report's tables: parameters, bodies, changes, consistency, settings, inputs."""
 
 import math
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from html import escape
 from typing import Any
@@ -9,23 +9,21 @@ from typing import Any
 import numpy as np
 
 from robotid.base.findings import listed
-from robotid.base.typing import Array
+from robotid.base.versions import versions
 from robotid.diagnosis.verdict.parameter_table import CENTRAL_TERMS, central_parameters
 from robotid.estimation.variation.variation import Variation, VaryingParameter
-from robotid.identification.result import TorqueIdentification
-from robotid.output.files.urdf import urdf_changes
+from robotid.identification.result import Identification, TorqueIdentification
+from robotid.output.files.entries import input_entries
 from robotid.output.pages.html import (
     Cell,
     block,
     code,
-    folded,
     listing,
     number,
     table,
     text,
     with_error,
 )
-from robotid.robot.model import RobotModel
 from robotid.robot.parameters import INERTIAL_TERMS, pseudo_inertia
 
 #: What determined a parameter, by its source.
@@ -78,18 +76,12 @@ _VARYING = (
 
 
 def parameter_section(
-    model: RobotModel | None,
-    standard: Array | None,
-    entries: Sequence[Mapping[str, Any]],
-    words: str,
-    on_misfit: Collection[str] = (),
+    entries: Sequence[Mapping[str, Any]], words: str, on_misfit: Collection[str] = ()
 ) -> str:
-    """Return all parameters of the links and drives, and the changes of the URDF: standard (p,)."""
+    """Return all parameters of the links and drives."""
     rows = [_parameter(entry, on_misfit) for entry in entries]
     parameters = listing("Parameters of links and drives", _PARAMETERS, rows, is_data=True)
-    changes = folded("changes", "Changes of the URDF", _changes(model, standard))
-    tables = _drive_table(entries) + parameters
-    return block("report.parameters", words=words, tables=tables, changes=changes)
+    return block("report.parameters", words=words, tables=_drive_table(entries) + parameters)
 
 
 def _parameter(entry: Mapping[str, Any], on_misfit: Collection[str]) -> dict[str, Any]:
@@ -171,23 +163,6 @@ def sources_fact(entries: Sequence[Mapping[str, Any]]) -> dict[str, str]:
     words = ", ".join(f"{count} {SOURCE_NAMES[kind]}" for kind, count in known.items())
     name = f"{len(entries)} parameters, determined by"
     return {name: f'<span class="shares">{shares}</span>{words}'}
-
-
-def _changes(model: RobotModel | None, standard: Array | None) -> str:
-    """Return the changed lines of the URDF, each link's under its name."""
-    if standard is None:
-        return "<p>No URDF was written.</p>\n"
-    lines = [] if model is None else urdf_changes(model, standard)
-    if not lines:
-        return "<p>The URDF is no longer at its path.</p>\n"
-    kinds, html, link = {"-": "del", "+": "ins"}, "", ""
-    for line in lines[2:]:
-        if line[0] in kinds:
-            html += f"<{kinds[line[0]]}>{escape(line)}</{kinds[line[0]]}>\n"
-        elif (name := line.rpartition("@@ ")[2]) != link:  # unchanged lines split a link's changes
-            html, link = f"{html}<strong>{escape(name)}</strong>\n", name
-    title = " and ".join(line.split(" ", 1)[1].strip() for line in lines[:2])
-    return block("report.changes", title=escape(title), lines=html)
 
 
 def body_table(identification: TorqueIdentification) -> str:
@@ -332,22 +307,21 @@ def pairs_table(caption: str, pairs: Mapping[str, str], heads: Sequence[str] = (
     return table(caption, heads or ["setting", "value"], rows)
 
 
-def input_table(inputs: Iterable[Mapping[str, Any]]) -> str:
-    """Return the table of the input files."""
+def sources_of(found: Identification) -> dict[str, tuple[str, str]]:
+    """Return the parts of an appendix on the files read and the versions that ran."""
     rows = [
         {
             **entry,
             "role": _ROLES[entry["role"]],
             "sha256": entry["sha256"] or "not read from a file",
         }
-        for entry in inputs
+        for entry in input_entries(found)
     ]
-    return listing("Files read", _INPUTS, rows)
-
-
-def version_table(ran: Mapping[str, str]) -> str:
-    """Return the table of the versions that ran."""
-    return pairs_table("Versions that ran", ran, ["what", "version"])
+    ran = pairs_table("Versions that ran", versions(), ["what", "version"])
+    return {
+        "inputs": ("Inputs", listing("Files read", _INPUTS, rows)),
+        "versions": ("Versions", ran),
+    }
 
 
 def variation_section(variation: Variation | None, torques: Mapping[str, str]) -> str:

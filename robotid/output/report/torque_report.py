@@ -1,14 +1,12 @@
 """The report on an identification from torques: its sections, and the content of its page."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from html import escape
 from pathlib import Path
 
 import numpy as np
 
 from robotid.base.findings import listed
-from robotid.base.versions import versions
 from robotid.data.signal_settings import SignalSettings
 from robotid.diagnosis.residual.decisions import DEPENDENCE_SHARE
 from robotid.diagnosis.residual.torque_split import JointTorque, friction_split
@@ -16,24 +14,16 @@ from robotid.diagnosis.verdict.parameter_table import parameter_entries
 from robotid.estimation.fitting.drive_terms import DriveChoice
 from robotid.estimation.fitting.evaluation import Evaluation
 from robotid.estimation.fitting.fitted import next_errors
-from robotid.estimation.fitting.standard_errors import TorqueBand
 from robotid.identification.result import TorqueIdentification
 from robotid.identification.summary import left_out_lines
-from robotid.output.files.entries import input_entries
 from robotid.output.pages.charts import Chart, chart_html
 from robotid.output.pages.html import Cell, block, cell, code, folded, listing, percent, table, text
 from robotid.output.report import pictures, tables
 from robotid.output.report.dock import Residual
-from robotid.output.report.errors import TORQUE, errors_of, worst_errors
-from robotid.output.report.next_steps import Origin, next_steps
+from robotid.output.report.errors import TORQUE, VISIBLE, errors_of, worst_errors
+from robotid.output.report.next_steps import Origin
 from robotid.output.report.report_page import Report, curves_section, drawn
 
-_LOW = 130  # [px] height of a friction chart
-_CURVES = 8  # friction charts that are not folded
-_POINTS = 300  # of a chart of the residual analysis
-_ALL_POINTS = 1800  # of one chart, summed over the joints
-_FEWEST_POINTS = 100
-_MOST = 12  # joints with all charts; others have charts of significant dependences only
 _TRIED = (
     ("terms", "text", "terms"), ("held-out error %", ".2f", "error"), ("p-value", ".1e", "p_value"),
     ("", "text", "selected"),
@@ -41,47 +31,35 @@ _TRIED = (
 
 
 def torque_report(found: TorqueIdentification, origin: Origin, replay: str = "") -> Report:
-    """Return the content of a report on an identification."""
-    *validation, fitted = recordings = errors_of(found)
+    """Return the content of a report on an identification from torques."""
+    *validation, fitted = errors_of(found)
     counted = [errors for errors, e in zip(validation, found.validation, strict=True)
                if not e.is_refitted] or [fitted]  # fmt: skip
     entries = [entry for part in parameter_entries(found) for entry in part]
-    verdict, worst = found.verdict.to_dict(), [*worst_errors(counted)]
+    worst = [*worst_errors(counted)]
     return Report(
         title=f"{found.model.name}: identified parameters",
-        robot=found.model.name,
-        rows=found.model.row_names,
-        verdict=verdict,
-        findings=found.findings,
         quantity=TORQUE,
         counted=counted,
-        recordings=recordings,
         facts=_facts(found),
-        steps=next_steps(found, origin),
         made=block("report.made", method=escape(_method(found)), totals=escape(_totals(found))),
         errors=(block("report.torque_errors"), ""),
-        curves=("Torques", torques_section(found, worst, origin, replay)),
-        friction=friction_section(found, worst),
+        curves=("Torques", _torques(found, worst[0], origin, replay)),
+        friction=_friction(found, worst),
         bodies=tables.body_table(found),
         why=why_section(found),
         variation=tables.variation_section(found.variation, _next_errors(found)),
         parameters=tables.parameter_section(
-            found.model,
-            found.standard if found.has_urdf else None,
-            entries,
-            block("report.torque_parameters"),
-            found.on_misfit,
+            entries, block("report.torque_parameters"), found.on_misfit
         ),
         entries=entries,
         appendix={
-            "residuals": ("Residual spectra", residual_section(found)),
-            "drives": ("Selection of friction terms", drive_choices(found)),
+            "drives": ("Selection of friction terms", _drive_choices(found)),
             "base": ("Base parameters", tables.base_table(found)),
             "consistency": ("Physical consistency", tables.consistency_section(found)),
             "open": ("Parameters not identifiable", tables.open_section(found)),
             "settings": ("Settings", tables.settings_tables(found)),
-            "inputs": ("Inputs", tables.input_table(input_entries(found))),
-            "versions": ("Versions", tables.version_table(versions())),
+            **tables.sources_of(found),
         },
     )
 
@@ -159,15 +137,13 @@ def _chain(signals: SignalSettings) -> str:
     return f"{cutoff}, {rate}, velocity {signals.velocity}"
 
 
-def torques_section(
-    found: TorqueIdentification, worst: Sequence[str], origin: Origin, replay: str = ""
-) -> str:
+def _torques(found: TorqueIdentification, worst: str, origin: Origin, replay: str) -> str:
     """Return charts of torques and residuals over time."""
     evaluations, model = found.validation or found.fitted, found.model
     intro = _intro(found, drawn(evaluations, model.row_names))
 
     def charts(e: Evaluation, row: int, link: str, points: int) -> str:
-        return _charts(found, e, found.band(e), row, link=link, points=points)
+        return _charts(found, e, row, link, points)
 
     def residuals(row: int) -> Iterator[Residual]:
         return _residuals(() if model.is_static else evaluations, row)
@@ -198,16 +174,9 @@ def _intro(found: TorqueIdentification, shown: Sequence[Evaluation]) -> str:
     return html
 
 
-def _charts(
-    found: TorqueIdentification,
-    e: Evaluation,
-    band: TorqueBand,
-    row: int,
-    *,
-    link: str,
-    points: int,
-) -> str:
+def _charts(found: TorqueIdentification, e: Evaluation, row: int, link: str, points: int) -> str:
     """Return torque and residual of a joint in a recording."""
+    band = found.band(e)
     name, unit = found.model.row_names[row], found.model.row_units[row]
     measured, recording = e.metrics["estimate"].per_joint.get(name), e.recording
     words = "no samples used"
@@ -224,7 +193,7 @@ def _charts(
     return chart_html(torque, caption, points=points) + chart_html(residual, "", points=points)
 
 
-def friction_section(found: TorqueIdentification, worst: Sequence[str]) -> str:
+def _friction(found: TorqueIdentification, worst: Sequence[str]) -> str:
     """Return friction against speed of each joint, measured and identified."""
     model, layout = found.model, found.model.layout
     if model.is_static or all(term.is_inertia for _, term in layout.drive_parameters):
@@ -238,10 +207,9 @@ def friction_section(found: TorqueIdentification, worst: Sequence[str]) -> str:
             why = "no samples used" if is_driven else "no drive"
             figures[joint] = f"<p>{escape(joint)}: {why}.</p>\n"
         else:
-            caption = f"<strong>{escape(joint)}</strong>"
-            figures[joint] = chart_html(replace(chart, height=_LOW), caption)
-    is_few = len(figures) <= _CURVES
-    first = [joint for joint in figures if is_few or joint in worst[:_CURVES]]
+            figures[joint] = chart_html(chart, f"<strong>{escape(joint)}</strong>")
+    is_few = len(figures) <= VISIBLE
+    first = [joint for joint in figures if is_few or joint in worst[:VISIBLE]]
     more = "".join(html for joint, html in figures.items() if joint not in first)
     if more:
         title = f"{len(figures) - len(first)} more joints with smaller errors"
@@ -251,19 +219,7 @@ def friction_section(found: TorqueIdentification, worst: Sequence[str]) -> str:
     return block("report.friction", log=name, figures=shown, more=more)
 
 
-def residual_section(found: TorqueIdentification) -> str:
-    """Return the spectrum of each joint's residual."""
-    if found.model.is_static:
-        return "<p>Static poses and slow segments have no spectrum.</p>\n"
-    evaluation, figures = pictures.shown_evaluation(found), ""
-    for row, joint in enumerate(found.model.row_names):
-        chart, name = pictures.spectrum_chart(found, evaluation, row), escape(joint)
-        caption = f"<strong>{name}</strong>"
-        figures += chart_html(chart, caption) if chart else f"<p>{name}: no samples used.</p>\n"
-    return block("report.residuals", name=escape(evaluation.name), figures=figures)
-
-
-def drive_choices(found: TorqueIdentification) -> str:
+def _drive_choices(found: TorqueIdentification) -> str:
     """Return the selection of friction terms of each joint; "" if there is none."""
     choices = "".join(_choice(drive) for drive in found.drives)
     return block("report.terms", choices=choices) if choices else ""
@@ -296,14 +252,13 @@ def why_section(found: TorqueIdentification) -> str:
     torques = sorted(found.joint_torques, key=_relative_residual, reverse=True)
     logs = torques[0].rows.recordings
     kind = "Validation logs" if torques[0].fitted is not None else "Fitted logs, without validation"
-    points = max(_FEWEST_POINTS, min(_POINTS, _ALL_POINTS // len(torques)))
     names = [e.name for e in found.validation or found.fitted]
     link = f"recording {names.index(logs[0])}" if logs[0] in names else "fitted"  # as the torques
     joints = "".join(
         folded(
             f"why-{found.model.row_names.index(torque.joint)}",
             f"<strong>{code(torque.joint).html}</strong>: {escape(torque.sentence)}",
-            _joint(torque, link, points, is_full=k < _MOST),
+            _joint(torque, link),
             is_open=k == 0,
         )
         for k, torque in enumerate(torques)
@@ -317,31 +272,22 @@ def _relative_residual(torque: JointTorque) -> float:
     return rms["residual"] / rms["measured"] if rms["measured"] > 0 else -1.0
 
 
-def _joint(torque: JointTorque, link: str, points: int, *, is_full: bool) -> str:
-    """Return table and charts of a joint: all charts, or those of significant dependences."""
+def _joint(torque: JointTorque, link: str) -> str:
+    """Return the table and the charts of a joint."""
     if not torque.used.any():
         return ""
 
     def drawn_chart(chart: Chart, caption: str) -> str:
         return chart_html(chart, caption, points=2 * len(chart.x))
 
-    charts = pictures.why_charts(torque, link=link, points=points)
+    charts = pictures.why_charts(torque, link=link)
     caption = "Torque components, stacked; shaded: samples not used"
     split = drawn_chart(charts.pop("split"), caption)
-    significant = {d.name for d in torque.follows if d.is_significant}
-    small = "".join(
-        drawn_chart(chart, _caption(torque, name))
-        for name, chart in charts.items()
-        if is_full or name in significant
-    )
+    small = "".join(drawn_chart(chart, _caption(torque, name)) for name, chart in charts.items())
     return f'{_parts(torque)}{split}<div class="plots">\n{small}</div>\n'
 
 
 def _caption(torque: JointTorque, name: str) -> str:
-    if name == "power" and torque.power is not None:
-        used = torque.power[torque.used]
-        words = f"Mechanical power: mean {used.mean():.3g} W, peak {abs(used).max():.3g} W"
-        return words.replace("-", "−")
     (dependence,) = (d for d in torque.follows if d.name == name)
     share = percent(100 * (dependence.share or 0.0)).html
     result = "no dependence"

@@ -17,7 +17,7 @@ ORIGIN = Origin(("arm.toml",), "out")
 
 
 def screen_of(found, files=None):
-    return first_screen(torque_report(found, ORIGIN), files or {})
+    return first_screen(found, torque_report(found, ORIGIN), ORIGIN, files or {})
 
 
 @pytest.fixture(scope="module")

@@ -8,8 +8,8 @@ import pytest
 from helpers.pages import bars, chart, charts, tables
 
 from robotid.base.findings import Finding
-from robotid.output.report.document import write_report
 from robotid.output.report.next_steps import Origin
+from robotid.output.report.report_page import write_report
 
 JOINTS = ("rail", "turn")
 
