@@ -16,8 +16,7 @@ from robotid.base.findings import listed
 from robotid.base.text import yaml_name, yaml_plain
 from robotid.base.typing import Array
 from robotid.dynamics.friction_projection import Projection, project_friction
-from robotid.output.files.commanded import CommandedDrive, commanded_drives
-from robotid.output.files.result_file import Result
+from robotid.output.files.result_file import CommandedDrive, Result, commanded_drives
 from robotid.output.files.urdf import DYNAMICS_TERMS, write_urdf
 from robotid.robot.model import RobotModel
 

@@ -12,7 +12,6 @@ from robotid.base.files import write_text
 from robotid.base.findings import listed
 from robotid.base.typing import Array
 from robotid.base.versions import __version__
-from robotid.output.files.commanded import CommandedDrive, limit_of
 from robotid.output.files.exports import (
     Exported,
     Format,
@@ -22,13 +21,12 @@ from robotid.output.files.exports import (
     unstated_terms,
     yaml_text,
 )
-from robotid.output.files.result_file import Result
+from robotid.output.files.result_file import CommandedDrive, Result, limit_of
 from robotid.robot.model import RobotModel
 from robotid.robot.tree import Joint
 
 # drive terms of Isaac Lab's actuators; a note of its own states the offset
 _TERMS = ("armature", "viscous", "coulomb", "offset")
-_STEP = 0.005  # [s]
 FORMAT = Format(
     "isaac",
     "YAML of Isaac Lab's actuators",
@@ -38,7 +36,7 @@ FORMAT = Format(
 )
 
 
-def export(result: Result, target: Path, *, step: float = _STEP) -> Written:
+def export(result: Result, target: Path, *, step: float = 0.005) -> Written:
     """Write the drives of a result as the YAML of Isaac Lab's actuators."""
     of = Exported.of(result, _TERMS)
     notes = write_isaac(of.model, of.pi, of.commanded, target, step=step, notes=of.notes)
@@ -75,7 +73,7 @@ def write_isaac(
     commanded: Sequence[CommandedDrive],
     target: str | Path,
     *,
-    step: float = _STEP,
+    step: float,  # [s]
     notes: Sequence[str] = (),
 ) -> tuple[str, ...]:
     """Write drives with position controllers as the YAML of Isaac Lab's actuators: pi (p,)."""

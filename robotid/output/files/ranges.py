@@ -27,9 +27,8 @@ from robotid.estimation.variation.draws import (
     scores_to_values,
 )
 from robotid.estimation.variation.variation import SCORES
-from robotid.output.files.commanded import commanded_drives
 from robotid.output.files.exports import Format, Option, Written, head_of, yaml_text
-from robotid.output.files.result_file import Result
+from robotid.output.files.result_file import Result, commanded_drives
 from robotid.output.files.urdf import link_parameters
 from robotid.robot.bodies import held_parameters, principal_moments
 from robotid.robot.drives import TERMS

@@ -42,8 +42,7 @@ from robotid.robot.tree import MOMENTS, Inertial
 #: The drive terms of ``<dynamics>``.
 DYNAMICS_TERMS = tuple(name for name, term in TERMS.items() if term.dynamics)
 _SCHEMA_VERSION = 1
-_UNCHANGED = 1e-12  # relative difference below which a parameter counts as unchanged
-_ROUNDING = 1e-12  # of the size of a link, below which a number is 0
+ROUNDING = 1e-12  # of the size of a parameter or a link, below which a difference is 0
 _STATES = 64  # random states at which the written file must give the same torque
 _SAME = 1e-6  # largest relative difference of a row's torque over these states
 
@@ -51,27 +50,16 @@ _SAME = 1e-6  # largest relative difference of a row's torque over these states
 def write_urdf(
     model: RobotModel, pi: Array, target: str | Path, *, dynamics: Projection | bool = False
 ) -> Path:
-    """Write standard parameters into a copy of the model's URDF, and a sidecar in the same folder.
+    """Write standard parameters into a copy of the model's URDF, and a sidecar beside it.
 
     The moving link of a body gets the inertial of the body. The inertials of links fixed to it are
     removed, because the body includes them. Links beyond locked joints are unchanged. Angles that
     the model has in exact form (``snap_angles``) are written in this form. Both files are read
     again, and must give the torque of pi, before they replace existing files.
 
-    Args:
-        model: The robot; a copy of its file is edited.
-        pi: Standard parameters, shape (p,), SI units, in ``layout.names`` order.
-        target: The URDF to write; not the original.
-        dynamics: Whether viscous and Coulomb friction are also written to ``<dynamics>``: those of
-            a projection, which the sidecar then states, or those of pi.
-
-    Returns:
-        Path of the sidecar, ``<target stem>.drive.json``.
-
-    Raises:
-        DataError: If pi does not have p finite entries.
-        ModelError: If a link or a drive would be physically impossible, the original is missing or
-            cannot be edited, the target is not usable, or the written file differs from pi.
+    pi (p,); ``dynamics``: whether viscous and Coulomb friction are also written to ``<dynamics>``,
+    those of pi or those of a projection, which the sidecar then states. Returns the path of the
+    sidecar, ``<target stem>.drive.json``.
     """
     require_kind(model, RobotModel, "model", "a robotid.RobotModel")
     require_kind(target, (str, Path), "target", "the path of a URDF to write")
@@ -319,15 +307,15 @@ def _is_as_stated(parameters: Array, stated: Inertial | None) -> bool:
     if stated is None:
         return False
     before = inertial_parameters(stated)
-    return bool(np.allclose(parameters, before, rtol=_UNCHANGED, atol=_ROUNDING * before[0]))
+    return bool(np.allclose(parameters, before, rtol=ROUNDING, atol=ROUNDING * before[0]))
 
 
 def _inertial(parameters: Array) -> list[str]:
     """Return an ``<inertial>`` about the centre of mass, line by line."""
     body = central_inertial(parameters)
     size = np.sqrt(np.trace(pseudo_inertia(parameters)[0][:3, :3]) / body.mass)  # [m]
-    com = np.where(np.abs(body.com) > _ROUNDING * size, body.com, 0.0)
-    least = _ROUNDING * body.mass * size**2
+    com = np.where(np.abs(body.com) > ROUNDING * size, body.com, 0.0)
+    least = ROUNDING * body.mass * size**2
     inertia = np.where(np.abs(body.inertia) > least, body.inertia, 0.0)
     moments = " ".join(
         f'{key}="{numbers_text([value])}"' for key, value in zip(MOMENTS, inertia, strict=True)

@@ -334,7 +334,7 @@ def _terms(found: TorqueIdentification, origin: Origin, causes: Sequence[Cause])
 def _payload(found: TorqueIdentification, origin: Origin, causes: Sequence[Cause]) -> Step:
     logs = [x for x in found.validation if not x.is_refitted] or list(found.fitted)
     log, urdf = str(logs[0].recording.log.path), str(found.model.tree.path)
-    words = (urdf, log, "--reference", f"{origin.folder}/result.json")
+    words: tuple[str, ...] = (urdf, log, "--reference", f"{origin.folder}/result.json")
     if all(f.evidence.get("mass", 0.0) < 0 for cause in causes for f in cause.findings):
         # the fitted log carries the payload
         gains = [x for pair in _gain_flags(origin) for x in ("--gain", "=".join(pair))]

@@ -18,10 +18,9 @@ from robotid.identification.closed_loop.position_errors import (
 from robotid.output.files.entries import loop_parameters
 from robotid.output.pages.charts import TONES, Chart, Series, chart_html
 from robotid.output.pages.html import block, code, number, table, text
-from robotid.output.report.dock import Residual
 from robotid.output.report.errors import POSITION, Errors, worst_errors
 from robotid.output.report.next_steps import Origin
-from robotid.output.report.report_page import Report, curves_section
+from robotid.output.report.report_page import Report, Residual, curves_section
 from robotid.output.report.tables import (
     pairs_table,
     parameter_section,

@@ -19,10 +19,9 @@ from robotid.identification.summary import left_out_lines
 from robotid.output.pages.charts import Chart, chart_html
 from robotid.output.pages.html import Cell, block, cell, code, folded, listing, percent, table, text
 from robotid.output.report import pictures, tables
-from robotid.output.report.dock import Residual
 from robotid.output.report.errors import TORQUE, VISIBLE, errors_of, worst_errors
 from robotid.output.report.next_steps import Origin
-from robotid.output.report.report_page import Report, curves_section, drawn
+from robotid.output.report.report_page import Report, Residual, curves_section, drawn
 
 _TRIED = (
     ("terms", "text", "terms"), ("held-out error %", ".2f", "error"), ("p-value", ".1e", "p_value"),

@@ -10,7 +10,7 @@ from robotid.identification.closed_loop.loop_simulator import (
     LoopSimulator,
     _better_start,
 )
-from robotid.output.files.commanded import loops_of
+from robotid.output.files.result_file import loops_of
 
 NOISE = 3e-4  # [rad]
 

@@ -15,8 +15,7 @@ from helpers.mujoco_plant import LEG, followed, loaded, multisine, plant, record
 
 from robotid.base.exceptions import DataError
 from robotid.cli import main
-from robotid.output.files.commanded import limit_of
-from robotid.output.files.result_file import load_result
+from robotid.output.files.result_file import limit_of, load_result
 from robotid.robot.examples import example_urdf
 from robotid.robot.tree import Joint
 
