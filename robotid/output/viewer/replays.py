@@ -6,6 +6,7 @@ no process, socket or port is needed.
 
 import itertools
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache, cached_property
@@ -23,87 +24,63 @@ from robotid.base.files import write_text
 from robotid.base.settings import is_number, require_each, require_kind
 from robotid.base.typing import Array
 from robotid.output.pages.html import asset, scaffold
-from robotid.output.viewer.scene import Scene, coordinates, mass_marks, packed, robot_scene
+from robotid.output.viewer.scene import coordinates, mass_marks, packed, robot_scene
 from robotid.robot.model import RobotModel
 
-_KEYS = 500_000  # numbers of a motion: about 3 MB
-_POINTS = 1_000_000  # numbers of all plots: about 6 MB
+_ASSETS = Path(__file__).parent / "assets"
+_SCRIPTS = (
+    *("data", "scene", "masses", "arcs", "strip", "choice", "plots"),
+    *("clock", "picking", "controls", "embed", "start"),
+)
+_NUMBERS = 500_000  # of a motion, or of all plots: about 3 MB
 _BINS = 480  # columns of the heat strip
 _PLOT_RATE = 50.0  # [Hz] points of a plot per second
 _DATA_RANGE = 100  # poses that determine the camera's view
-_CELLS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)  # [m] of the grid, 40 by 40
 _GAP = 0.25  # [s] a longer time without samples is a gap ...
 _TIMES = 5.0  # ... if it is this multiple of the typical one
 
 
 @dataclass(frozen=True, eq=False)
 class Torques:
-    """Torques to plot with a motion, or positions of position-controlled drives.
+    """Torques to plot with a motion, or positions of position-controlled drives."""
 
-    Attributes:
-        t: Times on the clock of the motion, shape (N,) [s].
-        measured: Measured torques, shape (N, n) [N m or N].
-        predicted: Predicted torques by the name of the model, shape (N, n) each, NaN where there
-            is no prediction; arcs, links and the heat strip show the residual of the first, until
-            another is selected.
-        noise: Scale of the residuals, shape (n,): the RMS residual of each joint on the fitted
-            logs of the first model; the RMS torque if None. Of positions: the RMS error of the
-            command.
-        quantity: "torque" or "position", whose units are the joints' [rad or m].
-    """
-
-    t: Array
-    measured: Array
+    t: Array  # (N,), times on the clock of the motion [s]
+    measured: Array  # (N, n) [N m or N]
+    # predicted torques by the name of the model, (N, n) each, NaN where there is no prediction;
+    # arcs, links and the heat strip show the residual of the first, until another is selected
     predicted: Mapping[str, Array] = field(default_factory=dict)
+    # scale of the residuals, (n,): the RMS residual of each joint on the fitted logs of the first
+    # model, the RMS torque if None; of positions, the RMS error of the command
     noise: Array | None = None
-    quantity: str = "torque"
+    quantity: str = "torque"  # or "position", whose units are the joints' [rad or m]
 
 
 @dataclass(frozen=True, eq=False)
 class Bands:
-    """Parameters over time, from a recursive estimator.
+    """Parameters over time, from a recursive estimator."""
 
-    Attributes:
-        t: Times on the clock of the motion, shape (K,) [s].
-        names: Names of the b parameters, as ``forearm.mcx``.
-        units: Their units.
-        theta: Their values, shape (K, b).
-        std_error: Their standard errors, shape (K, b).
-    """
-
-    t: Array
-    names: Sequence[str]
+    t: Array  # (K,), times on the clock of the motion [s]
+    names: Sequence[str]  # of the b parameters, as ``forearm.mcx``
     units: Sequence[str]
-    theta: Array
-    std_error: Array
+    theta: Array  # (K, b), values
+    std_error: Array  # (K, b)
 
 
 @dataclass(frozen=True)
 class Mark:
-    """An event on the time line.
+    """An event on the time line."""
 
-    Attributes:
-        t: Its time, on the clock of the motion [s].
-        label: Its description.
-        kind: "payload", "gap" or "note".
-        joint: The affected joint, if any.
-    """
-
-    t: float
+    t: float  # on the clock of the motion [s]
     label: str
-    kind: str = "note"
-    joint: str = ""
+    kind: str = "note"  # "payload", "gap" or "note"
+    joint: str = ""  # the affected joint, if any
 
 
 @dataclass(frozen=True, eq=False)
 class Replay:
-    """A page that plays a motion; a notebook shows it as the value of a cell.
+    """A page that plays a motion; a notebook shows it as the value of a cell."""
 
-    Attributes:
-        data: Content of the page, in plain values.
-    """
-
-    data: Mapping[str, Any]
+    data: Mapping[str, Any]  # content of the page, in plain values
 
     @cached_property
     def html(self) -> str:
@@ -177,45 +154,32 @@ def replay(
     _check(t, q, rate)
     moved = _moved(model, t, q, rate)
     others = dict(ghosts or {})
-    for label, own in others.items():
+    for label, path in others.items():
         require_each([label], str, "the label of a ghost", "text")
-        if len(require_each(own, np.ndarray, f"ghost {label!r}", "two arrays, t and q")) != 2:
-            raise SettingsError(f"ghost {label!r} has {len(own)} arrays, wanted two, t and q")
-        _check(*own, rate)
-    gaps = gap_marks(t)
-    start = float(t[0])
+        if len(require_each(path, np.ndarray, f"ghost {label!r}", "two arrays, t and q")) != 2:
+            raise SettingsError(f"ghost {label!r} has {len(path)} arrays, wanted two, t and q")
+        _check(*path, rate)
+    gaps = [Mark(float(t[k]), f"gap of {t[k + 1] - t[k]:.2f} s", "gap") for k in _gaps(t)]
     scene = robot_scene(model)
-    data = _data(
-        model,
-        scene,
-        [q, *(own for _, own in others.values())],
-        start=start,
-        log=log,
-        motion=_packed_motion(*moved),
-        ghosts=[
-            {"label": label, **_packed_motion(*_moved(model, *own, rate))}
-            for label, own in others.items()
+    motions = [q, *(path for _, path in others.values())]
+    data = {
+        "title": model.name,
+        "scene": scene.content,
+        "start": float(t[0]),
+        "log": log,
+        "motion": _packed_motion(*moved),
+        "ghosts": [
+            {"label": label, **_packed_motion(*_moved(model, *path, rate))}
+            for label, path in others.items()
         ],
-        masses=[mass_marks(model, pi, label) for label, pi in (masses or {}).items()],
-        torques=None if torques is None else _torque_data(model, torques, t),
-        bands=None if bands is None else _band_data(bands, start),
-        marks=[
-            {"t": mark.t, "label": mark.label, "kind": mark.kind, "joint": mark.joint}
-            for mark in sorted((*marks, *gaps), key=lambda mark: mark.t)
-        ],
-        notes=[*notes, *_fixed_base(model), *(f"{note}." for note in scene.notes)],
-    )
+        "masses": [mass_marks(model, pi, label) for label, pi in (masses or {}).items()],
+        "torques": None if torques is None else _torque_data(model, torques, t),
+        "bands": None if bands is None else _band_data(bands, float(t[0])),
+        "marks": [vars(mark) for mark in sorted((*marks, *gaps), key=lambda mark: mark.t)],
+        "notes": [*notes, *_fixed_base(model), *(f"{note}." for note in scene.notes)],
+        "view": _view(model, scene.corners, motions),
+    }
     return Replay(data)
-
-
-def _data(
-    model: RobotModel,
-    scene: Scene,
-    motions: Sequence[Array],
-    **content: Any,  # noqa: ANN401
-) -> dict[str, Any]:
-    view = _view(model, scene.corners, motions)
-    return {"title": model.name, "scene": scene.content, **content, "view": view}
 
 
 def _check_masses(model: RobotModel, label: str, pi: Array) -> None:
@@ -260,11 +224,6 @@ def _keyframes(t: Array, rate: float, most: int) -> Array:
     return rows
 
 
-def gap_marks(t: Array) -> list[Mark]:
-    """Return a mark for each gap of a recording, at the last sample before it: t (N,) [s]."""
-    return [Mark(float(t[k]), f"gap of {t[k + 1] - t[k]:.2f} s", "gap") for k in _gaps(t)]
-
-
 def _gaps(t: Array) -> list[int]:
     """Return the samples before gaps of the recording."""
     steps = np.diff(t)
@@ -281,7 +240,7 @@ def _moved(model: RobotModel, t: Array, q: Array, rate: float) -> tuple[Array, A
     if base:  # a quaternion and its negative are one pose, but not between keyframes
         turn = (q[1:, 3:7] * q[:-1, 3:7]).sum(axis=1) < 0
         q[1:, 3:7] *= np.where(np.cumsum(turn) % 2, -1.0, 1.0)[:, None]
-    rows = _keyframes(t, rate, _KEYS // q.shape[1])
+    rows = _keyframes(t, rate, _NUMBERS // q.shape[1])
     return t[rows] - t[0], coordinates(model, q[rows])
 
 
@@ -357,7 +316,7 @@ def _band_data(bands: Bands, start: float) -> dict[str, Any]:
 
 def _plotted(t: Array, values: Array) -> tuple[Array, Array]:
     """Return the samples of a plot, with a row of NaN in each gap."""
-    rows = _keyframes(t, _PLOT_RATE, _POINTS // max(values.shape[1], 1))
+    rows = _keyframes(t, _PLOT_RATE, _NUMBERS // max(values.shape[1], 1))
     holes = np.array(_gaps(t), dtype=int)
     rows = np.unique(np.r_[rows, holes, holes + 1])
     after = np.searchsorted(rows, holes) + 1
@@ -382,8 +341,9 @@ def _view(model: RobotModel, corners: Sequence[Array], motions: Sequence[Array])
     towards = np.array([d for d in itertools.product((-1, 0, 1), repeat=3) if any(d)], dtype=float)
     outermost = places[np.unique((places @ towards.T).argmax(axis=0))]
     radius = float(np.linalg.norm(np.ptp(places, axis=0)) / 2) or 0.1
-    # the camera is 2.8 radii away; the grid ends before it
-    cell = max((c for c in _CELLS if 20 * c <= 2.5 * radius), default=_CELLS[0])
+    # the camera is 2.8 radii away; the grid of 40 by 40 cells ends before it
+    decade = 10.0 ** math.floor(math.log10(radius / 8.0))
+    cell = max(step for step in (decade, 2.0 * decade, 5.0 * decade) if step <= radius / 8.0)
     # the ground is at 0, or below a robot that extends below 0
     ground = lowest if lowest < -0.1 * radius else 0.0
     return {"points": outermost.tolist(), "radius": radius, "cell": cell, "ground": ground}
@@ -406,14 +366,6 @@ def residual_levels(edges: Array, t: Array, residual: Array) -> Array:
     return levels
 
 
-_ASSETS = Path(__file__).parent / "assets"
-_SCRIPTS = (
-    *("data", "scene", "masses", "arcs", "strip", "choice", "plots"),
-    *("clock", "picking", "controls", "embed", "start"),
-)
-_SPEEDS = (0.1, 0.25, 0.5, 1, 2, 5, 10)
-
-
 def page(data: Mapping[str, Any]) -> str:
     """Return the page of a replay. It loads nothing."""
     title = f"{data['title']}: replay"
@@ -422,9 +374,6 @@ def page(data: Mapping[str, Any]) -> str:
     body = Template(_asset("replay.html")).substitute(
         title=escape(title),
         notes=" ".join(f"<p>{escape(note)}</p>" for note in data["notes"]),
-        options="".join(
-            f'<option value="{s}"{" selected" * (s == 1)}>{s}×</option>' for s in _SPEEDS
-        ),
         # "<" is an escape in JSON, so no text in it can end the script
         data=json.dumps(data, allow_nan=False).replace("<", "\\u003c"),
         viewer=_viewer(),
