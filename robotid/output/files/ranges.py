@@ -35,6 +35,11 @@ from robotid.robot.drives import TERMS
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia, pseudo_inertia_basis
 
+_DIGITS = 9  # significant digits of the root in result.json
+_MOST = 1_000_000
+#: Drive terms of simulators, which replace the friction of drives with further terms.
+SIMULATED = ("viscous", "coulomb", "offset")
+_POSITIVE = ("kp", "limit")
 #: Parameters of drives that cannot be negative.
 _NOT_NEGATIVE = {"kd", "delay", *(name for name, term in TERMS.items() if term.is_nonnegative)}
 FORMAT = Format(
@@ -78,47 +83,32 @@ def parameter_ranges(found: Identified) -> dict[str, Any]:
 
     The intervals of centre and moments are first-order functions of those of the parameters.
     """
-    layout, sources = found.model.layout, found.sources
-    errors, covariance = found.standard_error, found.standard_covariance
-    quantile = found.standard_quantile
+    layout, sources, quantile = found.model.layout, found.sources, found.standard_quantile
     variation = getattr(found, "variation", None)  # not of a result from commands
-    between = {} if variation is None else {each.name: each for each in variation.parameters}
+    between = {} if variation is None else {x.name: x.prediction for x in variation.parameters}
     drives: dict[str, dict[str, Any]] = {drive.name: {} for drive in layout.drives}
-    for k, (d, term) in enumerate(layout.drive_parameters, start=layout.n_inertial):
-        name, least = layout.drives[d].name, 0.0 if term.is_nonnegative else -math.inf
+    for k, (d, drive_term) in enumerate(layout.drive_parameters, start=layout.n_inertial):
+        name, drive = layout.names[k], layout.drives[d].name
+        least = 0.0 if drive_term.is_nonnegative else -math.inf
         source = "bound" if found.at_bound[k] else sources[k]
-        found_range = _range(
-            found.standard[k], errors[k], source, least=least, quantile=float(quantile[k])
-        )
-        if layout.names[k] in between and source != "bound":
-            low, high = between[layout.names[k]].prediction.ends
-            found_range |= {"low": max(float(low), least), "high": float(high), "source": "logs"}
-        term_name = layout.names[k].removeprefix(f"{name}.")
-        drives[name][term_name] = found_range | {"unit": layout.units[k]}
+        error, reach = found.standard_error[k], float(quantile[k])
+        ends = _range(found.standard[k], error, source, reach, least)
+        if name in between and source != "bound":
+            ends = _of_logs(ends, between[name].ends, least)
+        drives[drive][name.removeprefix(f"{drive}.")] = ends | {"unit": layout.units[k]}
+    bodies = {}
+    for i, (body, pi) in enumerate(link_parameters(found.model, found.standard).items()):
+        part = slice(10 * i, 10 * i + 10)
+        C = found.standard_covariance[part, part]
+        bodies[body] = _body(pi, C, sources[part], float(quantile[part].max()))
     return {
         "robot": found.model.name,
         "confidence": 0.95,
-        "bodies": body_ranges(found.model, found.standard, covariance, sources, quantile),
+        "bodies": bodies,
         "drives": drives,
         **projected_ranges(found),
         "undetermined": list(found.undetermined),
     }
-
-
-def body_ranges(
-    model: RobotModel, standard: Array, covariance: Array, sources: Sequence[str], quantile: Array
-) -> dict[str, dict[str, Any]]:
-    """Return the ranges of links; a link that was not identified has no ends.
-
-    standard (p,), covariance (p, p), quantile (p,).
-    """
-    own, bodies = link_parameters(model, standard), {}
-    for i, body in enumerate(model.layout.bodies):
-        part = slice(10 * i, 10 * i + 10)
-        bodies[body] = _body(
-            own[body], covariance[part, part], sources[part], float(quantile[part].max())
-        )
-    return bodies
 
 
 def projected_ranges(found: Identified) -> dict[str, Any]:
@@ -131,13 +121,7 @@ def projected_ranges(found: Identified) -> dict[str, Any]:
         errors = np.sqrt(np.maximum(np.diag(drive.transfer @ C @ drive.transfer.T), 0.0))
         quantile = float(found.standard_quantile[list(drive.own)].max())
         ranges[drive.name] = {
-            term: _range(
-                value,
-                error,
-                "data",
-                quantile=quantile,
-                least=0.0 if term in _NOT_NEGATIVE else -math.inf,
-            )
+            term: _range(value, error, "data", quantile, _least(term))
             for (term, value), error in zip(drive.values.items(), errors, strict=True)
             if error > 0
         }
@@ -146,31 +130,23 @@ def projected_ranges(found: Identified) -> dict[str, Any]:
 
 def stated_ranges(content: Mapping[str, Any]) -> dict[str, Any]:
     """Return the ranges of a result, including gains, delays and zeros of its drives."""
+    empty = {"robot": content["robot"], "confidence": 0.95, "bodies": {}, "drives": {}}
+    ranges = content.get("ranges", empty)
+    between = content.get("variation", {}).get("parameters", {})
     drives: dict[str, dict[str, Any]] = {}
     for entry in content["drive_parameters"]:
         drive, _, term = entry["name"].rpartition(".")
         error = entry.get("std_error")
+        reach = entry.get("quantile") or QUANTILE
         ends = _range(
-            entry["value"],
-            math.inf if error is None else error,
-            source_of(entry),
-            is_positive=term == "kp",
-            quantile=entry.get("quantile") or QUANTILE,
-            least=0.0 if term in _NOT_NEGATIVE else -math.inf,
-        )
-        drives.setdefault(drive, {})[term] = ends | {"unit": entry["unit"]}
-    empty = {"robot": content["robot"], "confidence": 0.95, "bodies": {}, "drives": {}}
-    ranges = content.get("ranges", empty)
-    merged = {drive: terms | ranges["drives"].get(drive, {}) for drive, terms in drives.items()}
-    for name, entry in content.get("variation", {}).get("parameters", {}).items():
-        drive, _, term = name.rpartition(".")
-        own = merged.get(drive, {}).get(term)
-        if own is not None and "low" in own and own["source"] != "bound":
-            low, high = entry["next_interval"]
-            least = 0.0 if term in _NOT_NEGATIVE or term == "kp" else -math.inf
-            of_logs = {"low": max(low, least), "high": high, "source": "logs"}
-            merged[drive][term] = own | of_logs
-    return {"undetermined": content["structure"]["undetermined"], **ranges, "drives": merged}
+            entry["value"], math.inf if error is None else error, source_of(entry), reach,
+            _least(term), is_positive=term == "kp",
+        ) | {"unit": entry["unit"]}  # fmt: skip
+        ends = ranges["drives"].get(drive, {}).get(term, ends)
+        if entry["name"] in between and "low" in ends and ends["source"] != "bound":
+            ends = _of_logs(ends, between[entry["name"]]["next_interval"], _least(term))
+        drives.setdefault(drive, {})[term] = ends
+    return {"undetermined": content["structure"]["undetermined"], **ranges, "drives": drives}
 
 
 def ranges_text(ranges: Mapping[str, Any]) -> str:
@@ -196,7 +172,7 @@ def _body(pi: Array, covariance: Array, sources: Sequence[str], quantile: float)
     origins += [_joint_source(sources)] * 6
     x, y, z, w = Rotation.from_matrix(V).as_quat()
     mass, *rest = (
-        _range(value, error, origin, is_positive=not 1 <= k <= 3, quantile=quantile)
+        _range(value, error, origin, quantile, is_positive=not 1 <= k <= 3)
         for k, (value, error, origin) in enumerate(zip(values, errors, origins, strict=True))
     )
     return {
@@ -223,10 +199,10 @@ def _range(
     value: float,
     error: float,
     source: str,
+    quantile: float,
+    least: float = -math.inf,
     *,
     is_positive: bool = False,
-    least: float = -math.inf,
-    quantile: float = QUANTILE,
 ) -> dict[str, Any]:
     """Return the range of a value; without ends if its standard error is infinite."""
     nominal, half = float(value), quantile * float(error)
@@ -236,11 +212,14 @@ def _range(
     return {"nominal": nominal, "low": low, "high": nominal + half, "source": source}
 
 
-_DIGITS = 9  # significant digits of the root in result.json
-_MOST = 1_000_000
-_POSITIVE = ("kp", "limit")
-#: Drive terms of simulators, which replace the friction of drives with further terms.
-SIMULATED = ("viscous", "coulomb", "offset")
+def _of_logs(ends: Mapping[str, Any], interval: Sequence[float], least: float) -> dict[str, Any]:
+    """Return a range with the interval of the next log."""
+    low, high = map(float, interval)
+    return {**ends, "low": max(low, least), "high": high, "source": "logs"}
+
+
+def _least(term: str) -> float:
+    return 0.0 if term in _NOT_NEGATIVE or term == "kp" else -math.inf
 
 
 def covariance_entry(names: Sequence[str], covariance: Array, is_fixed: Array) -> dict[str, Any]:

@@ -20,7 +20,6 @@ _KINDS = ("line", "dots", "bars", "area")
 TONES = 8  # distinguishable colours of lines in one chart: tone-1 to tone-8
 POINTS = 2000  # rows of a chart's data
 _AROUND = 112  # [px] of caption, axis and legend of each chart in a notebook
-_HIGHEST = 900  # [px] of a notebook cell
 _STYLE = "main { padding: .5rem 1rem; } h1 { font-size: 1.125rem; margin: 0 0 .5rem; }"
 
 
@@ -74,24 +73,20 @@ class Chart:
 
 @dataclass(frozen=True, eq=False)
 class Plot:
-    """Charts one below the other: drag to zoom, double click for all, values under the cursor.
+    """Charts one below the other: drag to zoom, double click for all, values under the cursor."""
 
-    Attributes:
-        title: Their subject.
-        charts: The charts, each with its caption.
-    """
-
-    title: str
-    charts: tuple[tuple[Chart, str], ...]
+    title: str  # their subject
+    charts: tuple[tuple[Chart, str], ...]  # each with its caption
 
     def __repr__(self) -> str:
         return f"<Plot of {self.title}; .write('plot.html') saves it>"
 
     def _repr_html_(self) -> str:
-        height = min(_HIGHEST, sum(chart.height + _AROUND for chart, _ in self.charts) + 60)
+        height = sum(chart.height + _AROUND for chart, _ in self.charts) + 60
         return (
             f'<iframe title="{escape(self.title)}" srcdoc="{escape(self.html())}" '
-            f'style="width:100%;height:{height}px;border:0" loading="lazy"></iframe>\n'
+            f'style="width:100%;height:{height}px;max-height:90vh;border:0" '
+            f'loading="lazy"></iframe>\n'
         )
 
     def html(self) -> str:

@@ -42,17 +42,8 @@ def plot_torques(
 ) -> Plot:
     """Return charts of measured and identified torque over time, and of the residual.
 
-    Args:
-        identification: The result.
-        joints: The joints; all if none is named.
-        recording: One of ``fitted`` or ``validation``; None: the first validation recording, or
-            the first fitted one.
-
-    Returns:
-        Charts that a notebook shows and ``.write("torques.html")`` saves.
-
-    Raises:
-        DataError: If there is no such joint.
+    Of all joints if none is named; of the recording in ``fitted`` or ``validation``, or of the
+    first validation recording, or the first fitted one.
     """
     require_kind(
         recording, (Evaluation, type(None)), "recording", "one of fitted or validation, or none"
@@ -68,18 +59,7 @@ def plot_torques(
 
 
 def plot_friction(identification: TorqueIdentification, *joints: str) -> Plot:
-    """Return charts of friction against speed, measured and identified, with its band.
-
-    Args:
-        identification: The result.
-        joints: The joints; all if none is named.
-
-    Returns:
-        Charts that a notebook shows and ``.write("friction.html")`` saves.
-
-    Raises:
-        DataError: If there is no such joint, or none that moved.
-    """
+    """Return charts of friction against speed, measured and identified, with its band."""
     names = joints or identification.model.joints
     for name in names:
         _row_of(identification, name)
@@ -91,18 +71,7 @@ def plot_friction(identification: TorqueIdentification, *joints: str) -> Plot:
 
 
 def plot_why(identification: TorqueIdentification, joint: str) -> Plot:
-    """Return charts of the parts of a joint's torque, and of its residual's dependences.
-
-    Args:
-        identification: The result.
-        joint: The joint.
-
-    Returns:
-        Charts that a notebook shows and ``.write("why.html")`` saves.
-
-    Raises:
-        DataError: If there is no such joint.
-    """
+    """Return charts of the parts of a joint's torque, and of its residual's dependences."""
     torque = identification.joint_torques[_row_of(identification, joint)]
     charts = why_charts(torque)
     about = {name: f"residual against {name}" for name in charts}
