@@ -112,6 +112,11 @@ def with_error(value: float, error: float, *, sign: str = "") -> tuple[Cell, Cel
     return number(value, f"{sign}z.{decimals}f"), number(error, f".{decimals}f")
 
 
+def paragraphs(sentences: Iterable[str]) -> str:
+    """Return sentences as paragraphs; empty ones are left out."""
+    return "".join(f"<p>{escape(words)}</p>\n" for words in sentences if words)
+
+
 def cell(value: Any, form: str) -> Cell:  # noqa: ANN401
     """Return a value as a cell: its form is "text", "code", "%" or the format of a number."""
     if isinstance(value, Cell):

@@ -11,11 +11,10 @@ from robotid.base.files import write_text
 from robotid.base.findings import listed
 from robotid.base.typing import Array
 from robotid.base.versions import __version__
-from robotid.design.clearance import Clearance
 from robotid.design.limits import LIMITS, Course
 from robotid.design.previews import Preview
 from robotid.output.pages.charts import TONES, Chart, Series, chart_html
-from robotid.output.pages.html import Section, block, facts_html, listing, page
+from robotid.output.pages.html import Section, block, facts_html, listing, page, paragraphs
 from robotid.robot.model import RobotModel
 
 _UNITS = ("rad", "rad/s", "rad/s²", "rad/s³", "N m", "W")
@@ -33,7 +32,6 @@ _UNCHECKED = {
 _NAMED = 5  # base parameters with the largest expected standard errors that are named
 _SHARP = 0.1  # share of the plausible range below which one is well determined ...
 _OPEN = 0.5  # ... and above which it is undetermined
-_WIDE = 10.0  # ratio of distances from which their axis is logarithmic
 _SOURCES = {
     "data": "by the motion",
     "mixed": "by motion and URDF together",
@@ -53,7 +51,7 @@ def write_motion_page(
 
     The file loads nothing from the network. It is written under a temporary name, then renamed.
     """
-    errors = _expected(expected) if isinstance(expected, Preview) else _paragraphs(expected)
+    errors = _expected(expected) if isinstance(expected, Preview) else paragraphs(expected)
     sections = {
         "limits": Section("Smallest margin to each limit", _limit_table(model, content, course)),
         "time": Section("Course over time", _over_time(model, content, course)),
@@ -129,7 +127,7 @@ def _nearest(where: str, distance: float, time: float, required: float, between:
 
 
 def _over_time(model: RobotModel, content: Mapping[str, Any], course: Course) -> str:
-    """Return charts of the use of each limit, of unlimited quantities, and of distances."""
+    """Return charts of the use of each limit, and of unlimited quantities."""
     charts = []
     for k, kind in enumerate(LIMITS):
         is_limited = np.isfinite(course.limits.sizes[k])
@@ -148,39 +146,11 @@ def _over_time(model: RobotModel, content: Mapping[str, Any], course: Course) ->
             name = f"{kind} [{' or '.join(units)}]"
             chart = Chart(f"{kind} of each joint", course.t, lines, "time [s]", name, "time")
             charts.append(chart_html(chart, f"{kind.capitalize()} without a stated limit"))
-    if course.clearance is not None and course.nearest is not None:
-        charts.append(_distance_chart(model, course, course.clearance))
     return f'<div class="plots">\n{"".join(charts)}</div>\n'
 
 
 def _lines(model: RobotModel, values: Array, joints: Array) -> list[Series]:
     return [Series(model.joints[j], values[:, j], f"tone-{j % TONES + 1}") for j in joints.tolist()]
-
-
-def _distance_chart(model: RobotModel, course: Course, clearance: Clearance) -> str:
-    """Return the chart of distances between links, and to the floor and boxes."""
-    course = course.thinned
-    own = np.array([b in model.tree.links and a in model.tree.links for a, b in clearance.named])
-    series = [Series("clearance", np.full(len(course.t), 1e3 * clearance.least), "text")]
-    changes = course.changes(clearance)
-    near = np.isfinite(clearance.slack)
-    groups = (
-        ("links", own & ~near, "tone-1"),
-        ("floor and boxes", ~own, "tone-2"),
-        ("links close by design", near, "tone-3"),
-    )
-    for label, chosen, tone in groups:
-        if (chosen & changes).any():
-            series.append(Series(label, 1e3 * course.nearness(chosen & changes)[0], tone))
-    low, high = (float(f([f(x.y) for x in series])) for f in (np.min, np.max))
-    is_wide = low > 0 and high > _WIDE * low
-    chart = Chart(
-        "distance of the two nearest hulls", course.t, tuple(series), "time [s]",
-        "distance [mm]", link="time", logarithmic="y" if is_wide else "",
-    )  # fmt: skip
-    return chart_html(
-        chart, "Smallest distance between two links, and to floor and boxes, where it changes"
-    )
 
 
 def _expected(preview: Preview) -> str:
@@ -203,8 +173,4 @@ def _expected(preview: Preview) -> str:
         f"Standard deviation of the torque noise, {listed(dict.fromkeys(noise.origins))}: "
         f"{', '.join(stds)} (N m or N).",
     ]
-    return _paragraphs(sentences)
-
-
-def _paragraphs(sentences: Sequence[str]) -> str:
-    return "".join(f"<p>{escape(words)}</p>\n" for words in sentences if words)
+    return paragraphs(sentences)

@@ -115,7 +115,7 @@ def _step(
     text, setting = _texts()[name], tuple[str, ...]()
     if "table" in text:
         slots = [words | {"joint": joint, "key": toml_key(joint), "value": value}
-                 for joint, value in (values_of or {"": ""}).items()]  # fmt: skip
+                 for joint, value in ({"": ""} if values_of is None else values_of).items()]  # fmt: skip
         line = "\n".join(text["line"].format(**slot) for slot in slots)
         flags = [flag.format(**slot) for slot in slots for flag in text.get("flags", ())]
         setting = origin.stating(text["table"], line, *flags)

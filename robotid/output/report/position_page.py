@@ -17,7 +17,7 @@ from robotid.identification.closed_loop.position_errors import (
 )
 from robotid.output.files.entries import loop_parameters
 from robotid.output.pages.charts import TONES, Chart, Series, chart_html
-from robotid.output.pages.html import block, code, number, table, text
+from robotid.output.pages.html import block, code, number, paragraphs, table, text
 from robotid.output.report.errors import POSITION, Errors, worst_errors
 from robotid.output.report.next_steps import Origin
 from robotid.output.report.report_page import Report, Residual, curves_section
@@ -182,4 +182,4 @@ def _open_section(found: PositionIdentification) -> str:
             "friction and masses multiplied by this factor cause the same motion. Stated "
             "parameters and the masses of the URDF determine the factor."
         )
-    return "".join(f"<p>{escape(sentence)}</p>\n" for sentence in words)
+    return paragraphs(words)

@@ -1,7 +1,7 @@
 """The report's tables: parameters, bodies, changes, consistency, settings, inputs."""
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from html import escape
 from typing import Any
@@ -20,6 +20,7 @@ from robotid.output.pages.html import (
     code,
     listing,
     number,
+    paragraphs,
     table,
     text,
     with_error,
@@ -208,14 +209,6 @@ def base_table(identification: TorqueIdentification) -> str:
 
 def consistency_section(identification: TorqueIdentification) -> str:
     """Return whether bodies and drives are consistent; prior, bounds, mass matrix."""
-    is_consistent = identification.is_consistent
-    every = "All bodies and drives are" if is_consistent else "Not all bodies and drives are"
-    notes = "".join(f"<p>{escape(note)}</p>\n" for note in _consistency_notes(identification))
-    return block("report.consistency", all=every, notes=notes)
-
-
-def _consistency_notes(identification: TorqueIdentification) -> list[str]:
-    """Return sentences on mass matrix, prior and bounds of the fit."""
     check, details = identification.mass_matrix, identification.estimate.details
     layout = identification.model.layout
     lows = np.linalg.eigvalsh(pseudo_inertia(identification.standard[: layout.n_inertial]))[:, 0]
@@ -241,38 +234,32 @@ def _consistency_notes(identification: TorqueIdentification) -> list[str]:
             notes.append(f"Extents that contradict the data: {', '.join(details['relaxed'])}.")
         if details["pinned"]:
             notes.append(f"Fixed at the URDF's values: {', '.join(details['pinned'])}.")
-    return notes
+    is_consistent = identification.is_consistent
+    every = "All bodies and drives are" if is_consistent else "Not all bodies and drives are"
+    return block("report.consistency", all=every, notes=paragraphs(notes))
 
 
 def open_section(identification: TorqueIdentification) -> str:
-    """Return the parameters that the data do not determine."""
+    """Return the parameters that the data do not determine, and indistinguishable ones."""
     names, sources = identification.model.layout.names, identification.sources
     fixed = [name for name, source in zip(names, sources, strict=True) if source == "prior"]
-    without_effect = identification.mapping.unidentifiable
+    groups = identification.determination.merged
+    html = block("report.indistinguishable") if groups else ""
+    for group in groups:
+        combinations = map(str, group.combinations)
+        html += block("report.group", names=_codes(group.names), sums=_codes(combinations, "<br>"))
     return block(
         "report.open",
         rank=identification.determination.rank,
         count=len(identification.base),
-        groups=_indistinguishable(identification),
-        lists=_names("Parameters without effect on the torque", without_effect)
-        + _names("Standard parameters that remain at the URDF's values", fixed),
+        groups=html,
+        without_effect=_codes(identification.mapping.unidentifiable),
+        fixed=_codes(fixed),
     )
 
 
-def _indistinguishable(identification: TorqueIdentification) -> str:
-    """Return indistinguishable base parameters, and their identifiable combinations."""
-    groups = identification.determination.merged
-    html = block("report.indistinguishable") if groups else ""
-    for group in groups:
-        names = ", ".join(code(name).html for name in group.names)
-        sums = "<br>".join(code(str(combination)).html for combination in group.combinations)
-        html += f'<p class="code">{names}</p>\n<p>Identifiable: {sums or "none"}</p>\n'
-    return html
-
-
-def _names(title: str, names: Sequence[str]) -> str:
-    words = ", ".join(code(name).html for name in names) or "none"
-    return f'<h3>{title}</h3>\n<p class="code">{words}</p>\n'
+def _codes(names: Iterable[str], between: str = ", ") -> str:
+    return between.join(code(name).html for name in names) or "none"
 
 
 def settings_tables(identification: TorqueIdentification) -> str:
