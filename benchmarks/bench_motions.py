@@ -1,4 +1,4 @@
-"""What a second motion adds, and whether a motion for a payload finds it.
+"""What a second motion adds.
 
     python benchmarks/bench_motions.py [--picture] [--quick]
 
@@ -9,12 +9,8 @@ were known (criteria D and A), and one designed with ``--given``. The first is e
 5 s, or what people record: a random Fourier series of 20 s, 4 harmonics, at 30 % of the speeds and
 half of the ranges.
 
-A payload of 2 kg on the last link: ``excite --kind payload``, then robots that differ from their
-URDF by 10 % are simulated with it and without it, following the motion by the URDF's inverse
-dynamics and PD, and ``robotid payload`` finds it.
-
-Every design has one start, and is followed until it settles; collisions are looked at for payloads
-alone. ``--picture`` writes docs/pictures/next_motion.svg.
+Every design has one start, and is followed until it settles; collisions are not looked at.
+``--picture`` writes docs/pictures/next_motion.svg.
 """
 
 import setting  # noqa: I001 -- pins the threads of BLAS before numpy is imported
@@ -42,11 +38,6 @@ SECOND = {
     "fresh, criterion A": ("--criterion", "A"),
     "--given the first": ("--given",),
 }
-PAYLOADS = {
-    "ur10_robot": ("tool0",),
-    "panda": ("panda_hand", "--lock", "panda_finger_joint1=0", "--lock", "panda_finger_joint2=0"),
-}
-COM, INERTIA = (0.02, 0.01, 0.05), (0.02, 0.0, 0.025, 0.0, 0.0, 0.015)
 PICTURE = Path(__file__).resolve().parents[1] / "docs" / "pictures" / "next_motion.svg"
 
 
@@ -133,48 +124,6 @@ def draw(found):
     figure.savefig(PICTURE, metadata={"Date": None})
 
 
-def payload_row(folder, robot, options, seeds):
-    """Return what a motion for a payload tells, expected and found."""
-    urdf, (link, *locked) = example_urdf(f"{robot}.urdf"), options
-    motion, plant = folder / "motion.parquet", folder / "plant.toml"
-    words = ("--kind", "payload", "--link", link, "--mass", 2, "--com", "0.02,0.01,0.05",
-             "--starts", 1)  # fmt: skip
-    said = must("excite", urdf, "--out", motion, *locked, *words, "--json")
-    told = json.loads(said)["payload"]
-    plant.write_text(
-        f'[payload]\nlink = "{link}"\nmass = 2.0\ncom = {list(COM)}\ninertia = {list(INERTIA)}\n'
-    )
-    noisy = ("--rate", 200, "--torque-noise", 0.02, "--perturb", 0.1, "--json")
-    errors, inside, stds, com, inertia = [], 0, [], [], 0
-    for seed in range(seeds):
-        logs = [folder / f"{name}.parquet" for name in ("loaded", "bare")]
-        for log, own in zip(logs, (("--plant", plant), ()), strict=True):
-            must("simulate", urdf, motion, "--out", log, "--seed", seed, *noisy, *locked, *own)
-        said = must("payload", urdf, logs[0], "--reference", logs[1], "--link", link, *locked,
-                    "--json")  # fmt: skip
-        found = json.loads(said)["payloads"][0]
-        errors.append(abs(found["mass"] - 2.0))
-        stds.append(found["mass_std_error"])
-        inside += found["mass_interval"][0] <= 2.0 <= found["mass_interval"][1]
-        com.append(np.abs(np.subtract(found["com"], COM)).max())
-        inertia += found["inertia"] is not None
-    return (
-        f"| {robot} | {', '.join(told['moving'])} | {told['std_error']['m']:.3f} | "
-        f"{np.mean(stds):.3f} | {np.max(errors):.3f} | {inside} of {seeds} | "
-        f"{1e3 * np.max(com):.1f} | {inertia} of {seeds} |"
-    )
-
-
-def payloads(seeds):
-    print("| robot | joints that move | mass of 2 kg, expected standard error at 1 % noise, kg | "
-          "stated, kg | largest error, kg | in its 95 % interval | largest error of the centre, mm "
-          "| inertia determined |")  # fmt: skip
-    print("|---" * 8 + "|")
-    for robot, options in PAYLOADS.items():
-        with tempfile.TemporaryDirectory() as folder:
-            print(payload_row(Path(folder), robot, options, seeds), flush=True)
-
-
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument(
@@ -185,8 +134,6 @@ def main():
     found = second_motions(1 if options.quick else 5)
     if options.picture:
         draw(found)
-    print()
-    payloads(1 if options.quick else 10)
     print(f"\n{setting.machine()}")
 
 

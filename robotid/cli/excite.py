@@ -24,7 +24,6 @@ from robotid.design.design import Design, Designer
 from robotid.design.excitation_settings import FARTHEST, ROUTES, MotionSettings
 from robotid.design.limits import LIMITS, Course, MotionLimits
 from robotid.design.motion_files import check_motion_file, write_motion
-from robotid.design.payload_motion import design_payload
 from robotid.design.previews import Preview, Run, preview_logs
 from robotid.design.routes import design_stands, design_sweeps
 from robotid.estimation.fitting.survey import hold_log
@@ -69,31 +68,17 @@ def excite(
         if progress is not None:
             progress("designing", start, settings.starts, "starts")
 
-    initialised, carried = time.monotonic(), None
-    if settings.kind == "payload":
-        carried = design_payload(
-            designer, np.random.default_rng(settings.seed), settings.payload,
-            moving=settings.moving, starts=settings.starts, seconds=settings.seconds,
-            progress=show_start,
-        )  # fmt: skip
-        designer, design = carried.designer, carried.design
-    else:
-        design = _designed(designer, settings, show_start)
+    initialised = time.monotonic()
+    design = _designed(designer, settings, show_start)
     design = replace(design, seconds=time.monotonic() - initialised)
     course = designer.course(design)
     if settings.kind in ROUTES:
         _check_jerk(course, model.joints)
-    expected: Preview | list[str] | None = None
+    expected: Preview | None = None
     if report is not None:  # computed before any file is written: the motion may be too short
-        expected = (
-            _expected(job, model, design, settings, run, str(target))
-            if carried is None
-            else carried.described()
-        )
+        expected = _expected(job, model, design, settings, run, str(target))
     content = _content(designer, design, course, settings)
     write_motion(design.motion, model.joints, design.duration, settings.points, target)
-    if carried is not None:
-        content["payload"] = carried.to_dict()
     if report is not None and expected is not None:
         write_motion_page(report, model, content, course, expected)
         content["report"] = str(report)
@@ -116,11 +101,11 @@ def _designer(
         _, _, model, run = result_run(job, given)
     name = settings.criterion
     if name is None:
-        name = "D" if run is None or settings.kind == "payload" else "widest"
-    elif name == "widest" and (run is None or settings.kind == "payload"):
+        name = "D" if run is None else "widest"
+    elif name == "widest" and run is None:
         raise SettingsError(
-            "criterion is widest, which needs an earlier result: wanted --given RESULT, and a kind "
-            "other than payload; or another criterion"
+            "criterion is widest, which needs an earlier result: wanted --given RESULT, or another "
+            "criterion"
         )
     model.require_fixed("motion design")
     limits = MotionLimits.of_model(
@@ -147,7 +132,6 @@ def _designer(
 def _designed(
     designer: Designer, settings: MotionSettings, progress: Callable[[int, float], None]
 ) -> Design:
-    """Return a motion of another kind than "payload"."""
     rng = np.random.default_rng(settings.seed)
     if settings.kind == "sweeps":
         return design_sweeps(designer, rng)
@@ -233,8 +217,8 @@ def _content(
 
 
 MAIN_FLAGS = (
-    "--out", "--report", "--given", "--kind", "--link", "--mass", "--duration", "--share",
-    "--clearance", "--floor", "--joints", "--lock",
+    "--out", "--report", "--given", "--kind", "--duration", "--share", "--clearance",
+    "--floor", "--joints", "--lock",
 )  # fmt: skip
 EXAMPLES = (
     "robotid excite robot.urdf --out motion.csv --report motion.html",
@@ -276,8 +260,6 @@ def run(options: argparse.Namespace) -> None:
 
 def motion_settings(options: argparse.Namespace) -> MotionSettings:
     """Return the settings of the motion that the flags state."""
-    if options.com is not None and not options.mass:
-        raise SettingsError(_COM.format(options.com))
     return MotionSettings.from_dict(_MOTION.stated(options))
 
 
@@ -304,27 +286,15 @@ def _boxes(words: Sequence[str], flag: str) -> tuple["Box", ...]:
     return tuple(boxes)
 
 
-def _centre(word: str, _: str) -> tuple[float, ...]:
-    found = _numbers(word)
-    if len(found) != 3:
-        raise SettingsError(_COM.format(word))
-    return found
-
-
 def _clearance(word: str, flag: str) -> float | None:
     return None if word == "none" else number(word, flag, "metres, or none")
 
 
-_COM = "--com {!r}: wanted three numbers X,Y,Z [m], together with --mass"
 #: Flags of the settings of the motion.
 _MOTION = Flags(
     MotionSettings(),
     {
         "--kind": ("kind", ""),
-        "--link": ("payload.link", "NAME"),
-        "--mass": ("payload.mass", "KG"),
-        "--com": ("payload.com", "X,Y,Z"),
-        "--moving": ("moving", "JOINTS"),
         "--duration": ("duration", "S"),
         "--harmonics": ("harmonics", "N"),
         "--criterion": ("criterion", ""),
@@ -343,7 +313,7 @@ _MOTION = Flags(
         "--seconds": ("seconds", "S"),
         "--points": ("points", "HZ"),
     },
-    {"--box": _boxes, "--clearance": _clearance, "--com": _centre},
+    {"--box": _boxes, "--clearance": _clearance},
 )
 
 
@@ -365,10 +335,6 @@ def _show(content: dict[str, Any]) -> None:
     print("\nsmallest margin to each limit")
     for name, margin in content["limits"].items():
         echo(f"  {name:18} {_margin(name, margin)}", 21 * " ")
-    if "payload" in content:
-        print()
-        for words in content["payload"]["words"]:
-            echo(words)
 
 
 def _margin(name: str, margin: Mapping[str, Any]) -> str:

@@ -17,7 +17,7 @@ from robotid.base.exceptions import NotConvergedError
 from robotid.base.typing import Array
 from robotid.design.basis import Basis, DesignedMotion
 from robotid.design.clearance import SOFT, Clearance, Contact, Nearness
-from robotid.design.information import Aim, MotionInformation, MotionRows, criterion
+from robotid.design.information import MotionInformation, MotionRows, criterion
 from robotid.design.limits import Course, MotionLimits, Postures
 from robotid.design.previews import (
     CORRELATION,
@@ -154,16 +154,10 @@ class Designer:
     #: shape (n,) [(N m)^2 s or N^2 s].
     noise: Array
     spread: Array  # prior deviations of the base parameters, shape (b,)
-    standard_spread: Array  # prior deviations of the standard parameters, shape (p,)
     given: Array | None = None  # prior information, shape (b, b), in units of the spread; 1 if None
     name: str = "D"  # the criterion, as of ``criterion``
     clearance: Clearance | None = None  # the distances to collisions; None: they are not checked
     finer: int = 1  # number of samples of the grid relative to a coarse one
-    #: The parameters of interest, if not the base parameters; there is no prior then.
-    aim: Aim | None = None
-    #: Which joints move, shape (n,), bool; all if None. The others rest where the motion
-    #: starts and contribute no information, since static friction may carry any load.
-    moving: Array | None = None
 
     @classmethod
     def of_model(
@@ -186,16 +180,13 @@ class Designer:
         found = None if run is None else run.noise(mapping.K)
         density = assumed_noise(model, size, noise or {}, correlation, found).density(0.0)
         typical = _TYPICAL * np.array([size, speed, speed * 2 * np.pi / basis.shortest])
-        standard_spread = prior_spread(model, typical**2, 1)
-        spread = base_spread(mapping.K, standard_spread)
+        spread = base_spread(mapping.K, prior_spread(model, typical**2, 1))
         given = None
         if run is not None:
             earlier = run.factors.information(run.step / density)
             given = np.eye(len(spread)) + spread[:, None] * earlier * spread
         information = MotionInformation(model, mapping, mapping.to_base(pi))
-        return cls(
-            information, limits, basis, density, spread, standard_spread, given, name, clearance
-        )
+        return cls(information, limits, basis, density, spread, given, name, clearance)
 
     @cached_property
     def _functions(self) -> Array:
@@ -300,7 +291,6 @@ class Designer:
         contact: Contact | None,
     ) -> Design:
         own = information - self.known
-        own = own if self.aim is None else self.aim.information(own)[0]
         low, *_, high = np.linalg.eigvalsh(own)
         return Design(
             motion=motion,
@@ -331,8 +321,6 @@ class Designer:
     @property
     def known(self) -> Array:
         """Prior information, in units of the spread, shape (b, b)."""
-        if self.aim is not None:
-            return np.zeros((len(self.spread), len(self.spread)))
         known: Array = np.eye(len(self.spread)) if self.given is None else self.given
         return known
 
@@ -342,25 +330,14 @@ class Designer:
         variance = np.diag(np.linalg.inv(self.known))
         return np.argsort(variance, kind="stable")[-max(1, round(_WIDEST * len(variance))) :]
 
-    @cached_property
-    def _moves(self) -> Array:
-        """Which joints move, shape (n,), bool."""
-        return np.ones(len(self.limits.middle), dtype=bool) if self.moving is None else self.moving
-
     def judged(self, F: Array) -> tuple[float, Array]:
         """Return the criterion of information about the base parameters, and its gradient."""
         # F (b, b)
-        if self.aim is None:
-            return criterion(self.name, F, self.widest)
-        own, L = self.aim.information(F)
-        value, by_own = criterion(self.name, own)
-        return value, L @ by_own @ L.T
+        return criterion(self.name, F, self.widest)
 
     def _scale(self, step: float) -> Array:
         """Return the factor of rows with which their squares are information, (n, b, 1)."""
-        used = 1.0 if self.moving is None else self.moving
-        weight = used * np.sqrt(step / self.noise)
-        scale: Array = weight[:, None, None] * self.spread[:, None]
+        scale: Array = np.sqrt(step / self.noise)[:, None, None] * self.spread[:, None]
         return scale
 
     @cached_property
@@ -436,7 +413,6 @@ class Designer:
         by_rows = self.information.pull(rows, entries)
         by_state = (*(x + y for x, y in zip(by_rows, (by_q, by_v, by_a), strict=True)), by_jerk)
         gradient: Array = sum(functions.T @ g for functions, g in zip(D, by_state, strict=True))
-        gradient[1:, ~self._moves] = 0.0
         return value, gradient
 
     @property
@@ -456,7 +432,6 @@ class Designer:
         """Return the coefficients of a random motion that satisfies the limits, shape (h, n)."""
         unit = self.limits.sizes[0]
         C = rng.standard_normal((self.basis.size, len(unit))) * unit
-        C[:, ~self._moves] = 0.0
         C[0] = self.postures.one(rng)
         return self._feasible(C, 1.0 - SPARE)
 

@@ -6,7 +6,6 @@ from typing import Any
 
 from robotid.base.exceptions import SettingsError
 from robotid.base.settings import SIZE, Range, Settings, setting
-from robotid.dynamics.simulation.simulation_settings import Payload
 
 #: Kinds of motion from posture to posture.
 ROUTES = ("sweeps", "stands")
@@ -27,12 +26,11 @@ class MotionSettings(Settings):
 
     kind: str = setting(
         "fourier",
-        "kind of motion: sweeps for friction, stands for gravity, payload for the payload of a "
-        "link; default: fourier",
-        among=("fourier", "bspline", "payload", *ROUTES),
+        "kind of motion: sweeps for friction, stands for gravity; default: fourier",
+        among=("fourier", "bspline", *ROUTES),
     )
     duration: float = setting(
-        10.0, "length [s] of fourier, bspline and payload motions", within=_from(0.1, 3600.0, " s")
+        10.0, "length [s] of fourier and bspline motions", within=_from(0.1, 3600.0, " s")
     )
     harmonics: int = setting(
         5,
@@ -80,12 +78,6 @@ class MotionSettings(Settings):
     points: float = setting(
         100.0, "rows per second of the file", within=_from(0.1, 1e5, " rows per second")
     )
-    payload: Payload = setting(Payload(), "link, mass and centre of mass of the payload, if known")
-    moving: Sequence[str] = setting(
-        (),
-        "joints that move for payload identification, separated by commas; default: the fewest "
-        "that suffice",
-    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -93,7 +85,3 @@ class MotionSettings(Settings):
             for joint, value in getattr(self, name).items():
                 if not SIZE.holds(value):
                     raise SettingsError(f"{name} of {joint!r} is {value:g}, wanted {SIZE.words}")
-        if self.kind != "payload" and (self.moving or self.payload != Payload()):
-            raise SettingsError(
-                f"a payload or moving joints are stated, but kind is {self.kind!r}, wanted payload"
-            )

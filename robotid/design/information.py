@@ -209,26 +209,6 @@ class MotionInformation:
         return gradients
 
 
-@dataclass(frozen=True, eq=False)
-class Aim:
-    """Parameters of interest other than the base parameters: some of u that determine these."""
-
-    #: Derivatives of the base parameters by each parameter, both in units of their spreads,
-    #: shape (b, u).
-    columns: Array
-    #: Number of parameters of interest, the last ones; the others are nuisance parameters.
-    asked: int
-
-    def information(self, F: Array) -> tuple[Array, Array]:
-        """Return the information about those of interest, and L with d information = L^T dF L."""
-        # F (b, b)
-        T, rest = self.columns, self.columns.shape[1] - self.asked
-        N = T.T @ F @ T + np.eye(T.shape[1])
-        others = np.linalg.solve(N[:rest, :rest], N[:rest, rest:])
-        L = np.vstack([-others, np.eye(self.asked)])
-        return L.T @ N @ L, T @ L
-
-
 def criterion(name: str, F: Array, widest: Array | None = None) -> tuple[float, Array]:
     """Return a criterion of an information matrix, the smaller the better, and its gradient.
 

@@ -11,7 +11,6 @@ from robotid.data.files.formats import open_table
 from robotid.data.signal_settings import LogSource
 from robotid.design.clearance import Box
 from robotid.design.excitation_settings import MotionSettings
-from robotid.dynamics.simulation.simulation_settings import Payload
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 
@@ -186,10 +185,7 @@ def test_every_flag_states_its_setting():
         velocity=each, torque=each, acceleration=each, jerk=each, power=each, noise=each,
         boxes=(Box("post", (0, 1, 2), (3, 4, 5)), Box("wall", (-1, 0, 0), (0, 1, 1))),
     )  # fmt: skip
-    load = ["--link", "wrist_3_link", "--mass", "2", "--com", "0.1,0,-0.2", "--moving", "one,two"]
-    found = stated_by_flags("--kind", "payload", "--clearance", "none", *load)
-    payload = Payload(link="wrist_3_link", mass=2.0, com=(0.1, 0.0, -0.2))
-    assert (found.payload, found.moving, found.clearance) == (payload, ("one", "two"), None)
+    assert stated_by_flags("--clearance", "none").clearance is None
     assert stated_by_flags() == MotionSettings()
 
 

@@ -135,6 +135,8 @@ def test_links_that_are_built_near_each_other_are_watched_and_those_that_touch_a
     assert clearance.slack == pytest.approx(usual / 2, abs=5e-4)
     assert clearance.built_near == [f"base and plate ({1e3 * clearance.required[0]:.0f} mm)"]
     assert clearance.likely.all()
+    bare, reserved = (clearance.margins(clearance.placed(np.zeros((1, 3))), x) for x in (0.0, 1.0))
+    np.testing.assert_allclose(bare - reserved, np.minimum(0.002, clearance.slack[:, None] / 4))
     far, less = (
         clearance.nearest(ProgramMotion(np.array([0.0, speed, 0.0]), 2.0, np.zeros(3)), 2.0)
         for speed in (0.3, 0.1)

@@ -5,7 +5,7 @@ import pytest
 
 from robotid.design.basis import BSplineBasis, FourierBasis
 from robotid.design.clearance import Box, Clearance
-from robotid.design.design import Designer, Multipliers
+from robotid.design.design import Designer, Multipliers, State
 from robotid.design.limits import LIMITS, MotionLimits
 from robotid.dynamics.torque import joint_torque_regressor
 from robotid.robot.examples import example_urdf
@@ -84,6 +84,17 @@ def test_designs_are_the_same_under_a_seed_and_stop_when_told(designer):
     np.testing.assert_array_equal(one.motion.coefficients, other.motion.coefficients)
     assert not one.is_converged
     assert one.used.max() <= 1.0
+
+
+def test_a_search_near_the_limits_continues_beyond_them_and_a_stalled_one_restarts(designer, rng):
+    within = designer.random(rng)
+    for excess, continues in ((1.005, True), (1.05, False)):
+        share = excess / np.abs(designer._constraints(within)[0]).max()
+        C = np.vstack([within[:1], share * within[1:]])
+        feasible = designer._feasible(C, 0.997)
+        state = State(feasible, designer._objective(feasible), C, Multipliers(0.1))
+        after, _ = designer._updated(state, C, 2e-3)
+        assert np.array_equal(after.iterate, C) == continues
 
 
 def test_what_is_known_already_is_not_asked_for_again(designer, design):

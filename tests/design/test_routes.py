@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 
+from robotid.design import routes
 from robotid.design.basis import FourierBasis
 from robotid.design.clearance import Clearance
 from robotid.design.design import Designer
@@ -67,6 +68,16 @@ def test_sweeps_go_both_ways_at_each_speed_while_the_others_rest(designer, rng):
         steady = v[(np.abs(a).max(axis=1) < 1e-9) & (np.abs(v[:, j]) > 1e-6)]
         assert set(np.round(steady[:, j] / fastest, 6)) == {-0.4, -0.1, 0.1, 0.4}
         assert np.abs(np.delete(steady, j, axis=1)).max() == 0.0
+
+
+def test_sweeps_beyond_a_limit_are_each_a_fifth_shorter(designer, monkeypatch):
+    spans = []
+    for attempts in (1, 3):
+        results = iter([False] * (attempts - 1) + [True])
+        monkeypatch.setattr(routes, "_is_feasible", lambda _, verdicts=results: next(verdicts))
+        design = design_sweeps(designer, np.random.default_rng(0), speeds=(0.8,))
+        spans.append(np.ptp(design.motion.places, axis=0))
+    assert (spans[1] / spans[0]).min() == pytest.approx(0.64)
 
 
 def test_stands_tell_more_of_gravity_than_random_ones(designer):

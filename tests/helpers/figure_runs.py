@@ -364,14 +364,12 @@ def design(folder):
     around = f"--points 20 --share 0.6 --clearance 0.01 {box}"
     # the first motion of the search is taken: where it ends is a matter of rounding
     first = f"{limits} --seconds 0.001"
-    loaded = "--link tool --mass 1.5 --com 0.02,0,0.1 --moving lift,roll"
     for kind, words in (
         ("fourier", "--duration 5 --harmonics 3 --points 50 --criterion E "
          f"{first} --report @fourier.html"),
         ("bspline", f"--duration 4 --harmonics 2 --points 40 --criterion A {first}"),
         ("sweeps", around),
         ("stands", around),
-        ("payload", f"--duration 5 --harmonics 2 {loaded} {first}"),
     ):  # fmt: skip
         line = f"{excite} {noise} --kind {kind} --out @{kind}.csv {words} --json"
         found[kind] = runs.run(f"excite {kind}", line)

@@ -13,7 +13,15 @@ from helpers.synthetic import truth
 from robotid.base.exceptions import SettingsError
 from robotid.data.log import Log
 from robotid.data.signal_settings import SignalSettings
-from robotid.design.previews import Run, TorqueNoise, _band, _Information, assumed_noise, preview
+from robotid.design.previews import (
+    Run,
+    TorqueNoise,
+    _band,
+    _Information,
+    assumed_noise,
+    assumed_parameters,
+    preview,
+)
 from robotid.dynamics.base_parameters import structural_mapping
 from robotid.dynamics.factors import Factors, compress
 from robotid.dynamics.simulation.motions import random_fourier
@@ -176,6 +184,16 @@ def test_noise_is_stated_or_a_hundredth_of_the_largest_torque(ur5):
             assumed_noise(ur5, size, {"elbow_joint": value})
     with pytest.raises(SettingsError, match="correlation is -1 s"):
         assumed_noise(ur5, size, {}, -1.0)
+
+
+def test_assumed_friction_is_a_twentieth_of_the_torque_at_the_speed_of_each_joint():
+    model = arm()
+    unlimited = tuple(replace(joint, velocity=np.inf) for joint in model.tree.joints)
+    model = replace(model, tree=replace(model.tree, joints=unlimited))
+    pi = dict(zip(model.layout.names, assumed_parameters(model, STD[:3], STD[3:]), strict=True))
+    for joint, size, fastest in zip(model.joints, STD[:3], STD[3:], strict=True):
+        assert pi[f"{joint}.coulomb"] == pytest.approx(0.05 * size)
+        assert pi[f"{joint}.viscous"] == pytest.approx(0.05 * size / fastest)
 
 
 def test_noise_of_a_long_run_has_the_scatter_of_each_joint_s_own_scores(rng):

@@ -200,7 +200,8 @@ def test_an_impossible_guess_is_not_updated_and_a_runaway_is_told():
     # D of -P is negative definite: the control drives the robot away
     history = run(np.stack([-P4, P4 / 2]), settings=short(2), offset=DEGREE)
     np.testing.assert_array_equal(history.diverged, [1, 0])
-    assert history.skipped[0] > 0 == history.skipped[1]
+    assert 0 < history.skipped[0] < 100  # of 200: none after it has diverged
+    assert history.skipped[1] == 0
     np.testing.assert_array_equal(history.estimates[-1, 0], -P4)
     alone = run(settings=short(2), offset=DEGREE)
     np.testing.assert_array_equal(history.estimates[:, 1], alone.estimates[:, 0])

@@ -1,6 +1,6 @@
 """The page of a designed motion: criterion, smallest margin to each limit, expected errors."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -45,17 +45,16 @@ def write_motion_page(
     model: RobotModel,
     content: Mapping[str, Any],
     course: Course,
-    expected: Preview | Sequence[str],
+    expected: Preview,
 ) -> Path:
     """Write a designed motion's use of the limits and its expected errors, as one HTML file.
 
     The file loads nothing from the network. It is written under a temporary name, then renamed.
     """
-    errors = _expected(expected) if isinstance(expected, Preview) else paragraphs(expected)
     sections = {
         "limits": Section("Smallest margin to each limit", _limit_table(model, content, course)),
         "time": Section("Course over time", _over_time(model, content, course)),
-        "expected": Section("Expected standard errors", errors),
+        "expected": Section("Expected standard errors", _expected(expected)),
     }
     return write_text(
         page(f"{model.name}: excitation trajectory", _head(model, content), sections), target

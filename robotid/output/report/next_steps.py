@@ -114,8 +114,11 @@ def _step(
     """Return a step of steps.toml: its setting, with the values of joints, then further blocks."""
     text, setting = _texts()[name], tuple[str, ...]()
     if "table" in text:
-        slots = [words | {"joint": joint, "key": toml_key(joint), "value": value}
-                 for joint, value in ({"": ""} if values_of is None else values_of).items()]  # fmt: skip
+        values = {"": ""} if values_of is None else values_of
+        slots = [
+            words | {"joint": joint, "key": toml_key(joint), "value": value}
+            for joint, value in values.items()
+        ]
         line = "\n".join(text["line"].format(**slot) for slot in slots)
         flags = [flag.format(**slot) for slot in slots for flag in text.get("flags", ())]
         setting = origin.stating(text["table"], line, *flags)

@@ -170,6 +170,21 @@ def test_a_larger_weight_may_leave_an_error_that_repeats_in_all_segments():
     assert not weighting._is_accepted(best * 1.03**2, best, 0.1)
 
 
+@pytest.mark.parametrize(("loss", "named"), [(0.4, ()), (0.6, ("wrist_3_link",))])
+def test_an_extent_is_contradicted_beyond_the_scatter_of_segments(ur5, monkeypatch, loss, named):
+    case = Case(ur5, np.random.default_rng(0), 0.1 * NOISE)
+    center = body_boxes(ur5)["wrist_3_link"].mean(axis=0)
+    box = 0.1 * (body_boxes(ur5)["wrist_3_link"] - center)
+    fit = consistent(case, constraints=Constraints(extent={"wrist_3_link": box}))
+    scatter = loss + np.array([-0.5, 0.5, -0.5, 0.5])  # mean 2 standard errors at 0.58
+
+    def errors(one, segments, weight, starts=None):
+        return np.ones((4, 1)) + (one is fit) * scatter[:, None], []
+
+    monkeypatch.setattr("robotid.estimation.estimators.prior_weight.held_out_errors", errors)
+    assert contradicted_extents(fit, Segments.of(fit, cut(case.problem, 4))) == named
+
+
 def test_an_extent_is_contradicted_by_a_body_clearly_outside_its_box(ur5):
     """Of a tenth of the size of the body, and of a generous size; and of noise too large to see."""
     body = "wrist_3_link"
