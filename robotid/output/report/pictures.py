@@ -214,6 +214,7 @@ def friction_chart(
         ),
         "speed [m/s]" if unit == "N" else "speed [rad/s]",
         f"friction [{unit}]",
+        height=130,
     )
 
 
