@@ -11,12 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robotid.base.exceptions import DataError
 from robotid.base.files import write_text
 from robotid.base.typing import Array
 from robotid.output.pages.html import asset, scaffold
 
-_KINDS = ("line", "dots", "bars", "area")
 TONES = 8  # distinguishable colours of lines in one chart: tone-1 to tone-8
 POINTS = 2000  # rows of a chart's data
 _AROUND = 112  # [px] of caption, axis and legend of each chart in a notebook
@@ -25,16 +23,15 @@ _STYLE = "main { padding: .5rem 1rem; } h1 { font-size: 1.125rem; margin: 0 0 .5
 
 @dataclass(frozen=True, eq=False)
 class Series:
-    """One line, cloud or set of bars of a chart."""
+    """One line, cloud or area of a chart."""
 
     label: str  # its name in the legend
     y: Array  # values, shape (N,), NaN where the line breaks
     tone: str  # its colour: a variable of tones.css without its dashes, as "predicted" or "tone-1"
-    # "line", "dots", "bars", which are side by side, or "area"; the areas of a chart are stacked,
-    # positive values upwards and negative values downwards
+    # "line", "dots", or "area"; the areas of a chart are stacked, positive values upwards and
+    # negative values downwards
     kind: str = "line"
-    # half width of a band about a line, of error bars about dots and bars, shape (N,)
-    half: Array | None = None
+    half: Array | None = None  # half width of a band about a line, shape (N,)
     is_weak: bool = False  # whether it is drawn faintly
     is_hidden: bool = False  # whether it is hidden until its key in the legend is pressed
 
@@ -51,24 +48,8 @@ class Chart:
     link: str = ""  # charts of one link share the cursor and the zoom along x
     # segments of x with a shaded background, as samples that are not used
     spans: tuple[tuple[float, float], ...] = ()
-    marks: tuple[float, ...] = ()  # positions of dotted lines on x
     logarithmic: str = ""  # the logarithmic axes: "", "x", "y" or "xy"
     height: int = 180  # height of the plot [px]
-    x_names: tuple[str, ...] = ()  # names at x = 0, 1, ... in place of numbers, if any
-
-    def __post_init__(self) -> None:
-        for series in self.series:
-            if series.kind not in _KINDS:
-                raise DataError(
-                    f"series '{series.label}' of the chart '{self.title}' is of kind "
-                    f"'{series.kind}'; kinds: {', '.join(_KINDS)}"
-                )
-            for what, values in (("values", series.y), ("half widths", series.half)):
-                if values is not None and np.shape(values) != np.shape(self.x):
-                    raise DataError(
-                        f"series '{series.label}' of the chart '{self.title}' has "
-                        f"{np.size(values)} {what}, its x has {np.size(self.x)}"
-                    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,10 +110,8 @@ def chart_html(chart: Chart, caption: str, *, points: int = POINTS) -> str:
         "y_label": chart.y_label,
         "link": chart.link,
         "spans": chart.spans,
-        "marks": chart.marks,
         "logarithmic": chart.logarithmic,
         "height": chart.height,
-        "x_names": chart.x_names,
     }
     # "<" is an escape in JSON, so no text in it can end the script
     text = json.dumps(data, separators=(",", ":")).replace("<", "\\u003c")

@@ -35,7 +35,7 @@ SOURCE_NAMES = {
     "bound": "at its bound",
     "stated": "stated",
 }
-_WIDEST = 7  # drive terms, or logs, that a page shows side by side
+_WIDEST = 7  # logs that a page shows side by side
 _FIRST_TERMS = ("kp", "kd", "delay", "limit", "zero")  # of a drive, before all others
 _MILLI = {"s": "ms"}  # units in the table of drives
 _ROLES = {"urdf": "URDF", "identification": "fitted", "validation": "validation"}
@@ -108,7 +108,7 @@ def _parameter(entry: Mapping[str, Any], on_misfit: Collection[str]) -> dict[str
 
 
 def _drive_table(entries: Sequence[Mapping[str, Any]]) -> str:
-    """Return the drive terms, one row per joint, or one per term if these are more."""
+    """Return the drive terms, one row per joint."""
     drives: dict[str, dict[str, Mapping[str, Any]]] = {}
     for entry in entries:
         owner, _, term = entry["name"].rpartition(".")
@@ -124,13 +124,8 @@ def _drive_table(entries: Sequence[Mapping[str, Any]]) -> str:
     units = [_MILLI.get(known[term]["unit"], known[term]["unit"]) for term in terms]
     names = [f"{term} [{unit}]" for term, unit in zip(terms, units, strict=True)]
     cells = [[_short(own.get(term)) for term in terms] for own in drives.values()]
-    headers = ["joint", *names]
     rows = [[code(drive), *row] for drive, row in zip(drives, cells, strict=True)]
-    if len(terms) > max(len(drives), _WIDEST):  # too wide for a page
-        headers = ["term", *drives]
-        columns = zip(*cells, strict=True)
-        rows = [[text(name), *row] for name, row in zip(names, columns, strict=True)]
-    return table("Drives, by joint", headers, rows, is_data=True) if terms else ""
+    return table("Drives, by joint", ["joint", *names], rows, is_data=True) if terms else ""
 
 
 def _error(entry: Mapping[str, Any]) -> float:
